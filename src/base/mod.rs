@@ -1,0 +1,8 @@
+//! What every layer may use: errors, random draws, deterministic math, instruction paths, sizes.
+//! Nothing here knows a Gaussian, a picture or a disk format.
+
+pub mod error;
+pub mod math;
+pub mod rng;
+pub mod simd;
+pub mod units;

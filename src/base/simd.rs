@@ -1,0 +1,116 @@
+//! Instruction paths: the same kernel code compiled for several instruction sets, chosen at run time.
+//!
+//! A kernel implements [`Kernel::run`] once, `#[inline(always)]`, on plain slices in 16-wide inner loops that the
+//! compiler vectorises; [`dispatch`] calls it inside a function compiled for the path. `FMA` tells the kernel
+//! whether fused multiply-add is an instruction there: use [`fma`], which is fused on AVX2 and AVX-512 and two
+//! roundings on the baseline. So AVX2 and AVX-512 give the same bits as each other; the baseline gives others.
+//! Bits are promised per path, and the path is recorded in the run's config.
+//!
+//! The `unsafe` of the crate's compute half lives here and nowhere else.
+#![allow(unsafe_code)] // calling a function compiled for a detected instruction set
+
+use std::sync::OnceLock;
+
+/// Width of inner loops: one tile row, one AVX-512 register, two AVX2 registers.
+pub const LANES: usize = 16;
+
+/// An instruction path.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum SimdPath {
+    /// AVX-512 F/BW/DQ/VL with FMA.
+    Avx512,
+    /// AVX2 with FMA.
+    Avx2,
+    /// Whatever the target's baseline is (SSE2 on x86-64).
+    Baseline,
+}
+
+impl SimdPath {
+    /// All paths, best first.
+    pub const ALL: [SimdPath; 3] = [SimdPath::Avx512, SimdPath::Avx2, SimdPath::Baseline];
+
+    /// The name on the command line and in config.toml.
+    pub fn name(self) -> &'static str {
+        match self {
+            SimdPath::Avx512 => "avx512",
+            SimdPath::Avx2 => "avx2",
+            SimdPath::Baseline => "baseline",
+        }
+    }
+
+    /// The path with this name.
+    pub fn from_name(name: &str) -> Option<SimdPath> {
+        SimdPath::ALL.into_iter().find(|p| p.name() == name)
+    }
+
+    /// Whether this machine can run it.
+    #[cfg(target_arch = "x86_64")]
+    pub fn is_supported(self) -> bool {
+        match self {
+            SimdPath::Avx512 => {
+                is_x86_feature_detected!("avx512f")
+                    && is_x86_feature_detected!("avx512bw")
+                    && is_x86_feature_detected!("avx512dq")
+                    && is_x86_feature_detected!("avx512vl")
+                    && SimdPath::Avx2.is_supported()
+            }
+            SimdPath::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
+            SimdPath::Baseline => true,
+        }
+    }
+
+    /// Whether this machine can run it.
+    #[cfg(not(target_arch = "x86_64"))]
+    pub fn is_supported(self) -> bool {
+        self == SimdPath::Baseline
+    }
+
+    /// The best path of this machine.
+    pub fn best() -> SimdPath {
+        static BEST: OnceLock<SimdPath> = OnceLock::new();
+        *BEST.get_or_init(|| SimdPath::ALL.into_iter().find(|p| p.is_supported()).unwrap_or(SimdPath::Baseline))
+    }
+}
+
+/// Work that [`dispatch`] compiles for each path.
+pub trait Kernel {
+    /// What it returns.
+    type Out;
+    /// The work. Mark the implementation, and every function it calls in its inner loop, `#[inline(always)]`.
+    fn run<const FMA: bool>(self) -> Self::Out;
+}
+
+/// `a * b + c`: fused when `FMA`, otherwise rounded twice.
+#[inline(always)]
+pub fn fma<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
+    if FMA { a.mul_add(b, c) } else { a * b + c }
+}
+
+/// Runs `kernel` on `path`; a path that this machine lacks falls back to the baseline.
+#[inline]
+pub fn dispatch<K: Kernel>(path: SimdPath, kernel: K) -> K::Out {
+    #[cfg(target_arch = "x86_64")]
+    {
+        match path {
+            // SAFETY: the features of the callee were detected on this machine just now (the answer is cached by std).
+            SimdPath::Avx512 if path.is_supported() => return unsafe { run_avx512(kernel) },
+            // SAFETY: as above.
+            SimdPath::Avx2 if path.is_supported() => return unsafe { run_avx2(kernel) },
+            _ => {}
+        }
+    }
+    let _ = path;
+    kernel.run::<false>()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx2,fma")]
+fn run_avx512<K: Kernel>(kernel: K) -> K::Out {
+    kernel.run::<true>()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn run_avx2<K: Kernel>(kernel: K) -> K::Out {
+    kernel.run::<true>()
+}

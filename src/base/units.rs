@@ -1,0 +1,61 @@
+//! Byte sizes as people write them: `512MiB`, `4GiB`, `2GB`, `1048576`.
+
+/// Bytes in one MiB.
+pub const MIB: u64 = 1 << 20;
+/// Bytes in one GiB.
+pub const GIB: u64 = 1 << 30;
+
+/// Parses a size: a number, then an optional unit. `K M G T` and `KiB ...` are powers of 1024, `KB ...` of 1000.
+pub fn parse_bytes(text: &str) -> Result<u64, String> {
+    let text = text.trim();
+    let split = text.find(|c: char| !(c.is_ascii_digit() || c == '.')).unwrap_or(text.len());
+    let (number, unit) = text.split_at(split);
+    let value: f64 = number.parse().map_err(|_| format!("'{text}' is not a size; write for example 4GiB"))?;
+    let factor = match unit.trim().to_ascii_lowercase().as_str() {
+        "" | "b" => 1.0,
+        "k" | "kib" => 1024.0,
+        "m" | "mib" => 1_048_576.0,
+        "g" | "gib" => 1_073_741_824.0,
+        "t" | "tib" => 1_099_511_627_776.0,
+        "kb" => 1e3,
+        "mb" => 1e6,
+        "gb" => 1e9,
+        "tb" => 1e12,
+        other => return Err(format!("unknown unit '{other}' in '{text}'; use KiB, MiB, GiB or KB, MB, GB")),
+    };
+    let bytes = value * factor;
+    if bytes.is_finite() && bytes < 9e18 { Ok(bytes as u64) } else { Err(format!("'{text}' is out of range")) }
+}
+
+/// A size for people: two or three digits and a binary unit.
+pub fn format_bytes(bytes: u64) -> String {
+    let units = ["B", "KiB", "MiB", "GiB", "TiB"];
+    let mut value = bytes as f64;
+    let mut unit = 0;
+    while value >= 1024.0 && unit + 1 < units.len() {
+        value /= 1024.0;
+        unit += 1;
+    }
+    if unit == 0 || value >= 100.0 {
+        format!("{value:.0} {}", units[unit])
+    } else {
+        format!("{value:.1} {}", units[unit])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_parse_and_print() {
+        assert_eq!(parse_bytes("4GiB"), Ok(4 * GIB));
+        assert_eq!(parse_bytes("1.5 MiB"), Ok(MIB + MIB / 2));
+        assert_eq!(parse_bytes("2GB"), Ok(2_000_000_000));
+        assert_eq!(parse_bytes("77"), Ok(77));
+        assert!(parse_bytes("GiB").is_err());
+        assert!(parse_bytes("4 parsecs").is_err());
+        assert_eq!(format_bytes(4 * GIB), "4.0 GiB");
+        assert_eq!(format_bytes(900), "900 B");
+    }
+}

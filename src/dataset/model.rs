@@ -1,0 +1,98 @@
+//! What a reader finds, before any photo is opened: plain data in the dataset's own coordinates, all f64.
+
+use glam::{DMat3, DVec3};
+use std::path::PathBuf;
+
+/// Camera models that can be used, with COLMAP's parameter order in the comments.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Lens {
+    /// No distortion.
+    Pinhole,
+    /// k1, k2, p1, p2, k3, k4, k5, k6: radial (rational when k4..k6 are not 0) and tangential, as OpenCV's.
+    /// SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV are cases of it.
+    Radial([f64; 8]),
+    /// k1, k2, k3, k4 on the angle (equidistant fisheye), as OpenCV's fisheye.
+    /// SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE and OPENCV_FISHEYE are cases of it.
+    Fisheye([f64; 4]),
+}
+
+/// Intrinsics of a photo as the dataset states them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Intrinsics {
+    /// Size that the other numbers refer to, pixels.
+    pub width: u32,
+    /// Size that the other numbers refer to, pixels.
+    pub height: u32,
+    /// Focal lengths, pixels.
+    pub fx: f64,
+    /// Focal lengths, pixels.
+    pub fy: f64,
+    /// Principal point, pixels; the centre of the first pixel is (0.5, 0.5).
+    pub cx: f64,
+    /// Principal point, pixels.
+    pub cy: f64,
+    /// Distortion.
+    pub lens: Lens,
+}
+
+/// World to camera, OpenCV axes: `p_cam = rotation * p + translation`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pose {
+    /// Proper rotation.
+    pub rotation: DMat3,
+    /// Camera-space position of the world's origin.
+    pub translation: DVec3,
+}
+
+impl Pose {
+    /// Position of the camera in the world.
+    pub fn centre(&self) -> DVec3 {
+        -(self.rotation.transpose() * self.translation)
+    }
+}
+
+/// Which set a view belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Split {
+    /// Used for training.
+    Train,
+    /// Held out: only evaluated.
+    Test,
+}
+
+/// One registered photo.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RawView {
+    /// Name as in the dataset, `/`-separated, relative to the image folder; proven to stay inside it.
+    pub name: String,
+    /// The photo's file.
+    pub image_path: PathBuf,
+    /// Intrinsics at the size that the dataset states.
+    pub intrinsics: Intrinsics,
+    /// Pose.
+    pub pose: Pose,
+    /// A mask named by the dataset itself; masks found by folder are the loader's matter.
+    pub mask_path: Option<PathBuf>,
+    /// The split that the dataset itself prescribes (transforms_train/val/test.json), if it does.
+    pub split: Option<Split>,
+}
+
+/// Coloured points.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct PointCloud {
+    /// Positions, dataset coordinates.
+    pub positions: Vec<[f64; 3]>,
+    /// sRGB, one per position.
+    pub colors: Vec<[u8; 3]>,
+}
+
+/// Everything a reader found.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct RawScene {
+    /// Views in sorted order of their names, names unique.
+    pub views: Vec<RawView>,
+    /// Points; may be empty.
+    pub points: PointCloud,
+    /// What was left out or repaired, one sentence each, for the user.
+    pub warnings: Vec<String>,
+}

@@ -1,0 +1,42 @@
+//! gsscale trains 3D Gaussian Splatting scenes. This page is the tour, in the order in which data flows.
+//!
+//! ```text
+//!  photos, poses, points ──> dataset ──> scene (columns, events)
+//!                                          │ rows of the view's working set
+//!            config ──> train ─────────────┤
+//!                         │                v
+//!                         │   kernels (one file per stage) ──> render (the stages in order)
+//!                         │                │ gradients
+//!                         └──> optim, densify <──┘
+//!                                          │
+//!                                          v
+//!                              exchange (PLY), metrics, pictures
+//! ```
+//!
+//! | module | what it is responsible for |
+//! | --- | --- |
+//! | [`base`] | ids, random draws, deterministic math, instruction paths, errors; knows neither Gaussians nor disks |
+//! | [`scene`] | Gaussians, cameras and images as data; first Gaussians from points; the log of global events |
+//! | [`dataset`] | where views come from: COLMAP, transforms.json, the generated city; decoding photos |
+//! | [`kernels`] | the ordered table of stages and each stage as a function on plain slices |
+//! | [`render`] | the stages in order: forward, loss, backward; image metrics |
+//! | [`optim`] | learning rates as a function of the step; dense Adam (oracle) and deferred Adam |
+//! | [`densify`] | statistics, decisions and edits that change the number of Gaussians |
+//! | [`exchange`] | PLY in and out |
+//! | [`config`] | what the user wrote and what follows from it |
+//! | [`train`] | the only place where all of it meets: one step, the loop, evaluation |
+//!
+//! One word, one thing: a *row* is one Gaussian inside a working set, a *column* one attribute of all of them, a
+//! *view* a photo with its pose, a *target* its pixels, a *tile* 16x16 pixels, a *stage* one kernel of the pipeline,
+//! a *step* one optimizer iteration, an *event* one global change that every row applies.
+
+pub mod base;
+pub mod config;
+pub mod dataset;
+pub mod densify;
+pub mod exchange;
+pub mod kernels;
+pub mod optim;
+pub mod render;
+pub mod scene;
+pub mod train;

@@ -1,0 +1,145 @@
+//! The six columns of a Gaussian and a table of rows in them.
+//!
+//! Invariants: 1. values are stored *before* activation: log-scales, logit opacities, quaternions w-first and not
+//! necessarily unit; 2. every column holds exactly `rows * width` floats, row-major; 3. `sh_n` is coefficient-major
+//! (`[K-1][3]`, band 1 first), the order of the field's tensors; PLY's channel-major order is the exchange's matter.
+
+/// One attribute of a Gaussian.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Column {
+    /// Positions, local frame.
+    Means,
+    /// Rotations, w x y z.
+    Quats,
+    /// Log of the three standard deviations.
+    Scales,
+    /// Logit of the opacity.
+    Opacities,
+    /// Constant band of the colour.
+    Sh0,
+    /// Higher bands of the colour.
+    ShN,
+}
+
+impl Column {
+    /// All columns, in storage order.
+    pub const ALL: [Column; 6] =
+        [Column::Means, Column::Quats, Column::Scales, Column::Opacities, Column::Sh0, Column::ShN];
+
+    /// Floats of one row, for scenes stored with `sh_degree` (0 to 3).
+    pub fn width(self, sh_degree: u8) -> usize {
+        match self {
+            Column::Means | Column::Scales | Column::Sh0 => 3,
+            Column::Quats => 4,
+            Column::Opacities => 1,
+            Column::ShN => sh_n_width(sh_degree),
+        }
+    }
+
+    /// The field's name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Column::Means => "means",
+            Column::Quats => "quats",
+            Column::Scales => "scales",
+            Column::Opacities => "opacities",
+            Column::Sh0 => "sh0",
+            Column::ShN => "shN",
+        }
+    }
+}
+
+/// Floats of `shN` at a degree: 3 ((degree + 1)^2 - 1).
+pub fn sh_n_width(sh_degree: u8) -> usize {
+    let d = sh_degree as usize + 1;
+    3 * (d * d - 1)
+}
+
+/// Floats of a whole row at a degree: 14 + [`sh_n_width`] (59 at degree 3).
+pub fn row_width(sh_degree: u8) -> usize {
+    14 + sh_n_width(sh_degree)
+}
+
+/// Rows of Gaussians by column. Also used for what has the same shape: gradients (`v_*`), `exp_avg`, `exp_avg_sq`.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Columns {
+    /// Degree that `sh_n` is stored with, 0 to 3.
+    pub sh_degree: u8,
+    /// `[rows][3]`.
+    pub means: Vec<f32>,
+    /// `[rows][4]`, w x y z.
+    pub quats: Vec<f32>,
+    /// `[rows][3]`, log.
+    pub scales: Vec<f32>,
+    /// `[rows]`, logit.
+    pub opacities: Vec<f32>,
+    /// `[rows][3]`.
+    pub sh0: Vec<f32>,
+    /// `[rows][(degree + 1)^2 - 1][3]`.
+    pub sh_n: Vec<f32>,
+}
+
+impl Columns {
+    /// `rows` rows of zeros.
+    pub fn zeros(rows: usize, sh_degree: u8) -> Self {
+        let mut c = Columns { sh_degree, ..Columns::default() };
+        c.resize(rows);
+        c
+    }
+
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.opacities.len()
+    }
+
+    /// Changes the number of rows; new rows are zeros. Keeps the allocation.
+    pub fn resize(&mut self, rows: usize) {
+        for column in Column::ALL {
+            let width = column.width(self.sh_degree);
+            self.column_mut(column).resize(rows * width, 0.0);
+        }
+    }
+
+    /// Sets every value to zero.
+    pub fn fill_zero(&mut self) {
+        for column in Column::ALL {
+            self.column_mut(column).fill(0.0);
+        }
+    }
+
+    /// The floats of one column.
+    pub fn column(&self, column: Column) -> &[f32] {
+        match column {
+            Column::Means => &self.means,
+            Column::Quats => &self.quats,
+            Column::Scales => &self.scales,
+            Column::Opacities => &self.opacities,
+            Column::Sh0 => &self.sh0,
+            Column::ShN => &self.sh_n,
+        }
+    }
+
+    /// The floats of one column.
+    pub fn column_mut(&mut self, column: Column) -> &mut Vec<f32> {
+        match column {
+            Column::Means => &mut self.means,
+            Column::Quats => &mut self.quats,
+            Column::Scales => &mut self.scales,
+            Column::Opacities => &mut self.opacities,
+            Column::Sh0 => &mut self.sh0,
+            Column::ShN => &mut self.sh_n,
+        }
+    }
+
+    /// The floats of one row of one column.
+    pub fn row(&self, column: Column, row: usize) -> &[f32] {
+        let width = column.width(self.sh_degree);
+        &self.column(column)[row * width..(row + 1) * width]
+    }
+
+    /// The floats of one row of one column.
+    pub fn row_mut(&mut self, column: Column, row: usize) -> &mut [f32] {
+        let width = column.width(self.sh_degree);
+        &mut self.column_mut(column)[row * width..(row + 1) * width]
+    }
+}

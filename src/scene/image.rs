@@ -1,0 +1,61 @@
+//! Images as data: what the renderer makes and what it is compared with.
+
+/// A rendered picture: planar f32, `[3][height][width]`, not clamped.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Image {
+    /// Width, pixels.
+    pub width: u32,
+    /// Height, pixels.
+    pub height: u32,
+    /// Red plane, green plane, blue plane, each row-major.
+    pub rgb: Vec<f32>,
+}
+
+/// The photo of a view at training size: 8-bit, interleaved `[height][width][3]`.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Target {
+    /// Width, pixels.
+    pub width: u32,
+    /// Height, pixels.
+    pub height: u32,
+    /// Interleaved RGB, row-major.
+    pub rgb: Vec<u8>,
+    /// One byte per pixel, 255 = counts, 0 = is left out of loss and metrics; `None` when every pixel counts.
+    pub mask: Option<Vec<u8>>,
+}
+
+impl Image {
+    /// A black image.
+    pub fn new(width: u32, height: u32) -> Self {
+        Image { width, height, rgb: vec![0.0; 3 * width as usize * height as usize] }
+    }
+
+    /// Pixels in one plane.
+    pub fn pixels(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
+    /// Interleaved 8-bit copy, clamped and rounded to nearest.
+    pub fn to_rgb8(&self) -> Vec<u8> {
+        let n = self.pixels();
+        let mut out = Vec::with_capacity(3 * n);
+        for i in 0..n {
+            for c in 0..3 {
+                out.push((self.rgb[c * n + i].clamp(0.0, 1.0) * 255.0 + 0.5) as u8);
+            }
+        }
+        out
+    }
+}
+
+impl Target {
+    /// Pixels in the image.
+    pub fn pixels(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
+    /// Bytes that this target keeps in memory.
+    pub fn bytes(&self) -> u64 {
+        (self.rgb.len() + self.mask.as_ref().map_or(0, Vec::len)) as u64
+    }
+}

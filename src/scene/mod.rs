@@ -1,0 +1,7 @@
+//! Gaussians, cameras and images as data: no files, no rendering, no optimizer.
+
+pub mod camera;
+pub mod columns;
+pub mod events;
+pub mod image;
+pub mod init;
