@@ -1,1 +1,5 @@
-//! (being written)
+//! Statistics, decisions and edits that change the number of Gaussians.
+
+pub mod ops;
+pub mod policy;
+pub mod stats;

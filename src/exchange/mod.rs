@@ -1,1 +1,3 @@
-//! (being written)
+//! Scenes in and out of other programs: PLY.
+
+pub mod ply;

@@ -1,3 +1,15 @@
-//! One file per stage of the pipeline, on plain slices. No files, no GPU types, no optimizer of the scene.
+//! One file per stage of the pipeline, on plain slices. No files, no GPU types, no optimizer.
 
 pub mod constants;
+pub mod image_loss;
+pub mod isect_emit;
+pub mod isect_offsets;
+pub mod project_bwd;
+pub mod project_fwd;
+pub mod radix_sort;
+pub mod rasterize_bwd;
+pub mod rasterize_fwd;
+pub mod scan;
+pub mod sh_bwd;
+pub mod sh_fwd;
+pub mod stages;

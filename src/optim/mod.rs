@@ -1,1 +1,5 @@
-//! (being written)
+//! Learning rates and Adam.
+
+pub mod adam;
+pub mod deferred;
+pub mod rates;

@@ -1,5 +1,8 @@
 //! The stages in order: forward, loss, backward; and image metrics.
 
+pub mod cpu;
+pub mod metrics;
+
 use crate::base::simd::SimdPath;
 
 /// What a rendering depends on besides rows and camera.
@@ -30,4 +33,39 @@ pub enum SsimPadding {
     Valid,
     /// Every pixel, zeros outside (the 3DGS code).
     Same,
+}
+
+/// What the loss weighs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LossOptions {
+    /// Weight of 1 - SSIM; L1 has the rest.
+    pub ssim_lambda: f32,
+    /// Pixels that the SSIM map covers.
+    pub padding: SsimPadding,
+    /// Instruction path of the CPU kernels.
+    pub simd: SimdPath,
+}
+
+/// Loss of one image and its parts.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct LossValue {
+    /// (1 - lambda) l1 + lambda (1 - ssim).
+    pub loss: f64,
+    /// Mean absolute difference.
+    pub l1: f64,
+    /// Mean of the SSIM map.
+    pub ssim: f64,
+    /// Mean squared difference of the unclamped image.
+    pub mse: f64,
+}
+
+/// Gradients of one view, one entry per row of the working set.
+#[derive(Debug, Clone, Default)]
+pub struct Gradients {
+    /// With respect to the stored (pre-activation) columns.
+    pub columns: crate::scene::columns::Columns,
+    /// With respect to the pixel position of the mean, signed, pixel units.
+    pub means2d: Vec<[f32; 2]>,
+    /// Half extents of the footprint, pixels; [0, 0]: the row was not drawn.
+    pub radii: Vec<[u32; 2]>,
 }

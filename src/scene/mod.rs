@@ -5,3 +5,4 @@ pub mod columns;
 pub mod events;
 pub mod image;
 pub mod init;
+pub mod state;

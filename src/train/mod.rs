@@ -1,1 +1,3 @@
-//! (being written)
+//! Where everything meets.
+
+pub mod catch_up;
