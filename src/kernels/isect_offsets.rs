@@ -1,1 +1,45 @@
-//! (being written)
+//! Where each tile's list begins: from tile counts to places.
+//!
+//! Invariant: within a tile, intersections stand in depth order, because the chunks of the counting sort are cut in
+//! depth order and each writes in it.
+
+/// `tile_counts` is `[chunks][tiles]`: how many intersections each chunk of ranks has in each tile. On return,
+/// `tile_offsets` (tiles + 1 entries, the last is the total) says where each tile's list begins, and `cursors`
+/// (`[chunks][tiles]`) where each chunk's part of it begins.
+pub fn isect_offsets(tile_counts: &[u32], tiles: usize, tile_offsets: &mut Vec<u64>, cursors: &mut Vec<u64>) {
+    tile_offsets.clear();
+    tile_offsets.resize(tiles + 1, 0);
+    for counts in tile_counts.chunks_exact(tiles.max(1)) {
+        for (sum, &count) in tile_offsets[1..].iter_mut().zip(counts) {
+            *sum += u64::from(count);
+        }
+    }
+    for tile in 0..tiles {
+        tile_offsets[tile + 1] += tile_offsets[tile];
+    }
+    cursors.clear();
+    cursors.resize(tile_counts.len(), 0);
+    if tile_counts.is_empty() {
+        return;
+    }
+    cursors[..tiles].copy_from_slice(&tile_offsets[..tiles]);
+    for at in tiles..cursors.len() {
+        cursors[at] = cursors[at - tiles] + u64::from(tile_counts[at - tiles]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn chunks_follow_each_other_within_a_tile() {
+        let (mut offsets, mut cursors) = (vec![5; 9], vec![5; 2]);
+        isect_offsets(&[1, 0, 2, 3, 1, 0], 3, &mut offsets, &mut cursors);
+        assert_eq!(offsets, [0, 4, 5, 7]);
+        assert_eq!(cursors, [0, 4, 5, 1, 4, 7]);
+        isect_offsets(&[], 3, &mut offsets, &mut cursors);
+        assert_eq!(offsets, [0, 0, 0, 0]);
+        assert!(cursors.is_empty());
+    }
+}

@@ -1,1 +1,283 @@
-//! (being written)
+//! Gradients of footprints and colours from the gradient of the image, back to front through each tile's list.
+//!
+//! With h = alpha dL/dalpha (zero where alpha is clamped), a splat needs from a tile only nine sums over its pixels:
+//! h, h dx, h dy, h dx^2, h dx dy, h dy^2 and weight v_rgb. Everything else is linear in them and is done once per row.
+//!
+//! Invariants: 1. no gradient passes through alpha where opacity exp(-sigma) > max_alpha; the colour's does; 2. a
+//! splat that contributes to no pixel gets exact zeros; 3. the nine sums of a row are folded over its tiles from left
+//! to right in emit order (tiles column by column), starting from zero: this order is part of the result's definition,
+//! so that a view may be cut at tile columns without changing a bit; 4. threads cannot change a bit.
+
+use super::constants::TILE;
+use super::isect_emit::Isect;
+use super::project_fwd::Projected;
+use super::rasterize_fwd::{InTile, Lanes, Lists, NEVER, Raster, TILE_PIXELS, exp2_bounded, log2_max_alpha};
+use super::splats::LOG2_ALPHA_MIN;
+use crate::base::simd::{Kernel, LANES, dispatch, fma};
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
+const ROWS: usize = TILE as usize;
+/// Sums of one intersection: h, hx, hy, hxx, hxy, hyy, red, green, blue.
+pub const SUMS: usize = 9;
+
+/// The sums of one intersection as f32 bits. Every place is written by one tile; relaxed stores are how safe Rust
+/// says that the writes of different tiles do not meet.
+pub type Partial = [AtomicU32; SUMS];
+
+/// Gradient of the loss with respect to the image.
+#[derive(Debug, Clone, Copy)]
+pub struct Upstream<'a> {
+    /// `[3][height][width]`.
+    pub v_rgb: &'a [f32],
+    /// `[height][width]`, for alpha = 1 - T.
+    pub v_alpha: Option<&'a [f32]>,
+}
+
+/// Gradients of footprints and colours, one entry per row; zeros for rows that were not drawn.
+#[derive(Debug, Clone, Default)]
+pub struct FootprintGradients {
+    /// Pixel units, signed.
+    pub v_means2d: Vec<[f32; 2]>,
+    /// xx, xy, yy of the conic, xy counted once.
+    pub v_conics: Vec<[f32; 3]>,
+    /// With respect to the colour after its clamp at 0.
+    pub v_colors: Vec<[f32; 3]>,
+    /// With respect to the opacity after activation.
+    pub v_opacities: Vec<f32>,
+}
+
+/// State of one tile on its way back.
+struct Tile {
+    /// T in front of the splats passed so far (first: T behind everything).
+    t: [Lanes; ROWS],
+    /// dL/dT of the part behind, times T: the sum of weight (color . v_rgb) behind, and the background's part.
+    behind: [Lanes; ROWS],
+    v_rgb: [[Lanes; 3]; ROWS],
+    stop: [[u32; LANES]; ROWS],
+    /// Largest stop of each row: the row takes no part at or beyond it.
+    row_stop: [u32; ROWS],
+}
+
+impl Tile {
+    fn load(lists: &Lists<'_>, raster: &Raster, upstream: &Upstream<'_>, tile: usize) -> Self {
+        let grid = lists.grid;
+        let (tx, ty) = grid.position(tile);
+        let columns = (grid.width - tx * TILE).min(TILE) as usize;
+        let rows = (grid.height - ty * TILE).min(TILE) as usize;
+        let pixels = grid.width as usize * grid.height as usize;
+        let mut state = Tile {
+            t: [[0.0; LANES]; ROWS],
+            behind: [[0.0; LANES]; ROWS],
+            v_rgb: [[[0.0; LANES]; 3]; ROWS],
+            stop: [[0; LANES]; ROWS],
+            row_stop: [0; ROWS],
+        };
+        for row in 0..rows {
+            let from = (ty as usize * ROWS + row) * grid.width as usize + tx as usize * LANES;
+            for c in 0..3 {
+                state.v_rgb[row][c][..columns].copy_from_slice(&upstream.v_rgb[c * pixels + from..][..columns]);
+            }
+            let within = tile * TILE_PIXELS + row * LANES;
+            for lane in 0..columns {
+                let t = raster.t_final[within + lane];
+                let mut v = -upstream.v_alpha.map_or(0.0, |v| v[from + lane]);
+                for c in 0..3 {
+                    v += lists.background[c] * state.v_rgb[row][c][lane];
+                }
+                state.t[row][lane] = t;
+                state.behind[row][lane] = t * v;
+                state.stop[row][lane] = raster.stop[within + lane];
+                state.row_stop[row] = state.row_stop[row].max(raster.stop[within + lane]);
+            }
+        }
+        state
+    }
+}
+
+struct BackTile<'a> {
+    lists: &'a Lists<'a>,
+    offsets: &'a [u64],
+    tile: usize,
+    cap: f32,
+    state: &'a mut Tile,
+    partials: &'a [Partial],
+}
+
+impl Kernel for BackTile<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        let BackTile { lists, offsets, tile, cap, state, partials } = self;
+        let (tx, ty) = lists.grid.position(tile);
+        let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
+        for (at, bits) in lists.tile(tile).iter().enumerate().rev() {
+            let isect = Isect::unpack(bits.load(Relaxed));
+            let splat = &lists.splats[isect.rank as usize];
+            let local = InTile::new::<FMA>(splat, x0, y0);
+            let top = if splat.log2_opacity < cap { splat.log2_opacity } else { cap };
+            let mut acc = Sums::default();
+            for row in usize::from(isect.rows[0])..=usize::from(isect.rows[1]) {
+                if at as u32 >= state.row_stop[row] {
+                    continue;
+                }
+                back_row::<FMA>(state, row, at as u32, &local, top, cap, splat.color, &mut acc);
+            }
+            let out = &partials[(offsets[isect.rank as usize] + u64::from(isect.k)) as usize];
+            for (out, sum) in out.iter().zip(acc.reduce::<FMA>(&local.dx)) {
+                out.store(sum.to_bits(), Relaxed);
+            }
+        }
+    }
+}
+
+/// Sums of one splat in one tile, by lane.
+#[derive(Clone, Copy, Default)]
+struct Sums {
+    h: Lanes,
+    hy: Lanes,
+    hyy: Lanes,
+    rgb: [Lanes; 3],
+}
+
+impl Sums {
+    /// The nine sums over lanes; dx is constant in a lane, so its moments are formed here.
+    #[inline(always)]
+    fn reduce<const FMA: bool>(&self, dx: &Lanes) -> [f32; SUMS] {
+        let times_dx = |v: &Lanes| std::array::from_fn(|lane| v[lane] * dx[lane]);
+        let hx = times_dx(&self.h);
+        let hxx = times_dx(&hx);
+        let hxy = times_dx(&self.hy);
+        [
+            sum(&self.h),
+            sum(&hx),
+            sum(&self.hy),
+            sum(&hxx),
+            sum(&hxy),
+            sum(&self.hyy),
+            sum(&self.rgb[0]),
+            sum(&self.rgb[1]),
+            sum(&self.rgb[2]),
+        ]
+    }
+}
+
+/// Sum over lanes: halves upon halves, the same order on every path.
+#[inline(always)]
+fn sum(v: &Lanes) -> f32 {
+    let mut eight = [0.0; 8];
+    for i in 0..8 {
+        eight[i] = v[i] + v[i + 8];
+    }
+    let mut four = [0.0; 4];
+    for i in 0..4 {
+        four[i] = eight[i] + eight[i + 4];
+    }
+    (four[0] + four[2]) + (four[1] + four[3])
+}
+
+#[inline(always)]
+fn back_row<const FMA: bool>(
+    state: &mut Tile,
+    row: usize,
+    at: u32,
+    local: &InTile,
+    top: f32,
+    cap: f32,
+    color: [f32; 3],
+    acc: &mut Sums,
+) {
+    let (dy, bdy, cdy) = (local.dy[row], local.bdy[row], local.cdy[row]);
+    let [v_red, v_green, v_blue] = &state.v_rgb[row];
+    let (t, behind, stop) = (&mut state.t[row], &mut state.behind[row], &state.stop[row]);
+    for lane in 0..LANES {
+        let e = fma::<FMA>(local.adx[lane] + bdy, local.dx[lane], cdy);
+        let clamped = if e < top { e } else { top };
+        let active = e >= LOG2_ALPHA_MIN && at < stop[lane];
+        let alpha = if active { exp2_bounded::<FMA>(clamped) } else { 0.0 };
+        let over = 1.0 / (1.0 - alpha);
+        let before = t[lane] * over;
+        let weight = alpha * before;
+        let q = fma::<FMA>(color[0], v_red[lane], fma::<FMA>(color[1], v_green[lane], color[2] * v_blue[lane]));
+        // alpha dL/dalpha = T alpha (color . v) - alpha / (1 - alpha) (what lies behind)
+        let h = fma::<FMA>(weight, q, -(alpha * over) * behind[lane]);
+        let h = if e <= cap { h } else { 0.0 };
+        t[lane] = before;
+        behind[lane] = fma::<FMA>(weight, q, behind[lane]);
+        acc.h[lane] += h;
+        acc.hy[lane] = fma::<FMA>(h, dy, acc.hy[lane]);
+        acc.hyy[lane] = fma::<FMA>(h, dy * dy, acc.hyy[lane]);
+        acc.rgb[0][lane] = fma::<FMA>(weight, v_red[lane], acc.rgb[0][lane]);
+        acc.rgb[1][lane] = fma::<FMA>(weight, v_green[lane], acc.rgb[1][lane]);
+        acc.rgb[2][lane] = fma::<FMA>(weight, v_blue[lane], acc.rgb[2][lane]);
+    }
+}
+
+/// Writes the sums of every intersection to its emit index (`offsets[rank] + k`) in `partials`, which is resized.
+pub fn rasterize_bwd(
+    lists: &Lists<'_>,
+    offsets: &[u64],
+    raster: &Raster,
+    upstream: &Upstream<'_>,
+    partials: &mut Vec<Partial>,
+) {
+    let cap = log2_max_alpha(lists.max_alpha, lists.simd);
+    partials.resize_with(lists.isects.len(), Partial::default);
+    let partials = &partials[..];
+    (0..lists.grid.tiles()).into_par_iter().for_each(|tile| {
+        let mut state = Tile::load(lists, raster, upstream, tile);
+        dispatch(lists.simd, BackTile { lists, offsets, tile, cap, state: &mut state, partials });
+    });
+}
+
+/// Folds the sums of each row over its intersections and turns them into gradients. `order` are the rows by rank.
+pub fn fold_rows(
+    order: &[u32],
+    offsets: &[u64],
+    partials: &[Partial],
+    projected: &Projected,
+    rank_from_row: &mut Vec<u32>,
+    out: &mut FootprintGradients,
+) {
+    let rows = projected.radii.len();
+    rank_from_row.clear();
+    rank_from_row.resize(rows, NEVER);
+    for (rank, &row) in order.iter().enumerate() {
+        rank_from_row[row as usize] = rank as u32;
+    }
+    out.v_means2d.resize(rows, [0.0; 2]);
+    out.v_conics.resize(rows, [0.0; 3]);
+    out.v_colors.resize(rows, [0.0; 3]);
+    out.v_opacities.resize(rows, 0.0);
+    out.v_means2d
+        .par_iter_mut()
+        .with_min_len(1024)
+        .zip(&mut out.v_conics)
+        .zip(&mut out.v_colors)
+        .zip(&mut out.v_opacities)
+        .enumerate()
+        .for_each(|(row, (((v_mean, v_conic), v_color), v_opacity))| {
+            let mut sums = [0.0f32; SUMS];
+            let rank = rank_from_row[row];
+            if rank != NEVER {
+                let (first, last) = (offsets[rank as usize] as usize, offsets[rank as usize + 1] as usize);
+                for partial in &partials[first..last] {
+                    for (sum, part) in sums.iter_mut().zip(partial) {
+                        *sum += f32::from_bits(part.load(Relaxed));
+                    }
+                }
+            }
+            let [h, hx, hy, hxx, hxy, hyy, red, green, blue] = sums;
+            *v_color = [red, green, blue];
+            if rank == NEVER {
+                (*v_mean, *v_conic, *v_opacity) = ([0.0; 2], [0.0; 3], 0.0);
+                return;
+            }
+            // dL/dsigma = -h; sigma = (A dx^2 + C dy^2) / 2 + B dx dy with dx = pixel - mean.
+            let [a, b, c] = projected.conics[row];
+            *v_mean = [a * hx + b * hy, b * hx + c * hy];
+            *v_conic = [-0.5 * hxx, -hxy, -0.5 * hyy];
+            *v_opacity = h / projected.opacities[row];
+        });
+}

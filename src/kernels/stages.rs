@@ -1,1 +1,42 @@
-//! (being written)
+//! The stages of one training step, in the order in which they run. Every backend follows this table: a stage's name
+//! is the stem of its file here, of its twin on other devices, and its key in profiles.
+
+/// One stage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Stage {
+    /// File stem and profile key.
+    pub name: &'static str,
+    /// What it does, one line.
+    pub doc: &'static str,
+}
+
+/// The stages in order.
+///
+/// The sort by tile that stands between `isect_emit` and `isect_offsets` on a device is a counting sort on the CPU:
+/// there `isect_offsets` turns the tile counts of the rows into places, and `isect_emit` writes straight to them.
+pub const STAGES: [Stage; 11] = [
+    Stage { name: "project_fwd", doc: "rows to footprints on the screen; culls" },
+    Stage { name: "sh_fwd", doc: "colours of the visible rows from their view directions" },
+    Stage { name: "radix_sort", doc: "visible rows front to back by the bits of their depth, ties by row" },
+    Stage { name: "scan", doc: "tiles touched by each row to 64-bit offsets of its intersections" },
+    Stage { name: "isect_emit", doc: "one intersection for each row and tile that it touches" },
+    Stage { name: "isect_offsets", doc: "where each tile's list of intersections begins" },
+    Stage { name: "rasterize_fwd", doc: "blends each tile's list front to back" },
+    Stage { name: "image_loss", doc: "loss of the image and its gradient" },
+    Stage { name: "rasterize_bwd", doc: "gradients of footprints and colours, back to front" },
+    Stage { name: "sh_bwd", doc: "gradients of colours to coefficients and means" },
+    Stage { name: "project_bwd", doc: "gradients of footprints to means, quats, scales, opacities" },
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_stage_has_its_file() {
+        let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src/kernels");
+        for stage in STAGES {
+            assert!(folder.join(format!("{}.rs", stage.name)).is_file(), "{}", stage.name);
+        }
+    }
+}
