@@ -4,6 +4,7 @@ pub mod constants;
 pub mod image_loss;
 pub mod isect_emit;
 pub mod isect_offsets;
+pub mod lanes;
 pub mod project_bwd;
 pub mod project_fwd;
 pub mod radix_sort;
