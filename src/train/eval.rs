@@ -9,7 +9,7 @@ use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
 use crate::dataset::reader::{ReadOptions, read_scene};
 use crate::dataset::target_cache::TargetCache;
-use crate::exchange::ply::{PlyContent, read_ply};
+use crate::exchange::ply::{PlyContent, read_ply, to_local};
 use crate::optim::deferred::DeferredAdam;
 use crate::render::cpu::CpuRenderer;
 use crate::render::metrics::{SsimVariant, psnr, ssim};
@@ -120,7 +120,7 @@ pub fn evaluate_ply(
     for warning in &dataset.warnings {
         eprintln!("warning: {warning}");
     }
-    meta.to_local(&mut columns, dataset.frame.origin.to_array(), dataset.frame.scale);
+    to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
     let run = RunOptions::new(config, dataset.scene_scale);
     let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
     let gaussians = columns.rows() as u64;

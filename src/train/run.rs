@@ -16,7 +16,7 @@ use crate::dataset::loader::{Dataset, load_dataset};
 use crate::dataset::model::PointCloud;
 use crate::dataset::reader::{ReadOptions, read_scene};
 use crate::dataset::target_cache::TargetCache;
-use crate::exchange::ply::{ExportFrame, PlyContent, read_ply};
+use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
 use crate::render::cpu::CpuRenderer;
 use crate::scene::columns::Columns;
 use crate::scene::init::{gaussians_from_points, random_points_in_frusta};
@@ -73,7 +73,7 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
                 raw.points = PointCloud::default();
                 gaussians = Some((columns, meta));
             }
-            PlyContent::Points { positions, colors } => raw.points = PointCloud { positions, colors },
+            PlyContent::Points { positions, colors, .. } => raw.points = PointCloud { positions, colors },
         }
     }
     let dataset = load_dataset(raw, &limits::load_options(config))?;
@@ -83,7 +83,7 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
     }
     let columns = match gaussians {
         Some((mut columns, meta)) => {
-            meta.to_local(&mut columns, dataset.frame.origin.to_array(), dataset.frame.scale);
+            to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
             resize_sh(&columns, config.sh_degree)
         }
         None => first_gaussians(scene, &dataset, config)?,
@@ -110,7 +110,9 @@ fn first_gaussians(scene: &Path, dataset: &Dataset, config: &TrainConfig) -> Inp
     }
     let cameras: Vec<_> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
     let count = config.init_points as usize;
-    let (points, colors) = random_points_in_frusta(&cameras, count, dataset.scene_scale, config.seed);
+    // Aerial and object captures both have their subject within a few camera-spreads of the cameras.
+    let (near, far) = (0.1 * dataset.scene_scale, 3.0 * dataset.scene_scale);
+    let (points, colors) = random_points_in_frusta(&cameras, count, near, far, config.seed);
     Ok(gaussians_from_points(&points, &colors, &options))
 }
 
@@ -173,8 +175,8 @@ fn train_into(
     let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop };
     let looped = trainer.run(dataset, &targets, &mut outputs);
     let ply = Trainer::ply_path(out);
-    let frame = trainer.save(dataset, &ply)?;
-    if frame == ExportFrame::Local && config.export_frame == "dataset" {
+    let written = trainer.save(dataset, &ply)?;
+    if written.frame == ExportFrame::Local && config.export_frame == "dataset" {
         eprintln!(
             "warning: the scene lies too far from its origin for f32, so {} holds local positions; \
              its comments give origin and scale",

@@ -252,17 +252,17 @@ impl Trainer {
         evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)
     }
 
-    /// Writes the rows as of now as a PLY; returns the coordinates it holds.
+    /// Writes the rows as of now as a PLY; returns what was written, in which coordinates.
     ///
     /// # Errors
     /// The folder cannot be written.
-    pub fn save(&self, dataset: &Dataset, path: &Path) -> Result<ply::ExportFrame, TrainError> {
+    pub fn save(&self, dataset: &Dataset, path: &Path) -> Result<ply::PlyWritten, TrainError> {
         let columns = evaluate_all(&self.state, &self.adam, self.step);
         let meta = PlyMeta {
-            step: self.step,
-            sh_degree: self.options.sh_degree_at(self.step.saturating_sub(1)),
+            step: Some(u64::from(self.step)),
             origin: dataset.frame.origin.to_array(),
             scale: dataset.frame.scale,
+            scene_radius: f64::from(dataset.scene_scale) * dataset.frame.scale,
             frame: self.options.export_frame,
             ..PlyMeta::default()
         };
