@@ -12,4 +12,5 @@ pub mod rasterize_fwd;
 pub mod scan;
 pub mod sh_bwd;
 pub mod sh_fwd;
+mod ssim_band;
 pub mod stages;
