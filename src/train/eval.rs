@@ -7,7 +7,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
-use crate::dataset::reader::{ReadOptions, read_scene};
+use crate::dataset::read::{ReadOptions, read_scene};
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{PlyContent, read_ply, to_local};
 use crate::optim::deferred::DeferredAdam;

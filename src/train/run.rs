@@ -14,7 +14,7 @@ use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
 use crate::dataset::model::PointCloud;
-use crate::dataset::reader::{ReadOptions, read_scene};
+use crate::dataset::read::{ReadOptions, read_scene};
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
 use crate::render::cpu::CpuRenderer;

@@ -3,7 +3,7 @@
 #![allow(dead_code, clippy::unwrap_used, clippy::expect_used)] // test code: each test file uses a part of it
 
 use glam::{DMat3, DQuat, DVec3};
-use gsscale::dataset::reader::{ReadOptions, read_scene};
+use gsscale::dataset::read::{ReadOptions, read_scene};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
