@@ -17,10 +17,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("render", &["base", "scene", "kernels"]),
     ("exchange", &["base", "scene"]),
     ("config", &["base", "scene", "dataset", "schedule", "kernels", "optim", "densify", "render", "exchange"]),
-    (
-        "train",
-        &["base", "scene", "dataset", "schedule", "kernels", "optim", "densify", "render", "exchange", "config"],
-    ),
+    ("train", &["base", "scene", "dataset", "schedule", "kernels", "optim", "densify", "render", "exchange", "config"]),
 ];
 
 /// Files that may hold `unsafe`, each block with its argument.
@@ -131,7 +128,8 @@ fn functions_stay_readable() {
         let lines: Vec<&str> = text.lines().collect();
         for (start, line) in lines.iter().enumerate() {
             let code = line.trim_start();
-            let is_function = ["fn ", "pub fn ", "pub(crate) fn ", "pub(super) fn "].iter().any(|p| code.starts_with(p));
+            let is_function =
+                ["fn ", "pub fn ", "pub(crate) fn ", "pub(super) fn "].iter().any(|p| code.starts_with(p));
             if !is_function {
                 continue;
             }

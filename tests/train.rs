@@ -10,18 +10,8 @@ use std::path::Path;
 use tempfile::TempDir;
 
 /// Densification rounds, resets and SH raises all happen within 300 steps.
-const BUSY: &[&str] = &[
-    "--steps",
-    "300",
-    "--refine-start",
-    "100",
-    "--refine-every",
-    "50",
-    "--reset-every",
-    "200",
-    "--sh-every",
-    "100",
-];
+const BUSY: &[&str] =
+    &["--steps", "300", "--refine-start", "100", "--refine-every", "50", "--reset-every", "200", "--sh-every", "100"];
 
 fn run(scene: &Path, out: &Path, more: &[&str]) {
     let mut args = vec![text(scene), "--out", text(out), "--quiet"];

@@ -74,7 +74,14 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
         Some(scene) => scene,
         None => demo_scene(&out, &config, args.overwrite, args.quiet)?,
     };
-    run(&RunRequest { scene, out, config, dry_run: args.dry_run, overwrite: args.overwrite || args.demo, quiet: args.quiet })
+    run(&RunRequest {
+        scene,
+        out,
+        config,
+        dry_run: args.dry_run,
+        overwrite: args.overwrite || args.demo,
+        quiet: args.quiet,
+    })
 }
 
 /// What the demo changes: enough steps for a picture worth looking at within minutes on two cores.
@@ -92,10 +99,17 @@ fn demo_config() -> TrainConfig {
 }
 
 /// The generated city beside the results; one of an earlier demo is used again.
-fn demo_scene(out: &std::path::Path, config: &TrainConfig, overwrite: bool, quiet: bool) -> Result<PathBuf, TrainError> {
+fn demo_scene(
+    out: &std::path::Path,
+    config: &TrainConfig,
+    overwrite: bool,
+    quiet: bool,
+) -> Result<PathBuf, TrainError> {
     let scene = out.join("scene");
     if out.join("summary.json").exists() && !overwrite {
-        return Err(InputError::new(out, "exists already", "choose another --out, or replace it with --overwrite").into());
+        return Err(
+            InputError::new(out, "exists already", "choose another --out, or replace it with --overwrite").into()
+        );
     }
     if scene.join("sparse/0/points3D.bin").is_file() {
         return Ok(scene);

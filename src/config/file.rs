@@ -38,8 +38,8 @@ macro_rules! config_keys {
 
 config_keys! {
     "Dataset" {
-        /// Folder of the photos inside the scene
-        images: String = "images".into();
+        /// Folder of the photos inside the scene; empty = where the dataset says (COLMAP: images)
+        images: String = String::new();
         /// Reduce photos by this factor (may be fractional: 3.4175)
         data_factor: f64 = 1.0;
         /// Longest side of a photo in pixels after --data-factor; 0 = no limit

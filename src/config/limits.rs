@@ -5,9 +5,10 @@
 use super::file::TrainConfig;
 use crate::base::simd::SimdPath;
 use crate::dataset::loader::LoadOptions;
-use crate::densify::policy::PolicyConfig;
+use crate::dataset::read::ReadOptions;
+use crate::densify::policy::DensifyConfig;
 use crate::exchange::ply::ExportFrame;
-use crate::optim::deferred::AdamOptions;
+use crate::optim::adam::AdamConfig;
 use crate::optim::rates::Rates;
 use crate::render::metrics::SsimVariant;
 use crate::render::{LossOptions, RenderOptions, SsimPadding};
@@ -34,9 +35,11 @@ pub struct RunOptions {
     /// Learning rates.
     pub rates: Rates,
     /// Adam's constants.
-    pub adam: AdamOptions,
+    pub adam: AdamConfig,
     /// Densification; `None` for `--strategy none`.
-    pub policy: Option<PolicyConfig>,
+    pub densify: Option<DensifyConfig>,
+    /// Scene scale, local units.
+    pub scene_scale: f32,
     /// SSIM that is reported.
     pub ssim_variant: SsimVariant,
     /// Coordinates of PLY files.
@@ -78,8 +81,9 @@ impl RunOptions {
                 sh_n: config.shn_lr,
                 steps: config.steps,
             },
-            adam: AdamOptions { eps: config.adam_eps, ..AdamOptions::default() },
-            policy: (config.strategy == "default").then(|| policy(config, scene_scale)),
+            adam: AdamConfig { eps: config.adam_eps, ..AdamConfig::default() },
+            densify: (config.strategy == "default").then(|| densify(config)),
+            scene_scale,
             ssim_variant: SsimVariant::from_name(&config.ssim_variant).unwrap_or(SsimVariant::Same),
             export_frame: if config.export_frame == "local" { ExportFrame::Local } else { ExportFrame::Dataset },
             eval_every: config.eval_every,
@@ -94,23 +98,32 @@ impl RunOptions {
     }
 }
 
-fn policy(config: &TrainConfig, scene_scale: f32) -> PolicyConfig {
-    PolicyConfig {
+fn densify(config: &TrainConfig) -> DensifyConfig {
+    let never_if_zero = |n: u32| if n == 0 { u32::MAX } else { n };
+    DensifyConfig {
         grow_grad2d: config.grow_grad2d,
-        grow_scale3d: config.grow_scale3d * scene_scale,
+        grow_scale3d: config.grow_scale3d,
         prune_opa: config.prune_opa,
-        prune_scale3d: config.prune_scale3d * scene_scale,
+        prune_scale3d: config.prune_scale3d,
         refine_start: config.refine_start,
         refine_stop: config.refine_stop,
         refine_every: config.refine_every,
-        reset_every: config.reset_every,
-        max_gaussians: config.max_gaussians as usize,
+        reset_every: never_if_zero(config.reset_every),
+        max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
     }
 }
 
 /// The instruction path that a config asks for on this machine.
 pub fn simd_path(config: &TrainConfig) -> SimdPath {
     SimdPath::from_name(&config.simd).unwrap_or_else(SimdPath::best)
+}
+
+/// How the scene is to be read.
+pub fn read_options(config: &TrainConfig) -> ReadOptions {
+    ReadOptions {
+        images: (!config.images.is_empty()).then(|| config.images.clone()),
+        allow_missing: config.allow_missing,
+    }
 }
 
 /// How the dataset is to be loaded.

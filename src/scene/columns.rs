@@ -100,6 +100,11 @@ impl Columns {
         }
     }
 
+    /// Bytes allocated.
+    pub fn bytes(&self) -> usize {
+        Column::ALL.iter().map(|&c| self.column(c).capacity() * 4).sum()
+    }
+
     /// Sets every value to zero.
     pub fn fill_zero(&mut self) {
         for column in Column::ALL {

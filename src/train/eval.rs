@@ -7,7 +7,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
-use crate::dataset::read::{ReadOptions, read_scene};
+use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{PlyContent, read_ply, to_local};
 use crate::optim::deferred::DeferredAdam;
@@ -115,8 +115,7 @@ pub fn evaluate_ply(
         let problem = "holds points, not Gaussians (no property f_dc_0)";
         return Err(InputError::new(ply, problem, "give the point_cloud.ply of a run").into());
     };
-    let options = ReadOptions { images: Some(config.images.clone()), ..ReadOptions::default() };
-    let dataset = load_dataset(read_scene(scene, &options)?, &limits::load_options(config))?;
+    let dataset = load_dataset(read_scene(scene, &limits::read_options(config))?, &limits::load_options(config))?;
     for warning in &dataset.warnings {
         eprintln!("warning: {warning}");
     }
@@ -125,12 +124,11 @@ pub fn evaluate_ply(
     let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
     let gaussians = columns.rows() as u64;
     let state = SceneState::from_columns(columns);
-    let adam = DeferredAdam::new(run.rates.clone(), run.adam);
-    let targets = TargetCache::new(&dataset, config.image_cache.0, rayon::current_num_threads());
+    let adam = DeferredAdam::new(run.rates, run.adam, render.simd);
+    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let views = dataset.test_views();
     let request = EvalRequest { views: &views, ssim: run.ssim_variant, pictures };
-    let test =
-        evaluate((&state, &adam, 0), &mut CpuRenderer::new(), (&dataset, &targets), &render, &request)?;
+    let test = evaluate((&state, &adam, 0), &mut CpuRenderer::new(), (&dataset, &targets), &render, &request)?;
     Ok(EvalReport {
         ply: ply.to_path_buf(),
         scene: scene.to_path_buf(),

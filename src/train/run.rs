@@ -14,7 +14,7 @@ use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
 use crate::dataset::model::PointCloud;
-use crate::dataset::read::{ReadOptions, read_scene};
+use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
 use crate::render::cpu::CpuRenderer;
@@ -61,7 +61,7 @@ pub struct Prepared {
 /// # Errors
 /// Whatever is wrong with the scene or the PLY, by file, place and remedy.
 pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
-    let mut raw = read_scene(scene, &ReadOptions { images: Some(config.images.clone()), ..ReadOptions::default() })?;
+    let mut raw = read_scene(scene, &limits::read_options(config))?;
     let mut gaussians = None;
     let points_file = match (config.init_ply.as_str(), &raw.points_path) {
         ("", path) => path.clone(),
@@ -168,7 +168,7 @@ fn train_into(
     let (config, out) = (&request.config, &request.out);
     write_config(&out.join("config.toml"), config, &resolved(request, dataset, columns.rows()))?;
     let mut metrics = MetricsLog::create(&out.join("metrics.jsonl"))?;
-    let targets = TargetCache::new(dataset, config.image_cache.0, rayon::current_num_threads());
+    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let options = RunOptions::new(config, dataset.scene_scale);
     let mut trainer = Trainer::new(columns, dataset, Box::new(CpuRenderer::new()), options);
     let mut progress = Progress::new(config.steps, request.quiet);

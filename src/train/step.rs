@@ -1,7 +1,7 @@
 //! One training step, top to bottom. Nothing here opens a file.
 
 use super::catch_up::{gather, visible_rows};
-use crate::densify::stats;
+use crate::densify::stats::{GradHistogram, accumulate};
 use crate::optim::deferred::DeferredAdam;
 use crate::render::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
 use crate::scene::camera::Camera;
@@ -22,9 +22,9 @@ pub struct WorkingSet {
 
 impl WorkingSet {
     /// Bytes held.
-    pub fn bytes(&self) -> u64 {
-        let columns = (self.columns.column_floats() + self.gradients.columns.column_floats()) * 4;
-        (self.row_from_working.capacity() * 4 + columns + self.gradients.means2d.capacity() * 16) as u64
+    pub fn bytes(&self) -> usize {
+        let columns = self.columns.bytes() + self.gradients.columns.bytes();
+        self.row_from_working.capacity() * 4 + columns + self.gradients.means2d.capacity() * 16
     }
 }
 
@@ -43,7 +43,8 @@ pub struct StepOutcome {
     pub skipped: bool,
 }
 
-/// Trains on one view at 0-based `step`: cull, gather, forward, loss, backward, optimizer, statistics.
+/// Trains on one view at 0-based `step`: cull, gather, forward, loss, backward, optimizer, and the statistics of
+/// densification while they are collected.
 ///
 /// # Errors
 /// The renderer failed; the state is as it was before the step.
@@ -54,6 +55,7 @@ pub fn train_step(
     adam: &DeferredAdam,
     (step, camera, target): (u32, &Camera, &Target),
     (render, loss): (&RenderOptions, &LossOptions),
+    statistics: Option<&mut GradHistogram>,
 ) -> Result<StepOutcome, RenderError> {
     visible_rows(state, adam, step, camera, &mut working.row_from_working);
     gather(state, adam, step, &working.row_from_working, &mut working.columns);
@@ -65,8 +67,12 @@ pub fn train_step(
         return Ok(outcome);
     }
     let counts = adam.step(state, &working.row_from_working, &working.gradients.columns, step);
-    outcome.updated = counts.updated;
-    outcome.rows_skipped = counts.skipped_non_finite;
-    stats::record(state, &working.row_from_working, &working.gradients, camera);
+    outcome.updated = counts.updated as u64;
+    outcome.rows_skipped = counts.skipped_non_finite as u64;
+    if let Some(histogram) = statistics {
+        let (rows, gradients) = (&working.row_from_working, &working.gradients);
+        let size = [camera.width, camera.height];
+        accumulate(&mut state.view_mut(), rows, &gradients.means2d, &gradients.radii, size, histogram);
+    }
     Ok(outcome)
 }

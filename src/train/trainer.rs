@@ -4,7 +4,7 @@
 //! cadences of logging and evaluation; 2. a step whose loss is not finite changes nothing, and three in a row end
 //! the run with what the last good step left.
 
-use super::catch_up::evaluate_all;
+use super::catch_up::{apply_event, evaluate_all};
 use super::eval::{EvalRequest, evaluate};
 use super::memory::host_bytes_peak;
 use super::progress::Progress;
@@ -15,12 +15,12 @@ use crate::base::error::InputError;
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
-use crate::densify::policy::Policy;
+use crate::densify::stats::GradHistogram;
 use crate::exchange::ply::{self, PlyMeta};
 use crate::optim::deferred::DeferredAdam;
 use crate::render::{RenderError, RenderOptions, Renderer};
 use crate::scene::columns::Columns;
-use crate::scene::events::EventLog;
+use crate::scene::events::{Event, EventLog};
 use crate::scene::state::SceneState;
 use crate::schedule::order::ShuffledOrder;
 use std::path::{Path, PathBuf};
@@ -63,7 +63,7 @@ pub struct Trainer {
     /// The renderer.
     pub renderer: Box<dyn Renderer>,
     options: RunOptions,
-    policy: Option<Policy>,
+    histogram: GradHistogram,
     events: EventLog,
     order: ShuffledOrder,
     train_views: Vec<usize>,
@@ -93,11 +93,11 @@ impl Trainer {
         let train_views = dataset.train_views();
         let mut state = SceneState::from_columns(columns);
         if options.max_gaussians > 0 {
-            state.reserve(options.max_gaussians.saturating_sub(state.rows()));
+            state.reserve_exact(options.max_gaussians.saturating_sub(state.rows()));
         }
         Trainer {
-            adam: DeferredAdam::new(options.rates.clone(), options.adam),
-            policy: options.policy.clone().map(Policy::new),
+            adam: DeferredAdam::new(options.rates, options.adam, options.render.simd),
+            histogram: GradHistogram::default(),
             events: EventLog::default(),
             order: ShuffledOrder::new(options.seed, train_views.len()),
             train_views,
@@ -155,6 +155,7 @@ impl Trainer {
             &self.adam,
             (self.step, &dataset.views[view].camera, &target),
             (&render, &self.options.loss),
+            self.options.densify.is_some_and(|d| d.collects(self.step)).then_some(&mut self.histogram),
         )?;
         self.count(&outcome, &dataset.views[view].name)?;
         self.run_events();
@@ -184,10 +185,16 @@ impl Trainer {
 
     /// Events fire after the update of their step, on values that contain it.
     fn run_events(&mut self) {
-        let Some(policy) = &mut self.policy else { return };
-        for kind in policy.due(self.step, &self.state) {
-            let event = self.events.push(self.step, kind);
-            policy.apply(event, &mut self.state, &self.adam, self.options.seed);
+        let Some(densify) = self.options.densify else { return };
+        let rows = self.state.rows() as u64;
+        let kinds: Vec<_> = densify.events_after(self.step, self.options.scene_scale, rows, &self.histogram).collect();
+        for kind in kinds {
+            let event = Event { step: self.step, kind };
+            let index = self.events.push(event);
+            apply_event(&mut self.state, &self.adam, self.options.seed, index, &event);
+        }
+        if densify.is_round(self.step) {
+            self.histogram.clear();
         }
     }
 
@@ -271,7 +278,7 @@ impl Trainer {
 
     /// Bytes that the trainer itself holds: state and working set.
     pub fn bytes(&self) -> u64 {
-        self.state.bytes() + self.working.bytes()
+        (self.state.bytes() + self.working.bytes()) as u64
     }
 
     /// The path of the final PLY in an output folder.
