@@ -5,6 +5,7 @@
 mod checks;
 pub mod colmap;
 pub mod frame;
+pub mod colmap_write;
 pub mod loader;
 pub mod masks;
 pub mod model;
