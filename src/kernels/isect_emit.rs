@@ -186,7 +186,7 @@ mod tests {
         count(&splats, grid, &mut counts, &mut tile_counts);
         let total = scan(&counts, &mut offsets);
         isect_offsets(&tile_counts, grid.tiles(), &mut tile_offsets, &mut cursors);
-        assert_eq!(*tile_offsets.last().unwrap(), total);
+        assert_eq!(tile_offsets[grid.tiles()], total);
         emit(&splats, grid, total, &mut cursors, &mut isects);
         let mut tiles_of = vec![Vec::new(); splats.len()];
         for tile in 0..grid.tiles() {

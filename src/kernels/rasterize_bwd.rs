@@ -281,3 +281,41 @@ pub fn fold_rows(
             *v_opacity = h / projected.opacities[row];
         });
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::rng::{Purpose, Stream};
+    use crate::base::simd::SimdPath;
+    use crate::kernels::rasterize_fwd::{rasterize_fwd, tests::scene};
+
+    fn sums(lists: &Lists<'_>, offsets: &[u64]) -> Vec<f32> {
+        let pixels = (lists.grid.width * lists.grid.height) as usize;
+        let mut draws = Stream::new(22, Purpose::Test, 0, 0);
+        let v_rgb: Vec<f32> = (0..3 * pixels).map(|_| draws.normal() as f32).collect();
+        let v_alpha: Vec<f32> = (0..pixels).map(|_| draws.normal() as f32).collect();
+        let mut raster = Raster::default();
+        rasterize_fwd(lists, &mut raster);
+        let mut partials = Vec::new();
+        let upstream = Upstream { v_rgb: &v_rgb, v_alpha: Some(&v_alpha) };
+        rasterize_bwd(lists, offsets, &raster, &upstream, &mut partials);
+        partials.iter().flatten().map(|x| f32::from_bits(x.load(Relaxed))).collect()
+    }
+
+    #[test]
+    fn rows_that_are_skipped_add_nothing() {
+        for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+            for (n, needles) in [(60, false), (2000, false), (300, true)] {
+                let mut scene = scene(n, needles);
+                let fast = sums(&scene.lists(simd), &scene.offsets);
+                for bits in &mut scene.isects {
+                    let isect = Isect::unpack(bits.load(Relaxed));
+                    *bits.get_mut() = Isect { rows: [0, 15], ..isect }.pack();
+                }
+                // == and not bits: a sum of nothing is 0.0, a sum of zeros may be -0.0.
+                assert!(fast == sums(&scene.lists(simd), &scene.offsets), "{simd:?} {n}");
+                assert!(fast.iter().any(|x| *x != 0.0) && fast.iter().all(|x| x.is_finite()));
+            }
+        }
+    }
+}
