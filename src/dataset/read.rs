@@ -8,8 +8,8 @@ use std::path::Path;
 /// What the user says about where things are.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ReadOptions {
-    /// Image folder, relative to the scene. COLMAP: `images` when `None`. transforms.json: the folder of the JSON
-    /// when `None`; otherwise each `file_path`, with or without its first folder, is looked for in it.
+    /// Image folder, relative to the scene; `None` is `images`. transforms.json names its photos with their folder:
+    /// there, `images` is only a second place to look, and any other folder replaces the one in the name.
     pub images: Option<String>,
     /// A photo that is needed now (its size is not in the JSON) and is missing: leave the view out with a warning
     /// instead of failing. Photos whose size is known are the loader's to miss.

@@ -182,6 +182,14 @@ fn photos_are_found_in_another_image_folder() {
     assert_eq!(views[0].image_path, folder.path().join("images_2/a.png"));
     assert_eq!((views[0].name.as_str(), views[0].intrinsics.width), ("images/a.png", 40));
     assert_eq!((views[1].name.as_str(), views[1].intrinsics.width), ("images/b.png", 20));
+    // The usual folder does not change names that already say where the photo is.
+    png(&folder.path().join("r/c.png"), 16, 12);
+    png(&folder.path().join("images/d.png"), 8, 6);
+    write(folder.path(), "transforms.json", json!({"camera_angle_x": 0.5}), vec![frame("r/c"), frame("d")]);
+    let options = ReadOptions { images: Some("images".into()), ..ReadOptions::default() };
+    let views = read_transforms(folder.path(), &options).unwrap().views;
+    let found: Vec<_> = views.iter().map(|v| (v.name.as_str(), v.intrinsics.width)).collect();
+    assert_eq!(found, [("d.png", 8), ("r/c.png", 16)]);
 }
 
 #[test]

@@ -16,19 +16,26 @@ pub(super) struct Photo {
     pub exists: bool,
 }
 
-/// Looks for the photo that `stated` names, in `folder`, or in `folder/<images>` with and without the first folder of
-/// the name. Not found: the name as stated, with `.png` when it has no ending. Refused names come back as text.
-pub(super) fn find_photo(folder: &Path, images: Option<&str>, stated: &str) -> Result<Photo, String> {
-    let name = clean_name(stated)?;
-    let places = match images {
-        None => vec![folder.join(&name)],
+/// Where the photo that `stated` names may be: in `folder`, and in `folder/images` too when that folder is asked for,
+/// since it is what programs ask for by default; any other image folder is meant instead, with and without the first
+/// folder of the name.
+fn places(folder: &Path, images: Option<&str>, name: &str) -> Vec<PathBuf> {
+    match images {
+        None => vec![folder.join(name)],
+        Some("images") => vec![folder.join(name), folder.join("images").join(name)],
         Some(images) => {
             let root = folder.join(images);
-            let mut places = vec![root.join(&name)];
-            places.extend(name.split_once('/').map(|(_, rest)| root.join(rest)));
-            places
+            let rest = name.split_once('/').map(|(_, rest)| root.join(rest));
+            [Some(root.join(name)), rest].into_iter().flatten().collect()
         }
-    };
+    }
+}
+
+/// Looks for the photo that `stated` names. Not found: the first place, with `.png` when the name has no ending.
+/// Refused names come back as text.
+pub(super) fn find_photo(folder: &Path, images: Option<&str>, stated: &str) -> Result<Photo, String> {
+    let name = clean_name(stated)?;
+    let places = places(folder, images, &name);
     for place in &places {
         for ending in ENDINGS {
             let path = with_ending(place, ending);
@@ -38,7 +45,7 @@ pub(super) fn find_photo(folder: &Path, images: Option<&str>, stated: &str) -> R
         }
     }
     let ending = if Path::new(&name).extension().is_some() { "" } else { ".png" };
-    let path = with_ending(&places[places.len() - 1], ending);
+    let path = with_ending(&places[0], ending);
     Ok(Photo { name: name + ending, path, exists: false })
 }
 
