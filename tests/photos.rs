@@ -66,7 +66,7 @@ fn noise_scene(count: usize) -> (TempDir, RawScene) {
             raw_view(folder.path(), &name, i, count, pinhole(SIZE.0, SIZE.1))
         })
         .collect();
-    (folder, RawScene { views, points: some_points(), warnings: Vec::new() })
+    (folder, RawScene { views, points: some_points(), ..RawScene::default() })
 }
 
 fn load(raw: &RawScene) -> Dataset {
@@ -480,7 +480,7 @@ fn real_photos(name: &str) -> Option<RawScene> {
     let count = names.len();
     let views: Vec<RawView> =
         names.iter().enumerate().map(|(i, n)| raw_view(&folder, n, i, count, pinhole(1200, 674))).collect();
-    Some(RawScene { views, points: some_points(), warnings: Vec::new() })
+    Some(RawScene { views, points: some_points(), ..RawScene::default() })
 }
 
 #[test]
@@ -512,7 +512,7 @@ fn empty_and_cut_jpegs_are_refused_at_load() {
     for (view, from) in views.iter().zip(&source.views) {
         std::fs::copy(&from.image_path, &view.image_path).unwrap();
     }
-    let raw = RawScene { views, points: some_points(), warnings: Vec::new() };
+    let raw = RawScene { views, points: some_points(), ..RawScene::default() };
     let whole = std::fs::read(&raw.views[1].image_path).unwrap();
     for keep in [0, 1, 2, 20, 1000, whole.len() / 2, whole.len() - 2, whole.len() - 1] {
         std::fs::write(&raw.views[1].image_path, &whole[..keep]).unwrap();

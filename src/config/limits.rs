@@ -12,7 +12,6 @@ use crate::optim::adam::AdamConfig;
 use crate::optim::rates::Rates;
 use crate::render::metrics::SsimVariant;
 use crate::render::{LossOptions, RenderOptions, SsimPadding};
-use crate::scene::columns::row_width;
 use crate::scene::init::InitOptions;
 
 /// Everything that the training loop needs, resolved.
@@ -151,33 +150,4 @@ pub fn init_options(config: &TrainConfig) -> InitOptions {
         max_gaussians: (config.max_gaussians > 0).then_some(config.max_gaussians as usize),
         ..InitOptions::default()
     }
-}
-
-/// What a run is expected to hold in memory at its peak, by part, bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct MemoryEstimate {
-    /// Program, libraries, stacks.
-    pub base: u64,
-    /// Values, moments, stamps, identities and statistics of all Gaussians.
-    pub state: u64,
-    /// Rows of one view, their gradients and the stages' intermediates.
-    pub view: u64,
-    /// Images and the loss's intermediates.
-    pub images: u64,
-    /// Decoded photos.
-    pub targets: u64,
-    /// The evaluated copy that a PLY is written from.
-    pub export: u64,
-}
-
-impl MemoryEstimate {
-    /// All parts.
-    pub fn total(&self) -> u64 {
-        self.base + self.state + self.view.max(self.export) + self.images + self.targets
-    }
-}
-
-/// Bytes of one Gaussian's state: value and two moments per float, stamp, uid, statistics.
-pub fn state_row_bytes(sh_degree: u8) -> u64 {
-    row_width(sh_degree) as u64 * 12 + 4 + 8 + 8
 }

@@ -102,7 +102,8 @@ impl Columns {
 
     /// Bytes allocated.
     pub fn bytes(&self) -> usize {
-        Column::ALL.iter().map(|&c| self.column(c).capacity() * 4).sum()
+        let floats = self.means.capacity() + self.quats.capacity() + self.scales.capacity();
+        4 * (floats + self.opacities.capacity() + self.sh0.capacity() + self.sh_n.capacity())
     }
 
     /// Sets every value to zero.

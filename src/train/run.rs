@@ -3,7 +3,7 @@
 //! Invariants: 1. the output folder is made only after the dataset was understood, so bad input leaves nothing
 //! behind; 2. a run that is stopped or fails after its first step still writes the PLY of its last good step.
 
-use super::memory::host_bytes_peak;
+use super::memory::{estimate, host_bytes_peak};
 use super::progress::Progress;
 use super::report::{MetricsLog, Resolved, Summary, write_config, write_summary};
 use super::signals::StopFlag;
@@ -150,7 +150,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     for warning in &dataset.warnings {
         eprintln!("warning: {warning}");
     }
-    say(&describe(request, &dataset, &columns));
+    say(&describe(request, &dataset, &columns)?);
     if request.dry_run {
         return Ok(RunOutcome { summary: None, exit_code: 0 });
     }
@@ -274,9 +274,9 @@ fn resolved(request: &RunRequest, dataset: &Dataset, rows: usize) -> Resolved {
 }
 
 /// What was understood and what it will take, for people.
-fn describe(request: &RunRequest, dataset: &Dataset, columns: &Columns) -> String {
+fn describe(request: &RunRequest, dataset: &Dataset, columns: &Columns) -> Result<String, TrainError> {
     let config = &request.config;
-    let memory = limits::estimate(config, dataset, columns.rows());
+    let memory = estimate(config, dataset, columns)?;
     let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
     let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
     let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
@@ -285,11 +285,11 @@ fn describe(request: &RunRequest, dataset: &Dataset, columns: &Columns) -> Strin
         (_, 0) => String::from(" (densification without a cap: memory grows with them; see --max-gaussians)"),
         (_, cap) => format!(" growing to at most {cap}"),
     };
-    format!(
+    let text = format!(
         "scene   {}: {} views to train on, {} held out, at most {size}\n\
          start   {} Gaussians, SH degree {}{growth}\n\
          run     {} steps on {} threads ({}), results in {}\n\
-         memory  about {} at the peak\n{}{}{}{}{}{}",
+         memory  about {} at the peak\n{}{}{}{}{}",
         request.scene.display(),
         dataset.train_views().len(),
         dataset.test_views().len(),
@@ -301,12 +301,10 @@ fn describe(request: &RunRequest, dataset: &Dataset, columns: &Columns) -> Strin
         request.out.display(),
         format_bytes(memory.total()),
         part("Gaussians with their optimizer state", memory.state),
-        part("rows of one view and their gradients", memory.view),
-        part("images and loss", memory.images),
+        part("one view: rows, gradients, images", memory.view),
         part("decoded photos (--image-cache)", memory.targets),
         part("copy for export", memory.export),
         part("program", memory.base),
-    )
-    .trim_end()
-    .to_string()
+    );
+    Ok(text.trim_end().to_string())
 }
