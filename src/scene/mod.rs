@@ -5,4 +5,5 @@ pub mod columns;
 pub mod events;
 pub mod image;
 pub mod init;
+pub mod rows;
 pub mod state;
