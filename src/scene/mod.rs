@@ -6,4 +6,5 @@ pub mod events;
 pub mod image;
 pub mod init;
 pub mod neighbours;
+pub mod rows;
 pub mod state;
