@@ -1,1 +1,298 @@
-//! (being written)
+//! The training loss of one picture and its gradient: (1 - lambda) L1 + lambda (1 - SSIM).
+//! Cuts the picture into bands of rows and adds up what `ssim_band` finds in them; knows no files and no renderer.
+//!
+//! Masks: a pixel with mask byte 0 is left out of the means of L1 and squared differences and has gradient 0. For SSIM
+//! the picture is replaced by the reference there before filtering, so it adds no difference to its neighbours' windows,
+//! and the map is averaged over the pixels that count only. Nothing counts (all masked, or no pixels): loss and gradient
+//! are 0, SSIM is 1.
+//!
+//! `SsimVariant::Valid` on a picture with a side under 11 pixels would have no window at all: it falls back to `Same`.
+//!
+//! Invariants: 1. bands depend on the height alone and their f64 sums are added in order, so the bits are the same for any
+//! number of threads; 2. nothing is allocated by a call whose picture is no larger than earlier ones; 3. a picture with
+//! NaN or infinity at a pixel that counts gives a loss that is not finite, and never a panic.
+
+use super::ssim_band::{BandKernel, BandSums, GradientBand, WINDOW, domain};
+use crate::base::simd::{SimdPath, dispatch};
+use crate::scene::image::{Image, Target};
+use rayon::prelude::*;
+use std::fmt;
+use std::ops::Range;
+use std::str::FromStr;
+
+/// Rows of a band at most: few enough for every core to get one, many enough that the ten rows read twice cost little.
+const BAND_ROWS: usize = 64;
+
+/// Which pixels the SSIM map of the loss covers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SsimPadding {
+    /// Only windows that lie inside the image (the default of the loss).
+    Valid,
+    /// Every pixel, zeros outside (the 3DGS code).
+    Same,
+}
+
+/// Which SSIM is meant; published figures use all three, and they differ in the third digit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum SsimVariant {
+    /// Mean over every pixel, zeros outside the picture: the 3DGS code.
+    #[default]
+    Same,
+    /// Mean over the windows that lie inside the picture: scikit-image, pytorch-msssim.
+    Valid,
+    /// Mean over every pixel, the picture mirrored at its borders: torchmetrics.
+    Reflect,
+}
+
+impl SsimVariant {
+    /// All variants, the default first.
+    pub const ALL: [SsimVariant; 3] = [SsimVariant::Same, SsimVariant::Valid, SsimVariant::Reflect];
+
+    /// The name on the command line, in config files and in reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            SsimVariant::Same => "same",
+            SsimVariant::Valid => "valid",
+            SsimVariant::Reflect => "reflect",
+        }
+    }
+
+    /// The variant with this name.
+    pub fn from_name(name: &str) -> Option<SsimVariant> {
+        SsimVariant::ALL.into_iter().find(|v| v.name() == name)
+    }
+}
+
+impl fmt::Display for SsimVariant {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for SsimVariant {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        SsimVariant::from_name(name)
+            .ok_or_else(|| format!("'{name}' is not an SSIM variant; use same, valid or reflect"))
+    }
+}
+
+impl From<SsimPadding> for SsimVariant {
+    fn from(padding: SsimPadding) -> Self {
+        match padding {
+            SsimPadding::Valid => SsimVariant::Valid,
+            SsimPadding::Same => SsimVariant::Same,
+        }
+    }
+}
+
+/// What the loss weighs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LossOptions {
+    /// Weight of 1 - SSIM; L1 has the rest.
+    pub ssim_lambda: f32,
+    /// Pixels that the SSIM map covers.
+    pub padding: SsimPadding,
+    /// Instruction path of the CPU kernels.
+    pub simd: SimdPath,
+}
+
+/// Loss of one image and its parts.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct LossValue {
+    /// (1 - lambda) l1 + lambda (1 - ssim).
+    pub loss: f64,
+    /// Mean absolute difference.
+    pub l1: f64,
+    /// Mean of the SSIM map.
+    pub ssim: f64,
+    /// Mean squared difference of the unclamped image.
+    pub mse: f64,
+}
+
+/// Pixels that a picture is compared with.
+#[derive(Debug, Clone, Copy)]
+pub enum Reference<'a> {
+    /// Interleaved `[height][width][3]`, a byte meaning byte / 255.
+    Bytes(&'a [u8]),
+    /// Planar `[3][height][width]`.
+    Planar(&'a [f32]),
+}
+
+/// Two pictures of one size on plain slices.
+#[derive(Debug, Clone, Copy)]
+pub struct ImagePair<'a> {
+    /// Width, pixels.
+    pub width: usize,
+    /// Height, pixels.
+    pub height: usize,
+    /// The picture that is judged, planar `[3][height][width]`.
+    pub rgb: &'a [f32],
+    /// What it should look like.
+    pub reference: Reference<'a>,
+    /// One byte per pixel, 0 = left out; `None`: every pixel counts.
+    pub mask: Option<&'a [u8]>,
+    /// Compare the values cut to 0..1, as metrics do. No gradient knows of it: keep it `false` for the loss.
+    pub clamp: bool,
+}
+
+impl<'a> ImagePair<'a> {
+    /// A picture and the photo it is compared with.
+    pub fn new(image: &'a Image, target: &'a Target) -> Self {
+        assert_eq!((image.width, image.height), (target.width, target.height), "picture and target differ in size");
+        ImagePair {
+            width: image.width as usize,
+            height: image.height as usize,
+            rgb: &image.rgb,
+            reference: Reference::Bytes(&target.rgb),
+            mask: target.mask.as_deref(),
+            clamp: false,
+        }
+    }
+
+    /// Pixels in the picture.
+    pub fn pixels(&self) -> usize {
+        self.width * self.height
+    }
+
+    /// Pixels that count, in a part of the picture.
+    fn counted(&self, rows: Range<usize>, columns: Range<usize>) -> usize {
+        let Some(mask) = self.mask else { return rows.len() * columns.len() };
+        rows.map(|row| {
+            let line = &mask[row * self.width..][columns.clone()];
+            line.iter().filter(|&&byte| byte != 0).count()
+        })
+        .sum()
+    }
+
+    /// Pixels of the picture that count.
+    pub fn counted_pixels(&self) -> usize {
+        self.counted(0..self.height, 0..self.width)
+    }
+
+    /// Pixels of the SSIM map that count.
+    fn counted_windows(&self, variant: SsimVariant) -> usize {
+        self.counted(domain(variant, self.height), domain(variant, self.width))
+    }
+
+    /// The variant that can be computed at this size.
+    fn possible(&self, variant: SsimVariant) -> SsimVariant {
+        let small = self.width.min(self.height) < WINDOW;
+        if small && variant == SsimVariant::Valid { SsimVariant::Same } else { variant }
+    }
+
+    fn check(&self) {
+        let n = self.pixels();
+        let reference = match self.reference {
+            Reference::Bytes(bytes) => bytes.len(),
+            Reference::Planar(values) => values.len(),
+        };
+        assert!(self.rgb.len() == 3 * n && reference == 3 * n, "a picture's length does not fit its size");
+        assert!(self.mask.is_none_or(|mask| mask.len() == n), "the mask's length does not fit the picture");
+    }
+}
+
+/// Computes losses; keeps the sums of bands between calls so that nothing is allocated once it is warm.
+#[derive(Debug, Default)]
+pub struct ImageLoss {
+    sums: Vec<BandSums>,
+}
+
+impl ImageLoss {
+    /// One for any size of picture.
+    pub fn new() -> Self {
+        ImageLoss::default()
+    }
+
+    /// Loss of `image` against `target`, and its derivative with respect to every value of the image into `v_rgb`
+    /// (planar `[3][height][width]`, resized; sign(0) = 0 in the L1 part).
+    ///
+    /// # Panics
+    /// When sizes disagree.
+    pub fn value_and_gradient(
+        &mut self,
+        image: &Image,
+        target: &Target,
+        options: &LossOptions,
+        v_rgb: &mut Vec<f32>,
+    ) -> LossValue {
+        self.pair_value_and_gradient(&ImagePair::new(image, target), options, v_rgb)
+    }
+
+    /// The same on plain slices; the reference need not be 8-bit.
+    ///
+    /// # Panics
+    /// When lengths disagree with the size.
+    pub fn pair_value_and_gradient(
+        &mut self,
+        pair: &ImagePair,
+        options: &LossOptions,
+        v_rgb: &mut Vec<f32>,
+    ) -> LossValue {
+        pair.check();
+        let variant = pair.possible(options.padding.into());
+        let lambda = f64::from(options.ssim_lambda);
+        let samples = 3.0 * pair.counted_pixels() as f64;
+        let windows = 3.0 * pair.counted_windows(variant) as f64;
+        let n = pair.pixels();
+        v_rgb.resize(3 * n, 0.0);
+        if samples == 0.0 {
+            v_rgb.fill(0.0);
+            return LossValue { ssim: 1.0, ..LossValue::default() };
+        }
+        let l1_weight = ((1.0 - lambda) / samples) as f32;
+        // Every window is masked but some pixel at the border counts: L1 alone is left.
+        let ssim_weight = if windows > 0.0 { (-lambda / windows) as f32 } else { 0.0 };
+        let bands = pair.height.div_ceil(BAND_ROWS);
+        self.sums.resize(3 * bands, BandSums::default());
+        let planes = v_rgb.par_chunks_mut(n).zip(self.sums.par_chunks_mut(bands)).enumerate();
+        planes.for_each(|(channel, (v_plane, sums))| {
+            let parts = v_plane.par_chunks_mut(BAND_ROWS * pair.width).zip(sums).enumerate();
+            parts.for_each(|(band, (v_plane, sum))| {
+                let gradient = Some(GradientBand { v_plane, l1_weight, ssim_weight });
+                let rows = band_rows(band, pair.height);
+                *sum = dispatch(options.simd, BandKernel { pair, variant, channel, rows, gradient });
+            });
+        });
+        let total = add_up(&self.sums);
+        let l1 = total.l1 / samples;
+        let ssim = if windows > 0.0 { total.ssim / windows } else { 1.0 };
+        LossValue { loss: (1.0 - lambda) * l1 + lambda * (1.0 - ssim), l1, ssim, mse: total.squares / samples }
+    }
+}
+
+/// Mean of the SSIM map over pixels and channels; NaN when no pixel of the map counts.
+///
+/// # Panics
+/// When lengths disagree with the size.
+pub fn mean_ssim(pair: &ImagePair, variant: SsimVariant, simd: SimdPath) -> f64 {
+    pair.check();
+    let variant = pair.possible(variant);
+    let windows = 3.0 * pair.counted_windows(variant) as f64;
+    if windows == 0.0 {
+        return f64::NAN;
+    }
+    let bands = pair.height.div_ceil(BAND_ROWS);
+    let sums: Vec<BandSums> = (0..3 * bands)
+        .into_par_iter()
+        .map(|i| {
+            let rows = band_rows(i % bands, pair.height);
+            dispatch(simd, BandKernel { pair, variant, channel: i / bands, rows, gradient: None })
+        })
+        .collect();
+    add_up(&sums).ssim / windows
+}
+
+fn band_rows(band: usize, height: usize) -> Range<usize> {
+    band * BAND_ROWS..((band + 1) * BAND_ROWS).min(height)
+}
+
+/// Sums in the order of channels and bands.
+fn add_up(bands: &[BandSums]) -> BandSums {
+    bands.iter().fold(BandSums::default(), |total, band| BandSums {
+        l1: total.l1 + band.l1,
+        squares: total.squares + band.squares,
+        ssim: total.ssim + band.ssim,
+    })
+}

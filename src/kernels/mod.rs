@@ -14,4 +14,5 @@ pub mod scan;
 pub mod sh_bwd;
 pub mod sh_fwd;
 pub mod splats;
+mod ssim_band;
 pub mod stages;

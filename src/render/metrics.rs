@@ -1,1 +1,138 @@
-//! (being written)
+//! Image metrics for reports: PSNR and SSIM of a rendered picture against its photo.
+//! What the loss needs is in `kernels::image_loss`; here values are cut to 0..1 first, and no gradient is made.
+//!
+//! Invariants: 1. pictures are clamped but not rounded to 8 bits; 2. pixels with mask byte 0 are left out; 3. the bits are
+//! the same for any number of threads; 4. a picture with NaN at a pixel that counts gives NaN, never a number.
+
+use crate::base::simd::SimdPath;
+pub use crate::kernels::image_loss::SsimVariant;
+use crate::kernels::image_loss::{ImagePair, mean_ssim};
+use crate::scene::image::{Image, Target};
+use rayon::prelude::*;
+
+/// Mean squared difference over pixels that count and channels, values cut to 0..1; NaN when no pixel counts.
+///
+/// # Panics
+/// When picture and target differ in size.
+pub fn mse(image: &Image, target: &Target) -> f64 {
+    let counted = ImagePair::new(image, target).counted_pixels();
+    let (width, pixels) = (image.width as usize, image.pixels());
+    let rows: Vec<f64> = (0..image.height as usize)
+        .into_par_iter()
+        .map(|row| {
+            let mut sum = 0.0;
+            for i in row * width..(row + 1) * width {
+                if target.mask.as_ref().is_some_and(|mask| mask[i] == 0) {
+                    continue;
+                }
+                for c in 0..3 {
+                    let x = f64::from(image.rgb[c * pixels + i].clamp(0.0, 1.0));
+                    let difference = x - f64::from(target.rgb[3 * i + c]) / 255.0;
+                    sum += difference * difference;
+                }
+            }
+            sum
+        })
+        .collect();
+    rows.iter().sum::<f64>() / (3.0 * counted as f64)
+}
+
+/// Peak signal-to-noise ratio, dB: -10 log10 of [`mse`], the peak being 1. A picture without any difference gives
+/// `f64::INFINITY`, which JSON cannot write, so whoever reports it decides what to print; NaN when no pixel counts.
+///
+/// # Panics
+/// When picture and target differ in size.
+pub fn psnr(image: &Image, target: &Target) -> f64 {
+    let mse = mse(image, target);
+    if mse == 0.0 { f64::INFINITY } else { -10.0 * libm::log10(mse) }
+}
+
+/// Mean structural similarity over pixels and channels (11x11 Gaussian window, sigma 1.5), values cut to 0..1.
+/// Masked pixels take the photo's value before filtering and are left out of the mean; NaN when no pixel counts.
+/// [`SsimVariant::Valid`] falls back to `Same` when a side is under 11 pixels.
+///
+/// # Panics
+/// When picture and target differ in size.
+pub fn ssim(image: &Image, target: &Target, variant: SsimVariant) -> f64 {
+    let pair = ImagePair { clamp: true, ..ImagePair::new(image, target) };
+    mean_ssim(&pair, variant, SimdPath::best())
+}
+
+/// Mean over views: every view weighs the same, whatever its size (the field's convention, also for PSNR, which is
+/// averaged in dB). NaN for no views; NaN or infinity in a view stays visible in the mean.
+pub fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn gradient_pair(width: u32, height: u32) -> (Image, Target) {
+        let n = (width * height) as usize;
+        let rgb: Vec<u8> = (0..3 * n).map(|i| (i * 37 % 256) as u8).collect();
+        let target = Target { width, height, rgb, mask: None };
+        let mut image = Image::new(width, height);
+        for i in 0..n {
+            for c in 0..3 {
+                image.rgb[c * n + i] = f32::from(target.rgb[3 * i + c]) / 255.0;
+            }
+        }
+        (image, target)
+    }
+
+    #[test]
+    fn names_round_trip() {
+        for variant in SsimVariant::ALL {
+            assert_eq!(variant.to_string().parse(), Ok(variant));
+        }
+        assert!("full".parse::<SsimVariant>().is_err());
+    }
+
+    #[test]
+    fn a_perfect_picture_is_infinitely_good() {
+        let (image, target) = gradient_pair(23, 14);
+        // One f32 rounding of byte / 255 per value is all that differs: at most 2^-25 each, so above 144 dB.
+        assert!(psnr(&image, &target) > 144.0);
+        for variant in SsimVariant::ALL {
+            // f32 rounding of windowed sums, relative to C2 = 9e-4.
+            assert!((ssim(&image, &target, variant) - 1.0).abs() < 1e-5);
+        }
+        let white = Target { width: 4, height: 3, rgb: vec![255; 36], mask: None };
+        let mut bright = Image::new(4, 3);
+        bright.rgb.fill(7.5);
+        assert_eq!(psnr(&bright, &white), f64::INFINITY, "clamped to white");
+    }
+
+    #[test]
+    fn a_uniform_offset_has_the_psnr_of_its_square() {
+        let target = Target { width: 12, height: 11, rgb: vec![51; 3 * 132], mask: None };
+        let mut image = Image::new(12, 11);
+        image.rgb.fill(0.3);
+        // 0.3 is rounded to f32 (3e-8 relative to the difference 0.1, 3e-6 dB).
+        assert!((psnr(&image, &target) - 20.0).abs() < 1e-5);
+    }
+
+    #[test]
+    fn masked_pixels_do_not_matter_and_nan_shows() {
+        let (mut image, mut target) = gradient_pair(23, 14);
+        image.rgb[40] = 0.9;
+        let mut mask = vec![255u8; 23 * 14];
+        mask[100] = 0;
+        target.mask = Some(mask);
+        let before = (psnr(&image, &target), SsimVariant::ALL.map(|v| ssim(&image, &target, v)));
+        image.rgb[100] = f32::NAN;
+        assert_eq!(before, (psnr(&image, &target), SsimVariant::ALL.map(|v| ssim(&image, &target, v))));
+        image.rgb[101] = f32::NAN;
+        assert!(psnr(&image, &target).is_nan());
+        assert!(SsimVariant::ALL.iter().all(|&v| ssim(&image, &target, v).is_nan()));
+        target.mask = Some(vec![0; 23 * 14]);
+        assert!(psnr(&image, &target).is_nan() && ssim(&image, &target, SsimVariant::Same).is_nan());
+    }
+
+    #[test]
+    fn the_mean_weighs_views_alike() {
+        assert_eq!(mean(&[20.0, 30.0]), 25.0);
+        assert!(mean(&[]).is_nan());
+    }
+}

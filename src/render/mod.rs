@@ -4,6 +4,7 @@ pub mod cpu;
 pub mod metrics;
 
 use crate::base::simd::SimdPath;
+pub use crate::kernels::image_loss::{LossOptions, LossValue, SsimPadding};
 
 /// What a rendering depends on besides rows and camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,39 +25,6 @@ impl Default for RenderOptions {
     fn default() -> Self {
         RenderOptions { sh_degree: 3, max_alpha: 0.99, eps2d: 0.3, background: [0.0; 3], simd: SimdPath::best() }
     }
-}
-
-/// Which pixels the SSIM map covers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SsimPadding {
-    /// Only windows that lie inside the image (the default of the loss).
-    Valid,
-    /// Every pixel, zeros outside (the 3DGS code).
-    Same,
-}
-
-/// What the loss weighs.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LossOptions {
-    /// Weight of 1 - SSIM; L1 has the rest.
-    pub ssim_lambda: f32,
-    /// Pixels that the SSIM map covers.
-    pub padding: SsimPadding,
-    /// Instruction path of the CPU kernels.
-    pub simd: SimdPath,
-}
-
-/// Loss of one image and its parts.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct LossValue {
-    /// (1 - lambda) l1 + lambda (1 - ssim).
-    pub loss: f64,
-    /// Mean absolute difference.
-    pub l1: f64,
-    /// Mean of the SSIM map.
-    pub ssim: f64,
-    /// Mean squared difference of the unclamped image.
-    pub mse: f64,
 }
 
 /// Gradients of one view, one entry per row of the working set.

@@ -1,0 +1,407 @@
+//! The arithmetic of the image loss on one band of rows of one channel: windowed sums, SSIM map, its derivative, L1.
+//! What to average, what to weigh and which bands there are is decided by `image_loss`.
+//!
+//! A band is walked in tiles of at most [`TILE`] columns, each row by row from top to bottom: an input row enters a ring
+//! of eleven, the map row five above it becomes computable, and the gradient row ten above it. Only these rings are
+//! kept (about 100 KB on the stack), so memory does not grow with the picture and stays in the second-level cache.
+//!
+//! SSIM (Wang, Bovik, Sheikh and Simoncelli 2004) with means m, over an 11x11 Gaussian window of sigma 1.5:
+//! S = (2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sxx + syy + C2)). Only the sum sxx + syy occurs, so four windowed
+//! maps are enough: x, y, x^2 + y^2, x y. The derivative goes back through the same symmetric window, with three maps:
+//! dS/dx = W * dS/dmx + 2 x (W * dS/dE[xx]) + y (W * dS/dE[xy]).
+//!
+//! Invariants: 1. each value of a pixel comes from the same operations in the same order wherever the band or tile
+//! borders lie; 2. each pixel is counted once in the sums, by the band and tile that own it; 3. where the mask is 0 the
+//! picture is replaced by the reference, the map has weight 0 and the gradient is exactly 0.
+
+use super::image_loss::{ImagePair, Reference, SsimVariant};
+use crate::base::simd::{Kernel, LANES, fma};
+use std::array::from_fn;
+use std::ops::Range;
+
+/// Pixels on a side of the SSIM window.
+pub(super) const WINDOW: usize = 11;
+/// Pixels on each side of the window's centre.
+pub(super) const RADIUS: usize = 5;
+/// Columns of one tile: with the map's margin of 5 on both sides, 16 vectors.
+const TILE: usize = 16 * LANES - 2 * RADIUS;
+/// Columns (and rows) of input that a gradient needs on each side.
+const HALO: usize = 2 * RADIUS;
+/// Floats in one row of scratch: 16 vectors of map and one more to read the window's right half from.
+const STRIDE: usize = 17 * LANES;
+
+/// (0.01 L)^2 and (0.03 L)^2 for the value range L = 1.
+const C1: f32 = 1e-4;
+const C2: f32 = 9e-4;
+
+/// exp(-k^2 / 4.5) for k = -5..=5, divided by its sum.
+const TAPS: [f32; WINDOW] = [
+    1.028_380_1e-3,
+    7.598_758e-3,
+    3.600_077_3e-2,
+    1.093_606_9e-1,
+    2.130_055_4e-1,
+    2.660_117_2e-1,
+    2.130_055_4e-1,
+    1.093_606_9e-1,
+    3.600_077_3e-2,
+    7.598_758e-3,
+    1.028_380_1e-3,
+];
+
+type Lane = [f32; LANES];
+type Row = [f32; STRIDE];
+
+/// Sums over the pixels of one band that count.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct BandSums {
+    /// Sum of absolute differences; 0 without a gradient.
+    pub l1: f64,
+    /// Sum of squared differences; 0 without a gradient.
+    pub squares: f64,
+    /// Sum of the SSIM map.
+    pub ssim: f64,
+}
+
+/// Where the gradient of a band goes, and what the derivatives of the sums are multiplied with.
+pub(super) struct GradientBand<'a> {
+    /// The band's rows of the channel's plane.
+    pub v_plane: &'a mut [f32],
+    /// Derivative of the loss with respect to the sum of absolute differences.
+    pub l1_weight: f32,
+    /// Derivative of the loss with respect to the sum of the SSIM map.
+    pub ssim_weight: f32,
+}
+
+/// One band of one channel. Run through `base::simd::dispatch`.
+pub(super) struct BandKernel<'a> {
+    /// The two pictures.
+    pub pair: &'a ImagePair<'a>,
+    /// Pixels of the map that count, and what lies outside the picture.
+    pub variant: SsimVariant,
+    /// 0, 1, 2: red, green, blue.
+    pub channel: usize,
+    /// Image rows that the band owns.
+    pub rows: Range<usize>,
+    /// `None`: only the SSIM sum is wanted.
+    pub gradient: Option<GradientBand<'a>>,
+}
+
+/// One input row with its margins: x, y, x^2 + y^2, x y and the weight of the pixel (0 outside the picture).
+struct InputRow {
+    maps: [Row; 4],
+    weight: Row,
+}
+
+struct Scratch {
+    input: [InputRow; WINDOW],
+    derivatives: [[Row; 3]; WINDOW],
+    columns: [Row; 4],
+    domain: Row,
+    owned: Row,
+}
+
+struct Tile {
+    /// Image columns that the tile owns.
+    own: Range<usize>,
+    /// Image columns that exist within the halo.
+    loaded: Range<usize>,
+    /// Position of `loaded.start` in a scratch row; scratch column 0 is image column `own.start - HALO`.
+    at: usize,
+}
+
+#[derive(Default)]
+struct LaneSums {
+    l1: [f64; LANES],
+    squares: [f64; LANES],
+    ssim: [f64; LANES],
+}
+
+impl Kernel for BandKernel<'_> {
+    type Out = BandSums;
+
+    #[inline(always)]
+    fn run<const FMA: bool>(mut self) -> BandSums {
+        const ZERO: Row = [0.0; STRIDE];
+        let mut scratch = Scratch {
+            input: [const { InputRow { maps: [ZERO; 4], weight: ZERO } }; WINDOW],
+            derivatives: [[ZERO; 3]; WINDOW],
+            columns: [ZERO; 4],
+            domain: ZERO,
+            owned: ZERO,
+        };
+        let mut sums = LaneSums::default();
+        let width = self.pair.width;
+        let tile_width = width.div_ceil(width.div_ceil(TILE).max(1)).max(1);
+        for start in (0..width).step_by(tile_width) {
+            let own = start..(start + tile_width).min(width);
+            let loaded = start.saturating_sub(HALO)..(own.end + HALO).min(width);
+            let at = loaded.start + HALO - start;
+            self.walk::<FMA>(&Tile { own, loaded, at }, &mut scratch, &mut sums);
+        }
+        BandSums { l1: sums.l1.iter().sum(), squares: sums.squares.iter().sum(), ssim: sums.ssim.iter().sum() }
+    }
+}
+
+impl BandKernel<'_> {
+    /// Streams the rows of one tile through the rings.
+    #[inline(always)]
+    fn walk<const FMA: bool>(&mut self, tile: &Tile, scratch: &mut Scratch, sums: &mut LaneSums) {
+        self.mark_columns(tile, scratch);
+        let margin = if self.gradient.is_some() { HALO } else { RADIUS };
+        for i in 0..self.rows.len() + 2 * margin {
+            let row = (self.rows.start + i) as isize - margin as isize;
+            self.load_row::<FMA>(tile, row, &mut scratch.input[i % WINDOW]);
+            if i >= 2 * RADIUS {
+                self.map_row::<FMA>(tile, row - RADIUS as isize, i, scratch, sums);
+            }
+            if i >= 4 * RADIUS && self.gradient.is_some() {
+                // Both margins are in: the row is one of the band's own.
+                self.gradient_row::<FMA>(tile, i - 4 * RADIUS, i, scratch, sums);
+            }
+        }
+    }
+
+    /// Which columns of the map have weight, and which of them this tile sums.
+    fn mark_columns(&self, tile: &Tile, scratch: &mut Scratch) {
+        let inside = domain(self.variant, self.pair.width);
+        for j in 0..STRIDE {
+            let column = (tile.own.start + j).wrapping_sub(RADIUS);
+            let counts = inside.contains(&column) && j < tile.own.len() + 2 * RADIUS;
+            scratch.domain[j] = f32::from(u8::from(counts));
+            scratch.owned[j] = f32::from(u8::from(counts && tile.own.contains(&column)));
+        }
+    }
+
+    /// Fills one ring entry with image row `row`, which may lie outside the picture.
+    #[inline(always)]
+    fn load_row<const FMA: bool>(&self, tile: &Tile, row: isize, entry: &mut InputRow) {
+        let height = self.pair.height;
+        let inside = (0..height as isize).contains(&row);
+        if !inside && self.variant != SsimVariant::Reflect {
+            entry.maps = [[0.0; STRIDE]; 4];
+            entry.weight = [0.0; STRIDE];
+            return;
+        }
+        let row = reflect(row, height);
+        let [x, y, squares, products] = &mut entry.maps;
+        let span = tile.at..tile.at + tile.loaded.len();
+        for outside in [0..span.start, span.end..STRIDE] {
+            x[outside.clone()].fill(0.0);
+            y[outside.clone()].fill(0.0);
+            entry.weight[outside].fill(0.0);
+        }
+        self.copy_row(row, tile, &mut x[span.clone()], &mut y[span.clone()], &mut entry.weight[span.clone()]);
+        if self.variant == SsimVariant::Reflect {
+            self.mirror_columns(tile, span, x, y);
+        }
+        for at in (0..STRIDE).step_by(LANES) {
+            let (a, b) = (load(x, at), load(y, at));
+            store(squares, at, from_fn(|l| fma::<FMA>(a[l], a[l], b[l] * b[l])));
+            store(products, at, from_fn(|l| a[l] * b[l]));
+        }
+    }
+
+    /// Values and weights of the columns that exist.
+    #[inline(always)]
+    fn copy_row(&self, row: usize, tile: &Tile, x: &mut [f32], y: &mut [f32], weight: &mut [f32]) {
+        let (width, pixels) = (self.pair.width, self.pair.width * self.pair.height);
+        let span = row * width + tile.loaded.start..row * width + tile.loaded.end;
+        let plane = self.channel * pixels;
+        x.copy_from_slice(&self.pair.rgb[plane + span.start..plane + span.end]);
+        match self.pair.reference {
+            Reference::Bytes(bytes) => {
+                let (interleaved, _) = bytes[3 * span.start..3 * span.end].as_chunks::<3>();
+                let channel = self.channel;
+                for (y, pixel) in y.iter_mut().zip(interleaved) {
+                    *y = f32::from(pixel[channel]) / 255.0;
+                }
+            }
+            Reference::Planar(values) => y.copy_from_slice(&values[plane + span.start..plane + span.end]),
+        }
+        if self.pair.clamp {
+            // clamp() keeps NaN, so a broken picture still shows in the result.
+            x.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
+            y.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
+        }
+        weight.fill(1.0);
+        if let Some(mask) = self.pair.mask {
+            for (((x, &y), weight), &byte) in x.iter_mut().zip(&*y).zip(weight).zip(&mask[span]) {
+                *weight = if byte == 0 { 0.0 } else { 1.0 };
+                *x = if byte == 0 { y } else { *x };
+            }
+        }
+    }
+
+    /// Fills the columns outside the picture with their mirror images, as far as a window reaches.
+    fn mirror_columns(&self, tile: &Tile, span: Range<usize>, x: &mut Row, y: &mut Row) {
+        let origin = tile.own.start as isize - HALO as isize;
+        for j in (span.start.saturating_sub(RADIUS)..span.start).chain(span.end..(span.end + RADIUS).min(STRIDE)) {
+            let column = origin + j as isize;
+            if (0..self.pair.width as isize).contains(&column) {
+                continue; // beyond the halo of an inner tile: no window reaches it
+            }
+            let from = (reflect(column, self.pair.width) as isize - origin) as usize;
+            (x[j], y[j]) = (x[from], y[from]);
+        }
+    }
+
+    /// SSIM and its three derivatives along map row `row`, once its last input row, ring index `i`, is in.
+    #[inline(always)]
+    fn map_row<const FMA: bool>(&self, tile: &Tile, row: isize, i: usize, scratch: &mut Scratch, sums: &mut LaneSums) {
+        let Scratch { input, derivatives, columns, domain: in_domain, owned } = scratch;
+        let derivatives = &mut derivatives[(i - 2 * RADIUS) % WINDOW];
+        let rows_with_weight = domain(self.variant, self.pair.height);
+        if row < 0 || !rows_with_weight.contains(&(row as usize)) {
+            *derivatives = [[0.0; STRIDE]; 3];
+            return;
+        }
+        let window: [&InputRow; WINDOW] = from_fn(|k| &input[(i + 1 + k) % WINDOW]);
+        let end = (tile.own.len() + 2 * RADIUS).next_multiple_of(LANES);
+        for at in (0..end + LANES).step_by(LANES) {
+            for m in 0..4 {
+                store(&mut columns[m], at, weighted::<FMA>(|k| load(&window[k].maps[m], at)));
+            }
+        }
+        let sum_row = self.rows.contains(&(row as usize));
+        for at in (0..end).step_by(LANES) {
+            let [mx, my, squares, products] = [0, 1, 2, 3].map(|m| weighted::<FMA>(|k| load(&columns[m], at + k)));
+            let weight = multiply(load(&window[RADIUS].weight, at + RADIUS), load(in_domain, at));
+            let points: [[f32; 4]; LANES] = from_fn(|l| ssim_point::<FMA>(mx[l], my[l], squares[l], products[l]));
+            if sum_row {
+                let owned = load(owned, at);
+                for l in 0..LANES {
+                    sums.ssim[l] += f64::from(points[l][0] * weight[l] * owned[l]);
+                }
+            }
+            if self.gradient.is_some() {
+                for m in 0..3 {
+                    store(&mut derivatives[m], at, from_fn(|l| points[l][m + 1] * weight[l]));
+                }
+            }
+        }
+    }
+
+    /// Gradient of the band's row `own_row`, ten above ring index `i`, and the plain differences along it.
+    #[inline(always)]
+    fn gradient_row<const FMA: bool>(
+        &mut self,
+        tile: &Tile,
+        own_row: usize,
+        i: usize,
+        scratch: &mut Scratch,
+        sums: &mut LaneSums,
+    ) {
+        let Some(out) = &mut self.gradient else { return };
+        let Scratch { input, derivatives, columns, .. } = scratch;
+        let window: [&[Row; 3]; WINDOW] = from_fn(|k| &derivatives[(i + 2 + k) % WINDOW]);
+        let centre = &input[(i + 1) % WINDOW];
+        let end = tile.own.len().next_multiple_of(LANES);
+        for at in (0..end + LANES).step_by(LANES) {
+            for m in 0..3 {
+                store(&mut columns[m], at, weighted::<FMA>(|k| load(&window[k][m], at)));
+            }
+        }
+        let first = own_row * self.pair.width + tile.own.start;
+        let v_row = &mut out.v_plane[first..first + tile.own.len()];
+        for (v, at) in v_row.chunks_mut(LANES).zip((0..end).step_by(LANES)) {
+            let [v_mean, v_square, v_product] = [0, 1, 2].map(|m| weighted::<FMA>(|k| load(&columns[m], at + k)));
+            let [x, y] = [0, 1].map(|m| load(&centre.maps[m], at + HALO));
+            let weight = load(&centre.weight, at + HALO);
+            let v_pixel: Lane = from_fn(|l| {
+                let difference = x[l] - y[l];
+                let sign = f32::from(u8::from(difference > 0.0)) - f32::from(u8::from(difference < 0.0));
+                let v_ssim = fma::<FMA>(2.0 * x[l], v_square[l], fma::<FMA>(y[l], v_product[l], v_mean[l]));
+                weight[l] * fma::<FMA>(out.ssim_weight, v_ssim, out.l1_weight * sign)
+            });
+            v.copy_from_slice(&v_pixel[..v.len()]);
+            for l in 0..v.len() {
+                let difference = f64::from(x[l] - y[l]);
+                sums.l1[l] += difference.abs();
+                sums.squares[l] += difference * difference;
+            }
+        }
+    }
+}
+
+/// [S, dS/dmx, dS/dE[xx], dS/dE[xy]] from the windowed means of x, y, x^2 + y^2 and x y.
+#[inline(always)]
+fn ssim_point<const FMA: bool>(mx: f32, my: f32, squares: f32, products: f32) -> [f32; 4] {
+    let mean_product = mx * my;
+    let mean_squares = fma::<FMA>(mx, mx, my * my);
+    let a1 = fma::<FMA>(2.0, mean_product, C1);
+    let a2 = fma::<FMA>(2.0, products - mean_product, C2);
+    let b1 = mean_squares + C1;
+    // Rounding can take the sum of two variances below zero by 1e-7 of the squares: a bright flat patch.
+    let b2 = (squares - mean_squares).max(0.0) + C2;
+    let inverse = 1.0 / (b1 * b2);
+    let ssim = a1 * a2 * inverse;
+    let v_mean = 2.0 * inverse * fma::<FMA>(my, a2 - a1, mx * ssim * (b1 - b2));
+    [ssim, v_mean, -ssim * b1 * inverse, 2.0 * a1 * inverse]
+}
+
+/// Sum of eleven vectors with the window's weights.
+#[inline(always)]
+fn weighted<const FMA: bool>(vector: impl Fn(usize) -> Lane) -> Lane {
+    let mut sum = [0.0; LANES];
+    for k in 0..WINDOW {
+        let v = vector(k);
+        for l in 0..LANES {
+            sum[l] = fma::<FMA>(TAPS[k], v[l], sum[l]);
+        }
+    }
+    sum
+}
+
+#[inline(always)]
+fn load(row: &Row, at: usize) -> Lane {
+    let mut lane = [0.0; LANES];
+    lane.copy_from_slice(&row[at..at + LANES]);
+    lane
+}
+
+#[inline(always)]
+fn store(row: &mut Row, at: usize, lane: Lane) {
+    row[at..at + LANES].copy_from_slice(&lane);
+}
+
+#[inline(always)]
+fn multiply(a: Lane, b: Lane) -> Lane {
+    from_fn(|l| a[l] * b[l])
+}
+
+/// Positions along one side at which the map counts.
+pub(super) fn domain(variant: SsimVariant, side: usize) -> Range<usize> {
+    match variant {
+        SsimVariant::Valid => RADIUS..side.saturating_sub(RADIUS),
+        SsimVariant::Same | SsimVariant::Reflect => 0..side,
+    }
+}
+
+/// Index of the mirror image of `i` in `0..side`, the border element not repeated.
+fn reflect(i: isize, side: usize) -> usize {
+    let period = 2 * (side as isize - 1).max(1);
+    let i = i.rem_euclid(period);
+    (if i < side as isize { i } else { period - i }).min(side as isize - 1) as usize
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_window_is_a_normalised_gaussian() {
+        let raw: [f64; WINDOW] = from_fn(|k| libm::exp(-(k as f64 - 5.0).powi(2) / 4.5));
+        let sum: f64 = raw.iter().sum();
+        for k in 0..WINDOW {
+            assert_eq!(TAPS[k], (raw[k] / sum) as f32, "tap {k}");
+        }
+    }
+
+    #[test]
+    fn reflection_does_not_repeat_the_border() {
+        let got: Vec<usize> = (-5..9).map(|i| reflect(i, 4)).collect();
+        assert_eq!(got, [1, 2, 3, 2, 1, 0, 1, 2, 3, 2, 1, 0, 1, 2]);
+        assert!((-5..6).all(|i| reflect(i, 1) == 0));
+    }
+}
