@@ -4,7 +4,8 @@
 //! number of threads, and on the AVX2 and AVX-512 paths; 3. `backward` belongs to the last `forward` and must be given
 //! the same rows.
 
-use super::{Gradients, RenderOptions};
+use super::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
+use crate::kernels::image_loss::ImageLoss;
 use crate::kernels::isect_emit::{count, emit};
 use crate::kernels::isect_offsets::isect_offsets;
 use crate::kernels::project_bwd::project_bwd;
@@ -18,7 +19,7 @@ use crate::kernels::sh_fwd::sh_fwd;
 use crate::kernels::splats::{Grid, Splat, pack};
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
-use crate::scene::image::Image;
+use crate::scene::image::{Image, Target};
 use std::sync::atomic::AtomicU64;
 
 /// Counters of the last view.
@@ -54,6 +55,8 @@ pub struct CpuRenderer {
     partials: Vec<Partial>,
     rank_from_row: Vec<u32>,
     footprints: FootprintGradients,
+    image_loss: ImageLoss,
+    v_rgb: Vec<f32>,
     stats: RenderStats,
 }
 
@@ -174,11 +177,58 @@ impl CpuRenderer {
             + self.raster.bytes()
             + bytes(&self.image.rgb)
             + bytes(&self.alpha)
+            + bytes(&self.v_rgb)
             + (bytes(&p.means2d) + bytes(&p.conics) + bytes(&p.depths) + bytes(&p.radii) + bytes(&p.opacities))
             + (bytes(&self.colors) + bytes(&self.order) + bytes(&self.splats))
             + (bytes(&self.counts) + bytes(&self.tile_counts) + bytes(&self.offsets) + bytes(&self.tile_offsets))
             + (bytes(&self.cursors) + bytes(&self.isects) + bytes(&self.partials) + bytes(&self.rank_from_row))
             + (bytes(&f.v_means2d) + bytes(&f.v_conics) + bytes(&f.v_colors) + bytes(&f.v_opacities))
+    }
+}
+
+impl Renderer for CpuRenderer {
+    fn name(&self) -> &'static str {
+        "cpu"
+    }
+
+    fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
+        let Camera { width, height, .. } = *camera;
+        if width.max(height) > Grid::SIDE_MAX {
+            return Err(RenderError::ImageTooLarge { width, height });
+        }
+        if rows.rows() >= u32::MAX as usize {
+            return Err(RenderError::TooManyRows(rows.rows()));
+        }
+        if options.sh_degree > rows.sh_degree {
+            return Err(RenderError::ShDegree { asked: options.sh_degree, stored: rows.sh_degree });
+        }
+        self.forward(rows, camera, options);
+        Ok(())
+    }
+
+    fn image(&mut self) -> Result<&Image, RenderError> {
+        if self.view.is_some() { Ok(&self.image) } else { Err(RenderError::NoForward) }
+    }
+
+    fn loss_backward(
+        &mut self,
+        rows: &Columns,
+        target: &Target,
+        options: &LossOptions,
+        grads: &mut Gradients,
+    ) -> Result<LossValue, RenderError> {
+        if self.view.is_none() || self.projected.rows() != rows.rows() {
+            return Err(RenderError::NoForward);
+        }
+        let image = (self.image.width, self.image.height);
+        if (target.width, target.height) != image {
+            return Err(RenderError::TargetSize { target: (target.width, target.height), image });
+        }
+        let mut v_rgb = std::mem::take(&mut self.v_rgb);
+        let value = self.image_loss.value_and_gradient(&self.image, target, options, &mut v_rgb);
+        self.backward(rows, &v_rgb, None, grads);
+        self.v_rgb = v_rgb;
+        Ok(value)
     }
 }
 

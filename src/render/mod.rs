@@ -5,6 +5,10 @@ pub mod metrics;
 
 use crate::base::simd::SimdPath;
 pub use crate::kernels::image_loss::{LossOptions, LossValue, SsimPadding};
+use crate::kernels::splats::Grid;
+use crate::scene::camera::Camera;
+use crate::scene::columns::Columns;
+use crate::scene::image::{Image, Target};
 
 /// What a rendering depends on besides rows and camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -31,9 +35,75 @@ impl Default for RenderOptions {
 #[derive(Debug, Clone, Default)]
 pub struct Gradients {
     /// With respect to the stored (pre-activation) columns.
-    pub columns: crate::scene::columns::Columns,
+    pub columns: Columns,
     /// With respect to the pixel position of the mean, signed, pixel units.
     pub means2d: Vec<[f32; 2]>,
     /// Half extents of the footprint, pixels; [0, 0]: the row was not drawn.
     pub radii: Vec<[u32; 2]>,
+}
+
+/// Why a view could not be rendered.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum RenderError {
+    /// Tiles are numbered in 24 bits.
+    #[error("an image of {width}x{height} is too large: a side holds at most {} pixels", Grid::SIDE_MAX)]
+    ImageTooLarge {
+        /// Pixels.
+        width: u32,
+        /// Pixels.
+        height: u32,
+    },
+    /// Rows are numbered in 32 bits within a view.
+    #[error("{0} Gaussians are too many for one view")]
+    TooManyRows(usize),
+    /// More bands were asked for than the rows hold.
+    #[error("SH degree {asked} was asked for, but the rows are stored with degree {stored}")]
+    ShDegree {
+        /// Of the options.
+        asked: u8,
+        /// Of the rows.
+        stored: u8,
+    },
+    /// The photo does not have the size of the picture.
+    #[error("the target is {}x{}, the picture {}x{}", .target.0, .target.1, .image.0, .image.1)]
+    TargetSize {
+        /// Width and height of the target.
+        target: (u32, u32),
+        /// Width and height of the picture.
+        image: (u32, u32),
+    },
+    /// `image` or `loss_backward` came before `forward`, or with other rows.
+    #[error("no view was rendered from these rows yet")]
+    NoForward,
+}
+
+/// Renders one view at a time: `forward`, then what is wanted of it.
+pub trait Renderer: Send {
+    /// Name for reports.
+    fn name(&self) -> &'static str;
+
+    /// Renders `rows` as seen by `camera`.
+    ///
+    /// # Errors
+    /// When the view is too large or does not fit the rows.
+    fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError>;
+
+    /// The picture of the last forward pass.
+    ///
+    /// # Errors
+    /// Without a forward pass.
+    fn image(&mut self) -> Result<&Image, RenderError>;
+
+    /// Loss of that picture against `target`, and the gradients of the rows it was made from: every entry of `grads` is
+    /// written, zeros for rows that were not drawn.
+    ///
+    /// # Errors
+    /// Without a forward pass of the same rows, or when the target's size differs.
+    fn loss_backward(
+        &mut self,
+        rows: &Columns,
+        target: &Target,
+        options: &LossOptions,
+        grads: &mut Gradients,
+    ) -> Result<LossValue, RenderError>;
 }
