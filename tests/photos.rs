@@ -375,11 +375,12 @@ fn distortion_is_taken_out() {
 fn budgets_are_kept_and_change_no_bit() {
     let (_folder, raw) = noise_scene(12);
     let options = LoadOptions { data_factor: 2.0, test_every: None, ..LoadOptions::default() };
-    let views = load_dataset(raw, &options).unwrap().views;
+    let dataset = load_dataset(raw, &options).unwrap();
+    let views = &dataset.views;
     let want: Vec<_> = views.iter().map(|v| decode(&v.photo).unwrap()).collect();
     let one_decode = views.iter().map(|v| v.photo.decode_bytes()).max().unwrap();
     let one_target = views[0].photo.target_bytes();
-    let all = TargetCache::bytes_to_keep_all(&views, 3);
+    let all = TargetCache::bytes_to_keep_all(&dataset, 3);
     let mut order = Stream::new(1, Purpose::Test, 1, 1);
     let epochs: Vec<Vec<usize>> = (0..6)
         .map(|_| {
@@ -389,8 +390,8 @@ fn budgets_are_kept_and_change_no_bit() {
         })
         .collect();
     for budget in [0, one_decode, one_decode + one_target, one_decode + 5 * one_target, all, 10 * all] {
-        for threads in [1, 3] {
-            let cache = TargetCache::new(&views, budget, threads).unwrap();
+        for threads in [0, 1, 3] {
+            let cache = TargetCache::new(&dataset, budget, threads);
             for epoch in &epochs {
                 cache.prefetch(epoch);
                 for &view in epoch {
@@ -413,10 +414,11 @@ fn budgets_are_kept_and_change_no_bit() {
 #[test]
 fn held_targets_count_and_are_never_evicted() {
     let (_folder, raw) = noise_scene(8);
-    let views = load(&raw).views;
+    let dataset = load(&raw);
+    let views = &dataset.views;
     let one_decode = views[0].photo.decode_bytes();
     let one_target = views[0].photo.target_bytes();
-    let cache = TargetCache::new(&views, one_decode + one_target, 2).unwrap();
+    let cache = TargetCache::new(&dataset, one_decode + one_target, 2);
     let first = cache.get(0).unwrap();
     let second = cache.get(1).unwrap();
     let third = cache.get(2).unwrap();
@@ -432,35 +434,39 @@ fn held_targets_count_and_are_never_evicted() {
 #[test]
 fn several_callers_share_a_small_cache() {
     let (_folder, raw) = noise_scene(10);
-    let views = load(&raw).views;
+    let dataset = load(&raw);
+    let views = &dataset.views;
     let want: Vec<_> = views.iter().map(|v| decode(&v.photo).unwrap()).collect();
-    let cache = TargetCache::new(&views, 1, 2).unwrap();
-    std::thread::scope(|scope| {
-        for key in 0..3 {
-            let (cache, want) = (&cache, &want);
-            scope.spawn(move || {
-                let mut s = Stream::new(2, Purpose::Test, key, 0);
-                for _ in 0..60 {
-                    let view = s.below(10) as usize;
-                    if s.below(4) == 0 {
-                        cache.prefetch(&[s.below(10) as usize, view, s.below(10) as usize]);
+    for threads in [0, 2] {
+        let cache = TargetCache::new(&dataset, 1, threads);
+        std::thread::scope(|scope| {
+            for key in 0..3 {
+                let (cache, want) = (&cache, &want);
+                scope.spawn(move || {
+                    let mut s = Stream::new(2, Purpose::Test, key, 0);
+                    for _ in 0..60 {
+                        let view = s.below(10) as usize;
+                        if s.below(4) == 0 {
+                            cache.prefetch(&[s.below(10) as usize, view, s.below(10) as usize]);
+                        }
+                        assert_eq!(*cache.get(view).unwrap(), want[view]);
                     }
-                    assert_eq!(*cache.get(view).unwrap(), want[view]);
-                }
-            });
-        }
-    });
+                });
+            }
+        });
+    }
 }
 
 #[test]
 fn a_photo_that_breaks_after_load_is_an_error_of_its_view_alone() {
     let (_folder, raw) = noise_scene(3);
-    let views = load(&raw).views;
+    let dataset = load(&raw);
+    let views = &dataset.views;
     let path = &views[1].photo.image_path;
     let bytes = std::fs::read(path).unwrap();
     std::fs::write(path, &bytes[..bytes.len() / 2]).unwrap();
     noise_photo(20, 20, 1).save(&views[2].photo.image_path).unwrap();
-    let cache = TargetCache::new(&views, 1 << 20, 1).unwrap();
+    let cache = TargetCache::new(&dataset, 1 << 20, 1);
     cache.prefetch(&[0, 1, 2]);
     assert!(cache.get(0).is_ok());
     assert_eq!(&cache.get(1).unwrap_err().file, path);
@@ -489,7 +495,7 @@ fn real_photos_decode_and_shrink() {
     let dataset = load_dataset(raw, &LoadOptions { data_factor: 3.4175, ..LoadOptions::default() }).unwrap();
     assert_eq!(dataset.views.len(), 18);
     let budget = 3 * dataset.views[0].photo.decode_bytes();
-    let cache = TargetCache::new(&dataset.views, budget, 2).unwrap();
+    let cache = TargetCache::new(&dataset, budget, 2);
     cache.prefetch(&(0..18).collect::<Vec<usize>>());
     for (i, view) in dataset.views.iter().enumerate() {
         let target = cache.get(i).unwrap();
