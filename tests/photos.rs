@@ -380,7 +380,7 @@ fn budgets_are_kept_and_change_no_bit() {
     let want: Vec<_> = views.iter().map(|v| decode(&v.photo).unwrap()).collect();
     let one_decode = views.iter().map(|v| v.photo.decode_bytes()).max().unwrap();
     let one_target = views[0].photo.target_bytes();
-    let all = TargetCache::bytes_to_keep_all(&dataset, 3);
+    let all = TargetCache::bytes_to_keep_all(views, 3);
     let mut order = Stream::new(1, Purpose::Test, 1, 1);
     let epochs: Vec<Vec<usize>> = (0..6)
         .map(|_| {
@@ -391,7 +391,7 @@ fn budgets_are_kept_and_change_no_bit() {
         .collect();
     for budget in [0, one_decode, one_decode + one_target, one_decode + 5 * one_target, all, 10 * all] {
         for threads in [0, 1, 3] {
-            let cache = TargetCache::new(&dataset, budget, threads);
+            let cache = TargetCache::new(&dataset.views, budget, threads).unwrap();
             for epoch in &epochs {
                 cache.prefetch(epoch);
                 for &view in epoch {
@@ -418,7 +418,7 @@ fn held_targets_count_and_are_never_evicted() {
     let views = &dataset.views;
     let one_decode = views[0].photo.decode_bytes();
     let one_target = views[0].photo.target_bytes();
-    let cache = TargetCache::new(&dataset, one_decode + one_target, 2);
+    let cache = TargetCache::new(&dataset.views, one_decode + one_target, 2).unwrap();
     let first = cache.get(0).unwrap();
     let second = cache.get(1).unwrap();
     let third = cache.get(2).unwrap();
@@ -438,7 +438,7 @@ fn several_callers_share_a_small_cache() {
     let views = &dataset.views;
     let want: Vec<_> = views.iter().map(|v| decode(&v.photo).unwrap()).collect();
     for threads in [0, 2] {
-        let cache = TargetCache::new(&dataset, 1, threads);
+        let cache = TargetCache::new(&dataset.views, 1, threads).unwrap();
         std::thread::scope(|scope| {
             for key in 0..3 {
                 let (cache, want) = (&cache, &want);
@@ -466,7 +466,7 @@ fn a_photo_that_breaks_after_load_is_an_error_of_its_view_alone() {
     let bytes = std::fs::read(path).unwrap();
     std::fs::write(path, &bytes[..bytes.len() / 2]).unwrap();
     noise_photo(20, 20, 1).save(&views[2].photo.image_path).unwrap();
-    let cache = TargetCache::new(&dataset, 1 << 20, 1);
+    let cache = TargetCache::new(&dataset.views, 1 << 20, 1).unwrap();
     cache.prefetch(&[0, 1, 2]);
     assert!(cache.get(0).is_ok());
     assert_eq!(&cache.get(1).unwrap_err().file, path);
@@ -495,7 +495,7 @@ fn real_photos_decode_and_shrink() {
     let dataset = load_dataset(raw, &LoadOptions { data_factor: 3.4175, ..LoadOptions::default() }).unwrap();
     assert_eq!(dataset.views.len(), 18);
     let budget = 3 * dataset.views[0].photo.decode_bytes();
-    let cache = TargetCache::new(&dataset, budget, 2);
+    let cache = TargetCache::new(&dataset.views, budget, 2).unwrap();
     cache.prefetch(&(0..18).collect::<Vec<usize>>());
     for (i, view) in dataset.views.iter().enumerate() {
         let target = cache.get(i).unwrap();

@@ -11,7 +11,7 @@
 //! fit the budget together, with room for the decodes in flight, are decoded once; 4. the bits of a target never
 //! depend on budget, threads or order.
 
-use super::loader::Dataset;
+use super::loader::View;
 use super::photo::{PhotoSource, decode};
 use crate::base::error::{InputError, InputResult};
 use crate::scene::image::Target;
@@ -91,10 +91,12 @@ enum Content {
 const NEVER: u64 = u64::MAX;
 
 impl TargetCache {
-    /// A cache for the views of a dataset that uses at most `budget_bytes` and decodes on `threads` threads of its
-    /// own. With 0, or where the system refuses to start threads, callers of `get` decode and nothing is done ahead.
-    pub fn new(dataset: &Dataset, budget_bytes: u64, threads: usize) -> Self {
-        let photos: Vec<PhotoSource> = dataset.views.iter().map(|v| v.photo.clone()).collect();
+    /// A cache for these views that uses at most `budget_bytes` and decodes on `threads` threads of its own. With 0,
+    /// callers of `get` decode and nothing is done ahead.
+    ///
+    /// Errors: the system refuses to start a thread.
+    pub fn new(views: &[View], budget_bytes: u64, threads: usize) -> InputResult<Self> {
+        let photos: Vec<PhotoSource> = views.iter().map(|v| v.photo.clone()).collect();
         let state = State { slots: photos.iter().map(|_| Slot::default()).collect(), ..State::default() };
         let shared = Arc::new(Shared {
             photos,
@@ -103,12 +105,13 @@ impl TargetCache {
             work: Condvar::new(),
             done: Condvar::new(),
         });
-        let start = |i: usize| {
-            let shared = Arc::clone(&shared);
-            std::thread::Builder::new().name(format!("decode-{i}")).spawn(move || shared.run_worker()).ok()
-        };
-        let workers = (0..threads).map_while(start).collect();
-        TargetCache { shared, workers }
+        let mut cache = TargetCache { shared, workers: Vec::new() };
+        for i in 0..threads {
+            let shared = Arc::clone(&cache.shared);
+            let worker = std::thread::Builder::new().name(format!("decode-{i}")).spawn(move || shared.run_worker());
+            cache.workers.push(worker.map_err(|e| InputError::io("decode threads", "starting a thread", &e))?);
+        }
+        Ok(cache)
     }
 
     /// Says which views come next, in order, the next one first; replaces what was said before. Decoding starts at
@@ -178,10 +181,10 @@ impl TargetCache {
 
     /// The budget with which a cache with `decodes` threads never evicts a target, and so the most that it ever uses:
     /// all targets plus the largest decodes.
-    pub fn bytes_to_keep_all(dataset: &Dataset, decodes: usize) -> u64 {
-        let mut peaks: Vec<u64> = dataset.views.iter().map(|v| v.photo.decode_bytes()).collect();
+    pub fn bytes_to_keep_all(views: &[View], decodes: usize) -> u64 {
+        let mut peaks: Vec<u64> = views.iter().map(|v| v.photo.decode_bytes()).collect();
         peaks.sort_unstable_by(|a, b| b.cmp(a));
-        let targets: u64 = dataset.views.iter().map(|v| v.photo.target_bytes()).sum();
+        let targets: u64 = views.iter().map(|v| v.photo.target_bytes()).sum();
         targets + peaks.iter().take(decodes.max(1)).sum::<u64>()
     }
 }
