@@ -9,6 +9,7 @@ use gsscale::base::rng::{Purpose, Stream};
 use gsscale::dataset::loader::{Dataset, LoadOptions, load_dataset};
 use gsscale::dataset::model::{Intrinsics, Lens, PointCloud, Pose, RawScene, RawView, Split};
 use gsscale::dataset::photo::decode;
+use gsscale::dataset::read::{ReadOptions, read_scene};
 use gsscale::dataset::resize::resize_area;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::dataset::undistort::distort;
@@ -536,4 +537,38 @@ fn empty_and_cut_jpegs_are_refused_at_load() {
     assert!(refusal(&raw, &LoadOptions::default()).problem.contains("cut short"));
     std::fs::write(&raw.views[1].image_path, &whole).unwrap();
     assert_eq!(load(&raw).views.len(), 3);
+}
+
+#[test]
+fn a_real_scene_fits_its_frame() {
+    let Some(folder) = support::real_scene("brighton") else { return };
+    let raw = read_scene(&folder, &ReadOptions::default()).unwrap();
+    let world: Vec<DVec3> = raw.points.positions.iter().map(|&p| DVec3::from_array(p)).collect();
+    let poses: Vec<(Pose, Intrinsics)> = raw.views.iter().map(|v| (v.pose, v.intrinsics)).collect();
+    let dataset = load_dataset(raw, &LoadOptions { data_factor: 2.0, ..LoadOptions::default() }).unwrap();
+    assert_eq!(dataset.warnings, Vec::<String>::new());
+    assert_eq!((dataset.views.len(), dataset.points.len()), (18, 7395));
+    assert_eq!(dataset.test_views(), [0, 8, 16]);
+    // Half of the cameras are within one unit; the farthest of a flight is a few units away.
+    assert!((1.1..4.0).contains(&dataset.scene_scale), "{}", dataset.scene_scale);
+    for (view, (pose, k)) in dataset.views.iter().zip(&poses) {
+        let (m, camera) = (&view.camera.viewmat, &view.camera);
+        assert_eq!((camera.width, camera.height), (600, 337));
+        let mut inside = 0;
+        for (point, world) in dataset.points.iter().zip(&world) {
+            let at = |i: usize| m[i][0] * point[0] + m[i][1] * point[1] + m[i][2] * point[2] + m[i][3];
+            let (x, y) = (camera.fx * at(0) / at(2) + camera.cx, camera.fy * at(1) / at(2) + camera.cy);
+            let p = pose.rotation * *world + pose.translation;
+            let want = [(k.fx * p.x / p.z + k.cx) / 2.0, (k.fy * p.y / p.z + k.cy) / 2.0];
+            if p.z > 0.0 && (0.0..600.0).contains(&want[0]) && (0.0..337.0).contains(&want[1]) {
+                inside += 1;
+                // f32 along the way: 600 pixels x 1e-7 x a few operations with cancellation.
+                assert!(
+                    (f64::from(x) - want[0]).abs() < 2e-3 && (f64::from(y) - want[1]).abs() < 2e-3,
+                    "{x} {y} {want:?}"
+                );
+            }
+        }
+        assert!(inside > 300, "{}: {inside} points in the photo", view.name);
+    }
 }
