@@ -9,6 +9,7 @@ use gsscale::base::rng::{Purpose, Stream};
 use gsscale::dataset::loader::{Dataset, LoadOptions, load_dataset};
 use gsscale::dataset::model::{Intrinsics, Lens, PointCloud, Pose, RawScene, RawView, Split};
 use gsscale::dataset::photo::decode;
+use gsscale::dataset::read::{ReadOptions, read_scene};
 use gsscale::dataset::resize::resize_area;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::dataset::undistort::distort;
@@ -375,11 +376,12 @@ fn distortion_is_taken_out() {
 fn budgets_are_kept_and_change_no_bit() {
     let (_folder, raw) = noise_scene(12);
     let options = LoadOptions { data_factor: 2.0, test_every: None, ..LoadOptions::default() };
-    let views = load_dataset(raw, &options).unwrap().views;
+    let dataset = load_dataset(raw, &options).unwrap();
+    let views = &dataset.views;
     let want: Vec<_> = views.iter().map(|v| decode(&v.photo).unwrap()).collect();
     let one_decode = views.iter().map(|v| v.photo.decode_bytes()).max().unwrap();
     let one_target = views[0].photo.target_bytes();
-    let all = TargetCache::bytes_to_keep_all(&views, 3);
+    let all = TargetCache::bytes_to_keep_all(views, 3);
     let mut order = Stream::new(1, Purpose::Test, 1, 1);
     let epochs: Vec<Vec<usize>> = (0..6)
         .map(|_| {
@@ -389,8 +391,8 @@ fn budgets_are_kept_and_change_no_bit() {
         })
         .collect();
     for budget in [0, one_decode, one_decode + one_target, one_decode + 5 * one_target, all, 10 * all] {
-        for threads in [1, 3] {
-            let cache = TargetCache::new(&views, budget, threads).unwrap();
+        for threads in [0, 1, 3] {
+            let cache = TargetCache::new(&dataset.views, budget, threads).unwrap();
             for epoch in &epochs {
                 cache.prefetch(epoch);
                 for &view in epoch {
@@ -413,10 +415,11 @@ fn budgets_are_kept_and_change_no_bit() {
 #[test]
 fn held_targets_count_and_are_never_evicted() {
     let (_folder, raw) = noise_scene(8);
-    let views = load(&raw).views;
+    let dataset = load(&raw);
+    let views = &dataset.views;
     let one_decode = views[0].photo.decode_bytes();
     let one_target = views[0].photo.target_bytes();
-    let cache = TargetCache::new(&views, one_decode + one_target, 2).unwrap();
+    let cache = TargetCache::new(&dataset.views, one_decode + one_target, 2).unwrap();
     let first = cache.get(0).unwrap();
     let second = cache.get(1).unwrap();
     let third = cache.get(2).unwrap();
@@ -432,35 +435,39 @@ fn held_targets_count_and_are_never_evicted() {
 #[test]
 fn several_callers_share_a_small_cache() {
     let (_folder, raw) = noise_scene(10);
-    let views = load(&raw).views;
+    let dataset = load(&raw);
+    let views = &dataset.views;
     let want: Vec<_> = views.iter().map(|v| decode(&v.photo).unwrap()).collect();
-    let cache = TargetCache::new(&views, 1, 2).unwrap();
-    std::thread::scope(|scope| {
-        for key in 0..3 {
-            let (cache, want) = (&cache, &want);
-            scope.spawn(move || {
-                let mut s = Stream::new(2, Purpose::Test, key, 0);
-                for _ in 0..60 {
-                    let view = s.below(10) as usize;
-                    if s.below(4) == 0 {
-                        cache.prefetch(&[s.below(10) as usize, view, s.below(10) as usize]);
+    for threads in [0, 2] {
+        let cache = TargetCache::new(&dataset.views, 1, threads).unwrap();
+        std::thread::scope(|scope| {
+            for key in 0..3 {
+                let (cache, want) = (&cache, &want);
+                scope.spawn(move || {
+                    let mut s = Stream::new(2, Purpose::Test, key, 0);
+                    for _ in 0..60 {
+                        let view = s.below(10) as usize;
+                        if s.below(4) == 0 {
+                            cache.prefetch(&[s.below(10) as usize, view, s.below(10) as usize]);
+                        }
+                        assert_eq!(*cache.get(view).unwrap(), want[view]);
                     }
-                    assert_eq!(*cache.get(view).unwrap(), want[view]);
-                }
-            });
-        }
-    });
+                });
+            }
+        });
+    }
 }
 
 #[test]
 fn a_photo_that_breaks_after_load_is_an_error_of_its_view_alone() {
     let (_folder, raw) = noise_scene(3);
-    let views = load(&raw).views;
+    let dataset = load(&raw);
+    let views = &dataset.views;
     let path = &views[1].photo.image_path;
     let bytes = std::fs::read(path).unwrap();
     std::fs::write(path, &bytes[..bytes.len() / 2]).unwrap();
     noise_photo(20, 20, 1).save(&views[2].photo.image_path).unwrap();
-    let cache = TargetCache::new(&views, 1 << 20, 1).unwrap();
+    let cache = TargetCache::new(&dataset.views, 1 << 20, 1).unwrap();
     cache.prefetch(&[0, 1, 2]);
     assert!(cache.get(0).is_ok());
     assert_eq!(&cache.get(1).unwrap_err().file, path);
@@ -530,4 +537,38 @@ fn empty_and_cut_jpegs_are_refused_at_load() {
     assert!(refusal(&raw, &LoadOptions::default()).problem.contains("cut short"));
     std::fs::write(&raw.views[1].image_path, &whole).unwrap();
     assert_eq!(load(&raw).views.len(), 3);
+}
+
+#[test]
+fn a_real_scene_fits_its_frame() {
+    let Some(folder) = support::real_scene("brighton") else { return };
+    let raw = read_scene(&folder, &ReadOptions::default()).unwrap();
+    let world: Vec<DVec3> = raw.points.positions.iter().map(|&p| DVec3::from_array(p)).collect();
+    let poses: Vec<(Pose, Intrinsics)> = raw.views.iter().map(|v| (v.pose, v.intrinsics)).collect();
+    let dataset = load_dataset(raw, &LoadOptions { data_factor: 2.0, ..LoadOptions::default() }).unwrap();
+    assert_eq!(dataset.warnings, Vec::<String>::new());
+    assert_eq!((dataset.views.len(), dataset.points.len()), (18, 7395));
+    assert_eq!(dataset.test_views(), [0, 8, 16]);
+    // Half of the cameras are within one unit; the farthest of a flight is a few units away.
+    assert!((1.1..4.0).contains(&dataset.scene_scale), "{}", dataset.scene_scale);
+    for (view, (pose, k)) in dataset.views.iter().zip(&poses) {
+        let (m, camera) = (&view.camera.viewmat, &view.camera);
+        assert_eq!((camera.width, camera.height), (600, 337));
+        let mut inside = 0;
+        for (point, world) in dataset.points.iter().zip(&world) {
+            let at = |i: usize| m[i][0] * point[0] + m[i][1] * point[1] + m[i][2] * point[2] + m[i][3];
+            let (x, y) = (camera.fx * at(0) / at(2) + camera.cx, camera.fy * at(1) / at(2) + camera.cy);
+            let p = pose.rotation * *world + pose.translation;
+            let want = [(k.fx * p.x / p.z + k.cx) / 2.0, (k.fy * p.y / p.z + k.cy) / 2.0];
+            if p.z > 0.0 && (0.0..600.0).contains(&want[0]) && (0.0..337.0).contains(&want[1]) {
+                inside += 1;
+                // f32 along the way: 600 pixels x 1e-7 x a few operations with cancellation.
+                assert!(
+                    (f64::from(x) - want[0]).abs() < 2e-3 && (f64::from(y) - want[1]).abs() < 2e-3,
+                    "{x} {y} {want:?}"
+                );
+            }
+        }
+        assert!(inside > 300, "{}: {inside} points in the photo", view.name);
+    }
 }

@@ -12,7 +12,7 @@ use super::masks::{MaskIndex, MaskSource};
 use super::model::{Intrinsics, Lens, RawScene, RawView, Split};
 use super::photo::{PhotoSource, intrinsics_at};
 use super::photo_header::{PhotoHeader, read_header};
-use super::resize::{Size, divided_size};
+use super::resize::{Size, divided_size, same_shape};
 use crate::base::error::{InputError, InputResult};
 use crate::scene::camera::Camera;
 use glam::DVec3;
@@ -22,9 +22,6 @@ use std::path::{Path, PathBuf};
 
 /// Names that a message lists before it only counts.
 const NAMES_LISTED: usize = 20;
-
-/// How far width and height may disagree about the scale between photo and camera.
-const SHAPE_TOLERANCE: f64 = 0.01;
 
 /// Depth beyond which nothing is drawn, local units.
 const FAR_PLANE: f32 = 1e10;
@@ -393,13 +390,6 @@ fn target_size(photo: Size, options: &LoadOptions) -> Size {
     }
 }
 
-/// Whether one size is the other, scaled: aspect ratios within 1 %, or a side within rounding (1.5 pixels).
-fn same_shape(size: Size, stated: Size) -> bool {
-    let [w, h, sw, sh] = [size.0, size.1, stated.0, stated.1].map(f64::from);
-    let (x, y) = (w / sw, h / sh);
-    (x / y - 1.0).abs() <= SHAPE_TOLERANCE || (w - sw * y).abs() <= 1.5 && (h - sh * x).abs() <= 1.5
-}
-
 fn check_shape(view: &RawView, size: Size) -> InputResult<()> {
     let stated = (view.intrinsics.width, view.intrinsics.height);
     if stated.0 > 0 && stated.1 > 0 && same_shape(size, stated) {
@@ -471,17 +461,6 @@ fn list_names<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn shapes_agree_up_to_scale_and_rounding() {
-        assert!(same_shape((1200, 674), (1200, 674)));
-        assert!(same_shape((600, 337), (1200, 674)));
-        assert!(same_shape((351, 197), (1200, 674)));
-        assert!(same_shape((19, 11), (1200, 674))); // 18.75 x 10.53, rounded
-        assert!(!same_shape((674, 1200), (1200, 674)));
-        assert!(!same_shape((1200, 800), (1200, 674)));
-        assert!(!same_shape((1000, 674), (1200, 674)));
-    }
 
     #[test]
     fn targets_round_once_from_the_full_size() {

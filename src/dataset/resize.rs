@@ -11,6 +11,9 @@
 /// Largest side that the integer sums are proven for.
 pub const LARGEST_SIDE: u32 = 65_535;
 
+/// How far width and height may disagree about the scale between two sizes of one shape.
+const SHAPE_TOLERANCE: f64 = 0.01;
+
 /// Width and height, pixels.
 pub type Size = (u32, u32);
 
@@ -18,6 +21,13 @@ pub type Size = (u32, u32);
 pub fn divided_size(full: Size, factor: f64) -> Size {
     let side = |n: u32| (f64::from(n) / factor).round().clamp(1.0, f64::from(LARGEST_SIDE)) as u32;
     (side(full.0), side(full.1))
+}
+
+/// Whether one size is the other, scaled: aspect ratios within 1 %, or a side within rounding (1.5 pixels).
+pub fn same_shape(size: Size, stated: Size) -> bool {
+    let [w, h, sw, sh] = [size.0, size.1, stated.0, stated.1].map(f64::from);
+    let (x, y) = (w / sw, h / sh);
+    (x / y - 1.0).abs() <= SHAPE_TOLERANCE || (w - sw * y).abs() <= 1.5 && (h - sh * x).abs() <= 1.5
 }
 
 /// One target pixel's stretch of a source row.
@@ -189,6 +199,17 @@ mod tests {
             }
         }
         out
+    }
+
+    #[test]
+    fn shapes_agree_up_to_scale_and_rounding() {
+        assert!(same_shape((1200, 674), (1200, 674)));
+        assert!(same_shape((600, 337), (1200, 674)));
+        assert!(same_shape((351, 197), (1200, 674)));
+        assert!(same_shape((19, 11), (1200, 674))); // 18.75 x 10.53, rounded
+        assert!(!same_shape((674, 1200), (1200, 674)));
+        assert!(!same_shape((1200, 800), (1200, 674)));
+        assert!(!same_shape((1000, 674), (1200, 674)));
     }
 
     #[test]

@@ -91,19 +91,22 @@ enum Content {
 const NEVER: u64 = u64::MAX;
 
 impl TargetCache {
-    /// A cache for these views that uses at most `budget_bytes`, decoding on `threads` threads (at least one).
+    /// A cache for these views that uses at most `budget_bytes` and decodes on `threads` threads of its own. With 0,
+    /// callers of `get` decode and nothing is done ahead.
     ///
     /// Errors: the system refuses to start a thread.
     pub fn new(views: &[View], budget_bytes: u64, threads: usize) -> InputResult<Self> {
-        Self::from_photos(views.iter().map(|v| v.photo.clone()).collect(), budget_bytes, threads)
-    }
-
-    fn from_photos(photos: Vec<PhotoSource>, budget: u64, threads: usize) -> InputResult<Self> {
+        let photos: Vec<PhotoSource> = views.iter().map(|v| v.photo.clone()).collect();
         let state = State { slots: photos.iter().map(|_| Slot::default()).collect(), ..State::default() };
-        let shared =
-            Arc::new(Shared { photos, budget, state: Mutex::new(state), work: Condvar::new(), done: Condvar::new() });
+        let shared = Arc::new(Shared {
+            photos,
+            budget: budget_bytes,
+            state: Mutex::new(state),
+            work: Condvar::new(),
+            done: Condvar::new(),
+        });
         let mut cache = TargetCache { shared, workers: Vec::new() };
-        for i in 0..threads.max(1) {
+        for i in 0..threads {
             let shared = Arc::clone(&cache.shared);
             let worker = std::thread::Builder::new().name(format!("decode-{i}")).spawn(move || shared.run_worker());
             cache.workers.push(worker.map_err(|e| InputError::io("decode threads", "starting a thread", &e))?);
@@ -149,7 +152,12 @@ impl TargetCache {
                 Content::Failed(error) => break Err(error.clone()),
                 Content::Absent | Content::Decoding => {}
             }
-            state = shared.done.wait(state).unwrap_or_else(PoisonError::into_inner);
+            // Without workers the caller does their job, unless another caller is at it.
+            let next = if self.workers.is_empty() { shared.start_next(&mut state) } else { None };
+            state = match next {
+                Some(next) => shared.decode_unlocked(state, next),
+                None => shared.done.wait(state).unwrap_or_else(PoisonError::into_inner),
+            };
         };
         state.slots[view].waiters -= 1;
         state.clock += 1;
@@ -171,7 +179,8 @@ impl TargetCache {
         self.shared.lock().stats
     }
 
-    /// The budget with which `decodes` decodes in flight never evict a target: all targets plus the largest decodes.
+    /// The budget with which a cache with `decodes` threads never evicts a target, and so the most that it ever uses:
+    /// all targets plus the largest decodes.
     pub fn bytes_to_keep_all(views: &[View], decodes: usize) -> u64 {
         let mut peaks: Vec<u64> = views.iter().map(|v| v.photo.decode_bytes()).collect();
         peaks.sort_unstable_by(|a, b| b.cmp(a));
@@ -200,17 +209,22 @@ impl Shared {
     fn run_worker(&self) {
         let mut state = self.lock();
         while !state.stop {
-            let Some(view) = self.start_next(&mut state) else {
-                state = self.work.wait(state).unwrap_or_else(PoisonError::into_inner);
-                continue;
+            state = match self.start_next(&mut state) {
+                Some(view) => self.decode_unlocked(state, view),
+                None => self.work.wait(state).unwrap_or_else(PoisonError::into_inner),
             };
-            drop(state);
-            let result = decode_caught(&self.photos[view]);
-            state = self.lock();
-            self.finish(&mut state, view, result);
-            self.done.notify_all();
-            self.work.notify_all();
         }
+    }
+
+    /// Decodes a view that [`Shared::start_next`] chose, without holding the lock meanwhile.
+    fn decode_unlocked<'a>(&'a self, state: MutexGuard<'a, State>, view: usize) -> MutexGuard<'a, State> {
+        drop(state);
+        let result = decode_caught(&self.photos[view]);
+        let mut state = self.lock();
+        self.finish(&mut state, view, result);
+        self.done.notify_all();
+        self.work.notify_all();
+        state
     }
 
     /// Chooses the next view to decode, makes room and reserves its bytes; `None` when there is nothing to do now.

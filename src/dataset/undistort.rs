@@ -53,10 +53,15 @@ impl Undistorter {
             *valid = if inside { 255 } else { 0 };
             let (x0, x1, tx) = neighbours(x, width);
             let (y0, y1, ty) = neighbours(y, height);
-            let at = |px: usize, py: usize, c: usize| f32::from(photo[(py * width + px) * C + c]);
-            for (c, value) in pixel.iter_mut().enumerate() {
-                let top = at(x0, y0, c) + tx * (at(x1, y0, c) - at(x0, y0, c));
-                let bottom = at(x0, y1, c) + tx * (at(x1, y1, c) - at(x0, y1, c));
+            let at = |px: usize, py: usize| -> [f32; C] {
+                let first = (py * width + px) * C;
+                let samples = &photo[first..first + C];
+                std::array::from_fn(|c| f32::from(samples[c]))
+            };
+            let (a, b, c, d) = (at(x0, y0), at(x1, y0), at(x0, y1), at(x1, y1));
+            for (i, value) in pixel.iter_mut().enumerate() {
+                let top = a[i] + tx * (b[i] - a[i]);
+                let bottom = c[i] + tx * (d[i] - c[i]);
                 *value = ((top + ty * (bottom - top)) * 256.0 + 0.5) as u16;
             }
         }
