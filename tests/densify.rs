@@ -219,9 +219,6 @@ fn the_cap_is_reached_and_never_exceeded() {
             assert_eq!(histogram, histogram_of(&state));
             let rows = state.rows() as u64;
             let kind = config.events_after(step, 1.0, rows, &histogram).next().unwrap();
-            let EventKind::Densify(thresholds) = kind else { panic!("{kind:?}") };
-            // prune_scale is finite after step 0 = reset_every; sizes here stay below it or are kept out of the test.
-            let kind = EventKind::Densify(RoundThresholds { prune_scale: f32::INFINITY, ..thresholds });
             apply_event(&mut state, &adam, SEED, index, &Event { step, kind });
             histogram.clear();
             assert!(state.rows() as u64 <= max_gaussians.max(2000), "{} of {max_gaussians}", state.rows());

@@ -83,11 +83,12 @@ impl DensifyConfig {
     /// round are not counted on.
     pub fn thresholds(&self, step: u32, scene_scale: f32, rows: u64, histogram: &GradHistogram) -> RoundThresholds {
         let room = self.max_gaussians.saturating_sub(rows);
+        let was_reset = self.reset_every > 0 && step > self.reset_every;
         RoundThresholds {
             grow_grad2d: histogram.threshold(self.grow_grad2d, room),
             split_scale: self.grow_scale3d * scene_scale,
             prune_opacity: self.prune_opa,
-            prune_scale: if step > self.reset_every { self.prune_scale3d * scene_scale } else { f32::INFINITY },
+            prune_scale: if was_reset { self.prune_scale3d * scene_scale } else { f32::INFINITY },
         }
     }
 }
@@ -147,6 +148,7 @@ mod tests {
         assert_eq!(config.thresholds(3100, 2.0, 10, &GradHistogram::default()).prune_scale, 0.2);
         let never = DensifyConfig { refine_every: 0, reset_every: 0, ..config };
         assert!((0..20_000).all(|s| !never.is_round(s) && !never.is_reset(s)));
+        assert_eq!(never.thresholds(9000, 1.0, 10, &GradHistogram::default()).prune_scale, f32::INFINITY);
     }
 
     #[test]

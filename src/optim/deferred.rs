@@ -221,8 +221,11 @@ impl<'a> AdamNow<'a> {
         }
         let rates = &self.adam.lane_rates;
         let (means, others) = ([drift[0], drift[1], drift[2]], [drift[4], drift[5], drift[6]]);
-        let sums: [[f32; 16]; 3] =
-            std::array::from_fn(|p| std::array::from_fn(|l| [others[p], means[p]][usize::from(l < 3)]));
+        let mut sums = [[0.0; SH_N_LANE]; 3];
+        for p in 0..3 {
+            sums[p] = [others[p]; SH_N_LANE];
+            sums[p][..3].fill(means[p]);
+        }
         for l in 0..SH_N_LANE {
             value[l] = drifted(value[l], m[l], v[l], [sums[0][l], sums[1][l], sums[2][l]], rates[l], eps);
         }

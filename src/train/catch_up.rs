@@ -144,8 +144,9 @@ impl Frustum {
     #[inline(always)]
     fn may_draw(&self, p: [f32; 3], sigma_max: f32) -> bool {
         let m = &self.viewmat;
-        let axis = |r: usize| m[r][0] * p[0] + m[r][1] * p[1] + m[r][2] * p[2] + m[r][3];
-        let (x, y, z) = (axis(0), axis(1), axis(2));
+        let x = m[0][0] * p[0] + m[0][1] * p[1] + m[0][2] * p[2] + m[0][3];
+        let y = m[1][0] * p[0] + m[1][1] * p[1] + m[1][2] * p[2] + m[1][3];
+        let z = m[2][0] * p[0] + m[2][1] * p[1] + m[2][2] * p[2] + m[2][3];
         let slack = POSITION_SLACK * (p[0].abs() + p[1].abs() + p[2].abs() + self.translation);
         let slopes = &self.slopes;
         let steepest = slopes[0].abs().max(slopes[1].abs()).max(slopes[2].abs()).max(slopes[3].abs());
@@ -204,36 +205,82 @@ impl Kernel for CullRows<'_, '_> {
     }
 }
 
-/// [`LANES`] rows from `first` on.
+/// [`LANES`] rows from `first` on: one vector per coordinate.
 #[inline(always)]
 fn cull_lanes(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, first: usize) -> [bool; LANES] {
-    let EpsFloor { eps, floor } = at.eps_floor();
-    let (mean_rate, scale_rate) = (at.base_rate(Column::Means), at.base_rate(Column::Scales));
-    let drifts: [_; LANES] = std::array::from_fn(|l| *at.drift(view.stamp[first + l]));
-    let (from, to) = (first * 3, (first + LANES) * 3);
-    let (means, scales) = (&view.columns.means[from..to], &view.columns.scales[from..to]);
-    let (means_m, scales_m) = (&view.exp_avg.means[from..to], &view.exp_avg.scales[from..to]);
-    let (means_v, scales_v) = (&view.exp_avg_sq.means[from..to], &view.exp_avg_sq.scales[from..to]);
-    let mut drawn = [false; LANES];
-    let mut direct = false;
-    for l in 0..LANES {
-        let d = &drifts[l];
-        let (of_means, of_scales) = ([d[0], d[1], d[2]], [d[4], d[5], d[6]]);
-        let mut p = [0.0; 3];
-        let mut s = [0.0; 3];
-        for c in 0..3 {
-            let i = l * 3 + c;
-            direct |=
-                needs_direct_sum(means_m[i], means_v[i], floor) | needs_direct_sum(scales_m[i], scales_v[i], floor);
-            p[c] = drifted(means[i], means_m[i], means_v[i], of_means, mean_rate, eps);
-            s[c] = drifted(scales[i], scales_m[i], scales_v[i], of_scales, scale_rate, eps);
+    let mut drift = [[0.0; LANES]; 8];
+    for (l, &stamp) in view.stamp[first..first + LANES].iter().enumerate() {
+        let of_row = at.drift(stamp);
+        for p in 0..8 {
+            drift[p][l] = of_row[p];
         }
-        drawn[l] = frustum.may_draw(p, exp32(s[0].max(s[1]).max(s[2])));
     }
-    if direct {
-        drawn = std::array::from_fn(|l| cull_row(at, frustum, view, first + l));
+    let [m1, m2, m3, _, c1, c2, c3, _] = &drift;
+    let (values, exp_avg, exp_avg_sq) = (&view.columns, &view.exp_avg, &view.exp_avg_sq);
+    let (means, a) =
+        drifted_lanes(at, Column::Means, [values.means, exp_avg.means, exp_avg_sq.means], first, [m1, m2, m3]);
+    let (scales, b) =
+        drifted_lanes(at, Column::Scales, [values.scales, exp_avg.scales, exp_avg_sq.scales], first, [c1, c2, c3]);
+    if a | b {
+        return cull_row_by_row(at, frustum, view, first);
+    }
+    let mut drawn = [false; LANES];
+    for l in 0..LANES {
+        let sigma_max = exp32(scales[0][l].max(scales[1][l]).max(scales[2][l]));
+        drawn[l] = frustum.may_draw([means[0][l], means[1][l], means[2][l]], sigma_max);
     }
     drawn
+}
+
+/// The three coordinates of a column now, by the series; and whether some of them need the direct sum instead.
+/// `tables`: values, first and second moments.
+#[inline(always)]
+fn drifted_lanes(
+    at: &AdamNow<'_>,
+    column: Column,
+    tables: [&[f32]; 3],
+    first: usize,
+    sums: [&[f32; LANES]; 3],
+) -> ([[f32; LANES]; 3], bool) {
+    let EpsFloor { eps, floor } = at.eps_floor();
+    let rate = at.base_rate(column);
+    let (from, to) = (first * 3, (first + LANES) * 3);
+    // Not `map` over the tables: its closure is not always inlined, and then runs without the vector instructions.
+    let value = by_coordinate(&tables[0][from..to]);
+    let m = by_coordinate(&tables[1][from..to]);
+    let v = by_coordinate(&tables[2][from..to]);
+    let mut out = [[0.0; LANES]; 3];
+    let mut direct = false;
+    for c in 0..3 {
+        let mut lanes = [false; LANES];
+        for l in 0..LANES {
+            out[c][l] = drifted(value[c][l], m[c][l], v[c][l], [sums[0][l], sums[1][l], sums[2][l]], rate, eps);
+            lanes[l] = needs_direct_sum(m[c][l], v[c][l], floor);
+        }
+        for lane in lanes {
+            direct |= lane;
+        }
+    }
+    (out, direct)
+}
+
+/// `[LANES][3]` to `[3][LANES]`.
+#[inline(always)]
+fn by_coordinate(rows: &[f32]) -> [[f32; LANES]; 3] {
+    let rows = &rows[..LANES * 3];
+    let mut out = [[0.0; LANES]; 3];
+    for l in 0..LANES {
+        out[0][l] = rows[l * 3];
+        out[1][l] = rows[l * 3 + 1];
+        out[2][l] = rows[l * 3 + 2];
+    }
+    out
+}
+
+#[cold]
+#[inline(never)]
+fn cull_row_by_row(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, first: usize) -> [bool; LANES] {
+    std::array::from_fn(|l| cull_row(at, frustum, view, first + l))
 }
 
 /// One row, by the exact evaluation.
