@@ -109,14 +109,6 @@ impl Solid {
     /// Where `ray` enters, if it does so in (0, limit).
     #[inline]
     pub(super) fn enter(&self, ray: &Ray, limit: f64) -> Option<Entry> {
-        let a = (self.low - ray.from) * ray.inverse;
-        let b = (self.high - ray.from) * ray.inverse;
-        let (near, far) = (a.min(b), a.max(b));
-        let t0 = near.x.max(near.y).max(near.z);
-        let t1 = far.x.min(far.y).min(far.z);
-        if t0 > t1 || t1 < 0.0 || t0 > limit {
-            return None;
-        }
         let from = self.turn_in(ray.from - self.origin);
         let along = self.turn_in(ray.along);
         let entry = match self.shape {

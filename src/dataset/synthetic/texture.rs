@@ -44,17 +44,19 @@ impl Noise {
         low + (high - low) * sy
     }
 
-    /// Sum of (wavelength in metres, amplitude) layers; layers shorter than the footprint fade out.
-    #[inline]
+    /// Sum of (wavelength in metres, amplitude) layers; layers shorter than the footprint fade out as [`fade`] says.
+    #[inline(always)]
     pub(super) fn layers(&self, x: f64, y: f64, w: f64, layers: &[(f64, f32)]) -> f32 {
         let mut sum = 0.0;
         let (mut a, mut b) = (x, y);
+        let per_footprint = 1.0 / w;
         for &(length, amplitude) in layers {
             // Every layer is turned by 37 degrees against the one before, so that the lattices do not line up.
             (a, b) = (0.8 * a - 0.6 * b + 17.3, 0.6 * a + 0.8 * b - 5.1);
-            let keep = fade(length, w);
+            let keep = ((length * per_footprint - 1.0) * 0.5).clamp(0.0, 1.0) as f32;
             if keep > 0.0 {
-                sum += amplitude * keep * self.value(a / length, b / length);
+                let frequency = 1.0 / length;
+                sum += amplitude * keep * self.value(a * frequency, b * frequency);
             }
         }
         sum
@@ -199,7 +201,7 @@ impl Skin {
             Kind::Solar => solar(u, v, w),
             Kind::Leaves => {
                 let n = noise.layers(u, v, w, &[(1.6, 0.22), (0.7, 0.30), (0.3, 0.30), (0.12, 0.25)]);
-                Look { albedo: mix(self.color, self.accent, 0.5 + n) * (0.95 + 0.9 * n), gloss: 0.0, rough: 0.55 }
+                Look { albedo: mix(self.color, self.accent, 0.5 + n) * (0.95 + 0.9 * n), gloss: 0.0, rough: 0.7 }
             }
             Kind::Wood => matt(self.color * (1.0 + noise.layers(u * 4.0, v, w, &[(0.8, 0.2), (0.3, 0.2)]))),
             Kind::CarPaint => Look { albedo: self.color, gloss: 0.35, rough: 0.0 },
