@@ -4,8 +4,8 @@
 
 mod checks;
 pub mod colmap;
-pub mod frame;
 pub mod colmap_write;
+pub mod frame;
 pub mod loader;
 pub mod masks;
 pub mod model;
