@@ -3,6 +3,8 @@
 
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
+use gsscale::kernels::constants::EPS2D;
+use gsscale::kernels::project_fwd::{Projected, project_fwd};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
@@ -77,6 +79,8 @@ fn scene(rows: usize, adam: &DeferredAdam) -> SceneState {
     columns.means.iter_mut().for_each(|x| *x = (draws.normal() * 6.0) as f32);
     columns.quats.iter_mut().for_each(|x| *x = draws.normal() as f32);
     columns.scales.iter_mut().for_each(|x| *x = (draws.normal() * 1.5 - 4.0) as f32);
+    // Nearly opaque, so that footprints have their full extent.
+    columns.opacities.fill(6.0);
     let mut state = SceneState::from_columns(columns);
     for step in 0..12 {
         let listed: Vec<u32> = (0..rows as u32).filter(|_| draws.below(3) == 0).collect();
@@ -116,6 +120,25 @@ fn no_row_that_would_be_drawn_is_left_out() {
     // The cull takes the largest sigma for every direction, which costs a third here, with needles up to the size of
     // the scene and views whose principal point lies outside of the picture.
     assert!(drawn > 4000 && listed * 2 < drawn * 3, "{listed} listed for {drawn} drawn");
+}
+
+#[test]
+fn no_row_that_the_projection_kernel_draws_is_left_out() {
+    let simd = SimdPath::best();
+    let adam = DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), simd);
+    let state = scene(20_000, &adam);
+    let mut draws = Stream::new(3, Purpose::Test, 1, 2);
+    let (mut drawn, mut out, mut projected) = (0, Vec::new(), Projected::default());
+    for now in 12..212 {
+        let camera = camera(&mut draws);
+        visible_rows(&state, &adam, now, &camera, &mut out);
+        project_fwd(&evaluate_all(&state, &adam, now), &camera, EPS2D, simd, &mut projected);
+        for (row, radii) in projected.radii.iter().enumerate().filter(|(_, r)| **r != [0, 0]) {
+            drawn += 1;
+            assert!(out.binary_search(&(row as u32)).is_ok(), "row {row} with radii {radii:?} is missing");
+        }
+    }
+    assert!(drawn > 50_000, "{drawn}");
 }
 
 #[test]
