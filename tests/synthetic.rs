@@ -2,6 +2,8 @@
 //! threads, photos that agree with their poses, and no half-written or silently replaced folders.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // test code: a panic is a failure
 
+use gsscale::dataset::read::ReadOptions;
+use gsscale::dataset::colmap::read_colmap;
 use gsscale::dataset::synthetic::{CityOptions, CitySummary, write_city};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -182,6 +184,25 @@ fn counts_sizes_and_tracks_are_as_asked() {
     // With eight photos over one block nearly every place is seen twice.
     let lonely = scene.points.iter().filter(|p| p.track.len() < 2).count();
     assert!(lonely < 60, "{lonely} of 600 points have one observation only");
+}
+
+#[test]
+fn the_colmap_reader_finds_nothing_to_complain_about() {
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), &CityOptions { offset: [5e5, 4.6e6, 0.0], ..small() });
+    let raw = read_colmap(folder.path(), &ReadOptions::default()).unwrap();
+    assert_eq!(raw.warnings, Vec::<String>::new());
+    let scene = read_scene(folder.path());
+    assert_eq!(raw.points.positions, scene.points.iter().map(|p| p.xyz).collect::<Vec<_>>());
+    assert_eq!(raw.views.len(), 8);
+    for view in &raw.views {
+        assert!(view.image_path.is_file());
+        // Cameras fly 82 m high with a jitter below 2 m; the z offset is 0. A UTM translation of 4.6e6 m times the
+        // rounding of a unit quaternion (1e-16) moves them by far less than a millimetre.
+        let centre = view.pose.centre();
+        assert!((centre.z - 82.0).abs() < 2.0, "{centre}");
+        assert!((centre.x - 5e5).abs() < 200.0 && (centre.y - 4.6e6).abs() < 200.0, "{centre}");
+    }
 }
 
 /// The proof that poses, photos and points belong together: projecting points through the written poses lands on

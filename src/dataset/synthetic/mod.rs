@@ -45,7 +45,8 @@ pub struct CityOptions {
     pub height: u32,
     /// Points to sample, up to 50 million.
     pub points: u32,
-    /// Side of the city in blocks of 60 m, 1 to 400; `None` takes what the views cover at full overlap.
+    /// Side of the city in blocks of 60 m, 1 to 150 (each takes about 0.15 MB of memory); `None` takes what
+    /// the views cover at full overlap.
     pub blocks: Option<u32>,
     /// Standard deviation of the gain of the photos (0.03 is 3 %), 0 to 0.3.
     pub exposure: f64,
@@ -110,7 +111,7 @@ fn check(options: &CityOptions) -> InputResult<()> {
     in_range("--resolution", f64::from(options.width), 16.0, 16_384.0)?;
     in_range("--resolution", f64::from(options.height), 16.0, 16_384.0)?;
     in_range("--points", f64::from(options.points), 0.0, 50e6)?;
-    in_range("--blocks", f64::from(options.blocks.unwrap_or(1)), 1.0, 400.0)?;
+    in_range("--blocks", f64::from(options.blocks.unwrap_or(1)), 1.0, 150.0)?;
     in_range("--exposure", options.exposure, 0.0, 0.3)?;
     in_range("--noise", options.noise, 0.0, 0.3)?;
     in_range("--supersample", f64::from(options.supersample), 1.0, 8.0)?;

@@ -302,7 +302,7 @@ impl Skin {
         let moss = (noise.layers(u, v, w, &[(3.0, 0.7), (0.8, 0.4)]) - 0.35 - 0.06 * v as f32).clamp(0.0, 0.6);
         albedo = mix(albedo, paint(0.36, 0.38, 0.26), moss);
         albedo = mix(albedo, self.accent, cover(v, p.height - 0.25, p.height + 1.0, w));
-        if self.seed % 5 == 0 && p.width > 6.0 {
+        if self.seed.is_multiple_of(5) && p.width > 6.0 {
             let (low, high) = (p.width * 0.2, p.width * 0.2 + 1.0 * (p.width * 0.55).max(2.0));
             let on = cover(p.u, low, high, w) * cover(v, p.height * 0.25, p.height * 0.8, w);
             let panel = solar(p.u - low, v - p.height * 0.25, w);
