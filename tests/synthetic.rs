@@ -2,8 +2,8 @@
 //! threads, photos that agree with their poses, and no half-written or silently replaced folders.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // test code: a panic is a failure
 
-use gsscale::dataset::read::ReadOptions;
 use gsscale::dataset::colmap::read_colmap;
+use gsscale::dataset::read::ReadOptions;
 use gsscale::dataset::synthetic::{CityOptions, CitySummary, write_city};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -294,6 +294,12 @@ fn a_folder_with_something_in_it_is_refused_unless_told_otherwise() {
     let found = files(folder.path());
     assert_eq!(found.len(), 1 + 4 + 3, "{:?}", found.keys());
     assert_eq!(std::fs::read_to_string(notes).unwrap(), "mine", "overwriting touched a foreign file");
+    // Real photos are worth more than a flag.
+    std::fs::write(folder.path().join("images/DSC_0001.jpg"), "a photo").unwrap();
+    let before = files(folder.path());
+    let error = write_city(folder.path(), &CityOptions { overwrite: true, ..small() }, &|_, _| {}).unwrap_err();
+    assert!(error.to_string().contains("DSC_0001.jpg"), "{error}");
+    assert!(files(folder.path()) == before);
 }
 
 #[test]

@@ -159,33 +159,53 @@ fn photo_name(k: usize, views: u32) -> String {
     format!("view_{k:0digits$}.jpg")
 }
 
-/// Makes the folders; with `overwrite` takes away the scene that is there, and only what a scene consists of.
+/// Makes the folders; with `overwrite` takes away the scene that is there, but never photos that are not ours.
 fn prepare(folder: &Path, overwrite: bool) -> InputResult<()> {
-    let failed = |path: &Path, doing: &str| {
-        let path = path.to_path_buf();
-        let doing = doing.to_string();
-        move |e: std::io::Error| InputError::io(&path, &doing, &e)
-    };
-    std::fs::create_dir_all(folder).map_err(failed(folder, "making the folder"))?;
-    let mut entries = std::fs::read_dir(folder).map_err(failed(folder, "listing the folder"))?;
-    if entries.next().is_some() {
+    make_folder(folder)?;
+    let images = folder.join("images");
+    if !list(folder)?.is_empty() {
         if !overwrite {
             return Err(InputError::new(
                 folder,
                 "the folder is not empty",
-                "choose another folder, or --overwrite to replace the scene in it",
+                "choose another folder, or --overwrite to replace the generated scene in it",
+            ));
+        }
+        let photos = if images.is_dir() { list(&images)? } else { Vec::new() };
+        if let Some(foreign) = photos.iter().find(|name| !is_photo_name(name)) {
+            return Err(InputError::new(
+                &images,
+                format!("'{foreign}' is no photo of a generated city, so nothing is overwritten"),
+                "choose another folder",
             ));
         }
         // The model goes first: without it the rest is no scene.
         for name in ["sparse", "sparse.partial", "images"] {
             let path = folder.join(name);
             if path.symlink_metadata().is_ok_and(|m| m.is_dir()) {
-                std::fs::remove_dir_all(&path).map_err(failed(&path, "removing the old scene"))?;
+                std::fs::remove_dir_all(&path).map_err(|e| InputError::io(&path, "removing the old scene", &e))?;
             }
         }
     }
-    let images = folder.join("images");
-    std::fs::create_dir_all(&images).map_err(failed(&images, "making the folder"))
+    make_folder(&images)
+}
+
+fn make_folder(path: &Path) -> InputResult<()> {
+    std::fs::create_dir_all(path).map_err(|e| InputError::io(path, "making the folder", &e))
+}
+
+/// Names of what is in a folder.
+fn list(folder: &Path) -> InputResult<Vec<String>> {
+    let names = std::fs::read_dir(folder)
+        .and_then(|entries| entries.map(|e| Ok(e?.file_name().to_string_lossy().into_owned())).collect());
+    names.map_err(|e: std::io::Error| InputError::io(folder, "listing the folder", &e))
+}
+
+/// Whether [`photo_name`] makes such names (what a broken run leaves counts too).
+fn is_photo_name(name: &str) -> bool {
+    let name = name.strip_suffix(".partial").unwrap_or(name);
+    let number = name.strip_prefix("view_").and_then(|n| n.strip_suffix(".jpg"));
+    number.is_some_and(|n| n.len() >= 4 && n.bytes().all(|b| b.is_ascii_digit()))
 }
 
 /// Takes and writes all photos; returns the rays cast.
