@@ -2,7 +2,7 @@
 //!
 //! Invariants: 1. a pixel depends on (scene, shot, options, view, pixel) alone, so photos have the same bytes for
 //! any number of threads; 2. a pixel gets either one ray, with textures averaged over the whole pixel, or
-//! `supersample`^2 rays; the choice looks only at the first rays of the pixel and its eight neighbours.
+//! up to `supersample`^2 more; the choice looks only at rays of the pixel and the first rays of its neighbours.
 
 use super::CityOptions;
 use super::flight::Shot;
@@ -59,8 +59,10 @@ pub(super) fn take(scene: &Scene, k: &Intrinsics, shot: &Shot, view: u32, option
             for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
                 let mut light = first[y * width + x].light;
                 if options.supersample > 1 && is_mixed(&first, width, height, x, y) {
-                    light = many_rays(scene, k, shot, (x, y), options.supersample, spread);
-                    extra += u64::from(options.supersample).pow(2);
+                    let own = &first[y * width + x];
+                    let (mean, rays) = many_rays(scene, k, shot, (x, y), options.supersample, own);
+                    light = mean;
+                    extra += rays;
                 }
                 let mut value = tone(light) * gain;
                 if options.noise > 0.0 {
@@ -91,15 +93,41 @@ fn is_mixed(first: &[Sample], width: usize, height: usize, x: usize, y: usize) -
     high - low > CONTRAST * (high + low)
 }
 
-/// Mean light of n x n rays through one pixel. Bright spots are held at twice white, as a sensor's pixel would.
-fn many_rays(scene: &Scene, k: &Intrinsics, shot: &Shot, (x, y): (usize, usize), n: u32, spread: f64) -> Vec3 {
+/// Mean light of n x n rays through one pixel, and the rays cast. The four outermost are cast first: when they and
+/// the pixel's first ray agree, the border that called for more rays runs through a neighbour, and they suffice.
+fn many_rays(
+    scene: &Scene,
+    k: &Intrinsics,
+    shot: &Shot,
+    (x, y): (usize, usize),
+    n: u32,
+    first: &Sample,
+) -> (Vec3, u64) {
     let cell = 1.0 / f64::from(n);
-    let mut sum = Vec3::ZERO;
+    let spread = cell / k.fx;
+    let cast = |i: u32, j: u32| {
+        let (px, py) = (x as f64 + (f64::from(i) + 0.5) * cell, y as f64 + (f64::from(j) + 0.5) * cell);
+        let sample = scene.sample(&shot.ray(k, px, py), spread);
+        // Bright spots are held at twice white, as a sensor's pixel would.
+        Sample { light: sample.light.min(Vec3::splat(2.0)), ..sample }
+    };
+    let corners = [(0, 0), (n - 1, 0), (0, n - 1), (n - 1, n - 1)].map(|(i, j)| cast(i, j));
+    let mut sum = corners[0].light + corners[1].light + corners[2].light + corners[3].light;
+    if n == 2 {
+        return (sum / 4.0, 4);
+    }
+    let (low, high) =
+        corners.iter().fold((first.light.y, first.light.y), |(low, high), s| (low.min(s.light.y), high.max(s.light.y)));
+    if corners.iter().all(|s| s.surface == first.surface) && high - low <= CONTRAST * (high + low) {
+        return ((sum + first.light) / 5.0, 4);
+    }
     for j in 0..n {
         for i in 0..n {
-            let (px, py) = (x as f64 + (f64::from(i) + 0.5) * cell, y as f64 + (f64::from(j) + 0.5) * cell);
-            sum += scene.sample(&shot.ray(k, px, py), spread * cell).light.min(Vec3::splat(2.0));
+            let is_corner = (i == 0 || i == n - 1) && (j == 0 || j == n - 1);
+            if !is_corner {
+                sum += cast(i, j).light;
+            }
         }
     }
-    sum / (n * n) as f32
+    (sum / (n * n) as f32, u64::from(n * n))
 }
