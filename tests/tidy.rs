@@ -130,7 +130,7 @@ fn functions_stay_readable() {
             let code = line.trim_start();
             let is_function =
                 ["fn ", "pub fn ", "pub(crate) fn ", "pub(super) fn "].iter().any(|p| code.starts_with(p));
-            if !is_function {
+            if !is_function || line.ends_with('}') {
                 continue;
             }
             let closing = format!("{}}}", " ".repeat(line.len() - code.len()));

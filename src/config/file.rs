@@ -159,7 +159,7 @@ impl Serialize for ByteSize {
         let units = [(1u64 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")];
         let text = units
             .iter()
-            .find(|(unit, _)| self.0 > 0 && self.0 % unit == 0)
+            .find(|(unit, _)| self.0 > 0 && self.0.is_multiple_of(*unit))
             .map_or_else(|| self.0.to_string(), |(unit, name)| format!("{}{name}", self.0 / unit));
         s.serialize_str(&text)
     }

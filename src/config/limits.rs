@@ -93,7 +93,8 @@ impl RunOptions {
 
     /// Bands in use at 0-based `step`.
     pub fn sh_degree_at(&self, step: u32) -> u8 {
-        if self.sh_every == 0 { self.sh_degree } else { (step / self.sh_every).min(u32::from(self.sh_degree)) as u8 }
+        let raised = step.checked_div(self.sh_every).unwrap_or(u32::MAX);
+        raised.min(u32::from(self.sh_degree)) as u8
     }
 }
 

@@ -48,10 +48,13 @@ pub fn read_header(path: &Path) -> InputResult<PhotoHeader> {
     if bytes == 0 {
         return Err(InputError::new(path, "the photo is empty (0 bytes)", COPY_AGAIN));
     }
+    // The shortest picture of either format is longer than its two signatures together.
+    if bytes < 16 {
+        return Err(InputError::new(path, format!("the photo is cut short ({bytes} bytes)"), COPY_AGAIN));
+    }
     let mut reader = HeaderReader { path, file: BufReader::with_capacity(4096, file), bytes };
     let mut magic = [0u8; 16];
-    let have = bytes.min(16) as usize;
-    reader.read(&mut magic[..have], "its first bytes")?;
+    reader.read(&mut magic, "its first bytes")?;
     if magic.starts_with(&[0xff, 0xd8]) {
         reader.jpeg()
     } else if magic.starts_with(b"\x89PNG\r\n\x1a\n") {

@@ -213,7 +213,7 @@ impl Trainer {
             let step = self.step;
             let outcome = self.step(dataset, targets)?;
             let is_last = self.step == self.options.steps;
-            let due = |every: u32| every > 0 && step > 0 && step % every == 0;
+            let due = |every: u32| step > 0 && step.is_multiple_of(every);
             let psnr = json_psnr(-10.0 * outcome.loss.mse.log10());
             if due(self.options.eval_every) && !is_last {
                 last_test = self.evaluate(dataset, targets, None)?;
@@ -221,7 +221,7 @@ impl Trainer {
             if due(self.options.save_every) && !is_last {
                 self.save(dataset, &outputs.out.join(format!("point_cloud_{step:06}.ply")))?;
             }
-            if step % self.options.log_every == 0 || is_last || due(self.options.eval_every) {
+            if step.is_multiple_of(self.options.log_every) || is_last || due(self.options.eval_every) {
                 outputs.metrics.write(&StepLine {
                     step,
                     loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },
