@@ -47,49 +47,55 @@ pub struct FootprintGradients {
     pub v_opacities: Vec<f32>,
 }
 
+/// State of one row of a tile on its way back. One block of memory, so that the compiler sees that its parts do not
+/// overlap.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+struct Row {
+    /// T in front of the splats passed so far (first: T behind everything).
+    t: Lanes,
+    /// What lies behind: the sum of weight (color . v_rgb), and the background's part.
+    behind: Lanes,
+    v_rgb: [Lanes; 3],
+    /// List index at which the lane stopped: it takes no part there and beyond.
+    stop: [u32; LANES],
+}
+
 /// State of one tile on its way back.
 struct Tile {
-    /// T in front of the splats passed so far (first: T behind everything).
-    t: [Lanes; ROWS],
-    /// dL/dT of the part behind, times T: the sum of weight (color . v_rgb) behind, and the background's part.
-    behind: [Lanes; ROWS],
-    v_rgb: [[Lanes; 3]; ROWS],
-    stop: [[u32; LANES]; ROWS],
-    /// Largest stop of each row: the row takes no part at or beyond it.
+    rows: [Row; ROWS],
+    /// Largest stop of each row.
     row_stop: [u32; ROWS],
 }
 
 impl Tile {
+    #[inline(always)]
     fn load(lists: &Lists<'_>, raster: &Raster, upstream: &Upstream<'_>, tile: usize) -> Self {
         let grid = lists.grid;
         let (tx, ty) = grid.position(tile);
         let columns = (grid.width - tx * TILE).min(TILE) as usize;
         let rows = (grid.height - ty * TILE).min(TILE) as usize;
         let pixels = grid.width as usize * grid.height as usize;
-        let mut state = Tile {
-            t: [[0.0; LANES]; ROWS],
-            behind: [[0.0; LANES]; ROWS],
-            v_rgb: [[[0.0; LANES]; 3]; ROWS],
-            stop: [[0; LANES]; ROWS],
-            row_stop: [0; ROWS],
-        };
-        for row in 0..rows {
+        let empty = Row { t: [0.0; LANES], behind: [0.0; LANES], v_rgb: [[0.0; LANES]; 3], stop: [0; LANES] };
+        let mut state = Tile { rows: [empty; ROWS], row_stop: [0; ROWS] };
+        for (row, out) in state.rows[..rows].iter_mut().enumerate() {
             let from = (ty as usize * ROWS + row) * grid.width as usize + tx as usize * LANES;
             for c in 0..3 {
-                state.v_rgb[row][c][..columns].copy_from_slice(&upstream.v_rgb[c * pixels + from..][..columns]);
+                out.v_rgb[c][..columns].copy_from_slice(&upstream.v_rgb[c * pixels + from..][..columns]);
             }
             let within = tile * TILE_PIXELS + row * LANES;
+            let v_alpha = upstream.v_alpha.map(|v| &v[from..from + columns]);
             for lane in 0..columns {
                 let t = raster.t_final[within + lane];
-                let mut v = -upstream.v_alpha.map_or(0.0, |v| v[from + lane]);
+                let mut v = -v_alpha.map_or(0.0, |v| v[lane]);
                 for c in 0..3 {
-                    v += lists.background[c] * state.v_rgb[row][c][lane];
+                    v += lists.background[c] * out.v_rgb[c][lane];
                 }
-                state.t[row][lane] = t;
-                state.behind[row][lane] = t * v;
-                state.stop[row][lane] = raster.stop[within + lane];
-                state.row_stop[row] = state.row_stop[row].max(raster.stop[within + lane]);
+                out.t[lane] = t;
+                out.behind[lane] = t * v;
             }
+            out.stop[..columns].copy_from_slice(&raster.stop[within..within + columns]);
+            state.row_stop[row] = out.stop.iter().fold(0, |m, s| m.max(*s));
         }
         state
     }
@@ -118,14 +124,13 @@ impl Kernel for BackTile<'_> {
             let local = InTile::new::<FMA>(splat, x0, y0);
             let top = if splat.log2_opacity < cap { splat.log2_opacity } else { cap };
             let mut acc = Sums::default();
-            for row in usize::from(isect.rows[0])..=usize::from(isect.rows[1]) {
-                if at as u32 >= state.row_stop[row] {
-                    continue;
+            for row in usize::from(isect.rows[0])..usize::from(isect.rows[1]) + 1 {
+                if (at as u32) < state.row_stop[row] {
+                    back_row::<FMA>(&mut state.rows[row], at as u32, &local, row, [top, cap], splat.color, &mut acc);
                 }
-                back_row::<FMA>(state, row, at as u32, &local, top, cap, splat.color, &mut acc);
             }
             let out = &partials[(offsets[isect.rank as usize] + u64::from(isect.k)) as usize];
-            for (out, sum) in out.iter().zip(acc.reduce::<FMA>(&local.dx)) {
+            for (out, sum) in out.iter().zip(acc.reduce(&local.dx)) {
                 out.store(sum.to_bits(), Relaxed);
             }
         }
@@ -134,6 +139,7 @@ impl Kernel for BackTile<'_> {
 
 /// Sums of one splat in one tile, by lane.
 #[derive(Clone, Copy, Default)]
+#[repr(C, align(64))]
 struct Sums {
     h: Lanes,
     hy: Lanes,
@@ -143,74 +149,54 @@ struct Sums {
 
 impl Sums {
     /// The nine sums over lanes; dx is constant in a lane, so its moments are formed here.
+    /// Halves upon halves, the same order on every path.
     #[inline(always)]
-    fn reduce<const FMA: bool>(&self, dx: &Lanes) -> [f32; SUMS] {
-        let times_dx = |v: &Lanes| std::array::from_fn(|lane| v[lane] * dx[lane]);
+    fn reduce(&self, dx: &Lanes) -> [f32; SUMS] {
+        let times_dx = |v: &Lanes| -> Lanes { std::array::from_fn(|lane| v[lane] * dx[lane]) };
         let hx = times_dx(&self.h);
-        let hxx = times_dx(&hx);
-        let hxy = times_dx(&self.hy);
-        [
-            sum(&self.h),
-            sum(&hx),
-            sum(&self.hy),
-            sum(&hxx),
-            sum(&hxy),
-            sum(&self.hyy),
-            sum(&self.rgb[0]),
-            sum(&self.rgb[1]),
-            sum(&self.rgb[2]),
-        ]
+        let [red, green, blue] = self.rgb;
+        let all = [self.h, hx, self.hy, times_dx(&hx), times_dx(&self.hy), self.hyy, red, green, blue];
+        all.map(|v| {
+            let eight: [f32; 8] = std::array::from_fn(|i| v[i] + v[i + 8]);
+            let four: [f32; 4] = std::array::from_fn(|i| eight[i] + eight[i + 4]);
+            (four[0] + four[2]) + (four[1] + four[3])
+        })
     }
 }
 
-/// Sum over lanes: halves upon halves, the same order on every path.
-#[inline(always)]
-fn sum(v: &Lanes) -> f32 {
-    let mut eight = [0.0; 8];
-    for i in 0..8 {
-        eight[i] = v[i] + v[i + 8];
-    }
-    let mut four = [0.0; 4];
-    for i in 0..4 {
-        four[i] = eight[i] + eight[i + 4];
-    }
-    (four[0] + four[2]) + (four[1] + four[3])
-}
-
+/// One row of a tile through one splat.
 #[inline(always)]
 fn back_row<const FMA: bool>(
-    state: &mut Tile,
-    row: usize,
+    row: &mut Row,
     at: u32,
     local: &InTile,
-    top: f32,
-    cap: f32,
+    y: usize,
+    [top, cap]: [f32; 2],
     color: [f32; 3],
     acc: &mut Sums,
 ) {
-    let (dy, bdy, cdy) = (local.dy[row], local.bdy[row], local.cdy[row]);
-    let [v_red, v_green, v_blue] = &state.v_rgb[row];
-    let (t, behind, stop) = (&mut state.t[row], &mut state.behind[row], &state.stop[row]);
+    let (dy, bdy, cdy) = (local.dy[y], local.bdy[y], local.cdy[y]);
     for lane in 0..LANES {
         let e = fma::<FMA>(local.adx[lane] + bdy, local.dx[lane], cdy);
         let clamped = if e < top { e } else { top };
-        let active = e >= LOG2_ALPHA_MIN && at < stop[lane];
+        let active = (e >= LOG2_ALPHA_MIN) & (at < row.stop[lane]);
         let alpha = if active { exp2_bounded::<FMA>(clamped) } else { 0.0 };
         let over = 1.0 / (1.0 - alpha);
-        let before = t[lane] * over;
+        let before = row.t[lane] * over;
         let weight = alpha * before;
-        let q = fma::<FMA>(color[0], v_red[lane], fma::<FMA>(color[1], v_green[lane], color[2] * v_blue[lane]));
+        let [v_red, v_green, v_blue] = [row.v_rgb[0][lane], row.v_rgb[1][lane], row.v_rgb[2][lane]];
+        let q = fma::<FMA>(color[0], v_red, fma::<FMA>(color[1], v_green, color[2] * v_blue));
         // alpha dL/dalpha = T alpha (color . v) - alpha / (1 - alpha) (what lies behind)
-        let h = fma::<FMA>(weight, q, -(alpha * over) * behind[lane]);
+        let h = fma::<FMA>(weight, q, -(alpha * over) * row.behind[lane]);
         let h = if e <= cap { h } else { 0.0 };
-        t[lane] = before;
-        behind[lane] = fma::<FMA>(weight, q, behind[lane]);
+        row.t[lane] = before;
+        row.behind[lane] = fma::<FMA>(weight, q, row.behind[lane]);
         acc.h[lane] += h;
         acc.hy[lane] = fma::<FMA>(h, dy, acc.hy[lane]);
         acc.hyy[lane] = fma::<FMA>(h, dy * dy, acc.hyy[lane]);
-        acc.rgb[0][lane] = fma::<FMA>(weight, v_red[lane], acc.rgb[0][lane]);
-        acc.rgb[1][lane] = fma::<FMA>(weight, v_green[lane], acc.rgb[1][lane]);
-        acc.rgb[2][lane] = fma::<FMA>(weight, v_blue[lane], acc.rgb[2][lane]);
+        acc.rgb[0][lane] = fma::<FMA>(weight, v_red, acc.rgb[0][lane]);
+        acc.rgb[1][lane] = fma::<FMA>(weight, v_green, acc.rgb[1][lane]);
+        acc.rgb[2][lane] = fma::<FMA>(weight, v_blue, acc.rgb[2][lane]);
     }
 }
 

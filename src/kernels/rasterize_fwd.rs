@@ -120,6 +120,7 @@ pub fn log2_max_alpha(max_alpha: f32, simd: SimdPath) -> f32 {
 
 /// A splat against one tile: what is constant along rows, and what is constant along columns.
 #[derive(Clone, Copy)]
+#[repr(C, align(64))]
 pub(super) struct InTile {
     pub dx: Lanes,
     pub adx: Lanes,
@@ -150,12 +151,20 @@ impl InTile {
     }
 }
 
+/// State of one row of a tile that every splat touches. One block of memory, so that the compiler sees that its parts
+/// do not overlap.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+struct Row {
+    t: Lanes,
+    /// T at or below which the lane stops; -1 for dead lanes.
+    floor: Lanes,
+    rgb: [Lanes; 3],
+}
+
 /// State of one tile.
 struct Tile {
-    t: [Lanes; ROWS],
-    rgb: [[Lanes; 3]; ROWS],
-    /// T at or below which the lane stops; -1 for dead lanes.
-    floor: [Lanes; ROWS],
+    rows: [Row; ROWS],
     t_final: [Lanes; ROWS],
     stop: [[u32; LANES]; ROWS],
     /// Bit by row: some lane lives.
@@ -163,22 +172,22 @@ struct Tile {
 }
 
 impl Tile {
+    #[inline(always)]
     fn new(grid: Grid, tile: usize) -> Self {
         let (tx, ty) = grid.position(tile);
         let columns = (grid.width - tx * TILE).min(TILE) as usize;
         let rows = (grid.height - ty * TILE).min(TILE) as usize;
+        let dead = Row { t: [0.0; LANES], floor: [-1.0; LANES], rgb: [[0.0; LANES]; 3] };
+        let mut live = dead;
+        live.t[..columns].fill(1.0);
+        live.floor[..columns].fill(TRANSMITTANCE_MIN);
         let mut state = Tile {
-            t: [[0.0; LANES]; ROWS],
-            rgb: [[[0.0; LANES]; 3]; ROWS],
-            floor: [[-1.0; LANES]; ROWS],
+            rows: [dead; ROWS],
             t_final: [[0.0; LANES]; ROWS],
             stop: [[NEVER; LANES]; ROWS],
             alive: (1u32 << rows) - 1,
         };
-        for row in 0..rows {
-            state.t[row][..columns].fill(1.0);
-            state.floor[row][..columns].fill(TRANSMITTANCE_MIN);
-        }
+        state.rows[..rows].fill(live);
         state
     }
 
@@ -186,34 +195,33 @@ impl Tile {
     #[cold]
     #[inline(never)]
     fn stop_lanes(&mut self, row: usize, at: u32, next: &mut Lanes, weight: &mut Lanes) {
+        let Row { t, floor, .. } = &mut self.rows[row];
         for lane in 0..LANES {
-            if next[lane] <= self.floor[row][lane] {
-                self.t_final[row][lane] = self.t[row][lane];
+            if next[lane] <= floor[lane] {
+                self.t_final[row][lane] = t[lane];
                 self.stop[row][lane] = at;
-                self.floor[row][lane] = -1.0;
+                floor[lane] = -1.0;
                 next[lane] = 0.0;
                 weight[lane] = 0.0;
             }
         }
-        if self.floor[row].iter().all(|&f| f < 0.0) {
+        if floor.iter().all(|&f| f < 0.0) {
             self.alive &= !(1 << row);
         }
     }
 
-    fn write(&mut self, background: [f32; 3], rgb: &mut [f32], t_final: &mut [f32], stop: &mut [u32]) {
-        for row in 0..ROWS {
-            for lane in 0..LANES {
-                if self.floor[row][lane] > 0.0 {
-                    self.t_final[row][lane] = self.t[row][lane];
-                }
-            }
+    fn write(&self, background: [f32; 3], rgb: &mut [f32], t_final: &mut [f32], stop: &mut [u32]) {
+        for (row, state) in self.rows.iter().enumerate() {
             let at = row * LANES..(row + 1) * LANES;
-            t_final[at.clone()].copy_from_slice(&self.t_final[row]);
+            let t_out = &mut t_final[at.clone()];
+            for lane in 0..LANES {
+                t_out[lane] = if state.floor[lane] > 0.0 { state.t[lane] } else { self.t_final[row][lane] };
+            }
             stop[at].copy_from_slice(&self.stop[row]);
             for c in 0..3 {
                 let out = &mut rgb[c * TILE_PIXELS + row * LANES..][..LANES];
                 for lane in 0..LANES {
-                    out[lane] = self.rgb[row][c][lane] + self.t_final[row][lane] * background[c];
+                    out[lane] = state.rgb[c][lane] + t_out[lane] * background[c];
                 }
             }
         }
@@ -242,12 +250,11 @@ impl Kernel for BlendTile<'_> {
             let splat = &lists.splats[isect.rank as usize];
             let local = InTile::new::<FMA>(splat, x0, y0);
             let top = if splat.log2_opacity < cap { splat.log2_opacity } else { cap };
-            for row in usize::from(isect.rows[0])..=usize::from(isect.rows[1]) {
-                if state.alive >> row & 1 == 0 {
-                    continue;
+            for row in usize::from(isect.rows[0])..usize::from(isect.rows[1]) + 1 {
+                if state.alive >> row & 1 != 0 {
+                    rows_done += 1;
+                    blend_row::<FMA>(state, row, at as u32, &local, top, splat.color);
                 }
-                rows_done += 1;
-                blend_row::<FMA>(state, row, at as u32, &local, top, splat.color);
             }
             if state.alive == 0 {
                 break;
@@ -260,27 +267,28 @@ impl Kernel for BlendTile<'_> {
 #[inline(always)]
 fn blend_row<const FMA: bool>(state: &mut Tile, row: usize, at: u32, local: &InTile, top: f32, color: [f32; 3]) {
     let (bdy, cdy) = (local.bdy[row], local.cdy[row]);
-    let mut weight = [0.0; LANES];
-    let mut next = [0.0; LANES];
+    let (mut weight, mut next) = ([0.0; LANES], [0.0; LANES]);
     let mut stops = false;
+    let before = &state.rows[row];
     for lane in 0..LANES {
         let e = fma::<FMA>(local.adx[lane] + bdy, local.dx[lane], cdy);
         let clamped = if e < top { e } else { top };
         let alpha = if e >= LOG2_ALPHA_MIN { exp2_bounded::<FMA>(clamped) } else { 0.0 };
-        let t = state.t[row][lane];
+        let t = before.t[lane];
         weight[lane] = alpha * t;
         next[lane] = fma::<FMA>(-alpha, t, t);
-        stops |= next[lane] <= state.floor[row][lane];
+        stops |= next[lane] <= before.floor[lane];
     }
     if stops {
         let (mut n, mut w) = (next, weight);
         state.stop_lanes(row, at, &mut n, &mut w);
         (next, weight) = (n, w);
     }
-    state.t[row] = next;
+    let after = &mut state.rows[row];
+    after.t = next;
     for c in 0..3 {
         for lane in 0..LANES {
-            state.rgb[row][c][lane] = fma::<FMA>(weight[lane], color[c], state.rgb[row][c][lane]);
+            after.rgb[c][lane] = fma::<FMA>(weight[lane], color[c], after.rgb[c][lane]);
         }
     }
 }
@@ -374,10 +382,10 @@ pub(in crate::kernels) mod tests {
         let mut s = Scene { grid, splats: vec![], offsets: vec![], tile_offsets: vec![], isects: vec![] };
         let (mut counts, mut tile_counts, mut cursors) = (vec![], vec![], vec![]);
         pack(&order, &p, &colors, grid, &mut s.splats);
-        count(&s.splats, grid, &mut counts, &mut tile_counts);
+        count(&s.splats, grid, SimdPath::best(), &mut counts, &mut tile_counts);
         let total = scan(&counts, &mut s.offsets);
         isect_offsets(&tile_counts, grid.tiles(), &mut s.tile_offsets, &mut cursors);
-        emit(&s.splats, grid, total, &mut cursors, &mut s.isects);
+        emit(&s.splats, grid, SimdPath::best(), total, &mut cursors, &mut s.isects);
         s
     }
 
