@@ -3,11 +3,13 @@
 //! Invariants: 1. a row's tiles are enumerated column by column (tile x outer, tile y inner), and the k-th of them has
 //! emit index `offset[rank] + k`: per-row sums are folded in that order; 2. a tile, and a pixel row of a tile, is left
 //! out only where every pixel's alpha is computed below 1/255, so leaving it out cannot change the image;
-//! 3. [`count`] and [`emit`] walk through the same enumeration; 4. the result does not depend on the number of threads.
+//! 3. [`count`] and [`emit`] walk through the same enumeration, with the same bits on every
+//! path (nothing is contracted); 4. the result does not depend on the number of threads.
 
 use super::constants::TILE;
 use super::radix_sort::chunk_len;
 use super::splats::{Grid, Splat};
+use crate::base::simd::{Kernel, SimdPath, dispatch};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -67,7 +69,7 @@ fn for_each_tile(splat: &Splat, grid: Grid, mut each: impl FnMut(usize, [u8; 2])
 }
 
 /// Counts intersections: `counts` by rank, `tile_counts` as `[chunks][tiles]` for [`super::isect_offsets`].
-pub fn count(splats: &[Splat], grid: Grid, counts: &mut Vec<u32>, tile_counts: &mut Vec<u32>) {
+pub fn count(splats: &[Splat], grid: Grid, simd: SimdPath, counts: &mut Vec<u32>, tile_counts: &mut Vec<u32>) {
     let tiles = grid.tiles();
     let len = chunk_len(splats.len(), RANKS_PER_CHUNK, CHUNKS_MAX);
     counts.resize(splats.len(), 0);
@@ -79,19 +81,42 @@ pub fn count(splats: &[Splat], grid: Grid, counts: &mut Vec<u32>, tile_counts: &
     }
     let chunks = splats.par_chunks(len).zip(counts.par_chunks_mut(len));
     chunks.zip(tile_counts.par_chunks_mut(tiles)).for_each(|((splats, counts), tile_counts)| {
-        for (splat, count) in splats.iter().zip(counts) {
+        dispatch(simd, CountChunk { splats, grid, counts, tile_counts });
+    });
+}
+
+struct CountChunk<'a> {
+    splats: &'a [Splat],
+    grid: Grid,
+    counts: &'a mut [u32],
+    tile_counts: &'a mut [u32],
+}
+
+impl Kernel for CountChunk<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        for (splat, count) in self.splats.iter().zip(self.counts) {
             *count = 0;
-            for_each_tile(splat, grid, |tile, _| {
-                tile_counts[tile] += 1;
+            for_each_tile(splat, self.grid, |tile, _| {
+                self.tile_counts[tile] += 1;
                 *count += 1;
             });
         }
-    });
+    }
 }
 
 /// Writes each intersection (as [`Isect::pack`]) to its place in its tile's list. `cursors` comes from
 /// [`super::isect_offsets`] and is used up; `isects` is resized to `total`.
-pub fn emit(splats: &[Splat], grid: Grid, total: u64, cursors: &mut [u64], isects: &mut Vec<AtomicU64>) {
+pub fn emit(
+    splats: &[Splat],
+    grid: Grid,
+    simd: SimdPath,
+    total: u64,
+    cursors: &mut [u64],
+    isects: &mut Vec<AtomicU64>,
+) {
     let tiles = grid.tiles();
     let len = chunk_len(splats.len(), RANKS_PER_CHUNK, CHUNKS_MAX);
     isects.resize_with(total as usize, AtomicU64::default);
@@ -100,16 +125,33 @@ pub fn emit(splats: &[Splat], grid: Grid, total: u64, cursors: &mut [u64], isect
     }
     let isects = &*isects;
     splats.par_chunks(len).zip(cursors.par_chunks_mut(tiles)).enumerate().for_each(|(chunk, (splats, cursors))| {
-        for (i, splat) in splats.iter().enumerate() {
+        dispatch(simd, EmitChunk { splats, grid, first_rank: (chunk * len) as u32, cursors, isects });
+    });
+}
+
+struct EmitChunk<'a> {
+    splats: &'a [Splat],
+    grid: Grid,
+    first_rank: u32,
+    cursors: &'a mut [u64],
+    isects: &'a [AtomicU64],
+}
+
+impl Kernel for EmitChunk<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        for (rank, splat) in (self.first_rank..).zip(self.splats) {
             let mut k = 0;
-            for_each_tile(splat, grid, |tile, rows| {
-                let isect = Isect { rank: (chunk * len + i) as u32, rows, k };
-                isects[cursors[tile] as usize].store(isect.pack(), Relaxed);
-                cursors[tile] += 1;
+            for_each_tile(splat, self.grid, |tile, rows| {
+                let place = &mut self.cursors[tile];
+                self.isects[*place as usize].store(Isect { rank, rows, k }.pack(), Relaxed);
+                *place += 1;
                 k += 1;
             });
         }
-    });
+    }
 }
 
 #[cfg(test)]
@@ -183,11 +225,11 @@ mod tests {
         let splats: Vec<Splat> = (0..5000).map(|_| random_splat(&mut draws, false, grid)).collect();
         let (mut counts, mut tile_counts, mut offsets) = (Vec::new(), Vec::new(), Vec::new());
         let (mut tile_offsets, mut cursors, mut isects) = (Vec::new(), Vec::new(), Vec::new());
-        count(&splats, grid, &mut counts, &mut tile_counts);
+        count(&splats, grid, SimdPath::best(), &mut counts, &mut tile_counts);
         let total = scan(&counts, &mut offsets);
         isect_offsets(&tile_counts, grid.tiles(), &mut tile_offsets, &mut cursors);
         assert_eq!(tile_offsets[grid.tiles()], total);
-        emit(&splats, grid, total, &mut cursors, &mut isects);
+        emit(&splats, grid, SimdPath::best(), total, &mut cursors, &mut isects);
         let mut tiles_of = vec![Vec::new(); splats.len()];
         for tile in 0..grid.tiles() {
             let list = &isects[tile_offsets[tile] as usize..tile_offsets[tile + 1] as usize];

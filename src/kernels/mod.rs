@@ -16,3 +16,4 @@ pub mod sh_fwd;
 pub mod splats;
 mod ssim_band;
 pub mod stages;
+mod tile_block;

@@ -9,15 +9,15 @@
 //! so that a view may be cut at tile columns without changing a bit; 4. threads cannot change a bit.
 
 use super::constants::TILE;
-use super::isect_emit::Isect;
 use super::project_fwd::Projected;
-use super::rasterize_fwd::{InTile, Lanes, Lists, NEVER, Raster, TILE_PIXELS, exp2_bounded, log2_max_alpha};
+use super::rasterize_fwd::{Lanes, Lists, NEVER, Raster, TILE_PIXELS, exp2_bounded, log2_max_alpha};
 use super::splats::LOG2_ALPHA_MIN;
+use super::tile_block::{Block, ROWS};
 use crate::base::simd::{Kernel, LANES, dispatch, fma};
 use rayon::prelude::*;
+use std::cell::RefCell;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
-const ROWS: usize = TILE as usize;
 /// Sums of one intersection: h, hx, hy, hxx, hxy, hyy, red, green, blue.
 pub const SUMS: usize = 9;
 
@@ -47,51 +47,75 @@ pub struct FootprintGradients {
     pub v_opacities: Vec<f32>,
 }
 
+/// State of one row of a tile on its way back. One block of memory, so that the compiler sees that its parts do not
+/// overlap.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+struct Row {
+    /// T in front of the splats passed so far (first: T behind everything).
+    t: Lanes,
+    /// What is seen behind the splats passed so far, dotted with v_rgb, as though nothing stood in front: behind
+    /// everything that is the background, less v_alpha.
+    behind: Lanes,
+    v_rgb: [Lanes; 3],
+    /// List index at which the lane stopped: it takes no part there and beyond.
+    stop: [u32; LANES],
+}
+
+/// Splats that are prepared together: half of a first-level cache with their sums.
+const BLOCK: usize = 32;
+
 /// State of one tile on its way back.
 struct Tile {
-    /// T in front of the splats passed so far (first: T behind everything).
-    t: [Lanes; ROWS],
-    /// dL/dT of the part behind, times T: the sum of weight (color . v_rgb) behind, and the background's part.
-    behind: [Lanes; ROWS],
-    v_rgb: [[Lanes; 3]; ROWS],
-    stop: [[u32; LANES]; ROWS],
-    /// Largest stop of each row: the row takes no part at or beyond it.
+    rows: [Row; ROWS],
+    /// Largest stop of each row.
     row_stop: [u32; ROWS],
+    block: Block<BLOCK>,
+    sums: [Sums; BLOCK],
+}
+
+thread_local! {
+    /// Each thread keeps one: building it anew for every tile would cost as much as going through some hundred splats.
+    static SCRATCH: RefCell<Box<Tile>> = RefCell::new(Box::new(Tile {
+        rows: [Row::EMPTY; ROWS],
+        row_stop: [0; ROWS],
+        block: Block::new(),
+        sums: [Sums::default(); BLOCK],
+    }));
+}
+
+impl Row {
+    const EMPTY: Row = Row { t: [0.0; LANES], behind: [0.0; LANES], v_rgb: [[0.0; LANES]; 3], stop: [0; LANES] };
 }
 
 impl Tile {
-    fn load(lists: &Lists<'_>, raster: &Raster, upstream: &Upstream<'_>, tile: usize) -> Self {
+    fn load(&mut self, lists: &Lists<'_>, raster: &Raster, upstream: &Upstream<'_>, tile: usize) {
         let grid = lists.grid;
         let (tx, ty) = grid.position(tile);
         let columns = (grid.width - tx * TILE).min(TILE) as usize;
         let rows = (grid.height - ty * TILE).min(TILE) as usize;
         let pixels = grid.width as usize * grid.height as usize;
-        let mut state = Tile {
-            t: [[0.0; LANES]; ROWS],
-            behind: [[0.0; LANES]; ROWS],
-            v_rgb: [[[0.0; LANES]; 3]; ROWS],
-            stop: [[0; LANES]; ROWS],
-            row_stop: [0; ROWS],
-        };
-        for row in 0..rows {
+        self.rows = [Row::EMPTY; ROWS];
+        self.row_stop = [0; ROWS];
+        for (row, out) in self.rows[..rows].iter_mut().enumerate() {
             let from = (ty as usize * ROWS + row) * grid.width as usize + tx as usize * LANES;
             for c in 0..3 {
-                state.v_rgb[row][c][..columns].copy_from_slice(&upstream.v_rgb[c * pixels + from..][..columns]);
+                out.v_rgb[c][..columns].copy_from_slice(&upstream.v_rgb[c * pixels + from..][..columns]);
             }
             let within = tile * TILE_PIXELS + row * LANES;
+            let v_alpha = upstream.v_alpha.map(|v| &v[from..from + columns]);
             for lane in 0..columns {
                 let t = raster.t_final[within + lane];
-                let mut v = -upstream.v_alpha.map_or(0.0, |v| v[from + lane]);
+                let mut v = -v_alpha.map_or(0.0, |v| v[lane]);
                 for c in 0..3 {
-                    v += lists.background[c] * state.v_rgb[row][c][lane];
+                    v += lists.background[c] * out.v_rgb[c][lane];
                 }
-                state.t[row][lane] = t;
-                state.behind[row][lane] = t * v;
-                state.stop[row][lane] = raster.stop[within + lane];
-                state.row_stop[row] = state.row_stop[row].max(raster.stop[within + lane]);
+                out.t[lane] = t;
+                out.behind[lane] = v;
             }
+            out.stop[..columns].copy_from_slice(&raster.stop[within..within + columns]);
+            self.row_stop[row] = out.stop.iter().fold(0, |m, s| m.max(*s));
         }
-        state
     }
 }
 
@@ -110,23 +134,25 @@ impl Kernel for BackTile<'_> {
     #[inline(always)]
     fn run<const FMA: bool>(self) {
         let BackTile { lists, offsets, tile, cap, state, partials } = self;
+        let Tile { rows, row_stop, block, sums } = state;
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
-        for (at, bits) in lists.tile(tile).iter().enumerate().rev() {
-            let isect = Isect::unpack(bits.load(Relaxed));
-            let splat = &lists.splats[isect.rank as usize];
-            let local = InTile::new::<FMA>(splat, x0, y0);
-            let top = if splat.log2_opacity < cap { splat.log2_opacity } else { cap };
-            let mut acc = Sums::default();
-            for row in usize::from(isect.rows[0])..=usize::from(isect.rows[1]) {
-                if at as u32 >= state.row_stop[row] {
-                    continue;
+        let x: Lanes = std::array::from_fn(|lane| x0 + lane as f32);
+        for (number, list) in lists.tile(tile).chunks(BLOCK).enumerate().rev() {
+            block.fill::<FMA>(list, lists.splats, y0, cap);
+            *sums = [Sums::default(); BLOCK];
+            let first = (number * BLOCK) as u32;
+            for (y, row) in rows.iter_mut().enumerate() {
+                if first < row_stop[y] {
+                    back_row::<FMA>(row, y, first, block, &x, cap, sums);
                 }
-                back_row::<FMA>(state, row, at as u32, &local, top, cap, splat.color, &mut acc);
             }
-            let out = &partials[(offsets[isect.rank as usize] + u64::from(isect.k)) as usize];
-            for (out, sum) in out.iter().zip(acc.reduce::<FMA>(&local.dx)) {
-                out.store(sum.to_bits(), Relaxed);
+            for (local, sums) in block.locals[..list.len()].iter().zip(sums.iter()) {
+                let out = &partials[(offsets[local.rank as usize] + u64::from(local.k)) as usize];
+                let dx = std::array::from_fn(|lane| x[lane] - local.mean_x);
+                for (out, sum) in out.iter().zip(sums.reduce(&dx)) {
+                    out.store(sum.to_bits(), Relaxed);
+                }
             }
         }
     }
@@ -134,6 +160,7 @@ impl Kernel for BackTile<'_> {
 
 /// Sums of one splat in one tile, by lane.
 #[derive(Clone, Copy, Default)]
+#[repr(C, align(64))]
 struct Sums {
     h: Lanes,
     hy: Lanes,
@@ -143,75 +170,67 @@ struct Sums {
 
 impl Sums {
     /// The nine sums over lanes; dx is constant in a lane, so its moments are formed here.
+    /// Halves upon halves, the same order on every path.
     #[inline(always)]
-    fn reduce<const FMA: bool>(&self, dx: &Lanes) -> [f32; SUMS] {
-        let times_dx = |v: &Lanes| std::array::from_fn(|lane| v[lane] * dx[lane]);
+    fn reduce(&self, dx: &Lanes) -> [f32; SUMS] {
+        let times_dx = |v: &Lanes| -> Lanes { std::array::from_fn(|lane| v[lane] * dx[lane]) };
         let hx = times_dx(&self.h);
-        let hxx = times_dx(&hx);
-        let hxy = times_dx(&self.hy);
-        [
-            sum(&self.h),
-            sum(&hx),
-            sum(&self.hy),
-            sum(&hxx),
-            sum(&hxy),
-            sum(&self.hyy),
-            sum(&self.rgb[0]),
-            sum(&self.rgb[1]),
-            sum(&self.rgb[2]),
-        ]
+        let [red, green, blue] = self.rgb;
+        let all = [self.h, hx, self.hy, times_dx(&hx), times_dx(&self.hy), self.hyy, red, green, blue];
+        all.map(|v| {
+            let eight: [f32; 8] = std::array::from_fn(|i| v[i] + v[i + 8]);
+            let four: [f32; 4] = std::array::from_fn(|i| eight[i] + eight[i + 4]);
+            (four[0] + four[2]) + (four[1] + four[3])
+        })
     }
 }
 
-/// Sum over lanes: halves upon halves, the same order on every path.
-#[inline(always)]
-fn sum(v: &Lanes) -> f32 {
-    let mut eight = [0.0; 8];
-    for i in 0..8 {
-        eight[i] = v[i] + v[i + 8];
-    }
-    let mut four = [0.0; 4];
-    for i in 0..4 {
-        four[i] = eight[i] + eight[i + 4];
-    }
-    (four[0] + four[2]) + (four[1] + four[3])
-}
-
+/// One row of a tile, whose pixel centres are at `x`, back through a block that begins at list index
+/// `first`.
 #[inline(always)]
 fn back_row<const FMA: bool>(
-    state: &mut Tile,
-    row: usize,
-    at: u32,
-    local: &InTile,
-    top: f32,
+    row: &mut Row,
+    y: usize,
+    first: u32,
+    block: &Block<BLOCK>,
+    x: &Lanes,
     cap: f32,
-    color: [f32; 3],
-    acc: &mut Sums,
+    sums: &mut [Sums; BLOCK],
 ) {
-    let (dy, bdy, cdy) = (local.dy[row], local.bdy[row], local.cdy[row]);
-    let [v_red, v_green, v_blue] = &state.v_rgb[row];
-    let (t, behind, stop) = (&mut state.t[row], &mut state.behind[row], &state.stop[row]);
-    for lane in 0..LANES {
-        let e = fma::<FMA>(local.adx[lane] + bdy, local.dx[lane], cdy);
-        let clamped = if e < top { e } else { top };
-        let active = e >= LOG2_ALPHA_MIN && at < stop[lane];
-        let alpha = if active { exp2_bounded::<FMA>(clamped) } else { 0.0 };
-        let over = 1.0 / (1.0 - alpha);
-        let before = t[lane] * over;
-        let weight = alpha * before;
-        let q = fma::<FMA>(color[0], v_red[lane], fma::<FMA>(color[1], v_green[lane], color[2] * v_blue[lane]));
-        // alpha dL/dalpha = T alpha (color . v) - alpha / (1 - alpha) (what lies behind)
-        let h = fma::<FMA>(weight, q, -(alpha * over) * behind[lane]);
-        let h = if e <= cap { h } else { 0.0 };
-        t[lane] = before;
-        behind[lane] = fma::<FMA>(weight, q, behind[lane]);
-        acc.h[lane] += h;
-        acc.hy[lane] = fma::<FMA>(h, dy, acc.hy[lane]);
-        acc.hyy[lane] = fma::<FMA>(h, dy * dy, acc.hyy[lane]);
-        acc.rgb[0][lane] = fma::<FMA>(weight, v_red[lane], acc.rgb[0][lane]);
-        acc.rgb[1][lane] = fma::<FMA>(weight, v_green[lane], acc.rgb[1][lane]);
-        acc.rgb[2][lane] = fma::<FMA>(weight, v_blue[lane], acc.rgb[2][lane]);
+    let mut reach = block.reach[y];
+    let Row { mut t, mut behind, v_rgb: [v_red, v_green, v_blue], stop } = *row;
+    while reach != 0 {
+        let i = reach.ilog2() as usize % BLOCK;
+        reach ^= 1 << i;
+        let (local, acc) = (&block.locals[i], &mut sums[i]);
+        let at = first + i as u32;
+        // Read once: a load under the loop's conditions would become a gather.
+        let (dy, bdy, cdy, top, color) = (local.dy[y], local.bdy[y], local.cdy[y], local.top, local.color);
+        for lane in 0..LANES {
+            let dx = x[lane] - local.mean_x;
+            let e = fma::<FMA>(fma::<FMA>(local.a, dx, bdy), dx, cdy);
+            let clamped = if e < top { e } else { top };
+            let active = (e >= LOG2_ALPHA_MIN) & (at < stop[lane]);
+            let alpha = if active { exp2_bounded::<FMA>(clamped) } else { 0.0 };
+            let before = t[lane] * (1.0 / (1.0 - alpha));
+            let weight = alpha * before;
+            let q = color[2] * v_blue[lane];
+            let q = fma::<FMA>(color[0], v_red[lane], fma::<FMA>(color[1], v_green[lane], q));
+            // alpha dL/dalpha = weight (what the splat shows - what it hides)
+            let over = q - behind[lane];
+            let h = if e <= cap { weight * over } else { 0.0 };
+            t[lane] = before;
+            behind[lane] = fma::<FMA>(alpha, over, behind[lane]);
+            let hy = h * dy;
+            acc.h[lane] += h;
+            acc.hy[lane] += hy;
+            acc.hyy[lane] = fma::<FMA>(hy, dy, acc.hyy[lane]);
+            acc.rgb[0][lane] = fma::<FMA>(weight, v_red[lane], acc.rgb[0][lane]);
+            acc.rgb[1][lane] = fma::<FMA>(weight, v_green[lane], acc.rgb[1][lane]);
+            acc.rgb[2][lane] = fma::<FMA>(weight, v_blue[lane], acc.rgb[2][lane]);
+        }
     }
+    (row.t, row.behind) = (t, behind);
 }
 
 /// Writes the sums of every intersection to its emit index (`offsets[rank] + k`) in `partials`, which is resized.
@@ -226,8 +245,10 @@ pub fn rasterize_bwd(
     partials.resize_with(lists.isects.len(), Partial::default);
     let partials = &partials[..];
     (0..lists.grid.tiles()).into_par_iter().for_each(|tile| {
-        let mut state = Tile::load(lists, raster, upstream, tile);
-        dispatch(lists.simd, BackTile { lists, offsets, tile, cap, state: &mut state, partials });
+        SCRATCH.with_borrow_mut(|state| {
+            state.load(lists, raster, upstream, tile);
+            dispatch(lists.simd, BackTile { lists, offsets, tile, cap, state, partials });
+        });
     });
 }
 
@@ -287,6 +308,7 @@ mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};
     use crate::base::simd::SimdPath;
+    use crate::kernels::isect_emit::Isect;
     use crate::kernels::rasterize_fwd::{rasterize_fwd, tests::scene};
 
     fn sums(lists: &Lists<'_>, offsets: &[u64]) -> Vec<f32> {

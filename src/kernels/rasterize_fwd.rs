@@ -8,22 +8,22 @@
 //! a tile have no contribution, so the image has the same bits as the plain loop over all splats of the tile; 3. AVX2
 //! and AVX-512 give the same bits; 4. tiles are independent, so threads cannot change a bit.
 //!
-//! The unit of work is a pixel row of a tile: 16 lanes. A tile's state lives in the first cache level. Dead lanes
-//! (stopped, or outside the image) keep T = 0, so they add nothing, and a `floor` of -1, so they never stop again:
-//! that spares the inner loop every other test.
+//! The unit of work is a pixel row of a tile, 16 lanes, through a block of splats (see [`super::tile_block`]). Dead
+//! lanes (stopped, or outside the image) keep T = 0, so they add nothing, and a `floor` of -1, so they never stop
+//! again: that spares the inner loop every other test.
 
 use super::constants::{TILE, TRANSMITTANCE_MIN};
-use super::isect_emit::Isect;
 use super::splats::{Grid, LOG2_ALPHA_MIN, Splat};
+use super::tile_block::{Block, ROWS};
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch, fma};
 use rayon::prelude::*;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::cell::RefCell;
+use std::sync::atomic::AtomicU64;
 
 /// One value for each pixel of a row of a tile.
 pub type Lanes = [f32; LANES];
 /// Pixels of a tile.
 pub const TILE_PIXELS: usize = (TILE * TILE) as usize;
-const ROWS: usize = TILE as usize;
 /// Stop position of a pixel that went through its whole list.
 pub const NEVER: u32 = u32::MAX;
 
@@ -34,7 +34,7 @@ pub struct Lists<'a> {
     pub grid: Grid,
     /// Footprints by rank.
     pub splats: &'a [Splat],
-    /// Packed [`Isect`]s, tile by tile.
+    /// Packed [`super::isect_emit::Isect`]s, tile by tile.
     pub isects: &'a [AtomicU64],
     /// Where each tile's list begins; tiles + 1 entries.
     pub tile_offsets: &'a [u64],
@@ -118,102 +118,85 @@ pub fn log2_max_alpha(max_alpha: f32, simd: SimdPath) -> f32 {
     dispatch(simd, Find(max_alpha))
 }
 
-/// A splat against one tile: what is constant along rows, and what is constant along columns.
+/// Splats that are prepared together: their locals fill a quarter of a first-level cache.
+const BLOCK: usize = 64;
+
+/// State of one row of a tile.
 #[derive(Clone, Copy)]
-pub(super) struct InTile {
-    pub dx: Lanes,
-    pub adx: Lanes,
-    /// By row.
-    pub dy: Lanes,
-    /// b dy, by row.
-    pub bdy: Lanes,
-    /// c dy^2 + log2_opacity, by row.
-    pub cdy: Lanes,
+#[repr(C, align(64))]
+struct Row {
+    t: Lanes,
+    /// T at or below which the lane stops; -1 for dead lanes.
+    floor: Lanes,
+    rgb: [Lanes; 3],
+    t_final: Lanes,
+    stop: [u32; LANES],
+    /// Some lane lives.
+    alive: bool,
 }
 
-impl InTile {
-    #[inline(always)]
-    pub(super) fn new<const FMA: bool>(splat: &Splat, x0: f32, y0: f32) -> Self {
-        let mut t = InTile { dx: [0.0; 16], adx: [0.0; 16], dy: [0.0; 16], bdy: [0.0; 16], cdy: [0.0; 16] };
-        for i in 0..LANES {
-            let dx = (x0 + i as f32) - splat.mean[0];
-            t.dx[i] = dx;
-            t.adx[i] = splat.a * dx;
+impl Row {
+    const DEAD: Row = Row {
+        t: [0.0; LANES],
+        floor: [-1.0; LANES],
+        rgb: [[0.0; LANES]; 3],
+        t_final: [0.0; LANES],
+        stop: [NEVER; LANES],
+        alive: false,
+    };
+
+    /// The lane at list index `at`: those whose next transmittance is at or below their floor stop there.
+    #[cold]
+    #[inline(never)]
+    fn stop_lanes(&mut self, at: u32, t: &Lanes, next: &mut Lanes, weight: &mut Lanes) {
+        for lane in 0..LANES {
+            if next[lane] <= self.floor[lane] {
+                self.t_final[lane] = t[lane];
+                self.stop[lane] = at;
+                self.floor[lane] = -1.0;
+                next[lane] = 0.0;
+                weight[lane] = 0.0;
+            }
         }
-        for i in 0..LANES {
-            let dy = (y0 + i as f32) - splat.mean[1];
-            t.dy[i] = dy;
-            t.bdy[i] = splat.b * dy;
-            t.cdy[i] = fma::<FMA>(splat.c * dy, dy, splat.log2_opacity);
-        }
-        t
+        self.alive = self.floor.iter().any(|&f| f > 0.0);
     }
 }
 
 /// State of one tile.
 struct Tile {
-    t: [Lanes; ROWS],
-    rgb: [[Lanes; 3]; ROWS],
-    /// T at or below which the lane stops; -1 for dead lanes.
-    floor: [Lanes; ROWS],
-    t_final: [Lanes; ROWS],
-    stop: [[u32; LANES]; ROWS],
-    /// Bit by row: some lane lives.
-    alive: u32,
+    rows: [Row; ROWS],
+    block: Block<BLOCK>,
+}
+
+thread_local! {
+    /// Each thread keeps one: building it anew for every tile would cost as much as blending a few hundred splats.
+    static SCRATCH: RefCell<Box<Tile>> = RefCell::new(Box::new(Tile { rows: [Row::DEAD; ROWS], block: Block::new() }));
 }
 
 impl Tile {
-    fn new(grid: Grid, tile: usize) -> Self {
+    fn reset(&mut self, grid: Grid, tile: usize) {
         let (tx, ty) = grid.position(tile);
         let columns = (grid.width - tx * TILE).min(TILE) as usize;
         let rows = (grid.height - ty * TILE).min(TILE) as usize;
-        let mut state = Tile {
-            t: [[0.0; LANES]; ROWS],
-            rgb: [[[0.0; LANES]; 3]; ROWS],
-            floor: [[-1.0; LANES]; ROWS],
-            t_final: [[0.0; LANES]; ROWS],
-            stop: [[NEVER; LANES]; ROWS],
-            alive: (1u32 << rows) - 1,
-        };
-        for row in 0..rows {
-            state.t[row][..columns].fill(1.0);
-            state.floor[row][..columns].fill(TRANSMITTANCE_MIN);
-        }
-        state
+        let mut live = Row { alive: true, ..Row::DEAD };
+        live.t[..columns].fill(1.0);
+        live.floor[..columns].fill(TRANSMITTANCE_MIN);
+        self.rows[..rows].fill(live);
+        self.rows[rows..].fill(Row::DEAD);
     }
 
-    /// Lanes of `row` whose next transmittance is at or below their floor stop at list index `at`.
-    #[cold]
-    #[inline(never)]
-    fn stop_lanes(&mut self, row: usize, at: u32, next: &mut Lanes, weight: &mut Lanes) {
-        for lane in 0..LANES {
-            if next[lane] <= self.floor[row][lane] {
-                self.t_final[row][lane] = self.t[row][lane];
-                self.stop[row][lane] = at;
-                self.floor[row][lane] = -1.0;
-                next[lane] = 0.0;
-                weight[lane] = 0.0;
-            }
-        }
-        if self.floor[row].iter().all(|&f| f < 0.0) {
-            self.alive &= !(1 << row);
-        }
-    }
-
-    fn write(&mut self, background: [f32; 3], rgb: &mut [f32], t_final: &mut [f32], stop: &mut [u32]) {
-        for row in 0..ROWS {
-            for lane in 0..LANES {
-                if self.floor[row][lane] > 0.0 {
-                    self.t_final[row][lane] = self.t[row][lane];
-                }
-            }
+    fn write(&self, background: [f32; 3], rgb: &mut [f32], t_final: &mut [f32], stop: &mut [u32]) {
+        for (row, state) in self.rows.iter().enumerate() {
             let at = row * LANES..(row + 1) * LANES;
-            t_final[at.clone()].copy_from_slice(&self.t_final[row]);
-            stop[at].copy_from_slice(&self.stop[row]);
+            let t_out = &mut t_final[at.clone()];
+            for lane in 0..LANES {
+                t_out[lane] = if state.floor[lane] > 0.0 { state.t[lane] } else { state.t_final[lane] };
+            }
+            stop[at].copy_from_slice(&state.stop);
             for c in 0..3 {
                 let out = &mut rgb[c * TILE_PIXELS + row * LANES..][..LANES];
                 for lane in 0..LANES {
-                    out[lane] = self.rgb[row][c][lane] + self.t_final[row][lane] * background[c];
+                    out[lane] = state.rgb[c][lane] + t_out[lane] * background[c];
                 }
             }
         }
@@ -233,23 +216,20 @@ impl Kernel for BlendTile<'_> {
 
     #[inline(always)]
     fn run<const FMA: bool>(self) -> u64 {
-        let BlendTile { lists, tile, cap, state } = self;
+        let BlendTile { lists, tile, cap, state: Tile { rows, block } } = self;
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
         let mut rows_done = 0u64;
-        for (at, bits) in lists.tile(tile).iter().enumerate() {
-            let isect = Isect::unpack(bits.load(Relaxed));
-            let splat = &lists.splats[isect.rank as usize];
-            let local = InTile::new::<FMA>(splat, x0, y0);
-            let top = if splat.log2_opacity < cap { splat.log2_opacity } else { cap };
-            for row in usize::from(isect.rows[0])..=usize::from(isect.rows[1]) {
-                if state.alive >> row & 1 == 0 {
-                    continue;
+        for (number, list) in lists.tile(tile).chunks(BLOCK).enumerate() {
+            block.fill::<FMA>(list, lists.splats, y0, cap);
+            let mut alive = false;
+            for (y, row) in rows.iter_mut().enumerate() {
+                if row.alive {
+                    rows_done += blend_row::<FMA>(row, y, (number * BLOCK) as u32, block, x0);
+                    alive |= row.alive;
                 }
-                rows_done += 1;
-                blend_row::<FMA>(state, row, at as u32, &local, top, splat.color);
             }
-            if state.alive == 0 {
+            if !alive {
                 break;
             }
         }
@@ -257,32 +237,45 @@ impl Kernel for BlendTile<'_> {
     }
 }
 
+/// One row of a tile through a block that begins at list index `first`; returns the number of splats evaluated.
 #[inline(always)]
-fn blend_row<const FMA: bool>(state: &mut Tile, row: usize, at: u32, local: &InTile, top: f32, color: [f32; 3]) {
-    let (bdy, cdy) = (local.bdy[row], local.cdy[row]);
-    let mut weight = [0.0; LANES];
-    let mut next = [0.0; LANES];
-    let mut stops = false;
-    for lane in 0..LANES {
-        let e = fma::<FMA>(local.adx[lane] + bdy, local.dx[lane], cdy);
-        let clamped = if e < top { e } else { top };
-        let alpha = if e >= LOG2_ALPHA_MIN { exp2_bounded::<FMA>(clamped) } else { 0.0 };
-        let t = state.t[row][lane];
-        weight[lane] = alpha * t;
-        next[lane] = fma::<FMA>(-alpha, t, t);
-        stops |= next[lane] <= state.floor[row][lane];
-    }
-    if stops {
-        let (mut n, mut w) = (next, weight);
-        state.stop_lanes(row, at, &mut n, &mut w);
-        (next, weight) = (n, w);
-    }
-    state.t[row] = next;
-    for c in 0..3 {
+fn blend_row<const FMA: bool>(row: &mut Row, y: usize, first: u32, block: &Block<BLOCK>, x0: f32) -> u64 {
+    let mut reach = block.reach[y];
+    let count = u64::from(reach.count_ones());
+    let (mut t, mut rgb) = (row.t, row.rgb);
+    let x: Lanes = std::array::from_fn(|lane| x0 + lane as f32);
+    while reach != 0 {
+        let i = reach.trailing_zeros() as usize % BLOCK;
+        reach &= reach - 1;
+        let local = &block.locals[i];
+        // Read once: a load under the loop's conditions would become a gather.
+        let (bdy, cdy, top) = (local.bdy[y], local.cdy[y], local.top);
+        let (mut weight, mut next) = ([0.0; LANES], [0.0; LANES]);
+        let mut stops = false;
         for lane in 0..LANES {
-            state.rgb[row][c][lane] = fma::<FMA>(weight[lane], color[c], state.rgb[row][c][lane]);
+            let dx = x[lane] - local.mean_x;
+            let e = fma::<FMA>(fma::<FMA>(local.a, dx, bdy), dx, cdy);
+            let clamped = if e < top { e } else { top };
+            let alpha = if e >= LOG2_ALPHA_MIN { exp2_bounded::<FMA>(clamped) } else { 0.0 };
+            weight[lane] = alpha * t[lane];
+            next[lane] = fma::<FMA>(-alpha, t[lane], t[lane]);
+            stops |= next[lane] <= row.floor[lane];
+        }
+        if stops {
+            let (before, mut n, mut w) = (t, next, weight);
+            row.stop_lanes(first + i as u32, &before, &mut n, &mut w);
+            (next, weight) = (n, w);
+            reach = if row.alive { reach } else { 0 };
+        }
+        t = next;
+        for lane in 0..LANES {
+            rgb[0][lane] = fma::<FMA>(weight[lane], local.color[0], rgb[0][lane]);
+            rgb[1][lane] = fma::<FMA>(weight[lane], local.color[1], rgb[1][lane]);
+            rgb[2][lane] = fma::<FMA>(weight[lane], local.color[2], rgb[2][lane]);
         }
     }
+    (row.t, row.rgb) = (t, rgb);
+    count
 }
 
 /// Blends every tile into `out`.
@@ -297,10 +290,12 @@ pub fn rasterize_fwd(lists: &Lists<'_>, out: &mut Raster) {
         .zip(out.evaluated.par_iter_mut())
         .enumerate()
         .for_each(|(tile, (((rgb, t_final), stop), evaluated))| {
-            let mut state = Tile::new(lists.grid, tile);
-            let rows = dispatch(lists.simd, BlendTile { lists, tile, cap, state: &mut state });
-            state.write(lists.background, rgb, t_final, stop);
-            *evaluated = rows * LANES as u64;
+            SCRATCH.with_borrow_mut(|state| {
+                state.reset(lists.grid, tile);
+                let rows = dispatch(lists.simd, BlendTile { lists, tile, cap, state });
+                state.write(lists.background, rgb, t_final, stop);
+                *evaluated = rows * LANES as u64;
+            });
         });
 }
 
@@ -374,10 +369,10 @@ pub(in crate::kernels) mod tests {
         let mut s = Scene { grid, splats: vec![], offsets: vec![], tile_offsets: vec![], isects: vec![] };
         let (mut counts, mut tile_counts, mut cursors) = (vec![], vec![], vec![]);
         pack(&order, &p, &colors, grid, &mut s.splats);
-        count(&s.splats, grid, &mut counts, &mut tile_counts);
+        count(&s.splats, grid, SimdPath::best(), &mut counts, &mut tile_counts);
         let total = scan(&counts, &mut s.offsets);
         isect_offsets(&tile_counts, grid.tiles(), &mut s.tile_offsets, &mut cursors);
-        emit(&s.splats, grid, total, &mut cursors, &mut s.isects);
+        emit(&s.splats, grid, SimdPath::best(), total, &mut cursors, &mut s.isects);
         s
     }
 
@@ -415,7 +410,7 @@ pub(in crate::kernels) mod tests {
                     continue;
                 }
                 let (dx, dy) = (px - s.mean[0], py - s.mean[1]);
-                let e = fma::<FMA>(s.a * dx + s.b * dy, dx, fma::<FMA>(s.c * dy, dy, s.log2_opacity));
+                let e = fma::<FMA>(fma::<FMA>(s.a, dx, s.b * dy), dx, fma::<FMA>(s.c * dy, dy, s.log2_opacity));
                 if e.is_nan() || e < LOG2_ALPHA_MIN {
                     continue;
                 }

@@ -17,10 +17,12 @@ use crate::kernels::scan::scan;
 use crate::kernels::sh_bwd::sh_bwd;
 use crate::kernels::sh_fwd::sh_fwd;
 use crate::kernels::splats::{Grid, Splat, pack};
+use crate::kernels::stages::STAGES;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
 use std::sync::atomic::AtomicU64;
+use std::time::Instant;
 
 /// Counters of the last view.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -31,6 +33,24 @@ pub struct RenderStats {
     pub isects: u64,
     /// Pixel-Gaussian pairs that the forward pass evaluated.
     pub evaluated: u64,
+}
+
+/// Seconds of each stage of [`STAGES`] in the last view.
+#[derive(Debug, Default)]
+struct StageClock {
+    seconds: [f64; STAGES.len()],
+}
+
+impl StageClock {
+    /// Runs the stage of this name and notes its time.
+    fn time<T>(&mut self, stage: &str, work: impl FnOnce() -> T) -> T {
+        let start = Instant::now();
+        let out = work();
+        if let Some(at) = STAGES.iter().position(|s| s.name == stage) {
+            self.seconds[at] = start.elapsed().as_secs_f64();
+        }
+        out
+    }
 }
 
 /// Renders views on the CPU.
@@ -58,6 +78,7 @@ pub struct CpuRenderer {
     image_loss: ImageLoss,
     v_rgb: Vec<f32>,
     stats: RenderStats,
+    clock: StageClock,
 }
 
 impl CpuRenderer {
@@ -75,28 +96,44 @@ impl CpuRenderer {
         assert!(side <= Grid::SIDE_MAX, "images are at most {} pixels on a side, not {side}", Grid::SIDE_MAX);
         assert!(rows.rows() < u32::MAX as usize, "too many rows in one view");
         let grid = Grid::new(camera.width, camera.height);
-        project_fwd(rows, camera, options.eps2d, options.simd, &mut self.projected);
-        sh_fwd(rows, camera, options.sh_degree, &self.projected, options.simd, &mut self.colors);
-        self.depth_sort.sort(&self.projected.depths, &self.projected.radii, &mut self.order);
-        pack(&self.order, &self.projected, &self.colors, grid, &mut self.splats);
-        count(&self.splats, grid, &mut self.counts, &mut self.tile_counts);
-        let total = scan(&self.counts, &mut self.offsets);
-        isect_offsets(&self.tile_counts, grid.tiles(), &mut self.tile_offsets, &mut self.cursors);
-        emit(&self.splats, grid, total, &mut self.cursors, &mut self.isects);
+        let mut clock = StageClock::default();
+        let simd = options.simd;
+        clock.time("project_fwd", || project_fwd(rows, camera, options.eps2d, simd, &mut self.projected));
+        clock.time("sh_fwd", || {
+            sh_fwd(rows, camera, options.sh_degree, &self.projected, simd, &mut self.colors);
+        });
+        clock.time("radix_sort", || {
+            self.depth_sort.sort(&self.projected.depths, &self.projected.radii, &mut self.order);
+        });
+        let total = clock.time("scan", || {
+            pack(&self.order, &self.projected, &self.colors, grid, &mut self.splats);
+            count(&self.splats, grid, simd, &mut self.counts, &mut self.tile_counts);
+            scan(&self.counts, &mut self.offsets)
+        });
+        clock.time("isect_offsets", || {
+            isect_offsets(&self.tile_counts, grid.tiles(), &mut self.tile_offsets, &mut self.cursors);
+        });
+        clock.time("isect_emit", || emit(&self.splats, grid, simd, total, &mut self.cursors, &mut self.isects));
         self.view = Some((*camera, *options));
-        let mut raster = std::mem::take(&mut self.raster);
-        rasterize_fwd(&self.lists(grid, options), &mut raster);
-        self.raster = raster;
-        (self.image.width, self.image.height) = (camera.width, camera.height);
-        self.image.rgb.resize(3 * camera.pixels(), 0.0);
-        self.alpha.resize(camera.pixels(), 0.0);
-        untile(grid, &self.raster, &mut self.image.rgb, &mut self.alpha);
+        clock.time("rasterize_fwd", || self.rasterize(grid, options));
+        self.clock = clock;
         self.stats = RenderStats {
             visible: self.order.len() as u64,
             isects: total,
             evaluated: self.raster.evaluated.iter().sum(),
         };
         &self.image
+    }
+
+    fn rasterize(&mut self, grid: Grid, options: &RenderOptions) {
+        let mut raster = std::mem::take(&mut self.raster);
+        rasterize_fwd(&self.lists(grid, options), &mut raster);
+        self.raster = raster;
+        let pixels = grid.width as usize * grid.height as usize;
+        (self.image.width, self.image.height) = (grid.width, grid.height);
+        self.image.rgb.resize(3 * pixels, 0.0);
+        self.alpha.resize(pixels, 0.0);
+        untile(grid, &self.raster, &mut self.image.rgb, &mut self.alpha);
     }
 
     fn lists(&self, grid: Grid, options: &RenderOptions) -> Lists<'_> {
@@ -147,21 +184,35 @@ impl CpuRenderer {
         assert!(v_alpha.is_none_or(|v| v.len() == self.alpha.len()), "v_alpha has the size of the image");
         let Some((camera, options)) = self.view else { panic!("backward needs a forward pass before it") };
         let grid = Grid::new(camera.width, camera.height);
-        let mut partials = std::mem::take(&mut self.partials);
-        let lists = self.lists(grid, &options);
-        rasterize_bwd(&lists, &self.offsets, &self.raster, &Upstream { v_rgb, v_alpha }, &mut partials);
-        self.partials = partials;
-        let out = &mut self.footprints;
-        fold_rows(&self.order, &self.offsets, &self.partials, &self.projected, &mut self.rank_from_row, out);
+        let mut clock = std::mem::take(&mut self.clock);
+        clock.time("rasterize_bwd", || self.rasterize_back(grid, &options, &Upstream { v_rgb, v_alpha }));
         let columns = &mut grads.columns;
         columns.sh_degree = rows.sh_degree;
         columns.resize(rows.rows());
-        let (projected, simd) = (&self.projected, options.simd);
-        sh_bwd(rows, &camera, options.sh_degree, projected, &self.colors, &out.v_colors, simd, columns);
+        let (projected, simd, out) = (&self.projected, options.simd, &self.footprints);
+        clock.time("sh_bwd", || {
+            sh_bwd(rows, &camera, options.sh_degree, projected, &self.colors, &out.v_colors, simd, columns);
+        });
         let (v_means2d, v_conics, v_opacities) = (&out.v_means2d, &out.v_conics, &out.v_opacities);
-        project_bwd(rows, &camera, options.eps2d, projected, v_means2d, v_conics, v_opacities, simd, columns);
+        clock.time("project_bwd", || {
+            project_bwd(rows, &camera, options.eps2d, projected, v_means2d, v_conics, v_opacities, simd, columns);
+        });
         grads.means2d.clone_from(&out.v_means2d);
         grads.radii.clone_from(&projected.radii);
+        self.clock = clock;
+    }
+
+    fn rasterize_back(&mut self, grid: Grid, options: &RenderOptions, upstream: &Upstream<'_>) {
+        let mut partials = std::mem::take(&mut self.partials);
+        rasterize_bwd(&self.lists(grid, options), &self.offsets, &self.raster, upstream, &mut partials);
+        self.partials = partials;
+        let (order, out) = (&self.order, &mut self.footprints);
+        fold_rows(order, &self.offsets, &self.partials, &self.projected, &mut self.rank_from_row, out);
+    }
+
+    /// Seconds that each stage took in the last view, in the order of [`STAGES`] (0 for those that did not run).
+    pub fn stage_seconds(&self) -> impl Iterator<Item = (&'static str, f64)> + '_ {
+        STAGES.iter().zip(self.clock.seconds).map(|(stage, seconds)| (stage.name, seconds))
     }
 
     /// Counters of the last view.

@@ -1,0 +1,91 @@
+//! A block of consecutive splats of one tile's list, made ready for loops over the tile's pixel rows.
+//!
+//! Both directions of the rasterizer go block by block, and within a block row by row, so that a row's state stays in
+//! registers and the inner loop is long: a loop over the few rows of each splat would cost a mispredicted branch and a
+//! drained pipeline per splat, as much time as the blending itself. For each row a bit set says which splats reach it.
+
+use super::constants::TILE;
+use super::isect_emit::Isect;
+use super::rasterize_fwd::Lanes;
+use super::splats::Splat;
+use crate::base::simd::{LANES, fma};
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+pub(super) const ROWS: usize = TILE as usize;
+
+/// A splat against one tile.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+pub(super) struct Local {
+    /// By row.
+    pub dy: Lanes,
+    /// b dy, by row.
+    pub bdy: Lanes,
+    /// c dy^2 + log2_opacity, by row.
+    pub cdy: Lanes,
+    /// x of the mean.
+    pub mean_x: f32,
+    /// Coefficient of dx^2.
+    pub a: f32,
+    /// Upper bound of the exponent: the opacity's, or the clamp's where it is lower.
+    pub top: f32,
+    /// Colour.
+    pub color: [f32; 3],
+    /// The row's place in depth order.
+    pub rank: u32,
+    /// Number among the row's intersections.
+    pub k: u32,
+}
+
+/// Up to `N` (at most 64) consecutive splats of a tile's list.
+#[repr(C, align(64))]
+pub(super) struct Block<const N: usize> {
+    pub locals: [Local; N],
+    /// Bit i of `reach[row]`: splat i can reach the row.
+    pub reach: [u64; ROWS],
+}
+
+impl<const N: usize> Block<N> {
+    pub(super) fn new() -> Self {
+        let none = Local {
+            dy: [0.0; LANES],
+            bdy: [0.0; LANES],
+            cdy: [0.0; LANES],
+            mean_x: 0.0,
+            a: 0.0,
+            top: 0.0,
+            color: [0.0; 3],
+            rank: 0,
+            k: 0,
+        };
+        Block { locals: [none; N], reach: [0; ROWS] }
+    }
+
+    /// Fills the block from at most `N` entries of a list. `y0` is the centre of the tile's first pixel row, `cap` the
+    /// exponent at which alpha is clamped.
+    #[inline(always)]
+    pub(super) fn fill<const FMA: bool>(&mut self, list: &[AtomicU64], splats: &[Splat], y0: f32, cap: f32) {
+        let mut reach = [0u64; ROWS];
+        for (i, (local, bits)) in self.locals.iter_mut().zip(list).enumerate() {
+            let isect = Isect::unpack(bits.load(Relaxed));
+            let splat = &splats[isect.rank as usize];
+            let rows = (2u64 << isect.rows[1]) - (1u64 << isect.rows[0]);
+            for (row, set) in reach.iter_mut().enumerate() {
+                *set |= ((rows >> row) & 1) << i;
+            }
+            for row in 0..ROWS {
+                let dy = (y0 + row as f32) - splat.mean[1];
+                local.dy[row] = dy;
+                local.bdy[row] = splat.b * dy;
+                local.cdy[row] = fma::<FMA>(splat.c * dy, dy, splat.log2_opacity);
+            }
+            local.mean_x = splat.mean[0];
+            local.a = splat.a;
+            local.top = if splat.log2_opacity < cap { splat.log2_opacity } else { cap };
+            local.color = splat.color;
+            local.rank = isect.rank;
+            local.k = isect.k;
+        }
+        self.reach = reach;
+    }
+}
