@@ -156,30 +156,19 @@ impl<'a> ImagePair<'a> {
         self.width * self.height
     }
 
-    /// Pixels that count, in a part of the picture.
-    fn counted(&self, rows: Range<usize>, columns: Range<usize>) -> usize {
-        let Some(mask) = self.mask else { return rows.len() * columns.len() };
-        rows.map(|row| {
-            let line = &mask[row * self.width..][columns.clone()];
-            line.iter().filter(|&&byte| byte != 0).count()
-        })
-        .sum()
-    }
-
     /// Pixels of the picture that count.
     pub fn counted_pixels(&self) -> usize {
-        self.counted(0..self.height, 0..self.width)
+        counted(self.mask, self.width, 0..self.height, 0..self.width)
     }
 
     /// Pixels of the SSIM map that count.
     fn counted_windows(&self, variant: SsimVariant) -> usize {
-        self.counted(domain(variant, self.height), domain(variant, self.width))
+        counted_windows(self.mask, self.width, self.height, variant)
     }
 
     /// The variant that can be computed at this size.
     fn possible(&self, variant: SsimVariant) -> SsimVariant {
-        let small = self.width.min(self.height) < WINDOW;
-        if small && variant == SsimVariant::Valid { SsimVariant::Same } else { variant }
+        possible(self.width, self.height, variant)
     }
 
     fn check(&self) {
@@ -190,6 +179,76 @@ impl<'a> ImagePair<'a> {
         };
         assert!(self.rgb.len() == 3 * n && reference == 3 * n, "a picture's length does not fit its size");
         assert!(self.mask.is_none_or(|mask| mask.len() == n), "the mask's length does not fit the picture");
+    }
+}
+
+/// Pixels that count, in a part of a picture.
+fn counted(mask: Option<&[u8]>, width: usize, rows: Range<usize>, columns: Range<usize>) -> usize {
+    let Some(mask) = mask else { return rows.len() * columns.len() };
+    rows.map(|row| {
+        let line = &mask[row * width..][columns.clone()];
+        line.iter().filter(|&&byte| byte != 0).count()
+    })
+    .sum()
+}
+
+fn counted_windows(mask: Option<&[u8]>, width: usize, height: usize, variant: SsimVariant) -> usize {
+    counted(mask, width, domain(variant, height), domain(variant, width))
+}
+
+fn possible(width: usize, height: usize, variant: SsimVariant) -> SsimVariant {
+    let small = width.min(height) < WINDOW;
+    if small && variant == SsimVariant::Valid { SsimVariant::Same } else { variant }
+}
+
+/// How the sums over a picture make the loss: what every backend decides in the same way before it adds anything up.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LossPlan {
+    /// The SSIM that can be computed at this size.
+    pub variant: SsimVariant,
+    /// Values that count: three for each pixel.
+    pub samples: f64,
+    /// Values of the SSIM map that count.
+    pub windows: f64,
+    /// Derivative of the loss with respect to the sum of absolute differences.
+    pub l1_weight: f32,
+    /// Derivative of the loss with respect to the sum of the SSIM map.
+    pub ssim_weight: f32,
+    lambda: f64,
+}
+
+impl LossPlan {
+    /// For a picture of this size; `mask` as in [`ImagePair::mask`].
+    pub fn new(width: usize, height: usize, mask: Option<&[u8]>, options: &LossOptions) -> Self {
+        let variant = possible(width, height, options.padding.into());
+        let lambda = f64::from(options.ssim_lambda);
+        let samples = 3.0 * counted(mask, width, 0..height, 0..width) as f64;
+        let windows = 3.0 * counted_windows(mask, width, height, variant) as f64;
+        LossPlan {
+            variant,
+            samples,
+            windows,
+            // Nothing counts: no gradient.
+            l1_weight: if samples > 0.0 { ((1.0 - lambda) / samples) as f32 } else { 0.0 },
+            // Every window is masked but some pixel at the border counts: L1 alone is left.
+            ssim_weight: if windows > 0.0 { (-lambda / windows) as f32 } else { 0.0 },
+            lambda,
+        }
+    }
+
+    /// Pixels at each border that are not in the SSIM map.
+    pub fn margin(&self) -> usize {
+        domain(self.variant, WINDOW).start
+    }
+
+    /// The loss from the sums of absolute differences, of squared differences and of the SSIM map.
+    pub fn value(&self, l1: f64, squares: f64, ssim: f64) -> LossValue {
+        if self.samples == 0.0 {
+            return LossValue { ssim: 1.0, ..LossValue::default() };
+        }
+        let l1 = l1 / self.samples;
+        let ssim = if self.windows > 0.0 { ssim / self.windows } else { 1.0 };
+        LossValue { loss: (1.0 - self.lambda) * l1 + self.lambda * (1.0 - ssim), l1, ssim, mse: squares / self.samples }
     }
 }
 
@@ -231,19 +290,14 @@ impl ImageLoss {
         v_rgb: &mut Vec<f32>,
     ) -> LossValue {
         pair.check();
-        let variant = pair.possible(options.padding.into());
-        let lambda = f64::from(options.ssim_lambda);
-        let samples = 3.0 * pair.counted_pixels() as f64;
-        let windows = 3.0 * pair.counted_windows(variant) as f64;
+        let plan = LossPlan::new(pair.width, pair.height, pair.mask, options);
+        let LossPlan { variant, l1_weight, ssim_weight, .. } = plan;
         let n = pair.pixels();
         v_rgb.resize(3 * n, 0.0);
-        if samples == 0.0 {
+        if plan.samples == 0.0 {
             v_rgb.fill(0.0);
-            return LossValue { ssim: 1.0, ..LossValue::default() };
+            return plan.value(0.0, 0.0, 0.0);
         }
-        let l1_weight = ((1.0 - lambda) / samples) as f32;
-        // Every window is masked but some pixel at the border counts: L1 alone is left.
-        let ssim_weight = if windows > 0.0 { (-lambda / windows) as f32 } else { 0.0 };
         let bands = pair.height.div_ceil(BAND_ROWS);
         self.sums.resize(3 * bands, BandSums::default());
         let planes = v_rgb.par_chunks_mut(n).zip(self.sums.par_chunks_mut(bands)).enumerate();
@@ -256,9 +310,7 @@ impl ImageLoss {
             });
         });
         let total = add_up(&self.sums);
-        let l1 = total.l1 / samples;
-        let ssim = if windows > 0.0 { total.ssim / windows } else { 1.0 };
-        LossValue { loss: (1.0 - lambda) * l1 + lambda * (1.0 - ssim), l1, ssim, mse: total.squares / samples }
+        plan.value(total.l1, total.squares, total.ssim)
     }
 }
 

@@ -17,3 +17,4 @@ pub mod splats;
 mod ssim_band;
 pub mod stages;
 mod tile_block;
+pub mod uniforms;

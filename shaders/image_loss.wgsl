@@ -1,0 +1,293 @@
+// Stage "image_loss": (1 - lambda) L1 + lambda (1 - SSIM) of a picture and its gradient. The twin of
+// src/kernels/image_loss.rs and src/kernels/ssim_band.rs, which have the formulas and say what a mask does.
+//
+// Three entry points, run in this order:
+//   ssim_map     one workgroup per tile and channel: SSIM's three derivative maps, and the tile's sum of SSIM;
+//   gradient     likewise: v_rgb, and the tile's sums of absolute and squared differences;
+//   sum_partials one workgroup per 4,096 partial sums: adds them up in a fixed order. Run again until one is left.
+// ssim_map and gradient cover `channel_count` channels from `first_channel` on, so that the derivative maps, 12 bytes
+// per pixel and channel, may be kept for one channel at a time.
+//
+// Sums are f32, added as trees: no atomics, so the same bits on every run. No loop is longer than 16 turns.
+#import "shared/constants.wgsl"
+#import "shared/dispatch.wgsl"
+
+struct LossUniforms {
+    width: u32,
+    height: u32,
+    first_channel: u32,
+    channel_count: u32,
+    /// Pixels at each border that are left out of the SSIM map: 5 or 0.
+    margin: u32,
+    /// Derivative of the loss by the sum of absolute differences, and by the sum of the SSIM map.
+    l1_weight: f32,
+    ssim_weight: f32,
+    /// Partial sums that sum_partials reads.
+    partial_count: u32,
+}
+
+@group(0) @binding(0) var<uniform> loss: LossUniforms;
+/// The picture, planar [3][height][width].
+@group(0) @binding(1) var<storage, read> rgb: array<f32>;
+/// The photo: red in the lowest byte, then green, blue, and the mask (0: the pixel is left out).
+@group(0) @binding(2) var<storage, read> target_pixels: array<u32>;
+/// dS/dmx, dS/dE[xx], dS/dE[xy], planar [channel_count][3][height][width].
+@group(0) @binding(3) var<storage, read_write> derivatives: array<f32>;
+/// Planar [3][height][width].
+@group(0) @binding(4) var<storage, read_write> v_rgb: array<f32>;
+/// Absolute differences, squared differences, SSIM, 0: one for each channel and tile.
+@group(0) @binding(5) var<storage, read_write> partials: array<vec4<f32>>;
+/// What sum_partials makes of them.
+@group(0) @binding(6) var<storage, read_write> sums: array<vec4<f32>>;
+
+const RADIUS: u32 = 5u;
+const WINDOW: u32 = 11u;
+/// Side of a tile with the window's margin.
+const PATCH: u32 = 26u;
+/// 26 * 26 values of a patch, and 26 * 16 once it is filtered along its rows.
+const PATCH_LEN: u32 = 676u;
+const FILTERED_LEN: u32 = 416u;
+/// Partial sums that one invocation of sum_partials adds up.
+const PARTIALS_EACH: u32 = 16u;
+/// (0.01 L)^2 and (0.03 L)^2 for the value range L = 1.
+const SSIM_C1: f32 = 1e-4;
+const SSIM_C2: f32 = 9e-4;
+/// exp(-k^2 / 4.5) for k = 0..=5, divided by the sum over -5..=5.
+const TAPS = array<f32, 6>(0.26601172, 0.21300554, 0.10936069, 0.036000773, 0.007598758, 0.0010283801);
+
+/// x, y of the patch; in `gradient` dS/dmx and dS/dE[xx].
+var<workgroup> patch_two: array<vec2<f32>, PATCH_LEN>;
+/// In `gradient` dS/dE[xy].
+var<workgroup> patch_one: array<f32, PATCH_LEN>;
+/// Filtered along rows: x, y; or as in patch_two.
+var<workgroup> filtered_two: array<vec2<f32>, FILTERED_LEN>;
+/// x^2 + y^2, x y; or dS/dE[xy], 0.
+var<workgroup> filtered_more: array<vec2<f32>, FILTERED_LEN>;
+
+/// The part of the work that a workgroup does.
+struct Job {
+    /// 0 red, 1 green, 2 blue; and counted from first_channel.
+    channel: u32,
+    plane: u32,
+    /// First pixel of the tile.
+    x0: u32,
+    y0: u32,
+    /// Where its sums go.
+    partial: u32,
+    exists: bool,
+}
+
+fn job(group: u32) -> Job {
+    let tiles_x = (loss.width + TILE - 1u) / TILE;
+    let tiles_y = (loss.height + TILE - 1u) / TILE;
+    let tiles = max(tiles_x * tiles_y, 1u);
+    let plane = group / tiles;
+    let tile = group % tiles;
+    let channel = loss.first_channel + plane;
+    let exists = plane < loss.channel_count && tiles_x * tiles_y > 0u;
+    let columns = max(tiles_x, 1u);
+    return Job(channel, plane, TILE * (tile % columns), TILE * (tile / columns), channel * tiles + tile, exists);
+}
+
+/// Pixel index of a place of the patch, or 0xffffffff outside the picture. Patch column 0 is 5 left of the tile.
+fn pixel_of_patch(j: Job, at: u32) -> u32 {
+    // Below 0 wraps around to far beyond the picture.
+    let x = j.x0 + at % PATCH - RADIUS;
+    let y = j.y0 + at / PATCH - RADIUS;
+    return select(0xffffffffu, y * loss.width + x, x < loss.width && y < loss.height);
+}
+
+/// Picture and photo at a pixel; the photo twice where the pixel is left out.
+fn values(channel: u32, pixel: u32) -> vec2<f32> {
+    let photo = target_pixels[pixel];
+    let y = f32((photo >> (8u * channel)) & 255u) / 255.0;
+    let x = rgb[channel * loss.width * loss.height + pixel];
+    return vec2<f32>(select(x, y, (photo >> 24u) == 0u), y);
+}
+
+fn tap(k: u32) -> f32 {
+    return TAPS[u32(abs(i32(k) - 5))];
+}
+
+/// Adds up the lanes' sums in the memory of the patch, which nobody reads any more; the first lane has the result.
+fn sum_lanes(lane: u32, value: vec3<f32>) -> vec3<f32> {
+    patch_two[lane] = value.xy;
+    patch_one[lane] = value.z;
+    workgroupBarrier();
+    var sum = vec3<f32>();
+    if lane < 16u {
+        for (var k = 0u; k < 16u; k++) {
+            sum += vec3<f32>(patch_two[16u * lane + k], patch_one[16u * lane + k]);
+        }
+    }
+    workgroupBarrier();
+    if lane < 16u {
+        patch_two[lane] = sum.xy;
+        patch_one[lane] = sum.z;
+    }
+    workgroupBarrier();
+    sum = vec3<f32>();
+    if lane == 0u {
+        for (var k = 0u; k < 16u; k++) {
+            sum += vec3<f32>(patch_two[k], patch_one[k]);
+        }
+    }
+    return sum;
+}
+
+/// [S, dS/dmx, dS/dE[xx], dS/dE[xy]] from the windowed means of x, y, x^2 + y^2 and x y.
+fn ssim_point(mx: f32, my: f32, squares: f32, products: f32) -> vec4<f32> {
+    let mean_product = mx * my;
+    let mean_squares = mx * mx + my * my;
+    let a1 = 2.0 * mean_product + SSIM_C1;
+    let a2 = 2.0 * (products - mean_product) + SSIM_C2;
+    let b1 = mean_squares + SSIM_C1;
+    // Rounding can take the sum of two variances below zero: a bright flat patch.
+    let b2 = max(squares - mean_squares, 0.0) + SSIM_C2;
+    let inverse = 1.0 / (b1 * b2);
+    let ssim = a1 * a2 * inverse;
+    let v_mean = 2.0 * inverse * (my * (a2 - a1) + mx * ssim * (b1 - b2));
+    return vec4<f32>(ssim, v_mean, -ssim * b1 * inverse, 2.0 * a1 * inverse);
+}
+
+@compute @workgroup_size(256)
+fn ssim_map(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let j = job(linear_index(workgroup, workgroups, 0u) / WORKGROUP);
+    for (var at = lane; at < PATCH_LEN; at += WORKGROUP) {
+        let pixel = pixel_of_patch(j, at);
+        var both = vec2<f32>();
+        if j.exists && pixel != 0xffffffffu {
+            both = values(j.channel, pixel);
+        }
+        patch_two[at] = both;
+    }
+    workgroupBarrier();
+    for (var at = lane; at < FILTERED_LEN; at += WORKGROUP) {
+        let from = (at / TILE) * PATCH + at % TILE;
+        var two = vec2<f32>();
+        var more = vec2<f32>();
+        for (var k = 0u; k < WINDOW; k++) {
+            let both = patch_two[from + k];
+            two += tap(k) * both;
+            more += tap(k) * vec2<f32>(both.x * both.x + both.y * both.y, both.x * both.y);
+        }
+        filtered_two[at] = two;
+        filtered_more[at] = more;
+    }
+    workgroupBarrier();
+    let column = lane % TILE;
+    let row = lane / TILE;
+    var two = vec2<f32>();
+    var more = vec2<f32>();
+    for (var k = 0u; k < WINDOW; k++) {
+        two += tap(k) * filtered_two[(row + k) * TILE + column];
+        more += tap(k) * filtered_more[(row + k) * TILE + column];
+    }
+    let x = j.x0 + column;
+    let y = j.y0 + row;
+    var sum = vec3<f32>();
+    if j.exists && x < loss.width && y < loss.height {
+        let pixels = loss.width * loss.height;
+        let pixel = y * loss.width + x;
+        let inside = x >= loss.margin && x + loss.margin < loss.width && y >= loss.margin && y + loss.margin < loss.height;
+        var point = vec4<f32>();
+        if inside && (target_pixels[pixel] >> 24u) != 0u {
+            point = ssim_point(two.x, two.y, more.x, more.y);
+        }
+        sum.z = point.x;
+        derivatives[3u * j.plane * pixels + pixel] = point.y;
+        derivatives[(3u * j.plane + 1u) * pixels + pixel] = point.z;
+        derivatives[(3u * j.plane + 2u) * pixels + pixel] = point.w;
+    }
+    let total = sum_lanes(lane, sum);
+    if lane == 0u && j.exists {
+        partials[j.partial] = vec4<f32>(total, 0.0);
+    }
+}
+
+@compute @workgroup_size(256)
+fn gradient(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let j = job(linear_index(workgroup, workgroups, 0u) / WORKGROUP);
+    let pixels = loss.width * loss.height;
+    for (var at = lane; at < PATCH_LEN; at += WORKGROUP) {
+        let pixel = pixel_of_patch(j, at);
+        var two = vec2<f32>();
+        var one = 0.0;
+        if j.exists && pixel != 0xffffffffu {
+            two = vec2<f32>(
+                derivatives[3u * j.plane * pixels + pixel],
+                derivatives[(3u * j.plane + 1u) * pixels + pixel],
+            );
+            one = derivatives[(3u * j.plane + 2u) * pixels + pixel];
+        }
+        patch_two[at] = two;
+        patch_one[at] = one;
+    }
+    workgroupBarrier();
+    for (var at = lane; at < FILTERED_LEN; at += WORKGROUP) {
+        let from = (at / TILE) * PATCH + at % TILE;
+        var two = vec2<f32>();
+        var one = 0.0;
+        for (var k = 0u; k < WINDOW; k++) {
+            two += tap(k) * patch_two[from + k];
+            one += tap(k) * patch_one[from + k];
+        }
+        filtered_two[at] = two;
+        filtered_more[at] = vec2<f32>(one, 0.0);
+    }
+    workgroupBarrier();
+    let column = lane % TILE;
+    let row = lane / TILE;
+    var two = vec2<f32>();
+    var one = 0.0;
+    for (var k = 0u; k < WINDOW; k++) {
+        two += tap(k) * filtered_two[(row + k) * TILE + column];
+        one += tap(k) * filtered_more[(row + k) * TILE + column].x;
+    }
+    let x = j.x0 + column;
+    let y = j.y0 + row;
+    var sum = vec3<f32>();
+    if j.exists && x < loss.width && y < loss.height {
+        let pixel = y * loss.width + x;
+        let both = values(j.channel, pixel);
+        let difference = both.x - both.y;
+        var v = select(0.0, loss.l1_weight, difference > 0.0) - select(0.0, loss.l1_weight, difference < 0.0);
+        v += loss.ssim_weight * (2.0 * both.x * two.y + both.y * one + two.x);
+        let counts = (target_pixels[pixel] >> 24u) != 0u;
+        v_rgb[j.channel * pixels + pixel] = select(0.0, v, counts);
+        sum = vec3<f32>(abs(difference), difference * difference, 0.0);
+    }
+    let total = sum_lanes(lane, sum);
+    if lane == 0u && j.exists {
+        partials[j.partial] = vec4<f32>(total.xy, partials[j.partial].z, 0.0);
+    }
+}
+
+@compute @workgroup_size(256)
+fn sum_partials(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let group = linear_index(workgroup, workgroups, 0u) / WORKGROUP;
+    let each = PARTIALS_EACH * WORKGROUP;
+    var sum = vec3<f32>();
+    for (var k = 0u; k < PARTIALS_EACH; k++) {
+        let at = group * each + k * WORKGROUP + lane;
+        if at < loss.partial_count {
+            sum += partials[at].xyz;
+        }
+    }
+    let total = sum_lanes(lane, sum);
+    if lane == 0u && group < (loss.partial_count + each - 1u) / each {
+        sums[group] = vec4<f32>(total, 0.0);
+    }
+}
