@@ -40,6 +40,8 @@ struct LossUniforms {
 /// What sum_partials makes of them.
 @group(0) @binding(6) var<storage, read_write> sums: array<vec4<f32>>;
 
+/// Invocations of a workgroup: one for each pixel of a tile.
+const WORKGROUP: u32 = 256u;
 const RADIUS: u32 = 5u;
 const WINDOW: u32 = 11u;
 /// Side of a tile with the window's margin.
@@ -156,7 +158,7 @@ fn ssim_map(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let j = job(linear_index(workgroup, workgroups, 0u) / WORKGROUP);
+    let j = job(linear_group(workgroup, workgroups));
     for (var at = lane; at < PATCH_LEN; at += WORKGROUP) {
         let pixel = pixel_of_patch(j, at);
         var both = vec2<f32>();
@@ -167,11 +169,11 @@ fn ssim_map(
     }
     workgroupBarrier();
     for (var at = lane; at < FILTERED_LEN; at += WORKGROUP) {
-        let from = (at / TILE) * PATCH + at % TILE;
+        let first = (at / TILE) * PATCH + at % TILE;
         var two = vec2<f32>();
         var more = vec2<f32>();
         for (var k = 0u; k < WINDOW; k++) {
-            let both = patch_two[from + k];
+            let both = patch_two[first + k];
             two += tap(k) * both;
             more += tap(k) * vec2<f32>(both.x * both.x + both.y * both.y, both.x * both.y);
         }
@@ -215,7 +217,7 @@ fn gradient(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let j = job(linear_index(workgroup, workgroups, 0u) / WORKGROUP);
+    let j = job(linear_group(workgroup, workgroups));
     let pixels = loss.width * loss.height;
     for (var at = lane; at < PATCH_LEN; at += WORKGROUP) {
         let pixel = pixel_of_patch(j, at);
@@ -233,12 +235,12 @@ fn gradient(
     }
     workgroupBarrier();
     for (var at = lane; at < FILTERED_LEN; at += WORKGROUP) {
-        let from = (at / TILE) * PATCH + at % TILE;
+        let first = (at / TILE) * PATCH + at % TILE;
         var two = vec2<f32>();
         var one = 0.0;
         for (var k = 0u; k < WINDOW; k++) {
-            two += tap(k) * patch_two[from + k];
-            one += tap(k) * patch_one[from + k];
+            two += tap(k) * patch_two[first + k];
+            one += tap(k) * patch_one[first + k];
         }
         filtered_two[at] = two;
         filtered_more[at] = vec2<f32>(one, 0.0);
@@ -277,7 +279,7 @@ fn sum_partials(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let group = linear_index(workgroup, workgroups, 0u) / WORKGROUP;
+    let group = linear_group(workgroup, workgroups);
     let each = PARTIALS_EACH * WORKGROUP;
     var sum = vec3<f32>();
     for (var k = 0u; k < PARTIALS_EACH; k++) {

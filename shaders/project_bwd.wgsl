@@ -98,7 +98,7 @@ fn project_bwd(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let i = linear_index(workgroup, workgroups, lane);
+    let i = linear_index(workgroup, workgroups, lane, 256u);
     if i >= view.row_count {
         return;
     }

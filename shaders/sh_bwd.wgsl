@@ -61,7 +61,7 @@ fn sh_bwd(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let i = linear_index(workgroup, workgroups, lane);
+    let i = linear_index(workgroup, workgroups, lane, 256u);
     if i >= view.row_count {
         return;
     }
@@ -83,10 +83,10 @@ fn sh_bwd(
     var basis1 = sh_band1(dir.unit);
     var v_basis1: array<f32, 3>;
     for (var k = 0u; k < 3u; k++) {
-        let from = 9u * i + 3u * k;
-        v_basis1[k] = dot3(vec3<f32>(sh1[from], sh1[from + 1u], sh1[from + 2u]), v);
+        let first = 9u * i + 3u * k;
+        v_basis1[k] = dot3(vec3<f32>(sh1[first], sh1[first + 1u], sh1[first + 2u]), v);
         for (var c = 0u; c < 3u; c++) {
-            v_sh1[from + c] = basis1[k] * v[c];
+            v_sh1[first + c] = basis1[k] * v[c];
         }
     }
     v_dir += sh_band1_vjp(v_basis1);
@@ -95,10 +95,10 @@ fn sh_bwd(
     var basis2 = sh_band2(dir.unit);
     var v_basis2: array<f32, 5>;
     for (var k = 0u; k < 5u; k++) {
-        let from = 15u * i + 3u * k;
-        v_basis2[k] = dot3(vec3<f32>(sh2[from], sh2[from + 1u], sh2[from + 2u]), v);
+        let first = 15u * i + 3u * k;
+        v_basis2[k] = dot3(vec3<f32>(sh2[first], sh2[first + 1u], sh2[first + 2u]), v);
         for (var c = 0u; c < 3u; c++) {
-            v_sh2[from + c] = basis2[k] * v[c];
+            v_sh2[first + c] = basis2[k] * v[c];
         }
     }
     v_dir += sh_band2_vjp(dir.unit, v_basis2);
@@ -107,10 +107,10 @@ fn sh_bwd(
     var basis3 = sh_band3(dir.unit);
     var v_basis3: array<f32, 7>;
     for (var k = 0u; k < 7u; k++) {
-        let from = 21u * i + 3u * k;
-        v_basis3[k] = dot3(vec3<f32>(sh3[from], sh3[from + 1u], sh3[from + 2u]), v);
+        let first = 21u * i + 3u * k;
+        v_basis3[k] = dot3(vec3<f32>(sh3[first], sh3[first + 1u], sh3[first + 2u]), v);
         for (var c = 0u; c < 3u; c++) {
-            v_sh3[from + c] = basis3[k] * v[c];
+            v_sh3[first + c] = basis3[k] * v[c];
         }
     }
     v_dir += sh_band3_vjp(dir.unit, v_basis3);

@@ -28,7 +28,7 @@ fn sh_fwd(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let i = linear_index(workgroup, workgroups, lane);
+    let i = linear_index(workgroup, workgroups, lane, 256u);
     if i >= view.row_count {
         return;
     }
@@ -43,22 +43,22 @@ fn sh_fwd(
     let dir = unit_direction(mean - view.centre).unit;
     var basis1 = sh_band1(dir);
     for (var k = 0u; k < 3u; k++) {
-        let from = 9u * i + 3u * k;
-        color += basis1[k] * vec3<f32>(sh1[from], sh1[from + 1u], sh1[from + 2u]);
+        let first = 9u * i + 3u * k;
+        color += basis1[k] * vec3<f32>(sh1[first], sh1[first + 1u], sh1[first + 2u]);
     }
 #endif
 #ifdef SH_DEGREE_2
     var basis2 = sh_band2(dir);
     for (var k = 0u; k < 5u; k++) {
-        let from = 15u * i + 3u * k;
-        color += basis2[k] * vec3<f32>(sh2[from], sh2[from + 1u], sh2[from + 2u]);
+        let first = 15u * i + 3u * k;
+        color += basis2[k] * vec3<f32>(sh2[first], sh2[first + 1u], sh2[first + 2u]);
     }
 #endif
 #ifdef SH_DEGREE_3
     var basis3 = sh_band3(dir);
     for (var k = 0u; k < 7u; k++) {
-        let from = 21u * i + 3u * k;
-        color += basis3[k] * vec3<f32>(sh3[from], sh3[from + 1u], sh3[from + 2u]);
+        let first = 21u * i + 3u * k;
+        color += basis3[k] * vec3<f32>(sh3[first], sh3[first + 1u], sh3[first + 2u]);
     }
 #endif
     // NaN gives 0.
