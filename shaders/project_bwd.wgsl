@@ -102,7 +102,7 @@ fn project_bwd(
     if i >= view.row_count {
         return;
     }
-    let at = SPLAT_STRIDE * (view.first_row + i);
+    let at = SPLAT_STRIDE * i;
     let radius = splats[at + 1u].w;
     if !(radius > 0.0) {
         // Culled: nothing to add to v_means.

@@ -60,7 +60,7 @@ fn project_fwd(
         && is_finite(g.depth) && g.depth > view.depth_range.x && g.depth < view.depth_range.y
         && on_screen(mean2d.x, radii.x, view.size.x) && on_screen(mean2d.y, radii.y, view.size.y)
         && is_finite(conic.x) && is_finite(conic.y) && is_finite(conic.z);
-    let at = SPLAT_STRIDE * (view.first_row + i);
+    let at = SPLAT_STRIDE * i;
     if visible {
         splats[at] = vec4<f32>(mean2d, g.depth, opacity);
         splats[at + 1u] = vec4<f32>(conic, radii.x);

@@ -18,14 +18,14 @@
 #ifdef SH_DEGREE_1
 @group(0) @binding(6) var<storage, read> sh1: array<f32>;
 @group(0) @binding(7) var<storage, read_write> v_sh1: array<f32>;
-#endif
 #ifdef SH_DEGREE_2
 @group(0) @binding(8) var<storage, read> sh2: array<f32>;
 @group(0) @binding(9) var<storage, read_write> v_sh2: array<f32>;
-#endif
 #ifdef SH_DEGREE_3
 @group(0) @binding(10) var<storage, read> sh3: array<f32>;
 @group(0) @binding(11) var<storage, read_write> v_sh3: array<f32>;
+#endif
+#endif
 #endif
 
 fn dot3(a: vec3<f32>, b: vec3<f32>) -> f32 {
@@ -42,16 +42,16 @@ fn clear_row(i: u32) {
     for (var c = 0u; c < 9u; c++) {
         v_sh1[9u * i + c] = 0.0;
     }
-#endif
 #ifdef SH_DEGREE_2
     for (var c = 0u; c < 15u; c++) {
         v_sh2[15u * i + c] = 0.0;
     }
-#endif
 #ifdef SH_DEGREE_3
     for (var c = 0u; c < 21u; c++) {
         v_sh3[21u * i + c] = 0.0;
     }
+#endif
+#endif
 #endif
 }
 
@@ -65,7 +65,7 @@ fn sh_bwd(
     if i >= view.row_count {
         return;
     }
-    let at = SPLAT_STRIDE * (view.first_row + i);
+    let at = SPLAT_STRIDE * i;
     let radius = splats[at + 1u].w;
     if !(radius > 0.0) {
         clear_row(i);
@@ -90,7 +90,6 @@ fn sh_bwd(
         }
     }
     v_dir += sh_band1_vjp(v_basis1);
-#endif
 #ifdef SH_DEGREE_2
     var basis2 = sh_band2(dir.unit);
     var v_basis2: array<f32, 5>;
@@ -102,7 +101,6 @@ fn sh_bwd(
         }
     }
     v_dir += sh_band2_vjp(dir.unit, v_basis2);
-#endif
 #ifdef SH_DEGREE_3
     var basis3 = sh_band3(dir.unit);
     var v_basis3: array<f32, 7>;
@@ -115,7 +113,7 @@ fn sh_bwd(
     }
     v_dir += sh_band3_vjp(dir.unit, v_basis3);
 #endif
-#ifdef SH_DEGREE_1
+#endif
     // From the unit direction to the mean: the part across it, by 1/length.
     v_dir = (v_dir - dot3(dir.unit, v_dir) * dir.unit) * dir.inv_len;
 #endif

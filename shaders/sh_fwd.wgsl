@@ -14,12 +14,12 @@
 @group(0) @binding(3) var<storage, read> sh0: array<f32>;
 #ifdef SH_DEGREE_1
 @group(0) @binding(4) var<storage, read> sh1: array<f32>;
-#endif
 #ifdef SH_DEGREE_2
 @group(0) @binding(5) var<storage, read> sh2: array<f32>;
-#endif
 #ifdef SH_DEGREE_3
 @group(0) @binding(6) var<storage, read> sh3: array<f32>;
+#endif
+#endif
 #endif
 
 @compute @workgroup_size(256)
@@ -32,7 +32,7 @@ fn sh_fwd(
     if i >= view.row_count {
         return;
     }
-    let at = SPLAT_STRIDE * (view.first_row + i);
+    let at = SPLAT_STRIDE * i;
     let radius = splats[at + 1u].w;
     if !(radius > 0.0) {
         return;
@@ -46,20 +46,20 @@ fn sh_fwd(
         let first = 9u * i + 3u * k;
         color += basis1[k] * vec3<f32>(sh1[first], sh1[first + 1u], sh1[first + 2u]);
     }
-#endif
 #ifdef SH_DEGREE_2
     var basis2 = sh_band2(dir);
     for (var k = 0u; k < 5u; k++) {
         let first = 15u * i + 3u * k;
         color += basis2[k] * vec3<f32>(sh2[first], sh2[first + 1u], sh2[first + 2u]);
     }
-#endif
 #ifdef SH_DEGREE_3
     var basis3 = sh_band3(dir);
     for (var k = 0u; k < 7u; k++) {
         let first = 21u * i + 3u * k;
         color += basis3[k] * vec3<f32>(sh3[first], sh3[first + 1u], sh3[first + 2u]);
     }
+#endif
+#endif
 #endif
     // NaN gives 0.
     splats[at + 2u] = vec4<f32>(select(vec3<f32>(), color, color > vec3<f32>()), splats[at + 2u].w);

@@ -2,8 +2,8 @@
 // those of `View` in src/kernels/project_fwd.rs, computed once per view on the CPU; src/kernels/uniforms.rs mirrors the
 // struct.
 //
-// A stage runs over `row_count` rows. Its columns (stored attributes and their gradients) are bound from the window's
-// first row on and indexed from 0; splats and v_splats are bound whole and indexed from `first_row`.
+// A stage runs over a window of `row_count` rows: every column, stored or gradient, splats and v_splats are bound from
+// the window's first row on and indexed from 0.
 
 struct RowsUniforms {
     /// Rows of the world-to-camera rotation, with the translation in w.
@@ -25,9 +25,9 @@ struct RowsUniforms {
     /// Where X/Z and Y/Z are cut inside the Jacobian.
     slope_low: vec2<f32>,
     slope_high: vec2<f32>,
-    /// Row of the view at which this window begins.
-    first_row: u32,
     /// Rows of this window.
     row_count: u32,
-    pad: vec2<u32>,
+    pad0: u32,
+    pad1: u32,
+    pad2: u32,
 }

@@ -1,5 +1,5 @@
 // The real spherical harmonics of bands 0 to 3, signs and order of src/kernels/sh_fwd.rs.
-// SH_DEGREE_1, SH_DEGREE_2 and SH_DEGREE_3 are defined up to the degree in use: degree 2 defines the first two.
+// Degree 2 defines SH_DEGREE_1 and SH_DEGREE_2; a switch without those below it counts for nothing in the stages.
 
 const SH_C0: f32 = 0.28209479;
 const SH_C1: f32 = 0.48860251;

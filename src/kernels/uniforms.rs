@@ -35,17 +35,19 @@ pub struct RowsUniforms {
     pub slope_low: [f32; 2],
     /// Upper cut.
     pub slope_high: [f32; 2],
-    /// Row of the view at which the window begins.
-    pub first_row: u32,
     /// Rows of the window.
     pub row_count: u32,
-    /// Zeros.
-    pub pad: [u32; 2],
+    /// 0.
+    pub pad0: u32,
+    /// 0.
+    pub pad1: u32,
+    /// 0.
+    pub pad2: u32,
 }
 
 impl RowsUniforms {
-    /// For the rows `first_row..first_row + row_count` of a view.
-    pub fn new(camera: &Camera, eps2d: f32, first_row: u32, row_count: u32) -> Self {
+    /// For a window of `row_count` rows.
+    pub fn new(camera: &Camera, eps2d: f32, row_count: u32) -> Self {
         let view = View::new(camera, eps2d);
         let with_last = |row: [f32; 3], last: f32| [row[0], row[1], row[2], last];
         RowsUniforms {
@@ -59,9 +61,10 @@ impl RowsUniforms {
             depth_range: view.depth_range,
             slope_low: view.slope_low,
             slope_high: view.slope_high,
-            first_row,
             row_count,
-            pad: [0; 2],
+            pad0: 0,
+            pad1: 0,
+            pad2: 0,
         }
     }
 }

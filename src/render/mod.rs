@@ -1,6 +1,8 @@
 //! The stages in order: forward, loss, backward; and image metrics.
 
 pub mod cpu;
+pub mod gpu_loss;
+pub mod gpu_rows;
 pub mod metrics;
 
 use crate::base::simd::SimdPath;

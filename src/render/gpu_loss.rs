@@ -1,0 +1,87 @@
+//! The image loss on the device: value and gradient of a picture against an 8-bit photo, all on the device but the
+//! four numbers of the value.
+//!
+//! Invariants: 1. sums are trees in a fixed order: the same bits on every run of one device; 2. the derivative maps are
+//! kept for one channel at a time.
+
+use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
+use crate::kernels::image_loss::{LossPlan, LossValue};
+use crate::kernels::uniforms::LossUniforms;
+use std::sync::Arc;
+
+/// The compiled stage.
+#[derive(Debug)]
+pub struct LossStage {
+    ssim_map: Arc<Pipeline>,
+    gradient: Arc<Pipeline>,
+    sum_partials: Arc<Pipeline>,
+}
+
+impl LossStage {
+    /// Compiles the stage.
+    ///
+    /// # Errors
+    /// The device refuses a shader.
+    pub fn new(gpu: &Gpu) -> GpuResult<Self> {
+        let entry = |name: &str| gpu.pipeline("image_loss.wgsl", name, &[]);
+        Ok(LossStage {
+            ssim_map: entry("ssim_map")?,
+            gradient: entry("gradient")?,
+            sum_partials: entry("sum_partials")?,
+        })
+    }
+
+    /// Writes the gradient of the picture `rgb` (planar) against `target_pixels` (see
+    /// [`crate::kernels::uniforms::pack_target`]) to `v_rgb`, and returns the sums that [`value`] makes a loss of: read
+    /// back four floats. A picture without pixels has no sums.
+    ///
+    /// # Errors
+    /// The device failed, or its budget cannot hold 12 bytes per pixel more.
+    pub fn run(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        [width, height]: [u32; 2],
+        plan: &LossPlan,
+        rgb: &BufferView,
+        target_pixels: &BufferView,
+        v_rgb: &BufferView,
+    ) -> GpuResult<Option<Buffer>> {
+        let tiles = LossUniforms::tiles(width, height);
+        if tiles == 0 {
+            return Ok(None);
+        }
+        let derivatives = gpu.buffer("derivatives", 12 * u64::from(width) * u64::from(height))?;
+        let mut partials = gpu.buffer("partials", 16 * 3 * u64::from(tiles))?;
+        let mut uniforms = LossUniforms::new(width, height, plan);
+        let groups = groups_1d(tiles, 1);
+        for channel in 0..3 {
+            (uniforms.first_channel, uniforms.channel_count) = (channel, 1);
+            let uniform = recorder.uniform(&uniforms)?;
+            let (map, sums) = (derivatives.view(), partials.view());
+            let views = [uniform.clone(), rgb.clone(), target_pixels.clone(), map.clone(), sums.clone()];
+            recorder.dispatch("image_loss", &self.ssim_map, &views, groups)?;
+            let views = [uniform, rgb.clone(), target_pixels.clone(), map, v_rgb.clone(), sums];
+            recorder.dispatch("image_loss", &self.gradient, &views, groups)?;
+        }
+        let mut count = 3 * tiles;
+        loop {
+            uniforms.partial_count = count;
+            let uniform = recorder.uniform(&uniforms)?;
+            count = count.div_ceil(LossUniforms::PARTIALS_PER_GROUP);
+            let sums = gpu.buffer("loss sums", 16 * u64::from(count))?;
+            let views = [uniform, partials.view(), sums.view()];
+            recorder.dispatch("image_loss", &self.sum_partials, &views, groups_1d(count, 1))?;
+            if count == 1 {
+                return Ok(Some(sums));
+            }
+            partials = sums;
+        }
+    }
+}
+
+/// The loss from the four floats that [`LossStage::run`] left.
+pub fn value(plan: &LossPlan, sums: [f32; 4]) -> LossValue {
+    let [l1, squares, ssim, _] = sums.map(f64::from);
+    plan.value(l1, squares, ssim)
+}

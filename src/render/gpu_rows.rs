@@ -1,0 +1,301 @@
+//! The stages on rows, on the device: project_fwd, sh_fwd, sh_bwd, project_bwd, with the columns that they work on.
+//!
+//! Not here: which rows, tiles, the order of a step.
+//!
+//! Invariants: 1. no binding is larger than the device allows: longer columns are bound in windows of rows, and since
+//! rows do not depend on each other the result has the same bits; 2. higher bands of the colour are a buffer each.
+
+use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
+use crate::kernels::uniforms::RowsUniforms;
+use crate::scene::camera::Camera;
+use crate::scene::columns::Columns;
+use std::sync::Arc;
+
+/// Bytes of a row in `splats` and `v_splats`: see `shaders/shared/splat.wgsl`.
+pub const SPLAT_BYTES: u64 = 48;
+/// Floats of a row of each higher band.
+pub const BAND_WIDTHS: [usize; 3] = [9, 15, 21];
+/// Windows begin at multiples of this many rows: then every column's offset is a multiple of 256 bytes, the largest
+/// alignment that a device may ask for.
+const WINDOW_STEP: u64 = 64;
+/// Invocations of a workgroup.
+const WORKGROUP: u32 = 256;
+
+/// Columns of rows on the device, or their gradients.
+#[derive(Debug)]
+pub struct DeviceColumns {
+    /// Rows.
+    pub rows: u32,
+    /// `[rows][3]`.
+    pub means: Buffer,
+    /// `[rows][4]`.
+    pub quats: Buffer,
+    /// `[rows][3]`.
+    pub scales: Buffer,
+    /// `[rows]`.
+    pub opacities: Buffer,
+    /// `[rows][3]`.
+    pub sh0: Buffer,
+    /// `[rows][2 l + 1][3]` for each band l in use, from 1 on.
+    pub bands: Vec<Buffer>,
+}
+
+impl DeviceColumns {
+    /// Memory for `rows` rows with the bands 1 to `sh_degree`; its contents are arbitrary.
+    ///
+    /// # Errors
+    /// The device or its budget cannot hold them.
+    pub fn new(gpu: &Gpu, rows: u32, sh_degree: u8) -> GpuResult<Self> {
+        let column = |label, width: usize| gpu.buffer(label, 4 * width as u64 * u64::from(rows));
+        let band_labels = ["sh1", "sh2", "sh3"];
+        Ok(DeviceColumns {
+            rows,
+            means: column("means", 3)?,
+            quats: column("quats", 4)?,
+            scales: column("scales", 3)?,
+            opacities: column("opacities", 1)?,
+            sh0: column("sh0", 3)?,
+            bands: (0..usize::from(sh_degree.min(3)))
+                .map(|band| column(band_labels[band], BAND_WIDTHS[band]))
+                .collect::<GpuResult<_>>()?,
+        })
+    }
+
+    /// Bytes of one row over all columns, for columns with the bands 1 to `sh_degree`.
+    pub fn row_bytes(sh_degree: u8) -> u64 {
+        4 * (14 + BAND_WIDTHS[..usize::from(sh_degree.min(3))].iter().sum::<usize>()) as u64
+    }
+
+    /// The columns with their floats per row, bands last.
+    pub fn columns(&self) -> impl Iterator<Item = (&Buffer, usize)> {
+        let narrow =
+            [(&self.means, 3), (&self.quats, 4), (&self.scales, 3), (&self.opacities, 1), (&self.sh0, 3)];
+        narrow.into_iter().chain(self.bands.iter().zip(BAND_WIDTHS))
+    }
+
+    /// Uploads `rows`, which hold as many rows and at least the bands in use. `scratch` takes one band at a time.
+    ///
+    /// # Errors
+    /// The device failed.
+    pub fn upload(&self, recorder: &mut Recorder<'_>, rows: &Columns, scratch: &mut Vec<f32>) -> GpuResult<()> {
+        recorder.upload(&self.means.view(), &rows.means)?;
+        recorder.upload(&self.quats.view(), &rows.quats)?;
+        recorder.upload(&self.scales.view(), &rows.scales)?;
+        recorder.upload(&self.opacities.view(), &rows.opacities)?;
+        recorder.upload(&self.sh0.view(), &rows.sh0)?;
+        for (band, buffer) in self.bands.iter().enumerate() {
+            band_from_sh_n(rows, band, scratch);
+            recorder.upload(&buffer.view(), scratch)?;
+        }
+        Ok(())
+    }
+
+    /// The window of each column.
+    fn window(&self, window: Window) -> WindowViews {
+        let view = |buffer: &Buffer, width: usize| window.of(buffer, 4 * width as u64);
+        WindowViews {
+            means: view(&self.means, 3),
+            quats: view(&self.quats, 4),
+            scales: view(&self.scales, 3),
+            opacities: view(&self.opacities, 1),
+            sh0: view(&self.sh0, 3),
+            bands: self.bands.iter().zip(BAND_WIDTHS).map(|(buffer, width)| view(buffer, width)).collect(),
+        }
+    }
+}
+
+/// Copies one band (0: l = 1) out of `sh_n` into `[rows][2 l + 1][3]`.
+pub fn band_from_sh_n(rows: &Columns, band: usize, out: &mut Vec<f32>) {
+    out.clear();
+    let row_width = rows.sh_n.len() / rows.rows().max(1);
+    let first: usize = BAND_WIDTHS[..band].iter().sum();
+    for row in rows.sh_n.chunks_exact(row_width.max(1)) {
+        out.extend_from_slice(&row[first..first + BAND_WIDTHS[band]]);
+    }
+}
+
+/// Copies one band back into its place in `sh_n`.
+pub fn band_into_sh_n(values: &[f32], band: usize, rows: &mut Columns) {
+    let row_width = rows.sh_n.len() / rows.rows().max(1);
+    let first: usize = BAND_WIDTHS[..band].iter().sum();
+    let width = BAND_WIDTHS[band];
+    for (row, values) in rows.sh_n.chunks_exact_mut(row_width.max(1)).zip(values.chunks_exact(width)) {
+        row[first..first + width].copy_from_slice(values);
+    }
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Window {
+    first: u64,
+    rows: u32,
+}
+
+impl Window {
+    fn of(self, buffer: &Buffer, row_bytes: u64) -> BufferView {
+        buffer.slice(self.first * row_bytes, u64::from(self.rows) * row_bytes)
+    }
+}
+
+struct WindowViews {
+    means: BufferView,
+    quats: BufferView,
+    scales: BufferView,
+    opacities: BufferView,
+    sh0: BufferView,
+    bands: Vec<BufferView>,
+}
+
+/// Windows that cover `rows` rows so that no binding of `row_bytes` per row exceeds the device's limit.
+fn windows(gpu: &Gpu, rows: u32, row_bytes: u64) -> impl Iterator<Item = Window> {
+    let rows = u64::from(rows);
+    let step = (gpu.max_binding_bytes() / row_bytes / WINDOW_STEP * WINDOW_STEP).max(WINDOW_STEP);
+    (0..rows.div_ceil(step)).map(move |i| Window { first: i * step, rows: (rows - i * step).min(step) as u32 })
+}
+
+/// The compiled stages.
+#[derive(Debug)]
+pub struct RowStages {
+    project_fwd: Arc<Pipeline>,
+    project_bwd: Arc<Pipeline>,
+    /// By degree.
+    sh_fwd: [Arc<Pipeline>; 4],
+    sh_bwd: [Arc<Pipeline>; 4],
+}
+
+impl RowStages {
+    /// Compiles the stages.
+    ///
+    /// # Errors
+    /// The device refuses a shader.
+    pub fn new(gpu: &Gpu) -> GpuResult<Self> {
+        let defines = [("SH_DEGREE_1", ""), ("SH_DEGREE_2", ""), ("SH_DEGREE_3", "")];
+        let sh = |shader: &str, entry: &str, degree: usize| gpu.pipeline(shader, entry, &defines[..degree]);
+        let all = |shader: &str, entry: &str| -> GpuResult<[Arc<Pipeline>; 4]> {
+            Ok([sh(shader, entry, 0)?, sh(shader, entry, 1)?, sh(shader, entry, 2)?, sh(shader, entry, 3)?])
+        };
+        Ok(RowStages {
+            project_fwd: gpu.pipeline("project_fwd.wgsl", "project_fwd", &[])?,
+            project_bwd: gpu.pipeline("project_bwd.wgsl", "project_bwd", &[])?,
+            sh_fwd: all("sh_fwd.wgsl", "sh_fwd")?,
+            sh_bwd: all("sh_bwd.wgsl", "sh_bwd")?,
+        })
+    }
+
+    /// Writes the footprints of all rows to `splats`, colours still 0.
+    ///
+    /// # Errors
+    /// The device failed.
+    pub fn project_fwd(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        camera: &Camera,
+        eps2d: f32,
+        rows: &DeviceColumns,
+        splats: &Buffer,
+    ) -> GpuResult<()> {
+        for window in windows(gpu, rows.rows, SPLAT_BYTES) {
+            let uniform = recorder.uniform(&RowsUniforms::new(camera, eps2d, window.rows))?;
+            let w = rows.window(window);
+            let views = [uniform, w.means, w.quats, w.scales, w.opacities, window.of(splats, SPLAT_BYTES)];
+            recorder.dispatch("project_fwd", &self.project_fwd, &views, groups_1d(window.rows, WORKGROUP))?;
+        }
+        Ok(())
+    }
+
+    /// Fills in the colours of the rows that are drawn, from the bands up to `sh_degree`.
+    ///
+    /// # Errors
+    /// The device failed.
+    pub fn sh_fwd(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        camera: &Camera,
+        sh_degree: u8,
+        rows: &DeviceColumns,
+        splats: &Buffer,
+    ) -> GpuResult<()> {
+        let degree = usize::from(sh_degree);
+        for window in windows(gpu, rows.rows, widest_row(degree)) {
+            let uniform = recorder.uniform(&RowsUniforms::new(camera, 0.0, window.rows))?;
+            let w = rows.window(window);
+            let mut views = vec![uniform];
+            // Without a direction the means are not used.
+            views.extend((degree > 0).then_some(w.means));
+            views.extend([window.of(splats, SPLAT_BYTES), w.sh0]);
+            views.extend(w.bands.into_iter().take(degree));
+            recorder.dispatch("sh_fwd", &self.sh_fwd[degree], &views, groups_1d(window.rows, WORKGROUP))?;
+        }
+        Ok(())
+    }
+
+    /// Writes the gradients of means (the colour's part), sh0 and the bands up to `sh_degree`.
+    ///
+    /// # Errors
+    /// The device failed.
+    pub fn sh_bwd(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        camera: &Camera,
+        sh_degree: u8,
+        rows: &DeviceColumns,
+        splats: &Buffer,
+        v_splats: &Buffer,
+        grads: &DeviceColumns,
+    ) -> GpuResult<()> {
+        let degree = usize::from(sh_degree);
+        for window in windows(gpu, rows.rows, widest_row(degree)) {
+            let uniform = recorder.uniform(&RowsUniforms::new(camera, 0.0, window.rows))?;
+            let (w, v) = (rows.window(window), grads.window(window));
+            let mut views = vec![uniform];
+            views.extend((degree > 0).then_some(w.means));
+            views.extend([window.of(splats, SPLAT_BYTES), window.of(v_splats, SPLAT_BYTES), v.means, v.sh0]);
+            views.extend(w.bands.into_iter().zip(v.bands).take(degree).flat_map(|(band, v_band)| [band, v_band]));
+            recorder.dispatch("sh_bwd", &self.sh_bwd[degree], &views, groups_1d(window.rows, WORKGROUP))?;
+        }
+        Ok(())
+    }
+
+    /// Adds to the gradients of means and writes those of quats, scales and opacities.
+    ///
+    /// # Errors
+    /// The device failed.
+    pub fn project_bwd(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        camera: &Camera,
+        eps2d: f32,
+        rows: &DeviceColumns,
+        splats: &Buffer,
+        v_splats: &Buffer,
+        grads: &DeviceColumns,
+    ) -> GpuResult<()> {
+        for window in windows(gpu, rows.rows, SPLAT_BYTES) {
+            let uniform = recorder.uniform(&RowsUniforms::new(camera, eps2d, window.rows))?;
+            let (w, v) = (rows.window(window), grads.window(window));
+            let views = [
+                uniform,
+                w.means,
+                w.quats,
+                w.scales,
+                w.opacities,
+                window.of(splats, SPLAT_BYTES),
+                window.of(v_splats, SPLAT_BYTES),
+                v.means,
+                v.quats,
+                v.scales,
+                v.opacities,
+            ];
+            recorder.dispatch("project_bwd", &self.project_bwd, &views, groups_1d(window.rows, WORKGROUP))?;
+        }
+        Ok(())
+    }
+}
+
+/// Bytes of a row in the widest binding of the colour stages.
+fn widest_row(degree: usize) -> u64 {
+    BAND_WIDTHS[..degree].iter().map(|w| 4 * *w as u64).fold(SPLAT_BYTES, u64::max)
+}
