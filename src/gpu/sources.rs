@@ -11,4 +11,17 @@ macro_rules! sources {
     };
 }
 
-sources!["shared/constants.wgsl", "shared/dispatch.wgsl",];
+sources![
+    "image_loss.wgsl",
+    "project_bwd.wgsl",
+    "project_fwd.wgsl",
+    "sh_bwd.wgsl",
+    "sh_fwd.wgsl",
+    "shared/camera.wgsl",
+    "shared/constants.wgsl",
+    "shared/covariance.wgsl",
+    "shared/dispatch.wgsl",
+    "shared/math.wgsl",
+    "shared/sh.wgsl",
+    "shared/splat.wgsl",
+];

@@ -1,20 +1,23 @@
 //! project_fwd, sh_fwd, sh_bwd and project_bwd.
+//!
+//! Where tolerances come from: devices may fuse multiplications and additions and may divide within 2.5 units in the
+//! last place, so every quantity differs by some roundings of 6e-8. Lavapipe differs by at most 2.6e-6 of a conic.
 
-use crate::device::{Lab, bits, floats, lab};
+use crate::support::gpu::open;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
+use gsscale::gpu::{Buffer, Gpu, GpuOptions, Recorder};
 use gsscale::kernels::project_bwd::project_bwd;
 use gsscale::kernels::project_fwd::{Projected, project_fwd};
 use gsscale::kernels::sh_bwd::sh_bwd;
 use gsscale::kernels::sh_fwd::sh_fwd;
-use gsscale::kernels::uniforms::RowsUniforms;
+use gsscale::render::gpu_rows::{BAND_WIDTHS, DeviceColumns, RowStages, SPLAT_BYTES, band_into_sh_n};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::Columns;
 
 const EPS2D: f32 = 0.3;
-const DEFINES: [&str; 3] = ["SH_DEGREE_1", "SH_DEGREE_2", "SH_DEGREE_3"];
-/// Floats of a row in each band's buffer, and where they begin in a row of `sh_n`.
-const BANDS: [(usize, usize); 3] = [(9, 0), (15, 9), (21, 24)];
+/// Numbers of rows: none, one, below, at and above the workgroup, several workgroups.
+const SIZES: [usize; 6] = [0, 1, 255, 256, 257, 5000];
 
 fn camera() -> Camera {
     Camera {
@@ -30,9 +33,9 @@ fn camera() -> Camera {
     }
 }
 
-fn random_rows(n: usize, sh_degree: u8) -> Columns {
+fn random_rows(n: usize) -> Columns {
     let mut rng = Stream::new(3, Purpose::Test, n as u64, 1);
-    let mut rows = Columns::zeros(n, sh_degree);
+    let mut rows = Columns::zeros(n, 3);
     rows.means.fill_with(|| rng.range(-3.0, 3.0) as f32);
     rows.quats.fill_with(|| rng.range(-1.0, 1.0) as f32);
     rows.scales.fill_with(|| rng.range(-5.0, 0.0) as f32);
@@ -42,135 +45,310 @@ fn random_rows(n: usize, sh_degree: u8) -> Columns {
     rows
 }
 
-/// Numbers of rows: none, one, below, at and above the workgroup, several workgroups.
-const SIZES: [usize; 6] = [0, 1, 255, 256, 257, 5000];
-
-/// Twelve floats of a row, as `shaders/shared/splat.wgsl` says.
-fn record(mean2d: [f32; 2], depth: f32, opacity: f32, conic: [f32; 3], radii: [f32; 2], color: [f32; 3]) -> [f32; 12] {
-    let ([mx, my], [xx, xy, yy], [r, g, b]) = (mean2d, conic, color);
-    [mx, my, depth, opacity, xx, xy, yy, radii[0], r, g, b, radii[1]]
+/// What the tile stages hand back: twelve floats for each row, as in `shaders/shared/splat.wgsl`.
+fn random_gradients(n: usize) -> Vec<[f32; 12]> {
+    let mut rng = Stream::new(4, Purpose::Test, n as u64, 1);
+    let mut draw = || rng.normal() as f32;
+    let one = |_| [draw(), draw(), 0.0, draw(), draw(), draw(), draw(), 0.0, draw(), draw(), draw(), 0.0];
+    (0..n).map(one).collect()
 }
 
-fn splats_of(p: &Projected, colors: &[[f32; 3]]) -> Vec<f32> {
-    (0..p.rows())
-        .flat_map(|i| {
-            let radii = p.radii[i].map(|r| r as f32);
-            record(p.means2d[i], p.depths[i], p.opacities[i], p.conics[i], radii, colors[i])
-        })
-        .collect()
+fn record_of(p: &Projected, row: usize, [r, g, b]: [f32; 3]) -> [f32; 12] {
+    let ([mx, my], [xx, xy, yy]) = (p.means2d[row], p.conics[row]);
+    let [rx, ry] = p.radii[row].map(|r| r as f32);
+    [mx, my, p.depths[row], p.opacities[row], xx, xy, yy, rx, r, g, b, ry]
 }
 
-fn band(rows: &Columns, band: usize) -> Vec<f32> {
-    let (width, from) = BANDS[band];
-    let row_width = rows.sh_n.len() / rows.rows().max(1);
-    rows.sh_n.chunks(row_width.max(1)).flat_map(|row| row[from..from + width].iter().copied()).collect()
+/// Everything that the stages say about some rows.
+struct Results {
+    projected: Vec<[f32; 12]>,
+    colors: Vec<[f32; 3]>,
+    grads: Columns,
 }
 
-fn groups(rows: usize) -> u32 {
-    rows.div_ceil(256) as u32
+fn on_cpu(rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]]) -> Results {
+    let simd = SimdPath::best();
+    let (mut p, mut colors, mut grads) = (Projected::default(), Vec::new(), Columns::zeros(rows.rows(), 3));
+    project_fwd(rows, camera, EPS2D, simd, &mut p);
+    sh_fwd(rows, camera, degree, &p, simd, &mut colors);
+    let v_colors: Vec<_> = v.iter().map(|v| [v[8], v[9], v[10]]).collect();
+    let v_means2d: Vec<_> = v.iter().map(|v| [v[0], v[1]]).collect();
+    let v_conics: Vec<_> = v.iter().map(|v| [v[4], v[5], v[6]]).collect();
+    let v_opacities: Vec<_> = v.iter().map(|v| v[3]).collect();
+    sh_bwd(rows, camera, degree, &p, &colors, &v_colors, simd, &mut grads);
+    project_bwd(rows, camera, EPS2D, &p, &v_means2d, &v_conics, &v_opacities, simd, &mut grads);
+    let projected = (0..rows.rows()).map(|i| record_of(&p, i, [0.0; 3])).collect();
+    Results { projected, colors, grads }
 }
 
-fn uniform(camera: &Camera, first_row: usize, rows: usize) -> RowsUniforms {
-    RowsUniforms::new(camera, EPS2D, first_row as u32, rows as u32)
+/// Runs `stage` on a fresh recorder and reads `buffer` back.
+fn read<'g>(gpu: &'g Gpu, buffer: &Buffer, stage: impl FnOnce(&mut Recorder<'g>)) -> Vec<f32> {
+    let mut recorder = gpu.begin("parity");
+    stage(&mut recorder);
+    let bytes = recorder.read_back("parity", &buffer.view()).unwrap();
+    gpu.submit(recorder).unwrap();
+    let mut values: Vec<f32> = bytes.to_vec(gpu).unwrap();
+    values.truncate((buffer.size() / 4) as usize);
+    values
 }
 
-/// Runs project_fwd over windows of `window` rows.
-fn project_on(lab: &Lab, rows: &Columns, camera: &Camera, window: usize) -> Vec<f32> {
+/// The same on the device; sh_fwd and the backward stages are given the CPU's splats.
+fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]], cpu: &Results) -> Results {
     let n = rows.rows();
-    let mut splats = vec![f32::NAN.to_bits(); 12 * n];
-    for first in (0..n).step_by(window.max(1)) {
-        let end = n.min(first + window);
-        let mut means = bits(&rows.means[3 * first..3 * end]);
-        let mut quats = bits(&rows.quats[4 * first..4 * end]);
-        let mut scales = bits(&rows.scales[3 * first..3 * end]);
-        let mut opacities = bits(&rows.opacities[first..end]);
-        lab.run(
-            "project_fwd.wgsl",
-            "project_fwd",
-            &[],
-            bytemuck::bytes_of(&uniform(camera, first, end - first)),
-            &mut [(1, &mut means), (2, &mut quats), (3, &mut scales), (4, &mut opacities), (5, &mut splats)],
-            groups(end - first),
-        );
+    let stages = RowStages::new(gpu).unwrap();
+    let columns = DeviceColumns::new(gpu, n as u32, degree).unwrap();
+    let grads = DeviceColumns::new(gpu, n as u32, degree).unwrap();
+    let splats = gpu.buffer("splats", SPLAT_BYTES * n as u64).unwrap();
+    let v_splats = gpu.buffer("v_splats", SPLAT_BYTES * n as u64).unwrap();
+    let projected = read(gpu, &splats, |r| {
+        columns.upload(r, rows, &mut Vec::new()).unwrap();
+        // Every entry must be written: what was there before must not show.
+        for (buffer, width) in grads.columns() {
+            r.upload(&buffer.view(), &vec![f32::NAN; width * n]).unwrap();
+        }
+        r.upload(&splats.view(), &vec![f32::NAN; 12 * n]).unwrap();
+        r.upload(&v_splats.view(), v).unwrap();
+        stages.project_fwd(gpu, r, camera, EPS2D, &columns, &splats).unwrap();
+    });
+    let colored = read(gpu, &splats, |r| {
+        r.upload(&splats.view(), &cpu.projected).unwrap();
+        stages.sh_fwd(gpu, r, camera, degree, &columns, &splats).unwrap();
+    });
+    let with_colors: Vec<_> = cpu.projected.iter().zip(&cpu.colors).map(|(p, c)| with_color(*p, *c)).collect();
+    let mut out = Columns::zeros(n, 3);
+    out.opacities = read(gpu, &grads.opacities, |r| {
+        r.upload(&splats.view(), &with_colors).unwrap();
+        stages.sh_bwd(gpu, r, camera, degree, &columns, &splats, &v_splats, &grads).unwrap();
+        stages.project_bwd(gpu, r, camera, EPS2D, &columns, &splats, &v_splats, &grads).unwrap();
+    });
+    out.means = read(gpu, &grads.means, |_| {});
+    out.quats = read(gpu, &grads.quats, |_| {});
+    out.scales = read(gpu, &grads.scales, |_| {});
+    out.sh0 = read(gpu, &grads.sh0, |_| {});
+    for (band, buffer) in grads.bands.iter().enumerate() {
+        band_into_sh_n(&read(gpu, buffer, |_| {}), band, &mut out);
     }
-    floats(&splats)
+    let (projected, _) = projected.as_chunks::<12>();
+    let (colored, _) = colored.as_chunks::<12>();
+    for (got, want) in colored.iter().zip(&cpu.projected) {
+        assert_eq!(with_color(*got, [0.0; 3]), *want, "sh_fwd changes nothing but the colour");
+    }
+    let colors = colored.iter().map(|c| [c[8], c[9], c[10]]).collect();
+    Results { projected: projected.to_vec(), colors, grads: out }
 }
 
-fn projected(rows: &Columns, camera: &Camera) -> Projected {
-    let mut p = Projected::default();
-    project_fwd(rows, camera, EPS2D, SimdPath::best(), &mut p);
-    p
+fn with_color(mut splat: [f32; 12], color: [f32; 3]) -> [f32; 12] {
+    splat[8..11].copy_from_slice(&color);
+    splat
 }
 
-fn measure(what: &str, got: &[f32], want: &[f32], width: usize) {
-    let mut worst = (0.0f64, 0usize);
-    for (i, (g, w)) in got.chunks(width).zip(want.chunks(width)).enumerate() {
-        let scale = w.iter().fold(1e-30f64, |m, x| m.max(f64::from(x.abs())));
-        let d = g.iter().zip(w).fold(0.0f64, |m, (a, b)| { let d = f64::from((a - b).abs()); if d.is_nan() { f64::INFINITY } else { m.max(d) } }) / scale;
-        if d > worst.0 { worst = (d, i); }
+/// Largest difference relative to the largest value of the row; zeros must be zeros, what is not finite must agree.
+fn difference(got: &[f32], want: &[f32]) -> f64 {
+    let scale = want.iter().filter(|w| w.is_finite()).fold(0.0f32, |m, w| m.max(w.abs()));
+    got.iter().zip(want).fold(0.0f64, |worst, (g, w)| {
+        let same = g == w || (g.is_nan() && w.is_nan());
+        let relative = f64::from((g - w).abs()) / f64::from(scale);
+        worst.max(if same { 0.0 } else if relative.is_nan() { f64::INFINITY } else { relative })
+    })
+}
+
+#[track_caller]
+fn assert_rows(what: &str, got: &[f32], want: &[f32], width: usize, limit: impl Fn(usize) -> f64) {
+    assert_eq!(got.len(), want.len(), "{what}");
+    for (row, (got, want)) in got.chunks(width).zip(want.chunks(width)).enumerate() {
+        let d = difference(got, want);
+        assert!(d <= limit(row), "{what}, row {row}: {got:?}, want {want:?}: {d:e} > {:e}", limit(row));
     }
-    println!("{what}: {worst:?} {:?} {:?}", got.chunks(width).nth(worst.1), want.chunks(width).nth(worst.1));
+}
+
+/// Compares all results; `radius_flips`: rows whose radius may be rounded up by one pixel more or less.
+fn assert_same(got: &Results, want: &Results, radius_flips: usize) {
+    let drawn = |s: &[f32; 12]| s[7] > 0.0;
+    let mut flips = 0;
+    for (row, (g, w)) in got.projected.iter().zip(&want.projected).enumerate() {
+        assert_eq!(drawn(g), drawn(w), "row {row}: {g:?}, want {w:?}");
+        flips += usize::from([g[7], g[11]] != [w[7], w[11]]);
+        assert!((g[7] - w[7]).abs() <= 1.0 && (g[11] - w[11]).abs() <= 1.0, "row {row}: {g:?}, want {w:?}");
+    }
+    assert!(flips <= radius_flips, "{flips} radii differ");
+    // The camera-space position is a sum of terms up to 10 that nearly cancel close to the camera; the footprint goes
+    // with its square.
+    let near = |row: usize| 1.0 + 10.0 / f64::from(want.projected[row][2].max(0.01));
+    let part = |r: &Results, at: usize, width: usize| -> Vec<f32> {
+        r.projected.iter().flat_map(|s| s[at..at + width].to_vec()).collect()
+    };
+    for (what, at, width, units) in [("means2d", 0, 2, 1.0), ("depths", 2, 1, 1.0), ("conics", 4, 3, 4.0)] {
+        let limit = |row: usize| 1e-6 * units * near(row);
+        assert_rows(what, &part(got, at, width), &part(want, at, width), width, limit);
+    }
+    // Ten roundings of exp and sigmoid.
+    assert_rows("opacities", &part(got, 3, 1), &part(want, 3, 1), 1, |_| 1e-6);
+    // 16 products of up to 3 in size, against the colours' size.
+    let (got_colors, want_colors) = (got.colors.as_flattened(), want.colors.as_flattened());
+    for (row, (g, w)) in got.colors.iter().zip(&want.colors).enumerate() {
+        assert!(g.iter().zip(w).all(|(g, w)| (g - w).abs() <= 5e-6 || g == w), "colour {row}: {g:?}, want {w:?}");
+    }
+    assert_eq!(got_colors.len(), want_colors.len());
+    let (g, w) = (&got.grads, &want.grads);
+    assert_rows("v_sh0", &g.sh0, &w.sh0, 3, |_| 1e-6);
+    // Basis functions of a direction with roundings: their terms are up to 3.
+    assert_rows("v_sh_n", &g.sh_n, &w.sh_n, 45, |_| 5e-6);
+    assert_rows("v_opacities", &g.opacities, &w.opacities, 1, |_| 2e-6);
+    // Sums over products of conics, each with its roundings, some of which cancel: where axes are nearly equal, a
+    // turn changes nothing. Lavapipe: 4.4e-5 at most.
+    assert_rows("v_scales", &g.scales, &w.scales, 3, |row| 2e-5 * near(row));
+    assert_rows("v_quats", &g.quats, &w.quats, 4, |row| 1e-4 * near(row));
+    assert_rows("v_means", &g.means, &w.means, 3, |row| 2e-5 * near(row));
 }
 
 #[test]
-fn probe() {
-    let Some(lab) = lab() else { return };
+fn stages_on_rows_are_those_of_the_cpu() {
+    let Some(gpu) = open(&GpuOptions::default()) else { return };
     for n in SIZES {
-        let rows = random_rows(n, 3);
-        let p = projected(&rows, &camera());
-        let mut colors = Vec::new();
-        let got = project_on(lab, &rows, &camera(), 2048);
-        let want = splats_of(&p, &vec![[0.0; 3]; n]);
-        let flips = (0..n).filter(|i| (got[12 * i + 7] > 0.0) != (want[12 * i + 7] > 0.0)).count();
-        let radii = (0..n).filter(|i| got[12 * i + 7] != want[12 * i + 7] || got[12 * i + 11] != want[12 * i + 11]).count();
-        println!("{n}: flips {flips}, radii {radii}");
-        for (c, w) in [(0, 2), (2, 1), (3, 1), (4, 3)] {
-            let take = |v: &[f32]| -> Vec<f32> { v.chunks(12).flat_map(|r| r[c..c + w].to_vec()).collect() };
-            measure(&format!("at {c}"), &take(&got), &take(&want), w);
-        }
+        let rows = random_rows(n);
+        let v = random_gradients(n);
         for degree in 0..=3u8 {
-            sh_fwd(&rows, &camera(), degree, &p, SimdPath::best(), &mut colors);
-            let mut splats = bits(&splats_of(&p, &vec![[0.0; 3]; n]));
-            let mut means = bits(&rows.means);
-            let mut sh0 = bits(&rows.sh0);
-            let mut bands: Vec<_> = (0..degree as usize).map(|b| bits(&band(&rows, b))).collect();
-            let mut bind = vec![(1, &mut means), (2, &mut splats), (3, &mut sh0)];
-            for (b, data) in bands.iter_mut().enumerate() { bind.push((4 + b as u32, data)); }
-            let u = uniform(&camera(), 0, n);
-            lab.run("sh_fwd.wgsl", "sh_fwd", &DEFINES[..degree as usize], bytemuck::bytes_of(&u), &mut bind, groups(n));
-            measure("sh_fwd", &floats(&splats), &splats_of(&p, &colors), 12);
-
-            let mut rng = Stream::new(4, Purpose::Test, n as u64, 1);
-            let mut draw = |k: f32| rng.normal() as f32 * k;
-            let v_means2d: Vec<[f32; 2]> = (0..n).map(|_| [draw(1.0), draw(1.0)]).collect();
-            let v_conics: Vec<[f32; 3]> = (0..n).map(|_| [draw(1.0), draw(1.0), draw(1.0)]).collect();
-            let v_colors: Vec<[f32; 3]> = (0..n).map(|_| [draw(1.0), draw(1.0), draw(1.0)]).collect();
-            let v_opacities: Vec<f32> = (0..n).map(|_| draw(1.0)).collect();
-            let mut grads = Columns::zeros(n, 3);
-            sh_bwd(&rows, &camera(), degree, &p, &colors, &v_colors, SimdPath::best(), &mut grads);
-            let mut splats = bits(&splats_of(&p, &colors));
-            let mut v_splats = bits(&(0..n).flat_map(|i| record(v_means2d[i], 0.0, v_opacities[i], v_conics[i], [0.0; 2], v_colors[i])).collect::<Vec<_>>());
-            let mut v_means = vec![0u32; 3 * n];
-            let mut v_sh0 = vec![0u32; 3 * n];
-            let mut v_bands: Vec<_> = bands.iter().map(|b| vec![0u32; b.len()]).collect();
-            {
-            let mut bind = vec![(1, &mut means), (2, &mut splats), (3, &mut v_splats), (4, &mut v_means), (5, &mut v_sh0)];
-            for (b, (data, v)) in bands.iter_mut().zip(&mut v_bands).enumerate() { bind.push((6 + 2 * b as u32, data)); bind.push((7 + 2 * b as u32, v)); }
-            lab.run("sh_bwd.wgsl", "sh_bwd", &DEFINES[..degree as usize], bytemuck::bytes_of(&u), &mut bind, groups(n));
-            }
-            measure("v_sh0", &floats(&v_sh0), &grads.sh0, 3);
-            measure("v_means", &floats(&v_means), &grads.means, 3);
-            for (b, v) in v_bands.iter().enumerate() { measure("v_band", &floats(v), &band(&grads, b), BANDS[b].0); }
-            if degree == 3 {
-                project_bwd(&rows, &camera(), EPS2D, &p, &v_means2d, &v_conics, &v_opacities, SimdPath::best(), &mut grads);
-                let (mut quats, mut scales, mut opacities) = (bits(&rows.quats), bits(&rows.scales), bits(&rows.opacities));
-                let (mut vq, mut vs, mut vo) = (vec![0u32; 4 * n], vec![0u32; 3 * n], vec![0u32; n]);
-                lab.run("project_bwd.wgsl", "project_bwd", &[], bytemuck::bytes_of(&u), &mut [(1, &mut means), (2, &mut quats), (3, &mut scales), (4, &mut opacities), (5, &mut splats), (6, &mut v_splats), (7, &mut v_means), (8, &mut vq), (9, &mut vs), (10, &mut vo)], groups(n));
-                measure("v_means", &floats(&v_means), &grads.means, 3);
-                measure("v_quats", &floats(&vq), &grads.quats, 4);
-                measure("v_scales", &floats(&vs), &grads.scales, 3);
-                measure("v_opac", &floats(&vo), &grads.opacities, 1);
-            }
+            let want = on_cpu(&rows, &camera(), degree, &v);
+            let got = on_gpu(&gpu, &rows, &camera(), degree, &v, &want);
+            // A radius is rounded up: one row in a thousand may stand within 1e-4 px of a whole number.
+            assert_same(&got, &want, n / 1000);
         }
     }
+}
+
+/// A row in front of the camera that is drawn.
+fn plain_row(rows: &mut Columns, row: usize) {
+    rows.means[3 * row..3 * row + 3].copy_from_slice(&[0.1, -0.2, 0.3]);
+    rows.quats[4 * row..4 * row + 4].copy_from_slice(&[0.9, 0.1, -0.3, 0.2]);
+    rows.scales[3 * row..3 * row + 3].copy_from_slice(&[-2.0, -1.5, -2.5]);
+    rows.opacities[row] = 0.5;
+}
+
+/// Logit of an opacity of exactly 1/255, moved by a part of itself.
+fn logit_of_alpha_min(by: f32) -> f32 {
+    -5.537_334_3 * (1.0 - by)
+}
+
+/// What is done to a row, and to what number of it.
+type Poison = (&'static str, fn(&mut Columns, usize));
+
+const POISON: [Poison; 30] = [
+    ("nothing", |_, _| {}),
+    ("NaN mean", |r, i| r.means[3 * i + 1] = f32::NAN),
+    ("infinite mean", |r, i| r.means[3 * i] = f32::INFINITY),
+    ("mean at minus infinity", |r, i| r.means[3 * i + 2] = f32::NEG_INFINITY),
+    ("far to the side", |r, i| r.means[3 * i] = 1e30),
+    ("largest mean", |r, i| r.means[3 * i] = f32::MAX),
+    ("denormal mean", |r, i| r.means[3 * i] = 1e-40),
+    ("behind the camera", |r, i| r.means[3 * i + 2] = -30.0),
+    ("beside the image", |r, i| r.means[3 * i] = 30.0),
+    ("just beyond the near plane", |r, i| set_depth(r, i, 0.0102)),
+    ("just before the near plane", |r, i| set_depth(r, i, 0.0098)),
+    ("at the camera", |r, i| set_depth(r, i, 0.0)),
+    ("zero quaternion", |r, i| r.quats[4 * i..4 * i + 4].fill(0.0)),
+    ("tiny quaternion", |r, i| r.quats[4 * i..4 * i + 4].fill(1e-25)),
+    ("huge quaternion", |r, i| r.quats[4 * i..4 * i + 4].fill(1e25)),
+    ("denormal quaternion", |r, i| r.quats[4 * i..4 * i + 4].fill(1e-41)),
+    ("small but usable quaternion", |r, i| r.quats[4 * i..4 * i + 4].fill(1e-13)),
+    ("NaN quaternion", |r, i| r.quats[4 * i + 3] = f32::NAN),
+    ("infinite quaternion", |r, i| r.quats[4 * i + 3] = f32::INFINITY),
+    ("infinite scale", |r, i| r.scales[3 * i] = 1e3),
+    ("squares overflow", |r, i| r.scales[3 * i..3 * i + 3].fill(60.0)),
+    ("NaN scale", |r, i| r.scales[3 * i + 2] = f32::NAN),
+    ("no size along one axis", |r, i| r.scales[3 * i] = -200.0),
+    ("no size", |r, i| r.scales[3 * i..3 * i + 3].fill(f32::NEG_INFINITY)),
+    ("opacity just below 1/255", |r, i| r.opacities[i] = logit_of_alpha_min(-1e-5)),
+    ("opacity just above 1/255", |r, i| r.opacities[i] = logit_of_alpha_min(1e-5)),
+    ("opacity of 0", |r, i| r.opacities[i] = f32::NEG_INFINITY),
+    ("opacity of 1", |r, i| r.opacities[i] = f32::INFINITY),
+    ("NaN opacity", |r, i| r.opacities[i] = f32::NAN),
+    ("NaN and infinite coefficients", |r, i| {
+        r.sh0[3 * i] = f32::NAN;
+        r.sh_n[45 * i + 1] = f32::INFINITY;
+        r.sh_n[45 * i + 2] = 1e-42;
+    }),
+];
+
+/// Puts a row on the axis of the camera at this depth.
+fn set_depth(rows: &mut Columns, row: usize, depth: f32) {
+    let m = camera().viewmat;
+    for c in 0..3 {
+        rows.means[3 * row + c] = (0..3).map(|i| m[i][c] * (if i == 2 { depth } else { 0.0 } - m[i][3])).sum();
+    }
+}
+
+#[test]
+fn poison_is_culled_as_on_the_cpu_and_does_not_spread() {
+    let Some(gpu) = open(&GpuOptions::default()) else { return };
+    let n = 10 * POISON.len() + 3;
+    let mut rows = random_rows(n);
+    for (k, (_, edit)) in POISON.iter().enumerate() {
+        plain_row(&mut rows, 10 * k);
+        edit(&mut rows, 10 * k);
+    }
+    let mut v = random_gradients(n);
+    let first = on_cpu(&rows, &camera(), 3, &v);
+    // Gradients of rows that are not drawn must not be read into anything.
+    for (v, splat) in v.iter_mut().zip(&first.projected) {
+        if splat[7] == 0.0 {
+            *v = [f32::NAN; 12];
+        }
+    }
+    let want = on_cpu(&rows, &camera(), 3, &v);
+    let got = on_gpu(&gpu, &rows, &camera(), 3, &v, &want);
+    for (k, (what, _)) in POISON.iter().enumerate() {
+        let (g, w) = (got.projected[10 * k], want.projected[10 * k]);
+        assert_eq!(g[7] > 0.0, w[7] > 0.0, "{what}: {g:?}, want {w:?}");
+        if w[7] == 0.0 {
+            assert_eq!(g, [0.0; 12], "{what}");
+        }
+        assert!(g.iter().all(|x| x.is_finite()), "{what}: {g:?}");
+        let color = got.colors[10 * k];
+        assert!(color.iter().all(|c| !c.is_nan()), "{what}: {color:?}");
+    }
+    // Gradients through an infinite coefficient are as undefined on the CPU; everything else is compared.
+    let last = POISON.len() - 1;
+    let without = |r: Results| {
+        let Results { projected, mut colors, mut grads } = r;
+        colors[10 * last].fill(0.0);
+        grads.means[30 * last..30 * last + 3].fill(0.0);
+        Results { projected, colors, grads }
+    };
+    let drawn = POISON.iter().enumerate().filter(|(k, _)| want.projected[10 * k][7] > 0.0).count();
+    assert!((5..20).contains(&drawn), "{drawn} of the poisoned rows are drawn");
+    assert_same(&without(got), &without(want), 0);
+}
+
+#[test]
+fn windows_and_runs_change_no_bit() {
+    let Some(whole) = open(&GpuOptions::default()) else { return };
+    let n = 1000;
+    // 84 bytes of the widest band: windows of 384 rows, so three of them; and of 64 rows.
+    for limit in [33_000, 8_000] {
+        let options = GpuOptions { max_binding_bytes: Some(limit), ..GpuOptions::default() };
+        let cut = open(&options).expect("it opened before");
+        assert!(cut.max_binding_bytes() <= limit);
+        let (rows, v) = (random_rows(n), random_gradients(n));
+        let cpu = on_cpu(&rows, &camera(), 3, &v);
+        let run = |gpu: &Gpu| {
+            let r = on_gpu(gpu, &rows, &camera(), 3, &v, &cpu);
+            (r.projected, r.colors, r.grads)
+        };
+        let want = run(&whole);
+        assert!(run(&cut) == want, "windows of {limit} bytes");
+        assert!(run(&whole) == want, "a second run");
+    }
+}
+
+#[test]
+fn bands_are_cut_out_and_put_back() {
+    let rows = random_rows(7);
+    let mut back = Columns::zeros(7, 3);
+    for band in 0..BAND_WIDTHS.len() {
+        let mut values = Vec::new();
+        gsscale::render::gpu_rows::band_from_sh_n(&rows, band, &mut values);
+        assert_eq!(values.len(), 7 * BAND_WIDTHS[band]);
+        band_into_sh_n(&values, band, &mut back);
+    }
+    assert_eq!(back.sh_n, rows.sh_n);
 }
