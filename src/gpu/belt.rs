@@ -67,7 +67,7 @@ impl Belt {
             view.copy_from_slice(&bytes[done..done + n]);
             drop(view);
             encoder.copy_buffer_to_buffer(&chunk.raw, chunk.used, target, offset + done as u64, n as u64);
-            chunk.used = end;
+            chunk.used = end.next_multiple_of(8); // mapped ranges begin at multiples of 8
             done += n;
         }
         Ok(done)
