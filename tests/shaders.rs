@@ -3,16 +3,27 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
 use gsscale::gpu::{SOURCES, Source, StructLayout, preprocess, validate, variants};
-use gsscale::kernels::constants;
+use gsscale::kernels::{constants, uniforms_tiles};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use wgpu::naga;
 
 /// Rust twins of the structs that shaders read as uniforms (and of others that are declared in both languages).
-const LAYOUTS: &[&[StructLayout]] = &[];
+const LAYOUTS: &[&[StructLayout]] = &[&[
+    uniforms_tiles::ScanUniforms::LAYOUT,
+    uniforms_tiles::SortUniforms::LAYOUT,
+    uniforms_tiles::DepthUniforms::LAYOUT,
+    uniforms_tiles::IsectUniforms::LAYOUT,
+    uniforms_tiles::OffsetsUniforms::LAYOUT,
+    uniforms_tiles::RasterUniforms::LAYOUT,
+    uniforms_tiles::FoldUniforms::LAYOUT,
+]];
 
 /// Entry points whose workgroups are not 256 invocations in one dimension: file, entry point, size, and why.
-const OTHER_WORKGROUPS: &[(&str, &str, [u32; 3], &str)] = &[];
+const OTHER_WORKGROUPS: &[(&str, &str, [u32; 3], &str)] = &[
+    ("rasterize_fwd.wgsl", "rasterize_fwd", [64, 1, 1], "four pixels of a tile to an invocation"),
+    ("rasterize_bwd.wgsl", "rasterize_bwd", [64, 1, 1], "four pixels of a tile to an invocation"),
+];
 
 /// Variants of one shader that are still tested one by one.
 const VARIANTS_MAX: usize = 64;

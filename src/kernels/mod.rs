@@ -18,3 +18,4 @@ mod ssim_band;
 pub mod stages;
 mod tile_block;
 pub mod uniforms;
+pub mod uniforms_tiles;

@@ -68,8 +68,7 @@ impl DeviceColumns {
 
     /// The columns with their floats per row, bands last.
     pub fn columns(&self) -> impl Iterator<Item = (&Buffer, usize)> {
-        let narrow =
-            [(&self.means, 3), (&self.quats, 4), (&self.scales, 3), (&self.opacities, 1), (&self.sh0, 3)];
+        let narrow = [(&self.means, 3), (&self.quats, 4), (&self.scales, 3), (&self.opacities, 1), (&self.sh0, 3)];
         narrow.into_iter().chain(self.bands.iter().zip(BAND_WIDTHS))
     }
 

@@ -3,6 +3,7 @@
 pub mod cpu;
 pub mod gpu_loss;
 pub mod gpu_rows;
+pub mod gpu_tiles;
 pub mod metrics;
 
 use crate::base::simd::SimdPath;

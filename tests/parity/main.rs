@@ -7,3 +7,4 @@ mod support;
 
 mod loss;
 mod rows;
+mod tiles;

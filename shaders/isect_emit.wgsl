@@ -1,0 +1,77 @@
+// One intersection for each row and tile that it can reach, the twin of src/kernels/isect_emit.rs: rows in depth order,
+// the tiles of a row column by column. One invocation finds one intersection, so a row that covers the picture costs no
+// more than its share.
+//
+// Nothing is written beyond the capacity: the scan's total tells the demand, and the caller runs again with more room.
+#import "shared/constants.wgsl"
+#import "shared/dispatch.wgsl"
+#import "shared/footprint.wgsl"
+
+struct IsectUniforms {
+    grid: Grid,
+    row_count: u32,
+    /// Intersections that the buffers hold.
+    capacity: u32,
+    pad: vec2<u32>,
+}
+
+@group(0) @binding(0) var<uniform> view: IsectUniforms;
+@group(0) @binding(1) var<storage, read> splats: array<vec4<f32>>;
+/// Rows by rank.
+@group(0) @binding(2) var<storage, read> order: array<u32>;
+/// Where each rank's intersections begin; row_count + 1 entries.
+@group(0) @binding(3) var<storage, read> offsets: array<u32>;
+@group(0) @binding(4) var<storage, read_write> tiles: array<u32>;
+/// The numbers 0, 1, 2, ... that the sort by tile carries along.
+@group(0) @binding(5) var<storage, read_write> isects: array<u32>;
+/// NO_ROW where the intersection was counted and then not found.
+@group(0) @binding(6) var<storage, read_write> row_from_isect: array<u32>;
+
+const NO_ROW: u32 = 0xffffffffu;
+
+/// The last rank whose intersections begin at or before this one.
+fn rank_from_isect(isect: u32) -> u32 {
+    var low = 0u;
+    var high = view.row_count;
+    while low + 1u < high {
+        let middle = (low + high) / 2u;
+        if offsets[middle] <= isect {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    return low;
+}
+
+@compute @workgroup_size(256)
+fn isect_emit(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let isect = linear_index(workgroup, workgroups, lane, 256u);
+    if isect >= min(offsets[view.row_count], view.capacity) {
+        return;
+    }
+    let rank = rank_from_isect(isect);
+    let row = order[rank];
+    let at = SPLAT_STRIDE * row;
+    let reach = reach_of(splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]), view.grid);
+    var left = isect - offsets[rank];
+    // Should the two shaders' roundings ever differ, an intersection that is not found goes behind all tiles.
+    var tile = view.grid.tiles_x * view.grid.tiles_y;
+    var found = NO_ROW;
+    for (var tile_x = reach.box.x; tile_x < reach.box.z; tile_x++) {
+        let rows = tile_rows_in(reach, view.grid, tile_x);
+        if left < rows.y - rows.x {
+            tile = (rows.x + left) * view.grid.tiles_x + tile_x;
+            found = row;
+            break;
+        }
+        left -= rows.y - rows.x;
+    }
+    tiles[isect] = tile;
+    isects[isect] = isect;
+    row_from_isect[isect] = found;
+}

@@ -1,0 +1,194 @@
+// Gradients of footprints and colours from the gradient of the image, back to front through each tile's list: the twin
+// of src/kernels/rasterize_bwd.rs, which has the formulas. Nine sums for each splat of a tile: h, h dx, h dy, h dx^2,
+// h dx dy, h dy^2 and weight v_rgb; fold_rows.wgsl makes gradients of them.
+//
+// No float atomics: the sums of an invocation's pixels are added within the subgroup (without subgroups, each
+// invocation is a part of its own), the parts through workgroup memory in a fixed order, and one invocation writes them
+// to the place that belongs to this intersection. So a device gives the same bits whenever it runs again.
+#import "shared/constants.wgsl"
+#import "shared/dispatch.wgsl"
+#import "shared/raster.wgsl"
+
+@group(0) @binding(0) var<uniform> view: RasterUniforms;
+@group(0) @binding(1) var<storage, read> splats: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> row_from_isect: array<u32>;
+@group(0) @binding(3) var<storage, read> isects: array<u32>;
+@group(0) @binding(4) var<storage, read> tile_offsets: array<u32>;
+@group(0) @binding(5) var<storage, read> t_final: array<f32>;
+@group(0) @binding(6) var<storage, read> stops: array<u32>;
+/// [3][height][width]
+@group(0) @binding(7) var<storage, read> v_rgb: array<f32>;
+/// [height][width], read with HAS_V_ALPHA only.
+@group(0) @binding(8) var<storage, read> v_alpha: array<f32>;
+/// [intersections][9]
+@group(0) @binding(9) var<storage, read_write> partials: array<f32>;
+/// [height][width][2]: t and behind, where the list has more than one segment.
+@group(0) @binding(10) var<storage, read_write> carry: array<vec2<f32>>;
+
+const SUMS: u32 = 9u;
+/// Parts of the sums of one splat, times splats of a batch.
+const PARTS_OF_BATCH: u32 = 256u;
+
+var<workgroup> batch: array<TileSplat, TILE_LANES>;
+var<workgroup> batch_isects: array<u32, TILE_LANES>;
+/// [splats of the batch][9][parts]
+var<workgroup> sums: array<f32, 2304>;
+/// Largest stop of the tile.
+var<workgroup> tile_stop: atomic<u32>;
+
+@compute @workgroup_size(64)
+fn rasterize_bwd(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+#ifdef SUBGROUPS
+    @builtin(subgroup_id) part: u32,
+    @builtin(num_subgroups) parts: u32,
+    @builtin(subgroup_invocation_id) subgroup_lane: u32,
+#endif
+) {
+#ifndef SUBGROUPS
+    let part = lane;
+    let parts = TILE_LANES;
+#endif
+    let tile = linear_group(workgroup, workgroups);
+    let grid = view.grid;
+    // Uniform in the workgroup.
+    if tile >= grid.tiles_x * grid.tiles_y {
+        return;
+    }
+    let pixel = pixel_of(tile, lane, grid);
+    let plane = grid.width * grid.height;
+    let at = pixel.y * grid.width + pixel.x;
+    let inside = (vec4<u32>(pixel.x) + vec4<u32>(0u, 1u, 2u, 3u) < vec4<u32>(grid.width))
+        & vec4<bool>(pixel.y < grid.height);
+
+    var t = vec4<f32>(0.0);
+    // What is seen behind the splats passed so far, dotted with v_rgb.
+    var behind = vec4<f32>(0.0);
+    var stop = vec4<u32>(0u);
+    var v_red = vec4<f32>(0.0);
+    var v_green = vec4<f32>(0.0);
+    var v_blue = vec4<f32>(0.0);
+    for (var i = 0u; i < 4u; i++) {
+        if inside[i] {
+            let p = at + i;
+            v_red[i] = v_rgb[p];
+            v_green[i] = v_rgb[plane + p];
+            v_blue[i] = v_rgb[2u * plane + p];
+            stop[i] = stops[p];
+            if (view.flags & SEGMENT_FIRST) != 0u {
+                t[i] = t_final[p];
+                behind[i] = dot(view.background, vec3<f32>(v_red[i], v_green[i], v_blue[i]));
+                if (view.flags & HAS_V_ALPHA) != 0u {
+                    behind[i] -= v_alpha[p];
+                }
+            } else {
+                t[i] = carry[p].x;
+                behind[i] = carry[p].y;
+            }
+        }
+    }
+    atomicMax(&tile_stop, max(max(stop.x, stop.y), max(stop.z, stop.w)));
+
+    let list = tile_offsets[tile];
+    let count = tile_offsets[tile + 1u] - list;
+    let batch_size = min(TILE_LANES, PARTS_OF_BATCH / parts);
+    let x = vec4<f32>(f32(pixel.x)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
+    let y = f32(pixel.y) + 0.5;
+    var end = min(count, view.end);
+    while end > view.first {
+        let size = min(batch_size, end - view.first);
+        let first = end - size;
+        end = first;
+        workgroupBarrier();
+        if lane < size {
+            let isect = isects[list + first + lane];
+            let record = SPLAT_STRIDE * row_from_isect[isect];
+            batch_isects[lane] = isect;
+            batch[lane] = tile_splat(splat_unpack(splats[record], splats[record + 1u], splats[record + 2u]));
+        }
+        workgroupBarrier();
+        // Uniform: nothing changes it behind the first barrier.
+        let reached = first < atomicLoad(&tile_stop);
+        for (var i = size; reached && i > 0u;) {
+            i--;
+            let splat = batch[i];
+            let dx = x - vec4<f32>(splat.mean.x);
+            let dy = y - splat.mean.y;
+            let e = exponents(splat, dx, dy);
+            let taking_part = (e >= vec4<f32>(LOG2_ALPHA_MIN)) & (vec4<u32>(first + i) < stop);
+            let to = i * SUMS * parts + part;
+#ifdef SUBGROUPS
+            if !subgroupAny(any(taking_part)) {
+                if subgroup_lane == 0u {
+                    write_sums(to, parts, 0.0, vec2<f32>(), vec3<f32>(), vec3<f32>());
+                }
+                continue;
+            }
+#endif
+            let alpha = select(vec4<f32>(0.0), alphas(e, splat.log2_opacity, view.max_alpha), taking_part);
+            let before = t / (vec4<f32>(1.0) - alpha);
+            let weight = alpha * before;
+            // alpha dL/dalpha = weight (what the splat shows - what it hides)
+            let over = splat.color.x * v_red + (splat.color.y * v_green + splat.color.z * v_blue) - behind;
+            let h = select(vec4<f32>(0.0), weight * over, e <= vec4<f32>(view.log2_max_alpha));
+            t = before;
+            behind += alpha * over;
+            let hx = h * dx;
+            var h_sum = (h.x + h.y) + (h.z + h.w);
+            var hx_sum = (hx.x + hx.y) + (hx.z + hx.w);
+            var hxx_sum = dot(hx, dx);
+            var color_sums = vec3<f32>(dot(weight, v_red), dot(weight, v_green), dot(weight, v_blue));
+            var firsts = vec2<f32>(hx_sum, dy * h_sum);
+            var seconds = vec3<f32>(hxx_sum, dy * hx_sum, dy * dy * h_sum);
+#ifdef SUBGROUPS
+            h_sum = subgroupAdd(h_sum);
+            firsts = subgroupAdd(firsts);
+            seconds = subgroupAdd(seconds);
+            color_sums = subgroupAdd(color_sums);
+            if subgroup_lane == 0u {
+                write_sums(to, parts, h_sum, firsts, seconds, color_sums);
+            }
+#else
+            write_sums(to, parts, h_sum, firsts, seconds, color_sums);
+#endif
+        }
+        workgroupBarrier();
+        for (var i = lane; i < size * SUMS; i += TILE_LANES) {
+            var sum = 0.0;
+            if reached {
+                if parts < 4u {
+                    for (var p = 0u; p < parts; p++) {
+                        sum += sums[i * parts + p];
+                    }
+                } else {
+                    // By fours, to stay below the limit on iterations; the number of parts is a power of two.
+                    for (var p = i * parts; p < (i + 1u) * parts; p += 4u) {
+                        sum += (sums[p] + sums[p + 1u]) + (sums[p + 2u] + sums[p + 3u]);
+                    }
+                }
+            }
+            partials[batch_isects[i / SUMS] * SUMS + i % SUMS] = sum;
+        }
+    }
+    if (view.flags & SEGMENT_LAST) == 0u {
+        for (var i = 0u; i < 4u; i++) {
+            if inside[i] {
+                carry[at + i] = vec2<f32>(t[i], behind[i]);
+            }
+        }
+    }
+}
+
+fn write_sums(to: u32, parts: u32, h: f32, firsts: vec2<f32>, seconds: vec3<f32>, color: vec3<f32>) {
+    sums[to] = h;
+    sums[to + parts] = firsts.x;
+    sums[to + 2u * parts] = firsts.y;
+    sums[to + 3u * parts] = seconds.x;
+    sums[to + 4u * parts] = seconds.y;
+    sums[to + 5u * parts] = seconds.z;
+    sums[to + 6u * parts] = color.x;
+    sums[to + 7u * parts] = color.y;
+    sums[to + 8u * parts] = color.z;
+}

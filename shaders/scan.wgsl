@@ -1,0 +1,67 @@
+// Exclusive prefix sum, the twin of src/kernels/scan.rs: blocks of 2048 values, each from the sum of the blocks before it.
+//
+// Reduce, then scan: scan_reduce.wgsl sums blocks, level by level until one block is left; then every level is scanned
+// from the top down with the scanned sums as bases. No workgroup waits for another. Offsets are 32-bit and saturate:
+// a last entry of 0xffffffff means that the true total is that or more.
+#import "shared/constants.wgsl"
+#import "shared/dispatch.wgsl"
+#import "shared/workgroup_scan.wgsl"
+
+struct ScanUniforms {
+    /// Values of this level.
+    count: u32,
+    /// 1: `bases` holds the sum before each block; 0: there is one block, and its base is 0.
+    has_bases: u32,
+    pad: vec2<u32>,
+}
+
+@group(0) @binding(0) var<uniform> level: ScanUniforms;
+@group(0) @binding(1) var<storage, read> values: array<u32>;
+@group(0) @binding(2) var<storage, read> bases: array<u32>;
+/// One more than there are values: the last is the total.
+@group(0) @binding(3) var<storage, read_write> offsets: array<u32>;
+
+const ITEMS: u32 = 8u;
+
+@compute @workgroup_size(256)
+fn scan(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+#ifdef SUBGROUPS
+    @builtin(subgroup_id) subgroup: u32,
+    @builtin(num_subgroups) subgroups: u32,
+    @builtin(subgroup_invocation_id) subgroup_lane: u32,
+#endif
+) {
+    let block = linear_group(workgroup, workgroups);
+    let first = (block * 256u + lane) * ITEMS;
+    var before: array<u32, ITEMS>;
+    var sum = 0u;
+    for (var i = 0u; i < ITEMS; i++) {
+        before[i] = sum;
+        if first + i < level.count {
+            sum = saturating_add(sum, values[first + i]);
+        }
+    }
+#ifdef SUBGROUPS
+    let scanned = workgroup_scan(sum, lane, subgroup, subgroups, subgroup_lane);
+#else
+    let scanned = workgroup_scan(sum, lane);
+#endif
+    var base = scanned.before;
+    if level.has_bases != 0u {
+        base = saturating_add(bases[block], base);
+    }
+    for (var i = 0u; i < ITEMS; i++) {
+        if first + i < level.count {
+            offsets[first + i] = saturating_add(base, before[i]);
+        }
+    }
+    // The invocation of the last value also knows the total; with no values the first one does.
+    if first < level.count && first + ITEMS >= level.count {
+        offsets[level.count] = saturating_add(base, sum);
+    } else if level.count == 0u && first == 0u {
+        offsets[0] = 0u;
+    }
+}

@@ -1,0 +1,58 @@
+// What both directions of the rasterizer share: a workgroup of 64 invocations takes a tile, an invocation four pixels
+// side by side, and splats come in batches through workgroup memory.
+//
+// An invocation makes at most 65,535 loop iterations on some drivers, which then go on silently with wrong results. So
+// a dispatch takes one segment of every tile's list, and what a pixel knows is carried from segment to segment.
+#import "shared/footprint.wgsl"
+
+struct RasterUniforms {
+    grid: Grid,
+    /// RGB behind everything.
+    background: vec3<f32>,
+    max_alpha: f32,
+    /// log2 of max_alpha.
+    log2_max_alpha: f32,
+    /// List index at which the segment begins, and one past its last.
+    first: u32,
+    end: u32,
+    /// Sum of SEGMENT_FIRST, SEGMENT_LAST (in the order in which this direction goes) and HAS_V_ALPHA.
+    flags: u32,
+}
+
+const SEGMENT_FIRST: u32 = 1u;
+const SEGMENT_LAST: u32 = 2u;
+const HAS_V_ALPHA: u32 = 4u;
+
+/// Invocations of a tile.
+const TILE_LANES: u32 = 64u;
+/// Stop position of a pixel that went through its whole list.
+const NEVER: u32 = 0xffffffffu;
+
+struct TileSplat {
+    mean: vec2<f32>,
+    a: f32,
+    b: f32,
+    c: f32,
+    log2_opacity: f32,
+    color: vec3<f32>,
+}
+
+fn tile_splat(splat: Splat) -> TileSplat {
+    let e = exponent_of(splat);
+    return TileSplat(splat.mean2d, e.a, e.b, e.c, e.log2_opacity, splat.color);
+}
+
+/// The exponent of a splat at four pixels of a row, from dx and dy.
+fn exponents(splat: TileSplat, dx: vec4<f32>, dy: f32) -> vec4<f32> {
+    return (splat.a * dx + splat.b * dy) * dx + (splat.c * dy * dy + splat.log2_opacity);
+}
+
+/// Alpha before the threshold is applied. The form below 0 can only be rounding and counts as 0.
+fn alphas(e: vec4<f32>, log2_opacity: f32, max_alpha: f32) -> vec4<f32> {
+    return min(exp2(min(e, vec4<f32>(log2_opacity))), vec4<f32>(max_alpha));
+}
+
+/// The first of an invocation's four pixels.
+fn pixel_of(tile: u32, lane: u32, grid: Grid) -> vec2<u32> {
+    return 16u * vec2<u32>(tile % grid.tiles_x, tile / grid.tiles_x) + vec2<u32>(4u * (lane % 4u), lane / 4u);
+}
