@@ -26,8 +26,31 @@ struct IsectUniforms {
 @group(0) @binding(5) var<storage, read_write> isects: array<u32>;
 /// NO_ROW where the intersection was counted and then not found.
 @group(0) @binding(6) var<storage, read_write> row_from_isect: array<u32>;
+/// By rank: how many tiles the row can reach. The scan makes the offsets of them.
+@group(0) @binding(7) var<storage, read_write> counts: array<u32>;
 
 const NO_ROW: u32 = 0xffffffffu;
+
+/// Counts before anything is emitted.
+@compute @workgroup_size(256)
+fn isect_count(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let rank = linear_index(workgroup, workgroups, lane, 256u);
+    if rank >= view.row_count {
+        return;
+    }
+    let at = SPLAT_STRIDE * order[rank];
+    let reach = reach_of(splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]), view.grid);
+    var count = 0u;
+    for (var tile_x = reach.box.x; tile_x < reach.box.z; tile_x++) {
+        let rows = tile_rows_in(reach, view.grid, tile_x);
+        count += rows.y - rows.x;
+    }
+    counts[rank] = count;
+}
 
 /// The last rank whose intersections begin at or before this one.
 fn rank_from_isect(isect: u32) -> u32 {
@@ -59,7 +82,7 @@ fn isect_emit(
     let at = SPLAT_STRIDE * row;
     let reach = reach_of(splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]), view.grid);
     var left = isect - offsets[rank];
-    // Should the two shaders' roundings ever differ, an intersection that is not found goes behind all tiles.
+    // Should the roundings of the two entry points ever differ, an intersection that is not found goes behind all tiles.
     var tile = view.grid.tiles_x * view.grid.tiles_y;
     var found = NO_ROW;
     for (var tile_x = reach.box.x; tile_x < reach.box.z; tile_x++) {

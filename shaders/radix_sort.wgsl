@@ -5,7 +5,17 @@
 // No workgroup waits for another, and which order workgroups run in cannot change a place.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
-#import "shared/radix.wgsl"
+#import "shared/splat.wgsl"
+
+struct SortUniforms {
+    /// The number of keys is live[live_at], but never more than this.
+    capacity: u32,
+    live_at: u32,
+    /// Blocks that the histogram has room for.
+    blocks: u32,
+    /// Lowest bit of this pass's digit.
+    shift: u32,
+}
 
 @group(0) @binding(0) var<uniform> sort: SortUniforms;
 @group(0) @binding(1) var<storage, read> live: array<u32>;
@@ -15,6 +25,39 @@
 @group(0) @binding(4) var<storage, read> places: array<u32>;
 @group(0) @binding(5) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(6) var<storage, read_write> values_out: array<u32>;
+/// [digits][blocks]: how many keys of each digit every block has; every entry is written, also of blocks without keys.
+@group(0) @binding(7) var<storage, read_write> histogram: array<u32>;
+@group(0) @binding(8) var<storage, read> splats: array<vec4<f32>>;
+
+/// Keys of one invocation; they stand side by side, so that the order within a block is that of the invocations.
+const KEYS: u32 = 8u;
+const BLOCK_KEYS: u32 = 2048u;
+const DIGITS: u32 = 16u;
+/// Words in which an invocation's counts are kept: digits w and w + 8 in the halves of word w.
+const WORDS: u32 = 8u;
+
+/// How many keys of each digit one invocation has, 4 bits each (a count of 8 fits): digits 0 to 7, then 8 to 15.
+struct DigitCounts {
+    low: u32,
+    high: u32,
+}
+
+fn digit_count(counts: DigitCounts, digit: u32) -> u32 {
+    return (select(counts.high, counts.low, digit < 8u) >> (4u * (digit & 7u))) & 15u;
+}
+
+fn digit_add(counts: DigitCounts, digit: u32) -> DigitCounts {
+    let one = 1u << (4u * (digit & 7u));
+    return DigitCounts(
+        counts.low + select(0u, one, digit < 8u),
+        counts.high + select(one, 0u, digit < 8u),
+    );
+}
+
+/// Counts of digits `word` and `word` + 8.
+fn digit_word(counts: DigitCounts, word: u32) -> u32 {
+    return ((counts.low >> (4u * word)) & 15u) | (((counts.high >> (4u * word)) & 15u) << 16u);
+}
 
 /// Invocations of a word stand side by side with one word of padding after every 8, against bank conflicts.
 const WORD_STRIDE: u32 = 288u;
@@ -29,6 +72,80 @@ fn counts_at(word: u32, lane: u32) -> u32 {
     return word * WORD_STRIDE + lane + lane / 8u;
 }
 
+/// Keys and values of the sort by depth: the bits of a drawn row's depth (positive, so they order as the depths do) and
+/// the row. Rows that are not drawn go behind all others. The capacity is the number of rows.
+@compute @workgroup_size(256)
+fn depth_keys(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = linear_index(workgroup, workgroups, lane, 256u);
+    if row >= sort.capacity {
+        return;
+    }
+    let radius_x = splats[SPLAT_STRIDE * row + 1u].w;
+    keys_out[row] = select(0xffffffffu, bitcast<u32>(splats[SPLAT_STRIDE * row].z), radius_x > 0.0);
+    values_out[row] = row;
+}
+
+/// [words][parts]: counts of runs of invocations.
+var<workgroup> counts_of_parts: array<u32, 2048>;
+
+/// First half of a pass: fills the histogram.
+@compute @workgroup_size(256)
+fn radix_histogram(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+#ifdef SUBGROUPS
+    @builtin(subgroup_id) subgroup: u32,
+    @builtin(num_subgroups) subgroups: u32,
+    @builtin(subgroup_invocation_id) subgroup_lane: u32,
+#endif
+) {
+    let block = linear_group(workgroup, workgroups);
+    let count = min(live[sort.live_at], sort.capacity);
+    let first = block * BLOCK_KEYS + lane * KEYS;
+    var counts = DigitCounts(0u, 0u);
+    for (var i = 0u; i < KEYS; i++) {
+        if first + i < count {
+            counts = digit_add(counts, (keys[first + i] >> sort.shift) & (DIGITS - 1u));
+        }
+    }
+#ifdef SUBGROUPS
+    let parts = subgroups;
+    for (var word = 0u; word < WORDS; word++) {
+        let sum = subgroupAdd(digit_word(counts, word));
+        if subgroup_lane == 0u {
+            counts_of_parts[word * parts + subgroup] = sum;
+        }
+    }
+    workgroupBarrier();
+#else
+    let parts = 32u;
+    for (var word = 0u; word < WORDS; word++) {
+        counts_of_parts[word * 256u + lane] = digit_word(counts, word);
+    }
+    workgroupBarrier();
+    var sum = 0u;
+    for (var i = 0u; i < 8u; i++) {
+        sum += counts_of_parts[lane * 8u + i];
+    }
+    workgroupBarrier();
+    counts_of_parts[lane] = sum;
+    workgroupBarrier();
+#endif
+    if lane < DIGITS && block < sort.blocks {
+        var total = 0u;
+        for (var part = 0u; part < parts; part++) {
+            total += counts_of_parts[(lane & 7u) * parts + part];
+        }
+        histogram[lane * sort.blocks + block] = (total >> (16u * (lane / 8u))) & 0xffffu;
+    }
+}
+
+/// Second half of a pass, behind the scan of the histogram: moves keys and values.
 @compute @workgroup_size(256)
 fn radix_sort(
     @builtin(workgroup_id) workgroup: vec3<u32>,

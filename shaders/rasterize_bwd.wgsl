@@ -1,6 +1,6 @@
 // Gradients of footprints and colours from the gradient of the image, back to front through each tile's list: the twin
 // of src/kernels/rasterize_bwd.rs, which has the formulas. Nine sums for each splat of a tile: h, h dx, h dy, h dx^2,
-// h dx dy, h dy^2 and weight v_rgb; fold_rows.wgsl makes gradients of them.
+// h dx dy, h dy^2 and weight v_rgb; fold_rows makes gradients of them.
 //
 // No float atomics: the sums of an invocation's pixels are added within the subgroup (without subgroups, each
 // invocation is a part of its own), the parts through workgroup memory in a fixed order, and one invocation writes them
@@ -24,6 +24,11 @@
 @group(0) @binding(9) var<storage, read_write> partials: array<f32>;
 /// [height][width][2]: t and behind, where the list has more than one segment.
 @group(0) @binding(10) var<storage, read_write> carry: array<vec2<f32>>;
+/// Rows by rank.
+@group(0) @binding(11) var<storage, read> order: array<u32>;
+/// Where each rank's intersections begin; row_count + 1 entries.
+@group(0) @binding(12) var<storage, read> offsets: array<u32>;
+@group(0) @binding(13) var<storage, read_write> v_splats: array<vec4<f32>>;
 
 const SUMS: u32 = 9u;
 /// Parts of the sums of one splat, times splats of a batch.
@@ -191,4 +196,64 @@ fn write_sums(to: u32, parts: u32, h: f32, firsts: vec2<f32>, seconds: vec3<f32>
     sums[to + 6u * parts] = color.x;
     sums[to + 7u * parts] = color.y;
     sums[to + 8u * parts] = color.z;
+}
+
+/// Rows of a workgroup; its last four invocations rest.
+const GROUP_ROWS: u32 = 28u;
+
+var<workgroup> row_sums: array<f32, 256>;
+
+/// One sum of one intersection; nothing where it was counted and then not found, since no tile wrote it.
+fn partial(isect: u32, row: u32, which: u32) -> f32 {
+    return select(0.0, partials[isect * SUMS + which], row_from_isect[isect] == row);
+}
+
+/// Folds the sums of each row over its intersections, in emit order (tiles column by column), and turns them into
+/// gradients. Nine invocations take a row, one for each sum.
+@compute @workgroup_size(256)
+fn fold_rows(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let group = linear_group(workgroup, workgroups);
+    let rank = group * GROUP_ROWS + lane / SUMS;
+    let which = lane % SUMS;
+    var sum = 0.0;
+    if lane < GROUP_ROWS * SUMS && rank < view.row_count {
+        let row = order[rank];
+        let end = min(offsets[rank + 1u], view.isect_count);
+        var isect = min(offsets[rank], end);
+        // By fours, to stay below the limit on iterations; the order of the additions is that of the intersections.
+        while isect + 4u <= end {
+            let p0 = partial(isect, row, which);
+            let p1 = partial(isect + 1u, row, which);
+            let p2 = partial(isect + 2u, row, which);
+            let p3 = partial(isect + 3u, row, which);
+            sum = (((sum + p0) + p1) + p2) + p3;
+            isect += 4u;
+        }
+        while isect < end {
+            sum += partial(isect, row, which);
+            isect++;
+        }
+    }
+    row_sums[lane] = sum;
+    workgroupBarrier();
+    let own_rank = group * GROUP_ROWS + lane;
+    if lane >= GROUP_ROWS || own_rank >= view.row_count {
+        return;
+    }
+    let row = order[own_rank];
+    let at = SPLAT_STRIDE * row;
+    let splat = splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]);
+    let s = lane * SUMS;
+    // dL/dsigma = -h; sigma = (A dx^2 + C dy^2) / 2 + B dx dy with dx = pixel - mean.
+    let conic = splat.conic;
+    let v_mean = vec2<f32>(conic.x * row_sums[s + 1u] + conic.y * row_sums[s + 2u], conic.y * row_sums[s + 1u] + conic.z * row_sums[s + 2u]);
+    // A row that is not drawn has no opacity, and no sums either.
+    let v_opacity = select(0.0, row_sums[s] / splat.opacity, splat.opacity > 0.0);
+    v_splats[at] = vec4<f32>(v_mean, 0.0, v_opacity);
+    v_splats[at + 1u] = vec4<f32>(-0.5 * row_sums[s + 3u], -row_sums[s + 4u], -0.5 * row_sums[s + 5u], 0.0);
+    v_splats[at + 2u] = vec4<f32>(row_sums[s + 6u], row_sums[s + 7u], row_sums[s + 8u], 0.0);
 }

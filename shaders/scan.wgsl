@@ -1,6 +1,6 @@
 // Exclusive prefix sum, the twin of src/kernels/scan.rs: blocks of 2048 values, each from the sum of the blocks before it.
 //
-// Reduce, then scan: scan_reduce.wgsl sums blocks, level by level until one block is left; then every level is scanned
+// Reduce, then scan: scan_reduce sums blocks, level by level until one block is left; then every level is scanned
 // from the top down with the scanned sums as bases. No workgroup waits for another. Offsets are 32-bit and saturate:
 // a last entry of 0xffffffff means that the true total is that or more.
 #import "shared/constants.wgsl"
@@ -18,10 +18,39 @@ struct ScanUniforms {
 @group(0) @binding(0) var<uniform> level: ScanUniforms;
 @group(0) @binding(1) var<storage, read> values: array<u32>;
 @group(0) @binding(2) var<storage, read> bases: array<u32>;
-/// One more than there are values: the last is the total.
+/// One more than there are values: the last is the total. Of scan_reduce: the sums of blocks.
 @group(0) @binding(3) var<storage, read_write> offsets: array<u32>;
 
 const ITEMS: u32 = 8u;
+
+@compute @workgroup_size(256)
+fn scan_reduce(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+#ifdef SUBGROUPS
+    @builtin(subgroup_id) subgroup: u32,
+    @builtin(num_subgroups) subgroups: u32,
+    @builtin(subgroup_invocation_id) subgroup_lane: u32,
+#endif
+) {
+    let block = linear_group(workgroup, workgroups);
+    let first = (block * 256u + lane) * ITEMS;
+    var sum = 0u;
+    for (var i = 0u; i < ITEMS; i++) {
+        if first + i < level.count {
+            sum = saturating_add(sum, values[first + i]);
+        }
+    }
+#ifdef SUBGROUPS
+    let scanned = workgroup_scan(sum, lane, subgroup, subgroups, subgroup_lane);
+#else
+    let scanned = workgroup_scan(sum, lane);
+#endif
+    if lane == 0u && block * (256u * ITEMS) < level.count {
+        offsets[block] = scanned.total;
+    }
+}
 
 @compute @workgroup_size(256)
 fn scan(

@@ -12,11 +12,9 @@ use wgpu::naga;
 const LAYOUTS: &[&[StructLayout]] = &[&[
     uniforms_tiles::ScanUniforms::LAYOUT,
     uniforms_tiles::SortUniforms::LAYOUT,
-    uniforms_tiles::DepthUniforms::LAYOUT,
     uniforms_tiles::IsectUniforms::LAYOUT,
     uniforms_tiles::OffsetsUniforms::LAYOUT,
     uniforms_tiles::RasterUniforms::LAYOUT,
-    uniforms_tiles::FoldUniforms::LAYOUT,
 ]];
 
 /// Entry points whose workgroups are not 256 invocations in one dimension: file, entry point, size, and why.

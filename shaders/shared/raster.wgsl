@@ -17,6 +17,10 @@ struct RasterUniforms {
     end: u32,
     /// Sum of SEGMENT_FIRST, SEGMENT_LAST (in the order in which this direction goes) and HAS_V_ALPHA.
     flags: u32,
+    /// Rows of the view and their intersections, for fold_rows.
+    row_count: u32,
+    isect_count: u32,
+    pad: vec2<u32>,
 }
 
 const SEGMENT_FIRST: u32 = 1u;

@@ -12,20 +12,15 @@ macro_rules! sources {
 }
 
 sources![
-    "depth_keys.wgsl",
-    "fold_rows.wgsl",
     "image_loss.wgsl",
-    "isect_count.wgsl",
     "isect_emit.wgsl",
     "isect_offsets.wgsl",
     "project_bwd.wgsl",
     "project_fwd.wgsl",
-    "radix_histogram.wgsl",
     "radix_sort.wgsl",
     "rasterize_bwd.wgsl",
     "rasterize_fwd.wgsl",
     "scan.wgsl",
-    "scan_reduce.wgsl",
     "sh_bwd.wgsl",
     "sh_fwd.wgsl",
     "shared/camera.wgsl",
@@ -34,7 +29,6 @@ sources![
     "shared/dispatch.wgsl",
     "shared/footprint.wgsl",
     "shared/math.wgsl",
-    "shared/radix.wgsl",
     "shared/raster.wgsl",
     "shared/sh.wgsl",
     "shared/splat.wgsl",

@@ -30,7 +30,7 @@ pub const SEGMENT_LAST: u32 = 2;
 pub const HAS_V_ALPHA: u32 = 4;
 
 crate::wgsl_struct! {
-    /// Of `scan_reduce.wgsl` and `scan.wgsl`.
+    /// Of `scan.wgsl`.
     pub struct ScanUniforms {
         /// Values of this level.
         pub count: u32,
@@ -42,9 +42,9 @@ crate::wgsl_struct! {
 }
 
 crate::wgsl_struct! {
-    /// Of `radix_histogram.wgsl` and `radix_sort.wgsl`.
+    /// Of `radix_sort.wgsl`.
     pub struct SortUniforms {
-        /// Most keys.
+        /// Most keys; for `depth_keys`, rows.
         pub capacity: u32,
         /// Where the number of keys stands.
         pub live_at: u32,
@@ -56,19 +56,7 @@ crate::wgsl_struct! {
 }
 
 crate::wgsl_struct! {
-    /// Of `depth_keys.wgsl`.
-    pub struct DepthUniforms {
-        /// Rows of the view.
-        pub row_count: u32,
-        /// Unused.
-        pub pad: u32,
-        /// Unused.
-        pub pad2: [u32; 2],
-    }
-}
-
-crate::wgsl_struct! {
-    /// Of `isect_count.wgsl` and `isect_emit.wgsl`.
+    /// Of `isect_emit.wgsl`.
     pub struct IsectUniforms {
         /// Width, height, tile columns, tile rows.
         pub grid: [u32; 4],
@@ -112,16 +100,10 @@ crate::wgsl_struct! {
         pub end: u32,
         /// Sum of flags.
         pub flags: u32,
-    }
-}
-
-crate::wgsl_struct! {
-    /// Of `fold_rows.wgsl`.
-    pub struct FoldUniforms {
         /// Rows of the view.
         pub row_count: u32,
-        /// Most intersections.
-        pub capacity: u32,
+        /// Their intersections.
+        pub isect_count: u32,
         /// Unused.
         pub pad: [u32; 2],
     }

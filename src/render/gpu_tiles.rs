@@ -13,9 +13,9 @@
 use crate::gpu::{Buffer, BufferView, Gpu, GpuError, GpuResult, Pipeline, Readback, Recorder, groups_1d};
 use crate::kernels::splats::Grid;
 use crate::kernels::uniforms_tiles::{
-    DIGIT_BITS, DIGITS, DepthUniforms, FOLD_ROWS, FoldUniforms, HAS_V_ALPHA, IsectUniforms, OffsetsUniforms,
-    RasterUniforms, SCAN_BLOCK, SEGMENT_BWD, SEGMENT_FIRST, SEGMENT_FWD, SEGMENT_LAST, SORT_BLOCK, SPLAT_WORDS, SUMS,
-    ScanUniforms, SortUniforms, grid_words,
+    DIGIT_BITS, DIGITS, FOLD_ROWS, HAS_V_ALPHA, IsectUniforms, OffsetsUniforms, RasterUniforms, SCAN_BLOCK,
+    SEGMENT_BWD, SEGMENT_FIRST, SEGMENT_FWD, SEGMENT_LAST, SORT_BLOCK, SPLAT_WORDS, SUMS, ScanUniforms, SortUniforms,
+    grid_words,
 };
 use std::sync::Arc;
 
@@ -143,19 +143,19 @@ impl TileStages {
     /// # Errors
     /// A shader does not compile on this device.
     pub fn new(gpu: &Gpu) -> GpuResult<TileStages> {
-        let get = |stage: &str| gpu.pipeline(&format!("{stage}.wgsl"), stage, &[]);
+        let get = |stage: &str, entry: &str| gpu.pipeline(&format!("{stage}.wgsl"), entry, &[]);
         let pipelines = Pipelines {
-            scan_reduce: get("scan_reduce")?,
-            scan: get("scan")?,
-            radix_histogram: get("radix_histogram")?,
-            radix_sort: get("radix_sort")?,
-            depth_keys: get("depth_keys")?,
-            isect_count: get("isect_count")?,
-            isect_emit: get("isect_emit")?,
-            isect_offsets: get("isect_offsets")?,
-            rasterize_fwd: get("rasterize_fwd")?,
-            rasterize_bwd: get("rasterize_bwd")?,
-            fold_rows: get("fold_rows")?,
+            scan_reduce: get("scan", "scan_reduce")?,
+            scan: get("scan", "scan")?,
+            radix_histogram: get("radix_sort", "radix_histogram")?,
+            radix_sort: get("radix_sort", "radix_sort")?,
+            depth_keys: get("radix_sort", "depth_keys")?,
+            isect_count: get("isect_emit", "isect_count")?,
+            isect_emit: get("isect_emit", "isect_emit")?,
+            isect_offsets: get("isect_offsets", "isect_offsets")?,
+            rasterize_fwd: get("rasterize_fwd", "rasterize_fwd")?,
+            rasterize_bwd: get("rasterize_bwd", "rasterize_bwd")?,
+            fold_rows: get("rasterize_bwd", "fold_rows")?,
         };
         Ok(TileStages { pipelines, capacity: CAPACITY_MIN, list_max: SEGMENT_FWD })
     }
@@ -260,8 +260,8 @@ impl TileStages {
         let groups = groups_1d(rows, WORKGROUP);
         let pairs =
             Pairs { keys: gpu.buffer("sort keys", words(rows))?, values: gpu.buffer("sort values", words(rows))? };
-        let depth = recorder.uniform(&DepthUniforms { row_count: rows, pad: 0, pad2: [0; 2] })?;
-        let views = [depth, splats.clone(), pairs.keys.view(), pairs.values.view()];
+        let depth = recorder.uniform(&SortUniforms { capacity: rows, live_at: 0, blocks: 0, shift: 0 })?;
+        let views = [depth, pairs.keys.view(), pairs.values.view(), splats.clone()];
         recorder.dispatch("radix_sort", &self.pipelines.depth_keys, &views, groups)?;
         let live = recorder.buffer_with("rows of the view", &[rows])?;
         let sorted = self.sort(gpu, recorder, &live.view(), 0, rows, 32, pairs)?;
@@ -463,14 +463,15 @@ impl TileStages {
             ];
             recorder.dispatch("rasterize_bwd", &self.pipelines.rasterize_bwd, &views, groups_1d(tiles, 1))?;
         }
-        let view = recorder.uniform(&FoldUniforms { row_count: ranks.rows, capacity: demand.isects, pad: [0; 2] })?;
+        let mut fold = raster_uniforms(&frame.blend, 0, SEGMENT_BWD, 0);
+        (fold.row_count, fold.isect_count) = (ranks.rows, demand.isects);
         let views = [
-            view,
+            recorder.uniform(&fold)?,
             splats.clone(),
-            ranks.order.view(),
-            ranks.offsets.view(),
             frame.row_from_isect.view(),
             partials.view(),
+            ranks.order.view(),
+            ranks.offsets.view(),
             v_splats.clone(),
         ];
         let groups = groups_1d(ranks.rows, FOLD_ROWS);
@@ -492,5 +493,8 @@ fn raster_uniforms(blend: &Blend, segment: u32, length: u32, flags: u32) -> Rast
         first: segment.saturating_mul(length),
         end: segment.saturating_add(1).saturating_mul(length),
         flags,
+        row_count: 0,
+        isect_count: 0,
+        pad: [0; 2],
     }
 }
