@@ -431,7 +431,7 @@ fn dispatches_beyond_65_535_workgroups_fold() {
         gpu.submit(recorder).unwrap();
         let (_, frame, demand) = stages.forward(&gpu, &splats.view(), rows, scene.blend).unwrap();
         assert_eq!(demand.isects, 4150 * 4095);
-        assert!(demand.isects > 65_535 * 256 && demand.isects > 1 << 24);
+        assert!(demand.isects > 65_535 * 256);
         let mut recorder = gpu.begin("read");
         let read = [&frame.row_from_isect, &frame.isects, &frame.tile_offsets, &frame.rgb]
             .map(|b| recorder.read_back("results", &b.view()).unwrap());
