@@ -4,12 +4,13 @@
 
 use gsscale::gpu::{SOURCES, Source, StructLayout, preprocess, validate, variants};
 use gsscale::kernels::constants;
+use gsscale::kernels::uniforms::{LossUniforms, RowsUniforms};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use wgpu::naga;
 
 /// Rust twins of the structs that shaders read as uniforms (and of others that are declared in both languages).
-const LAYOUTS: &[&[StructLayout]] = &[];
+const LAYOUTS: &[&[StructLayout]] = &[&[RowsUniforms::LAYOUT, LossUniforms::LAYOUT]];
 
 /// Entry points whose workgroups are not 256 invocations in one dimension: file, entry point, size, and why.
 const OTHER_WORKGROUPS: &[(&str, &str, [u32; 3], &str)] = &[];

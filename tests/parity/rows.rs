@@ -148,7 +148,13 @@ fn difference(got: &[f32], want: &[f32]) -> f64 {
     got.iter().zip(want).fold(0.0f64, |worst, (g, w)| {
         let same = g == w || (g.is_nan() && w.is_nan());
         let relative = f64::from((g - w).abs()) / f64::from(scale);
-        worst.max(if same { 0.0 } else if relative.is_nan() { f64::INFINITY } else { relative })
+        worst.max(if same {
+            0.0
+        } else if relative.is_nan() {
+            f64::INFINITY
+        } else {
+            relative
+        })
     })
 }
 
