@@ -10,7 +10,7 @@
 
 use super::constants::TILE;
 use super::project_fwd::Projected;
-use super::rasterize_fwd::{Lanes, Lists, NEVER, Raster, TILE_PIXELS, exp2_bounded, log2_max_alpha};
+use super::rasterize_fwd::{Lanes, Lists, Raster, TILE_PIXELS, exp2_bounded, log2_max_alpha};
 use super::splats::LOG2_ALPHA_MIN;
 use super::tile_block::{Block, ROWS};
 use crate::base::simd::{Kernel, LANES, dispatch, fma};
@@ -148,7 +148,7 @@ impl Kernel for BackTile<'_> {
                 }
             }
             for (local, sums) in block.locals[..list.len()].iter().zip(sums.iter()) {
-                let out = &partials[(offsets[local.rank as usize] + u64::from(local.k)) as usize];
+                let out = &partials[(offsets[local.row as usize] + u64::from(local.k)) as usize];
                 let dx = std::array::from_fn(|lane| x[lane] - local.mean_x);
                 for (out, sum) in out.iter().zip(sums.reduce(&dx)) {
                     out.store(sum.to_bits(), Relaxed);
@@ -233,7 +233,7 @@ fn back_row<const FMA: bool>(
     (row.t, row.behind) = (t, behind);
 }
 
-/// Writes the sums of every intersection to its emit index (`offsets[rank] + k`) in `partials`, which is resized.
+/// Writes the sums of every intersection to its emit index (`offsets[row] + k`) in `partials`, which is resized.
 pub fn rasterize_bwd(
     lists: &Lists<'_>,
     offsets: &[u64],
@@ -252,21 +252,9 @@ pub fn rasterize_bwd(
     });
 }
 
-/// Folds the sums of each row over its intersections and turns them into gradients. `order` are the rows by rank.
-pub fn fold_rows(
-    order: &[u32],
-    offsets: &[u64],
-    partials: &[Partial],
-    projected: &Projected,
-    rank_from_row: &mut Vec<u32>,
-    out: &mut FootprintGradients,
-) {
-    let rows = projected.radii.len();
-    rank_from_row.clear();
-    rank_from_row.resize(rows, NEVER);
-    for (rank, &row) in order.iter().enumerate() {
-        rank_from_row[row as usize] = rank as u32;
-    }
+/// Folds the sums of each row over its intersections (`offsets[row]..offsets[row + 1]`) and turns them into gradients.
+pub fn fold_rows(offsets: &[u64], partials: &[Partial], projected: &Projected, out: &mut FootprintGradients) {
+    let rows = projected.rows();
     out.v_means2d.resize(rows, [0.0; 2]);
     out.v_conics.resize(rows, [0.0; 3]);
     out.v_colors.resize(rows, [0.0; 3]);
@@ -279,19 +267,17 @@ pub fn fold_rows(
         .zip(&mut out.v_opacities)
         .enumerate()
         .for_each(|(row, (((v_mean, v_conic), v_color), v_opacity))| {
+            let (first, last) = (offsets[row] as usize, offsets[row + 1] as usize);
             let mut sums = [0.0f32; SUMS];
-            let rank = rank_from_row[row];
-            if rank != NEVER {
-                let (first, last) = (offsets[rank as usize] as usize, offsets[rank as usize + 1] as usize);
-                for partial in &partials[first..last] {
-                    for (sum, part) in sums.iter_mut().zip(partial) {
-                        *sum += f32::from_bits(part.load(Relaxed));
-                    }
+            for partial in &partials[first..last] {
+                for (sum, part) in sums.iter_mut().zip(partial) {
+                    *sum += f32::from_bits(part.load(Relaxed));
                 }
             }
             let [h, hx, hy, hxx, hxy, hyy, red, green, blue] = sums;
             *v_color = [red, green, blue];
-            if rank == NEVER {
+            if first == last {
+                // The footprint of a culled row is not to be read.
                 (*v_mean, *v_conic, *v_opacity) = ([0.0; 2], [0.0; 3], 0.0);
                 return;
             }
@@ -332,7 +318,7 @@ mod tests {
                 let fast = sums(&scene.lists(simd), &scene.offsets);
                 for bits in &mut scene.isects {
                     let isect = Isect::unpack(bits.load(Relaxed));
-                    *bits.get_mut() = Isect { rows: [0, 15], ..isect }.pack();
+                    *bits.get_mut() = Isect { pixel_rows: [0, 15], ..isect }.pack();
                 }
                 // == and not bits: a sum of nothing is 0.0, a sum of zeros may be -0.0.
                 assert!(fast == sums(&scene.lists(simd), &scene.offsets), "{simd:?} {n}");
