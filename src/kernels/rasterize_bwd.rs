@@ -72,6 +72,7 @@ struct Tile {
     row_stop: [u32; ROWS],
     block: Block<BLOCK>,
     sums: [Sums; BLOCK],
+    halves: [Halves; BLOCK],
 }
 
 thread_local! {
@@ -81,6 +82,7 @@ thread_local! {
         row_stop: [0; ROWS],
         block: Block::new(),
         sums: [Sums::default(); BLOCK],
+        halves: [Halves::default(); BLOCK],
     }));
 }
 
@@ -134,28 +136,55 @@ impl Kernel for BackTile<'_> {
     #[inline(always)]
     fn run<const FMA: bool>(self) {
         let BackTile { lists, offsets, tile, cap, state, partials } = self;
-        let Tile { rows, row_stop, block, sums } = state;
+        let Tile { rows, row_stop, block, sums, halves } = state;
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
         let x: Lanes = std::array::from_fn(|lane| x0 + lane as f32);
+        let last_stop = row_stop.iter().fold(0, |m, s| m.max(*s));
         for (number, list) in lists.tile(tile).chunks(BLOCK).enumerate().rev() {
-            block.fill::<FMA>(list, lists.splats, y0, cap);
-            *sums = [Sums::default(); BLOCK];
             let first = (number * BLOCK) as u32;
-            for (y, row) in rows.iter_mut().enumerate() {
-                if first < row_stop[y] {
-                    back_row::<FMA>(row, y, first, block, &x, cap, sums);
-                }
+            if first >= last_stop {
+                continue;
             }
-            for (local, sums) in block.locals[..list.len()].iter().zip(sums.iter()) {
+            block.fill::<FMA>(list, lists.splats, y0, cap);
+            let mut touched = 0;
+            for (reach, &stop) in block.reach.iter_mut().zip(row_stop.iter()) {
+                // Splats at or behind the row's last stop take no part.
+                let before = stop.saturating_sub(first);
+                *reach &= if before < BLOCK as u32 { (1u64 << before) - 1 } else { u64::MAX };
+                touched |= *reach;
+            }
+            for i in bits(touched) {
+                sums[i] = Sums::default();
+            }
+            for (y, row) in rows.iter_mut().enumerate() {
+                back_row::<FMA>(row, y, first, block, &x, cap, sums);
+            }
+            for i in bits(touched) {
+                halves[i] = sums[i].halves(&x, block.locals[i].mean_x);
+            }
+            for i in bits(touched) {
+                let local = &block.locals[i];
                 let out = &partials[(offsets[local.row as usize] + u64::from(local.k)) as usize];
-                let dx = std::array::from_fn(|lane| x[lane] - local.mean_x);
-                for (out, sum) in out.iter().zip(sums.reduce(&dx)) {
+                for (out, half) in out.iter().zip(&halves[i].0) {
+                    let four: [f32; 4] = std::array::from_fn(|lane| half[lane] + half[lane + 4]);
+                    let sum = (four[0] + four[2]) + (four[1] + four[3]);
                     out.store(sum.to_bits(), Relaxed);
                 }
             }
         }
     }
+}
+
+/// Numbers of the bits that are set, upwards.
+#[inline(always)]
+fn bits(mut set: u64) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let i = set.trailing_zeros() as usize % BLOCK;
+        let some = set != 0;
+        set &= set.wrapping_sub(1);
+        some.then_some(i)
+    })
 }
 
 /// Sums of one splat in one tile, by lane.
@@ -168,20 +197,29 @@ struct Sums {
     rgb: [Lanes; 3],
 }
 
+/// The nine sums with lanes i and i + 8 added.
+#[derive(Clone, Copy, Default)]
+#[repr(C, align(64))]
+struct Halves([[f32; 8]; SUMS]);
+
 impl Sums {
-    /// The nine sums over lanes; dx is constant in a lane, so its moments are formed here.
-    /// Halves upon halves, the same order on every path.
+    /// First step of the sum over lanes (halves upon halves, the same order on every path). dx is constant in a lane,
+    /// so its moments are formed here.
     #[inline(always)]
-    fn reduce(&self, dx: &Lanes) -> [f32; SUMS] {
-        let times_dx = |v: &Lanes| -> Lanes { std::array::from_fn(|lane| v[lane] * dx[lane]) };
-        let hx = times_dx(&self.h);
-        let [red, green, blue] = self.rgb;
-        let all = [self.h, hx, self.hy, times_dx(&hx), times_dx(&self.hy), self.hyy, red, green, blue];
-        all.map(|v| {
-            let eight: [f32; 8] = std::array::from_fn(|i| v[i] + v[i + 8]);
-            let four: [f32; 4] = std::array::from_fn(|i| eight[i] + eight[i + 4]);
-            (four[0] + four[2]) + (four[1] + four[3])
-        })
+    fn halves(&self, x: &Lanes, mean_x: f32) -> Halves {
+        let mut out = Halves::default();
+        for i in 0..8 {
+            let [left, right] = [i, i + 8].map(|lane| {
+                let (dx, h, hy) = (x[lane] - mean_x, self.h[lane], self.hy[lane]);
+                let hx = h * dx;
+                let [red, green, blue] = [self.rgb[0][lane], self.rgb[1][lane], self.rgb[2][lane]];
+                [h, hx, hy, hx * dx, hy * dx, self.hyy[lane], red, green, blue]
+            });
+            for s in 0..SUMS {
+                out.0[s][i] = left[s] + right[s];
+            }
+        }
+        out
     }
 }
 
@@ -243,6 +281,10 @@ pub fn rasterize_bwd(
 ) {
     let cap = log2_max_alpha(lists.max_alpha, lists.simd);
     partials.resize_with(lists.isects.len(), Partial::default);
+    // Zeros for all, in order of memory: cheaper than writing them one by one where a splat takes no part.
+    partials.par_chunks_mut(16_384).for_each(|partials| {
+        partials.iter_mut().flatten().for_each(|sum| *sum.get_mut() = 0);
+    });
     let partials = &partials[..];
     (0..lists.grid.tiles()).into_par_iter().for_each(|tile| {
         SCRATCH.with_borrow_mut(|state| {
