@@ -1,7 +1,7 @@
 //! One intersection for each row and tile that it can reach.
 //!
 //! Invariants: 1. a row's tiles are enumerated column by column (tile x outer, tile y inner), and the k-th of them has
-//! emit index `offset[row] + k`: per-row sums are folded in that order; 2. a tile, and a pixel row of a tile, is left
+//! emit index `first emit index of the row + k`: per-row sums are folded in that order; 2. a tile, and a pixel row of a tile, is left
 //! out only where every pixel's alpha is computed below 1/255, so leaving it out cannot change the image;
 //! 3. [`count`] and [`emit`] walk through the same enumeration as the counts of [`super::splats::pack`]; 4. the result
 //! does not depend on the number of threads.
@@ -228,7 +228,7 @@ mod tests {
         let (mut tile_counts, mut offsets) = (Vec::new(), Vec::new());
         let (mut tile_offsets, mut cursors, mut isects) = (Vec::new(), Vec::new(), Vec::new());
         count(&order, &packed, grid, SimdPath::best(), &mut tile_counts);
-        let total = scan(&packed.counts, &mut offsets);
+        let total = scan(&packed.chunk_counts, &mut offsets);
         isect_offsets(&tile_counts, grid.tiles(), &mut tile_offsets, &mut cursors);
         assert_eq!(tile_offsets[grid.tiles()], total);
         emit(&order, &packed, grid, SimdPath::best(), total, &mut cursors, &mut isects);

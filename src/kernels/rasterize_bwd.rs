@@ -11,7 +11,7 @@
 use super::constants::TILE;
 use super::project_fwd::Projected;
 use super::rasterize_fwd::{Lanes, Lists, Raster, TILE_PIXELS, exp2_bounded, log2_max_alpha};
-use super::splats::LOG2_ALPHA_MIN;
+use super::splats::{LOG2_ALPHA_MIN, ROWS_PER_CHUNK};
 use super::tile_block::{Block, ROWS};
 use crate::base::simd::{Kernel, LANES, dispatch, fma};
 use rayon::prelude::*;
@@ -123,7 +123,7 @@ impl Tile {
 
 struct BackTile<'a> {
     lists: &'a Lists<'a>,
-    offsets: &'a [u64],
+    chunk_offsets: &'a [u64],
     tile: usize,
     cap: f32,
     state: &'a mut Tile,
@@ -135,7 +135,7 @@ impl Kernel for BackTile<'_> {
 
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        let BackTile { lists, offsets, tile, cap, state, partials } = self;
+        let BackTile { lists, chunk_offsets, tile, cap, state, partials } = self;
         let Tile { rows, row_stop, block, sums, halves } = state;
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
@@ -165,7 +165,8 @@ impl Kernel for BackTile<'_> {
             }
             for i in bits(touched) {
                 let local = &block.locals[i];
-                let out = &partials[(offsets[local.row as usize] + u64::from(local.k)) as usize];
+                let chunk = local.row as usize / ROWS_PER_CHUNK;
+                let out = &partials[(chunk_offsets[chunk] + local.emit) as usize];
                 for (out, half) in out.iter().zip(&halves[i].0) {
                     let four: [f32; 4] = std::array::from_fn(|lane| half[lane] + half[lane + 4]);
                     let sum = (four[0] + four[2]) + (four[1] + four[3]);
@@ -271,10 +272,11 @@ fn back_row<const FMA: bool>(
     (row.t, row.behind) = (t, behind);
 }
 
-/// Writes the sums of every intersection to its emit index (`offsets[row] + k`) in `partials`, which is resized.
+/// Writes the sums of every intersection to its emit index in `partials`, which is resized. `chunk_offsets` are the
+/// emit indices at which chunks of [`ROWS_PER_CHUNK`] rows begin.
 pub fn rasterize_bwd(
     lists: &Lists<'_>,
-    offsets: &[u64],
+    chunk_offsets: &[u64],
     raster: &Raster,
     upstream: &Upstream<'_>,
     partials: &mut Vec<Partial>,
@@ -289,27 +291,33 @@ pub fn rasterize_bwd(
     (0..lists.grid.tiles()).into_par_iter().for_each(|tile| {
         SCRATCH.with_borrow_mut(|state| {
             state.load(lists, raster, upstream, tile);
-            dispatch(lists.simd, BackTile { lists, offsets, tile, cap, state, partials });
+            dispatch(lists.simd, BackTile { lists, chunk_offsets, tile, cap, state, partials });
         });
     });
 }
 
-/// Folds the sums of each row over its intersections (`offsets[row]..offsets[row + 1]`) and turns them into gradients.
-pub fn fold_rows(offsets: &[u64], partials: &[Partial], projected: &Projected, out: &mut FootprintGradients) {
+/// Folds the sums of each row over its intersections and turns them into gradients. `counts` says how many
+/// intersections a row has.
+pub fn fold_rows(
+    counts: &[u32],
+    chunk_offsets: &[u64],
+    partials: &[Partial],
+    projected: &Projected,
+    out: &mut FootprintGradients,
+) {
     let rows = projected.rows();
     out.v_means2d.resize(rows, [0.0; 2]);
     out.v_conics.resize(rows, [0.0; 3]);
     out.v_colors.resize(rows, [0.0; 3]);
     out.v_opacities.resize(rows, 0.0);
-    out.v_means2d
-        .par_iter_mut()
-        .with_min_len(1024)
-        .zip(&mut out.v_conics)
-        .zip(&mut out.v_colors)
-        .zip(&mut out.v_opacities)
-        .enumerate()
-        .for_each(|(row, (((v_mean, v_conic), v_color), v_opacity))| {
-            let (first, last) = (offsets[row] as usize, offsets[row + 1] as usize);
+    let geometry = (out.v_means2d.par_chunks_mut(ROWS_PER_CHUNK), out.v_conics.par_chunks_mut(ROWS_PER_CHUNK));
+    let looks = (out.v_colors.par_chunks_mut(ROWS_PER_CHUNK), out.v_opacities.par_chunks_mut(ROWS_PER_CHUNK));
+    let chunks = geometry.into_par_iter().zip(looks.into_par_iter()).enumerate();
+    chunks.for_each(|(chunk, ((v_means2d, v_conics), (v_colors, v_opacities)))| {
+        let mut first = chunk_offsets[chunk] as usize;
+        for i in 0..v_means2d.len() {
+            let row = chunk * ROWS_PER_CHUNK + i;
+            let last = first + counts[row] as usize;
             let mut sums = [0.0f32; SUMS];
             for partial in &partials[first..last] {
                 for (sum, part) in sums.iter_mut().zip(partial) {
@@ -317,18 +325,20 @@ pub fn fold_rows(offsets: &[u64], partials: &[Partial], projected: &Projected, o
                 }
             }
             let [h, hx, hy, hxx, hxy, hyy, red, green, blue] = sums;
-            *v_color = [red, green, blue];
+            v_colors[i] = [red, green, blue];
             if first == last {
                 // The footprint of a culled row is not to be read.
-                (*v_mean, *v_conic, *v_opacity) = ([0.0; 2], [0.0; 3], 0.0);
-                return;
+                (v_means2d[i], v_conics[i], v_opacities[i]) = ([0.0; 2], [0.0; 3], 0.0);
+                continue;
             }
             // dL/dsigma = -h; sigma = (A dx^2 + C dy^2) / 2 + B dx dy with dx = pixel - mean.
             let [a, b, c] = projected.conics[row];
-            *v_mean = [a * hx + b * hy, b * hx + c * hy];
-            *v_conic = [-0.5 * hxx, -hxy, -0.5 * hyy];
-            *v_opacity = h / projected.opacities[row];
-        });
+            v_means2d[i] = [a * hx + b * hy, b * hx + c * hy];
+            v_conics[i] = [-0.5 * hxx, -hxy, -0.5 * hyy];
+            v_opacities[i] = h / projected.opacities[row];
+            first = last;
+        }
+    });
 }
 
 #[cfg(test)]
@@ -339,7 +349,7 @@ mod tests {
     use crate::kernels::isect_emit::Isect;
     use crate::kernels::rasterize_fwd::{rasterize_fwd, tests::scene};
 
-    fn sums(lists: &Lists<'_>, offsets: &[u64]) -> Vec<f32> {
+    fn sums(lists: &Lists<'_>, chunk_offsets: &[u64]) -> Vec<f32> {
         let pixels = (lists.grid.width * lists.grid.height) as usize;
         let mut draws = Stream::new(22, Purpose::Test, 0, 0);
         let v_rgb: Vec<f32> = (0..3 * pixels).map(|_| draws.normal() as f32).collect();
@@ -348,7 +358,7 @@ mod tests {
         rasterize_fwd(lists, &mut raster);
         let mut partials = Vec::new();
         let upstream = Upstream { v_rgb: &v_rgb, v_alpha: Some(&v_alpha) };
-        rasterize_bwd(lists, offsets, &raster, &upstream, &mut partials);
+        rasterize_bwd(lists, chunk_offsets, &raster, &upstream, &mut partials);
         partials.iter().flatten().map(|x| f32::from_bits(x.load(Relaxed))).collect()
     }
 
@@ -357,13 +367,13 @@ mod tests {
         for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
             for (n, needles) in [(60, false), (2000, false), (300, true)] {
                 let mut scene = scene(n, needles);
-                let fast = sums(&scene.lists(simd), &scene.offsets);
+                let fast = sums(&scene.lists(simd), &scene.chunk_offsets);
                 for bits in &mut scene.isects {
                     let isect = Isect::unpack(bits.load(Relaxed));
                     *bits.get_mut() = Isect { pixel_rows: [0, 15], ..isect }.pack();
                 }
                 // == and not bits: a sum of nothing is 0.0, a sum of zeros may be -0.0.
-                assert!(fast == sums(&scene.lists(simd), &scene.offsets), "{simd:?} {n}");
+                assert!(fast == sums(&scene.lists(simd), &scene.chunk_offsets), "{simd:?} {n}");
                 assert!(fast.iter().any(|x| *x != 0.0) && fast.iter().all(|x| x.is_finite()));
             }
         }

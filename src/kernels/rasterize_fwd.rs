@@ -342,7 +342,7 @@ pub(in crate::kernels) mod tests {
         pub grid: Grid,
         pub radii: Vec<[u32; 2]>,
         pub packed: Packed,
-        pub offsets: Vec<u64>,
+        pub chunk_offsets: Vec<u64>,
         pub tile_offsets: Vec<u64>,
         pub isects: Vec<AtomicU64>,
     }
@@ -368,14 +368,14 @@ pub(in crate::kernels) mod tests {
         }
         let order: Vec<u32> = (0..n as u32).collect();
         let (mut packed, simd) = (Packed::default(), SimdPath::best());
-        let (mut offsets, mut tile_offsets, mut isects) = (vec![], vec![], vec![]);
+        let (mut chunk_offsets, mut tile_offsets, mut isects) = (vec![], vec![], vec![]);
         let (mut tile_counts, mut cursors) = (vec![], vec![]);
         pack(&p, &colors, grid, simd, &mut packed);
         count(&order, &packed, grid, simd, &mut tile_counts);
-        let total = scan(&packed.counts, &mut offsets);
+        let total = scan(&packed.chunk_counts, &mut chunk_offsets);
         isect_offsets(&tile_counts, grid.tiles(), &mut tile_offsets, &mut cursors);
         emit(&order, &packed, grid, simd, total, &mut cursors, &mut isects);
-        Scene { grid, radii: p.radii, packed, offsets, tile_offsets, isects }
+        Scene { grid, radii: p.radii, packed, chunk_offsets, tile_offsets, isects }
     }
 
     impl Scene {

@@ -69,6 +69,8 @@ pub struct Splat {
     pub color: [f32; 3],
     /// How far the exponent may fall before no contribution is possible; not positive when none is possible at all.
     pub reach: f32,
+    /// Emit index of its first intersection, counted from its chunk's first (see [`Packed::chunk_counts`]).
+    pub emit: u64,
 }
 
 /// What a row can reach: the intersection stages read only this of most rows.
@@ -214,20 +216,25 @@ pub struct Packed {
     pub spans: Vec<Span>,
     /// Tiles that each row reaches; 0 for culled rows.
     pub counts: Vec<u32>,
+    /// Sums of `counts` over chunks of [`ROWS_PER_CHUNK`] rows: their prefix sums are the chunks' emit offsets.
+    pub chunk_counts: Vec<u64>,
 }
+
+/// Rows whose emit indices are counted together.
+pub const ROWS_PER_CHUNK: usize = 2048;
 
 /// Packs all rows. `colors` has one entry per row.
 pub fn pack(projected: &Projected, colors: &[[f32; 3]], grid: Grid, simd: SimdPath, out: &mut Packed) {
-    const ROWS_PER_CHUNK: usize = 2048;
     let rows = projected.rows();
     out.splats.resize(rows, Splat::default());
     out.spans.resize(rows, Span::default());
     out.counts.resize(rows, 0);
+    out.chunk_counts.resize(rows.div_ceil(ROWS_PER_CHUNK), 0);
     let chunks = (out.splats.par_chunks_mut(ROWS_PER_CHUNK), out.spans.par_chunks_mut(ROWS_PER_CHUNK));
-    let chunks = chunks.into_par_iter().zip(out.counts.par_chunks_mut(ROWS_PER_CHUNK)).enumerate();
-    chunks.for_each(|(chunk, ((splats, spans), counts))| {
+    let counts = (out.counts.par_chunks_mut(ROWS_PER_CHUNK), out.chunk_counts.par_iter_mut()).into_par_iter();
+    chunks.into_par_iter().zip(counts).enumerate().for_each(|(chunk, ((splats, spans), (counts, sum)))| {
         let first = chunk * ROWS_PER_CHUNK;
-        dispatch(simd, PackChunk { projected, colors, grid, first, splats, spans, counts });
+        *sum = dispatch(simd, PackChunk { projected, colors, grid, first, splats, spans, counts });
     });
 }
 
@@ -242,10 +249,12 @@ struct PackChunk<'a> {
 }
 
 impl Kernel for PackChunk<'_> {
-    type Out = ();
+    /// Sum of the counts.
+    type Out = u64;
 
     #[inline(always)]
-    fn run<const FMA: bool>(self) {
+    fn run<const FMA: bool>(self) -> u64 {
+        let mut emit = 0;
         let grid = self.grid;
         let p = self.projected;
         let range = self.first..self.first + self.splats.len();
@@ -266,11 +275,14 @@ impl Kernel for PackChunk<'_> {
             for (lane, radii) in radii.iter().enumerate() {
                 let row = block * LANES + lane;
                 let (splat, span) = lanes.lane(lane, colors[lane]);
-                self.splats[row] = splat;
+                let count = if *radii == [0, 0] { 0 } else { tiles_reached(&splat, &span, grid) };
+                self.splats[row] = Splat { emit, ..splat };
                 self.spans[row] = span;
-                self.counts[row] = if *radii == [0, 0] { 0 } else { tiles_reached(&splat, &span, grid) };
+                self.counts[row] = count;
+                emit += u64::from(count);
             }
         }
+        emit
     }
 }
 
@@ -320,7 +332,7 @@ impl PackedLanes {
             let (dx, dy) = (radii[0] + TILE as f32 + 1.0, radii[1] + TILE as f32 + 1.0);
             let rounding = 2e-6 * (a.abs() * dx * dx + c.abs() * dy * dy) + 1e-4;
             let reach = logs[lane] - LOG2_ALPHA_MIN + rounding;
-            let splat = Splat { mean, a, b, c, log2_opacity: logs[lane], color: [0.0; 3], reach };
+            let splat = Splat { mean, a, b, c, log2_opacity: logs[lane], color: [0.0; 3], reach, emit: 0 };
             let ellipse = splat.ellipse();
             let [first, last] = ellipse.columns();
             // The box of the radii in whole tiles, narrowed to the tile columns that the ellipse can reach. Written so
@@ -354,7 +366,7 @@ impl PackedLanes {
         let [x, y, a, b, c, log2_opacity, reach] = std::array::from_fn(|i| self.splat[i][lane]);
         let tiles = std::array::from_fn(|i| self.tiles[i][lane] as u16);
         let rows = std::array::from_fn(|i| [self.rows[2 * i][lane] as u16, self.rows[2 * i + 1][lane] as u16]);
-        (Splat { mean: [x, y], a, b, c, log2_opacity, color, reach }, Span { tiles, rows })
+        (Splat { mean: [x, y], a, b, c, log2_opacity, color, reach, emit: 0 }, Span { tiles, rows })
     }
 }
 

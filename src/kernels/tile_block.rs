@@ -33,8 +33,8 @@ pub(super) struct Local {
     pub color: [f32; 3],
     /// The Gaussian.
     pub row: u32,
-    /// Number among its intersections.
-    pub k: u32,
+    /// Emit index of this intersection, counted from that of its chunk of rows.
+    pub emit: u64,
 }
 
 /// Up to `N` (at most 64) consecutive splats of a tile's list.
@@ -56,7 +56,7 @@ impl<const N: usize> Block<N> {
             top: 0.0,
             color: [0.0; 3],
             row: 0,
-            k: 0,
+            emit: 0,
         };
         Block { locals: [none; N], reach: [0; ROWS] }
     }
@@ -84,7 +84,7 @@ impl<const N: usize> Block<N> {
             local.top = if splat.log2_opacity < cap { splat.log2_opacity } else { cap };
             local.color = splat.color;
             local.row = isect.row;
-            local.k = isect.k;
+            local.emit = splat.emit + u64::from(isect.k);
         }
         self.reach = reach;
     }

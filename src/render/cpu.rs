@@ -65,8 +65,8 @@ pub struct CpuRenderer {
     order: Vec<u32>,
     packed: Packed,
     tile_counts: Vec<u32>,
-    /// Emit offsets by row.
-    offsets: Vec<u64>,
+    /// Emit offsets by chunk of rows.
+    chunk_offsets: Vec<u64>,
     tile_offsets: Vec<u64>,
     cursors: Vec<u64>,
     isects: Vec<AtomicU64>,
@@ -105,7 +105,7 @@ impl CpuRenderer {
         });
         let total = clock.time("scan", || {
             pack(&self.projected, &self.colors, grid, simd, &mut self.packed);
-            scan(&self.packed.counts, &mut self.offsets)
+            scan(&self.packed.chunk_counts, &mut self.chunk_offsets)
         });
         clock.time("isect_offsets", || {
             count(&self.order, &self.packed, grid, simd, &mut self.tile_counts);
@@ -204,9 +204,9 @@ impl CpuRenderer {
 
     fn rasterize_back(&mut self, grid: Grid, options: &RenderOptions, upstream: &Upstream<'_>) {
         let mut partials = std::mem::take(&mut self.partials);
-        rasterize_bwd(&self.lists(grid, options), &self.offsets, &self.raster, upstream, &mut partials);
+        rasterize_bwd(&self.lists(grid, options), &self.chunk_offsets, &self.raster, upstream, &mut partials);
         self.partials = partials;
-        fold_rows(&self.offsets, &self.partials, &self.projected, &mut self.footprints);
+        fold_rows(&self.packed.counts, &self.chunk_offsets, &self.partials, &self.projected, &mut self.footprints);
     }
 
     /// Seconds that each stage took in the last view, in the order of [`STAGES`] (0 for those that did not run).
@@ -233,7 +233,8 @@ impl CpuRenderer {
             + (bytes(&self.packed.counts)
                 + bytes(&self.packed.spans)
                 + bytes(&self.tile_counts)
-                + bytes(&self.offsets)
+                + bytes(&self.chunk_offsets)
+                + bytes(&self.packed.chunk_counts)
                 + bytes(&self.tile_offsets))
             + (bytes(&self.cursors) + bytes(&self.isects) + bytes(&self.partials))
             + (bytes(&f.v_means2d) + bytes(&f.v_conics) + bytes(&f.v_colors) + bytes(&f.v_opacities))
