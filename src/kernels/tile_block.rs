@@ -31,10 +31,10 @@ pub(super) struct Local {
     pub top: f32,
     /// Colour.
     pub color: [f32; 3],
-    /// The row's place in depth order.
-    pub rank: u32,
-    /// Number among the row's intersections.
-    pub k: u32,
+    /// The Gaussian.
+    pub row: u32,
+    /// Emit index of this intersection, counted from that of its chunk of rows.
+    pub emit: u64,
 }
 
 /// Up to `N` (at most 64) consecutive splats of a tile's list.
@@ -55,8 +55,8 @@ impl<const N: usize> Block<N> {
             a: 0.0,
             top: 0.0,
             color: [0.0; 3],
-            rank: 0,
-            k: 0,
+            row: 0,
+            emit: 0,
         };
         Block { locals: [none; N], reach: [0; ROWS] }
     }
@@ -68,8 +68,8 @@ impl<const N: usize> Block<N> {
         let mut reach = [0u64; ROWS];
         for (i, (local, bits)) in self.locals.iter_mut().zip(list).enumerate() {
             let isect = Isect::unpack(bits.load(Relaxed));
-            let splat = &splats[isect.rank as usize];
-            let rows = (2u64 << isect.rows[1]) - (1u64 << isect.rows[0]);
+            let splat = &splats[isect.row as usize];
+            let rows = (2u64 << isect.pixel_rows[1]) - (1u64 << isect.pixel_rows[0]);
             for (row, set) in reach.iter_mut().enumerate() {
                 *set |= ((rows >> row) & 1) << i;
             }
@@ -83,8 +83,8 @@ impl<const N: usize> Block<N> {
             local.a = splat.a;
             local.top = if splat.log2_opacity < cap { splat.log2_opacity } else { cap };
             local.color = splat.color;
-            local.rank = isect.rank;
-            local.k = isect.k;
+            local.row = isect.row;
+            local.emit = splat.emit + u64::from(isect.k);
         }
         self.reach = reach;
     }
