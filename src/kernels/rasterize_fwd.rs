@@ -14,7 +14,7 @@
 
 use super::constants::{TILE, TRANSMITTANCE_MIN};
 use super::splats::{Grid, LOG2_ALPHA_MIN, Splat};
-use super::tile_block::{Block, ROWS};
+use super::tile_block::{Block, ROWS, prefetch_splats};
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch, fma};
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -220,8 +220,11 @@ impl Kernel for BlendTile<'_> {
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
         let mut rows_done = 0u64;
-        for (number, list) in lists.tile(tile).chunks(BLOCK).enumerate() {
+        let all = lists.tile(tile);
+        for (number, list) in all.chunks(BLOCK).enumerate() {
             block.fill::<FMA>(list, lists.splats, y0, cap);
+            let next = all.len().min((number + 1) * BLOCK)..all.len().min((number + 2) * BLOCK);
+            prefetch_splats(&all[next], lists.splats);
             let mut alive = false;
             for (y, row) in rows.iter_mut().enumerate() {
                 if row.alive {
