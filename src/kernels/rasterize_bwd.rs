@@ -10,7 +10,7 @@
 
 use super::constants::TILE;
 use super::project_fwd::Projected;
-use super::rasterize_fwd::{Lanes, Lists, Raster, TILE_PIXELS, exp2_bounded, log2_max_alpha};
+use super::rasterize_fwd::{Lanes, Lists, Raster, TILE_PIXELS, copy_lanes, exp2_bounded, log2_max_alpha};
 use super::splats::{LOG2_ALPHA_MIN, ROWS_PER_CHUNK};
 use super::tile_block::{Block, ROWS, prefetch_splats};
 use crate::base::simd::{Kernel, LANES, dispatch, fma};
@@ -102,7 +102,7 @@ impl Tile {
         for (row, out) in self.rows[..rows].iter_mut().enumerate() {
             let from = (ty as usize * ROWS + row) * grid.width as usize + tx as usize * LANES;
             for c in 0..3 {
-                out.v_rgb[c][..columns].copy_from_slice(&upstream.v_rgb[c * pixels + from..][..columns]);
+                copy_lanes(&mut out.v_rgb[c][..columns], &upstream.v_rgb[c * pixels + from..]);
             }
             let within = tile * TILE_PIXELS + row * LANES;
             let v_alpha = upstream.v_alpha.map(|v| &v[from..from + columns]);

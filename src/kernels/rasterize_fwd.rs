@@ -302,6 +302,16 @@ pub fn rasterize_fwd(lists: &Lists<'_>, out: &mut Raster) {
         });
 }
 
+/// Copies up to a tile's row of values; whole rows without a library call each.
+#[inline(always)]
+pub(super) fn copy_lanes(out: &mut [f32], from: &[f32]) {
+    let n = out.len();
+    match (<&mut Lanes>::try_from(&mut *out), from.first_chunk::<LANES>()) {
+        (Ok(out), Some(from)) => *out = *from,
+        _ => out.copy_from_slice(&from[..n]),
+    }
+}
+
 /// Copies tiles to a planar image (`[3][height][width]`) and its alpha plane (1 - T).
 pub fn untile(grid: Grid, raster: &Raster, rgb: &mut [f32], alpha: &mut [f32]) {
     let (width, pixels) = (grid.width as usize, grid.width as usize * grid.height as usize);
@@ -318,9 +328,9 @@ pub fn untile(grid: Grid, raster: &Raster, rgb: &mut [f32], alpha: &mut [f32]) {
             let n = LANES.min(width - x);
             let within = y % ROWS * LANES;
             let colors = &raster.rgb[tile * 3 * TILE_PIXELS..][..3 * TILE_PIXELS];
-            r[x..x + n].copy_from_slice(&colors[within..within + n]);
-            g[x..x + n].copy_from_slice(&colors[TILE_PIXELS + within..][..n]);
-            b[x..x + n].copy_from_slice(&colors[2 * TILE_PIXELS + within..][..n]);
+            copy_lanes(&mut r[x..x + n], &colors[within..]);
+            copy_lanes(&mut g[x..x + n], &colors[TILE_PIXELS + within..]);
+            copy_lanes(&mut b[x..x + n], &colors[2 * TILE_PIXELS + within..]);
             let t = &raster.t_final[tile * TILE_PIXELS + within..][..n];
             for (a, t) in alpha[x..x + n].iter_mut().zip(t) {
                 *a = 1.0 - t;
