@@ -18,6 +18,7 @@
 //! | [`base`] | ids, random draws, deterministic math, instruction paths, errors; knows neither Gaussians nor disks |
 //! | [`scene`] | Gaussians, cameras and images as data; first Gaussians from points; the log of global events |
 //! | [`dataset`] | where views come from: COLMAP, transforms.json, the generated city; decoding photos |
+//! | [`schedule`] | which view comes when |
 //! | [`kernels`] | the ordered table of stages and each stage as a function on plain slices |
 //! | [`render`] | the stages in order: forward, loss, backward; image metrics |
 //! | [`optim`] | learning rates as a function of the step; dense Adam (oracle) and deferred Adam |
@@ -39,4 +40,5 @@ pub mod kernels;
 pub mod optim;
 pub mod render;
 pub mod scene;
+pub mod schedule;
 pub mod train;

@@ -1,1 +1,70 @@
-fn main() {}
+//! `gsscale-eval`: held-out PSNR and SSIM of a PLY (or of a run's PLY). Parses, calls the library, prints.
+
+use clap::Parser;
+use gsscale::base::error::{InputError, InputResult};
+use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::train::eval::evaluate_ply;
+use gsscale::train::report::write_whole;
+use gsscale::train::trainer::TrainError;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-eval runs/village scans/village
+  gsscale-eval point_cloud.ply scans/village --data-factor 4 --test-every 83
+  gsscale-eval runs/village scans/village --renders pictures --json eval.json";
+
+/// Evaluates Gaussians on the held-out photos of a scene.
+#[derive(Parser)]
+#[command(name = "gsscale-eval", version, after_help = EXAMPLES)]
+struct Args {
+    /// A run's output folder (its config.toml is used), or a PLY
+    model: PathBuf,
+    /// The scene with the photos
+    scene: PathBuf,
+    /// Config file; by default the run's own, or the defaults for a bare PLY. Flags override it
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// Write render-beside-photo pictures here
+    #[arg(long)]
+    renders: Option<PathBuf>,
+    /// Write the numbers here as JSON too
+    #[arg(long)]
+    json: Option<PathBuf>,
+    #[command(flatten)]
+    keys: TrainOverrides,
+}
+
+fn main() -> ExitCode {
+    match start(Args::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn start(args: Args) -> Result<(), TrainError> {
+    let (ply, run_config) = if args.model.is_dir() {
+        (args.model.join("point_cloud.ply"), Some(args.model.join("config.toml")))
+    } else {
+        (args.model.clone(), None)
+    };
+    let mut config = read_config(args.config.as_deref().or(run_config.as_deref()))?;
+    args.keys.apply(&mut config);
+    config.check()?;
+    let report = evaluate_ply(&ply, &args.scene, &config, args.renders.as_deref())?;
+    let text = serde_json::to_string_pretty(&report)
+        .map_err(|e| InputError::new(&ply, format!("writing JSON failed: {e}"), "report this as a bug"))?;
+    println!("{text}");
+    if let Some(path) = &args.json {
+        write_whole(path, (text + "\n").as_bytes())?;
+    }
+    Ok(())
+}
+
+fn read_config(path: Option<&Path>) -> InputResult<TrainConfig> {
+    path.map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)
+}

@@ -1,1 +1,4 @@
-//! (being written)
+//! What the user wrote ([`file`]) and what follows from it ([`limits`]).
+
+pub mod file;
+pub mod limits;

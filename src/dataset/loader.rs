@@ -1,1 +1,483 @@
-//! (being written)
+//! From a [`RawScene`] to a checked [`Dataset`]: every photo's header and end are looked at, intrinsics are brought
+//! to training size, offset and scale are taken out, and each view gets its set.
+//!
+//! Not responsible for reading models (the readers are) or pixels ([`super::photo`], [`super::target_cache`]).
+//!
+//! Invariants: 1. every view of a dataset has a photo whose header and end marker were seen and whose shape can
+//! belong to its camera; 2. frame, scene scale and split depend on the views that the model registers, so a photo
+//! left out with `allow_missing` changes none of them; 3. whatever is left out or repaired is in `warnings`.
+
+use super::frame::{Extent, Frame, usable};
+use super::masks::{MaskIndex, MaskSource};
+use super::model::{Intrinsics, Lens, RawScene, RawView, Split};
+use super::photo::{PhotoSource, intrinsics_at};
+use super::photo_header::{PhotoHeader, read_header};
+use super::resize::{Size, divided_size, same_shape};
+use crate::base::error::{InputError, InputResult};
+use crate::scene::camera::Camera;
+use glam::DVec3;
+use rayon::prelude::*;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+/// Names that a message lists before it only counts.
+const NAMES_LISTED: usize = 20;
+
+/// Depth beyond which nothing is drawn, local units.
+const FAR_PLANE: f32 = 1e10;
+
+/// What the user chose about photos, split and frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LoadOptions {
+    /// Photos are made smaller by this, at least 1; each side is rounded to nearest.
+    pub data_factor: f64,
+    /// Limit of the longer side after `data_factor`, pixels.
+    pub max_resolution: Option<u32>,
+    /// Every N-th registered view in sorted order of the names (index % N == 0) is a test view; `None` or 0: none.
+    pub test_every: Option<u32>,
+    /// Registered views with index > N are test views; wins over `test_every`.
+    pub test_after: Option<u32>,
+    /// Whether masks are used.
+    pub masks: bool,
+    /// Black is kept instead of white.
+    pub invert_masks: bool,
+    /// Views without a photo are left out instead of refused.
+    pub allow_missing: bool,
+    /// Near plane in robust scene sizes, the local unit (see [`Extent::frame`]): 0.01 is what gsplat uses in a scene
+    /// normalised to a median camera distance of 1.
+    pub near_plane: f64,
+    /// Folder that the views' names are relative to; `None`: found from the first view's name and path.
+    pub image_folder: Option<PathBuf>,
+}
+
+impl Default for LoadOptions {
+    fn default() -> Self {
+        LoadOptions {
+            data_factor: 1.0,
+            max_resolution: None,
+            test_every: Some(8),
+            test_after: None,
+            masks: true,
+            invert_masks: false,
+            allow_missing: false,
+            near_plane: 0.01,
+            image_folder: None,
+        }
+    }
+}
+
+/// A scene ready for training.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Dataset {
+    /// Views in sorted order of their names.
+    pub views: Vec<View>,
+    /// Points, local frame, finite.
+    pub points: Vec<[f32; 3]>,
+    /// sRGB, one per point.
+    pub colors: Vec<[u8; 3]>,
+    /// What was taken out of the dataset's coordinates.
+    pub frame: Frame,
+    /// 1.1 times the largest camera distance from the mean of the cameras, outliers left out; local units, > 0.
+    pub scene_scale: f32,
+    /// What was left out or repaired, one sentence each: the reader's, then the loader's.
+    pub warnings: Vec<String>,
+    /// Folder that the views' names are relative to.
+    pub image_folder: PathBuf,
+}
+
+/// One view: what is rendered and what it is compared with.
+#[derive(Debug, Clone, PartialEq)]
+pub struct View {
+    /// Name in the dataset.
+    pub name: String,
+    /// Its set.
+    pub split: Split,
+    /// Pose and intrinsics, local frame, without distortion, at training size.
+    pub camera: Camera,
+    /// Where its pixels come from.
+    pub photo: PhotoSource,
+}
+
+impl Dataset {
+    /// Indices of the training views, ascending; never empty.
+    pub fn train_views(&self) -> Vec<usize> {
+        self.views_of(Split::Train)
+    }
+
+    /// Indices of the test views, ascending.
+    pub fn test_views(&self) -> Vec<usize> {
+        self.views_of(Split::Test)
+    }
+
+    fn views_of(&self, split: Split) -> Vec<usize> {
+        (0..self.views.len()).filter(|&i| self.views[i].split == split).collect()
+    }
+}
+
+/// Checks photos and brings a scene into the local frame.
+///
+/// Errors: options out of range, no usable view, no training view; missing photos (listed by name) unless
+/// `allow_missing`; photos or masks that are empty, cut short, not JPEG or PNG, or of a shape that cannot belong to
+/// the camera.
+pub fn load_dataset(raw: RawScene, options: &LoadOptions) -> InputResult<Dataset> {
+    check_options(options)?;
+    let mut warnings = raw.warnings;
+    let image_folder = options.image_folder.clone().unwrap_or_else(|| image_folder_of(&raw.views));
+    if raw.views.is_empty() {
+        return Err(InputError::new(image_folder, "the scene has no registered view", "give a model with photos"));
+    }
+    let splits = split_views(&raw.views, options, &mut warnings)?;
+    let registered: Vec<(RawView, Split)> = raw.views.into_iter().zip(splits).collect();
+    let extent = measure(&registered, &raw.points.positions);
+    let frame = extent.frame();
+    let posed = drop_unusable_poses(registered, &extent, &mut warnings);
+    let (scene_scale, outliers) =
+        extent.scene_scale(&posed.iter().map(|(view, _)| view.pose.centre()).collect::<Vec<DVec3>>());
+    if !outliers.is_empty() {
+        let names = list_names(outliers.iter().map(|&i| posed[i].0.name.as_str()));
+        warnings.push(format!(
+            "{} cameras are far from all others and do not count for the scene's size: {names}",
+            outliers.len()
+        ));
+    }
+    warn_about_extra_photos(&posed, &mut warnings);
+    let present = drop_missing(posed, options, &image_folder, &mut warnings)?;
+    let photos = check_photos(&present, options, &image_folder, &mut warnings)?;
+    let views: Vec<View> = present
+        .into_iter()
+        .zip(photos)
+        .map(|((raw, split), photo)| View {
+            camera: camera_of(&raw, &photo, &frame, options),
+            name: raw.name,
+            split,
+            photo,
+        })
+        .collect();
+    if !views.iter().any(|v| v.split == Split::Train) {
+        let remedy = "check the split of the dataset, --test-every and --test-after";
+        return Err(InputError::new(image_folder, "no view is left for training", remedy));
+    }
+    let (points, colors) = local_points(raw.points.positions, raw.points.colors, &extent, &frame, &mut warnings);
+    let scene_scale = (scene_scale / frame.scale) as f32;
+    Ok(Dataset { views, points, colors, frame, scene_scale, warnings, image_folder })
+}
+
+fn check_options(options: &LoadOptions) -> InputResult<()> {
+    let factor = options.data_factor;
+    if !(1.0..=1e4).contains(&factor) {
+        return Err(InputError::new("--data-factor", format!("{factor} is not between 1 and 10000"), "give 1 or more"));
+    }
+    if options.max_resolution == Some(0) {
+        return Err(InputError::new("--max-resolution", "0 leaves no pixel", "give the longer side in pixels"));
+    }
+    let near = options.near_plane;
+    if !(near > 0.0 && near <= 1e3) {
+        return Err(InputError::new(
+            "--near-plane",
+            format!("{near} is not between 0 and 1000"),
+            "the usual value is 0.01",
+        ));
+    }
+    Ok(())
+}
+
+/// The folder such that folder / name is the first view's path; its parent where that does not hold.
+fn image_folder_of(views: &[RawView]) -> PathBuf {
+    let Some(view) = views.first() else { return PathBuf::from(".") };
+    let up = if view.image_path.ends_with(&view.name) { Path::new(&view.name).components().count() } else { 1 };
+    view.image_path.ancestors().nth(up).unwrap_or(Path::new(".")).to_path_buf()
+}
+
+/// The set of every registered view: the dataset's own, else by index in the sorted list of registered views (also
+/// those whose photo turns out to be missing: their absence must not shift the others).
+fn split_views(views: &[RawView], options: &LoadOptions, warnings: &mut Vec<String>) -> InputResult<Vec<Split>> {
+    let by_index = |index: usize| {
+        let is_test = match (options.test_after, options.test_every) {
+            (Some(after), _) => index as u64 > u64::from(after),
+            (None, Some(every)) if every > 0 => index.is_multiple_of(every as usize),
+            _ => false,
+        };
+        if is_test { Split::Test } else { Split::Train }
+    };
+    let splits: Vec<Split> = views.iter().enumerate().map(|(i, v)| v.split.unwrap_or_else(|| by_index(i))).collect();
+    if splits.contains(&Split::Train) {
+        return Ok(splits);
+    }
+    if views.len() == 1 && views[0].split.is_none() {
+        warnings.push("there is only one view: it is used for training, none is held out".to_string());
+        return Ok(vec![Split::Train]);
+    }
+    if views.iter().all(|v| v.split == Some(Split::Test)) {
+        let problem = "the dataset's own split has no training view";
+        return Err(InputError::new(image_folder_of(views), problem, "add views to its training set"));
+    }
+    let problem = format!("every one of the {} views would be a test view", views.len());
+    Err(InputError::new("--test-every", problem, "give 2 or more, or 0 to hold none out"))
+}
+
+fn measure(registered: &[(RawView, Split)], points: &[[f64; 3]]) -> Extent {
+    let centres: Vec<DVec3> = registered.iter().map(|(view, _)| view.pose.centre()).collect();
+    Extent::measure(&centres, points)
+}
+
+/// Leaves out views whose pose or intrinsics are not finite, or that are absurdly far from all others.
+fn drop_unusable_poses(
+    registered: Vec<(RawView, Split)>,
+    extent: &Extent,
+    warnings: &mut Vec<String>,
+) -> Vec<(RawView, Split)> {
+    let is_good = |view: &RawView| {
+        let k = &view.intrinsics;
+        let finite = [k.fx, k.fy, k.cx, k.cy].iter().all(|x| x.is_finite()) && lens_is_finite(&k.lens);
+        finite
+            && k.fx > 0.0
+            && k.fy > 0.0
+            && view.pose.rotation.is_finite()
+            && usable(view.pose.translation)
+            && extent.is_plausible(view.pose.centre())
+    };
+    let (good, bad): (Vec<_>, Vec<_>) = registered.into_iter().partition(|(view, _)| is_good(view));
+    if !bad.is_empty() {
+        let names = list_names(bad.iter().map(|(view, _)| view.name.as_str()));
+        warnings.push(format!(
+            "{} views have a pose or intrinsics that are not finite or far beyond the scene, and are left out: {names}",
+            bad.len()
+        ));
+    }
+    good
+}
+
+fn lens_is_finite(lens: &Lens) -> bool {
+    match lens {
+        Lens::Pinhole => true,
+        Lens::Radial(k) => k.iter().all(|x| x.is_finite()),
+        Lens::Fisheye(k) => k.iter().all(|x| x.is_finite()),
+    }
+}
+
+/// Photos of the views' folders that no view uses.
+fn warn_about_extra_photos(views: &[(RawView, Split)], warnings: &mut Vec<String>) {
+    let used: BTreeSet<&Path> = views.iter().map(|(view, _)| view.image_path.as_path()).collect();
+    let folders: BTreeSet<&Path> = used.iter().filter_map(|path| path.parent()).collect();
+    let mut extra = Vec::new();
+    for folder in folders {
+        let Ok(entries) = std::fs::read_dir(folder) else { continue };
+        let photos = entries.flatten().map(|e| e.path()).filter(|path| is_photo_name(path));
+        extra.extend(photos.filter(|path| !used.contains(path.as_path())));
+    }
+    if !extra.is_empty() {
+        extra.sort();
+        let names: Vec<_> = extra.iter().filter_map(|p| p.file_name()).take(3).map(|n| n.to_string_lossy()).collect();
+        let more = if extra.len() > 3 { ", ..." } else { "" };
+        warnings.push(format!(
+            "{} photos are not in the model and are not used: {}{more}",
+            extra.len(),
+            names.join(", ")
+        ));
+    }
+}
+
+fn is_photo_name(path: &Path) -> bool {
+    let extension = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+    extension.is_some_and(|e| ["jpg", "jpeg", "png"].contains(&e.as_str()))
+}
+
+fn drop_missing(
+    views: Vec<(RawView, Split)>,
+    options: &LoadOptions,
+    image_folder: &Path,
+    warnings: &mut Vec<String>,
+) -> InputResult<Vec<(RawView, Split)>> {
+    let exists: Vec<bool> = views.par_iter().map(|(view, _)| view.image_path.is_file()).collect();
+    let total = views.len();
+    let (present, missing): (Vec<_>, Vec<_>) = views.into_iter().zip(exists).partition(|(_, exists)| *exists);
+    let present: Vec<(RawView, Split)> = present.into_iter().map(|(view, _)| view).collect();
+    if missing.is_empty() {
+        return Ok(present);
+    }
+    let names = list_names(missing.iter().map(|((view, _), _)| view.name.as_str()));
+    let problem = format!("{} of {total} photos are missing: {names}", missing.len());
+    if !options.allow_missing {
+        let remedy = "copy them there, give the right folder with --images, or train without them with --allow-missing";
+        return Err(InputError::new(image_folder, problem, remedy));
+    }
+    if present.is_empty() {
+        return Err(InputError::new(image_folder, problem, "give the right folder with --images"));
+    }
+    warnings.push(problem);
+    Ok(present)
+}
+
+/// Headers, shapes and masks of all views, in parallel; the first bad one in view order is the error.
+fn check_photos(
+    views: &[(RawView, Split)],
+    options: &LoadOptions,
+    image_folder: &Path,
+    warnings: &mut Vec<String>,
+) -> InputResult<Vec<PhotoSource>> {
+    let index = if options.masks { MaskIndex::scan(image_folder) } else { MaskIndex::default() };
+    let checked: Vec<InputResult<PhotoSource>> =
+        views.par_iter().map(|(view, _)| check_photo(view, &index, options)).collect();
+    let bad = checked.iter().filter(|c| c.is_err()).count();
+    let mut photos = Vec::with_capacity(checked.len());
+    for photo in checked {
+        photos.push(photo.map_err(|mut error| {
+            if bad > 1 {
+                error.problem.push_str(&format!(" ({} other photos or masks cannot be used either)", bad - 1));
+            }
+            error
+        })?);
+    }
+    let masked = photos.iter().filter(|p| p.mask.is_some()).count();
+    if masked == 0 && !index.is_empty() {
+        warnings.push("none of the files in the masks folder belongs to a photo: no mask is used".to_string());
+    } else if masked == 0 && options.invert_masks {
+        warnings.push("--invert-masks has no effect: there is no mask".to_string());
+    } else if masked > 0 && masked < photos.len() {
+        warnings.push(format!(
+            "{} of {} photos have no mask: all of their pixels count",
+            photos.len() - masked,
+            photos.len()
+        ));
+    }
+    Ok(photos)
+}
+
+fn check_photo(view: &RawView, index: &MaskIndex, options: &LoadOptions) -> InputResult<PhotoSource> {
+    let header = read_header(&view.image_path)?;
+    let size = (header.width, header.height);
+    check_shape(view, size)?;
+    let mask_path = view.mask_path.as_deref().filter(|_| options.masks).or_else(|| index.find(&view.name));
+    let mask = mask_path.map(|path| check_mask(path, size, options.invert_masks)).transpose()?;
+    let stated = Intrinsics { lens: effective_lens(&view.intrinsics.lens), ..view.intrinsics };
+    Ok(PhotoSource {
+        image_path: view.image_path.clone(),
+        header,
+        intrinsics: intrinsics_at(&stated, size),
+        target: target_size(size, options),
+        mask,
+    })
+}
+
+fn check_mask(path: &Path, photo: Size, invert: bool) -> InputResult<MaskSource> {
+    let header: PhotoHeader = read_header(path)?;
+    if !same_shape((header.width, header.height), photo) {
+        let problem = format!(
+            "the mask is {} x {}, its photo {} x {}: their shapes differ",
+            header.width, header.height, photo.0, photo.1
+        );
+        return Err(InputError::new(path, problem, "make the mask again for this photo, or remove it"));
+    }
+    Ok(MaskSource { path: path.to_path_buf(), header, invert })
+}
+
+/// A lens whose parameters are all zero does nothing.
+fn effective_lens(lens: &Lens) -> Lens {
+    match lens {
+        Lens::Radial(k) if k.iter().all(|&x| x == 0.0) => Lens::Pinhole,
+        lens => *lens,
+    }
+}
+
+/// Size of the target: the photo's divided by `data_factor`; where the longer side then exceeds `max_resolution`,
+/// the photo's scaled to it instead (one rounding, from the full size).
+fn target_size(photo: Size, options: &LoadOptions) -> Size {
+    let size = divided_size(photo, options.data_factor);
+    let longest = photo.0.max(photo.1);
+    match options.max_resolution {
+        Some(limit) if size.0.max(size.1) > limit => divided_size(photo, f64::from(longest) / f64::from(limit)),
+        _ => size,
+    }
+}
+
+fn check_shape(view: &RawView, size: Size) -> InputResult<()> {
+    let stated = (view.intrinsics.width, view.intrinsics.height);
+    if stated.0 > 0 && stated.1 > 0 && same_shape(size, stated) {
+        return Ok(());
+    }
+    let problem = format!(
+        "the photo is {} x {}, its camera {} x {}: a photo of this shape cannot belong to this camera",
+        size.0, size.1, stated.0, stated.1
+    );
+    let turned = stated.0 > 0 && stated.1 > 0 && same_shape((size.1, size.0), stated);
+    let remedy = if turned {
+        "the photo is turned by 90 degrees against its camera, as viewers do when they apply EXIF orientation: \
+         use the photos that the model was made from, stored the same way up"
+    } else {
+        "use the photos that the model was made from (other sizes are fine, cropped photos are not)"
+    };
+    Err(InputError::new(&view.image_path, problem, remedy).at(format!("view {}", view.name)))
+}
+
+fn camera_of(view: &RawView, photo: &PhotoSource, frame: &Frame, options: &LoadOptions) -> Camera {
+    let k = intrinsics_at(&photo.intrinsics, photo.target);
+    Camera {
+        viewmat: frame.viewmat(&view.pose),
+        fx: k.fx as f32,
+        fy: k.fy as f32,
+        cx: k.cx as f32,
+        cy: k.cy as f32,
+        width: k.width,
+        height: k.height,
+        near_plane: options.near_plane as f32,
+        far_plane: FAR_PLANE,
+    }
+}
+
+/// Points in the local frame; what is not finite or absurdly far is dropped and counted.
+fn local_points(
+    positions: Vec<[f64; 3]>,
+    colors: Vec<[u8; 3]>,
+    extent: &Extent,
+    frame: &Frame,
+    warnings: &mut Vec<String>,
+) -> (Vec<[f32; 3]>, Vec<[u8; 3]>) {
+    let mut dropped: BTreeMap<&str, usize> = BTreeMap::new();
+    let (mut points, mut kept_colors) = (Vec::with_capacity(positions.len()), Vec::with_capacity(positions.len()));
+    for (position, color) in positions.into_iter().zip(colors) {
+        let position = DVec3::from_array(position);
+        if extent.is_plausible(position) {
+            points.push(frame.to_local(position).as_vec3().to_array());
+            kept_colors.push(color);
+        } else {
+            let why = if position.is_finite() { "are more than a million scene sizes away" } else { "are not finite" };
+            *dropped.entry(why).or_default() += 1;
+        }
+    }
+    warnings.extend(dropped.into_iter().map(|(why, count)| format!("{count} points {why} and are dropped")));
+    (points, kept_colors)
+}
+
+/// Up to twenty names, then a count.
+fn list_names<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
+    let total = names.len();
+    let mut text = names.take(NAMES_LISTED).collect::<Vec<_>>().join(", ");
+    if total > NAMES_LISTED {
+        text.push_str(&format!(", and {} more", total - NAMES_LISTED));
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn targets_round_once_from_the_full_size() {
+        let with = |factor: f64, limit: Option<u32>| {
+            target_size((4608, 3456), &LoadOptions { data_factor: factor, max_resolution: limit, ..Default::default() })
+        };
+        assert_eq!(with(1.0, None), (4608, 3456));
+        assert_eq!(with(3.4175, None), (1348, 1011));
+        assert_eq!(with(1.0, Some(1600)), (1600, 1200));
+        assert_eq!(with(4.0, Some(1600)), (1152, 864));
+        assert_eq!(with(2.0, Some(1000)), (1000, 750));
+    }
+
+    #[test]
+    fn long_lists_end_in_a_count() {
+        let names: Vec<String> = (0..23).map(|i| format!("n{i}")).collect();
+        let text = list_names(names.iter().map(String::as_str));
+        assert!(text.ends_with("n19, and 3 more"), "{text}");
+    }
+}

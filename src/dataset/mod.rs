@@ -1,8 +1,20 @@
-//! Where views come from. A reader (COLMAP, transforms.json) fills a [`RawScene`] in the dataset's own f64
+//! Where views come from. A reader (COLMAP, transforms.json) fills a [`model::RawScene`] in the dataset's own f64
 //! coordinates; the loader checks the photos against it and turns it into a [`loader::Dataset`] in the local frame.
+//! Pixels are decoded later, a few views ahead of their use, by [`target_cache`].
 
+mod checks;
 pub mod colmap;
+pub mod colmap_write;
+pub mod frame;
 pub mod loader;
+pub mod masks;
 pub mod model;
+pub mod paths;
+pub mod photo;
+pub mod photo_header;
+pub mod read;
+pub mod resize;
 pub mod synthetic;
+pub mod target_cache;
 pub mod transforms;
+pub mod undistort;

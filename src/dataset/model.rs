@@ -93,6 +93,8 @@ pub struct RawScene {
     pub views: Vec<RawView>,
     /// Points; may be empty.
     pub points: PointCloud,
+    /// A PLY of points that the dataset names and that exists; read by the caller, since this module knows no PLY.
+    pub points_path: Option<PathBuf>,
     /// What was left out or repaired, one sentence each, for the user.
     pub warnings: Vec<String>,
 }

@@ -1,1 +1,252 @@
-//! (being written)
+//! Edits that rounds and resets make to rows: growing, pruning, resetting, on values, moments, stamps, identities and
+//! statistics together. What to do with a row is decided by [`super::policy`].
+//!
+//! Rows are judged as they are at the event's time. A row that is neither grown, pruned nor reset is not rewritten:
+//! it goes on from its stored state. So applying an event late gives what applying it on time would have given, as a
+//! set of (uid, bits).
+//!
+//! Invariants: 1. new rows have zero moments and contain the steps of the event; 2. identities of new rows and their
+//! random draws depend on (seed, parent's uid, event, child) only; 3. rows that stay keep their order, new rows follow
+//! in the order of their parents.
+
+use super::policy::{Fate, fate};
+use super::stats::mean_grad2d;
+use crate::base::math::{exp32, logit};
+use crate::base::rng::{Purpose, Stream, hash64};
+use crate::scene::columns::{Column, Columns};
+use crate::scene::events::RoundThresholds;
+use crate::scene::rows::{BLOCK_LANES, RowBlock, Rows, RowsMut, RowsNow, first_lane};
+use crate::scene::state::SceneState;
+use rayon::prelude::*;
+
+/// Rows of one unit of parallel work.
+const ROWS_PER_TASK: usize = 4096;
+/// Children of a split lie within this many standard deviations of their parent, in its own axes: bounds can count
+/// on it. 1.1 % of draws are drawn again.
+pub const SPLIT_SIGMAS: f64 = 3.33;
+/// Children of a split are smaller than their parent by this factor.
+const SPLIT_SHRINK: f64 = 1.6;
+
+/// What a round did.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct RoundCounts {
+    /// Rows that got a copy.
+    pub duplicated: usize,
+    /// Rows replaced by two children.
+    pub split: usize,
+    /// Rows pruned, new ones included.
+    pub pruned: usize,
+}
+
+/// Edits that a round makes to some rows.
+#[derive(Debug, Clone)]
+pub struct RoundEdits {
+    /// Rows to remove, numbered in the view, ascending.
+    pub removed: Vec<u32>,
+    /// Rows to append.
+    pub added: SceneState,
+    /// What they amount to.
+    pub counts: RoundCounts,
+}
+
+/// Decides a round for the rows of a view, reading only.
+pub fn plan_round<V: RowsNow>(
+    values: &V,
+    rows: &Rows<'_>,
+    thresholds: &RoundThresholds,
+    seed: u64,
+    event: u64,
+) -> RoundEdits {
+    let mut removed = Vec::new();
+    let mut born = NewRows { columns: Columns::zeros(0, rows.columns.sh_degree), uid: Vec::new() };
+    let mut counts = RoundCounts::default();
+    let mut block = [0.0; BLOCK_LANES];
+    for row in 0..rows.rows() {
+        let scale = |i| values.evaluate_element(rows, Column::Scales, row, i);
+        let log_scale = scale(0).max(scale(1)).max(scale(2));
+        let opacity = values.evaluate_element(rows, Column::Opacities, row, 0);
+        let fate = fate(thresholds, mean_grad2d(rows.grad2d[row], rows.count[row]), log_scale, opacity);
+        if matches!(fate, Fate::Split { .. } | Fate::Duplicate { pruned: false }) {
+            values.evaluate_row(rows, row, &mut block);
+        }
+        match fate {
+            Fate::Keep => {}
+            Fate::Prune => {
+                removed.push(row as u32);
+                counts.pruned += 1;
+            }
+            Fate::Duplicate { pruned: false } => {
+                counts.duplicated += 1;
+                born.push(child_uid(rows.uid[row], event, 0), &block);
+            }
+            Fate::Duplicate { pruned: true } => {
+                // Both copies go at once.
+                counts.duplicated += 1;
+                counts.pruned += 2;
+                removed.push(row as u32);
+            }
+            Fate::Split { children_pruned } => {
+                counts.split += 1;
+                removed.push(row as u32);
+                if children_pruned {
+                    counts.pruned += 2;
+                    continue;
+                }
+                for child in 0..2 {
+                    let uid = child_uid(rows.uid[row], event, child);
+                    born.push(uid, &split_child(&block, seed, uid, event));
+                }
+            }
+        }
+    }
+    RoundEdits { removed, added: born.into_state(values.now()), counts }
+}
+
+/// Applies a round to a whole table and clears its statistics.
+pub fn apply_round<V: RowsNow>(
+    values: &V,
+    state: &mut SceneState,
+    thresholds: &RoundThresholds,
+    seed: u64,
+    event: u64,
+) -> RoundCounts {
+    let chunks = state.chunks(ROWS_PER_TASK);
+    let edits: Vec<(usize, RoundEdits)> =
+        chunks.par_iter().map(|rows| (rows.first_row, plan_round(values, rows, thresholds, seed, event))).collect();
+    let mut removed = Vec::new();
+    let mut counts = RoundCounts::default();
+    for (first, edit) in &edits {
+        removed.extend(edit.removed.iter().map(|&row| row + *first as u32));
+        counts.duplicated += edit.counts.duplicated;
+        counts.split += edit.counts.split;
+        counts.pruned += edit.counts.pruned;
+    }
+    state.remove(&removed);
+    state.reserve_exact(edits.iter().map(|(_, edit)| edit.added.rows()).sum());
+    edits.iter().for_each(|(_, edit)| state.append(&edit.added));
+    state.grad2d.fill(0.0);
+    state.count.fill(0);
+    counts
+}
+
+/// Applies an opacity reset to a whole table; returns the number of rows rewritten.
+pub fn reset_opacities<V: RowsNow>(values: &V, state: &mut SceneState, max_opacity: f32) -> usize {
+    let mut chunks = state.chunks_mut(ROWS_PER_TASK);
+    chunks.par_iter_mut().map(|rows| reset_opacity_rows(values, rows, max_opacity)).sum()
+}
+
+/// Caps the opacities of the rows of a view and clears the moments of their opacities. A row is left alone when that
+/// changes nothing: opacity at or below the cap, no moments (never drawn, just made, or reset before).
+pub fn reset_opacity_rows<V: RowsNow>(values: &V, rows: &mut RowsMut<'_>, max_opacity: f32) -> usize {
+    let cap = logit(max_opacity);
+    let mut rewritten = 0;
+    for row in 0..rows.rows() {
+        let has_moments = rows.exp_avg.opacities[row] != 0.0 || rows.exp_avg_sq.opacities[row] != 0.0;
+        if !has_moments && rows.columns.opacities[row] <= cap {
+            continue;
+        }
+        values.settle_row(rows, row);
+        rows.columns.opacities[row] = rows.columns.opacities[row].min(cap);
+        rows.exp_avg.opacities[row] = 0.0;
+        rows.exp_avg_sq.opacities[row] = 0.0;
+        rewritten += 1;
+    }
+    rewritten
+}
+
+/// Identity of a new row.
+pub fn child_uid(parent: u64, event: u64, child: u64) -> u64 {
+    hash64(&[parent, event, child])
+}
+
+/// A child of a split: drawn from the parent as a Gaussian, smaller, otherwise the same.
+fn split_child(parent: &RowBlock, seed: u64, uid: u64, event: u64) -> RowBlock {
+    let mut child = *parent;
+    let (scales, quats) = (first_lane(Column::Scales), first_lane(Column::Quats));
+    let mut draws = Stream::new(seed, Purpose::Split, uid, event);
+    let z = loop {
+        let z = [draws.normal(), draws.normal(), draws.normal()];
+        if z.iter().map(|x| x * x).sum::<f64>() <= SPLIT_SIGMAS * SPLIT_SIGMAS {
+            break z;
+        }
+    };
+    let offset: [f64; 3] = std::array::from_fn(|i| z[i] * libm::exp(f64::from(parent[scales + i])));
+    let r = rotation(std::array::from_fn(|i| f64::from(parent[quats + i])));
+    for i in 0..3 {
+        let moved = r[i][0] * offset[0] + r[i][1] * offset[1] + r[i][2] * offset[2];
+        child[i] = (f64::from(parent[i]) + moved) as f32;
+        child[scales + i] = (f64::from(parent[scales + i]) - libm::log(SPLIT_SHRINK)) as f32;
+    }
+    child
+}
+
+/// Largest log-scale of a split's child, rounded as the child's own scales are.
+pub(super) fn child_log_scale(parent: f32) -> f32 {
+    (f64::from(parent) - libm::log(SPLIT_SHRINK)) as f32
+}
+
+/// Rotation matrix of a quaternion w x y z of any length; a zero quaternion counts as no rotation.
+fn rotation(q: [f64; 4]) -> [[f64; 3]; 3] {
+    let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let [w, x, y, z] = if length > 0.0 { q.map(|c| c / length) } else { [1.0, 0.0, 0.0, 0.0] };
+    [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+}
+
+/// Rows being made.
+struct NewRows {
+    columns: Columns,
+    uid: Vec<u64>,
+}
+
+impl NewRows {
+    fn push(&mut self, uid: u64, block: &RowBlock) {
+        let row = self.uid.len();
+        self.uid.push(uid);
+        self.columns.resize(row + 1);
+        self.columns.view_mut().store_row_any(row, block);
+    }
+
+    fn into_state(self, now: u32) -> SceneState {
+        let mut state = SceneState::from_columns(self.columns);
+        state.uid = self.uid;
+        state.stamp.fill(now);
+        state
+    }
+}
+
+/// Largest standard deviation from the largest log-scale, as the decisions compare it.
+pub(super) fn sigma(log_scale: f32) -> f32 {
+    exp32(log_scale)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn children_are_drawn_from_the_parent_within_the_cut() {
+        let mut parent = [0.0f32; BLOCK_LANES];
+        // A quarter turn about z (x to y), sigmas 1, 0.1, 0.01.
+        parent[3..7].copy_from_slice(&[2.0, 0.0, 0.0, 2.0]);
+        parent[7..10].copy_from_slice(&[0.0, -std::f32::consts::LN_10, -2.0 * std::f32::consts::LN_10]);
+        let n = 20_000;
+        let mut sums = [0.0f64; 3];
+        for uid in 0..n {
+            let child = split_child(&parent, 1, uid, 3);
+            let z = [f64::from(child[1]), f64::from(child[0]) / 0.1, f64::from(child[2]) / 0.01];
+            let norm2 = z.iter().map(|x| x * x).sum::<f64>();
+            // f32 positions and the rounded log-scales above.
+            assert!(norm2 <= SPLIT_SIGMAS * SPLIT_SIGMAS * (1.0 + 1e-5));
+            (0..3).for_each(|i| sums[i] += z[i] * z[i]);
+            assert_eq!(child[8], child_log_scale(parent[8]));
+        }
+        for sum in sums {
+            // The cut takes 3.3 % of the variance; five standard errors of sqrt(2 / n) are 5 %.
+            assert!((sum / n as f64 - 0.967).abs() < 0.05, "{sum}");
+        }
+    }
+}

@@ -1,1 +1,169 @@
-//! (being written)
+//! When to densify and what becomes of a row: the rules of gsplat's `DefaultStrategy`, without side effects.
+//!
+//! Invariants: 1. decisions are functions of their arguments; 2. a round never leaves more than `max_gaussians` rows;
+//! 3. a cadence of 0 means never.
+
+use super::ops::{child_log_scale, sigma};
+use super::stats::GradHistogram;
+use crate::base::math::sigmoid;
+use crate::scene::events::{EventKind, RoundThresholds};
+
+/// Densification of a run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DensifyConfig {
+    /// Rows grow whose mean gradient norm (NDC units) is greater.
+    pub grow_grad2d: f32,
+    /// Growing rows up to this size are duplicated, larger ones split; share of the scene scale.
+    pub grow_scale3d: f32,
+    /// Rows are pruned whose opacity is smaller.
+    pub prune_opa: f32,
+    /// Rows are pruned that are larger than this, once a reset has happened; share of the scene scale.
+    pub prune_scale3d: f32,
+    /// No round at or before this step.
+    pub refine_start: u32,
+    /// No round, reset or statistics at or after this step.
+    pub refine_stop: u32,
+    /// Steps from round to round.
+    pub refine_every: u32,
+    /// Steps from opacity reset to opacity reset.
+    pub reset_every: u32,
+    /// The scene never has more rows.
+    pub max_gaussians: u64,
+}
+
+impl Default for DensifyConfig {
+    fn default() -> Self {
+        DensifyConfig {
+            grow_grad2d: 2e-4,
+            grow_scale3d: 0.01,
+            prune_opa: 0.005,
+            prune_scale3d: 0.1,
+            refine_start: 500,
+            refine_stop: 15_000,
+            refine_every: 100,
+            reset_every: 3000,
+            max_gaussians: u64::MAX,
+        }
+    }
+}
+
+impl DensifyConfig {
+    /// Whether the gradients of this step go into the statistics.
+    pub fn collects(&self, step: u32) -> bool {
+        step < self.refine_stop
+    }
+
+    /// Whether a round follows this step.
+    pub fn is_round(&self, step: u32) -> bool {
+        step > self.refine_start && step < self.refine_stop && step.is_multiple_of(self.refine_every)
+    }
+
+    /// Whether an opacity reset follows this step (after its round).
+    pub fn is_reset(&self, step: u32) -> bool {
+        step > 0 && step < self.refine_stop && step.is_multiple_of(self.reset_every)
+    }
+
+    /// The events that follow this step, in order: a round, a reset. `rows` is the number of rows before the round,
+    /// `histogram` holds their statistics. The caller clears the histogram after a round.
+    pub fn events_after(
+        &self,
+        step: u32,
+        scene_scale: f32,
+        rows: u64,
+        histogram: &GradHistogram,
+    ) -> impl Iterator<Item = EventKind> {
+        let round =
+            self.is_round(step).then(|| EventKind::Densify(self.thresholds(step, scene_scale, rows, histogram)));
+        let reset = self.is_reset(step).then_some(EventKind::ResetOpacity { max_opacity: 2.0 * self.prune_opa });
+        round.into_iter().chain(reset)
+    }
+
+    /// Thresholds of the round after this step. Every growing row adds one, so the cap leaves room for as many as rows
+    /// are missing to it; where more would grow, the strongest bins of the histogram that fit do. Prunes of the same
+    /// round are not counted on.
+    pub fn thresholds(&self, step: u32, scene_scale: f32, rows: u64, histogram: &GradHistogram) -> RoundThresholds {
+        let room = self.max_gaussians.saturating_sub(rows);
+        let was_reset = self.reset_every > 0 && step > self.reset_every;
+        RoundThresholds {
+            grow_grad2d: histogram.threshold(self.grow_grad2d, room),
+            split_scale: self.grow_scale3d * scene_scale,
+            prune_opacity: self.prune_opa,
+            prune_scale: if was_reset { self.prune_scale3d * scene_scale } else { f32::INFINITY },
+        }
+    }
+}
+
+/// What a round does with a row.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fate {
+    /// Nothing.
+    Keep,
+    /// Removed.
+    Prune,
+    /// Gets a copy of itself; or, when what it is would be pruned, both go.
+    Duplicate {
+        /// Whether the row and its copy are pruned at once.
+        pruned: bool,
+    },
+    /// Replaced by two smaller children; or by nothing, when those would be pruned.
+    Split {
+        /// Whether the children are pruned at once.
+        children_pruned: bool,
+    },
+}
+
+/// What becomes of a row: growth first, then pruning of everything that is there afterwards. `log_scale` is the row's
+/// largest, `opacity` its logit.
+pub fn fate(thresholds: &RoundThresholds, mean_grad2d: f32, log_scale: f32, opacity: f32) -> Fate {
+    let is_faint = sigmoid(opacity) < thresholds.prune_opacity;
+    let is_pruned = |log_scale: f32| is_faint || sigma(log_scale) > thresholds.prune_scale;
+    let grows = mean_grad2d > thresholds.grow_grad2d;
+    if !grows {
+        return if is_pruned(log_scale) { Fate::Prune } else { Fate::Keep };
+    }
+    if sigma(log_scale) <= thresholds.split_scale {
+        Fate::Duplicate { pruned: is_pruned(log_scale) }
+    } else {
+        Fate::Split { children_pruned: is_pruned(child_log_scale(log_scale)) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::math::logit;
+
+    #[test]
+    fn the_schedule_is_that_of_the_default_strategy() {
+        let config = DensifyConfig::default();
+        let rounds: Vec<u32> = (0..20_000).filter(|&s| config.is_round(s)).collect();
+        assert_eq!((rounds[0], rounds[1], rounds[rounds.len() - 1]), (600, 700, 14_900));
+        let resets: Vec<u32> = (0..20_000).filter(|&s| config.is_reset(s)).collect();
+        assert_eq!(resets, [3000, 6000, 9000, 12_000]);
+        assert!(config.collects(14_999) && !config.collects(15_000));
+        let events: Vec<EventKind> = config.events_after(3000, 1.0, 10, &GradHistogram::default()).collect();
+        let EventKind::Densify(round) = events[0] else { panic!("{events:?}") };
+        assert_eq!(round.prune_scale, f32::INFINITY);
+        assert_eq!(events[1], EventKind::ResetOpacity { max_opacity: 0.01 });
+        assert_eq!(config.thresholds(3100, 2.0, 10, &GradHistogram::default()).prune_scale, 0.2);
+        let never = DensifyConfig { refine_every: 0, reset_every: 0, ..config };
+        assert!((0..20_000).all(|s| !never.is_round(s) && !never.is_reset(s)));
+        assert_eq!(never.thresholds(9000, 1.0, 10, &GradHistogram::default()).prune_scale, f32::INFINITY);
+    }
+
+    #[test]
+    fn rows_grow_before_they_are_pruned() {
+        let t = RoundThresholds { grow_grad2d: 1.0, split_scale: 0.1, prune_opacity: 0.005, prune_scale: 0.5 };
+        let (solid, faint) = (logit(0.5), logit(0.004));
+        let of = |sigma: f32, grad: f32, opacity: f32| fate(&t, grad, sigma.ln(), opacity);
+        assert_eq!(of(0.05, 1.0, solid), Fate::Keep);
+        assert_eq!(of(0.05, 1.1, solid), Fate::Duplicate { pruned: false });
+        assert_eq!(of(0.05, 1.1, faint), Fate::Duplicate { pruned: true });
+        assert_eq!(of(0.2, 1.1, solid), Fate::Split { children_pruned: false });
+        // 0.7 is too large to stay, 0.7 / 1.6 is not.
+        assert_eq!(of(0.7, 1.1, solid), Fate::Split { children_pruned: false });
+        assert_eq!(of(0.7, 0.0, solid), Fate::Prune);
+        assert_eq!(of(0.9, 1.1, solid), Fate::Split { children_pruned: true });
+        assert_eq!(of(0.01, 0.0, faint), Fate::Prune);
+    }
+}

@@ -1,1 +1,147 @@
-//! (being written)
+//! What is known of rows since the last round: how strongly the loss pulls their position on the screen.
+//!
+//! Invariants: 1. only drawn rows change; 2. sums are in NDC units, so thresholds do not depend on the image size;
+//! 3. the histogram counts every row that has statistics, exactly once, in the bin of its mean: integers only, so the
+//! order in which rows were touched leaves no trace in it.
+
+use crate::scene::rows::RowsMut;
+
+/// Bins: one per value of the upper 16 bits of a non-negative f32, so 128 to every doubling.
+const BINS: usize = 1 << 15;
+
+/// Mean gradient norm per view that drew the row; 0 without views.
+#[inline]
+pub fn mean_grad2d(grad2d: f32, count: u32) -> f32 {
+    grad2d / count.max(1) as f32
+}
+
+/// Number of rows with statistics by their mean gradient norm. 128 KiB.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct GradHistogram {
+    bins: Vec<u32>,
+}
+
+impl Default for GradHistogram {
+    fn default() -> Self {
+        GradHistogram { bins: vec![0; BINS] }
+    }
+}
+
+impl GradHistogram {
+    /// Counts a row with this mean.
+    pub fn add(&mut self, mean: f32) {
+        self.bins[bin(mean)] += 1;
+    }
+
+    /// Takes a row with this mean out again.
+    pub fn remove(&mut self, mean: f32) {
+        self.bins[bin(mean)] -= 1;
+    }
+
+    /// Forgets all rows; after a round.
+    pub fn clear(&mut self) {
+        self.bins.fill(0);
+    }
+
+    /// Rows counted.
+    pub fn rows(&self) -> u64 {
+        self.bins.iter().map(|&n| u64::from(n)).sum()
+    }
+
+    /// The smallest threshold, not below `least`, that at most `room` rows exceed, in whole bins: either `least`
+    /// itself, or just below the edge of a bin, or infinity.
+    pub fn threshold(&self, least: f32, room: u64) -> f32 {
+        let first = bin(least);
+        let mut above = 0u64;
+        for b in (first..BINS).rev() {
+            above += u64::from(self.bins[b]);
+            if above > room {
+                // Bin b does not fit any more: growth starts with the bin after it.
+                let edge = f32::from_bits((b as u32 + 1) << 16);
+                return if edge.is_finite() { edge.next_down() } else { f32::INFINITY };
+            }
+        }
+        least
+    }
+}
+
+fn bin(mean: f32) -> usize {
+    // Negative zero, negative numbers and NaN do not occur in sums of norms; they would count as 0.
+    if mean > 0.0 { (mean.to_bits() >> 16) as usize } else { 0 }
+}
+
+/// Adds the gradients of one view. `rows` ascends and is numbered in the table that the view was cut from; `v_means2d`
+/// (loss with respect to the pixel position, pixel units) and `radii` have one entry per listed row; rows with a zero
+/// radius were not drawn. Gradients that are not finite are left out.
+pub fn accumulate(
+    view: &mut RowsMut<'_>,
+    rows: &[u32],
+    v_means2d: &[[f32; 2]],
+    radii: &[[u32; 2]],
+    image_size: [u32; 2],
+    histogram: &mut GradHistogram,
+) {
+    assert!(rows.len() == v_means2d.len() && rows.len() == radii.len(), "one gradient and radius per listed row");
+    let half = image_size.map(|n| n as f32 * 0.5);
+    for ((&row, v), radius) in rows.iter().zip(v_means2d).zip(radii) {
+        if radius[0] == 0 || radius[1] == 0 {
+            continue;
+        }
+        let (x, y) = (v[0] * half[0], v[1] * half[1]);
+        let norm = (x * x + y * y).sqrt();
+        if !norm.is_finite() {
+            continue;
+        }
+        let row = row as usize - view.first_row;
+        let (grad2d, count) = (&mut view.grad2d[row], &mut view.count[row]);
+        if *count > 0 {
+            histogram.remove(mean_grad2d(*grad2d, *count));
+        }
+        *grad2d = (*grad2d + norm).min(f32::MAX);
+        *count += 1;
+        histogram.add(mean_grad2d(*grad2d, *count));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::columns::Columns;
+    use crate::scene::state::SceneState;
+
+    #[test]
+    fn only_drawn_rows_count_and_the_histogram_follows() {
+        let mut state = SceneState::from_columns(Columns::zeros(4, 0));
+        let mut histogram = GradHistogram::default();
+        let v = [[3e-4, 4e-4], [1.0, 1.0], [f32::NAN, 0.0]];
+        for _ in 0..2 {
+            let radii = [[2, 1], [0, 3], [1, 1]];
+            accumulate(&mut state.view_mut(), &[0, 2, 3], &v, &radii, [20, 20], &mut histogram);
+        }
+        assert_eq!(state.count, [2, 0, 0, 0]);
+        // |(3e-4, 4e-4)| * 10, twice.
+        assert!((state.grad2d[0] - 1e-2).abs() < 1e-8);
+        assert_eq!(histogram.rows(), 1);
+        assert_eq!(histogram.threshold(2e-4, 1), 2e-4);
+        let threshold = histogram.threshold(2e-4, 0);
+        assert!(threshold >= mean_grad2d(state.grad2d[0], 2));
+    }
+
+    #[test]
+    fn thresholds_admit_at_most_the_room_and_whole_bins() {
+        let mut histogram = GradHistogram::default();
+        let means: Vec<f32> = (1..1000).map(|i| i as f32 * 1e-5).collect();
+        means.iter().for_each(|&m| histogram.add(m));
+        let mut last = f32::INFINITY;
+        for room in 0..1000u64 {
+            let threshold = histogram.threshold(2e-4, room);
+            let above = means.iter().filter(|&&m| m > threshold).count() as u64;
+            assert!(above <= room);
+            // Bins are under 1 % wide: up to 10 of these means share one.
+            assert!(above + 10 >= room.min(979), "{above} of {room}");
+            assert!(threshold <= last);
+            last = threshold;
+        }
+        assert_eq!(last, 2e-4);
+    }
+}

@@ -197,8 +197,12 @@ impl BandKernel<'_> {
         }
         for at in (0..STRIDE).step_by(LANES) {
             let (a, b) = (load(x, at), load(y, at));
-            store(squares, at, from_fn(|l| fma::<FMA>(a[l], a[l], b[l] * b[l])));
-            store(products, at, from_fn(|l| a[l] * b[l]));
+            let mut sum = multiply(b, b);
+            for l in 0..LANES {
+                sum[l] = fma::<FMA>(a[l], a[l], sum[l]);
+            }
+            store(squares, at, sum);
+            store(products, at, multiply(a, b));
         }
     }
 
@@ -260,24 +264,36 @@ impl BandKernel<'_> {
         let end = (tile.own.len() + 2 * RADIUS).next_multiple_of(LANES);
         for at in (0..end + LANES).step_by(LANES) {
             for m in 0..4 {
-                store(&mut columns[m], at, weighted::<FMA>(|k| load(&window[k].maps[m], at)));
+                let mut sum = [0.0; LANES];
+                for k in 0..WINDOW {
+                    sum = add_scaled::<FMA>(TAPS[k], load(&window[k].maps[m], at), sum);
+                }
+                store(&mut columns[m], at, sum);
             }
         }
         let sum_row = self.rows.contains(&(row as usize));
         for at in (0..end).step_by(LANES) {
-            let [mx, my, squares, products] = [0, 1, 2, 3].map(|m| weighted::<FMA>(|k| load(&columns[m], at + k)));
+            let [mx, my] = [across::<FMA>(&columns[0], at), across::<FMA>(&columns[1], at)];
+            let [squares, products] = [across::<FMA>(&columns[2], at), across::<FMA>(&columns[3], at)];
             let weight = multiply(load(&window[RADIUS].weight, at + RADIUS), load(in_domain, at));
-            let points: [[f32; 4]; LANES] = from_fn(|l| ssim_point::<FMA>(mx[l], my[l], squares[l], products[l]));
+            let [mut ssim, mut v_mean, mut v_square, mut v_product] = [weight; 4];
+            for l in 0..LANES {
+                let point = ssim_point::<FMA>(mx[l], my[l], squares[l], products[l]);
+                ssim[l] *= point[0];
+                v_mean[l] *= point[1];
+                v_square[l] *= point[2];
+                v_product[l] *= point[3];
+            }
             if sum_row {
                 let owned = load(owned, at);
                 for l in 0..LANES {
-                    sums.ssim[l] += f64::from(points[l][0] * weight[l] * owned[l]);
+                    sums.ssim[l] += f64::from(ssim[l] * owned[l]);
                 }
             }
             if self.gradient.is_some() {
-                for m in 0..3 {
-                    store(&mut derivatives[m], at, from_fn(|l| points[l][m + 1] * weight[l]));
-                }
+                store(&mut derivatives[0], at, v_mean);
+                store(&mut derivatives[1], at, v_square);
+                store(&mut derivatives[2], at, v_product);
             }
         }
     }
@@ -299,24 +315,33 @@ impl BandKernel<'_> {
         let end = tile.own.len().next_multiple_of(LANES);
         for at in (0..end + LANES).step_by(LANES) {
             for m in 0..3 {
-                store(&mut columns[m], at, weighted::<FMA>(|k| load(&window[k][m], at)));
+                let mut sum = [0.0; LANES];
+                for k in 0..WINDOW {
+                    sum = add_scaled::<FMA>(TAPS[k], load(&window[k][m], at), sum);
+                }
+                store(&mut columns[m], at, sum);
             }
         }
         let first = own_row * self.pair.width + tile.own.start;
         let v_row = &mut out.v_plane[first..first + tile.own.len()];
         for (v, at) in v_row.chunks_mut(LANES).zip((0..end).step_by(LANES)) {
-            let [v_mean, v_square, v_product] = [0, 1, 2].map(|m| weighted::<FMA>(|k| load(&columns[m], at + k)));
-            let [x, y] = [0, 1].map(|m| load(&centre.maps[m], at + HALO));
+            let (v_mean, v_square) = (across::<FMA>(&columns[0], at), across::<FMA>(&columns[1], at));
+            let v_product = across::<FMA>(&columns[2], at);
+            let (x, y) = (load(&centre.maps[0], at + HALO), load(&centre.maps[1], at + HALO));
             let weight = load(&centre.weight, at + HALO);
-            let v_pixel: Lane = from_fn(|l| {
-                let difference = x[l] - y[l];
-                let sign = f32::from(u8::from(difference > 0.0)) - f32::from(u8::from(difference < 0.0));
+            let [mut v_pixel, mut difference] = [[0.0; LANES]; 2];
+            for l in 0..LANES {
+                difference[l] = x[l] - y[l];
+                let above = if difference[l] > 0.0 { out.l1_weight } else { 0.0 };
+                let below = if difference[l] < 0.0 { out.l1_weight } else { 0.0 };
                 let v_ssim = fma::<FMA>(2.0 * x[l], v_square[l], fma::<FMA>(y[l], v_product[l], v_mean[l]));
-                weight[l] * fma::<FMA>(out.ssim_weight, v_ssim, out.l1_weight * sign)
-            });
+                v_pixel[l] = weight[l] * fma::<FMA>(out.ssim_weight, v_ssim, above - below);
+            }
             v.copy_from_slice(&v_pixel[..v.len()]);
-            for l in 0..v.len() {
-                let difference = f64::from(x[l] - y[l]);
+            // Columns beyond the tile belong to the next one.
+            difference[v.len()..].fill(0.0);
+            for l in 0..LANES {
+                let difference = f64::from(difference[l]);
                 sums.l1[l] += difference.abs();
                 sums.squares[l] += difference * difference;
             }
@@ -340,15 +365,21 @@ fn ssim_point<const FMA: bool>(mx: f32, my: f32, squares: f32, products: f32) ->
     [ssim, v_mean, -ssim * b1 * inverse, 2.0 * a1 * inverse]
 }
 
-/// Sum of eleven vectors with the window's weights.
+/// `tap * v + sum`.
 #[inline(always)]
-fn weighted<const FMA: bool>(vector: impl Fn(usize) -> Lane) -> Lane {
+fn add_scaled<const FMA: bool>(tap: f32, v: Lane, mut sum: Lane) -> Lane {
+    for l in 0..LANES {
+        sum[l] = fma::<FMA>(tap, v[l], sum[l]);
+    }
+    sum
+}
+
+/// The window along a row: sixteen results, the first from columns `at..at + 11`.
+#[inline(always)]
+fn across<const FMA: bool>(row: &Row, at: usize) -> Lane {
     let mut sum = [0.0; LANES];
     for k in 0..WINDOW {
-        let v = vector(k);
-        for l in 0..LANES {
-            sum[l] = fma::<FMA>(TAPS[k], v[l], sum[l]);
-        }
+        sum = add_scaled::<FMA>(TAPS[k], load(row, at + k), sum);
     }
     sum
 }
@@ -366,8 +397,11 @@ fn store(row: &mut Row, at: usize, lane: Lane) {
 }
 
 #[inline(always)]
-fn multiply(a: Lane, b: Lane) -> Lane {
-    from_fn(|l| a[l] * b[l])
+fn multiply(mut a: Lane, b: Lane) -> Lane {
+    for l in 0..LANES {
+        a[l] *= b[l];
+    }
+    a
 }
 
 /// Positions along one side at which the map counts.

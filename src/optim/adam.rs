@@ -1,1 +1,109 @@
-//! (being written)
+//! Dense Adam, one step at a time: the definition that the deferred form is held to.
+//!
+//! Not used in training: every value takes every step, seen or not. Kingma and Ba 2015 (arXiv 1412.6980), with eps
+//! outside the bias-corrected root as in torch: `value -= lr / (1 - beta1^t) * m / (sqrt(v) / sqrt(1 - beta2^t) + eps)`.
+//!
+//! Invariant: t counts steps from 1.
+
+use std::ops::{Add, Div, Mul, Sub};
+
+/// A float that dense Adam can run in.
+pub trait Real: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> {
+    /// Rounds to the type.
+    fn from_f64(x: f64) -> Self;
+    /// Square root.
+    fn sqrt(self) -> Self;
+}
+
+impl Real for f32 {
+    fn from_f64(x: f64) -> Self {
+        x as f32
+    }
+    fn sqrt(self) -> Self {
+        f32::sqrt(self)
+    }
+}
+
+impl Real for f64 {
+    fn from_f64(x: f64) -> Self {
+        x
+    }
+    fn sqrt(self) -> Self {
+        f64::sqrt(self)
+    }
+}
+
+/// Decay of the moments and the floor of the root.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdamConfig {
+    /// Decay of the first moment per step.
+    pub beta1: f64,
+    /// Decay of the second moment per step.
+    pub beta2: f64,
+    /// Added to the bias-corrected root.
+    pub eps: f64,
+}
+
+impl Default for AdamConfig {
+    fn default() -> Self {
+        AdamConfig { beta1: 0.9, beta2: 0.999, eps: 1e-15 }
+    }
+}
+
+/// Values with their moments, all stepped together.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DenseAdam<F> {
+    config: AdamConfig,
+    /// Steps taken.
+    pub steps: u32,
+    /// The values.
+    pub values: Vec<F>,
+    /// First moments, without bias correction.
+    pub exp_avg: Vec<F>,
+    /// Second moments, without bias correction.
+    pub exp_avg_sq: Vec<F>,
+}
+
+impl<F: Real> DenseAdam<F> {
+    /// Fresh moments for these values.
+    pub fn new(config: AdamConfig, values: Vec<F>) -> Self {
+        let zeros = vec![F::from_f64(0.0); values.len()];
+        DenseAdam { config, steps: 0, values, exp_avg: zeros.clone(), exp_avg_sq: zeros }
+    }
+
+    /// One step at rate `lr` with a gradient for every value.
+    pub fn step(&mut self, grads: &[F], lr: f64) {
+        assert_eq!(grads.len(), self.values.len());
+        self.steps += 1;
+        let AdamConfig { beta1, beta2, eps } = self.config;
+        let t = f64::from(self.steps);
+        let step_size = F::from_f64(lr / (1.0 - libm::pow(beta1, t)));
+        let root_correction = F::from_f64(libm::sqrt(1.0 - libm::pow(beta2, t)));
+        let (b2, eps) = (F::from_f64(beta2), F::from_f64(eps));
+        let (one_minus_b1, one_minus_b2) = (F::from_f64(1.0 - beta1), F::from_f64(1.0 - beta2));
+        for i in 0..grads.len() {
+            let g = grads[i];
+            let m = self.exp_avg[i];
+            let m = m + one_minus_b1 * (g - m);
+            let v = b2 * self.exp_avg_sq[i] + one_minus_b2 * (g * g);
+            self.exp_avg[i] = m;
+            self.exp_avg_sq[i] = v;
+            self.values[i] = self.values[i] - step_size * (m / (v.sqrt() / root_correction + eps));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_step_is_one_rate_long_whatever_the_gradient() {
+        let mut adam = DenseAdam::new(AdamConfig::default(), vec![1.0f64, 1.0, 1.0]);
+        adam.step(&[3.0, -2e-5, 0.0], 0.25);
+        // eps shifts it by 1e-15 / |g| at most.
+        assert!((adam.values[0] - 0.75).abs() < 1e-14);
+        assert!((adam.values[1] - 1.25).abs() < 1e-9);
+        assert_eq!(adam.values[2], 1.0);
+    }
+}

@@ -100,6 +100,12 @@ impl Columns {
         }
     }
 
+    /// Bytes allocated.
+    pub fn bytes(&self) -> usize {
+        let floats = self.means.capacity() + self.quats.capacity() + self.scales.capacity();
+        4 * (floats + self.opacities.capacity() + self.sh0.capacity() + self.sh_n.capacity())
+    }
+
     /// Sets every value to zero.
     pub fn fill_zero(&mut self) {
         for column in Column::ALL {

@@ -1,1 +1,177 @@
-//! (being written)
+//! First Gaussians from points; points where the dataset has none.
+//!
+//! Not here: reading points, choosing the local frame.
+//!
+//! Invariants: 1. every value made here is finite, whatever the points; 2. a draw depends on the seed and the row
+//! (or point) alone; 3. row i holds the i-th point that was kept, and its uid is i.
+
+use super::camera::Camera;
+use super::columns::{Column, Columns};
+use super::neighbours::nearest_dist2;
+use crate::base::math::logit;
+use crate::base::rng::{Purpose, Stream, hash64};
+use rayon::prelude::*;
+
+/// Value of the constant SH basis function, 1 / (2 sqrt(pi)): colour = C0 sh0 + 1/2 at degree 0.
+pub const SH_C0: f64 = 0.282_094_791_773_878_14;
+
+/// First word of the hash that chooses among too many points.
+const SUBSAMPLE: u64 = 0x7375_6273_616d_706c;
+
+/// Scale of a row when no two points of the cloud differ, in units of the scene scale.
+const LONE_POINT_SCALE: f64 = 0.01;
+
+/// What first Gaussians depend on besides the points.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct InitOptions {
+    /// Degree that the rows are stored with, 0 to 3. The higher bands start at zero.
+    pub sh_degree: u8,
+    /// First opacity, in (0, 1).
+    pub opacity: f32,
+    /// First scale in units of the distance to the neighbours.
+    pub scale_factor: f32,
+    /// Seed of the run.
+    pub seed: u64,
+    /// At most this many rows.
+    pub max_gaussians: Option<usize>,
+    /// Size of the scene, local units: what the two guards refer to.
+    pub scene_scale: f32,
+    /// No first scale is below this many scene scales.
+    pub min_scale: f32,
+    /// No first scale is above this many scene scales.
+    pub max_scale: f32,
+}
+
+impl Default for InitOptions {
+    fn default() -> Self {
+        InitOptions {
+            sh_degree: 3,
+            opacity: 0.1,
+            scale_factor: 1.0,
+            seed: 0,
+            max_gaussians: None,
+            scene_scale: 1.0,
+            min_scale: 1e-6,
+            max_scale: 10.0,
+        }
+    }
+}
+
+/// One isotropic Gaussian per point, as gsplat's trainer starts: the scale is the root mean square distance to the
+/// three nearest points times `scale_factor`, the rotation is random, the colour is the point's.
+///
+/// Differences to gsplat, all for clouds that it cannot start from: with fewer than four points the mean is over
+/// those there are; a point whose neighbours all coincide with it gets the median distance of the others (0.01 scene
+/// scales when there are none); scales are kept within the guards of [`InitOptions`]; points that are not finite get
+/// no row. Rotations are uniform on the sphere and of unit length, where gsplat's are uniform in [0, 1)^4: at first
+/// the Gaussians are round, so this shows in no picture.
+///
+/// Beyond `max_gaussians` the points with the smallest hashes of (seed, index) stay, in their order, and distances
+/// are those among the points that stay.
+pub fn gaussians_from_points(points: &[[f32; 3]], colors: &[[u8; 3]], options: &InitOptions) -> Columns {
+    let kept = kept_points(points, options);
+    let means: Vec<[f32; 3]> = kept.iter().map(|&i| points[i]).collect();
+    let scales = log_scales(&means, options);
+    let mut columns = Columns::zeros(kept.len(), options.sh_degree);
+    columns.opacities.fill(logit(options.opacity));
+    for (row, (&point, &scale)) in kept.iter().zip(&scales).enumerate() {
+        columns.row_mut(Column::Means, row).copy_from_slice(&means[row]);
+        columns.row_mut(Column::Scales, row).fill(scale);
+        let quat = random_rotation(&mut Stream::new(options.seed, Purpose::InitQuat, row as u64, 0));
+        columns.row_mut(Column::Quats, row).copy_from_slice(&quat);
+        let color = colors.get(point).copied().unwrap_or([128; 3]);
+        for (sh0, byte) in columns.row_mut(Column::Sh0, row).iter_mut().zip(color) {
+            *sh0 = ((f64::from(byte) / 255.0 - 0.5) / SH_C0) as f32;
+        }
+    }
+    columns
+}
+
+/// Indices of the points that get a row, ascending.
+fn kept_points(points: &[[f32; 3]], options: &InitOptions) -> Vec<usize> {
+    let mut kept: Vec<usize> = (0..points.len()).filter(|&i| points[i].iter().all(|v| v.is_finite())).collect();
+    let Some(most) = options.max_gaussians.filter(|&most| most < kept.len()) else { return kept };
+    // For one seed the hash is a bijection of the index, so there are no ties.
+    kept.sort_by_cached_key(|&i| hash64(&[options.seed, SUBSAMPLE, i as u64]));
+    kept.truncate(most);
+    kept.sort_unstable();
+    kept
+}
+
+/// Log of the first scale of each point.
+fn log_scales(points: &[[f32; 3]], options: &InitOptions) -> Vec<f32> {
+    let rms = |dist2: &[f32; 3]| {
+        let there = dist2.iter().filter(|d| d.is_finite());
+        let (sum, count) = there.fold((0.0, 0u32), |(sum, count), &d| (sum + f64::from(d), count + 1));
+        if count == 0 { 0.0 } else { libm::sqrt(sum / f64::from(count)) }
+    };
+    let distances: Vec<f64> = nearest_dist2(points).par_iter().map(rms).collect();
+    let scene_scale = f64::from(options.scene_scale);
+    let fallback = median_above_zero(&distances).unwrap_or(LONE_POINT_SCALE * scene_scale);
+    let (low, high) = (f64::from(options.min_scale) * scene_scale, f64::from(options.max_scale) * scene_scale);
+    let log_scale = |&distance: &f64| {
+        let distance = if distance > 0.0 { distance } else { fallback };
+        // max, then min: not clamp, which panics when the options are the wrong way round.
+        libm::log((distance * f64::from(options.scale_factor)).max(low).min(high)) as f32
+    };
+    distances.par_iter().map(log_scale).collect()
+}
+
+fn median_above_zero(values: &[f64]) -> Option<f64> {
+    let mut positive: Vec<f64> = values.iter().copied().filter(|&v| v > 0.0).collect();
+    if positive.is_empty() {
+        return None;
+    }
+    let middle = positive.len() / 2;
+    Some(*positive.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// A rotation from the uniform distribution, w x y z (Marsaglia 1972, "Choosing a point from the surface of a sphere").
+fn random_rotation(stream: &mut Stream) -> [f32; 4] {
+    let mut in_disk = || loop {
+        let (a, b) = (stream.range(-1.0, 1.0), stream.range(-1.0, 1.0));
+        let r2 = a * a + b * b;
+        // The lower end keeps the division below finite.
+        if r2 < 1.0 && r2 > 1e-12 {
+            return (a, b, r2);
+        }
+    };
+    let (w, x, first) = in_disk();
+    let (y, z, second) = in_disk();
+    let stretch = libm::sqrt((1.0 - first) / second);
+    [w as f32, x as f32, (y * stretch) as f32, (z * stretch) as f32]
+}
+
+/// `count` points with random colours in what the cameras see, for datasets without points: a random camera, a random
+/// place of its image, a depth uniform in [near, far). Uniform depth thins out as 1/z^2 in space, which is as many
+/// points per pixel near as far. Empty when there are no cameras.
+pub fn random_points_in_frusta(
+    cameras: &[Camera],
+    count: usize,
+    near: f32,
+    far: f32,
+    seed: u64,
+) -> (Vec<[f32; 3]>, Vec<[u8; 3]>) {
+    if cameras.is_empty() {
+        return (Vec::new(), Vec::new());
+    }
+    let point = |i: usize| {
+        let mut s = Stream::new(seed, Purpose::InitPoint, i as u64, 0);
+        let camera = &cameras[s.below(cameras.len() as u64) as usize];
+        let u = s.range(0.0, f64::from(camera.width));
+        let v = s.range(0.0, f64::from(camera.height));
+        let z = s.range(f64::from(near), f64::from(far));
+        let x = (u - f64::from(camera.cx)) / f64::from(camera.fx) * z;
+        let y = (v - f64::from(camera.cy)) / f64::from(camera.fy) * z;
+        let position = unproject(camera, [x, y, z]);
+        (position, std::array::from_fn(|_| s.below(256) as u8))
+    };
+    (0..count).into_par_iter().map(point).unzip()
+}
+
+/// World position of a camera-space one: R^T (p - t).
+fn unproject(camera: &Camera, p: [f64; 3]) -> [f32; 3] {
+    let m = &camera.viewmat;
+    let moved: [f64; 3] = std::array::from_fn(|row| p[row] - f64::from(m[row][3]));
+    std::array::from_fn(|i| (0..3).map(|row| f64::from(m[row][i]) * moved[row]).sum::<f64>() as f32)
+}

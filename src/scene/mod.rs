@@ -5,4 +5,6 @@ pub mod columns;
 pub mod events;
 pub mod image;
 pub mod init;
+pub mod neighbours;
+pub mod rows;
 pub mod state;

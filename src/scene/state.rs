@@ -1,9 +1,12 @@
 //! The trainable state of rows: values, moments, stamps, identities, statistics.
 //!
 //! Invariants: 1. every vector has one entry (or one column width) per row; 2. `columns` is the value that the last
-//! update left, not the value now: [`crate::optim::deferred`] evaluates what it is now; 3. a row is rewritten whole.
+//! update left, not the value now: [`crate::optim::deferred`] evaluates what it is now; 3. a row is rewritten whole;
+//! 4. rows are removed and appended in all vectors at once, and the rows that stay keep their order.
 
-use super::columns::Columns;
+use super::columns::{Column, Columns, row_width};
+use super::rows::{ColumnsMut, ColumnsRef, Rows, RowsMut};
+use rayon::prelude::*;
 
 /// Rows with all that training keeps of them.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -22,4 +25,294 @@ pub struct SceneState {
     pub grad2d: Vec<f32>,
     /// Views that drew the row since the last round.
     pub count: Vec<u32>,
+}
+
+/// Bytes that one row takes in memory at a degree: values and two moments, stamp, uid, statistics (728 at degree 3).
+pub fn row_bytes(sh_degree: u8) -> usize {
+    row_width(sh_degree) * 4 * 3 + 4 + 8 + 4 + 4
+}
+
+impl SceneState {
+    /// No rows, at a degree.
+    pub fn empty(sh_degree: u8) -> Self {
+        SceneState::from_columns(Columns::zeros(0, sh_degree))
+    }
+
+    /// Fresh rows: uids 0..n, zero moments, no step contained, no statistics.
+    pub fn from_columns(columns: Columns) -> Self {
+        let rows = columns.rows();
+        let sh_degree = columns.sh_degree;
+        SceneState {
+            columns,
+            exp_avg: Columns::zeros(rows, sh_degree),
+            exp_avg_sq: Columns::zeros(rows, sh_degree),
+            stamp: vec![0; rows],
+            uid: (0..rows as u64).collect(),
+            grad2d: vec![0.0; rows],
+            count: vec![0; rows],
+        }
+    }
+
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.stamp.len()
+    }
+
+    /// Degree that the rows are stored with.
+    pub fn sh_degree(&self) -> u8 {
+        self.columns.sh_degree
+    }
+
+    /// Bytes reserved by all vectors.
+    pub fn bytes(&self) -> usize {
+        let tables = [&self.columns, &self.exp_avg, &self.exp_avg_sq];
+        let floats: usize =
+            tables.iter().flat_map(|t| Column::ALL.map(|c| column_vec(t, c).capacity())).sum::<usize>() * 4;
+        floats
+            + self.stamp.capacity() * 4
+            + self.uid.capacity() * 8
+            + self.grad2d.capacity() * 4
+            + self.count.capacity() * 4
+    }
+
+    /// All rows, shared.
+    pub fn view(&self) -> Rows<'_> {
+        Rows {
+            first_row: 0,
+            columns: self.columns.view(),
+            exp_avg: self.exp_avg.view(),
+            exp_avg_sq: self.exp_avg_sq.view(),
+            stamp: &self.stamp,
+            uid: &self.uid,
+            grad2d: &self.grad2d,
+            count: &self.count,
+        }
+    }
+
+    /// All rows, exclusive.
+    pub fn view_mut(&mut self) -> RowsMut<'_> {
+        RowsMut {
+            first_row: 0,
+            columns: self.columns.view_mut(),
+            exp_avg: self.exp_avg.view_mut(),
+            exp_avg_sq: self.exp_avg_sq.view_mut(),
+            stamp: &mut self.stamp,
+            uid: &mut self.uid,
+            grad2d: &mut self.grad2d,
+            count: &mut self.count,
+        }
+    }
+
+    /// Consecutive views of `rows_per_chunk` rows (the last may be shorter); at least 1.
+    pub fn chunks(&self, rows_per_chunk: usize) -> Vec<Rows<'_>> {
+        let size = rows_per_chunk.max(1);
+        let mut rest = self.view();
+        let mut chunks = Vec::with_capacity(self.rows().div_ceil(size));
+        while rest.rows() > 0 {
+            let (head, tail) = rest.split_at(size.min(rest.rows()));
+            chunks.push(head);
+            rest = tail;
+        }
+        chunks
+    }
+
+    /// Consecutive exclusive views of `rows_per_chunk` rows (the last may be shorter); at least 1.
+    pub fn chunks_mut(&mut self, rows_per_chunk: usize) -> Vec<RowsMut<'_>> {
+        let size = rows_per_chunk.max(1);
+        let mut chunks = Vec::with_capacity(self.rows().div_ceil(size));
+        let mut rest = self.view_mut();
+        while rest.rows() > 0 {
+            let at = size.min(rest.rows());
+            let (head, tail) = rest.split_at(at);
+            chunks.push(head);
+            rest = tail;
+        }
+        chunks
+    }
+
+    /// Keeps the rows for which `keep` says so, in their order.
+    pub fn retain(&mut self, keep: impl Fn(usize) -> bool) {
+        let removed: Vec<u32> = (0..self.rows()).filter(|&row| !keep(row)).map(|row| row as u32).collect();
+        self.remove(&removed);
+    }
+
+    /// Removes the rows named by `removed` (ascending, each once); the others keep their order.
+    pub fn remove(&mut self, removed: &[u32]) {
+        if removed.is_empty() {
+            return;
+        }
+        let sh_degree = self.sh_degree();
+        let SceneState { columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count } = self;
+        let floats = [columns, exp_avg, exp_avg_sq].into_iter().flat_map(column_vecs);
+        let mut floats: Vec<(usize, &mut Vec<f32>)> = floats.map(|(c, v)| (c.width(sh_degree), v)).collect();
+        floats.push((1, grad2d));
+        floats.par_iter_mut().for_each(|(width, values)| remove_runs(values, *width, removed));
+        remove_runs(stamp, 1, removed);
+        remove_runs(uid, 1, removed);
+        remove_runs(count, 1, removed);
+    }
+
+    /// Makes room for `more` further rows, and no more than that: what a scene takes follows from its rows, not from
+    /// the doubling of vectors. Growing moves one vector at a time.
+    pub fn reserve_exact(&mut self, more: usize) {
+        let sh_degree = self.sh_degree();
+        for table in [&mut self.columns, &mut self.exp_avg, &mut self.exp_avg_sq] {
+            for (column, values) in column_vecs(table) {
+                values.reserve_exact(more * column.width(sh_degree));
+            }
+        }
+        self.stamp.reserve_exact(more);
+        self.uid.reserve_exact(more);
+        self.grad2d.reserve_exact(more);
+        self.count.reserve_exact(more);
+    }
+
+    /// Appends all rows of `other`, which must be stored at the same degree.
+    pub fn append(&mut self, other: &SceneState) {
+        assert_eq!(self.sh_degree(), other.sh_degree(), "rows of another degree cannot be appended");
+        for (table, more) in [
+            (&mut self.columns, &other.columns),
+            (&mut self.exp_avg, &other.exp_avg),
+            (&mut self.exp_avg_sq, &other.exp_avg_sq),
+        ] {
+            for column in Column::ALL {
+                table.column_mut(column).extend_from_slice(more.column(column));
+            }
+        }
+        self.stamp.extend_from_slice(&other.stamp);
+        self.uid.extend_from_slice(&other.uid);
+        self.grad2d.extend_from_slice(&other.grad2d);
+        self.count.extend_from_slice(&other.count);
+    }
+}
+
+impl Columns {
+    /// All rows, shared.
+    pub fn view(&self) -> ColumnsRef<'_> {
+        ColumnsRef {
+            sh_degree: self.sh_degree,
+            means: &self.means,
+            quats: &self.quats,
+            scales: &self.scales,
+            opacities: &self.opacities,
+            sh0: &self.sh0,
+            sh_n: &self.sh_n,
+        }
+    }
+
+    /// All rows, exclusive.
+    pub fn view_mut(&mut self) -> ColumnsMut<'_> {
+        ColumnsMut {
+            sh_degree: self.sh_degree,
+            means: &mut self.means,
+            quats: &mut self.quats,
+            scales: &mut self.scales,
+            opacities: &mut self.opacities,
+            sh0: &mut self.sh0,
+            sh_n: &mut self.sh_n,
+        }
+    }
+}
+
+fn column_vec(columns: &Columns, column: Column) -> &Vec<f32> {
+    match column {
+        Column::Means => &columns.means,
+        Column::Quats => &columns.quats,
+        Column::Scales => &columns.scales,
+        Column::Opacities => &columns.opacities,
+        Column::Sh0 => &columns.sh0,
+        Column::ShN => &columns.sh_n,
+    }
+}
+
+fn column_vecs(columns: &mut Columns) -> [(Column, &mut Vec<f32>); 6] {
+    [
+        (Column::Means, &mut columns.means),
+        (Column::Quats, &mut columns.quats),
+        (Column::Scales, &mut columns.scales),
+        (Column::Opacities, &mut columns.opacities),
+        (Column::Sh0, &mut columns.sh0),
+        (Column::ShN, &mut columns.sh_n),
+    ]
+}
+
+/// Closes the gaps that the removed rows leave, one move per run of rows that stay.
+fn remove_runs<T: Copy>(values: &mut Vec<T>, width: usize, removed: &[u32]) {
+    let Some(&first) = removed.first() else { return };
+    if width == 0 {
+        return; // `sh_n` at degree 0
+    }
+    let rows = values.len() / width;
+    let mut to = first as usize;
+    for (i, &gap) in removed.iter().enumerate() {
+        let from = gap as usize + 1;
+        let end = removed.get(i + 1).map_or(rows, |&next| next as usize);
+        values.copy_within(from * width..end * width, to * width);
+        to += end - from;
+    }
+    values.truncate(to * width);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn numbered(rows: usize, sh_degree: u8) -> SceneState {
+        let mut columns = Columns::zeros(rows, sh_degree);
+        for column in Column::ALL {
+            let width = column.width(sh_degree);
+            for (i, x) in columns.column_mut(column).iter_mut().enumerate() {
+                *x = (i / width) as f32;
+            }
+        }
+        SceneState::from_columns(columns)
+    }
+
+    #[test]
+    fn removing_and_appending_keeps_every_vector_in_step() {
+        (0..=3).for_each(removing_and_appending);
+    }
+
+    fn removing_and_appending(sh_degree: u8) {
+        let mut state = numbered(10, sh_degree);
+        state.remove(&[0, 3, 4, 9]);
+        let more = numbered(2, sh_degree);
+        state.append(&more);
+        let want = [1u64, 2, 5, 6, 7, 8, 0, 1];
+        assert_eq!(state.uid, want);
+        for column in Column::ALL {
+            for (row, &uid) in want.iter().enumerate() {
+                assert!(state.columns.row(column, row).iter().all(|&x| x == uid as f32), "{column:?} {row}");
+                assert_eq!(state.exp_avg.row(column, row).len(), column.width(sh_degree));
+            }
+        }
+        assert_eq!(state.rows(), 8);
+        assert_eq!(state.grad2d.len(), 8);
+        assert_eq!(state.count.len(), 8);
+        state.retain(|row| row % 2 == 1);
+        assert_eq!(state.uid, [2, 6, 8, 1]);
+        state.retain(|_| false);
+        assert_eq!(state.rows(), 0);
+    }
+
+    #[test]
+    fn chunks_cover_all_rows_once_and_blocks_go_and_come_back() {
+        let mut state = numbered(11, 1);
+        let copy = state.clone();
+        let mut seen = Vec::new();
+        for mut chunk in state.chunks_mut(4) {
+            for row in 0..chunk.rows() {
+                seen.push(chunk.first_row + row);
+                let mut block = [0.0; super::super::rows::BLOCK_LANES];
+                chunk.columns.as_ref().load_row_any(row, &mut block);
+                assert_eq!(block[0], (chunk.first_row + row) as f32);
+                chunk.columns.store_row_any(row, &block);
+            }
+        }
+        assert_eq!(seen, (0..11).collect::<Vec<_>>());
+        assert_eq!(state, copy);
+        assert_eq!(state.chunks(4).iter().map(Rows::rows).collect::<Vec<_>>(), [4, 4, 3]);
+        assert!(state.bytes() >= 11 * row_bytes(1));
+        assert_eq!(row_bytes(3), 728);
+    }
 }

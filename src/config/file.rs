@@ -1,0 +1,358 @@
+//! Every key of a run, once: the TOML file, the command line and the defaults come from the one list below.
+//!
+//! Invariants: 1. a key has the same kebab-case spelling in the file and as a flag; 2. flags override the file, the
+//! file overrides the defaults; 3. unknown keys are refused; 4. what a run resolved is written to its config.toml,
+//! which is itself a valid config file (its `[resolved]` table states facts and is ignored when read).
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::units::parse_bytes;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+macro_rules! config_keys {
+    ($($heading:literal { $( $(#[doc = $doc:literal])+ $([$($arg:tt)+])? $name:ident: $ty:ty = $default:expr; )+ })+) => {
+        /// All keys of a run with their values.
+        #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields, default, rename_all = "kebab-case")]
+        pub struct TrainConfig { $($( $(#[doc = $doc])+ pub $name: $ty, )+)+ }
+
+        impl Default for TrainConfig {
+            fn default() -> Self { TrainConfig { $($( $name: $default, )+)+ } }
+        }
+
+        /// The keys as flags; only those typed are set.
+        #[derive(Debug, Clone, Default, clap::Args)]
+        pub struct TrainOverrides {
+            $($( $(#[doc = $doc])+ #[arg(long, help_heading = $heading $(, $($arg)+)?)] pub $name: Option<$ty>, )+)+
+        }
+
+        impl TrainOverrides {
+            /// Puts the typed flags over `config`.
+            pub fn apply(self, config: &mut TrainConfig) { $($( if let Some(v) = self.$name { config.$name = v; } )+)+ }
+        }
+
+        /// Heading, kebab-case name and meaning of every key, in order.
+        pub const KEYS: &[(&str, &str, &str)] = &[$($( ($heading, stringify!($name), concat!($($doc, "\n"),+)), )+)+];
+    };
+}
+
+config_keys! {
+    "Dataset" {
+        /// Folder of the photos inside the scene; empty = where the dataset says (COLMAP: images)
+        images: String = String::new();
+        /// Reduce photos by this factor (may be fractional: 3.4175)
+        data_factor: f64 = 1.0;
+        /// Longest side of a photo in pixels after --data-factor; 0 = no limit
+        max_resolution: u32 = 0;
+        /// Hold out every N-th photo, names in sorted order (index % N == 0); 0 = none
+        test_every: u32 = 8;
+        /// Hold out every photo whose index is greater than N; -1 = off. Takes the place of --test-every
+        [allow_negative_numbers = true] test_after: i64 = -1;
+        /// Use masks found in masks/ (white = keep)
+        [num_args = 0..=1, default_missing_value = "true"] masks: bool = true;
+        /// Masks mark what to leave out instead of what to keep
+        [num_args = 0..=1, default_missing_value = "true"] invert_masks: bool = false;
+        /// Train without the photos that are registered but missing
+        [num_args = 0..=1, default_missing_value = "true"] allow_missing: bool = false;
+        /// Memory for decoded photos
+        image_cache: ByteSize = ByteSize(1 << 30);
+        /// Near plane, relative to the size of the scene
+        near_plane: f64 = 0.01;
+        /// Start from this PLY: Gaussians if it has f_dc_0, else coloured points; empty = the dataset's points
+        init_ply: String = String::new();
+        /// Random points in the views' frusta when the dataset has none; 0 = refuse such a dataset
+        init_points: u32 = 100_000;
+    }
+    "Training" {
+        /// Total number of steps; schedules are absolute in it
+        steps: u32 = 30_000;
+        /// Seed of every random draw
+        seed: u64 = 42;
+        /// Highest band of spherical harmonics, 0 to 3
+        sh_degree: u8 = 3;
+        /// Raise the band in use every N steps; 0 = all from the start
+        sh_every: u32 = 1000;
+        /// Weight of 1 - SSIM in the loss; L1 has the rest
+        ssim_lambda: f32 = 0.2;
+        /// Pixels that the loss's SSIM covers: valid (windows inside the image) or same (zero padded)
+        ssim_padding: String = "valid".into();
+        /// Rate of positions, times the scene scale
+        means_lr: f64 = 1.6e-4;
+        /// Factor that the rate of positions has decayed to at the last step
+        means_lr_final: f64 = 0.01;
+        /// Rate of log-scales
+        scales_lr: f64 = 5e-3;
+        /// Rate of quaternions
+        quats_lr: f64 = 1e-3;
+        /// Rate of logit opacities
+        opacities_lr: f64 = 5e-2;
+        /// Rate of the constant colour band
+        sh0_lr: f64 = 2.5e-3;
+        /// Rate of the higher colour bands
+        shn_lr: f64 = 2.5e-3 / 20.0;
+        /// Adam's epsilon
+        adam_eps: f64 = 1e-15;
+        /// Opacity of first Gaussians
+        init_opacity: f32 = 0.1;
+        /// Size of first Gaussians, times the distance to their three nearest neighbours
+        init_scale: f32 = 1.0;
+        /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
+        max_alpha: f32 = 0.99;
+        /// Background colour, RGB in 0..1
+        [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]);
+    }
+    "Densification" {
+        /// default (clone, split, prune, reset) or none
+        strategy: String = "default".into();
+        /// Never more Gaussians than this; 0 = no cap
+        max_gaussians: u64 = 0;
+        /// First step after which rounds may run
+        refine_start: u32 = 500;
+        /// Step at which rounds and resets end
+        refine_stop: u32 = 15_000;
+        /// Steps between rounds
+        refine_every: u32 = 100;
+        /// Steps between opacity resets; 0 = never
+        reset_every: u32 = 3000;
+        /// Grow Gaussians whose mean screen-space gradient exceeds this
+        grow_grad2d: f32 = 2e-4;
+        /// Growing Gaussians up to this size (times the scene scale) are cloned, larger ones split
+        grow_scale3d: f32 = 0.01;
+        /// Remove Gaussians with a lower opacity
+        prune_opa: f32 = 0.005;
+        /// Remove Gaussians larger than this (times the scene scale), after the first reset
+        prune_scale3d: f32 = 0.1;
+    }
+    "Output" {
+        /// Evaluate on the held-out photos every N steps; 0 = only at the end
+        eval_every: u32 = 0;
+        /// Write a PLY every N steps; 0 = only at the end
+        save_every: u32 = 0;
+        /// Write a line of metrics every N steps
+        log_every: u32 = 100;
+        /// SSIM that is reported: same (zero padded, as the 3DGS code), valid or reflect
+        ssim_variant: String = "same".into();
+        /// Coordinates of the PLY: dataset or local
+        export_frame: String = "dataset".into();
+    }
+    "Machine" {
+        /// Worker threads; 0 = one per core. Never changes results
+        threads: u32 = 0;
+        /// Instruction path: auto, avx512, avx2 or baseline. Results are the same bits per path
+        simd: String = "auto".into();
+    }
+}
+
+/// A number of bytes, written as `4GiB`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ByteSize(pub u64);
+
+impl std::str::FromStr for ByteSize {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        parse_bytes(text).map(ByteSize)
+    }
+}
+
+impl Serialize for ByteSize {
+    fn serialize<S: serde::Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
+        let units = [(1u64 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")];
+        let text = units
+            .iter()
+            .find(|(unit, _)| self.0 > 0 && self.0.is_multiple_of(*unit))
+            .map_or_else(|| self.0.to_string(), |(unit, name)| format!("{}{name}", self.0 / unit));
+        s.serialize_str(&text)
+    }
+}
+
+impl<'de> Deserialize<'de> for ByteSize {
+    fn deserialize<D: serde::Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
+        let text = String::deserialize(d)?;
+        text.parse().map_err(serde::de::Error::custom)
+    }
+}
+
+/// A colour: three numbers in 0..1, in the file `[0.0, 0.0, 0.0]`, on the command line `0,0,0`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Rgb(pub [f32; 3]);
+
+impl std::str::FromStr for Rgb {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        let values: Result<Vec<f32>, _> = text.split(',').map(|v| v.trim().parse::<f32>()).collect();
+        match values.as_deref() {
+            Ok(&[r, g, b]) => Ok(Rgb([r, g, b])),
+            _ => Err(format!("'{text}' is not a colour; write R,G,B with numbers in 0..1")),
+        }
+    }
+}
+
+impl TrainConfig {
+    /// Reads a config file over the defaults.
+    pub fn read(path: &Path) -> InputResult<TrainConfig> {
+        let text = std::fs::read_to_string(path).map_err(|e| InputError::io(path, "reading the config", &e))?;
+        TrainConfig::parse(&text)
+            .map_err(|problem| InputError::new(path, problem, "see configs/default.toml for every key and its meaning"))
+    }
+
+    /// Parses a config text over the defaults; the error is a sentence.
+    pub fn parse(text: &str) -> Result<TrainConfig, String> {
+        let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| e.to_string())?;
+        table.remove("resolved");
+        TrainConfig::deserialize(table).map_err(|e| e.to_string())
+    }
+
+    /// Checks ranges and relations between keys.
+    ///
+    /// # Errors
+    /// Names the first key that is out of range, with what is allowed.
+    pub fn check(&self) -> InputResult<()> {
+        let refuse = |key: &str, allowed: &str| {
+            Err(InputError::new(format!("--{key}"), "the value is out of range", format!("use {allowed}")))
+        };
+        let positive = |x: f64| x.is_finite() && x > 0.0;
+        let rate = |x: f64| x.is_finite() && (0.0..=1e6).contains(&x);
+        if !positive(self.data_factor) || self.data_factor < 1.0 {
+            return refuse("data-factor", "1 or more");
+        }
+        if !positive(self.near_plane) {
+            return refuse("near-plane", "a positive number");
+        }
+        if self.sh_degree > 3 {
+            return refuse("sh-degree", "0, 1, 2 or 3");
+        }
+        if self.steps == 0 || self.steps > 100_000_000 {
+            return refuse("steps", "1 to 100,000,000");
+        }
+        if !(0.0..=1.0).contains(&self.ssim_lambda) {
+            return refuse("ssim-lambda", "0 to 1");
+        }
+        let rates = [
+            ("means-lr", self.means_lr),
+            ("scales-lr", self.scales_lr),
+            ("quats-lr", self.quats_lr),
+            ("opacities-lr", self.opacities_lr),
+            ("sh0-lr", self.sh0_lr),
+            ("shn-lr", self.shn_lr),
+        ];
+        for (key, value) in rates {
+            if !rate(value) {
+                return refuse(key, "a number from 0 on");
+            }
+        }
+        if !positive(self.means_lr_final) || self.means_lr_final > 1.0 {
+            return refuse("means-lr-final", "a number above 0 and up to 1");
+        }
+        if !positive(self.adam_eps) {
+            return refuse("adam-eps", "a positive number");
+        }
+        if !(self.init_opacity > 0.0 && self.init_opacity < 1.0) {
+            return refuse("init-opacity", "a number between 0 and 1");
+        }
+        if !positive(f64::from(self.init_scale)) {
+            return refuse("init-scale", "a positive number");
+        }
+        if !(self.max_alpha > 0.5 && self.max_alpha < 1.0) {
+            return refuse("max-alpha", "a number between 0.5 and 1, such as 0.99 or 0.999");
+        }
+        if self.background.0.iter().any(|c| !(0.0..=1.0).contains(c)) {
+            return refuse("background", "three numbers in 0..1");
+        }
+        if self.refine_every == 0 {
+            return refuse("refine-every", "1 or more");
+        }
+        if self.log_every == 0 {
+            return refuse("log-every", "1 or more");
+        }
+        let thresholds = [
+            ("grow-grad2d", self.grow_grad2d),
+            ("grow-scale3d", self.grow_scale3d),
+            ("prune-opa", self.prune_opa),
+            ("prune-scale3d", self.prune_scale3d),
+        ];
+        for (key, value) in thresholds {
+            if !(value >= 0.0 && value.is_finite()) {
+                return refuse(key, "a number from 0 on");
+            }
+        }
+        if self.prune_opa >= 0.5 {
+            return refuse("prune-opa", "less than 0.5");
+        }
+        self.check_names()
+    }
+
+    fn check_names(&self) -> InputResult<()> {
+        let names: [(&str, &str, &[&str]); 5] = [
+            ("ssim-padding", &self.ssim_padding, &["valid", "same"]),
+            ("strategy", &self.strategy, &["default", "none"]),
+            ("ssim-variant", &self.ssim_variant, &["same", "valid", "reflect"]),
+            ("export-frame", &self.export_frame, &["dataset", "local"]),
+            ("simd", &self.simd, &["auto", "avx512", "avx2", "baseline"]),
+        ];
+        for (key, value, allowed) in names {
+            if !allowed.contains(&value) {
+                let problem = format!("'{value}' is not known");
+                return Err(InputError::new(
+                    format!("--{key}"),
+                    problem,
+                    format!("use one of: {}", allowed.join(", ")),
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The text of configs/default.toml: every key with its meaning and default.
+pub fn default_file() -> String {
+    let defaults = toml::Table::try_from(TrainConfig::default()).unwrap_or_default();
+    let mut text = String::from(
+        "# Every key with its meaning and default. A config file needs only the keys that it changes;\n\
+         # flags of the same name override it.\n",
+    );
+    let mut last_heading = "";
+    for (heading, name, meaning) in KEYS {
+        if *heading != last_heading {
+            text.push_str(&format!("\n## {heading}\n"));
+            last_heading = heading;
+        }
+        let key = name.replace('_', "-");
+        for line in meaning.lines() {
+            text.push_str(&format!("\n#{line}"));
+        }
+        let value = defaults.get(&key).map(ToString::to_string).unwrap_or_default();
+        text.push_str(&format!("\n{key} = {value}\n"));
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_override_defaults_and_unknown_keys_are_refused() {
+        let config = TrainConfig::parse("steps = 7\nimage-cache = \"64MiB\"\n[resolved]\nversion = \"x\"\n");
+        let config = config.unwrap_or_default();
+        assert_eq!((config.steps, config.image_cache), (7, ByteSize(64 << 20)));
+        let error = TrainConfig::parse("stepz = 7").err().unwrap_or_default();
+        assert!(error.contains("stepz"), "{error}");
+    }
+
+    #[test]
+    fn what_is_written_reads_back_the_same() {
+        let mut config = TrainConfig { image_cache: ByteSize(12345), ..TrainConfig::default() };
+        config.background = Rgb([0.5, 0.25, 1.0]);
+        let text = toml::to_string(&config).unwrap_or_default();
+        assert_eq!(TrainConfig::parse(&text), Ok(config));
+    }
+
+    #[test]
+    fn values_out_of_range_are_refused_by_name() {
+        let bad = TrainConfig { sh_degree: 4, ..TrainConfig::default() };
+        assert!(bad.check().is_err_and(|e| e.to_string().contains("--sh-degree")));
+        let bad = TrainConfig { simd: "neon".into(), ..TrainConfig::default() };
+        assert!(bad.check().is_err_and(|e| e.to_string().contains("neon")));
+        assert!(TrainConfig::default().check().is_ok());
+    }
+}

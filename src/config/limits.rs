@@ -1,0 +1,154 @@
+//! What follows from a config: the options of each layer, and what the run will take of memory.
+//!
+//! The libraries below never see the file; they get their own option structs from here.
+
+use super::file::TrainConfig;
+use crate::base::simd::SimdPath;
+use crate::dataset::loader::LoadOptions;
+use crate::dataset::read::ReadOptions;
+use crate::densify::policy::DensifyConfig;
+use crate::exchange::ply::ExportFrame;
+use crate::optim::adam::AdamConfig;
+use crate::optim::rates::Rates;
+use crate::render::metrics::SsimVariant;
+use crate::render::{LossOptions, RenderOptions, SsimPadding};
+use crate::scene::init::InitOptions;
+
+/// Everything that the training loop needs, resolved.
+#[derive(Debug, Clone)]
+pub struct RunOptions {
+    /// Total steps.
+    pub steps: u32,
+    /// Seed of every draw.
+    pub seed: u64,
+    /// Degree that rows are stored with.
+    pub sh_degree: u8,
+    /// Steps between raises of the degree in use; 0 = all from the start.
+    pub sh_every: u32,
+    /// Cap on Gaussians; 0 = none.
+    pub max_gaussians: usize,
+    /// Rendering, but for the degree in use.
+    pub render: RenderOptions,
+    /// Loss.
+    pub loss: LossOptions,
+    /// Learning rates.
+    pub rates: Rates,
+    /// Adam's constants.
+    pub adam: AdamConfig,
+    /// Densification; `None` for `--strategy none`.
+    pub densify: Option<DensifyConfig>,
+    /// Scene scale, local units.
+    pub scene_scale: f32,
+    /// SSIM that is reported.
+    pub ssim_variant: SsimVariant,
+    /// Coordinates of PLY files.
+    pub export_frame: ExportFrame,
+    /// Cadences in steps; 0 = only at the end.
+    pub eval_every: u32,
+    /// Steps between PLY files; 0 = only at the end.
+    pub save_every: u32,
+    /// Steps between lines of metrics.
+    pub log_every: u32,
+}
+
+impl RunOptions {
+    /// Options of a checked config for a scene of this scale (local units).
+    pub fn new(config: &TrainConfig, scene_scale: f32) -> RunOptions {
+        let simd = simd_path(config);
+        let padding = if config.ssim_padding == "same" { SsimPadding::Same } else { SsimPadding::Valid };
+        RunOptions {
+            steps: config.steps,
+            seed: config.seed,
+            sh_degree: config.sh_degree,
+            sh_every: config.sh_every,
+            max_gaussians: config.max_gaussians as usize,
+            render: RenderOptions {
+                sh_degree: config.sh_degree,
+                max_alpha: config.max_alpha,
+                background: config.background.0,
+                simd,
+                ..RenderOptions::default()
+            },
+            loss: LossOptions { ssim_lambda: config.ssim_lambda, padding, simd },
+            rates: Rates {
+                means: config.means_lr * f64::from(scene_scale),
+                means_final_factor: config.means_lr_final,
+                scales: config.scales_lr,
+                quats: config.quats_lr,
+                opacities: config.opacities_lr,
+                sh0: config.sh0_lr,
+                sh_n: config.shn_lr,
+                steps: config.steps,
+            },
+            adam: AdamConfig { eps: config.adam_eps, ..AdamConfig::default() },
+            densify: (config.strategy == "default").then(|| densify(config)),
+            scene_scale,
+            ssim_variant: SsimVariant::from_name(&config.ssim_variant).unwrap_or(SsimVariant::Same),
+            export_frame: if config.export_frame == "local" { ExportFrame::Local } else { ExportFrame::Dataset },
+            eval_every: config.eval_every,
+            save_every: config.save_every,
+            log_every: config.log_every,
+        }
+    }
+
+    /// Bands in use at 0-based `step`.
+    pub fn sh_degree_at(&self, step: u32) -> u8 {
+        let raised = step.checked_div(self.sh_every).unwrap_or(u32::MAX);
+        raised.min(u32::from(self.sh_degree)) as u8
+    }
+}
+
+fn densify(config: &TrainConfig) -> DensifyConfig {
+    let never_if_zero = |n: u32| if n == 0 { u32::MAX } else { n };
+    DensifyConfig {
+        grow_grad2d: config.grow_grad2d,
+        grow_scale3d: config.grow_scale3d,
+        prune_opa: config.prune_opa,
+        prune_scale3d: config.prune_scale3d,
+        refine_start: config.refine_start,
+        refine_stop: config.refine_stop,
+        refine_every: config.refine_every,
+        reset_every: never_if_zero(config.reset_every),
+        max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
+    }
+}
+
+/// The instruction path that a config asks for on this machine.
+pub fn simd_path(config: &TrainConfig) -> SimdPath {
+    SimdPath::from_name(&config.simd).unwrap_or_else(SimdPath::best)
+}
+
+/// How the scene is to be read.
+pub fn read_options(config: &TrainConfig) -> ReadOptions {
+    ReadOptions {
+        images: (!config.images.is_empty()).then(|| config.images.clone()),
+        allow_missing: config.allow_missing,
+    }
+}
+
+/// How the dataset is to be loaded.
+pub fn load_options(config: &TrainConfig) -> LoadOptions {
+    LoadOptions {
+        data_factor: config.data_factor,
+        max_resolution: (config.max_resolution > 0).then_some(config.max_resolution),
+        test_every: (config.test_every > 0).then_some(config.test_every),
+        test_after: u32::try_from(config.test_after).ok(),
+        masks: config.masks,
+        invert_masks: config.invert_masks,
+        allow_missing: config.allow_missing,
+        near_plane: config.near_plane,
+        ..LoadOptions::default()
+    }
+}
+
+/// How first Gaussians are made.
+pub fn init_options(config: &TrainConfig) -> InitOptions {
+    InitOptions {
+        sh_degree: config.sh_degree,
+        opacity: config.init_opacity,
+        scale_factor: config.init_scale,
+        seed: config.seed,
+        max_gaussians: (config.max_gaussians > 0).then_some(config.max_gaussians as usize),
+        ..InitOptions::default()
+    }
+}

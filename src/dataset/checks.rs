@@ -1,0 +1,81 @@
+//! What both readers check before a number from a file is believed, and how they say what they left out.
+
+use crate::base::error::{InputError, InputResult};
+use crate::dataset::model::{Intrinsics, Lens, RawView};
+use std::path::Path;
+
+/// Largest width or height accepted, pixels: the limit of JPEG, and beyond every photo there is.
+const MAX_SIDE: u64 = 65_535;
+/// Focal lengths accepted, in units of the longer side. Satellite views come near the upper end.
+const FOCAL_RANGE: (f64, f64) = (1e-3, 1e6);
+/// Farthest principal point accepted, in units of the longer side (crops lie off centre, but not further).
+const MAX_CENTRE: f64 = 1e3;
+/// Farthest coordinate of a pose that is believed.
+pub(super) const MAX_COORDINATE: f64 = 1e15;
+/// Names listed in one warning.
+const LISTED: usize = 10;
+
+/// Intrinsics whose numbers can belong to a camera, or what is wrong with them. A radial lens without distortion
+/// becomes a pinhole, which is the same map.
+pub(super) fn checked_intrinsics(
+    (width, height): (u64, u64),
+    focal: [f64; 2],
+    centre: [f64; 2],
+    lens: Lens,
+) -> Result<Intrinsics, String> {
+    if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
+        return Err(format!("an image of {width} x {height} pixels (each side must be 1 to {MAX_SIDE})"));
+    }
+    let side = width.max(height) as f64;
+    for f in focal {
+        if !(FOCAL_RANGE.0 * side..=FOCAL_RANGE.1 * side).contains(&f) {
+            return Err(format!("a focal length of {f} pixels for an image of {width} x {height}"));
+        }
+    }
+    for c in centre {
+        if c.is_nan() || c.abs() > MAX_CENTRE * side {
+            return Err(format!("a principal point at {c} pixels for an image of {width} x {height}"));
+        }
+    }
+    let coefficients: &[f64] = match &lens {
+        Lens::Pinhole => &[],
+        Lens::Radial(k) => k,
+        Lens::Fisheye(k) => k,
+    };
+    if let Some(k) = coefficients.iter().find(|k| !k.is_finite()) {
+        return Err(format!("a distortion coefficient of {k}"));
+    }
+    let lens = if lens == Lens::Radial([0.0; 8]) { Lens::Pinhole } else { lens };
+    Ok(Intrinsics {
+        width: width as u32,
+        height: height as u32,
+        fx: focal[0],
+        fy: focal[1],
+        cx: centre[0],
+        cy: centre[1],
+        lens,
+    })
+}
+
+/// Sorts the views by name and refuses two of the same name.
+pub(super) fn sort_views(file: &Path, views: &mut [RawView]) -> InputResult<()> {
+    views.sort_by(|a, b| a.name.cmp(&b.name));
+    match views.windows(2).find(|pair| pair[0].name == pair[1].name) {
+        None => Ok(()),
+        Some(pair) => Err(InputError::new(
+            file,
+            format!("two views have the name '{}'", pair[0].name),
+            "every photo may be listed once: remove one of the two entries",
+        )
+        .at(format!("image '{}'", pair[0].name))),
+    }
+}
+
+/// The first names of a list and how many more there are.
+pub(super) fn listed(names: &[String]) -> String {
+    let shown = names.iter().take(LISTED).map(|n| format!("'{n}'")).collect::<Vec<_>>().join(", ");
+    match names.len().saturating_sub(LISTED) {
+        0 => shown,
+        more => format!("{shown} and {more} more"),
+    }
+}

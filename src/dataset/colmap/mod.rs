@@ -1,0 +1,274 @@
+//! Reads a COLMAP scene: which model folder, what its files say, and views from it. Photos are not opened.
+//!
+//! Invariants: 1. whatever the files hold, the result is a scene or an [`InputError`] with file, place and remedy;
+//! 2. memory grows with the views and points that are kept, not with tracks or 2D points; 3. a view is left out, with
+//! a warning that names it, only for its own pose; anything that makes the rest of a file doubtful is an error.
+//!
+//! Camera models 0 to 6, 8 and 9 can be used ([`models`]); rigs and frames files are ignored, since the images file
+//! holds every pose. Image and point numbers are not looked at: views are identified by name.
+
+mod binary;
+mod models;
+mod text;
+
+use crate::base::error::{InputError, InputResult};
+use crate::dataset::checks::{MAX_COORDINATE, listed, sort_views};
+use crate::dataset::model::{Intrinsics, PointCloud, Pose, RawScene, RawView};
+use crate::dataset::paths::safe_join;
+pub use crate::dataset::read::ReadOptions;
+use glam::{DMat3, DQuat, DVec3};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Where a model is looked for, in words.
+pub(super) const LOOKED_FOR: &str = "COLMAP's cameras and images files (.bin or .txt) in sparse/*, sparse, colmap/sparse/*, colmap/sparse and the folder itself";
+/// Remedy for a file that cannot be what COLMAP wrote.
+const DAMAGED: &str = "the file is damaged or cut short: copy it again or export the model again";
+/// A quaternion whose largest component is smaller than this has no direction.
+const MIN_QUAT: f64 = 1e-6;
+
+type Cameras = BTreeMap<u32, Intrinsics>;
+
+/// One entry of an images file.
+struct ImageRecord {
+    /// Byte or line where the entry begins.
+    position: u64,
+    camera_id: u32,
+    /// w, x, y, z as in the file, world to camera.
+    quat: [f64; 4],
+    translation: [f64; 3],
+    name: String,
+}
+
+/// A folder with cameras and images in one of the two formats.
+struct ModelFolder {
+    folder: PathBuf,
+    is_binary: bool,
+}
+
+impl ModelFolder {
+    fn of(folder: PathBuf) -> Option<ModelFolder> {
+        let both = |ext: &str| ["cameras", "images"].iter().all(|n| folder.join(format!("{n}.{ext}")).is_file());
+        match (both("bin"), both("txt")) {
+            (true, _) => Some(ModelFolder { folder, is_binary: true }),
+            (false, true) => Some(ModelFolder { folder, is_binary: false }),
+            (false, false) => None,
+        }
+    }
+
+    fn file(&self, stem: &str) -> PathBuf {
+        self.folder.join(format!("{stem}.{}", if self.is_binary { "bin" } else { "txt" }))
+    }
+
+    fn count_images(&self) -> InputResult<u64> {
+        let path = self.file("images");
+        if self.is_binary { binary::count_images(&path) } else { text::count_images(&path) }
+    }
+}
+
+/// Whether a COLMAP model is found where [`read_colmap`] looks for one.
+pub fn looks_like_colmap(scene: &Path) -> bool {
+    !find_models(scene).is_empty()
+}
+
+/// Reads the COLMAP model of a scene folder. Views come in the order of their names; `image_path` is
+/// `scene/<images>/<name>`. Points that are not finite are dropped and counted.
+///
+/// # Errors
+/// No model, no image folder, files that are truncated, contradict themselves or hold more than 1 % of points that are
+/// not finite, names that would leave the image folder or occur twice, cameras that cannot be used.
+pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> {
+    let mut warnings = Vec::new();
+    let model = choose_model(scene, &mut warnings)?;
+    let image_folder = scene.join(options.images.as_deref().unwrap_or("images"));
+    if !image_folder.is_dir() {
+        return Err(InputError::new(
+            &image_folder,
+            "the image folder is not there",
+            "name the folder of the photos, relative to the scene, with --images",
+        ));
+    }
+    let cameras_path = model.file("cameras");
+    let images_path = model.file("images");
+    let (cameras, images) = if model.is_binary {
+        (binary::read_cameras(&cameras_path, &mut warnings)?, binary::read_images(&images_path, &mut warnings)?)
+    } else {
+        (text::read_cameras(&cameras_path, &mut warnings)?, text::read_images(&images_path, &mut warnings)?)
+    };
+    let unit = if model.is_binary { "byte" } else { "line" };
+    let views = make_views(&images_path, unit, &image_folder, &cameras, images, &mut warnings)?;
+    let (points, points_path) = read_points(&model, &mut warnings)?;
+    Ok(RawScene { views, points, points_path, warnings })
+}
+
+/// Every model folder, in a fixed order.
+fn find_models(scene: &Path) -> Vec<ModelFolder> {
+    let mut folders = Vec::new();
+    for parent in ["sparse", "colmap/sparse"] {
+        let parent = scene.join(parent);
+        let mut inside: Vec<PathBuf> =
+            std::fs::read_dir(&parent).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
+        inside.sort();
+        folders.extend(inside);
+        folders.push(parent);
+    }
+    folders.push(scene.to_path_buf());
+    folders.into_iter().filter_map(ModelFolder::of).collect()
+}
+
+/// The model with the most images; the first of equals.
+fn choose_model(scene: &Path, warnings: &mut Vec<String>) -> InputResult<ModelFolder> {
+    let mut models = find_models(scene);
+    if models.is_empty() {
+        return Err(InputError::new(
+            scene,
+            format!("no COLMAP model here; looked for {LOOKED_FOR}"),
+            "give the folder that holds 'sparse' and 'images'",
+        ));
+    }
+    if models.len() == 1 {
+        return Ok(models.remove(0));
+    }
+    let total = models.len();
+    let mut best: Option<(u64, ModelFolder)> = None;
+    let mut first_error = None;
+    for model in models {
+        match model.count_images() {
+            Ok(count) if best.as_ref().is_none_or(|(most, _)| count > *most) => best = Some((count, model)),
+            Ok(_) => {}
+            Err(error) => {
+                warnings.push(format!("{}: this model is passed over: {}", model.folder.display(), error.problem));
+                first_error.get_or_insert(error);
+            }
+        }
+    }
+    match (best, first_error) {
+        (Some((count, model)), _) => {
+            let folder = model.folder.display();
+            warnings.push(format!("{total} COLMAP models found; {folder} has the most images ({count}) and is used"));
+            Ok(model)
+        }
+        (None, Some(error)) => Err(error),
+        (None, None) => Err(InputError::new(scene, "no COLMAP model can be read", DAMAGED)),
+    }
+}
+
+fn make_views(
+    file: &Path,
+    unit: &str,
+    image_folder: &Path,
+    cameras: &Cameras,
+    images: Vec<ImageRecord>,
+    warnings: &mut Vec<String>,
+) -> InputResult<Vec<RawView>> {
+    if images.is_empty() {
+        return Err(InputError::new(file, "the model holds no images", "check that COLMAP registered any photo"));
+    }
+    let mut views = Vec::with_capacity(images.len());
+    let mut left_out = Vec::new();
+    for image in images {
+        let place = format!("{unit} {}", image.position);
+        let (name, image_path) = safe_join(image_folder, &image.name).map_err(|problem| {
+            InputError::new(file, problem, "image names must be relative to the image folder and stay inside it")
+                .at(&place)
+        })?;
+        let intrinsics = *cameras.get(&image.camera_id).ok_or_else(|| {
+            InputError::new(file, format!("camera {} is not in the cameras file", image.camera_id), DAMAGED)
+                .at(format!("{place}, image '{name}'"))
+        })?;
+        match make_pose(image.quat, image.translation) {
+            Some(pose) => views.push(RawView { name, image_path, intrinsics, pose, mask_path: None, split: None }),
+            None => left_out.push(name),
+        }
+    }
+    if views.is_empty() {
+        let remedy = "export the model again; its rotations and translations must be finite numbers";
+        return Err(InputError::new(file, "no image has a usable pose", remedy).at(listed(&left_out)));
+    }
+    if !left_out.is_empty() {
+        let (count, names) = (left_out.len(), listed(&left_out));
+        let file = file.display();
+        warnings.push(format!("{file}: {count} view(s) left out, their pose is not finite or not a rotation: {names}"));
+    }
+    sort_views(file, &mut views)?;
+    Ok(views)
+}
+
+/// The pose of a w-first quaternion of any length and a translation; `None` when there is none.
+fn make_pose(quat: [f64; 4], translation: [f64; 3]) -> Option<Pose> {
+    let largest = quat.iter().fold(0.0f64, |m, q| m.max(q.abs()));
+    let finite = quat.iter().all(|q| q.is_finite()) && translation.iter().all(|t| t.abs() <= MAX_COORDINATE);
+    if !finite || largest < MIN_QUAT {
+        return None;
+    }
+    // Divided by the largest first, so that squares of huge components stay finite.
+    let [w, x, y, z] = quat.map(|q| q / largest);
+    let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
+    Some(Pose { rotation, translation: DVec3::from_array(translation) })
+}
+
+/// Points of the model: from either format, the images' own first; a `points3D.ply` is named for the caller instead.
+fn read_points(model: &ModelFolder, warnings: &mut Vec<String>) -> InputResult<(PointCloud, Option<PathBuf>)> {
+    let (bin, txt) = (model.folder.join("points3D.bin"), model.folder.join("points3D.txt"));
+    let prefer_bin = model.is_binary || !txt.is_file();
+    if bin.is_file() && prefer_bin {
+        return Ok((binary::read_points(&bin, warnings)?, None));
+    }
+    if txt.is_file() {
+        return Ok((text::read_points(&txt, warnings)?, None));
+    }
+    let ply = model.folder.join("points3D.ply");
+    if ply.is_file() {
+        return Ok((PointCloud::default(), Some(ply)));
+    }
+    warnings.push(format!("{}: no points3D file, so there are no points to start from", model.folder.display()));
+    Ok((PointCloud::default(), None))
+}
+
+/// Collects points and counts those that are not finite.
+struct PointTally {
+    cloud: PointCloud,
+    dropped: u64,
+    first_dropped: u64,
+}
+
+impl PointTally {
+    fn with_capacity(count: usize) -> PointTally {
+        let cloud = PointCloud { positions: Vec::with_capacity(count), colors: Vec::with_capacity(count) };
+        PointTally { cloud, dropped: 0, first_dropped: 0 }
+    }
+
+    fn add(&mut self, position: [f64; 3], color: [u8; 3], place: u64) {
+        if position.iter().all(|x| x.is_finite()) {
+            self.cloud.positions.push(position);
+            self.cloud.colors.push(color);
+        } else {
+            if self.dropped == 0 {
+                self.first_dropped = place;
+            }
+            self.dropped += 1;
+        }
+    }
+
+    fn total(&self) -> u64 {
+        self.cloud.positions.len() as u64 + self.dropped
+    }
+
+    /// The points; an error when more than 1 % were dropped.
+    fn finish(self, path: &Path, unit: &str, warnings: &mut Vec<String>) -> InputResult<PointCloud> {
+        let total = self.total();
+        if self.dropped.saturating_mul(100) > total {
+            let problem = format!("{} of {total} points are not finite numbers, more than 1 %", self.dropped);
+            return Err(InputError::new(path, problem, DAMAGED).at(format!("{unit} {}", self.first_dropped)));
+        }
+        if self.dropped > 0 {
+            let (file, dropped, first) = (path.display(), self.dropped, self.first_dropped);
+            warnings
+                .push(format!("{file}: {dropped} of {total} points are not finite (first: {unit} {first}), dropped"));
+        }
+        if total == 0 {
+            warnings.push(format!("{}: the file holds no points", path.display()));
+        }
+        Ok(self.cloud)
+    }
+}

@@ -1,0 +1,173 @@
+//! Writes a COLMAP model in its binary form: `cameras.bin`, `images.bin`, `points3D.bin` with one shared camera.
+//!
+//! Format: COLMAP, "Output Format" in its documentation, binary files of `src/colmap/scene/reconstruction_io.cc`;
+//! little-endian, quaternions w first, world to camera.
+//!
+//! Invariants: 1. image and point ids count from 1, camera id is 1; 2. tracks and the images' point lists agree in
+//! both directions; 3. a file appears under its name only when all its bytes are on disk, and the model's folder
+//! only when all its files are.
+
+use crate::base::error::{InputError, InputResult};
+use crate::dataset::model::{Intrinsics, Lens, Pose};
+use glam::{DMat3, DQuat};
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+
+/// Number of the PINHOLE camera model (fx, fy, cx, cy).
+const PINHOLE: i32 = 1;
+
+/// A model of one camera.
+#[derive(Debug, Clone)]
+pub struct Model {
+    /// The camera of all images; a pinhole.
+    pub intrinsics: Intrinsics,
+    /// The images.
+    pub images: Vec<ModelImage>,
+    /// The points.
+    pub points: Vec<Point>,
+}
+
+/// An image of the model.
+#[derive(Debug, Clone)]
+pub struct ModelImage {
+    /// Name relative to the image folder.
+    pub name: String,
+    /// World to camera.
+    pub pose: Pose,
+}
+
+/// A point with its track.
+#[derive(Debug, Clone)]
+pub struct Point {
+    /// Position, world.
+    pub position: [f64; 3],
+    /// sRGB.
+    pub rgb: [u8; 3],
+    /// Mean reprojection error, pixels.
+    pub error: f64,
+    /// Who sees it.
+    pub observations: Vec<Observation>,
+}
+
+/// A point seen in an image.
+#[derive(Debug, Clone, Copy)]
+pub struct Observation {
+    /// Index into the images, from 0.
+    pub image: u32,
+    /// Position in the image, pixels; the centre of the first pixel is (0.5, 0.5).
+    pub at: [f64; 2],
+}
+
+/// Writes `<sparse>/0/*.bin`; `sparse` must not exist and its parent must.
+///
+/// # Errors
+/// A camera with distortion, an observation of an image that is not there, anything that cannot be written.
+pub fn write_model(sparse: &Path, model: &Model) -> InputResult<()> {
+    let images = model.images.len();
+    if model.intrinsics.lens != Lens::Pinhole {
+        return Err(InputError::new(sparse, "only pinhole cameras are written", "undistort the images first"));
+    }
+    if model.points.iter().flat_map(|p| &p.observations).any(|o| o.image as usize >= images) {
+        return Err(InputError::new(sparse, format!("a track names an image beyond the {images} there are"), ""));
+    }
+    let partial = sparse.with_extension("partial");
+    let folder = partial.join("0");
+    std::fs::create_dir_all(&folder).map_err(|e| InputError::io(&folder, "making the folder", &e))?;
+    write_file(&folder.join("cameras.bin"), |out| cameras(out, &model.intrinsics))?;
+    let order = observation_order(model);
+    write_file(&folder.join("images.bin"), |out| images_bin(out, model, &order))?;
+    write_file(&folder.join("points3D.bin"), |out| points_bin(out, model))?;
+    std::fs::rename(&partial, sparse).map_err(|e| InputError::io(sparse, "naming the model's folder", &e))
+}
+
+/// Writes a file under a temporary name, waits until its bytes are on disk, and then gives it its name.
+///
+/// # Errors
+/// Whatever the system says, with the file's name.
+pub fn write_file(path: &Path, fill: impl FnOnce(&mut dyn Write) -> std::io::Result<()>) -> InputResult<()> {
+    let mut name = path.file_name().unwrap_or_default().to_os_string();
+    name.push(".partial");
+    let partial = path.with_file_name(name);
+    let write = || {
+        let mut out = BufWriter::with_capacity(1 << 20, File::create(&partial)?);
+        fill(&mut out)?;
+        out.flush()?;
+        out.get_ref().sync_data()?;
+        drop(out);
+        std::fs::rename(&partial, path)
+    };
+    write().map_err(|e| {
+        // What is left of the attempt is of no use; that it may not be there is no second error.
+        let _ = std::fs::remove_file(&partial);
+        InputError::io(path, "writing", &e)
+    })
+}
+
+fn cameras(out: &mut dyn Write, k: &Intrinsics) -> std::io::Result<()> {
+    out.write_all(&1u64.to_le_bytes())?;
+    out.write_all(&1u32.to_le_bytes())?;
+    out.write_all(&PINHOLE.to_le_bytes())?;
+    out.write_all(&u64::from(k.width).to_le_bytes())?;
+    out.write_all(&u64::from(k.height).to_le_bytes())?;
+    floats(out, &[k.fx, k.fy, k.cx, k.cy])
+}
+
+fn floats(out: &mut dyn Write, values: &[f64]) -> std::io::Result<()> {
+    values.iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))
+}
+
+/// For each image its observations as (point, position), in the order of the points.
+fn observation_order(model: &Model) -> Vec<Vec<(u64, [f64; 2])>> {
+    let mut lists = vec![Vec::new(); model.images.len()];
+    for (k, point) in model.points.iter().enumerate() {
+        for o in &point.observations {
+            lists[o.image as usize].push((k as u64 + 1, o.at));
+        }
+    }
+    lists
+}
+
+fn images_bin(out: &mut dyn Write, model: &Model, order: &[Vec<(u64, [f64; 2])>]) -> std::io::Result<()> {
+    out.write_all(&(model.images.len() as u64).to_le_bytes())?;
+    for (k, image) in model.images.iter().enumerate() {
+        out.write_all(&(k as u32 + 1).to_le_bytes())?;
+        floats(out, &quaternion(&image.pose.rotation))?;
+        floats(out, &image.pose.translation.to_array())?;
+        out.write_all(&1u32.to_le_bytes())?;
+        out.write_all(image.name.as_bytes())?;
+        out.write_all(&[0])?;
+        out.write_all(&(order[k].len() as u64).to_le_bytes())?;
+        for (point, at) in &order[k] {
+            floats(out, at)?;
+            out.write_all(&point.to_le_bytes())?;
+        }
+    }
+    Ok(())
+}
+
+fn points_bin(out: &mut dyn Write, model: &Model) -> std::io::Result<()> {
+    // The place of an observation in its image's list: lists are in the order of the points.
+    let mut written = vec![0u32; model.images.len()];
+    out.write_all(&(model.points.len() as u64).to_le_bytes())?;
+    for (k, point) in model.points.iter().enumerate() {
+        out.write_all(&(k as u64 + 1).to_le_bytes())?;
+        floats(out, &point.position)?;
+        out.write_all(&point.rgb)?;
+        out.write_all(&point.error.to_le_bytes())?;
+        out.write_all(&(point.observations.len() as u64).to_le_bytes())?;
+        for o in &point.observations {
+            out.write_all(&(o.image + 1).to_le_bytes())?;
+            out.write_all(&written[o.image as usize].to_le_bytes())?;
+            written[o.image as usize] += 1;
+        }
+    }
+    Ok(())
+}
+
+/// Unit quaternion of a rotation, w first and not negative.
+fn quaternion(rotation: &DMat3) -> [f64; 4] {
+    let q = DQuat::from_mat3(rotation).normalize();
+    let sign = if q.w < 0.0 { -1.0 } else { 1.0 };
+    [q.w * sign, q.x * sign, q.y * sign, q.z * sign]
+}

@@ -1,0 +1,238 @@
+//! The local frame: which offset and scale are taken out of a dataset before anything becomes f32, and how large
+//! the scene is.
+//!
+//! Responsible for medians of cameras and points, and for moving positions and poses between frames. Not
+//! responsible for photos or for which views exist.
+//!
+//! Invariants: 1. subtraction of the origin happens in f64, so a map-projection offset of 5e5 m changes local values
+//! by less than f32 rounding; 2. the scale is finite and positive whatever the input; 3. only medians decide origin
+//! and scale, so fewer than half of the cameras or points can be anywhere without moving them far.
+
+use super::model::Pose;
+use glam::DVec3;
+
+/// Coordinates larger than this are treated like non-finite ones: their squares would overflow.
+pub const LARGEST_COORDINATE: f64 = 1e100;
+
+/// A length below this share of the distance to the points (or 1e-12 of the coordinates) counts as zero.
+const NEGLIGIBLE: f64 = 1e-6;
+
+/// How many robust extents away a position may be before it is called absurd.
+const ABSURD: f64 = 1e6;
+
+/// Local = (world - origin) / scale, axes unchanged.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Frame {
+    /// World position of the local origin.
+    pub origin: DVec3,
+    /// World length of one local unit; finite and positive.
+    pub scale: f64,
+}
+
+impl Frame {
+    /// The frame in which local and world are the same.
+    pub fn identity() -> Self {
+        Frame { origin: DVec3::ZERO, scale: 1.0 }
+    }
+
+    /// A world position in local coordinates.
+    pub fn to_local(&self, world: DVec3) -> DVec3 {
+        (world - self.origin) / self.scale
+    }
+
+    /// A local position in world coordinates.
+    pub fn to_world(&self, local: DVec3) -> DVec3 {
+        self.origin + local * self.scale
+    }
+
+    /// World-to-camera pose as the local-to-camera matrix `[R | t]`, row-major, with camera lengths in local units.
+    ///
+    /// From `R (origin + scale p) + t`, divided by the scale: the rotation stays and t becomes
+    /// `(R origin + t) / scale`.
+    pub fn viewmat(&self, pose: &Pose) -> [[f32; 4]; 3] {
+        let translation = (pose.rotation * self.origin + pose.translation) / self.scale;
+        std::array::from_fn(|i| {
+            let row = pose.rotation.row(i);
+            [row.x as f32, row.y as f32, row.z as f32, translation[i] as f32]
+        })
+    }
+}
+
+/// Robust lengths of a scene, world units.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Extent {
+    /// Coordinate-wise median of the camera positions.
+    pub centre: DVec3,
+    /// Median distance of the cameras from `centre`; 0 where it is negligible (one camera, or all in one place).
+    pub camera_radius: f64,
+    /// Median distance of the points from `centre`; 0 without points.
+    pub point_distance: f64,
+}
+
+impl Extent {
+    /// Measures cameras and points. Positions that are not [`usable`] are passed over.
+    pub fn measure(centres: &[DVec3], points: &[[f64; 3]]) -> Self {
+        let centres: Vec<DVec3> = centres.iter().copied().filter(|&c| usable(c)).collect();
+        let centre = DVec3::from_array(std::array::from_fn(|axis| median(centres.iter().map(|c| c[axis]).collect())));
+        let mut camera_radius = median(centres.iter().map(|c| c.distance(centre)).collect());
+        let points = points.iter().map(|&p| DVec3::from_array(p)).filter(|&p| usable(p));
+        let point_distance = median(points.map(|p| p.distance(centre)).collect());
+        if camera_radius <= negligible(point_distance, centre) {
+            camera_radius = 0.0;
+        }
+        Extent { centre, camera_radius, point_distance }
+    }
+
+    /// The local frame: the origin is the median camera; one unit is the median distance of the cameras from it, so
+    /// that half of the cameras are within 1 and `scene_scale` of an ordinary flight is about 2. Cameras in one place
+    /// use the median distance to the points; without points the world's unit stays.
+    pub fn frame(&self) -> Frame {
+        let scale = [self.camera_radius, self.point_distance].into_iter().find(|&s| s > 0.0).unwrap_or(1.0);
+        Frame { origin: self.centre, scale }
+    }
+
+    /// Whether a position is finite and not farther than 1e6 robust extents from the cameras.
+    pub fn is_plausible(&self, position: DVec3) -> bool {
+        let extent = self.camera_radius.max(self.point_distance);
+        usable(position) && (extent == 0.0 || position.distance(self.centre) <= ABSURD * extent)
+    }
+
+    /// `scene_scale` in world units: 1.1 times the largest distance of a camera from the mean of the cameras; and the
+    /// indices of the cameras that are left out of it as outliers.
+    ///
+    /// A camera is an outlier when its distance from the median camera exceeds the median of these distances by more
+    /// than ten times that median and ten times their spread (1.4826 times the median absolute deviation). With all
+    /// cameras in one place the result is the median distance to the points, without points 1.
+    pub fn scene_scale(&self, centres: &[DVec3]) -> (f64, Vec<usize>) {
+        let distances: Vec<f64> = centres.iter().map(|c| c.distance(self.centre)).collect();
+        let typical = median(distances.clone());
+        let spread = 1.4826 * median(distances.iter().map(|d| (d - typical).abs()).collect());
+        let limit = if self.camera_radius > 0.0 { typical + 10.0 * typical.max(spread) } else { f64::INFINITY };
+        let (mut inliers, mut outliers) = (Vec::new(), Vec::new());
+        for (i, &distance) in distances.iter().enumerate() {
+            if distance <= limit { inliers.push(centres[i]) } else { outliers.push(i) }
+        }
+        // The offset is taken out before the sum, so that the mean of large coordinates loses nothing.
+        let sum = inliers.iter().fold(DVec3::ZERO, |sum, &c| sum + (c - self.centre));
+        let mean = self.centre + sum / inliers.len().max(1) as f64;
+        let largest = inliers.iter().map(|c| c.distance(mean)).fold(0.0, f64::max);
+        if largest > negligible(self.point_distance, self.centre) {
+            (1.1 * largest, outliers)
+        } else if self.point_distance > 0.0 {
+            (self.point_distance, outliers)
+        } else {
+            (1.0, outliers)
+        }
+    }
+}
+
+/// Whether every coordinate is finite and small enough to be squared.
+pub fn usable(position: DVec3) -> bool {
+    position.to_array().iter().all(|x| x.abs() <= LARGEST_COORDINATE)
+}
+
+fn negligible(point_distance: f64, centre: DVec3) -> f64 {
+    (NEGLIGIBLE * point_distance).max(1e-12 * centre.abs().max_element())
+}
+
+/// The middle value (the mean of the two middle ones for an even count); 0 for none.
+fn median(mut values: Vec<f64>) -> f64 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let middle = values.len() / 2;
+    let even = values.len().is_multiple_of(2);
+    let (below, &mut upper, _) = values.select_nth_unstable_by(middle, f64::total_cmp);
+    if even { (below.iter().copied().fold(f64::NEG_INFINITY, f64::max) + upper) / 2.0 } else { upper }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::rng::{Purpose, Stream};
+    use glam::DMat3;
+
+    fn cloud(n: u64, radius: f64, offset: DVec3, key: u64) -> Vec<DVec3> {
+        let mut s = Stream::new(1, Purpose::Test, key, 0);
+        (0..n).map(|_| offset + radius * DVec3::from_array(std::array::from_fn(|_| s.range(-1.0, 1.0)))).collect()
+    }
+
+    fn arrays(points: &[DVec3]) -> Vec<[f64; 3]> {
+        points.iter().map(|p| p.to_array()).collect()
+    }
+
+    #[test]
+    fn medians_of_odd_and_even_counts() {
+        assert_eq!(median(vec![]), 0.0);
+        assert_eq!(median(vec![3.0]), 3.0);
+        assert_eq!(median(vec![5.0, 1.0]), 3.0);
+        assert_eq!(median(vec![9.0, 1.0, 2.0]), 2.0);
+        assert_eq!(median(vec![9.0, 1.0, 2.0, 4.0]), 3.0);
+    }
+
+    #[test]
+    fn outliers_hardly_move_the_frame() {
+        let (cameras, points) = (cloud(101, 3.0, DVec3::ZERO, 1), cloud(1000, 5.0, DVec3::ZERO, 2));
+        let clean = Extent::measure(&cameras, &arrays(&points));
+        let (mut far_cameras, mut far_points) = (cameras.clone(), arrays(&points));
+        far_cameras.push(DVec3::splat(1e9));
+        far_points.extend([[1e12; 3], [f64::NAN; 3], [f64::INFINITY, 0.0, 0.0], [1e200; 3]]);
+        let dirty = Extent::measure(&far_cameras, &far_points);
+        // One of 102 values moves a median by one rank: about 1 % of the spread per coordinate.
+        assert!(dirty.centre.distance(clean.centre) < 0.2, "{dirty:?} {clean:?}");
+        assert!((dirty.camera_radius / clean.camera_radius - 1.0).abs() < 0.05);
+        let plausible = far_points.iter().filter(|&&p| dirty.is_plausible(DVec3::from_array(p))).count();
+        assert_eq!(plausible, 1000);
+        let (scale, outliers) = dirty.scene_scale(&far_cameras);
+        assert_eq!(outliers, [101]);
+        assert_eq!(scale, clean.scene_scale(&cameras).0);
+    }
+
+    #[test]
+    fn a_map_offset_changes_nothing_beyond_rounding() {
+        let offset = DVec3::new(5e5, 4.1e6, 300.0);
+        let cameras = cloud(40, 80.0, DVec3::ZERO, 3);
+        let points = cloud(500, 120.0, DVec3::ZERO, 4);
+        let moved: Vec<DVec3> = cameras.iter().map(|&c| c + offset).collect();
+        let moved_points: Vec<DVec3> = points.iter().map(|&p| p + offset).collect();
+        let (near, far) =
+            (Extent::measure(&cameras, &arrays(&points)), Extent::measure(&moved, &arrays(&moved_points)));
+        let (near_frame, far_frame) = (near.frame(), far.frame());
+        // f64 at 4e6 resolves 1e-9; one local unit is about 80.
+        assert!((near_frame.scale - far_frame.scale).abs() < 1e-8);
+        let rotation = DMat3::from_rotation_x(2.8) * DMat3::from_rotation_z(0.3);
+        for (a, b) in cameras.iter().zip(&moved) {
+            let va = near_frame.viewmat(&Pose { rotation, translation: -(rotation * *a) });
+            let vb = far_frame.viewmat(&Pose { rotation, translation: -(rotation * *b) });
+            for (x, y) in va.as_flattened().iter().zip(vb.as_flattened()) {
+                assert!((x - y).abs() < 3e-7, "{x} {y}"); // an ulp of a value up to 2
+            }
+        }
+        for (a, b) in points.iter().zip(&moved_points) {
+            assert!(near_frame.to_local(*a).distance(far_frame.to_local(*b)) < 1e-9);
+            assert!(far_frame.to_world(far_frame.to_local(*b)).distance(*b) < 1e-8);
+        }
+    }
+
+    #[test]
+    fn degenerate_scenes_have_a_positive_scale() {
+        let one = DVec3::new(1.0, 2.0, 3.0);
+        let cases: [(Vec<DVec3>, Vec<[f64; 3]>); 6] = [
+            (vec![one], vec![]),
+            (vec![one], vec![[1.0, 2.0, 8.0]]),
+            (vec![one], vec![one.to_array()]),
+            (vec![one; 5], vec![[0.0; 3]; 7]),
+            (vec![DVec3::splat(f64::NAN)], vec![[f64::NAN; 3]]),
+            (vec![one, one + DVec3::X], vec![]),
+        ];
+        for (cameras, points) in cases {
+            let extent = Extent::measure(&cameras, &points);
+            let frame = extent.frame();
+            assert!(frame.scale.is_finite() && frame.scale > 0.0 && frame.origin.is_finite(), "{frame:?}");
+            let usable: Vec<DVec3> = cameras.into_iter().filter(|&c| usable(c)).collect();
+            let (scale, outliers) = extent.scene_scale(&usable);
+            assert!(scale.is_finite() && scale > 0.0 && outliers.is_empty());
+        }
+        assert_eq!(Extent::measure(&[one], &[[1.0, 2.0, 8.0]]).frame().scale, 5.0);
+    }
+}

@@ -1,0 +1,148 @@
+//! Masks: which file belongs to which photo, and which pixels it keeps.
+//!
+//! A mask is a picture of the photo's shape: white (128 and above) is kept, black is left out of loss and metrics. A
+//! transparent mask pixel counts as black. Masks lie in `masks/` beside (or inside) the image folder, under the
+//! photo's relative name: the same name, the name with `.png` appended, or the name with another picture extension.
+//! Extensions compare without case.
+//!
+//! Invariants: 1. the folder is listed once, never followed out of itself through a link; 2. mask size may differ
+//! from photo size, not its shape; 3. a target pixel is kept when at least half of its area is.
+
+use super::model::{Intrinsics, Lens};
+use super::photo::{self, intrinsics_at};
+use super::photo_header::PhotoHeader;
+use super::resize::{AreaResizer, Size, resize_area};
+use super::undistort::Undistorter;
+use crate::base::error::InputResult;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
+const DEEPEST: usize = 16;
+
+/// The mask of a photo.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MaskSource {
+    /// The mask's file.
+    pub path: PathBuf,
+    /// What its header says.
+    pub header: PhotoHeader,
+    /// Black is kept instead of white.
+    pub invert: bool,
+}
+
+/// Files of the mask folders by relative name.
+#[derive(Debug, Clone, Default)]
+pub struct MaskIndex {
+    files: BTreeMap<String, PathBuf>,
+}
+
+impl MaskIndex {
+    /// Lists `masks/` beside `image_folder`, then `masks/` inside it (the first wins). Missing folders are empty.
+    pub fn scan(image_folder: &Path) -> Self {
+        let mut index = MaskIndex::default();
+        if let Some(parent) = image_folder.parent() {
+            index.add_folder(&parent.join("masks"), "", 0);
+        }
+        index.add_folder(&image_folder.join("masks"), "", 0);
+        index
+    }
+
+    /// Whether there is no mask at all.
+    pub fn is_empty(&self) -> bool {
+        self.files.is_empty()
+    }
+
+    /// The mask of the photo with this `/`-separated relative name. A leading `images/` of the name is optional in
+    /// the mask folder.
+    pub fn find(&self, name: &str) -> Option<&Path> {
+        let short = name.strip_prefix("images/");
+        [Some(name), short].into_iter().flatten().find_map(|name| self.find_exact(name))
+    }
+
+    fn find_exact(&self, name: &str) -> Option<&Path> {
+        let stem = match name.rsplit_once('.') {
+            Some((stem, extension)) if !extension.contains('/') => stem,
+            _ => name,
+        };
+        let same = std::iter::once(normalised(name));
+        let appended = std::iter::once(format!("{name}.png"));
+        let others = EXTENSIONS.iter().map(|e| format!("{stem}.{e}"));
+        same.chain(appended).chain(others).find_map(|key| self.files.get(&key)).map(PathBuf::as_path)
+    }
+
+    fn add_folder(&mut self, folder: &Path, prefix: &str, depth: usize) {
+        let Ok(entries) = std::fs::read_dir(folder) else { return };
+        for entry in entries.flatten() {
+            let (Ok(kind), Ok(name)) = (entry.file_type(), entry.file_name().into_string()) else { continue };
+            let relative = format!("{prefix}{name}");
+            if kind.is_dir() && depth < DEEPEST {
+                self.add_folder(&entry.path(), &format!("{relative}/"), depth + 1);
+            } else if kind.is_file() {
+                self.files.entry(normalised(&relative)).or_insert_with(|| entry.path());
+            }
+        }
+    }
+}
+
+/// The name with its last extension in lower case.
+fn normalised(name: &str) -> String {
+    match name.rsplit_once('.') {
+        Some((stem, extension)) => format!("{stem}.{}", extension.to_ascii_lowercase()),
+        None => name.to_string(),
+    }
+}
+
+/// Decodes a mask for a photo with these full-size intrinsics: one byte per target pixel, 255 = keep, 0 = leave out.
+pub fn decode_mask(mask: &MaskSource, intrinsics: &Intrinsics, target: Size) -> InputResult<Vec<u8>> {
+    let mut keep = photo::read_luma(&mask.path, &mask.header)?;
+    for value in &mut keep {
+        let white = *value >= 128;
+        *value = if white != mask.invert { 255 } else { 0 };
+    }
+    let size = (mask.header.width, mask.header.height);
+    let mut share = if intrinsics.lens == Lens::Pinhole {
+        resize_area(&keep, 1, size, target)
+    } else {
+        let undistorter = Undistorter::new(intrinsics_at(intrinsics, size));
+        let mut resizer = AreaResizer::new(1, size, target, 256);
+        let (mut row, mut valid) = (vec![0u16; size.0 as usize], vec![0u8; size.0 as usize]);
+        for y in 0..size.1 {
+            undistorter.sample_row::<1>(&keep, y, &mut row, &mut valid);
+            resizer.push_row(&row);
+        }
+        resizer.finish()
+    };
+    threshold(&mut share);
+    Ok(share)
+}
+
+/// Shares of 0 to 255 become 0 or 255; half or more is kept.
+pub fn threshold(share: &mut [u8]) {
+    for value in share {
+        *value = if *value >= 128 { 255 } else { 0 };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn index(names: &[&str]) -> MaskIndex {
+        MaskIndex { files: names.iter().map(|n| (normalised(n), PathBuf::from(n))).collect() }
+    }
+
+    #[test]
+    fn masks_are_found_under_every_usual_name() {
+        let masks = index(&["a.PNG", "b.JPG.png", "c.jpg", "left/d.png", "E.png"]);
+        let found = |name: &str| masks.find(name).map(|p| p.to_string_lossy().into_owned());
+        assert_eq!(found("a.JPG").as_deref(), Some("a.PNG"));
+        assert_eq!(found("b.JPG").as_deref(), Some("b.JPG.png"));
+        assert_eq!(found("c.JPG").as_deref(), Some("c.jpg"));
+        assert_eq!(found("left/d.jpeg").as_deref(), Some("left/d.png"));
+        assert_eq!(found("images/left/d.jpeg").as_deref(), Some("left/d.png"));
+        assert_eq!(found("d.jpeg"), None);
+        assert_eq!(found("e.jpg"), None); // stems keep their case
+        assert_eq!(found("v1.2/noext"), None);
+    }
+}

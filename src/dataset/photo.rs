@@ -1,0 +1,197 @@
+//! From a photo file to a training target: decode, take the distortion out, average down, apply the mask.
+//!
+//! Every picture becomes 8-bit RGB: 16-bit samples are rounded, gray is repeated, CMYK is converted. Transparent
+//! pixels are composited over black, the colour the renderer starts from, so that a cut-out object (Blender's RGBA
+//! renders) is learned as an object in front of nothing. EXIF orientation is ignored: COLMAP poses refer to the
+//! stored pixels.
+//!
+//! Invariants: 1. a target depends on its [`PhotoSource`] and the files alone, never on budgets or threads; 2. the
+//! memory used at any moment of [`decode`] is at most [`PhotoSource::decode_bytes`]; 3. distorted photos are
+//! undistorted at full size, row by row into the area average: the full-size result never exists.
+
+use super::masks::{self, MaskSource};
+use super::model::{Intrinsics, Lens};
+use super::photo_header::{PhotoFormat, PhotoHeader};
+use super::resize::{AreaResizer, Size, resize_area};
+use super::undistort::Undistorter;
+use crate::base::error::{InputError, InputResult};
+use crate::scene::image::Target;
+use image::codecs::{jpeg::JpegDecoder, png::PngDecoder};
+use image::{DynamicImage, ImageDecoder, ImageError};
+use std::fs::File;
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+
+/// All that decoding a view's target needs; the files were checked at load.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PhotoSource {
+    /// The photo's file.
+    pub image_path: PathBuf,
+    /// What its header said at load.
+    pub header: PhotoHeader,
+    /// Intrinsics at the photo's true size, with the lens to be undone.
+    pub intrinsics: Intrinsics,
+    /// Size of the target, pixels.
+    pub target: Size,
+    /// The view's mask.
+    pub mask: Option<MaskSource>,
+}
+
+impl PhotoSource {
+    /// Bytes that the decoded target keeps, at most (a mask may turn out to be unnecessary).
+    pub fn target_bytes(&self) -> u64 {
+        let has_mask = self.mask.is_some() || self.intrinsics.lens != Lens::Pinhole;
+        self.target_pixels() * if has_mask { 4 } else { 3 }
+    }
+
+    /// Bytes that [`decode`] holds at its peak: the larger of the photo's and the mask's turn, with the target.
+    /// Buffers of a few rows are not counted.
+    pub fn decode_bytes(&self) -> u64 {
+        let photo = self.header.decode_bytes + self.target_bytes();
+        let undone = if self.intrinsics.lens == Lens::Pinhole { 0 } else { self.target_pixels() };
+        let mask = self.mask.as_ref().map_or(0, |m| m.header.decode_bytes + self.target_pixels());
+        photo.max(mask + self.target_bytes()) + undone
+    }
+
+    fn target_pixels(&self) -> u64 {
+        u64::from(self.target.0) * u64::from(self.target.1)
+    }
+}
+
+/// Intrinsics for the same photo at another size: each axis scaled by its own ratio. The lens acts on directions and
+/// stays.
+pub fn intrinsics_at(intrinsics: &Intrinsics, size: Size) -> Intrinsics {
+    let sx = f64::from(size.0) / f64::from(intrinsics.width);
+    let sy = f64::from(size.1) / f64::from(intrinsics.height);
+    Intrinsics {
+        width: size.0,
+        height: size.1,
+        fx: intrinsics.fx * sx,
+        fy: intrinsics.fy * sy,
+        cx: intrinsics.cx * sx,
+        cy: intrinsics.cy * sy,
+        lens: intrinsics.lens,
+    }
+}
+
+/// Decodes a view's target.
+///
+/// Errors: the photo or its mask cannot be read or decoded, or changed its size since load.
+pub fn decode(source: &PhotoSource) -> InputResult<Target> {
+    let rgb = read_rgb(&source.image_path, &source.header)?;
+    let full = (source.header.width, source.header.height);
+    let (rgb, valid) = if source.intrinsics.lens != Lens::Pinhole {
+        undistorted(&rgb, source)
+    } else if full == source.target {
+        (rgb, None)
+    } else {
+        (resize_area(&rgb, 3, full, source.target), None)
+    };
+    let mut mask = valid;
+    if let Some(mask_source) = &source.mask {
+        let mut kept = masks::decode_mask(mask_source, &source.intrinsics, source.target)?;
+        if let Some(valid) = &mask {
+            kept.iter_mut().zip(valid).for_each(|(k, v)| *k &= v);
+        }
+        mask = Some(kept);
+    }
+    let mask = mask.filter(|m| m.contains(&0));
+    Ok(Target { width: source.target.0, height: source.target.1, rgb, mask })
+}
+
+/// The photo without its distortion at target size, and the pixels of which at least half lies inside the photo.
+fn undistorted(rgb: &[u8], source: &PhotoSource) -> (Vec<u8>, Option<Vec<u8>>) {
+    let full = (source.header.width, source.header.height);
+    let undistorter = Undistorter::new(source.intrinsics);
+    let mut colors = AreaResizer::new(3, full, source.target, 256);
+    let mut shares = AreaResizer::new(1, full, source.target, 1);
+    let mut row = vec![0u16; 3 * full.0 as usize];
+    let mut valid = vec![0u8; full.0 as usize];
+    for y in 0..full.1 {
+        undistorter.sample_row::<3>(rgb, y, &mut row, &mut valid);
+        colors.push_row(&row);
+        shares.push_row(&valid);
+    }
+    let mut shares = shares.finish();
+    masks::threshold(&mut shares);
+    (colors.finish(), Some(shares))
+}
+
+/// Decodes a picture to 8-bit RGB over black.
+fn read_rgb(path: &Path, header: &PhotoHeader) -> InputResult<Vec<u8>> {
+    let picture = read_picture(path, header)?;
+    if !picture.color().has_alpha() {
+        return Ok(picture.into_rgb8().into_raw());
+    }
+    let rgba = picture.into_rgba8();
+    let mut rgb = Vec::with_capacity(rgba.len() / 4 * 3);
+    for &[r, g, b, a] in rgba.as_raw().as_chunks::<4>().0 {
+        rgb.extend([over_black(r, a), over_black(g, a), over_black(b, a)]);
+    }
+    Ok(rgb)
+}
+
+/// Decodes a picture to 8-bit gray over black.
+pub(super) fn read_luma(path: &Path, header: &PhotoHeader) -> InputResult<Vec<u8>> {
+    let picture = read_picture(path, header)?;
+    if !picture.color().has_alpha() {
+        return Ok(picture.into_luma8().into_raw());
+    }
+    let gray = picture.into_luma_alpha8();
+    Ok(gray.as_raw().as_chunks::<2>().0.iter().map(|&[l, a]| over_black(l, a)).collect())
+}
+
+fn over_black(value: u8, alpha: u8) -> u8 {
+    ((u32::from(value) * u32::from(alpha) + 127) / 255) as u8
+}
+
+fn read_picture(path: &Path, header: &PhotoHeader) -> InputResult<DynamicImage> {
+    let file = File::open(path).map_err(|e| InputError::io(path, "opening the photo", &e))?;
+    let reader = BufReader::new(file);
+    match header.format {
+        PhotoFormat::Jpeg => decode_with(JpegDecoder::new(reader).map_err(|e| undecodable(path, &e))?, path, header),
+        PhotoFormat::Png => decode_with(PngDecoder::new(reader).map_err(|e| undecodable(path, &e))?, path, header),
+    }
+}
+
+fn decode_with(decoder: impl ImageDecoder, path: &Path, header: &PhotoHeader) -> InputResult<DynamicImage> {
+    let (width, height) = decoder.dimensions();
+    if (width, height) != (header.width, header.height) {
+        let problem = format!("its size is {width} x {height} now, {} x {} at load", header.width, header.height);
+        return Err(InputError::new(path, problem, "do not change photos during a run; start it again"));
+    }
+    DynamicImage::from_decoder(decoder).map_err(|e| undecodable(path, &e))
+}
+
+fn undecodable(path: &Path, e: &ImageError) -> InputError {
+    match e {
+        ImageError::IoError(e) => InputError::io(path, "decoding the photo", e),
+        e => InputError::new(path, format!("the picture cannot be decoded: {e}"), "copy it again from its source"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn intrinsics_follow_the_true_size() {
+        let stated = Intrinsics {
+            width: 4000,
+            height: 3000,
+            fx: 3000.0,
+            fy: 3010.0,
+            cx: 2000.0,
+            cy: 1490.0,
+            lens: Lens::Pinhole,
+        };
+        let half = intrinsics_at(&stated, (2000, 1500));
+        assert_eq!((half.fx, half.fy, half.cx, half.cy), (1500.0, 1505.0, 1000.0, 745.0));
+        // Rounded sizes: each axis has its own ratio.
+        let odd = intrinsics_at(&stated, (1170, 878));
+        assert_eq!((odd.fx, odd.fy), (3000.0 * 1170.0 / 4000.0, 3010.0 * (878.0 / 3000.0)));
+        assert_eq!(over_black(200, 255), 200);
+        assert_eq!(over_black(200, 0), 0);
+        assert_eq!(over_black(255, 128), 128);
+    }
+}

@@ -1,0 +1,320 @@
+//! What a photo file says about itself, without decoding it: format, size, whether its end is there, and how much
+//! memory decoding will take.
+//!
+//! Invariants: 1. nothing is allocated in proportion to a number in the file; 2. a file that passes has a complete
+//! header and its format's end marker behind the start of the pixel data; 3. EXIF orientation is ignored, as COLMAP
+//! ignores it: sizes are those of the stored pixels.
+
+use super::resize::LARGEST_SIDE;
+use crate::base::error::{InputError, InputResult};
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
+
+/// Photos with more pixels are refused: no camera makes them, and a broken header easily claims them.
+pub const MOST_PIXELS: u64 = 500_000_000;
+
+/// How much of a file's end is searched for the end marker before the whole file is.
+const TAIL: u64 = 64 * 1024;
+
+/// File formats that can be decoded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PhotoFormat {
+    /// Baseline, extended or progressive JPEG.
+    Jpeg,
+    /// PNG.
+    Png,
+}
+
+/// What the header of a photo says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PhotoHeader {
+    /// File format.
+    pub format: PhotoFormat,
+    /// Stored width, pixels.
+    pub width: u32,
+    /// Stored height, pixels.
+    pub height: u32,
+    /// Bytes that the decoder needs at its peak, the 8-bit RGB result included.
+    pub decode_bytes: u64,
+}
+
+/// Reads and checks the header and the end of a photo file.
+///
+/// Errors: unreadable, empty, neither JPEG nor PNG, damaged header, cut short, or too large.
+pub fn read_header(path: &Path) -> InputResult<PhotoHeader> {
+    let file = File::open(path).map_err(|e| InputError::io(path, "opening the photo", &e))?;
+    let bytes = file.metadata().map_err(|e| InputError::io(path, "reading the photo", &e))?.len();
+    if bytes == 0 {
+        return Err(InputError::new(path, "the photo is empty (0 bytes)", COPY_AGAIN));
+    }
+    // The shortest picture of either format is longer than its two signatures together.
+    if bytes < 16 {
+        return Err(InputError::new(path, format!("the photo is cut short ({bytes} bytes)"), COPY_AGAIN));
+    }
+    let mut reader = HeaderReader { path, file: BufReader::with_capacity(4096, file), bytes };
+    let mut magic = [0u8; 16];
+    reader.read(&mut magic, "its first bytes")?;
+    if magic.starts_with(&[0xff, 0xd8]) {
+        reader.jpeg()
+    } else if magic.starts_with(b"\x89PNG\r\n\x1a\n") {
+        reader.png()
+    } else {
+        let problem = match foreign_format(&magic) {
+            Some(name) => format!("this is a {name} file; photos must be JPEG or PNG"),
+            None => "this is not a picture that can be read; photos must be JPEG or PNG".to_string(),
+        };
+        Err(InputError::new(path, problem, "convert the photo to JPEG or PNG under the name that the model uses")
+            .at("byte 0"))
+    }
+}
+
+const COPY_AGAIN: &str = "copy the photo again from its source, or remove it and use --allow-missing";
+
+fn foreign_format(magic: &[u8; 16]) -> Option<&'static str> {
+    Some(match magic {
+        [b'G', b'I', b'F', b'8', ..] => "GIF",
+        [b'B', b'M', ..] => "BMP",
+        [b'I', b'I', 42, 0, ..] | [b'M', b'M', 0, 42, ..] => "TIFF (or camera raw)",
+        [b'R', b'I', b'F', b'F', _, _, _, _, b'W', b'E', b'B', b'P', ..] => "WebP",
+        [_, _, _, _, b'f', b't', b'y', b'p', ..] => "HEIC or AVIF",
+        [0, 0, 0, 12, b'j', b'P', ..] => "JPEG 2000",
+        [0, 0, 0, 12, b'J', b'X', ..] => "JPEG XL",
+        [0x76, 0x2f, 0x31, 0x01, ..] => "OpenEXR",
+        _ => return None,
+    })
+}
+
+struct HeaderReader<'a> {
+    path: &'a Path,
+    file: BufReader<File>,
+    bytes: u64,
+}
+
+impl HeaderReader<'_> {
+    fn io(&self, e: &std::io::Error) -> InputError {
+        InputError::io(self.path, "reading the photo", e)
+    }
+
+    fn read(&mut self, into: &mut [u8], what: &str) -> InputResult<()> {
+        let at = self.file.stream_position().map_err(|e| self.io(&e))?;
+        self.file.read_exact(into).map_err(|e| {
+            if e.kind() == std::io::ErrorKind::UnexpectedEof {
+                self.truncated(format!("byte {at} of {}", self.bytes), what)
+            } else {
+                self.io(&e)
+            }
+        })
+    }
+
+    fn truncated(&self, place: String, what: &str) -> InputError {
+        InputError::new(self.path, format!("the photo is cut short: {what} is not there"), COPY_AGAIN).at(place)
+    }
+
+    fn damaged(&self, at: u64, problem: &str) -> InputError {
+        InputError::new(self.path, format!("the photo is damaged: {problem}"), COPY_AGAIN).at(format!("byte {at}"))
+    }
+
+    /// Walks the segments up to the first scan (ITU T.81, annex B).
+    fn jpeg(mut self) -> InputResult<PhotoHeader> {
+        let mut at = 2u64;
+        let mut frame = None;
+        loop {
+            self.file.seek(SeekFrom::Start(at)).map_err(|e| self.io(&e))?;
+            let mut marker = [0u8; 2];
+            self.read(&mut marker, "a segment of its header")?;
+            match marker {
+                [0xff, 0xff] => at += 1, // fill byte
+                [0xff, 0x01 | 0xd0..=0xd8] => at += 2,
+                [0xff, 0xda] => break,
+                [0xff, 0xd9] => return Err(self.damaged(at, "it ends before its pixels begin")),
+                [0xff, code] if code != 0 => {
+                    let mut length = [0u8; 2];
+                    self.read(&mut length, "a segment of its header")?;
+                    let length = u64::from(u16::from_be_bytes(length));
+                    if length < 2 {
+                        return Err(self.damaged(at, "a segment is shorter than its own length field"));
+                    }
+                    if (0xc0..=0xcf).contains(&code) && ![0xc4, 0xc8, 0xcc].contains(&code) {
+                        frame = Some(self.jpeg_frame(code, at)?);
+                    }
+                    at += 2 + length;
+                }
+                _ => return Err(self.damaged(at, "a JPEG marker is expected here")),
+            }
+        }
+        let Some(header) = frame else {
+            return Err(self.damaged(at, "its pixels begin before its size is stated"));
+        };
+        // Pixel data cannot contain this pair (a 255 in it is followed by 0), a preview in the header can: so only
+        // what follows the start of the scan counts. Anything may follow the marker.
+        self.require_end(at, &[0xff, 0xd9], "the end marker (FF D9)")?;
+        Ok(header)
+    }
+
+    fn jpeg_frame(&mut self, code: u8, at: u64) -> InputResult<PhotoHeader> {
+        let mut f = [0u8; 6];
+        self.read(&mut f, "its frame header")?;
+        let (height, width) = (u16::from_be_bytes([f[1], f[2]]), u16::from_be_bytes([f[3], f[4]]));
+        let components = u64::from(f[5]);
+        if code > 0xc2 || f[0] != 8 {
+            let problem = "its JPEG coding (lossless, arithmetic or 12-bit) cannot be read";
+            let remedy = "save the photo again as an ordinary 8-bit JPEG or as PNG";
+            return Err(InputError::new(self.path, problem, remedy).at(format!("byte {at}")));
+        }
+        let pixels = self.check_size(u32::from(width), u32::from(height), at)?;
+        // Result, then RGB made from it when it is gray; a progressive file keeps all 16-bit coefficients.
+        let result = if components == 1 { 4 } else { 3 };
+        let coefficients = if code == 0xc2 { 2 * components.min(4) } else { 0 };
+        let decode_bytes = self.bytes + pixels * (result + coefficients);
+        Ok(PhotoHeader { format: PhotoFormat::Jpeg, width: width.into(), height: height.into(), decode_bytes })
+    }
+
+    /// Signature, IHDR and IEND (PNG specification, sections 5 and 11.2).
+    fn png(mut self) -> InputResult<PhotoHeader> {
+        self.file.seek(SeekFrom::Start(8)).map_err(|e| self.io(&e))?;
+        let mut h = [0u8; 21];
+        self.read(&mut h, "its IHDR chunk")?;
+        if h[..8] != *b"\0\0\0\x0dIHDR" {
+            return Err(self.damaged(8, "an IHDR chunk is expected here"));
+        }
+        let width = u32::from_be_bytes([h[8], h[9], h[10], h[11]]);
+        let height = u32::from_be_bytes([h[12], h[13], h[14], h[15]]);
+        let pixels = self.check_size(width, height, 16)?;
+        let samples = match h[17] {
+            0 => 1,
+            2 | 3 => 3,
+            4 => 2,
+            6 => 4,
+            _ => return Err(self.damaged(25, "its colour type does not exist")),
+        };
+        let decoded = if h[16] == 16 { 2 * samples } else { samples };
+        // An 8-bit RGB result is used as it is; others are converted, with an RGBA copy between when there is alpha.
+        let converted = match (h[17], h[16]) {
+            (2 | 3, 1..=8) => 0,
+            (4 | 6, _) => 4 + 3,
+            _ => 3,
+        };
+        // A palette may carry alpha (tRNS): counted as RGBA with its conversion.
+        let per_pixel = if h[17] == 3 || h[17] == 2 { (decoded + converted).max(4 + 3) } else { decoded + converted };
+        self.require_end(33, b"IEND\xae\x42\x60\x82", "the end chunk (IEND)")?;
+        Ok(PhotoHeader { format: PhotoFormat::Png, width, height, decode_bytes: pixels * per_pixel })
+    }
+
+    fn check_size(&self, width: u32, height: u32, at: u64) -> InputResult<u64> {
+        if width == 0 || height == 0 {
+            return Err(self.damaged(at, &format!("it states a size of {width} x {height}")));
+        }
+        let pixels = u64::from(width) * u64::from(height);
+        if width > LARGEST_SIDE || height > LARGEST_SIDE || pixels > MOST_PIXELS {
+            let problem = format!(
+                "it states a size of {width} x {height}; at most {LARGEST_SIDE} a side and {MOST_PIXELS} pixels can be read"
+            );
+            let remedy = "if the size is real, make the photos smaller and give their folder with --images";
+            return Err(InputError::new(self.path, problem, remedy).at(format!("byte {at}")));
+        }
+        Ok(pixels)
+    }
+
+    /// Requires `marker` somewhere behind `from`: first in the file's last 64 KiB, then anywhere.
+    fn require_end(&mut self, from: u64, marker: &[u8], what: &str) -> InputResult<()> {
+        let tail = self.bytes.saturating_sub(TAIL).max(from);
+        for (start, end) in [(tail, self.bytes), (from, self.bytes)] {
+            if self.find(start, end, marker)? {
+                return Ok(());
+            }
+        }
+        Err(self.truncated(format!("byte {}", self.bytes), what))
+    }
+
+    /// Whether `marker` occurs in bytes `start..end`, read in blocks that overlap by a marker's length.
+    fn find(&mut self, start: u64, end: u64, marker: &[u8]) -> InputResult<bool> {
+        let mut block = vec![0u8; TAIL as usize];
+        let overlap = marker.len() as u64 - 1;
+        let mut at = start;
+        while at + overlap < end {
+            let length = (end - at).min(TAIL) as usize;
+            self.file.seek(SeekFrom::Start(at)).map_err(|e| self.io(&e))?;
+            self.read(&mut block[..length], "its end")?;
+            if block[..length].windows(marker.len()).any(|w| w == marker) {
+                return Ok(true);
+            }
+            at += length as u64 - overlap;
+        }
+        Ok(false)
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use std::io::Write;
+
+    fn check(bytes: &[u8]) -> InputResult<PhotoHeader> {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        file.write_all(bytes).unwrap();
+        read_header(file.path())
+    }
+
+    fn encoded(format: image::ImageFormat) -> Vec<u8> {
+        let picture = image::RgbImage::from_fn(40, 30, |x, y| image::Rgb([x as u8 * 6, y as u8 * 8, (x * y) as u8]));
+        let mut bytes = std::io::Cursor::new(Vec::new());
+        picture.write_to(&mut bytes, format).unwrap();
+        bytes.into_inner()
+    }
+
+    #[test]
+    fn whole_files_pass_also_with_data_appended() {
+        for (format, want) in
+            [(image::ImageFormat::Jpeg, PhotoFormat::Jpeg), (image::ImageFormat::Png, PhotoFormat::Png)]
+        {
+            let mut bytes = encoded(format);
+            let header = check(&bytes).unwrap();
+            assert_eq!((header.format, header.width, header.height), (want, 40, 30));
+            for appended in [3, 100_000] {
+                bytes.resize(bytes.len() + appended, 0);
+                assert_eq!(check(&bytes).unwrap().width, 40);
+            }
+        }
+    }
+
+    #[test]
+    fn every_cut_is_noticed_and_no_garbage_panics() {
+        for format in [image::ImageFormat::Jpeg, image::ImageFormat::Png] {
+            let bytes = encoded(format);
+            for length in 0..bytes.len() {
+                let error = check(&bytes[..length]).unwrap_err();
+                assert!(!error.remedy.is_empty() && !error.problem.is_empty());
+            }
+            // The header with every byte set to extremes: any answer will do, a panic will not.
+            for at in 0..bytes.len().min(200) {
+                for value in [0, 1, 0x7f, 0xff] {
+                    let mut broken = bytes.clone();
+                    broken[at] = value;
+                    let _ = check(&broken);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn an_end_marker_in_a_preview_does_not_count() {
+        let bytes = encoded(image::ImageFormat::Jpeg);
+        let mut with_preview = vec![0xff, 0xd8, 0xff, 0xe1, 0, 6, 0xff, 0xd8, 0xff, 0xd9];
+        with_preview.extend(&bytes[2..]);
+        assert!(check(&with_preview).is_ok());
+        assert!(check(&with_preview[..with_preview.len() - 40]).is_err());
+    }
+
+    #[test]
+    fn other_formats_are_refused_by_name() {
+        let error = check(b"II\x2a\0\x08\0\0\0").unwrap_err();
+        assert!(error.problem.contains("TIFF"), "{error}");
+        assert!(check(b"hello").unwrap_err().problem.contains("JPEG or PNG"));
+        assert!(check(b"").unwrap_err().problem.contains("empty"));
+        let mut huge = encoded(image::ImageFormat::Png);
+        huge[16..24].copy_from_slice(&[0x7f, 0xff, 0xff, 0xff, 0, 0, 0, 1]);
+        assert!(check(&huge).unwrap_err().problem.contains("size"));
+    }
+}

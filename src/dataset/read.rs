@@ -1,0 +1,43 @@
+//! Which reader a path is for.
+
+use crate::base::error::{InputError, InputResult};
+use crate::dataset::model::RawScene;
+use crate::dataset::{colmap, transforms};
+use std::path::Path;
+
+/// What the user says about where things are.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct ReadOptions {
+    /// Image folder, relative to the scene; `None` is `images`. transforms.json names its photos with their folder:
+    /// there, `images` is only a second place to look, and any other folder replaces the one in the name.
+    pub images: Option<String>,
+    /// A photo that is needed now (its size is not in the JSON) and is missing: leave the view out with a warning
+    /// instead of failing. Photos whose size is known are the loader's to miss.
+    pub allow_missing: bool,
+}
+
+/// Reads a scene: a folder with a COLMAP model, a folder with `transforms*.json`, or such a JSON file. A folder that
+/// holds both is read as COLMAP.
+///
+/// # Errors
+/// Whatever is wrong with the files; a path with neither says what was looked for.
+pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
+    let facts = std::fs::metadata(path).map_err(|e| InputError::io(path, "opening the scene", &e))?;
+    if facts.is_file() {
+        if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) {
+            return transforms::read_transforms(path, options);
+        }
+        return Err(InputError::new(path, "a scene is a folder or a transforms.json", "give the folder that holds it"));
+    }
+    if colmap::looks_like_colmap(path) {
+        return colmap::read_colmap(path, options);
+    }
+    if transforms::looks_like_transforms(path) {
+        return transforms::read_transforms(path, options);
+    }
+    Err(InputError::new(
+        path,
+        format!("no scene here; looked for {}, and for transforms_train.json and transforms.json", colmap::LOOKED_FOR),
+        "give the folder that holds 'sparse' and 'images' or a transforms.json",
+    ))
+}

@@ -1,0 +1,279 @@
+//! A city that does not exist, photographed: the demo, the data of scaling runs, and a test scene.
+//!
+//! [`write_city`] builds a world from a seed (`world`, `build`, `parts`, `solid`, `texture`), plans a flight over it
+//! (`flight`), casts rays (`trace`, `shade`, `photo`), picks points (`points`) and writes an ordinary COLMAP scene:
+//! `images/view_0000.jpg ...` and `sparse/0/{cameras,images,points3D}.bin`. It knows nothing about training.
+//!
+//! Invariants: 1. the same options give the same bytes for any number of threads and on every platform: all draws
+//! are keyed, all arithmetic is + - * / sqrt and `libm`; 2. `sparse/` appears last and whole, under its final name
+//! in one rename, so that an interrupted run leaves no folder that reads as a scene.
+
+mod build;
+mod flight;
+mod parts;
+mod photo;
+mod points;
+mod shade;
+mod solid;
+mod texture;
+mod trace;
+mod world;
+
+use crate::base::error::{InputError, InputResult};
+use crate::dataset::colmap_write::{Model, ModelImage, write_file, write_model};
+use flight::Flight;
+use glam::DVec3;
+use image::{ExtendedColorType, codecs::jpeg::JpegEncoder};
+use photo::Photo;
+use shade::Scene;
+use std::path::{Path, PathBuf};
+use world::World;
+
+/// Quality of the JPEGs.
+const JPEG_QUALITY: u8 = 95;
+
+/// What city to make and how to photograph it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CityOptions {
+    /// Seed of everything.
+    pub seed: u64,
+    /// Photos, 1 to 100,000.
+    pub views: u32,
+    /// Width of a photo, pixels, 16 to 16,384.
+    pub width: u32,
+    /// Height of a photo, pixels, 16 to 16,384.
+    pub height: u32,
+    /// Points to sample, up to 50 million.
+    pub points: u32,
+    /// Side of the city in blocks of 60 m, 1 to 150 (each takes about 0.15 MB of memory); `None` takes what
+    /// the views cover at full overlap.
+    pub blocks: Option<u32>,
+    /// Standard deviation of the gain of the photos (0.03 is 3 %), 0 to 0.3.
+    pub exposure: f64,
+    /// Standard deviation of the sensor noise as a share of white, 0 to 0.3.
+    pub noise: f64,
+    /// Rays per pixel and direction where surfaces meet: 3 casts 3x3. 1 to 8.
+    pub supersample: u32,
+    /// Added to all coordinates, metres: (500000, 4600000, 0) makes them look like UTM.
+    pub offset: [f64; 3],
+    /// Replace a scene that is already in the folder.
+    pub overwrite: bool,
+}
+
+impl Default for CityOptions {
+    fn default() -> Self {
+        CityOptions {
+            seed: 1,
+            views: 60,
+            width: 480,
+            height: 320,
+            points: 20_000,
+            blocks: None,
+            exposure: 0.0,
+            noise: 0.0,
+            supersample: 3,
+            offset: [0.0; 3],
+            overwrite: false,
+        }
+    }
+}
+
+/// What was written.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CitySummary {
+    /// The scene's folder.
+    pub folder: PathBuf,
+    /// Photos written.
+    pub views: u32,
+    /// Points written.
+    pub points: u32,
+    /// Entries of all tracks.
+    pub observations: u64,
+    /// Side of the city in blocks.
+    pub blocks: u32,
+    /// Side of the city, metres.
+    pub side: f64,
+    /// Solids that the city is made of.
+    pub solids: u32,
+    /// Rays cast through pixels (shadow rays are not counted).
+    pub rays: u64,
+}
+
+/// Refuses options out of range, naming the flag of `gsscale-synth`.
+fn check(options: &CityOptions) -> InputResult<()> {
+    let in_range = |flag: &str, value: f64, low: f64, high: f64| {
+        if value >= low && value <= high {
+            return Ok(());
+        }
+        Err(InputError::new(flag, format!("{value} is out of range"), format!("choose {low} to {high}")))
+    };
+    in_range("--views", f64::from(options.views), 1.0, 100_000.0)?;
+    in_range("--resolution", f64::from(options.width), 16.0, 16_384.0)?;
+    in_range("--resolution", f64::from(options.height), 16.0, 16_384.0)?;
+    in_range("--points", f64::from(options.points), 0.0, 50e6)?;
+    in_range("--blocks", f64::from(options.blocks.unwrap_or(1)), 1.0, 150.0)?;
+    in_range("--exposure", options.exposure, 0.0, 0.3)?;
+    in_range("--noise", options.noise, 0.0, 0.3)?;
+    in_range("--supersample", f64::from(options.supersample), 1.0, 8.0)?;
+    options.offset.iter().try_for_each(|&v| in_range("--offset", v, -1e9, 1e9))
+}
+
+/// Makes the city and writes it to `folder` as a COLMAP scene. `progress(done, views)` is called after each photo.
+///
+/// # Errors
+/// Options out of range; a folder that holds something while `overwrite` is off; anything that cannot be written.
+pub fn write_city(
+    folder: &Path,
+    options: &CityOptions,
+    progress: &(dyn Fn(u32, u32) + Sync),
+) -> InputResult<CitySummary> {
+    check(options)?;
+    prepare(folder, options.overwrite)?;
+    let flight = flight::plan(options);
+    let scene = Scene::new(World::build(options.seed, flight.blocks));
+    let rays = write_photos(folder, options, &flight, &scene, progress)?;
+    let points = points::sample(&scene, &flight, options);
+    let offset = DVec3::from(options.offset);
+    let images = flight.shots.iter().enumerate();
+    let model = Model {
+        intrinsics: flight.intrinsics,
+        images: images.map(|(k, s)| ModelImage { name: photo_name(k, options.views), pose: s.pose(offset) }).collect(),
+        points,
+    };
+    write_model(&folder.join("sparse"), &model)?;
+    Ok(CitySummary {
+        folder: folder.to_path_buf(),
+        views: options.views,
+        points: model.points.len() as u32,
+        observations: model.points.iter().map(|p| p.observations.len() as u64).sum(),
+        blocks: flight.blocks,
+        side: 2.0 * scene.world.half(),
+        solids: scene.world.solids.len() as u32,
+        rays,
+    })
+}
+
+/// Name of a photo; names sort in the order of the flight.
+fn photo_name(k: usize, views: u32) -> String {
+    let digits = views.saturating_sub(1).to_string().len().max(4);
+    format!("view_{k:0digits$}.jpg")
+}
+
+/// Makes the folders; with `overwrite` takes away the scene that is there, but never photos that are not ours.
+fn prepare(folder: &Path, overwrite: bool) -> InputResult<()> {
+    make_folder(folder)?;
+    let images = folder.join("images");
+    if !list(folder)?.is_empty() {
+        if !overwrite {
+            return Err(InputError::new(
+                folder,
+                "the folder is not empty",
+                "choose another folder, or --overwrite to replace the generated scene in it",
+            ));
+        }
+        let photos = if images.is_dir() { list(&images)? } else { Vec::new() };
+        if let Some(foreign) = photos.iter().find(|name| !is_photo_name(name)) {
+            return Err(InputError::new(
+                &images,
+                format!("'{foreign}' is no photo of a generated city, so nothing is overwritten"),
+                "choose another folder",
+            ));
+        }
+        // The model goes first: without it the rest is no scene.
+        for name in ["sparse", "sparse.partial", "images"] {
+            let path = folder.join(name);
+            if path.symlink_metadata().is_ok_and(|m| m.is_dir()) {
+                std::fs::remove_dir_all(&path).map_err(|e| InputError::io(&path, "removing the old scene", &e))?;
+            }
+        }
+    }
+    make_folder(&images)
+}
+
+fn make_folder(path: &Path) -> InputResult<()> {
+    std::fs::create_dir_all(path).map_err(|e| InputError::io(path, "making the folder", &e))
+}
+
+/// Names of what is in a folder.
+fn list(folder: &Path) -> InputResult<Vec<String>> {
+    let names = std::fs::read_dir(folder)
+        .and_then(|entries| entries.map(|e| Ok(e?.file_name().to_string_lossy().into_owned())).collect());
+    names.map_err(|e: std::io::Error| InputError::io(folder, "listing the folder", &e))
+}
+
+/// Whether [`photo_name`] makes such names (what a broken run leaves counts too).
+fn is_photo_name(name: &str) -> bool {
+    let name = name.strip_suffix(".partial").unwrap_or(name);
+    let number = name.strip_prefix("view_").and_then(|n| n.strip_suffix(".jpg"));
+    number.is_some_and(|n| n.len() >= 4 && n.bytes().all(|b| b.is_ascii_digit()))
+}
+
+/// Takes and writes all photos; returns the rays cast.
+fn write_photos(
+    folder: &Path,
+    options: &CityOptions,
+    flight: &Flight,
+    scene: &Scene,
+    progress: &(dyn Fn(u32, u32) + Sync),
+) -> InputResult<u64> {
+    let mut rays = 0;
+    let mut waiting: Option<(usize, Photo)> = None;
+    // While one photo is taken, the one before it is compressed and written.
+    for k in 0..=flight.shots.len() {
+        let done = waiting.take();
+        let (taken, written) = rayon::join(
+            || {
+                let shot = flight.shots.get(k)?;
+                Some((k, photo::take(scene, &flight.intrinsics, shot, k as u32, options)))
+            },
+            || match &done {
+                Some((j, photo)) => write_photo(folder, options, *j, photo),
+                None => Ok(()),
+            },
+        );
+        written?;
+        if let Some((j, photo)) = done {
+            rays += photo.rays;
+            progress(j as u32 + 1, options.views);
+        }
+        waiting = taken;
+    }
+    Ok(rays)
+}
+
+fn write_photo(folder: &Path, options: &CityOptions, k: usize, photo: &Photo) -> InputResult<()> {
+    let path = folder.join("images").join(photo_name(k, options.views));
+    let mut bytes = Vec::with_capacity(photo.rgb.len() / 4);
+    JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY)
+        .encode(&photo.rgb, options.width, options.height, ExtendedColorType::Rgb8)
+        .map_err(|e| InputError::new(&path, format!("compressing failed: {e}"), "choose another --resolution"))?;
+    write_file(&path, |out| out.write_all(&bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_out_of_range_are_refused_by_flag() {
+        let cases: [(CityOptions, &str); 5] = [
+            (CityOptions { views: 0, ..Default::default() }, "--views"),
+            (CityOptions { width: 8, ..Default::default() }, "--resolution"),
+            (CityOptions { noise: f64::NAN, ..Default::default() }, "--noise"),
+            (CityOptions { supersample: 0, ..Default::default() }, "--supersample"),
+            (CityOptions { offset: [0.0, f64::INFINITY, 0.0], ..Default::default() }, "--offset"),
+        ];
+        for (options, flag) in cases {
+            let error = check(&options).err().map(|e| e.to_string()).unwrap_or_default();
+            assert!(error.starts_with(flag), "{error}");
+        }
+        assert!(check(&CityOptions::default()).is_ok());
+    }
+
+    #[test]
+    fn names_sort_in_flight_order() {
+        assert_eq!(photo_name(7, 60), "view_0007.jpg");
+        assert_eq!(photo_name(7, 10_000), "view_0007.jpg");
+        assert_eq!(photo_name(7, 10_001), "view_00007.jpg");
+    }
+}

@@ -1,0 +1,265 @@
+//! Light: the sun with sharp shadows, a blue sky with the share of it that each place sees, a little light from the
+//! ground, and a mild gloss that depends on the direction of view.
+//!
+//! Invariant: the light of a place is a function of (world, place, direction of view, footprint) alone.
+
+use super::solid::{Entry, Face, Ray, Shape, Solid};
+use super::texture::{Look, Place};
+use super::trace::Grid;
+use super::world::World;
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+
+/// Side of a cell of the sky map, metres.
+const SKY_CELL: f64 = 1.0;
+/// Directions that sample the sky.
+const SKY_RAYS: usize = 32;
+/// How far a sky ray looks for obstacles, metres.
+const SKY_REACH: f64 = 45.0;
+
+const SUN_LIGHT: Vec3 = Vec3::new(1.42, 1.30, 1.10);
+const SKY_LIGHT: Vec3 = Vec3::new(0.40, 0.47, 0.58);
+const GROUND_LIGHT: Vec3 = Vec3::new(0.17, 0.155, 0.13);
+
+/// Unit vector towards the sun: 47 degrees high in the south-east.
+fn sun() -> DVec3 {
+    let v = DVec3::new(0.52, -0.43, 0.74);
+    v / v.length()
+}
+
+/// A world ready for rays.
+pub(super) struct Scene {
+    pub(super) world: World,
+    grid: Grid,
+    sun: DVec3,
+    sky: SkyMap,
+}
+
+/// How much of the sky the top of each square metre sees, and how high that top is.
+struct SkyMap {
+    low: f64,
+    cells: usize,
+    height: Vec<f32>,
+    open: Vec<f32>,
+}
+
+/// What a ray met.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Hit {
+    pub(super) t: f64,
+    pub(super) point: DVec3,
+    pub(super) normal: DVec3,
+    /// Solid and its part; `None` for the ground.
+    solid: Option<(u32, Face)>,
+}
+
+/// Light along one ray.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Sample {
+    /// Linear light.
+    pub(super) light: Vec3,
+    /// Changes at every border of a surface or a shadow.
+    pub(super) surface: u32,
+}
+
+/// Surface number of the sky.
+const SKY: Sample = Sample { light: Vec3::new(0.55, 0.68, 0.85), surface: u32::MAX };
+
+impl Scene {
+    /// Prepares the world: grid, sky map.
+    pub(super) fn new(world: World) -> Scene {
+        let grid = Grid::new(&world.solids);
+        let sky = SkyMap::new(&world, &grid);
+        Scene { world, grid, sun: sun(), sky }
+    }
+
+    /// What the ray meets; `None` is the sky.
+    pub(super) fn hit(&self, ray: &Ray) -> Option<Hit> {
+        let ground = if ray.along.z < 0.0 { -ray.from.z * ray.inverse.z } else { f64::INFINITY };
+        if let Some((k, Entry { t, normal, face })) = self.grid.nearest(&self.world.solids, ray, ground.min(1e5)) {
+            let normal = self.world.solids[k as usize].turn_out(normal);
+            return Some(Hit { t, point: ray.at(t), normal, solid: Some((k, face)) });
+        }
+        if !ground.is_finite() {
+            return None;
+        }
+        let p = ray.at(ground);
+        Some(Hit { t: ground, point: DVec3::new(p.x, p.y, 0.0), normal: DVec3::Z, solid: None })
+    }
+
+    /// Whether the straight line between a place (just off its surface) and a camera is free.
+    pub(super) fn sees(&self, camera: DVec3, hit: &Hit) -> bool {
+        let from = hit.point + hit.normal * 0.02;
+        let way = camera - from;
+        let length = way.length();
+        !self.grid.blocked(&self.world.solids, &Ray::new(from, way / length), length)
+    }
+
+    /// Light along a ray; `spread` is the side of a sample's footprint at distance 1.
+    pub(super) fn sample(&self, ray: &Ray, spread: f64) -> Sample {
+        match self.hit(ray) {
+            Some(hit) => self.shade(ray, &hit, spread),
+            None => SKY,
+        }
+    }
+
+    /// Light from a place towards the ray's origin.
+    pub(super) fn shade(&self, ray: &Ray, hit: &Hit, spread: f64) -> Sample {
+        let facing = -hit.normal.dot(ray.along);
+        // The footprint is longer the flatter the view; its side is taken between both extents.
+        let w = hit.t * spread / facing.max(0.08).sqrt();
+        let (look, surface) = match hit.solid {
+            Some((k, face)) => {
+                let solid = &self.world.solids[k as usize];
+                (solid_look(&self.world, solid, face, hit.point, w), (k + 64) * 8 + face as u32)
+            }
+            None => self.world.ground(hit.point.x, hit.point.y, w),
+        };
+        let (light, in_sun) = self.light(ray, hit, &look, w);
+        Sample { light, surface: surface * 2 + u32::from(in_sun) }
+    }
+
+    fn light(&self, ray: &Ray, hit: &Hit, look: &Look, w: f64) -> (Vec3, bool) {
+        let mut n = hit.normal;
+        if look.rough > 0.0 {
+            let p = hit.point;
+            let noise = &self.world.noise;
+            let tilt = |a: f64, b: f64| f64::from(noise.layers(a, b, w, &[(0.9, 0.6), (0.4, 0.6), (0.2, 0.4)]));
+            let bump = DVec3::new(tilt(p.x + p.z, p.y), tilt(p.y - p.z, p.x), tilt(p.z + p.x, p.y - p.x));
+            let turned = n + bump * f64::from(look.rough);
+            n = turned / turned.length();
+        }
+        let to_sun = hit.normal.dot(self.sun);
+        let mut in_sun = to_sun > 0.0;
+        if in_sun {
+            let away = Ray::new(hit.point + hit.normal * 1e-3, self.sun);
+            in_sun = !self.grid.blocked(&self.world.solids, &away, 1e4);
+        }
+        let direct = if in_sun { n.dot(self.sun).max(0.0) as f32 } else { 0.0 };
+        let open = self.sky.open_at(hit.point + hit.normal * 0.7);
+        let up = (0.5 + 0.5 * n.z) as f32;
+        let ambient = SKY_LIGHT * (open * up) + GROUND_LIGHT * ((1.0 - up) * (0.4 + 0.6 * open));
+        let mut light = look.albedo * (SUN_LIGHT * direct + ambient);
+        if look.gloss > 0.0 {
+            light += self.gloss(ray, hit.normal, look.gloss, in_sun, open);
+        }
+        (light, in_sun)
+    }
+
+    /// Mirror-like part: sky or street in the mirrored direction, and a broad highlight of the sun.
+    fn gloss(&self, ray: &Ray, n: DVec3, gloss: f32, in_sun: bool, open: f32) -> Vec3 {
+        let facing = (-n.dot(ray.along)).clamp(0.0, 1.0);
+        let mirrored = ray.along + n * (2.0 * facing);
+        // Schlick's approximation of Fresnel's law, with a floor of 6 %.
+        let rest = (1.0 - facing) as f32;
+        let fresnel = 0.06 + 0.94 * rest * rest * rest * rest * rest;
+        let up = mirrored.z as f32;
+        let around = if up > 0.0 {
+            Vec3::new(0.75, 0.85, 1.0).lerp(Vec3::new(0.4, 0.6, 0.9), up) * (0.3 + 0.7 * open)
+        } else {
+            // What stands opposite: bright towards the side that the sun lights.
+            let lit = (mirrored.x * self.sun.x + mirrored.y * self.sun.y) as f32;
+            Vec3::new(0.42, 0.38, 0.33).lerp(Vec3::new(0.16, 0.16, 0.17), -up) * (1.0 - 0.45 * lit)
+        };
+        let mut light = around * (fresnel * gloss * 1.6);
+        if in_sun {
+            let c = mirrored.dot(self.sun).max(0.0) as f32;
+            let c4 = (c * c) * (c * c);
+            light += SUN_LIGHT * (c4 * c4 * c4 * c4 * gloss * 0.35);
+        }
+        light
+    }
+}
+
+/// Surface of a solid at a world point.
+fn solid_look(world: &World, solid: &Solid, face: Face, point: DVec3, w: f64) -> Look {
+    let p = solid.turn_in(point - solid.origin);
+    let (half_x, half_y, height) = match solid.shape {
+        Shape::Block { half_x, half_y, height } | Shape::Roof { half_x, half_y, height, .. } => {
+            (half_x, half_y, height)
+        }
+        Shape::Ellipsoid { radii } => (radii.x, radii.y, radii.z),
+    };
+    let (x, y) = (p.x + half_x, p.y + half_y);
+    let (u, v, width, height) = match face {
+        Face::SideX => (y, p.z, 2.0 * half_y, height),
+        Face::SideY => (x, p.z, 2.0 * half_x, height),
+        Face::Top | Face::Bottom => (x, y, 2.0 * half_x, 2.0 * half_y),
+        Face::SlopeY => {
+            let stretch = (half_y * half_y + height * height).sqrt();
+            (x, (1.0 - p.y.abs() / half_y) * stretch, 2.0 * half_x, stretch)
+        }
+        Face::SlopeX => {
+            let run = if let Shape::Roof { run, .. } = solid.shape { run } else { half_x };
+            let stretch = (run * run + height * height).sqrt();
+            (y, (half_x - p.x.abs()) / run * stretch, 2.0 * half_y, stretch)
+        }
+        Face::Round => (p.x + 0.6 * p.z, p.y - 0.6 * p.z, 2.0 * half_x, 2.0 * half_y),
+    };
+    let skin = match face {
+        Face::SideX | Face::SideY | Face::Round | Face::Bottom => &solid.side,
+        Face::Top | Face::SlopeX | Face::SlopeY => &solid.top,
+    };
+    skin.look(&world.noise, Place { u, v, width, height, w })
+}
+
+impl SkyMap {
+    fn new(world: &World, grid: &Grid) -> SkyMap {
+        let half = world.half() + 25.0;
+        let cells = (2.0 * half / SKY_CELL) as usize + 1;
+        let directions = sky_directions();
+        let rows: Vec<(Vec<f32>, Vec<f32>)> = (0..cells)
+            .into_par_iter()
+            .map(|j| {
+                (0..cells)
+                    .map(|i| {
+                        let (x, y) = (i as f64 * SKY_CELL - half, j as f64 * SKY_CELL - half);
+                        let height = grid.top_at(&world.solids, x, y);
+                        let from = DVec3::new(x, y, height + 0.1);
+                        let free = |d: &&DVec3| !grid.blocked(&world.solids, &Ray::new(from, **d), SKY_REACH);
+                        let open = directions.iter().filter(free).count() as f32 / SKY_RAYS as f32;
+                        (height as f32, open)
+                    })
+                    .unzip()
+            })
+            .collect();
+        let (height, open): (Vec<_>, Vec<_>) = rows.into_iter().unzip();
+        SkyMap { low: -half, cells, height: height.concat(), open: open.concat() }
+    }
+
+    /// Share of the sky that a point sees, weighted by the cosine to the vertical.
+    fn open_at(&self, p: DVec3) -> f32 {
+        let (x, y) = ((p.x - self.low) / SKY_CELL, (p.y - self.low) / SKY_CELL);
+        let last = (self.cells - 1) as f64;
+        if !(x > 0.0 && y > 0.0 && x < last && y < last) {
+            return 0.96;
+        }
+        let (i, j) = (x as usize, y as usize);
+        let (fx, fy) = ((x - i as f64) as f32, (y - j as f64) as f32);
+        let z = p.z as f32;
+        let (mut sum, mut weight) = (0.0, 0.0);
+        for (dj, wy) in [(0, 1.0 - fy), (1, fy)] {
+            for (di, wx) in [(0, 1.0 - fx), (1, fx)] {
+                let c = (j + dj) * self.cells + i + di;
+                let above = z - self.height[c];
+                // A corner whose top lies above the point is inside or over it and says nothing about it.
+                let usable = (1.5 + above).clamp(0.0, 1.0) * wx * wy;
+                let rise = (above / 16.0).clamp(0.0, 1.0);
+                sum += usable * (self.open[c] + (1.0 - self.open[c]) * rise);
+                weight += usable;
+            }
+        }
+        // Under a crown or an eave.
+        let covered = 0.45;
+        (sum + covered * 0.05) / (weight + 0.05)
+    }
+}
+
+/// Directions over the upper half, dense towards the zenith as the cosine is (a spiral on the disk, lifted).
+fn sky_directions() -> [DVec3; SKY_RAYS] {
+    std::array::from_fn(|k| {
+        let area = (k as f64 + 0.5) / SKY_RAYS as f64;
+        let (radius, turn) = (area.sqrt(), 2.399_963_229_728_653 * k as f64);
+        DVec3::new(radius * libm::cos(turn), radius * libm::sin(turn), (1.0 - area).sqrt())
+    })
+}

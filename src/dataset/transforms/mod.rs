@@ -1,0 +1,257 @@
+//! Reads `transforms.json` scenes: nerfstudio's and instant-ngp's single file, Blender's and MatrixCity's
+//! `transforms_train/val/test.json`. Photos are opened only for their size, and only when the JSON does not state it.
+//!
+//! Invariants: 1. whatever the JSON holds, the result is a scene or an [`InputError`] that names file and key; 2. a
+//! view is left out, with a warning that names it, only for its own pose or, when allowed, its missing photo.
+//!
+//! Which files: a folder with `transforms_train.json` is read as a split scene, `transforms_test.json` being the test
+//! set. `transforms_val.json` is the test set only where there is no test file; otherwise its views are left out, with
+//! a warning. A folder without is read from `transforms.json`, whose `train_filenames`, `val_filenames` and
+//! `test_filenames`, if any, are obeyed in the same way. A JSON given by its path is read alone and prescribes no
+//! split by its own name.
+//!
+//! Poses are taken as they stand: `applied_transform` and `applied_scale` tell how they came about, and
+//! `ply_file_path` is in the same frame.
+
+mod intrinsics;
+mod json;
+mod photos;
+mod pose;
+
+use crate::base::error::{InputError, InputResult};
+use crate::dataset::checks::{listed, sort_views};
+use crate::dataset::model::{PointCloud, RawScene, RawView, Split};
+use crate::dataset::paths::{clean_name, safe_join};
+use crate::dataset::read::ReadOptions;
+use intrinsics::Levels;
+use json::{FIX_KEY, Node};
+use serde_json::{Map, Value};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+const STAY_INSIDE: &str = "paths must be relative to the JSON and stay in its folder: move the JSON to a folder above the \
+                           files that it names and write the paths from there";
+
+/// Whether [`read_transforms`] finds something in this folder.
+pub fn looks_like_transforms(folder: &Path) -> bool {
+    ["transforms_train.json", "transforms.json"].iter().any(|n| folder.join(n).is_file())
+}
+
+/// Reads a folder with `transforms*.json` or one such file. Paths in it are relative to its folder and must stay
+/// there. `points_path` is set when `ply_file_path` names a file that exists.
+///
+/// # Errors
+/// No JSON, broken JSON, keys of the wrong kind, cameras that cannot be used, names that leave the folder or occur
+/// twice, no view left, photos that are missing while their size is needed.
+pub fn read_transforms(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
+    let mut reading =
+        Reading { options, views: Vec::new(), bad_poses: Vec::new(), missing: Vec::new(), unlisted: Vec::new() };
+    let mut scene = RawScene { points: PointCloud::default(), ..RawScene::default() };
+    let files = choose_files(path, &mut scene.warnings)?;
+    for (file, split) in &files {
+        let top = json::load(file)?;
+        reading.add_file(file, &top, *split, &mut scene)?;
+    }
+    let file = &files[0].0;
+    reading.report(file, &mut scene.warnings)?;
+    scene.views = reading.views;
+    sort_views(file, &mut scene.views)?;
+    Ok(scene)
+}
+
+/// The files to read and the split each prescribes; never empty.
+fn choose_files(path: &Path, warnings: &mut Vec<String>) -> InputResult<Vec<(PathBuf, Option<Split>)>> {
+    if path.is_file() {
+        return Ok(vec![(path.to_path_buf(), None)]);
+    }
+    let [single, train, val, test] =
+        ["transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json"]
+            .map(|n| Some(path.join(n)).filter(|p| p.is_file()));
+    let Some(train) = train else {
+        return match single {
+            Some(single) => Ok(vec![(single, None)]),
+            None => Err(InputError::new(
+                path,
+                "neither transforms_train.json nor transforms.json is here",
+                "give the folder that holds one of them, or the JSON itself",
+            )),
+        };
+    };
+    if let Some(single) = single {
+        warnings.push(format!("{}: not read, since transforms_train.json is beside it", single.display()));
+    }
+    let mut files = vec![(train, Some(Split::Train))];
+    match (test, val) {
+        (Some(test), val) => {
+            files.push((test, Some(Split::Test)));
+            if let Some(val) = val {
+                let val = val.display();
+                warnings.push(format!("{val}: not read; transforms_test.json is the test set"));
+            }
+        }
+        (None, Some(val)) => files.push((val, Some(Split::Test))),
+        (None, None) => {}
+    }
+    Ok(files)
+}
+
+/// What has been read so far.
+struct Reading<'a> {
+    options: &'a ReadOptions,
+    views: Vec<RawView>,
+    bad_poses: Vec<String>,
+    missing: Vec<String>,
+    /// Frames that are in none of the lists of file names that are used.
+    unlisted: Vec<String>,
+}
+
+impl Reading<'_> {
+    fn add_file(
+        &mut self,
+        file: &Path,
+        map: &Map<String, Value>,
+        split: Option<Split>,
+        scene: &mut RawScene,
+    ) -> InputResult<()> {
+        let top = Node { file, map, frame: None };
+        let folder = file.parent().unwrap_or(Path::new(""));
+        let frames = top.array("frames")?.ok_or_else(|| top.error("frames", "the key is missing", FIX_KEY))?;
+        if frames.is_empty() && split != Some(Split::Test) {
+            return Err(top.error("frames", "no frames", "write the file again with its frames"));
+        }
+        let prescribed = prescribed_splits(&top)?;
+        for (i, frame) in frames.iter().enumerate() {
+            let map = frame.as_object().ok_or_else(|| top.error(&format!("frames[{i}]"), "not an object", FIX_KEY))?;
+            let levels = Levels { frame: Node { file, map, frame: Some(i) }, top };
+            self.add_frame(folder, &levels, split, prescribed.as_ref())?;
+        }
+        if scene.points_path.is_none() {
+            scene.points_path = points_path(&top, folder, &mut scene.warnings)?;
+        }
+        Ok(())
+    }
+
+    fn add_frame(
+        &mut self,
+        folder: &Path,
+        levels: &Levels<'_>,
+        split: Option<Split>,
+        prescribed: Option<&BTreeMap<String, Split>>,
+    ) -> InputResult<()> {
+        let frame = &levels.frame;
+        let (key, stated) = stated_path(frame)?;
+        let refused = |problem: String| frame.error(key, problem, STAY_INSIDE);
+        let split = match prescribed {
+            None => split,
+            Some(splits) => match splits.get(&clean_name(&stated).map_err(refused)?) {
+                None => {
+                    self.unlisted.push(stated.into_owned());
+                    return Ok(());
+                }
+                found => found.copied(),
+            },
+        };
+        let photo = photos::find_photo(folder, self.options.images.as_deref(), &stated).map_err(refused)?;
+        let Some(pose) = pose::make_pose(&pose::read_matrix(frame)?) else {
+            self.bad_poses.push(photo.name);
+            return Ok(());
+        };
+        let size = match levels.size()? {
+            Some(size) => size,
+            None if photo.exists => photos::read_size(&photo.path)?,
+            None => {
+                self.missing.push(photo.name);
+                return Ok(());
+            }
+        };
+        let intrinsics = levels.intrinsics(size)?;
+        let mask_path = match frame.text("mask_path")? {
+            None => None,
+            Some(mask) => Some(safe_join(folder, mask).map_err(|p| frame.error("mask_path", p, STAY_INSIDE))?.1),
+        };
+        self.views.push(RawView { name: photo.name, image_path: photo.path, intrinsics, pose, mask_path, split });
+        Ok(())
+    }
+
+    /// Says what was left out; an error when a photo's size was needed or no view remains.
+    fn report(&self, file: &Path, warnings: &mut Vec<String>) -> InputResult<()> {
+        let shown = file.display();
+        if !self.missing.is_empty() {
+            let (count, names) = (self.missing.len(), listed(&self.missing));
+            if !self.options.allow_missing {
+                return Err(InputError::new(
+                    file,
+                    format!("{count} photo(s) are missing: {names}"),
+                    "put them there, name their folder with --images, or leave them out with --allow-missing",
+                )
+                .at("file_path"));
+            }
+            warnings.push(format!("{shown}: {count} view(s) left out, their photo is missing: {names}"));
+        }
+        if !self.bad_poses.is_empty() {
+            let (count, names) = (self.bad_poses.len(), listed(&self.bad_poses));
+            warnings.push(format!(
+                "{shown}: {count} view(s) left out, their pose is not finite or not a rotation: {names}"
+            ));
+        }
+        if !self.unlisted.is_empty() {
+            let (count, names) = (self.unlisted.len(), listed(&self.unlisted));
+            warnings.push(format!(
+                "{shown}: {count} view(s) left out, neither train_filenames nor the held-out list has them: {names}"
+            ));
+        }
+        if self.views.is_empty() {
+            let problem = match self.bad_poses.len() {
+                0 => "no view is left".to_string(),
+                n => format!("no view is left: {n} pose(s) are not finite or not a rotation"),
+            };
+            return Err(InputError::new(file, problem, "write the file again").at("frames"));
+        }
+        Ok(())
+    }
+}
+
+/// The photo's path in a frame and the key it stands under; MatrixCity's own files number the photos instead.
+fn stated_path<'a>(frame: &Node<'a>) -> InputResult<(&'static str, std::borrow::Cow<'a, str>)> {
+    if let Some(path) = frame.text("file_path")? {
+        return Ok(("file_path", path.into()));
+    }
+    if frame.get("rot_mat").is_some()
+        && let Some(index) = frame.get("frame_index").and_then(Value::as_u64)
+    {
+        return Ok(("frame_index", format!("{index:04}.png").into()));
+    }
+    Err(frame.error("file_path", "the key is missing", FIX_KEY))
+}
+
+/// nerfstudio's lists of file names, if the file has them: the split of each name that is used.
+fn prescribed_splits(top: &Node<'_>) -> InputResult<Option<BTreeMap<String, Split>>> {
+    let [train, val, test] = [top.array("train_filenames")?, top.array("val_filenames")?, top.array("test_filenames")?];
+    if train.is_none() {
+        return Ok(None);
+    }
+    let mut splits = BTreeMap::new();
+    let held_out = if test.is_some() { ("test_filenames", test) } else { ("val_filenames", val) };
+    for ((key, names), split) in [(held_out, Split::Test), (("train_filenames", train), Split::Train)] {
+        for name in names.into_iter().flatten() {
+            let name = name.as_str().ok_or_else(|| top.error(key, "not a list of strings", FIX_KEY))?;
+            let name = clean_name(name).map_err(|p| top.error(key, p, STAY_INSIDE))?;
+            if splits.insert(name.clone(), split).is_some_and(|before| before != split) {
+                let problem = format!("'{name}' is in the train and in the held-out list");
+                return Err(top.error(key, problem, "a photo belongs to one of them"));
+            }
+        }
+    }
+    Ok(Some(splits))
+}
+
+/// The PLY that the file names, if it exists.
+fn points_path(top: &Node<'_>, folder: &Path, warnings: &mut Vec<String>) -> InputResult<Option<PathBuf>> {
+    let Some(stated) = top.text("ply_file_path")? else { return Ok(None) };
+    let (name, path) = safe_join(folder, stated).map_err(|p| top.error("ply_file_path", p, STAY_INSIDE))?;
+    if path.is_file() {
+        return Ok(Some(path));
+    }
+    warnings.push(format!("{}: ply_file_path names '{name}', which is not there", top.file.display()));
+    Ok(None)
+}

@@ -1,0 +1,272 @@
+//! The header of a PLY file: format, elements, properties, comments.
+//!
+//! Not here: the values behind it, and what they mean.
+//!
+//! Invariants: 1. at most [`MAX_HEADER_BYTES`] are read, whatever the file says; 2. counts are numbers that the file
+//! states, nothing more: readers check them; 3. property names of one element are unique.
+
+use crate::base::error::{InputError, InputResult};
+use std::io::{BufRead, Read};
+use std::path::Path;
+
+/// Longest header that is read. A Gaussian's is 1.5 KB.
+pub const MAX_HEADER_BYTES: u64 = 64 * 1024;
+
+const REMEDY: &str = "check that this is a PLY file and that it was copied whole";
+
+/// How the values are stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// Decimal numbers, one element per line.
+    Ascii,
+    /// Packed, least significant byte first.
+    LittleEndian,
+    /// Packed, most significant byte first.
+    BigEndian,
+}
+
+/// Type of a number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Scalar {
+    /// `char`, `int8`
+    I8,
+    /// `uchar`, `uint8`
+    U8,
+    /// `short`, `int16`
+    I16,
+    /// `ushort`, `uint16`
+    U16,
+    /// `int`, `int32`
+    I32,
+    /// `uint`, `uint32`
+    U32,
+    /// `float`, `float32`
+    F32,
+    /// `double`, `float64`
+    F64,
+}
+
+impl Scalar {
+    fn from_name(name: &str) -> Option<Scalar> {
+        Some(match name {
+            "char" | "int8" => Scalar::I8,
+            "uchar" | "uint8" => Scalar::U8,
+            "short" | "int16" => Scalar::I16,
+            "ushort" | "uint16" => Scalar::U16,
+            "int" | "int32" => Scalar::I32,
+            "uint" | "uint32" => Scalar::U32,
+            "float" | "float32" => Scalar::F32,
+            "double" | "float64" => Scalar::F64,
+            _ => return None,
+        })
+    }
+
+    /// Bytes of one value.
+    pub fn size(self) -> usize {
+        match self {
+            Scalar::I8 | Scalar::U8 => 1,
+            Scalar::I16 | Scalar::U16 => 2,
+            Scalar::I32 | Scalar::U32 | Scalar::F32 => 4,
+            Scalar::F64 => 8,
+        }
+    }
+
+    /// Whether values are fractions.
+    pub fn is_float(self) -> bool {
+        matches!(self, Scalar::F32 | Scalar::F64)
+    }
+
+    /// The value at the start of `bytes`, which holds at least [`Scalar::size`] bytes. Every type fits f64 exactly.
+    #[inline]
+    pub fn decode(self, bytes: &[u8], big_endian: bool) -> f64 {
+        macro_rules! number {
+            ($t:ty, $n:literal) => {{
+                let mut raw = [0u8; $n];
+                raw.copy_from_slice(&bytes[..$n]);
+                f64::from(if big_endian { <$t>::from_be_bytes(raw) } else { <$t>::from_le_bytes(raw) })
+            }};
+        }
+        match self {
+            Scalar::I8 => number!(i8, 1),
+            Scalar::U8 => number!(u8, 1),
+            Scalar::I16 => number!(i16, 2),
+            Scalar::U16 => number!(u16, 2),
+            Scalar::I32 => number!(i32, 4),
+            Scalar::U32 => number!(u32, 4),
+            Scalar::F32 => number!(f32, 4),
+            Scalar::F64 => number!(f64, 8),
+        }
+    }
+}
+
+/// One number or one list of numbers per element.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// One value.
+    Scalar(Scalar),
+    /// A count, then that many values.
+    List {
+        /// Type of the count.
+        count: Scalar,
+        /// Type of the values.
+        item: Scalar,
+    },
+}
+
+/// A named value of an element.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Property {
+    /// Name.
+    pub name: String,
+    /// Type.
+    pub kind: Kind,
+}
+
+/// A table of the file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Element {
+    /// Name: `vertex`, `face` ...
+    pub name: String,
+    /// Rows that the header promises.
+    pub count: u64,
+    /// Values of a row, in order.
+    pub properties: Vec<Property>,
+}
+
+impl Element {
+    /// Index of the property with this name.
+    pub fn find(&self, name: &str) -> Option<usize> {
+        self.properties.iter().position(|p| p.name == name)
+    }
+
+    /// Bytes of a row in a binary file with every list empty, and whether there are no lists, so that it is exact.
+    pub fn row_bytes(&self) -> (u64, bool) {
+        let mut exact = true;
+        let mut bytes = 0;
+        for property in &self.properties {
+            bytes += match property.kind {
+                Kind::Scalar(s) => s.size() as u64,
+                Kind::List { count, .. } => {
+                    exact = false;
+                    count.size() as u64
+                }
+            };
+        }
+        (bytes, exact)
+    }
+}
+
+/// A parsed header.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Header {
+    /// Storage of the values.
+    pub format: Format,
+    /// Tables, in file order.
+    pub elements: Vec<Element>,
+    /// Comments without the word `comment`, trimmed.
+    pub comments: Vec<String>,
+    /// Length of the header, bytes.
+    pub bytes: u64,
+    /// Lines of the header.
+    pub lines: u64,
+}
+
+/// Reads the header up to and including `end_header`. Errors name the line.
+pub fn parse_header(reader: &mut impl BufRead, path: &Path) -> InputResult<Header> {
+    let mut limited = reader.by_ref().take(MAX_HEADER_BYTES);
+    let mut header = Header { format: Format::Ascii, elements: Vec::new(), comments: Vec::new(), bytes: 0, lines: 0 };
+    let mut format = None;
+    let mut raw = Vec::new();
+    loop {
+        raw.clear();
+        let read = limited.read_until(b'\n', &mut raw).map_err(|e| InputError::io(path, "reading the header", &e))?;
+        header.bytes += read as u64;
+        header.lines += 1;
+        let line = header.lines;
+        let bad = |problem: String| InputError::new(path, problem, REMEDY).at(format!("header line {line}"));
+        if raw.last() != Some(&b'\n') {
+            let what = if line == 1 {
+                "this is not a PLY file".to_string()
+            } else if header.bytes >= MAX_HEADER_BYTES {
+                format!("no end_header within {MAX_HEADER_BYTES} bytes")
+            } else {
+                "the file ends inside the header".to_string()
+            };
+            return Err(bad(what));
+        }
+        let text = String::from_utf8_lossy(&raw);
+        let text = text.trim();
+        if line == 1 {
+            if text != "ply" {
+                return Err(bad("this is not a PLY file: it does not begin with 'ply'".into()));
+            }
+            continue;
+        }
+        let (word, rest) = text.split_once(char::is_whitespace).unwrap_or((text, ""));
+        match word {
+            "format" => format = Some(parse_format(rest).map_err(bad)?),
+            "comment" => header.comments.push(rest.trim().to_string()),
+            "obj_info" | "" => {}
+            "element" => header.elements.push(parse_element(rest, &header.elements).map_err(bad)?),
+            "property" => match header.elements.last_mut() {
+                Some(element) => element.properties.push(parse_property(rest, element).map_err(bad)?),
+                None => return Err(bad("a property before any element".into())),
+            },
+            "end_header" => break,
+            other => return Err(bad(format!("unknown keyword '{}'", shorten(other)))),
+        }
+    }
+    header.format =
+        format.ok_or_else(|| InputError::new(path, "the header has no format line", REMEDY).at("header"))?;
+    Ok(header)
+}
+
+fn parse_format(rest: &str) -> Result<Format, String> {
+    match rest.split_whitespace().collect::<Vec<_>>()[..] {
+        ["ascii", "1.0"] => Ok(Format::Ascii),
+        ["binary_little_endian", "1.0"] => Ok(Format::LittleEndian),
+        ["binary_big_endian", "1.0"] => Ok(Format::BigEndian),
+        _ => Err(format!("unknown format '{}'", shorten(rest))),
+    }
+}
+
+fn parse_element(rest: &str, before: &[Element]) -> Result<Element, String> {
+    let [name, count] = rest.split_whitespace().collect::<Vec<_>>()[..] else {
+        return Err("an element line needs a name and a count".into());
+    };
+    let Ok(count) = count.parse::<u64>() else {
+        return Err(format!("'{}' is not a count of elements", shorten(count)));
+    };
+    if before.iter().any(|e| e.name == name) {
+        return Err(format!("element '{}' appears twice", shorten(name)));
+    }
+    Ok(Element { name: name.to_string(), count, properties: Vec::new() })
+}
+
+fn parse_property(rest: &str, element: &Element) -> Result<Property, String> {
+    let scalar = |name: &str| Scalar::from_name(name).ok_or_else(|| format!("unknown type '{}'", shorten(name)));
+    let (kind, name) = match rest.split_whitespace().collect::<Vec<_>>()[..] {
+        ["list", count, item, name] => {
+            let (count, item) = (scalar(count)?, scalar(item)?);
+            if count.is_float() {
+                return Err(format!("list '{}' is counted by fractions", shorten(name)));
+            }
+            (Kind::List { count, item }, name)
+        }
+        [kind, name] => (Kind::Scalar(scalar(kind)?), name),
+        _ => return Err("a property line needs a type and a name".into()),
+    };
+    if element.find(name).is_some() {
+        return Err(format!("property '{}' appears twice", shorten(name)));
+    }
+    Ok(Property { name: name.to_string(), kind })
+}
+
+/// Text of a file as far as it fits into a message.
+pub fn shorten(text: &str) -> String {
+    let mut out: String = text.chars().take(40).map(|c| if c.is_control() { '?' } else { c }).collect();
+    if text.chars().nth(40).is_some() {
+        out.push_str("...");
+    }
+    out
+}

@@ -1,0 +1,235 @@
+//! A PLY file to Gaussians or coloured points.
+//!
+//! Not here: the header's grammar (`header`), how rows are cut out of bytes or lines (`rows`).
+//!
+//! Invariants: 1. nothing is allocated before the count it follows from was checked against the bytes left; 2. no
+//! byte makes this panic; 3. rows with a value that is not finite are dropped and counted, and more than 1 % of them
+//! is an error; 4. what is handed out has at least one row.
+
+use super::header::{Element, Header, Kind, Scalar, parse_header, shorten};
+use super::rows::{Body, read_rows};
+use super::{ExportFrame, PlyContent, PlyMeta, unit_quat};
+use crate::base::error::{InputError, InputResult};
+use crate::scene::columns::{Column, Columns, sh_n_width};
+use std::collections::TryReserveError;
+use std::fs::File;
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+
+/// Reads `path`. See [`parse_ply`].
+pub fn read_ply(path: &Path) -> InputResult<PlyContent> {
+    let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
+    let about = file.metadata().map_err(|e| InputError::io(path, "asking for the length", &e))?;
+    if !about.is_file() {
+        return Err(InputError::new(path, "this is not a regular file", "give a PLY file"));
+    }
+    parse_ply(BufReader::with_capacity(1 << 20, file), about.len(), path)
+}
+
+/// Reads a PLY of `total_bytes` bytes: Gaussians if its vertices have `f_dc_0`, else coloured points.
+///
+/// ascii and both binary formats; properties in any order; other properties and elements, lists included, are passed
+/// over. Colours are `red green blue`, integers of 0 to 255 (16 bits: to 65,535) or fractions of 0 to 1.
+/// `path` only names the file in errors.
+///
+/// # Errors
+/// A file that is cut short, promises more than it holds, lacks a property, has another number of `f_rest` than 0, 9,
+/// 24 or 45, has no vertices, or has more than 1 % of rows with values that are not finite.
+pub fn parse_ply<R: BufRead>(mut reader: R, total_bytes: u64, path: &Path) -> InputResult<PlyContent> {
+    let header = parse_header(&mut reader, path)?;
+    let vertex_at = header.elements.iter().position(|e| e.name == "vertex").ok_or_else(|| {
+        InputError::new(path, "the file has no element 'vertex'", "give a PLY of points or Gaussians").at("header")
+    })?;
+    let vertex = &header.elements[vertex_at];
+    if vertex.count == 0 {
+        return Err(
+            InputError::new(path, "the file has no vertices", "give a PLY with at least one point").at("header")
+        );
+    }
+    if vertex.find("x").is_none() && vertex.find("packed_position").is_some() {
+        let remedy = "convert it to an ordinary PLY first, for example with splat-transform";
+        return Err(InputError::new(path, "this is a compressed PLY (packed_position)", remedy).at("header"));
+    }
+    let mut body = Body::new(reader, path, &header, total_bytes);
+    for element in &header.elements[..vertex_at] {
+        body.skip(element)?;
+    }
+    body.check_room(vertex)?;
+    if vertex.find("f_dc_0").is_some() {
+        read_gaussians(&mut body, &header, vertex)
+    } else {
+        read_points(&mut body, vertex)
+    }
+}
+
+/// Index of a number property, or an error that names it.
+fn scalar_at(path: &Path, vertex: &Element, name: &str) -> InputResult<(usize, Scalar)> {
+    let index = vertex.find(name);
+    match index.map(|i| (i, vertex.properties[i].kind)) {
+        Some((i, Kind::Scalar(s))) => Ok((i, s)),
+        Some((_, Kind::List { .. })) => Err((format!("property '{name}' is a list"), "write it as a number")),
+        None if name == "scale_2" => {
+            Err(("these are 2D Gaussians (no scale_2)".to_string(), "give a PLY of 3D Gaussians"))
+        }
+        None => Err((format!("the vertices have no property '{name}'"), "export the file again with all properties")),
+    }
+    .map_err(|(problem, remedy)| InputError::new(path, problem, remedy).at("header"))
+}
+
+fn no_memory(path: &Path, rows: u64) -> impl Fn(TryReserveError) -> InputError {
+    move |_| InputError::new(path, format!("no memory for {rows} rows"), "thin the file out or use a larger machine")
+}
+
+/// Rows that were dropped, with the place of the first.
+#[derive(Default)]
+struct Dropped {
+    count: u64,
+    first: u64,
+}
+
+impl Dropped {
+    fn add(&mut self, row: u64) {
+        if self.count == 0 {
+            self.first = row;
+        }
+        self.count += 1;
+    }
+
+    fn check(&self, path: &Path, rows: u64) -> InputResult<()> {
+        if u128::from(self.count) * 100 <= u128::from(rows) {
+            return Ok(());
+        }
+        let problem = format!("{} of {rows} vertices have values that are not finite numbers", self.count);
+        let remedy = "more than 1 % is taken for a broken file: repair or export it again";
+        Err(InputError::new(path, problem, remedy).at(format!("vertex {}", self.first)))
+    }
+}
+
+fn read_gaussians<R: BufRead>(body: &mut Body<'_, R>, header: &Header, vertex: &Element) -> InputResult<PlyContent> {
+    let path = body.path;
+    let sh_degree = sh_degree_of(path, vertex)?;
+    let rest = sh_n_width(sh_degree);
+    let mut names: Vec<String> = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"].map(String::from).into();
+    names.extend((0..3).map(|i| format!("scale_{i}")));
+    names.extend((0..4).map(|i| format!("rot_{i}")));
+    names.extend((0..rest).map(|i| format!("f_rest_{i}")));
+    let slots = names.iter().map(|n| Ok(scalar_at(path, vertex, n)?.0)).collect::<InputResult<Vec<usize>>>()?;
+    let mut meta = meta_from_comments(path, &header.comments)?;
+
+    let mut columns = Columns { sh_degree, ..Columns::default() };
+    for column in Column::ALL {
+        let floats = (vertex.count as usize).saturating_mul(column.width(sh_degree));
+        columns.column_mut(column).try_reserve_exact(floats).map_err(no_memory(path, vertex.count))?;
+    }
+    let mut dropped = Dropped::default();
+    let mut values = vec![0.0f32; slots.len()];
+    read_rows(body, vertex, &slots, |row, raw| {
+        for (value, &r) in values.iter_mut().zip(raw) {
+            *value = r as f32;
+        }
+        if !values.iter().all(|v| v.is_finite()) {
+            dropped.add(row);
+            return;
+        }
+        columns.means.extend_from_slice(&values[0..3]);
+        columns.sh0.extend_from_slice(&values[3..6]);
+        columns.opacities.push(values[6]);
+        columns.scales.extend_from_slice(&values[7..10]);
+        columns.quats.extend_from_slice(&unit_quat([values[10], values[11], values[12], values[13]]));
+        let f_rest = &values[14..];
+        for k in 0..rest / 3 {
+            columns.sh_n.extend((0..3).map(|channel| f_rest[channel * (rest / 3) + k]));
+        }
+    })?;
+    dropped.check(path, vertex.count)?;
+    meta.dropped = dropped.count;
+    Ok(PlyContent::Gaussians { columns, meta })
+}
+
+/// The degree that follows from the number of `f_rest` properties.
+fn sh_degree_of(path: &Path, vertex: &Element) -> InputResult<u8> {
+    let rest = vertex.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
+    (0..=3).find(|&degree| sh_n_width(degree) == rest).ok_or_else(|| {
+        let problem = format!("{rest} f_rest properties belong to no SH degree from 0 to 3 (0, 9, 24 or 45 would)");
+        InputError::new(path, problem, "export the file with SH degree 3 or less").at("header")
+    })
+}
+
+/// What the comments say. Our own words (`step`, `origin`, `scale`, `frame`) count only in files that say they are
+/// ours: elsewhere they may mean anything.
+fn meta_from_comments(path: &Path, comments: &[String]) -> InputResult<PlyMeta> {
+    let mut meta = PlyMeta::default();
+    let ours = comments.iter().any(|c| c.starts_with("Generated by gsscale"));
+    for comment in comments {
+        let bad = || {
+            let problem = format!("the comment '{}' cannot be understood", shorten(comment));
+            InputError::new(path, problem, "export the file again, or remove all its gsscale comments").at("header")
+        };
+        let words: Vec<&str> = comment.split_whitespace().collect();
+        match words[..] {
+            // Brush's spelling, then Postshot's.
+            ["SplatRenderMode:", mode] => meta.antialiased = mode == "mip",
+            ["antialiased", flag] => meta.antialiased = flag == "1",
+            _ if !ours => {}
+            ["step", n] => meta.step = Some(n.parse().map_err(|_| bad())?),
+            ["origin", x, y, z] => {
+                for (value, text) in meta.origin.iter_mut().zip([x, y, z]) {
+                    *value = text.parse().ok().filter(|v: &f64| v.is_finite()).ok_or_else(bad)?;
+                }
+            }
+            ["scale", s] => {
+                meta.scale = s.parse().ok().filter(|v: &f64| v.is_normal() && *v > 0.0).ok_or_else(bad)?;
+            }
+            ["frame", name] => meta.frame = ExportFrame::from_name(name).ok_or_else(bad)?,
+            ["step" | "origin" | "scale" | "frame", ..] => return Err(bad()),
+            _ => {}
+        }
+    }
+    meta.scene_radius = meta.scale;
+    Ok(meta)
+}
+
+fn read_points<R: BufRead>(body: &mut Body<'_, R>, vertex: &Element) -> InputResult<PlyContent> {
+    let path = body.path;
+    let mut slots = Vec::with_capacity(6);
+    for name in ["x", "y", "z"] {
+        slots.push(scalar_at(path, vertex, name)?.0);
+    }
+    let color_names = [["red", "green", "blue"], ["diffuse_red", "diffuse_green", "diffuse_blue"], ["r", "g", "b"]];
+    let mut color_types = [Scalar::U8; 3];
+    if let Some(names) = color_names.into_iter().find(|n| n.iter().all(|name| vertex.find(name).is_some())) {
+        for (kind, name) in color_types.iter_mut().zip(names) {
+            let (slot, scalar) = scalar_at(path, vertex, name)?;
+            slots.push(slot);
+            *kind = scalar;
+        }
+    }
+    let rows = vertex.count as usize;
+    let (mut positions, mut colors) = (Vec::new(), Vec::new());
+    positions.try_reserve_exact(rows).map_err(no_memory(path, vertex.count))?;
+    colors.try_reserve_exact(rows).map_err(no_memory(path, vertex.count))?;
+    let mut dropped = Dropped::default();
+    read_rows(body, vertex, &slots, |row, raw| {
+        if !raw.iter().all(|v| v.is_finite()) {
+            dropped.add(row);
+            return;
+        }
+        positions.push([raw[0], raw[1], raw[2]]);
+        let color = |c: usize| raw.get(3 + c).map_or(128, |&v| color_byte(v, color_types[c]));
+        colors.push([color(0), color(1), color(2)]);
+    })?;
+    dropped.check(path, vertex.count)?;
+    Ok(PlyContent::Points { positions, colors, dropped: dropped.count })
+}
+
+/// A finite colour value as a byte; the type says its range.
+fn color_byte(value: f64, kind: Scalar) -> u8 {
+    let full = if kind.is_float() {
+        1.0
+    } else if kind.size() == 2 {
+        65_535.0
+    } else {
+        255.0
+    };
+    ((value / full).clamp(0.0, 1.0) * 255.0 + 0.5) as u8
+}

@@ -1,0 +1,265 @@
+//! How far dense Adam moves a value over steps in which its gradient is zero, for any gap and rate schedule, as a
+//! pure function of the stored moments and two step numbers. Knows no rows; [`super::deferred`] applies it to them.
+//!
+//! A value whose state contains s steps, with moments m and v, moves over the next k zero-gradient steps by
+//!
+//! ```text
+//! sum over j = 1..k of  lr(s+j) beta1^j m / ((1 - beta1^(s+j)) (sqrt(beta2^j v) / sqrt(1 - beta2^(s+j)) + eps))
+//! ```
+//!
+//! Without eps that is (m / sqrt v) (S(s) - r^k S(s+k)), where r = beta1 / sqrt beta2,
+//! c(t) = lr(t) sqrt(1 - beta2^t) / (1 - beta1^t) and S(s) = r (c(s+1) + S(s+1)), which is filled backwards once. Expanding
+//! 1 / (root + eps) gives the same series with the square and the cube of the corrected root, here T2 and T3, T1 = S:
+//! (m / sqrt v) (T1 - e T2 + e^2 T3) with e = eps / sqrt v. Where e is not small the sum itself is taken, 200 terms of it:
+//! the rest is below 1e-9 of it.
+//!
+//! Invariants: 1. the same bits on every instruction path: + - * / sqrt only, nothing contracted, sums in a fixed
+//! order; 2. tables depend on the rates and the betas alone; 3. results below the smallest normal float are zero.
+
+use super::adam::AdamConfig;
+use super::rates::Rates;
+
+/// Gaps from which the term r^k S(s+k) is below a rounding of S(s).
+pub(super) const RECENT: usize = 400;
+/// Terms of the direct sum.
+const DIRECT_TERMS: usize = 200;
+/// After this many steps every bias correction is 1 in f64 (0.999^40000 = 4e-18).
+const BIAS_STEPS: u32 = 40_000;
+/// The series is used where sqrt(v) is more than this many eps; what it leaves out is e^3 < 1e-6 of the movement.
+const SERIES_FLOOR: f32 = 100.0;
+
+/// Series sums of one gap, at unit base rate: T1, T2, T3 of the schedule of the means, 0, then of the constant one, 0.
+pub(crate) type Drift = [f32; 8];
+
+/// Tables of a run: 88 bytes per step (of at least 40,000), and 0.6 MB.
+#[derive(Debug, Clone)]
+pub struct DriftTables {
+    rates: Rates,
+    config: AdamConfig,
+    /// `[s]`: T1, T2, T3 for the means' schedule and for the constant one.
+    series: Vec<[f64; 6]>,
+    /// `series` rounded: the movement over endless gaps.
+    limits: Vec<Drift>,
+    /// `[k]`: r_1^k, r_2^k, r_3^k.
+    ratio_powers: Vec<[f64; 3]>,
+    /// `[t]`, t from 1: 1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t).
+    bias: Vec<[f64; 2]>,
+    /// `[j]`: beta1^j, sqrt(beta2^j).
+    decay_powers: Vec<[f64; 2]>,
+    /// `[step]`, 0-based: factor on the rate of the means.
+    means_factor: Vec<f64>,
+}
+
+impl DriftTables {
+    /// Fills the tables. Panics when the betas are so slow that a gap of 400 steps still matters
+    /// (beta1 > 0.91 at beta2 = 0.999): that is a mistake of the program, not of the input.
+    pub fn new(rates: Rates, config: AdamConfig) -> Self {
+        let root = libm::sqrt(config.beta2);
+        let ratios: [f64; 3] = std::array::from_fn(|p| config.beta1 / libm::pow(root, p as f64 + 1.0));
+        assert!(
+            libm::pow(ratios[2], RECENT as f64) < 1e-15,
+            "beta1 {} forgets too slowly for the deferred form",
+            config.beta1
+        );
+        let horizon = rates.steps.max(BIAS_STEPS) as usize;
+        let means_factor: Vec<f64> = (0..=rates.steps).map(|step| rates.means_factor(step)).collect();
+        let bias = bias_table(config);
+        let mut series = vec![[0.0; 6]; horizon + 1];
+        // Row s needs the factors of 1-based step s + 1. Beyond the horizon they stay the same: a geometric series.
+        let term = |s: usize| {
+            let [inv_bias1, inv_root] = bias[(s + 1).min(bias.len() - 1)];
+            let means = means_factor[s.min(means_factor.len() - 1)];
+            let corrected = |p: usize| inv_bias1 / libm::pow(inv_root, p as f64 + 1.0);
+            std::array::from_fn::<f64, 6, _>(|i| if i < 3 { means * corrected(i) } else { corrected(i - 3) })
+        };
+        let last = term(horizon);
+        series[horizon] = std::array::from_fn(|i| last[i] * ratios[i % 3] / (1.0 - ratios[i % 3]));
+        for s in (0..horizon).rev() {
+            let (c, next) = (term(s), series[s + 1]);
+            series[s] = std::array::from_fn(|i| ratios[i % 3] * (c[i] + next[i]));
+        }
+        DriftTables {
+            limits: series.iter().map(|&t| rounded(t)).collect(),
+            ratio_powers: powers(ratios, RECENT),
+            decay_powers: powers([config.beta1, root], DIRECT_TERMS + 1),
+            series,
+            bias,
+            means_factor,
+            rates,
+            config,
+        }
+    }
+
+    /// The rates that the tables were made for.
+    pub fn rates(&self) -> &Rates {
+        &self.rates
+    }
+
+    /// The decays that the tables were made for.
+    pub fn config(&self) -> AdamConfig {
+        self.config
+    }
+
+    /// Bytes of the tables.
+    pub fn bytes(&self) -> usize {
+        self.series.len() * 48
+            + self.limits.len() * 32
+            + self.ratio_powers.len() * 24
+            + (self.bias.len() + self.decay_powers.len()) * 16
+            + self.means_factor.len() * 8
+    }
+
+    /// Series sums of the gap from a state of `stamp` steps to one of `now` steps.
+    pub(crate) fn drift(&self, stamp: u32, now: u32) -> Drift {
+        let gap = now.saturating_sub(stamp) as usize;
+        let from = (stamp as usize).min(self.series.len() - 1);
+        let Some(power) = self.ratio_powers.get(gap) else { return self.limits[from] };
+        let (start, end) = (self.series[from], self.series[(now as usize).min(self.series.len() - 1)]);
+        rounded(std::array::from_fn(|i| start[i] - power[i % 3] * end[i]))
+    }
+
+    /// The movement over any number of further steps, from a state of `stamp` steps.
+    pub(crate) fn limit(&self, stamp: u32) -> &Drift {
+        &self.limits[(stamp as usize).min(self.limits.len() - 1)]
+    }
+
+    /// 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) for the 1-based step t.
+    pub(crate) fn bias(&self, t: u32) -> [f64; 2] {
+        self.bias[(t as usize).min(self.bias.len() - 1)]
+    }
+
+    /// The movement at unit base rate, term by term with eps in its place; for roots that eps touches.
+    pub(crate) fn direct_sum(&self, m: f32, v: f32, stamp: u32, now: u32, of_means: bool) -> f32 {
+        const LANES: usize = 8;
+        let terms = (now.saturating_sub(stamp) as usize).min(DIRECT_TERMS);
+        let (m, root, eps) = (f64::from(m), f64::from(v).sqrt(), self.config.eps);
+        let mut sums = [0.0f64; LANES];
+        for j in 1..=terms {
+            let t = (stamp as usize).saturating_add(j);
+            let [inv_bias1, inv_root] = self.bias[t.min(self.bias.len() - 1)];
+            let rate = if of_means { self.means_factor[(t - 1).min(self.means_factor.len() - 1)] } else { 1.0 };
+            let [decay1, decay2] = self.decay_powers[j];
+            sums[j % LANES] += rate * inv_bias1 * decay1 * m / (root * decay2 * inv_root + eps);
+        }
+        sums.iter().sum::<f64>() as f32
+    }
+}
+
+/// What the movement of one value needs besides its moments.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct EpsFloor {
+    /// eps.
+    pub eps: f32,
+    /// Roots must be greater than this for the series.
+    pub floor: f32,
+}
+
+impl EpsFloor {
+    pub(crate) fn new(eps: f64) -> Self {
+        EpsFloor { eps: eps as f32, floor: SERIES_FLOOR * eps as f32 }
+    }
+}
+
+/// The value after a gap by the series. Only for roots above the floor: see [`needs_direct_sum`].
+/// Rounding: at most 4e-7 of the movement, and half an ulp of the value.
+#[inline(always)]
+pub(crate) fn drifted(value: f32, m: f32, v: f32, sums: [f32; 3], rate: f32, eps: f32) -> f32 {
+    let inv = 1.0 / v.sqrt();
+    let e = eps * inv;
+    let moved = flush(value - (m * inv) * (sums[0] - e * (sums[1] - e * sums[2])) * rate);
+    // Without a first moment nothing moves; and the quotient above may be 0 / 0.
+    if m == 0.0 { value } else { moved }
+}
+
+/// Whether the series is too coarse for this root.
+#[inline(always)]
+pub(crate) fn needs_direct_sum(m: f32, v: f32, floor: f32) -> bool {
+    // Written so that a NaN root is not asked for 200 terms of NaN.
+    (m != 0.0) & (v.sqrt() <= floor)
+}
+
+/// Zero for values below the smallest normal float, so that hardware that flushes them gives the same bits.
+#[inline(always)]
+pub(crate) fn flush(x: f32) -> f32 {
+    if x.abs() < f32::MIN_POSITIVE { 0.0 } else { x }
+}
+
+fn rounded(t: [f64; 6]) -> Drift {
+    [t[0] as f32, t[1] as f32, t[2] as f32, 0.0, t[3] as f32, t[4] as f32, t[5] as f32, 0.0]
+}
+
+/// `[k]` = each base to the power k, for k in 0..count.
+fn powers<const N: usize>(bases: [f64; N], count: usize) -> Vec<[f64; N]> {
+    (0..count).map(|k| bases.map(|b| libm::pow(b, k as f64))).collect()
+}
+
+fn bias_table(config: AdamConfig) -> Vec<[f64; 2]> {
+    let correction = |t: u32| {
+        let t = f64::from(t.max(1));
+        [1.0 / (1.0 - libm::pow(config.beta1, t)), 1.0 / libm::sqrt(1.0 - libm::pow(config.beta2, t))]
+    };
+    (0..=BIAS_STEPS).map(correction).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The definition, in f64, for any number of terms.
+    fn by_loop(tables: &DriftTables, m: f64, v: f64, stamp: u32, now: u32, of_means: bool) -> f64 {
+        let AdamConfig { beta1, beta2, eps } = tables.config;
+        let mut moved = 0.0;
+        for t in stamp + 1..=now {
+            let (j, tf) = (f64::from(t - stamp), f64::from(t));
+            let rate = if of_means { tables.rates.means_factor(t - 1) } else { 1.0 };
+            let root = (v * beta2.powf(j)).sqrt() / (1.0 - beta2.powf(tf)).sqrt();
+            moved += rate * m * beta1.powf(j) / ((1.0 - beta1.powf(tf)) * (root + eps));
+        }
+        moved
+    }
+
+    #[test]
+    fn series_and_direct_sum_agree_with_the_definition() {
+        for eps in [1e-15, 1e-8] {
+            let tables = DriftTables::new(Rates::new(1.0, 5000), AdamConfig { eps, ..AdamConfig::default() });
+            let floor = EpsFloor::new(eps);
+            for stamp in [0, 1, 7, 300, 4990, 5000, 60_000] {
+                for gap in [0, 1, 2, 15, 199, 200, 201, 399, 400, 401, 3000] {
+                    for root in [0.3, 1e-5, 1e-7, 1.1e-6, 0.9e-6, 1e-9, 1e-13, 1e-14, 1e-17] {
+                        for of_means in [true, false] {
+                            check(&tables, floor, stamp, stamp + gap, root, of_means);
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    fn check(tables: &DriftTables, floor: EpsFloor, stamp: u32, now: u32, root: f32, of_means: bool) {
+        let (m, v) = (root * 0.7, root * root);
+        let want = by_loop(tables, f64::from(m), f64::from(v), stamp, now, of_means);
+        let sums = tables.drift(stamp, now);
+        let sums = if of_means { [sums[0], sums[1], sums[2]] } else { [sums[4], sums[5], sums[6]] };
+        let direct = needs_direct_sum(m, v, floor.floor);
+        let got = if direct {
+            tables.direct_sum(m, v, stamp, now, of_means)
+        } else {
+            -drifted(0.0, m, v, sums, 1.0, floor.eps)
+        };
+        // 4e-7 for the roundings, 1e-6 for the fourth power of e at the edge of the series, 1e-9 for the tail
+        // that the direct sum leaves out.
+        let slack = 1.4e-6 * want.abs() + 1e-30;
+        assert!((f64::from(got) - want).abs() <= slack, "{stamp}..{now} root {root}: {got} {want} direct {direct}");
+    }
+
+    #[test]
+    fn far_gaps_reach_the_limit() {
+        let tables = DriftTables::new(Rates::new(1.0, 3000), AdamConfig::default());
+        for stamp in [0, 100, 2999, 3000, 100_000] {
+            assert_eq!(tables.drift(stamp, stamp + 400), *tables.limit(stamp));
+            // One step before the cut the difference is below two roundings of f32.
+            let near = tables.drift(stamp, stamp + 399)[0];
+            assert!((near - tables.limit(stamp)[0]).abs() <= 1.2e-7 * near);
+        }
+    }
+}

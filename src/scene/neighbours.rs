@@ -1,0 +1,227 @@
+//! Exact distances to the three nearest neighbours of every point of a cloud, by a k-d tree over sorted arrays.
+//!
+//! Not here: what the distances are for.
+//!
+//! Invariants: 1. distances are those of a brute-force search in f32, bit for bit: bounds of boxes are computed with
+//! the same operations in the same order as distances of points, and rounding is monotone, so that a box is never
+//! farther than a point in it; 2. the result does not depend on threads; 3. O(n log n) however the points cluster:
+//! the tree halves the points, not the space, and equal points may lie on both sides.
+
+use rayon::prelude::*;
+
+/// Neighbours per point.
+pub const NEIGHBOURS: usize = 3;
+
+const LEAF: usize = 12;
+/// Subtrees below this many points are built by one thread.
+const SERIAL_BELOW: usize = 4096;
+const QUERIES_PER_TASK: usize = 1024;
+
+#[derive(Clone, Copy)]
+struct Entry {
+    point: [f32; 3],
+    index: u32,
+}
+
+#[derive(Clone, Copy)]
+struct Bounds {
+    low: [f32; 3],
+    high: [f32; 3],
+}
+
+/// A balanced tree: every node halves its range of `entries`, all leaves are at depth `levels`. `boxes` is in
+/// preorder: the left child of a node follows it, the right child of one with `l` levels below is 2^l further.
+struct Tree {
+    entries: Vec<Entry>,
+    boxes: Vec<Bounds>,
+    levels: u32,
+}
+
+/// Squared distances of every point to its three nearest other points, ascending; infinity where there are fewer
+/// points. Other points at the same place count, at distance 0. Coordinates that are not finite have no neighbours.
+///
+/// # Panics
+/// With 2^32 points or more.
+pub fn nearest_dist2(points: &[[f32; 3]]) -> Vec<[f32; NEIGHBOURS]> {
+    let tree = Tree::new(points);
+    let mut by_entry = vec![[f32::INFINITY; NEIGHBOURS]; points.len()];
+    by_entry.par_chunks_mut(QUERIES_PER_TASK).enumerate().for_each(|(task, out)| {
+        let first = task * QUERIES_PER_TASK;
+        for (entry, out) in tree.entries[first..].iter().zip(out) {
+            // The point itself is found too, at distance 0, which no other point can undercut.
+            let mut best = [f32::INFINITY; NEIGHBOURS + 1];
+            tree.search(0, tree.levels, 0, tree.entries.len(), entry.point, &mut best);
+            out.copy_from_slice(&best[1..]);
+        }
+    });
+    let mut by_point = vec![[f32::INFINITY; NEIGHBOURS]; points.len()];
+    for (entry, dist2) in tree.entries.iter().zip(by_entry) {
+        by_point[entry.index as usize] = dist2;
+    }
+    by_point
+}
+
+impl Tree {
+    fn new(points: &[[f32; 3]]) -> Tree {
+        assert!(u32::try_from(points.len()).is_ok(), "more than 2^32 points");
+        let entries = points.iter().enumerate().map(|(i, &point)| Entry { point, index: i as u32 });
+        let mut entries: Vec<Entry> = entries.collect();
+        let mut levels = 0;
+        while points.len().div_ceil(1 << levels) > LEAF {
+            levels += 1;
+        }
+        let mut boxes = vec![Bounds { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3] }; (2 << levels) - 1];
+        build(&mut entries, &mut boxes, levels);
+        Tree { entries, boxes, levels }
+    }
+
+    fn search(&self, node: usize, levels: u32, low: usize, high: usize, q: [f32; 3], best: &mut [f32; 4]) {
+        if levels == 0 {
+            for entry in &self.entries[low..high] {
+                insert(best, dist2(std::array::from_fn(|i| entry.point[i] - q[i])));
+            }
+            return;
+        }
+        let middle = low + (high - low) / 2;
+        let (left, right) = (node + 1, node + (1 << levels));
+        let (to_left, to_right) = (self.boxes[left].dist2(q), self.boxes[right].dist2(q));
+        let mut visit = |is_left: bool| {
+            if is_left && to_left < best[NEIGHBOURS] {
+                self.search(left, levels - 1, low, middle, q, best);
+            } else if !is_left && to_right < best[NEIGHBOURS] {
+                self.search(right, levels - 1, middle, high, q, best);
+            }
+        };
+        let left_first = to_left <= to_right;
+        visit(left_first);
+        visit(!left_first);
+    }
+}
+
+impl Bounds {
+    fn of(entries: &[Entry]) -> Bounds {
+        let mut b = Bounds { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3] };
+        for entry in entries {
+            for i in 0..3 {
+                b.low[i] = b.low[i].min(entry.point[i]);
+                b.high[i] = b.high[i].max(entry.point[i]);
+            }
+        }
+        b
+    }
+
+    #[inline]
+    fn dist2(&self, q: [f32; 3]) -> f32 {
+        dist2(std::array::from_fn(|i| (self.low[i] - q[i]).max(q[i] - self.high[i]).max(0.0)))
+    }
+}
+
+#[inline]
+fn dist2(d: [f32; 3]) -> f32 {
+    d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+}
+
+/// Keeps the smallest values, ascending. NaN is never kept.
+#[inline]
+fn insert(best: &mut [f32; 4], value: f32) {
+    if value < best[3] {
+        best[3] = value;
+        for i in (0..3).rev() {
+            if best[i + 1] < best[i] {
+                best.swap(i, i + 1);
+            }
+        }
+    }
+}
+
+/// Sorts `entries` into the tree with `levels` levels below this node, and fills its boxes.
+fn build(entries: &mut [Entry], boxes: &mut [Bounds], levels: u32) {
+    boxes[0] = Bounds::of(entries);
+    if levels == 0 {
+        return;
+    }
+    let extent = |i: usize| boxes[0].high[i] - boxes[0].low[i];
+    let axis = (1..3).fold(0, |widest, i| if extent(i) > extent(widest) { i } else { widest });
+    let middle = entries.len() / 2;
+    // Ties by index make the two halves a function of the points alone.
+    entries.select_nth_unstable_by(middle, |a, b| a.point[axis].total_cmp(&b.point[axis]).then(a.index.cmp(&b.index)));
+    let serial = entries.len() < SERIAL_BELOW;
+    let (left, right) = entries.split_at_mut(middle);
+    let (left_boxes, right_boxes) = boxes[1..].split_at_mut((1 << levels) - 1);
+    if serial {
+        build(left, left_boxes, levels - 1);
+        build(right, right_boxes, levels - 1);
+    } else {
+        rayon::join(|| build(left, left_boxes, levels - 1), || build(right, right_boxes, levels - 1));
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failure
+mod tests {
+    use super::*;
+    use crate::base::rng::{Purpose, Stream};
+
+    fn brute_force(points: &[[f32; 3]]) -> Vec<[f32; 3]> {
+        let of = |i: usize| {
+            let mut all: Vec<f32> = (0..points.len())
+                .filter(|&j| j != i)
+                .map(|j| dist2(std::array::from_fn(|k| points[j][k] - points[i][k])))
+                .filter(|d| !d.is_nan())
+                .collect();
+            all.sort_by(f32::total_cmp);
+            std::array::from_fn(|k| all.get(k).copied().unwrap_or(f32::INFINITY))
+        };
+        (0..points.len()).map(of).collect()
+    }
+
+    fn cloud(n: u64, kind: u64) -> Vec<[f32; 3]> {
+        let point = |i: u64| {
+            let mut s = Stream::new(5, Purpose::Test, kind, i);
+            match kind {
+                0 => std::array::from_fn(|_| s.uniform() as f32),
+                // Tight clusters far apart.
+                1 => {
+                    std::array::from_fn(|k| (100.0 * ((i % 7) * (k as u64 + 1) % 5) as f64 + 1e-3 * s.normal()) as f32)
+                }
+                // A coarse lattice: nearly every point has duplicates and ties.
+                2 => std::array::from_fn(|_| s.below(4) as f32),
+                // A surface with offsets that eat most of f32.
+                _ => [1e4 + s.uniform() as f32, -2e4 + s.uniform() as f32, 300.0],
+            }
+        };
+        (0..n).map(point).collect()
+    }
+
+    #[test]
+    fn equals_brute_force_bit_for_bit() {
+        for kind in 0..4 {
+            for n in [0, 1, 2, 3, 4, 5, 12, 13, 100, 1500] {
+                let points = cloud(n, kind);
+                assert_eq!(nearest_dist2(&points), brute_force(&points), "kind {kind}, {n} points");
+            }
+        }
+    }
+
+    #[test]
+    fn equal_points_and_broken_points_are_survived() {
+        assert_eq!(nearest_dist2(&[[2.5; 3]; 500]), vec![[0.0; 3]; 500]);
+        let mut points = cloud(200, 0);
+        points[7] = [f32::NAN; 3];
+        points[90] = [f32::INFINITY, 0.0, 0.0];
+        points[91] = [1e30; 3];
+        let found = nearest_dist2(&points);
+        assert_eq!(found, brute_force(&points));
+        assert_eq!(found[7], [f32::INFINITY; 3]);
+    }
+
+    #[test]
+    fn threads_do_not_matter() {
+        let points = cloud(20_000, 1);
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| nearest_dist2(&points))
+        };
+        assert_eq!(with(1), with(3));
+    }
+}

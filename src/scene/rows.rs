@@ -1,0 +1,315 @@
+//! Views of rows: what an operation on rows borrows, whether the rows live in one table in memory or in a page.
+//!
+//! Invariants: 1. every slice of a view covers the same rows; 2. row numbers given to a view's methods count from its
+//! own first row; 3. splitting a view gives disjoint views, so rows can be worked on in parallel without locks;
+//! 4. a [`RowBlock`] holds one whole row in a fixed order of lanes, whatever the degree: unused lanes are zero.
+
+use super::columns::{Column, sh_n_width};
+
+/// Floats of a [`RowBlock`]: 16 for the columns of fixed width (14 used), 48 for `sh_n` (45 used at degree 3).
+pub const BLOCK_LANES: usize = 64;
+/// First lane of `sh_n` in a [`RowBlock`].
+pub const SH_N_LANE: usize = 16;
+
+/// One row of any table with the shape of the columns: means 0..3, quats 3..7, scales 7..10, opacity 10,
+/// sh0 11..14, `sh_n` from [`SH_N_LANE`].
+pub type RowBlock = [f32; BLOCK_LANES];
+
+/// First lane of a column in a [`RowBlock`].
+pub const fn first_lane(column: Column) -> usize {
+    match column {
+        Column::Means => 0,
+        Column::Quats => 3,
+        Column::Scales => 7,
+        Column::Opacities => 10,
+        Column::Sh0 => 11,
+        Column::ShN => SH_N_LANE,
+    }
+}
+
+/// Shared view of the columns of some rows; each slice is `[rows][width]`.
+#[derive(Debug, Clone, Copy)]
+pub struct ColumnsRef<'a> {
+    /// Degree that `sh_n` is stored with.
+    pub sh_degree: u8,
+    /// `[rows][3]`.
+    pub means: &'a [f32],
+    /// `[rows][4]`, w x y z.
+    pub quats: &'a [f32],
+    /// `[rows][3]`, log.
+    pub scales: &'a [f32],
+    /// `[rows]`, logit.
+    pub opacities: &'a [f32],
+    /// `[rows][3]`.
+    pub sh0: &'a [f32],
+    /// `[rows][(degree + 1)^2 - 1][3]`.
+    pub sh_n: &'a [f32],
+}
+
+/// Exclusive view of the columns of some rows; each slice is `[rows][width]`.
+#[derive(Debug)]
+pub struct ColumnsMut<'a> {
+    /// Degree that `sh_n` is stored with.
+    pub sh_degree: u8,
+    /// `[rows][3]`.
+    pub means: &'a mut [f32],
+    /// `[rows][4]`, w x y z.
+    pub quats: &'a mut [f32],
+    /// `[rows][3]`, log.
+    pub scales: &'a mut [f32],
+    /// `[rows]`, logit.
+    pub opacities: &'a mut [f32],
+    /// `[rows][3]`.
+    pub sh0: &'a mut [f32],
+    /// `[rows][(degree + 1)^2 - 1][3]`.
+    pub sh_n: &'a mut [f32],
+}
+
+impl<'a> ColumnsRef<'a> {
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.opacities.len()
+    }
+
+    /// The rows before `row`, and the rest.
+    pub fn split_at(self, row: usize) -> (ColumnsRef<'a>, ColumnsRef<'a>) {
+        let sh_degree = self.sh_degree;
+        let (means, means_b) = self.means.split_at(row * 3);
+        let (quats, quats_b) = self.quats.split_at(row * 4);
+        let (scales, scales_b) = self.scales.split_at(row * 3);
+        let (opacities, opacities_b) = self.opacities.split_at(row);
+        let (sh0, sh0_b) = self.sh0.split_at(row * 3);
+        let (sh_n, sh_n_b) = self.sh_n.split_at(row * sh_n_width(sh_degree));
+        (
+            ColumnsRef { sh_degree, means, quats, scales, opacities, sh0, sh_n },
+            ColumnsRef {
+                sh_degree,
+                means: means_b,
+                quats: quats_b,
+                scales: scales_b,
+                opacities: opacities_b,
+                sh0: sh0_b,
+                sh_n: sh_n_b,
+            },
+        )
+    }
+
+    /// Copies one row into the lanes of a block. `W` is the width of `sh_n`: fixed, so that the copy is a few
+    /// vector moves. Lanes that the row does not use are left alone.
+    #[inline(always)]
+    pub fn load_row<const W: usize>(&self, row: usize, block: &mut RowBlock) {
+        block[0..3].copy_from_slice(&self.means[row * 3..row * 3 + 3]);
+        block[3..7].copy_from_slice(&self.quats[row * 4..row * 4 + 4]);
+        block[7..10].copy_from_slice(&self.scales[row * 3..row * 3 + 3]);
+        block[10] = self.opacities[row];
+        block[11..14].copy_from_slice(&self.sh0[row * 3..row * 3 + 3]);
+        block[SH_N_LANE..SH_N_LANE + W].copy_from_slice(&self.sh_n[row * W..row * W + W]);
+    }
+
+    /// [`ColumnsRef::load_row`] for a degree known only at run time.
+    pub fn load_row_any(&self, row: usize, block: &mut RowBlock) {
+        match self.sh_degree {
+            0 => self.load_row::<0>(row, block),
+            1 => self.load_row::<9>(row, block),
+            2 => self.load_row::<24>(row, block),
+            _ => self.load_row::<45>(row, block),
+        }
+    }
+}
+
+impl<'a> ColumnsMut<'a> {
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.opacities.len()
+    }
+
+    /// The same rows, shared.
+    pub fn as_ref(&self) -> ColumnsRef<'_> {
+        ColumnsRef {
+            sh_degree: self.sh_degree,
+            means: self.means,
+            quats: self.quats,
+            scales: self.scales,
+            opacities: self.opacities,
+            sh0: self.sh0,
+            sh_n: self.sh_n,
+        }
+    }
+
+    /// The rows before `row`, and the rest.
+    pub fn split_at(self, row: usize) -> (ColumnsMut<'a>, ColumnsMut<'a>) {
+        let sh_degree = self.sh_degree;
+        let (means, means_b) = self.means.split_at_mut(row * 3);
+        let (quats, quats_b) = self.quats.split_at_mut(row * 4);
+        let (scales, scales_b) = self.scales.split_at_mut(row * 3);
+        let (opacities, opacities_b) = self.opacities.split_at_mut(row);
+        let (sh0, sh0_b) = self.sh0.split_at_mut(row * 3);
+        let (sh_n, sh_n_b) = self.sh_n.split_at_mut(row * sh_n_width(sh_degree));
+        (
+            ColumnsMut { sh_degree, means, quats, scales, opacities, sh0, sh_n },
+            ColumnsMut {
+                sh_degree,
+                means: means_b,
+                quats: quats_b,
+                scales: scales_b,
+                opacities: opacities_b,
+                sh0: sh0_b,
+                sh_n: sh_n_b,
+            },
+        )
+    }
+
+    /// Copies the lanes of a block into one row; `W` is the width of `sh_n`.
+    #[inline(always)]
+    pub fn store_row<const W: usize>(&mut self, row: usize, block: &RowBlock) {
+        self.means[row * 3..row * 3 + 3].copy_from_slice(&block[0..3]);
+        self.quats[row * 4..row * 4 + 4].copy_from_slice(&block[3..7]);
+        self.scales[row * 3..row * 3 + 3].copy_from_slice(&block[7..10]);
+        self.opacities[row] = block[10];
+        self.sh0[row * 3..row * 3 + 3].copy_from_slice(&block[11..14]);
+        self.sh_n[row * W..row * W + W].copy_from_slice(&block[SH_N_LANE..SH_N_LANE + W]);
+    }
+
+    /// [`ColumnsMut::store_row`] for a degree known only at run time.
+    pub fn store_row_any(&mut self, row: usize, block: &RowBlock) {
+        match self.sh_degree {
+            0 => self.store_row::<0>(row, block),
+            1 => self.store_row::<9>(row, block),
+            2 => self.store_row::<24>(row, block),
+            _ => self.store_row::<45>(row, block),
+        }
+    }
+}
+
+/// Shared view of rows with all that training keeps of them.
+#[derive(Debug, Clone, Copy)]
+pub struct Rows<'a> {
+    /// Number of the first row in the table that the view was cut from.
+    pub first_row: usize,
+    /// Values after the last update of each row.
+    pub columns: ColumnsRef<'a>,
+    /// First moments after it.
+    pub exp_avg: ColumnsRef<'a>,
+    /// Second moments after it.
+    pub exp_avg_sq: ColumnsRef<'a>,
+    /// Optimizer steps contained in the row.
+    pub stamp: &'a [u32],
+    /// Identities.
+    pub uid: &'a [u64],
+    /// Sums of gradient norms since the last round.
+    pub grad2d: &'a [f32],
+    /// Views that drew the row since the last round.
+    pub count: &'a [u32],
+}
+
+/// Exclusive view of rows with all that training keeps of them.
+#[derive(Debug)]
+pub struct RowsMut<'a> {
+    /// Number of the first row in the table that the view was cut from.
+    pub first_row: usize,
+    /// Values after the last update of each row.
+    pub columns: ColumnsMut<'a>,
+    /// First moments after it.
+    pub exp_avg: ColumnsMut<'a>,
+    /// Second moments after it.
+    pub exp_avg_sq: ColumnsMut<'a>,
+    /// Optimizer steps contained in the row.
+    pub stamp: &'a mut [u32],
+    /// Identities.
+    pub uid: &'a mut [u64],
+    /// Sums of gradient norms since the last round.
+    pub grad2d: &'a mut [f32],
+    /// Views that drew the row since the last round.
+    pub count: &'a mut [u32],
+}
+
+impl<'a> Rows<'a> {
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.stamp.len()
+    }
+
+    /// The rows before `row`, and the rest.
+    pub fn split_at(self, row: usize) -> (Rows<'a>, Rows<'a>) {
+        let (columns, columns_b) = self.columns.split_at(row);
+        let (exp_avg, exp_avg_b) = self.exp_avg.split_at(row);
+        let (exp_avg_sq, exp_avg_sq_b) = self.exp_avg_sq.split_at(row);
+        let (stamp, stamp_b) = self.stamp.split_at(row);
+        let (uid, uid_b) = self.uid.split_at(row);
+        let (grad2d, grad2d_b) = self.grad2d.split_at(row);
+        let (count, count_b) = self.count.split_at(row);
+        let first_row = self.first_row;
+        (
+            Rows { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count },
+            Rows {
+                first_row: first_row + row,
+                columns: columns_b,
+                exp_avg: exp_avg_b,
+                exp_avg_sq: exp_avg_sq_b,
+                stamp: stamp_b,
+                uid: uid_b,
+                grad2d: grad2d_b,
+                count: count_b,
+            },
+        )
+    }
+}
+
+impl<'a> RowsMut<'a> {
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.stamp.len()
+    }
+
+    /// The same rows, shared.
+    pub fn as_ref(&self) -> Rows<'_> {
+        Rows {
+            first_row: self.first_row,
+            columns: self.columns.as_ref(),
+            exp_avg: self.exp_avg.as_ref(),
+            exp_avg_sq: self.exp_avg_sq.as_ref(),
+            stamp: self.stamp,
+            uid: self.uid,
+            grad2d: self.grad2d,
+            count: self.count,
+        }
+    }
+
+    /// The rows before `row`, and the rest.
+    pub fn split_at(self, row: usize) -> (RowsMut<'a>, RowsMut<'a>) {
+        let (columns, columns_b) = self.columns.split_at(row);
+        let (exp_avg, exp_avg_b) = self.exp_avg.split_at(row);
+        let (exp_avg_sq, exp_avg_sq_b) = self.exp_avg_sq.split_at(row);
+        let (stamp, stamp_b) = self.stamp.split_at_mut(row);
+        let (uid, uid_b) = self.uid.split_at_mut(row);
+        let (grad2d, grad2d_b) = self.grad2d.split_at_mut(row);
+        let (count, count_b) = self.count.split_at_mut(row);
+        let first_row = self.first_row;
+        (
+            RowsMut { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count },
+            RowsMut {
+                first_row: first_row + row,
+                columns: columns_b,
+                exp_avg: exp_avg_b,
+                exp_avg_sq: exp_avg_sq_b,
+                stamp: stamp_b,
+                uid: uid_b,
+                grad2d: grad2d_b,
+                count: count_b,
+            },
+        )
+    }
+}
+
+/// What rows are at one moment of training. The optimizer implements it; events act on rows through it, because an
+/// untouched row still moves by its momentum.
+pub trait RowsNow: Sync {
+    /// The moment: number of optimizer steps contained in every value that this gives.
+    fn now(&self) -> u32;
+    /// The whole row as it is now. Lanes that the degree does not use are zero.
+    fn evaluate_row(&self, rows: &Rows<'_>, row: usize, out: &mut RowBlock);
+    /// One value of one column of a row as it is now; `element` counts within the row.
+    fn evaluate_element(&self, rows: &Rows<'_>, column: Column, row: usize, element: usize) -> f32;
+    /// Rewrites the row as what it is now: values, decayed moments, stamp.
+    fn settle_row(&self, rows: &mut RowsMut<'_>, row: usize);
+}

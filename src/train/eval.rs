@@ -1,0 +1,139 @@
+//! Looking at held-out views: PSNR, SSIM, and pictures of render beside photo. Changes no state.
+
+use super::catch_up::{gather, visible_rows};
+use super::report::{TestMetrics, json_psnr};
+use super::trainer::TrainError;
+use crate::base::error::{InputError, InputResult};
+use crate::config::file::TrainConfig;
+use crate::config::limits::{self, RunOptions};
+use crate::dataset::loader::{Dataset, load_dataset};
+use crate::dataset::read::read_scene;
+use crate::dataset::target_cache::TargetCache;
+use crate::exchange::ply::{PlyContent, read_ply, to_local};
+use crate::optim::deferred::DeferredAdam;
+use crate::render::cpu::CpuRenderer;
+use crate::render::metrics::{SsimVariant, psnr, ssim};
+use crate::render::{RenderOptions, Renderer};
+use crate::scene::columns::Columns;
+use crate::scene::image::{Image, Target};
+use crate::scene::state::SceneState;
+use std::path::{Path, PathBuf};
+
+/// Where pictures go and which views are looked at.
+pub struct EvalRequest<'a> {
+    /// Positions in `dataset.views`.
+    pub views: &'a [usize],
+    /// The SSIM to report.
+    pub ssim: SsimVariant,
+    /// Folder for pictures (render beside photo), created when missing; `None` for none.
+    pub pictures: Option<&'a Path>,
+}
+
+/// Evaluates the rows as they are at `now` on the requested views. `None` when there are none.
+///
+/// # Errors
+/// A photo cannot be decoded, the renderer failed, or a picture cannot be written.
+pub fn evaluate(
+    (state, adam, now): (&SceneState, &DeferredAdam, u32),
+    renderer: &mut dyn Renderer,
+    (dataset, targets): (&Dataset, &TargetCache),
+    options: &RenderOptions,
+    request: &EvalRequest<'_>,
+) -> Result<Option<TestMetrics>, TrainError> {
+    if request.views.is_empty() {
+        return Ok(None);
+    }
+    let mut rows = Vec::new();
+    let mut columns = Columns::zeros(0, state.columns.sh_degree);
+    let (mut psnr_sum, mut ssim_sum) = (0.0, 0.0);
+    for (i, &view) in request.views.iter().enumerate() {
+        targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
+        let target = targets.get(view)?;
+        let camera = &dataset.views[view].camera;
+        visible_rows(state, adam, now, camera, &mut rows);
+        gather(state, adam, now, &rows, &mut columns);
+        renderer.forward(&columns, camera, options)?;
+        let image = renderer.image()?;
+        psnr_sum += json_psnr(psnr(image, &target));
+        ssim_sum += ssim(image, &target, request.ssim);
+        if let Some(folder) = request.pictures {
+            write_pair(folder, &dataset.views[view].name, image, &target)?;
+        }
+    }
+    let n = request.views.len() as f64;
+    Ok(Some(TestMetrics { views: request.views.len() as u32, psnr: psnr_sum / n, ssim: ssim_sum / n }))
+}
+
+/// File of the picture of a view: its name with folders and extension folded in.
+pub fn picture_path(folder: &Path, view_name: &str) -> PathBuf {
+    let flat = view_name.replace(['/', '\\'], "_");
+    let stem = flat.rsplit_once('.').map_or(flat.as_str(), |(stem, _)| stem);
+    folder.join(format!("{stem}.png"))
+}
+
+/// Writes render (left) beside photo (right).
+fn write_pair(folder: &Path, view_name: &str, image: &Image, target: &Target) -> InputResult<()> {
+    std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder for pictures", &e))?;
+    let (w, h) = (image.width as usize, image.height as usize);
+    let render = image.to_rgb8();
+    let mut both = Vec::with_capacity(6 * w * h);
+    for y in 0..h {
+        both.extend_from_slice(&render[3 * w * y..3 * w * (y + 1)]);
+        both.extend_from_slice(&target.rgb[3 * w * y..3 * w * (y + 1)]);
+    }
+    let path = picture_path(folder, view_name);
+    image::save_buffer(&path, &both, 2 * image.width, image.height, image::ExtendedColorType::Rgb8)
+        .map_err(|e| InputError::new(&path, format!("writing the picture failed: {e}"), "check the disk and its space"))
+}
+
+/// What `gsscale-eval` prints.
+#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
+pub struct EvalReport {
+    /// The PLY.
+    pub ply: PathBuf,
+    /// The scene.
+    pub scene: PathBuf,
+    /// Gaussians in the PLY.
+    pub gaussians: u64,
+    /// Which SSIM is reported.
+    pub ssim_variant: String,
+    /// Means over the held-out views; absent when there are none.
+    pub test: Option<TestMetrics>,
+}
+
+/// Evaluates a PLY of Gaussians on the held-out views of a scene.
+///
+/// # Errors
+/// The PLY or the scene cannot be used, or a picture cannot be written.
+pub fn evaluate_ply(
+    ply: &Path,
+    scene: &Path,
+    config: &TrainConfig,
+    pictures: Option<&Path>,
+) -> Result<EvalReport, TrainError> {
+    let PlyContent::Gaussians { mut columns, meta, .. } = read_ply(ply)? else {
+        let problem = "holds points, not Gaussians (no property f_dc_0)";
+        return Err(InputError::new(ply, problem, "give the point_cloud.ply of a run").into());
+    };
+    let dataset = load_dataset(read_scene(scene, &limits::read_options(config))?, &limits::load_options(config))?;
+    for warning in &dataset.warnings {
+        eprintln!("warning: {warning}");
+    }
+    to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
+    let run = RunOptions::new(config, dataset.scene_scale);
+    let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
+    let gaussians = columns.rows() as u64;
+    let state = SceneState::from_columns(columns);
+    let adam = DeferredAdam::new(run.rates, run.adam, render.simd);
+    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
+    let views = dataset.test_views();
+    let request = EvalRequest { views: &views, ssim: run.ssim_variant, pictures };
+    let test = evaluate((&state, &adam, 0), &mut CpuRenderer::new(), (&dataset, &targets), &render, &request)?;
+    Ok(EvalReport {
+        ply: ply.to_path_buf(),
+        scene: scene.to_path_buf(),
+        gaussians,
+        ssim_variant: config.ssim_variant.clone(),
+        test,
+    })
+}

@@ -1,0 +1,63 @@
+//! What a person sees while a run goes on: a bar on a terminal, plain lines elsewhere, nothing with `--quiet`.
+
+use indicatif::{ProgressBar, ProgressStyle};
+use std::io::IsTerminal;
+use std::time::Instant;
+
+/// Progress of a loop over steps.
+pub struct Progress {
+    bar: Option<ProgressBar>,
+    quiet: bool,
+    total: u32,
+    started: Instant,
+    last_line: Instant,
+}
+
+impl Progress {
+    /// A display for `total` steps.
+    pub fn new(total: u32, quiet: bool) -> Self {
+        let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
+            let bar = ProgressBar::new(u64::from(total));
+            let template = "{bar:32.cyan/blue} {pos}/{len} {per_sec} {msg} {eta} left";
+            bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
+            bar
+        });
+        let now = Instant::now();
+        Progress { bar, quiet, total, started: now, last_line: now }
+    }
+
+    /// One step is done. `message` is asked for only when it will be shown.
+    pub fn step(&mut self, done: u32, message: impl FnOnce() -> String) {
+        if let Some(bar) = &self.bar {
+            bar.set_position(u64::from(done));
+            if self.last_line.elapsed().as_millis() > 100 {
+                bar.set_message(message());
+                self.last_line = Instant::now();
+            }
+            return;
+        }
+        // Off a terminal a line every ten seconds tells that the run lives without filling a log.
+        if !self.quiet && (self.last_line.elapsed().as_secs() >= 10 || done == self.total) {
+            self.last_line = Instant::now();
+            let rate = f64::from(done) / self.started.elapsed().as_secs_f64().max(1e-9);
+            let left = f64::from(self.total - done) / rate.max(1e-9);
+            eprintln!("step {done}/{}  {rate:.1}/s  {}  {left:.0} s left", self.total, message());
+        }
+    }
+
+    /// A line that stays on the screen.
+    pub fn say(&self, line: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| eprintln!("{line}")),
+            None if !self.quiet => eprintln!("{line}"),
+            None => {}
+        }
+    }
+
+    /// The loop has ended.
+    pub fn finish(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}

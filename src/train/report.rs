@@ -1,0 +1,171 @@
+//! What a run leaves behind for programs: metrics.jsonl line by line, summary.json at the end, config.toml at the start.
+//!
+//! Invariants: 1. every number written is finite (JSON has no infinity: an infinite PSNR is written as 100); 2. whole
+//! files appear by rename, so a reader never sees half of one.
+
+use crate::base::error::{InputError, InputResult};
+use crate::config::file::TrainConfig;
+use crate::render::metrics::SsimVariant;
+use serde::{Deserialize, Serialize};
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+/// PSNR that stands for a perfect image.
+pub const PSNR_PERFECT: f64 = 100.0;
+
+/// One logged step.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct StepLine {
+    /// 0-based step.
+    pub step: u32,
+    /// Loss of the step's view.
+    pub loss: f64,
+    /// PSNR of the step's view, unclamped, dB.
+    pub psnr: f64,
+    /// Gaussians after the step.
+    pub gaussians: u64,
+    /// Seconds of training so far.
+    pub seconds: f64,
+    /// Largest resident size so far, bytes.
+    pub host_bytes_peak: u64,
+    /// Evaluation on the held-out views, where one was due.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub test: Option<TestMetrics>,
+}
+
+/// Means over the held-out views.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct TestMetrics {
+    /// Views evaluated.
+    pub views: u32,
+    /// Mean PSNR, dB.
+    pub psnr: f64,
+    /// Mean SSIM.
+    pub ssim: f64,
+}
+
+/// What summary.json holds.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Summary {
+    /// Steps done.
+    pub steps: u32,
+    /// Gaussians in the result.
+    pub gaussians: u64,
+    /// Seconds spent in training steps, evaluation left out.
+    pub train_seconds: f64,
+    /// Largest resident size of the process, bytes.
+    pub host_bytes_peak: u64,
+    /// Held-out metrics; absent when no view is held out.
+    pub test: Option<TestMetrics>,
+    /// The scene that was trained.
+    pub scene: PathBuf,
+    /// Version of the program.
+    pub version: String,
+    /// Which SSIM `test.ssim` is: same, valid or reflect.
+    pub ssim_variant: String,
+    /// Whether the run did all of its steps.
+    pub finished: bool,
+    /// Gaussians whose update was skipped because a gradient was not finite, over all steps.
+    pub rows_skipped_non_finite: u64,
+    /// Steps skipped because the loss was not finite.
+    pub steps_skipped_non_finite: u32,
+}
+
+/// A finite PSNR for JSON.
+pub fn json_psnr(psnr: f64) -> f64 {
+    if psnr.is_finite() { psnr.min(PSNR_PERFECT) } else { PSNR_PERFECT }
+}
+
+/// The variant of this name; the config has checked it.
+pub fn ssim_variant(config: &TrainConfig) -> SsimVariant {
+    SsimVariant::from_name(&config.ssim_variant).unwrap_or(SsimVariant::Same)
+}
+
+/// Appends lines to metrics.jsonl.
+pub struct MetricsLog {
+    path: PathBuf,
+    file: BufWriter<File>,
+}
+
+impl MetricsLog {
+    /// Creates the file.
+    ///
+    /// # Errors
+    /// The file cannot be created.
+    pub fn create(path: &Path) -> InputResult<Self> {
+        let file = File::create(path).map_err(|e| InputError::io(path, "creating the metrics file", &e))?;
+        Ok(MetricsLog { path: path.to_path_buf(), file: BufWriter::new(file) })
+    }
+
+    /// Writes one line and hands it to the system, so that a crash loses none that was written.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn write(&mut self, line: &StepLine) -> InputResult<()> {
+        let io = |e: std::io::Error| InputError::io(&self.path, "writing metrics", &e);
+        let text = serde_json::to_string(line).map_err(|e| io(e.into()))?;
+        self.file.write_all(text.as_bytes()).and_then(|()| self.file.write_all(b"\n")).map_err(io)?;
+        self.file.flush().map_err(io)
+    }
+}
+
+/// Writes a whole file by way of a temporary one beside it.
+///
+/// # Errors
+/// The folder cannot be written.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> InputResult<()> {
+    let mut name = path.file_name().unwrap_or_default().to_os_string();
+    name.push(".part");
+    let part = path.with_file_name(name);
+    let io = |e: std::io::Error| InputError::io(path, "writing", &e);
+    let mut file = File::create(&part).map_err(io)?;
+    file.write_all(bytes).and_then(|()| file.sync_all()).map_err(io)?;
+    std::fs::rename(&part, path).map_err(io)
+}
+
+/// Writes summary.json.
+///
+/// # Errors
+/// The folder cannot be written.
+pub fn write_summary(path: &Path, summary: &Summary) -> InputResult<()> {
+    let text = serde_json::to_string_pretty(summary).map_err(|e| InputError::io(path, "writing", &e.into()))?;
+    write_whole(path, (text + "\n").as_bytes())
+}
+
+/// Facts of a run that follow from its config and machine.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Resolved {
+    /// Version of the program.
+    pub version: String,
+    /// The scene.
+    pub scene: PathBuf,
+    /// Instruction path in use.
+    pub simd: String,
+    /// Worker threads in use.
+    pub threads: usize,
+    /// Training views.
+    pub train_views: usize,
+    /// Held-out views.
+    pub test_views: usize,
+    /// Gaussians at the start.
+    pub gaussians: u64,
+    /// Origin removed from the dataset's coordinates.
+    pub origin: [f64; 3],
+    /// Scale removed from the dataset's coordinates.
+    pub scale: f64,
+    /// Scene scale, dataset units.
+    pub scene_scale: f64,
+}
+
+/// Writes config.toml: every key, then the facts.
+///
+/// # Errors
+/// The folder cannot be written.
+pub fn write_config(path: &Path, config: &TrainConfig, resolved: &Resolved) -> InputResult<()> {
+    let fail = |e: toml::ser::Error| InputError::new(path, format!("writing failed: {e}"), "report this as a bug");
+    let mut text = toml::to_string(config).map_err(fail)?;
+    text.push_str("\n[resolved]\n");
+    text.push_str(&toml::to_string(resolved).map_err(fail)?);
+    write_whole(path, text.as_bytes())
+}

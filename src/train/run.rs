@@ -1,0 +1,310 @@
+//! A run from command line to result: load, check, say what it will take, train, evaluate, write.
+//!
+//! Invariants: 1. the output folder is made only after the dataset was understood, so bad input leaves nothing
+//! behind; 2. a run that is stopped or fails after its first step still writes the PLY of its last good step.
+
+use super::memory::{estimate, host_bytes_peak};
+use super::progress::Progress;
+use super::report::{MetricsLog, Resolved, Summary, write_config, write_summary};
+use super::signals::StopFlag;
+use super::trainer::{LoopOutputs, TrainError, Trainer};
+use crate::base::error::{InputError, InputResult};
+use crate::base::units::format_bytes;
+use crate::config::file::TrainConfig;
+use crate::config::limits::{self, RunOptions};
+use crate::dataset::loader::{Dataset, load_dataset};
+use crate::dataset::model::PointCloud;
+use crate::dataset::read::read_scene;
+use crate::dataset::target_cache::TargetCache;
+use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
+use crate::render::cpu::CpuRenderer;
+use crate::scene::columns::Columns;
+use crate::scene::init::{gaussians_from_points, random_points_in_frusta};
+use std::path::{Path, PathBuf};
+
+/// What to run.
+#[derive(Debug, Clone)]
+pub struct RunRequest {
+    /// Scene folder (or transforms.json).
+    pub scene: PathBuf,
+    /// Output folder.
+    pub out: PathBuf,
+    /// Checked config.
+    pub config: TrainConfig,
+    /// Print what was understood and stop.
+    pub dry_run: bool,
+    /// An existing output folder may be replaced.
+    pub overwrite: bool,
+    /// Nothing but errors on the terminal.
+    pub quiet: bool,
+}
+
+/// How a run ended.
+#[derive(Debug, Clone)]
+pub struct RunOutcome {
+    /// What summary.json holds; `None` for a dry run.
+    pub summary: Option<Summary>,
+    /// Exit code of the process: 0, or 130/143 when asked to stop.
+    pub exit_code: i32,
+}
+
+/// A dataset with the Gaussians that training starts from.
+pub struct Prepared {
+    /// Views and frame.
+    pub dataset: Dataset,
+    /// First Gaussians, local frame.
+    pub columns: Columns,
+}
+
+/// Reads the scene and makes first Gaussians.
+///
+/// # Errors
+/// Whatever is wrong with the scene or the PLY, by file, place and remedy.
+pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
+    let mut raw = read_scene(scene, &limits::read_options(config))?;
+    let mut gaussians = None;
+    let points_file = match (config.init_ply.as_str(), &raw.points_path) {
+        ("", path) => path.clone(),
+        (path, _) => Some(PathBuf::from(path)),
+    };
+    if let Some(path) = points_file {
+        match read_ply(&path)? {
+            PlyContent::Gaussians { columns, meta, .. } => {
+                raw.points = PointCloud::default();
+                gaussians = Some((columns, meta));
+            }
+            PlyContent::Points { positions, colors, .. } => raw.points = PointCloud { positions, colors },
+        }
+    }
+    let dataset = load_dataset(raw, &limits::load_options(config))?;
+    if dataset.train_views().is_empty() {
+        let problem = "no view is left to train on";
+        return Err(InputError::new(scene, problem, "hold out fewer photos: see --test-every and --test-after"));
+    }
+    let columns = match gaussians {
+        Some((mut columns, meta)) => {
+            to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
+            resize_sh(&columns, config.sh_degree)
+        }
+        None => first_gaussians(scene, &dataset, config)?,
+    };
+    if config.max_gaussians > 0 && columns.rows() as u64 > config.max_gaussians {
+        let problem = format!("the start has {} Gaussians, above --max-gaussians", columns.rows());
+        return Err(InputError::new(scene, problem, "raise --max-gaussians or start from fewer"));
+    }
+    Ok(Prepared { dataset, columns })
+}
+
+fn first_gaussians(scene: &Path, dataset: &Dataset, config: &TrainConfig) -> InputResult<Columns> {
+    let mut options = limits::init_options(config);
+    options.scene_scale = dataset.scene_scale;
+    if !dataset.points.is_empty() {
+        return Ok(gaussians_from_points(&dataset.points, &dataset.colors, &options));
+    }
+    if config.init_points == 0 {
+        return Err(InputError::new(
+            scene,
+            "the dataset has no points and --init-points is 0",
+            "give points with --init-ply, or let --init-points N draw them in the views' frusta",
+        ));
+    }
+    let cameras: Vec<_> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
+    let count = config.init_points as usize;
+    // Aerial and object captures both have their subject within a few camera-spreads of the cameras.
+    let (near, far) = (0.1 * dataset.scene_scale, 3.0 * dataset.scene_scale);
+    let (points, colors) = random_points_in_frusta(&cameras, count, near, far, config.seed);
+    Ok(gaussians_from_points(&points, &colors, &options))
+}
+
+/// The same rows stored with another degree: bands are cut or filled with zeros.
+fn resize_sh(columns: &Columns, sh_degree: u8) -> Columns {
+    let mut out = Columns { sh_degree, ..columns.clone() };
+    out.sh_n.clear();
+    out.resize(columns.rows());
+    let kept = crate::scene::columns::sh_n_width(sh_degree.min(columns.sh_degree));
+    if kept > 0 {
+        for row in 0..columns.rows() {
+            let from = &columns.row(crate::scene::columns::Column::ShN, row)[..kept];
+            out.row_mut(crate::scene::columns::Column::ShN, row)[..kept].copy_from_slice(from);
+        }
+    }
+    out
+}
+
+/// Runs a request from beginning to end.
+///
+/// # Errors
+/// Bad input (nothing is left behind), or a failure while training (the last good step is written).
+pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
+    let config = &request.config;
+    config.check()?;
+    set_threads(config);
+    check_simd(config)?;
+    check_out(request)?;
+    let Prepared { dataset, columns } = prepare(&request.scene, config)?;
+    let say = |line: &str| {
+        if !request.quiet {
+            eprintln!("{line}");
+        }
+    };
+    for warning in &dataset.warnings {
+        eprintln!("warning: {warning}");
+    }
+    say(&describe(request, &dataset, &columns)?);
+    if request.dry_run {
+        return Ok(RunOutcome { summary: None, exit_code: 0 });
+    }
+    let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
+    make_out(&request.out, request.overwrite)?;
+    train_into(request, &dataset, columns, &stop)
+}
+
+fn train_into(
+    request: &RunRequest,
+    dataset: &Dataset,
+    columns: Columns,
+    stop: &StopFlag,
+) -> Result<RunOutcome, TrainError> {
+    let (config, out) = (&request.config, &request.out);
+    write_config(&out.join("config.toml"), config, &resolved(request, dataset, columns.rows()))?;
+    let mut metrics = MetricsLog::create(&out.join("metrics.jsonl"))?;
+    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
+    let options = RunOptions::new(config, dataset.scene_scale);
+    let mut trainer = Trainer::new(columns, dataset, Box::new(CpuRenderer::new()), options);
+    let mut progress = Progress::new(config.steps, request.quiet);
+    let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop };
+    let looped = trainer.run(dataset, &targets, &mut outputs);
+    let ply = Trainer::ply_path(out);
+    let written = trainer.save(dataset, &ply)?;
+    if written.frame == ExportFrame::Local && config.export_frame == "dataset" {
+        eprintln!(
+            "warning: the scene lies too far from its origin for f32, so {} holds local positions; \
+             its comments give origin and scale",
+            ply.display()
+        );
+    }
+    // A stopped run owes the user its files at once; the held-out views can be looked at later with gsscale-eval.
+    let test = if looped.is_ok() && stop.exit_code().is_none() {
+        trainer.evaluate(dataset, &targets, Some(&out.join("renders/test")))?
+    } else {
+        None
+    };
+    let (rows_skipped, steps_skipped) = trainer.skipped();
+    let summary = Summary {
+        steps: trainer.steps_done(),
+        gaussians: trainer.state.rows() as u64,
+        train_seconds: trainer.train_seconds(),
+        host_bytes_peak: host_bytes_peak().unwrap_or(0),
+        test,
+        scene: request.scene.clone(),
+        version: env!("CARGO_PKG_VERSION").to_string(),
+        ssim_variant: config.ssim_variant.clone(),
+        finished: trainer.steps_done() == config.steps,
+        rows_skipped_non_finite: rows_skipped,
+        steps_skipped_non_finite: steps_skipped,
+    };
+    write_summary(&out.join("summary.json"), &summary)?;
+    looped?;
+    Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
+}
+
+fn set_threads(config: &TrainConfig) {
+    if config.threads > 0 {
+        // A pool that exists already (a library user's) is kept: results do not depend on it.
+        let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
+    }
+}
+
+fn check_simd(config: &TrainConfig) -> InputResult<()> {
+    let path = limits::simd_path(config);
+    if path.is_supported() {
+        return Ok(());
+    }
+    let problem = format!("this machine cannot run {}", path.name());
+    Err(InputError::new("--simd", problem, "use --simd auto"))
+}
+
+fn check_out(request: &RunRequest) -> InputResult<()> {
+    if request.dry_run || request.overwrite || !request.out.exists() {
+        return Ok(());
+    }
+    let is_empty_folder = std::fs::read_dir(&request.out).is_ok_and(|mut entries| entries.next().is_none());
+    if is_empty_folder {
+        return Ok(());
+    }
+    Err(InputError::new(&request.out, "exists already", "choose another --out, or replace it with --overwrite"))
+}
+
+/// Makes the folder, proves that it can be written, and removes what an earlier run left there under our names.
+fn make_out(out: &Path, overwrite: bool) -> InputResult<()> {
+    let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
+    std::fs::create_dir_all(out).map_err(io)?;
+    let probe = out.join(".gsscale-probe");
+    std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(io)?;
+    if !overwrite {
+        return Ok(());
+    }
+    for name in ["config.toml", "metrics.jsonl", "summary.json", "point_cloud.ply"] {
+        let path = out.join(name);
+        if path.is_file() {
+            std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
+        }
+    }
+    let pictures = out.join("renders/test");
+    if pictures.is_dir() {
+        let io = |e: std::io::Error| InputError::io(&pictures, "removing the earlier run's pictures", &e);
+        std::fs::remove_dir_all(&pictures).map_err(io)?;
+    }
+    Ok(())
+}
+
+fn resolved(request: &RunRequest, dataset: &Dataset, rows: usize) -> Resolved {
+    Resolved {
+        version: env!("CARGO_PKG_VERSION").to_string(),
+        scene: request.scene.clone(),
+        simd: limits::simd_path(&request.config).name().to_string(),
+        threads: rayon::current_num_threads(),
+        train_views: dataset.train_views().len(),
+        test_views: dataset.test_views().len(),
+        gaussians: rows as u64,
+        origin: dataset.frame.origin.to_array(),
+        scale: dataset.frame.scale,
+        scene_scale: f64::from(dataset.scene_scale) * dataset.frame.scale,
+    }
+}
+
+/// What was understood and what it will take, for people.
+fn describe(request: &RunRequest, dataset: &Dataset, columns: &Columns) -> Result<String, TrainError> {
+    let config = &request.config;
+    let memory = estimate(config, dataset, columns)?;
+    let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
+    let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
+    let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
+    let growth = match (config.strategy.as_str(), config.max_gaussians) {
+        ("none", _) => String::from(" (no densification)"),
+        (_, 0) => String::from(" (densification without a cap: memory grows with them; see --max-gaussians)"),
+        (_, cap) => format!(" growing to at most {cap}"),
+    };
+    let text = format!(
+        "scene   {}: {} views to train on, {} held out, at most {size}\n\
+         start   {} Gaussians, SH degree {}{growth}\n\
+         run     {} steps on {} threads ({}), results in {}\n\
+         memory  about {} at the peak\n{}{}{}{}{}",
+        request.scene.display(),
+        dataset.train_views().len(),
+        dataset.test_views().len(),
+        columns.rows(),
+        config.sh_degree,
+        config.steps,
+        rayon::current_num_threads(),
+        limits::simd_path(config).name(),
+        request.out.display(),
+        format_bytes(memory.total()),
+        part("Gaussians with their optimizer state", memory.state),
+        part("one view: rows, gradients, images", memory.view),
+        part("decoded photos (--image-cache)", memory.targets),
+        part("copy for export", memory.export),
+        part("program", memory.base),
+    );
+    Ok(text.trim_end().to_string())
+}

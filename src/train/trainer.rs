@@ -1,0 +1,288 @@
+//! The loop over steps: views in order, events where they are due, metrics, evaluation and saves.
+//!
+//! Invariants: 1. the state after step s is a function of dataset, config and s alone, not of threads, budgets or
+//! cadences of logging and evaluation; 2. a step whose loss is not finite changes nothing, and three in a row end
+//! the run with what the last good step left.
+
+use super::catch_up::{apply_event, evaluate_all};
+use super::eval::{EvalRequest, evaluate};
+use super::memory::host_bytes_peak;
+use super::progress::Progress;
+use super::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
+use super::signals::StopFlag;
+use super::step::{StepOutcome, WorkingSet, train_step};
+use crate::base::error::InputError;
+use crate::config::limits::RunOptions;
+use crate::dataset::loader::Dataset;
+use crate::dataset::target_cache::TargetCache;
+use crate::densify::stats::GradHistogram;
+use crate::exchange::ply::{self, PlyMeta};
+use crate::optim::deferred::DeferredAdam;
+use crate::render::{RenderError, RenderOptions, Renderer};
+use crate::scene::columns::Columns;
+use crate::scene::events::{Event, EventLog};
+use crate::scene::state::SceneState;
+use crate::schedule::order::ShuffledOrder;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// Steps in a row with a loss that is not finite after which a run ends.
+const NON_FINITE_STEPS_MAX: u32 = 3;
+/// Views whose photos are asked for ahead of their steps.
+const PREFETCH_VIEWS: u32 = 8;
+
+/// What can end a run early.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainError {
+    /// Something that the user gave.
+    #[error(transparent)]
+    Input(#[from] InputError),
+    /// The renderer.
+    #[error("rendering failed at {0}")]
+    Render(#[from] RenderError),
+    /// The loss was not finite several times in a row.
+    #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
+    NonFinite {
+        /// Last of the steps.
+        step: u32,
+        /// View of that step.
+        view: String,
+        /// How many in a row.
+        count: u32,
+        /// What to do.
+        remedy: &'static str,
+    },
+}
+
+/// A run in memory.
+pub struct Trainer {
+    /// The rows.
+    pub state: SceneState,
+    /// The optimizer.
+    pub adam: DeferredAdam,
+    /// The renderer.
+    pub renderer: Box<dyn Renderer>,
+    options: RunOptions,
+    histogram: GradHistogram,
+    events: EventLog,
+    order: ShuffledOrder,
+    train_views: Vec<usize>,
+    working: WorkingSet,
+    step: u32,
+    rows_skipped: u64,
+    steps_skipped: u32,
+    steps_skipped_in_a_row: u32,
+    train_seconds: f64,
+}
+
+/// Where a loop writes, and how it is watched.
+pub struct LoopOutputs<'a> {
+    /// Output folder.
+    pub out: &'a Path,
+    /// metrics.jsonl.
+    pub metrics: &'a mut MetricsLog,
+    /// Bar or lines.
+    pub progress: &'a mut Progress,
+    /// Ctrl-C.
+    pub stop: &'a StopFlag,
+}
+
+impl Trainer {
+    /// A trainer of first Gaussians `columns` on the training views of `dataset` (at least one).
+    pub fn new(columns: Columns, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Self {
+        let train_views = dataset.train_views();
+        let mut state = SceneState::from_columns(columns);
+        if options.max_gaussians > 0 {
+            state.reserve_exact(options.max_gaussians.saturating_sub(state.rows()));
+        }
+        Trainer {
+            adam: DeferredAdam::new(options.rates, options.adam, options.render.simd),
+            histogram: GradHistogram::default(),
+            events: EventLog::default(),
+            order: ShuffledOrder::new(options.seed, train_views.len()),
+            train_views,
+            working: WorkingSet::default(),
+            state,
+            renderer,
+            options,
+            step: 0,
+            rows_skipped: 0,
+            steps_skipped: 0,
+            steps_skipped_in_a_row: 0,
+            train_seconds: 0.0,
+        }
+    }
+
+    /// Steps done.
+    pub fn steps_done(&self) -> u32 {
+        self.step
+    }
+
+    /// Seconds spent in steps.
+    pub fn train_seconds(&self) -> f64 {
+        self.train_seconds
+    }
+
+    /// Gaussians whose update was skipped, and steps that were, because something was not finite.
+    pub fn skipped(&self) -> (u64, u32) {
+        (self.rows_skipped, self.steps_skipped)
+    }
+
+    /// Options of a rendering at 0-based `step`: the bands in use follow from it.
+    pub fn render_options(&self, step: u32) -> RenderOptions {
+        RenderOptions { sh_degree: self.options.sh_degree_at(step), ..self.options.render }
+    }
+
+    /// Runs one step and the events that are due after it.
+    ///
+    /// # Errors
+    /// A photo cannot be decoded, the renderer failed, or the loss was not finite too often.
+    pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
+        let view = self.train_views[self.order.view_at(self.step)];
+        let mut ahead = Vec::new();
+        self.order.upcoming(self.step, PREFETCH_VIEWS.min(self.options.steps - self.step), &mut ahead);
+        for position in &mut ahead {
+            *position = self.train_views[*position];
+        }
+        targets.prefetch(&ahead);
+        let target = targets.get(view)?;
+        let started = Instant::now();
+        let render = self.render_options(self.step);
+        let outcome = train_step(
+            &mut self.state,
+            &mut self.working,
+            &mut *self.renderer,
+            &self.adam,
+            (self.step, &dataset.views[view].camera, &target),
+            (&render, &self.options.loss),
+            self.options.densify.is_some_and(|d| d.collects(self.step)).then_some(&mut self.histogram),
+        )?;
+        self.count(&outcome, &dataset.views[view].name)?;
+        self.run_events();
+        self.step += 1;
+        self.train_seconds += started.elapsed().as_secs_f64();
+        Ok(outcome)
+    }
+
+    fn count(&mut self, outcome: &StepOutcome, view: &str) -> Result<(), TrainError> {
+        self.rows_skipped += outcome.rows_skipped;
+        if !outcome.skipped {
+            self.steps_skipped_in_a_row = 0;
+            return Ok(());
+        }
+        self.steps_skipped += 1;
+        self.steps_skipped_in_a_row += 1;
+        if self.steps_skipped_in_a_row < NON_FINITE_STEPS_MAX {
+            return Ok(());
+        }
+        Err(TrainError::NonFinite {
+            step: self.step,
+            view: view.to_string(),
+            count: self.steps_skipped_in_a_row,
+            remedy: "lower the learning rates; if the defaults were used, report this as a bug with the scene",
+        })
+    }
+
+    /// Events fire after the update of their step, on values that contain it.
+    fn run_events(&mut self) {
+        let Some(densify) = self.options.densify else { return };
+        let rows = self.state.rows() as u64;
+        let kinds: Vec<_> = densify.events_after(self.step, self.options.scene_scale, rows, &self.histogram).collect();
+        for kind in kinds {
+            let event = Event { step: self.step, kind };
+            let index = self.events.push(event);
+            apply_event(&mut self.state, &self.adam, self.options.seed, index, &event);
+        }
+        if densify.is_round(self.step) {
+            self.histogram.clear();
+        }
+    }
+
+    /// Runs to the last step or until asked to stop.
+    ///
+    /// # Errors
+    /// As [`Trainer::step`], or an output cannot be written.
+    pub fn run(
+        &mut self,
+        dataset: &Dataset,
+        targets: &TargetCache,
+        outputs: &mut LoopOutputs<'_>,
+    ) -> Result<(), TrainError> {
+        let mut last_test: Option<TestMetrics> = None;
+        while self.step < self.options.steps && outputs.stop.exit_code().is_none() {
+            let step = self.step;
+            let outcome = self.step(dataset, targets)?;
+            let is_last = self.step == self.options.steps;
+            let due = |every: u32| step > 0 && step.is_multiple_of(every);
+            let psnr = json_psnr(-10.0 * outcome.loss.mse.log10());
+            if due(self.options.eval_every) && !is_last {
+                last_test = self.evaluate(dataset, targets, None)?;
+            }
+            if due(self.options.save_every) && !is_last {
+                self.save(dataset, &outputs.out.join(format!("point_cloud_{step:06}.ply")))?;
+            }
+            if step.is_multiple_of(self.options.log_every) || is_last || due(self.options.eval_every) {
+                outputs.metrics.write(&StepLine {
+                    step,
+                    loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },
+                    psnr,
+                    gaussians: self.state.rows() as u64,
+                    seconds: self.train_seconds,
+                    host_bytes_peak: host_bytes_peak().unwrap_or(0),
+                    test: last_test.filter(|_| due(self.options.eval_every) && !is_last),
+                })?;
+            }
+            let gaussians = self.state.rows();
+            outputs.progress.step(self.step, || {
+                let test = last_test.map_or(String::new(), |t| format!(" test {:.2}", t.psnr));
+                format!("loss {:.4} psnr {psnr:.2}{test} {gaussians} gaussians", outcome.loss.loss)
+            });
+        }
+        outputs.progress.finish();
+        Ok(())
+    }
+
+    /// Evaluates on the held-out views as of now.
+    ///
+    /// # Errors
+    /// As [`evaluate`].
+    pub fn evaluate(
+        &mut self,
+        dataset: &Dataset,
+        targets: &TargetCache,
+        pictures: Option<&Path>,
+    ) -> Result<Option<TestMetrics>, TrainError> {
+        let render = self.render_options(self.step.saturating_sub(1));
+        let views = dataset.test_views();
+        let request = EvalRequest { views: &views, ssim: self.options.ssim_variant, pictures };
+        let now = (&self.state, &self.adam, self.step);
+        evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)
+    }
+
+    /// Writes the rows as of now as a PLY; returns what was written, in which coordinates.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub fn save(&self, dataset: &Dataset, path: &Path) -> Result<ply::PlyWritten, TrainError> {
+        let columns = evaluate_all(&self.state, &self.adam, self.step);
+        let meta = PlyMeta {
+            step: Some(u64::from(self.step)),
+            origin: dataset.frame.origin.to_array(),
+            scale: dataset.frame.scale,
+            scene_radius: f64::from(dataset.scene_scale) * dataset.frame.scale,
+            frame: self.options.export_frame,
+            ..PlyMeta::default()
+        };
+        Ok(ply::write_gaussians(path, &columns, &meta)?)
+    }
+
+    /// Bytes that the trainer itself holds: state and working set.
+    pub fn bytes(&self) -> u64 {
+        (self.state.bytes() + self.working.bytes()) as u64
+    }
+
+    /// The path of the final PLY in an output folder.
+    pub fn ply_path(out: &Path) -> PathBuf {
+        out.join("point_cloud.ply")
+    }
+}

@@ -1,0 +1,316 @@
+//! What the programs do with input that is wrong, strange or merely unusual, through the real binaries. A bad scene
+//! must end with a message that names the file, the place and the remedy, a non-zero exit code, and no output folder.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+
+#[path = "support/scenes.rs"]
+mod scenes;
+
+use scenes::{TextModel, city, stderr, summary, text, train};
+use std::path::{Path, PathBuf};
+use tempfile::TempDir;
+
+/// A small city as a text model in a fresh folder.
+fn small() -> (TempDir, PathBuf, TextModel) {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 12, 96, 64, 400);
+    let model = TextModel::of(&scene);
+    model.write(&scene);
+    (folder, scene, model)
+}
+
+/// Must train to the end; returns what it said.
+fn trains(folder: &TempDir, scene: &Path, more: &[&str]) -> String {
+    let out = folder.path().join("out");
+    let mut args = vec![text(scene), "--out", text(&out), "--steps", "12", "--quiet", "--overwrite"];
+    args.extend(more);
+    let output = train(&args);
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    let loss_line = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
+    assert!(loss_line.contains("\"loss\":"), "{loss_line}");
+    assert!(out.join("point_cloud.ply").is_file());
+    assert!(summary(&out)["test"]["psnr"].as_f64().unwrap().is_finite());
+    said
+}
+
+/// Must refuse: exit code 1, all `words` in the message, a remedy, and nothing left behind.
+fn refuses(folder: &TempDir, scene: &Path, more: &[&str], words: &[&str]) {
+    let out = folder.path().join("refused");
+    let mut args = vec![text(scene), "--out", text(&out), "--steps", "12"];
+    args.extend(more);
+    let output = train(&args);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    for word in words {
+        assert!(said.contains(word), "'{word}' is not in: {said}");
+    }
+    assert!(said.contains("remedy"), "{said}");
+    assert!(!said.contains("panicked"), "{said}");
+    assert!(!out.exists(), "something was left behind: {said}");
+}
+
+// Must train.
+
+#[test]
+fn one_point_trains() {
+    let (folder, scene, mut model) = small();
+    model.points.truncate(1);
+    model.colors.truncate(1);
+    model.write(&scene);
+    trains(&folder, &scene, &[]);
+}
+
+#[test]
+fn all_points_equal_train() {
+    let (folder, scene, mut model) = small();
+    let first = model.points[0];
+    model.points.fill(first);
+    model.write(&scene);
+    trains(&folder, &scene, &[]);
+}
+
+#[test]
+fn points_very_far_away_are_dropped_and_counted() {
+    let (folder, scene, mut model) = small();
+    for i in 0..3 {
+        model.points[i * 7] = [1e12, -1e12, 1e12];
+    }
+    model.write(&scene);
+    let said = trains(&folder, &scene, &[]);
+    assert!(said.contains("3 points"), "{said}");
+}
+
+#[test]
+fn a_camera_inside_a_gaussian_trains() {
+    let (folder, scene, mut model) = small();
+    // A wide cloud of few points around a camera makes first Gaussians that contain it.
+    let v = &model.views[3];
+    let q = glam::DQuat::from_xyzw(v.qvec[1], v.qvec[2], v.qvec[3], v.qvec[0]);
+    let centre = -(q.inverse() * glam::DVec3::from_array(v.tvec));
+    model.points.truncate(4);
+    model.colors.truncate(4);
+    model.points[0] = (centre + glam::DVec3::new(0.01, 0.0, 0.01)).to_array();
+    model.write(&scene);
+    trains(&folder, &scene, &["--init-scale", "3"]);
+}
+
+#[test]
+fn a_view_that_sees_nothing_trains() {
+    let (folder, scene, mut model) = small();
+    // Turned by half a turn about its own y axis, the camera looks away from the city.
+    let q = model.views[5].qvec;
+    let turned = glam::DQuat::from_rotation_y(std::f64::consts::PI) * glam::DQuat::from_xyzw(q[1], q[2], q[3], q[0]);
+    model.views[5].qvec = [turned.w, turned.x, turned.y, turned.z];
+    let t = model.views[5].tvec;
+    model.views[5].tvec = [-t[0], t[1], -t[2]];
+    model.write(&scene);
+    trains(&folder, &scene, &[]);
+}
+
+// Must warn and go on.
+
+#[test]
+fn extra_images_are_a_warning() {
+    let (folder, scene, model) = small();
+    let photo = scene.join("images").join(&model.views[0].name);
+    std::fs::copy(photo, scene.join("images/zz_extra.jpg")).unwrap();
+    let said = trains(&folder, &scene, &[]);
+    assert!(said.contains("zz_extra.jpg"), "{said}");
+}
+
+#[test]
+fn a_pose_that_is_not_a_number_leaves_its_view_out_by_name() {
+    let (folder, scene, mut model) = small();
+    model.views[4].tvec[1] = f64::NAN;
+    model.write(&scene);
+    let said = trains(&folder, &scene, &[]);
+    assert!(said.contains(&model.views[4].name), "{said}");
+}
+
+// Must fail, with the file, the place and the remedy.
+
+#[test]
+fn missing_images_are_listed_and_may_be_allowed() {
+    let (folder, scene, model) = small();
+    for i in [2, 6] {
+        std::fs::remove_file(scene.join("images").join(&model.views[i].name)).unwrap();
+    }
+    refuses(&folder, &scene, &[], &[&model.views[2].name, &model.views[6].name, "--allow-missing"]);
+    trains(&folder, &scene, &["--allow-missing"]);
+}
+
+#[test]
+fn an_image_that_cannot_belong_to_its_camera_is_refused() {
+    let (folder, scene, model) = small();
+    let path = scene.join("images").join(&model.views[1].name);
+    image::RgbImage::new(50, 64).save(&path).unwrap();
+    refuses(&folder, &scene, &[], &[&model.views[1].name, "50 x 64", "96 x 64"]);
+}
+
+#[test]
+fn broken_photos_are_refused_at_load() {
+    let (folder, scene, model) = small();
+    let path = scene.join("images").join(&model.views[1].name);
+    let whole = std::fs::read(&path).unwrap();
+    std::fs::write(&path, b"").unwrap();
+    refuses(&folder, &scene, &[], &[&model.views[1].name, "empty"]);
+    for keep in [20, whole.len() / 2, whole.len() - 2] {
+        std::fs::write(&path, &whole[..keep]).unwrap();
+        refuses(&folder, &scene, &[], &[&model.views[1].name]);
+    }
+}
+
+#[test]
+fn truncated_models_are_refused() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 12, 96, 64, 400);
+    for name in ["cameras.bin", "images.bin", "points3D.bin"] {
+        let path = scene.join("sparse/0").join(name);
+        let whole = std::fs::read(&path).unwrap();
+        for keep in [0, 5, whole.len() / 2, whole.len() - 1] {
+            std::fs::write(&path, &whole[..keep]).unwrap();
+            refuses(&folder, &scene, &[], &[name]);
+        }
+        std::fs::write(&path, &whole).unwrap();
+    }
+}
+
+#[test]
+fn counts_larger_than_the_file_are_refused() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 12, 96, 64, 400);
+    for name in ["cameras.bin", "images.bin", "points3D.bin"] {
+        let path = scene.join("sparse/0").join(name);
+        let whole = std::fs::read(&path).unwrap();
+        for count in [1u64 << 60, u64::MAX, 1_000_000] {
+            let mut hostile = whole.clone();
+            hostile[..8].copy_from_slice(&count.to_le_bytes());
+            std::fs::write(&path, &hostile).unwrap();
+            refuses(&folder, &scene, &[], &[name]);
+        }
+        std::fs::write(&path, &whole).unwrap();
+    }
+}
+
+#[test]
+fn too_many_points_that_are_not_numbers_are_refused() {
+    let (folder, scene, mut model) = small();
+    model.points[0] = [f64::NAN, 0.0, 0.0];
+    model.write(&scene);
+    let said = trains(&folder, &scene, &[]);
+    assert!(said.contains("not finite") || said.contains("non-finite"), "{said}");
+    for p in model.points.iter_mut().take(20) {
+        *p = [0.0, f64::INFINITY, 0.0];
+    }
+    model.write(&scene);
+    refuses(&folder, &scene, &[], &["points3D.txt"]);
+}
+
+#[test]
+fn names_that_leave_the_folder_are_refused() {
+    for name in ["../secret.jpg", "/etc/hostname", "a/../../b.jpg"] {
+        let (folder, scene, mut model) = small();
+        model.views[0].name = name.into();
+        model.write(&scene);
+        refuses(&folder, &scene, &[], &["images.txt", name]);
+    }
+}
+
+#[test]
+fn unsupported_camera_models_are_refused_by_name() {
+    let (folder, scene, model) = small();
+    let [w, h] = model.size;
+    std::fs::write(scene.join("sparse/0/cameras.txt"), format!("1 FOV {w} {h} 80 80 48 32 0.9\n")).unwrap();
+    refuses(&folder, &scene, &[], &["FOV", "cameras.txt"]);
+}
+
+#[test]
+fn no_points_and_no_way_to_make_any_is_refused() {
+    let (folder, scene, mut model) = small();
+    model.points.clear();
+    model.colors.clear();
+    model.write(&scene);
+    refuses(&folder, &scene, &["--init-points", "0"], &["no points"]);
+    trains(&folder, &scene, &["--init-points", "500"]);
+}
+
+#[test]
+fn hostile_ply_files_are_refused() {
+    let (folder, scene, _) = small();
+    let ply = folder.path().join("start.ply");
+    let header = |count: &str| {
+        format!(
+            "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n\
+             property float x\nproperty float y\nproperty float z\nend_header\n"
+        )
+    };
+    for (count, bytes) in [("1152921504606846976", 24), ("3", 24), ("-1", 24), ("0", 0)] {
+        let mut file = header(count).into_bytes();
+        file.extend(vec![0u8; bytes]);
+        std::fs::write(&ply, file).unwrap();
+        refuses(&folder, &scene, &["--init-ply", text(&ply)], &["start.ply"]);
+    }
+    std::fs::write(&ply, b"not a ply at all").unwrap();
+    refuses(&folder, &scene, &["--init-ply", text(&ply)], &["start.ply"]);
+}
+
+#[test]
+fn an_output_folder_that_cannot_be_written_is_refused() {
+    let (folder, scene, _) = small();
+    let file = folder.path().join("a_file");
+    std::fs::write(&file, b"x").unwrap();
+    let out = file.join("out");
+    let output = train(&[text(&scene), "--out", text(&out), "--steps", "12"]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(stderr(&output).contains("a_file"), "{}", stderr(&output));
+}
+
+#[test]
+fn an_existing_run_is_refused_unless_overwritten() {
+    let (folder, scene, _) = small();
+    trains(&folder, &scene, &[]);
+    let out = folder.path().join("out");
+    let output = train(&[text(&scene), "--out", text(&out), "--steps", "12"]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(stderr(&output).contains("--overwrite"));
+    trains(&folder, &scene, &[]);
+}
+
+#[test]
+fn scenes_that_are_not_there_say_what_was_looked_for() {
+    let folder = TempDir::new().unwrap();
+    refuses(&folder, &folder.path().join("nowhere"), &[], &["nowhere"]);
+    std::fs::create_dir(folder.path().join("empty")).unwrap();
+    refuses(&folder, &folder.path().join("empty"), &[], &["sparse", "transforms"]);
+}
+
+#[test]
+fn unknown_flags_and_keys_are_refused() {
+    let (folder, scene, _) = small();
+    let output = train(&[text(&scene), "--out", "x", "--stepz", "3"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(stderr(&output).contains("--stepz"));
+    let config = folder.path().join("bad.toml");
+    std::fs::write(&config, "steps = 5\nstepz = 3\n").unwrap();
+    refuses(&folder, &scene, &["--config", text(&config)], &["bad.toml", "stepz"]);
+}
+
+#[test]
+fn a_dry_run_writes_nothing_and_tells_the_memory() {
+    let (folder, scene, _) = small();
+    let out = folder.path().join("dry");
+    let output = train(&[text(&scene), "--out", text(&out), "--dry-run"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let said = stderr(&output);
+    assert!(said.contains("memory") && said.contains("views to train on"), "{said}");
+    assert!(!out.exists());
+}
+
+#[test]
+fn help_is_grouped_and_has_examples() {
+    let output = train(&["--help"]);
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    for word in ["Examples:", "Dataset:", "Training:", "Densification:", "--refine-start", "--demo"] {
+        assert!(said.contains(word), "{word} is not in --help");
+    }
+}

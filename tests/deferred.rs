@@ -1,0 +1,214 @@
+//! Deferred Adam: every value follows dense Adam, however long and however often nobody looks, and looking changes
+//! nothing.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+
+use gsscale::base::rng::{Purpose, Stream};
+use gsscale::base::simd::SimdPath;
+use gsscale::optim::adam::{AdamConfig, DenseAdam};
+use gsscale::optim::deferred::DeferredAdam;
+use gsscale::optim::rates::Rates;
+use gsscale::scene::columns::{Column, Columns};
+use gsscale::scene::rows::{BLOCK_LANES, RowsNow, first_lane};
+use gsscale::scene::state::SceneState;
+use gsscale::train::catch_up;
+
+const STEPS: u32 = 5200;
+
+/// Whether row `row` has a gradient at a step: never, every 7th, in bursts, once at the end, always.
+fn is_touched(row: usize, step: u32) -> bool {
+    match row % 5 {
+        0 => false,
+        1 => step % 7 == 3,
+        2 => step % 900 < 12,
+        3 => step == STEPS - 1,
+        _ => true,
+    }
+}
+
+fn random_columns(rows: usize, sh_degree: u8, size: f64, key: u64) -> Columns {
+    let mut columns = Columns::zeros(rows, sh_degree);
+    let mut draws = Stream::new(5, Purpose::Test, key, 0);
+    for column in Column::ALL {
+        columns.column_mut(column).iter_mut().for_each(|x| *x = (draws.normal() * size) as f32);
+    }
+    columns
+}
+
+/// Gradients of the listed rows at a step: noise around a mean, size depending on the row.
+fn grads_at(rows: &[u32], sh_degree: u8, step: u32) -> Columns {
+    let mut grads = Columns::zeros(rows.len(), sh_degree);
+    for (i, &row) in rows.iter().enumerate() {
+        let mut draws = Stream::new(6, Purpose::Test, u64::from(row), u64::from(step));
+        let size = libm::pow(10.0, -f64::from(row % 8));
+        for column in Column::ALL {
+            grads.row_mut(column, i).iter_mut().for_each(|x| *x = ((draws.normal() + 0.3) * size) as f32);
+        }
+    }
+    grads
+}
+
+fn touched_rows(rows: usize, step: u32) -> Vec<u32> {
+    (0..rows as u32).filter(|&row| is_touched(row as usize, step)).collect()
+}
+
+#[test]
+fn values_follow_dense_adam_in_f64() {
+    let rows = 10;
+    for decay in [1.0, 0.01] {
+        let rates = Rates { means_final_factor: decay, ..Rates::new(3.0, STEPS) };
+        let adam = DeferredAdam::new(rates, AdamConfig::default(), SimdPath::best());
+        let start = random_columns(rows, 0, 1.0, 1);
+        let mut state = SceneState::from_columns(start.clone());
+        let widen = |c: &[f32]| c.iter().map(|&x| f64::from(x)).collect::<Vec<_>>();
+        let mut dense = Column::ALL.map(|c| DenseAdam::<f64>::new(AdamConfig::default(), widen(start.column(c))));
+        let mut narrow = Column::ALL.map(|c| DenseAdam::<f32>::new(AdamConfig::default(), start.column(c).to_vec()));
+        // Values written so far, per row: each write rounds the value once.
+        let mut writes = vec![0.0f64; rows];
+        let (mut sum_deferred, mut sum_dense_f32) = (0.0, 0.0);
+        for step in 0..STEPS {
+            let listed = touched_rows(rows, step);
+            let grads = grads_at(&listed, 0, step);
+            adam.step(&mut state, &listed, &grads, step);
+            listed.iter().for_each(|&row| writes[row as usize] += 1.0);
+            let mut full = Columns::zeros(rows, 0);
+            for column in Column::ALL {
+                for (i, &row) in listed.iter().enumerate() {
+                    full.row_mut(column, row as usize).copy_from_slice(grads.row(column, i));
+                }
+            }
+            for (i, column) in Column::ALL.into_iter().enumerate() {
+                dense[i].step(&widen(full.column(column)), rates.at(column, step));
+                narrow[i].step(full.column(column), rates.at(column, step));
+            }
+            if step % 650 != 649 && step + 1 != STEPS {
+                continue;
+            }
+            let now = catch_up::evaluate_all(&state, &adam, step + 1);
+            for (i, column) in Column::ALL.into_iter().enumerate().filter(|(_, c)| *c != Column::ShN) {
+                let (width, rate) = (column.width(0), rates.base(column));
+                for (j, (&got, &want)) in now.column(column).iter().zip(&dense[i].values).enumerate() {
+                    let error = (f64::from(got) - want).abs();
+                    // Half an ulp of the value for every write and for this reading, and 1e-6 of the rate for
+                    // every write (moments in f32) and reading.
+                    let half_ulp = want.abs() * f64::from(f32::EPSILON) / 2.0;
+                    let slack = (1.0 + writes[j / width]) * (half_ulp + 1e-6 * rate);
+                    assert!(error <= slack, "{column:?} value {j} after step {step}: {error:e} > {slack:e}");
+                    sum_deferred += error / rate;
+                    sum_dense_f32 += (f64::from(narrow[i].values[j]) - want).abs() / rate;
+                }
+            }
+        }
+        assert!(sum_deferred < sum_dense_f32, "deferred {sum_deferred} is further off than f32 {sum_dense_f32}");
+    }
+}
+
+#[test]
+fn reading_any_number_of_times_changes_no_bit_and_late_equals_on_time() {
+    let (rows, degree) = (300, 2);
+    let adam = DeferredAdam::new(Rates::new(1.0, 900), AdamConfig::default(), SimdPath::best());
+    let start = random_columns(rows, degree, 1.0, 2);
+    let (mut quiet, mut read) = (SceneState::from_columns(start.clone()), SceneState::from_columns(start));
+    for step in 0..1000 {
+        let listed = touched_rows(rows, step);
+        let grads = grads_at(&listed, degree, step);
+        adam.step(&mut quiet, &listed, &grads, step);
+        if step % 3 == 0 {
+            let before = read.clone();
+            let mut out = Columns::zeros(0, degree);
+            catch_up::gather(&read, &adam, step, &listed, &mut out);
+            catch_up::evaluate_all(&read, &adam, step + 500);
+            assert_eq!(before, read);
+        }
+        adam.step(&mut read, &listed, &grads, step);
+    }
+    assert_eq!(quiet, read);
+    assert_eq!(catch_up::evaluate_all(&quiet, &adam, 3000), catch_up::evaluate_all(&read, &adam, 3000));
+}
+
+#[test]
+fn the_same_bits_on_every_instruction_path_and_from_every_way_of_reading() {
+    let (rows, degree) = (2100, 3);
+    // eps of 1e-8 so that some rows (gradients down to 1e-7) take the direct sum.
+    let config = AdamConfig { eps: 1e-8, ..AdamConfig::default() };
+    let run = |simd: SimdPath| {
+        let adam = DeferredAdam::new(Rates::new(1.0, 100), config, simd);
+        let mut state = SceneState::from_columns(random_columns(rows, degree, 1.0, 3));
+        for step in 0..60 {
+            let listed: Vec<u32> = (0..rows as u32).filter(|r| (r * 7 + step) % 11 < 3).collect();
+            adam.step(&mut state, &listed, &grads_at(&listed, degree, step), step);
+        }
+        (adam, state)
+    };
+    let (adam, state) = run(SimdPath::Baseline);
+    for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+        assert!(run(simd).1 == state, "{}", simd.name());
+    }
+    for now in [60, 61, 77, 459, 460, 461, 5000] {
+        let all = catch_up::evaluate_all(&state, &adam, now);
+        let at = adam.at(now);
+        for row in (0..rows).step_by(13) {
+            let mut block = [0.0; BLOCK_LANES];
+            at.evaluate_row(&state.view(), row, &mut block);
+            for column in Column::ALL {
+                for (i, &x) in all.row(column, row).iter().enumerate() {
+                    assert_eq!(x.to_bits(), block[first_lane(column) + i].to_bits());
+                    assert_eq!(x.to_bits(), at.evaluate_element(&state.view(), column, row, i).to_bits());
+                    let (m, v) = (state.exp_avg.row(column, row)[i], state.exp_avg_sq.row(column, row)[i]);
+                    let value = state.columns.row(column, row)[i];
+                    let one = adam.evaluate(column, value, m, v, state.stamp[row], now);
+                    assert_eq!(x.to_bits(), one.to_bits());
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn settling_a_row_leaves_its_later_values_where_they_were() {
+    let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), SimdPath::best());
+    let mut state = SceneState::from_columns(random_columns(20, 1, 1.0, 4));
+    let all: Vec<u32> = (0..20).collect();
+    for step in 0..40 {
+        adam.step(&mut state, &all, &grads_at(&all, 1, step), step);
+    }
+    let want = catch_up::evaluate_all(&state, &adam, 300);
+    let mut view = state.view_mut();
+    (0..20).for_each(|row| adam.at(45).settle_row(&mut view, row));
+    assert!(state.stamp.iter().all(|&s| s == 45));
+    let got = catch_up::evaluate_all(&state, &adam, 300);
+    for column in Column::ALL {
+        for (a, b) in got.column(column).iter().zip(want.column(column)) {
+            // One more rounding of the value, and of moments that still move it by a few rates.
+            let slack = b.abs() * f32::EPSILON + 1e-6 * adam.rates().base(column) as f32;
+            assert!((a - b).abs() <= slack, "{column:?} {a} {b}");
+        }
+    }
+}
+
+#[test]
+fn gradients_that_are_not_finite_or_zero_leave_their_row_alone() {
+    let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), SimdPath::best());
+    let mut state = SceneState::from_columns(random_columns(6, 3, 1.0, 5));
+    state.columns.scales[15] = 80.0;
+    let all: Vec<u32> = (0..6).collect();
+    let mut grads = grads_at(&all, 3, 0);
+    grads.row_mut(Column::ShN, 1)[44] = f32::NAN;
+    grads.row_mut(Column::Opacities, 2)[0] = f32::INFINITY;
+    grads.row_mut(Column::Means, 3)[1] = 1e30;
+    for column in Column::ALL {
+        grads.row_mut(column, 4).fill(-0.0);
+    }
+    let before = state.clone();
+    let counts = adam.step(&mut state, &all, &grads, 9);
+    assert_eq!((counts.updated, counts.skipped_non_finite), (2, 3));
+    assert_eq!(state.stamp, [10, 0, 0, 0, 0, 10]);
+    for row in 1..5 {
+        for column in Column::ALL {
+            assert_eq!(state.columns.row(column, row), before.columns.row(column, row));
+            assert_eq!(state.exp_avg_sq.row(column, row), before.exp_avg_sq.row(column, row));
+        }
+    }
+    // A runaway log-scale is brought back to the limit when its row is updated.
+    assert_eq!(state.columns.scales[15], 30.0);
+    assert!(Column::ALL.into_iter().all(|c| state.columns.column(c).iter().all(|x| x.is_finite())));
+}

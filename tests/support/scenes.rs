@@ -1,0 +1,127 @@
+//! Small scenes for tests through the real binaries: a generated city, rewritten as a COLMAP text model that a test
+//! can bend in any way.
+#![allow(dead_code, clippy::unwrap_used, clippy::expect_used)] // test code: each test file uses a part of it
+
+use glam::{DMat3, DQuat, DVec3};
+use gsscale::dataset::read::{ReadOptions, read_scene};
+use gsscale::dataset::synthetic::{CityOptions, write_city};
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// A view of a [`TextModel`].
+#[derive(Debug, Clone)]
+pub struct TextView {
+    /// Photo, relative to images/.
+    pub name: String,
+    /// w x y z, as written.
+    pub qvec: [f64; 4],
+    /// As written.
+    pub tvec: [f64; 3],
+}
+
+/// A COLMAP text model with one PINHOLE camera.
+#[derive(Debug, Clone)]
+pub struct TextModel {
+    /// Width, height.
+    pub size: [u32; 2],
+    /// fx, fy, cx, cy.
+    pub pinhole: [f64; 4],
+    /// Views.
+    pub views: Vec<TextView>,
+    /// Positions.
+    pub points: Vec<[f64; 3]>,
+    /// Colours.
+    pub colors: Vec<[u8; 3]>,
+}
+
+/// A generated city of `views` photos of `width` x `height`.
+pub fn city(folder: &Path, views: u32, width: u32, height: u32, points: u32) -> PathBuf {
+    let scene = folder.join("scene");
+    let options = CityOptions { seed: 5, views, width, height, points, ..CityOptions::default() };
+    write_city(&scene, &options, &|_, _| {}).unwrap();
+    scene
+}
+
+impl TextModel {
+    /// What a scene holds.
+    pub fn of(scene: &Path) -> TextModel {
+        let raw = read_scene(scene, &ReadOptions::default()).unwrap();
+        let i = raw.views[0].intrinsics;
+        let views = raw.views.iter().map(|v| {
+            let q = DQuat::from_mat3(&v.pose.rotation);
+            TextView { name: v.name.clone(), qvec: [q.w, q.x, q.y, q.z], tvec: v.pose.translation.to_array() }
+        });
+        TextModel {
+            size: [i.width, i.height],
+            pinhole: [i.fx, i.fy, i.cx, i.cy],
+            views: views.collect(),
+            points: raw.points.positions,
+            colors: raw.points.colors,
+        }
+    }
+
+    /// Replaces the scene's model.
+    pub fn write(&self, scene: &Path) {
+        let folder = scene.join("sparse/0");
+        std::fs::remove_dir_all(scene.join("sparse")).ok();
+        std::fs::create_dir_all(&folder).unwrap();
+        let [w, h] = self.size;
+        let [fx, fy, cx, cy] = self.pinhole;
+        std::fs::write(folder.join("cameras.txt"), format!("1 PINHOLE {w} {h} {fx} {fy} {cx} {cy}\n")).unwrap();
+        let mut images = String::new();
+        for (i, v) in self.views.iter().enumerate() {
+            let [qw, qx, qy, qz] = v.qvec;
+            let [tx, ty, tz] = v.tvec;
+            writeln!(images, "{} {qw} {qx} {qy} {qz} {tx} {ty} {tz} 1 {}\n", i + 1, v.name).unwrap();
+        }
+        std::fs::write(folder.join("images.txt"), images).unwrap();
+        let mut points = String::new();
+        for (i, (p, c)) in self.points.iter().zip(&self.colors).enumerate() {
+            writeln!(points, "{} {} {} {} {} {} {} 0.5 1 0", i + 1, p[0], p[1], p[2], c[0], c[1], c[2]).unwrap();
+        }
+        std::fs::write(folder.join("points3D.txt"), points).unwrap();
+    }
+
+    /// Moves the whole scene by `offset`.
+    pub fn shift(&mut self, offset: [f64; 3]) {
+        let offset = DVec3::from_array(offset);
+        for p in &mut self.points {
+            *p = (DVec3::from_array(*p) + offset).to_array();
+        }
+        for v in &mut self.views {
+            let rotation = DMat3::from_quat(DQuat::from_xyzw(v.qvec[1], v.qvec[2], v.qvec[3], v.qvec[0]).normalize());
+            v.tvec = (DVec3::from_array(v.tvec) - rotation * offset).to_array();
+        }
+    }
+}
+
+/// Runs `gsscale-train` with these arguments.
+pub fn train(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_gsscale-train")).args(args).output().unwrap()
+}
+
+/// Runs `gsscale-eval` with these arguments.
+pub fn eval(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_gsscale-eval")).args(args).output().unwrap()
+}
+
+/// What a program said on stderr.
+pub fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// The path as text.
+pub fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// summary.json of a run.
+pub fn summary(out: &Path) -> serde_json::Value {
+    serde_json::from_slice(&std::fs::read(out.join("summary.json")).unwrap()).unwrap()
+}
+
+/// Test PSNR of a run.
+pub fn psnr(out: &Path) -> f64 {
+    summary(out)["test"]["psnr"].as_f64().unwrap()
+}

@@ -1,0 +1,144 @@
+//! House rules that the compiler does not hold: which layer may name which, how long functions are, where `unsafe`
+//! may stand, and that no marker of unfinished work is left.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// For each layer, the layers that it may name (itself always).
+const LAYERS: &[(&str, &[&str])] = &[
+    ("base", &[]),
+    ("scene", &["base"]),
+    ("dataset", &["base", "scene"]),
+    ("schedule", &["base", "scene"]),
+    ("kernels", &["base", "scene"]),
+    ("optim", &["base", "scene"]),
+    ("densify", &["base", "scene", "optim"]),
+    ("render", &["base", "scene", "kernels"]),
+    ("exchange", &["base", "scene"]),
+    ("config", &["base", "scene", "dataset", "schedule", "kernels", "optim", "densify", "render", "exchange"]),
+    ("train", &["base", "scene", "dataset", "schedule", "kernels", "optim", "densify", "render", "exchange", "config"]),
+];
+
+/// Files that may hold `unsafe`, each block with its argument.
+const UNSAFE_FILES: &[&str] = &["src/base/simd.rs"];
+
+const FUNCTION_LINES_MAX: usize = 80;
+
+fn rust_files(folders: &[&str]) -> Vec<(String, String)> {
+    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
+    let mut files = Vec::new();
+    let mut stack: Vec<PathBuf> = folders.iter().map(|f| root.join(f)).collect();
+    while let Some(path) = stack.pop() {
+        if path.is_dir() {
+            stack.extend(std::fs::read_dir(&path).unwrap().map(|e| e.unwrap().path()));
+        } else if path.extension().is_some_and(|e| e == "rs") {
+            let name = path.strip_prefix(&root).unwrap().to_string_lossy().into_owned();
+            files.push((name, std::fs::read_to_string(&path).unwrap()));
+        }
+    }
+    files.sort();
+    assert!(!files.is_empty());
+    files
+}
+
+/// Layers that a source text names through `crate::<layer>` (also inside `crate::{a, b}`), tests included.
+fn named_layers(text: &str) -> Vec<String> {
+    let code: String = text.lines().filter(|l| !l.trim_start().starts_with("//")).collect::<Vec<_>>().join("\n");
+    let mut names = Vec::new();
+    for (at, _) in code.match_indices("crate::") {
+        let rest = &code[at + "crate::".len()..];
+        if let Some(list) = rest.strip_prefix('{') {
+            let list = &list[..list.find('}').unwrap_or(list.len())];
+            names.extend(list.split(',').map(|n| n.trim().split("::").next().unwrap_or("").to_string()));
+        } else {
+            names.push(rest.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect());
+        }
+    }
+    names.retain(|n| LAYERS.iter().any(|(layer, _)| layer == n));
+    names
+}
+
+#[test]
+fn dependencies_point_one_way() {
+    let allowed: BTreeMap<&str, &[&str]> = LAYERS.iter().copied().collect();
+    let mut wrong = Vec::new();
+    for (name, text) in rust_files(&["src"]) {
+        let Some(layer) = Path::new(&name).components().nth(1) else { continue };
+        let layer = layer.as_os_str().to_string_lossy().into_owned();
+        if layer == "lib.rs" {
+            continue;
+        }
+        let allowed = allowed.get(layer.as_str()).unwrap_or_else(|| panic!("{name}: folder {layer} has no layer"));
+        for used in named_layers(&text) {
+            if used != layer && !allowed.contains(&used.as_str()) {
+                wrong.push(format!("{name} names {used}"));
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "these point the wrong way:\n{}", wrong.join("\n"));
+}
+
+#[test]
+fn the_layer_reader_sees_what_it_should() {
+    let text = "use crate::scene::camera::Camera;\n// crate::train in a comment\nuse crate::{optim, base::rng};\n";
+    assert_eq!(named_layers(text), ["scene", "optim", "base"]);
+}
+
+#[test]
+fn unsafe_stands_only_where_it_is_argued() {
+    let mut wrong = Vec::new();
+    for (name, text) in rust_files(&["src", "tools", "benches"]) {
+        let lines: Vec<&str> = text.lines().collect();
+        for (i, line) in lines.iter().enumerate() {
+            let code = line.split("//").next().unwrap_or("");
+            let is_block = code.contains("unsafe {") || code.contains("unsafe impl") || code.contains("unsafe fn");
+            if is_block && !UNSAFE_FILES.contains(&name.as_str()) {
+                wrong.push(format!("{name}:{}: unsafe outside the files for it", i + 1));
+            } else if is_block && !lines[i.saturating_sub(3)..i].iter().any(|l| l.contains("SAFETY:")) {
+                wrong.push(format!("{name}:{}: unsafe without its SAFETY argument", i + 1));
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+#[test]
+fn files_say_what_they_are_and_leave_no_markers() {
+    let markers = ["todo!(", "unimplemented!(", "dbg!(", "FIXME", "XXX", "(being written)"];
+    let mut wrong = Vec::new();
+    for (name, text) in rust_files(&["src", "tools", "benches"]) {
+        if !text.starts_with("//!") {
+            wrong.push(format!("{name}: the first line does not say what the file is responsible for"));
+        }
+        for marker in markers {
+            if text.contains(marker) {
+                wrong.push(format!("{name}: holds {marker}"));
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// Functions are found by their closing brace at the indentation of their `fn`, which rustfmt guarantees.
+#[test]
+fn functions_stay_readable() {
+    let mut wrong = Vec::new();
+    for (name, text) in rust_files(&["src", "tools"]) {
+        let lines: Vec<&str> = text.lines().collect();
+        for (start, line) in lines.iter().enumerate() {
+            let code = line.trim_start();
+            let is_function =
+                ["fn ", "pub fn ", "pub(crate) fn ", "pub(super) fn "].iter().any(|p| code.starts_with(p));
+            if !is_function || line.ends_with('}') {
+                continue;
+            }
+            let closing = format!("{}}}", " ".repeat(line.len() - code.len()));
+            let length = lines[start..].iter().position(|l| *l == closing).unwrap_or(0);
+            if length > FUNCTION_LINES_MAX {
+                wrong.push(format!("{name}:{}: {length} lines", start + 1));
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "functions over {FUNCTION_LINES_MAX} lines:\n{}", wrong.join("\n"));
+}
