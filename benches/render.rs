@@ -118,6 +118,14 @@ fn measure(n: usize, width: u32, height: u32, simd: SimdPath, floor: f64, least:
     let sum = 1e3 * (forward.cpu + backward.cpu);
     let mib = renderer.scratch_bytes() as f64 / f64::from(1 << 20);
     println!("  together {sum:.2} ms CPU, scratch {mib:.1} MiB");
+    let blend = stages.iter().find(|(name, _)| *name == "rasterize_fwd").map_or(f64::NAN, |(_, seconds)| *seconds);
+    let rate = evaluated / blend / rayon::current_num_threads() as f64;
+    println!(
+        "  rasterize_fwd alone, by wall time: {:.2} G/s a thread evaluated ({:.2} of the floor), {:.2} nominal",
+        rate / 1e9,
+        rate / floor,
+        rate / 1e9 * nominal / evaluated
+    );
     print!("  least wall ms:");
     for (stage, seconds) in stages.iter().filter(|(_, s)| s.is_finite()) {
         print!(" {stage} {:.2}", 1e3 * seconds);

@@ -9,7 +9,7 @@
 use super::constants::TILE;
 use super::radix_sort::chunk_len;
 use super::splats::{Grid, Packed, Span, Splat, rows_in_column, tile_rows};
-use crate::base::simd::{Kernel, SimdPath, dispatch};
+use crate::base::simd::{Kernel, SimdPath, dispatch, prefetch};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -65,6 +65,14 @@ fn for_each_tile(splat: &Splat, span: &Span, grid: Grid, mut each: impl FnMut(us
     }
 }
 
+/// Rows come in order of depth, which is no order in memory: asks for a span some rows ahead.
+#[inline(always)]
+fn prefetch_ahead(spans: &[Span], order: &[u32], i: usize) {
+    if let Some(&row) = order.get(i + 24) {
+        prefetch(&spans[row as usize]);
+    }
+}
+
 /// Counts intersections as `[chunks][tiles]` for [`super::isect_offsets`]; chunks are parts of `order`, the drawn rows
 /// front to back.
 pub fn count(order: &[u32], packed: &Packed, grid: Grid, simd: SimdPath, tile_counts: &mut Vec<u32>) {
@@ -93,7 +101,8 @@ impl Kernel for CountChunk<'_> {
     #[inline(always)]
     fn run<const FMA: bool>(self) {
         let Packed { splats, spans, .. } = self.packed;
-        for &row in self.order {
+        for (i, &row) in self.order.iter().enumerate() {
+            prefetch_ahead(spans, self.order, i);
             for_each_tile(&splats[row as usize], &spans[row as usize], self.grid, |tile, _| {
                 self.tile_counts[tile] += 1;
             });
@@ -138,7 +147,8 @@ impl Kernel for EmitChunk<'_> {
     #[inline(always)]
     fn run<const FMA: bool>(self) {
         let Packed { splats, spans, .. } = self.packed;
-        for &row in self.order {
+        for (i, &row) in self.order.iter().enumerate() {
+            prefetch_ahead(spans, self.order, i);
             let mut k = 0;
             for_each_tile(&splats[row as usize], &spans[row as usize], self.grid, |tile, pixel_rows| {
                 let place = &mut self.cursors[tile];

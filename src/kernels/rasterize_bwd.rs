@@ -10,9 +10,9 @@
 
 use super::constants::TILE;
 use super::project_fwd::Projected;
-use super::rasterize_fwd::{Lanes, Lists, Raster, TILE_PIXELS, exp2_bounded, log2_max_alpha};
+use super::rasterize_fwd::{Lanes, Lists, Raster, TILE_PIXELS, copy_lanes, exp2_bounded, log2_max_alpha};
 use super::splats::{LOG2_ALPHA_MIN, ROWS_PER_CHUNK};
-use super::tile_block::{Block, ROWS};
+use super::tile_block::{Block, ROWS, prefetch_splats};
 use crate::base::simd::{Kernel, LANES, dispatch, fma};
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -102,7 +102,7 @@ impl Tile {
         for (row, out) in self.rows[..rows].iter_mut().enumerate() {
             let from = (ty as usize * ROWS + row) * grid.width as usize + tx as usize * LANES;
             for c in 0..3 {
-                out.v_rgb[c][..columns].copy_from_slice(&upstream.v_rgb[c * pixels + from..][..columns]);
+                copy_lanes(&mut out.v_rgb[c][..columns], &upstream.v_rgb[c * pixels + from..]);
             }
             let within = tile * TILE_PIXELS + row * LANES;
             let v_alpha = upstream.v_alpha.map(|v| &v[from..from + columns]);
@@ -141,12 +141,14 @@ impl Kernel for BackTile<'_> {
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
         let x: Lanes = std::array::from_fn(|lane| x0 + lane as f32);
         let last_stop = row_stop.iter().fold(0, |m, s| m.max(*s));
-        for (number, list) in lists.tile(tile).chunks(BLOCK).enumerate().rev() {
+        let all = lists.tile(tile);
+        for (number, list) in all.chunks(BLOCK).enumerate().rev() {
             let first = (number * BLOCK) as u32;
             if first >= last_stop {
                 continue;
             }
             block.fill::<FMA>(list, lists.splats, y0, cap);
+            prefetch_splats(&all[number.saturating_sub(1) * BLOCK..number * BLOCK], lists.splats);
             let mut touched = 0;
             for (reach, &stop) in block.reach.iter_mut().zip(row_stop.iter()) {
                 // Splats at or behind the row's last stop take no part.

@@ -14,7 +14,7 @@
 
 use super::constants::{TILE, TRANSMITTANCE_MIN};
 use super::splats::{Grid, LOG2_ALPHA_MIN, Splat};
-use super::tile_block::{Block, ROWS};
+use super::tile_block::{Block, ROWS, prefetch_splats};
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch, fma};
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -220,8 +220,11 @@ impl Kernel for BlendTile<'_> {
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
         let mut rows_done = 0u64;
-        for (number, list) in lists.tile(tile).chunks(BLOCK).enumerate() {
+        let all = lists.tile(tile);
+        for (number, list) in all.chunks(BLOCK).enumerate() {
             block.fill::<FMA>(list, lists.splats, y0, cap);
+            let next = all.len().min((number + 1) * BLOCK)..all.len().min((number + 2) * BLOCK);
+            prefetch_splats(&all[next], lists.splats);
             let mut alive = false;
             for (y, row) in rows.iter_mut().enumerate() {
                 if row.alive {
@@ -299,6 +302,16 @@ pub fn rasterize_fwd(lists: &Lists<'_>, out: &mut Raster) {
         });
 }
 
+/// Copies up to a tile's row of values; whole rows without a library call each.
+#[inline(always)]
+pub(super) fn copy_lanes(out: &mut [f32], from: &[f32]) {
+    let n = out.len();
+    match (<&mut Lanes>::try_from(&mut *out), from.first_chunk::<LANES>()) {
+        (Ok(out), Some(from)) => *out = *from,
+        _ => out.copy_from_slice(&from[..n]),
+    }
+}
+
 /// Copies tiles to a planar image (`[3][height][width]`) and its alpha plane (1 - T).
 pub fn untile(grid: Grid, raster: &Raster, rgb: &mut [f32], alpha: &mut [f32]) {
     let (width, pixels) = (grid.width as usize, grid.width as usize * grid.height as usize);
@@ -315,9 +328,9 @@ pub fn untile(grid: Grid, raster: &Raster, rgb: &mut [f32], alpha: &mut [f32]) {
             let n = LANES.min(width - x);
             let within = y % ROWS * LANES;
             let colors = &raster.rgb[tile * 3 * TILE_PIXELS..][..3 * TILE_PIXELS];
-            r[x..x + n].copy_from_slice(&colors[within..within + n]);
-            g[x..x + n].copy_from_slice(&colors[TILE_PIXELS + within..][..n]);
-            b[x..x + n].copy_from_slice(&colors[2 * TILE_PIXELS + within..][..n]);
+            copy_lanes(&mut r[x..x + n], &colors[within..]);
+            copy_lanes(&mut g[x..x + n], &colors[TILE_PIXELS + within..]);
+            copy_lanes(&mut b[x..x + n], &colors[2 * TILE_PIXELS + within..]);
             let t = &raster.t_final[tile * TILE_PIXELS + within..][..n];
             for (a, t) in alpha[x..x + n].iter_mut().zip(t) {
                 *a = 1.0 - t;

@@ -8,7 +8,7 @@ use super::constants::TILE;
 use super::isect_emit::Isect;
 use super::rasterize_fwd::Lanes;
 use super::splats::Splat;
-use crate::base::simd::{LANES, fma};
+use crate::base::simd::{LANES, fma, prefetch};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 pub(super) const ROWS: usize = TILE as usize;
@@ -45,6 +45,14 @@ pub(super) struct Block<const N: usize> {
     pub reach: [u64; ROWS],
 }
 
+/// Asks for the splats of a list, which will be filled into a block soon.
+#[inline(always)]
+pub(super) fn prefetch_splats(list: &[AtomicU64], splats: &[Splat]) {
+    for bits in list {
+        prefetch(&splats[Isect::unpack(bits.load(Relaxed)).row as usize]);
+    }
+}
+
 impl<const N: usize> Block<N> {
     pub(super) fn new() -> Self {
         let none = Local {
@@ -71,7 +79,7 @@ impl<const N: usize> Block<N> {
             let splat = &splats[isect.row as usize];
             let rows = (2u64 << isect.pixel_rows[1]) - (1u64 << isect.pixel_rows[0]);
             for (row, set) in reach.iter_mut().enumerate() {
-                *set |= ((rows >> row) & 1) << i;
+                *set |= if rows & (1 << row) != 0 { 1u64 << i } else { 0 };
             }
             for row in 0..ROWS {
                 let dy = (y0 + row as f32) - splat.mean[1];
