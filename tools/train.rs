@@ -1,8 +1,8 @@
 //! `gsscale-train`: trains a scene from photos to a PLY. Parses, calls the library, prints.
 
-use clap::Parser;
+use clap::{CommandFactory, FromArgMatches, Parser};
 use gsscale::base::error::InputError;
-use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::config::file::{TrainConfig, TrainOverrides, help_with_defaults};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::train::run::{RunOutcome, RunRequest, run};
 use gsscale::train::trainer::TrainError;
@@ -50,7 +50,7 @@ struct Args {
 }
 
 fn main() -> ExitCode {
-    let args = Args::parse();
+    let args = parse();
     let quiet = args.quiet;
     match start(args) {
         Ok(outcome) => finish(&outcome, quiet),
@@ -59,6 +59,12 @@ fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+/// The command line; clap prints help and usage errors itself.
+fn parse() -> Args {
+    let matches = help_with_defaults(Args::command()).get_matches();
+    Args::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
 }
 
 fn start(args: Args) -> Result<RunOutcome, TrainError> {

@@ -64,12 +64,12 @@ impl RunOptions {
             max_gaussians: config.max_gaussians as usize,
             render: RenderOptions {
                 sh_degree: config.sh_degree,
-                max_alpha: config.max_alpha,
-                background: config.background.0,
+                max_alpha: config.max_alpha as f32,
+                background: config.background.0.map(|c| c as f32),
                 simd,
                 ..RenderOptions::default()
             },
-            loss: LossOptions { ssim_lambda: config.ssim_lambda, padding, simd },
+            loss: LossOptions { ssim_lambda: config.ssim_lambda as f32, padding, simd },
             rates: Rates {
                 means: config.means_lr * f64::from(scene_scale),
                 means_final_factor: config.means_lr_final,
@@ -101,10 +101,10 @@ impl RunOptions {
 fn densify(config: &TrainConfig) -> DensifyConfig {
     let never_if_zero = |n: u32| if n == 0 { u32::MAX } else { n };
     DensifyConfig {
-        grow_grad2d: config.grow_grad2d,
-        grow_scale3d: config.grow_scale3d,
-        prune_opa: config.prune_opa,
-        prune_scale3d: config.prune_scale3d,
+        grow_grad2d: config.grow_grad2d as f32,
+        grow_scale3d: config.grow_scale3d as f32,
+        prune_opa: config.prune_opa as f32,
+        prune_scale3d: config.prune_scale3d as f32,
         refine_start: config.refine_start,
         refine_stop: config.refine_stop,
         refine_every: config.refine_every,
@@ -145,8 +145,8 @@ pub fn load_options(config: &TrainConfig) -> LoadOptions {
 pub fn init_options(config: &TrainConfig) -> InitOptions {
     InitOptions {
         sh_degree: config.sh_degree,
-        opacity: config.init_opacity,
-        scale_factor: config.init_scale,
+        opacity: config.init_opacity as f32,
+        scale_factor: config.init_scale as f32,
         seed: config.seed,
         max_gaussians: (config.max_gaussians > 0).then_some(config.max_gaussians as usize),
         ..InitOptions::default()
