@@ -9,6 +9,13 @@ use crate::base::units::parse_bytes;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
+/// Most steps of a run: the optimizer keeps 88 bytes for each.
+const STEPS_MAX: u32 = 10_000_000;
+/// Most random points to start from.
+const INIT_POINTS_MAX: u32 = 100_000_000;
+/// Most worker threads: each has a stack, and a slip of the finger must not fill the machine with them.
+const THREADS_MAX: u32 = 1024;
+
 macro_rules! config_keys {
     ($($heading:literal { $( $(#[doc = $doc:literal])+ $([$($arg:tt)+])? $name:ident: $ty:ty = $default:expr; )+ })+) => {
         /// All keys of a run with their values.
@@ -207,11 +214,7 @@ impl TrainConfig {
     /// # Errors
     /// Names the first key that is out of range, with what is allowed.
     pub fn check(&self) -> InputResult<()> {
-        let refuse = |key: &str, allowed: &str| {
-            Err(InputError::new(format!("--{key}"), "the value is out of range", format!("use {allowed}")))
-        };
         let positive = |x: f64| x.is_finite() && x > 0.0;
-        let rate = |x: f64| x.is_finite() && (0.0..=1e6).contains(&x);
         if !positive(self.data_factor) || self.data_factor < 1.0 {
             return refuse("data-factor", "1 or more");
         }
@@ -221,30 +224,20 @@ impl TrainConfig {
         if self.sh_degree > 3 {
             return refuse("sh-degree", "0, 1, 2 or 3");
         }
-        if self.steps == 0 || self.steps > 100_000_000 {
-            return refuse("steps", "1 to 100,000,000");
+        if self.steps == 0 || self.steps > STEPS_MAX {
+            return refuse("steps", "1 to 10,000,000");
+        }
+        if self.max_gaussians >= u64::from(u32::MAX) {
+            return refuse("max-gaussians", "less than 4,294,967,295, or 0 for no cap");
+        }
+        if self.init_points > INIT_POINTS_MAX {
+            return refuse("init-points", "0 to 100,000,000");
+        }
+        if self.threads > THREADS_MAX {
+            return refuse("threads", "0 to 1024");
         }
         if !(0.0..=1.0).contains(&self.ssim_lambda) {
             return refuse("ssim-lambda", "0 to 1");
-        }
-        let rates = [
-            ("means-lr", self.means_lr),
-            ("scales-lr", self.scales_lr),
-            ("quats-lr", self.quats_lr),
-            ("opacities-lr", self.opacities_lr),
-            ("sh0-lr", self.sh0_lr),
-            ("shn-lr", self.shn_lr),
-        ];
-        for (key, value) in rates {
-            if !rate(value) {
-                return refuse(key, "a number from 0 on");
-            }
-        }
-        if !positive(self.means_lr_final) || self.means_lr_final > 1.0 {
-            return refuse("means-lr-final", "a number above 0 and up to 1");
-        }
-        if !positive(self.adam_eps) {
-            return refuse("adam-eps", "a positive number");
         }
         if !(self.init_opacity > 0.0 && self.init_opacity < 1.0) {
             return refuse("init-opacity", "a number between 0 and 1");
@@ -278,7 +271,32 @@ impl TrainConfig {
         if self.prune_opa >= 0.5 {
             return refuse("prune-opa", "less than 0.5");
         }
+        self.check_rates()?;
         self.check_names()
+    }
+
+    fn check_rates(&self) -> InputResult<()> {
+        let rates = [
+            ("means-lr", self.means_lr),
+            ("scales-lr", self.scales_lr),
+            ("quats-lr", self.quats_lr),
+            ("opacities-lr", self.opacities_lr),
+            ("sh0-lr", self.sh0_lr),
+            ("shn-lr", self.shn_lr),
+        ];
+        for (key, value) in rates {
+            if !(0.0..=1e6).contains(&value) {
+                return refuse(key, "a number from 0 to 1e6");
+            }
+        }
+        if !(self.means_lr_final > 0.0 && self.means_lr_final <= 1.0) {
+            return refuse("means-lr-final", "a number above 0 and up to 1");
+        }
+        // It is used in f32, where it must not vanish: a root of 0 is divided by it.
+        if !(1e-30..=1.0).contains(&self.adam_eps) {
+            return refuse("adam-eps", "1e-30 to 1");
+        }
+        Ok(())
     }
 
     fn check_names(&self) -> InputResult<()> {
@@ -301,6 +319,11 @@ impl TrainConfig {
         }
         Ok(())
     }
+}
+
+/// The error about a key whose value is out of range.
+fn refuse(key: &str, allowed: &str) -> InputResult<()> {
+    Err(InputError::new(format!("--{key}"), "the value is out of range", format!("use {allowed}")))
 }
 
 /// The command with the default of each key in its help. (The flags have no clap defaults: an absent flag must leave

@@ -25,6 +25,8 @@ pub struct RunOptions {
     pub sh_degree: u8,
     /// Steps between raises of the degree in use; 0 = all from the start.
     pub sh_every: u32,
+    /// Degree in use at step 0: 0, or what the Gaussians that a run starts from were trained with.
+    pub sh_degree_start: u8,
     /// Cap on Gaussians; 0 = none.
     pub max_gaussians: usize,
     /// Rendering, but for the degree in use.
@@ -61,6 +63,7 @@ impl RunOptions {
             seed: config.seed,
             sh_degree: config.sh_degree,
             sh_every: config.sh_every,
+            sh_degree_start: 0,
             max_gaussians: config.max_gaussians as usize,
             render: RenderOptions {
                 sh_degree: config.sh_degree,
@@ -94,7 +97,7 @@ impl RunOptions {
     /// Bands in use at 0-based `step`.
     pub fn sh_degree_at(&self, step: u32) -> u8 {
         let raised = step.checked_div(self.sh_every).unwrap_or(u32::MAX);
-        raised.min(u32::from(self.sh_degree)) as u8
+        raised.max(u32::from(self.sh_degree_start)).min(u32::from(self.sh_degree)) as u8
     }
 }
 
