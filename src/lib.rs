@@ -19,6 +19,7 @@
 //! | [`scene`] | Gaussians, cameras and images as data; first Gaussians from points; the log of global events |
 //! | [`dataset`] | where views come from: COLMAP, transforms.json, the generated city; decoding photos |
 //! | [`schedule`] | which view comes when |
+//! | [`gpu`] | a device and its memory, shaders, recording of work; knows no Gaussians |
 //! | [`kernels`] | the ordered table of stages and each stage as a function on plain slices |
 //! | [`render`] | the stages in order: forward, loss, backward; image metrics |
 //! | [`optim`] | learning rates as a function of the step; dense Adam (oracle) and deferred Adam |
@@ -36,6 +37,7 @@ pub mod config;
 pub mod dataset;
 pub mod densify;
 pub mod exchange;
+pub mod gpu;
 pub mod kernels;
 pub mod optim;
 pub mod render;

@@ -11,13 +11,17 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("scene", &["base"]),
     ("dataset", &["base", "scene"]),
     ("schedule", &["base", "scene"]),
+    ("gpu", &["base"]),
     ("kernels", &["base", "scene"]),
     ("optim", &["base", "scene"]),
     ("densify", &["base", "scene", "optim"]),
-    ("render", &["base", "scene", "kernels"]),
+    ("render", &["base", "scene", "gpu", "kernels"]),
     ("exchange", &["base", "scene"]),
-    ("config", &["base", "scene", "dataset", "schedule", "kernels", "optim", "densify", "render", "exchange"]),
-    ("train", &["base", "scene", "dataset", "schedule", "kernels", "optim", "densify", "render", "exchange", "config"]),
+    ("config", &["base", "scene", "dataset", "schedule", "kernels", "optim", "densify", "gpu", "render", "exchange"]),
+    (
+        "train",
+        &["base", "scene", "dataset", "schedule", "kernels", "optim", "densify", "gpu", "render", "exchange", "config"],
+    ),
 ];
 
 /// Files that may hold `unsafe`, each block with its argument.

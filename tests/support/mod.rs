@@ -1,6 +1,7 @@
 //! What several test files share: the reference fixtures and how their absence is handled.
 #![allow(dead_code, clippy::unwrap_used, clippy::expect_used)] // test code: each test file uses a part of it, and a panic is a failure
 
+pub mod gpu;
 pub mod reference64;
 
 use safetensors::{Dtype, SafeTensors};

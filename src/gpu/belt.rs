@@ -1,0 +1,136 @@
+//! Uploads through staging memory that is reused: two sets, so that one is filled while the device reads the other.
+//!
+//! Invariants: (1) a chunk is written only while it is mapped, and unmapped before the commands that read it are
+//! submitted; (2) a set is filled again only after its submission has finished; (3) a set never holds more than
+//! [`SET_BYTES`]: the recorder submits what it has when a set is full.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, Ordering};
+
+use super::error::{Faults, GpuError, GpuResult};
+
+/// Bytes of one staging buffer: within the range where copies run fastest.
+const CHUNK_BYTES: u64 = 4 << 20;
+/// Most bytes that wait in one set.
+pub(super) const SET_BYTES: u64 = 32 << 20;
+
+const PENDING: u8 = 0;
+const MAPPED: u8 = 1;
+const FAILED: u8 = 2;
+
+#[derive(Debug)]
+struct Chunk {
+    raw: wgpu::Buffer,
+    state: Arc<AtomicU8>,
+    used: u64,
+}
+
+#[derive(Debug, Default)]
+struct Set {
+    chunks: Vec<Chunk>,
+    submission: Option<wgpu::SubmissionIndex>,
+}
+
+/// Both sets; the first is being filled.
+#[derive(Debug, Default)]
+pub(super) struct Belt {
+    sets: [Set; 2],
+}
+
+impl Belt {
+    /// Host memory held, bytes.
+    pub(super) fn bytes(&self) -> u64 {
+        self.sets.iter().map(|s| s.chunks.len() as u64 * CHUNK_BYTES).sum()
+    }
+
+    /// Records copies of the beginning of `bytes` to `target` at `offset`; says how many bytes found room. Less than
+    /// all means that the set is full. `bytes.len()` is a multiple of 4.
+    pub(super) fn write(
+        &mut self,
+        device: &wgpu::Device,
+        faults: &Faults,
+        encoder: &mut wgpu::CommandEncoder,
+        target: &wgpu::Buffer,
+        offset: u64,
+        bytes: &[u8],
+    ) -> GpuResult<usize> {
+        self.sets[0].wait(device, faults)?;
+        let mut done = 0;
+        while done < bytes.len() {
+            let Some(chunk) = self.sets[0].chunk_with_room(device) else { break };
+            faults.check()?;
+            let room = usize::try_from(CHUNK_BYTES - chunk.used).unwrap_or(0);
+            let n = room.min(bytes.len() - done);
+            let end = chunk.used + n as u64;
+            let mut view =
+                chunk.raw.get_mapped_range_mut(chunk.used..end).map_err(|e| mapping_failed(&e.to_string()))?;
+            view.copy_from_slice(&bytes[done..done + n]);
+            drop(view);
+            encoder.copy_buffer_to_buffer(&chunk.raw, chunk.used, target, offset + done as u64, n as u64);
+            chunk.used = end;
+            done += n;
+        }
+        Ok(done)
+    }
+
+    /// Before a submission: what was written becomes visible to the device.
+    pub(super) fn finish(&mut self) {
+        for chunk in self.sets[0].chunks.iter_mut().filter(|c| c.used > 0) {
+            chunk.state.store(PENDING, Ordering::Release);
+            chunk.raw.unmap();
+        }
+    }
+
+    /// After it: the set waits for the device, the other one is next.
+    pub(super) fn submitted(&mut self, submission: &wgpu::SubmissionIndex) {
+        let mut any = false;
+        for chunk in self.sets[0].chunks.iter_mut().filter(|c| c.used > 0) {
+            any = true;
+            chunk.used = 0;
+            let state = Arc::clone(&chunk.state);
+            chunk.raw.map_async(wgpu::MapMode::Write, .., move |result| {
+                state.store(if result.is_ok() { MAPPED } else { FAILED }, Ordering::Release);
+            });
+        }
+        if any {
+            self.sets[0].submission = Some(submission.clone());
+            self.sets.swap(0, 1);
+        }
+    }
+}
+
+impl Set {
+    /// Until the device has read what was last in this set.
+    fn wait(&mut self, device: &wgpu::Device, faults: &Faults) -> GpuResult<()> {
+        let Some(submission) = self.submission.take() else { return Ok(()) };
+        let waited = device.poll(wgpu::PollType::Wait { submission_index: Some(submission), timeout: None });
+        faults.check()?;
+        waited.map_err(|e| mapping_failed(&e.to_string()))?;
+        if self.chunks.iter().any(|c| c.state.load(Ordering::Acquire) != MAPPED) {
+            return Err(mapping_failed("staging memory did not come back"));
+        }
+        Ok(())
+    }
+
+    fn chunk_with_room(&mut self, device: &wgpu::Device) -> Option<&mut Chunk> {
+        let at = match self.chunks.iter().position(|c| c.used < CHUNK_BYTES) {
+            Some(at) => at,
+            None if self.chunks.len() as u64 * CHUNK_BYTES >= SET_BYTES => return None,
+            None => {
+                let raw = device.create_buffer(&wgpu::BufferDescriptor {
+                    label: Some("upload staging"),
+                    size: CHUNK_BYTES,
+                    usage: wgpu::BufferUsages::MAP_WRITE | wgpu::BufferUsages::COPY_SRC,
+                    mapped_at_creation: true,
+                });
+                self.chunks.push(Chunk { raw, state: Arc::new(AtomicU8::new(MAPPED)), used: 0 });
+                self.chunks.len() - 1
+            }
+        };
+        self.chunks.get_mut(at)
+    }
+}
+
+fn mapping_failed(message: &str) -> GpuError {
+    GpuError::Validation { stage: "upload".into(), message: message.into() }
+}

@@ -1,0 +1,201 @@
+//! Device memory: buffers from a pool of size classes, with every byte taken from one budget.
+//!
+//! Invariants: (1) allocated bytes, in use or waiting for reuse, never exceed the budget; (2) a buffer is reused only
+//! within its class, which is at most a quarter larger than what was asked for; (3) a buffer that is dropped goes back
+//! to the pool, where commands recorded later may use it: that is right because commands run in the order recorded.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
+
+use super::error::{Faults, GpuError, GpuResult, lock};
+
+/// Smallest buffer, bytes; also what a view of an empty buffer spans.
+const CLASS_MIN: u64 = 256;
+
+/// Memory on the device. Goes back to the pool when dropped.
+#[derive(Debug)]
+pub struct Buffer {
+    raw: wgpu::Buffer,
+    label: &'static str,
+    size: u64,
+    class: u64,
+    pool: Arc<Pool>,
+}
+
+/// A range of a buffer, as shaders and copies see it. Holds the memory alive, not its place in the budget: keep the
+/// [`Buffer`] for as long as its contents matter.
+#[derive(Debug, Clone)]
+pub struct BufferView {
+    pub(super) raw: wgpu::Buffer,
+    pub(super) label: &'static str,
+    pub(super) offset: u64,
+    pub(super) size: u64,
+}
+
+impl BufferView {
+    /// Bytes.
+    pub fn size(&self) -> u64 {
+        self.size
+    }
+}
+
+impl Buffer {
+    /// Bytes that were asked for.
+    pub fn size(&self) -> u64 {
+        self.size
+    }
+
+    /// All of it: the bytes asked for rounded up to a multiple of 4, or 256 if none were.
+    pub fn view(&self) -> BufferView {
+        let size = if self.size == 0 { CLASS_MIN } else { self.size.next_multiple_of(4) };
+        BufferView { raw: self.raw.clone(), label: self.label, offset: 0, size }
+    }
+
+    /// `size` bytes from `offset`, both clamped to the buffer; as a binding, the offset must be a multiple of
+    /// [`super::Gpu::offset_alignment`], and in any case of 4.
+    pub fn slice(&self, offset: u64, size: u64) -> BufferView {
+        let offset = offset.min(self.class);
+        let size = size.min(self.class - offset);
+        BufferView { raw: self.raw.clone(), label: self.label, offset, size }
+    }
+}
+
+impl Drop for Buffer {
+    fn drop(&mut self) {
+        let mut state = lock(&self.pool.state);
+        state.in_use -= self.class;
+        state.free.entry(self.class).or_default().push(self.raw.clone());
+    }
+}
+
+/// The pool and its books.
+#[derive(Debug)]
+pub(super) struct Pool {
+    state: Mutex<PoolState>,
+    budget: u64,
+    buffer_max: u64,
+}
+
+#[derive(Debug, Default)]
+struct PoolState {
+    free: BTreeMap<u64, Vec<wgpu::Buffer>>,
+    in_use: u64,
+    allocated: u64,
+    peak: u64,
+    allocations: u64,
+}
+
+/// The books of the pool, bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct PoolUse {
+    pub(super) in_use: u64,
+    pub(super) allocated: u64,
+    pub(super) peak: u64,
+    pub(super) allocations: u64,
+}
+
+impl Pool {
+    pub(super) fn new(budget: u64, buffer_max: u64) -> Arc<Pool> {
+        Arc::new(Pool { state: Mutex::default(), budget, buffer_max })
+    }
+
+    /// A buffer of `size` bytes with arbitrary contents.
+    pub(super) fn take(
+        self: &Arc<Self>,
+        device: &wgpu::Device,
+        faults: &Faults,
+        label: &'static str,
+        size: u64,
+    ) -> GpuResult<Buffer> {
+        let limit = self.buffer_max / 4 * 4;
+        if size > limit {
+            return Err(GpuError::BufferTooLarge { what: label.into(), need: size, limit });
+        }
+        let class = size_class(size).min(limit);
+        let mut state = lock(&self.state);
+        let reused = state.free.get_mut(&class).and_then(Vec::pop);
+        let raw = match reused {
+            Some(raw) => raw,
+            None => {
+                self.make_room(&mut state, label, class)?;
+                faults.doing(label);
+                let raw = device.create_buffer(&wgpu::BufferDescriptor {
+                    label: Some(label),
+                    size: class,
+                    usage: wgpu::BufferUsages::STORAGE
+                        | wgpu::BufferUsages::COPY_SRC
+                        | wgpu::BufferUsages::COPY_DST
+                        | wgpu::BufferUsages::INDIRECT,
+                    mapped_at_creation: false,
+                });
+                faults.check()?;
+                state.allocated += class;
+                state.allocations += 1;
+                state.peak = state.peak.max(state.allocated);
+                raw
+            }
+        };
+        state.in_use += class;
+        Ok(Buffer { raw, label, size, class, pool: Arc::clone(self) })
+    }
+
+    /// Gives free buffers back to the device, the largest first, until `class` bytes fit.
+    fn make_room(&self, state: &mut PoolState, label: &str, class: u64) -> GpuResult<()> {
+        if state.in_use.saturating_add(class) > self.budget {
+            return Err(GpuError::OutOfBudget {
+                what: label.into(),
+                need: class,
+                in_use: state.in_use,
+                budget: self.budget,
+            });
+        }
+        while state.allocated + class > self.budget {
+            let Some(mut largest) = state.free.last_entry() else { break };
+            let size = *largest.key();
+            if largest.get_mut().pop().is_some() {
+                state.allocated -= size;
+            }
+            if largest.get().is_empty() {
+                largest.remove();
+            }
+        }
+        Ok(())
+    }
+
+    /// Gives all free buffers back to the device.
+    pub(super) fn trim(&self) {
+        let mut state = lock(&self.state);
+        state.allocated = state.in_use;
+        state.free.clear();
+    }
+
+    pub(super) fn usage(&self) -> PoolUse {
+        let state = lock(&self.state);
+        PoolUse { in_use: state.in_use, allocated: state.allocated, peak: state.peak, allocations: state.allocations }
+    }
+}
+
+/// The class of a size, at least 256: four classes between a power of two and the next.
+pub(super) fn size_class(size: u64) -> u64 {
+    if size <= CLASS_MIN {
+        return CLASS_MIN;
+    }
+    // The step between classes is a quarter of the largest power of two below the size.
+    let step = 1u64 << ((size - 1).ilog2().saturating_sub(2));
+    size.next_multiple_of(step)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn classes_hold_their_sizes_and_waste_at_most_a_quarter() {
+        for size in (1..5000).chain([1 << 20, (1 << 20) + 1, 123_456_789, (1 << 31) - 1]) {
+            let class = size_class(size);
+            assert!(class >= size && class % 4 == 0, "{size} -> {class}");
+            assert!(class <= CLASS_MIN || class * 4 <= size * 5 + 4, "{size} -> {class}");
+            assert_eq!(size_class(class), class, "a class is its own class");
+        }
+    }
+}

@@ -1,0 +1,184 @@
+//! What can go wrong on a device, and the one place where asynchronous reports of the driver are gathered.
+//!
+//! Invariants: (1) every error that concerns work names the stage that was being recorded or waited for; (2) a lost
+//! device stays lost: every later call says so; (3) any other report is handed out exactly once, by the call that
+//! caused it or, if it came late, by the next one.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// Locks; a panic of another holder is no reason to panic too, since every holder leaves valid data.
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Why the device could not do what was asked.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum GpuError {
+    /// `auto` was asked for and there is no hardware GPU: the caller takes the CPU renderer.
+    #[error("no hardware GPU was found (found: {found})")]
+    NoHardwareGpu {
+        /// The adapters that there are, or "none".
+        found: String,
+    },
+    /// The device that was asked for does not exist or cannot be used.
+    #[error("no usable GPU matches {wanted:?}; found: {found}\n  remedy: choose one of `gsscale-train --list-devices`")]
+    NoSuchDevice {
+        /// What the user asked for.
+        wanted: String,
+        /// The adapters that there are, each with the reason if it cannot be used.
+        found: String,
+    },
+    /// The driver refused to open the device.
+    #[error("{device} could not be opened: {message}")]
+    Open {
+        /// Name of the adapter.
+        device: String,
+        /// The driver's words.
+        message: String,
+    },
+    /// The budget of `--device-mem` cannot hold a buffer.
+    #[error(
+        "{what} needs {need} bytes of device memory, but {in_use} of the {budget} allowed are in use\n  remedy: raise \
+         --device-mem, or train with smaller pictures (--data-factor)"
+    )]
+    OutOfBudget {
+        /// Name of the buffer.
+        what: String,
+        /// Bytes that it needs.
+        need: u64,
+        /// Bytes in use by other buffers.
+        in_use: u64,
+        /// Bytes allowed in total.
+        budget: u64,
+    },
+    /// The device itself has no memory left.
+    #[error("{stage}: the device is out of memory ({message})\n  remedy: lower --device-mem")]
+    OutOfMemory {
+        /// Stage or buffer.
+        stage: String,
+        /// The driver's words.
+        message: String,
+    },
+    /// One buffer is larger than the device allows.
+    #[error("{what} needs one buffer of {need} bytes; the device allows {limit}")]
+    BufferTooLarge {
+        /// Name of the buffer.
+        what: String,
+        /// Bytes that it needs.
+        need: u64,
+        /// Largest buffer of the device, bytes.
+        limit: u64,
+    },
+    /// One binding is larger than the device (or the test's limit) allows.
+    #[error("{stage}: binding {binding} would span {need} bytes; the device allows {limit} in one binding")]
+    BindingTooLarge {
+        /// Stage.
+        stage: String,
+        /// Name of the variable in the shader.
+        binding: String,
+        /// Bytes of the view.
+        need: u64,
+        /// Bytes allowed.
+        limit: u64,
+    },
+    /// The views given do not fit the shader, or a copy does not fit its ends.
+    #[error("{stage}: {problem}")]
+    Bindings {
+        /// Stage.
+        stage: String,
+        /// What does not fit.
+        problem: String,
+    },
+    /// A shader does not preprocess, parse or validate.
+    #[error("shader {shader}: {problem}")]
+    Shader {
+        /// Name in the table of sources.
+        shader: String,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// The API refused a call: a defect of this program.
+    #[error("{stage}: the graphics API refused the work: {message}")]
+    Validation {
+        /// Stage.
+        stage: String,
+        /// The API's words.
+        message: String,
+    },
+    /// The device is gone: unplugged, reset by the driver, or hung.
+    #[error("{stage}: the device was lost: {message}")]
+    DeviceLost {
+        /// Stage.
+        stage: String,
+        /// The driver's words.
+        message: String,
+    },
+}
+
+/// Result of everything that talks to a device.
+pub type GpuResult<T> = Result<T, GpuError>;
+
+/// Reports of the driver, gathered until the next check.
+#[derive(Debug, Default)]
+pub(super) struct Faults {
+    state: Mutex<FaultState>,
+}
+
+#[derive(Debug, Default)]
+struct FaultState {
+    doing: String,
+    first: Option<GpuError>,
+    lost: Option<GpuError>,
+}
+
+impl Faults {
+    /// Names what the calls from here on belong to.
+    pub(super) fn doing(&self, what: &str) {
+        let mut state = lock(&self.state);
+        state.doing.clear();
+        state.doing.push_str(what);
+    }
+
+    /// Keeps the first report; later ones are its consequences.
+    pub(super) fn report(&self, error: &wgpu::Error) {
+        let mut state = lock(&self.state);
+        let stage = state.doing.clone();
+        let message = causes(error);
+        state.first.get_or_insert(match error {
+            wgpu::Error::OutOfMemory { .. } => GpuError::OutOfMemory { stage, message },
+            wgpu::Error::Validation { .. } | wgpu::Error::Internal { .. } => GpuError::Validation { stage, message },
+        });
+    }
+
+    /// The device is gone.
+    pub(super) fn lost(&self, message: String) {
+        let mut state = lock(&self.state);
+        let stage = state.doing.clone();
+        state.lost.get_or_insert(GpuError::DeviceLost { stage, message });
+    }
+
+    /// Hands out what was reported.
+    pub(super) fn check(&self) -> GpuResult<()> {
+        let mut state = lock(&self.state);
+        if let Some(lost) = &state.lost {
+            return Err(lost.clone());
+        }
+        state.first.take().map_or(Ok(()), Err)
+    }
+}
+
+/// An error with its chain of causes on one line.
+fn causes(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(source) = cause {
+        let message = source.to_string();
+        if !text.contains(&message) {
+            text.push_str(": ");
+            text.push_str(&message);
+        }
+        cause = source.source();
+    }
+    text
+}

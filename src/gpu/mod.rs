@@ -1,0 +1,49 @@
+//! Compute on a GPU through wgpu: the device, its memory, shaders, and recording of work. Knows neither Gaussians nor
+//! stages: [`crate::base`] is all it builds on.
+//!
+//! How the parts work together:
+//!
+//! ```text
+//! Gpu::open ──> gpu.buffer(label, bytes) ──> Buffer::view / slice ──> BufferView
+//!           ──> gpu.pipeline(shader, entry, defines) ──> Pipeline
+//!           ──> gpu.begin("step") ──> Recorder: upload, uniform, clear, dispatch, copy, read_back
+//!           ──> gpu.submit(recorder) ──> Readback::to_vec
+//! ```
+//!
+//! Rules that hold for every shader:
+//!
+//! 1. All bindings are in `@group(0)`, numbered from 0 without holes in a file. Views are given to
+//!    [`Recorder::dispatch`] in the order of the numbers that the entry point uses. A uniform struct, where there is
+//!    one, is binding 0.
+//! 2. Workgroups are 1-D. Beyond 65,535 workgroups [`groups_1d`] folds them into two dimensions, and the shader finds
+//!    its index with `linear_group` of `shared/dispatch.wgsl`.
+//! 3. Counts come from uniforms or buffers, never from `arrayLength`: a view of an empty buffer still spans some bytes.
+//! 4. No workgroup waits for another one; no invocation loops more than 65,535 times in total.
+//! 5. Contents of a fresh buffer are arbitrary (it may be recycled): [`Recorder::clear`] where zeros are needed.
+//! 6. One recorder at a time: its commands and its recycled buffers are in one order only then.
+
+mod belt;
+mod buffers;
+mod device;
+mod error;
+mod layout;
+mod profile;
+mod readback;
+mod record;
+mod shader;
+mod sources;
+
+pub use buffers::{Buffer, BufferView};
+pub use device::{AdapterSummary, DeviceChoice, DeviceKind, Gpu, GpuOptions, Traffic, list_adapters};
+pub use error::{GpuError, GpuResult};
+pub use layout::StructLayout;
+pub use profile::StageTime;
+pub use readback::Readback;
+pub use record::{Recorder, Submission, groups_1d};
+pub use shader::{
+    Binding, BindingKind, Defines, Pipeline, Reflection, Source, preprocess, reflect, validate, variants,
+};
+pub use sources::SOURCES;
+
+/// Invocations of a workgroup, unless a shader has a reason for another number.
+pub const WORKGROUP: u32 = 256;

@@ -1,0 +1,132 @@
+//! Time of every stage on the device, from timestamps around its compute passes.
+//!
+//! Invariants: (1) without timestamps on the adapter, or with profiling off, nothing is recorded and the list is empty:
+//! no figure is ever guessed; (2) a pass holds dispatches of one stage only while profiling.
+
+use super::device::Gpu;
+use super::error::{GpuResult, lock};
+use super::readback::{PendingMap, Readback};
+
+/// Passes of one recorder that can be timed; later ones are not.
+const PASSES_MAX: u32 = 1024;
+
+/// Time of one stage since the device was opened.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StageTime {
+    /// Stage.
+    pub stage: &'static str,
+    /// Timed passes.
+    pub passes: u64,
+    /// Their time together, seconds.
+    pub seconds: f64,
+}
+
+/// Timestamps on their way, and the sums of those that arrived.
+#[derive(Debug)]
+pub(super) struct Profiler {
+    queries: Option<(wgpu::QuerySet, wgpu::Buffer)>,
+    seconds_per_tick: f64,
+    recorded: Vec<&'static str>,
+    under_way: Vec<(Readback, Vec<&'static str>)>,
+    sums: Vec<StageTime>,
+}
+
+impl Profiler {
+    pub(super) fn new(device: &wgpu::Device, queue: &wgpu::Queue, on: bool) -> Profiler {
+        let queries = on.then(|| {
+            let set = device.create_query_set(&wgpu::QuerySetDescriptor {
+                label: Some("stage times"),
+                ty: wgpu::QueryType::Timestamp,
+                count: 2 * PASSES_MAX,
+            });
+            let resolved = device.create_buffer(&wgpu::BufferDescriptor {
+                label: Some("stage times"),
+                size: u64::from(2 * PASSES_MAX) * 8,
+                usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
+                mapped_at_creation: false,
+            });
+            (set, resolved)
+        });
+        Profiler {
+            queries,
+            seconds_per_tick: if on { f64::from(queue.get_timestamp_period()) * 1e-9 } else { 0.0 },
+            recorded: Vec::new(),
+            under_way: Vec::new(),
+            sums: Vec::new(),
+        }
+    }
+
+    pub(super) fn is_on(&self) -> bool {
+        self.queries.is_some()
+    }
+
+    /// Begins a pass for `stage`, timed if there is room.
+    pub(super) fn begin_pass(
+        &mut self,
+        encoder: &mut wgpu::CommandEncoder,
+        stage: &'static str,
+    ) -> wgpu::ComputePass<'static> {
+        let at = u32::try_from(self.recorded.len()).unwrap_or(PASSES_MAX);
+        let writes =
+            self.queries.as_ref().filter(|_| at < PASSES_MAX).map(|(set, _)| wgpu::ComputePassTimestampWrites {
+                query_set: set,
+                beginning_of_pass_write_index: Some(2 * at),
+                end_of_pass_write_index: Some(2 * at + 1),
+            });
+        let timed = writes.is_some();
+        let pass = encoder
+            .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(stage), timestamp_writes: writes })
+            .forget_lifetime();
+        if timed {
+            self.recorded.push(stage);
+        }
+        pass
+    }
+
+    /// Records that the stamps of this submission be read back.
+    pub(super) fn resolve(&mut self, gpu: &Gpu, encoder: &mut wgpu::CommandEncoder) -> GpuResult<Option<PendingMap>> {
+        let Some((set, resolved)) = &self.queries else { return Ok(None) };
+        if self.recorded.is_empty() {
+            return Ok(None);
+        }
+        let stages = std::mem::take(&mut self.recorded);
+        let count = 2 * u32::try_from(stages.len()).unwrap_or(PASSES_MAX);
+        encoder.resolve_query_set(set, 0..count, resolved, 0);
+        let view =
+            super::BufferView { raw: resolved.clone(), label: "stage times", offset: 0, size: u64::from(count) * 8 };
+        let (readback, pending) = Readback::record(gpu, encoder, "stage times", &view)?;
+        self.under_way.push((readback, stages));
+        Ok(Some(pending))
+    }
+
+    /// Adds what is under way to the sums, waiting for all but the last `leave`.
+    pub(super) fn collect(&mut self, gpu: &Gpu, leave: usize) -> GpuResult<()> {
+        while self.under_way.len() > leave {
+            let (readback, stages) = self.under_way.remove(0);
+            let ticks: Vec<u64> = readback.to_vec(gpu)?;
+            for (stage, pair) in stages.into_iter().zip(ticks.chunks_exact(2)) {
+                let seconds = pair[1].saturating_sub(pair[0]) as f64 * self.seconds_per_tick;
+                match self.sums.iter_mut().find(|s| s.stage == stage) {
+                    Some(sum) => {
+                        sum.passes += 1;
+                        sum.seconds += seconds;
+                    }
+                    None => self.sums.push(StageTime { stage, passes: 1, seconds }),
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Gpu {
+    /// Time of every stage so far, in the order of their first use; empty without profiling. Waits for the device.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn stage_times(&self) -> GpuResult<Vec<StageTime>> {
+        let mut profiler = lock(&self.profiler);
+        profiler.collect(self, 0)?;
+        Ok(profiler.sums.clone())
+    }
+}

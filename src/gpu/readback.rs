@@ -1,0 +1,157 @@
+//! Reading results back: copies into staging memory that is mapped when the device has finished. Staging is reused,
+//! two buffers of a class at most, so that one is read while the other is filled.
+//!
+//! Invariants: (1) a read-back yields the bytes at the place in the recording where it was asked for; (2) it is empty
+//! until its recorder was submitted, and asking then is an error, not a wait without end.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+
+use super::buffers::{BufferView, size_class};
+use super::device::Gpu;
+use super::error::{GpuError, GpuResult, lock};
+
+const RECORDED: u8 = 0;
+const MAPPING: u8 = 1;
+const MAPPED: u8 = 2;
+const FAILED: u8 = 3;
+
+/// Staging buffers that wait for reuse, by class, and the count of bytes read.
+#[derive(Debug, Default)]
+pub(super) struct Staging {
+    free: Mutex<BTreeMap<u64, Vec<wgpu::Buffer>>>,
+    read: AtomicU64,
+}
+
+impl Staging {
+    pub(super) fn bytes_read(&self) -> u64 {
+        self.read.load(Ordering::Relaxed)
+    }
+
+    /// Host memory that waits for reuse.
+    pub(super) fn bytes(&self) -> u64 {
+        lock(&self.free).iter().map(|(class, free)| class * free.len() as u64).sum()
+    }
+}
+
+/// Bytes on their way to the host.
+#[derive(Debug)]
+#[must_use]
+pub struct Readback {
+    raw: wgpu::Buffer,
+    stage: &'static str,
+    size: u64,
+    class: u64,
+    state: Arc<AtomicU8>,
+    staging: Arc<Staging>,
+}
+
+/// The part of a read-back that its recorder keeps until it is submitted.
+#[derive(Debug)]
+pub(super) struct PendingMap {
+    raw: wgpu::Buffer,
+    size: u64,
+    state: Arc<AtomicU8>,
+}
+
+impl PendingMap {
+    /// Asks for the mapping; called right after the submission.
+    pub(super) fn start(self) {
+        self.state.store(MAPPING, Ordering::Release);
+        let state = Arc::clone(&self.state);
+        self.raw.map_async(wgpu::MapMode::Read, ..self.size, move |result| {
+            state.store(if result.is_ok() { MAPPED } else { FAILED }, Ordering::Release);
+        });
+    }
+}
+
+impl Readback {
+    /// Records the copy of `view`.
+    pub(super) fn record(
+        gpu: &Gpu,
+        encoder: &mut wgpu::CommandEncoder,
+        stage: &'static str,
+        view: &BufferView,
+    ) -> GpuResult<(Readback, PendingMap)> {
+        let class = size_class(view.size);
+        let reused = lock(&gpu.staging.free).get_mut(&class).and_then(Vec::pop);
+        let raw = reused.unwrap_or_else(|| {
+            gpu.device.create_buffer(&wgpu::BufferDescriptor {
+                label: Some("read-back staging"),
+                size: class,
+                usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
+                mapped_at_creation: false,
+            })
+        });
+        gpu.faults.check()?;
+        encoder.copy_buffer_to_buffer(&view.raw, view.offset, &raw, 0, view.size);
+        gpu.staging.read.fetch_add(view.size, Ordering::Relaxed);
+        let state = Arc::new(AtomicU8::new(RECORDED));
+        let pending = PendingMap { raw: raw.clone(), size: view.size, state: Arc::clone(&state) };
+        let staging = Arc::clone(&gpu.staging);
+        Ok((Readback { raw, stage, size: view.size, class, state, staging }, pending))
+    }
+
+    /// Bytes.
+    pub fn size(&self) -> u64 {
+        self.size
+    }
+
+    /// Whether the bytes have arrived; never waits.
+    pub fn is_ready(&self, gpu: &Gpu) -> bool {
+        let _ = gpu.device.poll(wgpu::PollType::Poll); // an error shows when the bytes are asked for
+        self.state.load(Ordering::Acquire) >= MAPPED
+    }
+
+    /// Waits, then yields the elements.
+    ///
+    /// # Errors
+    /// The recorder was not submitted, the device was lost, or its work failed.
+    pub fn to_vec<T: bytemuck::Pod>(self, gpu: &Gpu) -> GpuResult<Vec<T>> {
+        let mut out = vec![T::zeroed(); usize::try_from(self.size).unwrap_or(0) / size_of::<T>().max(1)];
+        self.copy_to(gpu, &mut out)?;
+        Ok(out)
+    }
+
+    /// Waits, then fills the beginning of `out`, or all of it if there are more bytes.
+    ///
+    /// # Errors
+    /// The recorder was not submitted, the device was lost, or its work failed.
+    pub fn copy_to<T: bytemuck::Pod>(self, gpu: &Gpu, out: &mut [T]) -> GpuResult<()> {
+        self.wait(gpu)?;
+        let out = bytemuck::cast_slice_mut::<T, u8>(out);
+        let view = self.raw.get_mapped_range(..self.size).map_err(|e| self.failed(&e.to_string()))?;
+        let n = out.len().min(view.len());
+        out[..n].copy_from_slice(&view[..n]);
+        drop(view);
+        self.raw.unmap();
+        let mut free = lock(&self.staging.free);
+        let class = free.entry(self.class).or_default();
+        if class.len() < 2 {
+            class.push(self.raw.clone());
+        }
+        Ok(())
+    }
+
+    fn wait(&self, gpu: &Gpu) -> GpuResult<()> {
+        if self.state.load(Ordering::Acquire) == RECORDED {
+            return Err(self.failed("read back before its commands were submitted"));
+        }
+        gpu.faults.doing(self.stage);
+        while self.state.load(Ordering::Acquire) == MAPPING {
+            let waited = gpu.device.poll(wgpu::PollType::wait_indefinitely());
+            gpu.faults.check()?;
+            waited.map_err(|e| self.failed(&e.to_string()))?;
+        }
+        gpu.faults.check()?;
+        match self.state.load(Ordering::Acquire) {
+            MAPPED => Ok(()),
+            _ => Err(self.failed("the results could not be mapped")),
+        }
+    }
+
+    fn failed(&self, message: &str) -> GpuError {
+        GpuError::Validation { stage: self.stage.into(), message: message.into() }
+    }
+}

@@ -1,0 +1,433 @@
+//! Recording of work: uploads, dispatches, copies and read-backs in the order in which they will run.
+//!
+//! Invariants: (1) what a dispatch binds is checked here, so that an error names the stage and the variable, and nothing
+//! is submitted after an error; (2) commands run in the order recorded, also across submissions; (3) uploads beyond one
+//! staging set submit what is recorded so far and go on.
+
+use std::sync::atomic::Ordering;
+
+use super::belt::SET_BYTES;
+use super::buffers::{Buffer, BufferView};
+use super::device::{GROUPS_MAX, Gpu};
+use super::error::{GpuError, GpuResult, lock};
+use super::readback::{PendingMap, Readback};
+use super::shader::{BindingKind, Pipeline};
+
+/// Workgroups for `count` invocations in workgroups of `workgroup`, folded into two dimensions beyond 65,535.
+///
+/// The shader finds its place with `linear_group` or `linear_index` of `shared/dispatch.wgsl`, and ignores places at
+/// or beyond its count. Indices stay within 32 bits for counts up to 2^32 - 2^24.
+pub fn groups_1d(count: u32, workgroup: u32) -> [u32; 3] {
+    let groups = count.div_ceil(workgroup.max(1));
+    if groups <= GROUPS_MAX {
+        return [groups, 1, 1];
+    }
+    let rows = groups.div_ceil(GROUPS_MAX);
+    [groups.div_ceil(rows), rows, 1]
+}
+
+/// Bytes of one uniform buffer of the ring.
+const UNIFORM_CHUNK: u64 = 64 << 10;
+
+/// Uniform buffers that every submission fills anew.
+#[derive(Debug)]
+pub(super) struct UniformRing {
+    chunks: Vec<wgpu::Buffer>,
+    alignment: u64,
+}
+
+impl UniformRing {
+    pub(super) fn new(alignment: u64) -> UniformRing {
+        UniformRing { chunks: Vec::new(), alignment: alignment.max(16) }
+    }
+
+    fn chunk(&mut self, device: &wgpu::Device, index: usize) -> wgpu::Buffer {
+        while self.chunks.len() <= index {
+            self.chunks.push(device.create_buffer(&wgpu::BufferDescriptor {
+                label: Some("uniforms"),
+                size: UNIFORM_CHUNK,
+                usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+                mapped_at_creation: false,
+            }));
+        }
+        self.chunks[index].clone()
+    }
+}
+
+/// A submission that can be waited for.
+#[derive(Debug, Clone)]
+pub struct Submission {
+    index: wgpu::SubmissionIndex,
+    name: &'static str,
+}
+
+/// Work being recorded.
+pub struct Recorder<'g> {
+    gpu: &'g Gpu,
+    name: &'static str,
+    encoder: wgpu::CommandEncoder,
+    pass: Option<(wgpu::ComputePass<'static>, &'static str)>,
+    uniforms: Vec<Vec<u8>>,
+    readbacks: Vec<PendingMap>,
+}
+
+impl Drop for Recorder<'_> {
+    fn drop(&mut self) {
+        self.gpu.recorders.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+impl Gpu {
+    /// Begins to record; `name` appears in errors that no stage can be blamed for.
+    pub fn begin(&self, name: &'static str) -> Recorder<'_> {
+        self.recorders.fetch_add(1, Ordering::Relaxed);
+        Recorder {
+            gpu: self,
+            name,
+            encoder: new_encoder(&self.device, name),
+            pass: None,
+            uniforms: Vec::new(),
+            readbacks: Vec::new(),
+        }
+    }
+
+    /// Submits; does not wait.
+    ///
+    /// # Errors
+    /// The API refused the commands, the device was lost or ran out of memory, or two recorders were open at once.
+    pub fn submit(&self, mut recorder: Recorder<'_>) -> GpuResult<Submission> {
+        if self.recorders.load(Ordering::Relaxed) > 1 {
+            let problem = "two recorders are open at once".into();
+            return Err(GpuError::Bindings { stage: recorder.name.into(), problem });
+        }
+        recorder.flush()
+    }
+
+    /// Waits until the device has finished a submission.
+    ///
+    /// # Errors
+    /// The device was lost or ran out of memory.
+    pub fn wait(&self, submission: &Submission) -> GpuResult<()> {
+        self.faults.doing(submission.name);
+        let index = Some(submission.index.clone());
+        let waited = self.device.poll(wgpu::PollType::Wait { submission_index: index, timeout: None });
+        self.faults.check()?;
+        let stage = submission.name.into();
+        waited.map(|_| ()).map_err(|e| GpuError::Validation { stage, message: e.to_string() })
+    }
+}
+
+fn new_encoder(device: &wgpu::Device, name: &'static str) -> wgpu::CommandEncoder {
+    device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some(name) })
+}
+
+impl Recorder<'_> {
+    /// A uniform struct for dispatches of this recorder: what binding 0 expects.
+    ///
+    /// # Errors
+    /// The device has no memory left.
+    pub fn uniform<T: bytemuck::NoUninit>(&mut self, value: &T) -> GpuResult<BufferView> {
+        let bytes = bytemuck::bytes_of(value);
+        let mut ring = lock(&self.gpu.uniforms);
+        let alignment = ring.alignment;
+        let fits =
+            |chunk: &Vec<u8>| (chunk.len() as u64).next_multiple_of(alignment) + bytes.len() as u64 <= UNIFORM_CHUNK;
+        if !self.uniforms.last().is_some_and(fits) {
+            self.uniforms.push(Vec::new());
+        }
+        let index = self.uniforms.len() - 1;
+        let raw = ring.chunk(&self.gpu.device, index);
+        drop(ring);
+        self.gpu.faults.check()?;
+        let chunk = &mut self.uniforms[index];
+        let offset = (chunk.len() as u64).next_multiple_of(alignment);
+        chunk.resize(usize::try_from(offset).unwrap_or(chunk.len()), 0);
+        chunk.extend_from_slice(bytes);
+        let size = bytes.len() as u64;
+        let tail = chunk.len().next_multiple_of(4);
+        chunk.resize(tail, 0); // writes are multiples of 4 bytes
+        Ok(BufferView { raw, label: "uniforms", offset, size })
+    }
+
+    /// A fresh buffer holding `data`.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`] and [`Recorder::upload`].
+    pub fn buffer_with<T: bytemuck::NoUninit>(&mut self, label: &'static str, data: &[T]) -> GpuResult<Buffer> {
+        let buffer = self.gpu.buffer(label, size_of_val(data) as u64)?;
+        self.upload(&buffer.view(), data)?;
+        Ok(buffer)
+    }
+
+    /// A fresh buffer of zeros.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub fn buffer_zeroed(&mut self, label: &'static str, size: u64) -> GpuResult<Buffer> {
+        let buffer = self.gpu.buffer(label, size)?;
+        self.clear(&buffer.view())?;
+        Ok(buffer)
+    }
+
+    /// Uploads `data` to the beginning of `view`; the last word is filled up with zero bytes.
+    ///
+    /// # Errors
+    /// The data is longer than the view, or the device failed.
+    pub fn upload<T: bytemuck::NoUninit>(&mut self, view: &BufferView, data: &[T]) -> GpuResult<()> {
+        let bytes = bytemuck::cast_slice::<T, u8>(data);
+        if bytes.is_empty() {
+            return Ok(());
+        }
+        self.check_copy("upload", view, (bytes.len() as u64).next_multiple_of(4))?;
+        let (whole, rest) = bytes.split_at(bytes.len() / 4 * 4);
+        self.upload_words(view, 0, whole)?;
+        if !rest.is_empty() {
+            let mut word = [0u8; 4];
+            word[..rest.len()].copy_from_slice(rest);
+            self.upload_words(view, whole.len() as u64, &word)?;
+        }
+        Ok(())
+    }
+
+    fn upload_words(&mut self, view: &BufferView, mut at: u64, mut bytes: &[u8]) -> GpuResult<()> {
+        self.pass = None;
+        self.gpu.faults.doing(view.label);
+        self.gpu.uploaded.fetch_add(bytes.len() as u64, Ordering::Relaxed);
+        while !bytes.is_empty() {
+            let mut belt = lock(&self.gpu.belt);
+            let (device, faults) = (&self.gpu.device, &self.gpu.faults);
+            let done = belt.write(device, faults, &mut self.encoder, &view.raw, view.offset + at, bytes)?;
+            drop(belt);
+            bytes = &bytes[done..];
+            at += done as u64;
+            if !bytes.is_empty() {
+                self.flush()?; // the set of SET_BYTES is full
+            }
+        }
+        Ok(())
+    }
+
+    /// Zeros `view`.
+    ///
+    /// # Errors
+    /// The view does not lie on multiples of 4 bytes.
+    pub fn clear(&mut self, view: &BufferView) -> GpuResult<()> {
+        self.check_copy("clear", view, view.size)?;
+        self.pass = None;
+        self.gpu.faults.doing(view.label);
+        self.encoder.clear_buffer(&view.raw, view.offset, Some(view.size));
+        Ok(())
+    }
+
+    /// Copies `from` to the beginning of `to`, which is another buffer.
+    ///
+    /// # Errors
+    /// `to` is shorter, both lie in one buffer, or one does not lie on multiples of 4 bytes.
+    pub fn copy(&mut self, from: &BufferView, to: &BufferView) -> GpuResult<()> {
+        self.check_copy("copy", from, from.size)?;
+        self.check_copy("copy", to, from.size)?;
+        if from.raw == to.raw {
+            let problem = format!("a copy of {} within one buffer", from.label);
+            return Err(GpuError::Bindings { stage: self.name.into(), problem });
+        }
+        self.pass = None;
+        self.gpu.faults.doing(to.label);
+        self.encoder.copy_buffer_to_buffer(&from.raw, from.offset, &to.raw, to.offset, from.size);
+        Ok(())
+    }
+
+    /// Records that `view`, as it is at this point, be read back.
+    ///
+    /// # Errors
+    /// The view does not lie on multiples of 4 bytes, or there is no memory for staging.
+    pub fn read_back(&mut self, stage: &'static str, view: &BufferView) -> GpuResult<Readback> {
+        self.check_copy("read_back", view, view.size)?;
+        self.pass = None;
+        self.gpu.faults.doing(stage);
+        let (readback, pending) = Readback::record(self.gpu, &mut self.encoder, stage, view)?;
+        self.readbacks.push(pending);
+        Ok(readback)
+    }
+
+    /// Runs a stage: `views` in the order of the binding numbers that its entry point uses. Zero groups do nothing.
+    ///
+    /// # Errors
+    /// A view does not fit its binding; the message names the stage and the variable.
+    pub fn dispatch(
+        &mut self,
+        stage: &'static str,
+        pipeline: &Pipeline,
+        views: &[BufferView],
+        groups: [u32; 3],
+    ) -> GpuResult<()> {
+        if groups.contains(&0) {
+            return Ok(());
+        }
+        if groups.iter().any(|&n| n > GROUPS_MAX) {
+            let problem = format!("{groups:?} workgroups; a dimension holds at most {GROUPS_MAX}");
+            return Err(GpuError::Bindings { stage: stage.into(), problem });
+        }
+        self.bind(stage, pipeline, views)?.dispatch_workgroups(groups[0], groups[1], groups[2]);
+        self.gpu.faults.check()
+    }
+
+    /// Runs a stage with the three workgroup counts that `groups` holds on the device.
+    ///
+    /// # Errors
+    /// As [`Recorder::dispatch`].
+    pub fn dispatch_indirect(
+        &mut self,
+        stage: &'static str,
+        pipeline: &Pipeline,
+        views: &[BufferView],
+        groups: &BufferView,
+    ) -> GpuResult<()> {
+        self.check_copy(stage, groups, 12)?;
+        self.bind(stage, pipeline, views)?.dispatch_workgroups_indirect(&groups.raw, groups.offset);
+        self.gpu.faults.check()
+    }
+
+    /// A pass with pipeline and bind group set.
+    fn bind(
+        &mut self,
+        stage: &'static str,
+        pipeline: &Pipeline,
+        views: &[BufferView],
+    ) -> GpuResult<&mut wgpu::ComputePass<'static>> {
+        self.check_bindings(stage, pipeline, views)?;
+        self.gpu.faults.doing(stage);
+        let entries: Vec<wgpu::BindGroupEntry<'_>> = pipeline
+            .reflection
+            .bindings
+            .iter()
+            .zip(views)
+            .map(|(binding, view)| wgpu::BindGroupEntry {
+                binding: binding.number,
+                resource: wgpu::BindingResource::Buffer(wgpu::BufferBinding {
+                    buffer: &view.raw,
+                    offset: view.offset,
+                    size: wgpu::BufferSize::new(view.size),
+                }),
+            })
+            .collect();
+        let group = self.gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some(stage),
+            layout: &pipeline.layout,
+            entries: &entries,
+        });
+        self.gpu.faults.check()?;
+        let mut profiler = lock(&self.gpu.profiler);
+        let reusable = self.pass.take_if(|(_, of)| !profiler.is_on() || *of == stage);
+        let pass = match reusable {
+            Some((pass, _)) => pass,
+            None => {
+                self.pass = None; // ends the pass of the stage before
+                profiler.begin_pass(&mut self.encoder, stage)
+            }
+        };
+        let (pass, _) = self.pass.insert((pass, stage));
+        pass.set_pipeline(&pipeline.raw);
+        pass.set_bind_group(0, &group, &[]);
+        Ok(pass)
+    }
+
+    fn check_bindings(&self, stage: &'static str, pipeline: &Pipeline, views: &[BufferView]) -> GpuResult<()> {
+        let problem = |problem: String| Err(GpuError::Bindings { stage: stage.into(), problem });
+        let bindings = &pipeline.reflection.bindings;
+        if bindings.len() != views.len() {
+            let names: Vec<&str> = bindings.iter().map(|b| b.name.as_str()).collect();
+            return problem(format!("{} views were given for the bindings {}", views.len(), names.join(", ")));
+        }
+        for (i, (binding, view)) in bindings.iter().zip(views).enumerate() {
+            let name = &binding.name;
+            if view.size < binding.min_size {
+                return problem(format!("{name} spans {} bytes, the shader needs {}", view.size, binding.min_size));
+            }
+            if binding.kind == BindingKind::Uniform {
+                continue;
+            }
+            if view.size > self.gpu.max_binding_bytes() {
+                return Err(GpuError::BindingTooLarge {
+                    stage: stage.into(),
+                    binding: name.clone(),
+                    need: view.size,
+                    limit: self.gpu.max_binding_bytes(),
+                });
+            }
+            if view.offset % self.gpu.offset_alignment() != 0 {
+                let alignment = self.gpu.offset_alignment();
+                return problem(format!("{name} begins at byte {}, not a multiple of {alignment}", view.offset));
+            }
+            for (other, other_view) in bindings.iter().zip(views).take(i) {
+                if other_view.raw == view.raw && other.kind != binding.kind {
+                    return problem(format!("{name} and {} are one buffer, one read and one written", other.name));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether `size` bytes fit at the beginning of `view`, on multiples of 4.
+    fn check_copy(&self, what: &str, view: &BufferView, size: u64) -> GpuResult<()> {
+        let problem = if size > view.size {
+            format!("{what}: {size} bytes do not fit the {} of {}", view.size, view.label)
+        } else if !view.offset.is_multiple_of(4) || !size.is_multiple_of(4) {
+            format!("{what}: {size} bytes at {} of {} are not whole words", view.offset, view.label)
+        } else {
+            return Ok(());
+        };
+        Err(GpuError::Bindings { stage: self.name.into(), problem })
+    }
+
+    /// Submits what is recorded so far and goes on with an empty encoder.
+    fn flush(&mut self) -> GpuResult<Submission> {
+        let gpu = self.gpu;
+        self.pass = None;
+        let mut profiler = lock(&gpu.profiler);
+        let stamps = profiler.resolve(gpu, &mut self.encoder)?;
+        drop(profiler);
+        self.readbacks.extend(stamps);
+        gpu.faults.doing(self.name);
+        let encoder = std::mem::replace(&mut self.encoder, new_encoder(&gpu.device, self.name));
+        let commands = encoder.finish();
+        gpu.faults.check()?;
+        let mut ring = lock(&gpu.uniforms);
+        for (index, bytes) in self.uniforms.drain(..).enumerate() {
+            gpu.uploaded.fetch_add(bytes.len() as u64, Ordering::Relaxed);
+            gpu.queue.write_buffer(&ring.chunk(&gpu.device, index), 0, &bytes);
+        }
+        drop(ring);
+        let mut belt = lock(&gpu.belt);
+        belt.finish();
+        let index = gpu.queue.submit([commands]);
+        belt.submitted(&index);
+        drop(belt);
+        for pending in self.readbacks.drain(..) {
+            pending.start();
+        }
+        gpu.faults.check()?;
+        lock(&gpu.profiler).collect(gpu, 4)?;
+        Ok(Submission { index, name: self.name })
+    }
+}
+
+const _: () = assert!(SET_BYTES.is_multiple_of(4));
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn groups_cover_every_count_and_stay_within_a_dimension() {
+        for count in [0u32, 1, 255, 256, 257, 65_535 * 256, 65_535 * 256 + 1, 1 << 28, u32::MAX - (1 << 24)] {
+            let [x, y, z] = groups_1d(count, 256);
+            assert!(x <= GROUPS_MAX && y <= GROUPS_MAX && z == 1);
+            let covered = u64::from(x) * u64::from(y) * 256;
+            assert!(covered >= u64::from(count) && covered <= u64::from(u32::MAX) + 1, "{count}: {covered}");
+            assert!(
+                covered - u64::from(count) < 256 * u64::from(y.max(1)),
+                "{count}: one row's workgroup at most is idle"
+            );
+        }
+    }
+}
