@@ -14,6 +14,9 @@ const CHUNK_BYTES: u64 = 4 << 20;
 /// Most bytes that wait in one set.
 pub(super) const SET_BYTES: u64 = 32 << 20;
 
+/// Mapped ranges begin at multiples of this.
+const MAP_ALIGNMENT: u64 = wgpu::MAP_ALIGNMENT;
+
 const PENDING: u8 = 0;
 const MAPPED: u8 = 1;
 const FAILED: u8 = 2;
@@ -67,7 +70,7 @@ impl Belt {
             view.copy_from_slice(&bytes[done..done + n]);
             drop(view);
             encoder.copy_buffer_to_buffer(&chunk.raw, chunk.used, target, offset + done as u64, n as u64);
-            chunk.used = end;
+            chunk.used = end.next_multiple_of(MAP_ALIGNMENT).min(CHUNK_BYTES);
             done += n;
         }
         Ok(done)

@@ -37,6 +37,11 @@ impl BufferView {
     pub fn size(&self) -> u64 {
         self.size
     }
+
+    /// Whether the range lies within its buffer.
+    pub(super) fn is_inside(&self) -> bool {
+        self.offset.checked_add(self.size).is_some_and(|end| end <= self.raw.size())
+    }
 }
 
 impl Buffer {
@@ -51,11 +56,9 @@ impl Buffer {
         BufferView { raw: self.raw.clone(), label: self.label, offset: 0, size }
     }
 
-    /// `size` bytes from `offset`, both clamped to the buffer; as a binding, the offset must be a multiple of
-    /// [`super::Gpu::offset_alignment`], and in any case of 4.
+    /// `size` bytes from `offset`; as a binding, the offset must be a multiple of [`super::Gpu::offset_alignment`],
+    /// and in any case of 4. A range beyond the buffer is an error of the command that uses it.
     pub fn slice(&self, offset: u64, size: u64) -> BufferView {
-        let offset = offset.min(self.class);
-        let size = size.min(self.class - offset);
         BufferView { raw: self.raw.clone(), label: self.label, offset, size }
     }
 }

@@ -225,6 +225,14 @@ impl Gpu {
         u64::from(self.limits.min_storage_buffer_offset_alignment)
     }
 
+    /// Most rows of `row_bytes` in one binding, such that windows of so many rows begin at offsets that can be bound.
+    pub fn rows_per_window(&self, row_bytes: u64) -> u64 {
+        let row_bytes = row_bytes.max(1);
+        let alignment = self.offset_alignment();
+        let step = alignment / (1 << row_bytes.trailing_zeros().min(alignment.trailing_zeros()));
+        (self.max_binding_bytes / row_bytes / step * step).max(step)
+    }
+
     /// Workgroup memory of a shader, bytes: 16 or 32 KiB.
     pub fn workgroup_storage_bytes(&self) -> u32 {
         self.limits.max_compute_workgroup_storage_size
@@ -367,6 +375,27 @@ mod tests {
         let mut kinds = [DeviceKind::Software, DeviceKind::Other, DeviceKind::Integrated, DeviceKind::Discrete];
         kinds.sort();
         assert_eq!(kinds, [DeviceKind::Discrete, DeviceKind::Integrated, DeviceKind::Other, DeviceKind::Software]);
+    }
+
+    #[test]
+    #[allow(clippy::unwrap_used)] // a panic is a failed test
+    fn a_lost_device_is_reported_by_every_later_call() {
+        let gpu = match Gpu::open(&DeviceChoice::Gpu) {
+            Ok(gpu) => gpu,
+            Err(GpuError::NoSuchDevice { .. }) if std::env::var_os("CI").is_none() => return,
+            Err(error) => panic!("{error}"),
+        };
+        let mut recorder = gpu.begin("step 12");
+        let buffer = recorder.buffer_zeroed("zeros", 64).unwrap();
+        let readback = recorder.read_back("zeros", &buffer.view()).unwrap();
+        gpu.device.destroy();
+        let is_loss = |e: GpuError| matches!(e, GpuError::DeviceLost { .. });
+        let submitted = gpu.submit(recorder);
+        assert!(submitted.is_err() || readback.to_vec::<u32>(&gpu).is_err());
+        assert!(gpu.submit(gpu.begin("step 13")).is_err_and(is_loss));
+        assert!(
+            gpu.buffer("another", 64).is_ok_and(|b| b.size() == 64) || gpu.buffer("big", 1 << 20).is_err_and(is_loss)
+        );
     }
 
     #[test]

@@ -343,6 +343,9 @@ impl Recorder<'_> {
             if view.size < binding.min_size {
                 return problem(format!("{name} spans {} bytes, the shader needs {}", view.size, binding.min_size));
             }
+            if !view.is_inside() {
+                return problem(format!("{name} would span bytes beyond the end of {}", view.label));
+            }
             if binding.kind == BindingKind::Uniform {
                 continue;
             }
@@ -369,7 +372,9 @@ impl Recorder<'_> {
 
     /// Whether `size` bytes fit at the beginning of `view`, on multiples of 4.
     fn check_copy(&self, what: &str, view: &BufferView, size: u64) -> GpuResult<()> {
-        let problem = if size > view.size {
+        let problem = if !view.is_inside() {
+            format!("{what}: a range beyond the end of {}", view.label)
+        } else if size > view.size {
             format!("{what}: {size} bytes do not fit the {} of {}", view.size, view.label)
         } else if !view.offset.is_multiple_of(4) || !size.is_multiple_of(4) {
             format!("{what}: {size} bytes at {} of {} are not whole words", view.offset, view.label)
