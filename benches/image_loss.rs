@@ -1,13 +1,16 @@
 //! Time of the image loss with its gradient, per instruction path, on one thread and on all.
-//! `cargo bench --bench image_loss` prints the best of several runs in milliseconds and per megapixel; inside a test
-//! run (no `--bench`) it does one small picture and prints nothing, so that it cannot rot.
+//! `cargo bench --bench image_loss` prints the best of several runs in milliseconds and per megapixel, beside a plain copy
+//! of what must be read and written; inside a test run it does one small picture, so that it cannot rot.
+
+mod support;
 
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::kernels::image_loss::ImageLoss;
 use gsscale::render::{LossOptions, SsimPadding};
 use gsscale::scene::image::{Image, Target};
-use std::time::Instant;
+use support::floor::copy_rate;
+use support::{Args, Hash, least_time, machine};
 
 fn pictures(width: u32, height: u32) -> (Image, Target) {
     let mut draw = Stream::new(1, Purpose::Test, u64::from(width), u64::from(height));
@@ -17,33 +20,52 @@ fn pictures(width: u32, height: u32) -> (Image, Target) {
     (image, Target { width, height, rgb, mask: None })
 }
 
-fn best_ms(width: u32, height: u32, simd: SimdPath, runs: usize) -> f64 {
+/// Least wall and CPU milliseconds, and the bits of the loss.
+fn best_ms(width: u32, height: u32, simd: SimdPath, runs: usize) -> (f64, f64, u64) {
     let (image, target) = pictures(width, height);
     let options = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd };
     let (mut loss, mut v_rgb) = (ImageLoss::new(), Vec::new());
-    let mut best = f64::INFINITY;
-    for _ in 0..runs {
-        let start = Instant::now();
+    let mut bits = 0;
+    let least = least_time(runs, || {
         let value = loss.value_and_gradient(&image, &target, &options, &mut v_rgb);
         assert!(value.loss.is_finite());
-        best = best.min(start.elapsed().as_secs_f64() * 1e3);
+        bits = value.loss.to_bits();
+    });
+    (1e3 * least.wall, 1e3 * least.cpu, bits)
+}
+
+/// One small picture on every path; returns a hash of the losses.
+pub fn tiny() -> u64 {
+    let mut hash = Hash::default();
+    for path in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+        hash.add(best_ms(40, 30, path, 1).2);
     }
-    best
+    hash.0
 }
 
 fn main() {
-    if !std::env::args().any(|arg| arg == "--bench") {
-        best_ms(40, 30, SimdPath::best(), 1);
+    let args = Args::read();
+    if !args.real {
+        assert!(tiny() != 0);
         return;
     }
-    for threads in [1, std::thread::available_parallelism().map_or(1, usize::from)] {
+    println!("{}", machine(args.simd()));
+    let floor = copy_rate(1 << 24);
+    for threads in [1, rayon::current_num_threads()] {
         let Ok(pool) = rayon::ThreadPoolBuilder::new().num_threads(threads).build() else { return };
         for (width, height) in [(395, 297), (1600, 1064)] {
+            let mega = f64::from(width * height) / 1e6;
+            // Three floats and three bytes read, three floats written.
+            let floor_ms = 1e3 * mega * 1e6 * 27.0 / floor;
             for path in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
-                let ms = pool.install(|| best_ms(width, height, path, 30));
-                let mega = f64::from(width * height) / 1e6;
-                let name = path.name();
-                println!("{width}x{height} {threads} threads {name}: {ms:.2} ms, {:.1} ms/Mpixel", ms / mega);
+                let (wall, cpu, bits) = pool.install(|| best_ms(width, height, path, 30));
+                println!(
+                    "{width}x{height} {threads} threads {}: {wall:.2} ms wall, {cpu:.2} ms CPU ({:.1} a megapixel, {:.0} \
+                     times a copy's), loss {bits:016x}",
+                    path.name(),
+                    cpu / mega,
+                    cpu / floor_ms
+                );
             }
         }
     }

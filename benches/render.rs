@@ -1,67 +1,123 @@
 //! Speed of the CPU renderer beside its floor.
 //!
-//! `cargo bench --bench render` runs one tiny size, so that the program cannot rot;
-//! `cargo bench --bench render -- 10000 100000 1000000` measures those numbers of Gaussians (`--path avx2` picks the
-//! instruction path, `RAYON_NUM_THREADS` the threads).
+//! `cargo bench --bench render` measures the inner loop on each instruction path, then whole views of 10k, 100k and 1M
+//! Gaussians (other numbers choose other sizes, `--path avx2` the instruction path, `RAYON_NUM_THREADS` the threads).
+//! Inside a test run it renders one tiny view.
 //!
-//! Rates are per second of CPU time and thread where the system tells it (Linux), so that other programs on the
+//! Rates are per second of CPU time and thread where the system tells it, so that other programs on the
 //! machine disturb them little; else per second of wall time.
 //!
 //! The floor of blending is a bare loop over splats that stay in the first cache level: no lists, no early stops, no
 //! edges, all pixels of a tile. A ratio of 1 means that only blending takes time. `nominal` counts every pixel of the
 //! tiles that a row can reach, `evaluated` only the pixel rows that are blended.
+//!
+//! The inner loop is measured on tiles with 2,048 splats that reach every pixel and never saturate it.
 
-use gsscale::base::rng::{Purpose, Stream};
-use gsscale::base::simd::{Kernel, LANES, SimdPath, dispatch, fma};
-use gsscale::kernels::rasterize_fwd::exp2_bounded;
-use gsscale::kernels::splats::LOG2_ALPHA_MIN;
+mod support;
+
+use gsscale::base::simd::SimdPath;
+use gsscale::kernels::isect_emit::Isect;
+use gsscale::kernels::rasterize_fwd::{Lists, Raster, TILE_PIXELS, rasterize_fwd};
+use gsscale::kernels::splats::{Grid, Splat};
 use gsscale::kernels::stages::STAGES;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::{Gradients, RenderOptions};
-use gsscale::scene::camera::Camera;
-use gsscale::scene::columns::Columns;
-use rayon::prelude::*;
+use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
+use support::floor::bare_blend_rate;
+use support::{Args, Hash, Seconds, least_time, machine, terrain, time};
 
 fn main() {
-    let mut sizes = Vec::new();
-    let mut simd = SimdPath::best();
-    let mut args = std::env::args().skip(1);
-    while let Some(arg) = args.next() {
-        if let Ok(n) = arg.parse::<usize>() {
-            sizes.push(n);
-        } else if arg == "--path" {
-            simd = args.next().and_then(|name| SimdPath::from_name(&name)).unwrap_or(simd);
+    let args = Args::read();
+    if !args.real {
+        assert!(tiny() != 0);
+        return;
+    }
+    println!("{}", machine(args.simd()));
+    let threads = rayon::current_num_threads();
+    for path in SimdPath::ALL.into_iter().filter(|p| p.is_supported() && args.path.is_none_or(|only| only == *p)) {
+        for threads in if threads > 1 { vec![1, threads] } else { vec![1] } {
+            inner_loop(path, threads, 60);
         }
     }
-    let real = !sizes.is_empty();
-    if !real {
-        sizes.push(500);
-    }
-    let (width, height) = if real { (960, 540) } else { (64, 48) };
-    let floor = floor_rate(simd, if real { 400 } else { 1 });
-    println!("path {}, {} threads, {width}x{height}", simd.name(), rayon::current_num_threads());
-    println!("floor: {:.2} Gpixel-Gaussians/s a thread (bare blend loop)", floor / 1e9);
+    let (width, height) = (960, 540);
+    let floor = bare_blend_rate(args.simd(), 400);
+    println!("{width}x{height}; floor {:.2} Gpixel-Gaussians/s a thread (bare blend loop)", floor / 1e9);
+    let sizes = if args.sizes.is_empty() { vec![10_000, 100_000, 1_000_000] } else { args.sizes.clone() };
     for n in sizes {
-        measure(n, width, height, simd, floor, if real { Duration::from_secs(2) } else { Duration::ZERO });
+        measure(n, width, height, args.simd(), floor, Duration::from_secs(2));
     }
 }
 
-/// Wall and CPU seconds of one run.
-#[derive(Clone, Copy)]
-struct Seconds {
-    wall: f64,
-    cpu: f64,
+/// One tiny view and one small tile on every path; returns a hash of the pictures.
+pub fn tiny() -> u64 {
+    let mut hash = Hash::default();
+    for path in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+        inner_loop(path, 1, 1).iter().for_each(|x| hash.add(u64::from(x.to_bits())));
+    }
+    measure(300, 48, 40, SimdPath::best(), 1e9, Duration::ZERO);
+    hash.0
 }
 
-/// CPU seconds of all threads of this program so far.
-fn cpu_seconds() -> Option<f64> {
-    let tasks = std::fs::read_dir("/proc/self/task").ok()?;
-    let nanos = tasks.map(|task| {
-        let text = std::fs::read_to_string(task.ok()?.path().join("schedstat")).ok()?;
-        text.split_whitespace().next()?.parse::<u64>().ok()
-    });
-    Some(nanos.sum::<Option<u64>>()? as f64 * 1e-9)
+/// Splats in the list of a tile of the inner loop's scene.
+const INNER_SPLATS: usize = 2048;
+
+/// Prints the rate of the rasterizer's inner loop beside the bare loop's, both on `threads` threads; returns the
+/// picture of one tile.
+fn inner_loop(simd: SimdPath, threads: usize, repeats: usize) -> Vec<f32> {
+    let Ok(pool) = rayon::ThreadPoolBuilder::new().num_threads(threads).build() else { return Vec::new() };
+    pool.install(|| {
+        let bare = bare_blend_rate(simd, 5 * repeats);
+        // Eight tiles a thread, so that threads get the same share.
+        let grid = Grid::new(16 * 8 * threads as u32, 16);
+        let splats: Vec<Splat> = (0..INNER_SPLATS).map(|i| wide_splat(i, grid.width as f32)).collect();
+        let isect = |i: usize| Isect { rank: (i % INNER_SPLATS) as u32, rows: [0, 15], k: 0 };
+        let isects: Vec<AtomicU64> =
+            (0..grid.tiles() * INNER_SPLATS).map(|i| AtomicU64::new(isect(i).pack())).collect();
+        let tile_offsets: Vec<u64> = (0..=grid.tiles()).map(|tile| (tile * INNER_SPLATS) as u64).collect();
+        let lists = Lists {
+            grid,
+            splats: &splats,
+            isects: &isects,
+            tile_offsets: &tile_offsets,
+            max_alpha: 0.99,
+            background: [0.0; 3],
+            simd,
+        };
+        let mut raster = Raster::default();
+        let t = least_time(repeats, || rasterize_fwd(&lists, &mut raster));
+        let pairs = (grid.tiles() * INNER_SPLATS * TILE_PIXELS) as f64;
+        assert!(raster.evaluated.iter().sum::<u64>() as f64 == pairs, "some pixel stopped early or was not reached");
+        let rate = pairs / t.cpu;
+        println!(
+            "inner loop, {}, {threads} threads: {:.2} Gpixel-Gaussians/s a thread, {:.2} of the bare loop's {:.2}; \
+             all threads {:.2}",
+            simd.name(),
+            rate / 1e9,
+            rate / bare,
+            bare / 1e9,
+            threads as f64 * rate / 1e9
+        );
+        raster.rgb[..3 * TILE_PIXELS].to_vec()
+    })
+}
+
+/// A splat with an alpha of 1/240 to 1/230 at every pixel of a picture this wide: above 1/255, and 2,048 of them leave
+/// a transmittance of more than 1e-4.
+fn wide_splat(i: usize, width: f32) -> Splat {
+    let color = [0.25, 0.5, 0.1 + 0.8 * i as f32 / INNER_SPLATS as f32];
+    // Over the picture the exponent to base 2 falls by less than 0.05.
+    let fall = 0.01 / (width * width);
+    Splat {
+        mean: [0.5 * width + (i % 16) as f32, (i / 128) as f32],
+        a: -fall,
+        b: 0.5 * fall,
+        c: -fall,
+        log2_opacity: -7.85,
+        color,
+        reach: 1.0,
+        tiles: [0, 0, (width / 16.0) as u16, 1],
+    }
 }
 
 /// The least of at least three runs and `least` of time, by CPU.
@@ -70,18 +126,15 @@ fn seconds(least: Duration, mut work: impl FnMut()) -> Seconds {
     let mut best = Seconds { wall: f64::INFINITY, cpu: f64::INFINITY };
     let mut runs = 0;
     while runs < 3 || start.elapsed() < least {
-        let (begin, before) = (Instant::now(), cpu_seconds());
-        work();
-        let wall = begin.elapsed().as_secs_f64();
-        let cpu = cpu_seconds().zip(before).map_or(wall * rayon::current_num_threads() as f64, |(b, a)| b - a);
-        best = Seconds { wall: best.wall.min(wall), cpu: best.cpu.min(cpu) };
+        let t = time(&mut work);
+        best = Seconds { wall: best.wall.min(t.wall), cpu: best.cpu.min(t.cpu) };
         runs += 1;
     }
     best
 }
 
 fn measure(n: usize, width: u32, height: u32, simd: SimdPath, floor: f64, least: Duration) {
-    let (rows, camera) = scene(n, width, height);
+    let (rows, camera) = terrain(n, width, height);
     let options = RenderOptions { sh_degree: 3, simd, ..RenderOptions::default() };
     let mut renderer = CpuRenderer::new();
     let mut grads = Gradients::default();
@@ -118,6 +171,14 @@ fn measure(n: usize, width: u32, height: u32, simd: SimdPath, floor: f64, least:
     let sum = 1e3 * (forward.cpu + backward.cpu);
     let mib = renderer.scratch_bytes() as f64 / f64::from(1 << 20);
     println!("  together {sum:.2} ms CPU, scratch {mib:.1} MiB");
+    let blend = stages.iter().find(|(name, _)| *name == "rasterize_fwd").map_or(f64::NAN, |(_, seconds)| *seconds);
+    let rate = evaluated / blend / rayon::current_num_threads() as f64;
+    println!(
+        "  rasterize_fwd alone, by wall time: {:.2} G/s a thread evaluated ({:.2} of the floor), {:.2} nominal",
+        rate / 1e9,
+        rate / floor,
+        rate / 1e9 * nominal / evaluated
+    );
     print!("  least wall ms:");
     for (stage, seconds) in stages.iter().filter(|(_, s)| s.is_finite()) {
         print!(" {stage} {:.2}", 1e3 * seconds);
@@ -132,80 +193,5 @@ fn note_stages(renderer: &CpuRenderer, least: &mut [(&'static str, f64)]) {
         if seconds > 0.0 {
             least.1 = least.1.min(seconds);
         }
-    }
-}
-
-/// A rough terrain seen obliquely, covered by flat Gaussians whose size follows their spacing; most are half opaque.
-fn scene(n: usize, width: u32, height: u32) -> (Columns, Camera) {
-    let mut draws = Stream::new(1, Purpose::Test, n as u64, 0);
-    let mut c = Columns::zeros(n, 3);
-    let spacing = 4.0 / (n as f64).sqrt();
-    for row in 0..n {
-        let (x, y) = (draws.range(-2.0, 2.0), draws.range(-2.0, 2.0));
-        let z = 0.2 * (libm::sin(3.0 * x) + libm::cos(4.0 * y)) + draws.range(-0.15, 0.15);
-        c.means[3 * row..3 * row + 3].copy_from_slice(&[x as f32, y as f32, z as f32]);
-        for i in 0..4 {
-            c.quats[4 * row + i] = draws.normal() as f32;
-        }
-        for i in 0..3 {
-            c.scales[3 * row + i] = libm::log(spacing * libm::exp(0.6 * draws.normal()) * 0.8) as f32;
-        }
-        c.opacities[row] = draws.range(-2.0, 3.0) as f32;
-    }
-    c.sh0.iter_mut().chain(&mut c.sh_n).for_each(|x| *x = 0.2 * draws.normal() as f32);
-    // Looks down at 45 degrees from the side of negative y.
-    let h = std::f32::consts::FRAC_1_SQRT_2;
-    let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, -h, -h, 0.0], [0.0, h, -h, 3.0]];
-    let f = width as f32 * 0.9;
-    let (cx, cy) = (0.5 * width as f32, 0.5 * height as f32);
-    (c, Camera { viewmat, fx: f, fy: f, cx, cy, width, height, near_plane: 0.01, far_plane: 1e10 })
-}
-
-/// Pixel-Gaussians per CPU second of the bare loop.
-fn floor_rate(simd: SimdPath, repeats: usize) -> f64 {
-    let threads = rayon::current_num_threads();
-    let splats: Vec<[f32; 8]> = (0..512)
-        .map(|i| [(i % 16) as f32, (i / 32) as f32, -0.02, 0.01, -0.03, -6.0, 0.5, 0.25 + i as f32 * 1e-3])
-        .collect();
-    let t = seconds(Duration::ZERO, || {
-        let sums: Vec<f32> =
-            (0..threads).into_par_iter().map(|_| dispatch(simd, Bare { splats: &splats, repeats })).collect();
-        assert!(sums.iter().all(|s| s.is_finite()));
-    });
-    (threads * repeats * splats.len() * 256) as f64 / t.cpu
-}
-
-struct Bare<'a> {
-    splats: &'a [[f32; 8]],
-    repeats: usize,
-}
-
-impl Kernel for Bare<'_> {
-    type Out = f32;
-
-    #[inline(always)]
-    fn run<const FMA: bool>(self) -> f32 {
-        let mut sum = 0.0;
-        for _ in 0..self.repeats {
-            for row in 0..16 {
-                let (mut t, mut rgb) = ([1.0f32; LANES], [[0.0f32; LANES]; 3]);
-                for s in std::hint::black_box(self.splats) {
-                    let dy = row as f32 - s[1];
-                    let (bdy, cdy) = (s[3] * dy, fma::<FMA>(s[4] * dy, dy, s[5]));
-                    for lane in 0..LANES {
-                        let dx = lane as f32 - s[0];
-                        let e = fma::<FMA>(fma::<FMA>(s[2], dx, bdy), dx, cdy);
-                        let alpha = if e >= LOG2_ALPHA_MIN { exp2_bounded::<FMA>(e) } else { 0.0 };
-                        let w = alpha * t[lane];
-                        t[lane] -= w;
-                        rgb[0][lane] = fma::<FMA>(w, s[5], rgb[0][lane]);
-                        rgb[1][lane] = fma::<FMA>(w, s[6], rgb[1][lane]);
-                        rgb[2][lane] = fma::<FMA>(w, s[7], rgb[2][lane]);
-                    }
-                }
-                sum += rgb.iter().flatten().sum::<f32>();
-            }
-        }
-        sum
     }
 }

@@ -9,10 +9,10 @@
 #import "shared/sh.wgsl"
 
 @group(0) @binding(0) var<uniform> view: RowsUniforms;
-@group(0) @binding(1) var<storage, read> means: array<f32>;
-@group(0) @binding(2) var<storage, read_write> splats: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read> sh0: array<f32>;
+@group(0) @binding(1) var<storage, read_write> splats: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> sh0: array<f32>;
 #ifdef SH_DEGREE_1
+@group(0) @binding(3) var<storage, read> means: array<f32>;
 @group(0) @binding(4) var<storage, read> sh1: array<f32>;
 #ifdef SH_DEGREE_2
 @group(0) @binding(5) var<storage, read> sh2: array<f32>;

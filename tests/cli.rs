@@ -307,6 +307,96 @@ fn a_dry_run_writes_nothing_and_tells_the_memory() {
 }
 
 #[test]
+fn switches_may_stand_before_the_scene() {
+    let (folder, scene, _) = small();
+    let out = folder.path().join("out");
+    let output = train(&["--allow-missing", text(&scene), "--masks=false", "--out", text(&out), "--steps", "3", "-q"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let config = std::fs::read_to_string(out.join("config.toml")).unwrap();
+    assert!(config.contains("allow-missing = true") && config.contains("masks = false"), "{config}");
+}
+
+#[test]
+fn numbers_that_no_machine_can_hold_are_refused() {
+    let (folder, scene, _) = small();
+    for (flag, value) in [
+        ("--max-gaussians", "1000000000000"),
+        ("--threads", "4000000000"),
+        ("--init-points", "4000000000"),
+        ("--adam-eps", "1e-40"),
+    ] {
+        refuses(&folder, &scene, &[flag, value], &[flag, "out of range"]);
+    }
+}
+
+#[test]
+fn a_cap_beyond_memory_is_a_warning() {
+    let (folder, scene, _) = small();
+    // 3 TB with the optimizer's state; the city has 400 points and never gets there.
+    let said = trains(&folder, &scene, &["--max-gaussians", "4000000000"]);
+    let knows_memory = cfg!(target_os = "linux");
+    assert!(said.contains("--max-gaussians") || !knows_memory, "{said}");
+}
+
+#[test]
+fn a_view_masked_as_a_whole_counts_for_nothing() {
+    let (folder, scene, model) = small();
+    let masks = scene.join("masks");
+    std::fs::create_dir(&masks).unwrap();
+    // Views 0 and 8 of 12 are held out.
+    let black = image::GrayImage::new(96, 64);
+    black.save(masks.join(format!("{}.png", model.views[0].name))).unwrap();
+    trains(&folder, &scene, &[]);
+    let test = summary(&folder.path().join("out"))["test"].clone();
+    assert_eq!(test["views"], 1);
+    assert!(test["psnr"].as_f64().unwrap() < 50.0 && test["ssim"].as_f64().is_some(), "{test}");
+}
+
+#[test]
+fn a_held_out_photo_that_cannot_be_decoded_loses_no_run() {
+    let (folder, scene, model) = small();
+    // Header and end are whole, so it passes at load; the pixels between are not.
+    let path = scene.join("images").join(&model.views[0].name);
+    image::RgbImage::new(96, 64).save_with_format(&path, image::ImageFormat::Png).unwrap();
+    let mut bytes = std::fs::read(&path).unwrap();
+    bytes[45] ^= 0xff;
+    std::fs::write(&path, bytes).unwrap();
+    let out = folder.path().join("out");
+    let output = train(&[text(&scene), "--out", text(&out), "--steps", "12", "-q"]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(stderr(&output).contains(&model.views[0].name), "{}", stderr(&output));
+    assert!(out.join("point_cloud.ply").is_file());
+    assert_eq!(summary(&out)["steps"], 12);
+}
+
+#[test]
+fn overwriting_removes_what_an_earlier_run_saved() {
+    let (folder, scene, _) = small();
+    trains(&folder, &scene, &["--save-every", "5"]);
+    let saved = |name: &str| folder.path().join("out").join(name).exists();
+    assert!(saved("point_cloud_000005.ply") && saved("point_cloud_000010.ply"));
+    std::fs::write(folder.path().join("out/point_cloud_mine.ply"), "kept").unwrap();
+    trains(&folder, &scene, &[]);
+    assert!(!saved("point_cloud_000005.ply") && !saved("point_cloud_000010.ply"));
+    assert!(saved("point_cloud_mine.ply") && saved("point_cloud.ply"));
+}
+
+#[test]
+fn points_of_a_ply_that_are_dropped_are_counted() {
+    let (folder, scene, _) = small();
+    let ply = folder.path().join("start.ply");
+    let mut file = b"ply\nformat ascii 1.0\nelement vertex 200\nproperty float x\nproperty float y\n\
+        property float z\nend_header\n"
+        .to_vec();
+    for i in 0..200 {
+        file.extend(if i == 7 { "nan 0 0\n".to_string() } else { format!("{i} {} 0\n", i % 9) }.bytes());
+    }
+    std::fs::write(&ply, file).unwrap();
+    let said = trains(&folder, &scene, &["--init-ply", text(&ply)]);
+    assert!(said.contains("start.ply") && said.contains("1 points"), "{said}");
+}
+
+#[test]
 fn help_is_grouped_and_has_examples() {
     let output = train(&["--help"]);
     let said = String::from_utf8_lossy(&output.stdout).into_owned();

@@ -3,19 +3,23 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
 use gsscale::gpu::{SOURCES, Source, StructLayout, preprocess, validate, variants};
+use gsscale::kernels::uniforms::{LossUniforms, RowsUniforms};
 use gsscale::kernels::{constants, uniforms_tiles};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use wgpu::naga;
 
 /// Rust twins of the structs that shaders read as uniforms (and of others that are declared in both languages).
-const LAYOUTS: &[&[StructLayout]] = &[&[
-    uniforms_tiles::ScanUniforms::LAYOUT,
-    uniforms_tiles::SortUniforms::LAYOUT,
-    uniforms_tiles::IsectUniforms::LAYOUT,
-    uniforms_tiles::OffsetsUniforms::LAYOUT,
-    uniforms_tiles::RasterUniforms::LAYOUT,
-]];
+const LAYOUTS: &[&[StructLayout]] = &[
+    &[RowsUniforms::LAYOUT, LossUniforms::LAYOUT],
+    &[
+        uniforms_tiles::ScanUniforms::LAYOUT,
+        uniforms_tiles::SortUniforms::LAYOUT,
+        uniforms_tiles::IsectUniforms::LAYOUT,
+        uniforms_tiles::OffsetsUniforms::LAYOUT,
+        uniforms_tiles::RasterUniforms::LAYOUT,
+    ],
+];
 
 /// Entry points whose workgroups are not 256 invocations in one dimension: file, entry point, size, and why.
 const OTHER_WORKGROUPS: &[(&str, &str, [u32; 3], &str)] = &[

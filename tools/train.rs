@@ -1,12 +1,12 @@
 //! `gsscale-train`: trains a scene from photos to a PLY. Parses, calls the library, prints.
 
-use clap::Parser;
-use gsscale::base::error::InputError;
-use gsscale::config::file::{TrainConfig, TrainOverrides};
+use clap::{CommandFactory, FromArgMatches, Parser};
+use gsscale::base::error::{InputError, InputResult};
+use gsscale::config::file::{TrainConfig, TrainOverrides, help_with_defaults};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::train::run::{RunOutcome, RunRequest, run};
 use gsscale::train::trainer::TrainError;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 const EXAMPLES: &str = "\
@@ -50,7 +50,7 @@ struct Args {
 }
 
 fn main() -> ExitCode {
-    let args = Args::parse();
+    let args = parse();
     let quiet = args.quiet;
     match start(args) {
         Ok(outcome) => finish(&outcome, quiet),
@@ -61,6 +61,12 @@ fn main() -> ExitCode {
     }
 }
 
+/// The command line; clap prints help and usage errors itself.
+fn parse() -> Args {
+    let matches = help_with_defaults(Args::command()).get_matches();
+    Args::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
+}
+
 fn start(args: Args) -> Result<RunOutcome, TrainError> {
     let mut config = match (&args.config, args.demo) {
         (Some(path), _) => TrainConfig::read(path)?,
@@ -69,9 +75,11 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
     };
     args.keys.apply(&mut config);
     config.check()?;
-    let out = args.out.unwrap_or_else(|| PathBuf::from("runs/dry"));
+    let out = args.out.unwrap_or_default();
+    let mut scratch = None;
     let scene = match args.scene {
         Some(scene) => scene,
+        None if args.dry_run => make_city(&scratch.insert(Scratch::new()?).folder, &config, args.quiet)?,
         None => demo_scene(&out, &config, args.overwrite, args.quiet)?,
     };
     run(&RunRequest {
@@ -98,28 +106,52 @@ fn demo_config() -> TrainConfig {
     }
 }
 
-/// The generated city beside the results; one of an earlier demo is used again.
-fn demo_scene(
-    out: &std::path::Path,
-    config: &TrainConfig,
-    overwrite: bool,
-    quiet: bool,
-) -> Result<PathBuf, TrainError> {
+/// The generated city beside the results; that of an earlier demo with the same seed is used again.
+fn demo_scene(out: &Path, config: &TrainConfig, overwrite: bool, quiet: bool) -> Result<PathBuf, TrainError> {
     let scene = out.join("scene");
-    if out.join("summary.json").exists() && !overwrite {
+    // A demo that was stopped before its first step left its city and nothing else.
+    let is_foreign = |entry: std::fs::DirEntry| entry.file_name() != "scene";
+    let is_taken = std::fs::read_dir(out).is_ok_and(|entries| entries.flatten().any(is_foreign));
+    if !overwrite && (is_taken || out.is_file()) {
         return Err(
             InputError::new(out, "exists already", "choose another --out, or replace it with --overwrite").into()
         );
     }
-    if scene.join("sparse/0/points3D.bin").is_file() {
+    let same_seed = TrainConfig::read(&out.join("config.toml")).is_ok_and(|earlier| earlier.seed == config.seed);
+    if same_seed && scene.join("sparse/0/points3D.bin").is_file() {
         return Ok(scene);
     }
+    make_city(&scene, config, quiet)
+}
+
+fn make_city(scene: &Path, config: &TrainConfig, quiet: bool) -> Result<PathBuf, TrainError> {
     if !quiet {
         eprintln!("making a city in {}", scene.display());
     }
     let options = CityOptions { seed: config.seed, overwrite: true, ..CityOptions::default() };
-    write_city(&scene, &options, &|_, _| {})?;
-    Ok(scene)
+    write_city(scene, &options, &|_, _| {})?;
+    Ok(scene.to_path_buf())
+}
+
+/// A folder for what a dry run has to write to know what it would take; gone when the program ends.
+struct Scratch {
+    /// Inside the system's temporary folder.
+    folder: PathBuf,
+}
+
+impl Scratch {
+    fn new() -> InputResult<Self> {
+        let folder = std::env::temp_dir().join(format!("gsscale-dry-{}", std::process::id()));
+        std::fs::create_dir(&folder).map_err(|e| InputError::io(&folder, "making a scratch folder", &e))?;
+        Ok(Scratch { folder })
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        // What is left in the system's folder for such things is cleared by the system.
+        let _ = std::fs::remove_dir_all(&self.folder);
+    }
 }
 
 fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {

@@ -2,6 +2,7 @@
 // src/kernels/project_fwd.rs, which has the derivation: the determinant is a sum of squares (the 2x2 minors of the
 // projected axes), because c0 c2 - c1^2 cancels for needles.
 #import "shared/camera.wgsl"
+#import "shared/math.wgsl"
 
 /// A quaternion whose squared length is outside of this range has no usable direction: the row is culled.
 const QUAT_NORM_SQ_MIN: f32 = 1e-30;

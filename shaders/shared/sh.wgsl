@@ -1,5 +1,6 @@
 // The real spherical harmonics of bands 0 to 3, signs and order of src/kernels/sh_fwd.rs.
 // Degree 2 defines SH_DEGREE_1 and SH_DEGREE_2; a switch without those below it counts for nothing in the stages.
+#import "shared/math.wgsl"
 
 const SH_C0: f32 = 0.28209479;
 const SH_C1: f32 = 0.48860251;

@@ -86,6 +86,19 @@ pub fn fma<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
 }
 
+/// Asks for the cache line of `value`, which will be read soon; costs nothing but the request, and does nothing where
+/// there is no such instruction.
+#[inline(always)]
+pub fn prefetch<T>(value: &T) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: SSE is part of x86-64; the address comes from a reference, and a prefetch reads nothing anyway.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast()) };
+    }
+    let _ = value;
+}
+
 /// Runs `kernel` on `path`; a path that this machine lacks falls back to the baseline.
 #[inline]
 pub fn dispatch<K: Kernel>(path: SimdPath, kernel: K) -> K::Out {

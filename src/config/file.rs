@@ -9,6 +9,13 @@ use crate::base::units::parse_bytes;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
+/// Most steps of a run: the optimizer keeps 88 bytes for each.
+const STEPS_MAX: u32 = 10_000_000;
+/// Most random points to start from.
+const INIT_POINTS_MAX: u32 = 100_000_000;
+/// Most worker threads: each has a stack, and a slip of the finger must not fill the machine with them.
+const THREADS_MAX: u32 = 1024;
+
 macro_rules! config_keys {
     ($($heading:literal { $( $(#[doc = $doc:literal])+ $([$($arg:tt)+])? $name:ident: $ty:ty = $default:expr; )+ })+) => {
         /// All keys of a run with their values.
@@ -49,11 +56,11 @@ config_keys! {
         /// Hold out every photo whose index is greater than N; -1 = off. Takes the place of --test-every
         [allow_negative_numbers = true] test_after: i64 = -1;
         /// Use masks found in masks/ (white = keep)
-        [num_args = 0..=1, default_missing_value = "true"] masks: bool = true;
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] masks: bool = true;
         /// Masks mark what to leave out instead of what to keep
-        [num_args = 0..=1, default_missing_value = "true"] invert_masks: bool = false;
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] invert_masks: bool = false;
         /// Train without the photos that are registered but missing
-        [num_args = 0..=1, default_missing_value = "true"] allow_missing: bool = false;
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] allow_missing: bool = false;
         /// Memory for decoded photos
         image_cache: ByteSize = ByteSize(1 << 30);
         /// Near plane, relative to the size of the scene
@@ -73,7 +80,7 @@ config_keys! {
         /// Raise the band in use every N steps; 0 = all from the start
         sh_every: u32 = 1000;
         /// Weight of 1 - SSIM in the loss; L1 has the rest
-        ssim_lambda: f32 = 0.2;
+        ssim_lambda: f64 = 0.2;
         /// Pixels that the loss's SSIM covers: valid (windows inside the image) or same (zero padded)
         ssim_padding: String = "valid".into();
         /// Rate of positions, times the scene scale
@@ -93,11 +100,11 @@ config_keys! {
         /// Adam's epsilon
         adam_eps: f64 = 1e-15;
         /// Opacity of first Gaussians
-        init_opacity: f32 = 0.1;
+        init_opacity: f64 = 0.1;
         /// Size of first Gaussians, times the distance to their three nearest neighbours
-        init_scale: f32 = 1.0;
+        init_scale: f64 = 1.0;
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
-        max_alpha: f32 = 0.99;
+        max_alpha: f64 = 0.99;
         /// Background colour, RGB in 0..1
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]);
     }
@@ -115,13 +122,13 @@ config_keys! {
         /// Steps between opacity resets; 0 = never
         reset_every: u32 = 3000;
         /// Grow Gaussians whose mean screen-space gradient exceeds this
-        grow_grad2d: f32 = 2e-4;
+        grow_grad2d: f64 = 2e-4;
         /// Growing Gaussians up to this size (times the scene scale) are cloned, larger ones split
-        grow_scale3d: f32 = 0.01;
+        grow_scale3d: f64 = 0.01;
         /// Remove Gaussians with a lower opacity
-        prune_opa: f32 = 0.005;
+        prune_opa: f64 = 0.005;
         /// Remove Gaussians larger than this (times the scene scale), after the first reset
-        prune_scale3d: f32 = 0.1;
+        prune_scale3d: f64 = 0.1;
     }
     "Output" {
         /// Evaluate on the held-out photos every N steps; 0 = only at the end
@@ -174,12 +181,12 @@ impl<'de> Deserialize<'de> for ByteSize {
 
 /// A colour: three numbers in 0..1, in the file `[0.0, 0.0, 0.0]`, on the command line `0,0,0`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Rgb(pub [f32; 3]);
+pub struct Rgb(pub [f64; 3]);
 
 impl std::str::FromStr for Rgb {
     type Err = String;
     fn from_str(text: &str) -> Result<Self, String> {
-        let values: Result<Vec<f32>, _> = text.split(',').map(|v| v.trim().parse::<f32>()).collect();
+        let values: Result<Vec<f64>, _> = text.split(',').map(|v| v.trim().parse::<f64>()).collect();
         match values.as_deref() {
             Ok(&[r, g, b]) => Ok(Rgb([r, g, b])),
             _ => Err(format!("'{text}' is not a colour; write R,G,B with numbers in 0..1")),
@@ -207,11 +214,7 @@ impl TrainConfig {
     /// # Errors
     /// Names the first key that is out of range, with what is allowed.
     pub fn check(&self) -> InputResult<()> {
-        let refuse = |key: &str, allowed: &str| {
-            Err(InputError::new(format!("--{key}"), "the value is out of range", format!("use {allowed}")))
-        };
         let positive = |x: f64| x.is_finite() && x > 0.0;
-        let rate = |x: f64| x.is_finite() && (0.0..=1e6).contains(&x);
         if !positive(self.data_factor) || self.data_factor < 1.0 {
             return refuse("data-factor", "1 or more");
         }
@@ -221,35 +224,25 @@ impl TrainConfig {
         if self.sh_degree > 3 {
             return refuse("sh-degree", "0, 1, 2 or 3");
         }
-        if self.steps == 0 || self.steps > 100_000_000 {
-            return refuse("steps", "1 to 100,000,000");
+        if self.steps == 0 || self.steps > STEPS_MAX {
+            return refuse("steps", "1 to 10,000,000");
+        }
+        if self.max_gaussians >= u64::from(u32::MAX) {
+            return refuse("max-gaussians", "less than 4,294,967,295, or 0 for no cap");
+        }
+        if self.init_points > INIT_POINTS_MAX {
+            return refuse("init-points", "0 to 100,000,000");
+        }
+        if self.threads > THREADS_MAX {
+            return refuse("threads", "0 to 1024");
         }
         if !(0.0..=1.0).contains(&self.ssim_lambda) {
             return refuse("ssim-lambda", "0 to 1");
         }
-        let rates = [
-            ("means-lr", self.means_lr),
-            ("scales-lr", self.scales_lr),
-            ("quats-lr", self.quats_lr),
-            ("opacities-lr", self.opacities_lr),
-            ("sh0-lr", self.sh0_lr),
-            ("shn-lr", self.shn_lr),
-        ];
-        for (key, value) in rates {
-            if !rate(value) {
-                return refuse(key, "a number from 0 on");
-            }
-        }
-        if !positive(self.means_lr_final) || self.means_lr_final > 1.0 {
-            return refuse("means-lr-final", "a number above 0 and up to 1");
-        }
-        if !positive(self.adam_eps) {
-            return refuse("adam-eps", "a positive number");
-        }
         if !(self.init_opacity > 0.0 && self.init_opacity < 1.0) {
             return refuse("init-opacity", "a number between 0 and 1");
         }
-        if !positive(f64::from(self.init_scale)) {
+        if !positive(self.init_scale) {
             return refuse("init-scale", "a positive number");
         }
         if !(self.max_alpha > 0.5 && self.max_alpha < 1.0) {
@@ -278,7 +271,32 @@ impl TrainConfig {
         if self.prune_opa >= 0.5 {
             return refuse("prune-opa", "less than 0.5");
         }
+        self.check_rates()?;
         self.check_names()
+    }
+
+    fn check_rates(&self) -> InputResult<()> {
+        let rates = [
+            ("means-lr", self.means_lr),
+            ("scales-lr", self.scales_lr),
+            ("quats-lr", self.quats_lr),
+            ("opacities-lr", self.opacities_lr),
+            ("sh0-lr", self.sh0_lr),
+            ("shn-lr", self.shn_lr),
+        ];
+        for (key, value) in rates {
+            if !(0.0..=1e6).contains(&value) {
+                return refuse(key, "a number from 0 to 1e6");
+            }
+        }
+        if !(self.means_lr_final > 0.0 && self.means_lr_final <= 1.0) {
+            return refuse("means-lr-final", "a number above 0 and up to 1");
+        }
+        // It is used in f32, where it must not vanish: a root of 0 is divided by it.
+        if !(1e-30..=1.0).contains(&self.adam_eps) {
+            return refuse("adam-eps", "1e-30 to 1");
+        }
+        Ok(())
     }
 
     fn check_names(&self) -> InputResult<()> {
@@ -301,6 +319,29 @@ impl TrainConfig {
         }
         Ok(())
     }
+}
+
+/// The error about a key whose value is out of range.
+fn refuse(key: &str, allowed: &str) -> InputResult<()> {
+    Err(InputError::new(format!("--{key}"), "the value is out of range", format!("use {allowed}")))
+}
+
+/// The command with the default of each key in its help. (The flags have no clap defaults: an absent flag must leave
+/// the config file's value alone.)
+pub fn help_with_defaults(mut command: clap::Command) -> clap::Command {
+    let defaults = toml::Table::try_from(TrainConfig::default()).unwrap_or_default();
+    for (_, name, _) in KEYS {
+        let Some(value) = defaults.get(&name.replace('_', "-")) else { continue };
+        let value = value.as_str().map_or_else(|| value.to_string(), str::to_string);
+        if value.is_empty() {
+            continue;
+        }
+        command = command.mut_arg(name, |arg| {
+            let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
+            arg.help(format!("{help} [default: {value}]"))
+        });
+    }
+    command
 }
 
 /// The text of configs/default.toml: every key with its meaning and default.

@@ -25,6 +25,8 @@ pub struct RunOptions {
     pub sh_degree: u8,
     /// Steps between raises of the degree in use; 0 = all from the start.
     pub sh_every: u32,
+    /// Degree in use at step 0: 0, or what the Gaussians that a run starts from were trained with.
+    pub sh_degree_start: u8,
     /// Cap on Gaussians; 0 = none.
     pub max_gaussians: usize,
     /// Rendering, but for the degree in use.
@@ -61,15 +63,16 @@ impl RunOptions {
             seed: config.seed,
             sh_degree: config.sh_degree,
             sh_every: config.sh_every,
+            sh_degree_start: 0,
             max_gaussians: config.max_gaussians as usize,
             render: RenderOptions {
                 sh_degree: config.sh_degree,
-                max_alpha: config.max_alpha,
-                background: config.background.0,
+                max_alpha: config.max_alpha as f32,
+                background: config.background.0.map(|c| c as f32),
                 simd,
                 ..RenderOptions::default()
             },
-            loss: LossOptions { ssim_lambda: config.ssim_lambda, padding, simd },
+            loss: LossOptions { ssim_lambda: config.ssim_lambda as f32, padding, simd },
             rates: Rates {
                 means: config.means_lr * f64::from(scene_scale),
                 means_final_factor: config.means_lr_final,
@@ -94,17 +97,17 @@ impl RunOptions {
     /// Bands in use at 0-based `step`.
     pub fn sh_degree_at(&self, step: u32) -> u8 {
         let raised = step.checked_div(self.sh_every).unwrap_or(u32::MAX);
-        raised.min(u32::from(self.sh_degree)) as u8
+        raised.max(u32::from(self.sh_degree_start)).min(u32::from(self.sh_degree)) as u8
     }
 }
 
 fn densify(config: &TrainConfig) -> DensifyConfig {
     let never_if_zero = |n: u32| if n == 0 { u32::MAX } else { n };
     DensifyConfig {
-        grow_grad2d: config.grow_grad2d,
-        grow_scale3d: config.grow_scale3d,
-        prune_opa: config.prune_opa,
-        prune_scale3d: config.prune_scale3d,
+        grow_grad2d: config.grow_grad2d as f32,
+        grow_scale3d: config.grow_scale3d as f32,
+        prune_opa: config.prune_opa as f32,
+        prune_scale3d: config.prune_scale3d as f32,
         refine_start: config.refine_start,
         refine_stop: config.refine_stop,
         refine_every: config.refine_every,
@@ -145,8 +148,8 @@ pub fn load_options(config: &TrainConfig) -> LoadOptions {
 pub fn init_options(config: &TrainConfig) -> InitOptions {
     InitOptions {
         sh_degree: config.sh_degree,
-        opacity: config.init_opacity,
-        scale_factor: config.init_scale,
+        opacity: config.init_opacity as f32,
+        scale_factor: config.init_scale as f32,
         seed: config.seed,
         max_gaussians: (config.max_gaussians > 0).then_some(config.max_gaussians as usize),
         ..InitOptions::default()

@@ -48,13 +48,10 @@ pub fn read_header(path: &Path) -> InputResult<PhotoHeader> {
     if bytes == 0 {
         return Err(InputError::new(path, "the photo is empty (0 bytes)", COPY_AGAIN));
     }
-    // The shortest picture of either format is longer than its two signatures together.
-    if bytes < 16 {
-        return Err(InputError::new(path, format!("the photo is cut short ({bytes} bytes)"), COPY_AGAIN));
-    }
     let mut reader = HeaderReader { path, file: BufReader::with_capacity(4096, file), bytes };
     let mut magic = [0u8; 16];
-    reader.read(&mut magic, "its first bytes")?;
+    let have = bytes.min(16) as usize;
+    reader.read(&mut magic[..have], "its first bytes")?;
     if magic.starts_with(&[0xff, 0xd8]) {
         reader.jpeg()
     } else if magic.starts_with(b"\x89PNG\r\n\x1a\n") {
@@ -62,6 +59,10 @@ pub fn read_header(path: &Path) -> InputResult<PhotoHeader> {
     } else {
         let problem = match foreign_format(&magic) {
             Some(name) => format!("this is a {name} file; photos must be JPEG or PNG"),
+            // The shortest picture of either format is longer than this: what is there is the beginning of one.
+            None if bytes < 8 => {
+                return Err(InputError::new(path, format!("the photo is cut short ({bytes} bytes)"), COPY_AGAIN));
+            }
             None => "this is not a picture that can be read; photos must be JPEG or PNG".to_string(),
         };
         Err(InputError::new(path, problem, "convert the photo to JPEG or PNG under the name that the model uses")
@@ -311,7 +312,7 @@ mod tests {
     fn other_formats_are_refused_by_name() {
         let error = check(b"II\x2a\0\x08\0\0\0").unwrap_err();
         assert!(error.problem.contains("TIFF"), "{error}");
-        assert!(check(b"hello").unwrap_err().problem.contains("JPEG or PNG"));
+        assert!(check(b"hello, I am no picture").unwrap_err().problem.contains("JPEG or PNG"));
         assert!(check(b"").unwrap_err().problem.contains("empty"));
         let mut huge = encoded(image::ImageFormat::Png);
         huge[16..24].copy_from_slice(&[0x7f, 0xff, 0xff, 0xff, 0, 0, 0, 1]);

@@ -122,7 +122,8 @@ pub fn apply_round<V: RowsNow>(
         counts.pruned += edit.counts.pruned;
     }
     state.remove(&removed);
-    state.reserve_exact(edits.iter().map(|(_, edit)| edit.added.rows()).sum());
+    // Where this fails, appending fails too, with the allocator's own message.
+    let _ = state.try_reserve_exact(edits.iter().map(|(_, edit)| edit.added.rows()).sum());
     edits.iter().for_each(|(_, edit)| state.append(&edit.added));
     state.grad2d.fill(0.0);
     state.count.fill(0);

@@ -196,7 +196,7 @@ mod tests {
     fn classes_hold_their_sizes_and_waste_at_most_a_quarter() {
         for size in (1..5000).chain([1 << 20, (1 << 20) + 1, 123_456_789, (1 << 31) - 1]) {
             let class = size_class(size);
-            assert!(class >= size && class % 4 == 0, "{size} -> {class}");
+            assert!(class >= size && class.is_multiple_of(4), "{size} -> {class}");
             assert!(class <= CLASS_MIN || class * 4 <= size * 5 + 4, "{size} -> {class}");
             assert_eq!(size_class(class), class, "a class is its own class");
         }

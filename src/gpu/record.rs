@@ -410,7 +410,10 @@ impl Recorder<'_> {
         for pending in self.readbacks.drain(..) {
             pending.start();
         }
+        // Without a poll the loss of the device would go unnoticed: a submission to it is silently dropped.
+        let polled = gpu.device.poll(wgpu::PollType::Poll);
         gpu.faults.check()?;
+        polled.map_err(|e| GpuError::Validation { stage: self.name.into(), message: e.to_string() })?;
         lock(&gpu.profiler).collect(gpu, 4)?;
         Ok(Submission { index, name: self.name })
     }

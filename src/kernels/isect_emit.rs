@@ -1,28 +1,28 @@
-//! One intersection for each visible row and tile that it can reach.
+//! One intersection for each row and tile that it can reach.
 //!
 //! Invariants: 1. a row's tiles are enumerated column by column (tile x outer, tile y inner), and the k-th of them has
-//! emit index `offset[rank] + k`: per-row sums are folded in that order; 2. a tile, and a pixel row of a tile, is left
+//! emit index `first emit index of the row + k`: per-row sums are folded in that order; 2. a tile, and a pixel row of a tile, is left
 //! out only where every pixel's alpha is computed below 1/255, so leaving it out cannot change the image;
-//! 3. [`count`] and [`emit`] walk through the same enumeration, with the same bits on every
-//! path (nothing is contracted); 4. the result does not depend on the number of threads.
+//! 3. [`count`] and [`emit`] walk through the same enumeration as the counts of [`super::splats::pack`]; 4. the result
+//! does not depend on the number of threads.
 
 use super::constants::TILE;
 use super::radix_sort::chunk_len;
-use super::splats::{Grid, Splat};
-use crate::base::simd::{Kernel, SimdPath, dispatch};
+use super::splats::{Grid, Packed, Span, Splat, rows_in_column, tile_rows};
+use crate::base::simd::{Kernel, SimdPath, dispatch, prefetch};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-const RANKS_PER_CHUNK: usize = 2048;
+const ROWS_PER_CHUNK: usize = 2048;
 const CHUNKS_MAX: usize = 32;
 
-/// One intersection, packed in 64 bits: rank (32), first pixel row in the tile (4), last pixel row (4), k (24).
+/// One intersection, packed in 64 bits: row (32), first pixel row in the tile (4), last pixel row (4), k (24).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Isect {
-    /// The row's place in depth order.
-    pub rank: u32,
-    /// First and last pixel row of the tile, 0 to 15, that the row can reach.
-    pub rows: [u8; 2],
+    /// The Gaussian.
+    pub row: u32,
+    /// First and last pixel row of the tile, 0 to 15, that it can reach.
+    pub pixel_rows: [u8; 2],
     /// Its number among the row's intersections, below 2^24.
     pub k: u32,
 }
@@ -31,64 +31,67 @@ impl Isect {
     /// To 64 bits.
     #[inline(always)]
     pub fn pack(self) -> u64 {
-        u64::from(self.rank) | u64::from(self.rows[0]) << 32 | u64::from(self.rows[1]) << 36 | u64::from(self.k) << 40
+        let [first, last] = self.pixel_rows.map(u64::from);
+        u64::from(self.row) | first << 32 | last << 36 | u64::from(self.k) << 40
     }
 
     /// From 64 bits.
     #[inline(always)]
     pub fn unpack(bits: u64) -> Self {
-        Isect { rank: bits as u32, rows: [(bits >> 32) as u8 & 15, (bits >> 36) as u8 & 15], k: (bits >> 40) as u32 }
+        let pixel_rows = [(bits >> 32) as u8 & 15, (bits >> 36) as u8 & 15];
+        Isect { row: bits as u32, pixel_rows, k: (bits >> 40) as u32 }
     }
 }
 
-/// Calls `each(tile, [first row, last row])` for every tile that the splat can reach, in emit order.
+/// Calls `each(tile, pixel rows within the tile)` for every tile that a row can reach, in emit order.
 #[inline(always)]
-fn for_each_tile(splat: &Splat, grid: Grid, mut each: impl FnMut(usize, [u8; 2])) {
-    // Written so that NaN (an opacity of 0) has no tiles.
-    let possible = splat.reach > 0.0;
-    if !possible {
-        return;
-    }
-    let ellipse = splat.ellipse();
-    let [box_x0, box_y0, box_x1, box_y1] = splat.tiles.map(u32::from);
-    let last_pixel = grid.height as i32 - 1;
-    let side = TILE as i32;
-    for tx in box_x0..box_x1 {
-        let x0 = (tx * TILE) as f32 + 0.5;
-        let (first, last) = ellipse.rows_in(x0, x0 + (TILE - 1) as f32);
-        let first = first.max(box_y0 as i32 * side);
-        let last = last.min(box_y1 as i32 * side - 1).min(last_pixel);
-        if last < first {
-            continue;
+fn for_each_tile(splat: &Splat, span: &Span, grid: Grid, mut each: impl FnMut(usize, [u8; 2])) {
+    let mut column = |x: u16, rows: [u16; 2]| {
+        for y in tile_rows(rows) {
+            let top = (y * TILE) as i32;
+            let [first, last] = rows.map(|row| (i32::from(row) - top).clamp(0, TILE as i32 - 1) as u8);
+            each(y as usize * grid.tiles_x as usize + usize::from(x), [first, last]);
         }
-        for ty in first / side..=last / side {
-            let rows = [(first - ty * side).max(0) as u8, (last - ty * side).min(side - 1) as u8];
-            each(ty as usize * grid.tiles_x as usize + tx as usize, rows);
+    };
+    let [x0, _, x1, _] = span.tiles;
+    for (x, rows) in (x0..x1).zip(span.rows) {
+        column(x, rows);
+    }
+    if x1.saturating_sub(x0) > 2 {
+        let ellipse = splat.ellipse();
+        for x in x0 + 2..x1 {
+            column(x, rows_in_column(&ellipse, grid, span.tiles, x));
         }
     }
 }
 
-/// Counts intersections: `counts` by rank, `tile_counts` as `[chunks][tiles]` for [`super::isect_offsets`].
-pub fn count(splats: &[Splat], grid: Grid, simd: SimdPath, counts: &mut Vec<u32>, tile_counts: &mut Vec<u32>) {
+/// Rows come in order of depth, which is no order in memory: asks for a span some rows ahead.
+#[inline(always)]
+fn prefetch_ahead(spans: &[Span], order: &[u32], i: usize) {
+    if let Some(&row) = order.get(i + 24) {
+        prefetch(&spans[row as usize]);
+    }
+}
+
+/// Counts intersections as `[chunks][tiles]` for [`super::isect_offsets`]; chunks are parts of `order`, the drawn rows
+/// front to back.
+pub fn count(order: &[u32], packed: &Packed, grid: Grid, simd: SimdPath, tile_counts: &mut Vec<u32>) {
     let tiles = grid.tiles();
-    let len = chunk_len(splats.len(), RANKS_PER_CHUNK, CHUNKS_MAX);
-    counts.resize(splats.len(), 0);
+    let len = chunk_len(order.len(), ROWS_PER_CHUNK, CHUNKS_MAX);
     tile_counts.clear();
-    tile_counts.resize(splats.len().div_ceil(len) * tiles, 0);
+    tile_counts.resize(order.len().div_ceil(len) * tiles, 0);
     if tiles == 0 {
-        counts.fill(0);
         return;
     }
-    let chunks = splats.par_chunks(len).zip(counts.par_chunks_mut(len));
-    chunks.zip(tile_counts.par_chunks_mut(tiles)).for_each(|((splats, counts), tile_counts)| {
-        dispatch(simd, CountChunk { splats, grid, counts, tile_counts });
+    order.par_chunks(len).zip(tile_counts.par_chunks_mut(tiles)).for_each(|(order, tile_counts)| {
+        dispatch(simd, CountChunk { order, packed, grid, tile_counts });
     });
 }
 
 struct CountChunk<'a> {
-    splats: &'a [Splat],
+    order: &'a [u32],
+    packed: &'a Packed,
     grid: Grid,
-    counts: &'a mut [u32],
     tile_counts: &'a mut [u32],
 }
 
@@ -97,11 +100,11 @@ impl Kernel for CountChunk<'_> {
 
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        for (splat, count) in self.splats.iter().zip(self.counts) {
-            *count = 0;
-            for_each_tile(splat, self.grid, |tile, _| {
+        let Packed { splats, spans, .. } = self.packed;
+        for (i, &row) in self.order.iter().enumerate() {
+            prefetch_ahead(spans, self.order, i);
+            for_each_tile(&splats[row as usize], &spans[row as usize], self.grid, |tile, _| {
                 self.tile_counts[tile] += 1;
-                *count += 1;
             });
         }
     }
@@ -110,7 +113,8 @@ impl Kernel for CountChunk<'_> {
 /// Writes each intersection (as [`Isect::pack`]) to its place in its tile's list. `cursors` comes from
 /// [`super::isect_offsets`] and is used up; `isects` is resized to `total`.
 pub fn emit(
-    splats: &[Splat],
+    order: &[u32],
+    packed: &Packed,
     grid: Grid,
     simd: SimdPath,
     total: u64,
@@ -118,21 +122,21 @@ pub fn emit(
     isects: &mut Vec<AtomicU64>,
 ) {
     let tiles = grid.tiles();
-    let len = chunk_len(splats.len(), RANKS_PER_CHUNK, CHUNKS_MAX);
+    let len = chunk_len(order.len(), ROWS_PER_CHUNK, CHUNKS_MAX);
     isects.resize_with(total as usize, AtomicU64::default);
     if tiles == 0 {
         return;
     }
     let isects = &*isects;
-    splats.par_chunks(len).zip(cursors.par_chunks_mut(tiles)).enumerate().for_each(|(chunk, (splats, cursors))| {
-        dispatch(simd, EmitChunk { splats, grid, first_rank: (chunk * len) as u32, cursors, isects });
+    order.par_chunks(len).zip(cursors.par_chunks_mut(tiles)).for_each(|(order, cursors)| {
+        dispatch(simd, EmitChunk { order, packed, grid, cursors, isects });
     });
 }
 
 struct EmitChunk<'a> {
-    splats: &'a [Splat],
+    order: &'a [u32],
+    packed: &'a Packed,
     grid: Grid,
-    first_rank: u32,
     cursors: &'a mut [u64],
     isects: &'a [AtomicU64],
 }
@@ -142,11 +146,13 @@ impl Kernel for EmitChunk<'_> {
 
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        for (rank, splat) in (self.first_rank..).zip(self.splats) {
+        let Packed { splats, spans, .. } = self.packed;
+        for (i, &row) in self.order.iter().enumerate() {
+            prefetch_ahead(spans, self.order, i);
             let mut k = 0;
-            for_each_tile(splat, self.grid, |tile, rows| {
+            for_each_tile(&splats[row as usize], &spans[row as usize], self.grid, |tile, pixel_rows| {
                 let place = &mut self.cursors[tile];
-                self.isects[*place as usize].store(Isect { rank, rows, k }.pack(), Relaxed);
+                self.isects[*place as usize].store(Isect { row, pixel_rows, k }.pack(), Relaxed);
                 *place += 1;
                 k += 1;
             });
@@ -159,90 +165,95 @@ mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};
     use crate::kernels::isect_offsets::isect_offsets;
+    use crate::kernels::project_fwd::Projected;
     use crate::kernels::scan::scan;
     use crate::kernels::splats::LOG2_ALPHA_MIN;
 
-    fn random_splat(draws: &mut Stream, needles: bool, grid: Grid) -> Splat {
-        let angle = draws.range(0.0, std::f64::consts::PI);
-        let major = draws.range(0.0, if needles { 9.0 } else { 4.0 }).exp2();
-        let minor = if needles { 0.55 } else { draws.range(0.55, major.max(0.6)) };
-        let (s, c) = angle.sin_cos();
-        let (p, q) = (1.0 / (major * major), 1.0 / (minor * minor));
-        let conic = [p * c * c + q * s * s, (p - q) * s * c, p * s * s + q * c * c];
-        let sigma_x = (major * major * c * c + minor * minor * s * s).sqrt();
-        let sigma_y = (major * major * s * s + minor * minor * c * c).sqrt();
-        let projected = crate::kernels::project_fwd::Projected {
-            means2d: vec![[draws.range(-40.0, 140.0) as f32, draws.range(-40.0, 110.0) as f32]],
-            conics: vec![conic.map(|x| x as f32)],
-            depths: vec![1.0],
-            radii: vec![[(3.33 * sigma_x).ceil() as u32, (3.33 * sigma_y).ceil() as u32]],
-            opacities: vec![draws.range(0.001, 1.0) as f32],
-        };
-        let mut splats = Vec::new();
-        crate::kernels::splats::pack(&[0], &projected, &[[0.5; 3]], grid, &mut splats);
-        splats[0]
+    /// Footprints of all kinds, in no order of depth.
+    fn random_rows(n: usize, needles: bool, seed: u64, grid: Grid) -> (Packed, Projected) {
+        let mut draws = Stream::new(5, Purpose::Test, seed, u64::from(needles));
+        let mut p = Projected::default();
+        for _ in 0..n {
+            let major = draws.range(0.0, if needles { 9.0 } else { 4.0 }).exp2();
+            let minor = if needles { 0.55 } else { draws.range(0.55, major.max(0.6)) };
+            let (s, c) = draws.range(0.0, std::f64::consts::PI).sin_cos();
+            let (u, v) = (1.0 / (major * major), 1.0 / (minor * minor));
+            let conic = [u * c * c + v * s * s, (u - v) * s * c, u * s * s + v * c * c];
+            p.means2d.push([draws.range(-40.0, 140.0) as f32, draws.range(-40.0, 110.0) as f32]);
+            p.conics.push(conic.map(|x| x as f32));
+            p.radii.push([conic[2], conic[0]].map(|x| (3.33 * (x / (u * v)).sqrt()).ceil() as u32));
+            p.opacities.push(draws.range(0.001, 1.0) as f32);
+            p.depths.push(1.0);
+        }
+        let mut packed = Packed::default();
+        crate::kernels::splats::pack(&p, &vec![[0.5; 3]; n], grid, SimdPath::best(), &mut packed);
+        (packed, p)
     }
 
     /// Every pixel of the box whose exponent reaches the threshold must be in a tile and row that was emitted.
     #[test]
     fn no_contribution_is_left_out() {
         let grid = Grid::new(107, 75);
-        let mut draws = Stream::new(5, Purpose::Test, 0, 0);
-        let (mut emitted, mut boxed) = (0, 0);
-        for trial in 0..4000 {
-            let splat = random_splat(&mut draws, trial % 2 == 0, grid);
-            let mut reached = vec![[16u8, 0]; grid.tiles()];
-            for_each_tile(&splat, grid, |tile, rows| {
-                assert_eq!(reached[tile], [16, 0], "a tile comes once");
-                reached[tile] = rows;
-                emitted += 1;
-            });
-            let [x0, y0, x1, y1] = splat.tiles.map(|t| u32::from(t) * TILE);
-            boxed += (x1 - x0) / TILE * ((y1 - y0) / TILE);
-            for y in y0..y1.min(grid.height) {
-                for x in x0..x1.min(grid.width) {
-                    let (dx, dy) = (x as f32 + 0.5 - splat.mean[0], y as f32 + 0.5 - splat.mean[1]);
-                    let fused = (splat.a * dx)
-                        .mul_add(1.0, splat.b * dy)
-                        .mul_add(dx, (splat.c * dy).mul_add(dy, splat.log2_opacity));
-                    let plain = (splat.a * dx + splat.b * dy) * dx + (splat.c * dy * dy + splat.log2_opacity);
-                    if fused >= LOG2_ALPHA_MIN || plain >= LOG2_ALPHA_MIN {
-                        let rows = reached[(y / TILE * grid.tiles_x + x / TILE) as usize];
-                        let row = (y % TILE) as u8;
-                        assert!(rows[0] <= row && row <= rows[1], "trial {trial}: pixel {x},{y} lost: {splat:?}");
+        for needles in [false, true] {
+            let (packed, projected) = random_rows(2000, needles, 0, grid);
+            let (mut emitted, mut boxed) = (0, 0.0);
+            for row in 0..2000 {
+                let (splat, [rx, ry]) = (packed.splats[row], projected.radii[row].map(|r| r as f32));
+                let mut reached = vec![[16u8, 0]; grid.tiles()];
+                for_each_tile(&splat, &packed.spans[row], grid, |tile, rows| {
+                    assert_eq!(reached[tile], [16, 0], "a tile comes once");
+                    reached[tile] = rows;
+                    emitted += 1;
+                });
+                for y in 0..grid.height {
+                    for x in 0..grid.width {
+                        let (dx, dy) = (x as f32 + 0.5 - splat.mean[0], y as f32 + 0.5 - splat.mean[1]);
+                        if dx.abs() > rx || dy.abs() > ry {
+                            continue;
+                        }
+                        boxed += 1.0 / 256.0;
+                        let constant = (splat.c * dy).mul_add(dy, splat.log2_opacity);
+                        let fused = splat.a.mul_add(dx, splat.b * dy).mul_add(dx, constant);
+                        let plain = (splat.a * dx + splat.b * dy) * dx + (splat.c * dy * dy + splat.log2_opacity);
+                        if fused >= LOG2_ALPHA_MIN || plain >= LOG2_ALPHA_MIN {
+                            let rows = reached[(y / TILE * grid.tiles_x + x / TILE) as usize];
+                            let y_in = (y % TILE) as u8;
+                            assert!(rows[0] <= y_in && y_in <= rows[1], "row {row}: {x},{y} lost: {splat:?}");
+                        }
                     }
                 }
             }
+            assert!(!needles || f64::from(emitted) < boxed, "needles must leave out tiles: {emitted} of {boxed}");
         }
-        assert!(emitted < boxed, "the ellipse must leave out some tiles of the boxes");
     }
 
     #[test]
     fn lists_are_in_depth_order_and_k_counts_columns_first() {
         let grid = Grid::new(107, 75);
-        let mut draws = Stream::new(6, Purpose::Test, 0, 0);
-        // More than two chunks.
-        let splats: Vec<Splat> = (0..5000).map(|_| random_splat(&mut draws, false, grid)).collect();
-        let (mut counts, mut tile_counts, mut offsets) = (Vec::new(), Vec::new(), Vec::new());
+        // More than two chunks, in an order that is not that of the rows.
+        let (packed, _) = random_rows(5000, false, 1, grid);
+        let order: Vec<u32> = (0..5000).map(|i| i * 7 % 5000).collect();
+        let mut rank = vec![0; 5000];
+        order.iter().enumerate().for_each(|(i, &row)| rank[row as usize] = i);
+        let (mut tile_counts, mut offsets) = (Vec::new(), Vec::new());
         let (mut tile_offsets, mut cursors, mut isects) = (Vec::new(), Vec::new(), Vec::new());
-        count(&splats, grid, SimdPath::best(), &mut counts, &mut tile_counts);
-        let total = scan(&counts, &mut offsets);
+        count(&order, &packed, grid, SimdPath::best(), &mut tile_counts);
+        let total = scan(&packed.chunk_counts, &mut offsets);
         isect_offsets(&tile_counts, grid.tiles(), &mut tile_offsets, &mut cursors);
         assert_eq!(tile_offsets[grid.tiles()], total);
-        emit(&splats, grid, SimdPath::best(), total, &mut cursors, &mut isects);
-        let mut tiles_of = vec![Vec::new(); splats.len()];
+        emit(&order, &packed, grid, SimdPath::best(), total, &mut cursors, &mut isects);
+        let mut tiles_of = vec![Vec::new(); 5000];
         for tile in 0..grid.tiles() {
             let list = &isects[tile_offsets[tile] as usize..tile_offsets[tile + 1] as usize];
             let list: Vec<Isect> = list.iter().map(|bits| Isect::unpack(bits.load(Relaxed))).collect();
-            assert!(list.windows(2).all(|w| w[0].rank < w[1].rank));
+            assert!(list.windows(2).all(|w| rank[w[0].row as usize] < rank[w[1].row as usize]));
             for isect in list {
-                let (x, y) = grid.position(tile);
-                tiles_of[isect.rank as usize].push((isect.k, (x, y)));
+                tiles_of[isect.row as usize].push((isect.k, grid.position(tile)));
             }
         }
-        for (rank, mut tiles) in tiles_of.into_iter().enumerate() {
+        for (row, mut tiles) in tiles_of.into_iter().enumerate() {
             tiles.sort_unstable();
-            assert_eq!(tiles.len(), counts[rank] as usize);
+            assert_eq!(tiles.len(), packed.counts[row] as usize);
             assert!(tiles.iter().enumerate().all(|(i, t)| t.0 as usize == i));
             assert!(tiles.windows(2).all(|w| w[0].1 < w[1].1), "columns first");
         }

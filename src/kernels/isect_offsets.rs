@@ -3,7 +3,8 @@
 //! Invariant: within a tile, intersections stand in depth order, because the chunks of the counting sort are cut in
 //! depth order and each writes in it.
 
-/// `tile_counts` is `[chunks][tiles]`: how many intersections each chunk of ranks has in each tile. On return,
+/// `tile_counts` is `[chunks][tiles]`: how many intersections each chunk of the drawn rows has in
+/// each tile. On return,
 /// `tile_offsets` (tiles + 1 entries, the last is the total) says where each tile's list begins, and `cursors`
 /// (`[chunks][tiles]`) where each chunk's part of it begins.
 pub fn isect_offsets(tile_counts: &[u32], tiles: usize, tile_offsets: &mut Vec<u64>, cursors: &mut Vec<u64>) {

@@ -10,9 +10,9 @@
 
 use super::constants::TILE;
 use super::project_fwd::Projected;
-use super::rasterize_fwd::{Lanes, Lists, NEVER, Raster, TILE_PIXELS, exp2_bounded, log2_max_alpha};
-use super::splats::LOG2_ALPHA_MIN;
-use super::tile_block::{Block, ROWS};
+use super::rasterize_fwd::{Lanes, Lists, Raster, TILE_PIXELS, copy_lanes, exp2_bounded, log2_max_alpha};
+use super::splats::{LOG2_ALPHA_MIN, ROWS_PER_CHUNK};
+use super::tile_block::{Block, ROWS, prefetch_splats};
 use crate::base::simd::{Kernel, LANES, dispatch, fma};
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -72,6 +72,7 @@ struct Tile {
     row_stop: [u32; ROWS],
     block: Block<BLOCK>,
     sums: [Sums; BLOCK],
+    halves: [Halves; BLOCK],
 }
 
 thread_local! {
@@ -81,6 +82,7 @@ thread_local! {
         row_stop: [0; ROWS],
         block: Block::new(),
         sums: [Sums::default(); BLOCK],
+        halves: [Halves::default(); BLOCK],
     }));
 }
 
@@ -100,7 +102,7 @@ impl Tile {
         for (row, out) in self.rows[..rows].iter_mut().enumerate() {
             let from = (ty as usize * ROWS + row) * grid.width as usize + tx as usize * LANES;
             for c in 0..3 {
-                out.v_rgb[c][..columns].copy_from_slice(&upstream.v_rgb[c * pixels + from..][..columns]);
+                copy_lanes(&mut out.v_rgb[c][..columns], &upstream.v_rgb[c * pixels + from..]);
             }
             let within = tile * TILE_PIXELS + row * LANES;
             let v_alpha = upstream.v_alpha.map(|v| &v[from..from + columns]);
@@ -121,7 +123,7 @@ impl Tile {
 
 struct BackTile<'a> {
     lists: &'a Lists<'a>,
-    offsets: &'a [u64],
+    chunk_offsets: &'a [u64],
     tile: usize,
     cap: f32,
     state: &'a mut Tile,
@@ -133,29 +135,59 @@ impl Kernel for BackTile<'_> {
 
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        let BackTile { lists, offsets, tile, cap, state, partials } = self;
-        let Tile { rows, row_stop, block, sums } = state;
+        let BackTile { lists, chunk_offsets, tile, cap, state, partials } = self;
+        let Tile { rows, row_stop, block, sums, halves } = state;
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
         let x: Lanes = std::array::from_fn(|lane| x0 + lane as f32);
-        for (number, list) in lists.tile(tile).chunks(BLOCK).enumerate().rev() {
-            block.fill::<FMA>(list, lists.splats, y0, cap);
-            *sums = [Sums::default(); BLOCK];
+        let last_stop = row_stop.iter().fold(0, |m, s| m.max(*s));
+        let all = lists.tile(tile);
+        for (number, list) in all.chunks(BLOCK).enumerate().rev() {
             let first = (number * BLOCK) as u32;
-            for (y, row) in rows.iter_mut().enumerate() {
-                if first < row_stop[y] {
-                    back_row::<FMA>(row, y, first, block, &x, cap, sums);
-                }
+            if first >= last_stop {
+                continue;
             }
-            for (local, sums) in block.locals[..list.len()].iter().zip(sums.iter()) {
-                let out = &partials[(offsets[local.rank as usize] + u64::from(local.k)) as usize];
-                let dx = std::array::from_fn(|lane| x[lane] - local.mean_x);
-                for (out, sum) in out.iter().zip(sums.reduce(&dx)) {
+            block.fill::<FMA>(list, lists.splats, y0, cap);
+            prefetch_splats(&all[number.saturating_sub(1) * BLOCK..number * BLOCK], lists.splats);
+            let mut touched = 0;
+            for (reach, &stop) in block.reach.iter_mut().zip(row_stop.iter()) {
+                // Splats at or behind the row's last stop take no part.
+                let before = stop.saturating_sub(first);
+                *reach &= if before < BLOCK as u32 { (1u64 << before) - 1 } else { u64::MAX };
+                touched |= *reach;
+            }
+            for i in bits(touched) {
+                sums[i] = Sums::default();
+            }
+            for (y, row) in rows.iter_mut().enumerate() {
+                back_row::<FMA>(row, y, first, block, &x, cap, sums);
+            }
+            for i in bits(touched) {
+                halves[i] = sums[i].halves(&x, block.locals[i].mean_x);
+            }
+            for i in bits(touched) {
+                let local = &block.locals[i];
+                let chunk = local.row as usize / ROWS_PER_CHUNK;
+                let out = &partials[(chunk_offsets[chunk] + local.emit) as usize];
+                for (out, half) in out.iter().zip(&halves[i].0) {
+                    let four: [f32; 4] = std::array::from_fn(|lane| half[lane] + half[lane + 4]);
+                    let sum = (four[0] + four[2]) + (four[1] + four[3]);
                     out.store(sum.to_bits(), Relaxed);
                 }
             }
         }
     }
+}
+
+/// Numbers of the bits that are set, upwards.
+#[inline(always)]
+fn bits(mut set: u64) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let i = set.trailing_zeros() as usize % BLOCK;
+        let some = set != 0;
+        set &= set.wrapping_sub(1);
+        some.then_some(i)
+    })
 }
 
 /// Sums of one splat in one tile, by lane.
@@ -168,20 +200,29 @@ struct Sums {
     rgb: [Lanes; 3],
 }
 
+/// The nine sums with lanes i and i + 8 added.
+#[derive(Clone, Copy, Default)]
+#[repr(C, align(64))]
+struct Halves([[f32; 8]; SUMS]);
+
 impl Sums {
-    /// The nine sums over lanes; dx is constant in a lane, so its moments are formed here.
-    /// Halves upon halves, the same order on every path.
+    /// First step of the sum over lanes (halves upon halves, the same order on every path). dx is constant in a lane,
+    /// so its moments are formed here.
     #[inline(always)]
-    fn reduce(&self, dx: &Lanes) -> [f32; SUMS] {
-        let times_dx = |v: &Lanes| -> Lanes { std::array::from_fn(|lane| v[lane] * dx[lane]) };
-        let hx = times_dx(&self.h);
-        let [red, green, blue] = self.rgb;
-        let all = [self.h, hx, self.hy, times_dx(&hx), times_dx(&self.hy), self.hyy, red, green, blue];
-        all.map(|v| {
-            let eight: [f32; 8] = std::array::from_fn(|i| v[i] + v[i + 8]);
-            let four: [f32; 4] = std::array::from_fn(|i| eight[i] + eight[i + 4]);
-            (four[0] + four[2]) + (four[1] + four[3])
-        })
+    fn halves(&self, x: &Lanes, mean_x: f32) -> Halves {
+        let mut out = Halves::default();
+        for i in 0..8 {
+            let [left, right] = [i, i + 8].map(|lane| {
+                let (dx, h, hy) = (x[lane] - mean_x, self.h[lane], self.hy[lane]);
+                let hx = h * dx;
+                let [red, green, blue] = [self.rgb[0][lane], self.rgb[1][lane], self.rgb[2][lane]];
+                [h, hx, hy, hx * dx, hy * dx, self.hyy[lane], red, green, blue]
+            });
+            for s in 0..SUMS {
+                out.0[s][i] = left[s] + right[s];
+            }
+        }
+        out
     }
 }
 
@@ -233,74 +274,73 @@ fn back_row<const FMA: bool>(
     (row.t, row.behind) = (t, behind);
 }
 
-/// Writes the sums of every intersection to its emit index (`offsets[rank] + k`) in `partials`, which is resized.
+/// Writes the sums of every intersection to its emit index in `partials`, which is resized. `chunk_offsets` are the
+/// emit indices at which chunks of [`ROWS_PER_CHUNK`] rows begin.
 pub fn rasterize_bwd(
     lists: &Lists<'_>,
-    offsets: &[u64],
+    chunk_offsets: &[u64],
     raster: &Raster,
     upstream: &Upstream<'_>,
     partials: &mut Vec<Partial>,
 ) {
     let cap = log2_max_alpha(lists.max_alpha, lists.simd);
     partials.resize_with(lists.isects.len(), Partial::default);
+    // Zeros for all, in order of memory: cheaper than writing them one by one where a splat takes no part.
+    partials.par_chunks_mut(16_384).for_each(|partials| {
+        partials.iter_mut().flatten().for_each(|sum| *sum.get_mut() = 0);
+    });
     let partials = &partials[..];
     (0..lists.grid.tiles()).into_par_iter().for_each(|tile| {
         SCRATCH.with_borrow_mut(|state| {
             state.load(lists, raster, upstream, tile);
-            dispatch(lists.simd, BackTile { lists, offsets, tile, cap, state, partials });
+            dispatch(lists.simd, BackTile { lists, chunk_offsets, tile, cap, state, partials });
         });
     });
 }
 
-/// Folds the sums of each row over its intersections and turns them into gradients. `order` are the rows by rank.
+/// Folds the sums of each row over its intersections and turns them into gradients. `counts` says how many
+/// intersections a row has.
 pub fn fold_rows(
-    order: &[u32],
-    offsets: &[u64],
+    counts: &[u32],
+    chunk_offsets: &[u64],
     partials: &[Partial],
     projected: &Projected,
-    rank_from_row: &mut Vec<u32>,
     out: &mut FootprintGradients,
 ) {
-    let rows = projected.radii.len();
-    rank_from_row.clear();
-    rank_from_row.resize(rows, NEVER);
-    for (rank, &row) in order.iter().enumerate() {
-        rank_from_row[row as usize] = rank as u32;
-    }
+    let rows = projected.rows();
     out.v_means2d.resize(rows, [0.0; 2]);
     out.v_conics.resize(rows, [0.0; 3]);
     out.v_colors.resize(rows, [0.0; 3]);
     out.v_opacities.resize(rows, 0.0);
-    out.v_means2d
-        .par_iter_mut()
-        .with_min_len(1024)
-        .zip(&mut out.v_conics)
-        .zip(&mut out.v_colors)
-        .zip(&mut out.v_opacities)
-        .enumerate()
-        .for_each(|(row, (((v_mean, v_conic), v_color), v_opacity))| {
+    let geometry = (out.v_means2d.par_chunks_mut(ROWS_PER_CHUNK), out.v_conics.par_chunks_mut(ROWS_PER_CHUNK));
+    let looks = (out.v_colors.par_chunks_mut(ROWS_PER_CHUNK), out.v_opacities.par_chunks_mut(ROWS_PER_CHUNK));
+    let chunks = geometry.into_par_iter().zip(looks.into_par_iter()).enumerate();
+    chunks.for_each(|(chunk, ((v_means2d, v_conics), (v_colors, v_opacities)))| {
+        let mut first = chunk_offsets[chunk] as usize;
+        for i in 0..v_means2d.len() {
+            let row = chunk * ROWS_PER_CHUNK + i;
+            let last = first + counts[row] as usize;
             let mut sums = [0.0f32; SUMS];
-            let rank = rank_from_row[row];
-            if rank != NEVER {
-                let (first, last) = (offsets[rank as usize] as usize, offsets[rank as usize + 1] as usize);
-                for partial in &partials[first..last] {
-                    for (sum, part) in sums.iter_mut().zip(partial) {
-                        *sum += f32::from_bits(part.load(Relaxed));
-                    }
+            for partial in &partials[first..last] {
+                for (sum, part) in sums.iter_mut().zip(partial) {
+                    *sum += f32::from_bits(part.load(Relaxed));
                 }
             }
             let [h, hx, hy, hxx, hxy, hyy, red, green, blue] = sums;
-            *v_color = [red, green, blue];
-            if rank == NEVER {
-                (*v_mean, *v_conic, *v_opacity) = ([0.0; 2], [0.0; 3], 0.0);
-                return;
+            v_colors[i] = [red, green, blue];
+            if first == last {
+                // The footprint of a culled row is not to be read.
+                (v_means2d[i], v_conics[i], v_opacities[i]) = ([0.0; 2], [0.0; 3], 0.0);
+                continue;
             }
             // dL/dsigma = -h; sigma = (A dx^2 + C dy^2) / 2 + B dx dy with dx = pixel - mean.
             let [a, b, c] = projected.conics[row];
-            *v_mean = [a * hx + b * hy, b * hx + c * hy];
-            *v_conic = [-0.5 * hxx, -hxy, -0.5 * hyy];
-            *v_opacity = h / projected.opacities[row];
-        });
+            v_means2d[i] = [a * hx + b * hy, b * hx + c * hy];
+            v_conics[i] = [-0.5 * hxx, -hxy, -0.5 * hyy];
+            v_opacities[i] = h / projected.opacities[row];
+            first = last;
+        }
+    });
 }
 
 #[cfg(test)]
@@ -311,7 +351,7 @@ mod tests {
     use crate::kernels::isect_emit::Isect;
     use crate::kernels::rasterize_fwd::{rasterize_fwd, tests::scene};
 
-    fn sums(lists: &Lists<'_>, offsets: &[u64]) -> Vec<f32> {
+    fn sums(lists: &Lists<'_>, chunk_offsets: &[u64]) -> Vec<f32> {
         let pixels = (lists.grid.width * lists.grid.height) as usize;
         let mut draws = Stream::new(22, Purpose::Test, 0, 0);
         let v_rgb: Vec<f32> = (0..3 * pixels).map(|_| draws.normal() as f32).collect();
@@ -320,7 +360,7 @@ mod tests {
         rasterize_fwd(lists, &mut raster);
         let mut partials = Vec::new();
         let upstream = Upstream { v_rgb: &v_rgb, v_alpha: Some(&v_alpha) };
-        rasterize_bwd(lists, offsets, &raster, &upstream, &mut partials);
+        rasterize_bwd(lists, chunk_offsets, &raster, &upstream, &mut partials);
         partials.iter().flatten().map(|x| f32::from_bits(x.load(Relaxed))).collect()
     }
 
@@ -329,13 +369,13 @@ mod tests {
         for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
             for (n, needles) in [(60, false), (2000, false), (300, true)] {
                 let mut scene = scene(n, needles);
-                let fast = sums(&scene.lists(simd), &scene.offsets);
+                let fast = sums(&scene.lists(simd), &scene.chunk_offsets);
                 for bits in &mut scene.isects {
                     let isect = Isect::unpack(bits.load(Relaxed));
-                    *bits.get_mut() = Isect { rows: [0, 15], ..isect }.pack();
+                    *bits.get_mut() = Isect { pixel_rows: [0, 15], ..isect }.pack();
                 }
                 // == and not bits: a sum of nothing is 0.0, a sum of zeros may be -0.0.
-                assert!(fast == sums(&scene.lists(simd), &scene.offsets), "{simd:?} {n}");
+                assert!(fast == sums(&scene.lists(simd), &scene.chunk_offsets), "{simd:?} {n}");
                 assert!(fast.iter().any(|x| *x != 0.0) && fast.iter().all(|x| x.is_finite()));
             }
         }

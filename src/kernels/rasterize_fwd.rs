@@ -14,7 +14,7 @@
 
 use super::constants::{TILE, TRANSMITTANCE_MIN};
 use super::splats::{Grid, LOG2_ALPHA_MIN, Splat};
-use super::tile_block::{Block, ROWS};
+use super::tile_block::{Block, ROWS, prefetch_splats};
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch, fma};
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -32,7 +32,7 @@ pub const NEVER: u32 = u32::MAX;
 pub struct Lists<'a> {
     /// The tiles.
     pub grid: Grid,
-    /// Footprints by rank.
+    /// Splats by row.
     pub splats: &'a [Splat],
     /// Packed [`super::isect_emit::Isect`]s, tile by tile.
     pub isects: &'a [AtomicU64],
@@ -220,8 +220,11 @@ impl Kernel for BlendTile<'_> {
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
         let mut rows_done = 0u64;
-        for (number, list) in lists.tile(tile).chunks(BLOCK).enumerate() {
+        let all = lists.tile(tile);
+        for (number, list) in all.chunks(BLOCK).enumerate() {
             block.fill::<FMA>(list, lists.splats, y0, cap);
+            let next = all.len().min((number + 1) * BLOCK)..all.len().min((number + 2) * BLOCK);
+            prefetch_splats(&all[next], lists.splats);
             let mut alive = false;
             for (y, row) in rows.iter_mut().enumerate() {
                 if row.alive {
@@ -299,6 +302,16 @@ pub fn rasterize_fwd(lists: &Lists<'_>, out: &mut Raster) {
         });
 }
 
+/// Copies up to a tile's row of values; whole rows without a library call each.
+#[inline(always)]
+pub(super) fn copy_lanes(out: &mut [f32], from: &[f32]) {
+    let n = out.len();
+    match (<&mut Lanes>::try_from(&mut *out), from.first_chunk::<LANES>()) {
+        (Ok(out), Some(from)) => *out = *from,
+        _ => out.copy_from_slice(&from[..n]),
+    }
+}
+
 /// Copies tiles to a planar image (`[3][height][width]`) and its alpha plane (1 - T).
 pub fn untile(grid: Grid, raster: &Raster, rgb: &mut [f32], alpha: &mut [f32]) {
     let (width, pixels) = (grid.width as usize, grid.width as usize * grid.height as usize);
@@ -315,9 +328,9 @@ pub fn untile(grid: Grid, raster: &Raster, rgb: &mut [f32], alpha: &mut [f32]) {
             let n = LANES.min(width - x);
             let within = y % ROWS * LANES;
             let colors = &raster.rgb[tile * 3 * TILE_PIXELS..][..3 * TILE_PIXELS];
-            r[x..x + n].copy_from_slice(&colors[within..within + n]);
-            g[x..x + n].copy_from_slice(&colors[TILE_PIXELS + within..][..n]);
-            b[x..x + n].copy_from_slice(&colors[2 * TILE_PIXELS + within..][..n]);
+            copy_lanes(&mut r[x..x + n], &colors[within..]);
+            copy_lanes(&mut g[x..x + n], &colors[TILE_PIXELS + within..]);
+            copy_lanes(&mut b[x..x + n], &colors[2 * TILE_PIXELS + within..]);
             let t = &raster.t_final[tile * TILE_PIXELS + within..][..n];
             for (a, t) in alpha[x..x + n].iter_mut().zip(t) {
                 *a = 1.0 - t;
@@ -335,13 +348,14 @@ pub(in crate::kernels) mod tests {
     use crate::kernels::isect_offsets::isect_offsets;
     use crate::kernels::project_fwd::Projected;
     use crate::kernels::scan::scan;
-    use crate::kernels::splats::pack;
+    use crate::kernels::splats::{Packed, pack};
 
-    /// Footprints of all kinds, by rank, and their intersections.
+    /// Footprints of all kinds, depths in the order of rows, and their intersections.
     pub(in crate::kernels) struct Scene {
         pub grid: Grid,
-        pub splats: Vec<Splat>,
-        pub offsets: Vec<u64>,
+        pub radii: Vec<[u32; 2]>,
+        pub packed: Packed,
+        pub chunk_offsets: Vec<u64>,
         pub tile_offsets: Vec<u64>,
         pub isects: Vec<AtomicU64>,
     }
@@ -359,28 +373,29 @@ pub(in crate::kernels) mod tests {
             let conic = [u * cos * cos + v * sin * sin, (u - v) * sin * cos, u * sin * sin + v * cos * cos];
             p.means2d.push([draws.range(-20.0, 90.0) as f32, draws.range(-20.0, 60.0) as f32]);
             p.conics.push(conic.map(|x| x as f32));
-            let det = u * v;
-            p.radii.push([conic[2] / det, conic[0] / det].map(|var| (3.33 * var.sqrt()).ceil() as u32));
+            p.radii.push([conic[2], conic[0]].map(|x| (3.33 * (x / (u * v)).sqrt()).ceil() as u32));
             // A third of them can reach the clamp.
             p.opacities.push((draws.range(0.0, 1.5) as f32).min(1.0));
+            p.depths.push(1.0);
             colors.push([0; 3].map(|_| draws.range(0.0, 1.5) as f32));
         }
         let order: Vec<u32> = (0..n as u32).collect();
-        let mut s = Scene { grid, splats: vec![], offsets: vec![], tile_offsets: vec![], isects: vec![] };
-        let (mut counts, mut tile_counts, mut cursors) = (vec![], vec![], vec![]);
-        pack(&order, &p, &colors, grid, &mut s.splats);
-        count(&s.splats, grid, SimdPath::best(), &mut counts, &mut tile_counts);
-        let total = scan(&counts, &mut s.offsets);
-        isect_offsets(&tile_counts, grid.tiles(), &mut s.tile_offsets, &mut cursors);
-        emit(&s.splats, grid, SimdPath::best(), total, &mut cursors, &mut s.isects);
-        s
+        let (mut packed, simd) = (Packed::default(), SimdPath::best());
+        let (mut chunk_offsets, mut tile_offsets, mut isects) = (vec![], vec![], vec![]);
+        let (mut tile_counts, mut cursors) = (vec![], vec![]);
+        pack(&p, &colors, grid, simd, &mut packed);
+        count(&order, &packed, grid, simd, &mut tile_counts);
+        let total = scan(&packed.chunk_counts, &mut chunk_offsets);
+        isect_offsets(&tile_counts, grid.tiles(), &mut tile_offsets, &mut cursors);
+        emit(&order, &packed, grid, simd, total, &mut cursors, &mut isects);
+        Scene { grid, radii: p.radii, packed, chunk_offsets, tile_offsets, isects }
     }
 
     impl Scene {
         pub(in crate::kernels) fn lists(&self, simd: SimdPath) -> Lists<'_> {
             Lists {
                 grid: self.grid,
-                splats: &self.splats,
+                splats: &self.packed.splats,
                 isects: &self.isects,
                 tile_offsets: &self.tile_offsets,
                 max_alpha: 0.99,
@@ -390,9 +405,10 @@ pub(in crate::kernels) mod tests {
         }
     }
 
-    /// One pixel by the contract, over every splat whose box holds its tile.
+    /// One pixel by the contract, over every splat whose box holds it.
     struct PlainPixel<'a> {
         lists: &'a Lists<'a>,
+        radii: &'a [[u32; 2]],
         x: u32,
         y: u32,
         cap: f32,
@@ -403,13 +419,12 @@ pub(in crate::kernels) mod tests {
         #[inline(always)]
         fn run<const FMA: bool>(self) -> [f32; 4] {
             let (px, py) = (self.x as f32 + 0.5, self.y as f32 + 0.5);
-            let (tx, ty) = ((self.x / TILE) as u16, (self.y / TILE) as u16);
             let (mut t, mut rgb) = (1.0f32, [0.0f32; 3]);
-            for s in self.lists.splats {
-                if !(s.tiles[0] <= tx && tx < s.tiles[2] && s.tiles[1] <= ty && ty < s.tiles[3]) {
+            for (s, radii) in self.lists.splats.iter().zip(self.radii) {
+                let (dx, dy) = (px - s.mean[0], py - s.mean[1]);
+                if dx.abs() > radii[0] as f32 || dy.abs() > radii[1] as f32 {
                     continue;
                 }
-                let (dx, dy) = (px - s.mean[0], py - s.mean[1]);
                 let e = fma::<FMA>(fma::<FMA>(s.a, dx, s.b * dy), dx, fma::<FMA>(s.c * dy, dy, s.log2_opacity));
                 if e.is_nan() || e < LOG2_ALPHA_MIN {
                     continue;
@@ -440,7 +455,7 @@ pub(in crate::kernels) mod tests {
                 let cap = log2_max_alpha(lists.max_alpha, simd);
                 for p in 0..pixels {
                     let (x, y) = ((p % 70) as u32, (p / 70) as u32);
-                    let want = dispatch(simd, PlainPixel { lists: &lists, x, y, cap });
+                    let want = dispatch(simd, PlainPixel { lists: &lists, radii: &scene.radii, x, y, cap });
                     let got = [rgb[p], rgb[pixels + p], rgb[2 * pixels + p], alpha[p]];
                     assert_eq!(got.map(f32::to_bits), want.map(f32::to_bits), "{simd:?} {n} {x},{y}: {got:?} {want:?}");
                 }

@@ -13,12 +13,12 @@ pub struct Stage {
 /// The stages in order.
 ///
 /// The sort by tile that stands between `isect_emit` and `isect_offsets` on a device is a counting sort on the CPU:
-/// there `isect_offsets` turns the tile counts of the rows into places, and `isect_emit` writes straight to them.
+/// there `isect_offsets` counts tiles and turns the counts into places, and `isect_emit` writes straight to them.
 pub const STAGES: [Stage; 11] = [
     Stage { name: "project_fwd", doc: "rows to footprints on the screen; culls" },
     Stage { name: "sh_fwd", doc: "colours of the visible rows from their view directions" },
     Stage { name: "radix_sort", doc: "visible rows front to back by the bits of their depth, ties by row" },
-    Stage { name: "scan", doc: "tiles touched by each row to 64-bit offsets of its intersections" },
+    Stage { name: "scan", doc: "packs rows and turns the tiles that each touches into 64-bit offsets" },
     Stage { name: "isect_emit", doc: "one intersection for each row and tile that it touches" },
     Stage { name: "isect_offsets", doc: "where each tile's list of intersections begins" },
     Stage { name: "rasterize_fwd", doc: "blends each tile's list front to back" },

@@ -8,7 +8,7 @@ use super::constants::TILE;
 use super::isect_emit::Isect;
 use super::rasterize_fwd::Lanes;
 use super::splats::Splat;
-use crate::base::simd::{LANES, fma};
+use crate::base::simd::{LANES, fma, prefetch};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 pub(super) const ROWS: usize = TILE as usize;
@@ -31,10 +31,10 @@ pub(super) struct Local {
     pub top: f32,
     /// Colour.
     pub color: [f32; 3],
-    /// The row's place in depth order.
-    pub rank: u32,
-    /// Number among the row's intersections.
-    pub k: u32,
+    /// The Gaussian.
+    pub row: u32,
+    /// Emit index of this intersection, counted from that of its chunk of rows.
+    pub emit: u64,
 }
 
 /// Up to `N` (at most 64) consecutive splats of a tile's list.
@@ -43,6 +43,14 @@ pub(super) struct Block<const N: usize> {
     pub locals: [Local; N],
     /// Bit i of `reach[row]`: splat i can reach the row.
     pub reach: [u64; ROWS],
+}
+
+/// Asks for the splats of a list, which will be filled into a block soon.
+#[inline(always)]
+pub(super) fn prefetch_splats(list: &[AtomicU64], splats: &[Splat]) {
+    for bits in list {
+        prefetch(&splats[Isect::unpack(bits.load(Relaxed)).row as usize]);
+    }
 }
 
 impl<const N: usize> Block<N> {
@@ -55,8 +63,8 @@ impl<const N: usize> Block<N> {
             a: 0.0,
             top: 0.0,
             color: [0.0; 3],
-            rank: 0,
-            k: 0,
+            row: 0,
+            emit: 0,
         };
         Block { locals: [none; N], reach: [0; ROWS] }
     }
@@ -68,10 +76,10 @@ impl<const N: usize> Block<N> {
         let mut reach = [0u64; ROWS];
         for (i, (local, bits)) in self.locals.iter_mut().zip(list).enumerate() {
             let isect = Isect::unpack(bits.load(Relaxed));
-            let splat = &splats[isect.rank as usize];
-            let rows = (2u64 << isect.rows[1]) - (1u64 << isect.rows[0]);
+            let splat = &splats[isect.row as usize];
+            let rows = (2u64 << isect.pixel_rows[1]) - (1u64 << isect.pixel_rows[0]);
             for (row, set) in reach.iter_mut().enumerate() {
-                *set |= ((rows >> row) & 1) << i;
+                *set |= if rows & (1 << row) != 0 { 1u64 << i } else { 0 };
             }
             for row in 0..ROWS {
                 let dy = (y0 + row as f32) - splat.mean[1];
@@ -83,8 +91,8 @@ impl<const N: usize> Block<N> {
             local.a = splat.a;
             local.top = if splat.log2_opacity < cap { splat.log2_opacity } else { cap };
             local.color = splat.color;
-            local.rank = isect.rank;
-            local.k = isect.k;
+            local.row = isect.row;
+            local.emit = splat.emit + u64::from(isect.k);
         }
         self.reach = reach;
     }

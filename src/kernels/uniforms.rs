@@ -9,40 +9,39 @@ use crate::kernels::image_loss::LossPlan;
 use crate::kernels::project_fwd::View;
 use crate::scene::camera::Camera;
 use crate::scene::image::Target;
-use bytemuck::{Pod, Zeroable};
 
-/// Uniform of `project_fwd`, `sh_fwd`, `sh_bwd` and `project_bwd`: `RowsUniforms` in `shaders/shared/camera.wgsl`.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct RowsUniforms {
-    /// Rows of the world-to-camera rotation, with the translation last.
-    pub world_to_camera: [[f32; 4]; 3],
-    /// Cofactors of the rotation, last 0.
-    pub cofactors: [[f32; 4]; 3],
-    /// Position of the camera in the world.
-    pub centre: [f32; 3],
-    /// Blur of the covariance, px^2.
-    pub eps2d: f32,
-    /// Focal lengths, pixels.
-    pub focal: [f32; 2],
-    /// Principal point, pixels.
-    pub principal: [f32; 2],
-    /// Image size, pixels.
-    pub size: [f32; 2],
-    /// Depths that are drawn lie strictly between these.
-    pub depth_range: [f32; 2],
-    /// Lower cut of X/Z and Y/Z inside the Jacobian.
-    pub slope_low: [f32; 2],
-    /// Upper cut.
-    pub slope_high: [f32; 2],
-    /// Rows of the window.
-    pub row_count: u32,
-    /// 0.
-    pub pad0: u32,
-    /// 0.
-    pub pad1: u32,
-    /// 0.
-    pub pad2: u32,
+crate::wgsl_struct! {
+    /// Uniform of `project_fwd`, `sh_fwd`, `sh_bwd` and `project_bwd`: `RowsUniforms` in `shaders/shared/camera.wgsl`.
+    pub struct RowsUniforms {
+        /// Rows of the world-to-camera rotation, with the translation last.
+        pub world_to_camera: [[f32; 4]; 3],
+        /// Cofactors of the rotation, last 0.
+        pub cofactors: [[f32; 4]; 3],
+        /// Position of the camera in the world.
+        pub centre: [f32; 3],
+        /// Blur of the covariance, px^2.
+        pub eps2d: f32,
+        /// Focal lengths, pixels.
+        pub focal: [f32; 2],
+        /// Principal point, pixels.
+        pub principal: [f32; 2],
+        /// Image size, pixels.
+        pub size: [f32; 2],
+        /// Depths that are drawn lie strictly between these.
+        pub depth_range: [f32; 2],
+        /// Lower cut of X/Z and Y/Z inside the Jacobian.
+        pub slope_low: [f32; 2],
+        /// Upper cut.
+        pub slope_high: [f32; 2],
+        /// Rows of the window.
+        pub row_count: u32,
+        /// 0.
+        pub pad0: u32,
+        /// 0.
+        pub pad1: u32,
+        /// 0.
+        pub pad2: u32,
+    }
 }
 
 impl RowsUniforms {
@@ -69,26 +68,26 @@ impl RowsUniforms {
     }
 }
 
-/// Uniform of `image_loss`: `LossUniforms` in `shaders/image_loss.wgsl`.
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-#[repr(C)]
-pub struct LossUniforms {
-    /// Pixels.
-    pub width: u32,
-    /// Pixels.
-    pub height: u32,
-    /// First channel of this dispatch.
-    pub first_channel: u32,
-    /// Channels of this dispatch.
-    pub channel_count: u32,
-    /// Pixels at each border that are left out of the SSIM map.
-    pub margin: u32,
-    /// Derivative of the loss with respect to the sum of absolute differences.
-    pub l1_weight: f32,
-    /// Derivative of the loss with respect to the sum of the SSIM map.
-    pub ssim_weight: f32,
-    /// Partial sums that `sum_partials` reads.
-    pub partial_count: u32,
+crate::wgsl_struct! {
+    /// Uniform of `image_loss`: `LossUniforms` in `shaders/image_loss.wgsl`.
+    pub struct LossUniforms {
+        /// Pixels.
+        pub width: u32,
+        /// Pixels.
+        pub height: u32,
+        /// First channel of this dispatch.
+        pub first_channel: u32,
+        /// Channels of this dispatch.
+        pub channel_count: u32,
+        /// Pixels at each border that are left out of the SSIM map.
+        pub margin: u32,
+        /// Derivative of the loss with respect to the sum of absolute differences.
+        pub l1_weight: f32,
+        /// Derivative of the loss with respect to the sum of the SSIM map.
+        pub ssim_weight: f32,
+        /// Partial sums that `sum_partials` reads.
+        pub partial_count: u32,
+    }
 }
 
 impl LossUniforms {

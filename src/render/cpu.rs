@@ -16,7 +16,7 @@ use crate::kernels::rasterize_fwd::{Lists, Raster, rasterize_fwd, untile};
 use crate::kernels::scan::scan;
 use crate::kernels::sh_bwd::sh_bwd;
 use crate::kernels::sh_fwd::sh_fwd;
-use crate::kernels::splats::{Grid, Splat, pack};
+use crate::kernels::splats::{Grid, Packed, pack};
 use crate::kernels::stages::STAGES;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
@@ -63,17 +63,15 @@ pub struct CpuRenderer {
     colors: Vec<[f32; 3]>,
     depth_sort: DepthSort,
     order: Vec<u32>,
-    splats: Vec<Splat>,
-    counts: Vec<u32>,
+    packed: Packed,
     tile_counts: Vec<u32>,
-    /// Emit offsets by rank.
-    offsets: Vec<u64>,
+    /// Emit offsets by chunk of rows.
+    chunk_offsets: Vec<u64>,
     tile_offsets: Vec<u64>,
     cursors: Vec<u64>,
     isects: Vec<AtomicU64>,
     raster: Raster,
     partials: Vec<Partial>,
-    rank_from_row: Vec<u32>,
     footprints: FootprintGradients,
     image_loss: ImageLoss,
     v_rgb: Vec<f32>,
@@ -106,14 +104,16 @@ impl CpuRenderer {
             self.depth_sort.sort(&self.projected.depths, &self.projected.radii, &mut self.order);
         });
         let total = clock.time("scan", || {
-            pack(&self.order, &self.projected, &self.colors, grid, &mut self.splats);
-            count(&self.splats, grid, simd, &mut self.counts, &mut self.tile_counts);
-            scan(&self.counts, &mut self.offsets)
+            pack(&self.projected, &self.colors, grid, simd, &mut self.packed);
+            scan(&self.packed.chunk_counts, &mut self.chunk_offsets)
         });
         clock.time("isect_offsets", || {
+            count(&self.order, &self.packed, grid, simd, &mut self.tile_counts);
             isect_offsets(&self.tile_counts, grid.tiles(), &mut self.tile_offsets, &mut self.cursors);
         });
-        clock.time("isect_emit", || emit(&self.splats, grid, simd, total, &mut self.cursors, &mut self.isects));
+        clock.time("isect_emit", || {
+            emit(&self.order, &self.packed, grid, simd, total, &mut self.cursors, &mut self.isects)
+        });
         self.view = Some((*camera, *options));
         clock.time("rasterize_fwd", || self.rasterize(grid, options));
         self.clock = clock;
@@ -139,7 +139,7 @@ impl CpuRenderer {
     fn lists(&self, grid: Grid, options: &RenderOptions) -> Lists<'_> {
         Lists {
             grid,
-            splats: &self.splats,
+            splats: &self.packed.splats,
             isects: &self.isects,
             tile_offsets: &self.tile_offsets,
             max_alpha: options.max_alpha,
@@ -204,10 +204,9 @@ impl CpuRenderer {
 
     fn rasterize_back(&mut self, grid: Grid, options: &RenderOptions, upstream: &Upstream<'_>) {
         let mut partials = std::mem::take(&mut self.partials);
-        rasterize_bwd(&self.lists(grid, options), &self.offsets, &self.raster, upstream, &mut partials);
+        rasterize_bwd(&self.lists(grid, options), &self.chunk_offsets, &self.raster, upstream, &mut partials);
         self.partials = partials;
-        let (order, out) = (&self.order, &mut self.footprints);
-        fold_rows(order, &self.offsets, &self.partials, &self.projected, &mut self.rank_from_row, out);
+        fold_rows(&self.packed.counts, &self.chunk_offsets, &self.partials, &self.projected, &mut self.footprints);
     }
 
     /// Seconds that each stage took in the last view, in the order of [`STAGES`] (0 for those that did not run).
@@ -230,9 +229,14 @@ impl CpuRenderer {
             + bytes(&self.alpha)
             + bytes(&self.v_rgb)
             + (bytes(&p.means2d) + bytes(&p.conics) + bytes(&p.depths) + bytes(&p.radii) + bytes(&p.opacities))
-            + (bytes(&self.colors) + bytes(&self.order) + bytes(&self.splats))
-            + (bytes(&self.counts) + bytes(&self.tile_counts) + bytes(&self.offsets) + bytes(&self.tile_offsets))
-            + (bytes(&self.cursors) + bytes(&self.isects) + bytes(&self.partials) + bytes(&self.rank_from_row))
+            + (bytes(&self.colors) + bytes(&self.order) + bytes(&self.packed.splats))
+            + (bytes(&self.packed.counts)
+                + bytes(&self.packed.spans)
+                + bytes(&self.tile_counts)
+                + bytes(&self.chunk_offsets)
+                + bytes(&self.packed.chunk_counts)
+                + bytes(&self.tile_offsets))
+            + (bytes(&self.cursors) + bytes(&self.isects) + bytes(&self.partials))
             + (bytes(&f.v_means2d) + bytes(&f.v_conics) + bytes(&f.v_colors) + bytes(&f.v_opacities))
     }
 }

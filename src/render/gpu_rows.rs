@@ -219,10 +219,9 @@ impl RowStages {
         for window in windows(gpu, rows.rows, widest_row(degree)) {
             let uniform = recorder.uniform(&RowsUniforms::new(camera, 0.0, window.rows))?;
             let w = rows.window(window);
-            let mut views = vec![uniform];
-            // Without a direction the means are not used.
+            let mut views = vec![uniform, window.of(splats, SPLAT_BYTES), w.sh0];
+            // Band 0 has no direction.
             views.extend((degree > 0).then_some(w.means));
-            views.extend([window.of(splats, SPLAT_BYTES), w.sh0]);
             views.extend(w.bands.into_iter().take(degree));
             recorder.dispatch("sh_fwd", &self.sh_fwd[degree], &views, groups_1d(window.rows, WORKGROUP))?;
         }
@@ -248,9 +247,10 @@ impl RowStages {
         for window in windows(gpu, rows.rows, widest_row(degree)) {
             let uniform = recorder.uniform(&RowsUniforms::new(camera, 0.0, window.rows))?;
             let (w, v) = (rows.window(window), grads.window(window));
+            let splats = [window.of(splats, SPLAT_BYTES), window.of(v_splats, SPLAT_BYTES)];
             let mut views = vec![uniform];
+            views.extend(splats.into_iter().chain([v.means, v.sh0]));
             views.extend((degree > 0).then_some(w.means));
-            views.extend([window.of(splats, SPLAT_BYTES), window.of(v_splats, SPLAT_BYTES), v.means, v.sh0]);
             views.extend(w.bands.into_iter().zip(v.bands).take(degree).flat_map(|(band, v_band)| [band, v_band]));
             recorder.dispatch("sh_bwd", &self.sh_bwd[degree], &views, groups_1d(window.rows, WORKGROUP))?;
         }

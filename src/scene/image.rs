@@ -54,6 +54,11 @@ impl Target {
         self.width as usize * self.height as usize
     }
 
+    /// Whether any pixel counts.
+    pub fn counts(&self) -> bool {
+        self.mask.as_ref().is_none_or(|mask| mask.iter().any(|&byte| byte != 0))
+    }
+
     /// Bytes that this target keeps in memory.
     pub fn bytes(&self) -> u64 {
         (self.rgb.len() + self.mask.as_ref().map_or(0, Vec::len)) as u64

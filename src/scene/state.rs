@@ -7,6 +7,7 @@
 use super::columns::{Column, Columns, row_width};
 use super::rows::{ColumnsMut, ColumnsRef, Rows, RowsMut};
 use rayon::prelude::*;
+use std::collections::TryReserveError;
 
 /// Rows with all that training keeps of them.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -154,17 +155,20 @@ impl SceneState {
 
     /// Makes room for `more` further rows, and no more than that: what a scene takes follows from its rows, not from
     /// the doubling of vectors. Growing moves one vector at a time.
-    pub fn reserve_exact(&mut self, more: usize) {
+    ///
+    /// # Errors
+    /// There is not that much memory; some of the vectors may have grown then.
+    pub fn try_reserve_exact(&mut self, more: usize) -> Result<(), TryReserveError> {
         let sh_degree = self.sh_degree();
         for table in [&mut self.columns, &mut self.exp_avg, &mut self.exp_avg_sq] {
             for (column, values) in column_vecs(table) {
-                values.reserve_exact(more * column.width(sh_degree));
+                values.try_reserve_exact(more.saturating_mul(column.width(sh_degree)))?;
             }
         }
-        self.stamp.reserve_exact(more);
-        self.uid.reserve_exact(more);
-        self.grad2d.reserve_exact(more);
-        self.count.reserve_exact(more);
+        self.stamp.try_reserve_exact(more)?;
+        self.uid.try_reserve_exact(more)?;
+        self.grad2d.try_reserve_exact(more)?;
+        self.count.try_reserve_exact(more)
     }
 
     /// Appends all rows of `other`, which must be stored at the same degree.

@@ -9,10 +9,10 @@ use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
-use crate::exchange::ply::{PlyContent, read_ply, to_local};
+use crate::exchange::ply::{PlyContent, PlyMeta, read_ply, to_local};
 use crate::optim::deferred::DeferredAdam;
 use crate::render::cpu::CpuRenderer;
-use crate::render::metrics::{SsimVariant, psnr, ssim};
+use crate::render::metrics::{SsimVariant, mean, psnr, ssim};
 use crate::render::{RenderOptions, Renderer};
 use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
@@ -29,7 +29,8 @@ pub struct EvalRequest<'a> {
     pub pictures: Option<&'a Path>,
 }
 
-/// Evaluates the rows as they are at `now` on the requested views. `None` when there are none.
+/// Evaluates the rows as they are at `now` on the requested views. Views that are masked as a whole have no metrics and
+/// are left out of the means; `None` when no view is left.
 ///
 /// # Errors
 /// A photo cannot be decoded, the renderer failed, or a picture cannot be written.
@@ -45,7 +46,7 @@ pub fn evaluate(
     }
     let mut rows = Vec::new();
     let mut columns = Columns::zeros(0, state.columns.sh_degree);
-    let (mut psnr_sum, mut ssim_sum) = (0.0, 0.0);
+    let (mut psnrs, mut ssims) = (Vec::new(), Vec::new());
     for (i, &view) in request.views.iter().enumerate() {
         targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
         let target = targets.get(view)?;
@@ -54,14 +55,20 @@ pub fn evaluate(
         gather(state, adam, now, &rows, &mut columns);
         renderer.forward(&columns, camera, options)?;
         let image = renderer.image()?;
-        psnr_sum += json_psnr(psnr(image, &target));
-        ssim_sum += ssim(image, &target, request.ssim);
+        if target.counts() {
+            psnrs.push(json_psnr(psnr(image, &target)));
+            // No window of the map may count although some pixels at the border do.
+            ssims.extend(Some(ssim(image, &target, request.ssim)).filter(|x| !x.is_nan()));
+        }
         if let Some(folder) = request.pictures {
             write_pair(folder, &dataset.views[view].name, image, &target)?;
         }
     }
-    let n = request.views.len() as f64;
-    Ok(Some(TestMetrics { views: request.views.len() as u32, psnr: psnr_sum / n, ssim: ssim_sum / n }))
+    if psnrs.is_empty() {
+        return Ok(None);
+    }
+    let ssim = if ssims.is_empty() { 0.0 } else { mean(&ssims) };
+    Ok(Some(TestMetrics { views: psnrs.len() as u32, psnr: mean(&psnrs), ssim }))
 }
 
 /// File of the picture of a view: its name with folders and extension folded in.
@@ -101,6 +108,22 @@ pub struct EvalReport {
     pub test: Option<TestMetrics>,
 }
 
+/// What to say about Gaussians that were read from `ply`, of which `far` did not survive the change of frame.
+pub fn ply_warnings(ply: &Path, meta: &PlyMeta, far: u64) -> Vec<String> {
+    let mut warnings = Vec::new();
+    if meta.dropped > 0 {
+        warnings.push(format!("{}: {} Gaussians are not finite and are dropped", ply.display(), meta.dropped));
+    }
+    if far > 0 {
+        warnings.push(format!("{}: {far} Gaussians are too far from this scene and are dropped", ply.display()));
+    }
+    if meta.antialiased {
+        let file = ply.display();
+        warnings.push(format!("{file}: trained with opacity compensation (antialiased), which is not rendered here"));
+    }
+    warnings
+}
+
 /// Evaluates a PLY of Gaussians on the held-out views of a scene.
 ///
 /// # Errors
@@ -116,10 +139,14 @@ pub fn evaluate_ply(
         return Err(InputError::new(ply, problem, "give the point_cloud.ply of a run").into());
     };
     let dataset = load_dataset(read_scene(scene, &limits::read_options(config))?, &limits::load_options(config))?;
-    for warning in &dataset.warnings {
+    let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
+    for warning in dataset.warnings.iter().chain(&ply_warnings(ply, &meta, far)) {
         eprintln!("warning: {warning}");
     }
-    to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
+    if columns.rows() == 0 {
+        let problem = "no Gaussian lies within reach of this scene";
+        return Err(InputError::new(ply, problem, "give a PLY that was trained on this scene").into());
+    }
     let run = RunOptions::new(config, dataset.scene_scale);
     let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
     let gaussians = columns.rows() as u64;

@@ -10,14 +10,14 @@ use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::optim::deferred::DeferredAdam;
 use crate::render::cpu::CpuRenderer;
-use crate::render::{Gradients, RenderError};
+use crate::render::{Gradients, RenderError, Renderer};
 use crate::scene::columns::{Columns, row_width};
 use crate::scene::state::{SceneState, row_bytes};
 
 /// Views rendered to see what a view takes.
 const PROBE_VIEWS: usize = 6;
-/// Program, libraries and thread stacks, measured on an empty run.
-const BASE_BYTES: u64 = 16 << 20;
+/// Program, libraries and thread stacks, measured on an empty run: 16 MiB with the tables of a short one.
+const BASE_BYTES: u64 = 12 << 20;
 
 /// What a run is expected to hold in memory at its peak, by part, bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -57,12 +57,14 @@ pub fn estimate(config: &TrainConfig, dataset: &Dataset, columns: &Columns) -> R
         view: view.pixels + (view.rows as f64 * growth) as u64,
         targets: config.image_cache.0.min(TargetCache::bytes_to_keep_all(&dataset.views, decoders)),
         export: rows_max * row_width(config.sh_degree) as u64 * 4,
-        base: BASE_BYTES,
+        base: BASE_BYTES + view.tables,
     })
 }
 
-/// Bytes of the heaviest probed view: what grows with its rows, and what only with its pixels.
+/// Bytes of the heaviest probed view: what grows with its rows, and what only with its pixels. And of the optimizer's
+/// tables, which grow with the steps of the run.
 struct ProbedView {
+    tables: u64,
     rows: u64,
     pixels: u64,
 }
@@ -80,7 +82,7 @@ fn probe_view(config: &TrainConfig, dataset: &Dataset, columns: &Columns) -> Res
     for view in dataset.views.iter().step_by(stride) {
         visible_rows(&state, &adam, 0, &view.camera, &mut rows);
         gather(&state, &adam, 0, &rows, &mut working);
-        renderer.forward(&working, &view.camera, &options.render);
+        Renderer::forward(&mut renderer, &working, &view.camera, &options.render)?;
         let v_rgb = vec![0.0; 3 * view.camera.pixels()];
         renderer.backward(&working, &v_rgb, None, &mut gradients);
         pixels = pixels.max(view.camera.pixels() as u64);
@@ -88,17 +90,12 @@ fn probe_view(config: &TrainConfig, dataset: &Dataset, columns: &Columns) -> Res
     let held = renderer.scratch_bytes() + (working.bytes() + gradients.columns.bytes()) as u64;
     // Image, coverage, gradient, and the tiles' copies of them.
     let of_pixels = (pixels * 4 * (3 + 1 + 3 + 6)).min(held);
-    Ok(ProbedView { rows: held - of_pixels, pixels: of_pixels })
+    Ok(ProbedView { rows: held - of_pixels, pixels: of_pixels, tables: adam.bytes() as u64 })
 }
 
 /// The largest resident size of this process so far, bytes; `None` where the system does not tell.
 pub fn host_bytes_peak() -> Option<u64> {
     status_field("VmHWM:")
-}
-
-/// The resident size of this process now, bytes; `None` where the system does not tell.
-pub fn host_bytes_now() -> Option<u64> {
-    status_field("VmRSS:")
 }
 
 /// Memory that programs could still take on this machine, bytes.

@@ -45,15 +45,6 @@ impl Progress {
         }
     }
 
-    /// A line that stays on the screen.
-    pub fn say(&self, line: &str) {
-        match &self.bar {
-            Some(bar) => bar.suspend(|| eprintln!("{line}")),
-            None if !self.quiet => eprintln!("{line}"),
-            None => {}
-        }
-    }
-
     /// The loop has ended.
     pub fn finish(&self) {
         if let Some(bar) = &self.bar {

@@ -1,11 +1,10 @@
 //! What a run leaves behind for programs: metrics.jsonl line by line, summary.json at the end, config.toml at the start.
 //!
-//! Invariants: 1. every number written is finite (JSON has no infinity: an infinite PSNR is written as 100); 2. whole
+//! Invariants: 1. every number written is finite (JSON knows neither infinity nor NaN: see [`json_psnr`]); 2. whole
 //! files appear by rename, so a reader never sees half of one.
 
 use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
-use crate::render::metrics::SsimVariant;
 use serde::{Deserialize, Serialize};
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -37,7 +36,7 @@ pub struct StepLine {
 /// Means over the held-out views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TestMetrics {
-    /// Views evaluated.
+    /// Views in the means: those with a pixel that is not masked.
     pub views: u32,
     /// Mean PSNR, dB.
     pub psnr: f64,
@@ -72,14 +71,10 @@ pub struct Summary {
     pub steps_skipped_non_finite: u32,
 }
 
-/// A finite PSNR for JSON.
+/// A PSNR for JSON: at most 100, which also stands for no difference at all; what is not a number (a broken picture)
+/// counts as the worst, 0.
 pub fn json_psnr(psnr: f64) -> f64 {
-    if psnr.is_finite() { psnr.min(PSNR_PERFECT) } else { PSNR_PERFECT }
-}
-
-/// The variant of this name; the config has checked it.
-pub fn ssim_variant(config: &TrainConfig) -> SsimVariant {
-    SsimVariant::from_name(&config.ssim_variant).unwrap_or(SsimVariant::Same)
+    if psnr.is_nan() || psnr == f64::NEG_INFINITY { 0.0 } else { psnr.min(PSNR_PERFECT) }
 }
 
 /// Appends lines to metrics.jsonl.
@@ -168,4 +163,17 @@ pub fn write_config(path: &Path, config: &TrainConfig, resolved: &Resolved) -> I
     text.push_str("\n[resolved]\n");
     text.push_str(&toml::to_string(resolved).map_err(fail)?);
     write_whole(path, text.as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_broken_picture_is_not_a_perfect_one() {
+        assert_eq!(json_psnr(f64::INFINITY), 100.0);
+        assert_eq!(json_psnr(f64::NAN), 0.0);
+        assert_eq!(json_psnr(f64::NEG_INFINITY), 0.0);
+        assert_eq!(json_psnr(23.5), 23.5);
+    }
 }

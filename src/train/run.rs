@@ -3,7 +3,8 @@
 //! Invariants: 1. the output folder is made only after the dataset was understood, so bad input leaves nothing
 //! behind; 2. a run that is stopped or fails after its first step still writes the PLY of its last good step.
 
-use super::memory::{estimate, host_bytes_peak};
+use super::eval::ply_warnings;
+use super::memory::{MemoryEstimate, estimate, host_bytes_available, host_bytes_peak};
 use super::progress::Progress;
 use super::report::{MetricsLog, Resolved, Summary, write_config, write_summary};
 use super::signals::StopFlag;
@@ -27,7 +28,7 @@ use std::path::{Path, PathBuf};
 pub struct RunRequest {
     /// Scene folder (or transforms.json).
     pub scene: PathBuf,
-    /// Output folder.
+    /// Output folder; may be empty for a dry run.
     pub out: PathBuf,
     /// Checked config.
     pub config: TrainConfig,
@@ -54,6 +55,8 @@ pub struct Prepared {
     pub dataset: Dataset,
     /// First Gaussians, local frame.
     pub columns: Columns,
+    /// Degree that they were trained with: it is in use from the first step. 0 for points.
+    pub sh_degree_start: u8,
 }
 
 /// Reads the scene and makes first Gaussians.
@@ -63,6 +66,7 @@ pub struct Prepared {
 pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
     let mut raw = read_scene(scene, &limits::read_options(config))?;
     let mut gaussians = None;
+    let mut dropped = None;
     let points_file = match (config.init_ply.as_str(), &raw.points_path) {
         ("", path) => path.clone(),
         (path, _) => Some(PathBuf::from(path)),
@@ -71,31 +75,40 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
         match read_ply(&path)? {
             PlyContent::Gaussians { columns, meta, .. } => {
                 raw.points = PointCloud::default();
-                gaussians = Some((columns, meta));
+                gaussians = Some((columns, meta, path));
             }
-            PlyContent::Points { positions, colors, .. } => raw.points = PointCloud { positions, colors },
+            PlyContent::Points { positions, colors, dropped: count } => {
+                raw.points = PointCloud { positions, colors };
+                dropped = (count > 0).then(|| format!("{}: {count} points are not finite, dropped", path.display()));
+            }
         }
     }
-    let dataset = load_dataset(raw, &limits::load_options(config))?;
+    raw.warnings.extend(dropped);
+    let mut dataset = load_dataset(raw, &limits::load_options(config))?;
     if dataset.train_views().is_empty() {
         let problem = "no view is left to train on";
         return Err(InputError::new(scene, problem, "hold out fewer photos: see --test-every and --test-after"));
     }
-    let columns = match gaussians {
-        Some((mut columns, meta)) => {
-            to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
-            resize_sh(&columns, config.sh_degree)
+    let (columns, sh_degree_start) = match gaussians {
+        Some((mut columns, meta, ply)) => {
+            let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
+            dataset.warnings.extend(ply_warnings(&ply, &meta, far));
+            (resize_sh(&columns, config.sh_degree), columns.sh_degree)
         }
-        None => first_gaussians(scene, &dataset, config)?,
+        None => (first_gaussians(scene, &mut dataset, config)?, 0),
     };
+    if columns.rows() == 0 {
+        let problem = "no Gaussian is left to start from: all are too far from the cameras";
+        return Err(InputError::new(scene, problem, "give a PLY of this scene with --init-ply"));
+    }
     if config.max_gaussians > 0 && columns.rows() as u64 > config.max_gaussians {
         let problem = format!("the start has {} Gaussians, above --max-gaussians", columns.rows());
         return Err(InputError::new(scene, problem, "raise --max-gaussians or start from fewer"));
     }
-    Ok(Prepared { dataset, columns })
+    Ok(Prepared { dataset, columns, sh_degree_start })
 }
 
-fn first_gaussians(scene: &Path, dataset: &Dataset, config: &TrainConfig) -> InputResult<Columns> {
+fn first_gaussians(scene: &Path, dataset: &mut Dataset, config: &TrainConfig) -> InputResult<Columns> {
     let mut options = limits::init_options(config);
     options.scene_scale = dataset.scene_scale;
     if !dataset.points.is_empty() {
@@ -108,6 +121,10 @@ fn first_gaussians(scene: &Path, dataset: &Dataset, config: &TrainConfig) -> Inp
             "give points with --init-ply, or let --init-points N draw them in the views' frusta",
         ));
     }
+    dataset.warnings.push(format!(
+        "there are no points to start from: {} random ones are drawn in what the cameras see",
+        config.init_points
+    ));
     let cameras: Vec<_> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
     let count = config.init_points as usize;
     // Aerial and object captures both have their subject within a few camera-spreads of the cameras.
@@ -141,35 +158,41 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     set_threads(config);
     check_simd(config)?;
     check_out(request)?;
-    let Prepared { dataset, columns } = prepare(&request.scene, config)?;
+    let prepared = prepare(&request.scene, config)?;
     let say = |line: &str| {
         if !request.quiet {
             eprintln!("{line}");
         }
     };
-    for warning in &dataset.warnings {
+    for warning in &prepared.dataset.warnings {
         eprintln!("warning: {warning}");
     }
-    say(&describe(request, &dataset, &columns)?);
+    let memory = estimate(config, &prepared.dataset, &prepared.columns)?;
+    say(&describe(request, &prepared, &memory));
+    if let Some(free) = host_bytes_available().filter(|&free| free < memory.total()) {
+        eprintln!(
+            "warning: the run may need {}, but {} are free: lower --max-gaussians, --image-cache, --sh-degree or the \
+             size of the photos",
+            format_bytes(memory.total()),
+            format_bytes(free)
+        );
+    }
     if request.dry_run {
         return Ok(RunOutcome { summary: None, exit_code: 0 });
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     make_out(&request.out, request.overwrite)?;
-    train_into(request, &dataset, columns, &stop)
+    train_into(request, prepared, &stop)
 }
 
-fn train_into(
-    request: &RunRequest,
-    dataset: &Dataset,
-    columns: Columns,
-    stop: &StopFlag,
-) -> Result<RunOutcome, TrainError> {
+fn train_into(request: &RunRequest, prepared: Prepared, stop: &StopFlag) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
+    let Prepared { dataset, columns, sh_degree_start } = prepared;
+    let dataset = &dataset;
     write_config(&out.join("config.toml"), config, &resolved(request, dataset, columns.rows()))?;
     let mut metrics = MetricsLog::create(&out.join("metrics.jsonl"))?;
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-    let options = RunOptions::new(config, dataset.scene_scale);
+    let options = RunOptions { sh_degree_start, ..RunOptions::new(config, dataset.scene_scale) };
     let mut trainer = Trainer::new(columns, dataset, Box::new(CpuRenderer::new()), options);
     let mut progress = Progress::new(config.steps, request.quiet);
     let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop };
@@ -183,19 +206,21 @@ fn train_into(
             ply.display()
         );
     }
+    if written.skipped > 0 {
+        eprintln!("warning: {} Gaussians are not finite and are not in {}", written.skipped, ply.display());
+    }
     // A stopped run owes the user its files at once; the held-out views can be looked at later with gsscale-eval.
-    let test = if looped.is_ok() && stop.exit_code().is_none() {
-        trainer.evaluate(dataset, &targets, Some(&out.join("renders/test")))?
-    } else {
-        None
-    };
+    let tested = looped.and_then(|()| match stop.exit_code() {
+        None => trainer.evaluate(dataset, &targets, Some(&out.join("renders/test"))),
+        Some(_) => Ok(None),
+    });
     let (rows_skipped, steps_skipped) = trainer.skipped();
     let summary = Summary {
         steps: trainer.steps_done(),
         gaussians: trainer.state.rows() as u64,
         train_seconds: trainer.train_seconds(),
         host_bytes_peak: host_bytes_peak().unwrap_or(0),
-        test,
+        test: tested.as_ref().ok().copied().flatten(),
         scene: request.scene.clone(),
         version: env!("CARGO_PKG_VERSION").to_string(),
         ssim_variant: config.ssim_variant.clone(),
@@ -204,7 +229,7 @@ fn train_into(
         steps_skipped_non_finite: steps_skipped,
     };
     write_summary(&out.join("summary.json"), &summary)?;
-    looped?;
+    tested?;
     Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
 }
 
@@ -250,10 +275,24 @@ fn make_out(out: &Path, overwrite: bool) -> InputResult<()> {
             std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
         }
     }
+    remove_saved(out)?;
     let pictures = out.join("renders/test");
     if pictures.is_dir() {
         let io = |e: std::io::Error| InputError::io(&pictures, "removing the earlier run's pictures", &e);
         std::fs::remove_dir_all(&pictures).map_err(io)?;
+    }
+    Ok(())
+}
+
+/// Removes what `--save-every` of an earlier run left: point_cloud_<step>.ply.
+fn remove_saved(out: &Path) -> InputResult<()> {
+    let entries = std::fs::read_dir(out).map_err(|e| InputError::io(out, "listing the folder", &e))?;
+    for path in entries.flatten().map(|entry| entry.path()) {
+        let name = path.file_name().and_then(|n| n.to_str()).unwrap_or("");
+        let step = name.strip_prefix("point_cloud_").and_then(|rest| rest.strip_suffix(".ply"));
+        if step.is_some_and(|s| s.len() >= 6 && s.bytes().all(|b| b.is_ascii_digit())) {
+            std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
+        }
     }
     Ok(())
 }
@@ -274,9 +313,8 @@ fn resolved(request: &RunRequest, dataset: &Dataset, rows: usize) -> Resolved {
 }
 
 /// What was understood and what it will take, for people.
-fn describe(request: &RunRequest, dataset: &Dataset, columns: &Columns) -> Result<String, TrainError> {
-    let config = &request.config;
-    let memory = estimate(config, dataset, columns)?;
+fn describe(request: &RunRequest, prepared: &Prepared, memory: &MemoryEstimate) -> String {
+    let (config, dataset) = (&request.config, &prepared.dataset);
     let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
     let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
     let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
@@ -285,20 +323,23 @@ fn describe(request: &RunRequest, dataset: &Dataset, columns: &Columns) -> Resul
         (_, 0) => String::from(" (densification without a cap: memory grows with them; see --max-gaussians)"),
         (_, cap) => format!(" growing to at most {cap}"),
     };
+    let results = match request.out.as_os_str().is_empty() {
+        true => String::new(),
+        false => format!(", results in {}", request.out.display()),
+    };
     let text = format!(
         "scene   {}: {} views to train on, {} held out, at most {size}\n\
          start   {} Gaussians, SH degree {}{growth}\n\
-         run     {} steps on {} threads ({}), results in {}\n\
+         run     {} steps on {} threads ({}){results}\n\
          memory  about {} at the peak\n{}{}{}{}{}",
         request.scene.display(),
         dataset.train_views().len(),
         dataset.test_views().len(),
-        columns.rows(),
+        prepared.columns.rows(),
         config.sh_degree,
         config.steps,
         rayon::current_num_threads(),
         limits::simd_path(config).name(),
-        request.out.display(),
         format_bytes(memory.total()),
         part("Gaussians with their optimizer state", memory.state),
         part("one view: rows, gradients, images", memory.view),
@@ -306,5 +347,5 @@ fn describe(request: &RunRequest, dataset: &Dataset, columns: &Columns) -> Resul
         part("copy for export", memory.export),
         part("program", memory.base),
     );
-    Ok(text.trim_end().to_string())
+    text.trim_end().to_string()
 }

@@ -20,7 +20,7 @@ use crate::exchange::ply::{self, PlyMeta};
 use crate::optim::deferred::DeferredAdam;
 use crate::render::{RenderError, RenderOptions, Renderer};
 use crate::scene::columns::Columns;
-use crate::scene::events::{Event, EventLog};
+use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::state::SceneState;
 use crate::schedule::order::ShuffledOrder;
 use std::path::{Path, PathBuf};
@@ -38,7 +38,7 @@ pub enum TrainError {
     #[error(transparent)]
     Input(#[from] InputError),
     /// The renderer.
-    #[error("rendering failed at {0}")]
+    #[error("rendering failed: {0}")]
     Render(#[from] RenderError),
     /// The loss was not finite several times in a row.
     #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
@@ -65,6 +65,8 @@ pub struct Trainer {
     options: RunOptions,
     histogram: GradHistogram,
     events: EventLog,
+    /// SH degree in use, as the events raised it.
+    sh_degree: u8,
     order: ShuffledOrder,
     train_views: Vec<usize>,
     working: WorkingSet,
@@ -93,12 +95,14 @@ impl Trainer {
         let train_views = dataset.train_views();
         let mut state = SceneState::from_columns(columns);
         if options.max_gaussians > 0 {
-            state.reserve_exact(options.max_gaussians.saturating_sub(state.rows()));
+            // A cap that memory cannot hold may still never be reached: then rounds make room as they need it.
+            let _ = state.try_reserve_exact(options.max_gaussians.saturating_sub(state.rows()));
         }
         Trainer {
             adam: DeferredAdam::new(options.rates, options.adam, options.render.simd),
             histogram: GradHistogram::default(),
             events: EventLog::default(),
+            sh_degree: options.sh_degree_at(0),
             order: ShuffledOrder::new(options.seed, train_views.len()),
             train_views,
             working: WorkingSet::default(),
@@ -128,9 +132,14 @@ impl Trainer {
         (self.rows_skipped, self.steps_skipped)
     }
 
-    /// Options of a rendering at 0-based `step`: the bands in use follow from it.
-    pub fn render_options(&self, step: u32) -> RenderOptions {
-        RenderOptions { sh_degree: self.options.sh_degree_at(step), ..self.options.render }
+    /// Options of a rendering now: with the bands that are in use.
+    pub fn render_options(&self) -> RenderOptions {
+        RenderOptions { sh_degree: self.sh_degree, ..self.options.render }
+    }
+
+    /// The events so far.
+    pub fn events(&self) -> &EventLog {
+        &self.events
     }
 
     /// Runs one step and the events that are due after it.
@@ -147,7 +156,7 @@ impl Trainer {
         targets.prefetch(&ahead);
         let target = targets.get(view)?;
         let started = Instant::now();
-        let render = self.render_options(self.step);
+        let render = self.render_options();
         let outcome = train_step(
             &mut self.state,
             &mut self.working,
@@ -185,17 +194,26 @@ impl Trainer {
 
     /// Events fire after the update of their step, on values that contain it.
     fn run_events(&mut self) {
-        let Some(densify) = self.options.densify else { return };
-        let rows = self.state.rows() as u64;
-        let kinds: Vec<_> = densify.events_after(self.step, self.options.scene_scale, rows, &self.histogram).collect();
-        for kind in kinds {
-            let event = Event { step: self.step, kind };
-            let index = self.events.push(event);
-            apply_event(&mut self.state, &self.adam, self.options.seed, index, &event);
+        let (step, rows) = (self.step, self.state.rows() as u64);
+        if let Some(densify) = self.options.densify {
+            let kinds: Vec<_> = densify.events_after(step, self.options.scene_scale, rows, &self.histogram).collect();
+            kinds.into_iter().for_each(|kind| self.run_event(Event { step, kind }));
+            if densify.is_round(step) {
+                self.histogram.clear();
+            }
         }
-        if densify.is_round(self.step) {
-            self.histogram.clear();
+        let degree = self.options.sh_degree_at(step + 1);
+        if degree > self.sh_degree {
+            self.run_event(Event { step, kind: EventKind::RaiseShDegree { degree } });
         }
+    }
+
+    fn run_event(&mut self, event: Event) {
+        let index = self.events.push(event);
+        if let EventKind::RaiseShDegree { degree } = event.kind {
+            self.sh_degree = degree;
+        }
+        apply_event(&mut self.state, &self.adam, self.options.seed, index, &event);
     }
 
     /// Runs to the last step or until asked to stop.
@@ -252,7 +270,7 @@ impl Trainer {
         targets: &TargetCache,
         pictures: Option<&Path>,
     ) -> Result<Option<TestMetrics>, TrainError> {
-        let render = self.render_options(self.step.saturating_sub(1));
+        let render = self.render_options();
         let views = dataset.test_views();
         let request = EvalRequest { views: &views, ssim: self.options.ssim_variant, pictures };
         let now = (&self.state, &self.adam, self.step);

@@ -1,0 +1,418 @@
+//! Time of a whole training step (cull, gather, forward, loss, backward, Adam, statistics) beside its floor.
+//!
+//! `cargo bench --bench step` measures real scenes (where `GSSCALE_DATA`, or `../shared/data`, has them) and a made-up
+//! terrain. Numbers choose sizes, words choose cases, `--path avx2` the instruction path, `--json` the form,
+//! `RAYON_NUM_THREADS` the threads. Inside a test run it does a few steps of a tiny terrain.
+//!
+//! Real scenes start from their points with the program's own defaults and all colour bands in use; densification is
+//! off but its statistics are collected. Each repetition trains once on the same views; the figure is the median
+//! repetition, by CPU seconds of all threads. Photos are decoded beforehand. The hash is over the bits of all losses:
+//! the same on each machine and for any number of threads, per instruction path.
+//!
+//! The floor is what the machine could do at best, each part measured here: blending the pixel-Gaussian pairs of the
+//! view once forward and once backward at the rate of a bare forward loop that stays in registers, and moving 11
+//! floats for each parameter (gather reads three and writes one for every row in view; Adam reads four and writes
+//! three for every row with a gradient) at the rate of a plain copy. The backward pass has about three times the
+//! arithmetic of the forward pass, so a ratio of 1 is out of reach.
+
+pub mod support;
+
+use gsscale::base::rng::{Purpose, Stream};
+use gsscale::base::simd::SimdPath;
+use gsscale::config::file::TrainConfig;
+use gsscale::config::limits::RunOptions;
+use gsscale::dataset::photo::decode;
+use gsscale::densify::stats::GradHistogram;
+use gsscale::optim::deferred::DeferredAdam;
+use gsscale::render::cpu::CpuRenderer;
+use gsscale::render::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
+use gsscale::scene::camera::Camera;
+use gsscale::scene::columns::{Columns, row_width};
+use gsscale::scene::image::{Image, Target};
+use gsscale::scene::init::gaussians_from_points;
+use gsscale::scene::neighbours::nearest_dist2;
+use gsscale::scene::state::SceneState;
+use gsscale::train::catch_up::{gather, visible_rows};
+use gsscale::train::step::{WorkingSet, train_step};
+use serde_json::json;
+use std::path::PathBuf;
+use std::time::Instant;
+use support::floor::{bare_blend_rate, copy_rate};
+use support::{Args, Hash, Seconds, machine, median, terrain, time};
+
+/// A peer's CPU seconds per step on the same input, on another machine: two vCPUs of an AMD EPYC (Zen 5), OpenSplat
+/// 1.1.5, CPU build, SH degree 3, no densification.
+struct Peer {
+    cpu_seconds: f64,
+    /// We want to take a this-th part of it.
+    target: Option<f64>,
+}
+
+/// One input.
+struct Case {
+    name: String,
+    columns: Columns,
+    views: Vec<(Camera, Target)>,
+    scene_scale: f32,
+    peer: Option<Peer>,
+}
+
+/// How much is measured.
+#[derive(Clone, Copy)]
+struct Effort {
+    /// Rounds over the views before the first that counts.
+    warm_up: usize,
+    /// Rounds that count.
+    rounds: usize,
+    /// Views of a round, at most.
+    views: usize,
+}
+
+const REAL: Effort = Effort { warm_up: 2, rounds: 5, views: 15 };
+const TINY: Effort = Effort { warm_up: 0, rounds: 2, views: 2 };
+
+fn main() {
+    let args = Args::read();
+    if !args.real {
+        assert!(tiny() != 0);
+        return;
+    }
+    let simd = args.simd();
+    let floor = Floor { pairs: bare_blend_rate(simd, 400), bytes: copy_rate(1 << 24) };
+    if !args.json {
+        println!("{}", machine(simd));
+        println!("floor a thread: {:.2} Gpixel-Gaussians/s, {:.1} GB/s", floor.pairs / 1e9, floor.bytes / 1e9);
+    }
+    for (n, target) in [(10_000, Some(3.0)), (50_000, None), (200_000, Some(5.0))] {
+        let peer = |cpu_seconds| Some(Peer { cpu_seconds, target });
+        let cpu_seconds = match n {
+            10_000 => 0.098,
+            50_000 => 0.130,
+            _ => 0.380,
+        };
+        let name = format!("brighton_480x269_{}k", n / 1000);
+        measure(&args, &name, floor, || photo_case("brighton", 2.5, Some(n), peer(cpu_seconds)));
+    }
+    let peer = || Some(Peer { cpu_seconds: 0.302, target: Some(5.0) });
+    measure(&args, "sheffield_cross_395", floor, || photo_case("sheffield_cross_395", 1.0, None, peer()));
+    let sizes = if args.sizes.is_empty() { vec![10_000, 100_000, 1_000_000] } else { args.sizes.clone() };
+    for n in sizes {
+        measure(&args, &format!("terrain_640x480_{n}"), floor, || Some(terrain_case(n, 640, 480, REAL.views)));
+    }
+}
+
+/// A few steps of a tiny terrain; returns the hash of its losses.
+pub fn tiny() -> u64 {
+    let floor = Floor { pairs: bare_blend_rate(SimdPath::best(), 1), bytes: copy_rate(1 << 10) };
+    let case = terrain_case(300, 48, 40, 2);
+    let result = run(&case, SimdPath::best(), TINY, floor);
+    assert!(result.cpu.cpu > 0.0 && result.floor_seconds > 0.0 && result.rows > 0.0);
+    result.hash
+}
+
+fn measure(args: &Args, name: &str, floor: Floor, make: impl Fn() -> Option<Case>) {
+    if !args.wants(name) {
+        return;
+    }
+    let Some(mut case) = make() else {
+        eprintln!("SKIPPED {name}: no such scene; set GSSCALE_DATA to the folder that has it");
+        return;
+    };
+    case.name = name.to_string();
+    let result = run(&case, args.simd(), REAL, floor);
+    if args.json {
+        println!("{}", result.json(&case, args.simd()));
+    } else {
+        result.print(&case);
+    }
+}
+
+/// Rates of this machine, per second of CPU time and thread.
+#[derive(Clone, Copy)]
+struct Floor {
+    pairs: f64,
+    bytes: f64,
+}
+
+/// What a case took, per step.
+struct StepResult {
+    cpu: Seconds,
+    /// Least and largest round, CPU seconds a step.
+    spread: [f64; 2],
+    floor_seconds: f64,
+    rows: f64,
+    updated: f64,
+    pairs: f64,
+    isects: f64,
+    /// Name and mean wall seconds of each part.
+    parts: Vec<(&'static str, f64)>,
+    hash: u64,
+}
+
+fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult {
+    let config = TrainConfig { simd: simd.name().to_string(), sh_every: 0, ..TrainConfig::default() };
+    let options = RunOptions::new(&config, case.scene_scale);
+    let adam = DeferredAdam::new(options.rates, options.adam, simd);
+    let mut state = SceneState::from_columns(case.columns.clone());
+    let (mut working, mut histogram) = (WorkingSet::default(), GradHistogram::default());
+    let mut renderer = Watched::default();
+    let stride = case.views.len().div_ceil(effort.views);
+    let views: Vec<&(Camera, Target)> = case.views.iter().step_by(stride).collect();
+    let (mut step, mut hash, mut rounds) = (0, Hash::default(), Vec::new());
+    let mut counts = [0.0; 4];
+    for round in 0..effort.warm_up + effort.rounds {
+        if round == effort.warm_up {
+            (renderer.parts, counts) = (Vec::new(), [0.0; 4]);
+        }
+        rounds.push(time(|| {
+            for (camera, target) in &views {
+                renderer.begin = Some(Instant::now());
+                let at = (step, camera, target);
+                let how = (&options.render, &options.loss);
+                let done = train_step(&mut state, &mut working, &mut renderer, &adam, at, how, Some(&mut histogram));
+                let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
+                renderer.note_end();
+                let stats = renderer.inner.stats();
+                let of_step =
+                    [outcome.rows as f64, outcome.updated as f64, stats.evaluated as f64, stats.isects as f64];
+                counts.iter_mut().zip(of_step).for_each(|(sum, x)| *sum += x);
+                hash.add(outcome.loss.loss.to_bits());
+                step += 1;
+            }
+        }));
+    }
+    let n = views.len() as f64;
+    let cpu: Vec<f64> = rounds[effort.warm_up..].iter().map(|s| s.cpu / n).collect();
+    let wall = median(rounds[effort.warm_up..].iter().map(|s| s.wall / n));
+    let steps = n * effort.rounds as f64;
+    let [rows, updated, pairs, isects] = counts.map(|c| c / steps);
+    let mut parts = split_cull(&renderer.parts, &state, &adam, step, &views);
+    parts.iter_mut().for_each(|(_, seconds)| *seconds /= steps);
+    let bytes = 4.0 * row_width(case.columns.sh_degree) as f64 * (4.0 * rows + 7.0 * updated);
+    StepResult {
+        cpu: Seconds { wall, cpu: median(cpu.iter().copied()) },
+        spread: [cpu.iter().copied().fold(f64::INFINITY, f64::min), cpu.iter().copied().fold(0.0, f64::max)],
+        floor_seconds: 2.0 * pairs / floor.pairs + bytes / floor.bytes,
+        rows,
+        updated,
+        pairs,
+        isects,
+        parts,
+        hash: hash.0,
+    }
+}
+
+/// Cull and gather are one span of the step; their shares are taken from doing each alone on the final state.
+fn split_cull(
+    parts: &[(&'static str, f64)],
+    state: &SceneState,
+    adam: &DeferredAdam,
+    now: u32,
+    views: &[&(Camera, Target)],
+) -> Vec<(&'static str, f64)> {
+    let (mut rows, mut columns) = (Vec::new(), Columns::zeros(0, state.sh_degree()));
+    let mut alone = [0.0; 2];
+    for (camera, _) in views {
+        let start = Instant::now();
+        visible_rows(state, adam, now, camera, &mut rows);
+        let culled = start.elapsed().as_secs_f64();
+        gather(state, adam, now, &rows, &mut columns);
+        alone[0] += culled;
+        alone[1] += start.elapsed().as_secs_f64() - culled;
+    }
+    let share = alone[0] / (alone[0] + alone[1]).max(1e-12);
+    let mut out = Vec::new();
+    for &(name, seconds) in parts {
+        if name == "cull+gather" {
+            out.extend([("cull", seconds * share), ("gather", seconds * (1.0 - share))]);
+        } else {
+            out.push((name, seconds));
+        }
+    }
+    out
+}
+
+impl StepResult {
+    fn print(&self, case: &Case) {
+        println!(
+            "{}: {} Gaussians, {:.0} in view, {:.0} updated, {:.0} intersections, {:.0} evaluated per pixel",
+            case.name,
+            case.columns.rows(),
+            self.rows,
+            self.updated,
+            self.isects,
+            self.pairs / case.views[0].0.pixels() as f64
+        );
+        println!(
+            "  step {:.2} ms CPU ({:.2} to {:.2}), {:.2} ms wall; floor {:.2} ms CPU, ratio {:.2}; losses {:016x}",
+            1e3 * self.cpu.cpu,
+            1e3 * self.spread[0],
+            1e3 * self.spread[1],
+            1e3 * self.cpu.wall,
+            1e3 * self.floor_seconds,
+            self.cpu.cpu / self.floor_seconds,
+            self.hash
+        );
+        if let Some(peer) = &case.peer {
+            let factor = peer.cpu_seconds / self.cpu.cpu;
+            let wanted = peer.target.map_or(String::new(), |t| {
+                format!("; wanted {t:.0} ({}), stretch 10", if factor >= t { "reached" } else { "missed" })
+            });
+            println!("  OpenSplat {:.0} ms CPU on a Zen 5: {factor:.1} times ours{wanted}", 1e3 * peer.cpu_seconds);
+        }
+        print!("  wall ms:");
+        for (name, seconds) in &self.parts {
+            print!(" {name} {:.2}", 1e3 * seconds);
+        }
+        println!();
+    }
+
+    fn json(&self, case: &Case, simd: SimdPath) -> serde_json::Value {
+        json!({
+            "case": case.name, "gaussians": case.columns.rows(), "rows": self.rows, "updated": self.updated,
+            "isects": self.isects, "pairs": self.pairs, "cpu_seconds": self.cpu.cpu, "wall_seconds": self.cpu.wall,
+            "cpu_seconds_least": self.spread[0], "cpu_seconds_most": self.spread[1],
+            "floor_cpu_seconds": self.floor_seconds, "ratio_to_floor": self.cpu.cpu / self.floor_seconds,
+            "peer_cpu_seconds": case.peer.as_ref().map(|p| p.cpu_seconds),
+            "times_faster": case.peer.as_ref().map(|p| p.cpu_seconds / self.cpu.cpu),
+            "target": case.peer.as_ref().and_then(|p| p.target),
+            "stage_wall_seconds": self.parts.iter().map(|&(n, s)| (n.to_string(), json!(s))).collect::<serde_json::Map<_, _>>(),
+            "losses": format!("{:016x}", self.hash), "path": simd.name(),
+            "threads": rayon::current_num_threads(), "machine": machine(simd),
+        })
+    }
+}
+
+/// The CPU renderer with a note of when its parts begin and end.
+#[derive(Default)]
+struct Watched {
+    inner: CpuRenderer,
+    begin: Option<Instant>,
+    backward_done: Option<Instant>,
+    parts: Vec<(&'static str, f64)>,
+}
+
+impl Watched {
+    fn add(&mut self, name: &'static str, seconds: f64) {
+        match self.parts.iter_mut().find(|(n, _)| *n == name) {
+            Some((_, sum)) => *sum += seconds,
+            None => self.parts.push((name, seconds)),
+        }
+    }
+
+    /// The step has ended: what came after the renderer is the optimizer's.
+    fn note_end(&mut self) {
+        let optimizer = self.backward_done.map_or(0.0, |t| t.elapsed().as_secs_f64());
+        let stages: Vec<(&'static str, f64)> = self.inner.stage_seconds().collect();
+        for (name, seconds) in stages {
+            if seconds > 0.0 && name != "image_loss" {
+                self.add(name, seconds);
+            }
+        }
+        self.add("adam+statistics", optimizer);
+    }
+}
+
+impl Renderer for Watched {
+    fn name(&self) -> &'static str {
+        "watched"
+    }
+
+    fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
+        let before = self.begin.map_or(0.0, |t| t.elapsed().as_secs_f64());
+        self.add("cull+gather", before);
+        Renderer::forward(&mut self.inner, rows, camera, options)
+    }
+
+    fn image(&mut self) -> Result<&Image, RenderError> {
+        Renderer::image(&mut self.inner)
+    }
+
+    fn loss_backward(
+        &mut self,
+        rows: &Columns,
+        target: &Target,
+        options: &LossOptions,
+        grads: &mut Gradients,
+    ) -> Result<LossValue, RenderError> {
+        let start = Instant::now();
+        let value = self.inner.loss_backward(rows, target, options, grads);
+        let whole = start.elapsed().as_secs_f64();
+        // The stages of the backward pass have their own clocks; what is left is the loss, and copying two columns.
+        let names = ["rasterize_bwd", "sh_bwd", "project_bwd"];
+        let stages: f64 = self.inner.stage_seconds().filter(|(n, _)| names.contains(n)).map(|(_, s)| s).sum();
+        self.add("image_loss", (whole - stages).max(0.0));
+        self.backward_done = Some(Instant::now());
+        value
+    }
+}
+
+/// A real scene with photos, its points brought to `count`.
+fn photo_case(folder: &str, data_factor: f64, count: Option<usize>, peer: Option<Peer>) -> Option<Case> {
+    let data = std::env::var_os("GSSCALE_DATA")
+        .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
+    let scene = data.join(folder);
+    if !scene.is_dir() {
+        return None;
+    }
+    let config = TrainConfig { data_factor, ..TrainConfig::default() };
+    let prepared = gsscale::train::run::prepare(&scene, &config);
+    let Ok(prepared) = prepared else { panic!("{}: {:?}", scene.display(), prepared.err()) };
+    let dataset = prepared.dataset;
+    let columns = match count {
+        None => prepared.columns,
+        Some(count) => {
+            let (points, colors) = resampled(&dataset.points, &dataset.colors, count);
+            let mut options = gsscale::config::limits::init_options(&config);
+            options.scene_scale = dataset.scene_scale;
+            gaussians_from_points(&points, &colors, &options)
+        }
+    };
+    let train = dataset.train_views();
+    let views = train.iter().step_by(train.len().div_ceil(REAL.views)).map(|&v| {
+        let view = &dataset.views[v];
+        let target = decode(&view.photo);
+        let Ok(target) = target else { panic!("{}: {:?}", view.name, target.err()) };
+        (view.camera, target)
+    });
+    Some(Case { name: String::new(), columns, views: views.collect(), scene_scale: dataset.scene_scale, peer })
+}
+
+/// `count` points: those there are, taken in turn, from the second turn on moved by a draw of half the distance to their
+/// neighbours; or the first `count` of an order that hashes their index.
+fn resampled(points: &[[f32; 3]], colors: &[[u8; 3]], count: usize) -> (Vec<[f32; 3]>, Vec<[u8; 3]>) {
+    let mut order: Vec<usize> = (0..points.len()).collect();
+    order.sort_by_cached_key(|&i| gsscale::base::rng::hash64(&[1, i as u64]));
+    let dist2 = nearest_dist2(points);
+    let mut out = (Vec::with_capacity(count), Vec::with_capacity(count));
+    for i in 0..count {
+        let from = order[i % order.len()];
+        let mut point = points[from];
+        if i >= order.len() {
+            let mut draws = Stream::new(1, Purpose::Test, i as u64, 0);
+            let near = 0.5 * f64::from(dist2[from][0]).sqrt();
+            point.iter_mut().for_each(|x| *x += (near * draws.normal()) as f32);
+        }
+        out.0.push(point);
+        out.1.push(colors[from]);
+    }
+    out
+}
+
+/// Rows of a terrain, disturbed, and pictures of the terrain as it was, from places around the first camera.
+fn terrain_case(n: usize, width: u32, height: u32, views: usize) -> Case {
+    let (mut columns, camera) = terrain(n, width, height);
+    let mut renderer = CpuRenderer::new();
+    let views = (0..views).map(|i| {
+        let mut camera = camera;
+        let turn = i as f32 * 2.4;
+        camera.viewmat[0][3] = 0.4 * turn.cos();
+        camera.viewmat[2][3] += 0.4 * turn.sin();
+        let image = renderer.forward(&columns, &camera, &RenderOptions::default());
+        (camera, Target { width, height, rgb: image.to_rgb8(), mask: None })
+    });
+    let views = views.collect();
+    let mut draws = Stream::new(2, Purpose::Test, n as u64, 0);
+    columns.sh0.iter_mut().for_each(|x| *x += 0.3 * draws.normal() as f32);
+    Case { name: String::new(), columns, views, scene_scale: 2.0, peer: None }
+}
