@@ -130,6 +130,8 @@ impl DemandReadback {
 pub struct TileStages {
     pipelines: Pipelines,
     capacity: u32,
+    /// Words of the largest binding.
+    binding_words: u32,
     list_max: u32,
 }
 
@@ -157,7 +159,8 @@ impl TileStages {
             rasterize_bwd: get("rasterize_bwd", "rasterize_bwd")?,
             fold_rows: get("rasterize_bwd", "fold_rows")?,
         };
-        Ok(TileStages { pipelines, capacity: CAPACITY_MIN, list_max: SEGMENT_FWD })
+        let binding_words = u32::try_from(gpu.max_binding_bytes() / 4).unwrap_or(u32::MAX);
+        Ok(TileStages { pipelines, capacity: CAPACITY_MIN, binding_words, list_max: SEGMENT_FWD })
     }
 
     /// Intersections that the next frame has room for.
@@ -165,7 +168,7 @@ impl TileStages {
         self.capacity
     }
 
-    /// Makes room for at least `isects` intersections in the next frame, exactly if `isects` is not 0.
+    /// Sets how many intersections the next frame has room for; it grows again on demand.
     pub fn set_capacity(&mut self, isects: u32) {
         self.capacity = isects.max(1);
     }
@@ -384,9 +387,10 @@ impl TileStages {
         }
         let room = demand.isects <= frame.capacity;
         if !room {
-            // A quarter more, so that views that need a little more do not come here again.
-            let more = u64::from(demand.isects) + u64::from(demand.isects) / 4;
-            self.capacity = self.capacity.max(more.min(CAPACITY_MAX) as u32);
+            // A quarter more, so that views that need a little more do not come here again; but not more than a binding
+            // holds, unless this view alone is beyond it, which the dispatch then reports.
+            let more = (demand.isects.saturating_add(demand.isects / 4)).min(self.binding_words);
+            self.capacity = self.capacity.max(more).max(demand.isects);
         }
         let reached = demand.list_max <= frame.list_max;
         if !reached {

@@ -11,7 +11,7 @@ use gsscale::kernels::radix_sort::DepthSort;
 use gsscale::kernels::rasterize_bwd::{FootprintGradients, Upstream, fold_rows, rasterize_bwd};
 use gsscale::kernels::rasterize_fwd::{Lists, Raster, rasterize_fwd, untile};
 use gsscale::kernels::scan::scan;
-use gsscale::kernels::splats::{Grid, Splat, pack};
+use gsscale::kernels::splats::{Grid, Packed, pack};
 use gsscale::render::gpu_tiles::{Blend, Pairs, TileStages, splat_bytes};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -31,7 +31,7 @@ fn sums_are_those_of_the_cpu() {
         for n in [0, 1, 7, 2047, 2048, 2049, 100_001, 5_000_000, 20_000_000] {
             let values: Vec<u32> = (0..n).map(|i| if n > 1 << 24 { i & 31 } else { draws.below(800) as u32 }).collect();
             let mut want = Vec::new();
-            scan(&values, &mut want);
+            scan(&values.iter().map(|&x| u64::from(x)).collect::<Vec<_>>(), &mut want);
             assert!(gpu_scan(&gpu, &stages, &values).iter().map(|&x| u64::from(x)).eq(want), "{n} values");
         }
         // Sums that do not fit 32 bits saturate, wherever it happens.
@@ -191,18 +191,18 @@ struct Outcome {
 
 fn on_cpu(scene: &Scene, v_rgb: &[f32], v_alpha: Option<&[f32]>) -> Outcome {
     let (grid, simd, p) = (scene.blend.grid, SimdPath::Baseline, &scene.projected);
-    let (mut order, mut splats) = (Vec::new(), Vec::<Splat>::new());
+    let (mut order, mut packed, mut chunk_offsets) = (Vec::new(), Packed::default(), Vec::new());
+    let (mut tile_counts, mut tile_offsets, mut cursors) = (Vec::new(), Vec::new(), Vec::new());
+    let mut isects = Vec::<AtomicU64>::new();
     DepthSort::default().sort(&p.depths, &p.radii, &mut order);
-    pack(&order, p, &scene.colors, grid, &mut splats);
-    let (mut counts, mut tile_counts, mut offsets) = (vec![], vec![], vec![]);
-    let (mut tile_offsets, mut cursors, mut isects) = (vec![], vec![], Vec::<AtomicU64>::new());
-    count(&splats, grid, simd, &mut counts, &mut tile_counts);
-    let total = scan(&counts, &mut offsets);
+    pack(p, &scene.colors, grid, simd, &mut packed);
+    let total = scan(&packed.chunk_counts, &mut chunk_offsets);
+    count(&order, &packed, grid, simd, &mut tile_counts);
     isect_offsets(&tile_counts, grid.tiles(), &mut tile_offsets, &mut cursors);
-    emit(&splats, grid, simd, total, &mut cursors, &mut isects);
+    emit(&order, &packed, grid, simd, total, &mut cursors, &mut isects);
     let lists = Lists {
         grid,
-        splats: &splats,
+        splats: &packed.splats,
         isects: &isects,
         tile_offsets: &tile_offsets,
         max_alpha: scene.blend.max_alpha,
@@ -211,13 +211,13 @@ fn on_cpu(scene: &Scene, v_rgb: &[f32], v_alpha: Option<&[f32]>) -> Outcome {
     };
     let (mut raster, mut partials) = (Raster::default(), Vec::new());
     rasterize_fwd(&lists, &mut raster);
-    rasterize_bwd(&lists, &offsets, &raster, &Upstream { v_rgb, v_alpha }, &mut partials);
-    let (mut rank_from_row, mut out) = (Vec::new(), FootprintGradients::default());
-    fold_rows(&order, &offsets, &partials, p, &mut rank_from_row, &mut out);
+    rasterize_bwd(&lists, &chunk_offsets, &raster, &Upstream { v_rgb, v_alpha }, &mut partials);
+    let mut out = FootprintGradients::default();
+    fold_rows(&packed.counts, &chunk_offsets, &partials, p, &mut out);
     let pixels = (grid.width * grid.height) as usize;
     let (mut rgb, mut alpha) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
     untile(grid, &raster, &mut rgb, &mut alpha);
-    let row_of = |bits: &AtomicU64| order[Isect::unpack(bits.load(Relaxed)).rank as usize];
+    let row_of = |bits: &AtomicU64| Isect::unpack(bits.load(Relaxed)).row;
     Outcome {
         lists: (0..grid.tiles()).map(|t| lists.tile(t).iter().map(row_of).collect()).collect(),
         rgb,
