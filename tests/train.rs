@@ -126,6 +126,28 @@ fn the_bands_of_a_trained_ply_stay_in_use() {
 }
 
 #[test]
+fn transforms_json_trains_like_the_colmap_model() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 16, 96, 64, 400);
+    let steps = ["--steps", "60", "--strategy", "none"];
+    let colmap = folder.path().join("colmap");
+    run(&scene, &colmap, &steps);
+    TextModel::of(&scene).write_transforms(&scene);
+    std::fs::remove_dir_all(scene.join("sparse")).unwrap();
+    let json = folder.path().join("json");
+    run(&scene, &json, &steps);
+    assert_eq!(summary(&json)["gaussians"], summary(&colmap)["gaussians"]);
+    assert_eq!(summary(&json)["test"]["views"], 2);
+    // The same scene to the rounding of f64 poses, which f32 training may amplify.
+    assert!((psnr(&json) - psnr(&colmap)).abs() < 0.05, "{} and {}", psnr(&json), psnr(&colmap));
+    let output = eval(&[text(&json), text(&scene.join("transforms.json"))]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    // Rounding on the way through the PLY.
+    assert!((report["test"]["psnr"].as_f64().unwrap() - psnr(&json)).abs() < 2e-3);
+}
+
+#[test]
 fn an_interrupt_finishes_the_step_and_writes_the_scene() {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 16, 96, 64, 400);
