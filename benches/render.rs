@@ -71,7 +71,7 @@ fn inner_loop(simd: SimdPath, threads: usize, repeats: usize) -> Vec<f32> {
         // Eight tiles a thread, so that threads get the same share.
         let grid = Grid::new(16 * 8 * threads as u32, 16);
         let splats: Vec<Splat> = (0..INNER_SPLATS).map(|i| wide_splat(i, grid.width as f32)).collect();
-        let isect = |i: usize| Isect { rank: (i % INNER_SPLATS) as u32, rows: [0, 15], k: 0 };
+        let isect = |i: usize| Isect { row: (i % INNER_SPLATS) as u32, pixel_rows: [0, 15], k: 0 };
         let isects: Vec<AtomicU64> =
             (0..grid.tiles() * INNER_SPLATS).map(|i| AtomicU64::new(isect(i).pack())).collect();
         let tile_offsets: Vec<u64> = (0..=grid.tiles()).map(|tile| (tile * INNER_SPLATS) as u64).collect();
@@ -116,7 +116,7 @@ fn wide_splat(i: usize, width: f32) -> Splat {
         log2_opacity: -7.85,
         color,
         reach: 1.0,
-        tiles: [0, 0, (width / 16.0) as u16, 1],
+        emit: 0,
     }
 }
 

@@ -8,7 +8,7 @@
 // ssim_map and gradient cover `channel_count` channels from `first_channel` on, so that the derivative maps, 12 bytes
 // per pixel and channel, may be kept for one channel at a time.
 //
-// Sums are f32, added as trees: no atomics, so the same bits on every run. No loop is longer than 16 turns.
+// Sums are f32, added as trees: no atomics, so the same bits on every run of a device. No loop is longer than 64 turns.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 
@@ -43,7 +43,6 @@ struct LossUniforms {
 /// Invocations of a workgroup: one for each pixel of a tile.
 const WORKGROUP: u32 = 256u;
 const RADIUS: u32 = 5u;
-const WINDOW: u32 = 11u;
 /// Side of a tile with the window's margin.
 const PATCH: u32 = 26u;
 /// 26 * 26 values of a patch, and 26 * 16 once it is filtered along its rows.
@@ -55,16 +54,31 @@ const PARTIALS_EACH: u32 = 16u;
 const SSIM_C1: f32 = 1e-4;
 const SSIM_C2: f32 = 9e-4;
 /// exp(-k^2 / 4.5) for k = 0..=5, divided by the sum over -5..=5.
-const TAPS = array<f32, 6>(0.26601172, 0.21300554, 0.10936069, 0.036000773, 0.007598758, 0.0010283801);
+const TAP0: f32 = 0.26601172;
+const TAP1: f32 = 0.21300554;
+const TAP2: f32 = 0.10936069;
+const TAP3: f32 = 0.036000773;
+const TAP4: f32 = 0.007598758;
+const TAP5: f32 = 0.0010283801;
 
 /// x, y of the patch; in `gradient` dS/dmx and dS/dE[xx].
 var<workgroup> patch_two: array<vec2<f32>, PATCH_LEN>;
 /// In `gradient` dS/dE[xy].
 var<workgroup> patch_one: array<f32, PATCH_LEN>;
-/// Filtered along rows: x, y; or as in patch_two.
-var<workgroup> filtered_two: array<vec2<f32>, FILTERED_LEN>;
-/// x^2 + y^2, x y; or dS/dE[xy], 0.
-var<workgroup> filtered_more: array<vec2<f32>, FILTERED_LEN>;
+/// Filtered along rows: x, y, x^2 + y^2, x y; or the three maps.
+var<workgroup> filtered: array<vec4<f32>, FILTERED_LEN>;
+
+/// Where an invocation stands.
+struct Place {
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+#ifdef SUBGROUPS
+    @builtin(subgroup_invocation_id) in_subgroup: u32,
+    @builtin(subgroup_id) subgroup: u32,
+    @builtin(num_subgroups) subgroups: u32,
+#endif
+}
 
 /// The part of the work that a workgroup does.
 struct Job {
@@ -107,12 +121,54 @@ fn values(channel: u32, pixel: u32) -> vec2<f32> {
     return vec2<f32>(select(x, y, (photo >> 24u) == 0u), y);
 }
 
-fn tap(k: u32) -> f32 {
-    return TAPS[u32(abs(i32(k) - 5))];
+/// The window over eleven values: the middle one, then sums of pairs outwards.
+fn windowed(v0: vec4<f32>, v1: vec4<f32>, v2: vec4<f32>, v3: vec4<f32>, v4: vec4<f32>, v5: vec4<f32>) -> vec4<f32> {
+    return TAP0 * v0 + TAP1 * v1 + TAP2 * v2 + TAP3 * v3 + TAP4 * v4 + TAP5 * v5;
+}
+
+/// x, y, x^2 + y^2 and x y at a place of the patch.
+fn four(at: u32) -> vec4<f32> {
+    let both = patch_two[at];
+    return vec4<f32>(both, both.x * both.x + both.y * both.y, both.x * both.y);
+}
+
+/// The three derivatives at a place of the patch.
+fn three(at: u32) -> vec4<f32> {
+    return vec4<f32>(patch_two[at], patch_one[at], 0.0);
+}
+
+/// The window down a column of what was filtered along rows, from place t on.
+fn down(t: u32) -> vec4<f32> {
+    return windowed(
+        filtered[t + 80u],
+        filtered[t + 64u] + filtered[t + 96u],
+        filtered[t + 48u] + filtered[t + 112u],
+        filtered[t + 32u] + filtered[t + 128u],
+        filtered[t + 16u] + filtered[t + 144u],
+        filtered[t] + filtered[t + 160u],
+    );
 }
 
 /// Adds up the lanes' sums in the memory of the patch, which nobody reads any more; the first lane has the result.
-fn sum_lanes(lane: u32, value: vec3<f32>) -> vec3<f32> {
+#ifdef SUBGROUPS
+fn sum_lanes(place: Place, value: vec3<f32>) -> vec3<f32> {
+    let part = subgroupAdd(value);
+    if place.in_subgroup == 0u {
+        patch_two[place.subgroup] = part.xy;
+        patch_one[place.subgroup] = part.z;
+    }
+    workgroupBarrier();
+    var sum = vec3<f32>();
+    if place.lane == 0u {
+        for (var k = 0u; k < place.subgroups; k++) {
+            sum += vec3<f32>(patch_two[k], patch_one[k]);
+        }
+    }
+    return sum;
+}
+#else
+fn sum_lanes(place: Place, value: vec3<f32>) -> vec3<f32> {
+    let lane = place.lane;
     patch_two[lane] = value.xy;
     patch_one[lane] = value.z;
     workgroupBarrier();
@@ -136,6 +192,7 @@ fn sum_lanes(lane: u32, value: vec3<f32>) -> vec3<f32> {
     }
     return sum;
 }
+#endif
 
 /// [S, dS/dmx, dS/dE[xx], dS/dE[xy]] from the windowed means of x, y, x^2 + y^2 and x y.
 fn ssim_point(mx: f32, my: f32, squares: f32, products: f32) -> vec4<f32> {
@@ -153,12 +210,9 @@ fn ssim_point(mx: f32, my: f32, squares: f32, products: f32) -> vec4<f32> {
 }
 
 @compute @workgroup_size(256)
-fn ssim_map(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let j = job(linear_group(workgroup, workgroups));
+fn ssim_map(place: Place) {
+    let lane = place.lane;
+    let j = job(linear_group(place.workgroup, place.workgroups));
     for (var at = lane; at < PATCH_LEN; at += WORKGROUP) {
         let pixel = pixel_of_patch(j, at);
         var both = vec2<f32>();
@@ -170,25 +224,19 @@ fn ssim_map(
     workgroupBarrier();
     for (var at = lane; at < FILTERED_LEN; at += WORKGROUP) {
         let first = (at / TILE) * PATCH + at % TILE;
-        var two = vec2<f32>();
-        var more = vec2<f32>();
-        for (var k = 0u; k < WINDOW; k++) {
-            let both = patch_two[first + k];
-            two += tap(k) * both;
-            more += tap(k) * vec2<f32>(both.x * both.x + both.y * both.y, both.x * both.y);
-        }
-        filtered_two[at] = two;
-        filtered_more[at] = more;
+        filtered[at] = windowed(
+            four(first + 5u),
+            four(first + 4u) + four(first + 6u),
+            four(first + 3u) + four(first + 7u),
+            four(first + 2u) + four(first + 8u),
+            four(first + 1u) + four(first + 9u),
+            four(first) + four(first + 10u),
+        );
     }
     workgroupBarrier();
     let column = lane % TILE;
     let row = lane / TILE;
-    var two = vec2<f32>();
-    var more = vec2<f32>();
-    for (var k = 0u; k < WINDOW; k++) {
-        two += tap(k) * filtered_two[(row + k) * TILE + column];
-        more += tap(k) * filtered_more[(row + k) * TILE + column];
-    }
+    let means = down(row * TILE + column);
     let x = j.x0 + column;
     let y = j.y0 + row;
     var sum = vec3<f32>();
@@ -198,26 +246,23 @@ fn ssim_map(
         let inside = x >= loss.margin && x + loss.margin < loss.width && y >= loss.margin && y + loss.margin < loss.height;
         var point = vec4<f32>();
         if inside && (target_pixels[pixel] >> 24u) != 0u {
-            point = ssim_point(two.x, two.y, more.x, more.y);
+            point = ssim_point(means.x, means.y, means.z, means.w);
         }
         sum.z = point.x;
         derivatives[3u * j.plane * pixels + pixel] = point.y;
         derivatives[(3u * j.plane + 1u) * pixels + pixel] = point.z;
         derivatives[(3u * j.plane + 2u) * pixels + pixel] = point.w;
     }
-    let total = sum_lanes(lane, sum);
+    let total = sum_lanes(place, sum);
     if lane == 0u && j.exists {
         partials[j.partial] = vec4<f32>(total, 0.0);
     }
 }
 
 @compute @workgroup_size(256)
-fn gradient(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let j = job(linear_group(workgroup, workgroups));
+fn gradient(place: Place) {
+    let lane = place.lane;
+    let j = job(linear_group(place.workgroup, place.workgroups));
     let pixels = loss.width * loss.height;
     for (var at = lane; at < PATCH_LEN; at += WORKGROUP) {
         let pixel = pixel_of_patch(j, at);
@@ -236,24 +281,19 @@ fn gradient(
     workgroupBarrier();
     for (var at = lane; at < FILTERED_LEN; at += WORKGROUP) {
         let first = (at / TILE) * PATCH + at % TILE;
-        var two = vec2<f32>();
-        var one = 0.0;
-        for (var k = 0u; k < WINDOW; k++) {
-            two += tap(k) * patch_two[first + k];
-            one += tap(k) * patch_one[first + k];
-        }
-        filtered_two[at] = two;
-        filtered_more[at] = vec2<f32>(one, 0.0);
+        filtered[at] = windowed(
+            three(first + 5u),
+            three(first + 4u) + three(first + 6u),
+            three(first + 3u) + three(first + 7u),
+            three(first + 2u) + three(first + 8u),
+            three(first + 1u) + three(first + 9u),
+            three(first) + three(first + 10u),
+        );
     }
     workgroupBarrier();
     let column = lane % TILE;
     let row = lane / TILE;
-    var two = vec2<f32>();
-    var one = 0.0;
-    for (var k = 0u; k < WINDOW; k++) {
-        two += tap(k) * filtered_two[(row + k) * TILE + column];
-        one += tap(k) * filtered_more[(row + k) * TILE + column].x;
-    }
+    let d = down(row * TILE + column);
     let x = j.x0 + column;
     let y = j.y0 + row;
     var sum = vec3<f32>();
@@ -262,24 +302,21 @@ fn gradient(
         let both = values(j.channel, pixel);
         let difference = both.x - both.y;
         var v = select(0.0, loss.l1_weight, difference > 0.0) - select(0.0, loss.l1_weight, difference < 0.0);
-        v += loss.ssim_weight * (2.0 * both.x * two.y + both.y * one + two.x);
+        v += loss.ssim_weight * (2.0 * both.x * d.y + both.y * d.z + d.x);
         let counts = (target_pixels[pixel] >> 24u) != 0u;
         v_rgb[j.channel * pixels + pixel] = select(0.0, v, counts);
         sum = vec3<f32>(abs(difference), difference * difference, 0.0);
     }
-    let total = sum_lanes(lane, sum);
+    let total = sum_lanes(place, sum);
     if lane == 0u && j.exists {
         partials[j.partial] = vec4<f32>(total.xy, partials[j.partial].z, 0.0);
     }
 }
 
 @compute @workgroup_size(256)
-fn sum_partials(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let group = linear_group(workgroup, workgroups);
+fn sum_partials(place: Place) {
+    let lane = place.lane;
+    let group = linear_group(place.workgroup, place.workgroups);
     let each = PARTIALS_EACH * WORKGROUP;
     var sum = vec3<f32>();
     for (var k = 0u; k < PARTIALS_EACH; k++) {
@@ -288,7 +325,7 @@ fn sum_partials(
             sum += partials[at].xyz;
         }
     }
-    let total = sum_lanes(lane, sum);
+    let total = sum_lanes(place, sum);
     if lane == 0u && group < (loss.partial_count + each - 1u) / each {
         sums[group] = vec4<f32>(total, 0.0);
     }

@@ -5,6 +5,13 @@
 #[path = "support/scenes.rs"]
 mod scenes;
 
+use gsscale::config::file::TrainConfig;
+use gsscale::config::limits::RunOptions;
+use gsscale::dataset::target_cache::TargetCache;
+use gsscale::render::cpu::CpuRenderer;
+use gsscale::scene::events::EventKind;
+use gsscale::train::run::{Prepared, prepare};
+use gsscale::train::trainer::Trainer;
 use scenes::{TextModel, city, eval, psnr, stderr, summary, text, train};
 use std::path::Path;
 use tempfile::TempDir;
@@ -37,6 +44,44 @@ fn one_and_two_threads_give_the_same_bytes() {
     assert!(files[1] == files[2], "two runs of the same command differ");
     let gaussians = summary(&folder.path().join("run0"))["gaussians"].as_u64().unwrap();
     assert_ne!(gaussians, 1500, "no densification round changed anything, so the test shows little");
+}
+
+#[test]
+fn every_global_change_is_an_event_in_order() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 12, 96, 64, 400);
+    let config = TrainConfig {
+        steps: 60,
+        sh_degree: 2,
+        sh_every: 20,
+        refine_start: 5,
+        refine_every: 10,
+        refine_stop: 50,
+        reset_every: 30,
+        ..TrainConfig::default()
+    };
+    let Prepared { dataset, columns, sh_degree_start } = prepare(&scene, &config).unwrap();
+    let options = RunOptions { sh_degree_start, ..RunOptions::new(&config, dataset.scene_scale) };
+    let targets = TargetCache::new(&dataset.views, 1 << 24, 1).unwrap();
+    let mut trainer = Trainer::new(columns, &dataset, Box::new(CpuRenderer::new()), options);
+    let mut degrees = Vec::new();
+    for _ in 0..config.steps {
+        degrees.push(trainer.render_options().sh_degree);
+        trainer.step(&dataset, &targets).unwrap();
+    }
+    // Bands as gsplat has them: step / 20, at most 2.
+    assert!(degrees.iter().enumerate().all(|(step, &d)| usize::from(d) == (step / 20).min(2)), "{degrees:?}");
+    let events: Vec<(u32, char)> = trainer.events().events().iter().map(|e| (e.step, letter(e.kind))).collect();
+    let want = [(10, 'd'), (19, 's'), (20, 'd'), (30, 'd'), (30, 'r'), (39, 's'), (40, 'd')];
+    assert_eq!(events, want);
+}
+
+fn letter(kind: EventKind) -> char {
+    match kind {
+        EventKind::Densify(_) => 'd',
+        EventKind::ResetOpacity { .. } => 'r',
+        EventKind::RaiseShDegree { .. } => 's',
+    }
 }
 
 #[test]
@@ -123,6 +168,28 @@ fn the_bands_of_a_trained_ply_stay_in_use() {
     let again = report["test"]["psnr"].as_f64().unwrap();
     // Rounding on the way through the PLY.
     assert!((again - psnr(&second)).abs() < 2e-3, "{again} from the PLY, {} in the run", psnr(&second));
+}
+
+#[test]
+fn transforms_json_trains_like_the_colmap_model() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 16, 96, 64, 400);
+    let steps = ["--steps", "60", "--strategy", "none"];
+    let colmap = folder.path().join("colmap");
+    run(&scene, &colmap, &steps);
+    TextModel::of(&scene).write_transforms(&scene);
+    std::fs::remove_dir_all(scene.join("sparse")).unwrap();
+    let json = folder.path().join("json");
+    run(&scene, &json, &steps);
+    assert_eq!(summary(&json)["gaussians"], summary(&colmap)["gaussians"]);
+    assert_eq!(summary(&json)["test"]["views"], 2);
+    // The same scene to the rounding of f64 poses, which f32 training may amplify.
+    assert!((psnr(&json) - psnr(&colmap)).abs() < 0.05, "{} and {}", psnr(&json), psnr(&colmap));
+    let output = eval(&[text(&json), text(&scene.join("transforms.json"))]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    // Rounding on the way through the PLY.
+    assert!((report["test"]["psnr"].as_f64().unwrap() - psnr(&json)).abs() < 2e-3);
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! Looking at held-out views: PSNR, SSIM, and pictures of render beside photo. Changes no state.
 
 use super::catch_up::{gather, visible_rows};
+use super::machine;
 use super::report::{TestMetrics, json_psnr};
 use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
@@ -134,6 +135,7 @@ pub fn evaluate_ply(
     config: &TrainConfig,
     pictures: Option<&Path>,
 ) -> Result<EvalReport, TrainError> {
+    machine::set_up(config)?;
     let PlyContent::Gaussians { mut columns, meta, .. } = read_ply(ply)? else {
         let problem = "holds points, not Gaussians (no property f_dc_0)";
         return Err(InputError::new(ply, problem, "give the point_cloud.ply of a run").into());

@@ -1,9 +1,10 @@
 //! The glue, in one direction: [`run`] sets a run up and sees it through, [`trainer`] loops over steps, [`step`] is
 //! one step from top to bottom, [`catch_up`] brings rows to now, [`eval`] looks at held-out views, [`report`] writes
-//! what happened, [`progress`] shows it, [`signals`] hears Ctrl-C.
+//! what happened, [`progress`] shows it, [`machine`] starts its threads, [`signals`] hears Ctrl-C.
 
 pub mod catch_up;
 pub mod eval;
+pub mod machine;
 pub mod memory;
 pub mod progress;
 pub mod report;

@@ -4,6 +4,7 @@
 //! behind; 2. a run that is stopped or fails after its first step still writes the PLY of its last good step.
 
 use super::eval::ply_warnings;
+use super::machine;
 use super::memory::{MemoryEstimate, estimate, host_bytes_available, host_bytes_peak};
 use super::progress::Progress;
 use super::report::{MetricsLog, Resolved, Summary, write_config, write_summary};
@@ -155,8 +156,7 @@ fn resize_sh(columns: &Columns, sh_degree: u8) -> Columns {
 pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
     config.check()?;
-    set_threads(config);
-    check_simd(config)?;
+    machine::set_up(config)?;
     check_out(request)?;
     let prepared = prepare(&request.scene, config)?;
     let say = |line: &str| {
@@ -231,22 +231,6 @@ fn train_into(request: &RunRequest, prepared: Prepared, stop: &StopFlag) -> Resu
     write_summary(&out.join("summary.json"), &summary)?;
     tested?;
     Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
-}
-
-fn set_threads(config: &TrainConfig) {
-    if config.threads > 0 {
-        // A pool that exists already (a library user's) is kept: results do not depend on it.
-        let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
-    }
-}
-
-fn check_simd(config: &TrainConfig) -> InputResult<()> {
-    let path = limits::simd_path(config);
-    if path.is_supported() {
-        return Ok(());
-    }
-    let problem = format!("this machine cannot run {}", path.name());
-    Err(InputError::new("--simd", problem, "use --simd auto"))
 }
 
 fn check_out(request: &RunRequest) -> InputResult<()> {

@@ -83,6 +83,37 @@ impl TextModel {
         std::fs::write(folder.join("points3D.txt"), points).unwrap();
     }
 
+    /// Writes the same scene as transforms.json beside its photos, with its points in points.ply.
+    pub fn write_transforms(&self, scene: &Path) {
+        let [w, h] = self.size;
+        let [fx, fy, cx, cy] = self.pinhole;
+        let frames = self.views.iter().map(|v| {
+            let rotation = DMat3::from_quat(DQuat::from_xyzw(v.qvec[1], v.qvec[2], v.qvec[3], v.qvec[0]).normalize());
+            // Camera to world; y and z of the camera point the other way in OpenGL.
+            let (x, y, z) = (rotation.row(0), -rotation.row(1), -rotation.row(2));
+            let t = -(rotation.transpose() * DVec3::from_array(v.tvec));
+            let row = |i: usize| [x[i], y[i], z[i], t[i]];
+            serde_json::json!({
+                "file_path": format!("images/{}", v.name),
+                "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
+            })
+        });
+        let frames: Vec<serde_json::Value> = frames.collect();
+        let top = serde_json::json!({
+            "w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "ply_file_path": "points.ply", "frames": frames,
+        });
+        std::fs::write(scene.join("transforms.json"), top.to_string()).unwrap();
+        let mut ply = format!("ply\nformat ascii 1.0\nelement vertex {}\n", self.points.len());
+        for property in ["double x", "double y", "double z", "uchar red", "uchar green", "uchar blue"] {
+            writeln!(ply, "property {property}").unwrap();
+        }
+        ply.push_str("end_header\n");
+        for (p, c) in self.points.iter().zip(&self.colors) {
+            writeln!(ply, "{} {} {} {} {} {}", p[0], p[1], p[2], c[0], c[1], c[2]).unwrap();
+        }
+        std::fs::write(scene.join("points.ply"), ply).unwrap();
+    }
+
     /// Moves the whole scene by `offset`.
     pub fn shift(&mut self, offset: [f64; 3]) {
         let offset = DVec3::from_array(offset);
