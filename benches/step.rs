@@ -318,6 +318,10 @@ impl Renderer for Watched {
         "watched"
     }
 
+    fn host_bytes(&self) -> u64 {
+        self.inner.host_bytes()
+    }
+
     fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
         let before = self.begin.map_or(0.0, |t| t.elapsed().as_secs_f64());
         self.add("cull+gather", before);
