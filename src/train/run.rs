@@ -254,7 +254,8 @@ fn make_out(out: &Path, overwrite: bool) -> InputResult<()> {
     std::fs::create_dir_all(out).map_err(io)?;
     let probe = out.join(".gsscale-probe");
     std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(io)?;
-    if !overwrite {
+    // Without a run's config the files under our names are somebody else's (the points of a scene, say).
+    if !overwrite || !out.join("config.toml").is_file() {
         return Ok(());
     }
     for name in ["config.toml", "metrics.jsonl", "summary.json", "point_cloud.ply"] {

@@ -266,7 +266,7 @@ impl Trainer {
             if due(self.options.save_every) && !is_last {
                 self.save(dataset, &outputs.out.join(format!("point_cloud_{step:06}.ply")))?;
             }
-            if step.is_multiple_of(self.options.log_every) || is_last || due(self.options.eval_every) {
+            if due(self.options.log_every) || is_last || due(self.options.eval_every) {
                 outputs.metrics.write(&StepLine {
                     step,
                     loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },
