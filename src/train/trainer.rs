@@ -39,7 +39,9 @@ pub enum TrainError {
     #[error(transparent)]
     Input(#[from] InputError),
     /// The renderer.
-    #[error("rendering failed: {0}")]
+    #[error(
+        "rendering failed: {0}\n  remedy: make the photos smaller with --max-resolution or --data-factor; if they are not large, report a bug"
+    )]
     Render(#[from] RenderError),
     /// The loss was not finite several times in a row.
     #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
