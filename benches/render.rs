@@ -23,9 +23,9 @@ use gsscale::kernels::stages::STAGES;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::{Gradients, RenderOptions};
 use std::sync::atomic::AtomicU64;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 use support::floor::bare_blend_rate;
-use support::{Args, Hash, Seconds, least_time, machine, terrain, time};
+use support::{Args, Hash, machine, steady_time, terrain};
 
 fn main() {
     let args = Args::read();
@@ -37,11 +37,11 @@ fn main() {
     let threads = rayon::current_num_threads();
     for path in SimdPath::ALL.into_iter().filter(|p| p.is_supported() && args.path.is_none_or(|only| only == *p)) {
         for threads in if threads > 1 { vec![1, threads] } else { vec![1] } {
-            inner_loop(path, threads, 60);
+            inner_loop(path, threads, Duration::from_secs(1));
         }
     }
     let (width, height) = (960, 540);
-    let floor = bare_blend_rate(args.simd(), 400);
+    let floor = bare_blend_rate(args.simd(), Duration::from_secs(1));
     println!("{width}x{height}; floor {:.2} Gpixel-Gaussians/s a thread (bare blend loop)", floor / 1e9);
     let sizes = if args.sizes.is_empty() { vec![10_000, 100_000, 1_000_000] } else { args.sizes.clone() };
     for n in sizes {
@@ -53,7 +53,7 @@ fn main() {
 pub fn tiny() -> u64 {
     let mut hash = Hash::default();
     for path in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
-        inner_loop(path, 1, 1).iter().for_each(|x| hash.add(u64::from(x.to_bits())));
+        inner_loop(path, 1, Duration::ZERO).iter().for_each(|x| hash.add(u64::from(x.to_bits())));
     }
     measure(300, 48, 40, SimdPath::best(), 1e9, Duration::ZERO);
     hash.0
@@ -64,10 +64,10 @@ const INNER_SPLATS: usize = 2048;
 
 /// Prints the rate of the rasterizer's inner loop beside the bare loop's, both on `threads` threads; returns the
 /// picture of one tile.
-fn inner_loop(simd: SimdPath, threads: usize, repeats: usize) -> Vec<f32> {
+fn inner_loop(simd: SimdPath, threads: usize, least: Duration) -> Vec<f32> {
     let Ok(pool) = rayon::ThreadPoolBuilder::new().num_threads(threads).build() else { return Vec::new() };
     pool.install(|| {
-        let bare = bare_blend_rate(simd, 5 * repeats);
+        let bare = bare_blend_rate(simd, least);
         // Eight tiles a thread, so that threads get the same share.
         let grid = Grid::new(16 * 8 * threads as u32, 16);
         let splats: Vec<Splat> = (0..INNER_SPLATS).map(|i| wide_splat(i, grid.width as f32)).collect();
@@ -85,7 +85,7 @@ fn inner_loop(simd: SimdPath, threads: usize, repeats: usize) -> Vec<f32> {
             simd,
         };
         let mut raster = Raster::default();
-        let t = least_time(repeats, || rasterize_fwd(&lists, &mut raster));
+        let t = steady_time(least, || rasterize_fwd(&lists, &mut raster));
         let pairs = (grid.tiles() * INNER_SPLATS * TILE_PIXELS) as f64;
         assert!(raster.evaluated.iter().sum::<u64>() as f64 == pairs, "some pixel stopped early or was not reached");
         let rate = pairs / t.cpu;
@@ -120,31 +120,18 @@ fn wide_splat(i: usize, width: f32) -> Splat {
     }
 }
 
-/// The least of at least three runs and `least` of time, by CPU.
-fn seconds(least: Duration, mut work: impl FnMut()) -> Seconds {
-    let start = Instant::now();
-    let mut best = Seconds { wall: f64::INFINITY, cpu: f64::INFINITY };
-    let mut runs = 0;
-    while runs < 3 || start.elapsed() < least {
-        let t = time(&mut work);
-        best = Seconds { wall: best.wall.min(t.wall), cpu: best.cpu.min(t.cpu) };
-        runs += 1;
-    }
-    best
-}
-
 fn measure(n: usize, width: u32, height: u32, simd: SimdPath, floor: f64, least: Duration) {
     let (rows, camera) = terrain(n, width, height);
     let options = RenderOptions { sh_degree: 3, simd, ..RenderOptions::default() };
     let mut renderer = CpuRenderer::new();
     let mut grads = Gradients::default();
     let mut stages = [("", f64::INFINITY); STAGES.len()];
-    let forward = seconds(least, || {
+    let forward = steady_time(least, || {
         renderer.forward(&rows, &camera, &options);
         note_stages(&renderer, &mut stages);
     });
     let v_rgb: Vec<f32> = renderer.image().rgb.iter().map(|x| x - 0.5).collect();
-    let backward = seconds(least, || {
+    let backward = steady_time(least, || {
         renderer.backward(&rows, &v_rgb, None, &mut grads);
         note_stages(&renderer, &mut stages);
     });

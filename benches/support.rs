@@ -12,7 +12,7 @@ use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::Columns;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// What was asked for on the command line.
 #[derive(Debug, Clone, PartialEq)]
@@ -106,20 +106,28 @@ pub fn time(mut work: impl FnMut()) -> Seconds {
     Seconds { wall, cpu }
 }
 
-/// The medians of `runs` runs (at least one), wall and CPU each for itself.
-pub fn median_time(runs: usize, mut work: impl FnMut()) -> Seconds {
-    let runs: Vec<Seconds> = (0..runs.max(1)).map(|_| time(&mut work)).collect();
-    Seconds { wall: median(runs.iter().map(|s| s.wall)), cpu: median(runs.iter().map(|s| s.cpu)) }
-}
+/// Least length of what is timed at once: the system books the time of other running threads at its ticks only.
+const BATCH: Duration = Duration::from_millis(100);
 
-/// The least of `runs` runs (at least one), wall and CPU each for itself: for floors, which must not be overstated.
-pub fn least_time(runs: usize, mut work: impl FnMut()) -> Seconds {
-    let mut least = time(&mut work);
-    for _ in 1..runs {
-        let next = time(&mut work);
-        least = Seconds { wall: least.wall.min(next.wall), cpu: least.cpu.min(next.cpu) };
+/// Time of one run of `work`: the medians over batches of runs, for at least as long as `least`.
+pub fn steady_time(least: Duration, mut work: impl FnMut()) -> Seconds {
+    let (start, batch) = (Instant::now(), least.min(BATCH));
+    let mut batches = Vec::new();
+    loop {
+        let mut runs = 0.0;
+        let t = time(|| {
+            let begin = Instant::now();
+            while runs == 0.0 || begin.elapsed() < batch {
+                work();
+                runs += 1.0;
+            }
+        });
+        batches.push(Seconds { wall: t.wall / runs, cpu: t.cpu / runs });
+        if start.elapsed() >= least {
+            break;
+        }
     }
-    least
+    Seconds { wall: median(batches.iter().map(|s| s.wall)), cpu: median(batches.iter().map(|s| s.cpu)) }
 }
 
 /// The middle value; of an even number, the mean of the middle two. 0 of none.

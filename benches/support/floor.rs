@@ -1,34 +1,35 @@
 //! What this machine could do at best, as bare loops: blending in registers, copying memory.
 
-use super::least_time;
+use super::steady_time;
 use gsscale::base::simd::{Kernel, LANES, SimdPath, dispatch, fma};
 use gsscale::kernels::rasterize_fwd::exp2_bounded;
 use gsscale::kernels::splats::LOG2_ALPHA_MIN;
 use rayon::prelude::*;
+use std::time::Duration;
 
-/// Runs of which the best counts.
-const RUNS: usize = 5;
+/// Times that the bare loop goes through its splats in one run.
+const REPEATS: usize = 50;
 
-/// Pixel-Gaussians per CPU second and thread of a bare loop over splats that stay in the first cache level: no lists,
-/// no early stops, no edges, all pixels of a 16x16 tile, their state in registers.
-pub fn bare_blend_rate(simd: SimdPath, repeats: usize) -> f64 {
+/// Pixel-Gaussians per CPU second and thread of a bare loop over splats that stay in the first cache level, timed for
+/// as long as `least`: no lists, no early stops, no edges, all pixels of a 16x16 tile, their state in registers.
+pub fn bare_blend_rate(simd: SimdPath, least: Duration) -> f64 {
     let threads = rayon::current_num_threads();
     let splats: Vec<[f32; 8]> = (0..512)
         .map(|i| [(i % 16) as f32, (i / 32) as f32, -0.02, 0.01, -0.03, -6.0, 0.5, 0.25 + i as f32 * 1e-3])
         .collect();
-    let t = least_time(RUNS, || {
+    let t = steady_time(least, || {
         let sums: Vec<f32> =
-            (0..threads).into_par_iter().map(|_| dispatch(simd, Bare { splats: &splats, repeats })).collect();
+            (0..threads).into_par_iter().map(|_| dispatch(simd, Bare { splats: &splats, repeats: REPEATS })).collect();
         assert!(sums.iter().all(|s| s.is_finite()));
     });
-    (threads * repeats * splats.len() * 256) as f64 / t.cpu
+    (threads * REPEATS * splats.len() * 256) as f64 / t.cpu
 }
 
 /// Bytes read and written per CPU second and thread of a plain copy of `words` floats a thread.
-pub fn copy_rate(words: usize) -> f64 {
+pub fn copy_rate(words: usize, least: Duration) -> f64 {
     let threads = rayon::current_num_threads();
     let mut pairs: Vec<(Vec<f32>, Vec<f32>)> = (0..threads).map(|_| (vec![1.0; words], vec![0.0; words])).collect();
-    let t = least_time(RUNS, || {
+    let t = steady_time(least, || {
         pairs.par_iter_mut().for_each(|(from, to)| to.copy_from_slice(std::hint::black_box(from)));
         std::hint::black_box(&pairs);
     });

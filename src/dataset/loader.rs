@@ -123,6 +123,10 @@ pub fn load_dataset(raw: RawScene, options: &LoadOptions) -> InputResult<Dataset
     check_options(options)?;
     let mut warnings = raw.warnings;
     let image_folder = options.image_folder.clone().unwrap_or_else(|| image_folder_of(&raw.views));
+    let root = match raw.root.as_os_str().is_empty() {
+        true => image_folder.parent().unwrap_or(&image_folder).to_path_buf(),
+        false => raw.root.clone(),
+    };
     if raw.views.is_empty() {
         return Err(InputError::new(image_folder, "the scene has no registered view", "give a model with photos"));
     }
@@ -142,7 +146,7 @@ pub fn load_dataset(raw: RawScene, options: &LoadOptions) -> InputResult<Dataset
     }
     warn_about_extra_photos(&posed, &mut warnings);
     let present = drop_missing(posed, options, &image_folder, &mut warnings)?;
-    let photos = check_photos(&present, options, &image_folder, &mut warnings)?;
+    let photos = check_photos(&present, options, (&root, &image_folder), &mut warnings)?;
     let views: Vec<View> = present
         .into_iter()
         .zip(photos)
@@ -312,10 +316,10 @@ fn drop_missing(
 fn check_photos(
     views: &[(RawView, Split)],
     options: &LoadOptions,
-    image_folder: &Path,
+    (root, image_folder): (&Path, &Path),
     warnings: &mut Vec<String>,
 ) -> InputResult<Vec<PhotoSource>> {
-    let index = if options.masks { MaskIndex::scan(image_folder) } else { MaskIndex::default() };
+    let index = if options.masks { MaskIndex::scan(root, image_folder) } else { MaskIndex::default() };
     let checked: Vec<InputResult<PhotoSource>> =
         views.par_iter().map(|(view, _)| check_photo(view, &index, options)).collect();
     let bad = checked.iter().filter(|c| c.is_err()).count();

@@ -38,10 +38,12 @@ pub struct MaskIndex {
 }
 
 impl MaskIndex {
-    /// Lists `masks/` beside `image_folder`, then `masks/` inside it (the first wins). Missing folders are empty.
-    pub fn scan(image_folder: &Path) -> Self {
+    /// Lists `masks/` in the scene's folder, beside the image folder when that lies deeper, and inside it; the first
+    /// wins. Nothing outside the scene is looked at; missing folders are empty.
+    pub fn scan(root: &Path, image_folder: &Path) -> Self {
         let mut index = MaskIndex::default();
-        if let Some(parent) = image_folder.parent() {
+        index.add_folder(&root.join("masks"), "", 0);
+        if let Some(parent) = image_folder.parent().filter(|p| p.starts_with(root)) {
             index.add_folder(&parent.join("masks"), "", 0);
         }
         index.add_folder(&image_folder.join("masks"), "", 0);

@@ -89,6 +89,8 @@ pub struct PointCloud {
 /// Everything a reader found.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct RawScene {
+    /// The scene's own folder, where `masks/` may lie; empty when a scene was not read from files.
+    pub root: PathBuf,
     /// Views in sorted order of their names, names unique.
     pub views: Vec<RawView>,
     /// Points; may be empty.

@@ -23,7 +23,12 @@ pub struct ReadOptions {
 /// Whatever is wrong with the files; a path with neither says what was looked for.
 pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let facts = std::fs::metadata(path).map_err(|e| InputError::io(path, "opening the scene", &e))?;
-    if facts.is_file() {
+    let root = if facts.is_file() { path.parent().unwrap_or(Path::new("")) } else { path };
+    Ok(RawScene { root: root.to_path_buf(), ..read_kind(path, facts.is_file(), options)? })
+}
+
+fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<RawScene> {
+    if is_file {
         if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) {
             return transforms::read_transforms(path, options);
         }

@@ -246,6 +246,10 @@ impl Renderer for CpuRenderer {
         "cpu"
     }
 
+    fn host_bytes(&self) -> u64 {
+        self.scratch_bytes()
+    }
+
     fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
         let Camera { width, height, .. } = *camera;
         if width.max(height) > Grid::SIDE_MAX {

@@ -53,9 +53,9 @@ pub fn psnr(image: &Image, target: &Target) -> f64 {
 ///
 /// # Panics
 /// When picture and target differ in size.
-pub fn ssim(image: &Image, target: &Target, variant: SsimVariant) -> f64 {
+pub fn ssim(image: &Image, target: &Target, variant: SsimVariant, simd: SimdPath) -> f64 {
     let pair = ImagePair { clamp: true, ..ImagePair::new(image, target) };
-    mean_ssim(&pair, variant, SimdPath::best())
+    mean_ssim(&pair, variant, simd)
 }
 
 /// Mean over views: every view weighs the same, whatever its size (the field's convention, also for PSNR, which is
@@ -96,7 +96,7 @@ mod tests {
         assert!(psnr(&image, &target) > 144.0);
         for variant in SsimVariant::ALL {
             // f32 rounding of windowed sums, relative to C2 = 9e-4.
-            assert!((ssim(&image, &target, variant) - 1.0).abs() < 1e-5);
+            assert!((ssim(&image, &target, variant, SimdPath::best()) - 1.0).abs() < 1e-5);
         }
         let white = Target { width: 4, height: 3, rgb: vec![255; 36], mask: None };
         let mut bright = Image::new(4, 3);
@@ -120,14 +120,17 @@ mod tests {
         let mut mask = vec![255u8; 23 * 14];
         mask[100] = 0;
         target.mask = Some(mask);
-        let before = (psnr(&image, &target), SsimVariant::ALL.map(|v| ssim(&image, &target, v)));
+        let before = (psnr(&image, &target), SsimVariant::ALL.map(|v| ssim(&image, &target, v, SimdPath::best())));
         image.rgb[100] = f32::NAN;
-        assert_eq!(before, (psnr(&image, &target), SsimVariant::ALL.map(|v| ssim(&image, &target, v))));
+        assert_eq!(
+            before,
+            (psnr(&image, &target), SsimVariant::ALL.map(|v| ssim(&image, &target, v, SimdPath::best())))
+        );
         image.rgb[101] = f32::NAN;
         assert!(psnr(&image, &target).is_nan());
-        assert!(SsimVariant::ALL.iter().all(|&v| ssim(&image, &target, v).is_nan()));
+        assert!(SsimVariant::ALL.iter().all(|&v| ssim(&image, &target, v, SimdPath::best()).is_nan()));
         target.mask = Some(vec![0; 23 * 14]);
-        assert!(psnr(&image, &target).is_nan() && ssim(&image, &target, SsimVariant::Same).is_nan());
+        assert!(psnr(&image, &target).is_nan() && ssim(&image, &target, SsimVariant::Same, SimdPath::best()).is_nan());
     }
 
     #[test]

@@ -85,6 +85,9 @@ pub trait Renderer: Send {
     /// Name for reports.
     fn name(&self) -> &'static str;
 
+    /// Host memory held for views, bytes.
+    fn host_bytes(&self) -> u64;
+
     /// Renders `rows` as seen by `camera`.
     ///
     /// # Errors

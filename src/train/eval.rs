@@ -59,10 +59,10 @@ pub fn evaluate(
         if target.counts() {
             psnrs.push(json_psnr(psnr(image, &target)));
             // No window of the map may count although some pixels at the border do.
-            ssims.extend(Some(ssim(image, &target, request.ssim)).filter(|x| !x.is_nan()));
+            ssims.extend(Some(ssim(image, &target, request.ssim, options.simd)).filter(|x| !x.is_nan()));
         }
         if let Some(folder) = request.pictures {
-            write_pair(folder, &dataset.views[view].name, image, &target)?;
+            write_pair(&picture_path(folder, dataset, view), image, &target)?;
         }
     }
     if psnrs.is_empty() {
@@ -72,15 +72,21 @@ pub fn evaluate(
     Ok(Some(TestMetrics { views: psnrs.len() as u32, psnr: mean(&psnrs), ssim }))
 }
 
-/// File of the picture of a view: its name with folders and extension folded in.
-pub fn picture_path(folder: &Path, view_name: &str) -> PathBuf {
-    let flat = view_name.replace(['/', '\\'], "_");
-    let stem = flat.rsplit_once('.').map_or(flat.as_str(), |(stem, _)| stem);
-    folder.join(format!("{stem}.png"))
+/// File of the picture of a view: its name, folders folded in, without the extension; with its number in front where
+/// two views would share a file.
+fn picture_path(folder: &Path, dataset: &Dataset, view: usize) -> PathBuf {
+    let flat = |name: &str| {
+        let flat = name.replace(['/', '\\'], "_");
+        flat.rsplit_once('.').map_or(flat.clone(), |(stem, _)| stem.to_string())
+    };
+    let stem = flat(&dataset.views[view].name);
+    let is_shared = dataset.views.iter().filter(|v| flat(&v.name) == stem).count() > 1;
+    folder.join(if is_shared { format!("{view:05}_{stem}.png") } else { format!("{stem}.png") })
 }
 
 /// Writes render (left) beside photo (right).
-fn write_pair(folder: &Path, view_name: &str, image: &Image, target: &Target) -> InputResult<()> {
+fn write_pair(path: &Path, image: &Image, target: &Target) -> InputResult<()> {
+    let folder = path.parent().unwrap_or(path);
     std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder for pictures", &e))?;
     let (w, h) = (image.width as usize, image.height as usize);
     let render = image.to_rgb8();
@@ -89,9 +95,8 @@ fn write_pair(folder: &Path, view_name: &str, image: &Image, target: &Target) ->
         both.extend_from_slice(&render[3 * w * y..3 * w * (y + 1)]);
         both.extend_from_slice(&target.rgb[3 * w * y..3 * w * (y + 1)]);
     }
-    let path = picture_path(folder, view_name);
-    image::save_buffer(&path, &both, 2 * image.width, image.height, image::ExtendedColorType::Rgb8)
-        .map_err(|e| InputError::new(&path, format!("writing the picture failed: {e}"), "check the disk and its space"))
+    image::save_buffer(path, &both, 2 * image.width, image.height, image::ExtendedColorType::Rgb8)
+        .map_err(|e| InputError::new(path, format!("writing the picture failed: {e}"), "check the disk and its space"))
 }
 
 /// What `gsscale-eval` prints.

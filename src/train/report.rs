@@ -18,7 +18,7 @@ pub const PSNR_PERFECT: f64 = 100.0;
 pub struct StepLine {
     /// 0-based step.
     pub step: u32,
-    /// Loss of the step's view.
+    /// Loss of the step's view; the largest f64 when it was not finite and the step was skipped.
     pub loss: f64,
     /// PSNR of the step's view, unclamped, dB.
     pub psnr: f64,

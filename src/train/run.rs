@@ -167,8 +167,11 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     for warning in &prepared.dataset.warnings {
         eprintln!("warning: {warning}");
     }
-    let memory = estimate(config, &prepared.dataset, &prepared.columns)?;
-    say(&describe(request, &prepared, &memory));
+    let Prepared { dataset, columns, sh_degree_start } = prepared;
+    let options = RunOptions { sh_degree_start, ..RunOptions::new(config, dataset.scene_scale) };
+    let mut trainer = Trainer::new(columns, &dataset, Box::new(CpuRenderer::new()), options);
+    let memory = estimate(config, &dataset, &mut trainer)?;
+    say(&describe(request, &dataset, trainer.state.rows(), &memory));
     if let Some(free) = host_bytes_available().filter(|&free| free < memory.total()) {
         eprintln!(
             "warning: the run may need {}, but {} are free: lower --max-gaussians, --image-cache, --sh-degree or the \
@@ -182,18 +185,19 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     make_out(&request.out, request.overwrite)?;
-    train_into(request, prepared, &stop)
+    train_into(request, &dataset, trainer, &stop)
 }
 
-fn train_into(request: &RunRequest, prepared: Prepared, stop: &StopFlag) -> Result<RunOutcome, TrainError> {
+fn train_into(
+    request: &RunRequest,
+    dataset: &Dataset,
+    mut trainer: Trainer,
+    stop: &StopFlag,
+) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
-    let Prepared { dataset, columns, sh_degree_start } = prepared;
-    let dataset = &dataset;
-    write_config(&out.join("config.toml"), config, &resolved(request, dataset, columns.rows()))?;
+    write_config(&out.join("config.toml"), config, &resolved(request, dataset, trainer.state.rows()))?;
     let mut metrics = MetricsLog::create(&out.join("metrics.jsonl"))?;
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-    let options = RunOptions { sh_degree_start, ..RunOptions::new(config, dataset.scene_scale) };
-    let mut trainer = Trainer::new(columns, dataset, Box::new(CpuRenderer::new()), options);
     let mut progress = Progress::new(config.steps, request.quiet);
     let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop };
     let looped = trainer.run(dataset, &targets, &mut outputs);
@@ -250,7 +254,8 @@ fn make_out(out: &Path, overwrite: bool) -> InputResult<()> {
     std::fs::create_dir_all(out).map_err(io)?;
     let probe = out.join(".gsscale-probe");
     std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(io)?;
-    if !overwrite {
+    // Without a run's config the files under our names are somebody else's (the points of a scene, say).
+    if !overwrite || !out.join("config.toml").is_file() {
         return Ok(());
     }
     for name in ["config.toml", "metrics.jsonl", "summary.json", "point_cloud.ply"] {
@@ -297,8 +302,8 @@ fn resolved(request: &RunRequest, dataset: &Dataset, rows: usize) -> Resolved {
 }
 
 /// What was understood and what it will take, for people.
-fn describe(request: &RunRequest, prepared: &Prepared, memory: &MemoryEstimate) -> String {
-    let (config, dataset) = (&request.config, &prepared.dataset);
+fn describe(request: &RunRequest, dataset: &Dataset, rows: usize, memory: &MemoryEstimate) -> String {
+    let config = &request.config;
     let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
     let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
     let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
@@ -319,7 +324,7 @@ fn describe(request: &RunRequest, prepared: &Prepared, memory: &MemoryEstimate) 
         request.scene.display(),
         dataset.train_views().len(),
         dataset.test_views().len(),
-        prepared.columns.rows(),
+        rows,
         config.sh_degree,
         config.steps,
         rayon::current_num_threads(),

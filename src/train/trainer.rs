@@ -4,7 +4,7 @@
 //! cadences of logging and evaluation; 2. a step whose loss is not finite changes nothing, and three in a row end
 //! the run with what the last good step left.
 
-use super::catch_up::{apply_event, evaluate_all};
+use super::catch_up::{apply_event, evaluate_all, gather, visible_rows};
 use super::eval::{EvalRequest, evaluate};
 use super::memory::host_bytes_peak;
 use super::progress::Progress;
@@ -21,6 +21,7 @@ use crate::optim::deferred::DeferredAdam;
 use crate::render::{RenderError, RenderOptions, Renderer};
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
+use crate::scene::image::Target;
 use crate::scene::state::SceneState;
 use crate::schedule::order::ShuffledOrder;
 use std::path::{Path, PathBuf};
@@ -38,7 +39,9 @@ pub enum TrainError {
     #[error(transparent)]
     Input(#[from] InputError),
     /// The renderer.
-    #[error("rendering failed: {0}")]
+    #[error(
+        "rendering failed: {0}\n  remedy: make the photos smaller with --max-resolution or --data-factor; if they are not large, report a bug"
+    )]
     Render(#[from] RenderError),
     /// The loss was not finite several times in a row.
     #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
@@ -115,6 +118,32 @@ impl Trainer {
             steps_skipped_in_a_row: 0,
             train_seconds: 0.0,
         }
+    }
+
+    /// Renders `count` views spread over the dataset, forward and backward, so that the memory of a view is allocated;
+    /// changes no state. Returns the most pixels of a view.
+    ///
+    /// # Errors
+    /// A view cannot be rendered.
+    pub fn probe_views(&mut self, dataset: &Dataset, count: usize) -> Result<usize, RenderError> {
+        let WorkingSet { row_from_working, columns, gradients } = &mut self.working;
+        let mut pixels = 0;
+        for view in dataset.views.iter().step_by(dataset.views.len().div_ceil(count)) {
+            let camera = &view.camera;
+            visible_rows(&self.state, &self.adam, 0, camera, row_from_working);
+            gather(&self.state, &self.adam, 0, row_from_working, columns);
+            self.renderer.forward(columns, camera, &self.options.render)?;
+            let rgb = vec![0; 3 * camera.pixels()];
+            let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
+            self.renderer.loss_backward(columns, &target, &self.options.loss, gradients)?;
+            pixels = pixels.max(camera.pixels());
+        }
+        Ok(pixels)
+    }
+
+    /// Bytes held for one view: its rows, gradients, intermediates and images.
+    pub fn view_bytes(&self) -> u64 {
+        self.renderer.host_bytes() + self.working.bytes() as u64
     }
 
     /// Steps done.
@@ -239,7 +268,7 @@ impl Trainer {
             if due(self.options.save_every) && !is_last {
                 self.save(dataset, &outputs.out.join(format!("point_cloud_{step:06}.ply")))?;
             }
-            if step.is_multiple_of(self.options.log_every) || is_last || due(self.options.eval_every) {
+            if due(self.options.log_every) || is_last || due(self.options.eval_every) {
                 outputs.metrics.write(&StepLine {
                     step,
                     loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },

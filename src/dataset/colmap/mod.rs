@@ -98,7 +98,7 @@ pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene>
     let unit = if model.is_binary { "byte" } else { "line" };
     let views = make_views(&images_path, unit, &image_folder, &cameras, images, &mut warnings)?;
     let (points, points_path) = read_points(&model, &mut warnings)?;
-    Ok(RawScene { views, points, points_path, warnings })
+    Ok(RawScene { views, points, points_path, warnings, ..RawScene::default() })
 }
 
 /// Every model folder, in a fixed order.
