@@ -15,6 +15,7 @@ Examples:
   gsscale-train scans/village --out runs/village    a COLMAP scene: images/ and sparse/0/
   gsscale-train scans/village --out runs/quick --steps 7000 --max-resolution 800
   gsscale-train scans/village --out runs/big --max-gaussians 2000000 --config configs/in_core.toml
+  gsscale-train scans/village --out runs/gpu --device gpu   on a GPU; --list-devices shows which there are
   gsscale-train scans/village --dry-run             what was understood, and the memory it will take
 
 Results in --out: point_cloud.ply (opens in any splat viewer), renders/test/*.png (render beside photo),
@@ -25,10 +26,10 @@ summary.json, metrics.jsonl, config.toml (every setting of the run; usable with 
 #[command(name = "gsscale-train", version, after_help = EXAMPLES)]
 struct Args {
     /// Scene: a COLMAP folder (images/, sparse/), or a folder with transforms.json
-    #[arg(required_unless_present = "demo")]
+    #[arg(required_unless_present_any = ["demo", "list_devices"])]
     scene: Option<PathBuf>,
     /// Output folder
-    #[arg(long, short, required_unless_present = "dry_run")]
+    #[arg(long, short, required_unless_present_any = ["dry_run", "list_devices"])]
     out: Option<PathBuf>,
     /// Config file; flags override it
     #[arg(long)]
@@ -39,6 +40,9 @@ struct Args {
     /// Print what was understood and the memory it will take, then stop
     #[arg(long)]
     dry_run: bool,
+    /// Print the GPUs that --device can choose from, best first, then stop
+    #[arg(long)]
+    list_devices: bool,
     /// Replace the results of an earlier run in --out
     #[arg(long)]
     overwrite: bool,
@@ -51,6 +55,10 @@ struct Args {
 
 fn main() -> ExitCode {
     let args = parse();
+    if args.list_devices {
+        list_devices();
+        return ExitCode::SUCCESS;
+    }
     let quiet = args.quiet;
     match start(args) {
         Ok(outcome) => finish(&outcome, quiet),
@@ -59,6 +67,14 @@ fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+/// One line for each adapter; the CPU renderer is always there.
+fn list_devices() {
+    for adapter in gsscale::gpu::list_adapters() {
+        println!("{adapter}");
+    }
+    println!("cpu: the CPU renderer");
 }
 
 /// The command line; clap prints help and usage errors itself.

@@ -147,6 +147,11 @@ config_keys! {
         threads: u32 = 0;
         /// Instruction path: auto, avx512, avx2 or baseline. Results are the same bits per path
         simd: String = "auto".into();
+        /// What renders: auto (a hardware GPU if there is one, else the CPU), gpu (a software adapter counts too), cpu,
+        /// or a part of the name of one of --list-devices
+        device: String = "auto".into();
+        /// Memory that may be taken on the device; 0 = what the device has
+        device_mem: ByteSize = ByteSize(0);
     }
 }
 
@@ -300,6 +305,9 @@ impl TrainConfig {
     }
 
     fn check_names(&self) -> InputResult<()> {
+        if self.device.trim().is_empty() {
+            return refuse("device", "auto, gpu, cpu, or a part of the name of one of --list-devices");
+        }
         let names: [(&str, &str, &[&str]); 5] = [
             ("ssim-padding", &self.ssim_padding, &["valid", "same"]),
             ("strategy", &self.strategy, &["default", "none"]),

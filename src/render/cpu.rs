@@ -251,16 +251,7 @@ impl Renderer for CpuRenderer {
     }
 
     fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
-        let Camera { width, height, .. } = *camera;
-        if width.max(height) > Grid::SIDE_MAX {
-            return Err(RenderError::ImageTooLarge { width, height });
-        }
-        if rows.rows() >= u32::MAX as usize {
-            return Err(RenderError::TooManyRows(rows.rows()));
-        }
-        if options.sh_degree > rows.sh_degree {
-            return Err(RenderError::ShDegree { asked: options.sh_degree, stored: rows.sh_degree });
-        }
+        super::check_view(rows, camera, options)?;
         self.forward(rows, camera, options);
         Ok(())
     }

@@ -1,12 +1,15 @@
 //! The stages in order: forward, loss, backward; and image metrics.
 
 pub mod cpu;
+pub mod gpu;
 pub mod gpu_loss;
 pub mod gpu_rows;
 pub mod gpu_tiles;
 pub mod metrics;
 
 use crate::base::simd::SimdPath;
+use crate::gpu::GpuError;
+pub use crate::gpu::Traffic;
 pub use crate::kernels::image_loss::{LossOptions, LossValue, SsimPadding};
 use crate::kernels::splats::Grid;
 use crate::scene::camera::Camera;
@@ -78,12 +81,59 @@ pub enum RenderError {
     /// `image` or `loss_backward` came before `forward`, or with other rows.
     #[error("no view was rendered from these rows yet")]
     NoForward,
+    /// The device could not do its part, or the view does not fit it; the stage or buffer is named.
+    #[error(transparent)]
+    Device(#[from] GpuError),
+}
+
+impl RenderError {
+    /// What the user can do about it; `None` when the text says so itself.
+    pub fn remedy(&self) -> Option<&'static str> {
+        match self {
+            RenderError::Device(GpuError::OutOfBudget { .. } | GpuError::OutOfMemory { .. }) => None,
+            RenderError::Device(GpuError::BufferTooLarge { .. } | GpuError::BindingTooLarge { .. }) => {
+                Some("make the photos smaller with --max-resolution or --data-factor, or render with --device cpu")
+            }
+            RenderError::Device(GpuError::DeviceLost { .. }) => {
+                Some("update the graphics driver if this happens again, or render with --device cpu")
+            }
+            RenderError::Device(_) => Some("render with --device cpu, and report a bug"),
+            _ => Some(
+                "make the photos smaller with --max-resolution or --data-factor; if they are not large, report a bug",
+            ),
+        }
+    }
+}
+
+/// Whether a view can be rendered at all, on any backend.
+fn check_view(rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
+    let Camera { width, height, .. } = *camera;
+    if width.max(height) > Grid::SIDE_MAX {
+        return Err(RenderError::ImageTooLarge { width, height });
+    }
+    if rows.rows() >= u32::MAX as usize {
+        return Err(RenderError::TooManyRows(rows.rows()));
+    }
+    if options.sh_degree > rows.sh_degree {
+        return Err(RenderError::ShDegree { asked: options.sh_degree, stored: rows.sh_degree });
+    }
+    Ok(())
 }
 
 /// Renders one view at a time: `forward`, then what is wanted of it.
 pub trait Renderer: Send {
     /// Name for reports.
     fn name(&self) -> &'static str;
+
+    /// The device, for reports.
+    fn device(&self) -> String {
+        self.name().to_string()
+    }
+
+    /// What crossed the bus to the device so far, and its memory; zeros where there is no device.
+    fn traffic(&self) -> Traffic {
+        Traffic::default()
+    }
 
     /// Host memory held for views, bytes.
     fn host_bytes(&self) -> u64;

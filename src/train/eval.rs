@@ -12,7 +12,6 @@ use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{PlyContent, PlyMeta, read_ply, to_local};
 use crate::optim::deferred::DeferredAdam;
-use crate::render::cpu::CpuRenderer;
 use crate::render::metrics::{SsimVariant, mean, psnr, ssim};
 use crate::render::{RenderOptions, Renderer};
 use crate::scene::columns::Columns;
@@ -162,7 +161,11 @@ pub fn evaluate_ply(
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let views = dataset.test_views();
     let request = EvalRequest { views: &views, ssim: run.ssim_variant, pictures };
-    let test = evaluate((&state, &adam, 0), &mut CpuRenderer::new(), (&dataset, &targets), &render, &request)?;
+    let (mut renderer, word) = machine::renderer(config)?;
+    if let Some(word) = word {
+        eprintln!("{word}");
+    }
+    let test = evaluate((&state, &adam, 0), &mut *renderer, (&dataset, &targets), &render, &request)?;
     Ok(EvalReport {
         ply: ply.to_path_buf(),
         scene: scene.to_path_buf(),

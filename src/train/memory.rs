@@ -38,12 +38,18 @@ impl MemoryEstimate {
     }
 }
 
-/// Estimates a run before its first step. The trainer renders a few views for it and keeps the memory for its own
+/// Estimates a run before its first step; `driver` bytes were taken by the graphics driver when it was looked for a
+/// device. The trainer renders a few views for it and keeps the memory for its own
 /// steps: allocating it twice would break the heap into pieces and the promise with it.
 ///
 /// # Errors
 /// A view cannot be rendered.
-pub fn estimate(config: &TrainConfig, dataset: &Dataset, trainer: &mut Trainer) -> Result<MemoryEstimate, RenderError> {
+pub fn estimate(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &mut Trainer,
+    driver: u64,
+) -> Result<MemoryEstimate, RenderError> {
     let rows = trainer.state.rows() as u64;
     let rows_max = if config.strategy == "none" { rows } else { rows.max(config.max_gaussians) };
     let pixels = trainer.probe_views(dataset, PROBE_VIEWS)? as u64;
@@ -58,13 +64,18 @@ pub fn estimate(config: &TrainConfig, dataset: &Dataset, trainer: &mut Trainer) 
         view: of_pixels + ((held - of_pixels) as f64 * growth) as u64,
         targets: config.image_cache.0.min(TargetCache::bytes_to_keep_all(&dataset.views, decoders)),
         export: rows_max * row_width(config.sh_degree) as u64 * 4,
-        base: BASE_BYTES + trainer.adam.bytes() as u64,
+        base: BASE_BYTES + trainer.adam.bytes() as u64 + driver,
     })
 }
 
 /// The largest resident size of this process so far, bytes; `None` where the system does not tell.
 pub fn host_bytes_peak() -> Option<u64> {
     status_field("VmHWM:")
+}
+
+/// The resident size of this process now, bytes; `None` where the system does not tell.
+pub fn host_bytes_now() -> Option<u64> {
+    status_field("VmRSS:")
 }
 
 /// Memory that programs could still take on this machine, bytes.

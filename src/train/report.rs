@@ -28,6 +28,12 @@ pub struct StepLine {
     pub seconds: f64,
     /// Largest resident size so far, bytes.
     pub host_bytes_peak: u64,
+    /// Bytes that this step sent to the device; 0 on the CPU.
+    pub bytes_uploaded: u64,
+    /// Bytes that this step brought back from the device.
+    pub bytes_read_back: u64,
+    /// Most device memory allocated so far, bytes.
+    pub device_bytes_peak: u64,
     /// Evaluation on the held-out views, where one was due.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub test: Option<TestMetrics>,
@@ -139,6 +145,8 @@ pub struct Resolved {
     pub simd: String,
     /// Worker threads in use.
     pub threads: usize,
+    /// What renders: "cpu", or the name of the GPU with its driver.
+    pub device: String,
     /// Training views.
     pub train_views: usize,
     /// Held-out views.

@@ -5,7 +5,7 @@
 
 use super::eval::ply_warnings;
 use super::machine;
-use super::memory::{MemoryEstimate, estimate, host_bytes_available, host_bytes_peak};
+use super::memory::{MemoryEstimate, estimate, host_bytes_available, host_bytes_now, host_bytes_peak};
 use super::progress::Progress;
 use super::report::{MetricsLog, Resolved, Summary, write_config, write_summary};
 use super::signals::StopFlag;
@@ -19,7 +19,6 @@ use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
-use crate::render::cpu::CpuRenderer;
 use crate::scene::columns::Columns;
 use crate::scene::init::{gaussians_from_points, random_points_in_frusta};
 use std::path::{Path, PathBuf};
@@ -169,9 +168,15 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     }
     let Prepared { dataset, columns, sh_degree_start } = prepared;
     let options = RunOptions { sh_degree_start, ..RunOptions::new(config, dataset.scene_scale) };
-    let mut trainer = Trainer::new(columns, &dataset, Box::new(CpuRenderer::new()), options);
-    let memory = estimate(config, &dataset, &mut trainer)?;
-    say(&describe(request, &dataset, trainer.state.rows(), &memory));
+    let before = host_bytes_now().unwrap_or(0);
+    let (renderer, word) = machine::renderer(config)?;
+    let driver = host_bytes_now().unwrap_or(0).saturating_sub(before);
+    if let Some(word) = word {
+        say(&word);
+    }
+    let mut trainer = Trainer::new(columns, &dataset, renderer, options);
+    let memory = estimate(config, &dataset, &mut trainer, driver)?;
+    say(&describe(request, &dataset, &trainer, &memory));
     if let Some(free) = host_bytes_available().filter(|&free| free < memory.total()) {
         eprintln!(
             "warning: the run may need {}, but {} are free: lower --max-gaussians, --image-cache, --sh-degree or the \
@@ -195,7 +200,7 @@ fn train_into(
     stop: &StopFlag,
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
-    write_config(&out.join("config.toml"), config, &resolved(request, dataset, trainer.state.rows()))?;
+    write_config(&out.join("config.toml"), config, &resolved(request, dataset, &trainer))?;
     let mut metrics = MetricsLog::create(&out.join("metrics.jsonl"))?;
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let mut progress = Progress::new(config.steps, request.quiet);
@@ -286,15 +291,16 @@ fn remove_saved(out: &Path) -> InputResult<()> {
     Ok(())
 }
 
-fn resolved(request: &RunRequest, dataset: &Dataset, rows: usize) -> Resolved {
+fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer) -> Resolved {
     Resolved {
         version: env!("CARGO_PKG_VERSION").to_string(),
         scene: request.scene.clone(),
         simd: limits::simd_path(&request.config).name().to_string(),
         threads: rayon::current_num_threads(),
+        device: trainer.renderer.device(),
         train_views: dataset.train_views().len(),
         test_views: dataset.test_views().len(),
-        gaussians: rows as u64,
+        gaussians: trainer.state.rows() as u64,
         origin: dataset.frame.origin.to_array(),
         scale: dataset.frame.scale,
         scene_scale: f64::from(dataset.scene_scale) * dataset.frame.scale,
@@ -302,8 +308,8 @@ fn resolved(request: &RunRequest, dataset: &Dataset, rows: usize) -> Resolved {
 }
 
 /// What was understood and what it will take, for people.
-fn describe(request: &RunRequest, dataset: &Dataset, rows: usize, memory: &MemoryEstimate) -> String {
-    let config = &request.config;
+fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, memory: &MemoryEstimate) -> String {
+    let (config, rows) = (&request.config, trainer.state.rows());
     let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
     let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
     let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
@@ -319,7 +325,7 @@ fn describe(request: &RunRequest, dataset: &Dataset, rows: usize, memory: &Memor
     let text = format!(
         "scene   {}: {} views to train on, {} held out, at most {size}\n\
          start   {} Gaussians, SH degree {}{growth}\n\
-         run     {} steps on {} threads ({}){results}\n\
+         run     {} steps on {} threads ({}), rendered by {}{results}\n\
          memory  about {} at the peak\n{}{}{}{}{}",
         request.scene.display(),
         dataset.train_views().len(),
@@ -329,6 +335,7 @@ fn describe(request: &RunRequest, dataset: &Dataset, rows: usize, memory: &Memor
         config.steps,
         rayon::current_num_threads(),
         limits::simd_path(config).name(),
+        trainer.renderer.device(),
         format_bytes(memory.total()),
         part("Gaussians with their optimizer state", memory.state),
         part("one view: rows, gradients, images", memory.view),

@@ -39,9 +39,7 @@ pub enum TrainError {
     #[error(transparent)]
     Input(#[from] InputError),
     /// The renderer.
-    #[error(
-        "rendering failed: {0}\n  remedy: make the photos smaller with --max-resolution or --data-factor; if they are not large, report a bug"
-    )]
+    #[error("rendering failed: {0}{remedy}", remedy = .0.remedy().map_or(String::new(), |r| format!("\n  remedy: {r}")))]
     Render(#[from] RenderError),
     /// The loss was not finite several times in a row.
     #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
@@ -258,7 +256,9 @@ impl Trainer {
         let mut last_test: Option<TestMetrics> = None;
         while self.step < self.options.steps && outputs.stop.exit_code().is_none() {
             let step = self.step;
+            let before = self.renderer.traffic();
             let outcome = self.step(dataset, targets)?;
+            let traffic = self.renderer.traffic();
             let is_last = self.step == self.options.steps;
             let due = |every: u32| step > 0 && step.is_multiple_of(every);
             let psnr = json_psnr(-10.0 * outcome.loss.mse.log10());
@@ -276,6 +276,9 @@ impl Trainer {
                     gaussians: self.state.rows() as u64,
                     seconds: self.train_seconds,
                     host_bytes_peak: host_bytes_peak().unwrap_or(0),
+                    bytes_uploaded: traffic.bytes_uploaded - before.bytes_uploaded,
+                    bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
+                    device_bytes_peak: traffic.device_bytes_peak,
                     test: last_test.filter(|_| due(self.options.eval_every) && !is_last),
                 })?;
             }

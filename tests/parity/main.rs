@@ -5,6 +5,7 @@
 #[path = "../support/mod.rs"]
 mod support;
 
+mod frame;
 mod loss;
 mod rows;
 mod tiles;

@@ -1,0 +1,349 @@
+//! The stages in order on a GPU, forward and backward, on the rows of one view at a time.
+//!
+//! Not here: the stages themselves (`gpu_rows`, `gpu_tiles`, `gpu_loss`), the device and its memory (`crate::gpu`).
+//!
+//! Invariants: 1. only the rows of the last view, its lists and its picture are on the device; 2. the same input gives
+//! the same bits on the same device; 3. a picture is never returned from buffers that were too small: such a frame is
+//! recorded again with larger ones; 4. after an error there is no view until the next `forward`.
+
+use super::gpu_loss::{LossStage, value};
+use super::gpu_rows::{DeviceColumns, RowStages, band_into_sh_n};
+use super::gpu_tiles::{Blend, Demand, Frame, Ranks, TileStages, splat_bytes};
+use super::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
+use crate::gpu::{Buffer, Gpu, GpuResult, Readback, Recorder, Traffic};
+use crate::kernels::image_loss::LossPlan;
+use crate::kernels::splats::Grid;
+use crate::kernels::uniforms::pack_target;
+use crate::scene::camera::Camera;
+use crate::scene::columns::Columns;
+use crate::scene::image::{Image, Target};
+
+/// Floats of a splat on the host.
+type SplatRecord = [f32; 12];
+
+/// What the device holds of the last view.
+#[derive(Debug)]
+struct View {
+    camera: Camera,
+    options: RenderOptions,
+    columns: DeviceColumns,
+    splats: Buffer,
+    ranks: Ranks,
+    frame: Frame,
+    demand: Demand,
+    /// Whether `image` holds its picture.
+    image_is_read: bool,
+}
+
+/// Host memory that is kept between views.
+#[derive(Debug, Default)]
+struct Scratch {
+    band: Vec<f32>,
+    target: Vec<u32>,
+    splats: Vec<SplatRecord>,
+    v_splats: Vec<SplatRecord>,
+}
+
+/// Renders views on a GPU.
+#[derive(Debug)]
+pub struct GpuRenderer {
+    gpu: Gpu,
+    rows: RowStages,
+    tiles: TileStages,
+    loss: LossStage,
+    view: Option<View>,
+    image: Image,
+    scratch: Scratch,
+    frames_again: u64,
+}
+
+/// Gradients on their way to the host.
+struct GradientReadbacks {
+    columns: Vec<Readback>,
+    splats: Readback,
+    v_splats: Readback,
+    sums: Option<Readback>,
+}
+
+impl GpuRenderer {
+    /// Compiles the stages for `gpu`.
+    ///
+    /// # Errors
+    /// The device refuses a shader.
+    pub fn new(gpu: Gpu) -> GpuResult<Self> {
+        Ok(GpuRenderer {
+            rows: RowStages::new(&gpu)?,
+            tiles: TileStages::new(&gpu)?,
+            loss: LossStage::new(&gpu)?,
+            gpu,
+            view: None,
+            image: Image::default(),
+            scratch: Scratch::default(),
+            frames_again: 0,
+        })
+    }
+
+    /// The device.
+    pub fn gpu(&self) -> &Gpu {
+        &self.gpu
+    }
+
+    /// Sets how many intersections the next view has room for; it grows again on demand.
+    pub fn set_capacity(&mut self, isects: u32) {
+        self.tiles.set_capacity(isects);
+    }
+
+    /// Frames so far that were recorded again because their buffers were too small.
+    pub fn frames_again(&self) -> u64 {
+        self.frames_again
+    }
+
+    /// Coverage 1 - T of the last picture, `[height][width]`.
+    ///
+    /// # Errors
+    /// Without a forward pass, or when the device failed.
+    pub fn alpha(&mut self) -> Result<Vec<f32>, RenderError> {
+        let view = self.view.as_ref().ok_or(RenderError::NoForward)?;
+        let mut alpha = vec![0.0; view.camera.pixels()];
+        let mut recorder = self.gpu.begin("coverage");
+        let bytes = recorder.read_back("rasterize_fwd", &view.frame.t_final.view())?;
+        self.gpu.submit(recorder)?;
+        bytes.copy_to(&self.gpu, &mut alpha)?;
+        alpha.iter_mut().for_each(|t| *t = 1.0 - *t);
+        Ok(alpha)
+    }
+
+    fn render(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> GpuResult<View> {
+        let gpu = &self.gpu;
+        // The caller has checked that the count fits.
+        let count = rows.rows() as u32;
+        let columns = DeviceColumns::new(gpu, count, options.sh_degree)?;
+        let splats = gpu.buffer("splats", splat_bytes(count))?;
+        let mut recorder = gpu.begin("forward");
+        columns.upload(&mut recorder, rows, &mut self.scratch.band)?;
+        self.rows.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, &splats)?;
+        self.rows.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, &splats)?;
+        let grid = Grid::new(camera.width, camera.height);
+        let blend = Blend { grid, background: options.background, max_alpha: options.max_alpha };
+        let ranks = self.tiles.order(gpu, &mut recorder, &splats.view(), count, grid)?;
+        loop {
+            let (frame, demand) = self.tiles.frame(gpu, &mut recorder, &splats.view(), &ranks, blend)?;
+            gpu.submit(recorder)?;
+            let demand = demand.wait(gpu)?;
+            if self.tiles.fits(&frame, demand)? {
+                let (camera, options) = (*camera, *options);
+                return Ok(View { camera, options, columns, splats, ranks, frame, demand, image_is_read: false });
+            }
+            self.frames_again += 1;
+            drop(frame);
+            recorder = gpu.begin("forward again");
+        }
+    }
+
+    fn read_image(&mut self, view: &View) -> GpuResult<()> {
+        let Camera { width, height, .. } = view.camera;
+        let mut recorder = self.gpu.begin("picture");
+        let bytes = recorder.read_back("rasterize_fwd", &view.frame.rgb.view())?;
+        self.gpu.submit(recorder)?;
+        (self.image.width, self.image.height) = (width, height);
+        self.image.rgb.resize(3 * view.camera.pixels(), 0.0);
+        bytes.copy_to(&self.gpu, &mut self.image.rgb)
+    }
+
+    /// Records the backward stages behind `v_rgb`, and what is read back of them.
+    fn record_backward(
+        &self,
+        recorder: &mut Recorder<'_>,
+        view: &View,
+        v_rgb: &Buffer,
+        v_alpha: Option<&Buffer>,
+    ) -> GpuResult<GradientReadbacks> {
+        let (gpu, camera, splats) = (&self.gpu, &view.camera, &view.splats);
+        let (eps2d, sh_degree) = (view.options.eps2d, view.options.sh_degree);
+        let v_splats = gpu.buffer("v_splats", splat_bytes(view.ranks.rows))?;
+        let v_alpha = v_alpha.map(Buffer::view);
+        self.tiles.backward(
+            gpu,
+            recorder,
+            &splats.view(),
+            &view.ranks,
+            &view.frame,
+            view.demand,
+            &v_rgb.view(),
+            v_alpha.as_ref(),
+            &v_splats.view(),
+        )?;
+        let grads = DeviceColumns::new(gpu, view.ranks.rows, sh_degree)?;
+        self.rows.sh_bwd(gpu, recorder, camera, sh_degree, &view.columns, splats, &v_splats, &grads)?;
+        self.rows.project_bwd(gpu, recorder, camera, eps2d, &view.columns, splats, &v_splats, &grads)?;
+        let columns = grads.columns().map(|(buffer, _)| recorder.read_back("project_bwd", &buffer.view()));
+        Ok(GradientReadbacks {
+            columns: columns.collect::<GpuResult<_>>()?,
+            splats: recorder.read_back("project_fwd", &splats.view())?,
+            v_splats: recorder.read_back("rasterize_bwd", &v_splats.view())?,
+            sums: None,
+        })
+    }
+
+    fn run_loss(
+        &mut self,
+        view: &View,
+        target: &Target,
+        plan: &LossPlan,
+        sh_degree: u8,
+        grads: &mut Gradients,
+    ) -> GpuResult<LossValue> {
+        let gpu = &self.gpu;
+        pack_target(target, &mut self.scratch.target);
+        let mut recorder = gpu.begin("backward");
+        let pixels = recorder.buffer_with("target", &self.scratch.target)?;
+        let v_rgb = gpu.buffer("v_rgb", view.frame.rgb.size())?;
+        let size = [target.width, target.height];
+        let (rgb, target) = (view.frame.rgb.view(), pixels.view());
+        let sums = self.loss.run(gpu, &mut recorder, size, plan, &rgb, &target, &v_rgb.view())?;
+        let sums = sums.map(|sums| recorder.read_back("image_loss", &sums.slice(0, 16))).transpose()?;
+        let back = self.record_backward(&mut recorder, view, &v_rgb, None)?;
+        gpu.submit(recorder)?;
+        let sums = self.finish(view, GradientReadbacks { sums, ..back }, sh_degree, grads)?;
+        Ok(value(plan, sums))
+    }
+
+    /// Waits for the gradients and puts them where the caller wants them; returns the sums of the loss.
+    fn finish(
+        &mut self,
+        view: &View,
+        back: GradientReadbacks,
+        sh_degree: u8,
+        grads: &mut Gradients,
+    ) -> GpuResult<[f32; 4]> {
+        let rows = view.ranks.rows as usize;
+        let mut sums = [0.0f32; 4];
+        if let Some(bytes) = back.sums {
+            bytes.copy_to(&self.gpu, &mut sums)?;
+        }
+        let out = &mut grads.columns;
+        out.sh_degree = sh_degree;
+        out.resize(rows);
+        if view.options.sh_degree < sh_degree {
+            out.sh_n.fill(0.0); // bands that are not in use
+        }
+        let mut columns = back.columns.into_iter();
+        let narrow = [&mut out.means, &mut out.quats, &mut out.scales, &mut out.opacities, &mut out.sh0];
+        for (to, bytes) in narrow.into_iter().zip(columns.by_ref()) {
+            bytes.copy_to(&self.gpu, to)?;
+        }
+        for (band, bytes) in columns.enumerate() {
+            let values = &mut self.scratch.band;
+            values.clear();
+            values.resize(rows * super::gpu_rows::BAND_WIDTHS[band], 0.0);
+            bytes.copy_to(&self.gpu, values)?;
+            band_into_sh_n(values, band, out);
+        }
+        let Scratch { splats, v_splats, .. } = &mut self.scratch;
+        for (to, bytes) in [(&mut *splats, back.splats), (&mut *v_splats, back.v_splats)] {
+            to.resize(rows, [0.0; 12]);
+            bytes.copy_to(&self.gpu, to)?;
+        }
+        grads.radii.clear();
+        grads.radii.extend(splats.iter().map(|s| [s[7] as u32, s[11] as u32]));
+        grads.means2d.clear();
+        let is_drawn = |splat: &SplatRecord| splat[7] > 0.0;
+        let v_mean = |(s, v): (&SplatRecord, &SplatRecord)| if is_drawn(s) { [v[0], v[1]] } else { [0.0; 2] };
+        grads.means2d.extend(splats.iter().zip(v_splats.iter()).map(v_mean));
+        Ok(sums)
+    }
+
+    /// Gradients of the last view's rows, from `v_rgb` (`[3][height][width]`) and `v_alpha` (`[height][width]`), as
+    /// [`super::cpu::CpuRenderer::backward`].
+    ///
+    /// # Errors
+    /// Without a forward pass of these rows, or when the device failed.
+    pub fn backward(
+        &mut self,
+        rows: &Columns,
+        v_rgb: &[f32],
+        v_alpha: Option<&[f32]>,
+        grads: &mut Gradients,
+    ) -> Result<(), RenderError> {
+        let view = self.take_view(rows)?;
+        let gpu = &self.gpu;
+        let mut recorder = gpu.begin("backward");
+        let v_rgb = recorder.buffer_with("v_rgb", v_rgb)?;
+        let v_alpha = v_alpha.map(|v| recorder.buffer_with("v_alpha", v)).transpose()?;
+        let back = self.record_backward(&mut recorder, &view, &v_rgb, v_alpha.as_ref())?;
+        gpu.submit(recorder)?;
+        self.finish(&view, back, rows.sh_degree, grads)?;
+        self.view = Some(view);
+        Ok(())
+    }
+
+    /// The last view, if it is one of so many rows.
+    fn take_view(&mut self, rows: &Columns) -> Result<View, RenderError> {
+        match self.view.take() {
+            Some(view) if view.ranks.rows as usize == rows.rows() => Ok(view),
+            other => {
+                self.view = other;
+                Err(RenderError::NoForward)
+            }
+        }
+    }
+}
+
+impl Renderer for GpuRenderer {
+    fn name(&self) -> &'static str {
+        "gpu"
+    }
+
+    fn device(&self) -> String {
+        let summary = self.gpu.summary();
+        format!("{} ({})", summary.name, summary.backend)
+    }
+
+    fn traffic(&self) -> Traffic {
+        self.gpu.traffic()
+    }
+
+    fn host_bytes(&self) -> u64 {
+        let s = &self.scratch;
+        let floats = s.band.capacity() + s.target.capacity() + self.image.rgb.capacity();
+        let records = s.splats.capacity() + s.v_splats.capacity();
+        (4 * floats + size_of::<SplatRecord>() * records) as u64 + self.gpu.traffic().staging_bytes
+    }
+
+    fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
+        super::check_view(rows, camera, options)?;
+        // What the last view held is free for this one.
+        self.view = None;
+        self.view = Some(self.render(rows, camera, options)?);
+        Ok(())
+    }
+
+    fn image(&mut self) -> Result<&Image, RenderError> {
+        let mut view = self.view.take().ok_or(RenderError::NoForward)?;
+        if !view.image_is_read {
+            self.read_image(&view)?;
+            view.image_is_read = true;
+        }
+        self.view = Some(view);
+        Ok(&self.image)
+    }
+
+    fn loss_backward(
+        &mut self,
+        rows: &Columns,
+        target: &Target,
+        options: &LossOptions,
+        grads: &mut Gradients,
+    ) -> Result<LossValue, RenderError> {
+        let view = self.take_view(rows)?;
+        let (image, size) = ((view.camera.width, view.camera.height), (target.width, target.height));
+        if size != image {
+            self.view = Some(view);
+            return Err(RenderError::TargetSize { target: size, image });
+        }
+        let plan = LossPlan::new(size.0 as usize, size.1 as usize, target.mask.as_deref(), options);
+        let value = self.run_loss(&view, target, &plan, rows.sh_degree, grads)?;
+        self.view = Some(view);
+        Ok(value)
+    }
+}

@@ -1,0 +1,117 @@
+//! Whole runs on a GPU through the real binary: the quality of the CPU renderer, what crosses the bus, and a choice of
+//! device that is explained.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+
+#[path = "support/gpu.rs"]
+mod gpu;
+#[path = "support/scenes.rs"]
+mod scenes;
+
+use gsscale::gpu::GpuOptions;
+use scenes::{city, eval, psnr, stderr, text, train};
+use std::path::Path;
+use tempfile::TempDir;
+
+const SHORT: &[&str] = &["--steps", "60", "--strategy", "none", "--sh-every", "20", "--log-every", "1"];
+
+fn run(scene: &Path, out: &Path, more: &[&str]) -> String {
+    let args = [&[text(scene), "--out", text(out)], SHORT, more].concat();
+    let output = train(&args);
+    assert!(output.status.success(), "{}", stderr(&output));
+    stderr(&output)
+}
+
+/// metrics.jsonl of a run.
+fn metrics(out: &Path) -> Vec<serde_json::Value> {
+    let lines = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
+    lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+#[test]
+fn a_gpu_trains_as_the_cpu_does() {
+    let Some(device) = gpu::open(&GpuOptions::default()) else { return };
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 16, 128, 96, 1200);
+    let [on_cpu, on_gpu] = ["cpu", "gpu"].map(|name| folder.path().join(name));
+    run(&scene, &on_cpu, &["--device", "cpu"]);
+    let said = run(&scene, &on_gpu, &["--device", "gpu"]);
+    assert!(said.contains(&device.summary().name), "{said}");
+    let resolved = std::fs::read_to_string(on_gpu.join("config.toml")).unwrap();
+    assert!(resolved.contains(&device.summary().name), "{resolved}");
+    // Roundings grow with every step, in both directions; a thousand steps are to stay within 0.1 dB.
+    let (want, got) = (psnr(&on_cpu), psnr(&on_gpu));
+    println!("test PSNR after 60 steps: {want:.3} dB on the CPU, {got:.3} dB on the GPU");
+    assert!((want - got).abs() < 0.1, "{got} dB, on the CPU {want} dB");
+    let lines = metrics(&on_gpu);
+    assert!(want > metrics(&on_cpu)[0]["psnr"].as_f64().unwrap() + 1.0, "60 steps are training");
+    for line in &lines {
+        for key in ["bytes_uploaded", "bytes_read_back", "device_bytes_peak"] {
+            assert!(line[key].as_u64().unwrap() > 0, "{key}: {line}");
+        }
+        // At most all rows of 59 floats with their splats, a photo of 4 bytes a pixel, and 64 KiB of counts and uniforms.
+        let most = 1200 * (59 * 4 + 96) + 128 * 96 * 4 + (64 << 10);
+        assert!(line["bytes_uploaded"].as_u64().unwrap() < most && line["bytes_read_back"].as_u64().unwrap() < most);
+    }
+    for line in metrics(&on_cpu) {
+        assert_eq!((&line["bytes_uploaded"], &line["device_bytes_peak"]), (&0.into(), &0.into()));
+    }
+    // The same command gives the same file.
+    let again = folder.path().join("again");
+    run(&scene, &again, &["--device", "gpu"]);
+    let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
+    assert!(ply(&on_gpu) == ply(&again), "two runs of the same command differ");
+    // The PLY alone gives the run's numbers, on the device that its config names.
+    let report = eval(&[text(&on_gpu), text(&scene)]);
+    assert!(report.status.success(), "{}", stderr(&report));
+}
+
+#[test]
+fn a_view_beyond_the_budget_ends_the_run_with_need_and_remedy() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 128, 96, 400);
+    let out = folder.path().join("run");
+    let args = [&[text(&scene), "--out", text(&out), "--device", "gpu", "--device-mem", "1MiB"], SHORT].concat();
+    let output = train(&args);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("bytes of device memory") && said.contains("remedy: raise --device-mem"), "{said}");
+    assert!(!out.join("point_cloud.ply").exists(), "nothing was trained");
+}
+
+#[test]
+fn devices_are_listed_and_an_unknown_one_is_refused() {
+    let output = train(&["--list-devices"]);
+    let listed = String::from_utf8(output.stdout).unwrap();
+    assert!(output.status.success() && listed.ends_with("cpu: the CPU renderer\n"), "{listed}");
+    if let Some(device) = gpu::open(&GpuOptions::default()) {
+        assert!(listed.contains(&device.summary().to_string()), "{listed}");
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 64, 48, 200);
+    let out = folder.path().join("run");
+    let output = train(&[text(&scene), "--out", text(&out), "--device", "no such device"]);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(
+        said.contains("--device") && said.contains("'no such device'") && said.contains("--list-devices"),
+        "{said}"
+    );
+    assert!(!out.exists(), "bad input leaves nothing behind");
+}
+
+#[test]
+fn auto_never_takes_a_software_adapter() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 64, 48, 200);
+    let output = train(&[text(&scene), "--dry-run"]);
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    let has_hardware = gsscale::gpu::list_adapters()
+        .iter()
+        .any(|a| a.kind != gsscale::gpu::DeviceKind::Software && a.refusal.is_none());
+    assert_eq!(said.contains("there is no hardware GPU: the CPU renders"), !has_hardware, "{said}");
+    assert_eq!(said.contains("rendered by cpu"), !has_hardware, "{said}");
+}
