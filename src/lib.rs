@@ -15,7 +15,7 @@
 //!
 //! | module | what it is responsible for |
 //! | --- | --- |
-//! | [`base`] | ids, random draws, deterministic math, instruction paths, errors; knows neither Gaussians nor disks |
+//! | [`base`] | errors, random draws, deterministic math, instruction paths, errors; knows neither Gaussians nor disks |
 //! | [`scene`] | Gaussians, cameras and images as data; first Gaussians from points; the log of global events |
 //! | [`dataset`] | where views come from: COLMAP, transforms.json, the generated city; decoding photos |
 //! | [`schedule`] | which view comes when |

@@ -34,7 +34,7 @@ struct Args {
     /// Config file; flags override it
     #[arg(long)]
     config: Option<PathBuf>,
-    /// Generate a small city into <out>/scene and train on it
+    /// Generate a small city into `scene` inside --out and train on it
     #[arg(long, conflicts_with = "scene")]
     demo: bool,
     /// Print what was understood and the memory it will take, then stop

@@ -1,4 +1,4 @@
-//! What the user wrote ([`file`]) and what follows from it ([`limits`]).
+//! What the user wrote ([`mod@file`]) and what follows from it ([`limits`]).
 
 pub mod file;
 pub mod limits;

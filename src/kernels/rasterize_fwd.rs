@@ -8,7 +8,7 @@
 //! a tile have no contribution, so the image has the same bits as the plain loop over all splats of the tile; 3. AVX2
 //! and AVX-512 give the same bits; 4. tiles are independent, so threads cannot change a bit.
 //!
-//! The unit of work is a pixel row of a tile, 16 lanes, through a block of splats (see [`super::tile_block`]). Dead
+//! The unit of work is a pixel row of a tile, 16 lanes, through a block of splats (see `tile_block`). Dead
 //! lanes (stopped, or outside the image) keep T = 0, so they add nothing, and a `floor` of -1, so they never stop
 //! again: that spares the inner loop every other test.
 

@@ -230,6 +230,25 @@ fn views_that_do_not_fit_are_errors_that_name_need_limit_and_remedy() {
 }
 
 #[test]
+fn a_view_allocates_nothing_once_warm_and_uploads_its_rows_only() {
+    let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
+    let (view, options, target) = (scene(4000, 160, 112), RenderOptions::default(), photo(160, 112, false));
+    let mut step = || {
+        let before = gpu.traffic();
+        results(&mut gpu, &view, &options, &target);
+        let after = gpu.traffic();
+        (after.device_allocations - before.device_allocations, after.bytes_uploaded - before.bytes_uploaded)
+    };
+    step();
+    step();
+    let (allocations, uploaded) = step();
+    assert_eq!(allocations, 0);
+    // 59 floats a row, a word a pixel; 64 KiB of counts and uniforms.
+    let least = 4000 * 59 * 4 + 160 * 112 * 4;
+    assert!((least..least + (64 << 10)).contains(&uploaded), "{uploaded} bytes, {least} at least");
+}
+
+#[test]
 fn misuse_is_an_error() {
     let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
     let (rows, camera) = scene(10, 32, 32);
@@ -248,7 +267,17 @@ fn misuse_is_an_error() {
 }
 
 /// The reference files: see `tests/oracle/raster.rs`, whose limits are those of the files' README.
-const FILES: [&str; 5] = ["raster_single", "raster_small", "raster_odd_bg", "raster_white_bg", "raster_dense_a990"];
+const FILES: [&str; 9] = [
+    "raster_single",
+    "raster_small",
+    "raster_odd_bg",
+    "raster_white_bg",
+    "raster_stress",
+    "raster_large",
+    "raster_dense_a990",
+    "raster_dense_a999",
+    "garden",
+];
 
 fn open_reference(name: &str) -> Option<(Fixture, Columns, Camera, RenderOptions)> {
     let file = Fixture::open(name)?;
@@ -329,6 +358,7 @@ fn assert_gradients(name: &str, file: &Fixture, grads: &Gradients) {
     ] {
         let error = l2(got, want);
         println!("{name}: {column} {error:.1e}");
-        assert!(error < 5e-5, "{name}: {column} {error}");
+        let limit = if name == "raster_stress" { 5e-3 } else { 5e-5 };
+        assert!(error < limit, "{name}: {column} {error}");
     }
 }

@@ -4,7 +4,7 @@
 //! 2. memory grows with the views and points that are kept, not with tracks or 2D points; 3. a view is left out, with
 //! a warning that names it, only for its own pose; anything that makes the rest of a file doubtful is an error.
 //!
-//! Camera models 0 to 6, 8 and 9 can be used ([`models`]); rigs and frames files are ignored, since the images file
+//! Camera models 0 to 6, 8 and 9 can be used (the table is in `models`); rigs and frames files are ignored, since the images file
 //! holds every pose. Image and point numbers are not looked at: views are identified by name.
 
 mod binary;
