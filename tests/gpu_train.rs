@@ -7,8 +7,16 @@ mod gpu;
 #[path = "support/scenes.rs"]
 mod scenes;
 
+use gsscale::config::file::TrainConfig;
+use gsscale::config::limits::RunOptions;
+use gsscale::dataset::target_cache::TargetCache;
 use gsscale::gpu::GpuOptions;
-use scenes::{city, eval, psnr, stderr, text, train};
+use gsscale::render::Traffic;
+use gsscale::render::gpu::GpuRenderer;
+use gsscale::scene::columns::Column;
+use gsscale::train::run::{Prepared, prepare};
+use gsscale::train::trainer::Trainer;
+use scenes::{city, eval, psnr, stderr, summary, text, train};
 use std::path::Path;
 use tempfile::TempDir;
 
@@ -79,6 +87,71 @@ fn a_view_beyond_the_budget_ends_the_run_with_need_and_remedy() {
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("bytes of device memory") && said.contains("remedy: raise --device-mem"), "{said}");
     assert!(!out.join("point_cloud.ply").exists(), "nothing was trained");
+}
+
+#[test]
+fn a_run_that_outgrows_the_budget_leaves_its_last_good_step() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 128, 96, 1200);
+    let short = folder.path().join("short");
+    run(&scene, &short, &["--device", "gpu"]);
+    let enough = metrics(&short).last().unwrap()["device_bytes_peak"].as_u64().unwrap();
+    let out = folder.path().join("run");
+    let budget = (enough + enough / 8).to_string();
+    let growing = ["--steps", "200", "--refine-start", "9", "--refine-every", "10", "--grow-grad2d", "0"];
+    let args = ["--device", "gpu", "--device-mem", &budget, "--max-gaussians", "60000"];
+    let output = train(&[&[text(&scene), "--out", text(&out)], &growing[..], &args].concat());
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("bytes of device memory") && said.contains("remedy: raise --device-mem"), "{said}");
+    let summary = summary(&out);
+    let (steps, rows) = (summary["steps"].as_u64().unwrap(), summary["gaussians"].as_u64().unwrap());
+    assert!(summary["finished"] == false && steps > 0 && steps < 200 && rows > 1200, "{summary}");
+    let ply = std::fs::read(out.join("point_cloud.ply")).unwrap();
+    let header = String::from_utf8_lossy(&ply[..ply.len().min(4096)]).into_owned();
+    assert!(header.contains(&format!("element vertex {rows}\n")), "{header}");
+}
+
+/// What the third and fourth step upload and allocate, of a scene `times` as large whose other rows no camera sees.
+fn steps_of_a_scene(scene: &Path, times: usize) -> Option<(Vec<usize>, Traffic, Traffic)> {
+    let renderer = GpuRenderer::new(gpu::open(&GpuOptions::default())?).unwrap();
+    let config = TrainConfig { steps: 10, strategy: "none".into(), ..TrainConfig::default() };
+    let Prepared { dataset, mut columns, .. } = prepare(scene, &config).unwrap();
+    let rows = columns.rows();
+    // Against the direction in which the cameras look, all of them: they look down on the city.
+    let away: Vec<f32> = (0..3).map(|i| dataset.views.iter().map(|v| -v.camera.viewmat[2][i]).sum::<f32>()).collect();
+    let small = columns.clone();
+    columns.resize(times * rows);
+    for column in Column::ALL {
+        let copies = small.column(column).repeat(times);
+        columns.column_mut(column).copy_from_slice(&copies);
+    }
+    for (i, x) in columns.means.iter_mut().enumerate().skip(3 * rows) {
+        *x += 100.0 * dataset.scene_scale * away[i % 3];
+    }
+    let mut trainer =
+        Trainer::new(columns, &dataset, Box::new(renderer), RunOptions::new(&config, dataset.scene_scale));
+    let targets = TargetCache::new(&dataset.views, 1 << 30, 1).unwrap();
+    let step = |trainer: &mut Trainer| trainer.step(&dataset, &targets).unwrap().rows;
+    let mut seen = vec![step(&mut trainer), step(&mut trainer)];
+    let before = trainer.renderer.traffic();
+    seen.extend([step(&mut trainer), step(&mut trainer)]);
+    Some((seen, before, trainer.renderer.traffic()))
+}
+
+#[test]
+fn what_no_camera_sees_costs_the_device_nothing() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 128, 96, 1500);
+    let (Some(small), Some(large)) = (steps_of_a_scene(&scene, 1), steps_of_a_scene(&scene, 10)) else { return };
+    assert!(small.0.iter().all(|&rows| rows > 100), "{:?}", small.0);
+    assert_eq!(small.0, large.0, "both see the same rows");
+    assert_eq!(small.1, large.1, "before the steps");
+    assert_eq!(small.2, large.2, "after the steps");
+    assert!(small.2.bytes_uploaded > small.1.bytes_uploaded);
 }
 
 #[test]

@@ -10,7 +10,7 @@ use super::gpu_loss::{LossStage, value};
 use super::gpu_rows::{DeviceColumns, RowStages, band_into_sh_n};
 use super::gpu_tiles::{Blend, Demand, Frame, Ranks, TileStages, splat_bytes};
 use super::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
-use crate::gpu::{Buffer, Gpu, GpuResult, Readback, Recorder, Traffic};
+use crate::gpu::{Buffer, DeviceKind, Gpu, GpuResult, Readback, Recorder, Traffic};
 use crate::kernels::image_loss::LossPlan;
 use crate::kernels::splats::Grid;
 use crate::kernels::uniforms::pack_target;
@@ -307,7 +307,11 @@ impl Renderer for GpuRenderer {
         let s = &self.scratch;
         let floats = s.band.capacity() + s.target.capacity() + self.image.rgb.capacity();
         let records = s.splats.capacity() + s.v_splats.capacity();
-        (4 * floats + size_of::<SplatRecord>() * records) as u64 + self.gpu.traffic().staging_bytes
+        let traffic = self.gpu.traffic();
+        // Such adapters have no memory of their own.
+        let is_shared = matches!(self.gpu.summary().kind, DeviceKind::Integrated | DeviceKind::Software);
+        let device = if is_shared { traffic.device_bytes_peak } else { 0 };
+        (4 * floats + size_of::<SplatRecord>() * records) as u64 + traffic.staging_bytes + device
     }
 
     fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
