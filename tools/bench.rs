@@ -4,7 +4,7 @@
 use clap::Parser;
 use gsscale::base::error::InputError;
 use gsscale::base::machine::{cpu_model, process_cpu_seconds};
-use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::config::limits::{RunOptions, simd_path};
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::render::cpu::CpuRenderer;
@@ -41,7 +41,7 @@ struct Args {
 }
 
 fn main() -> ExitCode {
-    match start(Args::parse()) {
+    match start(parse_command_line()) {
         Ok(line) => {
             println!("{line}");
             ExitCode::SUCCESS

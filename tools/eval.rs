@@ -1,8 +1,8 @@
 //! `gsscale-eval`: held-out PSNR and SSIM of a PLY (or of a run's PLY). Parses, calls the library, prints.
 
-use clap::{CommandFactory, FromArgMatches, Parser};
+use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::config::file::{TrainConfig, TrainOverrides, help_with_defaults};
+use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::train::eval::evaluate_ply;
 use gsscale::train::report::write_whole;
 use gsscale::train::trainer::TrainError;
@@ -37,19 +37,13 @@ struct Args {
 }
 
 fn main() -> ExitCode {
-    match start(parse()) {
+    match start(parse_command_line()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error}");
             ExitCode::FAILURE
         }
     }
-}
-
-/// The command line; clap prints help and usage errors itself.
-fn parse() -> Args {
-    let matches = help_with_defaults(Args::command()).get_matches();
-    Args::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
 }
 
 fn start(args: Args) -> Result<(), TrainError> {

@@ -1,8 +1,8 @@
 //! `gsscale-train`: trains a scene from photos to a PLY. Parses, calls the library, prints.
 
-use clap::{CommandFactory, FromArgMatches, Parser};
+use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::config::file::{TrainConfig, TrainOverrides, help_with_defaults};
+use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::train::run::{RunOutcome, RunRequest, run};
 use gsscale::train::trainer::TrainError;
@@ -54,7 +54,7 @@ struct Args {
 }
 
 fn main() -> ExitCode {
-    let args = parse();
+    let args: Args = parse_command_line();
     if args.list_devices {
         list_devices();
         return ExitCode::SUCCESS;
@@ -75,12 +75,6 @@ fn list_devices() {
         println!("{adapter}");
     }
     println!("cpu: the CPU renderer");
-}
-
-/// The command line; clap prints help and usage errors itself.
-fn parse() -> Args {
-    let matches = help_with_defaults(Args::command()).get_matches();
-    Args::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
 }
 
 fn start(args: Args) -> Result<RunOutcome, TrainError> {

@@ -334,9 +334,15 @@ fn refuse(key: &str, allowed: &str) -> InputResult<()> {
     Err(InputError::new(format!("--{key}"), "the value is out of range", format!("use {allowed}")))
 }
 
+/// Parses the command line of a program whose flags hold [`TrainOverrides`]; prints help and usage errors itself.
+pub fn parse_command_line<T: clap::CommandFactory + clap::FromArgMatches>() -> T {
+    let matches = help_with_defaults(T::command()).get_matches();
+    T::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
+}
+
 /// The command with the default of each key in its help. (The flags have no clap defaults: an absent flag must leave
 /// the config file's value alone.)
-pub fn help_with_defaults(mut command: clap::Command) -> clap::Command {
+fn help_with_defaults(mut command: clap::Command) -> clap::Command {
     let defaults = toml::Table::try_from(TrainConfig::default()).unwrap_or_default();
     for (_, name, _) in KEYS {
         let Some(value) = defaults.get(&name.replace('_', "-")) else { continue };
