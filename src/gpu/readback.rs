@@ -98,12 +98,6 @@ impl Readback {
         self.size
     }
 
-    /// Whether the bytes have arrived; never waits.
-    pub fn is_ready(&self, gpu: &Gpu) -> bool {
-        let _ = gpu.device.poll(wgpu::PollType::Poll); // an error shows when the bytes are asked for
-        self.state.load(Ordering::Acquire) >= MAPPED
-    }
-
     /// Waits, then yields the elements.
     ///
     /// # Errors

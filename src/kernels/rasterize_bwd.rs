@@ -364,6 +364,20 @@ mod tests {
         partials.iter().flatten().map(|x| f32::from_bits(x.load(Relaxed))).collect()
     }
 
+    /// 1e8 - 1e8 + 1 is 1 from the left; from the right, or paired otherwise, the 1 is lost to rounding.
+    #[test]
+    fn sums_of_a_row_are_folded_from_the_left() {
+        let partial = |x: f32| -> Partial { std::array::from_fn(|_| AtomicU32::new(x.to_bits())) };
+        let partials = [5.0, 1e8, -1e8, 1.0].map(partial);
+        let mut projected = Projected::default();
+        projected.resize(2);
+        projected.opacities.fill(1.0);
+        let mut out = FootprintGradients::default();
+        fold_rows(&[1, 3], &[0], &partials, &projected, &mut out);
+        assert_eq!(out.v_colors, [[5.0; 3], [1.0; 3]]);
+        assert_eq!(out.v_opacities, [5.0, 1.0]);
+    }
+
     #[test]
     fn rows_that_are_skipped_add_nothing() {
         for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {

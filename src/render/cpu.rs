@@ -168,11 +168,6 @@ impl CpuRenderer {
         &self.projected
     }
 
-    /// Gradients of the last view's footprints and colours, after [`CpuRenderer::backward`].
-    pub fn footprint_gradients(&self) -> &FootprintGradients {
-        &self.footprints
-    }
-
     /// Gradients of the last view's rows, from `v_rgb` (`[3][height][width]`) and `v_alpha` (`[height][width]`).
     /// Every entry of `grads` is written; rows that were not drawn get zeros.
     ///

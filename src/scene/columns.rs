@@ -106,13 +106,6 @@ impl Columns {
         4 * (floats + self.opacities.capacity() + self.sh0.capacity() + self.sh_n.capacity())
     }
 
-    /// Sets every value to zero.
-    pub fn fill_zero(&mut self) {
-        for column in Column::ALL {
-            self.column_mut(column).fill(0.0);
-        }
-    }
-
     /// The floats of one column.
     pub fn column(&self, column: Column) -> &[f32] {
         match column {
