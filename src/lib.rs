@@ -40,6 +40,7 @@ pub mod exchange;
 pub mod gpu;
 pub mod kernels;
 pub mod optim;
+pub mod page;
 pub mod render;
 pub mod scene;
 pub mod schedule;

@@ -11,21 +11,59 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("scene", &["base"]),
     ("dataset", &["base", "scene"]),
     ("schedule", &["base", "scene"]),
+    ("page", &["base"]),
+    ("cache", &["base", "page"]),
+    ("paging", &["base", "scene", "page", "cache", "schedule"]),
+    ("checkpoint", &["base", "scene", "page"]),
     ("gpu", &["base"]),
     ("kernels", &["base", "scene"]),
     ("optim", &["base", "scene"]),
     ("densify", &["base", "scene", "optim"]),
     ("render", &["base", "scene", "gpu", "kernels"]),
     ("exchange", &["base", "scene"]),
-    ("config", &["base", "scene", "dataset", "schedule", "kernels", "optim", "densify", "gpu", "render", "exchange"]),
+    (
+        "config",
+        &[
+            "base",
+            "scene",
+            "dataset",
+            "schedule",
+            "kernels",
+            "optim",
+            "densify",
+            "gpu",
+            "render",
+            "exchange",
+            "page",
+            "cache",
+            "paging",
+            "checkpoint",
+        ],
+    ),
     (
         "train",
-        &["base", "scene", "dataset", "schedule", "kernels", "optim", "densify", "gpu", "render", "exchange", "config"],
+        &[
+            "base",
+            "scene",
+            "dataset",
+            "schedule",
+            "page",
+            "cache",
+            "paging",
+            "checkpoint",
+            "kernels",
+            "optim",
+            "densify",
+            "gpu",
+            "render",
+            "exchange",
+            "config",
+        ],
     ),
 ];
 
 /// Files that may hold `unsafe`, each block with its argument.
-const UNSAFE_FILES: &[&str] = &["src/base/simd.rs"];
+const UNSAFE_FILES: &[&str] = &["src/base/simd.rs", "src/page/mmap_store.rs", "src/page/uring_store.rs"];
 
 const FUNCTION_LINES_MAX: usize = 80;
 

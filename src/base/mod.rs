@@ -2,6 +2,7 @@
 //! Nothing here knows a Gaussian, a picture or a disk format.
 
 pub mod error;
+pub mod ids;
 pub mod machine;
 pub mod math;
 pub mod rng;

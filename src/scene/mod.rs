@@ -6,5 +6,7 @@ pub mod events;
 pub mod image;
 pub mod init;
 pub mod neighbours;
+pub mod page_layout;
+pub mod page_meta;
 pub mod rows;
 pub mod state;

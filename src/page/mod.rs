@@ -1,0 +1,4 @@
+//! Pages as bytes: buffers, slots on disk and the engines that move between them. Nothing here knows what a page holds.
+
+pub mod buffer;
+pub mod store;

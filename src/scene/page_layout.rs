@@ -1,0 +1,208 @@
+//! Where the rows of one page lie in its bytes: the same in memory and, uncompressed, on disk.
+//!
+//! Tables follow each other, each padded to [`TABLE_ALIGNMENT`]: identities and statistics, then the column groups
+//! geometry (means, quats, scales), appearance (opacities, sh0) and the higher bands, each column as values, first
+//! moments, second moments. Bands that a page does not use take no bytes: its degree is part of the layout.
+//!
+//! Invariants: 1. a layout is a function of (rows, degree) alone; 2. tables do not overlap and their padding is zero;
+//! 3. more rows or a higher degree never make the payload shorter. Little-endian machines only, which is checked at
+//! compile time.
+
+use super::columns::{Column, Columns};
+use super::rows::{ColumnsMut, ColumnsRef, Rows, RowsMut};
+use super::state::SceneState;
+use bytemuck::{AnyBitPattern, NoUninit};
+
+const _: () = assert!(cfg!(target_endian = "little"), "pages on disk are little-endian");
+
+/// Every table starts at a multiple of this within the payload, bytes: one vector register, one cache line.
+pub const TABLE_ALIGNMENT: usize = 64;
+
+/// The layout of a page's payload.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PageLayout {
+    /// Rows in the page.
+    pub rows: usize,
+    /// Degree that the page is stored with, 0 to 3.
+    pub sh_degree: u8,
+}
+
+impl PageLayout {
+    /// Bytes of the payload: at least [`super::state::row_bytes`] a row, plus padding.
+    pub fn bytes(&self) -> usize {
+        let floats = |width: usize| padded(self.rows * width * 4);
+        let columns: usize = Column::ALL.iter().map(|c| 3 * floats(c.width(self.sh_degree))).sum();
+        padded(self.rows * 8) + 3 * floats(1) + columns
+    }
+
+    /// The rows in `payload`, numbered from `first_row` in the table of a working set. Panics when it is shorter than
+    /// [`PageLayout::bytes`] or not aligned to 8 bytes.
+    pub fn rows<'a>(&self, payload: &'a [u8], first_row: usize) -> Rows<'a> {
+        let mut rest = payload;
+        let uid = take(&mut rest, self.rows);
+        let stamp = take(&mut rest, self.rows);
+        let grad2d = take(&mut rest, self.rows);
+        let count = take(&mut rest, self.rows);
+        let [mut columns, mut exp_avg, mut exp_avg_sq] = [empty_ref(self.sh_degree); 3];
+        for column in Column::ALL {
+            for table in [&mut columns, &mut exp_avg, &mut exp_avg_sq] {
+                *slice_of(table, column) = take(&mut rest, self.rows * column.width(self.sh_degree));
+            }
+        }
+        Rows { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count }
+    }
+
+    /// As [`PageLayout::rows`], exclusive.
+    pub fn rows_mut<'a>(&self, payload: &'a mut [u8], first_row: usize) -> RowsMut<'a> {
+        let mut rest = payload;
+        let uid = take_mut(&mut rest, self.rows);
+        let stamp = take_mut(&mut rest, self.rows);
+        let grad2d = take_mut(&mut rest, self.rows);
+        let count = take_mut(&mut rest, self.rows);
+        let mut tables = [0; 3].map(|_| empty_mut(self.sh_degree));
+        for column in Column::ALL {
+            for table in &mut tables {
+                *slice_of_mut(table, column) = take_mut(&mut rest, self.rows * column.width(self.sh_degree));
+            }
+        }
+        let [columns, exp_avg, exp_avg_sq] = tables;
+        RowsMut { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count }
+    }
+}
+
+/// Payload bytes of a full page of `page_rows` rows at the degree of the scene.
+pub fn capacity_bytes(page_rows: usize, sh_degree: u8) -> usize {
+    PageLayout { rows: page_rows, sh_degree }.bytes()
+}
+
+/// Writes all rows of `state` as a page; returns its layout. The rest of `payload` is left alone, padding is zeroed.
+/// Panics when `payload` is too short.
+pub fn write_page(state: &SceneState, payload: &mut [u8]) -> PageLayout {
+    let layout = PageLayout { rows: state.rows(), sh_degree: state.sh_degree() };
+    payload[..layout.bytes()].fill(0);
+    let rows = layout.rows_mut(payload, 0);
+    rows.stamp.copy_from_slice(&state.stamp);
+    rows.uid.copy_from_slice(&state.uid);
+    rows.grad2d.copy_from_slice(&state.grad2d);
+    rows.count.copy_from_slice(&state.count);
+    for (mut to, from) in
+        [(rows.columns, &state.columns), (rows.exp_avg, &state.exp_avg), (rows.exp_avg_sq, &state.exp_avg_sq)]
+    {
+        for column in Column::ALL {
+            slice_of_mut(&mut to, column).copy_from_slice(from.column(column));
+        }
+    }
+    layout
+}
+
+/// The rows of a page as a table of their own.
+pub fn read_page(rows: &Rows<'_>) -> SceneState {
+    let table = |from: ColumnsRef<'_>| {
+        let mut from = from;
+        let mut columns = Columns { sh_degree: from.sh_degree, ..Columns::default() };
+        for column in Column::ALL {
+            columns.column_mut(column).extend_from_slice(slice_of(&mut from, column));
+        }
+        columns
+    };
+    SceneState {
+        columns: table(rows.columns),
+        exp_avg: table(rows.exp_avg),
+        exp_avg_sq: table(rows.exp_avg_sq),
+        stamp: rows.stamp.to_vec(),
+        uid: rows.uid.to_vec(),
+        grad2d: rows.grad2d.to_vec(),
+        count: rows.count.to_vec(),
+    }
+}
+
+fn padded(bytes: usize) -> usize {
+    bytes.next_multiple_of(TABLE_ALIGNMENT)
+}
+
+fn take<'a, T: AnyBitPattern>(rest: &mut &'a [u8], count: usize) -> &'a [T] {
+    let bytes = count * size_of::<T>();
+    let (table, tail) = rest.split_at(padded(bytes));
+    *rest = tail;
+    bytemuck::cast_slice(&table[..bytes])
+}
+
+fn take_mut<'a, T: AnyBitPattern + NoUninit>(rest: &mut &'a mut [u8], count: usize) -> &'a mut [T] {
+    let bytes = count * size_of::<T>();
+    let (table, tail) = std::mem::take(rest).split_at_mut(padded(bytes));
+    *rest = tail;
+    bytemuck::cast_slice_mut(&mut table[..bytes])
+}
+
+fn empty_ref<'a>(sh_degree: u8) -> ColumnsRef<'a> {
+    ColumnsRef { sh_degree, means: &[], quats: &[], scales: &[], opacities: &[], sh0: &[], sh_n: &[] }
+}
+
+fn empty_mut<'a>(sh_degree: u8) -> ColumnsMut<'a> {
+    ColumnsMut {
+        sh_degree,
+        means: &mut [],
+        quats: &mut [],
+        scales: &mut [],
+        opacities: &mut [],
+        sh0: &mut [],
+        sh_n: &mut [],
+    }
+}
+
+fn slice_of<'t, 'a>(table: &'t mut ColumnsRef<'a>, column: Column) -> &'t mut &'a [f32] {
+    match column {
+        Column::Means => &mut table.means,
+        Column::Quats => &mut table.quats,
+        Column::Scales => &mut table.scales,
+        Column::Opacities => &mut table.opacities,
+        Column::Sh0 => &mut table.sh0,
+        Column::ShN => &mut table.sh_n,
+    }
+}
+
+fn slice_of_mut<'t, 'a>(table: &'t mut ColumnsMut<'a>, column: Column) -> &'t mut &'a mut [f32] {
+    match column {
+        Column::Means => &mut table.means,
+        Column::Quats => &mut table.quats,
+        Column::Scales => &mut table.scales,
+        Column::Opacities => &mut table.opacities,
+        Column::Sh0 => &mut table.sh0,
+        Column::ShN => &mut table.sh_n,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::state::row_bytes;
+
+    #[test]
+    fn rows_go_into_a_page_and_come_back() {
+        for (rows, sh_degree) in [(0, 3), (1, 0), (7, 1), (128, 2), (1000, 3)] {
+            let mut columns = Columns::zeros(rows, sh_degree);
+            let mut next = 0.0f32;
+            for column in Column::ALL {
+                columns.column_mut(column).iter_mut().for_each(|x| (*x, next) = (next, next + 1.0));
+            }
+            let mut state = SceneState::from_columns(columns);
+            state.exp_avg = state.columns.clone();
+            state.exp_avg.means.iter_mut().for_each(|x| *x += 0.5);
+            state.exp_avg_sq.sh_n.fill(3.0);
+            state.stamp.fill(9);
+            state.grad2d.fill(0.25);
+            state.count.fill(4);
+            let bytes = capacity_bytes(rows, sh_degree);
+            assert!(
+                bytes >= rows * row_bytes(sh_degree) && bytes <= rows * row_bytes(sh_degree) + 22 * TABLE_ALIGNMENT
+            );
+            let mut words = vec![u64::MAX; bytes.div_ceil(8) + 8];
+            let payload = bytemuck::cast_slice_mut(&mut words);
+            let layout = write_page(&state, payload);
+            assert_eq!(layout.bytes(), bytes);
+            assert_eq!(read_page(&layout.rows(payload, 5)), state);
+            assert!(payload[bytes..].iter().all(|&b| b == 0xff), "nothing behind the page is touched");
+            assert_eq!(layout.rows_mut(payload, 5).first_row, 5);
+        }
+    }
+}
