@@ -143,7 +143,7 @@ impl Chart {
         if self.series.iter().any(|s| !s.name.is_empty()) {
             let mut legend = chart.configure_series_labels();
             legend
-                .position(SeriesLabelPosition::UpperRight)
+                .position(SeriesLabelPosition::LowerRight)
                 .background_style(WHITE.mix(0.8))
                 .border_style(AXIS.mix(0.3));
             legend.draw().map_err(text)?;

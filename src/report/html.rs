@@ -17,7 +17,7 @@ section.tiles{display:flex;flex-wrap:wrap;gap:12px;margin:18px 0}
 .tile{background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:10px 16px;min-width:130px}
 .tile b{display:block;font-size:21px}
 .tile span{color:var(--dim);font-size:13px}
-.charts{display:grid;grid-template-columns:repeat(auto-fit,minmax(440px,1fr));gap:14px}
+.charts{display:grid;grid-template-columns:repeat(auto-fill,minmax(440px,1fr));gap:14px}
 figure{margin:0;background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:10px}
 figure svg{width:100%;height:auto;display:block}
 figcaption{font-size:13px;margin-top:6px}
@@ -25,7 +25,7 @@ table{border-collapse:collapse;background:var(--paper);border:1px solid var(--li
 td,th{padding:4px 12px;border-bottom:1px solid var(--line);text-align:left}
 td.number{text-align:right;font-variant-numeric:tabular-nums}
 pre{background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:12px;overflow:auto;font-size:13px;max-height:420px}
-.views{display:grid;grid-template-columns:repeat(auto-fit,minmax(440px,1fr));gap:14px}
+.views{display:grid;grid-template-columns:repeat(auto-fill,minmax(440px,1fr));gap:14px}
 .slider{position:relative;overflow:hidden;line-height:0;touch-action:none;cursor:ew-resize}
 .slider img{width:100%;display:block}
 .slider .over{position:absolute;inset:0;width:50%;overflow:hidden;border-right:2px solid #fff}

@@ -217,7 +217,7 @@ fn add_views(page: &mut Page, folder: &Path) -> InputResult<()> {
     page.heading("Held-out views");
     let stride = files.len().div_ceil(VIEWS_MAX);
     if stride > 1 {
-        page.paragraph(&format!("Every {stride}th of {} views; all are in renders/test.", files.len()));
+        page.paragraph(&format!("One in {stride} of {} views; all are in renders/test.", files.len()));
     }
     page.begin_views();
     for file in files.iter().step_by(stride) {
