@@ -296,7 +296,7 @@ fn hostile_references_end_in_an_error() {
 fn what_does_not_fit_is_refused_at_once() {
     let (mut store, _, _) = faulty(Codec::Raw);
     let room = store.capacity_bytes();
-    assert!(room >= CAPACITY && room < CAPACITY + 4096);
+    assert!((CAPACITY..CAPACITY + 4096).contains(&room));
     let mut refuse = |label: &[u8], bytes: usize, buffer: PageBuffer| {
         let (error, _buffer) = store.write(0, id(0), label, bytes, buffer).unwrap_err();
         assert!(matches!(error, PageError::TooLong { .. }), "{error}");
