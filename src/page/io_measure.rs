@@ -1,13 +1,14 @@
 //! How fast a drive moves pages: by engine, request size and number of requests at once.
 //!
-//! Measures with the very engines that a run uses, on one segment that has no name any more while it is measured, so
-//! that nothing is left behind however the process ends. Reads are cold as far as this machine goes (direct I/O, or
+//! Measures with the very engines that a run uses, each on a segment of its own (direct I/O on bytes that the page
+//! cache holds is another thing than either), which have no names any more while they are measured, so that nothing is
+//! left behind however the process ends. Reads are cold as far as this machine goes (direct I/O, or
 //! bytes that the page cache was told to forget); a drive's own cache, or a host's below a virtual drive, is part of
 //! what is measured.
 //!
 //! Invariants: 1. rounds visit every case in turn, so that a drive whose speed wanders treats all alike; figures are
 //! medians over rounds; 2. bytes on the drive, bytes written and seconds are bounded by [`Limits`] (a case that was
-//! begun ends).
+//! begun ends, and the first one is always measured).
 
 use super::buffer::PageBuffer;
 use super::engine::{IoEngine, open_engine};
@@ -31,7 +32,7 @@ const FILL_DEPTH: usize = 8;
 /// Bounds of a measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
-    /// Size of the file, bytes.
+    /// Bytes on the drive, shared by the engines.
     pub file_bytes: u64,
     /// Seconds for everything, about.
     pub seconds: f64,
@@ -112,7 +113,8 @@ pub fn sweep(folder: &Path, cases: &[Case], limits: Limits, progress: &mut dyn F
                 continue;
             }
             for direction in [Direction::Read, Direction::Write] {
-                if begin.elapsed().as_secs_f64() > limits.seconds {
+                let begun = rounds > 0 || turn > 0;
+                if begun && begin.elapsed().as_secs_f64() > limits.seconds {
                     break 'rounds;
                 }
                 let bytes_max = if direction == Direction::Write { written_max } else { u64::MAX };
@@ -138,12 +140,10 @@ pub(super) fn median(values: &mut [f64]) -> Option<f64> {
     values.get(values.len() / 2).copied()
 }
 
-/// A segment without a name, open in several engines.
+/// Segments without names, one for each engine.
 pub(super) struct Scratch {
-    engines: Vec<(IoEngine, Box<dyn PageStore>)>,
-    /// Bytes that were written at least once; others would not be read from the drive.
-    filled_bytes: u64,
-    file_bytes: u64,
+    engines: Vec<Opened>,
+    segment_bytes: u64,
     buffers: Vec<PageBuffer>,
     draws: Stream,
     /// As in [`Sweep::notes`].
@@ -152,8 +152,17 @@ pub(super) struct Scratch {
     pub written_bytes: u64,
 }
 
+/// An engine at work.
+struct Opened {
+    engine: IoEngine,
+    segment: u32,
+    store: Box<dyn PageStore>,
+    /// Bytes from the start that were written at least once; others would not be read from the drive.
+    filled_bytes: u64,
+}
+
 impl Scratch {
-    /// Makes the segment and opens it in all `engines` that work here.
+    /// Makes the segments, of `file_bytes` bytes together, and opens them in all `engines` that work here.
     ///
     /// # Errors
     /// Too little space; the folder cannot be written; no engine works.
@@ -168,27 +177,28 @@ impl Scratch {
         let own = folder.join(format!("gsscale-measure-{}", std::process::id()));
         std::fs::create_dir(&own).map_err(failed("making a folder to measure in"))?;
         let opened = Scratch::open_all(&own, engines, file_bytes, depth);
-        // From here on the segment has no name: the system takes its space back when this process ends or before.
-        let file = own.join(segment_file_name(0));
-        let file_removed = std::fs::remove_file(&file);
+        // From here on the segments have no names: the system takes their space back when this process ends or before.
+        for segment in 0..engines.len() as u32 {
+            // Missing where an engine did not come so far; what cannot be removed is told with the folder.
+            let _ = std::fs::remove_file(own.join(segment_file_name(segment)));
+        }
         let removed = std::fs::remove_dir(&own);
         let scratch = opened?;
-        file_removed.and(removed).map_err(failed("removing the folder that was measured in"))?;
+        removed.map_err(failed("removing the folder that was measured in"))?;
         Ok(scratch)
     }
 
     fn open_all(own: &Path, engines: &[IoEngine], file_bytes: u64, depth: usize) -> InputResult<Scratch> {
         let mut scratch = Scratch {
             engines: Vec::new(),
-            filled_bytes: 0,
-            file_bytes,
+            segment_bytes: file_bytes / engines.len().max(1) as u64 / FILL_BYTES as u64 * FILL_BYTES as u64,
             buffers: Vec::new(),
             draws: Stream::new(1, Purpose::Test, 0, 0),
             notes: Vec::new(),
             written_bytes: 0,
         };
         let mut refused = None;
-        for &engine in engines {
+        for (segment, &engine) in (0..).zip(engines) {
             let mut opened = match open_engine(engine, own, depth) {
                 Ok(opened) => opened,
                 Err(error) => {
@@ -198,12 +208,13 @@ impl Scratch {
                 }
             };
             let failed = |e: io::Error| InputError::io(own, "making a file to measure with", &e);
-            opened.store.create_segment(0, file_bytes).map_err(failed)?;
+            opened.store.create_segment(segment, scratch.segment_bytes).map_err(failed)?;
             // The engine opens the file now, while it has a name, and keeps it.
             let buffer = PageBuffer::zeroed(4096);
-            opened.store.submit(transfer(Direction::Read, 0, 4096, buffer));
+            let place = Place { segment, offset: 0 };
+            opened.store.submit(Transfer { token: 0, direction: Direction::Read, place, bytes: 4096, buffer });
             finish(&mut *opened.store).map_err(failed)?;
-            scratch.engines.push((engine, opened.store));
+            scratch.engines.push(Opened { engine, segment, store: opened.store, filled_bytes: 0 });
             scratch.notes.extend(opened.notes);
         }
         scratch.notes.dedup();
@@ -214,24 +225,26 @@ impl Scratch {
     }
 
     fn has(&self, engine: IoEngine) -> bool {
-        self.engines.iter().any(|(e, _)| *e == engine)
+        self.engines.iter().any(|o| o.engine == engine)
     }
 
-    /// Writes the file from its start, until it or the time ends; returns bytes per second, made durable.
+    /// Writes every segment from its start, until it is full or its share of the time ends; returns bytes per second,
+    /// made durable.
     ///
     /// # Errors
     /// Of the drive.
     pub fn fill(&mut self, time: Duration) -> io::Result<f64> {
         self.prepare_buffers(FILL_DEPTH, FILL_BYTES);
-        let Some((_, store)) = self.engines.first_mut() else { return Ok(0.0) };
-        let places = (0..self.file_bytes / FILL_BYTES as u64).map(|i| i * FILL_BYTES as u64);
-        let begin = Instant::now();
-        let buffers = &mut self.buffers;
-        let moved = run(&mut **store, Direction::Write, FILL_BYTES, FILL_DEPTH, places, buffers, begin + time)?;
-        store.sync()?;
-        self.filled_bytes = moved;
-        self.written_bytes += moved;
-        Ok(moved as f64 / begin.elapsed().as_secs_f64())
+        let (begin, written_before) = (Instant::now(), self.written_bytes);
+        let share = time / self.engines.len().max(1) as u32;
+        for opened in &mut self.engines {
+            let places = (0..self.segment_bytes / FILL_BYTES as u64).map(|i| i * FILL_BYTES as u64);
+            let way = Way { direction: Direction::Write, bytes: FILL_BYTES, depth: FILL_DEPTH };
+            opened.filled_bytes = opened.run(way, places, &mut self.buffers, Instant::now() + share)?;
+            opened.store.sync()?;
+            self.written_bytes += opened.filled_bytes;
+        }
+        Ok((self.written_bytes - written_before) as f64 / begin.elapsed().as_secs_f64())
     }
 
     /// Bytes per second of one case, over about `time` and at most about `bytes_max` bytes.
@@ -241,20 +254,20 @@ impl Scratch {
     pub fn rate(&mut self, case: Case, direction: Direction, time: Duration, bytes_max: u64) -> io::Result<f64> {
         self.prepare_buffers(case.depth, case.bytes);
         let bytes = case.bytes as u64;
-        let mut places: Vec<u64> = (0..self.filled_bytes / bytes).map(|i| i * bytes).collect();
+        let Some(opened) = self.engines.iter_mut().find(|o| o.engine == case.engine) else {
+            return Err(io::ErrorKind::Unsupported.into());
+        };
+        let mut places: Vec<u64> = (0..opened.filled_bytes / bytes).map(|i| i * bytes).collect();
         for i in (1..places.len()).rev() {
             places.swap(i, self.draws.below(i as u64 + 1) as usize);
         }
         // Never fewer than keep the drive busy as the case wants it.
         places.truncate((bytes_max / bytes).max(2 * case.depth as u64) as usize);
-        let Some((_, store)) = self.engines.iter_mut().find(|(e, _)| *e == case.engine) else {
-            return Err(io::ErrorKind::Unsupported.into());
-        };
         let begin = Instant::now();
-        let (buffers, end) = (&mut self.buffers, begin + time);
-        let moved = run(&mut **store, direction, case.bytes, case.depth, places.into_iter(), buffers, end)?;
+        let way = Way { direction, bytes: case.bytes, depth: case.depth };
+        let moved = opened.run(way, places.into_iter(), &mut self.buffers, begin + time)?;
         if direction == Direction::Write {
-            store.sync()?;
+            opened.store.sync()?;
             self.written_bytes += moved;
         }
         Ok(moved as f64 / begin.elapsed().as_secs_f64())
@@ -276,37 +289,44 @@ impl Scratch {
     }
 }
 
-fn transfer(direction: Direction, offset: u64, bytes: usize, buffer: PageBuffer) -> Transfer {
-    Transfer { token: offset, direction, place: Place { segment: 0, offset }, bytes, buffer }
-}
-
-/// Moves bytes at `places`, `depth` at once, until they or the time end. Returns how many bytes were moved.
-fn run(
-    store: &mut dyn PageStore,
+/// How bytes are moved.
+#[derive(Clone, Copy)]
+struct Way {
     direction: Direction,
     bytes: usize,
     depth: usize,
-    mut places: impl Iterator<Item = u64>,
-    buffers: &mut Vec<PageBuffer>,
-    end: Instant,
-) -> io::Result<u64> {
-    let mut moved = 0;
-    let mut done: Vec<Completion> = Vec::new();
-    let mut error = None;
-    loop {
-        while store.in_flight() < depth && error.is_none() && (moved == 0 || Instant::now() < end) {
-            let Some(at) = buffers.iter().position(|b| b.len() >= bytes) else { break };
-            let Some(offset) = places.next() else { break };
-            store.submit(transfer(direction, offset, bytes, buffers.swap_remove(at)));
-        }
-        if store.in_flight() == 0 {
-            return error.map_or(Ok(moved), Err);
-        }
-        store.complete(true, &mut done);
-        for completion in done.drain(..) {
-            moved += completion.transfer.bytes as u64;
-            buffers.push(completion.transfer.buffer);
-            error = error.or(completion.result.err());
+}
+
+impl Opened {
+    /// Moves bytes at `places` until they or the time end. Returns how many bytes were moved.
+    fn run(
+        &mut self,
+        way: Way,
+        mut places: impl Iterator<Item = u64>,
+        buffers: &mut Vec<PageBuffer>,
+        end: Instant,
+    ) -> io::Result<u64> {
+        let Way { direction, bytes, depth } = way;
+        let mut moved = 0;
+        let mut done: Vec<Completion> = Vec::new();
+        let mut error = None;
+        loop {
+            while self.store.in_flight() < depth && error.is_none() && (moved == 0 || Instant::now() < end) {
+                let Some(at) = buffers.iter().position(|b| b.len() >= bytes) else { break };
+                let Some(offset) = places.next() else { break };
+                let place = Place { segment: self.segment, offset };
+                let buffer = buffers.swap_remove(at);
+                self.store.submit(Transfer { token: offset, direction, place, bytes, buffer });
+            }
+            if self.store.in_flight() == 0 {
+                return error.map_or(Ok(moved), Err);
+            }
+            self.store.complete(true, &mut done);
+            for completion in done.drain(..) {
+                moved += completion.transfer.bytes as u64;
+                buffers.push(completion.transfer.buffer);
+                error = error.or(completion.result.err());
+            }
         }
     }
 }
