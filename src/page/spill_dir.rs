@@ -79,6 +79,7 @@ impl SpillDir {
             Some(Err(error)) => return Err(bad_format(folder, &error)),
         }
         tighten(folder)?;
+        sign_lock(folder, &lock)?;
         let format = SpillFormat { store: new_identity(), purpose, layout };
         write_format(folder, &format)?;
         Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder, _lock: lock })
@@ -102,6 +103,7 @@ impl SpillDir {
         read()?;
         let lock = take_lock(folder)?;
         let format = read()?;
+        sign_lock(folder, &lock)?;
         Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder: false, _lock: lock })
     }
 
@@ -326,18 +328,18 @@ fn take_lock(folder: &Path) -> InputResult<File> {
             Err(TryLockError::Error(error)) => return Err(failed(error)),
         }
         if is_still_there(&path, &file) {
-            let content = format!("{LOCK_MAGIC}process {}\nhost {}\n", std::process::id(), host_name());
-            file.set_len(0).and_then(|()| rewrite(&file, content.as_bytes())).map_err(failed)?;
             return Ok(file);
         }
     }
     Err(InputError::new(path, "it is removed again and again", "see which other process uses the folder"))
 }
 
-fn rewrite(mut file: &File, content: &[u8]) -> io::Result<()> {
+/// Says in the lock's file who holds it, for the message to others.
+fn sign_lock(folder: &Path, mut lock: &File) -> InputResult<()> {
     use std::io::Seek;
-    file.rewind()?;
-    file.write_all(content)
+    let content = format!("{LOCK_MAGIC}process {}\nhost {}\n", std::process::id(), host_name());
+    let write = lock.rewind().and_then(|()| lock.set_len(0)).and_then(|()| lock.write_all(content.as_bytes()));
+    write.map_err(|e| InputError::io(folder.join(LOCK), "locking the spill directory", &e))
 }
 
 #[cfg(unix)]
