@@ -23,7 +23,7 @@ use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::image::Target;
 use crate::scene::state::SceneState;
-use crate::schedule::order::ShuffledOrder;
+use crate::schedule::order::{Order, ViewOrder};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -68,7 +68,7 @@ pub struct Trainer {
     events: EventLog,
     /// SH degree in use, as the events raised it.
     sh_degree: u8,
-    order: ShuffledOrder,
+    order: ViewOrder,
     train_views: Vec<usize>,
     working: WorkingSet,
     step: u32,
@@ -94,6 +94,7 @@ impl Trainer {
     /// A trainer of first Gaussians `columns` on the training views of `dataset` (at least one).
     pub fn new(columns: Columns, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Self {
         let train_views = dataset.train_views();
+        let cameras: Vec<_> = train_views.iter().map(|&v| dataset.views[v].camera).collect();
         let mut state = SceneState::from_columns(columns);
         if options.max_gaussians > 0 {
             // A cap that memory cannot hold may still never be reached: then rounds make room as they need it.
@@ -104,7 +105,7 @@ impl Trainer {
             histogram: GradHistogram::default(),
             events: EventLog::default(),
             sh_degree: options.sh_degree_at(0),
-            order: ShuffledOrder::new(options.seed, train_views.len()),
+            order: ViewOrder::new(Order::Shuffle, options.seed, &cameras),
             train_views,
             working: WorkingSet::default(),
             state,
