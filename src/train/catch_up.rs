@@ -1,32 +1,21 @@
 //! From stored rows to the rows of one view: which of them it may draw, and what they are at this step.
 //!
-//! Invariants: 1. the state is only read here, except by [`apply_event`]; 2. the cull is conservative: no row that the
+//! Invariants: 1. the state is only read here; 2. the cull is conservative: no row that the
 //! projection would draw is left out, whatever its rotation and opacity; 3. listed rows ascend; 4. results are the same
 //! for any number of threads; 5. once `out` has grown to its size, nothing that grows with the scene is allocated.
 
 use crate::base::math::exp32;
 use crate::base::simd::{Kernel, dispatch};
-use crate::densify::ops;
 use crate::kernels::constants::{EPS2D, EXTENT_SIGMAS};
 use crate::optim::deferred::{AdamNow, DeferredAdam, ROWS_PER_TASK};
 use crate::optim::lanes::{LANES, LaneDrifts, drifted_lanes, tables_of};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
-use crate::scene::events::{Event, EventKind};
 use crate::scene::rows::{ColumnsMut, Rows, RowsNow};
 use crate::scene::state::SceneState;
 
 /// The view angle at which the projection's Jacobian is clamped lies this share of the half field of view outside it.
 const CLAMP_MARGIN: f32 = 0.3;
-
-/// What an event changed.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct EventOutcome {
-    /// What a densification round did.
-    pub round: ops::RoundCounts,
-    /// Rows that an opacity reset rewrote.
-    pub reset_rows: usize,
-}
 
 /// The rows that `camera` may draw after `now` optimizer steps, ascending.
 pub fn visible_rows(state: &SceneState, adam: &DeferredAdam, now: u32, camera: &Camera, out: &mut Vec<u32>) {
@@ -52,27 +41,6 @@ pub fn evaluate_all(state: &SceneState, adam: &DeferredAdam, now: u32) -> Column
     let mut out = Columns::zeros(state.rows(), state.sh_degree());
     evaluate_into(&adam.at(now), state.view(), &|i| i, 0, out.view_mut());
     out
-}
-
-/// Applies event number `index` of the log to all rows of a table: the whole scene or one page of it.
-pub fn apply_event(
-    state: &mut SceneState,
-    adam: &DeferredAdam,
-    seed: u64,
-    index: usize,
-    event: &Event,
-) -> EventOutcome {
-    let at = adam.at(event.now());
-    match event.kind {
-        EventKind::RaiseShDegree { .. } => EventOutcome::default(),
-        EventKind::ResetOpacity { max_opacity } => {
-            EventOutcome { reset_rows: ops::reset_opacities(&at, state, max_opacity), ..EventOutcome::default() }
-        }
-        EventKind::Densify(thresholds) => {
-            let round = ops::apply_round(&at, state, &thresholds, seed, index as u64);
-            EventOutcome { round, ..EventOutcome::default() }
-        }
-    }
 }
 
 fn evaluate_into<F>(at: &AdamNow<'_>, view: Rows<'_>, row_of: &F, first: usize, out: ColumnsMut<'_>)
