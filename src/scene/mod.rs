@@ -9,5 +9,8 @@ pub mod init;
 pub mod neighbours;
 pub mod page_layout;
 pub mod page_meta;
+pub mod page_split;
+pub mod partition;
 pub mod rows;
+pub mod select;
 pub mod state;

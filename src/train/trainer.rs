@@ -4,7 +4,7 @@
 //! cadences of logging and evaluation; 2. a step whose loss is not finite changes nothing, and three in a row end
 //! the run with what the last good step left.
 
-use super::catch_up::{apply_event, evaluate_all, gather, visible_rows};
+use super::catch_up::{evaluate_all, gather, visible_rows};
 use super::eval::{EvalRequest, evaluate};
 use super::memory::host_bytes_peak;
 use super::progress::Progress;
@@ -15,6 +15,7 @@ use crate::base::error::InputError;
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::densify::replay::apply_event;
 use crate::densify::stats::GradHistogram;
 use crate::exchange::ply::{self, PlyMeta};
 use crate::optim::deferred::DeferredAdam;
