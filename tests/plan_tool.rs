@@ -22,14 +22,14 @@ fn stdout(output: &Output) -> String {
 #[test]
 fn a_scene_is_planned_for_several_memories_and_orders() {
     let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 40, 64, 48, 6000);
+    let scene = city(folder.path(), 300, 32, 24, 8000);
     let common = ["--page-rows", "32", "--steps", "1000", "--test-every", "0"];
     let with = |more: &[&str]| stdout(&plan(&scene, &[&common[..], more].concat()));
     let orders = "auto,shuffle,groups:4,tour";
     let value: Value =
-        serde_json::from_str(&with(&["--frames", "90%,100%", "--view-order", orders, "--json"])).unwrap();
+        serde_json::from_str(&with(&["--frames", "70%,100%", "--view-order", orders, "--json"])).unwrap();
     let plans = value["plans"].as_array().unwrap();
-    assert_eq!((plans.len(), value["views"].as_u64().unwrap()), (8, 40));
+    assert_eq!((plans.len(), value["views"].as_u64().unwrap()), (8, 300));
     let number = |plan: &Value, key: &str| plan[key].as_f64().unwrap();
     for plan in &plans[..4] {
         assert!(number(plan, "hit_rate") >= number(plan, "lru_hit_rate") && plan["is_belady_bound"] == true);
@@ -43,12 +43,12 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
         plans[4..].iter().all(|plan| number(plan, "hit_rate") == 1.0 && number(plan, "stall_seconds_worst") == 0.0)
     );
     assert_eq!(plans[4]["view_order"], "shuffle");
-    let table = with(&["--frames", "90%", "--view-order", orders]);
+    let table = with(&["--frames", "70%", "--view-order", orders]);
     assert_eq!(table.lines().count(), 3 + 4, "{table}");
     // The exact lists of two steps: what leaves makes room for what enters.
-    let lists = with(&["--frames", "90%", "--view-order", "shuffle", "--lists", "100..140"]);
+    let lists = with(&["--frames", "70%", "--view-order", "shuffle", "--lists", "700..740"]);
     let lines: Vec<&str> = lists.lines().collect();
-    assert!(lines[0].starts_with("step 100: ") && lines.iter().any(|line| line.starts_with("step 101: ")), "{lists}");
+    assert!(lines[0].starts_with("step 700: ") && lines.iter().any(|line| line.starts_with("step 701: ")), "{lists}");
     let count = |sign: &str| lines.iter().filter_map(|l| l.strip_prefix(sign)).flat_map(str::split_whitespace).count();
     assert!(count("  + ") > 0 && count("  + ") == count("  - "), "{lists}");
 }
