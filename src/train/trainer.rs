@@ -4,7 +4,7 @@
 //! cadences of logging and evaluation; 2. a step whose loss is not finite changes nothing, and three in a row end
 //! the run with what the last good step left.
 
-use super::catch_up::{apply_event, evaluate_all, gather, visible_rows};
+use super::catch_up::{evaluate_all, gather, visible_rows};
 use super::eval::{EvalRequest, evaluate};
 use super::memory::host_bytes_peak;
 use super::progress::Progress;
@@ -15,6 +15,7 @@ use crate::base::error::InputError;
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::densify::replay::apply_event;
 use crate::densify::stats::GradHistogram;
 use crate::exchange::ply::{self, PlyMeta};
 use crate::optim::deferred::DeferredAdam;
@@ -23,7 +24,7 @@ use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::image::Target;
 use crate::scene::state::SceneState;
-use crate::schedule::order::ShuffledOrder;
+use crate::schedule::order::{Order, ViewOrder};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -68,7 +69,7 @@ pub struct Trainer {
     events: EventLog,
     /// SH degree in use, as the events raised it.
     sh_degree: u8,
-    order: ShuffledOrder,
+    order: ViewOrder,
     train_views: Vec<usize>,
     working: WorkingSet,
     step: u32,
@@ -94,6 +95,7 @@ impl Trainer {
     /// A trainer of first Gaussians `columns` on the training views of `dataset` (at least one).
     pub fn new(columns: Columns, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Self {
         let train_views = dataset.train_views();
+        let cameras: Vec<_> = train_views.iter().map(|&v| dataset.views[v].camera).collect();
         let mut state = SceneState::from_columns(columns);
         if options.max_gaussians > 0 {
             // A cap that memory cannot hold may still never be reached: then rounds make room as they need it.
@@ -104,7 +106,7 @@ impl Trainer {
             histogram: GradHistogram::default(),
             events: EventLog::default(),
             sh_degree: options.sh_degree_at(0),
-            order: ShuffledOrder::new(options.seed, train_views.len()),
+            order: ViewOrder::new(Order::Shuffle, options.seed, &cameras),
             train_views,
             working: WorkingSet::default(),
             state,
