@@ -36,6 +36,7 @@
 //! a *step* one optimizer iteration, an *event* one global change that every row applies.
 
 pub mod base;
+pub mod cache;
 pub mod config;
 pub mod dataset;
 pub mod densify;
