@@ -29,7 +29,7 @@ fn a_step_that_failed_can_be_tried_again() {
         while (run.step as usize) < STEPS {
             let is_first_try = std::mem::replace(&mut tried, run.step) != run.step;
             // A read fails twice in a row before it is given up.
-            if run.step % 3 == 0 && is_first_try {
+            if run.step.is_multiple_of(3) && is_first_try {
                 let n = faults.count(Operation::Read) + u64::from(run.step % 2);
                 (n..n + 2).for_each(|n| faults.add(Operation::Read, n, false, fault));
             }
@@ -53,7 +53,7 @@ fn a_full_drive_can_be_waited_for() {
     let (mut failed, mut tried) = (0, u32::MAX);
     while (run.step as usize) < STEPS {
         let is_first_try = std::mem::replace(&mut tried, run.step) != run.step;
-        if run.step % 4 == 0 && is_first_try {
+        if run.step.is_multiple_of(4) && is_first_try {
             faults.add(Operation::Write, faults.count(Operation::Write), true, Fault::Error(ErrorKind::StorageFull));
         }
         if let Err(error) = run.step() {

@@ -35,7 +35,7 @@ fn pages_hold_what_was_put_into_them_whatever_the_frames() {
             ] {
                 let faults = Faults::new();
                 // With and without transfers that take long and end out of order.
-                if (i as u64 + seed) % 2 == 0 {
+                if (i as u64 + seed).is_multiple_of(2) {
                     faults.reorder(seed + 100);
                 }
                 let config = PagerConfig { policy, prefetch_bytes: prefetch_pages * 8192, ..config(frames) };
