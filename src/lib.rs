@@ -19,6 +19,8 @@
 //! | [`scene`] | Gaussians, cameras and images as data; first Gaussians from points; the log of global events |
 //! | [`dataset`] | where views come from: COLMAP, transforms.json, the generated city; decoding photos |
 //! | [`schedule`] | which view comes when |
+//! | [`page`] | pages as bytes: buffers, places on disk, the engines that move them |
+//! | [`paging`] | brings the pages of a view into memory and takes them back |
 //! | [`gpu`] | a device and its memory, shaders, recording of work; knows no Gaussians |
 //! | [`kernels`] | the ordered table of stages and each stage as a function on plain slices |
 //! | [`render`] | the stages in order: forward, loss, backward; image metrics |
@@ -41,6 +43,7 @@ pub mod gpu;
 pub mod kernels;
 pub mod optim;
 pub mod page;
+pub mod paging;
 pub mod render;
 pub mod scene;
 pub mod schedule;

@@ -1,0 +1,8 @@
+//! The only place where cache, store and plan meet: brings the pages of a view into memory, and takes them back.
+//! Knows pages as bytes, metas and bounds; neither the optimizer nor the renderer.
+
+pub mod error;
+pub mod pager;
+pub mod pinned;
+pub mod stats;
+mod visible;
