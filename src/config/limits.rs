@@ -25,10 +25,12 @@ pub struct RunOptions {
     pub sh_degree: u8,
     /// Steps between raises of the degree in use; 0 = all from the start.
     pub sh_every: u32,
-    /// Degree in use at step 0: 0, or what the Gaussians that a run starts from were trained with.
+    /// Degree in use at step 0: what was asked for, or what the Gaussians that a run starts from were trained with.
     pub sh_degree_start: u8,
     /// Cap on Gaussians; 0 = none.
     pub max_gaussians: usize,
+    /// Rows that a page holds at most.
+    pub page_rows: usize,
     /// Rendering, but for the degree in use.
     pub render: RenderOptions,
     /// Loss.
@@ -63,8 +65,9 @@ impl RunOptions {
             seed: config.seed,
             sh_degree: config.sh_degree,
             sh_every: config.sh_every,
-            sh_degree_start: 0,
+            sh_degree_start: config.sh_start,
             max_gaussians: config.max_gaussians as usize,
+            page_rows: config.page_rows as usize,
             render: RenderOptions {
                 sh_degree: config.sh_degree,
                 max_alpha: config.max_alpha as f32,

@@ -48,6 +48,11 @@ impl GradHistogram {
         self.bins.iter().map(|&n| u64::from(n)).sum()
     }
 
+    /// Rows that may exceed a threshold that [`GradHistogram::threshold`] gave: those that it counted as exceeding it.
+    pub fn rows_above(&self, threshold: f32) -> u64 {
+        self.bins[first_bin_above(threshold)..].iter().map(|&n| u64::from(n)).sum()
+    }
+
     /// The smallest threshold, not below `least`, that at most `room` rows exceed, in whole bins: either `least`
     /// itself, or just below the edge of a bin, or infinity.
     pub fn threshold(&self, least: f32, room: u64) -> f32 {
@@ -65,6 +70,17 @@ impl GradHistogram {
     }
 }
 
+/// Whether [`GradHistogram::rows_above`] counted a row with this mean: true for every row that exceeds the threshold, and
+/// for those that share the lowest bin with it.
+pub fn may_exceed(mean: f32, threshold: f32) -> bool {
+    bin(mean) >= first_bin_above(threshold)
+}
+
+/// The bin of the smallest number above the threshold.
+fn first_bin_above(threshold: f32) -> usize {
+    bin(threshold.next_up())
+}
+
 fn bin(mean: f32) -> usize {
     // Negative zero, negative numbers and NaN do not occur in sums of norms; they would count as 0.
     if mean > 0.0 { (mean.to_bits() >> 16) as usize } else { 0 }
@@ -72,7 +88,7 @@ fn bin(mean: f32) -> usize {
 
 /// Adds the gradients of one view. `rows` ascends and is numbered in the table that the view was cut from; `v_means2d`
 /// (loss with respect to the pixel position, pixel units) and `radii` have one entry per listed row; rows with a zero
-/// radius were not drawn. Gradients that are not finite are left out.
+/// radius were not drawn. Gradients that are not finite are left out. Returns the number of rows that changed.
 pub fn accumulate(
     view: &mut RowsMut<'_>,
     rows: &[u32],
@@ -80,7 +96,8 @@ pub fn accumulate(
     radii: &[[u32; 2]],
     image_size: [u32; 2],
     histogram: &mut GradHistogram,
-) {
+) -> usize {
+    let mut changed = 0;
     assert!(rows.len() == v_means2d.len() && rows.len() == radii.len(), "one gradient and radius per listed row");
     let half = image_size.map(|n| n as f32 * 0.5);
     for ((&row, v), radius) in rows.iter().zip(v_means2d).zip(radii) {
@@ -100,7 +117,9 @@ pub fn accumulate(
         *grad2d = (*grad2d + norm).min(f32::MAX);
         *count += 1;
         histogram.add(mean_grad2d(*grad2d, *count));
+        changed += 1;
     }
+    changed
 }
 
 #[cfg(test)]
@@ -125,6 +144,20 @@ mod tests {
         assert_eq!(histogram.threshold(2e-4, 1), 2e-4);
         let threshold = histogram.threshold(2e-4, 0);
         assert!(threshold >= mean_grad2d(state.grad2d[0], 2));
+    }
+
+    #[test]
+    fn rows_above_a_threshold_are_the_rows_that_may_exceed_it() {
+        let mut histogram = GradHistogram::default();
+        let means: Vec<f32> = (1..1000).map(|i| i as f32 * 1e-5).collect();
+        means.iter().for_each(|&m| histogram.add(m));
+        for room in [0, 1, 7, 500, 5000] {
+            let threshold = histogram.threshold(2e-4, room);
+            let may = means.iter().filter(|&&m| may_exceed(m, threshold)).count() as u64;
+            assert_eq!(histogram.rows_above(threshold), may);
+            assert!(may <= room, "{may} of {room}");
+            assert!(means.iter().all(|&m| m <= threshold || may_exceed(m, threshold)));
+        }
     }
 
     #[test]

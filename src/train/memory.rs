@@ -3,11 +3,10 @@
 //! What depends on the views (rows, intersections, images) is measured by rendering a few of them with the first
 //! Gaussians; what is simple arithmetic is computed. The promise is 10 % of the peak that a run without growth has.
 
-use super::trainer::Trainer;
+use super::trainer::{TrainError, Trainer};
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
-use crate::render::RenderError;
 use crate::scene::columns::row_width;
 use crate::scene::state::row_bytes;
 
@@ -49,8 +48,8 @@ pub fn estimate(
     dataset: &Dataset,
     trainer: &mut Trainer,
     driver: u64,
-) -> Result<MemoryEstimate, RenderError> {
-    let rows = trainer.state.rows() as u64;
+) -> Result<MemoryEstimate, TrainError> {
+    let rows = trainer.scene.rows();
     let rows_max = if config.strategy == "none" { rows } else { rows.max(config.max_gaussians) };
     let pixels = trainer.probe_views(dataset, PROBE_VIEWS)? as u64;
     let held = trainer.view_bytes();
@@ -64,7 +63,7 @@ pub fn estimate(
         view: of_pixels + ((held - of_pixels) as f64 * growth) as u64,
         targets: config.image_cache.0.min(TargetCache::bytes_to_keep_all(&dataset.views, decoders)),
         export: rows_max * row_width(config.sh_degree) as u64 * 4,
-        base: BASE_BYTES + trainer.adam.bytes() as u64 + driver,
+        base: BASE_BYTES + trainer.scene.adam.bytes() as u64 + driver,
     })
 }
 

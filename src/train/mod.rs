@@ -4,11 +4,14 @@
 
 pub mod catch_up;
 pub mod eval;
+pub mod events;
 pub mod machine;
 pub mod memory;
+pub mod pages;
 pub mod progress;
 pub mod report;
 pub mod run;
 pub mod signals;
 pub mod step;
 pub mod trainer;
+mod update;

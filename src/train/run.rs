@@ -55,7 +55,7 @@ pub struct Prepared {
     pub dataset: Dataset,
     /// First Gaussians, local frame.
     pub columns: Columns,
-    /// Degree that they were trained with: it is in use from the first step. 0 for points.
+    /// Degree in use from the first step: what they were trained with, or what was asked for.
     pub sh_degree_start: u8,
 }
 
@@ -93,9 +93,9 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
         Some((mut columns, meta, ply)) => {
             let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
             dataset.warnings.extend(ply_warnings(&ply, &meta, far));
-            (resize_sh(&columns, config.sh_degree), columns.sh_degree)
+            (resize_sh(&columns, config.sh_degree), columns.sh_degree.max(config.sh_start))
         }
-        None => (first_gaussians(scene, &mut dataset, config)?, 0),
+        None => (first_gaussians(scene, &mut dataset, config)?, config.sh_start),
     };
     if columns.rows() == 0 {
         let problem = "no Gaussian is left to start from: all are too far from the cameras";
@@ -174,7 +174,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     if let Some(word) = word {
         say(&word);
     }
-    let mut trainer = Trainer::new(columns, &dataset, renderer, options);
+    let mut trainer = Trainer::new(columns, &dataset, renderer, options)?;
     let memory = estimate(config, &dataset, &mut trainer, driver)?;
     say(&describe(request, &dataset, &trainer, &memory));
     if let Some(free) = host_bytes_available().filter(|&free| free < memory.total()) {
@@ -226,7 +226,7 @@ fn train_into(
     let (rows_skipped, steps_skipped) = trainer.skipped();
     let summary = Summary {
         steps: trainer.steps_done(),
-        gaussians: trainer.state.rows() as u64,
+        gaussians: trainer.scene.rows(),
         train_seconds: trainer.train_seconds(),
         host_bytes_peak: host_bytes_peak().unwrap_or(0),
         test: tested.as_ref().ok().copied().flatten(),
@@ -300,7 +300,7 @@ fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer) -> Resol
         device: trainer.renderer.device(),
         train_views: dataset.train_views().len(),
         test_views: dataset.test_views().len(),
-        gaussians: trainer.state.rows() as u64,
+        gaussians: trainer.scene.rows(),
         origin: dataset.frame.origin.to_array(),
         scale: dataset.frame.scale,
         scene_scale: f64::from(dataset.scene_scale) * dataset.frame.scale,
@@ -309,7 +309,7 @@ fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer) -> Resol
 
 /// What was understood and what it will take, for people.
 fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, memory: &MemoryEstimate) -> String {
-    let (config, rows) = (&request.config, trainer.state.rows());
+    let (config, rows) = (&request.config, trainer.scene.rows());
     let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
     let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
     let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));

@@ -1,0 +1,296 @@
+//! The rows of a run as pages: first pages, what all of them share (optimizer, event log, statistics, counts), and
+//! bringing pages to now.
+//!
+//! Invariants: 1. events reach a page when a training step pins it, and only then; everything else applies them to a
+//! copy. So what is applied when does not depend on frames, cadences of evaluation or saves; 2. after
+//! [`PagedScene::apply_pending`] every pinned page is stored with the degree in use; 3. `rows_bound` is at least the
+//! number of rows that there would be if every page had applied every event.
+
+use super::catch_up::{evaluate_all, gather, visible_rows};
+use super::events::{CaughtUp, PageRules, caught_up};
+use super::step::WorkingSet;
+use crate::base::ids::{PageId, PageNo};
+use crate::config::limits::RunOptions;
+use crate::densify::stats::GradHistogram;
+use crate::optim::bounds::SplitLimits;
+use crate::optim::deferred::DeferredAdam;
+use crate::paging::error::PagingError;
+use crate::paging::pager::Pager;
+use crate::paging::pinned::PinnedPage;
+use crate::scene::camera::Camera;
+use crate::scene::columns::{Column, Columns};
+use crate::scene::events::{Event, EventKind, EventLog};
+use crate::scene::page_layout::write_page;
+use crate::scene::page_meta::{PageBounds, PageMeta};
+use crate::scene::partition::{first_fill, partition};
+use crate::scene::rows::Rows;
+use crate::scene::state::SceneState;
+use rayon::prelude::*;
+
+/// Pages that are brought to now together: their copies are in memory at once.
+const PAGES_PER_BATCH: usize = 32;
+
+/// The pages of a run and what they share.
+pub struct PagedScene {
+    /// Where the pages are.
+    pub pager: Pager,
+    /// The optimizer.
+    pub adam: DeferredAdam,
+    /// Statistics of rows since the last round.
+    pub histogram: GradHistogram,
+    events: EventLog,
+    rules: PageRules,
+    sh_degree: u8,
+    rows: u64,
+    rows_bound: u64,
+}
+
+impl PagedScene {
+    /// Pages of first Gaussians. Each row keeps its number in `columns` as its identity.
+    ///
+    /// # Errors
+    /// A page could not be stored.
+    pub fn new(columns: &Columns, pager: Pager, options: &RunOptions) -> Result<PagedScene, PagingError> {
+        let adam = DeferredAdam::new(options.rates, options.adam, options.render.simd);
+        let splits = options.densify.map_or(SplitLimits::NEVER, |d| SplitLimits {
+            grow_grad2d: d.grow_grad2d,
+            split_scale: d.grow_scale3d * options.scene_scale,
+        });
+        let rules = PageRules { seed: options.seed, page_rows: options.page_rows, splits };
+        let rows = columns.rows() as u64;
+        let mut scene = PagedScene {
+            pager,
+            adam,
+            histogram: GradHistogram::default(),
+            events: EventLog::default(),
+            rules,
+            sh_degree: options.sh_degree_at(0),
+            rows,
+            rows_bound: rows,
+        };
+        scene.insert_first_pages(columns, options.densify.is_some())?;
+        Ok(scene)
+    }
+
+    fn insert_first_pages(&mut self, columns: &Columns, is_growing: bool) -> Result<(), PagingError> {
+        let fill = first_fill(self.rules.page_rows, is_growing);
+        let pages = partition(&columns.means, &columns.scales, fill);
+        for (index, rows) in pages.iter().enumerate() {
+            let state = first_rows(columns, rows, self.sh_degree);
+            let id = PageId::initial(index as u32);
+            let meta = PageMeta {
+                id,
+                rows: rows.len() as u32,
+                sh_degree: self.sh_degree,
+                events_applied: 0,
+                bounds: self.adam.page_bounds(&state.view(), &self.rules.splits),
+            };
+            self.pager.insert(meta, |payload| {
+                write_page(&state, payload);
+            })?;
+        }
+        Ok(())
+    }
+
+    /// Degree in use, as the events raised it.
+    pub fn sh_degree(&self) -> u8 {
+        self.sh_degree
+    }
+
+    /// Rows in the pages as they are stored: late events are not counted.
+    pub fn rows(&self) -> u64 {
+        self.rows
+    }
+
+    /// No fewer than the rows that there would be if every page had applied every event.
+    pub fn rows_bound(&self) -> u64 {
+        self.rows_bound
+    }
+
+    /// The events so far.
+    pub fn events(&self) -> &EventLog {
+        &self.events
+    }
+
+    /// Logs an event: pages apply it when they are next pinned by a step. A round is promised the growth of all rows
+    /// that may exceed its threshold, and clears the statistics.
+    pub fn log_event(&mut self, event: Event) {
+        self.events.push(event);
+        match event.kind {
+            EventKind::RaiseShDegree { degree } => self.sh_degree = degree,
+            EventKind::Densify(thresholds) => {
+                self.rows_bound += self.histogram.rows_above(thresholds.grow_grad2d);
+                self.histogram.clear();
+            }
+            EventKind::ResetOpacity { .. } => {}
+        }
+    }
+
+    /// Applies the events that the pinned pages miss. Pages that outgrow their capacity split, which takes frames; the
+    /// list stays ascending by id.
+    ///
+    /// # Errors
+    /// No frame could be had for a split; the page that needed it is as it was.
+    pub fn apply_pending(&mut self, pages: &mut Vec<PinnedPage>) -> Result<(), PagingError> {
+        let behind: Vec<usize> = (0..pages.len()).filter(|&i| self.is_behind(&pages[i].meta)).collect();
+        if behind.is_empty() {
+            return Ok(());
+        }
+        for batch in behind.chunks(PAGES_PER_BATCH) {
+            let fresh: Vec<CaughtUp> = batch.par_iter().map(|&i| self.caught_up(&pages[i])).collect();
+            for (&i, fresh) in batch.iter().zip(&fresh) {
+                self.store_caught_up(pages, i, fresh)?;
+            }
+        }
+        pages.sort_unstable_by_key(|p| p.meta.id);
+        Ok(())
+    }
+
+    fn is_behind(&self, meta: &PageMeta) -> bool {
+        (meta.events_applied as usize) < self.events.len()
+    }
+
+    fn caught_up(&self, page: &PinnedPage) -> CaughtUp {
+        caught_up(&page.rows(0), &page.meta, &self.events, &self.adam, &self.rules)
+    }
+
+    /// Writes the parts of page `i`: the first in its place, the others behind all pages.
+    fn store_caught_up(&mut self, pages: &mut Vec<PinnedPage>, i: usize, fresh: &CaughtUp) -> Result<(), PagingError> {
+        let mut frames = Vec::with_capacity(fresh.parts.len() - 1);
+        for _ in 1..fresh.parts.len() {
+            match self.pager.take_frame() {
+                Ok(frame) => frames.push(frame),
+                Err(error) => {
+                    frames.into_iter().for_each(|frame| self.pager.return_frame(frame));
+                    return Err(error);
+                }
+            }
+        }
+        let before = u64::from(pages[i].meta.rows);
+        let mut after = 0;
+        let mut frames = frames.into_iter();
+        for (part, (meta, state)) in fresh.parts.iter().enumerate() {
+            after += u64::from(meta.rows);
+            if part == 0 {
+                write_page(state, pages[i].payload_mut());
+                (pages[i].meta, pages[i].dirty) = (*meta, true);
+            } else if let Some(mut frame) = frames.next() {
+                write_page(state, &mut frame.as_mut_slice()[crate::paging::pinned::HEADER_BYTES..]);
+                pages.push(self.pager.add_split(*meta, frame));
+            }
+        }
+        self.rows = self.rows - before + after;
+        self.rows_bound = self.rows_bound - before + after - fresh.promised;
+        Ok(())
+    }
+
+    /// Renews the bounds of a page that was changed.
+    pub(super) fn bounds_of(&self, page: &PinnedPage) -> PageBounds {
+        self.adam.page_bounds(&page.rows(0), &self.rules.splits)
+    }
+
+    /// Collects into `working` the rows that `camera` may draw after `now` steps, as though their pages had been touched
+    /// then; stores nothing.
+    ///
+    /// # Errors
+    /// Pages could not be had.
+    pub fn gather_view(&mut self, camera: &Camera, now: u32, working: &mut WorkingSet) -> Result<(), PagingError> {
+        let pages = self.pager.pages_of_view(camera);
+        let WorkingSet { row_from_working, columns, .. } = working;
+        if columns.sh_degree != self.sh_degree {
+            *columns = Columns::zeros(0, self.sh_degree);
+        }
+        columns.resize(0);
+        let mut part = Columns::zeros(0, self.sh_degree);
+        self.visit(&pages, &mut |scene, tables| {
+            visible_rows(tables, &scene.adam, now, camera, row_from_working);
+            gather(tables, scene.sh_degree, &scene.adam, now, row_from_working, &mut part);
+            append(columns, &part);
+            Ok::<(), PagingError>(())
+        })
+    }
+
+    /// Hands all rows as they are after `now` steps to `each`, part by part in the order of page ids; stores nothing.
+    ///
+    /// # Errors
+    /// Pages could not be had, or `each` failed.
+    pub fn for_all_rows<E: From<PagingError>>(
+        &mut self,
+        now: u32,
+        each: &mut dyn FnMut(&Columns) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let index = self.pager.index();
+        let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
+        pages.retain(|p| index[p.index()].rows > 0);
+        pages.sort_unstable_by_key(|p| index[p.index()].id);
+        self.visit(&pages, &mut |scene, tables| each(&evaluate_all(tables, scene.sh_degree, &scene.adam, now)))
+    }
+
+    /// Pins the pages batch by batch and hands their rows to `each`, with pending events applied to copies.
+    fn visit<E: From<PagingError>>(
+        &mut self,
+        pages: &[PageNo],
+        each: &mut dyn FnMut(&PagedScene, &[Rows<'_>]) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let batch = PAGES_PER_BATCH.min(self.pager.stats().frames_max).max(1);
+        for pages in pages.chunks(batch) {
+            let pinned = self.pager.acquire_pages(pages)?;
+            let copies: Vec<Option<CaughtUp>> =
+                pinned.par_iter().map(|p| self.is_behind(&p.meta).then(|| self.caught_up(p))).collect();
+            let mut tables = Vec::with_capacity(pinned.len());
+            for (page, copy) in pinned.iter().zip(&copies) {
+                match copy {
+                    None => tables.push(page.rows(0)),
+                    Some(copy) => tables.extend(copy.parts.iter().map(|(_, state)| state.view())),
+                }
+            }
+            let mut first_row = 0;
+            for table in &mut tables {
+                table.first_row = first_row;
+                first_row += table.rows();
+            }
+            let done = each(self, &tables);
+            drop(tables);
+            self.pager.release(pinned);
+            done?;
+        }
+        Ok(())
+    }
+}
+
+/// The rows of the pages, numbered through.
+pub fn numbered(pages: &[PinnedPage]) -> Vec<Rows<'_>> {
+    let mut first_row = 0;
+    let mut tables = Vec::with_capacity(pages.len());
+    for page in pages {
+        tables.push(page.rows(first_row));
+        first_row += page.meta.rows as usize;
+    }
+    tables
+}
+
+/// The listed rows of `columns` as fresh rows with their numbers as identities, stored with `sh_degree`: bands above it
+/// are left out.
+fn first_rows(columns: &Columns, rows: &[u32], sh_degree: u8) -> SceneState {
+    let mut out = Columns::zeros(rows.len(), sh_degree);
+    for column in Column::ALL {
+        let width = column.width(sh_degree);
+        if width == 0 {
+            continue;
+        }
+        for (to, &row) in out.column_mut(column).chunks_exact_mut(width).zip(rows) {
+            let from = columns.row(column, row as usize);
+            let kept = width.min(from.len());
+            to[..kept].copy_from_slice(&from[..kept]);
+        }
+    }
+    let mut state = SceneState::from_columns(out);
+    state.uid.iter_mut().zip(rows).for_each(|(uid, &row)| *uid = u64::from(row));
+    state
+}
+
+fn append(to: &mut Columns, more: &Columns) {
+    for column in Column::ALL {
+        to.column_mut(column).extend_from_slice(more.column(column));
+    }
+}
