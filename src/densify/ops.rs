@@ -10,20 +10,16 @@
 //! in the order of their parents.
 
 use super::policy::{Fate, fate};
-use super::stats::mean_grad2d;
 use crate::base::math::{exp32, logit};
 use crate::base::rng::{Purpose, Stream, hash64};
 use crate::scene::columns::{Column, Columns};
-use crate::scene::events::RoundThresholds;
-use crate::scene::rows::{BLOCK_LANES, RowBlock, Rows, RowsMut, RowsNow, first_lane};
+use crate::scene::events::{RoundThresholds, SPLIT_SIGMAS};
+use crate::scene::rows::{BLOCK_LANES, RowBlock, Rows, RowsMut, RowsNow, first_lane, mean_grad2d};
 use crate::scene::state::SceneState;
 use rayon::prelude::*;
 
 /// Rows of one unit of parallel work.
 const ROWS_PER_TASK: usize = 4096;
-/// Children of a split lie within this many standard deviations of their parent, in its own axes: bounds can count
-/// on it. 1.1 % of draws are drawn again.
-pub const SPLIT_SIGMAS: f64 = 3.33;
 /// Children of a split are smaller than their parent by this factor.
 const SPLIT_SHRINK: f64 = 1.6;
 

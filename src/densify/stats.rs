@@ -5,15 +5,10 @@
 //! order in which rows were touched leaves no trace in it.
 
 use crate::scene::rows::RowsMut;
+pub use crate::scene::rows::mean_grad2d;
 
 /// Bins: one per value of the upper 16 bits of a non-negative f32, so 128 to every doubling.
 const BINS: usize = 1 << 15;
-
-/// Mean gradient norm per view that drew the row; 0 without views.
-#[inline]
-pub fn mean_grad2d(grad2d: f32, count: u32) -> f32 {
-    grad2d / count.max(1) as f32
-}
 
 /// Number of rows with statistics by their mean gradient norm. 128 KiB.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -301,6 +301,12 @@ impl<'a> RowsMut<'a> {
     }
 }
 
+/// Mean gradient norm per view that drew the row; 0 without views.
+#[inline(always)]
+pub fn mean_grad2d(grad2d: f32, count: u32) -> f32 {
+    grad2d / count.max(1) as f32
+}
+
 /// What rows are at one moment of training. The optimizer implements it; events act on rows through it, because an
 /// untouched row still moves by its momentum.
 pub trait RowsNow: Sync {

@@ -11,13 +11,11 @@ use crate::base::math::exp32;
 use crate::base::simd::{Kernel, dispatch};
 use crate::kernels::constants::{EPS2D, EXTENT_SIGMAS};
 use crate::optim::deferred::{AdamNow, DeferredAdam, ROWS_PER_TASK};
-use crate::optim::drift::{EpsFloor, drifted, needs_direct_sum};
+use crate::optim::lanes::{LANES, LaneDrifts, drifted_lanes, tables_of};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
 use crate::scene::rows::{ColumnsMut, Rows, RowsNow};
 
-/// Rows of one vector of the cull.
-const LANES: usize = 16;
 /// The view angle at which the projection's Jacobian is clamped lies this share of the half field of view outside it.
 const CLAMP_MARGIN: f32 = 0.3;
 
@@ -214,19 +212,9 @@ impl Kernel for CullRows<'_, '_> {
 /// [`LANES`] rows from `first` on: one vector per coordinate.
 #[inline(always)]
 fn cull_lanes(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, first: usize) -> [bool; LANES] {
-    let mut drift = [[0.0; LANES]; 8];
-    for (l, &stamp) in view.stamp[first..first + LANES].iter().enumerate() {
-        let of_row = at.drift(stamp);
-        for p in 0..8 {
-            drift[p][l] = of_row[p];
-        }
-    }
-    let [m1, m2, m3, _, c1, c2, c3, _] = &drift;
-    let (values, exp_avg, exp_avg_sq) = (&view.columns, &view.exp_avg, &view.exp_avg_sq);
-    let (means, a) =
-        drifted_lanes(at, Column::Means, [values.means, exp_avg.means, exp_avg_sq.means], first, [m1, m2, m3]);
-    let (scales, b) =
-        drifted_lanes(at, Column::Scales, [values.scales, exp_avg.scales, exp_avg_sq.scales], first, [c1, c2, c3]);
+    let drifts = LaneDrifts::gather(&view.stamp[first..], |stamp| at.drift(stamp));
+    let (means, a) = drifted_lanes(at.adam(), Column::Means, tables_of(view, Column::Means), first, &drifts);
+    let (scales, b) = drifted_lanes(at.adam(), Column::Scales, tables_of(view, Column::Scales), first, &drifts);
     if a | b {
         return cull_row_by_row(at, frustum, view, first);
     }
@@ -236,51 +224,6 @@ fn cull_lanes(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, first: usize
         drawn[l] = frustum.may_draw([means[0][l], means[1][l], means[2][l]], sigma_max);
     }
     drawn
-}
-
-/// The three coordinates of a column now, by the series; and whether some of them need the direct sum instead.
-/// `tables`: values, first and second moments.
-#[inline(always)]
-fn drifted_lanes(
-    at: &AdamNow<'_>,
-    column: Column,
-    tables: [&[f32]; 3],
-    first: usize,
-    sums: [&[f32; LANES]; 3],
-) -> ([[f32; LANES]; 3], bool) {
-    let EpsFloor { eps, floor } = at.eps_floor();
-    let rate = at.base_rate(column);
-    let (from, to) = (first * 3, (first + LANES) * 3);
-    // Not `map` over the tables: its closure is not always inlined, and then runs without the vector instructions.
-    let value = by_coordinate(&tables[0][from..to]);
-    let m = by_coordinate(&tables[1][from..to]);
-    let v = by_coordinate(&tables[2][from..to]);
-    let mut out = [[0.0; LANES]; 3];
-    let mut direct = false;
-    for c in 0..3 {
-        let mut lanes = [false; LANES];
-        for l in 0..LANES {
-            out[c][l] = drifted(value[c][l], m[c][l], v[c][l], [sums[0][l], sums[1][l], sums[2][l]], rate, eps);
-            lanes[l] = needs_direct_sum(m[c][l], v[c][l], floor);
-        }
-        for lane in lanes {
-            direct |= lane;
-        }
-    }
-    (out, direct)
-}
-
-/// `[LANES][3]` to `[3][LANES]`.
-#[inline(always)]
-fn by_coordinate(rows: &[f32]) -> [[f32; LANES]; 3] {
-    let rows = &rows[..LANES * 3];
-    let mut out = [[0.0; LANES]; 3];
-    for l in 0..LANES {
-        out[0][l] = rows[l * 3];
-        out[1][l] = rows[l * 3 + 1];
-        out[2][l] = rows[l * 3 + 2];
-    }
-    out
 }
 
 #[cold]
