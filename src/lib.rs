@@ -18,7 +18,7 @@
 //! | [`base`] | errors, random draws, deterministic math, instruction paths, errors; knows neither Gaussians nor disks |
 //! | [`scene`] | Gaussians, cameras and images as data; first Gaussians from points; the log of global events |
 //! | [`dataset`] | where views come from: COLMAP, transforms.json, the generated city; decoding photos |
-//! | [`schedule`] | which view comes when |
+//! | [`schedule`] | which view comes when, which pages it needs, what a cache should keep |
 //! | [`page`] | pages as bytes: buffers, places on disk, the engines that move them |
 //! | [`paging`] | brings the pages of a view into memory and takes them back |
 //! | [`gpu`] | a device and its memory, shaders, recording of work; knows no Gaussians |

@@ -1,3 +1,4 @@
-//! Which view comes when: pure functions of the seed, no I/O.
+//! Which view comes when and which pages it needs: pure planning, no I/O.
 
 pub mod order;
+pub mod visibility;

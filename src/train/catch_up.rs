@@ -9,15 +9,12 @@
 
 use crate::base::math::exp32;
 use crate::base::simd::{Kernel, dispatch};
-use crate::kernels::constants::{EPS2D, EXTENT_SIGMAS};
 use crate::optim::deferred::{AdamNow, DeferredAdam, ROWS_PER_TASK};
 use crate::optim::lanes::{LANES, LaneDrifts, drifted_lanes, tables_of};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
+use crate::scene::frustum::Frustum;
 use crate::scene::rows::{ColumnsMut, Rows, RowsNow};
-
-/// The view angle at which the projection's Jacobian is clamped lies this share of the half field of view outside it.
-const CLAMP_MARGIN: f32 = 0.3;
 
 /// The rows of `tables` that `camera` may draw after `now` optimizer steps, ascending. Tables are numbered through:
 /// each starts where the one before it ends.
@@ -81,76 +78,6 @@ fn evaluate_into(at: &AdamNow<'_>, tables: &[Rows<'_>], rows: &[u32], out: Colum
 /// Runs both, on two threads where that is worth it.
 fn join_if<A: Send, B: Send>(worth: bool, a: impl FnOnce() -> A + Send, b: impl FnOnce() -> B + Send) -> (A, B) {
     if worth { rayon::join(a, b) } else { (a(), b()) }
-}
-
-/// Half-spaces of a camera in its own axes, each shifted outwards by a multiple of the row's largest sigma.
-///
-/// A row is drawn when z lies between the planes and its box meets the image. The box's half width is at most
-/// ceil(3.33 sqrt(c_xx)), with c_xx <= (sigma_max fx / z)^2 (1 + lim^2) + 0.3, lim being the angle at which the Jacobian is
-/// clamped; the square root of a sum is at most the sum of the roots. Multiplied by z / fx, the box meets the image
-/// only if  x <= ((W - cx) + 3.33 sqrt 0.3 + 1) / fx z + 3.33 sigma_max sqrt(1 + lim^2),  and likewise on the other sides.
-#[derive(Debug, Clone, Copy)]
-struct Frustum {
-    viewmat: [[f32; 4]; 3],
-    /// Largest |t|: rounding errors of camera coordinates scale with it and with the position.
-    translation: f32,
-    near: f32,
-    far: f32,
-    /// Slopes of the planes at x low, x high, y low, y high; outwards positive.
-    slopes: [f32; 4],
-    /// Sigmas that a footprint reaches beyond its mean, in x and y.
-    reach: [f32; 2],
-}
-
-/// Rounding slack of a camera coordinate, per unit of position: sixteen times what a dot product of four terms loses.
-const POSITION_SLACK: f32 = 4e-6;
-/// Relative slack on slopes and footprints, for the roundings of the projection itself.
-const RELATIVE_SLACK: f32 = 1e-4;
-
-impl Frustum {
-    fn new(camera: &Camera) -> Self {
-        let blur = EXTENT_SIGMAS * EPS2D.sqrt() + 1.0;
-        let axis = |size: u32, f: f32, c: f32| {
-            let size = size as f32;
-            let (low, high, margin) = (c / f, (size - c) / f, CLAMP_MARGIN * 0.5 * size / f);
-            let limit = (low + margin).abs().max((high + margin).abs());
-            let slope = |edge: f32| edge + blur / f + RELATIVE_SLACK * (edge.abs() + blur / f);
-            let reach = EXTENT_SIGMAS * (1.0 + limit * limit).sqrt() * (1.0 + RELATIVE_SLACK);
-            (slope(low), slope(high), reach)
-        };
-        let (x_low, x_high, reach_x) = axis(camera.width, camera.fx, camera.cx);
-        let (y_low, y_high, reach_y) = axis(camera.height, camera.fy, camera.cy);
-        let m = &camera.viewmat;
-        Frustum {
-            viewmat: camera.viewmat,
-            translation: m[0][3].abs() + m[1][3].abs() + m[2][3].abs(),
-            near: camera.near_plane,
-            far: camera.far_plane,
-            slopes: [x_low, x_high, y_low, y_high],
-            reach: [reach_x, reach_y],
-        }
-    }
-
-    /// Whether a row may be drawn. Comparisons are such that a NaN counts as drawn.
-    #[inline(always)]
-    fn may_draw(&self, p: [f32; 3], sigma_max: f32) -> bool {
-        let m = &self.viewmat;
-        let x = m[0][0] * p[0] + m[0][1] * p[1] + m[0][2] * p[2] + m[0][3];
-        let y = m[1][0] * p[0] + m[1][1] * p[1] + m[1][2] * p[2] + m[1][3];
-        let z = m[2][0] * p[0] + m[2][1] * p[1] + m[2][2] * p[2] + m[2][3];
-        let slack = POSITION_SLACK * (p[0].abs() + p[1].abs() + p[2].abs() + self.translation);
-        let slopes = &self.slopes;
-        let steepest = slopes[0].abs().max(slopes[1].abs()).max(slopes[2].abs()).max(slopes[3].abs());
-        let side = slack * (1.0 + steepest);
-        let (reach_x, reach_y) = (self.reach[0] * sigma_max + side, self.reach[1] * sigma_max + side);
-        let outside = (z <= self.near - slack)
-            | (z >= self.far + slack)
-            | (-x > slopes[0] * z + reach_x)
-            | (x > slopes[1] * z + reach_x)
-            | (-y > slopes[2] * z + reach_y)
-            | (y > slopes[3] * z + reach_y);
-        !outside
-    }
 }
 
 /// Lists the rows of the tables that may be drawn in the front of `out`, which has room for all; returns how many.
