@@ -368,7 +368,7 @@ fn photo_case(folder: &str, data_factor: f64, count: Option<usize>, peer: Option
     if !scene.is_dir() {
         return None;
     }
-    let config = TrainConfig { data_factor, ..TrainConfig::default() };
+    let config = TrainConfig { data_factor, sh_every: 0, ..TrainConfig::default() };
     let prepared = gsscale::train::run::prepare(&scene, &config);
     let Ok(prepared) = prepared else { panic!("{}: {:?}", scene.display(), prepared.err()) };
     let dataset = prepared.dataset;

@@ -65,7 +65,7 @@ impl RunOptions {
             seed: config.seed,
             sh_degree: config.sh_degree,
             sh_every: config.sh_every,
-            sh_degree_start: config.sh_start,
+            sh_degree_start: first_sh_degree(config),
             max_gaussians: config.max_gaussians as usize,
             page_rows: config.page_rows as usize,
             render: RenderOptions {
@@ -147,10 +147,15 @@ pub fn load_options(config: &TrainConfig) -> LoadOptions {
     }
 }
 
-/// How first Gaussians are made.
+/// Degree in use from the first step, where the Gaussians themselves do not ask for more.
+pub fn first_sh_degree(config: &TrainConfig) -> u8 {
+    if config.sh_every == 0 { config.sh_degree } else { config.sh_start.min(config.sh_degree) }
+}
+
+/// How first Gaussians are made: without bands that are not in use yet.
 pub fn init_options(config: &TrainConfig) -> InitOptions {
     InitOptions {
-        sh_degree: config.sh_degree,
+        sh_degree: first_sh_degree(config),
         opacity: config.init_opacity as f32,
         scale_factor: config.init_scale as f32,
         seed: config.seed,

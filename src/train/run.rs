@@ -19,7 +19,7 @@ use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
-use crate::scene::columns::Columns;
+use crate::scene::columns::{Columns, sh_n_width};
 use crate::scene::init::{gaussians_from_points, random_points_in_frusta};
 use std::path::{Path, PathBuf};
 
@@ -53,7 +53,7 @@ pub struct RunOutcome {
 pub struct Prepared {
     /// Views and frame.
     pub dataset: Dataset,
-    /// First Gaussians, local frame.
+    /// First Gaussians, local frame. Bands that are not in use yet may be missing.
     pub columns: Columns,
     /// Degree in use from the first step: what they were trained with, or what was asked for.
     pub sh_degree_start: u8,
@@ -93,9 +93,10 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
         Some((mut columns, meta, ply)) => {
             let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
             dataset.warnings.extend(ply_warnings(&ply, &meta, far));
-            (resize_sh(&columns, config.sh_degree), columns.sh_degree.max(config.sh_start))
+            let in_use = columns.sh_degree.max(limits::first_sh_degree(config));
+            (cut_sh(columns, config.sh_degree), in_use)
         }
-        None => (first_gaussians(scene, &mut dataset, config)?, config.sh_start),
+        None => (first_gaussians(scene, &mut dataset, config)?, limits::first_sh_degree(config)),
     };
     if columns.rows() == 0 {
         let problem = "no Gaussian is left to start from: all are too far from the cameras";
@@ -133,19 +134,14 @@ fn first_gaussians(scene: &Path, dataset: &mut Dataset, config: &TrainConfig) ->
     Ok(gaussians_from_points(&points, &colors, &options))
 }
 
-/// The same rows stored with another degree: bands are cut or filled with zeros.
-fn resize_sh(columns: &Columns, sh_degree: u8) -> Columns {
-    let mut out = Columns { sh_degree, ..columns.clone() };
-    out.sh_n.clear();
-    out.resize(columns.rows());
-    let kept = crate::scene::columns::sh_n_width(sh_degree.min(columns.sh_degree));
-    if kept > 0 {
-        for row in 0..columns.rows() {
-            let from = &columns.row(crate::scene::columns::Column::ShN, row)[..kept];
-            out.row_mut(crate::scene::columns::Column::ShN, row)[..kept].copy_from_slice(from);
-        }
+/// The same rows without the bands above a degree.
+fn cut_sh(columns: Columns, sh_degree: u8) -> Columns {
+    if columns.sh_degree <= sh_degree {
+        return columns;
     }
-    out
+    let (from, to) = (sh_n_width(columns.sh_degree), sh_n_width(sh_degree));
+    let sh_n = columns.sh_n.chunks_exact(from).flat_map(|row| &row[..to]).copied().collect();
+    Columns { sh_degree, sh_n, ..columns }
 }
 
 /// Runs a request from beginning to end.
