@@ -6,6 +6,7 @@ use gsscale::base::rng::{Purpose, Stream, hash64};
 use gsscale::base::simd::SimdPath;
 use gsscale::densify::ops::child_uid;
 use gsscale::densify::policy::DensifyConfig;
+use gsscale::densify::replay::apply_event;
 use gsscale::densify::stats::{GradHistogram, accumulate};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
@@ -14,7 +15,6 @@ use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::events::{Event, EventKind, EventLog, RoundThresholds};
 use gsscale::scene::state::SceneState;
 use gsscale::train::catch_up;
-use gsscale::train::events::apply_event;
 use std::collections::{BTreeMap, HashMap};
 
 const SEED: u64 = 11;

@@ -109,9 +109,14 @@ pub fn apply_round<V: RowsNow>(
     let chunks = state.chunks(ROWS_PER_TASK);
     let edits: Vec<(usize, RoundEdits)> =
         chunks.par_iter().map(|rows| (rows.first_row, plan_round(values, rows, thresholds, seed, event))).collect();
+    apply_edits(state, &edits)
+}
+
+/// Makes the edits of views that cover a whole table, given with the first row of each, and clears its statistics.
+pub fn apply_edits(state: &mut SceneState, edits: &[(usize, RoundEdits)]) -> RoundCounts {
     let mut removed = Vec::new();
     let mut counts = RoundCounts::default();
-    for (first, edit) in &edits {
+    for (first, edit) in edits {
         removed.extend(edit.removed.iter().map(|&row| row + *first as u32));
         counts.duplicated += edit.counts.duplicated;
         counts.split += edit.counts.split;

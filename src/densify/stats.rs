@@ -4,8 +4,8 @@
 //! 3. the histogram counts every row that has statistics, exactly once, in the bin of its mean: integers only, so the
 //! order in which rows were touched leaves no trace in it.
 
-use crate::scene::rows::RowsMut;
 pub use crate::scene::rows::mean_grad2d;
+use crate::scene::rows::{Rows, RowsMut};
 
 /// Bins: one per value of the upper 16 bits of a non-negative f32, so 128 to every doubling.
 const BINS: usize = 1 << 15;
@@ -43,11 +43,6 @@ impl GradHistogram {
         self.bins.iter().map(|&n| u64::from(n)).sum()
     }
 
-    /// Rows that may exceed a threshold that [`GradHistogram::threshold`] gave: those that it counted as exceeding it.
-    pub fn rows_above(&self, threshold: f32) -> u64 {
-        self.bins[first_bin_above(threshold)..].iter().map(|&n| u64::from(n)).sum()
-    }
-
     /// The smallest threshold, not below `least`, that at most `room` rows exceed, in whole bins: either `least`
     /// itself, or just below the edge of a bin, or infinity.
     pub fn threshold(&self, least: f32, room: u64) -> f32 {
@@ -63,17 +58,19 @@ impl GradHistogram {
         }
         least
     }
+
+    /// Rows that may grow at this threshold, one of [`GradHistogram::threshold`]'s: whole bins, so at least those that
+    /// exceed it. Adds up to the [`promised_growth`] of all pages.
+    pub fn promised(&self, threshold: f32) -> u64 {
+        self.bins[bin(threshold.next_up())..].iter().map(|&n| u64::from(n)).sum()
+    }
 }
 
-/// Whether [`GradHistogram::rows_above`] counted a row with this mean: true for every row that exceeds the threshold, and
-/// for those that share the lowest bin with it.
-pub fn may_exceed(mean: f32, threshold: f32) -> bool {
-    bin(mean) >= first_bin_above(threshold)
-}
-
-/// The bin of the smallest number above the threshold.
-fn first_bin_above(threshold: f32) -> usize {
-    bin(threshold.next_up())
+/// Rows of a view that [`GradHistogram::promised`] counted, when their statistics are still those of the round.
+pub fn promised_growth(rows: &Rows<'_>, threshold: f32) -> u64 {
+    let first = bin(threshold.next_up());
+    let is_counted = |&(&grad2d, &count): &(&f32, &u32)| count > 0 && bin(mean_grad2d(grad2d, count)) >= first;
+    rows.grad2d.iter().zip(rows.count).filter(is_counted).count() as u64
 }
 
 fn bin(mean: f32) -> usize {
@@ -139,20 +136,6 @@ mod tests {
         assert_eq!(histogram.threshold(2e-4, 1), 2e-4);
         let threshold = histogram.threshold(2e-4, 0);
         assert!(threshold >= mean_grad2d(state.grad2d[0], 2));
-    }
-
-    #[test]
-    fn rows_above_a_threshold_are_the_rows_that_may_exceed_it() {
-        let mut histogram = GradHistogram::default();
-        let means: Vec<f32> = (1..1000).map(|i| i as f32 * 1e-5).collect();
-        means.iter().for_each(|&m| histogram.add(m));
-        for room in [0, 1, 7, 500, 5000] {
-            let threshold = histogram.threshold(2e-4, room);
-            let may = means.iter().filter(|&&m| may_exceed(m, threshold)).count() as u64;
-            assert_eq!(histogram.rows_above(threshold), may);
-            assert!(may <= room, "{may} of {room}");
-            assert!(means.iter().all(|&m| m <= threshold || may_exceed(m, threshold)));
-        }
     }
 
     #[test]

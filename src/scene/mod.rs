@@ -9,6 +9,7 @@ pub mod init;
 pub mod neighbours;
 pub mod page_layout;
 pub mod page_meta;
+pub mod page_split;
 pub mod partition;
 pub mod rows;
 pub mod select;

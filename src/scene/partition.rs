@@ -4,7 +4,7 @@
 //! number of pages is odd, the halves are as unequal as the pages. The largest rows are divided the same way among
 //! themselves: one giant in a page of small rows would make every view need that page.
 //!
-//! Not here: what a page stores, and pages that outgrow their capacity (their split). A cloud that does not
+//! Not here: what a page stores, and pages that outgrow their capacity ([`super::page_split`]). A cloud that does not
 //! fit in memory is divided through files, with the same result.
 //!
 //! Invariants: 1. every row is in exactly one page; 2. pages differ by one row at most (giants among themselves);

@@ -4,7 +4,6 @@
 
 pub mod catch_up;
 pub mod eval;
-pub mod events;
 pub mod machine;
 pub mod memory;
 pub mod pages;

@@ -7,21 +7,23 @@
 //! number of rows that there would be if every page had applied every event.
 
 use super::catch_up::{evaluate_all, gather, visible_rows};
-use super::events::{CaughtUp, PageRules, caught_up};
 use super::step::WorkingSet;
+use super::trainer::TrainError;
 use crate::base::ids::{PageId, PageNo};
 use crate::config::limits::RunOptions;
+use crate::densify::replay::{PageEdit, PendingEvents, Replay};
 use crate::densify::stats::GradHistogram;
 use crate::optim::bounds::SplitLimits;
 use crate::optim::deferred::DeferredAdam;
 use crate::paging::error::PagingError;
 use crate::paging::pager::Pager;
-use crate::paging::pinned::PinnedPage;
+use crate::paging::pinned::{HEADER_BYTES, PinnedPage};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
 use crate::scene::events::{Event, EventKind, EventLog};
-use crate::scene::page_layout::write_page;
+use crate::scene::page_layout::{read_page, write_page};
 use crate::scene::page_meta::{PageBounds, PageMeta};
+use crate::scene::page_split::SplitTooDeep;
 use crate::scene::partition::{first_fill, partition};
 use crate::scene::rows::Rows;
 use crate::scene::state::SceneState;
@@ -29,6 +31,18 @@ use rayon::prelude::*;
 
 /// Pages that are brought to now together: their copies are in memory at once.
 const PAGES_PER_BATCH: usize = 32;
+
+/// What the rows of a run depend on besides the steps.
+#[derive(Debug, Clone, Copy)]
+struct PageRules {
+    seed: u64,
+    page_rows: usize,
+    /// When rows may split before they are seen again.
+    splits: SplitLimits,
+}
+
+/// Gets the rows of some pages, numbered through.
+type Visitor<'v, E> = dyn FnMut(&PagedScene, &[Rows<'_>]) -> Result<(), E> + 'v;
 
 /// The pages of a run and what they share.
 pub struct PagedScene {
@@ -119,7 +133,7 @@ impl PagedScene {
         match event.kind {
             EventKind::RaiseShDegree { degree } => self.sh_degree = degree,
             EventKind::Densify(thresholds) => {
-                self.rows_bound += self.histogram.rows_above(thresholds.grow_grad2d);
+                self.rows_bound += self.histogram.promised(thresholds.grow_grad2d);
                 self.histogram.clear();
             }
             EventKind::ResetOpacity { .. } => {}
@@ -130,57 +144,98 @@ impl PagedScene {
     /// list stays ascending by id.
     ///
     /// # Errors
-    /// No frame could be had for a split; the page that needed it is as it was.
-    pub fn apply_pending(&mut self, pages: &mut Vec<PinnedPage>) -> Result<(), PagingError> {
-        let behind: Vec<usize> = (0..pages.len()).filter(|&i| self.is_behind(&pages[i].meta)).collect();
-        if behind.is_empty() {
+    /// No frame could be had for a split, or a page cannot be split; it keeps its rows then.
+    pub fn apply_pending(&mut self, pages: &mut Vec<PinnedPage>) -> Result<(), TrainError> {
+        if pages.iter().all(|p| !self.is_behind(&p.meta)) {
             return Ok(());
         }
-        for batch in behind.chunks(PAGES_PER_BATCH) {
-            let fresh: Vec<CaughtUp> = batch.par_iter().map(|&i| self.caught_up(&pages[i])).collect();
-            for (&i, fresh) in batch.iter().zip(&fresh) {
-                self.store_caught_up(pages, i, fresh)?;
+        let mut added = Vec::new();
+        let mut done = Ok(());
+        for batch in pages.chunks_mut(PAGES_PER_BATCH) {
+            let mut behind: Vec<&mut PinnedPage> = batch.iter_mut().filter(|p| self.is_behind(&p.meta)).collect();
+            let pending = self.pending();
+            let replays: Vec<Result<Replay, SplitTooDeep>> = behind
+                .par_iter_mut()
+                .map(|p| pending.apply(p.meta.id, p.meta.events_applied as usize, &mut p.rows_mut(0)))
+                .collect();
+            for (page, replay) in behind.into_iter().zip(replays) {
+                let stored = replay.map_err(TrainError::from).and_then(|r| self.store_replay(page, r, &mut added));
+                done = done.and(stored);
+            }
+            if done.is_err() {
+                break;
             }
         }
+        pages.append(&mut added);
         pages.sort_unstable_by_key(|p| p.meta.id);
-        Ok(())
+        done
+    }
+
+    fn pending(&self) -> PendingEvents<'_> {
+        PendingEvents::new(&self.adam, self.rules.seed, self.rules.page_rows, &self.events)
     }
 
     fn is_behind(&self, meta: &PageMeta) -> bool {
         (meta.events_applied as usize) < self.events.len()
     }
 
-    fn caught_up(&self, page: &PinnedPage) -> CaughtUp {
-        caught_up(&page.rows(0), &page.meta, &self.events, &self.adam, &self.rules)
+    /// Takes over what became of a page; the parts that it split into but the first go to `added`.
+    fn store_replay(
+        &mut self,
+        page: &mut PinnedPage,
+        replay: Replay,
+        added: &mut Vec<PinnedPage>,
+    ) -> Result<(), TrainError> {
+        let Replay { edit, rounds, .. } = replay;
+        if let PageEdit::Replaced(parts) = &edit {
+            self.store_parts(page, parts, added)?;
+        } else {
+            page.meta.events_applied = self.events.len() as u32;
+            if edit == PageEdit::InPlace {
+                page.meta.bounds = self.bounds_of(page);
+            }
+        }
+        page.dirty = true;
+        for round in rounds {
+            self.rows = self.rows.saturating_add_signed(round.rows_change);
+            self.rows_bound = (self.rows_bound - round.promised).saturating_add_signed(round.rows_change);
+        }
+        Ok(())
     }
 
-    /// Writes the parts of page `i`: the first in its place, the others behind all pages.
-    fn store_caught_up(&mut self, pages: &mut Vec<PinnedPage>, i: usize, fresh: &CaughtUp) -> Result<(), PagingError> {
-        let mut frames = Vec::with_capacity(fresh.parts.len() - 1);
-        for _ in 1..fresh.parts.len() {
+    fn store_parts(
+        &mut self,
+        page: &mut PinnedPage,
+        parts: &[(PageId, SceneState)],
+        added: &mut Vec<PinnedPage>,
+    ) -> Result<(), TrainError> {
+        let mut frames = Vec::new();
+        for _ in 1..parts.len() {
             match self.pager.take_frame() {
                 Ok(frame) => frames.push(frame),
                 Err(error) => {
                     frames.into_iter().for_each(|frame| self.pager.return_frame(frame));
-                    return Err(error);
+                    return Err(error.into());
                 }
             }
         }
-        let before = u64::from(pages[i].meta.rows);
-        let mut after = 0;
         let mut frames = frames.into_iter();
-        for (part, (meta, state)) in fresh.parts.iter().enumerate() {
-            after += u64::from(meta.rows);
+        for (part, (id, state)) in parts.iter().enumerate() {
+            let meta = PageMeta {
+                id: *id,
+                rows: state.rows() as u32,
+                sh_degree: state.sh_degree(),
+                events_applied: self.events.len() as u32,
+                bounds: self.adam.page_bounds(&state.view(), &self.rules.splits),
+            };
             if part == 0 {
-                write_page(state, pages[i].payload_mut());
-                (pages[i].meta, pages[i].dirty) = (*meta, true);
+                write_page(state, page.payload_mut());
+                page.meta = meta;
             } else if let Some(mut frame) = frames.next() {
-                write_page(state, &mut frame.as_mut_slice()[crate::paging::pinned::HEADER_BYTES..]);
-                pages.push(self.pager.add_split(*meta, frame));
+                write_page(state, &mut frame.as_mut_slice()[HEADER_BYTES..]);
+                added.push(self.pager.add_split(meta, frame));
             }
         }
-        self.rows = self.rows - before + after;
-        self.rows_bound = self.rows_bound - before + after - fresh.promised;
         Ok(())
     }
 
@@ -227,23 +282,22 @@ impl PagedScene {
     }
 
     /// Pins the pages batch by batch and hands their rows to `each`, with pending events applied to copies.
-    fn visit<E: From<PagingError>>(
-        &mut self,
-        pages: &[PageNo],
-        each: &mut dyn FnMut(&PagedScene, &[Rows<'_>]) -> Result<(), E>,
-    ) -> Result<(), E> {
+    fn visit<E: From<PagingError>>(&mut self, pages: &[PageNo], each: &mut Visitor<'_, E>) -> Result<(), E> {
         let batch = PAGES_PER_BATCH.min(self.pager.stats().frames_max).max(1);
         for pages in pages.chunks(batch) {
             let pinned = self.pager.acquire_pages(pages)?;
-            let copies: Vec<Option<CaughtUp>> =
-                pinned.par_iter().map(|p| self.is_behind(&p.meta).then(|| self.caught_up(p))).collect();
-            let mut tables = Vec::with_capacity(pinned.len());
-            for (page, copy) in pinned.iter().zip(&copies) {
-                match copy {
-                    None => tables.push(page.rows(0)),
-                    Some(copy) => tables.extend(copy.parts.iter().map(|(_, state)| state.view())),
-                }
-            }
+            let pending = self.pending();
+            let copies: Vec<Option<SceneState>> = pinned
+                .par_iter()
+                .map(|page| {
+                    let mut state = self.is_behind(&page.meta).then(|| read_page(&page.rows(0)))?;
+                    pending.apply_to_table(page.meta.events_applied as usize, &mut state);
+                    Some(state)
+                })
+                .collect();
+            let tables = pinned.iter().zip(&copies);
+            let mut tables: Vec<Rows<'_>> =
+                tables.map(|(page, copy)| copy.as_ref().map_or_else(|| page.rows(0), SceneState::view)).collect();
             let mut first_row = 0;
             for table in &mut tables {
                 table.first_row = first_row;

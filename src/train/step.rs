@@ -68,7 +68,7 @@ pub fn train_step(
     scene.pager.prefetch(step);
     if let Err(error) = scene.apply_pending(&mut pages) {
         scene.pager.release(pages);
-        return Err(error.into());
+        return Err(error);
     }
     let WorkingSet { row_from_working, columns, gradients } = working;
     let tables = numbered(&pages);

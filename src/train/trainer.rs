@@ -22,6 +22,7 @@ use crate::render::{RenderError, RenderOptions, Renderer};
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::image::Target;
+use crate::scene::page_split::SplitTooDeep;
 use crate::schedule::order::ShuffledOrder;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -43,6 +44,9 @@ pub enum TrainError {
     /// Pages could not be had.
     #[error(transparent)]
     Paging(#[from] PagingError),
+    /// A page cannot be split.
+    #[error(transparent)]
+    Split(#[from] SplitTooDeep),
     /// The loss was not finite several times in a row.
     #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
     NonFinite {
