@@ -88,7 +88,11 @@ impl SegmentFiles {
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{} {what}", path.display())));
         }
         if there.len() < bytes {
-            allocate(&file, there.len(), bytes)?;
+            if let Err(error) = allocate(&file, there.len(), bytes) {
+                // What was allocated before space ran out is given back; a file that was here stays as it was.
+                let _ = if there.len() == 0 { std::fs::remove_file(&path) } else { file.set_len(there.len()) };
+                return Err(error);
+            }
             file.sync_all()?;
             sync_folder(&self.folder)?;
         }
@@ -105,12 +109,15 @@ impl SegmentFiles {
             open.last_used = self.clock;
             return Ok(Arc::clone(&open.file));
         }
-        while self.open.len() >= self.open_max {
-            self.close_oldest()?;
-        }
-        let mut options = OpenOptions::new();
-        options.read(true).write(true);
-        let file = Arc::new(open_segment(&self.path(segment), &mut options, self.direct)?);
+        while self.open.len() >= self.open_max && self.close_oldest()? {}
+        let path = self.path(segment);
+        let file = loop {
+            match open_segment(&path, self.direct) {
+                // Others of this process hold more files than expected.
+                Err(error) if is_too_many_files(&error) && self.close_oldest()? => {}
+                opened => break Arc::new(opened?),
+            }
+        };
         let open = OpenFile { file: Arc::clone(&file), last_used: self.clock, is_dirty: false };
         self.open.insert(segment, open);
         Ok(file)
@@ -141,14 +148,22 @@ impl SegmentFiles {
         Ok(())
     }
 
-    fn close_oldest(&mut self) -> io::Result<()> {
-        let Some((&segment, _)) = self.open.iter().min_by_key(|(_, open)| open.last_used) else { return Ok(()) };
+    /// Closes the file that was not used for longest, except those that a transfer in flight still holds: a write
+    /// that ends after the sync would be missed by the next. Tells whether there was one.
+    fn close_oldest(&mut self) -> io::Result<bool> {
+        let idle = self.open.iter().filter(|(_, open)| Arc::strong_count(&open.file) == 1);
+        let Some((&segment, _)) = idle.min_by_key(|(_, open)| open.last_used) else { return Ok(false) };
         // The kernel may forget a failed write-back of a file that nobody has open.
         if let Some(open) = self.open.remove(&segment).filter(|o| o.is_dirty) {
             open.file.sync_data()?;
         }
-        Ok(())
+        Ok(true)
     }
+}
+
+/// Whether a file could not be opened because the process or the system has too many open.
+fn is_too_many_files(error: &io::Error) -> bool {
+    cfg!(unix) && matches!(error.raw_os_error(), Some(23 | 24)) // ENFILE, EMFILE everywhere
 }
 
 /// Makes the entries of a folder durable.
@@ -160,27 +175,30 @@ pub fn sync_folder(folder: &Path) -> io::Result<()> {
     if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
 }
 
-/// Adds: private to its owner, no link followed. (Handles are never inherited: the standard library sees to it.)
+/// Adds: private to its owner, no link followed, no waiting on a pipe that somebody put there. (Handles are never
+/// inherited: the standard library sees to it.)
 pub fn with_safe_flags(options: &mut OpenOptions) -> &mut OpenOptions {
     #[cfg(unix)]
     {
+        use rustix::fs::OFlags;
         use std::os::unix::fs::OpenOptionsExt;
-        options.mode(0o600).custom_flags(rustix::fs::OFlags::NOFOLLOW.bits() as i32);
+        options.mode(0o600).custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32);
     }
     options
 }
 
 #[cfg(target_os = "linux")]
-fn open_segment(path: &Path, options: &mut OpenOptions, direct: bool) -> io::Result<File> {
+fn open_segment(path: &Path, direct: bool) -> io::Result<File> {
     use rustix::fs::OFlags;
     use std::os::unix::fs::OpenOptionsExt;
     let direct = if direct { OFlags::DIRECT } else { OFlags::empty() };
-    options.mode(0o600).custom_flags((OFlags::NOFOLLOW | direct).bits() as i32).open(path)
+    let flags = (OFlags::NOFOLLOW | direct).bits() as i32;
+    OpenOptions::new().read(true).write(true).custom_flags(flags).open(path)
 }
 
 #[cfg(not(target_os = "linux"))]
-fn open_segment(path: &Path, options: &mut OpenOptions, _direct: bool) -> io::Result<File> {
-    with_safe_flags(options).open(path)
+fn open_segment(path: &Path, _direct: bool) -> io::Result<File> {
+    with_safe_flags(OpenOptions::new().read(true).write(true)).open(path)
 }
 
 /// Whether files of this folder can be opened around the page cache: asked of a file that has no name.
@@ -305,6 +323,11 @@ mod tests {
             files.file_for_write(segment).unwrap().write_all_at(&[segment as u8 + 1], 7).unwrap();
             assert!(files.open.len() <= 3);
         }
+        // A transfer in flight keeps its file open and changed until its end.
+        let in_flight = files.file_for_write(0).unwrap();
+        (1..10).for_each(|segment| drop(files.file(segment).unwrap()));
+        assert!(files.open[&0].is_dirty && files.open.len() == 3);
+        drop(in_flight);
         files.sync().unwrap();
         assert!(files.open.values().all(|o| !o.is_dirty));
         for segment in 0..10 {

@@ -5,20 +5,20 @@
 
 use crate::base::ids::PageId;
 use crate::base::units::format_bytes;
-use std::io;
+use crate::page::page_error::PageError;
 
 /// Why pages could not be had.
 #[derive(Debug, thiserror::Error)]
 pub enum PagingError {
     /// A working set is larger than the frames.
     #[error(
-        "{what} needs {pages} pages in memory at once, but there are {frames} frames ({} of {})\n  remedy: a larger \
+        "{what} needs {pages} pages in memory at once ({}), but there are {frames} frames ({})\n  remedy: a larger \
          --host-mem or --frames (at least {pages}), or smaller --page-rows; a lower resolution does not help",
-        format_bytes(*frames as u64 * *frame_bytes as u64),
-        format_bytes(*pages as u64 * *frame_bytes as u64)
+        format_bytes(*pages as u64 * *frame_bytes as u64),
+        format_bytes(*frames as u64 * *frame_bytes as u64)
     )]
     WorkingSet {
-        /// Who asked: `step 17`, or `a list of pages`.
+        /// Who asked: `the view of step 17`, `a list of pages`.
         what: String,
         /// Pages needed at once, at least.
         pages: usize,
@@ -35,6 +35,13 @@ pub enum PagingError {
         /// `reading` or `writing`.
         doing: &'static str,
         /// What the store said.
-        source: io::Error,
+        source: PageError,
     },
+}
+
+impl PagingError {
+    /// Whether it is only space on the drive that is missing: the same call may work later.
+    pub fn is_out_of_space(&self) -> bool {
+        matches!(self, PagingError::Store { source, .. } if source.is_out_of_space())
+    }
 }

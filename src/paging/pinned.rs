@@ -5,12 +5,10 @@
 
 use crate::base::ids::PageNo;
 use crate::page::buffer::PageBuffer;
+use crate::page::format::HEADER_BYTES;
 use crate::scene::page_layout::PageLayout;
 use crate::scene::page_meta::PageMeta;
 use crate::scene::rows::{Rows, RowsMut};
-
-/// Space for the header in front of the payload, bytes.
-pub const HEADER_BYTES: usize = 4096;
 
 /// One pinned page. Goes back by [`super::pager::Pager::release`].
 #[derive(Debug)]
