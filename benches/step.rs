@@ -153,7 +153,7 @@ struct StepResult {
 fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult {
     let config = TrainConfig { simd: simd.name().to_string(), sh_every: 0, ..TrainConfig::default() };
     let options = RunOptions::new(&config, case.scene_scale);
-    let pager = Pager::in_memory(PagerConfig { page_rows: options.page_rows, sh_degree: options.sh_degree });
+    let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
     let made = PagedScene::new(&case.columns, pager, &options);
     let Ok(mut scene) = made else { panic!("no pages: {:?}", made.err()) };
     let mut working = WorkingSet::default();
@@ -219,9 +219,9 @@ fn split_cull(
         let Ok(pages) = acquired else { panic!("no pages: {:?}", acquired.err()) };
         let tables = numbered(&pages);
         let acquired = start.elapsed().as_secs_f64();
-        visible_rows(&tables, &scene.adam, now, camera, &mut rows);
+        visible_rows(&tables, &scene.rules.adam, now, camera, &mut rows);
         let culled = start.elapsed().as_secs_f64();
-        gather(&tables, scene.sh_degree(), &scene.adam, now, &rows, &mut columns);
+        gather(&tables, scene.rules.sh_degree(), &scene.rules.adam, now, &rows, &mut columns);
         let gathered = start.elapsed().as_secs_f64();
         let spans = [acquired, culled - acquired, gathered - culled];
         alone.iter_mut().zip(spans).for_each(|(sum, seconds)| *sum += seconds);

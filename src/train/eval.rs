@@ -154,7 +154,7 @@ pub fn evaluate_ply(
     let gaussians = columns.rows() as u64;
     // All bands of the file, whatever the config has for training.
     let bands = RunOptions { sh_degree: columns.sh_degree, sh_degree_start: columns.sh_degree, ..run.clone() };
-    let pager = Pager::in_memory(PagerConfig { page_rows: run.page_rows, sh_degree: columns.sh_degree });
+    let pager = Pager::in_memory(PagerConfig::in_memory(run.page_rows, columns.sh_degree));
     let mut pages = PagedScene::new(&columns, pager, &bands)?;
     drop(columns);
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;

@@ -63,7 +63,7 @@ pub fn estimate(
         view: of_pixels + ((held - of_pixels) as f64 * growth) as u64,
         targets: config.image_cache.0.min(TargetCache::bytes_to_keep_all(&dataset.views, decoders)),
         export: rows_max * row_width(config.sh_degree) as u64 * 4,
-        base: BASE_BYTES + trainer.scene.adam.bytes() as u64 + driver,
+        base: BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + driver,
     })
 }
 

@@ -15,9 +15,10 @@ use crate::densify::replay::{PageEdit, PendingEvents, Replay};
 use crate::densify::stats::GradHistogram;
 use crate::optim::bounds::SplitLimits;
 use crate::optim::deferred::DeferredAdam;
+use crate::page::format::HEADER_BYTES;
 use crate::paging::error::PagingError;
 use crate::paging::pager::Pager;
-use crate::paging::pinned::{HEADER_BYTES, PinnedPage};
+use crate::paging::pinned::PinnedPage;
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
 use crate::scene::events::{Event, EventKind, EventLog};
@@ -32,31 +33,76 @@ use rayon::prelude::*;
 /// Pages that are brought to now together: their copies are in memory at once.
 const PAGES_PER_BATCH: usize = 32;
 
-/// What the rows of a run depend on besides the steps.
-#[derive(Debug, Clone, Copy)]
-struct PageRules {
+/// What all pages share.
+pub struct PageRules {
+    /// The optimizer.
+    pub adam: DeferredAdam,
+    events: EventLog,
     seed: u64,
     page_rows: usize,
     /// When rows may split before they are seen again.
     splits: SplitLimits,
+    sh_degree: u8,
 }
 
 /// Gets the rows of some pages, numbered through.
-type Visitor<'v, E> = dyn FnMut(&PagedScene, &[Rows<'_>]) -> Result<(), E> + 'v;
+type Visitor<'v, E> = dyn FnMut(&PageRules, &[Rows<'_>]) -> Result<(), E> + 'v;
 
 /// The pages of a run and what they share.
 pub struct PagedScene {
     /// Where the pages are.
     pub pager: Pager,
-    /// The optimizer.
-    pub adam: DeferredAdam,
+    /// What they share.
+    pub rules: PageRules,
     /// Statistics of rows since the last round.
     pub histogram: GradHistogram,
-    events: EventLog,
-    rules: PageRules,
-    sh_degree: u8,
     rows: u64,
     rows_bound: u64,
+}
+
+impl PageRules {
+    fn new(options: &RunOptions) -> PageRules {
+        PageRules {
+            adam: DeferredAdam::new(options.rates, options.adam, options.render.simd),
+            events: EventLog::default(),
+            seed: options.seed,
+            page_rows: options.page_rows,
+            splits: options.densify.map_or(SplitLimits::NEVER, |d| SplitLimits {
+                grow_grad2d: d.grow_grad2d,
+                split_scale: d.grow_scale3d * options.scene_scale,
+            }),
+            sh_degree: options.sh_degree_at(0),
+        }
+    }
+
+    /// Degree in use, as the events raised it.
+    pub fn sh_degree(&self) -> u8 {
+        self.sh_degree
+    }
+
+    /// Bounds of rows that were changed, for the index.
+    pub(super) fn bounds(&self, rows: &Rows<'_>) -> PageBounds {
+        self.adam.page_bounds(rows, &self.splits)
+    }
+
+    fn pending(&self) -> PendingEvents<'_> {
+        PendingEvents::new(&self.adam, self.seed, self.page_rows, &self.events)
+    }
+
+    fn is_behind(&self, meta: &PageMeta) -> bool {
+        (meta.events_applied as usize) < self.events.len()
+    }
+
+    /// The entry of a page that was rewritten with these rows.
+    fn meta(&self, id: PageId, state: &SceneState) -> PageMeta {
+        PageMeta {
+            id,
+            rows: state.rows() as u32,
+            sh_degree: state.sh_degree(),
+            events_applied: self.events.len() as u32,
+            bounds: self.bounds(&state.view()),
+        }
+    }
 }
 
 impl PagedScene {
@@ -65,20 +111,11 @@ impl PagedScene {
     /// # Errors
     /// A page could not be stored.
     pub fn new(columns: &Columns, pager: Pager, options: &RunOptions) -> Result<PagedScene, PagingError> {
-        let adam = DeferredAdam::new(options.rates, options.adam, options.render.simd);
-        let splits = options.densify.map_or(SplitLimits::NEVER, |d| SplitLimits {
-            grow_grad2d: d.grow_grad2d,
-            split_scale: d.grow_scale3d * options.scene_scale,
-        });
-        let rules = PageRules { seed: options.seed, page_rows: options.page_rows, splits };
         let rows = columns.rows() as u64;
         let mut scene = PagedScene {
             pager,
-            adam,
+            rules: PageRules::new(options),
             histogram: GradHistogram::default(),
-            events: EventLog::default(),
-            rules,
-            sh_degree: options.sh_degree_at(0),
             rows,
             rows_bound: rows,
         };
@@ -90,25 +127,13 @@ impl PagedScene {
         let fill = first_fill(self.rules.page_rows, is_growing);
         let pages = partition(&columns.means, &columns.scales, fill);
         for (index, rows) in pages.iter().enumerate() {
-            let state = first_rows(columns, rows, self.sh_degree);
-            let id = PageId::initial(index as u32);
-            let meta = PageMeta {
-                id,
-                rows: rows.len() as u32,
-                sh_degree: self.sh_degree,
-                events_applied: 0,
-                bounds: self.adam.page_bounds(&state.view(), &self.rules.splits),
-            };
+            let state = first_rows(columns, rows, self.rules.sh_degree);
+            let meta = self.rules.meta(PageId::initial(index as u32), &state);
             self.pager.insert(meta, |payload| {
                 write_page(&state, payload);
             })?;
         }
         Ok(())
-    }
-
-    /// Degree in use, as the events raised it.
-    pub fn sh_degree(&self) -> u8 {
-        self.sh_degree
     }
 
     /// Rows in the pages as they are stored: late events are not counted.
@@ -123,15 +148,15 @@ impl PagedScene {
 
     /// The events so far.
     pub fn events(&self) -> &EventLog {
-        &self.events
+        &self.rules.events
     }
 
     /// Logs an event: pages apply it when they are next pinned by a step. A round is promised the growth of all rows
     /// that may exceed its threshold, and clears the statistics.
     pub fn log_event(&mut self, event: Event) {
-        self.events.push(event);
+        self.rules.events.push(event);
         match event.kind {
-            EventKind::RaiseShDegree { degree } => self.sh_degree = degree,
+            EventKind::RaiseShDegree { degree } => self.rules.sh_degree = degree,
             EventKind::Densify(thresholds) => {
                 self.rows_bound += self.histogram.promised(thresholds.grow_grad2d);
                 self.histogram.clear();
@@ -146,14 +171,15 @@ impl PagedScene {
     /// # Errors
     /// No frame could be had for a split, or a page cannot be split; it keeps its rows then.
     pub fn apply_pending(&mut self, pages: &mut Vec<PinnedPage>) -> Result<(), TrainError> {
-        if pages.iter().all(|p| !self.is_behind(&p.meta)) {
+        if pages.iter().all(|p| !self.rules.is_behind(&p.meta)) {
             return Ok(());
         }
         let mut added = Vec::new();
         let mut done = Ok(());
         for batch in pages.chunks_mut(PAGES_PER_BATCH) {
-            let mut behind: Vec<&mut PinnedPage> = batch.iter_mut().filter(|p| self.is_behind(&p.meta)).collect();
-            let pending = self.pending();
+            let is_behind = |p: &&mut PinnedPage| self.rules.is_behind(&p.meta);
+            let mut behind: Vec<&mut PinnedPage> = batch.iter_mut().filter(is_behind).collect();
+            let pending = self.rules.pending();
             let replays: Vec<Result<Replay, SplitTooDeep>> = behind
                 .par_iter_mut()
                 .map(|p| pending.apply(p.meta.id, p.meta.events_applied as usize, &mut p.rows_mut(0)))
@@ -171,14 +197,6 @@ impl PagedScene {
         done
     }
 
-    fn pending(&self) -> PendingEvents<'_> {
-        PendingEvents::new(&self.adam, self.rules.seed, self.rules.page_rows, &self.events)
-    }
-
-    fn is_behind(&self, meta: &PageMeta) -> bool {
-        (meta.events_applied as usize) < self.events.len()
-    }
-
     /// Takes over what became of a page; the parts that it split into but the first go to `added`.
     fn store_replay(
         &mut self,
@@ -190,9 +208,9 @@ impl PagedScene {
         if let PageEdit::Replaced(parts) = &edit {
             self.store_parts(page, parts, added)?;
         } else {
-            page.meta.events_applied = self.events.len() as u32;
+            page.meta.events_applied = self.rules.events.len() as u32;
             if edit == PageEdit::InPlace {
-                page.meta.bounds = self.bounds_of(page);
+                page.meta.bounds = self.rules.bounds(&page.rows(0));
             }
         }
         page.dirty = true;
@@ -221,13 +239,7 @@ impl PagedScene {
         }
         let mut frames = frames.into_iter();
         for (part, (id, state)) in parts.iter().enumerate() {
-            let meta = PageMeta {
-                id: *id,
-                rows: state.rows() as u32,
-                sh_degree: state.sh_degree(),
-                events_applied: self.events.len() as u32,
-                bounds: self.adam.page_bounds(&state.view(), &self.rules.splits),
-            };
+            let meta = self.rules.meta(*id, state);
             if part == 0 {
                 write_page(state, page.payload_mut());
                 page.meta = meta;
@@ -239,11 +251,6 @@ impl PagedScene {
         Ok(())
     }
 
-    /// Renews the bounds of a page that was changed.
-    pub(super) fn bounds_of(&self, page: &PinnedPage) -> PageBounds {
-        self.adam.page_bounds(&page.rows(0), &self.rules.splits)
-    }
-
     /// Collects into `working` the rows that `camera` may draw after `now` steps, as though their pages had been touched
     /// then; stores nothing.
     ///
@@ -252,14 +259,14 @@ impl PagedScene {
     pub fn gather_view(&mut self, camera: &Camera, now: u32, working: &mut WorkingSet) -> Result<(), PagingError> {
         let pages = self.pager.pages_of_view(camera);
         let WorkingSet { row_from_working, columns, .. } = working;
-        if columns.sh_degree != self.sh_degree {
-            *columns = Columns::zeros(0, self.sh_degree);
+        if columns.sh_degree != self.rules.sh_degree {
+            *columns = Columns::zeros(0, self.rules.sh_degree);
         }
         columns.resize(0);
-        let mut part = Columns::zeros(0, self.sh_degree);
-        self.visit(&pages, &mut |scene, tables| {
-            visible_rows(tables, &scene.adam, now, camera, row_from_working);
-            gather(tables, scene.sh_degree, &scene.adam, now, row_from_working, &mut part);
+        let mut part = Columns::zeros(0, self.rules.sh_degree);
+        self.visit(&pages, &mut |rules, tables| {
+            visible_rows(tables, &rules.adam, now, camera, row_from_working);
+            gather(tables, rules.sh_degree, &rules.adam, now, row_from_working, &mut part);
             append(columns, &part);
             Ok::<(), PagingError>(())
         })
@@ -278,7 +285,7 @@ impl PagedScene {
         let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
         pages.retain(|p| index[p.index()].rows > 0);
         pages.sort_unstable_by_key(|p| index[p.index()].id);
-        self.visit(&pages, &mut |scene, tables| each(&evaluate_all(tables, scene.sh_degree, &scene.adam, now)))
+        self.visit(&pages, &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
     }
 
     /// Pins the pages batch by batch and hands their rows to `each`, with pending events applied to copies.
@@ -286,11 +293,12 @@ impl PagedScene {
         let batch = PAGES_PER_BATCH.min(self.pager.stats().frames_max).max(1);
         for pages in pages.chunks(batch) {
             let pinned = self.pager.acquire_pages(pages)?;
-            let pending = self.pending();
+            let rules = &self.rules;
+            let pending = rules.pending();
             let copies: Vec<Option<SceneState>> = pinned
                 .par_iter()
                 .map(|page| {
-                    let mut state = self.is_behind(&page.meta).then(|| read_page(&page.rows(0)))?;
+                    let mut state = rules.is_behind(&page.meta).then(|| read_page(&page.rows(0)))?;
                     pending.apply_to_table(page.meta.events_applied as usize, &mut state);
                     Some(state)
                 })
@@ -303,7 +311,7 @@ impl PagedScene {
                 table.first_row = first_row;
                 first_row += table.rows();
             }
-            let done = each(self, &tables);
+            let done = each(rules, &tables);
             drop(tables);
             self.pager.release(pinned);
             done?;

@@ -72,8 +72,8 @@ pub fn train_step(
     }
     let WorkingSet { row_from_working, columns, gradients } = working;
     let tables = numbered(&pages);
-    visible_rows(&tables, &scene.adam, step, camera, row_from_working);
-    gather(&tables, scene.sh_degree(), &scene.adam, step, row_from_working, columns);
+    visible_rows(&tables, &scene.rules.adam, step, camera, row_from_working);
+    gather(&tables, scene.rules.sh_degree(), &scene.rules.adam, step, row_from_working, columns);
     let rows_pinned = tables.iter().map(|t| t.rows()).sum();
     let rendered = renderer
         .forward(columns, camera, render)

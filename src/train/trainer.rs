@@ -101,7 +101,7 @@ impl Trainer {
         renderer: Box<dyn Renderer>,
         options: RunOptions,
     ) -> Result<Self, TrainError> {
-        let pager = Pager::in_memory(PagerConfig { page_rows: options.page_rows, sh_degree: options.sh_degree });
+        let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
         Trainer::with_pager(columns, pager, dataset, renderer, options)
     }
 
@@ -175,7 +175,7 @@ impl Trainer {
 
     /// Options of a rendering now: with the bands that are in use.
     pub fn render_options(&self) -> RenderOptions {
-        RenderOptions { sh_degree: self.scene.sh_degree(), ..self.options.render }
+        RenderOptions { sh_degree: self.scene.rules.sh_degree(), ..self.options.render }
     }
 
     /// The events so far.
@@ -241,7 +241,7 @@ impl Trainer {
             kinds.into_iter().for_each(|kind| self.scene.log_event(Event { step, kind }));
         }
         let degree = self.options.sh_degree_at(step + 1);
-        if degree > self.scene.sh_degree() {
+        if degree > self.scene.rules.sh_degree() {
             self.scene.log_event(Event { step, kind: EventKind::RaiseShDegree { degree } });
         }
     }

@@ -41,7 +41,7 @@ pub(super) fn update_pages(
     of_step: &StepGradients<'_>,
     collects: bool,
 ) -> StepCounts {
-    let at = scene.adam.at(of_step.step);
+    let at = scene.rules.adam.at(of_step.step);
     let mut shares = shares(pages, of_step);
     let counts: Vec<StepCounts> = shares
         .par_iter_mut()
@@ -59,9 +59,10 @@ pub(super) fn update_pages(
             share.touched |= accumulate(&mut view, share.rows, v, radii, of_step.size, &mut scene.histogram) > 0;
         }
     }
+    let rules = &scene.rules;
     shares.par_iter_mut().filter(|share| share.touched).for_each(|share| {
         share.page.dirty = true;
-        share.page.meta.bounds = scene.bounds_of(share.page);
+        share.page.meta.bounds = rules.bounds(&share.page.rows(0));
     });
     counts.iter().fold(StepCounts::default(), |sum, c| StepCounts {
         updated: sum.updated + c.updated,
