@@ -5,13 +5,14 @@
 
 use super::eval::ply_warnings;
 use super::machine;
-use super::memory::{MemoryEstimate, estimate, host_bytes_available, host_bytes_now, host_bytes_peak};
+use super::memory::{estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
+use super::preflight;
 use super::progress::Progress;
 use super::report::{MetricsLog, Resolved, Summary, write_config, write_summary};
 use super::signals::StopFlag;
+use super::tiers;
 use super::trainer::{LoopOutputs, TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
-use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
@@ -21,6 +22,7 @@ use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
 use crate::scene::columns::{Columns, sh_n_width};
 use crate::scene::init::{gaussians_from_points, random_points_in_frusta};
+use crate::scene::partition::first_fill;
 use std::path::{Path, PathBuf};
 
 /// What to run.
@@ -170,23 +172,24 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     if let Some(word) = word {
         say(&word);
     }
-    let mut trainer = Trainer::new(columns, &dataset, renderer, options)?;
-    let memory = estimate(config, &dataset, &mut trainer, driver)?;
-    say(&describe(request, &dataset, &trainer, &memory));
-    if let Some(free) = host_bytes_available().filter(|&free| free < memory.total()) {
-        eprintln!(
-            "warning: the run may need {}, but {} are free: lower --max-gaussians, --image-cache, --sh-degree or the \
-             size of the photos",
-            format_bytes(memory.total()),
-            format_bytes(free)
-        );
-    }
+    let host_mem = host_budget(config);
+    let fill = first_fill(config.page_rows as usize, options.densify.is_some());
+    let pages = rows_at_most(config, columns.rows() as u64).div_ceil(fill as u64);
+    // Dropped after the trainer, whose pages may lie there.
+    let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
+    tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
+    let mut trainer = Trainer::with_pager(columns, pager, &dataset, renderer, options)?;
+    let mut memory = estimate(config, &dataset, &mut trainer, driver)?;
+    let plan = preflight::settle(config, &dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
+    say(&describe(request, &dataset, &trainer, &preflight::describe(&plan, &memory[1], &tiers)));
     if request.dry_run {
         return Ok(RunOutcome { summary: None, exit_code: 0 });
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     make_out(&request.out, request.overwrite)?;
-    train_into(request, &dataset, trainer, &stop)
+    let outcome = train_into(request, &dataset, trainer, &stop);
+    tiers.close().iter().for_each(|word| eprintln!("warning: {word}"));
+    outcome
 }
 
 fn train_into(
@@ -304,11 +307,10 @@ fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer) -> Resol
 }
 
 /// What was understood and what it will take, for people.
-fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, memory: &MemoryEstimate) -> String {
+fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, tiers: &str) -> String {
     let (config, rows) = (&request.config, trainer.scene.rows());
     let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
     let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
-    let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
     let growth = match (config.strategy.as_str(), config.max_gaussians) {
         ("none", _) => String::from(" (no densification)"),
         (_, 0) => String::from(" (densification without a cap: memory grows with them; see --max-gaussians)"),
@@ -322,7 +324,7 @@ fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, memory: 
         "scene   {}: {} views to train on, {} held out, at most {size}\n\
          start   {} Gaussians, SH degree {}{growth}\n\
          run     {} steps on {} threads ({}), rendered by {}{results}\n\
-         memory  about {} at the peak\n{}{}{}{}{}",
+         {tiers}",
         request.scene.display(),
         dataset.train_views().len(),
         dataset.test_views().len(),
@@ -332,12 +334,6 @@ fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, memory: 
         rayon::current_num_threads(),
         limits::simd_path(config).name(),
         trainer.renderer.device(),
-        format_bytes(memory.total()),
-        part("Gaussians with their optimizer state", memory.state),
-        part("one view: rows, gradients, images", memory.view),
-        part("decoded photos (--image-cache)", memory.targets),
-        part("copy for export", memory.export),
-        part("program", memory.base),
     );
     text.trim_end().to_string()
 }

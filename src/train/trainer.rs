@@ -153,9 +153,14 @@ impl Trainer {
         Ok(pixels)
     }
 
-    /// Bytes held for one view: its rows, gradients, intermediates and images.
-    pub fn view_bytes(&self) -> u64 {
-        self.renderer.host_bytes() + self.working.bytes() as u64
+    /// Bytes held for one view: its rows with their gradients, and what the renderer has.
+    pub fn view_bytes(&self) -> [u64; 2] {
+        [self.working.bytes() as u64, self.renderer.host_bytes()]
+    }
+
+    /// Degrees in use now and at the last step.
+    pub fn sh_degrees(&self) -> (u8, u8) {
+        (self.scene.rules.sh_degree(), self.options.sh_degree_at(self.options.steps.saturating_sub(1)))
     }
 
     /// Steps done.
