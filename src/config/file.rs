@@ -6,6 +6,8 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::parse_bytes;
+use crate::page::codec::Codec;
+use crate::schedule::order::Order;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -338,22 +340,16 @@ impl TrainConfig {
         Ok(())
     }
 
-    fn check_order(&self) -> Option<()> {
-        let groups = self.view_order.strip_prefix("groups:").map(str::parse::<u32>);
-        let known = matches!(self.view_order.as_str(), "auto" | "shuffle" | "tour");
-        (known || matches!(groups, Some(Ok(1..=65_536)))).then_some(())
-    }
-
     fn check_names(&self) -> InputResult<()> {
         if self.device.trim().is_empty() {
             return refuse("device", "auto, gpu, cpu, or a part of the name of one of --list-devices");
         }
-        if self.check_order().is_none() {
-            return refuse("view-order", "auto, shuffle, tour, or groups:<n> with n from 1 to 65536");
+        let written = |key: &str, problem: String| InputError::new(format!("--{key}"), problem, "or write auto");
+        if self.view_order != "auto" {
+            self.view_order.parse::<Order>().map_err(|problem| written("view-order", problem))?;
         }
-        let level = self.spill_codec.strip_prefix("zstd:").map(str::parse::<i32>);
-        if !matches!(self.spill_codec.as_str(), "raw" | "auto") && !matches!(level, Some(Ok(1..=19))) {
-            return refuse("spill-codec", "raw, auto, or zstd:<level> with a level from 1 to 19");
+        if self.spill_codec != "auto" {
+            self.spill_codec.parse::<Codec>().map_err(|problem| written("spill-codec", problem))?;
         }
         let names: [(&str, &str, &[&str]); 7] = [
             ("io", &self.io, &["auto", "uring", "mmap", "pread"]),

@@ -13,6 +13,7 @@ use crate::optim::rates::Rates;
 use crate::render::metrics::SsimVariant;
 use crate::render::{LossOptions, RenderOptions, SsimPadding};
 use crate::scene::init::InitOptions;
+use crate::schedule::order::Order;
 
 /// Everything that the training loop needs, resolved.
 #[derive(Debug, Clone)]
@@ -31,6 +32,8 @@ pub struct RunOptions {
     pub max_gaussians: usize,
     /// Rows that a page holds at most.
     pub page_rows: usize,
+    /// Order of the views; a shuffle where that is still to be settled.
+    pub view_order: Order,
     /// Rendering, but for the degree in use.
     pub render: RenderOptions,
     /// Loss.
@@ -68,6 +71,7 @@ impl RunOptions {
             sh_degree_start: first_sh_degree(config),
             max_gaussians: config.max_gaussians as usize,
             page_rows: config.page_rows as usize,
+            view_order: config.view_order.parse().unwrap_or(Order::Shuffle),
             render: RenderOptions {
                 sh_degree: config.sh_degree,
                 max_alpha: config.max_alpha as f32,

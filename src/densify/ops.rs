@@ -57,11 +57,11 @@ pub fn plan_round<V: RowsNow>(
     let mut born = NewRows { columns: Columns::zeros(0, rows.columns.sh_degree), uid: Vec::new() };
     let mut counts = RoundCounts::default();
     let mut block = [0.0; BLOCK_LANES];
+    let (mut log_scales, mut opacities) = (vec![0.0; rows.rows()], vec![0.0; rows.rows()]);
+    values.sizes_and_opacities(rows, &mut log_scales, &mut opacities);
     for row in 0..rows.rows() {
-        let scale = |i| values.evaluate_element(rows, Column::Scales, row, i);
-        let log_scale = scale(0).max(scale(1)).max(scale(2));
-        let opacity = values.evaluate_element(rows, Column::Opacities, row, 0);
-        let fate = fate(thresholds, mean_grad2d(rows.grad2d[row], rows.count[row]), log_scale, opacity);
+        let mean_grad2d = mean_grad2d(rows.grad2d[row], rows.count[row]);
+        let fate = fate(thresholds, mean_grad2d, log_scales[row], opacities[row]);
         if matches!(fate, Fate::Split { .. } | Fate::Duplicate { pruned: false }) {
             values.evaluate_row(rows, row, &mut block);
         }

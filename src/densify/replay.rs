@@ -11,12 +11,14 @@
 use super::ops::{self, RoundCounts, RoundEdits};
 use super::stats::promised_growth;
 use crate::base::ids::PageId;
+use crate::base::math::sigmoid;
+use crate::optim::bounds::SplitLimits;
 use crate::optim::deferred::{AdamNow, DeferredAdam};
 use crate::scene::columns::Column;
 use crate::scene::events::{Event, EventKind, EventLog, RoundThresholds};
 use crate::scene::page_layout::read_page;
 use crate::scene::page_split::{SplitTooDeep, split_page};
-use crate::scene::rows::{Rows, RowsMut, RowsNow};
+use crate::scene::rows::{Rows, RowsMut, RowsNow, mean_grad2d};
 use crate::scene::state::SceneState;
 use std::sync::OnceLock;
 
@@ -125,37 +127,34 @@ impl<'a> PendingEvents<'a> {
     /// # Errors
     /// The page must be split and cannot be.
     pub fn apply(&self, id: PageId, applied: usize, rows: &mut RowsMut<'_>) -> Result<Replay, SplitTooDeep> {
-        let mut replay = Replay { edit: PageEdit::Unchanged, rounds: Vec::new(), reset_rows: 0 };
+        let mut replay = Replay::default();
+        let mut quiet = None;
         for index in applied..self.events.len() {
             let edits = match self.events[index].kind {
                 EventKind::RaiseShDegree { degree } if degree <= rows.columns.sh_degree => continue,
                 EventKind::RaiseShDegree { .. } => None,
                 EventKind::ResetOpacity { max_opacity } => {
                     let reset_rows = ops::reset_opacity_rows(self.at(index), rows, max_opacity);
-                    replay.reset_rows += reset_rows;
+                    (replay.reset_rows, quiet) = (replay.reset_rows + reset_rows, None);
                     replay.touch(reset_rows > 0);
                     continue;
                 }
                 EventKind::Densify(thresholds) => {
-                    let (round, edits) = self.plan(index, &thresholds, &rows.as_ref());
-                    if edits.removed.is_empty() && edits.added.rows() == 0 {
+                    let (round, edits) = self.plan(index, &thresholds, &rows.as_ref(), &mut quiet);
+                    replay.rounds.push(round);
+                    if edits.is_none() {
                         replay.touch(clear_statistics(rows));
-                        replay.rounds.push(round);
                         continue;
                     }
-                    Some((round, edits))
+                    edits
                 }
             };
             // From here on the rows are a table of their own.
             let mut state = read_page(&rows.as_ref());
-            let rest = match edits {
-                Some((round, edits)) => {
-                    ops::apply_edits(&mut state, &[(0, edits)]);
-                    replay.rounds.push(round);
-                    index + 1
-                }
-                None => index,
-            };
+            let rest = index + usize::from(edits.is_some());
+            if let Some(edits) = edits {
+                ops::apply_edits(&mut state, &[(0, edits)]);
+            }
             self.replay_table(rest, &mut state, &mut replay);
             replay.edit = PageEdit::Replaced(self.split(id, state)?);
             break;
@@ -166,31 +165,51 @@ impl<'a> PendingEvents<'a> {
     /// Applies the events from number `applied` on to a table that nobody splits or stores: rows as evaluation and
     /// export see them.
     pub fn apply_to_table(&self, applied: usize, state: &mut SceneState) {
-        let mut replay = Replay { edit: PageEdit::Unchanged, rounds: Vec::new(), reset_rows: 0 };
-        self.replay_table(applied, state, &mut replay);
+        self.replay_table(applied, state, &mut Replay::default());
     }
 
     fn replay_table(&self, from: usize, state: &mut SceneState, replay: &mut Replay) {
+        let mut quiet = None;
         for index in from..self.events.len() {
             match self.events[index].kind {
                 EventKind::RaiseShDegree { degree } => state.raise_sh_degree(degree),
                 EventKind::ResetOpacity { max_opacity } => {
                     replay.reset_rows += ops::reset_opacities(self.at(index), state, max_opacity);
+                    quiet = None;
                 }
                 EventKind::Densify(thresholds) => {
-                    let (round, edits) = self.plan(index, &thresholds, &state.view());
-                    ops::apply_edits(state, &[(0, edits)]);
+                    let (round, edits) = self.plan(index, &thresholds, &state.view(), &mut quiet);
                     replay.rounds.push(round);
+                    if let Some(edits) = edits {
+                        ops::apply_edits(state, &[(0, edits)]);
+                        quiet = None;
+                    } else {
+                        clear_statistics(&mut state.view_mut());
+                    }
                 }
             }
         }
     }
 
-    fn plan(&self, index: usize, thresholds: &RoundThresholds, rows: &Rows<'_>) -> (PageRound, RoundEdits) {
-        let edits = ops::plan_round(self.at(index), rows, thresholds, self.seed, index as u64);
-        let rows_change = edits.added.rows() as i64 - edits.removed.len() as i64;
+    /// What a round does to rows; no edits when that is nothing, statistics aside.
+    fn plan(
+        &self,
+        index: usize,
+        thresholds: &RoundThresholds,
+        rows: &Rows<'_>,
+        quiet: &mut Option<Extremes>,
+    ) -> (PageRound, Option<RoundEdits>) {
         let promised = promised_growth(rows, thresholds.grow_grad2d);
-        (PageRound { event: index, rows_change, promised, counts: edits.counts }, edits)
+        let mut round = PageRound { event: index, rows_change: 0, promised, counts: RoundCounts::default() };
+        let nothing_grows = promised == 0 && !may_grow(rows, thresholds);
+        if nothing_grows && quiet.get_or_insert_with(|| Extremes::of(self.adam, rows)).survive(thresholds) {
+            return (round, None);
+        }
+        let edits = ops::plan_round(self.at(index), rows, thresholds, self.seed, index as u64);
+        round.rows_change = edits.added.rows() as i64 - edits.removed.len() as i64;
+        round.counts = edits.counts;
+        let is_nothing = edits.removed.is_empty() && edits.added.rows() == 0;
+        (round, (!is_nothing).then_some(edits))
     }
 
     /// The table as pages within the capacity, cut by the positions after the last event.
@@ -212,6 +231,38 @@ impl Replay {
             self.edit = PageEdit::InPlace;
         }
     }
+}
+
+impl Default for Replay {
+    fn default() -> Self {
+        Replay { edit: PageEdit::Unchanged, rounds: Vec::new(), reset_rows: 0 }
+    }
+}
+
+/// Bounds of what rows that nobody touches are pruned by, at any later step. A page that sleeps through many rounds is
+/// looked at once, unless some row comes close to being pruned.
+struct Extremes {
+    lowest_opacity: f32,
+    sigma_max: f32,
+}
+
+impl Extremes {
+    fn of(adam: &DeferredAdam, rows: &Rows<'_>) -> Extremes {
+        let sigma_max = adam.page_bounds(rows, &SplitLimits::NEVER).sigma_max;
+        Extremes { lowest_opacity: adam.lowest_opacity(rows), sigma_max }
+    }
+
+    /// Whether no row is pruned. The slack is for the roundings of the sigmoid, some 4e-7.
+    fn survive(&self, thresholds: &RoundThresholds) -> bool {
+        sigmoid(self.lowest_opacity) >= thresholds.prune_opacity * (1.0 + 1e-5)
+            && self.sigma_max <= thresholds.prune_scale
+    }
+}
+
+/// Whether the statistics of some row exceed the threshold.
+fn may_grow(rows: &Rows<'_>, thresholds: &RoundThresholds) -> bool {
+    let means = rows.grad2d.iter().zip(rows.count).map(|(&grad2d, &count)| mean_grad2d(grad2d, count));
+    means.fold(false, |any, mean| any | (mean > thresholds.grow_grad2d))
 }
 
 /// Forgets the statistics of rows; returns whether there were any.

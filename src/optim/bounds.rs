@@ -12,7 +12,7 @@
 //! the evaluation; 3. the same bits on every instruction path.
 
 use super::deferred::DeferredAdam;
-use super::lanes::{Coordinates, LANES, LaneDrifts, by_coordinate, drifted_lanes, tables_of};
+use super::lanes::{Coordinates, LANES, LaneDrifts, by_coordinate, drifted_lanes, drifted_opacities, tables_of};
 use crate::base::math::exp32;
 use crate::base::simd::{Kernel, dispatch};
 use crate::scene::columns::Column;
@@ -50,6 +50,46 @@ impl DeferredAdam {
     /// Bounds of the rows of a page that has just been rewritten.
     pub fn page_bounds(&self, rows: &Rows<'_>, splits: &SplitLimits) -> PageBounds {
         dispatch(self.simd(), BoundRows { adam: self, rows, splits })
+    }
+
+    /// A lower bound of the opacities (logit) of rows that nobody touches; infinity without rows. Opacity resets are not
+    /// in it.
+    pub fn lowest_opacity(&self, rows: &Rows<'_>) -> f32 {
+        dispatch(self.simd(), LowestOpacity { adam: self, rows })
+    }
+}
+
+struct LowestOpacity<'k> {
+    adam: &'k DeferredAdam,
+    rows: &'k Rows<'k>,
+}
+
+impl Kernel for LowestOpacity<'_> {
+    type Out = f32;
+    #[inline(always)]
+    fn run<const FMA: bool>(self) -> f32 {
+        let LowestOpacity { adam, rows } = self;
+        let values = rows.columns.opacities;
+        let of_row = |row: usize| {
+            let (m, v) = (rows.exp_avg.opacities[row], rows.exp_avg_sq.opacities[row]);
+            hull(values[row], adam.limit(Column::Opacities, values[row], m, v, rows.stamp[row]))[0]
+        };
+        let mut lowest = [f32::INFINITY; LANES];
+        let whole = rows.rows() / LANES * LANES;
+        for first in (0..whole).step_by(LANES) {
+            let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| adam.limit_drift(stamp));
+            let (limits, direct) = drifted_opacities(adam, rows, first, &drifts);
+            if direct {
+                (0..LANES).for_each(|l| lowest[l] = lowest[l].min(of_row(first + l)));
+                continue;
+            }
+            let values = &values[first..first + LANES];
+            for l in 0..LANES {
+                lowest[l] = lowest[l].min(hull(values[l], limits[l])[0]);
+            }
+        }
+        (whole..rows.rows()).for_each(|row| lowest[0] = lowest[0].min(of_row(row)));
+        lowest.into_iter().fold(f32::INFINITY, f32::min)
     }
 }
 

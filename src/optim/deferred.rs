@@ -10,6 +10,7 @@
 
 use super::adam::AdamConfig;
 use super::drift::{Drift, DriftTables, EpsFloor, RECENT, drifted, flush, needs_direct_sum};
+use super::lanes::SizeRows;
 use super::rates::Rates;
 use crate::base::simd::{Kernel, SimdPath, dispatch};
 use crate::scene::columns::{Column, Columns};
@@ -290,6 +291,10 @@ impl RowsNow for AdamNow<'_> {
         let (value, m, v) = (of(&rows.columns), of(&rows.exp_avg), of(&rows.exp_avg_sq));
         let stamp = rows.stamp[row];
         self.adam.evaluate_with(self.drift(stamp), column, value, m, v, stamp, self.now)
+    }
+
+    fn sizes_and_opacities(&self, rows: &Rows<'_>, log_scales: &mut [f32], opacities: &mut [f32]) {
+        dispatch(self.adam.simd, SizeRows { at: self, rows, log_scales, opacities });
     }
 
     fn settle_row(&self, rows: &mut RowsMut<'_>, row: usize) {

@@ -5,10 +5,11 @@
 //!
 //! Invariant: the bits are those of [`RowsNow`](crate::scene::rows::RowsNow), whatever the instruction path.
 
-use super::deferred::DeferredAdam;
+use super::deferred::{AdamNow, DeferredAdam};
 use super::drift::{Drift, EpsFloor, drifted, needs_direct_sum};
+use crate::base::simd::Kernel;
 use crate::scene::columns::Column;
-use crate::scene::rows::Rows;
+use crate::scene::rows::{Rows, RowsNow};
 
 /// Rows of one vector.
 pub(crate) const LANES: usize = 16;
@@ -96,4 +97,67 @@ pub(crate) fn by_coordinate(rows: &[f32]) -> Coordinates {
         out[2][l] = rows[l * 3 + 2];
     }
     out
+}
+
+/// The opacities (logit) of rows `first..` after their drifts, and whether some of them need the direct sum instead.
+#[inline(always)]
+pub(crate) fn drifted_opacities(
+    adam: &DeferredAdam,
+    rows: &Rows<'_>,
+    first: usize,
+    drifts: &LaneDrifts,
+) -> ([f32; LANES], bool) {
+    let EpsFloor { eps, floor } = adam.eps_floor();
+    let rate = adam.base_rate(Column::Opacities);
+    let sums = drifts.of(Column::Opacities);
+    let value = &rows.columns.opacities[first..first + LANES];
+    let m = &rows.exp_avg.opacities[first..first + LANES];
+    let v = &rows.exp_avg_sq.opacities[first..first + LANES];
+    let mut out = [0.0; LANES];
+    let mut direct = false;
+    for l in 0..LANES {
+        out[l] = drifted(value[l], m[l], v[l], [sums[0][l], sums[1][l], sums[2][l]], rate, eps);
+        direct |= needs_direct_sum(m[l], v[l], floor);
+    }
+    (out, direct)
+}
+
+/// The largest log-scale and the opacity of every row as they are now.
+pub(crate) struct SizeRows<'k, 'a> {
+    pub at: &'k AdamNow<'a>,
+    pub rows: &'k Rows<'k>,
+    pub log_scales: &'k mut [f32],
+    pub opacities: &'k mut [f32],
+}
+
+impl Kernel for SizeRows<'_, '_> {
+    type Out = ();
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        let SizeRows { at, rows, log_scales, opacities } = self;
+        let adam = at.adam();
+        let scale_tables = tables_of(rows, Column::Scales);
+        let whole = rows.rows() / LANES * LANES;
+        for first in (0..whole).step_by(LANES) {
+            let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| at.drift(stamp));
+            let (scales, a) = drifted_lanes(adam, Column::Scales, scale_tables, first, &drifts);
+            let (opacity, b) = drifted_opacities(adam, rows, first, &drifts);
+            if a | b {
+                (first..first + LANES).for_each(|row| size_row(at, rows, row, log_scales, opacities));
+                continue;
+            }
+            for l in 0..LANES {
+                log_scales[first + l] = scales[0][l].max(scales[1][l]).max(scales[2][l]);
+            }
+            opacities[first..first + LANES].copy_from_slice(&opacity);
+        }
+        (whole..rows.rows()).for_each(|row| size_row(at, rows, row, log_scales, opacities));
+    }
+}
+
+/// One row, by the exact evaluation.
+fn size_row(at: &AdamNow<'_>, rows: &Rows<'_>, row: usize, log_scales: &mut [f32], opacities: &mut [f32]) {
+    let scale = |i| at.evaluate_element(rows, Column::Scales, row, i);
+    log_scales[row] = scale(0).max(scale(1)).max(scale(2));
+    opacities[row] = at.evaluate_element(rows, Column::Opacities, row, 0);
 }

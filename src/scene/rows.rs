@@ -316,6 +316,9 @@ pub trait RowsNow: Sync {
     fn evaluate_row(&self, rows: &Rows<'_>, row: usize, out: &mut RowBlock);
     /// One value of one column of a row as it is now; `element` counts within the row.
     fn evaluate_element(&self, rows: &Rows<'_>, column: Column, row: usize, element: usize) -> f32;
+    /// What rounds decide by, for all rows as they are now: the largest log-scale and the opacity (logit). One entry
+    /// per row each.
+    fn sizes_and_opacities(&self, rows: &Rows<'_>, log_scales: &mut [f32], opacities: &mut [f32]);
     /// Rewrites the row as what it is now: values, decayed moments, stamp.
     fn settle_row(&self, rows: &mut RowsMut<'_>, row: usize);
 }

@@ -2,5 +2,8 @@
 
 pub mod model;
 pub mod order;
+pub mod places;
 pub mod plan;
+pub mod replay;
+pub mod tour;
 pub mod visibility;

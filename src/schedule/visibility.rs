@@ -11,6 +11,10 @@ use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use crate::scene::camera::Camera;
 use crate::scene::frustum::{Frustum, PagePlane, PagePlanes, larger};
 use crate::scene::page_meta::{PageBounds, PageMeta};
+use rayon::prelude::*;
+
+/// Views that are listed at a time.
+const VIEWS_PER_PART: usize = 64;
 
 /// Lists the pages of `index` that `camera` needs, ascending. The list is cleared first.
 pub fn visible_pages(index: &[PageMeta], camera: &Camera, out: &mut Vec<PageNo>) {
@@ -19,6 +23,62 @@ pub fn visible_pages(index: &[PageMeta], camera: &Camera, out: &mut Vec<PageNo>)
     out.resize(index.len(), PageNo(0));
     let found = dispatch(SimdPath::best(), ListPages { planes: &planes, index, out });
     out.truncate(found);
+}
+
+/// The pages of many views: lists one after the other.
+#[derive(Debug, Clone, Default)]
+pub struct ViewPages {
+    pages: Vec<PageNo>,
+    /// Where the list of each view ends.
+    ends: Vec<usize>,
+}
+
+impl ViewPages {
+    /// The pages that each of `cameras` needs.
+    pub fn new(index: &[PageMeta], cameras: &[Camera]) -> ViewPages {
+        // In parts, so that no more than a part is held twice.
+        let mut all = ViewPages::default();
+        for first in (0..cameras.len()).step_by(VIEWS_PER_PART) {
+            let part = first..cameras.len().min(first + VIEWS_PER_PART);
+            let lists: Vec<Vec<PageNo>> = cameras[part]
+                .par_iter()
+                .map(|camera| {
+                    let mut list = Vec::new();
+                    visible_pages(index, camera, &mut list);
+                    list
+                })
+                .collect();
+            lists.iter().for_each(|list| all.push(list));
+        }
+        all
+    }
+
+    /// Adds the list of one more view.
+    pub fn push(&mut self, pages: &[PageNo]) {
+        self.pages.extend_from_slice(pages);
+        self.ends.push(self.pages.len());
+    }
+
+    /// Number of views.
+    pub fn views(&self) -> usize {
+        self.ends.len()
+    }
+
+    /// The pages of a view, ascending.
+    pub fn of(&self, view: usize) -> &[PageNo] {
+        let start = if view == 0 { 0 } else { self.ends[view - 1] };
+        &self.pages[start..self.ends[view]]
+    }
+
+    /// Most pages of a view.
+    pub fn most(&self) -> usize {
+        (0..self.views()).map(|view| self.of(view).len()).max().unwrap_or(0)
+    }
+
+    /// Pages of all views together, each as often as it is needed.
+    pub fn total(&self) -> usize {
+        self.pages.len()
+    }
 }
 
 struct ListPages<'a> {

@@ -67,10 +67,7 @@ impl PageRules {
             events: EventLog::default(),
             seed: options.seed,
             page_rows: options.page_rows,
-            splits: options.densify.map_or(SplitLimits::NEVER, |d| SplitLimits {
-                grow_grad2d: d.grow_grad2d,
-                split_scale: d.grow_scale3d * options.scene_scale,
-            }),
+            splits: options.densify.map_or(SplitLimits::NEVER, |d| d.split_limits(options.scene_scale)),
             sh_degree: options.sh_degree_at(0),
         }
     }

@@ -10,10 +10,17 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
+use crate::scene::camera::Camera;
 use crate::scene::partition::first_fill;
+use crate::schedule::model::Policy;
+use crate::schedule::order::Order;
+use crate::schedule::replay::{ReplayOptions, replay};
+use crate::schedule::visibility::ViewPages;
 
 /// Bytes that a common drive of 500 GB is rated to take in its life.
 const ENDURANCE_BYTES: f64 = 300e12;
+/// Epochs that are played through to see what a run will write.
+const PLAYED_EPOCHS: u32 = 3;
 /// Slots that writes in flight take beside those of the pages.
 const SLOTS_IN_FLIGHT: u64 = 64;
 
@@ -28,7 +35,7 @@ pub struct TierPlan {
     pub frames: Option<u64>,
     /// Pages of the view that needs most, its name, and the mean over all views.
     pub largest_view: (u64, String, f64),
-    /// Bytes that the run may write to the drive, at most.
+    /// Bytes that the run is expected to write to the drive.
     pub bytes_written: f64,
     /// Free bytes of the drive, where one is used and the system tells.
     pub free_bytes: Option<u64>,
@@ -75,12 +82,34 @@ pub fn settle(
     trainer.scene.pager.allow_frames(frames as usize);
     plan.frames = Some(frames);
     memory.iter_mut().for_each(|m| m.frames = m.frames.min(frames * frame_bytes));
-    // Nearly every page that a step reads has been changed when it leaves; with few frames most pages of a view are
-    // not there.
-    let absent = 1.0 - (frames as f64 / pages_max as f64).min(1.0);
-    plan.bytes_written = f64::from(config.steps) * plan.largest_view.2 * absent * frame_bytes as f64;
+    if config.view_order == "auto" {
+        trainer.set_view_order(auto_order(frames, &plan), dataset);
+    }
+    plan.bytes_written = bytes_written(config, dataset, trainer, frames as usize);
     check_drive(&plan, tiers)?;
     Ok(plan)
+}
+
+/// A shuffle where all pages fit, else groups of views small enough for the pages of each to stay in memory: about four
+/// times as many groups as the scene is larger than memory.
+fn auto_order(frames: u64, plan: &TierPlan) -> Order {
+    if frames >= plan.pages[1] {
+        return Order::Shuffle;
+    }
+    Order::Groups((4 * plan.pages[0].max(frames)).div_ceil(frames.max(1)).clamp(4, 400) as u32)
+}
+
+/// Bytes that the run will write to the drive: some epochs of it played through with the pages as they are now.
+fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, frames: usize) -> f64 {
+    let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
+    let index = trainer.scene.pager.index();
+    let policy = if config.evict == "lru" { Policy::LeastRecent } else { Policy::Farthest };
+    let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
+    let options = ReplayOptions { frames, policy, steps, plan_bytes: PLAN_BYTES as u64 };
+    let page_bytes = vec![trainer.scene.pager.frame_bytes() as u32; index.len()];
+    let played = replay(&ViewPages::new(index, &cameras), &page_bytes, trainer.view_order(), &options);
+    let written: u64 = played.map_or(0, |p| p.steps.iter().map(|s| s.bytes_written).sum());
+    written as f64 * f64::from(config.steps) / f64::from(steps.max(1))
 }
 
 /// The view that needs most pages by the bounds as they are now.
@@ -201,7 +230,7 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
     text.push_str(&part("program and tables", memory.base));
     if tiers.spills() {
         text.push_str(&format!(
-            "drive   {} of pages by {} ({}), {} free; up to {} written, {:.2} % of what a common drive is rated for\n",
+            "drive   {} of pages by {} ({}), {} free; about {} to be written, {:.2} % of what a common drive is rated for\n",
             format_bytes(plan.pages[0] * plan.frame_bytes),
             tiers.engine,
             tiers.codec,

@@ -199,7 +199,8 @@ fn train_into(
     stop: &StopFlag,
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
-    write_config(&out.join("config.toml"), config, &resolved(request, dataset, &trainer))?;
+    let settled = TrainConfig { view_order: trainer.view_order().order().to_string(), ..config.clone() };
+    write_config(&out.join("config.toml"), &settled, &resolved(request, dataset, &trainer))?;
     let mut metrics = MetricsLog::create(&out.join("metrics.jsonl"))?;
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let mut progress = Progress::new(config.steps, request.quiet);

@@ -19,11 +19,12 @@ use crate::exchange::ply::{self, PlyMeta};
 use crate::paging::error::PagingError;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::{RenderError, RenderOptions, Renderer};
+use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::image::Target;
 use crate::scene::page_split::SplitTooDeep;
-use crate::schedule::order::ShuffledOrder;
+use crate::schedule::order::{Order, ViewOrder};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -31,6 +32,11 @@ use std::time::Instant;
 const NON_FINITE_STEPS_MAX: u32 = 3;
 /// Views whose photos are asked for ahead of their steps.
 const PREFETCH_VIEWS: u32 = 8;
+
+/// Steps from one look at the coming views to the next, and how many views are looked at.
+const LOOK_AHEAD_EVERY: u32 = 8;
+const LOOK_AHEAD_LEAST: u32 = 64;
+const LOOK_AHEAD_MOST: u32 = 8192;
 
 /// What can end a run early.
 #[derive(Debug, thiserror::Error)]
@@ -68,7 +74,7 @@ pub struct Trainer {
     /// The renderer.
     pub renderer: Box<dyn Renderer>,
     options: RunOptions,
-    order: ShuffledOrder,
+    order: ViewOrder,
     train_views: Vec<usize>,
     working: WorkingSet,
     step: u32,
@@ -88,6 +94,11 @@ pub struct LoopOutputs<'a> {
     pub progress: &'a mut Progress,
     /// Ctrl-C.
     pub stop: &'a StopFlag,
+}
+
+fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
+    let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
+    ViewOrder::new(order, seed, &cameras)
 }
 
 impl Trainer {
@@ -119,7 +130,7 @@ impl Trainer {
         let train_views = dataset.train_views();
         Ok(Trainer {
             scene: PagedScene::new(&columns, pager, &options)?,
-            order: ShuffledOrder::new(options.seed, train_views.len()),
+            order: view_order(options.view_order, options.seed, dataset),
             train_views,
             working: WorkingSet::default(),
             renderer,
@@ -151,6 +162,16 @@ impl Trainer {
             pixels = pixels.max(camera.pixels());
         }
         Ok(pixels)
+    }
+
+    /// Trains in this order of views from the first step on; for orders that are settled after the pages are known.
+    pub fn set_view_order(&mut self, order: Order, dataset: &Dataset) {
+        self.order = view_order(order, self.options.seed, dataset);
+    }
+
+    /// The order of views.
+    pub fn view_order(&self) -> &ViewOrder {
+        &self.order
     }
 
     /// Bytes held for one view: its rows with their gradients, and what the renderer has.
@@ -200,6 +221,7 @@ impl Trainer {
             *position = self.train_views[*position];
         }
         targets.prefetch(&ahead);
+        self.look_ahead(dataset);
         let target = targets.get(view)?;
         let started = Instant::now();
         let render = self.render_options();
@@ -216,6 +238,21 @@ impl Trainer {
         self.step += 1;
         self.train_seconds += started.elapsed().as_secs_f64();
         Ok(outcome)
+    }
+
+    /// Tells the pager which views come next, now and then: it plans by pages, which costs more than a step should.
+    fn look_ahead(&mut self, dataset: &Dataset) {
+        let spills = self.scene.pager.stats().frames_max != usize::MAX;
+        if !spills || !self.step.is_multiple_of(LOOK_AHEAD_EVERY) {
+            return;
+        }
+        // Every page of the scene is needed within the next two epochs, if it ever is.
+        let count = (2 * self.train_views.len() as u32).clamp(LOOK_AHEAD_LEAST, LOOK_AHEAD_MOST);
+        let mut coming = Vec::new();
+        self.order.upcoming(self.step, count.min(self.options.steps - self.step), &mut coming);
+        let camera = |&position: &usize| &dataset.views[self.train_views[position]].camera;
+        let cameras: Vec<&Camera> = coming.iter().map(camera).collect();
+        self.scene.pager.look_ahead(self.step, &cameras);
     }
 
     fn count(&mut self, outcome: &StepOutcome, view: &str) -> Result<(), TrainError> {
