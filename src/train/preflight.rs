@@ -33,7 +33,7 @@ pub struct TierPlan {
     pub frame_bytes: u64,
     /// Frames; `None` for as many as there are pages.
     pub frames: Option<u64>,
-    /// Pages of the view that needs most, its name, and the mean over all views.
+    /// Pages of the view that needs most, its name, and the mean over views.
     pub largest_view: (u64, String, f64),
     /// Bytes that the run is expected to write to the drive.
     pub bytes_written: f64,
@@ -112,18 +112,19 @@ fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, fra
     written as f64 * f64::from(config.steps) / f64::from(steps.max(1))
 }
 
-/// The view that needs most pages by the bounds as they are now.
+/// The training view that needs most pages by the bounds as they are now. Evaluation takes its views page by page.
 fn largest_view(dataset: &Dataset, trainer: &Trainer) -> (u64, String, f64) {
     let mut largest = (0, String::new());
     let mut sum = 0;
-    for view in &dataset.views {
+    let views = dataset.train_views();
+    for view in views.iter().map(|&v| &dataset.views[v]) {
         let pages = trainer.scene.pager.pages_of_view(&view.camera).len() as u64;
         sum += pages;
         if pages > largest.0 {
             largest = (pages, view.name.clone());
         }
     }
-    (largest.0, largest.1, sum as f64 / dataset.views.len().max(1) as f64)
+    (largest.0, largest.1, sum as f64 / views.len().max(1) as f64)
 }
 
 fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -> InputResult<()> {

@@ -8,7 +8,7 @@ use super::machine;
 use super::memory::{estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
 use super::preflight;
 use super::progress::Progress;
-use super::report::{MetricsLog, Resolved, Summary, write_config, write_summary};
+use super::report::{MetricsLog, Resolved, Summary, TierTraffic, write_config, write_summary};
 use super::signals::StopFlag;
 use super::tiers;
 use super::trainer::{LoopOutputs, TrainError, Trainer};
@@ -226,7 +226,7 @@ fn train_into(
     let (rows_skipped, steps_skipped) = trainer.skipped();
     let summary = Summary {
         steps: trainer.steps_done(),
-        gaussians: trainer.scene.rows(),
+        gaussians: written.rows + written.skipped,
         train_seconds: trainer.train_seconds(),
         host_bytes_peak: host_bytes_peak().unwrap_or(0),
         test: tested.as_ref().ok().copied().flatten(),
@@ -236,6 +236,7 @@ fn train_into(
         finished: trainer.steps_done() == config.steps,
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
+        tiers: TierTraffic::of(&trainer.scene.pager),
     };
     write_summary(&out.join("summary.json"), &summary)?;
     tested?;

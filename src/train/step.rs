@@ -75,9 +75,11 @@ pub fn train_step(
     visible_rows(&tables, &scene.rules.adam, step, camera, row_from_working);
     gather(&tables, scene.rules.sh_degree(), &scene.rules.adam, step, row_from_working, columns);
     let rows_pinned = tables.iter().map(|t| t.rows()).sum();
-    let rendered = renderer
-        .forward(columns, camera, render)
-        .and_then(|()| renderer.loss_backward(columns, target, loss, gradients));
+    let rendered = renderer.forward(columns, camera, render).and_then(|()| {
+        // What was read since may let more be read.
+        scene.pager.prefetch(step);
+        renderer.loss_backward(columns, target, loss, gradients)
+    });
     let mut outcome =
         StepOutcome { rows: row_from_working.len(), rows_pinned, pages: pages.len(), ..StepOutcome::default() };
     if let Ok(value) = rendered {

@@ -8,7 +8,7 @@ use super::eval::{EvalRequest, evaluate};
 use super::memory::host_bytes_peak;
 use super::pages::PagedScene;
 use super::progress::Progress;
-use super::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
+use super::report::{MetricsLog, StepLine, TestMetrics, TierTraffic, json_psnr};
 use super::signals::StopFlag;
 use super::step::{StepOutcome, WorkingSet, train_step};
 use crate::base::error::InputError;
@@ -324,13 +324,15 @@ impl Trainer {
                     bytes_uploaded: traffic.bytes_uploaded - before.bytes_uploaded,
                     bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
                     device_bytes_peak: traffic.device_bytes_peak,
+                    tiers: TierTraffic::of(&self.scene.pager),
                     test: last_test.filter(|_| due(self.options.eval_every) && !is_last),
                 })?;
             }
             let gaussians = self.scene.rows();
             outputs.progress.step(self.step, || {
                 let test = last_test.map_or(String::new(), |t| format!(" test {:.2}", t.psnr));
-                format!("loss {:.4} psnr {psnr:.2}{test} {gaussians} gaussians", outcome.loss.loss)
+                let tiers = TierTraffic::of(&self.scene.pager).words();
+                format!("loss {:.4} psnr {psnr:.2}{test} {gaussians} gaussians{tiers}", outcome.loss.loss)
             });
         }
         outputs.progress.finish();
