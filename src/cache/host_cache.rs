@@ -93,6 +93,11 @@ impl HostCache {
         self.counts[state as usize]
     }
 
+    /// Allows more frames; never takes any away.
+    pub fn allow_frames(&mut self, frames_max: usize) {
+        self.frames_max = self.frames_max.max(frames_max);
+    }
+
     /// Allows one frame more.
     pub fn add_frame(&mut self) {
         self.frames_max = self.frames_max.saturating_add(1);

@@ -115,6 +115,22 @@ impl Pager {
         Ok(page)
     }
 
+    /// Allows more frames than the pager was made with, once it is known what memory is left for them.
+    pub fn allow_frames(&mut self, frames: usize) {
+        self.cache.allow_frames(frames);
+        self.config.frames = self.cache.frames_max();
+    }
+
+    /// Bytes that [`Pager::prefetch`] has in flight at most.
+    pub fn prefetch_bytes(&self) -> usize {
+        2 * self.config.prefetch_bytes
+    }
+
+    /// Bytes of one frame.
+    pub fn frame_bytes(&self) -> usize {
+        self.config.frame_bytes()
+    }
+
     /// The metas of all pages, by number.
     pub fn index(&self) -> &[PageMeta] {
         &self.index

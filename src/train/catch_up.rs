@@ -1,8 +1,11 @@
 //! From stored rows to the rows of one view: which of them it may draw, and what they are at this step.
 //!
-//! Invariants: 1. the state is only read here; 2. the cull is conservative: no row that the
-//! projection would draw is left out, whatever its rotation and opacity; 3. listed rows ascend; 4. results are the same
-//! for any number of threads; 5. once `out` has grown to its size, nothing that grows with the scene is allocated.
+//! Rows come as a list of tables numbered through: the pinned pages of a step, or one table in memory.
+//!
+//! Invariants: 1. rows are only read here; 2. the cull is conservative: no row that the projection would draw is left
+//! out, whatever its rotation and opacity; 3. listed rows ascend; 4. results are the same for any number of threads and
+//! for any cut of the rows into tables; 5. once `out` has grown to its size, nothing that grows with the scene is
+//! allocated.
 
 use crate::base::math::exp32;
 use crate::base::simd::{Kernel, dispatch};
@@ -12,58 +15,93 @@ use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
 use crate::scene::frustum::Frustum;
 use crate::scene::rows::{ColumnsMut, Rows, RowsNow};
-use crate::scene::state::SceneState;
 
-/// The rows that `camera` may draw after `now` optimizer steps, ascending.
-pub fn visible_rows(state: &SceneState, adam: &DeferredAdam, now: u32, camera: &Camera, out: &mut Vec<u32>) {
+/// The rows of `tables` that `camera` may draw after `now` optimizer steps, ascending. Tables are numbered through:
+/// each starts where the one before it ends.
+pub fn visible_rows(tables: &[Rows<'_>], adam: &DeferredAdam, now: u32, camera: &Camera, out: &mut Vec<u32>) {
     let at = adam.at(now);
     let frustum = Frustum::new(camera);
-    out.resize(state.rows(), 0);
-    let found = cull(&at, &frustum, state.view(), out);
+    out.resize(rows_of(tables), 0);
+    let found = cull(&at, &frustum, tables, out);
     out.truncate(found);
 }
 
-/// The listed rows as they are after `now` optimizer steps: row i of `out` is row `rows[i]` of the state.
-pub fn gather(state: &SceneState, adam: &DeferredAdam, now: u32, rows: &[u32], out: &mut Columns) {
-    if out.sh_degree != state.sh_degree() {
-        *out = Columns::zeros(0, state.sh_degree());
+/// The listed rows as they are after `now` optimizer steps: row i of `out` is row `rows[i]` of the tables, which are
+/// numbered through and all stored with `sh_degree`.
+pub fn gather(tables: &[Rows<'_>], sh_degree: u8, adam: &DeferredAdam, now: u32, rows: &[u32], out: &mut Columns) {
+    if out.sh_degree != sh_degree {
+        *out = Columns::zeros(0, sh_degree);
     }
     out.resize(rows.len());
-    let row_of = |i: usize| rows[i] as usize;
-    evaluate_into(&adam.at(now), state.view(), &row_of, 0, out.view_mut());
+    evaluate_into(&adam.at(now), tables, rows, out.view_mut());
 }
 
-/// All rows as they are after `now` optimizer steps.
-pub fn evaluate_all(state: &SceneState, adam: &DeferredAdam, now: u32) -> Columns {
-    let mut out = Columns::zeros(state.rows(), state.sh_degree());
-    evaluate_into(&adam.at(now), state.view(), &|i| i, 0, out.view_mut());
+/// All rows of the tables as they are after `now` optimizer steps, in their order.
+pub fn evaluate_all(tables: &[Rows<'_>], sh_degree: u8, adam: &DeferredAdam, now: u32) -> Columns {
+    let first = tables.first().map_or(0, |t| t.first_row) as u32;
+    let rows: Vec<u32> = (first..first + rows_of(tables) as u32).collect();
+    let mut out = Columns::zeros(0, sh_degree);
+    gather(tables, sh_degree, adam, now, &rows, &mut out);
     out
 }
 
-fn evaluate_into<F>(at: &AdamNow<'_>, view: Rows<'_>, row_of: &F, first: usize, out: ColumnsMut<'_>)
-where
-    F: Fn(usize) -> usize + Sync,
-{
-    if out.rows() <= ROWS_PER_TASK {
-        return at.evaluate_rows(view, |i| row_of(first + i), out);
-    }
-    let half = out.rows().div_ceil(ROWS_PER_TASK) / 2 * ROWS_PER_TASK;
-    let (head, tail) = out.split_at(half);
-    rayon::join(
-        || evaluate_into(at, view, row_of, first, head),
-        || evaluate_into(at, view, row_of, first + half, tail),
-    );
+fn rows_of(tables: &[Rows<'_>]) -> usize {
+    tables.iter().map(Rows::rows).sum()
 }
 
-/// Lists the rows of the view that may be drawn in the front of `out`, which is as long as the view; returns how many.
-fn cull(at: &AdamNow<'_>, frustum: &Frustum, view: Rows<'_>, out: &mut [u32]) -> usize {
-    if view.rows() <= ROWS_PER_TASK {
-        return dispatch(at.simd(), CullRows { at, frustum, view, out });
+/// Evaluates the listed rows, cut into tasks by tables and within them.
+fn evaluate_into(at: &AdamNow<'_>, tables: &[Rows<'_>], rows: &[u32], out: ColumnsMut<'_>) {
+    if rows.is_empty() {
+        return;
     }
-    let half = view.rows().div_ceil(ROWS_PER_TASK) / 2 * ROWS_PER_TASK;
-    let (head, tail) = view.split_at(half);
+    if let [table] = tables
+        && rows.len() <= ROWS_PER_TASK
+    {
+        return at.evaluate_rows(*table, |i| rows[i] as usize - table.first_row, out);
+    }
+    let (listed, head_tables, tail_tables) = match tables {
+        [_] => (rows.len().div_ceil(ROWS_PER_TASK) / 2 * ROWS_PER_TASK, tables, tables),
+        _ => {
+            let (head, tail) = tables.split_at(tables.len() / 2);
+            let bound = tail[0].first_row;
+            (rows.partition_point(|&row| (row as usize) < bound), head, tail)
+        }
+    };
+    let (head, tail) = out.split_at(listed);
+    let both = (
+        || evaluate_into(at, head_tables, &rows[..listed], head),
+        || evaluate_into(at, tail_tables, &rows[listed..], tail),
+    );
+    join_if(rows.len() > ROWS_PER_TASK, both.0, both.1);
+}
+
+/// Runs both, on two threads where that is worth it.
+fn join_if<A: Send, B: Send>(worth: bool, a: impl FnOnce() -> A + Send, b: impl FnOnce() -> B + Send) -> (A, B) {
+    if worth { rayon::join(a, b) } else { (a(), b()) }
+}
+
+/// Lists the rows of the tables that may be drawn in the front of `out`, which has room for all; returns how many.
+fn cull(at: &AdamNow<'_>, frustum: &Frustum, tables: &[Rows<'_>], out: &mut [u32]) -> usize {
+    let rows = out.len();
+    match tables {
+        [] => return 0,
+        [view] if rows <= ROWS_PER_TASK => return dispatch(at.simd(), CullRows { at, frustum, view: *view, out }),
+        _ => {}
+    }
+    let halves;
+    let (head, tail) = match tables {
+        [view] => {
+            // Halved at whole tasks.
+            let (a, b) = view.split_at(rows.div_ceil(ROWS_PER_TASK) / 2 * ROWS_PER_TASK);
+            halves = [a, b];
+            halves.split_at(1)
+        }
+        _ => tables.split_at(tables.len() / 2),
+    };
+    let half = rows_of(head);
     let (head_out, tail_out) = out.split_at_mut(half);
-    let (a, b) = rayon::join(|| cull(at, frustum, head, head_out), || cull(at, frustum, tail, tail_out));
+    let (a, b) =
+        join_if(rows > ROWS_PER_TASK, || cull(at, frustum, head, head_out), || cull(at, frustum, tail, tail_out));
     out.copy_within(half..half + b, a);
     a + b
 }
