@@ -126,6 +126,7 @@ pub fn read_options(config: &TrainConfig) -> ReadOptions {
     ReadOptions {
         images: (!config.images.is_empty()).then(|| config.images.clone()),
         allow_missing: config.allow_missing,
+        points_later: false,
     }
 }
 

@@ -9,10 +9,12 @@
 //! [`crate::scene::partition::partition`], bit for bit, whatever the budget; 2. memory is bounded by the budget and one
 //! page of Gaussians; 3. files of an import are gone when it is over.
 
+mod cloud;
 mod distances;
 mod divide;
 mod spool;
 
+pub use cloud::{Cloud, LocalCloud};
 pub use divide::{Division, TakePages};
 pub use spool::{Spool, SpoolSpace, SpoolWriter};
 
