@@ -362,7 +362,7 @@ fn tightest_bounds(adam: &DeferredAdam) -> f64 {
             let due = EventLog::from_events(log.events().iter().copied().filter(|e| e.now() <= now).collect()).unwrap();
             let mut late = state.clone();
             PendingEvents::new(adam, SEED, 1 << 20, &due).apply_to_table(0, &mut late);
-            let values = evaluate_all(&late, adam, now);
+            let values = evaluate_all(&[late.view()], late.sh_degree(), adam, now);
             for row in 0..values.rows() {
                 let (mean, scales) = (values.row(Column::Means, row), values.row(Column::Scales, row));
                 let sigma = scales.iter().map(|&s| gsscale::base::math::exp32(s)).fold(0.0, f32::max);

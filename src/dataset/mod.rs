@@ -9,6 +9,7 @@ pub mod frame;
 pub mod import;
 pub mod loader;
 pub mod masks;
+pub mod mega_nerf;
 pub mod model;
 pub mod paths;
 pub mod photo;

@@ -80,7 +80,7 @@ fn bin(mean: f32) -> usize {
 
 /// Adds the gradients of one view. `rows` ascends and is numbered in the table that the view was cut from; `v_means2d`
 /// (loss with respect to the pixel position, pixel units) and `radii` have one entry per listed row; rows with a zero
-/// radius were not drawn. Gradients that are not finite are left out.
+/// radius were not drawn. Gradients that are not finite are left out. Returns the number of rows that changed.
 pub fn accumulate(
     view: &mut RowsMut<'_>,
     rows: &[u32],
@@ -88,7 +88,8 @@ pub fn accumulate(
     radii: &[[u32; 2]],
     image_size: [u32; 2],
     histogram: &mut GradHistogram,
-) {
+) -> usize {
+    let mut changed = 0;
     assert!(rows.len() == v_means2d.len() && rows.len() == radii.len(), "one gradient and radius per listed row");
     let half = image_size.map(|n| n as f32 * 0.5);
     for ((&row, v), radius) in rows.iter().zip(v_means2d).zip(radii) {
@@ -108,7 +109,9 @@ pub fn accumulate(
         *grad2d = (*grad2d + norm).min(f32::MAX);
         *count += 1;
         histogram.add(mean_grad2d(*grad2d, *count));
+        changed += 1;
     }
+    changed
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 pub mod camera;
 pub mod columns;
 pub mod events;
+pub mod frustum;
 pub mod image;
 pub mod init;
 pub mod neighbours;

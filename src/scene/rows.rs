@@ -28,7 +28,7 @@ pub const fn first_lane(column: Column) -> usize {
 }
 
 /// Shared view of the columns of some rows; each slice is `[rows][width]`.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct ColumnsRef<'a> {
     /// Degree that `sh_n` is stored with.
     pub sh_degree: u8,
@@ -182,7 +182,7 @@ impl<'a> ColumnsMut<'a> {
 }
 
 /// Shared view of rows with all that training keeps of them.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct Rows<'a> {
     /// Number of the first row in the table that the view was cut from.
     pub first_row: usize,

@@ -19,7 +19,7 @@ mod rows;
 mod write;
 
 pub use read::{holds_gaussians, parse_ply, read_ply, stream_points};
-pub use write::{PlyWritten, write_gaussians};
+pub use write::{PlyWriter, PlyWritten, write_gaussians};
 
 use crate::scene::columns::Columns;
 
