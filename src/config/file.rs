@@ -112,6 +112,8 @@ config_keys! {
         shn_lr: f64 = 2.5e-3 / 20.0;
         /// Adam's epsilon
         adam_eps: f64 = 1e-15;
+        /// What is kept of Adam's moments between steps: f32, or bf16, which is not exact and saves half of their disk
+        moments: String = "f32".into();
         /// Opacity of first Gaussians
         init_opacity: f64 = 0.1;
         /// Size of first Gaussians, times the distance to their three nearest neighbours
@@ -351,10 +353,11 @@ impl TrainConfig {
         if self.spill_codec != "auto" {
             self.spill_codec.parse::<Codec>().map_err(|problem| written("spill-codec", problem))?;
         }
-        let names: [(&str, &str, &[&str]); 7] = [
+        let names: [(&str, &str, &[&str]); 8] = [
             ("io", &self.io, &["auto", "uring", "mmap", "pread"]),
             ("evict", &self.evict, &["belady", "lru"]),
             ("ssim-padding", &self.ssim_padding, &["valid", "same"]),
+            ("moments", &self.moments, &["f32", "bf16"]),
             ("strategy", &self.strategy, &["default", "none"]),
             ("ssim-variant", &self.ssim_variant, &["same", "valid", "reflect"]),
             ("export-frame", &self.export_frame, &["dataset", "local"]),

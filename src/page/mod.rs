@@ -8,6 +8,7 @@ pub mod engine;
 pub mod faulty_store;
 pub mod file_system;
 pub mod format;
+pub mod halves;
 pub mod io_measure;
 pub mod memory_store;
 pub mod mmap_store;
