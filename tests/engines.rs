@@ -403,3 +403,23 @@ fn a_refused_ring_falls_back_with_the_reason() {
         refused.join().unwrap();
     }
 }
+
+#[test]
+fn iotune_prints_lines_for_a_config_and_leaves_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let tune = |args: &[&str]| {
+        let mut program = std::process::Command::new(env!("CARGO_BIN_EXE_gsscale-iotune"));
+        program.arg(folder.path()).args(args).output().unwrap()
+    };
+    let output = tune(&["--file", "192MiB", "--seconds", "4", "--written", "64MiB"]);
+    let (said, errors) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{said}{errors}");
+    for key in ["io = \"", "page-rows = ", "spill-codec = \""] {
+        assert_eq!(said.lines().filter(|l| l.starts_with(key)).count(), 1, "{key} in: {said}");
+    }
+    let refused = tune(&["--file", "1023GiB"]);
+    let errors = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(errors.contains("are free") && errors.contains("remedy"), "{errors}");
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "nothing is left");
+}

@@ -5,9 +5,10 @@ use gsscale::base::ids::PageId;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::page_meta::{PageBounds, PageMeta};
+use gsscale::schedule::auto::automatic_order;
 use gsscale::schedule::model::Policy;
 use gsscale::schedule::order::{Order, ViewOrder};
-use gsscale::schedule::replay::{Replay, ReplayOptions, replay};
+use gsscale::schedule::replay::{DriveModel, Replay, ReplayOptions, Stall, StepTraffic, replay};
 use gsscale::schedule::visibility::ViewPages;
 
 /// A camera at `centre` that looks down, tilted by `tilt` off the vertical towards `heading`, radians.
@@ -94,33 +95,125 @@ fn run(survey: &Survey, pages: &ViewPages, order: Order, policy: Policy, cache: 
     replay(pages, &bytes, &order, &ReplayOptions { frames, policy, steps, plan_bytes: 1 << 30 }).unwrap()
 }
 
-/// Prints the table of the design; not a test of anything.
+fn miss(run: &Replay) -> f64 {
+    1.0 - run.figures(run.steady()).hit_rate
+}
+
+/// The table of the design, on two surveys. `cargo nextest run --test replay --run-ignored all --no-capture table`
 #[test]
 #[ignore = "prints the table of orders"]
 fn table() {
     for (name, tilt) in [("vertical", 0.0), ("tilted", 0.7)] {
         let survey = survey(1000, 64, 0.07, tilt);
-        let began = std::time::Instant::now();
         let pages = ViewPages::new(&survey.index, &survey.cameras);
-        let share = pages.total() as f64 / 1000.0 / 4096.0;
-        println!("{name}: share {share:.3}, most {}, {:?}", pages.most(), began.elapsed());
-        for order in ["groups:4", "groups:9", "groups:25", "groups:100", "tour"] {
-            let mut line = format!("{order:12}");
-            for cache in [0.13, 0.25, 0.5] {
-                let figures = Policy::ALL.map(|policy| {
-                    let replay = run(&survey, &pages, order.parse().unwrap(), policy, cache, 4);
-                    assert!(replay.is_exact);
-                    replay.figures(replay.steady())
-                });
-                let [b, l] = figures;
-                line += &format!(
-                    " | lru {:.3} belady {:.3} top5 {:.2}",
-                    1.0 - l.hit_rate,
-                    1.0 - b.hit_rate,
-                    b.heaviest_share
-                );
-            }
-            println!("{line}");
+        let share = pages.total() as f64 / (survey.cameras.len() * survey.index.len()) as f64;
+        println!("{name}: a view sees {share:.3} of the pages, at most {}", pages.most());
+        for order in ["shuffle", "groups:4", "groups:9", "groups:16", "groups:25", "groups:49", "groups:100", "tour"] {
+            let cells = [0.13, 0.25, 0.5].map(|cache| {
+                let [b, l] = Policy::ALL.map(|p| run(&survey, &pages, order.parse().unwrap(), p, cache, 4));
+                assert!(b.is_exact);
+                format!("{:.3} / {:.3}", miss(&l), miss(&b))
+            });
+            println!("| {order} | {} |", cells.join(" | "));
         }
     }
+}
+
+#[test]
+fn orders_and_policies_read_in_the_order_of_the_design() {
+    let survey = survey(400, 32, 0.07, 0.0);
+    let pages = ViewPages::new(&survey.index, &survey.cameras);
+    let share = pages.total() as f64 / (400.0 * 1024.0);
+    assert!((0.06..0.10).contains(&share), "a view sees {share}");
+    for cache in [0.18, 0.25, 0.5] {
+        let of = |order: &str, policy| miss(&run(&survey, &pages, order.parse().unwrap(), policy, cache, 3));
+        let table = ["shuffle", "groups:4", "groups:9", "groups:25"].map(|order| {
+            let (lru, known) = (of(order, Policy::LeastRecent), of(order, Policy::Farthest));
+            assert!(known <= lru, "{order}: knowing the future never reads more");
+            known
+        });
+        // Each refinement of the order saves a good deal, until what is left is the way through the city itself.
+        assert!(table[1] < 0.75 * table[0] && table[2] < 0.75 * table[1] + 0.01, "{table:?}");
+        assert!(table[3] < 0.75 * table[2] + 0.01, "{table:?}");
+        assert!(of("tour", Policy::Farthest) < 0.15 * table[0] + 0.02);
+    }
+    // A shuffle that knows the future is about as good as least recent use with half as many pages missing.
+    let shuffle = |policy| miss(&run(&survey, &pages, Order::Shuffle, policy, 0.25, 3));
+    let (lru, known) = (shuffle(Policy::LeastRecent), shuffle(Policy::Farthest));
+    assert!((0.6..0.85).contains(&lru) && (0.35..0.6).contains(&known), "{lru} {known}");
+}
+
+#[test]
+fn bytes_follow_pages_and_everything_that_leaves_is_written() {
+    let survey = survey(100, 16, 0.1, 0.7);
+    let pages = ViewPages::new(&survey.index, &survey.cameras);
+    let needed: std::collections::BTreeSet<u32> = (0..100).flat_map(|v| pages.of(v).iter().map(|p| p.0)).collect();
+    let planned = run(&survey, &pages, Order::Shuffle, Policy::Farthest, 0.4, 3);
+    let (read, written) = planned.totals();
+    let frames = (0.4 * 256.0) as u64;
+    assert_eq!(read - written, frames << 20, "what was read and not written is what the frames hold");
+    assert!(planned.steps.iter().all(|s| s.bytes_read == u64::from(s.pages_read) << 20 && s.pages_read <= s.pages));
+    // With a frame for every page each page is read once and nothing is written.
+    let all = run(&survey, &pages, Order::Shuffle, Policy::Farthest, 1.0, 3);
+    assert_eq!(all.totals(), ((needed.len() as u64) << 20, 0));
+    assert_eq!(all.figures(all.steady()).hit_rate, 1.0);
+    // A plan that looks less far reads no less, and says that it is no bound.
+    let order = ViewOrder::new(Order::Shuffle, 5, &survey.cameras);
+    let options = ReplayOptions { frames: 102, policy: Policy::Farthest, steps: 300, plan_bytes: 3000 };
+    let short = replay(&pages, &vec![1 << 20; 256], &order, &options).unwrap();
+    assert!(planned.is_exact && !short.is_exact && short.totals().0 > read);
+    let options = ReplayOptions { frames: pages.most() - 1, ..options };
+    let error = replay(&pages, &[], &order, &options).unwrap_err();
+    assert_eq!((error.needed, error.frames), (pages.most(), pages.most() - 1));
+}
+
+fn traffic(read: &[u64]) -> Replay {
+    let step = |&bytes_read: &u64| StepTraffic { pages: 10, pages_read: 1, bytes_read, bytes_written: bytes_read };
+    Replay { steps: read.iter().map(step).collect(), views: 1000, is_exact: true }
+}
+
+#[test]
+fn stalls_are_what_the_drive_cannot_do_in_time() {
+    // 10 bytes take a second to read and a second to write; a step takes 2 s.
+    let drive = DriveModel { read_rate: 10.0, write_rate: 10.0, step_seconds: 2.0, ahead_bytes: 0 };
+    let seconds = |read: &[u64], drive: &DriveModel| traffic(read).stall(0..read.len(), drive);
+    assert_eq!(seconds(&[500, 10, 10, 10], &drive), Stall::default(), "the drive keeps up");
+    // 30 bytes are 6 s of reading and writing, begun with the step before, which takes 2 s.
+    assert_eq!(seconds(&[0, 0, 0, 30], &drive), Stall { seconds: 4.0, worst_seconds: 4.0, steps: 1 });
+    // Begun two steps earlier they cost nothing.
+    let ahead = DriveModel { ahead_bytes: 30, ..drive };
+    assert_eq!(seconds(&[0, 0, 0, 30], &ahead), Stall::default());
+    // But reading ahead does not make the drive faster: 4 s for each step of 2 s, the first two begun with step 0.
+    let ahead = DriveModel { ahead_bytes: 1000, ..drive };
+    assert_eq!(seconds(&[0, 20, 20, 20], &ahead).seconds, 3.0 * 4.0 - 3.0 * 2.0);
+    let slow = DriveModel { step_seconds: 0.0, ..drive };
+    assert_eq!(seconds(&[0, 20, 20], &slow).seconds, 8.0);
+}
+
+#[test]
+fn figures_name_the_worst_window_and_the_heaviest_steps() {
+    let mut read = vec![10u64; 100];
+    read[40..60].fill(100);
+    read[50] = 1000;
+    let figures = traffic(&read).figures(0..100);
+    assert_eq!((figures.worst_window, figures.worst_per_step), (40, 2.0 * 2900.0 / 20.0));
+    // 5 of 100 steps: 1000 and four times 100, of 800 + 19 x 100 + 1000.
+    assert!((figures.heaviest_share - 1400.0 / 3700.0).abs() < 1e-12);
+    assert_eq!((figures.hit_rate, figures.read_per_step), (0.9, 37.0));
+    assert_eq!(traffic(&read).figures(70..80).worst_window, 70);
+}
+
+#[test]
+fn the_automatic_order_gives_up_randomness_only_for_bytes() {
+    let survey = survey(400, 32, 0.07, 0.7);
+    let views = ViewPages::new(&survey.index, &survey.cameras);
+    let auto = |frames| automatic_order(&views, &survey.cameras, 1024, frames, 1, 1 << 28);
+    assert_eq!(auto(1024), Ok(Order::Shuffle));
+    let groups = |frames| match auto(frames).unwrap() {
+        Order::Groups(groups) => groups,
+        other => panic!("{other} with {frames} frames"),
+    };
+    let (tight, ample) = (groups(views.most() + 20), groups(700));
+    assert!(tight >= 25 && ample <= 16, "{tight} groups in a small cache, {ample} in a large one");
+    assert!(auto(20).is_err());
 }

@@ -154,3 +154,27 @@ fn pages_without_rows_are_never_needed_and_unusable_bounds_always() {
         }
     }
 }
+
+/// `cargo nextest run --test visibility --run-ignored all --no-capture times`
+#[test]
+#[ignore = "prints times"]
+fn times() {
+    let mut draws = Stream::new(4, Purpose::Test, 40, 0);
+    for pages in [28_000, 1_000_000] {
+        let page = |p: usize| {
+            let at: [f32; 3] = std::array::from_fn(|_| (100.0 * draws.normal()) as f32);
+            let bounds = PageBounds { lo: at, hi: at.map(|x| x + 1.0), sigma_max: 0.1 };
+            meta(p, bounds)
+        };
+        let index: Vec<PageMeta> = (0..pages).map(page).collect();
+        let mut view = camera(&mut draws);
+        let (mut list, mut best) = (Vec::new(), f64::INFINITY);
+        (0..3).for_each(|i| view.viewmat[i][3] = 0.0);
+        for _ in 0..20 {
+            let began = std::time::Instant::now();
+            visible_pages(&index, &view, &mut list);
+            best = best.min(began.elapsed().as_secs_f64());
+        }
+        println!("{pages} pages: {:.3} ms, {} needed", 1e3 * best, list.len());
+    }
+}

@@ -87,6 +87,7 @@ pub fn free_bytes(folder: &Path) -> io::Result<Option<u64>> {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

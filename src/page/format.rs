@@ -278,6 +278,7 @@ impl Take<'_> {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::base::rng::mix64;
@@ -313,7 +314,7 @@ mod tests {
         let mut bytes = [0; HEADER_BYTES];
         header().encode(&mut bytes);
         assert_eq!(&bytes[..16], b"gsscpage\x01\0\0\0\0\0\0\0");
-        assert_eq!((bytes[16], bytes[37], bytes[40], &bytes[48..50]), (77, 5u8 * 0, 12, [0, 2].as_slice()));
+        assert_eq!((bytes[16], bytes[36], bytes[40], &bytes[48..50]), (77, 5, 12, [0, 2].as_slice()));
         assert_eq!((bytes[50], u16::from_le_bytes([bytes[54], bytes[55]])), (3, 8192));
         assert_eq!((bytes[LABEL_AT], bytes[LABEL_AT + 511], bytes[LABEL_AT + 512]), (0xab, 0xab, 0));
     }

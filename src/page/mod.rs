@@ -2,11 +2,13 @@
 
 pub mod buffer;
 pub mod codec;
+pub mod drive_rate;
 pub mod encoding;
 pub mod engine;
 pub mod faulty_store;
 pub mod file_system;
 pub mod format;
+pub mod io_measure;
 pub mod memory_store;
 pub mod mmap_store;
 mod page_cache;

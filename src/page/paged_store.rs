@@ -276,7 +276,12 @@ impl PagedStore {
     ) -> Result<SlotRef, PageError> {
         self.refuse_if_poisoned()?;
         let room = self.capacity_bytes().min(buffer.len().saturating_sub(HEADER_BYTES));
-        if payload_bytes > room || label.len() > LABEL_BYTES_MAX || u32::try_from(payload_bytes).is_err() {
+        let has_header_room = buffer.len() >= HEADER_BYTES;
+        if !has_header_room
+            || payload_bytes > room
+            || label.len() > LABEL_BYTES_MAX
+            || u32::try_from(payload_bytes).is_err()
+        {
             let label_bytes = label.len();
             return Err(PageError::TooLong { page, payload_bytes, capacity_bytes: room, label_bytes });
         }

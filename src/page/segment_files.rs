@@ -39,6 +39,8 @@ struct OpenFile {
 #[derive(Debug)]
 pub struct SegmentFiles {
     folder: PathBuf,
+    /// Held open, so that a segment can be made durable whatever the process has open.
+    entries: Option<File>,
     direct: bool,
     open: BTreeMap<u32, OpenFile>,
     open_max: usize,
@@ -54,7 +56,10 @@ impl SegmentFiles {
     pub fn new(folder: &Path, direct: bool) -> io::Result<SegmentFiles> {
         let direct = direct && direct_works(folder)?;
         let open_max = open_files_max();
-        Ok(SegmentFiles { folder: folder.to_path_buf(), direct, open: BTreeMap::new(), open_max, clock: 0 })
+        // Other systems do not open folders; there a file's entry is durable with the file.
+        let entries = if cfg!(unix) { Some(File::open(folder)?) } else { None };
+        let open = BTreeMap::new();
+        Ok(SegmentFiles { folder: folder.to_path_buf(), entries, direct, open, open_max, clock: 0 })
     }
 
     /// Whether files bypass the page cache. Then memory, offsets and lengths must be multiples of
@@ -80,8 +85,10 @@ impl SegmentFiles {
     /// No space; the folder cannot be written; the file is longer, a link, or not a file.
     pub fn create(&mut self, segment: u32, bytes: u64) -> io::Result<()> {
         let path = self.path(segment);
-        let file =
-            with_safe_flags(OpenOptions::new().read(true).write(true).create(true).truncate(false)).open(&path)?;
+        let make = |path: &Path| {
+            with_safe_flags(OpenOptions::new().read(true).write(true).create(true).truncate(false)).open(path)
+        };
+        let file = self.open_with_room(&path, make)?;
         let there = file.metadata()?;
         if !there.is_file() || there.len() > bytes {
             let what = if there.is_file() { "exists with another length" } else { "is not a file" };
@@ -94,7 +101,7 @@ impl SegmentFiles {
                 return Err(error);
             }
             file.sync_all()?;
-            sync_folder(&self.folder)?;
+            self.entries.as_ref().map_or(Ok(()), File::sync_all)?;
         }
         Ok(())
     }
@@ -110,14 +117,8 @@ impl SegmentFiles {
             return Ok(Arc::clone(&open.file));
         }
         while self.open.len() >= self.open_max && self.close_oldest()? {}
-        let path = self.path(segment);
-        let file = loop {
-            match open_segment(&path, self.direct) {
-                // Others of this process hold more files than expected.
-                Err(error) if is_too_many_files(&error) && self.close_oldest()? => {}
-                opened => break Arc::new(opened?),
-            }
-        };
+        let direct = self.direct;
+        let file = Arc::new(self.open_with_room(&self.path(segment), |path| open_segment(path, direct))?);
         let open = OpenFile { file: Arc::clone(&file), last_used: self.clock, is_dirty: false };
         self.open.insert(segment, open);
         Ok(file)
@@ -148,6 +149,16 @@ impl SegmentFiles {
         Ok(())
     }
 
+    /// Opens a file; where others of this process hold more files than was reckoned with, closes some of ours.
+    fn open_with_room(&mut self, path: &Path, open: impl Fn(&Path) -> io::Result<File>) -> io::Result<File> {
+        loop {
+            match open(path) {
+                Err(error) if is_too_many_files(&error) && self.close_oldest()? => {}
+                opened => return opened,
+            }
+        }
+    }
+
     /// Closes the file that was not used for longest, except those that a transfer in flight still holds: a write
     /// that ends after the sync would be missed by the next. Tells whether there was one.
     fn close_oldest(&mut self) -> io::Result<bool> {
@@ -171,7 +182,6 @@ fn is_too_many_files(error: &io::Error) -> bool {
 /// # Errors
 /// The drive reported an error.
 pub fn sync_folder(folder: &Path) -> io::Result<()> {
-    // Other systems have no such call; there a file's entry is durable with the file.
     if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
 }
 
@@ -264,6 +274,7 @@ fn open_files_max() -> usize {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

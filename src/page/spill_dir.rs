@@ -5,6 +5,7 @@
 //! program made are ever removed, told by name and by the store's identity inside; 3. no symbolic link is followed,
 //! neither to the folder nor in it; 4. what is made is private to the user.
 
+use super::drive_rate;
 use super::file_system::{FileSystem, free_bytes};
 use super::format::{HEADER_BYTES, SlotHeader};
 use super::segment_files::{segment_from_file_name, sync_folder, with_safe_flags};
@@ -78,6 +79,7 @@ impl SpillDir {
             Some(Err(error)) => return Err(bad_format(folder, &error)),
         }
         tighten(folder)?;
+        sign_lock(folder, &lock)?;
         let format = SpillFormat { store: new_identity(), purpose, layout };
         write_format(folder, &format)?;
         Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder, _lock: lock })
@@ -101,6 +103,7 @@ impl SpillDir {
         read()?;
         let lock = take_lock(folder)?;
         let format = read()?;
+        sign_lock(folder, &lock)?;
         Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder: false, _lock: lock })
     }
 
@@ -144,7 +147,7 @@ impl SpillDir {
     /// A file cannot be removed.
     pub fn remove(self) -> InputResult<Vec<String>> {
         let mut foreign = Vec::new();
-        let mut ours = vec![FORMAT_NEW.to_string(), FORMAT.to_string(), LOCK.to_string()];
+        let mut ours = [FORMAT_NEW, FORMAT, LOCK, drive_rate::FILE_NAME].map(str::to_string).to_vec();
         for name in names(&self.folder)? {
             if segment_from_file_name(&name).is_some() && self.is_our_segment(&self.folder.join(&name)) {
                 ours.insert(0, name);
@@ -325,18 +328,18 @@ fn take_lock(folder: &Path) -> InputResult<File> {
             Err(TryLockError::Error(error)) => return Err(failed(error)),
         }
         if is_still_there(&path, &file) {
-            let content = format!("{LOCK_MAGIC}process {}\nhost {}\n", std::process::id(), host_name());
-            file.set_len(0).and_then(|()| rewrite(&file, content.as_bytes())).map_err(failed)?;
             return Ok(file);
         }
     }
     Err(InputError::new(path, "it is removed again and again", "see which other process uses the folder"))
 }
 
-fn rewrite(mut file: &File, content: &[u8]) -> io::Result<()> {
+/// Says in the lock's file who holds it, for the message to others.
+fn sign_lock(folder: &Path, mut lock: &File) -> InputResult<()> {
     use std::io::Seek;
-    file.rewind()?;
-    file.write_all(content)
+    let content = format!("{LOCK_MAGIC}process {}\nhost {}\n", std::process::id(), host_name());
+    let write = lock.rewind().and_then(|()| lock.set_len(0)).and_then(|()| lock.write_all(content.as_bytes()));
+    write.map_err(|e| InputError::io(folder.join(LOCK), "locking the spill directory", &e))
 }
 
 #[cfg(unix)]
@@ -407,6 +410,7 @@ fn write_format(folder: &Path, format: &SpillFormat) -> InputResult<()> {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -114,6 +114,7 @@ fn field<const N: usize>(bytes: &[u8; FORMAT_BYTES], at: usize) -> [u8; N] {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

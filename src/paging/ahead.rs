@@ -3,7 +3,8 @@
 //! The coming steps are played through with the pages in memory, as a cache that knows the future would: for every page
 //! that is missing at step s, the page leaves that is needed last of all that are there at s. What of that can be done
 //! already is done: the leaving page is free of use until s, so nothing is read that the cache would not have read at s.
-//! A page that leaves but is pinned now, or needed in between, is waited for, unless the next step needs the frame.
+//! All that leave in the time that is played through are alike: where the page that leaves first is pinned still,
+//! another one of them makes room.
 //!
 //! Invariants: 1. never blocks; 2. never takes the frame of a page that the current step or a step up to the one that
 //! the frame is for needs; 3. reads and writes in flight are bounded in bytes; 4. nothing here changes what a step gets.
@@ -12,11 +13,14 @@ use super::pager::Pager;
 use super::transfers::{Failure, READS, WRITES};
 use crate::base::ids::PageNo;
 use crate::cache::evict::EvictPolicy;
-use crate::cache::frame::FrameState;
-use std::collections::{BTreeSet, HashMap};
+use crate::cache::host_cache::Victim;
+use std::collections::{BTreeSet, HashMap, VecDeque};
 
 /// Steps that are played through at most.
 const STEPS_AHEAD: u32 = 16;
+/// A page that is not needed for so many steps may leave early for a page that the next step would wait for: at most one
+/// read more in so many steps.
+const FAR_STEPS: u32 = 4 * STEPS_AHEAD;
 
 /// A page that a coming step will need.
 struct Admit {
@@ -52,12 +56,50 @@ impl Pager {
         // The next step by what is known now; a page that this step moves into its view is a late miss at most.
         self.window.refresh(step + 1, &self.index);
         self.apply_changed_uses();
-        for admit in self.play(step) {
-            if !self.may_read_ahead() && !self.may_write_ahead() {
+        let admits = self.play(step);
+        let mut clean = self.leaving(&admits);
+        for admit in admits {
+            if !self.may_read_ahead() {
                 break;
             }
-            self.prepare(&admit, admit.step == step + 1);
+            if self.cache.state(admit.page).is_none() {
+                self.bring(&admit, &mut clean, admit.step == step + 1);
+            }
         }
+    }
+
+    /// The pages that leave and can do so already: clean ones are returned, the first to leave first, dirty ones begin to
+    /// be written. As all of them leave unused, whichever is taken for whichever page costs nothing.
+    fn leaving(&mut self, admits: &[Admit]) -> VecDeque<Victim> {
+        let mut clean = VecDeque::new();
+        for Admit { leaves, step, .. } in admits {
+            let now = leaves.and_then(|page| self.cache.as_victim(page)).filter(|v| v.next_use > *step);
+            match now {
+                Some(victim) if !victim.dirty => clean.push_back(victim),
+                Some(victim) if self.may_write_ahead() => {
+                    if let Err(Failure { error, .. }) = self.begin_write(victim.page, true) {
+                        // The next step gets the error.
+                        let _ = self.stop_writes(error, false);
+                    }
+                }
+                _ => {}
+            }
+        }
+        clean
+    }
+
+    /// Begins to read a coming page, into a free frame or that of a page that leaves.
+    fn bring(&mut self, admit: &Admit, clean: &mut VecDeque<Victim>, is_next: bool) {
+        if !self.cache.has_free() {
+            let leaves = std::iter::from_fn(|| clean.pop_front()).find(|v| v.next_use > admit.step);
+            // For the next step any page that is not needed for long will do. It may have to be read once more than the
+            // cache that knows the future would, but waiting costs more.
+            let far = admit.step.saturating_add(FAR_STEPS);
+            let other = || self.cache.clean_victim().filter(|v| is_next && v.next_use > far);
+            let Some(victim) = leaves.or_else(other) else { return };
+            self.evict(victim.page);
+        }
+        self.begin_read(admit.page, true);
     }
 
     /// The pages that the steps after `step` will have to read, in order, as far as the transfers in flight may go.
@@ -82,33 +124,6 @@ impl Pager {
         admits
     }
 
-    /// Does what can be done now for a coming page.
-    fn prepare(&mut self, admit: &Admit, is_next: bool) {
-        if self.cache.state(admit.page).is_some() {
-            return;
-        }
-        if let Some(page) = admit.leaves {
-            let planned = self.cache.as_victim(page).filter(|v| v.next_use > admit.step);
-            let other = || self.cache.victim().filter(|v| is_next && v.next_use > admit.step);
-            let Some(victim) = planned.or_else(other) else { return };
-            if victim.dirty {
-                if self.may_write_ahead()
-                    && let Err(Failure { error, .. }) = self.begin_write(victim.page, true)
-                {
-                    let _ = self.stop_writes(error, false);
-                }
-                return;
-            }
-            if !self.may_read_ahead() {
-                return;
-            }
-            self.evict(victim.page);
-        }
-        if self.may_read_ahead() {
-            self.begin_read(admit.page, true);
-        }
-    }
-
     fn may_read_ahead(&self) -> bool {
         self.ahead[READS] + self.cache.frame_bytes() <= self.config.prefetch_bytes
     }
@@ -125,7 +140,6 @@ impl Play {
         for held in pager.cache.held() {
             play.insert(held.page, held.next_use, u32::MAX - held.last_use);
         }
-        debug_assert!(pager.cache.count(FrameState::Lent) == 0 || play.free < usize::MAX);
         play
     }
 

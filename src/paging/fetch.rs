@@ -33,7 +33,7 @@ impl Pager {
         pages: &[PageNo],
         is_step: bool,
     ) -> Result<Vec<PinnedPage>, PagingError> {
-        let held = self.cache.count(FrameState::Pinned) + self.cache.count(FrameState::Lent);
+        let held = self.held_by_callers();
         if held + pages.len() > self.cache.frames_max() {
             return Err(self.working_set(what, held + pages.len()));
         }
@@ -72,8 +72,7 @@ impl Pager {
                 return Ok(());
             }
             if self.in_flight() == 0 {
-                let held = self.cache.count(FrameState::Pinned) + self.cache.count(FrameState::Lent);
-                return Err(self.working_set(&fetch.what, held + fetch.outstanding.len()));
+                return Err(self.working_set(&fetch.what, self.held_by_callers() + fetch.outstanding.len()));
             }
             let mut ended = Vec::new();
             let failures = self.settle(true, &mut ended);
@@ -131,9 +130,8 @@ impl Pager {
                         self.stop_writes(error, is_step)?;
                     }
                 }
-                _ if self.writes_stopped && !self.has_spare_frame && self.in_flight() == 0 => {
+                _ if !is_step && self.writes_stopped && self.in_flight() == 0 && self.held_by_callers() == 0 => {
                     // Everything in memory is dirty and cannot leave: one frame more lets the scene be written out.
-                    self.has_spare_frame = true;
                     self.cache.add_frame();
                     return Ok(true);
                 }
@@ -190,7 +188,11 @@ impl Pager {
         Ok(())
     }
 
-    pub(super) fn working_set(&self, what: &str, pages: usize) -> PagingError {
+    fn held_by_callers(&self) -> usize {
+        self.cache.count(FrameState::Pinned) + self.cache.count(FrameState::Lent)
+    }
+
+    fn working_set(&self, what: &str, pages: usize) -> PagingError {
         let (frames, frame_bytes) = (self.cache.frames_max(), self.cache.frame_bytes());
         PagingError::WorkingSet { what: what.to_string(), pages, frames, frame_bytes }
     }

@@ -71,9 +71,6 @@ pub struct Pager {
     pub(super) failed_write: Option<PagingError>,
     /// After a failed write nothing is written until a step asks for pages again.
     pub(super) writes_stopped: bool,
-    /// Whether the one frame beyond the budget was added that a run needs to write out its scene when the drive takes
-    /// no more pages.
-    pub(super) has_spare_frame: bool,
     /// Reads and writes that were started ahead of their need and are still in flight, bytes.
     pub(super) ahead: [usize; 2],
 }
@@ -96,7 +93,6 @@ impl Pager {
             stats: PagerStats::default(),
             failed_write: None,
             writes_stopped: false,
-            has_spare_frame: false,
             ahead: [0; 2],
         }
     }
@@ -232,6 +228,11 @@ impl Pager {
             frames_max: self.cache.frames_max(),
             ..self.stats
         }
+    }
+
+    /// Whether a page has a frame.
+    pub fn is_in_memory(&self, page: PageNo) -> bool {
+        self.cache.state(page).is_some()
     }
 
     /// Where the versions of the pages on the drive are, by page: for the index of a commit, once nothing is dirty.
