@@ -46,6 +46,12 @@ pub struct GpuOptions {
     pub budget: Option<u64>,
     /// Measures the time of every stage where the adapter can.
     pub profile: bool,
+    /// Whether shaders read their uniforms as uniform blocks or as storage; none: as storage on software adapters.
+    ///
+    /// Mesa's lavapipe folds the values of a uniform block that decide branches into the shader, once for every set of
+    /// values, and keeps each such copy for as long as the pipeline lives: a view whose counts are new costs it time
+    /// and some 100 KB of host memory that never come back.
+    pub uniform_blocks: Option<bool>,
 }
 
 /// Kind of an adapter, best first.
@@ -147,6 +153,7 @@ pub struct Gpu {
     limits: wgpu::Limits,
     max_binding_bytes: u64,
     subgroups: bool,
+    uniform_blocks: bool,
 }
 
 impl fmt::Debug for Gpu {
@@ -186,17 +193,19 @@ impl Gpu {
         let own_max = limits.max_storage_buffer_binding_size.min(BINDING_MAX);
         let profiler = Profiler::new(&device, &queue, options.profile && summary.timestamps);
         faults.check()?;
+        let alignment = limits.min_uniform_buffer_offset_alignment.max(limits.min_storage_buffer_offset_alignment);
         Ok(Gpu {
             pool: Pool::new(options.budget.unwrap_or(u64::MAX), limits.max_buffer_size),
             pipelines: Mutex::default(),
             belt: Mutex::default(),
             staging: Arc::default(),
-            uniforms: Mutex::new(UniformRing::new(u64::from(limits.min_uniform_buffer_offset_alignment))),
+            uniforms: Mutex::new(UniformRing::new(u64::from(alignment))),
             profiler: Mutex::new(profiler),
             uploaded: AtomicU64::new(0),
             recorders: AtomicU32::new(0),
             max_binding_bytes: options.max_binding_bytes.map_or(own_max, |lowered| lowered.min(own_max)),
             subgroups,
+            uniform_blocks: options.uniform_blocks.unwrap_or(summary.kind != DeviceKind::Software),
             device,
             queue,
             faults,
@@ -213,6 +222,11 @@ impl Gpu {
     /// Whether shaders are compiled with subgroup operations (the define `SUBGROUPS`).
     pub fn subgroups(&self) -> bool {
         self.subgroups
+    }
+
+    /// Whether shaders read their uniforms as uniform blocks; else as storage.
+    pub(super) fn uniform_blocks(&self) -> bool {
+        self.uniform_blocks
     }
 
     /// Largest binding, bytes: longer columns are bound in windows.

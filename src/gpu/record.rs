@@ -46,7 +46,7 @@ impl UniformRing {
             self.chunks.push(device.create_buffer(&wgpu::BufferDescriptor {
                 label: Some("uniforms"),
                 size: UNIFORM_CHUNK,
-                usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+                usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST,
                 mapped_at_creation: false,
             }));
         }

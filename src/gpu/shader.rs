@@ -111,7 +111,11 @@ impl Gpu {
     }
 
     fn compile(&self, source: &Source, entry: &str, defines: Defines<'_>) -> GpuResult<Pipeline> {
-        let text = preprocess(source, defines)?;
+        let mut text = preprocess(source, defines)?;
+        if !self.uniform_blocks() {
+            // A struct that may stand in a uniform block has the same layout in storage.
+            text = text.replace("var<uniform>", "var<storage, read>");
+        }
         let reflection = reflect(source.name, &text, entry, self.subgroups())?;
         self.check_workgroup(source.name, &reflection)?;
         self.faults.doing(source.name);

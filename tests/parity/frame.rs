@@ -193,6 +193,16 @@ fn columns_in_windows_give_the_same_bits() {
     assert!(bits(&want) == bits(&results(&mut cut, &view, &options, &target)));
 }
 
+#[test]
+fn uniforms_in_blocks_and_in_storage_give_the_same_bits() {
+    let form = |blocks| renderer(&GpuOptions { uniform_blocks: Some(blocks), ..GpuOptions::default() });
+    let (Some(mut blocks), Some(mut storage)) = (form(true), form(false)) else { return };
+    let (view, target) = (scene(900, 65, 47), photo(65, 47, true));
+    let options = RenderOptions { background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
+    let want = results(&mut blocks, &view, &options, &target);
+    assert!(bits(&want) == bits(&results(&mut storage, &view, &options, &target)));
+}
+
 /// Small Gaussians, hardly any of which touches two tiles.
 fn few_isects(rows: usize) -> (Columns, Camera) {
     let (mut columns, camera) = scene(rows, 64, 48);
