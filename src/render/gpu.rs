@@ -98,6 +98,11 @@ impl GpuRenderer {
         self.frames_again
     }
 
+    /// Intersections of the last view; 0 before there is one.
+    pub fn isects(&self) -> u32 {
+        self.view.as_ref().map_or(0, |view| view.demand.isects)
+    }
+
     /// Coverage 1 - T of the last picture, `[height][width]`.
     ///
     /// # Errors
