@@ -9,6 +9,7 @@
 use super::gpu_loss::{LossStage, value};
 use super::gpu_rows::{DeviceColumns, RowStages, band_into_sh_n};
 use super::gpu_tiles::{Blend, Demand, Frame, Ranks, TileStages, splat_bytes};
+use super::gpu_tiles_bwd::PictureGradients;
 use super::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
 use crate::gpu::{Buffer, DeviceKind, Gpu, GpuResult, Readback, Recorder, Traffic};
 use crate::kernels::image_loss::LossPlan;
@@ -174,8 +175,7 @@ impl GpuRenderer {
             &view.ranks,
             &view.frame,
             view.demand,
-            &v_rgb.view(),
-            v_alpha.as_ref(),
+            PictureGradients { v_rgb: &v_rgb.view(), v_alpha: v_alpha.as_ref() },
             &v_splats.view(),
         )?;
         let grads = DeviceColumns::new(gpu, view.ranks.rows, sh_degree)?;
