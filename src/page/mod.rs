@@ -2,10 +2,22 @@
 //! that make them last. Nothing here knows what a page holds.
 
 pub mod buffer;
+pub mod codec;
+pub mod commit;
 pub mod encoding;
+pub mod folder;
+pub mod format;
+pub mod generations;
 pub mod manifest;
 pub mod map_file;
+pub mod memory_store;
 #[doc(hidden)]
 pub mod mutants;
+pub mod opening;
+pub mod page_error;
+pub mod paged_store;
+pub mod segment_files;
+pub mod slots;
 pub mod store;
+pub mod verify;
 pub mod witness;

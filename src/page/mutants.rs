@@ -30,10 +30,10 @@ pub enum Mutant {
     RemovalNotRecorded,
     /// Payload checksums of pages are not verified.
     PayloadNotVerified,
-    /// The page id in a slot's header is not verified.
-    HeaderIdNotVerified,
-    /// The generation in a slot's header is not verified.
-    HeaderGenerationNotVerified,
+    /// A slot with any good header and checksum is taken for the page that the map says is there.
+    SlotIdentityNotVerified,
+    /// A slot of the right page and place is taken for the right version.
+    SlotGenerationNotVerified,
     /// A transfer of fewer bytes than asked for counts as done.
     ShortAccepted,
     /// A failed write does not poison the store.
@@ -62,10 +62,6 @@ pub enum Mutant {
     WitnessInOneSlot,
     /// The transaction of the map is not durable when it returns.
     MapNotDurable,
-    /// A rollback frees the slots of the generations it drops before its acknowledgement.
-    RollbackFreesEarly,
-    /// A commit forgets the pages written since the last one by eviction.
-    SpillsForgotten,
     /// Generation numbers start again after a rollback.
     GenerationsReused,
 }
