@@ -140,10 +140,10 @@ impl Commits {
         witness.map_err(|source| CommitError::File { name: WITNESS_NAME, source })?;
         let file = folder.create(MAP_NEW_NAME).map_err(|source| CommitError::File { name: MAP_NAME, source })?;
         drop(Manifest::create(file, config.store, config.cache_bytes)?);
-        let named = folder.rename(MAP_NEW_NAME, MAP_NAME).and_then(|()| folder.sync());
-        if !active(Mutant::FolderNotSyncedForMap) {
-            named.map_err(|source| CommitError::File { name: MAP_NAME, source })?;
-        }
+        // Entries may become durable in any order: first all files, then the name that makes them a store.
+        let named = sync_entries(folder.as_ref()).and_then(|()| folder.rename(MAP_NEW_NAME, MAP_NAME));
+        let named = named.and_then(|()| sync_entries(folder.as_ref()));
+        named.map_err(|source| CommitError::File { name: MAP_NAME, source })?;
         Commits::open(folder, config)
     }
 
@@ -160,7 +160,7 @@ impl Commits {
         let witness = witness.ok_or_else(|| witness_error(io::ErrorKind::NotFound.into()))?;
         let mut witness = Witness::open(witness, config.store).map_err(witness_error)?;
         // A process that was killed may have left entries that only memory knows; from here on they can be counted on.
-        folder.sync().map_err(|source| CommitError::File { name: "the folder", source })?;
+        sync_entries(folder.as_ref()).map_err(|source| CommitError::File { name: "the folder", source })?;
         let (manifest, content) = Manifest::open(file, config.store, witness.sequence(), config.cache_bytes)?;
         // A commit that was durable and not yet acknowledged is acknowledged now.
         if witness.sequence() < content.counters.sequence {
@@ -410,6 +410,10 @@ impl std::fmt::Debug for Commits {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "Commits({:?}, {:?}, poison: {:?})", self.manifest, self.witness, self.poison)
     }
+}
+
+fn sync_entries(folder: &dyn Folder) -> io::Result<()> {
+    if active(Mutant::FolderNotSyncedForMap) { Ok(()) } else { folder.sync() }
 }
 
 /// What the map keeps about a version of a page: the slot, then the label.

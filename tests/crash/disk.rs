@@ -13,6 +13,8 @@ use std::io;
 use std::sync::{Arc, Mutex, MutexGuard};
 
 const BLOCK: usize = 4096;
+/// Length of the writes to the header of the map's file.
+const MAP_HEADER_BYTES: usize = 320;
 
 /// Numbers from a seed.
 #[derive(Debug, Clone)]
@@ -375,6 +377,8 @@ fn survive(image: &mut Image, change: &Unsynced, survival: Survival, index: usiz
             image.write(*offset, &bytes[..bytes.len().min(sectors * 512)]);
         }
         (Unsynced::Write(offset, bytes), Survival::Sectors(_, sector, flips)) => {
+            // The map's first sector stands alone: nothing could survive a drive that damages what it overwrites there.
+            let flips = flips && bytes.len() != MAP_HEADER_BYTES;
             // Most changes are whole or lost; some are torn in pieces.
             let torn = rng.one_in(3);
             let whole = rng.one_in(2);
