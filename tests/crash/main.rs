@@ -7,6 +7,8 @@ mod decay;
 mod disk;
 mod engine;
 mod life;
+#[cfg(debug_assertions)]
+mod mutants;
 mod oracle;
 mod random;
 
@@ -16,13 +18,18 @@ use std::time::Instant;
 /// Crashes of every push.
 const CRASHES: u64 = 50_000;
 
+/// Crashes within which every mutant must be noticed.
+#[cfg(debug_assertions)]
+const MUTANT_CRASHES: u64 = 20_000;
+
 /// Panics inside the map's library become errors of the store; their messages would only hide those of the tests.
 fn hush_library_panics() {
     static ONCE: std::sync::Once = std::sync::Once::new();
     ONCE.call_once(|| {
         let default = std::panic::take_hook();
         std::panic::set_hook(Box::new(move |info| {
-            if !info.location().is_some_and(|l| l.file().contains("redb")) {
+            let is_mutant = std::thread::current().name() == Some("mutant");
+            if !is_mutant && !info.location().is_some_and(|l| l.file().contains("redb")) {
                 default(info);
             }
         }));
@@ -45,4 +52,24 @@ fn no_acknowledged_commit_is_lost_and_no_wrong_byte_returned() {
         }
     }
     println!("{counts:?} in {:.1} s", start.elapsed().as_secs_f64());
+}
+
+#[test]
+#[cfg(debug_assertions)]
+fn every_mutant_is_noticed() {
+    hush_library_panics();
+    let hunters = std::thread::Builder::new().name("mutant".to_string()).spawn(|| {
+        let mut survivors = Vec::new();
+        for &mutant in mutants::MUTANTS {
+            match mutants::hunt(mutant, MUTANT_CRASHES) {
+                Some((crashes, what)) => {
+                    println!("{mutant:?}: {crashes} crashes: {}", what.lines().next().unwrap_or(""))
+                }
+                None => survivors.push(mutant),
+            }
+        }
+        survivors
+    });
+    let survivors = hunters.unwrap().join().unwrap();
+    assert!(survivors.is_empty(), "not noticed: {survivors:?}");
 }
