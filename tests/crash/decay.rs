@@ -3,17 +3,26 @@
 use crate::disk::{Disk, Rng};
 use crate::life::{CONFIG, paged_store};
 use crate::oracle::Oracle;
+use crate::tamper;
 use gsscale::page::commit::{Commits, MAP_NAME};
 
 /// Damages a copy of the disk and opens it. Returns whether the damage was noticed; an error is wrong data or a commit
 /// lost without a word.
-pub fn spoil_and_open(disk: &Disk, oracle: &Oracle, rng: &mut Rng) -> Result<bool, String> {
+///
+/// `past` is the disk at an earlier time.
+pub fn spoil_and_open(disk: &Disk, past: &Disk, oracle: &Oracle, rng: &mut Rng) -> Result<bool, String> {
     let disk = disk.fork();
     disk.forget_faults();
     let names: Vec<String> = disk.names().into_iter().filter(|name| disk.file_len(name) > 0).collect();
     let Some(name) = names.get(rng.below(names.len() as u64) as usize) else { return Ok(false) };
-    let what = match rng.below(4) {
+    let what = match rng.below(6) {
         0 if name.starts_with("seg-") => astray(&disk, name, rng),
+        3 if name.starts_with("seg-") && past.names().contains(name) => lost_write(&disk, past, name, rng),
+        3 | 4 if name == MAP_NAME && past.names().contains(name) => {
+            disk.replace(name, &past.contents(name));
+            "an old copy of the map".to_string()
+        }
+        5 if name == MAP_NAME => tamper::with(&disk, name, rng),
         1 => flip_used(&disk, name, rng),
         2 if name == MAP_NAME => {
             // The first sector is written with every commit and decides which tree counts.
@@ -46,6 +55,17 @@ fn astray(disk: &Disk, name: &str, rng: &mut Rng) -> String {
     let (from, to) = (rng.below(slots), rng.below(slots));
     disk.copy_within(name, from * 8192, to * 8192, 8192);
     format!("slot {from} of {name} written to {to}")
+}
+
+/// A slot holds what it held before: the drive had dropped a write without a word.
+fn lost_write(disk: &Disk, past: &Disk, name: &str, rng: &mut Rng) -> String {
+    let (mut bytes, old) = (disk.contents(name), past.contents(name));
+    let slot = rng.below(disk.file_len(name) / 8192) as usize * 8192;
+    if let (Some(now), Some(old)) = (bytes.get_mut(slot..slot + 8192), old.get(slot..slot + 8192)) {
+        now.copy_from_slice(old);
+    }
+    disk.replace(name, &bytes);
+    format!("a write to slot {slot} of {name} was lost")
 }
 
 /// Opens a damaged disk: an error with a name, or exactly what was acknowledged.

@@ -235,6 +235,14 @@ impl Disk {
         self.state().faults_given
     }
 
+    /// A drive that was full has space again.
+    pub fn end_shortage(&self) {
+        let mut state = self.state();
+        if state.fault.is_some_and(|plan| plan.fault == Fault::Full) {
+            state.fault = None;
+        }
+    }
+
     /// No injected error waits any more, and none counts as given.
     pub fn forget_faults(&self) {
         let mut state = self.state();
@@ -257,13 +265,18 @@ impl Disk {
         state.files.iter().map(|f| f.unsynced.len()).sum::<usize>() + state.unsynced_entries.len()
     }
 
-    /// Sectors of the last un-synced write, if the last change is one.
-    pub fn last_write_sectors(&self, index: usize) -> usize {
+    /// Of every file, the last un-synced change if it is a write: its index among all changes, and its sectors.
+    pub fn last_writes(&self) -> Vec<(usize, usize)> {
         let state = self.state();
-        match state.files.iter().flat_map(|f| &f.unsynced).nth(index) {
-            Some(Unsynced::Write(_, bytes)) => bytes.len().div_ceil(512),
-            _ => 0,
+        let mut index = 0;
+        let mut last = Vec::new();
+        for file in &state.files {
+            index += file.unsynced.len();
+            if let Some(Unsynced::Write(_, bytes)) = file.unsynced.last() {
+                last.push((index - 1, bytes.len().div_ceil(512)));
+            }
         }
+        last
     }
 
     /// The power fails and comes back.

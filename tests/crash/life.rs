@@ -3,7 +3,7 @@
 
 use crate::disk::{Disk, Rng};
 use crate::engine::SimStore;
-use crate::oracle::{Acknowledged, Oracle, Snapshot, fill, payload_bytes, read_and_compare, version_of};
+use crate::oracle::{Acknowledged, Oracle, Snapshot, fill, payload_bytes, read_and_compare, state_of, version_of};
 use gsscale::base::ids::PageId;
 use gsscale::page::codec::Codec;
 use gsscale::page::commit::{CommitConfig, CommitError, Commits, Cut, PageChange};
@@ -127,14 +127,17 @@ impl Life<'_> {
         children.into_iter().for_each(|child| self.edit(child));
     }
 
-    /// Writes a dirty page, as an eviction does.
+    /// Writes a dirty page, as an eviction does. Where there is no space it stays dirty.
     pub fn write(&mut self, page: PageId) -> Result<(), End> {
         let Some(held) = self.pages.get(&page).copied().filter(|held| held.slot.is_none()) else { return Ok(()) };
         let mut buffer = self.store.new_buffer();
         let bytes = payload_bytes(page, held.version);
         fill(page, held.version, &mut buffer.as_mut_slice()[HEADER_BYTES..][..bytes]);
         let label = held.version.to_le_bytes();
-        self.store.write(page.to_bits(), page, &label, bytes, buffer).map_err(|(error, _)| error)?;
+        match self.store.write(page.to_bits(), page, &label, bytes, buffer) {
+            Err((error, _)) if error.is_out_of_space() => return Ok(()),
+            other => other.map_err(|(error, _)| error)?,
+        }
         let mut done = Vec::new();
         while done.is_empty() && self.store.in_flight() > 0 {
             self.store.complete(true, &mut done);
@@ -144,7 +147,11 @@ impl Life<'_> {
 
     fn take_ends(&mut self, done: Vec<PageDone>) -> Result<(), End> {
         for end in done {
-            let PageMoved::Written(slot) = end.result? else { continue };
+            let slot = match end.result {
+                Ok(PageMoved::Written(slot)) => slot,
+                Err(error) if !error.is_out_of_space() => return Err(error.into()),
+                _ => continue,
+            };
             let Some(held) = self.pages.get_mut(&end.page) else { continue };
             held.slot = Some(slot);
             if let Some(before) = held.before.take() {
@@ -154,64 +161,72 @@ impl Life<'_> {
         Ok(())
     }
 
+    /// Commits; where there is no space, everything stays as it is.
     pub fn commit(&mut self, pin: Option<&str>) -> Result<(), End> {
         let dirty: Vec<PageId> = self.pages.iter().filter(|(_, h)| h.slot.is_none()).map(|(p, _)| *p).collect();
         for page in dirty {
             self.write(page)?;
         }
-        let changes: Vec<PageChange> = self
-            .changed
-            .iter()
-            .map(|page| {
-                let version = self.pages.get(page).and_then(|h| Some((h.slot?, h.version.to_le_bytes().to_vec())));
-                PageChange { page: *page, version }
-            })
-            .collect();
-        let mut after = Acknowledged { latest: self.store.generation(), ..self.oracle.acknowledged.clone() };
-        after.pins.extend(pin.map(|name| (name.to_string(), after.latest)));
-        let pages = self.pages.iter().map(|(page, held)| (*page, held.version)).collect();
-        let run_state = self.next_version.to_le_bytes().repeat(1 + after.latest as usize % 5);
-        self.oracle.begin(after, Some(Snapshot { pages, run_state: run_state.clone() }));
+        if self.pages.values().any(|held| held.slot.is_none()) {
+            return Ok(());
+        }
+        let change = |page: &PageId| {
+            let version = self.pages.get(page).and_then(|h| Some((h.slot?, h.version.to_le_bytes().to_vec())));
+            PageChange { page: *page, version }
+        };
+        let changes: Vec<PageChange> = self.changed.iter().map(change).collect();
+        let run_state = self.next_version.to_le_bytes().repeat(1 + self.changed.len());
         let cut = Cut { changes: &changes, run_state: &run_state, note: b"note", pin };
         let mut done = Vec::new();
-        let result = self.commits.commit(&mut self.store, &mut done, &cut);
+        self.begin(&cut)?;
+        let mut result = self.commits.commit(&mut self.store, &mut done, &cut);
         // An honest process stops after an error; a confused one may try again and must be refused.
-        let result = match result {
-            Err(error) if !error.is_out_of_space() => self.retry(&cut, &mut done).map_or(Err(error), Ok),
-            other => other,
-        };
+        if result.as_ref().is_err_and(|error| !error.is_out_of_space()) {
+            self.begin(&cut)?;
+            result = result.or_else(|error| self.commits.commit(&mut self.store, &mut done, &cut).map_err(|_| error));
+        }
         self.take_ends(done)?;
-        result?;
-        self.oracle.acknowledge();
+        match result {
+            Err(error) if error.is_out_of_space() => return Ok(()),
+            other => other?,
+        };
+        self.oracle.acknowledge(&state_of(&self.commits)).map_err(End::Violation)?;
         self.changed.clear();
         Ok(())
     }
 
-    /// A second attempt after an error: only a store that goes on where it must not returns a generation.
-    fn retry(&mut self, cut: &Cut<'_>, done: &mut Vec<PageDone>) -> Option<u64> {
+    fn begin(&mut self, cut: &Cut<'_>) -> Result<(), End> {
         let generation = self.store.generation();
-        let again = self.commits.commit(&mut self.store, done, cut).ok();
-        if again.is_some()
-            && let Some(after) = &mut self.oracle.in_flight
-        {
-            after.latest = generation;
-            if let Some((trying, _)) = &mut self.oracle.trying {
-                *trying = generation;
-            }
+        if generation <= self.oracle.highest {
+            return Err(End::Violation(format!("generation {generation} comes a second time")));
         }
-        again
+        let pages = self.pages.iter().map(|(page, held)| (*page, held.version)).collect();
+        let snapshot = Snapshot { pages, run_state: cut.run_state.to_vec() };
+        let change = |after: &mut Acknowledged| {
+            after.latest = generation;
+            after.pins.extend(cut.pin.map(|name| (name.to_string(), generation)));
+        };
+        self.oracle.begin(change, Some((generation, snapshot)));
+        Ok(())
     }
 
     pub fn pin(&mut self, put: &[(String, u64)], drop: &[String]) -> Result<(), End> {
-        let mut after = self.oracle.acknowledged.clone();
-        drop.iter().for_each(|name| {
-            after.pins.remove(name);
-        });
-        after.pins.extend(put.iter().cloned());
-        self.oracle.begin(after, None);
-        self.commits.pin(&mut self.store, put, drop)?;
-        self.oracle.acknowledge();
-        Ok(())
+        let change = |after: &mut Acknowledged| {
+            drop.iter().for_each(|name| {
+                after.pins.remove(name);
+            });
+            after.pins.extend(put.iter().cloned());
+        };
+        self.oracle.begin(change, None);
+        match self.commits.pin(&mut self.store, put, drop) {
+            Err(error) if error.is_out_of_space() => return Ok(()),
+            other => other?,
+        }
+        self.oracle.acknowledge(&state_of(&self.commits)).map_err(End::Violation)
+    }
+
+    pub fn ids(&self) -> Vec<PageId> {
+        self.pages.keys().copied().collect()
     }
 
     fn check_read(&mut self, disk: &Disk, page: PageId) -> Result<(), End> {
@@ -259,12 +274,12 @@ impl Life<'_> {
             }
             10..15 => {
                 let name = ["a", "b"][rng.below(2) as usize];
-                let is_free = !self.oracle.acknowledged.pins.contains_key(name);
+                let is_free = !self.commits.generations().pins().contains_key(name);
                 self.commit(Some(name).filter(|_| is_free && rng.one_in(4)))?;
             }
             _ => {
-                let pins = self.oracle.acknowledged.pins.clone();
-                let latest = self.oracle.acknowledged.latest;
+                let pins = self.commits.generations().pins().clone();
+                let latest = self.commits.generations().latest();
                 match pins.keys().next() {
                     Some(name) if rng.one_in(2) => self.pin(&[], std::slice::from_ref(name))?,
                     _ if latest > 0 => self.pin(&[("c".to_string(), latest)], &[])?,

@@ -11,6 +11,8 @@ mod life;
 mod mutants;
 mod oracle;
 mod random;
+mod script;
+mod tamper;
 
 use random::{Counts, run_seed};
 use std::time::Instant;
@@ -72,4 +74,22 @@ fn every_mutant_is_noticed() {
     });
     let survivors = hunters.unwrap().join().unwrap();
     assert!(survivors.is_empty(), "not noticed: {survivors:?}");
+}
+
+#[test]
+fn every_crash_point_of_a_small_run_opens_at_an_acknowledged_state() {
+    hush_library_panics();
+    let start = Instant::now();
+    let states = script::every_crash_point().unwrap_or_else(|what| panic!("{what}"));
+    println!("{states} states after crashes in {:.1} s", start.elapsed().as_secs_f64());
+    assert!(states > 5_000, "{states}");
+}
+
+#[test]
+fn every_call_of_a_small_run_may_fail() {
+    hush_library_panics();
+    let start = Instant::now();
+    let cases = script::every_call_fails().unwrap_or_else(|what| panic!("{what}"));
+    println!("{cases} failing calls in {:.1} s", start.elapsed().as_secs_f64());
+    assert!(cases > 2_000, "{cases}");
 }

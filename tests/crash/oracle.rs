@@ -2,7 +2,7 @@
 
 use gsscale::base::ids::PageId;
 use gsscale::base::rng::mix64;
-use gsscale::page::commit::CommitError;
+use gsscale::page::commit::{CommitError, Commits};
 use gsscale::page::format::{HEADER_BYTES, SlotRef};
 use gsscale::page::opening::{Opened, StoredPage};
 use gsscale::page::page_error::PageError;
@@ -28,14 +28,21 @@ pub struct Oracle {
     /// Whether the making of the store returned.
     pub is_created: bool,
     pub acknowledged: Acknowledged,
-    /// What the transaction under way would leave.
-    pub in_flight: Option<Acknowledged>,
-    /// All generations ever committed or tried; a number is tried with one content until it is acknowledged.
+    /// What the transactions under way would leave: several after one that found no space, since it may have been durable.
+    pub in_flight: Vec<Candidate>,
+    /// The kept generations.
     pub snapshots: BTreeMap<u64, Snapshot>,
-    /// Content of a generation whose commit is under way.
-    pub trying: Option<(u64, Snapshot)>,
-    /// Generations that a rollback dropped or that were let go.
+    /// Largest number that a generation ever had.
+    pub highest: u64,
     pub commits: u64,
+}
+
+/// A state that a transaction under way would leave.
+#[derive(Debug, Clone)]
+pub struct Candidate {
+    pub after: Acknowledged,
+    /// Generations that it and those before it bring.
+    pub snapshots: Vec<(u64, Snapshot)>,
 }
 
 /// Length and bytes of version `version` of `page`.
@@ -79,34 +86,46 @@ fn read(store: &mut PagedStore, page: PageId, slot: &SlotRef) -> Result<Vec<u8>,
 }
 
 impl Oracle {
-    /// A transaction begins.
-    pub fn begin(&mut self, after: Acknowledged, snapshot: Option<Snapshot>) {
-        self.trying = snapshot.map(|s| (after.latest, s));
-        self.in_flight = Some(after);
+    /// A transaction begins: `change` says what it makes of a state; `snapshot` is the generation that it brings.
+    pub fn begin(&mut self, change: impl Fn(&mut Acknowledged), snapshot: Option<(u64, Snapshot)>) {
+        let now = Candidate { after: self.acknowledged.clone(), snapshots: Vec::new() };
+        let bases = std::iter::once(now).chain(self.in_flight.iter().cloned());
+        let begun: Vec<Candidate> = bases
+            .map(|mut candidate| {
+                change(&mut candidate.after);
+                candidate.snapshots.extend(snapshot.clone());
+                candidate
+            })
+            .collect();
+        self.in_flight.extend(begun);
     }
 
-    /// It was acknowledged.
-    pub fn acknowledge(&mut self) {
-        if let Some(after) = self.in_flight.take() {
-            self.acknowledged = after;
-            self.commits += 1;
-        }
-        self.snapshots.extend(self.trying.take());
+    /// It was acknowledged, and the store says that it is at `found`.
+    pub fn acknowledge(&mut self, found: &Acknowledged) -> Result<(), String> {
+        let Some(at) = self.in_flight.iter().rposition(|c| c.after == *found) else {
+            return Err(format!("acknowledged {found:?}, under way was {:?}", self.in_flight));
+        };
+        let candidate = self.in_flight.swap_remove(at);
+        self.in_flight.clear();
+        self.acknowledged = candidate.after;
+        self.snapshots.extend(candidate.snapshots);
         let latest = self.acknowledged.latest;
         self.snapshots.retain(|g, _| *g <= latest);
+        self.highest = self.highest.max(latest);
+        self.commits += 1;
+        Ok(())
     }
 
     /// The state of a store that was just opened is one of those that may be; takes it over.
     pub fn judge(&mut self, opened: &Opened) -> Result<(), String> {
         let generations = opened.commits.generations();
-        let found = Acknowledged { latest: generations.latest(), pins: generations.pins().clone() };
-        if self.in_flight.as_ref() == Some(&found) {
-            self.acknowledge();
-        } else if found != self.acknowledged {
+        let found = state_of(&opened.commits);
+        if found == self.acknowledged {
+            self.in_flight.clear();
+        } else if self.acknowledge(&found).is_err() {
             let (expected, other) = (&self.acknowledged, &self.in_flight);
             return Err(format!("opened at {found:?}, acknowledged was {expected:?}, under way {other:?}"));
         }
-        (self.in_flight, self.trying) = (None, None);
         let kept: Vec<u64> = generations.kept().collect();
         if let Some((name, generation)) = found.pins.iter().find(|(_, g)| !kept.contains(g)) {
             return Err(format!("pin {name} names generation {generation}, which is not kept: {kept:?}"));
@@ -152,4 +171,9 @@ impl Oracle {
 /// The version that a page's label names.
 pub fn version_of(page: &StoredPage) -> u64 {
     page.label.first_chunk().map_or(u64::MAX, |bytes| u64::from_le_bytes(*bytes))
+}
+
+/// Where a store says that it is.
+pub fn state_of(commits: &Commits) -> Acknowledged {
+    Acknowledged { latest: commits.generations().latest(), pins: commits.generations().pins().clone() }
 }

@@ -26,6 +26,7 @@ pub fn run_seed(seed: u64, counts: &mut Counts) -> Result<(), String> {
     let mut rng = Rng(seed);
     let disk = Disk::new(rng.next());
     let mut oracle = Oracle::default();
+    let mut past = disk.fork();
     counts.seeds += 1;
     for life in 0..LIVES {
         prepare(&disk, &mut rng, life);
@@ -44,9 +45,12 @@ pub fn run_seed(seed: u64, counts: &mut Counts) -> Result<(), String> {
             counts.crashes += 1;
         }
         if rng.one_in(4) {
-            let noticed = decay::spoil_and_open(&disk, &oracle, &mut rng);
+            let noticed = decay::spoil_and_open(&disk, &past, &oracle, &mut rng);
             counts.decays += 1;
             counts.decays_noticed += u64::from(noticed.map_err(|what| format!("seed {seed} life {life}: {what}"))?);
+        }
+        if rng.one_in(3) {
+            past = disk.fork();
         }
         if rng.one_in(8) {
             roll_back(&disk, &mut oracle, &mut rng, counts)
@@ -69,7 +73,7 @@ fn survival(rng: &mut Rng) -> Survival {
         1 => Survival::Everything,
         2 => Survival::First(rng.below(30) as usize),
         3 => Survival::Mask(rng.next()),
-        n => Survival::Sectors(rng.next(), [64, 512, 512, 4096][n as usize - 4], n == 5),
+        n => Survival::Sectors(rng.next(), [16, 512, 512, 4096][n as usize - 4], n == 5),
     }
 }
 
@@ -79,15 +83,15 @@ fn prepare(disk: &Disk, rng: &mut Rng, life: u64) {
         let span = if life == 0 { 80 } else { 150 };
         disk.crash_at(disk.clock() + 1 + rng.below(span));
     }
-    match rng.below(10) {
+    match rng.below(9) {
         0 => disk.fail_sync(Some(rng.below(16))),
-        1 => {
+        1 | 2 => {
             let fault = [Fault::Io, Fault::Full, Fault::TooManyFiles, Fault::Short, Fault::Interrupted];
             let fault = fault[rng.below(5) as usize];
             let at_call = disk.calls() + 1 + rng.below(300);
             disk.set_fault(Some(FaultPlan { at_call, fault, for_ever: rng.one_in(2) }));
         }
-        2 | 3 => disk.short_write(Some(rng.below(20))),
+        3 | 4 => disk.short_write(Some(rng.below(20))),
         _ => {}
     }
 }
@@ -99,6 +103,10 @@ fn live(disk: &Disk, oracle: &mut Oracle, rng: &mut Rng) -> Result<(), End> {
     }
     for _ in 0..rng.below(STEPS) + 4 {
         life.step(disk, rng)?;
+        // Space comes back some time.
+        if rng.one_in(16) {
+            disk.end_shortage();
+        }
     }
     Ok(())
 }
@@ -114,12 +122,16 @@ fn roll_back(disk: &Disk, oracle: &mut Oracle, rng: &mut Rng, counts: &mut Count
     oracle.judge(&opened)?;
     let kept: Vec<u64> = opened.commits.generations().kept().collect();
     let Some(&to) = kept.get(rng.below(kept.len() as u64) as usize) else { return Ok(()) };
-    let mut after = Acknowledged { latest: to, ..oracle.acknowledged.clone() };
-    after.pins.retain(|_, generation| *generation <= to);
-    oracle.begin(after, oracle.snapshots.get(&to).cloned());
+    let change = |after: &mut Acknowledged| {
+        after.latest = to;
+        after.pins.retain(|_, generation| *generation <= to);
+    };
+    oracle.begin(change, None);
+    let mut after = oracle.acknowledged.clone();
+    change(&mut after);
     disk.crash_at(disk.clock() + 1 + rng.below(20));
     if opened.commits.rollback(to).is_ok() {
-        oracle.acknowledge();
+        oracle.acknowledge(&after)?;
     }
     disk.power_cycle(survival(rng));
     counts.crashes += 1;
