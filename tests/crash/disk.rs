@@ -151,11 +151,11 @@ impl Fault {
 /// When calls fail.
 #[derive(Debug, Clone, Copy)]
 pub struct FaultPlan {
-    /// Number of the call, reads included.
+    /// Number of the first call that fails, reads included.
     pub at_call: u64,
+    /// How many calls from there on fail. Of those, [`Fault::Full`] fails only such as need space.
+    pub calls: u64,
     pub fault: Fault,
-    /// All calls from there on.
-    pub for_ever: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -439,13 +439,14 @@ fn apply_entry(entries: &mut BTreeMap<String, usize>, entry: &Entry) {
 
 impl State {
     /// Counts a call; tells whether it fails.
-    fn call(&mut self) -> io::Result<()> {
+    fn call(&mut self, needs_space: bool) -> io::Result<()> {
         if self.crashed {
             return Err(io::Error::other("the power is off"));
         }
         self.calls += 1;
         if let Some(plan) = self.fault
-            && (self.calls == plan.at_call || (plan.for_ever && self.calls > plan.at_call))
+            && self.calls.checked_sub(plan.at_call).is_some_and(|since| since < plan.calls)
+            && (needs_space || plan.fault != Fault::Full)
         {
             self.faults_given += 1;
             return Err(plan.fault.error());
@@ -464,7 +465,7 @@ impl State {
     }
 
     fn write(&mut self, file: usize, offset: u64, data: &[u8]) -> io::Result<usize> {
-        let failed = self.call();
+        let failed = self.call(true);
         let mut count = data.len();
         if failed.is_err() && !self.crashed {
             // A failed write may have reached the file in part.
@@ -494,7 +495,7 @@ impl State {
     }
 
     fn sync(&mut self, file: usize) -> io::Result<()> {
-        self.call()?;
+        self.call(false)?;
         self.tick()?;
         if let Some(left) = self.failing_sync {
             self.failing_sync = left.checked_sub(1);
@@ -521,7 +522,7 @@ impl State {
     }
 
     fn sync_folder(&mut self) -> io::Result<()> {
-        self.call()?;
+        self.call(false)?;
         self.tick()?;
         self.unsynced_entries.clear();
         self.durable_entries = self.entries.clone();
@@ -529,7 +530,7 @@ impl State {
     }
 
     fn change_entry(&mut self, entry: Entry) -> io::Result<()> {
-        self.call()?;
+        self.call(matches!(entry, Entry::Create(..)))?;
         apply_entry(&mut self.entries, &entry);
         self.unsynced_entries.push(entry);
         self.tick()
@@ -553,13 +554,13 @@ impl DiskFile {
 impl StorageBackend for DiskFile {
     fn len(&self) -> io::Result<u64> {
         let mut state = self.disk.state();
-        state.call()?;
+        state.call(false)?;
         Ok(state.files[self.file].now.len)
     }
 
     fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
         let mut state = self.disk.state();
-        state.call()?;
+        state.call(false)?;
         let image = &state.files[self.file].now;
         if offset + out.len() as u64 > image.len {
             return Err(io::ErrorKind::UnexpectedEof.into());
@@ -570,7 +571,7 @@ impl StorageBackend for DiskFile {
 
     fn set_len(&self, len: u64) -> io::Result<()> {
         let mut state = self.disk.state();
-        state.call()?;
+        state.call(true)?;
         let file = &mut state.files[self.file];
         file.now.set_len(len);
         file.unsynced.push(Unsynced::Length(len));
@@ -593,7 +594,7 @@ impl StorageBackend for DiskFile {
 impl Folder for Disk {
     fn open(&self, name: &str) -> io::Result<Option<Arc<dyn StorageBackend>>> {
         let mut state = self.state();
-        state.call()?;
+        state.call(false)?;
         let file = state.entries.get(name).copied();
         Ok(file.map(|file| Arc::new(DiskFile { disk: self.clone(), file }) as Arc<dyn StorageBackend>))
     }
@@ -611,7 +612,7 @@ impl Folder for Disk {
     fn remove(&self, name: &str) -> io::Result<()> {
         let mut state = self.state();
         if !state.entries.contains_key(name) {
-            return state.call();
+            return state.call(false);
         }
         state.change_entry(Entry::Remove(name.to_string()))
     }
@@ -633,7 +634,7 @@ impl Disk {
 
     pub fn open_file(&self, name: &str) -> io::Result<Option<DiskFile>> {
         let mut state = self.state();
-        state.call()?;
+        state.call(false)?;
         Ok(state.entries.get(name).map(|&file| DiskFile { disk: self.clone(), file }))
     }
 }

@@ -3,7 +3,7 @@
 
 use crate::disk::{Disk, Rng};
 use crate::engine::SimStore;
-use crate::oracle::{Acknowledged, Oracle, Snapshot, fill, payload_bytes, read_and_compare, state_of, version_of};
+use crate::oracle::{Acknowledged, Oracle, Snapshot, fill, payload_bytes, read_and_compare, version_of};
 use gsscale::base::ids::PageId;
 use gsscale::page::codec::Codec;
 use gsscale::page::commit::{CommitConfig, CommitError, Commits, Cut, PageChange};
@@ -190,7 +190,7 @@ impl Life<'_> {
             Err(error) if error.is_out_of_space() => return Ok(()),
             other => other?,
         };
-        self.oracle.acknowledge(&state_of(&self.commits)).map_err(End::Violation)?;
+        self.oracle.acknowledge_by(&self.commits).map_err(End::Violation)?;
         self.changed.clear();
         Ok(())
     }
@@ -222,7 +222,7 @@ impl Life<'_> {
             Err(error) if error.is_out_of_space() => return Ok(()),
             other => other?,
         }
-        self.oracle.acknowledge(&state_of(&self.commits)).map_err(End::Violation)
+        self.oracle.acknowledge_by(&self.commits).map_err(End::Violation)
     }
 
     pub fn ids(&self) -> Vec<PageId> {

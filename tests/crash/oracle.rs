@@ -100,16 +100,17 @@ impl Oracle {
         self.in_flight.extend(begun);
     }
 
-    /// It was acknowledged, and the store says that it is at `found`.
-    pub fn acknowledge(&mut self, found: &Acknowledged) -> Result<(), String> {
-        let Some(at) = self.in_flight.iter().rposition(|c| c.after == *found) else {
-            return Err(format!("acknowledged {found:?}, under way was {:?}", self.in_flight));
-        };
-        let candidate = self.in_flight.swap_remove(at);
-        self.in_flight.clear();
-        self.acknowledged = candidate.after;
-        self.snapshots.extend(candidate.snapshots);
-        let latest = self.acknowledged.latest;
+    /// It was acknowledged, and the store says that it is at `found` and keeps `kept`.
+    pub fn acknowledge(&mut self, found: &Acknowledged, kept: &[u64]) -> Result<(), String> {
+        let candidates = std::mem::take(&mut self.in_flight);
+        if candidates.iter().all(|c| c.after != *found) {
+            return Err(format!("acknowledged {found:?}, under way was {candidates:?}"));
+        }
+        // Which of the transactions before it had been durable, the kept generations tell.
+        let brought = candidates.into_iter().filter(|c| c.after == *found).flat_map(|c| c.snapshots);
+        self.snapshots.extend(brought.filter(|(generation, _)| kept.contains(generation)));
+        self.acknowledged = found.clone();
+        let latest = found.latest;
         self.snapshots.retain(|g, _| *g <= latest);
         self.highest = self.highest.max(latest);
         self.commits += 1;
@@ -120,13 +121,14 @@ impl Oracle {
     pub fn judge(&mut self, opened: &Opened) -> Result<(), String> {
         let generations = opened.commits.generations();
         let found = state_of(&opened.commits);
+        let kept: Vec<u64> = generations.kept().collect();
         if found == self.acknowledged {
             self.in_flight.clear();
-        } else if self.acknowledge(&found).is_err() {
-            let (expected, other) = (&self.acknowledged, &self.in_flight);
-            return Err(format!("opened at {found:?}, acknowledged was {expected:?}, under way {other:?}"));
+        } else {
+            let expected = self.acknowledged.clone();
+            self.acknowledge(&found, &kept)
+                .map_err(|other| format!("opened wrongly; {expected:?} expected, {other}"))?;
         }
-        let kept: Vec<u64> = generations.kept().collect();
         if let Some((name, generation)) = found.pins.iter().find(|(_, g)| !kept.contains(g)) {
             return Err(format!("pin {name} names generation {generation}, which is not kept: {kept:?}"));
         }
@@ -174,6 +176,14 @@ pub fn version_of(page: &StoredPage) -> u64 {
 }
 
 /// Where a store says that it is.
-pub fn state_of(commits: &Commits) -> Acknowledged {
+fn state_of(commits: &Commits) -> Acknowledged {
     Acknowledged { latest: commits.generations().latest(), pins: commits.generations().pins().clone() }
+}
+
+impl Oracle {
+    /// [`Oracle::acknowledge`] by what the store says.
+    pub fn acknowledge_by(&mut self, commits: &Commits) -> Result<(), String> {
+        let kept: Vec<u64> = commits.generations().kept().collect();
+        self.acknowledge(&state_of(commits), &kept)
+    }
 }

@@ -86,10 +86,10 @@ fn prepare(disk: &Disk, rng: &mut Rng, life: u64) {
     match rng.below(9) {
         0 => disk.fail_sync(Some(rng.below(16))),
         1 | 2 => {
-            let fault = [Fault::Io, Fault::Full, Fault::TooManyFiles, Fault::Short, Fault::Interrupted];
-            let fault = fault[rng.below(5) as usize];
+            let fault = [Fault::Full, Fault::Io, Fault::TooManyFiles, Fault::Short, Fault::Interrupted, Fault::Full];
+            let fault = fault[rng.below(6) as usize];
             let at_call = disk.calls() + 1 + rng.below(300);
-            disk.set_fault(Some(FaultPlan { at_call, fault, for_ever: rng.one_in(2) }));
+            disk.set_fault(Some(FaultPlan { at_call, fault, calls: [1, 8, 40, u64::MAX][rng.below(4) as usize] }));
         }
         3 | 4 => disk.short_write(Some(rng.below(20))),
         _ => {}
@@ -131,7 +131,7 @@ fn roll_back(disk: &Disk, oracle: &mut Oracle, rng: &mut Rng, counts: &mut Count
     change(&mut after);
     disk.crash_at(disk.clock() + 1 + rng.below(20));
     if opened.commits.rollback(to).is_ok() {
-        oracle.acknowledge(&after)?;
+        oracle.acknowledge(&after, &[])?;
     }
     disk.power_cycle(survival(rng));
     counts.crashes += 1;

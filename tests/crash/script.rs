@@ -103,11 +103,11 @@ pub fn every_call_fails() -> Result<u64, String> {
     let mut cases = 0;
     for at_call in 1..=whole.calls() {
         for fault in [Fault::Io, Fault::Full, Fault::TooManyFiles, Fault::Short, Fault::Interrupted] {
-            for for_ever in [false, true] {
-                let place = format!("call {at_call}, {fault:?}, for ever: {for_ever}");
+            for calls in [1, u64::MAX] {
+                let place = format!("call {at_call}, {fault:?}, {calls} calls");
                 let disk = Disk::new(1);
                 let mut oracle = Oracle::default();
-                disk.set_fault(Some(FaultPlan { at_call, fault, for_ever }));
+                disk.set_fault(Some(FaultPlan { at_call, calls, fault }));
                 checked(&disk, &mut oracle).map_err(|what| format!("{place}: {what}"))?;
                 let killed = disk.fork();
                 killed.process_killed();
