@@ -26,6 +26,7 @@
 //! | [`densify`] | statistics, decisions and edits that change the number of Gaussians |
 //! | [`exchange`] | PLY in and out |
 //! | [`config`] | what the user wrote and what follows from it |
+//! | [`report`] | pages for people: charts and pictures of what a run left behind |
 //! | [`train`] | the only place where all of it meets: one step, the loop, evaluation |
 //!
 //! One word, one thing: a *row* is one Gaussian inside a working set, a *column* one attribute of all of them, a
@@ -42,6 +43,7 @@ pub mod kernels;
 pub mod optim;
 pub mod page;
 pub mod render;
+pub mod report;
 pub mod scene;
 pub mod schedule;
 pub mod train;

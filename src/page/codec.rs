@@ -135,6 +135,7 @@ fn unshuffle(from: &[u8], to: &mut [u8]) {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::base::rng::mix64;

@@ -1,134 +1,102 @@
-//! How numbers and structs become bytes in the map, in headers and in run state: the only file that names bincode.
+//! Small structs as bytes, for the index and the state of a run on the drive. The only file that knows which library
+//! does it.
 //!
-//! A sealed value is a body with a checksum in front that is bound to the store, to the table and to the key, so that a
-//! value read from the wrong place, from another store or with a flipped bit is never taken for good. The checksum
-//! protects against accidents, not against forgery.
-//!
-//! Invariants: 1. the same value gives the same bytes on every machine: little-endian, fixed width; 2. decoding allocates
-//! no more than [`DECODE_MAX_BYTES`], whatever the bytes say.
+//! Invariants: 1. numbers are little-endian and of fixed length, so that equal values have equal bytes in every
+//! version of the program; 2. bytes that nobody vouches for take no more memory than their own length asks for, and a
+//! value must use up all of them. Types with lists of things without bytes (`Vec<()>`) do not belong here: their
+//! length would be believed.
 
-use xxhash_rust::xxh3::Xxh3;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 
-/// Most bytes that one decoded struct may hold. Longer things are opaque tails behind the struct.
-pub const DECODE_MAX_BYTES: usize = 1 << 16;
+/// Bytes that are not a value of the type, or a value that has no bytes.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("not what should be here: {0}")]
+pub struct EncodingError(String);
 
-/// Bytes that a seal adds in front of a body.
-pub const SEAL_BYTES: usize = 8;
+/// Longest value, bytes.
+pub const VALUE_BYTES_MAX: usize = 256 << 20;
 
-/// Bytes that are not what they should be.
-#[derive(Debug, Clone, thiserror::Error)]
-pub enum EncodingError {
-    /// The checksum does not fit body, key and store.
-    #[error("checksum does not match")]
-    Checksum,
-    /// Too short, too long or with impossible values.
-    #[error("not decodable: {0}")]
-    Malformed(String),
-}
-
-fn configuration() -> impl bincode::config::Config {
-    bincode::config::standard().with_fixed_int_encoding().with_limit::<DECODE_MAX_BYTES>()
-}
-
-/// The bytes of `value`. Structs of the store stay below [`DECODE_MAX_BYTES`].
+/// A value as bytes.
 ///
 /// # Errors
-/// A value that cannot be written, such as one above the limit.
-pub fn encode<T: bincode::Encode>(value: &T) -> Result<Vec<u8>, EncodingError> {
-    bincode::encode_to_vec(value, configuration()).map_err(|e| EncodingError::Malformed(e.to_string()))
+/// The type holds something that cannot be written, such as a list of unknown length.
+pub fn to_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, EncodingError> {
+    bincode::serde::encode_to_vec(value, bincode::config::legacy()).map_err(|e| EncodingError(e.to_string()))
 }
 
-/// The value at the start of `bytes`, and what follows it.
+/// The value that [`to_bytes`] made these bytes of.
 ///
 /// # Errors
-/// Bytes that no [`encode`] wrote.
-pub fn decode<T: bincode::Decode<()>>(bytes: &[u8]) -> Result<(T, &[u8]), EncodingError> {
-    let (value, used) =
-        bincode::decode_from_slice(bytes, configuration()).map_err(|e| EncodingError::Malformed(e.to_string()))?;
-    Ok((value, bytes.get(used..).unwrap_or(&[])))
+/// The bytes are not exactly one value of the type.
+pub fn from_bytes<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EncodingError> {
+    // A length inside the bytes is believed up to the limit, and the limit must be known to the compiler: so the
+    // smallest of these that holds the bytes.
+    match bytes.len() {
+        0..=0x100 => from_limited::<T, 0x100>(bytes),
+        0x101..=0x1000 => from_limited::<T, 0x1000>(bytes),
+        0x1001..=0x1_0000 => from_limited::<T, 0x1_0000>(bytes),
+        0x1_0001..=0x10_0000 => from_limited::<T, 0x10_0000>(bytes),
+        0x10_0001..=0x100_0000 => from_limited::<T, 0x100_0000>(bytes),
+        _ => from_limited::<T, VALUE_BYTES_MAX>(bytes),
+    }
 }
 
-/// The value that `bytes` hold and nothing else.
-///
-/// # Errors
-/// Bytes that no [`encode`] wrote, or more than one value's.
-pub fn decode_all<T: bincode::Decode<()>>(bytes: &[u8]) -> Result<T, EncodingError> {
-    let (value, rest) = decode(bytes)?;
-    if rest.is_empty() { Ok(value) } else { Err(EncodingError::Malformed(format!("{} bytes too many", rest.len()))) }
-}
-
-/// Whose values, and which table's: what every seal is bound to beside the key.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct SealScope {
-    /// Identity of the store.
-    pub store: u128,
-    /// Number of the table.
-    pub table: u8,
-}
-
-impl SealScope {
-    /// Checksum of `body` under `key`.
-    pub fn checksum(self, key: &[u8], body: &[u8]) -> u64 {
-        let mut hash = Xxh3::with_seed(u64::from(self.table));
-        hash.update(&self.store.to_le_bytes());
-        hash.update(&(key.len() as u64).to_le_bytes());
-        hash.update(key);
-        hash.update(body);
-        hash.digest()
+fn from_limited<T: DeserializeOwned, const LIMIT: usize>(bytes: &[u8]) -> Result<T, EncodingError> {
+    let config = bincode::config::legacy().with_limit::<LIMIT>();
+    let (value, used) = bincode::serde::decode_from_slice(bytes, config).map_err(|e| EncodingError(e.to_string()))?;
+    if used < bytes.len() {
+        return Err(EncodingError(format!("{} bytes are left over", bytes.len() - used)));
     }
-
-    /// `body` with its checksum in front.
-    pub fn seal(self, key: &[u8], body: &[u8]) -> Vec<u8> {
-        let mut bytes = Vec::with_capacity(SEAL_BYTES + body.len());
-        bytes.extend_from_slice(&self.checksum(key, body).to_le_bytes());
-        bytes.extend_from_slice(body);
-        bytes
-    }
-
-    /// The body of a sealed value and its checksum.
-    ///
-    /// # Errors
-    /// A value that was not sealed under this scope and key, or was changed since.
-    pub fn unseal<'a>(self, key: &[u8], sealed: &'a [u8]) -> Result<(&'a [u8], u64), EncodingError> {
-        let (checksum, body) = sealed.split_first_chunk::<SEAL_BYTES>().ok_or(EncodingError::Checksum)?;
-        let checksum = u64::from_le_bytes(*checksum);
-        if checksum == self.checksum(key, body) { Ok((body, checksum)) } else { Err(EncodingError::Checksum) }
-    }
+    Ok(value)
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use crate::base::rng::mix64;
 
-    #[test]
-    fn every_flipped_bit_and_every_wrong_place_is_noticed() {
-        let scope = SealScope { store: 7, table: 1 };
-        let sealed = scope.seal(b"key", b"some body");
-        assert_eq!(scope.unseal(b"key", &sealed).unwrap().0, b"some body");
-        for bit in 0..sealed.len() * 8 {
-            let mut damaged = sealed.clone();
-            damaged[bit / 8] ^= 1 << (bit % 8);
-            assert!(scope.unseal(b"key", &damaged).is_err(), "bit {bit}");
-        }
-        for cut in 0..sealed.len() {
-            assert!(scope.unseal(b"key", &sealed[..cut]).is_err(), "cut at {cut}");
-        }
-        assert!(scope.unseal(b"kez", &sealed).is_err());
-        assert!(SealScope { store: 8, table: 1 }.unseal(b"key", &sealed).is_err());
-        assert!(SealScope { store: 7, table: 2 }.unseal(b"key", &sealed).is_err());
-        // The border between key and body is part of what is sealed.
-        assert!(scope.unseal(b"keys", &scope.seal(b"key", b"s")).is_err());
+    #[derive(Debug, PartialEq, Serialize, serde::Deserialize)]
+    struct Sample {
+        step: u32,
+        scales: Vec<f32>,
+        name: String,
+        last: Option<u64>,
+    }
+
+    fn sample() -> Sample {
+        Sample { step: 7, scales: vec![1.5, -0.0], name: "crème".to_string(), last: Some(u64::MAX) }
     }
 
     #[test]
-    fn lengths_in_hostile_bytes_allocate_nothing() {
-        let mut bytes = u64::MAX.to_le_bytes().to_vec();
-        bytes.extend_from_slice(&[1; 40]);
-        assert!(decode_all::<Vec<u8>>(&bytes).is_err());
-        assert!(decode_all::<Vec<u64>>(&(1u64 << 40).to_le_bytes()).is_err());
-        let good = encode(&(3u32, 9u64)).unwrap();
-        assert_eq!(decode_all::<(u32, u64)>(&good).unwrap(), (3, 9));
-        assert!(decode_all::<u32>(&good).is_err());
-        assert!(decode_all::<(u32, u64)>(&good[..11]).is_err());
+    fn values_come_back_and_their_bytes_do_not_move() {
+        let bytes = to_bytes(&sample()).unwrap();
+        assert_eq!(from_bytes::<Sample>(&bytes).unwrap(), sample());
+        // Fixed lengths: 4, then 8 + 2 x 4, then 8 + 6, then 1 + 8.
+        assert_eq!(bytes.len(), 4 + 16 + 14 + 9);
+        assert_eq!(bytes[..12], [7, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0]);
+    }
+
+    #[test]
+    fn hostile_bytes_end_in_an_error() {
+        let bytes = to_bytes(&sample()).unwrap();
+        assert!((0..bytes.len()).all(|cut| from_bytes::<Sample>(&bytes[..cut]).is_err()));
+        let longer = [bytes.as_slice(), &[0]].concat();
+        assert!(from_bytes::<Sample>(&longer).unwrap_err().to_string().contains("1 bytes are left over"));
+        // Lengths of lists and strings beyond all bytes.
+        for at in [4, 20] {
+            let mut huge = bytes.clone();
+            huge[at..at + 8].fill(0x7f);
+            assert!(from_bytes::<Sample>(&huge).is_err());
+        }
+        for seed in 0..5000 {
+            let mut random = bytes.clone();
+            for i in 0..4 {
+                let at = mix64(seed * 4 + i) as usize % random.len();
+                random[at] = mix64(seed * 4 + i + (1 << 40)) as u8;
+            }
+            let _ = from_bytes::<Sample>(&random);
+        }
     }
 }

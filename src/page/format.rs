@@ -57,7 +57,8 @@ impl StoredAs {
 }
 
 /// Where one version of a page is, and what its bytes must be. Kept by the index.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(into = "Vec<u8>", try_from = "Vec<u8>")]
 pub struct SlotRef {
     /// Place of the slot.
     pub place: Place,
@@ -109,6 +110,21 @@ impl SlotRef {
         };
         let is_aligned = slot.place.offset.is_multiple_of(ALIGNMENT as u64);
         (is_aligned && lengths_agree(slot.codec, slot.stored_bytes, slot.payload_bytes)).then_some(slot)
+    }
+}
+
+impl From<SlotRef> for Vec<u8> {
+    fn from(slot: SlotRef) -> Vec<u8> {
+        slot.to_bytes().into()
+    }
+}
+
+impl TryFrom<Vec<u8>> for SlotRef {
+    type Error = &'static str;
+
+    fn try_from(bytes: Vec<u8>) -> Result<SlotRef, &'static str> {
+        let bytes = bytes.as_slice().try_into().ok();
+        bytes.and_then(SlotRef::from_bytes).ok_or("these bytes refer to no slot")
     }
 }
 
@@ -262,6 +278,7 @@ impl Take<'_> {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::base::rng::mix64;
@@ -297,7 +314,7 @@ mod tests {
         let mut bytes = [0; HEADER_BYTES];
         header().encode(&mut bytes);
         assert_eq!(&bytes[..16], b"gsscpage\x01\0\0\0\0\0\0\0");
-        assert_eq!((bytes[16], bytes[37], bytes[40], &bytes[48..50]), (77, 5u8 * 0, 12, [0, 2].as_slice()));
+        assert_eq!((bytes[16], bytes[36], bytes[40], &bytes[48..50]), (77, 5, 12, [0, 2].as_slice()));
         assert_eq!((bytes[50], u16::from_le_bytes([bytes[54], bytes[55]])), (3, 8192));
         assert_eq!((bytes[LABEL_AT], bytes[LABEL_AT + 511], bytes[LABEL_AT + 512]), (0xab, 0xab, 0));
     }

@@ -9,9 +9,10 @@
 //! Entries are keyed (page, generation): the page is as the entry says from that generation on, until its next entry.
 //! Invariant: what [`Manifest::apply`] was given is in the map entirely or not at all, and durable when it returned.
 
-use super::encoding::{EncodingError, SealScope};
+use super::encoding;
 use super::map_file::MapFile;
 use super::mutants::{Mutant, active};
+use super::seal::{SealBroken, SealScope};
 use crate::base::ids::PageId;
 use redb::{Builder, Database, ReadableDatabase, ReadableTable, StorageBackend, Table, TableDefinition};
 use std::collections::BTreeMap;
@@ -112,7 +113,7 @@ fn damaged(place: impl std::fmt::Display, problem: impl std::fmt::Display) -> Fa
 }
 
 /// Counts of the whole map, written with every transaction.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Counters {
     /// Transactions so far.
     pub sequence: u64,
@@ -281,7 +282,7 @@ impl Manifest {
             let header = transaction.open_table(HEADER)?;
             let value = header.get(COUNTERS)?.ok_or_else(|| damaged("header", "no counters"))?;
             let (body, _) = unseal(self.scope(HEADER_SEAL), COUNTERS.as_bytes(), value.value(), "counters")?;
-            content.counters = super::encoding::decode_all(body).map_err(|e| damaged("counters", e))?;
+            content.counters = encoding::from_bytes(body).map_err(|e| damaged("counters", e))?;
             let mut sum = Sum::default();
             self.read_versions(&transaction.open_table(PAGES)?, &mut content, &mut sum)?;
             for entry in transaction.open_table(GENERATIONS)?.iter()? {
@@ -299,7 +300,7 @@ impl Manifest {
             for entry in transaction.open_table(PINS)?.iter()? {
                 let (key, value) = entry?;
                 let body = sum.add(unseal(self.scope(PINS_SEAL), key.value().as_bytes(), value.value(), "pin")?);
-                let generation = super::encoding::decode_all(body).map_err(|e| damaged("pin", e))?;
+                let generation = encoding::from_bytes(body).map_err(|e| damaged("pin", e))?;
                 content.pins.insert(key.value().to_string(), generation);
             }
             let fits = (sum.entries, sum.tally) == (content.counters.entries, content.counters.tally);
@@ -363,13 +364,13 @@ fn version_key(page: u64, generation: u64) -> [u8; 16] {
     key
 }
 
-fn bound<'a>(key: &'a [u8]) -> &'a [u8] {
+fn bound(key: &[u8]) -> &[u8] {
     if active(Mutant::ValuesNotBoundToKeys) { &[] } else { key }
 }
 
 fn unseal<'a>(scope: SealScope, key: &[u8], sealed: &'a [u8], what: &str) -> Result<(&'a [u8], u64), Fault> {
     match scope.unseal(bound(key), sealed) {
-        Err(EncodingError::Checksum) if active(Mutant::ValuesNotVerified) => {
+        Err(SealBroken) if active(Mutant::ValuesNotVerified) => {
             let (checksum, body) = sealed.split_first_chunk().ok_or_else(|| damaged(what, "too short"))?;
             Ok((body, u64::from_le_bytes(*checksum)))
         }
@@ -434,10 +435,10 @@ impl Writer {
             self.remove(PINS_SEAL, &mut pins, name.as_str(), name.as_bytes())?;
         }
         for (name, generation) in &batch.put_pins {
-            let body = super::encoding::encode(generation).map_err(|e| damaged("pin", e))?;
+            let body = encoding::to_bytes(generation).map_err(|e| damaged("pin", e))?;
             self.insert(PINS_SEAL, &mut pins, name.as_str(), name.as_bytes(), &body)?;
         }
-        let body = super::encoding::encode(&self.counters).map_err(|e| damaged("counters", e))?;
+        let body = encoding::to_bytes(&self.counters).map_err(|e| damaged("counters", e))?;
         let sealed = self.scope(HEADER_SEAL).seal(bound(COUNTERS.as_bytes()), &body);
         transaction.open_table(HEADER)?.insert(COUNTERS, sealed.as_slice())?;
         Ok(())

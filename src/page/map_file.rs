@@ -252,6 +252,7 @@ impl StorageBackend for DriveFile {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use redb::backends::InMemoryBackend;

@@ -76,6 +76,7 @@ impl PageStore for MemoryStore {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::super::buffer::PageBuffer;
     use super::super::store::Place;

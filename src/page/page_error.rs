@@ -2,8 +2,9 @@
 //!
 //! Invariant: an error about stored bytes names the segment file, the offset, the page and its generation.
 
-use super::format::{LABEL_BYTES_MAX, SlotRef};
+use super::format::LABEL_BYTES_MAX;
 use super::segment_files::segment_file_name;
+use super::store::Place;
 use crate::base::ids::PageId;
 use std::io;
 
@@ -12,15 +13,17 @@ use std::io;
 pub struct SlotName {
     /// The page.
     pub page: PageId,
-    /// The version.
-    pub slot: SlotRef,
+    /// Where its slot is.
+    pub place: Place,
+    /// First generation that the version can belong to.
+    pub generation: u64,
 }
 
 impl std::fmt::Display for SlotName {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let SlotName { page, slot } = self;
-        let file = segment_file_name(slot.place.segment);
-        write!(f, "page {page} of generation {} ({file}, offset {})", slot.generation, slot.place.offset)
+        let SlotName { page, place, generation } = self;
+        let file = segment_file_name(place.segment);
+        write!(f, "page {page} of generation {generation} ({file}, offset {})", place.offset)
     }
 }
 

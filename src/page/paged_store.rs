@@ -14,6 +14,7 @@ use super::buffer::PageBuffer;
 use super::codec::{self, Codec};
 use super::format::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, checksum, transfer_bytes};
 use super::mutants::{Mutant, active};
+pub use super::page_done::{PageDone, PageMoved, PageTraffic};
 use super::page_error::{PageError, SlotName, is_out_of_space};
 use super::slots::{SlotError, SlotLayout, Slots};
 use super::store::{Completion, Direction, PageStore, Place, Transfer};
@@ -39,44 +40,6 @@ pub struct PagedStoreConfig {
     pub generation: u64,
     /// Number of the next write; larger than that of any slot that counts.
     pub serial: u64,
-}
-
-/// What a transfer did.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum PageMoved {
-    /// The payload is in the buffer, behind its [`HEADER_BYTES`] of header room.
-    Read {
-        /// Its bytes.
-        payload_bytes: usize,
-    },
-    /// The version is in this slot, durable after the next [`PagedStore::sync`].
-    Written(SlotRef),
-}
-
-/// The end of a read or write.
-#[derive(Debug)]
-pub struct PageDone {
-    /// The caller's name for it.
-    pub token: u64,
-    /// The page.
-    pub page: PageId,
-    /// The caller's buffer. After a write it holds the payload as before; after a failed read, nothing of use.
-    pub buffer: PageBuffer,
-    /// How it went.
-    pub result: Result<PageMoved, PageError>,
-}
-
-/// Bytes moved so far, headers and padding included.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct PageTraffic {
-    /// Bytes read.
-    pub bytes_read: u64,
-    /// Bytes written.
-    pub bytes_written: u64,
-    /// Payload bytes of what was written.
-    pub payload_bytes_written: u64,
-    /// Reads that had to be repeated.
-    pub reads_repeated: u64,
 }
 
 /// A transfer between acceptance and end.
@@ -184,7 +147,8 @@ impl PagedStore {
         self.pending.len() + self.unencoded.len() + self.ended.len()
     }
 
-    /// Memory of the store's own buffers, bytes: none while pages are stored raw.
+    /// Memory of the store's own buffers, bytes: none while pages are stored raw, otherwise as much as was ever in flight
+    /// at once.
     pub fn staging_bytes(&self) -> u64 {
         let encoded = self.pending.values().filter(|p| p.payload.is_some()).count();
         (self.staging.len() + self.unencoded.len() + encoded) as u64 * self.config.layout.slot_bytes
@@ -331,7 +295,12 @@ impl PagedStore {
     ) -> Result<SlotRef, PageError> {
         self.refuse_if_poisoned()?;
         let room = self.capacity_bytes().min(buffer.len().saturating_sub(HEADER_BYTES));
-        if payload_bytes > room || label.len() > LABEL_BYTES_MAX || u32::try_from(payload_bytes).is_err() {
+        let has_header_room = buffer.len() >= HEADER_BYTES;
+        if !has_header_room
+            || payload_bytes > room
+            || label.len() > LABEL_BYTES_MAX
+            || u32::try_from(payload_bytes).is_err()
+        {
             let label_bytes = label.len();
             return Err(PageError::TooLong { page, payload_bytes, capacity_bytes: room, label_bytes });
         }
@@ -524,7 +493,7 @@ impl PagedStore {
 
 impl Pending {
     fn name(&self) -> SlotName {
-        SlotName { page: self.page, slot: self.slot }
+        SlotName { page: self.page, place: self.slot.place, generation: self.slot.generation }
     }
 
     fn end(self, buffer: PageBuffer, result: Result<PageMoved, PageError>) -> PageDone {

@@ -39,6 +39,8 @@ struct OpenFile {
 #[derive(Debug)]
 pub struct SegmentFiles {
     folder: PathBuf,
+    /// Held open, so that a segment can be made durable whatever the process has open.
+    entries: Option<File>,
     direct: bool,
     open: BTreeMap<u32, OpenFile>,
     open_max: usize,
@@ -54,7 +56,10 @@ impl SegmentFiles {
     pub fn new(folder: &Path, direct: bool) -> io::Result<SegmentFiles> {
         let direct = direct && direct_works(folder)?;
         let open_max = open_files_max();
-        Ok(SegmentFiles { folder: folder.to_path_buf(), direct, open: BTreeMap::new(), open_max, clock: 0 })
+        // Other systems do not open folders; there a file's entry is durable with the file.
+        let entries = if cfg!(unix) { Some(File::open(folder)?) } else { None };
+        let open = BTreeMap::new();
+        Ok(SegmentFiles { folder: folder.to_path_buf(), entries, direct, open, open_max, clock: 0 })
     }
 
     /// Whether files bypass the page cache. Then memory, offsets and lengths must be multiples of
@@ -80,19 +85,25 @@ impl SegmentFiles {
     /// No space; the folder cannot be written; the file is longer, a link, or not a file.
     pub fn create(&mut self, segment: u32, bytes: u64) -> io::Result<()> {
         let path = self.path(segment);
-        let file =
-            with_safe_flags(OpenOptions::new().read(true).write(true).create(true).truncate(false)).open(&path)?;
+        let make = |path: &Path| {
+            with_safe_flags(OpenOptions::new().read(true).write(true).create(true).truncate(false)).open(path)
+        };
+        let file = self.open_with_room(&path, make)?;
         let there = file.metadata()?;
         if !there.is_file() || there.len() > bytes {
             let what = if there.is_file() { "exists with another length" } else { "is not a file" };
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{} {what}", path.display())));
         }
-        if there.len() < bytes {
-            allocate(&file, there.len(), bytes)?;
+        if there.len() < bytes
+            && let Err(error) = allocate(&file, there.len(), bytes)
+        {
+            // What was allocated before space ran out is given back; a file that was here stays as it was.
+            let _ = if there.len() == 0 { std::fs::remove_file(&path) } else { file.set_len(there.len()) };
+            return Err(error);
         }
         // Also when nothing seems missing: whoever made it may have been killed before these calls.
         file.sync_all()?;
-        sync_folder(&self.folder)
+        self.entries.as_ref().map_or(Ok(()), File::sync_all)
     }
 
     /// The file of a segment, for reading.
@@ -105,12 +116,9 @@ impl SegmentFiles {
             open.last_used = self.clock;
             return Ok(Arc::clone(&open.file));
         }
-        while self.open.len() >= self.open_max {
-            self.close_oldest()?;
-        }
-        let mut options = OpenOptions::new();
-        options.read(true).write(true);
-        let file = Arc::new(open_segment(&self.path(segment), &mut options, self.direct)?);
+        while self.open.len() >= self.open_max && self.close_oldest()? {}
+        let direct = self.direct;
+        let file = Arc::new(self.open_with_room(&self.path(segment), |path| open_segment(path, direct))?);
         let open = OpenFile { file: Arc::clone(&file), last_used: self.clock, is_dirty: false };
         self.open.insert(segment, open);
         Ok(file)
@@ -141,14 +149,32 @@ impl SegmentFiles {
         Ok(())
     }
 
-    fn close_oldest(&mut self) -> io::Result<()> {
-        let Some((&segment, _)) = self.open.iter().min_by_key(|(_, open)| open.last_used) else { return Ok(()) };
+    /// Opens a file; where others of this process hold more files than was reckoned with, closes some of ours.
+    fn open_with_room(&mut self, path: &Path, open: impl Fn(&Path) -> io::Result<File>) -> io::Result<File> {
+        loop {
+            match open(path) {
+                Err(error) if is_too_many_files(&error) && self.close_oldest()? => {}
+                opened => return opened,
+            }
+        }
+    }
+
+    /// Closes the file that was not used for longest, except those that a transfer in flight still holds: a write
+    /// that ends after the sync would be missed by the next. Tells whether there was one.
+    fn close_oldest(&mut self) -> io::Result<bool> {
+        let idle = self.open.iter().filter(|(_, open)| Arc::strong_count(&open.file) == 1);
+        let Some((&segment, _)) = idle.min_by_key(|(_, open)| open.last_used) else { return Ok(false) };
         // The kernel may forget a failed write-back of a file that nobody has open.
         if let Some(open) = self.open.remove(&segment).filter(|o| o.is_dirty) {
             open.file.sync_data()?;
         }
-        Ok(())
+        Ok(true)
     }
+}
+
+/// Whether a file could not be opened because the process or the system has too many open.
+fn is_too_many_files(error: &io::Error) -> bool {
+    cfg!(unix) && matches!(error.raw_os_error(), Some(23 | 24)) // ENFILE, EMFILE everywhere
 }
 
 /// Makes the entries of a folder durable.
@@ -156,31 +182,33 @@ impl SegmentFiles {
 /// # Errors
 /// The drive reported an error.
 pub fn sync_folder(folder: &Path) -> io::Result<()> {
-    // Other systems have no such call; there a file's entry is durable with the file.
     if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
 }
 
-/// Adds: private to its owner, no link followed. (Handles are never inherited: the standard library sees to it.)
+/// Adds: private to its owner, no link followed, no waiting on a pipe that somebody put there. (Handles are never
+/// inherited: the standard library sees to it.)
 pub fn with_safe_flags(options: &mut OpenOptions) -> &mut OpenOptions {
     #[cfg(unix)]
     {
+        use rustix::fs::OFlags;
         use std::os::unix::fs::OpenOptionsExt;
-        options.mode(0o600).custom_flags(rustix::fs::OFlags::NOFOLLOW.bits() as i32);
+        options.mode(0o600).custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32);
     }
     options
 }
 
 #[cfg(target_os = "linux")]
-fn open_segment(path: &Path, options: &mut OpenOptions, direct: bool) -> io::Result<File> {
+fn open_segment(path: &Path, direct: bool) -> io::Result<File> {
     use rustix::fs::OFlags;
     use std::os::unix::fs::OpenOptionsExt;
     let direct = if direct { OFlags::DIRECT } else { OFlags::empty() };
-    options.mode(0o600).custom_flags((OFlags::NOFOLLOW | direct).bits() as i32).open(path)
+    let flags = (OFlags::NOFOLLOW | direct).bits() as i32;
+    OpenOptions::new().read(true).write(true).custom_flags(flags).open(path)
 }
 
 #[cfg(not(target_os = "linux"))]
-fn open_segment(path: &Path, options: &mut OpenOptions, _direct: bool) -> io::Result<File> {
-    with_safe_flags(options).open(path)
+fn open_segment(path: &Path, _direct: bool) -> io::Result<File> {
+    with_safe_flags(OpenOptions::new().read(true).write(true)).open(path)
 }
 
 /// Whether files of this folder can be opened around the page cache: asked of a file that has no name.
@@ -246,6 +274,7 @@ fn open_files_max() -> usize {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
 
@@ -305,6 +334,11 @@ mod tests {
             files.file_for_write(segment).unwrap().write_all_at(&[segment as u8 + 1], 7).unwrap();
             assert!(files.open.len() <= 3);
         }
+        // A transfer in flight keeps its file open and changed until its end.
+        let in_flight = files.file_for_write(0).unwrap();
+        (1..10).for_each(|segment| drop(files.file(segment).unwrap()));
+        assert!(files.open[&0].is_dirty && files.open.len() == 3);
+        drop(in_flight);
         files.sync().unwrap();
         assert!(files.open.values().all(|o| !o.is_dirty));
         for segment in 0..10 {

@@ -7,8 +7,8 @@
 //! The file is two slots of 4 KiB, written in turns, each synced before the next is touched: after a crash at least one
 //! is whole, and it is at most one transaction behind. A witness behind its map is an ordinary crash.
 
-use super::encoding::SealScope;
 use super::mutants::{Mutant, active};
+use super::seal::{SEAL_BYTES, SealScope};
 use redb::StorageBackend;
 use std::io;
 use std::sync::Arc;
@@ -88,13 +88,14 @@ fn scope(store: u128) -> SealScope {
 }
 
 fn read_slot(store: u128, slot: u64, bytes: &[u8]) -> Option<u64> {
-    let sealed = bytes.get(..super::encoding::SEAL_BYTES + BODY_BYTES)?;
+    let sealed = bytes.get(..SEAL_BYTES + BODY_BYTES)?;
     let (body, _) = scope(store).unseal(&slot.to_le_bytes(), sealed).ok()?;
     let (magic, sequence) = body.split_first_chunk::<8>()?;
     (*magic == MAGIC).then_some(u64::from_le_bytes(sequence.try_into().ok()?))
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use redb::backends::InMemoryBackend;

@@ -19,6 +19,7 @@ use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
+use crate::report::run_report::{PAGES_FILE, REPORT_FILE, write_run_report};
 use crate::scene::columns::Columns;
 use crate::scene::init::{gaussians_from_points, random_points_in_frusta};
 use std::path::{Path, PathBuf};
@@ -238,6 +239,7 @@ fn train_into(
         steps_skipped_non_finite: steps_skipped,
     };
     write_summary(&out.join("summary.json"), &summary)?;
+    write_run_report(out)?;
     tested?;
     Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
 }
@@ -263,7 +265,7 @@ fn make_out(out: &Path, overwrite: bool) -> InputResult<()> {
     if !overwrite || !out.join("config.toml").is_file() {
         return Ok(());
     }
-    for name in ["config.toml", "metrics.jsonl", "summary.json", "point_cloud.ply"] {
+    for name in ["config.toml", "metrics.jsonl", "summary.json", "point_cloud.ply", REPORT_FILE, PAGES_FILE] {
         let path = out.join(name);
         if path.is_file() {
             std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;

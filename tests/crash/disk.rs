@@ -411,14 +411,13 @@ fn survive(image: &mut Image, change: &Unsynced, survival: Survival, index: usiz
                 }
             }
         }
-        (Unsynced::Length(len), Survival::Sectors(..)) => {
-            if rng.one_in(2) {
-                image.set_len(*len);
-            }
+        (Unsynced::Length(len), _) => {
+            let kept =
+                if matches!(survival, Survival::Sectors(..)) { rng.one_in(2) } else { is_whole(survival, index) };
+            image.set_len(if kept { *len } else { image.len });
         }
         (Unsynced::Write(offset, bytes), _) if is_whole(survival, index) => image.write(*offset, bytes),
-        (Unsynced::Length(len), _) if is_whole(survival, index) => image.set_len(*len),
-        _ => {}
+        (Unsynced::Write(..), _) => {}
     }
 }
 
