@@ -8,6 +8,7 @@ pub mod colmap_write;
 pub mod frame;
 pub mod loader;
 pub mod masks;
+pub mod mega_nerf;
 pub mod model;
 pub mod paths;
 pub mod photo;

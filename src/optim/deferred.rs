@@ -10,6 +10,7 @@
 
 use super::adam::AdamConfig;
 use super::drift::{Drift, DriftTables, EpsFloor, RECENT, drifted, flush, needs_direct_sum};
+use super::lanes::SizeRows;
 use super::rates::Rates;
 use crate::base::simd::{Kernel, SimdPath, dispatch};
 use crate::scene::columns::{Column, Columns};
@@ -99,6 +100,34 @@ impl DeferredAdam {
         self.evaluate_with(&self.tables.drift(stamp, now), column, value, m, v, stamp, now)
     }
 
+    /// Series sums of the movement for ever, for a row of this stamp.
+    #[inline(always)]
+    pub(crate) fn limit_drift(&self, stamp: u32) -> &Drift {
+        self.tables.limit(stamp)
+    }
+
+    /// What one value comes to when it never gets a gradient again; it moves there from `value` without turning back.
+    pub(crate) fn limit(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32) -> f32 {
+        self.evaluate_with(self.tables.limit(stamp), column, value, m, v, stamp, u32::MAX)
+    }
+
+    /// Instruction path of the run.
+    pub(crate) fn simd(&self) -> SimdPath {
+        self.simd
+    }
+
+    /// eps and the root above which the series holds.
+    #[inline(always)]
+    pub(crate) fn eps_floor(&self) -> EpsFloor {
+        self.eps
+    }
+
+    /// Base rate of a column, as the evaluation uses it.
+    #[inline(always)]
+    pub(crate) fn base_rate(&self, column: Column) -> f32 {
+        self.lane_rates[first_lane(column)]
+    }
+
     fn evaluate_with(&self, drift: &Drift, column: Column, value: f32, m: f32, v: f32, stamp: u32, now: u32) -> f32 {
         if stamp >= now {
             return value;
@@ -147,18 +176,6 @@ impl<'a> AdamNow<'a> {
     pub(crate) fn drift(&self, stamp: u32) -> &Drift {
         let gap = self.now.saturating_sub(stamp) as usize;
         if gap < RECENT { &self.recent[gap] } else { self.adam.tables.limit(stamp) }
-    }
-
-    /// eps and the root above which the series holds.
-    #[inline(always)]
-    pub(crate) fn eps_floor(&self) -> EpsFloor {
-        self.adam.eps
-    }
-
-    /// Base rate of a column, as the evaluation uses it.
-    #[inline(always)]
-    pub(crate) fn base_rate(&self, column: Column) -> f32 {
-        self.adam.lane_rates[first_lane(column)]
     }
 
     /// The step on a view of rows: as [`DeferredAdam::step`], `rows` counted in the table that the view was cut from.
@@ -274,6 +291,10 @@ impl RowsNow for AdamNow<'_> {
         let (value, m, v) = (of(&rows.columns), of(&rows.exp_avg), of(&rows.exp_avg_sq));
         let stamp = rows.stamp[row];
         self.adam.evaluate_with(self.drift(stamp), column, value, m, v, stamp, self.now)
+    }
+
+    fn sizes_and_opacities(&self, rows: &Rows<'_>, log_scales: &mut [f32], opacities: &mut [f32]) {
+        dispatch(self.adam.simd, SizeRows { at: self, rows, log_scales, opacities });
     }
 
     fn settle_row(&self, rows: &mut RowsMut<'_>, row: usize) {

@@ -10,30 +10,31 @@
 //! Invariant: what [`Manifest::apply`] was given is in the map entirely or not at all, and durable when it returned.
 
 use super::encoding;
+use super::manifest_write::Writer;
 use super::map_file::MapFile;
 use super::mutants::{Mutant, active};
 use super::seal::{SealBroken, SealScope};
 use crate::base::ids::PageId;
-use redb::{Builder, Database, ReadableDatabase, ReadableTable, StorageBackend, Table, TableDefinition};
+use redb::{Builder, Database, ReadableDatabase, ReadableTable, StorageBackend, TableDefinition};
 use std::collections::BTreeMap;
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 
-const PAGES: TableDefinition<'_, (u64, u64), &[u8]> = TableDefinition::new("pages");
-const GENERATIONS: TableDefinition<'_, u64, &[u8]> = TableDefinition::new("generations");
-const RUN_STATES: TableDefinition<'_, u64, &[u8]> = TableDefinition::new("run_states");
-const PINS: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("pins");
-const HEADER: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("header");
+pub(super) const PAGES: TableDefinition<'_, (u64, u64), &[u8]> = TableDefinition::new("pages");
+pub(super) const GENERATIONS: TableDefinition<'_, u64, &[u8]> = TableDefinition::new("generations");
+pub(super) const RUN_STATES: TableDefinition<'_, u64, &[u8]> = TableDefinition::new("run_states");
+pub(super) const PINS: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("pins");
+pub(super) const HEADER: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("header");
 
 /// Numbers of the tables in seals.
-const PAGES_SEAL: u8 = 1;
-const GENERATIONS_SEAL: u8 = 2;
-const RUN_STATES_SEAL: u8 = 3;
-const PINS_SEAL: u8 = 4;
-const HEADER_SEAL: u8 = 5;
+pub(super) const PAGES_SEAL: u8 = 1;
+pub(super) const GENERATIONS_SEAL: u8 = 2;
+pub(super) const RUN_STATES_SEAL: u8 = 3;
+pub(super) const PINS_SEAL: u8 = 4;
+pub(super) const HEADER_SEAL: u8 = 5;
 /// Key of the counters in the header table.
-const COUNTERS: &str = "counters";
+pub(super) const COUNTERS: &str = "counters";
 
 /// Why the map cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -97,7 +98,7 @@ fn guarded<T>(calls: impl FnOnce() -> Result<T, Fault>) -> Result<T, MapError> {
 }
 
 /// What can go wrong inside [`guarded`].
-enum Fault {
+pub(super) enum Fault {
     Library(Box<redb::Error>),
     Map(MapError),
 }
@@ -108,7 +109,7 @@ impl<E: Into<redb::Error>> From<E> for Fault {
     }
 }
 
-fn damaged(place: impl std::fmt::Display, problem: impl std::fmt::Display) -> Fault {
+pub(super) fn damaged(place: impl std::fmt::Display, problem: impl std::fmt::Display) -> Fault {
     Fault::Map(MapError::Damaged(format!("{place}: {problem}")))
 }
 
@@ -122,9 +123,9 @@ pub struct Counters {
     /// Number of the next generation; never used twice.
     pub next: u64,
     /// Entries of all tables but the header's.
-    entries: u64,
+    pub(super) entries: u64,
     /// Sum of the checksums of all these entries.
-    tally: u64,
+    pub(super) tally: u64,
 }
 
 /// One version of a page.
@@ -357,18 +358,18 @@ fn builder(cache_bytes: usize) -> Builder {
     builder
 }
 
-fn version_key(page: u64, generation: u64) -> [u8; 16] {
+pub(super) fn version_key(page: u64, generation: u64) -> [u8; 16] {
     let mut key = [0; 16];
     key[..8].copy_from_slice(&page.to_le_bytes());
     key[8..].copy_from_slice(&generation.to_le_bytes());
     key
 }
 
-fn bound(key: &[u8]) -> &[u8] {
+pub(super) fn bound(key: &[u8]) -> &[u8] {
     if active(Mutant::ValuesNotBoundToKeys) { &[] } else { key }
 }
 
-fn unseal<'a>(scope: SealScope, key: &[u8], sealed: &'a [u8], what: &str) -> Result<(&'a [u8], u64), Fault> {
+pub(super) fn unseal<'a>(scope: SealScope, key: &[u8], sealed: &'a [u8], what: &str) -> Result<(&'a [u8], u64), Fault> {
     match scope.unseal(bound(key), sealed) {
         Err(SealBroken) if active(Mutant::ValuesNotVerified) => {
             let (checksum, body) = sealed.split_first_chunk().ok_or_else(|| damaged(what, "too short"))?;
@@ -407,96 +408,4 @@ fn check_generations(content: &MapContent) -> Result<(), Fault> {
         return Err(damaged(format!("page {}", version.page), format!("impossible generation {}", version.generation)));
     }
     Ok(())
-}
-
-/// Writes one batch and keeps the counts.
-struct Writer {
-    store: u128,
-    counters: Counters,
-}
-
-impl Writer {
-    fn write(&mut self, transaction: &redb::WriteTransaction, batch: &MapBatch) -> Result<(), Fault> {
-        let mut pages = transaction.open_table(PAGES)?;
-        for (page, generation) in &batch.drop_versions {
-            let (key, bytes) = ((page.to_bits(), *generation), version_key(page.to_bits(), *generation));
-            self.remove(PAGES_SEAL, &mut pages, key, &bytes)?;
-        }
-        for version in &batch.put_versions {
-            let page = version.page.to_bits();
-            let mut body = vec![u8::from(version.value.is_some())];
-            body.extend_from_slice(version.value.as_deref().unwrap_or(&[]));
-            let key = version_key(page, version.generation);
-            self.insert(PAGES_SEAL, &mut pages, (page, version.generation), &key, &body)?;
-        }
-        self.write_generations(transaction, batch)?;
-        let mut pins = transaction.open_table(PINS)?;
-        for name in &batch.drop_pins {
-            self.remove(PINS_SEAL, &mut pins, name.as_str(), name.as_bytes())?;
-        }
-        for (name, generation) in &batch.put_pins {
-            let body = encoding::to_bytes(generation).map_err(|e| damaged("pin", e))?;
-            self.insert(PINS_SEAL, &mut pins, name.as_str(), name.as_bytes(), &body)?;
-        }
-        let body = encoding::to_bytes(&self.counters).map_err(|e| damaged("counters", e))?;
-        let sealed = self.scope(HEADER_SEAL).seal(bound(COUNTERS.as_bytes()), &body);
-        transaction.open_table(HEADER)?.insert(COUNTERS, sealed.as_slice())?;
-        Ok(())
-    }
-
-    fn write_generations(&mut self, transaction: &redb::WriteTransaction, batch: &MapBatch) -> Result<(), Fault> {
-        let mut generations = transaction.open_table(GENERATIONS)?;
-        let mut run_states = transaction.open_table(RUN_STATES)?;
-        for generation in &batch.drop_generations {
-            let key = generation.to_le_bytes();
-            self.remove(GENERATIONS_SEAL, &mut generations, *generation, &key)?;
-            self.remove(RUN_STATES_SEAL, &mut run_states, *generation, &key)?;
-        }
-        if let Some((generation, note, run_state)) = &batch.put_generation {
-            let key = generation.to_le_bytes();
-            self.insert(GENERATIONS_SEAL, &mut generations, *generation, &key, note)?;
-            self.insert(RUN_STATES_SEAL, &mut run_states, *generation, &key, run_state)?;
-        }
-        Ok(())
-    }
-
-    fn scope(&self, table: u8) -> SealScope {
-        SealScope { store: self.store, table }
-    }
-
-    fn insert<'k, K: redb::Key + 'static>(
-        &mut self,
-        seal: u8,
-        table: &mut Table<'_, K, &'static [u8]>,
-        key: K::SelfType<'k>,
-        key_bytes: &[u8],
-        body: &[u8],
-    ) -> Result<(), Fault> {
-        let scope = self.scope(seal);
-        let sealed = scope.seal(bound(key_bytes), body);
-        let before = table.insert(key, sealed.as_slice())?;
-        if let Some(before) = before {
-            self.forget(unseal(scope, key_bytes, before.value(), "overwritten entry")?.1);
-        }
-        self.counters.entries += 1;
-        self.counters.tally = self.counters.tally.wrapping_add(scope.checksum(bound(key_bytes), body));
-        Ok(())
-    }
-
-    fn remove<'k, K: redb::Key + 'static>(
-        &mut self,
-        seal: u8,
-        table: &mut Table<'_, K, &'static [u8]>,
-        key: K::SelfType<'k>,
-        key_bytes: &[u8],
-    ) -> Result<(), Fault> {
-        let before = table.remove(key)?.ok_or_else(|| damaged("entry to remove", "it is not there"))?;
-        self.forget(unseal(self.scope(seal), key_bytes, before.value(), "entry to remove")?.1);
-        Ok(())
-    }
-
-    fn forget(&mut self, checksum: u64) {
-        self.counters.entries = self.counters.entries.wrapping_sub(1);
-        self.counters.tally = self.counters.tally.wrapping_sub(checksum);
-    }
 }

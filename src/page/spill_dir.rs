@@ -5,6 +5,7 @@
 //! program made are ever removed, told by name and by the store's identity inside; 3. no symbolic link is followed,
 //! neither to the folder nor in it; 4. what is made is private to the user.
 
+use super::drive_rate;
 use super::file_system::{FileSystem, free_bytes};
 use super::format::{HEADER_BYTES, SlotHeader};
 use super::segment_files::{segment_from_file_name, sync_folder, with_safe_flags};
@@ -146,7 +147,7 @@ impl SpillDir {
     /// A file cannot be removed.
     pub fn remove(self) -> InputResult<Vec<String>> {
         let mut foreign = Vec::new();
-        let mut ours = vec![FORMAT_NEW.to_string(), FORMAT.to_string(), LOCK.to_string()];
+        let mut ours = [FORMAT_NEW, FORMAT, LOCK, drive_rate::FILE_NAME].map(str::to_string).to_vec();
         for name in names(&self.folder)? {
             if segment_from_file_name(&name).is_some() && self.is_our_segment(&self.folder.join(&name)) {
                 ours.insert(0, name);

@@ -19,7 +19,7 @@ mod rows;
 mod write;
 
 pub use read::{parse_ply, read_ply};
-pub use write::{PlyWritten, write_gaussians};
+pub use write::{PlyWriter, PlyWritten, write_gaussians};
 
 use crate::scene::columns::Columns;
 
