@@ -83,7 +83,7 @@ fn write_pages(store: &mut PagedStore, pages: u32, bytes: usize) -> Vec<PageChan
     let mut done = Vec::new();
     for page in 0..pages {
         let mut buffer = store.new_buffer();
-        buffer.as_mut_slice()[4096..].fill(page as u8 + 1);
+        buffer.as_mut_slice()[4096..].fill((page as u8).wrapping_add(1));
         let written = store.write(u64::from(page), PageId::initial(page), &LABEL, bytes, buffer);
         written.map_err(|(error, _)| error).expect("the drive has space");
         while store.in_flight() > 32 {
