@@ -182,6 +182,9 @@ config_keys! {
         /// What renders: auto (a hardware GPU if there is one, else the CPU), gpu (a software adapter counts too), cpu,
         /// or a part of the name of one of --list-devices
         device: String = "auto".into();
+        /// The same command gives the same bits again on the same device. Every run does so, at no cost: there is no
+        /// faster way that does not
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] deterministic: bool = true;
         /// Memory that may be taken on the device; 0 = what the device has
         device_mem: ByteSize = ByteSize(0);
     }
