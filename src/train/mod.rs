@@ -12,6 +12,7 @@ pub mod progress;
 pub mod report;
 pub mod run;
 pub mod signals;
+pub mod start;
 pub mod step;
 pub mod tiers;
 pub mod trainer;

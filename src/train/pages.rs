@@ -7,10 +7,12 @@
 //! number of rows that there would be if every page had applied every event.
 
 use super::catch_up::{evaluate_all, gather, visible_rows};
+use super::start::not_stored;
 use super::step::WorkingSet;
 use super::trainer::TrainError;
 use crate::base::ids::{PageId, PageNo};
 use crate::config::limits::RunOptions;
+use crate::dataset::import::{ImportOptions, PointSource, import_points};
 use crate::densify::replay::{PageEdit, PendingEvents, Replay};
 use crate::densify::stats::GradHistogram;
 use crate::optim::bounds::SplitLimits;
@@ -108,28 +110,53 @@ impl PagedScene {
     /// # Errors
     /// A page could not be stored.
     pub fn new(columns: &Columns, pager: Pager, options: &RunOptions) -> Result<PagedScene, PagingError> {
-        let rows = columns.rows() as u64;
-        let mut scene = PagedScene {
-            pager,
-            rules: PageRules::new(options),
-            histogram: GradHistogram::default(),
-            rows,
-            rows_bound: rows,
-        };
-        scene.insert_first_pages(columns, options.densify.is_some())?;
+        let mut scene = PagedScene::empty(pager, options);
+        let fill = first_fill(options.page_rows, options.densify.is_some());
+        let pages = partition(&columns.means, &columns.scales, fill);
+        for (index, rows) in pages.iter().enumerate() {
+            let state = first_rows(columns, rows, scene.rules.sh_degree);
+            scene.insert_first_page(PageId::initial(index as u32), &state)?;
+        }
         Ok(scene)
     }
 
-    fn insert_first_pages(&mut self, columns: &Columns, is_growing: bool) -> Result<(), PagingError> {
-        let fill = first_fill(self.rules.page_rows, is_growing);
-        let pages = partition(&columns.means, &columns.scales, fill);
-        for (index, rows) in pages.iter().enumerate() {
-            let state = first_rows(columns, rows, self.rules.sh_degree);
-            let meta = self.rules.meta(PageId::initial(index as u32), &state);
-            self.pager.insert(meta, |payload| {
-                write_page(&state, payload);
-            })?;
+    /// Pages of the first Gaussians of points that need not fit in memory: those of [`PagedScene::new`] for the same
+    /// points.
+    ///
+    /// # Errors
+    /// The points cannot be read, or a page could not be stored.
+    pub fn import(
+        source: &dyn PointSource,
+        import: &ImportOptions<'_>,
+        pager: Pager,
+        options: &RunOptions,
+    ) -> Result<PagedScene, TrainError> {
+        let mut scene = PagedScene::empty(pager, options);
+        let mut failed = None;
+        let imported = import_points(source, import, &mut |page| {
+            let mut state = SceneState::from_columns(page.columns);
+            state.uid.iter_mut().zip(&page.rows).for_each(|(uid, &row)| *uid = u64::from(row));
+            state.raise_sh_degree(scene.rules.sh_degree);
+            scene.insert_first_page(page.id, &state).map_err(|error| not_stored(failed.insert(error)))
+        });
+        match failed {
+            Some(error) => Err(error.into()),
+            None => Ok(imported.map(|_| scene)?),
         }
+    }
+
+    fn empty(pager: Pager, options: &RunOptions) -> PagedScene {
+        let (rules, histogram) = (PageRules::new(options), GradHistogram::default());
+        PagedScene { pager, rules, histogram, rows: 0, rows_bound: 0 }
+    }
+
+    fn insert_first_page(&mut self, id: PageId, state: &SceneState) -> Result<(), PagingError> {
+        let meta = self.rules.meta(id, state);
+        self.pager.insert(meta, |payload| {
+            write_page(state, payload);
+        })?;
+        self.rows += state.rows() as u64;
+        self.rows_bound += state.rows() as u64;
         Ok(())
     }
 

@@ -10,6 +10,7 @@ use super::preflight;
 use super::progress::Progress;
 use super::report::{MetricsLog, Resolved, Summary, TierTraffic, write_config, write_summary};
 use super::signals::StopFlag;
+use super::start::Start;
 use super::tiers;
 use super::trainer::{LoopOutputs, TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
@@ -88,10 +89,7 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
     }
     raw.warnings.extend(dropped);
     let mut dataset = load_dataset(raw, &limits::load_options(config))?;
-    if dataset.train_views().is_empty() {
-        let problem = "no view is left to train on";
-        return Err(InputError::new(scene, problem, "hold out fewer photos: see --test-every and --test-after"));
-    }
+    check_train_views(scene, &dataset)?;
     let (columns, sh_degree_start) = match gaussians {
         Some((mut columns, meta, ply)) => {
             let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
@@ -110,6 +108,15 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
         return Err(InputError::new(scene, problem, "raise --max-gaussians or start from fewer"));
     }
     Ok(Prepared { dataset, columns, sh_degree_start })
+}
+
+/// There must be views to train on.
+pub(super) fn check_train_views(scene: &Path, dataset: &Dataset) -> InputResult<()> {
+    if !dataset.train_views().is_empty() {
+        return Ok(());
+    }
+    let problem = "no view is left to train on";
+    Err(InputError::new(scene, problem, "hold out fewer photos: see --test-every and --test-after"))
 }
 
 fn first_gaussians(scene: &Path, dataset: &mut Dataset, config: &TrainConfig) -> InputResult<Columns> {
@@ -156,30 +163,31 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     config.check()?;
     machine::set_up(config)?;
     check_out(request)?;
-    let prepared = prepare(&request.scene, config)?;
+    let host_mem = host_budget(config);
+    let start = Start::read(&request.scene, config, host_mem)?;
     let say = |line: &str| {
         if !request.quiet {
             eprintln!("{line}");
         }
     };
-    for warning in &prepared.dataset.warnings {
+    for warning in &start.dataset.warnings {
         eprintln!("warning: {warning}");
     }
-    let Prepared { dataset, columns, sh_degree_start } = prepared;
-    let options = RunOptions { sh_degree_start, ..RunOptions::new(config, dataset.scene_scale) };
+    let sh_degree_start = start.sh_degree_start;
+    let options = RunOptions { sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
     let before = host_bytes_now().unwrap_or(0);
     let (renderer, word) = machine::renderer(config)?;
     let driver = host_bytes_now().unwrap_or(0).saturating_sub(before);
     if let Some(word) = word {
         say(&word);
     }
-    let host_mem = host_budget(config);
     let fill = first_fill(config.page_rows as usize, options.densify.is_some());
-    let pages = rows_at_most(config, columns.rows() as u64).div_ceil(fill as u64);
+    let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
     // Dropped after the trainer, whose pages may lie there.
     let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
     tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
-    let mut trainer = Trainer::with_pager(columns, pager, &dataset, renderer, options)?;
+    let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
+    let mut trainer = Trainer::of_scene(scene, &dataset, renderer, options);
     let mut memory = estimate(config, &dataset, &mut trainer, driver)?;
     let plan = preflight::settle(config, &dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
     say(&describe(request, &dataset, &trainer, &preflight::describe(&plan, &memory[1], &tiers)));

@@ -127,9 +127,15 @@ impl Trainer {
         renderer: Box<dyn Renderer>,
         options: RunOptions,
     ) -> Result<Self, TrainError> {
+        let scene = PagedScene::new(&columns, pager, &options)?;
+        Ok(Trainer::of_scene(scene, dataset, renderer, options))
+    }
+
+    /// A trainer of pages that were made with the same options.
+    pub fn of_scene(scene: PagedScene, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Trainer {
         let train_views = dataset.train_views();
-        Ok(Trainer {
-            scene: PagedScene::new(&columns, pager, &options)?,
+        Trainer {
+            scene,
             order: view_order(options.view_order, options.seed, dataset),
             train_views,
             working: WorkingSet::default(),
@@ -140,7 +146,7 @@ impl Trainer {
             steps_skipped: 0,
             steps_skipped_in_a_row: 0,
             train_seconds: 0.0,
-        })
+        }
     }
 
     /// Renders `count` views spread over the dataset, forward and backward, so that the memory of a view is allocated;

@@ -1,0 +1,151 @@
+//! What a run starts from: first Gaussians in memory, or points that go into pages one page at a time.
+//!
+//! Points are streamed when there is a spill directory: then the scene may be larger than memory. Gaussians from a PLY
+//! and points drawn at random are made in memory.
+//!
+//! Invariant: both ways give the same pages, bit for bit ([`crate::dataset::import`]).
+
+use super::pages::PagedScene;
+use super::run::{Prepared, check_train_views, prepare};
+use super::trainer::TrainError;
+use crate::base::error::{InputError, InputResult};
+use crate::config::file::TrainConfig;
+use crate::config::limits::{self, RunOptions};
+use crate::dataset::colmap;
+use crate::dataset::frame::Extent;
+use crate::dataset::import::{Budget, Cloud, ImportOptions, LocalCloud};
+use crate::dataset::loader::{Dataset, load_dataset_with_cloud};
+use crate::dataset::model::TakePoint;
+use crate::dataset::read::{ReadOptions, read_scene};
+use crate::exchange::ply;
+use crate::paging::pager::Pager;
+use crate::scene::columns::Columns;
+use crate::scene::init::InitOptions;
+use crate::scene::partition::first_fill;
+use std::path::{Path, PathBuf};
+
+/// Memory of an import where no budget is known, bytes.
+const BUDGET_DEFAULT: u64 = 1 << 30;
+
+/// A dataset and what its Gaussians are made from.
+pub struct Start {
+    /// Views and frame.
+    pub dataset: Dataset,
+    /// Degree in use from the first step.
+    pub sh_degree_start: u8,
+    /// Gaussians that there will be; of a cloud no fewer.
+    pub rows: u64,
+    from: FirstRows,
+}
+
+enum FirstRows {
+    Columns(Columns),
+    Points { cloud: Cloud, extent: Extent, init: InitOptions },
+}
+
+impl Start {
+    /// Reads the scene; of its points no more is kept in memory than `host_mem` allows, where they can be streamed.
+    ///
+    /// # Errors
+    /// As [`prepare`].
+    pub fn read(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
+        if !config.spill_dir.is_empty() {
+            let folder = folder_beside(Path::new(&config.spill_dir));
+            if let Some(start) = Start::stream(scene, config, &budget(&folder, host_mem))? {
+                return Ok(start);
+            }
+        }
+        let Prepared { dataset, columns, sh_degree_start } = prepare(scene, config)?;
+        Ok(Start { dataset, sh_degree_start, rows: columns.rows() as u64, from: FirstRows::Columns(columns) })
+    }
+
+    /// `None` where there are no points in a file.
+    fn stream(scene: &Path, config: &TrainConfig, budget: &Budget<'_>) -> InputResult<Option<Start>> {
+        let mut raw = read_scene(scene, &ReadOptions { points_later: true, ..limits::read_options(config) })?;
+        let file = match config.init_ply.as_str() {
+            "" => raw.points_path.take(),
+            path => Some(PathBuf::from(path)),
+        };
+        let Some(file) = file else { return Ok(None) };
+        if is_ply(&file) && ply::holds_gaussians(&file)? {
+            return Ok(None);
+        }
+        let mut warnings = Vec::new();
+        let cloud = Cloud::gather(budget, |take| read_points(&file, &mut warnings, take))?;
+        if cloud.is_empty() {
+            return Ok(None);
+        }
+        raw.warnings.append(&mut warnings);
+        let (dataset, local) = load_dataset_with_cloud(raw, &cloud, &limits::load_options(config))?;
+        check_train_views(scene, &dataset)?;
+        let extent = local.extent;
+        let mut rows = 0;
+        cloud.for_each(|position, _| {
+            rows += u64::from(extent.is_plausible(position));
+            Ok(())
+        })?;
+        if rows == 0 {
+            return Ok(None);
+        }
+        let init = InitOptions { scene_scale: dataset.scene_scale, ..limits::init_options(config) };
+        let rows = init.max_gaussians.map_or(rows, |most| rows.min(most as u64));
+        let from = FirstRows::Points { cloud, extent, init };
+        Ok(Some(Start { dataset, sh_degree_start: limits::first_sh_degree(config), rows, from }))
+    }
+
+    /// The dataset, and the Gaussians in the pages of `pager`.
+    ///
+    /// # Errors
+    /// The points cannot be read again, or a page could not be stored.
+    pub fn into_pages(
+        self,
+        pager: Pager,
+        options: &RunOptions,
+        config: &TrainConfig,
+        host_mem: Option<u64>,
+    ) -> Result<(Dataset, PagedScene), TrainError> {
+        let scene = match &self.from {
+            FirstRows::Columns(columns) => PagedScene::new(columns, pager, options)?,
+            FirstRows::Points { cloud, extent, init } => {
+                let folder = folder_beside(Path::new(&config.spill_dir));
+                let fill = first_fill(options.page_rows, options.densify.is_some());
+                let import = ImportOptions { init, fill, budget: budget(&folder, host_mem) };
+                let source = LocalCloud { cloud, extent: *extent, frame: self.dataset.frame };
+                PagedScene::import(&source, &import, pager, options)?
+            }
+        };
+        Ok((self.dataset, scene))
+    }
+}
+
+/// A third of the memory: the frames have a share already, and the system keeps what was just written.
+fn budget(folder: &Path, host_mem: Option<u64>) -> Budget<'_> {
+    Budget { folder, bytes: (host_mem.unwrap_or(BUDGET_DEFAULT) / 3) as usize }
+}
+
+/// A folder on the drive of the spill directory, which may not be there yet and must stay empty: the nearest one above
+/// it. What is written there has no name.
+fn folder_beside(spill_dir: &Path) -> PathBuf {
+    let above = spill_dir.ancestors().skip(1).find(|folder| folder.is_dir());
+    above.map_or_else(|| PathBuf::from("."), Path::to_path_buf)
+}
+
+fn is_ply(file: &Path) -> bool {
+    !file.extension().is_some_and(|e| e.eq_ignore_ascii_case("bin") || e.eq_ignore_ascii_case("txt"))
+}
+
+fn read_points(file: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>) -> InputResult<()> {
+    if !is_ply(file) {
+        return colmap::stream_points(file, warnings, take);
+    }
+    let dropped = ply::stream_points(file, take)?;
+    if dropped > 0 {
+        warnings.push(format!("{}: {dropped} points are not finite, dropped", file.display()));
+    }
+    Ok(())
+}
+
+/// The error of a page that could not be stored, on its way through an import.
+pub(super) fn not_stored(error: &impl std::fmt::Display) -> InputError {
+    InputError::new("--spill-dir", format!("a page could not be stored: {error}"), "see the cause")
+}
