@@ -17,44 +17,23 @@
 
 pub mod support;
 
-use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
-use gsscale::dataset::photo::decode;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Columns, row_width};
 use gsscale::scene::image::{Image, Target};
-use gsscale::scene::init::gaussians_from_points;
-use gsscale::scene::neighbours::nearest_dist2;
 use gsscale::train::catch_up::{gather, visible_rows};
 use gsscale::train::pages::{PagedScene, numbered};
 use gsscale::train::step::{WorkingSet, train_step};
 use serde_json::json;
-use std::path::PathBuf;
 use std::time::{Duration, Instant};
+use support::cases::{Case, PHOTO_CASES, photo_case, terrain_case};
 use support::floor::{bare_blend_rate, copy_rate};
-use support::{Args, Hash, Seconds, machine, median, terrain, time};
-
-/// A peer's CPU seconds per step on the same input, on another machine: two vCPUs of an AMD EPYC (Zen 5), OpenSplat
-/// 1.1.5, CPU build, SH degree 3, no densification.
-struct Peer {
-    cpu_seconds: f64,
-    /// We want to take a this-th part of it.
-    target: Option<f64>,
-}
-
-/// One input.
-struct Case {
-    name: String,
-    columns: Columns,
-    views: Vec<(Camera, Target)>,
-    scene_scale: f32,
-    peer: Option<Peer>,
-}
+use support::{Args, Hash, Seconds, machine, median, time};
 
 /// How much is measured.
 #[derive(Clone, Copy)]
@@ -83,18 +62,9 @@ fn main() {
         println!("{}", machine(simd));
         println!("floor a thread: {:.2} Gpixel-Gaussians/s, {:.1} GB/s", floor.pairs / 1e9, floor.bytes / 1e9);
     }
-    for (n, target) in [(10_000, Some(3.0)), (50_000, None), (200_000, Some(5.0))] {
-        let peer = |cpu_seconds| Some(Peer { cpu_seconds, target });
-        let cpu_seconds = match n {
-            10_000 => 0.098,
-            50_000 => 0.130,
-            _ => 0.380,
-        };
-        let name = format!("brighton_480x269_{}k", n / 1000);
-        measure(&args, &name, floor, || photo_case("brighton", 2.5, Some(n), peer(cpu_seconds)));
+    for real in &PHOTO_CASES {
+        measure(&args, real.name, floor, || photo_case(real, REAL.views));
     }
-    let peer = || Some(Peer { cpu_seconds: 0.302, target: Some(5.0) });
-    measure(&args, "sheffield_cross_395", floor, || photo_case("sheffield_cross_395", 1.0, None, peer()));
     let sizes = if args.sizes.is_empty() { vec![10_000, 100_000, 1_000_000] } else { args.sizes.clone() };
     for n in sizes {
         measure(&args, &format!("terrain_640x480_{n}"), floor, || Some(terrain_case(n, 640, 480, REAL.views)));
@@ -263,11 +233,11 @@ impl StepResult {
             self.hash
         );
         if let Some(peer) = &case.peer {
-            let factor = peer.cpu_seconds / self.cpu.cpu;
+            let factor = peer.opensplat / self.cpu.cpu;
             let wanted = peer.target.map_or(String::new(), |t| {
                 format!("; wanted {t:.0} ({}), stretch 10", if factor >= t { "reached" } else { "missed" })
             });
-            println!("  OpenSplat {:.0} ms CPU on a Zen 5: {factor:.1} times ours{wanted}", 1e3 * peer.cpu_seconds);
+            println!("  OpenSplat {:.0} ms CPU on a Zen 5: {factor:.1} times ours{wanted}", 1e3 * peer.opensplat);
         }
         print!("  wall ms:");
         for (name, seconds) in &self.parts {
@@ -282,8 +252,8 @@ impl StepResult {
             "isects": self.isects, "pairs": self.pairs, "cpu_seconds": self.cpu.cpu, "wall_seconds": self.cpu.wall,
             "cpu_seconds_least": self.spread[0], "cpu_seconds_most": self.spread[1],
             "floor_cpu_seconds": self.floor_seconds, "ratio_to_floor": self.cpu.cpu / self.floor_seconds,
-            "peer_cpu_seconds": case.peer.as_ref().map(|p| p.cpu_seconds),
-            "times_faster": case.peer.as_ref().map(|p| p.cpu_seconds / self.cpu.cpu),
+            "peer_cpu_seconds": case.peer.as_ref().map(|p| p.opensplat),
+            "times_faster": case.peer.as_ref().map(|p| p.opensplat / self.cpu.cpu),
             "target": case.peer.as_ref().and_then(|p| p.target),
             "stage_wall_seconds": self.parts.iter().map(|&(n, s)| (n.to_string(), json!(s))).collect::<serde_json::Map<_, _>>(),
             "losses": format!("{:016x}", self.hash), "path": simd.name(),
@@ -358,74 +328,4 @@ impl Renderer for Watched {
         self.backward_done = Some(Instant::now());
         value
     }
-}
-
-/// A real scene with photos, its points brought to `count`.
-fn photo_case(folder: &str, data_factor: f64, count: Option<usize>, peer: Option<Peer>) -> Option<Case> {
-    let data = std::env::var_os("GSSCALE_DATA")
-        .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
-    let scene = data.join(folder);
-    if !scene.is_dir() {
-        return None;
-    }
-    let config = TrainConfig { data_factor, sh_every: 0, ..TrainConfig::default() };
-    let prepared = gsscale::train::run::prepare(&scene, &config);
-    let Ok(prepared) = prepared else { panic!("{}: {:?}", scene.display(), prepared.err()) };
-    let dataset = prepared.dataset;
-    let columns = match count {
-        None => prepared.columns,
-        Some(count) => {
-            let (points, colors) = resampled(&dataset.points, &dataset.colors, count);
-            let mut options = gsscale::config::limits::init_options(&config);
-            options.scene_scale = dataset.scene_scale;
-            gaussians_from_points(&points, &colors, &options)
-        }
-    };
-    let train = dataset.train_views();
-    let views = train.iter().step_by(train.len().div_ceil(REAL.views)).map(|&v| {
-        let view = &dataset.views[v];
-        let target = decode(&view.photo);
-        let Ok(target) = target else { panic!("{}: {:?}", view.name, target.err()) };
-        (view.camera, target)
-    });
-    Some(Case { name: String::new(), columns, views: views.collect(), scene_scale: dataset.scene_scale, peer })
-}
-
-/// `count` points: those there are, taken in turn, from the second turn on moved by a draw of half the distance to their
-/// neighbours; or the first `count` of an order that hashes their index.
-fn resampled(points: &[[f32; 3]], colors: &[[u8; 3]], count: usize) -> (Vec<[f32; 3]>, Vec<[u8; 3]>) {
-    let mut order: Vec<usize> = (0..points.len()).collect();
-    order.sort_by_cached_key(|&i| gsscale::base::rng::hash64(&[1, i as u64]));
-    let dist2 = nearest_dist2(points);
-    let mut out = (Vec::with_capacity(count), Vec::with_capacity(count));
-    for i in 0..count {
-        let from = order[i % order.len()];
-        let mut point = points[from];
-        if i >= order.len() {
-            let mut draws = Stream::new(1, Purpose::Test, i as u64, 0);
-            let near = 0.5 * f64::from(dist2[from][0]).sqrt();
-            point.iter_mut().for_each(|x| *x += (near * draws.normal()) as f32);
-        }
-        out.0.push(point);
-        out.1.push(colors[from]);
-    }
-    out
-}
-
-/// Rows of a terrain, disturbed, and pictures of the terrain as it was, from places around the first camera.
-fn terrain_case(n: usize, width: u32, height: u32, views: usize) -> Case {
-    let (mut columns, camera) = terrain(n, width, height);
-    let mut renderer = CpuRenderer::new();
-    let views = (0..views).map(|i| {
-        let mut camera = camera;
-        let turn = i as f32 * 2.4;
-        camera.viewmat[0][3] = 0.4 * turn.cos();
-        camera.viewmat[2][3] += 0.4 * turn.sin();
-        let image = renderer.forward(&columns, &camera, &RenderOptions::default());
-        (camera, Target { width, height, rgb: image.to_rgb8(), mask: None })
-    });
-    let views = views.collect();
-    let mut draws = Stream::new(2, Purpose::Test, n as u64, 0);
-    columns.sh0.iter_mut().for_each(|x| *x += 0.3 * draws.normal() as f32);
-    Case { name: String::new(), columns, views, scene_scale: 2.0, peer: None }
 }

@@ -5,6 +5,8 @@
 //! work too; where the system does not tell them they are wall seconds times threads.
 #![allow(dead_code)] // each benchmark uses a part of it
 
+pub mod cases;
+pub mod device_bytes;
 pub mod floor;
 
 use gsscale::base::machine::cpu_model;

@@ -3,7 +3,9 @@
 //
 // Three entry points, run in this order:
 //   ssim_map     one workgroup per tile and channel: SSIM's three derivative maps, and the tile's sum of SSIM;
-//   gradient     likewise: v_rgb, and the tile's sums of absolute and squared differences;
+//   gradient     likewise: v_rgb, and the tile's sums of absolute and squared differences.
+//                In both an invocation takes four places side by side, whose windows share most of what they read:
+//                first four of a row of the patch, then four pixels of a column;
 //   sum_partials one workgroup per 4,096 partial sums: adds them up in a fixed order. Run again until one is left.
 // ssim_map and gradient cover `channel_count` channels from `first_channel` on, so that the derivative maps, 12 bytes
 // per pixel and channel, may be kept for one channel at a time.
@@ -40,7 +42,9 @@ struct LossUniforms {
 /// What sum_partials makes of them.
 @group(0) @binding(6) var<storage, read_write> sums: array<vec4<f32>>;
 
-/// Invocations of a workgroup: one for each pixel of a tile.
+/// Invocations of a workgroup of ssim_map and gradient: one for every four pixels of a tile.
+const LANES: u32 = 64u;
+/// Invocations of a workgroup of sum_partials.
 const WORKGROUP: u32 = 256u;
 const RADIUS: u32 = 5u;
 /// Side of a tile with the window's margin.
@@ -137,21 +141,32 @@ fn three(at: u32) -> vec4<f32> {
     return vec4<f32>(patch_two[at], patch_one[at], 0.0);
 }
 
-/// The window down a column of what was filtered along rows, from place t on.
-fn down(t: u32) -> vec4<f32> {
-    return windowed(
-        filtered[t + 80u],
-        filtered[t + 64u] + filtered[t + 96u],
-        filtered[t + 48u] + filtered[t + 112u],
-        filtered[t + 32u] + filtered[t + 128u],
-        filtered[t + 16u] + filtered[t + 144u],
-        filtered[t] + filtered[t + 160u],
+/// Fours of places side by side in the rows of a patch.
+const FOURS_LEN: u32 = 104u;
+/// What the windows of four neighbours span.
+const SPAN: u32 = 14u;
+
+/// The window at four places side by side.
+fn windowed_4(v: array<vec4<f32>, SPAN>) -> array<vec4<f32>, 4> {
+    return array<vec4<f32>, 4>(
+#repeat K 0u 1u 2u 3u
+        windowed(v[K + 5u], v[K + 4u] + v[K + 6u], v[K + 3u] + v[K + 7u], v[K + 2u] + v[K + 8u], v[K + 1u] + v[K + 9u], v[K] + v[K + 10u]),
+#end
     );
+}
+
+/// The window down a column of what was filtered along rows, at four pixels from place t on.
+fn down_4(t: u32) -> array<vec4<f32>, 4> {
+    var v: array<vec4<f32>, SPAN>;
+#repeat K 0u 1u 2u 3u 4u 5u 6u 7u 8u 9u 10u 11u 12u 13u
+    v[K] = filtered[t + TILE * K];
+#end
+    return windowed_4(v);
 }
 
 /// Adds up the lanes' sums in the memory of the patch, which nobody reads any more; the first lane has the result.
 #ifdef SUBGROUPS
-fn sum_lanes(place: Place, value: vec3<f32>) -> vec3<f32> {
+fn sum_lanes(place: Place, lanes: u32, value: vec3<f32>) -> vec3<f32> {
     let part = subgroupAdd(value);
     if place.in_subgroup == 0u {
         patch_two[place.subgroup] = part.xy;
@@ -167,15 +182,17 @@ fn sum_lanes(place: Place, value: vec3<f32>) -> vec3<f32> {
     return sum;
 }
 #else
-fn sum_lanes(place: Place, value: vec3<f32>) -> vec3<f32> {
+fn sum_lanes(place: Place, lanes: u32, value: vec3<f32>) -> vec3<f32> {
     let lane = place.lane;
     patch_two[lane] = value.xy;
     patch_one[lane] = value.z;
     workgroupBarrier();
+    // Sixteen parts of as many lanes as it takes.
+    let each = lanes / 16u;
     var sum = vec3<f32>();
     if lane < 16u {
-        for (var k = 0u; k < 16u; k++) {
-            sum += vec3<f32>(patch_two[16u * lane + k], patch_one[16u * lane + k]);
+        for (var k = 0u; k < each; k++) {
+            sum += vec3<f32>(patch_two[each * lane + k], patch_one[each * lane + k]);
         }
     }
     workgroupBarrier();
@@ -209,11 +226,11 @@ fn ssim_point(mx: f32, my: f32, squares: f32, products: f32) -> vec4<f32> {
     return vec4<f32>(ssim, v_mean, -ssim * b1 * inverse, 2.0 * a1 * inverse);
 }
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(64)
 fn ssim_map(place: Place) {
     let lane = place.lane;
     let j = job(linear_group(place.workgroup, place.workgroups));
-    for (var at = lane; at < PATCH_LEN; at += WORKGROUP) {
+    for (var at = lane; at < PATCH_LEN; at += LANES) {
         let pixel = pixel_of_patch(j, at);
         var both = vec2<f32>();
         if j.exists && pixel != 0xffffffffu {
@@ -222,49 +239,53 @@ fn ssim_map(place: Place) {
         patch_two[at] = both;
     }
     workgroupBarrier();
-    for (var at = lane; at < FILTERED_LEN; at += WORKGROUP) {
-        let first = (at / TILE) * PATCH + at % TILE;
-        filtered[at] = windowed(
-            four(first + 5u),
-            four(first + 4u) + four(first + 6u),
-            four(first + 3u) + four(first + 7u),
-            four(first + 2u) + four(first + 8u),
-            four(first + 1u) + four(first + 9u),
-            four(first) + four(first + 10u),
-        );
+    for (var at = lane; at < FOURS_LEN; at += LANES) {
+        let first = (at / 4u) * PATCH + 4u * (at % 4u);
+        var v: array<vec4<f32>, SPAN>;
+#repeat K 0u 1u 2u 3u 4u 5u 6u 7u 8u 9u 10u 11u 12u 13u
+        v[K] = four(first + K);
+#end
+        let sums = windowed_4(v);
+#repeat K 0u 1u 2u 3u
+        filtered[4u * at + K] = sums[K];
+#end
     }
     workgroupBarrier();
     let column = lane % TILE;
-    let row = lane / TILE;
-    let means = down(row * TILE + column);
+    let row = lane / TILE * 4u;
+    let means = down_4(row * TILE + column);
     let x = j.x0 + column;
-    let y = j.y0 + row;
+    let pixels = loss.width * loss.height;
     var sum = vec3<f32>();
-    if j.exists && x < loss.width && y < loss.height {
-        let pixels = loss.width * loss.height;
-        let pixel = y * loss.width + x;
-        let inside = x >= loss.margin && x + loss.margin < loss.width && y >= loss.margin && y + loss.margin < loss.height;
-        var point = vec4<f32>();
-        if inside && (target_pixels[pixel] >> 24u) != 0u {
-            point = ssim_point(means.x, means.y, means.z, means.w);
+#repeat K 0u 1u 2u 3u
+    {
+        let y = j.y0 + row + K;
+        if j.exists && x < loss.width && y < loss.height {
+            let pixel = y * loss.width + x;
+            let inside = x >= loss.margin && x + loss.margin < loss.width && y >= loss.margin && y + loss.margin < loss.height;
+            var point = vec4<f32>();
+            if inside && (target_pixels[pixel] >> 24u) != 0u {
+                point = ssim_point(means[K].x, means[K].y, means[K].z, means[K].w);
+            }
+            sum.z += point.x;
+            derivatives[3u * j.plane * pixels + pixel] = point.y;
+            derivatives[(3u * j.plane + 1u) * pixels + pixel] = point.z;
+            derivatives[(3u * j.plane + 2u) * pixels + pixel] = point.w;
         }
-        sum.z = point.x;
-        derivatives[3u * j.plane * pixels + pixel] = point.y;
-        derivatives[(3u * j.plane + 1u) * pixels + pixel] = point.z;
-        derivatives[(3u * j.plane + 2u) * pixels + pixel] = point.w;
     }
-    let total = sum_lanes(place, sum);
+#end
+    let total = sum_lanes(place, LANES, sum);
     if lane == 0u && j.exists {
         partials[j.partial] = vec4<f32>(total, 0.0);
     }
 }
 
-@compute @workgroup_size(256)
+@compute @workgroup_size(64)
 fn gradient(place: Place) {
     let lane = place.lane;
     let j = job(linear_group(place.workgroup, place.workgroups));
     let pixels = loss.width * loss.height;
-    for (var at = lane; at < PATCH_LEN; at += WORKGROUP) {
+    for (var at = lane; at < PATCH_LEN; at += LANES) {
         let pixel = pixel_of_patch(j, at);
         var two = vec2<f32>();
         var one = 0.0;
@@ -279,35 +300,39 @@ fn gradient(place: Place) {
         patch_one[at] = one;
     }
     workgroupBarrier();
-    for (var at = lane; at < FILTERED_LEN; at += WORKGROUP) {
-        let first = (at / TILE) * PATCH + at % TILE;
-        filtered[at] = windowed(
-            three(first + 5u),
-            three(first + 4u) + three(first + 6u),
-            three(first + 3u) + three(first + 7u),
-            three(first + 2u) + three(first + 8u),
-            three(first + 1u) + three(first + 9u),
-            three(first) + three(first + 10u),
-        );
+    for (var at = lane; at < FOURS_LEN; at += LANES) {
+        let first = (at / 4u) * PATCH + 4u * (at % 4u);
+        var v: array<vec4<f32>, SPAN>;
+#repeat K 0u 1u 2u 3u 4u 5u 6u 7u 8u 9u 10u 11u 12u 13u
+        v[K] = three(first + K);
+#end
+        let sums = windowed_4(v);
+#repeat K 0u 1u 2u 3u
+        filtered[4u * at + K] = sums[K];
+#end
     }
     workgroupBarrier();
     let column = lane % TILE;
-    let row = lane / TILE;
-    let d = down(row * TILE + column);
+    let row = lane / TILE * 4u;
+    let d = down_4(row * TILE + column);
     let x = j.x0 + column;
-    let y = j.y0 + row;
     var sum = vec3<f32>();
-    if j.exists && x < loss.width && y < loss.height {
-        let pixel = y * loss.width + x;
-        let both = values(j.channel, pixel);
-        let difference = both.x - both.y;
-        var v = select(0.0, loss.l1_weight, difference > 0.0) - select(0.0, loss.l1_weight, difference < 0.0);
-        v += loss.ssim_weight * (2.0 * both.x * d.y + both.y * d.z + d.x);
-        let counts = (target_pixels[pixel] >> 24u) != 0u;
-        v_rgb[j.channel * pixels + pixel] = select(0.0, v, counts);
-        sum = vec3<f32>(abs(difference), difference * difference, 0.0);
+#repeat K 0u 1u 2u 3u
+    {
+        let y = j.y0 + row + K;
+        if j.exists && x < loss.width && y < loss.height {
+            let pixel = y * loss.width + x;
+            let both = values(j.channel, pixel);
+            let difference = both.x - both.y;
+            var v = select(0.0, loss.l1_weight, difference > 0.0) - select(0.0, loss.l1_weight, difference < 0.0);
+            v += loss.ssim_weight * (2.0 * both.x * d[K].y + both.y * d[K].z + d[K].x);
+            let counts = (target_pixels[pixel] >> 24u) != 0u;
+            v_rgb[j.channel * pixels + pixel] = select(0.0, v, counts);
+            sum += vec3<f32>(abs(difference), difference * difference, 0.0);
+        }
     }
-    let total = sum_lanes(place, sum);
+#end
+    let total = sum_lanes(place, LANES, sum);
     if lane == 0u && j.exists {
         partials[j.partial] = vec4<f32>(total.xy, partials[j.partial].z, 0.0);
     }
@@ -325,7 +350,7 @@ fn sum_partials(place: Place) {
             sum += partials[at].xyz;
         }
     }
-    let total = sum_lanes(place, sum);
+    let total = sum_lanes(place, WORKGROUP, sum);
     if lane == 0u && group < (loss.partial_count + each - 1u) / each {
         sums[group] = vec4<f32>(total, 0.0);
     }

@@ -4,7 +4,8 @@
 //
 // No float atomics: the sums of an invocation's pixels are added within the subgroup (without subgroups, each
 // invocation is a part of its own), the parts through workgroup memory in a fixed order, and one invocation writes them
-// to the place that belongs to this intersection. So a device gives the same bits whenever it runs again.
+// to the place that belongs to this intersection. Where subgroups have 8 invocations, sums within one are written out,
+// 8 splats at a time. So a device gives the same bits whenever it runs again.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/raster.wgsl"
@@ -20,7 +21,7 @@
 @group(0) @binding(7) var<storage, read> v_rgb: array<f32>;
 /// [height][width], read with HAS_V_ALPHA only.
 @group(0) @binding(8) var<storage, read> v_alpha: array<f32>;
-/// [intersections][9]
+/// [intersections of the window][9]
 @group(0) @binding(9) var<storage, read_write> partials: array<f32>;
 /// [height][width][2]: t and behind, where the list has more than one segment.
 @group(0) @binding(10) var<storage, read_write> carry: array<vec2<f32>>;
@@ -41,20 +42,159 @@ var<workgroup> sums: array<f32, 2304>;
 /// Largest stop of the tile.
 var<workgroup> tile_stop: atomic<u32>;
 
+/// An invocation's four pixels.
+struct Pixels {
+    /// Transmittance behind the splats passed so far.
+    t: vec4<f32>,
+    /// What is seen behind them, dotted with v_rgb.
+    behind: vec4<f32>,
+    stop: vec4<u32>,
+    v_red: vec4<f32>,
+    v_green: vec4<f32>,
+    v_blue: vec4<f32>,
+}
+
+/// The nine sums over an invocation's pixels.
+struct Sums {
+    h: f32,
+    firsts: vec2<f32>,
+    seconds: vec3<f32>,
+    color: vec3<f32>,
+}
+
+fn pixels_behind(at: u32, plane: u32, inside: vec4<bool>) -> Pixels {
+    var p: Pixels;
+    for (var i = 0u; i < 4u; i++) {
+        if inside[i] {
+            let here = at + i;
+            p.v_red[i] = v_rgb[here];
+            p.v_green[i] = v_rgb[plane + here];
+            p.v_blue[i] = v_rgb[2u * plane + here];
+            p.stop[i] = stops[here];
+            if (view.flags & SEGMENT_FIRST) != 0u {
+                p.t[i] = t_final[here];
+                p.behind[i] = dot(view.background, vec3<f32>(p.v_red[i], p.v_green[i], p.v_blue[i]));
+                if (view.flags & HAS_V_ALPHA) != 0u {
+                    p.behind[i] -= v_alpha[here];
+                }
+            } else {
+                p.t[i] = carry[here].x;
+                p.behind[i] = carry[here].y;
+            }
+        }
+    }
+    return p;
+}
+
+/// Takes a splat off the pixels where it takes part.
+fn take_off(
+    pixels: ptr<function, Pixels>,
+    splat: TileSplat,
+    e: vec4<f32>,
+    taking_part: vec4<bool>,
+    dx: vec4<f32>,
+    dy: f32,
+) -> Sums {
+    let alpha = select(vec4<f32>(0.0), alphas(e, splat.log2_opacity, view.max_alpha), taking_part);
+    let before = (*pixels).t / (vec4<f32>(1.0) - alpha);
+    let weight = alpha * before;
+    let v_red = (*pixels).v_red;
+    let v_green = (*pixels).v_green;
+    let v_blue = (*pixels).v_blue;
+    // alpha dL/dalpha = weight (what the splat shows - what it hides)
+    let over = splat.color.x * v_red + (splat.color.y * v_green + splat.color.z * v_blue) - (*pixels).behind;
+    let h = select(vec4<f32>(0.0), weight * over, e <= vec4<f32>(view.log2_max_alpha));
+    (*pixels).t = before;
+    (*pixels).behind += alpha * over;
+    let hx = h * dx;
+    let h_sum = (h.x + h.y) + (h.z + h.w);
+    let hx_sum = (hx.x + hx.y) + (hx.z + hx.w);
+    return Sums(
+        h_sum,
+        vec2<f32>(hx_sum, dy * h_sum),
+        vec3<f32>(dot(hx, dx), dy * hx_sum, dy * dy * h_sum),
+        vec3<f32>(dot(weight, v_red), dot(weight, v_green), dot(weight, v_blue)),
+    );
+}
+
+fn write_sums(to: u32, parts: u32, s: Sums) {
+    sums[to] = s.h;
+    sums[to + parts] = s.firsts.x;
+    sums[to + 2u * parts] = s.firsts.y;
+    sums[to + 3u * parts] = s.seconds.x;
+    sums[to + 4u * parts] = s.seconds.y;
+    sums[to + 5u * parts] = s.seconds.z;
+    sums[to + 6u * parts] = s.color.x;
+    sums[to + 7u * parts] = s.color.y;
+    sums[to + 8u * parts] = s.color.z;
+}
+
+#ifdef SUBGROUPS_OF_8
+/// The sum over a subgroup of 8, known to all of it.
+fn sum_of_8(v: vec3<f32>) -> vec3<f32> {
+    let low = (subgroupBroadcast(v, 0u) + subgroupBroadcast(v, 1u)) + (subgroupBroadcast(v, 2u) + subgroupBroadcast(v, 3u));
+    let high = (subgroupBroadcast(v, 4u) + subgroupBroadcast(v, 5u)) + (subgroupBroadcast(v, 6u) + subgroupBroadcast(v, 7u));
+    return low + high;
+}
+
+/// Takes off the splats [first, first + 8) that lie below `size` and leaves their sums in workgroup memory: each
+/// invocation of the subgroup loads one, the others take it over from there, and it keeps that splat's sums.
+fn take_off_8(pixels: ptr<function, Pixels>, first: u32, list_index: u32, size: u32, x: vec4<f32>, y: f32, part: u32, own_lane: u32) {
+    var own = batch[min(first + own_lane, size - 1u)];
+    // Beyond the end: far below every threshold.
+    own.log2_opacity = select(-1e30, own.log2_opacity, first + own_lane < size);
+    var one = vec3<f32>();
+    var two = vec3<f32>();
+    var three = vec3<f32>();
+#repeat LANE 7u 6u 5u 4u 3u 2u 1u 0u
+    {
+        let splat = TileSplat(
+            subgroupBroadcast(own.mean, LANE),
+            subgroupBroadcast(own.a, LANE),
+            subgroupBroadcast(own.b, LANE),
+            subgroupBroadcast(own.c, LANE),
+            subgroupBroadcast(own.log2_opacity, LANE),
+            subgroupBroadcast(own.color, LANE),
+        );
+        let dx = x - vec4<f32>(splat.mean.x);
+        let dy = y - splat.mean.y;
+        let e = exponents(splat, dx, dy);
+        let taking_part = (e >= vec4<f32>(LOG2_ALPHA_MIN)) & (vec4<u32>(list_index + first + LANE) < (*pixels).stop);
+        let s = take_off(pixels, splat, e, taking_part, dx, dy);
+        one = select(one, sum_of_8(vec3<f32>(s.h, s.firsts)), own_lane == LANE);
+        two = select(two, sum_of_8(s.seconds), own_lane == LANE);
+        three = select(three, sum_of_8(s.color), own_lane == LANE);
+    }
+#end
+    if first + own_lane < size {
+        write_sums((first + own_lane) * SUMS * 8u + part, 8u, Sums(one.x, one.yz, two, three));
+    }
+}
+#endif
+
 @compute @workgroup_size(64)
 fn rasterize_bwd(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
+#ifdef SUBGROUPS_OF_8
+    @builtin(subgroup_id) part: u32,
+    @builtin(subgroup_invocation_id) subgroup_lane: u32,
+#else
 #ifdef SUBGROUPS
     @builtin(subgroup_id) part: u32,
     @builtin(num_subgroups) parts: u32,
     @builtin(subgroup_invocation_id) subgroup_lane: u32,
 #endif
+#endif
 ) {
+#ifdef SUBGROUPS_OF_8
+    let parts = 8u;
+#else
 #ifndef SUBGROUPS
     let part = lane;
     let parts = TILE_LANES;
+#endif
 #endif
     let tile = linear_group(workgroup, workgroups);
     let grid = view.grid;
@@ -67,33 +207,8 @@ fn rasterize_bwd(
     let at = pixel.y * grid.width + pixel.x;
     let inside = (vec4<u32>(pixel.x) + vec4<u32>(0u, 1u, 2u, 3u) < vec4<u32>(grid.width))
         & vec4<bool>(pixel.y < grid.height);
-
-    var t = vec4<f32>(0.0);
-    // What is seen behind the splats passed so far, dotted with v_rgb.
-    var behind = vec4<f32>(0.0);
-    var stop = vec4<u32>(0u);
-    var v_red = vec4<f32>(0.0);
-    var v_green = vec4<f32>(0.0);
-    var v_blue = vec4<f32>(0.0);
-    for (var i = 0u; i < 4u; i++) {
-        if inside[i] {
-            let p = at + i;
-            v_red[i] = v_rgb[p];
-            v_green[i] = v_rgb[plane + p];
-            v_blue[i] = v_rgb[2u * plane + p];
-            stop[i] = stops[p];
-            if (view.flags & SEGMENT_FIRST) != 0u {
-                t[i] = t_final[p];
-                behind[i] = dot(view.background, vec3<f32>(v_red[i], v_green[i], v_blue[i]));
-                if (view.flags & HAS_V_ALPHA) != 0u {
-                    behind[i] -= v_alpha[p];
-                }
-            } else {
-                t[i] = carry[p].x;
-                behind[i] = carry[p].y;
-            }
-        }
-    }
+    var pixels = pixels_behind(at, plane, inside);
+    let stop = pixels.stop;
     atomicMax(&tile_stop, max(max(stop.x, stop.y), max(stop.z, stop.w)));
 
     let list = tile_offsets[tile];
@@ -116,6 +231,12 @@ fn rasterize_bwd(
         workgroupBarrier();
         // Uniform: nothing changes it behind the first barrier.
         let reached = first < atomicLoad(&tile_stop);
+#ifdef SUBGROUPS_OF_8
+        for (var i = (size + 7u) / 8u * 8u; reached && i > 0u;) {
+            i -= 8u;
+            take_off_8(&pixels, i, first, size, x, y, part, subgroup_lane);
+        }
+#else
         for (var i = size; reached && i > 0u;) {
             i--;
             let splat = batch[i];
@@ -127,38 +248,20 @@ fn rasterize_bwd(
 #ifdef SUBGROUPS
             if !subgroupAny(any(taking_part)) {
                 if subgroup_lane == 0u {
-                    write_sums(to, parts, 0.0, vec2<f32>(), vec3<f32>(), vec3<f32>());
+                    write_sums(to, parts, Sums());
                 }
                 continue;
             }
-#endif
-            let alpha = select(vec4<f32>(0.0), alphas(e, splat.log2_opacity, view.max_alpha), taking_part);
-            let before = t / (vec4<f32>(1.0) - alpha);
-            let weight = alpha * before;
-            // alpha dL/dalpha = weight (what the splat shows - what it hides)
-            let over = splat.color.x * v_red + (splat.color.y * v_green + splat.color.z * v_blue) - behind;
-            let h = select(vec4<f32>(0.0), weight * over, e <= vec4<f32>(view.log2_max_alpha));
-            t = before;
-            behind += alpha * over;
-            let hx = h * dx;
-            var h_sum = (h.x + h.y) + (h.z + h.w);
-            var hx_sum = (hx.x + hx.y) + (hx.z + hx.w);
-            var hxx_sum = dot(hx, dx);
-            var color_sums = vec3<f32>(dot(weight, v_red), dot(weight, v_green), dot(weight, v_blue));
-            var firsts = vec2<f32>(hx_sum, dy * h_sum);
-            var seconds = vec3<f32>(hxx_sum, dy * hx_sum, dy * dy * h_sum);
-#ifdef SUBGROUPS
-            h_sum = subgroupAdd(h_sum);
-            firsts = subgroupAdd(firsts);
-            seconds = subgroupAdd(seconds);
-            color_sums = subgroupAdd(color_sums);
+            var s = take_off(&pixels, splat, e, taking_part, dx, dy);
+            s = Sums(subgroupAdd(s.h), subgroupAdd(s.firsts), subgroupAdd(s.seconds), subgroupAdd(s.color));
             if subgroup_lane == 0u {
-                write_sums(to, parts, h_sum, firsts, seconds, color_sums);
+                write_sums(to, parts, s);
             }
 #else
-            write_sums(to, parts, h_sum, firsts, seconds, color_sums);
+            write_sums(to, parts, take_off(&pixels, splat, e, taking_part, dx, dy));
 #endif
         }
+#endif
         workgroupBarrier();
         for (var i = lane; i < size * SUMS; i += TILE_LANES) {
             var sum = 0.0;
@@ -174,28 +277,19 @@ fn rasterize_bwd(
                     }
                 }
             }
-            partials[batch_isects[i / SUMS] * SUMS + i % SUMS] = sum;
+            let isect = batch_isects[i / SUMS];
+            if isect >= view.window_first && isect < view.window_end {
+                partials[(isect - view.window_first) * SUMS + i % SUMS] = sum;
+            }
         }
     }
     if (view.flags & SEGMENT_LAST) == 0u {
         for (var i = 0u; i < 4u; i++) {
             if inside[i] {
-                carry[at + i] = vec2<f32>(t[i], behind[i]);
+                carry[at + i] = vec2<f32>(pixels.t[i], pixels.behind[i]);
             }
         }
     }
-}
-
-fn write_sums(to: u32, parts: u32, h: f32, firsts: vec2<f32>, seconds: vec3<f32>, color: vec3<f32>) {
-    sums[to] = h;
-    sums[to + parts] = firsts.x;
-    sums[to + 2u * parts] = firsts.y;
-    sums[to + 3u * parts] = seconds.x;
-    sums[to + 4u * parts] = seconds.y;
-    sums[to + 5u * parts] = seconds.z;
-    sums[to + 6u * parts] = color.x;
-    sums[to + 7u * parts] = color.y;
-    sums[to + 8u * parts] = color.z;
 }
 
 /// Rows of a workgroup; its last four invocations rest.
@@ -205,11 +299,12 @@ var<workgroup> row_sums: array<f32, 256>;
 
 /// One sum of one intersection; nothing where it was counted and then not found, since no tile wrote it.
 fn partial(isect: u32, row: u32, which: u32) -> f32 {
-    return select(0.0, partials[isect * SUMS + which], row_from_isect[isect] == row);
+    return select(0.0, partials[(isect - view.window_first) * SUMS + which], row_from_isect[isect] == row);
 }
 
 /// Folds the sums of each row over its intersections, in emit order (tiles column by column), and turns them into
-/// gradients. Nine invocations take a row, one for each sum.
+/// gradients. Nine invocations take a row, one for each sum. A row that ends beyond the window leaves its sums where its
+/// gradients will be, in the order of the sums, and the next window goes on from there.
 @compute @workgroup_size(256)
 fn fold_rows(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -222,8 +317,14 @@ fn fold_rows(
     var sum = 0.0;
     if lane < GROUP_ROWS * SUMS && rank < view.row_count {
         let row = order[rank];
-        let end = min(offsets[rank + 1u], view.isect_count);
-        var isect = min(offsets[rank], end);
+        let row_end = min(offsets[rank + 1u], view.isect_count);
+        let row_first = min(offsets[rank], row_end);
+        let end = min(row_end, view.window_end);
+        var isect = max(row_first, view.window_first);
+        if row_first < view.window_first && row_end > view.window_first {
+            let carried = v_splats[SPLAT_STRIDE * row + which / 4u];
+            sum = carried[which % 4u];
+        }
         // By fours, to stay below the limit on iterations; the order of the additions is that of the intersections.
         while isect + 4u <= end {
             let p0 = partial(isect, row, which);
@@ -246,8 +347,21 @@ fn fold_rows(
     }
     let row = order[own_rank];
     let at = SPLAT_STRIDE * row;
-    let splat = splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]);
     let s = lane * SUMS;
+    let row_end = min(offsets[own_rank + 1u], view.isect_count);
+    let row_first = min(offsets[own_rank], row_end);
+    // A row without intersections belongs to the first window, another to each that has some of its own.
+    let is_here = select(view.window_first == 0u, row_first < view.window_end && row_end > view.window_first, row_end > row_first);
+    if !is_here {
+        return;
+    }
+    if row_end > view.window_end {
+        v_splats[at] = vec4<f32>(row_sums[s], row_sums[s + 1u], row_sums[s + 2u], row_sums[s + 3u]);
+        v_splats[at + 1u] = vec4<f32>(row_sums[s + 4u], row_sums[s + 5u], row_sums[s + 6u], row_sums[s + 7u]);
+        v_splats[at + 2u] = vec4<f32>(row_sums[s + 8u], 0.0, 0.0, 0.0);
+        return;
+    }
+    let splat = splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]);
     // dL/dsigma = -h; sigma = (A dx^2 + C dy^2) / 2 + B dx dy with dx = pixel - mean.
     let conic = splat.conic;
     let v_mean = vec2<f32>(conic.x * row_sums[s + 1u] + conic.y * row_sums[s + 2u], conic.y * row_sums[s + 1u] + conic.z * row_sums[s + 2u]);

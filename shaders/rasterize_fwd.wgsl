@@ -2,6 +2,9 @@
 //
 // Dead pixels (stopped, or outside the image) keep t = 0, so they add nothing, and a floor of -1, so they never stop
 // again.
+//
+// Where subgroups have 8 invocations, each goes through the list by itself, 8 splats at a time: every invocation loads
+// one and the others take it over from there. Elsewhere the workgroup loads batches into its memory.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/raster.wgsl"
@@ -19,6 +22,88 @@
 /// [height][width]: list index of the splat at which the pixel stopped, or NEVER.
 @group(0) @binding(7) var<storage, read_write> stops: array<u32>;
 
+/// An invocation's four pixels.
+struct Pixels {
+    /// Transmittance, 0 once dead.
+    t: vec4<f32>,
+    /// The transmittance that stops a pixel, or -1 once it is dead.
+    low: vec4<f32>,
+    /// Transmittance where it stopped.
+    end_t: vec4<f32>,
+    stop: vec4<u32>,
+    red: vec4<f32>,
+    green: vec4<f32>,
+    blue: vec4<f32>,
+}
+
+fn are_alive(pixels: Pixels) -> bool {
+    return any(pixels.low > vec4<f32>(0.0));
+}
+
+/// Blends list entry `index`, whose exponents are `e`.
+fn blend(pixels: ptr<function, Pixels>, splat: TileSplat, e: vec4<f32>, index: u32) {
+    let above = e >= vec4<f32>(LOG2_ALPHA_MIN);
+    let alpha = select(vec4<f32>(0.0), alphas(e, splat.log2_opacity, view.max_alpha), above);
+    let t = (*pixels).t;
+    let next = t - alpha * t;
+    let stopping = next <= (*pixels).low;
+    (*pixels).end_t = select((*pixels).end_t, t, stopping);
+    (*pixels).stop = select((*pixels).stop, vec4<u32>(index), stopping);
+    (*pixels).low = select((*pixels).low, vec4<f32>(-1.0), stopping);
+    (*pixels).t = select(next, vec4<f32>(0.0), stopping);
+    let weight = select(alpha * t, vec4<f32>(0.0), stopping);
+    (*pixels).red += weight * splat.color.x;
+    (*pixels).green += weight * splat.color.y;
+    (*pixels).blue += weight * splat.color.z;
+}
+
+/// The pixels as they are before the segment.
+fn pixels_before(at: u32, plane: u32, inside: vec4<bool>) -> Pixels {
+    var p: Pixels;
+    p.t = select(vec4<f32>(0.0), vec4<f32>(1.0), inside);
+    p.low = select(vec4<f32>(-1.0), vec4<f32>(TRANSMITTANCE_MIN), inside);
+    p.stop = vec4<u32>(NEVER);
+    if (view.flags & SEGMENT_FIRST) == 0u {
+        for (var i = 0u; i < 4u; i++) {
+            if inside[i] {
+                p.red[i] = rgb[at + i];
+                p.green[i] = rgb[plane + at + i];
+                p.blue[i] = rgb[2u * plane + at + i];
+                p.stop[i] = stops[at + i];
+                p.end_t[i] = t_final[at + i];
+                let alive = p.stop[i] == NEVER;
+                p.t[i] = select(0.0, p.end_t[i], alive);
+                p.low[i] = select(-1.0, TRANSMITTANCE_MIN, alive);
+            }
+        }
+    }
+    return p;
+}
+
+fn write_pixels(pixels: Pixels, at: u32, plane: u32, inside: vec4<bool>) {
+    var p = pixels;
+    p.end_t = select(p.end_t, p.t, p.low > vec4<f32>(0.0));
+    if (view.flags & SEGMENT_LAST) != 0u {
+        p.red += p.end_t * view.background.x;
+        p.green += p.end_t * view.background.y;
+        p.blue += p.end_t * view.background.z;
+    }
+    for (var i = 0u; i < 4u; i++) {
+        if inside[i] {
+            rgb[at + i] = p.red[i];
+            rgb[plane + at + i] = p.green[i];
+            rgb[2u * plane + at + i] = p.blue[i];
+            t_final[at + i] = p.end_t[i];
+            stops[at + i] = p.stop[i];
+        }
+    }
+}
+
+fn splat_of(entry: u32) -> TileSplat {
+    let record = SPLAT_STRIDE * row_from_isect[isects[entry]];
+    return tile_splat(splat_unpack(splats[record], splats[record + 1u], splats[record + 2u]));
+}
+
 var<workgroup> batch: array<TileSplat, TILE_LANES>;
 /// Invocations whose four pixels are dead.
 var<workgroup> finished: atomic<u32>;
@@ -28,6 +113,9 @@ fn rasterize_fwd(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
+#ifdef SUBGROUPS_OF_8
+    @builtin(subgroup_invocation_id) subgroup_lane: u32,
+#endif
 ) {
     let tile = linear_group(workgroup, workgroups);
     let grid = view.grid;
@@ -40,38 +128,40 @@ fn rasterize_fwd(
     let at = pixel.y * grid.width + pixel.x;
     let inside = (vec4<u32>(pixel.x) + vec4<u32>(0u, 1u, 2u, 3u) < vec4<u32>(grid.width))
         & vec4<bool>(pixel.y < grid.height);
-
-    var t = select(vec4<f32>(0.0), vec4<f32>(1.0), inside);
-    var low = select(vec4<f32>(-1.0), vec4<f32>(TRANSMITTANCE_MIN), inside);
-    var end_t = vec4<f32>(0.0);
-    var stop = vec4<u32>(NEVER);
-    var red = vec4<f32>(0.0);
-    var green = vec4<f32>(0.0);
-    var blue = vec4<f32>(0.0);
-    if (view.flags & SEGMENT_FIRST) == 0u {
-        for (var i = 0u; i < 4u; i++) {
-            if inside[i] {
-                red[i] = rgb[at + i];
-                green[i] = rgb[plane + at + i];
-                blue[i] = rgb[2u * plane + at + i];
-                stop[i] = stops[at + i];
-                end_t[i] = t_final[at + i];
-                let alive = stop[i] == NEVER;
-                t[i] = select(0.0, end_t[i], alive);
-                low[i] = select(-1.0, TRANSMITTANCE_MIN, alive);
-            }
-        }
-    }
-    var alive = any(low > vec4<f32>(0.0));
-    if !alive {
-        atomicAdd(&finished, 1u);
-    }
+    var pixels = pixels_before(at, plane, inside);
 
     let list = tile_offsets[tile];
     let count = tile_offsets[tile + 1u] - list;
     let end = min(count, view.end);
     let x = vec4<f32>(f32(pixel.x)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
     let y = f32(pixel.y) + 0.5;
+#ifdef SUBGROUPS_OF_8
+    for (var first = view.first; first < end; first += 8u) {
+        if !subgroupAny(are_alive(pixels)) {
+            break;
+        }
+        var own = splat_of(list + min(first + subgroup_lane, end - 1u));
+        // Beyond the end: far below every threshold.
+        own.log2_opacity = select(-1e30, own.log2_opacity, first + subgroup_lane < end);
+#repeat LANE 0u 1u 2u 3u 4u 5u 6u 7u
+        {
+            let splat = TileSplat(
+                subgroupBroadcast(own.mean, LANE),
+                subgroupBroadcast(own.a, LANE),
+                subgroupBroadcast(own.b, LANE),
+                subgroupBroadcast(own.c, LANE),
+                subgroupBroadcast(own.log2_opacity, LANE),
+                subgroupBroadcast(own.color, LANE),
+            );
+            blend(&pixels, splat, exponents(splat, x - vec4<f32>(splat.mean.x), y - splat.mean.y), first + LANE);
+        }
+#end
+    }
+#else
+    var alive = are_alive(pixels);
+    if !alive {
+        atomicAdd(&finished, 1u);
+    }
     for (var first = view.first; first < end; first += TILE_LANES) {
         workgroupBarrier();
         // Every invocation reads between two barriers and adds behind the second: all see the same number.
@@ -79,54 +169,22 @@ fn rasterize_fwd(
             break;
         }
         if first + lane < end {
-            let record = SPLAT_STRIDE * row_from_isect[isects[list + first + lane]];
-            batch[lane] = tile_splat(splat_unpack(splats[record], splats[record + 1u], splats[record + 2u]));
+            batch[lane] = splat_of(list + first + lane);
         }
         workgroupBarrier();
         let batch_end = min(TILE_LANES, end - first);
         for (var i = 0u; alive && i < batch_end; i++) {
             let splat = batch[i];
-            let dx = x - vec4<f32>(splat.mean.x);
-            let e = exponents(splat, dx, y - splat.mean.y);
-            let above = e >= vec4<f32>(LOG2_ALPHA_MIN);
-            if !any(above) {
-                continue;
-            }
-            let alpha = select(vec4<f32>(0.0), alphas(e, splat.log2_opacity, view.max_alpha), above);
-            var weight = alpha * t;
-            var next = t - alpha * t;
-            let stopping = next <= low;
-            if any(stopping) {
-                end_t = select(end_t, t, stopping);
-                stop = select(stop, vec4<u32>(first + i), stopping);
-                low = select(low, vec4<f32>(-1.0), stopping);
-                next = select(next, vec4<f32>(0.0), stopping);
-                weight = select(weight, vec4<f32>(0.0), stopping);
-                alive = any(low > vec4<f32>(0.0));
+            let e = exponents(splat, x - vec4<f32>(splat.mean.x), y - splat.mean.y);
+            if any(e >= vec4<f32>(LOG2_ALPHA_MIN)) {
+                blend(&pixels, splat, e, first + i);
+                alive = are_alive(pixels);
                 if !alive {
                     atomicAdd(&finished, 1u);
                 }
             }
-            t = next;
-            red += weight * splat.color.x;
-            green += weight * splat.color.y;
-            blue += weight * splat.color.z;
         }
     }
-
-    end_t = select(end_t, t, low > vec4<f32>(0.0));
-    if (view.flags & SEGMENT_LAST) != 0u {
-        red += end_t * view.background.x;
-        green += end_t * view.background.y;
-        blue += end_t * view.background.z;
-    }
-    for (var i = 0u; i < 4u; i++) {
-        if inside[i] {
-            rgb[at + i] = red[i];
-            rgb[plane + at + i] = green[i];
-            rgb[2u * plane + at + i] = blue[i];
-            t_final[at + i] = end_t[i];
-            stops[at + i] = stop[i];
-        }
-    }
+#endif
+    write_pixels(pixels, at, plane, inside);
 }

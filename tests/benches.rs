@@ -3,6 +3,12 @@
 #![allow(clippy::duplicate_mod)] // each benchmark is a program of its own, with its own support
 
 #[allow(dead_code)] // its `main`
+#[path = "../benches/commit.rs"]
+mod commit;
+#[allow(dead_code)] // its `main`
+#[path = "../benches/gpu.rs"]
+mod gpu;
+#[allow(dead_code)] // its `main`
 #[path = "../benches/image_loss.rs"]
 mod image_loss;
 #[allow(dead_code)] // its `main`
@@ -13,6 +19,16 @@ mod render;
 mod step;
 
 use step::support::{Args, median};
+
+#[test]
+fn commit_runs() {
+    assert!(commit::tiny());
+}
+
+#[test]
+fn gpu_runs() {
+    assert_eq!(gpu::tiny(), gpu::tiny());
+}
 
 #[test]
 fn image_loss_runs() {

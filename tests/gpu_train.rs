@@ -18,6 +18,7 @@ use gsscale::train::run::{Prepared, prepare};
 use gsscale::train::trainer::Trainer;
 use scenes::{city, eval, psnr, stderr, summary, text, train};
 use std::path::Path;
+use std::process::Command;
 use tempfile::TempDir;
 
 const SHORT: &[&str] = &["--steps", "60", "--strategy", "none", "--sh-every", "20", "--log-every", "1"];
@@ -63,11 +64,15 @@ fn a_gpu_trains_as_the_cpu_does() {
     for line in metrics(&on_cpu) {
         assert_eq!((&line["bytes_uploaded"], &line["device_bytes_peak"]), (&0.into(), &0.into()));
     }
-    // The same command gives the same file.
-    let again = folder.path().join("again");
-    run(&scene, &again, &["--device", "gpu"]);
+    // The same command gives the same file: with --deterministic, which is the default, and without.
     let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
-    assert!(ply(&on_gpu) == ply(&again), "two runs of the same command differ");
+    for (name, device, first) in [("again", "gpu", &on_gpu), ("again on the CPU", "cpu", &on_cpu)] {
+        for switch in ["--deterministic", "--deterministic=false"] {
+            let again = folder.path().join(format!("{name} {switch}"));
+            run(&scene, &again, &["--device", device, switch]);
+            assert!(ply(first) == ply(&again), "two runs of the same command differ: {name} {switch}");
+        }
+    }
     // The PLY alone gives the run's numbers, on the device that its config names.
     let report = eval(&[text(&on_gpu), text(&scene)]);
     assert!(report.status.success(), "{}", stderr(&report));
@@ -113,6 +118,37 @@ fn a_run_that_outgrows_the_budget_leaves_its_last_good_step() {
     let ply = std::fs::read(out.join("point_cloud.ply")).unwrap();
     let header = String::from_utf8_lossy(&ply[..ply.len().min(4096)]).into_owned();
     assert!(header.contains(&format!("element vertex {rows}\n")), "{header}");
+}
+
+/// A fault of the device in the middle of a run, through the real binary: the stage is named, the exit code is not 0, and
+/// the last good step is there.
+#[test]
+fn a_device_that_fails_in_mid_run_leaves_the_last_good_step() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 64, 48, 300);
+    // Two submissions a step; the memory estimate renders some views before the first.
+    let cases = [("lost", "the device was lost"), ("validation", "refused the work"), ("memory", "out of memory")];
+    for (kind, expected) in cases {
+        let out = folder.path().join(kind);
+        let output = Command::new(env!("CARGO_BIN_EXE_gsscale-train"))
+            .args([text(&scene), "--out", text(&out), "--device", "gpu", "--steps", "200", "--strategy", "none"])
+            .env("GSSCALE_GPU_FAULT", format!("{kind}@100"))
+            .output()
+            .unwrap();
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(1), "{kind}: {said}");
+        let line = said.lines().rev().find(|l| l.starts_with("error: ")).unwrap_or_else(|| panic!("{kind}: {said}"));
+        assert!(line.contains(expected), "{kind}: {line}");
+        assert!(["forward: ", "backward: "].iter().any(|stage| line.contains(stage)), "{kind}: {line}");
+        let summary = summary(&out);
+        let steps = summary["steps"].as_u64().unwrap();
+        assert!(summary["finished"] == false && steps > 10 && steps < 100, "{kind}: {summary}");
+        let ply = std::fs::read(out.join("point_cloud.ply")).unwrap();
+        assert!(ply.starts_with(b"ply") && ply.len() > 300 * 59 * 4, "{kind}: {} bytes", ply.len());
+    }
 }
 
 /// What the third and fourth step upload and allocate, of a scene `times` as large whose other rows no camera sees.

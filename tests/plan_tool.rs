@@ -27,7 +27,7 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
     let with = |more: &[&str]| stdout(&plan(&scene, &[&common[..], more].concat()));
     let orders = "auto,shuffle,groups:4,tour";
     let value: Value =
-        serde_json::from_str(&with(&["--frames", "70%,100%", "--view-order", orders, "--json"])).unwrap();
+        serde_json::from_str(&with(&["--compare-frames", "70%,100%", "--compare-orders", orders, "--json"])).unwrap();
     let plans = value["plans"].as_array().unwrap();
     assert_eq!((plans.len(), value["views"].as_u64().unwrap()), (8, 300));
     let number = |plan: &Value, key: &str| plan[key].as_f64().unwrap();
@@ -43,10 +43,10 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
         plans[4..].iter().all(|plan| number(plan, "hit_rate") == 1.0 && number(plan, "stall_seconds_worst") == 0.0)
     );
     assert_eq!(plans[4]["view_order"], "shuffle");
-    let table = with(&["--frames", "70%", "--view-order", orders]);
+    let table = with(&["--compare-frames", "70%", "--compare-orders", orders]);
     assert_eq!(table.lines().count(), 3 + 4, "{table}");
     // The exact lists of two steps: what leaves makes room for what enters.
-    let lists = with(&["--frames", "70%", "--view-order", "shuffle", "--lists", "700..740"]);
+    let lists = with(&["--compare-frames", "70%", "--view-order", "shuffle", "--lists", "700..740"]);
     let lines: Vec<&str> = lists.lines().collect();
     assert!(lines[0].starts_with("step 700: ") && lines.iter().any(|line| line.starts_with("step 701: ")), "{lists}");
     let count = |sign: &str| lines.iter().filter_map(|l| l.strip_prefix(sign)).flat_map(str::split_whitespace).count();
@@ -60,12 +60,12 @@ fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
     let run = folder.path().join("run");
     std::fs::create_dir(&run).unwrap();
     std::fs::write(run.join("config.toml"), format!("steps = 77\n[resolved]\nscene = {:?}\n", text(&scene))).unwrap();
-    let told = stdout(&plan(&run, &["--page-rows", "16", "--frames", "100%"]));
+    let told = stdout(&plan(&run, &["--page-rows", "16", "--compare-frames", "100%"]));
     assert!(told.contains("by all 77 steps"), "{told}");
     for (args, words) in [
         (&["--page-rows", "16", "--frames", "2"][..], ["2 frames", "--host-mem"]),
-        (&["--frames", "many"], ["'many'", "25%"]),
-        (&["--view-order", "random"], ["'random'", "groups:<n>"]),
+        (&["--compare-frames", "many"], ["'many'", "25%"]),
+        (&["--compare-orders", "random"], ["'random'", "groups:<n>"]),
         (&["--drive-read", "0"], ["--drive-read", "bytes per second"]),
         (&["--lists", "5..5"], ["5..5", "100..110"]),
     ] {

@@ -23,6 +23,8 @@ const LAYOUTS: &[&[StructLayout]] = &[
 
 /// Entry points whose workgroups are not 256 invocations in one dimension: file, entry point, size, and why.
 const OTHER_WORKGROUPS: &[(&str, &str, [u32; 3], &str)] = &[
+    ("image_loss.wgsl", "ssim_map", [64, 1, 1], "four pixels of a tile to an invocation"),
+    ("image_loss.wgsl", "gradient", [64, 1, 1], "four pixels of a tile to an invocation"),
     ("rasterize_fwd.wgsl", "rasterize_fwd", [64, 1, 1], "four pixels of a tile to an invocation"),
     ("rasterize_bwd.wgsl", "rasterize_bwd", [64, 1, 1], "four pixels of a tile to an invocation"),
 ];
@@ -44,7 +46,7 @@ fn problems(source: &Source, layouts: &[StructLayout]) -> Vec<String> {
     let mut found = Vec::new();
     for variant in all {
         let defines: Vec<(&str, &str)> = variant.iter().map(|(n, v)| (n.as_str(), v.as_str())).collect();
-        let subgroups = defines.iter().any(|(n, _)| *n == "SUBGROUPS");
+        let subgroups = defines.iter().any(|(n, _)| n.starts_with("SUBGROUPS"));
         let checked = preprocess(source, &defines).and_then(|text| validate(source.name, &text, subgroups));
         let wrong = match checked {
             Ok((module, info)) => module_problems(source.name, &module, &info, layouts),
@@ -245,6 +247,9 @@ fn the_checks_find_faults() {
         ("struct U", "struct V {} struct U", "x.wgsl"),
         ("@compute", "#ifdef SUBGROUPS\nnonsense\n#endif\n@compute", "SUBGROUPS"),
         ("@compute", "#param N 1 2 x\nconst N2 = N;\n@compute", "\"x\""),
+        ("out[id.x] = u.scale", "\n#repeat N 0 1 x\nout[N] = u.scale;\n#end\n", "x"),
+        ("@compute", "#repeat N 0 1\n@compute", "#repeat has no #end"),
+        ("@compute", "#end\n@compute", "out of place"),
     ];
     for (from, to, expected) in cases {
         let report = found(from, to);

@@ -22,7 +22,7 @@ use std::process::ExitCode;
 
 const EXAMPLES: &str = "\
 Examples:
-  gsscale-plan scans/village --frames 10%,25%,50% --view-order shuffle,groups:9,groups:25,tour
+  gsscale-plan scans/village --compare-frames 10%,25%,50% --compare-orders shuffle,groups:9,groups:25,tour
   gsscale-plan scans/city --host-mem 4GiB --steps 200000 --drive-read 3GB --step-seconds 0.4
   gsscale-plan runs/city --host-mem 2GiB --lists 100..110
 
@@ -46,18 +46,13 @@ struct Args {
     /// Config file; flags override it
     #[arg(long)]
     config: Option<PathBuf>,
-    /// Memory of the run; three quarters of it are frames
-    #[arg(long, value_name = "SIZE", help_heading = "Plan")]
-    host_mem: Option<ByteSize>,
-    /// Frames, or their share of all pages; several to compare [default: 10%,25%,50%]
+    /// Numbers of frames, or their shares of all pages, to compare; without it --frames or --host-mem, or else
+    /// 10%,25%,50%
     #[arg(long, value_delimiter = ',', value_name = "N|N%", help_heading = "Plan")]
-    frames: Vec<String>,
-    /// Orders of views: auto, shuffle, groups:<n>, tour; several to compare
-    #[arg(long, value_delimiter = ',', default_value = "auto,shuffle", help_heading = "Plan")]
-    view_order: Vec<String>,
-    /// Rows of a page
-    #[arg(long, default_value_t = 1024, value_name = "N", help_heading = "Plan")]
-    page_rows: u32,
+    compare_frames: Vec<String>,
+    /// Orders of views to compare: auto, shuffle, groups:<n>, tour; without it --view-order, or else auto and shuffle
+    #[arg(long, value_delimiter = ',', value_name = "ORDER", help_heading = "Plan")]
+    compare_orders: Vec<String>,
     /// Plan as if every page had grown to this many
     #[arg(long, default_value_t = 1.0, value_name = "X", help_heading = "Plan")]
     growth: f64,
@@ -143,14 +138,14 @@ fn start(args: &Args) -> InputResult<String> {
     }
     let mut rows = Vec::new();
     for &frames in &frames {
-        for text in &args.view_order {
+        for text in &orders(args, &scene.config) {
             rows.push(row(args, &scene, frames, text)?);
         }
     }
     if args.json {
         let value = json!({
             "gaussians": scene.gaussians, "views": scene.cameras.len(), "steps": scene.config.steps,
-            "pages": scene.pages.index.len(), "page_rows": args.page_rows, "frame_bytes": scene.frame_bytes,
+            "pages": scene.pages.index.len(), "page_rows": scene.config.page_rows, "frame_bytes": scene.frame_bytes,
             "state_bytes": state_bytes(&scene), "pages_of_largest_view": scene.views.most(),
             "plans": rows.iter().map(|row| json_of(args, row)).collect::<Vec<_>>(),
         });
@@ -166,9 +161,9 @@ fn load(args: &Args) -> InputResult<Scene> {
     let mut config = config_path.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
     args.keys.clone().apply(&mut config);
     config.check()?;
-    if args.page_rows == 0 || !(1.0..=1e6).contains(&args.growth) || args.step_seconds.is_nan() {
-        let problem = "--page-rows, --growth and --step-seconds must be numbers from 1, 1 and 0 on";
-        return Err(InputError::new("--page-rows, --growth, --step-seconds", problem, "leave them out"));
+    if !(1.0..=1e6).contains(&args.growth) || args.step_seconds.is_nan() {
+        let problem = "--growth and --step-seconds must be numbers from 1 and 0 on";
+        return Err(InputError::new("--growth, --step-seconds", problem, "leave them out"));
     }
     if args.drive_read.0 == 0 || args.drive_write.0 == 0 {
         return Err(InputError::new(
@@ -181,7 +176,7 @@ fn load(args: &Args) -> InputResult<Scene> {
     let prepared = prepare(&path, &config)?;
     let dataset = &prepared.dataset;
     let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
-    let page_rows = args.page_rows as usize;
+    let page_rows = config.page_rows as usize;
     let pages = first_pages(&prepared.columns, page_rows, config.strategy == "default");
     let slot = |payload: u64| BLOCK + payload.next_multiple_of(BLOCK);
     let grown = |bytes: u64| (bytes as f64 * args.growth) as u64;
@@ -213,12 +208,17 @@ fn state_bytes(scene: &Scene) -> u64 {
 /// The numbers of frames to plan for.
 fn frames(args: &Args, scene: &Scene) -> InputResult<Vec<usize>> {
     let pages = scene.pages.index.len();
+    let config = &scene.config;
     let mut frames = Vec::new();
-    if let Some(host_mem) = args.host_mem {
-        frames.push(((host_mem.0 as f64 * FRAME_SHARE) as u64 / scene.frame_bytes) as usize);
+    if args.compare_frames.is_empty() && config.frames > 0 {
+        return Ok(vec![config.frames as usize]);
+    }
+    if config.host_mem.0 > 0 {
+        frames.push(((config.host_mem.0 as f64 * FRAME_SHARE) as u64 / scene.frame_bytes) as usize);
     }
     let shares = ["10%", "25%", "50%"].map(String::from);
-    let texts = if args.frames.is_empty() && frames.is_empty() { &shares[..] } else { &args.frames[..] };
+    let is_open = args.compare_frames.is_empty() && frames.is_empty();
+    let texts = if is_open { &shares[..] } else { &args.compare_frames[..] };
     for text in texts {
         let count = match text.strip_suffix('%') {
             Some(share) => share
@@ -228,11 +228,25 @@ fn frames(args: &Args, scene: &Scene) -> InputResult<Vec<usize>> {
                 .map(|s: f64| (s / 100.0 * pages as f64).ceil() as usize),
             None => text.parse().ok(),
         };
-        let wrong =
-            || InputError::new("--frames", format!("'{text}' is no number of frames"), "write for example 2000 or 25%");
+        let wrong = || {
+            InputError::new(
+                "--compare-frames",
+                format!("'{text}' is no number of frames"),
+                "write for example 2000 or 25%",
+            )
+        };
         frames.push(count.ok_or_else(wrong)?);
     }
     Ok(frames)
+}
+
+/// The orders to plan for, as text.
+fn orders(args: &Args, config: &TrainConfig) -> Vec<String> {
+    match (args.compare_orders.is_empty(), config.view_order.as_str()) {
+        (false, _) => args.compare_orders.clone(),
+        (true, "auto") => vec!["auto".into(), "shuffle".into()],
+        (true, order) => vec![order.into()],
+    }
 }
 
 fn order(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Order> {
@@ -306,7 +320,7 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
     let mut text = format!(
         "{} Gaussians in {pages} pages of at most {} rows, {} on disk; {} views need {:.1} % of the pages on average, {:.1} % at most",
         scene.gaussians,
-        args.page_rows,
+        scene.config.page_rows,
         format_bytes(state_bytes(scene)),
         scene.cameras.len(),
         100.0 * scene.views.total() as f64 / scene.cameras.len() as f64 / pages as f64,
@@ -359,7 +373,7 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
 
 /// The exact pages that enter and leave in some steps.
 fn lists(args: &Args, scene: &Scene, frames: usize, range: Range<u32>) -> InputResult<String> {
-    let order = order(args, scene, frames, &args.view_order[0])?;
+    let order = order(args, scene, frames, &orders(args, &scene.config)[0])?;
     let mut views = ViewOrder::new(order, scene.config.seed, &scene.cameras);
     let mut plan = Plan::new(0, args.plan_mem.0);
     let mut cache = CacheModel::new(frames, Policy::Farthest);

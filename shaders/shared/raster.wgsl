@@ -20,7 +20,9 @@ struct RasterUniforms {
     /// Rows of the view and their intersections, for fold_rows.
     row_count: u32,
     isect_count: u32,
-    pad: vec2<u32>,
+    /// The intersections, by emit index, whose sums the backward rasterizer keeps this time.
+    window_first: u32,
+    window_end: u32,
 }
 
 const SEGMENT_FIRST: u32 = 1u;

@@ -112,6 +112,8 @@ config_keys! {
         shn_lr: f64 = 2.5e-3 / 20.0;
         /// Adam's epsilon
         adam_eps: f64 = 1e-15;
+        /// What is kept of Adam's moments between steps: f32, or bf16, which is not exact and saves half of their disk
+        moments: String = "f32".into();
         /// Opacity of first Gaussians
         init_opacity: f64 = 0.1;
         /// Size of first Gaussians, times the distance to their three nearest neighbours
@@ -180,6 +182,9 @@ config_keys! {
         /// What renders: auto (a hardware GPU if there is one, else the CPU), gpu (a software adapter counts too), cpu,
         /// or a part of the name of one of --list-devices
         device: String = "auto".into();
+        /// The same command gives the same bits again on the same device. Every run does so, at no cost: there is no
+        /// faster way that does not
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] deterministic: bool = true;
         /// Memory that may be taken on the device; 0 = what the device has
         device_mem: ByteSize = ByteSize(0);
     }
@@ -351,10 +356,11 @@ impl TrainConfig {
         if self.spill_codec != "auto" {
             self.spill_codec.parse::<Codec>().map_err(|problem| written("spill-codec", problem))?;
         }
-        let names: [(&str, &str, &[&str]); 7] = [
+        let names: [(&str, &str, &[&str]); 8] = [
             ("io", &self.io, &["auto", "uring", "mmap", "pread"]),
             ("evict", &self.evict, &["belady", "lru"]),
             ("ssim-padding", &self.ssim_padding, &["valid", "same"]),
+            ("moments", &self.moments, &["f32", "bf16"]),
             ("strategy", &self.strategy, &["default", "none"]),
             ("ssim-variant", &self.ssim_variant, &["same", "valid", "reflect"]),
             ("export-frame", &self.export_frame, &["dataset", "local"]),

@@ -9,6 +9,7 @@ use crate::dataset::read::ReadOptions;
 use crate::densify::policy::DensifyConfig;
 use crate::exchange::ply::ExportFrame;
 use crate::optim::adam::AdamConfig;
+use crate::optim::moments::Moments;
 use crate::optim::rates::Rates;
 use crate::render::metrics::SsimVariant;
 use crate::render::{LossOptions, RenderOptions, SsimPadding};
@@ -42,6 +43,8 @@ pub struct RunOptions {
     pub rates: Rates,
     /// Adam's constants.
     pub adam: AdamConfig,
+    /// What is kept of its moments.
+    pub moments: Moments,
     /// Densification; `None` for `--strategy none`.
     pub densify: Option<DensifyConfig>,
     /// Scene scale, local units.
@@ -91,6 +94,7 @@ impl RunOptions {
                 steps: config.steps,
             },
             adam: AdamConfig { eps: config.adam_eps, ..AdamConfig::default() },
+            moments: Moments::from_name(&config.moments).unwrap_or_default(),
             densify: (config.strategy == "default").then(|| densify(config)),
             scene_scale,
             ssim_variant: SsimVariant::from_name(&config.ssim_variant).unwrap_or(SsimVariant::Same),
@@ -133,6 +137,7 @@ pub fn read_options(config: &TrainConfig) -> ReadOptions {
     ReadOptions {
         images: (!config.images.is_empty()).then(|| config.images.clone()),
         allow_missing: config.allow_missing,
+        points_later: false,
     }
 }
 

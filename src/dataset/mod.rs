@@ -6,6 +6,7 @@ mod checks;
 pub mod colmap;
 pub mod colmap_write;
 pub mod frame;
+pub mod import;
 pub mod loader;
 pub mod masks;
 pub mod mega_nerf;

@@ -14,6 +14,8 @@ pub struct ReadOptions {
     /// A photo that is needed now (its size is not in the JSON) and is missing: leave the view out with a warning
     /// instead of failing. Photos whose size is known are the loader's to miss.
     pub allow_missing: bool,
+    /// Points stay in their file, whose path is given: they may not fit in memory.
+    pub points_later: bool,
 }
 
 /// Reads a scene: a folder with a COLMAP model, with `transforms*.json`, or in Mega-NeRF's layout, or such a JSON

@@ -10,6 +10,7 @@ use std::sync::{Arc, Mutex};
 use super::belt::Belt;
 use super::buffers::{Buffer, Pool};
 use super::error::{Faults, GpuError, GpuResult};
+use super::injected::{InjectedFault, Injector};
 use super::profile::Profiler;
 use super::readback::Staging;
 use super::record::UniformRing;
@@ -42,10 +43,20 @@ pub struct GpuOptions {
     pub max_binding_bytes: Option<u64>,
     /// `Some(false)` takes the plain path where the adapter has subgroup operations.
     pub subgroups: Option<bool>,
+    /// `Some(false)` takes the path for subgroups of any size where all have 8 invocations.
+    pub subgroups_of_8: Option<bool>,
     /// Device memory that may be allocated, bytes (`--device-mem`); none: whatever the device has.
     pub budget: Option<u64>,
     /// Measures the time of every stage where the adapter can.
     pub profile: bool,
+    /// Whether shaders read their uniforms as uniform blocks or as storage; none: as storage on software adapters.
+    ///
+    /// Mesa's lavapipe folds the values of a uniform block that decide branches into the shader, once for every set of
+    /// values, and keeps each such copy for as long as the pipeline lives: a view whose counts are new costs it time
+    /// and some 100 KB of host memory that never come back.
+    pub uniform_blocks: Option<bool>,
+    /// A fault on purpose; none: what the environment variable `GSSCALE_GPU_FAULT` asks for, if anything.
+    pub fault: Option<InjectedFault>,
 }
 
 /// Kind of an adapter, best first.
@@ -142,11 +153,14 @@ pub struct Gpu {
     pub(super) profiler: Mutex<Profiler>,
     pub(super) uploaded: AtomicU64,
     pub(super) recorders: AtomicU32,
+    pub(super) injector: Injector,
     pool: Arc<Pool>,
     summary: AdapterSummary,
     limits: wgpu::Limits,
     max_binding_bytes: u64,
     subgroups: bool,
+    subgroups_of_8: bool,
+    uniform_blocks: bool,
 }
 
 impl fmt::Debug for Gpu {
@@ -186,17 +200,21 @@ impl Gpu {
         let own_max = limits.max_storage_buffer_binding_size.min(BINDING_MAX);
         let profiler = Profiler::new(&device, &queue, options.profile && summary.timestamps);
         faults.check()?;
+        let alignment = limits.min_uniform_buffer_offset_alignment.max(limits.min_storage_buffer_offset_alignment);
         Ok(Gpu {
             pool: Pool::new(options.budget.unwrap_or(u64::MAX), limits.max_buffer_size),
             pipelines: Mutex::default(),
             belt: Mutex::default(),
             staging: Arc::default(),
-            uniforms: Mutex::new(UniformRing::new(u64::from(limits.min_uniform_buffer_offset_alignment))),
+            uniforms: Mutex::new(UniformRing::new(u64::from(alignment))),
             profiler: Mutex::new(profiler),
             uploaded: AtomicU64::new(0),
             recorders: AtomicU32::new(0),
+            injector: Injector::new(options.fault.or_else(InjectedFault::from_environment)),
             max_binding_bytes: options.max_binding_bytes.map_or(own_max, |lowered| lowered.min(own_max)),
             subgroups,
+            subgroups_of_8: summary.subgroup_sizes == Some((8, 8)) && options.subgroups_of_8 != Some(false),
+            uniform_blocks: options.uniform_blocks.unwrap_or(summary.kind != DeviceKind::Software),
             device,
             queue,
             faults,
@@ -213,6 +231,20 @@ impl Gpu {
     /// Whether shaders are compiled with subgroup operations (the define `SUBGROUPS`).
     pub fn subgroups(&self) -> bool {
         self.subgroups
+    }
+
+    /// The defines that all shaders which know them are compiled with.
+    pub(super) fn subgroup_defines(&self) -> &'static [&'static str] {
+        match (self.subgroups, self.subgroups_of_8) {
+            (false, _) => &[],
+            (true, false) => &["SUBGROUPS"],
+            (true, true) => &["SUBGROUPS", "SUBGROUPS_OF_8"],
+        }
+    }
+
+    /// Whether shaders read their uniforms as uniform blocks; else as storage.
+    pub(super) fn uniform_blocks(&self) -> bool {
+        self.uniform_blocks
     }
 
     /// Largest binding, bytes: longer columns are bound in windows.

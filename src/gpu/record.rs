@@ -10,6 +10,7 @@ use super::belt::SET_BYTES;
 use super::buffers::{Buffer, BufferView};
 use super::device::{GROUPS_MAX, Gpu};
 use super::error::{GpuError, GpuResult, lock};
+use super::injected::FaultKind;
 use super::readback::{PendingMap, Readback};
 use super::shader::{BindingKind, Pipeline};
 
@@ -46,7 +47,7 @@ impl UniformRing {
             self.chunks.push(device.create_buffer(&wgpu::BufferDescriptor {
                 label: Some("uniforms"),
                 size: UNIFORM_CHUNK,
-                usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+                usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST,
                 mapped_at_creation: false,
             }));
         }
@@ -384,6 +385,21 @@ impl Recorder<'_> {
         Err(GpuError::Bindings { stage: self.name.into(), problem })
     }
 
+    /// Lets the fault happen that is planned for this submission, if one is.
+    fn strike(&mut self) {
+        match self.gpu.injector.next() {
+            None => {}
+            Some(FaultKind::Lost) => self.gpu.device.destroy(),
+            Some(FaultKind::Validation) => {
+                let raw = lock(&self.gpu.uniforms).chunk(&self.gpu.device, 0);
+                self.encoder.clear_buffer(&raw, 0, Some(2 * UNIFORM_CHUNK)); // beyond its end
+            }
+            Some(FaultKind::OutOfMemory) => {
+                self.gpu.faults.report(&wgpu::Error::OutOfMemory { source: "a fault on purpose".into() });
+            }
+        }
+    }
+
     /// Submits what is recorded so far and goes on with an empty encoder.
     fn flush(&mut self) -> GpuResult<Submission> {
         let gpu = self.gpu;
@@ -393,6 +409,7 @@ impl Recorder<'_> {
         drop(profiler);
         self.readbacks.extend(stamps);
         gpu.faults.doing(self.name);
+        self.strike();
         let encoder = std::mem::replace(&mut self.encoder, new_encoder(&gpu.device, self.name));
         let commands = encoder.finish();
         gpu.faults.check()?;

@@ -5,10 +5,11 @@
 //! - `#import "shared/x.wgsl"`: the file at this place, each file once;
 //! - `#ifdef NAME`, `#ifndef NAME`, `#else`, `#endif`;
 //! - `#param NAME 0 1 2 3`: `NAME` stands for a value; the first one unless a define says otherwise, and only values
-//!   of the list are accepted, so that every variant can be tested.
+//!   of the list are accepted, so that every variant can be tested;
+//! - `#repeat NAME 0u 1u` ... `#end`: the lines between, once for each value of `NAME`.
 //!
 //! Invariants: (1) a define that a shader does not know is an error, but for `SUBGROUPS`, which is set for all shaders
-//! of a device with subgroup operations; (2) layouts follow from what the entry point uses, not from what a caller
+//! of a device with subgroup operations, and `SUBGROUPS_OF_8`, where all of them have 8 invocations; (2) layouts follow from what the entry point uses, not from what a caller
 //! declares; (3) equal (shader, entry, defines) give the same pipeline, compiled once.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -95,9 +96,8 @@ impl Gpu {
     /// As [`Gpu::pipeline`].
     pub fn pipeline_from(&self, source: &Source, entry: &str, defines: Defines<'_>) -> GpuResult<Arc<Pipeline>> {
         let mut all = defines.to_vec();
-        if self.subgroups() && switches(source)?.contains("SUBGROUPS") {
-            all.push(("SUBGROUPS", ""));
-        }
+        let known = switches(source)?;
+        all.extend(self.subgroup_defines().iter().filter(|name| known.contains(**name)).map(|name| (*name, "")));
         all.sort_unstable();
         all.dedup();
         let owned = all.iter().map(|(n, v)| (n.to_string(), v.to_string())).collect();
@@ -111,7 +111,11 @@ impl Gpu {
     }
 
     fn compile(&self, source: &Source, entry: &str, defines: Defines<'_>) -> GpuResult<Pipeline> {
-        let text = preprocess(source, defines)?;
+        let mut text = preprocess(source, defines)?;
+        if !self.uniform_blocks() {
+            // A struct that may stand in a uniform block has the same layout in storage.
+            text = text.replace("var<uniform>", "var<storage, read>");
+        }
         let reflection = reflect(source.name, &text, entry, self.subgroups())?;
         self.check_workgroup(source.name, &reflection)?;
         self.faults.doing(source.name);
@@ -196,6 +200,35 @@ fn stitched(source: &Source) -> GpuResult<Vec<String>> {
     Ok(lines)
 }
 
+/// The stitched lines with repetitions written out.
+fn repeated(source: &Source) -> GpuResult<Vec<String>> {
+    let mut out = Vec::new();
+    let mut open: Option<(String, Vec<String>, Vec<String>)> = None;
+    for line in stitched(source)? {
+        match (directive(&line).as_deref(), &mut open) {
+            (Some(["repeat", name, values @ ..]), None) => {
+                open = Some((name.to_string(), values.iter().map(|v| v.to_string()).collect(), Vec::new()));
+            }
+            (Some(["end"]), Some(_)) => {
+                let Some((name, values, lines)) = open.take() else { continue };
+                for value in values {
+                    let as_value = BTreeMap::from([(name.clone(), value)]);
+                    out.extend(lines.iter().map(|line| replaced(line, &as_value)));
+                }
+            }
+            (Some(["repeat" | "end", ..]), _) => {
+                return Err(failed(source.name, format!("this directive is out of place: {line}")));
+            }
+            (_, Some((_, _, lines))) => lines.push(line),
+            (_, None) => out.push(line),
+        }
+    }
+    match open {
+        Some(_) => Err(failed(source.name, "a #repeat has no #end")),
+        None => Ok(out),
+    }
+}
+
 /// A line of the preprocessor: its words, the first without `#`.
 fn directive(line: &str) -> Option<Vec<&str>> {
     line.trim_start().strip_prefix('#').map(|rest| rest.split_whitespace().collect())
@@ -268,7 +301,7 @@ pub fn preprocess(source: &Source, defines: Defines<'_>) -> GpuResult<String> {
     let is_defined = |name: &str| defines.iter().any(|(n, _)| *n == name) || values.contains_key(name);
     let mut out = String::new();
     let mut conditions: Vec<bool> = Vec::new();
-    for line in stitched(source)? {
+    for line in repeated(source)? {
         let wrong = || failed(source.name, format!("this directive is out of place: {line}"));
         match directive(&line).as_deref() {
             Some(["ifdef", name]) => conditions.push(is_defined(name)),

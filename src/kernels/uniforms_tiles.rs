@@ -104,8 +104,10 @@ crate::wgsl_struct! {
         pub row_count: u32,
         /// Their intersections.
         pub isect_count: u32,
-        /// Unused.
-        pub pad: [u32; 2],
+        /// First intersection, by emit index, whose sums are kept.
+        pub window_first: u32,
+        /// One past the last.
+        pub window_end: u32,
     }
 }
 

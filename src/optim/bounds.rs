@@ -13,6 +13,7 @@
 
 use super::deferred::DeferredAdam;
 use super::lanes::{Coordinates, LANES, LaneDrifts, by_coordinate, drifted_lanes, drifted_opacities, tables_of};
+use super::moments::Moments;
 use crate::base::math::exp32;
 use crate::base::simd::{Kernel, dispatch};
 use crate::scene::columns::Column;
@@ -23,6 +24,8 @@ use crate::scene::rows::{Rows, mean_grad2d};
 /// Slack per movement. Rewriting a row on the way rounds its moments (1e-7 each), may change between series and direct
 /// sum (1e-6 apart), and may flush a second moment of 1e-38 to zero, which eps = 1e-15 hides but for 1e-4.
 const MOVEMENT_SLACK: f32 = 1e-3;
+/// The same where rewriting rounds moments to 16 bits: by up to 0.8 % each, the second one under a root.
+const MOVEMENT_SLACK_BF16: f32 = 2e-2;
 /// Slack per value: four roundings on the way there, one for the child of a split, three for this file's own.
 const VALUE_SLACK: f32 = 8.0 * 0.5 * f32::EPSILON;
 /// Slack of a value that is flushed to zero.
@@ -70,9 +73,10 @@ impl Kernel for LowestOpacity<'_> {
     fn run<const FMA: bool>(self) -> f32 {
         let LowestOpacity { adam, rows } = self;
         let values = rows.columns.opacities;
+        let slack = movement_slack(adam);
         let of_row = |row: usize| {
             let (m, v) = (rows.exp_avg.opacities[row], rows.exp_avg_sq.opacities[row]);
-            hull(values[row], adam.limit(Column::Opacities, values[row], m, v, rows.stamp[row]))[0]
+            hull(values[row], adam.limit(Column::Opacities, values[row], m, v, rows.stamp[row]), slack)[0]
         };
         let mut lowest = [f32::INFINITY; LANES];
         let whole = rows.rows() / LANES * LANES;
@@ -85,7 +89,7 @@ impl Kernel for LowestOpacity<'_> {
             }
             let values = &values[first..first + LANES];
             for l in 0..LANES {
-                lowest[l] = lowest[l].min(hull(values[l], limits[l])[0]);
+                lowest[l] = lowest[l].min(hull(values[l], limits[l], slack)[0]);
             }
         }
         (whole..rows.rows()).for_each(|row| lowest[0] = lowest[0].min(of_row(row)));
@@ -141,11 +145,12 @@ impl LaneBounds {
         let (from, to) = (first * 3, (first + LANES) * 3);
         let (means, scales) = (by_coordinate(&means[0][from..to]), by_coordinate(&scales[0][from..to]));
         let (grad2d, count) = (&rows.grad2d[first..first + LANES], &rows.count[first..first + LANES]);
+        let slack = movement_slack(adam);
         let mut reach = [0.0; LANES];
         for l in 0..LANES {
             let mut log_scale = f32::NEG_INFINITY;
             for c in 0..3 {
-                log_scale = log_scale.max(hull(scales[c][l], scale_limits[c][l])[1]);
+                log_scale = log_scale.max(hull(scales[c][l], scale_limits[c][l], slack)[1]);
             }
             let sigma = sigma(log_scale);
             reach[l] = split_reach(splits, grad2d[l], count[l], sigma);
@@ -153,7 +158,7 @@ impl LaneBounds {
         }
         for c in 0..3 {
             for l in 0..LANES {
-                let [lo, hi] = hull(means[c][l], mean_limits[c][l]);
+                let [lo, hi] = hull(means[c][l], mean_limits[c][l], slack);
                 self.lo[c][l] = self.lo[c][l].min(outwards(lo, -reach[l]));
                 self.hi[c][l] = self.hi[c][l].max(outwards(hi, reach[l]));
             }
@@ -179,7 +184,7 @@ impl LaneBounds {
 fn add_row(bounds: &mut PageBounds, adam: &DeferredAdam, rows: &Rows<'_>, splits: &SplitLimits, row: usize) {
     let hull_of = |column: Column, c: usize| {
         let [value, m, v] = tables_of(rows, column).map(|table| table[row * 3 + c]);
-        hull(value, adam.limit(column, value, m, v, rows.stamp[row]))
+        hull(value, adam.limit(column, value, m, v, rows.stamp[row]), movement_slack(adam))
     };
     let log_scale = (0..3).map(|c| hull_of(Column::Scales, c)[1]).fold(f32::NEG_INFINITY, f32::max);
     let sigma = sigma(log_scale);
@@ -192,11 +197,16 @@ fn add_row(bounds: &mut PageBounds, adam: &DeferredAdam, rows: &Rows<'_>, splits
     bounds.sigma_max = bounds.sigma_max.max(sigma);
 }
 
+#[inline(always)]
+fn movement_slack(adam: &DeferredAdam) -> f32 {
+    if adam.moments() == Moments::Bf16 { MOVEMENT_SLACK_BF16 } else { MOVEMENT_SLACK }
+}
+
 /// The range that a value passes through on its way to its limit, in the arithmetic of the evaluation.
 #[inline(always)]
-fn hull(value: f32, limit: f32) -> [f32; 2] {
+fn hull(value: f32, limit: f32, movement_slack: f32) -> [f32; 2] {
     let (lo, hi) = (value.min(limit), value.max(limit));
-    let slack = MOVEMENT_SLACK * (hi - lo) + VALUE_SLACK * lo.abs().max(hi.abs()) + FLUSH_SLACK;
+    let slack = movement_slack * (hi - lo) + VALUE_SLACK * lo.abs().max(hi.abs()) + FLUSH_SLACK;
     [lo - slack, hi + slack]
 }
 

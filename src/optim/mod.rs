@@ -5,4 +5,5 @@ pub mod bounds;
 pub mod deferred;
 pub mod drift;
 pub(crate) mod lanes;
+pub mod moments;
 pub mod rates;

@@ -13,6 +13,7 @@
 use super::buffer::PageBuffer;
 use super::codec::{self, Codec};
 use super::format::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, checksum, transfer_bytes};
+use super::mutants::{Mutant, active};
 pub use super::page_done::{PageDone, PageMoved, PageTraffic};
 use super::page_error::{PageError, SlotName, is_out_of_space};
 use super::slots::{SlotError, SlotLayout, Slots};
@@ -238,7 +239,11 @@ impl PagedStore {
             self.complete(true, done);
         }
         self.refuse_if_poisoned()?;
-        self.engine.sync().map_err(|source| {
+        let mut synced = self.engine.sync();
+        if synced.is_err() && active(Mutant::SyncRetried) {
+            synced = self.engine.sync();
+        }
+        synced.map_err(|source| {
             self.poison = Some(format!("making pages durable failed: {source}"));
             PageError::Sync { source }
         })
@@ -263,8 +268,22 @@ impl PagedStore {
         self.slots.release_retired(durable, pinned)
     }
 
+    /// At opening: the version `slot`, in use so far, is one that only generations before `until` name.
+    pub fn retire_past(&mut self, slot: &SlotRef, until: u64) {
+        let was_in_use = self.slots.retire(slot.place, slot.generation, until);
+        debug_assert!(was_in_use, "a slot was retired twice: {slot:?}");
+    }
+
+    /// Takes no writes from now on: something else that belongs to the store failed.
+    pub fn poison_with(&mut self, cause: String) {
+        self.poison.get_or_insert(cause);
+    }
+
     fn refuse_if_poisoned(&self) -> Result<(), PageError> {
-        self.poison.clone().map_or(Ok(()), |cause| Err(PageError::Poisoned { cause }))
+        match &self.poison {
+            Some(cause) if !active(Mutant::PoisonIgnored) => Err(PageError::Poisoned { cause: cause.clone() }),
+            _ => Ok(()),
+        }
     }
 
     fn take_slot(
@@ -405,13 +424,18 @@ impl PagedStore {
             .filter_map(|c| Some((self.pending.remove(&c.transfer.token)?, c, Ok(()))))
             .collect();
         let store = self.config.store;
-        checked.par_iter_mut().for_each(|(pending, completion, verdict)| {
+        let check = |(pending, completion, verdict): &mut (Pending, Completion, Result<(), String>)| {
             if pending.direction == Direction::Read && completion.result.is_ok() {
                 let bytes = &completion.transfer.buffer.as_slice()[..completion.transfer.bytes];
                 let payload = pending.payload.as_mut().map(PageBuffer::as_mut_slice);
                 *verdict = verify(store, pending.page, &pending.slot, bytes, payload);
             }
-        });
+        };
+        match checked.as_mut_slice() {
+            // Handing one page to another thread costs more than it saves.
+            [one] => check(one),
+            many => many.par_iter_mut().for_each(check),
+        }
         for (mut pending, Completion { transfer, result }, verdict) in checked {
             let buffer = match pending.payload.take() {
                 Some(payload) => {
@@ -454,6 +478,7 @@ impl PagedStore {
 
     fn finish_write(&mut self, pending: Pending, buffer: PageBuffer, result: io::Result<()>) {
         let at = pending.name();
+        let result = if active(Mutant::WriteErrorIgnored) { Ok(()) } else { result };
         let end = result.map(|()| PageMoved::Written(pending.slot)).map_err(|source| {
             self.slots.release(pending.slot.place);
             if is_out_of_space(&source) {

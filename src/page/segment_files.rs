@@ -94,16 +94,16 @@ impl SegmentFiles {
             let what = if there.is_file() { "exists with another length" } else { "is not a file" };
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{} {what}", path.display())));
         }
-        if there.len() < bytes {
-            if let Err(error) = allocate(&file, there.len(), bytes) {
-                // What was allocated before space ran out is given back; a file that was here stays as it was.
-                let _ = if there.len() == 0 { std::fs::remove_file(&path) } else { file.set_len(there.len()) };
-                return Err(error);
-            }
-            file.sync_all()?;
-            self.entries.as_ref().map_or(Ok(()), File::sync_all)?;
+        if there.len() < bytes
+            && let Err(error) = allocate(&file, there.len(), bytes)
+        {
+            // What was allocated before space ran out is given back; a file that was here stays as it was.
+            let _ = if there.len() == 0 { std::fs::remove_file(&path) } else { file.set_len(there.len()) };
+            return Err(error);
         }
-        Ok(())
+        // Also when nothing seems missing: whoever made it may have been killed before these calls.
+        file.sync_all()?;
+        self.entries.as_ref().map_or(Ok(()), File::sync_all)
     }
 
     /// The file of a segment, for reading.

@@ -7,7 +7,7 @@
 use super::error::PagingError;
 use super::pager::Pager;
 use super::pinned::PinnedPage;
-use super::transfers::Failure;
+use super::transfers::{Failure, WRITES};
 use crate::base::ids::PageNo;
 use crate::cache::evict::NEVER;
 use crate::cache::frame::FrameState;
@@ -119,13 +119,18 @@ impl Pager {
     /// there are frames wanted. Returns whether a frame is free now.
     fn make_room(&mut self, wanted: usize, is_step: bool) -> Result<bool, PagingError> {
         loop {
+            // Pages that are written to leave come first: a nearer one must not leave in their place.
+            let leaving = self.cache.count(FrameState::Writing) - self.ahead[WRITES] / self.cache.frame_bytes();
+            if leaving >= wanted {
+                return Ok(false);
+            }
             let victim = if self.writes_stopped { self.cache.clean_victim() } else { self.cache.victim() };
             match victim {
                 Some(victim) if !victim.dirty => {
                     self.evict(victim.page);
                     return Ok(true);
                 }
-                Some(victim) if self.store.is_some() && self.cache.count(FrameState::Writing) < wanted => {
+                Some(victim) if self.store.is_some() => {
                     if let Err(Failure { error, .. }) = self.begin_write(victim.page, false) {
                         self.stop_writes(error, is_step)?;
                     }

@@ -9,6 +9,7 @@
 use super::gpu_loss::{LossStage, value};
 use super::gpu_rows::{DeviceColumns, RowStages, band_into_sh_n};
 use super::gpu_tiles::{Blend, Demand, Frame, Ranks, TileStages, splat_bytes};
+use super::gpu_tiles_bwd::PictureGradients;
 use super::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
 use crate::gpu::{Buffer, DeviceKind, Gpu, GpuResult, Readback, Recorder, Traffic};
 use crate::kernels::image_loss::LossPlan;
@@ -98,6 +99,11 @@ impl GpuRenderer {
         self.frames_again
     }
 
+    /// Intersections of the last view; 0 before there is one.
+    pub fn isects(&self) -> u32 {
+        self.view.as_ref().map_or(0, |view| view.demand.isects)
+    }
+
     /// Coverage 1 - T of the last picture, `[height][width]`.
     ///
     /// # Errors
@@ -169,8 +175,7 @@ impl GpuRenderer {
             &view.ranks,
             &view.frame,
             view.demand,
-            &v_rgb.view(),
-            v_alpha.as_ref(),
+            PictureGradients { v_rgb: &v_rgb.view(), v_alpha: v_alpha.as_ref() },
             &v_splats.view(),
         )?;
         let grads = DeviceColumns::new(gpu, view.ranks.rows, sh_degree)?;

@@ -13,9 +13,8 @@
 use crate::gpu::{Buffer, BufferView, Gpu, GpuError, GpuResult, Pipeline, Readback, Recorder, groups_1d};
 use crate::kernels::splats::Grid;
 use crate::kernels::uniforms_tiles::{
-    DIGIT_BITS, DIGITS, FOLD_ROWS, HAS_V_ALPHA, IsectUniforms, OffsetsUniforms, RasterUniforms, SCAN_BLOCK,
-    SEGMENT_BWD, SEGMENT_FIRST, SEGMENT_FWD, SEGMENT_LAST, SORT_BLOCK, SPLAT_WORDS, SUMS, ScanUniforms, SortUniforms,
-    grid_words,
+    DIGIT_BITS, DIGITS, IsectUniforms, OffsetsUniforms, RasterUniforms, SCAN_BLOCK, SEGMENT_FIRST, SEGMENT_FWD,
+    SEGMENT_LAST, SORT_BLOCK, SPLAT_WORDS, ScanUniforms, SortUniforms, grid_words,
 };
 use std::sync::Arc;
 
@@ -28,7 +27,7 @@ const CAPACITY_MAX: u64 = (1 << 32) - (1 << 25);
 
 /// Compiled stages.
 #[derive(Debug)]
-struct Pipelines {
+pub(super) struct Pipelines {
     scan_reduce: Arc<Pipeline>,
     scan: Arc<Pipeline>,
     radix_histogram: Arc<Pipeline>,
@@ -38,8 +37,8 @@ struct Pipelines {
     isect_emit: Arc<Pipeline>,
     isect_offsets: Arc<Pipeline>,
     rasterize_fwd: Arc<Pipeline>,
-    rasterize_bwd: Arc<Pipeline>,
-    fold_rows: Arc<Pipeline>,
+    pub(super) rasterize_bwd: Arc<Pipeline>,
+    pub(super) fold_rows: Arc<Pipeline>,
 }
 
 /// What blending depends on besides splats.
@@ -128,14 +127,14 @@ impl DemandReadback {
 /// The tile stages of one device, and how much room the views so far needed.
 #[derive(Debug)]
 pub struct TileStages {
-    pipelines: Pipelines,
+    pub(super) pipelines: Pipelines,
     capacity: u32,
     /// Words of the largest binding.
     binding_words: u32,
     list_max: u32,
 }
 
-fn words(count: u32) -> u64 {
+pub(super) fn words(count: u32) -> u64 {
     4 * u64::from(count)
 }
 
@@ -423,64 +422,6 @@ impl TileStages {
             recorder = gpu.begin("tiles again");
         }
     }
-
-    /// Records the gradients of the splats (`v_splats`, a record for each row) from `v_rgb` (`[3][height][width]` f32)
-    /// and `v_alpha` (`[height][width]`). The frame must have fitted, with this demand.
-    ///
-    /// # Errors
-    /// The device has no room.
-    pub fn backward(
-        &self,
-        gpu: &Gpu,
-        recorder: &mut Recorder<'_>,
-        splats: &BufferView,
-        ranks: &Ranks,
-        frame: &Frame,
-        demand: Demand,
-        v_rgb: &BufferView,
-        v_alpha: Option<&BufferView>,
-        v_splats: &BufferView,
-    ) -> GpuResult<()> {
-        let grid = frame.blend.grid;
-        let tiles = grid.tiles_x * grid.tiles_y;
-        let segments = demand.list_max.div_ceil(SEGMENT_BWD).max(1);
-        let pixels = u64::from(grid.width) * u64::from(grid.height);
-        let partials = gpu.buffer("sums of intersections", u64::from(SUMS) * words(demand.isects))?;
-        let carry = gpu.buffer("pixels between segments", if segments > 1 { 8 * pixels } else { 8 })?;
-        for segment in (0..segments).rev() {
-            let mut flags = if v_alpha.is_some() { HAS_V_ALPHA } else { 0 };
-            flags |= if segment + 1 == segments { SEGMENT_FIRST } else { 0 };
-            flags |= if segment == 0 { SEGMENT_LAST } else { 0 };
-            let view = recorder.uniform(&raster_uniforms(&frame.blend, segment, SEGMENT_BWD, flags))?;
-            let views = [
-                view,
-                splats.clone(),
-                frame.row_from_isect.view(),
-                frame.isects.view(),
-                frame.tile_offsets.view(),
-                frame.t_final.view(),
-                frame.stops.view(),
-                v_rgb.clone(),
-                v_alpha.unwrap_or(v_rgb).clone(),
-                partials.view(),
-                carry.view(),
-            ];
-            recorder.dispatch("rasterize_bwd", &self.pipelines.rasterize_bwd, &views, groups_1d(tiles, 1))?;
-        }
-        let mut fold = raster_uniforms(&frame.blend, 0, SEGMENT_BWD, 0);
-        (fold.row_count, fold.isect_count) = (ranks.rows, demand.isects);
-        let views = [
-            recorder.uniform(&fold)?,
-            splats.clone(),
-            frame.row_from_isect.view(),
-            partials.view(),
-            ranks.order.view(),
-            ranks.offsets.view(),
-            v_splats.clone(),
-        ];
-        let groups = groups_1d(ranks.rows, FOLD_ROWS);
-        recorder.dispatch("rasterize_bwd", &self.pipelines.fold_rows, &views, groups)
-    }
 }
 
 /// Bytes of the splats, or of their gradients, of `rows` rows.
@@ -488,7 +429,8 @@ pub fn splat_bytes(rows: u32) -> u64 {
     u64::from(SPLAT_WORDS) * words(rows)
 }
 
-fn raster_uniforms(blend: &Blend, segment: u32, length: u32, flags: u32) -> RasterUniforms {
+/// Uniforms of one dispatch of a rasterizer: list entries from `length` times `segment` on.
+pub(super) fn raster_uniforms(blend: &Blend, segment: u32, length: u32, flags: u32) -> RasterUniforms {
     RasterUniforms {
         grid: grid_words(blend.grid),
         background: blend.background,
@@ -499,6 +441,7 @@ fn raster_uniforms(blend: &Blend, segment: u32, length: u32, flags: u32) -> Rast
         flags,
         row_count: 0,
         isect_count: 0,
-        pad: [0; 2],
+        window_first: 0,
+        window_end: 0,
     }
 }

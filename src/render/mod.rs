@@ -5,6 +5,7 @@ pub mod gpu;
 pub mod gpu_loss;
 pub mod gpu_rows;
 pub mod gpu_tiles;
+pub mod gpu_tiles_bwd;
 pub mod lpips;
 pub mod metrics;
 

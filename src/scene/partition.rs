@@ -22,9 +22,25 @@ const SERIAL_BELOW: usize = 8192;
 /// With densification on, pages start this full, in percent: most grow, and a split costs a half-empty page.
 const FILL_PERCENT: usize = 70;
 
+/// What can be divided: something with a position and the number of a row, which no two of them share.
+pub trait Placed: Copy + Send + Sync {
+    /// Position.
+    fn point(&self) -> [f32; 3];
+    /// Row.
+    fn row(&self) -> u32;
+}
+
+impl Placed for PointRow {
+    fn point(&self) -> [f32; 3] {
+        self.point
+    }
+    fn row(&self) -> u32 {
+        self.row
+    }
+}
+
 /// A position and the number of its row.
-#[derive(Debug, Clone, Copy, PartialEq, bytemuck::Zeroable, bytemuck::Pod)]
-#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointRow {
     /// Position.
     pub point: [f32; 3],
@@ -164,7 +180,7 @@ impl Pages {
     }
 
     /// Sorts the rows into pages: page p holds what lies from `start(p)` to `start(p + 1)` afterwards, ascending.
-    pub fn divide(&self, entries: &mut [PointRow]) {
+    pub fn divide<E: Placed>(&self, entries: &mut [E]) {
         assert_eq!(entries.len(), self.rows);
         if self.pages > 0 {
             self.divide_range(entries, 0..self.pages);
@@ -172,9 +188,9 @@ impl Pages {
     }
 
     /// The same for the rows of the pages `range` (at least one), of which there must be the right number.
-    pub fn divide_range(&self, entries: &mut [PointRow], range: Range<usize>) {
+    pub fn divide_range<E: Placed>(&self, entries: &mut [E], range: Range<usize>) {
         if range.len() == 1 {
-            return entries.sort_unstable_by_key(|e| e.row);
+            return entries.sort_unstable_by_key(E::row);
         }
         let middle = Pages::middle(&range);
         let at = self.start(middle) - self.start(range.start);
@@ -193,8 +209,8 @@ impl Pages {
 }
 
 /// Orders rows along an axis, equal coordinates by row.
-pub fn axis_key(entry: &PointRow, axis: usize) -> u64 {
-    u64::from(float_key(entry.point[axis])) << 32 | u64::from(entry.row)
+pub fn axis_key<E: Placed>(entry: &E, axis: usize) -> u64 {
+    u64::from(float_key(entry.point()[axis])) << 32 | u64::from(entry.row())
 }
 
 /// The box of some points.
@@ -211,13 +227,13 @@ impl PointBox {
     pub const EMPTY: PointBox = PointBox { lo: [f32::INFINITY; 3], hi: [f32::NEG_INFINITY; 3] };
 
     /// The box of all entries.
-    pub fn of(entries: &[PointRow]) -> PointBox {
+    pub fn of<E: Placed>(entries: &[E]) -> PointBox {
         if entries.len() >= 8 * SERIAL_BELOW {
             let parts = entries.par_chunks(SERIAL_BELOW).map(PointBox::of);
             return parts.reduce(|| PointBox::EMPTY, PointBox::and);
         }
         let mut all = PointBox::EMPTY;
-        entries.iter().for_each(|e| all.add(e.point));
+        entries.iter().for_each(|e| all.add(e.point()));
         all
     }
 

@@ -63,7 +63,7 @@ pub struct PagedScene {
 impl PageRules {
     fn new(options: &RunOptions) -> PageRules {
         PageRules {
-            adam: DeferredAdam::new(options.rates, options.adam, options.render.simd),
+            adam: DeferredAdam::new(options.rates, options.adam, options.render.simd).with_moments(options.moments),
             events: EventLog::default(),
             seed: options.seed,
             page_rows: options.page_rows,

@@ -193,6 +193,36 @@ fn columns_in_windows_give_the_same_bits() {
     assert!(bits(&want) == bits(&results(&mut cut, &view, &options, &target)));
 }
 
+#[test]
+fn uniforms_in_blocks_and_in_storage_give_the_same_bits() {
+    let form = |blocks| renderer(&GpuOptions { uniform_blocks: Some(blocks), ..GpuOptions::default() });
+    let (Some(mut blocks), Some(mut storage)) = (form(true), form(false)) else { return };
+    let (view, target) = (scene(900, 65, 47), photo(65, 47, true));
+    let options = RenderOptions { background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
+    let want = results(&mut blocks, &view, &options, &target);
+    assert!(bits(&want) == bits(&results(&mut storage, &view, &options, &target)));
+}
+
+#[test]
+fn sums_of_intersections_in_windows_give_the_same_bits() {
+    // Nine sums of 4 bytes: the sums of a third of what the keys of as many intersections take fit one binding.
+    let limit = 4 << 16;
+    let (Some(mut whole), Some(mut cut)) = (
+        renderer(&GpuOptions::default()),
+        renderer(&GpuOptions { max_binding_bytes: Some(limit), ..GpuOptions::default() }),
+    ) else {
+        return;
+    };
+    let (view, target) = (scene(2500, 144, 112), photo(144, 112, false));
+    let options = RenderOptions { background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
+    let want = results(&mut whole, &view, &options, &target);
+    let got = results(&mut cut, &view, &options, &target);
+    let windows = (36 * u64::from(cut.isects())).div_ceil(limit);
+    println!("{} intersections, {windows} windows", cut.isects());
+    assert!(windows >= 3);
+    assert!(bits(&want) == bits(&got));
+}
+
 /// Small Gaussians, hardly any of which touches two tiles.
 fn few_isects(rows: usize) -> (Columns, Camera) {
     let (mut columns, camera) = scene(rows, 64, 48);

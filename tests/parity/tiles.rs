@@ -13,13 +13,18 @@ use gsscale::kernels::rasterize_fwd::{Lists, Raster, rasterize_fwd, untile};
 use gsscale::kernels::scan::scan;
 use gsscale::kernels::splats::{Grid, Packed, pack};
 use gsscale::render::gpu_tiles::{Blend, Pairs, TileStages, splat_bytes};
+use gsscale::render::gpu_tiles_bwd::PictureGradients;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-/// The device on both paths, or only the plain one where it has no subgroup operations.
+/// The device on each path that it has: subgroups of 8, subgroups of any size, none.
 fn devices() -> Vec<Gpu> {
-    let open = |subgroups| support::gpu::open(&GpuOptions { subgroups: Some(subgroups), ..GpuOptions::default() });
-    let with = open(true).filter(Gpu::subgroups);
-    with.into_iter().chain(open(false)).collect()
+    let open = |subgroups, subgroups_of_8| {
+        let options = GpuOptions { subgroups, subgroups_of_8, ..GpuOptions::default() };
+        support::gpu::open(&options)
+    };
+    let any_size = open(None, Some(false)).filter(Gpu::subgroups);
+    let of_8 = open(None, None).filter(|gpu| gpu.subgroups() && gpu.summary().subgroup_sizes == Some((8, 8)));
+    of_8.into_iter().chain(any_size).chain(open(Some(false), None)).collect()
 }
 
 #[test]
@@ -245,9 +250,8 @@ fn on_gpu(gpu: &Gpu, stages: &mut TileStages, scene: &Scene, v_rgb: &[f32], v_al
     let (ranks, frame, demand) = stages.forward(gpu, &splats.view(), rows, scene.blend).unwrap();
     let mut recorder = gpu.begin("backward");
     let (from, to) = (splats.view(), v_splats.view());
-    stages
-        .backward(gpu, &mut recorder, &from, &ranks, &frame, demand, &v_rgb.view(), v_alpha_view.as_ref(), &to)
-        .unwrap();
+    let picture = PictureGradients { v_rgb: &v_rgb.view(), v_alpha: v_alpha_view.as_ref() };
+    stages.backward(gpu, &mut recorder, &from, &ranks, &frame, demand, picture, &to).unwrap();
     let read = [
         &ranks.order,
         &frame.row_from_isect,

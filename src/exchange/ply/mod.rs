@@ -18,7 +18,7 @@ mod read;
 mod rows;
 mod write;
 
-pub use read::{parse_ply, read_ply};
+pub use read::{holds_gaussians, parse_ply, read_ply, stream_points};
 pub use write::{PlyWriter, PlyWritten, write_gaussians};
 
 use crate::scene::columns::Columns;
