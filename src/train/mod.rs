@@ -1,6 +1,8 @@
-//! The glue, in one direction: [`run`] sets a run up and sees it through, [`trainer`] loops over steps, [`step`] is
-//! one step from top to bottom, [`catch_up`] brings rows to now, [`eval`] looks at held-out views, [`report`] writes
-//! what happened, [`progress`] shows it, [`machine`] starts its threads, [`signals`] hears Ctrl-C.
+//! The glue, in one direction: [`run`] sets a run up and sees it through ([`tiers`] says where pages live, [`memory`] and
+//! [`preflight`] whether that fits), [`trainer`] loops over steps, [`step`] is one step from top to bottom, [`pages`]
+//! has the rows of a run in pages and brings them to now with [`catch_up`], `update` changes them, [`eval`] looks at
+//! held-out views, [`report`] writes what happened, [`progress`] shows it, [`machine`] starts its threads, [`signals`]
+//! hears Ctrl-C.
 
 pub mod catch_up;
 pub mod eval;

@@ -1,0 +1,91 @@
+//! Budgets and the spill directory at the command line: what is too small is refused with numbers and alternatives,
+//! scratch is removed, and what is not ours stays.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+
+#[path = "support/scenes.rs"]
+mod scenes;
+
+use scenes::{city, stderr, summary, text, train};
+use std::path::{Path, PathBuf};
+use tempfile::TempDir;
+
+fn small() -> (TempDir, PathBuf) {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 12, 96, 64, 3000);
+    (folder, scene)
+}
+
+fn run(folder: &Path, scene: &Path, more: &[&str]) -> std::process::Output {
+    let out = folder.join("out");
+    train(&[&[text(scene), "--out", text(&out), "--steps", "12", "--overwrite"], more].concat())
+}
+
+/// The run ends with code 1, says all of `words`, and leaves no output.
+fn refuses(folder: &Path, scene: &Path, more: &[&str], words: &[&str]) {
+    let output = run(folder, scene, more);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    for word in words.iter().chain(&["remedy"]) {
+        assert!(said.contains(word), "{word} is not in: {said}");
+    }
+    assert!(!folder.join("out").exists(), "bad input leaves nothing behind");
+}
+
+#[test]
+fn budgets_that_are_too_small_are_refused_with_numbers_and_alternatives() {
+    let (folder, scene) = small();
+    let spill = folder.path().join("spill");
+    refuses(folder.path(), &scene, &["--host-mem", "8MiB"], &["--host-mem: 8.0 MiB", "--spill-dir", "in memory"]);
+    let with_drive = ["--host-mem", "8MiB", "--spill-dir", text(&spill)];
+    refuses(folder.path(), &scene, &with_drive, &["8.0 MiB", "needs", "at least"]);
+    assert!(!spill.exists(), "a refused run leaves no spill directory");
+    refuses(folder.path(), &scene, &["--frames", "2", "--page-rows", "64"], &["--frames: 2", "pages at once"]);
+    refuses(folder.path(), &scene, &["--io", "floppy"], &["--io", "uring"]);
+    refuses(folder.path(), &scene, &["--spill-codec", "zip"], &["--spill-codec", "zstd:"]);
+    refuses(folder.path(), &scene, &["--view-order", "groups:0"], &["--view-order", "groups:"]);
+    refuses(folder.path(), &scene, &["--page-rows", "3"], &["--page-rows"]);
+    refuses(folder.path(), &scene, &["--sh-degree", "1", "--sh-start", "2"], &["--sh-start"]);
+}
+
+#[test]
+fn the_spill_directory_is_scratch_and_others_files_are_safe() {
+    let (folder, scene) = small();
+    let spill = folder.path().join("spill");
+    let with_drive = ["--frames", "60", "--page-rows", "64", "--spill-dir", text(&spill), "--strategy", "none"];
+    let output = run(folder.path(), &scene, &with_drive);
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert!(stderr(&output).contains("60 frames of pages") && stderr(&output).contains("drive "));
+    assert!(!spill.exists(), "removed at a clean end");
+    let done = summary(&folder.path().join("out"));
+    // All 48 pages fit, so nothing has to leave.
+    assert!(done["bytes_written"] == 0 && done["frames"] == done["pages"], "{done}");
+    let config = std::fs::read_to_string(folder.path().join("out/config.toml")).unwrap();
+    assert!(config.contains("view-order = \"shuffle\""), "resolved once, and recorded: {config}");
+    std::fs::remove_dir_all(folder.path().join("out")).unwrap();
+    std::fs::create_dir(&spill).unwrap();
+    std::fs::write(spill.join("diary.txt"), "mine").unwrap();
+    refuses(folder.path(), &scene, &with_drive, &["diary.txt"]);
+    assert_eq!(std::fs::read_to_string(spill.join("diary.txt")).unwrap(), "mine");
+}
+
+#[test]
+fn a_dry_run_touches_no_spill_directory() {
+    let (folder, scene) = small();
+    let spill = folder.path().join("spill");
+    let output = train(&[text(&scene), "--dry-run", "--spill-dir", text(&spill)]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert!(!spill.exists());
+}
+
+#[test]
+fn bands_are_in_use_from_the_first_step_when_asked() {
+    let (folder, scene) = small();
+    let output = run(folder.path(), &scene, &["--sh-start", "3", "--strategy", "none", "--quiet"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let ply = std::fs::read(folder.path().join("out/point_cloud.ply")).unwrap();
+    let header_end = ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    let rows: Vec<f32> = ply[header_end..].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
+    // 62 floats a row, the higher bands from the tenth on.
+    let trained = rows.chunks_exact(62).filter(|row| row[9..54].iter().any(|&x| x != 0.0)).count();
+    assert!(trained > 1000, "{trained} rows have trained bands");
+}
