@@ -17,13 +17,13 @@ use gsscale::base::simd::SimdPath;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::gpu::{DeviceChoice, Gpu, GpuOptions, GpuResult};
-use gsscale::optim::deferred::DeferredAdam;
+use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::Renderer;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::gpu::GpuRenderer;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::image::Target;
-use gsscale::scene::state::SceneState;
+use gsscale::train::pages::PagedScene;
 use gsscale::train::step::{WorkingSet, train_step};
 use serde_json::{Map, json};
 use std::time::Instant;
@@ -121,8 +121,9 @@ fn steps<R: Renderer>(
 ) -> Run {
     let config = TrainConfig { simd: simd.name().to_string(), sh_every: 0, ..TrainConfig::default() };
     let options = RunOptions::new(&config, case.scene_scale);
-    let adam = DeferredAdam::new(options.rates, options.adam, simd);
-    let mut state = SceneState::from_columns(case.columns.clone());
+    let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
+    let made = PagedScene::new(&case.columns, pager, &options);
+    let Ok(mut scene) = made else { panic!("no pages: {:?}", made.err()) };
     let mut working = WorkingSet::default();
     let stride = case.views.len().div_ceil(VIEWS);
     let views: Vec<&(Camera, Target)> = case.views.iter().step_by(stride).collect();
@@ -130,7 +131,7 @@ fn steps<R: Renderer>(
     let mut round = |counted: bool| {
         for (camera, target) in &views {
             let how = (&options.render, &options.loss);
-            let done = train_step(&mut state, &mut working, renderer, &adam, (step, camera, target), how, None);
+            let done = train_step(&mut scene, &mut working, renderer, (step, camera, target), how, false);
             let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
             hash.add(outcome.loss.loss.to_bits());
             step += 1;
@@ -171,7 +172,7 @@ fn measure(args: &Args, case: &Case, rate: f64) {
         let gpu = Gpu::open_with(&DeviceChoice::Gpu, &GpuOptions { profile, ..GpuOptions::default() });
         checked(gpu.and_then(GpuRenderer::new))
     };
-    let on_cpu = steps(case, simd, &mut CpuRenderer::new(), ROUNDS, |r| r.stats().isects as u64);
+    let on_cpu = steps(case, simd, &mut CpuRenderer::new(), ROUNDS, |r| r.stats().isects);
     let mut renderer = open(false);
     let on_gpu = steps(case, simd, &mut renderer, ROUNDS, |r| u64::from(r.isects()));
     let traffic = renderer.traffic();

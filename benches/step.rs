@@ -1,4 +1,4 @@
-//! Time of a whole training step (cull, gather, forward, loss, backward, Adam, statistics) beside its floor.
+//! Time of a whole training step (acquire, cull, gather, forward, loss, backward, Adam, statistics, bounds) beside its floor.
 //!
 //! `cargo bench --bench step` measures real scenes (where `GSSCALE_DATA`, or `../shared/data`, has them) and a made-up
 //! terrain. Numbers choose sizes, words choose cases, `--path avx2` the instruction path, `--json` the form,
@@ -20,15 +20,14 @@ pub mod support;
 use gsscale::base::simd::SimdPath;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
-use gsscale::densify::stats::GradHistogram;
-use gsscale::optim::deferred::DeferredAdam;
+use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Columns, row_width};
 use gsscale::scene::image::{Image, Target};
-use gsscale::scene::state::SceneState;
 use gsscale::train::catch_up::{gather, visible_rows};
+use gsscale::train::pages::{PagedScene, numbered};
 use gsscale::train::step::{WorkingSet, train_step};
 use serde_json::json;
 use std::time::{Duration, Instant};
@@ -124,9 +123,10 @@ struct StepResult {
 fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult {
     let config = TrainConfig { simd: simd.name().to_string(), sh_every: 0, ..TrainConfig::default() };
     let options = RunOptions::new(&config, case.scene_scale);
-    let adam = DeferredAdam::new(options.rates, options.adam, simd);
-    let mut state = SceneState::from_columns(case.columns.clone());
-    let (mut working, mut histogram) = (WorkingSet::default(), GradHistogram::default());
+    let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
+    let made = PagedScene::new(&case.columns, pager, &options);
+    let Ok(mut scene) = made else { panic!("no pages: {:?}", made.err()) };
+    let mut working = WorkingSet::default();
     let mut renderer = Watched::default();
     let stride = case.views.len().div_ceil(effort.views);
     let views: Vec<&(Camera, Target)> = case.views.iter().step_by(stride).collect();
@@ -141,7 +141,7 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
                 renderer.begin = Some(Instant::now());
                 let at = (step, camera, target);
                 let how = (&options.render, &options.loss);
-                let done = train_step(&mut state, &mut working, &mut renderer, &adam, at, how, Some(&mut histogram));
+                let done = train_step(&mut scene, &mut working, &mut renderer, at, how, true);
                 let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
                 renderer.note_end();
                 let stats = renderer.inner.stats();
@@ -158,7 +158,7 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
     let wall = median(rounds[effort.warm_up..].iter().map(|s| s.wall / n));
     let steps = n * effort.rounds as f64;
     let [rows, updated, pairs, isects] = counts.map(|c| c / steps);
-    let mut parts = split_cull(&renderer.parts, &state, &adam, step, &views);
+    let mut parts = split_cull(&renderer.parts, &mut scene, step, &views);
     parts.iter_mut().for_each(|(_, seconds)| *seconds /= steps);
     let bytes = 4.0 * row_width(case.columns.sh_degree) as f64 * (4.0 * rows + 7.0 * updated);
     StepResult {
@@ -174,29 +174,36 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
     }
 }
 
-/// Cull and gather are one span of the step; their shares are taken from doing each alone on the final state.
+/// Acquire, cull and gather are one span of the step; their shares are taken from doing each alone on the final state.
 fn split_cull(
     parts: &[(&'static str, f64)],
-    state: &SceneState,
-    adam: &DeferredAdam,
+    scene: &mut PagedScene,
     now: u32,
     views: &[&(Camera, Target)],
 ) -> Vec<(&'static str, f64)> {
-    let (mut rows, mut columns) = (Vec::new(), Columns::zeros(0, state.sh_degree()));
-    let mut alone = [0.0; 2];
+    let (mut rows, mut columns) = (Vec::new(), Columns::default());
+    let mut alone = [0.0; 3];
     for (camera, _) in views {
         let start = Instant::now();
-        visible_rows(state, adam, now, camera, &mut rows);
+        let acquired = scene.pager.acquire(now, camera);
+        let Ok(pages) = acquired else { panic!("no pages: {:?}", acquired.err()) };
+        let tables = numbered(&pages);
+        let acquired = start.elapsed().as_secs_f64();
+        visible_rows(&tables, &scene.rules.adam, now, camera, &mut rows);
         let culled = start.elapsed().as_secs_f64();
-        gather(state, adam, now, &rows, &mut columns);
-        alone[0] += culled;
-        alone[1] += start.elapsed().as_secs_f64() - culled;
+        gather(&tables, scene.rules.sh_degree(), &scene.rules.adam, now, &rows, &mut columns);
+        let gathered = start.elapsed().as_secs_f64();
+        let spans = [acquired, culled - acquired, gathered - culled];
+        alone.iter_mut().zip(spans).for_each(|(sum, seconds)| *sum += seconds);
+        drop(tables);
+        scene.pager.release(pages);
     }
-    let share = alone[0] / (alone[0] + alone[1]).max(1e-12);
+    let all = alone.iter().sum::<f64>().max(1e-12);
     let mut out = Vec::new();
     for &(name, seconds) in parts {
-        if name == "cull+gather" {
-            out.extend([("cull", seconds * share), ("gather", seconds * (1.0 - share))]);
+        if name == "acquire+cull+gather" {
+            let names = ["acquire", "cull", "gather"];
+            out.extend(names.into_iter().zip(alone).map(|(name, part)| (name, seconds * part / all)));
         } else {
             out.push((name, seconds));
         }
@@ -281,7 +288,7 @@ impl Watched {
                 self.add(name, seconds);
             }
         }
-        self.add("adam+statistics", optimizer);
+        self.add("adam+statistics+bounds", optimizer);
     }
 }
 
@@ -296,7 +303,7 @@ impl Renderer for Watched {
 
     fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
         let before = self.begin.map_or(0.0, |t| t.elapsed().as_secs_f64());
-        self.add("cull+gather", before);
+        self.add("acquire+cull+gather", before);
         Renderer::forward(&mut self.inner, rows, camera, options)
     }
 

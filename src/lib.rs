@@ -18,7 +18,10 @@
 //! | [`base`] | errors, random draws, deterministic math, instruction paths, errors; knows neither Gaussians nor disks |
 //! | [`scene`] | Gaussians, cameras and images as data; first Gaussians from points; the log of global events |
 //! | [`dataset`] | where views come from: COLMAP, transforms.json, the generated city; decoding photos |
-//! | [`schedule`] | which view comes when |
+//! | [`schedule`] | which view comes when, which pages it needs, what a cache should keep |
+//! | [`page`] | pages as bytes: buffers, slots on disk, checksums, the engines that move them |
+//! | [`cache`] | which pages are in memory, in what state, and which leaves next; no I/O |
+//! | [`paging`] | brings the pages of a view into memory and takes them back |
 //! | [`gpu`] | a device and its memory, shaders, recording of work; knows no Gaussians |
 //! | [`kernels`] | the ordered table of stages and each stage as a function on plain slices |
 //! | [`render`] | the stages in order: forward, loss, backward; image metrics |
@@ -26,6 +29,7 @@
 //! | [`densify`] | statistics, decisions and edits that change the number of Gaussians |
 //! | [`exchange`] | PLY in and out |
 //! | [`config`] | what the user wrote and what follows from it |
+//! | [`report`] | pages for people: charts and pictures of what a run left behind |
 //! | [`train`] | the only place where all of it meets: one step, the loop, evaluation |
 //!
 //! One word, one thing: a *row* is one Gaussian inside a working set, a *column* one attribute of all of them, a
@@ -33,6 +37,7 @@
 //! a *step* one optimizer iteration, an *event* one global change that every row applies.
 
 pub mod base;
+pub mod cache;
 pub mod config;
 pub mod dataset;
 pub mod densify;
@@ -41,7 +46,9 @@ pub mod gpu;
 pub mod kernels;
 pub mod optim;
 pub mod page;
+pub mod paging;
 pub mod render;
+pub mod report;
 pub mod scene;
 pub mod schedule;
 pub mod train;

@@ -3,6 +3,9 @@
 #![allow(clippy::duplicate_mod)] // each benchmark is a program of its own, with its own support
 
 #[allow(dead_code)] // its `main`
+#[path = "../benches/commit.rs"]
+mod commit;
+#[allow(dead_code)] // its `main`
 #[path = "../benches/gpu.rs"]
 mod gpu;
 #[allow(dead_code)] // its `main`
@@ -16,6 +19,11 @@ mod render;
 mod step;
 
 use step::support::{Args, median};
+
+#[test]
+fn commit_runs() {
+    assert!(commit::tiny());
+}
 
 #[test]
 fn gpu_runs() {

@@ -106,8 +106,8 @@ fn no_row_that_would_be_drawn_is_left_out() {
     let (mut drawn, mut listed, mut out) = (0, 0, Vec::new());
     for now in 12..72 {
         let camera = camera(&mut draws);
-        let values = evaluate_all(&state, &adam, now);
-        visible_rows(&state, &adam, now, &camera, &mut out);
+        let values = evaluate_all(&[state.view()], 0, &adam, now);
+        visible_rows(&[state.view()], &adam, now, &camera, &mut out);
         assert!(out.windows(2).all(|pair| pair[0] < pair[1]));
         listed += out.len();
         for row in 0..rows {
@@ -131,8 +131,8 @@ fn no_row_that_the_projection_kernel_draws_is_left_out() {
     let (mut drawn, mut out, mut projected) = (0, Vec::new(), Projected::default());
     for now in 12..212 {
         let camera = camera(&mut draws);
-        visible_rows(&state, &adam, now, &camera, &mut out);
-        project_fwd(&evaluate_all(&state, &adam, now), &camera, EPS2D, simd, &mut projected);
+        visible_rows(&[state.view()], &adam, now, &camera, &mut out);
+        project_fwd(&evaluate_all(&[state.view()], 0, &adam, now), &camera, EPS2D, simd, &mut projected);
         for (row, radii) in projected.radii.iter().enumerate().filter(|(_, r)| **r != [0, 0]) {
             drawn += 1;
             assert!(out.binary_search(&(row as u32)).is_ok(), "row {row} with radii {radii:?} is missing");
@@ -152,8 +152,8 @@ fn lists_do_not_depend_on_threads_or_on_the_instruction_path() {
             let mut out = Vec::new();
             let mut values = Columns::default();
             let runs = (0..8).map(|i| {
-                visible_rows(&state, &adam, 12 + i * 60, &camera(&mut draws), &mut out);
-                gather(&state, &adam, 12 + i * 60, &out, &mut values);
+                visible_rows(&[state.view()], &adam, 12 + i * 60, &camera(&mut draws), &mut out);
+                gather(&[state.view()], 0, &adam, 12 + i * 60, &out, &mut values);
                 (out.clone(), values.clone())
             });
             runs.collect::<Vec<_>>()
@@ -170,9 +170,9 @@ fn gathered_rows_are_the_evaluated_ones() {
     let adam = DeferredAdam::new(Rates::new(1.0, 500), AdamConfig::default(), SimdPath::best());
     let state = scene(4000, &adam);
     let rows: Vec<u32> = (0..4000).step_by(3).collect();
-    let all = evaluate_all(&state, &adam, 40);
+    let all = evaluate_all(&[state.view()], 0, &adam, 40);
     let mut out = Columns::default();
-    gather(&state, &adam, 40, &rows, &mut out);
+    gather(&[state.view()], 0, &adam, 40, &rows, &mut out);
     for (i, &row) in rows.iter().enumerate() {
         Column::ALL.iter().for_each(|&c| assert_eq!(out.row(c, i), all.row(c, row as usize)));
     }

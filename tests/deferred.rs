@@ -47,6 +47,11 @@ fn grads_at(rows: &[u32], sh_degree: u8, step: u32) -> Columns {
     grads
 }
 
+/// All rows after `now` steps.
+fn evaluate_all(state: &SceneState, adam: &DeferredAdam, now: u32) -> Columns {
+    catch_up::evaluate_all(&[state.view()], state.sh_degree(), adam, now)
+}
+
 fn touched_rows(rows: usize, step: u32) -> Vec<u32> {
     (0..rows as u32).filter(|&row| is_touched(row as usize, step)).collect()
 }
@@ -83,7 +88,7 @@ fn values_follow_dense_adam_in_f64() {
             if step % 650 != 649 && step + 1 != STEPS {
                 continue;
             }
-            let now = catch_up::evaluate_all(&state, &adam, step + 1);
+            let now = evaluate_all(&state, &adam, step + 1);
             for (i, column) in Column::ALL.into_iter().enumerate().filter(|(_, c)| *c != Column::ShN) {
                 let (width, rate) = (column.width(0), rates.base(column));
                 for (j, (&got, &want)) in now.column(column).iter().zip(&dense[i].values).enumerate() {
@@ -115,14 +120,14 @@ fn reading_any_number_of_times_changes_no_bit_and_late_equals_on_time() {
         if step % 3 == 0 {
             let before = read.clone();
             let mut out = Columns::zeros(0, degree);
-            catch_up::gather(&read, &adam, step, &listed, &mut out);
-            catch_up::evaluate_all(&read, &adam, step + 500);
+            catch_up::gather(&[read.view()], degree, &adam, step, &listed, &mut out);
+            evaluate_all(&read, &adam, step + 500);
             assert_eq!(before, read);
         }
         adam.step(&mut read, &listed, &grads, step);
     }
     assert_eq!(quiet, read);
-    assert_eq!(catch_up::evaluate_all(&quiet, &adam, 3000), catch_up::evaluate_all(&read, &adam, 3000));
+    assert_eq!(evaluate_all(&quiet, &adam, 3000), evaluate_all(&read, &adam, 3000));
 }
 
 #[test]
@@ -144,7 +149,7 @@ fn the_same_bits_on_every_instruction_path_and_from_every_way_of_reading() {
         assert!(run(simd).1 == state, "{}", simd.name());
     }
     for now in [60, 61, 77, 459, 460, 461, 5000] {
-        let all = catch_up::evaluate_all(&state, &adam, now);
+        let all = evaluate_all(&state, &adam, now);
         let at = adam.at(now);
         for row in (0..rows).step_by(13) {
             let mut block = [0.0; BLOCK_LANES];
@@ -171,11 +176,11 @@ fn settling_a_row_leaves_its_later_values_where_they_were() {
     for step in 0..40 {
         adam.step(&mut state, &all, &grads_at(&all, 1, step), step);
     }
-    let want = catch_up::evaluate_all(&state, &adam, 300);
+    let want = evaluate_all(&state, &adam, 300);
     let mut view = state.view_mut();
     (0..20).for_each(|row| adam.at(45).settle_row(&mut view, row));
     assert!(state.stamp.iter().all(|&s| s == 45));
-    let got = catch_up::evaluate_all(&state, &adam, 300);
+    let got = evaluate_all(&state, &adam, 300);
     for column in Column::ALL {
         for (a, b) in got.column(column).iter().zip(want.column(column)) {
             // One more rounding of the value, and of moments that still move it by a few rates.

@@ -6,6 +6,7 @@ use gsscale::base::rng::{Purpose, Stream, hash64};
 use gsscale::base::simd::SimdPath;
 use gsscale::densify::ops::child_uid;
 use gsscale::densify::policy::DensifyConfig;
+use gsscale::densify::replay::apply_event;
 use gsscale::densify::stats::{GradHistogram, accumulate};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
@@ -13,7 +14,7 @@ use gsscale::optim::rates::Rates;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::events::{Event, EventKind, EventLog, RoundThresholds};
 use gsscale::scene::state::SceneState;
-use gsscale::train::catch_up::{apply_event, evaluate_all};
+use gsscale::train::catch_up;
 use std::collections::{BTreeMap, HashMap};
 
 const SEED: u64 = 11;
@@ -32,6 +33,11 @@ fn scene(rows: usize, sh_degree: u8) -> SceneState {
     columns.scales.iter_mut().for_each(|x| *x = *x * 1.2 - 5.5);
     columns.opacities.iter_mut().for_each(|x| *x = *x * 1.5 - 4.0);
     SceneState::from_columns(columns)
+}
+
+/// All rows after `now` steps.
+fn evaluate_all(state: &SceneState, adam: &DeferredAdam, now: u32) -> Columns {
+    catch_up::evaluate_all(&[state.view()], state.sh_degree(), adam, now)
 }
 
 /// One optimizer step and its statistics for the rows that `is_drawn` names; both depend on uid and step alone.

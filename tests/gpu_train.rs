@@ -173,7 +173,7 @@ fn steps_of_a_scene(scene: &Path, times: usize) -> Option<(Vec<usize>, Traffic, 
         *x += 100.0 * dataset.scene_scale * away[i % 3];
     }
     let mut trainer =
-        Trainer::new(columns, &dataset, Box::new(renderer), RunOptions::new(&config, dataset.scene_scale));
+        Trainer::new(columns, &dataset, Box::new(renderer), RunOptions::new(&config, dataset.scene_scale)).unwrap();
     let targets = TargetCache::new(&dataset.views, 1 << 30, 1).unwrap();
     let step = |trainer: &mut Trainer| trainer.step(&dataset, &targets).unwrap().rows;
     let mut seen = vec![step(&mut trainer), step(&mut trainer)];

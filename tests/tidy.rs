@@ -21,6 +21,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("densify", &["base", "scene", "optim"]),
     ("render", &["base", "scene", "gpu", "kernels"]),
     ("exchange", &["base", "scene"]),
+    ("report", &["base"]),
     (
         "config",
         &[
@@ -57,6 +58,7 @@ const LAYERS: &[(&str, &[&str])] = &[
             "gpu",
             "render",
             "exchange",
+            "report",
             "config",
         ],
     ),

@@ -72,7 +72,7 @@ fn start(args: Args) -> Result<Value, TrainError> {
     let gaussians_at_start = prepared.columns.rows();
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let options = RunOptions::new(&config, dataset.scene_scale);
-    let mut trainer = Trainer::new(prepared.columns, &dataset, Box::new(CpuRenderer::new()), options);
+    let mut trainer = Trainer::new(prepared.columns, &dataset, Box::new(CpuRenderer::new()), options)?;
     let (began, cpu_before) = (Instant::now(), process_cpu_seconds());
     let mut loss = 0.0;
     while trainer.steps_done() < config.steps {
@@ -85,7 +85,7 @@ fn start(args: Args) -> Result<Value, TrainError> {
         "scene": args.scene,
         "steps": config.steps,
         "gaussians_at_start": gaussians_at_start,
-        "gaussians": trainer.state.rows(),
+        "gaussians": trainer.scene.rows(),
         "load_seconds": load_seconds,
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,

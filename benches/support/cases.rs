@@ -75,7 +75,7 @@ pub fn photo_case(case: &PhotoCase, views: usize) -> Option<Case> {
     if !scene.is_dir() {
         return None;
     }
-    let config = TrainConfig { data_factor: case.data_factor, ..TrainConfig::default() };
+    let config = TrainConfig { data_factor: case.data_factor, sh_every: 0, ..TrainConfig::default() };
     let prepared = gsscale::train::run::prepare(&scene, &config);
     let Ok(prepared) = prepared else { panic!("{}: {:?}", scene.display(), prepared.err()) };
     let dataset = prepared.dataset;

@@ -1,5 +1,7 @@
 //! What the system tells about this machine and this process, for reports. No result of training depends on it.
 
+use std::path::{Path, PathBuf};
+
 /// CPU seconds, user and system, of all threads that this process has had; `None` where the system does not tell.
 ///
 /// From /proc/self/stat, whose ticks are hundredths of a second on every Linux (USER_HZ).
@@ -24,9 +26,97 @@ pub fn cpu_model() -> String {
     name.unwrap_or(std::env::consts::ARCH).to_string()
 }
 
+/// Memory that this process could still take, bytes: what the machine has available, or what is left of the limit of a
+/// control group that it is in, whichever is less. `None` where the system does not tell.
+pub fn memory_available() -> Option<u64> {
+    let machine = meminfo_available(&std::fs::read_to_string("/proc/meminfo").ok()?)?;
+    let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
+    let left = group_folders(&groups).iter().filter_map(|(folder, files)| left_in_group(folder, files)).min();
+    Some(left.map_or(machine, |left| left.min(machine)))
+}
+
+fn meminfo_available(text: &str) -> Option<u64> {
+    let line = text.lines().find_map(|l| l.strip_prefix("MemAvailable:"))?;
+    let kib: u64 = line.trim().trim_end_matches("kB").trim().parse().ok()?;
+    Some(kib * 1024)
+}
+
+/// Names of the files of a control group: limit, use, and the part of the use that is page cache that can go.
+struct GroupFiles {
+    limit: &'static str,
+    used: &'static str,
+    cache: &'static str,
+}
+
+const GROUP_V1: GroupFiles =
+    GroupFiles { limit: "memory.limit_in_bytes", used: "memory.usage_in_bytes", cache: "total_inactive_file" };
+const GROUP_V2: GroupFiles = GroupFiles { limit: "memory.max", used: "memory.current", cache: "inactive_file" };
+
+/// The folders of the memory groups that the lines of /proc/self/cgroup name, each with those above it: every one may
+/// have a limit. A container may see its own group as the root, so folders that are not there are tried all the same.
+fn group_folders(groups: &str) -> Vec<(PathBuf, &'static GroupFiles)> {
+    let mut folders = Vec::new();
+    for line in groups.lines() {
+        let mut fields = line.splitn(3, ':').skip(1);
+        let (Some(controllers), Some(path)) = (fields.next(), fields.next()) else { continue };
+        let (root, files) = match controllers {
+            "" => ("/sys/fs/cgroup", &GROUP_V2),
+            list if list.split(',').any(|c| c == "memory") => ("/sys/fs/cgroup/memory", &GROUP_V1),
+            _ => continue,
+        };
+        let inner = Path::new(path.trim_start_matches('/'));
+        folders.extend(inner.ancestors().map(|part| (Path::new(root).join(part), files)));
+    }
+    folders
+}
+
+fn left_in_group(folder: &Path, files: &GroupFiles) -> Option<u64> {
+    let number = |name: &str| std::fs::read_to_string(folder.join(name)).ok()?.trim().parse::<u64>().ok();
+    // `max` in v2; in v1 a number near 2^63 says the same and does no harm.
+    let (limit, used) = (number(files.limit)?, number(files.used)?);
+    let stat = std::fs::read_to_string(folder.join("memory.stat")).unwrap_or_default();
+    let cache = stat.lines().find_map(|l| l.strip_prefix(files.cache)?.trim().parse::<u64>().ok()).unwrap_or(0);
+    Some(limit.saturating_sub(used.saturating_sub(cache)))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn groups_are_found_with_all_above_them_in_both_versions() {
+        let folders = |text: &str| -> Vec<String> {
+            group_folders(text).iter().map(|(folder, files)| format!("{} {}", folder.display(), files.limit)).collect()
+        };
+        assert_eq!(
+            folders("9:name=systemd:/\n4:cpu,memory:/a/b\n0::/\n"),
+            [
+                "/sys/fs/cgroup/memory/a/b memory.limit_in_bytes",
+                "/sys/fs/cgroup/memory/a memory.limit_in_bytes",
+                "/sys/fs/cgroup/memory/ memory.limit_in_bytes",
+                "/sys/fs/cgroup/ memory.max",
+            ]
+        );
+        assert_eq!(folders("0::/x:y\nnonsense\n"), ["/sys/fs/cgroup/x:y memory.max", "/sys/fs/cgroup/ memory.max"]);
+    }
+
+    #[test]
+    fn what_is_left_of_a_limit_counts_cache_that_can_go() -> std::io::Result<()> {
+        let folder = std::env::temp_dir().join(format!("gsscale-group-{}", std::process::id()));
+        std::fs::create_dir_all(&folder)?;
+        let write = |name: &str, text: &str| std::fs::write(folder.join(name), text);
+        write("memory.max", "1000\n")?;
+        write("memory.current", "700\n")?;
+        write("memory.stat", "anon 100\ninactive_file 300\nactive_file 50\n")?;
+        let left = left_in_group(&folder, &GROUP_V2);
+        write("memory.max", "max\n")?;
+        let unlimited = left_in_group(&folder, &GROUP_V2);
+        let missing = left_in_group(&folder, &GROUP_V1);
+        std::fs::remove_dir_all(&folder)?;
+        assert_eq!((left, unlimited, missing), (Some(600), None, None));
+        assert_eq!(meminfo_available("MemTotal: 5 kB\nMemAvailable:      3 kB\n"), Some(3072));
+        Ok(())
+    }
 
     #[test]
     fn a_name_with_spaces_and_parentheses_does_not_shift_the_fields() {

@@ -6,6 +6,8 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::parse_bytes;
+use crate::page::codec::Codec;
+use crate::schedule::order::Order;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -15,6 +17,10 @@ const STEPS_MAX: u32 = 10_000_000;
 const INIT_POINTS_MAX: u32 = 100_000_000;
 /// Most worker threads: each has a stack, and a slip of the finger must not fill the machine with them.
 const THREADS_MAX: u32 = 1024;
+
+/// Fewest and most rows of a page: below, the index and the headers outweigh the rows; above, a page is 48 MB.
+const PAGE_ROWS_MIN: u32 = 16;
+const PAGE_ROWS_MAX: u32 = 65_536;
 
 macro_rules! config_keys {
     ($($heading:literal { $( $(#[doc = $doc:literal])+ $([$($arg:tt)+])? $name:ident: $ty:ty = $default:expr; )+ })+) => {
@@ -79,6 +85,13 @@ config_keys! {
         sh_degree: u8 = 3;
         /// Raise the band in use every N steps; 0 = all from the start
         sh_every: u32 = 1000;
+        /// Band in use from the first step
+        sh_start: u8 = 0;
+        /// Order of the photos: auto, shuffle, groups:<n> (n spatial groups, shuffled within) or tour (along the way).
+        /// auto is shuffle where the scene fits in memory, else groups
+        view_order: String = "auto".into();
+        /// Gaussians that a page holds. Part of a run: other pages give other roundings
+        page_rows: u32 = 1024;
         /// Weight of 1 - SSIM in the loss; L1 has the rest
         ssim_lambda: f64 = 0.2;
         /// Pixels that the loss's SSIM covers: valid (windows inside the image) or same (zero padded)
@@ -99,6 +112,8 @@ config_keys! {
         shn_lr: f64 = 2.5e-3 / 20.0;
         /// Adam's epsilon
         adam_eps: f64 = 1e-15;
+        /// What is kept of Adam's moments between steps: f32, or bf16, which is not exact and saves half of their disk
+        moments: String = "f32".into();
         /// Opacity of first Gaussians
         init_opacity: f64 = 0.1;
         /// Size of first Gaussians, times the distance to their three nearest neighbours
@@ -141,6 +156,23 @@ config_keys! {
         ssim_variant: String = "same".into();
         /// Coordinates of the PLY: dataset or local
         export_frame: String = "dataset".into();
+    }
+    "Memory and disk" {
+        /// Memory that the run may take; 0 = 70 % of what this machine, or its control group, has available
+        host_mem: ByteSize = ByteSize(0);
+        /// Folder for pages that do not fit in memory, on a fast drive; empty = all pages stay in memory. Scratch: removed
+        /// at the end
+        spill_dir: String = String::new();
+        /// Pages held in memory at once; 0 = as many as --host-mem allows
+        frames: u32 = 0;
+        /// How pages are read and written: auto, uring, mmap or pread. Never changes results
+        io: String = "auto".into();
+        /// How pages are stored: raw, zstd:<level>, or auto (what the drive's speed favours). Never changes results
+        spill_codec: String = "auto".into();
+        /// Which page leaves memory first: belady (next used last) or lru. Never changes results
+        evict: String = "belady".into();
+        /// Bytes of pages that may be read ahead of their step; 0 = an eighth of the frames
+        prefetch_bytes: ByteSize = ByteSize(0);
     }
     "Machine" {
         /// Worker threads; 0 = one per core. Never changes results
@@ -232,6 +264,12 @@ impl TrainConfig {
         if self.sh_degree > 3 {
             return refuse("sh-degree", "0, 1, 2 or 3");
         }
+        if self.sh_start > self.sh_degree {
+            return refuse("sh-start", "0 to --sh-degree");
+        }
+        if !(PAGE_ROWS_MIN..=PAGE_ROWS_MAX).contains(&self.page_rows) {
+            return refuse("page-rows", "16 to 65536");
+        }
         if self.steps == 0 || self.steps > STEPS_MAX {
             return refuse("steps", "1 to 10,000,000");
         }
@@ -311,8 +349,18 @@ impl TrainConfig {
         if self.device.trim().is_empty() {
             return refuse("device", "auto, gpu, cpu, or a part of the name of one of --list-devices");
         }
-        let names: [(&str, &str, &[&str]); 5] = [
+        let written = |key: &str, problem: String| InputError::new(format!("--{key}"), problem, "or write auto");
+        if self.view_order != "auto" {
+            self.view_order.parse::<Order>().map_err(|problem| written("view-order", problem))?;
+        }
+        if self.spill_codec != "auto" {
+            self.spill_codec.parse::<Codec>().map_err(|problem| written("spill-codec", problem))?;
+        }
+        let names: [(&str, &str, &[&str]); 8] = [
+            ("io", &self.io, &["auto", "uring", "mmap", "pread"]),
+            ("evict", &self.evict, &["belady", "lru"]),
             ("ssim-padding", &self.ssim_padding, &["valid", "same"]),
+            ("moments", &self.moments, &["f32", "bf16"]),
             ("strategy", &self.strategy, &["default", "none"]),
             ("ssim-variant", &self.ssim_variant, &["same", "valid", "reflect"]),
             ("export-frame", &self.export_frame, &["dataset", "local"]),

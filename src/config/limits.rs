@@ -9,10 +9,12 @@ use crate::dataset::read::ReadOptions;
 use crate::densify::policy::DensifyConfig;
 use crate::exchange::ply::ExportFrame;
 use crate::optim::adam::AdamConfig;
+use crate::optim::moments::Moments;
 use crate::optim::rates::Rates;
 use crate::render::metrics::SsimVariant;
 use crate::render::{LossOptions, RenderOptions, SsimPadding};
 use crate::scene::init::InitOptions;
+use crate::schedule::order::Order;
 
 /// Everything that the training loop needs, resolved.
 #[derive(Debug, Clone)]
@@ -25,10 +27,14 @@ pub struct RunOptions {
     pub sh_degree: u8,
     /// Steps between raises of the degree in use; 0 = all from the start.
     pub sh_every: u32,
-    /// Degree in use at step 0: 0, or what the Gaussians that a run starts from were trained with.
+    /// Degree in use at step 0: what was asked for, or what the Gaussians that a run starts from were trained with.
     pub sh_degree_start: u8,
     /// Cap on Gaussians; 0 = none.
     pub max_gaussians: usize,
+    /// Rows that a page holds at most.
+    pub page_rows: usize,
+    /// Order of the views; a shuffle where that is still to be settled.
+    pub view_order: Order,
     /// Rendering, but for the degree in use.
     pub render: RenderOptions,
     /// Loss.
@@ -37,6 +43,8 @@ pub struct RunOptions {
     pub rates: Rates,
     /// Adam's constants.
     pub adam: AdamConfig,
+    /// What is kept of its moments.
+    pub moments: Moments,
     /// Densification; `None` for `--strategy none`.
     pub densify: Option<DensifyConfig>,
     /// Scene scale, local units.
@@ -63,8 +71,10 @@ impl RunOptions {
             seed: config.seed,
             sh_degree: config.sh_degree,
             sh_every: config.sh_every,
-            sh_degree_start: 0,
+            sh_degree_start: first_sh_degree(config),
             max_gaussians: config.max_gaussians as usize,
+            page_rows: config.page_rows as usize,
+            view_order: config.view_order.parse().unwrap_or(Order::Shuffle),
             render: RenderOptions {
                 sh_degree: config.sh_degree,
                 max_alpha: config.max_alpha as f32,
@@ -84,6 +94,7 @@ impl RunOptions {
                 steps: config.steps,
             },
             adam: AdamConfig { eps: config.adam_eps, ..AdamConfig::default() },
+            moments: Moments::from_name(&config.moments).unwrap_or_default(),
             densify: (config.strategy == "default").then(|| densify(config)),
             scene_scale,
             ssim_variant: SsimVariant::from_name(&config.ssim_variant).unwrap_or(SsimVariant::Same),
@@ -126,6 +137,7 @@ pub fn read_options(config: &TrainConfig) -> ReadOptions {
     ReadOptions {
         images: (!config.images.is_empty()).then(|| config.images.clone()),
         allow_missing: config.allow_missing,
+        points_later: false,
     }
 }
 
@@ -144,10 +156,15 @@ pub fn load_options(config: &TrainConfig) -> LoadOptions {
     }
 }
 
-/// How first Gaussians are made.
+/// Degree in use from the first step, where the Gaussians themselves do not ask for more.
+pub fn first_sh_degree(config: &TrainConfig) -> u8 {
+    if config.sh_every == 0 { config.sh_degree } else { config.sh_start.min(config.sh_degree) }
+}
+
+/// How first Gaussians are made: without bands that are not in use yet.
 pub fn init_options(config: &TrainConfig) -> InitOptions {
     InitOptions {
-        sh_degree: config.sh_degree,
+        sh_degree: first_sh_degree(config),
         opacity: config.init_opacity as f32,
         scale_factor: config.init_scale as f32,
         seed: config.seed,

@@ -10,6 +10,7 @@
 
 use super::model::Pose;
 use glam::DVec3;
+use std::convert::Infallible;
 
 /// Coordinates larger than this are treated like non-finite ones: their squares would overflow.
 pub const LARGEST_COORDINATE: f64 = 1e100;
@@ -72,15 +73,29 @@ pub struct Extent {
 impl Extent {
     /// Measures cameras and points. Positions that are not [`usable`] are passed over.
     pub fn measure(centres: &[DVec3], points: &[[f64; 3]]) -> Self {
+        let distances = |centre: DVec3| {
+            let points = points.iter().map(|&p| DVec3::from_array(p)).filter(|&p| usable(p));
+            Ok::<f64, Infallible>(median(points.map(|p| p.distance(centre)).collect()))
+        };
+        match Extent::measure_by(centres, distances) {
+            Ok(extent) => extent,
+            Err(never) => match never {},
+        }
+    }
+
+    /// As [`Extent::measure`], where `point_distance` gives the median distance of the usable points from a position.
+    ///
+    /// # Errors
+    /// What `point_distance` says.
+    pub fn measure_by<E>(centres: &[DVec3], point_distance: impl FnOnce(DVec3) -> Result<f64, E>) -> Result<Self, E> {
         let centres: Vec<DVec3> = centres.iter().copied().filter(|&c| usable(c)).collect();
         let centre = DVec3::from_array(std::array::from_fn(|axis| median(centres.iter().map(|c| c[axis]).collect())));
         let mut camera_radius = median(centres.iter().map(|c| c.distance(centre)).collect());
-        let points = points.iter().map(|&p| DVec3::from_array(p)).filter(|&p| usable(p));
-        let point_distance = median(points.map(|p| p.distance(centre)).collect());
+        let point_distance = point_distance(centre)?;
         if camera_radius <= negligible(point_distance, centre) {
             camera_radius = 0.0;
         }
-        Extent { centre, camera_radius, point_distance }
+        Ok(Extent { centre, camera_radius, point_distance })
     }
 
     /// The local frame: the origin is the median camera; one unit is the median distance of the cameras from it, so

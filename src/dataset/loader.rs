@@ -8,6 +8,7 @@
 //! left out with `allow_missing` changes none of them; 3. whatever is left out or repaired is in `warnings`.
 
 use super::frame::{Extent, Frame, usable};
+use super::import::{Cloud, LocalCloud};
 use super::masks::{MaskIndex, MaskSource};
 use super::model::{Intrinsics, Lens, RawScene, RawView, Split};
 use super::photo::{PhotoSource, intrinsics_at};
@@ -119,7 +120,43 @@ impl Dataset {
 /// Errors: options out of range, no usable view, no training view; missing photos (listed by name) unless
 /// `allow_missing`; photos or masks that are empty, cut short, not JPEG or PNG, or of a shape that cannot belong to
 /// the camera.
-pub fn load_dataset(raw: RawScene, options: &LoadOptions) -> InputResult<Dataset> {
+pub fn load_dataset(mut raw: RawScene, options: &LoadOptions) -> InputResult<Dataset> {
+    let points = std::mem::take(&mut raw.points);
+    let measure = |centres: &[DVec3]| Ok(Extent::measure(centres, &points.positions));
+    let (mut dataset, extent) = load_views(raw, options, measure)?;
+    let (kept, colors) = local_points(points.positions, points.colors, &extent, &dataset.frame, &mut dataset.warnings);
+    (dataset.points, dataset.colors) = (kept, colors);
+    Ok(dataset)
+}
+
+/// As [`load_dataset`], for points that may not fit in memory: the dataset has none, the source gives them one by one.
+///
+/// # Errors
+/// As [`load_dataset`]; or the cloud's file cannot be read.
+pub fn load_dataset_with_cloud<'c>(
+    raw: RawScene,
+    cloud: &'c Cloud,
+    options: &LoadOptions,
+) -> InputResult<(Dataset, LocalCloud<'c>)> {
+    let measure = |centres: &[DVec3]| Extent::measure_by(centres, |centre| cloud.median_distance(centre));
+    let (mut dataset, extent) = load_views(raw, options, measure)?;
+    let local = LocalCloud { cloud, extent, frame: dataset.frame };
+    let mut dropped = BTreeMap::new();
+    cloud.for_each(|position, _| {
+        if !extent.is_plausible(position) {
+            *dropped.entry(why_dropped(position)).or_default() += 1;
+        }
+        Ok(())
+    })?;
+    warn_about_dropped(dropped, &mut dataset.warnings);
+    Ok((dataset, local))
+}
+
+fn load_views(
+    raw: RawScene,
+    options: &LoadOptions,
+    measure: impl FnOnce(&[DVec3]) -> InputResult<Extent>,
+) -> InputResult<(Dataset, Extent)> {
     check_options(options)?;
     let mut warnings = raw.warnings;
     let image_folder = options.image_folder.clone().unwrap_or_else(|| image_folder_of(&raw.views));
@@ -132,7 +169,7 @@ pub fn load_dataset(raw: RawScene, options: &LoadOptions) -> InputResult<Dataset
     }
     let splits = split_views(&raw.views, options, &mut warnings)?;
     let registered: Vec<(RawView, Split)> = raw.views.into_iter().zip(splits).collect();
-    let extent = measure(&registered, &raw.points.positions);
+    let extent = measure(&registered.iter().map(|(view, _)| view.pose.centre()).collect::<Vec<DVec3>>())?;
     let frame = extent.frame();
     let posed = drop_unusable_poses(registered, &extent, &mut warnings);
     let (scene_scale, outliers) =
@@ -161,9 +198,9 @@ pub fn load_dataset(raw: RawScene, options: &LoadOptions) -> InputResult<Dataset
         let remedy = "check the split of the dataset, --test-every and --test-after";
         return Err(InputError::new(image_folder, "no view is left for training", remedy));
     }
-    let (points, colors) = local_points(raw.points.positions, raw.points.colors, &extent, &frame, &mut warnings);
     let scene_scale = (scene_scale / frame.scale) as f32;
-    Ok(Dataset { views, points, colors, frame, scene_scale, warnings, image_folder })
+    let (points, colors) = (Vec::new(), Vec::new());
+    Ok((Dataset { views, points, colors, frame, scene_scale, warnings, image_folder }, extent))
 }
 
 fn check_options(options: &LoadOptions) -> InputResult<()> {
@@ -217,11 +254,6 @@ fn split_views(views: &[RawView], options: &LoadOptions, warnings: &mut Vec<Stri
     }
     let problem = format!("every one of the {} views would be a test view", views.len());
     Err(InputError::new("--test-every", problem, "give 2 or more, or 0 to hold none out"))
-}
-
-fn measure(registered: &[(RawView, Split)], points: &[[f64; 3]]) -> Extent {
-    let centres: Vec<DVec3> = registered.iter().map(|(view, _)| view.pose.centre()).collect();
-    Extent::measure(&centres, points)
 }
 
 /// Leaves out views whose pose or intrinsics are not finite, or that are absurdly far from all others.
@@ -444,12 +476,19 @@ fn local_points(
             points.push(frame.to_local(position).as_vec3().to_array());
             kept_colors.push(color);
         } else {
-            let why = if position.is_finite() { "are more than a million scene sizes away" } else { "are not finite" };
-            *dropped.entry(why).or_default() += 1;
+            *dropped.entry(why_dropped(position)).or_default() += 1;
         }
     }
-    warnings.extend(dropped.into_iter().map(|(why, count)| format!("{count} points {why} and are dropped")));
+    warn_about_dropped(dropped, warnings);
     (points, kept_colors)
+}
+
+fn why_dropped(position: DVec3) -> &'static str {
+    if position.is_finite() { "are more than a million scene sizes away" } else { "are not finite" }
+}
+
+fn warn_about_dropped(dropped: BTreeMap<&str, usize>, warnings: &mut Vec<String>) {
+    warnings.extend(dropped.into_iter().map(|(why, count)| format!("{count} points {why} and are dropped")));
 }
 
 /// Up to twenty names, then a count.

@@ -1,5 +1,6 @@
 //! What a reader finds, before any photo is opened: plain data in the dataset's own coordinates, all f64.
 
+use crate::base::error::InputResult;
 use glam::{DMat3, DVec3};
 use std::path::PathBuf;
 
@@ -77,6 +78,9 @@ pub struct RawView {
     pub split: Option<Split>,
 }
 
+/// Takes points one by one: position in dataset coordinates, sRGB.
+pub type TakePoint<'a> = dyn FnMut([f64; 3], [u8; 3]) -> InputResult<()> + 'a;
+
 /// Coloured points.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PointCloud {
@@ -95,7 +99,9 @@ pub struct RawScene {
     pub views: Vec<RawView>,
     /// Points; may be empty.
     pub points: PointCloud,
-    /// A PLY of points that the dataset names and that exists; read by the caller, since this module knows no PLY.
+    /// A file of points that exists and is the caller's to read: a PLY that the dataset names, since this module knows no
+    /// PLY; or, with [`super::read::ReadOptions::points_later`], the model's own points3D file
+    /// ([`super::colmap::stream_points`]).
     pub points_path: Option<PathBuf>,
     /// What was left out or repaired, one sentence each, for the user.
     pub warnings: Vec<String>,

@@ -2,7 +2,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::model::RawScene;
-use crate::dataset::{colmap, transforms};
+use crate::dataset::{colmap, mega_nerf, transforms};
 use std::path::Path;
 
 /// What the user says about where things are.
@@ -14,10 +14,12 @@ pub struct ReadOptions {
     /// A photo that is needed now (its size is not in the JSON) and is missing: leave the view out with a warning
     /// instead of failing. Photos whose size is known are the loader's to miss.
     pub allow_missing: bool,
+    /// Points stay in their file, whose path is given: they may not fit in memory.
+    pub points_later: bool,
 }
 
-/// Reads a scene: a folder with a COLMAP model, a folder with `transforms*.json`, or such a JSON file. A folder that
-/// holds both is read as COLMAP.
+/// Reads a scene: a folder with a COLMAP model, with `transforms*.json`, or in Mega-NeRF's layout, or such a JSON
+/// file. A folder that holds several is read as the first of them.
 ///
 /// # Errors
 /// Whatever is wrong with the files; a path with neither says what was looked for.
@@ -40,9 +42,15 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
     if transforms::looks_like_transforms(path) {
         return transforms::read_transforms(path, options);
     }
+    if mega_nerf::looks_like_mega_nerf(path) {
+        return mega_nerf::read_mega_nerf(path, options);
+    }
     Err(InputError::new(
         path,
-        format!("no scene here; looked for {}, and for transforms_train.json and transforms.json", colmap::LOOKED_FOR),
+        format!(
+            "no scene here; looked for {}, for transforms_train.json and transforms.json, and for Mega-NeRF's coordinates.pt",
+            colmap::LOOKED_FOR
+        ),
         "give the folder that holds 'sparse' and 'images' or a transforms.json",
     ))
 }

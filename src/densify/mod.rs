@@ -2,4 +2,5 @@
 
 pub mod ops;
 pub mod policy;
+pub mod replay;
 pub mod stats;

@@ -10,20 +10,16 @@
 //! in the order of their parents.
 
 use super::policy::{Fate, fate};
-use super::stats::mean_grad2d;
 use crate::base::math::{exp32, logit};
 use crate::base::rng::{Purpose, Stream, hash64};
 use crate::scene::columns::{Column, Columns};
-use crate::scene::events::RoundThresholds;
-use crate::scene::rows::{BLOCK_LANES, RowBlock, Rows, RowsMut, RowsNow, first_lane};
+use crate::scene::events::{RoundThresholds, SPLIT_SIGMAS};
+use crate::scene::rows::{BLOCK_LANES, RowBlock, Rows, RowsMut, RowsNow, first_lane, mean_grad2d};
 use crate::scene::state::SceneState;
 use rayon::prelude::*;
 
 /// Rows of one unit of parallel work.
 const ROWS_PER_TASK: usize = 4096;
-/// Children of a split lie within this many standard deviations of their parent, in its own axes: bounds can count
-/// on it. 1.1 % of draws are drawn again.
-pub const SPLIT_SIGMAS: f64 = 3.33;
 /// Children of a split are smaller than their parent by this factor.
 const SPLIT_SHRINK: f64 = 1.6;
 
@@ -61,11 +57,11 @@ pub fn plan_round<V: RowsNow>(
     let mut born = NewRows { columns: Columns::zeros(0, rows.columns.sh_degree), uid: Vec::new() };
     let mut counts = RoundCounts::default();
     let mut block = [0.0; BLOCK_LANES];
+    let (mut log_scales, mut opacities) = (vec![0.0; rows.rows()], vec![0.0; rows.rows()]);
+    values.sizes_and_opacities(rows, &mut log_scales, &mut opacities);
     for row in 0..rows.rows() {
-        let scale = |i| values.evaluate_element(rows, Column::Scales, row, i);
-        let log_scale = scale(0).max(scale(1)).max(scale(2));
-        let opacity = values.evaluate_element(rows, Column::Opacities, row, 0);
-        let fate = fate(thresholds, mean_grad2d(rows.grad2d[row], rows.count[row]), log_scale, opacity);
+        let mean_grad2d = mean_grad2d(rows.grad2d[row], rows.count[row]);
+        let fate = fate(thresholds, mean_grad2d, log_scales[row], opacities[row]);
         if matches!(fate, Fate::Split { .. } | Fate::Duplicate { pruned: false }) {
             values.evaluate_row(rows, row, &mut block);
         }
@@ -113,9 +109,14 @@ pub fn apply_round<V: RowsNow>(
     let chunks = state.chunks(ROWS_PER_TASK);
     let edits: Vec<(usize, RoundEdits)> =
         chunks.par_iter().map(|rows| (rows.first_row, plan_round(values, rows, thresholds, seed, event))).collect();
+    apply_edits(state, &edits)
+}
+
+/// Makes the edits of views that cover a whole table, given with the first row of each, and clears its statistics.
+pub fn apply_edits(state: &mut SceneState, edits: &[(usize, RoundEdits)]) -> RoundCounts {
     let mut removed = Vec::new();
     let mut counts = RoundCounts::default();
-    for (first, edit) in &edits {
+    for (first, edit) in edits {
         removed.extend(edit.removed.iter().map(|&row| row + *first as u32));
         counts.duplicated += edit.counts.duplicated;
         counts.split += edit.counts.split;

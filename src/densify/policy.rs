@@ -6,6 +6,7 @@
 use super::ops::{child_log_scale, sigma};
 use super::stats::GradHistogram;
 use crate::base::math::sigmoid;
+use crate::optim::bounds::SplitLimits;
 use crate::scene::events::{EventKind, RoundThresholds};
 
 /// Densification of a run.
@@ -61,6 +62,11 @@ impl DensifyConfig {
     /// Whether an opacity reset follows this step (after its round).
     pub fn is_reset(&self, step: u32) -> bool {
         step > 0 && step < self.refine_stop && step.is_multiple_of(self.reset_every)
+    }
+
+    /// What bounds of pages must count on: no round's thresholds are lower.
+    pub fn split_limits(&self, scene_scale: f32) -> SplitLimits {
+        SplitLimits { grow_grad2d: self.grow_grad2d, split_scale: self.grow_scale3d * scene_scale }
     }
 
     /// The events that follow this step, in order: a round, a reset. `rows` is the number of rows before the round,

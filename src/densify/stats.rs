@@ -4,16 +4,11 @@
 //! 3. the histogram counts every row that has statistics, exactly once, in the bin of its mean: integers only, so the
 //! order in which rows were touched leaves no trace in it.
 
-use crate::scene::rows::RowsMut;
+pub use crate::scene::rows::mean_grad2d;
+use crate::scene::rows::{Rows, RowsMut};
 
 /// Bins: one per value of the upper 16 bits of a non-negative f32, so 128 to every doubling.
 const BINS: usize = 1 << 15;
-
-/// Mean gradient norm per view that drew the row; 0 without views.
-#[inline]
-pub fn mean_grad2d(grad2d: f32, count: u32) -> f32 {
-    grad2d / count.max(1) as f32
-}
 
 /// Number of rows with statistics by their mean gradient norm. 128 KiB.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -63,6 +58,19 @@ impl GradHistogram {
         }
         least
     }
+
+    /// Rows that may grow at this threshold, one of [`GradHistogram::threshold`]'s: whole bins, so at least those that
+    /// exceed it. Adds up to the [`promised_growth`] of all pages.
+    pub fn promised(&self, threshold: f32) -> u64 {
+        self.bins[bin(threshold.next_up())..].iter().map(|&n| u64::from(n)).sum()
+    }
+}
+
+/// Rows of a view that [`GradHistogram::promised`] counted, when their statistics are still those of the round.
+pub fn promised_growth(rows: &Rows<'_>, threshold: f32) -> u64 {
+    let first = bin(threshold.next_up());
+    let is_counted = |&(&grad2d, &count): &(&f32, &u32)| count > 0 && bin(mean_grad2d(grad2d, count)) >= first;
+    rows.grad2d.iter().zip(rows.count).filter(is_counted).count() as u64
 }
 
 fn bin(mean: f32) -> usize {
@@ -72,7 +80,7 @@ fn bin(mean: f32) -> usize {
 
 /// Adds the gradients of one view. `rows` ascends and is numbered in the table that the view was cut from; `v_means2d`
 /// (loss with respect to the pixel position, pixel units) and `radii` have one entry per listed row; rows with a zero
-/// radius were not drawn. Gradients that are not finite are left out.
+/// radius were not drawn. Gradients that are not finite are left out. Returns the number of rows that changed.
 pub fn accumulate(
     view: &mut RowsMut<'_>,
     rows: &[u32],
@@ -80,7 +88,8 @@ pub fn accumulate(
     radii: &[[u32; 2]],
     image_size: [u32; 2],
     histogram: &mut GradHistogram,
-) {
+) -> usize {
+    let mut changed = 0;
     assert!(rows.len() == v_means2d.len() && rows.len() == radii.len(), "one gradient and radius per listed row");
     let half = image_size.map(|n| n as f32 * 0.5);
     for ((&row, v), radius) in rows.iter().zip(v_means2d).zip(radii) {
@@ -100,7 +109,9 @@ pub fn accumulate(
         *grad2d = (*grad2d + norm).min(f32::MAX);
         *count += 1;
         histogram.add(mean_grad2d(*grad2d, *count));
+        changed += 1;
     }
+    changed
 }
 
 #[cfg(test)]

@@ -1,3 +1,4 @@
-//! Scenes in and out of other programs: PLY.
+//! Scenes in and out of other programs: PLY; what TensorBoard reads.
 
 pub mod ply;
+pub mod tensorboard;

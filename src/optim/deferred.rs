@@ -10,6 +10,8 @@
 
 use super::adam::AdamConfig;
 use super::drift::{Drift, DriftTables, EpsFloor, RECENT, drifted, flush, needs_direct_sum};
+use super::lanes::SizeRows;
+use super::moments::{Moments, round_block};
 use super::rates::Rates;
 use crate::base::simd::{Kernel, SimdPath, dispatch};
 use crate::scene::columns::{Column, Columns};
@@ -39,6 +41,7 @@ pub struct DeferredAdam {
     /// `[k]`: beta1^k, beta2^k.
     beta_powers: Vec<[f32; 2]>,
     simd: SimdPath,
+    moments: Moments,
 }
 
 /// What a step did.
@@ -74,7 +77,19 @@ impl DeferredAdam {
             eps: EpsFloor::new(config.eps),
             beta_powers: (0..POWERS).map(|k| [power(config.beta1, k), power(config.beta2, k)]).collect(),
             simd,
+            moments: Moments::F32,
         }
+    }
+
+    /// The same optimizer for rows that keep their moments so.
+    #[must_use]
+    pub fn with_moments(self, moments: Moments) -> Self {
+        DeferredAdam { moments, ..self }
+    }
+
+    /// What rows keep of their moments.
+    pub fn moments(&self) -> Moments {
+        self.moments
     }
 
     /// The rates of the run.
@@ -97,6 +112,34 @@ impl DeferredAdam {
     /// [`AdamNow`] gives the same bits for rows.
     pub fn evaluate(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32, now: u32) -> f32 {
         self.evaluate_with(&self.tables.drift(stamp, now), column, value, m, v, stamp, now)
+    }
+
+    /// Series sums of the movement for ever, for a row of this stamp.
+    #[inline(always)]
+    pub(crate) fn limit_drift(&self, stamp: u32) -> &Drift {
+        self.tables.limit(stamp)
+    }
+
+    /// What one value comes to when it never gets a gradient again; it moves there from `value` without turning back.
+    pub(crate) fn limit(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32) -> f32 {
+        self.evaluate_with(self.tables.limit(stamp), column, value, m, v, stamp, u32::MAX)
+    }
+
+    /// Instruction path of the run.
+    pub(crate) fn simd(&self) -> SimdPath {
+        self.simd
+    }
+
+    /// eps and the root above which the series holds.
+    #[inline(always)]
+    pub(crate) fn eps_floor(&self) -> EpsFloor {
+        self.eps
+    }
+
+    /// Base rate of a column, as the evaluation uses it.
+    #[inline(always)]
+    pub(crate) fn base_rate(&self, column: Column) -> f32 {
+        self.lane_rates[first_lane(column)]
     }
 
     fn evaluate_with(&self, drift: &Drift, column: Column, value: f32, m: f32, v: f32, stamp: u32, now: u32) -> f32 {
@@ -147,18 +190,6 @@ impl<'a> AdamNow<'a> {
     pub(crate) fn drift(&self, stamp: u32) -> &Drift {
         let gap = self.now.saturating_sub(stamp) as usize;
         if gap < RECENT { &self.recent[gap] } else { self.adam.tables.limit(stamp) }
-    }
-
-    /// eps and the root above which the series holds.
-    #[inline(always)]
-    pub(crate) fn eps_floor(&self) -> EpsFloor {
-        self.adam.eps
-    }
-
-    /// Base rate of a column, as the evaluation uses it.
-    #[inline(always)]
-    pub(crate) fn base_rate(&self, column: Column) -> f32 {
-        self.adam.lane_rates[first_lane(column)]
     }
 
     /// The step on a view of rows: as [`DeferredAdam::step`], `rows` counted in the table that the view was cut from.
@@ -276,6 +307,10 @@ impl RowsNow for AdamNow<'_> {
         self.adam.evaluate_with(self.drift(stamp), column, value, m, v, stamp, self.now)
     }
 
+    fn sizes_and_opacities(&self, rows: &Rows<'_>, log_scales: &mut [f32], opacities: &mut [f32]) {
+        dispatch(self.adam.simd, SizeRows { at: self, rows, log_scales, opacities });
+    }
+
     fn settle_row(&self, rows: &mut RowsMut<'_>, row: usize) {
         let stamp = rows.stamp[row];
         if stamp >= self.now {
@@ -284,12 +319,17 @@ impl RowsNow for AdamNow<'_> {
         let mut value = [0.0; BLOCK_LANES];
         self.evaluate_row(&rows.as_ref(), row, &mut value);
         rows.columns.store_row_any(row, &value);
-        let powers = self.adam.beta_power(self.now - stamp);
-        for (table, power) in [&mut rows.exp_avg, &mut rows.exp_avg_sq].into_iter().zip(powers) {
-            let mut block = [0.0; BLOCK_LANES];
-            table.as_ref().load_row_any(row, &mut block);
-            table.store_row_any(row, &block.map(|x| flush(x * power)));
+        let [power1, power2] = self.adam.beta_power(self.now - stamp);
+        let (mut m, mut v) = ([0.0; BLOCK_LANES], [0.0; BLOCK_LANES]);
+        rows.exp_avg.as_ref().load_row_any(row, &mut m);
+        rows.exp_avg_sq.as_ref().load_row_any(row, &mut v);
+        m.iter_mut().for_each(|x| *x = flush(*x * power1));
+        v.iter_mut().for_each(|x| *x = flush(*x * power2));
+        if self.adam.moments == Moments::Bf16 {
+            round_block::<45>(&mut m, &mut v, rows.uid[row], self.now);
         }
+        rows.exp_avg.store_row_any(row, &m);
+        rows.exp_avg_sq.store_row_any(row, &v);
         rows.stamp[row] = self.now;
     }
 }
@@ -355,6 +395,9 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
             self.at.evaluate_block::<W>(&mut value, &m, &v, stamp);
             let powers = self.at.adam.beta_power(self.at.now.saturating_sub(stamp));
             constants.step_block::<W>(&mut value, &mut m, &mut v, &g, powers);
+            if self.at.adam.moments == Moments::Bf16 {
+                round_block::<W>(&mut m, &mut v, self.view.uid[row], self.at.now + 1);
+            }
             self.view.columns.store_row::<W>(row, &value);
             self.view.exp_avg.store_row::<W>(row, &m);
             self.view.exp_avg_sq.store_row::<W>(row, &v);

@@ -1,6 +1,9 @@
 //! Learning rates and Adam: dense as the definition, deferred as what runs.
 
 pub mod adam;
+pub mod bounds;
 pub mod deferred;
 pub mod drift;
+pub(crate) mod lanes;
+pub mod moments;
 pub mod rates;

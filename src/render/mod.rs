@@ -6,6 +6,7 @@ pub mod gpu_loss;
 pub mod gpu_rows;
 pub mod gpu_tiles;
 pub mod gpu_tiles_bwd;
+pub mod lpips;
 pub mod metrics;
 
 use crate::base::simd::SimdPath;

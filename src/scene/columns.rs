@@ -100,6 +100,22 @@ impl Columns {
         }
     }
 
+    /// Makes room for the bands up to `degree`, as zeros; nothing happens when they are there already.
+    pub fn raise_sh_degree(&mut self, degree: u8) {
+        if degree <= self.sh_degree {
+            return;
+        }
+        let (from, to) = (sh_n_width(self.sh_degree), sh_n_width(degree));
+        let mut sh_n = vec![0.0; self.rows() * to];
+        if from > 0 {
+            for (wide, narrow) in sh_n.chunks_exact_mut(to).zip(self.sh_n.chunks_exact(from)) {
+                // Bands follow each other, lowest first.
+                wide[..from].copy_from_slice(narrow);
+            }
+        }
+        (self.sh_n, self.sh_degree) = (sh_n, degree);
+    }
+
     /// Bytes allocated.
     pub fn bytes(&self) -> usize {
         let floats = self.means.capacity() + self.quats.capacity() + self.scales.capacity();

@@ -7,6 +7,10 @@
 //! Invariants: 1. the log only grows; 2. steps never decrease in it; 3. the index of an event is its name: it is
 //! part of the uids of the rows that it makes.
 
+/// Children of a split lie within this many standard deviations of their parent, in its own axes: bounds of pages
+/// count on it. 1.1 % of draws are drawn again.
+pub const SPLIT_SIGMAS: f64 = 3.33;
+
 /// What a densification round decides by. Everything absolute, so that a late application decides the same.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RoundThresholds {
@@ -28,7 +32,7 @@ pub enum EventKind {
         /// Largest opacity (after activation) that remains.
         max_opacity: f32,
     },
-    /// Bands up to this degree are rendered from now on. Changes no row: the bands were stored as zeros.
+    /// Bands up to this degree are rendered from now on. Rows that are stored without them get zeros.
     RaiseShDegree {
         /// The degree.
         degree: u8,

@@ -72,14 +72,38 @@ pub fn gaussians_from_points(points: &[[f32; 3]], colors: &[[u8; 3]], options: &
     let kept = kept_points(points, options);
     let means: Vec<[f32; 3]> = kept.iter().map(|&i| points[i]).collect();
     let scales = log_scales(&means, options);
-    let mut columns = Columns::zeros(kept.len(), options.sh_degree);
+    let point = |row: usize| FirstPoint {
+        point: means[row],
+        row: row as u32,
+        color: colors.get(kept[row]).copied().unwrap_or([128; 3]),
+        log_scale: scales[row],
+    };
+    first_gaussians(kept.len(), point, options)
+}
+
+/// A point with the size that its Gaussian starts with.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FirstPoint {
+    /// Position.
+    pub point: [f32; 3],
+    /// Row among all that start: part of the key of its random rotation.
+    pub row: u32,
+    /// sRGB.
+    pub color: [u8; 3],
+    /// Log of the first scale.
+    pub log_scale: f32,
+}
+
+/// The first Gaussians of some points.
+pub fn first_gaussians(rows: usize, point: impl Fn(usize) -> FirstPoint, options: &InitOptions) -> Columns {
+    let mut columns = Columns::zeros(rows, options.sh_degree);
     columns.opacities.fill(logit(options.opacity));
-    for (row, (&point, &scale)) in kept.iter().zip(&scales).enumerate() {
-        columns.row_mut(Column::Means, row).copy_from_slice(&means[row]);
-        columns.row_mut(Column::Scales, row).fill(scale);
-        let quat = random_rotation(&mut Stream::new(options.seed, Purpose::InitQuat, row as u64, 0));
+    for row in 0..rows {
+        let FirstPoint { point, row: key, color, log_scale } = point(row);
+        columns.row_mut(Column::Means, row).copy_from_slice(&point);
+        columns.row_mut(Column::Scales, row).fill(log_scale);
+        let quat = random_rotation(&mut Stream::new(options.seed, Purpose::InitQuat, u64::from(key), 0));
         columns.row_mut(Column::Quats, row).copy_from_slice(&quat);
-        let color = colors.get(point).copied().unwrap_or([128; 3]);
         for (sh0, byte) in columns.row_mut(Column::Sh0, row).iter_mut().zip(color) {
             *sh0 = ((f64::from(byte) / 255.0 - 0.5) / SH_C0) as f32;
         }
@@ -91,30 +115,64 @@ pub fn gaussians_from_points(points: &[[f32; 3]], colors: &[[u8; 3]], options: &
 fn kept_points(points: &[[f32; 3]], options: &InitOptions) -> Vec<usize> {
     let mut kept: Vec<usize> = (0..points.len()).filter(|&i| points[i].iter().all(|v| v.is_finite())).collect();
     let Some(most) = options.max_gaussians.filter(|&most| most < kept.len()) else { return kept };
-    // For one seed the hash is a bijection of the index, so there are no ties.
-    kept.sort_by_cached_key(|&i| hash64(&[options.seed, SUBSAMPLE, i as u64]));
+    kept.sort_by_cached_key(|&i| subsample_key(options.seed, i as u64));
     kept.truncate(most);
     kept.sort_unstable();
     kept
 }
 
+/// Orders points for the choice among too many: the smallest stay. For one seed a bijection of the index, so there are
+/// no ties.
+pub fn subsample_key(seed: u64, index: u64) -> u64 {
+    hash64(&[seed, SUBSAMPLE, index])
+}
+
+/// Root mean square of the distances to the neighbours that there are; 0 without any.
+pub fn rms_distance(dist2: &[f32; 3]) -> f64 {
+    let there = dist2.iter().filter(|d| d.is_finite());
+    let (sum, count) = there.fold((0.0, 0u32), |(sum, count), &d| (sum + f64::from(d), count + 1));
+    if count == 0 { 0.0 } else { libm::sqrt(sum / f64::from(count)) }
+}
+
+/// From distances to first log-scales.
+#[derive(Debug, Clone, Copy)]
+pub struct ScaleRule {
+    factor: f64,
+    fallback: f64,
+    low: f64,
+    high: f64,
+}
+
+impl ScaleRule {
+    /// The rule; `typical` is the median of the distances above zero ([`middle_rank`]), if there are any.
+    pub fn new(options: &InitOptions, typical: Option<f64>) -> ScaleRule {
+        let scene_scale = f64::from(options.scene_scale);
+        ScaleRule {
+            factor: f64::from(options.scale_factor),
+            fallback: typical.unwrap_or(LONE_POINT_SCALE * scene_scale),
+            low: f64::from(options.min_scale) * scene_scale,
+            high: f64::from(options.max_scale) * scene_scale,
+        }
+    }
+
+    /// Log of the first scale at a distance.
+    pub fn log_scale(&self, distance: f64) -> f32 {
+        let distance = if distance > 0.0 { distance } else { self.fallback };
+        // max, then min: not clamp, which panics when the options are the wrong way round.
+        libm::log((distance * self.factor).max(self.low).min(self.high)) as f32
+    }
+}
+
+/// Rank of the value that stands for a median.
+pub fn middle_rank(count: usize) -> usize {
+    count / 2
+}
+
 /// Log of the first scale of each point.
 fn log_scales(points: &[[f32; 3]], options: &InitOptions) -> Vec<f32> {
-    let rms = |dist2: &[f32; 3]| {
-        let there = dist2.iter().filter(|d| d.is_finite());
-        let (sum, count) = there.fold((0.0, 0u32), |(sum, count), &d| (sum + f64::from(d), count + 1));
-        if count == 0 { 0.0 } else { libm::sqrt(sum / f64::from(count)) }
-    };
-    let distances: Vec<f64> = nearest_dist2(points).par_iter().map(rms).collect();
-    let scene_scale = f64::from(options.scene_scale);
-    let fallback = median_above_zero(&distances).unwrap_or(LONE_POINT_SCALE * scene_scale);
-    let (low, high) = (f64::from(options.min_scale) * scene_scale, f64::from(options.max_scale) * scene_scale);
-    let log_scale = |&distance: &f64| {
-        let distance = if distance > 0.0 { distance } else { fallback };
-        // max, then min: not clamp, which panics when the options are the wrong way round.
-        libm::log((distance * f64::from(options.scale_factor)).max(low).min(high)) as f32
-    };
-    distances.par_iter().map(log_scale).collect()
+    let distances: Vec<f64> = nearest_dist2(points).par_iter().map(rms_distance).collect();
+    let rule = ScaleRule::new(options, median_above_zero(&distances));
+    distances.par_iter().map(|&distance| rule.log_scale(distance)).collect()
 }
 
 fn median_above_zero(values: &[f64]) -> Option<f64> {
@@ -122,7 +180,7 @@ fn median_above_zero(values: &[f64]) -> Option<f64> {
     if positive.is_empty() {
         return None;
     }
-    let middle = positive.len() / 2;
+    let middle = middle_rank(positive.len());
     Some(*positive.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 

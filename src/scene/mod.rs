@@ -3,10 +3,14 @@
 pub mod camera;
 pub mod columns;
 pub mod events;
+pub mod frustum;
 pub mod image;
 pub mod init;
 pub mod neighbours;
 pub mod page_layout;
 pub mod page_meta;
+pub mod page_split;
+pub mod partition;
 pub mod rows;
+pub mod select;
 pub mod state;

@@ -1,5 +1,7 @@
 //! Exact distances to the three nearest neighbours of every point of a cloud, by a k-d tree over sorted arrays.
 //!
+//! A cloud that is only there in parts is searched part by part: [`NeighbourTree::nearer`] gives what one part adds.
+//!
 //! Not here: what the distances are for.
 //!
 //! Invariants: 1. distances are those of a brute-force search in f32, bit for bit: bounds of boxes are computed with
@@ -23,15 +25,18 @@ struct Entry {
     index: u32,
 }
 
-#[derive(Clone, Copy)]
-struct Bounds {
-    low: [f32; 3],
-    high: [f32; 3],
+/// The box of some points.
+#[derive(Debug, Clone, Copy)]
+pub struct Bounds {
+    /// Lower corner.
+    pub low: [f32; 3],
+    /// Upper corner.
+    pub high: [f32; 3],
 }
 
 /// A balanced tree: every node halves its range of `entries`, all leaves are at depth `levels`. `boxes` is in
 /// preorder: the left child of a node follows it, the right child of one with `l` levels below is 2^l further.
-struct Tree {
+pub struct NeighbourTree {
     entries: Vec<Entry>,
     boxes: Vec<Bounds>,
     levels: u32,
@@ -43,26 +48,15 @@ struct Tree {
 /// # Panics
 /// With 2^32 points or more.
 pub fn nearest_dist2(points: &[[f32; 3]]) -> Vec<[f32; NEIGHBOURS]> {
-    let tree = Tree::new(points);
-    let mut by_entry = vec![[f32::INFINITY; NEIGHBOURS]; points.len()];
-    by_entry.par_chunks_mut(QUERIES_PER_TASK).enumerate().for_each(|(task, out)| {
-        let first = task * QUERIES_PER_TASK;
-        for (entry, out) in tree.entries[first..].iter().zip(out) {
-            // The point itself is found too, at distance 0, which no other point can undercut.
-            let mut best = [f32::INFINITY; NEIGHBOURS + 1];
-            tree.search(0, tree.levels, 0, tree.entries.len(), entry.point, &mut best);
-            out.copy_from_slice(&best[1..]);
-        }
-    });
-    let mut by_point = vec![[f32::INFINITY; NEIGHBOURS]; points.len()];
-    for (entry, dist2) in tree.entries.iter().zip(by_entry) {
-        by_point[entry.index as usize] = dist2;
-    }
-    by_point
+    NeighbourTree::new(points).nearest_dist2()
 }
 
-impl Tree {
-    fn new(points: &[[f32; 3]]) -> Tree {
+impl NeighbourTree {
+    /// The tree of some points.
+    ///
+    /// # Panics
+    /// With 2^32 points or more.
+    pub fn new(points: &[[f32; 3]]) -> NeighbourTree {
         assert!(u32::try_from(points.len()).is_ok(), "more than 2^32 points");
         let entries = points.iter().enumerate().map(|(i, &point)| Entry { point, index: i as u32 });
         let mut entries: Vec<Entry> = entries.collect();
@@ -72,7 +66,41 @@ impl Tree {
         }
         let mut boxes = vec![Bounds { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3] }; (2 << levels) - 1];
         build(&mut entries, &mut boxes, levels);
-        Tree { entries, boxes, levels }
+        NeighbourTree { entries, boxes, levels }
+    }
+
+    /// Squared distances of every point of the tree, in the order given, to its three nearest others.
+    pub fn nearest_dist2(&self) -> Vec<[f32; NEIGHBOURS]> {
+        let mut by_entry = vec![[f32::INFINITY; NEIGHBOURS]; self.entries.len()];
+        by_entry.par_chunks_mut(QUERIES_PER_TASK).enumerate().for_each(|(task, out)| {
+            let first = task * QUERIES_PER_TASK;
+            for (entry, out) in self.entries[first..].iter().zip(out) {
+                // The point itself is found too, at distance 0, which no other point can undercut.
+                let mut best = [f32::INFINITY; NEIGHBOURS + 1];
+                self.search(0, self.levels, 0, self.entries.len(), entry.point, &mut best);
+                out.copy_from_slice(&best[1..]);
+            }
+        });
+        let mut by_point = vec![[f32::INFINITY; NEIGHBOURS]; self.entries.len()];
+        for (entry, dist2) in self.entries.iter().zip(by_entry) {
+            by_point[entry.index as usize] = dist2;
+        }
+        by_point
+    }
+
+    /// Squared distances below `limit` from `q`, which is no point of the tree, to its nearest points, ascending;
+    /// infinity where there are fewer.
+    pub fn nearer(&self, q: [f32; 3], limit: f32) -> [f32; NEIGHBOURS] {
+        let mut best = [limit; NEIGHBOURS + 1];
+        if self.bounds().dist2(q) < limit {
+            self.search(0, self.levels, 0, self.entries.len(), q, &mut best);
+        }
+        std::array::from_fn(|i| if best[i] < limit { best[i] } else { f32::INFINITY })
+    }
+
+    /// The box of all points.
+    pub fn bounds(&self) -> Bounds {
+        self.boxes[0]
     }
 
     fn search(&self, node: usize, levels: u32, low: usize, high: usize, q: [f32; 3], best: &mut [f32; 4]) {
@@ -110,8 +138,9 @@ impl Bounds {
         b
     }
 
+    /// Squared distance of the box from a point; never above that of a point in it.
     #[inline]
-    fn dist2(&self, q: [f32; 3]) -> f32 {
+    pub fn dist2(&self, q: [f32; 3]) -> f32 {
         dist2(std::array::from_fn(|i| (self.low[i] - q[i]).max(q[i] - self.high[i]).max(0.0)))
     }
 }
@@ -119,6 +148,13 @@ impl Bounds {
 #[inline]
 fn dist2(d: [f32; 3]) -> f32 {
     d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+}
+
+/// The smallest of two lists, ascending.
+pub fn merged(a: [f32; NEIGHBOURS], b: [f32; NEIGHBOURS]) -> [f32; NEIGHBOURS] {
+    let mut best = [a[0], a[1], a[2], f32::INFINITY];
+    b.into_iter().for_each(|value| insert(&mut best, value));
+    [best[0], best[1], best[2]]
 }
 
 /// Keeps the smallest values, ascending. NaN is never kept.

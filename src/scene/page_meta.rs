@@ -8,11 +8,12 @@ use crate::base::ids::PageId;
 /// Where the rows of a page can be, now and until the page is next rewritten.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PageBounds {
-    /// Lower corner of the box of the means, local frame. Above `hi` for a page without rows.
+    /// Lower corner of the box of the means, local frame; the children of rows that may split before they are seen
+    /// again are inside. Above `hi` for a page without rows.
     pub lo: [f32; 3],
     /// Upper corner.
     pub hi: [f32; 3],
-    /// Largest standard deviation, any rotation; counts 1.63-fold for rows that may split before they are seen again.
+    /// Largest standard deviation, any rotation.
     pub sigma_max: f32,
 }
 

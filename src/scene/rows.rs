@@ -28,7 +28,7 @@ pub const fn first_lane(column: Column) -> usize {
 }
 
 /// Shared view of the columns of some rows; each slice is `[rows][width]`.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct ColumnsRef<'a> {
     /// Degree that `sh_n` is stored with.
     pub sh_degree: u8,
@@ -182,7 +182,7 @@ impl<'a> ColumnsMut<'a> {
 }
 
 /// Shared view of rows with all that training keeps of them.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct Rows<'a> {
     /// Number of the first row in the table that the view was cut from.
     pub first_row: usize,
@@ -301,6 +301,12 @@ impl<'a> RowsMut<'a> {
     }
 }
 
+/// Mean gradient norm per view that drew the row; 0 without views.
+#[inline(always)]
+pub fn mean_grad2d(grad2d: f32, count: u32) -> f32 {
+    grad2d / count.max(1) as f32
+}
+
 /// What rows are at one moment of training. The optimizer implements it; events act on rows through it, because an
 /// untouched row still moves by its momentum.
 pub trait RowsNow: Sync {
@@ -310,6 +316,9 @@ pub trait RowsNow: Sync {
     fn evaluate_row(&self, rows: &Rows<'_>, row: usize, out: &mut RowBlock);
     /// One value of one column of a row as it is now; `element` counts within the row.
     fn evaluate_element(&self, rows: &Rows<'_>, column: Column, row: usize, element: usize) -> f32;
+    /// What rounds decide by, for all rows as they are now: the largest log-scale and the opacity (logit). One entry
+    /// per row each.
+    fn sizes_and_opacities(&self, rows: &Rows<'_>, log_scales: &mut [f32], opacities: &mut [f32]);
     /// Rewrites the row as what it is now: values, decayed moments, stamp.
     fn settle_row(&self, rows: &mut RowsMut<'_>, row: usize);
 }

@@ -171,6 +171,36 @@ impl SceneState {
         self.count.try_reserve_exact(more)
     }
 
+    /// Makes room for the bands up to `degree`, as zeros without moments, which is what they are until then.
+    pub fn raise_sh_degree(&mut self, degree: u8) {
+        self.columns.raise_sh_degree(degree);
+        self.exp_avg.raise_sh_degree(degree);
+        self.exp_avg_sq.raise_sh_degree(degree);
+    }
+
+    /// The listed rows, in the order of the list.
+    #[must_use]
+    pub fn select(&self, rows: &[u32]) -> SceneState {
+        let of = |from: &Columns| {
+            let mut columns = Columns { sh_degree: from.sh_degree, ..Columns::default() };
+            for column in Column::ALL {
+                let values = columns.column_mut(column);
+                values.reserve_exact(rows.len() * column.width(from.sh_degree));
+                rows.iter().for_each(|&row| values.extend_from_slice(from.row(column, row as usize)));
+            }
+            columns
+        };
+        SceneState {
+            columns: of(&self.columns),
+            exp_avg: of(&self.exp_avg),
+            exp_avg_sq: of(&self.exp_avg_sq),
+            stamp: rows.iter().map(|&row| self.stamp[row as usize]).collect(),
+            uid: rows.iter().map(|&row| self.uid[row as usize]).collect(),
+            grad2d: rows.iter().map(|&row| self.grad2d[row as usize]).collect(),
+            count: rows.iter().map(|&row| self.count[row as usize]).collect(),
+        }
+    }
+
     /// Appends all rows of `other`, which must be stored at the same degree.
     pub fn append(&mut self, other: &SceneState) {
         assert_eq!(self.sh_degree(), other.sh_degree(), "rows of another degree cannot be appended");

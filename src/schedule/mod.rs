@@ -1,3 +1,11 @@
-//! Which view comes when: pure functions of the seed, no I/O.
+//! Which view comes when and which pages it needs: pure planning, no I/O.
 
+pub mod auto;
+pub mod first_pages;
+pub mod model;
 pub mod order;
+pub mod places;
+pub mod plan;
+pub mod replay;
+pub mod tour;
+pub mod visibility;

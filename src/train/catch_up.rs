@@ -1,176 +1,107 @@
 //! From stored rows to the rows of one view: which of them it may draw, and what they are at this step.
 //!
-//! Invariants: 1. the state is only read here, except by [`apply_event`]; 2. the cull is conservative: no row that the
-//! projection would draw is left out, whatever its rotation and opacity; 3. listed rows ascend; 4. results are the same
-//! for any number of threads; 5. once `out` has grown to its size, nothing that grows with the scene is allocated.
+//! Rows come as a list of tables numbered through: the pinned pages of a step, or one table in memory.
+//!
+//! Invariants: 1. rows are only read here; 2. the cull is conservative: no row that the projection would draw is left
+//! out, whatever its rotation and opacity; 3. listed rows ascend; 4. results are the same for any number of threads and
+//! for any cut of the rows into tables; 5. once `out` has grown to its size, nothing that grows with the scene is
+//! allocated.
 
 use crate::base::math::exp32;
 use crate::base::simd::{Kernel, dispatch};
-use crate::densify::ops;
-use crate::kernels::constants::{EPS2D, EXTENT_SIGMAS};
 use crate::optim::deferred::{AdamNow, DeferredAdam, ROWS_PER_TASK};
-use crate::optim::drift::{EpsFloor, drifted, needs_direct_sum};
+use crate::optim::lanes::{LANES, LaneDrifts, drifted_lanes, tables_of};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
-use crate::scene::events::{Event, EventKind};
+use crate::scene::frustum::Frustum;
 use crate::scene::rows::{ColumnsMut, Rows, RowsNow};
-use crate::scene::state::SceneState;
 
-/// Rows of one vector of the cull.
-const LANES: usize = 16;
-/// The view angle at which the projection's Jacobian is clamped lies this share of the half field of view outside it.
-const CLAMP_MARGIN: f32 = 0.3;
-
-/// What an event changed.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct EventOutcome {
-    /// What a densification round did.
-    pub round: ops::RoundCounts,
-    /// Rows that an opacity reset rewrote.
-    pub reset_rows: usize,
-}
-
-/// The rows that `camera` may draw after `now` optimizer steps, ascending.
-pub fn visible_rows(state: &SceneState, adam: &DeferredAdam, now: u32, camera: &Camera, out: &mut Vec<u32>) {
+/// The rows of `tables` that `camera` may draw after `now` optimizer steps, ascending. Tables are numbered through:
+/// each starts where the one before it ends.
+pub fn visible_rows(tables: &[Rows<'_>], adam: &DeferredAdam, now: u32, camera: &Camera, out: &mut Vec<u32>) {
     let at = adam.at(now);
     let frustum = Frustum::new(camera);
-    out.resize(state.rows(), 0);
-    let found = cull(&at, &frustum, state.view(), out);
+    out.resize(rows_of(tables), 0);
+    let found = cull(&at, &frustum, tables, out);
     out.truncate(found);
 }
 
-/// The listed rows as they are after `now` optimizer steps: row i of `out` is row `rows[i]` of the state.
-pub fn gather(state: &SceneState, adam: &DeferredAdam, now: u32, rows: &[u32], out: &mut Columns) {
-    if out.sh_degree != state.sh_degree() {
-        *out = Columns::zeros(0, state.sh_degree());
+/// The listed rows as they are after `now` optimizer steps: row i of `out` is row `rows[i]` of the tables, which are
+/// numbered through and all stored with `sh_degree`.
+pub fn gather(tables: &[Rows<'_>], sh_degree: u8, adam: &DeferredAdam, now: u32, rows: &[u32], out: &mut Columns) {
+    if out.sh_degree != sh_degree {
+        *out = Columns::zeros(0, sh_degree);
     }
     out.resize(rows.len());
-    let row_of = |i: usize| rows[i] as usize;
-    evaluate_into(&adam.at(now), state.view(), &row_of, 0, out.view_mut());
+    evaluate_into(&adam.at(now), tables, rows, out.view_mut());
 }
 
-/// All rows as they are after `now` optimizer steps.
-pub fn evaluate_all(state: &SceneState, adam: &DeferredAdam, now: u32) -> Columns {
-    let mut out = Columns::zeros(state.rows(), state.sh_degree());
-    evaluate_into(&adam.at(now), state.view(), &|i| i, 0, out.view_mut());
+/// All rows of the tables as they are after `now` optimizer steps, in their order.
+pub fn evaluate_all(tables: &[Rows<'_>], sh_degree: u8, adam: &DeferredAdam, now: u32) -> Columns {
+    let first = tables.first().map_or(0, |t| t.first_row) as u32;
+    let rows: Vec<u32> = (first..first + rows_of(tables) as u32).collect();
+    let mut out = Columns::zeros(0, sh_degree);
+    gather(tables, sh_degree, adam, now, &rows, &mut out);
     out
 }
 
-/// Applies event number `index` of the log to all rows of a table: the whole scene or one page of it.
-pub fn apply_event(
-    state: &mut SceneState,
-    adam: &DeferredAdam,
-    seed: u64,
-    index: usize,
-    event: &Event,
-) -> EventOutcome {
-    let at = adam.at(event.now());
-    match event.kind {
-        EventKind::RaiseShDegree { .. } => EventOutcome::default(),
-        EventKind::ResetOpacity { max_opacity } => {
-            EventOutcome { reset_rows: ops::reset_opacities(&at, state, max_opacity), ..EventOutcome::default() }
-        }
-        EventKind::Densify(thresholds) => {
-            let round = ops::apply_round(&at, state, &thresholds, seed, index as u64);
-            EventOutcome { round, ..EventOutcome::default() }
-        }
-    }
+fn rows_of(tables: &[Rows<'_>]) -> usize {
+    tables.iter().map(Rows::rows).sum()
 }
 
-fn evaluate_into<F>(at: &AdamNow<'_>, view: Rows<'_>, row_of: &F, first: usize, out: ColumnsMut<'_>)
-where
-    F: Fn(usize) -> usize + Sync,
-{
-    if out.rows() <= ROWS_PER_TASK {
-        return at.evaluate_rows(view, |i| row_of(first + i), out);
+/// Evaluates the listed rows, cut into tasks by tables and within them.
+fn evaluate_into(at: &AdamNow<'_>, tables: &[Rows<'_>], rows: &[u32], out: ColumnsMut<'_>) {
+    if rows.is_empty() {
+        return;
     }
-    let half = out.rows().div_ceil(ROWS_PER_TASK) / 2 * ROWS_PER_TASK;
-    let (head, tail) = out.split_at(half);
-    rayon::join(
-        || evaluate_into(at, view, row_of, first, head),
-        || evaluate_into(at, view, row_of, first + half, tail),
+    if let [table] = tables
+        && rows.len() <= ROWS_PER_TASK
+    {
+        return at.evaluate_rows(*table, |i| rows[i] as usize - table.first_row, out);
+    }
+    let (listed, head_tables, tail_tables) = match tables {
+        [_] => (rows.len().div_ceil(ROWS_PER_TASK) / 2 * ROWS_PER_TASK, tables, tables),
+        _ => {
+            let (head, tail) = tables.split_at(tables.len() / 2);
+            let bound = tail[0].first_row;
+            (rows.partition_point(|&row| (row as usize) < bound), head, tail)
+        }
+    };
+    let (head, tail) = out.split_at(listed);
+    let both = (
+        || evaluate_into(at, head_tables, &rows[..listed], head),
+        || evaluate_into(at, tail_tables, &rows[listed..], tail),
     );
+    join_if(rows.len() > ROWS_PER_TASK, both.0, both.1);
 }
 
-/// Half-spaces of a camera in its own axes, each shifted outwards by a multiple of the row's largest sigma.
-///
-/// A row is drawn when z lies between the planes and its box meets the image. The box's half width is at most
-/// ceil(3.33 sqrt(c_xx)), with c_xx <= (sigma_max fx / z)^2 (1 + lim^2) + 0.3, lim being the angle at which the Jacobian is
-/// clamped; the square root of a sum is at most the sum of the roots. Multiplied by z / fx, the box meets the image
-/// only if  x <= ((W - cx) + 3.33 sqrt 0.3 + 1) / fx z + 3.33 sigma_max sqrt(1 + lim^2),  and likewise on the other sides.
-#[derive(Debug, Clone, Copy)]
-struct Frustum {
-    viewmat: [[f32; 4]; 3],
-    /// Largest |t|: rounding errors of camera coordinates scale with it and with the position.
-    translation: f32,
-    near: f32,
-    far: f32,
-    /// Slopes of the planes at x low, x high, y low, y high; outwards positive.
-    slopes: [f32; 4],
-    /// Sigmas that a footprint reaches beyond its mean, in x and y.
-    reach: [f32; 2],
+/// Runs both, on two threads where that is worth it.
+fn join_if<A: Send, B: Send>(worth: bool, a: impl FnOnce() -> A + Send, b: impl FnOnce() -> B + Send) -> (A, B) {
+    if worth { rayon::join(a, b) } else { (a(), b()) }
 }
 
-/// Rounding slack of a camera coordinate, per unit of position: sixteen times what a dot product of four terms loses.
-const POSITION_SLACK: f32 = 4e-6;
-/// Relative slack on slopes and footprints, for the roundings of the projection itself.
-const RELATIVE_SLACK: f32 = 1e-4;
-
-impl Frustum {
-    fn new(camera: &Camera) -> Self {
-        let blur = EXTENT_SIGMAS * EPS2D.sqrt() + 1.0;
-        let axis = |size: u32, f: f32, c: f32| {
-            let size = size as f32;
-            let (low, high, margin) = (c / f, (size - c) / f, CLAMP_MARGIN * 0.5 * size / f);
-            let limit = (low + margin).abs().max((high + margin).abs());
-            let slope = |edge: f32| edge + blur / f + RELATIVE_SLACK * (edge.abs() + blur / f);
-            let reach = EXTENT_SIGMAS * (1.0 + limit * limit).sqrt() * (1.0 + RELATIVE_SLACK);
-            (slope(low), slope(high), reach)
-        };
-        let (x_low, x_high, reach_x) = axis(camera.width, camera.fx, camera.cx);
-        let (y_low, y_high, reach_y) = axis(camera.height, camera.fy, camera.cy);
-        let m = &camera.viewmat;
-        Frustum {
-            viewmat: camera.viewmat,
-            translation: m[0][3].abs() + m[1][3].abs() + m[2][3].abs(),
-            near: camera.near_plane,
-            far: camera.far_plane,
-            slopes: [x_low, x_high, y_low, y_high],
-            reach: [reach_x, reach_y],
+/// Lists the rows of the tables that may be drawn in the front of `out`, which has room for all; returns how many.
+fn cull(at: &AdamNow<'_>, frustum: &Frustum, tables: &[Rows<'_>], out: &mut [u32]) -> usize {
+    let rows = out.len();
+    match tables {
+        [] => return 0,
+        [view] if rows <= ROWS_PER_TASK => return dispatch(at.simd(), CullRows { at, frustum, view: *view, out }),
+        _ => {}
+    }
+    let halves;
+    let (head, tail) = match tables {
+        [view] => {
+            // Halved at whole tasks.
+            let (a, b) = view.split_at(rows.div_ceil(ROWS_PER_TASK) / 2 * ROWS_PER_TASK);
+            halves = [a, b];
+            halves.split_at(1)
         }
-    }
-
-    /// Whether a row may be drawn. Comparisons are such that a NaN counts as drawn.
-    #[inline(always)]
-    fn may_draw(&self, p: [f32; 3], sigma_max: f32) -> bool {
-        let m = &self.viewmat;
-        let x = m[0][0] * p[0] + m[0][1] * p[1] + m[0][2] * p[2] + m[0][3];
-        let y = m[1][0] * p[0] + m[1][1] * p[1] + m[1][2] * p[2] + m[1][3];
-        let z = m[2][0] * p[0] + m[2][1] * p[1] + m[2][2] * p[2] + m[2][3];
-        let slack = POSITION_SLACK * (p[0].abs() + p[1].abs() + p[2].abs() + self.translation);
-        let slopes = &self.slopes;
-        let steepest = slopes[0].abs().max(slopes[1].abs()).max(slopes[2].abs()).max(slopes[3].abs());
-        let side = slack * (1.0 + steepest);
-        let (reach_x, reach_y) = (self.reach[0] * sigma_max + side, self.reach[1] * sigma_max + side);
-        let outside = (z <= self.near - slack)
-            | (z >= self.far + slack)
-            | (-x > slopes[0] * z + reach_x)
-            | (x > slopes[1] * z + reach_x)
-            | (-y > slopes[2] * z + reach_y)
-            | (y > slopes[3] * z + reach_y);
-        !outside
-    }
-}
-
-/// Lists the rows of the view that may be drawn in the front of `out`, which is as long as the view; returns how many.
-fn cull(at: &AdamNow<'_>, frustum: &Frustum, view: Rows<'_>, out: &mut [u32]) -> usize {
-    if view.rows() <= ROWS_PER_TASK {
-        return dispatch(at.simd(), CullRows { at, frustum, view, out });
-    }
-    let half = view.rows().div_ceil(ROWS_PER_TASK) / 2 * ROWS_PER_TASK;
-    let (head, tail) = view.split_at(half);
+        _ => tables.split_at(tables.len() / 2),
+    };
+    let half = rows_of(head);
     let (head_out, tail_out) = out.split_at_mut(half);
-    let (a, b) = rayon::join(|| cull(at, frustum, head, head_out), || cull(at, frustum, tail, tail_out));
+    let (a, b) =
+        join_if(rows > ROWS_PER_TASK, || cull(at, frustum, head, head_out), || cull(at, frustum, tail, tail_out));
     out.copy_within(half..half + b, a);
     a + b
 }
@@ -208,19 +139,9 @@ impl Kernel for CullRows<'_, '_> {
 /// [`LANES`] rows from `first` on: one vector per coordinate.
 #[inline(always)]
 fn cull_lanes(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, first: usize) -> [bool; LANES] {
-    let mut drift = [[0.0; LANES]; 8];
-    for (l, &stamp) in view.stamp[first..first + LANES].iter().enumerate() {
-        let of_row = at.drift(stamp);
-        for p in 0..8 {
-            drift[p][l] = of_row[p];
-        }
-    }
-    let [m1, m2, m3, _, c1, c2, c3, _] = &drift;
-    let (values, exp_avg, exp_avg_sq) = (&view.columns, &view.exp_avg, &view.exp_avg_sq);
-    let (means, a) =
-        drifted_lanes(at, Column::Means, [values.means, exp_avg.means, exp_avg_sq.means], first, [m1, m2, m3]);
-    let (scales, b) =
-        drifted_lanes(at, Column::Scales, [values.scales, exp_avg.scales, exp_avg_sq.scales], first, [c1, c2, c3]);
+    let drifts = LaneDrifts::gather(&view.stamp[first..], |stamp| at.drift(stamp));
+    let (means, a) = drifted_lanes(at.adam(), Column::Means, tables_of(view, Column::Means), first, &drifts);
+    let (scales, b) = drifted_lanes(at.adam(), Column::Scales, tables_of(view, Column::Scales), first, &drifts);
     if a | b {
         return cull_row_by_row(at, frustum, view, first);
     }
@@ -230,51 +151,6 @@ fn cull_lanes(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, first: usize
         drawn[l] = frustum.may_draw([means[0][l], means[1][l], means[2][l]], sigma_max);
     }
     drawn
-}
-
-/// The three coordinates of a column now, by the series; and whether some of them need the direct sum instead.
-/// `tables`: values, first and second moments.
-#[inline(always)]
-fn drifted_lanes(
-    at: &AdamNow<'_>,
-    column: Column,
-    tables: [&[f32]; 3],
-    first: usize,
-    sums: [&[f32; LANES]; 3],
-) -> ([[f32; LANES]; 3], bool) {
-    let EpsFloor { eps, floor } = at.eps_floor();
-    let rate = at.base_rate(column);
-    let (from, to) = (first * 3, (first + LANES) * 3);
-    // Not `map` over the tables: its closure is not always inlined, and then runs without the vector instructions.
-    let value = by_coordinate(&tables[0][from..to]);
-    let m = by_coordinate(&tables[1][from..to]);
-    let v = by_coordinate(&tables[2][from..to]);
-    let mut out = [[0.0; LANES]; 3];
-    let mut direct = false;
-    for c in 0..3 {
-        let mut lanes = [false; LANES];
-        for l in 0..LANES {
-            out[c][l] = drifted(value[c][l], m[c][l], v[c][l], [sums[0][l], sums[1][l], sums[2][l]], rate, eps);
-            lanes[l] = needs_direct_sum(m[c][l], v[c][l], floor);
-        }
-        for lane in lanes {
-            direct |= lane;
-        }
-    }
-    (out, direct)
-}
-
-/// `[LANES][3]` to `[3][LANES]`.
-#[inline(always)]
-fn by_coordinate(rows: &[f32]) -> [[f32; LANES]; 3] {
-    let rows = &rows[..LANES * 3];
-    let mut out = [[0.0; LANES]; 3];
-    for l in 0..LANES {
-        out[0][l] = rows[l * 3];
-        out[1][l] = rows[l * 3 + 1];
-        out[2][l] = rows[l * 3 + 2];
-    }
-    out
 }
 
 #[cold]

@@ -1,8 +1,9 @@
 //! Looking at held-out views: PSNR, SSIM, and pictures of render beside photo. Changes no state.
 
-use super::catch_up::{gather, visible_rows};
 use super::machine;
+use super::pages::PagedScene;
 use super::report::{TestMetrics, json_psnr};
+use super::step::WorkingSet;
 use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
@@ -11,12 +12,10 @@ use crate::dataset::loader::{Dataset, load_dataset};
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{PlyContent, PlyMeta, read_ply, to_local};
-use crate::optim::deferred::DeferredAdam;
+use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::metrics::{SsimVariant, mean, psnr, ssim};
 use crate::render::{RenderOptions, Renderer};
-use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
-use crate::scene::state::SceneState;
 use std::path::{Path, PathBuf};
 
 /// Where pictures go and which views are looked at.
@@ -29,13 +28,13 @@ pub struct EvalRequest<'a> {
     pub pictures: Option<&'a Path>,
 }
 
-/// Evaluates the rows as they are at `now` on the requested views. Views that are masked as a whole have no metrics and
+/// Evaluates the rows as they are after `now` steps on the requested views, collected in `working`. Views that are masked as a whole have no metrics and
 /// are left out of the means; `None` when no view is left.
 ///
 /// # Errors
-/// A photo cannot be decoded, the renderer failed, or a picture cannot be written.
+/// A photo cannot be decoded, pages could not be had, the renderer failed, or a picture cannot be written.
 pub fn evaluate(
-    (state, adam, now): (&SceneState, &DeferredAdam, u32),
+    (scene, now, working): (&mut PagedScene, u32, &mut WorkingSet),
     renderer: &mut dyn Renderer,
     (dataset, targets): (&Dataset, &TargetCache),
     options: &RenderOptions,
@@ -44,16 +43,13 @@ pub fn evaluate(
     if request.views.is_empty() {
         return Ok(None);
     }
-    let mut rows = Vec::new();
-    let mut columns = Columns::zeros(0, state.columns.sh_degree);
     let (mut psnrs, mut ssims) = (Vec::new(), Vec::new());
     for (i, &view) in request.views.iter().enumerate() {
         targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
         let target = targets.get(view)?;
         let camera = &dataset.views[view].camera;
-        visible_rows(state, adam, now, camera, &mut rows);
-        gather(state, adam, now, &rows, &mut columns);
-        renderer.forward(&columns, camera, options)?;
+        scene.gather_view(camera, now, working)?;
+        renderer.forward(&working.columns, camera, options)?;
         let image = renderer.image()?;
         if target.counts() {
             psnrs.push(json_psnr(psnr(image, &target)));
@@ -156,8 +152,11 @@ pub fn evaluate_ply(
     let run = RunOptions::new(config, dataset.scene_scale);
     let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
     let gaussians = columns.rows() as u64;
-    let state = SceneState::from_columns(columns);
-    let adam = DeferredAdam::new(run.rates, run.adam, render.simd);
+    // All bands of the file, whatever the config has for training.
+    let bands = RunOptions { sh_degree: columns.sh_degree, sh_degree_start: columns.sh_degree, ..run.clone() };
+    let pager = Pager::in_memory(PagerConfig::in_memory(run.page_rows, columns.sh_degree));
+    let mut pages = PagedScene::new(&columns, pager, &bands)?;
+    drop(columns);
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let views = dataset.test_views();
     let request = EvalRequest { views: &views, ssim: run.ssim_variant, pictures };
@@ -165,7 +164,8 @@ pub fn evaluate_ply(
     if let Some(word) = word {
         eprintln!("{word}");
     }
-    let test = evaluate((&state, &adam, 0), &mut *renderer, (&dataset, &targets), &render, &request)?;
+    let now = (&mut pages, 0, &mut WorkingSet::default());
+    let test = evaluate(now, &mut *renderer, (&dataset, &targets), &render, &request)?;
     Ok(EvalReport {
         ply: ply.to_path_buf(),
         scene: scene.to_path_buf(),

@@ -3,43 +3,69 @@
 //! What depends on the views (rows, intersections, images) is measured by rendering a few of them with the first
 //! Gaussians; what is simple arithmetic is computed. The promise is 10 % of the peak that a run without growth has.
 
-use super::trainer::Trainer;
+use super::trainer::{TrainError, Trainer};
+use crate::base::machine::memory_available;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
-use crate::render::RenderError;
 use crate::scene::columns::row_width;
 use crate::scene::state::row_bytes;
 
 /// Views rendered to see what a view takes.
 const PROBE_VIEWS: usize = 6;
+/// What is kept of a page that is not in memory: its entry, its place on the drive, its uses in the plan.
+const INDEX_BYTES: u64 = 256;
 /// Program, libraries and thread stacks, measured on an empty run: 16 MiB with the tables of a short one.
 const BASE_BYTES: u64 = 12 << 20;
+
+/// Share of the memory that is available which a run takes when it is not told how much, percent.
+const BUDGET_PERCENT: u64 = 70;
 
 /// What a run is expected to hold in memory at its peak, by part, bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct MemoryEstimate {
-    /// Values, moments, stamps, identities and statistics of all Gaussians.
-    pub state: u64,
+    /// Pages in frames: values, moments, stamps, identities and statistics.
+    pub frames: u64,
+    /// Pages on their way to or from a drive, and the plan.
+    pub staging: u64,
     /// Rows of one view, their gradients, the stages' intermediates, images and loss.
     pub view: u64,
     /// Decoded photos.
     pub targets: u64,
-    /// The evaluated copy that a PLY is written from.
-    pub export: u64,
-    /// Everything else.
+    /// The index of the pages, in memory or not.
+    pub index: u64,
+    /// Everything else, with the optimizer's tables.
     pub base: u64,
 }
 
 impl MemoryEstimate {
+    /// All parts but the frames.
+    pub fn fixed(&self) -> u64 {
+        self.base + self.view + self.staging + self.targets + self.index
+    }
+
     /// All parts.
     pub fn total(&self) -> u64 {
-        self.base + self.state + self.view + self.export + self.targets
+        self.fixed() + self.frames
     }
 }
 
-/// Estimates a run before its first step; `driver` bytes were taken by the graphics driver when it was looked for a
-/// device. The trainer renders a few views for it and keeps the memory for its own
+/// Bytes that a run may take: what it was told, or a share of what this process could have; `None` where the system does
+/// not tell.
+pub fn host_budget(config: &TrainConfig) -> Option<u64> {
+    match config.host_mem.0 {
+        0 => memory_available().map(|bytes| bytes / 100 * BUDGET_PERCENT),
+        bytes => Some(bytes),
+    }
+}
+
+/// Rows that a run may come to, as far as it is known: those there are, or the cap.
+pub fn rows_at_most(config: &TrainConfig, rows: u64) -> u64 {
+    if config.strategy == "none" { rows } else { rows.max(config.max_gaussians) }
+}
+
+/// Estimates a run before its first step, with all pages in memory: if nothing grows, and if it grows to its cap. `driver` bytes were taken by the graphics driver when
+/// it was looked for a device. The trainer renders a few views for it and keeps the memory for its own
 /// steps: allocating it twice would break the heap into pieces and the promise with it.
 ///
 /// # Errors
@@ -49,23 +75,32 @@ pub fn estimate(
     dataset: &Dataset,
     trainer: &mut Trainer,
     driver: u64,
-) -> Result<MemoryEstimate, RenderError> {
-    let rows = trainer.state.rows() as u64;
-    let rows_max = if config.strategy == "none" { rows } else { rows.max(config.max_gaussians) };
+) -> Result<[MemoryEstimate; 2], TrainError> {
+    let rows = trainer.scene.rows();
     let pixels = trainer.probe_views(dataset, PROBE_VIEWS)? as u64;
-    let held = trainer.view_bytes();
+    let [working, rendering] = trainer.view_bytes();
     // Image, coverage, gradient, and the tiles' copies of them.
-    let of_pixels = (pixels * 4 * (3 + 1 + 3 + 6)).min(held);
-    // More Gaussians make a view's part grow in proportion; the part of its pixels stays.
-    let growth = rows_max as f64 / rows.max(1) as f64;
+    let of_pixels = (pixels * 4 * (3 + 1 + 3 + 6)).min(rendering);
+    // More Gaussians make a view's part grow in proportion, and bands that come into use its rows; the part of its
+    // pixels stays.
+    let (first, last) = trainer.sh_degrees();
+    let wider = row_width(last) as f64 / row_width(first) as f64;
+    let of_rows = working as f64 * wider + (rendering - of_pixels) as f64;
     let decoders = rayon::current_num_threads();
-    Ok(MemoryEstimate {
-        state: rows_max * row_bytes(config.sh_degree) as u64,
-        view: of_pixels + ((held - of_pixels) as f64 * growth) as u64,
-        targets: config.image_cache.0.min(TargetCache::bytes_to_keep_all(&dataset.views, decoders)),
-        export: rows_max * row_width(config.sh_degree) as u64 * 4,
-        base: BASE_BYTES + trainer.adam.bytes() as u64 + driver,
-    })
+    let targets = config.image_cache.0.min(TargetCache::bytes_to_keep_all(&dataset.views, decoders));
+    let pages = trainer.scene.pager.index().len() as f64;
+    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + driver;
+    Ok([rows, rows_at_most(config, rows)].map(|rows_then| {
+        let growth = rows_then as f64 / rows.max(1) as f64;
+        MemoryEstimate {
+            frames: rows_then * row_bytes(last) as u64,
+            staging: 0,
+            view: of_pixels + (of_rows * growth) as u64,
+            targets,
+            index: (pages * growth) as u64 * INDEX_BYTES,
+            base,
+        }
+    }))
 }
 
 /// The largest resident size of this process so far, bytes; `None` where the system does not tell.
@@ -76,12 +111,6 @@ pub fn host_bytes_peak() -> Option<u64> {
 /// The resident size of this process now, bytes; `None` where the system does not tell.
 pub fn host_bytes_now() -> Option<u64> {
     status_field("VmRSS:")
-}
-
-/// Memory that programs could still take on this machine, bytes.
-pub fn host_bytes_available() -> Option<u64> {
-    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
-    field(&text, "MemAvailable:")
 }
 
 fn status_field(name: &str) -> Option<u64> {

@@ -4,7 +4,9 @@
 //! files appear by rename, so a reader never sees half of one.
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
+use crate::paging::pager::Pager;
 use serde::{Deserialize, Serialize};
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -12,6 +14,65 @@ use std::path::{Path, PathBuf};
 
 /// PSNR that stands for a perfect image.
 pub const PSNR_PERFECT: f64 = 100.0;
+
+/// What moved between the tiers so far. Without a spill directory nothing is read or written.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct TierTraffic {
+    /// Bytes read from the drive.
+    pub bytes_read: u64,
+    /// Bytes written to it.
+    pub bytes_written: u64,
+    /// Pages that views needed.
+    pub pages_needed: u64,
+    /// Of these, pages that lay in memory.
+    pub page_hits: u64,
+    /// Of these, pages that did not: on their way, or still to be read.
+    pub page_misses: u64,
+    /// Of the misses, those that the plan had left out.
+    pub late_misses: u64,
+    /// Pages read from the drive.
+    pub pages_read: u64,
+    /// Pages that left memory.
+    pub evictions: u64,
+    /// Seconds that steps waited for the drive.
+    pub stall_seconds: f64,
+    /// The most pages that a step had at once.
+    pub pages_pinned_max: u64,
+    /// Frames in use.
+    pub frames: u64,
+    /// Pages of the scene.
+    pub pages: u64,
+}
+
+impl TierTraffic {
+    /// Of a pager.
+    pub fn of(pager: &Pager) -> TierTraffic {
+        let stats = pager.stats();
+        TierTraffic {
+            bytes_read: stats.bytes_read,
+            bytes_written: stats.bytes_written,
+            pages_needed: stats.pages_needed,
+            page_hits: stats.hits,
+            page_misses: stats.misses,
+            late_misses: stats.late_misses,
+            pages_read: stats.pages_read,
+            evictions: stats.evictions,
+            stall_seconds: stats.stall_seconds,
+            pages_pinned_max: stats.pinned_max as u64,
+            frames: stats.frames as u64,
+            pages: pager.index().len() as u64,
+        }
+    }
+
+    /// For the progress line; empty while nothing was read or written.
+    pub fn words(&self) -> String {
+        if self.bytes_read + self.bytes_written == 0 {
+            return String::new();
+        }
+        let (read, written) = (format_bytes(self.bytes_read), format_bytes(self.bytes_written));
+        format!(" read {read} written {written} waited {:.1} s", self.stall_seconds)
+    }
+}
 
 /// One logged step.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -34,6 +95,9 @@ pub struct StepLine {
     pub bytes_read_back: u64,
     /// Most device memory allocated so far, bytes.
     pub device_bytes_peak: u64,
+    /// Between the tiers, since the start.
+    #[serde(flatten)]
+    pub tiers: TierTraffic,
     /// Evaluation on the held-out views, where one was due.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub test: Option<TestMetrics>,
@@ -75,6 +139,9 @@ pub struct Summary {
     pub rows_skipped_non_finite: u64,
     /// Steps skipped because the loss was not finite.
     pub steps_skipped_non_finite: u32,
+    /// Between the tiers, first pages, evaluation and export included.
+    #[serde(flatten)]
+    pub tiers: TierTraffic,
 }
 
 /// A PSNR for JSON: at most 100, which also stands for no difference at all; what is not a number (a broken picture)

@@ -5,13 +5,14 @@
 
 use super::eval::ply_warnings;
 use super::machine;
-use super::memory::{MemoryEstimate, estimate, host_bytes_available, host_bytes_now, host_bytes_peak};
+use super::memory::{estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
+use super::preflight;
 use super::progress::Progress;
-use super::report::{MetricsLog, Resolved, Summary, write_config, write_summary};
+use super::report::{MetricsLog, Resolved, Summary, TierTraffic, write_config, write_summary};
 use super::signals::StopFlag;
+use super::tiers;
 use super::trainer::{LoopOutputs, TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
-use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
@@ -19,8 +20,10 @@ use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
-use crate::scene::columns::Columns;
+use crate::report::run_report::{PAGES_FILE, REPORT_FILE, write_run_report};
+use crate::scene::columns::{Columns, sh_n_width};
 use crate::scene::init::{gaussians_from_points, random_points_in_frusta};
+use crate::scene::partition::first_fill;
 use std::path::{Path, PathBuf};
 
 /// What to run.
@@ -53,9 +56,9 @@ pub struct RunOutcome {
 pub struct Prepared {
     /// Views and frame.
     pub dataset: Dataset,
-    /// First Gaussians, local frame.
+    /// First Gaussians, local frame. Bands that are not in use yet may be missing.
     pub columns: Columns,
-    /// Degree that they were trained with: it is in use from the first step. 0 for points.
+    /// Degree in use from the first step: what they were trained with, or what was asked for.
     pub sh_degree_start: u8,
 }
 
@@ -93,9 +96,10 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
         Some((mut columns, meta, ply)) => {
             let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
             dataset.warnings.extend(ply_warnings(&ply, &meta, far));
-            (resize_sh(&columns, config.sh_degree), columns.sh_degree)
+            let in_use = columns.sh_degree.max(limits::first_sh_degree(config));
+            (cut_sh(columns, config.sh_degree), in_use)
         }
-        None => (first_gaussians(scene, &mut dataset, config)?, 0),
+        None => (first_gaussians(scene, &mut dataset, config)?, limits::first_sh_degree(config)),
     };
     if columns.rows() == 0 {
         let problem = "no Gaussian is left to start from: all are too far from the cameras";
@@ -133,19 +137,14 @@ fn first_gaussians(scene: &Path, dataset: &mut Dataset, config: &TrainConfig) ->
     Ok(gaussians_from_points(&points, &colors, &options))
 }
 
-/// The same rows stored with another degree: bands are cut or filled with zeros.
-fn resize_sh(columns: &Columns, sh_degree: u8) -> Columns {
-    let mut out = Columns { sh_degree, ..columns.clone() };
-    out.sh_n.clear();
-    out.resize(columns.rows());
-    let kept = crate::scene::columns::sh_n_width(sh_degree.min(columns.sh_degree));
-    if kept > 0 {
-        for row in 0..columns.rows() {
-            let from = &columns.row(crate::scene::columns::Column::ShN, row)[..kept];
-            out.row_mut(crate::scene::columns::Column::ShN, row)[..kept].copy_from_slice(from);
-        }
+/// The same rows without the bands above a degree.
+fn cut_sh(columns: Columns, sh_degree: u8) -> Columns {
+    if columns.sh_degree <= sh_degree {
+        return columns;
     }
-    out
+    let (from, to) = (sh_n_width(columns.sh_degree), sh_n_width(sh_degree));
+    let sh_n = columns.sh_n.chunks_exact(from).flat_map(|row| &row[..to]).copied().collect();
+    Columns { sh_degree, sh_n, ..columns }
 }
 
 /// Runs a request from beginning to end.
@@ -174,23 +173,24 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     if let Some(word) = word {
         say(&word);
     }
-    let mut trainer = Trainer::new(columns, &dataset, renderer, options);
-    let memory = estimate(config, &dataset, &mut trainer, driver)?;
-    say(&describe(request, &dataset, &trainer, &memory));
-    if let Some(free) = host_bytes_available().filter(|&free| free < memory.total()) {
-        eprintln!(
-            "warning: the run may need {}, but {} are free: lower --max-gaussians, --image-cache, --sh-degree or the \
-             size of the photos",
-            format_bytes(memory.total()),
-            format_bytes(free)
-        );
-    }
+    let host_mem = host_budget(config);
+    let fill = first_fill(config.page_rows as usize, options.densify.is_some());
+    let pages = rows_at_most(config, columns.rows() as u64).div_ceil(fill as u64);
+    // Dropped after the trainer, whose pages may lie there.
+    let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
+    tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
+    let mut trainer = Trainer::with_pager(columns, pager, &dataset, renderer, options)?;
+    let mut memory = estimate(config, &dataset, &mut trainer, driver)?;
+    let plan = preflight::settle(config, &dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
+    say(&describe(request, &dataset, &trainer, &preflight::describe(&plan, &memory[1], &tiers)));
     if request.dry_run {
         return Ok(RunOutcome { summary: None, exit_code: 0 });
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     make_out(&request.out, request.overwrite)?;
-    train_into(request, &dataset, trainer, &stop)
+    let outcome = train_into(request, &dataset, trainer, &stop);
+    tiers.close().iter().for_each(|word| eprintln!("warning: {word}"));
+    outcome
 }
 
 fn train_into(
@@ -200,7 +200,8 @@ fn train_into(
     stop: &StopFlag,
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
-    write_config(&out.join("config.toml"), config, &resolved(request, dataset, &trainer))?;
+    let settled = TrainConfig { view_order: trainer.view_order().order().to_string(), ..config.clone() };
+    write_config(&out.join("config.toml"), &settled, &resolved(request, dataset, &trainer))?;
     let mut metrics = MetricsLog::create(&out.join("metrics.jsonl"))?;
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let mut progress = Progress::new(config.steps, request.quiet);
@@ -226,7 +227,7 @@ fn train_into(
     let (rows_skipped, steps_skipped) = trainer.skipped();
     let summary = Summary {
         steps: trainer.steps_done(),
-        gaussians: trainer.state.rows() as u64,
+        gaussians: written.rows + written.skipped,
         train_seconds: trainer.train_seconds(),
         host_bytes_peak: host_bytes_peak().unwrap_or(0),
         test: tested.as_ref().ok().copied().flatten(),
@@ -236,8 +237,10 @@ fn train_into(
         finished: trainer.steps_done() == config.steps,
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
+        tiers: TierTraffic::of(&trainer.scene.pager),
     };
     write_summary(&out.join("summary.json"), &summary)?;
+    write_run_report(out)?;
     tested?;
     Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
 }
@@ -263,7 +266,7 @@ fn make_out(out: &Path, overwrite: bool) -> InputResult<()> {
     if !overwrite || !out.join("config.toml").is_file() {
         return Ok(());
     }
-    for name in ["config.toml", "metrics.jsonl", "summary.json", "point_cloud.ply"] {
+    for name in ["config.toml", "metrics.jsonl", "summary.json", "point_cloud.ply", REPORT_FILE, PAGES_FILE] {
         let path = out.join(name);
         if path.is_file() {
             std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
@@ -300,7 +303,7 @@ fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer) -> Resol
         device: trainer.renderer.device(),
         train_views: dataset.train_views().len(),
         test_views: dataset.test_views().len(),
-        gaussians: trainer.state.rows() as u64,
+        gaussians: trainer.scene.rows(),
         origin: dataset.frame.origin.to_array(),
         scale: dataset.frame.scale,
         scene_scale: f64::from(dataset.scene_scale) * dataset.frame.scale,
@@ -308,11 +311,10 @@ fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer) -> Resol
 }
 
 /// What was understood and what it will take, for people.
-fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, memory: &MemoryEstimate) -> String {
-    let (config, rows) = (&request.config, trainer.state.rows());
+fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, tiers: &str) -> String {
+    let (config, rows) = (&request.config, trainer.scene.rows());
     let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
     let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
-    let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
     let growth = match (config.strategy.as_str(), config.max_gaussians) {
         ("none", _) => String::from(" (no densification)"),
         (_, 0) => String::from(" (densification without a cap: memory grows with them; see --max-gaussians)"),
@@ -326,7 +328,7 @@ fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, memory: 
         "scene   {}: {} views to train on, {} held out, at most {size}\n\
          start   {} Gaussians, SH degree {}{growth}\n\
          run     {} steps on {} threads ({}), rendered by {}{results}\n\
-         memory  about {} at the peak\n{}{}{}{}{}",
+         {tiers}",
         request.scene.display(),
         dataset.train_views().len(),
         dataset.test_views().len(),
@@ -336,12 +338,6 @@ fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, memory: 
         rayon::current_num_threads(),
         limits::simd_path(config).name(),
         trainer.renderer.device(),
-        format_bytes(memory.total()),
-        part("Gaussians with their optimizer state", memory.state),
-        part("one view: rows, gradients, images", memory.view),
-        part("decoded photos (--image-cache)", memory.targets),
-        part("copy for export", memory.export),
-        part("program", memory.base),
     );
     text.trim_end().to_string()
 }

@@ -1,18 +1,22 @@
 //! One training step, top to bottom. Nothing here opens a file.
+//!
+//! Invariants: 1. every pinned page is released, whatever happens; 2. a step whose rendering fails, or whose loss is not
+//! finite, changes no row, except that events which were due on the pinned pages are applied; 3. the result is the same
+//! for any number of threads and frames.
 
 use super::catch_up::{gather, visible_rows};
-use crate::densify::stats::{GradHistogram, accumulate};
-use crate::optim::deferred::DeferredAdam;
-use crate::render::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
+use super::pages::{PagedScene, numbered};
+use super::trainer::TrainError;
+use super::update::{StepGradients, update_pages};
+use crate::render::{Gradients, LossOptions, LossValue, RenderOptions, Renderer};
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::image::Target;
-use crate::scene::state::SceneState;
 
 /// The rows that a view needs, evaluated at its step, and their gradients; kept between steps for its allocations.
 #[derive(Default)]
 pub struct WorkingSet {
-    /// Row of the state for each row of the working set, ascending.
+    /// Row of the pinned pages, numbered through, for each row of the working set, ascending.
     pub row_from_working: Vec<u32>,
     /// Values now.
     pub columns: Columns,
@@ -35,6 +39,10 @@ pub struct StepOutcome {
     pub loss: LossValue,
     /// Rows in the working set.
     pub rows: usize,
+    /// Rows in the pinned pages.
+    pub rows_pinned: usize,
+    /// Pages pinned.
+    pub pages: usize,
     /// Rows that the optimizer rewrote.
     pub updated: u64,
     /// Rows left as they were because a gradient or a result was not finite.
@@ -43,36 +51,48 @@ pub struct StepOutcome {
     pub skipped: bool,
 }
 
-/// Trains on one view at 0-based `step`: cull, gather, forward, loss, backward, optimizer, and the statistics of
-/// densification while they are collected.
+/// Trains on one view at 0-based `step`: acquire, catch up with events, cull, gather, forward, loss, backward, optimizer,
+/// and the statistics of densification while they are collected, bounds, release.
 ///
 /// # Errors
-/// The renderer failed; the state is as it was before the step.
+/// Pages could not be had, or the renderer failed; the rows are as they were before the step.
 pub fn train_step(
-    state: &mut SceneState,
+    scene: &mut PagedScene,
     working: &mut WorkingSet,
     renderer: &mut dyn Renderer,
-    adam: &DeferredAdam,
     (step, camera, target): (u32, &Camera, &Target),
     (render, loss): (&RenderOptions, &LossOptions),
-    statistics: Option<&mut GradHistogram>,
-) -> Result<StepOutcome, RenderError> {
-    visible_rows(state, adam, step, camera, &mut working.row_from_working);
-    gather(state, adam, step, &working.row_from_working, &mut working.columns);
-    renderer.forward(&working.columns, camera, render)?;
-    let value = renderer.loss_backward(&working.columns, target, loss, &mut working.gradients)?;
-    let mut outcome = StepOutcome { loss: value, rows: working.row_from_working.len(), ..StepOutcome::default() };
-    if !value.loss.is_finite() {
-        outcome.skipped = true;
-        return Ok(outcome);
+    collects: bool,
+) -> Result<StepOutcome, TrainError> {
+    let mut pages = scene.pager.acquire(step, camera)?;
+    scene.pager.prefetch(step);
+    if let Err(error) = scene.apply_pending(&mut pages) {
+        scene.pager.release(pages);
+        return Err(error);
     }
-    let counts = adam.step(state, &working.row_from_working, &working.gradients.columns, step);
-    outcome.updated = counts.updated as u64;
-    outcome.rows_skipped = counts.skipped_non_finite as u64;
-    if let Some(histogram) = statistics {
-        let (rows, gradients) = (&working.row_from_working, &working.gradients);
-        let size = [camera.width, camera.height];
-        accumulate(&mut state.view_mut(), rows, &gradients.means2d, &gradients.radii, size, histogram);
+    let WorkingSet { row_from_working, columns, gradients } = working;
+    let tables = numbered(&pages);
+    visible_rows(&tables, &scene.rules.adam, step, camera, row_from_working);
+    gather(&tables, scene.rules.sh_degree(), &scene.rules.adam, step, row_from_working, columns);
+    let rows_pinned = tables.iter().map(|t| t.rows()).sum();
+    let rendered = renderer.forward(columns, camera, render).and_then(|()| {
+        // What was read since may let more be read.
+        scene.pager.prefetch(step);
+        renderer.loss_backward(columns, target, loss, gradients)
+    });
+    let mut outcome =
+        StepOutcome { rows: row_from_working.len(), rows_pinned, pages: pages.len(), ..StepOutcome::default() };
+    if let Ok(value) = rendered {
+        outcome.loss = value;
+        outcome.skipped = !value.loss.is_finite();
     }
+    if rendered.is_ok() && !outcome.skipped {
+        let of_step = StepGradients { step, rows: row_from_working, gradients, size: [camera.width, camera.height] };
+        let counts = update_pages(scene, &mut pages, &of_step, collects);
+        outcome.updated = counts.updated as u64;
+        outcome.rows_skipped = counts.skipped_non_finite as u64;
+    }
+    scene.pager.release(pages);
+    rendered?;
     Ok(outcome)
 }

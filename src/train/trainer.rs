@@ -4,26 +4,27 @@
 //! cadences of logging and evaluation; 2. a step whose loss is not finite changes nothing, and three in a row end
 //! the run with what the last good step left.
 
-use super::catch_up::{apply_event, evaluate_all, gather, visible_rows};
 use super::eval::{EvalRequest, evaluate};
 use super::memory::host_bytes_peak;
+use super::pages::PagedScene;
 use super::progress::Progress;
-use super::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
+use super::report::{MetricsLog, StepLine, TestMetrics, TierTraffic, json_psnr};
 use super::signals::StopFlag;
 use super::step::{StepOutcome, WorkingSet, train_step};
 use crate::base::error::InputError;
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
-use crate::densify::stats::GradHistogram;
 use crate::exchange::ply::{self, PlyMeta};
-use crate::optim::deferred::DeferredAdam;
+use crate::paging::error::PagingError;
+use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::{RenderError, RenderOptions, Renderer};
+use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::image::Target;
-use crate::scene::state::SceneState;
-use crate::schedule::order::ShuffledOrder;
+use crate::scene::page_split::SplitTooDeep;
+use crate::schedule::order::{Order, ViewOrder};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -31,6 +32,11 @@ use std::time::Instant;
 const NON_FINITE_STEPS_MAX: u32 = 3;
 /// Views whose photos are asked for ahead of their steps.
 const PREFETCH_VIEWS: u32 = 8;
+
+/// Steps from one look at the coming views to the next, and how many views are looked at.
+const LOOK_AHEAD_EVERY: u32 = 8;
+const LOOK_AHEAD_LEAST: u32 = 64;
+const LOOK_AHEAD_MOST: u32 = 8192;
 
 /// What can end a run early.
 #[derive(Debug, thiserror::Error)]
@@ -41,6 +47,12 @@ pub enum TrainError {
     /// The renderer.
     #[error("rendering failed: {0}{remedy}", remedy = .0.remedy().map_or(String::new(), |r| format!("\n  remedy: {r}")))]
     Render(#[from] RenderError),
+    /// Pages could not be had.
+    #[error(transparent)]
+    Paging(#[from] PagingError),
+    /// A page cannot be split.
+    #[error(transparent)]
+    Split(#[from] SplitTooDeep),
     /// The loss was not finite several times in a row.
     #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
     NonFinite {
@@ -55,20 +67,14 @@ pub enum TrainError {
     },
 }
 
-/// A run in memory.
+/// A run. In memory is the same code with as many frames as there are pages.
 pub struct Trainer {
-    /// The rows.
-    pub state: SceneState,
-    /// The optimizer.
-    pub adam: DeferredAdam,
+    /// The rows, in pages, with the optimizer and the events.
+    pub scene: PagedScene,
     /// The renderer.
     pub renderer: Box<dyn Renderer>,
     options: RunOptions,
-    histogram: GradHistogram,
-    events: EventLog,
-    /// SH degree in use, as the events raised it.
-    sh_degree: u8,
-    order: ShuffledOrder,
+    order: ViewOrder,
     train_views: Vec<usize>,
     working: WorkingSet,
     step: u32,
@@ -90,24 +96,43 @@ pub struct LoopOutputs<'a> {
     pub stop: &'a StopFlag,
 }
 
+fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
+    let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
+    ViewOrder::new(order, seed, &cameras)
+}
+
 impl Trainer {
-    /// A trainer of first Gaussians `columns` on the training views of `dataset` (at least one).
-    pub fn new(columns: Columns, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Self {
+    /// A trainer of first Gaussians `columns` on the training views of `dataset` (at least one), all pages in memory.
+    ///
+    /// # Errors
+    /// As [`Trainer::with_pager`].
+    pub fn new(
+        columns: Columns,
+        dataset: &Dataset,
+        renderer: Box<dyn Renderer>,
+        options: RunOptions,
+    ) -> Result<Self, TrainError> {
+        let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
+        Trainer::with_pager(columns, pager, dataset, renderer, options)
+    }
+
+    /// A trainer whose pages are where `pager` (without pages yet) puts them.
+    ///
+    /// # Errors
+    /// A page could not be stored.
+    pub fn with_pager(
+        columns: Columns,
+        pager: Pager,
+        dataset: &Dataset,
+        renderer: Box<dyn Renderer>,
+        options: RunOptions,
+    ) -> Result<Self, TrainError> {
         let train_views = dataset.train_views();
-        let mut state = SceneState::from_columns(columns);
-        if options.max_gaussians > 0 {
-            // A cap that memory cannot hold may still never be reached: then rounds make room as they need it.
-            let _ = state.try_reserve_exact(options.max_gaussians.saturating_sub(state.rows()));
-        }
-        Trainer {
-            adam: DeferredAdam::new(options.rates, options.adam, options.render.simd),
-            histogram: GradHistogram::default(),
-            events: EventLog::default(),
-            sh_degree: options.sh_degree_at(0),
-            order: ShuffledOrder::new(options.seed, train_views.len()),
+        Ok(Trainer {
+            scene: PagedScene::new(&columns, pager, &options)?,
+            order: view_order(options.view_order, options.seed, dataset),
             train_views,
             working: WorkingSet::default(),
-            state,
             renderer,
             options,
             step: 0,
@@ -115,7 +140,7 @@ impl Trainer {
             steps_skipped: 0,
             steps_skipped_in_a_row: 0,
             train_seconds: 0.0,
-        }
+        })
     }
 
     /// Renders `count` views spread over the dataset, forward and backward, so that the memory of a view is allocated;
@@ -123,14 +148,14 @@ impl Trainer {
     ///
     /// # Errors
     /// A view cannot be rendered.
-    pub fn probe_views(&mut self, dataset: &Dataset, count: usize) -> Result<usize, RenderError> {
-        let WorkingSet { row_from_working, columns, gradients } = &mut self.working;
+    pub fn probe_views(&mut self, dataset: &Dataset, count: usize) -> Result<usize, TrainError> {
+        let render = self.render_options();
         let mut pixels = 0;
         for view in dataset.views.iter().step_by(dataset.views.len().div_ceil(count)) {
             let camera = &view.camera;
-            visible_rows(&self.state, &self.adam, 0, camera, row_from_working);
-            gather(&self.state, &self.adam, 0, row_from_working, columns);
-            self.renderer.forward(columns, camera, &self.options.render)?;
+            self.scene.gather_view(camera, self.step, &mut self.working)?;
+            let WorkingSet { columns, gradients, .. } = &mut self.working;
+            self.renderer.forward(columns, camera, &render)?;
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
             self.renderer.loss_backward(columns, &target, &self.options.loss, gradients)?;
@@ -139,9 +164,24 @@ impl Trainer {
         Ok(pixels)
     }
 
-    /// Bytes held for one view: its rows, gradients, intermediates and images.
-    pub fn view_bytes(&self) -> u64 {
-        self.renderer.host_bytes() + self.working.bytes() as u64
+    /// Trains in this order of views from the first step on; for orders that are settled after the pages are known.
+    pub fn set_view_order(&mut self, order: Order, dataset: &Dataset) {
+        self.order = view_order(order, self.options.seed, dataset);
+    }
+
+    /// The order of views.
+    pub fn view_order(&self) -> &ViewOrder {
+        &self.order
+    }
+
+    /// Bytes held for one view: its rows with their gradients, and what the renderer has.
+    pub fn view_bytes(&self) -> [u64; 2] {
+        [self.working.bytes() as u64, self.renderer.host_bytes()]
+    }
+
+    /// Degrees in use now and at the last step.
+    pub fn sh_degrees(&self) -> (u8, u8) {
+        (self.scene.rules.sh_degree(), self.options.sh_degree_at(self.options.steps.saturating_sub(1)))
     }
 
     /// Steps done.
@@ -161,12 +201,12 @@ impl Trainer {
 
     /// Options of a rendering now: with the bands that are in use.
     pub fn render_options(&self) -> RenderOptions {
-        RenderOptions { sh_degree: self.sh_degree, ..self.options.render }
+        RenderOptions { sh_degree: self.scene.rules.sh_degree(), ..self.options.render }
     }
 
     /// The events so far.
     pub fn events(&self) -> &EventLog {
-        &self.events
+        self.scene.events()
     }
 
     /// Runs one step and the events that are due after it.
@@ -181,23 +221,38 @@ impl Trainer {
             *position = self.train_views[*position];
         }
         targets.prefetch(&ahead);
+        self.look_ahead(dataset);
         let target = targets.get(view)?;
         let started = Instant::now();
         let render = self.render_options();
         let outcome = train_step(
-            &mut self.state,
+            &mut self.scene,
             &mut self.working,
             &mut *self.renderer,
-            &self.adam,
             (self.step, &dataset.views[view].camera, &target),
             (&render, &self.options.loss),
-            self.options.densify.is_some_and(|d| d.collects(self.step)).then_some(&mut self.histogram),
+            self.options.densify.is_some_and(|d| d.collects(self.step)),
         )?;
         self.count(&outcome, &dataset.views[view].name)?;
-        self.run_events();
+        self.log_events();
         self.step += 1;
         self.train_seconds += started.elapsed().as_secs_f64();
         Ok(outcome)
+    }
+
+    /// Tells the pager which views come next, now and then: it plans by pages, which costs more than a step should.
+    fn look_ahead(&mut self, dataset: &Dataset) {
+        let spills = self.scene.pager.stats().frames_max != usize::MAX;
+        if !spills || !self.step.is_multiple_of(LOOK_AHEAD_EVERY) {
+            return;
+        }
+        // Every page of the scene is needed within the next two epochs, if it ever is.
+        let count = (2 * self.train_views.len() as u32).clamp(LOOK_AHEAD_LEAST, LOOK_AHEAD_MOST);
+        let mut coming = Vec::new();
+        self.order.upcoming(self.step, count.min(self.options.steps - self.step), &mut coming);
+        let camera = |&position: &usize| &dataset.views[self.train_views[position]].camera;
+        let cameras: Vec<&Camera> = coming.iter().map(camera).collect();
+        self.scene.pager.look_ahead(self.step, &cameras);
     }
 
     fn count(&mut self, outcome: &StepOutcome, view: &str) -> Result<(), TrainError> {
@@ -219,28 +274,18 @@ impl Trainer {
         })
     }
 
-    /// Events fire after the update of their step, on values that contain it.
-    fn run_events(&mut self) {
-        let (step, rows) = (self.step, self.state.rows() as u64);
+    /// Events fire after the update of their step, on values that contain it; here they are decided and logged.
+    fn log_events(&mut self) {
+        let (step, scale) = (self.step, self.options.scene_scale);
         if let Some(densify) = self.options.densify {
-            let kinds: Vec<_> = densify.events_after(step, self.options.scene_scale, rows, &self.histogram).collect();
-            kinds.into_iter().for_each(|kind| self.run_event(Event { step, kind }));
-            if densify.is_round(step) {
-                self.histogram.clear();
-            }
+            let rows = self.scene.rows_bound();
+            let kinds: Vec<_> = densify.events_after(step, scale, rows, &self.scene.histogram).collect();
+            kinds.into_iter().for_each(|kind| self.scene.log_event(Event { step, kind }));
         }
         let degree = self.options.sh_degree_at(step + 1);
-        if degree > self.sh_degree {
-            self.run_event(Event { step, kind: EventKind::RaiseShDegree { degree } });
+        if degree > self.scene.rules.sh_degree() {
+            self.scene.log_event(Event { step, kind: EventKind::RaiseShDegree { degree } });
         }
-    }
-
-    fn run_event(&mut self, event: Event) {
-        let index = self.events.push(event);
-        if let EventKind::RaiseShDegree { degree } = event.kind {
-            self.sh_degree = degree;
-        }
-        apply_event(&mut self.state, &self.adam, self.options.seed, index, &event);
     }
 
     /// Runs to the last step or until asked to stop.
@@ -273,19 +318,21 @@ impl Trainer {
                     step,
                     loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },
                     psnr,
-                    gaussians: self.state.rows() as u64,
+                    gaussians: self.scene.rows(),
                     seconds: self.train_seconds,
                     host_bytes_peak: host_bytes_peak().unwrap_or(0),
                     bytes_uploaded: traffic.bytes_uploaded - before.bytes_uploaded,
                     bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
                     device_bytes_peak: traffic.device_bytes_peak,
+                    tiers: TierTraffic::of(&self.scene.pager),
                     test: last_test.filter(|_| due(self.options.eval_every) && !is_last),
                 })?;
             }
-            let gaussians = self.state.rows();
+            let gaussians = self.scene.rows();
             outputs.progress.step(self.step, || {
                 let test = last_test.map_or(String::new(), |t| format!(" test {:.2}", t.psnr));
-                format!("loss {:.4} psnr {psnr:.2}{test} {gaussians} gaussians", outcome.loss.loss)
+                let tiers = TierTraffic::of(&self.scene.pager).words();
+                format!("loss {:.4} psnr {psnr:.2}{test} {gaussians} gaussians{tiers}", outcome.loss.loss)
             });
         }
         outputs.progress.finish();
@@ -305,16 +352,15 @@ impl Trainer {
         let render = self.render_options();
         let views = dataset.test_views();
         let request = EvalRequest { views: &views, ssim: self.options.ssim_variant, pictures };
-        let now = (&self.state, &self.adam, self.step);
+        let now = (&mut self.scene, self.step, &mut self.working);
         evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)
     }
 
     /// Writes the rows as of now as a PLY; returns what was written, in which coordinates.
     ///
     /// # Errors
-    /// The folder cannot be written.
-    pub fn save(&self, dataset: &Dataset, path: &Path) -> Result<ply::PlyWritten, TrainError> {
-        let columns = evaluate_all(&self.state, &self.adam, self.step);
+    /// The folder cannot be written, or pages could not be had.
+    pub fn save(&mut self, dataset: &Dataset, path: &Path) -> Result<ply::PlyWritten, TrainError> {
         let meta = PlyMeta {
             step: Some(u64::from(self.step)),
             origin: dataset.frame.origin.to_array(),
@@ -323,12 +369,10 @@ impl Trainer {
             frame: self.options.export_frame,
             ..PlyMeta::default()
         };
-        Ok(ply::write_gaussians(path, &columns, &meta)?)
-    }
-
-    /// Bytes that the trainer itself holds: state and working set.
-    pub fn bytes(&self) -> u64 {
-        (self.state.bytes() + self.working.bytes()) as u64
+        let rows_at_most = self.scene.rows_bound();
+        let mut writer = ply::PlyWriter::create(path, self.options.sh_degree, rows_at_most, &meta)?;
+        self.scene.for_all_rows(self.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
+        Ok(writer.finish()?)
     }
 
     /// The path of the final PLY in an output folder.

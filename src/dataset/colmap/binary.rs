@@ -9,7 +9,7 @@
 
 use super::{Cameras, DAMAGED, ImageRecord, PointTally, models};
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::model::PointCloud;
+use crate::dataset::model::TakePoint;
 use crate::dataset::paths::MAX_NAME_BYTES;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -178,10 +178,10 @@ pub(super) fn read_images(path: &Path, warnings: &mut Vec<String>) -> InputResul
 }
 
 /// Reads `points3D.bin`; tracks are passed over.
-pub(super) fn read_points(path: &Path, warnings: &mut Vec<String>) -> InputResult<PointCloud> {
+pub(super) fn read_points(path: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>) -> InputResult<()> {
     let mut source = Source::open(path)?;
     let count = source.count("points", POINT_MIN)?;
-    let mut tally = PointTally::with_capacity(count as usize);
+    let mut tally = PointTally::default();
     for _ in 0..count {
         let at = source.offset;
         source.u64("a point")?;
@@ -190,7 +190,7 @@ pub(super) fn read_points(path: &Path, warnings: &mut Vec<String>) -> InputResul
         source.f64s::<1>("a point")?;
         let track = source.count("track elements", TRACK_ELEMENT)?;
         source.skip(track * TRACK_ELEMENT)?;
-        tally.add(position, color, at);
+        tally.add(position, color, at, take)?;
     }
     source.finish(warnings);
     tally.finish(path, "byte", warnings)

@@ -13,7 +13,7 @@ mod text;
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::checks::{MAX_COORDINATE, listed, sort_views};
-use crate::dataset::model::{Intrinsics, PointCloud, Pose, RawScene, RawView};
+use crate::dataset::model::{Intrinsics, PointCloud, Pose, RawScene, RawView, TakePoint};
 use crate::dataset::paths::safe_join;
 pub use crate::dataset::read::ReadOptions;
 use glam::{DMat3, DQuat, DVec3};
@@ -97,7 +97,7 @@ pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene>
     };
     let unit = if model.is_binary { "byte" } else { "line" };
     let views = make_views(&images_path, unit, &image_folder, &cameras, images, &mut warnings)?;
-    let (points, points_path) = read_points(&model, &mut warnings)?;
+    let (points, points_path) = read_points(&model, options.points_later, &mut warnings)?;
     Ok(RawScene { views, points, points_path, warnings, ..RawScene::default() })
 }
 
@@ -207,15 +207,38 @@ fn make_pose(quat: [f64; 4], translation: [f64; 3]) -> Option<Pose> {
     Some(Pose { rotation, translation: DVec3::from_array(translation) })
 }
 
-/// Points of the model: from either format, the images' own first; a `points3D.ply` is named for the caller instead.
-fn read_points(model: &ModelFolder, warnings: &mut Vec<String>) -> InputResult<(PointCloud, Option<PathBuf>)> {
+/// Hands every point of a `points3D.bin` or `points3D.txt` to `take`, in the file's order; tracks are passed over, points
+/// that are not finite are left out and counted in a warning.
+///
+/// # Errors
+/// A file that is damaged or holds more than 1 % of points that are not finite; or `take` failed.
+pub fn stream_points(file: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>) -> InputResult<()> {
+    let is_text = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("txt"));
+    if is_text { text::read_points(file, warnings, take) } else { binary::read_points(file, warnings, take) }
+}
+
+/// Points of the model: from either format, the images' own first. A `points3D.ply` is named for the caller instead, and
+/// any file when points are to be read `later`.
+fn read_points(
+    model: &ModelFolder,
+    later: bool,
+    warnings: &mut Vec<String>,
+) -> InputResult<(PointCloud, Option<PathBuf>)> {
     let (bin, txt) = (model.folder.join("points3D.bin"), model.folder.join("points3D.txt"));
     let prefer_bin = model.is_binary || !txt.is_file();
-    if bin.is_file() && prefer_bin {
-        return Ok((binary::read_points(&bin, warnings)?, None));
-    }
-    if txt.is_file() {
-        return Ok((text::read_points(&txt, warnings)?, None));
+    let own = [(bin.is_file() && prefer_bin).then_some(bin), txt.is_file().then_some(txt)].into_iter().flatten().next();
+    if let Some(file) = own {
+        if later {
+            return Ok((PointCloud::default(), Some(file)));
+        }
+        let mut cloud = PointCloud::default();
+        let mut take = |position, color| {
+            cloud.positions.push(position);
+            cloud.colors.push(color);
+            Ok(())
+        };
+        stream_points(&file, warnings, &mut take)?;
+        return Ok((cloud, None));
     }
     let ply = model.folder.join("points3D.ply");
     if ply.is_file() {
@@ -225,38 +248,31 @@ fn read_points(model: &ModelFolder, warnings: &mut Vec<String>) -> InputResult<(
     Ok((PointCloud::default(), None))
 }
 
-/// Collects points and counts those that are not finite.
+/// Counts points as they go by, and those that are not finite.
+#[derive(Default)]
 struct PointTally {
-    cloud: PointCloud,
+    total: u64,
     dropped: u64,
     first_dropped: u64,
 }
 
 impl PointTally {
-    fn with_capacity(count: usize) -> PointTally {
-        let cloud = PointCloud { positions: Vec::with_capacity(count), colors: Vec::with_capacity(count) };
-        PointTally { cloud, dropped: 0, first_dropped: 0 }
-    }
-
-    fn add(&mut self, position: [f64; 3], color: [u8; 3], place: u64) {
+    /// Hands on a point unless it is not finite.
+    fn add(&mut self, position: [f64; 3], color: [u8; 3], place: u64, take: &mut TakePoint<'_>) -> InputResult<()> {
+        self.total += 1;
         if position.iter().all(|x| x.is_finite()) {
-            self.cloud.positions.push(position);
-            self.cloud.colors.push(color);
-        } else {
-            if self.dropped == 0 {
-                self.first_dropped = place;
-            }
-            self.dropped += 1;
+            return take(position, color);
         }
+        if self.dropped == 0 {
+            self.first_dropped = place;
+        }
+        self.dropped += 1;
+        Ok(())
     }
 
-    fn total(&self) -> u64 {
-        self.cloud.positions.len() as u64 + self.dropped
-    }
-
-    /// The points; an error when more than 1 % were dropped.
-    fn finish(self, path: &Path, unit: &str, warnings: &mut Vec<String>) -> InputResult<PointCloud> {
-        let total = self.total();
+    /// An error when more than 1 % were dropped.
+    fn finish(self, path: &Path, unit: &str, warnings: &mut Vec<String>) -> InputResult<()> {
+        let total = self.total;
         if self.dropped.saturating_mul(100) > total {
             let problem = format!("{} of {total} points are not finite numbers, more than 1 %", self.dropped);
             return Err(InputError::new(path, problem, DAMAGED).at(format!("{unit} {}", self.first_dropped)));
@@ -269,6 +285,6 @@ impl PointTally {
         if total == 0 {
             warnings.push(format!("{}: the file holds no points", path.display()));
         }
-        Ok(self.cloud)
+        Ok(())
     }
 }

@@ -8,7 +8,7 @@
 
 use super::{Cameras, DAMAGED, ImageRecord, PointTally, models};
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::model::PointCloud;
+use crate::dataset::model::TakePoint;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -213,17 +213,17 @@ fn check_observations(lines: &Lines) -> InputResult<()> {
 }
 
 /// Reads `points3D.txt`; tracks are passed over.
-pub(super) fn read_points(path: &Path, warnings: &mut Vec<String>) -> InputResult<PointCloud> {
+pub(super) fn read_points(path: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>) -> InputResult<()> {
     let mut lines = Lines::open(path)?;
-    let mut tally = PointTally::with_capacity(0);
+    let mut tally = PointTally::default();
     while lines.next_record()? {
         let mut words = Words::of(&lines)?;
         let _: u64 = words.number("the point's number")?;
         let position = words.numbers("a coordinate")?;
         let color = [words.number("red")?, words.number("green")?, words.number("blue")?];
         let _: f64 = words.number("the reprojection error")?;
-        tally.add(position, color, lines.line);
+        tally.add(position, color, lines.line, take)?;
     }
-    lines.finish("points", tally.total(), warnings);
+    lines.finish("points", tally.total, warnings);
     tally.finish(path, "line", warnings)
 }

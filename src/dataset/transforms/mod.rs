@@ -16,7 +16,7 @@
 mod intrinsics;
 mod json;
 mod photos;
-mod pose;
+pub(in crate::dataset) mod pose;
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::checks::{listed, sort_views};

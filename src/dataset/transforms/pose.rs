@@ -41,7 +41,7 @@ pub(super) fn read_matrix(frame: &Node<'_>) -> InputResult<[[f64; 4]; 4]> {
 
 /// The pose of a camera-to-world matrix whose rotation may carry one common scale; `None` when it is not finite or
 /// not a proper rotation.
-pub(super) fn make_pose(m: &[[f64; 4]; 4]) -> Option<Pose> {
+pub(in crate::dataset) fn make_pose(m: &[[f64; 4]; 4]) -> Option<Pose> {
     if !m.iter().flatten().all(|x| x.abs() <= MAX_COORDINATE) {
         return None;
     }

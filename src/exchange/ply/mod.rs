@@ -18,8 +18,8 @@ mod read;
 mod rows;
 mod write;
 
-pub use read::{parse_ply, read_ply};
-pub use write::{PlyWritten, write_gaussians};
+pub use read::{holds_gaussians, parse_ply, read_ply, stream_points};
+pub use write::{PlyWriter, PlyWritten, write_gaussians};
 
 use crate::scene::columns::Columns;
 

@@ -18,12 +18,38 @@ use std::path::Path;
 
 /// Reads `path`. See [`parse_ply`].
 pub fn read_ply(path: &Path) -> InputResult<PlyContent> {
+    let (reader, total_bytes) = open(path)?;
+    parse_ply(reader, total_bytes, path)
+}
+
+/// Whether `path` holds Gaussians rather than points.
+///
+/// # Errors
+/// The file cannot be opened, or its header cannot be read.
+pub fn holds_gaussians(path: &Path) -> InputResult<bool> {
+    let header = parse_header(&mut open(path)?.0, path)?;
+    Ok(vertex_of(&header, path)?.1.find("f_dc_0").is_some())
+}
+
+/// Hands the coloured points of `path` to `take`, in the file's order and without keeping them; returns how many were
+/// dropped because they are not finite. Gaussians count as points of the default colour.
+///
+/// # Errors
+/// As [`parse_ply`]; or `take` failed.
+pub fn stream_points(path: &Path, take: &mut dyn FnMut([f64; 3], [u8; 3]) -> InputResult<()>) -> InputResult<u64> {
+    let (mut reader, total_bytes) = open(path)?;
+    let header = parse_header(&mut reader, path)?;
+    let (mut body, vertex) = body_at_vertices(reader, &header, total_bytes, path)?;
+    stream_rows(&mut body, vertex, take)
+}
+
+fn open(path: &Path) -> InputResult<(BufReader<File>, u64)> {
     let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
     let about = file.metadata().map_err(|e| InputError::io(path, "asking for the length", &e))?;
     if !about.is_file() {
         return Err(InputError::new(path, "this is not a regular file", "give a PLY file"));
     }
-    parse_ply(BufReader::with_capacity(1 << 20, file), about.len(), path)
+    Ok((BufReader::with_capacity(1 << 20, file), about.len()))
 }
 
 /// Reads a PLY of `total_bytes` bytes: Gaussians if its vertices have `f_dc_0`, else coloured points.
@@ -37,6 +63,32 @@ pub fn read_ply(path: &Path) -> InputResult<PlyContent> {
 /// 24 or 45, has no vertices, or has more than 1 % of rows with values that are not finite.
 pub fn parse_ply<R: BufRead>(mut reader: R, total_bytes: u64, path: &Path) -> InputResult<PlyContent> {
     let header = parse_header(&mut reader, path)?;
+    let (mut body, vertex) = body_at_vertices(reader, &header, total_bytes, path)?;
+    if vertex.find("f_dc_0").is_some() {
+        read_gaussians(&mut body, &header, vertex)
+    } else {
+        read_points(&mut body, vertex)
+    }
+}
+
+/// The body of a file, passed over up to its vertices, which are checked to be there.
+fn body_at_vertices<'p, 'h, R: BufRead>(
+    reader: R,
+    header: &'h Header,
+    total_bytes: u64,
+    path: &'p Path,
+) -> InputResult<(Body<'p, R>, &'h Element)> {
+    let (vertex_at, vertex) = vertex_of(header, path)?;
+    let mut body = Body::new(reader, path, header, total_bytes);
+    for element in &header.elements[..vertex_at] {
+        body.skip(element)?;
+    }
+    body.check_room(vertex)?;
+    Ok((body, vertex))
+}
+
+/// The element of the vertices and its place; there is at least one of them.
+fn vertex_of<'h>(header: &'h Header, path: &Path) -> InputResult<(usize, &'h Element)> {
     let vertex_at = header.elements.iter().position(|e| e.name == "vertex").ok_or_else(|| {
         InputError::new(path, "the file has no element 'vertex'", "give a PLY of points or Gaussians").at("header")
     })?;
@@ -50,16 +102,7 @@ pub fn parse_ply<R: BufRead>(mut reader: R, total_bytes: u64, path: &Path) -> In
         let remedy = "convert it to an ordinary PLY first, for example with splat-transform";
         return Err(InputError::new(path, "this is a compressed PLY (packed_position)", remedy).at("header"));
     }
-    let mut body = Body::new(reader, path, &header, total_bytes);
-    for element in &header.elements[..vertex_at] {
-        body.skip(element)?;
-    }
-    body.check_room(vertex)?;
-    if vertex.find("f_dc_0").is_some() {
-        read_gaussians(&mut body, &header, vertex)
-    } else {
-        read_points(&mut body, vertex)
-    }
+    Ok((vertex_at, vertex))
 }
 
 /// Index of a number property, or an error that names it.
@@ -190,6 +233,24 @@ fn meta_from_comments(path: &Path, comments: &[String]) -> InputResult<PlyMeta> 
 }
 
 fn read_points<R: BufRead>(body: &mut Body<'_, R>, vertex: &Element) -> InputResult<PlyContent> {
+    let rows = vertex.count as usize;
+    let (mut positions, mut colors) = (Vec::new(), Vec::new());
+    positions.try_reserve_exact(rows).map_err(no_memory(body.path, vertex.count))?;
+    colors.try_reserve_exact(rows).map_err(no_memory(body.path, vertex.count))?;
+    let dropped = stream_rows(body, vertex, &mut |position, color| {
+        positions.push(position);
+        colors.push(color);
+        Ok(())
+    })?;
+    Ok(PlyContent::Points { positions, colors, dropped })
+}
+
+/// Hands on the points of a body; returns how many were dropped.
+fn stream_rows<R: BufRead>(
+    body: &mut Body<'_, R>,
+    vertex: &Element,
+    take: &mut dyn FnMut([f64; 3], [u8; 3]) -> InputResult<()>,
+) -> InputResult<u64> {
     let path = body.path;
     let mut slots = Vec::with_capacity(6);
     for name in ["x", "y", "z"] {
@@ -204,22 +265,22 @@ fn read_points<R: BufRead>(body: &mut Body<'_, R>, vertex: &Element) -> InputRes
             *kind = scalar;
         }
     }
-    let rows = vertex.count as usize;
-    let (mut positions, mut colors) = (Vec::new(), Vec::new());
-    positions.try_reserve_exact(rows).map_err(no_memory(path, vertex.count))?;
-    colors.try_reserve_exact(rows).map_err(no_memory(path, vertex.count))?;
     let mut dropped = Dropped::default();
+    let mut outcome = Ok(());
     read_rows(body, vertex, &slots, |row, raw| {
+        if outcome.is_err() {
+            return;
+        }
         if !raw.iter().all(|v| v.is_finite()) {
             dropped.add(row);
             return;
         }
-        positions.push([raw[0], raw[1], raw[2]]);
         let color = |c: usize| raw.get(3 + c).map_or(128, |&v| color_byte(v, color_types[c]));
-        colors.push([color(0), color(1), color(2)]);
+        outcome = take([raw[0], raw[1], raw[2]], [color(0), color(1), color(2)]);
     })?;
+    outcome?;
     dropped.check(path, vertex.count)?;
-    Ok(PlyContent::Points { positions, colors, dropped: dropped.count })
+    Ok(dropped.count)
 }
 
 /// A finite colour value as a byte; the type says its range.

@@ -2,7 +2,7 @@
 //!
 //! Not here: when to write and where. The parent's page states the file's layout.
 //!
-//! Invariants: 1. memory beyond the scene is one block of [`BLOCK_ROWS`] rows; 2. the bytes depend on the arguments
+//! Invariants: 1. memory beyond the rows given is one block of [`BLOCK_ROWS`] rows; 2. the bytes depend on the arguments
 //! alone; 3. the target is replaced whole, after the new bytes have reached the disk, or not at all; 4. a row with a
 //! value that is not finite, before or after the change of frame, is left out and counted.
 //!
@@ -11,10 +11,9 @@
 use super::{ExportFrame, PlyMeta, unit_quat};
 use crate::base::error::{InputError, InputResult};
 use crate::scene::columns::{Column, Columns, sh_n_width};
-use rayon::prelude::*;
 use std::fmt::Write as _;
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 const BLOCK_ROWS: usize = 4096;
@@ -32,46 +31,115 @@ pub struct PlyWritten {
     pub bytes: u64,
 }
 
-/// Writes rows of the local frame to `path`, in the frame that `meta` asks for where f32 can hold it.
-///
-/// In the dataset's frame positions are `means * scale + origin`, computed in f64 and rounded once, and `ln(scale)` is
-/// added to the log-scales. Quaternions are written at unit length, as viewers expect; the rotation is the same.
+/// Writes rows of the local frame to `path`, in the frame that `meta` asks for where f32 can hold it: [`PlyWriter`] for
+/// rows that are all at hand.
 ///
 /// # Errors
 /// When the disk refuses, when `path` names no file, or when no row is finite. The target is then what it was.
 pub fn write_gaussians(path: &Path, columns: &Columns, meta: &PlyMeta) -> InputResult<PlyWritten> {
-    let name = path.file_name().ok_or_else(|| InputError::new(path, "this path names no file", "give a file name"))?;
-    let frame = meta.frame.that_fits(meta.origin, meta.scene_radius);
-    let rows = FileRows::new(columns, meta, frame);
-    let finite = rows.count();
-    if finite == 0 {
-        let problem = format!("none of the {} Gaussians is finite, so there is nothing to write", columns.rows());
-        return Err(InputError::new(path, problem, "the training diverged or lost all Gaussians: lower the rates"));
-    }
-    let mut part_name = std::ffi::OsString::from(".");
-    part_name.push(name);
-    part_name.push(".part");
-    let part = PartFile { path: path.with_file_name(part_name) };
-    let failed = |doing: &str, e: &std::io::Error| InputError::io(path, doing, e);
+    let mut writer = PlyWriter::create(path, columns.sh_degree, columns.rows() as u64, meta)?;
+    writer.write(columns)?;
+    writer.finish()
+}
 
-    let file = File::create(&part.path).map_err(|e| failed("creating the file", &e))?;
-    let mut out = BufWriter::with_capacity(1 << 20, file);
-    let header = header_text(columns.sh_degree, finite, meta, frame);
-    out.write_all(header.as_bytes()).map_err(|e| failed("writing", &e))?;
-    let mut bytes = header.len() as u64;
-    let mut block = Vec::with_capacity(BLOCK_ROWS * rows.width() * 4);
-    for first in (0..columns.rows()).step_by(BLOCK_ROWS) {
-        block.clear();
-        rows.encode(first..(first + BLOCK_ROWS).min(columns.rows()), &mut block);
-        out.write_all(&block).map_err(|e| failed("writing", &e))?;
-        bytes += block.len() as u64;
+/// A file that is written part by part.
+///
+/// In the dataset's frame positions are `means * scale + origin`, computed in f64 and rounded once, and `ln(scale)` is
+/// added to the log-scales. Quaternions are written at unit length, as viewers expect; the rotation is the same.
+/// Bands above those of the rows are zeros.
+///
+/// The number of rows stands in the header and is known at the end: the header is written again then, at the same
+/// length. Where the number turned out to have fewer digits than room was left for, its comment is padded with spaces.
+pub struct PlyWriter {
+    path: PathBuf,
+    part: PartFile,
+    out: BufWriter<File>,
+    file_rows: FileRows,
+    meta: PlyMeta,
+    frame: ExportFrame,
+    rows_at_most: u64,
+    given: u64,
+    rows: u64,
+    bytes: u64,
+    block: Vec<u8>,
+}
+
+impl PlyWriter {
+    /// Begins a file of at most `rows_at_most` rows with the bands of `sh_degree`, beside its target.
+    ///
+    /// # Errors
+    /// When the disk refuses, or when `path` names no file.
+    pub fn create(path: &Path, sh_degree: u8, rows_at_most: u64, meta: &PlyMeta) -> InputResult<PlyWriter> {
+        let name =
+            path.file_name().ok_or_else(|| InputError::new(path, "this path names no file", "give a file name"))?;
+        let frame = meta.frame.that_fits(meta.origin, meta.scene_radius);
+        let mut part_name = std::ffi::OsString::from(".");
+        part_name.push(name);
+        part_name.push(".part");
+        let part = PartFile { path: path.with_file_name(part_name) };
+        let file = File::create(&part.path).map_err(|e| InputError::io(path, "creating the file", &e))?;
+        let mut out = BufWriter::with_capacity(1 << 20, file);
+        let header = header_text(sh_degree, rows_at_most, rows_at_most, meta, frame);
+        out.write_all(header.as_bytes()).map_err(|e| InputError::io(path, "writing", &e))?;
+        Ok(PlyWriter {
+            path: path.to_path_buf(),
+            part,
+            out,
+            file_rows: FileRows::new(sh_degree, meta, frame),
+            meta: meta.clone(),
+            frame,
+            rows_at_most,
+            given: 0,
+            rows: 0,
+            bytes: header.len() as u64,
+            block: Vec::new(),
+        })
     }
-    let file = out.into_inner().map_err(|e| failed("writing", e.error()))?;
-    file.sync_all().map_err(|e| failed("flushing to the disk", &e))?;
-    drop(file);
-    std::fs::rename(&part.path, path).map_err(|e| failed("replacing the file", &e))?;
-    sync_folder(path);
-    Ok(PlyWritten { frame, rows: finite, skipped: columns.rows() as u64 - finite, bytes })
+
+    /// Appends rows; those that are not finite are left out and counted.
+    ///
+    /// # Errors
+    /// When the disk refuses, or when there are more rows than were announced.
+    pub fn write(&mut self, columns: &Columns) -> InputResult<()> {
+        let rows = columns.rows();
+        self.given += rows as u64;
+        if self.given > self.rows_at_most || columns.sh_degree > self.file_rows.sh_degree {
+            let problem = format!("{} rows came, {} were announced", self.given, self.rows_at_most);
+            return Err(InputError::new(&self.path, problem, "report this as a bug"));
+        }
+        for first in (0..rows).step_by(BLOCK_ROWS) {
+            self.block.clear();
+            self.rows += self.file_rows.encode(columns, first..(first + BLOCK_ROWS).min(rows), &mut self.block);
+            self.out.write_all(&self.block).map_err(|e| InputError::io(&self.path, "writing", &e))?;
+            self.bytes += self.block.len() as u64;
+        }
+        Ok(())
+    }
+
+    /// Puts the file in the place of its target, after its bytes have reached the disk.
+    ///
+    /// # Errors
+    /// When the disk refuses, or when no row is finite. The target is then what it was.
+    pub fn finish(self) -> InputResult<PlyWritten> {
+        let PlyWriter { path, part, out, meta, frame, rows_at_most, given, rows, bytes, .. } = self;
+        if rows == 0 {
+            let problem = format!("none of the {given} Gaussians is finite, so there is nothing to write");
+            let remedy = "the training diverged or lost all Gaussians: lower the rates";
+            return Err(InputError::new(&path, problem, remedy));
+        }
+        let failed = |doing: &str, e: &std::io::Error| InputError::io(&path, doing, e);
+        let mut file = out.into_inner().map_err(|e| failed("writing", e.error()))?;
+        if rows < rows_at_most {
+            let header = header_text(self.file_rows.sh_degree, rows, rows_at_most, &meta, frame);
+            let written = file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(header.as_bytes()));
+            written.map_err(|e| failed("writing", &e))?;
+        }
+        file.sync_all().map_err(|e| failed("flushing to the disk", &e))?;
+        drop(file);
+        std::fs::rename(&part.path, &path).map_err(|e| failed("replacing the file", &e))?;
+        sync_folder(&path);
+        Ok(PlyWritten { frame, rows, skipped: given - rows, bytes })
+    }
 }
 
 /// The unfinished file; removed unless it was renamed away.
@@ -94,14 +162,17 @@ fn sync_folder(path: &Path) {
     }
 }
 
-fn header_text(sh_degree: u8, rows: u64, meta: &PlyMeta, frame: ExportFrame) -> String {
+/// The header for `rows` rows, as long as the one for `rows_at_most`.
+fn header_text(sh_degree: u8, rows: u64, rows_at_most: u64, meta: &PlyMeta, frame: ExportFrame) -> String {
+    let digits = |n: u64| n.checked_ilog10().unwrap_or(0) as usize;
+    let padding = digits(rows_at_most) - digits(rows);
     let mut text = format!("ply\nformat binary_little_endian 1.0\nelement vertex {rows}\n");
     let mut line = |args: std::fmt::Arguments| {
         // Writing to a String cannot fail.
         let _ = text.write_fmt(args);
         text.push('\n');
     };
-    line(format_args!("comment Generated by gsscale {}", env!("CARGO_PKG_VERSION")));
+    line(format_args!("comment Generated by gsscale {}{:padding$}", env!("CARGO_PKG_VERSION"), ""));
     if let Some(step) = meta.step {
         line(format_args!("comment step {step}"));
     }
@@ -132,19 +203,19 @@ fn property_names(sh_degree: u8) -> Vec<String> {
     names
 }
 
-/// Rows as the file holds them.
-struct FileRows<'a> {
-    columns: &'a Columns,
+/// How the file holds rows.
+struct FileRows {
+    sh_degree: u8,
     origin: [f64; 3],
     scale: f64,
     log_scale: f64,
     local: bool,
 }
 
-impl<'a> FileRows<'a> {
-    fn new(columns: &'a Columns, meta: &PlyMeta, frame: ExportFrame) -> Self {
+impl FileRows {
+    fn new(sh_degree: u8, meta: &PlyMeta, frame: ExportFrame) -> Self {
         FileRows {
-            columns,
+            sh_degree,
             origin: meta.origin,
             scale: meta.scale,
             log_scale: libm::log(meta.scale),
@@ -152,37 +223,23 @@ impl<'a> FileRows<'a> {
         }
     }
 
-    /// Floats of a row.
-    fn width(&self) -> usize {
-        17 + sh_n_width(self.columns.sh_degree)
-    }
-
-    /// Rows that will be written.
-    fn count(&self) -> u64 {
-        let blocks = self.columns.rows().div_ceil(BLOCK_ROWS);
-        let finite_in = |block: usize| {
-            let mut values = vec![0.0; self.width()];
-            let end = ((block + 1) * BLOCK_ROWS).min(self.columns.rows());
-            (block * BLOCK_ROWS..end).filter(|&row| self.fill(row, &mut values)).count() as u64
-        };
-        (0..blocks).into_par_iter().map(finite_in).sum()
-    }
-
-    /// Appends the bytes of the finite rows among `rows`.
-    fn encode(&self, rows: std::ops::Range<usize>, out: &mut Vec<u8>) {
-        let mut values = vec![0.0; self.width()];
+    /// Appends the bytes of the finite rows among `rows`; returns how many those are.
+    fn encode(&self, columns: &Columns, rows: std::ops::Range<usize>, out: &mut Vec<u8>) -> u64 {
+        let mut values = vec![0.0; 17 + sh_n_width(self.sh_degree)];
+        let mut finite = 0;
         for row in rows {
-            if self.fill(row, &mut values) {
+            if self.fill(columns, row, &mut values) {
                 out.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+                finite += 1;
             }
         }
+        finite
     }
 
-    /// The values of one row in file order; false when one is not finite.
-    fn fill(&self, row: usize, out: &mut [f32]) -> bool {
-        let c = self.columns;
+    /// The values of one row in file order; false when one is not finite. Bands that the rows lack are left alone.
+    fn fill(&self, c: &Columns, row: usize, out: &mut [f32]) -> bool {
         let (geometry, rest) = out.split_at_mut(9);
-        let coefficients = sh_n_width(c.sh_degree) / 3;
+        let coefficients = sh_n_width(self.sh_degree) / 3;
         let (f_rest, tail) = rest.split_at_mut(3 * coefficients);
         let mean = c.row(Column::Means, row);
         let scales = c.row(Column::Scales, row);
@@ -192,10 +249,9 @@ impl<'a> FileRows<'a> {
             tail[1 + i] = if self.local { scales[i] } else { (f64::from(scales[i]) + self.log_scale) as f32 };
         }
         geometry[6..9].copy_from_slice(c.row(Column::Sh0, row));
-        let sh_n = c.row(Column::ShN, row);
-        for k in 0..coefficients {
+        for (k, coefficient) in c.row(Column::ShN, row).chunks_exact(3).enumerate() {
             for channel in 0..3 {
-                f_rest[channel * coefficients + k] = sh_n[3 * k + channel];
+                f_rest[channel * coefficients + k] = coefficient[channel];
             }
         }
         tail[0] = c.opacities[row];

@@ -1,0 +1,155 @@
+//! Time to open a store and to commit, on a real drive.
+//!
+//! `cargo bench --bench commit` opens a store of 100,000 pages and commits 64 and 1,000 dirty pages of 728 KiB; numbers
+//! choose other counts of dirty pages. Files lie in the folder of temporary files (`TMPDIR`). Inside a test run it
+//! does the same with a few small pages.
+//!
+//! Opening is everything between a closed store and the first read: the map verified, every value of it, generations and
+//! free slots. It reads no page. A commit is its writes, the sync of the segments, the map's transaction and the witness.
+
+#![allow(clippy::expect_used)] // a benchmark that cannot run ends
+
+pub mod support;
+
+use gsscale::base::ids::PageId;
+use gsscale::page::codec::Codec;
+use gsscale::page::commit::{CommitConfig, CommitError, Commits, Cut, PageChange};
+use gsscale::page::engine::{IoEngine, open_engine};
+use gsscale::page::folder::DriveFolder;
+use gsscale::page::format::{SlotRef, StoredAs};
+use gsscale::page::memory_store::MemoryStore;
+use gsscale::page::paged_store::{PageMoved, PagedStore};
+use gsscale::page::slots::SlotLayout;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+use support::Args;
+
+const CONFIG: CommitConfig = CommitConfig { store: 0xbe, cache_bytes: 16 << 20, reserve_bytes: 0 };
+/// Like bounds and counts of a page.
+const LABEL: [u8; 64] = [7; 64];
+
+/// Seconds of one measurement.
+#[derive(Debug, Clone, Copy)]
+pub struct CommitTime {
+    /// Writing the pages.
+    pub write: f64,
+    /// Sync, transaction, witness.
+    pub commit: f64,
+}
+
+fn folder(name: &str) -> PathBuf {
+    let folder = std::env::temp_dir().join(format!("gsscale-bench-{name}-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).expect("the folder of temporary files can be written");
+    folder
+}
+
+fn layout(capacity: usize) -> SlotLayout {
+    SlotLayout::new(capacity, 1 << 16)
+}
+
+/// A store whose map names `pages` pages; their bytes do not exist.
+fn fill_map(at: &Path, pages: u32) -> Result<(), CommitError> {
+    let opened = Commits::create(Box::new(DriveFolder::new(at)), CONFIG)?;
+    let layout = layout(745_472);
+    let mut store = opened.paged_store(Box::new(MemoryStore::new()), layout, Codec::Raw)?;
+    let changes: Vec<PageChange> = (0..pages)
+        .map(|page| {
+            let (place, codec) = (layout.place(u64::from(page)), StoredAs::Raw);
+            let checksum = u128::from(page) << 64;
+            let slot = SlotRef { place, stored_bytes: 9, payload_bytes: 9, generation: 1, checksum, codec };
+            PageChange { page: PageId::initial(page), version: Some((slot, LABEL.to_vec())) }
+        })
+        .collect();
+    let mut commits = opened.commits;
+    let cut = Cut { changes: &changes, run_state: &[1; 4096], note: b"", pin: None };
+    commits.commit(&mut store, &mut Vec::new(), &cut)?;
+    Ok(())
+}
+
+/// Seconds to open a store of `pages` pages.
+pub fn open_seconds(pages: u32) -> Result<f64, CommitError> {
+    let at = folder("open");
+    fill_map(&at, pages)?;
+    let began = Instant::now();
+    let opened = Commits::open(Box::new(DriveFolder::new(&at)), CONFIG)?;
+    let store = opened.paged_store(Box::new(MemoryStore::new()), layout(745_472), Codec::Raw)?;
+    let seconds = began.elapsed().as_secs_f64();
+    assert_eq!((opened.pages.len(), store.slots().free() > 0), (pages as usize, true));
+    let _ = std::fs::remove_dir_all(at);
+    Ok(seconds)
+}
+
+fn write_pages(store: &mut PagedStore, pages: u32, bytes: usize) -> Vec<PageChange> {
+    let mut done = Vec::new();
+    for page in 0..pages {
+        let mut buffer = store.new_buffer();
+        buffer.as_mut_slice()[4096..].fill(page as u8 + 1);
+        let written = store.write(u64::from(page), PageId::initial(page), &LABEL, bytes, buffer);
+        written.map_err(|(error, _)| error).expect("the drive has space");
+        while store.in_flight() > 32 {
+            store.complete(true, &mut done);
+        }
+    }
+    while store.in_flight() > 0 {
+        store.complete(true, &mut done);
+    }
+    let changes = done.into_iter().map(|end| match end.result {
+        Ok(PageMoved::Written(slot)) => PageChange { page: end.page, version: Some((slot, LABEL.to_vec())) },
+        other => panic!("a page was not written: {other:?}"),
+    });
+    changes.collect()
+}
+
+/// Seconds to write and to commit `pages` pages of `bytes` bytes, the median of `times`.
+pub fn commit_seconds(pages: u32, bytes: usize, times: usize) -> Result<CommitTime, CommitError> {
+    let at = folder("commit");
+    let engine = open_engine(IoEngine::Auto, &at, 8).expect("an engine works here").store;
+    let opened = Commits::create(Box::new(DriveFolder::new(&at)), CONFIG)?;
+    let mut store = opened.paged_store(engine, layout(bytes), Codec::Raw)?;
+    let mut commits = opened.commits;
+    let mut present: Vec<PageChange> = Vec::new();
+    let mut measured = Vec::new();
+    for _ in 0..times {
+        let began = Instant::now();
+        let changes = write_pages(&mut store, pages, bytes);
+        let write = began.elapsed().as_secs_f64();
+        present.iter().filter_map(|c| c.version.as_ref()).for_each(|(slot, _)| store.free(slot));
+        let began = Instant::now();
+        let cut = Cut { changes: &changes, run_state: &[1; 4096], note: b"", pin: None };
+        commits.commit(&mut store, &mut Vec::new(), &cut)?;
+        measured.push((write, began.elapsed().as_secs_f64()));
+        present = changes;
+    }
+    let _ = std::fs::remove_dir_all(at);
+    let write = support::median(measured.iter().map(|m| m.0));
+    Ok(CommitTime { write, commit: support::median(measured.iter().map(|m| m.1)) })
+}
+
+/// Small sizes: opens and commits, and says whether times are times.
+pub fn tiny() -> bool {
+    let open = open_seconds(300).expect("a store opens");
+    let commit = commit_seconds(5, 5000, 3).expect("a store takes commits");
+    open > 0.0 && commit.write > 0.0 && commit.commit > 0.0
+}
+
+fn main() {
+    let args = Args::read();
+    if !args.real {
+        assert!(tiny());
+        return;
+    }
+    let pages = 100_000;
+    match open_seconds(pages) {
+        Ok(seconds) => println!("open {pages} pages: {seconds:.3} s"),
+        Err(error) => println!("open: {error}"),
+    }
+    let sizes = if args.sizes.is_empty() { vec![64, 1000] } else { args.sizes.clone() };
+    for dirty in sizes {
+        match commit_seconds(dirty as u32, 745_472, 5) {
+            Ok(CommitTime { write, commit }) => {
+                println!("commit {dirty} pages of 728 KiB: write {write:.3} s, commit {:.1} ms", commit * 1e3);
+            }
+            Err(error) => println!("commit: {error}"),
+        }
+    }
+}

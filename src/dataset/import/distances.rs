@@ -1,0 +1,149 @@
+//! Distances to the nearest neighbours in a cloud that does not fit in memory: block by block, and across blocks where
+//! a block's box is near enough to matter.
+//!
+//! Invariant: the distances are those of [`crate::scene::neighbours::nearest_dist2`] over the whole cloud, bit for bit,
+//! whatever fits in memory: a neighbour in another block is nearer than the third of the own block only if that
+//! block's box is.
+
+use super::divide::Division;
+use super::spool::{Spool, SpoolSpace, SpoolWriter};
+use super::{Budget, CloudPoint};
+use crate::base::error::InputResult;
+use crate::scene::init::rms_distance;
+use crate::scene::neighbours::{Bounds, NEIGHBOURS, NeighbourTree, merged};
+use crate::scene::partition::Pages;
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// Bytes that a point takes while its block is searched: record, position, tree, distances.
+const SEARCH_BYTES: usize = 96;
+
+/// A question to another block.
+#[derive(Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
+#[repr(C)]
+struct Question {
+    point: [f32; 3],
+    /// Only what is nearer than this matters.
+    limit: f32,
+    /// Place of the asking point in the sorted cloud.
+    at: u32,
+    /// Whom it asks.
+    block: u32,
+}
+
+/// What another block knew.
+#[derive(Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
+#[repr(C)]
+struct Answer {
+    at: u32,
+    dist2: [f32; NEIGHBOURS],
+}
+
+/// The cloud in spatial order, and for each point the root mean square distance of its neighbours.
+pub(super) struct Measured {
+    pub points: Spool<CloudPoint>,
+    pub distances: Spool<f64>,
+}
+
+/// The search over one cloud.
+struct Search<'a> {
+    space: SpoolSpace<'a>,
+    blocks: Vec<Range<usize>>,
+    points: Spool<CloudPoint>,
+    /// Distances within the own block.
+    own: Spool<[f32; NEIGHBOURS]>,
+}
+
+/// Measures a cloud.
+pub(super) fn measure(points: Spool<CloudPoint>, budget: &Budget<'_>) -> InputResult<Measured> {
+    let pages = Pages::of(points.len(), budget.records(SEARCH_BYTES));
+    let blocks: Vec<Range<usize>> = (0..pages.pages).map(|b| pages.start(b)..pages.start(b + 1)).collect();
+    let space = budget.space();
+    let mut sorted = SpoolWriter::new(space);
+    let division = Division { space, pages, records_in_memory: pages.rows.div_ceil(pages.pages.max(1)) };
+    division.run(points, &mut |_, entries| entries.into_iter().try_for_each(|e| sorted.push(e)))?;
+    let mut search = Search { space, blocks, points: sorted.finish()?, own: SpoolWriter::new(space).finish()? };
+    let bounds = search.search_own_blocks()?;
+    let questions = search.ask(&bounds)?;
+    let answers = search.answer(&questions)?;
+    let distances = search.conclude(&answers)?;
+    Ok(Measured { points: search.points, distances })
+}
+
+impl Search<'_> {
+    fn positions(&self, block: &Range<usize>) -> InputResult<Vec<[f32; 3]>> {
+        Ok(self.points.range(block.clone())?.iter().map(|p| p.point).collect())
+    }
+
+    fn search_own_blocks(&mut self) -> InputResult<Vec<Bounds>> {
+        let mut own = SpoolWriter::new(self.space);
+        let mut bounds = Vec::with_capacity(self.blocks.len());
+        for block in &self.blocks {
+            let tree = NeighbourTree::new(&self.positions(block)?);
+            bounds.push(tree.bounds());
+            tree.nearest_dist2().into_iter().try_for_each(|dist2| own.push(dist2))?;
+        }
+        self.own = own.finish()?;
+        Ok(bounds)
+    }
+
+    /// The questions of all points whose third neighbour is farther than another block's box.
+    fn ask(&self, bounds: &[Bounds]) -> InputResult<Spool<Question>> {
+        let mut questions = SpoolWriter::new(self.space);
+        for (from, block) in self.blocks.iter().enumerate() {
+            let (points, own) = (self.positions(block)?, self.own.range(block.clone())?);
+            for (i, (&point, dist2)) in points.iter().zip(&own).enumerate() {
+                let limit = dist2[NEIGHBOURS - 1];
+                for (to, other) in bounds.iter().enumerate() {
+                    if to != from && other.dist2(point) < limit {
+                        let at = (block.start + i) as u32;
+                        questions.push(Question { point, limit, at, block: to as u32 })?;
+                    }
+                }
+            }
+        }
+        questions.finish()
+    }
+
+    fn answer(&self, questions: &Spool<Question>) -> InputResult<Spool<Answer>> {
+        let mut answers = SpoolWriter::new(self.space);
+        if questions.is_empty() {
+            return answers.finish();
+        }
+        for (number, block) in self.blocks.iter().enumerate() {
+            let tree = NeighbourTree::new(&self.positions(block)?);
+            // As many questions at a time as there are points: they are smaller than what a point takes.
+            let mut batch = Vec::new();
+            let mut reply = |batch: &mut Vec<Question>| {
+                let known = batch.par_iter().map(|q| Answer { at: q.at, dist2: tree.nearer(q.point, q.limit) });
+                let known: Vec<Answer> = known.collect();
+                batch.clear();
+                known.into_iter().filter(|a| a.dist2[0].is_finite()).try_for_each(|a| answers.push(a))
+            };
+            questions.for_each(|q| {
+                if q.block as usize == number {
+                    batch.push(*q);
+                }
+                if batch.len() >= block.len().max(64) { reply(&mut batch) } else { Ok(()) }
+            })?;
+            reply(&mut batch)?;
+        }
+        answers.finish()
+    }
+
+    fn conclude(&self, answers: &Spool<Answer>) -> InputResult<Spool<f64>> {
+        let mut distances = SpoolWriter::new(self.space);
+        for block in &self.blocks {
+            let mut dist2 = self.own.range(block.clone())?;
+            answers.for_each(|a| {
+                if block.contains(&(a.at as usize)) {
+                    let of_point = &mut dist2[a.at as usize - block.start];
+                    *of_point = merged(*of_point, a.dist2);
+                }
+                Ok(())
+            })?;
+            dist2.iter().try_for_each(|d| distances.push(rms_distance(d)))?;
+        }
+        distances.finish()
+    }
+}

@@ -1,0 +1,94 @@
+//! Median splits of records that do not fit in memory: the halves are written to lists of their own until they do.
+//!
+//! Invariant: the pages are those of [`Pages::divide`], whatever fits in memory.
+
+use super::spool::{Spool, SpoolSpace, SpoolWriter};
+use crate::base::error::InputResult;
+use crate::scene::partition::{Pages, Placed, PointBox, axis_key};
+use crate::scene::select::RankSearch;
+use bytemuck::Pod;
+use std::ops::Range;
+
+/// Division of one list.
+pub struct Division<'a> {
+    /// Where halves go that outgrow memory.
+    pub space: SpoolSpace<'a>,
+    /// Pages to divide into.
+    pub pages: Pages,
+    /// Records that may be in memory to be divided there; one page always may.
+    pub records_in_memory: usize,
+}
+
+/// Takes the records of some consecutive pages, sorted as [`Pages::divide`] sorts them.
+pub type TakePages<'a, E> = dyn FnMut(Range<usize>, Vec<E>) -> InputResult<()> + 'a;
+
+impl Division<'_> {
+    /// Divides `records` and hands the pages out in order, as many at a time as fit in memory.
+    ///
+    /// # Errors
+    /// A file cannot be written or read, or `take` failed.
+    pub fn run<E: Placed + Pod>(&self, records: Spool<E>, take: &mut TakePages<'_, E>) -> InputResult<()> {
+        assert_eq!(records.len(), self.pages.rows);
+        if self.pages.pages == 0 {
+            return Ok(());
+        }
+        let mut all = PointBox::EMPTY;
+        if records.len() > self.records_in_memory {
+            records.for_each(|e| {
+                all.add(e.point());
+                Ok(())
+            })?;
+        }
+        self.run_range(records, all, 0..self.pages.pages, take)
+    }
+
+    fn run_range<E: Placed + Pod>(
+        &self,
+        records: Spool<E>,
+        all: PointBox,
+        range: Range<usize>,
+        take: &mut TakePages<'_, E>,
+    ) -> InputResult<()> {
+        if range.len() == 1 || records.len() <= self.records_in_memory {
+            let mut entries = records.into_vec()?;
+            self.pages.divide_range(&mut entries, range.clone());
+            return take(range, entries);
+        }
+        let middle = Pages::middle(&range);
+        let (low, high) =
+            self.cut(records, all.longest_axis(), self.pages.start(middle) - self.pages.start(range.start))?;
+        self.run_range(low.0, low.1, range.start..middle, take)?;
+        self.run_range(high.0, high.1, middle..range.end, take)
+    }
+
+    /// The `count` lowest records along an axis, and the others, each with its box.
+    #[allow(clippy::type_complexity)] // two lists with their boxes
+    fn cut<E: Placed + Pod>(
+        &self,
+        records: Spool<E>,
+        axis: usize,
+        count: usize,
+    ) -> InputResult<((Spool<E>, PointBox), (Spool<E>, PointBox))> {
+        let mut search = RankSearch::new(count as u64, records.len() as u64);
+        while !search.is_done() {
+            records.for_each(|e| {
+                search.count(axis_key(e, axis));
+                Ok(())
+            })?;
+            search.next_pass();
+        }
+        let first_high = search.key().unwrap_or(u64::MAX);
+        let (mut low, mut high) = (SpoolWriter::new(self.space), SpoolWriter::new(self.space));
+        let (mut low_box, mut high_box) = (PointBox::EMPTY, PointBox::EMPTY);
+        records.for_each(|e| {
+            if axis_key(e, axis) < first_high {
+                low_box.add(e.point());
+                low.push(*e)
+            } else {
+                high_box.add(e.point());
+                high.push(*e)
+            }
+        })?;
+        Ok(((low.finish()?, low_box), (high.finish()?, high_box)))
+    }
+}

@@ -1,0 +1,145 @@
+//! Writes scenes in Mega-NeRF's layout, as [`super::read_mega_nerf`] reads them: for trying a run of Mill-19 on a generated
+//! city before 20 GB are fetched.
+//!
+//! Files are what `torch.save` of a dictionary gives: a stored zip archive, protocol 2, little-endian tensors.
+
+use crate::base::error::{InputError, InputResult};
+use crate::dataset::model::{RawScene, RawView, Split};
+use glam::DMat3;
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+use zip::CompressionMethod;
+use zip::write::{SimpleFileOptions, ZipWriter};
+
+/// A value of a dictionary.
+pub(super) enum Entry {
+    Int(i32),
+    Float(f64),
+    /// Row-major numbers with their shape, stored as f32.
+    Floats(Vec<f32>, Vec<u8>),
+    /// The same as f64.
+    Doubles(Vec<f64>),
+}
+
+/// Writes the views of `scene` to `folder`, every `test_every`th into `val`; photos are moved there from where they are.
+///
+/// # Errors
+/// The folder cannot be written.
+pub fn write_mega_nerf(folder: &Path, scene: &RawScene, test_every: usize) -> InputResult<()> {
+    let centres: Vec<_> = scene.views.iter().map(|view| view.pose.centre()).collect();
+    let (mut low, mut high) = (centres[0], centres[0]);
+    for c in &centres {
+        (low, high) = (low.min(*c), high.max(*c));
+    }
+    // The generated world is right-handed with z up: down, right, back are -z, x, -y.
+    let drb_from_world = DMat3::from_cols_array(&[0., 1., 0., 0., 0., -1., -1., 0., 0.]);
+    let origin = drb_from_world * ((low + high) * 0.5);
+    let scale = (high - low).length().max(1.0) * 0.5;
+    write_torch(
+        &folder.join("coordinates.pt"),
+        &[("origin_drb", Entry::Doubles(origin.to_array().to_vec())), ("pose_scale_factor", Entry::Float(scale))],
+    )?;
+    for (i, view) in scene.views.iter().enumerate() {
+        let split = if i.is_multiple_of(test_every) { Split::Test } else { Split::Train };
+        let part = folder.join(if split == Split::Test { "val" } else { "train" });
+        let stem = format!("{i:06}");
+        for sub in ["metadata", "rgbs"] {
+            let sub = part.join(sub);
+            std::fs::create_dir_all(&sub).map_err(|e| InputError::io(&sub, "making the folder", &e))?;
+        }
+        write_metadata(&part.join("metadata").join(format!("{stem}.pt")), view, drb_from_world, origin, scale)?;
+        let extension = view.image_path.extension().and_then(|e| e.to_str()).unwrap_or("jpg");
+        let photo = part.join("rgbs").join(format!("{stem}.{extension}"));
+        std::fs::rename(&view.image_path, &photo).map_err(|e| InputError::io(&photo, "moving the photo", &e))?;
+    }
+    Ok(())
+}
+
+fn write_metadata(path: &Path, view: &RawView, drb: DMat3, origin: glam::DVec3, scale: f64) -> InputResult<()> {
+    let rotation = drb * view.pose.rotation.transpose();
+    let centre = (drb * view.pose.centre() - origin) / scale;
+    let mut c2w = Vec::with_capacity(12);
+    for row in 0..3 {
+        // The camera's axes right-up-back out of right-down-forward.
+        let r = rotation.row(row);
+        c2w.extend([r.x as f32, -r.y as f32, -r.z as f32, centre[row] as f32]);
+    }
+    let k = view.intrinsics;
+    let intrinsics = [k.fx, k.fy, k.cx, k.cy].map(|x| x as f32).to_vec();
+    write_torch(
+        path,
+        &[
+            ("W", Entry::Int(k.width as i32)),
+            ("H", Entry::Int(k.height as i32)),
+            ("intrinsics", Entry::Floats(intrinsics, vec![4])),
+            ("c2w", Entry::Floats(c2w, vec![3, 4])),
+        ],
+    )
+}
+
+/// Writes a dictionary as torch.save does.
+pub(super) fn write_torch(path: &Path, entries: &[(&str, Entry)]) -> InputResult<()> {
+    let io = |e: std::io::Error| InputError::io(path, "writing", &e);
+    let zipped = |e: zip::result::ZipError| io(std::io::Error::other(e));
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    let mut zip = ZipWriter::new(BufWriter::new(File::create(path).map_err(io)?));
+    let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
+    let mut pickle = b"\x80\x02}(".to_vec();
+    let mut data = Vec::new();
+    for (key, entry) in entries {
+        text(&mut pickle, key);
+        match entry {
+            Entry::Int(n) => {
+                pickle.push(b'J');
+                pickle.extend_from_slice(&n.to_le_bytes());
+            }
+            Entry::Float(x) => {
+                pickle.push(b'G');
+                pickle.extend_from_slice(&x.to_be_bytes());
+            }
+            Entry::Floats(values, shape) => {
+                tensor(&mut pickle, "FloatStorage", data.len(), values.len(), shape);
+                data.push(values.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>());
+            }
+            Entry::Doubles(values) => {
+                tensor(&mut pickle, "DoubleStorage", data.len(), values.len(), &[values.len() as u8]);
+                data.push(values.iter().flat_map(|x| x.to_le_bytes()).collect());
+            }
+        }
+    }
+    pickle.extend_from_slice(b"u.");
+    let mut add = |name: String, bytes: &[u8]| {
+        zip.start_file(format!("{stem}/{name}"), stored).map_err(zipped)?;
+        zip.write_all(bytes).map_err(io)
+    };
+    add("data.pkl".into(), &pickle)?;
+    for (i, bytes) in data.iter().enumerate() {
+        add(format!("data/{i}"), bytes)?;
+    }
+    add("version".into(), b"3\n")?;
+    zip.finish().map_err(zipped)?.into_inner().map_err(|e| io(e.into_error()))?;
+    Ok(())
+}
+
+fn text(pickle: &mut Vec<u8>, value: &str) {
+    pickle.push(b'X');
+    pickle.extend_from_slice(&(value.len() as u32).to_le_bytes());
+    pickle.extend_from_slice(value.as_bytes());
+}
+
+/// A call of the function that rebuilds a contiguous tensor.
+fn tensor(pickle: &mut Vec<u8>, storage: &str, key: usize, count: usize, shape: &[u8]) {
+    pickle.extend_from_slice(b"ctorch._utils\n_rebuild_tensor_v2\n((");
+    text(pickle, "storage");
+    pickle.extend_from_slice(format!("ctorch\n{storage}\n").as_bytes());
+    text(pickle, &key.to_string());
+    text(pickle, "cpu");
+    pickle.extend_from_slice(&[b'K', count as u8, b't', b'Q', b'K', 0, b'(']);
+    shape.iter().for_each(|&n| pickle.extend_from_slice(&[b'K', n]));
+    pickle.extend_from_slice(b"t(");
+    for axis in 0..shape.len() {
+        pickle.extend_from_slice(&[b'K', shape[axis + 1..].iter().product()]);
+    }
+    pickle.extend_from_slice(b"t\x89ccollections\nOrderedDict\n)RtR");
+}

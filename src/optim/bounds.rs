@@ -1,0 +1,277 @@
+//! Where the rows of a page can be, from now until somebody touches the page again.
+//!
+//! An untouched value moves by its momentum, without turning back, towards a limit ([`super::drift`]): value and
+//! limit bound it for ever. Opacity resets may rewrite a row on the way, which changes roundings only; rounds may
+//! split it, once at most, because they clear the statistics by which it grew. Its children then lie around it. They
+//! are put into the box itself, rather than counted as a larger sigma (1.63 times: 3.33 + 3.33 / 1.6 of 3.33): a row
+//! must not be missed whose parent lies before the near plane, and the room is that of the row, not of the page's
+//! largest.
+//!
+//! Invariants: 1. bounds are a function of the stored rows and the run's configuration alone, not of the step at
+//! which they are asked for; 2. they hold for every later step, whatever events are pending, in the f32 arithmetic of
+//! the evaluation; 3. the same bits on every instruction path.
+
+use super::deferred::DeferredAdam;
+use super::lanes::{Coordinates, LANES, LaneDrifts, by_coordinate, drifted_lanes, drifted_opacities, tables_of};
+use super::moments::Moments;
+use crate::base::math::exp32;
+use crate::base::simd::{Kernel, dispatch};
+use crate::scene::columns::Column;
+use crate::scene::events::SPLIT_SIGMAS;
+use crate::scene::page_meta::PageBounds;
+use crate::scene::rows::{Rows, mean_grad2d};
+
+/// Slack per movement. Rewriting a row on the way rounds its moments (1e-7 each), may change between series and direct
+/// sum (1e-6 apart), and may flush a second moment of 1e-38 to zero, which eps = 1e-15 hides but for 1e-4.
+const MOVEMENT_SLACK: f32 = 1e-3;
+/// The same where rewriting rounds moments to 16 bits: by up to 0.8 % each, the second one under a root.
+const MOVEMENT_SLACK_BF16: f32 = 2e-2;
+/// Slack per value: four roundings on the way there, one for the child of a split, three for this file's own.
+const VALUE_SLACK: f32 = 8.0 * 0.5 * f32::EPSILON;
+/// Slack of a value that is flushed to zero.
+const FLUSH_SLACK: f32 = 2.0 * f32::MIN_POSITIVE;
+/// Slack per standard deviation: [`exp32`] is within two ulp, here and where it is compared.
+const SIGMA_SLACK: f32 = 1e-6;
+/// Reach of a split, in standard deviations of the parent. The slack is for the roundings of its rotation and scales.
+const SPLIT_REACH: f32 = SPLIT_SIGMAS as f32 * (1.0 + 1e-4);
+
+/// When rows may split: the lowest thresholds that a round of the run can have.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SplitLimits {
+    /// Rows whose mean gradient norm is not greater do not grow.
+    pub grow_grad2d: f32,
+    /// Growing rows whose largest standard deviation is not greater do not split.
+    pub split_scale: f32,
+}
+
+impl SplitLimits {
+    /// Of a run without rounds.
+    pub const NEVER: SplitLimits = SplitLimits { grow_grad2d: f32::INFINITY, split_scale: f32::INFINITY };
+}
+
+impl DeferredAdam {
+    /// Bounds of the rows of a page that has just been rewritten.
+    pub fn page_bounds(&self, rows: &Rows<'_>, splits: &SplitLimits) -> PageBounds {
+        dispatch(self.simd(), BoundRows { adam: self, rows, splits })
+    }
+
+    /// A lower bound of the opacities (logit) of rows that nobody touches; infinity without rows. Opacity resets are not
+    /// in it.
+    pub fn lowest_opacity(&self, rows: &Rows<'_>) -> f32 {
+        dispatch(self.simd(), LowestOpacity { adam: self, rows })
+    }
+}
+
+struct LowestOpacity<'k> {
+    adam: &'k DeferredAdam,
+    rows: &'k Rows<'k>,
+}
+
+impl Kernel for LowestOpacity<'_> {
+    type Out = f32;
+    #[inline(always)]
+    fn run<const FMA: bool>(self) -> f32 {
+        let LowestOpacity { adam, rows } = self;
+        let values = rows.columns.opacities;
+        let slack = movement_slack(adam);
+        let of_row = |row: usize| {
+            let (m, v) = (rows.exp_avg.opacities[row], rows.exp_avg_sq.opacities[row]);
+            hull(values[row], adam.limit(Column::Opacities, values[row], m, v, rows.stamp[row]), slack)[0]
+        };
+        let mut lowest = [f32::INFINITY; LANES];
+        let whole = rows.rows() / LANES * LANES;
+        for first in (0..whole).step_by(LANES) {
+            let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| adam.limit_drift(stamp));
+            let (limits, direct) = drifted_opacities(adam, rows, first, &drifts);
+            if direct {
+                (0..LANES).for_each(|l| lowest[l] = lowest[l].min(of_row(first + l)));
+                continue;
+            }
+            let values = &values[first..first + LANES];
+            for l in 0..LANES {
+                lowest[l] = lowest[l].min(hull(values[l], limits[l], slack)[0]);
+            }
+        }
+        (whole..rows.rows()).for_each(|row| lowest[0] = lowest[0].min(of_row(row)));
+        lowest.into_iter().fold(f32::INFINITY, f32::min)
+    }
+}
+
+struct BoundRows<'k> {
+    adam: &'k DeferredAdam,
+    rows: &'k Rows<'k>,
+    splits: &'k SplitLimits,
+}
+
+impl Kernel for BoundRows<'_> {
+    type Out = PageBounds;
+    #[inline(always)]
+    fn run<const FMA: bool>(self) -> PageBounds {
+        let BoundRows { adam, rows, splits } = self;
+        let mut lanes = LaneBounds::EMPTY;
+        let mut bounds = PageBounds::EMPTY;
+        let whole = rows.rows() / LANES * LANES;
+        for first in (0..whole).step_by(LANES) {
+            if !lanes.add(adam, rows, splits, first) {
+                (first..first + LANES).for_each(|row| add_row(&mut bounds, adam, rows, splits, row));
+            }
+        }
+        (whole..rows.rows()).for_each(|row| add_row(&mut bounds, adam, rows, splits, row));
+        lanes.fold(bounds)
+    }
+}
+
+/// Bounds of the rows in each lane.
+struct LaneBounds {
+    lo: Coordinates,
+    hi: Coordinates,
+    sigma_max: [f32; LANES],
+}
+
+impl LaneBounds {
+    const EMPTY: LaneBounds =
+        LaneBounds { lo: [[f32::INFINITY; LANES]; 3], hi: [[f32::NEG_INFINITY; LANES]; 3], sigma_max: [0.0; LANES] };
+
+    /// Adds [`LANES`] rows from `first` on; or none, and says so, when one of them needs the direct sum.
+    #[inline(always)]
+    fn add(&mut self, adam: &DeferredAdam, rows: &Rows<'_>, splits: &SplitLimits, first: usize) -> bool {
+        let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| adam.limit_drift(stamp));
+        let (means, scales) = (tables_of(rows, Column::Means), tables_of(rows, Column::Scales));
+        let (mean_limits, a) = drifted_lanes(adam, Column::Means, means, first, &drifts);
+        let (scale_limits, b) = drifted_lanes(adam, Column::Scales, scales, first, &drifts);
+        if a | b {
+            return false;
+        }
+        let (from, to) = (first * 3, (first + LANES) * 3);
+        let (means, scales) = (by_coordinate(&means[0][from..to]), by_coordinate(&scales[0][from..to]));
+        let (grad2d, count) = (&rows.grad2d[first..first + LANES], &rows.count[first..first + LANES]);
+        let slack = movement_slack(adam);
+        let mut reach = [0.0; LANES];
+        for l in 0..LANES {
+            let mut log_scale = f32::NEG_INFINITY;
+            for c in 0..3 {
+                log_scale = log_scale.max(hull(scales[c][l], scale_limits[c][l], slack)[1]);
+            }
+            let sigma = sigma(log_scale);
+            reach[l] = split_reach(splits, grad2d[l], count[l], sigma);
+            self.sigma_max[l] = self.sigma_max[l].max(sigma);
+        }
+        for c in 0..3 {
+            for l in 0..LANES {
+                let [lo, hi] = hull(means[c][l], mean_limits[c][l], slack);
+                self.lo[c][l] = self.lo[c][l].min(outwards(lo, -reach[l]));
+                self.hi[c][l] = self.hi[c][l].max(outwards(hi, reach[l]));
+            }
+        }
+        true
+    }
+
+    /// All lanes and what is in `bounds`.
+    #[inline(always)]
+    fn fold(&self, mut bounds: PageBounds) -> PageBounds {
+        for l in 0..LANES {
+            for c in 0..3 {
+                bounds.lo[c] = bounds.lo[c].min(self.lo[c][l]);
+                bounds.hi[c] = bounds.hi[c].max(self.hi[c][l]);
+            }
+            bounds.sigma_max = bounds.sigma_max.max(self.sigma_max[l]);
+        }
+        bounds
+    }
+}
+
+/// Adds one row, by the exact evaluation.
+fn add_row(bounds: &mut PageBounds, adam: &DeferredAdam, rows: &Rows<'_>, splits: &SplitLimits, row: usize) {
+    let hull_of = |column: Column, c: usize| {
+        let [value, m, v] = tables_of(rows, column).map(|table| table[row * 3 + c]);
+        hull(value, adam.limit(column, value, m, v, rows.stamp[row]), movement_slack(adam))
+    };
+    let log_scale = (0..3).map(|c| hull_of(Column::Scales, c)[1]).fold(f32::NEG_INFINITY, f32::max);
+    let sigma = sigma(log_scale);
+    let reach = split_reach(splits, rows.grad2d[row], rows.count[row], sigma);
+    for c in 0..3 {
+        let [lo, hi] = hull_of(Column::Means, c);
+        bounds.lo[c] = bounds.lo[c].min(outwards(lo, -reach));
+        bounds.hi[c] = bounds.hi[c].max(outwards(hi, reach));
+    }
+    bounds.sigma_max = bounds.sigma_max.max(sigma);
+}
+
+#[inline(always)]
+fn movement_slack(adam: &DeferredAdam) -> f32 {
+    if adam.moments() == Moments::Bf16 { MOVEMENT_SLACK_BF16 } else { MOVEMENT_SLACK }
+}
+
+/// The range that a value passes through on its way to its limit, in the arithmetic of the evaluation.
+#[inline(always)]
+fn hull(value: f32, limit: f32, movement_slack: f32) -> [f32; 2] {
+    let (lo, hi) = (value.min(limit), value.max(limit));
+    let slack = movement_slack * (hi - lo) + VALUE_SLACK * lo.abs().max(hi.abs()) + FLUSH_SLACK;
+    [lo - slack, hi + slack]
+}
+
+/// A bound moved by `reach`, and by the rounding of that.
+#[inline(always)]
+fn outwards(bound: f32, reach: f32) -> f32 {
+    let moved = bound + reach;
+    // Only rows that split are moved; the others have been rounded outwards already.
+    let slack = if reach == 0.0 { 0.0 } else { f32::EPSILON * moved.abs() };
+    if reach < 0.0 { moved - slack } else { moved + slack }
+}
+
+#[inline(always)]
+fn sigma(log_scale: f32) -> f32 {
+    exp32(log_scale) * (1.0 + SIGMA_SLACK)
+}
+
+/// How far the children of a row may lie from it.
+#[inline(always)]
+fn split_reach(splits: &SplitLimits, grad2d: f32, count: u32, sigma: f32) -> f32 {
+    let splits = (mean_grad2d(grad2d, count) > splits.grow_grad2d) & (sigma > splits.split_scale);
+    if splits { SPLIT_REACH * sigma } else { 0.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::rng::{Purpose, Stream};
+    use crate::base::simd::SimdPath;
+    use crate::optim::adam::AdamConfig;
+    use crate::optim::rates::Rates;
+    use crate::scene::columns::Columns;
+    use crate::scene::state::SceneState;
+
+    #[test]
+    fn bounds_are_the_hull_of_rows_on_every_instruction_path() {
+        let rows = 16 * 7 + 5;
+        let mut state = SceneState::from_columns(Columns::zeros(rows, 0));
+        let mut draws = Stream::new(2, Purpose::Test, 0, 0);
+        for row in 0..rows {
+            for c in row * 3..row * 3 + 3 {
+                (state.columns.means[c], state.columns.scales[c]) =
+                    (draws.normal() as f32, draws.normal() as f32 - 5.0);
+                for (m, v) in [
+                    (&mut state.exp_avg.means, &mut state.exp_avg_sq.means),
+                    (&mut state.exp_avg.scales, &mut state.exp_avg_sq.scales),
+                ] {
+                    // Some second moments so small that eps shows, some of both zero.
+                    let size = libm::pow(10.0, -draws.range(0.0, if row % 16 == 3 { 18.0 } else { 9.0 }));
+                    (m[c], v[c]) = ((draws.normal() * size) as f32, (size * size) as f32);
+                }
+            }
+            state.stamp[row] = draws.below(600) as u32;
+            (state.grad2d[row], state.count[row]) = (draws.uniform() as f32, draws.below(3) as u32);
+        }
+        let splits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01 };
+        let of = |simd: SimdPath, rows: &Rows<'_>| {
+            DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), simd).page_bounds(rows, &splits)
+        };
+        let adam = DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), SimdPath::Baseline);
+        let mut want = PageBounds::EMPTY;
+        (0..rows).for_each(|row| add_row(&mut want, &adam, &state.view(), &splits, row));
+        for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+            assert_eq!(of(simd, &state.view()), want, "{}", simd.name());
+        }
+        assert!(of(SimdPath::best(), &SceneState::empty(0).view()).is_empty());
+    }
+}

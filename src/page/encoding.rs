@@ -1,0 +1,102 @@
+//! Small structs as bytes, for the index and the state of a run on the drive. The only file that knows which library
+//! does it.
+//!
+//! Invariants: 1. numbers are little-endian and of fixed length, so that equal values have equal bytes in every
+//! version of the program; 2. bytes that nobody vouches for take no more memory than their own length asks for, and a
+//! value must use up all of them. Types with lists of things without bytes (`Vec<()>`) do not belong here: their
+//! length would be believed.
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+/// Bytes that are not a value of the type, or a value that has no bytes.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("not what should be here: {0}")]
+pub struct EncodingError(String);
+
+/// Longest value, bytes.
+pub const VALUE_BYTES_MAX: usize = 256 << 20;
+
+/// A value as bytes.
+///
+/// # Errors
+/// The type holds something that cannot be written, such as a list of unknown length.
+pub fn to_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, EncodingError> {
+    bincode::serde::encode_to_vec(value, bincode::config::legacy()).map_err(|e| EncodingError(e.to_string()))
+}
+
+/// The value that [`to_bytes`] made these bytes of.
+///
+/// # Errors
+/// The bytes are not exactly one value of the type.
+pub fn from_bytes<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EncodingError> {
+    // A length inside the bytes is believed up to the limit, and the limit must be known to the compiler: so the
+    // smallest of these that holds the bytes.
+    match bytes.len() {
+        0..=0x100 => from_limited::<T, 0x100>(bytes),
+        0x101..=0x1000 => from_limited::<T, 0x1000>(bytes),
+        0x1001..=0x1_0000 => from_limited::<T, 0x1_0000>(bytes),
+        0x1_0001..=0x10_0000 => from_limited::<T, 0x10_0000>(bytes),
+        0x10_0001..=0x100_0000 => from_limited::<T, 0x100_0000>(bytes),
+        _ => from_limited::<T, VALUE_BYTES_MAX>(bytes),
+    }
+}
+
+fn from_limited<T: DeserializeOwned, const LIMIT: usize>(bytes: &[u8]) -> Result<T, EncodingError> {
+    let config = bincode::config::legacy().with_limit::<LIMIT>();
+    let (value, used) = bincode::serde::decode_from_slice(bytes, config).map_err(|e| EncodingError(e.to_string()))?;
+    if used < bytes.len() {
+        return Err(EncodingError(format!("{} bytes are left over", bytes.len() - used)));
+    }
+    Ok(value)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::base::rng::mix64;
+
+    #[derive(Debug, PartialEq, Serialize, serde::Deserialize)]
+    struct Sample {
+        step: u32,
+        scales: Vec<f32>,
+        name: String,
+        last: Option<u64>,
+    }
+
+    fn sample() -> Sample {
+        Sample { step: 7, scales: vec![1.5, -0.0], name: "crème".to_string(), last: Some(u64::MAX) }
+    }
+
+    #[test]
+    fn values_come_back_and_their_bytes_do_not_move() {
+        let bytes = to_bytes(&sample()).unwrap();
+        assert_eq!(from_bytes::<Sample>(&bytes).unwrap(), sample());
+        // Fixed lengths: 4, then 8 + 2 x 4, then 8 + 6, then 1 + 8.
+        assert_eq!(bytes.len(), 4 + 16 + 14 + 9);
+        assert_eq!(bytes[..12], [7, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0]);
+    }
+
+    #[test]
+    fn hostile_bytes_end_in_an_error() {
+        let bytes = to_bytes(&sample()).unwrap();
+        assert!((0..bytes.len()).all(|cut| from_bytes::<Sample>(&bytes[..cut]).is_err()));
+        let longer = [bytes.as_slice(), &[0]].concat();
+        assert!(from_bytes::<Sample>(&longer).unwrap_err().to_string().contains("1 bytes are left over"));
+        // Lengths of lists and strings beyond all bytes.
+        for at in [4, 20] {
+            let mut huge = bytes.clone();
+            huge[at..at + 8].fill(0x7f);
+            assert!(from_bytes::<Sample>(&huge).is_err());
+        }
+        for seed in 0..5000 {
+            let mut random = bytes.clone();
+            for i in 0..4 {
+                let at = mix64(seed * 4 + i) as usize % random.len();
+                random[at] = mix64(seed * 4 + i + (1 << 40)) as u8;
+            }
+            let _ = from_bytes::<Sample>(&random);
+        }
+    }
+}

@@ -1,0 +1,127 @@
+//! What kind of file system a folder lies on and how much space it has left.
+//!
+//! The kinds are told apart by the number that Linux gives each file system; elsewhere every one counts as a local
+//! drive.
+
+use std::io;
+use std::path::Path;
+
+/// Kinds that matter to pages on a drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FileSystem {
+    /// A drive of this machine, as far as can be told.
+    Local,
+    /// Files are memory.
+    Memory,
+    /// Layers over another one, as in containers: slower, and often small.
+    Overlay,
+    /// Another machine or program stands behind it: locks and syncs may not mean what they say.
+    Remote(&'static str),
+}
+
+const KINDS: &[(u32, FileSystem)] = &[
+    (0x0102_1994, FileSystem::Memory), // tmpfs
+    (0x8584_58f6, FileSystem::Memory), // ramfs
+    (0x794c_7630, FileSystem::Overlay),
+    (0x0000_6969, FileSystem::Remote("NFS")),
+    (0x0000_517b, FileSystem::Remote("SMB")),
+    (0xff53_4d42, FileSystem::Remote("CIFS")),
+    (0xfe53_4d42, FileSystem::Remote("SMB2")),
+    (0x0102_1997, FileSystem::Remote("9p")),
+    (0x6573_5546, FileSystem::Remote("FUSE")),
+    (0x00c3_6400, FileSystem::Remote("Ceph")),
+    (0x5346_414f, FileSystem::Remote("AFS")),
+    (0x6b41_4653, FileSystem::Remote("AFS")),
+    (0x7375_7245, FileSystem::Remote("Coda")),
+    (0x0bd0_0bd0, FileSystem::Remote("Lustre")),
+    (0x4750_4653, FileSystem::Remote("GPFS")),
+    (0x1983_0326, FileSystem::Remote("BeeGFS")),
+    (0x0116_1970, FileSystem::Remote("GFS2")),
+    (0x7461_636f, FileSystem::Remote("OCFS2")),
+    (0x786f_4256, FileSystem::Remote("a shared folder of VirtualBox")),
+    (0xbacb_acbc, FileSystem::Remote("a shared folder of VMware")),
+    (0x5346_4846, FileSystem::Remote("a Windows drive seen from WSL")),
+];
+
+impl FileSystem {
+    /// By the number that `statfs` gives on Linux.
+    pub fn from_magic(magic: u32) -> FileSystem {
+        KINDS.iter().find(|(number, _)| *number == magic).map_or(FileSystem::Local, |(_, kind)| *kind)
+    }
+
+    /// Of a folder.
+    ///
+    /// # Errors
+    /// The folder cannot be asked.
+    #[cfg(target_os = "linux")]
+    pub fn of(folder: &Path) -> io::Result<FileSystem> {
+        // The number has 32 bits; the field is wider and signed on some machines.
+        Ok(FileSystem::from_magic(rustix::fs::statfs(folder)?.f_type as u32))
+    }
+
+    /// Of a folder.
+    ///
+    /// # Errors
+    /// None here.
+    #[cfg(not(target_os = "linux"))]
+    pub fn of(_folder: &Path) -> io::Result<FileSystem> {
+        Ok(FileSystem::Local)
+    }
+}
+
+/// Bytes that this user may still write to the drive of `folder`; `None` where the system does not tell.
+///
+/// # Errors
+/// The folder cannot be asked.
+pub fn free_bytes(folder: &Path) -> io::Result<Option<u64>> {
+    #[cfg(unix)]
+    {
+        let there = rustix::fs::statvfs(folder)?;
+        Ok(Some(there.f_bavail.saturating_mul(there.f_frsize)))
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = folder;
+        Ok(None)
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    #[test]
+    fn kinds_are_told_by_their_number() {
+        let numbers = [
+            (0xef53, FileSystem::Local),      // ext4
+            (0x5846_5342, FileSystem::Local), // XFS
+            (0x9123_683e, FileSystem::Local), // Btrfs
+            (0x2fc1_2fc1, FileSystem::Local), // ZFS
+            (0x0102_1994, FileSystem::Memory),
+            (0x794c_7630, FileSystem::Overlay),
+            (0x6969, FileSystem::Remote("NFS")),
+            (0xff53_4d42, FileSystem::Remote("CIFS")),
+            (0x0102_1997, FileSystem::Remote("9p")),
+            (0x6573_5546, FileSystem::Remote("FUSE")),
+        ];
+        for (magic, kind) in numbers {
+            assert_eq!(FileSystem::from_magic(magic), kind, "{magic:#x}");
+        }
+        let mut all: Vec<u32> = KINDS.iter().map(|(number, _)| *number).collect();
+        all.sort_unstable();
+        all.dedup();
+        assert_eq!(all.len(), KINDS.len(), "a number stands twice");
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn memory_is_told_from_drives() {
+        assert!(FileSystem::of(Path::new("/nowhere")).is_err());
+        assert!(free_bytes(&std::env::temp_dir()).unwrap().is_some_and(|bytes| bytes > 0));
+        let memory = Path::new("/dev/shm");
+        if memory.is_dir() && std::fs::read_to_string("/proc/mounts").unwrap().contains(" /dev/shm tmpfs ") {
+            assert_eq!(FileSystem::of(memory).unwrap(), FileSystem::Memory);
+        }
+    }
+}

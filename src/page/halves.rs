@@ -1,0 +1,136 @@
+//! Bytes of which many 32-bit words have an empty lower half: those lines are stored as their upper halves alone.
+//!
+//! For numbers that were rounded to 16 bits and are worked on as 32-bit ones. Says nothing about what they are. One
+//! pass each way, and cheaper than any general codec; what does not fit the pattern stays as it is.
+//!
+//! Stored: one bit per line of 64 bytes (1: halved), padded to a line; then the lines in order, 32 or 64 bytes each;
+//! then what was left of an incomplete last line.
+//!
+//! Invariants: 1. decoding gives back every byte; 2. no stored bytes make decoding panic or write beyond its output.
+
+/// Bytes that are halved together, or not.
+const LINE: usize = 64;
+
+/// Stored bytes that cannot be decoded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("halved bytes: {stored} are stored, {expected} were expected")]
+pub struct HalvesError {
+    /// Bytes given.
+    pub stored: usize,
+    /// Bytes that their table of lines asks for (or the table itself, when that is cut short).
+    pub expected: usize,
+}
+
+fn table_bytes(payload: usize) -> usize {
+    (payload / LINE).div_ceil(8).next_multiple_of(LINE)
+}
+
+/// Longest encoding of so many bytes.
+pub fn encoded_bytes_max(payload: usize) -> usize {
+    table_bytes(payload) + payload
+}
+
+/// Encodes `payload` into the front of `out`, which has [`encoded_bytes_max`] bytes at least; returns the length.
+pub fn encode(payload: &[u8], out: &mut [u8]) -> usize {
+    let (table, data) = out.split_at_mut(table_bytes(payload.len()));
+    table.fill(0);
+    let lines = payload.chunks_exact(LINE);
+    let rest = lines.remainder();
+    let mut at = 0;
+    for (i, line) in lines.enumerate() {
+        if is_halvable(line) {
+            table[i / 8] |= 1 << (i % 8);
+            for (half, word) in data[at..at + LINE / 2].chunks_exact_mut(2).zip(line.chunks_exact(4)) {
+                half.copy_from_slice(&word[2..]);
+            }
+            at += LINE / 2;
+        } else {
+            data[at..at + LINE].copy_from_slice(line);
+            at += LINE;
+        }
+    }
+    data[at..at + rest.len()].copy_from_slice(rest);
+    table.len() + at + rest.len()
+}
+
+fn is_halvable(line: &[u8]) -> bool {
+    let lower = line.chunks_exact(4).fold(0, |any, word| any | word[0] | word[1]);
+    lower == 0
+}
+
+/// Decodes into `payload`, whose length is that of what was encoded.
+///
+/// # Errors
+/// `stored` is not an encoding of so many bytes.
+pub fn decode(stored: &[u8], payload: &mut [u8]) -> Result<(), HalvesError> {
+    let table_len = table_bytes(payload.len());
+    let wrong = |expected| HalvesError { stored: stored.len(), expected };
+    if stored.len() < table_len {
+        return Err(wrong(table_len));
+    }
+    let (table, data) = stored.split_at(table_len);
+    let lines = payload.len() / LINE;
+    let halved = (0..lines).filter(|i| table[i / 8] >> (i % 8) & 1 == 1).count();
+    let expected = payload.len() - halved * LINE / 2;
+    if data.len() != expected {
+        return Err(wrong(table_len + expected));
+    }
+    let mut at = 0;
+    let mut lines = payload.chunks_exact_mut(LINE);
+    for (i, line) in lines.by_ref().enumerate() {
+        if table[i / 8] >> (i % 8) & 1 == 1 {
+            for (word, half) in line.chunks_exact_mut(4).zip(data[at..at + LINE / 2].chunks_exact(2)) {
+                word.copy_from_slice(&[0, 0, half[0], half[1]]);
+            }
+            at += LINE / 2;
+        } else {
+            line.copy_from_slice(&data[at..at + LINE]);
+            at += LINE;
+        }
+    }
+    lines.into_remainder().copy_from_slice(&data[at..]);
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::rng::{Purpose, Stream};
+
+    #[test]
+    fn every_byte_comes_back_and_halved_lines_take_half() {
+        for len in [0, 1, 63, 64, 65, 4096, 64 * 513 + 7, 700_000] {
+            for halved in [0u64, 1, 2, 3] {
+                let mut draws = Stream::new(1, Purpose::Test, len as u64, halved);
+                let mut payload: Vec<u8> = (0..len).map(|_| draws.next_u64() as u8).collect();
+                let mut pattern = 0;
+                for line in payload.chunks_exact_mut(LINE) {
+                    if draws.below(3) < halved {
+                        pattern += 1;
+                        line.chunks_exact_mut(4).for_each(|word| word[..2].fill(0));
+                    }
+                }
+                let mut out = vec![0xaa; encoded_bytes_max(len)];
+                let stored = encode(&payload, &mut out);
+                assert_eq!(stored, table_bytes(len) + len - pattern * LINE / 2);
+                let mut back = vec![0x55; len];
+                assert_eq!(decode(&out[..stored], &mut back), Ok(()));
+                assert!(back == payload);
+            }
+        }
+    }
+
+    #[test]
+    fn foreign_bytes_are_refused() {
+        let payload = vec![0u8; 640];
+        let mut out = vec![0; encoded_bytes_max(640)];
+        let stored = encode(&payload, &mut out);
+        let mut back = vec![0; 640];
+        for len in 0..stored {
+            assert!(decode(&out[..len], &mut back).is_err(), "{len}");
+        }
+        out[0] ^= 4;
+        assert!(decode(&out[..stored], &mut back).is_err());
+        assert!(decode(&out, &mut back).is_err());
+    }
+}

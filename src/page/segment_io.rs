@@ -1,0 +1,140 @@
+//! What the engines that work on files share: transfers checked against their segment, whole reads and writes at a
+//! place, and syncs whose failure is never forgotten.
+//!
+//! Invariants: 1. no byte outside of a segment is read or written, whatever a transfer asks for; 2. after a sync
+//! failed, every later one fails too: the system reports a lost write only once.
+
+use super::buffer::ALIGNMENT;
+use super::resume::Resume;
+use super::segment_files::SegmentFiles;
+use super::store::{Direction, Transfer};
+use std::fs::File;
+use std::io;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// A symbolic link where a segment should be, on Linux.
+const ELOOP: i32 = 40;
+
+/// The segments of a folder, for an engine.
+#[derive(Debug)]
+pub struct SegmentIo {
+    files: SegmentFiles,
+    /// The first sync that failed.
+    lost: Option<(io::ErrorKind, String)>,
+}
+
+impl SegmentIo {
+    /// The segments of `folder`; with `direct`, past the page cache where the file system allows it.
+    ///
+    /// # Errors
+    /// The folder cannot be used.
+    pub fn new(folder: &Path, direct: bool) -> io::Result<SegmentIo> {
+        Ok(SegmentIo { files: SegmentFiles::new(folder, direct)?, lost: None })
+    }
+
+    /// Whether bytes go past the page cache.
+    pub fn is_direct(&self) -> bool {
+        self.files.is_direct()
+    }
+
+    /// As [`super::store::PageStore::create_segment`].
+    ///
+    /// # Errors
+    /// No space, another size, or the folder cannot be written.
+    pub fn create(&mut self, segment: u32, bytes: u64) -> io::Result<()> {
+        self.files.create(segment, bytes)
+    }
+
+    /// The file that `transfer` goes to. A write counts as not yet durable from here on.
+    ///
+    /// # Errors
+    /// `NotFound` without such a segment, `UnexpectedEof` for a place beyond its end, `InvalidInput` for bytes that
+    /// are not whole blocks of the buffer.
+    pub fn file_of(&mut self, transfer: &Transfer) -> io::Result<Arc<File>> {
+        let (offset, bytes) = (transfer.place.offset, transfer.bytes);
+        let whole = offset.is_multiple_of(ALIGNMENT as u64) && bytes.is_multiple_of(ALIGNMENT);
+        if !whole || bytes > transfer.buffer.len() {
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, "a transfer moves whole blocks of its buffer"));
+        }
+        let opened = match transfer.direction {
+            Direction::Read => self.files.file(transfer.place.segment),
+            Direction::Write => self.files.file_for_write(transfer.place.segment),
+        };
+        // To open one file another may have to be synced and closed.
+        let file = opened.inspect_err(|e| self.note_if_lost(e))?;
+        if offset.checked_add(bytes as u64).is_none_or(|end| file.metadata().is_ok_and(|m| end > m.len())) {
+            let problem = "the place lies beyond the end of the segment";
+            return Err(io::Error::new(io::ErrorKind::UnexpectedEof, problem));
+        }
+        Ok(file)
+    }
+
+    /// Makes completed writes durable.
+    ///
+    /// # Errors
+    /// The drive lost a write, now or before an earlier sync.
+    pub fn sync(&mut self) -> io::Result<()> {
+        if let Some((kind, what)) = &self.lost {
+            return Err(io::Error::new(*kind, format!("an earlier sync failed: {what}")));
+        }
+        self.files.sync().inspect_err(|e| self.lost = Some((e.kind(), e.to_string())))
+    }
+
+    fn note_if_lost(&mut self, error: &io::Error) {
+        use io::ErrorKind as K;
+        // None of these comes from a sync; anything else may.
+        let harmless = matches!(error.kind(), K::NotFound | K::PermissionDenied) || error.raw_os_error() == Some(ELOOP);
+        if !harmless && !too_many_files(error) {
+            self.lost.get_or_insert((error.kind(), error.to_string()));
+        }
+    }
+}
+
+/// Whether opening failed for want of file descriptors: closing another file helps.
+pub fn too_many_files(error: &io::Error) -> bool {
+    cfg!(unix) && matches!(error.raw_os_error(), Some(23 | 24))
+}
+
+/// Carries out a whole transfer with calls that block.
+///
+/// # Errors
+/// Of the drive; `UnexpectedEof` where the file ends too early.
+pub fn move_bytes(file: &File, transfer: &mut Transfer) -> io::Result<()> {
+    let (direction, total, start) = (transfer.direction, transfer.bytes, transfer.place.offset);
+    let mut resume = Resume::default();
+    while resume.done < total {
+        let at = start + resume.done as u64;
+        let rest = resume.done..total;
+        let outcome = match direction {
+            Direction::Read => read_at(file, &mut transfer.buffer.as_mut_slice()[rest], at),
+            Direction::Write => write_at(file, &transfer.buffer.as_slice()[rest], at),
+        };
+        resume.advance(direction, outcome, total)?;
+        if resume.tries > 1 {
+            std::thread::sleep(Duration::from_micros(50 * u64::from(resume.tries)));
+        }
+    }
+    Ok(())
+}
+
+#[cfg(unix)]
+fn read_at(file: &File, bytes: &mut [u8], offset: u64) -> io::Result<usize> {
+    std::os::unix::fs::FileExt::read_at(file, bytes, offset)
+}
+
+#[cfg(unix)]
+fn write_at(file: &File, bytes: &[u8], offset: u64) -> io::Result<usize> {
+    std::os::unix::fs::FileExt::write_at(file, bytes, offset)
+}
+
+#[cfg(windows)]
+fn read_at(file: &File, bytes: &mut [u8], offset: u64) -> io::Result<usize> {
+    std::os::windows::fs::FileExt::seek_read(file, bytes, offset)
+}
+
+#[cfg(windows)]
+fn write_at(file: &File, bytes: &[u8], offset: u64) -> io::Result<usize> {
+    std::os::windows::fs::FileExt::seek_write(file, bytes, offset)
+}

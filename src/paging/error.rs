@@ -1,0 +1,47 @@
+//! What can go wrong between a view and its pages.
+//!
+//! Invariant: after an error no page is pinned by the call that failed, no buffer is lost, and every page that was in
+//! memory still is: a run can stop cleanly and write out what it holds.
+
+use crate::base::ids::PageId;
+use crate::base::units::format_bytes;
+use crate::page::page_error::PageError;
+
+/// Why pages could not be had.
+#[derive(Debug, thiserror::Error)]
+pub enum PagingError {
+    /// A working set is larger than the frames.
+    #[error(
+        "{what} needs {pages} pages in memory at once ({}), but there are {frames} frames ({})\n  remedy: a larger \
+         --host-mem or --frames (at least {pages}), or smaller --page-rows; a lower resolution does not help",
+        format_bytes(*pages as u64 * *frame_bytes as u64),
+        format_bytes(*frames as u64 * *frame_bytes as u64)
+    )]
+    WorkingSet {
+        /// Who asked: `the view of step 17`, `a list of pages`.
+        what: String,
+        /// Pages needed at once, at least.
+        pages: usize,
+        /// Frames that there are.
+        frames: usize,
+        /// Bytes of one frame.
+        frame_bytes: usize,
+    },
+    /// The store failed.
+    #[error("{doing} page {page} failed: {source}")]
+    Store {
+        /// The page.
+        page: PageId,
+        /// `reading` or `writing`.
+        doing: &'static str,
+        /// What the store said.
+        source: PageError,
+    },
+}
+
+impl PagingError {
+    /// Whether it is only space on the drive that is missing: the same call may work later.
+    pub fn is_out_of_space(&self) -> bool {
+        matches!(self, PagingError::Store { source, .. } if source.is_out_of_space())
+    }
+}

@@ -1,0 +1,204 @@
+//! Brings pages into memory that are needed now.
+//!
+//! Invariants: 1. waits only when nothing can be started; 2. a page that is needed is pinned as soon as it is in
+//! memory, so making room never takes it; 3. what was loaded ahead gives way like every other page, farthest next use
+//! first, so the fewest frames that hold the working set are enough; 4. after an error nothing is pinned.
+
+use super::error::PagingError;
+use super::pager::Pager;
+use super::pinned::PinnedPage;
+use super::transfers::{Failure, WRITES};
+use crate::base::ids::PageNo;
+use crate::cache::evict::NEVER;
+use crate::cache::frame::FrameState;
+use crate::page::buffer::PageBuffer;
+use std::collections::{BTreeMap, VecDeque};
+
+/// Pages on their way to a caller.
+struct Fetch {
+    /// For messages.
+    what: String,
+    pinned: Vec<Option<PinnedPage>>,
+    /// Pages that are not pinned yet, with their place in the list.
+    outstanding: BTreeMap<PageNo, usize>,
+    /// Whether a training step asks: only then are pages stamped as used, and do failed writes end the call.
+    is_step: bool,
+}
+
+impl Pager {
+    /// Pins pages with rows, in this order.
+    pub(super) fn fetch(
+        &mut self,
+        what: &str,
+        pages: &[PageNo],
+        is_step: bool,
+    ) -> Result<Vec<PinnedPage>, PagingError> {
+        let held = self.held_by_callers();
+        if held + pages.len() > self.cache.frames_max() {
+            return Err(self.working_set(what, held + pages.len()));
+        }
+        let pinned = pages.iter().map(|_| None).collect();
+        let mut fetch = Fetch { what: what.to_string(), pinned, outstanding: BTreeMap::new(), is_step };
+        fetch.outstanding.extend(pages.iter().copied().zip(0..));
+        let result = self.fetch_into(&mut fetch, pages);
+        let pinned = fetch.pinned.into_iter().flatten();
+        if let Err(error) = result {
+            pinned.for_each(|p| self.cache.unpin(p.page, p.buffer, false));
+            return Err(error);
+        }
+        let pinned: Vec<PinnedPage> = pinned.collect();
+        self.count_pinned();
+        Ok(pinned)
+    }
+
+    fn fetch_into(&mut self, fetch: &mut Fetch, pages: &[PageNo]) -> Result<(), PagingError> {
+        let failures = self.settle(false, &mut Vec::new());
+        pages.iter().for_each(|&page| self.pin_into(fetch, page));
+        self.stats.pages_needed += pages.len() as u64;
+        self.stats.misses += fetch.outstanding.len() as u64;
+        self.stats.hits += (pages.len() - fetch.outstanding.len()) as u64;
+        self.judge(fetch, failures)?;
+        let is_absent = |page: &PageNo| self.cache.state(*page).is_none();
+        let mut to_read: VecDeque<PageNo> = pages.iter().copied().filter(is_absent).collect();
+        loop {
+            while let Some(&page) = to_read.front() {
+                if self.begin_read(page, false) {
+                    to_read.pop_front();
+                } else if !self.make_room(to_read.len(), fetch.is_step)? {
+                    break;
+                }
+            }
+            if fetch.outstanding.is_empty() {
+                return Ok(());
+            }
+            if self.in_flight() == 0 {
+                return Err(self.working_set(&fetch.what, self.held_by_callers() + fetch.outstanding.len()));
+            }
+            let mut ended = Vec::new();
+            let failures = self.settle(true, &mut ended);
+            ended.into_iter().for_each(|page| self.pin_into(fetch, page));
+            self.judge(fetch, failures)?;
+        }
+    }
+
+    /// Pins an outstanding page if it is resident.
+    fn pin_into(&mut self, fetch: &mut Fetch, page: PageNo) {
+        let Some(&place) = fetch.outstanding.get(&page) else { return };
+        if let Some((buffer, dirty)) = self.cache.pin(page, fetch.is_step) {
+            fetch.outstanding.remove(&page);
+            fetch.pinned[place] = Some(PinnedPage { page, meta: self.index[page.index()], dirty, buffer });
+        }
+    }
+
+    /// Failures end the fetch when they are about a page that it needs, or when a step would go on although pages
+    /// cannot be written any more.
+    fn judge(&mut self, fetch: &mut Fetch, failures: Vec<Failure>) -> Result<(), PagingError> {
+        for Failure { page, is_write, error } in failures {
+            if is_write {
+                // It is in memory again.
+                self.pin_into(fetch, page);
+                self.stop_writes(error, fetch.is_step)?;
+            } else if fetch.outstanding.contains_key(&page) {
+                return Err(error);
+            }
+        }
+        Ok(())
+    }
+
+    /// No more writes until a step asks again. The error goes to the step that waits, or to the next one.
+    pub(super) fn stop_writes(&mut self, error: PagingError, is_step: bool) -> Result<(), PagingError> {
+        self.writes_stopped = true;
+        if is_step {
+            return Err(error);
+        }
+        self.failed_write.get_or_insert(error);
+        Ok(())
+    }
+
+    /// Makes a frame free: at once if a clean page leaves first, otherwise by beginning to write dirty ones, as many as
+    /// there are frames wanted. Returns whether a frame is free now.
+    fn make_room(&mut self, wanted: usize, is_step: bool) -> Result<bool, PagingError> {
+        loop {
+            // Pages that are written to leave come first: a nearer one must not leave in their place.
+            let leaving = self.cache.count(FrameState::Writing) - self.ahead[WRITES] / self.cache.frame_bytes();
+            if leaving >= wanted {
+                return Ok(false);
+            }
+            let victim = if self.writes_stopped { self.cache.clean_victim() } else { self.cache.victim() };
+            match victim {
+                Some(victim) if !victim.dirty => {
+                    self.evict(victim.page);
+                    return Ok(true);
+                }
+                Some(victim) if self.store.is_some() => {
+                    if let Err(Failure { error, .. }) = self.begin_write(victim.page, false) {
+                        self.stop_writes(error, is_step)?;
+                    }
+                }
+                _ if !is_step && self.writes_stopped && self.in_flight() == 0 && self.held_by_callers() == 0 => {
+                    // Everything in memory is dirty and cannot leave: one frame more lets the scene be written out.
+                    self.cache.add_frame();
+                    return Ok(true);
+                }
+                _ => return Ok(false),
+            }
+        }
+    }
+
+    /// A frame for the upper half of a page that splits; its bytes are whatever was there before. Goes back by
+    /// [`Pager::add_split`] or [`Pager::return_frame`].
+    ///
+    /// # Errors
+    /// Every frame is pinned, or the store failed while one was emptied.
+    pub fn take_frame(&mut self) -> Result<PageBuffer, PagingError> {
+        loop {
+            if let Some(buffer) = self.cache.lend() {
+                return Ok(buffer);
+            }
+            if self.make_room(1, true)? {
+                continue;
+            }
+            if self.in_flight() == 0 {
+                return Err(self.working_set("a page that splits", self.cache.frames_max() + 1));
+            }
+            for Failure { is_write, error, .. } in self.settle(true, &mut Vec::new()) {
+                if is_write {
+                    self.stop_writes(error, true)?;
+                }
+            }
+        }
+    }
+
+    /// Keeps an import at the speed of the drive: a frame that is clean already for the next page, and writes of those
+    /// that are not.
+    pub(super) fn write_behind(&mut self) -> Result<(), PagingError> {
+        if self.cache.has_free() || self.store.is_none() {
+            return Ok(());
+        }
+        for Failure { is_write, error, .. } in self.settle(false, &mut Vec::new()) {
+            if is_write {
+                self.stop_writes(error, true)?;
+            }
+        }
+        while self.may_write_ahead()
+            && let Some(victim) = self.cache.dirty_victim()
+        {
+            if let Err(Failure { error, .. }) = self.begin_write(victim.page, true) {
+                self.stop_writes(error, true)?;
+            }
+        }
+        if let Some(victim) = self.cache.clean_victim().filter(|v| v.next_use == NEVER) {
+            self.evict(victim.page);
+        }
+        Ok(())
+    }
+
+    fn held_by_callers(&self) -> usize {
+        self.cache.count(FrameState::Pinned) + self.cache.count(FrameState::Lent)
+    }
+
+    fn working_set(&self, what: &str, pages: usize) -> PagingError {
+        let (frames, frame_bytes) = (self.cache.frames_max(), self.cache.frame_bytes());
+        PagingError::WorkingSet { what: what.to_string(), pages, frames, frame_bytes }
+    }
+}

@@ -1,0 +1,12 @@
+//! The only place where cache, store and plan meet: brings the pages of a view into memory, and takes them back.
+//! Knows pages as bytes, metas and bounds; neither the optimizer nor the renderer.
+
+mod ahead;
+pub mod error;
+mod fetch;
+pub mod label;
+pub mod pager;
+pub mod pinned;
+pub mod stats;
+mod transfers;
+mod window;

@@ -1,0 +1,259 @@
+//! Hands out the pages of a view and takes them back.
+//!
+//! Here are the pages' entries and the calls of the trainer; `fetch` brings what is missing, `ahead` what will be
+//! missing, `transfers` talks to the store.
+//!
+//! Invariants: 1. `acquire` gives every page that the view may see by the bounds as they are now, whatever was planned;
+//! 2. a page's buffer is in one place: with the cache, with the store, or with the caller who pinned it; 3. what a step
+//! reads and writes never depends on frames, plan or store; 4. a page with rows that is not in memory has a slot, and the
+//! slot holds exactly what was last released.
+
+use super::error::PagingError;
+use super::pinned::PinnedPage;
+use super::stats::PagerStats;
+use super::window::Window;
+use crate::base::ids::PageNo;
+use crate::cache::evict::EvictPolicy;
+use crate::cache::frame::FrameState;
+use crate::cache::host_cache::HostCache;
+use crate::page::buffer::PageBuffer;
+use crate::page::format::{HEADER_BYTES, SlotRef, transfer_bytes};
+use crate::page::paged_store::PagedStore;
+use crate::scene::camera::Camera;
+use crate::scene::page_layout::capacity_bytes;
+use crate::scene::page_meta::PageMeta;
+use crate::schedule::visibility::visible_pages;
+
+/// Sizes of a pager. None of them changes a bit of the rows.
+#[derive(Debug, Clone, Copy)]
+pub struct PagerConfig {
+    /// Rows that a page holds at most.
+    pub page_rows: usize,
+    /// Degree of the scene: frames hold a full page of it.
+    pub sh_degree: u8,
+    /// Pages that memory holds at once; `usize::MAX` for as many as there are.
+    pub frames: usize,
+    /// Which page leaves first.
+    pub policy: EvictPolicy,
+    /// Bytes that [`Pager::prefetch`] has in flight at most, reads and writes each.
+    pub prefetch_bytes: usize,
+    /// Bytes for the plan of the coming steps; what does not fit is planned later.
+    pub plan_bytes: usize,
+}
+
+impl PagerConfig {
+    /// Everything in memory, for pages of `page_rows` rows.
+    pub fn in_memory(page_rows: usize, sh_degree: u8) -> PagerConfig {
+        let policy = EvictPolicy::default();
+        PagerConfig { page_rows, sh_degree, frames: usize::MAX, policy, prefetch_bytes: 0, plan_bytes: 0 }
+    }
+
+    /// Bytes of one frame: header space and the payload of a full page, as a slot has them.
+    pub fn frame_bytes(&self) -> usize {
+        transfer_bytes(capacity_bytes(self.page_rows, self.sh_degree))
+    }
+}
+
+/// The pages of a scene.
+#[derive(Debug)]
+pub struct Pager {
+    pub(super) config: PagerConfig,
+    /// By page.
+    pub(super) index: Vec<PageMeta>,
+    /// By page: where its version on the drive is, current or not; `None` before its first write.
+    pub(super) slots: Vec<Option<SlotRef>>,
+    pub(super) cache: HostCache,
+    pub(super) window: Window,
+    /// `None` for a pager whose pages never leave memory.
+    pub(super) store: Option<PagedStore>,
+    pub(super) stats: PagerStats,
+    /// A write that failed while nobody waited for it.
+    pub(super) failed_write: Option<PagingError>,
+    /// After a failed write nothing is written until a step asks for pages again.
+    pub(super) writes_stopped: bool,
+    /// Reads and writes that were started ahead of their need and are still in flight, bytes.
+    pub(super) ahead: [usize; 2],
+}
+
+impl Pager {
+    /// A pager with `config.frames` frames over a store whose slots are as large as the frames.
+    pub fn new(config: PagerConfig, store: PagedStore) -> Pager {
+        Pager { store: Some(store), ..Pager::in_memory(config) }
+    }
+
+    /// A pager that keeps every page in memory, in as many frames as needed.
+    pub fn in_memory(config: PagerConfig) -> Pager {
+        Pager {
+            cache: HostCache::new(config.frames, config.frame_bytes(), config.policy),
+            window: Window::new(config.plan_bytes),
+            config,
+            index: Vec::new(),
+            slots: Vec::new(),
+            store: None,
+            stats: PagerStats::default(),
+            failed_write: None,
+            writes_stopped: false,
+            ahead: [0; 2],
+        }
+    }
+
+    /// Adds an initial page. `fill` writes its rows into the payload space (all of it is given; see
+    /// [`crate::scene::page_layout::write_page`]), in the layout that `meta` names.
+    ///
+    /// # Errors
+    /// The store failed while a frame was emptied.
+    pub fn insert(&mut self, meta: PageMeta, fill: impl FnOnce(&mut [u8])) -> Result<PageNo, PagingError> {
+        if meta.rows == 0 {
+            return Ok(self.add_entry(meta));
+        }
+        self.write_behind()?;
+        let mut buffer = self.take_frame()?;
+        fill(&mut buffer.as_mut_slice()[HEADER_BYTES..]);
+        let page = self.add_entry(meta);
+        self.cache.adopt(page);
+        self.cache.unpin(page, buffer, true);
+        Ok(page)
+    }
+
+    /// Allows more frames than the pager was made with, once it is known what memory is left for them.
+    pub fn allow_frames(&mut self, frames: usize) {
+        self.cache.allow_frames(frames);
+        self.config.frames = self.cache.frames_max();
+    }
+
+    /// Bytes that [`Pager::prefetch`] has in flight at most.
+    pub fn prefetch_bytes(&self) -> usize {
+        2 * self.config.prefetch_bytes
+    }
+
+    /// Bytes of one frame.
+    pub fn frame_bytes(&self) -> usize {
+        self.config.frame_bytes()
+    }
+
+    /// The metas of all pages, by number.
+    pub fn index(&self) -> &[PageMeta] {
+        &self.index
+    }
+
+    /// Says which views come next: `cameras[i]` at step `first_step + i`. Replaces what was said before; what is known
+    /// already for the same views costs nothing.
+    pub fn look_ahead(&mut self, first_step: u32, cameras: &[&Camera]) {
+        if self.store.is_some() {
+            self.window.renew(first_step, cameras, &self.index);
+            self.apply_changed_uses();
+        }
+    }
+
+    /// Pins every page with rows that `camera` may see by the bounds as they are now, ascending by id. `step` is the
+    /// 0-based step that uses them. Blocks only for pages that are not in memory.
+    ///
+    /// # Errors
+    /// The working set is larger than the frames; a page cannot be read; a page could not be written, now or since the
+    /// last call. Nothing is pinned then, and every page keeps what it holds.
+    pub fn acquire(&mut self, step: u32, camera: &Camera) -> Result<Vec<PinnedPage>, PagingError> {
+        self.writes_stopped = false;
+        if let Some(error) = self.failed_write.take() {
+            return Err(error);
+        }
+        let pages = self.pages_of_view(camera);
+        let planned = self.window.pages(step).map(<[PageNo]>::to_vec);
+        self.window.pass(step.saturating_add(1));
+        self.window.add_pages(&self.index);
+        self.apply_changed_uses();
+        self.cache.tick();
+        if let Some(planned) = planned {
+            let missed = |p: &&PageNo| planned.binary_search(p).is_err() && self.cache.state(**p).is_none();
+            self.stats.late_misses += pages.iter().filter(missed).count() as u64;
+        }
+        self.fetch(&format!("the view of step {step}"), &pages, true)
+    }
+
+    /// Pages with rows that `camera` may see by the bounds as they are now, ascending by id.
+    pub fn pages_of_view(&self, camera: &Camera) -> Vec<PageNo> {
+        let mut pages = Vec::new();
+        visible_pages(&self.index, camera, &mut pages);
+        pages.retain(|p| self.index[p.index()].rows > 0);
+        pages.sort_unstable_by_key(|p| self.index[p.index()].id);
+        pages
+    }
+
+    /// Pins the listed pages (none of them pinned already, none twice) in this order, leaving out those without rows:
+    /// for evaluation and export. They do not count as used. Works also after writes failed, at least one page at a
+    /// time.
+    ///
+    /// # Errors
+    /// As [`Pager::acquire`], but without earlier failures.
+    pub fn acquire_pages(&mut self, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
+        let pages: Vec<PageNo> = pages.iter().copied().filter(|p| self.index[p.index()].rows > 0).collect();
+        self.fetch("a list of pages", &pages, false)
+    }
+
+    /// Gives back a frame that was taken for nothing.
+    pub fn return_frame(&mut self, buffer: PageBuffer) {
+        self.cache.take_back(buffer);
+    }
+
+    /// Adds the upper half of a page that split: it gets a number, is pinned and dirty. The lower half keeps the number of
+    /// the page; its new meta goes in by [`Pager::release`].
+    pub fn add_split(&mut self, meta: PageMeta, buffer: PageBuffer) -> PinnedPage {
+        let page = self.add_entry(meta);
+        self.cache.adopt(page);
+        self.count_pinned();
+        PinnedPage { page, meta, dirty: true, buffer }
+    }
+
+    /// Takes pages back: all that a step has pinned, or some of them. Metas and dirty flags go into the index. A page
+    /// that has no rows any more gives up its frame and its slot.
+    pub fn release(&mut self, pages: Vec<PinnedPage>) {
+        for PinnedPage { page, meta, dirty, buffer } in pages {
+            debug_assert!(meta == self.index[page.index()] || dirty, "a page whose entry changes is dirty");
+            self.index[page.index()] = meta;
+            if meta.rows > 0 {
+                self.cache.unpin(page, buffer, dirty);
+            } else {
+                self.cache.drop_pinned(page, buffer);
+                self.free_slot(page);
+            }
+        }
+    }
+
+    /// What was done so far.
+    pub fn stats(&self) -> PagerStats {
+        let traffic = self.store.as_ref().map(PagedStore::traffic).unwrap_or_default();
+        PagerStats {
+            bytes_read: traffic.bytes_read,
+            bytes_written: traffic.bytes_written,
+            frames: self.cache.frames(),
+            frames_max: self.cache.frames_max(),
+            ..self.stats
+        }
+    }
+
+    /// Whether a page has a frame.
+    pub fn is_in_memory(&self, page: PageNo) -> bool {
+        self.cache.state(page).is_some()
+    }
+
+    /// Where the versions of the pages on the drive are, by page: for the index of a commit, once nothing is dirty.
+    pub fn slots(&self) -> &[Option<SlotRef>] {
+        &self.slots
+    }
+
+    fn add_entry(&mut self, meta: PageMeta) -> PageNo {
+        self.index.push(meta);
+        self.slots.push(None);
+        PageNo(self.index.len() as u32 - 1)
+    }
+
+    pub(super) fn count_pinned(&mut self) {
+        self.stats.pinned_max = self.stats.pinned_max.max(self.cache.count(FrameState::Pinned));
+    }
+
+    /// Tells the cache of next uses that changed.
+    pub(super) fn apply_changed_uses(&mut self) {
+        for page in self.window.take_changed() {
+            self.cache.set_next_use(page, self.window.next_use(page));
+        }
+    }
+}

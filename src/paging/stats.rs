@@ -1,0 +1,32 @@
+//! What a pager did so far, for metrics.
+
+/// Totals since the pager was made; subtract two of them for one step.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct PagerStats {
+    /// Bytes read from the store.
+    pub bytes_read: u64,
+    /// Bytes written to the store.
+    pub bytes_written: u64,
+    /// Pages read from the store.
+    pub pages_read: u64,
+    /// Pages written to the store.
+    pub pages_written: u64,
+    /// Pages asked for.
+    pub pages_needed: u64,
+    /// Pages asked for that lay in memory.
+    pub hits: u64,
+    /// Pages asked for that did not: on their way, or still to be read.
+    pub misses: u64,
+    /// Of the misses, those that the plan of a planned step had left out.
+    pub late_misses: u64,
+    /// Pages that lost their frame.
+    pub evictions: u64,
+    /// Seconds that callers waited for the store.
+    pub stall_seconds: f64,
+    /// The most pages pinned at once.
+    pub pinned_max: usize,
+    /// Frames in use now, and the most that there may be (`usize::MAX` for as many as needed).
+    pub frames: usize,
+    /// See `frames`.
+    pub frames_max: usize,
+}

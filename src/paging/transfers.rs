@@ -1,0 +1,124 @@
+//! Between cache and store: begins reads and writes, and takes their ends.
+//!
+//! Invariants: 1. every buffer that goes to the store comes back into its frame, however the transfer ends; 2. a failed
+//! read leaves its page on the drive, a failed write leaves its page dirty in memory; 3. the slot of an older version is
+//! given up only when the newer one is written.
+
+use super::error::PagingError;
+use super::label::label;
+use super::pager::Pager;
+use crate::base::ids::PageNo;
+use crate::page::page_error::PageError;
+use crate::page::paged_store::{PageDone, PageMoved};
+use crate::scene::page_layout::PageLayout;
+use std::time::Instant;
+
+/// Set in the token of a transfer that was started ahead of its need.
+const AHEAD: u64 = 1 << 32;
+/// Index into [`Pager::ahead`].
+pub(super) const READS: usize = 0;
+/// Index into [`Pager::ahead`].
+pub(super) const WRITES: usize = 1;
+
+/// A transfer that failed.
+pub(super) struct Failure {
+    pub page: PageNo,
+    pub is_write: bool,
+    pub error: PagingError,
+}
+
+impl Pager {
+    /// Transfers whose end was not taken yet.
+    pub(super) fn in_flight(&self) -> usize {
+        self.store.as_ref().map_or(0, |store| store.in_flight())
+    }
+
+    /// Begins to read a page that is not in memory, if there is a free frame for it.
+    pub(super) fn begin_read(&mut self, page: PageNo, is_ahead: bool) -> bool {
+        let (Some(store), Some(slot)) = (&mut self.store, self.slots[page.index()]) else { return false };
+        let Some(buffer) = self.cache.begin_load(page, self.window.next_use(page)) else { return false };
+        store.read(token(page, is_ahead), self.index[page.index()].id, &slot, buffer);
+        self.ahead[READS] += if is_ahead { self.cache.frame_bytes() } else { 0 };
+        self.stats.pages_read += 1;
+        true
+    }
+
+    /// Begins to write a resident dirty page.
+    pub(super) fn begin_write(&mut self, page: PageNo, is_ahead: bool) -> Result<(), Failure> {
+        let Some(store) = &mut self.store else { return Ok(()) };
+        let meta = &self.index[page.index()];
+        let layout = PageLayout { rows: meta.rows as usize, sh_degree: meta.sh_degree };
+        let buffer = self.cache.begin_write(page);
+        match store.write(token(page, is_ahead), meta.id, &label(meta), layout.bytes(), buffer) {
+            Ok(()) => {
+                self.ahead[WRITES] += if is_ahead { self.cache.frame_bytes() } else { 0 };
+                self.stats.pages_written += 1;
+                Ok(())
+            }
+            Err((source, buffer)) => {
+                self.cache.finish_write(page, buffer, false);
+                Err(self.failure(page, true, source))
+            }
+        }
+    }
+
+    /// Evicts a clean resident page.
+    pub(super) fn evict(&mut self, page: PageNo) {
+        self.cache.evict(page);
+        self.stats.evictions += 1;
+    }
+
+    /// Gives up the slot of a page.
+    pub(super) fn free_slot(&mut self, page: PageNo) {
+        if let (Some(store), Some(slot)) = (&mut self.store, self.slots[page.index()].take()) {
+            store.free(&slot);
+        }
+    }
+
+    /// Takes the ends of transfers; with `wait`, blocks until there is one, if any is in flight, and counts the time.
+    /// `ended` gets the pages whose transfer ended well.
+    pub(super) fn settle(&mut self, wait: bool, ended: &mut Vec<PageNo>) -> Vec<Failure> {
+        let Some(store) = &mut self.store else { return Vec::new() };
+        let mut done = Vec::new();
+        let started = Instant::now();
+        store.complete(wait, &mut done);
+        if wait {
+            self.stats.stall_seconds += started.elapsed().as_secs_f64();
+        }
+        let mut failures = Vec::new();
+        for PageDone { token, buffer, result, .. } in done {
+            let page = PageNo(token as u32);
+            let is_read = self.cache.is_loading(page);
+            if token & AHEAD != 0 {
+                self.ahead[if is_read { READS } else { WRITES }] -= self.cache.frame_bytes();
+            }
+            match result {
+                Ok(PageMoved::Read { .. }) => self.cache.finish_load(page, buffer),
+                Ok(PageMoved::Written(slot)) => {
+                    self.cache.finish_write(page, buffer, true);
+                    self.free_slot(page);
+                    self.slots[page.index()] = Some(slot);
+                }
+                Err(source) => {
+                    match is_read {
+                        true => self.cache.fail_load(page, buffer),
+                        false => self.cache.finish_write(page, buffer, false),
+                    }
+                    failures.push(self.failure(page, !is_read, source));
+                    continue;
+                }
+            }
+            ended.push(page);
+        }
+        failures
+    }
+
+    fn failure(&self, page: PageNo, is_write: bool, source: PageError) -> Failure {
+        let doing = if is_write { "writing" } else { "reading" };
+        Failure { page, is_write, error: PagingError::Store { page: self.index[page.index()].id, doing, source } }
+    }
+}
+
+fn token(page: PageNo, is_ahead: bool) -> u64 {
+    u64::from(page.0) | if is_ahead { AHEAD } else { 0 }
+}

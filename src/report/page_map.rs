@@ -1,0 +1,100 @@
+//! The pages of a scene seen from above: where they lie, how often views needed them, which are in memory.
+//!
+//! Invariant: the picture has one rectangle a page, up to a bound; beyond it pages are drawn as cells of a grid.
+
+use serde::{Deserialize, Serialize};
+use std::fmt::Write as _;
+
+/// Longest side of the picture.
+const SIDE: f64 = 720.0;
+/// More rectangles than this make a file that browsers labour at.
+const RECTANGLES_MAX: usize = 20_000;
+
+/// One page, seen along the shortest axis of the scene.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PageTile {
+    /// Lower corner of its box.
+    pub lo: [f32; 2],
+    /// Upper corner.
+    pub hi: [f32; 2],
+    /// Gaussians in it.
+    pub rows: u32,
+    /// Steps that pinned it.
+    pub pins: u32,
+    /// Whether it was in memory at the end.
+    pub resident: bool,
+}
+
+/// The map as SVG: colour by the number of steps that pinned a page, outline by residency. Empty without pages.
+pub fn page_map_svg(tiles: &[PageTile]) -> String {
+    let corners = || tiles.iter().flat_map(|t| [t.lo, t.hi]).filter(|c| c.iter().all(|x| x.is_finite()));
+    // A few far pages (sky, giants) would shrink the rest to a dot: the map shows what 98 % of the corners span.
+    let Some((lo, hi)) = span(corners().map(|c| c[0])).zip(span(corners().map(|c| c[1]))) else {
+        return String::new();
+    };
+    let (lo, hi) = ([lo.0, hi.0], [lo.1, hi.1]);
+    let extent = [0, 1].map(|i| f64::from(hi[i] - lo[i]).max(1e-12));
+    let scale = SIDE / extent[0].max(extent[1]);
+    let size = extent.map(|e| e * scale);
+    let most = tiles.iter().map(|t| t.pins).max().unwrap_or(0).max(1);
+    let mut svg = format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {:.0} {:.0}\"><rect width=\"100%\" height=\"100%\" fill=\"#10151c\"/>\n",
+        size[0].max(1.0),
+        size[1].max(1.0)
+    );
+    let stride = tiles.len().div_ceil(RECTANGLES_MAX).max(1);
+    let mut drawn: Vec<&PageTile> = tiles.iter().step_by(stride).filter(|t| t.rows > 0).collect();
+    // Small pages over large ones, so that none is hidden.
+    drawn.sort_by(|a, b| area(b).total_cmp(&area(a)));
+    for tile in drawn {
+        let at = [0, 1].map(|i| (f64::from(tile.lo[i] - lo[i]) * scale).clamp(-1e4, 1e4));
+        let side = [0, 1].map(|i| (f64::from(tile.hi[i] - tile.lo[i]) * scale).clamp(1.0, 2e4));
+        let heat = (f64::from(tile.pins) / f64::from(most)).sqrt();
+        let line = if tile.resident { "#7fd0ff" } else { "#3a4450" };
+        // Writing to a String cannot fail.
+        let _ = writeln!(
+            svg,
+            "<rect x=\"{:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{:.1}\" fill=\"hsl({:.0} 85% {:.0}%)\" fill-opacity=\"0.55\" stroke=\"{line}\" stroke-width=\"0.6\"/>",
+            at[0],
+            size[1] - at[1] - side[1],
+            side[0],
+            side[1],
+            220.0 - 200.0 * heat,
+            18.0 + 45.0 * heat,
+        );
+    }
+    svg.push_str("</svg>");
+    svg
+}
+
+fn area(tile: &PageTile) -> f32 {
+    (tile.hi[0] - tile.lo[0]) * (tile.hi[1] - tile.lo[1])
+}
+
+/// From the first to the 99th percentile of some values.
+fn span(values: impl Iterator<Item = f32>) -> Option<(f32, f32)> {
+    let mut values: Vec<f32> = values.collect();
+    if values.is_empty() {
+        return None;
+    }
+    values.sort_unstable_by(f32::total_cmp);
+    let last = values.len() - 1;
+    Some((values[last / 100], values[last - last / 100]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn maps_draw_every_page_and_survive_far_ones() {
+        let tile = |x: f32, pins: u32| PageTile { lo: [x, 0.0], hi: [x + 1.0, 1.0], rows: 9, pins, resident: pins > 3 };
+        let mut tiles: Vec<PageTile> = (0..200).map(|i| tile(i as f32, i)).collect();
+        tiles.push(PageTile { lo: [f32::NEG_INFINITY; 2], hi: [f32::INFINITY; 2], ..tile(0.0, 1) });
+        tiles.push(tile(1e30, 0));
+        let svg = page_map_svg(&tiles);
+        assert_eq!(svg.matches("<rect x=").count(), 202);
+        assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+        assert_eq!(page_map_svg(&[]), "");
+    }
+}

@@ -1,0 +1,92 @@
+//! Pictures for pages: the render-beside-photo files of an evaluation, cut in two, shrunk, with a map of differences,
+//! as data URIs.
+//!
+//! Invariant: sizes are bounded before anything is decoded.
+
+use crate::base::error::{InputError, InputResult};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use image::codecs::jpeg::JpegEncoder;
+use image::imageops::{FilterType, crop_imm, resize};
+use image::{ImageReader, Limits, RgbImage};
+use std::path::Path;
+
+/// Widest picture in a page, pixels.
+const WIDTH_MAX: u32 = 800;
+const JPEG_QUALITY: u8 = 88;
+/// A difference of this many levels (of 255) is shown at full strength.
+const FULL_DIFFERENCE: f32 = 64.0;
+
+/// A view for a page, each picture a data URI.
+pub struct ViewPictures {
+    /// The render.
+    pub render: String,
+    /// The photo.
+    pub photo: String,
+    /// Their difference: black for none over red and yellow to white for a quarter of the range and more.
+    pub difference: String,
+}
+
+/// Reads a picture whose left half is the render and whose right half is the photo.
+///
+/// # Errors
+/// The file cannot be read or decoded, or is larger than any view.
+pub fn view_pictures(path: &Path) -> InputResult<ViewPictures> {
+    let bad = |e: image::ImageError| InputError::new(path, format!("is no picture: {e}"), "evaluate the run again");
+    let mut reader = ImageReader::open(path).map_err(|e| InputError::io(path, "reading the picture", &e))?;
+    let mut limits = Limits::default();
+    (limits.max_image_width, limits.max_image_height) = (Some(1 << 16), Some(1 << 15));
+    limits.max_alloc = Some(1 << 30);
+    reader.limits(limits);
+    let both = reader.decode().map_err(bad)?.to_rgb8();
+    let (width, height) = (both.width() / 2, both.height());
+    if width == 0 || height == 0 {
+        return Err(InputError::new(path, "is empty", "evaluate the run again"));
+    }
+    let half = |x: u32| {
+        let half = crop_imm(&both, x, 0, width, height).to_image();
+        match width > WIDTH_MAX {
+            true => resize(&half, WIDTH_MAX, (height * WIDTH_MAX / width).max(1), FilterType::Triangle),
+            false => half,
+        }
+    };
+    let (render, photo) = (half(0), half(width));
+    let difference = difference(&render, &photo);
+    Ok(ViewPictures {
+        render: data_uri(&render).map_err(bad)?,
+        photo: data_uri(&photo).map_err(bad)?,
+        difference: data_uri(&difference).map_err(bad)?,
+    })
+}
+
+fn difference(a: &RgbImage, b: &RgbImage) -> RgbImage {
+    RgbImage::from_fn(a.width(), a.height(), |x, y| {
+        let (p, q) = (a.get_pixel(x, y).0, b.get_pixel(x, y).0);
+        let mean = (0..3).map(|c| f32::from(p[c].abs_diff(q[c]))).sum::<f32>() / 3.0;
+        let heat = (mean / FULL_DIFFERENCE).min(1.0) * 3.0;
+        image::Rgb([0.0, 1.0, 2.0].map(|from: f32| ((heat - from).clamp(0.0, 1.0) * 255.0) as u8))
+    })
+}
+
+fn data_uri(picture: &RgbImage) -> image::ImageResult<String> {
+    let mut bytes = Vec::new();
+    JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY).encode_image(picture)?;
+    Ok(format!("data:image/jpeg;base64,{}", STANDARD.encode(bytes)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn differences_go_from_black_to_white() {
+        let a = RgbImage::from_pixel(3, 1, image::Rgb([10, 20, 30]));
+        let mut b = a.clone();
+        b.put_pixel(1, 0, image::Rgb([42, 52, 62]));
+        b.put_pixel(2, 0, image::Rgb([255, 255, 255]));
+        let map = difference(&a, &b);
+        assert_eq!(map.get_pixel(0, 0).0, [0, 0, 0]);
+        assert_eq!(map.get_pixel(1, 0).0, [255, 127, 0]);
+        assert_eq!(map.get_pixel(2, 0).0, [255, 255, 255]);
+    }
+}

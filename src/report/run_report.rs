@@ -1,0 +1,281 @@
+//! report.html of a run, made from the files that the run left in its folder.
+//!
+//! Invariants: 1. files that are missing or cut short (a run that was stopped) make the report shorter, not fail; only a
+//! folder without metrics is refused; 2. the number of pictures and of points in a chart is bounded.
+
+use super::chart::{Chart, Mark, short};
+use super::html::{Cell, Page};
+use super::page_map::{PageTile, page_map_svg};
+use super::picture::view_pictures;
+use crate::base::error::{InputError, InputResult};
+use crate::base::units::format_bytes;
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+/// Name of the report in a run's folder.
+pub const REPORT_FILE: &str = "report.html";
+/// Name of the page map's data in a run's folder: a JSON list of [`PageTile`].
+pub const PAGES_FILE: &str = "pages.json";
+/// Views shown; more make a file that is slow to open.
+const VIEWS_MAX: usize = 12;
+/// Points of a curve.
+const POINTS_MAX: usize = 600;
+/// Largest text file that is read whole, bytes.
+const TEXT_BYTES_MAX: u64 = 256 << 20;
+const MIB: f64 = (1 << 20) as f64;
+
+/// Makes the report of the run in `folder` as HTML text.
+///
+/// # Errors
+/// The folder holds no metrics, or a picture in it is none.
+pub fn run_report(folder: &Path) -> InputResult<String> {
+    let metrics = read_metrics(folder)?;
+    let summary = read_json(&folder.join("summary.json")).unwrap_or(Value::Null);
+    let scene = summary["scene"].as_str().unwrap_or("").to_string();
+    let name = folder.file_name().map_or("run".into(), |n| n.to_string_lossy().into_owned());
+    let mut page = Page::new(&format!("gsscale: {name}"), &scene);
+    page.tiles(&tiles(&summary, &metrics));
+    page.heading("Training");
+    page.charts(&training_charts(&metrics));
+    let tiers = tier_charts(&metrics);
+    if !tiers.is_empty() {
+        page.heading("Memory and disk");
+        page.charts(&tiers);
+    }
+    add_page_map(&mut page, &folder.join(PAGES_FILE));
+    add_views(&mut page, &folder.join("renders/test"))?;
+    page.heading("Config");
+    if let Some(text) = read_text(&folder.join("config.toml")) {
+        page.folded("config.toml, every key as it was used", &text);
+    }
+    if !summary.is_null() {
+        let text = serde_json::to_string_pretty(&summary).unwrap_or_default();
+        page.folded("summary.json", &text);
+    }
+    Ok(page.finish())
+}
+
+/// Makes the report and writes it into the folder; returns its path.
+///
+/// # Errors
+/// As [`run_report`], or the folder cannot be written.
+pub fn write_run_report(folder: &Path) -> InputResult<PathBuf> {
+    let html = run_report(folder)?;
+    let path = folder.join(REPORT_FILE);
+    let part = folder.join(format!(".{REPORT_FILE}.part"));
+    std::fs::write(&part, html)
+        .and_then(|()| std::fs::rename(&part, &path))
+        .map_err(|e| InputError::io(&path, "writing the report", &e))?;
+    Ok(path)
+}
+
+fn read_text(path: &Path) -> Option<String> {
+    let len = std::fs::metadata(path).ok()?.len();
+    (len <= TEXT_BYTES_MAX).then(|| std::fs::read_to_string(path).ok())?
+}
+
+fn read_json(path: &Path) -> Option<Value> {
+    serde_json::from_str(&read_text(path)?).ok()
+}
+
+/// The lines of metrics.jsonl that are whole.
+pub(super) fn read_metrics(folder: &Path) -> InputResult<Vec<Value>> {
+    let path = folder.join("metrics.jsonl");
+    let text = read_text(&path)
+        .ok_or_else(|| InputError::new(&path, "cannot be read", "name the output folder of a training run"))?;
+    Ok(text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect())
+}
+
+/// Points (x, y) of the lines that have both, thinned evenly.
+pub(super) fn curve(metrics: &[Value], x: &str, y: impl Fn(&Value) -> Option<f64>) -> Vec<(f64, f64)> {
+    let all: Vec<(f64, f64)> = metrics.iter().filter_map(|m| Some((m[x].as_f64()?, y(m)?))).collect();
+    let stride = all.len().div_ceil(POINTS_MAX).max(1);
+    let last = all.len().saturating_sub(1);
+    all.into_iter().enumerate().filter(|(i, _)| i % stride == 0 || *i == last).map(|(_, p)| p).collect()
+}
+
+fn tiles(summary: &Value, metrics: &[Value]) -> Vec<(String, &'static str)> {
+    let mut tiles = Vec::new();
+    let last = metrics.last().unwrap_or(&Value::Null);
+    let number = |name: &str| summary[name].as_f64().or(last[name].as_f64());
+    if let Some(psnr) = summary["test"]["psnr"].as_f64() {
+        tiles.push((format!("{psnr:.2} dB"), "PSNR, held-out views"));
+    }
+    if let Some(ssim) = summary["test"]["ssim"].as_f64() {
+        tiles.push((format!("{ssim:.3}"), "SSIM, held-out views"));
+    }
+    if let Some(n) = number("gaussians") {
+        tiles.push((short(n), "Gaussians"));
+    }
+    if let Some(steps) = summary["steps"].as_f64().or(last["step"].as_f64().map(|s| s + 1.0)) {
+        tiles.push((short(steps), "steps"));
+    }
+    if let Some(seconds) = summary["train_seconds"].as_f64().or(last["seconds"].as_f64()) {
+        tiles.push((format!("{seconds:.0} s"), "training"));
+    }
+    if let Some(bytes) = number("host_bytes_peak") {
+        tiles.push((format_bytes(bytes as u64), "peak memory"));
+    }
+    for (name, label) in [("bytes_read", "read from disk"), ("bytes_written", "written to disk")] {
+        if let Some(bytes) = number(name).filter(|&b| b > 0.0) {
+            tiles.push((format_bytes(bytes as u64), label));
+        }
+    }
+    tiles
+}
+
+fn training_charts(metrics: &[Value]) -> Vec<(String, String)> {
+    let train = |m: &Value| m["psnr"].as_f64();
+    let test = |m: &Value| m["test"]["psnr"].as_f64();
+    // Skipped steps carry the largest number there is.
+    let loss = |m: &Value| m["loss"].as_f64().filter(|l| *l < 1e30);
+    let mut charts = Vec::new();
+    for (x, unit) in [("step", "step"), ("seconds", "seconds of training")] {
+        let chart = Chart::new("PSNR", unit, "dB").with("training view", curve(metrics, x, train), Mark::Line).with(
+            "held-out views",
+            curve(metrics, x, test),
+            Mark::LineAndDots,
+        );
+        charts.push((
+            chart.svg(),
+            format!("PSNR of the view of each logged step and of the held-out views, over {unit}."),
+        ));
+        let chart = Chart::new("Loss", unit, "loss").with("", curve(metrics, x, loss), Mark::Line).zero_based();
+        charts.push((chart.svg(), format!("Loss of the view of each logged step, over {unit}.")));
+    }
+    let rows = curve(metrics, "step", |m| m["gaussians"].as_f64());
+    let chart = Chart::new("Gaussians", "step", "").with("", rows, Mark::Line).zero_based();
+    charts.push((chart.svg(), "Gaussians in the scene.".to_string()));
+    charts
+}
+
+/// Charts of memory and of the traffic between the tiers, as far as the run logged them.
+fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
+    let mib = |name: &'static str| move |m: &Value| m[name].as_f64().map(|b| b / MIB);
+    let mut charts = Vec::new();
+    let mut add = |chart: Chart, caption: &str| {
+        if !chart.is_empty() {
+            charts.push((chart.svg(), caption.to_string()));
+        }
+    };
+    let mut memory = Chart::new("Host memory", "step", "MiB").zero_based();
+    memory = memory.with("peak", curve(metrics, "step", mib("host_bytes_peak")), Mark::Line);
+    let budget = curve(metrics, "step", mib("host_bytes_budget"));
+    if !budget.is_empty() {
+        memory = memory.with("budget", budget, Mark::Line);
+    }
+    add(memory, "Largest resident size so far, beside what --host-mem allows where it was given.");
+    if metrics.iter().any(|m| m["bytes_read"].as_f64().is_some_and(|b| b > 0.0)) {
+        let chart = Chart::new("Disk traffic", "step", "MiB since the start").zero_based();
+        let chart = chart.with("read", curve(metrics, "step", mib("bytes_read")), Mark::Line);
+        add(
+            chart.with("written", curve(metrics, "step", mib("bytes_written")), Mark::Line),
+            "Bytes of pages read from and written to the spill directory.",
+        );
+        let chart = Chart::new("Waiting for pages", "step", "seconds since the start").zero_based();
+        add(
+            chart.with("", curve(metrics, "step", |m| m["stall_seconds"].as_f64()), Mark::Line),
+            "Time in which a step could not start because a page was not there yet.",
+        );
+        let chart = Chart::new("Page hits", "step", "share").zero_based();
+        let share = |m: &Value| {
+            let (hits, misses) = (m["page_hits"].as_f64()?, m["page_misses"].as_f64()?);
+            (hits + misses > 0.0).then(|| hits / (hits + misses))
+        };
+        add(
+            chart.with("", curve(metrics, "step", share), Mark::Line),
+            "Share of needed pages that were in memory already, since the start.",
+        );
+    }
+    if metrics.iter().any(|m| m["device_bytes_peak"].as_f64().is_some_and(|b| b > 0.0)) {
+        let chart = Chart::new("Device memory", "step", "MiB").zero_based();
+        add(chart.with("", curve(metrics, "step", mib("device_bytes_peak")), Mark::Line), "Most device memory so far.");
+    }
+    charts
+}
+
+fn add_page_map(page: &mut Page, path: &Path) {
+    let tiles: Option<Vec<PageTile>> = read_text(path).and_then(|text| serde_json::from_str(&text).ok());
+    let svg = page_map_svg(&tiles.unwrap_or_default());
+    if svg.is_empty() {
+        return;
+    }
+    page.heading("Pages");
+    let caption = "The pages of the scene along its shortest axis: the warmer, the more steps needed the page; light \
+                   outlines were in memory at the end.";
+    page.charts(&[(svg, caption.to_string())]);
+}
+
+fn add_views(page: &mut Page, folder: &Path) -> InputResult<()> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
+    let mut files: Vec<PathBuf> =
+        entries.flatten().map(|e| e.path()).filter(|p| p.extension().is_some_and(|e| e == "png")).collect();
+    if files.is_empty() {
+        return Ok(());
+    }
+    files.sort();
+    page.heading("Held-out views");
+    let stride = files.len().div_ceil(VIEWS_MAX);
+    if stride > 1 {
+        page.paragraph(&format!("One in {stride} of {} views; all are in renders/test.", files.len()));
+    }
+    page.begin_views();
+    for file in files.iter().step_by(stride) {
+        let pictures = view_pictures(file)?;
+        let name = file.file_stem().unwrap_or_default().to_string_lossy();
+        page.view(&name, &pictures.render, &pictures.photo, &pictures.difference, "");
+    }
+    page.end_views();
+    Ok(())
+}
+
+/// A report that sets several runs side by side: what they reached, over steps and over seconds.
+///
+/// # Errors
+/// A folder holds no metrics.
+pub fn compare_report(folders: &[PathBuf]) -> InputResult<String> {
+    let mut page = Page::new("gsscale: comparison", &format!("{} runs", folders.len()));
+    let names: Vec<String> = folders.iter().map(|f| f.display().to_string()).collect();
+    let mut runs = Vec::new();
+    for folder in folders {
+        let summary = read_json(&folder.join("summary.json")).unwrap_or(Value::Null);
+        runs.push((read_metrics(folder)?, summary));
+    }
+    let columns = ["run", "PSNR, dB", "SSIM", "Gaussians", "steps", "seconds", "peak memory", "read", "written"];
+    let rows: Vec<Vec<Cell>> = names.iter().zip(&runs).map(|(name, (_, summary))| compare_row(name, summary)).collect();
+    page.table(&columns, &rows);
+    let mut charts = Vec::new();
+    for (x, unit) in [("step", "step"), ("seconds", "seconds of training")] {
+        for (title, of) in [
+            ("PSNR of held-out views", (|m: &Value| m["test"]["psnr"].as_f64()) as fn(&Value) -> Option<f64>),
+            ("PSNR of training views", |m: &Value| m["psnr"].as_f64()),
+        ] {
+            let mut chart = Chart::new(title, unit, "dB");
+            for (name, (metrics, _)) in names.iter().zip(&runs) {
+                chart = chart.with(name, curve(metrics, x, of), Mark::Line);
+            }
+            if !chart.is_empty() {
+                charts.push((chart.svg(), format!("{title}, over {unit}.")));
+            }
+        }
+    }
+    page.charts(&charts);
+    Ok(page.finish())
+}
+
+fn compare_row(name: &str, summary: &Value) -> Vec<Cell> {
+    let number =
+        |value: &Value, digits: usize| Cell::Number(value.as_f64().map_or(String::new(), |v| format!("{v:.digits$}")));
+    let bytes = |value: &Value| Cell::Number(value.as_u64().map_or(String::new(), format_bytes));
+    vec![
+        Cell::Text(name.to_string()),
+        number(&summary["test"]["psnr"], 3),
+        number(&summary["test"]["ssim"], 4),
+        number(&summary["gaussians"], 0),
+        number(&summary["steps"], 0),
+        number(&summary["train_seconds"], 1),
+        bytes(&summary["host_bytes_peak"]),
+        bytes(&summary["bytes_read"]),
+        bytes(&summary["bytes_written"]),
+    ]
+}

@@ -1,0 +1,337 @@
+//! First pages: which rows go together, from positions and sizes alone.
+//!
+//! The rows are halved along the longest axis of their box, again and again, until every part is a page; where the
+//! number of pages is odd, the halves are as unequal as the pages. The largest rows are divided the same way among
+//! themselves: one giant in a page of small rows would make every view need that page.
+//!
+//! Not here: what a page stores, and pages that outgrow their capacity ([`super::page_split`]). A cloud that does not
+//! fit in memory is divided through files, with the same result.
+//!
+//! Invariants: 1. every row is in exactly one page; 2. pages differ by one row at most (giants among themselves);
+//! 3. the result is a function of positions and sizes, not of threads: equal coordinates are ordered by row; 4. the
+//! rows of a page ascend.
+
+use super::select::{RankSearch, float_key};
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// One row of this many is a giant.
+const ROWS_PER_GIANT: usize = 200;
+/// Parts below this many rows are divided by one thread.
+const SERIAL_BELOW: usize = 8192;
+/// With densification on, pages start this full, in percent: most grow, and a split costs a half-empty page.
+const FILL_PERCENT: usize = 70;
+
+/// What can be divided: something with a position and the number of a row, which no two of them share.
+pub trait Placed: Copy + Send + Sync {
+    /// Position.
+    fn point(&self) -> [f32; 3];
+    /// Row.
+    fn row(&self) -> u32;
+}
+
+impl Placed for PointRow {
+    fn point(&self) -> [f32; 3] {
+        self.point
+    }
+    fn row(&self) -> u32 {
+        self.row
+    }
+}
+
+/// A position and the number of its row.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PointRow {
+    /// Position.
+    pub point: [f32; 3],
+    /// Row.
+    pub row: u32,
+}
+
+/// The rows of every page, numbered as [`crate::base::ids::PageId::initial`] numbers pages.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Partition {
+    /// Rows, page after page.
+    rows: Vec<u32>,
+    /// Where each page starts in `rows`, and the end.
+    starts: Vec<u32>,
+}
+
+impl Partition {
+    /// Number of pages.
+    pub fn pages(&self) -> usize {
+        self.starts.len() - 1
+    }
+
+    /// The rows of a page, ascending.
+    pub fn rows_of(&self, page: usize) -> &[u32] {
+        &self.rows[self.starts[page] as usize..self.starts[page + 1] as usize]
+    }
+
+    /// The pages in order.
+    pub fn iter(&self) -> impl ExactSizeIterator<Item = &[u32]> {
+        (0..self.pages()).map(|page| self.rows_of(page))
+    }
+}
+
+/// Rows that a first page gets at most: all it holds, or less when pages are going to grow.
+pub fn first_fill(page_rows: usize, is_growing: bool) -> usize {
+    if is_growing { (page_rows * FILL_PERCENT / 100).max(1) } else { page_rows.max(1) }
+}
+
+/// Number of giants among so many rows.
+pub fn giants(rows: usize) -> usize {
+    rows / ROWS_PER_GIANT
+}
+
+/// Divides rows into pages of at most `fill` rows (at least 1). `means` and `scales` (log) are `[rows][3]`. Takes 16
+/// bytes per row on top of the result.
+///
+/// # Panics
+/// With 2^32 rows or more.
+pub fn partition(means: &[f32], scales: &[f32], fill: usize) -> Partition {
+    let count = means.len() / 3;
+    assert!(u32::try_from(count).is_ok(), "more than 2^32 rows");
+    assert_eq!(means.len(), scales.len(), "one size per position");
+    let cut = GiantCut::find(count, |row| largest(&scales[row * 3..row * 3 + 3]));
+    let entry = |row: usize| PointRow { point: std::array::from_fn(|i| means[row * 3 + i]), row: row as u32 };
+    let is_giant = |row: usize| cut.is_giant(largest(&scales[row * 3..row * 3 + 3]), row as u32);
+    let mut entries = Vec::with_capacity(count);
+    entries.extend((0..count).filter(|&row| !is_giant(row)).map(entry));
+    let small = entries.len();
+    entries.extend((0..count).filter(|&row| is_giant(row)).map(entry));
+    let mut starts = vec![0];
+    for range in [0..small, small..count] {
+        let pages = Pages::of(range.len(), fill);
+        pages.divide(&mut entries[range.clone()]);
+        starts.extend((1..=pages.pages).map(|page| (range.start + pages.start(page)) as u32));
+    }
+    Partition { rows: entries.into_par_iter().map(|e| e.row).collect(), starts }
+}
+
+fn largest(scales: &[f32]) -> f32 {
+    scales[0].max(scales[1]).max(scales[2])
+}
+
+/// Which rows are giants: the largest half percent, equal sizes by row.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct GiantCut {
+    /// Key of the smallest giant.
+    smallest: u64,
+}
+
+impl GiantCut {
+    /// From the size of every row: any number that grows with it, the same for [`GiantCut::is_giant`].
+    pub fn find(rows: usize, size: impl Fn(usize) -> f32) -> GiantCut {
+        let mut search = GiantCut::search(rows);
+        while !search.is_done() {
+            (0..rows).for_each(|row| search.count(GiantCut::key(size(row), row as u32)));
+            search.next_pass();
+        }
+        GiantCut::found(&search)
+    }
+
+    /// The search for the cut among so many rows, for those who see sizes one after the other: count
+    /// [`GiantCut::key`] of every row in every pass.
+    pub fn search(rows: usize) -> RankSearch {
+        // Without giants any rank does: `found` is not asked.
+        RankSearch::new((rows - giants(rows)) as u64, rows as u64)
+    }
+
+    /// The cut after the last pass.
+    pub fn found(search: &RankSearch) -> GiantCut {
+        GiantCut { smallest: search.key().unwrap_or(u64::MAX) }
+    }
+
+    /// Orders rows by size, equal sizes by row, the first row counting as the largest.
+    pub fn key(size: f32, row: u32) -> u64 {
+        u64::from(float_key(size)) << 32 | u64::from(!row)
+    }
+
+    /// Whether a row is among the largest.
+    pub fn is_giant(self, size: f32, row: u32) -> bool {
+        GiantCut::key(size, row) >= self.smallest
+    }
+}
+
+/// Pages of nearly equal size for so many rows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Pages {
+    /// Rows in all.
+    pub rows: usize,
+    /// Pages in all.
+    pub pages: usize,
+}
+
+impl Pages {
+    /// As few pages as hold `rows` rows with at most `fill` each.
+    pub fn of(rows: usize, fill: usize) -> Pages {
+        Pages { rows, pages: rows.div_ceil(fill.max(1)) }
+    }
+
+    /// Rows in the pages before this one.
+    pub fn start(&self, page: usize) -> usize {
+        (self.rows as u128 * page as u128 / self.pages.max(1) as u128) as usize
+    }
+
+    /// The page at which the pages `range` are cut in two.
+    pub fn middle(range: &Range<usize>) -> usize {
+        range.start + range.len() / 2
+    }
+
+    /// Sorts the rows into pages: page p holds what lies from `start(p)` to `start(p + 1)` afterwards, ascending.
+    pub fn divide<E: Placed>(&self, entries: &mut [E]) {
+        assert_eq!(entries.len(), self.rows);
+        if self.pages > 0 {
+            self.divide_range(entries, 0..self.pages);
+        }
+    }
+
+    /// The same for the rows of the pages `range` (at least one), of which there must be the right number.
+    pub fn divide_range<E: Placed>(&self, entries: &mut [E], range: Range<usize>) {
+        if range.len() == 1 {
+            return entries.sort_unstable_by_key(E::row);
+        }
+        let middle = Pages::middle(&range);
+        let at = self.start(middle) - self.start(range.start);
+        let axis = PointBox::of(entries).longest_axis();
+        entries.select_nth_unstable_by_key(at, |e| axis_key(e, axis));
+        let serial = entries.len() < SERIAL_BELOW;
+        let (low, high) = entries.split_at_mut(at);
+        let (low_pages, high_pages) = (range.start..middle, middle..range.end);
+        if serial {
+            self.divide_range(low, low_pages);
+            self.divide_range(high, high_pages);
+        } else {
+            rayon::join(|| self.divide_range(low, low_pages), || self.divide_range(high, high_pages));
+        }
+    }
+}
+
+/// Orders rows along an axis, equal coordinates by row.
+pub fn axis_key<E: Placed>(entry: &E, axis: usize) -> u64 {
+    u64::from(float_key(entry.point()[axis])) << 32 | u64::from(entry.row())
+}
+
+/// The box of some points.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PointBox {
+    /// Lower corner; above `hi` without points.
+    pub lo: [f32; 3],
+    /// Upper corner.
+    pub hi: [f32; 3],
+}
+
+impl PointBox {
+    /// No points.
+    pub const EMPTY: PointBox = PointBox { lo: [f32::INFINITY; 3], hi: [f32::NEG_INFINITY; 3] };
+
+    /// The box of all entries.
+    pub fn of<E: Placed>(entries: &[E]) -> PointBox {
+        if entries.len() >= 8 * SERIAL_BELOW {
+            let parts = entries.par_chunks(SERIAL_BELOW).map(PointBox::of);
+            return parts.reduce(|| PointBox::EMPTY, PointBox::and);
+        }
+        let mut all = PointBox::EMPTY;
+        entries.iter().for_each(|e| all.add(e.point()));
+        all
+    }
+
+    /// Makes room for a point.
+    pub fn add(&mut self, point: [f32; 3]) {
+        for i in 0..3 {
+            self.lo[i] = self.lo[i].min(point[i]);
+            self.hi[i] = self.hi[i].max(point[i]);
+        }
+    }
+
+    /// The box of both.
+    #[must_use]
+    pub fn and(mut self, other: PointBox) -> PointBox {
+        for i in 0..3 {
+            self.lo[i] = self.lo[i].min(other.lo[i]);
+            self.hi[i] = self.hi[i].max(other.hi[i]);
+        }
+        self
+    }
+
+    /// The axis along which the box is longest; the first of equal ones.
+    pub fn longest_axis(&self) -> usize {
+        let extent = |i: usize| self.hi[i] - self.lo[i];
+        (1..3).fold(0, |widest, i| if extent(i) > extent(widest) { i } else { widest })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::rng::{Purpose, Stream};
+
+    fn cloud(rows: usize) -> (Vec<f32>, Vec<f32>) {
+        let mut draws = Stream::new(1, Purpose::Test, rows as u64, 7);
+        // A third of the coordinates on a coarse lattice: many ties.
+        let mean = |d: &mut Stream| if d.below(3) == 0 { d.below(5) as f32 } else { (d.normal() * 3.0) as f32 };
+        let means = (0..rows * 3).map(|i| mean(&mut draws) * [1.0, 4.0, 0.5][i % 3]).collect();
+        let scales = (0..rows * 3).map(|_| (draws.below(64) as f32 - 300.0) * 0.02).collect();
+        (means, scales)
+    }
+
+    /// The definition: sort along the axis, cut, again.
+    fn plainly(
+        means: &[f32],
+        mut rows: Vec<usize>,
+        pages: usize,
+        share: &dyn Fn(usize) -> usize,
+        first: usize,
+    ) -> Vec<Vec<u32>> {
+        if pages == 1 {
+            rows.sort_unstable();
+            return vec![rows.iter().map(|&row| row as u32).collect()];
+        }
+        let extent = |i: usize| {
+            let of = |pick: fn(f32, f32) -> f32, start: f32| rows.iter().fold(start, |a, &r| pick(a, means[r * 3 + i]));
+            of(f32::max, f32::NEG_INFINITY) - of(f32::min, f32::INFINITY)
+        };
+        let mut axis = 0;
+        (1..3).for_each(|i| {
+            if extent(i) > extent(axis) {
+                axis = i
+            }
+        });
+        rows.sort_by(|&a, &b| means[a * 3 + axis].total_cmp(&means[b * 3 + axis]).then(a.cmp(&b)));
+        let high = rows.split_off(share(first + pages / 2) - share(first));
+        let mut all = plainly(means, rows, pages / 2, share, first);
+        all.extend(plainly(means, high, pages - pages / 2, share, first + pages / 2));
+        all
+    }
+
+    #[test]
+    fn pages_are_those_of_sorting_and_cutting_and_giants_are_apart() {
+        for (rows, fill) in [(1, 4), (7, 4), (1000, 7), (1000, 1000), (23_456, 100), (70_000, 716)] {
+            let (means, scales) = cloud(rows);
+            let size = |row: usize| scales[row * 3..row * 3 + 3].iter().copied().fold(f32::NEG_INFINITY, f32::max);
+            let mut by_size: Vec<usize> = (0..rows).collect();
+            by_size.sort_by(|&a, &b| size(b).total_cmp(&size(a)).then(a.cmp(&b)));
+            let mut want = Vec::new();
+            for part in [&by_size[rows / 200..], &by_size[..rows / 200]] {
+                let (n, pages) = (part.len(), part.len().div_ceil(fill));
+                if pages > 0 {
+                    want.extend(plainly(&means, part.to_vec(), pages, &|p| n * p / pages, 0));
+                }
+            }
+            for threads in [1, 3] {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+                let got = pool.map(|pool| pool.install(|| partition(&means, &scales, fill)));
+                let got: Vec<Vec<u32>> = got.iter().flat_map(|p| p.iter().map(<[u32]>::to_vec)).collect();
+                assert!(got == want, "{rows} rows, {fill} a page, {threads} threads");
+            }
+            assert!(want.iter().all(|page| page.len() <= fill && !page.is_empty()));
+        }
+        assert_eq!(partition(&[], &[], 5).pages(), 0);
+    }
+
+    #[test]
+    fn pages_start_with_room_when_they_are_going_to_grow() {
+        assert_eq!((first_fill(1024, false), first_fill(1024, true), first_fill(1, true)), (1024, 716, 1));
+    }
+}

@@ -1,0 +1,223 @@
+//! A whole run of the cache before it happens: what every step reads and writes, and how long the run waits for it.
+//!
+//! [`replay`] takes steps through a [`Plan`] and a [`CacheModel`]. With [`Policy::Farthest`] and a plan that looks at
+//! least two epochs ahead it reads Belady's bound: no cache with that many frames can read fewer pages for the same
+//! views in the same order.
+//!
+//! The model of time: one drive that serves one request after the other, reads in the order of steps, each preceded by
+//! the writes that free its frames; reads of coming steps start as early as the read-ahead in bytes allows; a step takes
+//! the same time everywhere. What a run waits for is the sum over steps of what is still missing when they could start.
+//!
+//! Invariants: 1. nothing here knows clocks or files: the same input gives the same report; 2. bytes are counted when a
+//! page moves, whole pages only; every page that leaves was changed and is written, unless its share says otherwise.
+
+use super::model::{CacheModel, Policy, StepChange, TooFewFrames};
+use super::order::ViewOrder;
+use super::plan::Plan;
+use super::visibility::ViewPages;
+use crate::base::ids::PageNo;
+use std::ops::Range;
+
+/// Steps of the window whose heaviest place is reported.
+pub const WINDOW_STEPS: usize = 20;
+
+/// What is simulated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ReplayOptions {
+    /// Frames of the cache.
+    pub frames: usize,
+    /// Which page leaves first.
+    pub policy: Policy,
+    /// Steps to go through.
+    pub steps: u32,
+    /// Bytes that the plan may take: fewer let it look less far.
+    pub plan_bytes: u64,
+}
+
+/// One step.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct StepTraffic {
+    /// Pages needed.
+    pub pages: u32,
+    /// Of these, pages that were read for it.
+    pub pages_read: u32,
+    /// Bytes of these.
+    pub bytes_read: u64,
+    /// Bytes of the pages that left for it.
+    pub bytes_written: u64,
+}
+
+/// All steps of a replay.
+#[derive(Debug, Clone, Default)]
+pub struct Replay {
+    /// By step.
+    pub steps: Vec<StepTraffic>,
+    /// Steps of an epoch.
+    pub views: usize,
+    /// Whether every next use was known whenever a page left: then reads under [`Policy::Farthest`] are Belady's bound.
+    pub is_exact: bool,
+}
+
+/// Goes through the steps. `page_bytes` are bytes on disk by page; pages that are needed but not listed count nothing.
+///
+/// # Errors
+/// A view needs more pages than there are frames.
+pub fn replay(
+    views: &ViewPages,
+    page_bytes: &[u32],
+    order: &ViewOrder,
+    options: &ReplayOptions,
+) -> Result<Replay, TooFewFrames> {
+    let mut coming = order.clone();
+    let mut plan = Plan::new(0, options.plan_bytes);
+    let mut cache = CacheModel::new(options.frames, options.policy);
+    let mut change = StepChange::default();
+    // Each page is needed in every epoch, so its next use lies less than two epochs ahead.
+    let reach = 2 * views.views() as u32;
+    let mut is_exact = true;
+    let bytes = |pages: &[PageNo]| -> u64 {
+        pages.iter().map(|p| page_bytes.get(p.index()).map_or(0, |&b| u64::from(b))).sum()
+    };
+    let (mut pages, mut steps) = (Vec::new(), Vec::with_capacity(options.steps as usize));
+    for step in 0..options.steps {
+        // The run ends; what would come after it is not needed by anyone.
+        while plan.steps().end < options.steps.min(step.saturating_add(reach)) {
+            if !plan.push(views.of(coming.view_at(plan.steps().end))) {
+                is_exact = false;
+                break;
+            }
+        }
+        pages.clear();
+        pages.extend(plan.pages(step));
+        cache.step(step, &pages, |page| plan.next_use(page, step + 1), &mut change)?;
+        steps.push(StepTraffic {
+            pages: pages.len() as u32,
+            pages_read: change.admit.len() as u32,
+            bytes_read: bytes(&change.admit),
+            bytes_written: bytes(&change.evict),
+        });
+        plan.pop();
+    }
+    Ok(Replay { steps, views: views.views(), is_exact })
+}
+
+/// What a drive does and how long a step takes without it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DriveModel {
+    /// Bytes per second.
+    pub read_rate: f64,
+    /// Bytes per second.
+    pub write_rate: f64,
+    /// Seconds of a step that waits for nothing.
+    pub step_seconds: f64,
+    /// Bytes that may be read before the step before theirs has begun: reads go further ahead only within them.
+    pub ahead_bytes: u64,
+}
+
+/// Waiting for the drive.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Stall {
+    /// Seconds, all steps together.
+    pub seconds: f64,
+    /// Of the worst step.
+    pub worst_seconds: f64,
+    /// Steps that wait.
+    pub steps: u32,
+}
+
+/// Figures over some steps.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Figures {
+    /// How many steps.
+    pub steps: u32,
+    /// Pages needed by a step, mean.
+    pub pages_per_step: f64,
+    /// Share of the needed pages that are in memory already.
+    pub hit_rate: f64,
+    /// Bytes read by a step, mean.
+    pub read_per_step: f64,
+    /// Bytes written by a step, mean.
+    pub written_per_step: f64,
+    /// Share of all reads that falls on the heaviest twentieth of the steps.
+    pub heaviest_share: f64,
+    /// First of the [`WINDOW_STEPS`] steps in a row that move most.
+    pub worst_window: u32,
+    /// Bytes that these read and write, per step.
+    pub worst_per_step: f64,
+}
+
+impl Replay {
+    /// Steps after the first epoch, in which the cache fills and everything is read once; all if there are no others.
+    pub fn steady(&self) -> Range<usize> {
+        let first = if self.steps.len() > self.views { self.views } else { 0 };
+        first..self.steps.len()
+    }
+
+    /// Bytes read and written by all steps.
+    pub fn totals(&self) -> (u64, u64) {
+        self.steps.iter().fold((0, 0), |(read, written), s| (read + s.bytes_read, written + s.bytes_written))
+    }
+
+    /// Figures over a range of steps.
+    pub fn figures(&self, range: Range<usize>) -> Figures {
+        let steps = &self.steps[range.clone()];
+        if steps.is_empty() {
+            return Figures::default();
+        }
+        let count = steps.len() as f64;
+        let sum = |of: &dyn Fn(&StepTraffic) -> u64| steps.iter().map(of).sum::<u64>() as f64;
+        let pages = sum(&|s| u64::from(s.pages));
+        let read = sum(&|s| s.bytes_read);
+        let mut heaviest: Vec<u64> = steps.iter().map(|s| s.bytes_read).collect();
+        heaviest.sort_unstable_by(|a, b| b.cmp(a));
+        let heavy: u64 = heaviest[..steps.len().div_ceil(20)].iter().sum();
+        let width = WINDOW_STEPS.min(steps.len());
+        let moved: Vec<u64> = steps.iter().map(|s| s.bytes_read + s.bytes_written).collect();
+        let mut window: u64 = moved[..width].iter().sum();
+        let mut worst = (window, 0);
+        for first in 1..=steps.len() - width {
+            window = window - moved[first - 1] + moved[first + width - 1];
+            if window > worst.0 {
+                worst = (window, first);
+            }
+        }
+        Figures {
+            steps: steps.len() as u32,
+            pages_per_step: pages / count,
+            hit_rate: 1.0 - sum(&|s| u64::from(s.pages_read)) / pages.max(1.0),
+            read_per_step: read / count,
+            written_per_step: sum(&|s| s.bytes_written) / count,
+            heaviest_share: heavy as f64 / read.max(1.0),
+            worst_window: (range.start + worst.1) as u32,
+            worst_per_step: worst.0 as f64 / width as f64,
+        }
+    }
+
+    /// How long a range of steps waits for the drive. The first step's reads count as done: the run waits for them once,
+    /// before it begins.
+    pub fn stall(&self, range: Range<usize>, drive: &DriveModel) -> Stall {
+        let steps = &self.steps[range];
+        let mut stall = Stall::default();
+        // When each step began; its pages may be worked on until the next begins.
+        let mut began = vec![0.0f64; steps.len()];
+        let (mut drive_free, mut ahead, mut from) = (0.0f64, 0, 0);
+        for step in 1..steps.len() {
+            // Reads of this step may start when step `from` begins: from there to here no more bytes than allowed.
+            ahead += steps[step].bytes_read;
+            while from + 1 < step && ahead > drive.ahead_bytes {
+                from += 1;
+                ahead -= steps[from].bytes_read;
+            }
+            let StepTraffic { bytes_read, bytes_written, .. } = steps[step];
+            let busy = bytes_read as f64 / drive.read_rate + bytes_written as f64 / drive.write_rate;
+            drive_free = drive_free.max(began[from]) + busy;
+            let ready = began[step - 1] + drive.step_seconds;
+            let waits = if bytes_read > 0 { (drive_free - ready).max(0.0) } else { 0.0 };
+            began[step] = ready + waits;
+            stall.seconds += waits;
+            stall.worst_seconds = stall.worst_seconds.max(waits);
+            stall.steps += u32::from(waits > 0.0);
+        }
+        stall
+    }
+}

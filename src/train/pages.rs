@@ -1,0 +1,355 @@
+//! The rows of a run as pages: first pages, what all of them share (optimizer, event log, statistics, counts), and
+//! bringing pages to now.
+//!
+//! Invariants: 1. events reach a page when a training step pins it, and only then; everything else applies them to a
+//! copy. So what is applied when does not depend on frames, cadences of evaluation or saves; 2. after
+//! [`PagedScene::apply_pending`] every pinned page is stored with the degree in use; 3. `rows_bound` is at least the
+//! number of rows that there would be if every page had applied every event.
+
+use super::catch_up::{evaluate_all, gather, visible_rows};
+use super::step::WorkingSet;
+use super::trainer::TrainError;
+use crate::base::ids::{PageId, PageNo};
+use crate::config::limits::RunOptions;
+use crate::densify::replay::{PageEdit, PendingEvents, Replay};
+use crate::densify::stats::GradHistogram;
+use crate::optim::bounds::SplitLimits;
+use crate::optim::deferred::DeferredAdam;
+use crate::page::format::HEADER_BYTES;
+use crate::paging::error::PagingError;
+use crate::paging::pager::Pager;
+use crate::paging::pinned::PinnedPage;
+use crate::scene::camera::Camera;
+use crate::scene::columns::{Column, Columns};
+use crate::scene::events::{Event, EventKind, EventLog};
+use crate::scene::page_layout::{read_page, write_page};
+use crate::scene::page_meta::{PageBounds, PageMeta};
+use crate::scene::page_split::SplitTooDeep;
+use crate::scene::partition::{first_fill, partition};
+use crate::scene::rows::Rows;
+use crate::scene::state::SceneState;
+use rayon::prelude::*;
+
+/// Pages that are brought to now together: their copies are in memory at once.
+const PAGES_PER_BATCH: usize = 32;
+
+/// What all pages share.
+pub struct PageRules {
+    /// The optimizer.
+    pub adam: DeferredAdam,
+    events: EventLog,
+    seed: u64,
+    page_rows: usize,
+    /// When rows may split before they are seen again.
+    splits: SplitLimits,
+    sh_degree: u8,
+}
+
+/// Gets the rows of some pages, numbered through.
+type Visitor<'v, E> = dyn FnMut(&PageRules, &[Rows<'_>]) -> Result<(), E> + 'v;
+
+/// The pages of a run and what they share.
+pub struct PagedScene {
+    /// Where the pages are.
+    pub pager: Pager,
+    /// What they share.
+    pub rules: PageRules,
+    /// Statistics of rows since the last round.
+    pub histogram: GradHistogram,
+    rows: u64,
+    rows_bound: u64,
+}
+
+impl PageRules {
+    fn new(options: &RunOptions) -> PageRules {
+        PageRules {
+            adam: DeferredAdam::new(options.rates, options.adam, options.render.simd).with_moments(options.moments),
+            events: EventLog::default(),
+            seed: options.seed,
+            page_rows: options.page_rows,
+            splits: options.densify.map_or(SplitLimits::NEVER, |d| d.split_limits(options.scene_scale)),
+            sh_degree: options.sh_degree_at(0),
+        }
+    }
+
+    /// Degree in use, as the events raised it.
+    pub fn sh_degree(&self) -> u8 {
+        self.sh_degree
+    }
+
+    /// Bounds of rows that were changed, for the index.
+    pub(super) fn bounds(&self, rows: &Rows<'_>) -> PageBounds {
+        self.adam.page_bounds(rows, &self.splits)
+    }
+
+    fn pending(&self) -> PendingEvents<'_> {
+        PendingEvents::new(&self.adam, self.seed, self.page_rows, &self.events)
+    }
+
+    fn is_behind(&self, meta: &PageMeta) -> bool {
+        (meta.events_applied as usize) < self.events.len()
+    }
+
+    /// The entry of a page that was rewritten with these rows.
+    fn meta(&self, id: PageId, state: &SceneState) -> PageMeta {
+        PageMeta {
+            id,
+            rows: state.rows() as u32,
+            sh_degree: state.sh_degree(),
+            events_applied: self.events.len() as u32,
+            bounds: self.bounds(&state.view()),
+        }
+    }
+}
+
+impl PagedScene {
+    /// Pages of first Gaussians. Each row keeps its number in `columns` as its identity.
+    ///
+    /// # Errors
+    /// A page could not be stored.
+    pub fn new(columns: &Columns, pager: Pager, options: &RunOptions) -> Result<PagedScene, PagingError> {
+        let rows = columns.rows() as u64;
+        let mut scene = PagedScene {
+            pager,
+            rules: PageRules::new(options),
+            histogram: GradHistogram::default(),
+            rows,
+            rows_bound: rows,
+        };
+        scene.insert_first_pages(columns, options.densify.is_some())?;
+        Ok(scene)
+    }
+
+    fn insert_first_pages(&mut self, columns: &Columns, is_growing: bool) -> Result<(), PagingError> {
+        let fill = first_fill(self.rules.page_rows, is_growing);
+        let pages = partition(&columns.means, &columns.scales, fill);
+        for (index, rows) in pages.iter().enumerate() {
+            let state = first_rows(columns, rows, self.rules.sh_degree);
+            let meta = self.rules.meta(PageId::initial(index as u32), &state);
+            self.pager.insert(meta, |payload| {
+                write_page(&state, payload);
+            })?;
+        }
+        Ok(())
+    }
+
+    /// Rows in the pages as they are stored: late events are not counted.
+    pub fn rows(&self) -> u64 {
+        self.rows
+    }
+
+    /// No fewer than the rows that there would be if every page had applied every event.
+    pub fn rows_bound(&self) -> u64 {
+        self.rows_bound
+    }
+
+    /// The events so far.
+    pub fn events(&self) -> &EventLog {
+        &self.rules.events
+    }
+
+    /// Logs an event: pages apply it when they are next pinned by a step. A round is promised the growth of all rows
+    /// that may exceed its threshold, and clears the statistics.
+    pub fn log_event(&mut self, event: Event) {
+        self.rules.events.push(event);
+        match event.kind {
+            EventKind::RaiseShDegree { degree } => self.rules.sh_degree = degree,
+            EventKind::Densify(thresholds) => {
+                self.rows_bound += self.histogram.promised(thresholds.grow_grad2d);
+                self.histogram.clear();
+            }
+            EventKind::ResetOpacity { .. } => {}
+        }
+    }
+
+    /// Applies the events that the pinned pages miss. Pages that outgrow their capacity split, which takes frames; the
+    /// list stays ascending by id.
+    ///
+    /// # Errors
+    /// No frame could be had for a split, or a page cannot be split; it keeps its rows then.
+    pub fn apply_pending(&mut self, pages: &mut Vec<PinnedPage>) -> Result<(), TrainError> {
+        if pages.iter().all(|p| !self.rules.is_behind(&p.meta)) {
+            return Ok(());
+        }
+        let mut added = Vec::new();
+        let mut done = Ok(());
+        for batch in pages.chunks_mut(PAGES_PER_BATCH) {
+            let is_behind = |p: &&mut PinnedPage| self.rules.is_behind(&p.meta);
+            let mut behind: Vec<&mut PinnedPage> = batch.iter_mut().filter(is_behind).collect();
+            let pending = self.rules.pending();
+            let replays: Vec<Result<Replay, SplitTooDeep>> = behind
+                .par_iter_mut()
+                .map(|p| pending.apply(p.meta.id, p.meta.events_applied as usize, &mut p.rows_mut(0)))
+                .collect();
+            for (page, replay) in behind.into_iter().zip(replays) {
+                let stored = replay.map_err(TrainError::from).and_then(|r| self.store_replay(page, r, &mut added));
+                done = done.and(stored);
+            }
+            if done.is_err() {
+                break;
+            }
+        }
+        pages.append(&mut added);
+        pages.sort_unstable_by_key(|p| p.meta.id);
+        done
+    }
+
+    /// Takes over what became of a page; the parts that it split into but the first go to `added`.
+    fn store_replay(
+        &mut self,
+        page: &mut PinnedPage,
+        replay: Replay,
+        added: &mut Vec<PinnedPage>,
+    ) -> Result<(), TrainError> {
+        let Replay { edit, rounds, .. } = replay;
+        if let PageEdit::Replaced(parts) = &edit {
+            self.store_parts(page, parts, added)?;
+        } else {
+            page.meta.events_applied = self.rules.events.len() as u32;
+            if edit == PageEdit::InPlace {
+                page.meta.bounds = self.rules.bounds(&page.rows(0));
+            }
+        }
+        page.dirty = true;
+        for round in rounds {
+            self.rows = self.rows.saturating_add_signed(round.rows_change);
+            self.rows_bound = (self.rows_bound - round.promised).saturating_add_signed(round.rows_change);
+        }
+        Ok(())
+    }
+
+    fn store_parts(
+        &mut self,
+        page: &mut PinnedPage,
+        parts: &[(PageId, SceneState)],
+        added: &mut Vec<PinnedPage>,
+    ) -> Result<(), TrainError> {
+        let mut frames = Vec::new();
+        for _ in 1..parts.len() {
+            match self.pager.take_frame() {
+                Ok(frame) => frames.push(frame),
+                Err(error) => {
+                    frames.into_iter().for_each(|frame| self.pager.return_frame(frame));
+                    return Err(error.into());
+                }
+            }
+        }
+        let mut frames = frames.into_iter();
+        for (part, (id, state)) in parts.iter().enumerate() {
+            let meta = self.rules.meta(*id, state);
+            if part == 0 {
+                write_page(state, page.payload_mut());
+                page.meta = meta;
+            } else if let Some(mut frame) = frames.next() {
+                write_page(state, &mut frame.as_mut_slice()[HEADER_BYTES..]);
+                added.push(self.pager.add_split(meta, frame));
+            }
+        }
+        Ok(())
+    }
+
+    /// Collects into `working` the rows that `camera` may draw after `now` steps, as though their pages had been touched
+    /// then; stores nothing.
+    ///
+    /// # Errors
+    /// Pages could not be had.
+    pub fn gather_view(&mut self, camera: &Camera, now: u32, working: &mut WorkingSet) -> Result<(), PagingError> {
+        let pages = self.pager.pages_of_view(camera);
+        let WorkingSet { row_from_working, columns, .. } = working;
+        if columns.sh_degree != self.rules.sh_degree {
+            *columns = Columns::zeros(0, self.rules.sh_degree);
+        }
+        columns.resize(0);
+        let mut part = Columns::zeros(0, self.rules.sh_degree);
+        self.visit(&pages, &mut |rules, tables| {
+            visible_rows(tables, &rules.adam, now, camera, row_from_working);
+            gather(tables, rules.sh_degree, &rules.adam, now, row_from_working, &mut part);
+            append(columns, &part);
+            Ok::<(), PagingError>(())
+        })
+    }
+
+    /// Hands all rows as they are after `now` steps to `each`, part by part in the order of page ids; stores nothing.
+    ///
+    /// # Errors
+    /// Pages could not be had, or `each` failed.
+    pub fn for_all_rows<E: From<PagingError>>(
+        &mut self,
+        now: u32,
+        each: &mut dyn FnMut(&Columns) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let index = self.pager.index();
+        let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
+        pages.retain(|p| index[p.index()].rows > 0);
+        pages.sort_unstable_by_key(|p| index[p.index()].id);
+        self.visit(&pages, &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
+    }
+
+    /// Pins the pages batch by batch and hands their rows to `each`, with pending events applied to copies.
+    fn visit<E: From<PagingError>>(&mut self, pages: &[PageNo], each: &mut Visitor<'_, E>) -> Result<(), E> {
+        let batch = PAGES_PER_BATCH.min(self.pager.stats().frames_max).max(1);
+        for pages in pages.chunks(batch) {
+            let pinned = self.pager.acquire_pages(pages)?;
+            let rules = &self.rules;
+            let pending = rules.pending();
+            let copies: Vec<Option<SceneState>> = pinned
+                .par_iter()
+                .map(|page| {
+                    let mut state = rules.is_behind(&page.meta).then(|| read_page(&page.rows(0)))?;
+                    pending.apply_to_table(page.meta.events_applied as usize, &mut state);
+                    Some(state)
+                })
+                .collect();
+            let tables = pinned.iter().zip(&copies);
+            let mut tables: Vec<Rows<'_>> =
+                tables.map(|(page, copy)| copy.as_ref().map_or_else(|| page.rows(0), SceneState::view)).collect();
+            let mut first_row = 0;
+            for table in &mut tables {
+                table.first_row = first_row;
+                first_row += table.rows();
+            }
+            let done = each(rules, &tables);
+            drop(tables);
+            self.pager.release(pinned);
+            done?;
+        }
+        Ok(())
+    }
+}
+
+/// The rows of the pages, numbered through.
+pub fn numbered(pages: &[PinnedPage]) -> Vec<Rows<'_>> {
+    let mut first_row = 0;
+    let mut tables = Vec::with_capacity(pages.len());
+    for page in pages {
+        tables.push(page.rows(first_row));
+        first_row += page.meta.rows as usize;
+    }
+    tables
+}
+
+/// The listed rows of `columns` as fresh rows with their numbers as identities, stored with `sh_degree`: bands above it
+/// are left out.
+fn first_rows(columns: &Columns, rows: &[u32], sh_degree: u8) -> SceneState {
+    let mut out = Columns::zeros(rows.len(), sh_degree);
+    for column in Column::ALL {
+        let width = column.width(sh_degree);
+        if width == 0 {
+            continue;
+        }
+        for (to, &row) in out.column_mut(column).chunks_exact_mut(width).zip(rows) {
+            let from = columns.row(column, row as usize);
+            let kept = width.min(from.len());
+            to[..kept].copy_from_slice(&from[..kept]);
+        }
+    }
+    let mut state = SceneState::from_columns(out);
+    state.uid.iter_mut().zip(rows).for_each(|(uid, &row)| *uid = u64::from(row));
+    state
+}
+
+fn append(to: &mut Columns, more: &Columns) {
+    for column in Column::ALL {
+        to.column_mut(column).extend_from_slice(more.column(column));
+    }
+}

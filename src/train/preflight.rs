@@ -1,0 +1,244 @@
+//! Before the first step: what each tier will hold, whether that fits, and how many frames there are.
+//!
+//! Invariant: a run that cannot fit is refused here, with the numbers and the alternatives; what only might not fit,
+//! because the scene grows, is a warning.
+
+use super::memory::{MemoryEstimate, rows_at_most};
+use super::tiers::{PLAN_BYTES, Tiers};
+use super::trainer::Trainer;
+use crate::base::error::{InputError, InputResult};
+use crate::base::units::format_bytes;
+use crate::config::file::TrainConfig;
+use crate::dataset::loader::Dataset;
+use crate::scene::camera::Camera;
+use crate::scene::partition::first_fill;
+use crate::schedule::model::Policy;
+use crate::schedule::order::Order;
+use crate::schedule::replay::{ReplayOptions, replay};
+use crate::schedule::visibility::ViewPages;
+
+/// Bytes that a common drive of 500 GB is rated to take in its life.
+const ENDURANCE_BYTES: f64 = 300e12;
+/// Epochs that are played through to see what a run will write.
+const PLAYED_EPOCHS: u32 = 3;
+/// Slots that writes in flight take beside those of the pages.
+const SLOTS_IN_FLIGHT: u64 = 64;
+
+/// What a run needs and has of pages.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TierPlan {
+    /// Pages now, and as far as is known at most.
+    pub pages: [u64; 2],
+    /// Bytes of a frame and of a slot on the drive.
+    pub frame_bytes: u64,
+    /// Frames; `None` for as many as there are pages.
+    pub frames: Option<u64>,
+    /// Pages of the view that needs most, its name, and the mean over views.
+    pub largest_view: (u64, String, f64),
+    /// Bytes that the run is expected to write to the drive.
+    pub bytes_written: f64,
+    /// Free bytes of the drive, where one is used and the system tells.
+    pub free_bytes: Option<u64>,
+}
+
+/// Settles the frames and completes the estimates with them: [`super::memory::estimate`]'s, at the start and at most.
+///
+/// # Errors
+/// The budget or the drive is too small.
+pub fn settle(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &mut Trainer,
+    tiers: &Tiers,
+    host_mem: Option<u64>,
+    memory: &mut [MemoryEstimate; 2],
+) -> InputResult<TierPlan> {
+    let index = trainer.scene.pager.index().len() as u64;
+    let rows_max = rows_at_most(config, trainer.scene.rows());
+    let fill = first_fill(config.page_rows as usize, config.strategy != "none") as u64;
+    let pages_max = index.max(rows_max.div_ceil(fill));
+    let frame_bytes = trainer.scene.pager.frame_bytes() as u64;
+    let largest_view = largest_view(dataset, trainer);
+    let mut plan = TierPlan {
+        pages: [index, pages_max],
+        frame_bytes,
+        frames: None,
+        bytes_written: 0.0,
+        free_bytes: tiers.free_bytes()?,
+        largest_view,
+    };
+    if trainer.scene.pager.stats().frames_max == usize::MAX {
+        check_in_memory(memory, host_mem)?;
+        return Ok(plan);
+    }
+    let staging = PLAN_BYTES as u64 + trainer.scene.pager.prefetch_bytes() as u64;
+    memory.iter_mut().for_each(|m| m.staging = staging);
+    let frames = match config.frames {
+        // By what is known for certain: the cap may never be reached.
+        0 => frames_of_budget(&plan, host_mem, &memory[0])?,
+        frames => u64::from(frames),
+    };
+    check_view(&plan, frames)?;
+    trainer.scene.pager.allow_frames(frames as usize);
+    plan.frames = Some(frames);
+    memory.iter_mut().for_each(|m| m.frames = m.frames.min(frames * frame_bytes));
+    if config.view_order == "auto" {
+        trainer.set_view_order(auto_order(frames, &plan), dataset);
+    }
+    plan.bytes_written = bytes_written(config, dataset, trainer, frames as usize);
+    check_drive(&plan, tiers)?;
+    Ok(plan)
+}
+
+/// A shuffle where all pages fit, else groups of views small enough for the pages of each to stay in memory: about four
+/// times as many groups as the scene is larger than memory.
+fn auto_order(frames: u64, plan: &TierPlan) -> Order {
+    if frames >= plan.pages[1] {
+        return Order::Shuffle;
+    }
+    Order::Groups((4 * plan.pages[0].max(frames)).div_ceil(frames.max(1)).clamp(4, 400) as u32)
+}
+
+/// Bytes that the run will write to the drive: some epochs of it played through with the pages as they are now.
+fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, frames: usize) -> f64 {
+    let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
+    let index = trainer.scene.pager.index();
+    let policy = if config.evict == "lru" { Policy::LeastRecent } else { Policy::Farthest };
+    let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
+    let options = ReplayOptions { frames, policy, steps, plan_bytes: PLAN_BYTES as u64 };
+    let page_bytes = vec![trainer.scene.pager.frame_bytes() as u32; index.len()];
+    let played = replay(&ViewPages::new(index, &cameras), &page_bytes, trainer.view_order(), &options);
+    let written: u64 = played.map_or(0, |p| p.steps.iter().map(|s| s.bytes_written).sum());
+    written as f64 * f64::from(config.steps) / f64::from(steps.max(1))
+}
+
+/// The training view that needs most pages by the bounds as they are now. Evaluation takes its views page by page.
+fn largest_view(dataset: &Dataset, trainer: &Trainer) -> (u64, String, f64) {
+    let mut largest = (0, String::new());
+    let mut sum = 0;
+    let views = dataset.train_views();
+    for view in views.iter().map(|&v| &dataset.views[v]) {
+        let pages = trainer.scene.pager.pages_of_view(&view.camera).len() as u64;
+        sum += pages;
+        if pages > largest.0 {
+            largest = (pages, view.name.clone());
+        }
+    }
+    (largest.0, largest.1, sum as f64 / views.len().max(1) as f64)
+}
+
+fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -> InputResult<()> {
+    let Some(budget) = host_mem else { return Ok(()) };
+    if start.total() > budget {
+        let problem = format!(
+            "{} are too little: the scene takes about {} in memory ({} of Gaussians)",
+            format_bytes(budget),
+            format_bytes(start.total()),
+            format_bytes(start.frames)
+        );
+        let remedy = "name a folder on a fast drive with --spill-dir, raise --host-mem, or lower --image-cache, \
+                      --sh-degree or the size of the photos";
+        return Err(InputError::new("--host-mem", problem, remedy));
+    }
+    if most.total() > budget {
+        eprintln!(
+            "warning: the run may need {}, but has {}: lower --max-gaussians, --image-cache, --sh-degree or the size \
+             of the photos, or name a folder on a fast drive with --spill-dir",
+            format_bytes(most.total()),
+            format_bytes(budget)
+        );
+    }
+    Ok(())
+}
+
+fn frames_of_budget(plan: &TierPlan, host_mem: Option<u64>, memory: &MemoryEstimate) -> InputResult<u64> {
+    // Where the system tells nothing, everything fits until it does not.
+    let Some(budget) = host_mem else { return Ok(plan.pages[1]) };
+    let frames = budget.saturating_sub(memory.fixed()) / plan.frame_bytes;
+    let (needed, view, _) = &plan.largest_view;
+    if frames >= *needed {
+        return Ok(frames.min(plan.pages[1].max(1)));
+    }
+    let problem = format!(
+        "{} are too little: {} go to one view, photos, staging and tables, which leaves {frames} pages of {}, but the \
+         view {view} needs {needed}",
+        format_bytes(budget),
+        format_bytes(memory.fixed()),
+        format_bytes(plan.frame_bytes)
+    );
+    let least = memory.fixed() + needed * plan.frame_bytes;
+    let remedy = format!(
+        "give at least {}, or lower --image-cache, --prefetch-bytes, --page-rows, --sh-degree or the size of the photos",
+        format_bytes(least + least / 50)
+    );
+    Err(InputError::new("--host-mem", problem, remedy))
+}
+
+fn check_view(plan: &TierPlan, frames: u64) -> InputResult<()> {
+    let (needed, view, _) = &plan.largest_view;
+    if frames >= *needed {
+        return Ok(());
+    }
+    let problem = format!("{frames} are too few: the view {view} needs {needed} pages at once");
+    Err(InputError::new("--frames", problem, format!("give at least {needed}; views may come to need more")))
+}
+
+fn check_drive(plan: &TierPlan, tiers: &Tiers) -> InputResult<()> {
+    let Some(free) = plan.free_bytes.filter(|_| tiers.spills()) else { return Ok(()) };
+    let bytes = |pages: u64| (pages + SLOTS_IN_FLIGHT) * plan.frame_bytes;
+    let [now, most] = plan.pages.map(bytes);
+    if free < now {
+        let problem = format!(
+            "the drive has {} free, but {} pages of {} may have to lie there",
+            format_bytes(free),
+            plan.pages[0],
+            format_bytes(plan.frame_bytes)
+        );
+        let remedy = "free space on it, choose another drive, or lower --sh-degree";
+        return Err(InputError::new("--spill-dir", problem, remedy));
+    }
+    if free < most {
+        eprintln!(
+            "warning: the scene may grow to {} on the drive, which has {} free: lower --max-gaussians",
+            format_bytes(most),
+            format_bytes(free)
+        );
+    }
+    Ok(())
+}
+
+/// The tiers' part of what is said at the start.
+pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> String {
+    let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
+    let (largest, _, mean) = &plan.largest_view;
+    let mut text = format!(
+        "pages   {} of up to {}; a view needs {mean:.0} on average, {largest} at most\n",
+        plan.pages[0],
+        format_bytes(plan.frame_bytes)
+    );
+    let frames = match plan.frames {
+        None => String::from("Gaussians with their optimizer state"),
+        Some(frames) => format!("{frames} frames of pages"),
+    };
+    text.push_str(&format!("memory  about {} at the peak\n", format_bytes(memory.total())));
+    text.push_str(&part(&frames, memory.frames));
+    text.push_str(&part("one view: rows, gradients, images", memory.view));
+    text.push_str(&part("decoded photos (--image-cache)", memory.targets));
+    if memory.staging > 0 {
+        text.push_str(&part("pages read and written ahead, and the plan", memory.staging));
+    }
+    text.push_str(&part("index of the pages", memory.index));
+    text.push_str(&part("program and tables", memory.base));
+    if tiers.spills() {
+        text.push_str(&format!(
+            "drive   {} of pages by {} ({}), {} free; about {} to be written, {:.2} % of what a common drive is rated for\n",
+            format_bytes(plan.pages[0] * plan.frame_bytes),
+            tiers.engine,
+            tiers.codec,
+            plan.free_bytes.map_or(String::from("unknown"), format_bytes),
+            format_bytes(plan.bytes_written as u64),
+            100.0 * plan.bytes_written / ENDURANCE_BYTES
+        ));
+    }
+    text
+}

@@ -1,0 +1,95 @@
+//! The store survives power failures at any point: the real store, commits and page map over a simulated disk.
+//!
+//! Every push runs tens of thousands of crashes; `GSSCALE_CRASHES=5000000` runs as many as it says.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+
+mod decay;
+mod disk;
+mod engine;
+mod life;
+#[cfg(debug_assertions)]
+mod mutants;
+mod oracle;
+mod random;
+mod script;
+mod tamper;
+
+use random::{Counts, run_seed};
+use std::time::Instant;
+
+/// Crashes of every push.
+const CRASHES: u64 = 50_000;
+
+/// Crashes within which every mutant must be noticed.
+#[cfg(debug_assertions)]
+const MUTANT_CRASHES: u64 = 20_000;
+
+/// Panics inside the map's library become errors of the store; their messages would only hide those of the tests.
+fn hush_library_panics() {
+    static ONCE: std::sync::Once = std::sync::Once::new();
+    ONCE.call_once(|| {
+        let default = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |info| {
+            let is_mutant = std::thread::current().name() == Some("mutant");
+            if !is_mutant && !info.location().is_some_and(|l| l.file().contains("redb")) {
+                default(info);
+            }
+        }));
+    });
+}
+
+#[test]
+fn no_acknowledged_commit_is_lost_and_no_wrong_byte_returned() {
+    hush_library_panics();
+    let wanted = std::env::var("GSSCALE_CRASHES").ok().and_then(|n| n.parse().ok()).unwrap_or(CRASHES);
+    let first = std::env::var("GSSCALE_CRASH_SEED").ok().and_then(|n| n.parse().ok()).unwrap_or(0);
+    let start = Instant::now();
+    let mut counts = Counts::default();
+    for seed in first.. {
+        if counts.crashes >= wanted {
+            break;
+        }
+        if let Err(what) = run_seed(seed, &mut counts) {
+            panic!("after {} crashes: {what}", counts.crashes);
+        }
+    }
+    println!("{counts:?} in {:.1} s", start.elapsed().as_secs_f64());
+}
+
+#[test]
+#[cfg(debug_assertions)]
+fn every_mutant_is_noticed() {
+    hush_library_panics();
+    let hunters = std::thread::Builder::new().name("mutant".to_string()).spawn(|| {
+        let mut survivors = Vec::new();
+        for &mutant in mutants::MUTANTS {
+            match mutants::hunt(mutant, MUTANT_CRASHES) {
+                Some((crashes, what)) => {
+                    println!("{mutant:?}: {crashes} crashes: {}", what.lines().next().unwrap_or(""))
+                }
+                None => survivors.push(mutant),
+            }
+        }
+        survivors
+    });
+    let survivors = hunters.unwrap().join().unwrap();
+    assert!(survivors.is_empty(), "not noticed: {survivors:?}");
+}
+
+#[test]
+fn every_crash_point_of_a_small_run_opens_at_an_acknowledged_state() {
+    hush_library_panics();
+    let start = Instant::now();
+    let states = script::every_crash_point().unwrap_or_else(|what| panic!("{what}"));
+    println!("{states} states after crashes in {:.1} s", start.elapsed().as_secs_f64());
+    assert!(states > 5_000, "{states}");
+}
+
+#[test]
+fn every_call_of_a_small_run_may_fail() {
+    hush_library_panics();
+    let start = Instant::now();
+    let cases = script::every_call_fails().unwrap_or_else(|what| panic!("{what}"));
+    println!("{cases} failing calls in {:.1} s", start.elapsed().as_secs_f64());
+    assert!(cases > 2_000, "{cases}");
+}

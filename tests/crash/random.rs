@@ -1,0 +1,139 @@
+//! Lives by chance: seeds, each several lives with power failures, injected errors, kills, rollbacks and decay between.
+
+use crate::decay;
+use crate::disk::{Disk, Fault, FaultPlan, Rng, Survival};
+use crate::life::{CONFIG, End, end_of, open};
+use crate::oracle::{Acknowledged, Oracle};
+use gsscale::page::commit::Commits;
+
+/// What happened so far.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Counts {
+    pub seeds: u64,
+    pub crashes: u64,
+    pub kills: u64,
+    pub commits: u64,
+    pub faults: u64,
+    pub decays: u64,
+    pub decays_noticed: u64,
+}
+
+const LIVES: u64 = 6;
+const STEPS: u64 = 40;
+
+/// One seed. An error is a violation.
+pub fn run_seed(seed: u64, counts: &mut Counts) -> Result<(), String> {
+    let mut rng = Rng(seed);
+    let disk = Disk::new(rng.next());
+    let mut oracle = Oracle::default();
+    let mut past = disk.fork();
+    counts.seeds += 1;
+    for life in 0..LIVES {
+        prepare(&disk, &mut rng, life);
+        let before = disk.faults_given();
+        let ended = live(&disk, &mut oracle, &mut rng);
+        counts.faults += disk.faults_given() - before;
+        match ended.map_err(|end| end_of(&disk, end)) {
+            Err(End::Violation(what)) => return Err(format!("seed {seed} life {life}: {what}")),
+            Ok(()) | Err(End::Stopped) => {}
+        }
+        if rng.one_in(6) {
+            disk.process_killed();
+            counts.kills += 1;
+        } else {
+            disk.power_cycle(survival(&mut rng));
+            counts.crashes += 1;
+        }
+        if rng.one_in(4) {
+            let noticed = decay::spoil_and_open(&disk, &past, &oracle, &mut rng);
+            counts.decays += 1;
+            counts.decays_noticed += u64::from(noticed.map_err(|what| format!("seed {seed} life {life}: {what}"))?);
+        }
+        if rng.one_in(3) {
+            past = disk.fork();
+        }
+        if rng.one_in(8) {
+            roll_back(&disk, &mut oracle, &mut rng, counts)
+                .map_err(|what| format!("seed {seed} life {life}: {what}"))?;
+        }
+    }
+    counts.commits += oracle.commits;
+    // A last, quiet opening.
+    disk.process_killed();
+    match open(&disk, &mut oracle, rng.next()) {
+        Err(End::Violation(what)) => Err(format!("seed {seed} at the end: {what}")),
+        Err(End::Stopped) => Err(format!("seed {seed}: the store does not open on a healthy disk")),
+        Ok(_) => Ok(()),
+    }
+}
+
+fn survival(rng: &mut Rng) -> Survival {
+    match rng.below(8) {
+        0 => Survival::Nothing,
+        1 => Survival::Everything,
+        2 => Survival::First(rng.below(30) as usize),
+        3 => Survival::Mask(rng.next()),
+        n => Survival::Sectors(rng.next(), [16, 512, 512, 4096][n as usize - 4], n == 5),
+    }
+}
+
+fn prepare(disk: &Disk, rng: &mut Rng, life: u64) {
+    disk.forget_faults();
+    if !rng.one_in(8) {
+        let span = if life == 0 { 80 } else { 150 };
+        disk.crash_at(disk.clock() + 1 + rng.below(span));
+    }
+    match rng.below(9) {
+        0 => disk.fail_sync(Some(rng.below(16))),
+        1 | 2 => {
+            let fault = [Fault::Full, Fault::Io, Fault::TooManyFiles, Fault::Short, Fault::Interrupted, Fault::Full];
+            let fault = fault[rng.below(6) as usize];
+            let at_call = disk.calls() + 1 + rng.below(300);
+            disk.set_fault(Some(FaultPlan { at_call, fault, calls: [1, 8, 40, u64::MAX][rng.below(4) as usize] }));
+        }
+        3 | 4 => disk.short_write(Some(rng.below(20))),
+        _ => {}
+    }
+}
+
+fn live(disk: &Disk, oracle: &mut Oracle, rng: &mut Rng) -> Result<(), End> {
+    let mut life = open(disk, oracle, rng.next())?;
+    if rng.one_in(4) {
+        life.commits.fill_reserve()?;
+    }
+    for _ in 0..rng.below(STEPS) + 4 {
+        life.step(disk, rng)?;
+        // Space comes back some time.
+        if rng.one_in(16) {
+            disk.end_shortage();
+        }
+    }
+    Ok(())
+}
+
+/// A tool rolls the store back; the power may fail meanwhile.
+fn roll_back(disk: &Disk, oracle: &mut Oracle, rng: &mut Rng, counts: &mut Counts) -> Result<(), String> {
+    disk.forget_faults();
+    let opened = match Commits::open(Box::new(disk.clone()), CONFIG) {
+        Ok(opened) => opened,
+        Err(_) if !oracle.is_created => return Ok(()),
+        Err(error) => return Err(format!("before a rollback: {error}")),
+    };
+    oracle.judge(&opened)?;
+    let kept: Vec<u64> = opened.commits.generations().kept().collect();
+    let Some(&to) = kept.get(rng.below(kept.len() as u64) as usize) else { return Ok(()) };
+    let change = |after: &mut Acknowledged| {
+        after.latest = to;
+        after.pins.retain(|_, generation| *generation <= to);
+    };
+    oracle.begin(change, None);
+    let mut after = oracle.acknowledged.clone();
+    change(&mut after);
+    disk.crash_at(disk.clock() + 1 + rng.below(20));
+    if opened.commits.rollback(to).is_ok() {
+        oracle.acknowledge(&after, &[])?;
+    }
+    disk.power_cycle(survival(rng));
+    counts.crashes += 1;
+    Ok(())
+}

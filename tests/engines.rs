@@ -1,0 +1,425 @@
+//! One suite for every engine that moves pages: what is written comes back whatever is in flight, and every buffer
+//! comes back whatever goes wrong. The system's refusals are real ones: limits, seccomp filters, files cut short.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+#![cfg(unix)]
+
+use gsscale::base::rng::{Purpose, Stream};
+use gsscale::page::buffer::{ALIGNMENT, PageBuffer};
+use gsscale::page::engine::{IoEngine, open_engine};
+use gsscale::page::memory_store::MemoryStore;
+use gsscale::page::mmap_store::MmapStore;
+use gsscale::page::pread_store::PreadStore;
+use gsscale::page::segment_files::segment_file_name;
+use gsscale::page::store::{Completion, Direction, PageStore, Place, Transfer};
+use rustix::process::{Resource, Rlimit, setrlimit};
+use std::io::ErrorKind;
+use std::path::Path;
+
+const SEGMENT: u64 = 8 << 20;
+
+type Open = fn(&Path) -> Box<dyn PageStore>;
+
+/// The engines that work on files, with and without the page cache, by name.
+fn file_engines() -> Vec<(&'static str, Open)> {
+    let mut engines: Vec<(&str, Open)> = vec![
+        ("pread", |folder| Box::new(PreadStore::open(folder, 6, true).unwrap())),
+        ("pread, buffered", |folder| Box::new(PreadStore::open(folder, 6, false).unwrap())),
+        ("mmap", |folder| Box::new(MmapStore::open(folder, 6).unwrap())),
+    ];
+    #[cfg(target_os = "linux")]
+    {
+        use gsscale::page::uring_store::UringStore;
+        match UringStore::open(&std::env::temp_dir(), 1, true) {
+            Ok(_) => {
+                // A ring of 4 is always full here.
+                engines.push(("uring", |folder| Box::new(UringStore::open(folder, 32, true).unwrap())));
+                engines.push(("uring of 4", |folder| Box::new(UringStore::open(folder, 4, true).unwrap())));
+                engines.push(("uring, buffered", |folder| Box::new(UringStore::open(folder, 32, false).unwrap())));
+            }
+            Err(error) => eprintln!("io_uring is left out: {error}"),
+        }
+    }
+    engines
+}
+
+fn all_engines() -> Vec<(&'static str, Open)> {
+    let mut engines = file_engines();
+    engines.push(("memory", |_| Box::new(MemoryStore::new())));
+    engines
+}
+
+fn transfer(token: u64, direction: Direction, segment: u32, offset: u64, buffer: PageBuffer) -> Transfer {
+    Transfer { token, direction, place: Place { segment, offset }, bytes: buffer.len(), buffer }
+}
+
+/// Carries out one transfer alone.
+fn move_one(store: &mut dyn PageStore, transfer: Transfer) -> Completion {
+    let mut done = Vec::new();
+    store.submit(transfer);
+    assert_eq!(store.in_flight(), 1);
+    while done.is_empty() {
+        store.complete(true, &mut done);
+    }
+    assert_eq!((done.len(), store.in_flight()), (1, 0));
+    done.remove(0)
+}
+
+fn random_buffer(draws: &mut Stream, bytes: usize) -> PageBuffer {
+    let mut buffer = PageBuffer::zeroed(bytes);
+    for word in buffer.as_mut_slice().chunks_exact_mut(8) {
+        word.copy_from_slice(&draws.next_u64().to_le_bytes());
+    }
+    buffer
+}
+
+/// What the segments should hold, and which bytes are on the way.
+struct Model {
+    segments: Vec<Vec<u8>>,
+    busy: Vec<(u64, Place, usize)>,
+}
+
+impl Model {
+    /// A place for `bytes` bytes that nothing in flight touches.
+    fn free_place(&self, draws: &mut Stream, bytes: usize) -> Option<Place> {
+        let segment = draws.below(self.segments.len() as u64) as u32;
+        let blocks = (SEGMENT - bytes as u64) / ALIGNMENT as u64 + 1;
+        let place = Place { segment, offset: draws.below(blocks) * ALIGNMENT as u64 };
+        let apart = |&(_, at, len): &(u64, Place, usize)| {
+            at.segment != segment || at.offset + len as u64 <= place.offset || place.offset + bytes as u64 <= at.offset
+        };
+        self.busy.iter().all(apart).then_some(place)
+    }
+
+    fn take(&mut self, completion: &Completion, engine: &str) {
+        let transfer = &completion.transfer;
+        let at = self.busy.iter().position(|b| b.0 == transfer.token).expect("a completion of its own transfer");
+        let (_, place, bytes) = self.busy.swap_remove(at);
+        assert_eq!((transfer.place, transfer.bytes), (place, bytes));
+        completion.result.as_ref().unwrap_or_else(|e| panic!("{engine}: {e}"));
+        if transfer.direction == Direction::Read {
+            let there = &self.segments[place.segment as usize][place.offset as usize..][..bytes];
+            assert!(transfer.buffer.as_slice()[..bytes] == *there, "{engine}: other bytes at {place:?}, {bytes}");
+        }
+    }
+}
+
+#[test]
+fn what_is_written_comes_back_with_many_in_flight() {
+    for (name, open) in all_engines() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut store = open(folder.path());
+        let mut draws = Stream::new(1, Purpose::Test, 0, 0);
+        let mut model = Model { segments: vec![vec![0; SEGMENT as usize]; 3], busy: Vec::new() };
+        for segment in 0..3 {
+            store.create_segment(segment, SEGMENT).unwrap();
+        }
+        let mut done = Vec::new();
+        for token in 0..400 {
+            // One block to 3 MiB, most of them odd numbers of blocks; some transfers end before their buffer does.
+            let blocks = if token % 7 == 0 { 257 + draws.below(512) } else { 1 + draws.below(120) };
+            let bytes = blocks as usize * ALIGNMENT;
+            let Some(place) = model.free_place(&mut draws, bytes) else { continue };
+            let mut buffer = random_buffer(&mut draws, bytes + ALIGNMENT * (token % 3) as usize);
+            let direction = if draws.below(2) == 0 { Direction::Read } else { Direction::Write };
+            if direction == Direction::Write {
+                let there = &mut model.segments[place.segment as usize][place.offset as usize..][..bytes];
+                there.copy_from_slice(&buffer.as_mut_slice()[..bytes]);
+            }
+            model.busy.push((token, place, bytes));
+            store.submit(Transfer { token, direction, place, bytes, buffer });
+            assert_eq!(store.in_flight(), model.busy.len());
+            let crowded = model.busy.len() > 24;
+            store.complete(crowded, &mut done);
+            assert!(!crowded || !done.is_empty(), "{name}: waiting brought nothing");
+            done.drain(..).for_each(|c| model.take(&c, name));
+        }
+        while store.in_flight() > 0 {
+            store.complete(true, &mut done);
+            done.drain(..).for_each(|c| model.take(&c, name));
+        }
+        assert!(model.busy.is_empty());
+        store.complete(true, &mut done);
+        assert!(done.is_empty(), "nothing is in flight, and waiting for it ends at once");
+        store.sync().unwrap();
+        drop(store);
+        if name != "memory" {
+            every_engine_reads(folder.path(), &model, name);
+        }
+    }
+}
+
+/// A folder written with one engine is opened with all.
+fn every_engine_reads(folder: &Path, model: &Model, writer: &str) {
+    for (name, open) in file_engines() {
+        let mut store = open(folder);
+        for (segment, bytes) in model.segments.iter().enumerate() {
+            store.create_segment(segment as u32, SEGMENT).unwrap();
+            let buffer = PageBuffer::zeroed(SEGMENT as usize);
+            let end = move_one(&mut *store, transfer(9, Direction::Read, segment as u32, 0, buffer));
+            end.result.unwrap();
+            assert!(end.transfer.buffer.as_slice() == *bytes, "{name} reads what {writer} wrote");
+        }
+    }
+}
+
+#[test]
+fn impossible_transfers_end_as_errors_with_their_buffers() {
+    for (name, open) in all_engines() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut store = open(folder.path());
+        store.create_segment(3, SEGMENT).unwrap();
+        store.create_segment(3, SEGMENT).unwrap();
+        assert_eq!(store.create_segment(3, SEGMENT / 2).unwrap_err().kind(), ErrorKind::AlreadyExists, "{name}");
+        let bytes = 3 << 20;
+        let cases = [
+            (2, 0, ErrorKind::NotFound),
+            (3, SEGMENT, ErrorKind::UnexpectedEof),
+            (3, SEGMENT - (2 << 20), ErrorKind::UnexpectedEof),
+            (3, u64::MAX - 4095, ErrorKind::UnexpectedEof),
+        ];
+        for (segment, offset, expected) in cases {
+            for direction in [Direction::Read, Direction::Write] {
+                let asked = transfer(7, direction, segment, offset, PageBuffer::zeroed(bytes));
+                let end = move_one(&mut *store, asked);
+                assert_eq!(end.result.unwrap_err().kind(), expected, "{name}, {segment} {offset} {direction:?}");
+                assert_eq!((end.transfer.token, end.transfer.buffer.len()), (7, bytes));
+            }
+        }
+        if name != "memory" {
+            let mut asked = transfer(8, Direction::Write, 3, 512, PageBuffer::zeroed(4096));
+            assert_eq!(move_one(&mut *store, asked).result.unwrap_err().kind(), ErrorKind::InvalidInput, "{name}");
+            asked = transfer(8, Direction::Read, 3, 0, PageBuffer::zeroed(4096));
+            asked.bytes = 8192;
+            assert_eq!(move_one(&mut *store, asked).result.unwrap_err().kind(), ErrorKind::InvalidInput, "{name}");
+            let length = std::fs::metadata(folder.path().join(segment_file_name(3))).unwrap().len();
+            assert_eq!(length, SEGMENT, "{name}: a write beyond the end made the file longer");
+        }
+        // After all that the store works.
+        let fresh = move_one(&mut *store, transfer(9, Direction::Read, 3, 4096, PageBuffer::zeroed(bytes)));
+        fresh.result.unwrap();
+        assert!(fresh.transfer.buffer.as_slice().iter().all(|&b| b == 0), "{name}: fresh space is zeros");
+        store.sync().unwrap();
+    }
+}
+
+/// Someone cuts or removes a file that is in use: an error or the bytes, never a signal.
+#[test]
+fn files_cut_short_or_removed_in_use_are_errors() {
+    for (name, open) in file_engines() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut store = open(folder.path());
+        for segment in 0..2 {
+            store.create_segment(segment, SEGMENT).unwrap();
+            let buffer = random_buffer(&mut Stream::new(2, Purpose::Test, 0, 0), SEGMENT as usize);
+            move_one(&mut *store, transfer(0, Direction::Write, segment, 0, buffer)).result.unwrap();
+            move_one(&mut *store, transfer(0, Direction::Read, segment, 0, PageBuffer::zeroed(4096))).result.unwrap();
+        }
+        let path = |segment| folder.path().join(segment_file_name(segment));
+        std::fs::OpenOptions::new().write(true).open(path(0)).unwrap().set_len(1 << 20).unwrap();
+        let end = move_one(&mut *store, transfer(5, Direction::Read, 0, 0, PageBuffer::zeroed(2 << 20)));
+        assert_eq!(end.result.unwrap_err().kind(), ErrorKind::UnexpectedEof, "{name}");
+        assert_eq!(end.transfer.buffer.len(), 2 << 20);
+        std::fs::remove_file(path(1)).unwrap();
+        let end = move_one(&mut *store, transfer(6, Direction::Read, 1, 0, PageBuffer::zeroed(2 << 20)));
+        assert_eq!((end.transfer.token, end.transfer.buffer.len()), (6, 2 << 20), "{name}");
+        drop(store);
+        let mut store = open(folder.path());
+        let end = move_one(&mut *store, transfer(7, Direction::Read, 1, 0, PageBuffer::zeroed(4096)));
+        assert_eq!(end.result.unwrap_err().kind(), ErrorKind::NotFound, "{name}");
+    }
+}
+
+#[test]
+fn dropping_a_store_carries_out_what_was_submitted() {
+    for (name, open) in file_engines() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut store = open(folder.path());
+        store.create_segment(0, SEGMENT).unwrap();
+        let mut draws = Stream::new(3, Purpose::Test, 0, 0);
+        let expected: Vec<PageBuffer> = (0..8).map(|_| random_buffer(&mut draws, 1 << 20)).collect();
+        let mut draws = Stream::new(3, Purpose::Test, 0, 0);
+        for token in 0..8 {
+            let buffer = random_buffer(&mut draws, 1 << 20);
+            store.submit(transfer(token, Direction::Write, 0, token << 20, buffer));
+        }
+        drop(store);
+        let mut store = open(folder.path());
+        for (i, bytes) in expected.iter().enumerate() {
+            let asked = transfer(0, Direction::Read, 0, (i as u64) << 20, PageBuffer::zeroed(1 << 20));
+            let end = move_one(&mut *store, asked);
+            assert!(end.transfer.buffer.as_slice() == bytes.as_slice(), "{name}: write {i} is lost");
+        }
+    }
+}
+
+/// A thread submits and ends; another takes the completions. (The kernel cancels what a ring's thread left behind.)
+#[test]
+fn transfers_outlive_the_thread_that_submitted_them() {
+    for (name, open) in all_engines() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut store = open(folder.path());
+        store.create_segment(0, SEGMENT).unwrap();
+        for round in 0..20u8 {
+            let submitting = std::thread::spawn(move || {
+                for token in 0..8 {
+                    let mut buffer = PageBuffer::zeroed(1 << 20);
+                    buffer.as_mut_slice().fill(round + token as u8);
+                    let direction = if round % 2 == 0 { Direction::Write } else { Direction::Read };
+                    store.submit(transfer(token, direction, 0, token << 20, buffer));
+                }
+                store
+            });
+            store = submitting.join().unwrap();
+            let mut done = Vec::new();
+            while store.in_flight() > 0 {
+                store.complete(true, &mut done);
+            }
+            assert_eq!(done.len(), 8);
+            for end in done {
+                end.result.unwrap_or_else(|e| panic!("{name}: {e}"));
+                let expected = round - round % 2 + end.transfer.token as u8;
+                assert!(end.transfer.buffer.as_slice().iter().all(|&b| b == expected), "{name}, round {round}");
+            }
+        }
+    }
+}
+
+/// Runs the test `name` of this file again in a process of its own, whose limits may be changed. True in that process.
+fn in_child(name: &str) -> bool {
+    if std::env::var_os("GSSCALE_TEST_CHILD").is_some() {
+        return true;
+    }
+    let mut child = std::process::Command::new(std::env::current_exe().unwrap());
+    let output = child.args(["--exact", name, "--nocapture"]).env("GSSCALE_TEST_CHILD", "1").output().unwrap();
+    let said = String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    assert!(said.contains("1 passed"), "the test is not there: {said}");
+    false
+}
+
+#[test]
+fn more_segments_than_open_files() {
+    if !in_child("more_segments_than_open_files") {
+        return;
+    }
+    setrlimit(Resource::Nofile, Rlimit { current: Some(64), maximum: Some(64) }).unwrap();
+    let segments = 150;
+    let folder = tempfile::tempdir().unwrap();
+    for (name, open) in file_engines() {
+        let mut store = open(folder.path());
+        for segment in 0..segments {
+            store.create_segment(segment, 16384).unwrap();
+        }
+        for direction in [Direction::Write, Direction::Read] {
+            let mut done = Vec::new();
+            for segment in 0..segments {
+                let mut buffer = PageBuffer::zeroed(8192);
+                if direction == Direction::Write {
+                    buffer.as_mut_slice().fill((segment as u8).wrapping_add(name.len() as u8));
+                }
+                store.submit(transfer(u64::from(segment), direction, segment, 4096, buffer));
+            }
+            while store.in_flight() > 0 {
+                store.complete(true, &mut done);
+            }
+            store.sync().unwrap_or_else(|e| panic!("{name}: {e}"));
+            assert_eq!(done.len(), segments as usize);
+            for end in done {
+                end.result.unwrap_or_else(|e| panic!("{name}: segment {}: {e}", end.transfer.token));
+                let expected = (end.transfer.token as u8).wrapping_add(name.len() as u8);
+                assert!(end.transfer.buffer.as_slice().iter().all(|&b| b == expected), "{name}");
+            }
+        }
+    }
+}
+
+/// The system refuses to write behind the first 2 MiB of any file, in the middle of a transfer.
+#[test]
+fn refused_writes_are_errors_with_their_buffers() {
+    if !in_child("refused_writes_are_errors_with_their_buffers") {
+        return;
+    }
+    // Without a handler the signal that comes with the refusal ends the process.
+    let told = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
+    signal_hook::flag::register(signal_hook::consts::SIGXFSZ, told).unwrap();
+    let engines = file_engines();
+    let stores: Vec<_> = engines
+        .iter()
+        .map(|(name, open)| {
+            let folder = tempfile::tempdir().unwrap();
+            let mut store = open(folder.path());
+            store.create_segment(0, SEGMENT).unwrap();
+            (name, folder, store)
+        })
+        .collect();
+    setrlimit(Resource::Fsize, Rlimit { current: Some(2 << 20), maximum: Some(2 << 20) }).unwrap();
+    for (name, _folder, mut store) in stores {
+        let end = move_one(&mut *store, transfer(1, Direction::Write, 0, 1 << 20, PageBuffer::zeroed(3 << 20)));
+        assert_eq!(end.result.unwrap_err().kind(), ErrorKind::FileTooLarge, "{name}");
+        assert_eq!(end.transfer.buffer.len(), 3 << 20);
+        let end = move_one(&mut *store, transfer(2, Direction::Write, 0, 0, PageBuffer::zeroed(2 << 20)));
+        end.result.unwrap_or_else(|e| panic!("{name}: {e}"));
+    }
+}
+
+#[test]
+fn auto_takes_what_works_and_says_what_does_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut opened = open_engine(IoEngine::Auto, folder.path(), 8).unwrap();
+    assert!(["uring", "pread"].contains(&opened.store.name()));
+    assert_eq!(opened.store.name() == "pread", !opened.notes.is_empty());
+    opened.store.create_segment(0, SEGMENT).unwrap();
+    for engine in [IoEngine::Pread, IoEngine::Mmap, IoEngine::Memory] {
+        let opened = open_engine(engine, folder.path(), 8).unwrap();
+        assert_eq!(opened.store.name(), engine.name());
+    }
+}
+
+/// Containers forbid io_uring with a seccomp filter; so does this thread to itself, and only to itself.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_refused_ring_falls_back_with_the_reason() {
+    use seccompiler::{BpfProgram, SeccompAction, SeccompFilter, apply_filter};
+    const SETUP: i64 = 425;
+    const ENTER: i64 = 426;
+    let cases = [(SETUP, 1, "Operation not permitted"), (SETUP, 38, "not implemented"), (ENTER, 1, "not permitted")];
+    for (call, errno, reason) in cases {
+        let refused = std::thread::spawn(move || {
+            let rules = [(call, Vec::new())].into_iter().collect();
+            let machine = std::env::consts::ARCH.try_into().unwrap();
+            let filter = SeccompFilter::new(rules, SeccompAction::Allow, SeccompAction::Errno(errno), machine);
+            let program: BpfProgram = filter.unwrap().try_into().unwrap();
+            apply_filter(&program).unwrap();
+            let folder = tempfile::tempdir().unwrap();
+            let mut opened = open_engine(IoEngine::Auto, folder.path(), 8).unwrap();
+            assert_eq!((opened.store.name(), opened.notes.len()), ("pread", 1));
+            assert!(opened.notes[0].contains(reason) && opened.notes[0].contains("pread"), "{:?}", opened.notes);
+            opened.store.create_segment(0, SEGMENT).unwrap();
+            let buffer = random_buffer(&mut Stream::new(4, Purpose::Test, 0, 0), 1 << 20);
+            move_one(&mut *opened.store, transfer(1, Direction::Write, 0, 0, buffer)).result.unwrap();
+            let by_name = open_engine(IoEngine::Uring, folder.path(), 8).err().unwrap().to_string();
+            assert!(by_name.contains(reason) && by_name.contains("--io auto"), "{by_name}");
+        });
+        refused.join().unwrap();
+    }
+}
+
+#[test]
+fn iotune_prints_lines_for_a_config_and_leaves_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let tune = |args: &[&str]| {
+        let mut program = std::process::Command::new(env!("CARGO_BIN_EXE_gsscale-iotune"));
+        program.arg(folder.path()).args(args).output().unwrap()
+    };
+    let output = tune(&["--file", "192MiB", "--seconds", "4", "--written", "64MiB"]);
+    let (said, errors) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{said}{errors}");
+    for key in ["io = \"", "page-rows = ", "spill-codec = \""] {
+        assert_eq!(said.lines().filter(|l| l.starts_with(key)).count(), 1, "{key} in: {said}");
+    }
+    let refused = tune(&["--file", "1023GiB"]);
+    let errors = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(errors.contains("are free") && errors.contains("remedy"), "{errors}");
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "nothing is left");
+}

@@ -1,0 +1,105 @@
+//! How much is read and written: as little as a cache of that size can, and never more because of what is done ahead.
+
+use super::world::{self, camera, config, store};
+use gsscale::base::ids::{PageId, PageNo};
+use gsscale::base::rng::{Purpose, Stream};
+use gsscale::cache::evict::EvictPolicy;
+use gsscale::page::codec::Codec;
+use gsscale::page::faulty_store::Faults;
+use gsscale::paging::pager::{Pager, PagerConfig};
+use gsscale::paging::stats::PagerStats;
+use gsscale::scene::camera::Camera;
+use gsscale::schedule::visibility::visible_pages;
+use std::collections::{BTreeMap, BTreeSet};
+
+const PAGES: u32 = 100;
+
+fn scene(pager: &mut Pager) {
+    for i in 0..PAGES {
+        let meta = world::meta(PageId::initial(i), f64::from(i), 3, 1);
+        pager.insert(meta, |payload| world::fill(payload, &meta, 0)).unwrap();
+    }
+}
+
+/// Views in groups of neighbours, as aerial flights have them.
+fn cameras() -> Vec<Camera> {
+    let mut draws = Stream::new(9, Purpose::Test, 1, 1);
+    (0..400).map(|i| camera(f64::from(i / 12 * 29 % 97) + draws.range(0.0, 8.0))).collect()
+}
+
+/// Steps that touch every page, or that only read; the whole future is known. Also the pages in memory at the start.
+fn drive(config: PagerConfig, cameras: &[Camera], touches: bool, calls: usize) -> (PagerStats, Vec<u32>) {
+    let mut pager = Pager::new(config, store(Codec::Raw, &Faults::new()));
+    scene(&mut pager);
+    let coming: Vec<&Camera> = cameras.iter().collect();
+    let before = pager.stats();
+    let start = (0..PAGES).filter(|&p| pager.is_in_memory(PageNo(p))).collect();
+    for (step, camera) in cameras.iter().enumerate() {
+        pager.look_ahead(step as u32, &coming[step..]);
+        let mut pages = pager.acquire(step as u32, camera).unwrap();
+        (0..calls).for_each(|_| pager.prefetch(step as u32));
+        pages.iter_mut().for_each(|p| p.dirty = touches);
+        pager.release(pages);
+    }
+    let after = pager.stats();
+    (PagerStats { pages_read: after.pages_read - before.pages_read, ..after }, start)
+}
+
+/// Pages that the best cache of `frames` frames reads: on a miss the page leaves whose next use is farthest. `start`
+/// are in memory at first.
+fn belady(views: &[Vec<u32>], frames: usize, start: &[u32]) -> u64 {
+    let mut uses: BTreeMap<u32, Vec<usize>> = BTreeMap::new();
+    views.iter().enumerate().for_each(|(s, v)| v.iter().for_each(|&p| uses.entry(p).or_default().push(s)));
+    let next = |page: u32, step: usize| uses[&page].iter().copied().find(|&s| s >= step).unwrap_or(usize::MAX);
+    let mut held: BTreeSet<u32> = start.iter().copied().collect();
+    let mut read = 0;
+    for (step, view) in views.iter().enumerate() {
+        for &page in view {
+            if held.contains(&page) {
+                continue;
+            }
+            if held.len() == frames {
+                let victim = held.iter().copied().filter(|p| !view.contains(p)).max_by_key(|&p| next(p, step));
+                held.remove(&victim.expect("frames for the view"));
+            }
+            held.insert(page);
+            read += 1;
+        }
+    }
+    read
+}
+
+fn pages_of(cameras: &[Camera]) -> Vec<Vec<u32>> {
+    let mut pager = Pager::in_memory(PagerConfig::in_memory(world::PAGE_ROWS, world::SH_DEGREE));
+    scene(&mut pager);
+    let mut pages = Vec::new();
+    let list = |camera: &Camera| {
+        visible_pages(pager.index(), camera, &mut pages);
+        pages.iter().map(|p| p.0).collect()
+    };
+    cameras.iter().map(list).collect()
+}
+
+#[test]
+fn reads_are_the_least_that_the_frames_allow() {
+    let cameras = cameras();
+    let views = pages_of(&cameras);
+    assert!(views.iter().flatten().collect::<BTreeSet<_>>().len() > 90);
+    for (frames, touches) in [12, 20, 35, 60].into_iter().flat_map(|f| [(f, true), (f, false)]) {
+        let read = |calls, prefetch_pages: usize, policy| {
+            let config = PagerConfig { prefetch_bytes: prefetch_pages * 8192, policy, ..config(frames) };
+            drive(config, &cameras, touches, calls)
+        };
+        let (asked, start) = read(0, 0, EvictPolicy::FarthestNextUse);
+        let least = belady(&views, frames, &start);
+        assert_eq!(asked.pages_read, least, "{frames} frames");
+        // Looking ahead may cost a page now and then that leaves early so that nobody waits.
+        let (ahead, _) = read(3, 16, EvictPolicy::FarthestNextUse);
+        assert!(ahead.pages_read >= least && ahead.pages_read <= least + least / 16, "{frames}: {least} {ahead:?}");
+        assert!(ahead.misses * 4 < asked.misses, "{frames}: {asked:?} {ahead:?}");
+        let (recent, _) = read(0, 0, EvictPolicy::LeastRecentlyUsed);
+        assert!(recent.pages_read > least, "{frames}: {recent:?}");
+        // The import wrote most pages once; what is only read is not written again.
+        assert!(touches || ahead.pages_written <= u64::from(PAGES), "{frames}: {ahead:?}");
+    }
+}

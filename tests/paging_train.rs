@@ -1,0 +1,138 @@
+//! Paging is invisible: whatever is in memory, however pages are read and written, and on any number of threads, a run
+//! writes the same bytes. Through the real binary.
+//!
+//! `GSSCALE_PAGING_FULL=1` runs the whole grid at 600 steps.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+
+#[path = "support/scenes.rs"]
+mod scenes;
+#[path = "support/mod.rs"]
+mod support;
+
+use gsscale::dataset::synthetic::{CityOptions, write_city};
+use scenes::{stderr, summary, text, train};
+use std::path::Path;
+use support::real_scene;
+use tempfile::TempDir;
+
+/// Every event several times within 200 steps.
+const BUSY: &[&str] = &[
+    "--refine-start",
+    "100",
+    "--refine-every",
+    "50",
+    "--reset-every",
+    "200",
+    "--sh-every",
+    "100",
+    "--view-order",
+    "groups:4",
+    "--test-every",
+    "24",
+    "--quiet",
+];
+
+/// Where pages are and how they get there.
+#[derive(Debug, Clone)]
+struct How {
+    /// 0: all pages in memory.
+    frames: u64,
+    /// Empty: no files, a store in memory.
+    io: &'static str,
+    threads: &'static str,
+    more: &'static [&'static str],
+}
+
+/// Runs the scene; returns the PLY and the summary.
+fn run(folder: &Path, scene: &Path, base: &[&str], how: &How) -> (Vec<u8>, serde_json::Value) {
+    let (out, spill) = (folder.join("out"), folder.join("spill"));
+    let frames = how.frames.to_string();
+    let mut args = vec![text(scene), "--out", text(&out), "--overwrite", "--frames", &frames];
+    args.extend(["--threads", how.threads]);
+    args.extend(base);
+    args.extend(how.more);
+    if !how.io.is_empty() {
+        args.extend(["--io", how.io, "--spill-dir", text(&spill)]);
+    }
+    let output = train(&args);
+    assert!(output.status.success(), "{how:?}: {}", stderr(&output));
+    assert!(!spill.exists(), "{how:?}: the spill directory is left over");
+    (std::fs::read(out.join("point_cloud.ply")).unwrap(), summary(&out))
+}
+
+fn number(summary: &serde_json::Value, key: &str) -> u64 {
+    summary[key].as_u64().unwrap()
+}
+
+/// Engines that work here: containers often forbid io_uring.
+fn engines() -> Vec<&'static str> {
+    let folder = TempDir::new().unwrap();
+    let works = |io: &&str| gsscale::page::engine::open_engine(io.parse().unwrap(), folder.path(), 4).is_ok();
+    ["uring", "mmap", "pread"].into_iter().filter(works).collect()
+}
+
+#[test]
+fn frames_engines_and_threads_change_no_bit() {
+    let Some(scene) = real_scene("seneca") else { return };
+    let folder = TempDir::new().unwrap();
+    let is_full = std::env::var_os("GSSCALE_PAGING_FULL").is_some();
+    let steps = if is_full { "600" } else { "200" };
+    let base = [&["--data-factor", "4", "--page-rows", "128", "--steps", steps], BUSY].concat();
+    let in_memory = How { frames: 0, io: "", threads: "2", more: &[] };
+    let (want, whole) = run(folder.path(), &scene, &base, &in_memory);
+    let (pages, fewest) = (number(&whole, "frames"), number(&whole, "pages_pinned_max"));
+    assert_ne!(number(&whole, "gaussians"), 59_927, "no round changed anything, so the test shows little");
+    assert_eq!((number(&whole, "bytes_read"), number(&whole, "evictions")), (0, 0));
+    let engines = engines();
+    let how = |frames, io, threads, more| How { frames, io, threads, more };
+    let mut grid = Vec::new();
+    if is_full {
+        for frames in [pages, pages / 2, pages / 4, fewest] {
+            for &io in engines.iter().chain(&[""]) {
+                grid.extend(["1", "2"].map(|threads| how(frames, io, threads, &[] as &[&str])));
+            }
+        }
+    } else {
+        let io = |i: usize| engines[i % engines.len()];
+        grid.push(how(pages, io(1), "1", &[]));
+        grid.push(how(pages / 2, io(0), "2", &[]));
+        grid.push(how(pages / 4, io(1), "2", &["--evict", "lru", "--prefetch-bytes", "1MiB"]));
+        grid.push(how(pages / 4, "", "1", &[]));
+        grid.push(how(fewest, io(0), "1", &["--spill-codec", "zstd:1"]));
+        grid.push(how(fewest, io(2), "2", &[]));
+    }
+    for how in grid.into_iter().map(|h| How { frames: h.frames.max(fewest), ..h }) {
+        let (got, summary) = run(folder.path(), &scene, &base, &how);
+        assert!(got == want, "{how:?} gives another scene");
+        assert!(number(&summary, "frames") <= how.frames, "{how:?}: {summary}");
+        let spills = how.frames < pages;
+        assert_eq!(number(&summary, "pages_read") > 0, spills, "{how:?}: {summary}");
+        assert_eq!(number(&summary, "bytes_written") > 0, spills, "{how:?}: {summary}");
+    }
+}
+
+#[test]
+fn a_tenth_of_a_city_in_memory_gives_the_same_city() {
+    let folder = TempDir::new().unwrap();
+    let scene = folder.path().join("scene");
+    let options = CityOptions {
+        seed: 5,
+        views: 60,
+        width: 48,
+        height: 36,
+        points: 30_000,
+        blocks: Some(60),
+        supersample: 1,
+        ..CityOptions::default()
+    };
+    write_city(&scene, &options, &|_, _| {}).unwrap();
+    let base = [&["--page-rows", "32", "--steps", "120", "--grow-grad2d", "0.001"], BUSY].concat();
+    let (want, whole) = run(folder.path(), &scene, &base, &How { frames: 0, io: "", threads: "2", more: &[] });
+    let frames = number(&whole, "pages") / 10;
+    let (got, summary) = run(folder.path(), &scene, &base, &How { frames, io: "auto", threads: "2", more: &[] });
+    assert!(got == want);
+    // Events change few pages here, so a page that is needed was needed by a view.
+    let seen = number(&summary, "pages_needed") as f64 / 120.0 / number(&summary, "pages") as f64;
+    assert!(seen < 0.03, "a view sees {seen} of the pages, evaluation included");
+    assert!(number(&summary, "evictions") > 0 && number(&summary, "pages_read") > 0, "{summary}");
+}

@@ -1,0 +1,219 @@
+//! Whole runs of the cache on made-up aerial surveys.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+
+use gsscale::base::ids::PageId;
+use gsscale::base::rng::{Purpose, Stream};
+use gsscale::scene::camera::Camera;
+use gsscale::scene::page_meta::{PageBounds, PageMeta};
+use gsscale::schedule::auto::automatic_order;
+use gsscale::schedule::model::Policy;
+use gsscale::schedule::order::{Order, ViewOrder};
+use gsscale::schedule::replay::{DriveModel, Replay, ReplayOptions, Stall, StepTraffic, replay};
+use gsscale::schedule::visibility::ViewPages;
+
+/// A camera at `centre` that looks down, tilted by `tilt` off the vertical towards `heading`, radians.
+fn camera(centre: [f64; 3], heading: f64, tilt: f64) -> Camera {
+    let (ch, sh) = (libm::cos(heading), libm::sin(heading));
+    let (ct, st) = (libm::cos(tilt), libm::sin(tilt));
+    let forward = [ch * st, sh * st, -ct];
+    let right = [sh, -ch, 0.0];
+    let down = [
+        forward[1] * right[2] - forward[2] * right[1],
+        forward[2] * right[0] - forward[0] * right[2],
+        forward[0] * right[1] - forward[1] * right[0],
+    ];
+    let row = |r: [f64; 3]| {
+        [r[0] as f32, r[1] as f32, r[2] as f32, -(r[0] * centre[0] + r[1] * centre[1] + r[2] * centre[2]) as f32]
+    };
+    Camera {
+        viewmat: [row(right), row(down), row(forward)],
+        fx: 900.0,
+        fy: 900.0,
+        cx: 500.0,
+        cy: 375.0,
+        width: 1000,
+        height: 750,
+        near_plane: 0.1,
+        far_plane: 1e10,
+    }
+}
+
+/// Square city of side 1 in `side` x `side` pages of ground; strips of views across it.
+struct Survey {
+    index: Vec<PageMeta>,
+    cameras: Vec<Camera>,
+}
+
+/// `views` views, each of which sees about `share` of the city, from two crossing passes when tilted.
+fn survey(views: usize, side: usize, share: f64, tilt: f64) -> Survey {
+    let mut draws = Stream::new(1, Purpose::Test, 60, 0);
+    let cell = 1.0 / side as f64;
+    let page = |i: usize| {
+        let (x, y) = ((i % side) as f64 * cell, (i / side) as f64 * cell);
+        let bounds = PageBounds {
+            lo: [x as f32, y as f32, 0.0],
+            hi: [(x + cell) as f32, (y + cell) as f32, (0.02 * cell) as f32],
+            sigma_max: (0.01 * cell) as f32,
+        };
+        PageMeta { id: PageId::initial(i as u32), rows: 1024, sh_degree: 3, events_applied: 0, bounds }
+    };
+    // A vertical view sees (1000/900 h)(750/900 h).
+    let mut height = (share / (1000.0 / 900.0 * 750.0 / 900.0)).sqrt();
+    if tilt > 0.0 {
+        height *= 0.62;
+    }
+    let passes = if tilt > 0.0 { 2 } else { 1 };
+    let mut cameras = Vec::new();
+    for pass in 0..passes {
+        let count = views / passes;
+        let strips = (count as f64).sqrt().ceil() as usize;
+        for v in 0..count {
+            let (strip, k) = (v / strips, v % strips);
+            let along = (k as f64 + 0.5) / strips as f64;
+            let across = (strip as f64 + 0.5) / count.div_ceil(strips) as f64;
+            let back = height * libm::tan(tilt);
+            let forth = strip % 2 == 0;
+            let along = if forth { along } else { 1.0 - along };
+            let sign = if forth { 1.0 } else { -1.0 };
+            let half = std::f64::consts::FRAC_PI_2;
+            let heading = if forth { 0.0 } else { 2.0 * half } + if pass == 1 { half } else { 0.0 };
+            let behind = along - sign * back;
+            let (x, y) = if pass == 0 { (behind, across) } else { (across, behind) };
+            let jitter = 0.02 * height;
+            let at = [x + jitter * draws.normal(), y + jitter * draws.normal(), height + jitter * draws.normal()];
+            cameras.push(camera(at, heading + 0.03 * draws.normal(), tilt + 0.02 * draws.normal()));
+        }
+    }
+    Survey { index: (0..side * side).map(page).collect(), cameras }
+}
+
+fn run(survey: &Survey, pages: &ViewPages, order: Order, policy: Policy, cache: f64, epochs: u32) -> Replay {
+    let order = ViewOrder::new(order, 5, &survey.cameras);
+    let bytes = vec![1 << 20; survey.index.len()];
+    let frames = (cache * survey.index.len() as f64) as usize;
+    let steps = survey.cameras.len() as u32 * epochs;
+    replay(pages, &bytes, &order, &ReplayOptions { frames, policy, steps, plan_bytes: 1 << 30 }).unwrap()
+}
+
+fn miss(run: &Replay) -> f64 {
+    1.0 - run.figures(run.steady()).hit_rate
+}
+
+/// The table of the design, on two surveys. `cargo nextest run --test replay --run-ignored all --no-capture table`
+#[test]
+#[ignore = "prints the table of orders"]
+fn table() {
+    for (name, tilt) in [("vertical", 0.0), ("tilted", 0.7)] {
+        let survey = survey(1000, 64, 0.07, tilt);
+        let pages = ViewPages::new(&survey.index, &survey.cameras);
+        let share = pages.total() as f64 / (survey.cameras.len() * survey.index.len()) as f64;
+        println!("{name}: a view sees {share:.3} of the pages, at most {}", pages.most());
+        for order in ["shuffle", "groups:4", "groups:9", "groups:16", "groups:25", "groups:49", "groups:100", "tour"] {
+            let cells = [0.13, 0.25, 0.5].map(|cache| {
+                let [b, l] = Policy::ALL.map(|p| run(&survey, &pages, order.parse().unwrap(), p, cache, 4));
+                assert!(b.is_exact);
+                format!("{:.3} / {:.3}", miss(&l), miss(&b))
+            });
+            println!("| {order} | {} |", cells.join(" | "));
+        }
+    }
+}
+
+#[test]
+fn orders_and_policies_read_in_the_order_of_the_design() {
+    let survey = survey(400, 32, 0.07, 0.0);
+    let pages = ViewPages::new(&survey.index, &survey.cameras);
+    let share = pages.total() as f64 / (400.0 * 1024.0);
+    assert!((0.06..0.10).contains(&share), "a view sees {share}");
+    for cache in [0.18, 0.25, 0.5] {
+        let of = |order: &str, policy| miss(&run(&survey, &pages, order.parse().unwrap(), policy, cache, 3));
+        let table = ["shuffle", "groups:4", "groups:9", "groups:25"].map(|order| {
+            let (lru, known) = (of(order, Policy::LeastRecent), of(order, Policy::Farthest));
+            assert!(known <= lru, "{order}: knowing the future never reads more");
+            known
+        });
+        // Each refinement of the order saves a good deal, until what is left is the way through the city itself.
+        assert!(table[1] < 0.75 * table[0] && table[2] < 0.75 * table[1] + 0.01, "{table:?}");
+        assert!(table[3] < 0.75 * table[2] + 0.01, "{table:?}");
+        assert!(of("tour", Policy::Farthest) < 0.15 * table[0] + 0.02);
+    }
+    // A shuffle that knows the future is about as good as least recent use with half as many pages missing.
+    let shuffle = |policy| miss(&run(&survey, &pages, Order::Shuffle, policy, 0.25, 3));
+    let (lru, known) = (shuffle(Policy::LeastRecent), shuffle(Policy::Farthest));
+    assert!((0.6..0.85).contains(&lru) && (0.35..0.6).contains(&known), "{lru} {known}");
+}
+
+#[test]
+fn bytes_follow_pages_and_everything_that_leaves_is_written() {
+    let survey = survey(100, 16, 0.1, 0.7);
+    let pages = ViewPages::new(&survey.index, &survey.cameras);
+    let needed: std::collections::BTreeSet<u32> = (0..100).flat_map(|v| pages.of(v).iter().map(|p| p.0)).collect();
+    let planned = run(&survey, &pages, Order::Shuffle, Policy::Farthest, 0.4, 3);
+    let (read, written) = planned.totals();
+    let frames = (0.4 * 256.0) as u64;
+    assert_eq!(read - written, frames << 20, "what was read and not written is what the frames hold");
+    assert!(planned.steps.iter().all(|s| s.bytes_read == u64::from(s.pages_read) << 20 && s.pages_read <= s.pages));
+    // With a frame for every page each page is read once and nothing is written.
+    let all = run(&survey, &pages, Order::Shuffle, Policy::Farthest, 1.0, 3);
+    assert_eq!(all.totals(), ((needed.len() as u64) << 20, 0));
+    assert_eq!(all.figures(all.steady()).hit_rate, 1.0);
+    // A plan that looks less far reads no less, and says that it is no bound.
+    let order = ViewOrder::new(Order::Shuffle, 5, &survey.cameras);
+    let options = ReplayOptions { frames: 102, policy: Policy::Farthest, steps: 300, plan_bytes: 3000 };
+    let short = replay(&pages, &vec![1 << 20; 256], &order, &options).unwrap();
+    assert!(planned.is_exact && !short.is_exact && short.totals().0 > read);
+    let options = ReplayOptions { frames: pages.most() - 1, ..options };
+    let error = replay(&pages, &[], &order, &options).unwrap_err();
+    assert_eq!((error.needed, error.frames), (pages.most(), pages.most() - 1));
+}
+
+fn traffic(read: &[u64]) -> Replay {
+    let step = |&bytes_read: &u64| StepTraffic { pages: 10, pages_read: 1, bytes_read, bytes_written: bytes_read };
+    Replay { steps: read.iter().map(step).collect(), views: 1000, is_exact: true }
+}
+
+#[test]
+fn stalls_are_what_the_drive_cannot_do_in_time() {
+    // 10 bytes take a second to read and a second to write; a step takes 2 s.
+    let drive = DriveModel { read_rate: 10.0, write_rate: 10.0, step_seconds: 2.0, ahead_bytes: 0 };
+    let seconds = |read: &[u64], drive: &DriveModel| traffic(read).stall(0..read.len(), drive);
+    assert_eq!(seconds(&[500, 10, 10, 10], &drive), Stall::default(), "the drive keeps up");
+    // 30 bytes are 6 s of reading and writing, begun with the step before, which takes 2 s.
+    assert_eq!(seconds(&[0, 0, 0, 30], &drive), Stall { seconds: 4.0, worst_seconds: 4.0, steps: 1 });
+    // Begun two steps earlier they cost nothing.
+    let ahead = DriveModel { ahead_bytes: 30, ..drive };
+    assert_eq!(seconds(&[0, 0, 0, 30], &ahead), Stall::default());
+    // But reading ahead does not make the drive faster: 4 s for each step of 2 s, the first two begun with step 0.
+    let ahead = DriveModel { ahead_bytes: 1000, ..drive };
+    assert_eq!(seconds(&[0, 20, 20, 20], &ahead).seconds, 3.0 * 4.0 - 3.0 * 2.0);
+    let slow = DriveModel { step_seconds: 0.0, ..drive };
+    assert_eq!(seconds(&[0, 20, 20], &slow).seconds, 8.0);
+}
+
+#[test]
+fn figures_name_the_worst_window_and_the_heaviest_steps() {
+    let mut read = vec![10u64; 100];
+    read[40..60].fill(100);
+    read[50] = 1000;
+    let figures = traffic(&read).figures(0..100);
+    assert_eq!((figures.worst_window, figures.worst_per_step), (40, 2.0 * 2900.0 / 20.0));
+    // 5 of 100 steps: 1000 and four times 100, of 800 + 19 x 100 + 1000.
+    assert!((figures.heaviest_share - 1400.0 / 3700.0).abs() < 1e-12);
+    assert_eq!((figures.hit_rate, figures.read_per_step), (0.9, 37.0));
+    assert_eq!(traffic(&read).figures(70..80).worst_window, 70);
+}
+
+#[test]
+fn the_automatic_order_gives_up_randomness_only_for_bytes() {
+    let survey = survey(400, 32, 0.07, 0.7);
+    let views = ViewPages::new(&survey.index, &survey.cameras);
+    let auto = |frames| automatic_order(&views, &survey.cameras, 1024, frames, 1, 1 << 28);
+    assert_eq!(auto(1024), Ok(Order::Shuffle));
+    let groups = |frames| match auto(frames).unwrap() {
+        Order::Groups(groups) => groups,
+        other => panic!("{other} with {frames} frames"),
+    };
+    let (tight, ample) = (groups(views.most() + 20), groups(700));
+    assert!(tight >= 25 && ample <= 16, "{tight} groups in a small cache, {ample} in a large one");
+    assert!(auto(20).is_err());
+}

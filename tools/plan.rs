@@ -1,0 +1,398 @@
+//! `gsscale-plan`: what a run would read and write through the disk tier, before any training. Parses, calls the
+//! library, prints; writes no file.
+
+use clap::Parser;
+use gsscale::base::error::{InputError, InputResult};
+use gsscale::base::units::format_bytes;
+use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides, parse_command_line};
+use gsscale::scene::camera::Camera;
+use gsscale::scene::page_layout::capacity_bytes;
+use gsscale::schedule::auto::automatic_order;
+use gsscale::schedule::first_pages::{FirstPages, first_pages};
+use gsscale::schedule::model::{CacheModel, Policy, StepChange, TooFewFrames};
+use gsscale::schedule::order::{Order, ViewOrder};
+use gsscale::schedule::plan::Plan;
+use gsscale::schedule::replay::{DriveModel, Figures, Replay, ReplayOptions, Stall, WINDOW_STEPS, replay};
+use gsscale::schedule::visibility::ViewPages;
+use gsscale::train::run::prepare;
+use serde_json::{Value, json};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-plan scans/village --compare-frames 10%,25%,50% --compare-orders shuffle,groups:9,groups:25,tour
+  gsscale-plan scans/city --host-mem 4GiB --steps 200000 --drive-read 3GB --step-seconds 0.4
+  gsscale-plan runs/city --host-mem 2GiB --lists 100..110
+
+Pages are those of the first Gaussians; --growth 5 plans as if each page had grown to five.
+Shares of a step's pages that are read, 'of a plan' and 'lru', are those of the optimal cache and of one that drops what
+was used longest ago. Waiting assumes that the drive does one thing at a time.";
+
+/// Header of a page on disk; pages are padded to the same.
+const BLOCK: u64 = 4096;
+/// Part of --host-mem that frames take here; targets, gradients, staging and tables have the rest.
+const FRAME_SHARE: f64 = 0.75;
+/// Epochs that are gone through; later ones are counted like the mean of those after the first.
+const EPOCHS: u32 = 4;
+
+/// Says what a run would read and write through the disk tier, for any memory, page size and order of views.
+#[derive(Parser)]
+#[command(name = "gsscale-plan", version, after_help = EXAMPLES)]
+struct Args {
+    /// Scene: a COLMAP folder, or a folder with transforms.json; or a run's output folder (its config.toml is used)
+    scene: PathBuf,
+    /// Config file; flags override it
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// Numbers of frames, or their shares of all pages, to compare; without it --frames or --host-mem, or else
+    /// 10%,25%,50%
+    #[arg(long, value_delimiter = ',', value_name = "N|N%", help_heading = "Plan")]
+    compare_frames: Vec<String>,
+    /// Orders of views to compare: auto, shuffle, groups:<n>, tour; without it --view-order, or else auto and shuffle
+    #[arg(long, value_delimiter = ',', value_name = "ORDER", help_heading = "Plan")]
+    compare_orders: Vec<String>,
+    /// Plan as if every page had grown to this many
+    #[arg(long, default_value_t = 1.0, value_name = "X", help_heading = "Plan")]
+    growth: f64,
+    /// Print the exact pages that enter and leave in these steps, for the first order and number of frames
+    #[arg(long, value_parser = parse_range, value_name = "A..B", help_heading = "Plan")]
+    lists: Option<Range<u32>>,
+    /// Bytes per second that the drive reads
+    #[arg(long, default_value = "3GB", value_name = "SIZE", help_heading = "Drive")]
+    drive_read: ByteSize,
+    /// Bytes per second that the drive writes
+    #[arg(long, default_value = "2GB", value_name = "SIZE", help_heading = "Drive")]
+    drive_write: ByteSize,
+    /// Seconds of a step that waits for nothing
+    #[arg(long, default_value_t = 0.3, value_name = "S", help_heading = "Drive")]
+    step_seconds: f64,
+    /// Bytes that are read ahead beyond the next step's
+    #[arg(long, default_value = "256MiB", value_name = "SIZE", help_heading = "Drive")]
+    read_ahead: ByteSize,
+    /// Bytes that the drive is rated to write in its life
+    #[arg(long, default_value = "600TB", value_name = "SIZE", help_heading = "Drive")]
+    endurance: ByteSize,
+    /// Memory that the planning itself may take; with less the plan looks less far
+    #[arg(long, default_value = "1GiB", value_name = "SIZE", help_heading = "Plan")]
+    plan_mem: ByteSize,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    keys: TrainOverrides,
+}
+
+fn parse_range(text: &str) -> Result<Range<u32>, String> {
+    let wrong = || format!("'{text}' is no range of steps; write for example 100..110");
+    let (from, to) = text.split_once("..").ok_or_else(wrong)?;
+    let range = from.parse().map_err(|_| wrong())?..to.parse().map_err(|_| wrong())?;
+    if range.is_empty() { Err(wrong()) } else { Ok(range) }
+}
+
+/// What all plans of this program have in common.
+struct Scene {
+    config: TrainConfig,
+    cameras: Vec<Camera>,
+    pages: FirstPages,
+    /// On disk, by page, header and padding included.
+    page_bytes: Vec<u32>,
+    /// Of one frame.
+    frame_bytes: u64,
+    views: ViewPages,
+    gaussians: usize,
+}
+
+/// One line of the answer.
+struct Row {
+    order: Order,
+    is_automatic: bool,
+    frames: usize,
+    planned: Replay,
+    figures: Figures,
+    lru: Figures,
+    stall: Stall,
+    total_read: f64,
+    total_written: f64,
+}
+
+fn main() -> ExitCode {
+    match start(&parse_command_line()) {
+        Ok(text) => {
+            println!("{text}");
+            ExitCode::SUCCESS
+        }
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn start(args: &Args) -> InputResult<String> {
+    let scene = load(args)?;
+    let frames = frames(args, &scene)?;
+    if let Some(range) = &args.lists {
+        return lists(args, &scene, frames[0], range.clone());
+    }
+    let mut rows = Vec::new();
+    for &frames in &frames {
+        for text in &orders(args, &scene.config) {
+            rows.push(row(args, &scene, frames, text)?);
+        }
+    }
+    if args.json {
+        let value = json!({
+            "gaussians": scene.gaussians, "views": scene.cameras.len(), "steps": scene.config.steps,
+            "pages": scene.pages.index.len(), "page_rows": scene.config.page_rows, "frame_bytes": scene.frame_bytes,
+            "state_bytes": state_bytes(&scene), "pages_of_largest_view": scene.views.most(),
+            "plans": rows.iter().map(|row| json_of(args, row)).collect::<Vec<_>>(),
+        });
+        return Ok(format!("{value:#}"));
+    }
+    Ok(report(args, &scene, &rows))
+}
+
+fn load(args: &Args) -> InputResult<Scene> {
+    let run_config = args.scene.join("config.toml");
+    let is_run = run_config.is_file();
+    let config_path = args.config.clone().or_else(|| is_run.then(|| run_config.clone()));
+    let mut config = config_path.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
+    args.keys.clone().apply(&mut config);
+    config.check()?;
+    if !(1.0..=1e6).contains(&args.growth) || args.step_seconds.is_nan() {
+        let problem = "--growth and --step-seconds must be numbers from 1 and 0 on";
+        return Err(InputError::new("--growth, --step-seconds", problem, "leave them out"));
+    }
+    if args.drive_read.0 == 0 || args.drive_write.0 == 0 {
+        return Err(InputError::new(
+            "--drive-read, --drive-write",
+            "a rate of 0",
+            "give bytes per second, such as 3GB",
+        ));
+    }
+    let path = if is_run { scene_of_run(&run_config)? } else { args.scene.clone() };
+    let prepared = prepare(&path, &config)?;
+    let dataset = &prepared.dataset;
+    let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
+    let page_rows = config.page_rows as usize;
+    let pages = first_pages(&prepared.columns, page_rows, config.strategy == "default");
+    let slot = |payload: u64| BLOCK + payload.next_multiple_of(BLOCK);
+    let grown = |bytes: u64| (bytes as f64 * args.growth) as u64;
+    let page_bytes = pages.bytes.iter().map(|&b| grown(slot(u64::from(b))).min(u64::from(u32::MAX)) as u32).collect();
+    Ok(Scene {
+        views: ViewPages::new(&pages.index, &cameras),
+        frame_bytes: grown(slot(capacity_bytes(page_rows, config.sh_degree) as u64)),
+        gaussians: prepared.columns.rows(),
+        config,
+        cameras,
+        pages,
+        page_bytes,
+    })
+}
+
+fn scene_of_run(config: &Path) -> InputResult<PathBuf> {
+    let text = std::fs::read_to_string(config).map_err(|e| InputError::io(config, "reading", &e))?;
+    let scene =
+        text.parse::<toml::Table>().ok().and_then(|t| t.get("resolved")?.get("scene")?.as_str().map(PathBuf::from));
+    scene.ok_or_else(|| {
+        InputError::new(config, "it does not say which scene it is of", "give the scene's folder instead")
+    })
+}
+
+fn state_bytes(scene: &Scene) -> u64 {
+    scene.page_bytes.iter().map(|&b| u64::from(b)).sum()
+}
+
+/// The numbers of frames to plan for.
+fn frames(args: &Args, scene: &Scene) -> InputResult<Vec<usize>> {
+    let pages = scene.pages.index.len();
+    let config = &scene.config;
+    let mut frames = Vec::new();
+    if args.compare_frames.is_empty() && config.frames > 0 {
+        return Ok(vec![config.frames as usize]);
+    }
+    if config.host_mem.0 > 0 {
+        frames.push(((config.host_mem.0 as f64 * FRAME_SHARE) as u64 / scene.frame_bytes) as usize);
+    }
+    let shares = ["10%", "25%", "50%"].map(String::from);
+    let is_open = args.compare_frames.is_empty() && frames.is_empty();
+    let texts = if is_open { &shares[..] } else { &args.compare_frames[..] };
+    for text in texts {
+        let count = match text.strip_suffix('%') {
+            Some(share) => share
+                .parse()
+                .ok()
+                .filter(|s| (0.0..=100.0).contains(s))
+                .map(|s: f64| (s / 100.0 * pages as f64).ceil() as usize),
+            None => text.parse().ok(),
+        };
+        let wrong = || {
+            InputError::new(
+                "--compare-frames",
+                format!("'{text}' is no number of frames"),
+                "write for example 2000 or 25%",
+            )
+        };
+        frames.push(count.ok_or_else(wrong)?);
+    }
+    Ok(frames)
+}
+
+/// The orders to plan for, as text.
+fn orders(args: &Args, config: &TrainConfig) -> Vec<String> {
+    match (args.compare_orders.is_empty(), config.view_order.as_str()) {
+        (false, _) => args.compare_orders.clone(),
+        (true, "auto") => vec!["auto".into(), "shuffle".into()],
+        (true, order) => vec![order.into()],
+    }
+}
+
+fn order(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Order> {
+    if text != "auto" {
+        return text.parse().map_err(|problem| InputError::new("--view-order", problem, "or auto"));
+    }
+    let pages = scene.pages.index.len();
+    automatic_order(&scene.views, &scene.cameras, pages, frames, scene.config.seed, args.plan_mem.0)
+        .map_err(|e| too_few(scene, &e))
+}
+
+fn too_few(scene: &Scene, error: &TooFewFrames) -> InputError {
+    let most = scene.views.most().max(error.needed);
+    let bytes = format_bytes((most as f64 * scene.frame_bytes as f64 / FRAME_SHARE) as u64);
+    let remedy = format!("the largest view needs --frames {most}, which is a --host-mem of about {bytes}");
+    InputError::new("--frames", error.to_string(), remedy)
+}
+
+fn row(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Row> {
+    let order = order(args, scene, frames, text)?;
+    let views = ViewOrder::new(order, scene.config.seed, &scene.cameras);
+    let steps = scene.config.steps.min((EPOCHS * scene.cameras.len() as u32).max(1));
+    let run = |policy| {
+        let options = ReplayOptions { frames, policy, steps, plan_bytes: args.plan_mem.0 };
+        replay(&scene.views, &scene.page_bytes, &views, &options).map_err(|e| too_few(scene, &e))
+    };
+    let (planned, lru) = (run(Policy::Farthest)?, run(Policy::LeastRecent)?);
+    let figures = planned.figures(planned.steady());
+    let drive = DriveModel {
+        read_rate: args.drive_read.0 as f64,
+        write_rate: args.drive_write.0 as f64,
+        step_seconds: args.step_seconds,
+        ahead_bytes: args.read_ahead.0,
+    };
+    let stall = planned.stall(planned.steady(), &drive);
+    let (read, written) = planned.totals();
+    let rest = f64::from(scene.config.steps - steps);
+    Ok(Row {
+        order,
+        is_automatic: text == "auto",
+        frames,
+        lru: lru.figures(lru.steady()),
+        stall,
+        total_read: read as f64 + rest * figures.read_per_step,
+        // Every page is written once before the first step.
+        total_written: state_bytes(scene) as f64 + written as f64 + rest * figures.written_per_step,
+        planned,
+        figures,
+    })
+}
+
+fn json_of(args: &Args, row: &Row) -> Value {
+    let (f, steps) = (&row.figures, f64::from(row.figures.steps));
+    json!({
+        "view_order": row.order.to_string(), "automatic": row.is_automatic, "frames": row.frames,
+        "steps_simulated": row.planned.steps.len(), "is_belady_bound": row.planned.is_exact,
+        "pages_per_step": f.pages_per_step, "hit_rate": f.hit_rate, "lru_hit_rate": row.lru.hit_rate,
+        "bytes_read_per_step": f.read_per_step, "bytes_written_per_step": f.written_per_step,
+        "heaviest_5_percent_share": f.heaviest_share,
+        "worst_window": { "first_step": f.worst_window, "steps": WINDOW_STEPS, "bytes_per_step": f.worst_per_step },
+        "stall_seconds_per_step": row.stall.seconds / steps, "stall_seconds_worst": row.stall.worst_seconds,
+        "steps_that_wait": f64::from(row.stall.steps) / steps,
+        "bytes_read": row.total_read, "bytes_written": row.total_written,
+        "share_of_endurance": row.total_written / args.endurance.0 as f64,
+    })
+}
+
+fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
+    let size = |bytes: f64| format_bytes(bytes as u64);
+    let pages = scene.pages.index.len();
+    let mut text = format!(
+        "{} Gaussians in {pages} pages of at most {} rows, {} on disk; {} views need {:.1} % of the pages on average, {:.1} % at most",
+        scene.gaussians,
+        scene.config.page_rows,
+        format_bytes(state_bytes(scene)),
+        scene.cameras.len(),
+        100.0 * scene.views.total() as f64 / scene.cameras.len() as f64 / pages as f64,
+        100.0 * scene.views.most() as f64 / pages as f64,
+    );
+    text += &format!(
+        "\n{:12} {:>14} {:>9} {:>9} {:>10} {:>10} {:>12} {:>9} {:>8} {:>10} {:>7}",
+        "order",
+        "frames",
+        "of a plan",
+        "lru",
+        "read/step",
+        "write/step",
+        "worst 20/step",
+        "wait/step",
+        "longest",
+        "written",
+        "life"
+    );
+    for row in rows {
+        let f = &row.figures;
+        let mut name = row.order.to_string();
+        if row.is_automatic {
+            name += " *";
+        }
+        let memory = format!("{} {}", row.frames, size(row.frames as f64 * scene.frame_bytes as f64));
+        text += &format!(
+            "\n{name:12} {memory:>14} {:>9.3} {:>9.3} {:>10} {:>10} {:>13} {:>8.3}s {:>7.2}s {:>10} {:>6.1}%",
+            1.0 - f.hit_rate,
+            1.0 - row.lru.hit_rate,
+            size(f.read_per_step),
+            size(f.written_per_step),
+            size(f.worst_per_step),
+            row.stall.seconds / f64::from(f.steps),
+            row.stall.worst_seconds,
+            size(row.total_written),
+            100.0 * row.total_written / args.endurance.0 as f64,
+        );
+    }
+    text += &format!(
+        "\nwritten: by all {} steps and the import, as a share of {}; worst 20: read and written; * chosen by auto",
+        scene.config.steps,
+        format_bytes(args.endurance.0)
+    );
+    if rows.iter().any(|row| !row.planned.is_exact) {
+        text += "\nThe plan did not reach two epochs ahead: with a larger --plan-mem less may be read.";
+    }
+    text
+}
+
+/// The exact pages that enter and leave in some steps.
+fn lists(args: &Args, scene: &Scene, frames: usize, range: Range<u32>) -> InputResult<String> {
+    let order = order(args, scene, frames, &orders(args, &scene.config)[0])?;
+    let mut views = ViewOrder::new(order, scene.config.seed, &scene.cameras);
+    let mut plan = Plan::new(0, args.plan_mem.0);
+    let mut cache = CacheModel::new(frames, Policy::Farthest);
+    let (end, mut change) = (range.end.min(scene.config.steps), StepChange::default());
+    loop {
+        let step = plan.steps().start;
+        while plan.steps().end < step.saturating_add(2 * scene.cameras.len() as u32).min(scene.config.steps) {
+            if !plan.push(scene.views.of(views.view_at(plan.steps().end))) {
+                break;
+            }
+        }
+        if step >= range.start.min(end) {
+            break;
+        }
+        let pages: Vec<_> = plan.pages(step).collect();
+        cache.step(step, &pages, |page| plan.next_use(page, step + 1), &mut change).map_err(|e| too_few(scene, &e))?;
+        plan.pop();
+    }
+    let planned = plan.changes(&cache, range.start.min(end)..end).map_err(|e| too_few(scene, &e))?;
+    let lines: Vec<String> = planned.iter().map(ToString::to_string).collect();
+    Ok(lines.join("\n"))
+}
