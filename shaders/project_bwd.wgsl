@@ -19,6 +19,8 @@
 @group(0) @binding(9) var<storage, read_write> v_scales: array<f32>;
 /// With respect to the logits.
 @group(0) @binding(10) var<storage, read_write> v_opacities: array<f32>;
+/// What densification needs of each row: v_mean2d.x, v_mean2d.y, radius.x, radius.y; zeros for a culled row.
+@group(0) @binding(11) var<storage, read_write> footprints: array<vec4<f32>>;
 
 /// The image of axis k times the conic, from its image and minor and those of the two axes after it in turn.
 fn axis_by_conic(g: Geometry, eps2d: f32, k: vec2<f32>, l: vec2<f32>, m: vec2<f32>, by_l: f32, by_m: f32) -> vec2<f32> {
@@ -111,6 +113,7 @@ fn project_bwd(
             v_scales[3u * i + c] = 0.0;
         }
         v_opacities[i] = 0.0;
+        footprints[i] = vec4<f32>();
         return;
     }
     let a = v_splats[at];
@@ -125,4 +128,5 @@ fn project_bwd(
     }
     v_quats[i] = v.quat;
     v_opacities[i] = a.w * sigmoid_slope(opacities[i]);
+    footprints[i] = vec4<f32>(a.xy, radius, splats[at + 2u].w);
 }

@@ -63,7 +63,7 @@ pub fn stage_bytes(stage: &str, counts: &Counts) -> f64 {
         // The list again and nine sums for each; then sums and splats in, gradients of splats out.
         "rasterize_bwd" => isects * (8.0 + SPLAT + 36.0) + pixels * 20.0 + isects * 40.0 + rows * (2.0 * SPLAT + 12.0),
         "sh_bwd" => rows * (32.0 + 16.0 + 12.0 + BANDS + 12.0 + SH0 + BANDS),
-        "project_bwd" => rows * (GEOMETRY + 16.0 + 32.0 + 12.0 + GEOMETRY),
+        "project_bwd" => rows * (GEOMETRY + 16.0 + 32.0 + 16.0 + 12.0 + GEOMETRY + 16.0),
         _ => 0.0,
     }
 }

@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
 
 use super::buffers::{BufferView, size_class};
 use super::device::Gpu;
@@ -44,6 +44,7 @@ pub struct Readback {
     size: u64,
     class: u64,
     state: Arc<AtomicU8>,
+    submission: Arc<OnceLock<wgpu::SubmissionIndex>>,
     staging: Arc<Staging>,
 }
 
@@ -53,11 +54,13 @@ pub(super) struct PendingMap {
     raw: wgpu::Buffer,
     size: u64,
     state: Arc<AtomicU8>,
+    submission: Arc<OnceLock<wgpu::SubmissionIndex>>,
 }
 
 impl PendingMap {
     /// Asks for the mapping; called right after the submission.
-    pub(super) fn start(self) {
+    pub(super) fn start(self, submission: &wgpu::SubmissionIndex) {
+        let _ = self.submission.set(submission.clone()); // starts once
         self.state.store(MAPPING, Ordering::Release);
         let state = Arc::clone(&self.state);
         self.raw.map_async(wgpu::MapMode::Read, ..self.size, move |result| {
@@ -88,9 +91,11 @@ impl Readback {
         encoder.copy_buffer_to_buffer(&view.raw, view.offset, &raw, 0, view.size);
         gpu.staging.read.fetch_add(view.size, Ordering::Relaxed);
         let state = Arc::new(AtomicU8::new(RECORDED));
-        let pending = PendingMap { raw: raw.clone(), size: view.size, state: Arc::clone(&state) };
+        let submission = Arc::new(OnceLock::new());
+        let (size, shared) = (view.size, Arc::clone(&submission));
+        let pending = PendingMap { raw: raw.clone(), size, state: Arc::clone(&state), submission: shared };
         let staging = Arc::clone(&gpu.staging);
-        Ok((Readback { raw, stage, size: view.size, class, state, staging }, pending))
+        Ok((Readback { raw, stage, size, class, state, submission, staging }, pending))
     }
 
     /// Bytes.
@@ -134,7 +139,9 @@ impl Readback {
         }
         gpu.faults.doing(self.stage);
         while self.state.load(Ordering::Acquire) == MAPPING {
-            let waited = gpu.device.poll(wgpu::PollType::wait_indefinitely());
+            // For its own submission, not for later ones: the device may go on meanwhile.
+            let submission_index = self.submission.get().cloned();
+            let waited = gpu.device.poll(wgpu::PollType::Wait { submission_index, timeout: None });
             gpu.faults.check()?;
             waited.map_err(|e| self.failed(&e.to_string()))?;
         }

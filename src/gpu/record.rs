@@ -425,7 +425,7 @@ impl Recorder<'_> {
         belt.submitted(&index);
         drop(belt);
         for pending in self.readbacks.drain(..) {
-            pending.start();
+            pending.start(&index);
         }
         // Without a poll the loss of the device would go unnoticed: a submission to it is silently dropped.
         let polled = gpu.device.poll(wgpu::PollType::Poll);

@@ -7,7 +7,7 @@
 //! recorded again with larger ones; 4. after an error there is no view until the next `forward`.
 
 use super::gpu_loss::{LossStage, value};
-use super::gpu_rows::{DeviceColumns, RowStages, band_into_sh_n};
+use super::gpu_rows::{DeviceColumns, FOOTPRINT_BYTES, RowStages, band_into_sh_n};
 use super::gpu_tiles::{Blend, Demand, Frame, Ranks, TileStages, splat_bytes};
 use super::gpu_tiles_bwd::PictureGradients;
 use super::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
@@ -19,8 +19,8 @@ use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
 
-/// Floats of a splat on the host.
-type SplatRecord = [f32; 12];
+/// A row of what densification needs: the gradient by the mean on the screen, and the radii.
+type Footprint = [f32; 4];
 
 /// What the device holds of the last view.
 #[derive(Debug)]
@@ -41,8 +41,7 @@ struct View {
 struct Scratch {
     band: Vec<f32>,
     target: Vec<u32>,
-    splats: Vec<SplatRecord>,
-    v_splats: Vec<SplatRecord>,
+    footprints: Vec<Footprint>,
 }
 
 /// Renders views on a GPU.
@@ -60,9 +59,11 @@ pub struct GpuRenderer {
 
 /// Gradients on their way to the host.
 struct GradientReadbacks {
-    columns: Vec<Readback>,
-    splats: Readback,
-    v_splats: Readback,
+    /// sh0 and the bands in use.
+    colors: Vec<Readback>,
+    /// Means, quats, scales, opacities.
+    geometry: Vec<Readback>,
+    footprints: Readback,
     sums: Option<Readback>,
 }
 
@@ -126,12 +127,16 @@ impl GpuRenderer {
         let columns = DeviceColumns::new(gpu, count, options.sh_degree)?;
         let splats = gpu.buffer("splats", splat_bytes(count))?;
         let mut recorder = gpu.begin("forward");
-        columns.upload(&mut recorder, rows, &mut self.scratch.band)?;
+        columns.upload_geometry(&mut recorder, rows)?;
         self.rows.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, &splats)?;
-        self.rows.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, &splats)?;
         let grid = Grid::new(camera.width, camera.height);
         let blend = Blend { grid, background: options.background, max_alpha: options.max_alpha };
         let ranks = self.tiles.order(gpu, &mut recorder, &splats.view(), count, grid)?;
+        gpu.submit(recorder)?;
+        // The device projects and sorts while colours, four fifths of a row, are on their way.
+        let mut recorder = gpu.begin("forward");
+        columns.upload_colors(&mut recorder, rows, &mut self.scratch.band)?;
+        self.rows.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, &splats)?;
         loop {
             let (frame, demand) = self.tiles.frame(gpu, &mut recorder, &splats.view(), &ranks, blend)?;
             gpu.submit(recorder)?;
@@ -156,10 +161,10 @@ impl GpuRenderer {
         bytes.copy_to(&self.gpu, &mut self.image.rgb)
     }
 
-    /// Records the backward stages behind `v_rgb`, and what is read back of them.
-    fn record_backward(
+    /// Submits the backward stages behind `v_rgb`, and what is read back of them.
+    fn submit_backward(
         &self,
-        recorder: &mut Recorder<'_>,
+        mut recorder: Recorder<'_>,
         view: &View,
         v_rgb: &Buffer,
         v_alpha: Option<&Buffer>,
@@ -170,7 +175,7 @@ impl GpuRenderer {
         let v_alpha = v_alpha.map(Buffer::view);
         self.tiles.backward(
             gpu,
-            recorder,
+            &mut recorder,
             &splats.view(),
             &view.ranks,
             &view.frame,
@@ -179,15 +184,27 @@ impl GpuRenderer {
             &v_splats.view(),
         )?;
         let grads = DeviceColumns::new(gpu, view.ranks.rows, sh_degree)?;
-        self.rows.sh_bwd(gpu, recorder, camera, sh_degree, &view.columns, splats, &v_splats, &grads)?;
-        self.rows.project_bwd(gpu, recorder, camera, eps2d, &view.columns, splats, &v_splats, &grads)?;
-        let columns = grads.columns().map(|(buffer, _)| recorder.read_back("project_bwd", &buffer.view()));
-        Ok(GradientReadbacks {
-            columns: columns.collect::<GpuResult<_>>()?,
-            splats: recorder.read_back("project_fwd", &splats.view())?,
-            v_splats: recorder.read_back("rasterize_bwd", &v_splats.view())?,
+        self.rows.sh_bwd(gpu, &mut recorder, camera, sh_degree, &view.columns, splats, &v_splats, &grads)?;
+        let colors: Vec<Readback> = std::iter::once(&grads.sh0)
+            .chain(&grads.bands)
+            .map(|buffer| recorder.read_back("sh_bwd", &buffer.view()))
+            .collect::<GpuResult<_>>()?;
+        gpu.submit(recorder)?;
+        // Colours, four fifths of a row, are copied on the host while the device does the rest.
+        let mut recorder = gpu.begin("backward");
+        let footprints = gpu.buffer("footprints", FOOTPRINT_BYTES * u64::from(view.ranks.rows))?;
+        let (columns, into) = (&view.columns, &mut recorder);
+        self.rows.project_bwd(gpu, into, camera, eps2d, columns, splats, &v_splats, &grads, &footprints)?;
+        let geometry = [&grads.means, &grads.quats, &grads.scales, &grads.opacities]
+            .map(|buffer| recorder.read_back("project_bwd", &buffer.view()));
+        let back = GradientReadbacks {
+            colors,
+            geometry: geometry.into_iter().collect::<GpuResult<_>>()?,
+            footprints: recorder.read_back("project_bwd", &footprints.view())?,
             sums: None,
-        })
+        };
+        gpu.submit(recorder)?;
+        Ok(back)
     }
 
     fn run_loss(
@@ -207,8 +224,7 @@ impl GpuRenderer {
         let (rgb, target) = (view.frame.rgb.view(), pixels.view());
         let sums = self.loss.run(gpu, &mut recorder, size, plan, &rgb, &target, &v_rgb.view())?;
         let sums = sums.map(|sums| recorder.read_back("image_loss", &sums.slice(0, 16))).transpose()?;
-        let back = self.record_backward(&mut recorder, view, &v_rgb, None)?;
-        gpu.submit(recorder)?;
+        let back = self.submit_backward(recorder, view, &v_rgb, None)?;
         let sums = self.finish(view, GradientReadbacks { sums, ..back }, sh_degree, grads)?;
         Ok(value(plan, sums))
     }
@@ -232,29 +248,28 @@ impl GpuRenderer {
         if view.options.sh_degree < sh_degree {
             out.sh_n.fill(0.0); // bands that are not in use
         }
-        let mut columns = back.columns.into_iter();
-        let narrow = [&mut out.means, &mut out.quats, &mut out.scales, &mut out.opacities, &mut out.sh0];
-        for (to, bytes) in narrow.into_iter().zip(columns.by_ref()) {
-            bytes.copy_to(&self.gpu, to)?;
+        let mut colors = back.colors.into_iter();
+        for bytes in colors.by_ref().take(1) {
+            bytes.copy_to(&self.gpu, &mut out.sh0)?;
         }
-        for (band, bytes) in columns.enumerate() {
+        for (band, bytes) in colors.enumerate() {
             let values = &mut self.scratch.band;
             values.clear();
             values.resize(rows * super::gpu_rows::BAND_WIDTHS[band], 0.0);
             bytes.copy_to(&self.gpu, values)?;
             band_into_sh_n(values, band, out);
         }
-        let Scratch { splats, v_splats, .. } = &mut self.scratch;
-        for (to, bytes) in [(&mut *splats, back.splats), (&mut *v_splats, back.v_splats)] {
-            to.resize(rows, [0.0; 12]);
+        let geometry = [&mut out.means, &mut out.quats, &mut out.scales, &mut out.opacities];
+        for (to, bytes) in geometry.into_iter().zip(back.geometry) {
             bytes.copy_to(&self.gpu, to)?;
         }
+        let footprints = &mut self.scratch.footprints;
+        footprints.resize(rows, [0.0; 4]);
+        back.footprints.copy_to(&self.gpu, footprints)?;
         grads.radii.clear();
-        grads.radii.extend(splats.iter().map(|s| [s[7] as u32, s[11] as u32]));
+        grads.radii.extend(footprints.iter().map(|f| [f[2] as u32, f[3] as u32]));
         grads.means2d.clear();
-        let is_drawn = |splat: &SplatRecord| splat[7] > 0.0;
-        let v_mean = |(s, v): (&SplatRecord, &SplatRecord)| if is_drawn(s) { [v[0], v[1]] } else { [0.0; 2] };
-        grads.means2d.extend(splats.iter().zip(v_splats.iter()).map(v_mean));
+        grads.means2d.extend(footprints.iter().map(|f| [f[0], f[1]]));
         Ok(sums)
     }
 
@@ -275,8 +290,7 @@ impl GpuRenderer {
         let mut recorder = gpu.begin("backward");
         let v_rgb = recorder.buffer_with("v_rgb", v_rgb)?;
         let v_alpha = v_alpha.map(|v| recorder.buffer_with("v_alpha", v)).transpose()?;
-        let back = self.record_backward(&mut recorder, &view, &v_rgb, v_alpha.as_ref())?;
-        gpu.submit(recorder)?;
+        let back = self.submit_backward(recorder, &view, &v_rgb, v_alpha.as_ref())?;
         self.finish(&view, back, rows.sh_degree, grads)?;
         self.view = Some(view);
         Ok(())
@@ -311,12 +325,11 @@ impl Renderer for GpuRenderer {
     fn host_bytes(&self) -> u64 {
         let s = &self.scratch;
         let floats = s.band.capacity() + s.target.capacity() + self.image.rgb.capacity();
-        let records = s.splats.capacity() + s.v_splats.capacity();
         let traffic = self.gpu.traffic();
         // Such adapters have no memory of their own.
         let is_shared = matches!(self.gpu.summary().kind, DeviceKind::Integrated | DeviceKind::Software);
         let device = if is_shared { traffic.device_bytes_peak } else { 0 };
-        (4 * floats + size_of::<SplatRecord>() * records) as u64 + traffic.staging_bytes + device
+        (4 * floats + size_of::<Footprint>() * s.footprints.capacity()) as u64 + traffic.staging_bytes + device
     }
 
     fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {

@@ -13,6 +13,8 @@ use std::sync::Arc;
 
 /// Bytes of a row in `splats` and `v_splats`: see `shaders/shared/splat.wgsl`.
 pub const SPLAT_BYTES: u64 = 48;
+/// Bytes of a row of what `project_bwd` leaves for densification: the gradient by the mean on the screen, and the radii.
+pub const FOOTPRINT_BYTES: u64 = 16;
 /// Floats of a row of each higher band.
 pub const BAND_WIDTHS: [usize; 3] = [9, 15, 21];
 /// Windows begin at multiples of this many rows: then every column's offset is a multiple of 256 bytes, the largest
@@ -72,15 +74,23 @@ impl DeviceColumns {
         narrow.into_iter().chain(self.bands.iter().zip(BAND_WIDTHS))
     }
 
-    /// Uploads `rows`, which hold as many rows and at least the bands in use. `scratch` takes one band at a time.
+    /// Uploads what `project_fwd` reads of `rows`, which hold as many rows.
     ///
     /// # Errors
     /// The device failed.
-    pub fn upload(&self, recorder: &mut Recorder<'_>, rows: &Columns, scratch: &mut Vec<f32>) -> GpuResult<()> {
+    pub fn upload_geometry(&self, recorder: &mut Recorder<'_>, rows: &Columns) -> GpuResult<()> {
         recorder.upload(&self.means.view(), &rows.means)?;
         recorder.upload(&self.quats.view(), &rows.quats)?;
         recorder.upload(&self.scales.view(), &rows.scales)?;
-        recorder.upload(&self.opacities.view(), &rows.opacities)?;
+        recorder.upload(&self.opacities.view(), &rows.opacities)
+    }
+
+    /// Uploads the colours of `rows`, which hold as many rows and at least the bands in use. `scratch` takes one band
+    /// at a time.
+    ///
+    /// # Errors
+    /// The device failed.
+    pub fn upload_colors(&self, recorder: &mut Recorder<'_>, rows: &Columns, scratch: &mut Vec<f32>) -> GpuResult<()> {
         recorder.upload(&self.sh0.view(), &rows.sh0)?;
         for (band, buffer) in self.bands.iter().enumerate() {
             band_from_sh_n(rows, band, scratch);
@@ -257,7 +267,8 @@ impl RowStages {
         Ok(())
     }
 
-    /// Adds to the gradients of means and writes those of quats, scales and opacities.
+    /// Adds to the gradients of means and writes those of quats, scales and opacities, and `footprints`
+    /// ([`FOOTPRINT_BYTES`] a row).
     ///
     /// # Errors
     /// The device failed.
@@ -271,6 +282,7 @@ impl RowStages {
         splats: &Buffer,
         v_splats: &Buffer,
         grads: &DeviceColumns,
+        footprints: &Buffer,
     ) -> GpuResult<()> {
         for window in windows(gpu, rows.rows, SPLAT_BYTES) {
             let uniform = recorder.uniform(&RowsUniforms::new(camera, eps2d, window.rows))?;
@@ -287,6 +299,7 @@ impl RowStages {
                 v.quats,
                 v.scales,
                 v.opacities,
+                window.of(footprints, FOOTPRINT_BYTES),
             ];
             recorder.dispatch("project_bwd", &self.project_bwd, &views, groups_1d(window.rows, WORKGROUP))?;
         }

@@ -11,7 +11,7 @@ use gsscale::kernels::project_bwd::project_bwd;
 use gsscale::kernels::project_fwd::{Projected, project_fwd};
 use gsscale::kernels::sh_bwd::sh_bwd;
 use gsscale::kernels::sh_fwd::sh_fwd;
-use gsscale::render::gpu_rows::{BAND_WIDTHS, DeviceColumns, RowStages, SPLAT_BYTES, band_into_sh_n};
+use gsscale::render::gpu_rows::{BAND_WIDTHS, DeviceColumns, FOOTPRINT_BYTES, RowStages, SPLAT_BYTES, band_into_sh_n};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::Columns;
 
@@ -101,7 +101,8 @@ fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]
     let splats = gpu.buffer("splats", SPLAT_BYTES * n as u64).unwrap();
     let v_splats = gpu.buffer("v_splats", SPLAT_BYTES * n as u64).unwrap();
     let projected = read(gpu, &splats, |r| {
-        columns.upload(r, rows, &mut Vec::new()).unwrap();
+        columns.upload_geometry(r, rows).unwrap();
+        columns.upload_colors(r, rows, &mut Vec::new()).unwrap();
         // Every entry must be written: what was there before must not show.
         for (buffer, width) in grads.columns() {
             r.upload(&buffer.view(), &vec![f32::NAN; width * n]).unwrap();
@@ -116,11 +117,17 @@ fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]
     });
     let with_colors: Vec<_> = cpu.projected.iter().zip(&cpu.colors).map(|(p, c)| with_color(*p, *c)).collect();
     let mut out = Columns::zeros(n, 3);
+    let footprints = gpu.buffer("footprints", FOOTPRINT_BYTES * n as u64).unwrap();
     out.opacities = read(gpu, &grads.opacities, |r| {
         r.upload(&splats.view(), &with_colors).unwrap();
         stages.sh_bwd(gpu, r, camera, degree, &columns, &splats, &v_splats, &grads).unwrap();
-        stages.project_bwd(gpu, r, camera, EPS2D, &columns, &splats, &v_splats, &grads).unwrap();
+        stages.project_bwd(gpu, r, camera, EPS2D, &columns, &splats, &v_splats, &grads, &footprints).unwrap();
     });
+    let packed = read(gpu, &footprints, |_| {});
+    for (i, (got, record)) in packed.as_chunks::<4>().0.iter().zip(&with_colors).enumerate() {
+        let want = if record[7] > 0.0 { [v[i][0], v[i][1], record[7], record[11]] } else { [0.0; 4] };
+        assert_eq!(got.map(f32::to_bits), want.map(f32::to_bits), "row {i}: {got:?}, want {want:?}");
+    }
     out.means = read(gpu, &grads.means, |_| {});
     out.quats = read(gpu, &grads.quats, |_| {});
     out.scales = read(gpu, &grads.scales, |_| {});
