@@ -131,8 +131,11 @@ fn a_tenth_of_a_city_in_memory_gives_the_same_city() {
     let frames = number(&whole, "pages") / 10;
     let (got, summary) = run(folder.path(), &scene, &base, &How { frames, io: "auto", threads: "2", more: &[] });
     assert!(got == want);
-    // Events change few pages here, so a page that is needed was needed by a view.
-    let seen = number(&summary, "pages_needed") as f64 / 120.0 / number(&summary, "pages") as f64;
-    assert!(seen < 0.03, "a view sees {seen} of the pages, evaluation included");
+    // After the last step, before evaluation and export, which look at pages too; the views that were probed at the start
+    // are among the pages needed, so this is a little too much.
+    let metrics = std::fs::read_to_string(folder.path().join("out/metrics.jsonl")).unwrap();
+    let last: serde_json::Value = serde_json::from_str(metrics.lines().last().unwrap()).unwrap();
+    let seen = number(&last, "pages_needed") as f64 / 120.0 / number(&last, "pages") as f64;
+    assert!(seen < 0.03, "a view sees {seen} of the pages");
     assert!(number(&summary, "evictions") > 0 && number(&summary, "pages_read") > 0, "{summary}");
 }
