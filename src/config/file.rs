@@ -112,7 +112,7 @@ config_keys! {
         shn_lr: f64 = 2.5e-3 / 20.0;
         /// Adam's epsilon
         adam_eps: f64 = 1e-15;
-        /// What is kept of Adam's moments between steps: f32, or bf16, which is not exact and saves half of their disk
+        /// What is kept of Adam's moments between steps: f32, or bf16, which is not exact and halves what they take on disk
         moments: String = "f32".into();
         /// Opacity of first Gaussians
         init_opacity: f64 = 0.1;
@@ -169,7 +169,8 @@ config_keys! {
         frames: u32 = 0;
         /// How pages are read and written: auto, uring, mmap or pread. Never changes results
         io: String = "auto".into();
-        /// How pages are stored: raw, zstd:<level>, or auto (what the drive's speed favours). Never changes results
+        /// How pages are stored: raw, halves (for --moments bf16), zstd:<level>, or auto (what the drive's speed and the
+        /// moments favour). Never changes results
         spill_codec: String = "auto".into();
         /// Which page leaves memory first: belady (next used last) or lru. Never changes results
         evict: String = "belady".into();

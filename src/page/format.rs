@@ -37,6 +37,8 @@ pub enum StoredAs {
     Raw,
     /// Bytes shuffled by their place in four-byte words, then one zstd frame.
     ShuffledZstd,
+    /// Lines of words with empty lower halves as their upper halves alone.
+    Halves,
 }
 
 impl StoredAs {
@@ -44,6 +46,7 @@ impl StoredAs {
         match self {
             StoredAs::Raw => 0,
             StoredAs::ShuffledZstd => 1,
+            StoredAs::Halves => 2,
         }
     }
 
@@ -51,6 +54,7 @@ impl StoredAs {
         match byte {
             0 => Some(StoredAs::Raw),
             1 => Some(StoredAs::ShuffledZstd),
+            2 => Some(StoredAs::Halves),
             _ => None,
         }
     }
@@ -141,7 +145,7 @@ pub fn checksum(bytes: &[u8]) -> u128 {
 fn lengths_agree(codec: StoredAs, stored: u32, payload: u32) -> bool {
     match codec {
         StoredAs::Raw => stored == payload,
-        StoredAs::ShuffledZstd => stored < payload,
+        StoredAs::ShuffledZstd | StoredAs::Halves => stored < payload,
     }
 }
 

@@ -30,7 +30,13 @@ pub fn encoded_bytes_max(payload: usize) -> usize {
     table_bytes(payload) + payload
 }
 
-/// Encodes `payload` into the front of `out`, which has [`encoded_bytes_max`] bytes at least; returns the length.
+/// Length of the encoding of `payload`.
+pub fn encoded_bytes(payload: &[u8]) -> usize {
+    let halved = payload.chunks_exact(LINE).filter(|line| is_halvable(line)).count();
+    encoded_bytes_max(payload.len()) - halved * LINE / 2
+}
+
+/// Encodes `payload` into the front of `out`, which has [`encoded_bytes`] bytes at least; returns the length.
 pub fn encode(payload: &[u8], out: &mut [u8]) -> usize {
     let (table, data) = out.split_at_mut(table_bytes(payload.len()));
     table.fill(0);

@@ -201,12 +201,12 @@ impl PagedStore {
                     Pending { token, page, slot, direction: Direction::Write, is_repeated: false, payload: None };
                 self.submit_write(pending, label, buffer);
             }
-            Codec::Zstd { level } => {
+            codec => {
                 let staging = self.take_staging();
                 let label = label.to_vec();
                 self.unencoded.push(Unencoded { token, page, slot, label, payload: buffer, staging });
                 if self.unencoded.len() >= ENCODE_BATCH {
-                    self.encode_waiting(level);
+                    self.encode_waiting(codec);
                 }
             }
         }
@@ -215,8 +215,8 @@ impl PagedStore {
 
     /// Moves ended reads and writes to `done`. With `wait`, blocks until at least one is there, if any is in flight.
     pub fn complete(&mut self, wait: bool, done: &mut Vec<PageDone>) {
-        if let Codec::Zstd { level } = self.config.codec {
-            self.encode_waiting(level);
+        if self.config.codec != Codec::Raw {
+            self.encode_waiting(self.config.codec);
         }
         loop {
             let wait = wait && self.ended.is_empty() && !self.pending.is_empty();
@@ -330,15 +330,15 @@ impl PagedStore {
         self.staging.pop().unwrap_or_else(|| self.new_buffer())
     }
 
-    fn encode_waiting(&mut self, level: i32) {
+    fn encode_waiting(&mut self, codec: Codec) {
         let mut batch = std::mem::take(&mut self.unencoded);
         batch.par_iter_mut().for_each(|write| {
             let payload = &write.payload.as_slice()[HEADER_BYTES..][..write.slot.payload_bytes as usize];
             let stored = &mut write.staging.as_mut_slice()[HEADER_BYTES..];
             // What cannot be encoded for whatever reason is stored raw.
-            if let Ok(Some(bytes)) = codec::encode(payload, level, stored) {
+            if let Ok(Some((bytes, stored_as))) = codec::encode_as(codec, payload, stored) {
                 write.slot.stored_bytes = bytes as u32;
-                write.slot.codec = StoredAs::ShuffledZstd;
+                write.slot.codec = stored_as;
             }
         });
         for Unencoded { token, page, slot, label, payload, staging } in batch {
@@ -347,7 +347,7 @@ impl PagedStore {
                     self.staging.push(staging);
                     (payload, None)
                 }
-                StoredAs::ShuffledZstd => (staging, Some(payload)),
+                _ => (staging, Some(payload)),
             };
             let pending = Pending { token, page, slot, direction: Direction::Write, is_repeated: false, payload };
             self.submit_write(pending, &label, buffer);
@@ -401,7 +401,7 @@ impl PagedStore {
         self.traffic.bytes_read += bytes as u64;
         let buffer = match pending.slot.codec {
             StoredAs::Raw => buffer,
-            StoredAs::ShuffledZstd => {
+            _ => {
                 pending.payload = Some(buffer);
                 self.take_staging()
             }
