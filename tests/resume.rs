@@ -52,8 +52,8 @@ impl Bench {
     fn new() -> Bench {
         let folder = TempDir::new().unwrap();
         let scene = folder.path().join("scene");
-        let (views, width, height, points) = (24, 64, 48, 8000);
-        let blocks = Some(40);
+        let (views, width, height, points) = (24, 64, 48, 6000);
+        let blocks = Some(20);
         let city =
             CityOptions { seed: 5, views, width, height, points, blocks, supersample: 1, ..CityOptions::default() };
         write_city(&scene, &city, &|_, _| {}).unwrap();
@@ -70,7 +70,7 @@ impl Bench {
         let output = train(&[&[text(&self.scene), "--out", text(&out)], BUSY].concat());
         assert!(output.status.success(), "{}", stderr(&output));
         let done = summary(&out);
-        assert_ne!(done["gaussians"], 8000, "no round changed anything, so the test shows little");
+        assert_ne!(done["gaussians"], 6000, "no round changed anything, so the test shows little");
         (ply(&out), logged(&out), done["pages_pinned_max"].as_u64().unwrap())
     }
 
@@ -198,7 +198,8 @@ fn what_cannot_go_on_is_refused_and_left_as_it_was() {
     let mut child = bench.begin(fewest, &[]);
     bench.wait_for_lines(&mut child, 2);
     // In use: a second process is kept out.
-    assert!(said(&[]).contains("use"), "{}", said(&[]));
+    let words = said(&[]);
+    assert!(words.contains("use"), "{words}");
     signal(&child, "INT");
     assert_eq!(ended(child).status.code(), Some(130));
     let words = said(&["--means-lr", "0.001", "--steps", "300"]);
@@ -225,7 +226,8 @@ fn what_cannot_go_on_is_refused_and_left_as_it_was() {
     let output = ended(bench.go_on(&[]));
     assert!(output.status.success(), "{}", stderr(&output));
     assert!(ply(&out) == want, "the scene is another");
-    assert!(said(&[]).contains("removed when a run ends") || said(&[]).contains("spill directory"), "{}", said(&[]));
+    let words = said(&[]);
+    assert!(words.contains("removed when a run ends"), "{words}");
 }
 
 #[test]

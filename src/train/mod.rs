@@ -9,6 +9,7 @@ pub mod checkpoint;
 pub mod eval;
 pub mod machine;
 pub mod memory;
+pub mod page_map;
 pub mod pages;
 pub mod preflight;
 pub mod progress;

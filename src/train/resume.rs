@@ -28,6 +28,7 @@ const FREE_KEYS: &[&str] = &[
     "eval-every",
     "save-every",
     "log-every",
+    "log",
     "ssim-variant",
     "export-frame",
     "host-mem",

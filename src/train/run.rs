@@ -7,6 +7,7 @@ use super::checkpoint::{Origin, dataset_print};
 use super::eval::ply_warnings;
 use super::machine;
 use super::memory::{estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
+use super::page_map::write_page_map;
 use super::preflight;
 use super::progress::Progress;
 use super::report::{MetricsLog, Resolved, Summary, TierTraffic, write_config, write_summary};
@@ -286,6 +287,9 @@ fn train_into(
     let metrics_bytes = begun.past.as_ref().map(|(_, bytes)| *bytes);
     let origin = begin_files(request, dataset, &trainer, begun)?;
     let mut metrics = MetricsLog::open(&out.join("metrics.jsonl"), metrics_bytes)?;
+    if config.log == "tensorboard" {
+        metrics = metrics.with_events(&out.join("tensorboard"))?;
+    }
     let mut checkpoint = tiers.checkpoint.as_mut();
     if let Some(checkpoint) = &mut checkpoint {
         checkpoint.set_origin(origin);
@@ -327,6 +331,7 @@ fn train_into(
         tiers: TierTraffic::of(&trainer.scene.pager),
     };
     write_summary(&out.join("summary.json"), &summary)?;
+    write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
     write_run_report(out)?;
     tested?;
     tiers.is_done = summary.finished;

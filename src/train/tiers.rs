@@ -11,6 +11,7 @@ use crate::checkpoint::run_state::RunState;
 use crate::config::file::TrainConfig;
 use crate::page::codec::Codec;
 use crate::page::commit::{CommitConfig, CommitError, Commits};
+use crate::page::drive_rate::DriveRate;
 use crate::page::engine::{DEPTH, IoEngine, open_engine};
 use crate::page::folder::DriveFolder;
 use crate::page::memory_store::MemoryStore;
@@ -58,10 +59,20 @@ fn policy(config: &TrainConfig) -> EvictPolicy {
     if config.evict == "lru" { EvictPolicy::LeastRecentlyUsed } else { EvictPolicy::FarthestNextUse }
 }
 
-/// How pages are stored, as `--spill-codec` says. `auto` is raw: the drives that this was measured on are faster than the
-/// codec.
-fn codec(config: &TrainConfig) -> Codec {
-    config.spill_codec.parse().unwrap_or(Codec::Raw)
+/// How pages are stored, as `--spill-codec` says; `auto` measures the drive of `folder`, and is raw without one or where
+/// it cannot be measured.
+fn chosen_codec(config: &TrainConfig, folder: Option<&Path>, notes: &mut Vec<String>) -> Codec {
+    if let Ok(codec) = config.spill_codec.parse() {
+        return codec;
+    }
+    match folder.map(DriveRate::of) {
+        None => Codec::Raw,
+        Some(Ok(rate)) => rate.codec(),
+        Some(Err(error)) => {
+            notes.push(format!("the drive was not measured, pages are stored raw: {error}"));
+            Codec::Raw
+        }
+    }
 }
 
 /// Sizes of the pager of a scene of about `pages` pages, within `host_mem` bytes.
@@ -100,19 +111,19 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let pager = pager_config(config, pages, host_mem);
     let layout = SlotLayout::new(capacity_bytes(page_rows, sh_degree), pages as u64);
     let mut tiers = Tiers::default();
-    tiers.codec = codec(config).to_string();
     if config.spill_dir.is_empty() {
         let engine = Box::new(MemoryStore::new());
-        tiers.engine = engine.name().to_string();
-        let of_store = PagedStoreConfig { store: 0, layout, codec: codec(config), generation: 1, serial: 1 };
+        let codec = chosen_codec(config, None, &mut tiers.notes);
+        (tiers.engine, tiers.codec) = (engine.name().to_string(), codec.to_string());
+        let of_store = PagedStoreConfig { store: 0, layout, codec, generation: 1, serial: 1 };
         return Ok((Pager::new(pager, PagedStore::new(engine, of_store)), tiers));
     }
     let spill = SpillDir::create(Path::new(&config.spill_dir), Purpose::Checkpoint, layout, false)?;
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
     // From here on an error removes the directory.
-    let engine = tiers.take_spill(spill, config)?;
+    let (engine, codec) = tiers.take_spill(spill, config)?;
     let opened = Commits::create(Box::new(folder), of_commits)?;
-    let store = opened.paged_store(engine, layout, codec(config))?;
+    let store = opened.paged_store(engine, layout, codec)?;
     tiers.checkpoint = Some(Checkpoint::new(opened.commits, config));
     Ok((Pager::new(pager, store), tiers))
 }
@@ -151,11 +162,6 @@ impl Stored {
         Ok(Stored { spill, opened, run_state })
     }
 
-    /// Pages that there are.
-    pub fn pages(&self) -> usize {
-        self.opened.pages.len()
-    }
-
     /// The tiers of the run that goes on, its pages in them.
     ///
     /// # Errors
@@ -168,9 +174,9 @@ impl Stored {
             return Err(CommitError::Contradiction("slots have another size than pages".to_string()).into());
         }
         let mut tiers = Tiers::default();
-        (tiers.codec, tiers.has_past) = (codec(config).to_string(), true);
-        let engine = tiers.take_spill(spill, config)?;
-        let store = opened.paged_store(engine, layout, codec(config))?;
+        tiers.has_past = true;
+        let (engine, codec) = tiers.take_spill(spill, config)?;
+        let store = opened.paged_store(engine, layout, codec)?;
         let pager = Pager::open(pager, store, &opened.pages, run_state.events.len())?;
         tiers.checkpoint = Some(Checkpoint::new(opened.commits, config));
         Ok((pager, tiers))
@@ -183,14 +189,15 @@ fn commit_config(spill: &SpillDir) -> CommitConfig {
 
 impl Tiers {
     /// Takes over a spill directory and starts what moves its pages.
-    fn take_spill(&mut self, spill: SpillDir, config: &TrainConfig) -> InputResult<Box<dyn PageStore>> {
+    fn take_spill(&mut self, spill: SpillDir, config: &TrainConfig) -> InputResult<(Box<dyn PageStore>, Codec)> {
         self.notes.extend(spill.warnings().iter().cloned());
         let folder = spill.folder().to_path_buf();
         self.spill = Some(spill);
+        let codec = chosen_codec(config, Some(&folder), &mut self.notes);
         let opened = open_engine(config.io.parse().unwrap_or(IoEngine::Auto), &folder, DEPTH)?;
         self.notes.extend(opened.notes);
-        self.engine = opened.store.name().to_string();
-        Ok(opened.store)
+        (self.engine, self.codec) = (opened.store.name().to_string(), codec.to_string());
+        Ok((opened.store, codec))
     }
 
     /// Whether a run that stops now can go on from the spill directory.
