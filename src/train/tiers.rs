@@ -211,12 +211,16 @@ impl Tiers {
         self.spill.is_some()
     }
 
-    /// Bytes that may still be written to the drive; `None` without one, or where the system does not tell.
+    /// Bytes that pages may take on the drive: what is free, and what those of a run that goes on have already; `None`
+    /// without a drive, or where the system does not tell.
     ///
     /// # Errors
     /// The folder is gone.
     pub fn free_bytes(&self) -> InputResult<Option<u64>> {
-        self.spill.as_ref().map_or(Ok(None), SpillDir::free_bytes)
+        let Some(spill) = &self.spill else { return Ok(None) };
+        let segments = spill.segments()?.len() as u64;
+        let taken = if self.has_past { segments * spill.format().layout.segment_bytes() } else { 0 };
+        Ok(spill.free_bytes()?.map(|free| free.saturating_add(taken)))
     }
 
     /// Closes the spill directory, and removes it unless a run can go on from it; the pager is gone by now. Gives what

@@ -352,7 +352,11 @@ impl Trainer {
             }
         }
         if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
-            checkpoint.commit(self, outputs.metrics)?;
+            // A run that is done needs no commit to be of use, one that stops does.
+            match self.step < self.options.steps {
+                true => checkpoint.commit(self, outputs.metrics)?,
+                false => checkpoint.commit_if_space(self, outputs.metrics)?,
+            }
         }
         outputs.progress.finish();
         Ok(())
