@@ -24,6 +24,7 @@
 //! | [`page`] | pages as bytes: buffers, slots on disk, checksums, the engines that move them |
 //! | [`cache`] | which pages are in memory, in what state, and which leaves next; no I/O |
 //! | [`paging`] | brings the pages of a view into memory and takes them back |
+//! | [`checkpoint`] | the state of a run beside its pages, as bytes |
 //! | [`gpu`] | a device and its memory, shaders, recording of work; knows no Gaussians |
 //! | [`kernels`] | the ordered table of stages and each stage as a function on plain slices |
 //! | [`render`] | the stages in order: forward, loss, backward; image metrics |
@@ -41,6 +42,7 @@
 
 pub mod base;
 pub mod cache;
+pub mod checkpoint;
 pub mod config;
 pub mod dataset;
 pub mod densify;

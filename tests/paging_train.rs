@@ -107,7 +107,9 @@ fn frames_engines_and_threads_change_no_bit() {
         assert!(number(&summary, "frames") <= how.frames, "{how:?}: {summary}");
         let spills = how.frames < pages;
         assert_eq!(number(&summary, "pages_read") > 0, spills, "{how:?}: {summary}");
-        assert_eq!(number(&summary, "bytes_written") > 0, spills, "{how:?}: {summary}");
+        // What fits in memory is written once to the drive, by the commit after the last step.
+        let commits = !how.io.is_empty();
+        assert_eq!(number(&summary, "bytes_written") > 0, spills || commits, "{how:?}: {summary}");
     }
 }
 

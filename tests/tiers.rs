@@ -1,5 +1,5 @@
 //! Budgets and the spill directory at the command line: what is too small is refused with numbers and alternatives,
-//! scratch is removed, and what is not ours stays.
+//! what is of no use any more is removed, and what is not ours stays.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
 #[path = "support/scenes.rs"]
@@ -48,7 +48,7 @@ fn budgets_that_are_too_small_are_refused_with_numbers_and_alternatives() {
 }
 
 #[test]
-fn the_spill_directory_is_scratch_and_others_files_are_safe() {
+fn the_spill_directory_goes_with_its_run_and_others_files_are_safe() {
     let (folder, scene) = small();
     let spill = folder.path().join("spill");
     let with_drive = ["--frames", "60", "--page-rows", "64", "--spill-dir", text(&spill), "--strategy", "none"];
@@ -57,8 +57,8 @@ fn the_spill_directory_is_scratch_and_others_files_are_safe() {
     assert!(stderr(&output).contains("60 frames of pages") && stderr(&output).contains("drive "));
     assert!(!spill.exists(), "removed at a clean end");
     let done = summary(&folder.path().join("out"));
-    // All 48 pages fit, so nothing has to leave.
-    assert!(done["bytes_written"] == 0 && done["frames"] == done["pages"], "{done}");
+    // All 48 pages fit, so nothing has to come back.
+    assert!(done["pages_read"] == 0 && done["frames"] == done["pages"], "{done}");
     let config = std::fs::read_to_string(folder.path().join("out/config.toml")).unwrap();
     assert!(config.contains("view-order = \"shuffle\""), "resolved once, and recorded: {config}");
     std::fs::remove_dir_all(folder.path().join("out")).unwrap();

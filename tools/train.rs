@@ -4,6 +4,7 @@ use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
+use gsscale::train::resume::{ResumeRequest, resume};
 use gsscale::train::run::{RunOutcome, RunRequest, run};
 use gsscale::train::trainer::TrainError;
 use std::path::{Path, PathBuf};
@@ -16,6 +17,7 @@ Examples:
   gsscale-train scans/village --out runs/quick --steps 7000 --max-resolution 800
   gsscale-train scans/village --out runs/big --max-gaussians 2000000 --config configs/in_core.toml
   gsscale-train scans/village --out runs/gpu --device gpu   on a GPU; --list-devices shows which there are
+  gsscale-train --resume runs/village               go on with a run that has a spill directory and stopped
   gsscale-train scans/village --dry-run             what was understood, and the memory it will take
 
 Results in --out: point_cloud.ply (opens in any splat viewer), renders/test/*.png (render beside photo),
@@ -26,10 +28,10 @@ summary.json, metrics.jsonl, config.toml (every setting of the run; usable with 
 #[command(name = "gsscale-train", version, after_help = EXAMPLES)]
 struct Args {
     /// Scene: a COLMAP folder (images/, sparse/), or a folder with transforms.json
-    #[arg(required_unless_present_any = ["demo", "list_devices"])]
+    #[arg(required_unless_present_any = ["demo", "list_devices", "resume"])]
     scene: Option<PathBuf>,
     /// Output folder
-    #[arg(long, short, required_unless_present_any = ["dry_run", "list_devices"])]
+    #[arg(long, short, required_unless_present_any = ["dry_run", "list_devices", "resume"])]
     out: Option<PathBuf>,
     /// Config file; flags override it
     #[arg(long)]
@@ -37,6 +39,10 @@ struct Args {
     /// Generate a small city into `scene` inside --out and train on it
     #[arg(long, conflicts_with = "scene")]
     demo: bool,
+    /// Go on with the run in this output folder, which was stopped or cut off and has a spill directory; its config and
+    /// scene are used. Memory, frames, threads, I/O and logging may be given anew
+    #[arg(long, value_name = "OUT", conflicts_with_all = ["scene", "out", "config", "demo", "dry_run", "overwrite"])]
+    resume: Option<PathBuf>,
     /// Print what was understood and the memory it will take, then stop
     #[arg(long)]
     dry_run: bool,
@@ -78,6 +84,9 @@ fn list_devices() {
 }
 
 fn start(args: Args) -> Result<RunOutcome, TrainError> {
+    if let Some(out) = args.resume {
+        return resume(&ResumeRequest { out, keys: args.keys, quiet: args.quiet });
+    }
     let mut config = match (&args.config, args.demo) {
         (Some(path), _) => TrainConfig::read(path)?,
         (None, true) => demo_config(),

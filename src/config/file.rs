@@ -162,8 +162,8 @@ config_keys! {
     "Memory and disk" {
         /// Memory that the run may take; 0 = 70 % of what this machine, or its control group, has available
         host_mem: ByteSize = ByteSize(0);
-        /// Folder for pages that do not fit in memory, on a fast drive; empty = all pages stay in memory. Scratch: removed
-        /// at the end
+        /// Folder for pages that do not fit in memory, on a fast drive; empty = all pages stay in memory. It is the
+        /// checkpoint of the run as well: kept when a run stops early (see --resume), removed at its end
         spill_dir: String = String::new();
         /// Pages held in memory at once; 0 = as many as --host-mem allows
         frames: u32 = 0;
@@ -172,6 +172,9 @@ config_keys! {
         /// How pages are stored: raw, halves (for --moments bf16), zstd:<level>, or auto (what the drive's speed and the
         /// moments favour). Never changes results
         spill_codec: String = "auto".into();
+        /// Seconds from one commit to the next, with --spill-dir: a run that is killed loses no more. 0 = only when it is
+        /// asked to stop, and after the last step. Never changes results
+        commit_every: f64 = 60.0;
         /// Which page leaves memory first: belady (next used last) or lru. Never changes results
         evict: String = "belady".into();
         /// Bytes of pages that may be read ahead of their step; 0 = an eighth of the frames
@@ -302,6 +305,9 @@ impl TrainConfig {
         }
         if self.refine_every == 0 {
             return refuse("refine-every", "1 or more");
+        }
+        if !(self.commit_every >= 0.0 && self.commit_every.is_finite()) {
+            return refuse("commit-every", "a number of seconds from 0 on");
         }
         if self.log_every == 0 {
             return refuse("log-every", "1 or more");

@@ -23,6 +23,20 @@ impl Default for GradHistogram {
 }
 
 impl GradHistogram {
+    /// The bins that are not empty, ascending, with their rows: for a checkpoint.
+    pub fn filled(&self) -> Vec<(u16, u32)> {
+        self.bins.iter().zip(0..).filter(|(rows, _)| **rows > 0).map(|(&rows, bin)| (bin, rows)).collect()
+    }
+
+    /// From what [`GradHistogram::filled`] gave; `None` for a bin that does not exist.
+    pub fn from_filled(filled: &[(u16, u32)]) -> Option<GradHistogram> {
+        let mut histogram = GradHistogram::default();
+        for &(bin, rows) in filled {
+            *histogram.bins.get_mut(usize::from(bin))? = rows;
+        }
+        Some(histogram)
+    }
+
     /// Counts a row with this mean.
     pub fn add(&mut self, mean: f32) {
         self.bins[bin(mean)] += 1;

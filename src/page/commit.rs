@@ -27,7 +27,7 @@ use std::io;
 /// The page map's file.
 pub const MAP_NAME: &str = "map.redb";
 /// The page map while it is made.
-const MAP_NEW_NAME: &str = "map.redb.new";
+pub const MAP_NEW_NAME: &str = "map.redb.new";
 /// The witness's file.
 pub const WITNESS_NAME: &str = "witness";
 /// Space set aside for a last commit on a full drive.

@@ -2,6 +2,7 @@
 //! Knows pages as bytes, metas and bounds; neither the optimizer nor the renderer.
 
 mod ahead;
+mod commit;
 pub mod error;
 mod fetch;
 pub mod label;

@@ -1,7 +1,7 @@
 //! Hands out the pages of a view and takes them back.
 //!
 //! Here are the pages' entries and the calls of the trainer; `fetch` brings what is missing, `ahead` what will be
-//! missing, `transfers` talks to the store.
+//! missing, `transfers` talks to the store, `commit` makes what it holds last.
 //!
 //! Invariants: 1. `acquire` gives every page that the view may see by the bounds as they are now, whatever was planned;
 //! 2. a page's buffer is in one place: with the cache, with the store, or with the caller who pinned it; 3. what a step
@@ -12,7 +12,7 @@ use super::error::PagingError;
 use super::pinned::PinnedPage;
 use super::stats::PagerStats;
 use super::window::Window;
-use crate::base::ids::PageNo;
+use crate::base::ids::{PageId, PageNo};
 use crate::cache::evict::EvictPolicy;
 use crate::cache::frame::FrameState;
 use crate::cache::host_cache::HostCache;
@@ -23,6 +23,7 @@ use crate::scene::camera::Camera;
 use crate::scene::page_layout::capacity_bytes;
 use crate::scene::page_meta::PageMeta;
 use crate::schedule::visibility::visible_pages;
+use std::collections::BTreeMap;
 
 /// Sizes of a pager. None of them changes a bit of the rows.
 #[derive(Debug, Clone, Copy)]
@@ -73,6 +74,8 @@ pub struct Pager {
     pub(super) writes_stopped: bool,
     /// Reads and writes that were started ahead of their need and are still in flight, bytes.
     pub(super) ahead: [usize; 2],
+    /// Pages of the last acknowledged commit, with the generations of their versions.
+    pub(super) committed: BTreeMap<PageId, u64>,
 }
 
 impl Pager {
@@ -94,6 +97,7 @@ impl Pager {
             failed_write: None,
             writes_stopped: false,
             ahead: [0; 2],
+            committed: BTreeMap::new(),
         }
     }
 

@@ -7,12 +7,14 @@
 //! Invariants: 1. the log only grows; 2. steps never decrease in it; 3. the index of an event is its name: it is
 //! part of the uids of the rows that it makes.
 
+use serde::{Deserialize, Serialize};
+
 /// Children of a split lie within this many standard deviations of their parent, in its own axes: bounds of pages
 /// count on it. 1.1 % of draws are drawn again.
 pub const SPLIT_SIGMAS: f64 = 3.33;
 
 /// What a densification round decides by. Everything absolute, so that a late application decides the same.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RoundThresholds {
     /// Rows grow whose mean gradient norm (NDC units) is greater. Infinite: nothing grows.
     pub grow_grad2d: f32,
@@ -25,7 +27,7 @@ pub struct RoundThresholds {
 }
 
 /// One kind of global change.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum EventKind {
     /// Opacities above the given one are set to it; the moments of all opacities become zero.
     ResetOpacity {
@@ -42,7 +44,7 @@ pub enum EventKind {
 }
 
 /// One global change and its time.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Event {
     /// 0-based optimizer step after which it happens.
     pub step: u32,

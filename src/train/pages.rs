@@ -150,6 +150,24 @@ impl PagedScene {
         PagedScene { pager, rules, histogram, rows: 0, rows_bound: 0 }
     }
 
+    /// Pages that a checkpoint brought back, with what all of them share.
+    pub(super) fn restore(
+        pager: Pager,
+        options: &RunOptions,
+        events: EventLog,
+        histogram: GradHistogram,
+        [rows, rows_bound]: [u64; 2],
+    ) -> PagedScene {
+        let mut rules = PageRules::new(options);
+        for event in events.events() {
+            if let EventKind::RaiseShDegree { degree } = event.kind {
+                rules.sh_degree = degree;
+            }
+        }
+        rules.events = events;
+        PagedScene { pager, rules, histogram, rows, rows_bound }
+    }
+
     fn insert_first_page(&mut self, id: PageId, state: &SceneState) -> Result<(), PagingError> {
         let meta = self.rules.meta(id, state);
         self.pager.insert(meta, |payload| {

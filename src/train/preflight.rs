@@ -21,6 +21,8 @@ use crate::schedule::visibility::ViewPages;
 const ENDURANCE_BYTES: f64 = 300e12;
 /// Epochs that are played through to see what a run will write.
 const PLAYED_EPOCHS: u32 = 3;
+/// Versions of a page that may lie on the drive: two commits', and the one that is written for the next.
+const VERSIONS: u64 = 3;
 /// Slots that writes in flight take beside those of the pages.
 const SLOTS_IN_FLIGHT: u64 = 64;
 
@@ -197,10 +199,12 @@ fn check_drive(plan: &TierPlan, tiers: &Tiers) -> InputResult<()> {
         let remedy = "free space on it, choose another drive, or lower --sh-degree";
         return Err(InputError::new("--spill-dir", problem, remedy));
     }
-    if free < most {
+    let with_past = most.saturating_mul(VERSIONS);
+    if free < with_past {
         eprintln!(
-            "warning: the scene may grow to {} on the drive, which has {} free: lower --max-gaussians",
-            format_bytes(most),
+            "warning: the scene and its last two commits may grow to {} on the drive, which has {} free: lower \
+             --max-gaussians, or commit less often with --commit-every",
+            format_bytes(with_past),
             format_bytes(free)
         );
     }

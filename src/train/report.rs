@@ -9,7 +9,7 @@ use crate::config::file::TrainConfig;
 use crate::exchange::tensorboard::EventFile;
 use crate::paging::pager::Pager;
 use serde::{Deserialize, Serialize};
-use std::fs::File;
+use std::fs::{File, OpenOptions};
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
@@ -180,6 +180,41 @@ impl MetricsLog {
         Ok(MetricsLog { events: Some(EventFile::create(folder)?), ..self })
     }
 
+    /// The file of a run that begins, or that goes on after the first `bytes` bytes.
+    ///
+    /// # Errors
+    /// As [`MetricsLog::create`] and [`MetricsLog::resume`].
+    pub fn open(path: &Path, bytes: Option<u64>) -> InputResult<Self> {
+        bytes.map_or_else(|| MetricsLog::create(path), |bytes| MetricsLog::resume(path, bytes))
+    }
+
+    /// Goes on after the first `bytes` bytes of the file; what follows them belongs to steps that are done again.
+    ///
+    /// # Errors
+    /// The file is missing, shorter, or cannot be written.
+    pub fn resume(path: &Path, bytes: u64) -> InputResult<Self> {
+        let io = |e: std::io::Error| InputError::io(path, "going on with the metrics file", &e);
+        let file = OpenOptions::new().append(true).open(path).map_err(io)?;
+        let there = file.metadata().map_err(io)?.len();
+        if there < bytes {
+            let problem = format!("it has {there} bytes, but the run had written {bytes}");
+            return Err(InputError::new(path, problem, "bring back the file of the run that stopped"));
+        }
+        file.set_len(bytes).map_err(io)?;
+        Ok(MetricsLog { path: path.to_path_buf(), file: BufWriter::new(file), events: None })
+    }
+
+    /// Makes what was written durable; returns its length in bytes.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn sync(&mut self) -> InputResult<u64> {
+        let io = |e: std::io::Error| InputError::io(&self.path, "writing metrics", &e);
+        self.file.flush().map_err(io)?;
+        self.file.get_ref().sync_all().map_err(io)?;
+        Ok(self.file.get_ref().metadata().map_err(io)?.len())
+    }
+
     /// Writes one line and hands it to the system, so that a crash loses none that was written.
     ///
     /// # Errors
@@ -276,6 +311,18 @@ pub fn write_config(path: &Path, config: &TrainConfig, resolved: &Resolved) -> I
     text.push_str("\n[resolved]\n");
     text.push_str(&toml::to_string(resolved).map_err(fail)?);
     write_whole(path, text.as_bytes())
+}
+
+/// Reads the facts back from a run's config.toml.
+///
+/// # Errors
+/// It is not a run's.
+pub fn read_resolved(path: &Path) -> InputResult<Resolved> {
+    let text = std::fs::read_to_string(path).map_err(|e| InputError::io(path, "reading the config", &e))?;
+    let refuse = |problem: String| InputError::new(path, problem, "name the output folder of a run");
+    let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| refuse(e.to_string()))?;
+    let resolved = table.remove("resolved").ok_or_else(|| refuse("it has no table [resolved]".to_string()))?;
+    Resolved::deserialize(resolved).map_err(|e| refuse(e.to_string()))
 }
 
 #[cfg(test)]

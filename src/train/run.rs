@@ -3,6 +3,7 @@
 //! Invariants: 1. the output folder is made only after the dataset was understood, so bad input leaves nothing
 //! behind; 2. a run that is stopped or fails after its first step still writes the PLY of its last good step.
 
+use super::checkpoint::{Origin, dataset_print};
 use super::eval::ply_warnings;
 use super::machine;
 use super::memory::{estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
@@ -12,9 +13,10 @@ use super::progress::Progress;
 use super::report::{MetricsLog, Resolved, Summary, TierTraffic, write_config, write_summary};
 use super::signals::StopFlag;
 use super::start::Start;
-use super::tiers;
+use super::tiers::{self, Tiers};
 use super::trainer::{LoopOutputs, TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
+use crate::checkpoint::run_state::DatasetPrint;
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
@@ -22,6 +24,7 @@ use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
+use crate::render::Renderer;
 use crate::report::run_report::{PAGES_FILE, REPORT_FILE, write_run_report};
 use crate::scene::columns::{Columns, sh_n_width};
 use crate::scene::init::{gaussians_from_points, random_points_in_frusta};
@@ -155,6 +158,20 @@ fn cut_sh(columns: Columns, sh_degree: u8) -> Columns {
     Columns { sh_degree, sh_n, ..columns }
 }
 
+/// What a run begins or goes on with.
+pub(super) struct Begun {
+    /// The dataset.
+    pub print: DatasetPrint,
+    /// Degree in use from the first step.
+    pub sh_degree_start: u8,
+    /// A run that goes on: its config, and the length of its metrics.
+    pub past: Option<(String, u64)>,
+    /// Budget, bytes.
+    pub host_mem: Option<u64>,
+    /// Bytes that the graphics driver took.
+    pub driver: u64,
+}
+
 /// Runs a request from beginning to end.
 ///
 /// # Errors
@@ -166,58 +183,120 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     check_out(request)?;
     let host_mem = host_budget(config);
     let start = Start::read(&request.scene, config, host_mem)?;
-    let say = |line: &str| {
-        if !request.quiet {
-            eprintln!("{line}");
-        }
-    };
-    for warning in &start.dataset.warnings {
-        eprintln!("warning: {warning}");
-    }
     let sh_degree_start = start.sh_degree_start;
-    let options = RunOptions { sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
-    let before = host_bytes_now().unwrap_or(0);
-    let (renderer, word) = machine::renderer(config)?;
-    let driver = host_bytes_now().unwrap_or(0).saturating_sub(before);
-    if let Some(word) = word {
-        say(&word);
-    }
+    let (renderer, options, driver) = begin(request.quiet, config, &start)?;
     let fill = first_fill(config.page_rows as usize, options.densify.is_some());
     let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
     // Dropped after the trainer, whose pages may lie there.
-    let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
+    let (pager, tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
     tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
+    let print = dataset_print(&start.dataset, start.rows);
     let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
-    let mut trainer = Trainer::of_scene(scene, &dataset, renderer, options);
-    let mut memory = estimate(config, &dataset, &mut trainer, driver)?;
-    let plan = preflight::settle(config, &dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
-    say(&describe(request, &dataset, &trainer, &preflight::describe(&plan, &memory[1], &tiers)));
+    let trainer = Trainer::of_scene(scene, &dataset, renderer, options);
+    see_through(request, &dataset, tiers, trainer, Begun { print, sh_degree_start, past: None, host_mem, driver })
+}
+
+/// What begins alike for all runs once the scene was read: warnings, options, the renderer and the bytes it took.
+pub(super) fn begin(
+    quiet: bool,
+    config: &TrainConfig,
+    start: &Start,
+) -> Result<(Box<dyn Renderer>, RunOptions, u64), TrainError> {
+    for warning in &start.dataset.warnings {
+        eprintln!("warning: {warning}");
+    }
+    let options =
+        RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
+    let before = host_bytes_now().unwrap_or(0);
+    let (renderer, word) = machine::renderer(config)?;
+    let driver = host_bytes_now().unwrap_or(0).saturating_sub(before);
+    if let Some(word) = word.filter(|_| !quiet) {
+        eprintln!("{word}");
+    }
+    Ok((renderer, options, driver))
+}
+
+/// Checks what a run will take, says it, and trains to the end.
+pub(super) fn see_through(
+    request: &RunRequest,
+    dataset: &Dataset,
+    mut tiers: Tiers,
+    mut trainer: Trainer,
+    begun: Begun,
+) -> Result<RunOutcome, TrainError> {
+    let (config, host_mem) = (&request.config, begun.host_mem);
+    let mut memory = estimate(config, dataset, &mut trainer, begun.driver)?;
+    let plan = preflight::settle(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
+    if !request.quiet {
+        let of_tiers = preflight::describe(&plan, &memory[1], &tiers);
+        eprintln!("{}", describe(request, dataset, &trainer, &of_tiers));
+    }
     if request.dry_run {
         return Ok(RunOutcome { summary: None, exit_code: 0 });
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
-    make_out(&request.out, request.overwrite)?;
-    let outcome = train_into(request, &dataset, trainer, &stop);
+    if begun.past.is_none() {
+        make_out(&request.out, request.overwrite)?;
+    }
+    let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun);
+    if tiers.can_resume() {
+        eprintln!("to go on from the last commit: gsscale-train --resume {}", request.out.display());
+    }
     tiers.close().iter().for_each(|word| eprintln!("warning: {word}"));
     outcome
+}
+
+/// The config as it is kept: settled, and with paths that do not depend on where the program was started.
+fn settled(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
+    let absolute = |path: &String| match path.as_str() {
+        "" => String::new(),
+        path => std::path::absolute(path).map_or(path.to_string(), |p| p.to_string_lossy().into_owned()),
+    };
+    TrainConfig {
+        view_order: trainer.view_order().order().to_string(),
+        spill_dir: absolute(&config.spill_dir),
+        init_ply: absolute(&config.init_ply),
+        ..config.clone()
+    }
+}
+
+/// Writes config.toml of a run that begins; returns what every commit says of how it began.
+fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun: Begun) -> InputResult<Origin> {
+    let simd = limits::simd_path(&request.config).name().to_string();
+    let Begun { print, sh_degree_start, past, .. } = begun;
+    let config = match past {
+        Some((config, _)) => config,
+        None => {
+            let (path, settled) = (request.out.join("config.toml"), settled(&request.config, trainer));
+            write_config(&path, &settled, &resolved(request, dataset, trainer))?;
+            let fail = |e: toml::ser::Error| InputError::new(&path, e.to_string(), "report this as a bug");
+            toml::to_string(&settled).map_err(fail)?
+        }
+    };
+    Ok(Origin { config, simd, sh_degree_start, dataset: print })
 }
 
 fn train_into(
     request: &RunRequest,
     dataset: &Dataset,
     mut trainer: Trainer,
-    stop: &StopFlag,
+    (stop, tiers): (&StopFlag, &mut Tiers),
+    begun: Begun,
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
-    let settled = TrainConfig { view_order: trainer.view_order().order().to_string(), ..config.clone() };
-    write_config(&out.join("config.toml"), &settled, &resolved(request, dataset, &trainer))?;
-    let mut metrics = MetricsLog::create(&out.join("metrics.jsonl"))?;
+    let metrics_bytes = begun.past.as_ref().map(|(_, bytes)| *bytes);
+    let origin = begin_files(request, dataset, &trainer, begun)?;
+    let mut metrics = MetricsLog::open(&out.join("metrics.jsonl"), metrics_bytes)?;
     if config.log == "tensorboard" {
         metrics = metrics.with_events(&out.join("tensorboard"))?;
     }
+    let mut checkpoint = tiers.checkpoint.as_mut();
+    if let Some(checkpoint) = &mut checkpoint {
+        checkpoint.set_origin(origin);
+    }
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let mut progress = Progress::new(config.steps, request.quiet);
-    let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop };
+    let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint };
     let looped = trainer.run(dataset, &targets, &mut outputs);
     let ply = Trainer::ply_path(out);
     let written = trainer.save(dataset, &ply)?;
@@ -255,6 +334,7 @@ fn train_into(
     write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
     write_run_report(out)?;
     tested?;
+    tiers.is_done = summary.finished;
     Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
 }
 
@@ -266,7 +346,16 @@ fn check_out(request: &RunRequest) -> InputResult<()> {
     if is_empty_folder {
         return Ok(());
     }
-    Err(InputError::new(&request.out, "exists already", "choose another --out, or replace it with --overwrite"))
+    let file = request.out.join("config.toml");
+    let can_go_on = TrainConfig::read(&file).is_ok_and(|c| !c.spill_dir.is_empty() && Path::new(&c.spill_dir).is_dir());
+    let remedy = match can_go_on {
+        true => format!(
+            "it holds a run that stopped: go on with gsscale-train --resume {}, or choose another --out",
+            request.out.display()
+        ),
+        false => "choose another --out, or replace it with --overwrite".to_string(),
+    };
+    Err(InputError::new(&request.out, "exists already", remedy))
 }
 
 /// Makes the folder, proves that it can be written, and removes what an earlier run left there under our names.
@@ -310,7 +399,7 @@ fn remove_saved(out: &Path) -> InputResult<()> {
 fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer) -> Resolved {
     Resolved {
         version: env!("CARGO_PKG_VERSION").to_string(),
-        scene: request.scene.clone(),
+        scene: std::path::absolute(&request.scene).unwrap_or_else(|_| request.scene.clone()),
         simd: limits::simd_path(&request.config).name().to_string(),
         threads: rayon::current_num_threads(),
         device: trainer.renderer.device(),

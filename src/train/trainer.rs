@@ -4,6 +4,7 @@
 //! cadences of logging and evaluation; 2. a step whose loss is not finite changes nothing, and three in a row end
 //! the run with what the last good step left.
 
+use super::checkpoint::Checkpoint;
 use super::eval::{EvalRequest, evaluate};
 use super::memory::host_bytes_peak;
 use super::pages::PagedScene;
@@ -16,6 +17,7 @@ use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{self, PlyMeta};
+use crate::page::commit::CommitError;
 use crate::paging::error::PagingError;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::{RenderError, RenderOptions, Renderer};
@@ -53,6 +55,9 @@ pub enum TrainError {
     /// A page cannot be split.
     #[error(transparent)]
     Split(#[from] SplitTooDeep),
+    /// A commit failed, or a checkpoint cannot be opened.
+    #[error(transparent)]
+    Commit(#[from] CommitError),
     /// The loss was not finite several times in a row.
     #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
     NonFinite {
@@ -77,11 +82,11 @@ pub struct Trainer {
     order: ViewOrder,
     train_views: Vec<usize>,
     working: WorkingSet,
-    step: u32,
-    rows_skipped: u64,
-    steps_skipped: u32,
-    steps_skipped_in_a_row: u32,
-    train_seconds: f64,
+    pub(super) step: u32,
+    pub(super) rows_skipped: u64,
+    pub(super) steps_skipped: u32,
+    pub(super) steps_skipped_in_a_row: u32,
+    pub(super) train_seconds: f64,
 }
 
 /// Where a loop writes, and how it is watched.
@@ -94,6 +99,8 @@ pub struct LoopOutputs<'a> {
     pub progress: &'a mut Progress,
     /// Ctrl-C.
     pub stop: &'a StopFlag,
+    /// Where the run is committed to, if anywhere.
+    pub checkpoint: Option<&'a mut Checkpoint>,
 }
 
 fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
@@ -340,6 +347,16 @@ impl Trainer {
                 let tiers = TierTraffic::of(&self.scene.pager).words();
                 format!("loss {:.4} psnr {psnr:.2}{test} {gaussians} gaussians{tiers}", outcome.loss.loss)
             });
+            if let Some(checkpoint) = outputs.checkpoint.as_deref_mut().filter(|c| c.is_due()) {
+                checkpoint.commit_if_space(self, outputs.metrics)?;
+            }
+        }
+        if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
+            // A run that is done needs no commit to be of use, one that stops does.
+            match self.step < self.options.steps {
+                true => checkpoint.commit(self, outputs.metrics)?,
+                false => checkpoint.commit_if_space(self, outputs.metrics)?,
+            }
         }
         outputs.progress.finish();
         Ok(())

@@ -1,0 +1,204 @@
+//! Everything that a run needs beside its pages to go on as though it had never stopped, as bytes.
+//!
+//! Invariants: 1. what the bytes give back is what went in, bit for bit; 2. the version comes first, so that a newer
+//! program's state is told from damage; 3. bytes that nobody vouches for give a state within its limits or an error,
+//! never a panic.
+
+use crate::page::encoding::{self, EncodingError};
+use crate::scene::events::{Event, EventKind, EventLog};
+use serde::{Deserialize, Serialize};
+
+/// Version of the layout below.
+pub const VERSION: u32 = 1;
+/// Bins of the statistics.
+const BINS: u16 = 1 << 15;
+
+/// The dataset that a run was started on, as far as training depends on it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DatasetPrint {
+    /// A digest of each view: name, set, size, pose.
+    pub views: Vec<u64>,
+    /// Gaussians that a run starts from.
+    pub first_rows: u64,
+    /// Scene scale, local units.
+    pub scene_scale: f32,
+}
+
+/// A run between two steps.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunState {
+    /// Steps done.
+    pub step: u32,
+    /// The config, every key, as TOML.
+    pub config: String,
+    /// Instruction path that was resolved.
+    pub simd: String,
+    /// What rendered.
+    pub device: String,
+    /// Degree in use from the first step.
+    pub sh_degree_start: u8,
+    /// The dataset.
+    pub dataset: DatasetPrint,
+    /// The events so far.
+    pub events: Vec<Event>,
+    /// Statistics of rows since the last round: bins that are not empty, with their rows.
+    pub histogram: Vec<(u16, u32)>,
+    /// Rows in the pages as they are stored.
+    pub rows: u64,
+    /// No fewer than the rows after all events.
+    pub rows_bound: u64,
+    /// Gaussians whose update was skipped because something was not finite.
+    pub rows_skipped: u64,
+    /// Steps that were skipped for the same reason.
+    pub steps_skipped: u32,
+    /// Of these, the last ones in a row.
+    pub steps_skipped_in_a_row: u32,
+    /// Seconds spent in steps.
+    pub train_seconds: f64,
+    /// Length of metrics.jsonl.
+    pub metrics_bytes: u64,
+}
+
+/// Why bytes are not the state of a run.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum RunStateError {
+    /// Written by another program.
+    #[error("the run state has version {0}; this program knows version {VERSION}")]
+    Version(u32),
+    /// Not a value.
+    #[error("the run state is {0}")]
+    Encoding(#[from] EncodingError),
+    /// A value that no run has.
+    #[error("the run state contradicts itself: {0}")]
+    Impossible(&'static str),
+}
+
+impl RunState {
+    /// As bytes.
+    ///
+    /// # Errors
+    /// None that a state of a run can cause.
+    pub fn to_bytes(&self) -> Result<Vec<u8>, RunStateError> {
+        let mut bytes = VERSION.to_le_bytes().to_vec();
+        bytes.extend(encoding::to_bytes(self)?);
+        Ok(bytes)
+    }
+
+    /// From bytes.
+    ///
+    /// # Errors
+    /// They are not the state of a run, or that of a newer program.
+    pub fn from_bytes(bytes: &[u8]) -> Result<RunState, RunStateError> {
+        let (version, body) = bytes.split_first_chunk().ok_or(RunStateError::Impossible("it is empty"))?;
+        let version = u32::from_le_bytes(*version);
+        if version != VERSION {
+            return Err(RunStateError::Version(version));
+        }
+        let state: RunState = encoding::from_bytes(body)?;
+        state.check()?;
+        Ok(state)
+    }
+
+    /// The events as a log.
+    ///
+    /// # Errors
+    /// They are not in the order of time.
+    pub fn event_log(&self) -> Result<EventLog, RunStateError> {
+        EventLog::from_events(self.events.clone()).ok_or(RunStateError::Impossible("its events go back in time"))
+    }
+
+    fn check(&self) -> Result<(), RunStateError> {
+        let log = self.event_log()?;
+        let refuse = |what| Err(RunStateError::Impossible(what));
+        if log.events().last().is_some_and(|last| last.step >= self.step) {
+            return refuse("an event lies in its future");
+        }
+        let is_too_high = |e: &Event| matches!(e.kind, EventKind::RaiseShDegree { degree } if degree > 3);
+        if self.sh_degree_start > 3 || log.events().iter().any(is_too_high) {
+            return refuse("a degree is above 3");
+        }
+        let ascends = self.histogram.windows(2).all(|pair| pair[0].0 < pair[1].0);
+        if !ascends || self.histogram.last().is_some_and(|last| last.0 >= BINS) {
+            return refuse("its statistics have bins that do not exist");
+        }
+        if !(self.train_seconds >= 0.0 && self.train_seconds.is_finite()) {
+            return refuse("it has trained for no length of time");
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::base::rng::mix64;
+    use crate::scene::events::RoundThresholds;
+
+    fn sample() -> RunState {
+        let thresholds =
+            RoundThresholds { grow_grad2d: f32::INFINITY, split_scale: 0.5, prune_opacity: -0.0, prune_scale: 2.0 };
+        let events = [
+            Event { step: 4, kind: EventKind::RaiseShDegree { degree: 1 } },
+            Event { step: 4, kind: EventKind::Densify(thresholds) },
+            Event { step: 8, kind: EventKind::ResetOpacity { max_opacity: 0.01 } },
+        ];
+        RunState {
+            step: 9,
+            config: "steps = 20\n".to_string(),
+            simd: "avx2".to_string(),
+            device: "cpu".to_string(),
+            sh_degree_start: 0,
+            dataset: DatasetPrint { views: vec![5, u64::MAX], first_rows: 7, scene_scale: 1.25 },
+            events: events.to_vec(),
+            histogram: vec![(3, 1), (32767, 9)],
+            rows: 10,
+            rows_bound: 12,
+            rows_skipped: 1,
+            steps_skipped: 2,
+            steps_skipped_in_a_row: 1,
+            train_seconds: 0.1,
+            metrics_bytes: 1234,
+        }
+    }
+
+    #[test]
+    fn states_come_back_and_other_versions_do_not() {
+        let mut bytes = sample().to_bytes().unwrap();
+        assert_eq!(RunState::from_bytes(&bytes).unwrap(), sample());
+        bytes[0] += 1;
+        assert_eq!(RunState::from_bytes(&bytes), Err(RunStateError::Version(VERSION + 1)));
+    }
+
+    #[test]
+    fn impossible_states_are_refused() {
+        let refused = |change: fn(&mut RunState)| {
+            let mut state = sample();
+            change(&mut state);
+            let bytes = state.to_bytes().unwrap();
+            assert!(matches!(RunState::from_bytes(&bytes), Err(RunStateError::Impossible(_))));
+        };
+        refused(|s| s.step = 8);
+        refused(|s| s.events.reverse());
+        refused(|s| s.sh_degree_start = 4);
+        refused(|s| s.histogram = vec![(32768, 1)]);
+        refused(|s| s.histogram.reverse());
+        refused(|s| s.train_seconds = f64::NAN);
+    }
+
+    #[test]
+    fn hostile_bytes_end_in_an_answer() {
+        let bytes = sample().to_bytes().unwrap();
+        assert!((0..bytes.len()).all(|cut| RunState::from_bytes(&bytes[..cut]).is_err()));
+        for seed in 0..20_000 {
+            let mut random = bytes.clone();
+            for i in 0..4 {
+                let at = mix64(seed * 4 + i) as usize % random.len();
+                random[at] = mix64(seed * 4 + i + (1 << 40)) as u8;
+            }
+            if let Ok(state) = RunState::from_bytes(&random) {
+                assert!(state.check().is_ok() && state.to_bytes().is_ok());
+            }
+        }
+    }
+}

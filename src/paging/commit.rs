@@ -1,0 +1,121 @@
+//! What a commit needs of the pages: all of them on the drive, and which differ from those of the last commit; and pages
+//! back from a store that was opened.
+//!
+//! Invariants: 1. after [`Pager::flush`] nothing is in flight and no page in memory is dirty; 2. a commit names every
+//! page with rows, by exactly the version that was last released; 3. only an acknowledged commit counts as the last one;
+//! 4. entries from a store are taken over only if their slots can hold what they say.
+
+use super::error::PagingError;
+use super::label::{label, meta_from_label};
+use super::pager::{Pager, PagerConfig};
+use super::transfers::Failure;
+use crate::base::ids::{PageId, PageNo};
+use crate::cache::frame::FrameState;
+use crate::page::commit::{CommitError, Commits, Cut, PageChange};
+use crate::page::format::SlotRef;
+use crate::page::opening::StoredPage;
+use crate::page::paged_store::PagedStore;
+use crate::scene::page_layout::{PageLayout, capacity_bytes};
+use std::collections::BTreeMap;
+
+/// Writes in flight at once: each may need a buffer of its own to be encoded in.
+const WRITES_IN_FLIGHT: usize = 32;
+
+impl Pager {
+    /// A pager over a store that holds these pages, none of them in memory. `events` is the length of the event log.
+    ///
+    /// # Errors
+    /// An entry contradicts itself or its slot.
+    pub fn open(
+        config: PagerConfig,
+        store: PagedStore,
+        pages: &[StoredPage],
+        events: usize,
+    ) -> Result<Pager, CommitError> {
+        let mut pager = Pager::new(config, store);
+        for stored in pages {
+            let wrong = |what: &str| CommitError::Contradiction(format!("page {}: {what}", stored.page));
+            let meta = meta_from_label(stored.page, &stored.label).ok_or_else(|| wrong("its label is none"))?;
+            if meta.rows == 0 || meta.rows as usize > config.page_rows || meta.sh_degree > config.sh_degree {
+                return Err(wrong("no page of this run has such sizes"));
+            }
+            if meta.events_applied as usize > events {
+                return Err(wrong("it has applied events that did not happen"));
+            }
+            let layout = PageLayout { rows: meta.rows as usize, sh_degree: meta.sh_degree };
+            if layout.bytes() != stored.slot.payload_bytes as usize
+                || layout.bytes() > capacity_bytes(config.page_rows, config.sh_degree)
+            {
+                return Err(wrong("its slot has another length"));
+            }
+            pager.index.push(meta);
+            pager.slots.push(Some(stored.slot));
+            pager.committed.insert(stored.page, stored.slot.generation);
+        }
+        Ok(pager)
+    }
+
+    /// Writes every dirty page and waits until nothing is in flight. Between steps: no page is pinned.
+    ///
+    /// # Errors
+    /// A page could not be written. It is still in memory, and the call may be repeated.
+    pub fn flush(&mut self) -> Result<(), PagingError> {
+        debug_assert_eq!(self.cache.count(FrameState::Pinned), 0, "a step holds pages");
+        // Pages whose write failed are dirty still: what was wrong with them is tried again here.
+        self.failed_write = None;
+        self.writes_stopped = false;
+        self.settle_below(1)?;
+        let mut dirty: Vec<PageNo> = self.cache.held().map(|h| h.page).filter(|&p| self.cache.is_dirty(p)).collect();
+        dirty.sort_unstable();
+        for page in dirty {
+            self.settle_below(WRITES_IN_FLIGHT)?;
+            self.begin_write(page, false).map_err(|f| f.error)?;
+        }
+        self.settle_below(1)
+    }
+
+    /// Waits until fewer than `most` transfers are in flight. A page that could not be read ahead is read when it is needed.
+    fn settle_below(&mut self, most: usize) -> Result<(), PagingError> {
+        let mut first_error = None;
+        while self.in_flight() >= most {
+            for Failure { is_write, error, .. } in self.settle(true, &mut Vec::new()) {
+                if is_write {
+                    first_error.get_or_insert(error);
+                }
+            }
+        }
+        first_error.map_or(Ok(()), Err)
+    }
+
+    /// Commits the pages as they are, right after [`Pager::flush`]; returns the generation, `None` for a pager without a
+    /// store.
+    ///
+    /// # Errors
+    /// As [`Commits::commit`].
+    pub fn commit(&mut self, commits: &mut Commits, run_state: &[u8], note: &[u8]) -> Result<Option<u64>, CommitError> {
+        debug_assert!(self.in_flight() == 0, "a commit comes after a flush");
+        let (changes, now) = self.changes();
+        let Some(store) = &mut self.store else { return Ok(None) };
+        let cut = Cut { changes: &changes, run_state, note, pin: None };
+        let generation = commits.commit(store, &mut Vec::new(), &cut)?;
+        self.committed = now;
+        Ok(Some(generation))
+    }
+
+    /// What differs from the last commit, and all pages with the generations of their versions. A page that is written
+    /// again after a commit belongs to a later generation, so the number tells versions of one page apart.
+    fn changes(&self) -> (Vec<PageChange>, BTreeMap<PageId, u64>) {
+        let mut changes = Vec::new();
+        let mut now = BTreeMap::new();
+        for (meta, slot) in self.index.iter().zip(&self.slots) {
+            let Some(slot) = slot.filter(|_| meta.rows > 0) else { continue };
+            now.insert(meta.id, slot.generation);
+            if self.committed.get(&meta.id) != Some(&slot.generation) {
+                changes.push(PageChange { page: meta.id, version: Some((slot, label(meta).to_vec())) });
+            }
+        }
+        let gone = self.committed.keys().filter(|page| !now.contains_key(page));
+        changes.extend(gone.map(|&page| PageChange { page, version: None::<(SlotRef, Vec<u8>)> }));
+        (changes, now)
+    }
+}
