@@ -188,6 +188,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
     let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
     let mut trainer = Trainer::of_scene(scene, &dataset, renderer, options);
+    preflight::hold_a_view(config, &dataset, &mut trainer, host_mem)?;
     let mut memory = estimate(config, &dataset, &mut trainer, driver)?;
     let plan = preflight::settle(config, &dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
     say(&describe(request, &dataset, &trainer, &preflight::describe(&plan, &memory[1], &tiers)));
