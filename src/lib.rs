@@ -1,21 +1,23 @@
 //! gsscale trains 3D Gaussian Splatting scenes. This page is the tour, in the order in which data flows.
 //!
 //! ```text
-//!  photos, poses, points ──> dataset ──> scene (columns, events)
-//!                                          │ rows of the view's working set
-//!            config ──> train ─────────────┤
+//!  photos, poses, points ──> dataset ──> scene (rows in pages, events)      drive
+//!                                          │                                 ^
+//!            schedule (views, plan) ──> paging ──> cache (frames)            │
+//!                                          │   └──> page (slots, engines) ───┘
+//!            config ──> train ─────────────┤ pinned pages of the view's working set
 //!                         │                v
 //!                         │   kernels (one file per stage) ──> render (the stages in order)
 //!                         │                │ gradients
 //!                         └──> optim, densify <──┘
 //!                                          │
 //!                                          v
-//!                              exchange (PLY), metrics, pictures
+//!                      exchange (PLY, TensorBoard), metrics, pictures, report
 //! ```
 //!
 //! | module | what it is responsible for |
 //! | --- | --- |
-//! | [`base`] | errors, random draws, deterministic math, instruction paths, errors; knows neither Gaussians nor disks |
+//! | [`base`] | errors, names of pages, random draws, deterministic math, instruction paths; knows neither Gaussians nor disks |
 //! | [`scene`] | Gaussians, cameras and images as data; first Gaussians from points; the log of global events |
 //! | [`dataset`] | where views come from: COLMAP, transforms.json, the generated city; decoding photos |
 //! | [`schedule`] | which view comes when, which pages it needs, what a cache should keep |
@@ -27,14 +29,15 @@
 //! | [`render`] | the stages in order: forward, loss, backward; image metrics |
 //! | [`optim`] | learning rates as a function of the step; dense Adam (oracle) and deferred Adam |
 //! | [`densify`] | statistics, decisions and edits that change the number of Gaussians |
-//! | [`exchange`] | PLY in and out |
+//! | [`exchange`] | PLY in and out; what TensorBoard reads |
 //! | [`config`] | what the user wrote and what follows from it |
 //! | [`report`] | pages for people: charts and pictures of what a run left behind |
 //! | [`train`] | the only place where all of it meets: one step, the loop, evaluation |
 //!
 //! One word, one thing: a *row* is one Gaussian inside a working set, a *column* one attribute of all of them, a
 //! *view* a photo with its pose, a *target* its pixels, a *tile* 16x16 pixels, a *stage* one kernel of the pipeline,
-//! a *step* one optimizer iteration, an *event* one global change that every row applies.
+//! a *step* one optimizer iteration, an *event* one global change that every row applies. A *page* is a group of rows that
+//! travel together, a *slot* its place on disk, a *frame* its place in memory, a *plan* which pages coming steps need.
 
 pub mod base;
 pub mod cache;

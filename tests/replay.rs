@@ -99,10 +99,12 @@ fn miss(run: &Replay) -> f64 {
     1.0 - run.figures(run.steady()).hit_rate
 }
 
-/// The table of the design, on two surveys. `cargo nextest run --test replay --run-ignored all --no-capture table`
+/// The table of the design, on two surveys. `GSSCALE_TABLES=1 cargo nextest run --test replay --no-capture table`
 #[test]
-#[ignore = "prints the table of orders"]
 fn table() {
+    if std::env::var_os("GSSCALE_TABLES").is_none() {
+        return;
+    }
     for (name, tilt) in [("vertical", 0.0), ("tilted", 0.7)] {
         let survey = survey(1000, 64, 0.07, tilt);
         let pages = ViewPages::new(&survey.index, &survey.cameras);

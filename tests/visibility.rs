@@ -155,10 +155,12 @@ fn pages_without_rows_are_never_needed_and_unusable_bounds_always() {
     }
 }
 
-/// `cargo nextest run --test visibility --run-ignored all --no-capture times`
+/// Prints times where asked to: `GSSCALE_TIMES=1 cargo nextest run --test visibility --no-capture times`
 #[test]
-#[ignore = "prints times"]
 fn times() {
+    if std::env::var_os("GSSCALE_TIMES").is_none() {
+        return;
+    }
     let mut draws = Stream::new(4, Purpose::Test, 40, 0);
     for pages in [28_000, 1_000_000] {
         let page = |p: usize| {

@@ -3,7 +3,8 @@
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
-use gsscale::train::eval::evaluate_ply;
+use gsscale::render::lpips::InputRange;
+use gsscale::train::eval::{EvalExtras, evaluate_ply};
 use gsscale::train::report::write_whole;
 use gsscale::train::trainer::TrainError;
 use std::path::{Path, PathBuf};
@@ -13,7 +14,8 @@ const EXAMPLES: &str = "\
 Examples:
   gsscale-eval runs/village scans/village
   gsscale-eval point_cloud.ply scans/village --data-factor 4 --test-every 83
-  gsscale-eval runs/village scans/village --renders pictures --json eval.json";
+  gsscale-eval runs/village scans/village --renders pictures --json eval.json
+  gsscale-eval runs/village scans/village --lpips lpips_alex.safetensors";
 
 /// Evaluates Gaussians on the held-out photos of a scene.
 #[derive(Parser)]
@@ -29,6 +31,12 @@ struct Args {
     /// Write render-beside-photo pictures here
     #[arg(long)]
     renders: Option<PathBuf>,
+    /// Measure LPIPS too, with these weights (safetensors; README.md says how to make them)
+    #[arg(long, value_name = "FILE")]
+    lpips: Option<PathBuf>,
+    /// What LPIPS's network is fed: signed (-1..1, what it was trained for) or unit (0..1, as the 3DGS code does)
+    #[arg(long, default_value = "signed", value_name = "RANGE")]
+    lpips_range: InputRange,
     /// Write the numbers here as JSON too
     #[arg(long)]
     json: Option<PathBuf>,
@@ -55,7 +63,11 @@ fn start(args: Args) -> Result<(), TrainError> {
     let mut config = read_config(args.config.as_deref().or(run_config.as_deref()))?;
     args.keys.apply(&mut config);
     config.check()?;
-    let report = evaluate_ply(&ply, &args.scene, &config, args.renders.as_deref())?;
+    let extras = EvalExtras {
+        pictures: args.renders.as_deref(),
+        lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range)),
+    };
+    let report = evaluate_ply(&ply, &args.scene, &config, &extras)?;
     let text = serde_json::to_string_pretty(&report)
         .map_err(|e| InputError::new(&ply, format!("writing JSON failed: {e}"), "report this as a bug"))?;
     println!("{text}");

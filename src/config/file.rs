@@ -152,6 +152,8 @@ config_keys! {
         save_every: u32 = 0;
         /// Write a line of metrics every N steps
         log_every: u32 = 100;
+        /// Where numbers go while training: json (metrics.jsonl), or tensorboard for event files beside it
+        log: String = "json".into();
         /// SSIM that is reported: same (zero padded, as the 3DGS code), valid or reflect
         ssim_variant: String = "same".into();
         /// Coordinates of the PLY: dataset or local
@@ -356,12 +358,13 @@ impl TrainConfig {
         if self.spill_codec != "auto" {
             self.spill_codec.parse::<Codec>().map_err(|problem| written("spill-codec", problem))?;
         }
-        let names: [(&str, &str, &[&str]); 8] = [
+        let names: [(&str, &str, &[&str]); 9] = [
             ("io", &self.io, &["auto", "uring", "mmap", "pread"]),
             ("evict", &self.evict, &["belady", "lru"]),
             ("ssim-padding", &self.ssim_padding, &["valid", "same"]),
             ("moments", &self.moments, &["f32", "bf16"]),
             ("strategy", &self.strategy, &["default", "none"]),
+            ("log", &self.log, &["json", "tensorboard"]),
             ("ssim-variant", &self.ssim_variant, &["same", "valid", "reflect"]),
             ("export-frame", &self.export_frame, &["dataset", "local"]),
             ("simd", &self.simd, &["auto", "avx512", "avx2", "baseline"]),

@@ -1,4 +1,4 @@
-//! The pages of a scene seen from above: where they lie, how often views needed them, which are in memory.
+//! The pages of a scene seen from above: where they lie, how many views need them, which are in memory.
 //!
 //! Invariant: the picture has one rectangle a page, up to a bound; beyond it pages are drawn as cells of a grid.
 
@@ -19,13 +19,13 @@ pub struct PageTile {
     pub hi: [f32; 2],
     /// Gaussians in it.
     pub rows: u32,
-    /// Steps that pinned it.
-    pub pins: u32,
+    /// Training views that see it.
+    pub views: u32,
     /// Whether it was in memory at the end.
     pub resident: bool,
 }
 
-/// The map as SVG: colour by the number of steps that pinned a page, outline by residency. Empty without pages.
+/// The map as SVG: colour by the number of views that see a page, outline by residency. Empty without pages.
 pub fn page_map_svg(tiles: &[PageTile]) -> String {
     let corners = || tiles.iter().flat_map(|t| [t.lo, t.hi]).filter(|c| c.iter().all(|x| x.is_finite()));
     // A few far pages (sky, giants) would shrink the rest to a dot: the map shows what 98 % of the corners span.
@@ -36,7 +36,7 @@ pub fn page_map_svg(tiles: &[PageTile]) -> String {
     let extent = [0, 1].map(|i| f64::from(hi[i] - lo[i]).max(1e-12));
     let scale = SIDE / extent[0].max(extent[1]);
     let size = extent.map(|e| e * scale);
-    let most = tiles.iter().map(|t| t.pins).max().unwrap_or(0).max(1);
+    let most = tiles.iter().map(|t| t.views).max().unwrap_or(0).max(1);
     let mut svg = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {:.0} {:.0}\"><rect width=\"100%\" height=\"100%\" fill=\"#10151c\"/>\n",
         size[0].max(1.0),
@@ -49,7 +49,7 @@ pub fn page_map_svg(tiles: &[PageTile]) -> String {
     for tile in drawn {
         let at = [0, 1].map(|i| (f64::from(tile.lo[i] - lo[i]) * scale).clamp(-1e4, 1e4));
         let side = [0, 1].map(|i| (f64::from(tile.hi[i] - tile.lo[i]) * scale).clamp(1.0, 2e4));
-        let heat = (f64::from(tile.pins) / f64::from(most)).sqrt();
+        let heat = (f64::from(tile.views) / f64::from(most)).sqrt();
         let line = if tile.resident { "#7fd0ff" } else { "#3a4450" };
         // Writing to a String cannot fail.
         let _ = writeln!(
@@ -88,7 +88,8 @@ mod tests {
 
     #[test]
     fn maps_draw_every_page_and_survive_far_ones() {
-        let tile = |x: f32, pins: u32| PageTile { lo: [x, 0.0], hi: [x + 1.0, 1.0], rows: 9, pins, resident: pins > 3 };
+        let tile =
+            |x: f32, views: u32| PageTile { lo: [x, 0.0], hi: [x + 1.0, 1.0], rows: 9, views, resident: views > 3 };
         let mut tiles: Vec<PageTile> = (0..200).map(|i| tile(i as f32, i)).collect();
         tiles.push(PageTile { lo: [f32::NEG_INFINITY; 2], hi: [f32::INFINITY; 2], ..tile(0.0, 1) });
         tiles.push(tile(1e30, 0));

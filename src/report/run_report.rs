@@ -201,7 +201,7 @@ fn add_page_map(page: &mut Page, path: &Path) {
         return;
     }
     page.heading("Pages");
-    let caption = "The pages of the scene along its shortest axis: the warmer, the more steps needed the page; light \
+    let caption = "The pages of the scene along its shortest axis: the warmer, the more training views see the page; light \
                    outlines were in memory at the end.";
     page.charts(&[(svg, caption.to_string())]);
 }

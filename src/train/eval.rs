@@ -13,6 +13,8 @@ use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{PlyContent, PlyMeta, read_ply, to_local};
 use crate::paging::pager::{Pager, PagerConfig};
+use crate::render::lpips::weights::read_lpips;
+use crate::render::lpips::{InputRange, Lpips};
 use crate::render::metrics::{SsimVariant, mean, psnr, ssim};
 use crate::render::{RenderOptions, Renderer};
 use crate::scene::image::{Image, Target};
@@ -26,6 +28,8 @@ pub struct EvalRequest<'a> {
     pub ssim: SsimVariant,
     /// Folder for pictures (render beside photo), created when missing; `None` for none.
     pub pictures: Option<&'a Path>,
+    /// The network of LPIPS and what it is fed, where LPIPS is wanted.
+    pub lpips: Option<(&'a Lpips, InputRange)>,
 }
 
 /// Evaluates the rows as they are after `now` steps on the requested views, collected in `working`. Views that are masked as a whole have no metrics and
@@ -43,7 +47,7 @@ pub fn evaluate(
     if request.views.is_empty() {
         return Ok(None);
     }
-    let (mut psnrs, mut ssims) = (Vec::new(), Vec::new());
+    let (mut psnrs, mut ssims, mut distances) = (Vec::new(), Vec::new(), Vec::new());
     for (i, &view) in request.views.iter().enumerate() {
         targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
         let target = targets.get(view)?;
@@ -55,6 +59,9 @@ pub fn evaluate(
             psnrs.push(json_psnr(psnr(image, &target)));
             // No window of the map may count although some pixels at the border do.
             ssims.extend(Some(ssim(image, &target, request.ssim, options.simd)).filter(|x| !x.is_nan()));
+            // A picture too small for the network has no distance.
+            let distance = request.lpips.map(|(lpips, range)| lpips.distance(image, &target, range));
+            distances.extend(distance.filter(|x| !x.is_nan()));
         }
         if let Some(folder) = request.pictures {
             write_pair(&picture_path(folder, dataset, view), image, &target)?;
@@ -64,7 +71,8 @@ pub fn evaluate(
         return Ok(None);
     }
     let ssim = if ssims.is_empty() { 0.0 } else { mean(&ssims) };
-    Ok(Some(TestMetrics { views: psnrs.len() as u32, psnr: mean(&psnrs), ssim }))
+    let lpips = (!distances.is_empty()).then(|| mean(&distances));
+    Ok(Some(TestMetrics { views: psnrs.len() as u32, psnr: mean(&psnrs), ssim, lpips }))
 }
 
 /// File of the picture of a view: its name, folders folded in, without the extension; with its number in front where
@@ -105,6 +113,9 @@ pub struct EvalReport {
     pub gaussians: u64,
     /// Which SSIM is reported.
     pub ssim_variant: String,
+    /// Network and input range of LPIPS, where it was measured: `alex, signed`.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub lpips_variant: Option<String>,
     /// Means over the held-out views; absent when there are none.
     pub test: Option<TestMetrics>,
 }
@@ -125,17 +136,30 @@ pub fn ply_warnings(ply: &Path, meta: &PlyMeta, far: u64) -> Vec<String> {
     warnings
 }
 
+/// What an evaluation of a PLY gives besides PSNR and SSIM.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct EvalExtras<'a> {
+    /// Folder for pictures.
+    pub pictures: Option<&'a Path>,
+    /// Weights of LPIPS, and what range of values its network is fed.
+    pub lpips: Option<(&'a Path, InputRange)>,
+}
+
 /// Evaluates a PLY of Gaussians on the held-out views of a scene.
 ///
 /// # Errors
-/// The PLY or the scene cannot be used, or a picture cannot be written.
+/// The PLY, the scene or the weights cannot be used, or a picture cannot be written.
 pub fn evaluate_ply(
     ply: &Path,
     scene: &Path,
     config: &TrainConfig,
-    pictures: Option<&Path>,
+    extras: &EvalExtras<'_>,
 ) -> Result<EvalReport, TrainError> {
     machine::set_up(config)?;
+    let lpips = match extras.lpips {
+        None => None,
+        Some((weights, range)) => Some((read_lpips(weights, limits::simd_path(config))?, range)),
+    };
     let PlyContent::Gaussians { mut columns, meta, .. } = read_ply(ply)? else {
         let problem = "holds points, not Gaussians (no property f_dc_0)";
         return Err(InputError::new(ply, problem, "give the point_cloud.ply of a run").into());
@@ -159,7 +183,8 @@ pub fn evaluate_ply(
     drop(columns);
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let views = dataset.test_views();
-    let request = EvalRequest { views: &views, ssim: run.ssim_variant, pictures };
+    let of_lpips = lpips.as_ref().map(|(lpips, range)| (lpips, *range));
+    let request = EvalRequest { views: &views, ssim: run.ssim_variant, pictures: extras.pictures, lpips: of_lpips };
     let (mut renderer, word) = machine::renderer(config)?;
     if let Some(word) = word {
         eprintln!("{word}");
@@ -171,6 +196,7 @@ pub fn evaluate_ply(
         scene: scene.to_path_buf(),
         gaussians,
         ssim_variant: config.ssim_variant.clone(),
+        lpips_variant: of_lpips.map(|(lpips, range)| format!("{}, {}", lpips.network().name(), range.name())),
         test,
     })
 }

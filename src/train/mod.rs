@@ -8,6 +8,7 @@ pub mod catch_up;
 pub mod eval;
 pub mod machine;
 pub mod memory;
+pub mod page_map;
 pub mod pages;
 pub mod preflight;
 pub mod progress;

@@ -6,6 +6,7 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
+use crate::exchange::tensorboard::EventFile;
 use crate::paging::pager::Pager;
 use serde::{Deserialize, Serialize};
 use std::fs::File;
@@ -112,6 +113,9 @@ pub struct TestMetrics {
     pub psnr: f64,
     /// Mean SSIM.
     pub ssim: f64,
+    /// Mean LPIPS, where weights were given: see the report for network and input range.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub lpips: Option<f64>,
 }
 
 /// What summary.json holds.
@@ -154,6 +158,8 @@ pub fn json_psnr(psnr: f64) -> f64 {
 pub struct MetricsLog {
     path: PathBuf,
     file: BufWriter<File>,
+    /// The same numbers for TensorBoard, where they were asked for.
+    events: Option<EventFile>,
 }
 
 impl MetricsLog {
@@ -163,7 +169,15 @@ impl MetricsLog {
     /// The file cannot be created.
     pub fn create(path: &Path) -> InputResult<Self> {
         let file = File::create(path).map_err(|e| InputError::io(path, "creating the metrics file", &e))?;
-        Ok(MetricsLog { path: path.to_path_buf(), file: BufWriter::new(file) })
+        Ok(MetricsLog { path: path.to_path_buf(), file: BufWriter::new(file), events: None })
+    }
+
+    /// Writes TensorBoard's event files to `folder` as well.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub fn with_events(self, folder: &Path) -> InputResult<Self> {
+        Ok(MetricsLog { events: Some(EventFile::create(folder)?), ..self })
     }
 
     /// Writes one line and hands it to the system, so that a crash loses none that was written.
@@ -174,8 +188,32 @@ impl MetricsLog {
         let io = |e: std::io::Error| InputError::io(&self.path, "writing metrics", &e);
         let text = serde_json::to_string(line).map_err(|e| io(e.into()))?;
         self.file.write_all(text.as_bytes()).and_then(|()| self.file.write_all(b"\n")).map_err(io)?;
-        self.file.flush().map_err(io)
+        self.file.flush().map_err(io)?;
+        match &mut self.events {
+            None => Ok(()),
+            Some(events) => write_scalars(events, line),
+        }
     }
+}
+
+fn write_scalars(events: &mut EventFile, line: &StepLine) -> InputResult<()> {
+    let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
+    let mut scalars = vec![
+        ("loss/train", line.loss),
+        ("psnr/train", line.psnr),
+        ("gaussians", line.gaussians as f64),
+        ("seconds", line.seconds),
+        ("host_peak_mib", mib(line.host_bytes_peak)),
+        ("disk/read_mib", mib(line.tiers.bytes_read)),
+        ("disk/written_mib", mib(line.tiers.bytes_written)),
+        ("disk/stall_seconds", line.tiers.stall_seconds),
+    ];
+    if let Some(test) = line.test {
+        scalars.extend([("psnr/test", test.psnr), ("ssim/test", test.ssim)]);
+    }
+    // A skipped step has no loss.
+    scalars.retain(|(_, value)| *value < f64::MAX);
+    events.write(line.step, &scalars)
 }
 
 /// Writes a whole file by way of a temporary one beside it.

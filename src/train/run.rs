@@ -6,6 +6,7 @@
 use super::eval::ply_warnings;
 use super::machine;
 use super::memory::{estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
+use super::page_map::write_page_map;
 use super::preflight;
 use super::progress::Progress;
 use super::report::{MetricsLog, Resolved, Summary, TierTraffic, write_config, write_summary};
@@ -212,6 +213,9 @@ fn train_into(
     let settled = TrainConfig { view_order: trainer.view_order().order().to_string(), ..config.clone() };
     write_config(&out.join("config.toml"), &settled, &resolved(request, dataset, &trainer))?;
     let mut metrics = MetricsLog::create(&out.join("metrics.jsonl"))?;
+    if config.log == "tensorboard" {
+        metrics = metrics.with_events(&out.join("tensorboard"))?;
+    }
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let mut progress = Progress::new(config.steps, request.quiet);
     let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop };
@@ -249,6 +253,7 @@ fn train_into(
         tiers: TierTraffic::of(&trainer.scene.pager),
     };
     write_summary(&out.join("summary.json"), &summary)?;
+    write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
     write_run_report(out)?;
     tested?;
     Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })

@@ -7,6 +7,7 @@ use crate::base::error::InputResult;
 use crate::cache::evict::EvictPolicy;
 use crate::config::file::TrainConfig;
 use crate::page::codec::Codec;
+use crate::page::drive_rate::DriveRate;
 use crate::page::engine::{DEPTH, IoEngine, open_engine};
 use crate::page::memory_store::MemoryStore;
 use crate::page::paged_store::{PagedStore, PagedStoreConfig};
@@ -43,10 +44,20 @@ fn policy(config: &TrainConfig) -> EvictPolicy {
     if config.evict == "lru" { EvictPolicy::LeastRecentlyUsed } else { EvictPolicy::FarthestNextUse }
 }
 
-/// How pages are stored, as `--spill-codec` says. `auto` is raw: the drives that this was measured on are faster than the
-/// codec.
-fn codec(config: &TrainConfig) -> Codec {
-    config.spill_codec.parse().unwrap_or(Codec::Raw)
+/// How pages are stored, as `--spill-codec` says; `auto` measures the drive of `folder`, and is raw without one or where
+/// it cannot be measured.
+fn chosen_codec(config: &TrainConfig, folder: Option<&Path>, notes: &mut Vec<String>) -> Codec {
+    if let Ok(codec) = config.spill_codec.parse() {
+        return codec;
+    }
+    match folder.map(DriveRate::of) {
+        None => Codec::Raw,
+        Some(Ok(rate)) => rate.codec(),
+        Some(Err(error)) => {
+            notes.push(format!("the drive was not measured, pages are stored raw: {error}"));
+            Codec::Raw
+        }
+    }
 }
 
 /// Opens the tiers for a scene of about `pages` pages, within `host_mem` bytes. The pager has few frames at first where
@@ -79,7 +90,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Inp
     pager.prefetch_bytes = pager.prefetch_bytes.max(pager.frame_bytes());
     let layout = SlotLayout::new(capacity_bytes(page_rows, sh_degree), pages as u64);
     let mut tiers = Tiers::default();
-    tiers.codec = codec(config).to_string();
+    let mut codec = chosen_codec(config, None, &mut tiers.notes);
     let mut store = 0;
     let engine: Box<dyn PageStore> = if config.spill_dir.is_empty() {
         Box::new(MemoryStore::new())
@@ -89,6 +100,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Inp
         tiers.notes.extend(spill.warnings().iter().cloned());
         let folder = spill.folder().to_path_buf();
         tiers.spill = Some(spill);
+        codec = chosen_codec(config, Some(&folder), &mut tiers.notes);
         match open_engine(config.io.parse().unwrap_or(IoEngine::Auto), &folder, DEPTH) {
             Ok(opened) => {
                 tiers.notes.extend(opened.notes);
@@ -101,7 +113,8 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Inp
         }
     };
     tiers.engine = engine.name().to_string();
-    let of_store = PagedStoreConfig { store, layout, codec: codec(config), generation: 1, serial: 1 };
+    tiers.codec = codec.to_string();
+    let of_store = PagedStoreConfig { store, layout, codec, generation: 1, serial: 1 };
     Ok((Pager::new(pager, PagedStore::new(engine, of_store)), tiers))
 }
 

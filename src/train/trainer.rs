@@ -362,7 +362,7 @@ impl Trainer {
     ) -> Result<Option<TestMetrics>, TrainError> {
         let render = self.render_options();
         let views = dataset.test_views();
-        let request = EvalRequest { views: &views, ssim: self.options.ssim_variant, pictures };
+        let request = EvalRequest { views: &views, ssim: self.options.ssim_variant, pictures, lpips: None };
         let now = (&mut self.scene, self.step, &mut self.working);
         evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)
     }

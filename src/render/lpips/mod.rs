@@ -69,6 +69,15 @@ impl InputRange {
     }
 }
 
+impl std::str::FromStr for InputRange {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<InputRange, String> {
+        let ranges = [InputRange::Signed, InputRange::Unit];
+        ranges.into_iter().find(|r| r.name() == text).ok_or_else(|| format!("'{text}' is neither signed nor unit"))
+    }
+}
+
 /// One step of a network. Every convolution is followed by a rectifier.
 #[derive(Debug, Clone, Copy)]
 enum Layer {
