@@ -89,3 +89,22 @@ fn bands_are_in_use_from_the_first_step_when_asked() {
     let trained = rows.chunks_exact(62).filter(|row| row[9..54].iter().any(|&x| x != 0.0)).count();
     assert!(trained > 1000, "{trained} rows have trained bands");
 }
+
+#[test]
+fn a_budget_that_was_refused_trains_with_what_the_remedy_names() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 150, 48, 32, 8000);
+    let spill = folder.path().join("spill");
+    // An eighth of this budget, which is what first frames get, does not hold the pages of the largest view.
+    let more = ["--prefetch-bytes", "1MiB", "--page-rows", "16", "--strategy", "none", "--spill-dir", text(&spill)];
+    let refused = run(folder.path(), &scene, &[&["--host-mem", "32MiB"][..], &more].concat());
+    let said = stderr(&refused);
+    assert_eq!(refused.status.code(), Some(1), "{said}");
+    let least = said.split("give at least ").nth(1).and_then(|rest| rest.split(" MiB").next()).expect(&said);
+    let enough = format!("{:.1}MiB", least.parse::<f64>().unwrap() + 0.1);
+    let trained = run(folder.path(), &scene, &[&["--host-mem", enough.as_str()][..], &more].concat());
+    assert!(trained.status.success(), "{enough}: {}", stderr(&trained));
+    let done = summary(&folder.path().join("out"));
+    assert!(done["frames"].as_u64().unwrap() >= done["pages_pinned_max"].as_u64().unwrap());
+    assert!(done["frames"].as_u64().unwrap() < done["pages"].as_u64().unwrap(), "not all pages fit");
+}

@@ -1,51 +1,46 @@
-//! `gsscale-bench`: trains a scene for some steps and prints one line of JSON about what it took. Parses, calls the
-//! library, prints; writes no file.
+//! `gsscale-bench`: measures training and prints lines of JSON. Which measurement is the first argument; without one of
+//! their names it is `run`. Parses, calls, prints.
 
-use clap::Parser;
+#[path = "bench/demand.rs"]
+mod demand;
+#[path = "bench/orders.rs"]
+mod orders;
+#[path = "bench/run.rs"]
+mod run;
+#[path = "bench/tiers.rs"]
+mod tiers;
+
 use gsscale::base::error::InputError;
-use gsscale::base::machine::{cpu_model, process_cpu_seconds};
-use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
-use gsscale::config::limits::{RunOptions, simd_path};
-use gsscale::dataset::target_cache::TargetCache;
-use gsscale::render::cpu::CpuRenderer;
-use gsscale::train::memory::host_bytes_peak;
-use gsscale::train::run::prepare;
-use gsscale::train::trainer::{TrainError, Trainer};
-use serde_json::{Value, json};
-use std::path::PathBuf;
+use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
+use gsscale::config::limits::simd_path;
+use gsscale::train::trainer::TrainError;
+use serde_json::Value;
+use std::ffi::OsString;
+use std::path::Path;
 use std::process::ExitCode;
-use std::time::Instant;
-
-const EXAMPLES: &str = "\
-Examples:
-  gsscale-bench scans/village --steps 500 --strategy none
-  gsscale-bench scans/village --steps 2000 --max-gaussians 200000 --threads 1 >> runs.jsonl
-
-cpu_seconds_per_step counts all threads during the steps, decoding of photos included; loading and evaluation are not
-in it. host_bytes_peak is without the copy that writing a PLY takes.";
-
-/// Trains a scene and prints one line of JSON: steps, seconds, CPU seconds, peak memory, PSNR, SSIM, machine.
-#[derive(Parser)]
-#[command(name = "gsscale-bench", version, after_help = EXAMPLES)]
-struct Args {
-    /// Scene: a COLMAP folder (images/, sparse/), or a folder with transforms.json
-    scene: PathBuf,
-    /// Config file; flags override it
-    #[arg(long)]
-    config: Option<PathBuf>,
-    /// Leave out the evaluation on held-out photos
-    #[arg(long)]
-    no_eval: bool,
-    #[command(flatten)]
-    keys: TrainOverrides,
-}
 
 fn main() -> ExitCode {
-    match start(parse_command_line()) {
-        Ok(line) => {
-            println!("{line}");
-            ExitCode::SUCCESS
+    let mut arguments: Vec<OsString> = std::env::args_os().collect();
+    let name = arguments.get(1).and_then(|a| a.to_str()).map(str::to_string);
+    let mut named = |known: &str| {
+        let is = name.as_deref() == Some(known);
+        if is {
+            // What is left is parsed as a program of its own, whose usage line names the measurement.
+            arguments.remove(1);
         }
+        is
+    };
+    let mut print = |line: &Value| println!("{line}");
+    let done = if named("tiers") {
+        tiers::start(&parse_arguments(&arguments), &mut print)
+    } else if named("orders") {
+        orders::start(&parse_arguments(&arguments), &mut print)
+    } else {
+        named("run");
+        run::start(&parse_arguments(&arguments), &mut print)
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error}");
             ExitCode::FAILURE
@@ -53,9 +48,10 @@ fn main() -> ExitCode {
     }
 }
 
-fn start(args: Args) -> Result<Value, TrainError> {
-    let mut config = args.config.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
-    args.keys.apply(&mut config);
+/// The config of a measurement, checked, with its worker threads started.
+fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, TrainError> {
+    let mut config = file.map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
+    keys.clone().apply(&mut config);
     config.check()?;
     if !simd_path(&config).is_supported() {
         let problem = format!("this machine cannot run {}", config.simd);
@@ -65,42 +61,5 @@ fn start(args: Args) -> Result<Value, TrainError> {
         // Fails only where the pool exists already, which it does not at the start of main.
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
     }
-    let began = Instant::now();
-    let prepared = prepare(&args.scene, &config)?;
-    let dataset = prepared.dataset;
-    let load_seconds = began.elapsed().as_secs_f64();
-    let gaussians_at_start = prepared.columns.rows();
-    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-    let options = RunOptions::new(&config, dataset.scene_scale);
-    let mut trainer = Trainer::new(prepared.columns, &dataset, Box::new(CpuRenderer::new()), options)?;
-    let (began, cpu_before) = (Instant::now(), process_cpu_seconds());
-    let mut loss = 0.0;
-    while trainer.steps_done() < config.steps {
-        loss = trainer.step(&dataset, &targets)?.loss.loss;
-    }
-    let seconds = began.elapsed().as_secs_f64();
-    let cpu_seconds = process_cpu_seconds().zip(cpu_before).map(|(after, before)| after - before);
-    let test = if args.no_eval { None } else { trainer.evaluate(&dataset, &targets, None)? };
-    Ok(json!({
-        "scene": args.scene,
-        "steps": config.steps,
-        "gaussians_at_start": gaussians_at_start,
-        "gaussians": trainer.scene.rows(),
-        "load_seconds": load_seconds,
-        "seconds": seconds,
-        "cpu_seconds": cpu_seconds,
-        "cpu_seconds_per_step": cpu_seconds.map(|s| s / f64::from(config.steps)),
-        "host_bytes_peak": host_bytes_peak(),
-        "psnr": test.map(|t| t.psnr),
-        "ssim": test.map(|t| t.ssim),
-        "ssim_variant": config.ssim_variant,
-        "last_loss": loss,
-        "last_loss_bits": format!("{:016x}", loss.to_bits()),
-        "version": env!("CARGO_PKG_VERSION"),
-        "renderer": trainer.renderer.name(),
-        "simd": simd_path(&config).name(),
-        "threads": rayon::current_num_threads(),
-        "cpu": cpu_model(),
-        "cores": std::thread::available_parallelism().map_or(0, usize::from),
-    }))
+    Ok(config)
 }

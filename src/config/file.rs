@@ -397,7 +397,12 @@ fn refuse(key: &str, allowed: &str) -> InputResult<()> {
 
 /// Parses the command line of a program whose flags hold [`TrainOverrides`]; prints help and usage errors itself.
 pub fn parse_command_line<T: clap::CommandFactory + clap::FromArgMatches>() -> T {
-    let matches = help_with_defaults(T::command()).get_matches();
+    parse_arguments(&std::env::args_os().collect::<Vec<_>>())
+}
+
+/// As [`parse_command_line`], of these arguments, the program's name first.
+pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[std::ffi::OsString]) -> T {
+    let matches = help_with_defaults(T::command()).get_matches_from(arguments);
     T::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
 }
 

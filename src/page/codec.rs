@@ -233,7 +233,10 @@ mod tests {
             assert_eq!(codec.to_string(), text);
         }
         for wrong in ["zstd", "zstd:0", "zstd:20", "zstd:-1", "lz4", "", "zstd:1x"] {
-            assert!(wrong.parse::<Codec>().is_err_and(|e| e.contains("write raw, or zstd:1 to zstd:19")), "{wrong}");
+            assert!(
+                wrong.parse::<Codec>().is_err_and(|e| e.contains("write raw, halves, or zstd:1 to zstd:19")),
+                "{wrong}"
+            );
         }
     }
 

@@ -9,7 +9,7 @@ use super::trainer::Trainer;
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
-use crate::dataset::loader::Dataset;
+use crate::dataset::loader::{Dataset, View};
 use crate::scene::camera::Camera;
 use crate::scene::partition::first_fill;
 use crate::schedule::model::Policy;
@@ -58,7 +58,9 @@ pub fn settle(
     let index = trainer.scene.pager.index().len() as u64;
     let rows_max = rows_at_most(config, trainer.scene.rows());
     let fill = first_fill(config.page_rows as usize, config.strategy != "none") as u64;
-    let pages_max = index.max(rows_max.div_ceil(fill));
+    // Pages are not all full (giants have their own), and what grows is filled like what is there.
+    let grown = (index as f64 * rows_max as f64 / trainer.scene.rows().max(1) as f64).ceil() as u64;
+    let pages_max = grown.max(rows_max.div_ceil(fill));
     let frame_bytes = trainer.scene.pager.frame_bytes() as u64;
     let largest_view = largest_view(dataset, trainer);
     let mut plan = TierPlan {
@@ -90,6 +92,41 @@ pub fn settle(
     plan.bytes_written = bytes_written(config, dataset, trainer, frames as usize);
     check_drive(&plan, tiers)?;
     Ok(plan)
+}
+
+/// Gives a pager whose frames follow from the budget as many as the largest view of `dataset` needs, so that views can
+/// be looked at; [`settle`] gives it the rest once it is known what a view takes.
+///
+/// # Errors
+/// The budget does not even hold the pages of that view.
+pub fn hold_a_view(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &mut Trainer,
+    host_mem: Option<u64>,
+) -> InputResult<()> {
+    if config.frames > 0 || trainer.scene.pager.stats().frames_max == usize::MAX {
+        return Ok(());
+    }
+    let of = |view: &View| trainer.scene.pager.pages_of_view(&view.camera).len();
+    let Some((needed, view)) = dataset.views.iter().map(|view| (of(view), view)).max_by_key(|(needed, _)| *needed)
+    else {
+        return Ok(());
+    };
+    let bytes = (needed * trainer.scene.pager.frame_bytes()) as u64;
+    if let Some(budget) = host_mem.filter(|budget| bytes > *budget) {
+        let problem = format!(
+            "{} are too little: the view {} needs {needed} pages of {} at once, which is {}",
+            format_bytes(budget),
+            view.name,
+            format_bytes(trainer.scene.pager.frame_bytes() as u64),
+            format_bytes(bytes)
+        );
+        let remedy = format!("give at least {}, or lower --page-rows or --sh-degree", format_bytes(bytes + bytes / 4));
+        return Err(InputError::new("--host-mem", problem, remedy));
+    }
+    trainer.scene.pager.allow_frames(needed);
+    Ok(())
 }
 
 /// A shuffle where all pages fit, else groups of views small enough for the pages of each to stay in memory: about four

@@ -225,6 +225,7 @@ pub(super) fn see_through(
     begun: Begun,
 ) -> Result<RunOutcome, TrainError> {
     let (config, host_mem) = (&request.config, begun.host_mem);
+    preflight::hold_a_view(config, dataset, &mut trainer, host_mem)?;
     let mut memory = estimate(config, dataset, &mut trainer, begun.driver)?;
     let plan = preflight::settle(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
     if !request.quiet {

@@ -202,6 +202,11 @@ impl Trainer {
         self.step
     }
 
+    /// Index into the dataset's views of the view that the next step trains on.
+    pub fn next_view(&mut self) -> usize {
+        self.train_views[self.order.view_at(self.step)]
+    }
+
     /// Seconds spent in steps.
     pub fn train_seconds(&self) -> f64 {
         self.train_seconds
@@ -227,7 +232,7 @@ impl Trainer {
     /// # Errors
     /// A photo cannot be decoded, the renderer failed, or the loss was not finite too often.
     pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
-        let view = self.train_views[self.order.view_at(self.step)];
+        let view = self.next_view();
         let mut ahead = Vec::new();
         self.order.upcoming(self.step, PREFETCH_VIEWS.min(self.options.steps - self.step), &mut ahead);
         for position in &mut ahead {

@@ -1,0 +1,94 @@
+//! `gsscale-bench` at its tiny sizes: every measurement runs, and what it prints is consistent.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+
+#[path = "support/scenes.rs"]
+mod scenes;
+
+use scenes::{city, stderr, text};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use tempfile::TempDir;
+
+fn bench(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_gsscale-bench")).args(args).output().unwrap()
+}
+
+fn lines(args: &[&str]) -> Vec<Value> {
+    let output = bench(args);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let said = String::from_utf8(output.stdout).unwrap();
+    said.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+fn number(line: &Value, key: &str) -> f64 {
+    line[key].as_f64().unwrap_or_else(|| panic!("{key} in {line}"))
+}
+
+/// A city of which no view sees more than two thirds.
+fn large_city(folder: &Path) -> PathBuf {
+    city(folder, 150, 48, 32, 8000)
+}
+
+#[test]
+fn shares_of_the_state_train_to_the_bits_of_the_run_in_memory() {
+    let folder = TempDir::new().unwrap();
+    let scene = large_city(folder.path());
+    let spill = folder.path().join("spill");
+    let sizes = ["--steps", "100", "--turn", "7", "--warm-up", "60", "--page-rows", "16", "--strategy", "none"];
+    let more = ["--spill-dir", text(&spill), "--shares", "70,0.1", "--view-order", "groups:9"];
+    let lines = lines(&[&["tiers", text(&scene)][..], &sizes, &more].concat());
+    let [too_small, in_memory, share] = &lines[..] else { panic!("{lines:?}") };
+    assert!(number(too_small, "frames") < number(too_small, "pages_of_largest_view"));
+    assert_eq!((number(in_memory, "ratio_of_sums"), &in_memory["frames"]), (1.0, &Value::Null));
+    assert_eq!(share["same_last_loss"], true);
+    for key in ["steps", "pages", "overfetch", "rows_per_step", "view_order"] {
+        assert_eq!(share[key], in_memory[key], "{key}");
+    }
+    assert!(number(share, "overfetch") >= 1.0 && number(share, "seconds_per_step_median") > 0.0);
+    // The bound starts and ends where the measurement does; only what was on its way at either end may differ, which
+    // the frames bound.
+    let reads = number(share, "pages_read_per_step") * 40.0;
+    let bound = number(share, "belady_pages_per_step") * 40.0;
+    assert!(bound > 0.0 && reads + number(share, "frames") >= bound, "{reads} pages read, {bound} at least");
+    assert!(spill.is_dir() && spill.read_dir().unwrap().next().is_none(), "scratch is removed");
+}
+
+#[test]
+fn orders_are_compared_in_quality_and_bytes() {
+    let folder = TempDir::new().unwrap();
+    let scene = large_city(folder.path());
+    let out = folder.path().join("orders.html");
+    let sizes = ["--steps", "10", "--page-rows", "16", "--strategy", "none", "--share", "70", "--seeds", "1,2"];
+    let more = ["--compare-orders", "shuffle,tour", "--out", text(&out)];
+    let lines = lines(&[&["orders", text(&scene)][..], &sizes, &more].concat());
+    let names: Vec<_> = lines.iter().map(|line| (line["view_order"].as_str().unwrap(), number(line, "seed"))).collect();
+    assert_eq!(names, [("shuffle", 1.0), ("tour", 1.0), ("shuffle", 2.0), ("tour", 2.0)]);
+    assert!(lines.iter().all(|line| number(line, "psnr") > 5.0));
+    assert!(number(&lines[1], "bytes_read_per_step") < number(&lines[0], "bytes_read_per_step"), "a tour reads less");
+    let page = std::fs::read_to_string(&out).unwrap();
+    assert!(page.contains("<svg") && page.contains("<td>tour</td>"));
+}
+
+#[test]
+fn a_run_needs_no_name_and_wrong_input_is_refused() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 10, 64, 48, 300);
+    let line = |args: &[&str]| {
+        let all = lines(&[args, &[text(&scene), "--steps", "4", "--threads", "1"]].concat());
+        assert_eq!(all.len(), 1);
+        all[0]["last_loss_bits"].clone()
+    };
+    assert_eq!(line(&[]), line(&["run"]));
+    let refuses = |args: &[&str], words: &str| {
+        let output = bench(args);
+        assert_eq!(output.status.code(), Some(1));
+        assert!(stderr(&output).contains(words) && stderr(&output).contains("remedy"), "{}", stderr(&output));
+    };
+    refuses(&["tiers", text(&scene)], "--spill-dir");
+    let spill = text(folder.path());
+    refuses(&["tiers", text(&scene), "--spill-dir", spill, "--shares", "0"], "--shares");
+    refuses(&["orders", text(&scene), "--compare-orders", "random"], "--compare-orders");
+    refuses(&["orders", text(&scene), "--share", "101"], "--share");
+    refuses(&["run", text(Path::new("/nowhere"))], "nowhere");
+}

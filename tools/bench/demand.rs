@@ -1,0 +1,59 @@
+//! The pages that steps needed, as they were needed, and the fewest reads that any cache could have served them with.
+//!
+//! Invariant: the bound starts from the pages that were in memory when the measurement began and ends with its last
+//! step, as the measured cache did, so the two differ by decisions alone.
+
+use gsscale::base::ids::PageNo;
+use gsscale::page::format::transfer_bytes;
+use gsscale::paging::pager::Pager;
+use gsscale::scene::page_layout::PageLayout;
+use gsscale::scene::page_meta::PageMeta;
+use gsscale::schedule::model::{CacheModel, Policy, StepChange};
+
+/// What a measurement asked of its cache.
+#[derive(Debug, Default)]
+pub struct Demand {
+    /// Pages in memory, or on their way, before the first step.
+    pub resident: Vec<PageNo>,
+    /// By step.
+    pub steps: Vec<Vec<PageNo>>,
+}
+
+impl Demand {
+    /// A measurement that begins now.
+    pub fn begin(pager: &Pager) -> Demand {
+        let all = (0..pager.index().len() as u32).map(PageNo);
+        Demand { resident: all.filter(|p| pager.is_in_memory(*p)).collect(), steps: Vec::new() }
+    }
+
+    /// Pages and bytes that the optimal cache of `frames` frames reads; `bytes` is the size of each page on the drive.
+    /// `None` when a step needs more frames than that.
+    pub fn fewest_reads(&self, frames: usize, bytes: &[u64]) -> Option<(u64, u64)> {
+        let mut uses: Vec<Vec<u32>> = vec![Vec::new(); bytes.len()];
+        for (pages, step) in self.steps.iter().zip(1..) {
+            pages.iter().for_each(|p| uses[p.index()].push(step));
+        }
+        let mut cache = CacheModel::new(frames, Policy::Farthest);
+        let mut change = StepChange::default();
+        let mut total = (0, 0);
+        // What is there at the beginning enters as a step of its own, which is not counted.
+        for (step, pages) in std::iter::once(&self.resident).chain(&self.steps).enumerate() {
+            let next_use = |page: PageNo| {
+                let of_page = &uses[page.index()];
+                of_page.get(of_page.partition_point(|&s| s <= step as u32)).copied()
+            };
+            cache.step(step as u32, pages, next_use, &mut change).ok()?;
+            if step > 0 {
+                total.0 += change.admit.len() as u64;
+                total.1 += change.admit.iter().map(|p| bytes[p.index()]).sum::<u64>();
+            }
+        }
+        Some(total)
+    }
+}
+
+/// Bytes of every page on the drive, stored raw.
+pub fn page_bytes(index: &[PageMeta]) -> Vec<u64> {
+    let layout = |meta: &PageMeta| PageLayout { rows: meta.rows as usize, sh_degree: meta.sh_degree };
+    index.iter().map(|meta| transfer_bytes(layout(meta).bytes()) as u64).collect()
+}

@@ -1,0 +1,88 @@
+//! `gsscale-bench run`: trains a scene for some steps and prints one line of JSON about what it took. Writes no file.
+
+use clap::Parser;
+use gsscale::base::machine::{cpu_model, process_cpu_seconds};
+use gsscale::config::file::TrainOverrides;
+use gsscale::config::limits::{RunOptions, simd_path};
+use gsscale::dataset::target_cache::TargetCache;
+use gsscale::render::cpu::CpuRenderer;
+use gsscale::train::memory::host_bytes_peak;
+use gsscale::train::run::prepare;
+use gsscale::train::trainer::{TrainError, Trainer};
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use std::time::Instant;
+
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-bench scans/village --steps 500 --strategy none
+  gsscale-bench scans/village --steps 2000 --max-gaussians 200000 --threads 1 >> runs.jsonl
+
+Other measurements: gsscale-bench tiers --help (through the disk tier against in memory),
+gsscale-bench orders --help (orders of views: quality against bytes).
+
+cpu_seconds_per_step counts all threads during the steps, decoding of photos included; loading and evaluation are not
+in it. host_bytes_peak is without the copy that writing a PLY takes.";
+
+/// Trains a scene and prints one line of JSON: steps, seconds, CPU seconds, peak memory, PSNR, SSIM, machine.
+#[derive(Parser)]
+#[command(name = "gsscale-bench", version, after_help = EXAMPLES)]
+pub struct Args {
+    /// Scene: a COLMAP folder (images/, sparse/), or a folder with transforms.json
+    scene: PathBuf,
+    /// Config file; flags override it
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// Leave out the evaluation on held-out photos
+    #[arg(long)]
+    no_eval: bool,
+    #[command(flatten)]
+    keys: TrainOverrides,
+}
+
+/// Measures.
+///
+/// # Errors
+/// As a run.
+pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
+    let config = super::settle(args.config.as_deref(), &args.keys)?;
+    let began = Instant::now();
+    let prepared = prepare(&args.scene, &config)?;
+    let dataset = prepared.dataset;
+    let load_seconds = began.elapsed().as_secs_f64();
+    let gaussians_at_start = prepared.columns.rows();
+    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
+    let options = RunOptions::new(&config, dataset.scene_scale);
+    let mut trainer = Trainer::new(prepared.columns, &dataset, Box::new(CpuRenderer::new()), options)?;
+    let (began, cpu_before) = (Instant::now(), process_cpu_seconds());
+    let mut loss = 0.0;
+    while trainer.steps_done() < config.steps {
+        loss = trainer.step(&dataset, &targets)?.loss.loss;
+    }
+    let seconds = began.elapsed().as_secs_f64();
+    let cpu_seconds = process_cpu_seconds().zip(cpu_before).map(|(after, before)| after - before);
+    let test = if args.no_eval { None } else { trainer.evaluate(&dataset, &targets, None)? };
+    print(&json!({
+        "scene": args.scene,
+        "steps": config.steps,
+        "gaussians_at_start": gaussians_at_start,
+        "gaussians": trainer.scene.rows(),
+        "load_seconds": load_seconds,
+        "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
+        "cpu_seconds_per_step": cpu_seconds.map(|s| s / f64::from(config.steps)),
+        "host_bytes_peak": host_bytes_peak(),
+        "psnr": test.map(|t| t.psnr),
+        "ssim": test.map(|t| t.ssim),
+        "ssim_variant": config.ssim_variant,
+        "last_loss": loss,
+        "last_loss_bits": format!("{:016x}", loss.to_bits()),
+        "version": env!("CARGO_PKG_VERSION"),
+        "renderer": trainer.renderer.name(),
+        "simd": simd_path(&config).name(),
+        "threads": rayon::current_num_threads(),
+        "cpu": cpu_model(),
+        "cores": std::thread::available_parallelism().map_or(0, usize::from),
+    }));
+    Ok(())
+}

@@ -1,0 +1,278 @@
+//! `gsscale-bench tiers`: the same training in memory and through the disk tier with frames for shares of the state.
+//!
+//! All of them run in one process, in turns of a few steps, so that whatever else the machine does hits them alike; step
+//! by step they train on the same views. Prints one line of JSON for each.
+
+use super::demand::{Demand, page_bytes};
+use clap::Parser;
+use gsscale::base::error::InputError;
+use gsscale::base::machine::process_cpu_seconds;
+use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides};
+use gsscale::config::limits::RunOptions;
+use gsscale::dataset::loader::Dataset;
+use gsscale::dataset::target_cache::TargetCache;
+use gsscale::paging::stats::PagerStats;
+use gsscale::render::cpu::CpuRenderer;
+use gsscale::scene::camera::Camera;
+use gsscale::schedule::auto::automatic_order;
+use gsscale::schedule::visibility::ViewPages;
+use gsscale::train::memory::host_bytes_peak;
+use gsscale::train::run::{Prepared, prepare};
+use gsscale::train::tiers::{self, Tiers};
+use gsscale::train::trainer::{TrainError, Trainer};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-bench tiers scans/city --spill-dir /mnt/nvme/bench --steps 600 --strategy none --view-order groups:25
+  gsscale-bench tiers scans/city --spill-dir /mnt/nvme/bench --steps 600 --shares 10,5 --page-rows 256
+
+Memory must hold the scene once for the run in memory and once for the sum of the shares. With --view-order auto all
+take the order that is chosen for the smallest share.";
+
+/// Memory that choosing the order of views may take, bytes.
+const ORDER_BYTES: u64 = 256 << 20;
+
+/// Trains a scene in memory and with frames for shares of it, in turns, and prints a line of JSON for each.
+#[derive(Parser)]
+#[command(name = "gsscale-bench tiers", version, after_help = EXAMPLES)]
+pub struct Args {
+    /// Scene: a COLMAP folder (images/, sparse/), or a folder with transforms.json
+    scene: PathBuf,
+    /// Config file; flags override it
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// Frames, in percent of the pages of the start
+    #[arg(long, value_delimiter = ',', default_value = "50,25,10", value_name = "P")]
+    shares: Vec<f64>,
+    /// Steps of a turn
+    #[arg(long, default_value_t = 25, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    turn: u32,
+    /// Steps that are not measured, while memory fills [default: one epoch, at most half of the steps]
+    #[arg(long, value_name = "N")]
+    warm_up: Option<u32>,
+    #[command(flatten)]
+    keys: TrainOverrides,
+}
+
+/// One of those that are compared.
+struct Contender {
+    share: Option<f64>,
+    trainer: Trainer,
+    /// After the trainer, whose pages lie there.
+    tiers: Tiers,
+    before: PagerStats,
+    demand: Demand,
+    seconds: Vec<f64>,
+    cpu_seconds: f64,
+    rows: u64,
+    rows_pinned: u64,
+    last_loss: f64,
+}
+
+/// Measures.
+///
+/// # Errors
+/// Bad input, or a step that fails.
+pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
+    let mut config = super::settle(args.config.as_deref(), &args.keys)?;
+    if config.spill_dir.is_empty() {
+        let remedy = "name a folder on the drive to measure";
+        return Err(InputError::new("--spill-dir", "there is no drive to measure", remedy).into());
+    }
+    if let Some(share) = args.shares.iter().find(|s| !(**s > 0.0 && **s <= 100.0)) {
+        let problem = format!("{share} is no share");
+        return Err(InputError::new("--shares", problem, "write for example 50,25,10").into());
+    }
+    let prepared = prepare(&args.scene, &config)?;
+    let targets = TargetCache::new(&prepared.dataset.views, config.image_cache.0, rayon::current_num_threads())?;
+    let dataset = &prepared.dataset;
+    let mut contenders = vec![contender(&prepared, &config, None, usize::MAX)?];
+    let pages = contenders[0].trainer.scene.pager.index().len();
+    let frames = |share: f64| (share / 100.0 * pages as f64).ceil() as usize;
+    settle_order(&mut config, dataset, &mut contenders[0].trainer, args.shares.iter().copied().map(frames))?;
+    let most = views(dataset, &contenders[0].trainer).most();
+    for &share in &args.shares {
+        if frames(share) < most {
+            print(&json!({ "share_percent": share, "frames": frames(share), "pages_of_largest_view": most }));
+            continue;
+        }
+        contenders.push(contender(&prepared, &config, Some(share), frames(share))?);
+    }
+    let warm_up = args.warm_up.unwrap_or(dataset.train_views().len() as u32).min(config.steps / 2);
+    take_turns(&mut contenders, (0..warm_up, args.turn), dataset, &targets, false)?;
+    contenders.iter_mut().for_each(Contender::begin);
+    take_turns(&mut contenders, (warm_up..config.steps, args.turn), dataset, &targets, true)?;
+    let facts = json!({
+        "scene": args.scene, "page_rows": config.page_rows, "pages": pages, "gaussians": contenders[0].trainer.scene.rows(),
+        "view_order": contenders[0].trainer.view_order().order().to_string(), "steps": config.steps - warm_up,
+        "pages_of_view": views(dataset, &contenders[0].trainer).total() as f64 / dataset.train_views().len() as f64,
+        "pages_of_largest_view": most, "threads": rayon::current_num_threads(), "host_bytes_peak": host_bytes_peak(),
+        "version": env!("CARGO_PKG_VERSION"),
+    });
+    let lines: Vec<Value> = contenders.iter().map(|c| c.line(&contenders[0], &facts)).collect();
+    lines.iter().for_each(print);
+    Ok(())
+}
+
+fn cameras(dataset: &Dataset) -> Vec<Camera> {
+    dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect()
+}
+
+fn views(dataset: &Dataset, trainer: &Trainer) -> ViewPages {
+    ViewPages::new(trainer.scene.pager.index(), &cameras(dataset))
+}
+
+/// One order for all, so that all train on the same views: for the smallest number of frames where it is automatic.
+fn settle_order(
+    config: &mut TrainConfig,
+    dataset: &Dataset,
+    trainer: &mut Trainer,
+    frames: impl Iterator<Item = usize>,
+) -> Result<(), TrainError> {
+    if config.view_order != "auto" {
+        return Ok(());
+    }
+    let (views, pages) = (views(dataset, trainer), trainer.scene.pager.index().len());
+    let frames = frames.min().unwrap_or(pages).max(views.most());
+    let order = automatic_order(&views, &cameras(dataset), pages, frames, config.seed, ORDER_BYTES)
+        .map_err(|e| InputError::new("--shares", e.to_string(), "give larger shares"))?;
+    config.view_order = order.to_string();
+    trainer.set_view_order(order, dataset);
+    Ok(())
+}
+
+/// In memory, or with this many frames over a folder of its own in the spill directory.
+fn contender(
+    prepared: &Prepared,
+    config: &TrainConfig,
+    share: Option<f64>,
+    frames: usize,
+) -> Result<Contender, TrainError> {
+    let folder = share.map(|s| Path::new(&config.spill_dir).join(format!("share-{s}")));
+    if let Some(above) = folder.as_deref().and_then(Path::parent) {
+        std::fs::create_dir_all(above).map_err(|e| InputError::io(above, "making the folder", &e))?;
+    }
+    let spill_dir = folder.map_or_else(String::new, |f| f.display().to_string());
+    let frames_key = if share.is_some() { u32::try_from(frames).unwrap_or(u32::MAX) } else { 0 };
+    // The share says how much memory there is.
+    let own = TrainConfig { spill_dir, frames: frames_key, host_mem: ByteSize(0), ..config.clone() };
+    let options = RunOptions::new(&own, prepared.dataset.scene_scale);
+    let (pager, tiers) = tiers::open(&own, prepared.columns.rows().div_ceil(options.page_rows), u64::MAX, false)?;
+    let columns = prepared.columns.clone();
+    let trainer = Trainer::with_pager(columns, pager, &prepared.dataset, Box::new(CpuRenderer::new()), options)?;
+    Ok(Contender {
+        share,
+        before: trainer.scene.pager.stats(),
+        demand: Demand::default(),
+        trainer,
+        tiers,
+        seconds: Vec::new(),
+        cpu_seconds: 0.0,
+        rows: 0,
+        rows_pinned: 0,
+        last_loss: 0.0,
+    })
+}
+
+fn take_turns(
+    contenders: &mut [Contender],
+    (steps, turn): (std::ops::Range<u32>, u32),
+    dataset: &Dataset,
+    targets: &TargetCache,
+    measures: bool,
+) -> Result<(), TrainError> {
+    let mut first = steps.start;
+    while first < steps.end {
+        let end = first.saturating_add(turn).min(steps.end);
+        for contender in &mut *contenders {
+            for _ in first..end {
+                contender.step(dataset, targets, measures)?;
+            }
+        }
+        first = end;
+    }
+    Ok(())
+}
+
+impl Contender {
+    fn begin(&mut self) {
+        self.before = self.trainer.scene.pager.stats();
+        self.demand = Demand::begin(&self.trainer.scene.pager);
+    }
+
+    fn step(&mut self, dataset: &Dataset, targets: &TargetCache, measures: bool) -> Result<(), TrainError> {
+        if measures && self.share.is_some() {
+            let view = self.trainer.next_view();
+            self.demand.steps.push(self.trainer.scene.pager.pages_of_view(&dataset.views[view].camera));
+        }
+        let (began, cpu) = (Instant::now(), process_cpu_seconds());
+        let outcome = self.trainer.step(dataset, targets)?;
+        if measures {
+            self.seconds.push(began.elapsed().as_secs_f64());
+            self.cpu_seconds += process_cpu_seconds().zip(cpu).map_or(0.0, |(after, before)| after - before);
+            self.rows += outcome.rows as u64;
+            self.rows_pinned += outcome.rows_pinned as u64;
+        }
+        self.last_loss = outcome.loss.loss;
+        Ok(())
+    }
+
+    /// What was measured, beside the run in memory and what holds for all.
+    fn line(&self, in_memory: &Contender, facts: &Value) -> Value {
+        let steps = self.seconds.len().max(1) as f64;
+        let sum = |of: &Contender| of.seconds.iter().sum::<f64>();
+        let pager = &self.trainer.scene.pager;
+        let (now, before) = (pager.stats(), self.before);
+        let needed = (now.pages_needed - before.pages_needed).max(1) as f64;
+        let pages_read = now.pages_read - before.pages_read;
+        let bytes_read = now.bytes_read - before.bytes_read;
+        let ratios = self.seconds.iter().zip(&in_memory.seconds).map(|(own, base)| own / base);
+        let mut line = json!({
+            "share_percent": self.share, "frames": self.share.map(|_| now.frames_max), "engine": self.tiers.engine,
+            "seconds_per_step_median": median(self.seconds.iter().copied()),
+            "seconds_per_step": sum(self) / steps, "cpu_seconds_per_step": self.cpu_seconds / steps,
+            "ratio_of_medians": median(self.seconds.iter().copied()) / median(in_memory.seconds.iter().copied()),
+            "median_of_ratios": median(ratios),
+            "ratio_of_sums": sum(self) / sum(in_memory),
+            "cpu_ratio": self.cpu_seconds / in_memory.cpu_seconds,
+            "overfetch": self.rows_pinned as f64 / self.rows.max(1) as f64,
+            "rows_per_step": self.rows as f64 / steps,
+            "same_last_loss": self.last_loss.to_bits() == in_memory.last_loss.to_bits(),
+        });
+        if self.share.is_some() {
+            let bytes = page_bytes(pager.index());
+            let bound = self.demand.fewest_reads(now.frames_max, &bytes);
+            let tier = json!({
+                "pages_read_per_step": pages_read as f64 / steps, "bytes_read_per_step": bytes_read as f64 / steps,
+                "bytes_written_per_step": (now.bytes_written - before.bytes_written) as f64 / steps,
+                "belady_pages_per_step": bound.map(|(pages, _)| pages as f64 / steps),
+                "belady_bytes_per_step": bound.map(|(_, bytes)| bytes as f64 / steps),
+                "pages_over_belady": bound.map(|(pages, _)| pages_read as f64 / pages.max(1) as f64),
+                "bytes_over_belady": bound.map(|(_, bytes)| bytes_read as f64 / bytes.max(1) as f64),
+                "share_misses": (now.misses - before.misses) as f64 / needed,
+                "share_late_misses": (now.late_misses - before.late_misses) as f64 / needed,
+                "stall_seconds": now.stall_seconds - before.stall_seconds,
+            });
+            extend(&mut line, &tier);
+        }
+        extend(&mut line, facts);
+        line
+    }
+}
+
+fn extend(line: &mut Value, more: &Value) {
+    if let (Some(line), Some(more)) = (line.as_object_mut(), more.as_object()) {
+        line.extend(more.clone());
+    }
+}
+
+/// Of at least one value; 0 of none.
+fn median(values: impl Iterator<Item = f64>) -> f64 {
+    let mut sorted: Vec<f64> = values.collect();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let (low, high) = (sorted.get((sorted.len().max(1) - 1) / 2), sorted.get(sorted.len() / 2));
+    low.zip(high).map_or(0.0, |(low, high)| (low + high) / 2.0)
+}
