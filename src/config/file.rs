@@ -87,7 +87,7 @@ config_keys! {
         sh_every: u32 = 1000;
         /// Band in use from the first step
         sh_start: u8 = 0;
-        /// Order of the photos: auto, shuffle, groups:<n> (n spatial groups, shuffled within) or tour (along the way).
+        /// Order of the photos: auto, shuffle, groups:N (n spatial groups, shuffled within) or tour (along the way).
         /// auto is shuffle where the scene fits in memory, else groups
         view_order: String = "auto".into();
         /// Gaussians that a page holds. Part of a run: other pages give other roundings
@@ -169,7 +169,7 @@ config_keys! {
         frames: u32 = 0;
         /// How pages are read and written: auto, uring, mmap or pread. Never changes results
         io: String = "auto".into();
-        /// How pages are stored: raw, halves (for --moments bf16), zstd:<level>, or auto (what the drive's speed and the
+        /// How pages are stored: raw, halves (for --moments bf16), zstd:LEVEL, or auto (what the drive's speed and the
         /// moments favour). Never changes results
         spill_codec: String = "auto".into();
         /// Seconds from one commit to the next, with --spill-dir: a run that is killed loses no more. 0 = only when it is

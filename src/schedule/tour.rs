@@ -5,7 +5,7 @@
 //! shorter one is taken. Flights in strips are found by the first, orbits and walks by the second.
 //!
 //! Invariants: 1. a function of the places alone; 2. time grows with the number of places, but for the second start,
-//! which is tried up to [`NEAREST_MAX`] places.
+//! which is tried up to `NEAREST_MAX` places.
 
 use super::places::{Place, distance_sq};
 

@@ -47,7 +47,7 @@ pub struct Args {
     /// Config file; flags override it
     #[arg(long)]
     config: Option<PathBuf>,
-    /// Orders: shuffle, groups:<n>, tour
+    /// Orders: shuffle, groups:N, tour
     #[arg(
         long,
         value_delimiter = ',',
