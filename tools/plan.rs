@@ -50,7 +50,7 @@ struct Args {
     /// 10%,25%,50%
     #[arg(long, value_delimiter = ',', value_name = "N|N%", help_heading = "Plan")]
     compare_frames: Vec<String>,
-    /// Orders of views to compare: auto, shuffle, groups:<n>, tour; without it --view-order, or else auto and shuffle
+    /// Orders of views to compare: auto, shuffle, groups:N, tour; without it --view-order, or else auto and shuffle
     #[arg(long, value_delimiter = ',', value_name = "ORDER", help_heading = "Plan")]
     compare_orders: Vec<String>,
     /// Plan as if every page had grown to this many
