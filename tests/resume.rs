@@ -159,6 +159,34 @@ fn a_run_that_is_killed_at_any_time_ends_with_the_same_bytes() {
     }
 }
 
+/// A kill while the spill directory of a finished run is being removed leaves a map whose segments are gone.
+#[test]
+fn a_run_that_was_done_is_not_trained_again() {
+    let bench = Bench::new();
+    let (want, _, fewest) = bench.alone();
+    let (out, spill, kept) = (bench.path("out"), bench.path("spill"), bench.path("kept"));
+    let seldom = ["--commit-every", "0"];
+    let mut child = bench.begin(fewest, &seldom);
+    bench.wait_for_lines(&mut child, 4);
+    signal(&child, "INT");
+    assert_eq!(ended(child).status.code(), Some(130));
+    std::fs::create_dir(&kept).unwrap();
+    for entry in std::fs::read_dir(&spill).unwrap().map(Result::unwrap) {
+        std::fs::copy(entry.path(), kept.join(entry.file_name())).unwrap();
+    }
+    assert!(ended(bench.go_on(&[])).status.success());
+    assert!(ply(&out) == want && !spill.exists());
+    std::fs::rename(&kept, &spill).unwrap();
+    let segments = |folder: &Path| {
+        let names = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
+        names.filter(|p| p.extension().is_some_and(|e| e == "dat")).collect::<Vec<_>>()
+    };
+    segments(&spill).iter().for_each(|segment| std::fs::remove_file(segment).unwrap());
+    let output = ended(bench.go_on(&[]));
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert!(ply(&out) == want && !spill.join("FORMAT").exists(), "the results stay, what was left over goes");
+}
+
 #[test]
 fn a_run_that_is_asked_to_stop_says_how_to_go_on_and_does() {
     let bench = Bench::new();
@@ -226,8 +254,9 @@ fn what_cannot_go_on_is_refused_and_left_as_it_was() {
     let output = ended(bench.go_on(&[]));
     assert!(output.status.success(), "{}", stderr(&output));
     assert!(ply(&out) == want, "the scene is another");
-    let words = said(&[]);
-    // The folder itself stays: the life that ended did not make it.
+    // Done is done; more steps would need the pages, which are gone.
+    assert!(ended(bench.go_on(&[])).status.success());
+    let words = said(&["--steps", "300"]);
     assert!(words.contains("no spill directory"), "{words}");
 }
 

@@ -368,7 +368,7 @@ mod tests {
             assert_eq!(SlotRef::from_bytes(&wrong.to_bytes()), None);
         }
         let mut bytes = slot.to_bytes();
-        bytes[SlotRef::ENCODED_BYTES - 1] = 2;
+        bytes[SlotRef::ENCODED_BYTES - 1] = 3;
         assert_eq!(SlotRef::from_bytes(&bytes), None);
     }
 }

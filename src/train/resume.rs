@@ -8,7 +8,7 @@ use super::checkpoint::{check_dataset, dataset_print};
 use super::machine;
 use super::memory::host_budget;
 use super::pages::PagedScene;
-use super::report::read_resolved;
+use super::report::{Summary, read_resolved};
 use super::run::{Begun, RunOutcome, RunRequest, begin, see_through};
 use super::start::Start;
 use super::tiers::Stored;
@@ -19,7 +19,9 @@ use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits::{self, RunOptions};
 use crate::densify::stats::GradHistogram;
 use crate::page::commit::CommitError;
+use crate::page::spill_dir::SpillDir;
 use crate::paging::pager::Pager;
+use crate::report::run_report::write_run_report;
 use std::path::{Path, PathBuf};
 
 /// Keys that a run may have otherwise when it goes on: they change no number of the result.
@@ -72,6 +74,9 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
         let problem = "this run kept its pages in memory and committed nothing";
         return Err(InputError::new(&file, problem, "start it again with --overwrite, and with --spill-dir").into());
     }
+    if let Some(outcome) = already_done(request, &config)? {
+        return Ok(outcome);
+    }
     machine::set_up(&config)?;
     let host_mem = host_budget(&config);
     let stored = Stored::open(Path::new(&config.spill_dir))?;
@@ -99,6 +104,23 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     let (out, quiet) = (request.out.clone(), request.quiet);
     let request = RunRequest { scene, out, config, dry_run: false, overwrite: false, quiet };
     see_through(&request, &dataset, tiers, trainer, begun)
+}
+
+/// A run that did all of its steps and wrote its results, but was killed before its spill directory was gone: what is left
+/// of that is removed, and nothing is trained.
+fn already_done(request: &ResumeRequest, config: &TrainConfig) -> InputResult<Option<RunOutcome>> {
+    let text = std::fs::read_to_string(request.out.join("summary.json")).unwrap_or_default();
+    let summary: Option<Summary> = serde_json::from_str(&text).ok();
+    let Some(summary) = summary.filter(|s| s.finished && s.steps >= config.steps) else { return Ok(None) };
+    // Without its FORMAT, or in use, it is left alone.
+    if let Ok(spill) = SpillDir::open(Path::new(&config.spill_dir), false) {
+        spill.remove()?;
+    }
+    write_run_report(&request.out)?;
+    if !request.quiet {
+        eprintln!("{} is done: all {} steps, results are there", request.out.display(), summary.steps);
+    }
+    Ok(Some(RunOutcome { summary: Some(summary), exit_code: 0 }))
 }
 
 fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {

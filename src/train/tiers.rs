@@ -67,7 +67,11 @@ fn chosen_codec(config: &TrainConfig, folder: Option<&Path>, notes: &mut Vec<Str
     }
     match folder.map(DriveRate::of) {
         None => Codec::Raw,
-        Some(Ok(rate)) => rate.codec(),
+        Some(Ok(rate)) => match rate.codec() {
+            // Costs one pass and saves a third of the bytes, on any drive.
+            Codec::Raw if config.moments == "bf16" => Codec::Halves,
+            codec => codec,
+        },
         Some(Err(error)) => {
             notes.push(format!("the drive was not measured, pages are stored raw: {error}"));
             Codec::Raw
