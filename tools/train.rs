@@ -5,7 +5,7 @@ use gsscale::base::error::{InputError, InputResult};
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::train::resume::{ResumeRequest, resume};
-use gsscale::train::run::{RunOutcome, RunRequest, run};
+use gsscale::train::run::{RunOutcome, RunRequest, remedy_of_existing, run};
 use gsscale::train::trainer::TrainError;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -17,7 +17,8 @@ Examples:
   gsscale-train scans/village --out runs/quick --steps 7000 --max-resolution 800
   gsscale-train scans/village --out runs/big --max-gaussians 2000000 --config configs/in_core.toml
   gsscale-train scans/village --out runs/gpu --device gpu   on a GPU; --list-devices shows which there are
-  gsscale-train --resume runs/village               go on with a run that has a spill directory and stopped
+  gsscale-train --resume runs/village               go on with a run that stopped or was cut off
+  gsscale-train --resume runs/village --steps 60000 more steps for a run that was made with --keep-checkpoint
   gsscale-train scans/village --dry-run             what was understood, and the memory it will take
 
 Results in --out: point_cloud.ply (opens in any splat viewer), renders/test/*.png (render beside photo),
@@ -39,10 +40,13 @@ struct Args {
     /// Generate a small city into `scene` inside --out and train on it
     #[arg(long, conflicts_with = "scene")]
     demo: bool,
-    /// Go on with the run in this output folder, which was stopped or cut off and has a spill directory; its config and
-    /// scene are used. Memory, frames, threads, I/O and logging may be given anew
+    /// Go on with the run in this output folder, which stopped, was cut off, or kept its checkpoint; its config and scene
+    /// are used. Memory, frames, threads, I/O, device and logging may be given anew, and more --steps
     #[arg(long, value_name = "OUT", conflicts_with_all = ["scene", "out", "config", "demo", "dry_run", "overwrite"])]
     resume: Option<PathBuf>,
+    /// With --resume: go on although the dataset changed, or with other values of keys that change numbers
+    #[arg(long, requires = "resume")]
+    accept_changes: bool,
     /// Print what was understood and the memory it will take, then stop
     #[arg(long)]
     dry_run: bool,
@@ -85,7 +89,8 @@ fn list_devices() {
 
 fn start(args: Args) -> Result<RunOutcome, TrainError> {
     if let Some(out) = args.resume {
-        return resume(&ResumeRequest { out, keys: args.keys, quiet: args.quiet });
+        let (accept_changes, quiet) = (args.accept_changes, args.quiet);
+        return resume(&ResumeRequest { out, keys: args.keys, accept_changes, quiet });
     }
     let mut config = match (&args.config, args.demo) {
         (Some(path), _) => TrainConfig::read(path)?,
@@ -132,9 +137,7 @@ fn demo_scene(out: &Path, config: &TrainConfig, overwrite: bool, quiet: bool) ->
     let is_foreign = |entry: std::fs::DirEntry| entry.file_name() != "scene";
     let is_taken = std::fs::read_dir(out).is_ok_and(|entries| entries.flatten().any(is_foreign));
     if !overwrite && (is_taken || out.is_file()) {
-        return Err(
-            InputError::new(out, "exists already", "choose another --out, or replace it with --overwrite").into()
-        );
+        return Err(InputError::new(out, "exists already", remedy_of_existing(out)).into());
     }
     let same_seed = TrainConfig::read(&out.join("config.toml")).is_ok_and(|earlier| earlier.seed == config.seed);
     if same_seed && scene.join("sparse/0/points3D.bin").is_file() {

@@ -3,25 +3,84 @@
 //! Invariants: 1. what the bytes give back is what went in, bit for bit; 2. the version comes first, so that a newer
 //! program's state is told from damage; 3. bytes that nobody vouches for give a state within its limits or an error,
 //! never a panic.
+//!
+//! Layout: [`VERSION`] as u32, then the fields of [`RunState`] in their order, as [`crate::page::encoding`] writes them.
+//! Version 2 added what tools list and what a run that goes on counts from ([`RunState::test`], [`RunState::traffic`]),
+//! and a dataset print that knows photos, points and the local frame. No program was released with version 1.
 
 use crate::page::encoding::{self, EncodingError};
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 /// Bins of the statistics.
 const BINS: u16 = 1 << 15;
+
+/// A view, as far as training depends on it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ViewPrint {
+    /// Digest of name, set, size and pose.
+    pub pose: u64,
+    /// Digest of the files of its photo and its mask.
+    pub photo: u64,
+}
 
 /// The dataset that a run was started on, as far as training depends on it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DatasetPrint {
-    /// A digest of each view: name, set, size, pose.
-    pub views: Vec<u64>,
+    /// In the dataset's order.
+    pub views: Vec<ViewPrint>,
     /// Gaussians that a run starts from.
     pub first_rows: u64,
+    /// Digest of the points or Gaussians that they are made from.
+    pub points: u64,
     /// Scene scale, local units.
     pub scene_scale: f32,
+    /// World position of the local origin.
+    pub origin: [f64; 3],
+    /// World length of one local unit.
+    pub scale: f64,
+}
+
+/// The last evaluation on the held-out views.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct LastTest {
+    /// Steps that were done by then.
+    pub step: u32,
+    /// Views in the means.
+    pub views: u32,
+    /// Mean PSNR, dB.
+    pub psnr: f64,
+    /// Mean SSIM.
+    pub ssim: f64,
+}
+
+/// What moved between the tiers since the run began, over all its lives.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct TrafficSoFar {
+    /// Bytes read from the store.
+    pub bytes_read: u64,
+    /// Bytes written to the store.
+    pub bytes_written: u64,
+    /// Pages read.
+    pub pages_read: u64,
+    /// Pages written.
+    pub pages_written: u64,
+    /// Pages asked for.
+    pub pages_needed: u64,
+    /// Of these, in memory.
+    pub hits: u64,
+    /// Of these, not there.
+    pub misses: u64,
+    /// Of the misses, those that the plan had left out.
+    pub late_misses: u64,
+    /// Pages that lost their frame.
+    pub evictions: u64,
+    /// Seconds that steps waited.
+    pub stall_seconds: f64,
+    /// The most pages pinned at once.
+    pub pinned_max: u64,
 }
 
 /// A run between two steps.
@@ -57,6 +116,10 @@ pub struct RunState {
     pub train_seconds: f64,
     /// Length of metrics.jsonl.
     pub metrics_bytes: u64,
+    /// The last evaluation, if there was one.
+    pub test: Option<LastTest>,
+    /// What moved between the tiers so far.
+    pub traffic: TrafficSoFar,
 }
 
 /// Why bytes are not the state of a run.
@@ -121,8 +184,12 @@ impl RunState {
         if !ascends || self.histogram.last().is_some_and(|last| last.0 >= BINS) {
             return refuse("its statistics have bins that do not exist");
         }
-        if !(self.train_seconds >= 0.0 && self.train_seconds.is_finite()) {
-            return refuse("it has trained for no length of time");
+        let is_time = |seconds: f64| seconds >= 0.0 && seconds.is_finite();
+        if !is_time(self.train_seconds) || !is_time(self.traffic.stall_seconds) {
+            return refuse("it has trained or waited for no length of time");
+        }
+        if self.test.is_some_and(|test| test.step > self.step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
+            return refuse("its last evaluation cannot be");
         }
         Ok(())
     }
@@ -149,7 +216,14 @@ mod tests {
             simd: "avx2".to_string(),
             device: "cpu".to_string(),
             sh_degree_start: 0,
-            dataset: DatasetPrint { views: vec![5, u64::MAX], first_rows: 7, scene_scale: 1.25 },
+            dataset: DatasetPrint {
+                views: vec![ViewPrint { pose: 5, photo: u64::MAX }, ViewPrint { pose: 0, photo: 1 }],
+                first_rows: 7,
+                points: 3,
+                scene_scale: 1.25,
+                origin: [5e5, -0.0, 1.0],
+                scale: 2.5,
+            },
             events: events.to_vec(),
             histogram: vec![(3, 1), (32767, 9)],
             rows: 10,
@@ -159,6 +233,8 @@ mod tests {
             steps_skipped_in_a_row: 1,
             train_seconds: 0.1,
             metrics_bytes: 1234,
+            test: Some(LastTest { step: 8, views: 3, psnr: 21.5, ssim: 0.75 }),
+            traffic: TrafficSoFar { bytes_read: 9, stall_seconds: 0.25, ..TrafficSoFar::default() },
         }
     }
 
@@ -184,6 +260,9 @@ mod tests {
         refused(|s| s.histogram = vec![(32768, 1)]);
         refused(|s| s.histogram.reverse());
         refused(|s| s.train_seconds = f64::NAN);
+        refused(|s| s.traffic.stall_seconds = -1.0);
+        refused(|s| s.test = s.test.map(|t| LastTest { step: 10, ..t }));
+        refused(|s| s.test = s.test.map(|t| LastTest { psnr: f64::NAN, ..t }));
     }
 
     #[test]

@@ -77,8 +77,11 @@ config_keys! {
         init_points: u32 = 100_000;
     }
     "Training" {
-        /// Total number of steps; schedules are absolute in it
+        /// Total number of steps. A run that ended or stopped may go on to more: see --resume and --keep-checkpoint
         steps: u32 = 30_000;
+        /// Steps over which the rate of positions decays; it stays there afterwards. 0 = --steps. A run that goes on to
+        /// more steps keeps the one it began with
+        schedule_steps: u32 = 0;
         /// Seed of every random draw
         seed: u64 = 42;
         /// Highest band of spherical harmonics, 0 to 3
@@ -148,7 +151,7 @@ config_keys! {
     "Output" {
         /// Evaluate on the held-out photos every N steps; 0 = only at the end
         eval_every: u32 = 0;
-        /// Write a PLY every N steps; 0 = only at the end
+        /// Write a PLY every N steps and keep the run as it is then as a named checkpoint, step-N; 0 = only at the end
         save_every: u32 = 0;
         /// Write a line of metrics every N steps
         log_every: u32 = 100;
@@ -163,8 +166,11 @@ config_keys! {
         /// Memory that the run may take; 0 = 70 % of what this machine, or its control group, has available
         host_mem: ByteSize = ByteSize(0);
         /// Folder for pages that do not fit in memory, on a fast drive; empty = all pages stay in memory. It is the
-        /// checkpoint of the run as well: kept when a run stops early (see --resume), removed at its end
+        /// checkpoint of the run as well; that of a run in memory is the folder `checkpoint` inside --out
         spill_dir: String = String::new();
+        /// Keep the checkpoint (the spill directory, or `checkpoint` inside --out) at the end of the run too, to go on to
+        /// more steps later or to look at it with gsscale-ckpt. Without it, it is kept only when the run stops early
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] keep_checkpoint: bool = false;
         /// Pages held in memory at once; 0 = as many as --host-mem allows
         frames: u32 = 0;
         /// How pages are read and written: auto, uring, mmap or pread. Never changes results
@@ -172,8 +178,8 @@ config_keys! {
         /// How pages are stored: raw, halves (for --moments bf16), zstd:LEVEL, or auto (what the drive's speed and the
         /// moments favour). Never changes results
         spill_codec: String = "auto".into();
-        /// Seconds from one commit to the next, with --spill-dir: a run that is killed loses no more. 0 = only when it is
-        /// asked to stop, and after the last step. Never changes results
+        /// Seconds from one commit to the next: a run that is killed loses no more. 0 = only when it is asked to stop, and
+        /// after the last step. Never changes results
         commit_every: f64 = 60.0;
         /// Which page leaves memory first: belady (next used last) or lru. Never changes results
         evict: String = "belady".into();
@@ -278,6 +284,9 @@ impl TrainConfig {
         }
         if self.steps == 0 || self.steps > STEPS_MAX {
             return refuse("steps", "1 to 10,000,000");
+        }
+        if self.schedule_steps > STEPS_MAX {
+            return refuse("schedule-steps", "0 to 10,000,000");
         }
         if self.max_gaussians >= u64::from(u32::MAX) {
             return refuse("max-gaussians", "less than 4,294,967,295, or 0 for no cap");

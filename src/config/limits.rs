@@ -91,7 +91,7 @@ impl RunOptions {
                 opacities: config.opacities_lr,
                 sh0: config.sh0_lr,
                 sh_n: config.shn_lr,
-                steps: config.steps,
+                steps: schedule_steps(config),
             },
             adam: AdamConfig { eps: config.adam_eps, ..AdamConfig::default() },
             moments: Moments::from_name(&config.moments).unwrap_or_default(),
@@ -125,6 +125,11 @@ fn densify(config: &TrainConfig) -> DensifyConfig {
         reset_every: never_if_zero(config.reset_every),
         max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
     }
+}
+
+/// Steps over which the rates decay.
+pub fn schedule_steps(config: &TrainConfig) -> u32 {
+    if config.schedule_steps == 0 { config.steps } else { config.schedule_steps }
 }
 
 /// The instruction path that a config asks for on this machine.

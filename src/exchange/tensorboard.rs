@@ -3,7 +3,8 @@
 //! An event file is a sequence of records: length (u64), its checksum, the bytes, their checksum; the bytes are a
 //! protocol-buffer message `Event { wall_time = 1: double, step = 2: int64, file_version = 3: string, summary = 5 }` with
 //! `Summary { value = 1: repeated { tag = 1: string, simple_value = 2: float } }`. Only these fields are written, by hand:
-//! a dozen lines in place of a code generator.
+//! a dozen lines in place of a code generator. A run that goes on writes `session_log = 7 { status = 1: START }` with its
+//! first step, upon which TensorBoard forgets what earlier files say of that step and later ones.
 //!
 //! Invariants: 1. every record is whole when [`EventFile::write`] returns, so a reader that follows the file never sees
 //! half of one for long; 2. values that are not finite are left out.
@@ -14,6 +15,9 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
+/// `SessionLog { status = 1: START }`.
+const SESSION_START: [u8; 2] = [0x08, 0x01];
+
 /// An event file that grows.
 pub struct EventFile {
     path: PathBuf,
@@ -21,20 +25,28 @@ pub struct EventFile {
 }
 
 impl EventFile {
-    /// Creates an event file in `folder`, under a name that TensorBoard recognises.
+    /// Creates an event file in `folder`, under a name that TensorBoard recognises. For a run that goes on,
+    /// `first_step` is the first step that this file may tell of: what earlier files say of it and of later ones is void.
     ///
     /// # Errors
     /// The folder cannot be written.
-    pub fn create(folder: &Path) -> InputResult<EventFile> {
-        let path = folder.join(format!("events.out.tfevents.{:010}.gsscale", seconds_now() as u64));
-        let io = |e: std::io::Error| InputError::io(&path, "creating the event file", &e);
-        std::fs::create_dir_all(folder).map_err(io)?;
-        let file = File::create(&path).map_err(io)?;
+    pub fn create(folder: &Path, first_step: Option<u32>) -> InputResult<EventFile> {
+        std::fs::create_dir_all(folder)
+            .map_err(|e| InputError::io(folder, "creating the folder of event files", &e))?;
+        let (path, file) = new_file(folder)?;
         let mut events = EventFile { path, file };
         let mut message = Vec::new();
         double(&mut message, 1, seconds_now());
         bytes(&mut message, 3, b"brain.Event:2");
         events.record(&message)?;
+        if let Some(step) = first_step {
+            let mut message = Vec::new();
+            double(&mut message, 1, seconds_now());
+            key(&mut message, 2, 0);
+            varint(&mut message, u64::from(step));
+            bytes(&mut message, 7, &SESSION_START);
+            events.record(&message)?;
+        }
         Ok(events)
     }
 
@@ -67,6 +79,21 @@ impl EventFile {
         record.extend_from_slice(message);
         record.extend_from_slice(&masked(crc32c(message)).to_le_bytes());
         self.file.write_all(&record).map_err(|e| InputError::io(&self.path, "writing the event file", &e))
+    }
+}
+
+/// A file that was not there: lives of a run may begin within one second. Names sort in the order of time, which is the
+/// order in which TensorBoard reads them.
+fn new_file(folder: &Path) -> InputResult<(PathBuf, File)> {
+    let seconds = seconds_now() as u64;
+    let mut number = 0;
+    loop {
+        let path = folder.join(format!("events.out.tfevents.{seconds:010}.gsscale.{number:03}"));
+        match File::create_new(&path) {
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => number += 1,
+            Err(error) => return Err(InputError::io(&path, "creating the event file", &error)),
+            Ok(file) => return Ok((path, file)),
+        }
     }
 }
 
@@ -122,7 +149,7 @@ mod tests {
     #[test]
     fn records_are_framed_and_hold_what_was_written() {
         let folder = tempfile::tempdir().expect("a scratch folder");
-        let mut events = EventFile::create(&folder.path().join("tb")).expect("created");
+        let mut events = EventFile::create(&folder.path().join("tb"), Some(300)).expect("created");
         events.write(300, &[("loss/train", 0.25), ("psnr/test", f64::NAN)]).expect("written");
         let data = std::fs::read(&events.path).expect("readable");
         let mut rest = data.as_slice();
@@ -135,13 +162,18 @@ mod tests {
             messages.push(&rest[12..12 + length]);
             rest = &rest[16 + length..];
         }
-        assert_eq!(messages.len(), 2);
+        assert_eq!(messages.len(), 3);
         assert!(messages[0].ends_with(b"\x1a\x0dbrain.Event:2"));
+        // After the time: step 300, then the start of a session.
+        assert_eq!(messages[1][9..], [0x10, 0xac, 0x02, 0x3a, 2, 0x08, 0x01]);
         // After the time: step 300 as a varint, then a summary with one value: tag, f32.
         let mut want = vec![0x10, 0xac, 0x02, 0x2a, 19, 0x0a, 17, 0x0a, 10];
         want.extend_from_slice(b"loss/train");
         want.push(0x15);
         want.extend_from_slice(&0.25f32.to_le_bytes());
-        assert_eq!(&messages[1][9..], want);
+        assert_eq!(&messages[2][9..], want);
+        // Another file within the same second takes nothing away.
+        let second = EventFile::create(&folder.path().join("tb"), None).expect("created");
+        assert!(second.path > events.path && std::fs::read(&events.path).expect("readable") == data);
     }
 }

@@ -112,6 +112,11 @@ impl SpillDir {
         Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder: false, _lock: lock })
     }
 
+    /// Whether there is one, of whatever version and in whatever state, without touching it.
+    pub fn is_one(folder: &Path) -> bool {
+        !matches!(read_format(folder), Ok(None))
+    }
+
     /// The folder.
     pub fn folder(&self) -> &Path {
         &self.folder

@@ -87,16 +87,22 @@ impl Pager {
         first_error.map_or(Ok(()), Err)
     }
 
-    /// Commits the pages as they are, right after [`Pager::flush`]; returns the generation, `None` for a pager without a
-    /// store.
+    /// Commits the pages as they are, right after [`Pager::flush`], under the name `pin` if there is one; returns the
+    /// generation, `None` for a pager without a store.
     ///
     /// # Errors
     /// As [`Commits::commit`].
-    pub fn commit(&mut self, commits: &mut Commits, run_state: &[u8], note: &[u8]) -> Result<Option<u64>, CommitError> {
+    pub fn commit(
+        &mut self,
+        commits: &mut Commits,
+        run_state: &[u8],
+        note: &[u8],
+        pin: Option<&str>,
+    ) -> Result<Option<u64>, CommitError> {
         debug_assert!(self.in_flight() == 0, "a commit comes after a flush");
         let (changes, now) = self.changes();
         let Some(store) = &mut self.store else { return Ok(None) };
-        let cut = Cut { changes: &changes, run_state, note, pin: None };
+        let cut = Cut { changes: &changes, run_state, note, pin };
         let generation = commits.commit(store, &mut Vec::new(), &cut)?;
         self.committed = now;
         Ok(Some(generation))

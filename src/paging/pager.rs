@@ -101,6 +101,18 @@ impl Pager {
         }
     }
 
+    /// Gives a pager whose pages never left memory a store of its frames' size, which is empty: from here on it can be
+    /// committed. Nothing is written before that.
+    pub fn attach(&mut self, store: PagedStore) {
+        assert!(self.store.is_none(), "a pager has one store for life");
+        self.store = Some(store);
+    }
+
+    /// Counts on from what an earlier life of the run had counted.
+    pub fn count_on(&mut self, past: PagerStats) {
+        self.stats = past;
+    }
+
     /// Adds an initial page. `fill` writes its rows into the payload space (all of it is given; see
     /// [`crate::scene::page_layout::write_page`]), in the layout that `meta` names.
     ///
@@ -226,8 +238,8 @@ impl Pager {
     pub fn stats(&self) -> PagerStats {
         let traffic = self.store.as_ref().map(PagedStore::traffic).unwrap_or_default();
         PagerStats {
-            bytes_read: traffic.bytes_read,
-            bytes_written: traffic.bytes_written,
+            bytes_read: self.stats.bytes_read + traffic.bytes_read,
+            bytes_written: self.stats.bytes_written + traffic.bytes_written,
             frames: self.cache.frames(),
             frames_max: self.cache.frames_max(),
             ..self.stats

@@ -1,6 +1,7 @@
 //! What a pager did so far, for metrics.
 
-/// Totals since the pager was made; subtract two of them for one step.
+/// Totals since the pager was made, or since the run began that it goes on with ([`super::pager::Pager::count_on`]);
+/// subtract two of them for one step.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct PagerStats {
     /// Bytes read from the store.

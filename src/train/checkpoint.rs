@@ -2,23 +2,29 @@
 //!
 //! Invariants: 1. commits happen between steps and change nothing of the run; 2. what is committed is all that later
 //! steps depend on: a run that goes on from it ends with the same bytes; 3. a full drive ends no run at a commit that
-//! only time asked for.
+//! only time asked for; 4. a run in memory makes its checkpoint when it first commits, so a short one writes none.
 
+use super::first_commit::FirstCommit;
 use super::report::MetricsLog;
 use super::trainer::{TrainError, Trainer};
-use crate::base::error::InputError;
-use crate::checkpoint::run_state::{DatasetPrint, RunState};
+use crate::checkpoint::run_state::{DatasetPrint, RunState, TrafficSoFar};
 use crate::config::file::TrainConfig;
-use crate::dataset::loader::Dataset;
-use crate::dataset::model::Split;
 use crate::page::commit::{CommitError, Commits};
-use crate::page::format::checksum;
+use crate::page::spill_dir::SpillDir;
+use crate::paging::stats::PagerStats;
 use std::time::{Duration, Instant};
 
 /// The commits of a run.
 #[derive(Debug)]
 pub struct Checkpoint {
-    commits: Commits,
+    /// `None` before the first commit of a run in memory.
+    commits: Option<Commits>,
+    /// How that one makes them.
+    first: Option<FirstCommit>,
+    /// What it made them in.
+    spill: Option<SpillDir>,
+    /// The next commit is kept under this name.
+    name: Option<String>,
     every: Option<Duration>,
     last: Instant,
     /// What does not change: see [`Checkpoint::set_origin`].
@@ -44,9 +50,28 @@ pub struct Origin {
 impl Checkpoint {
     /// Commits as often as the config says, the first one after that time.
     pub fn new(commits: Commits, config: &TrainConfig) -> Checkpoint {
+        Checkpoint { commits: Some(commits), ..Checkpoint::without(config) }
+    }
+
+    /// Of a run in memory: the first commit makes a checkpoint as `first` says.
+    pub(super) fn later(first: FirstCommit, config: &TrainConfig) -> Checkpoint {
+        Checkpoint { first: Some(first), ..Checkpoint::without(config) }
+    }
+
+    fn without(config: &TrainConfig) -> Checkpoint {
         let every =
             (config.commit_every > 0.0).then(|| Duration::try_from_secs_f64(config.commit_every).ok()).flatten();
-        Checkpoint { commits, every, last: Instant::now(), origin: None, done: 0, said_full: false }
+        Checkpoint {
+            commits: None,
+            first: None,
+            spill: None,
+            name: None,
+            every,
+            last: Instant::now(),
+            origin: None,
+            done: 0,
+            said_full: false,
+        }
     }
 
     /// What the run was started with; before the first commit.
@@ -55,9 +80,25 @@ impl Checkpoint {
         self.last = Instant::now();
     }
 
-    /// Whether the time from one commit to the next is over.
+    /// Whether the time from one commit to the next is over, or a name waits for one.
     pub fn is_due(&self) -> bool {
-        self.every.is_some_and(|every| self.last.elapsed() >= every)
+        self.name.is_some() || self.every.is_some_and(|every| self.last.elapsed() >= every)
+    }
+
+    /// The next commit is kept under `name`, whatever is committed later.
+    pub fn keep_next_as(&mut self, name: String) {
+        self.name = Some(name);
+    }
+
+    /// Whether a commit after the last step is worth its writes: one of a run in memory that never committed would write
+    /// everything for a checkpoint that is removed at once.
+    pub fn wants_last(&self) -> bool {
+        self.commits.is_some()
+    }
+
+    /// Gives up the folder that the first commit of a run in memory made, if it did; nothing is committed any more.
+    pub fn into_folder(self) -> Option<SpillDir> {
+        self.spill
     }
 
     /// Whether something was committed since the store was opened.
@@ -71,11 +112,20 @@ impl Checkpoint {
     /// Nothing was committed; what was committed before still is.
     pub fn commit(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         let Some(origin) = &self.origin else { return Ok(()) };
+        if let Some(first) = self.first.take() {
+            match first.make(&mut trainer.scene.pager) {
+                Ok((spill, commits)) => (self.spill, self.commits) = (Some(spill), Some(commits)),
+                // The run itself is none the worse for it.
+                Err(error) => eprintln!("warning: this run is not committed, so it cannot be resumed: {error}"),
+            }
+        }
+        let name = self.name.take();
+        let Some(commits) = &mut self.commits else { return Ok(()) };
         trainer.scene.pager.flush()?;
         let state = trainer.run_state(origin, metrics.sync()?);
         let bytes = state.to_bytes().map_err(|e| CommitError::Contradiction(e.to_string()))?;
         let note = format!("step {}", state.step);
-        trainer.scene.pager.commit(&mut self.commits, &bytes, note.as_bytes())?;
+        trainer.scene.pager.commit(commits, &bytes, note.as_bytes(), name.as_deref())?;
         self.done += 1;
         self.last = Instant::now();
         Ok(())
@@ -124,6 +174,8 @@ impl Trainer {
             steps_skipped_in_a_row: self.steps_skipped_in_a_row,
             train_seconds: self.train_seconds,
             metrics_bytes,
+            test: self.last_test,
+            traffic: traffic_of(&self.scene.pager.stats()),
         }
     }
 
@@ -134,49 +186,40 @@ impl Trainer {
         self.steps_skipped = state.steps_skipped;
         self.steps_skipped_in_a_row = state.steps_skipped_in_a_row;
         self.train_seconds = state.train_seconds;
+        self.last_test = state.test;
+        self.scene.pager.count_on(stats_of(&state.traffic));
     }
 }
 
-/// What training depends on of a dataset, as far as it is cheap to know: photos are not read.
-pub fn dataset_print(dataset: &Dataset, first_rows: u64) -> DatasetPrint {
-    let views = dataset.views.iter().map(|view| {
-        let camera = &view.camera;
-        let mut bytes = view.name.as_bytes().to_vec();
-        bytes.push(u8::from(view.split == Split::Train));
-        let floats = [camera.fx, camera.fy, camera.cx, camera.cy, camera.near_plane, camera.far_plane];
-        for float in camera.viewmat.iter().flatten().chain(&floats) {
-            bytes.extend(float.to_bits().to_le_bytes());
-        }
-        bytes.extend([camera.width, camera.height].iter().flat_map(|n| n.to_le_bytes()));
-        checksum(&bytes) as u64
-    });
-    DatasetPrint { views: views.collect(), first_rows, scene_scale: dataset.scene_scale }
+fn traffic_of(stats: &PagerStats) -> TrafficSoFar {
+    TrafficSoFar {
+        bytes_read: stats.bytes_read,
+        bytes_written: stats.bytes_written,
+        pages_read: stats.pages_read,
+        pages_written: stats.pages_written,
+        pages_needed: stats.pages_needed,
+        hits: stats.hits,
+        misses: stats.misses,
+        late_misses: stats.late_misses,
+        evictions: stats.evictions,
+        stall_seconds: stats.stall_seconds,
+        pinned_max: stats.pinned_max as u64,
+    }
 }
 
-/// Refuses a dataset that is not the one of the run, and says where it differs first.
-///
-/// # Errors
-/// It differs.
-pub fn check_dataset(dataset: &Dataset, there: &DatasetPrint, here: &DatasetPrint) -> Result<(), InputError> {
-    let refuse = |problem: String| {
-        let remedy = "bring the dataset back as it was, or start a new run with another --out";
-        Err(InputError::new(
-            &dataset.image_folder,
-            format!("the dataset changed since the run began: {problem}"),
-            remedy,
-        ))
-    };
-    if there.views.len() != here.views.len() {
-        return refuse(format!("it had {} views and has {}", there.views.len(), here.views.len()));
+fn stats_of(traffic: &TrafficSoFar) -> PagerStats {
+    PagerStats {
+        bytes_read: traffic.bytes_read,
+        bytes_written: traffic.bytes_written,
+        pages_read: traffic.pages_read,
+        pages_written: traffic.pages_written,
+        pages_needed: traffic.pages_needed,
+        hits: traffic.hits,
+        misses: traffic.misses,
+        late_misses: traffic.late_misses,
+        evictions: traffic.evictions,
+        stall_seconds: traffic.stall_seconds,
+        pinned_max: traffic.pinned_max as usize,
+        ..PagerStats::default()
     }
-    if let Some(view) = (0..here.views.len()).find(|&v| here.views[v] != there.views[v]) {
-        return refuse(format!("view {} ({}) has another name, size or pose", view + 1, dataset.views[view].name));
-    }
-    if there.first_rows != here.first_rows {
-        return refuse(format!("it gave {} first Gaussians and gives {}", there.first_rows, here.first_rows));
-    }
-    if there.scene_scale.to_bits() != here.scene_scale.to_bits() {
-        return refuse(format!("its scale was {} and is {}", there.scene_scale, here.scene_scale));
-    }
-    Ok(())
 }

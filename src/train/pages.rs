@@ -28,7 +28,7 @@ use crate::scene::page_layout::{read_page, write_page};
 use crate::scene::page_meta::{PageBounds, PageMeta};
 use crate::scene::page_split::SplitTooDeep;
 use crate::scene::partition::{first_fill, partition};
-use crate::scene::rows::Rows;
+use crate::scene::rows::{Rows, RowsNow};
 use crate::scene::state::SceneState;
 use rayon::prelude::*;
 
@@ -290,6 +290,37 @@ impl PagedScene {
                 added.push(self.pager.add_split(meta, frame));
             }
         }
+        Ok(())
+    }
+
+    /// Brings every page to `now`, the number of steps done, by the rules that it was trained by, and goes on by those of
+    /// `options`: rows take the steps that they missed at the old rates, and bounds are renewed. Reads and rewrites every
+    /// page, once.
+    ///
+    /// # Errors
+    /// Pages could not be had.
+    pub(super) fn change_rules(&mut self, options: &RunOptions, now: u32) -> Result<(), TrainError> {
+        let mut rules = PageRules::new(options);
+        rules.events = self.rules.events.clone();
+        rules.sh_degree = self.rules.sh_degree;
+        let batch = (self.pager.stats().frames_max / 2).clamp(1, PAGES_PER_BATCH);
+        let pages: Vec<PageNo> = (0..self.pager.index().len() as u32).map(PageNo).collect();
+        for pages in pages.chunks(batch) {
+            let mut pinned = self.pager.acquire_pages(pages)?;
+            let applied = self.apply_pending(&mut pinned);
+            if applied.is_ok() {
+                let at = self.rules.adam.at(now);
+                pinned.par_iter_mut().for_each(|page| {
+                    let mut rows = page.rows_mut(0);
+                    (0..rows.rows()).for_each(|row| at.settle_row(&mut rows, row));
+                    page.meta.bounds = rules.bounds(&page.rows(0));
+                    page.dirty = true;
+                });
+            }
+            self.pager.release(pinned);
+            applied?;
+        }
+        self.rules = rules;
         Ok(())
     }
 

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 /// PSNR that stands for a perfect image.
 pub const PSNR_PERFECT: f64 = 100.0;
 
-/// What moved between the tiers so far. Without a spill directory nothing is read or written.
+/// What moved between the tiers so far, over all lives of a run. Without a spill directory only commits write.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct TierTraffic {
     /// Bytes read from the drive.
@@ -172,12 +172,12 @@ impl MetricsLog {
         Ok(MetricsLog { path: path.to_path_buf(), file: BufWriter::new(file), events: None })
     }
 
-    /// Writes TensorBoard's event files to `folder` as well.
+    /// Writes TensorBoard's event files to `folder` as well; `first_step` as for [`EventFile::create`].
     ///
     /// # Errors
     /// The folder cannot be written.
-    pub fn with_events(self, folder: &Path) -> InputResult<Self> {
-        Ok(MetricsLog { events: Some(EventFile::create(folder)?), ..self })
+    pub fn with_events(self, folder: &Path, first_step: Option<u32>) -> InputResult<Self> {
+        Ok(MetricsLog { events: Some(EventFile::create(folder, first_step)?), ..self })
     }
 
     /// The file of a run that begins, or that goes on after the first `bytes` bytes.

@@ -1,15 +1,18 @@
-//! Going on with a run that stopped: from its output folder and its spill directory to the end.
+//! Going on with a run that stopped, or that ended and kept its checkpoint: from its output folder to the end.
 //!
 //! Invariants: 1. a run that goes on ends with the bytes that it would have had without the stop; 2. keys that change
-//! numbers, and the dataset, are those of the run, or it is refused with the difference; 3. a refused resume leaves
-//! everything as it was.
+//! numbers, and the dataset, are those of the run, or it is refused with the difference, unless the user accepts it: then
+//! every page is brought to the step of the change as it was trained, once, and goes on from there by the new rules; 3. a
+//! refused resume leaves everything as it was.
 
-use super::checkpoint::{check_dataset, dataset_print};
+use super::changes::Changes;
+use super::dataset_print::dataset_print;
+use super::first_commit::checkpoint_folder;
 use super::machine;
 use super::memory::host_budget;
 use super::pages::PagedScene;
 use super::report::{Summary, read_resolved};
-use super::run::{Begun, RunOutcome, RunRequest, begin, see_through};
+use super::run::{Begun, Past, RunOutcome, RunRequest, begin, see_through};
 use super::start::Start;
 use super::tiers::Stored;
 use super::trainer::{TrainError, Trainer};
@@ -21,32 +24,9 @@ use crate::densify::stats::GradHistogram;
 use crate::page::commit::CommitError;
 use crate::page::spill_dir::SpillDir;
 use crate::paging::pager::Pager;
+use crate::render::Renderer;
 use crate::report::run_report::write_run_report;
 use std::path::{Path, PathBuf};
-
-/// Keys that a run may have otherwise when it goes on: they change no number of the result.
-const FREE_KEYS: &[&str] = &[
-    "image-cache",
-    "eval-every",
-    "save-every",
-    "log-every",
-    "log",
-    "ssim-variant",
-    "export-frame",
-    "host-mem",
-    "spill-dir",
-    "frames",
-    "io",
-    "spill-codec",
-    "commit-every",
-    "evict",
-    "prefetch-bytes",
-    "threads",
-    "simd",
-    "device",
-    "deterministic",
-    "device-mem",
-];
 
 /// Which run, and what it is given now.
 #[derive(Debug, Clone)]
@@ -55,6 +35,8 @@ pub struct ResumeRequest {
     pub out: PathBuf,
     /// Flags.
     pub keys: TrainOverrides,
+    /// Other numbers and another dataset are accepted.
+    pub accept_changes: bool,
     /// Nothing but errors on the terminal.
     pub quiet: bool,
 }
@@ -66,59 +48,135 @@ pub struct ResumeRequest {
 /// [`super::run::run`].
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     let file = request.out.join("config.toml");
-    let mut config = TrainConfig::read(&file)?;
+    let of_file = TrainConfig::read(&file)?;
     let scene = read_resolved(&file)?.scene;
+    let mut config = of_file.clone();
     request.keys.clone().apply(&mut config);
     config.check()?;
-    if config.spill_dir.is_empty() {
-        let problem = "this run kept its pages in memory and committed nothing";
-        return Err(InputError::new(&file, problem, "start it again with --overwrite, and with --spill-dir").into());
-    }
-    if let Some(outcome) = already_done(request, &config)? {
+    let folder = stored_folder(&request.out, &config);
+    if let Some(outcome) = already_done(request, &config, &folder)? {
         return Ok(outcome);
     }
     machine::set_up(&config)?;
     let host_mem = host_budget(&config);
-    let stored = Stored::open(Path::new(&config.spill_dir))?;
+    let stored = Stored::open(&folder, config.spill_dir.is_empty())?;
     let state = stored.run_state.clone();
-    check_config(&file, &state, &config)?;
-    let start = Start::read(&scene, &config, host_mem)?;
-    check_dataset(&start.dataset, &state.dataset, &dataset_print(&start.dataset, start.rows))?;
-    check_start(&start, &state)?;
+    keep_schedule(&mut config, &request.keys, &state);
+    check_steps(&config, &state)?;
+    let mut changes = Changes::of_config(&file, &state, &config)?;
+    changes.check(&file, request.accept_changes)?;
+    let start = Start::look(&scene, &config, &request.out, host_mem)?;
+    let print = dataset_print(&start)?;
+    changes.add_dataset(&start.dataset, &state.dataset, &print);
+    changes.numbers.extend(start_change(&start, &state));
+    changes.check(&start.dataset.image_folder, request.accept_changes)?;
     let (renderer, options, driver) = begin(request.quiet, &config, &start)?;
+    say(request, &state, &config, &changes, &*renderer);
     let dataset = start.dataset;
-    if renderer.device() != state.device {
-        let (there, here) = (&state.device, renderer.device());
-        eprintln!("warning: the run was rendered by {there}, and is by {here} from here on: other roundings");
-    }
     let (pager, tiers) = stored.into_tiers(&config, host_mem.unwrap_or(u64::MAX))?;
     tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
-    let scene_pages = restore_pages(pager, &options, &state)?;
-    let mut trainer = Trainer::of_scene(scene_pages, &dataset, renderer, options);
+    let has_changed = !changes.numbers.is_empty();
+    let pages = match has_changed {
+        false => restore_pages(pager, &options, &state)?,
+        true => changed_pages(pager, &options, &state)?,
+    };
+    let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
     trainer.restore_counts(&state);
-    if !request.quiet {
-        eprintln!("resume  {} after {} of {} steps", request.out.display(), state.step, config.steps);
-    }
-    let RunState { config: text, dataset: print, metrics_bytes, sh_degree_start, .. } = state;
-    let begun = Begun { print, sh_degree_start, past: Some((text, metrics_bytes)), host_mem, driver };
+    let kept = kept_config(of_file, &config);
+    let past = Past { config: kept, metrics_bytes: state.metrics_bytes, step: state.step, has_changed };
+    let begun = Begun { print, sh_degree_start: state.sh_degree_start, past: Some(past), host_mem, driver };
     let (out, quiet) = (request.out.clone(), request.quiet);
     let request = RunRequest { scene, out, config, dry_run: false, overwrite: false, quiet };
     see_through(&request, &dataset, tiers, trainer, begun)
 }
 
-/// A run that did all of its steps and wrote its results, but was killed before its spill directory was gone: what is left
-/// of that is removed, and nothing is trained.
-fn already_done(request: &ResumeRequest, config: &TrainConfig) -> InputResult<Option<RunOutcome>> {
+/// Where the checkpoint of a run is.
+fn stored_folder(out: &Path, config: &TrainConfig) -> PathBuf {
+    match config.spill_dir.as_str() {
+        "" => checkpoint_folder(out),
+        folder => PathBuf::from(folder),
+    }
+}
+
+/// More steps do not stretch the rates of a run.
+fn keep_schedule(config: &mut TrainConfig, keys: &TrainOverrides, state: &RunState) {
+    if let Ok(then) = TrainConfig::parse(&state.config)
+        && keys.schedule_steps.is_none()
+        && config.steps != then.steps
+    {
+        config.schedule_steps = limits::schedule_steps(&then);
+    }
+}
+
+fn check_steps(config: &TrainConfig, state: &RunState) -> InputResult<()> {
+    if config.steps >= state.step {
+        return Ok(());
+    }
+    let problem = format!("{} are fewer than the {} steps that the run has done", config.steps, state.step);
+    Err(InputError::new("--steps", problem, "give more, or roll the run back with gsscale-ckpt"))
+}
+
+/// The config that a run keeps: that of its file, with what changes numbers and the number of steps as they are now.
+/// What changes none holds for this life of the run alone.
+fn kept_config(of_file: TrainConfig, config: &TrainConfig) -> TrainConfig {
+    let of = of_file;
+    TrainConfig {
+        image_cache: of.image_cache,
+        eval_every: of.eval_every,
+        save_every: of.save_every,
+        log_every: of.log_every,
+        log: of.log,
+        ssim_variant: of.ssim_variant,
+        export_frame: of.export_frame,
+        host_mem: of.host_mem,
+        spill_dir: of.spill_dir,
+        frames: of.frames,
+        io: of.io,
+        spill_codec: of.spill_codec,
+        commit_every: of.commit_every,
+        evict: of.evict,
+        prefetch_bytes: of.prefetch_bytes,
+        threads: of.threads,
+        device: of.device,
+        deterministic: of.deterministic,
+        device_mem: of.device_mem,
+        ..config.clone()
+    }
+}
+
+/// Says that a run goes on, and what is other than it was.
+fn say(request: &ResumeRequest, state: &RunState, config: &TrainConfig, changes: &Changes, renderer: &dyn Renderer) {
+    if renderer.device() != state.device {
+        let (there, here) = (&state.device, renderer.device());
+        eprintln!("warning: the run was rendered by {there}, and is by {here} from here on: other roundings");
+    }
+    changes.numbers.iter().for_each(|line| eprintln!("warning: accepted from step {} on: {line}", state.step));
+    if request.quiet {
+        return;
+    }
+    let other = match changes.free.as_slice() {
+        [] => String::new(),
+        free => format!("; {}", free.join(", ")),
+    };
+    eprintln!("resume  {} after {} of {} steps{other}", request.out.display(), state.step, config.steps);
+}
+
+/// A run that did all of its steps and wrote its results. If it was killed before its checkpoint was gone, what is left of
+/// that is removed, and nothing is trained; where it is to be kept, it stays.
+fn already_done(request: &ResumeRequest, config: &TrainConfig, folder: &Path) -> InputResult<Option<RunOutcome>> {
     let text = std::fs::read_to_string(request.out.join("summary.json")).unwrap_or_default();
     let summary: Option<Summary> = serde_json::from_str(&text).ok();
     let Some(summary) = summary.filter(|s| s.finished && s.steps >= config.steps) else { return Ok(None) };
     // Without its FORMAT, or in use, it is left alone.
-    if let Ok(spill) = SpillDir::open(Path::new(&config.spill_dir), false) {
+    let spill = SpillDir::open(folder, config.spill_dir.is_empty()).ok();
+    let is_kept = config.keep_checkpoint && spill.is_some();
+    if let Some(spill) = spill.filter(|_| !config.keep_checkpoint) {
         spill.remove()?;
     }
     write_run_report(&request.out)?;
     if !request.quiet {
-        eprintln!("{} is done: all {} steps, results are there", request.out.display(), summary.steps);
+        let more = if is_kept { "; --steps N goes on to more" } else { "" };
+        eprintln!("{} is done: all {} steps, results are there{more}", request.out.display(), summary.steps);
     }
     Ok(Some(RunOutcome { summary: Some(summary), exit_code: 0 }))
 }
@@ -131,35 +189,22 @@ fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result
     Ok(PagedScene::restore(pager, options, events, histogram, [state.rows, state.rows_bound]))
 }
 
-fn check_start(start: &Start, state: &RunState) -> InputResult<()> {
-    if start.sh_degree_start == state.sh_degree_start {
-        return Ok(());
-    }
-    let (there, here) = (state.sh_degree_start, start.sh_degree_start);
-    let problem = format!("the first Gaussians had {there} bands in use and have {here}");
-    Err(InputError::new("--init-ply", problem, "bring the file back as it was, or start a new run"))
+/// The pages of a run that goes on by other rules: brought to its last step by those that it had.
+fn changed_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
+    let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
+    // The path that the bits were made on, if this machine has it.
+    let simd = then.simd.clone();
+    let then = [state.simd.clone(), simd].into_iter().map(|simd| TrainConfig { simd, ..then.clone() });
+    let then = then.into_iter().find(|c| limits::simd_path(c).is_supported()).unwrap_or_default();
+    let old =
+        RunOptions { sh_degree_start: state.sh_degree_start, ..RunOptions::new(&then, state.dataset.scene_scale) };
+    let mut pages = restore_pages(pager, &old, state)?;
+    pages.change_rules(options, state.step)?;
+    Ok(pages)
 }
 
-/// Refuses keys that change numbers and are not those of the run.
-fn check_config(file: &Path, state: &RunState, config: &TrainConfig) -> InputResult<()> {
-    let broken = |e: String| InputError::new(file, e, "start the run again");
-    let there: toml::Table = state.config.parse().map_err(|e: toml::de::Error| broken(e.to_string()))?;
-    let here = toml::Table::try_from(config).map_err(|e| broken(e.to_string()))?;
-    let mut differences = Vec::new();
-    for (key, now) in here.iter().filter(|(key, _)| !FREE_KEYS.contains(&key.as_str())) {
-        match there.get(key) {
-            Some(then) if then == now => {}
-            Some(then) => differences.push(format!("{key} was {then} and is {now}")),
-            None => differences.push(format!("{key} was not there and is {now}")),
-        }
-    }
-    let simd = limits::simd_path(config).name();
-    if simd != state.simd {
-        differences.push(format!("simd was {} and is {simd}", state.simd));
-    }
-    if differences.is_empty() {
-        return Ok(());
-    }
-    let problem = format!("the run cannot go on with other numbers: {}", differences.join("; "));
-    Err(InputError::new(file, problem, "leave these keys as they were, or start a new run with another --out"))
+/// A start that would be another one now: of no use to a run that is past it, but a sign that something changed.
+fn start_change(start: &Start, state: &RunState) -> Option<String> {
+    let (there, here) = (state.sh_degree_start, start.sh_degree_start);
+    (there != here).then(|| format!("the first Gaussians had {there} bands in use and have {here}"))
 }

@@ -3,14 +3,16 @@
 //! Invariants: 1. the output folder is made only after the dataset was understood, so bad input leaves nothing
 //! behind; 2. a run that is stopped or fails after its first step still writes the PLY of its last good step.
 
-use super::checkpoint::{Origin, dataset_print};
+use super::checkpoint::Origin;
+use super::dataset_print::dataset_print;
 use super::eval::ply_warnings;
+use super::first_commit::checkpoint_folder;
 use super::machine;
 use super::memory::{estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
 use super::page_map::write_page_map;
 use super::preflight;
 use super::progress::Progress;
-use super::report::{MetricsLog, Resolved, Summary, TierTraffic, write_config, write_summary};
+use super::report::{MetricsLog, Resolved, Summary, TierTraffic, read_resolved, write_config, write_summary};
 use super::signals::StopFlag;
 use super::start::Start;
 use super::tiers::{self, Tiers};
@@ -24,6 +26,7 @@ use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
+use crate::page::spill_dir::SpillDir;
 use crate::render::Renderer;
 use crate::report::run_report::{PAGES_FILE, REPORT_FILE, write_run_report};
 use crate::scene::columns::{Columns, sh_n_width};
@@ -158,14 +161,26 @@ fn cut_sh(columns: Columns, sh_degree: u8) -> Columns {
     Columns { sh_degree, sh_n, ..columns }
 }
 
+/// What a run that goes on has behind it.
+pub(super) struct Past {
+    /// Its config, as it is kept from now on.
+    pub config: TrainConfig,
+    /// Length of its metrics.
+    pub metrics_bytes: u64,
+    /// Steps done.
+    pub step: u32,
+    /// It goes on with other numbers: that is committed at once.
+    pub has_changed: bool,
+}
+
 /// What a run begins or goes on with.
 pub(super) struct Begun {
     /// The dataset.
     pub print: DatasetPrint,
     /// Degree in use from the first step.
     pub sh_degree_start: u8,
-    /// A run that goes on: its config, and the length of its metrics.
-    pub past: Option<(String, u64)>,
+    /// A run that goes on.
+    pub past: Option<Past>,
     /// Budget, bytes.
     pub host_mem: Option<u64>,
     /// Bytes that the graphics driver took.
@@ -188,9 +203,12 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let fill = first_fill(config.page_rows as usize, options.densify.is_some());
     let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
     // Dropped after the trainer, whose pages may lie there.
-    let (pager, tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
+    let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
     tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
-    let print = dataset_print(&start.dataset, start.rows);
+    if !request.dry_run {
+        tiers.commit_in(&request.out, config);
+    }
+    let print = dataset_print(&start)?;
     let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
     let trainer = Trainer::of_scene(scene, &dataset, renderer, options);
     see_through(request, &dataset, tiers, trainer, Begun { print, sh_degree_start, past: None, host_mem, driver })
@@ -261,20 +279,26 @@ fn settled(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
     }
 }
 
-/// Writes config.toml of a run that begins; returns what every commit says of how it began.
-fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun: Begun) -> InputResult<Origin> {
+/// Writes config.toml, of a run that goes on where it changed; returns what every commit says of how the run began.
+fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun: &Begun) -> InputResult<Origin> {
     let simd = limits::simd_path(&request.config).name().to_string();
-    let Begun { print, sh_degree_start, past, .. } = begun;
-    let config = match past {
-        Some((config, _)) => config,
+    let path = request.out.join("config.toml");
+    let config = match &begun.past {
+        Some(past) => {
+            if TrainConfig::read(&path)? != past.config {
+                write_config(&path, &past.config, &read_resolved(&path)?)?;
+            }
+            past.config.clone()
+        }
         None => {
-            let (path, settled) = (request.out.join("config.toml"), settled(&request.config, trainer));
+            let settled = settled(&request.config, trainer);
             write_config(&path, &settled, &resolved(request, dataset, trainer))?;
-            let fail = |e: toml::ser::Error| InputError::new(&path, e.to_string(), "report this as a bug");
-            toml::to_string(&settled).map_err(fail)?
+            settled
         }
     };
-    Ok(Origin { config, simd, sh_degree_start, dataset: print })
+    let fail = |e: toml::ser::Error| InputError::new(&path, e.to_string(), "report this as a bug");
+    let config = toml::to_string(&config).map_err(fail)?;
+    Ok(Origin { config, simd, sh_degree_start: begun.sh_degree_start, dataset: begun.print.clone() })
 }
 
 fn train_into(
@@ -285,19 +309,23 @@ fn train_into(
     begun: Begun,
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
-    let metrics_bytes = begun.past.as_ref().map(|(_, bytes)| *bytes);
-    let origin = begin_files(request, dataset, &trainer, begun)?;
-    let mut metrics = MetricsLog::open(&out.join("metrics.jsonl"), metrics_bytes)?;
+    let origin = begin_files(request, dataset, &trainer, &begun)?;
+    let mut metrics = MetricsLog::open(&out.join("metrics.jsonl"), begun.past.as_ref().map(|p| p.metrics_bytes))?;
     if config.log == "tensorboard" {
-        metrics = metrics.with_events(&out.join("tensorboard"))?;
+        metrics = metrics.with_events(&out.join("tensorboard"), begun.past.as_ref().map(|p| p.step))?;
     }
+    let keeps = tiers.keeps_checkpoint();
     let mut checkpoint = tiers.checkpoint.as_mut();
     if let Some(checkpoint) = &mut checkpoint {
         checkpoint.set_origin(origin);
+        if begun.past.is_some_and(|p| p.has_changed) {
+            checkpoint.commit(&mut trainer, &mut metrics)?;
+        }
     }
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let mut progress = Progress::new(config.steps, request.quiet);
-    let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint };
+    let lent = checkpoint.as_deref_mut();
+    let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint: lent };
     let looped = trainer.run(dataset, &targets, &mut outputs);
     let ply = Trainer::ply_path(out);
     let written = trainer.save(dataset, &ply)?;
@@ -316,6 +344,10 @@ fn train_into(
         None => trainer.evaluate(dataset, &targets, Some(&out.join("renders/test"))),
         Some(_) => Ok(None),
     });
+    if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, checkpoint) {
+        // Once more, with what the evaluation said.
+        checkpoint.commit_if_space(&mut trainer, &mut metrics)?;
+    }
     let (rows_skipped, steps_skipped) = trainer.skipped();
     let summary = Summary {
         steps: trainer.steps_done(),
@@ -347,16 +379,27 @@ fn check_out(request: &RunRequest) -> InputResult<()> {
     if is_empty_folder {
         return Ok(());
     }
-    let file = request.out.join("config.toml");
-    let can_go_on = TrainConfig::read(&file).is_ok_and(|c| !c.spill_dir.is_empty() && Path::new(&c.spill_dir).is_dir());
-    let remedy = match can_go_on {
-        true => format!(
-            "it holds a run that stopped: go on with gsscale-train --resume {}, or choose another --out",
-            request.out.display()
-        ),
-        false => "choose another --out, or replace it with --overwrite".to_string(),
+    Err(InputError::new(&request.out, "exists already", remedy_of_existing(&request.out)))
+}
+
+/// What to do about an output folder that is there already: go on with the run in it, or start over.
+pub fn remedy_of_existing(out: &Path) -> String {
+    let start_over = "choose another --out, or replace it with --overwrite";
+    let Ok(config) = TrainConfig::read(&out.join("config.toml")) else { return start_over.to_string() };
+    let spill = Path::new(&config.spill_dir);
+    let in_memory = config.spill_dir.is_empty();
+    let checkpoint = if in_memory { checkpoint_folder(out) } else { spill.to_path_buf() };
+    if !SpillDir::is_one(&checkpoint) {
+        return start_over.to_string();
+    }
+    let over = match in_memory {
+        true => "--overwrite".to_string(),
+        false => format!("--overwrite after removing {}", spill.display()),
     };
-    Err(InputError::new(&request.out, "exists already", remedy))
+    format!(
+        "it holds a run that can go on: gsscale-train --resume {}; or choose another --out, or start over with {over}",
+        out.display()
+    )
 }
 
 /// Makes the folder, proves that it can be written, and removes what an earlier run left there under our names.
@@ -376,6 +419,12 @@ fn make_out(out: &Path, overwrite: bool) -> InputResult<()> {
         }
     }
     remove_saved(out)?;
+    let checkpoint = checkpoint_folder(out);
+    if SpillDir::is_one(&checkpoint) {
+        SpillDir::open(&checkpoint, true)?.remove()?;
+        // Only if nothing else is in it.
+        let _ = std::fs::remove_dir(&checkpoint);
+    }
     let pictures = out.join("renders/test");
     if pictures.is_dir() {
         let io = |e: std::io::Error| InputError::io(&pictures, "removing the earlier run's pictures", &e);

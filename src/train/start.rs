@@ -5,6 +5,7 @@
 //!
 //! Invariant: both ways give the same pages, bit for bit ([`crate::dataset::import`]).
 
+use super::dataset_print::{columns_print, points_print};
 use super::pages::PagedScene;
 use super::run::{Prepared, check_train_views, prepare};
 use super::trainer::TrainError;
@@ -35,6 +36,8 @@ pub struct Start {
     pub sh_degree_start: u8,
     /// Gaussians that there will be; of a cloud no fewer.
     pub rows: u64,
+    /// Digest of what they are made from: the same whether it was streamed or not.
+    pub points: u64,
     from: FirstRows,
 }
 
@@ -49,14 +52,31 @@ impl Start {
     /// # Errors
     /// As [`prepare`].
     pub fn read(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
-        if !config.spill_dir.is_empty() {
-            let folder = folder_beside(Path::new(&config.spill_dir));
-            if let Some(start) = Start::stream(scene, config, &budget(&folder, host_mem))? {
-                return Ok(start);
-            }
+        if config.spill_dir.is_empty() {
+            return Start::in_memory(scene, config);
         }
+        Start::look(scene, config, &folder_beside(Path::new(&config.spill_dir)), host_mem)
+    }
+
+    /// As [`Start::read`], for a look at what a run began with: Gaussians are not made where that can be avoided. `folder`
+    /// is for what does not fit in memory; what is written there has no name.
+    ///
+    /// # Errors
+    /// As [`prepare`].
+    pub fn look(scene: &Path, config: &TrainConfig, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
+        match Start::stream(scene, config, &budget(folder, host_mem))? {
+            Some(start) => Ok(start),
+            None => Start::in_memory(scene, config),
+        }
+    }
+
+    fn in_memory(scene: &Path, config: &TrainConfig) -> InputResult<Start> {
         let Prepared { dataset, columns, sh_degree_start } = prepare(scene, config)?;
-        Ok(Start { dataset, sh_degree_start, rows: columns.rows() as u64, from: FirstRows::Columns(columns) })
+        let points = match dataset.points.as_slice() {
+            [] => columns_print(&columns),
+            points => points_print(&(points, dataset.colors.as_slice()))?.0,
+        };
+        Ok(Start { dataset, sh_degree_start, rows: columns.rows() as u64, points, from: FirstRows::Columns(columns) })
     }
 
     /// `None` where there are no points in a file.
@@ -79,18 +99,14 @@ impl Start {
         let (dataset, local) = load_dataset_with_cloud(raw, &cloud, &limits::load_options(config))?;
         check_train_views(scene, &dataset)?;
         let extent = local.extent;
-        let mut rows = 0;
-        cloud.for_each(|position, _| {
-            rows += u64::from(extent.is_plausible(position));
-            Ok(())
-        })?;
+        let (points, rows) = points_print(&local)?;
         if rows == 0 {
             return Ok(None);
         }
         let init = InitOptions { scene_scale: dataset.scene_scale, ..limits::init_options(config) };
         let rows = init.max_gaussians.map_or(rows, |most| rows.min(most as u64));
         let from = FirstRows::Points { cloud, extent, init };
-        Ok(Some(Start { dataset, sh_degree_start: limits::first_sh_degree(config), rows, from }))
+        Ok(Some(Start { dataset, sh_degree_start: limits::first_sh_degree(config), rows, points, from }))
     }
 
     /// The dataset, and the Gaussians in the pages of `pager`.

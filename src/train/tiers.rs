@@ -1,9 +1,10 @@
 //! Where a run's pages live, as its config says: all in memory, or in frames over files in a spill directory.
 //!
-//! Invariants: 1. nothing here changes a bit of the result, only what is kept where; 2. [`Tiers::close`] removes the spill
-//! directory, unless something was committed in it that a run can go on from: see [`Tiers::is_done`].
+//! Invariants: 1. nothing here changes a bit of the result, only what is kept where; 2. [`Tiers::close`] removes the
+//! checkpoint (the spill directory, or that of a run in memory), unless a run can go on from it: see [`Tiers::is_done`].
 
 use super::checkpoint::Checkpoint;
+use super::first_commit::{FirstCommit, MAP_CACHE_BYTES, codec};
 use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
 use crate::cache::evict::EvictPolicy;
@@ -33,17 +34,20 @@ const PREFETCH_BYTES_MAX: usize = 256 << 20;
 /// Memory for the plan of the coming steps, bytes.
 pub const PLAN_BYTES: usize = 16 << 20;
 
-/// Memory for the cache of the page map, bytes.
-const MAP_CACHE_BYTES: usize = 8 << 20;
-
 /// The tiers of a run.
 #[derive(Debug, Default)]
 pub struct Tiers {
     spill: Option<SpillDir>,
     /// Commits to the spill directory, where there is one.
     pub checkpoint: Option<Checkpoint>,
-    /// The run did all that it had to: its checkpoint is of no use any more.
+    /// The run did all that it had to: its checkpoint is of no use any more, unless it is to be kept.
     pub is_done: bool,
+    /// `--keep-checkpoint`.
+    keeps: bool,
+    /// All pages are in memory, and in a folder only as far as they were committed.
+    is_in_memory: bool,
+    /// The checkpoint is in the output folder.
+    is_in_output: bool,
     /// The directory had a run in it when it was opened.
     has_past: bool,
     /// What moves pages, for reports; empty when all stay in memory.
@@ -115,6 +119,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let pager = pager_config(config, pages, host_mem);
     let layout = SlotLayout::new(capacity_bytes(page_rows, sh_degree), pages as u64);
     let mut tiers = Tiers::default();
+    tiers.keeps = config.keep_checkpoint;
     if config.spill_dir.is_empty() {
         let engine = Box::new(MemoryStore::new());
         let codec = chosen_codec(config, None, &mut tiers.notes);
@@ -141,17 +146,18 @@ pub struct Stored {
 }
 
 impl Stored {
-    /// Opens the spill directory of a run at its last commit.
+    /// Opens the checkpoint of a run at its last commit; `allow_remote`, also on a network file system.
     ///
     /// # Errors
     /// It is gone or damaged, in use, or nothing was committed in it.
-    pub fn open(folder: &Path) -> Result<Stored, TrainError> {
-        let again = "start the run again, with --overwrite and another --spill-dir, or after removing this one";
-        if !folder.exists() {
-            let problem = "the spill directory of this run is not there: it is removed when a run ends";
+    pub fn open(folder: &Path, allow_remote: bool) -> Result<Stored, TrainError> {
+        let again = "start the run again with --overwrite; with --spill-dir, name another folder or remove this one";
+        if !SpillDir::is_one(folder) {
+            let problem = "the checkpoint of this run is not there: it is removed when a run ends without \
+                           --keep-checkpoint, and made by the first commit";
             return Err(InputError::new(folder, problem, again).into());
         }
-        let spill = SpillDir::open(folder, false)?;
+        let spill = SpillDir::open(folder, allow_remote)?;
         let nothing = || InputError::new(folder, "this run was cut off before its first commit", again);
         let opened = match Commits::open(Box::new(DriveFolder::new(folder)), commit_config(&spill)) {
             Err(CommitError::NoStore) => return Err(nothing().into()),
@@ -172,13 +178,20 @@ impl Stored {
     /// The I/O engine does not work here, or what is stored contradicts itself. The directory stays as it is.
     pub fn into_tiers(self, config: &TrainConfig, host_mem: u64) -> Result<(Pager, Tiers), TrainError> {
         let Stored { spill, opened, run_state } = self;
-        let pager = pager_config(config, opened.pages.len(), host_mem);
+        let mut pager = pager_config(config, opened.pages.len(), host_mem);
+        let bytes = (opened.pages.len() * pager.frame_bytes()) as u64;
+        // A run in memory stays there while that is no question; otherwise its checkpoint serves as a spill directory.
+        let is_in_memory = config.spill_dir.is_empty() && config.frames == 0 && bytes <= host_mem / 2;
+        if is_in_memory {
+            pager = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree);
+        }
         let layout = spill.format().layout;
         if layout.slot_bytes != pager.frame_bytes() as u64 {
             return Err(CommitError::Contradiction("slots have another size than pages".to_string()).into());
         }
         let mut tiers = Tiers::default();
-        tiers.has_past = true;
+        (tiers.has_past, tiers.is_in_memory, tiers.keeps) = (true, is_in_memory, config.keep_checkpoint);
+        tiers.is_in_output = config.spill_dir.is_empty();
         let (engine, codec) = tiers.take_spill(spill, config)?;
         let store = opened.paged_store(engine, layout, codec)?;
         let pager = Pager::open(pager, store, &opened.pages, run_state.events.len())?;
@@ -194,25 +207,45 @@ fn commit_config(spill: &SpillDir) -> CommitConfig {
 impl Tiers {
     /// Takes over a spill directory and starts what moves its pages.
     fn take_spill(&mut self, spill: SpillDir, config: &TrainConfig) -> InputResult<(Box<dyn PageStore>, Codec)> {
-        self.notes.extend(spill.warnings().iter().cloned());
+        self.notes.extend(spill.warnings().iter().filter(|_| !self.is_in_memory).cloned());
         let folder = spill.folder().to_path_buf();
         self.spill = Some(spill);
-        let codec = chosen_codec(config, Some(&folder), &mut self.notes);
+        let codec = match self.is_in_memory {
+            true => codec(config),
+            false => chosen_codec(config, Some(&folder), &mut self.notes),
+        };
         let opened = open_engine(config.io.parse().unwrap_or(IoEngine::Auto), &folder, DEPTH)?;
         self.notes.extend(opened.notes);
         (self.engine, self.codec) = (opened.store.name().to_string(), codec.to_string());
         Ok((opened.store, codec))
     }
 
-    /// Whether a run that stops now can go on from the spill directory.
+    /// A run whose pages stay in memory commits to its output folder `out`, from its first commit on. Nothing for other
+    /// runs: those with a spill directory commit there, and `--frames` alone, which is for comparisons, has no drive.
+    pub fn commit_in(&mut self, out: &Path, config: &TrainConfig) {
+        if config.spill_dir.is_empty() && config.frames == 0 {
+            self.checkpoint = Some(Checkpoint::later(FirstCommit::of(out, config), config));
+            (self.is_in_memory, self.is_in_output, self.keeps) = (true, true, config.keep_checkpoint);
+        }
+    }
+
+    /// Whether a run that stops now can go on from its checkpoint.
     pub fn can_resume(&self) -> bool {
-        let has_commit = self.checkpoint.as_ref().is_some_and(Checkpoint::has_commit);
-        !self.is_done && (self.has_past || has_commit)
+        !self.is_done && self.has_checkpoint()
+    }
+
+    /// Whether the checkpoint stays at a clean end.
+    pub fn keeps_checkpoint(&self) -> bool {
+        self.keeps
+    }
+
+    fn has_checkpoint(&self) -> bool {
+        self.has_past || self.checkpoint.as_ref().is_some_and(Checkpoint::has_commit)
     }
 
     /// Whether pages may leave memory for a drive.
     pub fn spills(&self) -> bool {
-        self.spill.is_some()
+        self.spill.is_some() && !self.is_in_memory
     }
 
     /// Bytes that pages may take on the drive: what is free, and what those of a run that goes on have already; `None`
@@ -227,15 +260,21 @@ impl Tiers {
         Ok(spill.free_bytes()?.map(|free| free.saturating_add(taken)))
     }
 
-    /// Closes the spill directory, and removes it unless a run can go on from it; the pager is gone by now. Gives what
-    /// should be said about it.
+    /// Closes the checkpoint, and removes it unless a run can go on from it or it is to be kept; the pager is gone by now.
+    /// Gives what should be said about it.
     pub fn close(&mut self) -> Vec<String> {
-        let is_kept = self.can_resume();
-        self.checkpoint = None;
-        let Some(spill) = self.spill.take().filter(|_| !is_kept) else { return Vec::new() };
+        let is_kept = self.has_checkpoint() && (self.keeps || !self.is_done);
+        let made = self.checkpoint.take().and_then(Checkpoint::into_folder);
+        let Some(spill) = self.spill.take().or(made).filter(|_| !is_kept) else { return Vec::new() };
         let folder = spill.folder().to_path_buf();
         match spill.remove() {
-            Ok(foreign) if foreign.is_empty() => Vec::new(),
+            Ok(foreign) if foreign.is_empty() => {
+                if self.is_in_output {
+                    // An earlier life of the run made it. Only if it is empty.
+                    let _ = std::fs::remove_dir(&folder);
+                }
+                Vec::new()
+            }
             Ok(foreign) => vec![format!("{} is kept: {} are not ours", folder.display(), foreign.join(", "))],
             Err(error) => vec![format!("the spill directory could not be removed: {error}")],
         }

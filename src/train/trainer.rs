@@ -13,6 +13,7 @@ use super::report::{MetricsLog, StepLine, TestMetrics, TierTraffic, json_psnr};
 use super::signals::StopFlag;
 use super::step::{StepOutcome, WorkingSet, train_step};
 use crate::base::error::InputError;
+use crate::checkpoint::run_state::LastTest;
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
@@ -87,6 +88,8 @@ pub struct Trainer {
     pub(super) steps_skipped: u32,
     pub(super) steps_skipped_in_a_row: u32,
     pub(super) train_seconds: f64,
+    /// The last evaluation on the held-out views.
+    pub(super) last_test: Option<LastTest>,
 }
 
 /// Where a loop writes, and how it is watched.
@@ -153,6 +156,7 @@ impl Trainer {
             steps_skipped: 0,
             steps_skipped_in_a_row: 0,
             train_seconds: 0.0,
+            last_test: None,
         }
     }
 
@@ -316,7 +320,6 @@ impl Trainer {
         targets: &TargetCache,
         outputs: &mut LoopOutputs<'_>,
     ) -> Result<(), TrainError> {
-        let mut last_test: Option<TestMetrics> = None;
         while self.step < self.options.steps && outputs.stop.exit_code().is_none() {
             let step = self.step;
             let before = self.renderer.traffic();
@@ -325,11 +328,15 @@ impl Trainer {
             let is_last = self.step == self.options.steps;
             let due = |every: u32| step > 0 && step.is_multiple_of(every);
             let psnr = json_psnr(-10.0 * outcome.loss.mse.log10());
+            let mut test: Option<TestMetrics> = None;
             if due(self.options.eval_every) && !is_last {
-                last_test = self.evaluate(dataset, targets, None)?;
+                test = self.evaluate(dataset, targets, None)?;
             }
             if due(self.options.save_every) && !is_last {
                 self.save(dataset, &outputs.out.join(format!("point_cloud_{step:06}.ply")))?;
+                if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
+                    checkpoint.keep_next_as(format!("step-{step}"));
+                }
             }
             if due(self.options.log_every) || is_last || due(self.options.eval_every) {
                 outputs.metrics.write(&StepLine {
@@ -343,10 +350,10 @@ impl Trainer {
                     bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
                     device_bytes_peak: traffic.device_bytes_peak,
                     tiers: TierTraffic::of(&self.scene.pager),
-                    test: last_test.filter(|_| due(self.options.eval_every) && !is_last),
+                    test,
                 })?;
             }
-            let gaussians = self.scene.rows();
+            let (gaussians, last_test) = (self.scene.rows(), self.last_test);
             outputs.progress.step(self.step, || {
                 let test = last_test.map_or(String::new(), |t| format!(" test {:.2}", t.psnr));
                 let tiers = TierTraffic::of(&self.scene.pager).words();
@@ -360,7 +367,8 @@ impl Trainer {
             // A run that is done needs no commit to be of use, one that stops does.
             match self.step < self.options.steps {
                 true => checkpoint.commit(self, outputs.metrics)?,
-                false => checkpoint.commit_if_space(self, outputs.metrics)?,
+                false if checkpoint.wants_last() => checkpoint.commit_if_space(self, outputs.metrics)?,
+                false => {}
             }
         }
         outputs.progress.finish();
@@ -381,7 +389,10 @@ impl Trainer {
         let views = dataset.test_views();
         let request = EvalRequest { views: &views, ssim: self.options.ssim_variant, pictures, lpips: None };
         let now = (&mut self.scene, self.step, &mut self.working);
-        evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)
+        let test = evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)?;
+        let of = |t: TestMetrics| LastTest { step: self.step, views: t.views, psnr: t.psnr, ssim: t.ssim };
+        self.last_test = test.map(of).or(self.last_test);
+        Ok(test)
     }
 
     /// Writes the rows as of now as a PLY; returns what was written, in which coordinates.

@@ -1,0 +1,116 @@
+//! What is other than it was when a run goes on: its config, key by key, and its dataset.
+//!
+//! Three kinds of keys: those that change no number of the result may be given anew and are only said; those that do are
+//! refused unless the user accepts it; those that the stored pages are laid out by cannot change at all.
+
+use super::dataset_print::{DatasetChanges, dataset_changes};
+use crate::base::error::{InputError, InputResult};
+use crate::checkpoint::run_state::{DatasetPrint, RunState};
+use crate::config::file::TrainConfig;
+use crate::config::limits;
+use crate::dataset::loader::Dataset;
+use std::path::Path;
+
+/// Keys that change no number of the steps.
+const FREE_KEYS: &[&str] = &[
+    "image-cache",
+    "eval-every",
+    "save-every",
+    "log-every",
+    "log",
+    "ssim-variant",
+    "export-frame",
+    "host-mem",
+    "spill-dir",
+    "keep-checkpoint",
+    "frames",
+    "io",
+    "spill-codec",
+    "commit-every",
+    "evict",
+    "prefetch-bytes",
+    "threads",
+    "device",
+    "deterministic",
+    "device-mem",
+    // How far a run goes; what its rates follow is compared as schedule-steps.
+    "steps",
+];
+/// Keys by which stored pages are laid out.
+const LAYOUT_KEYS: &[&str] = &["page-rows", "sh-degree"];
+/// Compared as what follows from them.
+const DERIVED_KEYS: &[&str] = &["simd", "schedule-steps"];
+
+/// What is other than it was, a line each.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct Changes {
+    /// What changes no number.
+    pub free: Vec<String>,
+    /// What changes numbers.
+    pub numbers: Vec<String>,
+    /// What cannot change.
+    pub fixed: Vec<String>,
+}
+
+impl Changes {
+    /// The keys of `config` beside those of the last commit.
+    ///
+    /// # Errors
+    /// The config of the commit cannot be read.
+    pub fn of_config(file: &Path, state: &RunState, config: &TrainConfig) -> InputResult<Changes> {
+        let broken = |e: String| InputError::new(file, e, "start the run again");
+        let there: toml::Table = state.config.parse().map_err(|e: toml::de::Error| broken(e.to_string()))?;
+        let here = toml::Table::try_from(config).map_err(|e| broken(e.to_string()))?;
+        let mut changes = Changes::default();
+        let differs = |(key, now): &(&String, &toml::Value)| {
+            !DERIVED_KEYS.contains(&key.as_str()) && there.get(key.as_str()) != Some(*now)
+        };
+        for (key, now) in here.iter().filter(differs) {
+            let then = there.get(key).map_or_else(|| "not there".to_string(), toml::Value::to_string);
+            let lines = match key.as_str() {
+                key if FREE_KEYS.contains(&key) => &mut changes.free,
+                key if LAYOUT_KEYS.contains(&key) => &mut changes.fixed,
+                _ => &mut changes.numbers,
+            };
+            lines.push(format!("{key} was {then} and is {now}"));
+        }
+        let then = TrainConfig::parse(&state.config).map_err(broken)?;
+        let [was, is] = [&then, config].map(limits::schedule_steps);
+        if was != is {
+            changes.numbers.push(format!("schedule-steps was {was} and is {is}"));
+        }
+        let simd = limits::simd_path(config).name();
+        if simd != state.simd {
+            changes.numbers.push(format!("simd was {} and is {simd}", state.simd));
+        }
+        Ok(changes)
+    }
+
+    /// Adds what is other in the dataset.
+    pub fn add_dataset(&mut self, dataset: &Dataset, there: &DatasetPrint, here: &DatasetPrint) {
+        let DatasetChanges { lines, fixed } = dataset_changes(dataset, there, here);
+        self.numbers.extend(lines);
+        self.fixed.extend(fixed);
+    }
+
+    /// Refuses what a run cannot go on with, or not without `accept`.
+    ///
+    /// # Errors
+    /// There is such a change.
+    pub fn check(&self, place: &Path, accept: bool) -> InputResult<()> {
+        let list = |lines: &[String]| lines.iter().map(|line| format!("\n    {line}")).collect::<String>();
+        if !self.fixed.is_empty() {
+            let all = [self.fixed.as_slice(), &self.numbers].concat();
+            let problem = format!("the Gaussians of this run cannot follow what changed:{}", list(&all));
+            let remedy = "bring it back as it was, or start a new run from them: --init-ply with its point_cloud.ply";
+            return Err(InputError::new(place, problem, remedy));
+        }
+        if accept || self.numbers.is_empty() {
+            return Ok(());
+        }
+        let problem = format!("the run would go on with other numbers than it began with:{}", list(&self.numbers));
+        let remedy = "bring it back as it was, go on all the same with --accept-changes, or start a new run with another \
+                      --out";
+        Err(InputError::new(place, problem, remedy))
+    }
+}

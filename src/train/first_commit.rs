@@ -1,0 +1,79 @@
+//! The checkpoint of a run whose pages all stay in memory: made in its output folder by its first commit.
+//!
+//! From then on the run is one with a spill directory in which nothing is evicted: a commit writes the pages that changed
+//! since the last one, from the memory that they lie in. Invariant: a checkpoint that could not be made leaves nothing
+//! behind, and the pager as it was.
+
+use super::trainer::TrainError;
+use crate::config::file::TrainConfig;
+use crate::page::codec::Codec;
+use crate::page::commit::{CommitConfig, Commits};
+use crate::page::engine::{DEPTH, IoEngine, open_engine};
+use crate::page::folder::DriveFolder;
+use crate::page::paged_store::PagedStore;
+use crate::page::slots::SlotLayout;
+use crate::page::spill_dir::SpillDir;
+use crate::page::spill_format::Purpose;
+use crate::paging::pager::Pager;
+use crate::scene::page_layout::capacity_bytes;
+use std::path::{Path, PathBuf};
+
+/// Memory for the cache of the page map, bytes.
+pub(super) const MAP_CACHE_BYTES: usize = 8 << 20;
+
+/// Where the checkpoint of a run in memory is.
+pub(super) fn checkpoint_folder(out: &Path) -> PathBuf {
+    out.join("checkpoint")
+}
+
+/// What making a checkpoint takes.
+#[derive(Debug, Clone)]
+pub(super) struct FirstCommit {
+    folder: PathBuf,
+    io: IoEngine,
+    codec: Codec,
+    capacity_bytes: usize,
+}
+
+impl FirstCommit {
+    /// In the output folder of a run.
+    pub fn of(out: &Path, config: &TrainConfig) -> FirstCommit {
+        FirstCommit {
+            folder: checkpoint_folder(out),
+            io: config.io.parse().unwrap_or(IoEngine::Auto),
+            codec: codec(config),
+            capacity_bytes: capacity_bytes(config.page_rows as usize, config.sh_degree),
+        }
+    }
+
+    /// Makes it, and gives it to the pager.
+    pub fn make(self, pager: &mut Pager) -> Result<(SpillDir, Commits), TrainError> {
+        let layout = SlotLayout::new(self.capacity_bytes, pager.index().len() as u64);
+        // On a network file system too: it is where the user wants the results.
+        let spill = SpillDir::create(&self.folder, Purpose::Checkpoint, layout, true)?;
+        match self.make_in(&spill, layout) {
+            Ok((commits, store)) => {
+                pager.attach(store);
+                Ok((spill, commits))
+            }
+            Err(error) => {
+                spill.remove()?;
+                Err(error)
+            }
+        }
+    }
+
+    fn make_in(&self, spill: &SpillDir, layout: SlotLayout) -> Result<(Commits, PagedStore), TrainError> {
+        let engine = open_engine(self.io, &self.folder, DEPTH)?.store;
+        let config = CommitConfig { store: spill.format().store, cache_bytes: MAP_CACHE_BYTES, reserve_bytes: 0 };
+        let opened = Commits::create(Box::new(DriveFolder::new(&self.folder)), config)?;
+        let store = opened.paged_store(engine, layout, self.codec)?;
+        Ok((opened.commits, store))
+    }
+}
+
+/// As `--spill-codec` says; `auto` does not measure the drive, of which little is asked.
+pub(super) fn codec(config: &TrainConfig) -> Codec {
+    let auto = if config.moments == "bf16" { Codec::Halves } else { Codec::Raw };
+    config.spill_codec.parse().unwrap_or(auto)
+}

@@ -1,0 +1,82 @@
+//! What may change from life to life, and what may not without being accepted.
+
+use super::bench::{Bench, Place, SELDOM, copy_folder, ended, ply, refused, signal, succeeded};
+use super::scenes::{TextModel, stderr, text};
+use std::path::PathBuf;
+
+fn files(folder: PathBuf) -> Vec<(PathBuf, Vec<u8>)> {
+    let paths = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
+    let mut files: Vec<_> = paths.map(|p| (p.clone(), std::fs::read(p).unwrap())).collect();
+    files.sort();
+    files
+}
+
+#[test]
+fn what_changed_is_said_and_left_as_it_was() {
+    let bench = Bench::new();
+    let alone = bench.alone(&[]);
+    let out = bench.path("out");
+    let mut child = bench.begin(Place::Spill(alone.fewest), &SELDOM);
+    bench.wait_for_lines(&mut child, 2);
+    // In use: a second process is kept out, by this file or by the missing one of a run that has not committed.
+    let said = refused(bench.go_on(&[]));
+    assert!(said.contains("use"), "{said}");
+    signal(&child, "INT");
+    assert_eq!(ended(child).status.code(), Some(130));
+    // Every key that differs, and what it was.
+    let said = refused(bench.go_on(&["--means-lr", "0.001", "--seed", "3", "--threads", "1"]));
+    assert!(said.contains("\n    means-lr was 0.00016 and is 0.001"), "{said}");
+    assert!(said.contains("seed was 42 and is 3") && said.contains("--accept-changes"), "{said}");
+    assert!(!said.contains("threads"), "threads change nothing: {said}");
+    // What stored pages are laid out by cannot be accepted, nor fewer steps than were done.
+    let said = refused(bench.go_on(&["--page-rows", "64", "--accept-changes"]));
+    assert!(said.contains("page-rows was 32 and is 64") && said.contains("--init-ply"), "{said}");
+    let said = refused(bench.go_on(&["--steps", "3"]));
+    assert!(said.contains("fewer than"), "{said}");
+    // Poses, photos, points.
+    let model = files(bench.scene.join("sparse/0"));
+    let photos = files(bench.scene.join("images"));
+    let mut moved = TextModel::of(&bench.scene);
+    moved.views[3].tvec[0] += 0.01;
+    moved.colors[17][1] ^= 1;
+    moved.write(&bench.scene);
+    std::fs::write(&photos[5].0, &photos[6].1).unwrap();
+    let said = refused(bench.go_on(&[]));
+    assert!(said.contains("view 4 (") && said.contains("another name, set, size or pose"), "{said}");
+    assert!(said.contains("view 6 (") && said.contains("another photo or mask"), "{said}");
+    assert!(said.contains("points") && said.contains("are others"), "{said}");
+    std::fs::write(&photos[5].0, &photos[5].1).unwrap();
+    std::fs::remove_dir_all(bench.scene.join("sparse/0")).unwrap();
+    std::fs::create_dir(bench.scene.join("sparse/0")).unwrap();
+    model.iter().for_each(|(path, bytes)| std::fs::write(path, bytes).unwrap());
+    // After all of that it still goes on, and says what it is given anew.
+    let child = super::scenes::train(&["--resume", text(&out), "--threads", "1", "--evict", "lru"]);
+    let said = stderr(&child);
+    assert!(child.status.success(), "{said}");
+    let line = said.lines().find(|l| l.starts_with("resume")).unwrap();
+    assert!(line.contains("threads was 0 and is 1") && line.contains("evict was"), "{line}");
+    assert!(ply(&out) == alone.ply, "the scene is another");
+}
+
+/// Accepted changes hold from the step on at which the run stopped, whatever is in memory then, and for later lives.
+#[test]
+fn accepted_changes_are_the_same_in_any_memory() {
+    let bench = Bench::new();
+    let alone = bench.alone(&[]);
+    bench.stopped(Place::Memory, 12);
+    copy_folder(&bench.path("out"), &bench.path("twin"));
+    let other = ["--means-lr", "0.002", "--opacities-lr", "0.01", "--accept-changes"];
+    let said = succeeded(bench.go_on(&other));
+    assert!(said.contains("accepted from step") && said.contains("means-lr was 0.00016 and is 0.002"), "{said}");
+    // The twin has fewer frames (the largest view may grow by the change), and is stopped once more.
+    let frames = ((alone.fewest + alone.pages) / 2).to_string();
+    let mut child = bench.go_on_in("twin", &[&other[..], &["--frames", &frames], &SELDOM[..]].concat());
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    signal(&child, "INT");
+    let stopped = child.wait().unwrap();
+    assert!(stopped.code() == Some(130) || stopped.success(), "{stopped:?}");
+    succeeded(bench.go_on_in("twin", &["--frames", &frames]));
+    let (first, second) = (ply(&bench.path("out")), ply(&bench.path("twin")));
+    assert!(first == second, "the same changes gave two scenes");
+    assert!(first != alone.ply, "the change changed nothing");
+}
