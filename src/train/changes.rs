@@ -9,6 +9,7 @@ use crate::checkpoint::run_state::{DatasetPrint, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits;
 use crate::dataset::loader::Dataset;
+use serde::Deserialize;
 use std::path::Path;
 
 /// Keys that change no number of the steps.
@@ -36,10 +37,27 @@ const FREE_KEYS: &[&str] = &[
     // How far a run goes; what its rates follow is compared as schedule-steps.
     "steps",
 ];
+/// Of these, keys that hold for all later lives of a run too, not for this one alone.
+const LASTING_KEYS: &[&str] = &["steps", "keep-checkpoint"];
 /// Keys by which stored pages are laid out.
 const LAYOUT_KEYS: &[&str] = &["page-rows", "sh-degree"];
 /// Compared as what follows from them.
 const DERIVED_KEYS: &[&str] = &["simd", "schedule-steps"];
+
+/// The config that a run keeps when it goes on with `config`: that of its file, with what changes numbers and how far it
+/// goes as they are now.
+///
+/// # Errors
+/// None that a config can cause.
+pub(super) fn kept_config(file: &Path, of_file: &TrainConfig, config: &TrainConfig) -> InputResult<TrainConfig> {
+    let broken = |e: String| InputError::new(file, e, "report this as a bug");
+    let table = |config: &TrainConfig| toml::Table::try_from(config).map_err(|e| broken(e.to_string()));
+    let (of_file, mut kept) = (table(of_file)?, table(config)?);
+    for key in FREE_KEYS.iter().filter(|key| !LASTING_KEYS.contains(key)) {
+        kept.extend(of_file.get(*key).map(|value| (key.to_string(), value.clone())));
+    }
+    TrainConfig::deserialize(kept).map_err(|e| broken(e.to_string()))
+}
 
 /// What is other than it was, a line each.
 #[derive(Debug, Default, PartialEq)]
@@ -112,5 +130,24 @@ impl Changes {
         let remedy = "bring it back as it was, go on all the same with --accept-changes, or start a new run with another \
                       --out";
         Err(InputError::new(place, problem, remedy))
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::config::file::KEYS;
+
+    #[test]
+    fn the_lists_name_keys_and_what_lasts_is_kept() {
+        let keys: Vec<String> = KEYS.iter().map(|(_, name, _)| name.replace('_', "-")).collect();
+        let named = [FREE_KEYS, LASTING_KEYS, LAYOUT_KEYS, DERIVED_KEYS].concat();
+        let unknown: Vec<&&str> = named.iter().filter(|name| !keys.iter().any(|key| key == **name)).collect();
+        assert!(unknown.is_empty(), "{unknown:?}");
+        let of_file = TrainConfig { threads: 3, frames: 7, seed: 1, ..TrainConfig::default() };
+        let now = TrainConfig { threads: 1, steps: 9, seed: 2, keep_checkpoint: true, ..TrainConfig::default() };
+        let kept = kept_config(Path::new("config.toml"), &of_file, &now).unwrap();
+        assert_eq!(kept, TrainConfig { threads: 3, frames: 7, ..now });
     }
 }

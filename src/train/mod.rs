@@ -13,6 +13,7 @@ pub mod eval;
 mod first_commit;
 pub mod machine;
 pub mod memory;
+pub mod out_folder;
 pub mod page_map;
 pub mod pages;
 pub mod preflight;

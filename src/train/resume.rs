@@ -5,7 +5,7 @@
 //! every page is brought to the step of the change as it was trained, once, and goes on from there by the new rules; 3. a
 //! refused resume leaves everything as it was.
 
-use super::changes::Changes;
+use super::changes::{Changes, kept_config};
 use super::dataset_print::dataset_print;
 use super::first_commit::checkpoint_folder;
 use super::machine;
@@ -82,7 +82,7 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     };
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
     trainer.restore_counts(&state);
-    let kept = kept_config(of_file, &config);
+    let kept = kept_config(&file, &of_file, &config)?;
     let past = Past { config: kept, metrics_bytes: state.metrics_bytes, step: state.step, has_changed };
     let begun = Begun { print, sh_degree_start: state.sh_degree_start, past: Some(past), host_mem, driver };
     let (out, quiet) = (request.out.clone(), request.quiet);
@@ -116,34 +116,6 @@ fn check_steps(config: &TrainConfig, state: &RunState) -> InputResult<()> {
     Err(InputError::new("--steps", problem, "give more, or roll the run back with gsscale-ckpt"))
 }
 
-/// The config that a run keeps: that of its file, with what changes numbers and the number of steps as they are now.
-/// What changes none holds for this life of the run alone.
-fn kept_config(of_file: TrainConfig, config: &TrainConfig) -> TrainConfig {
-    let of = of_file;
-    TrainConfig {
-        image_cache: of.image_cache,
-        eval_every: of.eval_every,
-        save_every: of.save_every,
-        log_every: of.log_every,
-        log: of.log,
-        ssim_variant: of.ssim_variant,
-        export_frame: of.export_frame,
-        host_mem: of.host_mem,
-        spill_dir: of.spill_dir,
-        frames: of.frames,
-        io: of.io,
-        spill_codec: of.spill_codec,
-        commit_every: of.commit_every,
-        evict: of.evict,
-        prefetch_bytes: of.prefetch_bytes,
-        threads: of.threads,
-        device: of.device,
-        deterministic: of.deterministic,
-        device_mem: of.device_mem,
-        ..config.clone()
-    }
-}
-
 /// Says that a run goes on, and what is other than it was.
 fn say(request: &ResumeRequest, state: &RunState, config: &TrainConfig, changes: &Changes, renderer: &dyn Renderer) {
     if renderer.device() != state.device {
@@ -151,6 +123,9 @@ fn say(request: &ResumeRequest, state: &RunState, config: &TrainConfig, changes:
         eprintln!("warning: the run was rendered by {there}, and is by {here} from here on: other roundings");
     }
     changes.numbers.iter().for_each(|line| eprintln!("warning: accepted from step {} on: {line}", state.step));
+    if !changes.numbers.is_empty() {
+        eprintln!("warning: every page is brought to that step as it was trained, and rewritten, once");
+    }
     if request.quiet {
         return;
     }

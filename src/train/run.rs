@@ -6,9 +6,9 @@
 use super::checkpoint::Origin;
 use super::dataset_print::dataset_print;
 use super::eval::ply_warnings;
-use super::first_commit::checkpoint_folder;
 use super::machine;
 use super::memory::{estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
+use super::out_folder;
 use super::page_map::write_page_map;
 use super::preflight;
 use super::progress::Progress;
@@ -26,9 +26,8 @@ use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
-use crate::page::spill_dir::SpillDir;
 use crate::render::Renderer;
-use crate::report::run_report::{PAGES_FILE, REPORT_FILE, write_run_report};
+use crate::report::run_report::{PAGES_FILE, write_run_report};
 use crate::scene::columns::{Columns, sh_n_width};
 use crate::scene::init::{gaussians_from_points, random_points_in_frusta};
 use crate::scene::partition::first_fill;
@@ -195,7 +194,9 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
     config.check()?;
     machine::set_up(config)?;
-    check_out(request)?;
+    if !request.dry_run && !request.overwrite {
+        out_folder::check_new(&request.out)?;
+    }
     let host_mem = host_budget(config);
     let start = Start::read(&request.scene, config, host_mem)?;
     let sh_degree_start = start.sh_degree_start;
@@ -255,7 +256,7 @@ pub(super) fn see_through(
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     if begun.past.is_none() {
-        make_out(&request.out, request.overwrite)?;
+        out_folder::make(&request.out, request.overwrite)?;
     }
     let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun);
     if tiers.can_resume() {
@@ -371,81 +372,6 @@ fn train_into(
     Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
 }
 
-fn check_out(request: &RunRequest) -> InputResult<()> {
-    if request.dry_run || request.overwrite || !request.out.exists() {
-        return Ok(());
-    }
-    let is_empty_folder = std::fs::read_dir(&request.out).is_ok_and(|mut entries| entries.next().is_none());
-    if is_empty_folder {
-        return Ok(());
-    }
-    Err(InputError::new(&request.out, "exists already", remedy_of_existing(&request.out)))
-}
-
-/// What to do about an output folder that is there already: go on with the run in it, or start over.
-pub fn remedy_of_existing(out: &Path) -> String {
-    let start_over = "choose another --out, or replace it with --overwrite";
-    let Ok(config) = TrainConfig::read(&out.join("config.toml")) else { return start_over.to_string() };
-    let spill = Path::new(&config.spill_dir);
-    let in_memory = config.spill_dir.is_empty();
-    let checkpoint = if in_memory { checkpoint_folder(out) } else { spill.to_path_buf() };
-    if !SpillDir::is_one(&checkpoint) {
-        return start_over.to_string();
-    }
-    let over = match in_memory {
-        true => "--overwrite".to_string(),
-        false => format!("--overwrite after removing {}", spill.display()),
-    };
-    format!(
-        "it holds a run that can go on: gsscale-train --resume {}; or choose another --out, or start over with {over}",
-        out.display()
-    )
-}
-
-/// Makes the folder, proves that it can be written, and removes what an earlier run left there under our names.
-fn make_out(out: &Path, overwrite: bool) -> InputResult<()> {
-    let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
-    std::fs::create_dir_all(out).map_err(io)?;
-    let probe = out.join(".gsscale-probe");
-    std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(io)?;
-    // Without a run's config the files under our names are somebody else's (the points of a scene, say).
-    if !overwrite || !out.join("config.toml").is_file() {
-        return Ok(());
-    }
-    for name in ["config.toml", "metrics.jsonl", "summary.json", "point_cloud.ply", REPORT_FILE, PAGES_FILE] {
-        let path = out.join(name);
-        if path.is_file() {
-            std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
-        }
-    }
-    remove_saved(out)?;
-    let checkpoint = checkpoint_folder(out);
-    if SpillDir::is_one(&checkpoint) {
-        SpillDir::open(&checkpoint, true)?.remove()?;
-        // Only if nothing else is in it.
-        let _ = std::fs::remove_dir(&checkpoint);
-    }
-    let pictures = out.join("renders/test");
-    if pictures.is_dir() {
-        let io = |e: std::io::Error| InputError::io(&pictures, "removing the earlier run's pictures", &e);
-        std::fs::remove_dir_all(&pictures).map_err(io)?;
-    }
-    Ok(())
-}
-
-/// Removes what `--save-every` of an earlier run left: point_cloud_<step>.ply.
-fn remove_saved(out: &Path) -> InputResult<()> {
-    let entries = std::fs::read_dir(out).map_err(|e| InputError::io(out, "listing the folder", &e))?;
-    for path in entries.flatten().map(|entry| entry.path()) {
-        let name = path.file_name().and_then(|n| n.to_str()).unwrap_or("");
-        let step = name.strip_prefix("point_cloud_").and_then(|rest| rest.strip_suffix(".ply"));
-        if step.is_some_and(|s| s.len() >= 6 && s.bytes().all(|b| b.is_ascii_digit())) {
-            std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
-        }
-    }
-    Ok(())
-}
-
 fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer) -> Resolved {
     Resolved {
         version: env!("CARGO_PKG_VERSION").to_string(),
@@ -476,10 +402,16 @@ fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, tiers: &
         true => String::new(),
         false => format!(", results in {}", request.out.display()),
     };
+    let commits = match (config.spill_dir.as_str(), config.frames) {
+        ("", 0) => "to checkpoint/ in the results (see --commit-every)",
+        ("", _) => "nowhere: --frames without --spill-dir is for comparisons",
+        _ => "to the spill directory (see --commit-every)",
+    };
     let text = format!(
         "scene   {}: {} views to train on, {} held out, at most {size}\n\
          start   {} Gaussians, SH degree {}{growth}\n\
          run     {} steps on {} threads ({}), rendered by {}{results}\n\
+         commit  {commits}\n\
          {tiers}",
         request.scene.display(),
         dataset.train_views().len(),

@@ -1,0 +1,89 @@
+//! The output folder of a run that begins: refused where a run is in it already, made, and cleared of an earlier run when
+//! the user says so.
+//!
+//! Invariants: 1. nothing is removed but files under this program's names beside a run's config, and a checkpoint that
+//! tells itself as one; 2. a run that could go on is named with the command that does so.
+
+use super::first_commit::checkpoint_folder;
+use crate::base::error::{InputError, InputResult};
+use crate::config::file::TrainConfig;
+use crate::page::spill_dir::SpillDir;
+use crate::report::run_report::{PAGES_FILE, REPORT_FILE};
+use std::path::Path;
+
+/// Refuses a folder that has something in it, and says what to do about it.
+pub(super) fn check_new(out: &Path) -> InputResult<()> {
+    if !out.exists() {
+        return Ok(());
+    }
+    let is_empty_folder = std::fs::read_dir(out).is_ok_and(|mut entries| entries.next().is_none());
+    if is_empty_folder {
+        return Ok(());
+    }
+    Err(InputError::new(out, "exists already", remedy_of_existing(out)))
+}
+
+/// What to do about an output folder that is there already: go on with the run in it, or start over.
+pub fn remedy_of_existing(out: &Path) -> String {
+    let start_over = "choose another --out, or replace it with --overwrite";
+    let Ok(config) = TrainConfig::read(&out.join("config.toml")) else { return start_over.to_string() };
+    let spill = Path::new(&config.spill_dir);
+    let in_memory = config.spill_dir.is_empty();
+    let checkpoint = if in_memory { checkpoint_folder(out) } else { spill.to_path_buf() };
+    if !SpillDir::is_one(&checkpoint) {
+        return start_over.to_string();
+    }
+    let over = match in_memory {
+        true => "--overwrite".to_string(),
+        false => format!("--overwrite after removing {}", spill.display()),
+    };
+    format!(
+        "it holds a run that can go on: gsscale-train --resume {}; or choose another --out, or start over with {over}",
+        out.display()
+    )
+}
+
+/// Makes the folder, proves that it can be written, and removes what an earlier run left there under our names.
+pub(super) fn make(out: &Path, overwrite: bool) -> InputResult<()> {
+    let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
+    std::fs::create_dir_all(out).map_err(io)?;
+    let probe = out.join(".gsscale-probe");
+    std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(io)?;
+    // Without a run's config the files under our names are somebody else's (the points of a scene, say).
+    if !overwrite || !out.join("config.toml").is_file() {
+        return Ok(());
+    }
+    // First, because a run that is still at work in it ends this one here.
+    let checkpoint = checkpoint_folder(out);
+    if SpillDir::is_one(&checkpoint) {
+        SpillDir::open(&checkpoint, true)?.remove()?;
+        // Only if nothing else is in it.
+        let _ = std::fs::remove_dir(&checkpoint);
+    }
+    for name in ["config.toml", "metrics.jsonl", "summary.json", "point_cloud.ply", REPORT_FILE, PAGES_FILE] {
+        let path = out.join(name);
+        if path.is_file() {
+            std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
+        }
+    }
+    remove_saved(out)?;
+    let pictures = out.join("renders/test");
+    if pictures.is_dir() {
+        let io = |e: std::io::Error| InputError::io(&pictures, "removing the earlier run's pictures", &e);
+        std::fs::remove_dir_all(&pictures).map_err(io)?;
+    }
+    Ok(())
+}
+
+/// Removes what `--save-every` of an earlier run left: point_cloud_<step>.ply.
+fn remove_saved(out: &Path) -> InputResult<()> {
+    let entries = std::fs::read_dir(out).map_err(|e| InputError::io(out, "listing the folder", &e))?;
+    for path in entries.flatten().map(|entry| entry.path()) {
+        let name = path.file_name().and_then(|n| n.to_str()).unwrap_or("");
+        let step = name.strip_prefix("point_cloud_").and_then(|rest| rest.strip_suffix(".ply"));
+        if step.is_some_and(|s| s.len() >= 6 && s.bytes().all(|b| b.is_ascii_digit())) {
+            std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
+        }
+    }
+    Ok(())
+}
