@@ -1,31 +1,65 @@
-//! When a run is committed, and what a commit holds of it.
+//! The commits of a run: when they are made, and what they hold of it.
+//!
+//! A commit that time asks for is made beside training: a cut between two steps, its pages written during the steps that
+//! follow ([`crate::paging`]), then the transaction. One that must be there before anything else happens (a stop, the
+//! end, a drive without space) is made at once.
 //!
 //! Invariants: 1. commits happen between steps and change nothing of the run; 2. what is committed is all that later
-//! steps depend on: a run that goes on from it ends with the same bytes; 3. a full drive ends no run at a commit that
-//! only time asked for.
+//! steps depend on: a run that goes on from it ends with the same bytes; 3. clocks decide when a commit is made, and
+//! nothing else.
 
 use super::report::MetricsLog;
 use super::trainer::{TrainError, Trainer};
 use crate::base::error::InputError;
+use crate::checkpoint::interval::{CommitCost, CommitInterval, CommitReport};
 use crate::checkpoint::run_state::{DatasetPrint, RunState};
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::dataset::model::Split;
 use crate::page::commit::{CommitError, Commits};
 use crate::page::format::checksum;
+use crate::paging::stats::SlotSpace;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
+
+/// A commit is made at once where its pages are not written after this time beside training.
+const BESIDE_SECONDS: f64 = 20.0;
+/// Fewer free slots than one in so many are few.
+const FEW_FREE: u64 = 10;
+/// A commit before its time must make at least one slot in so many free.
+const WORTH_FREEING: u64 = 20;
 
 /// The commits of a run.
 #[derive(Debug)]
 pub struct Checkpoint {
-    commits: Commits,
-    every: Option<Duration>,
+    pub(super) commits: Commits,
+    pub(super) folder: PathBuf,
+    /// How long to wait for space.
+    pub(super) full_wait: Duration,
+    /// Step at which space was last made, and when; a second time at the same step it must come from elsewhere.
+    pub(super) space_made: Option<(u32, Instant)>,
+    interval: CommitInterval,
+    started: Instant,
+    /// When the last commit was durable, and its cut.
     last: Instant,
+    last_cut: Instant,
+    beside: Option<Beside>,
     /// What does not change: see [`Checkpoint::set_origin`].
     origin: Option<Origin>,
     done: u64,
-    /// A commit found no space, and the user knows.
-    said_full: bool,
+    /// Step of the last commit.
+    last_step: Option<u32>,
+}
+
+/// A commit that is made beside training.
+#[derive(Debug)]
+struct Beside {
+    run_state: Vec<u8>,
+    step: u32,
+    cut: Instant,
+    waited: Duration,
+    /// The pager's seconds for it, before it.
+    pager_seconds: f64,
 }
 
 /// What a run was started with, as its run state has it.
@@ -42,22 +76,29 @@ pub struct Origin {
 }
 
 impl Checkpoint {
-    /// Commits as often as the config says, the first one after that time.
-    pub fn new(commits: Commits, config: &TrainConfig) -> Checkpoint {
-        let every =
-            (config.commit_every > 0.0).then(|| Duration::try_from_secs_f64(config.commit_every).ok()).flatten();
-        Checkpoint { commits, every, last: Instant::now(), origin: None, done: 0, said_full: false }
+    /// Commits to the store in `folder` as often as the config says, the first one after that time.
+    pub fn new(commits: Commits, folder: &Path, config: &TrainConfig) -> Checkpoint {
+        let now = Instant::now();
+        Checkpoint {
+            commits,
+            folder: folder.to_path_buf(),
+            full_wait: Duration::try_from_secs_f64(config.disk_full_wait).unwrap_or_default(),
+            space_made: None,
+            interval: CommitInterval::new(config.commit_every),
+            started: now,
+            last: now,
+            last_cut: now,
+            beside: None,
+            origin: None,
+            done: 0,
+            last_step: None,
+        }
     }
 
     /// What the run was started with; before the first commit.
     pub fn set_origin(&mut self, origin: Origin) {
         self.origin = Some(origin);
-        self.last = Instant::now();
-    }
-
-    /// Whether the time from one commit to the next is over.
-    pub fn is_due(&self) -> bool {
-        self.every.is_some_and(|every| self.last.elapsed() >= every)
+        (self.started, self.last, self.last_cut) = (Instant::now(), Instant::now(), Instant::now());
     }
 
     /// Whether something was committed since the store was opened.
@@ -65,43 +106,106 @@ impl Checkpoint {
         self.done > 0
     }
 
-    /// Commits the run as it is now.
+    /// Step of the last commit since the store was opened.
+    pub fn last_step(&self) -> Option<u32> {
+        self.last_step
+    }
+
+    /// What commits have cost so far.
+    pub fn report(&self) -> CommitReport {
+        self.interval.report(self.started.elapsed().as_secs_f64())
+    }
+
+    /// Between two steps: begins a commit if one is due, and ends one whose pages are written.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::commit`].
+    pub fn between_steps(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
+        if !trainer.scene.pager.is_frozen() {
+            // A failed write gave it up; the next step gets the error.
+            self.beside = None;
+        }
+        match &self.beside {
+            None if self.interval.is_due(self.last.elapsed().as_secs_f64()) => self.begin(trainer, metrics),
+            None if self.space_is_short(trainer) => self.commit(trainer, metrics),
+            Some(beside) if trainer.scene.pager.is_frozen_written() || is_late(beside) => self.finish(trainer),
+            _ => Ok(()),
+        }
+    }
+
+    fn begin(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
+        let Some(origin) = &self.origin else { return Ok(()) };
+        let cut = Instant::now();
+        let pager_seconds = trainer.scene.pager.stats().commit_seconds;
+        let state = trainer.run_state(origin, metrics.sync()?);
+        let run_state = bytes_of(&state)?;
+        trainer.scene.pager.freeze()?;
+        self.beside = Some(Beside { run_state, step: state.step, cut, waited: cut.elapsed(), pager_seconds });
+        // In memory, or with nothing to write, there is nothing to wait for.
+        if trainer.scene.pager.is_frozen_written() { self.finish(trainer) } else { Ok(()) }
+    }
+
+    fn finish(&mut self, trainer: &mut Trainer) -> Result<(), TrainError> {
+        let Some(beside) = self.beside.take() else { return Ok(()) };
+        let began = Instant::now();
+        let pager = &mut trainer.scene.pager;
+        pager.finish_frozen()?;
+        let note = format!("step {}", beside.step);
+        let Some((_, bytes)) = pager.commit_frozen(&mut self.commits, &beside.run_state, note.as_bytes())? else {
+            return Ok(());
+        };
+        let beside_steps = pager.stats().commit_seconds - beside.pager_seconds;
+        let waited = (beside.waited + began.elapsed()).as_secs_f64() + beside_steps;
+        self.acknowledged(beside.step, beside.cut, waited, bytes);
+        Ok(())
+    }
+
+    /// Commits the run as it is now, at once. A commit beside training that has not ended is given up for it.
     ///
     /// # Errors
     /// Nothing was committed; what was committed before still is.
     pub fn commit(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         let Some(origin) = &self.origin else { return Ok(()) };
+        let cut = Instant::now();
+        self.beside = None;
+        let written = trainer.scene.pager.stats().bytes_written;
         trainer.scene.pager.flush()?;
         let state = trainer.run_state(origin, metrics.sync()?);
-        let bytes = state.to_bytes().map_err(|e| CommitError::Contradiction(e.to_string()))?;
         let note = format!("step {}", state.step);
-        trainer.scene.pager.commit(&mut self.commits, &bytes, note.as_bytes())?;
-        self.done += 1;
-        self.last = Instant::now();
+        trainer.scene.pager.commit(&mut self.commits, &bytes_of(&state)?, note.as_bytes())?;
+        let bytes = trainer.scene.pager.stats().bytes_written - written;
+        self.acknowledged(state.step, cut, cut.elapsed().as_secs_f64(), bytes);
         Ok(())
     }
 
-    /// As [`Checkpoint::commit`]; where only space is missing, says so and lets the run go on.
-    ///
-    /// # Errors
-    /// As [`Checkpoint::commit`], but for space.
-    pub fn commit_if_space(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
-        let is_space = |error: &TrainError| match error {
-            TrainError::Commit(error) => error.is_out_of_space(),
-            TrainError::Paging(error) => error.is_out_of_space(),
-            _ => false,
-        };
-        match self.commit(trainer, metrics) {
-            Err(error) if is_space(&error) => {
-                if !std::mem::replace(&mut self.said_full, true) {
-                    eprintln!("warning: nothing can be committed: {error}");
-                }
-                self.last = Instant::now();
-                Ok(())
-            }
-            done => done,
-        }
+    fn acknowledged(&mut self, step: u32, cut: Instant, waited: f64, bytes: u64) {
+        self.done += 1;
+        self.last_step = Some(step);
+        let until_durable = cut.elapsed().as_secs_f64();
+        let at_risk = self.last_cut.elapsed().as_secs_f64();
+        self.interval.add(CommitCost { waited, until_durable, bytes, at_risk });
+        (self.last, self.last_cut) = (Instant::now(), cut);
     }
+
+    /// Whether few slots are free, no more can be made, and a commit would make some free.
+    fn space_is_short(&self, trainer: &Trainer) -> bool {
+        let Some(SlotSpace { total, free, retired, segment_bytes }) = trainer.scene.pager.slot_space() else {
+            return false;
+        };
+        if free * FEW_FREE >= total || retired * WORTH_FREEING < total {
+            return false;
+        }
+        let left = crate::page::file_system::free_bytes(&self.folder).ok().flatten();
+        left.is_some_and(|left| left < segment_bytes)
+    }
+}
+
+fn is_late(beside: &Beside) -> bool {
+    beside.cut.elapsed().as_secs_f64() >= BESIDE_SECONDS
+}
+
+fn bytes_of(state: &RunState) -> Result<Vec<u8>, CommitError> {
+    state.to_bytes().map_err(|e| CommitError::Contradiction(e.to_string()))
 }
 
 impl Trainer {

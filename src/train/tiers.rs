@@ -36,6 +36,10 @@ pub const PLAN_BYTES: usize = 16 << 20;
 /// Memory for the cache of the page map, bytes.
 const MAP_CACHE_BYTES: usize = 8 << 20;
 
+/// Space set aside for a last commit on a full drive: room for a segment, at least for the map to grow, bytes.
+const RESERVE_BYTES_LEAST: u64 = 2 << 20;
+const RESERVE_BYTES_MOST: u64 = 256 << 20;
+
 /// The tiers of a run.
 #[derive(Debug, Default)]
 pub struct Tiers {
@@ -128,7 +132,9 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let (engine, codec) = tiers.take_spill(spill, config)?;
     let opened = Commits::create(Box::new(folder), of_commits)?;
     let store = opened.paged_store(engine, layout, codec)?;
-    tiers.checkpoint = Some(Checkpoint::new(opened.commits, config));
+    let mut checkpoint = Checkpoint::new(opened.commits, Path::new(&config.spill_dir), config);
+    checkpoint.fill_reserve()?;
+    tiers.checkpoint = Some(checkpoint);
     Ok((Pager::new(pager, store), tiers))
 }
 
@@ -182,13 +188,16 @@ impl Stored {
         let (engine, codec) = tiers.take_spill(spill, config)?;
         let store = opened.paged_store(engine, layout, codec)?;
         let pager = Pager::open(pager, store, &opened.pages, run_state.events.len())?;
-        tiers.checkpoint = Some(Checkpoint::new(opened.commits, config));
+        let mut checkpoint = Checkpoint::new(opened.commits, Path::new(&config.spill_dir), config);
+        checkpoint.fill_reserve()?;
+        tiers.checkpoint = Some(checkpoint);
         Ok((pager, tiers))
     }
 }
 
 fn commit_config(spill: &SpillDir) -> CommitConfig {
-    CommitConfig { store: spill.format().store, cache_bytes: MAP_CACHE_BYTES, reserve_bytes: 0 }
+    let reserve_bytes = spill.format().layout.segment_bytes().clamp(RESERVE_BYTES_LEAST, RESERVE_BYTES_MOST);
+    CommitConfig { store: spill.format().store, cache_bytes: MAP_CACHE_BYTES, reserve_bytes }
 }
 
 impl Tiers {
