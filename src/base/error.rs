@@ -17,6 +17,8 @@ pub struct InputError {
     pub problem: String,
     /// What the user can do about it.
     pub remedy: String,
+    /// The kind of the system call's error that is behind it, if one is.
+    pub kind: Option<std::io::ErrorKind>,
 }
 
 /// Result of everything that reads what a user gave.
@@ -30,7 +32,14 @@ impl InputError {
             place: String::new(),
             problem: problem.into(),
             remedy: remedy.into(),
+            kind: None,
         }
+    }
+
+    /// Whether it is only space on a drive that is missing.
+    pub fn is_out_of_space(&self) -> bool {
+        use std::io::ErrorKind as K;
+        matches!(self.kind, Some(K::StorageFull | K::QuotaExceeded | K::FileTooLarge))
     }
 
     /// The same error with its place inside the file.
@@ -52,7 +61,7 @@ impl InputError {
             K::UnexpectedEof => "the file is cut short: copy or write it again",
             _ => "check the disk and the path, then try again",
         };
-        InputError::new(file, format!("{doing} failed: {source}"), remedy)
+        InputError { kind: Some(source.kind()), ..InputError::new(file, format!("{doing} failed: {source}"), remedy) }
     }
 }
 

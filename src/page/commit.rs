@@ -201,8 +201,33 @@ impl Commits {
         done: &mut Vec<PageDone>,
         cut: &Cut<'_>,
     ) -> Result<u64, CommitError> {
+        self.commit_generation(store, done, None, cut)
+    }
+
+    /// As [`Commits::commit`], of a generation that was [cut](PagedStore::cut) before, and whose pages were written for it
+    /// since.
+    ///
+    /// # Errors
+    /// As [`Commits::commit`].
+    pub fn commit_cut(
+        &mut self,
+        store: &mut PagedStore,
+        done: &mut Vec<PageDone>,
+        generation: u64,
+        cut: &Cut<'_>,
+    ) -> Result<u64, CommitError> {
+        self.commit_generation(store, done, Some(generation), cut)
+    }
+
+    fn commit_generation(
+        &mut self,
+        store: &mut PagedStore,
+        done: &mut Vec<PageDone>,
+        generation: Option<u64>,
+        cut: &Cut<'_>,
+    ) -> Result<u64, CommitError> {
         self.refuse_if_poisoned()?;
-        let result = self.commit_steps(store, done, cut);
+        let result = self.commit_steps(store, done, generation, cut);
         if let Err(error) = &result {
             self.poison_unless_full(store, error);
         }
@@ -213,6 +238,7 @@ impl Commits {
         &mut self,
         store: &mut PagedStore,
         done: &mut Vec<PageDone>,
+        generation: Option<u64>,
         cut: &Cut<'_>,
     ) -> Result<u64, CommitError> {
         if !active(Mutant::SegmentsNotSynced) && !active(Mutant::SegmentsSyncedAfterMap) {
@@ -225,7 +251,7 @@ impl Commits {
             }
         }
         self.ensure_open()?;
-        let generation = store.cut();
+        let generation = generation.unwrap_or_else(|| store.cut());
         let put = cut.changes.iter().map(|c| (c.page, c.version.as_ref().map(|(slot, label)| value_of(slot, label))));
         let texts = (cut.note.to_vec(), cut.run_state.to_vec());
         let batch = self.generations.plan_commit(generation, put.collect(), texts, cut.pin);

@@ -4,6 +4,7 @@
 pub mod buffer;
 pub mod codec;
 pub mod commit;
+mod cut;
 pub mod drive_rate;
 pub mod encoding;
 pub mod engine;

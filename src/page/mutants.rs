@@ -62,6 +62,8 @@ pub enum Mutant {
     WitnessInOneSlot,
     /// The transaction of the map is not durable when it returns.
     MapNotDurable,
+    /// What is written after a cut for the generation that was cut counts as the next one's.
+    CutForgotten,
     /// Generation numbers start again after a rollback.
     GenerationsReused,
 }

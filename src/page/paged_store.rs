@@ -69,8 +69,8 @@ struct Unencoded {
 /// Pages in slots. One owner.
 pub struct PagedStore {
     engine: Box<dyn PageStore>,
-    config: PagedStoreConfig,
-    slots: Slots,
+    pub(super) config: PagedStoreConfig,
+    pub(super) slots: Slots,
     pending: BTreeMap<u64, Pending>,
     next_transfer: u64,
     unencoded: Vec<Unencoded>,
@@ -191,8 +191,26 @@ impl PagedStore {
         payload_bytes: usize,
         buffer: PageBuffer,
     ) -> Result<(), (PageError, PageBuffer)> {
+        self.write_for(self.config.generation, token, page, label, payload_bytes, buffer)
+    }
+
+    /// As [`PagedStore::write`], for a generation: the present one, or the last that was [cut](PagedStore::cut) and is
+    /// not committed yet.
+    ///
+    /// # Errors
+    /// As [`PagedStore::write`].
+    pub fn write_for(
+        &mut self,
+        generation: u64,
+        token: u64,
+        page: PageId,
+        label: &[u8],
+        payload_bytes: usize,
+        buffer: PageBuffer,
+    ) -> Result<(), (PageError, PageBuffer)> {
+        let generation = if active(Mutant::CutForgotten) { self.config.generation } else { generation };
         let slot = match self.take_slot(page, label, payload_bytes, &buffer) {
-            Ok(slot) => slot,
+            Ok(slot) => SlotRef { generation, ..slot },
             Err(error) => return Err((error, buffer)),
         };
         match self.config.codec {
@@ -247,31 +265,6 @@ impl PagedStore {
             self.poison = Some(format!("making pages durable failed: {source}"));
             PageError::Sync { source }
         })
-    }
-
-    /// The version `slot` is no longer its page's. If no committed generation can name it, its slot is free at once,
-    /// otherwise after [`PagedStore::commit_done`]. A run that commits nothing never has to wait.
-    pub fn free(&mut self, slot: &SlotRef) {
-        let was_in_use = self.slots.retire(slot.place, slot.generation, self.config.generation);
-        debug_assert!(was_in_use, "a slot was freed twice: {slot:?}");
-    }
-
-    /// The index as of now is about to be committed as generation [`PagedStore::generation`]: what is written from here
-    /// on belongs to the next. Call after [`PagedStore::sync`].
-    pub fn cut(&mut self) -> u64 {
-        self.config.generation += 1;
-        self.config.generation - 1
-    }
-
-    /// Generation `durable` is committed, and of those before it `pinned` are kept: frees slots that none names.
-    pub fn commit_done(&mut self, durable: u64, pinned: &[u64]) -> usize {
-        self.slots.release_retired(durable, pinned)
-    }
-
-    /// At opening: the version `slot`, in use so far, is one that only generations before `until` name.
-    pub fn retire_past(&mut self, slot: &SlotRef, until: u64) {
-        let was_in_use = self.slots.retire(slot.place, slot.generation, until);
-        debug_assert!(was_in_use, "a slot was retired twice: {slot:?}");
     }
 
     /// Takes no writes from now on: something else that belongs to the store failed.

@@ -53,6 +53,7 @@ impl Pager {
         if self.store.is_none() {
             return;
         }
+        self.write_frozen();
         // The next step by what is known now; a page that this step moves into its view is a late miss at most.
         self.window.refresh(step + 1, &self.index);
         self.apply_changed_uses();

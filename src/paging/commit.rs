@@ -19,7 +19,7 @@ use crate::scene::page_layout::{PageLayout, capacity_bytes};
 use std::collections::BTreeMap;
 
 /// Writes in flight at once: each may need a buffer of its own to be encoded in.
-const WRITES_IN_FLIGHT: usize = 32;
+pub(super) const WRITES_IN_FLIGHT: usize = 32;
 
 impl Pager {
     /// A pager over a store that holds these pages, none of them in memory. `events` is the length of the event log.
@@ -55,12 +55,14 @@ impl Pager {
         Ok(pager)
     }
 
-    /// Writes every dirty page and waits until nothing is in flight. Between steps: no page is pinned.
+    /// Writes every dirty page and waits until nothing is in flight. Between steps: no page is pinned. A cut that is not
+    /// committed is given up.
     ///
     /// # Errors
     /// A page could not be written. It is still in memory, and the call may be repeated.
     pub fn flush(&mut self) -> Result<(), PagingError> {
         debug_assert_eq!(self.cache.count(FrameState::Pinned), 0, "a step holds pages");
+        self.thaw();
         // Pages whose write failed are dirty still: what was wrong with them is tried again here.
         self.failed_write = None;
         self.writes_stopped = false;
@@ -75,7 +77,7 @@ impl Pager {
     }
 
     /// Waits until fewer than `most` transfers are in flight. A page that could not be read ahead is read when it is needed.
-    fn settle_below(&mut self, most: usize) -> Result<(), PagingError> {
+    pub(super) fn settle_below(&mut self, most: usize) -> Result<(), PagingError> {
         let mut first_error = None;
         while self.in_flight() >= most {
             for Failure { is_write, error, .. } in self.settle(true, &mut Vec::new()) {

@@ -13,6 +13,7 @@ use crate::cache::evict::NEVER;
 use crate::cache::frame::FrameState;
 use crate::page::buffer::PageBuffer;
 use std::collections::{BTreeMap, VecDeque};
+use std::time::Instant;
 
 /// Pages on their way to a caller.
 struct Fetch {
@@ -53,6 +54,7 @@ impl Pager {
 
     fn fetch_into(&mut self, fetch: &mut Fetch, pages: &[PageNo]) -> Result<(), PagingError> {
         let failures = self.settle(false, &mut Vec::new());
+        self.write_needed(pages, fetch.is_step)?;
         pages.iter().for_each(|&page| self.pin_into(fetch, page));
         self.stats.pages_needed += pages.len() as u64;
         self.stats.misses += fetch.outstanding.len() as u64;
@@ -75,10 +77,27 @@ impl Pager {
                 return Err(self.working_set(&fetch.what, self.held_by_callers() + fetch.outstanding.len()));
             }
             let mut ended = Vec::new();
+            let is_delayed = self.frozen.as_ref().is_some_and(|f| f.delays(fetch.outstanding.keys().copied()));
+            let started = Instant::now();
             let failures = self.settle(true, &mut ended);
+            self.stats.commit_seconds += if is_delayed { started.elapsed().as_secs_f64() } else { 0.0 };
             ended.into_iter().for_each(|page| self.pin_into(fetch, page));
             self.judge(fetch, failures)?;
         }
+    }
+
+    /// Begins to write those of the pages that are frozen: they can be pinned afterwards.
+    fn write_needed(&mut self, pages: &[PageNo], is_step: bool) -> Result<(), PagingError> {
+        for &page in pages {
+            let is_resident = self.cache.state(page) == Some(FrameState::Resident);
+            if is_resident
+                && self.frozen.as_ref().is_some_and(|f| f.holds(page))
+                && let Err(Failure { error, .. }) = self.begin_write(page, true)
+            {
+                self.stop_writes(error, is_step)?;
+            }
+        }
+        Ok(())
     }
 
     /// Pins an outstanding page if it is resident.
@@ -146,11 +165,27 @@ impl Pager {
     }
 
     /// A frame for the upper half of a page that splits; its bytes are whatever was there before. Goes back by
-    /// [`Pager::add_split`] or [`Pager::return_frame`].
+    /// [`Pager::add_split`] or [`Pager::return_frame`]. A step that has begun to change pages is seen through where only
+    /// space is missing, with a frame more than allowed: the next step gets the error.
     ///
     /// # Errors
     /// Every frame is pinned, or the store failed while one was emptied.
     pub fn take_frame(&mut self) -> Result<PageBuffer, PagingError> {
+        let error = match self.empty_frame() {
+            Err(error) => error,
+            frame => return frame,
+        };
+        let cause = self.failed_write.take().unwrap_or(error);
+        if !cause.is_out_of_space() {
+            return Err(cause);
+        }
+        self.failed_write = Some(cause);
+        self.cache.add_frame();
+        self.empty_frame()
+    }
+
+    /// A frame without a page, emptied if need be.
+    pub(super) fn empty_frame(&mut self) -> Result<PageBuffer, PagingError> {
         loop {
             if let Some(buffer) = self.cache.lend() {
                 return Ok(buffer);

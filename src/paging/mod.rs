@@ -5,6 +5,7 @@ mod ahead;
 mod commit;
 pub mod error;
 mod fetch;
+mod freeze;
 pub mod label;
 pub mod pager;
 pub mod pinned;

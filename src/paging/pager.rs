@@ -9,8 +9,9 @@
 //! slot holds exactly what was last released.
 
 use super::error::PagingError;
+use super::freeze::Frozen;
 use super::pinned::PinnedPage;
-use super::stats::PagerStats;
+use super::stats::{PagerStats, SlotSpace};
 use super::window::Window;
 use crate::base::ids::{PageId, PageNo};
 use crate::cache::evict::EvictPolicy;
@@ -76,6 +77,8 @@ pub struct Pager {
     pub(super) ahead: [usize; 2],
     /// Pages of the last acknowledged commit, with the generations of their versions.
     pub(super) committed: BTreeMap<PageId, u64>,
+    /// A cut that is being written.
+    pub(super) frozen: Option<Frozen>,
 }
 
 impl Pager {
@@ -98,6 +101,7 @@ impl Pager {
             writes_stopped: false,
             ahead: [0; 2],
             committed: BTreeMap::new(),
+            frozen: None,
         }
     }
 
@@ -123,7 +127,7 @@ impl Pager {
             return Ok(self.add_entry(meta));
         }
         self.write_behind()?;
-        let mut buffer = self.take_frame()?;
+        let mut buffer = self.empty_frame()?;
         fill(&mut buffer.as_mut_slice()[HEADER_BYTES..]);
         let page = self.add_entry(meta);
         self.cache.adopt(page);
@@ -254,6 +258,13 @@ impl Pager {
     /// Where the versions of the pages on the drive are, by page: for the index of a commit, once nothing is dirty.
     pub fn slots(&self) -> &[Option<SlotRef>] {
         &self.slots
+    }
+
+    /// What the slots of the store are, and the bytes of a segment; `None` for a pager without a store.
+    pub fn slot_space(&self) -> Option<SlotSpace> {
+        let slots = self.store.as_ref()?.slots();
+        let segment_bytes = slots.layout().segment_bytes();
+        Some(SlotSpace { total: slots.total(), free: slots.free(), retired: slots.retired(), segment_bytes })
     }
 
     fn add_entry(&mut self, meta: PageMeta) -> PageNo {

@@ -1,4 +1,4 @@
-//! What a pager did so far, for metrics.
+//! What a pager did so far, and how full its store is.
 
 /// Totals since the pager was made, or since the run began that it goes on with ([`super::pager::Pager::count_on`]);
 /// subtract two of them for one step.
@@ -24,10 +24,25 @@ pub struct PagerStats {
     pub evictions: u64,
     /// Seconds that callers waited for the store.
     pub stall_seconds: f64,
+    /// Seconds that steps lost to commits beside them: waited for frozen pages, or spent on writing them.
+    pub commit_seconds: f64,
     /// The most pages pinned at once.
     pub pinned_max: usize,
     /// Frames in use now, and the most that there may be (`usize::MAX` for as many as needed).
     pub frames: usize,
     /// See `frames`.
     pub frames_max: usize,
+}
+
+/// Slots of a store.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SlotSpace {
+    /// All.
+    pub total: u64,
+    /// Those that may be written at once.
+    pub free: u64,
+    /// Those with past versions, which commits make free.
+    pub retired: u64,
+    /// What the drive must have for more of them.
+    pub segment_bytes: u64,
 }

@@ -8,6 +8,7 @@ use super::error::PagingError;
 use super::label::label;
 use super::pager::Pager;
 use crate::base::ids::PageNo;
+use crate::page::format::SlotRef;
 use crate::page::page_error::PageError;
 use crate::page::paged_store::{PageDone, PageMoved};
 use crate::scene::page_layout::PageLayout;
@@ -49,13 +50,16 @@ impl Pager {
         let meta = &self.index[page.index()];
         let layout = PageLayout { rows: meta.rows as usize, sh_degree: meta.sh_degree };
         let buffer = self.cache.begin_write(page);
-        match store.write(token(page, is_ahead), meta.id, &label(meta), layout.bytes(), buffer) {
+        let cut = self.frozen.as_mut().and_then(|f| f.begin_write(page).then_some(f.generation));
+        let generation = cut.unwrap_or(store.generation());
+        match store.write_for(generation, token(page, is_ahead), meta.id, &label(meta), layout.bytes(), buffer) {
             Ok(()) => {
                 self.ahead[WRITES] += if is_ahead { self.cache.frame_bytes() } else { 0 };
                 self.stats.pages_written += 1;
                 Ok(())
             }
             Err((source, buffer)) => {
+                self.thaw();
                 self.cache.finish_write(page, buffer, false);
                 Err(self.failure(page, true, source))
             }
@@ -72,6 +76,18 @@ impl Pager {
     pub(super) fn free_slot(&mut self, page: PageNo) {
         if let (Some(store), Some(slot)) = (&mut self.store, self.slots[page.index()].take()) {
             store.free(&slot);
+        }
+    }
+
+    /// The present version of a page is in this slot; the one before it is given up.
+    fn take_version(&mut self, page: PageNo, slot: SlotRef) {
+        let meta = &self.index[page.index()];
+        let frozen = self.frozen.as_mut();
+        let cut = frozen.and_then(|f| f.end_write(page, meta.id, slot, &label(meta)).then_some(f.generation));
+        match (self.slots[page.index()].replace(slot), &mut self.store, cut) {
+            (Some(before), Some(store), Some(cut)) => store.free_from(&before, cut),
+            (Some(before), Some(store), None) => store.free(&before),
+            _ => {}
         }
     }
 
@@ -96,13 +112,15 @@ impl Pager {
                 Ok(PageMoved::Read { .. }) => self.cache.finish_load(page, buffer),
                 Ok(PageMoved::Written(slot)) => {
                     self.cache.finish_write(page, buffer, true);
-                    self.free_slot(page);
-                    self.slots[page.index()] = Some(slot);
+                    self.take_version(page, slot);
                 }
                 Err(source) => {
                     match is_read {
                         true => self.cache.fail_load(page, buffer),
-                        false => self.cache.finish_write(page, buffer, false),
+                        false => {
+                            self.thaw();
+                            self.cache.finish_write(page, buffer, false);
+                        }
                     }
                     failures.push(self.failure(page, !is_read, source));
                     continue;

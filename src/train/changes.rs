@@ -28,6 +28,7 @@ const FREE_KEYS: &[&str] = &[
     "io",
     "spill-codec",
     "commit-every",
+    "disk-full-wait",
     "evict",
     "prefetch-bytes",
     "threads",

@@ -1,37 +1,75 @@
-//! When a run is committed, and what a commit holds of it.
+//! The commits of a run: when they are made, and what they hold of it.
+//!
+//! A commit that time asks for is made beside training: a cut between two steps, its pages written during the steps that
+//! follow ([`crate::paging`]), then the transaction. One that must be there before anything else happens (a stop, the
+//! end, a drive without space) is made at once.
 //!
 //! Invariants: 1. commits happen between steps and change nothing of the run; 2. what is committed is all that later
-//! steps depend on: a run that goes on from it ends with the same bytes; 3. a full drive ends no run at a commit that
-//! only time asked for; 4. a run in memory makes its checkpoint when it first commits, so a short one writes none.
+//! steps depend on: a run that goes on from it ends with the same bytes; 3. clocks decide when a commit is made, and
+//! nothing else; 4. a run in memory makes its checkpoint when it first commits, so a short one writes none; a full drive
+//! costs such a run its commits, and nothing else.
 
 use super::first_commit::FirstCommit;
 use super::report::MetricsLog;
 use super::trainer::{TrainError, Trainer};
+use crate::checkpoint::interval::{CommitCost, CommitInterval, CommitReport};
 use crate::checkpoint::run_state::{DatasetPrint, RunState, TrafficSoFar};
 use crate::config::file::TrainConfig;
 use crate::page::commit::{CommitError, Commits};
 use crate::page::spill_dir::SpillDir;
-use crate::paging::stats::PagerStats;
+use crate::paging::stats::{PagerStats, SlotSpace};
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
+
+/// A commit is made at once where its pages are not written after this time beside training.
+const BESIDE_SECONDS: f64 = 20.0;
+/// Fewer free slots than one in so many are few.
+const FEW_FREE: u64 = 10;
+/// A commit before its time must make at least one slot in so many free.
+const WORTH_FREEING: u64 = 20;
 
 /// The commits of a run.
 #[derive(Debug)]
 pub struct Checkpoint {
     /// `None` before the first commit of a run in memory.
-    commits: Option<Commits>,
+    pub(super) commits: Option<Commits>,
     /// How that one makes them.
     first: Option<FirstCommit>,
     /// What it made them in.
     spill: Option<SpillDir>,
     /// The next commit is kept under this name.
     name: Option<String>,
-    every: Option<Duration>,
+    pub(super) folder: PathBuf,
+    /// The run can go on without: all of it is in memory.
+    is_optional: bool,
+    /// A commit found no space, and the user knows.
+    said_full: bool,
+    /// How long to wait for space.
+    pub(super) full_wait: Duration,
+    /// Step at which space was last made, and when; a second time at the same step it must come from elsewhere.
+    pub(super) space_made: Option<(u32, Instant)>,
+    interval: CommitInterval,
+    started: Instant,
+    /// When the last commit was durable, and its cut.
     last: Instant,
+    last_cut: Instant,
+    beside: Option<Beside>,
     /// What does not change: see [`Checkpoint::set_origin`].
     origin: Option<Origin>,
     done: u64,
-    /// A commit found no space, and the user knows.
-    said_full: bool,
+    /// Step of the last commit.
+    last_step: Option<u32>,
+}
+
+/// A commit that is made beside training.
+#[derive(Debug)]
+struct Beside {
+    run_state: Vec<u8>,
+    step: u32,
+    cut: Instant,
+    waited: Duration,
+    /// The pager's seconds for it, before it.
+    pager_seconds: f64,
 }
 
 /// What a run was started with, as its run state has it.
@@ -48,41 +86,49 @@ pub struct Origin {
 }
 
 impl Checkpoint {
-    /// Commits as often as the config says, the first one after that time.
-    pub fn new(commits: Commits, config: &TrainConfig) -> Checkpoint {
-        Checkpoint { commits: Some(commits), ..Checkpoint::without(config) }
+    /// Commits to the store in `folder` as often as the config says, the first one after that time.
+    pub fn new(commits: Commits, folder: &Path, config: &TrainConfig) -> Checkpoint {
+        Checkpoint { commits: Some(commits), ..Checkpoint::without(folder, config) }
     }
 
     /// Of a run in memory: the first commit makes a checkpoint as `first` says.
     pub(super) fn later(first: FirstCommit, config: &TrainConfig) -> Checkpoint {
-        Checkpoint { first: Some(first), ..Checkpoint::without(config) }
+        let folder = first.folder().to_path_buf();
+        Checkpoint { first: Some(first), is_optional: true, ..Checkpoint::without(&folder, config) }
     }
 
-    fn without(config: &TrainConfig) -> Checkpoint {
-        let every =
-            (config.commit_every > 0.0).then(|| Duration::try_from_secs_f64(config.commit_every).ok()).flatten();
+    fn without(folder: &Path, config: &TrainConfig) -> Checkpoint {
+        let now = Instant::now();
         Checkpoint {
             commits: None,
             first: None,
             spill: None,
             name: None,
-            every,
-            last: Instant::now(),
+            folder: folder.to_path_buf(),
+            is_optional: false,
+            said_full: false,
+            full_wait: Duration::try_from_secs_f64(config.disk_full_wait).unwrap_or_default(),
+            space_made: None,
+            interval: CommitInterval::new(config.commit_every),
+            started: now,
+            last: now,
+            last_cut: now,
+            beside: None,
             origin: None,
             done: 0,
-            said_full: false,
+            last_step: None,
         }
     }
 
     /// What the run was started with; before the first commit.
     pub fn set_origin(&mut self, origin: Origin) {
         self.origin = Some(origin);
-        self.last = Instant::now();
+        (self.started, self.last, self.last_cut) = (Instant::now(), Instant::now(), Instant::now());
     }
 
-    /// Whether the time from one commit to the next is over, or a name waits for one.
-    pub fn is_due(&self) -> bool {
-        self.name.is_some() || self.every.is_some_and(|every| self.last.elapsed() >= every)
+    /// A full drive costs the run its commits and nothing else: all of it is in memory.
+    pub fn set_optional(&mut self, is_optional: bool) {
+        self.is_optional = is_optional;
     }
 
     /// The next commit is kept under `name`, whatever is committed later.
@@ -106,43 +152,45 @@ impl Checkpoint {
         self.done > 0
     }
 
-    /// Commits the run as it is now.
-    ///
-    /// # Errors
-    /// Nothing was committed; what was committed before still is.
-    pub fn commit(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
-        let Some(origin) = &self.origin else { return Ok(()) };
-        if let Some(first) = self.first.take() {
-            match first.make(&mut trainer.scene.pager) {
-                Ok((spill, commits)) => (self.spill, self.commits) = (Some(spill), Some(commits)),
-                // The run itself is none the worse for it.
-                Err(error) => eprintln!("warning: this run is not committed, so it cannot be resumed: {error}"),
-            }
-        }
-        let name = self.name.take();
-        let Some(commits) = &mut self.commits else { return Ok(()) };
-        trainer.scene.pager.flush()?;
-        let state = trainer.run_state(origin, metrics.sync()?);
-        let bytes = state.to_bytes().map_err(|e| CommitError::Contradiction(e.to_string()))?;
-        let note = format!("step {}", state.step);
-        trainer.scene.pager.commit(commits, &bytes, note.as_bytes(), name.as_deref())?;
-        self.done += 1;
-        self.last = Instant::now();
-        Ok(())
+    /// Step of the last commit since the store was opened.
+    pub fn last_step(&self) -> Option<u32> {
+        self.last_step
     }
 
-    /// As [`Checkpoint::commit`]; where only space is missing, says so and lets the run go on.
+    /// What commits have cost so far.
+    pub fn report(&self) -> CommitReport {
+        self.interval.report(self.started.elapsed().as_secs_f64())
+    }
+
+    /// Between two steps: begins a commit if one is due, and ends one whose pages are written.
     ///
     /// # Errors
-    /// As [`Checkpoint::commit`], but for space.
-    pub fn commit_if_space(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
-        let is_space = |error: &TrainError| match error {
-            TrainError::Commit(error) => error.is_out_of_space(),
-            TrainError::Paging(error) => error.is_out_of_space(),
-            _ => false,
+    /// As [`Checkpoint::commit`].
+    pub fn between_steps(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
+        if !trainer.scene.pager.is_frozen() {
+            // A failed write gave it up; the next step gets the error.
+            self.beside = None;
+        }
+        let result = match &self.beside {
+            // What is named after a step holds that step.
+            _ if self.name.is_some() => self.commit(trainer, metrics),
+            None if self.is_time() && self.first.is_some() => self.commit(trainer, metrics),
+            None if self.is_time() && self.commits.is_some() => self.begin(trainer, metrics),
+            None if self.space_is_short(trainer) => self.commit(trainer, metrics),
+            Some(beside) if trainer.scene.pager.is_frozen_written() || is_late(beside) => self.finish(trainer),
+            _ => Ok(()),
         };
-        match self.commit(trainer, metrics) {
-            Err(error) if is_space(&error) => {
+        self.excused(result)
+    }
+
+    fn is_time(&self) -> bool {
+        self.interval.is_due(self.last.elapsed().as_secs_f64())
+    }
+
+    /// A run in memory goes on where only space is missing, and tries again after as long as from commit to commit.
+    fn excused(&mut self, result: Result<(), TrainError>) -> Result<(), TrainError> {
+        match result {
+            Err(error) if self.is_optional && error.is_out_of_space() => {
                 if !std::mem::replace(&mut self.said_full, true) {
                     eprintln!("warning: nothing can be committed: {error}");
                 }
@@ -152,6 +200,110 @@ impl Checkpoint {
             done => done,
         }
     }
+
+    /// The checkpoint of a run in memory, at its first commit. The run itself is none the worse without one.
+    fn make_first(&mut self, trainer: &mut Trainer) {
+        let Some(first) = self.first.take() else { return };
+        match first.make(&mut trainer.scene.pager) {
+            Ok((spill, commits)) => (self.spill, self.commits) = (Some(spill), Some(commits)),
+            Err(error) => eprintln!("warning: this run is not committed, so it cannot be resumed: {error}"),
+        }
+    }
+
+    fn begin(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
+        let Some(origin) = &self.origin else { return Ok(()) };
+        let cut = Instant::now();
+        let pager_seconds = trainer.scene.pager.stats().commit_seconds;
+        let state = trainer.run_state(origin, metrics.sync()?);
+        let run_state = bytes_of(&state)?;
+        trainer.scene.pager.freeze()?;
+        self.beside = Some(Beside { run_state, step: state.step, cut, waited: cut.elapsed(), pager_seconds });
+        // In memory, or with nothing to write, there is nothing to wait for.
+        if trainer.scene.pager.is_frozen_written() { self.finish(trainer) } else { Ok(()) }
+    }
+
+    fn finish(&mut self, trainer: &mut Trainer) -> Result<(), TrainError> {
+        let Some(beside) = self.beside.take() else { return Ok(()) };
+        let began = Instant::now();
+        let pager = &mut trainer.scene.pager;
+        pager.finish_frozen()?;
+        let note = format!("step {}", beside.step);
+        let Some(commits) = &mut self.commits else { return Ok(()) };
+        let Some((_, bytes)) = pager.commit_frozen(commits, &beside.run_state, note.as_bytes())? else {
+            return Ok(());
+        };
+        let beside_steps = pager.stats().commit_seconds - beside.pager_seconds;
+        let waited = (beside.waited + began.elapsed()).as_secs_f64() + beside_steps;
+        self.acknowledged(beside.step, beside.cut, waited, bytes);
+        Ok(())
+    }
+
+    /// Commits the run as it is now, at once. A commit beside training that has not ended is given up for it.
+    ///
+    /// # Errors
+    /// Nothing was committed; what was committed before still is.
+    pub fn commit(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
+        if self.origin.is_none() {
+            return Ok(());
+        }
+        let cut = Instant::now();
+        self.beside = None;
+        self.make_first(trainer);
+        let name = self.name.take();
+        let Some(origin) = &self.origin else { return Ok(()) };
+        let Some(commits) = &mut self.commits else { return Ok(()) };
+        let written = trainer.scene.pager.stats().bytes_written;
+        trainer.scene.pager.flush()?;
+        let state = trainer.run_state(origin, metrics.sync()?);
+        let note = format!("step {}", state.step);
+        trainer.scene.pager.commit(commits, &bytes_of(&state)?, note.as_bytes(), name.as_deref())?;
+        let bytes = trainer.scene.pager.stats().bytes_written - written;
+        self.acknowledged(state.step, cut, cut.elapsed().as_secs_f64(), bytes);
+        Ok(())
+    }
+
+    /// As [`Checkpoint::commit`]; where only space is missing, says so.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::commit`], but for space.
+    pub fn commit_or_warn(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
+        match self.commit(trainer, metrics) {
+            Err(error) if error.is_out_of_space() => {
+                eprintln!("warning: the last steps are not committed: {error}");
+                Ok(())
+            }
+            done => done,
+        }
+    }
+
+    fn acknowledged(&mut self, step: u32, cut: Instant, waited: f64, bytes: u64) {
+        self.done += 1;
+        self.last_step = Some(step);
+        let until_durable = cut.elapsed().as_secs_f64();
+        let at_risk = self.last_cut.elapsed().as_secs_f64();
+        self.interval.add(CommitCost { waited, until_durable, bytes, at_risk });
+        (self.last, self.last_cut) = (Instant::now(), cut);
+    }
+
+    /// Whether few slots are free, no more can be made, and a commit would make some free.
+    fn space_is_short(&self, trainer: &Trainer) -> bool {
+        let Some(SlotSpace { total, free, retired, segment_bytes }) = trainer.scene.pager.slot_space() else {
+            return false;
+        };
+        if free * FEW_FREE >= total || retired * WORTH_FREEING < total {
+            return false;
+        }
+        let left = crate::page::file_system::free_bytes(&self.folder).ok().flatten();
+        left.is_some_and(|left| left < segment_bytes)
+    }
+}
+
+fn is_late(beside: &Beside) -> bool {
+    beside.cut.elapsed().as_secs_f64() >= BESIDE_SECONDS
+}
+
+fn bytes_of(state: &RunState) -> Result<Vec<u8>, CommitError> {
+    state.to_bytes().map_err(|e| CommitError::Contradiction(e.to_string()))
 }
 
 impl Trainer {

@@ -46,6 +46,11 @@ impl FirstCommit {
         }
     }
 
+    /// Where it will be.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
     /// Makes it, and gives it to the pager.
     pub fn make(self, pager: &mut Pager) -> Result<(SpillDir, Commits), TrainError> {
         let layout = SlotLayout::new(self.capacity_bytes, pager.index().len() as u64);

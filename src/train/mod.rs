@@ -1,7 +1,7 @@
 //! The glue, in one direction: [`run`] sets a run up and sees it through ([`tiers`] says where pages live, [`memory`] and
 //! [`preflight`] whether that fits), [`trainer`] loops over steps, [`step`] is one step from top to bottom,
-//! [`checkpoint`] commits it (`first_commit` that of a run in memory), [`resume`] goes on from a commit if nothing changed
-//! (`changes`, [`dataset_print`]), [`pages`] has the rows of a run in pages and brings them to now with [`catch_up`], `update` changes them, [`eval`] looks at
+//! [`checkpoint`] commits it (`first_commit` that of a run in memory), [`full_drive`] finds it space, [`resume`] goes on from a
+//! commit if nothing changed (`changes`, [`dataset_print`]), [`pages`] has the rows of a run in pages and brings them to now with [`catch_up`], `update` changes them, [`eval`] looks at
 //! held-out views, [`report`] writes what happened, [`progress`] shows it, [`machine`] starts its threads, [`signals`]
 //! hears Ctrl-C.
 
@@ -11,6 +11,7 @@ pub mod checkpoint;
 pub mod dataset_print;
 pub mod eval;
 mod first_commit;
+pub mod full_drive;
 pub mod machine;
 pub mod memory;
 pub mod out_folder;

@@ -5,6 +5,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
+use crate::checkpoint::interval::CommitReport;
 use crate::config::file::TrainConfig;
 use crate::exchange::tensorboard::EventFile;
 use crate::paging::pager::Pager;
@@ -99,6 +100,9 @@ pub struct StepLine {
     /// Between the tiers, since the start.
     #[serde(flatten)]
     pub tiers: TierTraffic,
+    /// What commits cost so far, where there are any.
+    #[serde(flatten, skip_serializing_if = "Option::is_none", default)]
+    pub commits: Option<CommitReport>,
     /// Evaluation on the held-out views, where one was due.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub test: Option<TestMetrics>,
@@ -146,6 +150,9 @@ pub struct Summary {
     /// Between the tiers, first pages, evaluation and export included.
     #[serde(flatten)]
     pub tiers: TierTraffic,
+    /// What commits cost, where there were any. Of a run that was resumed, since then.
+    #[serde(flatten, skip_serializing_if = "Option::is_none", default)]
+    pub commits: Option<CommitReport>,
 }
 
 /// A PSNR for JSON: at most 100, which also stands for no difference at all; what is not a number (a broken picture)

@@ -3,7 +3,7 @@
 //! Invariants: 1. the output folder is made only after the dataset was understood, so bad input leaves nothing
 //! behind; 2. a run that is stopped or fails after its first step still writes the PLY of its last good step.
 
-use super::checkpoint::Origin;
+use super::checkpoint::{Checkpoint, Origin};
 use super::dataset_print::dataset_print;
 use super::eval::ply_warnings;
 use super::machine;
@@ -329,7 +329,15 @@ fn train_into(
     let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint: lent };
     let looped = trainer.run(dataset, &targets, &mut outputs);
     let ply = Trainer::ply_path(out);
-    let written = trainer.save(dataset, &ply)?;
+    let saved = trainer.save(dataset, &ply);
+    // What ended the run is the error to be told; that its last rows cannot be written either comes beside it.
+    let (looped, written) = match (looped, saved) {
+        (Err(error), Err(other)) => {
+            eprintln!("warning: {} cannot be written: {other}", ply.display());
+            return Err(error);
+        }
+        (looped, saved) => (looped, saved?),
+    };
     if written.frame == ExportFrame::Local && config.export_frame == "dataset" {
         eprintln!(
             "warning: the scene lies too far from its origin for f32, so {} holds local positions; \
@@ -347,7 +355,7 @@ fn train_into(
     });
     if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, checkpoint) {
         // Once more, with what the evaluation said.
-        checkpoint.commit_if_space(&mut trainer, &mut metrics)?;
+        checkpoint.commit_or_warn(&mut trainer, &mut metrics)?;
     }
     let (rows_skipped, steps_skipped) = trainer.skipped();
     let summary = Summary {
@@ -363,6 +371,7 @@ fn train_into(
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
         tiers: TierTraffic::of(&trainer.scene.pager),
+        commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
     };
     write_summary(&out.join("summary.json"), &summary)?;
     write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;

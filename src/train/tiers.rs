@@ -34,6 +34,10 @@ const PREFETCH_BYTES_MAX: usize = 256 << 20;
 /// Memory for the plan of the coming steps, bytes.
 pub const PLAN_BYTES: usize = 16 << 20;
 
+/// Space set aside for a last commit on a full drive: room for a segment, at least for the map to grow, bytes.
+const RESERVE_BYTES_LEAST: u64 = 2 << 20;
+const RESERVE_BYTES_MOST: u64 = 256 << 20;
+
 /// The tiers of a run.
 #[derive(Debug, Default)]
 pub struct Tiers {
@@ -133,7 +137,9 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let (engine, codec) = tiers.take_spill(spill, config)?;
     let opened = Commits::create(Box::new(folder), of_commits)?;
     let store = opened.paged_store(engine, layout, codec)?;
-    tiers.checkpoint = Some(Checkpoint::new(opened.commits, config));
+    let mut checkpoint = Checkpoint::new(opened.commits, Path::new(&config.spill_dir), config);
+    checkpoint.fill_reserve()?;
+    tiers.checkpoint = Some(checkpoint);
     Ok((Pager::new(pager, store), tiers))
 }
 
@@ -192,16 +198,21 @@ impl Stored {
         let mut tiers = Tiers::default();
         (tiers.has_past, tiers.is_in_memory, tiers.keeps) = (true, is_in_memory, config.keep_checkpoint);
         tiers.is_in_output = config.spill_dir.is_empty();
+        let folder = spill.folder().to_path_buf();
         let (engine, codec) = tiers.take_spill(spill, config)?;
         let store = opened.paged_store(engine, layout, codec)?;
         let pager = Pager::open(pager, store, &opened.pages, run_state.events.len())?;
-        tiers.checkpoint = Some(Checkpoint::new(opened.commits, config));
+        let mut checkpoint = Checkpoint::new(opened.commits, &folder, config);
+        checkpoint.set_optional(is_in_memory);
+        checkpoint.fill_reserve()?;
+        tiers.checkpoint = Some(checkpoint);
         Ok((pager, tiers))
     }
 }
 
 fn commit_config(spill: &SpillDir) -> CommitConfig {
-    CommitConfig { store: spill.format().store, cache_bytes: MAP_CACHE_BYTES, reserve_bytes: 0 }
+    let reserve_bytes = spill.format().layout.segment_bytes().clamp(RESERVE_BYTES_LEAST, RESERVE_BYTES_MOST);
+    CommitConfig { store: spill.format().store, cache_bytes: MAP_CACHE_BYTES, reserve_bytes }
 }
 
 impl Tiers {

@@ -59,6 +59,20 @@ pub enum TrainError {
     /// A commit failed, or a checkpoint cannot be opened.
     #[error(transparent)]
     Commit(#[from] CommitError),
+    /// The drive is full, and nobody freed space in time.
+    #[error(
+        "the drive of {folder} is full: it needs {needed} more{stands}\n  remedy: free space on it, then go on with \
+         gsscale-train --resume and the output folder",
+        stands = .last_step.map_or(String::new(), |step| format!("; the commit after step {step} stands"))
+    )]
+    DriveFull {
+        /// The spill directory.
+        folder: String,
+        /// Bytes, for people.
+        needed: String,
+        /// Step of the last commit of this process.
+        last_step: Option<u32>,
+    },
     /// The loss was not finite several times in a row.
     #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
     NonFinite {
@@ -323,7 +337,7 @@ impl Trainer {
         while self.step < self.options.steps && outputs.stop.exit_code().is_none() {
             let step = self.step;
             let before = self.renderer.traffic();
-            let outcome = self.step(dataset, targets)?;
+            let Some(outcome) = self.step_with_space(dataset, targets, outputs)? else { break };
             let traffic = self.renderer.traffic();
             let is_last = self.step == self.options.steps;
             let due = |every: u32| step > 0 && step.is_multiple_of(every);
@@ -339,7 +353,7 @@ impl Trainer {
                 }
             }
             if due(self.options.log_every) || is_last || due(self.options.eval_every) {
-                outputs.metrics.write(&StepLine {
+                let line = StepLine {
                     step,
                     loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },
                     psnr,
@@ -350,29 +364,63 @@ impl Trainer {
                     bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
                     device_bytes_peak: traffic.device_bytes_peak,
                     tiers: TierTraffic::of(&self.scene.pager),
+                    commits: outputs.checkpoint.as_deref().map(Checkpoint::report),
                     test,
-                })?;
+                };
+                let written = outputs.metrics.write(&line).map_err(TrainError::from);
+                written.or_else(|error| self.make_space(outputs, error))?;
             }
             let (gaussians, last_test) = (self.scene.rows(), self.last_test);
             outputs.progress.step(self.step, || {
                 let test = last_test.map_or(String::new(), |t| format!(" test {:.2}", t.psnr));
                 let tiers = TierTraffic::of(&self.scene.pager).words();
-                format!("loss {:.4} psnr {psnr:.2}{test} {gaussians} gaussians{tiers}", outcome.loss.loss)
+                let commits = outputs.checkpoint.as_deref().map_or(String::new(), |c| c.report().words());
+                format!("loss {:.4} psnr {psnr:.2}{test} {gaussians} gaussians{tiers}{commits}", outcome.loss.loss)
             });
-            if let Some(checkpoint) = outputs.checkpoint.as_deref_mut().filter(|c| c.is_due()) {
-                checkpoint.commit_if_space(self, outputs.metrics)?;
+            if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
+                let done = checkpoint.between_steps(self, outputs.metrics);
+                done.or_else(|error| self.make_space(outputs, error))?;
             }
         }
-        if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
-            // A run that is done needs no commit to be of use, one that stops does.
-            match self.step < self.options.steps {
-                true => checkpoint.commit(self, outputs.metrics)?,
-                false if checkpoint.wants_last() => checkpoint.commit_if_space(self, outputs.metrics)?,
-                false => {}
-            }
-        }
+        self.commit_last(outputs)?;
         outputs.progress.finish();
         Ok(())
+    }
+
+    /// A step; where its drive is full, another try once there is space. `None`: asked to stop while waiting for it.
+    fn step_with_space(
+        &mut self,
+        dataset: &Dataset,
+        targets: &TargetCache,
+        outputs: &mut LoopOutputs<'_>,
+    ) -> Result<Option<StepOutcome>, TrainError> {
+        loop {
+            match self.step(dataset, targets) {
+                Ok(outcome) => return Ok(Some(outcome)),
+                Err(error) => self.make_space(outputs, error)?,
+            }
+            if outputs.stop.exit_code().is_some() {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// Space after `error`, by the checkpoint where there is one.
+    fn make_space(&mut self, outputs: &mut LoopOutputs<'_>, error: TrainError) -> Result<(), TrainError> {
+        match outputs.checkpoint.as_deref_mut() {
+            Some(checkpoint) => checkpoint.make_space(self, outputs.metrics, outputs.stop, error),
+            None => Err(error),
+        }
+    }
+
+    /// The commit after the last step. Without space for it a run that is done needs none, and one that was asked to stop
+    /// stops.
+    fn commit_last(&mut self, outputs: &mut LoopOutputs<'_>) -> Result<(), TrainError> {
+        let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else { return Ok(()) };
+        match self.step < self.options.steps || checkpoint.wants_last() {
+            true => checkpoint.commit_or_warn(self, outputs.metrics),
+            false => Ok(()),
+        }
     }
 
     /// Evaluates on the held-out views as of now.

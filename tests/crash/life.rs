@@ -1,6 +1,7 @@
 //! One life of a process over the simulated disk: opens the real store, writes, splits and commits pages, until the
 //! power fails, an error is injected or it has had enough.
 
+use crate::cut::Frozen;
 use crate::disk::{Disk, Rng};
 use crate::engine::SimStore;
 use crate::oracle::{Acknowledged, Oracle, Snapshot, fill, payload_bytes, read_and_compare, version_of};
@@ -42,21 +43,23 @@ impl From<PageError> for End {
 
 /// A page as this process has it.
 #[derive(Debug, Clone, Copy)]
-struct Held {
-    version: u64,
+pub struct Held {
+    pub version: u64,
     /// `None`: dirty, in memory alone.
-    slot: Option<SlotRef>,
+    pub slot: Option<SlotRef>,
     /// Slot of the version before, until the page is written.
-    before: Option<SlotRef>,
+    pub before: Option<SlotRef>,
 }
 
 /// An open store and what this process knows of it.
 pub struct Life<'a> {
     pub commits: Commits,
     pub store: PagedStore,
-    oracle: &'a mut Oracle,
-    pages: BTreeMap<PageId, Held>,
-    changed: BTreeSet<PageId>,
+    pub oracle: &'a mut Oracle,
+    pub pages: BTreeMap<PageId, Held>,
+    pub changed: BTreeSet<PageId>,
+    /// A commit that is under way beside the rest.
+    pub frozen: Option<Frozen>,
     next_version: u64,
     next_page: u32,
 }
@@ -89,7 +92,7 @@ pub fn open<'a>(disk: &Disk, oracle: &'a mut Oracle, seed: u64) -> Result<Life<'
     let next_version = 1 + seed % 1000 + 1000 * (oracle.commits + seed % (1 << 30));
     let next_page = opened.pages.iter().map(|p| (p.page.to_bits() >> 32) as u32 + 1).max().unwrap_or(0);
     let commits = opened.commits;
-    Ok(Life { commits, store, oracle, pages, changed: BTreeSet::new(), next_version, next_page })
+    Ok(Life { commits, store, oracle, pages, changed: BTreeSet::new(), frozen: None, next_version, next_page })
 }
 
 pub fn paged_store(disk: &Disk, opened: &Opened, seed: u64) -> Result<PagedStore, CommitError> {
@@ -130,6 +133,9 @@ impl Life<'_> {
     /// Writes a dirty page, as an eviction does. Where there is no space it stays dirty.
     pub fn write(&mut self, page: PageId) -> Result<(), End> {
         let Some(held) = self.pages.get(&page).copied().filter(|held| held.slot.is_none()) else { return Ok(()) };
+        if self.is_frozen(page) {
+            return self.write_frozen(page);
+        }
         let mut buffer = self.store.new_buffer();
         let bytes = payload_bytes(page, held.version);
         fill(page, held.version, &mut buffer.as_mut_slice()[HEADER_BYTES..][..bytes]);
@@ -163,6 +169,7 @@ impl Life<'_> {
 
     /// Commits; where there is no space, everything stays as it is.
     pub fn commit(&mut self, pin: Option<&str>) -> Result<(), End> {
+        self.thaw();
         let dirty: Vec<PageId> = self.pages.iter().filter(|(_, h)| h.slot.is_none()).map(|(p, _)| *p).collect();
         for page in dirty {
             self.write(page)?;
@@ -248,7 +255,7 @@ impl Life<'_> {
     pub fn step(&mut self, disk: &Disk, rng: &mut Rng) -> Result<(), End> {
         let ids: Vec<PageId> = self.pages.keys().copied().collect();
         let some = |rng: &mut Rng| ids.get(rng.below(ids.len() as u64) as usize).copied();
-        match rng.below(16) {
+        match rng.below(20) {
             0..4 => {
                 let page = some(rng).filter(|_| ids.len() >= PAGES_MAX || rng.one_in(2)).unwrap_or_else(|| {
                     self.next_page += 1;
@@ -275,7 +282,17 @@ impl Life<'_> {
             10..15 => {
                 let name = ["a", "b"][rng.below(2) as usize];
                 let is_free = !self.commits.generations().pins().contains_key(name);
-                self.commit(Some(name).filter(|_| is_free && rng.one_in(4)))?;
+                let pin = Some(name).filter(|_| is_free && rng.one_in(4));
+                match self.frozen.is_some() && !rng.one_in(8) {
+                    true => self.commit_frozen(pin)?,
+                    false => self.commit(pin)?,
+                }
+            }
+            15..17 => self.freeze(),
+            17..19 => {
+                if let Some(page) = self.unwritten().first().copied() {
+                    self.write_frozen(page)?;
+                }
             }
             _ => {
                 let pins = self.commits.generations().pins().clone();

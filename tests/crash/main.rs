@@ -3,6 +3,7 @@
 //! Every push runs tens of thousands of crashes; `GSSCALE_CRASHES=5000000` runs as many as it says.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
+mod cut;
 mod decay;
 mod disk;
 mod engine;

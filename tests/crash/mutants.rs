@@ -34,6 +34,7 @@ pub const MUTANTS: &[Mutant] = &[
     Mutant::WitnessBeforeMap,
     Mutant::WitnessInOneSlot,
     Mutant::MapNotDurable,
+    Mutant::CutForgotten,
     Mutant::GenerationsReused,
 ];
 

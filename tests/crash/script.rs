@@ -26,8 +26,24 @@ fn run(disk: &Disk, oracle: &mut Oracle) -> Result<(), End> {
     first(&mut life, 2)?;
     life.commit(None)?;
     life.pin(&[], &["a".to_string()])?;
+    beside(&mut life)?;
     first(&mut life, 0)?;
     life.commit(None)
+}
+
+/// A commit beside work: a page of it gets a newer version before the cut's is written, and one after.
+fn beside(life: &mut Life<'_>) -> Result<(), End> {
+    let ids = life.ids();
+    let [a, b, ..] = ids[..] else { return Ok(()) };
+    life.edit(a);
+    life.edit(b);
+    life.freeze();
+    life.write(b)?;
+    life.edit(a);
+    life.edit(b);
+    life.write(a)?;
+    life.commit_frozen(None)?;
+    life.write(b)
 }
 
 /// A page is changed and spilled.

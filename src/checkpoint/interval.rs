@@ -1,0 +1,285 @@
+//! How often a run is committed, and what that cost it: numbers in, numbers out.
+//!
+//! `--commit-every auto` wants that a kill costs at most [`LOSS_SECONDS`] and that commits hold training up for at most
+//! [`OVERHEAD`] of its time. Where commits are cheap they come more often than that, where they are dear the loss wins:
+//! the overhead is reported then. What a drive may be made to take has the last word ([`BYTES_PER_HOUR`]).
+//!
+//! Invariants: 1. no clock is read here: whoever asks says how long ago things were; 2. the interval is a function of the
+//! costs that were told, in their order; 3. nothing here can change what a run computes.
+
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use std::fmt;
+use std::str::FromStr;
+
+/// Most seconds of work that a kill may cost.
+pub const LOSS_SECONDS: f64 = 60.0;
+/// Most of the run's time that commits may hold it up.
+pub const OVERHEAD: f64 = 0.03;
+/// Commits come more often than [`LOSS_SECONDS`] asks for while they hold the run up for less than this.
+const CHEAP_OVERHEAD: f64 = 0.01;
+/// But not more often than this: nobody misses the work of so few seconds.
+const SHORTEST_SECONDS: f64 = 10.0;
+/// Most bytes that commits write in an hour: a drive rated for 300 TB takes them for 1,100 hours.
+pub const BYTES_PER_HOUR: f64 = 256.0 * (1u64 << 30) as f64;
+/// Weight of the last commit in the expected cost of the next.
+const LAST_WEIGHT: f64 = 0.5;
+
+/// The value of `--commit-every`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum CommitEvery {
+    /// By what commits cost: see the head of this file.
+    Auto,
+    /// So many seconds from one commit to the next; 0: none that only time asks for.
+    Seconds(f64),
+}
+
+impl FromStr for CommitEvery {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text == "auto" {
+            return Ok(CommitEvery::Auto);
+        }
+        let seconds = text.parse().map_err(|_| format!("'{text}' is neither auto nor a number of seconds"))?;
+        Ok(CommitEvery::Seconds(seconds))
+    }
+}
+
+impl fmt::Display for CommitEvery {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            CommitEvery::Auto => f.write_str("auto"),
+            CommitEvery::Seconds(seconds) => write!(f, "{seconds}"),
+        }
+    }
+}
+
+impl Serialize for CommitEvery {
+    fn serialize<S: Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
+        match self {
+            CommitEvery::Auto => s.serialize_str("auto"),
+            CommitEvery::Seconds(seconds) => s.serialize_f64(*seconds),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for CommitEvery {
+    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(untagged)]
+        enum Written {
+            Integer(i64),
+            Number(f64),
+            Text(String),
+        }
+        match Written::deserialize(d)? {
+            Written::Integer(seconds) => Ok(CommitEvery::Seconds(seconds as f64)),
+            Written::Number(seconds) => Ok(CommitEvery::Seconds(seconds)),
+            Written::Text(text) => text.parse().map_err(serde::de::Error::custom),
+        }
+    }
+}
+
+/// What one commit took.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct CommitCost {
+    /// Seconds that training waited for it.
+    pub waited: f64,
+    /// Seconds from its cut to its being durable.
+    pub until_durable: f64,
+    /// Bytes of pages that were written for it and would not have been written then without it.
+    pub bytes: u64,
+    /// Seconds of work, since the cut of the commit before, that a kill just before this one was durable would have cost.
+    pub at_risk: f64,
+}
+
+/// Totals over the commits of a run, for its reports.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct CommitReport {
+    /// Commits so far.
+    pub commits: u64,
+    /// Bytes of pages written for them.
+    pub commit_bytes: u64,
+    /// Seconds that training waited for them.
+    pub commit_seconds: f64,
+    /// The same in percent of the time that the run has taken.
+    pub commit_overhead_percent: f64,
+    /// Seconds from the end of one commit to the cut of the next, as things are; 0 where time asks for none.
+    pub commit_interval: f64,
+    /// The most seconds of work that a kill could have cost so far.
+    pub commit_loss_seconds: f64,
+}
+
+/// When the next commit is due.
+#[derive(Debug, Clone)]
+pub struct CommitInterval {
+    every: CommitEvery,
+    /// What the next commit is expected to take.
+    expected: Option<CommitCost>,
+    total: CommitReport,
+}
+
+impl CommitReport {
+    /// For the progress line; empty before the first commit.
+    pub fn words(&self) -> String {
+        if self.commits == 0 {
+            return String::new();
+        }
+        let CommitReport { commits, commit_overhead_percent: percent, commit_loss_seconds: loss, .. } = self;
+        format!(" {commits} commits took {percent:.1} %, a kill costs {loss:.0} s at most")
+    }
+}
+
+impl CommitInterval {
+    /// Before the first commit.
+    pub fn new(every: CommitEvery) -> CommitInterval {
+        CommitInterval { every, expected: None, total: CommitReport::default() }
+    }
+
+    /// Seconds from the end of one commit to the cut of the next; `None` where time alone asks for none.
+    pub fn seconds(&self) -> Option<f64> {
+        match self.every {
+            CommitEvery::Seconds(seconds) => (seconds > 0.0).then_some(seconds),
+            CommitEvery::Auto => Some(self.expected.map_or(SHORTEST_SECONDS, automatic)),
+        }
+    }
+
+    /// Whether a commit is due `since` seconds after the last one was durable.
+    pub fn is_due(&self, since: f64) -> bool {
+        self.seconds().is_some_and(|seconds| since >= seconds)
+    }
+
+    /// Takes in what a commit took.
+    pub fn add(&mut self, cost: CommitCost) {
+        let before = self.expected.unwrap_or(cost);
+        let mean = |before: f64, last: f64| before + LAST_WEIGHT * (last - before);
+        self.expected = Some(CommitCost {
+            waited: mean(before.waited, cost.waited),
+            until_durable: mean(before.until_durable, cost.until_durable),
+            bytes: mean(before.bytes as f64, cost.bytes as f64) as u64,
+            at_risk: cost.at_risk,
+        });
+        self.total.commits += 1;
+        self.total.commit_bytes += cost.bytes;
+        self.total.commit_seconds += cost.waited;
+        self.total.commit_loss_seconds = self.total.commit_loss_seconds.max(cost.at_risk);
+    }
+
+    /// Totals, `run_seconds` after the start of this process's part of the run.
+    pub fn report(&self, run_seconds: f64) -> CommitReport {
+        CommitReport {
+            commit_overhead_percent: 100.0 * self.total.commit_seconds
+                / run_seconds.max(self.total.commit_seconds).max(1e-9),
+            commit_interval: self.seconds().unwrap_or(0.0),
+            ..self.total
+        }
+    }
+}
+
+/// The interval for commits of an expected cost.
+fn automatic(cost: CommitCost) -> f64 {
+    // A kill costs the interval and the time until the next commit is durable.
+    let longest = (LOSS_SECONDS - cost.until_durable).max(LOSS_SECONDS / 2.0);
+    let cheap = cost.waited * (1.0 / CHEAP_OVERHEAD - 1.0);
+    let wear = 3600.0 * cost.bytes as f64 / BYTES_PER_HOUR - cost.until_durable;
+    cheap.clamp(SHORTEST_SECONDS, longest).max(wear)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    const GIB: u64 = 1 << 30;
+
+    fn cost(waited: f64, until_durable: f64, bytes: u64) -> CommitCost {
+        CommitCost { waited, until_durable, bytes, at_risk: 0.0 }
+    }
+
+    fn after(costs: &[CommitCost]) -> f64 {
+        let mut interval = CommitInterval::new(CommitEvery::Auto);
+        costs.iter().for_each(|&cost| interval.add(cost));
+        interval.seconds().unwrap()
+    }
+
+    #[test]
+    fn cheap_commits_come_often_and_dear_ones_every_minute() {
+        assert_eq!(CommitInterval::new(CommitEvery::Auto).seconds(), Some(10.0));
+        assert_eq!(after(&[cost(0.0, 0.0, 0)]), 10.0);
+        assert_eq!(after(&[cost(0.05, 0.05, GIB / 8)]), 10.0);
+        // One percent of the time, while a minute allows it.
+        assert!((after(&[cost(0.3, 0.3, GIB)]) - 0.3 * 99.0).abs() < 1e-9);
+        assert!((after(&[cost(1.7, 1.7, GIB)]) - 58.3).abs() < 1e-9);
+    }
+
+    /// Whatever a commit takes, the loss is bounded by a minute, unless bytes forbid it; and commits that three percent
+    /// of a minute allow for take no more than that.
+    #[test]
+    fn the_bounds_hold_for_every_cost() {
+        for tenths in 0..600 {
+            let seconds = f64::from(tenths) / 10.0;
+            let interval = after(&[cost(seconds, seconds, GIB)]);
+            assert!((SHORTEST_SECONDS..=LOSS_SECONDS).contains(&interval), "{seconds}: {interval}");
+            if seconds <= LOSS_SECONDS / 2.0 {
+                assert!(interval + seconds <= LOSS_SECONDS + 1e-9, "{seconds}: {interval}");
+            }
+            if seconds <= OVERHEAD * LOSS_SECONDS {
+                assert!(seconds / (interval + seconds) <= OVERHEAD + 1e-9, "{seconds}: {interval}");
+            }
+            let of_many = after(&[cost(seconds, seconds, 16 * GIB)]);
+            assert!(16.0 * 3600.0 / (of_many + seconds) <= 256.0 + 1e-6, "{seconds}: {of_many}");
+        }
+    }
+
+    #[test]
+    fn the_interval_follows_a_drive_that_changes() {
+        let slow = cost(6.0, 6.0, GIB);
+        let fast = cost(0.1, 0.1, GIB);
+        let mut interval = CommitInterval::new(CommitEvery::Auto);
+        interval.add(slow);
+        let mut last = interval.seconds().unwrap();
+        assert_eq!(last, 54.0);
+        for _ in 0..12 {
+            interval.add(fast);
+            let now = interval.seconds().unwrap();
+            assert!(now <= LOSS_SECONDS, "{now}");
+            last = now;
+        }
+        // 3,600 s x 1 GiB / 256 GiB are 14 s: by now the bytes decide.
+        assert!((13.0..15.0).contains(&last), "{last}");
+    }
+
+    #[test]
+    fn a_plain_number_stays_what_it_is() {
+        for (seconds, since, is_due) in [(5.0, 4.9, false), (5.0, 5.0, true), (0.0, 1e9, false)] {
+            let mut interval = CommitInterval::new(CommitEvery::Seconds(seconds));
+            interval.add(cost(100.0, 100.0, 1 << 50));
+            assert_eq!(interval.is_due(since), is_due, "{seconds}");
+        }
+    }
+
+    #[test]
+    fn totals_are_of_the_whole_run() {
+        let mut interval = CommitInterval::new(CommitEvery::Auto);
+        assert_eq!(interval.report(0.0).commit_overhead_percent, 0.0);
+        interval.add(CommitCost { waited: 0.5, until_durable: 2.0, bytes: 7, at_risk: 12.0 });
+        interval.add(CommitCost { waited: 1.5, until_durable: 2.0, bytes: 8, at_risk: 11.0 });
+        let report = interval.report(100.0);
+        assert_eq!((report.commits, report.commit_bytes, report.commit_seconds), (2, 15, 2.0));
+        assert_eq!((report.commit_overhead_percent, report.commit_loss_seconds), (2.0, 12.0));
+    }
+
+    #[test]
+    fn values_are_read_as_they_are_written() {
+        #[derive(Debug, PartialEq, Serialize, Deserialize)]
+        struct File {
+            every: CommitEvery,
+        }
+        for (text, every) in [("\"auto\"", CommitEvery::Auto), ("60", CommitEvery::Seconds(60.0)), ("0.5", CommitEvery::Seconds(0.5))] {
+            let file: File = toml::from_str(&format!("every = {text}")).unwrap();
+            assert_eq!(file.every, every);
+            assert_eq!(toml::from_str::<File>(&toml::to_string(&file).unwrap()).unwrap(), file);
+            assert_eq!(every.to_string().parse(), Ok(every));
+        }
+        assert!("often".parse::<CommitEvery>().is_err_and(|e| e.contains("often")));
+    }
+}
