@@ -131,10 +131,15 @@ impl Bench {
         self.path(if place == Place::Memory { "out/checkpoint" } else { "spill" })
     }
 
-    /// Waits until the run has logged something after its first `lines` lines, or ended.
+    /// Waits until the run in `out` has logged something after its first `lines` lines, or ended.
     pub fn wait_for_lines(&self, child: &mut Child, lines: usize) {
+        self.wait_for_lines_in("out", child, lines);
+    }
+
+    /// As [`Bench::wait_for_lines`], of the run in the folder of this name.
+    pub fn wait_for_lines_in(&self, out: &str, child: &mut Child, lines: usize) {
         let started = Instant::now();
-        let file = self.path("out/metrics.jsonl");
+        let file = self.path(out).join("metrics.jsonl");
         let count = || std::fs::read_to_string(&file).map_or(0, |text| text.lines().count());
         while count() <= lines && child.try_wait().unwrap().is_none() {
             assert!(started.elapsed() < Duration::from_secs(240), "the run does not get on");

@@ -1,6 +1,6 @@
 //! What may change from life to life, and what may not without being accepted.
 
-use super::bench::{Bench, Place, SELDOM, copy_folder, ended, ply, refused, signal, succeeded};
+use super::bench::{Bench, Place, SELDOM, copy_folder, ended, logged, ply, refused, signal, succeeded};
 use super::scenes::{TextModel, stderr, text};
 use std::path::PathBuf;
 
@@ -71,10 +71,11 @@ fn accepted_changes_are_the_same_in_any_memory() {
     // The twin has fewer frames (the largest view may grow by the change), and is stopped once more.
     let frames = ((alone.fewest + alone.pages) / 2).to_string();
     let mut child = bench.go_on_in("twin", &[&other[..], &["--frames", &frames], &SELDOM[..]].concat());
-    std::thread::sleep(std::time::Duration::from_millis(300));
+    bench.wait_for_lines_in("twin", &mut child, logged(&bench.path("out")).len() - 8);
     signal(&child, "INT");
-    let stopped = child.wait().unwrap();
-    assert!(stopped.code() == Some(130) || stopped.success(), "{stopped:?}");
+    let output = ended(child);
+    // It may have been done before it heard.
+    assert!(output.status.code() == Some(130) || output.status.success(), "{}", stderr(&output));
     succeeded(bench.go_on_in("twin", &["--frames", &frames]));
     let (first, second) = (ply(&bench.path("out")), ply(&bench.path("twin")));
     assert!(first == second, "the same changes gave two scenes");

@@ -52,6 +52,7 @@ fn the_same_command_again_says_that_there_is_a_run() {
     assert!(bench.path("out/checkpoint/FORMAT").exists());
     // Starting over takes the checkpoint away, but not what somebody put beside it.
     std::fs::write(bench.path("out/checkpoint/notes.txt"), "mine").unwrap();
+    std::fs::remove_file(bench.path("out/metrics.jsonl")).unwrap();
     let mut child = bench.begin(Place::Memory, &[&SELDOM[..], &["--overwrite"]].concat());
     bench.wait_for_lines(&mut child, 2);
     assert!(!bench.path("out/checkpoint/FORMAT").exists() && bench.path("out/checkpoint/notes.txt").exists());
