@@ -352,7 +352,7 @@ fn a_really_full_drive_pauses_the_run_until_there_is_space() {
     reader.join().unwrap();
     let said = said.lock().unwrap().clone();
     assert!(status.success(), "{said}");
-    for words in ["no space", "needs", "free", "--disk-full-wait", "training goes on"] {
+    for words in ["No space", "needs", "free", "--disk-full-wait", "training goes on"] {
         assert!(said.contains(words), "{words} in: {said}");
     }
     let ply = |out: &Path| std::fs::read(Trainer::ply_path(out)).unwrap();
