@@ -71,6 +71,22 @@ fn orders_are_compared_in_quality_and_bytes() {
 }
 
 #[test]
+fn commits_are_measured_and_nothing_is_left() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 24, 64, 48, 3000);
+    let spill = folder.path().join("spill");
+    let sizes = ["--steps", "40", "--page-rows", "32", "--commit-every", "0.01", "--open-pages", "300"];
+    let lines = lines(&[&["commit", text(&scene), "--spill-dir", text(&spill)][..], &sizes].concat());
+    let [trained, opened] = &lines[..] else { panic!("{lines:?}") };
+    assert_eq!((number(trained, "steps"), number(opened, "open_pages")), (40.0, 300.0));
+    assert!(number(trained, "commits") > 1.0 && number(trained, "commit_bytes") > 0.0);
+    let percent = number(trained, "commit_overhead_percent");
+    assert!(percent > 0.0 && percent <= 100.0 && number(trained, "beside_percent") <= 100.0, "{trained}");
+    assert!(number(trained, "commit_loss_seconds") > 0.0 && number(opened, "open_seconds") > 0.0);
+    assert!(spill.read_dir().unwrap().next().is_none(), "what was written is removed");
+}
+
+#[test]
 fn a_run_needs_no_name_and_wrong_input_is_refused() {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 10, 64, 48, 300);
@@ -86,6 +102,7 @@ fn a_run_needs_no_name_and_wrong_input_is_refused() {
         assert!(stderr(&output).contains(words) && stderr(&output).contains("remedy"), "{}", stderr(&output));
     };
     refuses(&["tiers", text(&scene)], "--spill-dir");
+    refuses(&["commit", text(&scene)], "--spill-dir");
     let spill = text(folder.path());
     refuses(&["tiers", text(&scene), "--spill-dir", spill, "--shares", "0"], "--shares");
     refuses(&["orders", text(&scene), "--compare-orders", "random"], "--compare-orders");

@@ -1,6 +1,8 @@
 //! `gsscale-bench`: measures training and prints lines of JSON. Which measurement is the first argument; without one of
 //! their names it is `run`. Parses, calls, prints.
 
+#[path = "bench/commit.rs"]
+mod commit;
 #[path = "bench/demand.rs"]
 mod demand;
 #[path = "bench/orders.rs"]
@@ -33,6 +35,8 @@ fn main() -> ExitCode {
     let mut print = |line: &Value| println!("{line}");
     let done = if named("tiers") {
         tiers::start(&parse_arguments(&arguments), &mut print)
+    } else if named("commit") {
+        commit::start(&parse_arguments(&arguments), &mut print)
     } else if named("orders") {
         orders::start(&parse_arguments(&arguments), &mut print)
     } else {

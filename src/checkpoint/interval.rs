@@ -274,7 +274,9 @@ mod tests {
         struct File {
             every: CommitEvery,
         }
-        for (text, every) in [("\"auto\"", CommitEvery::Auto), ("60", CommitEvery::Seconds(60.0)), ("0.5", CommitEvery::Seconds(0.5))] {
+        for (text, every) in
+            [("\"auto\"", CommitEvery::Auto), ("60", CommitEvery::Seconds(60.0)), ("0.5", CommitEvery::Seconds(0.5))]
+        {
             let file: File = toml::from_str(&format!("every = {text}")).unwrap();
             assert_eq!(file.every, every);
             assert_eq!(toml::from_str::<File>(&toml::to_string(&file).unwrap()).unwrap(), file);

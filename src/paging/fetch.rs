@@ -24,6 +24,8 @@ struct Fetch {
     outstanding: BTreeMap<PageNo, usize>,
     /// Whether a training step asks: only then are pages stamped as used, and do failed writes end the call.
     is_step: bool,
+    /// Some of them are in memory, but a commit must write them first.
+    has_frozen: bool,
 }
 
 impl Pager {
@@ -39,7 +41,8 @@ impl Pager {
             return Err(self.working_set(what, held + pages.len()));
         }
         let pinned = pages.iter().map(|_| None).collect();
-        let mut fetch = Fetch { what: what.to_string(), pinned, outstanding: BTreeMap::new(), is_step };
+        let mut fetch =
+            Fetch { what: what.to_string(), pinned, outstanding: BTreeMap::new(), is_step, has_frozen: false };
         fetch.outstanding.extend(pages.iter().copied().zip(0..));
         let result = self.fetch_into(&mut fetch, pages);
         let pinned = fetch.pinned.into_iter().flatten();
@@ -54,15 +57,18 @@ impl Pager {
 
     fn fetch_into(&mut self, fetch: &mut Fetch, pages: &[PageNo]) -> Result<(), PagingError> {
         let failures = self.settle(false, &mut Vec::new());
-        self.write_needed(pages, fetch.is_step)?;
         pages.iter().for_each(|&page| self.pin_into(fetch, page));
         self.stats.pages_needed += pages.len() as u64;
-        self.stats.misses += fetch.outstanding.len() as u64;
-        self.stats.hits += (pages.len() - fetch.outstanding.len()) as u64;
+        let frozen = fetch.outstanding.keys().filter(|page| self.holds_frozen(**page)).count();
+        fetch.has_frozen = frozen > 0;
+        let misses = fetch.outstanding.len() - frozen;
+        self.stats.misses += misses as u64;
+        self.stats.hits += (pages.len() - misses) as u64;
         self.judge(fetch, failures)?;
         let is_absent = |page: &PageNo| self.cache.state(*page).is_none();
         let mut to_read: VecDeque<PageNo> = pages.iter().copied().filter(is_absent).collect();
         loop {
+            self.write_needed(fetch)?;
             while let Some(&page) = to_read.front() {
                 if self.begin_read(page, false) {
                     to_read.pop_front();
@@ -86,23 +92,26 @@ impl Pager {
         }
     }
 
-    /// Begins to write those of the pages that are frozen: they can be pinned afterwards.
-    fn write_needed(&mut self, pages: &[PageNo], is_step: bool) -> Result<(), PagingError> {
-        for &page in pages {
-            let is_resident = self.cache.state(page) == Some(FrameState::Resident);
-            if is_resident
-                && self.frozen.as_ref().is_some_and(|f| f.holds(page))
+    /// Begins to write those pages that are frozen, a few at a time, and pins those that are so no more.
+    fn write_needed(&mut self, fetch: &mut Fetch) -> Result<(), PagingError> {
+        if !fetch.has_frozen {
+            return Ok(());
+        }
+        let pages: Vec<PageNo> = fetch.outstanding.keys().copied().collect();
+        for page in pages {
+            if self.may_write_frozen(page)
                 && let Err(Failure { error, .. }) = self.begin_write(page, true)
             {
-                self.stop_writes(error, is_step)?;
+                self.stop_writes(error, fetch.is_step)?;
             }
+            self.pin_into(fetch, page);
         }
         Ok(())
     }
 
-    /// Pins an outstanding page if it is resident.
+    /// Pins an outstanding page if it is resident and not frozen.
     fn pin_into(&mut self, fetch: &mut Fetch, page: PageNo) {
-        let Some(&place) = fetch.outstanding.get(&page) else { return };
+        let Some(&place) = fetch.outstanding.get(&page).filter(|_| !self.holds_frozen(page)) else { return };
         if let Some((buffer, dirty)) = self.cache.pin(page, fetch.is_step) {
             fetch.outstanding.remove(&page);
             fetch.pinned[place] = Some(PinnedPage { page, meta: self.index[page.index()], dirty, buffer });

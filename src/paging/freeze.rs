@@ -8,6 +8,7 @@
 //! generation of the cut, and everything else for the next one; 3. when a write fails, the cut is given up: what it has
 //! written are versions like others, and the commit before it stands.
 
+use super::commit::WRITES_IN_FLIGHT;
 use super::error::PagingError;
 use super::label::label;
 use super::pager::Pager;
@@ -38,11 +39,6 @@ pub(super) struct Frozen {
 }
 
 impl Frozen {
-    /// Whether a page must not be pinned before it is written.
-    pub fn holds(&self, page: PageNo) -> bool {
-        self.waiting.contains(&page)
-    }
-
     /// A write of a page begins: whether it is the one that the cut waits for.
     pub fn begin_write(&mut self, page: PageNo) -> bool {
         let is_ours = self.waiting.remove(&page);
@@ -118,6 +114,17 @@ impl Pager {
         self.frozen.is_some()
     }
 
+    /// Whether a page must be written before it is pinned.
+    pub(super) fn holds_frozen(&self, page: PageNo) -> bool {
+        self.frozen.as_ref().is_some_and(|f| f.waiting.contains(&page))
+    }
+
+    /// Whether the write of a frozen page may begin because a step waits for it.
+    pub(super) fn may_write_frozen(&self, page: PageNo) -> bool {
+        self.frozen.as_ref().is_some_and(|f| f.waiting.contains(&page) && f.writing.len() < WRITES_IN_FLIGHT)
+            && self.cache.state(page) == Some(FrameState::Resident)
+    }
+
     /// Whether every page of the cut is written.
     pub fn is_frozen_written(&self) -> bool {
         self.frozen.as_ref().is_some_and(|f| f.waiting.is_empty() && f.writing.is_empty())
@@ -151,7 +158,7 @@ impl Pager {
     pub fn finish_frozen(&mut self) -> Result<(), PagingError> {
         while let Some(page) = self.frozen.as_mut().and_then(|f| f.order.pop_front()) {
             if self.frozen.as_ref().is_some_and(|f| f.waiting.contains(&page)) {
-                self.settle_below(super::commit::WRITES_IN_FLIGHT)?;
+                self.settle_below(WRITES_IN_FLIGHT)?;
                 self.begin_write(page, false).map_err(|f| f.error)?;
             }
         }

@@ -285,17 +285,18 @@ impl Checkpoint {
         (self.last, self.last_cut) = (Instant::now(), cut);
     }
 
-    /// Whether few slots are free, no more can be made, and a commit would make some free.
+    /// Whether a commit is needed for its space alone.
     fn space_is_short(&self, trainer: &Trainer) -> bool {
-        let Some(SlotSpace { total, free, retired, segment_bytes }) = trainer.scene.pager.slot_space() else {
-            return false;
-        };
-        if free * FEW_FREE >= total || retired * WORTH_FREEING < total {
-            return false;
-        }
+        let Some(space) = trainer.scene.pager.slot_space().filter(is_worth_a_commit) else { return false };
         let left = crate::page::file_system::free_bytes(&self.folder).ok().flatten();
-        left.is_some_and(|left| left < segment_bytes)
+        left.is_some_and(|left| left < space.segment_bytes)
     }
+}
+
+/// Whether few slots are free, and a commit would make some free.
+fn is_worth_a_commit(space: &SlotSpace) -> bool {
+    let SlotSpace { total, free, retired, .. } = *space;
+    free * FEW_FREE < total && retired * WORTH_FREEING >= total
 }
 
 fn is_late(beside: &Beside) -> bool {
@@ -373,5 +374,19 @@ fn stats_of(traffic: &TrafficSoFar) -> PagerStats {
         stall_seconds: traffic.stall_seconds,
         pinned_max: traffic.pinned_max as usize,
         ..PagerStats::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_commit_before_its_time_must_be_needed_and_of_use() {
+        let space = |total, free, retired| SlotSpace { total, free, retired, segment_bytes: 1 };
+        assert!(is_worth_a_commit(&space(100, 9, 5)) && is_worth_a_commit(&space(100, 0, 100)));
+        assert!(!is_worth_a_commit(&space(100, 10, 50)), "there are slots");
+        assert!(!is_worth_a_commit(&space(100, 0, 4)), "it would make hardly any free");
+        assert!(!is_worth_a_commit(&space(0, 0, 0)), "there are none yet");
     }
 }

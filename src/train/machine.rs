@@ -9,11 +9,13 @@ use crate::render::Renderer;
 use crate::render::cpu::CpuRenderer;
 use crate::render::gpu::GpuRenderer;
 
-/// Starts the worker threads that `config` asks for and checks its instruction path.
+/// Starts the worker threads that `config` asks for, checks its instruction path, and sees to it that a limit on the
+/// size of files is an error like others.
 ///
 /// # Errors
 /// This machine lacks the instructions.
 pub fn set_up(config: &TrainConfig) -> InputResult<()> {
+    super::signals::survive_file_size_limit();
     if config.threads > 0 {
         // A pool that exists already (a library user's) is kept: results do not depend on it.
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();

@@ -1,8 +1,16 @@
-//! Ctrl-C and SIGTERM: the first asks the loop to finish its step, the second ends the process at once.
+//! Ctrl-C and SIGTERM: the first asks the loop to finish its step, the second ends the process at once. And the signal
+//! about a file that is too large, which ends nothing.
 
 use signal_hook::consts::{SIGINT, SIGTERM};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+
+/// Writing a file beyond the size that this process may write is an error that can be told, and not its end.
+pub fn survive_file_size_limit() {
+    // Where the system refuses the handler, its own stays.
+    #[cfg(unix)]
+    let _ = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default());
+}
 
 /// Whether, and by which signal, the process was asked to stop.
 #[derive(Debug, Clone, Default)]

@@ -2,6 +2,7 @@
 //! the pages that its view needs, with the bytes that were last put into them.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
+mod beside;
 mod failures;
 mod traffic;
 mod world;
