@@ -92,7 +92,7 @@ impl Gpu {
         }
     }
 
-    /// Submits; does not wait.
+    /// Submits; does not wait, unless [`super::GpuOptions::serial`] asks for it.
     ///
     /// # Errors
     /// The API refused the commands, the device was lost or ran out of memory, or two recorders were open at once.
@@ -101,7 +101,11 @@ impl Gpu {
             let problem = "two recorders are open at once".into();
             return Err(GpuError::Bindings { stage: recorder.name.into(), problem });
         }
-        recorder.flush()
+        let submission = recorder.flush()?;
+        if self.serial {
+            self.wait(&submission)?;
+        }
+        Ok(submission)
     }
 
     /// Waits until the device has finished a submission.
