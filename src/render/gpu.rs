@@ -273,7 +273,13 @@ impl GpuRenderer {
     }
 
     /// Submits the loss of the view's picture, whether or not it is right yet.
-    fn submit_loss(&self, mut recorder: Recorder<'_>, view: &View, pixels: &Buffer, plan: &LossPlan) -> GpuResult<Loss> {
+    fn submit_loss(
+        &self,
+        mut recorder: Recorder<'_>,
+        view: &View,
+        pixels: &Buffer,
+        plan: &LossPlan,
+    ) -> GpuResult<Loss> {
         let gpu = &self.gpu;
         let v_rgb = gpu.buffer("v_rgb", view.frame.rgb.size())?;
         let size = [view.camera.width, view.camera.height];
