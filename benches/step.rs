@@ -13,7 +13,8 @@
 //! view once forward and once backward at the rate of a bare forward loop that stays in registers, and moving 11
 //! floats for each parameter (gather reads three and writes one for every row in view; Adam reads four and writes
 //! three for every row with a gradient) at the rate of a plain copy. The backward pass has about three times the
-//! arithmetic of the forward pass, so a ratio of 1 is out of reach.
+//! arithmetic of the forward pass, so a ratio of 1 is out of reach. Beside each part stands what moving its bytes once
+//! would take on all threads; parts that compute more than they move (the rasterizer, the loss) cannot reach that.
 
 pub mod support;
 
@@ -32,6 +33,7 @@ use gsscale::train::step::{WorkingSet, train_step};
 use serde_json::json;
 use std::time::{Duration, Instant};
 use support::cases::{Case, PHOTO_CASES, photo_case, terrain_case};
+use support::cpu_bytes::{CpuCounts, part_bytes};
 use support::floor::{bare_blend_rate, copy_rate};
 use support::{Args, Hash, Seconds, machine, median, time};
 
@@ -78,6 +80,8 @@ pub fn tiny() -> u64 {
     let case = terrain_case(300, 48, 40, 2);
     let result = run(&case, SimdPath::best(), TINY, floor);
     assert!(result.cpu.wall > 0.0 && result.floor_seconds > 0.0 && result.rows > 0.0);
+    // All but these move rows, lists or pictures.
+    assert!(result.parts.iter().all(|p| p.name == "acquire" || p.floor > 0.0));
     result.hash
 }
 
@@ -105,6 +109,14 @@ struct Floor {
     bytes: f64,
 }
 
+/// A part of a step: what it took, and what moving its bytes would take on all threads.
+struct Part {
+    name: &'static str,
+    wall: f64,
+    bytes: f64,
+    floor: f64,
+}
+
 /// What a case took, per step.
 struct StepResult {
     cpu: Seconds,
@@ -115,8 +127,7 @@ struct StepResult {
     updated: f64,
     pairs: f64,
     isects: f64,
-    /// Name and mean wall seconds of each part.
-    parts: Vec<(&'static str, f64)>,
+    parts: Vec<Part>,
     hash: u64,
 }
 
@@ -131,10 +142,10 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
     let stride = case.views.len().div_ceil(effort.views);
     let views: Vec<&(Camera, Target)> = case.views.iter().step_by(stride).collect();
     let (mut step, mut hash, mut rounds) = (0, Hash::default(), Vec::new());
-    let mut counts = [0.0; 4];
+    let mut counts = [0.0; 6];
     for round in 0..effort.warm_up + effort.rounds {
         if round == effort.warm_up {
-            (renderer.parts, counts) = (Vec::new(), [0.0; 4]);
+            (renderer.parts, counts) = (Vec::new(), [0.0; 6]);
         }
         rounds.push(time(|| {
             for (camera, target) in &views {
@@ -145,8 +156,9 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
                 let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
                 renderer.note_end();
                 let stats = renderer.inner.stats();
-                let of_step =
-                    [outcome.rows as f64, outcome.updated as f64, stats.evaluated as f64, stats.isects as f64];
+                let (pinned, rows) = (outcome.rows_pinned as f64, outcome.rows as f64);
+                let (updated, pixels) = (outcome.updated as f64, camera.pixels() as f64);
+                let of_step = [rows, updated, stats.evaluated as f64, stats.isects as f64, pinned, pixels];
                 counts.iter_mut().zip(of_step).for_each(|(sum, x)| *sum += x);
                 hash.add(outcome.loss.loss.to_bits());
                 step += 1;
@@ -157,9 +169,14 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
     let cpu: Vec<f64> = rounds[effort.warm_up..].iter().map(|s| s.cpu / n).collect();
     let wall = median(rounds[effort.warm_up..].iter().map(|s| s.wall / n));
     let steps = n * effort.rounds as f64;
-    let [rows, updated, pairs, isects] = counts.map(|c| c / steps);
-    let mut parts = split_cull(&renderer.parts, &mut scene, step, &views);
-    parts.iter_mut().for_each(|(_, seconds)| *seconds /= steps);
+    let [rows, updated, pairs, isects, pinned, pixels] = counts.map(|c| c / steps);
+    let counts = CpuCounts { pinned, rows, updated, isects, pixels };
+    let rate = floor.bytes * rayon::current_num_threads() as f64;
+    let parts = split_cull(&renderer.parts, &mut scene, step, &views).into_iter().map(|(name, seconds)| {
+        let bytes = part_bytes(name, &counts);
+        Part { name, wall: seconds / steps, bytes, floor: bytes / rate }
+    });
+    let parts = parts.collect();
     let bytes = 4.0 * row_width(case.columns.sh_degree) as f64 * (4.0 * rows + 7.0 * updated);
     StepResult {
         cpu: Seconds { wall, cpu: median(cpu.iter().copied()) },
@@ -239,14 +256,20 @@ impl StepResult {
             });
             println!("  OpenSplat {:.0} ms CPU on a Zen 5: {factor:.1} times ours{wanted}", 1e3 * peer.opensplat);
         }
-        print!("  wall ms:");
-        for (name, seconds) in &self.parts {
-            print!(" {name} {:.2}", 1e3 * seconds);
-        }
-        println!();
+        println!("  {:<22} {:>9} {:>9} {:>9} {:>7}", "part", "wall ms", "MB moved", "floor ms", "ratio");
+        let row = |name: &str, wall: f64, bytes: f64, floor: f64| {
+            let ratio = if floor > 0.0 { format!("{:.1}", wall / floor) } else { "-".to_string() };
+            println!("  {name:<22} {:>9.2} {:>9.2} {:>9.3} {ratio:>7}", 1e3 * wall, bytes / 1e6, 1e3 * floor);
+        };
+        self.parts.iter().for_each(|p| row(p.name, p.wall, p.bytes, p.floor));
+        let sum = |of: fn(&Part) -> f64| self.parts.iter().map(of).sum::<f64>();
+        row("all", sum(|p| p.wall), sum(|p| p.bytes), sum(|p| p.floor));
     }
 
     fn json(&self, case: &Case, simd: SimdPath) -> serde_json::Value {
+        let part = |p: &Part| {
+            (p.name.to_string(), json!({ "wall_seconds": p.wall, "bytes": p.bytes, "floor_seconds": p.floor }))
+        };
         json!({
             "case": case.name, "gaussians": case.columns.rows(), "rows": self.rows, "updated": self.updated,
             "isects": self.isects, "pairs": self.pairs, "cpu_seconds": self.cpu.cpu, "wall_seconds": self.cpu.wall,
@@ -255,7 +278,7 @@ impl StepResult {
             "peer_cpu_seconds": case.peer.as_ref().map(|p| p.opensplat),
             "times_faster": case.peer.as_ref().map(|p| p.opensplat / self.cpu.cpu),
             "target": case.peer.as_ref().and_then(|p| p.target),
-            "stage_wall_seconds": self.parts.iter().map(|&(n, s)| (n.to_string(), json!(s))).collect::<serde_json::Map<_, _>>(),
+            "stages": self.parts.iter().map(part).collect::<serde_json::Map<_, _>>(),
             "losses": format!("{:016x}", self.hash), "path": simd.name(),
             "threads": rayon::current_num_threads(), "machine": machine(simd),
         })

@@ -6,6 +6,7 @@
 #![allow(dead_code)] // each benchmark uses a part of it
 
 pub mod cases;
+pub mod cpu_bytes;
 pub mod device_bytes;
 pub mod floor;
 

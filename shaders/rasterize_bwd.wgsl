@@ -355,7 +355,8 @@ fn fold_rows(
     if !is_here {
         return;
     }
-    if row_end > view.window_end {
+    // More to come. (A row without intersections is complete, wherever its place would be.)
+    if row_end > view.window_end && row_end > row_first {
         v_splats[at] = vec4<f32>(row_sums[s], row_sums[s + 1u], row_sums[s + 2u], row_sums[s + 3u]);
         v_splats[at + 1u] = vec4<f32>(row_sums[s + 4u], row_sums[s + 5u], row_sums[s + 6u], row_sums[s + 7u]);
         v_splats[at + 2u] = vec4<f32>(row_sums[s + 8u], 0.0, 0.0, 0.0);

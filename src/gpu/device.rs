@@ -41,6 +41,10 @@ pub enum DeviceChoice {
 pub struct GpuOptions {
     /// Lowers the largest binding, bytes.
     pub max_binding_bytes: Option<u64>,
+    /// Lowers the rows of a window of columns.
+    pub window_rows: Option<u64>,
+    /// Waits for each submission before anything else is done: the plain path, beside which overlap is tested.
+    pub serial: bool,
     /// `Some(false)` takes the plain path where the adapter has subgroup operations.
     pub subgroups: Option<bool>,
     /// `Some(false)` takes the path for subgroups of any size where all have 8 invocations.
@@ -158,6 +162,8 @@ pub struct Gpu {
     summary: AdapterSummary,
     limits: wgpu::Limits,
     max_binding_bytes: u64,
+    window_rows: u64,
+    pub(super) serial: bool,
     subgroups: bool,
     subgroups_of_8: bool,
     uniform_blocks: bool,
@@ -212,6 +218,8 @@ impl Gpu {
             recorders: AtomicU32::new(0),
             injector: Injector::new(options.fault.or_else(InjectedFault::from_environment)),
             max_binding_bytes: options.max_binding_bytes.map_or(own_max, |lowered| lowered.min(own_max)),
+            window_rows: options.window_rows.unwrap_or(u64::MAX),
+            serial: options.serial,
             subgroups,
             subgroups_of_8: summary.subgroup_sizes == Some((8, 8)) && options.subgroups_of_8 != Some(false),
             uniform_blocks: options.uniform_blocks.unwrap_or(summary.kind != DeviceKind::Software),
@@ -250,6 +258,11 @@ impl Gpu {
     /// Largest binding, bytes: longer columns are bound in windows.
     pub fn max_binding_bytes(&self) -> u64 {
         self.max_binding_bytes
+    }
+
+    /// Most rows of a window of columns, whatever a binding holds.
+    pub fn window_rows(&self) -> u64 {
+        self.window_rows
     }
 
     /// Offsets of bound windows are multiples of this, bytes.

@@ -151,6 +151,12 @@ impl Faults {
         });
     }
 
+    /// Whether anything was reported that nobody was told yet.
+    pub(super) fn is_reported(&self) -> bool {
+        let state = lock(&self.state);
+        state.first.is_some() || state.lost.is_some()
+    }
+
     /// The device is gone.
     pub(super) fn lost(&self, message: String) {
         let mut state = lock(&self.state);

@@ -11,9 +11,12 @@ pub enum FaultKind {
     Lost,
     /// A command is recorded that the graphics API refuses.
     Validation,
-    /// The driver says that it has no memory left. (Reported as the driver would: filling a device that shares the
-    /// machine's memory would take the machine with it.)
+    /// The driver says that it has no memory left. Reported as the driver would: filling a device that shares the
+    /// machine's memory would take the machine with it.
     OutOfMemory,
+    /// The device is filled until the driver refuses, for real. On one that shares the machine's memory, do this under a
+    /// limit of the address space (`ulimit -v`).
+    Full,
 }
 
 /// A fault at one submission.
@@ -25,7 +28,7 @@ pub struct InjectedFault {
     pub submission: u64,
 }
 
-/// Names a fault for any program: `lost@40`, `validation@40`, `memory@40`.
+/// Names a fault for any program: `lost@40`, `validation@40`, `memory@40`, `full@40`.
 const VARIABLE: &str = "GSSCALE_GPU_FAULT";
 
 impl InjectedFault {
@@ -36,6 +39,7 @@ impl InjectedFault {
             "lost" => FaultKind::Lost,
             "validation" => FaultKind::Validation,
             "memory" => FaultKind::OutOfMemory,
+            "full" => FaultKind::Full,
             _ => return None,
         };
         Some(InjectedFault { kind, submission: at.parse().ok()? })

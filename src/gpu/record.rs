@@ -30,6 +30,10 @@ pub fn groups_1d(count: u32, workgroup: u32) -> [u32; 3] {
 /// Bytes of one uniform buffer of the ring.
 const UNIFORM_CHUNK: u64 = 64 << 10;
 
+/// Bytes of a buffer that fills the device on purpose, and most of them: a tebibyte.
+const FILL_BYTES: u64 = 128 << 20;
+const FILL_BUFFERS: usize = 8192;
+
 /// Uniform buffers that every submission fills anew.
 #[derive(Debug)]
 pub(super) struct UniformRing {
@@ -92,7 +96,7 @@ impl Gpu {
         }
     }
 
-    /// Submits; does not wait.
+    /// Submits; does not wait, unless [`super::GpuOptions::serial`] asks for it.
     ///
     /// # Errors
     /// The API refused the commands, the device was lost or ran out of memory, or two recorders were open at once.
@@ -101,7 +105,11 @@ impl Gpu {
             let problem = "two recorders are open at once".into();
             return Err(GpuError::Bindings { stage: recorder.name.into(), problem });
         }
-        recorder.flush()
+        let submission = recorder.flush()?;
+        if self.serial {
+            self.wait(&submission)?;
+        }
+        Ok(submission)
     }
 
     /// Waits until the device has finished a submission.
@@ -397,6 +405,20 @@ impl Recorder<'_> {
             Some(FaultKind::OutOfMemory) => {
                 self.gpu.faults.report(&wgpu::Error::OutOfMemory { source: "a fault on purpose".into() });
             }
+            Some(FaultKind::Full) => self.fill_device(),
+        }
+    }
+
+    /// Asks for memory until the driver refuses, as another program may do, and gives it back: the refusal stays reported.
+    fn fill_device(&self) {
+        let mut taken = Vec::new();
+        while !self.gpu.faults.is_reported() && taken.len() < FILL_BUFFERS {
+            taken.push(self.gpu.device.create_buffer(&wgpu::BufferDescriptor {
+                label: Some("all there is"),
+                size: FILL_BYTES,
+                usage: wgpu::BufferUsages::STORAGE,
+                mapped_at_creation: false,
+            }));
         }
     }
 

@@ -2,13 +2,33 @@
 //!
 //! Not here: the stages themselves (`gpu_rows`, `gpu_tiles`, `gpu_loss`), the device and its memory (`crate::gpu`).
 //!
+//! What crosses the bus in a step, with n rows in view, p pixels and all colour bands: 236 n bytes of values and 4 p of
+//! the photo up, 236 n of gradients and 16 n for densification down, and some KiB of counts and uniforms. Less is not
+//! possible while the truth of every value is on the host (the photo's mask could be left out where there is none).
+//! What waits for what:
+//!
+//! | crosses | while |
+//! | --- | --- |
+//! | geometry up (44 n) | nothing: it is the first thing that the device needs |
+//! | colours up (192 n) | the device projects and sorts |
+//! | photo up (4 p), commands of the loss | the device finishes the colours, makes the lists and blends |
+//! | two counts down, commands of the backward stages | the device computes the loss |
+//! | gradients of colours down (192 n) | the device goes from splats to geometry |
+//! | gradients of geometry down (60 n) | nothing: they are the last thing that the device makes |
+//!
+//! So the device waits for the host between two steps only. There the next step's values are not known yet: each row in
+//! view was just rewritten by the optimizer, and the cull of the next view reads the means that it wrote. The rows of the
+//! next view that this one does not see are known (their values are a function of the stored state and the step), but
+//! which these are follows from a cull too; that, and keeping rows on the device, is for the device tier. The next photo
+//! is known, but has its place above, where it delays nothing.
+//!
 //! Invariants: 1. only the rows of the last view, its lists and its picture are on the device; 2. the same input gives
-//! the same bits on the same device; 3. a picture is never returned from buffers that were too small: such a frame is
-//! recorded again with larger ones; 4. after an error there is no view until the next `forward`.
+//! the same bits on the same device; 3. nothing is returned that was made of buffers that were too small: such a frame
+//! and its loss are recorded again with larger ones; 4. after an error there is no view until the next `forward`.
 
 use super::gpu_loss::{LossStage, value};
 use super::gpu_rows::{DeviceColumns, FOOTPRINT_BYTES, RowStages, band_into_sh_n};
-use super::gpu_tiles::{Blend, Demand, Frame, Ranks, TileStages, splat_bytes};
+use super::gpu_tiles::{Blend, Demand, DemandReadback, Frame, Ranks, TileStages, splat_bytes};
 use super::gpu_tiles_bwd::PictureGradients;
 use super::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
 use crate::gpu::{Buffer, DeviceKind, Gpu, GpuResult, Readback, Recorder, Traffic};
@@ -22,6 +42,15 @@ use crate::scene::image::{Image, Target};
 /// A row of what densification needs: the gradient by the mean on the screen, and the radii.
 type Footprint = [f32; 4];
 
+/// What the frame of a view needs, which tells whether its picture is right.
+#[derive(Debug)]
+enum Need {
+    /// On its way to the host.
+    UnderWay(DemandReadback),
+    /// The frame had room for it.
+    Met(Demand),
+}
+
 /// What the device holds of the last view.
 #[derive(Debug)]
 struct View {
@@ -31,9 +60,17 @@ struct View {
     splats: Buffer,
     ranks: Ranks,
     frame: Frame,
-    demand: Demand,
+    need: Need,
     /// Whether `image` holds its picture.
     image_is_read: bool,
+}
+
+/// A view whose picture is right.
+struct Settled {
+    view: View,
+    demand: Demand,
+    /// Its frame was recorded again: what was made of the picture before is void.
+    again: bool,
 }
 
 /// Host memory that is kept between views.
@@ -64,6 +101,13 @@ struct GradientReadbacks {
     /// Means, quats, scales, opacities.
     geometry: Vec<Readback>,
     footprints: Readback,
+    sums: Option<Readback>,
+}
+
+/// A loss that is under way.
+struct Loss {
+    v_rgb: Buffer,
+    /// None for a picture without pixels.
     sums: Option<Readback>,
 }
 
@@ -100,9 +144,12 @@ impl GpuRenderer {
         self.frames_again
     }
 
-    /// Intersections of the last view; 0 before there is one.
+    /// Intersections of the last view; 0 before its loss or picture was taken.
     pub fn isects(&self) -> u32 {
-        self.view.as_ref().map_or(0, |view| view.demand.isects)
+        match self.view.as_ref().map(|view| &view.need) {
+            Some(Need::Met(demand)) => demand.isects,
+            _ => 0,
+        }
     }
 
     /// Coverage 1 - T of the last picture, `[height][width]`.
@@ -110,16 +157,19 @@ impl GpuRenderer {
     /// # Errors
     /// Without a forward pass, or when the device failed.
     pub fn alpha(&mut self) -> Result<Vec<f32>, RenderError> {
-        let view = self.view.as_ref().ok_or(RenderError::NoForward)?;
+        let view = self.view.take().ok_or(RenderError::NoForward)?;
+        let Settled { view, .. } = self.settle(view)?;
         let mut alpha = vec![0.0; view.camera.pixels()];
         let mut recorder = self.gpu.begin("coverage");
         let bytes = recorder.read_back("rasterize_fwd", &view.frame.t_final.view())?;
         self.gpu.submit(recorder)?;
         bytes.copy_to(&self.gpu, &mut alpha)?;
+        self.view = Some(view);
         alpha.iter_mut().for_each(|t| *t = 1.0 - *t);
         Ok(alpha)
     }
 
+    /// Submits the forward stages; does not wait for them.
     fn render(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> GpuResult<View> {
         let gpu = &self.gpu;
         // The caller has checked that the count fits.
@@ -137,17 +187,32 @@ impl GpuRenderer {
         let mut recorder = gpu.begin("forward");
         columns.upload_colors(&mut recorder, rows, &mut self.scratch.band)?;
         self.rows.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, &splats)?;
+        let (frame, demand) = self.tiles.frame(gpu, &mut recorder, &splats.view(), &ranks, blend)?;
+        gpu.submit(recorder)?;
+        let (camera, options, need) = (*camera, *options, Need::UnderWay(demand));
+        Ok(View { camera, options, columns, splats, ranks, frame, need, image_is_read: false })
+    }
+
+    /// Waits for what the view's frame needs. A frame with too little room is recorded again, with more.
+    fn settle(&mut self, mut view: View) -> GpuResult<Settled> {
+        let (gpu, mut again) = (&self.gpu, false);
         loop {
-            let (frame, demand) = self.tiles.frame(gpu, &mut recorder, &splats.view(), &ranks, blend)?;
-            gpu.submit(recorder)?;
-            let demand = demand.wait(gpu)?;
-            if self.tiles.fits(&frame, demand)? {
-                let (camera, options) = (*camera, *options);
-                return Ok(View { camera, options, columns, splats, ranks, frame, demand, image_is_read: false });
+            let demand = match view.need {
+                Need::Met(demand) => demand,
+                Need::UnderWay(readback) => readback.wait(gpu)?,
+            };
+            view.need = Need::Met(demand);
+            if self.tiles.fits(&view.frame, demand)? {
+                return Ok(Settled { view, demand, again });
             }
+            again = true;
             self.frames_again += 1;
-            drop(frame);
-            recorder = gpu.begin("forward again");
+            let blend = view.frame.blend;
+            drop(view.frame); // its memory is free for the next
+            let mut recorder = gpu.begin("forward again");
+            let (frame, demand) = self.tiles.frame(gpu, &mut recorder, &view.splats.view(), &view.ranks, blend)?;
+            gpu.submit(recorder)?;
+            (view.frame, view.need) = (frame, Need::UnderWay(demand));
         }
     }
 
@@ -165,7 +230,7 @@ impl GpuRenderer {
     fn submit_backward(
         &self,
         mut recorder: Recorder<'_>,
-        view: &View,
+        Settled { view, demand, .. }: &Settled,
         v_rgb: &Buffer,
         v_alpha: Option<&Buffer>,
     ) -> GpuResult<GradientReadbacks> {
@@ -179,7 +244,7 @@ impl GpuRenderer {
             &splats.view(),
             &view.ranks,
             &view.frame,
-            view.demand,
+            *demand,
             PictureGradients { v_rgb: &v_rgb.view(), v_alpha: v_alpha.as_ref() },
             &v_splats.view(),
         )?;
@@ -207,26 +272,46 @@ impl GpuRenderer {
         Ok(back)
     }
 
+    /// Submits the loss of the view's picture, whether or not it is right yet.
+    fn submit_loss(
+        &self,
+        mut recorder: Recorder<'_>,
+        view: &View,
+        pixels: &Buffer,
+        plan: &LossPlan,
+    ) -> GpuResult<Loss> {
+        let gpu = &self.gpu;
+        let v_rgb = gpu.buffer("v_rgb", view.frame.rgb.size())?;
+        let size = [view.camera.width, view.camera.height];
+        let (rgb, target) = (view.frame.rgb.view(), pixels.view());
+        let sums = self.loss.run(gpu, &mut recorder, size, plan, &rgb, &target, &v_rgb.view())?;
+        let sums = sums.map(|sums| recorder.read_back("image_loss", &sums.slice(0, 16))).transpose()?;
+        gpu.submit(recorder)?;
+        Ok(Loss { v_rgb, sums })
+    }
+
     fn run_loss(
         &mut self,
-        view: &View,
+        view: View,
         target: &Target,
         plan: &LossPlan,
         sh_degree: u8,
         grads: &mut Gradients,
-    ) -> GpuResult<LossValue> {
-        let gpu = &self.gpu;
+    ) -> GpuResult<(View, LossValue)> {
+        // The device blends while the photo is packed, crosses the bus, and the loss is recorded behind it.
         pack_target(target, &mut self.scratch.target);
-        let mut recorder = gpu.begin("backward");
+        let mut recorder = self.gpu.begin("image_loss");
         let pixels = recorder.buffer_with("target", &self.scratch.target)?;
-        let v_rgb = gpu.buffer("v_rgb", view.frame.rgb.size())?;
-        let size = [target.width, target.height];
-        let (rgb, target) = (view.frame.rgb.view(), pixels.view());
-        let sums = self.loss.run(gpu, &mut recorder, size, plan, &rgb, &target, &v_rgb.view())?;
-        let sums = sums.map(|sums| recorder.read_back("image_loss", &sums.slice(0, 16))).transpose()?;
-        let back = self.submit_backward(recorder, view, &v_rgb, None)?;
-        let sums = self.finish(view, GradientReadbacks { sums, ..back }, sh_degree, grads)?;
-        Ok(value(plan, sums))
+        let mut loss = self.submit_loss(recorder, &view, &pixels, plan)?;
+        let settled = self.settle(view)?;
+        if settled.again {
+            drop(loss); // of a picture that was not right
+            loss = self.submit_loss(self.gpu.begin("image_loss"), &settled.view, &pixels, plan)?;
+        }
+        let back = self.submit_backward(self.gpu.begin("backward"), &settled, &loss.v_rgb, None)?;
+        let back = GradientReadbacks { sums: loss.sums, ..back };
+        let sums = self.finish(&settled.view, back, sh_degree, grads)?;
+        Ok((settled.view, value(plan, sums)))
     }
 
     /// Waits for the gradients and puts them where the caller wants them; returns the sums of the loss.
@@ -286,13 +371,14 @@ impl GpuRenderer {
         grads: &mut Gradients,
     ) -> Result<(), RenderError> {
         let view = self.take_view(rows)?;
+        let settled = self.settle(view)?;
         let gpu = &self.gpu;
         let mut recorder = gpu.begin("backward");
         let v_rgb = recorder.buffer_with("v_rgb", v_rgb)?;
         let v_alpha = v_alpha.map(|v| recorder.buffer_with("v_alpha", v)).transpose()?;
-        let back = self.submit_backward(recorder, &view, &v_rgb, v_alpha.as_ref())?;
-        self.finish(&view, back, rows.sh_degree, grads)?;
-        self.view = Some(view);
+        let back = self.submit_backward(recorder, &settled, &v_rgb, v_alpha.as_ref())?;
+        self.finish(&settled.view, back, rows.sh_degree, grads)?;
+        self.view = Some(settled.view);
         Ok(())
     }
 
@@ -341,7 +427,8 @@ impl Renderer for GpuRenderer {
     }
 
     fn image(&mut self) -> Result<&Image, RenderError> {
-        let mut view = self.view.take().ok_or(RenderError::NoForward)?;
+        let view = self.view.take().ok_or(RenderError::NoForward)?;
+        let Settled { mut view, .. } = self.settle(view)?;
         if !view.image_is_read {
             self.read_image(&view)?;
             view.image_is_read = true;
@@ -364,7 +451,7 @@ impl Renderer for GpuRenderer {
             return Err(RenderError::TargetSize { target: size, image });
         }
         let plan = LossPlan::new(size.0 as usize, size.1 as usize, target.mask.as_deref(), options);
-        let value = self.run_loss(&view, target, &plan, rows.sh_degree, grads)?;
+        let (view, value) = self.run_loss(view, target, &plan, rows.sh_degree, grads)?;
         self.view = Some(view);
         Ok(value)
     }

@@ -157,7 +157,8 @@ struct WindowViews {
 /// Windows that cover `rows` rows so that no binding of `row_bytes` per row exceeds the device's limit.
 fn windows(gpu: &Gpu, rows: u32, row_bytes: u64) -> impl Iterator<Item = Window> {
     let rows = u64::from(rows);
-    let step = (gpu.max_binding_bytes() / row_bytes / WINDOW_STEP * WINDOW_STEP).max(WINDOW_STEP);
+    let most = (gpu.max_binding_bytes() / row_bytes).min(gpu.window_rows());
+    let step = (most / WINDOW_STEP * WINDOW_STEP).max(WINDOW_STEP);
     (0..rows.div_ceil(step)).map(move |i| Window { first: i * step, rows: (rows - i * step).min(step) as u32 })
 }
 

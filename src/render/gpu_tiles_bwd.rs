@@ -1,8 +1,8 @@
 //! Records the backward half of the tile stages: sums of every intersection, then gradients of every row's splat.
 //!
 //! Invariants: 1. the sums of all intersections need not fit one binding: they are made window by window, each from a
-//! pass of its own over the lists, and a row that a window cuts carries its sums on, so the result has the same values
-//! for any window (but for the sign of zeros); 2. the order of every sum is fixed.
+//! pass of its own over the lists, and a row that a window cuts carries its sums on, so the result has the same bits for
+//! any window; 2. the order of every sum is fixed.
 
 use super::gpu_tiles::{Demand, Frame, Ranks, TileStages, raster_uniforms, words};
 use crate::gpu::{BufferView, Gpu, GpuResult, Recorder, groups_1d};

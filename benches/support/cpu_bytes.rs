@@ -1,0 +1,60 @@
+//! Bytes that the parts of a step on the CPU must move: every input read once and every output written once, where a part
+//! gathers through an index once per gather. Colours use all bands. What stays in a cache between two parts is counted
+//! all the same, so a small view can be below its floor.
+
+/// What a step's bytes follow from, means over steps.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct CpuCounts {
+    /// Rows in the pinned pages.
+    pub pinned: f64,
+    /// Rows in view.
+    pub rows: f64,
+    /// Rows that the optimizer rewrites.
+    pub updated: f64,
+    /// Intersections.
+    pub isects: f64,
+    /// Pixels.
+    pub pixels: f64,
+}
+
+/// Bytes of means, quats, scales and opacities; of sh0; of the higher bands.
+const GEOMETRY: f64 = 44.0;
+const SH0: f64 = 12.0;
+const BANDS: f64 = 180.0;
+/// Bytes of all values of a row.
+const ROW: f64 = GEOMETRY + SH0 + BANDS;
+/// A row as projection leaves it: position, conic, depth, extent, opacity.
+const FOOTPRINT: f64 = 36.0;
+/// A row as the tile loops read it, with what it reaches and its count.
+const SPLAT: f64 = 64.0;
+const SPAN: f64 = 20.0;
+/// Nine sums.
+const PARTIAL: f64 = 36.0;
+
+/// Bytes of a part of a step of these counts; 0 for one that moves none by this account.
+pub fn part_bytes(part: &str, counts: &CpuCounts) -> f64 {
+    let CpuCounts { pinned, rows, updated, isects, pixels } = *counts;
+    match part {
+        // Means and scales with both moments, and the stamp.
+        "cull" => pinned * (2.0 * 36.0 + 4.0) + 4.0 * rows,
+        // Values with both moments in, values out.
+        "gather" => rows * (3.0 * ROW + 8.0 + ROW),
+        "project_fwd" => rows * (GEOMETRY + FOOTPRINT),
+        "sh_fwd" => rows * (8.0 + 12.0 + SH0 + BANDS + 12.0),
+        // Three passes over keys of 8 bytes, each read twice and written once.
+        "radix_sort" => rows * (12.0 + 8.0 + 3.0 * 24.0 + 12.0),
+        "scan" => rows * (FOOTPRINT + 12.0 + SPLAT + SPAN),
+        "isect_offsets" => rows * (4.0 + SPAN),
+        "isect_emit" => rows * (4.0 + SPAN) + isects * 8.0,
+        "rasterize_fwd" => isects * (8.0 + SPLAT) + pixels * 20.0,
+        // Picture and photo in, gradient out.
+        "image_loss" => pixels * (12.0 + 3.0 + 12.0),
+        // The list again and the sums of each; then sums and splats in, gradients of footprints and colours out.
+        "rasterize_bwd" => isects * (8.0 + SPLAT + 2.0 * PARTIAL) + pixels * 20.0 + rows * (SPLAT + PARTIAL),
+        "sh_bwd" => rows * (8.0 + 12.0 + 12.0 + 12.0 + BANDS + 12.0 + SH0 + BANDS),
+        "project_bwd" => rows * (GEOMETRY + FOOTPRINT + 24.0 + 12.0 + GEOMETRY),
+        // Values, both moments and the gradient in, all but the gradient out.
+        "adam+statistics+bounds" => updated * 7.0 * ROW,
+        _ => 0.0,
+    }
+}
