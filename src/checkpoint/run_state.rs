@@ -22,6 +22,10 @@ pub struct DatasetPrint {
     pub first_rows: u64,
     /// Scene scale, local units.
     pub scene_scale: f32,
+    /// Dataset coordinates of the local frame's zero: a PLY of the run needs no more than its state and its pages.
+    pub origin: [f64; 3],
+    /// Dataset units per local unit.
+    pub scale: f64,
 }
 
 /// A run between two steps.
@@ -121,6 +125,10 @@ impl RunState {
         if !ascends || self.histogram.last().is_some_and(|last| last.0 >= BINS) {
             return refuse("its statistics have bins that do not exist");
         }
+        let DatasetPrint { origin, scale, .. } = &self.dataset;
+        if !(origin.iter().all(|x| x.is_finite()) && scale.is_normal() && *scale > 0.0) {
+            return refuse("its local frame is none");
+        }
         if !(self.train_seconds >= 0.0 && self.train_seconds.is_finite()) {
             return refuse("it has trained for no length of time");
         }
@@ -149,7 +157,7 @@ mod tests {
             simd: "avx2".to_string(),
             device: "cpu".to_string(),
             sh_degree_start: 0,
-            dataset: DatasetPrint { views: vec![5, u64::MAX], first_rows: 7, scene_scale: 1.25 },
+            dataset: DatasetPrint { views: vec![5, u64::MAX], first_rows: 7, scene_scale: 1.25, origin: [5e5, -1.0, 0.0], scale: 2.5 },
             events: events.to_vec(),
             histogram: vec![(3, 1), (32767, 9)],
             rows: 10,
@@ -184,6 +192,8 @@ mod tests {
         refused(|s| s.histogram = vec![(32768, 1)]);
         refused(|s| s.histogram.reverse());
         refused(|s| s.train_seconds = f64::NAN);
+        refused(|s| s.dataset.scale = 0.0);
+        refused(|s| s.dataset.origin[1] = f64::INFINITY);
     }
 
     #[test]

@@ -9,5 +9,6 @@ pub mod label;
 pub mod pager;
 pub mod pinned;
 pub mod stats;
+pub mod stored;
 mod transfers;
 mod window;

@@ -150,7 +150,8 @@ pub fn dataset_print(dataset: &Dataset, first_rows: u64) -> DatasetPrint {
         bytes.extend([camera.width, camera.height].iter().flat_map(|n| n.to_le_bytes()));
         checksum(&bytes) as u64
     });
-    DatasetPrint { views: views.collect(), first_rows, scene_scale: dataset.scene_scale }
+    let (origin, scale) = (dataset.frame.origin.to_array(), dataset.frame.scale);
+    DatasetPrint { views: views.collect(), first_rows, scene_scale: dataset.scene_scale, origin, scale }
 }
 
 /// Refuses a dataset that is not the one of the run, and says where it differs first.
@@ -177,6 +178,9 @@ pub fn check_dataset(dataset: &Dataset, there: &DatasetPrint, here: &DatasetPrin
     }
     if there.scene_scale.to_bits() != here.scene_scale.to_bits() {
         return refuse(format!("its scale was {} and is {}", there.scene_scale, here.scene_scale));
+    }
+    if (there.origin, there.scale) != (here.origin, here.scale) {
+        return refuse(format!("its frame was {:?} x {} and is {:?} x {}", there.origin, there.scale, here.origin, here.scale));
     }
     Ok(())
 }

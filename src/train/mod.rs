@@ -2,7 +2,7 @@
 //! [`preflight`] whether that fits), [`trainer`] loops over steps, [`step`] is one step from top to bottom,
 //! [`checkpoint`] commits it, [`resume`] goes on from a commit, [`pages`] has the rows of a run in pages and brings them to now with [`catch_up`], `update` changes them, [`eval`] looks at
 //! held-out views, [`report`] writes what happened, [`progress`] shows it, [`machine`] starts its threads, [`signals`]
-//! hears Ctrl-C.
+//! hears Ctrl-C, [`stores`] is what tools do with checkpoints.
 
 pub mod catch_up;
 pub mod checkpoint;
@@ -19,6 +19,7 @@ pub mod run;
 pub mod signals;
 pub mod start;
 pub mod step;
+pub mod stores;
 pub mod tiers;
 pub mod trainer;
 mod update;

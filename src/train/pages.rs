@@ -63,7 +63,7 @@ pub struct PagedScene {
 }
 
 impl PageRules {
-    fn new(options: &RunOptions) -> PageRules {
+    pub(super) fn new(options: &RunOptions) -> PageRules {
         PageRules {
             adam: DeferredAdam::new(options.rates, options.adam, options.render.simd).with_moments(options.moments),
             events: EventLog::default(),
@@ -93,7 +93,7 @@ impl PageRules {
     }
 
     /// The entry of a page that was rewritten with these rows.
-    fn meta(&self, id: PageId, state: &SceneState) -> PageMeta {
+    pub(super) fn meta(&self, id: PageId, state: &SceneState) -> PageMeta {
         PageMeta {
             id,
             rows: state.rows() as u32,
@@ -327,7 +327,20 @@ impl PagedScene {
         let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
         pages.retain(|p| index[p.index()].rows > 0);
         pages.sort_unstable_by_key(|p| index[p.index()].id);
-        self.visit(&pages, &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
+        self.for_rows_of(&pages, now, each)
+    }
+
+    /// As [`PagedScene::for_all_rows`], of these pages alone.
+    ///
+    /// # Errors
+    /// Pages could not be had, or `each` failed.
+    pub fn for_rows_of<E: From<PagingError>>(
+        &mut self,
+        pages: &[PageNo],
+        now: u32,
+        each: &mut dyn FnMut(&Columns) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.visit(pages, &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
     }
 
     /// Pins the pages batch by batch and hands their rows to `each`, with pending events applied to copies.
