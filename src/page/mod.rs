@@ -21,8 +21,8 @@ pub mod memory_store;
 pub mod mmap_store;
 #[doc(hidden)]
 pub mod mutants;
-pub mod opening;
 pub mod new_store;
+pub mod opening;
 mod page_cache;
 mod page_done;
 pub mod page_error;

@@ -335,7 +335,11 @@ pub fn refuse_if_in_use(folder: &Path) -> InputResult<Option<File>> {
 
 fn in_use(folder: &Path, who: &str) -> InputError {
     let problem = format!("a process is writing to this store ({who}), so its pages cannot be read");
-    InputError::new(folder, problem, "wait for it to end, or stop it (Ctrl-C commits first); ls and diff work meanwhile")
+    InputError::new(
+        folder,
+        problem,
+        "wait for it to end, or stop it (Ctrl-C commits first); ls and diff work meanwhile",
+    )
 }
 
 enum ReadLock {

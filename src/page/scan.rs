@@ -59,7 +59,8 @@ impl Scan {
             Ok(header) if header.slot.place == place => self.found.entry(header.store).or_default().push(header),
             Ok(header) => {
                 let meant = header.slot.place;
-                let what = format!("page {} was meant for segment {} offset {}", header.page, meant.segment, meant.offset);
+                let what =
+                    format!("page {} was meant for segment {} offset {}", header.page, meant.segment, meant.offset);
                 self.broken.push((place, what));
             }
             // Never written, or the inside of a payload.

@@ -400,7 +400,9 @@ pub(super) fn format_bytes_of(folder: &Path) -> InputResult<Option<Vec<u8>>> {
 
 pub(super) fn bad_format(folder: &Path, error: &FormatError) -> InputError {
     let remedy = match error {
-        FormatError::Version { .. } | FormatError::Features { .. } => "use the program that made it, or name another folder",
+        FormatError::Version { .. } | FormatError::Features { .. } => {
+            "use the program that made it, or name another folder"
+        }
         _ => OTHER_FOLDER,
     };
     InputError::new(folder.join(FORMAT), error.to_string(), remedy)

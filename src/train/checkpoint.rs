@@ -180,7 +180,10 @@ pub fn check_dataset(dataset: &Dataset, there: &DatasetPrint, here: &DatasetPrin
         return refuse(format!("its scale was {} and is {}", there.scene_scale, here.scene_scale));
     }
     if (there.origin, there.scale) != (here.origin, here.scale) {
-        return refuse(format!("its frame was {:?} x {} and is {:?} x {}", there.origin, there.scale, here.origin, here.scale));
+        return refuse(format!(
+            "its frame was {:?} x {} and is {:?} x {}",
+            there.origin, there.scale, here.origin, here.scale
+        ));
     }
     Ok(())
 }

@@ -87,7 +87,8 @@ pub(super) fn usual_codec<'a>(slots: impl Iterator<Item = &'a SlotRef>) -> Codec
 }
 
 fn damaged(place: &StorePlace, page: PageId, slot: &SlotRef, what: &str) -> InputError {
-    let remedy = "gsscale-ckpt verify --deep lists all that is damaged; roll back to a generation without it, or salvage";
+    let remedy =
+        "gsscale-ckpt verify --deep lists all that is damaged; roll back to a generation without it, or salvage";
     InputError::new(place.folder.join(segment_file_name(slot.place.segment)), format!("page {page}: {what}"), remedy)
         .at(format!("offset {}", slot.place.offset))
 }

@@ -102,7 +102,9 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
     })?;
     if given == 0 && request.crop.is_some() {
         let problem = "no Gaussian lies in this box";
-        return Err(InputError::new("--crop", problem, "the box is minx,miny,minz,maxx,maxy,maxz in dataset units").into());
+        return Err(
+            InputError::new("--crop", problem, "the box is minx,miny,minz,maxx,maxy,maxz in dataset units").into()
+        );
     }
     let written = writer.finish()?;
     Ok(Exported {

@@ -110,7 +110,8 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
     let (rows, meta, sh_degree) = spool_rows(&request.file, space)?;
     let count = rows.len();
     let (config, options) = options_for(request, sh_degree, &meta)?;
-    let layout = SlotLayout::new(capacity_bytes(options.page_rows, sh_degree), count.div_ceil(options.page_rows) as u64);
+    let layout =
+        SlotLayout::new(capacity_bytes(options.page_rows, sh_degree), count.div_ceil(options.page_rows) as u64);
     let mut pages = PageWriter {
         store: NewStore::create(&request.out, layout, request.codec)?,
         rules: PageRules::new(&options),

@@ -129,9 +129,17 @@ fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
         format!("{} Gaussians in pages, {} with all promised growth", state.rows, state.rows_bound),
         format!("SH degree {degree} in use, up to {}; {} Gaussians a page at most", config.sh_degree, config.page_rows),
         format!("{} events: {rounds} rounds, {resets} opacity resets, {raises} SH raises{last}", state.events.len()),
-        format!("strategy {}, view order {}, seed {}, moments {}", config.strategy, config.view_order, config.seed, config.moments),
+        format!(
+            "strategy {}, view order {}, seed {}, moments {}",
+            config.strategy, config.view_order, config.seed, config.moments
+        ),
         format!("rendered by {}, instruction path {}", state.device, state.simd),
-        format!("dataset of {} views, {} first Gaussians, origin {x} {y} {z}, scale {}", print.views.len(), print.first_rows, print.scale),
+        format!(
+            "dataset of {} views, {} first Gaussians, origin {x} {y} {z}, scale {}",
+            print.views.len(),
+            print.first_rows,
+            print.scale
+        ),
         format!("{} steps and {} updates skipped as not finite", state.steps_skipped, state.rows_skipped),
         format!("{} bytes of metrics.jsonl belong to it", state.metrics_bytes),
     ]

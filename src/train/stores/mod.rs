@@ -20,7 +20,7 @@ pub use copy::{Copied, clone_store};
 pub use diff::{StoreDiff, diff};
 pub use export::{ExportRequest, Exported, export};
 pub use import::{ImportRequest, Imported, import};
-pub use inspect::{Inspected, PageInspected, inspect, inspect_page};
+pub use inspect::{Inspected, PageInspected, Spread, inspect, inspect_page};
 pub use list::{GenerationLine, Listed, list};
 pub use salvage::{LostPage, SalvageRequest, Salvaged, salvage};
 pub use verify::{Fault, Verdict, verify};
@@ -57,7 +57,11 @@ pub struct StorePlace {
 /// There is none.
 pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
     if !dir.is_dir() {
-        return Err(InputError::new(dir, "there is no such folder", "name a run's output folder or its spill directory"));
+        return Err(InputError::new(
+            dir,
+            "there is no such folder",
+            "name a run's output folder or its spill directory",
+        ));
     }
     // A FORMAT file that was lost leaves the segments.
     if dir.join("FORMAT").exists() || segments_in(dir).is_ok_and(|segments| !segments.is_empty()) {
@@ -76,7 +80,8 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
     if folder.is_dir() {
         return Ok(StorePlace { folder, run: Some(dir.to_path_buf()) });
     }
-    let problem = format!("the checkpoint of this run, {}, is not there: it is removed when a run ends", folder.display());
+    let problem =
+        format!("the checkpoint of this run, {}, is not there: it is removed when a run ends", folder.display());
     Err(InputError::new(dir, problem, "its result is point_cloud.ply in the same folder"))
 }
 

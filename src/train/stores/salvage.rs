@@ -198,12 +198,7 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
             applied.is_some_and(|applied| applied <= state.events.len()) && reader.payload(h.page, &h.slot).is_ok()
         };
         let instead = older.filter(|h| h.slot != page.slot).find(usable);
-        lost.push(LostPage {
-            page: page.page.to_string(),
-            rows,
-            taken: instead.map(|h| h.slot.generation),
-            what,
-        });
+        lost.push(LostPage { page: page.page.to_string(), rows, taken: instead.map(|h| h.slot.generation), what });
         if let Some(h) = instead {
             kept.insert(h.page, Kept { slot: h.slot, label: h.label.clone() });
         }
@@ -211,7 +206,11 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
     let rows: u64 = kept.iter().filter_map(|(id, k)| meta_from_label(*id, &k.label)).map(|m| u64::from(m.rows)).sum();
     let promised = state.rows_bound.saturating_sub(state.rows);
     (state.rows, state.rows_bound) = (rows, rows + promised);
-    let mut copy = NewStore::create(&request.to, layout_for(source.layout, kept.len() as u64), usual_codec(kept.values().map(|k| &k.slot)))?;
+    let mut copy = NewStore::create(
+        &request.to,
+        layout_for(source.layout, kept.len() as u64),
+        usual_codec(kept.values().map(|k| &k.slot)),
+    )?;
     for (id, Kept { slot, label }) in &kept {
         copy.put(*id, label, reader.payload(*id, slot).map_err(|what| changed(&source.folder, *id, &what))?)?;
     }
@@ -263,7 +262,8 @@ fn without_state(place: &StorePlace, mut source: Source, request: &SalvageReques
         return Err(InputError::new(&place.folder, problem, "there is nothing to salvage").into());
     }
     let mut config = config_for(place, request, &kept, &mut source)?;
-    let degree = kept.iter().filter_map(|(id, h)| meta_from_label(*id, &h.label)).map(|m| m.sh_degree).max().unwrap_or(0);
+    let degree =
+        kept.iter().filter_map(|(id, h)| meta_from_label(*id, &h.label)).map(|m| m.sh_degree).max().unwrap_or(0);
     let (rows, step) = measure(&mut reader, &kept, &source)?;
     config.0.steps = config.0.steps.max(step);
     let state = state_for(&config, rows, step, degree)?;
@@ -303,30 +303,37 @@ fn whole(reader: &mut SlotReader, header: &SlotHeader) -> Result<(), String> {
     check_values(&layout_of(&meta).rows(payload, 0), u32::MAX)
 }
 
-/// Takes out pages that were split later, and says where their parts are not all there.
+/// Takes out pages that were split later, and says where their parts are not all there. Parts that are older than the
+/// whole page come from a time that was rolled back: they go.
 fn drop_split_pages(
     kept: &mut BTreeMap<PageId, SlotHeader>,
     found: &BTreeMap<PageId, Vec<SlotHeader>>,
     lost: &mut Vec<LostPage>,
 ) {
-    let known: BTreeSet<PageId> = found.keys().copied().collect();
-    let was_split = |id: &PageId| !descendants(*id, &known).is_empty();
-    let split: Vec<PageId> = known.iter().copied().filter(was_split).collect();
-    for id in &split {
-        kept.remove(id);
+    let mut known: BTreeSet<PageId> = found.keys().copied().collect();
+    let newest = |id: &PageId| found.get(id).and_then(|of| of.first()).map_or(0, |h| h.serial);
+    let mut split = Vec::new();
+    for &id in found.keys() {
+        let parts = descendants(id, &known);
+        if parts.iter().map(newest).max().is_some_and(|serial| serial > newest(&id)) {
+            split.push(id);
+        } else {
+            parts.iter().for_each(|part| {
+                known.remove(part);
+            });
+        }
     }
-    // The lowest split page above a gap names it.
+    split.retain(|id| known.contains(id));
+    kept.retain(|id, _| known.contains(id) && !split.contains(id));
+    lost.retain(|page| page.page.parse().is_ok_and(|id| known.contains(&id) && !split.contains(&id)));
     for id in &split {
-        let Some(children) = id.children() else { continue };
-        for child in children {
+        for child in id.children().into_iter().flatten() {
             if !known.contains(&child) && descendants(child, &known).is_empty() {
-                let what = format!("page {id} was split and this part of it is nowhere");
+                let what = format!("page {id} was split, and this part is nowhere or has lost all its Gaussians");
                 lost.push(LostPage { page: child.to_string(), rows: None, taken: None, what });
             }
         }
     }
-    // Versions of a page that was split are of no interest any more.
-    lost.retain(|page| split.iter().all(|id| id.to_string() != page.page));
 }
 
 /// Pages that a page was split into, however often: its subtree without itself.
@@ -365,8 +372,7 @@ fn config_for(
     let file = request.config.clone().or_else(|| place.run.as_ref().map(|run| run.join("config.toml")));
     let metas = kept.iter().filter_map(|(id, h)| meta_from_label(*id, &h.label));
     let (rows, degree) = metas.fold((0, 0), |(rows, degree), m| (m.rows.max(rows), m.sh_degree.max(degree)));
-    let mut print =
-        DatasetPrint { views: Vec::new(), first_rows: 0, scene_scale: 1.0, origin: [0.0; 3], scale: 1.0 };
+    let mut print = DatasetPrint { views: Vec::new(), first_rows: 0, scene_scale: 1.0, origin: [0.0; 3], scale: 1.0 };
     let Some(file) = file else {
         source.notes.push(
             "the run's config is not known (name the run's output folder, or --config): default rates, local coordinates"
@@ -377,7 +383,10 @@ fn config_for(
     };
     let config = TrainConfig::read(&file)?;
     if config.page_rows < rows || config.sh_degree < degree {
-        let problem = format!("it has page-rows {} and sh-degree {}, its pages have {rows} and {degree}", config.page_rows, config.sh_degree);
+        let problem = format!(
+            "it has page-rows {} and sh-degree {}, its pages have {rows} and {degree}",
+            config.page_rows, config.sh_degree
+        );
         return Err(InputError::new(file, problem, "give the config.toml of the run that made these pages"));
     }
     let resolved = read_resolved(&file)?;
