@@ -12,7 +12,7 @@ mod fixture;
 #[path = "support/scenes.rs"]
 mod scenes;
 
-use bench::{Bench, EVENTLESS, Ply, ckpt, failed, json, pin};
+use bench::{Bench, EVENTLESS, Ply, ckpt, failed, json, pin, train_from};
 use gsscale::exchange::ply::{PlyMeta, write_gaussians};
 use gsscale::page::format::checksum;
 use gsscale::scene::columns::{Column, Columns};
@@ -176,7 +176,7 @@ fn names_keep_generations_until_they_are_pruned() {
     let out = bench.stopped(&[]);
     let first = generations(&json(&["ls", text(&out)]))[0];
     pin(&bench.spill(), &[("early", first), ("also-early", first)]);
-    bench.go_on_until_stopped(&[]);
+    bench.go_on_until_stopped();
     let listed = json(&["ls", text(&out)]);
     let kept = generations(&listed);
     assert_eq!((kept.len(), kept[0]), (3, first), "{listed}");
@@ -206,7 +206,7 @@ fn names_keep_generations_until_they_are_pruned() {
 #[test]
 fn a_store_in_use_is_not_written_and_what_only_looks_says_so() {
     let bench = Bench::new();
-    let (out, mut child) = bench.running(&["--steps", "20000"]);
+    let (out, mut child) = bench.running(&["--steps", "20000", "--commit-every", "0.02"]);
     let busy = json(&["ls", text(&out)]);
     assert!(busy["used_by"].as_str().unwrap().contains(&format!("process {}", child.id())), "{busy}");
     assert!(ckpt(&["ls", text(&out)]).contains("in use"));
@@ -386,7 +386,6 @@ fn a_lost_witness_costs_nothing() {
 fn segments_that_are_cut_short_or_gone_are_named() {
     let bench = Bench::new();
     let out = bench.stopped(&[]);
-    let pages = json(&["ls", text(&out)])["generations"][1]["pages"].as_u64().unwrap();
     let mut segments: Vec<PathBuf> =
         bench.store_files().into_keys().filter(|p| p.extension().is_some_and(|e| e == "dat")).collect();
     segments.sort();
@@ -403,7 +402,7 @@ fn segments_that_are_cut_short_or_gone_are_named() {
     assert!(found[1]["kind"] == "header" && found[1]["what"].to_string().contains("ends inside"), "{found:?}");
     std::fs::remove_file(&segments[0]).unwrap();
     let found = faults(&["verify", text(&out)]);
-    assert!(found[0]["what"] == "it is missing" && found.len() as u64 > pages / 4, "{found:?}");
+    assert!(found[0]["what"] == "it is missing" && found.len() > 20, "{found:?}");
     assert!(found[1]["what"].to_string().contains("seg-00000000.dat is missing"), "{found:?}");
 }
 
@@ -513,6 +512,21 @@ fn gaussians_go_into_a_store_and_out_again_within_the_budget() {
     std::fs::write(path("cut.ply"), &bytes[..bytes.len() / 2]).unwrap();
     let cut = failed(&["import", text(&path("cut.ply")), "--out", text(&path("other"))]);
     assert!(cut.contains("cut.ply") && !path("other").exists() && !path("other.part").exists(), "{cut}");
+}
+
+#[test]
+fn a_run_starts_from_a_store_as_from_the_file_that_it_was_made_of() {
+    let bench = Bench::new();
+    let out = bench.stopped(&["--export-frame", "local"]);
+    let (file, store) = (out.join("point_cloud.ply"), bench.path("store"));
+    json(&["import", text(&file), "--out", text(&store), "--page-rows", "32"]);
+    let want = train_from(&bench, &file, "from-file");
+    assert!(train_from(&bench, &store, "from-store") == want, "the store is another start than its file");
+    // The checkpoint of a run is a start as well; its pages are others than the file's, so its roundings are.
+    let rows = Ply::read(&file).rows.len();
+    train_from(&bench, &out, "from-run");
+    let started = scenes::summary(&bench.path("from-run"));
+    assert!(started["gaussians"].as_u64().unwrap().abs_diff(rows as u64) < rows as u64 / 5, "{started}");
 }
 
 #[test]

@@ -48,7 +48,7 @@ pub struct PageRules {
 }
 
 /// Gets the rows of some pages, numbered through.
-type Visitor<'v, E> = dyn FnMut(&PageRules, &[Rows<'_>]) -> Result<(), E> + 'v;
+pub(super) type Visitor<'v, E> = dyn FnMut(&PageRules, &[Rows<'_>]) -> Result<(), E> + 'v;
 
 /// The pages of a run and what they share.
 pub struct PagedScene {
@@ -145,7 +145,8 @@ impl PagedScene {
         }
     }
 
-    fn empty(pager: Pager, options: &RunOptions) -> PagedScene {
+    /// No pages yet.
+    pub(super) fn empty(pager: Pager, options: &RunOptions) -> PagedScene {
         let (rules, histogram) = (PageRules::new(options), GradHistogram::default());
         PagedScene { pager, rules, histogram, rows: 0, rows_bound: 0 }
     }
@@ -168,7 +169,8 @@ impl PagedScene {
         PagedScene { pager, rules, histogram, rows, rows_bound }
     }
 
-    fn insert_first_page(&mut self, id: PageId, state: &SceneState) -> Result<(), PagingError> {
+    /// Adds a page of first Gaussians.
+    pub(super) fn insert_first_page(&mut self, id: PageId, state: &SceneState) -> Result<(), PagingError> {
         let meta = self.rules.meta(id, state);
         self.pager.insert(meta, |payload| {
             write_page(state, payload);
@@ -344,7 +346,7 @@ impl PagedScene {
     }
 
     /// Pins the pages batch by batch and hands their rows to `each`, with pending events applied to copies.
-    fn visit<E: From<PagingError>>(&mut self, pages: &[PageNo], each: &mut Visitor<'_, E>) -> Result<(), E> {
+    pub(super) fn visit<E: From<PagingError>>(&mut self, pages: &[PageNo], each: &mut Visitor<'_, E>) -> Result<(), E> {
         let batch = PAGES_PER_BATCH.min(self.pager.stats().frames_max).max(1);
         for pages in pages.chunks(batch) {
             let pinned = self.pager.acquire_pages(pages)?;

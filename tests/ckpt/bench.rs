@@ -42,6 +42,8 @@ const BUSY: &[&str] = &[
     "cpu",
     "--frames",
     "4000",
+    "--commit-every",
+    "0",
     "--quiet",
 ];
 
@@ -87,23 +89,23 @@ impl Bench {
         std::fs::read(out.join("point_cloud.ply")).unwrap()
     }
 
-    /// A run that has committed a few times and goes on.
+    /// A run that goes on.
     pub fn running(&self, more: &[&str]) -> (PathBuf, Child) {
         let (out, spill) = (self.path("out"), self.spill());
-        let mut args =
-            vec![text(&self.scene), "--out", text(&out), "--spill-dir", text(&spill), "--commit-every", "0.02"];
+        let mut args = vec![text(&self.scene), "--out", text(&out), "--spill-dir", text(&spill)];
         // A key that is given anew takes the place of the usual one.
         let pairs = BUSY.chunks(2).filter(|pair| !more.contains(&pair[0]));
         args.extend(pairs.flatten().chain(more));
         let mut child = spawn(&args);
-        self.wait_for_lines(&mut child, 24);
+        self.wait_for_lines(&mut child, 20);
         (out, child)
     }
 
-    /// A run that was asked to stop at about two thirds of its steps.
+    /// A run that was asked to stop twice, some steps apart, at about two thirds of them: two generations.
     pub fn stopped(&self, more: &[&str]) -> PathBuf {
         let (out, child) = self.running(more);
         stop(child);
+        self.go_on_until_stopped();
         out
     }
 
@@ -114,17 +116,20 @@ impl Bench {
     }
 
     /// Goes on for a few steps.
-    pub fn go_on_until_stopped(&self, more: &[&str]) {
-        let mut child = spawn(&[&["--resume", text(&self.path("out")), "--quiet"], more].concat());
-        self.wait_for_lines(&mut child, 30);
+    pub fn go_on_until_stopped(&self) {
+        let lines = self.lines();
+        let mut child = spawn(&["--resume", text(&self.path("out")), "--quiet"]);
+        self.wait_for_lines(&mut child, lines + 4);
         stop(child);
+    }
+
+    fn lines(&self) -> usize {
+        std::fs::read_to_string(self.path("out/metrics.jsonl")).map_or(0, |text| text.lines().count())
     }
 
     fn wait_for_lines(&self, child: &mut Child, lines: usize) {
         let started = Instant::now();
-        let file = self.path("out/metrics.jsonl");
-        let count = || std::fs::read_to_string(&file).map_or(0, |text| text.lines().count());
-        while count() < lines {
+        while self.lines() < lines {
             assert!(child.try_wait().unwrap().is_none(), "the run ended before it could be stopped");
             assert!(started.elapsed() < Duration::from_secs(120), "the run does not get on");
             std::thread::sleep(Duration::from_millis(1));
@@ -240,4 +245,16 @@ impl Ply {
         scales.sort_by(f64::total_cmp);
         (scales[1] + scales[2]).exp() / (1.0 + (-at("opacity")).exp())
     }
+}
+
+/// A run from Gaussians that are somewhere else, of a few steps.
+pub fn train_from(bench: &Bench, init: &Path, out: &str) -> Vec<u8> {
+    let out = bench.path(out);
+    let more =
+        ["--init-ply", text(init), "--steps", "12", "--page-rows", "32", "--refine-start", "4", "--refine-every", "4"];
+    let args =
+        [&[text(&bench.scene), "--out", text(&out), "--quiet", "--device", "cpu", "--grow-grad2d", "0.001"], &more[..]];
+    let output = train(&args.concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    std::fs::read(out.join("point_cloud.ply")).unwrap()
 }

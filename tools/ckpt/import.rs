@@ -12,9 +12,11 @@ const EXAMPLES: &str = "\
 Examples:
   gsscale-ckpt import city.ply --out /mnt/nvme/city
   gsscale-ckpt import city.ply --out /mnt/nvme/city --host-mem 512MiB --page-rows 512
+  gsscale-train scans/city --out runs/city --init-ply /mnt/nvme/city --spill-dir /mnt/nvme/pages
   gsscale-ckpt export /mnt/nvme/city --out block.ply --crop 0,0,0,10,10,10
 
-The file may be larger than memory. Its values are kept bit for bit; moments are zero.";
+The file may be larger than memory. Its values are kept bit for bit; moments are zero. gsscale-train starts from the
+store with --init-ply.";
 
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]

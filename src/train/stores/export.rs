@@ -134,7 +134,7 @@ fn meta_of(state: &RunState, options: &RunOptions) -> PlyMeta {
 }
 
 /// The pages of a generation behind as many frames as the budget allows.
-fn scene_at(
+pub(super) fn scene_at(
     store: &StoreReader,
     generation: u64,
     state: &RunState,

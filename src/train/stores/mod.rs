@@ -13,6 +13,7 @@ mod import;
 mod inspect;
 mod list;
 mod salvage;
+mod start;
 mod verify;
 
 pub use change::{PruneRequest, Pruned, RolledBack, prune, rollback};
@@ -23,6 +24,7 @@ pub use import::{ImportRequest, Imported, import};
 pub use inspect::{Inspected, PageInspected, Spread, inspect, inspect_page};
 pub use list::{GenerationLine, Listed, list};
 pub use salvage::{LostPage, SalvageRequest, Salvaged, salvage};
+pub use start::StoredStart;
 pub use verify::{Fault, Verdict, verify};
 
 use super::trainer::TrainError;
