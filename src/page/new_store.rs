@@ -3,7 +3,7 @@
 //! It is made beside its target under another name and renamed when it is complete.
 //!
 //! Invariants: 1. the target is a whole store or nothing: a tool that fails or is killed leaves at most a folder with
-//! [`PART_SUFFIX`], which the next attempt refuses to overwrite; 2. no more than [`IN_FLIGHT`] pages are in memory.
+//! [`PART_SUFFIX`], which the next attempt refuses to overwrite; 2. memory is bounded by sixteen pages.
 
 use super::buffer::PageBuffer;
 use super::codec::Codec;

@@ -17,7 +17,7 @@ use tempfile::TempDir;
 /// Rounds, resets and raises of the SH degree before the stop; pages that split.
 const BUSY: &[&str] = &[
     "--steps",
-    "120",
+    "400",
     "--page-rows",
     "32",
     "--grow-grad2d",
@@ -26,6 +26,8 @@ const BUSY: &[&str] = &[
     "15",
     "--refine-every",
     "10",
+    "--refine-stop",
+    "100",
     "--reset-every",
     "40",
     "--sh-every",
@@ -101,7 +103,7 @@ impl Bench {
         (out, child)
     }
 
-    /// A run that was asked to stop twice, some steps apart, at about two thirds of them: two generations.
+    /// A run that was asked to stop twice, some steps apart, long before its end: two generations.
     pub fn stopped(&self, more: &[&str]) -> PathBuf {
         let (out, child) = self.running(more);
         stop(child);

@@ -22,6 +22,8 @@ fn pack(folder: &Path) -> Vec<u8> {
     let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
     let options = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
     let mut paths: Vec<PathBuf> = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path()).collect();
+    // Who used it last is nobody's business.
+    paths.retain(|path| path.file_name().is_some_and(|name| name != "LOCK"));
     paths.sort();
     for path in paths {
         zip.start_file(path.file_name().unwrap().to_str().unwrap(), options).unwrap();
