@@ -116,11 +116,11 @@ fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
     let rounds = count(|k| matches!(k, EventKind::Densify(_)));
     let resets = count(|k| matches!(k, EventKind::ResetOpacity { .. }));
     let raises = count(|k| matches!(k, EventKind::RaiseShDegree { .. }));
-    let degrees = state.events.iter().filter_map(|e| match e.kind {
+    let raised = state.events.iter().rev().find_map(|e| match e.kind {
         EventKind::RaiseShDegree { degree } => Some(degree),
         _ => None,
     });
-    let degree = degrees.last().unwrap_or(state.sh_degree_start);
+    let degree = raised.unwrap_or(state.sh_degree_start);
     let last = state.events.last().map_or(String::new(), |e| format!(", the last after step {}", e.step));
     let print = &state.dataset;
     let [x, y, z] = print.origin;
