@@ -35,6 +35,25 @@ impl PageId {
     }
 }
 
+/// As [`PageId`] is displayed: `7`, `7.0`, `7.0.1`.
+impl std::str::FromStr for PageId {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<PageId, String> {
+        let wrong = || format!("'{text}' names no page; write for example 7 or 7.0.1");
+        let mut parts = text.split('.');
+        let first = parts.next().and_then(|n| n.parse().ok()).ok_or_else(wrong)?;
+        parts.try_fold(PageId::initial(first), |id, part| {
+            let half = match part {
+                "0" => 0,
+                "1" => 1,
+                _ => return Err(wrong()),
+            };
+            id.children().map(|children| children[half]).ok_or_else(wrong)
+        })
+    }
+}
+
 impl std::fmt::Display for PageId {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let path = self.0 as u32;
@@ -67,6 +86,12 @@ mod tests {
         let [low_low, low_high] = low.children().unwrap_or([root; 2]);
         assert!(PageId::initial(6) < low_low && low_low < low_high && low_high < high && high < PageId::initial(8));
         assert_eq!(format!("{root} {low} {high} {low_high}"), "7 7.0 7.1 7.0.1");
+        for page in [root, low, high, low_high] {
+            assert_eq!(page.to_string().parse(), Ok(page));
+        }
+        for wrong in ["", "x", "7.", "7.2", ".1", "-1", "7.01"] {
+            assert!(wrong.parse::<PageId>().is_err(), "{wrong}");
+        }
         let mut id = root;
         let mut depth = 0;
         while let Some([_, next]) = id.children() {

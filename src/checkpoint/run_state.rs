@@ -184,6 +184,10 @@ impl RunState {
         if !ascends || self.histogram.last().is_some_and(|last| last.0 >= BINS) {
             return refuse("its statistics have bins that do not exist");
         }
+        let DatasetPrint { origin, scale, .. } = &self.dataset;
+        if !(origin.iter().all(|x| x.is_finite()) && scale.is_normal() && *scale > 0.0) {
+            return refuse("its local frame is none");
+        }
         let is_time = |seconds: f64| seconds >= 0.0 && seconds.is_finite();
         if !is_time(self.train_seconds) || !is_time(self.traffic.stall_seconds) {
             return refuse("it has trained or waited for no length of time");
@@ -263,6 +267,8 @@ mod tests {
         refused(|s| s.traffic.stall_seconds = -1.0);
         refused(|s| s.test = s.test.map(|t| LastTest { step: 10, ..t }));
         refused(|s| s.test = s.test.map(|t| LastTest { psnr: f64::NAN, ..t }));
+        refused(|s| s.dataset.scale = 0.0);
+        refused(|s| s.dataset.origin[1] = f64::INFINITY);
     }
 
     #[test]

@@ -72,7 +72,8 @@ config_keys! {
         image_cache: ByteSize = ByteSize(1 << 30);
         /// Near plane, relative to the size of the scene
         near_plane: f64 = 0.01;
-        /// Start from this PLY: Gaussians if it has f_dc_0, else coloured points; empty = the dataset's points
+        /// Start from this PLY: Gaussians if it has f_dc_0, else coloured points; or from the last generation of this store,
+        /// a folder (see gsscale-ckpt import): it may be larger than memory. Empty = the dataset's points
         init_ply: String = String::new();
         /// Random points in the views' frusta when the dataset has none; 0 = refuse such a dataset
         init_points: u32 = 100_000;

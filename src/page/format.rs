@@ -23,8 +23,10 @@ pub const HEADER_BYTES: usize = 4096;
 pub const LABEL_BYTES_MAX: usize = 512;
 /// Version of the layout of slots. A store of a newer version is refused.
 pub const FORMAT_VERSION: u32 = 1;
-/// Features that a reader must know to read the store, one bit each. None yet.
+/// Features that a reader must know to read the store, one bit each: a store with another bit is refused. None yet.
 pub const KNOWN_FEATURES: u32 = 0;
+/// Features that a reader may pass over, one bit each: other bits are ignored. None yet.
+pub const KNOWN_COMPATIBLE: u32 = 0;
 
 const MAGIC: [u8; 8] = *b"gsscpage";
 const CHECKSUM_AT: usize = HEADER_BYTES - 16;

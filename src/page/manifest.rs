@@ -206,19 +206,34 @@ impl Manifest {
         acknowledged: u64,
         cache_bytes: usize,
     ) -> Result<(Manifest, MapContent), MapError> {
+        let (mut manifest, content) = Manifest::look(file, store, acknowledged, cache_bytes)?;
+        manifest.file.let_through().map_err(MapError::Io)?;
+        manifest.poisoned = false;
+        Ok((manifest, content))
+    }
+
+    /// As [`Manifest::open`], but `file` stays as it is whatever happens: the map takes no transaction.
+    ///
+    /// # Errors
+    /// As [`Manifest::open`].
+    pub fn look(
+        file: Arc<dyn StorageBackend>,
+        store: u128,
+        acknowledged: u64,
+        cache_bytes: usize,
+    ) -> Result<(Manifest, MapContent), MapError> {
         let file = MapFile::holding_back(file).map_err(MapError::Io)?;
         if file.len().map_err(MapError::Io)? == 0 {
             return Err(MapError::Damaged("the file is empty".to_string()));
         }
         let database = guarded(|| Ok(builder(cache_bytes).create_with_backend(file.clone())?));
-        let mut manifest = Manifest { database: None, file, store, counters: Counters::default(), poisoned: false };
+        let mut manifest = Manifest { database: None, file, store, counters: Counters::default(), poisoned: true };
         manifest.database = Some(database?);
         let content = manifest.read_all()?;
         manifest.counters = content.counters;
         if content.counters.sequence < acknowledged && !active(Mutant::WitnessIgnored) {
             return Err(MapError::Stale { found: content.counters.sequence, acknowledged });
         }
-        manifest.file.let_through().map_err(MapError::Io)?;
         Ok((manifest, content))
     }
 

@@ -22,18 +22,22 @@ pub mod memory_store;
 pub mod mmap_store;
 #[doc(hidden)]
 pub mod mutants;
+pub mod new_store;
 pub mod opening;
 mod page_cache;
 mod page_done;
 pub mod page_error;
 pub mod paged_store;
 pub mod pread_store;
+pub mod reading;
 mod resume;
+pub mod scan;
 pub mod seal;
 pub mod segment_files;
 mod segment_io;
 #[cfg(target_os = "linux")]
 mod slab;
+pub mod slot_reader;
 pub mod slots;
 pub mod spill_dir;
 pub mod spill_format;

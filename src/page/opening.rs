@@ -104,7 +104,7 @@ impl Opened {
 }
 
 /// The pages that `generation` sees in `versions`, which are ordered by page, then generation.
-fn pages_at(versions: &[MapVersion], generation: u64) -> Result<Vec<StoredPage>, CommitError> {
+pub(super) fn pages_at(versions: &[MapVersion], generation: u64) -> Result<Vec<StoredPage>, CommitError> {
     let mut pages = Vec::new();
     for run in versions.chunk_by(|a, b| a.page == b.page) {
         let Some(version) = run.iter().rfind(|v| v.generation <= generation) else { continue };
@@ -140,7 +140,7 @@ fn past_slots(versions: &[MapVersion], present: &[StoredPage]) -> Result<Vec<Pas
     Ok(past.into_values().map(|(_, past)| past).collect())
 }
 
-fn slot_and_label(version: &MapVersion) -> Result<Option<(SlotRef, &[u8])>, CommitError> {
+pub(super) fn slot_and_label(version: &MapVersion) -> Result<Option<(SlotRef, &[u8])>, CommitError> {
     let Some(value) = &version.value else { return Ok(None) };
     let wrong = || CommitError::Contradiction(format!("the value of page {} is none", version.page));
     let (slot, label) = value.split_first_chunk().ok_or_else(wrong)?;

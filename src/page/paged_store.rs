@@ -159,6 +159,11 @@ impl PagedStore {
         self.config.generation
     }
 
+    /// Raises the number of the generation that is being written, if `generation` is higher: for copies that keep numbers.
+    pub fn skip_to(&mut self, generation: u64) {
+        self.config.generation = self.config.generation.max(generation);
+    }
+
     /// Number of the next write.
     pub fn serial(&self) -> u64 {
         self.config.serial

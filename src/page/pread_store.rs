@@ -30,7 +30,18 @@ impl PreadStore {
     /// # Errors
     /// The folder cannot be used, or no thread can be started.
     pub fn open(folder: &Path, threads: usize, direct: bool) -> io::Result<PreadStore> {
-        let segments = SegmentIo::new(folder, direct)?;
+        PreadStore::over(SegmentIo::new(folder, direct)?, threads)
+    }
+
+    /// As [`PreadStore::open`] for a store that must stay as it is: writes fail.
+    ///
+    /// # Errors
+    /// No thread can be started.
+    pub fn open_read_only(folder: &Path, threads: usize) -> io::Result<PreadStore> {
+        PreadStore::over(SegmentIo::read_only(folder), threads)
+    }
+
+    fn over(segments: SegmentIo, threads: usize) -> io::Result<PreadStore> {
         let direct = segments.is_direct();
         let shared = Arc::new(Shared { segments: Mutex::new(segments), behind: Mutex::default(), direct });
         let worker = Arc::clone(&shared);

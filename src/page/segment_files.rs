@@ -42,6 +42,7 @@ pub struct SegmentFiles {
     /// Held open, so that a segment can be made durable whatever the process has open.
     entries: Option<File>,
     direct: bool,
+    read_only: bool,
     open: BTreeMap<u32, OpenFile>,
     open_max: usize,
     clock: u64,
@@ -59,7 +60,22 @@ impl SegmentFiles {
         // Other systems do not open folders; there a file's entry is durable with the file.
         let entries = if cfg!(unix) { Some(File::open(folder)?) } else { None };
         let open = BTreeMap::new();
-        Ok(SegmentFiles { folder: folder.to_path_buf(), entries, direct, open, open_max, clock: 0 })
+        let (folder, read_only) = (folder.to_path_buf(), false);
+        Ok(SegmentFiles { folder, entries, direct, read_only, open, open_max, clock: 0 })
+    }
+
+    /// The segments in `folder`, which may be on a drive that cannot be written: nothing can be written through them.
+    pub fn read_only(folder: &Path) -> SegmentFiles {
+        let (open_max, folder) = (open_files_max(), folder.to_path_buf());
+        SegmentFiles {
+            folder,
+            entries: None,
+            direct: false,
+            read_only: true,
+            open: BTreeMap::new(),
+            open_max,
+            clock: 0,
+        }
     }
 
     /// Whether files bypass the page cache. Then memory, offsets and lengths must be multiples of
@@ -84,6 +100,7 @@ impl SegmentFiles {
     /// # Errors
     /// No space; the folder cannot be written; the file is longer, a link, or not a file.
     pub fn create(&mut self, segment: u32, bytes: u64) -> io::Result<()> {
+        self.refuse_if_read_only()?;
         let path = self.path(segment);
         let make = |path: &Path| {
             with_safe_flags(OpenOptions::new().read(true).write(true).create(true).truncate(false)).open(path)
@@ -117,8 +134,9 @@ impl SegmentFiles {
             return Ok(Arc::clone(&open.file));
         }
         while self.open.len() >= self.open_max && self.close_oldest()? {}
-        let direct = self.direct;
-        let file = Arc::new(self.open_with_room(&self.path(segment), |path| open_segment(path, direct))?);
+        let (direct, read_only) = (self.direct, self.read_only);
+        let open = |path: &Path| if read_only { open_for_reading(path) } else { open_segment(path, direct) };
+        let file = Arc::new(self.open_with_room(&self.path(segment), open)?);
         let open = OpenFile { file: Arc::clone(&file), last_used: self.clock, is_dirty: false };
         self.open.insert(segment, open);
         Ok(file)
@@ -129,6 +147,7 @@ impl SegmentFiles {
     /// # Errors
     /// It does not exist or cannot be opened.
     pub fn file_for_write(&mut self, segment: u32) -> io::Result<Arc<File>> {
+        self.refuse_if_read_only()?;
         let file = self.file(segment)?;
         if let Some(open) = self.open.get_mut(&segment) {
             open.is_dirty = true;
@@ -147,6 +166,10 @@ impl SegmentFiles {
             open.is_dirty = false;
         }
         Ok(())
+    }
+
+    fn refuse_if_read_only(&self) -> io::Result<()> {
+        if self.read_only { Err(io::ErrorKind::ReadOnlyFilesystem.into()) } else { Ok(()) }
     }
 
     /// Opens a file; where others of this process hold more files than was reckoned with, closes some of ours.
@@ -175,6 +198,14 @@ impl SegmentFiles {
 /// Whether a file could not be opened because the process or the system has too many open.
 fn is_too_many_files(error: &io::Error) -> bool {
     cfg!(unix) && matches!(error.raw_os_error(), Some(23 | 24)) // ENFILE, EMFILE everywhere
+}
+
+/// Opens a file of the store for reading: no link is followed.
+///
+/// # Errors
+/// It is not there or cannot be read.
+pub fn open_for_reading(path: &Path) -> io::Result<File> {
+    with_safe_flags(OpenOptions::new().read(true)).open(path)
 }
 
 /// Makes the entries of a folder durable.

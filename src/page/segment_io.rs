@@ -34,6 +34,11 @@ impl SegmentIo {
         Ok(SegmentIo { files: SegmentFiles::new(folder, direct)?, lost: None })
     }
 
+    /// The segments of `folder`, which stays as it is.
+    pub fn read_only(folder: &Path) -> SegmentIo {
+        SegmentIo { files: SegmentFiles::read_only(folder), lost: None }
+    }
+
     /// Whether bytes go past the page cache.
     pub fn is_direct(&self) -> bool {
         self.files.is_direct()

@@ -17,12 +17,12 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
-const FORMAT: &str = "FORMAT";
+pub(super) const FORMAT: &str = "FORMAT";
 /// The file while it is written; then it is renamed.
 const FORMAT_NEW: &str = "FORMAT.new";
-const LOCK: &str = "LOCK";
+pub(super) const LOCK: &str = "LOCK";
 /// First line of the lock's file, to tell it from somebody else's.
-const LOCK_MAGIC: &str = "gsscale spill directory\n";
+pub(super) const LOCK_MAGIC: &str = "gsscale spill directory\n";
 const OTHER_FOLDER: &str = "name another folder";
 
 /// A spill directory in use by this process. The lock is held until it is dropped.
@@ -383,7 +383,12 @@ fn new_identity() -> u128 {
 }
 
 /// What the FORMAT file says; `None` when there is none.
-fn read_format(folder: &Path) -> InputResult<Option<Result<SpillFormat, FormatError>>> {
+pub(super) fn read_format(folder: &Path) -> InputResult<Option<Result<SpillFormat, FormatError>>> {
+    Ok(format_bytes_of(folder)?.map(|bytes| SpillFormat::from_bytes(&bytes)))
+}
+
+/// The bytes of the FORMAT file, empty for one that is no file; `None` when there is none.
+pub(super) fn format_bytes_of(folder: &Path) -> InputResult<Option<Vec<u8>>> {
     let path = folder.join(FORMAT);
     let failed = |e: io::Error| InputError::io(&path, "reading", &e);
     let file = match with_safe_flags(OpenOptions::new().read(true)).open(&path) {
@@ -391,16 +396,18 @@ fn read_format(folder: &Path) -> InputResult<Option<Result<SpillFormat, FormatEr
         file => file.map_err(failed)?,
     };
     if !file.metadata().map_err(failed)?.is_file() {
-        return Ok(Some(Err(FormatError::Foreign)));
+        return Ok(Some(Vec::new()));
     }
     let mut bytes = Vec::new();
     file.take(FORMAT_BYTES as u64 + 1).read_to_end(&mut bytes).map_err(failed)?;
-    Ok(Some(SpillFormat::from_bytes(&bytes)))
+    Ok(Some(bytes))
 }
 
-fn bad_format(folder: &Path, error: &FormatError) -> InputError {
+pub(super) fn bad_format(folder: &Path, error: &FormatError) -> InputError {
     let remedy = match error {
-        FormatError::Version { .. } => "use the newer program, or name another folder",
+        FormatError::Version { .. } | FormatError::Features { .. } => {
+            "use the program that made it, or name another folder"
+        }
         _ => OTHER_FOLDER,
     };
     InputError::new(folder.join(FORMAT), error.to_string(), remedy)

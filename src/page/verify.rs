@@ -43,7 +43,7 @@ pub fn verify(
 }
 
 /// The header is that of version `slot` of `page`.
-fn verify_identity(store: u128, page: PageId, slot: &SlotRef, header: &SlotHeader) -> Result<(), String> {
+pub(super) fn verify_identity(store: u128, page: PageId, slot: &SlotRef, header: &SlotHeader) -> Result<(), String> {
     if header.store != store {
         return Err("it belongs to another store".to_string());
     }

@@ -6,8 +6,9 @@
 //! 4. entries from a store are taken over only if their slots can hold what they say.
 
 use super::error::PagingError;
-use super::label::{label, meta_from_label};
+use super::label::label;
 use super::pager::{Pager, PagerConfig};
+use super::stored::PageLimits;
 use super::transfers::Failure;
 use crate::base::ids::{PageId, PageNo};
 use crate::cache::frame::FrameState;
@@ -15,7 +16,6 @@ use crate::page::commit::{CommitError, Commits, Cut, PageChange};
 use crate::page::format::SlotRef;
 use crate::page::opening::StoredPage;
 use crate::page::paged_store::PagedStore;
-use crate::scene::page_layout::{PageLayout, capacity_bytes};
 use std::collections::BTreeMap;
 
 /// Writes in flight at once: each may need a buffer of its own to be encoded in.
@@ -34,20 +34,10 @@ impl Pager {
     ) -> Result<Pager, CommitError> {
         let mut pager = Pager::new(config, store);
         for stored in pages {
-            let wrong = |what: &str| CommitError::Contradiction(format!("page {}: {what}", stored.page));
-            let meta = meta_from_label(stored.page, &stored.label).ok_or_else(|| wrong("its label is none"))?;
-            if meta.rows == 0 || meta.rows as usize > config.page_rows || meta.sh_degree > config.sh_degree {
-                return Err(wrong("no page of this run has such sizes"));
-            }
-            if meta.events_applied as usize > events {
-                return Err(wrong("it has applied events that did not happen"));
-            }
-            let layout = PageLayout { rows: meta.rows as usize, sh_degree: meta.sh_degree };
-            if layout.bytes() != stored.slot.payload_bytes as usize
-                || layout.bytes() > capacity_bytes(config.page_rows, config.sh_degree)
-            {
-                return Err(wrong("its slot has another length"));
-            }
+            let limits = PageLimits { page_rows: config.page_rows, sh_degree: config.sh_degree, events };
+            let meta = limits
+                .meta_of(stored.page, &stored.slot, &stored.label)
+                .map_err(|what| CommitError::Contradiction(format!("page {}: {what}", stored.page)))?;
             pager.index.push(meta);
             pager.slots.push(Some(stored.slot));
             pager.committed.insert(stored.page, stored.slot.generation);

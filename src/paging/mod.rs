@@ -10,5 +10,6 @@ pub mod label;
 pub mod pager;
 pub mod pinned;
 pub mod stats;
+pub mod stored;
 mod transfers;
 mod window;

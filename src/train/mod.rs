@@ -3,7 +3,7 @@
 //! [`checkpoint`] commits it (`first_commit` that of a run in memory), [`full_drive`] finds it space, [`resume`] goes on from a
 //! commit if nothing changed (`changes`, [`dataset_print`]), [`pages`] has the rows of a run in pages and brings them to now with [`catch_up`], `update` changes them, [`eval`] looks at
 //! held-out views, [`report`] writes what happened, [`progress`] shows it, [`machine`] starts its threads, [`signals`]
-//! hears Ctrl-C.
+//! hears Ctrl-C, [`stores`] is what tools do with checkpoints.
 
 pub mod catch_up;
 mod changes;
@@ -25,6 +25,7 @@ pub mod run;
 pub mod signals;
 pub mod start;
 pub mod step;
+pub mod stores;
 pub mod tiers;
 pub mod trainer;
 mod update;

@@ -48,7 +48,7 @@ pub struct PageRules {
 }
 
 /// Gets the rows of some pages, numbered through.
-type Visitor<'v, E> = dyn FnMut(&PageRules, &[Rows<'_>]) -> Result<(), E> + 'v;
+pub(super) type Visitor<'v, E> = dyn FnMut(&PageRules, &[Rows<'_>]) -> Result<(), E> + 'v;
 
 /// The pages of a run and what they share.
 pub struct PagedScene {
@@ -63,7 +63,7 @@ pub struct PagedScene {
 }
 
 impl PageRules {
-    fn new(options: &RunOptions) -> PageRules {
+    pub(super) fn new(options: &RunOptions) -> PageRules {
         PageRules {
             adam: DeferredAdam::new(options.rates, options.adam, options.render.simd).with_moments(options.moments),
             events: EventLog::default(),
@@ -93,7 +93,7 @@ impl PageRules {
     }
 
     /// The entry of a page that was rewritten with these rows.
-    fn meta(&self, id: PageId, state: &SceneState) -> PageMeta {
+    pub(super) fn meta(&self, id: PageId, state: &SceneState) -> PageMeta {
         PageMeta {
             id,
             rows: state.rows() as u32,
@@ -145,7 +145,8 @@ impl PagedScene {
         }
     }
 
-    fn empty(pager: Pager, options: &RunOptions) -> PagedScene {
+    /// No pages yet.
+    pub(super) fn empty(pager: Pager, options: &RunOptions) -> PagedScene {
         let (rules, histogram) = (PageRules::new(options), GradHistogram::default());
         PagedScene { pager, rules, histogram, rows: 0, rows_bound: 0 }
     }
@@ -168,7 +169,8 @@ impl PagedScene {
         PagedScene { pager, rules, histogram, rows, rows_bound }
     }
 
-    fn insert_first_page(&mut self, id: PageId, state: &SceneState) -> Result<(), PagingError> {
+    /// Adds a page of first Gaussians.
+    pub(super) fn insert_first_page(&mut self, id: PageId, state: &SceneState) -> Result<(), PagingError> {
         let meta = self.rules.meta(id, state);
         self.pager.insert(meta, |payload| {
             write_page(state, payload);
@@ -358,11 +360,24 @@ impl PagedScene {
         let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
         pages.retain(|p| index[p.index()].rows > 0);
         pages.sort_unstable_by_key(|p| index[p.index()].id);
-        self.visit(&pages, &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
+        self.for_rows_of(&pages, now, each)
+    }
+
+    /// As [`PagedScene::for_all_rows`], of these pages alone.
+    ///
+    /// # Errors
+    /// Pages could not be had, or `each` failed.
+    pub fn for_rows_of<E: From<PagingError>>(
+        &mut self,
+        pages: &[PageNo],
+        now: u32,
+        each: &mut dyn FnMut(&Columns) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.visit(pages, &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
     }
 
     /// Pins the pages batch by batch and hands their rows to `each`, with pending events applied to copies.
-    fn visit<E: From<PagingError>>(&mut self, pages: &[PageNo], each: &mut Visitor<'_, E>) -> Result<(), E> {
+    pub(super) fn visit<E: From<PagingError>>(&mut self, pages: &[PageNo], each: &mut Visitor<'_, E>) -> Result<(), E> {
         let batch = PAGES_PER_BATCH.min(self.pager.stats().frames_max).max(1);
         for pages in pages.chunks(batch) {
             let pinned = self.pager.acquire_pages(pages)?;

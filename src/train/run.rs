@@ -151,7 +151,7 @@ fn first_gaussians(scene: &Path, dataset: &mut Dataset, config: &TrainConfig) ->
 }
 
 /// The same rows without the bands above a degree.
-fn cut_sh(columns: Columns, sh_degree: u8) -> Columns {
+pub(super) fn cut_sh(columns: Columns, sh_degree: u8) -> Columns {
     if columns.sh_degree <= sh_degree {
         return columns;
     }

@@ -1,22 +1,24 @@
 //! What a run starts from: first Gaussians in memory, or points that go into pages one page at a time.
 //!
-//! Points are streamed when there is a spill directory: then the scene may be larger than memory. Gaussians from a PLY
-//! and points drawn at random are made in memory.
+//! Points are streamed when there is a spill directory: then the scene may be larger than memory; so are the Gaussians of a
+//! store. Gaussians from a PLY and points drawn at random are made in memory.
 //!
 //! Invariant: both ways give the same pages, bit for bit ([`crate::dataset::import`]).
 
 use super::dataset_print::{columns_print, points_print};
 use super::pages::PagedScene;
 use super::run::{Prepared, check_train_views, prepare};
+use super::stores::StoredStart;
 use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
+use crate::base::ids::PageId;
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::colmap;
 use crate::dataset::frame::Extent;
 use crate::dataset::import::{Budget, Cloud, ImportOptions, LocalCloud};
-use crate::dataset::loader::{Dataset, load_dataset_with_cloud};
-use crate::dataset::model::TakePoint;
+use crate::dataset::loader::{Dataset, load_dataset, load_dataset_with_cloud};
+use crate::dataset::model::{PointCloud, TakePoint};
 use crate::dataset::read::{ReadOptions, read_scene};
 use crate::exchange::ply;
 use crate::paging::pager::Pager;
@@ -44,6 +46,7 @@ pub struct Start {
 enum FirstRows {
     Columns(Columns),
     Points { cloud: Cloud, extent: Extent, init: InitOptions },
+    Store(Box<StoredStart>),
 }
 
 impl Start {
@@ -52,7 +55,7 @@ impl Start {
     /// # Errors
     /// As [`prepare`].
     pub fn read(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
-        if config.spill_dir.is_empty() {
+        if config.spill_dir.is_empty() && !Path::new(&config.init_ply).is_dir() {
             return Start::in_memory(scene, config);
         }
         Start::look(scene, config, &folder_beside(Path::new(&config.spill_dir)), host_mem)
@@ -64,6 +67,9 @@ impl Start {
     /// # Errors
     /// As [`prepare`].
     pub fn look(scene: &Path, config: &TrainConfig, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
+        if Path::new(&config.init_ply).is_dir() {
+            return Start::of_store(scene, config, host_mem);
+        }
         match Start::stream(scene, config, &budget(folder, host_mem))? {
             Some(start) => Ok(start),
             None => Start::in_memory(scene, config),
@@ -77,6 +83,28 @@ impl Start {
             points => points_print(&(points, dataset.colors.as_slice()))?.0,
         };
         Ok(Start { dataset, sh_degree_start, rows: columns.rows() as u64, points, from: FirstRows::Columns(columns) })
+    }
+
+    /// From the Gaussians of a store.
+    fn of_store(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
+        let folder = Path::new(&config.init_ply);
+        let memory = host_mem.unwrap_or(BUDGET_DEFAULT) / 3;
+        let store = StoredStart::open(folder, memory).map_err(|error| match error {
+            TrainError::Input(error) => error,
+            other => InputError::new(folder, other.to_string(), "see the cause"),
+        })?;
+        let mut raw = read_scene(scene, &limits::read_options(config))?;
+        raw.points = PointCloud::default();
+        let dataset = load_dataset(raw, &limits::load_options(config))?;
+        check_train_views(scene, &dataset)?;
+        let rows = store.rows_at_most();
+        if config.max_gaussians > 0 && rows > config.max_gaussians {
+            let problem = format!("the start has {rows} Gaussians, above --max-gaussians");
+            return Err(InputError::new(folder, problem, "raise --max-gaussians or start from fewer"));
+        }
+        let sh_degree_start = store.sh_degree().max(limits::first_sh_degree(config));
+        let points = store.digest()?;
+        Ok(Start { dataset, sh_degree_start, rows, points, from: FirstRows::Store(Box::new(store)) })
     }
 
     /// `None` where there are no points in a file.
@@ -120,17 +148,30 @@ impl Start {
         config: &TrainConfig,
         host_mem: Option<u64>,
     ) -> Result<(Dataset, PagedScene), TrainError> {
-        let scene = match &self.from {
-            FirstRows::Columns(columns) => PagedScene::new(columns, pager, options)?,
+        let Start { dataset, from, .. } = self;
+        let scene = match from {
+            FirstRows::Columns(columns) => PagedScene::new(&columns, pager, options)?,
             FirstRows::Points { cloud, extent, init } => {
                 let folder = folder_beside(Path::new(&config.spill_dir));
                 let fill = first_fill(options.page_rows, options.densify.is_some());
-                let import = ImportOptions { init, fill, budget: budget(&folder, host_mem) };
-                let source = LocalCloud { cloud, extent: *extent, frame: self.dataset.frame };
+                let import = ImportOptions { init: &init, fill, budget: budget(&folder, host_mem) };
+                let source = LocalCloud { cloud: &cloud, extent, frame: dataset.frame };
                 PagedScene::import(&source, &import, pager, options)?
             }
+            FirstRows::Store(store) => {
+                let mut scene = PagedScene::empty(pager, options);
+                let frame = (dataset.frame.origin.to_array(), dataset.frame.scale);
+                let sizes = (options.page_rows, scene.rules.sh_degree());
+                let mut number = 0;
+                store.for_each_page(frame, sizes, &mut |state| {
+                    scene.insert_first_page(PageId::initial(number), &state)?;
+                    number += 1;
+                    Ok(())
+                })?;
+                scene
+            }
         };
-        Ok((self.dataset, scene))
+        Ok((dataset, scene))
     }
 }
 

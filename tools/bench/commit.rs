@@ -21,7 +21,8 @@ use gsscale::page::slots::SlotLayout;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::scene::partition::first_fill;
-use gsscale::train::checkpoint::{Checkpoint, Origin, dataset_print};
+use gsscale::train::checkpoint::{Checkpoint, Origin};
+use gsscale::train::dataset_print::dataset_print;
 use gsscale::train::memory::{host_budget, host_bytes_peak};
 use gsscale::train::report::MetricsLog;
 use gsscale::train::start::Start;
@@ -104,7 +105,7 @@ fn train(args: &Args, config: &TrainConfig) -> Result<Value, TrainError> {
         config: toml::to_string(config).map_err(|e| InputError::new("--config", e.to_string(), "report this"))?,
         simd: simd_path(config).name().to_string(),
         sh_degree_start: start.sh_degree_start,
-        dataset: dataset_print(&start.dataset, start.rows),
+        dataset: dataset_print(&start)?,
     };
     let fill = first_fill(options.page_rows, options.densify.is_some());
     let pages = start.rows.div_ceil(fill as u64) as usize;

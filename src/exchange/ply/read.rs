@@ -148,25 +148,68 @@ impl Dropped {
     }
 }
 
+/// Floats of a Gaussian before its higher bands: means, sh0, opacity, scales, quaternion.
+pub const ROW_HEAD: usize = 14;
+
+/// Hands the Gaussians of `path` to `take` one by one, in the file's order and without keeping them: means (3), sh0 (3),
+/// opacity, scales (3), quaternion (4), then the higher bands, coefficient by coefficient. What the comments say comes back.
+///
+/// # Errors
+/// As [`parse_ply`], or the file holds points; or `take` failed.
+pub fn stream_gaussians(path: &Path, take: &mut dyn FnMut(&[f32]) -> InputResult<()>) -> InputResult<PlyMeta> {
+    let (mut reader, total_bytes) = open(path)?;
+    let header = parse_header(&mut reader, path)?;
+    let (mut body, vertex) = body_at_vertices(reader, &header, total_bytes, path)?;
+    stream_gaussian_rows(&mut body, &header, vertex, take)
+}
+
 fn read_gaussians<R: BufRead>(body: &mut Body<'_, R>, header: &Header, vertex: &Element) -> InputResult<PlyContent> {
     let path = body.path;
     let sh_degree = sh_degree_of(path, vertex)?;
-    let rest = sh_n_width(sh_degree);
+    let mut columns = Columns { sh_degree, ..Columns::default() };
+    for column in Column::ALL {
+        let floats = (vertex.count as usize).saturating_mul(column.width(sh_degree));
+        columns.column_mut(column).try_reserve_exact(floats).map_err(no_memory(path, vertex.count))?;
+    }
+    let meta = stream_gaussian_rows(body, header, vertex, &mut |row| {
+        push_row(&mut columns, row);
+        Ok(())
+    })?;
+    Ok(PlyContent::Gaussians { columns, meta })
+}
+
+/// Appends a row as [`stream_gaussians`] hands it out.
+pub fn push_row(columns: &mut Columns, row: &[f32]) {
+    columns.means.extend_from_slice(&row[0..3]);
+    columns.sh0.extend_from_slice(&row[3..6]);
+    columns.opacities.push(row[6]);
+    columns.scales.extend_from_slice(&row[7..10]);
+    columns.quats.extend_from_slice(&row[10..ROW_HEAD]);
+    columns.sh_n.extend_from_slice(&row[ROW_HEAD..]);
+}
+
+/// Hands on the Gaussians of a body.
+fn stream_gaussian_rows<R: BufRead>(
+    body: &mut Body<'_, R>,
+    header: &Header,
+    vertex: &Element,
+    take: &mut dyn FnMut(&[f32]) -> InputResult<()>,
+) -> InputResult<PlyMeta> {
+    let path = body.path;
+    let rest = sh_n_width(sh_degree_of(path, vertex)?);
     let mut names: Vec<String> = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"].map(String::from).into();
     names.extend((0..3).map(|i| format!("scale_{i}")));
     names.extend((0..4).map(|i| format!("rot_{i}")));
     names.extend((0..rest).map(|i| format!("f_rest_{i}")));
     let slots = names.iter().map(|n| Ok(scalar_at(path, vertex, n)?.0)).collect::<InputResult<Vec<usize>>>()?;
     let mut meta = meta_from_comments(path, &header.comments)?;
-
-    let mut columns = Columns { sh_degree, ..Columns::default() };
-    for column in Column::ALL {
-        let floats = (vertex.count as usize).saturating_mul(column.width(sh_degree));
-        columns.column_mut(column).try_reserve_exact(floats).map_err(no_memory(path, vertex.count))?;
-    }
     let mut dropped = Dropped::default();
-    let mut values = vec![0.0f32; slots.len()];
+    let (mut values, mut out) = (vec![0.0f32; slots.len()], vec![0.0f32; slots.len()]);
+    let mut outcome = Ok(());
     read_rows(body, vertex, &slots, |row, raw| {
+        if outcome.is_err() {
+            return;
+        }
         for (value, &r) in values.iter_mut().zip(raw) {
             *value = r as f32;
         }
@@ -174,19 +217,19 @@ fn read_gaussians<R: BufRead>(body: &mut Body<'_, R>, header: &Header, vertex: &
             dropped.add(row);
             return;
         }
-        columns.means.extend_from_slice(&values[0..3]);
-        columns.sh0.extend_from_slice(&values[3..6]);
-        columns.opacities.push(values[6]);
-        columns.scales.extend_from_slice(&values[7..10]);
-        columns.quats.extend_from_slice(&unit_quat([values[10], values[11], values[12], values[13]]));
-        let f_rest = &values[14..];
+        out[..10].copy_from_slice(&values[..10]);
+        out[10..ROW_HEAD].copy_from_slice(&unit_quat([values[10], values[11], values[12], values[13]]));
+        // Channel-major in the file.
+        let f_rest = &values[ROW_HEAD..];
         for k in 0..rest / 3 {
-            columns.sh_n.extend((0..3).map(|channel| f_rest[channel * (rest / 3) + k]));
+            (0..3).for_each(|channel| out[ROW_HEAD + 3 * k + channel] = f_rest[channel * (rest / 3) + k]);
         }
+        outcome = take(&out);
     })?;
+    outcome?;
     dropped.check(path, vertex.count)?;
     meta.dropped = dropped.count;
-    Ok(PlyContent::Gaussians { columns, meta })
+    Ok(meta)
 }
 
 /// The degree that follows from the number of `f_rest` properties.

@@ -1,0 +1,95 @@
+//! Reads slots one at a time for tools that look at a store: no engine, no threads, nothing is written.
+//!
+//! Invariant: bytes are given out as good only if [`super::verify`] found them to be the version that was asked for.
+
+use super::buffer::PageBuffer;
+use super::format::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs};
+use super::map_file::DriveFile;
+use super::segment_files::{open_for_reading, segment_file_name};
+use super::store::Place;
+use super::verify::{verify, verify_identity};
+use crate::base::ids::PageId;
+use redb::StorageBackend;
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// Reads the slots of one store.
+#[derive(Debug)]
+pub struct SlotReader {
+    folder: PathBuf,
+    store: u128,
+    /// The segment that was read last, and its length.
+    file: Option<(u32, DriveFile, u64)>,
+    stored: PageBuffer,
+    decoded: PageBuffer,
+}
+
+impl SlotReader {
+    /// For the slots of store `store`, of `slot_bytes` bytes each, in `folder`.
+    pub fn new(folder: &Path, store: u128, slot_bytes: u64) -> SlotReader {
+        let buffer = || PageBuffer::zeroed(slot_bytes as usize);
+        SlotReader { folder: folder.to_path_buf(), store, file: None, stored: buffer(), decoded: buffer() }
+    }
+
+    /// Whether version `slot` of `page` is there, by its header alone.
+    ///
+    /// # Errors
+    /// What is wrong, for people.
+    pub fn check_header(&mut self, page: PageId, slot: &SlotRef) -> Result<SlotHeader, String> {
+        let header = self.header_at(slot.place)?;
+        verify_identity(self.store, page, slot, &header)?;
+        let end = slot.place.offset.saturating_add(slot.transfer_bytes() as u64);
+        match &self.file {
+            Some((_, _, bytes)) if end > *bytes => Err("the segment ends inside the slot".to_string()),
+            _ => Ok(header),
+        }
+    }
+
+    /// The header at `place`, whatever page it is of.
+    ///
+    /// # Errors
+    /// What is wrong, for people.
+    pub fn header_at(&mut self, place: Place) -> Result<SlotHeader, String> {
+        let mut bytes = [0; HEADER_BYTES];
+        self.read(place, HEADER_BYTES, |from| bytes.copy_from_slice(from))?;
+        SlotHeader::decode(&bytes).map_err(|e| e.to_string())
+    }
+
+    /// The payload of version `slot` of `page`, verified and decoded; aligned for its tables.
+    ///
+    /// # Errors
+    /// What is wrong, for people.
+    pub fn payload(&mut self, page: PageId, slot: &SlotRef) -> Result<&[u8], String> {
+        let bytes = slot.transfer_bytes();
+        if bytes.max(HEADER_BYTES + slot.payload_bytes as usize) > self.stored.len() {
+            return Err(format!("the index gives it {bytes} bytes, more than a slot holds"));
+        }
+        self.read(slot.place, bytes, |_| ())?;
+        let decoded = self.decoded.as_mut_slice();
+        verify(self.store, page, slot, &self.stored.as_slice()[..bytes], Some(decoded))?;
+        let whole = if slot.codec == StoredAs::Raw { &self.stored } else { &self.decoded };
+        Ok(&whole.as_slice()[HEADER_BYTES..][..slot.payload_bytes as usize])
+    }
+
+    /// Brings bytes into the buffer and hands them to `take`.
+    fn read(&mut self, place: Place, bytes: usize, take: impl FnOnce(&[u8])) -> Result<(), String> {
+        let failed = |e: io::Error| match e.kind() {
+            io::ErrorKind::NotFound => format!("{} is missing", segment_file_name(place.segment)),
+            io::ErrorKind::UnexpectedEof => "the segment ends inside the slot".to_string(),
+            _ => format!("it cannot be read: {e}"),
+        };
+        if self.file.as_ref().is_none_or(|(segment, ..)| *segment != place.segment) {
+            let file = open_for_reading(&self.folder.join(segment_file_name(place.segment))).map_err(failed)?;
+            let length = file.metadata().map_err(failed)?;
+            if !length.is_file() {
+                return Err(format!("{} is not a file", segment_file_name(place.segment)));
+            }
+            self.file = Some((place.segment, DriveFile::new(file), length.len()));
+        }
+        let Some((_, file, _)) = &self.file else { return Ok(()) };
+        let buffer = &mut self.stored.as_mut_slice()[..bytes];
+        file.read(place.offset, buffer).map_err(failed)?;
+        take(buffer);
+        Ok(())
+    }
+}

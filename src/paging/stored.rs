@@ -1,0 +1,106 @@
+//! Whether a stored page can be one of a run: its entry against the sizes of the run, its values against what training
+//! can leave behind.
+//!
+//! Invariant: a page that passes can be read into a frame and used without another look.
+
+use super::label::meta_from_label;
+use crate::base::ids::PageId;
+use crate::page::format::SlotRef;
+use crate::scene::page_layout::{PageLayout, capacity_bytes};
+use crate::scene::page_meta::PageMeta;
+use crate::scene::rows::{ColumnsRef, Rows};
+
+/// What no page of a run exceeds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PageLimits {
+    /// Rows that a page holds.
+    pub page_rows: usize,
+    /// Degree of the scene.
+    pub sh_degree: u8,
+    /// Length of the event log.
+    pub events: usize,
+}
+
+impl PageLimits {
+    /// The entry of a page from its label.
+    ///
+    /// # Errors
+    /// What contradicts the label, the slot or the run, for people.
+    pub fn meta_of(&self, page: PageId, slot: &SlotRef, label: &[u8]) -> Result<PageMeta, String> {
+        let meta = meta_from_label(page, label).ok_or("its label is none")?;
+        if meta.rows == 0 || meta.rows as usize > self.page_rows || meta.sh_degree > self.sh_degree {
+            return Err("no page of this run has such sizes".to_string());
+        }
+        if meta.events_applied as usize > self.events {
+            return Err("it has applied events that did not happen".to_string());
+        }
+        let layout = layout_of(&meta);
+        if layout.bytes() != slot.payload_bytes as usize
+            || layout.bytes() > capacity_bytes(self.page_rows, self.sh_degree)
+        {
+            return Err("its slot has another length".to_string());
+        }
+        Ok(meta)
+    }
+}
+
+/// The layout of a page's payload.
+pub fn layout_of(meta: &PageMeta) -> PageLayout {
+    PageLayout { rows: meta.rows as usize, sh_degree: meta.sh_degree }
+}
+
+/// Every value is one that training can leave behind after at most `step` steps: finite, second moments and statistics
+/// not negative, no row from the future.
+///
+/// # Errors
+/// The first value that is not.
+pub fn check_values(rows: &Rows<'_>, step: u32) -> Result<(), String> {
+    let Rows { columns, exp_avg, exp_avg_sq, stamp, grad2d, .. } = rows;
+    for (table, name, least) in [
+        (columns, "", f32::NEG_INFINITY),
+        (exp_avg, "first moment of ", f32::NEG_INFINITY),
+        (exp_avg_sq, "second moment of ", 0.0),
+    ] {
+        for (column, values) in named(table) {
+            let width = values.len() / stamp.len().max(1);
+            if let Some(at) = values.iter().position(|&v| !(v.is_finite() && v >= least)) {
+                return Err(format!("row {}: {name}{column} is {}", at / width.max(1), values[at]));
+            }
+        }
+    }
+    if let Some(row) = grad2d.iter().position(|&g| !(g.is_finite() && g >= 0.0)) {
+        return Err(format!("row {row}: grad2d is {}", grad2d[row]));
+    }
+    match stamp.iter().position(|&s| s > step) {
+        Some(row) => Err(format!("row {row}: it contains {} steps, the run has done {step}", stamp[row])),
+        None => Ok(()),
+    }
+}
+
+fn named<'a>(table: &ColumnsRef<'a>) -> [(&'static str, &'a [f32]); 6] {
+    let ColumnsRef { means, quats, scales, opacities, sh0, sh_n, .. } = *table;
+    [("means", means), ("quats", quats), ("scales", scales), ("opacities", opacities), ("sh0", sh0), ("shN", sh_n)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::columns::Columns;
+    use crate::scene::state::SceneState;
+
+    #[test]
+    fn values_that_training_never_leaves_are_named() {
+        let good = || SceneState::from_columns(Columns::zeros(3, 1));
+        assert_eq!(check_values(&good().view(), 0), Ok(()));
+        let refused = |change: fn(&mut SceneState), words: &str| {
+            let mut state = good();
+            change(&mut state);
+            assert_eq!(check_values(&state.view(), 7), Err(words.to_string()));
+        };
+        refused(|s| s.columns.means[4] = f32::NAN, "row 1: means is NaN");
+        refused(|s| s.exp_avg.sh_n[26] = f32::INFINITY, "row 2: first moment of shN is inf");
+        refused(|s| s.exp_avg_sq.opacities[2] = -1.0, "row 2: second moment of opacities is -1");
+        refused(|s| s.grad2d[0] = -0.5, "row 0: grad2d is -0.5");
+        refused(|s| s.stamp[1] = 8, "row 1: it contains 8 steps, the run has done 7");
+    }
+}

@@ -1,0 +1,129 @@
+//! The two commands that change a store that exists: going back to an earlier generation, and taking names away.
+//!
+//! Invariants: 1. both hold the lock of the store; 2. both are one transaction of the map: done or not done; 3. no byte
+//! of a page is written.
+
+use super::{StorePlace, run_state_of};
+use crate::base::error::InputError;
+use crate::page::codec::Codec;
+use crate::page::commit::Commits;
+use crate::page::engine::{IoEngine, open_engine};
+use crate::page::folder::DriveFolder;
+use crate::page::reading::{Access, StoreReader, WitnessRule, commit_config};
+use crate::page::spill_dir::SpillDir;
+use crate::train::trainer::TrainError;
+use serde::Serialize;
+
+/// What going back did, or would do.
+#[derive(Debug, Clone, Serialize)]
+pub struct RolledBack {
+    /// The generation that the store is at now.
+    pub generation: u64,
+    /// Its step.
+    pub step: u32,
+    /// Later generations that are gone.
+    pub dropped: Vec<u64>,
+    /// Their names.
+    pub dropped_names: Vec<String>,
+    /// Whether it was done.
+    pub is_done: bool,
+}
+
+/// Makes a kept generation the latest again; later ones are dropped with their names. Without `yes` only says what would
+/// go.
+///
+/// # Errors
+/// The store is in use or cannot be opened, or the generation is not kept.
+pub fn rollback(place: &StorePlace, generation: &str, yes: bool) -> Result<RolledBack, TrainError> {
+    let (generation, step, dropped, dropped_names) = {
+        let store = StoreReader::open(&place.folder, Access::Pages, WitnessRule::Obeyed)?;
+        let generation = store.find(Some(generation))?;
+        let pins = store.generations().pins().iter();
+        let names: Vec<String> = pins.filter(|(_, g)| **g > generation).map(|(name, _)| name.clone()).collect();
+        let dropped: Vec<u64> = store.generations().kept().filter(|g| *g > generation).collect();
+        (generation, run_state_of(&store, generation)?.step, dropped, names)
+    };
+    let is_done = yes && !dropped.is_empty();
+    if is_done {
+        let spill = SpillDir::open(&place.folder, true)?;
+        let opened = Commits::open(Box::new(DriveFolder::new(&place.folder)), commit_config(spill.format().store))?;
+        opened.commits.rollback(generation)?;
+    }
+    Ok(RolledBack { generation, step, dropped, dropped_names, is_done })
+}
+
+/// Which names go.
+#[derive(Debug, Clone, Default)]
+pub struct PruneRequest {
+    /// These.
+    pub names: Vec<String>,
+    /// All but this many of the newest named generations.
+    pub keep: Option<usize>,
+    /// Only say what would go.
+    pub dry_run: bool,
+}
+
+/// What was taken away, or would be.
+#[derive(Debug, Clone, Serialize)]
+pub struct Pruned {
+    /// Names that went.
+    pub dropped_names: Vec<String>,
+    /// Generations that are no longer kept.
+    pub dropped: Vec<u64>,
+    /// Generations that are kept.
+    pub kept: Vec<u64>,
+    /// Bytes of slots that became free for the run to write again; the segment files keep their length.
+    pub bytes_freed: u64,
+    /// Whether it was done.
+    pub is_done: bool,
+}
+
+/// Takes names away; what only they kept becomes free. The last two generations stay in any case.
+///
+/// # Errors
+/// The store is in use or cannot be opened, or a name is not there.
+pub fn prune(place: &StorePlace, request: &PruneRequest) -> Result<Pruned, TrainError> {
+    let before = StoreReader::open(&place.folder, Access::Pages, WitnessRule::Obeyed)?;
+    let pins = before.generations().pins();
+    if let Some(unknown) = request.names.iter().find(|name| !pins.contains_key(*name)) {
+        let names: Vec<&str> = pins.keys().map(String::as_str).collect();
+        let names = if names.is_empty() { "none".to_string() } else { names.join(", ") };
+        let problem = format!("no checkpoint is named '{unknown}'");
+        return Err(InputError::new(&place.folder, problem, format!("names that there are: {names}")).into());
+    }
+    let mut dropped_names = request.names.clone();
+    if let Some(keep) = request.keep {
+        let mut named: Vec<u64> = pins.values().copied().collect();
+        named.sort_unstable();
+        named.dedup();
+        let gone = &named[..named.len().saturating_sub(keep)];
+        dropped_names.extend(pins.iter().filter(|(_, g)| gone.contains(g)).map(|(name, _)| name.clone()));
+    }
+    dropped_names.sort_unstable();
+    dropped_names.dedup();
+    let plan = before.generations().plan_pins(&[], &dropped_names);
+    let kept: Vec<u64> = before.generations().kept().filter(|g| !plan.drop_generations.contains(g)).collect();
+    let bytes_of = |store: &StoreReader| -> Result<u64, TrainError> {
+        Ok(store.live_versions()?.iter().map(|(_, slot, _)| slot.transfer_bytes() as u64).sum())
+    };
+    let (bytes_before, dropped) = (bytes_of(&before)?, plan.drop_generations);
+    let is_done = !request.dry_run && !dropped_names.is_empty();
+    let mut bytes_freed = 0;
+    if is_done {
+        // A reader's lock keeps writers out, this process's own too.
+        drop(before);
+        write_pins(place, &dropped_names)?;
+        let after = StoreReader::open(&place.folder, Access::Pages, WitnessRule::Obeyed)?;
+        bytes_freed = bytes_before - bytes_of(&after)?;
+    }
+    Ok(Pruned { dropped_names, dropped, kept, bytes_freed, is_done })
+}
+
+fn write_pins(place: &StorePlace, dropped_names: &[String]) -> Result<(), TrainError> {
+    let spill = SpillDir::open(&place.folder, true)?;
+    let mut opened = Commits::open(Box::new(DriveFolder::new(&place.folder)), commit_config(spill.format().store))?;
+    let engine = open_engine(IoEngine::Pread, &place.folder, 1)?;
+    let mut store = opened.paged_store(engine.store, spill.format().layout, Codec::Raw)?;
+    opened.commits.pin(&mut store, &[], dropped_names)?;
+    Ok(())
+}

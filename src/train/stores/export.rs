@@ -1,0 +1,273 @@
+//! The Gaussians of a generation as a PLY, page by page, through the code that the trainer writes its own with.
+//!
+//! Invariants: 1. without a choice of rows the file is, byte for byte, the one that the trainer would have written after
+//! the step of the generation; 2. memory is bounded by the budget, whatever the scene's size; 3. the file is there whole
+//! or not at all; 4. which rows are chosen depends on the rows alone.
+
+use super::{StorePlace, options_of, run_state_of};
+use crate::base::error::InputError;
+use crate::base::ids::PageNo;
+use crate::base::math::exp32;
+use crate::base::units::format_bytes;
+use crate::cache::evict::EvictPolicy;
+use crate::checkpoint::run_state::RunState;
+use crate::config::limits::RunOptions;
+use crate::densify::stats::GradHistogram;
+use crate::exchange::ply::{ExportFrame, PlyMeta, PlyWriter};
+use crate::page::commit::CommitError;
+use crate::page::reading::{Access, StoreReader, WitnessRule};
+use crate::paging::pager::{Pager, PagerConfig};
+use crate::scene::columns::{Column, Columns};
+use crate::scene::partition::GiantCut;
+use crate::scene::select::RankSearch;
+use crate::train::memory::host_bytes_peak;
+use crate::train::pages::PagedScene;
+use crate::train::run::cut_sh;
+use crate::train::trainer::TrainError;
+use serde::Serialize;
+use std::path::PathBuf;
+
+/// Pages in memory at most: one pass needs no more.
+const FRAMES_MAX: usize = 64;
+/// Frames that a page takes on its way: its own, a copy with its pending events, its rows evaluated, the engine's buffer.
+const COPIES: u64 = 4;
+/// Threads that read.
+const READERS: usize = 4;
+/// Bytes of an entry of the map in memory: version, page, index.
+const ENTRY_BYTES: u64 = 512;
+/// What the program takes besides, bytes.
+const FIXED_BYTES: u64 = 32 << 20;
+
+/// What to export.
+#[derive(Debug, Clone)]
+pub struct ExportRequest {
+    /// Number or name of the generation; the latest without.
+    pub generation: Option<String>,
+    /// The PLY.
+    pub out: PathBuf,
+    /// Memory, bytes.
+    pub host_mem: u64,
+    /// Only the most visible Gaussians, this many.
+    pub max_gaussians: Option<u64>,
+    /// Only those whose means lie in this box, lower then upper corner, dataset coordinates.
+    pub crop: Option<[f64; 6]>,
+    /// Only bands up to this degree.
+    pub sh_degree: Option<u8>,
+}
+
+/// What was exported.
+#[derive(Debug, Clone, Serialize)]
+pub struct Exported {
+    /// The file.
+    pub file: PathBuf,
+    /// The generation.
+    pub generation: u64,
+    /// Its step.
+    pub step: u32,
+    /// Gaussians in the file.
+    pub gaussians: u64,
+    /// Gaussians that are not finite and were left out.
+    pub skipped: u64,
+    /// Bytes of the file.
+    pub bytes: u64,
+    /// Whether the file holds local coordinates, since f32 cannot hold the dataset's.
+    pub is_local: bool,
+    /// Bytes of pages that were read.
+    pub bytes_read: u64,
+    /// Most memory of the process, bytes.
+    pub host_bytes_peak: u64,
+}
+
+/// Exports a generation.
+///
+/// # Errors
+/// The store cannot be opened or is damaged, the budget is too small, no Gaussian is left, or the file cannot be written.
+pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, TrainError> {
+    let store = StoreReader::open(&place.folder, Access::Pages, WitnessRule::Obeyed)?;
+    let generation = store.find(request.generation.as_deref())?;
+    let state = run_state_of(&store, generation)?;
+    let (_, options) = options_of(&place.folder, &state)?;
+    let mut scene = scene_at(&store, generation, &state, &options, request.host_mem)?;
+    let mut choice = Choice::new(&state, request);
+    let pages = choice.pages(&scene);
+    choice.find_cut(&mut scene, &pages, state.step)?;
+    let sh_degree = request.sh_degree.map_or(options.sh_degree, |degree| degree.min(options.sh_degree));
+    let meta = meta_of(&state, &options);
+    let mut writer = PlyWriter::create(&request.out, sh_degree, state.rows_bound, &meta)?;
+    let mut given = 0;
+    scene.for_rows_of(&pages, state.step, &mut |rows| {
+        let chosen = choice.chosen(rows, sh_degree);
+        given += chosen.rows() as u64;
+        Ok::<(), TrainError>(writer.write(&chosen)?)
+    })?;
+    if given == 0 && request.crop.is_some() {
+        let problem = "no Gaussian lies in this box";
+        return Err(
+            InputError::new("--crop", problem, "the box is minx,miny,minz,maxx,maxy,maxz in dataset units").into()
+        );
+    }
+    let written = writer.finish()?;
+    Ok(Exported {
+        file: request.out.clone(),
+        generation,
+        step: state.step,
+        gaussians: written.rows,
+        skipped: written.skipped,
+        bytes: written.bytes,
+        is_local: written.frame == ExportFrame::Local,
+        bytes_read: scene.pager.stats().bytes_read,
+        host_bytes_peak: host_bytes_peak().unwrap_or(0),
+    })
+}
+
+/// What the trainer writes in the comments.
+fn meta_of(state: &RunState, options: &RunOptions) -> PlyMeta {
+    let print = &state.dataset;
+    PlyMeta {
+        step: Some(u64::from(state.step)),
+        origin: print.origin,
+        scale: print.scale,
+        scene_radius: f64::from(print.scene_scale) * print.scale,
+        frame: options.export_frame,
+        ..PlyMeta::default()
+    }
+}
+
+/// The pages of a generation behind as many frames as the budget allows.
+pub(super) fn scene_at(
+    store: &StoreReader,
+    generation: u64,
+    state: &RunState,
+    options: &RunOptions,
+    host_mem: u64,
+) -> Result<PagedScene, TrainError> {
+    let pages = store.pages_at(generation)?;
+    let frame = PagerConfig::in_memory(options.page_rows, options.sh_degree).frame_bytes() as u64;
+    // 88 bytes of tables for each step of the schedule.
+    let tables = 88 * u64::from(options.rates.steps);
+    let fixed = FIXED_BYTES + tables + (store.entries() + pages.len()) as u64 * ENTRY_BYTES;
+    let frames = host_mem.saturating_sub(fixed) / (frame * COPIES);
+    if frames == 0 {
+        let least = format_bytes(fixed + frame * COPIES);
+        let problem = format!("{} are too little for this store", format_bytes(host_mem));
+        return Err(InputError::new("--host-mem", problem, format!("give at least {least}")).into());
+    }
+    let config = PagerConfig {
+        page_rows: options.page_rows,
+        sh_degree: options.sh_degree,
+        frames: (frames as usize).min(FRAMES_MAX),
+        policy: EvictPolicy::default(),
+        prefetch_bytes: frame as usize,
+        plan_bytes: 0,
+    };
+    let contradiction = |what: String| CommitError::Contradiction(what);
+    let events = state.event_log().map_err(|e| contradiction(e.to_string()))?;
+    let histogram = GradHistogram::from_filled(&state.histogram);
+    let histogram = histogram.ok_or_else(|| contradiction("statistics without bins".to_string()))?;
+    let pager = Pager::open(config, store.paged_store(&pages, READERS)?, &pages, events.len())?;
+    Ok(PagedScene::restore(pager, options, events, histogram, [state.rows, state.rows_bound]))
+}
+
+/// Which rows go into the file.
+struct Choice {
+    /// In the local frame, rounded outwards for pages; rows are compared in dataset coordinates.
+    crop: Option<[f64; 6]>,
+    origin: [f64; 3],
+    scale: f64,
+    most: Option<u64>,
+    /// The least visible row that stays.
+    cut: Option<GiantCut>,
+    /// Number of the next row among those inside the box.
+    next: u32,
+}
+
+impl Choice {
+    fn new(state: &RunState, request: &ExportRequest) -> Choice {
+        let (origin, scale) = (state.dataset.origin, state.dataset.scale);
+        Choice { crop: request.crop, origin, scale, most: request.max_gaussians, cut: None, next: 0 }
+    }
+
+    /// Pages that may hold a row inside the box, in the order of their names.
+    fn pages(&self, scene: &PagedScene) -> Vec<PageNo> {
+        let index = scene.pager.index();
+        let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
+        pages.retain(|p| {
+            let bounds = &index[p.index()].bounds;
+            index[p.index()].rows > 0
+                && self.crop.is_none_or(|crop| {
+                    // A little wider than the box: the way back into dataset coordinates rounds.
+                    let slack = |x: f64| x.abs() * 1e-6 + 1e-9;
+                    (0..3).all(|i| {
+                        let at = |x: f32| f64::from(x) * self.scale + self.origin[i];
+                        let (lo, hi) = (at(bounds.lo[i]), at(bounds.hi[i]));
+                        hi + slack(hi) >= crop[i] && lo - slack(lo) <= crop[3 + i]
+                    })
+                })
+        });
+        pages.sort_unstable_by_key(|p| index[p.index()].id);
+        pages
+    }
+
+    /// Finds the least visible row that stays, in passes over the pages.
+    fn find_cut(&mut self, scene: &mut PagedScene, pages: &[PageNo], step: u32) -> Result<(), TrainError> {
+        let Some(most) = self.most else { return Ok(()) };
+        let mut count = 0u64;
+        scene.for_rows_of(pages, step, &mut |rows| {
+            count += (0..rows.rows()).filter(|&row| self.is_inside(rows, row)).count() as u64;
+            Ok::<(), TrainError>(())
+        })?;
+        if count <= most {
+            return Ok(());
+        }
+        let mut search = RankSearch::new(count - most, count);
+        while !search.is_done() {
+            let mut next = 0;
+            scene.for_rows_of(pages, step, &mut |rows| {
+                for row in (0..rows.rows()).filter(|&row| self.is_inside(rows, row)) {
+                    search.count(GiantCut::key(visibility(rows, row), next));
+                    next += 1;
+                }
+                Ok::<(), TrainError>(())
+            })?;
+            search.next_pass();
+        }
+        self.cut = Some(GiantCut::found(&search));
+        Ok(())
+    }
+
+    /// The rows that stay, without the bands above a degree.
+    fn chosen(&mut self, rows: &Columns, sh_degree: u8) -> Columns {
+        let mut chosen = Columns::zeros(0, rows.sh_degree);
+        if self.crop.is_none() && self.cut.is_none() {
+            chosen = rows.clone();
+        } else {
+            for row in 0..rows.rows() {
+                if !self.is_inside(rows, row) {
+                    continue;
+                }
+                self.next += 1;
+                if self.cut.is_none_or(|cut| cut.is_giant(visibility(rows, row), self.next - 1)) {
+                    Column::ALL.into_iter().for_each(|c| chosen.column_mut(c).extend_from_slice(rows.row(c, row)));
+                }
+            }
+        }
+        cut_sh(chosen, sh_degree)
+    }
+
+    fn is_inside(&self, rows: &Columns, row: usize) -> bool {
+        let Some(crop) = self.crop else { return true };
+        let mean = rows.row(Column::Means, row);
+        (0..3).all(|i| {
+            let x = f64::from(mean[i]) * self.scale + self.origin[i];
+            x >= crop[i] && x <= crop[3 + i]
+        })
+    }
+}
+
+/// How much of a picture a row can cover: its opacity times the area of its two longest axes.
+fn visibility(rows: &Columns, row: usize) -> f32 {
+    let scales = rows.row(Column::Scales, row);
+    let shortest = scales[0].min(scales[1]).min(scales[2]);
+    let opacity = 1.0 / (1.0 + exp32(-rows.opacities[row]));
+    opacity * exp32(scales[0] + scales[1] + scales[2] - shortest)
+}

@@ -1,0 +1,281 @@
+//! Gaussians of a PLY as a fresh store, however many there are.
+//!
+//! Rows go through files beside the store into pages, as a run's first Gaussians do: the largest 0.5 % apart, the others
+//! by median splits. Values are those of the file, bit for bit, in the file's own frame; moments are zero; no step is done.
+//!
+//! Invariants: 1. memory is bounded by the budget; 2. pages are a function of the file, `page_rows` and nothing else; 3. the
+//! store is there whole or not at all.
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::ids::PageId;
+use crate::base::units::{MIB, format_bytes};
+use crate::checkpoint::run_state::{DatasetPrint, RunState, TrafficSoFar};
+use crate::config::file::TrainConfig;
+use crate::config::limits::{self, RunOptions};
+use crate::dataset::import::{Division, Spool, SpoolSpace, SpoolWriter};
+use crate::exchange::ply::{ExportFrame, PlyMeta, ROW_HEAD, holds_gaussians, push_row, stream_gaussians};
+use crate::page::codec::Codec;
+use crate::page::commit::CommitError;
+use crate::page::new_store::{NewStore, refuse_existing};
+use crate::page::slots::SlotLayout;
+use crate::paging::label::label;
+use crate::scene::columns::Columns;
+use crate::scene::page_layout::{PageLayout, capacity_bytes, write_page};
+use crate::scene::partition::{GiantCut, Pages, Placed, first_fill};
+use crate::scene::state::SceneState;
+use crate::train::memory::host_bytes_peak;
+use crate::train::pages::PageRules;
+use crate::train::trainer::TrainError;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+/// What the program takes besides the budget's parts: threads, the store's buffers and its map.
+const FIXED_BYTES: u64 = 48 * MIB;
+
+/// What to import, and where to.
+#[derive(Debug, Clone)]
+pub struct ImportRequest {
+    /// The PLY of Gaussians.
+    pub file: PathBuf,
+    /// The new store, a folder that does not exist.
+    pub out: PathBuf,
+    /// Memory, bytes.
+    pub host_mem: u64,
+    /// Gaussians that a page holds.
+    pub page_rows: u32,
+    /// How pages are stored.
+    pub codec: Codec,
+}
+
+/// What was imported.
+#[derive(Debug, Clone, Serialize)]
+pub struct Imported {
+    /// The new folder.
+    pub store: PathBuf,
+    /// Gaussians.
+    pub gaussians: u64,
+    /// Gaussians that are not finite and were left out.
+    pub dropped: u64,
+    /// Pages.
+    pub pages: u64,
+    /// Degree of the file.
+    pub sh_degree: u8,
+    /// Most memory of the process, bytes.
+    pub host_bytes_peak: u64,
+}
+
+/// A Gaussian with its number, on its way into a page.
+#[derive(Debug, Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
+#[repr(C)]
+struct Row {
+    head: [f32; ROW_HEAD],
+    sh_n: [[f32; 15]; 3],
+    row: u32,
+}
+
+impl Row {
+    fn of(values: &[f32], row: u32) -> Row {
+        let mut of = Row { head: [0.0; ROW_HEAD], sh_n: [[0.0; 15]; 3], row };
+        of.head.copy_from_slice(&values[..ROW_HEAD]);
+        of.sh_n.as_flattened_mut()[..values.len() - ROW_HEAD].copy_from_slice(&values[ROW_HEAD..]);
+        of
+    }
+
+    fn size_key(&self) -> u64 {
+        GiantCut::key(self.head[7].max(self.head[8]).max(self.head[9]), self.row)
+    }
+}
+
+impl Placed for Row {
+    fn point(&self) -> [f32; 3] {
+        [self.head[0], self.head[1], self.head[2]]
+    }
+    fn row(&self) -> u32 {
+        self.row
+    }
+}
+
+/// Imports a PLY.
+///
+/// # Errors
+/// The file cannot be read or holds no Gaussians, the budget is too small, or the drive refuses. There is no store then.
+pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
+    refuse_existing(&request.out)?;
+    if !holds_gaussians(&request.file)? {
+        let remedy = "train on points with gsscale-train --init-ply";
+        return Err(InputError::new(&request.file, "it holds points, not Gaussians", remedy).into());
+    }
+    let (memory, beside) = (memory_for_rows(request)?, folder_of(&request.out));
+    let space = SpoolSpace { folder: &beside, memory: memory / 10 };
+    let (rows, meta, sh_degree) = spool_rows(&request.file, space)?;
+    let count = rows.len();
+    let (config, options) = options_for(request, sh_degree, &meta)?;
+    let layout =
+        SlotLayout::new(capacity_bytes(options.page_rows, sh_degree), count.div_ceil(options.page_rows) as u64);
+    let mut pages = PageWriter {
+        store: NewStore::create(&request.out, layout, request.codec)?,
+        rules: PageRules::new(&options),
+        sh_degree,
+        payload: vec![0; capacity_bytes(options.page_rows, sh_degree).div_ceil(8)],
+        pages: 0,
+        failed: None,
+    };
+    let (small, large) = split_giants(rows, space)?;
+    let fill = first_fill(options.page_rows, options.densify.is_some());
+    for part in [small, large] {
+        let of_part = Pages::of(part.len(), fill);
+        let records_in_memory = (memory / 2 / (2 * size_of::<Row>())).max(fill);
+        let division = Division { space, pages: of_part, records_in_memory };
+        let written = division.run(part, &mut |range, rows| {
+            let first = of_part.start(range.start);
+            let mut numbers = range;
+            numbers.try_for_each(|n| pages.write(&rows[of_part.start(n) - first..of_part.start(n + 1) - first]))
+        });
+        match pages.failed.take() {
+            Some(error) => return Err(error),
+            None => written?,
+        }
+    }
+    let state = first_state(&config, &meta, count as u64, sh_degree)?;
+    pages.store.commit(&state, format!("imported from {}", request.file.display()).as_bytes(), &[])?;
+    let number = u64::from(pages.pages);
+    pages.store.finish()?;
+    Ok(Imported {
+        store: request.out.clone(),
+        gaussians: count as u64,
+        dropped: meta.dropped,
+        pages: number,
+        sh_degree,
+        host_bytes_peak: host_bytes_peak().unwrap_or(0),
+    })
+}
+
+/// Makes pages of rows and stores them.
+struct PageWriter {
+    store: NewStore,
+    rules: PageRules,
+    sh_degree: u8,
+    /// Words, so that tables are aligned.
+    payload: Vec<u64>,
+    pages: u32,
+    failed: Option<TrainError>,
+}
+
+impl PageWriter {
+    fn write(&mut self, rows: &[Row]) -> InputResult<()> {
+        let mut columns = Columns::zeros(0, self.sh_degree);
+        let bands = crate::scene::columns::sh_n_width(self.sh_degree);
+        let mut values = [0.0; ROW_HEAD + 45];
+        for row in rows {
+            values[..ROW_HEAD].copy_from_slice(&row.head);
+            values[ROW_HEAD..].copy_from_slice(row.sh_n.as_flattened());
+            push_row(&mut columns, &values[..ROW_HEAD + bands]);
+        }
+        let mut state = SceneState::from_columns(columns);
+        state.uid.iter_mut().zip(rows).for_each(|(uid, row)| *uid = u64::from(row.row));
+        let payload: &mut [u8] = bytemuck::cast_slice_mut(&mut self.payload);
+        let layout: PageLayout = write_page(&state, payload);
+        let id = PageId::initial(self.pages);
+        let meta = self.rules.meta(id, &state);
+        self.pages += 1;
+        self.store.put(id, &label(&meta), &payload[..layout.bytes()]).map_err(|error| {
+            let told = InputError::new("the new store", error.to_string(), "see the cause");
+            self.failed = Some(error.into());
+            told
+        })
+    }
+}
+
+/// Memory for rows on their way, bytes.
+fn memory_for_rows(request: &ImportRequest) -> InputResult<usize> {
+    // Pages in flight, and one being made.
+    let pages = 20 * capacity_bytes(request.page_rows as usize, 3) as u64;
+    let least = FIXED_BYTES + pages + 16 * MIB;
+    if request.host_mem < least {
+        let problem = format!("{} are too little", format_bytes(request.host_mem));
+        return Err(InputError::new("--host-mem", problem, format!("give at least {}", format_bytes(least))));
+    }
+    Ok((request.host_mem - FIXED_BYTES - pages) as usize)
+}
+
+/// Where lists go that outgrow memory: the drive of the new store.
+fn folder_of(out: &Path) -> PathBuf {
+    out.parent().filter(|p| !p.as_os_str().is_empty()).map_or_else(|| PathBuf::from("."), Path::to_path_buf)
+}
+
+fn spool_rows(file: &Path, space: SpoolSpace<'_>) -> InputResult<(Spool<Row>, PlyMeta, u8)> {
+    let mut rows = SpoolWriter::new(space);
+    let (mut next, mut width) = (0u32, ROW_HEAD);
+    let meta = stream_gaussians(file, &mut |values| {
+        rows.push(Row::of(values, next))?;
+        width = values.len();
+        let too_many = || InputError::new(file, "it has 2^32 Gaussians or more", "thin it out");
+        next = next.checked_add(1).ok_or_else(too_many)?;
+        Ok(())
+    })?;
+    let sh_degree = (0..=3).find(|&d| crate::scene::columns::sh_n_width(d) == width - ROW_HEAD).unwrap_or(0);
+    Ok((rows.finish()?, meta, sh_degree))
+}
+
+/// The ordinary rows and the giants.
+fn split_giants(rows: Spool<Row>, space: SpoolSpace<'_>) -> InputResult<(Spool<Row>, Spool<Row>)> {
+    let mut search = GiantCut::search(rows.len());
+    while !search.is_done() {
+        rows.for_each(|row| {
+            search.count(row.size_key());
+            Ok(())
+        })?;
+        search.next_pass();
+    }
+    let cut = GiantCut::found(&search);
+    let (mut small, mut large) = (SpoolWriter::new(space), SpoolWriter::new(space));
+    rows.for_each(|row| {
+        let size = row.head[7].max(row.head[8]).max(row.head[9]);
+        if cut.is_giant(size, row.row) { large.push(*row) } else { small.push(*row) }
+    })?;
+    Ok((small.finish()?, large.finish()?))
+}
+
+/// The defaults, for Gaussians that have all their bands in use.
+fn options_for(request: &ImportRequest, sh_degree: u8, meta: &PlyMeta) -> InputResult<(TrainConfig, RunOptions)> {
+    let config = TrainConfig {
+        page_rows: request.page_rows,
+        sh_degree,
+        sh_every: 0,
+        init_ply: std::path::absolute(&request.file).unwrap_or_else(|_| request.file.clone()).display().to_string(),
+        export_frame: meta.frame.name().to_string(),
+        ..TrainConfig::default()
+    };
+    config.check()?;
+    let options = RunOptions { sh_degree_start: sh_degree, ..RunOptions::new(&config, 1.0) };
+    Ok((config, options))
+}
+
+/// The state of a run that has not begun.
+fn first_state(config: &TrainConfig, meta: &PlyMeta, rows: u64, sh_degree: u8) -> Result<Vec<u8>, TrainError> {
+    let (origin, scale) = match meta.frame {
+        ExportFrame::Local => (meta.origin, meta.scale),
+        ExportFrame::Dataset => ([0.0; 3], 1.0),
+    };
+    let fail = |e: String| CommitError::Contradiction(e);
+    let state = RunState {
+        step: 0,
+        config: toml::to_string(config).map_err(|e| fail(e.to_string()))?,
+        simd: limits::simd_path(config).name().to_string(),
+        device: "none".to_string(),
+        sh_degree_start: sh_degree,
+        dataset: DatasetPrint { views: Vec::new(), first_rows: rows, points: 0, scene_scale: 1.0, origin, scale },
+        events: Vec::new(),
+        histogram: Vec::new(),
+        rows,
+        rows_bound: rows,
+        rows_skipped: 0,
+        steps_skipped: 0,
+        steps_skipped_in_a_row: 0,
+        train_seconds: 0.0,
+        metrics_bytes: 0,
+        test: None,
+        traffic: TrafficSoFar::default(),
+    };
+    Ok(state.to_bytes().map_err(|e| fail(e.to_string()))?)
+}

@@ -1,0 +1,270 @@
+//! What a store is, its trainer's state in words, and one page.
+
+use super::{StorePlace, options_of, run_state_of};
+use crate::base::error::InputError;
+use crate::base::ids::PageId;
+use crate::base::math::exp32;
+use crate::checkpoint::run_state::RunState;
+use crate::config::file::TrainConfig;
+use crate::page::format::StoredAs;
+use crate::page::reading::{Access, StoreReader, WitnessRule};
+use crate::page::segment_files::segment_file_name;
+use crate::paging::label::meta_from_label;
+use crate::paging::stored::{check_values, layout_of};
+use crate::scene::events::EventKind;
+use crate::scene::rows::Rows;
+use crate::train::trainer::TrainError;
+use serde::Serialize;
+
+/// A store as a whole, and one of its generations.
+#[derive(Debug, Clone, Serialize)]
+pub struct Inspected {
+    /// The store's folder.
+    pub store: std::path::PathBuf,
+    /// Its identity, hexadecimal.
+    pub identity: String,
+    /// The process that writes to it, if any.
+    pub used_by: Option<String>,
+    /// Version of the format.
+    pub format_version: u32,
+    /// Feature bits that a reader must know.
+    pub features_incompatible: u32,
+    /// Feature bits that a reader may pass over.
+    pub features_compatible: u32,
+    /// Bytes of a slot.
+    pub slot_bytes: u64,
+    /// Slots in a segment.
+    pub slots_per_segment: u32,
+    /// Segment files that are there.
+    pub segments: u64,
+    /// Their bytes.
+    pub segment_bytes: u64,
+    /// Transactions of the map.
+    pub transactions: u64,
+    /// The generation that the rest is about.
+    pub generation: u64,
+    /// Its pages.
+    pub pages: u64,
+    /// Pages stored as they are, shuffled with zstd, as halves.
+    pub pages_by_codec: [u64; 3],
+    /// Bytes of payloads as used and as stored.
+    pub payload_bytes: [u64; 2],
+    /// Pages stored with each SH degree.
+    pub pages_by_degree: [u64; 4],
+    /// Pages that have not applied all events yet.
+    pub pages_behind: u64,
+    /// The trainer's state, a fact a line.
+    pub state: Vec<String>,
+}
+
+/// Looks at a generation.
+///
+/// # Errors
+/// The store cannot be opened, or the generation is not kept.
+pub fn inspect(place: &StorePlace, generation: Option<&str>) -> Result<Inspected, TrainError> {
+    let store = StoreReader::open(&place.folder, Access::Map, WitnessRule::Obeyed)?;
+    let generation = store.find(generation)?;
+    let state = run_state_of(&store, generation)?;
+    let (config, _) = options_of(&place.folder, &state)?;
+    let pages = store.pages_at(generation)?;
+    let segments = store.segments()?;
+    let (mut by_codec, mut by_degree, mut payload, mut behind) = ([0; 3], [0; 4], [0; 2], 0);
+    for page in &pages {
+        by_codec[codec_number(page.slot.codec)] += 1;
+        payload[0] += u64::from(page.slot.payload_bytes);
+        payload[1] += u64::from(page.slot.stored_bytes);
+        if let Some(meta) = meta_from_label(page.page, &page.label) {
+            by_degree[usize::from(meta.sh_degree)] += 1;
+            behind += u64::from((meta.events_applied as usize) < state.events.len());
+        }
+    }
+    let (format, features) = (store.format(), store.features());
+    Ok(Inspected {
+        store: place.folder.clone(),
+        identity: format!("{:032x}", format.store),
+        used_by: store.used_by().map(str::to_string),
+        format_version: features.version,
+        features_incompatible: features.incompatible,
+        features_compatible: features.compatible,
+        slot_bytes: format.layout.slot_bytes,
+        slots_per_segment: format.layout.slots_per_segment,
+        segments: segments.len() as u64,
+        segment_bytes: segments.iter().map(|(_, bytes)| bytes).sum(),
+        transactions: store.transactions(),
+        generation,
+        pages: pages.len() as u64,
+        pages_by_codec: by_codec,
+        payload_bytes: payload,
+        pages_by_degree: by_degree,
+        pages_behind: behind,
+        state: words_of(&state, &config),
+    })
+}
+
+/// Number of a codec in lists.
+fn codec_number(codec: StoredAs) -> usize {
+    match codec {
+        StoredAs::Raw => 0,
+        StoredAs::ShuffledZstd => 1,
+        StoredAs::Halves => 2,
+    }
+}
+
+/// The trainer's state in words.
+fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
+    let count = |is: fn(&EventKind) -> bool| state.events.iter().filter(|e| is(&e.kind)).count();
+    let rounds = count(|k| matches!(k, EventKind::Densify(_)));
+    let resets = count(|k| matches!(k, EventKind::ResetOpacity { .. }));
+    let raises = count(|k| matches!(k, EventKind::RaiseShDegree { .. }));
+    let raised = state.events.iter().rev().find_map(|e| match e.kind {
+        EventKind::RaiseShDegree { degree } => Some(degree),
+        _ => None,
+    });
+    let degree = raised.unwrap_or(state.sh_degree_start);
+    let last = state.events.last().map_or(String::new(), |e| format!(", the last after step {}", e.step));
+    let print = &state.dataset;
+    let [x, y, z] = print.origin;
+    vec![
+        format!("step {} of {}, {:.1} s of training", state.step, config.steps, state.train_seconds),
+        format!("{} Gaussians in pages, {} with all promised growth", state.rows, state.rows_bound),
+        format!("SH degree {degree} in use, up to {}; {} Gaussians a page at most", config.sh_degree, config.page_rows),
+        format!("{} events: {rounds} rounds, {resets} opacity resets, {raises} SH raises{last}", state.events.len()),
+        format!(
+            "strategy {}, view order {}, seed {}, moments {}",
+            config.strategy, config.view_order, config.seed, config.moments
+        ),
+        format!("rendered by {}, instruction path {}", state.device, state.simd),
+        format!(
+            "dataset of {} views, {} first Gaussians, origin {x} {y} {z}, scale {}",
+            print.views.len(),
+            print.first_rows,
+            print.scale
+        ),
+        format!("{} steps and {} updates skipped as not finite", state.steps_skipped, state.rows_skipped),
+        format!("{} bytes of metrics.jsonl belong to it", state.metrics_bytes),
+    ]
+}
+
+/// Least, mean and most of a value.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Spread {
+    /// Least.
+    pub least: f64,
+    /// Mean.
+    pub mean: f64,
+    /// Most.
+    pub most: f64,
+}
+
+/// One page.
+#[derive(Debug, Clone, Serialize)]
+pub struct PageInspected {
+    /// Its name.
+    pub page: String,
+    /// The generation that brought this version.
+    pub since: u64,
+    /// Segment file.
+    pub file: String,
+    /// Offset in it, bytes.
+    pub offset: u64,
+    /// Number of the write in the life of the store.
+    pub serial: u64,
+    /// How it is stored.
+    pub codec: String,
+    /// Bytes as used and as stored.
+    pub payload_bytes: [u32; 2],
+    /// xxh3-128 of the stored payload, hexadecimal.
+    pub checksum: String,
+    /// Rows.
+    pub rows: u32,
+    /// Degree that it is stored with.
+    pub sh_degree: u8,
+    /// Events that it has applied, of all so far.
+    pub events: [u32; 2],
+    /// Box of the means now and until it is next touched, local coordinates.
+    pub bounds: [[f32; 3]; 2],
+    /// Largest standard deviation, local units.
+    pub sigma_max: f32,
+    /// Step of the last update of its rows.
+    pub stamp: Spread,
+    /// Rows whose moments are all zero.
+    pub rows_without_moments: u64,
+    /// Opacities as stored, after activation.
+    pub opacity: Spread,
+    /// Largest standard deviation of each row as stored, local units.
+    pub sigma: Spread,
+    /// Views that drew a row since the last round.
+    pub views: Spread,
+    /// First value that training could not have left, if any.
+    pub fault: Option<String>,
+}
+
+/// Looks at a page: its header and its rows as they are stored.
+///
+/// # Errors
+/// The store is in use or cannot be opened, or the page is not there or damaged.
+pub fn inspect_page(place: &StorePlace, generation: Option<&str>, id: PageId) -> Result<PageInspected, TrainError> {
+    let store = StoreReader::open(&place.folder, Access::Pages, WitnessRule::Obeyed)?;
+    let generation = store.find(generation)?;
+    let state = run_state_of(&store, generation)?;
+    let pages = store.pages_at(generation)?;
+    let refuse = |problem: String, remedy: &str| InputError::new(&place.folder, problem, remedy);
+    let page = pages.iter().find(|p| p.page == id).ok_or_else(|| {
+        let (first, last) = (pages.first().map(|p| p.page), pages.last().map(|p| p.page));
+        let range = first.zip(last).map_or(String::new(), |(a, b)| format!(" ({a} to {b})"));
+        let problem = format!("generation {generation} has no page {id} among its {}{range}", pages.len());
+        refuse(problem, "a page that was split is replaced by its halves, page 7 by 7.0 and 7.1")
+    })?;
+    let broken = |what: String| refuse(format!("page {id}: {what}"), "gsscale-ckpt verify --deep lists all damage");
+    let meta = meta_from_label(id, &page.label).ok_or_else(|| broken("its label is none".to_string()))?;
+    let mut reader = store.slot_reader();
+    let header = reader.check_header(id, &page.slot).map_err(broken)?;
+    let payload = reader.payload(id, &page.slot).map_err(broken)?;
+    if layout_of(&meta).bytes() != payload.len() {
+        return Err(broken("its slot has another length".to_string()).into());
+    }
+    let rows = layout_of(&meta).rows(payload, 0);
+    let slot = page.slot;
+    let sigma = |s: &[f32]| f64::from(exp32(s[0].max(s[1]).max(s[2])));
+    Ok(PageInspected {
+        page: id.to_string(),
+        since: page.since,
+        file: segment_file_name(slot.place.segment),
+        offset: slot.place.offset,
+        serial: header.serial,
+        codec: ["raw", "shuffled zstd", "halves"][codec_number(slot.codec)].to_string(),
+        payload_bytes: [slot.payload_bytes, slot.stored_bytes],
+        checksum: format!("{:032x}", slot.checksum),
+        rows: meta.rows,
+        sh_degree: meta.sh_degree,
+        events: [meta.events_applied, state.events.len() as u32],
+        bounds: [meta.bounds.lo, meta.bounds.hi],
+        sigma_max: meta.bounds.sigma_max,
+        stamp: spread(rows.stamp.iter().map(|&s| f64::from(s))),
+        rows_without_moments: rows_without_moments(&rows),
+        opacity: spread(rows.columns.opacities.iter().map(|&o| 1.0 / (1.0 + f64::from(exp32(-o))))),
+        sigma: spread(rows.columns.scales.chunks_exact(3).map(sigma)),
+        views: spread(rows.count.iter().map(|&c| f64::from(c))),
+        fault: check_values(&rows, state.step).err(),
+    })
+}
+
+fn spread(values: impl Iterator<Item = f64>) -> Spread {
+    let (mut least, mut sum, mut most, mut count) = (f64::INFINITY, 0.0, f64::NEG_INFINITY, 0.0);
+    for value in values {
+        (least, sum, most, count) = (least.min(value), sum + value, most.max(value), count + 1.0);
+    }
+    Spread { least, mean: sum / count, most }
+}
+
+fn rows_without_moments(rows: &Rows<'_>) -> u64 {
+    let m = &rows.exp_avg;
+    let tables = [m.means, m.quats, m.scales, m.opacities, m.sh0, m.sh_n];
+    let is_zero = |row: usize| {
+        tables.iter().all(|table| {
+            let width = table.len() / rows.rows();
+            table[row * width..(row + 1) * width].iter().all(|&x| x == 0.0)
+        })
+    };
+    (0..rows.rows()).filter(|&row| is_zero(row)).count() as u64
+}

@@ -1,0 +1,83 @@
+//! The kept generations of a store.
+
+use super::{StorePlace, run_state_of};
+use crate::page::reading::{Access, StoreReader, WitnessRule};
+use crate::train::trainer::TrainError;
+use serde::Serialize;
+use std::path::Path;
+
+/// A kept generation.
+#[derive(Debug, Clone, Serialize)]
+pub struct GenerationLine {
+    /// Its number.
+    pub generation: u64,
+    /// Its names.
+    pub names: Vec<String>,
+    /// Whether `--resume` goes on from it.
+    pub is_latest: bool,
+    /// Steps done.
+    pub step: u32,
+    /// Held-out PSNR at the last evaluation before, dB; `None` where it is not known.
+    pub psnr: Option<f64>,
+    /// Gaussians in its pages.
+    pub gaussians: u64,
+    /// Pages.
+    pub pages: u64,
+    /// Bytes on the drive that no other kept generation needs.
+    pub bytes_alone: u64,
+    /// Bytes on the drive.
+    pub bytes: u64,
+}
+
+/// All of them.
+#[derive(Debug, Clone, Serialize)]
+pub struct Listed {
+    /// The store's folder.
+    pub store: std::path::PathBuf,
+    /// The process that writes to it, if any.
+    pub used_by: Option<String>,
+    /// Bytes of its segment files.
+    pub segment_bytes: u64,
+    /// Ascending.
+    pub generations: Vec<GenerationLine>,
+}
+
+/// Lists the kept generations.
+///
+/// # Errors
+/// The store cannot be opened, or a run state is of another program.
+pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
+    let store = StoreReader::open(&place.folder, Access::Map, WitnessRule::Obeyed)?;
+    let tests = place.run.as_deref().map(tests_of).unwrap_or_default();
+    let mut generations = Vec::new();
+    for used in store.uses()? {
+        let state = run_state_of(&store, used.generation)?;
+        let in_metrics = || tests.iter().rfind(|(step, _)| *step < state.step).map(|(_, psnr)| *psnr);
+        let psnr = state.test.map(|test| test.psnr).or_else(in_metrics);
+        generations.push(GenerationLine {
+            generation: used.generation,
+            names: used.names,
+            is_latest: used.generation == store.generations().latest(),
+            step: state.step,
+            psnr,
+            gaussians: state.rows,
+            pages: used.pages,
+            bytes_alone: used.bytes_alone,
+            bytes: used.bytes,
+        });
+    }
+    let segment_bytes = store.segments()?.iter().map(|(_, bytes)| bytes).sum();
+    let used_by = store.used_by().map(str::to_string);
+    Ok(Listed { store: place.folder.clone(), used_by, segment_bytes, generations })
+}
+
+/// Steps and PSNRs of the evaluations in a run's metrics.jsonl, in order. Lines that are none are passed over: the file is
+/// cut short after a crash.
+fn tests_of(run: &Path) -> Vec<(u32, f64)> {
+    let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
+    let test = |line: &str| {
+        let line: serde_json::Value = serde_json::from_str(line).ok()?;
+        Some((u32::try_from(line["step"].as_u64()?).ok()?, line["test"]["psnr"].as_f64()?))
+    };
+    text.lines().filter_map(test).collect()
+}

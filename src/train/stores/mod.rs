@@ -1,0 +1,107 @@
+//! What tools do with checkpoints: list, look, verify, compare, export, import, copy, rebuild, go back, forget.
+//!
+//! Each file is one of these. They give plain structs, which the tool prints as text or JSON.
+//!
+//! Invariants: 1. what only looks writes nothing ([`crate::page::reading`]); 2. what makes a store or a file makes it whole
+//! or not at all; 3. values of rows come from the code that the trainer uses.
+
+mod change;
+mod copy;
+mod diff;
+mod export;
+mod import;
+mod inspect;
+mod list;
+mod salvage;
+mod start;
+mod verify;
+
+pub use change::{PruneRequest, Pruned, RolledBack, prune, rollback};
+pub use copy::{Copied, clone_store};
+pub use diff::{StoreDiff, diff};
+pub use export::{ExportRequest, Exported, export};
+pub use import::{ImportRequest, Imported, import};
+pub use inspect::{Inspected, PageInspected, Spread, inspect, inspect_page};
+pub use list::{GenerationLine, Listed, list};
+pub use salvage::{LostPage, SalvageRequest, Salvaged, salvage};
+pub use start::StoredStart;
+pub use verify::{Fault, Verdict, verify};
+
+use super::trainer::TrainError;
+use crate::base::error::{InputError, InputResult};
+use crate::checkpoint::run_state::RunState;
+use crate::config::file::TrainConfig;
+use crate::config::limits::RunOptions;
+use crate::page::reading::{ReadError, StoreReader, segments_in};
+use std::path::{Path, PathBuf};
+
+impl From<ReadError> for TrainError {
+    fn from(error: ReadError) -> TrainError {
+        match error {
+            ReadError::Input(error) => error.into(),
+            ReadError::Commit(error) => error.into(),
+        }
+    }
+}
+
+/// Where the store is that a user means.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StorePlace {
+    /// The spill directory.
+    pub folder: PathBuf,
+    /// The output folder of its run, if that was named.
+    pub run: Option<PathBuf>,
+}
+
+/// The store of a run's output folder, or the spill directory itself.
+///
+/// # Errors
+/// There is none.
+pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
+    if !dir.is_dir() {
+        return Err(InputError::new(
+            dir,
+            "there is no such folder",
+            "name a run's output folder or its spill directory",
+        ));
+    }
+    // A FORMAT file that was lost leaves the segments.
+    if dir.join("FORMAT").exists() || segments_in(dir).is_ok_and(|segments| !segments.is_empty()) {
+        return Ok(StorePlace { folder: dir.to_path_buf(), run: None });
+    }
+    let file = dir.join("config.toml");
+    if !file.is_file() {
+        let remedy = "name a run's output folder or its spill directory";
+        return Err(InputError::new(dir, "it is neither a store nor a run's output folder", remedy));
+    }
+    let config = TrainConfig::read(&file)?;
+    let folder = match config.spill_dir.as_str() {
+        "" => dir.join("checkpoint"),
+        spill_dir => PathBuf::from(spill_dir),
+    };
+    if folder.is_dir() {
+        return Ok(StorePlace { folder, run: Some(dir.to_path_buf()) });
+    }
+    let problem =
+        format!("the checkpoint of this run, {}, is not there: it is removed when a run ends", folder.display());
+    Err(InputError::new(dir, problem, "its result is point_cloud.ply in the same folder"))
+}
+
+/// The run state of a generation.
+///
+/// # Errors
+/// It cannot be read, or is of another program.
+pub fn run_state_of(store: &StoreReader, generation: u64) -> Result<RunState, TrainError> {
+    let bytes = store.run_state(generation)?;
+    let wrong = |problem: String| InputError::new(store.folder(), problem, "use the program that made it");
+    Ok(RunState::from_bytes(&bytes).map_err(|e| wrong(e.to_string()).at(format!("generation {generation}")))?)
+}
+
+/// The config of a run, and what follows from it.
+fn options_of(store: &Path, state: &RunState) -> InputResult<(TrainConfig, RunOptions)> {
+    let config = TrainConfig::parse(&state.config)
+        .map_err(|problem| InputError::new(store, problem, "use the program that made it").at("config of the run"))?;
+    let options = RunOptions::new(&config, state.dataset.scene_scale);
+    let options = RunOptions { sh_degree_start: state.sh_degree_start, ..options };
+    Ok((config, options))
+}

@@ -1,0 +1,426 @@
+//! A store whose map or pages are damaged, rebuilt elsewhere from what is whole.
+//!
+//! Where the map can still be verified (only its witness or some pages are damaged), the pages are those of the last
+//! generation; in place of a damaged version comes the newest older one that is whole. A run can go on from that.
+//!
+//! Where the map is lost, the newest whole version of every page is taken, whether it was committed or not. A page that
+//! was split counts as replaced by its parts. The trainer's state was in the map: what is left is a scene at the step of
+//! its newest row, to be exported or started from, with its moments, and without the events that were still pending.
+//!
+//! Invariants: 1. the damaged store is not written; 2. everything that is missing is said.
+
+use super::copy::{layout_for, usual_codec};
+use super::{StorePlace, options_of, run_state_of};
+use crate::base::error::InputError;
+use crate::base::ids::PageId;
+use crate::checkpoint::run_state::{DatasetPrint, RunState, TrafficSoFar};
+use crate::config::file::TrainConfig;
+use crate::config::limits::{self, RunOptions};
+use crate::page::commit::CommitError;
+use crate::page::format::{SlotHeader, SlotRef};
+use crate::page::new_store::{NewStore, refuse_existing};
+use crate::page::reading::{Access, ReadError, StoreReader, WitnessRule, format_at, refuse_if_in_use};
+use crate::page::scan::{Scan, scan_slots};
+use crate::page::slot_reader::SlotReader;
+use crate::page::slots::SlotLayout;
+use crate::page::spill_format::SpillFormat;
+use crate::paging::label::{label, meta_from_label};
+use crate::paging::stored::{check_values, layout_of};
+use crate::scene::page_layout::{capacity_bytes, read_page, write_page};
+use crate::scene::page_meta::PageMeta;
+use crate::train::pages::PageRules;
+use crate::train::report::read_resolved;
+use crate::train::trainer::TrainError;
+use serde::Serialize;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+/// What to salvage, and where to.
+#[derive(Debug, Clone)]
+pub struct SalvageRequest {
+    /// The new store, a folder that does not exist.
+    pub to: PathBuf,
+    /// The run's config.toml, where the map is lost and the store was named rather than its run.
+    pub config: Option<PathBuf>,
+}
+
+/// A page that is missing or older than it should be.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct LostPage {
+    /// The page.
+    pub page: String,
+    /// Its rows, where its label is known.
+    pub rows: Option<u32>,
+    /// Generation of the version that was taken instead; `None`: there is no whole one.
+    pub taken: Option<u64>,
+    /// What is wrong.
+    pub what: String,
+}
+
+/// What was salvaged.
+#[derive(Debug, Clone, Serialize)]
+pub struct Salvaged {
+    /// The new folder.
+    pub to: PathBuf,
+    /// Whether the map could be used, so that a run can go on from the new store.
+    pub has_state: bool,
+    /// Step of the run, or of the newest row.
+    pub step: u32,
+    /// Gaussians.
+    pub gaussians: u64,
+    /// Pages.
+    pub pages: u64,
+    /// Pages that are missing, incomplete or older.
+    pub lost: Vec<LostPage>,
+    /// What else the user should know.
+    pub notes: Vec<String>,
+}
+
+/// A version that is to be kept.
+struct Kept {
+    slot: SlotRef,
+    label: Vec<u8>,
+}
+
+/// What is known before pages are copied.
+struct Source {
+    folder: PathBuf,
+    store: u128,
+    layout: SlotLayout,
+    scan: Scan,
+    notes: Vec<String>,
+}
+
+/// Rebuilds a store.
+///
+/// # Errors
+/// The store is in use or of another version, nothing in it is whole, or the drive of the new one refuses. There is no
+/// new store then.
+pub fn salvage(place: &StorePlace, request: &SalvageRequest) -> Result<Salvaged, TrainError> {
+    refuse_existing(&request.to)?;
+    // Held until the end: no trainer may write meanwhile.
+    let _lock = refuse_if_in_use(&place.folder)?;
+    let mut notes = Vec::new();
+    let map = match StoreReader::open(&place.folder, Access::Pages, WitnessRule::Ignored) {
+        Ok(store) if store.generations().latest() > 0 => Some(store),
+        Ok(_) => {
+            notes.push("nothing was committed: pages are taken by their headers".to_string());
+            None
+        }
+        Err(error @ ReadError::Commit(_)) => {
+            notes.push(format!("the map is lost: {}", error.to_string().lines().next().unwrap_or_default()));
+            None
+        }
+        Err(ReadError::Input(error)) => {
+            notes.push(format!("the map is of no use without FORMAT: {}", error.problem));
+            None
+        }
+    };
+    let format = format_at(&place.folder).ok().map(|(format, _)| format);
+    let scan = scan_slots(&place.folder, format.map(|f| f.layout))?;
+    let source = source_of(place, format, scan, notes)?;
+    match map {
+        Some(store) => with_state(&store, source, request),
+        None => without_state(place, source, request),
+    }
+}
+
+/// Identity and layout, from FORMAT or from the headers.
+fn source_of(
+    place: &StorePlace,
+    format: Option<SpillFormat>,
+    scan: Scan,
+    mut notes: Vec<String>,
+) -> Result<Source, InputError> {
+    let nothing = || {
+        let problem = format!("no slot header in its {} segment files is whole", scan.segments);
+        InputError::new(&place.folder, problem, "check whether this is the folder that was meant")
+    };
+    let (&store, found) = match format {
+        Some(format) => scan.found.get_key_value(&format.store).ok_or_else(nothing)?,
+        None => scan.found.iter().max_by_key(|(_, found)| found.len()).ok_or_else(nothing)?,
+    };
+    for (other, found) in scan.found.iter().filter(|(other, _)| **other != store) {
+        notes.push(format!("{} slots of another store ({other:032x}) are left out", found.len()));
+    }
+    for (segment, bytes) in &scan.short {
+        notes.push(format!("{} ends after {bytes} bytes", crate::page::segment_files::segment_file_name(*segment)));
+    }
+    for (at, what) in &scan.broken {
+        notes.push(format!("segment {} offset {}: {what}", at.segment, at.offset));
+    }
+    let layout = format.map_or_else(
+        || {
+            // Every payload lies in its slot, so the longest gives the least that a slot can be.
+            let bytes = found.iter().map(|h| h.slot.payload_bytes as usize).max().unwrap_or(0);
+            SlotLayout::new(bytes, found.len() as u64)
+        },
+        |format| format.layout,
+    );
+    Ok(Source { folder: place.folder.clone(), store, layout, scan, notes })
+}
+
+impl Source {
+    fn reader(&self) -> SlotReader {
+        SlotReader::new(&self.folder, self.store, self.layout.slot_bytes)
+    }
+
+    /// Headers of every page, newest first.
+    fn by_page(&mut self) -> BTreeMap<PageId, Vec<SlotHeader>> {
+        let mut pages: BTreeMap<PageId, Vec<SlotHeader>> = BTreeMap::new();
+        for header in self.scan.found.remove(&self.store).unwrap_or_default() {
+            pages.entry(header.page).or_default().push(header);
+        }
+        pages.values_mut().for_each(|of| of.sort_unstable_by_key(|h| std::cmp::Reverse(h.serial)));
+        pages
+    }
+}
+
+/// The last generation, damaged versions replaced by older ones.
+fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest) -> Result<Salvaged, TrainError> {
+    let latest = store.find(None)?;
+    let mut state = run_state_of(store, latest)?;
+    let mut reader = source.reader();
+    let found = source.by_page();
+    let (mut kept, mut lost) = (BTreeMap::new(), Vec::new());
+    for page in store.pages_at(latest)? {
+        let rows = meta_from_label(page.page, &page.label).map(|m| m.rows);
+        let what = match reader.payload(page.page, &page.slot) {
+            Ok(_) => {
+                kept.insert(page.page, Kept { slot: page.slot, label: page.label });
+                continue;
+            }
+            Err(what) => what,
+        };
+        let older = found.get(&page.page).into_iter().flatten().filter(|h| h.slot.generation <= latest);
+        let usable = |h: &&SlotHeader| {
+            let applied = meta_from_label(h.page, &h.label).map(|m| m.events_applied as usize);
+            applied.is_some_and(|applied| applied <= state.events.len()) && reader.payload(h.page, &h.slot).is_ok()
+        };
+        let instead = older.filter(|h| h.slot != page.slot).find(usable);
+        lost.push(LostPage { page: page.page.to_string(), rows, taken: instead.map(|h| h.slot.generation), what });
+        if let Some(h) = instead {
+            kept.insert(h.page, Kept { slot: h.slot, label: h.label.clone() });
+        }
+    }
+    let rows: u64 = kept.iter().filter_map(|(id, k)| meta_from_label(*id, &k.label)).map(|m| u64::from(m.rows)).sum();
+    let promised = state.rows_bound.saturating_sub(state.rows);
+    (state.rows, state.rows_bound) = (rows, rows + promised);
+    let mut copy = NewStore::create(
+        &request.to,
+        layout_for(source.layout, kept.len() as u64),
+        usual_codec(kept.values().map(|k| &k.slot)),
+    )?;
+    for (id, Kept { slot, label }) in &kept {
+        copy.put(*id, label, reader.payload(*id, slot).map_err(|what| changed(&source.folder, *id, &what))?)?;
+    }
+    copy.skip_to(latest);
+    commit(copy, &state, &source)?;
+    if !lost.is_empty() {
+        source.notes.push("the run can go on from it, but no longer ends with the bytes that it would have had".into());
+    }
+    let (step, pages, to) = (state.step, kept.len() as u64, request.to.clone());
+    Ok(Salvaged { to, has_state: true, step, gaussians: rows, pages, lost, notes: source.notes })
+}
+
+fn commit(mut copy: NewStore, state: &RunState, source: &Source) -> Result<(), TrainError> {
+    let bytes = state.to_bytes().map_err(|e| CommitError::Contradiction(e.to_string()))?;
+    copy.commit(&bytes, format!("salvaged from {}", source.folder.display()).as_bytes(), &[])?;
+    Ok(copy.finish()?)
+}
+
+fn changed(folder: &Path, page: PageId, what: &str) -> InputError {
+    InputError::new(folder, format!("page {page} changed while it was read: {what}"), "check the drive, then try again")
+}
+
+/// The newest whole version of every page.
+fn without_state(place: &StorePlace, mut source: Source, request: &SalvageRequest) -> Result<Salvaged, TrainError> {
+    let mut reader = source.reader();
+    let found = source.by_page();
+    let (mut kept, mut lost) = (BTreeMap::new(), Vec::new());
+    for (id, versions) in &found {
+        let mut first = None;
+        let is_whole = |h: &&SlotHeader| match whole(&mut reader, h) {
+            Ok(()) => true,
+            Err(what) => {
+                first.get_or_insert(what);
+                false
+            }
+        };
+        let instead = versions.iter().find(is_whole);
+        if let Some(what) = first {
+            let rows = meta_from_label(*id, &versions[0].label).map(|m| m.rows);
+            lost.push(LostPage { page: id.to_string(), rows, taken: instead.map(|h| h.slot.generation), what });
+        }
+        if let Some(h) = instead {
+            kept.insert(*id, h.clone());
+        }
+    }
+    drop_split_pages(&mut kept, &found, &mut lost);
+    if kept.is_empty() {
+        let problem = format!("none of its {} pages is whole", found.len());
+        return Err(InputError::new(&place.folder, problem, "there is nothing to salvage").into());
+    }
+    let mut config = config_for(place, request, &kept, &mut source)?;
+    let degree =
+        kept.iter().filter_map(|(id, h)| meta_from_label(*id, &h.label)).map(|m| m.sh_degree).max().unwrap_or(0);
+    let (rows, step) = measure(&mut reader, &kept, &source)?;
+    config.0.steps = config.0.steps.max(step);
+    let state = state_for(&config, rows, step, degree)?;
+    let (_, options) = options_of(&source.folder, &state)?;
+    let layout = SlotLayout::new(capacity_bytes(options.page_rows, options.sh_degree), kept.len() as u64);
+    let mut copy = NewStore::create(&request.to, layout, usual_codec(kept.values().map(|h| &h.slot)))?;
+    let rules = PageRules::new(&options);
+    let mut words = vec![0u64; capacity_bytes(options.page_rows, options.sh_degree).div_ceil(8)];
+    for (id, header) in &kept {
+        let payload = reader.payload(*id, &header.slot).map_err(|what| changed(&source.folder, *id, &what))?;
+        let Some(meta) = meta_from_label(*id, &header.label) else { continue };
+        let mut page = read_page(&layout_of(&meta).rows(payload, 0));
+        page.raise_sh_degree(degree);
+        let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
+        let written = write_page(&page, bytes).bytes();
+        // Events are gone with the map: none is pending any more.
+        let meta = PageMeta { events_applied: 0, ..rules.meta(*id, &page) };
+        copy.put(*id, &label(&meta), &bytes[..written])?;
+    }
+    commit(copy, &state, &source)?;
+    source.notes.push(format!(
+        "the trainer's state is lost: export the scene (gsscale-ckpt export {} --out FILE.ply) and start from it with \
+         gsscale-train --init-ply FILE.ply",
+        request.to.display()
+    ));
+    let (pages, to) = (kept.len() as u64, request.to.clone());
+    Ok(Salvaged { to, has_state: false, step, gaussians: rows, pages, lost, notes: source.notes })
+}
+
+/// The version can be used: label, checksum and values.
+fn whole(reader: &mut SlotReader, header: &SlotHeader) -> Result<(), String> {
+    let meta = meta_from_label(header.page, &header.label).ok_or("its label is none")?;
+    let payload = reader.payload(header.page, &header.slot)?;
+    if meta.rows == 0 || layout_of(&meta).bytes() != payload.len() {
+        return Err("its slot has another length than its label says".to_string());
+    }
+    check_values(&layout_of(&meta).rows(payload, 0), u32::MAX)
+}
+
+/// Takes out pages that were split later, and says where their parts are not all there. Parts that are older than the
+/// whole page come from a time that was rolled back: they go.
+fn drop_split_pages(
+    kept: &mut BTreeMap<PageId, SlotHeader>,
+    found: &BTreeMap<PageId, Vec<SlotHeader>>,
+    lost: &mut Vec<LostPage>,
+) {
+    let mut known: BTreeSet<PageId> = found.keys().copied().collect();
+    let newest = |id: &PageId| found.get(id).and_then(|of| of.first()).map_or(0, |h| h.serial);
+    let mut split = Vec::new();
+    for &id in found.keys() {
+        let parts = descendants(id, &known);
+        if parts.iter().map(newest).max().is_some_and(|serial| serial > newest(&id)) {
+            split.push(id);
+        } else {
+            parts.iter().for_each(|part| {
+                known.remove(part);
+            });
+        }
+    }
+    split.retain(|id| known.contains(id));
+    kept.retain(|id, _| known.contains(id) && !split.contains(id));
+    lost.retain(|page| page.page.parse().is_ok_and(|id| known.contains(&id) && !split.contains(&id)));
+    for id in &split {
+        for child in id.children().into_iter().flatten() {
+            if !known.contains(&child) && descendants(child, &known).is_empty() {
+                let what = format!("page {id} was split, and this part is nowhere or has lost all its Gaussians");
+                lost.push(LostPage { page: child.to_string(), rows: None, taken: None, what });
+            }
+        }
+    }
+}
+
+/// Pages that a page was split into, however often: its subtree without itself.
+fn descendants(id: PageId, known: &BTreeSet<PageId>) -> Vec<PageId> {
+    let Some([low, high]) = id.children() else { return Vec::new() };
+    // A subtree is a range of ids: it ends where the lowest bit of its root would carry.
+    let half = high.to_bits() - id.to_bits();
+    let (from, to) = (low.to_bits() - (half - 1), high.to_bits() + (half - 1));
+    let bounds = PageId::from_bits(from).zip(PageId::from_bits(to));
+    bounds.map_or_else(Vec::new, |(from, to)| known.range(from..=to).copied().filter(|p| *p != id).collect())
+}
+
+/// Rows of all pages, and the step of the newest.
+fn measure(
+    reader: &mut SlotReader,
+    kept: &BTreeMap<PageId, SlotHeader>,
+    source: &Source,
+) -> Result<(u64, u32), InputError> {
+    let (mut rows, mut step) = (0, 0);
+    for (id, header) in kept {
+        let payload = reader.payload(*id, &header.slot).map_err(|what| changed(&source.folder, *id, &what))?;
+        let Some(meta) = meta_from_label(*id, &header.label) else { continue };
+        rows += u64::from(meta.rows);
+        step = layout_of(&meta).rows(payload, 0).stamp.iter().copied().max().unwrap_or(0).max(step);
+    }
+    Ok((rows, step))
+}
+
+/// Config and frame of the run, from its config.toml, or the defaults.
+fn config_for(
+    place: &StorePlace,
+    request: &SalvageRequest,
+    kept: &BTreeMap<PageId, SlotHeader>,
+    source: &mut Source,
+) -> Result<(TrainConfig, DatasetPrint), InputError> {
+    let file = request.config.clone().or_else(|| place.run.as_ref().map(|run| run.join("config.toml")));
+    let metas = kept.iter().filter_map(|(id, h)| meta_from_label(*id, &h.label));
+    let (rows, degree) = metas.fold((0, 0), |(rows, degree), m| (m.rows.max(rows), m.sh_degree.max(degree)));
+    let mut print =
+        DatasetPrint { views: Vec::new(), first_rows: 0, points: 0, scene_scale: 1.0, origin: [0.0; 3], scale: 1.0 };
+    let Some(file) = file else {
+        source.notes.push(
+            "the run's config is not known (name the run's output folder, or --config): default rates, local coordinates"
+                .to_string(),
+        );
+        let config = TrainConfig { page_rows: rows.max(16), sh_degree: degree, ..TrainConfig::default() };
+        return Ok((config, print));
+    };
+    let config = TrainConfig::read(&file)?;
+    if config.page_rows < rows || config.sh_degree < degree {
+        let problem = format!(
+            "it has page-rows {} and sh-degree {}, its pages have {rows} and {degree}",
+            config.page_rows, config.sh_degree
+        );
+        return Err(InputError::new(file, problem, "give the config.toml of the run that made these pages"));
+    }
+    let resolved = read_resolved(&file)?;
+    (print.origin, print.scale) = (resolved.origin, resolved.scale);
+    print.scene_scale = (resolved.scene_scale / resolved.scale) as f32;
+    Ok((config, print))
+}
+
+/// A state at `step` without a past.
+fn state_for(
+    (config, print): &(TrainConfig, DatasetPrint),
+    rows: u64,
+    step: u32,
+    sh_degree_start: u8,
+) -> Result<RunState, TrainError> {
+    let options = RunOptions::new(config, print.scene_scale);
+    Ok(RunState {
+        step,
+        config: toml::to_string(config).map_err(|e| CommitError::Contradiction(e.to_string()))?,
+        simd: limits::simd_path(config).name().to_string(),
+        device: "unknown".to_string(),
+        sh_degree_start: sh_degree_start.min(options.sh_degree),
+        dataset: DatasetPrint { first_rows: rows, ..print.clone() },
+        events: Vec::new(),
+        histogram: Vec::new(),
+        rows,
+        rows_bound: rows,
+        rows_skipped: 0,
+        steps_skipped: 0,
+        steps_skipped_in_a_row: 0,
+        train_seconds: 0.0,
+        metrics_bytes: 0,
+        test: None,
+        traffic: TrafficSoFar::default(),
+    })
+}

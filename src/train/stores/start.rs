@@ -1,0 +1,103 @@
+//! A store as what a new run starts from: the Gaussians of its last generation, page by page, in the frame of the new
+//! run's dataset. Moments, statistics and events stay behind.
+//!
+//! Invariant: memory is bounded by the budget, whatever the scene's size.
+
+use super::export::scene_at;
+use super::{find_store, options_of, run_state_of};
+use crate::base::error::{InputError, InputResult};
+use crate::base::ids::PageNo;
+use crate::checkpoint::run_state::RunState;
+use crate::exchange::ply::{ExportFrame, PlyMeta, to_local};
+use crate::page::reading::{Access, StoreReader, WitnessRule};
+use crate::scene::columns::Columns;
+use crate::scene::state::SceneState;
+use crate::train::catch_up::evaluate_all;
+use crate::train::pages::PagedScene;
+use crate::train::run::cut_sh;
+use crate::train::trainer::TrainError;
+use std::path::{Path, PathBuf};
+use xxhash_rust::xxh3::xxh3_64;
+
+/// A stored scene, open.
+pub struct StoredStart {
+    folder: PathBuf,
+    scene: PagedScene,
+    state: RunState,
+    /// Keeps the store from being written.
+    _store: StoreReader,
+}
+
+impl StoredStart {
+    /// The last generation of the store in `dir`, or of the run whose output folder that is.
+    ///
+    /// # Errors
+    /// It cannot be opened, is in use, or the budget is too small for it.
+    pub fn open(dir: &Path, host_mem: u64) -> Result<StoredStart, TrainError> {
+        let folder = find_store(dir)?.folder;
+        let store = StoreReader::open(&folder, Access::Pages, WitnessRule::Obeyed)?;
+        let generation = store.find(None)?;
+        let state = run_state_of(&store, generation)?;
+        let (_, options) = options_of(&folder, &state)?;
+        let scene = scene_at(&store, generation, &state, &options, host_mem)?;
+        Ok(StoredStart { folder, scene, state, _store: store })
+    }
+
+    /// No fewer than its Gaussians.
+    pub fn rows_at_most(&self) -> u64 {
+        self.state.rows_bound
+    }
+
+    /// Tells one start from another: the state of the run that made it, which its pages follow from.
+    ///
+    /// # Errors
+    /// The state cannot be encoded.
+    pub fn digest(&self) -> InputResult<u64> {
+        let bytes = self.state.to_bytes();
+        let bytes = bytes.map_err(|e| InputError::new(&self.folder, e.to_string(), "report this as a bug"))?;
+        Ok(xxh3_64(&bytes))
+    }
+
+    /// Bands that its Gaussians have.
+    pub fn sh_degree(&self) -> u8 {
+        self.scene.rules.sh_degree()
+    }
+
+    /// Hands out first pages: at most `page_rows` rows each, in the local frame of `origin` and `scale`, with the bands up
+    /// to `sh_degree` and their identities.
+    ///
+    /// # Errors
+    /// A page cannot be read or leaves f32 in the new frame, or `take` failed.
+    pub fn for_each_page(
+        mut self,
+        (origin, scale): ([f64; 3], f64),
+        (page_rows, sh_degree): (usize, u8),
+        take: &mut dyn FnMut(SceneState) -> Result<(), TrainError>,
+    ) -> Result<(), TrainError> {
+        let print = &self.state.dataset;
+        let meta =
+            PlyMeta { origin: print.origin, scale: print.scale, frame: ExportFrame::Local, ..PlyMeta::default() };
+        let index = self.scene.pager.index();
+        let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
+        pages.sort_unstable_by_key(|p| index[p.index()].id);
+        let now = self.state.step;
+        for page in pages {
+            let (mut uid, mut columns) = (Vec::new(), Columns::default());
+            self.scene.visit(&[page], &mut |rules, tables| {
+                uid = tables.iter().flat_map(|table| table.uid).copied().collect();
+                columns = evaluate_all(tables, rules.sh_degree(), &rules.adam, now);
+                Ok::<(), TrainError>(())
+            })?;
+            if to_local(&mut columns, &meta, origin, scale) > 0 {
+                let problem = "its Gaussians are too far from the cameras for f32";
+                return Err(InputError::new(&self.folder, problem, "check that it is a scene of this dataset").into());
+            }
+            let mut state = SceneState::from_columns(cut_sh(columns, sh_degree));
+            state.raise_sh_degree(sh_degree);
+            state.uid = uid;
+            let rows: Vec<u32> = (0..state.rows() as u32).collect();
+            rows.chunks(page_rows).try_for_each(|rows| take(state.select(rows)))?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,42 @@
+//! `gsscale-ckpt clone`: a store on another drive.
+
+use gsscale::base::units::format_bytes;
+use gsscale::train::stores::{clone_store, find_store};
+use gsscale::train::trainer::TrainError;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-ckpt clone runs/village /mnt/other/village
+  gsscale-train --resume runs/village --spill-dir /mnt/other/village    goes on with the copy
+
+All kept generations with their names and numbers; only slots that they need. Every page is verified while it is read.";
+
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Args {
+    /// A run's output folder, or a spill directory
+    dir: PathBuf,
+    /// The copy: a folder that does not exist
+    to: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
+    let done = clone_store(&find_store(&args.dir)?, &args.to)?;
+    super::print(args.json, &done, || {
+        format!(
+            "{}: {} generations, {} versions of pages, {} read and verified\n\
+             go on with it: gsscale-train --resume OUT --spill-dir {}",
+            done.to.display(),
+            done.generations.len(),
+            done.versions,
+            format_bytes(done.bytes_read),
+            done.to.display(),
+        )
+    })?;
+    Ok(ExitCode::SUCCESS)
+}

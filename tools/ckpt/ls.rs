@@ -1,0 +1,60 @@
+//! `gsscale-ckpt ls`: generations and named checkpoints.
+
+use gsscale::base::units::format_bytes;
+use gsscale::train::stores::{GenerationLine, find_store, list};
+use gsscale::train::trainer::TrainError;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-ckpt ls runs/village
+  gsscale-ckpt ls /mnt/nvme/pages --json
+
+'alone' are the bytes that only this generation needs, 'bytes' those of all its pages. Works while the run trains.";
+
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Args {
+    /// A run's output folder, or a spill directory
+    dir: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
+    let listed = list(&find_store(&args.dir)?)?;
+    super::print(args.json, &listed, || {
+        let heads = ["generation", "step", "PSNR", "Gaussians", "pages", "alone", "bytes", "names"];
+        let mut rows = vec![heads.map(str::to_string).to_vec()];
+        rows.extend(listed.generations.iter().map(row));
+        let mut text = super::table(&rows);
+        if listed.generations.is_empty() {
+            text = "nothing was committed yet".to_string();
+        }
+        text += &format!("\nsegment files: {}", format_bytes(listed.segment_bytes));
+        if let Some(who) = &listed.used_by {
+            text += &format!("\nin use ({who}): this is as of its last commit");
+        }
+        text
+    })?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn row(line: &GenerationLine) -> Vec<String> {
+    let mut names = line.names.join(",");
+    if line.is_latest {
+        names = [names.as_str(), "(last)"].join(" ").trim().to_string();
+    }
+    vec![
+        line.generation.to_string(),
+        line.step.to_string(),
+        line.psnr.map_or_else(|| "-".to_string(), |psnr| format!("{psnr:.2}")),
+        line.gaussians.to_string(),
+        line.pages.to_string(),
+        format_bytes(line.bytes_alone),
+        format_bytes(line.bytes),
+        names,
+    ]
+}

@@ -1,0 +1,54 @@
+//! `gsscale-ckpt rollback`: makes an earlier generation the last one.
+
+use gsscale::train::stores::{RolledBack, find_store, rollback};
+use gsscale::train::trainer::TrainError;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-ckpt rollback runs/village 41          says what would be lost
+  gsscale-ckpt rollback runs/village 41 --yes    then gsscale-train --resume runs/village goes on from there";
+
+#[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Args {
+    /// A run's output folder, or a spill directory
+    dir: PathBuf,
+    /// Number or name of the generation to go back to
+    #[arg(value_name = "GEN|NAME")]
+    generation: String,
+    /// Do it: later generations and their names are lost
+    #[arg(long)]
+    yes: bool,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
+    let done = rollback(&find_store(&args.dir)?, &args.generation, args.yes)?;
+    super::print(args.json, &done, || text_of(&done))?;
+    if done.is_done || done.dropped.is_empty() {
+        return Ok(ExitCode::SUCCESS);
+    }
+    eprintln!("nothing was done\n  remedy: give --yes to go back");
+    Ok(ExitCode::FAILURE)
+}
+
+fn text_of(done: &RolledBack) -> String {
+    let RolledBack { generation, step, dropped, dropped_names, is_done } = done;
+    if dropped.is_empty() {
+        return format!("generation {generation} (step {step}) is the last one already");
+    }
+    let list: Vec<String> = dropped.iter().map(u64::to_string).collect();
+    let names = match dropped_names.as_slice() {
+        [] => String::new(),
+        names => format!(" with the names {}", names.join(", ")),
+    };
+    let (was, list) = (if *is_done { "gone" } else { "would be gone" }, list.join(", "));
+    match is_done {
+        true => format!("the store is at generation {generation} (step {step}); {was}: {list}{names}"),
+        false => format!("the store would be at generation {generation} (step {step}); {was}: {list}{names}"),
+    }
+}
