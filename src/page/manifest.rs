@@ -36,6 +36,11 @@ pub(super) const HEADER_SEAL: u8 = 5;
 /// Key of the counters in the header table.
 pub(super) const COUNTERS: &str = "counters";
 
+/// Most transactions and generations: one a second for 68 years. Numbers of writes follow from generations, so beyond it
+/// they would run over.
+const SEQUENCE_MAX: u64 = 1 << 31;
+const GENERATION_MAX: u64 = 1 << 31;
+
 /// Why the map cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum MapError {
@@ -396,7 +401,10 @@ impl Sum {
 
 /// What a map says about generations cannot contradict itself.
 fn check_generations(content: &MapContent) -> Result<(), Fault> {
-    let Counters { latest, next, .. } = content.counters;
+    let Counters { sequence, latest, next, .. } = content.counters;
+    if sequence > SEQUENCE_MAX || next > GENERATION_MAX {
+        return Err(damaged("counters", format!("no store gets to transaction {sequence} and generation {next}")));
+    }
     let known = |generation: u64| content.generations.contains_key(&generation);
     if next <= latest || (latest > 0 && !known(latest)) || content.generations.keys().any(|g| *g > latest || *g == 0) {
         return Err(damaged("generations", format!("the latest is {latest}, the next {next}")));

@@ -127,13 +127,14 @@ fn corpus(name: &str) -> Vec<PathBuf> {
     files
 }
 
-fn fuzz(target: &Target) {
+fn fuzz(target: fn() -> Target) {
     let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
     hush_library_panics();
+    let target = target();
     let is_over = AtomicBool::new(false);
     std::thread::scope(|scope| {
         scope.spawn(|| watch(target.name, &is_over));
-        let ended = catch_unwind(AssertUnwindSafe(|| run_all(target)));
+        let ended = catch_unwind(AssertUnwindSafe(|| run_all(&target)));
         is_over.store(true, Ordering::Relaxed);
         if let Err(panic) = ended {
             std::panic::resume_unwind(panic);
@@ -174,7 +175,7 @@ fn run_all(target: &Target) {
 }
 
 macro_rules! tests {
-    ($($name:ident),+ $(,)?) => { $( #[test] fn $name() { fuzz(&targets::$name()); } )+ };
+    ($($name:ident),+ $(,)?) => { $( #[test] fn $name() { fuzz(targets::$name); } )+ };
 }
 
 tests!(

@@ -114,7 +114,7 @@ pub fn map_values() -> Target {
         build(9, &[(0, 1, a.clone()), (1, 1, b)]),
         build(3, &[(0, 2, a)]),
     ];
-    Target { name: "map_values", run: run_map, seeds, words: &[], cases: 1_500, memory: [48 << 20, 64] }
+    Target { name: "map_values", run: run_map, seeds, words: &[], cases: 1_000, memory: [48 << 20, 64] }
 }
 
 /// The map that the input describes, sealed as the program seals it.
@@ -242,7 +242,7 @@ pub fn run_state() -> Target {
         with_mode(0, &long.to_bytes().unwrap()),
         with_mode(1, &encoding::to_bytes(&texts).unwrap()),
     ];
-    Target { name: "run_state", run: run_run_state, seeds, words: &[], cases: 40_000, memory: [256 << 10, 40] }
+    Target { name: "run_state", run: run_run_state, seeds, words: &[], cases: 40_000, memory: [3 << 20, 40] }
 }
 
 fn run_run_state(input: &[u8]) {

@@ -67,7 +67,7 @@ pub fn ply() -> Target {
         points("ascii", text),
         b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n4 5 6\n".to_vec(),
     ];
-    Target { name: "ply", run, seeds, words: WORDS, cases: 15_000, memory: [6 << 20, 48] }
+    Target { name: "ply", run, seeds, words: WORDS, cases: 8_000, memory: [6 << 20, 48] }
 }
 
 fn named(error: &InputError) {

@@ -83,14 +83,14 @@ fn model_seeds(files: &[Vec<u8>; 3]) -> Vec<Vec<u8>> {
 pub fn colmap_binary() -> Target {
     let run = |input: &[u8]| run_model(input, binary_files(b"b.jpg"), "bin");
     let seeds = model_seeds(&binary_files(b"b.jpg"));
-    Target { name: "colmap_binary", run, seeds, words: &["../", "\0"], cases: 5_000, memory: MEMORY }
+    Target { name: "colmap_binary", run, seeds, words: &["../", "\0"], cases: 3_000, memory: MEMORY }
 }
 
 pub fn colmap_text() -> Target {
     let run = |input: &[u8]| run_model(input, text_files(b"b.jpg"), "txt");
     let seeds = model_seeds(&text_files(b"b.jpg"));
     let words = &["OPENCV", "FOV", "FULL_OPENCV", "# Number of images: 9\n", "\n\n", "\u{feff}", "../", "\t", " "];
-    Target { name: "colmap_text", run, seeds, words, cases: 5_000, memory: MEMORY }
+    Target { name: "colmap_text", run, seeds, words, cases: 3_000, memory: MEMORY }
 }
 
 fn frame(name: &str, rest: &str) -> String {
@@ -113,7 +113,7 @@ pub fn transforms() -> Target {
     let words =
         &["null", "[[[[[[[[", "{\"a\":", "\"frames\"", "\"../x\"", "1e400", "\"is_fisheye\": true,", "OPENCV_FISHEYE"];
     let seeds = [nerfstudio.as_str(), &plain, city].map(|text| text.as_bytes().to_vec()).to_vec();
-    Target { name: "transforms", run: run_transforms, seeds, words, cases: 8_000, memory: MEMORY }
+    Target { name: "transforms", run: run_transforms, seeds, words, cases: 4_000, memory: MEMORY }
 }
 
 fn run_transforms(input: &[u8]) {
@@ -147,7 +147,7 @@ pub fn image_names() -> Target {
         "\u{feff}",
     ];
     let seeds = names.map(|name| name.as_bytes().to_vec()).to_vec();
-    Target { name: "image_names", run: run_name, seeds, words, cases: 4_000, memory: [3 << 20, 200] }
+    Target { name: "image_names", run: run_name, seeds, words, cases: 1_000, memory: [3 << 20, 200] }
 }
 
 fn run_name(input: &[u8]) {

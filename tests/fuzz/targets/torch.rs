@@ -46,7 +46,7 @@ pub fn torch() -> Target {
     }
     seeds.push(with_mode(1, &[b"\x80\x02]".as_slice(), &b"Na\x94".repeat(3000), b"."].concat()));
     let words = &["ctorch\nFloatStorage\n", "]", "(", "}", "\u{94}", "q", "h", "a", "u", "t", "R", "Q", "N", "."];
-    Target { name: "torch", run, seeds, words, cases: 5_000, memory: [3 << 20, 64] }
+    Target { name: "torch", run, seeds, words, cases: 1_500, memory: [3 << 20, 64] }
 }
 
 fn run(input: &[u8]) {
