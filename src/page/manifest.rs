@@ -13,6 +13,7 @@ use super::encoding;
 use super::manifest_write::Writer;
 use super::map_file::MapFile;
 use super::mutants::{Mutant, active};
+use super::page_error::is_out_of_space;
 use super::seal::{SealBroken, SealScope};
 use crate::base::ids::PageId;
 use redb::{Builder, Database, ReadableDatabase, ReadableTable, StorageBackend, TableDefinition};
@@ -71,10 +72,7 @@ pub enum MapError {
 
 impl From<io::Error> for MapError {
     fn from(error: io::Error) -> MapError {
-        match error.kind() {
-            io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => MapError::Full(error),
-            _ => MapError::Io(error),
-        }
+        if is_out_of_space(&error) { MapError::Full(error) } else { MapError::Io(error) }
     }
 }
 
