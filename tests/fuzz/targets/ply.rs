@@ -91,7 +91,7 @@ fn run(input: &[u8]) {
         Ok(PlyContent::Points { positions, colors, dropped }) => {
             assert!(!positions.is_empty() && positions.len() == colors.len());
             assert!(positions.iter().flatten().all(|x| x.is_finite()));
-            assert_eq!(is_gaussians.unwrap(), false);
+            assert!(!is_gaussians.unwrap());
             assert_eq!((stream.unwrap(), streamed), (dropped, positions.len() as u64));
         }
         Ok(PlyContent::Gaussians { mut columns, meta }) => {
