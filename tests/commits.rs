@@ -12,6 +12,7 @@ use gsscale::page::format::{HEADER_BYTES, SlotRef};
 use gsscale::page::manifest::{Manifest, MapBatch, MapError};
 use gsscale::page::opening::Opened;
 use gsscale::page::paged_store::{PageMoved, PagedStore};
+use gsscale::page::segment_files::segment_file_name;
 use gsscale::page::slots::SlotLayout;
 use redb::backends::InMemoryBackend;
 use redb::{Builder, ReadableDatabase, StorageBackend, TableDefinition};
@@ -106,6 +107,93 @@ fn generations_come_back_and_a_rollback_brings_an_older_one() {
     drop((commits, store));
     let opened = open(at).unwrap();
     assert_eq!(opened.pages.iter().map(|p| p.page).collect::<Vec<_>>(), [PageId::initial(0)]);
+}
+
+/// Two pages in two segments, committed. The segments' files are as long as they were made.
+fn two_segments(at: &Path) {
+    let opened = create(at).unwrap();
+    let mut store = pages_of(&opened, at);
+    let mut commits = opened.commits;
+    let slots: Vec<SlotRef> = (0..5).map(|page| write(&mut store, page, 7)).collect();
+    let changed: Vec<(u32, Option<SlotRef>)> = (0..5).map(|page| (page, Some(slots[page as usize]))).collect();
+    commit(&mut commits, &mut store, &changed, None);
+}
+
+/// Whatever engine: a segment that is missing, cut at any block, longer, or something else is named, and nothing is changed.
+#[test]
+fn missing_cut_and_longer_segments_are_refused_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    two_segments(at);
+    let paths = [0, 1].map(|segment| at.join(segment_file_name(segment)));
+    let bytes = paths.each_ref().map(|path| std::fs::read(path).unwrap());
+    assert!(bytes.iter().all(|b| b.len() as u64 == LAYOUT.segment_bytes()));
+    let refused = |names: &[&str]| {
+        for engine in [IoEngine::Auto, IoEngine::Pread, IoEngine::Mmap] {
+            let engine = open_engine(engine, at, 2).unwrap().store;
+            let error = open(at).unwrap().paged_store(engine, LAYOUT, Codec::Raw).unwrap_err().to_string();
+            assert!(names.iter().all(|name| error.contains(name)) && error.contains("remedy"), "{error}");
+        }
+    };
+    for (path, bytes) in paths.iter().zip(&bytes) {
+        let name = path.file_name().unwrap().to_str().unwrap();
+        for cut in (0..bytes.len()).step_by(4096) {
+            std::fs::write(path, &bytes[..cut]).unwrap();
+            refused(&[name, &format!("{cut} bytes")]);
+        }
+        std::fs::write(path, [bytes.as_slice(), &[0]].concat()).unwrap();
+        refused(&[name]);
+        std::fs::remove_file(path).unwrap();
+        refused(&[name]);
+        std::fs::create_dir(path).unwrap();
+        refused(&[name, "not a file"]);
+        std::fs::remove_dir(path).unwrap();
+        std::fs::write(path, bytes).unwrap();
+    }
+    paths.iter().for_each(|path| std::fs::remove_file(path).unwrap());
+    refused(&["seg-00000000.dat", "seg-00000001.dat"]);
+    for (path, bytes) in paths.iter().zip(&bytes) {
+        std::fs::write(path, bytes).unwrap();
+    }
+    // A file more is nobody's business: it stays as it is.
+    std::fs::write(at.join(segment_file_name(7)), b"mine").unwrap();
+    let opened = open(at).unwrap();
+    let mut store = pages_of(&opened, at);
+    assert!(opened.pages.iter().zip(0..).all(|(page, number)| read(&mut store, number, &page.slot) == 7));
+    assert_eq!(std::fs::read(at.join(segment_file_name(7))).unwrap(), b"mine");
+}
+
+/// A map that somebody made on purpose: right seals, and numbers that would take all memory or run over.
+#[test]
+fn hostile_maps_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    two_segments(at);
+    let opened = open(at).unwrap();
+    let (mut store, page) = (pages_of(&opened, at), opened.pages[0].page);
+    let mut commits = opened.commits;
+    for segment in [u32::MAX, u32::MAX - 1, 1 << 20] {
+        let mut slot = opened.pages[0].slot;
+        slot.place.segment = segment;
+        let changes = [PageChange { page, version: Some((slot, vec![9])) }];
+        let cut = Cut { changes: &changes, run_state: b"", note: b"", pin: None };
+        commits.commit(&mut store, &mut Vec::new(), &cut).unwrap();
+        // The map is in memory twice only while it is read.
+        let folder = Box::new(DriveFolder::new(at));
+        let again = Commits::open(folder, CONFIG).unwrap();
+        let engine = open_engine(IoEngine::Pread, at, 2).unwrap().store;
+        let error = again.paged_store(engine, LAYOUT, Codec::Raw).unwrap_err();
+        assert!(matches!(&error, CommitError::Segments(what) if what.contains("and more")), "{error}");
+    }
+    for (latest, next) in [(1, u64::MAX), (1, 1 << 32), (u64::MAX - 1, u64::MAX)] {
+        let file: Arc<dyn StorageBackend> = Arc::new(InMemoryBackend::new());
+        let mut map = Manifest::create(Arc::clone(&file), 5, 1 << 18).unwrap();
+        let put_generation = Some((latest, Vec::new(), Vec::new()));
+        map.apply(&MapBatch { latest, next, put_generation, ..MapBatch::default() }).unwrap();
+        drop(map);
+        let error = Manifest::open(file, 5, 0, 1 << 18).err().unwrap();
+        assert!(matches!(&error, MapError::Damaged(what) if what.contains("no store gets to")), "{error}");
+    }
 }
 
 #[test]

@@ -499,7 +499,10 @@ fn any_operation_may_fail_in_any_way() {
         for on in [Operation::Read, Operation::Write, Operation::Sync, Operation::Create] {
             let operations = faults.count(on);
             assert!(operations > 0, "{on:?} never happens");
-            let honest = [K::Other, K::StorageFull, K::TimedOut].map(Fault::Error).into_iter().chain([Fault::Short]);
+            let honest = [K::Other, K::StorageFull, K::TimedOut, K::ReadOnlyFilesystem, K::PermissionDenied]
+                .map(Fault::Error)
+                .into_iter()
+                .chain([Fault::Short]);
             let elsewhere = Place { segment: 0, offset: 0 };
             let lies = [Fault::Torn, Fault::Lost, Fault::FlipBit(50_000), Fault::Misdirected(elsewhere)];
             let all = honest.map(|fault| (fault, true)).chain(lies.map(|fault| (fault, false)));

@@ -10,8 +10,12 @@ use crate::checkpoint::interval::CommitEvery;
 use crate::page::codec::Codec;
 use crate::schedule::order::Order;
 use serde::{Deserialize, Serialize};
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 
+/// Longest config file, bytes; one with every key has some 8 KB.
+const FILE_BYTES_MAX: u64 = 1 << 20;
 /// Most steps of a run: the optimizer keeps 88 bytes for each.
 const STEPS_MAX: u32 = 10_000_000;
 /// Most random points to start from.
@@ -254,7 +258,12 @@ impl std::str::FromStr for Rgb {
 impl TrainConfig {
     /// Reads a config file over the defaults.
     pub fn read(path: &Path) -> InputResult<TrainConfig> {
-        let text = std::fs::read_to_string(path).map_err(|e| InputError::io(path, "reading the config", &e))?;
+        let mut text = String::new();
+        let read = File::open(path).and_then(|file| file.take(FILE_BYTES_MAX + 1).read_to_string(&mut text));
+        read.map_err(|e| InputError::io(path, "reading the config", &e))?;
+        if text.len() as u64 > FILE_BYTES_MAX {
+            return Err(InputError::new(path, "the file is far larger than any config", "give a TOML file of keys"));
+        }
         TrainConfig::parse(&text)
             .map_err(|problem| InputError::new(path, problem, "see configs/default.toml for every key and its meaning"))
     }

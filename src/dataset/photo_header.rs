@@ -70,6 +70,10 @@ pub fn read_header(path: &Path) -> InputResult<PhotoHeader> {
     }
 }
 
+/// Segments and fill bytes before the pixels of a JPEG: each costs a look at the file, and a photo with a large colour
+/// profile and previews has some hundred.
+const MOST_SEGMENTS: u32 = 10_000;
+
 const COPY_AGAIN: &str = "copy the photo again from its source, or remove it and use --allow-missing";
 
 fn foreign_format(magic: &[u8; 16]) -> Option<&'static str> {
@@ -120,7 +124,12 @@ impl HeaderReader<'_> {
     fn jpeg(mut self) -> InputResult<PhotoHeader> {
         let mut at = 2u64;
         let mut frame = None;
+        let mut segments = 0;
         loop {
+            segments += 1;
+            if segments > MOST_SEGMENTS {
+                return Err(self.damaged(at, "its header does not end"));
+            }
             self.file.seek(SeekFrom::Start(at)).map_err(|e| self.io(&e))?;
             let mut marker = [0u8; 2];
             self.read(&mut marker, "a segment of its header")?;
@@ -313,6 +322,8 @@ mod tests {
         let error = check(b"II\x2a\0\x08\0\0\0").unwrap_err();
         assert!(error.problem.contains("TIFF"), "{error}");
         assert!(check(b"hello, I am no picture").unwrap_err().problem.contains("JPEG or PNG"));
+        let filled = [&[0xff, 0xd8][..], &[0xff; 20_000]].concat();
+        assert!(check(&filled).unwrap_err().problem.contains("does not end"), "a look for every byte of a large file");
         assert!(check(b"").unwrap_err().problem.contains("empty"));
         let mut huge = encoded(image::ImageFormat::Png);
         huge[16..24].copy_from_slice(&[0x7f, 0xff, 0xff, 0xff, 0, 0, 0, 1]);

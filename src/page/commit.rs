@@ -99,6 +99,11 @@ pub enum CommitError {
     /// The map is whole, and what it says cannot be.
     #[error("the page map contradicts itself: {0}\n  remedy: `gsscale-ckpt salvage` can rebuild it from the pages")]
     Contradiction(String),
+    /// Segments that must be there are missing or have another length.
+    #[error(
+        "pages are missing: {0}\n  remedy: put the files back as they were; `gsscale-ckpt salvage` saves what is left"
+    )]
+    Segments(String),
     /// A generation that is not kept was asked for.
     #[error("generation {0} is not kept\n  remedy: `gsscale-ckpt ls` lists those that are")]
     NotKept(u64),

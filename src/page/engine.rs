@@ -81,6 +81,7 @@ pub fn open_engine(engine: IoEngine, folder: &Path, depth: usize) -> InputResult
     if engine == IoEngine::Memory {
         return Ok(OpenedEngine { store: Box::new(MemoryStore::new()), notes });
     }
+    outlive_length_limits();
     // So that what fails below is the engine's fault and not the folder's.
     std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "opening the folder of pages", &e))?;
     let store: Box<dyn PageStore> = match engine {
@@ -98,6 +99,21 @@ pub fn open_engine(engine: IoEngine, folder: &Path, depth: usize) -> InputResult
         },
     };
     Ok(OpenedEngine { store, notes })
+}
+
+/// A write beyond the limit on the length of files (`ulimit -f`) is an error from here on, as on a full drive; by default it
+/// ends the process with a signal.
+fn outlive_length_limits() {
+    #[cfg(unix)]
+    {
+        use std::sync::atomic::AtomicBool;
+        use std::sync::{Arc, Once};
+        static ONCE: Once = Once::new();
+        // Where the system refuses a handler, the signal does what it does without us.
+        ONCE.call_once(|| {
+            let _ = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::new(AtomicBool::new(false)));
+        });
+    }
 }
 
 #[cfg(target_os = "linux")]

@@ -172,6 +172,10 @@ impl PageStore for FaultyStore {
         }
     }
 
+    fn check_segment(&self, segment: u32, bytes: u64) -> io::Result<()> {
+        self.inner.check_segment(segment, bytes)
+    }
+
     fn submit(&mut self, mut transfer: Transfer) {
         let on = match transfer.direction {
             Direction::Read => Operation::Read,

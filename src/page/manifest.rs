@@ -13,6 +13,7 @@ use super::encoding;
 use super::manifest_write::Writer;
 use super::map_file::MapFile;
 use super::mutants::{Mutant, active};
+use super::page_error::is_out_of_space;
 use super::seal::{SealBroken, SealScope};
 use crate::base::ids::PageId;
 use redb::{Builder, Database, ReadableDatabase, ReadableTable, StorageBackend, TableDefinition};
@@ -35,6 +36,11 @@ pub(super) const PINS_SEAL: u8 = 4;
 pub(super) const HEADER_SEAL: u8 = 5;
 /// Key of the counters in the header table.
 pub(super) const COUNTERS: &str = "counters";
+
+/// Most transactions and generations: one a second for 68 years. Numbers of writes follow from generations, so beyond it
+/// they would run over.
+const SEQUENCE_MAX: u64 = 1 << 31;
+const GENERATION_MAX: u64 = 1 << 31;
 
 /// Why the map cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -66,10 +72,7 @@ pub enum MapError {
 
 impl From<io::Error> for MapError {
     fn from(error: io::Error) -> MapError {
-        match error.kind() {
-            io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => MapError::Full(error),
-            _ => MapError::Io(error),
-        }
+        if is_out_of_space(&error) { MapError::Full(error) } else { MapError::Io(error) }
     }
 }
 
@@ -411,7 +414,10 @@ impl Sum {
 
 /// What a map says about generations cannot contradict itself.
 fn check_generations(content: &MapContent) -> Result<(), Fault> {
-    let Counters { latest, next, .. } = content.counters;
+    let Counters { sequence, latest, next, .. } = content.counters;
+    if sequence > SEQUENCE_MAX || next > GENERATION_MAX {
+        return Err(damaged("counters", format!("no store gets to transaction {sequence} and generation {next}")));
+    }
     let known = |generation: u64| content.generations.contains_key(&generation);
     if next <= latest || (latest > 0 && !known(latest)) || content.generations.keys().any(|g| *g > latest || *g == 0) {
         return Err(damaged("generations", format!("the latest is {latest}, the next {next}")));

@@ -57,6 +57,11 @@ impl PageStore for MemoryStore {
         }
     }
 
+    fn check_segment(&self, segment: u32, bytes: u64) -> io::Result<()> {
+        let is_there = self.segments.get(&segment).is_some_and(|there| there.len() as u64 == bytes);
+        if is_there { Ok(()) } else { Err(io::ErrorKind::NotFound.into()) }
+    }
+
     fn submit(&mut self, mut transfer: Transfer) {
         let result = self.transfer(&mut transfer);
         self.done.push_back(Completion { transfer, result });

@@ -141,6 +141,10 @@ impl PageStore for MmapStore {
         lock(&self.shared.segments).create(segment, bytes)
     }
 
+    fn check_segment(&self, segment: u32, bytes: u64) -> io::Result<()> {
+        lock(&self.shared.segments).check(segment, bytes)
+    }
+
     fn submit(&mut self, transfer: Transfer) {
         if transfer.direction == Direction::Read {
             self.shared.read_ahead(&transfer);

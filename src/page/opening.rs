@@ -9,6 +9,7 @@ use super::format::SlotRef;
 use super::manifest::{MapContent, MapVersion};
 use super::mutants::{Mutant, active};
 use super::paged_store::{PagedStore, PagedStoreConfig};
+use super::segment_files::segment_file_name;
 use super::slots::SlotLayout;
 use super::store::{PageStore, Place};
 use crate::base::ids::PageId;
@@ -16,6 +17,9 @@ use std::collections::BTreeMap;
 
 /// Numbers of writes that a life of the store may use up before its first commit: the next life begins beyond them.
 const SERIALS_PER_LIFE: u64 = 1 << 32;
+
+/// Segments that an error names.
+const WRONG_SEGMENTS_LISTED: usize = 8;
 
 /// A page of a generation.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -76,7 +80,7 @@ impl Opened {
     /// The slots of this store over an engine that has its segments.
     ///
     /// # Errors
-    /// The map names a slot that cannot be, or one twice.
+    /// Segments are missing or have another length; the map names a slot that cannot be, or one twice.
     pub fn paged_store(
         &self,
         engine: Box<dyn PageStore>,
@@ -93,13 +97,33 @@ impl Opened {
         }
         let past: &[Past] = if active(Mutant::FreeListFromLatestOnly) { &[] } else { &self.past };
         used.extend(past.iter().map(|p| &p.slot));
-        let segments = used.iter().map(|slot| slot.place.segment + 1).max().unwrap_or(0);
+        let last = used.iter().map(|slot| slot.place.segment).max();
+        let segments = check_segments(engine.as_ref(), layout, last)?;
         let mut paged = PagedStore::open(engine, config, segments, used)
             .map_err(|error| CommitError::Contradiction(error.to_string()))?;
         for past in past {
             paged.retire_past(&past.slot, past.until);
         }
         Ok(paged)
+    }
+}
+
+/// Looks at all segments up to the `last` one that is named: they were made one after the other, and are written to as a
+/// store grows. So a map that names a segment beyond all that there are costs neither time nor memory. Gives their number.
+fn check_segments(engine: &dyn PageStore, layout: SlotLayout, last: Option<u32>) -> Result<u32, CommitError> {
+    let Some(last) = last else { return Ok(0) };
+    let check = |segment| engine.check_segment(segment, layout.segment_bytes()).err().map(|e| (segment, e));
+    let wrong: Vec<String> = (0..=last)
+        .filter_map(check)
+        .take(WRONG_SEGMENTS_LISTED + 1)
+        .map(|(segment, error)| format!("{}: {error}", segment_file_name(segment)))
+        .collect();
+    match wrong.as_slice() {
+        [] => last.checked_add(1).ok_or_else(|| CommitError::Contradiction(format!("it names segment {last}"))),
+        [listed @ .., _] if listed.len() == WRONG_SEGMENTS_LISTED => {
+            Err(CommitError::Segments(format!("{}; and more", listed.join("; "))))
+        }
+        all => Err(CommitError::Segments(all.join("; "))),
     }
 }
 

@@ -80,6 +80,10 @@ impl PageStore for PreadStore {
         lock(&self.shared.segments).create(segment, bytes)
     }
 
+    fn check_segment(&self, segment: u32, bytes: u64) -> io::Result<()> {
+        lock(&self.shared.segments).check(segment, bytes)
+    }
+
     fn submit(&mut self, transfer: Transfer) {
         self.pool.submit(transfer);
     }

@@ -123,6 +123,20 @@ impl SegmentFiles {
         self.entries.as_ref().map_or(Ok(()), File::sync_all)
     }
 
+    /// Whether the file of a segment is there with exactly `bytes` bytes. It is not opened.
+    ///
+    /// # Errors
+    /// It is missing, shorter, longer, a link, or not a file.
+    pub fn check(&self, segment: u32, bytes: u64) -> io::Result<()> {
+        let there = std::fs::symlink_metadata(self.path(segment))?;
+        let wrong = |what: String| Err(io::Error::new(io::ErrorKind::InvalidData, what));
+        match there.len() {
+            _ if !there.is_file() => wrong("is not a file".to_string()),
+            len if len != bytes => wrong(format!("has {len} bytes instead of {bytes}")),
+            _ => Ok(()),
+        }
+    }
+
     /// The file of a segment, for reading.
     ///
     /// # Errors

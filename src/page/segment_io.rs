@@ -52,6 +52,14 @@ impl SegmentIo {
         self.files.create(segment, bytes)
     }
 
+    /// As [`super::store::PageStore::check_segment`].
+    ///
+    /// # Errors
+    /// It is missing, or not as it was made.
+    pub fn check(&self, segment: u32, bytes: u64) -> io::Result<()> {
+        self.files.check(segment, bytes)
+    }
+
     /// The file that `transfer` goes to. A write counts as not yet durable from here on.
     ///
     /// # Errors

@@ -67,6 +67,16 @@ pub trait PageStore: Send {
     /// No space, or the folder cannot be written.
     fn create_segment(&mut self, segment: u32, bytes: u64) -> io::Result<()>;
 
+    /// Whether segment `segment` is there with exactly `bytes` bytes, as it was made. A store that cannot have lost any says
+    /// nothing.
+    ///
+    /// # Errors
+    /// It is missing, has another length, or is not a file of this store.
+    fn check_segment(&self, segment: u32, bytes: u64) -> io::Result<()> {
+        let _ = (segment, bytes);
+        Ok(())
+    }
+
     /// Queues a transfer. It may start at once; errors come with its completion.
     fn submit(&mut self, transfer: Transfer);
 

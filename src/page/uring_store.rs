@@ -251,6 +251,10 @@ impl PageStore for UringStore {
         self.segments.create(segment, bytes)
     }
 
+    fn check_segment(&self, segment: u32, bytes: u64) -> io::Result<()> {
+        self.segments.check(segment, bytes)
+    }
+
     fn submit(&mut self, mut transfer: Transfer) {
         if transfer.bytes > transfer.buffer.len() || transfer.bytes == 0 {
             // Checked before any address is computed from it; the file says what is wrong.

@@ -129,10 +129,15 @@ pub enum Survival {
 /// An injected error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
+    /// EIO.
     Io,
+    /// ENOSPC, for calls that need space.
     Full,
+    /// EMFILE.
     TooManyFiles,
+    /// Writes say that they wrote less, reads that the file ends.
     Short,
+    /// EINTR, as though nobody had tried again.
     Interrupted,
 }
 
@@ -464,9 +469,13 @@ impl State {
     }
 
     fn write(&mut self, file: usize, offset: u64, data: &[u8]) -> io::Result<usize> {
-        let failed = self.call(true);
+        let mut failed = self.call(true);
         let mut count = data.len();
-        if failed.is_err() && !self.crashed {
+        if failed.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::UnexpectedEof) {
+            // A short write is no error: it says how much it wrote, of less than two sectors nothing.
+            failed = Ok(());
+            count = data.len() / 1024 * 512;
+        } else if failed.is_err() && !self.crashed {
             // A failed write may have reached the file in part.
             count = self.rng.below(data.len() as u64 / 512 + 1) as usize * 512;
         }
@@ -544,9 +553,12 @@ pub struct DiskFile {
 }
 
 impl DiskFile {
-    /// One write as the system does it: may be short.
+    /// One write as the system does it: may be short. One that writes nothing is an error, as in the standard library.
     pub fn write_some(&self, offset: u64, data: &[u8]) -> io::Result<usize> {
-        self.disk.state().write(self.file, offset, data)
+        match self.disk.state().write(self.file, offset, data) {
+            Ok(0) if !data.is_empty() => Err(io::ErrorKind::WriteZero.into()),
+            other => other,
+        }
     }
 }
 

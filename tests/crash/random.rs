@@ -5,6 +5,9 @@ use crate::disk::{Disk, Fault, FaultPlan, Rng, Survival};
 use crate::life::{CONFIG, End, end_of, open};
 use crate::oracle::{Acknowledged, Oracle};
 use gsscale::page::commit::Commits;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 /// What happened so far.
 #[derive(Debug, Clone, Copy, Default)]
@@ -20,6 +23,57 @@ pub struct Counts {
 
 const LIVES: u64 = 6;
 const STEPS: u64 = 40;
+/// A long run says so often how far it is.
+const PROGRESS: Duration = Duration::from_secs(30);
+
+impl Counts {
+    fn add(&mut self, other: &Counts) {
+        self.seeds += other.seeds;
+        self.crashes += other.crashes;
+        self.kills += other.kills;
+        self.commits += other.commits;
+        self.faults += other.faults;
+        self.decays += other.decays;
+        self.decays_noticed += other.decays_noticed;
+    }
+}
+
+/// What has been run by all threads together.
+struct Progress {
+    counts: Counts,
+    said: Instant,
+}
+
+/// Runs seeds from `first` on, on every core, until there were `wanted` crashes. An error is the first violation; there
+/// was no commit lost and no wrong byte returned otherwise.
+pub fn run_many(first: u64, wanted: u64) -> Result<Counts, String> {
+    let (next, start) = (AtomicU64::new(first), Instant::now());
+    let progress = Mutex::new(Progress { counts: Counts::default(), said: start });
+    let work = || loop {
+        let mut counts = Counts::default();
+        let ended = run_seed(next.fetch_add(1, Ordering::Relaxed), &mut counts);
+        let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
+        ended.map_err(|what| format!("after {} crashes: {what}", progress.counts.crashes))?;
+        progress.counts.add(&counts);
+        let crashes = progress.counts.crashes;
+        if crashes >= wanted {
+            return Ok(());
+        }
+        if progress.said.elapsed() >= PROGRESS {
+            progress.said = Instant::now();
+            let seconds = start.elapsed().as_secs_f64();
+            let left = seconds * (wanted - crashes) as f64 / crashes as f64 / 60.0;
+            println!("{crashes} of {wanted} crashes in {seconds:.0} s, about {left:.0} min to go");
+        }
+    };
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let ended: Result<(), String> = std::thread::scope(|scope| {
+        let workers: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
+        workers.into_iter().try_for_each(|worker| worker.join().map_err(|_| "a seed panicked".to_string())?)
+    });
+    ended?;
+    Ok(progress.into_inner().unwrap_or_else(PoisonError::into_inner).counts)
+}
 
 /// One seed. An error is a violation.
 pub fn run_seed(seed: u64, counts: &mut Counts) -> Result<(), String> {

@@ -53,10 +53,12 @@ fn first(life: &mut Life<'_>, index: usize) -> Result<(), End> {
     life.write(page)
 }
 
-fn checked(disk: &Disk, oracle: &mut Oracle) -> Result<(), String> {
+/// Runs the workload; whether it went to its end.
+fn checked(disk: &Disk, oracle: &mut Oracle) -> Result<bool, String> {
     match run(disk, oracle).map_err(|end| end_of(disk, end)) {
         Err(End::Violation(what)) => Err(what),
-        _ => Ok(()),
+        Err(End::Stopped) => Ok(false),
+        Ok(()) => Ok(true),
     }
 }
 
@@ -112,27 +114,45 @@ pub fn every_crash_point() -> Result<u64, String> {
     Ok(states)
 }
 
-/// Every call fails, once and for ever, in every way: returns how many cases.
-pub fn every_call_fails() -> Result<u64, String> {
+/// All ways in which a call fails.
+pub const FAULTS: [Fault; 5] = [Fault::Io, Fault::Full, Fault::TooManyFiles, Fault::Short, Fault::Interrupted];
+
+/// What was tried.
+#[derive(Debug, Default)]
+pub struct Failing {
+    /// Calls of the workload.
+    pub calls: u64,
+    /// Cases by the ways of [`FAULTS`]: those that fail once, and those that fail for ever, in which an error was met.
+    pub met: [[u64; 2]; 5],
+    /// Of these, the cases in which the workload went to its end all the same.
+    pub survived: [[u64; 2]; 5],
+}
+
+/// Every call fails, once and for ever, in every way. Afterwards the store opens at the last acknowledged generation or at
+/// the one under way, with all bytes of all kept generations as they were committed, and takes another commit: after the
+/// process was killed, and after the power failed.
+pub fn every_call_fails() -> Result<Failing, String> {
     let whole = Disk::new(1);
     checked(&whole, &mut Oracle::default())?;
-    let mut cases = 0;
+    let mut failing = Failing { calls: whole.calls(), ..Failing::default() };
     for at_call in 1..=whole.calls() {
-        for fault in [Fault::Io, Fault::Full, Fault::TooManyFiles, Fault::Short, Fault::Interrupted] {
-            for calls in [1, u64::MAX] {
+        for (way, fault) in FAULTS.into_iter().enumerate() {
+            for (mode, calls) in [1, u64::MAX].into_iter().enumerate() {
                 let place = format!("call {at_call}, {fault:?}, {calls} calls");
                 let disk = Disk::new(1);
                 let mut oracle = Oracle::default();
                 disk.set_fault(Some(FaultPlan { at_call, calls, fault }));
-                checked(&disk, &mut oracle).map_err(|what| format!("{place}: {what}"))?;
+                let is_whole = checked(&disk, &mut oracle).map_err(|what| format!("{place}: {what}"))?;
+                let is_met = disk.faults_given() > 0;
+                failing.met[way][mode] += u64::from(is_met);
+                failing.survived[way][mode] += u64::from(is_met && is_whole);
                 let killed = disk.fork();
                 killed.process_killed();
                 reopen(&killed, &oracle).map_err(|what| format!("{place}, killed: {what}"))?;
                 disk.power_cycle(Survival::Nothing);
                 reopen(&disk, &oracle).map_err(|what| format!("{place}, powered off: {what}"))?;
-                cases += 1;
             }
         }
     }
-    Ok(cases)
+    Ok(failing)
 }

@@ -150,6 +150,10 @@ fn files_with(folder: &Path, extension: &str) -> InputResult<Vec<PathBuf>> {
     let entries = std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "listing the folder", &e))?;
     let mut files: Vec<PathBuf> =
         entries.flatten().map(|e| e.path()).filter(|p| p.extension().is_some_and(|e| e == extension)).collect();
+    if let Some(other) = files.iter().find(|p| !p.is_file()) {
+        // A pipe would be waited for.
+        return Err(InputError::new(other, "not a regular file", REMEDY));
+    }
     files.sort();
     Ok(files)
 }

@@ -11,6 +11,7 @@ use std::rc::Rc;
 
 /// Values that one file may make; a file of metadata has under a hundred.
 const ITEMS_MAX: usize = 10_000;
+const TOO_MANY: &str = "holds more values than any file of metadata";
 /// Nested containers; recursion is over values only when they are compared or dropped.
 const DEPTH_MAX: usize = 64;
 
@@ -78,12 +79,21 @@ pub(super) fn read(text: &[u8]) -> Result<Value, String> {
     }
 }
 
+/// A value that the text has numbered.
+#[derive(Clone)]
+enum Memo {
+    Unused,
+    /// A list or dictionary: never handed out again, so not kept; kept, each later change of it would be a copy.
+    Container,
+    Value(Value),
+}
+
 struct Machine<'a> {
     rest: &'a [u8],
     stack: Vec<Value>,
     /// Heights of the stack where tuples and dictionaries began.
     marks: Vec<usize>,
-    memo: Vec<Option<Value>>,
+    memo: Vec<Memo>,
     made: usize,
 }
 
@@ -99,6 +109,7 @@ impl<'a> Machine<'a> {
             }
             0x95 => _ = self.take(8)?,
             b'.' => return self.pop().map(Some),
+            b'(' if self.marks.len() >= ITEMS_MAX => return Err(TOO_MANY.into()),
             b'(' => self.marks.push(self.stack.len()),
             b'}' => self.push(Value::Dict(Rc::default()))?,
             b']' | b')' => self.push(Value::List(Rc::default()))?,
@@ -117,12 +128,14 @@ impl<'a> Machine<'a> {
             b'q' | b'r' | 0x94 => self.memorize(code)?,
             b'h' | b'j' => {
                 let index = self.number(if code == b'h' { 1 } else { 4 })?;
-                let value = self.memo.get(index).cloned().flatten().ok_or("refers to a value that was never made")?;
-                // Lists of lists of the same list would be endless to walk, and tensors need none of it.
-                if matches!(value, Value::List(_) | Value::Dict(_)) {
-                    return Err("uses one container twice, which files of tensors do not".into());
+                match self.memo.get(index) {
+                    Some(Memo::Value(value)) => self.push(value.clone())?,
+                    // Lists of lists of the same list would be endless to walk, and tensors need none of it.
+                    Some(Memo::Container) => {
+                        return Err("uses one container twice, which files of tensors do not".into());
+                    }
+                    Some(Memo::Unused) | None => return Err("refers to a value that was never made".into()),
                 }
-                self.push(value)?;
             }
             0x85..=0x87 => self.tuple_of(usize::from(code - 0x84))?,
             b't' => {
@@ -157,7 +170,7 @@ impl<'a> Machine<'a> {
     fn push(&mut self, value: Value) -> Result<(), String> {
         self.made += 1;
         if self.made > ITEMS_MAX || value.depth() > DEPTH_MAX {
-            return Err("holds more values than any file of metadata".into());
+            return Err(TOO_MANY.into());
         }
         self.stack.push(value);
         Ok(())
@@ -200,14 +213,17 @@ impl<'a> Machine<'a> {
             b'r' => self.number(4)?,
             _ => self.memo.len(),
         };
-        // Writers count upwards; a number far beyond what was made is an attack on memory.
-        if index > self.memo.len() + self.made {
+        // Writers count upwards, once for each value; a number beyond what was made is an attack on memory.
+        if index > self.made {
             return Err("numbers a value beyond all that it made".into());
         }
         if index >= self.memo.len() {
-            self.memo.resize(index + 1, None);
+            self.memo.resize(index + 1, Memo::Unused);
         }
-        self.memo[index] = Some(self.stack.last().cloned().ok_or("is malformed: a value is missing")?);
+        self.memo[index] = match self.stack.last().ok_or("is malformed: a value is missing")? {
+            Value::List(_) | Value::Dict(_) => Memo::Container,
+            value => Memo::Value(value.clone()),
+        };
         Ok(())
     }
 
@@ -339,6 +355,14 @@ mod tests {
             let said = read(text).err().unwrap_or_default();
             assert!(said.contains(word), "{said} for {text:?}");
         }
+        // Numbering a list again and again while it grows kept every version of it: 200 MB of 9 KB.
+        let grown = [&b"]"[..], &b"Na\x94".repeat(3000)[..], b"."].concat();
+        assert!(matches!(read(&grown), Ok(Value::List(items)) if items.len() == 3000));
+        assert!(read(&b"(".repeat(20_000)).is_err(), "too many marks");
+        // Numbers that run ahead of the values: a table that grows by as many entries as there are values, each time.
+        let ahead: Vec<u8> = (1..100u32).flat_map(|i| [&b"r"[..], &(i * 1000).to_le_bytes()].concat()).collect();
+        assert!(read(&[&b"N".repeat(1000)[..], &ahead].concat()).is_err_and(|e| e.contains("beyond")));
+        assert!(read(&[&b"N"[..], &b"\x94".repeat(20_000)].concat()).is_err_and(|e| e.contains("beyond")));
         let nested = [&b"]".repeat(200)[..], &b"a".repeat(199)[..], b"."].concat();
         assert!(read(&nested).is_err(), "too deep");
         assert!(read(&b"N".repeat(20_000)).is_err(), "too many");

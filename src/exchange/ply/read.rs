@@ -44,12 +44,14 @@ pub fn stream_points(path: &Path, take: &mut dyn FnMut([f64; 3], [u8; 3]) -> Inp
 }
 
 fn open(path: &Path) -> InputResult<(BufReader<File>, u64)> {
-    let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
-    let about = file.metadata().map_err(|e| InputError::io(path, "asking for the length", &e))?;
+    // Asked before it is opened: opening a pipe would wait for somebody to write to it.
+    let about = std::fs::metadata(path).map_err(|e| InputError::io(path, "opening", &e))?;
     if !about.is_file() {
         return Err(InputError::new(path, "this is not a regular file", "give a PLY file"));
     }
-    Ok((BufReader::with_capacity(1 << 20, file), about.len()))
+    let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
+    let bytes = file.metadata().map_err(|e| InputError::io(path, "asking for the length", &e))?.len();
+    Ok((BufReader::with_capacity(1 << 20, file), bytes))
 }
 
 /// Reads a PLY of `total_bytes` bytes: Gaussians if its vertices have `f_dc_0`, else coloured points.

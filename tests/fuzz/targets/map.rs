@@ -1,0 +1,261 @@
+//! The page map with right seals around wrong values, as a store that somebody made on purpose; and states of runs.
+
+use super::pages::{PAGE_ROWS, label_of_a_page, payload_bytes_of_a_page};
+use super::with_mode;
+use crate::Target;
+use gsscale::base::ids::PageId;
+use gsscale::cache::evict::EvictPolicy;
+use gsscale::checkpoint::run_state::{DatasetPrint, RunState};
+use gsscale::densify::stats::GradHistogram;
+use gsscale::page::codec::Codec;
+use gsscale::page::commit::{CommitConfig, Commits, Cut, MAP_NAME, PageChange, WITNESS_NAME};
+use gsscale::page::encoding;
+use gsscale::page::folder::Folder;
+use gsscale::page::format::{SlotRef, StoredAs};
+use gsscale::page::manifest::{Manifest, MapBatch, MapVersion};
+use gsscale::page::memory_store::MemoryStore;
+use gsscale::page::opening::Opened;
+use gsscale::page::paged_store::PagedStore;
+use gsscale::page::slots::SlotLayout;
+use gsscale::page::store::Place;
+use gsscale::page::witness::Witness;
+use gsscale::paging::pager::{Pager, PagerConfig};
+use gsscale::scene::events::{Event, EventKind, RoundThresholds};
+use redb::StorageBackend;
+use redb::backends::InMemoryBackend;
+use std::collections::BTreeMap;
+use std::io;
+use std::sync::{Arc, Mutex};
+
+const STORE: u128 = 0xf00d;
+const CONFIG: CommitConfig = CommitConfig { store: STORE, cache_bytes: 1 << 18, reserve_bytes: 0 };
+
+/// Files in memory.
+#[derive(Clone, Default)]
+struct MemoryFolder(Arc<Mutex<BTreeMap<String, Arc<dyn StorageBackend>>>>);
+
+impl Folder for MemoryFolder {
+    fn open(&self, name: &str) -> io::Result<Option<Arc<dyn StorageBackend>>> {
+        Ok(self.0.lock().unwrap().get(name).cloned())
+    }
+
+    fn create(&self, name: &str) -> io::Result<Arc<dyn StorageBackend>> {
+        let file: Arc<dyn StorageBackend> = Arc::new(InMemoryBackend::new());
+        self.0.lock().unwrap().insert(name.to_string(), Arc::clone(&file));
+        Ok(file)
+    }
+
+    fn rename(&self, from: &str, to: &str) -> io::Result<()> {
+        let file = self.0.lock().unwrap().remove(from).ok_or(io::ErrorKind::NotFound)?;
+        self.0.lock().unwrap().insert(to.to_string(), file);
+        Ok(())
+    }
+
+    fn remove(&self, name: &str) -> io::Result<()> {
+        self.0.lock().unwrap().remove(name);
+        Ok(())
+    }
+
+    fn sync(&self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Takes values from the input; zeros when it has ended.
+struct Reader<'a>(&'a [u8]);
+
+impl<'a> Reader<'a> {
+    fn bytes(&mut self, count: usize) -> &'a [u8] {
+        let (taken, rest) = self.0.split_at(count.min(self.0.len()));
+        self.0 = rest;
+        taken
+    }
+
+    fn byte(&mut self) -> u8 {
+        self.bytes(1).first().copied().unwrap_or(0)
+    }
+
+    fn u64(&mut self) -> u64 {
+        let mut bytes = [0; 8];
+        let taken = self.bytes(8);
+        bytes[..taken.len()].copy_from_slice(taken);
+        u64::from_le_bytes(bytes)
+    }
+}
+
+fn slot_bytes() -> u64 {
+    PAGES.frame_bytes() as u64
+}
+
+/// Latest and next number; a run state of so many bytes; then versions: page, generation, kind, value of so many
+/// bytes; at last pins.
+pub fn map_values() -> Target {
+    let slot = |offset: u64| {
+        let place = Place { segment: 0, offset };
+        let codec = StoredAs::Raw;
+        let bytes = payload_bytes_of_a_page() as u32;
+        let slot = SlotRef { place, stored_bytes: bytes, payload_bytes: bytes, generation: 1, checksum: 1, codec };
+        [&slot.to_bytes()[..], &label_of_a_page()].concat()
+    };
+    let build = |next: u64, versions: &[(u8, u8, Vec<u8>)]| {
+        let mut bytes = [2u64, next].map(u64::to_le_bytes).concat();
+        let state = sample().to_bytes().unwrap();
+        bytes.extend((state.len() as u16).to_le_bytes());
+        bytes.extend(state);
+        for (page, generation, value) in versions {
+            bytes.extend([*page, *generation, 1, value.len() as u8]);
+            bytes.extend(value);
+        }
+        bytes
+    };
+    let (a, b, c) = (slot(0), slot(slot_bytes()), slot(2 * slot_bytes()));
+    let seeds = vec![
+        build(3, &[(0, 1, a.clone()), (1, 1, b.clone()), (0, 2, c)]),
+        build(9, &[(0, 1, a.clone()), (1, 1, b)]),
+        build(3, &[(0, 2, a)]),
+    ];
+    Target { name: "map_values", run: run_map, seeds, words: &[], cases: 1_000, memory: [48 << 20, 64] }
+}
+
+/// The map that the input describes, sealed as the program seals it.
+fn folder_of(input: &[u8]) -> Option<MemoryFolder> {
+    let mut input = Reader(input);
+    let (latest, next) = (input.u64(), input.u64());
+    let state_bytes = usize::from(input.byte()) | usize::from(input.byte()) << 8;
+    let run_state = input.bytes(state_bytes).to_vec();
+    let mut batch = MapBatch { latest, next, ..MapBatch::default() };
+    batch.put_generation = Some((latest, Vec::new(), run_state));
+    while !input.0.is_empty() && batch.put_versions.len() < 40 {
+        let (page, generation, kind, len) = (input.byte(), input.byte(), input.byte(), input.byte());
+        let value = input.bytes(usize::from(len)).to_vec();
+        let generation = if generation == 200 { u64::MAX } else { u64::from(generation) };
+        if kind == 2 {
+            batch.put_pins.push((format!("pin{page}"), generation));
+            continue;
+        }
+        let value = (kind == 1).then_some(value);
+        batch.put_versions.push(MapVersion { page: PageId::initial(u32::from(page)), generation, value });
+    }
+    let folder = MemoryFolder::default();
+    Witness::create(folder.create(WITNESS_NAME).unwrap(), STORE).unwrap();
+    let mut map = Manifest::create(folder.create(MAP_NAME).unwrap(), STORE, CONFIG.cache_bytes).ok()?;
+    map.apply(&batch).ok()?;
+    Some(folder)
+}
+
+fn run_map(input: &[u8]) {
+    let Some(folder) = folder_of(input) else { return };
+    let Ok(opened) = Commits::open(Box::new(folder.clone()), CONFIG) else { return };
+    let kept: Vec<u64> = opened.commits.generations().kept().collect();
+    for &generation in &kept {
+        let _ = opened.pages_at(generation);
+        let _ = opened.commits.run_state(generation);
+    }
+    if let Ok(state) = RunState::from_bytes(&opened.run_state) {
+        check_state(&state);
+    }
+    let to = kept.first().copied();
+    let again = || Commits::open(Box::new(folder.clone()), CONFIG);
+    use_pages(opened, false);
+    if let Ok(opened) = again() {
+        use_pages(opened, true);
+    }
+    if let (Ok(opened), Some(to)) = (again(), to) {
+        let _ = opened.commits.rollback(to);
+        let _ = again();
+    }
+}
+
+const PAGES: PagerConfig = PagerConfig {
+    page_rows: PAGE_ROWS,
+    sh_degree: 3,
+    frames: 8,
+    policy: EvictPolicy::FarthestNextUse,
+    prefetch_bytes: 0,
+    plan_bytes: 0,
+};
+
+/// The pages of a map over an engine without segments.
+fn store_of(opened: &Opened) -> Option<PagedStore> {
+    let layout = SlotLayout { slot_bytes: PAGES.frame_bytes() as u64, slots_per_segment: 4 };
+    opened.paged_store(Box::new(MemoryStore::new()), layout, Codec::Raw).ok()
+}
+
+/// Opens the pages, if the map allows it, and commits once more: as they are, or without any.
+fn use_pages(mut opened: Opened, without: bool) {
+    let Some(mut store) = store_of(&opened) else { return };
+    if without {
+        let gone = opened.pages.iter().map(|p| PageChange { page: p.page, version: None });
+        let cut = Cut { changes: &gone.collect::<Vec<_>>(), run_state: b"", note: b"", pin: Some("x") };
+        let _ = opened.commits.commit(&mut store, &mut Vec::new(), &cut);
+        return;
+    }
+    let Ok(mut pager) = Pager::open(PAGES, store, &opened.pages, 2) else { return };
+    assert!(pager.index().iter().all(|meta| meta.rows > 0));
+    if pager.flush().is_ok() {
+        let _ = pager.commit(&mut opened.commits, b"", b"");
+    }
+}
+
+fn sample() -> RunState {
+    let thresholds = RoundThresholds { grow_grad2d: 0.1, split_scale: 0.5, prune_opacity: 0.01, prune_scale: 2.0 };
+    let events = vec![
+        Event { step: 4, kind: EventKind::RaiseShDegree { degree: 1 } },
+        Event { step: 4, kind: EventKind::Densify(thresholds) },
+        Event { step: 8, kind: EventKind::ResetOpacity { max_opacity: 0.01 } },
+    ];
+    RunState {
+        step: 9,
+        config: "steps = 20\n".to_string(),
+        simd: "avx2".to_string(),
+        device: "cpu".to_string(),
+        sh_degree_start: 0,
+        dataset: DatasetPrint { views: vec![5, u64::MAX], first_rows: 7, scene_scale: 1.25 },
+        events,
+        histogram: vec![(3, 1), (32767, 9)],
+        rows: 10,
+        rows_bound: 12,
+        rows_skipped: 1,
+        steps_skipped: 2,
+        steps_skipped_in_a_row: 1,
+        train_seconds: 0.1,
+        metrics_bytes: 1234,
+    }
+}
+
+fn check_state(state: &RunState) {
+    assert!(state.event_log().is_ok());
+    assert!(GradHistogram::from_filled(&state.histogram).is_some());
+    let bytes = state.to_bytes().unwrap();
+    assert_eq!(RunState::from_bytes(&bytes).unwrap().to_bytes().unwrap(), bytes);
+}
+
+/// Mode 0: a state. Others: small values of the map, as the library that encodes them reads them.
+pub fn run_state() -> Target {
+    let state = sample().to_bytes().unwrap();
+    let mut long = sample();
+    long.dataset.views = (0..300).collect();
+    long.config = "a = 1\n".repeat(100);
+    let texts = (7u64, vec!["abc".to_string(), "d".to_string()], Some(vec![1u8, 2]));
+    let seeds = vec![
+        with_mode(0, &state),
+        with_mode(0, &long.to_bytes().unwrap()),
+        with_mode(1, &encoding::to_bytes(&texts).unwrap()),
+    ];
+    Target { name: "run_state", run: run_run_state, seeds, words: &[], cases: 40_000, memory: [3 << 20, 40] }
+}
+
+fn run_run_state(input: &[u8]) {
+    let (mode, rest) = super::split_mode(input);
+    if mode == 1 {
+        type Texts = (u64, Vec<String>, Option<Vec<u8>>);
+        if let Ok(value) = encoding::from_bytes::<Texts>(rest) {
+            assert_eq!(encoding::to_bytes(&value).unwrap(), rest);
+        }
+        return;
+    }
+    match RunState::from_bytes(rest) {
+        Ok(state) => check_state(&state),
+        Err(error) => assert!(!error.to_string().is_empty()),
+    }
+}

@@ -1,0 +1,169 @@
+//! COLMAP models, transforms.json, and the names in both.
+
+use super::{split_mode, with_mode};
+use crate::Target;
+use crate::scene_folder::{read_and_check, scratch, stays_in};
+use gsscale::dataset::paths::{MAX_NAME_BYTES, clean_name, safe_join};
+use std::path::Path;
+use tempfile::TempDir;
+
+const MEMORY: [u64; 2] = [2 << 20, 60];
+const FILES: [&str; 3] = ["cameras", "images", "points3D"];
+
+fn binary_files(name: &[u8]) -> [Vec<u8>; 3] {
+    let u64s = |n: u64| n.to_le_bytes().to_vec();
+    let mut cameras = u64s(2);
+    for (id, model, params) in
+        [(1u32, 1i32, vec![500.0f64, 510.0, 320.0, 240.0]), (7, 3, vec![300.0, 160.0, 100.0, 0.1, 0.0])]
+    {
+        cameras.extend(id.to_le_bytes());
+        cameras.extend(model.to_le_bytes());
+        cameras.extend([u64s(640), u64s(480)].concat());
+        cameras.extend(params.iter().flat_map(|p| p.to_le_bytes()));
+    }
+    let mut images = u64s(3);
+    for (i, name) in [name, b"a b.jpg", b"sub/c.png"].into_iter().enumerate() {
+        images.extend((i as u32 + 1).to_le_bytes());
+        images.extend([0.9, 0.1, -0.2, 0.3, 1.0, -0.5, 2.0f64].iter().flat_map(|x| x.to_le_bytes()));
+        images.extend([1u32, 7, 1][i].to_le_bytes());
+        images.extend_from_slice(name);
+        images.push(0);
+        images.extend(u64s(i as u64));
+        images.extend(vec![0; 24 * i]);
+    }
+    let mut points = u64s(20);
+    for i in 0..20u64 {
+        points.extend(u64s(i));
+        points.extend([i as f64, 0.5, -1.5].iter().flat_map(|x| x.to_le_bytes()));
+        points.extend([1, 2, 3]);
+        points.extend(0.7f64.to_le_bytes());
+        points.extend(u64s(i % 3));
+        points.extend(vec![0; 8 * (i % 3) as usize]);
+    }
+    [cameras, images, points]
+}
+
+fn text_files(name: &[u8]) -> [Vec<u8>; 3] {
+    let cameras = b"# Camera list\n# Number of cameras: 2\n1 PINHOLE 640 480 500 510 320 240\n7 RADIAL 640 480 300 160 100 0.1 0\n";
+    let mut images = b"# Number of images: 3, mean\n1 0.9 0.1 -0.2 0.3 1 -0.5 2 1 ".to_vec();
+    images.extend_from_slice(name);
+    images.extend_from_slice(
+        b"\n\n2 1 0 0 0 0 0 0 7 a b.jpg\n1.5 2.5 -1\n3 1 0 0 0 0 0 1e1 1 sub/c.png\n0.5 1.5 3 2 3 -1\n",
+    );
+    let mut points = b"# Number of points: 20\n".to_vec();
+    for i in 0..20 {
+        points.extend(format!("{i} {i}.25 0.5 -1.5 1 2 3 0.7 1 2\n").bytes());
+    }
+    [cameras.to_vec(), images, points]
+}
+
+/// A scene with a model of these files.
+fn scene_of(files: &[Vec<u8>; 3], extension: &str) -> TempDir {
+    let scene = scratch();
+    let model = scene.path().join("sparse/0");
+    std::fs::create_dir_all(&model).unwrap();
+    std::fs::create_dir(scene.path().join("images")).unwrap();
+    for (name, bytes) in FILES.iter().zip(files) {
+        std::fs::write(model.join(format!("{name}.{extension}")), bytes).unwrap();
+    }
+    scene
+}
+
+/// The first byte says which file of the model is the rest.
+fn run_model(input: &[u8], mut files: [Vec<u8>; 3], extension: &str) {
+    let (mode, rest) = split_mode(input);
+    files[usize::from(mode % 3)] = rest.to_vec();
+    read_and_check(scene_of(&files, extension).path());
+}
+
+fn model_seeds(files: &[Vec<u8>; 3]) -> Vec<Vec<u8>> {
+    files.iter().zip(0..).map(|(file, mode)| with_mode(mode, file)).collect()
+}
+
+pub fn colmap_binary() -> Target {
+    let run = |input: &[u8]| run_model(input, binary_files(b"b.jpg"), "bin");
+    let seeds = model_seeds(&binary_files(b"b.jpg"));
+    Target { name: "colmap_binary", run, seeds, words: &["../", "\0"], cases: 3_000, memory: MEMORY }
+}
+
+pub fn colmap_text() -> Target {
+    let run = |input: &[u8]| run_model(input, text_files(b"b.jpg"), "txt");
+    let seeds = model_seeds(&text_files(b"b.jpg"));
+    let words = &["OPENCV", "FOV", "FULL_OPENCV", "# Number of images: 9\n", "\n\n", "\u{feff}", "../", "\t", " "];
+    Target { name: "colmap_text", run, seeds, words, cases: 3_000, memory: MEMORY }
+}
+
+fn frame(name: &str, rest: &str) -> String {
+    format!(
+        r#"{{"file_path": "images/{name}.png", "mask_path": "masks/{name}.png", {rest} "transform_matrix": [[1, 0, 0, 0.5],
+        [0, 0, -1, 2], [0, 1, 0, 1e1], [0, 0, 0, 1]]}}"#
+    )
+}
+
+pub fn transforms() -> Target {
+    let frames = [frame("a", ""), frame("b", "\"fl_y\": 501.5, \"k1\": 0.01,"), frame("c", "\"w\": null,")].join(", ");
+    let nerfstudio = format!(
+        r#"{{"camera_model": "OPENCV", "w": 640, "h": 480.0, "camera_angle_x": 0.9, "fl_x": 500, "cx": 320, "k1": 0.01,
+        "train_filenames": ["images/a.png", "images/b.png"], "test_filenames": ["images/c.png"], "ply_file_path": "p.ply",
+        "frames": [{frames}]}}"#
+    );
+    let plain = format!(r#"{{"camera_angle_x": 0.7, "w": 64, "h": 48, "frames": [{frames}]}}"#);
+    let city = r#"{"camera_angle_x": 0.7, "w": 64, "h": 48, "frames": [{"frame_index": 0, "rot_mat": [[0.01, 0, 0, 1],
+        [0, 0.01, 0, 2], [0, 0, 0.01, 3], [0, 0, 0, 1]]}]}"#;
+    let words =
+        &["null", "[[[[[[[[", "{\"a\":", "\"frames\"", "\"../x\"", "1e400", "\"is_fisheye\": true,", "OPENCV_FISHEYE"];
+    let seeds = [nerfstudio.as_str(), &plain, city].map(|text| text.as_bytes().to_vec()).to_vec();
+    Target { name: "transforms", run: run_transforms, seeds, words, cases: 4_000, memory: MEMORY }
+}
+
+fn run_transforms(input: &[u8]) {
+    let scene = scratch();
+    std::fs::create_dir(scene.path().join("images")).unwrap();
+    std::fs::write(scene.path().join("images/a.png"), b"\x89PNG\r\n\x1a\n").unwrap();
+    std::fs::write(scene.path().join("p.ply"), b"ply\n").unwrap();
+    std::fs::write(scene.path().join("transforms.json"), input).unwrap();
+    read_and_check(scene.path());
+}
+
+/// A name, in every place where a file can give one.
+pub fn image_names() -> Target {
+    let names =
+        ["images/0001.png", "cam1/x/a b.jpg", "..\\..\\a", "C:\\a.jpg", "./x//y", "~/.ssh/id", "\\\\host\\share\\a"];
+    let words = &[
+        "..",
+        "/",
+        "\\",
+        "C:",
+        "\0",
+        ".",
+        "//?/",
+        "\u{202e}",
+        "\u{2215}",
+        "%2e%2e%2f",
+        "NUL",
+        "a:",
+        "\n",
+        "~",
+        "\u{feff}",
+    ];
+    let seeds = names.map(|name| name.as_bytes().to_vec()).to_vec();
+    Target { name: "image_names", run: run_name, seeds, words, cases: 1_000, memory: [3 << 20, 200] }
+}
+
+fn run_name(input: &[u8]) {
+    let name = String::from_utf8_lossy(input);
+    let folder = Path::new("/data/scene");
+    if let Ok((clean, path)) = safe_join(folder, &name) {
+        assert!(stays_in(folder, &path), "{path:?}");
+        assert!(clean.len() <= MAX_NAME_BYTES && !clean.contains('\\') && !clean.chars().any(char::is_control));
+        assert_eq!(clean_name(&clean), Ok(clean));
+    }
+    read_and_check(scene_of(&binary_files(input), "bin").path());
+    read_and_check(scene_of(&text_files(input), "txt").path());
+    let text = serde_json::json!({
+        "w": 64, "h": 48, "fl_x": 60, "ply_file_path": name,
+        "frames": [{"file_path": name, "mask_path": name,
+            "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}],
+    });
+    run_transforms(text.to_string().as_bytes());
+}
