@@ -379,7 +379,13 @@ impl Trainer {
     ) -> Result<Option<TestMetrics>, TrainError> {
         let render = self.render_options();
         let views = dataset.test_views();
-        let request = EvalRequest { views: &views, ssim: self.options.ssim_variant, pictures, lpips: None };
+        let request = EvalRequest {
+            views: &views,
+            ssim: self.options.ssim_variant,
+            pictures,
+            lpips: None,
+            color_correct: self.options.color_correct,
+        };
         let now = (&mut self.scene, self.step, &mut self.working);
         evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)
     }
