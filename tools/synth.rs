@@ -133,9 +133,19 @@ fn report(flags: &Flags, options: &CityOptions, s: &CitySummary, seconds: f64) {
         println!("{}/", dir.display());
         println!("  images/    {} photos of {}x{}, {}", s.views, options.width, options.height, size("images"));
         let sparse = size("sparse/0");
-        println!("  sparse/0/  1 camera, {} poses, {} points in {} observations, {sparse}", s.views, s.points, s.observations);
+        println!(
+            "  sparse/0/  1 camera, {} poses, {} points in {} observations, {sparse}",
+            s.views, s.points, s.observations
+        );
     } else {
-        println!("{} photos of {}x{} in {}, laid out as {}", s.views, options.width, options.height, dir.display(), flags.layout.name());
+        println!(
+            "{} photos of {}x{} in {}, laid out as {}",
+            s.views,
+            options.width,
+            options.height,
+            dir.display(),
+            flags.layout.name()
+        );
         println!("{}", flags.layout.tree());
     }
     println!("{seconds:.1} s, {rate:.1} million camera rays per second");

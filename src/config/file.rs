@@ -157,8 +157,8 @@ config_keys! {
         log: String = "json".into();
         /// SSIM that is reported: same (zero padded, as the 3DGS code), valid or reflect
         ssim_variant: String = "same".into();
-        /// Report colour-corrected PSNR beside PSNR: affine (per channel), quadratic (Zip-NeRF's, nerfstudio's) or off. It
-        /// is a higher figure than PSNR, never comparable with it, and always named
+        /// Report colour-corrected PSNR beside PSNR: affine (per channel, gsplat's), quadratic (Zip-NeRF's, nerfstudio's)
+        /// or off. It is another measure than PSNR, never comparable with it, and always named
         [alias = "colour-correct"] color_correct: String = "off".into();
         /// Coordinates of the PLY: dataset or local
         export_frame: String = "dataset".into();

@@ -190,16 +190,39 @@ impl PublishedRun {
 /// Keys that say where and how fast a run computes, or what it writes, and never change what it reaches; only other keys
 /// make a run another one than the published.
 const NEVER_CHANGES_RESULTS: [&str; 22] = [
-    "images", "allow-missing", "image-cache", "eval-every", "save-every", "log-every", "log",
-    "export-frame", "color-correct", "host-mem", "spill-dir", "frames", "io", "spill-codec", "commit-every", "evict",
-    "prefetch-bytes", "threads", "simd", "device", "deterministic", "device-mem",
+    "images",
+    "allow-missing",
+    "image-cache",
+    "eval-every",
+    "save-every",
+    "log-every",
+    "log",
+    "export-frame",
+    "color-correct",
+    "host-mem",
+    "spill-dir",
+    "frames",
+    "io",
+    "spill-codec",
+    "commit-every",
+    "evict",
+    "prefetch-bytes",
+    "threads",
+    "simd",
+    "device",
+    "deterministic",
+    "device-mem",
 ];
 
 /// Settings of `used` that make it another run than `published`: `steps = 200 instead of 200000`.
 pub fn differences(published: &TrainConfig, used: &TrainConfig) -> Vec<String> {
     let [before, after] = [published, used].map(|c| toml::Table::try_from(c).unwrap_or_default());
-    let changed = after.iter().filter(|(key, value)| {
-        !NEVER_CHANGES_RESULTS.contains(&key.as_str()) && before.get(*key) != Some(*value)
-    });
-    changed.map(|(key, v)| format!("{key} = {v} instead of {}", before.get(key).map_or("none".into(), ToString::to_string))).collect()
+    let changed = after
+        .iter()
+        .filter(|(key, value)| !NEVER_CHANGES_RESULTS.contains(&key.as_str()) && before.get(*key) != Some(*value));
+    changed
+        .map(|(key, v)| {
+            format!("{key} = {v} instead of {}", before.get(key).map_or("none".into(), ToString::to_string))
+        })
+        .collect()
 }

@@ -28,14 +28,8 @@ pub enum Layout {
 
 impl Layout {
     /// All of them, in the order in which a folder that has several is read.
-    pub const ALL: [Layout; 6] = [
-        Layout::Colmap,
-        Layout::Gauu,
-        Layout::ColmapMerged,
-        Layout::Transforms,
-        Layout::MatrixCity,
-        Layout::MegaNerf,
-    ];
+    pub const ALL: [Layout; 6] =
+        [Layout::Colmap, Layout::Gauu, Layout::ColmapMerged, Layout::Transforms, Layout::MatrixCity, Layout::MegaNerf];
 
     /// The name in configs and on the command line.
     pub fn name(self) -> &'static str {
@@ -176,8 +170,10 @@ pub fn find_layout(folder: &Path, accepted: &[Layout], fetch: &[String]) -> Inpu
     let each: Vec<String> =
         lacks.iter().map(|(l, missing)| format!("  as {}: {} missing", l.name(), missing.join(", "))).collect();
     // A folder that has some of a layout is meant to be that one: its tree comes first.
+    let nowhere = folder.join("nothing of this name");
+    let has = |(layout, missing): &(Layout, Vec<String>)| layout.missing(&nowhere).len() - missing.len();
     let mut near = lacks;
-    near.sort_by_key(|(_, missing)| missing.len());
+    near.sort_by_key(|lack| std::cmp::Reverse(has(lack)));
     let near: Vec<Layout> = near.into_iter().map(|(l, _)| l).collect();
     Err(InputError::new(folder, format!("the dataset is not complete\n{}", each.join("\n")), remedy(&near)))
 }

@@ -73,7 +73,8 @@ fn make_folder(folder: &Path) -> InputResult<()> {
 /// A model of some views under other names, with the city's points.
 fn model_of<'a>(city: &RawScene, views: impl Iterator<Item = (String, &'a RawView)>) -> Model {
     let colored = city.points.positions.iter().zip(&city.points.colors);
-    let point = |(&position, &rgb): (&[f64; 3], &[u8; 3])| Point { position, rgb, error: 0.5, observations: Vec::new() };
+    let point =
+        |(&position, &rgb): (&[f64; 3], &[u8; 3])| Point { position, rgb, error: 0.5, observations: Vec::new() };
     Model {
         intrinsics: city.views[0].intrinsics,
         images: views.map(|(name, view)| ModelImage { name, pose: view.pose }).collect(),
@@ -110,12 +111,20 @@ fn matrix_city(folder: &Path, city: &RawScene, test_every: usize) -> InputResult
     let angle = 2.0 * libm::atan(0.5 * f64::from(k.width) / k.fx);
     make_folder(&folder.join("pose/block_all"))?;
     for (set, block, held_out) in [("train", "block_1", false), ("test", "block_1_test", true)] {
-        let of_set: Vec<&RawView> =
-            city.views.iter().enumerate().filter(|(i, _)| i.is_multiple_of(test_every) == held_out).map(|v| v.1).collect();
+        let of_set: Vec<&RawView> = city
+            .views
+            .iter()
+            .enumerate()
+            .filter(|(i, _)| i.is_multiple_of(test_every) == held_out)
+            .map(|v| v.1)
+            .collect();
         let photos = folder.join(set).join(block);
         make_folder(&photos)?;
-        let moved: InputResult<Vec<()>> =
-            of_set.par_iter().enumerate().map(|(i, v)| to_png(&v.image_path, &photos.join(format!("{i:04}.png")))).collect();
+        let moved: InputResult<Vec<()>> = of_set
+            .par_iter()
+            .enumerate()
+            .map(|(i, v)| to_png(&v.image_path, &photos.join(format!("{i:04}.png"))))
+            .collect();
         moved?;
         let named = |(i, view): (usize, &&RawView)| {
             let path = format!("../../{set}/{block}/{i:04}.png");
@@ -149,7 +158,9 @@ fn write_json(path: &Path, value: &Value) -> InputResult<()> {
 
 /// The same pixels as PNG; the photo it is made from is removed.
 fn to_png(from: &Path, to: &Path) -> InputResult<()> {
-    let wrong = |e: image::ImageError| InputError::new(to, format!("turning {} into PNG failed: {e}", from.display()), "check the disk and its space");
+    let wrong = |e: image::ImageError| {
+        InputError::new(to, format!("turning {} into PNG failed: {e}", from.display()), "check the disk and its space")
+    };
     image::open(from).and_then(|photo| photo.save(to)).map_err(wrong)?;
     std::fs::remove_file(from).map_err(|e| InputError::io(from, "removing what became PNG", &e))
 }

@@ -1,10 +1,11 @@
-//! PSNR after the render's colours were fitted to the photo's: an upper bound on what a model of exposure and white
-//! balance would gain. It is another measure than PSNR, by a decibel or more on drone photos, so whoever reports it names
-//! it; several papers on city scenes report nothing else.
+//! PSNR after the render's colours were fitted to the photo's: roughly what a model of exposure and white balance would
+//! reach. It is another measure than PSNR, by a decibel or more on drone photos, so whoever reports it names it; several
+//! papers on city scenes report nothing else.
 //!
 //! Two fits are in use, both from MultiNeRF (github.com/google-research/multinerf), both of one photo at a time:
 //! - [`ColorCorrect::Affine`], of RawNeRF and gsplat's `color_correct_affine`: per channel, (a, b) of least
-//!   sum (a photo + b - render)^2, undone as (render - b) / a;
+//!   sum (a photo + b - render)^2, undone as (render - b) / a. A render that has little to do with its photo has a small
+//!   slope, whose undoing magnifies its errors: there the figure is below PSNR;
 //! - [`ColorCorrect::Quadratic`], of Mip-NeRF 360 and Zip-NeRF, nerfstudio's and gsplat's `color_correct`: each channel of
 //!   the photo as a quadratic polynomial of the render's three (10 terms), by least squares over pixels that are not
 //!   saturated, five times, each on the result of the last.

@@ -134,9 +134,8 @@ pub struct ColorCorrected {
 impl TestMetrics {
     /// The colour-corrected PSNR with its name, for people; empty where it was not measured.
     pub fn words_of_color_corrected(&self) -> String {
-        self.color_corrected.map_or(String::new(), |c| {
-            format!(", colour-corrected PSNR ({}) {:.2} dB", c.method.name(), c.cc_psnr)
-        })
+        self.color_corrected
+            .map_or(String::new(), |c| format!(", colour-corrected PSNR ({}) {:.2} dB", c.method.name(), c.cc_psnr))
     }
 }
 

@@ -98,7 +98,8 @@ pub(super) fn find_photos(views: &mut [RawView], folders: &[PathBuf]) -> InputRe
             _ => {
                 let problem = format!("the model's photo '{}' is in {} folders", view.name, found.len());
                 let places = found.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ");
-                let remedy = "use one model for each folder (train/sparse/0, val/sparse/0), or merge the photos into images";
+                let remedy =
+                    "use one model for each folder (train/sparse/0, val/sparse/0), or merge the photos into images";
                 return Err(InputError::new(&found[0], problem, remedy).at(places));
             }
         }

@@ -125,7 +125,9 @@ mod tests {
         assert_eq!(from("../../train/block_1/0001.png").as_deref(), Ok("train/block_1/0001.png"));
         assert_eq!(from("./../x.png").as_deref(), Ok("pose/x.png"));
         assert_eq!(from("x.png").as_deref(), Ok("pose/block_all/x.png"));
-        for bad in ["../../../x.png", "../../train/../../x.png", "/etc/passwd", "../../C:/x.png", "../..", "..\\..\\..\\x"] {
+        for bad in
+            ["../../../x.png", "../../train/../../x.png", "/etc/passwd", "../../C:/x.png", "../..", "..\\..\\..\\x"]
+        {
             assert!(from(bad).is_err(), "{bad}");
         }
     }

@@ -1,5 +1,5 @@
-//! Reads `transforms.json` scenes: nerfstudio's and instant-ngp's single file, Blender's and MatrixCity's
-//! `transforms_train/val/test.json`. Photos are opened only for their size, and only when the JSON does not state it.
+//! Reads `transforms.json` scenes: nerfstudio's and instant-ngp's single file, Blender's
+//! `transforms_train/val/test.json`, and MatrixCity's folders of such files (`matrix_city`). Photos are opened only for their size, and only when the JSON does not state it.
 //!
 //! Invariants: 1. whatever the JSON holds, the result is a scene or an [`InputError`] that names file and key; 2. a
 //! view is left out, with a warning that names it, only for its own pose or, when allowed, its missing photo.
@@ -25,8 +25,8 @@ use crate::dataset::model::{PointCloud, RawScene, RawView, Split};
 use crate::dataset::paths::{clean_name, safe_join};
 use crate::dataset::read::ReadOptions;
 use intrinsics::Levels;
-pub use matrix_city::{looks_like_matrix_city, read_matrix_city};
 use json::{FIX_KEY, Node};
+pub use matrix_city::{looks_like_matrix_city, read_matrix_city};
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
