@@ -155,7 +155,7 @@ impl PublishedRun {
         let config = TrainConfig::parse(text).map_err(refuse)?;
         config.check()?;
         let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| refuse(e.to_string()))?;
-        table.retain(|key, _| TABLES.iter().any(|name| key == *name));
+        table.retain(|key, _| TABLES.contains(&key));
         if !table.contains_key("published") {
             return Err(refuse("it has no table [published]".to_string()));
         }
