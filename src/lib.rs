@@ -19,7 +19,7 @@
 //! | --- | --- |
 //! | [`base`] | errors, names of pages, random draws, deterministic math, instruction paths; knows neither Gaussians nor disks |
 //! | [`scene`] | Gaussians, cameras and images as data; first Gaussians from points; the log of global events |
-//! | [`dataset`] | where views come from: COLMAP, transforms.json, the generated city; decoding photos |
+//! | [`dataset`] | where views come from: COLMAP, transforms.json, MatrixCity, Mega-NeRF, the generated city; decoding photos |
 //! | [`schedule`] | which view comes when, which pages it needs, what a cache should keep |
 //! | [`page`] | pages as bytes: buffers, slots on disk, checksums, the engines that move them |
 //! | [`cache`] | which pages are in memory, in what state, and which leaves next; no I/O |

@@ -118,7 +118,7 @@ impl World {
         let spill_dir = out.join("spill");
         let config = config(&spill_dir);
         let start = Start::read(&self.scene, &config, None)?;
-        let print = dataset_print(&start.dataset, start.rows);
+        let print = dataset_print(&start).unwrap();
         let sh_degree_start = start.sh_degree_start;
         let options = RunOptions { sh_degree_start, ..RunOptions::new(&config, start.dataset.scene_scale) };
         let layout = SlotLayout::new(capacity_bytes(PAGE_ROWS as usize, config.sh_degree), 100);

@@ -7,6 +7,10 @@ mod commit;
 mod demand;
 #[path = "bench/orders.rs"]
 mod orders;
+#[path = "bench/published.rs"]
+mod published;
+#[path = "bench/published_table.rs"]
+mod published_table;
 #[path = "bench/run.rs"]
 mod run;
 #[path = "bench/tiers.rs"]
@@ -39,8 +43,12 @@ fn main() -> ExitCode {
         commit::start(&parse_arguments(&arguments), &mut print)
     } else if named("orders") {
         orders::start(&parse_arguments(&arguments), &mut print)
+    } else if named("run") && published::is_meant(&arguments) {
+        match published::start(&parse_arguments(&arguments), &mut print) {
+            Ok(code) => return code,
+            Err(error) => Err(error),
+        }
     } else {
-        named("run");
         run::start(&parse_arguments(&arguments), &mut print)
     };
     match done {

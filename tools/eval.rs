@@ -15,7 +15,7 @@ Examples:
   gsscale-eval runs/village scans/village
   gsscale-eval point_cloud.ply scans/village --data-factor 4 --test-every 83
   gsscale-eval runs/village scans/village --renders pictures --json eval.json
-  gsscale-eval runs/village scans/village --lpips lpips_alex.safetensors";
+  gsscale-eval runs/village scans/village --lpips lpips_alex.safetensors --color-correct affine";
 
 /// Evaluates Gaussians on the held-out photos of a scene.
 #[derive(Parser)]

@@ -1,9 +1,12 @@
-//! `gsscale-synth`: writes a generated city as a COLMAP scene. Parses flags, calls the library, prints.
+//! `gsscale-synth`: writes a generated city as a COLMAP scene, or in the layout of a published dataset. Parses flags, calls
+//! the library, prints.
 
 use clap::Parser;
 use gsscale::base::error::InputResult;
 use gsscale::base::units::format_bytes;
-use gsscale::dataset::synthetic::{CityOptions, CitySummary, write_city};
+use gsscale::dataset::layout::Layout;
+use gsscale::dataset::lookalike::write_lookalike;
+use gsscale::dataset::synthetic::{CityOptions, CitySummary};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -15,6 +18,7 @@ Examples:
   gsscale-synth town --views 1000 --resolution 1152x864 --points 1000000
   gsscale-synth hard --exposure 0.03 --noise 0.01     exposure changes by 3 %, sensor noise of 1 %
   gsscale-synth utm --offset 500000,4600000,120       coordinates as large as UTM's
+  gsscale-synth rubble --layout colmap-merged         a look-alike of Mill-19, for gsscale-bench run rubble
 
 The same flags give the same bytes, whatever the number of threads.
 Then: gsscale-train city --out runs/city";
@@ -23,7 +27,7 @@ Then: gsscale-train city --out runs/city";
 #[derive(Debug, Parser)]
 #[command(name = "gsscale-synth", version, after_help = EXAMPLES)]
 struct Flags {
-    /// Folder to write: images/ and sparse/0/
+    /// Folder to write: images/ and sparse/0/, or what --layout says
     dir: PathBuf,
     /// Number of photos; the city grows with it
     #[arg(long, default_value_t = 60, help_heading = "Size")]
@@ -52,6 +56,13 @@ struct Flags {
     /// Added to all coordinates, metres
     #[arg(long, default_value = "0,0,0", value_name = "X,Y,Z", value_parser = parse_offset, allow_hyphen_values = true, help_heading = "Output")]
     offset: [f64; 3],
+    /// Folders and files as in a published dataset: colmap, colmap-merged (Mill-19 with COLMAP models in train and val),
+    /// mega-nerf (Mill-19), gauu (GauU-Scene) or matrixcity
+    #[arg(long, default_value = "colmap", help_heading = "Output")]
+    layout: Layout,
+    /// Hold out every N-th photo, where the layout has a folder for them (--layout)
+    #[arg(long, default_value_t = 8, value_name = "N", help_heading = "Output")]
+    test_every: usize,
     /// Threads [default: all]
     #[arg(long, value_name = "N", help_heading = "Output")]
     threads: Option<usize>,
@@ -106,25 +117,37 @@ fn run(flags: &Flags) -> InputResult<()> {
     if let Ok(style) = ProgressStyle::with_template("{bar:32} {pos}/{len} photos  {per_sec}  {eta} left") {
         bar.set_style(style);
     }
-    let summary = write_city(&flags.dir, &options, &|done, _| bar.set_position(u64::from(done)))?;
+    let layout = (flags.layout, flags.test_every);
+    let summary = write_lookalike(&flags.dir, &options, layout, &|done, _| bar.set_position(u64::from(done)))?;
     bar.finish_and_clear();
-    report(&flags.dir, &options, &summary, start.elapsed().as_secs_f64());
+    report(flags, &options, &summary, start.elapsed().as_secs_f64());
     Ok(())
 }
 
-fn report(dir: &Path, options: &CityOptions, s: &CitySummary, seconds: f64) {
+fn report(flags: &Flags, options: &CityOptions, s: &CitySummary, seconds: f64) {
+    let dir = &flags.dir;
     let size = |sub: &str| format_bytes(folder_bytes(&dir.join(sub)));
     let rate = s.rays as f64 / seconds / 1e6;
     println!("A city of {0}x{0} blocks ({1:.0} m), {2} solids, seed {3}", s.blocks, s.side, s.solids, options.seed);
-    println!("{}/", dir.display());
-    println!("  images/    {} photos of {}x{}, {}", s.views, options.width, options.height, size("images"));
-    println!(
-        "  sparse/0/  1 camera, {} poses, {} points in {} observations, {}",
-        s.views,
-        s.points,
-        s.observations,
-        size("sparse/0")
-    );
+    if flags.layout == Layout::Colmap {
+        println!("{}/", dir.display());
+        println!("  images/    {} photos of {}x{}, {}", s.views, options.width, options.height, size("images"));
+        let sparse = size("sparse/0");
+        println!(
+            "  sparse/0/  1 camera, {} poses, {} points in {} observations, {sparse}",
+            s.views, s.points, s.observations
+        );
+    } else {
+        println!(
+            "{} photos of {}x{} in {}, laid out as {}",
+            s.views,
+            options.width,
+            options.height,
+            dir.display(),
+            flags.layout.name()
+        );
+        println!("{}", flags.layout.tree());
+    }
     println!("{seconds:.1} s, {rate:.1} million camera rays per second");
     println!("next: gsscale-train {} --out <run>", dir.display());
 }

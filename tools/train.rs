@@ -180,7 +180,8 @@ impl Drop for Scratch {
 fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
     if let (Some(summary), false) = (&outcome.summary, quiet) {
         let test = summary.test.map_or(String::from("no photos held out"), |t| {
-            format!("test PSNR {:.2} dB, SSIM {:.4} on {} held-out views", t.psnr, t.ssim, t.views)
+            let corrected = t.words_of_color_corrected();
+            format!("test PSNR {:.2} dB, SSIM {:.4}{corrected} on {} held-out views", t.psnr, t.ssim, t.views)
         });
         eprintln!(
             "{} {} steps, {} Gaussians, {:.1} s of training; {test}",

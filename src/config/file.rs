@@ -2,7 +2,8 @@
 //!
 //! Invariants: 1. a key has the same kebab-case spelling in the file and as a flag; 2. flags override the file, the
 //! file overrides the defaults; 3. unknown keys are refused; 4. what a run resolved is written to its config.toml,
-//! which is itself a valid config file (its `[resolved]` table states facts and is ignored when read).
+//! which is itself a valid config file (its `[resolved]` table states facts and is ignored when read, as are the tables
+//! of [`super::published`]).
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::parse_bytes;
@@ -165,6 +166,9 @@ config_keys! {
         log: String = "json".into();
         /// SSIM that is reported: same (zero padded, as the 3DGS code), valid or reflect
         ssim_variant: String = "same".into();
+        /// Report colour-corrected PSNR beside PSNR: affine (per channel, gsplat's), quadratic (Zip-NeRF's, nerfstudio's)
+        /// or off. It is another measure than PSNR, never comparable with it, and always named
+        [alias = "colour-correct"] color_correct: String = "off".into();
         /// Coordinates of the PLY: dataset or local
         export_frame: String = "dataset".into();
     }
@@ -271,7 +275,9 @@ impl TrainConfig {
     /// Parses a config text over the defaults; the error is a sentence.
     pub fn parse(text: &str) -> Result<TrainConfig, String> {
         let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| e.to_string())?;
-        table.remove("resolved");
+        for name in super::published::TABLES {
+            table.remove(name);
+        }
         TrainConfig::deserialize(table).map_err(|e| e.to_string())
     }
 
@@ -391,7 +397,7 @@ impl TrainConfig {
         if self.spill_codec != "auto" {
             self.spill_codec.parse::<Codec>().map_err(|problem| written("spill-codec", problem))?;
         }
-        let names: [(&str, &str, &[&str]); 9] = [
+        let names: [(&str, &str, &[&str]); 10] = [
             ("io", &self.io, &["auto", "uring", "mmap", "pread"]),
             ("evict", &self.evict, &["belady", "lru"]),
             ("ssim-padding", &self.ssim_padding, &["valid", "same"]),
@@ -399,6 +405,7 @@ impl TrainConfig {
             ("strategy", &self.strategy, &["default", "none"]),
             ("log", &self.log, &["json", "tensorboard"]),
             ("ssim-variant", &self.ssim_variant, &["same", "valid", "reflect"]),
+            ("color-correct", &self.color_correct, &["off", "affine", "quadratic"]),
             ("export-frame", &self.export_frame, &["dataset", "local"]),
             ("simd", &self.simd, &["auto", "avx512", "avx2", "baseline"]),
         ];

@@ -11,6 +11,7 @@ use crate::exchange::ply::ExportFrame;
 use crate::optim::adam::AdamConfig;
 use crate::optim::moments::Moments;
 use crate::optim::rates::Rates;
+use crate::render::color_correct::ColorCorrect;
 use crate::render::metrics::SsimVariant;
 use crate::render::{LossOptions, RenderOptions, SsimPadding};
 use crate::scene::init::InitOptions;
@@ -51,6 +52,8 @@ pub struct RunOptions {
     pub scene_scale: f32,
     /// SSIM that is reported.
     pub ssim_variant: SsimVariant,
+    /// How colours are fitted for the PSNR that is reported beside PSNR, where it was asked for.
+    pub color_correct: Option<ColorCorrect>,
     /// Coordinates of PLY files.
     pub export_frame: ExportFrame,
     /// Cadences in steps; 0 = only at the end.
@@ -98,6 +101,7 @@ impl RunOptions {
             densify: (config.strategy == "default").then(|| densify(config)),
             scene_scale,
             ssim_variant: SsimVariant::from_name(&config.ssim_variant).unwrap_or(SsimVariant::Same),
+            color_correct: ColorCorrect::from_name(&config.color_correct),
             export_frame: if config.export_frame == "local" { ExportFrame::Local } else { ExportFrame::Dataset },
             eval_every: config.eval_every,
             save_every: config.save_every,

@@ -1,4 +1,4 @@
-//! Where views come from. A reader (COLMAP, transforms.json) fills a [`model::RawScene`] in the dataset's own f64
+//! Where views come from. A reader (COLMAP, transforms.json, MatrixCity, Mega-NeRF) fills a [`model::RawScene`] in the dataset's own f64
 //! coordinates; the loader checks the photos against it and turns it into a [`loader::Dataset`] in the local frame.
 //! Pixels are decoded later, a few views ahead of their use, by [`target_cache`].
 
@@ -7,7 +7,9 @@ pub mod colmap;
 pub mod colmap_write;
 pub mod frame;
 pub mod import;
+pub mod layout;
 pub mod loader;
+pub mod lookalike;
 pub mod masks;
 pub mod mega_nerf;
 pub mod model;

@@ -18,8 +18,8 @@ pub struct ReadOptions {
     pub points_later: bool,
 }
 
-/// Reads a scene: a folder with a COLMAP model, with `transforms*.json`, or in Mega-NeRF's layout, or such a JSON
-/// file. A folder that holds several is read as the first of them.
+/// Reads a scene: a folder with a COLMAP model, with one for each of `train` and `val`, with `transforms*.json`, in
+/// MatrixCity's or in Mega-NeRF's layout, or such a JSON file. A folder that holds several is read as the first of them.
 ///
 /// # Errors
 /// Whatever is wrong with the files; a path with neither says what was looked for.
@@ -39,8 +39,14 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
     if colmap::looks_like_colmap(path) {
         return colmap::read_colmap(path, options);
     }
+    if colmap::parts::looks_like_parts(path) {
+        return colmap::parts::read_parts(path, options);
+    }
     if transforms::looks_like_transforms(path) {
         return transforms::read_transforms(path, options);
+    }
+    if transforms::looks_like_matrix_city(path) {
+        return transforms::read_matrix_city(path, options);
     }
     if mega_nerf::looks_like_mega_nerf(path) {
         return mega_nerf::read_mega_nerf(path, options);
@@ -48,7 +54,8 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
     Err(InputError::new(
         path,
         format!(
-            "no scene here; looked for {}, for transforms_train.json and transforms.json, and for Mega-NeRF's coordinates.pt",
+            "no scene here; looked for {}, for the same in train and val, for transforms_train.json and transforms.json, for \
+             MatrixCity's pose/block_all and for Mega-NeRF's coordinates.pt",
             colmap::LOOKED_FOR
         ),
         "give the folder that holds 'sparse' and 'images' or a transforms.json",

@@ -1,5 +1,6 @@
 //! The stages in order: forward, loss, backward; and image metrics.
 
+pub mod color_correct;
 pub mod cpu;
 pub mod gpu;
 pub mod gpu_loss;

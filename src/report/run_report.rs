@@ -104,6 +104,14 @@ fn tiles(summary: &Value, metrics: &[Value]) -> Vec<(String, &'static str)> {
     if let Some(ssim) = summary["test"]["ssim"].as_f64() {
         tiles.push((format!("{ssim:.3}"), "SSIM, held-out views"));
     }
+    let corrected = &summary["test"]["color_corrected"];
+    if let Some(psnr) = corrected["cc_psnr"].as_f64() {
+        let label = match corrected["method"].as_str() {
+            Some("affine") => "colour-corrected PSNR (affine)",
+            _ => "colour-corrected PSNR (quadratic)",
+        };
+        tiles.push((format!("{psnr:.2} dB"), label));
+    }
     if let Some(n) = number("gaussians") {
         tiles.push((short(n), "Gaussians"));
     }

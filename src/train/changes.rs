@@ -20,6 +20,7 @@ const FREE_KEYS: &[&str] = &[
     "log-every",
     "log",
     "ssim-variant",
+    "color-correct",
     "export-frame",
     "host-mem",
     "spill-dir",

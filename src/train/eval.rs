@@ -2,7 +2,7 @@
 
 use super::machine;
 use super::pages::PagedScene;
-use super::report::{TestMetrics, json_psnr};
+use super::report::{ColorCorrected, TestMetrics, json_psnr};
 use super::step::WorkingSet;
 use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
@@ -13,6 +13,7 @@ use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{PlyContent, PlyMeta, read_ply, to_local};
 use crate::paging::pager::{Pager, PagerConfig};
+use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
 use crate::render::lpips::weights::read_lpips;
 use crate::render::lpips::{InputRange, Lpips};
 use crate::render::metrics::{SsimVariant, mean, psnr, ssim};
@@ -30,6 +31,8 @@ pub struct EvalRequest<'a> {
     pub pictures: Option<&'a Path>,
     /// The network of LPIPS and what it is fed, where LPIPS is wanted.
     pub lpips: Option<(&'a Lpips, InputRange)>,
+    /// The fit of colours, where PSNR after one is wanted too.
+    pub color_correct: Option<ColorCorrect>,
 }
 
 /// Evaluates the rows as they are after `now` steps on the requested views, collected in `working`. Views that are masked as a whole have no metrics and
@@ -47,7 +50,7 @@ pub fn evaluate(
     if request.views.is_empty() {
         return Ok(None);
     }
-    let (mut psnrs, mut ssims, mut distances) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut psnrs, mut ssims, mut distances, mut corrected) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for (i, &view) in request.views.iter().enumerate() {
         targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
         let target = targets.get(view)?;
@@ -57,6 +60,8 @@ pub fn evaluate(
         let image = renderer.image()?;
         if target.counts() {
             psnrs.push(json_psnr(psnr(image, &target)));
+            let fit = request.color_correct;
+            corrected.extend(fit.map(|how| json_psnr(color_corrected_psnr(image, &target, how))));
             // No window of the map may count although some pixels at the border do.
             ssims.extend(Some(ssim(image, &target, request.ssim, options.simd)).filter(|x| !x.is_nan()));
             // A picture too small for the network has no distance.
@@ -72,7 +77,8 @@ pub fn evaluate(
     }
     let ssim = if ssims.is_empty() { 0.0 } else { mean(&ssims) };
     let lpips = (!distances.is_empty()).then(|| mean(&distances));
-    Ok(Some(TestMetrics { views: psnrs.len() as u32, psnr: mean(&psnrs), ssim, lpips }))
+    let color_corrected = request.color_correct.map(|method| ColorCorrected { method, cc_psnr: mean(&corrected) });
+    Ok(Some(TestMetrics { views: psnrs.len() as u32, psnr: mean(&psnrs), ssim, lpips, color_corrected }))
 }
 
 /// File of the picture of a view: its name, folders folded in, without the extension; with its number in front where
@@ -184,7 +190,13 @@ pub fn evaluate_ply(
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let views = dataset.test_views();
     let of_lpips = lpips.as_ref().map(|(lpips, range)| (lpips, *range));
-    let request = EvalRequest { views: &views, ssim: run.ssim_variant, pictures: extras.pictures, lpips: of_lpips };
+    let request = EvalRequest {
+        views: &views,
+        ssim: run.ssim_variant,
+        pictures: extras.pictures,
+        lpips: of_lpips,
+        color_correct: run.color_correct,
+    };
     let (mut renderer, word) = machine::renderer(config)?;
     if let Some(word) = word {
         eprintln!("{word}");

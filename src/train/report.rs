@@ -9,6 +9,7 @@ use crate::checkpoint::interval::CommitReport;
 use crate::config::file::TrainConfig;
 use crate::exchange::tensorboard::EventFile;
 use crate::paging::pager::Pager;
+use crate::render::color_correct::ColorCorrect;
 use serde::{Deserialize, Serialize};
 use std::fs::{File, OpenOptions};
 use std::io::{BufWriter, Write};
@@ -120,6 +121,26 @@ pub struct TestMetrics {
     /// Mean LPIPS, where weights were given: see the report for network and input range.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub lpips: Option<f64>,
+    /// PSNR after a fit of colours, where it was asked for: another measure than `psnr`.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub color_corrected: Option<ColorCorrected>,
+}
+
+/// Mean PSNR after each render's colours were fitted to its photo's.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ColorCorrected {
+    /// How.
+    pub method: ColorCorrect,
+    /// Mean over the views, dB.
+    pub cc_psnr: f64,
+}
+
+impl TestMetrics {
+    /// The colour-corrected PSNR with its name, for people; empty where it was not measured.
+    pub fn words_of_color_corrected(&self) -> String {
+        self.color_corrected
+            .map_or(String::new(), |c| format!(", colour-corrected PSNR ({}) {:.2} dB", c.method.name(), c.cc_psnr))
+    }
 }
 
 /// What summary.json holds.
@@ -252,6 +273,11 @@ fn write_scalars(events: &mut EventFile, line: &StepLine) -> InputResult<()> {
     ];
     if let Some(test) = line.test {
         scalars.extend([("psnr/test", test.psnr), ("ssim/test", test.ssim)]);
+        let name = |method| match method {
+            ColorCorrect::Affine => "psnr_color_corrected_affine/test",
+            ColorCorrect::Quadratic => "psnr_color_corrected_quadratic/test",
+        };
+        scalars.extend(test.color_corrected.map(|c| (name(c.method), c.cc_psnr)));
     }
     // A skipped step has no loss.
     scalars.retain(|(_, value)| *value < f64::MAX);

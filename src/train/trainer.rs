@@ -435,7 +435,13 @@ impl Trainer {
     ) -> Result<Option<TestMetrics>, TrainError> {
         let render = self.render_options();
         let views = dataset.test_views();
-        let request = EvalRequest { views: &views, ssim: self.options.ssim_variant, pictures, lpips: None };
+        let request = EvalRequest {
+            views: &views,
+            ssim: self.options.ssim_variant,
+            pictures,
+            lpips: None,
+            color_correct: self.options.color_correct,
+        };
         let now = (&mut self.scene, self.step, &mut self.working);
         let test = evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)?;
         let of = |t: TestMetrics| LastTest { step: self.step, views: t.views, psnr: t.psnr, ssim: t.ssim };

@@ -7,6 +7,7 @@ mod support;
 mod colmap_bad;
 mod colmap_good;
 mod fuzz;
+mod layouts;
 mod mega_nerf;
 mod real;
 mod transforms_bad;

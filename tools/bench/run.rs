@@ -18,6 +18,7 @@ Examples:
   gsscale-bench scans/village --steps 500 --strategy none
   gsscale-bench scans/village --steps 2000 --max-gaussians 200000 --threads 1 >> runs.jsonl
 
+A published run, ours beside the paper's figures: gsscale-bench run rubble --data DIR (see gsscale-bench run rubble --help).
 Other measurements: gsscale-bench tiers --help (through the disk tier against in memory),
 gsscale-bench orders --help (orders of views: quality against bytes), gsscale-bench commit --help (what commits cost).
 

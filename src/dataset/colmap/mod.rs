@@ -9,6 +9,7 @@
 
 mod binary;
 mod models;
+pub mod parts;
 mod text;
 
 use crate::base::error::{InputError, InputResult};
@@ -72,22 +73,44 @@ pub fn looks_like_colmap(scene: &Path) -> bool {
 }
 
 /// Reads the COLMAP model of a scene folder. Views come in the order of their names; `image_path` is
-/// `scene/<images>/<name>`. Points that are not finite are dropped and counted.
+/// `scene/<images>/<name>`. Points that are not finite are dropped and counted. Where there is no image folder but
+/// `train` and `val` with photos, these are looked through ([`parts`]).
 ///
 /// # Errors
 /// No model, no image folder, files that are truncated, contradict themselves or hold more than 1 % of points that are
 /// not finite, names that would leave the image folder or occur twice, cameras that cannot be used.
 pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> {
-    let mut warnings = Vec::new();
-    let model = choose_model(scene, &mut warnings)?;
+    if !looks_like_colmap(scene) {
+        return Err(no_model(scene));
+    }
     let image_folder = scene.join(options.images.as_deref().unwrap_or("images"));
-    if !image_folder.is_dir() {
+    let apart = if image_folder.is_dir() { Vec::new() } else { parts::photo_folders(scene) };
+    if !image_folder.is_dir() && apart.is_empty() {
         return Err(InputError::new(
             &image_folder,
             "the image folder is not there",
             "name the folder of the photos, relative to the scene, with --images",
         ));
     }
+    let photos = apart.first().unwrap_or(&image_folder);
+    let Model { mut views, points, points_path, warnings } = read_model(scene, photos, Some(options.points_later))?;
+    parts::find_photos(&mut views, &apart)?;
+    Ok(RawScene { views, points, points_path, warnings, ..RawScene::default() })
+}
+
+/// What a model says.
+struct Model {
+    views: Vec<RawView>,
+    points: PointCloud,
+    points_path: Option<PathBuf>,
+    warnings: Vec<String>,
+}
+
+/// Reads the model of a folder whose photos lie in `image_folder`; of its points, whether they are read later, or
+/// `None` to leave them out.
+fn read_model(folder: &Path, image_folder: &Path, points_later: Option<bool>) -> InputResult<Model> {
+    let mut warnings = Vec::new();
+    let model = choose_model(folder, &mut warnings)?;
     let cameras_path = model.file("cameras");
     let images_path = model.file("images");
     let (cameras, images) = if model.is_binary {
@@ -96,9 +119,12 @@ pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene>
         (text::read_cameras(&cameras_path, &mut warnings)?, text::read_images(&images_path, &mut warnings)?)
     };
     let unit = if model.is_binary { "byte" } else { "line" };
-    let views = make_views(&images_path, unit, &image_folder, &cameras, images, &mut warnings)?;
-    let (points, points_path) = read_points(&model, options.points_later, &mut warnings)?;
-    Ok(RawScene { views, points, points_path, warnings, ..RawScene::default() })
+    let views = make_views(&images_path, unit, image_folder, &cameras, images, &mut warnings)?;
+    let (points, points_path) = match points_later {
+        None => (PointCloud::default(), None),
+        Some(later) => read_points(&model, later, &mut warnings)?,
+    };
+    Ok(Model { views, points, points_path, warnings })
 }
 
 /// Every model folder, in a fixed order.
@@ -116,15 +142,16 @@ fn find_models(scene: &Path) -> Vec<ModelFolder> {
     folders.into_iter().filter_map(ModelFolder::of).collect()
 }
 
+fn no_model(scene: &Path) -> InputError {
+    let problem = format!("no COLMAP model here; looked for {LOOKED_FOR}");
+    InputError::new(scene, problem, "give the folder that holds 'sparse' and 'images'")
+}
+
 /// The model with the most images; the first of equals.
 fn choose_model(scene: &Path, warnings: &mut Vec<String>) -> InputResult<ModelFolder> {
     let mut models = find_models(scene);
     if models.is_empty() {
-        return Err(InputError::new(
-            scene,
-            format!("no COLMAP model here; looked for {LOOKED_FOR}"),
-            "give the folder that holds 'sparse' and 'images'",
-        ));
+        return Err(no_model(scene));
     }
     if models.len() == 1 {
         return Ok(models.remove(0));

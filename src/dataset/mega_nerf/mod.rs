@@ -8,7 +8,8 @@
 //!
 //! Poses are camera to world, the camera's axes right-up-back (as OpenGL's), the world's axes down-right-back; positions
 //! are `(metres - origin_drb) / pose_scale_factor`, which is undone here, so that a scene has its real size. The layout has
-//! no points: give some with `--init-ply`, or random ones are drawn.
+//! no points: a `points.ply` beside `coordinates.pt`, in metres and in the world's axes, is read where there is one; else
+//! give some with `--init-ply`, or random ones are drawn.
 //!
 //! Invariants: 1. whatever the files hold, the result is a scene or an [`InputError`] that names file and key; 2. names come
 //! from the folder's listing, so none leaves it.
@@ -58,6 +59,7 @@ pub fn read_mega_nerf(folder: &Path, options: &ReadOptions) -> InputResult<RawSc
     let mut scene = RawScene::default();
     reading.report(folder, &mut scene.warnings)?;
     scene.views = reading.views;
+    scene.points_path = Some(folder.join("points.ply")).filter(|path| path.is_file());
     sort_views(folder, &mut scene.views)?;
     Ok(scene)
 }

@@ -1,5 +1,5 @@
-//! Reads `transforms.json` scenes: nerfstudio's and instant-ngp's single file, Blender's and MatrixCity's
-//! `transforms_train/val/test.json`. Photos are opened only for their size, and only when the JSON does not state it.
+//! Reads `transforms.json` scenes: nerfstudio's and instant-ngp's single file, Blender's
+//! `transforms_train/val/test.json`, and MatrixCity's folders of such files (`matrix_city`). Photos are opened only for their size, and only when the JSON does not state it.
 //!
 //! Invariants: 1. whatever the JSON holds, the result is a scene or an [`InputError`] that names file and key; 2. a
 //! view is left out, with a warning that names it, only for its own pose or, when allowed, its missing photo.
@@ -15,6 +15,7 @@
 
 mod intrinsics;
 mod json;
+mod matrix_city;
 mod photos;
 pub(in crate::dataset) mod pose;
 
@@ -25,6 +26,7 @@ use crate::dataset::paths::{clean_name, safe_join};
 use crate::dataset::read::ReadOptions;
 use intrinsics::Levels;
 use json::{FIX_KEY, Node};
+pub use matrix_city::{looks_like_matrix_city, read_matrix_city};
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -44,8 +46,7 @@ pub fn looks_like_transforms(folder: &Path) -> bool {
 /// No JSON, broken JSON, keys of the wrong kind, cameras that cannot be used, names that leave the folder or occur
 /// twice, no view left, photos that are missing while their size is needed.
 pub fn read_transforms(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
-    let mut reading =
-        Reading { options, views: Vec::new(), bad_poses: Vec::new(), missing: Vec::new(), unlisted: Vec::new() };
+    let mut reading = Reading::new(options);
     let mut scene = RawScene { points: PointCloud::default(), ..RawScene::default() };
     let files = choose_files(path, &mut scene.warnings)?;
     for (file, split) in &files {
@@ -103,9 +104,15 @@ struct Reading<'a> {
     missing: Vec<String>,
     /// Frames that are in none of the lists of file names that are used.
     unlisted: Vec<String>,
+    /// MatrixCity's folder, when its files are read.
+    root: Option<PathBuf>,
 }
 
-impl Reading<'_> {
+impl<'a> Reading<'a> {
+    fn new(options: &'a ReadOptions) -> Reading<'a> {
+        let (views, bad_poses, missing, unlisted) = Default::default();
+        Reading { options, views, bad_poses, missing, unlisted, root: None }
+    }
     fn add_file(
         &mut self,
         file: &Path,
@@ -151,8 +158,17 @@ impl Reading<'_> {
                 found => found.copied(),
             },
         };
-        let photo = photos::find_photo(folder, self.options.images.as_deref(), &stated).map_err(refused)?;
-        let Some(pose) = pose::make_pose(&pose::read_matrix(frame)?) else {
+        let images = self.options.images.as_deref();
+        let mut matrix = pose::read_matrix(frame)?;
+        let photo = match &self.root {
+            None => photos::find_photo(folder, images, &stated),
+            Some(root) => matrix_city::find_photo(root, folder, images, &stated),
+        };
+        let photo = photo.map_err(refused)?;
+        if self.root.is_some() {
+            pose::scale_position(&mut matrix);
+        }
+        let Some(pose) = pose::make_pose(&matrix) else {
             self.bad_poses.push(photo.name);
             return Ok(());
         };

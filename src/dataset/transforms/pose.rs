@@ -39,6 +39,15 @@ pub(super) fn read_matrix(frame: &Node<'_>) -> InputResult<[[f64; 4]; 4]> {
     Ok(matrix)
 }
 
+/// Takes the scale that the rotation carries off the position too: MatrixCity's rotations times 0.01 come with positions
+/// in metres, its plain rotations with positions in 100 m.
+pub(super) fn scale_position(m: &mut [[f64; 4]; 4]) {
+    let scale = (0..3).map(|c| DVec3::new(m[0][c], m[1][c], m[2][c]).length()).sum::<f64>() / 3.0;
+    for row in m.iter_mut().take(3) {
+        row[3] *= scale;
+    }
+}
+
 /// The pose of a camera-to-world matrix whose rotation may carry one common scale; `None` when it is not finite or
 /// not a proper rotation.
 pub(in crate::dataset) fn make_pose(m: &[[f64; 4]; 4]) -> Option<Pose> {

@@ -1,0 +1,228 @@
+//! Published runs: what a config file says beside its settings, for whoever wants to set our figures beside a paper's.
+//!
+//! Such a file is an ordinary config with two kinds of tables more: `[published]` (what the scene is, where it is to be
+//! had, what was reached) and `[tier.NAME]` (densification settings that make more or fewer Gaussians). Training ignores
+//! both ([`TrainConfig::parse`]); here they are read as strictly as the settings.
+//!
+//! The files' values are GS-Scale's: the dictionary `configs` at the end of its trainers, its paper (arXiv 2509.15645)
+//! and what its code does; each file names the traps.
+
+use super::file::TrainConfig;
+use crate::base::error::{InputError, InputResult};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// The runs that come with the program, by name.
+pub const BUILT_IN: [(&str, &str); 8] = [
+    ("rubble", include_str!("../../configs/rubble.toml")),
+    ("building", include_str!("../../configs/building.toml")),
+    ("residence", include_str!("../../configs/residence.toml")),
+    ("sciart", include_str!("../../configs/sciart.toml")),
+    ("lfls", include_str!("../../configs/lfls.toml")),
+    ("sziit", include_str!("../../configs/sziit.toml")),
+    ("sztu", include_str!("../../configs/sztu.toml")),
+    ("aerial", include_str!("../../configs/aerial.toml")),
+];
+
+/// Tables of a config file that state something and set nothing.
+pub(super) const TABLES: [&str; 3] = ["resolved", "published", "tier"];
+
+/// A published run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PublishedRun {
+    /// Its name: that of the file, without the ending.
+    pub name: String,
+    /// Settings, those of the active tier.
+    pub config: TrainConfig,
+    /// What was published about it.
+    pub facts: Published,
+    /// Densification tiers by name.
+    pub tiers: BTreeMap<String, Tier>,
+}
+
+/// The table `[published]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct Published {
+    /// Dataset and scene, for people.
+    pub title: String,
+    /// Names of the folder layouts in which the scene is to be had, the best first.
+    pub layouts: Vec<String>,
+    /// Where photos, poses and points are to be had.
+    pub fetch: Vec<String>,
+    /// Files of points inside the scene's folder, of which the first that exists replaces the model's own.
+    #[serde(default)]
+    pub clouds: Vec<String>,
+    /// Photos of the published set.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub views: Option<u32>,
+    /// Of these, held out.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub held_out: Option<u32>,
+    /// Width and height that training used, pixels.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub size: Option<[u32; 2]>,
+    /// What else is to be known.
+    #[serde(default)]
+    pub notes: Vec<String>,
+    /// Quality that was reached, where it was published.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub expected: Option<Expected>,
+    /// Memory that was saved, where it was published.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub memory: Option<MemorySaving>,
+}
+
+/// Means over the held-out photos: GS-Scale's, and those of the trainer that it changed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct Expected {
+    /// dB.
+    pub psnr: f64,
+    /// Structural similarity.
+    pub ssim: f64,
+    /// Which one: a value of `ssim-variant`.
+    pub ssim_variant: String,
+    /// LPIPS.
+    pub lpips: f64,
+    /// Network and input range of it: `alex, signed`.
+    pub lpips_variant: String,
+    /// The unchanged trainer's.
+    pub original_psnr: f64,
+    /// The unchanged trainer's.
+    pub original_ssim: f64,
+    /// The unchanged trainer's.
+    pub original_lpips: f64,
+}
+
+/// GPU memory of the unchanged trainer over GS-Scale's, as PyTorch counts what it allocated.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct MemorySaving {
+    /// On this scene, where the text states it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub saving: Option<f64>,
+    /// Least and most of its six scenes.
+    pub saving_range: [f64; 2],
+    /// Their geometric mean.
+    pub saving_mean: f64,
+}
+
+/// Densification settings of a tier.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct Tier {
+    /// Mean screen-space gradient above which Gaussians grow.
+    pub grow_grad2d: f64,
+    /// Size up to which growing Gaussians are cloned, times the scene scale.
+    pub grow_scale3d: f64,
+    /// Step at which rounds end.
+    pub refine_stop: u32,
+}
+
+/// The tables beside the settings.
+#[derive(Deserialize)]
+struct Tables {
+    published: Published,
+    #[serde(default)]
+    tier: BTreeMap<String, Tier>,
+}
+
+impl PublishedRun {
+    /// The run of this name, or in this file.
+    ///
+    /// # Errors
+    /// No such name or file, a file without `[published]`, or settings that are refused.
+    pub fn find(name_or_file: &Path) -> InputResult<PublishedRun> {
+        let built_in = BUILT_IN.iter().find(|(name, _)| Path::new(name) == name_or_file);
+        if let Some((name, text)) = built_in {
+            return PublishedRun::parse(name, text, name_or_file);
+        }
+        let names = BUILT_IN.map(|(name, _)| name).join(", ");
+        let text = std::fs::read_to_string(name_or_file).map_err(|e| {
+            let problem = format!("neither a published run nor a file that can be read: {e}");
+            InputError::new(name_or_file, problem, format!("name one of {names}, or a config file with [published]"))
+        })?;
+        let stem = name_or_file.file_stem().unwrap_or_default().to_string_lossy();
+        PublishedRun::parse(&stem, &text, name_or_file)
+    }
+
+    fn parse(name: &str, text: &str, file: &Path) -> InputResult<PublishedRun> {
+        let refuse = |problem: String| {
+            InputError::new(file, problem, "configs/rubble.toml is an example of a published run's config")
+        };
+        let config = TrainConfig::parse(text).map_err(refuse)?;
+        config.check()?;
+        let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| refuse(e.to_string()))?;
+        table.retain(|key, _| TABLES.contains(&key));
+        if !table.contains_key("published") {
+            return Err(refuse("it has no table [published]".to_string()));
+        }
+        let Tables { published, tier } = Tables::deserialize(table).map_err(|e| refuse(e.to_string()))?;
+        Ok(PublishedRun { name: name.to_string(), config, facts: published, tiers: tier })
+    }
+
+    /// Puts the settings of a tier over the config.
+    ///
+    /// # Errors
+    /// There is no such tier.
+    pub fn use_tier(&mut self, name: &str) -> InputResult<()> {
+        let Some(tier) = self.tiers.get(name) else {
+            let names: Vec<&str> = self.tiers.keys().map(String::as_str).collect();
+            let problem = format!("'{name}' is no tier of {}", self.name);
+            return Err(InputError::new("--tier", problem, format!("use one of: {}", names.join(", "))));
+        };
+        self.config.grow_grad2d = tier.grow_grad2d;
+        self.config.grow_scale3d = tier.grow_scale3d;
+        self.config.refine_stop = tier.refine_stop;
+        Ok(())
+    }
+
+    /// Name of the tier whose settings the config has.
+    pub fn tier_of(&self, config: &TrainConfig) -> Option<&str> {
+        let of = |t: &Tier| (t.grow_grad2d, t.grow_scale3d, t.refine_stop);
+        let used = (config.grow_grad2d, config.grow_scale3d, config.refine_stop);
+        self.tiers.iter().find(|(_, tier)| of(tier) == used).map(|(name, _)| name.as_str())
+    }
+}
+
+/// Keys that say where and how fast a run computes, or what it writes, and never change what it reaches; only other keys
+/// make a run another one than the published.
+const NEVER_CHANGES_RESULTS: [&str; 22] = [
+    "images",
+    "allow-missing",
+    "image-cache",
+    "eval-every",
+    "save-every",
+    "log-every",
+    "log",
+    "export-frame",
+    "color-correct",
+    "host-mem",
+    "spill-dir",
+    "frames",
+    "io",
+    "spill-codec",
+    "commit-every",
+    "evict",
+    "prefetch-bytes",
+    "threads",
+    "simd",
+    "device",
+    "deterministic",
+    "device-mem",
+];
+
+/// Settings of `used` that make it another run than `published`: `steps = 200 instead of 200000`.
+pub fn differences(published: &TrainConfig, used: &TrainConfig) -> Vec<String> {
+    let [before, after] = [published, used].map(|c| toml::Table::try_from(c).unwrap_or_default());
+    let changed = after
+        .iter()
+        .filter(|(key, value)| !NEVER_CHANGES_RESULTS.contains(&key.as_str()) && before.get(*key) != Some(*value));
+    changed
+        .map(|(key, v)| {
+            format!("{key} = {v} instead of {}", before.get(key).map_or("none".into(), ToString::to_string))
+        })
+        .collect()
+}

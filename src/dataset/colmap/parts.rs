@@ -1,0 +1,108 @@
+//! Scenes whose photos lie in a training and a held-out folder, as Mill-19 and UrbanScene3D do once the COLMAP models
+//! that the CityGaussian line publishes were put beside them:
+//!
+//! ```text
+//! train/sparse/0/  train/rgbs/      val/sparse/0/  val/rgbs/
+//! ```
+//!
+//! or with one model of all photos in `sparse/0/`. They are read as though the folders were merged, and nothing is
+//! copied: a view keeps its own name, so that order and split by index are those of the merged folder.
+//!
+//! Invariants: 1. a photo name that both folders have is never guessed at: with two models it is told apart by its
+//! folder's name, with one model it is an error; 2. with two models the folders prescribe the split.
+
+use super::{Model, read_model};
+use crate::base::error::{InputError, InputResult};
+use crate::dataset::checks::sort_views;
+use crate::dataset::model::{RawScene, RawView, Split};
+use crate::dataset::read::ReadOptions;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// Folders with photos inside a part: as CityGaussian renames them, as Mega-NeRF has them, as COLMAP's scripts do.
+const PHOTOS: [&str; 3] = ["images", "rgbs", "input"];
+/// Folders of held-out photos.
+const HELD_OUT: [&str; 2] = ["val", "test"];
+
+/// The folder with the photos of a part.
+pub(in crate::dataset) fn photo_folder(part: &Path) -> Option<PathBuf> {
+    PHOTOS.iter().map(|name| part.join(name)).find(|path| path.is_dir())
+}
+
+/// Photo folders of both parts, where there are any.
+pub(super) fn photo_folders(scene: &Path) -> Vec<PathBuf> {
+    ["train", "val", "test"].iter().filter_map(|part| photo_folder(&scene.join(part))).collect()
+}
+
+/// Folders of a training and a held-out part, each with a model.
+fn parts(scene: &Path) -> Option<[PathBuf; 2]> {
+    let with_model = |name: &str| Some(scene.join(name)).filter(|part| super::looks_like_colmap(part));
+    Some([with_model("train")?, HELD_OUT.into_iter().find_map(with_model)?])
+}
+
+/// Whether [`read_parts`] finds something in this folder.
+pub fn looks_like_parts(scene: &Path) -> bool {
+    parts(scene).is_some()
+}
+
+/// Reads both parts; points are those of the training part.
+///
+/// # Errors
+/// As [`super::read_colmap`] of either; or a part without photos.
+pub fn read_parts(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> {
+    let Some(folders) = parts(scene) else {
+        return Err(InputError::new(scene, "no models in train/sparse and val/sparse", "put them there"));
+    };
+    let mut all = RawScene::default();
+    let mut names = BTreeSet::new();
+    let mut shared = false;
+    for (folder, split) in folders.iter().zip([Split::Train, Split::Test]) {
+        let photos = photos_of(folder, options)?;
+        let points = (split == Split::Train).then_some(options.points_later);
+        let Model { views, points, points_path, warnings } = read_model(folder, &photos, points)?;
+        all.warnings.extend(warnings);
+        if split == Split::Train {
+            (all.points, all.points_path) = (points, points_path);
+        }
+        for view in views {
+            shared |= !names.insert(view.name.clone());
+            all.views.push(RawView { split: Some(split), ..view });
+        }
+    }
+    if shared {
+        for view in &mut all.views {
+            let part = if view.split == Some(Split::Train) { &folders[0] } else { &folders[1] };
+            view.name = format!("{}/{}", part.file_name().unwrap_or_default().to_string_lossy(), view.name);
+        }
+    }
+    sort_views(scene, &mut all.views)?;
+    Ok(all)
+}
+
+fn photos_of(part: &Path, options: &ReadOptions) -> InputResult<PathBuf> {
+    let named = options.images.as_ref().map(|name| part.join(name));
+    named.filter(|folder| folder.is_dir()).or_else(|| photo_folder(part)).ok_or_else(|| {
+        let problem = format!("no photos here; looked for {}", PHOTOS.join(", "));
+        InputError::new(part, problem, "put them into rgbs or images, or name their folder with --images")
+    })
+}
+
+/// For a model of all photos without a folder of all photos: each view's photo in one of `folders`.
+pub(super) fn find_photos(views: &mut [RawView], folders: &[PathBuf]) -> InputResult<()> {
+    for view in views {
+        let found: Vec<PathBuf> = folders.iter().map(|f| f.join(&view.name)).filter(|path| path.is_file()).collect();
+        match &found[..] {
+            // Missing photos are the loader's matter.
+            [] => {}
+            [path] => view.image_path.clone_from(path),
+            _ => {
+                let problem = format!("the model's photo '{}' is in {} folders", view.name, found.len());
+                let places = found.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ");
+                let remedy =
+                    "use one model for each folder (train/sparse/0, val/sparse/0), or merge the photos into images";
+                return Err(InputError::new(&found[0], problem, remedy).at(places));
+            }
+        }
+    }
+    Ok(())
+}

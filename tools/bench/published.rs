@@ -1,0 +1,263 @@
+//! `gsscale-bench run NAME --data DIR`: a published run, from the dataset's folder to a table of ours beside the paper's.
+//!
+//! Checks the folder, trains through `train::run` (the same as `gsscale-train`), evaluates, and sets the figures side by
+//! side (`published_table`). Photos are read where they are; nothing is written outside the output folder but pages in
+//! `--spill-dir`.
+
+use super::published_table::{Comparison, Ours};
+use clap::Parser;
+use gsscale::base::error::{InputError, InputResult};
+use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::config::limits::read_options;
+use gsscale::config::published::{BUILT_IN, PublishedRun, differences};
+use gsscale::dataset::layout::{Layout, find_layout};
+use gsscale::dataset::model::{RawScene, Split};
+use gsscale::dataset::read::{ReadOptions, read_scene};
+use gsscale::render::lpips::InputRange;
+use gsscale::train::eval::{EvalExtras, evaluate_ply};
+use gsscale::train::report::{Summary, write_whole};
+use gsscale::train::run::{RunRequest, run};
+use gsscale::train::trainer::{TrainError, Trainer};
+use serde_json::Value;
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-bench run rubble --data /data/rubble-pixsfm --dry-run        is the folder complete? what would it take?
+  gsscale-bench run rubble --data /data/rubble-pixsfm --out runs/rubble --lpips lpips_alex.safetensors
+  gsscale-bench run building --data /data/building-pixsfm --tier S3 --spill-dir /nvme/pages --host-mem 12GiB
+  gsscale-train --resume runs/rubble && gsscale-bench run rubble --data /data/rubble-pixsfm --out runs/rubble --no-train
+
+Runs: rubble, building, residence, sciart, lfls, sziit, sztu, aerial. The figures go to the terminal, as one line of JSON to
+the standard output, and into OUT/published.json and OUT/published.html.";
+
+/// Trains a published run and prints our figures beside the published ones.
+#[derive(Parser)]
+#[command(name = "gsscale-bench run", version, after_help = EXAMPLES)]
+pub struct Args {
+    /// Name of a published run, or a config file with [published]
+    run: PathBuf,
+    /// Folder of the dataset
+    #[arg(long, value_name = "DIR")]
+    data: PathBuf,
+    /// Output folder [default: runs/NAME]
+    #[arg(long, short)]
+    out: Option<PathBuf>,
+    /// Densification tier of the config, S0 (fewest Gaussians) to S5 (most)
+    #[arg(long)]
+    tier: Option<String>,
+    /// Measure LPIPS too, with these weights (safetensors; README.md says how to make them)
+    #[arg(long, value_name = "FILE")]
+    lpips: Option<PathBuf>,
+    /// What LPIPS's network is fed: signed (-1..1) or unit (0..1)
+    #[arg(long, default_value = "signed", value_name = "RANGE")]
+    lpips_range: InputRange,
+    /// Check the folder, print what was understood and the memory it will take, then stop
+    #[arg(long)]
+    dry_run: bool,
+    /// Evaluate what is in the output folder instead of training
+    #[arg(long, conflicts_with_all = ["dry_run", "overwrite", "tier"])]
+    no_train: bool,
+    /// Replace the results of an earlier run in the output folder
+    #[arg(long)]
+    overwrite: bool,
+    /// Print nothing but warnings, errors and the line of JSON
+    #[arg(long, short)]
+    quiet: bool,
+    #[command(flatten)]
+    keys: TrainOverrides,
+}
+
+/// Whether these arguments (the program's name first) ask for a published run: they give a dataset, or begin with the
+/// name of one.
+pub fn is_meant(arguments: &[OsString]) -> bool {
+    let is_run =
+        |a: &OsString| BUILT_IN.iter().any(|(name, _)| a == name) || Path::new(a).extension() == Some("toml".as_ref());
+    let is_data = |a: &OsString| a.to_str().is_some_and(|a| a == "--data" || a.starts_with("--data="));
+    arguments.get(1).is_some_and(is_run) || arguments.iter().any(is_data)
+}
+
+/// What is known before any training.
+struct Setting {
+    run: PublishedRun,
+    layout: Layout,
+    /// As published, with the cloud that was found.
+    published: TrainConfig,
+    out: PathBuf,
+    /// Why the figures will not be comparable.
+    caveats: Vec<String>,
+}
+
+/// Runs.
+///
+/// # Errors
+/// The folder is not complete, or as a run.
+pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, TrainError> {
+    let mut run = PublishedRun::find(&args.run)?;
+    if let Some(tier) = &args.tier {
+        run.use_tier(tier)?;
+    }
+    let mut setting = settle(run, args)?;
+    let config = if args.no_train {
+        let mut config = TrainConfig::read(&setting.out.join("config.toml"))?;
+        args.keys.clone().apply(&mut config);
+        config
+    } else {
+        let mut config = setting.published.clone();
+        args.keys.clone().apply(&mut config);
+        config
+    };
+    config.check()?;
+    setting.caveats.extend(differences(&setting.published, &config));
+    check_photos(args, &config, &mut setting)?;
+    if !args.quiet {
+        describe(args, &setting, &config);
+    }
+    let trained = if args.no_train { Ok(read_summary(&setting.out)?) } else { train(args, &setting, &config)? };
+    let summary = match trained {
+        Ok(summary) => summary,
+        Err(code) => return Ok(code),
+    };
+    if !summary.finished {
+        setting.caveats.push(format!("the run stopped after {} steps", summary.steps));
+    }
+    let ours = measure(args, &setting, &config, summary)?;
+    report(args, &setting, &config, &ours, print)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The layout of the folder and the config with what lies in it.
+fn settle(run: PublishedRun, args: &Args) -> InputResult<Setting> {
+    let parse = |name: &String| {
+        let refuse = |problem| InputError::new(&args.run, problem, "correct the config").at("layouts");
+        name.parse::<Layout>().map_err(refuse)
+    };
+    let layouts: Vec<Layout> = run.facts.layouts.iter().map(parse).collect::<InputResult<_>>()?;
+    if layouts.is_empty() {
+        return Err(InputError::new(&args.run, "no layout is named", "name one, such as \"colmap\"").at("layouts"));
+    }
+    let layout = find_layout(&args.data, &layouts, &run.facts.fetch)?;
+    let mut published = run.config.clone();
+    let mut caveats = Vec::new();
+    let cloud = run.facts.clouds.iter().map(|name| args.data.join(name)).find(|path| path.is_file());
+    if let Some(cloud) = cloud {
+        let cloud = std::path::absolute(&cloud).map_err(|e| InputError::io(&cloud, "finding the cloud", &e))?;
+        published.init_ply = cloud.to_string_lossy().into_owned();
+    } else if layout == Layout::Colmap && !run.facts.clouds.is_empty() {
+        let places = run.facts.clouds.join(", ");
+        caveats.push(format!("starts from the model's own points: the published cloud is not there ({places})"));
+    }
+    let out = args.out.clone().unwrap_or_else(|| Path::new("runs").join(&run.name));
+    Ok(Setting { run, layout, published, out, caveats })
+}
+
+/// Sets what the folder holds beside what was published: photos, held-out photos, their size, points.
+fn check_photos(args: &Args, config: &TrainConfig, setting: &mut Setting) -> InputResult<()> {
+    let raw = read_scene(&args.data, &ReadOptions { points_later: true, ..read_options(config) })?;
+    let (facts, caveats) = (&setting.run.facts, &mut setting.caveats);
+    let (views, held_out) = (raw.views.len(), held_out(&raw, config));
+    for (what, published, found) in [("photos", facts.views, views), ("held-out photos", facts.held_out, held_out)] {
+        if let Some(published) = published.filter(|&n| n as usize != found) {
+            caveats.push(format!("{found} {what} instead of {published}"));
+        }
+    }
+    let k = raw.views[0].intrinsics;
+    let used = [k.width, k.height].map(|side| f64::from(side) / config.data_factor);
+    // Undistortion and rounding cost a pixel or a few; another set of photos has another size altogether.
+    let is_off = |size: &[u32; 2]| (0..2).any(|i| (used[i] / f64::from(size[i]) - 1.0).abs() > 0.01);
+    if let Some([w, h]) = facts.size.filter(is_off) {
+        caveats.push(format!("photos of {:.0}x{:.0} instead of {w}x{h}", used[0], used[1]));
+    }
+    if raw.points_path.is_none() && raw.points.positions.is_empty() && config.init_ply.is_empty() {
+        caveats.push("starts from random points: the folder has none".to_string());
+    }
+    Ok(())
+}
+
+fn held_out(raw: &RawScene, config: &TrainConfig) -> usize {
+    let by_index = |i: usize| match (u32::try_from(config.test_after), config.test_every) {
+        (Ok(after), _) => i > after as usize,
+        (Err(_), 0) => false,
+        (Err(_), every) => i.is_multiple_of(every as usize),
+    };
+    let is_test = |(i, split): (usize, Option<Split>)| split.map_or_else(|| by_index(i), |s| s == Split::Test);
+    raw.views.iter().map(|view| view.split).enumerate().filter(|v| is_test(*v)).count()
+}
+
+fn describe(args: &Args, setting: &Setting, config: &TrainConfig) {
+    let tier = setting.run.tier_of(config).unwrap_or("none");
+    eprintln!(
+        "run     {} ({}), tier {tier}, {} laid out as {}",
+        setting.run.name,
+        setting.run.facts.title,
+        args.data.display(),
+        setting.layout.name()
+    );
+    for caveat in &setting.caveats {
+        eprintln!("warning: not the published run: {caveat}");
+    }
+}
+
+/// Trains to the end; only an exit code for a dry run and for one that was stopped.
+fn train(args: &Args, setting: &Setting, config: &TrainConfig) -> Result<Result<Summary, ExitCode>, TrainError> {
+    let outcome = run(&RunRequest {
+        scene: args.data.clone(),
+        out: setting.out.clone(),
+        config: config.clone(),
+        dry_run: args.dry_run,
+        overwrite: args.overwrite,
+        quiet: args.quiet,
+    })?;
+    if outcome.exit_code == 0 {
+        return Ok(outcome.summary.ok_or(ExitCode::SUCCESS));
+    }
+    let (name, data, out) = (args.run.display(), args.data.display(), setting.out.display());
+    eprintln!("stopped; for the table: gsscale-bench run {name} --data {data} --out {out} --no-train");
+    Ok(Err(ExitCode::from(outcome.exit_code as u8)))
+}
+
+fn read_summary(out: &Path) -> InputResult<Summary> {
+    let path = out.join("summary.json");
+    let text = std::fs::read_to_string(&path).map_err(|e| InputError::io(&path, "reading the run's summary", &e))?;
+    serde_json::from_str(&text)
+        .map_err(|e| InputError::new(&path, format!("no summary of a run: {e}"), "name the output folder of a run"))
+}
+
+/// Our figures: those of the run, or of its PLY where that has to be looked at again.
+fn measure(args: &Args, setting: &Setting, config: &TrainConfig, summary: Summary) -> Result<Ours, TrainError> {
+    let mut ours = Ours::new(summary, config);
+    if args.lpips.is_some() || args.no_train {
+        let extras = EvalExtras { pictures: None, lpips: args.lpips.as_deref().map(|file| (file, args.lpips_range)) };
+        let report = evaluate_ply(&Trainer::ply_path(&setting.out), &args.data, config, &extras)?;
+        (ours.test, ours.lpips_variant) = (report.test, report.lpips_variant);
+    }
+    Ok(ours)
+}
+
+fn report(
+    args: &Args,
+    setting: &Setting,
+    config: &TrainConfig,
+    ours: &Ours,
+    print: &mut dyn FnMut(&Value),
+) -> InputResult<()> {
+    let comparison = Comparison {
+        run: &setting.run,
+        tier: setting.run.tier_of(config),
+        layout: setting.layout.name(),
+        data: &args.data,
+        out: &setting.out,
+        caveats: &setting.caveats,
+        ours,
+    };
+    let json = comparison.json();
+    write_whole(&setting.out.join("published.json"), format!("{json:#}\n").as_bytes())?;
+    write_whole(&setting.out.join("published.html"), comparison.page().as_bytes())?;
+    if !args.quiet {
+        eprintln!("{}", comparison.text());
+    }
+    print(&json);
+    Ok(())
+}
