@@ -4,7 +4,8 @@
 #[path = "support/scenes.rs"]
 mod scenes;
 
-use gsscale::report::run_report::{PAGES_FILE, compare_report, run_report};
+use gsscale::report::compare_report::compare_report;
+use gsscale::report::run_report::{PAGES_FILE, run_report};
 use scenes::{city, stderr, text, train};
 use std::path::{Path, PathBuf};
 use std::process::Command;

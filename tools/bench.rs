@@ -1,15 +1,28 @@
 //! `gsscale-bench`: measures training and prints lines of JSON. Which measurement is the first argument; without one of
 //! their names it is `run`. Parses, calls, prints.
 
+#[path = "bench/compare.rs"]
+mod compare;
 #[path = "bench/demand.rs"]
 mod demand;
+#[path = "bench/facts.rs"]
+mod facts;
+#[path = "bench/knobs.rs"]
+mod knobs;
+#[path = "bench/ladder.rs"]
+mod ladder;
 #[path = "bench/orders.rs"]
 mod orders;
+#[path = "bench/pareto.rs"]
+mod pareto;
 #[path = "bench/run.rs"]
 mod run;
+#[path = "bench/sweep.rs"]
+mod sweep;
 #[path = "bench/tiers.rs"]
 mod tiers;
 
+use clap::Parser;
 use gsscale::base::error::InputError;
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::config::limits::simd_path;
@@ -35,6 +48,12 @@ fn main() -> ExitCode {
         tiers::start(&parse_arguments(&arguments), &mut print)
     } else if named("orders") {
         orders::start(&parse_arguments(&arguments), &mut print)
+    } else if named("ladder") {
+        ladder::start(&parse_arguments(&arguments), &mut print)
+    } else if named("pareto") {
+        pareto::start(&parse_arguments(&arguments), &mut print)
+    } else if named("compare") {
+        compare::start(&compare::Args::parse_from(&arguments))
     } else {
         named("run");
         run::start(&parse_arguments(&arguments), &mut print)

@@ -8,6 +8,7 @@
 //! reads and writes never depends on frames, plan or store; 4. a page with rows that is not in memory has a slot, and the
 //! slot holds exactly what was last released.
 
+use super::ahead::Transfers;
 use super::error::PagingError;
 use super::pinned::PinnedPage;
 use super::stats::PagerStats;
@@ -74,6 +75,7 @@ pub struct Pager {
     pub(super) writes_stopped: bool,
     /// Reads and writes that were started ahead of their need and are still in flight, bytes.
     pub(super) ahead: [usize; 2],
+    pub(super) transfers: Transfers,
     /// Pages of the last acknowledged commit, with the generations of their versions.
     pub(super) committed: BTreeMap<PageId, u64>,
 }
@@ -97,6 +99,7 @@ impl Pager {
             failed_write: None,
             writes_stopped: false,
             ahead: [0; 2],
+            transfers: Transfers::default(),
             committed: BTreeMap::new(),
         }
     }
@@ -123,6 +126,11 @@ impl Pager {
     pub fn allow_frames(&mut self, frames: usize) {
         self.cache.allow_frames(frames);
         self.config.frames = self.cache.frames_max();
+    }
+
+    /// Moves pages at these times from now on.
+    pub fn set_transfers(&mut self, transfers: Transfers) {
+        self.transfers = transfers;
     }
 
     /// Bytes that [`Pager::prefetch`] has in flight at most.

@@ -19,6 +19,7 @@ section.tiles{display:flex;flex-wrap:wrap;gap:12px;margin:18px 0}
 .tile span{color:var(--dim);font-size:13px}
 .charts{display:grid;grid-template-columns:repeat(auto-fill,minmax(440px,1fr));gap:14px}
 figure{margin:0;background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:10px}
+figure.wide{margin-bottom:14px}
 figure svg{width:100%;height:auto;display:block}
 figcaption{font-size:13px;margin-top:6px}
 table{border-collapse:collapse;background:var(--paper);border:1px solid var(--line);font-size:14px}
@@ -101,6 +102,11 @@ impl Page {
             self.push(format_args!("<figure>{svg}<figcaption>{}</figcaption></figure>\n", escape(caption)));
         }
         self.push(format_args!("</div>\n"));
+    }
+
+    /// A chart over the whole width.
+    pub fn wide_chart(&mut self, svg: &str, caption: &str) {
+        self.push(format_args!("<figure class=\"wide\">{svg}<figcaption>{}</figcaption></figure>\n", escape(caption)));
     }
 
     /// A table.

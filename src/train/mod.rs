@@ -1,11 +1,14 @@
 //! The glue, in one direction: [`run`] sets a run up and sees it through ([`tiers`] says where pages live, [`memory`] and
 //! [`preflight`] whether that fits), [`trainer`] loops over steps, [`step`] is one step from top to bottom,
-//! [`checkpoint`] commits it, [`resume`] goes on from a commit, [`pages`] has the rows of a run in pages and brings them to now with [`catch_up`], `update` changes them, [`eval`] looks at
+//! [`checkpoint`] commits it, [`resume`] goes on from a commit, [`pages`] has the rows of a run in pages and brings them to now with [`catch_up`], `update` changes them, `dense` all of them
+//! at every step, [`costs`] counts what steps took, [`eval`] looks at
 //! held-out views, [`report`] writes what happened, [`progress`] shows it, [`machine`] starts its threads, [`signals`]
 //! hears Ctrl-C.
 
 pub mod catch_up;
 pub mod checkpoint;
+pub mod costs;
+mod dense;
 pub mod eval;
 pub mod machine;
 pub mod memory;

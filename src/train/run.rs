@@ -4,6 +4,7 @@
 //! behind; 2. a run that is stopped or fails after its first step still writes the PLY of its last good step.
 
 use super::checkpoint::{Origin, dataset_print};
+use super::costs::Meter;
 use super::eval::ply_warnings;
 use super::machine;
 use super::memory::{estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
@@ -298,7 +299,9 @@ fn train_into(
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let mut progress = Progress::new(config.steps, request.quiet);
     let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint };
+    let meter = Meter::start(&trainer);
     let looped = trainer.run(dataset, &targets, &mut outputs);
+    let costs = meter.stop(&trainer, &*tiers);
     let ply = Trainer::ply_path(out);
     let written = trainer.save(dataset, &ply)?;
     if written.frame == ExportFrame::Local && config.export_frame == "dataset" {
@@ -329,6 +332,7 @@ fn train_into(
         finished: trainer.steps_done() == config.steps,
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
+        costs,
         tiers: TierTraffic::of(&trainer.scene.pager),
     };
     write_summary(&out.join("summary.json"), &summary)?;

@@ -101,6 +101,12 @@ fn pager_config(config: &TrainConfig, pages: usize, host_mem: u64) -> PagerConfi
     pager
 }
 
+/// The pager with its pages moving when `--transfers` says.
+fn with_transfers(mut pager: Pager, config: &TrainConfig) -> Pager {
+    pager.set_transfers(config.transfers.parse().unwrap_or_default());
+    pager
+}
+
 /// Opens the tiers for a scene of about `pages` pages, within `host_mem` bytes. The pager has few frames at first where
 /// their number follows from the budget: see [`Pager::allow_frames`]. With `dry`, nothing is written: pages stay in
 /// memory.
@@ -120,7 +126,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
         let codec = chosen_codec(config, None, &mut tiers.notes);
         (tiers.engine, tiers.codec) = (engine.name().to_string(), codec.to_string());
         let of_store = PagedStoreConfig { store: 0, layout, codec, generation: 1, serial: 1 };
-        return Ok((Pager::new(pager, PagedStore::new(engine, of_store)), tiers));
+        return Ok((with_transfers(Pager::new(pager, PagedStore::new(engine, of_store)), config), tiers));
     }
     let spill = SpillDir::create(Path::new(&config.spill_dir), Purpose::Checkpoint, layout, false)?;
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
@@ -129,7 +135,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let opened = Commits::create(Box::new(folder), of_commits)?;
     let store = opened.paged_store(engine, layout, codec)?;
     tiers.checkpoint = Some(Checkpoint::new(opened.commits, config));
-    Ok((Pager::new(pager, store), tiers))
+    Ok((with_transfers(Pager::new(pager, store), config), tiers))
 }
 
 /// A spill directory with a run that can go on.
@@ -183,7 +189,7 @@ impl Stored {
         let store = opened.paged_store(engine, layout, codec)?;
         let pager = Pager::open(pager, store, &opened.pages, run_state.events.len())?;
         tiers.checkpoint = Some(Checkpoint::new(opened.commits, config));
-        Ok((pager, tiers))
+        Ok((with_transfers(pager, config), tiers))
     }
 }
 
@@ -213,6 +219,12 @@ impl Tiers {
     /// Whether pages may leave memory for a drive.
     pub fn spills(&self) -> bool {
         self.spill.is_some()
+    }
+
+    /// Bytes of the files that hold pages on the drive; 0 without one, or where they cannot be listed.
+    pub fn drive_bytes(&self) -> u64 {
+        let of = |spill: &SpillDir| spill.segments().map_or(0, |s| s.len() as u64 * spill.format().layout.segment_bytes());
+        self.spill.as_ref().map_or(0, of)
     }
 
     /// Bytes that pages may take on the drive: what is free, and what those of a run that goes on have already; `None`
