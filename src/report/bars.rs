@@ -9,10 +9,10 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 const WIDTH: u32 = 560;
-/// Height of a bar with the gap below it, of the title, and width of the names.
+/// Height of a bar with the gap below it, of the title, and width of the names: about twelve characters.
 const BAR: i32 = 30;
 const TITLE: i32 = 34;
-const NAMES: i32 = 190;
+const NAMES: i32 = 90;
 /// Room for the value behind the longest bar.
 const VALUES: i32 = 80;
 
@@ -56,7 +56,8 @@ impl Bars {
             let middle = y + BAR / 2 - 3;
             let style = TextStyle::from(("sans-serif", 13)).pos(anchor(HPos::Right));
             root.draw(&Text::new(name.clone(), (NAMES - 8, middle), style)).map_err(text)?;
-            let length = finite(value).map_or(0, |v| if most > 0.0 { (v.max(0.0) / most * room).round() as i32 } else { 0 });
+            let length =
+                finite(value).map_or(0, |v| if most > 0.0 { (v.max(0.0) / most * room).round() as i32 } else { 0 });
             let bar = [(NAMES, y), (NAMES + length.max(1), y + BAR - 6)];
             root.draw(&Rectangle::new(bar, COLORS[0].filled())).map_err(text)?;
             let style = TextStyle::from(("sans-serif", 13)).color(&AXIS).pos(anchor(HPos::Left));

@@ -131,7 +131,9 @@ fn judge(setting: &Setting, base: &Setting) -> Verdict {
 pub fn pareto_front(points: &[(f64, f64)]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.retain(|&i| points[i].0.is_finite() && points[i].1.is_finite());
-    order.sort_by(|&a, &b| points[a].0.total_cmp(&points[b].0).then(points[b].1.total_cmp(&points[a].1)).then(a.cmp(&b)));
+    order.sort_by(|&a, &b| {
+        points[a].0.total_cmp(&points[b].0).then(points[b].1.total_cmp(&points[a].1)).then(a.cmp(&b))
+    });
     let mut front: Vec<usize> = Vec::new();
     for i in order {
         let is_on_it = front.last().is_none_or(|&best| points[i].1 > points[best].1 || points[i] == points[best]);
@@ -167,15 +169,7 @@ mod tests {
 
     fn run(knob: &str, seed: u64, psnr: f64, ssim: f64, ply: &str) -> RunRecord {
         let (psnr, ssim) = (Some(psnr), Some(ssim));
-        RunRecord {
-            knob: knob.into(),
-            label: knob.into(),
-            seed,
-            psnr,
-            ssim,
-            ply: ply.into(),
-            ..RunRecord::default()
-        }
+        RunRecord { knob: knob.into(), label: knob.into(), seed, psnr, ssim, ply: ply.into(), ..RunRecord::default() }
     }
 
     #[test]

@@ -42,26 +42,19 @@ pub fn ladder_page(facts: &str, rungs: &[LadderRung], not_built: &[&str]) -> Str
             bytes(|r| Some(r.host_bytes_peak as f64), "Peak of host memory"),
             "Largest resident size of the process, photos, buffers and evaluation included.".into(),
         ),
-        (seconds(|r| Some(r.stall_seconds), "Seconds waiting for the drive"), "Import and export included.".into()),
+        (seconds(|r| Some(r.stall_seconds), "Seconds waiting for the drive"), "In which a step stood still.".into()),
     ]);
     page.heading("All figures");
     let in_memory = rungs.iter().find(|r| r.name == "memory").and_then(|r| r.record.psnr);
-    let mut rows: Vec<Vec<Cell>> = rungs.iter().map(|r| row(r, in_memory)).collect();
-    for name in not_built {
-        let mut row = vec![Cell::Text(format!("+ {name}")), Cell::Text("not built yet".into())];
-        row.resize_with(HEAD.len(), || Cell::Text(String::new()));
-        rows.push(row);
-    }
-    page.table(&HEAD, &rows);
+    page.table(&HEAD, &rungs.iter().map(|r| row(r, in_memory)).collect::<Vec<_>>());
+    page.heading("Rungs that are not built yet");
+    let not_built =
+        not_built.iter().map(|name| vec![Cell::Text(format!("+ {name}")), Cell::Text("not built yet".into())]);
+    page.table(&["rung", ""], &not_built.collect::<Vec<_>>());
     page.finish()
 }
 
-fn bars(
-    rungs: &[LadderRung],
-    title: &str,
-    of: fn(&RunRecord) -> Option<f64>,
-    write: &dyn Fn(f64) -> String,
-) -> String {
+fn bars(rungs: &[LadderRung], title: &str, of: fn(&RunRecord) -> Option<f64>, write: &dyn Fn(f64) -> String) -> String {
     let bar = |rung: &LadderRung| {
         let value = of(&rung.record).filter(|_| rung.record.problem.is_none());
         (rung.name.clone(), value, value.map_or("failed".to_string(), write))
@@ -92,18 +85,30 @@ fn sameness(rungs: &[LadderRung]) -> String {
 }
 
 const HEAD: [&str; 13] = [
-    "rung", "seconds", "ms a step", "CPU s", "waited, s", "read", "written", "host peak", "device peak", "drive peak",
-    "PSNR, dB", "against memory", "SSIM",
+    "rung",
+    "seconds",
+    "ms a step",
+    "CPU s",
+    "waited, s",
+    "read",
+    "written",
+    "host peak",
+    "device peak",
+    "drive peak",
+    "PSNR, dB",
+    "against memory",
+    "SSIM",
 ];
 
 fn row(rung: &LadderRung, in_memory: Option<f64>) -> Vec<Cell> {
     let record = &rung.record;
     if let Some(problem) = &record.problem {
-        let mut row = vec![Cell::Text(rung.what.clone()), Cell::Text(format!("failed: {problem}"))];
+        let mut row = vec![Cell::Text(format!("{}; failed: {problem}", rung.what))];
         row.resize_with(HEAD.len(), || Cell::Text(String::new()));
         return row;
     }
-    let number = |value: Option<f64>, digits: usize| Cell::Number(value.map_or(String::new(), |v| format!("{v:.digits$}")));
+    let number =
+        |value: Option<f64>, digits: usize| Cell::Number(value.map_or(String::new(), |v| format!("{v:.digits$}")));
     let bytes = |b: u64| Cell::Number(if b == 0 { String::from("–") } else { format_bytes(b) });
     vec![
         Cell::Text(rung.what.clone()),

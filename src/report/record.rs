@@ -37,7 +37,7 @@ pub struct RunRecord {
     pub cpu_seconds: Option<f64>,
     /// Seconds from the start of the process to its end.
     pub wall_seconds: f64,
-    /// Seconds that steps waited for the drive, import and export included.
+    /// Seconds that steps waited for the drive.
     pub stall_seconds: f64,
     /// Bytes that the steps read from the drive.
     pub bytes_read: u64,

@@ -13,6 +13,8 @@ struct Cost {
     title: &'static str,
     axis: &'static str,
     of: fn(&RunRecord) -> Option<f64>,
+    /// Whether SSIM is drawn against it as well: it mostly repeats what PSNR says.
+    is_for_both: bool,
 }
 
 /// Gets PSNR or SSIM of a setting.
@@ -20,15 +22,26 @@ type Quality = fn(&Setting) -> Option<Spread>;
 
 const GB: f64 = 1e9;
 const COSTS: [Cost; 5] = [
-    Cost { title: "seconds", axis: "seconds of training", of: |r| Some(r.seconds) },
-    Cost { title: "CPU seconds", axis: "CPU seconds of training, all threads", of: |r| r.cpu_seconds },
+    Cost { title: "seconds", axis: "seconds of training", of: |r| Some(r.seconds), is_for_both: true },
+    Cost {
+        title: "CPU seconds",
+        axis: "CPU seconds of training, all threads",
+        of: |r| r.cpu_seconds,
+        is_for_both: false,
+    },
     Cost {
         title: "bytes moved",
         axis: "GB read from and written to the drive",
         of: |r| Some(r.bytes_moved() as f64 / GB),
+        is_for_both: true,
     },
-    Cost { title: "Gaussians", axis: "Gaussians at the end", of: |r| Some(r.gaussians as f64) },
-    Cost { title: "peak memory", axis: "GB of host memory at the peak", of: |r| Some(r.host_bytes_peak as f64 / GB) },
+    Cost { title: "Gaussians", axis: "Gaussians at the end", of: |r| Some(r.gaussians as f64), is_for_both: true },
+    Cost {
+        title: "peak memory",
+        axis: "GB of host memory at the peak",
+        of: |r| Some(r.host_bytes_peak as f64 / GB),
+        is_for_both: false,
+    },
 ];
 /// Colour of the front's line: the grey one.
 const FRONT_COLOR: usize = 4;
@@ -39,13 +52,10 @@ pub fn sweep_page(scene: &str, facts: &str, records: &[RunRecord]) -> String {
     let mut page = Page::new(&format!("gsscale: what each setting costs, {scene}"), facts);
     page.tiles(&tiles(&settings));
     page.paragraph(&reading(&settings));
-    for (name, quality) in [
-        ("PSNR", (|s: &Setting| s.psnr) as Quality),
-        ("SSIM", |s: &Setting| s.ssim),
-    ] {
+    for (name, quality) in [("PSNR", (|s: &Setting| s.psnr) as Quality), ("SSIM", |s: &Setting| s.ssim)] {
         page.heading(&format!("{name} of the held-out views against"));
-        let charts: Vec<Chart> = COSTS.iter().filter_map(|cost| chart(&settings, name, quality, cost)).collect();
-        for chart in charts {
+        let costs = COSTS.iter().filter(|cost| name == "PSNR" || cost.is_for_both);
+        for chart in costs.filter_map(|cost| chart(&settings, name, quality, cost)) {
             page.wide_chart(&chart.svg(), "");
         }
     }
@@ -98,12 +108,12 @@ fn reading(settings: &[Setting]) -> String {
     )
 }
 
-/// `None` where no run takes any of it, or there is no such figure.
+/// `None` where all take the same of it, or there is no such figure.
 fn chart(settings: &[Setting], name: &str, quality: Quality, cost: &Cost) -> Option<Chart> {
     let at = |s: &Setting| Some((s.mean(cost.of)?, quality(s)?));
     let points: Vec<(&Setting, f64, Spread)> =
         settings.iter().filter_map(|s| at(s).map(|(x, spread)| (s, x, spread))).collect();
-    if points.iter().all(|p| p.1 == 0.0) {
+    if points.iter().all(|p| p.1 == points[0].1) {
         return None;
     }
     let unit = if name == "PSNR" { "PSNR, dB" } else { name };
@@ -130,20 +140,39 @@ fn chart(settings: &[Setting], name: &str, quality: Quality, cost: &Cost) -> Opt
     chart.ranges = points.iter().filter(|p| p.2.width() > 0.0).map(|p| (p.1, p.2.low, p.2.high)).collect();
     // Those on the front are named first, so that they have the best places.
     let rest = (0..points.len()).filter(|i| !front.contains(i));
-    let label = |i: usize| (points[i].1, points[i].2.mean, points[i].0.label.clone());
+    let label = |i: usize| (points[i].1, points[i].2.mean, clear_label(points[i].0));
     chart.labels = front.iter().copied().chain(rest).map(label).collect();
     let base = settings.first().filter(|s| s.verdict == Verdict::Base && s.runs.len() > 1);
     chart.rule = base.and_then(quality).map(|s| (s.mean - s.width(), "mean of the base less its spread".to_string()));
     Some(chart)
 }
 
+/// A number says nothing without its knob.
+fn clear_label(setting: &Setting) -> String {
+    let is_word = setting.label.len() > 2 && setting.label.starts_with(|c: char| c.is_alphabetic());
+    if is_word { setting.label.clone() } else { format!("{} {}", setting.knob, setting.label) }
+}
+
 const HEAD: [&str; 14] = [
-    "knob", "setting", "seeds", "PSNR, dB", "range", "against base", "SSIM", "seconds", "CPU s", "read", "written", "peak",
-    "Gaussians", "accuracy",
+    "knob",
+    "setting",
+    "seeds",
+    "PSNR, dB",
+    "range",
+    "against base",
+    "SSIM",
+    "seconds",
+    "CPU s",
+    "read",
+    "written",
+    "peak",
+    "Gaussians",
+    "accuracy",
 ];
 
 fn row(setting: &Setting, base: Option<&Setting>) -> Vec<Cell> {
-    let number = |value: Option<f64>, digits: usize| Cell::Number(value.map_or(String::new(), |v| format!("{v:.digits$}")));
+    let number =
+        |value: Option<f64>, digits: usize| Cell::Number(value.map_or(String::new(), |v| format!("{v:.digits$}")));
     let bytes = |of: fn(&RunRecord) -> u64| {
         let mean = setting.mean(|r| Some(of(r) as f64));
         Cell::Number(mean.filter(|b| *b > 0.0).map_or(String::from("–"), |b| format_bytes(b as u64)))

@@ -16,6 +16,8 @@ pub struct StepCosts {
     pub train_bytes_read: u64,
     /// Bytes written to it by the steps and their commits' pages.
     pub train_bytes_written: u64,
+    /// Seconds that the steps waited for the drive.
+    pub train_stall_seconds: f64,
     /// Most bytes allocated on the device; 0 on the CPU.
     pub device_bytes_peak: u64,
     /// Bytes of the segment files on the drive, which never shrink; 0 without a spill directory.
@@ -27,13 +29,15 @@ pub(super) struct Meter {
     cpu: Option<f64>,
     read: u64,
     written: u64,
+    stall: f64,
 }
 
 impl Meter {
     /// Counts from now on.
     pub fn start(trainer: &Trainer) -> Meter {
         let stats = trainer.scene.pager.stats();
-        Meter { cpu: process_cpu_seconds(), read: stats.bytes_read, written: stats.bytes_written }
+        let (read, written, stall) = (stats.bytes_read, stats.bytes_written, stats.stall_seconds);
+        Meter { cpu: process_cpu_seconds(), read, written, stall }
     }
 
     /// What was counted.
@@ -43,6 +47,7 @@ impl Meter {
             train_cpu_seconds: process_cpu_seconds().zip(self.cpu).map(|(now, before)| now - before),
             train_bytes_read: stats.bytes_read - self.read,
             train_bytes_written: stats.bytes_written - self.written,
+            train_stall_seconds: stats.stall_seconds - self.stall,
             device_bytes_peak: trainer.renderer.traffic().device_bytes_peak,
             drive_bytes_peak: tiers.drive_bytes(),
         }

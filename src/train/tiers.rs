@@ -223,7 +223,8 @@ impl Tiers {
 
     /// Bytes of the files that hold pages on the drive; 0 without one, or where they cannot be listed.
     pub fn drive_bytes(&self) -> u64 {
-        let of = |spill: &SpillDir| spill.segments().map_or(0, |s| s.len() as u64 * spill.format().layout.segment_bytes());
+        let of =
+            |spill: &SpillDir| spill.segments().map_or(0, |s| s.len() as u64 * spill.format().layout.segment_bytes());
         self.spill.as_ref().map_or(0, of)
     }
 

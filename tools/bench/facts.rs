@@ -39,10 +39,8 @@ impl Facts {
     pub fn of(scene: &Path, config: &TrainConfig) -> Result<Facts, TrainError> {
         let prepared = prepare(scene, config)?;
         let (dataset, columns) = (&prepared.dataset, &prepared.columns);
-        let options = RunOptions {
-            sh_degree_start: prepared.sh_degree_start,
-            ..RunOptions::new(config, dataset.scene_scale)
-        };
+        let options =
+            RunOptions { sh_degree_start: prepared.sh_degree_start, ..RunOptions::new(config, dataset.scene_scale) };
         let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
         let scene = PagedScene::new(columns, pager, &options)?;
         let cameras = cameras(dataset);

@@ -101,11 +101,14 @@ impl Knobs<'_> {
 
     fn budgets(&self) -> Vec<Planned> {
         let config = &self.base.config;
-        let shares = BUDGETS.into_iter().filter_map(|p| Some((format!("{p} % of the pages"), self.facts.frames(p, config)?)));
+        let shares =
+            BUDGETS.into_iter().filter_map(|p| Some((format!("{p} % of the pages"), self.facts.frames(p, config)?)));
         let mut all: Vec<Planned> =
             shares.map(|(label, frames)| self.named("budget", &label).on_drive(frames)).collect();
-        if all.len() < 2 && self.facts.fewest_frames(config) < self.facts.pages {
-            let frames = self.facts.fewest_frames(config);
+        // The fewest that hold a view, unless one of the shares is about that.
+        let (frames, least) =
+            (self.facts.fewest_frames(config), all.last().map_or(self.facts.pages, |p| p.config.frames.into()));
+        if frames * 5 < least * 4 {
             let percent = (100.0 * frames as f64 / self.facts.pages as f64).round();
             all.push(self.named("budget", &format!("{percent} % of the pages")).on_drive(frames));
         }
@@ -118,17 +121,18 @@ impl Knobs<'_> {
         all
     }
 
-    /// Frames for runs of a knob that does nothing in memory, and how labels say so.
-    fn drive(&self, facts: &Facts) -> (u64, String) {
+    /// Frames for runs of a knob that does nothing in memory, and how labels say so; `None` where a view needs all pages.
+    fn drive(&self, facts: &Facts) -> Option<(u64, String)> {
         let config = &self.base.config;
         let share = if self.share > 0.0 { self.share } else { DRIVE_SHARE };
         let frames = facts.frames(share, config).unwrap_or_else(|| facts.fewest_frames(config));
         let percent = (100.0 * frames as f64 / facts.pages as f64).round();
-        (frames, if self.share > 0.0 { String::new() } else { format!(", {percent} % of the pages") })
+        let label = if self.share > 0.0 { String::new() } else { format!(", {percent} % of the pages") };
+        (frames < facts.pages).then_some((frames, label))
     }
 
     fn codecs(&self) -> Vec<Planned> {
-        let (frames, at) = self.drive(self.facts);
+        let Some((frames, at)) = self.drive(self.facts) else { return Vec::new() };
         let codec = |name: &str| {
             let mut planned = self.named("codec", &format!("{name}{at}")).on_drive(frames);
             planned.config.spill_codec = name.into();
@@ -153,8 +157,7 @@ impl Knobs<'_> {
                 continue;
             }
             let facts = Facts::of(self.scene, &planned.config)?;
-            let (frames, at) = self.drive(&facts);
-            if frames < facts.pages {
+            if let Some((frames, at)) = self.drive(&facts) {
                 planned.label = format!("{rows} rows{at}");
                 all.push(planned.on_drive(frames));
             }

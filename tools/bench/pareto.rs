@@ -165,7 +165,8 @@ fn in_order(base: &Planned, settings: &[Planned], seeds: &[u64], setting_seeds: 
         run
     };
     let of_base = seeds.iter().map(|seed| with_seed(base, seed));
-    let of_settings = seeds.iter().take(setting_seeds).flat_map(|seed| settings.iter().map(move |s| with_seed(s, seed)));
+    let of_settings =
+        seeds.iter().take(setting_seeds).flat_map(|seed| settings.iter().map(move |s| with_seed(s, seed)));
     of_base.chain(of_settings).collect()
 }
 

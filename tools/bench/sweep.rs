@@ -164,7 +164,7 @@ impl Sweep {
         (record.psnr, record.ssim) = (summary.test.map(|t| t.psnr), summary.test.map(|t| t.ssim));
         record.seconds = summary.train_seconds;
         record.cpu_seconds = summary.costs.train_cpu_seconds;
-        record.stall_seconds = summary.tiers.stall_seconds;
+        record.stall_seconds = summary.costs.train_stall_seconds;
         record.bytes_read = summary.costs.train_bytes_read;
         record.bytes_written = summary.costs.train_bytes_written;
         record.gaussians = summary.gaussians;
