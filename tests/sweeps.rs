@@ -9,7 +9,7 @@ mod scenes;
 use browser::in_a_browser;
 use scenes::{city, stderr, text};
 use serde_json::Value;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
@@ -30,6 +30,11 @@ fn parse(text: &str) -> Vec<Value> {
 
 fn number(line: &Value, key: &str) -> f64 {
     line[key].as_f64().unwrap_or_else(|| panic!("{key} in {line}"))
+}
+
+/// A city of which no view sees more than two thirds.
+fn large_city(folder: &Path) -> PathBuf {
+    city(folder, 150, 48, 32, 8000)
 }
 
 fn names(folder: &Path) -> Vec<String> {
@@ -53,7 +58,7 @@ fn check_page(page: &Path, parts: &[&str], scratch: &Path) {
 #[test]
 fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 60, 48, 32, 3000);
+    let scene = large_city(folder.path());
     let out = folder.path().join("ladder");
     let sizes = ["--steps", "60", "--page-rows", "16", "--strategy", "none", "--share", "70", "--seed", "3"];
     let args = [&["ladder", text(&scene), "--out", text(&out)][..], &sizes].concat();
@@ -92,7 +97,7 @@ fn sweep<'a>(scene: &'a Path, out: &'a Path) -> Vec<&'a str> {
 #[test]
 fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
     let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 60, 48, 32, 3000);
+    let scene = large_city(folder.path());
     let out = folder.path().join("sweep");
     let args = sweep(&scene, &out);
     let listed = bench(&[&args[..], &["--list"]].concat());
@@ -163,7 +168,7 @@ fn check_sweep(records: &[Value], out: &Path, scratch: &Path) {
 #[test]
 fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 12, 48, 32, 300);
+    let scene = large_city(folder.path());
     let out = folder.path().join("out");
     let (scene, out) = (text(&scene), text(&out));
     let refuses = |args: &[&str], words: &str| {

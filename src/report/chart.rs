@@ -12,7 +12,7 @@ use plotters::style::text_anchor::{HPos, Pos, VPos};
 const SIZE: (u32, u32) = (560, 320);
 /// Those of a chart over the whole width of a page, and the part of it that its legend takes.
 const WIDE: (u32, u32) = (1040, 480);
-const LEGEND_WIDTH: u32 = 150;
+const LEGEND_WIDTH: u32 = 190;
 /// Colours of series, in their order.
 pub(super) const COLORS: [RGBColor; 12] = [
     RGBColor(36, 99, 180),
@@ -169,8 +169,8 @@ impl Chart {
         let mut chart = builder.build_cartesian_2d(x0..x1, y0..y1).map_err(text)?;
         let mut mesh = chart.configure_mesh();
         mesh.x_desc(&self.x).y_desc(&self.y).axis_style(AXIS).light_line_style(WHITE).x_labels(8).y_labels(7);
-        let label = |v: &f64| short(*v);
-        mesh.x_label_formatter(&label).y_label_formatter(&label);
+        let (of_x, of_y) = (|v: &f64| tick(*v, x1 - x0), |v: &f64| tick(*v, y1 - y0));
+        mesh.x_label_formatter(&of_x).y_label_formatter(&of_y);
         mesh.draw().map_err(text)?;
         if let Some((y, meaning)) = &self.rule {
             let line = DashedLineSeries::new([(x0, *y), (x1, *y)], 5, 4, AXIS.mix(0.7).stroke_width(1));
@@ -254,7 +254,7 @@ impl Chart {
             let span = if high > low { high - low } else { high.abs().max(1.0) };
             [if below { low - 0.04 * span } else { low }, high + 0.06 * span]
         };
-        (widen(x, self.is_wide && x[0] > 0.0), widen(y, !self.from_zero))
+        (widen(x, x[0] > 0.0 && self.series.iter().any(|s| s.mark != Mark::Line)), widen(y, !self.from_zero))
     }
 }
 
@@ -285,6 +285,18 @@ fn draw_series(chart: &mut Plot<'_, '_>, series: &Series, in_legend: bool) -> Re
         }
     }
     Ok(())
+}
+
+/// A tick of an axis that covers `span`: with so many digits that neighbours differ.
+fn tick(value: f64, span: f64) -> String {
+    if value.abs() >= 1e4 || span >= 100.0 {
+        return short(value);
+    }
+    // Some eight ticks, a digit finer than their distance.
+    let digits = (1.0 - (span / 8.0).log10()).floor().clamp(0.0, 6.0) as usize;
+    let text = format!("{value:.digits$}");
+    let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
+    if text == "-0" { "0".to_string() } else { text.to_string() }
 }
 
 /// A number in few characters: 1.2M, 350k, 0.25.
@@ -319,6 +331,27 @@ mod tests {
         for (value, want) in cases {
             assert_eq!(short(value), want);
         }
+    }
+
+    #[test]
+    fn ticks_of_a_narrow_axis_differ() {
+        let ticks = [19.3, 19.35, 19.4].map(|v| tick(v, 0.3));
+        assert_eq!(ticks, ["19.3", "19.35", "19.4"]);
+        assert_eq!([0.0, 0.0005, 0.001].map(|v| tick(v, 0.003)), ["0", "0.0005", "0.001"]);
+        assert_eq!([tick(25_000.0, 1e5), tick(3000.0, 3000.0), tick(-0.0, 1.0)], ["25k", "3000", "0"]);
+    }
+
+    #[test]
+    fn labels_lie_over_nothing_and_wide_charts_have_their_legend_beside_them() {
+        let dots = vec![(0.0, 0.0), (1.0, 1.0), (1.001, 1.0), (1.002, 1.0)];
+        let mut chart = Chart::new("a", "b", "c").with("knob", dots.clone(), Mark::Rings).wide();
+        chart.labels = (0..20).map(|i| (1.001, 1.0, format!("label{i}"))).collect();
+        chart.rule = Some((0.5, "limit".to_string()));
+        chart.ranges = vec![(0.0, -5.0, 5.0)];
+        let svg = chart.svg();
+        assert!(svg.contains("label0") && !svg.contains("label19"), "there is no room for twenty");
+        assert!(svg.contains("limit") && svg.contains(">\nknob") && svg.contains("width=\"1040\""), "{svg}");
+        assert!(chart.ranges().1[0] <= -5.0);
     }
 
     #[test]

@@ -39,7 +39,9 @@ pub fn compare_report(folders: &[PathBuf]) -> InputResult<String> {
     let mut page = Page::new("gsscale: comparison", &format!("{} runs; {scenes}", folders.len()));
     page.table(&HEAD, &runs.iter().map(|run| row(run, &runs[0])).collect::<Vec<_>>());
     page.heading("Over steps and seconds");
-    page.charts(&charts(&runs));
+    for chart in charts(&runs) {
+        page.wide_chart(&chart.svg(), "");
+    }
     add_views(&mut page, &runs)?;
     Ok(page.finish())
 }
@@ -63,23 +65,26 @@ const CURVES: [Curve; 4] = [
     ("Read from the drive", "GB", |m| m["bytes_read"].as_f64().filter(|b| *b > 0.0).map(|b| b / 1e9)),
 ];
 
-fn charts(runs: &[Compared]) -> Vec<(String, String)> {
+fn charts(runs: &[Compared]) -> Vec<Chart> {
     let mut charts = Vec::new();
     for (title, unit, of) in CURVES {
         for (x, axis) in [("step", "step"), ("seconds", "seconds of training")] {
-            let mut chart = Chart::new(title, axis, unit);
+            if x == "seconds" && unit != "dB" {
+                continue;
+            }
+            let mut chart = Chart::new(&format!("{title} over {axis}"), axis, unit).wide();
             for run in runs {
-                // The end of a run is in its summary, not in its metrics.
                 let mut points = curve(&run.metrics, x, of);
-                let end = if x == "step" { &run.summary["steps"] } else { &run.summary["train_seconds"] };
-                if title == CURVES[0].0 {
+                let is_test = title == CURVES[0].0;
+                if is_test {
+                    // The last evaluation is in the summary, not in the metrics.
+                    let end = if x == "step" { &run.summary["steps"] } else { &run.summary["train_seconds"] };
                     points.extend(end.as_f64().zip(run.summary["test"]["psnr"].as_f64()));
                 }
-                let mark = if title == CURVES[0].0 { Mark::LineAndDots } else { Mark::Line };
-                chart = chart.with(&run.name, points, mark);
+                chart = chart.with(&run.name, points, if is_test { Mark::LineAndDots } else { Mark::Line });
             }
             if !chart.is_empty() {
-                charts.push((chart.svg(), format!("{title}, over {axis}.")));
+                charts.push(chart);
             }
         }
     }

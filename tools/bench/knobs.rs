@@ -21,6 +21,9 @@ const BUDGETS: [f64; 4] = [75.0, 50.0, 25.0, 10.0];
 /// Share of the pages for knobs that do nothing in memory, where the base is in memory.
 const DRIVE_SHARE: f64 = 50.0;
 
+/// Changes some keys.
+type Turn = fn(&mut TrainConfig);
+
 /// What settings are made from.
 pub struct Knobs<'a> {
     /// The scene.
@@ -184,7 +187,7 @@ impl Knobs<'_> {
 
     fn together(&self) -> Vec<Planned> {
         let base = &self.base.config;
-        let turns: [(&str, fn(&mut TrainConfig)); 3] = [
+        let turns: [(&str, Turn); 3] = [
             ("SH 1 and bf16 moments", |c| {
                 lower_sh(c, 1);
                 c.moments = "bf16".into();
