@@ -217,3 +217,33 @@ fn gradients_that_are_not_finite_or_zero_leave_their_row_alone() {
     assert_eq!(state.columns.scales[15], 30.0);
     assert!(Column::ALL.into_iter().all(|c| state.columns.column(c).iter().all(|x| x.is_finite())));
 }
+
+#[test]
+fn without_catching_up_rows_stand_still_while_they_have_no_gradient() {
+    let (rows, degree) = (40, 1);
+    let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), SimdPath::best());
+    let sparse = adam.clone().without_catch_up();
+    let start = random_columns(rows, degree, 1.0, 8);
+    let all: Vec<u32> = (0..rows as u32).collect();
+    let (mut still, mut exact) = (SceneState::from_columns(start.clone()), SceneState::from_columns(start));
+    for step in 0..5 {
+        let grads = grads_at(&all, degree, step);
+        sparse.step(&mut still, &all, &grads, step);
+        adam.step(&mut exact, &all, &grads, step);
+    }
+    assert!(still == exact, "with a gradient at every step there is nothing to catch up with");
+    // Years later.
+    assert!(evaluate_all(&still, &sparse, 1500) == still.columns);
+    assert!(evaluate_all(&exact, &adam, 1500) != exact.columns);
+    let before = still.clone();
+    let at = sparse.at(1500);
+    (0..rows).for_each(|row| at.settle_row(&mut still.view_mut(), row));
+    assert!(
+        still.columns == before.columns && still.exp_avg == before.exp_avg && still.exp_avg_sq == before.exp_avg_sq
+    );
+    // The next gradient meets the moments as the last one left them.
+    let grads = grads_at(&all, degree, 1500);
+    sparse.step(&mut still, &all, &grads, 1500);
+    let (m, g) = (before.exp_avg.means[0], grads.means[0]);
+    assert!((still.exp_avg.means[0] - (0.9 * m + 0.1 * g)).abs() <= 1e-6 * (m.abs() + g.abs()));
+}

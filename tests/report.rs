@@ -1,13 +1,16 @@
 //! The report of a real run: that it is there, holds what a reader looks for, fetches nothing, and works in a browser.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
+#[path = "support/browser.rs"]
+mod browser;
 #[path = "support/scenes.rs"]
 mod scenes;
 
-use gsscale::report::run_report::{PAGES_FILE, compare_report, run_report};
+use browser::in_a_browser;
+use gsscale::report::compare_report::compare_report;
+use gsscale::report::run_report::{PAGES_FILE, run_report};
 use scenes::{city, stderr, text, train};
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use tempfile::TempDir;
 
 fn small_run(folder: &Path) -> PathBuf {
@@ -32,9 +35,10 @@ fn every_run_ends_with_a_report_that_stands_alone() {
     // The namespace of SVG is a name, not an address that is fetched.
     let addresses = html.replace("http://www.w3.org/2000/svg", "");
     assert!(!addresses.contains("http://") && !addresses.contains("https://") && !addresses.contains("src=\"/"));
-    in_a_browser(&out.join("report.html"), folder.path());
+    assert!(in_a_browser(&out.join("report.html"), folder.path()).is_none_or(|sliders| sliders > 0));
     let both = compare_report(&[out.clone(), out.clone()]).unwrap();
     assert!(both.contains("PSNR of held-out views") && both.matches("<tr>").count() == 3);
+    assert_eq!(both.matches("class=\"slider\"").count(), html.matches("class=\"slider\"").count());
 
     // A run that was cut short: the last line of the metrics is half, everything else is missing.
     let cut = folder.path().join("cut <b>");
@@ -45,25 +49,4 @@ fn every_run_ends_with_a_report_that_stands_alone() {
     let html = run_report(&cut).unwrap();
     assert!(html.contains("cut &lt;b&gt;") && html.contains("<h2>Pages</h2>"));
     assert!(run_report(folder.path()).unwrap_err().to_string().contains("metrics.jsonl"));
-}
-
-/// Opens the page in headless Chromium, where there is one: scripts run without an error, sliders were set up.
-fn in_a_browser(page: &Path, scratch: &Path) {
-    let names = ["chromium", "chromium-browser", "google-chrome"];
-    let Some(browser) = names.into_iter().find(|n| Command::new(n).arg("--version").output().is_ok()) else {
-        println!("no Chromium here: the report was not opened in a browser");
-        return;
-    };
-    let profile = format!("--user-data-dir={}", scratch.join("profile").display());
-    let output = Command::new(browser)
-        .args(["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"])
-        .args([&profile, "--virtual-time-budget=3000", "--dump-dom", &format!("file://{}", page.display())])
-        .output()
-        .unwrap();
-    let dom = String::from_utf8_lossy(&output.stdout);
-    assert!(output.status.success(), "{}", stderr(&output));
-    // The script sets the width of the upper picture: it ran to its end for every slider.
-    let sliders = dom.matches("class=\"slider\"").count();
-    assert!(sliders > 0);
-    assert_eq!(dom.matches("style=\"width: 50%;\"").count(), sliders, "the sliders were not set up");
 }

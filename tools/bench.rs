@@ -3,19 +3,32 @@
 
 #[path = "bench/commit.rs"]
 mod commit;
+#[path = "bench/compare.rs"]
+mod compare;
 #[path = "bench/demand.rs"]
 mod demand;
+#[path = "bench/facts.rs"]
+mod facts;
+#[path = "bench/knobs.rs"]
+mod knobs;
+#[path = "bench/ladder.rs"]
+mod ladder;
 #[path = "bench/orders.rs"]
 mod orders;
+#[path = "bench/pareto.rs"]
+mod pareto;
 #[path = "bench/published.rs"]
 mod published;
 #[path = "bench/published_table.rs"]
 mod published_table;
 #[path = "bench/run.rs"]
 mod run;
+#[path = "bench/sweep.rs"]
+mod sweep;
 #[path = "bench/tiers.rs"]
 mod tiers;
 
+use clap::Parser;
 use gsscale::base::error::InputError;
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::config::limits::simd_path;
@@ -43,6 +56,12 @@ fn main() -> ExitCode {
         commit::start(&parse_arguments(&arguments), &mut print)
     } else if named("orders") {
         orders::start(&parse_arguments(&arguments), &mut print)
+    } else if named("ladder") {
+        ladder::start(&parse_arguments(&arguments), &mut print)
+    } else if named("pareto") {
+        pareto::start(&parse_arguments(&arguments), &mut print)
+    } else if named("compare") {
+        compare::start(&compare::Args::parse_from(&arguments))
     } else if named("run") && published::is_meant(&arguments) {
         match published::start(&parse_arguments(&arguments), &mut print) {
             Ok(code) => return code,

@@ -122,6 +122,9 @@ config_keys! {
         shn_lr: f64 = 2.5e-3 / 20.0;
         /// Adam's epsilon
         adam_eps: f64 = 1e-15;
+        /// Which Gaussians take an optimizer step: deferred (all; those without a gradient when they are next looked at),
+        /// dense (all, at once: slow, for comparison), or sparse (only those with a gradient, which is not exact)
+        optimizer: String = "deferred".into();
         /// What is kept of Adam's moments between steps: f32, or bf16, which is not exact and halves what they take on disk
         moments: String = "f32".into();
         /// Opacity of first Gaussians
@@ -196,6 +199,9 @@ config_keys! {
         disk_full_wait: f64 = 600.0;
         /// Which page leaves memory first: belady (next used last) or lru. Never changes results
         evict: String = "belady".into();
+        /// When pages move: overlap (while steps compute), ahead (before they are needed, but the step waits for it) or
+        /// demand (when a step needs them). The last two are for comparison. Never changes results
+        transfers: String = "overlap".into();
         /// Bytes of pages that may be read ahead of their step; 0 = an eighth of the frames
         prefetch_bytes: ByteSize = ByteSize(0);
     }
@@ -397,10 +403,12 @@ impl TrainConfig {
         if self.spill_codec != "auto" {
             self.spill_codec.parse::<Codec>().map_err(|problem| written("spill-codec", problem))?;
         }
-        let names: [(&str, &str, &[&str]); 10] = [
+        let names: [(&str, &str, &[&str]); 12] = [
             ("io", &self.io, &["auto", "uring", "mmap", "pread"]),
             ("evict", &self.evict, &["belady", "lru"]),
             ("ssim-padding", &self.ssim_padding, &["valid", "same"]),
+            ("transfers", &self.transfers, &["overlap", "ahead", "demand"]),
+            ("optimizer", &self.optimizer, &["deferred", "dense", "sparse"]),
             ("moments", &self.moments, &["f32", "bf16"]),
             ("strategy", &self.strategy, &["default", "none"]),
             ("log", &self.log, &["json", "tensorboard"]),

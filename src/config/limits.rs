@@ -9,6 +9,7 @@ use crate::dataset::read::ReadOptions;
 use crate::densify::policy::DensifyConfig;
 use crate::exchange::ply::ExportFrame;
 use crate::optim::adam::AdamConfig;
+use crate::optim::method::Method;
 use crate::optim::moments::Moments;
 use crate::optim::rates::Rates;
 use crate::render::color_correct::ColorCorrect;
@@ -44,6 +45,8 @@ pub struct RunOptions {
     pub rates: Rates,
     /// Adam's constants.
     pub adam: AdamConfig,
+    /// When rows without a gradient take their steps.
+    pub optimizer: Method,
     /// What is kept of its moments.
     pub moments: Moments,
     /// Densification; `None` for `--strategy none`.
@@ -97,6 +100,7 @@ impl RunOptions {
                 steps: schedule_steps(config),
             },
             adam: AdamConfig { eps: config.adam_eps, ..AdamConfig::default() },
+            optimizer: config.optimizer.parse().unwrap_or_default(),
             moments: Moments::from_name(&config.moments).unwrap_or_default(),
             densify: (config.strategy == "default").then(|| densify(config)),
             scene_scale,

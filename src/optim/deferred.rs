@@ -87,6 +87,13 @@ impl DeferredAdam {
         DeferredAdam { moments, ..self }
     }
 
+    /// The same optimizer without catching up: rows without a gradient keep their values and their moments
+    /// ([`super::method::Method::Sparse`]).
+    #[must_use]
+    pub fn without_catch_up(self) -> Self {
+        DeferredAdam { tables: self.tables.still(), beta_powers: Vec::new(), ..self }
+    }
+
     /// What rows keep of their moments.
     pub fn moments(&self) -> Moments {
         self.moments
@@ -166,6 +173,9 @@ impl DeferredAdam {
 
     /// beta1^k and beta2^k.
     fn beta_power(&self, k: u32) -> [f32; 2] {
+        if self.tables.is_still() {
+            return [1.0, 1.0];
+        }
         if let Some(&power) = self.beta_powers.get(k as usize) {
             return power;
         }

@@ -48,6 +48,8 @@ pub struct DriftTables {
     decay_powers: Vec<[f64; 2]>,
     /// `[step]`, 0-based: factor on the rate of the means.
     means_factor: Vec<f64>,
+    /// Nothing moves without a gradient.
+    is_still: bool,
 }
 
 impl DriftTables {
@@ -87,7 +89,22 @@ impl DriftTables {
             means_factor,
             rates,
             config,
+            is_still: false,
         }
+    }
+
+    /// The same tables for values that stay where they are while they have no gradient: every sum is zero.
+    #[must_use]
+    pub fn still(mut self) -> Self {
+        self.series.fill([0.0; 6]);
+        self.limits.fill([0.0; 8]);
+        self.is_still = true;
+        self
+    }
+
+    /// Whether the tables are those of [`DriftTables::still`].
+    pub fn is_still(&self) -> bool {
+        self.is_still
     }
 
     /// The rates that the tables were made for.
@@ -131,6 +148,9 @@ impl DriftTables {
     /// The movement at unit base rate, term by term with eps in its place; for roots that eps touches.
     pub(crate) fn direct_sum(&self, m: f32, v: f32, stamp: u32, now: u32, of_means: bool) -> f32 {
         const LANES: usize = 8;
+        if self.is_still {
+            return 0.0;
+        }
         let terms = (now.saturating_sub(stamp) as usize).min(DIRECT_TERMS);
         let (m, root, eps) = (f64::from(m), f64::from(v).sqrt(), self.config.eps);
         let mut sums = [0.0f64; LANES];

@@ -5,5 +5,6 @@ pub mod bounds;
 pub mod deferred;
 pub mod drift;
 pub(crate) mod lanes;
+pub mod method;
 pub mod moments;
 pub mod rates;

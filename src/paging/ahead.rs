@@ -6,7 +6,7 @@
 //! All that leave in the time that is played through are alike: where the page that leaves first is pinned still,
 //! another one of them makes room.
 //!
-//! Invariants: 1. never blocks; 2. never takes the frame of a page that the current step or a step up to the one that
+//! Invariants: 1. never blocks, but for [`Transfers::Ahead`]; 2. never takes the frame of a page that the current step or a step up to the one that
 //! the frame is for needs; 3. reads and writes in flight are bounded in bytes; 4. nothing here changes what a step gets.
 
 use super::pager::Pager;
@@ -15,12 +15,37 @@ use crate::base::ids::PageNo;
 use crate::cache::evict::EvictPolicy;
 use crate::cache::host_cache::Victim;
 use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::str::FromStr;
 
 /// Steps that are played through at most.
 const STEPS_AHEAD: u32 = 16;
 /// A page that is not needed for so many steps may leave early for a page that the next step would wait for: at most one
 /// read more in so many steps.
 const FAR_STEPS: u32 = 4 * STEPS_AHEAD;
+
+/// When pages move. None of these changes what a step gets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Transfers {
+    /// Ahead of their step, while steps compute.
+    #[default]
+    Overlap,
+    /// Ahead of their step, but whoever asked waits until they have moved: the plan without the overlap, for comparison.
+    Ahead,
+    /// When a step needs them: neither plan nor overlap, for comparison.
+    Demand,
+}
+
+impl FromStr for Transfers {
+    type Err = String;
+    fn from_str(name: &str) -> Result<Self, String> {
+        match name {
+            "overlap" => Ok(Transfers::Overlap),
+            "ahead" => Ok(Transfers::Ahead),
+            "demand" => Ok(Transfers::Demand),
+            _ => Err(format!("'{name}' is no time for transfers")),
+        }
+    }
+}
 
 /// A page that a coming step will need.
 struct Admit {
@@ -41,15 +66,13 @@ struct Play {
 }
 
 impl Pager {
-    /// Starts reads for the steps after `step` and writes of the dirty pages that leave for them; never blocks. Call it
+    /// Starts reads for the steps after `step` and writes of the dirty pages that leave for them, as far as [`Transfers`] says. Call it
     /// when the pages of `step` are pinned. Calling it again during the step continues what became possible since.
     pub fn prefetch(&mut self, step: u32) {
-        for Failure { is_write, error, .. } in self.settle(false, &mut Vec::new()) {
-            if is_write {
-                // The next step gets the error.
-                let _ = self.stop_writes(error, false);
-            }
+        if self.transfers == Transfers::Demand {
+            return;
         }
+        self.settle_for_nobody(false);
         if self.store.is_none() {
             return;
         }
@@ -65,6 +88,19 @@ impl Pager {
             }
             if self.cache.state(admit.page).is_none() {
                 self.bring(&admit, &mut clean, admit.step == step + 1);
+            }
+        }
+        while self.transfers == Transfers::Ahead && self.in_flight() > 0 {
+            self.settle_for_nobody(true);
+        }
+    }
+
+    /// Takes the ends of transfers that nobody waits for.
+    fn settle_for_nobody(&mut self, wait: bool) {
+        for Failure { is_write, error, .. } in self.settle(wait, &mut Vec::new()) {
+            if is_write {
+                // The next step gets the error.
+                let _ = self.stop_writes(error, false);
             }
         }
     }

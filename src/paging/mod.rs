@@ -1,7 +1,7 @@
 //! The only place where cache, store and plan meet: brings the pages of a view into memory, and takes them back.
 //! Knows pages as bytes, metas and bounds; neither the optimizer nor the renderer.
 
-mod ahead;
+pub mod ahead;
 mod commit;
 pub mod error;
 mod fetch;

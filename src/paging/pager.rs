@@ -8,6 +8,7 @@
 //! reads and writes never depends on frames, plan or store; 4. a page with rows that is not in memory has a slot, and the
 //! slot holds exactly what was last released.
 
+use super::ahead::Transfers;
 use super::error::PagingError;
 use super::freeze::Frozen;
 use super::pinned::PinnedPage;
@@ -75,6 +76,7 @@ pub struct Pager {
     pub(super) writes_stopped: bool,
     /// Reads and writes that were started ahead of their need and are still in flight, bytes.
     pub(super) ahead: [usize; 2],
+    pub(super) transfers: Transfers,
     /// Pages of the last acknowledged commit, with the generations of their versions.
     pub(super) committed: BTreeMap<PageId, u64>,
     /// A cut that is being written.
@@ -100,6 +102,7 @@ impl Pager {
             failed_write: None,
             writes_stopped: false,
             ahead: [0; 2],
+            transfers: Transfers::default(),
             committed: BTreeMap::new(),
             frozen: None,
         }
@@ -139,6 +142,11 @@ impl Pager {
     pub fn allow_frames(&mut self, frames: usize) {
         self.cache.allow_frames(frames);
         self.config.frames = self.cache.frames_max();
+    }
+
+    /// Moves pages at these times from now on.
+    pub fn set_transfers(&mut self, transfers: Transfers) {
+        self.transfers = transfers;
     }
 
     /// Bytes that [`Pager::prefetch`] has in flight at most.

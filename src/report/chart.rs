@@ -4,21 +4,33 @@
 //! same data give the same text.
 
 use plotters::coord::Shift;
+use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 /// Width and height of a chart, in the units of its SVG.
 const SIZE: (u32, u32) = (560, 320);
-const COLORS: [RGBColor; 6] = [
+/// Those of a chart over the whole width of a page, and the part of it that its legend takes.
+const WIDE: (u32, u32) = (1040, 480);
+const LEGEND_WIDTH: u32 = 190;
+/// Colours of series, in their order.
+pub(super) const COLORS: [RGBColor; 12] = [
     RGBColor(36, 99, 180),
     RGBColor(205, 92, 32),
     RGBColor(46, 139, 87),
     RGBColor(148, 63, 148),
     RGBColor(120, 120, 120),
     RGBColor(180, 140, 20),
+    RGBColor(20, 150, 170),
+    RGBColor(190, 50, 80),
+    RGBColor(110, 160, 30),
+    RGBColor(90, 80, 200),
+    RGBColor(150, 100, 60),
+    RGBColor(230, 120, 170),
 ];
 
 /// Axes and frames.
-const AXIS: RGBColor = RGBColor(97, 97, 97);
+pub(super) const AXIS: RGBColor = RGBColor(97, 97, 97);
 
 /// How a series is drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,6 +39,8 @@ pub enum Mark {
     Line,
     /// A dot at every point.
     Dots,
+    /// A ring at every point.
+    Rings,
     /// Both.
     LineAndDots,
 }
@@ -40,6 +54,8 @@ pub struct Series {
     pub points: Vec<(f64, f64)>,
     /// How it is drawn.
     pub mark: Mark,
+    /// Index of its colour; larger ones begin again from the first.
+    pub color: usize,
 }
 
 /// A chart.
@@ -53,8 +69,14 @@ pub struct Chart {
     pub y: String,
     /// What is drawn, in the order of colours.
     pub series: Vec<Series>,
-    /// Labels of single points: (x, y, text).
+    /// Labels of single points: (x, y, text). One that would lie over points or other labels is left out.
     pub labels: Vec<(f64, f64, String)>,
+    /// Vertical ranges: (x, lowest y, highest y).
+    pub ranges: Vec<(f64, f64, f64)>,
+    /// A dashed horizontal line with what it means.
+    pub rule: Option<(f64, String)>,
+    /// Over the whole width of the page, the legend beside it.
+    pub is_wide: bool,
     /// Whether the y axis starts at zero.
     pub from_zero: bool,
 }
@@ -63,14 +85,22 @@ impl Chart {
     /// A chart without series.
     pub fn new(title: &str, x: &str, y: &str) -> Chart {
         let [title, x, y] = [title, x, y].map(str::to_string);
-        Chart { title, x, y, series: Vec::new(), labels: Vec::new(), from_zero: false }
+        let (series, labels, ranges, rule) = Default::default();
+        Chart { title, x, y, series, labels, ranges, rule, is_wide: false, from_zero: false }
     }
 
     /// Adds a series.
     #[must_use]
-    pub fn with(mut self, name: &str, points: Vec<(f64, f64)>, mark: Mark) -> Chart {
+    pub fn with(self, name: &str, points: Vec<(f64, f64)>, mark: Mark) -> Chart {
+        let color = self.series.len();
+        self.with_color(name, points, mark, color)
+    }
+
+    /// Adds a series in a colour.
+    #[must_use]
+    pub fn with_color(mut self, name: &str, points: Vec<(f64, f64)>, mark: Mark, color: usize) -> Chart {
         let points = points.into_iter().filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
-        self.series.push(Series { name: name.to_string(), points, mark });
+        self.series.push(Series { name: name.to_string(), points, mark, color });
         self
     }
 
@@ -78,6 +108,13 @@ impl Chart {
     #[must_use]
     pub fn zero_based(mut self) -> Chart {
         self.from_zero = true;
+        self
+    }
+
+    /// Lets the chart take the whole width of the page.
+    #[must_use]
+    pub fn wide(mut self) -> Chart {
+        self.is_wide = true;
         self
     }
 
@@ -90,7 +127,8 @@ impl Chart {
     pub fn svg(&self) -> String {
         let mut text = String::new();
         let drawn = {
-            let root = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
+            let size = if self.is_wide { WIDE } else { SIZE };
+            let root = SVGBackend::with_string(&mut text, size).into_drawing_area();
             self.draw(&root).and_then(|()| root.present().map_err(|e| e.to_string()))
         };
         match drawn {
@@ -102,10 +140,28 @@ impl Chart {
     }
 
     fn draw(&self, root: &DrawingArea<SVGBackend<'_>, Shift>) -> Result<(), String> {
-        fn text<E: std::fmt::Display>(e: E) -> String {
-            e.to_string()
-        }
         root.fill(&WHITE).map_err(text)?;
+        if !self.is_wide {
+            return self.draw_plot(root);
+        }
+        let (plot, legend) = root.split_horizontally(WIDE.0 - LEGEND_WIDTH);
+        self.draw_plot(&plot)?;
+        let mut y = 40;
+        for series in self.series.iter().filter(|s| !s.name.is_empty()) {
+            let color = COLORS[series.color % COLORS.len()];
+            match series.mark {
+                Mark::Line => legend.draw(&PathElement::new([(0, y), (12, y)], color.stroke_width(2))),
+                Mark::Rings => legend.draw(&Circle::new((6, y), 4, color.stroke_width(2))),
+                Mark::Dots | Mark::LineAndDots => legend.draw(&Circle::new((6, y), 4, color.filled())),
+            }
+            .map_err(text)?;
+            legend.draw(&Text::new(series.name.clone(), (20, y - 6), ("sans-serif", 13))).map_err(text)?;
+            y += 20;
+        }
+        Ok(())
+    }
+
+    fn draw_plot(&self, root: &DrawingArea<SVGBackend<'_>, Shift>) -> Result<(), String> {
         let ([x0, x1], [y0, y1]) = self.ranges();
         let mut builder = ChartBuilder::on(root);
         builder.margin(8).margin_right(18).x_label_area_size(38).y_label_area_size(58);
@@ -113,34 +169,24 @@ impl Chart {
         let mut chart = builder.build_cartesian_2d(x0..x1, y0..y1).map_err(text)?;
         let mut mesh = chart.configure_mesh();
         mesh.x_desc(&self.x).y_desc(&self.y).axis_style(AXIS).light_line_style(WHITE).x_labels(8).y_labels(7);
-        let label = |v: &f64| short(*v);
-        mesh.x_label_formatter(&label).y_label_formatter(&label);
+        let (of_x, of_y) = (|v: &f64| tick(*v, x1 - x0), |v: &f64| tick(*v, y1 - y0));
+        mesh.x_label_formatter(&of_x).y_label_formatter(&of_y);
         mesh.draw().map_err(text)?;
-        for (i, series) in self.series.iter().enumerate() {
-            let color = COLORS[i % COLORS.len()];
-            if series.mark != Mark::Dots {
-                let line = LineSeries::new(series.points.iter().copied(), color.stroke_width(2));
-                let drawn = chart.draw_series(line).map_err(text)?;
-                if !series.name.is_empty() {
-                    drawn
-                        .label(&series.name)
-                        .legend(move |(x, y)| Rectangle::new([(x, y - 4), (x + 12, y + 4)], color.filled()));
-                }
-            }
-            if series.mark != Mark::Line {
-                let dots = series.points.iter().map(|&p| Circle::new(p, 3, color.filled()));
-                let drawn = chart.draw_series(dots).map_err(text)?;
-                if !series.name.is_empty() && series.mark == Mark::Dots {
-                    drawn.label(&series.name).legend(move |(x, y)| Circle::new((x + 6, y), 4, color.filled()));
-                }
-            }
+        if let Some((y, meaning)) = &self.rule {
+            let line = DashedLineSeries::new([(x0, *y), (x1, *y)], 5, 4, AXIS.mix(0.7).stroke_width(1));
+            chart.draw_series(line).map_err(text)?;
+            let (x, y) = chart.backend_coord(&(x1, *y));
+            let style = TextStyle::from(("sans-serif", 11)).color(&AXIS).pos(Pos::new(HPos::Right, VPos::Top));
+            let (dx, dy) = root.get_base_pixel();
+            root.draw(&Text::new(meaning.clone(), (x - dx, y - dy + 3), style)).map_err(text)?;
         }
-        let labels = self
-            .labels
-            .iter()
-            .map(|(x, y, t)| EmptyElement::at((*x, *y)) + Text::new(t.clone(), (6, -12), ("sans-serif", 11)));
-        chart.draw_series(labels).map_err(text)?;
-        if self.series.iter().any(|s| !s.name.is_empty()) {
+        let range = |&(x, low, high): &(f64, f64, f64)| PathElement::new([(x, low), (x, high)], AXIS.mix(0.6));
+        chart.draw_series(self.ranges.iter().map(range)).map_err(text)?;
+        for series in &self.series {
+            draw_series(&mut chart, series, !self.is_wide)?;
+        }
+        self.draw_labels(root, &chart)?;
+        if !self.is_wide && self.series.iter().any(|s| !s.name.is_empty()) {
             let mut legend = chart.configure_series_labels();
             legend
                 .position(SeriesLabelPosition::LowerRight)
@@ -149,8 +195,43 @@ impl Chart {
             legend.draw().map_err(text)?;
         }
         if self.is_empty() {
-            let at = (SIZE.0 as i32 / 2 - 40, SIZE.1 as i32 / 2);
+            let (width, height) = root.dim_in_pixel();
+            let at = (width as i32 / 2 - 40, height as i32 / 2);
             root.draw(&Text::new("no data", at, ("sans-serif", 14))).map_err(text)?;
+        }
+        Ok(())
+    }
+
+    /// Writes the labels beside their points, each at the first of some places where it covers no point and no other
+    /// label.
+    fn draw_labels(&self, root: &DrawingArea<SVGBackend<'_>, Shift>, chart: &Plot<'_, '_>) -> Result<(), String> {
+        let pixel = |x: f64, y: f64| chart.backend_coord(&(x, y));
+        let ([x0, x1], [y0, y1]) = self.ranges();
+        let ((left, bottom), (right, top)) = (pixel(x0, y0), pixel(x1, y1));
+        let dots = self.series.iter().filter(|s| s.mark != Mark::Line).flat_map(|s| &s.points);
+        let mut taken: Vec<[i32; 4]> = dots
+            .map(|&(x, y)| {
+                let (x, y) = pixel(x, y);
+                [x - 4, y - 4, x + 4, y + 4]
+            })
+            .collect();
+        let (base_x, base_y) = root.get_base_pixel();
+        for (x, y, label) in &self.labels {
+            let ((x, y), width) = (pixel(*x, *y), 6 * label.chars().count() as i32);
+            let places = [(7, -6), (-width - 7, -6), (-width / 2, -18), (-width / 2, 7), (6, -17), (6, 6)];
+            let boxes = places.map(|(dx, dy)| [x + dx, y + dy, x + dx + width, y + dy + 11]);
+            let is_free = |b: &&[i32; 4]| {
+                b[0] >= left
+                    && b[2] <= right
+                    && b[1] >= top
+                    && b[3] <= bottom
+                    && taken.iter().all(|t| b[0] >= t[2] || t[0] >= b[2] || b[1] >= t[3] || t[1] >= b[3])
+            };
+            if let Some(&place) = boxes.iter().find(is_free) {
+                let at = (place[0] - base_x, place[1] - base_y);
+                root.draw(&Text::new(label.clone(), at, ("sans-serif", 11))).map_err(text)?;
+                taken.push(place);
+            }
         }
         Ok(())
     }
@@ -163,7 +244,9 @@ impl Chart {
             if low > high { [0.0, 1.0] } else { [low, high] }
         };
         let x = range(&mut points().map(|p| p.0));
-        let mut y = range(&mut points().map(|p| p.1));
+        let of_ranges = self.ranges.iter().flat_map(|r| [r.1, r.2]);
+        let ys = points().map(|p| p.1).chain(of_ranges).chain(self.rule.iter().map(|r| r.0));
+        let mut y = range(&mut ys.filter(|y| y.is_finite()));
         if self.from_zero {
             y[0] = y[0].min(0.0);
         }
@@ -171,8 +254,49 @@ impl Chart {
             let span = if high > low { high - low } else { high.abs().max(1.0) };
             [if below { low - 0.04 * span } else { low }, high + 0.06 * span]
         };
-        (widen(x, false), widen(y, !self.from_zero))
+        (widen(x, x[0] > 0.0 && self.series.iter().any(|s| s.mark != Mark::Line)), widen(y, !self.from_zero))
     }
+}
+
+type Plot<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+
+fn text<E: std::fmt::Display>(e: E) -> String {
+    e.to_string()
+}
+
+fn draw_series(chart: &mut Plot<'_, '_>, series: &Series, in_legend: bool) -> Result<(), String> {
+    let color = COLORS[series.color % COLORS.len()];
+    let is_named = in_legend && !series.name.is_empty();
+    if matches!(series.mark, Mark::Line | Mark::LineAndDots) {
+        let line = LineSeries::new(series.points.iter().copied(), color.stroke_width(2));
+        let drawn = chart.draw_series(line).map_err(text)?;
+        if is_named {
+            drawn
+                .label(&series.name)
+                .legend(move |(x, y)| Rectangle::new([(x, y - 4), (x + 12, y + 4)], color.filled()));
+        }
+    }
+    if series.mark != Mark::Line {
+        let style = if series.mark == Mark::Rings { color.stroke_width(2) } else { color.filled() };
+        let dots = series.points.iter().map(|&p| Circle::new(p, if series.mark == Mark::Rings { 4 } else { 3 }, style));
+        let drawn = chart.draw_series(dots).map_err(text)?;
+        if is_named && series.mark != Mark::LineAndDots {
+            drawn.label(&series.name).legend(move |(x, y)| Circle::new((x + 6, y), 4, style));
+        }
+    }
+    Ok(())
+}
+
+/// A tick of an axis that covers `span`: with so many digits that neighbours differ.
+fn tick(value: f64, span: f64) -> String {
+    if value.abs() >= 1e4 || span >= 100.0 {
+        return short(value);
+    }
+    // Some eight ticks, a digit finer than their distance.
+    let digits = (1.0 - (span / 8.0).log10()).floor().clamp(0.0, 6.0) as usize;
+    let text = format!("{value:.digits$}");
+    let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
+    if text == "-0" { "0".to_string() } else { text.to_string() }
 }
 
 /// A number in few characters: 1.2M, 350k, 0.25.
@@ -207,6 +331,27 @@ mod tests {
         for (value, want) in cases {
             assert_eq!(short(value), want);
         }
+    }
+
+    #[test]
+    fn ticks_of_a_narrow_axis_differ() {
+        let ticks = [19.3, 19.35, 19.4].map(|v| tick(v, 0.3));
+        assert_eq!(ticks, ["19.3", "19.35", "19.4"]);
+        assert_eq!([0.0, 0.0005, 0.001].map(|v| tick(v, 0.003)), ["0", "0.0005", "0.001"]);
+        assert_eq!([tick(25_000.0, 1e5), tick(3000.0, 3000.0), tick(-0.0, 1.0)], ["25k", "3000", "0"]);
+    }
+
+    #[test]
+    fn labels_lie_over_nothing_and_wide_charts_have_their_legend_beside_them() {
+        let dots = vec![(0.0, 0.0), (1.0, 1.0), (1.001, 1.0), (1.002, 1.0)];
+        let mut chart = Chart::new("a", "b", "c").with("knob", dots.clone(), Mark::Rings).wide();
+        chart.labels = (0..20).map(|i| (1.001, 1.0, format!("label{i}"))).collect();
+        chart.rule = Some((0.5, "limit".to_string()));
+        chart.ranges = vec![(0.0, -5.0, 5.0)];
+        let svg = chart.svg();
+        assert!(svg.contains("label0") && !svg.contains("label19"), "there is no room for twenty");
+        assert!(svg.contains("limit") && svg.contains(">\nknob") && svg.contains("width=\"1040\""), "{svg}");
+        assert!(chart.ranges().1[0] <= -5.0);
     }
 
     #[test]

@@ -19,12 +19,15 @@ section.tiles{display:flex;flex-wrap:wrap;gap:12px;margin:18px 0}
 .tile span{color:var(--dim);font-size:13px}
 .charts{display:grid;grid-template-columns:repeat(auto-fill,minmax(440px,1fr));gap:14px}
 figure{margin:0;background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:10px}
+figure.wide{margin-bottom:14px}
 figure svg{width:100%;height:auto;display:block}
 figcaption{font-size:13px;margin-top:6px}
 table{border-collapse:collapse;background:var(--paper);border:1px solid var(--line);font-size:14px}
-td,th{padding:4px 12px;border-bottom:1px solid var(--line);text-align:left}
-td.number{text-align:right;font-variant-numeric:tabular-nums}
+td,th{padding:4px 9px;border-bottom:1px solid var(--line);text-align:left}
+td.number{white-space:nowrap;text-align:right;font-variant-numeric:tabular-nums}
 pre{background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:12px;overflow:auto;font-size:13px;max-height:420px}
+div.table{overflow-x:auto}
+th{vertical-align:bottom}
 .views{display:grid;grid-template-columns:repeat(auto-fill,minmax(440px,1fr));gap:14px}
 .slider{position:relative;overflow:hidden;line-height:0;touch-action:none;cursor:ew-resize}
 .slider img{width:100%;display:block}
@@ -103,9 +106,14 @@ impl Page {
         self.push(format_args!("</div>\n"));
     }
 
+    /// A chart over the whole width.
+    pub fn wide_chart(&mut self, svg: &str, caption: &str) {
+        self.push(format_args!("<figure class=\"wide\">{svg}<figcaption>{}</figcaption></figure>\n", escape(caption)));
+    }
+
     /// A table.
     pub fn table(&mut self, head: &[&str], rows: &[Vec<Cell>]) {
-        self.push(format_args!("<table><thead><tr>"));
+        self.push(format_args!("<div class=\"table\"><table><thead><tr>"));
         for name in head {
             self.push(format_args!("<th>{}</th>", escape(name)));
         }
@@ -120,7 +128,7 @@ impl Page {
             }
             self.push(format_args!("</tr>\n"));
         }
-        self.push(format_args!("</tbody></table>\n"));
+        self.push(format_args!("</tbody></table></div>\n"));
     }
 
     /// Opens a grid of views; close it with [`Page::end_views`].
@@ -135,12 +143,20 @@ impl Page {
 
     /// A render over its photo with a movable edge, and the map of differences behind a fold. Pictures as data URIs.
     pub fn view(&mut self, name: &str, render: &str, photo: &str, difference: &str, caption: &str) {
+        self.slider(name, [("render", render), ("photo", photo)], ("difference", difference), caption);
+    }
+
+    /// Two pictures of the same view, (what it is, data URI), one over the other with a movable edge, and a third one
+    /// behind a fold.
+    pub fn slider(&mut self, name: &str, [left, right]: [(&str, &str); 2], folded: (&str, &str), caption: &str) {
         let (name, caption) = (escape(name), escape(caption));
+        let [(left, left_uri), (right, right_uri), (fold, fold_uri)] =
+            [left, right, folded].map(|(what, uri)| (escape(what), uri));
         self.push(format_args!(
-            "<figure><div class=\"slider\" tabindex=\"0\" role=\"slider\" aria-label=\"render against photo of {name}\" \
-             aria-valuenow=\"50\"><img src=\"{photo}\" alt=\"photo\"><div class=\"over\"><img src=\"{render}\" alt=\"render\">\
-             </div><i class=\"l\">render</i><i class=\"r\">photo</i></div>\n<figcaption>{name} {caption}\
-             <details><summary>difference</summary><img src=\"{difference}\" alt=\"difference\" style=\"width:100%\"></details>\
+            "<figure><div class=\"slider\" tabindex=\"0\" role=\"slider\" aria-label=\"{left} against {right} of {name}\" \
+             aria-valuenow=\"50\"><img src=\"{right_uri}\" alt=\"{right}\"><div class=\"over\"><img src=\"{left_uri}\" \
+             alt=\"{left}\"></div><i class=\"l\">{left}</i><i class=\"r\">{right}</i></div>\n<figcaption>{name} {caption}\
+             <details><summary>{fold}</summary><img src=\"{fold_uri}\" alt=\"{fold}\" style=\"width:100%\"></details>\
              </figcaption></figure>\n"
         ));
     }

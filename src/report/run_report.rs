@@ -4,7 +4,7 @@
 //! folder without metrics is refused; 2. the number of pictures and of points in a chart is bounded.
 
 use super::chart::{Chart, Mark, short};
-use super::html::{Cell, Page};
+use super::html::Page;
 use super::page_map::{PageTile, page_map_svg};
 use super::picture::view_pictures;
 use crate::base::error::{InputError, InputResult};
@@ -69,12 +69,12 @@ pub fn write_run_report(folder: &Path) -> InputResult<PathBuf> {
     Ok(path)
 }
 
-fn read_text(path: &Path) -> Option<String> {
+pub(super) fn read_text(path: &Path) -> Option<String> {
     let len = std::fs::metadata(path).ok()?.len();
     (len <= TEXT_BYTES_MAX).then(|| std::fs::read_to_string(path).ok())?
 }
 
-fn read_json(path: &Path) -> Option<Value> {
+pub(super) fn read_json(path: &Path) -> Option<Value> {
     serde_json::from_str(&read_text(path)?).ok()
 }
 
@@ -235,55 +235,4 @@ fn add_views(page: &mut Page, folder: &Path) -> InputResult<()> {
     }
     page.end_views();
     Ok(())
-}
-
-/// A report that sets several runs side by side: what they reached, over steps and over seconds.
-///
-/// # Errors
-/// A folder holds no metrics.
-pub fn compare_report(folders: &[PathBuf]) -> InputResult<String> {
-    let mut page = Page::new("gsscale: comparison", &format!("{} runs", folders.len()));
-    let names: Vec<String> = folders.iter().map(|f| f.display().to_string()).collect();
-    let mut runs = Vec::new();
-    for folder in folders {
-        let summary = read_json(&folder.join("summary.json")).unwrap_or(Value::Null);
-        runs.push((read_metrics(folder)?, summary));
-    }
-    let columns = ["run", "PSNR, dB", "SSIM", "Gaussians", "steps", "seconds", "peak memory", "read", "written"];
-    let rows: Vec<Vec<Cell>> = names.iter().zip(&runs).map(|(name, (_, summary))| compare_row(name, summary)).collect();
-    page.table(&columns, &rows);
-    let mut charts = Vec::new();
-    for (x, unit) in [("step", "step"), ("seconds", "seconds of training")] {
-        for (title, of) in [
-            ("PSNR of held-out views", (|m: &Value| m["test"]["psnr"].as_f64()) as fn(&Value) -> Option<f64>),
-            ("PSNR of training views", |m: &Value| m["psnr"].as_f64()),
-        ] {
-            let mut chart = Chart::new(title, unit, "dB");
-            for (name, (metrics, _)) in names.iter().zip(&runs) {
-                chart = chart.with(name, curve(metrics, x, of), Mark::Line);
-            }
-            if !chart.is_empty() {
-                charts.push((chart.svg(), format!("{title}, over {unit}.")));
-            }
-        }
-    }
-    page.charts(&charts);
-    Ok(page.finish())
-}
-
-fn compare_row(name: &str, summary: &Value) -> Vec<Cell> {
-    let number =
-        |value: &Value, digits: usize| Cell::Number(value.as_f64().map_or(String::new(), |v| format!("{v:.digits$}")));
-    let bytes = |value: &Value| Cell::Number(value.as_u64().map_or(String::new(), format_bytes));
-    vec![
-        Cell::Text(name.to_string()),
-        number(&summary["test"]["psnr"], 3),
-        number(&summary["test"]["ssim"], 4),
-        number(&summary["gaussians"], 0),
-        number(&summary["steps"], 0),
-        number(&summary["train_seconds"], 1),
-        bytes(&summary["host_bytes_peak"]),
-        bytes(&summary["bytes_read"]),
-        bytes(&summary["bytes_written"]),
-    ]
 }

@@ -1,14 +1,17 @@
 //! The glue, in one direction: [`run`] sets a run up and sees it through ([`tiers`] says where pages live, [`memory`] and
 //! [`preflight`] whether that fits), [`trainer`] loops over steps, [`step`] is one step from top to bottom,
 //! [`checkpoint`] commits it (`first_commit` that of a run in memory), [`full_drive`] finds it space, [`resume`] goes on from a
-//! commit if nothing changed (`changes`, [`dataset_print`]), [`pages`] has the rows of a run in pages and brings them to now with [`catch_up`], `update` changes them, [`eval`] looks at
+//! commit if nothing changed (`changes`, [`dataset_print`]), [`pages`] has the rows of a run in pages and brings them to now with [`catch_up`],
+//! `update` changes them, `dense` all of them at every step, [`costs`] counts what steps took, [`eval`] looks at
 //! held-out views, [`report`] writes what happened, [`progress`] shows it, [`machine`] starts its threads, [`signals`]
 //! hears Ctrl-C, [`stores`] is what tools do with checkpoints.
 
 pub mod catch_up;
 mod changes;
 pub mod checkpoint;
+pub mod costs;
 pub mod dataset_print;
+mod dense;
 pub mod eval;
 mod first_commit;
 pub mod full_drive;

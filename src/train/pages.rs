@@ -17,6 +17,7 @@ use crate::densify::replay::{PageEdit, PendingEvents, Replay};
 use crate::densify::stats::GradHistogram;
 use crate::optim::bounds::SplitLimits;
 use crate::optim::deferred::DeferredAdam;
+use crate::optim::method::Method;
 use crate::page::format::HEADER_BYTES;
 use crate::paging::error::PagingError;
 use crate::paging::pager::Pager;
@@ -64,8 +65,9 @@ pub struct PagedScene {
 
 impl PageRules {
     pub(super) fn new(options: &RunOptions) -> PageRules {
+        let adam = DeferredAdam::new(options.rates, options.adam, options.render.simd).with_moments(options.moments);
         PageRules {
-            adam: DeferredAdam::new(options.rates, options.adam, options.render.simd).with_moments(options.moments),
+            adam: if options.optimizer == Method::Sparse { adam.without_catch_up() } else { adam },
             events: EventLog::default(),
             seed: options.seed,
             page_rows: options.page_rows,

@@ -3,6 +3,7 @@
 //! Invariants: 1. every number written is finite (JSON knows neither infinity nor NaN: see [`json_psnr`]); 2. whole
 //! files appear by rename, so a reader never sees half of one.
 
+use super::costs::StepCosts;
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::checkpoint::interval::CommitReport;
@@ -168,6 +169,9 @@ pub struct Summary {
     pub rows_skipped_non_finite: u64,
     /// Steps skipped because the loss was not finite.
     pub steps_skipped_non_finite: u32,
+    /// What the steps alone took.
+    #[serde(flatten)]
+    pub costs: StepCosts,
     /// Between the tiers, first pages, evaluation and export included.
     #[serde(flatten)]
     pub tiers: TierTraffic,

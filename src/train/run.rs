@@ -4,6 +4,7 @@
 //! behind; 2. a run that is stopped or fails after its first step still writes the PLY of its last good step.
 
 use super::checkpoint::{Checkpoint, Origin};
+use super::costs::Meter;
 use super::dataset_print::dataset_print;
 use super::eval::ply_warnings;
 use super::machine;
@@ -325,9 +326,10 @@ fn train_into(
     }
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let mut progress = Progress::new(config.steps, request.quiet);
-    let lent = checkpoint.as_deref_mut();
-    let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint: lent };
+    let meter = Meter::start(&trainer);
+    let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint };
     let looped = trainer.run(dataset, &targets, &mut outputs);
+    let costs = meter.stop(&trainer, &*tiers);
     let ply = Trainer::ply_path(out);
     let saved = trainer.save(dataset, &ply);
     // What ended the run is the error to be told; that its last rows cannot be written either comes beside it.
@@ -353,7 +355,7 @@ fn train_into(
         None => trainer.evaluate(dataset, &targets, Some(&out.join("renders/test"))),
         Some(_) => Ok(None),
     });
-    if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, checkpoint) {
+    if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, tiers.checkpoint.as_mut()) {
         // Once more, with what the evaluation said.
         checkpoint.commit_or_warn(&mut trainer, &mut metrics)?;
     }
@@ -370,6 +372,7 @@ fn train_into(
         finished: trainer.steps_done() == config.steps,
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
+        costs,
         tiers: TierTraffic::of(&trainer.scene.pager),
         commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
     };

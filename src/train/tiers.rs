@@ -109,6 +109,12 @@ fn pager_config(config: &TrainConfig, pages: usize, host_mem: u64) -> PagerConfi
     pager
 }
 
+/// The pager with its pages moving when `--transfers` says.
+fn with_transfers(mut pager: Pager, config: &TrainConfig) -> Pager {
+    pager.set_transfers(config.transfers.parse().unwrap_or_default());
+    pager
+}
+
 /// Opens the tiers for a scene of about `pages` pages, within `host_mem` bytes. The pager has few frames at first where
 /// their number follows from the budget: see [`Pager::allow_frames`]. With `dry`, nothing is written: pages stay in
 /// memory.
@@ -129,7 +135,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
         let codec = chosen_codec(config, None, &mut tiers.notes);
         (tiers.engine, tiers.codec) = (engine.name().to_string(), codec.to_string());
         let of_store = PagedStoreConfig { store: 0, layout, codec, generation: 1, serial: 1 };
-        return Ok((Pager::new(pager, PagedStore::new(engine, of_store)), tiers));
+        return Ok((with_transfers(Pager::new(pager, PagedStore::new(engine, of_store)), config), tiers));
     }
     let spill = SpillDir::create(Path::new(&config.spill_dir), Purpose::Checkpoint, layout, false)?;
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
@@ -140,7 +146,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let mut checkpoint = Checkpoint::new(opened.commits, Path::new(&config.spill_dir), config);
     checkpoint.fill_reserve()?;
     tiers.checkpoint = Some(checkpoint);
-    Ok((Pager::new(pager, store), tiers))
+    Ok((with_transfers(Pager::new(pager, store), config), tiers))
 }
 
 /// A spill directory with a run that can go on.
@@ -206,7 +212,7 @@ impl Stored {
         checkpoint.set_optional(is_in_memory);
         checkpoint.fill_reserve()?;
         tiers.checkpoint = Some(checkpoint);
-        Ok((pager, tiers))
+        Ok((with_transfers(pager, config), tiers))
     }
 }
 
@@ -257,6 +263,13 @@ impl Tiers {
     /// Whether pages may leave memory for a drive.
     pub fn spills(&self) -> bool {
         self.spill.is_some() && !self.is_in_memory
+    }
+
+    /// Bytes of the files that hold pages on the drive; 0 without one, or where they cannot be listed.
+    pub fn drive_bytes(&self) -> u64 {
+        let of =
+            |spill: &SpillDir| spill.segments().map_or(0, |s| s.len() as u64 * spill.format().layout.segment_bytes());
+        self.spill.as_ref().map_or(0, of)
     }
 
     /// Bytes that pages may take on the drive: what is free, and what those of a run that goes on have already; `None`

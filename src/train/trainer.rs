@@ -5,6 +5,7 @@
 //! the run with what the last good step left.
 
 use super::checkpoint::Checkpoint;
+use super::dense::settle_all;
 use super::eval::{EvalRequest, evaluate};
 use super::memory::host_bytes_peak;
 use super::pages::PagedScene;
@@ -18,6 +19,7 @@ use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{self, PlyMeta};
+use crate::optim::method::Method;
 use crate::page::commit::CommitError;
 use crate::paging::error::PagingError;
 use crate::paging::pager::{Pager, PagerConfig};
@@ -270,6 +272,9 @@ impl Trainer {
             self.options.densify.is_some_and(|d| d.collects(self.step)),
         )?;
         self.count(&outcome, &dataset.views[view].name)?;
+        if self.options.optimizer == Method::Dense {
+            settle_all(&mut self.scene, self.step + 1)?;
+        }
         self.log_events();
         self.step += 1;
         self.train_seconds += started.elapsed().as_secs_f64();

@@ -20,7 +20,9 @@ Examples:
 
 A published run, ours beside the paper's figures: gsscale-bench run rubble --data DIR (see gsscale-bench run rubble --help).
 Other measurements: gsscale-bench tiers --help (through the disk tier against in memory),
-gsscale-bench orders --help (orders of views: quality against bytes), gsscale-bench commit --help (what commits cost).
+gsscale-bench orders --help (orders of views: quality against bytes), gsscale-bench commit --help (what commits cost),
+gsscale-bench ladder --help (from naive offloading to memory), gsscale-bench pareto --help (what every knob costs and
+saves), gsscale-bench compare --help (finished runs).
 
 cpu_seconds_per_step counts all threads during the steps, decoding of photos included; loading and evaluation are not
 in it. host_bytes_peak is without the copy that writing a PLY takes.";

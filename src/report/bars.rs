@@ -1,0 +1,85 @@
+//! Horizontal bars with their values beside them, as SVG text, drawn by `plotters`.
+//!
+//! Invariant: a bar without a value, or with one that is not finite, is an empty line, not an error.
+
+use super::chart::{AXIS, COLORS};
+use super::html::escape;
+use plotters::coord::Shift;
+use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
+
+const WIDTH: u32 = 560;
+/// Height of a bar with the gap below it, of the title, and width of the names: about twelve characters.
+const BAR: i32 = 30;
+const TITLE: i32 = 34;
+const NAMES: i32 = 90;
+/// Room for the value behind the longest bar.
+const VALUES: i32 = 80;
+
+/// Named values, one bar each.
+#[derive(Debug, Clone)]
+pub struct Bars {
+    /// Title with the unit.
+    pub title: String,
+    /// Name, value, and the value as it is written.
+    pub bars: Vec<(String, Option<f64>, String)>,
+}
+
+impl Bars {
+    /// The bars as SVG, the first on top.
+    pub fn svg(&self) -> String {
+        let mut text = String::new();
+        let size = (WIDTH, (TITLE + BAR * self.bars.len() as i32 + 6) as u32);
+        let drawn = {
+            let root = SVGBackend::with_string(&mut text, size).into_drawing_area();
+            self.draw(&root).and_then(|()| root.present().map_err(|e| e.to_string()))
+        };
+        match drawn {
+            Ok(()) => text,
+            Err(problem) => format!("<p class=\"dim\">This chart could not be drawn: {}</p>", escape(&problem)),
+        }
+    }
+
+    fn draw(&self, root: &DrawingArea<SVGBackend<'_>, Shift>) -> Result<(), String> {
+        fn text<E: std::fmt::Display>(e: E) -> String {
+            e.to_string()
+        }
+        root.fill(&WHITE).map_err(text)?;
+        let anchor = |h| Pos::new(h, VPos::Center);
+        let title = TextStyle::from(("sans-serif", 16)).pos(anchor(HPos::Center));
+        root.draw(&Text::new(self.title.clone(), (WIDTH as i32 / 2, TITLE / 2), title)).map_err(text)?;
+        let finite = |v: &Option<f64>| v.filter(|v| v.is_finite());
+        let most = self.bars.iter().filter_map(|(_, v, _)| finite(v)).fold(0.0, f64::max);
+        let room = f64::from(WIDTH as i32 - NAMES - VALUES);
+        for (i, (name, value, written)) in self.bars.iter().enumerate() {
+            let y = TITLE + BAR * i as i32;
+            let middle = y + BAR / 2 - 3;
+            let style = TextStyle::from(("sans-serif", 13)).pos(anchor(HPos::Right));
+            root.draw(&Text::new(name.clone(), (NAMES - 8, middle), style)).map_err(text)?;
+            let length =
+                finite(value).map_or(0, |v| if most > 0.0 { (v.max(0.0) / most * room).round() as i32 } else { 0 });
+            let bar = [(NAMES, y), (NAMES + length.max(1), y + BAR - 6)];
+            root.draw(&Rectangle::new(bar, COLORS[0].filled())).map_err(text)?;
+            let style = TextStyle::from(("sans-serif", 13)).color(&AXIS).pos(anchor(HPos::Left));
+            root.draw(&Text::new(written.clone(), (NAMES + length + 6, middle), style)).map_err(text)?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bars_are_as_long_as_their_values() {
+        let bar = |name: &str, value| (name.to_string(), value, format!("{value:?}"));
+        let bars = vec![bar("a <", Some(2.0)), bar("b", Some(1.0)), bar("c", None), bar("d", Some(f64::NAN))];
+        let svg = Bars { title: "seconds".into(), bars }.svg();
+        let width = |w: i32| format!("width=\"{w}\"");
+        let longest = WIDTH as i32 - NAMES - VALUES;
+        assert!(svg.contains(&width(longest)) && svg.contains(&width(longest / 2)), "{svg}");
+        assert!(svg.contains("a &lt;") && svg.matches(&width(1)).count() == 2);
+        assert!(Bars { title: String::new(), bars: Vec::new() }.svg().starts_with("<svg"));
+    }
+}

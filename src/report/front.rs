@@ -1,0 +1,204 @@
+//! Which settings are worth having: means and spreads over seeds, the Pareto front, and what costs no accuracy.
+//!
+//! Invariants: 1. a point is on the front unless another one is at least as good in both and better in one; 2. nothing
+//! is called free while the seeds of the base say nothing about their spread.
+
+use super::record::RunRecord;
+
+/// Mean and range of a figure over seeds.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Spread {
+    /// Mean.
+    pub mean: f64,
+    /// Lowest.
+    pub low: f64,
+    /// Highest.
+    pub high: f64,
+}
+
+impl Spread {
+    /// Of the finite values; `None` of none.
+    pub fn of(values: impl Iterator<Item = f64>) -> Option<Spread> {
+        let values: Vec<f64> = values.filter(|v| v.is_finite()).collect();
+        let low = values.iter().copied().fold(f64::INFINITY, f64::min);
+        let high = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        (!values.is_empty()).then(|| Spread { mean: values.iter().sum::<f64>() / values.len() as f64, low, high })
+    }
+
+    /// From the lowest to the highest.
+    pub fn width(&self) -> f64 {
+        self.high - self.low
+    }
+}
+
+/// What a setting costs in accuracy, against the base.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// It is the base.
+    Base,
+    /// The same bits as the base for every seed that both have.
+    SameBits,
+    /// PSNR and SSIM no lower than the base's means less its spread over seeds.
+    WithinSpread,
+    /// Lower than that.
+    Costs,
+    /// The base has one seed, so nothing can be said.
+    Unknown,
+}
+
+impl Verdict {
+    /// Whether no accuracy is lost as far as can be seen.
+    pub fn is_free(self) -> bool {
+        matches!(self, Verdict::Base | Verdict::SameBits | Verdict::WithinSpread)
+    }
+}
+
+/// A setting with all its seeds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Setting {
+    /// What was turned.
+    pub knob: String,
+    /// To what.
+    pub label: String,
+    /// Its runs.
+    pub runs: Vec<RunRecord>,
+    /// PSNR, dB.
+    pub psnr: Option<Spread>,
+    /// SSIM.
+    pub ssim: Option<Spread>,
+    /// What it costs in accuracy.
+    pub verdict: Verdict,
+}
+
+impl Setting {
+    /// Mean of a figure over the seeds that have it.
+    pub fn mean(&self, of: impl Fn(&RunRecord) -> Option<f64>) -> Option<f64> {
+        Spread::of(self.runs.iter().filter_map(of)).map(|s| s.mean)
+    }
+}
+
+/// The runs that were done, by setting, the base first, judged against it.
+pub fn settings(records: &[RunRecord]) -> Vec<Setting> {
+    let mut settings: Vec<Setting> = Vec::new();
+    for record in records.iter().filter(|r| r.problem.is_none()) {
+        let same = |s: &&mut Setting| s.knob == record.knob && s.label == record.label;
+        match settings.iter_mut().find(same) {
+            Some(setting) => setting.runs.push(record.clone()),
+            None => settings.push(Setting {
+                knob: record.knob.clone(),
+                label: record.label.clone(),
+                runs: vec![record.clone()],
+                psnr: None,
+                ssim: None,
+                verdict: Verdict::Unknown,
+            }),
+        }
+    }
+    for setting in &mut settings {
+        setting.psnr = Spread::of(setting.runs.iter().filter_map(|r| r.psnr));
+        setting.ssim = Spread::of(setting.runs.iter().filter_map(|r| r.ssim));
+    }
+    settings.sort_by_key(|s| s.knob != "base");
+    if let Some(base) = settings.first().filter(|s| s.knob == "base").cloned() {
+        settings.iter_mut().for_each(|s| s.verdict = judge(s, &base));
+    }
+    settings
+}
+
+fn judge(setting: &Setting, base: &Setting) -> Verdict {
+    if setting.knob == "base" {
+        return Verdict::Base;
+    }
+    let of_seed = |run: &RunRecord| base.runs.iter().find(|b| b.seed == run.seed);
+    let mut pairs = setting.runs.iter().filter_map(|run| Some((run, of_seed(run)?))).peekable();
+    if pairs.peek().is_some() && pairs.all(|(run, base)| !run.ply.is_empty() && run.ply == base.ply) {
+        return Verdict::SameBits;
+    }
+    if base.runs.len() < 2 {
+        return Verdict::Unknown;
+    }
+    let holds = |own: Option<Spread>, base: Option<Spread>| {
+        own.zip(base).is_some_and(|(own, base)| own.mean >= base.mean - base.width())
+    };
+    match holds(setting.psnr, base.psnr) && holds(setting.ssim, base.ssim) {
+        true => Verdict::WithinSpread,
+        false => Verdict::Costs,
+    }
+}
+
+/// Indices of the points (cost, value) that no other point beats, by ascending cost; lower cost and higher value are
+/// better. Of equal points all are on it.
+pub fn pareto_front(points: &[(f64, f64)]) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..points.len()).collect();
+    order.retain(|&i| points[i].0.is_finite() && points[i].1.is_finite());
+    order.sort_by(|&a, &b| {
+        points[a].0.total_cmp(&points[b].0).then(points[b].1.total_cmp(&points[a].1)).then(a.cmp(&b))
+    });
+    let mut front: Vec<usize> = Vec::new();
+    for i in order {
+        let is_on_it = front.last().is_none_or(|&best| points[i].1 > points[best].1 || points[i] == points[best]);
+        if is_on_it {
+            front.push(i);
+        }
+    }
+    front
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::rng::{Purpose, Stream};
+
+    #[test]
+    fn the_front_is_what_brute_force_finds() {
+        let mut draws = Stream::new(3, Purpose::Test, 0, 0);
+        for round in 0..300 {
+            // Few distinct values, so that ties in one or both happen; sometimes a value that is no number.
+            let draw = |draws: &mut Stream| if draws.below(30) == 0 { f64::NAN } else { draws.below(6) as f64 };
+            let points: Vec<(f64, f64)> = (0..round % 17).map(|_| (draw(&mut draws), draw(&mut draws))).collect();
+            let is_finite = |p: &(f64, f64)| p.0.is_finite() && p.1.is_finite();
+            let beats = |a: &(f64, f64), b: &(f64, f64)| is_finite(a) && a.0 <= b.0 && a.1 >= b.1 && a != b;
+            let mut want: Vec<usize> = (0..points.len()).filter(|&i| is_finite(&points[i])).collect();
+            want.retain(|&i| !points.iter().any(|p| beats(p, &points[i])));
+            let mut got = pareto_front(&points);
+            assert!(got.windows(2).all(|w| points[w[0]].0 <= points[w[1]].0));
+            got.sort_unstable();
+            assert_eq!(got, want, "{points:?}");
+        }
+    }
+
+    fn run(knob: &str, seed: u64, psnr: f64, ssim: f64, ply: &str) -> RunRecord {
+        let (psnr, ssim) = (Some(psnr), Some(ssim));
+        RunRecord { knob: knob.into(), label: knob.into(), seed, psnr, ssim, ply: ply.into(), ..RunRecord::default() }
+    }
+
+    #[test]
+    fn settings_are_judged_by_the_spread_of_the_base() {
+        let mut runs = vec![
+            run("slow", 1, 25.89, 0.8, "x"),
+            run("base", 1, 26.0, 0.80, "p1"),
+            run("base", 2, 26.2, 0.82, "p2"),
+            run("fine", 1, 25.91, 0.79, "x"),
+            run("dull", 1, 26.5, 0.78, "x"),
+            run("paged", 1, 26.0, 0.80, "p1"),
+            run("paged", 2, 26.2, 0.82, "p2"),
+            run("mixed", 1, 26.0, 0.80, "p1"),
+            run("mixed", 2, 20.0, 0.82, "x"),
+        ];
+        runs.push(RunRecord { problem: Some("died".into()), ..run("base", 3, 1.0, 0.1, "") });
+        let verdicts = |runs: &[RunRecord]| -> Vec<(String, Verdict)> {
+            settings(runs).into_iter().map(|s| (s.knob, s.verdict)).collect()
+        };
+        let names = ["base", "slow", "fine", "dull", "paged", "mixed"].map(str::to_string);
+        // The base has 26.1 dB and .81 on average, spread over 0.2 dB and .02.
+        use Verdict::{Base, Costs, SameBits, Unknown, WithinSpread};
+        let want = [Base, Costs, WithinSpread, Costs, SameBits, Costs];
+        assert_eq!(verdicts(&runs), names.clone().into_iter().zip(want).collect::<Vec<_>>());
+        // With one seed of the base only equal bits say anything.
+        runs.remove(2);
+        let want = [Base, Unknown, Unknown, Unknown, SameBits, SameBits];
+        assert_eq!(verdicts(&runs), names.into_iter().zip(want).collect::<Vec<_>>());
+        let paged = &settings(&runs)[4];
+        assert_eq!(paged.psnr.map(|s| (s.low, s.high)), Some((26.0, 26.2)));
+    }
+}

@@ -1,0 +1,34 @@
+//! `gsscale-bench compare`: finished runs side by side on one page.
+
+use clap::Parser;
+use gsscale::report::compare_report::compare_report;
+use gsscale::train::report::write_whole;
+use gsscale::train::trainer::TrainError;
+use std::path::PathBuf;
+
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-bench compare runs/village runs/village_sh1 --out compare.html
+  gsscale-bench compare sweeps/village/runs/* --out compare.html";
+
+/// Sets finished runs side by side: figures, curves over steps and seconds, renders of the same view under a slider.
+#[derive(Parser)]
+#[command(name = "gsscale-bench compare", version, after_help = EXAMPLES)]
+pub struct Args {
+    /// Output folders of gsscale-train
+    #[arg(required = true, num_args = 2..)]
+    runs: Vec<PathBuf>,
+    /// Page to write
+    #[arg(long, short, value_name = "FILE")]
+    out: PathBuf,
+}
+
+/// Compares.
+///
+/// # Errors
+/// A folder holds no run, or the page cannot be written.
+pub fn start(args: &Args) -> Result<(), TrainError> {
+    write_whole(&args.out, compare_report(&args.runs)?.as_bytes())?;
+    eprintln!("{}", args.out.display());
+    Ok(())
+}
