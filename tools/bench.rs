@@ -1,14 +1,24 @@
 //! `gsscale-bench`: measures training and prints lines of JSON. Which measurement is the first argument; without one of
 //! their names it is `run`. Parses, calls, prints.
 
+#[path = "bench/bounded.rs"]
+mod bounded;
 #[path = "bench/demand.rs"]
 mod demand;
+#[path = "bench/memory_group.rs"]
+mod memory_group;
 #[path = "bench/orders.rs"]
 mod orders;
 #[path = "bench/run.rs"]
 mod run;
+#[path = "bench/sizes.rs"]
+mod sizes;
+#[path = "bench/statistics.rs"]
+mod statistics;
 #[path = "bench/tiers.rs"]
 mod tiers;
+#[path = "bench/touched.rs"]
+mod touched;
 
 use gsscale::base::error::InputError;
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
@@ -35,6 +45,12 @@ fn main() -> ExitCode {
         tiers::start(&parse_arguments(&arguments), &mut print)
     } else if named("orders") {
         orders::start(&parse_arguments(&arguments), &mut print)
+    } else if named("bounded") {
+        bounded::start(&parse_arguments(&arguments), &mut print)
+    } else if named("sizes") {
+        sizes::start(&parse_arguments(&arguments), &mut print)
+    } else if named("touched") {
+        touched::start(&parse_arguments(&arguments), &mut print)
     } else {
         named("run");
         run::start(&parse_arguments(&arguments), &mut print)

@@ -54,12 +54,19 @@ impl Pager {
     fn fetch_into(&mut self, fetch: &mut Fetch, pages: &[PageNo]) -> Result<(), PagingError> {
         let failures = self.settle(false, &mut Vec::new());
         pages.iter().for_each(|&page| self.pin_into(fetch, page));
-        self.stats.pages_needed += pages.len() as u64;
-        self.stats.misses += fetch.outstanding.len() as u64;
-        self.stats.hits += (pages.len() - fetch.outstanding.len()) as u64;
         self.judge(fetch, failures)?;
         let is_absent = |page: &PageNo| self.cache.state(*page).is_none();
         let mut to_read: VecDeque<PageNo> = pages.iter().copied().filter(is_absent).collect();
+        if fetch.is_step {
+            self.stats.pages_needed += pages.len() as u64;
+            self.stats.misses += fetch.outstanding.len() as u64;
+            self.stats.hits += (pages.len() - fetch.outstanding.len()) as u64;
+            self.stats.absent += to_read.len() as u64;
+        } else {
+            let bytes = |page: &PageNo| self.slots[page.index()].map_or(0, |slot| slot.transfer_bytes() as u64);
+            self.stats.other_pages_needed += pages.len() as u64;
+            self.stats.other_bytes_read += to_read.iter().map(bytes).sum::<u64>();
+        }
         loop {
             while let Some(&page) = to_read.front() {
                 if self.begin_read(page, false) {
@@ -75,7 +82,7 @@ impl Pager {
                 return Err(self.working_set(&fetch.what, self.held_by_callers() + fetch.outstanding.len()));
             }
             let mut ended = Vec::new();
-            let failures = self.settle(true, &mut ended);
+            let failures = self.settle_for(fetch.is_step, &mut ended);
             ended.into_iter().for_each(|page| self.pin_into(fetch, page));
             self.judge(fetch, failures)?;
         }
@@ -151,6 +158,11 @@ impl Pager {
     /// # Errors
     /// Every frame is pinned, or the store failed while one was emptied.
     pub fn take_frame(&mut self) -> Result<PageBuffer, PagingError> {
+        self.frame_for(true)
+    }
+
+    /// As [`Pager::take_frame`], for a step or for the import.
+    pub(super) fn frame_for(&mut self, is_step: bool) -> Result<PageBuffer, PagingError> {
         loop {
             if let Some(buffer) = self.cache.lend() {
                 return Ok(buffer);
@@ -161,7 +173,7 @@ impl Pager {
             if self.in_flight() == 0 {
                 return Err(self.working_set("a page that splits", self.cache.frames_max() + 1));
             }
-            for Failure { is_write, error, .. } in self.settle(true, &mut Vec::new()) {
+            for Failure { is_write, error, .. } in self.settle_for(is_step, &mut Vec::new()) {
                 if is_write {
                     self.stop_writes(error, true)?;
                 }

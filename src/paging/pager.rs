@@ -8,6 +8,7 @@
 //! reads and writes never depends on frames, plan or store; 4. a page with rows that is not in memory has a slot, and the
 //! slot holds exactly what was last released.
 
+use super::ahead::Coming;
 use super::error::PagingError;
 use super::pinned::PinnedPage;
 use super::stats::PagerStats;
@@ -20,8 +21,9 @@ use crate::page::buffer::PageBuffer;
 use crate::page::format::{HEADER_BYTES, SlotRef, transfer_bytes};
 use crate::page::paged_store::PagedStore;
 use crate::scene::camera::Camera;
-use crate::scene::page_layout::capacity_bytes;
+use crate::scene::page_layout::{PageLayout, capacity_bytes};
 use crate::scene::page_meta::PageMeta;
+use crate::schedule::bound::FewestReads;
 use crate::schedule::visibility::visible_pages;
 use std::collections::BTreeMap;
 
@@ -76,6 +78,10 @@ pub struct Pager {
     pub(super) ahead: [usize; 2],
     /// Pages of the last acknowledged commit, with the generations of their versions.
     pub(super) committed: BTreeMap<PageId, u64>,
+    /// What the coming steps will wait for.
+    pub(super) coming: Coming,
+    /// What the steps so far would have made the best of caches read.
+    bound: FewestReads,
 }
 
 impl Pager {
@@ -98,6 +104,8 @@ impl Pager {
             writes_stopped: false,
             ahead: [0; 2],
             committed: BTreeMap::new(),
+            coming: Coming::default(),
+            bound: FewestReads::default(),
         }
     }
 
@@ -111,7 +119,7 @@ impl Pager {
             return Ok(self.add_entry(meta));
         }
         self.write_behind()?;
-        let mut buffer = self.take_frame()?;
+        let mut buffer = self.frame_for(false)?;
         fill(&mut buffer.as_mut_slice()[HEADER_BYTES..]);
         let page = self.add_entry(meta);
         self.cache.adopt(page);
@@ -170,7 +178,23 @@ impl Pager {
             let missed = |p: &&PageNo| planned.binary_search(p).is_err() && self.cache.state(**p).is_none();
             self.stats.late_misses += pages.iter().filter(missed).count() as u64;
         }
-        self.fetch(&format!("the view of step {step}"), &pages, true)
+        let pinned = self.fetch(&format!("the view of step {step}"), &pages, true)?;
+        self.count_bound(&pages);
+        Ok(pinned)
+    }
+
+    /// Takes a step over into what the best of caches would have read.
+    fn count_bound(&mut self, pages: &[PageNo]) {
+        if self.store.is_none() {
+            return;
+        }
+        let bytes = |page: PageNo| {
+            let PageMeta { rows, sh_degree, .. } = self.index[page.index()];
+            let raw = || transfer_bytes(PageLayout { rows: rows as usize, sh_degree }.bytes());
+            self.slots[page.index()].map_or_else(raw, |slot| slot.transfer_bytes()) as u64
+        };
+        self.bound.step(self.cache.frames_max(), pages.iter().map(|&page| (page, bytes(page))));
+        self.stats.belady_bytes_read = self.bound.bytes();
     }
 
     /// Pages with rows that `camera` may see by the bounds as they are now, ascending by id.
@@ -247,7 +271,11 @@ impl Pager {
     fn add_entry(&mut self, meta: PageMeta) -> PageNo {
         self.index.push(meta);
         self.slots.push(None);
-        PageNo(self.index.len() as u32 - 1)
+        let page = PageNo(self.index.len() as u32 - 1);
+        if self.store.is_some() {
+            self.bound.add(page);
+        }
+        page
     }
 
     pub(super) fn count_pinned(&mut self) {

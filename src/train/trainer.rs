@@ -306,6 +306,18 @@ impl Trainer {
         }
     }
 
+    /// A step that needed more frames than there are changed nothing that doing it again does not: the run as it is now is
+    /// committed, so that it can go on with more memory.
+    fn keep_outgrown(&mut self, error: TrainError, outputs: &mut LoopOutputs<'_>) -> Result<StepOutcome, TrainError> {
+        let is_outgrown = matches!(error, TrainError::Paging(PagingError::WorkingSet { .. }));
+        if let Some(checkpoint) = outputs.checkpoint.as_deref_mut().filter(|_| is_outgrown)
+            && let Err(second) = checkpoint.commit(self, outputs.metrics)
+        {
+            eprintln!("warning: the run could not be committed: {second}");
+        }
+        Err(error)
+    }
+
     /// Runs to the last step or until asked to stop.
     ///
     /// # Errors
@@ -320,7 +332,7 @@ impl Trainer {
         while self.step < self.options.steps && outputs.stop.exit_code().is_none() {
             let step = self.step;
             let before = self.renderer.traffic();
-            let outcome = self.step(dataset, targets)?;
+            let outcome = self.step(dataset, targets).or_else(|error| self.keep_outgrown(error, outputs))?;
             let traffic = self.renderer.traffic();
             let is_last = self.step == self.options.steps;
             let due = |every: u32| step > 0 && step.is_multiple_of(every);

@@ -19,7 +19,9 @@ Examples:
   gsscale-bench scans/village --steps 2000 --max-gaussians 200000 --threads 1 >> runs.jsonl
 
 Other measurements: gsscale-bench tiers --help (through the disk tier against in memory),
-gsscale-bench orders --help (orders of views: quality against bytes).
+gsscale-bench orders --help (orders of views: quality against bytes), gsscale-bench sizes --help (step time against the
+size of the scene), gsscale-bench touched --help (optimizer and forwarding against a plain copy), gsscale-bench bounded
+--help (a city far larger than memory under a hard limit).
 
 cpu_seconds_per_step counts all threads during the steps, decoding of photos included; loading and evaluation are not
 in it. host_bytes_peak is without the copy that writing a PLY takes.";
