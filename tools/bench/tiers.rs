@@ -30,6 +30,9 @@ Examples:
   gsscale-bench tiers scans/city --spill-dir /mnt/nvme/bench --steps 600 --strategy none --view-order groups:25
   gsscale-bench tiers scans/city --spill-dir /mnt/nvme/bench --steps 600 --shares 10,5 --page-rows 256
 
+share_misses of the pages were not in memory when a step asked, of these share_absent not even on their way; where the
+pages of two steps in a row do not fit into the frames together, share_absent_least cannot be helped.
+
 Memory must hold the scene once for the run in memory and once for the sum of the shares. With --view-order auto all
 take the order that is chosen for the smallest share.";
 
@@ -260,6 +263,7 @@ impl Contender {
                 "bytes_over_belady": bound.map(|(_, bytes)| bytes_read as f64 / bytes.max(1) as f64),
                 "share_misses": (now.misses - before.misses) as f64 / needed,
                 "share_absent": (now.absent - before.absent) as f64 / needed,
+                "share_absent_least": self.demand.fewest_absent(now.frames_max) as f64 / needed,
                 "share_late_misses": (now.late_misses - before.late_misses) as f64 / needed,
                 "stall_seconds": now.stall_seconds - before.stall_seconds,
             });
