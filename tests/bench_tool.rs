@@ -87,6 +87,52 @@ fn commits_are_measured_and_nothing_is_left() {
 }
 
 #[test]
+fn sizes_see_the_same_rows_whatever_lies_behind_them() {
+    let folder = TempDir::new().unwrap();
+    let scene = large_city(folder.path());
+    let spill = folder.path().join("spill");
+    let sizes = ["--steps", "60", "--turn", "7", "--page-rows", "16", "--strategy", "none", "--copies", "1,3"];
+    let lines = lines(&[&["sizes", text(&scene), "--spill-dir", text(&spill)][..], &sizes].concat());
+    let [one, three] = &lines[..] else { panic!("{lines:?}") };
+    assert_eq!(number(three, "gaussians"), 3.0 * number(one, "gaussians"));
+    assert_eq!((&one["frames"], number(one, "ratio_of_medians")), (&three["frames"], 1.0));
+    // Neighbours at the ends of a copy may differ, and with them a few first scales.
+    assert!((number(three, "rows_ratio") - 1.0).abs() < 0.01, "{three}");
+    assert!((number(three, "pages_per_step") / number(one, "pages_per_step") - 1.0).abs() < 0.2, "{one} {three}");
+    assert!(number(three, "pages") > 2.5 * number(one, "pages") && number(three, "seconds_per_step_median") > 0.0);
+    assert!(spill.read_dir().unwrap().next().is_none(), "scratch is removed");
+}
+
+#[test]
+fn touched_bytes_are_timed_beside_a_copy() {
+    let args = ["touched", "--rows", "5000", "--rounds", "3", "--listed", "100,50", "--page-rows", "128"];
+    let lines = lines(&args);
+    let listed: Vec<f64> = lines.iter().map(|line| number(line, "rows_listed")).collect();
+    assert!(listed[0] == 5000.0 && (2200.0..2800.0).contains(&listed[1]), "{listed:?}");
+    for line in &lines {
+        for key in ["forwarding_over_copy", "optimizer_over_copy", "both_over_copy", "copy_bytes_per_second"] {
+            assert!(number(line, key) > 0.0, "{line}");
+        }
+    }
+}
+
+/// A control group is made where this user may make one; else the line says why not.
+#[test]
+#[cfg(unix)]
+fn a_city_larger_than_memory_trains_under_a_hard_limit() {
+    let folder = TempDir::new().unwrap();
+    let dir = folder.path().join("bounded");
+    let sizes = ["--gaussians", "120000", "--city", "20000", "--views", "24", "--steps", "12", "--page-rows", "256"];
+    let lines = lines(&[&["bounded", "--dir", text(&dir), "--host-mem", "96MiB"][..], &sizes].concat());
+    let [line] = &lines[..] else { panic!("{lines:?}") };
+    assert_eq!((number(line, "gaussians"), number(line, "steps")), (120_000.0, 12.0), "{line}");
+    assert!(line["is_bounded"] == true && line["finished"] == true, "{line}");
+    assert_ne!(line["limited_by"].is_null(), line["no_limit_because"].is_null(), "{line}");
+    assert!(number(line, "host_bytes_peak") <= number(line, "limit_bytes"), "{line}");
+    assert!(!dir.exists(), "all of it is removed");
+}
+
+#[test]
 fn a_run_needs_no_name_and_wrong_input_is_refused() {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 10, 64, 48, 300);
@@ -107,5 +153,14 @@ fn a_run_needs_no_name_and_wrong_input_is_refused() {
     refuses(&["tiers", text(&scene), "--spill-dir", spill, "--shares", "0"], "--shares");
     refuses(&["orders", text(&scene), "--compare-orders", "random"], "--compare-orders");
     refuses(&["orders", text(&scene), "--share", "101"], "--share");
+    refuses(&["sizes", text(&scene)], "--spill-dir");
+    refuses(&["sizes", text(&scene), "--spill-dir", spill, "--copies", "1,0"], "--copies");
+    refuses(&["touched", "--listed", "0"], "--listed");
+    let taken = text(folder.path());
+    refuses(&["bounded", "--dir", taken], "exists already");
+    let new = folder.path().join("new");
+    refuses(&["bounded", "--dir", text(&new), "--gaussians", "lots"], "--gaussians");
+    refuses(&["bounded", "--dir", text(&new), "--gaussians", "999"], "fewer than");
+    assert!(!new.exists());
     refuses(&["run", text(Path::new("/nowhere"))], "nowhere");
 }

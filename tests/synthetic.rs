@@ -187,6 +187,36 @@ fn counts_sizes_and_tracks_are_as_asked() {
 }
 
 #[test]
+fn copies_of_a_city_lie_side_by_side_and_share_out_its_photos() {
+    let folder = tempfile::tempdir().unwrap();
+    let (one, many) = (folder.path().join("one"), folder.path().join("many"));
+    let base = write(&one, &small());
+    let summary = write(&many, &CityOptions { tiles: [3, 2], ..small() });
+    assert_eq!((summary.points, summary.views, summary.side), (3600, 8, base.side));
+    let (one, many) = (read_scene(&one), read_scene(&many));
+    for (k, p) in many.points.iter().enumerate() {
+        let (tile, of) = (k / 600, &one.points[k % 600]);
+        let shift = [(tile % 3) as f64 * base.side, (tile / 3) as f64 * base.side, 0.0];
+        assert_eq!((p.id, p.xyz, p.rgb), (k as u64 + 1, std::array::from_fn(|i| of.xyz[i] + shift[i]), of.rgb));
+        // A photo is at one of the copies, and its tracks are those of this copy's points.
+        let seen: Vec<u32> =
+            of.track.iter().map(|&(image, _)| image).filter(|i| (i - 1) as usize % 6 == tile).collect();
+        assert_eq!(p.track.iter().map(|&(image, _)| image).collect::<Vec<_>>(), seen);
+        for &(image, index) in &p.track {
+            let (at, id) = many.images[&image].points2d[index as usize];
+            assert_eq!(id, p.id);
+            let there = project(&many, &many.images[&image], p.xyz);
+            assert!((there[0] - at[0]).hypot(there[1] - at[1]) < 20.0, "{there:?} {at:?}");
+        }
+    }
+    assert!(many.points.iter().map(|p| p.track.len()).sum::<usize>() > 500);
+    let raw = read_colmap(&folder.path().join("many"), &ReadOptions::default());
+    assert_eq!(raw.unwrap().points.positions.len(), 3600);
+    let none = CityOptions { tiles: [0, 1], ..small() };
+    assert!(write_city(&folder.path().join("more"), &none, &|_, _| {}).unwrap_err().to_string().starts_with("--tile"));
+}
+
+#[test]
 fn the_colmap_reader_finds_nothing_to_complain_about() {
     let folder = tempfile::tempdir().unwrap();
     write(folder.path(), &CityOptions { offset: [5e5, 4.6e6, 0.0], ..small() });

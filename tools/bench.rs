@@ -1,6 +1,8 @@
 //! `gsscale-bench`: measures training and prints lines of JSON. Which measurement is the first argument; without one of
 //! their names it is `run`. Parses, calls, prints.
 
+#[path = "bench/bounded.rs"]
+mod bounded;
 #[path = "bench/commit.rs"]
 mod commit;
 #[path = "bench/compare.rs"]
@@ -13,6 +15,8 @@ mod facts;
 mod knobs;
 #[path = "bench/ladder.rs"]
 mod ladder;
+#[path = "bench/memory_group.rs"]
+mod memory_group;
 #[path = "bench/orders.rs"]
 mod orders;
 #[path = "bench/pareto.rs"]
@@ -23,10 +27,16 @@ mod published;
 mod published_table;
 #[path = "bench/run.rs"]
 mod run;
+#[path = "bench/sizes.rs"]
+mod sizes;
+#[path = "bench/statistics.rs"]
+mod statistics;
 #[path = "bench/sweep.rs"]
 mod sweep;
 #[path = "bench/tiers.rs"]
 mod tiers;
+#[path = "bench/touched.rs"]
+mod touched;
 
 use clap::Parser;
 use gsscale::base::error::InputError;
@@ -56,6 +66,12 @@ fn main() -> ExitCode {
         commit::start(&parse_arguments(&arguments), &mut print)
     } else if named("orders") {
         orders::start(&parse_arguments(&arguments), &mut print)
+    } else if named("bounded") {
+        bounded::start(&parse_arguments(&arguments), &mut print)
+    } else if named("sizes") {
+        sizes::start(&parse_arguments(&arguments), &mut print)
+    } else if named("touched") {
+        touched::start(&parse_arguments(&arguments), &mut print)
     } else if named("ladder") {
         ladder::start(&parse_arguments(&arguments), &mut print)
     } else if named("pareto") {

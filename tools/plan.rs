@@ -5,6 +5,7 @@ use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::units::format_bytes;
 use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides, parse_command_line};
+use gsscale::page::format::transfer_bytes;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::schedule::auto::automatic_order;
@@ -14,7 +15,9 @@ use gsscale::schedule::order::{Order, ViewOrder};
 use gsscale::schedule::plan::Plan;
 use gsscale::schedule::replay::{DriveModel, Figures, Replay, ReplayOptions, Stall, WINDOW_STEPS, replay};
 use gsscale::schedule::visibility::ViewPages;
+use gsscale::train::preflight;
 use gsscale::train::run::prepare;
+use gsscale::train::trainer::TrainError;
 use serde_json::{Value, json};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -30,10 +33,6 @@ Pages are those of the first Gaussians; --growth 5 plans as if each page had gro
 Shares of a step's pages that are read, 'of a plan' and 'lru', are those of the optimal cache and of one that drops what
 was used longest ago. Waiting assumes that the drive does one thing at a time.";
 
-/// Header of a page on disk; pages are padded to the same.
-const BLOCK: u64 = 4096;
-/// Part of --host-mem that frames take here; targets, gradients, staging and tables have the rest.
-const FRAME_SHARE: f64 = 0.75;
 /// Epochs that are gone through; later ones are counted like the mean of those after the first.
 const EPOCHS: u32 = 4;
 
@@ -102,6 +101,8 @@ struct Scene {
     frame_bytes: u64,
     views: ViewPages,
     gaussians: usize,
+    /// Frames that --host-mem leaves beside what else a run holds, where it was given.
+    frames_within: Option<u64>,
 }
 
 /// One line of the answer.
@@ -178,18 +179,34 @@ fn load(args: &Args) -> InputResult<Scene> {
     let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
     let page_rows = config.page_rows as usize;
     let pages = first_pages(&prepared.columns, page_rows, config.strategy == "default");
-    let slot = |payload: u64| BLOCK + payload.next_multiple_of(BLOCK);
-    let grown = |bytes: u64| (bytes as f64 * args.growth) as u64;
-    let page_bytes = pages.bytes.iter().map(|&b| grown(slot(u64::from(b))).min(u64::from(u32::MAX)) as u32).collect();
+    let grown = |bytes: usize| (bytes as f64 * args.growth) as u64;
+    let slot = |&bytes: &u32| grown(transfer_bytes(bytes as usize)).min(u64::from(u32::MAX)) as u32;
+    let gaussians = prepared.columns.rows();
+    let frame_bytes = transfer_bytes(capacity_bytes(page_rows, config.sh_degree));
+    let frames_within = match config.host_mem.0 {
+        0 => None,
+        budget => {
+            let frames = preflight::frames_within(&config, prepared, budget).map_err(not_planned)?;
+            Some((frames as f64 / args.growth) as u64)
+        }
+    };
     Ok(Scene {
         views: ViewPages::new(&pages.index, &cameras),
-        frame_bytes: grown(slot(capacity_bytes(page_rows, config.sh_degree) as u64)),
-        gaussians: prepared.columns.rows(),
+        page_bytes: pages.bytes.iter().map(slot).collect(),
+        frame_bytes: grown(frame_bytes),
+        gaussians,
+        frames_within,
         config,
         cameras,
         pages,
-        page_bytes,
     })
+}
+
+fn not_planned(error: TrainError) -> InputError {
+    match error {
+        TrainError::Input(error) => error,
+        other => InputError::new("--host-mem", other.to_string(), "plan for --frames instead"),
+    }
 }
 
 fn scene_of_run(config: &Path) -> InputResult<PathBuf> {
@@ -213,9 +230,7 @@ fn frames(args: &Args, scene: &Scene) -> InputResult<Vec<usize>> {
     if args.compare_frames.is_empty() && config.frames > 0 {
         return Ok(vec![config.frames as usize]);
     }
-    if config.host_mem.0 > 0 {
-        frames.push(((config.host_mem.0 as f64 * FRAME_SHARE) as u64 / scene.frame_bytes) as usize);
-    }
+    frames.extend(scene.frames_within.map(|frames| frames as usize));
     let shares = ["10%", "25%", "50%"].map(String::from);
     let is_open = args.compare_frames.is_empty() && frames.is_empty();
     let texts = if is_open { &shares[..] } else { &args.compare_frames[..] };
@@ -260,8 +275,8 @@ fn order(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<O
 
 fn too_few(scene: &Scene, error: &TooFewFrames) -> InputError {
     let most = scene.views.most().max(error.needed);
-    let bytes = format_bytes((most as f64 * scene.frame_bytes as f64 / FRAME_SHARE) as u64);
-    let remedy = format!("the largest view needs --frames {most}, which is a --host-mem of about {bytes}");
+    let bytes = format_bytes(most as u64 * scene.frame_bytes);
+    let remedy = format!("the largest view needs --frames {most}, {bytes} of --host-mem beside what else a run holds");
     InputError::new("--frames", error.to_string(), remedy)
 }
 

@@ -17,6 +17,7 @@ Examples:
   gsscale-synth city                                  60 photos of 480x320, a city of 3x3 blocks
   gsscale-synth town --views 1000 --resolution 1152x864 --points 1000000
   gsscale-synth hard --exposure 0.03 --noise 0.01     exposure changes by 3 %, sensor noise of 1 %
+  gsscale-synth metropolis --points 1000000 --tile 4x5  20 copies of a city side by side, 20 million points
   gsscale-synth utm --offset 500000,4600000,120       coordinates as large as UTM's
   gsscale-synth rubble --layout colmap-merged         a look-alike of Mill-19, for gsscale-bench run rubble
 
@@ -41,6 +42,10 @@ struct Flags {
     /// Side of the city in blocks of 60 m [default: what the views cover]
     #[arg(long, help_heading = "Size")]
     blocks: Option<u32>,
+    /// Repeat the city so many times along x and y: --points times AxB points in all, written in bounded memory. The
+    /// photos are shared out among the copies; what they show of the neighbours is missing
+    #[arg(long, default_value = "1x1", value_name = "AxB", value_parser = parse_size, help_heading = "Size")]
+    tile: (u32, u32),
     /// Another seed is another city
     #[arg(long, default_value_t = 1, help_heading = "Size")]
     seed: u64,
@@ -72,7 +77,7 @@ struct Flags {
 }
 
 fn parse_size(text: &str) -> Result<(u32, u32), String> {
-    let wrong = || format!("'{text}' is not a size; write for example 480x320");
+    let wrong = || format!("'{text}' is not a size; write for example 480x320 (photos), 4x5 (tiles)");
     let (w, h) = text.split_once('x').ok_or_else(wrong)?;
     Ok((w.parse().map_err(|_| wrong())?, h.parse().map_err(|_| wrong())?))
 }
@@ -109,6 +114,7 @@ fn run(flags: &Flags) -> InputResult<()> {
         exposure: flags.exposure,
         noise: flags.noise,
         supersample: flags.supersample,
+        tiles: flags.tile.into(),
         offset: flags.offset,
         overwrite: flags.overwrite,
     };
@@ -129,6 +135,9 @@ fn report(flags: &Flags, options: &CityOptions, s: &CitySummary, seconds: f64) {
     let size = |sub: &str| format_bytes(folder_bytes(&dir.join(sub)));
     let rate = s.rays as f64 / seconds / 1e6;
     println!("A city of {0}x{0} blocks ({1:.0} m), {2} solids, seed {3}", s.blocks, s.side, s.solids, options.seed);
+    if options.tiles != [1, 1] {
+        println!("in {}x{} copies side by side", options.tiles[0], options.tiles[1]);
+    }
     if flags.layout == Layout::Colmap {
         println!("{}/", dir.display());
         println!("  images/    {} photos of {}x{}, {}", s.views, options.width, options.height, size("images"));
@@ -138,14 +147,8 @@ fn report(flags: &Flags, options: &CityOptions, s: &CitySummary, seconds: f64) {
             s.views, s.points, s.observations
         );
     } else {
-        println!(
-            "{} photos of {}x{} in {}, laid out as {}",
-            s.views,
-            options.width,
-            options.height,
-            dir.display(),
-            flags.layout.name()
-        );
+        let (width, height, layout) = (options.width, options.height, flags.layout.name());
+        println!("{} photos of {width}x{height} in {}, laid out as {layout}", s.views, dir.display());
         println!("{}", flags.layout.tree());
     }
     println!("{seconds:.1} s, {rate:.1} million camera rays per second");

@@ -26,6 +26,9 @@ pub struct Model {
     pub images: Vec<ModelImage>,
     /// The points.
     pub points: Vec<Point>,
+    /// The points are written once for each of these, moved by it (at least one): so a model may be larger than memory.
+    /// Image k sees the points of number k modulo their count, its pose being where those are.
+    pub tiles: Vec<[f64; 3]>,
 }
 
 /// An image of the model.
@@ -70,6 +73,9 @@ pub fn write_model(sparse: &Path, model: &Model) -> InputResult<()> {
     }
     if model.points.iter().flat_map(|p| &p.observations).any(|o| o.image as usize >= images) {
         return Err(InputError::new(sparse, format!("a track names an image beyond the {images} there are"), ""));
+    }
+    if model.tiles.is_empty() {
+        return Err(InputError::new(sparse, "the points lie nowhere", "give at least one tile"));
     }
     let partial = sparse.with_extension("partial");
     let folder = partial.join("0");
@@ -117,15 +123,21 @@ fn floats(out: &mut dyn Write, values: &[f64]) -> std::io::Result<()> {
     values.iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))
 }
 
-/// For each image its observations as (point, position), in the order of the points.
+/// For each image its observations as (point, position), in the order of the points of its tile.
 fn observation_order(model: &Model) -> Vec<Vec<(u64, [f64; 2])>> {
     let mut lists = vec![Vec::new(); model.images.len()];
     for (k, point) in model.points.iter().enumerate() {
         for o in &point.observations {
-            lists[o.image as usize].push((k as u64 + 1, o.at));
+            let before = tile_of(model, o.image) as u64 * model.points.len() as u64;
+            lists[o.image as usize].push((before + k as u64 + 1, o.at));
         }
     }
     lists
+}
+
+/// Number of the tile that an image sees.
+fn tile_of(model: &Model, image: u32) -> usize {
+    image as usize % model.tiles.len()
 }
 
 fn images_bin(out: &mut dyn Write, model: &Model, order: &[Vec<(u64, [f64; 2])>]) -> std::io::Result<()> {
@@ -149,17 +161,23 @@ fn images_bin(out: &mut dyn Write, model: &Model, order: &[Vec<(u64, [f64; 2])>]
 fn points_bin(out: &mut dyn Write, model: &Model) -> std::io::Result<()> {
     // The place of an observation in its image's list: lists are in the order of the points.
     let mut written = vec![0u32; model.images.len()];
-    out.write_all(&(model.points.len() as u64).to_le_bytes())?;
-    for (k, point) in model.points.iter().enumerate() {
-        out.write_all(&(k as u64 + 1).to_le_bytes())?;
-        floats(out, &point.position)?;
-        out.write_all(&point.rgb)?;
-        out.write_all(&point.error.to_le_bytes())?;
-        out.write_all(&(point.observations.len() as u64).to_le_bytes())?;
-        for o in &point.observations {
-            out.write_all(&(o.image + 1).to_le_bytes())?;
-            out.write_all(&written[o.image as usize].to_le_bytes())?;
-            written[o.image as usize] += 1;
+    let (points, tiles) = (model.points.len() as u64, model.tiles.len() as u64);
+    out.write_all(&(points * tiles).to_le_bytes())?;
+    let mut id = 0u64;
+    for (tile, shift) in model.tiles.iter().enumerate() {
+        for point in &model.points {
+            id += 1;
+            out.write_all(&id.to_le_bytes())?;
+            floats(out, &std::array::from_fn::<f64, 3, _>(|i| point.position[i] + shift[i]))?;
+            out.write_all(&point.rgb)?;
+            out.write_all(&point.error.to_le_bytes())?;
+            let seen = || point.observations.iter().filter(|o| tile_of(model, o.image) == tile);
+            out.write_all(&(seen().count() as u64).to_le_bytes())?;
+            for o in seen() {
+                out.write_all(&(o.image + 1).to_le_bytes())?;
+                out.write_all(&written[o.image as usize].to_le_bytes())?;
+                written[o.image as usize] += 1;
+            }
         }
     }
     Ok(())

@@ -79,6 +79,7 @@ fn model_of<'a>(city: &RawScene, views: impl Iterator<Item = (String, &'a RawVie
         intrinsics: city.views[0].intrinsics,
         images: views.map(|(name, view)| ModelImage { name, pose: view.pose }).collect(),
         points: colored.map(point).collect(),
+        tiles: vec![[0.0; 3]],
     }
 }
 

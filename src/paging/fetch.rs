@@ -58,15 +58,23 @@ impl Pager {
     fn fetch_into(&mut self, fetch: &mut Fetch, pages: &[PageNo]) -> Result<(), PagingError> {
         let failures = self.settle(false, &mut Vec::new());
         pages.iter().for_each(|&page| self.pin_into(fetch, page));
-        self.stats.pages_needed += pages.len() as u64;
         let frozen = fetch.outstanding.keys().filter(|page| self.holds_frozen(**page)).count();
         fetch.has_frozen = frozen > 0;
-        let misses = fetch.outstanding.len() - frozen;
-        self.stats.misses += misses as u64;
-        self.stats.hits += (pages.len() - misses) as u64;
         self.judge(fetch, failures)?;
         let is_absent = |page: &PageNo| self.cache.state(*page).is_none();
         let mut to_read: VecDeque<PageNo> = pages.iter().copied().filter(is_absent).collect();
+        if fetch.is_step {
+            self.stats.pages_needed += pages.len() as u64;
+            // Frozen pages are there, and only wait for their write.
+            let misses = fetch.outstanding.len().saturating_sub(frozen);
+            self.stats.misses += misses as u64;
+            self.stats.hits += (pages.len() - misses) as u64;
+            self.stats.absent += to_read.len() as u64;
+        } else {
+            let bytes = |page: &PageNo| self.slots[page.index()].map_or(0, |slot| slot.transfer_bytes() as u64);
+            self.stats.other_pages_needed += pages.len() as u64;
+            self.stats.other_bytes_read += to_read.iter().map(bytes).sum::<u64>();
+        }
         loop {
             self.write_needed(fetch)?;
             while let Some(&page) = to_read.front() {
@@ -85,7 +93,7 @@ impl Pager {
             let mut ended = Vec::new();
             let is_delayed = self.frozen.as_ref().is_some_and(|f| f.delays(fetch.outstanding.keys().copied()));
             let started = Instant::now();
-            let failures = self.settle(true, &mut ended);
+            let failures = self.settle_for(fetch.is_step, &mut ended);
             self.stats.commit_seconds += if is_delayed { started.elapsed().as_secs_f64() } else { 0.0 };
             ended.into_iter().for_each(|page| self.pin_into(fetch, page));
             self.judge(fetch, failures)?;
@@ -180,7 +188,7 @@ impl Pager {
     /// # Errors
     /// Every frame is pinned, or the store failed while one was emptied.
     pub fn take_frame(&mut self) -> Result<PageBuffer, PagingError> {
-        let error = match self.empty_frame() {
+        let error = match self.frame_for(true) {
             Err(error) => error,
             frame => return frame,
         };
@@ -190,11 +198,11 @@ impl Pager {
         }
         self.failed_write = Some(cause);
         self.cache.add_frame();
-        self.empty_frame()
+        self.frame_for(true)
     }
 
-    /// A frame without a page, emptied if need be.
-    pub(super) fn empty_frame(&mut self) -> Result<PageBuffer, PagingError> {
+    /// A frame without a page, emptied if need be, for a step or for the import.
+    pub(super) fn frame_for(&mut self, is_step: bool) -> Result<PageBuffer, PagingError> {
         loop {
             if let Some(buffer) = self.cache.lend() {
                 return Ok(buffer);
@@ -205,7 +213,7 @@ impl Pager {
             if self.in_flight() == 0 {
                 return Err(self.working_set("a page that splits", self.cache.frames_max() + 1));
             }
-            for Failure { is_write, error, .. } in self.settle(true, &mut Vec::new()) {
+            for Failure { is_write, error, .. } in self.settle_for(is_step, &mut Vec::new()) {
                 if is_write {
                     self.stop_writes(error, true)?;
                 }

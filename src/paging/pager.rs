@@ -8,7 +8,7 @@
 //! reads and writes never depends on frames, plan or store; 4. a page with rows that is not in memory has a slot, and the
 //! slot holds exactly what was last released.
 
-use super::ahead::Transfers;
+use super::ahead::{Coming, Transfers};
 use super::error::PagingError;
 use super::freeze::Frozen;
 use super::pinned::PinnedPage;
@@ -22,8 +22,9 @@ use crate::page::buffer::PageBuffer;
 use crate::page::format::{HEADER_BYTES, SlotRef, transfer_bytes};
 use crate::page::paged_store::PagedStore;
 use crate::scene::camera::Camera;
-use crate::scene::page_layout::capacity_bytes;
+use crate::scene::page_layout::{PageLayout, capacity_bytes};
 use crate::scene::page_meta::PageMeta;
+use crate::schedule::bound::FewestReads;
 use crate::schedule::visibility::visible_pages;
 use std::collections::BTreeMap;
 
@@ -81,6 +82,10 @@ pub struct Pager {
     pub(super) committed: BTreeMap<PageId, u64>,
     /// A cut that is being written.
     pub(super) frozen: Option<Frozen>,
+    /// What the coming steps will wait for.
+    pub(super) coming: Coming,
+    /// What the steps so far would have made the best of caches read.
+    bound: FewestReads,
 }
 
 impl Pager {
@@ -105,6 +110,8 @@ impl Pager {
             transfers: Transfers::default(),
             committed: BTreeMap::new(),
             frozen: None,
+            coming: Coming::default(),
+            bound: FewestReads::default(),
         }
     }
 
@@ -130,7 +137,7 @@ impl Pager {
             return Ok(self.add_entry(meta));
         }
         self.write_behind()?;
-        let mut buffer = self.empty_frame()?;
+        let mut buffer = self.frame_for(false)?;
         fill(&mut buffer.as_mut_slice()[HEADER_BYTES..]);
         let page = self.add_entry(meta);
         self.cache.adopt(page);
@@ -194,7 +201,23 @@ impl Pager {
             let missed = |p: &&PageNo| planned.binary_search(p).is_err() && self.cache.state(**p).is_none();
             self.stats.late_misses += pages.iter().filter(missed).count() as u64;
         }
-        self.fetch(&format!("the view of step {step}"), &pages, true)
+        let pinned = self.fetch(&format!("the view of step {step}"), &pages, true)?;
+        self.count_bound(&pages);
+        Ok(pinned)
+    }
+
+    /// Takes a step over into what the best of caches would have read.
+    fn count_bound(&mut self, pages: &[PageNo]) {
+        if self.store.is_none() {
+            return;
+        }
+        let bytes = |page: PageNo| {
+            let PageMeta { rows, sh_degree, .. } = self.index[page.index()];
+            let raw = || transfer_bytes(PageLayout { rows: rows as usize, sh_degree }.bytes());
+            self.slots[page.index()].map_or_else(raw, |slot| slot.transfer_bytes()) as u64
+        };
+        self.bound.step(self.cache.frames_max(), pages.iter().map(|&page| (page, bytes(page))));
+        self.stats.belady_bytes_read = self.bound.bytes();
     }
 
     /// Pages with rows that `camera` may see by the bounds as they are now, ascending by id.
@@ -278,7 +301,11 @@ impl Pager {
     fn add_entry(&mut self, meta: PageMeta) -> PageNo {
         self.index.push(meta);
         self.slots.push(None);
-        PageNo(self.index.len() as u32 - 1)
+        let page = PageNo(self.index.len() as u32 - 1);
+        if self.store.is_some() {
+            self.bound.add(page);
+        }
+        page
     }
 
     pub(super) fn count_pinned(&mut self) {

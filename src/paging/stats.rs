@@ -12,20 +12,31 @@ pub struct PagerStats {
     pub pages_read: u64,
     /// Pages written to the store.
     pub pages_written: u64,
-    /// Pages asked for.
+    /// Pages that steps asked for.
     pub pages_needed: u64,
-    /// Pages asked for that lay in memory.
+    /// Of these, pages that lay in memory.
     pub hits: u64,
-    /// Pages asked for that did not: on their way, or still to be read.
+    /// Of these, pages that did not: on their way, or still to be read.
     pub misses: u64,
+    /// Of the misses, those that were not even on their way.
+    pub absent: u64,
     /// Of the misses, those that the plan of a planned step had left out.
     pub late_misses: u64,
     /// Pages that lost their frame.
     pub evictions: u64,
-    /// Seconds that callers waited for the store.
+    /// Seconds that steps waited for the store, commits between them included.
     pub stall_seconds: f64,
     /// Seconds that steps lost to commits beside them: waited for frozen pages, or spent on writing them.
     pub commit_seconds: f64,
+    /// Pages that all others asked for: evaluation, export, looking at views before the first step.
+    pub other_pages_needed: u64,
+    /// Bytes that were read for them.
+    pub other_bytes_read: u64,
+    /// Seconds that they and the import waited for the store.
+    pub other_stall_seconds: f64,
+    /// Bytes that steps would have made a cache of this size read that knows the future
+    /// ([`crate::schedule::bound::FewestReads`]).
+    pub belady_bytes_read: u64,
     /// The most pages pinned at once.
     pub pinned_max: usize,
     /// Frames in use now, and the most that there may be (`usize::MAX` for as many as needed).

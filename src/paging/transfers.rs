@@ -91,6 +91,17 @@ impl Pager {
         }
     }
 
+    /// Waits for the end of a transfer, if any is in flight; the time counts as a step's or as somebody else's.
+    pub(super) fn settle_for(&mut self, is_step: bool, ended: &mut Vec<PageNo>) -> Vec<Failure> {
+        let before = self.stats.stall_seconds;
+        let failures = self.settle(true, ended);
+        if !is_step {
+            self.stats.other_stall_seconds += self.stats.stall_seconds - before;
+            self.stats.stall_seconds = before;
+        }
+        failures
+    }
+
     /// Takes the ends of transfers; with `wait`, blocks until there is one, if any is in flight, and counts the time.
     /// `ended` gets the pages whose transfer ended well.
     pub(super) fn settle(&mut self, wait: bool, ended: &mut Vec<PageNo>) -> Vec<Failure> {

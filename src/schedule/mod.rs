@@ -1,6 +1,7 @@
 //! Which view comes when and which pages it needs: pure planning, no I/O.
 
 pub mod auto;
+pub mod bound;
 pub mod first_pages;
 pub mod model;
 pub mod order;

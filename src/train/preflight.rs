@@ -3,15 +3,19 @@
 //! Invariant: a run that cannot fit is refused here, with the numbers and the alternatives; what only might not fit,
 //! because the scene grows, is a warning.
 
-use super::memory::{MemoryEstimate, rows_at_most};
-use super::tiers::{PLAN_BYTES, Tiers};
-use super::trainer::Trainer;
+use super::memory::{MemoryEstimate, estimate, rows_at_most};
+use super::run::Prepared;
+use super::tiers::{PLAN_BYTES, Tiers, first_staging_bytes, staging_bytes};
+use super::trainer::{TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
+use crate::config::limits::RunOptions;
 use crate::dataset::loader::{Dataset, View};
+use crate::render::cpu::CpuRenderer;
 use crate::scene::camera::Camera;
 use crate::scene::partition::first_fill;
+use crate::schedule::auto::automatic_order;
 use crate::schedule::model::Policy;
 use crate::schedule::order::Order;
 use crate::schedule::replay::{ReplayOptions, replay};
@@ -75,7 +79,7 @@ pub fn settle(
         check_in_memory(memory, host_mem)?;
         return Ok(plan);
     }
-    let staging = PLAN_BYTES as u64 + trainer.scene.pager.prefetch_bytes() as u64;
+    let staging = staging_bytes(trainer.scene.pager.prefetch_bytes(), &tiers.codec);
     memory.iter_mut().for_each(|m| m.staging = staging);
     let frames = match config.frames {
         // By what is known for certain: the cap may never be reached.
@@ -87,8 +91,9 @@ pub fn settle(
     plan.frames = Some(frames);
     memory.iter_mut().for_each(|m| m.frames = m.frames.min(frames * frame_bytes));
     if config.view_order == "auto" {
-        trainer.set_view_order(auto_order(frames, &plan), dataset);
+        trainer.set_view_order(auto_order(config, dataset, trainer, frames, &plan)?, dataset);
     }
+    warn_of_growth(config, &plan, frames);
     plan.bytes_written = bytes_written(config, dataset, trainer, frames as usize);
     check_drive(&plan, tiers)?;
     Ok(plan)
@@ -129,18 +134,75 @@ pub fn hold_a_view(
     Ok(())
 }
 
-/// A shuffle where all pages fit, else groups of views small enough for the pages of each to stay in memory: about four
-/// times as many groups as the scene is larger than memory.
-fn auto_order(frames: u64, plan: &TierPlan) -> Order {
-    if frames >= plan.pages[1] {
-        return Order::Shuffle;
+/// What `--view-order auto` stands for. Of a scene that grows, the pages as they are now stand for what it may come to, and
+/// as many fewer frames for what there will be.
+fn auto_order(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &Trainer,
+    frames: u64,
+    plan: &TierPlan,
+) -> InputResult<Order> {
+    let [now, most] = plan.pages;
+    let cameras = train_cameras(dataset);
+    let views = ViewPages::new(trainer.scene.pager.index(), &cameras);
+    let frames = if frames >= most { now } else { frames * now / most };
+    let frames = (frames as usize).max(views.most());
+    automatic_order(&views, &cameras, now as usize, frames, config.seed, PLAN_BYTES as u64)
+        .map_err(|e| InputError::new("--view-order", e.to_string(), "name one: shuffle, groups:N or tour"))
+}
+
+fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
+    dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect()
+}
+
+/// Frames that `host_mem` bytes leave for the pages of a scene, as [`settle`] gives them to a run. For planning without
+/// one: the first Gaussians are in memory for it.
+///
+/// # Errors
+/// The budget does not hold a view, or a view cannot be rendered.
+pub fn frames_within(config: &TrainConfig, prepared: Prepared, host_mem: u64) -> Result<u64, TrainError> {
+    let Prepared { dataset, columns, sh_degree_start } = prepared;
+    let options = RunOptions { sh_degree_start, ..RunOptions::new(config, dataset.scene_scale) };
+    let mut trainer = Trainer::new(columns, &dataset, Box::new(CpuRenderer::new()), options)?;
+    let [mut memory, _] = estimate(config, &dataset, &mut trainer, 0)?;
+    let pages = trainer.scene.pager.index().len() as u64;
+    memory.staging = first_staging_bytes(config, pages as usize, host_mem);
+    let plan = TierPlan {
+        pages: [pages, u64::MAX],
+        frame_bytes: trainer.scene.pager.frame_bytes() as u64,
+        frames: None,
+        bytes_written: 0.0,
+        free_bytes: None,
+        largest_view: largest_view(&dataset, &trainer),
+    };
+    Ok(frames_of_budget(&plan, Some(host_mem), &memory)?)
+}
+
+/// Says when the scene may outgrow its frames: the largest view needs about as many times more pages as there are more
+/// Gaussians.
+fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, frames: u64) {
+    let [now, most] = plan.pages;
+    let (needed, view, _) = &plan.largest_view;
+    if config.strategy == "none" || frames >= most {
+        return;
     }
-    Order::Groups((4 * plan.pages[0].max(frames)).div_ceil(frames.max(1)).clamp(4, 400) as u32)
+    let times = frames as f64 / (*needed).max(1) as f64;
+    let then = (*needed as f64 * most as f64 / now.max(1) as f64).ceil() as u64;
+    let until = match config.max_gaussians {
+        0 => "there is no cap on it (--max-gaussians)".to_string(),
+        _ if then <= frames => return,
+        cap => format!("with --max-gaussians {cap} it may come to need {then}"),
+    };
+    eprintln!(
+        "warning: the view {view} needs {needed} pages, there are {frames} frames, and {until}: when the scene has grown to about \
+         {times:.1} times what it is, the run may stop; it can then go on with --resume and more --frames or --host-mem"
+    );
 }
 
 /// Bytes that the run will write to the drive: some epochs of it played through with the pages as they are now.
 fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, frames: usize) -> f64 {
-    let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
+    let cameras = train_cameras(dataset);
     let index = trainer.scene.pager.index();
     let policy = if config.evict == "lru" { Policy::LeastRecent } else { Policy::Farthest };
     let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
@@ -266,7 +328,7 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
     text.push_str(&part("one view: rows, gradients, images", memory.view));
     text.push_str(&part("decoded photos (--image-cache)", memory.targets));
     if memory.staging > 0 {
-        text.push_str(&part("pages read and written ahead, and the plan", memory.staging));
+        text.push_str(&part("pages on their way that are encoded, and the plan", memory.staging));
     }
     text.push_str(&part("index of the pages", memory.index));
     text.push_str(&part("program and tables", memory.base));

@@ -26,12 +26,15 @@ pub struct TierTraffic {
     pub bytes_read: u64,
     /// Bytes written to it.
     pub bytes_written: u64,
-    /// Pages that views needed.
+    /// Pages that steps needed.
     pub pages_needed: u64,
     /// Of these, pages that lay in memory.
     pub page_hits: u64,
     /// Of these, pages that did not: on their way, or still to be read.
     pub page_misses: u64,
+    /// Of the misses, those that were not even on their way.
+    #[serde(default)]
+    pub page_absent: u64,
     /// Of the misses, those that the plan had left out.
     pub late_misses: u64,
     /// Pages read from the drive.
@@ -40,6 +43,19 @@ pub struct TierTraffic {
     pub evictions: u64,
     /// Seconds that steps waited for the drive.
     pub stall_seconds: f64,
+    /// Pages that evaluation, export and a look at the views before the first step needed.
+    #[serde(default)]
+    pub other_pages_needed: u64,
+    /// Bytes that were read for them.
+    #[serde(default)]
+    pub other_bytes_read: u64,
+    /// Seconds that they and the import waited for the drive.
+    #[serde(default)]
+    pub other_stall_seconds: f64,
+    /// Bytes that the steps would have made a cache of this size read that knows all views beforehand; beside
+    /// `bytes_read` less `other_bytes_read`.
+    #[serde(default)]
+    pub belady_bytes_read: u64,
     /// The most pages that a step had at once.
     pub pages_pinned_max: u64,
     /// Frames in use.
@@ -58,10 +74,15 @@ impl TierTraffic {
             pages_needed: stats.pages_needed,
             page_hits: stats.hits,
             page_misses: stats.misses,
+            page_absent: stats.absent,
             late_misses: stats.late_misses,
             pages_read: stats.pages_read,
             evictions: stats.evictions,
             stall_seconds: stats.stall_seconds,
+            other_pages_needed: stats.other_pages_needed,
+            other_bytes_read: stats.other_bytes_read,
+            other_stall_seconds: stats.other_stall_seconds,
+            belady_bytes_read: stats.belady_bytes_read,
             pages_pinned_max: stats.pinned_max as u64,
             frames: stats.frames as u64,
             pages: pager.index().len() as u64,

@@ -27,6 +27,7 @@ use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
+use crate::paging::error::PagingError;
 use crate::render::Renderer;
 use crate::report::run_report::{PAGES_FILE, write_run_report};
 use crate::scene::columns::{Columns, sh_n_width};
@@ -261,7 +262,13 @@ pub(super) fn see_through(
     }
     let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun);
     if tiers.can_resume() {
-        eprintln!("to go on from the last commit: gsscale-train --resume {}", request.out.display());
+        let more = match &outcome {
+            Err(TrainError::Paging(PagingError::WorkingSet { pages, .. })) => {
+                format!(" --frames {pages} (at least), or with a larger --host-mem")
+            }
+            _ => String::new(),
+        };
+        eprintln!("to go on from the last commit: gsscale-train --resume {}{more}", request.out.display());
     }
     tiers.close().iter().for_each(|word| eprintln!("warning: {word}"));
     outcome

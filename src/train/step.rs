@@ -70,16 +70,18 @@ pub fn train_step(
         scene.pager.release(pages);
         return Err(error);
     }
+    // Again and again, since what was read and written since may let more be read.
+    scene.pager.prefetch(step);
     let WorkingSet { row_from_working, columns, gradients } = working;
     let tables = numbered(&pages);
     visible_rows(&tables, &scene.rules.adam, step, camera, row_from_working);
     gather(&tables, scene.rules.sh_degree(), &scene.rules.adam, step, row_from_working, columns);
     let rows_pinned = tables.iter().map(|t| t.rows()).sum();
     let rendered = renderer.forward(columns, camera, render).and_then(|()| {
-        // What was read since may let more be read.
         scene.pager.prefetch(step);
         renderer.loss_backward(columns, target, loss, gradients)
     });
+    scene.pager.prefetch(step);
     let mut outcome =
         StepOutcome { rows: row_from_working.len(), rows_pinned, pages: pages.len(), ..StepOutcome::default() };
     if let Ok(value) = rendered {

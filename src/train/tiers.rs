@@ -115,6 +115,19 @@ fn with_transfers(mut pager: Pager, config: &TrainConfig) -> Pager {
     pager
 }
 
+/// Bytes that the plan takes beside the frames, and pages on their way of which `prefetch_bytes` may be in flight: raw
+/// pages move between frames and drive without a copy.
+pub fn staging_bytes(prefetch_bytes: usize, codec: &str) -> u64 {
+    (PLAN_BYTES + if codec == Codec::Raw.to_string() { 0 } else { prefetch_bytes }) as u64
+}
+
+/// The same of a run that was not begun, with this budget and a drive that is fast enough for raw pages where the codec is
+/// chosen by its speed.
+pub fn first_staging_bytes(config: &TrainConfig, pages: usize, host_mem: u64) -> u64 {
+    let codec = chosen_codec(config, None, &mut Vec::new()).to_string();
+    staging_bytes(2 * pager_config(config, pages, host_mem).prefetch_bytes, &codec)
+}
+
 /// Opens the tiers for a scene of about `pages` pages, within `host_mem` bytes. The pager has few frames at first where
 /// their number follows from the budget: see [`Pager::allow_frames`]. With `dry`, nothing is written: pages stay in
 /// memory.

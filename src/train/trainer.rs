@@ -329,6 +329,18 @@ impl Trainer {
         }
     }
 
+    /// A step that needed more frames than there are changed nothing that doing it again does not: the run as it is now is
+    /// committed, so that it can go on with more memory.
+    fn keep_outgrown(&mut self, error: TrainError, outputs: &mut LoopOutputs<'_>) -> TrainError {
+        let is_outgrown = matches!(error, TrainError::Paging(PagingError::WorkingSet { .. }));
+        if let Some(checkpoint) = outputs.checkpoint.as_deref_mut().filter(|_| is_outgrown)
+            && let Err(second) = checkpoint.commit(self, outputs.metrics)
+        {
+            eprintln!("warning: the run could not be committed: {second}");
+        }
+        error
+    }
+
     /// Runs to the last step or until asked to stop.
     ///
     /// # Errors
@@ -402,7 +414,8 @@ impl Trainer {
         loop {
             match self.step(dataset, targets) {
                 Ok(outcome) => return Ok(Some(outcome)),
-                Err(error) => self.make_space(outputs, error)?,
+                Err(error) if error.is_out_of_space() => self.make_space(outputs, error)?,
+                Err(error) => return Err(self.keep_outgrown(error, outputs)),
             }
             if outputs.stop.exit_code().is_some() {
                 return Ok(None);

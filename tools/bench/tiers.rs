@@ -4,9 +4,10 @@
 //! by step they train on the same views. Prints one line of JSON for each.
 
 use super::demand::{Demand, page_bytes};
+use super::statistics::{extend, median};
 use clap::Parser;
 use gsscale::base::error::InputError;
-use gsscale::base::machine::process_cpu_seconds;
+use gsscale::base::machine::process_cpu_split;
 use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides};
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::loader::Dataset;
@@ -28,6 +29,9 @@ const EXAMPLES: &str = "\
 Examples:
   gsscale-bench tiers scans/city --spill-dir /mnt/nvme/bench --steps 600 --strategy none --view-order groups:25
   gsscale-bench tiers scans/city --spill-dir /mnt/nvme/bench --steps 600 --shares 10,5 --page-rows 256
+
+share_misses of the pages were not in memory when a step asked, of these share_absent not even on their way; where the
+pages of two steps in a row do not fit into the frames together, share_absent_least cannot be helped.
 
 Memory must hold the scene once for the run in memory and once for the sum of the shares. With --view-order auto all
 take the order that is chosen for the smallest share.";
@@ -66,7 +70,8 @@ struct Contender {
     before: PagerStats,
     demand: Demand,
     seconds: Vec<f64>,
-    cpu_seconds: f64,
+    /// User and system.
+    cpu_seconds: [f64; 2],
     rows: u64,
     rows_pinned: u64,
     last_loss: f64,
@@ -170,7 +175,7 @@ fn contender(
         trainer,
         tiers,
         seconds: Vec::new(),
-        cpu_seconds: 0.0,
+        cpu_seconds: [0.0; 2],
         rows: 0,
         rows_pinned: 0,
         last_loss: 0.0,
@@ -208,11 +213,13 @@ impl Contender {
             let view = self.trainer.next_view();
             self.demand.steps.push(self.trainer.scene.pager.pages_of_view(&dataset.views[view].camera));
         }
-        let (began, cpu) = (Instant::now(), process_cpu_seconds());
+        let (began, cpu) = (Instant::now(), process_cpu_split());
         let outcome = self.trainer.step(dataset, targets)?;
         if measures {
             self.seconds.push(began.elapsed().as_secs_f64());
-            self.cpu_seconds += process_cpu_seconds().zip(cpu).map_or(0.0, |(after, before)| after - before);
+            if let (Some(after), Some(before)) = (process_cpu_split(), cpu) {
+                (0..2).for_each(|i| self.cpu_seconds[i] += after[i] - before[i]);
+            }
             self.rows += outcome.rows as u64;
             self.rows_pinned += outcome.rows_pinned as u64;
         }
@@ -224,6 +231,7 @@ impl Contender {
     fn line(&self, in_memory: &Contender, facts: &Value) -> Value {
         let steps = self.seconds.len().max(1) as f64;
         let sum = |of: &Contender| of.seconds.iter().sum::<f64>();
+        let cpu = |of: &Contender| of.cpu_seconds[0] + of.cpu_seconds[1];
         let pager = &self.trainer.scene.pager;
         let (now, before) = (pager.stats(), self.before);
         let needed = (now.pages_needed - before.pages_needed).max(1) as f64;
@@ -233,11 +241,12 @@ impl Contender {
         let mut line = json!({
             "share_percent": self.share, "frames": self.share.map(|_| now.frames_max), "engine": self.tiers.engine,
             "seconds_per_step_median": median(self.seconds.iter().copied()),
-            "seconds_per_step": sum(self) / steps, "cpu_seconds_per_step": self.cpu_seconds / steps,
+            "seconds_per_step": sum(self) / steps, "cpu_seconds_per_step": cpu(self) / steps,
+            "cpu_system_seconds_per_step": self.cpu_seconds[1] / steps,
             "ratio_of_medians": median(self.seconds.iter().copied()) / median(in_memory.seconds.iter().copied()),
             "median_of_ratios": median(ratios),
             "ratio_of_sums": sum(self) / sum(in_memory),
-            "cpu_ratio": self.cpu_seconds / in_memory.cpu_seconds,
+            "cpu_ratio": cpu(self) / cpu(in_memory),
             "overfetch": self.rows_pinned as f64 / self.rows.max(1) as f64,
             "rows_per_step": self.rows as f64 / steps,
             "same_last_loss": self.last_loss.to_bits() == in_memory.last_loss.to_bits(),
@@ -253,6 +262,8 @@ impl Contender {
                 "pages_over_belady": bound.map(|(pages, _)| pages_read as f64 / pages.max(1) as f64),
                 "bytes_over_belady": bound.map(|(_, bytes)| bytes_read as f64 / bytes.max(1) as f64),
                 "share_misses": (now.misses - before.misses) as f64 / needed,
+                "share_absent": (now.absent - before.absent) as f64 / needed,
+                "share_absent_least": self.demand.fewest_absent(now.frames_max) as f64 / needed,
                 "share_late_misses": (now.late_misses - before.late_misses) as f64 / needed,
                 "stall_seconds": now.stall_seconds - before.stall_seconds,
             });
@@ -261,18 +272,4 @@ impl Contender {
         extend(&mut line, facts);
         line
     }
-}
-
-fn extend(line: &mut Value, more: &Value) {
-    if let (Some(line), Some(more)) = (line.as_object_mut(), more.as_object()) {
-        line.extend(more.clone());
-    }
-}
-
-/// Of at least one value; 0 of none.
-fn median(values: impl Iterator<Item = f64>) -> f64 {
-    let mut sorted: Vec<f64> = values.collect();
-    sorted.sort_unstable_by(f64::total_cmp);
-    let (low, high) = (sorted.get((sorted.len().max(1) - 1) / 2), sorted.get(sorted.len() / 2));
-    low.zip(high).map_or(0.0, |(low, high)| (low + high) / 2.0)
 }

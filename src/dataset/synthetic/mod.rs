@@ -54,6 +54,9 @@ pub struct CityOptions {
     pub noise: f64,
     /// Rays per pixel and direction where surfaces meet: 3 casts 3x3. 1 to 8.
     pub supersample: u32,
+    /// The city is repeated so many times along x and y, 1 to 100 each, and every photo is put into one of the copies in
+    /// turn (it shows no neighbour of its copy, which the points have): as many points as wanted, in bounded memory.
+    pub tiles: [u32; 2],
     /// Added to all coordinates, metres: (500000, 4600000, 0) makes them look like UTM.
     pub offset: [f64; 3],
     /// Replace a scene that is already in the folder.
@@ -72,6 +75,7 @@ impl Default for CityOptions {
             exposure: 0.0,
             noise: 0.0,
             supersample: 3,
+            tiles: [1, 1],
             offset: [0.0; 3],
             overwrite: false,
         }
@@ -86,7 +90,7 @@ pub struct CitySummary {
     /// Photos written.
     pub views: u32,
     /// Points written.
-    pub points: u32,
+    pub points: u64,
     /// Entries of all tracks.
     pub observations: u64,
     /// Side of the city in blocks.
@@ -115,6 +119,7 @@ fn check(options: &CityOptions) -> InputResult<()> {
     in_range("--exposure", options.exposure, 0.0, 0.3)?;
     in_range("--noise", options.noise, 0.0, 0.3)?;
     in_range("--supersample", f64::from(options.supersample), 1.0, 8.0)?;
+    options.tiles.iter().try_for_each(|&n| in_range("--tile", f64::from(n), 1.0, 100.0))?;
     options.offset.iter().try_for_each(|&v| in_range("--offset", v, -1e9, 1e9))
 }
 
@@ -134,23 +139,26 @@ pub fn write_city(
     let rays = write_photos(folder, options, &flight, &scene, progress)?;
     let points = points::sample(&scene, &flight, options);
     let offset = DVec3::from(options.offset);
-    let images = flight.shots.iter().enumerate();
-    let model = Model {
-        intrinsics: flight.intrinsics,
-        images: images.map(|(k, s)| ModelImage { name: photo_name(k, options.views), pose: s.pose(offset) }).collect(),
-        points,
-    };
+    let tiles = tiles(options.tiles, 2.0 * scene.world.half());
+    let pose = |k: usize| flight.shots[k].pose(offset + DVec3::from(tiles[k % tiles.len()]));
+    let images = (0..flight.shots.len()).map(|k| ModelImage { name: photo_name(k, options.views), pose: pose(k) });
+    let model = Model { intrinsics: flight.intrinsics, images: images.collect(), points, tiles };
     write_model(&folder.join("sparse"), &model)?;
     Ok(CitySummary {
         folder: folder.to_path_buf(),
         views: options.views,
-        points: model.points.len() as u32,
+        points: (model.points.len() * model.tiles.len()) as u64,
         observations: model.points.iter().map(|p| p.observations.len() as u64).sum(),
         blocks: flight.blocks,
         side: 2.0 * scene.world.half(),
         solids: scene.world.solids.len() as u32,
         rays,
     })
+}
+
+/// Where the copies of the city are.
+fn tiles([across, along]: [u32; 2], side: f64) -> Vec<[f64; 3]> {
+    (0..across * along).map(|k| [f64::from(k % across) * side, f64::from(k / across) * side, 0.0]).collect()
 }
 
 /// Name of a photo; names sort in the order of the flight.

@@ -1,0 +1,115 @@
+//! The fewest pages that any cache could have read for the steps so far, kept up as they happen.
+//!
+//! A page that is needed at two steps and at none between is either kept all the time between them, or read again.
+//! Keeping it takes a frame at every step in between, beside the pages that these steps need. The most such intervals
+//! that fit into the frames are found by taking them by their ends, the shorter of equal ends first, and keeping each
+//! that still fits: an interval that is left out could only take the place of one that ends no earlier. (Jain and Lin,
+//! "Back to the Future: Leveraging Belady's Algorithm for Improved Cache Replacement", ISCA 2016, do it for one access at
+//! a time.) So Belady's bound needs no knowledge of the future, only of the past.
+//!
+//! Invariants: 1. what is counted is never more than any cache of that many frames reads, and one that knows the future
+//! reads as much; 2. memory grows with the pages and with the steps since the last one that left no frame free.
+
+use crate::base::ids::PageNo;
+use std::collections::VecDeque;
+
+/// Never in memory so far.
+const ABSENT: u32 = u32::MAX;
+
+/// The bound so far.
+#[derive(Debug, Clone, Default)]
+pub struct FewestReads {
+    /// By page: the step that last had it, counted here.
+    last_use: Vec<u32>,
+    /// Frames taken at the steps from `first` on: by the pages that were needed, and by those that are kept for later.
+    taken: VecDeque<u32>,
+    /// Steps before it have no frame to spare, or are of no interest because of one behind them that has none.
+    first: u32,
+    /// Pages read.
+    pages: u64,
+    /// Bytes read.
+    bytes: u64,
+    /// For the order in which the pages of a step are looked at.
+    order: Vec<(u32, PageNo, u64)>,
+}
+
+impl FewestReads {
+    /// Pages that had to be read.
+    pub fn pages(&self) -> u64 {
+        self.pages
+    }
+
+    /// Their bytes.
+    pub fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    /// A new page, made in memory: at the start, or by a split in the last step.
+    pub fn add(&mut self, page: PageNo) {
+        let now = (self.first + self.taken.len() as u32).saturating_sub(1);
+        self.set_last_use(page, now);
+    }
+
+    /// The next step needs these pages, each named once, with its bytes on the drive; the cache has `frames` frames.
+    pub fn step(&mut self, frames: usize, pages: impl Iterator<Item = (PageNo, u64)>) {
+        if self.first == 0 && self.taken.is_empty() {
+            // Step 0 made the first pages, and at step 1 those that were chosen are in the frames.
+            self.taken.extend([0, 0]);
+        }
+        let now = self.first + self.taken.len() as u32;
+        self.order.clear();
+        for (page, bytes) in pages {
+            let last = self.last_use.get(page.index()).copied().unwrap_or(ABSENT);
+            self.order.push((last, page, bytes));
+        }
+        // The latest first; those that were never there count as the oldest.
+        self.order.sort_unstable_by_key(|&(last, page, _)| (std::cmp::Reverse(last.wrapping_add(1)), page));
+        let needed = self.order.len();
+        let order = std::mem::take(&mut self.order);
+        for &(last, page, bytes) in &order {
+            if !self.keep(last, now, frames) {
+                self.pages += 1;
+                self.bytes += bytes;
+            }
+            self.set_last_use(page, now);
+        }
+        self.order = order;
+        self.taken.push_back(needed as u32);
+        if needed >= frames {
+            self.forget_until(now);
+        }
+    }
+
+    /// Keeps a page between two steps, if there is a frame for it all the time.
+    fn keep(&mut self, last: u32, now: u32, frames: usize) -> bool {
+        // A step without a frame to spare is before `first`; the page's own steps have one for it.
+        if last == ABSENT || last + 1 < self.first {
+            return false;
+        }
+        let mut full = None;
+        for step in last + 1..now {
+            let taken = &mut self.taken[(step - self.first) as usize];
+            *taken += 1;
+            if *taken as usize >= frames {
+                full = Some(step);
+            }
+        }
+        if let Some(step) = full {
+            self.forget_until(step);
+        }
+        true
+    }
+
+    /// Nothing can be kept across `step`.
+    fn forget_until(&mut self, step: u32) {
+        self.taken.drain(..(step + 1 - self.first) as usize);
+        self.first = step + 1;
+    }
+
+    fn set_last_use(&mut self, page: PageNo, step: u32) {
+        if self.last_use.len() <= page.index() {
+            self.last_use.resize(page.index() + 1, ABSENT);
+        }
+        self.last_use[page.index()] = step;
+    }
+}

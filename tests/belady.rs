@@ -1,0 +1,61 @@
+//! The bound that is kept up as steps happen is what the cache that knows the future reads.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+
+use gsscale::base::ids::PageNo;
+use gsscale::base::rng::{Purpose, Stream};
+use gsscale::schedule::bound::FewestReads;
+use gsscale::schedule::model::{CacheModel, Policy, StepChange};
+
+/// What the cache that knows the future reads, from empty or with pages of a choice of its own at the start.
+fn model(steps: &[Vec<PageNo>], frames: usize, pages: u32, is_warm: bool) -> u64 {
+    let next = |page: PageNo, from: usize| (from..steps.len()).find(|&s| steps[s].contains(&page)).map(|s| s as u32);
+    let mut cache = CacheModel::new(frames, Policy::Farthest);
+    let mut change = StepChange::default();
+    let mut read = 0;
+    let mut first: Vec<PageNo> = (0..pages).map(PageNo).collect();
+    first.sort_by_key(|&page| next(page, 0).unwrap_or(u32::MAX));
+    first.truncate(if is_warm { frames } else { 0 });
+    for (step, pages) in std::iter::once(&first).chain(steps).enumerate() {
+        cache.step(step as u32, pages, |page| next(page, step).map(|s| s + 1), &mut change).unwrap();
+        read += if step > 0 { change.admit.len() as u64 } else { 0 };
+    }
+    read
+}
+
+#[test]
+fn counts_what_the_cache_that_knows_the_future_reads() {
+    let mut draws = Stream::new(5, Purpose::Test, 1, 1);
+    for round in 0..300 {
+        let pages = 4 + draws.below(20) as u32;
+        let frames = 2 + draws.below(u64::from(pages)) as usize;
+        let steps: Vec<Vec<PageNo>> = (0..40)
+            .map(|_| {
+                let mut all: Vec<PageNo> = (0..pages).map(PageNo).collect();
+                let count = 1 + draws.below(frames.min(pages as usize) as u64) as usize;
+                (0..count).for_each(|i| all.swap(i, i + draws.below(u64::from(pages) - i as u64) as usize));
+                all.truncate(count);
+                all
+            })
+            .collect();
+        for is_warm in [false, true] {
+            let mut bound = FewestReads::default();
+            (0..if is_warm { pages } else { 0 }).for_each(|p| bound.add(PageNo(p)));
+            steps.iter().for_each(|pages| bound.step(frames, pages.iter().map(|&p| (p, 10))));
+            let want = model(&steps, frames, pages, is_warm);
+            assert_eq!((bound.pages(), bound.bytes()), (want, 10 * want), "round {round}, {frames} frames");
+        }
+    }
+}
+
+#[test]
+fn pages_made_in_memory_are_not_read() {
+    let mut bound = FewestReads::default();
+    bound.add(PageNo(0));
+    bound.step(2, [(PageNo(0), 1)].into_iter());
+    bound.add(PageNo(1));
+    bound.step(2, [(PageNo(0), 1), (PageNo(1), 1)].into_iter());
+    assert_eq!(bound.pages(), 0);
+    // Two frames are full, so nothing else was kept: the page is read.
+    bound.step(2, [(PageNo(2), 7)].into_iter());
+    assert_eq!((bound.pages(), bound.bytes()), (1, 7));
+}

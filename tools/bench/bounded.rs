@@ -1,0 +1,228 @@
+//! `gsscale-bench bounded`: a city far larger than the memory that the run gets, imported and trained by
+//! `gsscale-train` under a hard limit of `--host-mem` and a tenth.
+//!
+//! The city is drawn small and repeated side by side (`gsscale-synth --tile`), so it takes no memory here. Prints one line
+//! of JSON. Everything is written below one new folder, which is removed at the end.
+
+use super::memory_group::MemoryGroup;
+use clap::Parser;
+use gsscale::base::error::{InputError, InputResult};
+use gsscale::config::file::{ByteSize, TrainConfig};
+use gsscale::dataset::synthetic::{CityOptions, write_city};
+use gsscale::page::file_system::free_bytes;
+use gsscale::page::format::transfer_bytes;
+use gsscale::scene::page_layout::capacity_bytes;
+use gsscale::train::trainer::TrainError;
+use serde_json::{Value, json};
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitStatus, Stdio};
+use std::time::Instant;
+
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-bench bounded --dir /mnt/nvme/bounded                      20 million Gaussians in 2 GiB, 200 steps
+  gsscale-bench bounded --dir /mnt/nvme/bounded --gaussians max      as many as leave a fifth of the free drive free
+  gsscale-bench bounded --dir /mnt/nvme/bounded --gaussians 5000000 --host-mem 512MiB
+
+The limit is a memory control group of Linux (it takes a user who may make one, such as root); where there is none the
+line says so, and the peak that the run measured of itself is all there is. 20 million Gaussians take some 17 GB of the
+drive while it runs.";
+
+/// On the drive beside the pages, for each Gaussian: its point in the scene, and what an import sorts.
+const SCENE_BYTES: u64 = 51 + 120;
+/// Share of the free drive that `--gaussians max` uses.
+const DRIVE_SHARE: f64 = 0.8;
+
+/// Trains a city far larger than memory under a hard limit, and prints a line of JSON about what it took.
+#[derive(Parser)]
+#[command(name = "gsscale-bench bounded", version, after_help = EXAMPLES)]
+pub struct Args {
+    /// Folder to make on the drive; it must not exist, and is removed at the end
+    #[arg(long, value_name = "DIR")]
+    dir: PathBuf,
+    /// Gaussians, rounded down to whole copies of the city; or max: as many as leave a fifth of the free drive free
+    #[arg(long, default_value = "20000000", value_name = "N|max")]
+    gaussians: String,
+    /// Gaussians of the city that is repeated
+    #[arg(long, default_value_t = 1_000_000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    city: u32,
+    /// Photos
+    #[arg(long, default_value_t = 300, value_name = "N")]
+    views: u32,
+    /// Memory of the run
+    #[arg(long, default_value = "2GiB", value_name = "SIZE")]
+    host_mem: ByteSize,
+    /// Steps
+    #[arg(long, default_value_t = 200, value_name = "N")]
+    steps: u32,
+    /// Gaussians that a page holds
+    #[arg(long, default_value_t = 1024, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    page_rows: u32,
+}
+
+/// Measures.
+///
+/// # Errors
+/// The folder cannot be made, or the program beside this one cannot be started. A run that fails is a result.
+pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
+    if args.dir.symlink_metadata().is_ok() {
+        return Err(InputError::new(&args.dir, "exists already", "name a folder that does not").into());
+    }
+    std::fs::create_dir_all(&args.dir).map_err(|e| InputError::io(&args.dir, "making the folder", &e))?;
+    let scratch = Scratch(args.dir.clone());
+    let tiles = tiles(args)?;
+    let began = Instant::now();
+    let options = CityOptions {
+        views: args.views,
+        points: args.city,
+        width: 320,
+        height: 208,
+        supersample: 1,
+        tiles,
+        ..CityOptions::default()
+    };
+    let city = write_city(&args.dir.join("scene"), &options, &|_, _| {})?;
+    let city_seconds = began.elapsed().as_secs_f64();
+    let run = train(args)?;
+    let summary = read_summary(&args.dir.join("out/summary.json"));
+    drop(scratch);
+    let of = |key: &str| summary.get(key).cloned().unwrap_or(Value::Null);
+    let peak = summary["host_bytes_peak"].as_u64();
+    let share = summary["pages_pinned_max"].as_f64().zip(summary["pages"].as_f64()).map(|(most, all)| most / all);
+    print(&json!({
+        "gaussians": city.points, "pages": of("pages"), "state_bytes": state_bytes(args, city.points),
+        "largest_view_share_of_pages": share, "steps": of("steps"), "host_mem": args.host_mem.0,
+        "limit_bytes": limit(args), "limited_by": run.limited_by, "no_limit_because": run.no_limit_because,
+        "finished": of("finished"), "exit_code": run.status.code(), "killed_by_signal": killed_by(&run.status),
+        "host_bytes_peak": peak, "group_bytes_peak": run.group_peak,
+        "is_bounded": run.status.success() && peak.is_some_and(|peak| peak <= limit(args)),
+        "train_seconds": of("train_seconds"), "stall_seconds": of("stall_seconds"), "frames": of("frames"),
+        "bytes_read": of("bytes_read"), "bytes_written": of("bytes_written"), "psnr": summary["test"]["psnr"],
+        "run_seconds": run.seconds, "city_seconds": city_seconds, "said": run.last_words,
+        "version": env!("CARGO_PKG_VERSION"),
+    }));
+    Ok(())
+}
+
+/// A tenth above what the run was promised.
+fn limit(args: &Args) -> u64 {
+    args.host_mem.0 + args.host_mem.0 / 10
+}
+
+fn state_bytes(args: &Args, gaussians: u64) -> u64 {
+    let degree = TrainConfig::default().sh_degree;
+    let page = transfer_bytes(capacity_bytes(args.page_rows as usize, degree)) as u64;
+    gaussians.div_ceil(u64::from(args.page_rows)) * page
+}
+
+/// How often the city is repeated along each side, as nearly square as it goes.
+fn tiles(args: &Args) -> InputResult<[u32; 2]> {
+    let wanted = match args.gaussians.as_str() {
+        "max" => {
+            let io = |e: std::io::Error| InputError::io(&args.dir, "asking for the free space", &e);
+            let unknown = || InputError::new(&args.dir, "the system does not tell what is free", "give --gaussians");
+            let free = free_bytes(&args.dir).map_err(io)?.ok_or_else(unknown)?;
+            let each = state_bytes(args, 1_000_000) as f64 / 1e6 + SCENE_BYTES as f64;
+            (free as f64 * DRIVE_SHARE / each) as u64
+        }
+        text => text.parse().map_err(|_| {
+            InputError::new("--gaussians", format!("'{text}' is no number"), "write for example 20000000, or max")
+        })?,
+    };
+    let copies = (wanted / u64::from(args.city)).min(10_000) as u32;
+    if copies == 0 {
+        let problem = format!("{wanted} Gaussians are fewer than the {} of one copy", args.city);
+        return Err(InputError::new("--gaussians", problem, "give more, or a smaller --city"));
+    }
+    // Nearly as many as wanted, of nearly square shape: the best of the widths up to the root.
+    let most = (f64::from(copies).sqrt() as u32).max(1);
+    let across = (most.div_ceil(2)..=most).max_by_key(|across| (copies / across * across, *across)).unwrap_or(1);
+    Ok([across, copies / across])
+}
+
+/// How the program ended.
+struct Run {
+    status: ExitStatus,
+    limited_by: Option<&'static str>,
+    no_limit_because: Option<String>,
+    group_peak: Option<u64>,
+    seconds: f64,
+    last_words: Option<String>,
+}
+
+fn train(args: &Args) -> InputResult<Run> {
+    let program = trainer()?;
+    let path = |name: &str| args.dir.join(name).into_os_string();
+    let flags = [
+        ("--out", path("out")),
+        ("--spill-dir", path("pages")),
+        ("--host-mem", args.host_mem.0.to_string().into()),
+        ("--steps", args.steps.to_string().into()),
+        ("--page-rows", args.page_rows.to_string().into()),
+        ("--sh-start", "3".into()),
+        ("--strategy", "none".into()),
+        ("--device", "cpu".into()),
+        // The state is on the drive once, not once for each commit.
+        ("--commit-every", "0".into()),
+    ];
+    let mut arguments: Vec<OsString> = vec![path("scene"), "--quiet".into()];
+    arguments.extend(flags.into_iter().flat_map(|(flag, value)| [flag.into(), value]));
+    let group = MemoryGroup::new(limit(args));
+    let mut command = match &group {
+        Ok(group) => group.command(&program, &arguments),
+        Err(_) => {
+            let mut command = Command::new(&program);
+            command.args(&arguments);
+            command
+        }
+    };
+    let began = Instant::now();
+    let output = command.stdout(Stdio::null()).stderr(Stdio::piped()).output();
+    let output = output.map_err(|e| InputError::io(&program, "starting the trainer", &e))?;
+    let said = String::from_utf8_lossy(&output.stderr).trim().to_string();
+    Ok(Run {
+        status: output.status,
+        limited_by: group.as_ref().ok().map(MemoryGroup::name),
+        group_peak: group.as_ref().ok().and_then(MemoryGroup::peak_bytes),
+        no_limit_because: group.err(),
+        seconds: began.elapsed().as_secs_f64(),
+        last_words: (!said.is_empty()).then_some(said),
+    })
+}
+
+/// `gsscale-train` beside this program.
+fn trainer() -> InputResult<PathBuf> {
+    let own = std::env::current_exe().map_err(|e| InputError::io("gsscale-bench", "finding itself", &e))?;
+    let program = own.with_file_name(format!("gsscale-train{}", std::env::consts::EXE_SUFFIX));
+    if program.is_file() {
+        return Ok(program);
+    }
+    Err(InputError::new(&program, "is not there", "build all programs: cargo build --release"))
+}
+
+fn read_summary(path: &Path) -> Value {
+    let text = std::fs::read_to_string(path).unwrap_or_default();
+    serde_json::from_str(&text).unwrap_or(Value::Null)
+}
+
+#[cfg(unix)]
+fn killed_by(status: &ExitStatus) -> Option<i32> {
+    std::os::unix::process::ExitStatusExt::signal(status)
+}
+
+#[cfg(not(unix))]
+fn killed_by(_status: &ExitStatus) -> Option<i32> {
+    None
+}
+
+/// The folder that was made, removed however this ends.
+struct Scratch(PathBuf);
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        if let Err(error) = std::fs::remove_dir_all(&self.0) {
+            eprintln!("warning: {} could not be removed: {error}", self.0.display());
+        }
+    }
+}

@@ -1,0 +1,222 @@
+//! `gsscale-bench touched`: how fast forwarding and the optimizer go through the bytes that they touch, beside a plain
+//! copy on the same machine.
+//!
+//! Forwarding (a step's gather) reads value and both moments of every listed row, moves the value to now and writes it into
+//! the working set; the optimizer reads these and a gradient, and writes all three. That is 4 and 7 floats a parameter.
+//! Rows lie in pages as in a run. The three are timed in turns, so that whatever else the machine does hits them alike.
+//! Prints one line of JSON for each share of rows that is listed.
+
+use super::statistics::median;
+use clap::Parser;
+use gsscale::base::error::InputError;
+use gsscale::base::rng::{Purpose, Stream};
+use gsscale::config::file::TrainOverrides;
+use gsscale::config::limits::RunOptions;
+use gsscale::paging::pager::{Pager, PagerConfig};
+use gsscale::paging::pinned::PinnedPage;
+use gsscale::scene::columns::{Column, Columns, row_width};
+use gsscale::train::catch_up::gather;
+use gsscale::train::pages::{PagedScene, numbered};
+use gsscale::train::trainer::TrainError;
+use rayon::prelude::*;
+use serde_json::{Value, json};
+use std::hint::black_box;
+use std::path::PathBuf;
+use std::time::Instant;
+
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-bench touched
+  gsscale-bench touched --rows 2000000 --rounds 21 --listed 100,65,10 --threads 1
+
+65 % is about what views list of the rows in their pages. The copy is one of each thread's own floats, as many bytes in all
+as the optimizer touches; bytes read and bytes written both count.";
+
+/// Steps from the oldest stamp to now: rows sleep that long at most.
+const SLEEP_STEPS: u32 = 500;
+
+/// Times forwarding and the optimizer against a plain copy, and prints a line of JSON for each share of rows.
+#[derive(Parser)]
+#[command(name = "gsscale-bench touched", version, after_help = EXAMPLES)]
+pub struct Args {
+    /// Rows
+    #[arg(long, default_value_t = 500_000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    rows: u32,
+    /// Times that each is measured
+    #[arg(long, default_value_t = 15, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    rounds: u32,
+    /// Rows that a step lists, in percent
+    #[arg(long, value_delimiter = ',', default_value = "100,65", value_name = "P")]
+    listed: Vec<f64>,
+    /// Config file; flags override it
+    #[arg(long)]
+    config: Option<PathBuf>,
+    #[command(flatten)]
+    keys: TrainOverrides,
+}
+
+/// Pages of random rows, all with a past.
+struct World {
+    scene: PagedScene,
+    pages: Vec<PinnedPage>,
+    degree: u8,
+    step: u32,
+}
+
+/// Measures.
+///
+/// # Errors
+/// Bad input.
+pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
+    let mut config = super::settle(args.config.as_deref(), &args.keys)?;
+    if let Some(share) = args.listed.iter().find(|s| !(**s > 0.0 && **s <= 100.0)) {
+        let problem = format!("{share} is no share");
+        return Err(InputError::new("--listed", problem, "write for example 100,65").into());
+    }
+    // All bands are in use, and no row grows.
+    config.sh_start = config.sh_degree;
+    config.strategy = "none".to_string();
+    let mut world = World::new(args.rows as usize, &RunOptions::new(&config, 1.0))?;
+    for &share in &args.listed {
+        let rows = listed(args.rows, share / 100.0);
+        let line = world.measure(&rows, args.rounds);
+        let mut line = line;
+        let facts = json!({
+            "listed_percent": share, "rows_listed": rows.len(), "rows": args.rows, "page_rows": config.page_rows,
+            "sh_degree": world.degree, "rounds": args.rounds, "threads": rayon::current_num_threads(),
+            "simd": gsscale::config::limits::simd_path(&config).name(), "version": env!("CARGO_PKG_VERSION"),
+        });
+        super::statistics::extend(&mut line, &facts);
+        print(&line);
+    }
+    Ok(())
+}
+
+/// A share of the rows, drawn.
+fn listed(rows: u32, share: f64) -> Vec<u32> {
+    let mut draws = Stream::new(1, Purpose::Test, 7, 7);
+    (0..rows).filter(|_| draws.uniform() < share).collect()
+}
+
+fn random_columns(rows: usize, degree: u8, scale: f64, number: u64) -> Columns {
+    let mut columns = Columns::zeros(rows, degree);
+    for (i, column) in Column::ALL.into_iter().enumerate() {
+        columns.column_mut(column).par_chunks_mut(1 << 14).enumerate().for_each(|(chunk, values)| {
+            let mut draws = Stream::new(number, Purpose::Test, i as u64, chunk as u64);
+            values.iter_mut().for_each(|x| *x = draws.range(-scale, scale) as f32);
+        });
+    }
+    columns
+}
+
+impl World {
+    fn new(rows: usize, options: &RunOptions) -> Result<World, TrainError> {
+        let degree = options.sh_degree;
+        let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, degree));
+        let mut scene = PagedScene::new(&random_columns(rows, degree, 1.0, 1), pager, options)?;
+        let all: Vec<_> = (0..scene.pager.index().len() as u32).map(gsscale::base::ids::PageNo).collect();
+        let pages = scene.pager.acquire_pages(&all)?;
+        let mut world = World { scene, pages, degree, step: 0 };
+        // Every row gets a past, a different one for every page.
+        let everything: Vec<u32> = (0..rows as u32).collect();
+        let gradients = random_columns(rows, degree, 1e-3, 2);
+        world.optimize(&everything, &gradients);
+        let mut draws = Stream::new(1, Purpose::Test, 8, 8);
+        for page in &mut world.pages {
+            let count = page.meta.rows as usize;
+            let stamps = page.rows_mut(0).stamp;
+            (0..count).for_each(|row| stamps[row] = 1 + draws.below(u64::from(SLEEP_STEPS)) as u32);
+        }
+        world.step = SLEEP_STEPS + 1;
+        Ok(world)
+    }
+
+    /// The optimizer's step on listed rows, page by page in parallel, as a training step does it.
+    fn optimize(&mut self, rows: &[u32], gradients: &Columns) {
+        let at = self.scene.rules.adam.at(self.step);
+        let (mut rest, mut grads, mut first_row) = (rows, gradients.view(), 0);
+        let mut shares = Vec::with_capacity(self.pages.len());
+        for page in &mut self.pages {
+            let first = first_row;
+            first_row += page.meta.rows as usize;
+            let count = rest.partition_point(|&row| (row as usize) < first_row);
+            let (own, rest_rows) = rest.split_at(count);
+            let (own_grads, rest_grads) = grads.split_at(count);
+            shares.push((page, first, own, own_grads));
+            (rest, grads) = (rest_rows, rest_grads);
+        }
+        shares.into_par_iter().for_each(|(page, first, own, own_grads)| {
+            at.step_rows(page.rows_mut(first), own, own_grads);
+        });
+        self.step += 1;
+    }
+
+    fn measure(&mut self, rows: &[u32], rounds: u32) -> Value {
+        let parameters = (rows.len() * row_width(self.degree)) as f64;
+        // Values, moments and gradients, and the stamps.
+        let stamps = 4.0 * rows.len() as f64;
+        let touched = [4.0 * 4.0 * parameters + stamps, 7.0 * 4.0 * parameters + 2.0 * stamps];
+        let gradients = random_columns(rows.len(), self.degree, 1e-3, 3);
+        let mut out = Columns::zeros(0, self.degree);
+        let mut copy = PlainCopy::new(touched[1] as usize / 8);
+        let mut rates: [Vec<f64>; 3] = Default::default();
+        // The first round takes memory from the system and is not counted.
+        for round in 0..=rounds {
+            let seconds = [
+                timed(|| {
+                    let tables = numbered(&self.pages);
+                    gather(&tables, self.degree, &self.scene.rules.adam, self.step, rows, &mut out);
+                    black_box(&out);
+                }),
+                timed(|| self.optimize(rows, &gradients)),
+                timed(|| copy.run()),
+            ];
+            if round > 0 {
+                let bytes = [touched[0], touched[1], copy.bytes()];
+                (0..3).for_each(|i| rates[i].push(bytes[i] / seconds[i]));
+            }
+        }
+        let [forwarding, optimizer, plain] = &rates;
+        let ratio = |of: &[f64]| median(of.iter().zip(plain).map(|(own, plain)| own / plain));
+        json!({
+            "forwarding_bytes_per_second": median(forwarding.iter().copied()),
+            "optimizer_bytes_per_second": median(optimizer.iter().copied()),
+            "copy_bytes_per_second": median(plain.iter().copied()),
+            "forwarding_over_copy": ratio(forwarding), "optimizer_over_copy": ratio(optimizer),
+            "both_over_copy": median((0..plain.len()).map(|i| {
+                let seconds = touched[0] / forwarding[i] + touched[1] / optimizer[i];
+                (touched[0] + touched[1]) / seconds / plain[i]
+            })),
+        })
+    }
+}
+
+fn timed(work: impl FnOnce()) -> f64 {
+    let began = Instant::now();
+    work();
+    began.elapsed().as_secs_f64()
+}
+
+/// A copy of floats, one stretch for each thread.
+struct PlainCopy {
+    pairs: Vec<(Vec<f32>, Vec<f32>)>,
+}
+
+impl PlainCopy {
+    /// Of this many floats in all.
+    fn new(floats: usize) -> PlainCopy {
+        let threads = rayon::current_num_threads();
+        let each = floats.div_ceil(threads).max(1);
+        PlainCopy { pairs: (0..threads).map(|_| (vec![1.0; each], vec![0.0; each])).collect() }
+    }
+
+    /// Read and written.
+    fn bytes(&self) -> f64 {
+        self.pairs.iter().map(|(from, _)| 8.0 * from.len() as f64).sum()
+    }
+
+    fn run(&mut self) {
+        self.pairs.par_iter_mut().for_each(|(from, to)| to.copy_from_slice(black_box(from)));
+        black_box(&self.pairs);
+    }
+}
