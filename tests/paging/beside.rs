@@ -85,7 +85,7 @@ fn run_with_commits(seed: u64, frames: usize, codec: Codec, faults: &Faults) -> 
             }
             Some(_) if draws.below(24) == 0 => {
                 run.pager.flush()?;
-                run.pager.commit(&mut commits, b"state", b"").unwrap();
+                run.pager.commit(&mut commits, b"state", b"", None).unwrap();
                 last = Some(run.model.clone());
                 cut = None;
             }
