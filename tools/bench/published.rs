@@ -37,7 +37,7 @@ the standard output, and into OUT/published.json and OUT/published.html.";
 #[derive(Parser)]
 #[command(name = "gsscale-bench run", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// Name of a published run, or a config file with [published]
+    /// Name of a published run, or a config file with a table published
     run: PathBuf,
     /// Folder of the dataset
     #[arg(long, value_name = "DIR")]
