@@ -110,15 +110,10 @@ mod tests {
         RunRecord { key: key.into(), problem: problem.map(str::to_string), ..RunRecord::default() }
     }
 
-    fn folder() -> PathBuf {
-        let folder = std::env::temp_dir().join(format!("gsscale-results-{}-{}", std::process::id(), line!()));
-        std::fs::create_dir_all(&folder).unwrap();
-        folder
-    }
-
     #[test]
     fn a_file_cut_at_any_byte_keeps_its_whole_lines_and_takes_more() {
-        let path = folder().join("cut.jsonl");
+        let folder = tempfile::TempDir::new().unwrap();
+        let path = folder.path().join("cut.jsonl");
         let mut log = ResultsLog::open(&path).unwrap();
         ["a", "b"].iter().for_each(|key| log.append(record(key, None)).unwrap());
         drop(log);
@@ -139,7 +134,8 @@ mod tests {
 
     #[test]
     fn failed_runs_are_not_done_and_broken_lines_are_named() {
-        let path = folder().join("failed.jsonl");
+        let folder = tempfile::TempDir::new().unwrap();
+        let path = folder.path().join("failed.jsonl");
         let mut log = ResultsLog::open(&path).unwrap();
         log.append(record("a", Some("no memory"))).unwrap();
         assert!(log.done("a").is_none());

@@ -175,7 +175,7 @@ impl Knobs<'_> {
         }
         let caps = match config.max_gaussians {
             0 => [start * 3 / 2, start * 3, start * 6],
-            cap => [cap / 2, cap / 4, cap * 2],
+            cap => [cap / 2, cap / 4 * 3, cap.saturating_mul(2)],
         };
         let cap = |n: u64| {
             let mut planned = self.named("cap", &n.to_string());
