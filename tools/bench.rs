@@ -20,6 +20,7 @@ mod tiers;
 #[path = "bench/touched.rs"]
 mod touched;
 
+use clap::Parser;
 use gsscale::base::error::InputError;
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::config::limits::simd_path;
@@ -46,7 +47,7 @@ fn main() -> ExitCode {
     } else if named("orders") {
         orders::start(&parse_arguments(&arguments), &mut print)
     } else if named("bounded") {
-        bounded::start(&parse_arguments(&arguments), &mut print)
+        bounded::start(&bounded::Args::parse_from(&arguments), &mut print)
     } else if named("sizes") {
         sizes::start(&parse_arguments(&arguments), &mut print)
     } else if named("touched") {

@@ -55,11 +55,11 @@ impl Demand {
     /// Pages that no reading ahead could have brought in time: where the pages of two steps in a row do not fit into the
     /// frames together, the second's wait until the first's may leave.
     pub fn fewest_absent(&self, frames: usize) -> u64 {
-        let mut both = BTreeSet::new();
+        let mut both: BTreeSet<PageNo> = BTreeSet::new();
         let mut absent = 0;
         for pair in self.steps.windows(2) {
             both.clear();
-            both.extend(pair.iter().flatten());
+            both.extend(pair.iter().flatten().copied());
             absent += both.len().saturating_sub(frames) as u64;
         }
         absent
