@@ -67,7 +67,7 @@ fn main() -> ExitCode {
     } else if named("orders") {
         orders::start(&parse_arguments(&arguments), &mut print)
     } else if named("bounded") {
-        bounded::start(&parse_arguments(&arguments), &mut print)
+        bounded::start(&bounded::Args::parse_from(&arguments), &mut print)
     } else if named("sizes") {
         sizes::start(&parse_arguments(&arguments), &mut print)
     } else if named("touched") {
