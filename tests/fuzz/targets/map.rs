@@ -5,7 +5,7 @@ use super::with_mode;
 use crate::Target;
 use gsscale::base::ids::PageId;
 use gsscale::cache::evict::EvictPolicy;
-use gsscale::checkpoint::run_state::{DatasetPrint, RunState};
+use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, RunState, TrafficSoFar, ViewPrint};
 use gsscale::densify::stats::GradHistogram;
 use gsscale::page::codec::Codec;
 use gsscale::page::commit::{CommitConfig, Commits, Cut, MAP_NAME, PageChange, WITNESS_NAME};
@@ -193,7 +193,7 @@ fn use_pages(mut opened: Opened, without: bool) {
     let Ok(mut pager) = Pager::open(PAGES, store, &opened.pages, 2) else { return };
     assert!(pager.index().iter().all(|meta| meta.rows > 0));
     if pager.flush().is_ok() {
-        let _ = pager.commit(&mut opened.commits, b"", b"");
+        let _ = pager.commit(&mut opened.commits, b"", b"", None);
     }
 }
 
@@ -210,7 +210,14 @@ fn sample() -> RunState {
         simd: "avx2".to_string(),
         device: "cpu".to_string(),
         sh_degree_start: 0,
-        dataset: DatasetPrint { views: vec![5, u64::MAX], first_rows: 7, scene_scale: 1.25 },
+        dataset: DatasetPrint {
+            views: vec![ViewPrint { pose: 5, photo: u64::MAX }],
+            first_rows: 7,
+            points: 3,
+            scene_scale: 1.25,
+            origin: [5e5, -1.0, 0.0],
+            scale: 2.5,
+        },
         events,
         histogram: vec![(3, 1), (32767, 9)],
         rows: 10,
@@ -220,6 +227,8 @@ fn sample() -> RunState {
         steps_skipped_in_a_row: 1,
         train_seconds: 0.1,
         metrics_bytes: 1234,
+        test: Some(LastTest { step: 8, views: 2, psnr: 20.5, ssim: 0.75 }),
+        traffic: TrafficSoFar { bytes_read: 9, ..TrafficSoFar::default() },
     }
 }
 
@@ -234,7 +243,7 @@ fn check_state(state: &RunState) {
 pub fn run_state() -> Target {
     let state = sample().to_bytes().unwrap();
     let mut long = sample();
-    long.dataset.views = (0..300).collect();
+    long.dataset.views = (0..300).map(|pose| ViewPrint { pose, photo: 1 }).collect();
     long.config = "a = 1\n".repeat(100);
     let texts = (7u64, vec!["abc".to_string(), "d".to_string()], Some(vec![1u8, 2]));
     let seeds = vec![
