@@ -141,10 +141,11 @@ pub trait Renderer: Send {
     /// Host memory held for views, bytes.
     fn host_bytes(&self) -> u64;
 
-    /// Renders `rows` as seen by `camera`.
+    /// Renders `rows` as seen by `camera`. A device may still be at it when this returns.
     ///
     /// # Errors
-    /// When the view is too large or does not fit the rows.
+    /// When the view is too large or does not fit the rows. What a device fails at later is an error of the call that
+    /// needs the result.
     fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError>;
 
     /// The picture of the last forward pass.
