@@ -122,12 +122,13 @@ fn touched_bytes_are_timed_beside_a_copy() {
 fn a_city_larger_than_memory_trains_under_a_hard_limit() {
     let folder = TempDir::new().unwrap();
     let dir = folder.path().join("bounded");
-    let sizes = ["--gaussians", "120000", "--city", "20000", "--views", "24", "--steps", "12", "--page-rows", "256"];
-    let lines = lines(&[&["bounded", "--dir", text(&dir), "--host-mem", "96MiB"][..], &sizes].concat());
+    let sizes = ["--gaussians", "240000", "--city", "20000", "--views", "24", "--steps", "12", "--page-rows", "128"];
+    let lines = lines(&[&["bounded", "--dir", text(&dir), "--host-mem", "128MiB"][..], &sizes].concat());
     let [line] = &lines[..] else { panic!("{lines:?}") };
-    assert_eq!((number(line, "gaussians"), number(line, "steps")), (120_000.0, 12.0), "{line}");
+    assert_eq!((number(line, "gaussians"), number(line, "steps")), (240_000.0, 12.0), "{line}");
     assert!(line["is_bounded"] == true && line["finished"] == true, "{line}");
     assert_ne!(line["limited_by"].is_null(), line["no_limit_because"].is_null(), "{line}");
+    assert!(number(line, "state_bytes") > number(line, "limit_bytes"), "{line}");
     assert!(number(line, "host_bytes_peak") <= number(line, "limit_bytes"), "{line}");
     assert!(!dir.exists(), "all of it is removed");
 }

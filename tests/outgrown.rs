@@ -67,13 +67,16 @@ fn a_run_that_outgrows_its_frames_says_so_keeps_what_it_has_and_goes_on_with_mor
     assert!(stopped["finished"] == false && steps > 30, "{stopped}");
     let kept = std::fs::read(out.join("point_cloud.ply")).unwrap();
     assert!(kept.len() > 62 * 4 * 6000, "the last good state is written");
-    // As few as before are refused before anything happens.
+    // With as few as before it stops where it did, with the same Gaussians; more pages may have been cut meanwhile, whose
+    // rows come in another order.
     let output = train(&["--resume", text(&out), "--quiet"]);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
-    assert_eq!(std::fs::read(out.join("point_cloud.ply")).unwrap(), kept);
+    let again = std::fs::read(out.join("point_cloud.ply")).unwrap();
+    assert!(again.len() == kept.len() && again[..300] == kept[..300], "step and number of Gaussians are in the header");
     let output = train(&["--resume", text(&out), "--frames", &most.to_string(), "--quiet"]);
     assert!(output.status.success(), "{}", stderr(&output));
-    assert!(summary(&out)["finished"] == true && !spill.exists());
+    assert_eq!(summary(&out)["finished"], true);
+    assert!(spill.read_dir().map_or(true, |mut left| left.next().is_none()), "nothing is left of its pages");
     let [got, want] = [&out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
     assert!(got == want, "another scene than that of a run with enough frames");
 }
