@@ -1,11 +1,9 @@
-//! Time to open a store and to commit, on a real drive.
+//! Time to commit, on a real drive. (Opening a store, and what commits cost a run: `gsscale-bench commit`.)
 //!
-//! `cargo bench --bench commit` opens a store of 100,000 pages and commits 64 and 1,000 dirty pages of 728 KiB; numbers
-//! choose other counts of dirty pages. Files lie in the folder of temporary files (`TMPDIR`). Inside a test run it
-//! does the same with a few small pages.
+//! `cargo bench --bench commit` commits 64 and 1,000 dirty pages of 728 KiB; numbers choose other counts. Files lie in the
+//! folder of temporary files (`TMPDIR`). Inside a test run it does the same with a few small pages.
 //!
-//! Opening is everything between a closed store and the first read: the map verified, every value of it, generations and
-//! free slots. It reads no page. A commit is its writes, the sync of the segments, the map's transaction and the witness.
+//! A commit is its writes, the sync of the segments, the map's transaction and the witness.
 
 #![allow(clippy::expect_used)] // a benchmark that cannot run ends
 
@@ -16,11 +14,9 @@ use gsscale::page::codec::Codec;
 use gsscale::page::commit::{CommitConfig, CommitError, Commits, Cut, PageChange};
 use gsscale::page::engine::{IoEngine, open_engine};
 use gsscale::page::folder::DriveFolder;
-use gsscale::page::format::{SlotRef, StoredAs};
-use gsscale::page::memory_store::MemoryStore;
 use gsscale::page::paged_store::{PageMoved, PagedStore};
 use gsscale::page::slots::SlotLayout;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 use support::Args;
 
@@ -45,38 +41,6 @@ fn folder(name: &str) -> PathBuf {
 
 fn layout(capacity: usize) -> SlotLayout {
     SlotLayout::new(capacity, 1 << 16)
-}
-
-/// A store whose map names `pages` pages; their bytes do not exist.
-fn fill_map(at: &Path, pages: u32) -> Result<(), CommitError> {
-    let opened = Commits::create(Box::new(DriveFolder::new(at)), CONFIG)?;
-    let layout = layout(745_472);
-    let mut store = opened.paged_store(Box::new(MemoryStore::new()), layout, Codec::Raw)?;
-    let changes: Vec<PageChange> = (0..pages)
-        .map(|page| {
-            let (place, codec) = (layout.place(u64::from(page)), StoredAs::Raw);
-            let checksum = u128::from(page) << 64;
-            let slot = SlotRef { place, stored_bytes: 9, payload_bytes: 9, generation: 1, checksum, codec };
-            PageChange { page: PageId::initial(page), version: Some((slot, LABEL.to_vec())) }
-        })
-        .collect();
-    let mut commits = opened.commits;
-    let cut = Cut { changes: &changes, run_state: &[1; 4096], note: b"", pin: None };
-    commits.commit(&mut store, &mut Vec::new(), &cut)?;
-    Ok(())
-}
-
-/// Seconds to open a store of `pages` pages.
-pub fn open_seconds(pages: u32) -> Result<f64, CommitError> {
-    let at = folder("open");
-    fill_map(&at, pages)?;
-    let began = Instant::now();
-    let opened = Commits::open(Box::new(DriveFolder::new(&at)), CONFIG)?;
-    let store = opened.paged_store(Box::new(MemoryStore::new()), layout(745_472), Codec::Raw)?;
-    let seconds = began.elapsed().as_secs_f64();
-    assert_eq!((opened.pages.len(), store.slots().free() > 0), (pages as usize, true));
-    let _ = std::fs::remove_dir_all(at);
-    Ok(seconds)
 }
 
 fn write_pages(store: &mut PagedStore, pages: u32, bytes: usize) -> Vec<PageChange> {
@@ -125,11 +89,10 @@ pub fn commit_seconds(pages: u32, bytes: usize, times: usize) -> Result<CommitTi
     Ok(CommitTime { write, commit: support::median(measured.iter().map(|m| m.1)) })
 }
 
-/// Small sizes: opens and commits, and says whether times are times.
+/// Small sizes: commits, and says whether times are times.
 pub fn tiny() -> bool {
-    let open = open_seconds(300).expect("a store opens");
     let commit = commit_seconds(5, 5000, 3).expect("a store takes commits");
-    open > 0.0 && commit.write > 0.0 && commit.commit > 0.0
+    commit.write > 0.0 && commit.commit > 0.0
 }
 
 fn main() {
@@ -137,11 +100,6 @@ fn main() {
     if !args.real {
         assert!(tiny());
         return;
-    }
-    let pages = 100_000;
-    match open_seconds(pages) {
-        Ok(seconds) => println!("open {pages} pages: {seconds:.3} s"),
-        Err(error) => println!("open: {error}"),
     }
     let sizes = if args.sizes.is_empty() { vec![64, 1000] } else { args.sizes.clone() };
     for dirty in sizes {

@@ -13,10 +13,12 @@ use gsscale::config::limits::{RunOptions, simd_path};
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::page::codec::Codec;
-use gsscale::page::commit::{CommitConfig, CommitError, Commits, Cut, PageChange};
+use gsscale::page::commit::{CommitConfig, Commits, Cut, PageChange};
+use gsscale::page::engine::{IoEngine, open_engine};
 use gsscale::page::folder::DriveFolder;
 use gsscale::page::format::{SlotRef, StoredAs};
 use gsscale::page::memory_store::MemoryStore;
+use gsscale::page::segment_files::segment_file_name;
 use gsscale::page::slots::SlotLayout;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::page_layout::capacity_bytes;
@@ -173,15 +175,15 @@ fn take_steps(
     Ok((began.elapsed().as_secs_f64(), cpu, steps))
 }
 
-/// Seconds to open a store whose map names `pages` pages; their bytes do not exist, and none is read.
+/// Seconds to open a store whose map names `pages` pages; their segments are files of holes, and none is read.
 fn open_seconds(folder: &Path, pages: u32, config: &TrainConfig) -> Result<f64, TrainError> {
     std::fs::create_dir(folder).map_err(|e| InputError::io(folder, "making the folder", &e))?;
     let measured = fill_and_open(folder, pages, config);
     std::fs::remove_dir_all(folder).map_err(|e| InputError::io(folder, "removing", &e))?;
-    Ok(measured?)
+    measured
 }
 
-fn fill_and_open(at: &Path, pages: u32, config: &TrainConfig) -> Result<f64, CommitError> {
+fn fill_and_open(at: &Path, pages: u32, config: &TrainConfig) -> Result<f64, TrainError> {
     let of_commits = CommitConfig { store: 0xbe, cache_bytes: 8 << 20, reserve_bytes: 0 };
     let layout = SlotLayout::new(capacity_bytes(config.page_rows as usize, config.sh_degree), u64::from(pages));
     let opened = Commits::create(Box::new(DriveFolder::new(at)), of_commits)?;
@@ -198,8 +200,13 @@ fn fill_and_open(at: &Path, pages: u32, config: &TrainConfig) -> Result<f64, Com
     let cut = Cut { changes: &changes, run_state: &[1; 4096], note: b"", pin: None };
     commits.commit(&mut store, &mut Vec::new(), &cut)?;
     drop((commits, store));
+    for segment in 0..=layout.place(u64::from(pages - 1)).segment {
+        let file = at.join(segment_file_name(segment));
+        let made = std::fs::File::create(&file).and_then(|file| file.set_len(layout.segment_bytes()));
+        made.map_err(|e| InputError::io(&file, "making a segment", &e))?;
+    }
     let began = Instant::now();
     let opened = Commits::open(Box::new(DriveFolder::new(at)), of_commits)?;
-    opened.paged_store(Box::new(MemoryStore::new()), layout, Codec::Raw)?;
+    opened.paged_store(open_engine(IoEngine::Pread, at, 8)?.store, layout, Codec::Raw)?;
     Ok(began.elapsed().as_secs_f64())
 }
