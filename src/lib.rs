@@ -21,10 +21,10 @@
 //! | [`scene`] | Gaussians, cameras and images as data; first Gaussians from points; the log of global events |
 //! | [`dataset`] | where views come from: COLMAP, transforms.json, MatrixCity, Mega-NeRF, the generated city; decoding photos |
 //! | [`schedule`] | which view comes when, which pages it needs, what a cache should keep |
-//! | [`page`] | pages as bytes: buffers, slots on disk, checksums, the engines that move them |
+//! | [`page`] | pages as bytes: buffers, slots on disk, checksums, the engines that move them, the map of versions and the commits that make them last |
 //! | [`cache`] | which pages are in memory, in what state, and which leaves next; no I/O |
-//! | [`paging`] | brings the pages of a view into memory and takes them back |
-//! | [`checkpoint`] | the state of a run beside its pages, as bytes |
+//! | [`paging`] | brings the pages of a view into memory and takes them back; writes a commit's pages beside training |
+//! | [`checkpoint`] | the state of a run beside its pages, as bytes; how often a run is committed |
 //! | [`gpu`] | a device and its memory, shaders, recording of work; knows no Gaussians |
 //! | [`kernels`] | the ordered table of stages and each stage as a function on plain slices |
 //! | [`render`] | the stages in order: forward, loss, backward; image metrics |
@@ -33,7 +33,9 @@
 //! | [`exchange`] | PLY in and out; what TensorBoard reads |
 //! | [`config`] | what the user wrote and what follows from it |
 //! | [`report`] | pages for people: charts and pictures of what a run left behind |
-//! | [`train`] | the only place where all of it meets: one step, the loop, evaluation |
+//! | [`train`] | the only place where all of it meets: one step, the loop, evaluation, commits and `--resume`, what tools do with checkpoints |
+//!
+//! The programs are in `tools/`, one file each, with a folder where a program has several commands: they parse, call, print.
 //!
 //! One word, one thing: a *row* is one Gaussian inside a working set, a *column* one attribute of all of them, a
 //! *view* a photo with its pose, a *target* its pixels, a *tile* 16x16 pixels, a *stage* one kernel of the pipeline,

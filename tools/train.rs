@@ -23,13 +23,13 @@ Examples:
   gsscale-train scans/village --dry-run             what was understood, and the memory it will take
 
 Results in --out: point_cloud.ply (opens in any splat viewer), renders/test/*.png (render beside photo),
-summary.json, metrics.jsonl, config.toml (every setting of the run; usable with --config).";
+report.html (open it in a browser), summary.json, metrics.jsonl, pages.json, config.toml (every setting of the run; usable with --config).";
 
 /// Trains a 3D Gaussian Splatting scene from photos with known poses.
 #[derive(Parser)]
 #[command(name = "gsscale-train", version, after_help = EXAMPLES)]
 struct Args {
-    /// Scene: a COLMAP folder (images/, sparse/), or a folder with transforms.json
+    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     #[arg(required_unless_present_any = ["demo", "list_devices", "resume"])]
     scene: Option<PathBuf>,
     /// Output folder

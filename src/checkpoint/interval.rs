@@ -1,8 +1,9 @@
 //! How often a run is committed, and what that cost it: numbers in, numbers out.
 //!
-//! `--commit-every auto` wants that a kill costs at most [`LOSS_SECONDS`] and that commits hold training up for at most
-//! [`OVERHEAD`] of its time. Where commits are cheap they come more often than that, where they are dear the loss wins:
-//! the overhead is reported then. What a drive may be made to take has the last word ([`BYTES_PER_HOUR`]).
+//! `--commit-every auto` wants that a kill costs at most [`LOSS_SECONDS`]; commits come more often while they hold training
+//! up for less than `CHEAP_OVERHEAD`, which keeps their whole cost below [`OVERHEAD`] on any drive that can have both. On
+//! one that cannot the loss wins, and the overhead is reported. What a drive may be made to take has the last word
+//! ([`BYTES_PER_HOUR`]).
 //!
 //! Invariants: 1. no clock is read here: whoever asks says how long ago things were; 2. the interval is a function of the
 //! costs that were told, in their order; 3. nothing here can change what a run computes.

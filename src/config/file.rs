@@ -192,8 +192,8 @@ config_keys! {
         /// moments favour). Never changes results
         spill_codec: String = "auto".into();
         /// Seconds from one commit to the next: a run that is killed loses no more. 0 = only when it is asked to stop, and
-        /// after the last step. auto = at most 60, by what a commit costs: at most 3 % of the time where the drive allows
-        /// it, and at most 256 GiB an hour. Never changes results
+        /// after the last step. auto = 10 to 60: as often as commits hold training up for less than 1 % of the time, and
+        /// later only where they would write more than 256 GiB an hour. Never changes results
         commit_every: CommitEvery = CommitEvery::Auto;
         /// Seconds that a run waits for space when the drive of --spill-dir is full, before it stops with its last commit
         disk_full_wait: f64 = 600.0;

@@ -31,6 +31,7 @@ const FREE_KEYS: &[&str] = &[
     "commit-every",
     "disk-full-wait",
     "evict",
+    "transfers",
     "prefetch-bytes",
     "threads",
     "device",

@@ -4,7 +4,8 @@
 //! commit if nothing changed (`changes`, [`dataset_print`]), [`pages`] has the rows of a run in pages and brings them to now with [`catch_up`],
 //! `update` changes them, `dense` all of them at every step, [`costs`] counts what steps took, [`eval`] looks at
 //! held-out views, [`report`] writes what happened, [`progress`] shows it, [`machine`] starts its threads, [`signals`]
-//! hears Ctrl-C, [`stores`] is what tools do with checkpoints.
+//! hears Ctrl-C, [`start`] gives the first Gaussians, [`out_folder`] is where results go, [`page_map`] draws where pages lie,
+//! [`stores`] is what tools do with checkpoints.
 
 pub mod catch_up;
 mod changes;

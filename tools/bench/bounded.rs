@@ -36,7 +36,7 @@ const DRIVE_SHARE: f64 = 0.8;
 
 /// Trains a city far larger than memory under a hard limit, and prints a line of JSON about what it took.
 #[derive(Parser)]
-#[command(name = "gsscale-bench bounded", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench bounded", bin_name = "gsscale-bench bounded", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Folder to make on the drive; it must not exist, and is removed at the end
     #[arg(long, value_name = "DIR")]

@@ -45,9 +45,9 @@ The first seconds, until every frame was used, are measured as well: commits are
 
 /// Trains a scene through the disk tier and prints what its commits cost, then the time to open a store of many pages.
 #[derive(Parser)]
-#[command(name = "gsscale-bench commit", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench commit", bin_name = "gsscale-bench commit", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// Scene: a COLMAP folder (images/, sparse/), or a folder with transforms.json
+    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     scene: PathBuf,
     /// Config file; flags override it
     #[arg(long)]

@@ -13,7 +13,7 @@ Examples:
 
 /// Sets finished runs side by side: figures, curves over steps and seconds, renders of the same view under a slider.
 #[derive(Parser)]
-#[command(name = "gsscale-bench compare", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench compare", bin_name = "gsscale-bench compare", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Output folders of gsscale-train
     #[arg(required = true, num_args = 2..)]

@@ -31,9 +31,9 @@ const RESULTS: &str = "ladder.jsonl";
 
 /// Trains a scene on each rung from naive offloading to all in memory, and draws what each takes.
 #[derive(Parser)]
-#[command(name = "gsscale-bench ladder", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench ladder", bin_name = "gsscale-bench ladder", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// Scene: a COLMAP folder (images/, sparse/), or a folder with transforms.json
+    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     scene: PathBuf,
     /// Config file; flags override it. Steps are 3000 unless they are given
     #[arg(long)]

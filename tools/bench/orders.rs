@@ -40,9 +40,9 @@ const PLAN_BYTES: u64 = 256 << 20;
 
 /// Trains with each order of views and prints its PSNR and what it would read with frames for a share of the pages.
 #[derive(Parser)]
-#[command(name = "gsscale-bench orders", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench orders", bin_name = "gsscale-bench orders", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// Scene: a COLMAP folder (images/, sparse/), or a folder with transforms.json
+    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     scene: PathBuf,
     /// Config file; flags override it
     #[arg(long)]

@@ -31,9 +31,9 @@ pub const STEPS_DEFAULT: u32 = 3000;
 
 /// Sweeps the knobs of training one at a time and a few together, and draws PSNR and SSIM against what they take.
 #[derive(Parser)]
-#[command(name = "gsscale-bench pareto", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench pareto", bin_name = "gsscale-bench pareto", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// Scene: a COLMAP folder (images/, sparse/), or a folder with transforms.json
+    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     scene: PathBuf,
     /// Config file of the base; flags override it. Steps are 3000 unless they are given
     #[arg(long)]

@@ -35,7 +35,7 @@ the standard output, and into OUT/published.json and OUT/published.html.";
 
 /// Trains a published run and prints our figures beside the published ones.
 #[derive(Parser)]
-#[command(name = "gsscale-bench run", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench run", bin_name = "gsscale-bench run", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Name of a published run, or a config file with a table published
     run: PathBuf,

@@ -33,7 +33,7 @@ in it. host_bytes_peak is without the copy that writing a PLY takes.";
 #[derive(Parser)]
 #[command(name = "gsscale-bench", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// Scene: a COLMAP folder (images/, sparse/), or a folder with transforms.json
+    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     scene: PathBuf,
     /// Config file; flags override it
     #[arg(long)]

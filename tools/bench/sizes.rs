@@ -40,7 +40,7 @@ const VIEWS_IN_FRAMES: usize = 3;
 
 /// Trains scenes of several sizes on the same visible Gaussians, in turns, and prints a line of JSON for each.
 #[derive(Parser)]
-#[command(name = "gsscale-bench sizes", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench sizes", bin_name = "gsscale-bench sizes", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Scene with points: a COLMAP folder (images/, sparse/), or a folder with transforms.json
     scene: PathBuf,

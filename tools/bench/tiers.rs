@@ -41,9 +41,9 @@ const ORDER_BYTES: u64 = 256 << 20;
 
 /// Trains a scene in memory and with frames for shares of it, in turns, and prints a line of JSON for each.
 #[derive(Parser)]
-#[command(name = "gsscale-bench tiers", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench tiers", bin_name = "gsscale-bench tiers", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// Scene: a COLMAP folder (images/, sparse/), or a folder with transforms.json
+    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     scene: PathBuf,
     /// Config file; flags override it
     #[arg(long)]

@@ -37,7 +37,7 @@ const SLEEP_STEPS: u32 = 500;
 
 /// Times forwarding and the optimizer against a plain copy, and prints a line of JSON for each share of rows.
 #[derive(Parser)]
-#[command(name = "gsscale-bench touched", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench touched", bin_name = "gsscale-bench touched", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Rows
     #[arg(long, default_value_t = 500_000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]

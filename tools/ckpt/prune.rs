@@ -9,7 +9,7 @@ use std::process::ExitCode;
 const EXAMPLES: &str = "\
 Examples:
   gsscale-ckpt prune runs/village --keep 3            the three newest named checkpoints stay
-  gsscale-ckpt prune runs/village step-007000         this one goes
+  gsscale-ckpt prune runs/village step-7000           this one goes
   gsscale-ckpt prune runs/village --keep 0 --dry-run
 
 The last two generations stay in any case. Slots that become free are written again by the run; the segment files keep
