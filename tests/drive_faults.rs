@@ -85,6 +85,8 @@ struct World {
     scene: PathBuf,
     want: Vec<u8>,
     fewest: usize,
+    /// The run can go on without its commits.
+    is_optional: bool,
 }
 
 /// How a life on a misbehaving drive ended.
@@ -97,7 +99,7 @@ impl World {
     fn new() -> World {
         let folder = TempDir::new().unwrap();
         let scene = make_scene(folder.path());
-        let mut world = World { folder, scene, want: Vec::new(), fewest: usize::MAX };
+        let mut world = World { folder, scene, want: Vec::new(), fewest: usize::MAX, is_optional: false };
         let life = world.live("healthy", &Faults::new(), |_| {});
         life.result.unwrap();
         world.want = std::fs::read(Trainer::ply_path(&life.out)).unwrap();
@@ -151,6 +153,7 @@ impl World {
         };
         write_config(&out.join("config.toml"), &config, &resolved)?;
         let mut checkpoint = Checkpoint::new(opened.commits, &spill_dir, &config);
+        checkpoint.set_optional(self.is_optional);
         checkpoint.fill_reserve()?;
         assert!(spill_dir.join(RESERVE_NAME).exists());
         let (simd, text) = (resolved.simd, toml::to_string(&config).unwrap());
@@ -173,7 +176,10 @@ impl World {
         trainer.run(&dataset, &targets, &mut outputs)?;
         trainer.save(&dataset, &Trainer::ply_path(out))?;
         let report = checkpoint.report();
-        assert!(report.commits > 1 && report.commit_loss_seconds > 0.0 && report.commit_overhead_percent <= 100.0);
+        assert!(
+            self.is_optional
+                || report.commits > 1 && report.commit_loss_seconds > 0.0 && report.commit_overhead_percent <= 100.0
+        );
         std::fs::write(out.join("pinned"), trainer.scene.pager.stats().pinned_max.to_string()).unwrap();
         Ok(())
     }
@@ -360,6 +366,24 @@ fn a_really_full_drive_pauses_the_run_until_there_is_space() {
     let ply = |out: &Path| std::fs::read(Trainer::ply_path(out)).unwrap();
     assert!(ply(&out) == ply(&alone), "waiting changed the scene");
     assert!(summary(&out)["commits"].as_u64().unwrap() > 1 && summary(&out)["commit_interval"] == 0.02);
+}
+
+/// All of such a run is in memory: it loses its commits on a full drive, and nothing else.
+#[test]
+fn a_run_in_memory_goes_on_when_the_drive_of_its_commits_is_full() {
+    let mut world = World::new();
+    (world.fewest, world.is_optional) = (usize::MAX, true);
+    for (i, (on, after, calls)) in [(Operation::Write, 0, 100_000), (Operation::Write, 37, 30)].into_iter().enumerate()
+    {
+        let faults = Faults::new();
+        let life = world.live(&format!("memory-{i}"), &faults, |faults| {
+            let first = faults.count(on) + after;
+            (first..first + calls).for_each(|n| faults.add(on, n, false, Fault::Error(ErrorKind::StorageFull)));
+        });
+        life.result.unwrap_or_else(|error| panic!("case {i}: {error}"));
+        assert!(faults.count(on) > after, "case {i}: nothing failed");
+        assert!(std::fs::read(Trainer::ply_path(&life.out)).unwrap() == world.want, "case {i}: the scene is another");
+    }
 }
 
 #[test]

@@ -113,7 +113,7 @@ impl CommitError {
     /// Whether it is only space that is missing: the same may work later.
     pub fn is_out_of_space(&self) -> bool {
         match self {
-            CommitError::Full(_) => true,
+            CommitError::Full(_) | CommitError::Map(MapError::Full(_)) => true,
             CommitError::Pages(error) => error.is_out_of_space(),
             _ => false,
         }

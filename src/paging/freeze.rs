@@ -20,6 +20,9 @@ use crate::page::format::SlotRef;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
 
+/// Frozen pages that are written at once at least, however little may be read ahead.
+const FROZEN_WRITES_LEAST: usize = 8;
+
 /// A cut whose pages are being written.
 #[derive(Debug, Default)]
 pub(super) struct Frozen {
@@ -132,7 +135,7 @@ impl Pager {
 
     /// Begins writes of frozen pages, as many as may be in flight ahead of other work; never blocks.
     pub fn write_frozen(&mut self) {
-        let most = (self.config.prefetch_bytes / 2 / self.cache.frame_bytes()).max(1);
+        let most = (self.config.prefetch_bytes / 2 / self.cache.frame_bytes()).max(FROZEN_WRITES_LEAST);
         let started = Instant::now();
         while !self.writes_stopped
             && let Some(frozen) = self.frozen.as_mut().filter(|f| f.writing.len() < most)

@@ -120,6 +120,8 @@ impl Pager {
     pub fn attach(&mut self, store: PagedStore) {
         assert!(self.store.is_none(), "a pager has one store for life");
         self.store = Some(store);
+        // They are there: no cache would have had to read them.
+        (0..self.index.len()).for_each(|page| self.bound.add(PageNo(page as u32)));
     }
 
     /// Counts on from what an earlier life of the run had counted.

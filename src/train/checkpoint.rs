@@ -23,6 +23,8 @@ use std::time::{Duration, Instant};
 
 /// A commit is made at once where its pages are not written after this time beside training.
 const BESIDE_SECONDS: f64 = 20.0;
+/// Least time from a commit to one before its time.
+const EARLY_SECONDS: f64 = 10.0;
 /// Fewer free slots than one in so many are few.
 const FEW_FREE: u64 = 10;
 /// A commit before its time must make at least one slot in so many free.
@@ -41,7 +43,7 @@ pub struct Checkpoint {
     name: Option<String>,
     pub(super) folder: PathBuf,
     /// The run can go on without: all of it is in memory.
-    is_optional: bool,
+    pub(super) is_optional: bool,
     /// A commit found no space, and the user knows.
     said_full: bool,
     /// How long to wait for space.
@@ -176,11 +178,17 @@ impl Checkpoint {
             _ if self.name.is_some() => self.commit(trainer, metrics),
             None if self.is_time() && self.first.is_some() => self.commit(trainer, metrics),
             None if self.is_time() && self.commits.is_some() => self.begin(trainer, metrics),
-            None if self.space_is_short(trainer) => self.commit(trainer, metrics),
+            None if self.may_be_early() && self.space_is_short(trainer) => self.commit(trainer, metrics),
             Some(beside) if trainer.scene.pager.is_frozen_written() || is_late(beside) => self.finish(trainer),
             _ => Ok(()),
         };
         self.excused(result)
+    }
+
+    /// Whether a commit may be made for the slots that it makes free. What only names keep stays taken, so that it is not
+    /// asked at every step.
+    fn may_be_early(&self) -> bool {
+        !self.is_optional && self.last.elapsed().as_secs_f64() >= EARLY_SECONDS
     }
 
     fn is_time(&self) -> bool {
@@ -194,6 +202,10 @@ impl Checkpoint {
                 if !std::mem::replace(&mut self.said_full, true) {
                     eprintln!("warning: nothing can be committed: {error}");
                 }
+                // The next one would hold another step.
+                if let Some(name) = self.name.take() {
+                    eprintln!("warning: {name} is not kept");
+                }
                 self.last = Instant::now();
                 Ok(())
             }
@@ -201,13 +213,24 @@ impl Checkpoint {
         }
     }
 
+    /// Gives up the commit that `why`, a lack of space, stands in the way of; the run goes on without.
+    pub(super) fn give_up(&mut self, trainer: &mut Trainer, why: TrainError) -> Result<(), TrainError> {
+        self.beside = None;
+        trainer.scene.pager.thaw();
+        self.excused(Err(why))
+    }
+
     /// The checkpoint of a run in memory, at its first commit. The run itself is none the worse without one.
-    fn make_first(&mut self, trainer: &mut Trainer) {
-        let Some(first) = self.first.take() else { return };
+    /// Where only space is missing it is tried again at the next commit.
+    fn make_first(&mut self, trainer: &mut Trainer) -> Result<(), TrainError> {
+        let Some(first) = &self.first else { return Ok(()) };
         match first.make(&mut trainer.scene.pager) {
             Ok((spill, commits)) => (self.spill, self.commits) = (Some(spill), Some(commits)),
+            Err(error) if error.is_out_of_space() => return Err(error),
             Err(error) => eprintln!("warning: this run is not committed, so it cannot be resumed: {error}"),
         }
+        self.first = None;
+        Ok(())
     }
 
     fn begin(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
@@ -248,8 +271,8 @@ impl Checkpoint {
         }
         let cut = Instant::now();
         self.beside = None;
-        self.make_first(trainer);
-        let name = self.name.take();
+        self.make_first(trainer)?;
+        let name = self.name.clone();
         let Some(origin) = &self.origin else { return Ok(()) };
         let Some(commits) = &mut self.commits else { return Ok(()) };
         let written = trainer.scene.pager.stats().bytes_written;
@@ -257,6 +280,7 @@ impl Checkpoint {
         let state = trainer.run_state(origin, metrics.sync()?);
         let note = format!("step {}", state.step);
         trainer.scene.pager.commit(commits, &bytes_of(&state)?, note.as_bytes(), name.as_deref())?;
+        self.name = None;
         let bytes = trainer.scene.pager.stats().bytes_written - written;
         self.acknowledged(state.step, cut, cut.elapsed().as_secs_f64(), bytes);
         Ok(())

@@ -52,7 +52,7 @@ impl FirstCommit {
     }
 
     /// Makes it, and gives it to the pager.
-    pub fn make(self, pager: &mut Pager) -> Result<(SpillDir, Commits), TrainError> {
+    pub fn make(&self, pager: &mut Pager) -> Result<(SpillDir, Commits), TrainError> {
         let layout = SlotLayout::new(self.capacity_bytes, pager.index().len() as u64);
         // On a network file system too: it is where the user wants the results.
         let spill = SpillDir::create(&self.folder, Purpose::Checkpoint, layout, true)?;

@@ -61,6 +61,10 @@ impl Checkpoint {
         if !why.is_out_of_space() {
             return Err(why);
         }
+        if self.is_optional {
+            // All of the run is in memory: what was being committed is given up, and the step works without a write.
+            return self.give_up(trainer, why);
+        }
         let now = (trainer.steps_done(), Instant::now());
         // Then the drive is too small for the scene, as far as commits can tell.
         let is_stuck = self.space_made.is_some_and(|(step, _)| step == now.0);
@@ -117,7 +121,12 @@ impl Checkpoint {
             }
             match self.commit(trainer, metrics) {
                 Ok(()) => {
-                    eprintln!("there is space again after {:.0} s: training goes on", began.elapsed().as_secs_f64());
+                    if !is_told {
+                        eprintln!(
+                            "there is space again after {:.0} s: training goes on",
+                            began.elapsed().as_secs_f64()
+                        );
+                    }
                     self.fill_reserve()?;
                     return Ok(());
                 }

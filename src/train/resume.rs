@@ -54,7 +54,8 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     request.keys.clone().apply(&mut config);
     config.check()?;
     let folder = stored_folder(&request.out, &config);
-    if let Some(outcome) = already_done(request, &config, &folder)? {
+    let is_its_own = folder == stored_folder(&request.out, &of_file);
+    if let Some(outcome) = already_done(request, &config, &folder, is_its_own)? {
         return Ok(outcome);
     }
     machine::set_up(&config)?;
@@ -137,15 +138,26 @@ fn say(request: &ResumeRequest, state: &RunState, config: &TrainConfig, changes:
 }
 
 /// A run that did all of its steps and wrote its results. If it was killed before its checkpoint was gone, what is left of
-/// that is removed, and nothing is trained; where it is to be kept, it stays.
-fn already_done(request: &ResumeRequest, config: &TrainConfig, folder: &Path) -> InputResult<Option<RunOutcome>> {
+/// that is removed, and nothing is trained; where it is to be kept, it stays, and a folder that is not `is_its_own` too.
+/// One that was rolled back since is not done.
+fn already_done(
+    request: &ResumeRequest,
+    config: &TrainConfig,
+    folder: &Path,
+    is_its_own: bool,
+) -> InputResult<Option<RunOutcome>> {
     let text = std::fs::read_to_string(request.out.join("summary.json")).unwrap_or_default();
     let summary: Option<Summary> = serde_json::from_str(&text).ok();
     let Some(summary) = summary.filter(|s| s.finished && s.steps >= config.steps) else { return Ok(None) };
+    let stored = Stored::open(folder, config.spill_dir.is_empty()).ok();
+    if stored.as_ref().is_some_and(|stored| stored.run_state.step < config.steps && stored.is_whole()) {
+        return Ok(None);
+    }
+    drop(stored);
     // Without its FORMAT, or in use, it is left alone.
     let spill = SpillDir::open(folder, config.spill_dir.is_empty()).ok();
     let is_kept = config.keep_checkpoint && spill.is_some();
-    if let Some(spill) = spill.filter(|_| !config.keep_checkpoint) {
+    if let Some(spill) = spill.filter(|_| is_its_own && !config.keep_checkpoint) {
         spill.remove()?;
     }
     write_run_report(&request.out)?;

@@ -328,7 +328,8 @@ fn train_into(
     if let Some(checkpoint) = &mut checkpoint {
         checkpoint.set_origin(origin);
         if begun.past.is_some_and(|p| p.has_changed) {
-            checkpoint.commit(&mut trainer, &mut metrics)?;
+            let committed = checkpoint.commit(&mut trainer, &mut metrics);
+            committed.or_else(|why| checkpoint.make_space(&mut trainer, &mut metrics, stop, why))?;
         }
     }
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;

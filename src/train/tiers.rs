@@ -42,7 +42,7 @@ const RESERVE_BYTES_MOST: u64 = 256 << 20;
 #[derive(Debug, Default)]
 pub struct Tiers {
     spill: Option<SpillDir>,
-    /// Commits to the spill directory, where there is one.
+    /// Commits to the spill directory, or to the output folder of a run in memory.
     pub checkpoint: Option<Checkpoint>,
     /// The run did all that it had to: its checkpoint is of no use any more, unless it is to be kept.
     pub is_done: bool,
@@ -195,6 +195,13 @@ impl Stored {
             InputError::new(folder, e.to_string(), "go on with the program that made it, or start the run again")
         })?;
         Ok(Stored { spill, opened, run_state })
+    }
+
+    /// Whether every segment that it names is there. A kill while a checkpoint is removed leaves a map without them.
+    pub fn is_whole(&self) -> bool {
+        let engine = open_engine(IoEngine::Pread, self.spill.folder(), DEPTH);
+        let layout = self.spill.format().layout;
+        engine.is_ok_and(|engine| self.opened.paged_store(engine.store, layout, Codec::Raw).is_ok())
     }
 
     /// The tiers of the run that goes on, its pages in them.
