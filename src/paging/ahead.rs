@@ -4,7 +4,7 @@
 //! that is missing at step s, the page leaves that is needed last of all that are there at s. What of that can be done
 //! already is done: the leaving page is free of use until s, so nothing is read that the cache would not have read at s.
 //! All that leave in the time that is played through are alike: where the page that leaves first is pinned still,
-//! another one of them makes room. Only for the next step another page leaves where none of these can: see [`FAR_STEPS`].
+//! another one of them makes room. Only for the next step another page leaves where none of these can: see `FAR_STEPS`.
 //!
 //! Invariants: 1. never blocks, but for [`Transfers::Ahead`]; 2. never takes the frame of a page that the current step or
 //! a step up to the one that the frame is for needs; 3. reads and writes in flight are bounded in bytes; 4. nothing here
