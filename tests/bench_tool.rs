@@ -1,34 +1,16 @@
 //! `gsscale-bench` at its tiny sizes: every measurement runs, and what it prints is consistent.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
+#[path = "support/bench.rs"]
+mod bench;
 #[path = "support/scenes.rs"]
 mod scenes;
 
+use bench::{bench, large_city, lines, number};
 use scenes::{city, stderr, text};
 use serde_json::Value;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::path::Path;
 use tempfile::TempDir;
-
-fn bench(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_gsscale-bench")).args(args).output().unwrap()
-}
-
-fn lines(args: &[&str]) -> Vec<Value> {
-    let output = bench(args);
-    assert!(output.status.success(), "{}", stderr(&output));
-    let said = String::from_utf8(output.stdout).unwrap();
-    said.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
-}
-
-fn number(line: &Value, key: &str) -> f64 {
-    line[key].as_f64().unwrap_or_else(|| panic!("{key} in {line}"))
-}
-
-/// A city of which no view sees more than two thirds.
-fn large_city(folder: &Path) -> PathBuf {
-    city(folder, 150, 48, 32, 8000)
-}
 
 #[test]
 fn shares_of_the_state_train_to_the_bits_of_the_run_in_memory() {

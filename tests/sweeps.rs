@@ -1,41 +1,21 @@
 //! `gsscale-bench` where it trains runs in processes of their own: ladder, sweep and comparison, through the program.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
+#[path = "support/bench.rs"]
+mod bench;
 #[path = "support/browser.rs"]
 mod browser;
 #[path = "support/scenes.rs"]
 mod scenes;
 
+use bench::{bench, large_city, lines, number, parse};
 use browser::in_a_browser;
-use scenes::{city, stderr, text};
+use scenes::{stderr, text};
 use serde_json::Value;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::path::Path;
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
-
-fn bench(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_gsscale-bench")).args(args).output().unwrap()
-}
-
-fn lines(args: &[&str]) -> Vec<Value> {
-    let output = bench(args);
-    assert!(output.status.success(), "{}", stderr(&output));
-    parse(&String::from_utf8(output.stdout).unwrap())
-}
-
-fn parse(text: &str) -> Vec<Value> {
-    text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
-}
-
-fn number(line: &Value, key: &str) -> f64 {
-    line[key].as_f64().unwrap_or_else(|| panic!("{key} in {line}"))
-}
-
-/// A city of which no view sees more than two thirds.
-fn large_city(folder: &Path) -> PathBuf {
-    city(folder, 150, 48, 32, 8000)
-}
 
 fn names(folder: &Path) -> Vec<String> {
     let entries = std::fs::read_dir(folder).into_iter().flatten();

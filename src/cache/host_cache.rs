@@ -186,13 +186,13 @@ impl HostCache {
 
     /// A load ended well: the page is resident and clean.
     pub fn finish_load(&mut self, page: PageNo, buffer: PageBuffer) {
-        let frame = self.expect(page, FrameState::Loading);
+        let frame = self.frame_in(page, FrameState::Loading);
         self.set_resident(frame, buffer);
     }
 
     /// A load failed: its frame is free again.
     pub fn fail_load(&mut self, page: PageNo, buffer: PageBuffer) {
-        let frame = self.expect(page, FrameState::Loading);
+        let frame = self.frame_in(page, FrameState::Loading);
         self.frame_from_page[page.index()] = ABSENT;
         self.set_free(frame, buffer);
     }
@@ -210,35 +210,35 @@ impl HostCache {
 
     /// Takes a pinned page back. It is dirty if it was before or `dirty` says so.
     pub fn unpin(&mut self, page: PageNo, buffer: PageBuffer, dirty: bool) {
-        let frame = self.expect(page, FrameState::Pinned);
+        let frame = self.frame_in(page, FrameState::Pinned);
         self.frames[frame].dirty |= dirty;
         self.set_resident(frame, buffer);
     }
 
     /// A pinned page lost its last row: its frame is free.
     pub fn drop_pinned(&mut self, page: PageNo, buffer: PageBuffer) {
-        let frame = self.expect(page, FrameState::Pinned);
+        let frame = self.frame_in(page, FrameState::Pinned);
         self.frame_from_page[page.index()] = ABSENT;
         self.set_free(frame, buffer);
     }
 
     /// A write of a resident dirty page begins.
     pub fn begin_write(&mut self, page: PageNo) -> PageBuffer {
-        let frame = self.expect(page, FrameState::Resident);
+        let frame = self.frame_in(page, FrameState::Resident);
         assert!(self.frames[frame].dirty, "a clean page is not written");
         self.unqueue(frame, FrameState::Writing)
     }
 
     /// A write ended: the page is resident, and clean if it went well.
     pub fn finish_write(&mut self, page: PageNo, buffer: PageBuffer, well: bool) {
-        let frame = self.expect(page, FrameState::Writing);
+        let frame = self.frame_in(page, FrameState::Writing);
         self.frames[frame].dirty = !well;
         self.set_resident(frame, buffer);
     }
 
     /// Evicts a resident clean page; its frame is free.
     pub fn evict(&mut self, page: PageNo) {
-        let frame = self.expect(page, FrameState::Resident);
+        let frame = self.frame_in(page, FrameState::Resident);
         assert!(!self.frames[frame].dirty, "a dirty page is written before it is evicted");
         let buffer = self.unqueue(frame, FrameState::Free);
         self.frame_from_page[page.index()] = ABSENT;
@@ -286,7 +286,7 @@ impl HostCache {
         self.frame_from_page.get(page.index()).filter(|&&frame| frame != ABSENT).map(|&frame| frame as usize)
     }
 
-    fn expect(&self, page: PageNo, state: FrameState) -> usize {
+    fn frame_in(&self, page: PageNo, state: FrameState) -> usize {
         match self.find(page) {
             Some(frame) if self.frames[frame].state == state => frame,
             found => panic!("page number {} should be {state:?}, is {:?}", page.0, found.map(|f| self.frames[f].state)),

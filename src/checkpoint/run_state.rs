@@ -137,6 +137,29 @@ pub enum RunStateError {
 }
 
 impl RunState {
+    /// The state of a run of `rows` Gaussians without a past: not trained yet, or its past is unknown.
+    pub fn without_past(config: String, simd: String, dataset: DatasetPrint, rows: u64) -> RunState {
+        RunState {
+            step: 0,
+            config,
+            simd,
+            device: String::new(),
+            sh_degree_start: 0,
+            dataset: DatasetPrint { first_rows: rows, ..dataset },
+            events: Vec::new(),
+            histogram: Vec::new(),
+            rows,
+            rows_bound: rows,
+            rows_skipped: 0,
+            steps_skipped: 0,
+            steps_skipped_in_a_row: 0,
+            train_seconds: 0.0,
+            metrics_bytes: 0,
+            test: None,
+            traffic: TrafficSoFar::default(),
+        }
+    }
+
     /// As bytes.
     ///
     /// # Errors

@@ -242,6 +242,15 @@ impl Pager {
         self.fetch("a list of pages", &pages, false)
     }
 
+    /// As [`Pager::acquire_pages`], as a part of a training step: hits, reads and the time waited count as the step's.
+    ///
+    /// # Errors
+    /// As [`Pager::acquire_pages`].
+    pub fn acquire_in_step(&mut self, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
+        let pages: Vec<PageNo> = pages.iter().copied().filter(|p| self.index[p.index()].rows > 0).collect();
+        self.fetch("a list of pages", &pages, true)
+    }
+
     /// Gives back a frame that was taken for nothing.
     pub fn return_frame(&mut self, buffer: PageBuffer) {
         self.cache.take_back(buffer);

@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct RunRecord {
-    /// Digest of the scene's path, all settings, the seed and the version of the program.
+    /// Digest of all that the figures depend on: scene, settings, seed, program, machine and drive.
     pub key: String,
     /// The scene.
     pub scene: String,

@@ -28,7 +28,7 @@ pub(super) fn settle_all(scene: &mut PagedScene, now: u32) -> Result<(), TrainEr
     // The other half of the frames is for pages that split.
     let batch = PAGES_PER_BATCH.min(scene.pager.stats().frames_max / 2).max(1);
     for batch in pages.chunks(batch) {
-        let mut pinned = scene.pager.acquire_pages(batch)?;
+        let mut pinned = scene.pager.acquire_in_step(batch)?;
         let applied = scene.apply_pending(&mut pinned);
         if applied.is_ok() {
             let (rules, at) = (&scene.rules, scene.rules.adam.at(now));

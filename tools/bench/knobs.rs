@@ -74,7 +74,7 @@ impl Knobs<'_> {
             "sh" => self.each(knob, ["2", "1", "0"], |c, degree| lower_sh(c, degree.parse().unwrap_or(0))),
             "cap" => self.caps(),
             "resolution" => self.each(knob, ["1/1.5", "1/2"], |c, text| {
-                c.data_factor = base.data_factor * text[2..].parse::<f64>().unwrap_or(1.0);
+                lower_resolution(c, text[2..].parse().unwrap_or(1.0));
             }),
             "steps" => self.each(knob, ["1/2", "x2"], |c, text| {
                 c.steps = if text == "x2" { base.steps.saturating_mul(2) } else { base.steps.div_ceil(2) };
@@ -104,15 +104,14 @@ impl Knobs<'_> {
 
     fn budgets(&self) -> Vec<Planned> {
         let config = &self.base.config;
-        let shares =
-            BUDGETS.into_iter().filter_map(|p| Some((format!("{p} % of the pages"), self.facts.frames(p, config)?)));
+        let shares = BUDGETS.into_iter().filter_map(|p| Some((format!("{p} % of the pages"), self.facts.frames(p)?)));
         let mut all: Vec<Planned> =
             shares.map(|(label, frames)| self.named("budget", &label).on_drive(frames)).collect();
         // The fewest that hold a view, unless one of the shares is about that.
         let (frames, least) =
-            (self.facts.fewest_frames(config), all.last().map_or(self.facts.pages, |p| p.config.frames.into()));
-        if frames * 5 < least * 4 {
-            let percent = (100.0 * frames as f64 / self.facts.pages as f64).round();
+            (self.facts.fewest_frames(), all.last().map_or(self.facts.pages_at_end(), |p| p.config.frames.into()));
+        if frames < self.facts.pages_at_end() && (all.is_empty() || frames * 5 < least * 4) {
+            let percent = self.facts.percent(frames).round();
             all.push(self.named("budget", &format!("{percent} % of the pages")).on_drive(frames));
         }
         if self.share > 0.0 {
@@ -126,12 +125,11 @@ impl Knobs<'_> {
 
     /// Frames for runs of a knob that does nothing in memory, and how labels say so; `None` where a view needs all pages.
     fn drive(&self, facts: &Facts) -> Option<(u64, String)> {
-        let config = &self.base.config;
         let share = if self.share > 0.0 { self.share } else { DRIVE_SHARE };
-        let frames = facts.frames(share, config).unwrap_or_else(|| facts.fewest_frames(config));
-        let percent = (100.0 * frames as f64 / facts.pages as f64).round();
+        let frames = facts.frames(share).unwrap_or_else(|| facts.fewest_frames());
+        let percent = facts.percent(frames).round();
         let label = if self.share > 0.0 { String::new() } else { format!(", {percent} % of the pages") };
-        (frames < facts.pages).then_some((frames, label))
+        (frames < facts.pages_at_end()).then_some((frames, label))
     }
 
     fn codecs(&self) -> Vec<Planned> {
@@ -150,18 +148,20 @@ impl Knobs<'_> {
         all
     }
 
+    /// Pages of other sizes, with as many bytes of frames as the codecs have, or what the largest view needs of them.
     fn page_sizes(&self) -> Result<Vec<Planned>, TrainError> {
-        let rows = self.base.config.page_rows;
-        let mut all = Vec::new();
-        for rows in [rows / 4, rows.saturating_mul(4)] {
+        let (own, mut all) = (self.base.config.page_rows, Vec::new());
+        let Some((own_frames, _)) = self.drive(self.facts) else { return Ok(all) };
+        for rows in [own / 4, own.saturating_mul(4)] {
             let mut planned = self.named("page", "");
             planned.config.page_rows = rows;
             if planned.config.check().is_err() {
                 continue;
             }
             let facts = Facts::of(self.scene, &planned.config)?;
-            if let Some((frames, at)) = self.drive(&facts) {
-                planned.label = format!("{rows} rows{at}");
+            let frames = (own_frames * u64::from(own)).div_ceil(u64::from(rows)).max(facts.fewest_frames());
+            if frames < facts.pages_at_end() {
+                planned.label = format!("{rows} rows, {:.0} % of the pages", facts.percent(frames));
                 all.push(planned.on_drive(frames));
             }
         }
@@ -194,7 +194,7 @@ impl Knobs<'_> {
             }),
             ("half the steps at 1/1.5 of the resolution", |c| {
                 c.steps = c.steps.div_ceil(2);
-                c.data_factor *= 1.5;
+                lower_resolution(c, 1.5);
             }),
             ("SH 1 and the sparse optimizer", |c| {
                 lower_sh(c, 1);
@@ -207,6 +207,14 @@ impl Knobs<'_> {
             planned
         });
         turned.into_iter().filter(|p| p.config != *base).collect()
+    }
+}
+
+/// Photos smaller by `factor`, whichever of the two keys it is that bounds them.
+fn lower_resolution(config: &mut TrainConfig, factor: f64) {
+    config.data_factor *= factor;
+    if config.max_resolution > 0 {
+        config.max_resolution = (f64::from(config.max_resolution) / factor).round().max(1.0) as u32;
     }
 }
 

@@ -99,7 +99,19 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let mut config = bench_config(args.config.as_deref(), &args.keys)?;
     settle(&mut config);
     let facts = Facts::of(&args.scene, &config)?;
-    let frames = facts.frames(args.share, &config).unwrap_or_else(|| facts.fewest_frames(&config));
+    let frames = facts.frames(args.share).unwrap_or_else(|| facts.fewest_frames());
+    if frames >= facts.pages_at_end() {
+        let problem = format!(
+            "the largest view needs {} of {} pages: nothing would leave memory",
+            facts.largest_view, facts.pages
+        );
+        return Err(InputError::new(
+            &args.scene,
+            problem,
+            "use smaller --page-rows, or a scene that views see less of",
+        )
+        .into());
+    }
     let facts = format!(
         "{}: {} steps, {} Gaussians in {} pages of {} rows, the largest view needs {}; {frames} frames; order {}",
         args.scene.display(),
@@ -140,4 +152,7 @@ fn settle(config: &mut TrainConfig) {
     if config.spill_codec == "auto" {
         config.spill_codec = "raw".into();
     }
+    // What rungs differ in, each names for itself.
+    let best = TrainConfig::default();
+    (config.optimizer, config.evict, config.transfers) = (best.optimizer, best.evict, best.transfers);
 }

@@ -2,9 +2,10 @@
 
 use super::facts::Facts;
 use super::knobs::{self, KNOBS, Knobs};
-use super::sweep::{Planned, Sweep};
+use super::sweep::{Planned, Surroundings, Sweep};
 use clap::Parser;
 use gsscale::base::error::InputError;
+use gsscale::checkpoint::interval::CommitEvery;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::ResultsLog;
@@ -28,6 +29,8 @@ page is pareto.html. Each run is a process of its own. Budget, page and codec ne
 const RESULTS: &str = "results.jsonl";
 /// Steps of a run where none are given.
 pub const STEPS_DEFAULT: u32 = 3000;
+/// The SH degree rises after so many parts of a run where nothing else is said: band 3 is in use after three tenths.
+const SH_RAISES: u32 = 10;
 
 /// Sweeps the knobs of training one at a time and a few together, and draws PSNR and SSIM against what they take.
 #[derive(Parser)]
@@ -81,11 +84,11 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let (base, settings) = plan(args, &names, config)?;
     let runs = in_order(&base, &settings, &args.seeds, args.setting_seeds);
     if args.list {
-        list(args, &runs)?;
+        list(args, &runs, &Surroundings::of(&args.scene, &args.out, args.spill.as_deref())?)?;
         return Ok(());
     }
     let mut sweep = Sweep::open(&args.scene, &args.out, args.spill.as_deref(), &base.config, RESULTS)?;
-    let open: Vec<&Planned> = runs.iter().filter(|r| sweep.log.done(&r.key(&args.scene)).is_none()).collect();
+    let open: Vec<&Planned> = runs.iter().filter(|r| sweep.log.done(&r.key(sweep.surroundings())).is_none()).collect();
     let done = runs.len() - open.len();
     let count = open.len().min(args.max_runs.unwrap_or(usize::MAX));
     eprintln!("{done} of {} runs are done; {count} to do now", runs.len());
@@ -96,9 +99,9 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
             eprintln!("warning: it failed: {problem}");
         }
         print(&serde_json::to_value(&record).unwrap_or_default());
-        write_page(args, &base, &runs, sweep.log.records())?;
+        write_page(args, &base, &runs, &sweep)?;
     }
-    write_page(args, &base, &runs, sweep.log.records())?;
+    write_page(args, &base, &runs, &sweep)?;
     eprintln!("{}", args.out.join("pareto.html").display());
     Ok(())
 }
@@ -120,8 +123,12 @@ fn check_numbers(args: &Args) -> Result<(), TrainError> {
 pub fn bench_config(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, TrainError> {
     let mut keys = keys.clone();
     if file.is_none() {
-        keys.steps.get_or_insert(STEPS_DEFAULT);
+        let steps = *keys.steps.get_or_insert(STEPS_DEFAULT);
+        // All bands are in use for most of a short run, as they are for nearly all of a long one.
+        keys.sh_every.get_or_insert((steps / SH_RAISES).max(1));
     }
+    // What commits cost goes by the clock and would count as bytes moved; gsscale-bench commit measures it.
+    keys.commit_every.get_or_insert(CommitEvery::Seconds(0.0));
     super::settle(file, &keys)
 }
 
@@ -135,12 +142,14 @@ fn plan(args: &Args, names: &[String], mut config: TrainConfig) -> Result<(Plann
     let facts = Facts::of(&args.scene, &config)?;
     let frames = match args.share {
         0.0 => None,
-        share => Some(facts.frames(share, &config).ok_or_else(|| {
+        share => Some(facts.frames(share).ok_or_else(|| {
             let problem = format!(
-                "{share} % of {} pages are too few: the largest view needs {} of them",
-                facts.pages, facts.largest_view
+                "{share} % of {} pages are too few: the largest view needs {} of the first {}, and views grow",
+                facts.pages_at_end(),
+                facts.largest_view,
+                facts.pages
             );
-            let least = (100.0 * facts.fewest_frames(&config) as f64 / facts.pages as f64).ceil();
+            let least = facts.percent(facts.fewest_frames()).ceil();
             InputError::new("--share", problem, format!("use --share {least} or more, or smaller --page-rows"))
         })?),
     };
@@ -171,10 +180,10 @@ fn in_order(base: &Planned, settings: &[Planned], seeds: &[u64], setting_seeds: 
 }
 
 /// Prints the runs, which of them are done, and how long the rest will take by those that are.
-fn list(args: &Args, runs: &[Planned]) -> Result<(), TrainError> {
+fn list(args: &Args, runs: &[Planned], surroundings: &Surroundings) -> Result<(), TrainError> {
     let records = ResultsLog::peek(&args.out.join(RESULTS))?;
     let done = |run: &Planned| {
-        let key = run.key(&args.scene);
+        let key = run.key(surroundings);
         records.iter().rev().find(|r| r.key == key && r.problem.is_none())
     };
     let per_step: Vec<f64> =
@@ -201,10 +210,11 @@ fn list(args: &Args, runs: &[Planned]) -> Result<(), TrainError> {
 }
 
 /// Draws the runs of this plan that are done.
-fn write_page(args: &Args, base: &Planned, runs: &[Planned], records: &[RunRecord]) -> Result<(), TrainError> {
+fn write_page(args: &Args, base: &Planned, runs: &[Planned], sweep: &Sweep) -> Result<(), TrainError> {
+    let (records, surroundings) = (sweep.log.records(), sweep.surroundings());
     let mut of_plan: Vec<RunRecord> = Vec::new();
     for run in runs {
-        let key = run.key(&args.scene);
+        let key = run.key(surroundings);
         if let Some(record) = records.iter().rev().find(|r| r.key == key) {
             // One run may stand for two settings: it is named as the plan names it.
             of_plan.push(RunRecord { knob: run.knob.clone(), label: run.label.clone(), ..record.clone() });

@@ -1,8 +1,10 @@
 //! Runs that are compared: each one trains in a process of its own, and its figures go to a file of results.
 //!
-//! Invariants: 1. a run that is in the file is not done again; what keys it is the scene, every setting, the seed and the
-//! program's version; 2. a run's folder appears under its name only when the run has ended well; 3. a run that fails is
-//! written down and the others go on, but a run that is interrupted ends everything.
+//! Invariants: 1. a run that is in the file is not done again; what keys it is all that its figures depend on: the scene,
+//! every setting, the seed, the program's bytes, the machine and the drive; 2. a run's folder appears under its name only
+//! when the run has ended well; 3. a run that fails is written down and the others go on, but a run that is interrupted
+//! ends everything; 4. what is being written is never removed: a run holds the sweep's lock as long as it lives, also when
+//! the sweep itself was killed.
 
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::cpu_model;
@@ -12,6 +14,7 @@ use gsscale::report::results_log::ResultsLog;
 use gsscale::train::report::{Summary, write_whole};
 use serde_json::Value;
 use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions, TryLockError};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -22,6 +25,37 @@ use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 const SPILL_PLACE: &str = "spill";
 /// Characters of a failed run's message that are kept.
 const PROBLEM_MAX: usize = 600;
+
+/// Held by the sweep and by the run that it started, in the output folder.
+const LOCK: &str = "sweep.lock";
+
+/// All that the figures of a run depend on beside its settings.
+pub struct Surroundings {
+    /// Scene, drive, program, processor and threads, as one text.
+    text: String,
+    /// Ends the names of this sweep's folders on the drive, which other sweeps may use as well.
+    mark: String,
+}
+
+impl Surroundings {
+    /// Looks at scene, drive, program and machine. `spill` is the folder for pages, as the sweep was given it.
+    ///
+    /// # Errors
+    /// `gsscale-train` is missing.
+    pub fn of(scene: &Path, out: &Path, spill: Option<&Path>) -> InputResult<Surroundings> {
+        let whole = |path: &Path| -> PathBuf {
+            let here = || std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
+            std::fs::canonicalize(path).unwrap_or_else(|_| here())
+        };
+        let program = digest(&beside("gsscale-train")?)?;
+        // The folder in --out needs no mention: an output folder may move with its results.
+        let drive = spill.map_or_else(String::new, |path| whole(path).display().to_string());
+        let (threads, cpu) = (rayon::current_num_threads(), cpu_model());
+        let text = format!("{}\n{drive}\n{program}\n{threads}\n{cpu}", whole(scene).display());
+        let mark = format!("{:08x}", xxh3_64(whole(out).as_os_str().as_encoded_bytes()) as u32);
+        Ok(Surroundings { text, mark })
+    }
+}
 
 /// A run to be done.
 #[derive(Debug, Clone)]
@@ -40,6 +74,8 @@ pub struct Sweep {
     out: PathBuf,
     spill: PathBuf,
     base: TrainConfig,
+    surroundings: Surroundings,
+    lock: File,
     /// The results so far.
     pub log: ResultsLog,
 }
@@ -50,12 +86,10 @@ impl Planned {
         Planned { knob: "base".into(), label: "base".into(), config: config.clone() }
     }
 
-    /// Digest of the scene, all settings, the seed and the program's version.
-    pub fn key(&self, scene: &Path) -> String {
-        let scene = std::fs::canonicalize(scene).unwrap_or_else(|_| scene.to_path_buf());
+    /// Digest of all settings, the seed, and what surrounds the run.
+    pub fn key(&self, surroundings: &Surroundings) -> String {
         let settings = toml::to_string(&self.config).unwrap_or_default();
-        let text = format!("{}\n{settings}\n{}", scene.display(), env!("CARGO_PKG_VERSION"));
-        format!("{:016x}", xxh3_64(text.as_bytes()))
+        format!("{:016x}", xxh3_64(format!("{}\n{settings}", surroundings.text).as_bytes()))
     }
 
     /// The same run, its pages going through a drive.
@@ -84,13 +118,20 @@ impl Sweep {
     pub fn open(scene: &Path, out: &Path, spill: Option<&Path>, base: &TrainConfig, file: &str) -> InputResult<Sweep> {
         let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
         std::fs::create_dir_all(out.join("runs")).map_err(io)?;
+        let lock = lock(out)?;
         let log = ResultsLog::open(&out.join(file))?;
+        let surroundings = Surroundings::of(scene, out, spill)?;
         let spill = spill.map_or_else(|| out.join("spill"), Path::to_path_buf);
         let (scene, out, base) = (scene.to_path_buf(), out.to_path_buf(), base.clone());
         // Only the one who holds the lock comes here, so nothing that is being written is removed.
-        remove_parts(&out.join("runs"))?;
-        remove_parts(&spill)?;
-        Ok(Sweep { scene, out, spill, base, log })
+        remove_parts(&out.join("runs"), &[".part", ".part.toml"])?;
+        remove_parts(&spill, &[&format!("{}.part", surroundings.mark)])?;
+        Ok(Sweep { scene, out, spill, base, surroundings, lock, log })
+    }
+
+    /// What keys the results beside the settings.
+    pub fn surroundings(&self) -> &Surroundings {
+        &self.surroundings
     }
 
     /// The result of a run: from the file, or of a process that trains now.
@@ -98,7 +139,7 @@ impl Sweep {
     /// # Errors
     /// The program is missing or was interrupted, or results cannot be written. A run that fails is a result.
     pub fn run(&mut self, planned: &Planned) -> InputResult<RunRecord> {
-        let key = planned.key(&self.scene);
+        let key = planned.key(&self.surroundings);
         if let Some(done) = self.log.done(&key) {
             return Ok(done.clone());
         }
@@ -111,7 +152,7 @@ impl Sweep {
         let name = planned.name(key);
         let part = self.out.join("runs").join(format!("{name}.part"));
         let mut config = planned.config.clone();
-        let spill = self.spill.join(format!("{name}.part"));
+        let spill = self.spill.join(format!("{name}-{}.part", self.surroundings.mark));
         if !config.spill_dir.is_empty() {
             make_folder(&self.spill)?;
             config.spill_dir = spill.display().to_string();
@@ -120,7 +161,8 @@ impl Sweep {
         let file = self.out.join("runs").join(format!("{name}.part.toml"));
         write_config(&file, &config)?;
         let began = Instant::now();
-        let output = spawn("gsscale-train", &[&self.scene, Path::new("--out"), &part, Path::new("--config"), &file])?;
+        let arguments = [&self.scene, Path::new("--out"), &part, Path::new("--config"), &file];
+        let output = self.spawn("gsscale-train", &arguments)?;
         record.wall_seconds = began.elapsed().as_secs_f64();
         if !output.status.success() {
             // Said before the folders go: a run that stops early would keep its checkpoint.
@@ -180,7 +222,7 @@ impl Sweep {
             write_config(&file, &self.base)?;
             let json = folder.join("evaluated.json");
             let arguments = [&ply, self.scene.as_path(), Path::new("--config"), &file, Path::new("--json"), &json];
-            let output = spawn("gsscale-eval", &arguments)?;
+            let output = self.spawn("gsscale-eval", &arguments)?;
             if !output.status.success() {
                 refuse_interrupted(&output)?;
                 record.problem = Some(problem(&output));
@@ -190,6 +232,18 @@ impl Sweep {
             (record.psnr, record.ssim) = (report["test"]["psnr"].as_f64(), report["test"]["ssim"].as_f64());
         }
         remove(&ply)
+    }
+
+    /// Runs a program that lies beside this one to its end. Its input is the lock, which stays held as long as it lives.
+    fn spawn(&self, program: &str, arguments: &[&Path]) -> InputResult<Output> {
+        let path = beside(program)?;
+        let held = self.lock.try_clone().map_err(|e| InputError::io(&self.out, "handing on the lock", &e))?;
+        let mut command = Command::new(&path);
+        command.args(arguments).stdin(Stdio::from(held)).stdout(Stdio::null()).stderr(Stdio::piped());
+        if program == "gsscale-train" {
+            command.arg("--quiet");
+        }
+        command.output().map_err(|e| InputError::io(&path, "starting the program", &e))
     }
 }
 
@@ -213,19 +267,29 @@ fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> InputResult<T> {
         .map_err(|e| InputError::new(path, format!("is not what a run writes: {e}"), "run it again"))
 }
 
-/// Runs a program that lies beside this one to its end.
-fn spawn(program: &str, arguments: &[&Path]) -> InputResult<Output> {
+/// A program that lies beside this one.
+fn beside(program: &str) -> InputResult<PathBuf> {
     let own = std::env::current_exe().map_err(|e| InputError::io(program, "finding this program", &e))?;
     let path = own.with_file_name(format!("{program}{}", std::env::consts::EXE_SUFFIX));
-    let mut command = Command::new(&path);
-    command.args(arguments).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
-    if program == "gsscale-train" {
-        command.arg("--quiet");
+    match path.is_file() {
+        true => Ok(path),
+        false => Err(InputError::new(&path, "is missing", "build all programs: cargo build --release")),
     }
-    command.output().map_err(|e| {
-        let problem = format!("cannot be started: {e}");
-        InputError::new(&path, problem, "build all programs: cargo build --release")
-    })
+}
+
+/// Takes the lock of an output folder.
+fn lock(out: &Path) -> InputResult<File> {
+    let path = out.join(LOCK);
+    let io = |e: std::io::Error| InputError::io(&path, "opening the lock", &e);
+    let file = OpenOptions::new().write(true).create(true).truncate(false).open(&path).map_err(io)?;
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => {
+            let problem = "another sweep, or a run that a killed one left behind, is at work here";
+            Err(InputError::new(out, problem, "wait until it has ended, or choose another --out"))
+        }
+        // Where a file system knows no locks there is one sweep all the same.
+        Ok(()) | Err(TryLockError::Error(_)) => Ok(file),
+    }
 }
 
 /// A run that somebody stopped is no result: the sweep stops too, and goes on with this run next time.
@@ -271,12 +335,12 @@ fn remove(path: &Path) -> InputResult<()> {
     }
 }
 
-/// Removes what runs that were cut off left in a folder: everything with `.part` in its name.
-fn remove_parts(folder: &Path) -> InputResult<()> {
+/// Removes what runs that were cut off left in a folder, by how the names end.
+fn remove_parts(folder: &Path, ends: &[&str]) -> InputResult<()> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
     let is_part = |path: &PathBuf| {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
-        name.contains("-seed") && (name.ends_with(".part") || name.ends_with(".part.toml"))
+        name.contains("-seed") && ends.iter().any(|end| name.ends_with(end))
     };
     entries.flatten().map(|e| e.path()).filter(is_part).try_for_each(|path| remove(&path))
 }

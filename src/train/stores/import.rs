@@ -9,7 +9,7 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::base::units::{MIB, format_bytes};
-use crate::checkpoint::run_state::{DatasetPrint, RunState, TrafficSoFar};
+use crate::checkpoint::run_state::{DatasetPrint, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::import::{Division, Spool, SpoolSpace, SpoolWriter};
@@ -258,24 +258,13 @@ fn first_state(config: &TrainConfig, meta: &PlyMeta, rows: u64, sh_degree: u8) -
         ExportFrame::Dataset => ([0.0; 3], 1.0),
     };
     let fail = |e: String| CommitError::Contradiction(e);
+    let text = toml::to_string(config).map_err(|e| fail(e.to_string()))?;
+    let dataset = DatasetPrint { views: Vec::new(), first_rows: rows, points: 0, scene_scale: 1.0, origin, scale };
+    let simd = limits::simd_path(config).name().to_string();
     let state = RunState {
-        step: 0,
-        config: toml::to_string(config).map_err(|e| fail(e.to_string()))?,
-        simd: limits::simd_path(config).name().to_string(),
         device: "none".to_string(),
         sh_degree_start: sh_degree,
-        dataset: DatasetPrint { views: Vec::new(), first_rows: rows, points: 0, scene_scale: 1.0, origin, scale },
-        events: Vec::new(),
-        histogram: Vec::new(),
-        rows,
-        rows_bound: rows,
-        rows_skipped: 0,
-        steps_skipped: 0,
-        steps_skipped_in_a_row: 0,
-        train_seconds: 0.0,
-        metrics_bytes: 0,
-        test: None,
-        traffic: TrafficSoFar::default(),
+        ..RunState::without_past(text, simd, dataset, rows)
     };
     Ok(state.to_bytes().map_err(|e| fail(e.to_string()))?)
 }

@@ -13,7 +13,7 @@ use super::copy::{layout_for, usual_codec};
 use super::{StorePlace, options_of, run_state_of};
 use crate::base::error::InputError;
 use crate::base::ids::PageId;
-use crate::checkpoint::run_state::{DatasetPrint, RunState, TrafficSoFar};
+use crate::checkpoint::run_state::{DatasetPrint, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::page::commit::CommitError;
@@ -404,23 +404,12 @@ fn state_for(
     sh_degree_start: u8,
 ) -> Result<RunState, TrainError> {
     let options = RunOptions::new(config, print.scene_scale);
+    let text = toml::to_string(config).map_err(|e| CommitError::Contradiction(e.to_string()))?;
+    let simd = limits::simd_path(config).name().to_string();
     Ok(RunState {
         step,
-        config: toml::to_string(config).map_err(|e| CommitError::Contradiction(e.to_string()))?,
-        simd: limits::simd_path(config).name().to_string(),
         device: "unknown".to_string(),
         sh_degree_start: sh_degree_start.min(options.sh_degree),
-        dataset: DatasetPrint { first_rows: rows, ..print.clone() },
-        events: Vec::new(),
-        histogram: Vec::new(),
-        rows,
-        rows_bound: rows,
-        rows_skipped: 0,
-        steps_skipped: 0,
-        steps_skipped_in_a_row: 0,
-        train_seconds: 0.0,
-        metrics_bytes: 0,
-        test: None,
-        traffic: TrafficSoFar::default(),
+        ..RunState::without_past(text, simd, print.clone(), rows)
     })
 }
