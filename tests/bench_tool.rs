@@ -28,11 +28,11 @@ fn shares_of_the_state_train_to_the_bits_of_the_run_in_memory() {
         assert_eq!(share[key], in_memory[key], "{key}");
     }
     assert!(number(share, "overfetch") >= 1.0 && number(share, "seconds_per_step_median") > 0.0);
-    // The bound starts and ends where the measurement does; only what was on its way at either end may differ, which
-    // the frames bound.
+    // The bound starts and ends where the measurement does; only what was read ahead at either end may differ, which an
+    // eighth of the frames bounds.
     let reads = number(share, "pages_read_per_step") * 40.0;
     let bound = number(share, "belady_pages_per_step") * 40.0;
-    assert!(bound > 0.0 && reads + number(share, "frames") >= bound, "{reads} pages read, {bound} at least");
+    assert!(bound > 0.0 && reads + number(share, "frames") / 8.0 >= bound, "{reads} pages read, {bound} at least");
     assert!(spill.is_dir() && spill.read_dir().unwrap().next().is_none(), "scratch is removed");
 }
 

@@ -294,6 +294,9 @@ fn a_run_is_set_beside_the_published_one() {
     // The PLY holds unit quaternions.
     assert!((again["ours"]["test"]["psnr"].as_f64().unwrap() - ours).abs() < 0.01);
     assert!(again["difference"]["ssim"].is_null() && again["tier"] == "S2");
+    // Nor are the tier's settings a difference that the run did not have when it was trained.
+    assert_eq!(signed["not_the_published_run"], line["not_the_published_run"]);
+    assert!(!why.contains("grow-") && !why.contains("refine-stop"), "{why}");
     // gsscale-eval, as others spell it, from the same PLY; the run's config asked for the affine fit.
     for (more, method) in [(&[][..], "affine"), (&["--colour-correct", "quadratic"], "quadratic")] {
         let output = eval(&[&[text(&out), text(&data)], more].concat());

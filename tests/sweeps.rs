@@ -101,6 +101,14 @@ fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
     std::fs::write(&results, format!("{kept}{{\"key\":\"0123")).unwrap();
     std::fs::create_dir_all(out.join("runs/base-base-seed9-00000000.part/renders")).unwrap();
 
+    // Whoever holds the lock is at work, be it only a run that outlived its sweep.
+    let lock = std::fs::File::open(out.join("sweep.lock")).unwrap();
+    lock.lock().unwrap();
+    let refused = bench(&args);
+    assert!(!refused.status.success() && stderr(&refused).contains("left behind"), "{}", stderr(&refused));
+    assert!(out.join("runs/base-base-seed9-00000000.part").is_dir(), "it may be in use");
+    drop(lock);
+
     let after = lines(&[&args[..], &["--max-runs", "3"]].concat());
     assert_eq!(after.len(), 3);
     let rest = lines(&args);
@@ -138,11 +146,17 @@ fn check_sweep(records: &[Value], out: &Path, scratch: &Path) {
     let parts = ["Pareto front", "the same bits", "mean of the base less its spread", "CPU seconds"];
     check_page(&out.join("pareto.html"), &parts, scratch);
     let names = names(&out.join("runs"));
-    let run = |part: &str| out.join("runs").join(names.iter().find(|n| n.contains(part)).unwrap());
-    let (one, other, page) = (run("base-base-seed1"), run("optimizer-sparse-seed1"), out.join("compare.html"));
-    let compared = bench(&["compare", text(&one), text(&other), "--out", text(&page)]);
+    // As the help says it: all runs of the sweep, of which the base is the first.
+    let folders: Vec<_> = names.iter().map(|name| out.join("runs").join(name)).collect();
+    let folders: Vec<&str> = folders.iter().map(|folder| text(folder)).collect();
+    let page = out.join("compare.html");
+    let compared = bench(&[&["compare"][..], &folders[..], &["--out", text(&page)]].concat());
     assert!(compared.status.success(), "{}", stderr(&compared));
-    check_page(&page, &["class=\"slider\"", "PSNR of training views"], scratch);
+    let figure = format!("<td class=\"number\">{:.3}</td>", number(small, "psnr"));
+    let marks = ["PSNR and SSIM are of evaluated.json", "trained with data-factor 2 instead of 1", "are left out"];
+    check_page(&page, &[&marks[..], &["PSNR of training views", figure.as_str()]].concat(), scratch);
+    let sliders = std::fs::read_to_string(&page).unwrap().matches("class=\"slider\"").count();
+    assert_eq!((names[0].starts_with("base-base-seed1"), sliders), (true, 12));
 }
 
 #[test]
@@ -162,11 +176,15 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     refuses(&["ladder", "/nowhere", "--out", out], "nowhere");
     refuses(&["compare", scene, scene, "--out", out], "metrics.jsonl");
     assert!(!Path::new(out).exists(), "bad input leaves nothing behind");
+    refuses(&["ladder", scene, "--out", out], "nothing would leave memory");
+    refuses(&["orders", scene, "--spill-dir", out], "--spill-dir");
+    refuses(&[scene, "--steps", "1", "--device", "gpu"], "--device");
+    assert!(!Path::new(out).exists(), "nor does a flag that means nothing here");
 
     // The drive cannot be used: the rungs that need it fail and say why, the one in memory is run.
     let file = folder.path().join("file");
     std::fs::write(&file, "").unwrap();
-    let output = bench(&["ladder", scene, "--out", out, "--steps", "4", "--spill", text(&file)]);
+    let output = bench(&["ladder", scene, "--out", out, "--steps", "4", "--page-rows", "16", "--spill", text(&file)]);
     assert!(!output.status.success() && stderr(&output).contains("file"), "{}", stderr(&output));
     let failing = ["--steps", "4", "--image-cache", "1", "--host-mem", "1MiB", "--knobs", "budget", "--seeds", "1"];
     let args = [&["pareto", scene, "--out", out, "--page-rows", "16", "--strategy", "none"][..], &failing].concat();

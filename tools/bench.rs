@@ -42,6 +42,8 @@ use clap::Parser;
 use gsscale::base::error::InputError;
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::config::limits::simd_path;
+use gsscale::dataset::loader::Dataset;
+use gsscale::dataset::target_cache::TargetCache;
 use gsscale::train::trainer::TrainError;
 use serde_json::Value;
 use std::ffi::OsString;
@@ -109,4 +111,38 @@ fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, Tra
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
     }
     Ok(config)
+}
+
+/// Refuses a device other than the CPU: this measurement is of the CPU path.
+fn refuse_devices(config: &TrainConfig) -> Result<(), TrainError> {
+    match config.device.as_str() {
+        "auto" | "cpu" => Ok(()),
+        other => {
+            let problem = format!("this measurement is of the CPU path, not of '{other}'");
+            Err(InputError::new("--device", problem, "leave it out, or use gsscale-bench pareto or ladder").into())
+        }
+    }
+}
+
+/// As [`refuse_devices`], and refuses a drive: this measurement is of a run in memory.
+fn refuse_tiers(config: &TrainConfig) -> Result<(), TrainError> {
+    refuse_devices(config)?;
+    let given = [
+        ("--spill-dir", !config.spill_dir.is_empty()),
+        ("--frames", config.frames > 0),
+        ("--host-mem", config.host_mem.0 > 0),
+    ];
+    match given.into_iter().find(|(_, is_given)| *is_given) {
+        None => Ok(()),
+        Some((flag, _)) => {
+            let remedy = "leave it out, or use gsscale-bench tiers or ladder for the drive";
+            Err(InputError::new(flag, "this measurement keeps all pages in memory", remedy).into())
+        }
+    }
+}
+
+/// Decodes every photo that the cache has room for, so that no contender of a comparison does it for the others.
+fn decode_all(dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
+    dataset.train_views().into_iter().try_for_each(|view| targets.get(view).map(|_| ()))?;
+    Ok(())
 }

@@ -8,6 +8,7 @@
 //! and what its code does; each file names the traps.
 
 use super::file::TrainConfig;
+use super::limits::schedule_steps;
 use crate::base::error::{InputError, InputResult};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -187,9 +188,10 @@ impl PublishedRun {
     }
 }
 
-/// Keys that say where and how fast a run computes, or what it writes, and never change what it reaches; only other keys
-/// make a run another one than the published.
-const NEVER_CHANGES_RESULTS: [&str; 22] = [
+/// Keys that say where and how fast a run computes, or what it writes and keeps, and never change what it reaches; only
+/// other keys make a run another one than the published. `ssim-variant` is none of them: it changes no Gaussian, but
+/// the figure that stands beside the published one.
+const NEVER_CHANGES_RESULTS: [&str; 25] = [
     "images",
     "allow-missing",
     "image-cache",
@@ -201,11 +203,14 @@ const NEVER_CHANGES_RESULTS: [&str; 22] = [
     "color-correct",
     "host-mem",
     "spill-dir",
+    "keep-checkpoint",
     "frames",
     "io",
     "spill-codec",
     "commit-every",
+    "disk-full-wait",
     "evict",
+    "transfers",
     "prefetch-bytes",
     "threads",
     "simd",
@@ -217,12 +222,58 @@ const NEVER_CHANGES_RESULTS: [&str; 22] = [
 /// Settings of `used` that make it another run than `published`: `steps = 200 instead of 200000`.
 pub fn differences(published: &TrainConfig, used: &TrainConfig) -> Vec<String> {
     let [before, after] = [published, used].map(|c| toml::Table::try_from(c).unwrap_or_default());
-    let changed = after
-        .iter()
-        .filter(|(key, value)| !NEVER_CHANGES_RESULTS.contains(&key.as_str()) && before.get(*key) != Some(*value));
+    // A run that went on to more steps has the number written that 0 stood for.
+    let is_same_schedule = schedule_steps(published) == schedule_steps(used);
+    let is_free = |key: &str| NEVER_CHANGES_RESULTS.contains(&key) || (key == "schedule-steps" && is_same_schedule);
+    let changed = after.iter().filter(|(key, value)| !is_free(key.as_str()) && before.get(*key) != Some(*value));
     changed
         .map(|(key, v)| {
             format!("{key} = {v} instead of {}", before.get(key).map_or("none".into(), ToString::to_string))
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::file::{ByteSize, KEYS};
+    use super::*;
+    use crate::checkpoint::interval::CommitEvery;
+
+    #[test]
+    fn keys_that_never_change_results_make_no_difference() {
+        let published = TrainConfig { steps: 200, ..TrainConfig::default() };
+        let used = TrainConfig {
+            keep_checkpoint: true,
+            disk_full_wait: 5.0,
+            transfers: "demand".into(),
+            commit_every: CommitEvery::Seconds(0.0),
+            host_mem: ByteSize(1 << 30),
+            schedule_steps: 200,
+            ..published.clone()
+        };
+        assert_eq!(differences(&published, &used), Vec::<String>::new());
+        let other = TrainConfig { ssim_variant: "valid".into(), schedule_steps: 100, seed: 7, ..used };
+        let want = [
+            "schedule-steps = 100 instead of 0",
+            "seed = 7 instead of 42",
+            "ssim-variant = \"valid\" instead of \"same\"",
+        ];
+        assert_eq!(differences(&published, &other), want);
+        // The shorter schedule of fewer steps follows from them.
+        let fewer = TrainConfig { steps: 50, ..published.clone() };
+        assert_eq!(differences(&published, &fewer), ["steps = 50 instead of 200"]);
+    }
+
+    #[test]
+    fn the_list_agrees_with_the_keys_and_what_they_say() {
+        let name = |name: &str| name.replace('_', "-");
+        for listed in NEVER_CHANGES_RESULTS {
+            assert!(KEYS.iter().any(|(_, key, _)| name(key) == listed), "{listed} is no key");
+        }
+        for (_, key, meaning) in KEYS {
+            let meaning = meaning.split_whitespace().collect::<Vec<_>>().join(" ");
+            let is_listed = NEVER_CHANGES_RESULTS.contains(&name(key).as_str());
+            assert!(is_listed || !meaning.contains("Never changes results"), "{key} is not listed");
+        }
+    }
 }

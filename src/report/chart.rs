@@ -3,6 +3,7 @@
 //! Invariants: 1. points that are not finite are left out; a chart without any point says so instead of failing; 2. the
 //! same data give the same text.
 
+use super::html::escape;
 use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
@@ -10,11 +11,17 @@ use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 /// Width and height of a chart, in the units of its SVG.
 const SIZE: (u32, u32) = (560, 320);
-/// Those of a chart over the whole width of a page, and the part of it that its legend takes.
+/// Those of a chart over the whole width of a page, and the part of it that its legend takes. Where the legend has more
+/// rows than the plot is high, the chart is higher.
 const WIDE: (u32, u32) = (1040, 480);
 const LEGEND_WIDTH: u32 = 190;
-/// Colours of series, in their order.
-pub(super) const COLORS: [RGBColor; 12] = [
+/// Middle of a legend's first row, and from one row to the next.
+const LEGEND_TOP: u32 = 40;
+const LEGEND_ROW: u32 = 20;
+/// Characters of a name that have room in a legend.
+const NAME_MAX: usize = 24;
+/// Colours of series, in their order: as many as a sweep needs, for the base, its eleven knobs and the front.
+pub(super) const COLORS: [RGBColor; 13] = [
     RGBColor(36, 99, 180),
     RGBColor(205, 92, 32),
     RGBColor(46, 139, 87),
@@ -27,7 +34,10 @@ pub(super) const COLORS: [RGBColor; 12] = [
     RGBColor(90, 80, 200),
     RGBColor(150, 100, 60),
     RGBColor(230, 120, 170),
+    RGBColor(0, 70, 60),
 ];
+/// What becomes of the colours when they begin again: below 1 they are darker, above lighter.
+const SHADES: [f64; 4] = [1.0, 0.6, 1.5, 0.3];
 
 /// Axes and frames.
 pub(super) const AXIS: RGBColor = RGBColor(97, 97, 97);
@@ -54,7 +64,7 @@ pub struct Series {
     pub points: Vec<(f64, f64)>,
     /// How it is drawn.
     pub mark: Mark,
-    /// Index of its colour; larger ones begin again from the first.
+    /// Index of its colour; those beyond the last begin again in other shades.
     pub color: usize,
 }
 
@@ -73,6 +83,8 @@ pub struct Chart {
     pub labels: Vec<(f64, f64, String)>,
     /// Vertical ranges: (x, lowest y, highest y).
     pub ranges: Vec<(f64, f64, f64)>,
+    /// Horizontal ranges: (y, lowest x, highest x).
+    pub ranges_x: Vec<(f64, f64, f64)>,
     /// A dashed horizontal line with what it means.
     pub rule: Option<(f64, String)>,
     /// Over the whole width of the page, the legend beside it.
@@ -85,8 +97,8 @@ impl Chart {
     /// A chart without series.
     pub fn new(title: &str, x: &str, y: &str) -> Chart {
         let [title, x, y] = [title, x, y].map(str::to_string);
-        let (series, labels, ranges, rule) = Default::default();
-        Chart { title, x, y, series, labels, ranges, rule, is_wide: false, from_zero: false }
+        let (series, labels, ranges, ranges_x, rule) = Default::default();
+        Chart { title, x, y, series, labels, ranges, ranges_x, rule, is_wide: false, from_zero: false }
     }
 
     /// Adds a series.
@@ -127,16 +139,56 @@ impl Chart {
     pub fn svg(&self) -> String {
         let mut text = String::new();
         let drawn = {
-            let size = if self.is_wide { WIDE } else { SIZE };
-            let root = SVGBackend::with_string(&mut text, size).into_drawing_area();
+            let root = SVGBackend::with_string(&mut text, self.size()).into_drawing_area();
             self.draw(&root).and_then(|()| root.present().map_err(|e| e.to_string()))
         };
         match drawn {
-            Ok(()) => text,
-            Err(problem) => {
-                format!("<p class=\"dim\">This chart could not be drawn: {}</p>", super::html::escape(&problem))
+            Ok(()) if self.is_wide => {
+                let end = text.rfind("</svg>").unwrap_or(text.len());
+                text.insert_str(end, &self.legend());
+                text
             }
+            Ok(()) => text,
+            Err(problem) => format!("<p class=\"dim\">This chart could not be drawn: {}</p>", escape(&problem)),
         }
+    }
+
+    fn size(&self) -> (u32, u32) {
+        let legend = LEGEND_TOP + LEGEND_ROW * self.named().count() as u32;
+        if self.is_wide { (WIDE.0, WIDE.1.max(legend)) } else { SIZE }
+    }
+
+    /// What the legend lists.
+    fn named(&self) -> impl Iterator<Item = &Series> {
+        self.series.iter().filter(|s| !s.name.is_empty())
+    }
+
+    /// The legend beside a wide plot, as SVG. It is written here because `plotters` knows no `<title>`, in which a name
+    /// that had to be shortened is whole.
+    fn legend(&self) -> String {
+        let left = WIDE.0 - LEGEND_WIDTH;
+        let (middle, words) = (left + 6, left + 20);
+        let mut svg = String::new();
+        for (row, series) in self.named().enumerate() {
+            let y = LEGEND_TOP + LEGEND_ROW * row as u32;
+            let RGBColor(r, g, b) = color(series.color);
+            let color = format!("#{r:02X}{g:02X}{b:02X}");
+            let ring = format!("fill=\"none\" stroke=\"{color}\" stroke-width=\"2\"");
+            let mark = match series.mark {
+                Mark::Line => format!("<path d=\"M{left} {y}h12\" {ring}/>"),
+                Mark::Rings => format!("<circle cx=\"{middle}\" cy=\"{y}\" r=\"4\" {ring}/>"),
+                Mark::Dots | Mark::LineAndDots => {
+                    format!("<circle cx=\"{middle}\" cy=\"{y}\" r=\"4\" fill=\"{color}\"/>")
+                }
+            };
+            let (whole, name) = (escape(&series.name), escape(&shortened(&series.name)));
+            let title = if whole == name { String::new() } else { format!("<title>{whole}</title>") };
+            svg.push_str(&format!(
+                "<g>{title}{mark}<text x=\"{words}\" y=\"{y}\" dy=\"0.35em\" font-family=\"sans-serif\" \
+                 font-size=\"10.5\">\n{name}\n</text></g>\n"
+            ));
+        }
+        svg
     }
 
     fn draw(&self, root: &DrawingArea<SVGBackend<'_>, Shift>) -> Result<(), String> {
@@ -144,21 +196,9 @@ impl Chart {
         if !self.is_wide {
             return self.draw_plot(root);
         }
-        let (plot, legend) = root.split_horizontally(WIDE.0 - LEGEND_WIDTH);
-        self.draw_plot(&plot)?;
-        let mut y = 40;
-        for series in self.series.iter().filter(|s| !s.name.is_empty()) {
-            let color = COLORS[series.color % COLORS.len()];
-            match series.mark {
-                Mark::Line => legend.draw(&PathElement::new([(0, y), (12, y)], color.stroke_width(2))),
-                Mark::Rings => legend.draw(&Circle::new((6, y), 4, color.stroke_width(2))),
-                Mark::Dots | Mark::LineAndDots => legend.draw(&Circle::new((6, y), 4, color.filled())),
-            }
-            .map_err(text)?;
-            legend.draw(&Text::new(series.name.clone(), (20, y - 6), ("sans-serif", 13))).map_err(text)?;
-            y += 20;
-        }
-        Ok(())
+        let (plot, _) = root.split_horizontally(WIDE.0 - LEGEND_WIDTH);
+        let (plot, _) = plot.split_vertically(WIDE.1);
+        self.draw_plot(&plot)
     }
 
     fn draw_plot(&self, root: &DrawingArea<SVGBackend<'_>, Shift>) -> Result<(), String> {
@@ -180,8 +220,7 @@ impl Chart {
             let (dx, dy) = root.get_base_pixel();
             root.draw(&Text::new(meaning.clone(), (x - dx, y - dy + 3), style)).map_err(text)?;
         }
-        let range = |&(x, low, high): &(f64, f64, f64)| PathElement::new([(x, low), (x, high)], AXIS.mix(0.6));
-        chart.draw_series(self.ranges.iter().map(range)).map_err(text)?;
+        chart.draw_series(self.bars().map(|ends| PathElement::new(ends, AXIS.mix(0.6)))).map_err(text)?;
         for series in &self.series {
             draw_series(&mut chart, series, !self.is_wide)?;
         }
@@ -236,6 +275,13 @@ impl Chart {
         Ok(())
     }
 
+    /// Both ends of each range, upright or level; one that is not finite is left out.
+    fn bars(&self) -> impl Iterator<Item = [(f64, f64); 2]> {
+        let upright = self.ranges.iter().map(|&(x, low, high)| [(x, low), (x, high)]);
+        let level = self.ranges_x.iter().map(|&(y, low, high)| [(low, y), (high, y)]);
+        upright.chain(level).filter(|ends| ends.iter().all(|(x, y)| x.is_finite() && y.is_finite()))
+    }
+
     /// Ranges of the axes, with a margin; never empty.
     fn ranges(&self) -> ([f64; 2], [f64; 2]) {
         let points = || self.series.iter().flat_map(|s| &s.points);
@@ -243,9 +289,9 @@ impl Chart {
             let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
             if low > high { [0.0, 1.0] } else { [low, high] }
         };
-        let x = range(&mut points().map(|p| p.0));
-        let of_ranges = self.ranges.iter().flat_map(|r| [r.1, r.2]);
-        let ys = points().map(|p| p.1).chain(of_ranges).chain(self.rule.iter().map(|r| r.0));
+        let ends = || self.bars().flatten();
+        let x = range(&mut points().map(|p| p.0).chain(ends().map(|p| p.0)));
+        let ys = points().map(|p| p.1).chain(ends().map(|p| p.1)).chain(self.rule.iter().map(|r| r.0));
         let mut y = range(&mut ys.filter(|y| y.is_finite()));
         if self.from_zero {
             y[0] = y[0].min(0.0);
@@ -264,8 +310,30 @@ fn text<E: std::fmt::Display>(e: E) -> String {
     e.to_string()
 }
 
+/// The colour of an index.
+fn color(index: usize) -> RGBColor {
+    let RGBColor(r, g, b) = COLORS[index % COLORS.len()];
+    let shade = SHADES[index / COLORS.len() % SHADES.len()];
+    let of = |c: u8| {
+        let c = f64::from(c);
+        let shaded = if shade <= 1.0 { c * shade } else { c + (255.0 - c) * (shade - 1.0) };
+        shaded.round() as u8
+    };
+    RGBColor(of(r), of(g), of(b))
+}
+
+/// A name with its middle left out where it is too long for a legend: names of runs differ in how they begin and end.
+fn shortened(name: &str) -> String {
+    let length = name.chars().count();
+    if length <= NAME_MAX {
+        return name.to_string();
+    }
+    let (before, after) = (NAME_MAX / 2, NAME_MAX - NAME_MAX / 2 - 1);
+    name.chars().take(before).chain(['…']).chain(name.chars().skip(length - after)).collect()
+}
+
 fn draw_series(chart: &mut Plot<'_, '_>, series: &Series, in_legend: bool) -> Result<(), String> {
-    let color = COLORS[series.color % COLORS.len()];
+    let color = color(series.color);
     let is_named = in_legend && !series.name.is_empty();
     if matches!(series.mark, Mark::Line | Mark::LineAndDots) {
         let line = LineSeries::new(series.points.iter().copied(), color.stroke_width(2));
@@ -289,25 +357,28 @@ fn draw_series(chart: &mut Plot<'_, '_>, series: &Series, in_legend: bool) -> Re
 
 /// A tick of an axis that covers `span`: with so many digits that neighbours differ.
 fn tick(value: f64, span: f64) -> String {
-    if value.abs() >= 1e4 || span >= 100.0 {
-        return short(value);
-    }
+    let (scale, unit) = unit(value);
     // Some eight ticks, a digit finer than their distance.
-    let digits = (1.0 - (span / 8.0).log10()).floor().clamp(0.0, 6.0) as usize;
-    let text = format!("{value:.digits$}");
+    let digits = (1.0 - (span / scale / 8.0).log10()).floor().clamp(0.0, 12.0) as usize;
+    let text = format!("{:.digits$}", value / scale);
     let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
-    if text == "-0" { "0".to_string() } else { text.to_string() }
+    if text == "-0" { "0".to_string() } else { format!("{text}{unit}") }
+}
+
+/// What a number is divided by to be short, and the letter for it.
+fn unit(value: f64) -> (f64, &'static str) {
+    match value.abs() {
+        m if m >= 1e9 => (1e9, "G"),
+        m if m >= 1e6 => (1e6, "M"),
+        m if m >= 1e4 => (1e3, "k"),
+        _ => (1.0, ""),
+    }
 }
 
 /// A number in few characters: 1.2M, 350k, 0.25.
 pub fn short(value: f64) -> String {
-    let magnitude = value.abs();
-    let (scaled, unit) = match magnitude {
-        m if m >= 1e9 => (value / 1e9, "G"),
-        m if m >= 1e6 => (value / 1e6, "M"),
-        m if m >= 1e4 => (value / 1e3, "k"),
-        _ => (value, ""),
-    };
+    let (scale, unit) = unit(value);
+    let scaled = value / scale;
     let digits = match scaled.abs() {
         s if s >= 100.0 || s == 0.0 => 0,
         s if s >= 10.0 => 1,
@@ -339,6 +410,53 @@ mod tests {
         assert_eq!(ticks, ["19.3", "19.35", "19.4"]);
         assert_eq!([0.0, 0.0005, 0.001].map(|v| tick(v, 0.003)), ["0", "0.0005", "0.001"]);
         assert_eq!([tick(25_000.0, 1e5), tick(3000.0, 3000.0), tick(-0.0, 1.0)], ["25k", "3000", "0"]);
+        let ticks = [149_880.0, 149_890.0, 149_900.0, 149_950.0].map(|v| tick(v, 77.0));
+        assert_eq!(ticks, ["149.88k", "149.89k", "149.9k", "149.95k"]);
+        assert_eq!([1.5e6, 2e6, -2e6].map(|v| tick(v, 3e6)), ["1.5M", "2M", "-2M"]);
+        assert_eq!([2_000_000.0, 2_000_010.0].map(|v| tick(v, 70.0)), ["2M", "2.00001M"]);
+    }
+
+    #[test]
+    fn colours_differ_also_when_they_begin_again() {
+        // The base, its knobs and the front of a sweep.
+        assert!(COLORS.len() > 12);
+        let all: Vec<RGBColor> = (0..COLORS.len() * SHADES.len()).map(color).collect();
+        assert_eq!(all[..COLORS.len()], COLORS);
+        for (i, one) in all.iter().enumerate() {
+            assert!(all[..i].iter().all(|other| other != one), "{i}: {one:?}");
+        }
+        assert_eq!(color(all.len()), COLORS[0]);
+    }
+
+    #[test]
+    fn a_long_legend_stays_inside_the_chart() {
+        let mut chart = Chart::new("a", "b", "c").wide();
+        let name = |i: usize| format!("resolution-1-2-seed{i}-0123&{i:04}");
+        for i in 0..60 {
+            chart = chart.with(&name(i), vec![(0.0, 0.0), (1.0, i as f64)], Mark::Line);
+        }
+        let svg = chart.with("short", vec![(1.0, 1.0)], Mark::Dots).svg();
+        let height = LEGEND_TOP + 61 * LEGEND_ROW;
+        assert!(svg.contains(&format!("viewBox=\"0 0 1040 {height}\"")) && svg.trim_end().ends_with("</svg>"), "{svg}");
+        assert!(svg.contains(&format!("y=\"{}\" dy=\"0.35em\"", height - LEGEND_ROW)), "the last row is inside");
+        assert!(svg.contains("<title>resolution-1-2-seed7-0123&amp;0007</title>") && svg.contains(">\nresolution-1…"));
+        assert_eq!(svg.matches("<title>").count(), 60, "names that are whole need none");
+        assert_eq!(shortened(&name(7)), "resolution-1…7-0123&0007");
+        assert_eq!(shortened("ä".repeat(30).as_str()).chars().count(), NAME_MAX);
+        assert_eq!(shortened(&"b".repeat(NAME_MAX)), "b".repeat(NAME_MAX));
+        assert!(Chart::new("a", "b", "c").wide().svg().contains("viewBox=\"0 0 1040 480\""));
+    }
+
+    #[test]
+    fn ranges_are_within_the_axes_and_odd_ones_are_left_out() {
+        let chart = Chart::new("a", "b", "c").with("", vec![(1.0, 1.0), (2.0, 2.0)], Mark::Dots);
+        let bars = |chart: &Chart| chart.svg().matches("opacity=\"0.6\" stroke=\"#616161\"").count();
+        let mut with = chart.clone();
+        with.ranges = vec![(1.0, -3.0, 4.0), (f64::NAN, 0.0, 1.0), (1.0, 0.0, f64::INFINITY)];
+        with.ranges_x = vec![(2.0, -5.0, 9.0), (2.0, f64::NAN, 1.0), (f64::INFINITY, 0.0, 1.0)];
+        assert_eq!([bars(&chart), bars(&with)], [0, 2], "{}", with.svg());
+        let ([x0, x1], [y0, y1]) = with.ranges();
+        assert!(x0 <= -5.0 && (9.0..12.0).contains(&x1) && y0 <= -3.0 && (4.0..6.0).contains(&y1));
     }
 
     #[test]

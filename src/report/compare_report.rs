@@ -1,12 +1,13 @@
 //! A page that sets finished runs side by side: figures, curves, and renders of the same held-out view.
 //!
 //! Invariants: 1. what a run lacks is left out for it; only a folder without metrics is refused; 2. the number of
-//! pictures is bounded.
+//! pictures is bounded; 3. figures of a run that was evaluated again, as a sweep does on the photos of its base, are
+//! those of that evaluation; what else makes figures another measure than those of the first run is said beside them.
 
 use super::chart::{Chart, Mark};
 use super::html::{Cell, Page};
 use super::picture::view_pictures;
-use super::run_report::{curve, read_json, read_metrics};
+use super::run_report::{curve, read_json, read_metrics, read_text};
 use crate::base::error::InputResult;
 use crate::base::units::format_bytes;
 use serde_json::Value;
@@ -15,6 +16,13 @@ use std::path::{Path, PathBuf};
 
 /// Sliders shown; more make a file that is slow to open.
 const SLIDERS_MAX: usize = 12;
+/// What `gsscale-eval --json` wrote of a run, and the config that it was told, where there is one.
+const EVALUATED: &str = "evaluated.json";
+const EVALUATED_AS: &str = "evaluated-as.toml";
+/// Keys that make photos smaller, and so easier.
+const PHOTO_KEYS: [&str; 2] = ["data-factor", "max-resolution"];
+/// Stands behind the names of runs that have remarks.
+const STAR: &str = " *";
 
 /// A run of the comparison.
 struct Compared {
@@ -22,6 +30,78 @@ struct Compared {
     folder: PathBuf,
     metrics: Vec<Value>,
     summary: Value,
+    /// What the held-out figures are from: the summary, or a later evaluation.
+    judged: Value,
+    is_evaluated_again: bool,
+    /// Values of [`PHOTO_KEYS`] while training.
+    trained_on: [Option<f64>; 2],
+    /// The same for the held-out figures.
+    judged_on: [Option<f64>; 2],
+    /// What sets it apart from the first run.
+    remarks: Vec<String>,
+}
+
+impl Compared {
+    fn read(folder: &Path, name: String) -> InputResult<Compared> {
+        let metrics = read_metrics(folder)?;
+        let json = |name: &str| read_json(&folder.join(name)).unwrap_or(Value::Null);
+        let (summary, evaluated) = (json("summary.json"), json(EVALUATED));
+        let is_evaluated_again = evaluated["test"]["psnr"].is_number();
+        let trained_on = photos(&folder.join("config.toml"));
+        let (judged, judged_on) = match is_evaluated_again {
+            true => (evaluated, photos(&folder.join(EVALUATED_AS))),
+            false => (summary.clone(), trained_on),
+        };
+        let (folder, remarks) = (folder.to_path_buf(), Vec::new());
+        Ok(Compared { name, folder, metrics, summary, judged, is_evaluated_again, trained_on, judged_on, remarks })
+    }
+
+    fn psnr(&self) -> Option<f64> {
+        self.judged["test"]["psnr"].as_f64()
+    }
+
+    /// Its name in charts.
+    fn label(&self) -> String {
+        format!("{}{}", self.name, if self.remarks.is_empty() { "" } else { STAR })
+    }
+
+    /// What sets it apart from the first run.
+    fn remarks(&self, first: &Compared) -> Vec<String> {
+        let mut remarks = Vec::new();
+        for (what, own, first) in
+            [("trained", self.trained_on, first.trained_on), ("judged", self.judged_on, first.judged_on)]
+        {
+            let pairs = PHOTO_KEYS.iter().zip(own.into_iter().zip(first));
+            let both = pairs.filter_map(|(key, (own, first))| Some((key, own?, first?)));
+            let others = both.filter(|(_, own, first)| own != first);
+            // 1.2 * 1.5 is not quite 1.8.
+            let round = |x: f64| (x * 1e4).round() / 1e4;
+            remarks.extend(
+                others.map(|(key, own, first)| format!("{what} with {key} {} instead of {}", round(own), round(first))),
+            );
+        }
+        let variant = |run: &Compared| run.judged["ssim_variant"].as_str().map(str::to_string);
+        if let Some((own, first)) = variant(self).zip(variant(first)).filter(|(own, first)| own != first) {
+            remarks.push(format!("SSIM is {own} instead of {first}"));
+        }
+        if self.is_evaluated_again {
+            remarks.push(format!("PSNR and SSIM are of {EVALUATED}"));
+        }
+        remarks
+    }
+
+    /// Whether both were judged on photos of the same size, as far as is known.
+    fn is_judged_as(&self, other: &Compared) -> bool {
+        let mut pairs = self.judged_on.into_iter().zip(other.judged_on);
+        pairs.all(|(own, other)| own.zip(other).is_none_or(|(own, other)| own == other))
+    }
+}
+
+/// Values of [`PHOTO_KEYS`] in a config file; none where it or the key is missing.
+fn photos(config: &Path) -> [Option<f64>; 2] {
+    let table: Option<toml::Table> = read_text(config).and_then(|text| text.parse().ok());
+    let number = |value: &toml::Value| value.as_float().or_else(|| value.as_integer().map(|i| i as f64));
+    PHOTO_KEYS.map(|key| table.as_ref().and_then(|table| table.get(key)).and_then(number))
 }
 
 /// A report that sets several runs side by side: what they reached, over steps and over seconds, and what they look like.
@@ -31,16 +111,18 @@ struct Compared {
 pub fn compare_report(folders: &[PathBuf]) -> InputResult<String> {
     let mut runs = Vec::new();
     for (folder, name) in folders.iter().zip(names(folders)) {
-        let summary = read_json(&folder.join("summary.json")).unwrap_or(Value::Null);
-        runs.push(Compared { name, folder: folder.clone(), metrics: read_metrics(folder)?, summary });
+        runs.push(Compared::read(folder, name)?);
     }
+    let remarks: Vec<Vec<String>> = runs.iter().map(|run| run.remarks(&runs[0])).collect();
+    runs.iter_mut().zip(remarks).for_each(|(run, remarks)| run.remarks = remarks);
     let scenes: BTreeSet<&str> = runs.iter().filter_map(|r| r.summary["scene"].as_str()).collect();
     let scenes = scenes.into_iter().collect::<Vec<_>>().join(", ");
     let mut page = Page::new("gsscale: comparison", &format!("{} runs; {scenes}", folders.len()));
     page.table(&HEAD, &runs.iter().map(|run| row(run, &runs[0])).collect::<Vec<_>>());
     page.heading("Over steps and seconds");
+    let caption = if runs.iter().all(|run| run.remarks.is_empty()) { "" } else { CAPTION };
     for chart in charts(&runs) {
-        page.wide_chart(&chart.svg(), "");
+        page.wide_chart(&chart.svg(), caption);
     }
     add_views(&mut page, &runs)?;
     Ok(page.finish())
@@ -65,6 +147,10 @@ const CURVES: [Curve; 4] = [
     ("Read from the drive", "GB", |m| m["bytes_read"].as_f64().filter(|b| *b > 0.0).map(|b| b / 1e9)),
 ];
 
+/// What the star means.
+const CAPTION: &str = "* trained or judged otherwise than the first run, see the remarks. Curves are of each run's own \
+                       photos; the held-out views of a run that was evaluated again on other ones are one dot at its end.";
+
 fn charts(runs: &[Compared]) -> Vec<Chart> {
     let mut charts = Vec::new();
     for (title, unit, of) in CURVES {
@@ -74,14 +160,16 @@ fn charts(runs: &[Compared]) -> Vec<Chart> {
             }
             let mut chart = Chart::new(&format!("{title} over {axis}"), axis, unit).wide();
             for run in runs {
-                let mut points = curve(&run.metrics, x, of);
                 let is_test = title == CURVES[0].0;
+                // What was measured on other photos than the figure at the end makes no line with it.
+                let is_other = is_test && run.is_evaluated_again && run.judged_on != run.trained_on;
+                let mut points = if is_other { Vec::new() } else { curve(&run.metrics, x, of) };
                 if is_test {
-                    // The last evaluation is in the summary, not in the metrics.
+                    // The last evaluation is not in the metrics.
                     let end = if x == "step" { &run.summary["steps"] } else { &run.summary["train_seconds"] };
-                    points.extend(end.as_f64().zip(run.summary["test"]["psnr"].as_f64()));
+                    points.extend(end.as_f64().zip(run.psnr()));
                 }
-                chart = chart.with(&run.name, points, if is_test { Mark::LineAndDots } else { Mark::Line });
+                chart = chart.with(&run.label(), points, if is_test { Mark::LineAndDots } else { Mark::Line });
             }
             if !chart.is_empty() {
                 charts.push(chart);
@@ -108,11 +196,21 @@ fn add_views(page: &mut Page, runs: &[Compared]) -> InputResult<()> {
         return Ok(());
     }
     page.heading("Held-out views that all have");
-    let stride = (common.len() * others.len()).div_ceil(SLIDERS_MAX).max(1);
+    let shown = others.len().min(SLIDERS_MAX);
+    let (runs, views) = (evenly(others.len(), shown), evenly(common.len(), SLIDERS_MAX / shown));
+    let (sliders, all) = (runs.len() * views.len(), others.len() * common.len());
+    if sliders < all {
+        page.paragraph(&format!(
+            "{sliders} of {all} pairs of a run and a view are shown, {} are left out; all pictures are in renders/test \
+             of the runs.",
+            all - sliders
+        ));
+    }
+    let common: Vec<&String> = common.iter().collect();
     page.begin_views();
-    for name in common.iter().step_by(stride) {
+    for name in views.iter().map(|&view| common[view]) {
         let left = view_pictures(&first.folder.join("renders/test").join(name))?;
-        for run in others {
+        for run in runs.iter().map(|&run| &others[run]) {
             let right = view_pictures(&run.folder.join("renders/test").join(name))?;
             let sides = [(first.name.as_str(), left.render.as_str()), (run.name.as_str(), right.render.as_str())];
             page.slider(name.trim_end_matches(".png"), sides, ("photo", &left.photo), "");
@@ -122,7 +220,13 @@ fn add_views(page: &mut Page, runs: &[Compared]) -> InputResult<()> {
     Ok(())
 }
 
-const HEAD: [&str; 11] = [
+/// At most `most` of the numbers below `count`, evenly.
+fn evenly(count: usize, most: usize) -> Vec<usize> {
+    let chosen = most.min(count);
+    (0..chosen).map(|i| i * count / chosen).collect()
+}
+
+const HEAD: [&str; 12] = [
     "run",
     "PSNR, dB",
     "against the first",
@@ -134,6 +238,7 @@ const HEAD: [&str; 11] = [
     "peak memory",
     "read",
     "written",
+    "remarks",
 ];
 
 fn row(run: &Compared, first: &Compared) -> Vec<Cell> {
@@ -141,13 +246,13 @@ fn row(run: &Compared, first: &Compared) -> Vec<Cell> {
     let number =
         |value: &Value, digits: usize| Cell::Number(value.as_f64().map_or(String::new(), |v| format!("{v:.digits$}")));
     let bytes = |value: &Value| Cell::Number(value.as_u64().map_or(String::new(), format_bytes));
-    let psnr = |run: &Compared| run.summary["test"]["psnr"].as_f64();
-    let against = psnr(run).zip(psnr(first)).filter(|_| run.folder != first.folder);
+    // On other photos it is another measure.
+    let against = run.psnr().zip(first.psnr()).filter(|_| run.folder != first.folder && run.is_judged_as(first));
     vec![
-        Cell::Text(run.name.clone()),
-        number(&summary["test"]["psnr"], 3),
+        Cell::Text(run.label()),
+        number(&run.judged["test"]["psnr"], 3),
         Cell::Number(against.map_or(String::new(), |(own, first)| format!("{:+.3}", own - first))),
-        number(&summary["test"]["ssim"], 4),
+        number(&run.judged["test"]["ssim"], 4),
         number(&summary["gaussians"], 0),
         number(&summary["steps"], 0),
         number(&summary["train_seconds"], 1),
@@ -155,5 +260,104 @@ fn row(run: &Compared, first: &Compared) -> Vec<Cell> {
         bytes(&summary["host_bytes_peak"]),
         bytes(&summary["bytes_read"]),
         bytes(&summary["bytes_written"]),
+        Cell::Text(run.remarks.join("; ")),
     ]
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use serde_json::json;
+    use tempfile::TempDir;
+
+    /// A finished run with these held-out figures and `views` pictures.
+    fn run(parent: &Path, name: &str, (psnr, factor, ssim): (f64, f64, &str), views: usize) -> PathBuf {
+        let folder = parent.join(name);
+        std::fs::create_dir_all(folder.join("renders/test")).unwrap();
+        let line = json!({"step": 4, "psnr": 20.0, "gaussians": 9, "seconds": 1.0, "test": {"psnr": 77.0}});
+        std::fs::write(folder.join("metrics.jsonl"), format!("{line}\n")).unwrap();
+        let test = json!({"views": views, "psnr": psnr, "ssim": 0.5});
+        let summary = json!({"steps": 10, "train_seconds": 2.0, "test": test, "ssim_variant": ssim});
+        std::fs::write(folder.join("summary.json"), summary.to_string()).unwrap();
+        std::fs::write(folder.join("config.toml"), config(factor)).unwrap();
+        for view in 0..views {
+            let picture = image::RgbImage::from_pixel(4, 2, image::Rgb([view as u8, 20, 30]));
+            picture.save(folder.join(format!("renders/test/view{view:02}.png"))).unwrap();
+        }
+        folder
+    }
+
+    fn config(factor: f64) -> String {
+        format!("data-factor = {factor:.1}\nmax-resolution = 0\n\n[resolved]\nversion = \"x\"\n")
+    }
+
+    fn evaluate(folder: &Path, psnr: f64, ssim: &str) {
+        let report = json!({"ssim_variant": ssim, "test": {"views": 1, "psnr": psnr, "ssim": 0.25}});
+        std::fs::write(folder.join(EVALUATED), report.to_string()).unwrap();
+    }
+
+    #[test]
+    fn runs_on_smaller_photos_are_judged_by_their_evaluation_or_marked() {
+        let parent = TempDir::new().unwrap();
+        let base = run(parent.path(), "base", (26.0, 1.0, "same"), 0);
+        let half = run(parent.path(), "half", (28.5, 2.0, "same"), 0);
+        let valid = run(parent.path(), "valid", (26.5, 1.0, "valid"), 0);
+        let page = compare_report(&[base.clone(), half.clone(), valid]).unwrap();
+        let marks = "<td>trained with data-factor 2 instead of 1; judged with data-factor 2 instead of 1</td>";
+        assert!(page.contains("<td>half *</td>") && page.contains("28.500") && page.contains(marks), "{page}");
+        assert!(!page.contains("+2.500"), "other photos make another measure");
+        assert!(page.contains("<td>SSIM is valid instead of same</td>") && page.contains("+0.500"));
+        assert!(page.contains("<td>base</td>") && page.contains(&CAPTION[..40]));
+
+        // As a sweep does it.
+        evaluate(&half, 25.25, "same");
+        std::fs::write(half.join(EVALUATED_AS), config(1.0)).unwrap();
+        let page = compare_report(&[base.clone(), half.clone()]).unwrap();
+        assert!(page.contains("25.250") && page.contains("-0.750") && page.contains("0.2500"), "{page}");
+        assert!(!page.contains("28.500") && !page.contains("judged with"));
+        let marks = "<td>trained with data-factor 2 instead of 1; PSNR and SSIM are of evaluated.json</td>";
+        assert!(page.contains(marks), "{page}");
+
+        // Without the config that it was evaluated with, nobody knows on which photos.
+        std::fs::remove_file(half.join(EVALUATED_AS)).unwrap();
+        assert!(compare_report(&[base.clone(), half]).unwrap().contains("-0.750"));
+        let alike = compare_report(&[base.clone(), base]).unwrap();
+        assert!(!alike.contains(" *<") && !alike.contains("trained or judged otherwise"));
+    }
+
+    #[test]
+    fn the_curve_of_held_out_views_does_not_join_figures_of_other_photos() {
+        let parent = TempDir::new().unwrap();
+        let half = run(parent.path(), "half", (28.5, 2.0, "same"), 0);
+        let points = |folder: &Path| {
+            let run = Compared::read(folder, "half".into()).unwrap();
+            charts(&[run]).remove(0).series.remove(0).points
+        };
+        assert_eq!(points(&half), [(4.0, 77.0), (10.0, 28.5)]);
+        evaluate(&half, 25.25, "same");
+        assert_eq!(points(&half), [(10.0, 25.25)]);
+        std::fs::write(half.join(EVALUATED_AS), config(2.0)).unwrap();
+        assert_eq!(points(&half), [(4.0, 77.0), (10.0, 25.25)]);
+    }
+
+    #[test]
+    fn pages_of_many_runs_are_bounded_and_say_what_they_leave_out() {
+        let parent = TempDir::new().unwrap();
+        let folder = |i: usize, views: usize| {
+            let name = format!("resolution-1-2-seed1-{i:08}-of-{views}");
+            run(parent.path(), &name, (26.0, 1.0, "same"), views)
+        };
+        for (runs, views, shown) in [(40, 2, 12), (3, 20, 12), (14, 1, 12), (6, 5, 10), (3, 2, 4), (2, 12, 12)] {
+            let folders: Vec<PathBuf> = (0..runs).map(|i| folder(i, views)).collect();
+            let page = compare_report(&folders).unwrap();
+            assert_eq!(page.matches("class=\"slider\"").count(), shown, "{runs} runs, {views} views");
+            let all = (runs - 1) * views;
+            let said = format!("{shown} of {all} pairs of a run and a view are shown, {} are left out", all - shown);
+            assert_eq!(page.contains(&said), shown < all, "{said}");
+            assert!(runs < 40 || page.contains("viewBox=\"0 0 1040 840\""), "charts are as high as their legends");
+        }
+        assert_eq!(evenly(5, 2), [0, 2]);
+        assert_eq!([evenly(3, 9), evenly(0, 9)], [vec![0, 1, 2], vec![]]);
+    }
 }

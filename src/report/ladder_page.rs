@@ -36,7 +36,9 @@ pub fn ladder_page(facts: &str, rungs: &[LadderRung], not_built: &[&str]) -> Str
         (bytes(|r| Some(r.bytes_read as f64), "Bytes read from the drive"), "By the steps.".into()),
         (
             bytes(|r| Some(r.bytes_written as f64), "Bytes written to the drive"),
-            "By the steps and the commit at the end.".into(),
+            "Pages, written by the steps and by the commit after the last one, which a run in memory does not make; by \
+             other commits only where --commit-every asks for them."
+                .into(),
         ),
         (
             bytes(|r| Some(r.host_bytes_peak as f64), "Peak of host memory"),
@@ -56,8 +58,12 @@ pub fn ladder_page(facts: &str, rungs: &[LadderRung], not_built: &[&str]) -> Str
 
 fn bars(rungs: &[LadderRung], title: &str, of: fn(&RunRecord) -> Option<f64>, write: &dyn Fn(f64) -> String) -> String {
     let bar = |rung: &LadderRung| {
-        let value = of(&rung.record).filter(|_| rung.record.problem.is_none());
-        (rung.name.clone(), value, value.map_or("failed".to_string(), write))
+        let (value, lack) = match rung.record.problem {
+            Some(_) => (None, "failed"),
+            // Not every system tells every figure.
+            None => (of(&rung.record), "–"),
+        };
+        (rung.name.clone(), value, value.map_or(lack.to_string(), write))
     };
     Bars { title: title.to_string(), bars: rungs.iter().map(bar).collect() }.svg()
 }
@@ -145,5 +151,16 @@ mod tests {
         rungs[1].record.problem = Some("no <memory>".into());
         let page = ladder_page("facts", &rungs, &["image splitting"]);
         assert!(page.contains("failed: no &lt;memory&gt;") && page.contains("not built yet"));
+    }
+
+    #[test]
+    fn a_figure_that_is_missing_is_not_a_rung_that_failed() {
+        // No CPU seconds, as where the system does not tell them.
+        let mut rungs = vec![rung("naive", "x", 26.5), rung("memory", "a", 26.25)];
+        let svg = |rungs: &[LadderRung]| bars(rungs, "CPU seconds", |r| r.cpu_seconds, &|v| format!("{v:.1} s"));
+        rungs[1].record.cpu_seconds = Some(7.5);
+        assert!(svg(&rungs).contains(">\n–\n") && svg(&rungs).contains("7.5 s") && !svg(&rungs).contains("failed"));
+        rungs[0].record.problem = Some("no memory".into());
+        assert!(svg(&rungs).contains(">\nfailed\n") && !svg(&rungs).contains('–'));
     }
 }

@@ -3,7 +3,7 @@
 //! Every figure of a setting is its mean over seeds; the bar through a point goes from its lowest seed to its highest.
 
 use super::chart::{Chart, Mark};
-use super::front::{Setting, Spread, Verdict, pareto_front, settings};
+use super::front::{Setting, Spread, Verdict, against, pareto_front, settings};
 use super::html::{Cell, Page};
 use super::record::RunRecord;
 use crate::base::units::format_bytes;
@@ -98,13 +98,15 @@ fn reading(settings: &[Setting]) -> String {
         1 => "The base has one seed, so its spread is not known: only results with the same bits are called free."
             .to_string(),
         n => format!(
-            "Costs no accuracy: PSNR and SSIM are both no lower than the mean of the base less its spread (highest less \
-             lowest) over {n} seeds; the dashed line is that limit."
+            "Costs no accuracy: PSNR and SSIM are both no lower than the base with the same seeds, less the base's spread \
+             (highest less lowest) over {n} seeds; the dashed line is that limit for a setting with all of these seeds."
         ),
     };
     format!(
-        "A point is a setting, its place the mean over its seeds, its bar their range. Dots cost no accuracy, rings do or \
-         may. The grey line joins the settings that no other one beats. {rule}"
+        "A point is a setting, its place the mean over its seeds, its bars their range both ways: where those of the base \
+         are as long as a difference, the difference says nothing. Dots cost no accuracy, rings do or may. The grey line \
+         joins the settings that no other one beats. Times are those of the steps alone, without loading and \
+         evaluation; bytes written hold those of the commit after the last step. {rule}"
     )
 }
 
@@ -137,6 +139,7 @@ fn chart(settings: &[Setting], name: &str, quality: Quality, cost: &Cost) -> Opt
             chart = chart.with_color(name, own, mark, color);
         }
     }
+    chart.ranges_x = points.iter().filter_map(|p| across(p.0, p.2.mean, cost)).collect();
     chart.ranges = points.iter().filter(|p| p.2.width() > 0.0).map(|p| (p.1, p.2.low, p.2.high)).collect();
     // Those on the front are named first, so that they have the best places.
     let rest = (0..points.len()).filter(|i| !front.contains(i));
@@ -147,15 +150,22 @@ fn chart(settings: &[Setting], name: &str, quality: Quality, cost: &Cost) -> Opt
     Some(chart)
 }
 
+/// The range of a cost over the seeds of a setting that has several.
+fn across(setting: &Setting, quality: f64, cost: &Cost) -> Option<(f64, f64, f64)> {
+    let spread = Spread::of(setting.runs.iter().filter_map(cost.of))?;
+    (spread.width() > 0.0).then_some((quality, spread.low, spread.high))
+}
+
 /// A number says nothing without its knob.
 fn clear_label(setting: &Setting) -> String {
     let is_word = setting.label.len() > 2 && setting.label.starts_with(|c: char| c.is_alphabetic());
     if is_word { setting.label.clone() } else { format!("{} {}", setting.knob, setting.label) }
 }
 
-const HEAD: [&str; 14] = [
+const HEAD: [&str; 15] = [
     "knob",
     "setting",
+    "frames of pages",
     "seeds",
     "PSNR, dB",
     "range",
@@ -177,8 +187,8 @@ fn row(setting: &Setting, base: Option<&Setting>) -> Vec<Cell> {
         let mean = setting.mean(|r| Some(of(r) as f64));
         Cell::Number(mean.filter(|b| *b > 0.0).map_or(String::from("–"), |b| format_bytes(b as u64)))
     };
-    let base = base.filter(|b| b.verdict == Verdict::Base).and_then(|b| b.psnr);
-    let against = setting.psnr.zip(base).filter(|_| setting.verdict != Verdict::Base);
+    let base = base.filter(|b| b.verdict == Verdict::Base && setting.verdict != Verdict::Base);
+    let against = base.and_then(|base| against(setting, base, |r| r.psnr));
     let range = setting.psnr.filter(|_| setting.runs.len() > 1);
     let verdict = match setting.verdict {
         Verdict::Base => "the base",
@@ -190,10 +200,11 @@ fn row(setting: &Setting, base: Option<&Setting>) -> Vec<Cell> {
     vec![
         Cell::Text(setting.knob.clone()),
         Cell::Text(setting.label.clone()),
+        Cell::Number(setting.runs.last().map_or(String::new(), |r| format!("{} of {}", r.frames, r.pages))),
         Cell::Number(setting.runs.len().to_string()),
         number(setting.psnr.map(|p| p.mean), 3),
         Cell::Number(range.map_or(String::new(), |p| format!("{:.3} to {:.3}", p.low, p.high))),
-        Cell::Number(against.map_or(String::new(), |(own, base)| format!("{:+.3}", own.mean - base.mean))),
+        Cell::Number(against.map_or(String::new(), |difference| format!("{difference:+.3}"))),
         number(setting.ssim.map(|s| s.mean), 4),
         number(setting.mean(|r| Some(r.seconds)), 1),
         number(setting.mean(|r| r.cpu_seconds), 1),

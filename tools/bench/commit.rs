@@ -85,6 +85,7 @@ impl Steps {
 /// Bad input, or a step or a commit that fails.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let mut config = super::settle(args.config.as_deref(), &args.keys)?;
+    super::refuse_devices(&config)?;
     if config.spill_dir.is_empty() {
         let remedy = "name a folder on the drive to measure";
         return Err(InputError::new("--spill-dir", "there is no drive to measure", remedy).into());

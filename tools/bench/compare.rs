@@ -9,7 +9,10 @@ use std::path::PathBuf;
 const EXAMPLES: &str = "\
 Examples:
   gsscale-bench compare runs/village runs/village_sh1 --out compare.html
-  gsscale-bench compare sweeps/village/runs/* --out compare.html";
+  gsscale-bench compare sweeps/village/runs/* --out compare.html
+
+The first run is the one that the others are set against. What a run's folder has in evaluated.json (written by
+gsscale-eval --json, as a sweep does for runs on smaller photos) takes the place of the run's own PSNR and SSIM.";
 
 /// Sets finished runs side by side: figures, curves over steps and seconds, renders of the same view under a slider.
 #[derive(Parser)]

@@ -91,6 +91,7 @@ struct Run {
 /// Bad input, or a step that fails.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let config = super::settle(args.config.as_deref(), &args.keys)?;
+    super::refuse_tiers(&config)?;
     let parse = |text: &String| text.parse().map_err(|p: String| InputError::new("--compare-orders", p, "see --help"));
     let orders: Vec<Order> = args.compare_orders.iter().map(parse).collect::<Result<_, _>>()?;
     if !(args.share > 0.0 && args.share <= 100.0) {

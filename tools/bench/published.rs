@@ -96,19 +96,16 @@ struct Setting {
 /// The folder is not complete, or as a run.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, TrainError> {
     let mut run = PublishedRun::find(&args.run)?;
-    if let Some(tier) = &args.tier {
-        run.use_tier(tier)?;
+    let out = args.out.clone().unwrap_or_else(|| Path::new("runs").join(&run.name));
+    let finished = if args.no_train { Some(TrainConfig::read(&out.join("config.toml"))?) } else { None };
+    // A run of another tier is compared with that tier afterwards too, as it was when it ended.
+    let of_finished = finished.as_ref().and_then(|config| run.tier_of(config)).map(str::to_string);
+    if let Some(tier) = args.tier.clone().or(of_finished) {
+        run.use_tier(&tier)?;
     }
-    let mut setting = settle(run, args)?;
-    let config = if args.no_train {
-        let mut config = TrainConfig::read(&setting.out.join("config.toml"))?;
-        args.keys.clone().apply(&mut config);
-        config
-    } else {
-        let mut config = setting.published.clone();
-        args.keys.clone().apply(&mut config);
-        config
-    };
+    let mut setting = settle(run, args, out)?;
+    let mut config = finished.unwrap_or_else(|| setting.published.clone());
+    args.keys.clone().apply(&mut config);
     config.check()?;
     setting.caveats.extend(differences(&setting.published, &config));
     check_photos(args, &config, &mut setting)?;
@@ -129,7 +126,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, Tra
 }
 
 /// The layout of the folder and the config with what lies in it.
-fn settle(run: PublishedRun, args: &Args) -> InputResult<Setting> {
+fn settle(run: PublishedRun, args: &Args, out: PathBuf) -> InputResult<Setting> {
     let parse = |name: &String| {
         let refuse = |problem| InputError::new(&args.run, problem, "correct the config").at("layouts");
         name.parse::<Layout>().map_err(refuse)
@@ -149,7 +146,6 @@ fn settle(run: PublishedRun, args: &Args) -> InputResult<Setting> {
         let places = run.facts.clouds.join(", ");
         caveats.push(format!("starts from the model's own points: the published cloud is not there ({places})"));
     }
-    let out = args.out.clone().unwrap_or_else(|| Path::new("runs").join(&run.name));
     Ok(Setting { run, layout, published, out, caveats })
 }
 

@@ -51,13 +51,15 @@ pub struct Args {
 /// As a run.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let config = super::settle(args.config.as_deref(), &args.keys)?;
+    super::refuse_tiers(&config)?;
     let began = Instant::now();
     let prepared = prepare(&args.scene, &config)?;
     let dataset = prepared.dataset;
     let load_seconds = began.elapsed().as_secs_f64();
     let gaussians_at_start = prepared.columns.rows();
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-    let options = RunOptions::new(&config, dataset.scene_scale);
+    let options =
+        RunOptions { sh_degree_start: prepared.sh_degree_start, ..RunOptions::new(&config, dataset.scene_scale) };
     let mut trainer = Trainer::new(prepared.columns, &dataset, Box::new(CpuRenderer::new()), options)?;
     let (began, cpu_before) = (Instant::now(), process_cpu_seconds());
     let mut loss = 0.0;

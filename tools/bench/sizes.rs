@@ -96,6 +96,7 @@ struct Size {
 /// Bad input, or a step that fails.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let config = super::settle(args.config.as_deref(), &args.keys)?;
+    super::refuse_devices(&config)?;
     if config.spill_dir.is_empty() {
         let remedy = "name a folder on the drive to measure";
         return Err(InputError::new("--spill-dir", "there is no drive to measure", remedy).into());
@@ -117,6 +118,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         sizes.push(size(&config, &Copies { dataset: &dataset, count, shift }, frames)?);
     }
     let warm_up = args.warm_up.unwrap_or(config.steps / 4).min(config.steps / 2);
+    super::decode_all(&dataset, &targets)?;
     take_turns(&mut sizes, (0..warm_up, args.turn), (&dataset, &targets), false)?;
     sizes.iter_mut().for_each(|size| size.before = size.trainer.scene.pager.stats());
     take_turns(&mut sizes, (warm_up..config.steps, args.turn), (&dataset, &targets), true)?;

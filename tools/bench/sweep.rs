@@ -312,7 +312,7 @@ fn problem(output: &Output) -> String {
 
 fn digest(path: &Path) -> InputResult<String> {
     let io = |e: std::io::Error| InputError::io(path, "reading the result", &e);
-    let mut file = std::fs::File::open(path).map_err(io)?;
+    let mut file = File::open(path).map_err(io)?;
     let (mut hash, mut buffer) = (Xxh3::new(), vec![0; 1 << 20]);
     loop {
         match file.read(&mut buffer).map_err(io)? {

@@ -83,6 +83,7 @@ struct Contender {
 /// Bad input, or a step that fails.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let mut config = super::settle(args.config.as_deref(), &args.keys)?;
+    super::refuse_devices(&config)?;
     if config.spill_dir.is_empty() {
         let remedy = "name a folder on the drive to measure";
         return Err(InputError::new("--spill-dir", "there is no drive to measure", remedy).into());
@@ -107,6 +108,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         contenders.push(contender(&prepared, &config, Some(share), frames(share))?);
     }
     let warm_up = args.warm_up.unwrap_or(dataset.train_views().len() as u32).min(config.steps / 2);
+    super::decode_all(dataset, &targets)?;
     take_turns(&mut contenders, (0..warm_up, args.turn), dataset, &targets, false)?;
     contenders.iter_mut().for_each(Contender::begin);
     take_turns(&mut contenders, (warm_up..config.steps, args.turn), dataset, &targets, true)?;
@@ -164,7 +166,8 @@ fn contender(
     let frames_key = if share.is_some() { u32::try_from(frames).unwrap_or(u32::MAX) } else { 0 };
     // The share says how much memory there is.
     let own = TrainConfig { spill_dir, frames: frames_key, host_mem: ByteSize(0), ..config.clone() };
-    let options = RunOptions::new(&own, prepared.dataset.scene_scale);
+    let scale = prepared.dataset.scene_scale;
+    let options = RunOptions { sh_degree_start: prepared.sh_degree_start, ..RunOptions::new(&own, scale) };
     let (pager, tiers) = tiers::open(&own, prepared.columns.rows().div_ceil(options.page_rows), u64::MAX, false)?;
     let columns = prepared.columns.clone();
     let trainer = Trainer::with_pager(columns, pager, &prepared.dataset, Box::new(CpuRenderer::new()), options)?;
