@@ -4,16 +4,19 @@
 use gsscale::base::ids::PageId;
 use gsscale::page::codec::Codec;
 use gsscale::page::commit::{
-    CommitConfig, CommitError, Commits, Cut, MAP_NAME, PageChange, RESERVE_NAME, WITNESS_NAME,
+    CommitConfig, CommitError, Commits, Cut, MAP_NAME, PageChange, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME,
 };
 use gsscale::page::engine::{IoEngine, open_engine};
-use gsscale::page::folder::DriveFolder;
+use gsscale::page::folder::{DriveFolder, Folder};
 use gsscale::page::format::{HEADER_BYTES, SlotRef};
 use gsscale::page::manifest::{Manifest, MapBatch, MapError};
 use gsscale::page::opening::Opened;
 use gsscale::page::paged_store::{PageMoved, PagedStore};
+use gsscale::page::reading::{Access, ReadError, StoreReader, WitnessRule, commit_config};
 use gsscale::page::segment_files::segment_file_name;
 use gsscale::page::slots::SlotLayout;
+use gsscale::page::spill_dir::SpillDir;
+use gsscale::page::spill_format::Purpose;
 use redb::backends::InMemoryBackend;
 use redb::{Builder, ReadableDatabase, StorageBackend, TableDefinition};
 use std::path::Path;
@@ -194,6 +197,105 @@ fn hostile_maps_are_refused() {
         let error = Manifest::open(file, 5, 0, 1 << 18).err().unwrap();
         assert!(matches!(&error, MapError::Damaged(what) if what.contains("no store gets to")), "{error}");
     }
+}
+
+/// The same for those who only look.
+#[test]
+fn hostile_maps_cost_readers_nothing() {
+    let parent = tempfile::tempdir().unwrap();
+    let at = parent.path().join("store");
+    let spill = SpillDir::create(&at, Purpose::Checkpoint, LAYOUT, false).unwrap();
+    let config = commit_config(spill.format().store);
+    let opened = Commits::create(Box::new(DriveFolder::new(&at)), config).unwrap();
+    let mut store = pages_of(&opened, &at);
+    let mut commits = opened.commits;
+    let good = write(&mut store, 0, 7);
+    for segment in [u32::MAX, u32::MAX - 1, 1 << 20] {
+        let mut slot = good;
+        slot.place.segment = segment;
+        commit(&mut commits, &mut store, &[(0, Some(slot))], None);
+    }
+    commit(&mut commits, &mut store, &[(0, Some(good))], Some("good"));
+    drop((commits, store, spill));
+    let reader = StoreReader::open(&at, Access::Pages, WitnessRule::Obeyed).unwrap();
+    let mut pages = reader.pages_at(reader.find(None).unwrap()).unwrap();
+    assert!(reader.paged_store(&pages, 1).is_ok());
+    let slot = pages[0].slot;
+    let mut reading = reader.slot_reader();
+    assert_eq!(reading.payload(PageId::initial(0), &slot).unwrap(), [7; 100]);
+    // More than the file holds, and more than a slot does.
+    let longer = |payload_bytes| SlotRef { stored_bytes: payload_bytes, payload_bytes, ..slot };
+    let error = reading.payload(PageId::initial(0), &longer(4000)).unwrap_err();
+    assert!(error.contains("another version"), "{error}");
+    let error = reading.payload(PageId::initial(0), &longer(5000)).unwrap_err();
+    assert!(error.contains("more than a slot holds"), "{error}");
+    for segment in [u32::MAX, u32::MAX - 1, 1 << 20] {
+        pages[0].slot.place.segment = segment;
+        let error = reader.paged_store(&pages, 1).unwrap_err();
+        assert!(matches!(&error, ReadError::Commit(CommitError::Segments(_))), "{error}");
+    }
+}
+
+/// A folder in which the second piece of the reserve cannot be written: the process is as good as killed there.
+struct Interrupted(DriveFolder);
+
+#[derive(Debug)]
+struct InterruptedFile(Arc<dyn StorageBackend>);
+
+impl Folder for Interrupted {
+    fn open(&self, name: &str) -> std::io::Result<Option<Arc<dyn StorageBackend>>> {
+        self.0.open(name)
+    }
+    fn create(&self, name: &str) -> std::io::Result<Arc<dyn StorageBackend>> {
+        let file = self.0.create(name)?;
+        Ok(if name.starts_with(RESERVE_NAME) { Arc::new(InterruptedFile(file)) } else { file })
+    }
+    fn rename(&self, from: &str, to: &str) -> std::io::Result<()> {
+        self.0.rename(from, to)
+    }
+    fn remove(&self, name: &str) -> std::io::Result<()> {
+        self.0.remove(name)
+    }
+    fn sync(&self) -> std::io::Result<()> {
+        self.0.sync()
+    }
+}
+
+impl StorageBackend for InterruptedFile {
+    fn len(&self) -> std::io::Result<u64> {
+        self.0.len()
+    }
+    fn read(&self, offset: u64, out: &mut [u8]) -> std::io::Result<()> {
+        self.0.read(offset, out)
+    }
+    fn set_len(&self, len: u64) -> std::io::Result<()> {
+        self.0.set_len(len)
+    }
+    fn sync_data(&self) -> std::io::Result<()> {
+        self.0.sync_data()
+    }
+    fn write(&self, offset: u64, data: &[u8]) -> std::io::Result<()> {
+        if offset > 0 { Err(std::io::ErrorKind::Other.into()) } else { self.0.write(offset, data) }
+    }
+}
+
+/// A reserve whose filling was interrupted is not taken for one: every byte of it was written when it has its name.
+#[test]
+fn a_reserve_that_was_not_filled_is_filled_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    drop(create(at).unwrap());
+    let config = CommitConfig { reserve_bytes: 3 << 20, ..CONFIG };
+    let mut killed = Commits::open(Box::new(Interrupted(DriveFolder::new(at))), config).unwrap().commits;
+    assert!(killed.fill_reserve().is_err());
+    drop(killed);
+    let mut commits = Commits::open(Box::new(DriveFolder::new(at)), config).unwrap().commits;
+    assert!(commits.fill_reserve().unwrap());
+    let bytes = std::fs::read(at.join(RESERVE_NAME)).unwrap();
+    assert!(bytes.len() == 3 << 20 && bytes.iter().all(|&byte| byte == 0x5a), "it is hollow");
+    assert!(!at.join(RESERVE_NEW_NAME).exists());
+    std::fs::write(at.join(RESERVE_NEW_NAME), b"left by a process that was killed").unwrap();
+    assert!(commits.give_up_reserve().unwrap() && !at.join(RESERVE_NEW_NAME).exists());
 }
 
 #[test]

@@ -32,6 +32,8 @@ pub const MAP_NEW_NAME: &str = "map.redb.new";
 pub const WITNESS_NAME: &str = "witness";
 /// Space set aside for a last commit on a full drive.
 pub const RESERVE_NAME: &str = "reserve";
+/// The reserve while it is filled.
+pub const RESERVE_NEW_NAME: &str = "reserve.new";
 /// The reserve is filled in pieces of this many bytes.
 const RESERVE_PIECE_BYTES: usize = 1 << 20;
 
@@ -326,7 +328,7 @@ impl Commits {
         match fill_reserve(self.folder.as_ref(), bytes) {
             Ok(()) => Ok(true),
             Err(error) if super::page_error::is_out_of_space(&error) => {
-                self.folder.remove(RESERVE_NAME).map_err(|source| CommitError::File { name: RESERVE_NAME, source })?;
+                self.give_up_reserve()?;
                 Ok(false)
             }
             Err(source) => Err(CommitError::File { name: RESERVE_NAME, source }),
@@ -339,8 +341,11 @@ impl Commits {
     /// The folder cannot be written.
     pub fn give_up_reserve(&mut self) -> Result<bool, CommitError> {
         let error = |source| CommitError::File { name: RESERVE_NAME, source };
-        let was_there = self.folder.open(RESERVE_NAME).map_err(error)?.is_some();
-        self.folder.remove(RESERVE_NAME).map_err(error)?;
+        let mut was_there = false;
+        for name in [RESERVE_NAME, RESERVE_NEW_NAME] {
+            was_there |= self.folder.open(name).map_err(error)?.is_some();
+            self.folder.remove(name).map_err(error)?;
+        }
         Ok(was_there)
     }
 
@@ -454,22 +459,27 @@ fn value_of(slot: &SlotRef, label: &[u8]) -> Vec<u8> {
     value
 }
 
-/// Really writes the bytes: some drives and file systems do not keep space that was only promised.
+/// Really writes the bytes: some drives and file systems do not keep space that was only promised. The name comes last: what
+/// has it is filled, also when a process was killed or the power failed meanwhile.
 fn fill_reserve(folder: &dyn Folder, bytes: u64) -> io::Result<()> {
     if bytes == 0 {
-        return folder.remove(RESERVE_NAME);
+        return folder.remove(RESERVE_NEW_NAME).and_then(|()| folder.remove(RESERVE_NAME));
     }
     if let Some(file) = folder.open(RESERVE_NAME)?
         && file.len()? >= bytes
     {
         return Ok(());
     }
-    let file = folder.create(RESERVE_NAME)?;
+    // One that is too small gives its space to the new one.
+    folder.remove(RESERVE_NAME)?;
+    let file = folder.create(RESERVE_NEW_NAME)?;
     file.set_len(bytes)?;
     let piece = vec![0x5a; RESERVE_PIECE_BYTES];
     for at in (0..bytes).step_by(RESERVE_PIECE_BYTES) {
         file.write(at, &piece[..(bytes - at).min(RESERVE_PIECE_BYTES as u64) as usize])?;
     }
     file.sync_data()?;
+    drop(file);
+    folder.rename(RESERVE_NEW_NAME, RESERVE_NAME)?;
     folder.sync()
 }

@@ -158,7 +158,8 @@ pub struct SlotHeader {
     pub store: u128,
     /// The page.
     pub page: PageId,
-    /// Number of the write in the life of the store; tells which of two versions of a page is the later one.
+    /// Number of the write in the life of the store; tells which of two versions of a page is the later one, unless one of
+    /// them comes from a process that ended before it committed anything: the next one gives the same numbers again.
     pub serial: u64,
     /// Place, lengths, generation and checksum.
     pub slot: SlotRef,

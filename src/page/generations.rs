@@ -84,11 +84,6 @@ impl Generations {
         &self.pins
     }
 
-    /// Entries that only past generations see.
-    pub fn superseded(&self) -> usize {
-        self.superseded.len()
-    }
-
     fn add(&mut self, version: &MapVersion) {
         let (page, until) = (version.page, version.generation);
         if let Some(from) = self.last.remove(&page).or_else(|| self.gone.remove(&page)) {

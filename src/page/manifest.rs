@@ -202,7 +202,8 @@ impl Manifest {
     /// Opens the map in `file`, verifies all of it and reads what it holds. Unless it succeeds, `file` stays as it was.
     ///
     /// # Errors
-    /// The map is damaged, older than transaction `acknowledged`, or cannot be read or written.
+    /// The map is damaged, older than transaction `acknowledged`, or cannot be read or written. [`MapError::Full`]: the
+    /// file is as a crash leaves it, and may be opened again.
     pub fn open(
         file: Arc<dyn StorageBackend>,
         store: u128,
@@ -210,7 +211,7 @@ impl Manifest {
         cache_bytes: usize,
     ) -> Result<(Manifest, MapContent), MapError> {
         let (mut manifest, content) = Manifest::look(file, store, acknowledged, cache_bytes)?;
-        manifest.file.let_through().map_err(MapError::Io)?;
+        manifest.file.let_through()?;
         manifest.poisoned = false;
         Ok((manifest, content))
     }
@@ -225,8 +226,8 @@ impl Manifest {
         acknowledged: u64,
         cache_bytes: usize,
     ) -> Result<(Manifest, MapContent), MapError> {
-        let file = MapFile::holding_back(file).map_err(MapError::Io)?;
-        if file.len().map_err(MapError::Io)? == 0 {
+        let file = MapFile::holding_back(file)?;
+        if file.len()? == 0 {
             return Err(MapError::Damaged("the file is empty".to_string()));
         }
         let database = guarded(|| Ok(builder(cache_bytes).create_with_backend(file.clone())?));

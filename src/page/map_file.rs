@@ -8,6 +8,7 @@
 //! Invariants: 1. held-back operations are carried out in their order, syncs included; 2. once shut, nothing is read or
 //! written any more.
 
+use super::segment_files::allocate;
 use redb::{BackendError, StorageBackend};
 use std::fs::File;
 use std::io;
@@ -219,19 +220,14 @@ impl StorageBackend for DriveFile {
     }
 
     fn set_len(&self, len: u64) -> io::Result<()> {
-        #[cfg(target_os = "linux")]
-        {
-            use rustix::fs::{FallocateFlags, fallocate};
-            let now = self.0.metadata()?.len();
-            if len > now {
-                match fallocate(&self.0, FallocateFlags::empty(), now, len - now) {
-                    Ok(()) => return Ok(()),
-                    Err(rustix::io::Errno::OPNOTSUPP | rustix::io::Errno::INVAL) => {}
-                    Err(error) => return Err(error.into()),
-                }
-            }
+        let now = self.0.metadata()?.len();
+        if len <= now {
+            return self.0.set_len(len);
         }
-        self.0.set_len(len)
+        allocate(&self.0, now, len).inspect_err(|_| {
+            // What was taken before space ran out is given back, as far as that works.
+            let _ = self.0.set_len(now);
+        })
     }
 
     fn sync_data(&self) -> io::Result<()> {
@@ -256,6 +252,21 @@ impl StorageBackend for DriveFile {
 mod tests {
     use super::*;
     use redb::backends::InMemoryBackend;
+
+    #[cfg(unix)]
+    #[test]
+    fn a_file_that_grows_takes_its_space() {
+        use std::os::unix::fs::MetadataExt;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map");
+        let open = File::options().read(true).write(true).create_new(true).open(&path).unwrap();
+        let file = DriveFile::new(open);
+        for (len, taken) in [(1 << 20, 1 << 20), (3 << 20, 3 << 20), (1 << 20, 1 << 20)] {
+            file.set_len(len).unwrap();
+            let there = std::fs::metadata(&path).unwrap();
+            assert!(there.len() == len && there.blocks() * 512 >= taken, "{} blocks", there.blocks());
+        }
+    }
 
     #[test]
     fn what_is_held_back_is_read_but_not_written() {

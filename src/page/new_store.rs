@@ -3,7 +3,8 @@
 //! It is made beside its target under another name and renamed when it is complete.
 //!
 //! Invariants: 1. the target is a whole store or nothing: a tool that fails or is killed leaves at most a folder with
-//! [`PART_SUFFIX`], which the next attempt refuses to overwrite; 2. memory is bounded by sixteen pages.
+//! [`PART_SUFFIX`], which the next attempt refuses to overwrite; 2. memory is bounded by sixteen pages, and by as many
+//! more where they are encoded.
 
 use super::buffer::PageBuffer;
 use super::codec::Codec;

@@ -15,7 +15,10 @@ use super::store::{PageStore, Place};
 use crate::base::ids::PageId;
 use std::collections::BTreeMap;
 
-/// Numbers of writes that a life of the store may use up before its first commit: the next life begins beyond them.
+/// Numbers of writes that a life of the store may use up between two commits: a life that opens a later generation begins
+/// beyond them. Lives that open the same generation, because those before them ended without a commit, begin at the same
+/// number. So of two versions whose slots name the same generation, the one with the larger number need not be the later
+/// one; the map never goes by these numbers, only a salvage without a map does.
 const SERIALS_PER_LIFE: u64 = 1 << 32;
 
 /// Segments that an error names.
@@ -110,7 +113,11 @@ impl Opened {
 
 /// Looks at all segments up to the `last` one that is named: they were made one after the other, and are written to as a
 /// store grows. So a map that names a segment beyond all that there are costs neither time nor memory. Gives their number.
-fn check_segments(engine: &dyn PageStore, layout: SlotLayout, last: Option<u32>) -> Result<u32, CommitError> {
+pub(super) fn check_segments(
+    engine: &dyn PageStore,
+    layout: SlotLayout,
+    last: Option<u32>,
+) -> Result<u32, CommitError> {
     let Some(last) = last else { return Ok(0) };
     let check = |segment| engine.check_segment(segment, layout.segment_bytes()).err().map(|e| (segment, e));
     let wrong: Vec<String> = (0..=last)

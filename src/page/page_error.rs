@@ -63,7 +63,7 @@ pub enum PageError {
         source: io::Error,
     },
     /// There is no space for another segment, or it cannot be made. Nothing is lost; it may be tried again.
-    #[error("{} ({bytes} bytes) cannot be made: {source}\n  remedy: free space on the drive of the spill directory", segment_file_name(*.segment))]
+    #[error("{} ({bytes} bytes) cannot be made: {source}\n  remedy: {}", segment_file_name(*.segment), grow_remedy(.source))]
     Grow {
         /// Number of the segment.
         segment: u32,
@@ -112,6 +112,19 @@ impl PageError {
             PageError::Grow { source, .. } => is_out_of_space(source),
             _ => false,
         }
+    }
+}
+
+/// What helps where a segment cannot be made.
+fn grow_remedy(source: &io::Error) -> &'static str {
+    match source.kind() {
+        // A limit on the length of files counts as a want of space, too; the message above says which it was.
+        _ if is_out_of_space(source) => "free space on the drive of the spill directory",
+        io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => {
+            "see to it that the spill directory can be written, or name another one"
+        }
+        io::ErrorKind::AlreadyExists => "take the file out of the spill directory if it is not of this run",
+        _ => "check the drive and the spill directory; what was committed is still there",
     }
 }
 

@@ -78,6 +78,8 @@ pub struct PagedStore {
     ended: Vec<PageDone>,
     /// Buffers of a slot's size that are not in use.
     staging: Vec<PageBuffer>,
+    /// Buffers of that kind that are in use.
+    staged: usize,
     traffic: PageTraffic,
     poison: Option<String>,
 }
@@ -112,6 +114,7 @@ impl PagedStore {
             unencoded: Vec::new(),
             ended: Vec::new(),
             staging: Vec::new(),
+            staged: 0,
             traffic: PageTraffic::default(),
             poison: None,
         }
@@ -150,8 +153,12 @@ impl PagedStore {
     /// Memory of the store's own buffers, bytes: none while pages are stored raw, otherwise as much as was ever in flight
     /// at once.
     pub fn staging_bytes(&self) -> u64 {
-        let encoded = self.pending.values().filter(|p| p.payload.is_some()).count();
-        (self.staging.len() + self.unencoded.len() + encoded) as u64 * self.config.layout.slot_bytes
+        (self.staging.len() + self.staged) as u64 * self.config.layout.slot_bytes
+    }
+
+    /// Buffers of the store's own that are in use: one for every page that is on its way encoded or waits to be.
+    pub fn staged(&self) -> usize {
+        self.staged
     }
 
     /// Generation that is being written.
@@ -325,7 +332,13 @@ impl PagedStore {
     }
 
     fn take_staging(&mut self) -> PageBuffer {
+        self.staged += 1;
         self.staging.pop().unwrap_or_else(|| self.new_buffer())
+    }
+
+    fn give_staging(&mut self, buffer: PageBuffer) {
+        self.staged -= 1;
+        self.staging.push(buffer);
     }
 
     fn encode_waiting(&mut self, codec: Codec) {
@@ -342,7 +355,7 @@ impl PagedStore {
         for Unencoded { token, page, slot, label, payload, staging } in batch {
             let (buffer, payload) = match slot.codec {
                 StoredAs::Raw => {
-                    self.staging.push(staging);
+                    self.give_staging(staging);
                     (payload, None)
                 }
                 _ => (staging, Some(payload)),
@@ -358,7 +371,7 @@ impl PagedStore {
             self.slots.release(pending.slot.place);
             let payload = match pending.payload.take() {
                 Some(payload) => {
-                    self.staging.push(buffer);
+                    self.give_staging(buffer);
                     payload
                 }
                 None => buffer,
@@ -437,7 +450,7 @@ impl PagedStore {
         for (mut pending, Completion { transfer, result }, verdict) in checked {
             let buffer = match pending.payload.take() {
                 Some(payload) => {
-                    self.staging.push(transfer.buffer);
+                    self.give_staging(transfer.buffer);
                     payload
                 }
                 None => transfer.buffer,

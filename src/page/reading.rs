@@ -12,7 +12,7 @@ use super::format::SlotRef;
 use super::generations::Generations;
 use super::manifest::{Manifest, MapContent, MapError};
 use super::map_file::DriveFile;
-use super::opening::{StoredPage, pages_at, slot_and_label};
+use super::opening::{StoredPage, check_segments, pages_at, slot_and_label};
 use super::paged_store::{PagedStore, PagedStoreConfig};
 use super::pread_store::PreadStore;
 use super::segment_files::{open_for_reading, segment_from_file_name};
@@ -265,7 +265,8 @@ impl StoreReader {
     /// These pages behind an engine that cannot write.
     ///
     /// # Errors
-    /// The map names a slot that cannot be, or the engine cannot be started.
+    /// The map names a slot that cannot be; segments up to the last that these pages lie in are missing or have another
+    /// length; or the engine cannot be started.
     pub fn paged_store(&self, pages: &[StoredPage], threads: usize) -> Result<PagedStore, ReadError> {
         let engine = PreadStore::open_read_only(&self.folder, threads)
             .map_err(|e| InputError::io(&self.folder, "opening the pages", &e))?;
@@ -277,7 +278,8 @@ impl StoreReader {
             generation: self.generations.next(),
             serial: 0,
         };
-        let segments = pages.iter().map(|p| p.slot.place.segment + 1).max().unwrap_or(0);
+        let last = pages.iter().map(|p| p.slot.place.segment).max();
+        let segments = check_segments(&engine, layout, last)?;
         let used = pages.iter().map(|p| &p.slot);
         let opened = PagedStore::open(Box::new(engine), config, segments, used);
         opened.map_err(|e| CommitError::Contradiction(e.to_string()).into())

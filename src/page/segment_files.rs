@@ -274,9 +274,9 @@ fn direct_works(_folder: &Path) -> io::Result<bool> {
 }
 
 /// Takes the space `from..to` from the file system. A longer length alone would not: writes could then still find the
-/// drive full.
+/// drive full. The file's length is `from` before and `to` after it.
 #[cfg(unix)]
-fn allocate(file: &File, from: u64, to: u64) -> io::Result<()> {
+pub(super) fn allocate(file: &File, from: u64, to: u64) -> io::Result<()> {
     use rustix::fs::{FallocateFlags, fallocate};
     use rustix::io::Errno;
     loop {
@@ -289,7 +289,7 @@ fn allocate(file: &File, from: u64, to: u64) -> io::Result<()> {
 }
 
 #[cfg(not(unix))]
-fn allocate(file: &File, from: u64, to: u64) -> io::Result<()> {
+pub(super) fn allocate(file: &File, from: u64, to: u64) -> io::Result<()> {
     write_zeros(file, from, to)
 }
 

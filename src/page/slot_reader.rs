@@ -1,9 +1,10 @@
 //! Reads slots one at a time for tools that look at a store: no engine, no threads, nothing is written.
 //!
-//! Invariant: bytes are given out as good only if [`super::verify`] found them to be the version that was asked for.
+//! Invariants: 1. bytes are given out as good only if [`super::verify`] found them to be the version that was asked for;
+//! 2. memory is taken for what a slot and its file really can hold, not for what the sizes of the store allow.
 
 use super::buffer::PageBuffer;
-use super::format::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs};
+use super::format::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs, transfer_bytes};
 use super::map_file::DriveFile;
 use super::segment_files::{open_for_reading, segment_file_name};
 use super::store::Place;
@@ -18,6 +19,7 @@ use std::path::{Path, PathBuf};
 pub struct SlotReader {
     folder: PathBuf,
     store: u128,
+    slot_bytes: u64,
     /// The segment that was read last, and its length.
     file: Option<(u32, DriveFile, u64)>,
     stored: PageBuffer,
@@ -27,8 +29,8 @@ pub struct SlotReader {
 impl SlotReader {
     /// For the slots of store `store`, of `slot_bytes` bytes each, in `folder`.
     pub fn new(folder: &Path, store: u128, slot_bytes: u64) -> SlotReader {
-        let buffer = || PageBuffer::zeroed(slot_bytes as usize);
-        SlotReader { folder: folder.to_path_buf(), store, file: None, stored: buffer(), decoded: buffer() }
+        let buffer = || PageBuffer::zeroed(HEADER_BYTES);
+        SlotReader { folder: folder.to_path_buf(), store, slot_bytes, file: None, stored: buffer(), decoded: buffer() }
     }
 
     /// Whether version `slot` of `page` is there, by its header alone.
@@ -61,10 +63,14 @@ impl SlotReader {
     /// What is wrong, for people.
     pub fn payload(&mut self, page: PageId, slot: &SlotRef) -> Result<&[u8], String> {
         let bytes = slot.transfer_bytes();
-        if bytes.max(HEADER_BYTES + slot.payload_bytes as usize) > self.stored.len() {
+        let needed = bytes.max(transfer_bytes(slot.payload_bytes as usize));
+        if needed as u64 > self.slot_bytes {
             return Err(format!("the index gives it {bytes} bytes, more than a slot holds"));
         }
         self.read(slot.place, bytes, |_| ())?;
+        if slot.codec != StoredAs::Raw {
+            make_longer(&mut self.decoded, needed);
+        }
         let decoded = self.decoded.as_mut_slice();
         verify(self.store, page, slot, &self.stored.as_slice()[..bytes], Some(decoded))?;
         let whole = if slot.codec == StoredAs::Raw { &self.stored } else { &self.decoded };
@@ -86,10 +92,21 @@ impl SlotReader {
             }
             self.file = Some((place.segment, DriveFile::new(file), length.len()));
         }
-        let Some((_, file, _)) = &self.file else { return Ok(()) };
+        let Some((_, file, length)) = &self.file else { return Ok(()) };
+        if place.offset.saturating_add(bytes as u64) > *length {
+            return Err(failed(io::ErrorKind::UnexpectedEof.into()));
+        }
+        make_longer(&mut self.stored, bytes);
         let buffer = &mut self.stored.as_mut_slice()[..bytes];
         file.read(place.offset, buffer).map_err(failed)?;
         take(buffer);
         Ok(())
+    }
+}
+
+/// Makes a buffer at least so long; what it held is lost then.
+fn make_longer(buffer: &mut PageBuffer, bytes: usize) {
+    if buffer.len() < bytes {
+        *buffer = PageBuffer::zeroed(bytes);
     }
 }

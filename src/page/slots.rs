@@ -8,12 +8,14 @@
 //! retired slots add up to all slots, each is exactly one of the three.
 
 use super::buffer::ALIGNMENT;
-use super::format::transfer_bytes;
+use super::format::{HEADER_BYTES, transfer_bytes};
 use super::store::Place;
 use std::collections::BTreeSet;
 
 /// Segments of small scenes are not made larger than this, bytes.
 const SEGMENT_BYTES: u64 = 256 << 20;
+/// No payload is longer than its length can say, so no slot is larger than this, bytes.
+const SLOT_BYTES_MAX: u64 = HEADER_BYTES as u64 + (1 << 32);
 /// A scene is expected to lie in about this many segments at most: each costs an open file.
 const SEGMENTS: u64 = 64;
 
@@ -53,9 +55,11 @@ impl SlotLayout {
         begins.then(|| u64::from(place.segment) * u64::from(self.slots_per_segment) + place.offset / self.slot_bytes)
     }
 
-    /// Whether the sizes can be those of a store: aligned, not empty, segments addressable.
+    /// Whether the sizes can be those of a store: aligned, not empty, no larger than a payload can be, segments
+    /// addressable.
     pub fn is_possible(&self) -> bool {
         self.slot_bytes > ALIGNMENT as u64
+            && self.slot_bytes <= SLOT_BYTES_MAX
             && self.slot_bytes.is_multiple_of(ALIGNMENT as u64)
             && self.slots_per_segment > 0
             && self.slot_bytes.checked_mul(u64::from(self.slots_per_segment)).is_some_and(|b| b <= i64::MAX as u64)
@@ -256,7 +260,9 @@ mod tests {
         }
         assert_eq!(usual.slot(Place { segment: 0, offset: 4096 }), None);
         assert_eq!(usual.slot(Place { segment: 0, offset: usual.segment_bytes() }), None);
-        let wrong = [(0, 1), (4096, 1), (8193, 1), (8192, 0), (1 << 62, 4)];
+        let largest = SlotLayout { slot_bytes: SLOT_BYTES_MAX, slots_per_segment: 1 };
+        assert!(largest.is_possible() && largest.slot_bytes == transfer_bytes(u32::MAX as usize) as u64);
+        let wrong = [(0, 1), (4096, 1), (8193, 1), (8192, 0), (1 << 62, 4), (1 << 62, 1), (SLOT_BYTES_MAX + 4096, 1)];
         assert!(wrong.iter().all(|&(slot_bytes, n)| !SlotLayout { slot_bytes, slots_per_segment: n }.is_possible()));
     }
 

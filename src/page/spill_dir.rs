@@ -5,7 +5,7 @@
 //! program made are ever removed, told by name and by the store's identity inside; 3. no symbolic link is followed,
 //! neither to the folder nor in it; 4. what is made is private to the user.
 
-use super::commit::{MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, WITNESS_NAME};
+use super::commit::{MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME};
 use super::drive_rate;
 use super::file_system::{FileSystem, free_bytes};
 use super::format::{HEADER_BYTES, SlotHeader};
@@ -157,10 +157,19 @@ impl SpillDir {
     /// A file cannot be removed.
     pub fn remove(self) -> InputResult<Vec<String>> {
         let mut foreign = Vec::new();
-        let mut ours =
-            [MAP_NAME, MAP_NEW_NAME, WITNESS_NAME, RESERVE_NAME, FORMAT_NEW, FORMAT, LOCK, drive_rate::FILE_NAME]
-                .map(str::to_string)
-                .to_vec();
+        let mut ours = [
+            MAP_NAME,
+            MAP_NEW_NAME,
+            WITNESS_NAME,
+            RESERVE_NAME,
+            RESERVE_NEW_NAME,
+            FORMAT_NEW,
+            FORMAT,
+            LOCK,
+            drive_rate::FILE_NAME,
+        ]
+        .map(str::to_string)
+        .to_vec();
         for name in names(&self.folder)? {
             if segment_from_file_name(&name).is_some() && self.is_our_segment(&self.folder.join(&name)) {
                 ours.insert(0, name);

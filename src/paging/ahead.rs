@@ -200,11 +200,13 @@ impl Pager {
     }
 
     fn may_read_ahead(&self) -> bool {
-        self.ahead[READS] + self.cache.frame_bytes() <= self.config.prefetch_bytes
+        self.has_staging() && self.ahead[READS] + self.cache.frame_bytes() <= self.config.prefetch_bytes
     }
 
     pub(super) fn may_write_ahead(&self) -> bool {
-        !self.writes_stopped && self.ahead[WRITES] + self.cache.frame_bytes() <= self.config.prefetch_bytes
+        !self.writes_stopped
+            && self.has_staging()
+            && self.ahead[WRITES] + self.cache.frame_bytes() <= self.config.prefetch_bytes
     }
 }
 

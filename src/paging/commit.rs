@@ -2,8 +2,9 @@
 //! back from a store that was opened.
 //!
 //! Invariants: 1. after [`Pager::flush`] nothing is in flight and no page in memory is dirty; 2. a commit names every
-//! page with rows, by exactly the version that was last released; 3. only an acknowledged commit counts as the last one;
-//! 4. entries from a store are taken over only if their slots can hold what they say.
+//! page with rows, by exactly the version that was last released; 3. only an acknowledged commit counts as the last one,
+//! but whatever the drive holds of those that were not acknowledged goes with the next; 4. entries from a store are taken
+//! over only if their slots can hold what they say.
 
 use super::error::PagingError;
 use super::label::label;
@@ -66,10 +67,11 @@ impl Pager {
         self.settle_below(1)
     }
 
-    /// Waits until fewer than `most` transfers are in flight. A page that could not be read ahead is read when it is needed.
+    /// Waits until fewer than `most` transfers are in flight and another page may be encoded. A page that could not be
+    /// read ahead is read when it is needed.
     pub(super) fn settle_below(&mut self, most: usize) -> Result<(), PagingError> {
         let mut first_error = None;
-        while self.in_flight() >= most {
+        while self.in_flight() >= most || !self.has_staging() {
             for Failure { is_write, error, .. } in self.settle(true, &mut Vec::new()) {
                 if is_write {
                     first_error.get_or_insert(error);
@@ -92,28 +94,59 @@ impl Pager {
         pin: Option<&str>,
     ) -> Result<Option<u64>, CommitError> {
         debug_assert!(self.in_flight() == 0, "a commit comes after a flush");
-        let (changes, now) = self.changes();
+        if self.store.is_none() {
+            return Ok(None);
+        }
+        let (changes, now) = self.changes()?;
         let Some(store) = &mut self.store else { return Ok(None) };
         let cut = Cut { changes: &changes, run_state, note, pin };
-        let generation = commits.commit(store, &mut Vec::new(), &cut)?;
-        self.committed = now;
-        Ok(Some(generation))
+        let result = commits.commit(store, &mut Vec::new(), &cut);
+        self.end_commit(now, result).map(Some)
+    }
+
+    /// Takes over the end of a commit of the pages `now`.
+    pub(super) fn end_commit(
+        &mut self,
+        now: BTreeMap<PageId, u64>,
+        result: Result<u64, CommitError>,
+    ) -> Result<u64, CommitError> {
+        if result.is_ok() {
+            self.committed = now;
+            self.unsure.clear();
+        } else {
+            self.unsure.extend(now.into_keys());
+        }
+        result
+    }
+
+    /// Pages that the drive may hold as the last commit and that `now` has not.
+    pub(super) fn gone_from<'a>(&'a self, now: &'a BTreeMap<PageId, u64>) -> impl Iterator<Item = PageChange> + 'a {
+        let not_yet_named = self.unsure.iter().filter(|page| !self.committed.contains_key(page));
+        let gone = self.committed.keys().chain(not_yet_named).filter(|page| !now.contains_key(page));
+        gone.map(|&page| PageChange { page, version: None::<(SlotRef, Vec<u8>)> })
     }
 
     /// What differs from the last commit, and all pages with the generations of their versions. A page that is written
     /// again after a commit belongs to a later generation, so the number tells versions of one page apart.
-    fn changes(&self) -> (Vec<PageChange>, BTreeMap<PageId, u64>) {
+    fn changes(&self) -> Result<(Vec<PageChange>, BTreeMap<PageId, u64>), CommitError> {
         let mut changes = Vec::new();
         let mut now = BTreeMap::new();
         for (meta, slot) in self.index.iter().zip(&self.slots) {
-            let Some(slot) = slot.filter(|_| meta.rows > 0) else { continue };
+            if meta.rows == 0 {
+                continue;
+            }
+            let slot = slot.ok_or_else(|| nowhere(meta.id))?;
             now.insert(meta.id, slot.generation);
             if self.committed.get(&meta.id) != Some(&slot.generation) {
                 changes.push(PageChange { page: meta.id, version: Some((slot, label(meta).to_vec())) });
             }
         }
-        let gone = self.committed.keys().filter(|page| !now.contains_key(page));
-        changes.extend(gone.map(|&page| PageChange { page, version: None::<(SlotRef, Vec<u8>)> }));
-        (changes, now)
+        changes.extend(self.gone_from(&now));
+        Ok((changes, now))
     }
+}
+
+/// A page with rows of which the drive has nothing: a commit without it would take it away.
+pub(super) fn nowhere(page: PageId) -> CommitError {
+    CommitError::Contradiction(format!("page {page} has rows and was never written"))
 }

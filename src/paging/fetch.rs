@@ -2,7 +2,8 @@
 //!
 //! Invariants: 1. waits only when nothing can be started; 2. a page that is needed is pinned as soon as it is in
 //! memory, so making room never takes it; 3. what was loaded ahead gives way like every other page, farthest next use
-//! first, so the fewest frames that hold the working set are enough; 4. after an error nothing is pinned.
+//! first, so the fewest frames that hold the working set are enough; 4. after an error nothing is pinned; 5. however many
+//! pages are needed, no more of them are encoded in memory at once than [`Pager::prefetch_bytes`] tells.
 
 use super::error::PagingError;
 use super::pager::Pager;
@@ -24,8 +25,9 @@ struct Fetch {
     outstanding: BTreeMap<PageNo, usize>,
     /// Whether a training step asks: only then are pages stamped as used, and do failed writes end the call.
     is_step: bool,
-    /// Some of them are in memory, but a commit must write them first.
-    has_frozen: bool,
+    /// Of these, pages that are in memory, but which a commit must write first. Nothing is known of those behind the
+    /// first one, so that an end costs no look at all of them.
+    frozen: VecDeque<PageNo>,
 }
 
 impl Pager {
@@ -42,7 +44,7 @@ impl Pager {
         }
         let pinned = pages.iter().map(|_| None).collect();
         let mut fetch =
-            Fetch { what: what.to_string(), pinned, outstanding: BTreeMap::new(), is_step, has_frozen: false };
+            Fetch { what: what.to_string(), pinned, outstanding: BTreeMap::new(), is_step, frozen: VecDeque::new() };
         fetch.outstanding.extend(pages.iter().copied().zip(0..));
         let result = self.fetch_into(&mut fetch, pages);
         let pinned = fetch.pinned.into_iter().flatten();
@@ -58,8 +60,8 @@ impl Pager {
     fn fetch_into(&mut self, fetch: &mut Fetch, pages: &[PageNo]) -> Result<(), PagingError> {
         let failures = self.settle(false, &mut Vec::new());
         pages.iter().for_each(|&page| self.pin_into(fetch, page));
-        let frozen = fetch.outstanding.keys().filter(|page| self.holds_frozen(**page)).count();
-        fetch.has_frozen = frozen > 0;
+        fetch.frozen = fetch.outstanding.keys().copied().filter(|&page| self.holds_frozen(page)).collect();
+        let frozen = fetch.frozen.len();
         self.judge(fetch, failures)?;
         let is_absent = |page: &PageNo| self.cache.state(*page).is_none();
         let mut to_read: VecDeque<PageNo> = pages.iter().copied().filter(is_absent).collect();
@@ -77,7 +79,7 @@ impl Pager {
         }
         loop {
             self.write_needed(fetch)?;
-            while let Some(&page) = to_read.front() {
+            while let Some(&page) = to_read.front().filter(|page| self.may_decode(**page)) {
                 if self.begin_read(page, false) {
                     to_read.pop_front();
                 } else if !self.make_room(to_read.len(), fetch.is_step)? {
@@ -100,18 +102,19 @@ impl Pager {
         }
     }
 
-    /// Begins to write those pages that are frozen, a few at a time, and pins those that are so no more.
+    /// Begins to write those pages that are frozen, a few at a time, and pins those that are so no more. One whose write
+    /// has begun is pinned at its end.
     fn write_needed(&mut self, fetch: &mut Fetch) -> Result<(), PagingError> {
-        if !fetch.has_frozen {
-            return Ok(());
-        }
-        let pages: Vec<PageNo> = fetch.outstanding.keys().copied().collect();
-        for page in pages {
-            if self.may_write_frozen(page)
-                && let Err(Failure { error, .. }) = self.begin_write(page, true)
-            {
-                self.stop_writes(error, fetch.is_step)?;
+        while let Some(&page) = fetch.frozen.front() {
+            if self.may_write_frozen(page) {
+                if let Err(Failure { error, .. }) = self.begin_write(page, true) {
+                    self.stop_writes(error, fetch.is_step)?;
+                }
+            } else if self.holds_frozen(page) {
+                // As many are being written as may be at once.
+                return Ok(());
             }
+            fetch.frozen.pop_front();
             self.pin_into(fetch, page);
         }
         Ok(())
@@ -166,6 +169,7 @@ impl Pager {
                     self.evict(victim.page);
                     return Ok(true);
                 }
+                Some(_) if !self.has_staging() => return Ok(false),
                 Some(victim) if self.store.is_some() => {
                     if let Err(Failure { error, .. }) = self.begin_write(victim.page, false) {
                         self.stop_writes(error, is_step)?;

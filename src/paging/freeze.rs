@@ -8,7 +8,7 @@
 //! generation of the cut, and everything else for the next one; 3. when a write fails, the cut is given up: what it has
 //! written are versions like others, and the commit before it stands.
 
-use super::commit::WRITES_IN_FLIGHT;
+use super::commit::{WRITES_IN_FLIGHT, nowhere};
 use super::error::PagingError;
 use super::label::label;
 use super::pager::Pager;
@@ -39,6 +39,8 @@ pub(super) struct Frozen {
     now: BTreeMap<PageId, u64>,
     /// Bytes written for the cut.
     bytes: u64,
+    /// A page with rows that is nowhere: the cut cannot be committed.
+    nowhere: Option<PageId>,
 }
 
 impl Frozen {
@@ -96,7 +98,7 @@ impl Pager {
                         frozen.changes.push(PageChange { page: meta.id, version: Some((*slot, label(meta).to_vec())) });
                     }
                 }
-                (None, _) => debug_assert!(false, "a page with rows is nowhere"),
+                (None, _) => frozen.nowhere = Some(meta.id),
             }
         }
         let held = self.cache.held().filter(|h| frozen.waiting.contains(&h.page));
@@ -125,6 +127,7 @@ impl Pager {
     /// Whether the write of a frozen page may begin because a step waits for it.
     pub(super) fn may_write_frozen(&self, page: PageNo) -> bool {
         self.frozen.as_ref().is_some_and(|f| f.waiting.contains(&page) && f.writing.len() < WRITES_IN_FLIGHT)
+            && self.has_staging()
             && self.cache.state(page) == Some(FrameState::Resident)
     }
 
@@ -138,6 +141,7 @@ impl Pager {
         let most = (self.config.prefetch_bytes / 2 / self.cache.frame_bytes()).max(FROZEN_WRITES_LEAST);
         let started = Instant::now();
         while !self.writes_stopped
+            && self.has_staging()
             && let Some(frozen) = self.frozen.as_mut().filter(|f| f.writing.len() < most)
             && let Some(page) = frozen.order.pop_front()
         {
@@ -180,13 +184,15 @@ impl Pager {
         note: &[u8],
     ) -> Result<Option<(u64, u64)>, CommitError> {
         debug_assert!(self.in_flight() == 0, "a commit comes after its writes");
-        let (Some(frozen), Some(store)) = (self.frozen.take(), &mut self.store) else { return Ok(None) };
-        let Frozen { generation, mut changes, now, bytes, .. } = frozen;
-        let gone = self.committed.keys().filter(|page| !now.contains_key(page));
-        changes.extend(gone.map(|&page| PageChange { page, version: None }));
+        let Some(frozen) = self.frozen.take() else { return Ok(None) };
+        let Frozen { generation, mut changes, now, bytes, nowhere: lost, .. } = frozen;
+        if let Some(page) = lost {
+            return Err(nowhere(page));
+        }
+        changes.extend(self.gone_from(&now));
+        let Some(store) = &mut self.store else { return Ok(None) };
         let cut = Cut { changes: &changes, run_state, note, pin: None };
-        commits.commit_cut(store, &mut Vec::new(), generation, &cut)?;
-        self.committed = now;
-        Ok(Some((generation, bytes)))
+        let result = commits.commit_cut(store, &mut Vec::new(), generation, &cut);
+        self.end_commit(now, result).map(|generation| Some((generation, bytes)))
     }
 }

@@ -26,7 +26,7 @@ use crate::scene::page_layout::{PageLayout, capacity_bytes};
 use crate::scene::page_meta::PageMeta;
 use crate::schedule::bound::FewestReads;
 use crate::schedule::visibility::visible_pages;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Sizes of a pager. None of them changes a bit of the rows.
 #[derive(Debug, Clone, Copy)]
@@ -80,6 +80,9 @@ pub struct Pager {
     pub(super) transfers: Transfers,
     /// Pages of the last acknowledged commit, with the generations of their versions.
     pub(super) committed: BTreeMap<PageId, u64>,
+    /// Pages of commits since then that were not acknowledged. One that found no space may have been durable all the
+    /// same, and the next one goes on from it: of these, those that are gone by then must be taken away as well.
+    pub(super) unsure: BTreeSet<PageId>,
     /// A cut that is being written.
     pub(super) frozen: Option<Frozen>,
     /// What the coming steps will wait for.
@@ -109,6 +112,7 @@ impl Pager {
             ahead: [0; 2],
             transfers: Transfers::default(),
             committed: BTreeMap::new(),
+            unsure: BTreeSet::new(),
             frozen: None,
             coming: Coming::default(),
             bound: FewestReads::default(),
@@ -161,6 +165,12 @@ impl Pager {
     /// Bytes that [`Pager::prefetch`] has in flight at most.
     pub fn prefetch_bytes(&self) -> usize {
         2 * self.config.prefetch_bytes
+    }
+
+    /// Memory of buffers for encoded pages, bytes: as much as was ever in use at once. At most [`Pager::prefetch_bytes`],
+    /// but a few pages in any case, and some more where nothing is ever ahead.
+    pub fn staging_bytes(&self) -> u64 {
+        self.store.as_ref().map_or(0, PagedStore::staging_bytes)
     }
 
     /// Bytes of one frame.

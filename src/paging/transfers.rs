@@ -4,11 +4,12 @@
 //! read leaves its page on the drive, a failed write leaves its page dirty in memory; 3. the slot of an older version is
 //! given up only when the newer one is written.
 
+use super::commit::WRITES_IN_FLIGHT;
 use super::error::PagingError;
 use super::label::label;
 use super::pager::Pager;
 use crate::base::ids::PageNo;
-use crate::page::format::SlotRef;
+use crate::page::format::{SlotRef, StoredAs};
 use crate::page::page_error::PageError;
 use crate::page::paged_store::{PageDone, PageMoved};
 use crate::scene::page_layout::PageLayout;
@@ -28,10 +29,29 @@ pub(super) struct Failure {
     pub error: PagingError,
 }
 
+/// Encoded pages on their way at once at least, so that a tool which reads nothing ahead has work for a few threads.
+const STAGED_LEAST: usize = 4;
+
 impl Pager {
     /// Transfers whose end was not taken yet.
     pub(super) fn in_flight(&self) -> usize {
         self.store.as_ref().map_or(0, |store| store.in_flight())
+    }
+
+    /// Whether another page may be on its way encoded, in a buffer beside its frame: no more than a run reckons with, which
+    /// is what may be ahead. Where it may not, transfers are in flight, so whoever waits for it has an end to wait for.
+    pub(super) fn has_staging(&self) -> bool {
+        let most = match self.prefetch_bytes() {
+            // Nobody reckoned with anything: pages that were all in memory are written.
+            0 => WRITES_IN_FLIGHT,
+            bytes => (bytes / self.cache.frame_bytes()).max(STAGED_LEAST),
+        };
+        self.store.as_ref().is_none_or(|store| store.staged() < most)
+    }
+
+    /// Whether the version of a page on the drive may be read now, as far as buffers for encoded pages go.
+    pub(super) fn may_decode(&self, page: PageNo) -> bool {
+        self.has_staging() || self.slots[page.index()].is_some_and(|slot| slot.codec == StoredAs::Raw)
     }
 
     /// Begins to read a page that is not in memory, if there is a free frame for it.

@@ -19,16 +19,16 @@ use gsscale::scene::page_layout::capacity_bytes;
 use std::io::ErrorKind;
 use std::path::Path;
 
-const COMMITS: CommitConfig = CommitConfig { store: 9, cache_bytes: 1 << 20, reserve_bytes: 0 };
+pub const COMMITS: CommitConfig = CommitConfig { store: 9, cache_bytes: 1 << 20, reserve_bytes: 0 };
 
-fn paged_store(opened: &Opened, folder: &Path, codec: Codec, faults: &Faults) -> PagedStore {
+pub fn paged_store(opened: &Opened, folder: &Path, codec: Codec, faults: &Faults) -> PagedStore {
     let engine = open_engine(IoEngine::Pread, folder, 3).unwrap().store;
     let layout = SlotLayout::new(capacity_bytes(PAGE_ROWS, SH_DEGREE), 40);
     opened.paged_store(Box::new(FaultyStore::new(engine, faults.clone())), layout, codec).unwrap()
 }
 
 /// The store holds exactly the pages of `model` that have rows.
-fn opens_with(folder: &Path, model: &Model) {
+pub fn opens_with(folder: &Path, model: &Model) {
     let opened = Commits::open(Box::new(DriveFolder::new(folder)), COMMITS).unwrap();
     let store = paged_store(&opened, folder, Codec::Raw, &Faults::new());
     let mut pager = Pager::open(config(7), store, &opened.pages, 0).unwrap();

@@ -92,4 +92,22 @@ fn an_import_that_fails_names_the_page() {
     let pager = Pager::new(config(9), store(Codec::Raw, &faults));
     let error = Run::new(pager, 1, PAGES, STEPS).map(|_| ()).unwrap_err();
     assert!(error.is_out_of_space() && error.to_string().contains("writing page"), "{error}");
+    assert!(error.to_string().contains("free space"), "{error}");
+}
+
+/// More space is no remedy where it is not space that is missing.
+#[test]
+fn a_segment_that_cannot_be_made_says_why_and_what_helps() {
+    for (kind, remedy) in [
+        (ErrorKind::PermissionDenied, "can be written"),
+        (ErrorKind::AlreadyExists, "take the file out"),
+        (ErrorKind::Other, "check the drive"),
+    ] {
+        let faults = Faults::new();
+        faults.add(Operation::Create, 0, true, Fault::Error(kind));
+        let pager = Pager::new(config(9), store(Codec::Raw, &faults));
+        let error = Run::new(pager, 1, PAGES, STEPS).map(|_| ()).unwrap_err();
+        let text = error.to_string();
+        assert!(!error.is_out_of_space() && text.contains(remedy) && !text.contains("free space"), "{text}");
+    }
 }

@@ -4,6 +4,8 @@
 
 mod beside;
 mod failures;
+mod full;
+mod staging;
 mod traffic;
 mod world;
 
