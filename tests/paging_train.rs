@@ -1,7 +1,8 @@
 //! Paging is invisible: whatever is in memory, however pages are read and written, and on any number of threads, a run
 //! writes the same bytes. Through the real binary.
 //!
-//! `GSSCALE_PAGING_FULL=1` runs the whole grid at 600 steps.
+//! `GSSCALE_PAGING_FULL=1 cargo test --test paging_train` runs the whole grid at 600 steps, some 15 minutes on two cores:
+//! longer than nextest gives a test.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
 #[path = "support/scenes.rs"]
