@@ -17,6 +17,7 @@ use super::start::Start;
 use super::tiers::Stored;
 use super::trainer::{TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
+use crate::base::simd::SimdPath;
 use crate::checkpoint::run_state::{RunState, RunStateError};
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits::{self, RunOptions};
@@ -73,7 +74,7 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     changes.check(&start.dataset.image_folder, request.accept_changes)?;
     let (renderer, options, driver) = begin(request.quiet, &config, &start)?;
     say(request, &state, &config, &changes, &*renderer);
-    let dataset = start.dataset;
+    let dataset = start.into_dataset();
     let (pager, tiers) = stored.into_tiers(&config, host_mem.unwrap_or(u64::MAX))?;
     tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
     let has_changed = !changes.numbers.is_empty();
@@ -179,10 +180,8 @@ fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result
 /// The pages of a run that goes on by other rules: brought to its last step by those that it had.
 fn changed_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
     let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
-    // The path that the bits were made on, if this machine has it.
-    let simd = then.simd.clone();
-    let then = [state.simd.clone(), simd].into_iter().map(|simd| TrainConfig { simd, ..then.clone() });
-    let then = then.into_iter().find(|c| limits::simd_path(c).is_supported()).unwrap_or_default();
+    let then = rules_then(&then, &state.simd, SimdPath::is_supported)
+        .ok_or_else(|| CommitError::Contradiction("no instruction path of this machine is known".to_string()))?;
     let old =
         RunOptions { sh_degree_start: state.sh_degree_start, ..RunOptions::new(&then, state.dataset.scene_scale) };
     let mut pages = restore_pages(pager, &old, state)?;
@@ -190,8 +189,37 @@ fn changed_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result
     Ok(pages)
 }
 
+/// The config that the pages were trained by, on the path that the bits were made on if this machine has it, else on that
+/// of the config or on the best that there is: a path changes roundings, other rates the scene.
+fn rules_then(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath) -> bool) -> Option<TrainConfig> {
+    let on = |simd: &str| TrainConfig { simd: simd.to_string(), ..then.clone() };
+    [on(simd), on(&then.simd), on("auto")].into_iter().find(|c| is_supported(limits::simd_path(c)))
+}
+
 /// A start that would be another one now: of no use to a run that is past it, but a sign that something changed.
 fn start_change(start: &Start, state: &RunState) -> Option<String> {
     let (there, here) = (state.sh_degree_start, start.sh_degree_start);
     (there != here).then(|| format!("the first Gaussians had {there} bands in use and have {here}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pages_go_on_by_their_own_config_on_a_machine_without_its_path() {
+        let then = TrainConfig { means_lr: 0.5, seed: 9, simd: "avx512".into(), ..TrainConfig::default() };
+        let here = |paths: &'static [SimdPath]| rules_then(&then, "avx512", move |path| paths.contains(&path));
+        let with = |simd: &str| Some(TrainConfig { simd: simd.into(), ..then.clone() });
+        assert_eq!(here(&SimdPath::ALL), with("avx512"));
+        // What `auto` stands for is the best path of the machine that runs this.
+        if SimdPath::best() != SimdPath::Avx512 {
+            assert_eq!(here(&[SimdPath::best()]), with("auto"));
+        }
+        let baseline = TrainConfig { simd: "baseline".into(), ..then.clone() };
+        let found = rules_then(&baseline, "avx512", |path| path == SimdPath::Baseline);
+        assert_eq!(found, Some(baseline), "that of the config comes second");
+        // Never by another config.
+        assert_eq!(here(&[]), None);
+    }
 }

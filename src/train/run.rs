@@ -3,6 +3,7 @@
 //! Invariants: 1. the output folder is made only after the dataset was understood, so bad input leaves nothing
 //! behind; 2. a run that is stopped or fails after its first step still writes the PLY of its last good step.
 
+use super::changes::with_absolute_paths;
 use super::checkpoint::{Checkpoint, Origin};
 use super::costs::Meter;
 use super::dataset_print::dataset_print;
@@ -202,6 +203,12 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let host_mem = host_budget(config);
     let start = Start::read(&request.scene, config, host_mem)?;
     let sh_degree_start = start.sh_degree_start;
+    if let Some(known) = preflight::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
+        if !request.quiet {
+            eprintln!("{known}");
+        }
+        return Ok(RunOutcome { summary: None, exit_code: 0 });
+    }
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
     let fill = first_fill(config.page_rows as usize, options.densify.is_some());
     let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
@@ -268,24 +275,27 @@ pub(super) fn see_through(
             }
             _ => String::new(),
         };
-        eprintln!("to go on from the last commit: gsscale-train --resume {}{more}", request.out.display());
+        let elsewhere = spill_dir_flag(request);
+        eprintln!("to go on from the last commit: gsscale-train --resume {}{elsewhere}{more}", request.out.display());
     }
     tiers.close().iter().for_each(|word| eprintln!("warning: {word}"));
     outcome
 }
 
+/// ` --spill-dir FOLDER` where the run's config does not lead to its checkpoint, because it could not be written anew.
+fn spill_dir_flag(request: &RunRequest) -> String {
+    let [kept, now] = [TrainConfig::read(&request.out.join("config.toml")), Ok(request.config.clone())]
+        .map(|config| config.map(|config| with_absolute_paths(config).spill_dir));
+    match now {
+        Ok(now) if !now.is_empty() && !kept.is_ok_and(|kept| kept == now) => format!(" --spill-dir {now}"),
+        _ => String::new(),
+    }
+}
+
 /// The config as it is kept: settled, and with paths that do not depend on where the program was started.
 fn settled(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
-    let absolute = |path: &String| match path.as_str() {
-        "" => String::new(),
-        path => std::path::absolute(path).map_or(path.to_string(), |p| p.to_string_lossy().into_owned()),
-    };
-    TrainConfig {
-        view_order: trainer.view_order().order().to_string(),
-        spill_dir: absolute(&config.spill_dir),
-        init_ply: absolute(&config.init_ply),
-        ..config.clone()
-    }
+    let view_order = trainer.view_order().order().to_string();
+    with_absolute_paths(TrainConfig { view_order, ..config.clone() })
 }
 
 /// Writes config.toml, of a run that goes on where it changed; returns what every commit says of how the run began.
@@ -377,7 +387,8 @@ fn train_into(
         scene: request.scene.clone(),
         version: env!("CARGO_PKG_VERSION").to_string(),
         ssim_variant: config.ssim_variant.clone(),
-        finished: trainer.steps_done() == config.steps,
+        // Without its evaluation a run is not done: it goes on to that.
+        finished: trainer.steps_done() == config.steps && tested.is_ok(),
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
         costs,

@@ -137,6 +137,12 @@ impl Start {
         Ok(Some(Start { dataset, sh_degree_start: limits::first_sh_degree(config), rows, points, from }))
     }
 
+    /// The dataset alone, for a run that has its Gaussians already: what they were made from, columns, a spool or a store
+    /// with its lock, is given up here.
+    pub(super) fn into_dataset(self) -> Dataset {
+        self.dataset
+    }
+
     /// The dataset, and the Gaussians in the pages of `pager`.
     ///
     /// # Errors
@@ -182,7 +188,7 @@ fn budget(folder: &Path, host_mem: Option<u64>) -> Budget<'_> {
 
 /// A folder on the drive of the spill directory, which may not be there yet and must stay empty: the nearest one above
 /// it. What is written there has no name.
-fn folder_beside(spill_dir: &Path) -> PathBuf {
+pub(super) fn folder_beside(spill_dir: &Path) -> PathBuf {
     let above = spill_dir.ancestors().skip(1).find(|folder| folder.is_dir());
     above.map_or_else(|| PathBuf::from("."), Path::to_path_buf)
 }
