@@ -14,7 +14,7 @@ use super::out_folder;
 use super::page_map::write_page_map;
 use super::preflight;
 use super::progress::Progress;
-use super::report::{MetricsLog, Resolved, Summary, TierTraffic, read_resolved, write_config, write_summary};
+use super::report::{MetricsLog, Resolved, Summary, read_resolved, write_config, write_summary};
 use super::signals::StopFlag;
 use super::start::Start;
 use super::tiers::{self, Tiers};
@@ -343,7 +343,7 @@ fn train_into(
         }
     }
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-    let mut progress = Progress::new(config.steps, request.quiet);
+    let mut progress = Progress::new(config.steps, request.quiet).after(trainer.steps_done());
     let meter = Meter::start(&trainer);
     let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint };
     let looped = trainer.run(dataset, &targets, &mut outputs);
@@ -392,7 +392,7 @@ fn train_into(
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
         costs,
-        tiers: TierTraffic::of(&trainer.scene.pager),
+        tiers: trainer.tier_traffic(),
         commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
     };
     write_summary(&out.join("summary.json"), &summary)?;
