@@ -327,8 +327,15 @@ fn flipped_bits_in_pages_are_named_and_older_versions_take_their_place() {
 /// Older versions have other statistics than the run has counted, and rounds ahead that its newer ones had behind them.
 #[test]
 fn a_run_goes_on_from_many_older_pages() {
+    // With rounds between the generations that grow much, and with statistics that no round cleared.
+    for (every, grow) in [("10", "0.0001"), ("150", "0.001")] {
+        goes_on_from_older_pages(&["--refine-stop", "200", "--refine-every", every, "--grow-grad2d", grow]);
+    }
+}
+
+fn goes_on_from_older_pages(more: &[&str]) {
     let bench = Bench::new();
-    let out = bench.stopped(&["--refine-stop", "400"]);
+    let out = bench.stopped(more);
     let listed = json(&["ls", text(&out)]);
     let [a, b] = generations(&listed)[..] else { panic!("{listed}") };
     let found = json(&["diff", text(&out), &a.to_string(), &b.to_string(), "--names"]);

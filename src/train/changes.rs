@@ -44,8 +44,8 @@ const FREE_KEYS: &[&str] = &[
 const LASTING_KEYS: &[&str] = &["steps", "keep-checkpoint", "spill-dir"];
 /// Keys by which stored pages are laid out.
 const LAYOUT_KEYS: &[&str] = &["page-rows", "sh-degree"];
-/// Compared as what follows from them.
-const DERIVED_KEYS: &[&str] = &["simd", "schedule-steps"];
+/// Compared as what follows from them; of init-ply that is the digest of first Gaussians, wherever the file lies now.
+const DERIVED_KEYS: &[&str] = &["simd", "schedule-steps", "init-ply"];
 
 /// The config that a run keeps when it goes on with `config`: that of its file, with what changes numbers and how far it
 /// goes and where its checkpoint is as they are now.

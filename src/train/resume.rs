@@ -18,7 +18,7 @@ use super::tiers::Stored;
 use super::trainer::{TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
-use crate::checkpoint::run_state::{RunState, RunStateError};
+use crate::checkpoint::run_state::{DatasetPrint, RunState, RunStateError};
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits::{self, RunOptions};
 use crate::densify::stats::GradHistogram;
@@ -36,6 +36,8 @@ pub struct ResumeRequest {
     pub out: PathBuf,
     /// Flags.
     pub keys: TrainOverrides,
+    /// Its scene, where that is not where it was.
+    pub scene: Option<PathBuf>,
     /// Other numbers and another dataset are accepted.
     pub accept_changes: bool,
     /// Nothing but errors on the terminal.
@@ -50,7 +52,7 @@ pub struct ResumeRequest {
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     let file = request.out.join("config.toml");
     let of_file = TrainConfig::read(&file)?;
-    let scene = read_resolved(&file)?.scene;
+    let scene = request.scene.clone().map_or_else(|| read_resolved(&file).map(|resolved| resolved.scene), Ok)?;
     let mut config = of_file.clone();
     request.keys.clone().apply(&mut config);
     config.check()?;
@@ -70,7 +72,7 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     let start = Start::look(&scene, &config, &request.out, host_mem)?;
     let print = dataset_print(&start)?;
     changes.add_dataset(&start.dataset, &state.dataset, &print);
-    changes.numbers.extend(start_change(&start, &state));
+    changes.numbers.extend(start_change(&start, &state, &print));
     changes.check(&start.dataset.image_folder, request.accept_changes)?;
     let (renderer, options, driver) = begin(request.quiet, &config, &start)?;
     say(request, &state, &config, &changes, &*renderer);
@@ -79,7 +81,7 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
     let has_changed = !changes.numbers.is_empty();
     let pages = match has_changed {
-        false => restore_pages(pager, &options, &state)?,
+        false => restore_pages(pager, &of_state(&options, &state), &state)?,
         true => changed_pages(pager, &options, &state)?,
     };
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
@@ -182,8 +184,7 @@ fn changed_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result
     let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
     let then = rules_then(&then, &state.simd, SimdPath::is_supported)
         .ok_or_else(|| CommitError::Contradiction("no instruction path of this machine is known".to_string()))?;
-    let old =
-        RunOptions { sh_degree_start: state.sh_degree_start, ..RunOptions::new(&then, state.dataset.scene_scale) };
+    let old = of_state(&RunOptions::new(&then, state.dataset.scene_scale), state);
     let mut pages = restore_pages(pager, &old, state)?;
     pages.change_rules(options, state.step)?;
     Ok(pages)
@@ -196,8 +197,18 @@ fn rules_then(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath) ->
     [on(simd), on(&then.simd), on("auto")].into_iter().find(|c| is_supported(limits::simd_path(c)))
 }
 
-/// A start that would be another one now: of no use to a run that is past it, but a sign that something changed.
-fn start_change(start: &Start, state: &RunState) -> Option<String> {
+/// The options by which pages come back: with the band that was in use from their first step, from which the events of
+/// the run raised it. Which band the run would begin with now may be another, by keys that were accepted.
+fn of_state(options: &RunOptions, state: &RunState) -> RunOptions {
+    RunOptions { sh_degree_start: state.sh_degree_start, ..options.clone() }
+}
+
+/// A start that would be another one now: of no use to a run that is past it, but a sign that something changed. Of the
+/// same points or Gaussians it is another by the config alone, whose keys are compared one by one, and once.
+fn start_change(start: &Start, state: &RunState, here: &DatasetPrint) -> Option<String> {
+    if state.dataset.points == here.points {
+        return None;
+    }
     let (there, here) = (state.sh_degree_start, start.sh_degree_start);
     (there != here).then(|| format!("the first Gaussians had {there} bands in use and have {here}"))
 }

@@ -5,7 +5,7 @@
 
 use super::changes::with_absolute_paths;
 use super::checkpoint::{Checkpoint, Origin};
-use super::costs::Meter;
+use super::costs::{Meter, StepCosts};
 use super::dataset_print::dataset_print;
 use super::eval::ply_warnings;
 use super::machine;
@@ -27,7 +27,7 @@ use crate::dataset::loader::{Dataset, load_dataset};
 use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
-use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
+use crate::exchange::ply::{ExportFrame, PlyContent, PlyWritten, read_ply, to_local};
 use crate::paging::error::PagingError;
 use crate::render::Renderer;
 use crate::report::run_report::{PAGES_FILE, write_run_report};
@@ -304,8 +304,10 @@ fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun
     let path = request.out.join("config.toml");
     let config = match &begun.past {
         Some(past) => {
-            if TrainConfig::read(&path)? != past.config {
-                write_config(&path, &past.config, &read_resolved(&path)?)?;
+            let before = read_resolved(&path)?;
+            let scene = absolute_scene(request);
+            if TrainConfig::read(&path)? != past.config || before.scene != scene {
+                write_config(&path, &past.config, &Resolved { scene, ..before })?;
             }
             past.config.clone()
         }
@@ -358,6 +360,35 @@ fn train_into(
         }
         (looped, saved) => (looped, saved?),
     };
+    warn_of_ply(config, &written, &ply);
+    // A stopped run owes the user its files at once; the held-out views can be looked at later with gsscale-eval.
+    let tested = looped.and_then(|()| match stop.exit_code() {
+        None => trainer.evaluate(dataset, &targets, Some(&out.join("renders/test"))),
+        Some(_) => Ok(None),
+    });
+    if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, tiers.checkpoint.as_mut()) {
+        // Once more, with what the evaluation said.
+        checkpoint.commit_or_warn(&mut trainer, &mut metrics)?;
+    }
+    let summary = Summary {
+        gaussians: written.rows + written.skipped,
+        test: tested.as_ref().ok().copied().flatten(),
+        // Without its evaluation a run is not done: it goes on to that.
+        finished: trainer.steps_done() == config.steps && tested.is_ok(),
+        costs,
+        commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
+        ..summary_of(request, &trainer)
+    };
+    write_summary(&out.join("summary.json"), &summary)?;
+    write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
+    write_run_report(out)?;
+    tested?;
+    tiers.is_done = summary.finished;
+    Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
+}
+
+/// Says where the final PLY is not what was asked for.
+fn warn_of_ply(config: &TrainConfig, written: &PlyWritten, ply: &Path) {
     if written.frame == ExportFrame::Local && config.export_frame == "dataset" {
         eprintln!(
             "warning: the scene lies too far from its origin for f32, so {} holds local positions; \
@@ -368,45 +399,37 @@ fn train_into(
     if written.skipped > 0 {
         eprintln!("warning: {} Gaussians are not finite and are not in {}", written.skipped, ply.display());
     }
-    // A stopped run owes the user its files at once; the held-out views can be looked at later with gsscale-eval.
-    let tested = looped.and_then(|()| match stop.exit_code() {
-        None => trainer.evaluate(dataset, &targets, Some(&out.join("renders/test"))),
-        Some(_) => Ok(None),
-    });
-    if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, tiers.checkpoint.as_mut()) {
-        // Once more, with what the evaluation said.
-        checkpoint.commit_or_warn(&mut trainer, &mut metrics)?;
-    }
+}
+
+/// What the trainer alone knows of a run that ended: not done, not evaluated.
+fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
     let (rows_skipped, steps_skipped) = trainer.skipped();
-    let summary = Summary {
+    Summary {
         steps: trainer.steps_done(),
-        gaussians: written.rows + written.skipped,
+        gaussians: trainer.scene.rows(),
         train_seconds: trainer.train_seconds(),
         host_bytes_peak: host_bytes_peak().unwrap_or(0),
-        test: tested.as_ref().ok().copied().flatten(),
+        test: None,
         scene: request.scene.clone(),
         version: env!("CARGO_PKG_VERSION").to_string(),
-        ssim_variant: config.ssim_variant.clone(),
-        // Without its evaluation a run is not done: it goes on to that.
-        finished: trainer.steps_done() == config.steps && tested.is_ok(),
+        ssim_variant: request.config.ssim_variant.clone(),
+        finished: false,
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
-        costs,
+        costs: StepCosts::default(),
         tiers: trainer.tier_traffic(),
-        commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
-    };
-    write_summary(&out.join("summary.json"), &summary)?;
-    write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
-    write_run_report(out)?;
-    tested?;
-    tiers.is_done = summary.finished;
-    Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
+        commits: None,
+    }
+}
+
+fn absolute_scene(request: &RunRequest) -> PathBuf {
+    std::path::absolute(&request.scene).unwrap_or_else(|_| request.scene.clone())
 }
 
 fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer) -> Resolved {
     Resolved {
         version: env!("CARGO_PKG_VERSION").to_string(),
-        scene: std::path::absolute(&request.scene).unwrap_or_else(|_| request.scene.clone()),
+        scene: absolute_scene(request),
         simd: limits::simd_path(&request.config).name().to_string(),
         threads: rayon::current_num_threads(),
         device: trainer.renderer.device(),
