@@ -162,11 +162,19 @@ fn a_run_that_was_rolled_back_or_cloned_ends_with_the_same_bytes() {
     let said = failed(&["clone", text(&out), text(&copy)]);
     assert!(said.contains("exists already"), "{said}");
 
-    bench.go_on(&["--spill-dir", text(&copy)]);
+    // The run goes with its copy from then on, and not back to a store that lacks what it did since.
+    bench.go_on_until_stopped(&["--spill-dir", text(&copy)]);
+    let config = std::fs::read_to_string(out.join("config.toml")).unwrap();
+    assert!(config.contains(&format!("spill-dir = \"{}\"", text(&copy))), "{config}");
+    let step = scenes::summary(&out)["steps"].as_u64().unwrap();
+    assert!(step > listed["generations"][1]["step"].as_u64().unwrap());
+    assert_eq!(json(&["ls", text(&out)])["generations"][1]["step"].as_u64(), Some(step));
+    bench.go_on(&[]);
     assert!(bench.ply() == want, "the run went on with the copy and ended otherwise");
+    assert!(!copy.join("map.redb").exists() && bench.spill().join("map.redb").exists());
     // The files of the run are those of the end; the older generation still leads there.
     std::fs::remove_file(out.join("summary.json")).unwrap();
-    bench.go_on(&[]);
+    bench.go_on(&["--spill-dir", text(&bench.spill())]);
     assert!(bench.ply() == want, "the run went back and ended otherwise");
 }
 
@@ -176,7 +184,7 @@ fn names_keep_generations_until_they_are_pruned() {
     let out = bench.stopped(&[]);
     let first = generations(&json(&["ls", text(&out)]))[0];
     pin(&bench.spill(), &[("early", first), ("also-early", first)]);
-    bench.go_on_until_stopped();
+    bench.go_on_until_stopped(&[]);
     let listed = json(&["ls", text(&out)]);
     let kept = generations(&listed);
     assert_eq!((kept.len(), kept[0]), (3, first), "{listed}");
@@ -229,6 +237,33 @@ fn a_store_in_use_is_not_written_and_what_only_looks_says_so() {
     child.wait().unwrap();
     assert!(json(&["ls", text(&out)])["used_by"].is_null(), "the lock goes with its process");
     assert!(json(&["verify", text(&out), "--deep"])["faults"].as_array().unwrap().is_empty());
+}
+
+/// What a run that goes on was started from is of no use to it any more.
+#[test]
+fn a_store_that_a_run_was_started_from_is_free_once_the_run_goes_on() {
+    let bench = Bench::new();
+    let out = bench.stopped(&[]);
+    let seed = bench.copy("clone", &out);
+    let first = generations(&json(&["ls", text(&seed)]))[0].to_string();
+    [out, bench.spill()].iter().for_each(|folder| std::fs::remove_dir_all(folder).unwrap());
+    // It gets a part of the budget; what is named is the budget that was given, and the one that would do.
+    let refused = |budget: &str| {
+        let out = bench.path("none");
+        let flags = ["--init-ply", text(&seed), "--host-mem", budget, "--out", text(&out), "--steps", "1"];
+        let output = scenes::train(&[&[text(&bench.path("scene"))], &flags[..]].concat());
+        stderr(&output)
+    };
+    let said = refused("48MiB");
+    assert!(said.contains("48.0 MiB are too little for this store"), "{said}");
+    let least = said.split("give at least ").nth(1).and_then(|rest| rest.split(" MiB").next()).expect(&said);
+    let enough = format!("{:.1}MiB", least.parse::<f64>().unwrap() + 0.1);
+    assert!(!refused(&enough).contains("too little for this store"), "{enough} would do");
+    bench.stopped(&["--init-ply", text(&seed)]);
+    let mut child = bench.going_on(&[]);
+    let dropped = json(&["rollback", text(&seed), &first, "--yes"]);
+    assert!(child.try_wait().unwrap().is_none() && dropped["dropped"].as_array().unwrap().len() == 1);
+    bench::stop(child);
 }
 
 /// The slot of the page that `verify` or `inspect` names: file and offset.
@@ -298,6 +333,35 @@ fn flipped_bits_in_pages_are_named_and_older_versions_take_their_place() {
     // Going back leads around the damage as well, and the run can go on from either.
     json(&["rollback", text(&out), &a.to_string(), "--yes"]);
     assert!(json(&["verify", text(&out), "--deep"])["faults"].as_array().unwrap().is_empty());
+    bench.go_on(&["--spill-dir", text(&rescued)]);
+}
+
+/// Older versions have other statistics than the run has counted, and rounds ahead that its newer ones had behind them.
+#[test]
+fn a_run_goes_on_from_many_older_pages() {
+    // With rounds between the generations that grow much, and with statistics that no round cleared.
+    for (every, grow) in [("10", "0.0001"), ("150", "0.001")] {
+        goes_on_from_older_pages(&["--refine-stop", "200", "--refine-every", every, "--grow-grad2d", grow]);
+    }
+}
+
+fn goes_on_from_older_pages(more: &[&str]) {
+    let bench = Bench::new();
+    let out = bench.stopped(more);
+    let listed = json(&["ls", text(&out)]);
+    let [a, b] = generations(&listed)[..] else { panic!("{listed}") };
+    let found = json(&["diff", text(&out), &a.to_string(), &b.to_string(), "--names"]);
+    let names = found["names"][2].as_array().unwrap();
+    for name in names {
+        let (file, offset) = slot_of(&out, name.as_str().unwrap());
+        flip(&bench.spill().join(file), offset + 4096 + 77);
+    }
+    let rescued = bench.path("rescued");
+    let done = json(&["salvage", text(&out), "--out", text(&rescued)]);
+    let taken = done["lost"].as_array().unwrap().iter().filter(|page| !page["taken"].is_null()).count();
+    assert!(taken > 10 && taken == names.len(), "{taken} older pages: {done}");
+    assert!(json(&["verify", text(&rescued), "--deep"])["faults"].as_array().unwrap().is_empty());
+    bench.export(&rescued, &[]);
     bench.go_on(&["--spill-dir", text(&rescued)]);
 }
 

@@ -449,6 +449,49 @@ fn a_limit_on_the_size_of_files_is_an_error_that_names_the_file() {
     assert!(Trainer::ply_path(&out).exists() && !spill.exists(), "what was trained is there, nothing was committed");
 }
 
+/// What `--save-every` writes is not needed to go on.
+#[test]
+fn a_drive_without_room_for_a_saved_ply_costs_that_file_alone() {
+    let folder = TempDir::new().unwrap();
+    let scene = make_scene(folder.path());
+    let out = folder.path().join("out");
+    let output = Command::new("sh")
+        .args(["-c", "ulimit -f 1000; exec \"$0\" \"$@\"", env!("CARGO_BIN_EXE_gsscale-train")])
+        .args([text(&scene), "--out", text(&out), "--steps", "30", "--save-every", "10", "--commit-every", "0"])
+        .args(["--device", "cpu", "--test-every", "24", "--log-every", "7", "--quiet"])
+        .output()
+        .unwrap();
+    let said = stderr(&output);
+    assert!(
+        said.contains("point_cloud_000010.ply is not written") && said.contains("point_cloud_000020.ply"),
+        "{said}"
+    );
+    let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
+    assert!(metrics.lines().last().unwrap().starts_with("{\"step\":29,"), "all steps were done: {metrics}");
+}
+
+/// The drive of the results is full, not that of the pages: it is that one that is named and waited for.
+#[test]
+fn a_full_drive_of_results_is_named_and_costs_no_reserve() {
+    let folder = TempDir::new().unwrap();
+    let scene = make_scene(folder.path());
+    let Some(drive) = Small::mount(&folder.path().join("results"), 32 << 10) else { return };
+    let (out, spill) = (drive.0.join("out"), folder.path().join("spill"));
+    let more = ["--commit-every", "0.02", "--disk-full-wait", "0.2", "--log-every", "1", "--quiet"];
+    let all = [&args(&scene, &out, &spill)[..], &more].concat();
+    // A flag that is given twice is refused.
+    let at = all.iter().position(|arg| *arg == "--log-every").unwrap();
+    let output = train(&[&all[..at], &all[at + 2..]].concat());
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains(&format!("the drive of {} is full", out.display())), "{said}");
+    assert!(!said.contains("the reserve is used up") && said.contains("--resume"), "{said}");
+    assert!(spill.join(RESERVE_NAME).exists());
+    drive.resize(200 << 20);
+    let output = train(&["--resume", text(&out), "--quiet"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+}
+
 /// Containers forbid io_uring with a seccomp filter; a child has the filter of the thread that starts it.
 #[cfg(target_os = "linux")]
 #[test]

@@ -75,6 +75,9 @@ fn a_dry_run_touches_no_spill_directory() {
     let output = train(&[text(&scene), "--dry-run", "--spill-dir", text(&spill)]);
     assert!(output.status.success(), "{}", stderr(&output));
     assert!(!spill.exists());
+    // Frames count in a dry run as they do in a run.
+    let output = train(&[text(&scene), "--dry-run", "--frames", "2", "--page-rows", "64"]);
+    assert!(output.status.code() == Some(1) && stderr(&output).contains("--frames: 2"), "{}", stderr(&output));
 }
 
 #[test]
@@ -104,6 +107,23 @@ fn a_budget_that_was_refused_trains_with_what_the_remedy_names() {
     let enough = format!("{:.1}MiB", least.parse::<f64>().unwrap() + 0.1);
     let trained = run(folder.path(), &scene, &[&["--host-mem", enough.as_str()][..], &more].concat());
     assert!(trained.status.success(), "{enough}: {}", stderr(&trained));
+    // A dry run says the same, of frames over a drive, and asks for no folder that it was given.
+    let dry = |budget: &str| {
+        let flags = [&["--steps", "12", "--dry-run", "--host-mem", budget][..], &more].concat();
+        train(&[&[text(&scene)], &flags[..]].concat())
+    };
+    let (enough, too_little) = (dry(&enough), dry("32MiB"));
+    let said = stderr(&enough);
+    assert!(enough.status.success() && said.contains("frames of pages") && said.contains("drive  "), "{said}");
+    let said = stderr(&too_little);
+    assert!(
+        too_little.status.code() == Some(1) && said.contains("the view") && !said.contains("name a folder"),
+        "{said}"
+    );
+    // What does not fit in memory is not brought there.
+    let said = stderr(&dry("8MiB"));
+    assert!(said.contains("a dry run writes none") && said.contains("8000 Gaussians"), "{said}");
+    assert!(!spill.exists());
     let done = summary(&folder.path().join("out"));
     assert!(done["frames"].as_u64().unwrap() >= done["pages_pinned_max"].as_u64().unwrap());
     assert!(done["frames"].as_u64().unwrap() < done["pages"].as_u64().unwrap(), "not all pages fit");

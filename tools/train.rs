@@ -42,8 +42,9 @@ struct Args {
     #[arg(long, conflicts_with = "scene")]
     demo: bool,
     /// Go on with the run in this output folder, which stopped, was cut off, or kept its checkpoint; its config and scene
-    /// are used. Memory, frames, threads, I/O, device and logging may be given anew, and more --steps
-    #[arg(long, value_name = "OUT", conflicts_with_all = ["scene", "out", "config", "demo", "dry_run", "overwrite"])]
+    /// are used. Memory, frames, threads, I/O, device and logging may be given anew, more --steps, and the scene or
+    /// --init-ply where they were moved
+    #[arg(long, value_name = "OUT", conflicts_with_all = ["out", "config", "demo", "dry_run", "overwrite"])]
     resume: Option<PathBuf>,
     /// With --resume: go on although the dataset changed, or with other values of keys that change numbers
     #[arg(long, requires = "resume")]
@@ -91,7 +92,7 @@ fn list_devices() {
 fn start(args: Args) -> Result<RunOutcome, TrainError> {
     if let Some(out) = args.resume {
         let (accept_changes, quiet) = (args.accept_changes, args.quiet);
-        return resume(&ResumeRequest { out, keys: args.keys, accept_changes, quiet });
+        return resume(&ResumeRequest { out, keys: args.keys, scene: args.scene, accept_changes, quiet });
     }
     let mut config = match (&args.config, args.demo) {
         (Some(path), _) => TrainConfig::read(path)?,

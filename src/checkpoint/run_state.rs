@@ -7,13 +7,16 @@
 //! Layout: [`VERSION`] as u32, then the fields of [`RunState`] in their order, as [`crate::page::encoding`] writes them.
 //! Version 2 added what tools list and what a run that goes on counts from ([`RunState::test`], [`RunState::traffic`]),
 //! and a dataset print that knows photos, points and the local frame. No program was released with version 1.
+//! Version 3 added the last five of [`TrafficSoFar`]; of a state of version 2 they are 0.
 
 use crate::page::encoding::{self, EncodingError};
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
+/// The oldest that is read.
+const OLDEST: u32 = 2;
 /// Bins of the statistics.
 const BINS: u16 = 1 << 15;
 
@@ -81,6 +84,16 @@ pub struct TrafficSoFar {
     pub stall_seconds: f64,
     /// The most pages pinned at once.
     pub pinned_max: u64,
+    /// Of the misses, those that were not even on their way.
+    pub absent: u64,
+    /// Pages that all others than steps asked for.
+    pub other_pages_needed: u64,
+    /// Bytes read for them.
+    pub other_bytes_read: u64,
+    /// Seconds that they waited.
+    pub other_stall_seconds: f64,
+    /// Bytes that the best of caches would have read for the steps.
+    pub belady_bytes_read: u64,
 }
 
 /// A run between two steps.
@@ -177,10 +190,14 @@ impl RunState {
     pub fn from_bytes(bytes: &[u8]) -> Result<RunState, RunStateError> {
         let (version, body) = bytes.split_first_chunk().ok_or(RunStateError::Impossible("it is empty"))?;
         let version = u32::from_le_bytes(*version);
-        if version != VERSION {
+        if !(OLDEST..=VERSION).contains(&version) {
             return Err(RunStateError::Version(version));
         }
-        let state: RunState = encoding::from_bytes(body)?;
+        let mut body = body.to_vec();
+        if version == 2 {
+            body.extend(of_version_3()?);
+        }
+        let state: RunState = encoding::from_bytes(&body)?;
         state.check()?;
         Ok(state)
     }
@@ -212,7 +229,10 @@ impl RunState {
             return refuse("its local frame is none");
         }
         let is_time = |seconds: f64| seconds >= 0.0 && seconds.is_finite();
-        if !is_time(self.train_seconds) || !is_time(self.traffic.stall_seconds) {
+        if !is_time(self.train_seconds)
+            || !is_time(self.traffic.stall_seconds)
+            || !is_time(self.traffic.other_stall_seconds)
+        {
             return refuse("it has trained or waited for no length of time");
         }
         if self.test.is_some_and(|test| test.step > self.step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
@@ -220,6 +240,13 @@ impl RunState {
         }
         Ok(())
     }
+}
+
+/// What version 3 added at the end, as it is of a state without it.
+fn of_version_3() -> Result<Vec<u8>, EncodingError> {
+    let TrafficSoFar { absent, other_pages_needed, other_bytes_read, other_stall_seconds, belady_bytes_read, .. } =
+        TrafficSoFar::default();
+    encoding::to_bytes(&(absent, other_pages_needed, other_bytes_read, other_stall_seconds, belady_bytes_read))
 }
 
 #[cfg(test)]
@@ -261,7 +288,13 @@ mod tests {
             train_seconds: 0.1,
             metrics_bytes: 1234,
             test: Some(LastTest { step: 8, views: 3, psnr: 21.5, ssim: 0.75 }),
-            traffic: TrafficSoFar { bytes_read: 9, stall_seconds: 0.25, ..TrafficSoFar::default() },
+            traffic: TrafficSoFar {
+                bytes_read: 9,
+                stall_seconds: 0.25,
+                other_bytes_read: 4,
+                belady_bytes_read: 3,
+                ..TrafficSoFar::default()
+            },
         }
     }
 
@@ -271,6 +304,17 @@ mod tests {
         assert_eq!(RunState::from_bytes(&bytes).unwrap(), sample());
         bytes[0] += 1;
         assert_eq!(RunState::from_bytes(&bytes), Err(RunStateError::Version(VERSION + 1)));
+    }
+
+    #[test]
+    fn states_of_version_2_have_counted_less() {
+        let bytes = sample().to_bytes().unwrap();
+        // Five numbers fewer, all of eight bytes.
+        let bytes = [&2u32.to_le_bytes(), &bytes[4..bytes.len() - 40]].concat();
+        let traffic = TrafficSoFar { bytes_read: 9, stall_seconds: 0.25, ..TrafficSoFar::default() };
+        assert_eq!(RunState::from_bytes(&bytes).unwrap(), RunState { traffic, ..sample() });
+        let of_version_1 = [&1u32.to_le_bytes(), &bytes[4..]].concat();
+        assert_eq!(RunState::from_bytes(&of_version_1), Err(RunStateError::Version(1)));
     }
 
     #[test]
@@ -288,6 +332,7 @@ mod tests {
         refused(|s| s.histogram.reverse());
         refused(|s| s.train_seconds = f64::NAN);
         refused(|s| s.traffic.stall_seconds = -1.0);
+        refused(|s| s.traffic.other_stall_seconds = f64::INFINITY);
         refused(|s| s.test = s.test.map(|t| LastTest { step: 10, ..t }));
         refused(|s| s.test = s.test.map(|t| LastTest { psnr: f64::NAN, ..t }));
         refused(|s| s.dataset.scale = 0.0);

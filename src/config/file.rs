@@ -350,6 +350,12 @@ impl TrainConfig {
         if self.log_every == 0 {
             return refuse("log-every", "1 or more");
         }
+        self.check_thresholds()?;
+        self.check_rates()?;
+        self.check_names()
+    }
+
+    fn check_thresholds(&self) -> InputResult<()> {
         let thresholds = [
             ("grow-grad2d", self.grow_grad2d),
             ("grow-scale3d", self.grow_scale3d),
@@ -364,8 +370,7 @@ impl TrainConfig {
         if self.prune_opa >= 0.5 {
             return refuse("prune-opa", "less than 0.5");
         }
-        self.check_rates()?;
-        self.check_names()
+        Ok(())
     }
 
     fn check_rates(&self) -> InputResult<()> {

@@ -11,7 +11,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use std::fs::File;
-use std::io::Write;
+use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -22,6 +22,8 @@ const SESSION_START: [u8; 2] = [0x08, 0x01];
 pub struct EventFile {
     path: PathBuf,
     file: File,
+    /// Bytes of whole records.
+    end: u64,
 }
 
 impl EventFile {
@@ -34,7 +36,7 @@ impl EventFile {
         std::fs::create_dir_all(folder)
             .map_err(|e| InputError::io(folder, "creating the folder of event files", &e))?;
         let (path, file) = new_file(folder)?;
-        let mut events = EventFile { path, file };
+        let mut events = EventFile { path, file, end: 0 };
         let mut message = Vec::new();
         double(&mut message, 1, seconds_now());
         bytes(&mut message, 3, b"brain.Event:2");
@@ -78,8 +80,28 @@ impl EventFile {
         record.extend_from_slice(&masked(crc32c(&length)).to_le_bytes());
         record.extend_from_slice(message);
         record.extend_from_slice(&masked(crc32c(message)).to_le_bytes());
-        self.file.write_all(&record).map_err(|e| InputError::io(&self.path, "writing the event file", &e))
+        let end = self.end;
+        let cut = |file: &mut File| file.set_len(end).and_then(|()| file.seek(SeekFrom::Start(end)).map(|_| ()));
+        append_whole(&mut self.file, &record, cut)
+            .map_err(|e| InputError::io(&self.path, "writing the event file", &e))?;
+        self.end += record.len() as u64;
+        Ok(())
     }
+}
+
+/// Appends all of a record; where that fails, `cut` takes back what was written of it, as far as the drive allows: readers
+/// would take what follows half a record for the rest of it.
+fn append_whole<W: Write>(
+    file: &mut W,
+    record: &[u8],
+    cut: impl FnOnce(&mut W) -> std::io::Result<()>,
+) -> std::io::Result<()> {
+    let written = file.write_all(record);
+    if written.is_err() {
+        // What made it fail is the error to be told.
+        let _ = cut(file);
+    }
+    written
 }
 
 /// A file that was not there: lives of a run may begin within one second. Names sort in the order of time, which is the
@@ -95,6 +117,14 @@ fn new_file(folder: &Path) -> InputResult<(PathBuf, File)> {
             Ok(file) => return Ok((path, file)),
         }
     }
+}
+
+/// Whether a file has a name as [`EventFile::create`] gives them.
+pub fn is_event_file(path: &Path) -> bool {
+    let name = path.file_name().and_then(|name| name.to_str());
+    let parts = name.and_then(|name| name.strip_prefix("events.out.tfevents.")?.split_once(".gsscale."));
+    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
+    parts.is_some_and(|(seconds, number)| is_number(seconds) && is_number(number))
 }
 
 fn seconds_now() -> f64 {
@@ -144,6 +174,34 @@ mod tests {
     #[test]
     fn the_checksum_has_its_published_check_value() {
         assert_eq!(crc32c(b"123456789"), 0xe306_9283);
+    }
+
+    /// Takes so many bytes.
+    struct Full(Vec<u8>, usize);
+
+    impl Write for Full {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            let room = (self.1 - self.0.len()).min(bytes.len());
+            self.0.extend_from_slice(&bytes[..room]);
+            if room == 0 { Err(std::io::ErrorKind::StorageFull.into()) } else { Ok(room) }
+        }
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn half_a_record_is_taken_back() {
+        let mut file = Full(Vec::new(), 10);
+        let mut append = |record: &[u8]| {
+            let end = file.0.len();
+            let result = append_whole(&mut file, record, |file| {
+                file.0.truncate(end);
+                Ok(())
+            });
+            (result.is_ok(), file.0.len())
+        };
+        assert_eq!([append(b"record"), append(b"record"), append(b"four")], [(true, 6), (false, 6), (true, 10)]);
     }
 
     #[test]

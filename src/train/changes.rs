@@ -41,14 +41,14 @@ const FREE_KEYS: &[&str] = &[
     "steps",
 ];
 /// Of these, keys that hold for all later lives of a run too, not for this one alone.
-const LASTING_KEYS: &[&str] = &["steps", "keep-checkpoint"];
+const LASTING_KEYS: &[&str] = &["steps", "keep-checkpoint", "spill-dir"];
 /// Keys by which stored pages are laid out.
 const LAYOUT_KEYS: &[&str] = &["page-rows", "sh-degree"];
-/// Compared as what follows from them.
-const DERIVED_KEYS: &[&str] = &["simd", "schedule-steps"];
+/// Compared as what follows from them; of init-ply that is the digest of first Gaussians, wherever the file lies now.
+const DERIVED_KEYS: &[&str] = &["simd", "schedule-steps", "init-ply"];
 
 /// The config that a run keeps when it goes on with `config`: that of its file, with what changes numbers and how far it
-/// goes as they are now.
+/// goes and where its checkpoint is as they are now.
 ///
 /// # Errors
 /// None that a config can cause.
@@ -59,7 +59,17 @@ pub(super) fn kept_config(file: &Path, of_file: &TrainConfig, config: &TrainConf
     for key in FREE_KEYS.iter().filter(|key| !LASTING_KEYS.contains(key)) {
         kept.extend(of_file.get(*key).map(|value| (key.to_string(), value.clone())));
     }
-    TrainConfig::deserialize(kept).map_err(|e| broken(e.to_string()))
+    let kept = TrainConfig::deserialize(kept).map_err(|e| broken(e.to_string()))?;
+    Ok(with_absolute_paths(kept))
+}
+
+/// The config with paths that do not depend on where the program was started.
+pub(super) fn with_absolute_paths(config: TrainConfig) -> TrainConfig {
+    let absolute = |path: &String| match path.as_str() {
+        "" => String::new(),
+        path => std::path::absolute(path).map_or(path.to_string(), |p| p.to_string_lossy().into_owned()),
+    };
+    TrainConfig { spill_dir: absolute(&config.spill_dir), init_ply: absolute(&config.init_ply), ..config }
 }
 
 /// What is other than it was, a line each.
@@ -151,6 +161,10 @@ mod tests {
         let of_file = TrainConfig { threads: 3, frames: 7, seed: 1, ..TrainConfig::default() };
         let now = TrainConfig { threads: 1, steps: 9, seed: 2, keep_checkpoint: true, ..TrainConfig::default() };
         let kept = kept_config(Path::new("config.toml"), &of_file, &now).unwrap();
-        assert_eq!(kept, TrainConfig { threads: 3, frames: 7, ..now });
+        assert_eq!(kept, TrainConfig { threads: 3, frames: 7, ..now.clone() });
+        // The folder of its pages goes with the run, wherever a later life is started.
+        let now = TrainConfig { spill_dir: "copy".into(), ..now };
+        let kept = kept_config(Path::new("config.toml"), &of_file, &now).unwrap();
+        assert!(Path::new(&kept.spill_dir).is_absolute() && kept.spill_dir.ends_with("copy"), "{}", kept.spill_dir);
     }
 }

@@ -352,7 +352,7 @@ impl Trainer {
             train_seconds: self.train_seconds,
             metrics_bytes,
             test: self.last_test,
-            traffic: traffic_of(&self.scene.pager.stats()),
+            traffic: traffic_of(&self.scene.pager.stats(), self.past_belady_bytes),
         }
     }
 
@@ -364,11 +364,12 @@ impl Trainer {
         self.steps_skipped_in_a_row = state.steps_skipped_in_a_row;
         self.train_seconds = state.train_seconds;
         self.last_test = state.test;
+        self.past_belady_bytes = state.traffic.belady_bytes_read;
         self.scene.pager.count_on(stats_of(&state.traffic));
     }
 }
 
-fn traffic_of(stats: &PagerStats) -> TrafficSoFar {
+fn traffic_of(stats: &PagerStats, past_belady_bytes: u64) -> TrafficSoFar {
     TrafficSoFar {
         bytes_read: stats.bytes_read,
         bytes_written: stats.bytes_written,
@@ -381,9 +382,15 @@ fn traffic_of(stats: &PagerStats) -> TrafficSoFar {
         evictions: stats.evictions,
         stall_seconds: stats.stall_seconds,
         pinned_max: stats.pinned_max as u64,
+        absent: stats.absent,
+        other_pages_needed: stats.other_pages_needed,
+        other_bytes_read: stats.other_bytes_read,
+        other_stall_seconds: stats.other_stall_seconds,
+        belady_bytes_read: past_belady_bytes + stats.belady_bytes_read,
     }
 }
 
+/// For a pager, which counts what the best of caches would have read anew in every life.
 fn stats_of(traffic: &TrafficSoFar) -> PagerStats {
     PagerStats {
         bytes_read: traffic.bytes_read,
@@ -397,6 +404,10 @@ fn stats_of(traffic: &TrafficSoFar) -> PagerStats {
         evictions: traffic.evictions,
         stall_seconds: traffic.stall_seconds,
         pinned_max: traffic.pinned_max as usize,
+        absent: traffic.absent,
+        other_pages_needed: traffic.other_pages_needed,
+        other_bytes_read: traffic.other_bytes_read,
+        other_stall_seconds: traffic.other_stall_seconds,
         ..PagerStats::default()
     }
 }
@@ -404,6 +415,20 @@ fn stats_of(traffic: &TrafficSoFar) -> PagerStats {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn traffic_is_counted_on_and_its_bound_once() {
+        let traffic = TrafficSoFar {
+            bytes_read: 100,
+            absent: 3,
+            other_pages_needed: 4,
+            other_bytes_read: 30,
+            other_stall_seconds: 0.5,
+            belady_bytes_read: 60,
+            ..TrafficSoFar::default()
+        };
+        assert_eq!(traffic_of(&stats_of(&traffic), traffic.belady_bytes_read), traffic);
+    }
 
     #[test]
     fn a_commit_before_its_time_must_be_needed_and_of_use() {

@@ -13,12 +13,15 @@ use super::trainer::{TrainError, Trainer};
 use crate::base::units::format_bytes;
 use crate::page::commit::Commits;
 use crate::page::file_system::free_bytes;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// From one look at the drive to the next.
 const POLL: Duration = Duration::from_secs(1);
 /// The reserve is filled only where it takes less than one in so many of the free bytes.
 const RESERVE_SHARE: u64 = 4;
+/// What is asked for on the drive of the results while a run goes on: metrics are a few hundred bytes a line.
+const OTHER_BYTES: u64 = 1 << 20;
 
 impl TrainError {
     /// Whether it is only space on a drive that is missing: the same may work later.
@@ -71,6 +74,9 @@ impl Checkpoint {
         let mut lacks = why;
         if !is_stuck {
             self.space_made = Some(now);
+        }
+        // Neither commits nor the reserve make space on another drive than their own.
+        if !is_stuck && self.other_drive(&lacks).is_none() {
             match self.commit_with_reserve(trainer, metrics) {
                 Ok(()) => return Ok(()),
                 Err(error) if error.is_out_of_space() => lacks = error,
@@ -84,7 +90,7 @@ impl Checkpoint {
     /// Commits twice, since one commit keeps what the one before it names; with the reserve's space if need be.
     fn commit_with_reserve(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         let mut result = self.commit(trainer, metrics);
-        let is_full = result.as_ref().is_err_and(TrainError::is_out_of_space);
+        let is_full = result.as_ref().is_err_and(|e| e.is_out_of_space() && self.other_drive(e).is_none());
         let commits = self.commits.as_mut().filter(|_| is_full);
         if commits.map_or(Ok(false), Commits::give_up_reserve)? {
             eprintln!("warning: the drive of {} is full: the reserve is used up", self.folder.display());
@@ -101,11 +107,16 @@ impl Checkpoint {
         lacks: TrainError,
         (began, is_told): (Instant, bool),
     ) -> Result<(), TrainError> {
-        let needed = trainer.scene.pager.slot_space().map_or(0, |space| space.segment_bytes) + self.map_growth();
-        let free = free_bytes(&self.folder).ok().flatten();
+        let other = self.other_drive(&lacks);
+        let needed = match other {
+            Some(_) => OTHER_BYTES,
+            None => trainer.scene.pager.slot_space().map_or(0, |space| space.segment_bytes) + self.map_growth(),
+        };
+        let full = other.unwrap_or_else(|| self.folder.clone());
+        let free = free_bytes(&full).ok().flatten();
         let free_then = free.map_or(String::from("unknown"), format_bytes);
         let until = self.full_wait.as_secs_f64();
-        let (needed_text, folder) = (format_bytes(needed), self.folder.display().to_string());
+        let (needed_text, folder) = (format_bytes(needed), full.display().to_string());
         if !is_told {
             eprintln!(
                 "paused: {lacks}\n  {folder} needs {needed_text} more and has {free_then} free. Training waits up to {until:.0} s \
@@ -114,7 +125,7 @@ impl Checkpoint {
         }
         while began.elapsed() < self.full_wait && stop.exit_code().is_none() {
             std::thread::sleep(POLL.min(self.full_wait / 20));
-            let free_now = free_bytes(&self.folder).ok().flatten();
+            let free_now = free_bytes(&full).ok().flatten();
             // Less than a segment does not help a scene that the drive is too small for.
             if free_now.zip(free).is_some_and(|(now, then)| now < needed && now <= then) {
                 continue;
@@ -140,8 +151,30 @@ impl Checkpoint {
         }
     }
 
+    /// The folder of the file that found no space, where that is on another drive than the store.
+    fn other_drive(&self, error: &TrainError) -> Option<PathBuf> {
+        let TrainError::Input(error) = error else { return None };
+        let folder = error.file.parent().filter(|folder| folder.is_dir())?;
+        (!is_same_drive(folder, &self.folder)).then(|| folder.to_path_buf())
+    }
+
     /// What the page map may grow by for one commit, bytes: it doubles at most.
     fn map_growth(&self) -> u64 {
         std::fs::metadata(self.folder.join(crate::page::commit::MAP_NAME)).map_or(0, |map| map.len())
+    }
+}
+
+/// Whether two folders lie on one drive; so they do where the system does not tell.
+fn is_same_drive(a: &Path, b: &Path) -> bool {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::MetadataExt;
+        let device = |folder: &Path| std::fs::metadata(folder).map(|m| m.dev()).ok();
+        device(a).zip(device(b)).is_none_or(|(a, b)| a == b)
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = (a, b);
+        true
     }
 }

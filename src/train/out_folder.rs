@@ -7,6 +7,7 @@
 use super::first_commit::checkpoint_folder;
 use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
+use crate::exchange::tensorboard::is_event_file;
 use crate::page::spill_dir::SpillDir;
 use crate::report::run_report::{PAGES_FILE, REPORT_FILE};
 use std::path::Path;
@@ -67,11 +68,26 @@ pub(super) fn make(out: &Path, overwrite: bool) -> InputResult<()> {
         }
     }
     remove_saved(out)?;
+    remove_events(&out.join("tensorboard"))?;
     let pictures = out.join("renders/test");
     if pictures.is_dir() {
         let io = |e: std::io::Error| InputError::io(&pictures, "removing the earlier run's pictures", &e);
         std::fs::remove_dir_all(&pictures).map_err(io)?;
     }
+    Ok(())
+}
+
+/// Removes the event files of an earlier run, which TensorBoard would draw into the new one's curves, and their folder if
+/// nothing else is in it.
+fn remove_events(folder: &Path) -> InputResult<()> {
+    if !folder.is_dir() {
+        return Ok(());
+    }
+    let entries = std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "listing the folder", &e))?;
+    for path in entries.flatten().map(|entry| entry.path()).filter(|path| is_event_file(path)) {
+        std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
+    }
+    let _ = std::fs::remove_dir(folder);
     Ok(())
 }
 
@@ -86,4 +102,32 @@ fn remove_saved(out: &Path) -> InputResult<()> {
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::exchange::tensorboard::EventFile;
+
+    #[test]
+    fn curves_of_an_earlier_run_go_and_others_files_stay() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path();
+        let events = out.join("tensorboard");
+        for _ in 0..2 {
+            EventFile::create(&events, None).unwrap().write(1, &[("loss/train", 0.5)]).unwrap();
+        }
+        let count = || std::fs::read_dir(&events).map_or(0, Iterator::count);
+        make(out, true).unwrap();
+        assert_eq!(count(), 2, "no run's config, so they are not a run's");
+        std::fs::write(out.join("config.toml"), "").unwrap();
+        std::fs::write(events.join("events.out.tfevents.0123456789.host.1.0"), "of another program").unwrap();
+        make(out, true).unwrap();
+        assert_eq!(count(), 1);
+        std::fs::remove_file(events.join("events.out.tfevents.0123456789.host.1.0")).unwrap();
+        std::fs::write(out.join("config.toml"), "").unwrap();
+        make(out, true).unwrap();
+        assert!(!events.exists());
+    }
 }

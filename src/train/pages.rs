@@ -162,6 +162,8 @@ impl PagedScene {
         [rows, rows_bound]: [u64; 2],
     ) -> PagedScene {
         let mut rules = PageRules::new(options);
+        // Not what keys would begin with now, which may have changed since.
+        rules.sh_degree = options.sh_degree_start.min(options.sh_degree);
         for event in events.events() {
             if let EventKind::RaiseShDegree { degree } = event.kind {
                 rules.sh_degree = degree;

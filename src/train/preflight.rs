@@ -5,13 +5,16 @@
 
 use super::memory::{MemoryEstimate, estimate, rows_at_most};
 use super::run::Prepared;
+use super::start::{Start, folder_beside};
 use super::tiers::{PLAN_BYTES, Tiers, first_staging_bytes, staging_bytes};
 use super::trainer::{TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
-use crate::dataset::loader::{Dataset, View};
+use crate::dataset::loader::Dataset;
+use crate::page::file_system::free_bytes;
+use crate::paging::pager::PagerConfig;
 use crate::render::cpu::CpuRenderer;
 use crate::scene::camera::Camera;
 use crate::scene::partition::first_fill;
@@ -20,6 +23,7 @@ use crate::schedule::model::Policy;
 use crate::schedule::order::Order;
 use crate::schedule::replay::{ReplayOptions, replay};
 use crate::schedule::visibility::ViewPages;
+use std::path::Path;
 
 /// Bytes that a common drive of 500 GB is rated to take in its life.
 const ENDURANCE_BYTES: f64 = 300e12;
@@ -99,7 +103,35 @@ pub fn settle(
     Ok(plan)
 }
 
-/// Gives a pager whose frames follow from the budget as many as the largest view of `dataset` needs, so that views can
+/// What is known of a scene whose pages a dry run cannot look at, since they do not fit in memory and it writes none;
+/// `None` where they do fit. A dry run keeps what would lie on the drive in memory, in half of the budget at most.
+pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Option<u64>) -> Option<String> {
+    let budget = host_mem.filter(|_| !config.spill_dir.is_empty())?;
+    let frame = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes() as u64;
+    let pages = start.rows.div_ceil(first_fill(config.page_rows as usize, config.strategy != "none") as u64);
+    if pages.saturating_mul(frame) <= budget / 2 {
+        return None;
+    }
+    let free = free_bytes(&folder_beside(Path::new(&config.spill_dir))).ok().flatten();
+    Some(format!(
+        "scene   {} views to train on, {} held out\n\
+         start   {} Gaussians\n\
+         pages   about {pages} of up to {}, {} in all; the drive has {} free\n\
+         memory  {} for everything, less than {} pages at once. What a view needs is not known before the pages are \
+         on the drive, and a dry run writes none: the run itself finds it before its first step, and refuses what is \
+         too little",
+        start.dataset.train_views().len(),
+        start.dataset.test_views().len(),
+        start.rows,
+        format_bytes(frame),
+        format_bytes(pages.saturating_mul(frame)),
+        free.map_or(String::from("unknown"), format_bytes),
+        format_bytes(budget),
+        (budget / frame).max(1),
+    ))
+}
+
+/// Gives a pager whose frames follow from the budget as many as the largest training view of `dataset` needs, so that views can
 /// be looked at; [`settle`] gives it the rest once it is known what a view takes.
 ///
 /// # Errors
@@ -113,24 +145,19 @@ pub fn hold_a_view(
     if config.frames > 0 || trainer.scene.pager.stats().frames_max == usize::MAX {
         return Ok(());
     }
-    let of = |view: &View| trainer.scene.pager.pages_of_view(&view.camera).len();
-    let Some((needed, view)) = dataset.views.iter().map(|view| (of(view), view)).max_by_key(|(needed, _)| *needed)
-    else {
-        return Ok(());
-    };
-    let bytes = (needed * trainer.scene.pager.frame_bytes()) as u64;
+    let (needed, view, _) = largest_view(dataset, trainer);
+    let bytes = needed * trainer.scene.pager.frame_bytes() as u64;
     if let Some(budget) = host_mem.filter(|budget| bytes > *budget) {
         let problem = format!(
-            "{} are too little: the view {} needs {needed} pages of {} at once, which is {}",
+            "{} are too little: the view {view} needs {needed} pages of {} at once, which is {}",
             format_bytes(budget),
-            view.name,
             format_bytes(trainer.scene.pager.frame_bytes() as u64),
             format_bytes(bytes)
         );
         let remedy = format!("give at least {}, or lower --page-rows or --sh-degree", format_bytes(bytes + bytes / 4));
         return Err(InputError::new("--host-mem", problem, remedy));
     }
-    trainer.scene.pager.allow_frames(needed);
+    trainer.scene.pager.allow_frames(needed as usize);
     Ok(())
 }
 

@@ -8,6 +8,8 @@ use std::time::Instant;
 pub struct Progress {
     bar: Option<ProgressBar>,
     quiet: bool,
+    /// Steps that were done before.
+    first: u32,
     total: u32,
     started: Instant,
     last_line: Instant,
@@ -23,7 +25,16 @@ impl Progress {
             bar
         });
         let now = Instant::now();
-        Progress { bar, quiet, total, started: now, last_line: now }
+        Progress { bar, quiet, first: 0, total, started: now, last_line: now }
+    }
+
+    /// The display of a run that goes on after `first` steps, which count for no rate.
+    pub fn after(self, first: u32) -> Self {
+        if let Some(bar) = &self.bar {
+            bar.set_position(u64::from(first));
+            bar.reset_eta();
+        }
+        Progress { first, ..self }
     }
 
     /// One step is done. `message` is asked for only when it will be shown.
@@ -39,8 +50,7 @@ impl Progress {
         // Off a terminal a line every ten seconds tells that the run lives without filling a log.
         if !self.quiet && (self.last_line.elapsed().as_secs() >= 10 || done == self.total) {
             self.last_line = Instant::now();
-            let rate = f64::from(done) / self.started.elapsed().as_secs_f64().max(1e-9);
-            let left = f64::from(self.total - done) / rate.max(1e-9);
+            let [rate, left] = rate(self.first, done, self.total, self.started.elapsed().as_secs_f64());
             eprintln!("step {done}/{}  {rate:.1}/s  {}  {left:.0} s left", self.total, message());
         }
     }
@@ -50,5 +60,24 @@ impl Progress {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
+    }
+}
+
+/// Steps a second since the first one of this process, and seconds that are left.
+fn rate(first: u32, done: u32, total: u32, seconds: f64) -> [f64; 2] {
+    let rate = f64::from(done.saturating_sub(first)) / seconds.max(1e-9);
+    [rate, f64::from(total.saturating_sub(done)) / rate.max(1e-9)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_of_earlier_lives_make_no_run_faster() {
+        assert_eq!(rate(0, 100, 300, 10.0), [10.0, 20.0]);
+        assert_eq!(rate(900, 1000, 1200, 10.0), [10.0, 20.0]);
+        let after = Progress::new(1200, true).after(900);
+        assert_eq!((after.first, after.total), (900, 1200));
     }
 }

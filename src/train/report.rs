@@ -184,7 +184,7 @@ pub struct Summary {
     pub version: String,
     /// Which SSIM `test.ssim` is: same, valid or reflect.
     pub ssim_variant: String,
-    /// Whether the run did all of its steps.
+    /// Whether the run did all of its steps and the evaluation after them.
     pub finished: bool,
     /// Gaussians whose update was skipped because a gradient was not finite, over all steps.
     pub rows_skipped_non_finite: u64,

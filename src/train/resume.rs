@@ -17,7 +17,8 @@ use super::start::Start;
 use super::tiers::Stored;
 use super::trainer::{TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
-use crate::checkpoint::run_state::{RunState, RunStateError};
+use crate::base::simd::SimdPath;
+use crate::checkpoint::run_state::{DatasetPrint, RunState, RunStateError};
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits::{self, RunOptions};
 use crate::densify::stats::GradHistogram;
@@ -35,6 +36,8 @@ pub struct ResumeRequest {
     pub out: PathBuf,
     /// Flags.
     pub keys: TrainOverrides,
+    /// Its scene, where that is not where it was.
+    pub scene: Option<PathBuf>,
     /// Other numbers and another dataset are accepted.
     pub accept_changes: bool,
     /// Nothing but errors on the terminal.
@@ -49,7 +52,7 @@ pub struct ResumeRequest {
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     let file = request.out.join("config.toml");
     let of_file = TrainConfig::read(&file)?;
-    let scene = read_resolved(&file)?.scene;
+    let scene = request.scene.clone().map_or_else(|| read_resolved(&file).map(|resolved| resolved.scene), Ok)?;
     let mut config = of_file.clone();
     request.keys.clone().apply(&mut config);
     config.check()?;
@@ -69,16 +72,16 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     let start = Start::look(&scene, &config, &request.out, host_mem)?;
     let print = dataset_print(&start)?;
     changes.add_dataset(&start.dataset, &state.dataset, &print);
-    changes.numbers.extend(start_change(&start, &state));
+    changes.numbers.extend(start_change(&start, &state, &print));
     changes.check(&start.dataset.image_folder, request.accept_changes)?;
     let (renderer, options, driver) = begin(request.quiet, &config, &start)?;
     say(request, &state, &config, &changes, &*renderer);
-    let dataset = start.dataset;
+    let dataset = start.into_dataset();
     let (pager, tiers) = stored.into_tiers(&config, host_mem.unwrap_or(u64::MAX))?;
     tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
     let has_changed = !changes.numbers.is_empty();
     let pages = match has_changed {
-        false => restore_pages(pager, &options, &state)?,
+        false => restore_pages(pager, &of_state(&options, &state), &state)?,
         true => changed_pages(pager, &options, &state)?,
     };
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
@@ -179,19 +182,55 @@ fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result
 /// The pages of a run that goes on by other rules: brought to its last step by those that it had.
 fn changed_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
     let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
-    // The path that the bits were made on, if this machine has it.
-    let simd = then.simd.clone();
-    let then = [state.simd.clone(), simd].into_iter().map(|simd| TrainConfig { simd, ..then.clone() });
-    let then = then.into_iter().find(|c| limits::simd_path(c).is_supported()).unwrap_or_default();
-    let old =
-        RunOptions { sh_degree_start: state.sh_degree_start, ..RunOptions::new(&then, state.dataset.scene_scale) };
+    let then = rules_then(&then, &state.simd, SimdPath::is_supported)
+        .ok_or_else(|| CommitError::Contradiction("no instruction path of this machine is known".to_string()))?;
+    let old = of_state(&RunOptions::new(&then, state.dataset.scene_scale), state);
     let mut pages = restore_pages(pager, &old, state)?;
     pages.change_rules(options, state.step)?;
     Ok(pages)
 }
 
-/// A start that would be another one now: of no use to a run that is past it, but a sign that something changed.
-fn start_change(start: &Start, state: &RunState) -> Option<String> {
+/// The config that the pages were trained by, on the path that the bits were made on if this machine has it, else on that
+/// of the config or on the best that there is: a path changes roundings, other rates the scene.
+fn rules_then(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath) -> bool) -> Option<TrainConfig> {
+    let on = |simd: &str| TrainConfig { simd: simd.to_string(), ..then.clone() };
+    [on(simd), on(&then.simd), on("auto")].into_iter().find(|c| is_supported(limits::simd_path(c)))
+}
+
+/// The options by which pages come back: with the band that was in use from their first step, from which the events of
+/// the run raised it. Which band the run would begin with now may be another, by keys that were accepted.
+fn of_state(options: &RunOptions, state: &RunState) -> RunOptions {
+    RunOptions { sh_degree_start: state.sh_degree_start, ..options.clone() }
+}
+
+/// A start that would be another one now: of no use to a run that is past it, but a sign that something changed. Of the
+/// same points or Gaussians it is another by the config alone, whose keys are compared one by one, and once.
+fn start_change(start: &Start, state: &RunState, here: &DatasetPrint) -> Option<String> {
+    if state.dataset.points == here.points {
+        return None;
+    }
     let (there, here) = (state.sh_degree_start, start.sh_degree_start);
     (there != here).then(|| format!("the first Gaussians had {there} bands in use and have {here}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pages_go_on_by_their_own_config_on_a_machine_without_its_path() {
+        let then = TrainConfig { means_lr: 0.5, seed: 9, simd: "avx512".into(), ..TrainConfig::default() };
+        let here = |paths: &[SimdPath]| rules_then(&then, "avx512", |path| paths.contains(&path));
+        let with = |simd: &str| Some(TrainConfig { simd: simd.into(), ..then.clone() });
+        assert_eq!(here(&SimdPath::ALL), with("avx512"));
+        // What `auto` stands for depends on the machine: it is the third that is asked for.
+        let asked = std::cell::Cell::new(0);
+        let third = |_| asked.replace(asked.get() + 1) == 2;
+        assert_eq!(rules_then(&then, "avx512", third), with("auto"));
+        let baseline = TrainConfig { simd: "baseline".into(), ..then.clone() };
+        let found = rules_then(&baseline, "avx512", |path| path == SimdPath::Baseline);
+        assert_eq!(found, Some(baseline), "that of the config comes second");
+        // Never by another config.
+        assert_eq!(here(&[]), None);
+    }
 }

@@ -3,8 +3,9 @@
 //! Invariants: 1. the output folder is made only after the dataset was understood, so bad input leaves nothing
 //! behind; 2. a run that is stopped or fails after its first step still writes the PLY of its last good step.
 
+use super::changes::with_absolute_paths;
 use super::checkpoint::{Checkpoint, Origin};
-use super::costs::Meter;
+use super::costs::{Meter, StepCosts};
 use super::dataset_print::dataset_print;
 use super::eval::ply_warnings;
 use super::machine;
@@ -13,7 +14,7 @@ use super::out_folder;
 use super::page_map::write_page_map;
 use super::preflight;
 use super::progress::Progress;
-use super::report::{MetricsLog, Resolved, Summary, TierTraffic, read_resolved, write_config, write_summary};
+use super::report::{MetricsLog, Resolved, Summary, read_resolved, write_config, write_summary};
 use super::signals::StopFlag;
 use super::start::Start;
 use super::tiers::{self, Tiers};
@@ -26,7 +27,7 @@ use crate::dataset::loader::{Dataset, load_dataset};
 use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
-use crate::exchange::ply::{ExportFrame, PlyContent, read_ply, to_local};
+use crate::exchange::ply::{ExportFrame, PlyContent, PlyWritten, read_ply, to_local};
 use crate::paging::error::PagingError;
 use crate::render::Renderer;
 use crate::report::run_report::{PAGES_FILE, write_run_report};
@@ -202,6 +203,12 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let host_mem = host_budget(config);
     let start = Start::read(&request.scene, config, host_mem)?;
     let sh_degree_start = start.sh_degree_start;
+    if let Some(known) = preflight::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
+        if !request.quiet {
+            eprintln!("{known}");
+        }
+        return Ok(RunOutcome { summary: None, exit_code: 0 });
+    }
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
     let fill = first_fill(config.page_rows as usize, options.densify.is_some());
     let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
@@ -268,24 +275,27 @@ pub(super) fn see_through(
             }
             _ => String::new(),
         };
-        eprintln!("to go on from the last commit: gsscale-train --resume {}{more}", request.out.display());
+        let elsewhere = spill_dir_flag(request);
+        eprintln!("to go on from the last commit: gsscale-train --resume {}{elsewhere}{more}", request.out.display());
     }
     tiers.close().iter().for_each(|word| eprintln!("warning: {word}"));
     outcome
 }
 
+/// ` --spill-dir FOLDER` where the run's config does not lead to its checkpoint, because it could not be written anew.
+fn spill_dir_flag(request: &RunRequest) -> String {
+    let [kept, now] = [TrainConfig::read(&request.out.join("config.toml")), Ok(request.config.clone())]
+        .map(|config| config.map(|config| with_absolute_paths(config).spill_dir));
+    match now {
+        Ok(now) if !now.is_empty() && !kept.is_ok_and(|kept| kept == now) => format!(" --spill-dir {now}"),
+        _ => String::new(),
+    }
+}
+
 /// The config as it is kept: settled, and with paths that do not depend on where the program was started.
 fn settled(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
-    let absolute = |path: &String| match path.as_str() {
-        "" => String::new(),
-        path => std::path::absolute(path).map_or(path.to_string(), |p| p.to_string_lossy().into_owned()),
-    };
-    TrainConfig {
-        view_order: trainer.view_order().order().to_string(),
-        spill_dir: absolute(&config.spill_dir),
-        init_ply: absolute(&config.init_ply),
-        ..config.clone()
-    }
+    let view_order = trainer.view_order().order().to_string();
+    with_absolute_paths(TrainConfig { view_order, ..config.clone() })
 }
 
 /// Writes config.toml, of a run that goes on where it changed; returns what every commit says of how the run began.
@@ -294,8 +304,10 @@ fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun
     let path = request.out.join("config.toml");
     let config = match &begun.past {
         Some(past) => {
-            if TrainConfig::read(&path)? != past.config {
-                write_config(&path, &past.config, &read_resolved(&path)?)?;
+            let before = read_resolved(&path)?;
+            let scene = absolute_scene(request);
+            if TrainConfig::read(&path)? != past.config || before.scene != scene {
+                write_config(&path, &past.config, &Resolved { scene, ..before })?;
             }
             past.config.clone()
         }
@@ -333,7 +345,7 @@ fn train_into(
         }
     }
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-    let mut progress = Progress::new(config.steps, request.quiet);
+    let mut progress = Progress::new(config.steps, request.quiet).after(trainer.steps_done());
     let meter = Meter::start(&trainer);
     let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint };
     let looped = trainer.run(dataset, &targets, &mut outputs);
@@ -348,6 +360,35 @@ fn train_into(
         }
         (looped, saved) => (looped, saved?),
     };
+    warn_of_ply(config, &written, &ply);
+    // A stopped run owes the user its files at once; the held-out views can be looked at later with gsscale-eval.
+    let tested = looped.and_then(|()| match stop.exit_code() {
+        None => trainer.evaluate(dataset, &targets, Some(&out.join("renders/test"))),
+        Some(_) => Ok(None),
+    });
+    if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, tiers.checkpoint.as_mut()) {
+        // Once more, with what the evaluation said.
+        checkpoint.commit_or_warn(&mut trainer, &mut metrics)?;
+    }
+    let summary = Summary {
+        gaussians: written.rows + written.skipped,
+        test: tested.as_ref().ok().copied().flatten(),
+        // Without its evaluation a run is not done: it goes on to that.
+        finished: trainer.steps_done() == config.steps && tested.is_ok(),
+        costs,
+        commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
+        ..summary_of(request, &trainer)
+    };
+    write_summary(&out.join("summary.json"), &summary)?;
+    write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
+    write_run_report(out)?;
+    tested?;
+    tiers.is_done = summary.finished;
+    Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
+}
+
+/// Says where the final PLY is not what was asked for.
+fn warn_of_ply(config: &TrainConfig, written: &PlyWritten, ply: &Path) {
     if written.frame == ExportFrame::Local && config.export_frame == "dataset" {
         eprintln!(
             "warning: the scene lies too far from its origin for f32, so {} holds local positions; \
@@ -358,44 +399,37 @@ fn train_into(
     if written.skipped > 0 {
         eprintln!("warning: {} Gaussians are not finite and are not in {}", written.skipped, ply.display());
     }
-    // A stopped run owes the user its files at once; the held-out views can be looked at later with gsscale-eval.
-    let tested = looped.and_then(|()| match stop.exit_code() {
-        None => trainer.evaluate(dataset, &targets, Some(&out.join("renders/test"))),
-        Some(_) => Ok(None),
-    });
-    if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, tiers.checkpoint.as_mut()) {
-        // Once more, with what the evaluation said.
-        checkpoint.commit_or_warn(&mut trainer, &mut metrics)?;
-    }
+}
+
+/// What the trainer alone knows of a run that ended: not done, not evaluated.
+fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
     let (rows_skipped, steps_skipped) = trainer.skipped();
-    let summary = Summary {
+    Summary {
         steps: trainer.steps_done(),
-        gaussians: written.rows + written.skipped,
+        gaussians: trainer.scene.rows(),
         train_seconds: trainer.train_seconds(),
         host_bytes_peak: host_bytes_peak().unwrap_or(0),
-        test: tested.as_ref().ok().copied().flatten(),
+        test: None,
         scene: request.scene.clone(),
         version: env!("CARGO_PKG_VERSION").to_string(),
-        ssim_variant: config.ssim_variant.clone(),
-        finished: trainer.steps_done() == config.steps,
+        ssim_variant: request.config.ssim_variant.clone(),
+        finished: false,
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
-        costs,
-        tiers: TierTraffic::of(&trainer.scene.pager),
-        commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
-    };
-    write_summary(&out.join("summary.json"), &summary)?;
-    write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
-    write_run_report(out)?;
-    tested?;
-    tiers.is_done = summary.finished;
-    Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
+        costs: StepCosts::default(),
+        tiers: trainer.tier_traffic(),
+        commits: None,
+    }
+}
+
+fn absolute_scene(request: &RunRequest) -> PathBuf {
+    std::path::absolute(&request.scene).unwrap_or_else(|_| request.scene.clone())
 }
 
 fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer) -> Resolved {
     Resolved {
         version: env!("CARGO_PKG_VERSION").to_string(),
-        scene: std::path::absolute(&request.scene).unwrap_or_else(|_| request.scene.clone()),
+        scene: absolute_scene(request),
         simd: limits::simd_path(&request.config).name().to_string(),
         threads: rayon::current_num_threads(),
         device: trainer.renderer.device(),

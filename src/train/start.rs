@@ -29,6 +29,8 @@ use std::path::{Path, PathBuf};
 
 /// Memory of an import where no budget is known, bytes.
 const BUDGET_DEFAULT: u64 = 1 << 30;
+/// What first Gaussians are made from gets one part in so many of the budget.
+const BUDGET_SHARE: u64 = 3;
 
 /// A dataset and what its Gaussians are made from.
 pub struct Start {
@@ -88,8 +90,8 @@ impl Start {
     /// From the Gaussians of a store.
     fn of_store(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
         let folder = Path::new(&config.init_ply);
-        let memory = host_mem.unwrap_or(BUDGET_DEFAULT) / 3;
-        let store = StoredStart::open(folder, memory).map_err(|error| match error {
+        let memory = host_mem.unwrap_or(BUDGET_DEFAULT);
+        let store = StoredStart::open(folder, memory, BUDGET_SHARE).map_err(|error| match error {
             TrainError::Input(error) => error,
             other => InputError::new(folder, other.to_string(), "see the cause"),
         })?;
@@ -137,6 +139,12 @@ impl Start {
         Ok(Some(Start { dataset, sh_degree_start: limits::first_sh_degree(config), rows, points, from }))
     }
 
+    /// The dataset alone, for a run that has its Gaussians already: what they were made from, columns, a spool or a store
+    /// with its lock, is given up here.
+    pub(super) fn into_dataset(self) -> Dataset {
+        self.dataset
+    }
+
     /// The dataset, and the Gaussians in the pages of `pager`.
     ///
     /// # Errors
@@ -177,12 +185,12 @@ impl Start {
 
 /// A third of the memory: the frames have a share already, and the system keeps what was just written.
 fn budget(folder: &Path, host_mem: Option<u64>) -> Budget<'_> {
-    Budget { folder, bytes: (host_mem.unwrap_or(BUDGET_DEFAULT) / 3) as usize }
+    Budget { folder, bytes: (host_mem.unwrap_or(BUDGET_DEFAULT) / BUDGET_SHARE) as usize }
 }
 
 /// A folder on the drive of the spill directory, which may not be there yet and must stay empty: the nearest one above
 /// it. What is written there has no name.
-fn folder_beside(spill_dir: &Path) -> PathBuf {
+pub(super) fn folder_beside(spill_dir: &Path) -> PathBuf {
     let above = spill_dir.ancestors().skip(1).find(|folder| folder.is_dir());
     above.map_or_else(|| PathBuf::from("."), Path::to_path_buf)
 }

@@ -5,6 +5,7 @@
 
 use super::checkpoint::Checkpoint;
 use super::first_commit::{FirstCommit, MAP_CACHE_BYTES, codec};
+use super::start::folder_beside;
 use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
 use crate::cache::evict::EvictPolicy;
@@ -14,6 +15,7 @@ use crate::page::codec::Codec;
 use crate::page::commit::{CommitConfig, CommitError, Commits};
 use crate::page::drive_rate::DriveRate;
 use crate::page::engine::{DEPTH, IoEngine, open_engine};
+use crate::page::file_system::free_bytes;
 use crate::page::folder::DriveFolder;
 use crate::page::memory_store::MemoryStore;
 use crate::page::opening::Opened;
@@ -24,7 +26,7 @@ use crate::page::spill_format::Purpose;
 use crate::page::store::PageStore;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::scene::page_layout::capacity_bytes;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Fewest frames that a run gets before its views were looked at: enough for importing and probing.
 const FIRST_FRAMES: usize = 64;
@@ -54,6 +56,8 @@ pub struct Tiers {
     is_in_output: bool,
     /// The directory had a run in it when it was opened.
     has_past: bool,
+    /// Of a dry run: a folder on the drive where the spill directory would be.
+    planned_on: Option<PathBuf>,
     /// What moves pages, for reports; empty when all stay in memory.
     pub engine: String,
     /// How pages are stored, for reports.
@@ -129,21 +133,23 @@ pub fn first_staging_bytes(config: &TrainConfig, pages: usize, host_mem: u64) ->
 }
 
 /// Opens the tiers for a scene of about `pages` pages, within `host_mem` bytes. The pager has few frames at first where
-/// their number follows from the budget: see [`Pager::allow_frames`]. With `dry`, nothing is written: pages stay in
-/// memory.
+/// their number follows from the budget: see [`Pager::allow_frames`]. With `dry`, nothing is written: what would lie on the
+/// drive is in memory, where it must fit ([`super::preflight::too_large_for_a_dry_run`]).
 ///
 /// # Errors
 /// The spill directory cannot be used, or the I/O engine does not work here.
 pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Result<(Pager, Tiers), TrainError> {
     let (page_rows, sh_degree) = (config.page_rows as usize, config.sh_degree);
-    if dry || (config.spill_dir.is_empty() && config.frames == 0) {
+    if config.spill_dir.is_empty() && config.frames == 0 {
         return Ok((Pager::in_memory(PagerConfig::in_memory(page_rows, sh_degree)), Tiers::default()));
     }
     let pager = pager_config(config, pages, host_mem);
     let layout = SlotLayout::new(capacity_bytes(page_rows, sh_degree), pages as u64);
     let mut tiers = Tiers::default();
     tiers.keeps = config.keep_checkpoint;
-    if config.spill_dir.is_empty() {
+    if dry || config.spill_dir.is_empty() {
+        let drive = Some(folder_beside(Path::new(&config.spill_dir)));
+        tiers.planned_on = drive.filter(|_| !config.spill_dir.is_empty());
         let engine = Box::new(MemoryStore::new());
         let codec = chosen_codec(config, None, &mut tiers.notes);
         (tiers.engine, tiers.codec) = (engine.name().to_string(), codec.to_string());
@@ -282,7 +288,7 @@ impl Tiers {
 
     /// Whether pages may leave memory for a drive.
     pub fn spills(&self) -> bool {
-        self.spill.is_some() && !self.is_in_memory
+        (self.spill.is_some() || self.planned_on.is_some()) && !self.is_in_memory
     }
 
     /// Bytes of the files that hold pages on the drive; 0 without one, or where they cannot be listed.
@@ -298,6 +304,9 @@ impl Tiers {
     /// # Errors
     /// The folder is gone.
     pub fn free_bytes(&self) -> InputResult<Option<u64>> {
+        if let Some(folder) = &self.planned_on {
+            return Ok(free_bytes(folder).ok().flatten());
+        }
         let Some(spill) = &self.spill else { return Ok(None) };
         let segments = spill.segments()?.len() as u64;
         let taken = if self.has_past { segments * spill.format().layout.segment_bytes() } else { 0 };

@@ -68,7 +68,7 @@ pub enum TrainError {
         stands = .last_step.map_or(String::new(), |step| format!("; the commit after step {step} stands"))
     )]
     DriveFull {
-        /// The spill directory.
+        /// The spill directory, or that of the file that found no space.
         folder: String,
         /// Bytes, for people.
         needed: String,
@@ -106,6 +106,8 @@ pub struct Trainer {
     pub(super) train_seconds: f64,
     /// The last evaluation on the held-out views.
     pub(super) last_test: Option<LastTest>,
+    /// Bytes that the best of caches would have read in earlier lives of the run, which the pager knows nothing of.
+    pub(super) past_belady_bytes: u64,
 }
 
 /// Where a loop writes, and how it is watched.
@@ -173,6 +175,7 @@ impl Trainer {
             steps_skipped_in_a_row: 0,
             train_seconds: 0.0,
             last_test: None,
+            past_belady_bytes: 0,
         }
     }
 
@@ -235,6 +238,12 @@ impl Trainer {
     /// Gaussians whose update was skipped, and steps that were, because something was not finite.
     pub fn skipped(&self) -> (u64, u32) {
         (self.rows_skipped, self.steps_skipped)
+    }
+
+    /// What moved between the tiers since the run began, over all its lives.
+    pub fn tier_traffic(&self) -> TierTraffic {
+        let tiers = TierTraffic::of(&self.scene.pager);
+        TierTraffic { belady_bytes_read: self.past_belady_bytes + tiers.belady_bytes_read, ..tiers }
     }
 
     /// Options of a rendering now: with the bands that are in use.
@@ -364,7 +373,7 @@ impl Trainer {
                 test = self.evaluate(dataset, targets, None)?;
             }
             if due(self.options.save_every) && !is_last {
-                self.save(dataset, &outputs.out.join(format!("point_cloud_{step:06}.ply")))?;
+                self.save_if_space(dataset, &outputs.out.join(format!("point_cloud_{step:06}.ply")))?;
                 if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
                     checkpoint.keep_next_as(format!("step-{step}"));
                 }
@@ -380,7 +389,7 @@ impl Trainer {
                     bytes_uploaded: traffic.bytes_uploaded - before.bytes_uploaded,
                     bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
                     device_bytes_peak: traffic.device_bytes_peak,
-                    tiers: TierTraffic::of(&self.scene.pager),
+                    tiers: self.tier_traffic(),
                     commits: outputs.checkpoint.as_deref().map(Checkpoint::report),
                     test,
                 };
@@ -484,6 +493,17 @@ impl Trainer {
         let mut writer = ply::PlyWriter::create(path, self.options.sh_degree, rows_at_most, &meta)?;
         self.scene.for_all_rows(self.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
         Ok(writer.finish()?)
+    }
+
+    /// As [`Trainer::save`], of a file that the run does not need: on a full drive it is left out, and said.
+    fn save_if_space(&mut self, dataset: &Dataset, path: &Path) -> Result<(), TrainError> {
+        match self.save(dataset, path) {
+            Err(error) if error.is_out_of_space() => {
+                eprintln!("warning: {} is not written: {error}", path.display());
+                Ok(())
+            }
+            done => done.map(|_| ()),
+        }
     }
 
     /// The path of the final PLY in an output folder.

@@ -107,7 +107,7 @@ impl Bench {
     pub fn stopped(&self, more: &[&str]) -> PathBuf {
         let (out, child) = self.running(more);
         stop(child);
-        self.go_on_until_stopped();
+        self.go_on_until_stopped(&[]);
         out
     }
 
@@ -118,11 +118,16 @@ impl Bench {
     }
 
     /// Goes on for a few steps.
-    pub fn go_on_until_stopped(&self) {
+    pub fn go_on_until_stopped(&self, more: &[&str]) {
+        stop(self.going_on(more));
+    }
+
+    /// A run that went on some steps ago.
+    pub fn going_on(&self, more: &[&str]) -> Child {
         let lines = self.lines();
-        let mut child = spawn(&["--resume", text(&self.path("out")), "--quiet"]);
+        let mut child = spawn(&[&["--resume", text(&self.path("out")), "--quiet"], more].concat());
         self.wait_for_lines(&mut child, lines + 4);
-        stop(child);
+        child
     }
 
     fn lines(&self) -> usize {
@@ -171,7 +176,7 @@ fn spawn(args: &[&str]) -> Child {
 }
 
 /// SIGTERM, and the end that follows.
-fn stop(child: Child) {
+pub fn stop(child: Child) {
     assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap().success());
     let output = child.wait_with_output().unwrap();
     assert_eq!(output.status.code(), Some(143), "{}", stderr(&output));

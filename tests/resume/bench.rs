@@ -119,7 +119,12 @@ impl Bench {
 
     /// Begins a run in `out` and asks it to stop after some lines of metrics.
     pub fn stopped(&self, place: Place, lines: usize) {
-        let mut child = self.begin(place, &SELDOM);
+        self.stopped_with(place, lines, &[]);
+    }
+
+    /// As [`Bench::stopped`], of a run that is told `more`.
+    pub fn stopped_with(&self, place: Place, lines: usize, more: &[&str]) {
+        let mut child = self.begin(place, &[&SELDOM, more].concat());
         self.wait_for_lines(&mut child, lines);
         signal(&child, "INT");
         let output = ended(child);

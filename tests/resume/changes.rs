@@ -103,3 +103,50 @@ fn accepted_changes_are_the_same_in_any_memory() {
     assert!(first == second, "the same changes gave two scenes");
     assert!(first != alone.ply, "the change changed nothing");
 }
+
+/// What was accepted is part of the run: later lives need not be told again, and end alike.
+#[test]
+fn other_bands_are_accepted_once() {
+    let bench = Bench::new();
+    for keys in [["--sh-start", "2"], ["--sh-every", "0"]] {
+        bench.stopped(Place::Memory, 2);
+        copy_folder(&bench.path("out"), &bench.path("twin"));
+        let accepted = [&keys[..], &["--accept-changes"]].concat();
+        assert!(refused(bench.go_on(&keys)).contains(&keys[0][2..]));
+        succeeded(bench.go_on_in("twin", &accepted));
+        let mut child = bench.go_on(&[&accepted[..], &SELDOM].concat());
+        bench.wait_for_lines(&mut child, logged(&bench.path("out")).len() + 3);
+        signal(&child, "INT");
+        assert_eq!(ended(child).status.code(), Some(130));
+        succeeded(bench.go_on(&[]));
+        assert!(ply(&bench.path("out")) == ply(&bench.path("twin")), "{keys:?}: the scene is another");
+        ["out", "twin"].iter().for_each(|out| std::fs::remove_dir_all(bench.path(out)).unwrap());
+    }
+}
+
+/// The same dataset and the same first Gaussians are told by what they hold, not by where they lie.
+#[test]
+fn a_scene_and_a_start_that_were_moved_are_named_and_the_run_goes_on() {
+    let bench = Bench::new();
+    let (first, moved) = (bench.path("first.ply"), bench.path("moved"));
+    succeeded(bench.begin(Place::Memory, &[]));
+    std::fs::rename(bench.path("out/point_cloud.ply"), &first).unwrap();
+    std::fs::remove_dir_all(bench.path("out")).unwrap();
+    succeeded(bench.begin(Place::Memory, &["--init-ply", text(&first)]));
+    let want = ply(&bench.path("out"));
+    std::fs::remove_dir_all(bench.path("out")).unwrap();
+    bench.stopped_with(Place::Memory, 4, &["--init-ply", text(&first)]);
+    std::fs::create_dir(&moved).unwrap();
+    std::fs::rename(&bench.scene, moved.join("scene")).unwrap();
+    std::fs::rename(&first, moved.join("first.ply")).unwrap();
+    let (scene, start) = (moved.join("scene"), moved.join("first.ply"));
+    assert!(refused(bench.go_on(&[])).contains("scene"));
+    assert!(refused(bench.go_on(&[text(&scene)])).contains("first.ply"));
+    let mut child = bench.go_on(&[&[text(&scene), "--init-ply", text(&start)], &SELDOM[..]].concat());
+    bench.wait_for_lines(&mut child, logged(&bench.path("out")).len() + 3);
+    signal(&child, "INT");
+    assert_eq!(ended(child).status.code(), Some(130));
+    // From then on it is there.
+    succeeded(bench.go_on(&[]));
+    assert!(ply(&bench.path("out")) == want, "the scene is another");
+}

@@ -62,3 +62,22 @@ fn the_same_command_again_says_that_there_is_a_run() {
     assert_eq!(output.status.code(), Some(130));
     assert!(stderr(&output).contains("not committed") && !stderr(&output).contains("--resume"), "{}", stderr(&output));
 }
+
+/// A run whose last evaluation failed is not done: its checkpoint stays, and the same command makes up for it.
+#[test]
+fn a_run_without_its_last_evaluation_goes_on_to_it() {
+    let bench = Bench::new();
+    let alone = bench.alone(&[]);
+    bench.stopped(Place::Spill(alone.fewest), 2);
+    let out = bench.path("out");
+    // In the way of the pictures.
+    std::fs::write(out.join("renders"), "mine").unwrap();
+    assert!(refused(bench.go_on(&[])).contains("renders"));
+    assert!(ply(&out) == alone.ply, "all steps were done");
+    assert!(summary(&out)["finished"] == false && bench.path("spill/map.redb").exists());
+    std::fs::remove_file(out.join("renders")).unwrap();
+    succeeded(bench.go_on(&[]));
+    let done = summary(&out);
+    assert!(done["finished"] == true && done["test"]["psnr"].as_f64().is_some(), "{done}");
+    assert!(ply(&out) == alone.ply && !bench.path("spill/map.redb").exists());
+}

@@ -87,7 +87,7 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
     let generation = store.find(request.generation.as_deref())?;
     let state = run_state_of(&store, generation)?;
     let (_, options) = options_of(&place.folder, &state)?;
-    let mut scene = scene_at(&store, generation, &state, &options, request.host_mem)?;
+    let mut scene = scene_at(&store, generation, &state, &options, (request.host_mem, 1))?;
     let mut choice = Choice::new(&state, request);
     let pages = choice.pages(&scene);
     choice.find_cut(&mut scene, &pages, state.step)?;
@@ -133,22 +133,22 @@ fn meta_of(state: &RunState, options: &RunOptions) -> PlyMeta {
     }
 }
 
-/// The pages of a generation behind as many frames as the budget allows.
+/// The pages of a generation behind as many frames as one part in `share` of the budget allows.
 pub(super) fn scene_at(
     store: &StoreReader,
     generation: u64,
     state: &RunState,
     options: &RunOptions,
-    host_mem: u64,
+    (host_mem, share): (u64, u64),
 ) -> Result<PagedScene, TrainError> {
     let pages = store.pages_at(generation)?;
     let frame = PagerConfig::in_memory(options.page_rows, options.sh_degree).frame_bytes() as u64;
     // 88 bytes of tables for each step of the schedule.
     let tables = 88 * u64::from(options.rates.steps);
     let fixed = FIXED_BYTES + tables + (store.entries() + pages.len()) as u64 * ENTRY_BYTES;
-    let frames = host_mem.saturating_sub(fixed) / (frame * COPIES);
+    let frames = (host_mem / share).saturating_sub(fixed) / (frame * COPIES);
     if frames == 0 {
-        let least = format_bytes(fixed + frame * COPIES);
+        let least = format_bytes((fixed + frame * COPIES) * share);
         let problem = format!("{} are too little for this store", format_bytes(host_mem));
         return Err(InputError::new("--host-mem", problem, format!("give at least {least}")).into());
     }

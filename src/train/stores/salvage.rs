@@ -80,6 +80,8 @@ pub struct Salvaged {
 struct Kept {
     slot: SlotRef,
     label: Vec<u8>,
+    /// In place of a newer version.
+    is_older: bool,
 }
 
 /// What is known before pages are copied.
@@ -187,7 +189,7 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
         let rows = meta_from_label(page.page, &page.label).map(|m| m.rows);
         let what = match reader.payload(page.page, &page.slot) {
             Ok(_) => {
-                kept.insert(page.page, Kept { slot: page.slot, label: page.label });
+                kept.insert(page.page, Kept { slot: page.slot, label: page.label, is_older: false });
                 continue;
             }
             Err(what) => what,
@@ -195,12 +197,12 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
         let older = found.get(&page.page).into_iter().flatten().filter(|h| h.slot.generation <= latest);
         let usable = |h: &&SlotHeader| {
             let applied = meta_from_label(h.page, &h.label).map(|m| m.events_applied as usize);
-            applied.is_some_and(|applied| applied <= state.events.len()) && reader.payload(h.page, &h.slot).is_ok()
+            applied.is_some_and(|applied| applied <= state.events.len()) && whole(&mut reader, h).is_ok()
         };
         let instead = older.filter(|h| h.slot != page.slot).find(usable);
         lost.push(LostPage { page: page.page.to_string(), rows, taken: instead.map(|h| h.slot.generation), what });
         if let Some(h) = instead {
-            kept.insert(h.page, Kept { slot: h.slot, label: h.label.clone() });
+            kept.insert(h.page, Kept { slot: h.slot, label: h.label.clone(), is_older: true });
         }
     }
     let rows: u64 = kept.iter().filter_map(|(id, k)| meta_from_label(*id, &k.label)).map(|m| u64::from(m.rows)).sum();
@@ -211,8 +213,12 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
         layout_for(source.layout, kept.len() as u64),
         usual_codec(kept.values().map(|k| &k.slot)),
     )?;
-    for (id, Kept { slot, label }) in &kept {
-        copy.put(*id, label, reader.payload(*id, slot).map_err(|what| changed(&source.folder, *id, &what))?)?;
+    for (id, Kept { slot, label, is_older }) in &kept {
+        let payload = reader.payload(*id, slot).map_err(|what| changed(&source.folder, *id, &what))?;
+        match meta_from_label(*id, label).filter(|_| *is_older) {
+            Some(meta) => copy.put(*id, label, &without_statistics(&meta, payload))?,
+            None => copy.put(*id, label, payload)?,
+        }
     }
     copy.skip_to(latest);
     commit(copy, &state, &source)?;
@@ -221,6 +227,19 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
     }
     let (step, pages, to) = (state.step, kept.len() as u64, request.to.clone());
     Ok(Salvaged { to, has_state: true, step, gaussians: rows, pages, lost, notes: source.notes })
+}
+
+/// A page without the statistics of its rows. Those of an older version are not what the run has counted: its histogram
+/// holds the newer ones, and of rounds that only the newer version had gone through nothing is promised any more. Without
+/// statistics rows neither grow in such a round nor are taken out of the histogram.
+fn without_statistics(meta: &PageMeta, payload: &[u8]) -> Vec<u8> {
+    let mut page = read_page(&layout_of(meta).rows(payload, 0));
+    page.grad2d.fill(0.0);
+    page.count.fill(0);
+    let mut words = vec![0u64; payload.len().div_ceil(8)];
+    let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
+    let written = write_page(&page, bytes).bytes();
+    bytes[..written].to_vec()
 }
 
 fn commit(mut copy: NewStore, state: &RunState, source: &Source) -> Result<(), TrainError> {

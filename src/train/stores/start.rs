@@ -32,14 +32,14 @@ impl StoredStart {
     /// The last generation of the store in `dir`, or of the run whose output folder that is.
     ///
     /// # Errors
-    /// It cannot be opened, is in use, or the budget is too small for it.
-    pub fn open(dir: &Path, host_mem: u64) -> Result<StoredStart, TrainError> {
+    /// It cannot be opened, is in use, or the budget, of which it gets one part in `share`, is too small for it.
+    pub fn open(dir: &Path, host_mem: u64, share: u64) -> Result<StoredStart, TrainError> {
         let folder = find_store(dir)?.folder;
         let store = StoreReader::open(&folder, Access::Pages, WitnessRule::Obeyed)?;
         let generation = store.find(None)?;
         let state = run_state_of(&store, generation)?;
         let (_, options) = options_of(&folder, &state)?;
-        let scene = scene_at(&store, generation, &state, &options, host_mem)?;
+        let scene = scene_at(&store, generation, &state, &options, (host_mem, share))?;
         Ok(StoredStart { folder, scene, state, _store: store })
     }
 
