@@ -61,7 +61,16 @@ pub(super) fn make(out: &Path, overwrite: bool) -> InputResult<()> {
         // Only if nothing else is in it.
         let _ = std::fs::remove_dir(&checkpoint);
     }
-    for name in ["config.toml", "metrics.jsonl", "summary.json", "point_cloud.ply", REPORT_FILE, PAGES_FILE] {
+    for name in [
+        "config.toml",
+        "metrics.jsonl",
+        "summary.json",
+        "point_cloud.ply",
+        "evaluated.json",
+        "evaluated-as.toml",
+        REPORT_FILE,
+        PAGES_FILE,
+    ] {
         let path = out.join(name);
         if path.is_file() {
             std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;

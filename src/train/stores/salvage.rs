@@ -3,7 +3,8 @@
 //! Where the map can still be verified (only its witness or some pages are damaged), the pages are those of the last
 //! generation; in place of a damaged version comes the newest older one that is whole. A run can go on from that.
 //!
-//! Where the map is lost, the newest whole version of every page is taken, whether it was committed or not. A page that
+//! Where the map is lost, the newest whole version of every page is taken by number of write, whether it was committed or
+//! not; numbers of a process that ended before its first commit are used again, so it may be an earlier one. A page that
 //! was split counts as replaced by its parts. The trainer's state was in the map: what is left is a scene at the step of
 //! its newest row, to be exported or started from, with its moments, and without the events that were still pending.
 //!
