@@ -248,17 +248,18 @@ fn a_store_that_a_run_was_started_from_is_free_once_the_run_goes_on() {
     let first = generations(&json(&["ls", text(&seed)]))[0].to_string();
     [out, bench.spill()].iter().for_each(|folder| std::fs::remove_dir_all(folder).unwrap());
     // It gets a part of the budget; what is named is the budget that was given, and the one that would do.
-    let refused = |budget: &str| {
+    let with_budget = |budget: &str| {
         let out = bench.path("none");
         let flags = ["--init-ply", text(&seed), "--host-mem", budget, "--out", text(&out), "--steps", "1"];
-        let output = scenes::train(&[&[text(&bench.path("scene"))], &flags[..]].concat());
-        stderr(&output)
+        scenes::train(&[&[text(&bench.path("scene"))], &flags[..]].concat())
     };
-    let said = refused("48MiB");
+    let said = stderr(&with_budget("48MiB"));
     assert!(said.contains("48.0 MiB are too little for this store"), "{said}");
     let least = said.split("give at least ").nth(1).and_then(|rest| rest.split(" MiB").next()).expect(&said);
     let enough = format!("{:.1}MiB", least.parse::<f64>().unwrap() + 0.1);
-    assert!(!refused(&enough).contains("too little for this store"), "{enough} would do");
+    let output = with_budget(&enough);
+    assert!(!stderr(&output).contains("too little for this store"), "{enough} would do: {}", stderr(&output));
+    assert!(output.status.success(), "{}", stderr(&output));
     bench.stopped(&["--init-ply", text(&seed)]);
     let mut child = bench.going_on(&[]);
     let dropped = json(&["rollback", text(&seed), &first, "--yes"]);

@@ -141,8 +141,12 @@ fn refuse_tiers(config: &TrainConfig) -> Result<(), TrainError> {
     }
 }
 
-/// Decodes every photo that the cache has room for, so that no contender of a comparison does it for the others.
-fn decode_all(dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
+/// Decodes every photo, so that no contender of a comparison does it for the others; where the cache does not hold all of
+/// them, all decode alike as they go.
+fn decode_all(dataset: &Dataset, targets: &TargetCache, config: &TrainConfig) -> Result<(), TrainError> {
+    if TargetCache::bytes_to_keep_all(&dataset.views, rayon::current_num_threads()) > config.image_cache.0 {
+        return Ok(());
+    }
     dataset.train_views().into_iter().try_for_each(|view| targets.get(view).map(|_| ()))?;
     Ok(())
 }

@@ -10,6 +10,7 @@
 //! a step up to the one that the frame is for needs; 3. reads and writes in flight are bounded in bytes; 4. nothing here
 //! changes what a step gets; 5. the steps are played once for each step, further calls in the same one cost what they begin.
 
+use super::fetch::Asker;
 use super::pager::Pager;
 use super::transfers::{Failure, READS, WRITES};
 use crate::base::ids::PageNo;
@@ -122,7 +123,7 @@ impl Pager {
         for Failure { is_write, error, .. } in self.settle(wait, &mut Vec::new()) {
             if is_write {
                 // The next step gets the error.
-                let _ = self.stop_writes(error, false);
+                let _ = self.stop_writes(error, Asker::Other);
             }
         }
     }
@@ -169,7 +170,7 @@ impl Pager {
     fn clean_early(&mut self, victim: Victim) {
         if let Err(Failure { error, .. }) = self.begin_write(victim.page, true) {
             // The next step gets the error.
-            let _ = self.stop_writes(error, false);
+            let _ = self.stop_writes(error, Asker::Other);
         }
     }
 

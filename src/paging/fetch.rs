@@ -16,6 +16,30 @@ use crate::page::buffer::PageBuffer;
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Instant;
 
+/// Who asks for pages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Asker {
+    /// A training step, before it changes anything: a failed write ends the call, so that the step can be done again.
+    Step,
+    /// A training step that has changed rows already: uses and waits are the step's, and a failed write is left to the
+    /// next step, since this one must not be done twice.
+    RestOfStep,
+    /// Somebody else: evaluation, export, checks.
+    Other,
+}
+
+impl Asker {
+    /// Whether uses, reads and waits count as a step's.
+    pub fn is_step(self) -> bool {
+        self != Asker::Other
+    }
+
+    /// Whether a failed write ends the call.
+    pub fn minds_writes(self) -> bool {
+        self == Asker::Step
+    }
+}
+
 /// Pages on their way to a caller.
 struct Fetch {
     /// For messages.
@@ -23,8 +47,7 @@ struct Fetch {
     pinned: Vec<Option<PinnedPage>>,
     /// Pages that are not pinned yet, with their place in the list.
     outstanding: BTreeMap<PageNo, usize>,
-    /// Whether a training step asks: only then are pages stamped as used, and do failed writes end the call.
-    is_step: bool,
+    asker: Asker,
     /// Of these, pages that are in memory, but which a commit must write first. Nothing is known of those behind the
     /// first one, so that an end costs no look at all of them.
     frozen: VecDeque<PageNo>,
@@ -32,19 +55,14 @@ struct Fetch {
 
 impl Pager {
     /// Pins pages with rows, in this order.
-    pub(super) fn fetch(
-        &mut self,
-        what: &str,
-        pages: &[PageNo],
-        is_step: bool,
-    ) -> Result<Vec<PinnedPage>, PagingError> {
+    pub(super) fn fetch(&mut self, what: &str, pages: &[PageNo], asker: Asker) -> Result<Vec<PinnedPage>, PagingError> {
         let held = self.held_by_callers();
         if held + pages.len() > self.cache.frames_max() {
             return Err(self.working_set(what, held + pages.len()));
         }
         let pinned = pages.iter().map(|_| None).collect();
         let mut fetch =
-            Fetch { what: what.to_string(), pinned, outstanding: BTreeMap::new(), is_step, frozen: VecDeque::new() };
+            Fetch { what: what.to_string(), pinned, outstanding: BTreeMap::new(), asker, frozen: VecDeque::new() };
         fetch.outstanding.extend(pages.iter().copied().zip(0..));
         let result = self.fetch_into(&mut fetch, pages);
         let pinned = fetch.pinned.into_iter().flatten();
@@ -65,7 +83,7 @@ impl Pager {
         self.judge(fetch, failures)?;
         let is_absent = |page: &PageNo| self.cache.state(*page).is_none();
         let mut to_read: VecDeque<PageNo> = pages.iter().copied().filter(is_absent).collect();
-        if fetch.is_step {
+        if fetch.asker.is_step() {
             self.stats.pages_needed += pages.len() as u64;
             // Frozen pages are there, and only wait for their write.
             let misses = fetch.outstanding.len().saturating_sub(frozen);
@@ -82,7 +100,7 @@ impl Pager {
             while let Some(&page) = to_read.front().filter(|page| self.may_decode(**page)) {
                 if self.begin_read(page, false) {
                     to_read.pop_front();
-                } else if !self.make_room(to_read.len(), fetch.is_step)? {
+                } else if !self.make_room(to_read.len(), fetch.asker)? {
                     break;
                 }
             }
@@ -95,7 +113,7 @@ impl Pager {
             let mut ended = Vec::new();
             let is_delayed = self.frozen.as_ref().is_some_and(|f| f.delays(fetch.outstanding.keys().copied()));
             let started = Instant::now();
-            let failures = self.settle_for(fetch.is_step, &mut ended);
+            let failures = self.settle_for(fetch.asker, &mut ended);
             self.stats.commit_seconds += if is_delayed { started.elapsed().as_secs_f64() } else { 0.0 };
             ended.into_iter().for_each(|page| self.pin_into(fetch, page));
             self.judge(fetch, failures)?;
@@ -108,7 +126,7 @@ impl Pager {
         while let Some(&page) = fetch.frozen.front() {
             if self.may_write_frozen(page) {
                 if let Err(Failure { error, .. }) = self.begin_write(page, true) {
-                    self.stop_writes(error, fetch.is_step)?;
+                    self.stop_writes(error, fetch.asker)?;
                 }
             } else if self.holds_frozen(page) {
                 // As many are being written as may be at once.
@@ -123,7 +141,7 @@ impl Pager {
     /// Pins an outstanding page if it is resident and not frozen.
     fn pin_into(&mut self, fetch: &mut Fetch, page: PageNo) {
         let Some(&place) = fetch.outstanding.get(&page).filter(|_| !self.holds_frozen(page)) else { return };
-        if let Some((buffer, dirty)) = self.cache.pin(page, fetch.is_step) {
+        if let Some((buffer, dirty)) = self.cache.pin(page, fetch.asker.is_step()) {
             fetch.outstanding.remove(&page);
             fetch.pinned[place] = Some(PinnedPage { page, meta: self.index[page.index()], dirty, buffer });
         }
@@ -136,7 +154,7 @@ impl Pager {
             if is_write {
                 // It is in memory again.
                 self.pin_into(fetch, page);
-                self.stop_writes(error, fetch.is_step)?;
+                self.stop_writes(error, fetch.asker)?;
             } else if fetch.outstanding.contains_key(&page) {
                 return Err(error);
             }
@@ -145,9 +163,9 @@ impl Pager {
     }
 
     /// No more writes until a step asks again. The error goes to the step that waits, or to the next one.
-    pub(super) fn stop_writes(&mut self, error: PagingError, is_step: bool) -> Result<(), PagingError> {
+    pub(super) fn stop_writes(&mut self, error: PagingError, asker: Asker) -> Result<(), PagingError> {
         self.writes_stopped = true;
-        if is_step {
+        if asker.minds_writes() {
             return Err(error);
         }
         self.failed_write.get_or_insert(error);
@@ -156,7 +174,7 @@ impl Pager {
 
     /// Makes a frame free: at once if a clean page leaves first, otherwise by beginning to write dirty ones, as many as
     /// there are frames wanted. Returns whether a frame is free now.
-    fn make_room(&mut self, wanted: usize, is_step: bool) -> Result<bool, PagingError> {
+    fn make_room(&mut self, wanted: usize, asker: Asker) -> Result<bool, PagingError> {
         loop {
             // Pages that are written to leave come first: a nearer one must not leave in their place.
             let leaving = self.cache.count(FrameState::Writing) - self.ahead[WRITES] / self.cache.frame_bytes();
@@ -172,10 +190,14 @@ impl Pager {
                 Some(_) if !self.has_staging() => return Ok(false),
                 Some(victim) if self.store.is_some() => {
                     if let Err(Failure { error, .. }) = self.begin_write(victim.page, false) {
-                        self.stop_writes(error, is_step)?;
+                        self.stop_writes(error, asker)?;
                     }
                 }
-                _ if !is_step && self.writes_stopped && self.in_flight() == 0 && self.held_by_callers() == 0 => {
+                _ if !asker.minds_writes()
+                    && self.writes_stopped
+                    && self.in_flight() == 0
+                    && self.held_by_callers() == 0 =>
+                {
                     // Everything in memory is dirty and cannot leave: one frame more lets the scene be written out.
                     self.cache.add_frame();
                     return Ok(true);
@@ -192,7 +214,7 @@ impl Pager {
     /// # Errors
     /// Every frame is pinned, or the store failed while one was emptied.
     pub fn take_frame(&mut self) -> Result<PageBuffer, PagingError> {
-        let error = match self.frame_for(true) {
+        let error = match self.frame_for(Asker::Step) {
             Err(error) => error,
             frame => return frame,
         };
@@ -202,24 +224,24 @@ impl Pager {
         }
         self.failed_write = Some(cause);
         self.cache.add_frame();
-        self.frame_for(true)
+        self.frame_for(Asker::Step)
     }
 
-    /// A frame without a page, emptied if need be, for a step or for the import.
-    pub(super) fn frame_for(&mut self, is_step: bool) -> Result<PageBuffer, PagingError> {
+    /// A frame without a page, emptied if need be, for a step or for the import; a failed write ends the call for both.
+    pub(super) fn frame_for(&mut self, asker: Asker) -> Result<PageBuffer, PagingError> {
         loop {
             if let Some(buffer) = self.cache.lend() {
                 return Ok(buffer);
             }
-            if self.make_room(1, true)? {
+            if self.make_room(1, Asker::Step)? {
                 continue;
             }
             if self.in_flight() == 0 {
                 return Err(self.working_set("a page that splits", self.cache.frames_max() + 1));
             }
-            for Failure { is_write, error, .. } in self.settle_for(is_step, &mut Vec::new()) {
+            for Failure { is_write, error, .. } in self.settle_for(asker, &mut Vec::new()) {
                 if is_write {
-                    self.stop_writes(error, true)?;
+                    self.stop_writes(error, Asker::Step)?;
                 }
             }
         }
@@ -233,14 +255,14 @@ impl Pager {
         }
         for Failure { is_write, error, .. } in self.settle(false, &mut Vec::new()) {
             if is_write {
-                self.stop_writes(error, true)?;
+                self.stop_writes(error, Asker::Step)?;
             }
         }
         while self.may_write_ahead()
             && let Some(victim) = self.cache.dirty_victim()
         {
             if let Err(Failure { error, .. }) = self.begin_write(victim.page, true) {
-                self.stop_writes(error, true)?;
+                self.stop_writes(error, Asker::Step)?;
             }
         }
         if let Some(victim) = self.cache.clean_victim().filter(|v| v.next_use == NEVER) {

@@ -10,6 +10,7 @@
 
 use super::commit::{WRITES_IN_FLIGHT, nowhere};
 use super::error::PagingError;
+use super::fetch::Asker;
 use super::label::label;
 use super::pager::Pager;
 use super::transfers::Failure;
@@ -150,7 +151,7 @@ impl Pager {
                 && let Err(Failure { error, .. }) = self.begin_write(page, true)
             {
                 // The next step gets the error.
-                let _ = self.stop_writes(error, false);
+                let _ = self.stop_writes(error, Asker::Other);
             }
         }
         if self.frozen.is_some() {

@@ -10,6 +10,7 @@
 
 use super::ahead::{Coming, Transfers};
 use super::error::PagingError;
+use super::fetch::Asker;
 use super::freeze::Frozen;
 use super::pinned::PinnedPage;
 use super::stats::{PagerStats, SlotSpace};
@@ -143,7 +144,7 @@ impl Pager {
             return Ok(self.add_entry(meta));
         }
         self.write_behind()?;
-        let mut buffer = self.frame_for(false)?;
+        let mut buffer = self.frame_for(Asker::Other)?;
         fill(&mut buffer.as_mut_slice()[HEADER_BYTES..]);
         let page = self.add_entry(meta);
         self.cache.adopt(page);
@@ -213,7 +214,7 @@ impl Pager {
             let missed = |p: &&PageNo| planned.binary_search(p).is_err() && self.cache.state(**p).is_none();
             self.stats.late_misses += pages.iter().filter(missed).count() as u64;
         }
-        let pinned = self.fetch(&format!("the view of step {step}"), &pages, true)?;
+        let pinned = self.fetch(&format!("the view of step {step}"), &pages, Asker::Step)?;
         self.count_bound(&pages);
         Ok(pinned)
     }
@@ -249,16 +250,17 @@ impl Pager {
     /// As [`Pager::acquire`], but without earlier failures.
     pub fn acquire_pages(&mut self, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
         let pages: Vec<PageNo> = pages.iter().copied().filter(|p| self.index[p.index()].rows > 0).collect();
-        self.fetch("a list of pages", &pages, false)
+        self.fetch("a list of pages", &pages, Asker::Other)
     }
 
-    /// As [`Pager::acquire_pages`], as a part of a training step: hits, reads and the time waited count as the step's.
+    /// As [`Pager::acquire_pages`], for the rest of a step that has changed rows already: hits, reads and the time waited
+    /// count as the step's.
     ///
     /// # Errors
     /// As [`Pager::acquire_pages`].
     pub fn acquire_in_step(&mut self, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
         let pages: Vec<PageNo> = pages.iter().copied().filter(|p| self.index[p.index()].rows > 0).collect();
-        self.fetch("a list of pages", &pages, true)
+        self.fetch("a list of pages", &pages, Asker::RestOfStep)
     }
 
     /// Gives back a frame that was taken for nothing.

@@ -6,6 +6,7 @@
 
 use super::commit::WRITES_IN_FLIGHT;
 use super::error::PagingError;
+use super::fetch::Asker;
 use super::label::label;
 use super::pager::Pager;
 use crate::base::ids::PageNo;
@@ -112,10 +113,10 @@ impl Pager {
     }
 
     /// Waits for the end of a transfer, if any is in flight; the time counts as a step's or as somebody else's.
-    pub(super) fn settle_for(&mut self, is_step: bool, ended: &mut Vec<PageNo>) -> Vec<Failure> {
+    pub(super) fn settle_for(&mut self, asker: Asker, ended: &mut Vec<PageNo>) -> Vec<Failure> {
         let before = self.stats.stall_seconds;
         let failures = self.settle(true, ended);
-        if !is_step {
+        if !asker.is_step() {
             self.stats.other_stall_seconds += self.stats.stall_seconds - before;
             self.stats.stall_seconds = before;
         }

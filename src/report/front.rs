@@ -42,7 +42,7 @@ pub enum Verdict {
     WithinSpread,
     /// Lower than that.
     Costs,
-    /// The base has one seed, so nothing can be said.
+    /// Nothing can be said: the base has one seed, or no seed that the setting has.
     Unknown,
 }
 
@@ -114,7 +114,7 @@ fn judge(setting: &Setting, base: &Setting) -> Verdict {
     if pairs.peek().is_some() && pairs.all(|(run, base)| !run.ply.is_empty() && run.ply == base.ply) {
         return Verdict::SameBits;
     }
-    if base.runs.len() < 2 {
+    if base.runs.len() < 2 || against(setting, base, |r| r.psnr).is_none() {
         return Verdict::Unknown;
     }
     let holds = |of: fn(&RunRecord) -> Option<f64>| {

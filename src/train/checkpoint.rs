@@ -49,7 +49,7 @@ pub struct Checkpoint {
     /// How long to wait for space.
     pub(super) full_wait: Duration,
     /// Step at which space was last made, and when; a second time at the same step it must come from elsewhere.
-    pub(super) space_made: Option<(u32, Instant)>,
+    pub(super) space_made: Option<(u32, bool, Instant)>,
     interval: CommitInterval,
     started: Instant,
     /// When the last commit was durable, and its cut.

@@ -68,22 +68,23 @@ impl Checkpoint {
             // All of the run is in memory: what was being committed is given up, and the step works without a write.
             return self.give_up(trainer, why);
         }
-        let now = (trainer.steps_done(), Instant::now());
+        let is_own = self.other_drive(&why).is_none();
+        let now = (trainer.steps_done(), is_own, Instant::now());
         // Then the drive is too small for the scene, as far as commits can tell.
-        let is_stuck = self.space_made.is_some_and(|(step, _)| step == now.0);
+        let is_stuck = self.space_made.is_some_and(|(step, own, _)| (step, own) == (now.0, is_own));
         let mut lacks = why;
         if !is_stuck {
             self.space_made = Some(now);
         }
         // Neither commits nor the reserve make space on another drive than their own.
-        if !is_stuck && self.other_drive(&lacks).is_none() {
+        if !is_stuck && is_own {
             match self.commit_with_reserve(trainer, metrics) {
                 Ok(()) => return Ok(()),
                 Err(error) if error.is_out_of_space() => lacks = error,
                 Err(error) => return Err(error),
             }
         }
-        let began = self.space_made.unwrap_or(now).1;
+        let began = self.space_made.unwrap_or(now).2;
         self.wait_for_space(trainer, (metrics, stop), lacks, (began, is_stuck))
     }
 

@@ -100,6 +100,19 @@ fn remove_events(folder: &Path) -> InputResult<()> {
     Ok(())
 }
 
+/// Removes what a later evaluation of an earlier state said, which comparisons would take for this run's.
+pub(super) fn remove_evaluation(out: &Path) -> InputResult<()> {
+    for path in ["evaluated.json", "evaluated-as.toml"].map(|name| out.join(name)) {
+        match std::fs::remove_file(&path) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                return Err(InputError::io(&path, "removing the earlier evaluation", &e));
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
 /// Removes what `--save-every` of an earlier run left: point_cloud_<step>.ply.
 fn remove_saved(out: &Path) -> InputResult<()> {
     let entries = std::fs::read_dir(out).map_err(|e| InputError::io(out, "listing the folder", &e))?;

@@ -5,7 +5,7 @@
 
 use super::memory::{MemoryEstimate, estimate, rows_at_most};
 use super::run::Prepared;
-use super::start::{Start, folder_beside};
+use super::start::{Start, drive_of};
 use super::tiers::{PLAN_BYTES, Tiers, first_staging_bytes, staging_bytes};
 use super::trainer::{TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
@@ -112,7 +112,7 @@ pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Op
     if pages.saturating_mul(frame) <= budget / 2 {
         return None;
     }
-    let free = free_bytes(&folder_beside(Path::new(&config.spill_dir))).ok().flatten();
+    let free = free_bytes(&drive_of(Path::new(&config.spill_dir))).ok().flatten();
     Some(format!(
         "scene   {} views to train on, {} held out\n\
          start   {} Gaussians\n\

@@ -304,6 +304,8 @@ fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun
     let path = request.out.join("config.toml");
     let config = match &begun.past {
         Some(past) => {
+            // Of the Gaussians that were here before.
+            out_folder::remove_evaluation(&request.out)?;
             let before = read_resolved(&path)?;
             let scene = absolute_scene(request);
             if TrainConfig::read(&path)? != past.config || before.scene != scene {
@@ -362,7 +364,8 @@ fn train_into(
     };
     warn_of_ply(config, &written, &ply);
     // A stopped run owes the user its files at once; the held-out views can be looked at later with gsscale-eval.
-    let tested = looped.and_then(|()| match stop.exit_code() {
+    let asked = stop.exit_code();
+    let tested = looped.and_then(|()| match asked {
         None => trainer.evaluate(dataset, &targets, Some(&out.join("renders/test"))),
         Some(_) => Ok(None),
     });
@@ -374,7 +377,7 @@ fn train_into(
         gaussians: written.rows + written.skipped,
         test: tested.as_ref().ok().copied().flatten(),
         // Without its evaluation a run is not done: it goes on to that.
-        finished: trainer.steps_done() == config.steps && tested.is_ok(),
+        finished: trainer.steps_done() == config.steps && tested.is_ok() && asked.is_none(),
         costs,
         commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
         ..summary_of(request, &trainer)

@@ -195,6 +195,11 @@ pub(super) fn folder_beside(spill_dir: &Path) -> PathBuf {
     above.map_or_else(|| PathBuf::from("."), Path::to_path_buf)
 }
 
+/// The spill directory, or as long as it is not there the folder above it that is: what tells of its drive.
+pub(super) fn drive_of(spill_dir: &Path) -> PathBuf {
+    if spill_dir.is_dir() { spill_dir.to_path_buf() } else { folder_beside(spill_dir) }
+}
+
 fn is_ply(file: &Path) -> bool {
     !file.extension().is_some_and(|e| e.eq_ignore_ascii_case("bin") || e.eq_ignore_ascii_case("txt"))
 }

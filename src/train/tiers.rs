@@ -5,7 +5,7 @@
 
 use super::checkpoint::Checkpoint;
 use super::first_commit::{FirstCommit, MAP_CACHE_BYTES, codec};
-use super::start::folder_beside;
+use super::start::drive_of;
 use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
 use crate::cache::evict::EvictPolicy;
@@ -148,7 +148,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let mut tiers = Tiers::default();
     tiers.keeps = config.keep_checkpoint;
     if dry || config.spill_dir.is_empty() {
-        let drive = Some(folder_beside(Path::new(&config.spill_dir)));
+        let drive = Some(drive_of(Path::new(&config.spill_dir)));
         tiers.planned_on = drive.filter(|_| !config.spill_dir.is_empty());
         let engine = Box::new(MemoryStore::new());
         let codec = chosen_codec(config, None, &mut tiers.notes);

@@ -35,7 +35,8 @@ const RESULTS: &str = "ladder.jsonl";
 pub struct Args {
     /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     scene: PathBuf,
-    /// Config file; flags override it. Steps are 3000 unless they are given
+    /// Config file; flags override it. Without one, steps are 3000 and --sh-every a tenth of the steps. Commits by the clock
+    /// are made only with --commit-every
     #[arg(long)]
     config: Option<PathBuf>,
     /// Folder for the results and the page
@@ -93,8 +94,8 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         let names = RUNGS.map(|r| r.name).join(",");
         return Err(InputError::new("--rungs", format!("'{name}' is no rung"), format!("use some of: {names}")).into());
     }
-    if !(args.share > 0.0 && args.share <= 100.0) {
-        return Err(InputError::new("--share", "it must be above 0 and at most 100", "use --share 50").into());
+    if !(args.share > 0.0 && args.share < 100.0) {
+        return Err(InputError::new("--share", "it must be above 0 and below 100", "use --share 50").into());
     }
     let mut config = bench_config(args.config.as_deref(), &args.keys)?;
     settle(&mut config);

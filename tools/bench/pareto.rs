@@ -38,7 +38,8 @@ const SH_RAISES: u32 = 10;
 pub struct Args {
     /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     scene: PathBuf,
-    /// Config file of the base; flags override it. Steps are 3000 unless they are given
+    /// Config file of the base; flags override it. Without one, steps are 3000 and --sh-every a tenth of the steps. Commits
+    /// by the clock are made only with --commit-every
     #[arg(long)]
     config: Option<PathBuf>,
     /// Folder for the results and the page

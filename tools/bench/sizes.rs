@@ -118,7 +118,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         sizes.push(size(&config, &Copies { dataset: &dataset, count, shift }, frames)?);
     }
     let warm_up = args.warm_up.unwrap_or(config.steps / 4).min(config.steps / 2);
-    super::decode_all(&dataset, &targets)?;
+    super::decode_all(&dataset, &targets, &config)?;
     take_turns(&mut sizes, (0..warm_up, args.turn), (&dataset, &targets), false)?;
     sizes.iter_mut().for_each(|size| size.before = size.trainer.scene.pager.stats());
     take_turns(&mut sizes, (warm_up..config.steps, args.turn), (&dataset, &targets), true)?;

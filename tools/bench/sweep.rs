@@ -43,10 +43,6 @@ impl Surroundings {
     /// # Errors
     /// `gsscale-train` is missing.
     pub fn of(scene: &Path, out: &Path, spill: Option<&Path>) -> InputResult<Surroundings> {
-        let whole = |path: &Path| -> PathBuf {
-            let here = || std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
-            std::fs::canonicalize(path).unwrap_or_else(|_| here())
-        };
         let program = digest(&beside("gsscale-train")?)?;
         // The folder in --out needs no mention: an output folder may move with its results.
         let drive = spill.map_or_else(String::new, |path| whole(path).display().to_string());
@@ -265,6 +261,13 @@ fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> InputResult<T> {
     let text = std::fs::read(path).map_err(|e| InputError::io(path, "reading", &e))?;
     serde_json::from_slice(&text)
         .map_err(|e| InputError::new(path, format!("is not what a run writes: {e}"), "run it again"))
+}
+
+/// The same path whether the folder is there yet or not: links of what is there are followed.
+fn whole(path: &Path) -> PathBuf {
+    let path = std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
+    let of = |up: &Path| Some(std::fs::canonicalize(up).ok()?.join(path.strip_prefix(up).ok()?));
+    path.ancestors().find_map(of).unwrap_or_else(|| path.clone())
 }
 
 /// A program that lies beside this one.

@@ -108,7 +108,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         contenders.push(contender(&prepared, &config, Some(share), frames(share))?);
     }
     let warm_up = args.warm_up.unwrap_or(dataset.train_views().len() as u32).min(config.steps / 2);
-    super::decode_all(dataset, &targets)?;
+    super::decode_all(dataset, &targets, &config)?;
     take_turns(&mut contenders, (0..warm_up, args.turn), dataset, &targets, false)?;
     contenders.iter_mut().for_each(Contender::begin);
     take_turns(&mut contenders, (warm_up..config.steps, args.turn), dataset, &targets, true)?;
