@@ -98,7 +98,7 @@ config_keys! {
         /// Band in use from the first step
         sh_start: u8 = 0;
         /// Order of the photos: auto, shuffle, groups:N (n spatial groups, shuffled within) or tour (along the way).
-        /// auto is shuffle where the scene fits in memory, else groups
+        /// auto is shuffle where the scene fits in memory or little has to be read, else groups
         view_order: String = "auto".into();
         /// Gaussians that a page holds. Part of a run: other pages give other roundings
         page_rows: u32 = 1024;
