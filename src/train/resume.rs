@@ -69,6 +69,10 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     check_steps(&config, &state)?;
     let mut changes = Changes::of_config(&file, &state, &config)?;
     changes.check(&file, request.accept_changes)?;
+    if !scene.is_dir() {
+        let remedy = format!("if it was moved: gsscale-train --resume {} SCENE", request.out.display());
+        return Err(InputError::new(&scene, "the scene of this run is not there", remedy).into());
+    }
     let start = Start::look(&scene, &config, &request.out, host_mem)?;
     let print = dataset_print(&start)?;
     changes.add_dataset(&start.dataset, &state.dataset, &print);

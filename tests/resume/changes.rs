@@ -140,7 +140,7 @@ fn a_scene_and_a_start_that_were_moved_are_named_and_the_run_goes_on() {
     std::fs::rename(&bench.scene, moved.join("scene")).unwrap();
     std::fs::rename(&first, moved.join("first.ply")).unwrap();
     let (scene, start) = (moved.join("scene"), moved.join("first.ply"));
-    assert!(refused(bench.go_on(&[])).contains("scene"));
+    assert!(refused(bench.go_on(&[])).contains("out SCENE"), "how to name the moved one");
     assert!(refused(bench.go_on(&[text(&scene)])).contains("first.ply"));
     let mut child = bench.go_on(&[&[text(&scene), "--init-ply", text(&start)], &SELDOM[..]].concat());
     bench.wait_for_lines(&mut child, logged(&bench.path("out")).len() + 3);
