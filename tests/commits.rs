@@ -239,16 +239,13 @@ fn hostile_maps_cost_readers_nothing() {
 /// A folder in which the second piece of the reserve cannot be written: the process is as good as killed there.
 struct Interrupted(DriveFolder);
 
-#[derive(Debug)]
-struct InterruptedFile(Arc<dyn StorageBackend>);
-
 impl Folder for Interrupted {
     fn open(&self, name: &str) -> std::io::Result<Option<Arc<dyn StorageBackend>>> {
         self.0.open(name)
     }
     fn create(&self, name: &str) -> std::io::Result<Arc<dyn StorageBackend>> {
         let file = self.0.create(name)?;
-        Ok(if name.starts_with(RESERVE_NAME) { Arc::new(InterruptedFile(file)) } else { file })
+        Ok(if name.starts_with(RESERVE_NAME) { Arc::new(Passed { to: file, stops: true }) } else { file })
     }
     fn rename(&self, from: &str, to: &str) -> std::io::Result<()> {
         self.0.rename(from, to)
@@ -258,24 +255,6 @@ impl Folder for Interrupted {
     }
     fn sync(&self) -> std::io::Result<()> {
         self.0.sync()
-    }
-}
-
-impl StorageBackend for InterruptedFile {
-    fn len(&self) -> std::io::Result<u64> {
-        self.0.len()
-    }
-    fn read(&self, offset: u64, out: &mut [u8]) -> std::io::Result<()> {
-        self.0.read(offset, out)
-    }
-    fn set_len(&self, len: u64) -> std::io::Result<()> {
-        self.0.set_len(len)
-    }
-    fn sync_data(&self) -> std::io::Result<()> {
-        self.0.sync_data()
-    }
-    fn write(&self, offset: u64, data: &[u8]) -> std::io::Result<()> {
-        if offset > 0 { Err(std::io::ErrorKind::Other.into()) } else { self.0.write(offset, data) }
     }
 }
 
@@ -348,25 +327,33 @@ fn flip_primary(file: &dyn StorageBackend) {
     file.write(PRIMARY_BYTE, &[byte[0] ^ 1]).unwrap();
 }
 
-/// Shares one memory between openings.
+/// A file that is somebody else's: one memory of several openings, or one that a process stops writing in the middle of.
 #[derive(Debug, Clone)]
-struct Shared(Arc<InMemoryBackend>);
+struct Passed {
+    to: Arc<dyn StorageBackend>,
+    /// Nothing but a first piece can be written.
+    stops: bool,
+}
 
-impl StorageBackend for Shared {
+fn memory() -> Passed {
+    Passed { to: Arc::new(InMemoryBackend::new()), stops: false }
+}
+
+impl StorageBackend for Passed {
     fn len(&self) -> std::io::Result<u64> {
-        self.0.len()
+        self.to.len()
     }
     fn read(&self, offset: u64, out: &mut [u8]) -> std::io::Result<()> {
-        self.0.read(offset, out)
+        self.to.read(offset, out)
     }
     fn set_len(&self, len: u64) -> std::io::Result<()> {
-        self.0.set_len(len)
+        self.to.set_len(len)
     }
     fn sync_data(&self) -> std::io::Result<()> {
-        self.0.sync_data()
+        self.to.sync_data()
     }
     fn write(&self, offset: u64, data: &[u8]) -> std::io::Result<()> {
-        self.0.write(offset, data)
+        if self.stops && offset > 0 { Err(std::io::ErrorKind::Other.into()) } else { self.to.write(offset, data) }
     }
 }
 
@@ -374,7 +361,7 @@ impl StorageBackend for Shared {
 /// with its integrity check at opening.
 #[test]
 fn one_flipped_bit_makes_redb_forget_a_durable_commit() {
-    let shared = Shared(Arc::new(InMemoryBackend::new()));
+    let shared = memory();
     let builder = || {
         let mut builder = Builder::new();
         builder.set_check_integrity_on_open(true);
@@ -388,7 +375,7 @@ fn one_flipped_bit_makes_redb_forget_a_durable_commit() {
         transaction.commit().unwrap();
     }
     // As a crash leaves it: nothing is written at closing.
-    let crashed = Shared(Arc::new(InMemoryBackend::new()));
+    let crashed = memory();
     let mut bytes = vec![0; shared.len().unwrap() as usize];
     shared.read(0, &mut bytes).unwrap();
     crashed.set_len(bytes.len() as u64).unwrap();
@@ -401,7 +388,7 @@ fn one_flipped_bit_makes_redb_forget_a_durable_commit() {
 
 #[test]
 fn the_witness_notices_what_the_library_does_not() {
-    let shared = Shared(Arc::new(InMemoryBackend::new()));
+    let shared = memory();
     let mut map = Manifest::create(Arc::new(shared.clone()), 5, 1 << 20).unwrap();
     for generation in 1..=2 {
         let put_generation = Some((generation, vec![1], vec![2]));

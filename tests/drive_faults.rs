@@ -87,6 +87,7 @@ struct World {
     fewest: usize,
     /// The run can go on without its commits.
     is_optional: bool,
+    optimizer: &'static str,
 }
 
 /// How a life on a misbehaving drive ended.
@@ -97,9 +98,13 @@ struct Life {
 
 impl World {
     fn new() -> World {
+        World::of("deferred")
+    }
+
+    fn of(optimizer: &'static str) -> World {
         let folder = TempDir::new().unwrap();
         let scene = make_scene(folder.path());
-        let mut world = World { folder, scene, want: Vec::new(), fewest: usize::MAX, is_optional: false };
+        let mut world = World { folder, scene, want: Vec::new(), fewest: usize::MAX, is_optional: false, optimizer };
         let life = world.live("healthy", &Faults::new(), |_| {});
         life.result.unwrap();
         world.want = std::fs::read(Trainer::ply_path(&life.out)).unwrap();
@@ -118,7 +123,7 @@ impl World {
 
     fn train_in(&self, out: &Path, faults: &Faults, plan: impl FnOnce(&Faults)) -> Result<(), TrainError> {
         let spill_dir = out.join("spill");
-        let config = config(&spill_dir);
+        let config = TrainConfig { optimizer: self.optimizer.into(), ..config(&spill_dir) };
         let start = Start::read(&self.scene, &config, None)?;
         let print = dataset_print(&start).unwrap();
         let sh_degree_start = start.sh_degree_start;
@@ -371,7 +376,16 @@ fn a_really_full_drive_pauses_the_run_until_there_is_space() {
 /// All of such a run is in memory: it loses its commits on a full drive, and nothing else.
 #[test]
 fn a_run_in_memory_goes_on_when_the_drive_of_its_commits_is_full() {
-    let mut world = World::new();
+    loses_commits_alone(World::new());
+}
+
+/// Its steps go on changing rows after they have changed those of their view, and must not be done twice.
+#[test]
+fn so_does_a_run_in_memory_that_updates_every_row() {
+    loses_commits_alone(World::of("dense"));
+}
+
+fn loses_commits_alone(mut world: World) {
     (world.fewest, world.is_optional) = (usize::MAX, true);
     for (i, (on, after, calls)) in [(Operation::Write, 0, 100_000), (Operation::Write, 37, 30)].into_iter().enumerate()
     {

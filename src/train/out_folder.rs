@@ -61,22 +61,14 @@ pub(super) fn make(out: &Path, overwrite: bool) -> InputResult<()> {
         // Only if nothing else is in it.
         let _ = std::fs::remove_dir(&checkpoint);
     }
-    for name in [
-        "config.toml",
-        "metrics.jsonl",
-        "summary.json",
-        "point_cloud.ply",
-        "evaluated.json",
-        "evaluated-as.toml",
-        REPORT_FILE,
-        PAGES_FILE,
-    ] {
+    for name in ["config.toml", "metrics.jsonl", "summary.json", "point_cloud.ply", REPORT_FILE, PAGES_FILE] {
         let path = out.join(name);
         if path.is_file() {
             std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
         }
     }
     remove_saved(out)?;
+    remove_evaluation(out)?;
     remove_events(&out.join("tensorboard"))?;
     let pictures = out.join("renders/test");
     if pictures.is_dir() {
@@ -149,7 +141,11 @@ mod tests {
         assert_eq!(count(), 1);
         std::fs::remove_file(events.join("events.out.tfevents.0123456789.host.1.0")).unwrap();
         std::fs::write(out.join("config.toml"), "").unwrap();
+        for name in ["evaluated.json", "evaluated-as.toml"] {
+            std::fs::write(out.join(name), "of the earlier run").unwrap();
+        }
         make(out, true).unwrap();
         assert!(!events.exists());
+        assert!(!out.join("evaluated.json").exists() && !out.join("evaluated-as.toml").exists());
     }
 }
