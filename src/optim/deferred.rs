@@ -13,21 +13,14 @@ use super::drift::{Drift, DriftTables, EpsFloor, RECENT, drifted, flush, needs_d
 use super::lanes::SizeRows;
 use super::moments::{Moments, round_block};
 use super::rates::Rates;
-use crate::base::simd::{Kernel, SimdPath, dispatch};
+use super::row_kernels::{EvaluateRows, OfLanes, StepRows, evaluate_block};
+use crate::base::simd::{SimdPath, dispatch};
 use crate::scene::columns::{Column, Columns};
-use crate::scene::rows::{
-    BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, RowsNow, SH_N_LANE, first_lane,
-};
+use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, RowsNow, first_lane};
 use crate::scene::state::SceneState;
 
 /// Rows of one unit of parallel work.
 pub const ROWS_PER_TASK: usize = 1024;
-/// Gradients beyond this are treated like non-finite ones: their square must not overflow the second moment. With it
-/// every number that an update computes from finite state is finite.
-const LARGEST_GRAD: f32 = 1e18;
-/// Log-scales are kept within this at every update: standard deviations of 1e-13 to 1e13 scene units, whose squares
-/// and projections stay finite. Out of reach of training that works.
-const LOG_SCALE_LIMIT: f32 = 30.0;
 /// Powers of the betas that are tabled; rarer gaps are computed.
 const POWERS: usize = 4096;
 
@@ -35,8 +28,8 @@ const POWERS: usize = 4096;
 #[derive(Debug, Clone)]
 pub struct DeferredAdam {
     tables: DriftTables,
-    /// Base rate of every lane of a row.
-    lane_rates: RowBlock,
+    /// Base rates.
+    lane_rates: OfLanes,
     eps: EpsFloor,
     /// `[k]`: beta1^k, beta2^k.
     beta_powers: Vec<[f32; 2]>,
@@ -65,11 +58,7 @@ pub struct AdamNow<'a> {
 impl DeferredAdam {
     /// Tables for these rates; panics as [`DriftTables::new`] does.
     pub fn new(rates: Rates, config: AdamConfig, simd: SimdPath) -> Self {
-        let mut lane_rates = [0.0; BLOCK_LANES];
-        for column in Column::ALL {
-            let first = first_lane(column);
-            lane_rates[first..first + column.width(3)].fill(rates.base(column) as f32);
-        }
+        let lane_rates = OfLanes::new(|column| rates.base(column) as f32);
         let power = |b: f64, k: usize| flush(libm::pow(b, k as f64) as f32);
         DeferredAdam {
             tables: DriftTables::new(rates, config),
@@ -137,6 +126,16 @@ impl DeferredAdam {
         self.simd
     }
 
+    /// Base rates of the lanes of a row.
+    #[inline(always)]
+    pub(super) fn lane_rates(&self) -> &OfLanes {
+        &self.lane_rates
+    }
+
+    pub(super) fn tables(&self) -> &DriftTables {
+        &self.tables
+    }
+
     /// eps and the root above which the series holds.
     #[inline(always)]
     pub(crate) fn eps_floor(&self) -> EpsFloor {
@@ -146,7 +145,7 @@ impl DeferredAdam {
     /// Base rate of a column, as the evaluation uses it.
     #[inline(always)]
     pub(crate) fn base_rate(&self, column: Column) -> f32 {
-        self.lane_rates[first_lane(column)]
+        self.lane_rates.of(column)
     }
 
     fn evaluate_with(&self, drift: &Drift, column: Column, value: f32, m: f32, v: f32, stamp: u32, now: u32) -> f32 {
@@ -154,7 +153,7 @@ impl DeferredAdam {
             return value;
         }
         let of_means = column == Column::Means;
-        let rate = self.lane_rates[first_lane(column)];
+        let rate = self.lane_rates.of(column);
         if needs_direct_sum(m, v, self.eps.floor) {
             return flush(value - self.tables.direct_sum(m, v, stamp, now, of_means) * rate);
         }
@@ -172,7 +171,7 @@ impl DeferredAdam {
     }
 
     /// beta1^k and beta2^k.
-    fn beta_power(&self, k: u32) -> [f32; 2] {
+    pub(super) fn beta_power(&self, k: u32) -> [f32; 2] {
         if self.tables.is_still() {
             return [1.0, 1.0];
         }
@@ -242,43 +241,14 @@ impl<'a> AdamNow<'a> {
         }
     }
 
-    /// Moves the values of one loaded row to now. `W` is the width of `sh_n`.
+    /// Number of optimizer steps contained in what this gives.
     #[inline(always)]
-    fn evaluate_block<const W: usize>(&self, value: &mut RowBlock, m: &RowBlock, v: &RowBlock, stamp: u32) {
-        if stamp >= self.now {
-            return;
-        }
-        let drift = self.drift(stamp);
-        let EpsFloor { eps, floor } = self.adam.eps;
-        let mut direct = false;
-        for l in 0..SH_N_LANE {
-            direct |= needs_direct_sum(m[l], v[l], floor);
-        }
-        for l in SH_N_LANE..SH_N_LANE + W.next_multiple_of(16) {
-            direct |= needs_direct_sum(m[l], v[l], floor);
-        }
-        if direct {
-            return self.evaluate_block_directly(value, m, v, stamp);
-        }
-        let rates = &self.adam.lane_rates;
-        let (means, others) = ([drift[0], drift[1], drift[2]], [drift[4], drift[5], drift[6]]);
-        let mut sums = [[0.0; SH_N_LANE]; 3];
-        for p in 0..3 {
-            sums[p] = [others[p]; SH_N_LANE];
-            sums[p][..3].fill(means[p]);
-        }
-        for l in 0..SH_N_LANE {
-            value[l] = drifted(value[l], m[l], v[l], [sums[0][l], sums[1][l], sums[2][l]], rates[l], eps);
-        }
-        for l in SH_N_LANE..SH_N_LANE + W.next_multiple_of(16) {
-            value[l] = drifted(value[l], m[l], v[l], others, rates[l], eps);
-        }
+    pub(super) fn steps(&self) -> u32 {
+        self.now
     }
 
-    /// The same for a row with a value that eps touches, lane by lane.
-    #[cold]
-    #[inline(never)]
-    fn evaluate_block_directly(&self, value: &mut RowBlock, m: &RowBlock, v: &RowBlock, stamp: u32) {
+    /// Moves the values of one loaded row with a value that eps touches to now, lane by lane.
+    pub(super) fn evaluate_block_directly(&self, value: &mut RowBlock, m: &RowBlock, v: &RowBlock, stamp: u32) {
         let drift = self.drift(stamp);
         for column in Column::ALL {
             let first = first_lane(column);
@@ -300,7 +270,7 @@ impl RowsNow for AdamNow<'_> {
         rows.columns.load_row_any(row, out);
         rows.exp_avg.load_row_any(row, &mut m);
         rows.exp_avg_sq.load_row_any(row, &mut v);
-        self.evaluate_block::<45>(out, &m, &v, rows.stamp[row]);
+        evaluate_block(self, out, &m, &v, rows.stamp[row]);
     }
 
     fn evaluate_element(&self, rows: &Rows<'_>, column: Column, row: usize, element: usize) -> f32 {
@@ -341,142 +311,5 @@ impl RowsNow for AdamNow<'_> {
         rows.exp_avg.store_row_any(row, &m);
         rows.exp_avg_sq.store_row_any(row, &v);
         rows.stamp[row] = self.now;
-    }
-}
-
-/// Evaluates listed rows into a table.
-struct EvaluateRows<'k, 'a, const W: usize, F> {
-    at: &'k AdamNow<'a>,
-    view: Rows<'k>,
-    row_of: F,
-    out: ColumnsMut<'k>,
-}
-
-impl<const W: usize, F: Fn(usize) -> usize> Kernel for EvaluateRows<'_, '_, W, F> {
-    type Out = ();
-    #[inline(always)]
-    fn run<const FMA: bool>(mut self) {
-        let (mut value, mut m, mut v) = ([0.0; BLOCK_LANES], [0.0; BLOCK_LANES], [0.0; BLOCK_LANES]);
-        for i in 0..self.out.rows() {
-            let row = (self.row_of)(i);
-            self.view.columns.load_row::<W>(row, &mut value);
-            self.view.exp_avg.load_row::<W>(row, &mut m);
-            self.view.exp_avg_sq.load_row::<W>(row, &mut v);
-            self.at.evaluate_block::<W>(&mut value, &m, &v, self.view.stamp[row]);
-            self.out.store_row::<W>(i, &value);
-        }
-    }
-}
-
-/// One optimizer step on listed rows of a view.
-struct StepRows<'k, 'a, const W: usize> {
-    at: &'k AdamNow<'a>,
-    view: RowsMut<'k>,
-    rows: &'k [u32],
-    grads: ColumnsRef<'k>,
-}
-
-impl<const W: usize> Kernel for StepRows<'_, '_, W> {
-    type Out = StepCounts;
-    #[inline(always)]
-    fn run<const FMA: bool>(mut self) -> StepCounts {
-        let mut counts = StepCounts::default();
-        let constants = StepConstants::new(self.at);
-        let (mut value, mut m, mut v) = ([0.0; BLOCK_LANES], [0.0; BLOCK_LANES], [0.0; BLOCK_LANES]);
-        let mut g = [0.0; BLOCK_LANES];
-        for (i, &row) in self.rows.iter().enumerate() {
-            self.grads.load_row::<W>(i, &mut g);
-            let (mut touched, mut bad) = (false, false);
-            for l in 0..BLOCK_LANES {
-                touched |= g[l] != 0.0;
-                bad |= g[l].is_nan() | (g[l].abs() > LARGEST_GRAD);
-            }
-            if bad {
-                counts.skipped_non_finite += 1;
-            }
-            if bad || !touched {
-                continue;
-            }
-            let row = row as usize - self.view.first_row;
-            let stamp = self.view.stamp[row];
-            self.view.columns.as_ref().load_row::<W>(row, &mut value);
-            self.view.exp_avg.as_ref().load_row::<W>(row, &mut m);
-            self.view.exp_avg_sq.as_ref().load_row::<W>(row, &mut v);
-            self.at.evaluate_block::<W>(&mut value, &m, &v, stamp);
-            let powers = self.at.adam.beta_power(self.at.now.saturating_sub(stamp));
-            constants.step_block::<W>(&mut value, &mut m, &mut v, &g, powers);
-            if self.at.adam.moments == Moments::Bf16 {
-                round_block::<W>(&mut m, &mut v, self.view.uid[row], self.at.now + 1);
-            }
-            self.view.columns.store_row::<W>(row, &value);
-            self.view.exp_avg.store_row::<W>(row, &m);
-            self.view.exp_avg_sq.store_row::<W>(row, &v);
-            self.view.stamp[row] = self.at.now + 1;
-            counts.updated += 1;
-        }
-        counts
-    }
-}
-
-/// Constants of one ordinary Adam step.
-struct StepConstants {
-    /// lr / (1 - beta1^t) of every lane.
-    step_sizes: RowBlock,
-    inv_root_correction: f32,
-    one_minus_b1: f32,
-    one_minus_b2: f32,
-    eps: f32,
-}
-
-impl StepConstants {
-    fn new(at: &AdamNow<'_>) -> Self {
-        let (tables, now) = (&at.adam.tables, at.now);
-        let [inv_bias1, inv_root] = tables.bias(now + 1);
-        let mut step_sizes = [0.0; BLOCK_LANES];
-        for column in Column::ALL {
-            let first = first_lane(column);
-            step_sizes[first..first + column.width(3)].fill((tables.rates().at(column, now) * inv_bias1) as f32);
-        }
-        let AdamConfig { beta1, beta2, eps } = tables.config();
-        StepConstants {
-            step_sizes,
-            inv_root_correction: inv_root as f32,
-            one_minus_b1: (1.0 - beta1) as f32,
-            one_minus_b2: (1.0 - beta2) as f32,
-            eps: eps as f32,
-        }
-    }
-
-    /// Decays the moments of a loaded row to now (`powers` of the betas), then takes the step with gradient `g`.
-    #[inline(always)]
-    fn step_block<const W: usize>(
-        &self,
-        value: &mut RowBlock,
-        m: &mut RowBlock,
-        v: &mut RowBlock,
-        g: &RowBlock,
-        powers: [f32; 2],
-    ) {
-        for l in 0..SH_N_LANE {
-            (value[l], m[l], v[l]) = self.step_value(value[l], m[l], v[l], g[l], powers, self.step_sizes[l]);
-        }
-        for l in SH_N_LANE..SH_N_LANE + W.next_multiple_of(16) {
-            (value[l], m[l], v[l]) = self.step_value(value[l], m[l], v[l], g[l], powers, self.step_sizes[l]);
-        }
-        let scales = first_lane(Column::Scales);
-        for l in scales..scales + 3 {
-            value[l] = value[l].clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT);
-        }
-    }
-
-    #[inline(always)]
-    fn step_value(&self, value: f32, m: f32, v: f32, g: f32, powers: [f32; 2], step_size: f32) -> (f32, f32, f32) {
-        let (m, v) = (flush(m * powers[0]), flush(v * powers[1]));
-        // m + (1 - beta)(g - m) rather than beta m + (1 - beta) g: f32 holds 0.001 to 5e-8 of itself but 0.999 only to
-        // 1.3e-5 of its distance from 1, which would show in every second moment.
-        let m = flush(m + (g - m) * self.one_minus_b1);
-        let v = flush(v + (g * g - v) * self.one_minus_b2);
-        let root = v.sqrt() * self.inv_root_correction + self.eps;
-        (flush(value - step_size * (m / root)), m, v)
     }
 }

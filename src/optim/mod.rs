@@ -8,3 +8,4 @@ pub(crate) mod lanes;
 pub mod method;
 pub mod moments;
 pub mod rates;
+mod row_kernels;

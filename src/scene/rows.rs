@@ -98,12 +98,20 @@ impl<'a> ColumnsRef<'a> {
     /// vector moves. Lanes that the row does not use are left alone.
     #[inline(always)]
     pub fn load_row<const W: usize>(&self, row: usize, block: &mut RowBlock) {
-        block[0..3].copy_from_slice(&self.means[row * 3..row * 3 + 3]);
-        block[3..7].copy_from_slice(&self.quats[row * 4..row * 4 + 4]);
-        block[7..10].copy_from_slice(&self.scales[row * 3..row * 3 + 3]);
-        block[10] = self.opacities[row];
-        block[11..14].copy_from_slice(&self.sh0[row * 3..row * 3 + 3]);
+        if let Some(narrow) = block.first_chunk_mut() {
+            self.load_narrow(row, narrow);
+        }
         block[SH_N_LANE..SH_N_LANE + W].copy_from_slice(&self.sh_n[row * W..row * W + W]);
+    }
+
+    /// Copies all of one row but `sh_n`, as [`ColumnsRef::load_row`] does.
+    #[inline(always)]
+    pub fn load_narrow(&self, row: usize, lanes: &mut [f32; SH_N_LANE]) {
+        lanes[0..3].copy_from_slice(&self.means[row * 3..row * 3 + 3]);
+        lanes[3..7].copy_from_slice(&self.quats[row * 4..row * 4 + 4]);
+        lanes[7..10].copy_from_slice(&self.scales[row * 3..row * 3 + 3]);
+        lanes[10] = self.opacities[row];
+        lanes[11..14].copy_from_slice(&self.sh0[row * 3..row * 3 + 3]);
     }
 
     /// [`ColumnsRef::load_row`] for a degree known only at run time.
@@ -124,6 +132,7 @@ impl<'a> ColumnsMut<'a> {
     }
 
     /// The same rows, shared.
+    #[inline(always)]
     pub fn as_ref(&self) -> ColumnsRef<'_> {
         ColumnsRef {
             sh_degree: self.sh_degree,
@@ -162,12 +171,20 @@ impl<'a> ColumnsMut<'a> {
     /// Copies the lanes of a block into one row; `W` is the width of `sh_n`.
     #[inline(always)]
     pub fn store_row<const W: usize>(&mut self, row: usize, block: &RowBlock) {
-        self.means[row * 3..row * 3 + 3].copy_from_slice(&block[0..3]);
-        self.quats[row * 4..row * 4 + 4].copy_from_slice(&block[3..7]);
-        self.scales[row * 3..row * 3 + 3].copy_from_slice(&block[7..10]);
-        self.opacities[row] = block[10];
-        self.sh0[row * 3..row * 3 + 3].copy_from_slice(&block[11..14]);
+        if let Some(narrow) = block.first_chunk() {
+            self.store_narrow(row, narrow);
+        }
         self.sh_n[row * W..row * W + W].copy_from_slice(&block[SH_N_LANE..SH_N_LANE + W]);
+    }
+
+    /// Copies the lanes of all columns but `sh_n` into one row.
+    #[inline(always)]
+    pub fn store_narrow(&mut self, row: usize, lanes: &[f32; SH_N_LANE]) {
+        self.means[row * 3..row * 3 + 3].copy_from_slice(&lanes[0..3]);
+        self.quats[row * 4..row * 4 + 4].copy_from_slice(&lanes[3..7]);
+        self.scales[row * 3..row * 3 + 3].copy_from_slice(&lanes[7..10]);
+        self.opacities[row] = lanes[10];
+        self.sh0[row * 3..row * 3 + 3].copy_from_slice(&lanes[11..14]);
     }
 
     /// [`ColumnsMut::store_row`] for a degree known only at run time.

@@ -30,15 +30,31 @@ impl Demand {
     /// Pages and bytes that the optimal cache of `frames` frames reads; `bytes` is the size of each page on the drive.
     /// `None` when a step needs more frames than that.
     pub fn fewest_reads(&self, frames: usize, bytes: &[u64]) -> Option<(u64, u64)> {
+        self.fewest_reads_of(&self.steps, frames, bytes)
+    }
+
+    /// As [`Demand::fewest_reads`], of the caches that let no step wait: the pages of the next step are in memory, beside
+    /// those of the present one, when this one ends. Where the two do not fit together, as many of the next as do.
+    pub fn fewest_reads_in_time(&self, frames: usize, bytes: &[u64]) -> Option<(u64, u64)> {
+        let both = |(i, pages): (usize, &Vec<PageNo>)| {
+            let coming = self.steps.get(i + 1).into_iter().flatten().filter(|p| !pages.contains(p));
+            let room = frames.saturating_sub(pages.len());
+            pages.iter().chain(coming.take(room)).copied().collect()
+        };
+        let steps: Vec<Vec<PageNo>> = self.steps.iter().enumerate().map(both).collect();
+        self.fewest_reads_of(&steps, frames, bytes)
+    }
+
+    fn fewest_reads_of(&self, steps: &[Vec<PageNo>], frames: usize, bytes: &[u64]) -> Option<(u64, u64)> {
         let mut uses: Vec<Vec<u32>> = vec![Vec::new(); bytes.len()];
-        for (pages, step) in self.steps.iter().zip(1..) {
+        for (pages, step) in steps.iter().zip(1..) {
             pages.iter().for_each(|p| uses[p.index()].push(step));
         }
         let mut cache = CacheModel::new(frames, Policy::Farthest);
         let mut change = StepChange::default();
         let mut total = (0, 0);
         // What is there at the beginning enters as a step of its own, which is not counted.
-        for (step, pages) in std::iter::once(&self.resident).chain(&self.steps).enumerate() {
+        for (step, pages) in std::iter::once(&self.resident).chain(steps).enumerate() {
             let next_use = |page: PageNo| {
                 let of_page = &uses[page.index()];
                 of_page.get(of_page.partition_point(|&s| s <= step as u32)).copied()

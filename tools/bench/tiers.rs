@@ -257,6 +257,7 @@ impl Contender {
         if self.share.is_some() {
             let bytes = page_bytes(pager.index());
             let bound = self.demand.fewest_reads(now.frames_max, &bytes);
+            let in_time = self.demand.fewest_reads_in_time(now.frames_max, &bytes);
             let tier = json!({
                 "pages_read_per_step": pages_read as f64 / steps, "bytes_read_per_step": bytes_read as f64 / steps,
                 "bytes_written_per_step": (now.bytes_written - before.bytes_written) as f64 / steps,
@@ -264,6 +265,7 @@ impl Contender {
                 "belady_bytes_per_step": bound.map(|(_, bytes)| bytes as f64 / steps),
                 "pages_over_belady": bound.map(|(pages, _)| pages_read as f64 / pages.max(1) as f64),
                 "bytes_over_belady": bound.map(|(_, bytes)| bytes_read as f64 / bytes.max(1) as f64),
+                "belady_in_time_over_belady": bound.zip(in_time).map(|((_, a), (_, b))| b as f64 / a.max(1) as f64),
                 "share_misses": (now.misses - before.misses) as f64 / needed,
                 "share_absent": (now.absent - before.absent) as f64 / needed,
                 "share_absent_least": self.demand.fewest_absent(now.frames_max) as f64 / needed,
