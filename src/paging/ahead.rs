@@ -1,10 +1,12 @@
 //! Begins what the coming steps will wait for: reads of their pages, and writes of the pages that leave for them.
 //!
-//! The coming steps are played through with the pages in memory, as a cache that knows the future would: for every page
-//! that is missing at step s, the page leaves that is needed last of all that are there at s. What of that can be done
-//! already is done: the leaving page is free of use until s, so nothing is read that the cache would not have read at s.
-//! All that leave in the time that is played through are alike: where the page that leaves first is pinned still,
-//! another one of them makes room. Only for the next step another page leaves where none of these can: see `FAR_STEPS`.
+//! The coming steps are played through with the pages in memory, as a cache would that knows the future and lets no step
+//! wait: while step s computes, the pages of s and of s + 1 have to be there, and for every page of s + 1 that is missing
+//! the page leaves that is needed last of all others. Where those would be needed again soon, a page of s leaves at its
+//! end instead, and s + 1 waits: see `FAR_STEPS`. What of all that can be done already is done: the leaving page is free of
+//! use until then, so nothing is read that this cache would not have read. All that leave in the time that is played
+//! through are alike: where the page that leaves first is in use still, another one of them makes room, and for the next
+//! step any other that is far from its next use.
 //!
 //! Invariants: 1. never blocks, but for [`Transfers::Ahead`]; 2. never takes the frame of a page that the current step or
 //! a step up to the one that the frame is for needs; 3. reads and writes in flight are bounded in bytes; 4. nothing here
@@ -22,11 +24,15 @@ use std::str::FromStr;
 
 /// Steps that are played through at most.
 const STEPS_AHEAD: u32 = 16;
-/// A page that is not needed for so many steps may leave early for a page that the next step would wait for: at most one
-/// read more in so many steps. On a survey in 25 groups with frames for a tenth of the pages, of which a view needs 5 %,
-/// 64, 4 and 1 left 4.5, 3.2 and 2.1 % of the pages to be waited for and read 0, 1.6 and 6.7 % more; 0.3 % must be waited
-/// for, because the views of two steps in a row do not fit together.
-const FAR_STEPS: u32 = 4;
+/// Steps that are planned anew, by the bounds as they are now, counted from the present one: the next, the last that is
+/// played through, and one far enough for pages to be kept for it. Pages were planned up to two epochs before, and their
+/// rows move. Without the latter two a cache for half of a small survey read 8 % more, for half of a large one 2 %.
+const PLANNED_ANEW: [u32; 3] = [1, STEPS_AHEAD, 4 * STEPS_AHEAD];
+/// A page that is not needed for so many steps may leave for a page that the next step would wait for: at most one read
+/// more in so many steps. With frames for a tenth of a large survey, of which a view needs 5 % of the pages, 4, 16 and 40
+/// steps read 4.3, 1.7 and 1.4 % more than need be, and 2.5, 3.1 and 3.1 % of the pages had to be waited for; with less
+/// reading 40 was the fastest, in small surveys as well.
+const FAR_STEPS: u32 = 40;
 
 /// When pages move. None of these changes what a step gets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -79,6 +85,8 @@ struct Play {
     keys: Vec<Option<(u32, u32)>>,
     /// (next use, time since the last use, page), the last leaves first; entries that differ from `keys` are out of date.
     order: BinaryHeap<(u32, u32, PageNo)>,
+    /// Pages that the step being played needs, ascending: in memory, and not in the order.
+    present: Vec<PageNo>,
 }
 
 impl Pager {
@@ -95,8 +103,8 @@ impl Pager {
         self.write_frozen();
         let mut coming = std::mem::take(&mut self.coming);
         if coming.after != Some(step) {
-            // The next step by what is known now; a page that this step moves into its view is a late miss at most.
-            self.window.refresh(step + 1, &self.index);
+            // By what is known now; a page that this step moves into the next one's view is a late miss at most.
+            PLANNED_ANEW.into_iter().for_each(|far| self.window.refresh(step.saturating_add(far), &self.index));
             self.apply_changed_uses();
             self.play(step, &mut coming);
         }
@@ -180,24 +188,34 @@ impl Pager {
         *after = Some(step);
         admits.clear();
         play.begin(self);
-        for s in step + 1..=step.saturating_add(STEPS_AHEAD) {
-            let Some(pages) = self.window.pages(s) else { break };
-            for &page in pages {
-                if play.take_out(page) || self.index[page.index()].rows == 0 {
+        let mut present = std::mem::take(&mut play.present);
+        for s in step..step.saturating_add(STEPS_AHEAD) {
+            let Some(next) = self.window.pages(s + 1) else { break };
+            let first = admits.len();
+            for &page in next {
+                if present.binary_search(&page).is_ok() || play.take_out(page) || self.index[page.index()].rows == 0 {
                     continue;
                 }
-                admits.push(Admit { page, step: s, leaves: None });
+                admits.push(Admit { page, step: s + 1, leaves: None });
             }
-            // What leaves is known when all that stays is out of the order.
-            let first = admits.partition_point(|admit| admit.step < s);
+            // What stays is known when all that the next step needs is out of the order.
+            let is_past = |page: &PageNo| next.binary_search(page).is_err() && self.index[page.index()].rows > 0;
+            let mut past = present.iter().copied().filter(is_past);
+            let mut put_in =
+                |play: &mut Play| past.by_ref().for_each(|p| play.put_in(p, self.window.next_use_after(p, s)));
             for i in first..admits.len() {
-                let Some(leaves) = play.room() else { return admits.truncate(i) };
+                let leaves = play.room(s + 1 + FAR_STEPS).or_else(|| {
+                    put_in(play);
+                    play.room(s + 1)
+                });
+                let Some(leaves) = leaves else { return admits.truncate(i) };
                 admits[i].leaves = leaves;
             }
-            for &page in pages {
-                play.put_in(page, self.window.next_use_after(page, s));
-            }
+            put_in(play);
+            present.clear();
+            present.extend_from_slice(next);
         }
+        play.present = present;
     }
 
     fn may_read_ahead(&self) -> bool {
@@ -217,7 +235,7 @@ fn is_far(victim: &Victim, step: u32) -> bool {
 }
 
 impl Play {
-    /// The frames as they are.
+    /// The frames as they are; those of the present step are apart.
     fn begin(&mut self, pager: &Pager) {
         self.policy = pager.config.policy;
         self.free = pager.cache.free_frames();
@@ -225,12 +243,18 @@ impl Play {
         self.keys.resize(pager.index.len(), None);
         let mut order = std::mem::take(&mut self.order).into_vec();
         order.clear();
+        self.present.clear();
         for held in pager.cache.held() {
+            if pager.cache.state(held.page) == Some(FrameState::Pinned) {
+                self.present.push(held.page);
+                continue;
+            }
             let (next_use, idle) = self.key(held.next_use, u32::MAX - held.last_use);
             self.keys[held.page.index()] = Some((next_use, idle));
             order.push((next_use, idle, held.page));
         }
         self.order = BinaryHeap::from(order);
+        self.present.sort_unstable();
     }
 
     fn key(&self, next_use: u32, idle: u32) -> (u32, u32) {
@@ -251,17 +275,23 @@ impl Play {
         self.order.push((next_use, idle, page));
     }
 
-    /// Room for one page: the page that leaves, `Some(None)` for a free frame, `None` when all that is left is in use.
-    fn room(&mut self) -> Option<Option<PageNo>> {
+    /// Room for one page: the page that leaves, `Some(None)` for a free frame, `None` when all that is left is in use or
+    /// needed again up to step `last`.
+    fn room(&mut self, last: u32) -> Option<Option<PageNo>> {
         if self.free > 0 {
             self.free -= 1;
             return Some(None);
         }
         while let Some((next_use, idle, page)) = self.order.pop() {
-            if self.keys[page.index()] == Some((next_use, idle)) {
-                self.keys[page.index()] = None;
-                return Some(Some(page));
+            if self.keys[page.index()] != Some((next_use, idle)) {
+                continue;
             }
+            if self.policy == EvictPolicy::FarthestNextUse && next_use <= last {
+                self.order.push((next_use, idle, page));
+                return None;
+            }
+            self.keys[page.index()] = None;
+            return Some(Some(page));
         }
         None
     }
