@@ -24,8 +24,8 @@ use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::io;
 
-/// Writes that wait to be encoded together, so that all threads have work.
-const ENCODE_BATCH: usize = 16;
+/// Writes that wait to be encoded and checksummed together, so that all threads have work.
+const WRITE_BATCH: usize = 16;
 
 /// What a store is told at its making.
 #[derive(Debug, Clone, Copy)]
@@ -55,15 +55,40 @@ struct Pending {
     payload: Option<PageBuffer>,
 }
 
-/// A write that waits to be encoded.
+/// A write that waits to be encoded and checksummed.
 #[derive(Debug)]
-struct Unencoded {
+struct Waiting {
     token: u64,
     page: PageId,
     slot: SlotRef,
     label: Vec<u8>,
     payload: PageBuffer,
-    staging: PageBuffer,
+    /// For the encoded form.
+    staging: Option<PageBuffer>,
+}
+
+impl Waiting {
+    /// Encodes, pads and checksums what will be stored.
+    fn seal(&mut self, codec: Codec) {
+        let slot = &mut self.slot;
+        if let Some(staging) = &mut self.staging {
+            let payload = &self.payload.as_slice()[HEADER_BYTES..][..slot.payload_bytes as usize];
+            // What cannot be encoded for whatever reason is stored raw.
+            if let Ok(Some((bytes, stored_as))) =
+                codec::encode_as(codec, payload, &mut staging.as_mut_slice()[HEADER_BYTES..])
+            {
+                slot.stored_bytes = bytes as u32;
+                slot.codec = stored_as;
+            }
+        }
+        let buffer = match (slot.codec, &mut self.staging) {
+            (StoredAs::Raw, _) | (_, None) => &mut self.payload,
+            (_, Some(staging)) => staging,
+        };
+        let stored = &mut buffer.as_mut_slice()[HEADER_BYTES..slot.transfer_bytes()];
+        stored[slot.stored_bytes as usize..].fill(0);
+        slot.checksum = checksum(stored);
+    }
 }
 
 /// Pages in slots. One owner.
@@ -73,7 +98,7 @@ pub struct PagedStore {
     pub(super) slots: Slots,
     pending: BTreeMap<u64, Pending>,
     next_transfer: u64,
-    unencoded: Vec<Unencoded>,
+    waiting: Vec<Waiting>,
     /// Ends that were not taken yet.
     ended: Vec<PageDone>,
     /// Buffers of a slot's size that are not in use.
@@ -111,7 +136,7 @@ impl PagedStore {
             slots,
             pending: BTreeMap::new(),
             next_transfer: 0,
-            unencoded: Vec::new(),
+            waiting: Vec::new(),
             ended: Vec::new(),
             staging: Vec::new(),
             staged: 0,
@@ -147,7 +172,7 @@ impl PagedStore {
 
     /// Reads and writes that were accepted and whose end was not taken yet.
     pub fn in_flight(&self) -> usize {
-        self.pending.len() + self.unencoded.len() + self.ended.len()
+        self.pending.len() + self.waiting.len() + self.ended.len()
     }
 
     /// Memory of the store's own buffers, bytes: none while pages are stored raw, otherwise as much as was ever in flight
@@ -225,29 +250,17 @@ impl PagedStore {
             Ok(slot) => SlotRef { generation, ..slot },
             Err(error) => return Err((error, buffer)),
         };
-        match self.config.codec {
-            Codec::Raw => {
-                let pending =
-                    Pending { token, page, slot, direction: Direction::Write, is_repeated: false, payload: None };
-                self.submit_write(pending, label, buffer);
-            }
-            codec => {
-                let staging = self.take_staging();
-                let label = label.to_vec();
-                self.unencoded.push(Unencoded { token, page, slot, label, payload: buffer, staging });
-                if self.unencoded.len() >= ENCODE_BATCH {
-                    self.encode_waiting(codec);
-                }
-            }
+        let staging = (self.config.codec != Codec::Raw).then(|| self.take_staging());
+        self.waiting.push(Waiting { token, page, slot, label: label.to_vec(), payload: buffer, staging });
+        if self.waiting.len() >= WRITE_BATCH {
+            self.begin_writes();
         }
         Ok(())
     }
 
     /// Moves ended reads and writes to `done`. With `wait`, blocks until at least one is there, if any is in flight.
     pub fn complete(&mut self, wait: bool, done: &mut Vec<PageDone>) {
-        if self.config.codec != Codec::Raw {
-            self.encode_waiting(self.config.codec);
-        }
+        self.begin_writes();
         loop {
             let wait = wait && self.ended.is_empty() && !self.pending.is_empty();
             let mut completions = Vec::new();
@@ -341,31 +354,30 @@ impl PagedStore {
         self.staging.push(buffer);
     }
 
-    fn encode_waiting(&mut self, codec: Codec) {
-        let mut batch = std::mem::take(&mut self.unencoded);
-        batch.par_iter_mut().for_each(|write| {
-            let payload = &write.payload.as_slice()[HEADER_BYTES..][..write.slot.payload_bytes as usize];
-            let stored = &mut write.staging.as_mut_slice()[HEADER_BYTES..];
-            // What cannot be encoded for whatever reason is stored raw.
-            if let Ok(Some((bytes, stored_as))) = codec::encode_as(codec, payload, stored) {
-                write.slot.stored_bytes = bytes as u32;
-                write.slot.codec = stored_as;
-            }
-        });
-        for Unencoded { token, page, slot, label, payload, staging } in batch {
-            let (buffer, payload) = match slot.codec {
-                StoredAs::Raw => {
-                    self.give_staging(staging);
+    /// Hands the writes that were accepted to the engine. They begin by themselves when there are some more of them, or
+    /// with [`PagedStore::complete`].
+    pub fn begin_writes(&mut self) {
+        let (mut batch, codec) = (std::mem::take(&mut self.waiting), self.config.codec);
+        match batch.as_mut_slice() {
+            // Handing one page to another thread costs more than it saves.
+            [one] => one.seal(codec),
+            many => many.par_iter_mut().for_each(|write| write.seal(codec)),
+        }
+        for Waiting { token, page, slot, label, payload, staging } in batch {
+            let (buffer, payload) = match (slot.codec, staging) {
+                (StoredAs::Raw, staging) => {
+                    staging.into_iter().for_each(|staging| self.give_staging(staging));
                     (payload, None)
                 }
-                _ => (staging, Some(payload)),
+                (_, Some(staging)) => (staging, Some(payload)),
+                (_, None) => (payload, None),
             };
             let pending = Pending { token, page, slot, direction: Direction::Write, is_repeated: false, payload };
             self.submit_write(pending, &label, buffer);
         }
     }
 
-    /// Pads, checksums, puts the header in front and submits.
+    /// Puts the header in front and submits.
     fn submit_write(&mut self, mut pending: Pending, label: &[u8], mut buffer: PageBuffer) {
         if let Err(error) = self.refuse_if_poisoned() {
             self.slots.release(pending.slot.place);
@@ -378,11 +390,8 @@ impl PagedStore {
             };
             return self.ended.push(pending.end(payload, Err(error)));
         }
-        let slot = &mut pending.slot;
+        let slot = &pending.slot;
         let bytes = slot.transfer_bytes();
-        let (header, stored) = buffer.as_mut_slice()[..bytes].split_at_mut(HEADER_BYTES);
-        stored[slot.stored_bytes as usize..].fill(0);
-        slot.checksum = checksum(stored);
         let described = SlotHeader {
             store: self.config.store,
             page: pending.page,
@@ -391,7 +400,7 @@ impl PagedStore {
             label: label.to_vec(),
         };
         self.config.serial += 1;
-        if let Some(header) = header.first_chunk_mut() {
+        if let Some(header) = buffer.as_mut_slice().first_chunk_mut() {
             described.encode(header);
         }
         self.traffic.bytes_written += bytes as u64;

@@ -121,6 +121,9 @@ impl Pager {
         }
         self.clean_for_next_step(lacking, step);
         self.coming = coming;
+        if let Some(store) = &mut self.store {
+            store.begin_writes();
+        }
         while self.transfers == Transfers::Ahead && self.in_flight() > 0 {
             self.settle_for_nobody(true);
         }

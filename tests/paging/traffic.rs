@@ -93,14 +93,43 @@ fn reads_are_the_least_that_the_frames_allow() {
         let (asked, start) = read(0, 0, EvictPolicy::FarthestNextUse);
         let least = belady(&views, frames, &start);
         assert_eq!(asked.pages_read, least, "{frames} frames");
-        // Looking ahead may cost a page now and then that leaves early so that nobody waits: these views come in groups of
-        // twelve, so a page that the next four steps do not need is soon needed again (7 % more were read).
+        // Looking ahead may cost a page now and then that leaves early so that nobody waits.
         let (ahead, _) = read(3, 16, EvictPolicy::FarthestNextUse);
-        assert!(ahead.pages_read >= least && ahead.pages_read <= least + least / 10, "{frames}: {least} {ahead:?}");
+        println!(
+            "{frames} frames: least {least}, read {}, missed {} of {}",
+            ahead.pages_read, ahead.misses, asked.misses
+        );
+        assert!(ahead.pages_read >= least && ahead.pages_read <= least + least / 20, "{frames}: {least} {ahead:?}");
         assert!(ahead.misses * 4 < asked.misses, "{frames}: {asked:?} {ahead:?}");
         let (recent, _) = read(0, 0, EvictPolicy::LeastRecentlyUsed);
         assert!(recent.pages_read > least, "{frames}: {recent:?}");
         // The import wrote most pages once; what is only read is not written again.
         assert!(touches || ahead.pages_written <= u64::from(PAGES), "{frames}: {ahead:?}");
+    }
+}
+
+/// What was planned long ago is planned anew before it is acted upon: a page that moves into a later view is kept for it.
+#[test]
+fn a_page_that_moves_into_a_later_view_is_kept_for_it() {
+    const LATER: usize = 17;
+    let mut pager = Pager::new(config(14), store(Codec::Raw, &Faults::new()));
+    scene(&mut pager);
+    let at = |step: usize| match step {
+        0 => 0.0,
+        LATER => 80.0,
+        _ => 20.0 + step as f64,
+    };
+    let cameras: Vec<Camera> = (0..=LATER).map(|step| camera(at(step))).collect();
+    pager.look_ahead(0, &cameras.iter().collect::<Vec<_>>());
+    for (step, camera) in cameras.iter().enumerate() {
+        let mut pages = pager.acquire(step as u32, camera).unwrap();
+        assert!(pager.is_in_memory(PageNo(0)), "gone at step {step}");
+        (0..3).for_each(|_| pager.prefetch(step as u32));
+        if step == 0 {
+            assert_eq!(pages[0].page, PageNo(0));
+            pages[0].meta = world::meta(pages[0].meta.id, at(LATER), 3, 1);
+            pages[0].dirty = true;
+        }
+        pager.release(pages);
     }
 }
