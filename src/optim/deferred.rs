@@ -136,7 +136,7 @@ impl DeferredAdam {
         &self.tables
     }
 
-    /// eps and the root above which the series holds.
+    /// eps and the second moment above which the series holds.
     #[inline(always)]
     pub(crate) fn eps_floor(&self) -> EpsFloor {
         self.eps

@@ -178,7 +178,7 @@ impl EpsFloor {
     pub(crate) fn new(eps: f64) -> Self {
         let eps = eps as f32;
         let largest_root = SERIES_FLOOR * eps;
-        // The largest number whose root is not above: asking for it costs no root of every second moment.
+        // The largest second moment whose root is not above that: comparing with it saves a root for every value.
         let mut floor = largest_root * largest_root;
         while floor.sqrt() > largest_root {
             floor = floor.next_down();
@@ -190,7 +190,7 @@ impl EpsFloor {
     }
 }
 
-/// The value after a gap by the series. Only for roots above the floor: see [`needs_direct_sum`].
+/// The value after a gap by the series. Only for second moments above the floor: see [`needs_direct_sum`].
 /// Rounding: at most 4e-7 of the movement, and half an ulp of the value.
 #[inline(always)]
 pub(crate) fn drifted(value: f32, m: f32, v: f32, sums: [f32; 3], rate: f32, eps: f32) -> f32 {

@@ -3,7 +3,8 @@
 //!
 //! A row is worked on in whole vectors: one of the narrow columns, the others of `sh_n`. Where the last of these would not
 //! be full it starts earlier instead, and what it shares with the one before it comes to the same in both: so every
-//! load and store is one of a whole vector, and none has to wait for parts of another. A row is loaded before it is stored.
+//! load and store is one of a whole vector, and none has to wait for parts of another. That is right in place because a row is
+//! loaded whole before any of it is stored. The next row is loaded before that, so listed rows must differ.
 //!
 //! Floor: the bytes, 4 floats a parameter for forwarding and 7 for the step; `gsscale-bench touched` prints both beside a
 //! plain copy.
@@ -62,7 +63,8 @@ impl<const W: usize> RowVectors<W> {
         }
     }
 
-    /// Asks for a row that will be loaded soon.
+    /// Asks for `sh_n` of a row that will be loaded soon, but for what lies in a last line of a few values; the narrow
+    /// columns come by themselves, many rows to a line.
     #[inline(always)]
     fn prefetch(columns: &ColumnsRef<'_>, row: usize) {
         for line in 0..W.div_ceil(LANES) {

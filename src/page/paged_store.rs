@@ -213,7 +213,7 @@ impl PagedStore {
         self.submit_read(pending, buffer);
     }
 
-    /// Starts to write a new version of `page`: the first `payload_bytes` behind the header room of `buffer`. `label` is
+    /// Accepts a new version of `page` for writing, which begins with [`PagedStore::begin_writes`]: the first `payload_bytes` behind the header room of `buffer`. `label` is
     /// what the index needs to know of the page, at most [`LABEL_BYTES_MAX`] bytes. Header room and padding are
     /// overwritten; the payload stays as it is and comes back with the end.
     ///

@@ -34,7 +34,8 @@ impl Demand {
     }
 
     /// As [`Demand::fewest_reads`], of the caches that let no step wait: the pages of the next step are in memory, beside
-    /// those of the present one, when this one ends. Where the two do not fit together, as many of the next as do.
+    /// those of the present one, when this one ends. Where the two do not fit together, the first of the next, whatever is
+    /// there already: then it is an estimate, and may be too high.
     pub fn fewest_reads_in_time(&self, frames: usize, bytes: &[u64]) -> Option<(u64, u64)> {
         let both = |(i, pages): (usize, &Vec<PageNo>)| {
             let coming = self.steps.get(i + 1).into_iter().flatten().filter(|p| !pages.contains(p));
