@@ -241,12 +241,6 @@ impl<'a> AdamNow<'a> {
         }
     }
 
-    /// Number of optimizer steps contained in what this gives.
-    #[inline(always)]
-    pub(super) fn steps(&self) -> u32 {
-        self.now
-    }
-
     /// Moves the values of one loaded row with a value that eps touches to now, lane by lane.
     pub(super) fn evaluate_block_directly(&self, value: &mut RowBlock, m: &RowBlock, v: &RowBlock, stamp: u32) {
         let drift = self.drift(stamp);

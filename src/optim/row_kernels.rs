@@ -9,7 +9,7 @@
 //! Floor: the bytes, 4 floats a parameter for forwarding and 7 for the step; `gsscale-bench touched` prints both beside a
 //! plain copy.
 //!
-//! Invariant: the bits are those of [`RowsNow`](crate::scene::rows::RowsNow), whatever the instruction path.
+//! Invariant: the bits are those of [`RowsNow`], whatever the instruction path.
 
 use super::adam::AdamConfig;
 use super::deferred::{AdamNow, StepCounts};
@@ -17,7 +17,9 @@ use super::drift::{EpsFloor, drifted, flush, needs_direct_sum};
 use super::moments::{Moments, round_block};
 use crate::base::simd::{Kernel, LANES, prefetch};
 use crate::scene::columns::Column;
-use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, SH_N_LANE, first_lane};
+use crate::scene::rows::{
+    BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, RowsNow, SH_N_LANE, first_lane,
+};
 
 /// Gradients beyond this are treated like non-finite ones: their square must not overflow the second moment. With it
 /// every number that an update computes from finite state is finite.
@@ -162,7 +164,7 @@ impl<const W: usize> Past<W> {
 /// What the values of a row are now.
 #[inline(always)]
 fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>, now: &mut RowVectors<W>) {
-    if past.stamp >= at.steps() {
+    if past.stamp >= at.now() {
         *now = past.value;
         return;
     }
@@ -283,16 +285,16 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
             }
             let row = row as usize - view.first_row;
             evaluate(at, past, &mut value);
-            let powers = at.adam().beta_power(at.steps().saturating_sub(past.stamp));
+            let powers = at.adam().beta_power(at.now().saturating_sub(past.stamp));
             let Past { m, v, .. } = past;
             constants.step(&mut value, m, v, g, powers);
             if at.adam().moments() == Moments::Bf16 {
-                round::<W>(m, v, view.uid[row], at.steps() + 1);
+                round::<W>(m, v, view.uid[row], at.now() + 1);
             }
             value.store(&mut columns, row);
             m.store(&mut exp_avg, row);
             v.store(&mut exp_avg_sq, row);
-            stamp[row] = at.steps() + 1;
+            stamp[row] = at.now() + 1;
             counts.updated += 1;
         }
         counts
@@ -320,7 +322,7 @@ struct StepConstants {
 
 impl StepConstants {
     fn new(at: &AdamNow<'_>) -> Self {
-        let (tables, now) = (at.adam().tables(), at.steps());
+        let (tables, now) = (at.adam().tables(), at.now());
         let [inv_bias1, inv_root] = tables.bias(now + 1);
         let AdamConfig { beta1, beta2, eps } = tables.config();
         StepConstants {

@@ -46,4 +46,5 @@ mod transfer_pool;
 #[cfg(target_os = "linux")]
 pub mod uring_store;
 pub mod verify;
+mod waiting;
 pub mod witness;

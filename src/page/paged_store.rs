@@ -11,14 +11,15 @@
 //! later; 4. every accepted transfer ends in exactly one [`PageDone`].
 
 use super::buffer::PageBuffer;
-use super::codec::{self, Codec};
-use super::format::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, checksum, transfer_bytes};
+use super::codec::Codec;
+use super::format::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, transfer_bytes};
 use super::mutants::{Mutant, active};
 pub use super::page_done::{PageDone, PageMoved, PageTraffic};
 use super::page_error::{PageError, SlotName, is_out_of_space};
 use super::slots::{SlotError, SlotLayout, Slots};
 use super::store::{Completion, Direction, PageStore, Place, Transfer};
 use super::verify::verify;
+use super::waiting::Waiting;
 use crate::base::ids::PageId;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -53,42 +54,6 @@ struct Pending {
     is_repeated: bool,
     /// The caller's buffer while the encoded form travels in one of the store's own.
     payload: Option<PageBuffer>,
-}
-
-/// A write that waits to be encoded and checksummed.
-#[derive(Debug)]
-struct Waiting {
-    token: u64,
-    page: PageId,
-    slot: SlotRef,
-    label: Vec<u8>,
-    payload: PageBuffer,
-    /// For the encoded form.
-    staging: Option<PageBuffer>,
-}
-
-impl Waiting {
-    /// Encodes, pads and checksums what will be stored.
-    fn seal(&mut self, codec: Codec) {
-        let slot = &mut self.slot;
-        if let Some(staging) = &mut self.staging {
-            let payload = &self.payload.as_slice()[HEADER_BYTES..][..slot.payload_bytes as usize];
-            // What cannot be encoded for whatever reason is stored raw.
-            if let Ok(Some((bytes, stored_as))) =
-                codec::encode_as(codec, payload, &mut staging.as_mut_slice()[HEADER_BYTES..])
-            {
-                slot.stored_bytes = bytes as u32;
-                slot.codec = stored_as;
-            }
-        }
-        let buffer = match (slot.codec, &mut self.staging) {
-            (StoredAs::Raw, _) | (_, None) => &mut self.payload,
-            (_, Some(staging)) => staging,
-        };
-        let stored = &mut buffer.as_mut_slice()[HEADER_BYTES..slot.transfer_bytes()];
-        stored[slot.stored_bytes as usize..].fill(0);
-        slot.checksum = checksum(stored);
-    }
 }
 
 /// Pages in slots. One owner.
@@ -213,9 +178,10 @@ impl PagedStore {
         self.submit_read(pending, buffer);
     }
 
-    /// Accepts a new version of `page` for writing, which begins with [`PagedStore::begin_writes`]: the first `payload_bytes` behind the header room of `buffer`. `label` is
-    /// what the index needs to know of the page, at most [`LABEL_BYTES_MAX`] bytes. Header room and padding are
-    /// overwritten; the payload stays as it is and comes back with the end.
+    /// Accepts a new version of `page` for writing, which begins with [`PagedStore::begin_writes`]: the first
+    /// `payload_bytes` bytes behind the header room of `buffer`. `label` is what the index needs to know of the page, at
+    /// most [`LABEL_BYTES_MAX`] bytes. Header room and padding are overwritten; the payload stays as it is and comes back
+    /// with the end.
     ///
     /// # Errors
     /// No space, the store is poisoned, or payload or label are too long; the buffer comes back at once. Nothing is in
