@@ -327,6 +327,27 @@ fn small_drive(folder: &Path) -> Option<Small> {
     Small::mount(folder, segment + segment / 2 + (4 << 20))
 }
 
+/// What it takes is known before anything is written; what the import has written is not counted twice.
+#[test]
+fn a_drive_is_refused_only_if_it_is_too_small_and_at_once() {
+    let folder = TempDir::new().unwrap();
+    let scene = make_scene(folder.path());
+    let Some(drive) = small_drive(&folder.path().join("drive")) else { return };
+    let (out, spill) = (folder.path().join("out"), drive.0.join("spill"));
+    // Pages beyond the frames are written by the import: more than the drive has free afterwards.
+    let mut few = args(&scene, &out, &spill);
+    let steps = few.iter().position(|arg| *arg == "60").unwrap();
+    few[steps] = "2";
+    few.extend(["--frames", "200"]);
+    let output = train(&few);
+    assert!(output.status.success(), "{}", stderr(&output));
+    drive.resize(4 << 20);
+    let output = train(&[&few[..], &["--overwrite"]].concat());
+    let said = stderr(&output);
+    assert!(!output.status.success() && said.contains("the drive has") && said.contains("free space on it"), "{said}");
+    assert!(!spill.exists() && Trainer::ply_path(&out).exists(), "it took something away or left something behind");
+}
+
 #[test]
 fn a_really_full_drive_pauses_the_run_until_there_is_space() {
     let folder = TempDir::new().unwrap();

@@ -311,21 +311,45 @@ fn check_view(plan: &TierPlan, frames: u64) -> InputResult<()> {
     Err(InputError::new("--frames", problem, format!("give at least {needed}; views may come to need more")))
 }
 
+/// Refuses a drive that cannot hold the `rows` first Gaussians, before anything is read or written for it.
+///
+/// # Errors
+/// It is too small; a drive that does not tell what is free is large enough.
+pub fn check_first_drive(config: &TrainConfig, rows: u64) -> InputResult<()> {
+    if config.spill_dir.is_empty() {
+        return Ok(());
+    }
+    let free = free_bytes(&drive_of(Path::new(&config.spill_dir))).ok().flatten();
+    let frame_bytes = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes() as u64;
+    let pages = rows.div_ceil(first_fill(config.page_rows as usize, config.strategy != "none") as u64);
+    free.map_or(Ok(()), |free| refuse_small_drive(free, pages, frame_bytes))
+}
+
+/// Bytes of so many pages on the drive, and of those that are on their way there.
+fn drive_bytes(pages: u64, frame_bytes: u64) -> u64 {
+    pages.saturating_add(SLOTS_IN_FLIGHT).saturating_mul(frame_bytes)
+}
+
+fn refuse_small_drive(free: u64, pages: u64, frame_bytes: u64) -> InputResult<()> {
+    let needed = drive_bytes(pages, frame_bytes);
+    if free >= needed {
+        return Ok(());
+    }
+    let problem = format!(
+        "the drive has {} free for pages, but {pages} of {} may have to lie there, {} with those on their way",
+        format_bytes(free),
+        format_bytes(frame_bytes),
+        format_bytes(needed)
+    );
+    let remedy = "free space on it, choose another drive, or lower --sh-degree";
+    Err(InputError::new("--spill-dir", problem, remedy))
+}
+
 fn check_drive(plan: &TierPlan, tiers: &Tiers) -> InputResult<()> {
     let Some(free) = plan.free_bytes.filter(|_| tiers.spills()) else { return Ok(()) };
-    let bytes = |pages: u64| (pages + SLOTS_IN_FLIGHT) * plan.frame_bytes;
-    let [now, most] = plan.pages.map(bytes);
-    if free < now {
-        let problem = format!(
-            "the drive has {} free, but {} pages of {} may have to lie there",
-            format_bytes(free),
-            plan.pages[0],
-            format_bytes(plan.frame_bytes)
-        );
-        let remedy = "free space on it, choose another drive, or lower --sh-degree";
-        return Err(InputError::new("--spill-dir", problem, remedy));
-    }
-    let with_past = most.saturating_mul(VERSIONS);
+    let [now, most] = plan.pages;
+    refuse_small_drive(free, now, plan.frame_bytes)?;
+    let with_past = drive_bytes(most, plan.frame_bytes).saturating_mul(VERSIONS);
     if free < with_past {
         eprintln!(
             "warning: the scene and its last two commits may grow to {} on the drive, which has {} free: lower \

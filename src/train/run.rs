@@ -209,6 +209,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
         }
         return Ok(RunOutcome { summary: None, exit_code: 0 });
     }
+    preflight::check_first_drive(config, start.rows)?;
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
     let fill = first_fill(config.page_rows as usize, options.densify.is_some());
     let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);

@@ -298,8 +298,8 @@ impl Tiers {
         self.spill.as_ref().map_or(0, of)
     }
 
-    /// Bytes that pages may take on the drive: what is free, and what those of a run that goes on have already; `None`
-    /// without a drive, or where the system does not tell.
+    /// Bytes that pages may take on the drive: what is free, and what they have already, of a run that goes on or of the
+    /// import; `None` without a drive, or where the system does not tell.
     ///
     /// # Errors
     /// The folder is gone.
@@ -308,8 +308,7 @@ impl Tiers {
             return Ok(free_bytes(folder).ok().flatten());
         }
         let Some(spill) = &self.spill else { return Ok(None) };
-        let segments = spill.segments()?.len() as u64;
-        let taken = if self.has_past { segments * spill.format().layout.segment_bytes() } else { 0 };
+        let taken = spill.segments()?.len() as u64 * spill.format().layout.segment_bytes();
         Ok(spill.free_bytes()?.map(|free| free.saturating_add(taken)))
     }
 

@@ -29,9 +29,8 @@ The limit is a memory control group of Linux (it takes a user who may make one, 
 line says so, and the peak that the run measured of itself is all there is. 20 million Gaussians take some 17 GB of the
 drive while it runs.";
 
-/// On the drive beside the pages, for each Gaussian: its point in the scene, and what an import sorts, read and written
-/// (64 million took 28 GB at the most).
-const SCENE_BYTES: u64 = 51 + 440;
+/// On the drive beside the pages, for each Gaussian: its point in the scene, and what an import sorts.
+const SCENE_BYTES: u64 = 51 + 120;
 /// Share of the free drive that `--gaussians max` uses.
 const DRIVE_SHARE: f64 = 0.8;
 
