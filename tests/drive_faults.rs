@@ -400,7 +400,7 @@ fn a_run_in_memory_goes_on_when_the_drive_of_its_commits_is_full() {
     loses_commits_alone(World::new());
 }
 
-/// Its steps go on changing rows after they have changed those of their view, and must not be done twice.
+/// Its steps go on changing rows after they have changed those of their view.
 #[test]
 fn so_does_a_run_in_memory_that_updates_every_row() {
     loses_commits_alone(World::of("dense"));

@@ -127,6 +127,25 @@ fn a_cut_is_committed_as_it_was_whatever_the_steps_after_it_do() {
     assert!(committed > 100 && had_to_write > 100, "{committed} of {had_to_write}");
 }
 
+/// A step that has changed rows must not be done twice: where one of the pages that it still needs cannot be written for the
+/// cut, it gets the page all the same, and the next step gets the error.
+#[test]
+fn a_failed_write_is_left_to_the_next_step_once_rows_have_changed() {
+    let folder = tempfile::tempdir().unwrap();
+    let faults = Faults::new();
+    let opened = Commits::create(Box::new(DriveFolder::new(folder.path())), COMMITS).unwrap();
+    let pager = Pager::new(config(usize::MAX), paged_store(&opened, folder.path(), Codec::Raw, &faults));
+    let mut run = Run::new(pager, 3, PAGES, STEPS).unwrap();
+    (0..20).for_each(|_| run.step().unwrap());
+    run.pager.freeze().unwrap();
+    faults.add(Operation::Write, faults.count(Operation::Write), true, Fault::Error(ErrorKind::StorageFull));
+    let page = (0..PAGES).map(PageNo).find(|p| run.pager.index()[p.index()].rows > 0).unwrap();
+    let pinned = run.pager.acquire_in_step(&[page]).expect("the step is seen through");
+    pinned.iter().for_each(|page| check(page, &run.model));
+    run.pager.release(pinned);
+    assert!(!run.pager.is_frozen() && run.step().unwrap_err().is_out_of_space());
+}
+
 /// A write that fails while a cut is written gives the cut up; the commit before it stands, and the steps go on where
 /// only space is missing.
 #[test]
