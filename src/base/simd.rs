@@ -86,17 +86,18 @@ pub fn fma<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
 }
 
-/// Asks for the cache line of `value`, which will be read soon; costs nothing but the request, and does nothing where
-/// there is no such instruction.
+/// Asks for the cache line of `values[at]`, which will be read soon; costs nothing but the request. Does nothing where there
+/// is no such instruction. Beyond the end is allowed: a check would cost more than the request.
 #[inline(always)]
-pub fn prefetch<T>(value: &T) {
+pub fn prefetch<T>(values: &[T], at: usize) {
+    let address = values.as_ptr().wrapping_add(at);
     #[cfg(target_arch = "x86_64")]
     {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        // SAFETY: SSE is part of x86-64; the address comes from a reference, and a prefetch reads nothing anyway.
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast()) };
+        // SAFETY: SSE is part of x86-64, and a prefetch reads nothing, whatever the address.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(address.cast()) };
     }
-    let _ = value;
+    let _ = address;
 }
 
 /// Runs `kernel` on `path`; a path that this machine lacks falls back to the baseline.

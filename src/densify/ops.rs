@@ -233,8 +233,9 @@ mod tests {
     fn children_are_drawn_from_the_parent_within_the_cut() {
         let mut parent = [0.0f32; BLOCK_LANES];
         // A quarter turn about z (x to y), sigmas 1, 0.1, 0.01.
-        parent[3..7].copy_from_slice(&[2.0, 0.0, 0.0, 2.0]);
-        parent[7..10].copy_from_slice(&[0.0, -std::f32::consts::LN_10, -2.0 * std::f32::consts::LN_10]);
+        let (quats, scales) = (first_lane(Column::Quats), first_lane(Column::Scales));
+        parent[quats..quats + 4].copy_from_slice(&[2.0, 0.0, 0.0, 2.0]);
+        parent[scales..scales + 3].copy_from_slice(&[0.0, -std::f32::consts::LN_10, -2.0 * std::f32::consts::LN_10]);
         let n = 20_000;
         let mut sums = [0.0f64; 3];
         for uid in 0..n {
@@ -244,7 +245,7 @@ mod tests {
             // The bounds of pages count on 3.33; the slack is for f32 positions and the rounded log-scales above.
             assert!(norm2 <= 3.33 * 3.33 * (1.0 + 1e-5));
             (0..3).for_each(|i| sums[i] += z[i] * z[i]);
-            assert_eq!(child[8], child_log_scale(parent[8]));
+            assert_eq!(child[scales + 1], child_log_scale(parent[scales + 1]));
         }
         for sum in sums {
             // The cut takes 3.3 % of the variance; five standard errors of sqrt(2 / n) are 5 %.

@@ -69,7 +69,7 @@ fn for_each_tile(splat: &Splat, span: &Span, grid: Grid, mut each: impl FnMut(us
 #[inline(always)]
 fn prefetch_ahead(spans: &[Span], order: &[u32], i: usize) {
     if let Some(&row) = order.get(i + 24) {
-        prefetch(&spans[row as usize]);
+        prefetch(spans, row as usize);
     }
 }
 

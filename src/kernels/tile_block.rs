@@ -49,7 +49,7 @@ pub(super) struct Block<const N: usize> {
 #[inline(always)]
 pub(super) fn prefetch_splats(list: &[AtomicU64], splats: &[Splat]) {
     for bits in list {
-        prefetch(&splats[Isect::unpack(bits.load(Relaxed)).row as usize]);
+        prefetch(splats, Isect::unpack(bits.load(Relaxed)).row as usize);
     }
 }
 

@@ -167,16 +167,25 @@ impl DeferredAdam {
         assert_eq!(rows.len(), grads.rows(), "one gradient row per listed row");
         assert_eq!(state.sh_degree(), grads.sh_degree, "gradients of another degree");
         let at = self.at(now);
-        at.step_rows(state.view_mut(), rows, grads.view())
+        let mut values = Columns::zeros(rows.len(), grads.sh_degree);
+        at.evaluate_rows(state.view(), |i| rows[i] as usize, values.view_mut());
+        at.step_rows(state.view_mut(), rows, values.view(), grads.view())
     }
 
     /// beta1^k and beta2^k.
+    #[inline(always)]
     pub(super) fn beta_power(&self, k: u32) -> [f32; 2] {
+        match self.beta_powers.get(k as usize) {
+            Some(&power) => power,
+            None => self.far_beta_power(k),
+        }
+    }
+
+    #[cold]
+    #[inline(never)]
+    fn far_beta_power(&self, k: u32) -> [f32; 2] {
         if self.tables.is_still() {
             return [1.0, 1.0];
-        }
-        if let Some(&power) = self.beta_powers.get(k as usize) {
-            return power;
         }
         let AdamConfig { beta1, beta2, .. } = self.tables.config();
         [beta1, beta2].map(|b| flush(libm::pow(b, f64::from(k)) as f32))
@@ -201,8 +210,15 @@ impl<'a> AdamNow<'a> {
         if gap < RECENT { &self.recent[gap] } else { self.adam.tables.limit(stamp) }
     }
 
-    /// The step on a view of rows: as [`DeferredAdam::step`], `rows` counted in the table that the view was cut from.
-    pub fn step_rows(&self, view: RowsMut<'_>, rows: &[u32], grads: ColumnsRef<'_>) -> StepCounts {
+    /// The step on a view of rows: as [`DeferredAdam::step`], `rows` counted in the table that the view was cut from. `values`
+    /// are the listed rows as they are now, as [`AdamNow::evaluate_rows`] gives them: whoever has gradients had these before.
+    pub fn step_rows(
+        &self,
+        view: RowsMut<'_>,
+        rows: &[u32],
+        values: ColumnsRef<'_>,
+        grads: ColumnsRef<'_>,
+    ) -> StepCounts {
         if rows.is_empty() {
             return StepCounts::default();
         }
@@ -212,22 +228,32 @@ impl<'a> AdamNow<'a> {
             let bound = view.first_row + at;
             let listed = rows.partition_point(|&row| (row as usize) < bound);
             let (head, tail) = view.split_at(at);
+            let (head_values, tail_values) = values.split_at(listed);
             let (head_grads, tail_grads) = grads.split_at(listed);
             let (a, b) = rayon::join(
-                || self.step_rows(head, &rows[..listed], head_grads),
-                || self.step_rows(tail, &rows[listed..], tail_grads),
+                || self.step_rows(head, &rows[..listed], head_values, head_grads),
+                || self.step_rows(tail, &rows[listed..], tail_values, tail_grads),
             );
             return StepCounts {
                 updated: a.updated + b.updated,
                 skipped_non_finite: a.skipped_non_finite + b.skipped_non_finite,
             };
         }
+        debug_assert!(self.are_values_of(&view.as_ref(), rows, &values), "values of another step");
         match grads.sh_degree {
-            0 => dispatch(self.adam.simd, StepRows::<0> { at: self, view, rows, grads }),
-            1 => dispatch(self.adam.simd, StepRows::<9> { at: self, view, rows, grads }),
-            2 => dispatch(self.adam.simd, StepRows::<24> { at: self, view, rows, grads }),
-            _ => dispatch(self.adam.simd, StepRows::<45> { at: self, view, rows, grads }),
+            0 => dispatch(self.adam.simd, StepRows::<0> { at: self, view, rows, values, grads }),
+            1 => dispatch(self.adam.simd, StepRows::<9> { at: self, view, rows, values, grads }),
+            2 => dispatch(self.adam.simd, StepRows::<24> { at: self, view, rows, values, grads }),
+            _ => dispatch(self.adam.simd, StepRows::<45> { at: self, view, rows, values, grads }),
         }
+    }
+
+    /// Whether `values` are the listed rows as they are now, to the bit.
+    fn are_values_of(&self, view: &Rows<'_>, rows: &[u32], values: &ColumnsRef<'_>) -> bool {
+        let mut now = Columns::zeros(rows.len(), values.sh_degree);
+        self.evaluate_rows(*view, |i| rows[i] as usize - view.first_row, now.view_mut());
+        let has_same_bits = |a: &[f32], b: &[f32]| a.iter().map(|x| x.to_bits()).eq(b.iter().map(|x| x.to_bits()));
+        Column::ALL.into_iter().all(|column| has_same_bits(now.column(column), values.column(column)))
     }
 
     /// Evaluates rows into `out`: its row i is row `row_of(i)` of the view as it is now.
@@ -268,14 +294,7 @@ impl RowsNow for AdamNow<'_> {
     }
 
     fn evaluate_element(&self, rows: &Rows<'_>, column: Column, row: usize, element: usize) -> f32 {
-        let of = |table: &ColumnsRef<'_>| match column {
-            Column::Means => table.means[row * 3 + element],
-            Column::Quats => table.quats[row * 4 + element],
-            Column::Scales => table.scales[row * 3 + element],
-            Column::Opacities => table.opacities[row + element],
-            Column::Sh0 => table.sh0[row * 3 + element],
-            Column::ShN => table.sh_n[row * column.width(table.sh_degree) + element],
-        };
+        let of = |table: &ColumnsRef<'_>| table.column(column)[row * column.width(table.sh_degree) + element];
         let (value, m, v) = (of(&rows.columns), of(&rows.exp_avg), of(&rows.exp_avg_sq));
         let stamp = rows.stamp[row];
         self.adam.evaluate_with(self.drift(stamp), column, value, m, v, stamp, self.now)

@@ -4,7 +4,10 @@
 //! A row is worked on in whole vectors: one of the narrow columns, the others of `sh_n`. Where the last of these would not
 //! be full it starts earlier instead, and what it shares with the one before it comes to the same in both: so every
 //! load and store is one of a whole vector, and none has to wait for parts of another. That is right in place because a row is
-//! loaded whole before any of it is stored. The next row is loaded before that, so listed rows must differ.
+//! loaded whole before any of it is stored. From load to store a row stays in registers.
+//!
+//! The step takes the values of its rows from whoever forwarded them: what they are now costs a root and a quotient for
+//! every value, more than all the rest of the step.
 //!
 //! Floor: the bytes, 4 floats a parameter for forwarding and 7 for the step; `gsscale-bench touched` prints both beside a
 //! plain copy.
@@ -29,7 +32,7 @@ const LARGEST_GRAD: f32 = 1e18;
 const LOG_SCALE_LIMIT: f32 = 30.0;
 
 /// Rows that are asked for ahead of their turn.
-const AHEAD: usize = 8;
+const AHEAD: usize = 16;
 /// The sign of a float.
 const SIGN: u32 = 1 << 31;
 
@@ -52,17 +55,14 @@ impl<const W: usize> RowVectors<W> {
     }
 
     #[inline(always)]
-    fn zero() -> Self {
-        RowVectors([0.0; BLOCK_LANES])
-    }
-
-    #[inline(always)]
-    fn load(&mut self, columns: &ColumnsRef<'_>, row: usize) {
-        columns.load_row::<0>(row, &mut self.0);
+    fn load(columns: &ColumnsRef<'_>, row: usize) -> Self {
+        let mut block = [0.0; BLOCK_LANES];
+        block[..SH_N_LANE].copy_from_slice(&columns.narrow(row));
         let sh_n = &columns.sh_n[row * W..row * W + W];
         for (lane, start, len) in Self::parts() {
-            self.0[lane..lane + len].copy_from_slice(&sh_n[start..start + len]);
+            block[lane..lane + len].copy_from_slice(&sh_n[start..start + len]);
         }
+        RowVectors(block)
     }
 
     /// Asks for `sh_n` of a row that will be loaded soon, but for what lies in a last line of a few values; the narrow
@@ -70,13 +70,13 @@ impl<const W: usize> RowVectors<W> {
     #[inline(always)]
     fn prefetch(columns: &ColumnsRef<'_>, row: usize) {
         for line in 0..W.div_ceil(LANES) {
-            columns.sh_n.get(row * W + line * LANES).into_iter().for_each(prefetch);
+            prefetch(columns.sh_n, row * W + line * LANES);
         }
     }
 
     #[inline(always)]
     fn store(&self, columns: &mut ColumnsMut<'_>, row: usize) {
-        columns.store_row::<0>(row, &self.0);
+        columns.store_narrow(row, &self.0);
         let sh_n = &mut columns.sh_n[row * W..row * W + W];
         for (lane, start, len) in Self::parts() {
             sh_n[start..start + len].copy_from_slice(&self.0[lane..lane + len]);
@@ -92,11 +92,13 @@ impl<const W: usize> RowVectors<W> {
         block
     }
 
-    fn set(&mut self, block: &RowBlock) {
-        self.0[..SH_N_LANE].copy_from_slice(&block[..SH_N_LANE]);
+    fn of_block(block: &RowBlock) -> Self {
+        let mut lanes = [0.0; BLOCK_LANES];
+        lanes[..SH_N_LANE].copy_from_slice(&block[..SH_N_LANE]);
         for (lane, start, len) in Self::parts() {
-            self.0[lane..lane + len].copy_from_slice(&block[SH_N_LANE + start..][..len]);
+            lanes[lane..lane + len].copy_from_slice(&block[SH_N_LANE + start..][..len]);
         }
+        RowVectors(lanes)
     }
 }
 
@@ -113,31 +115,30 @@ impl<const W: usize, F: Fn(usize) -> usize> Kernel for EvaluateRows<'_, '_, W, F
     type Out = ();
     #[inline(always)]
     fn run<const FMA: bool>(mut self) {
-        let mut pasts = [Past::<W>::zero(); 2];
-        let mut value = RowVectors::<W>::zero();
-        let count = self.out.rows();
-        for i in 0..=count {
-            if i + AHEAD < count {
+        let Rows { columns, exp_avg, exp_avg_sq, stamp, .. } = &self.view;
+        for i in 0..self.out.rows() {
+            if i + AHEAD < self.out.rows() {
                 let coming = (self.row_of)(i + AHEAD);
-                RowVectors::<W>::prefetch(&self.view.columns, coming);
-                RowVectors::<W>::prefetch(&self.view.exp_avg, coming);
-                RowVectors::<W>::prefetch(&self.view.exp_avg_sq, coming);
+                RowVectors::<W>::prefetch(columns, coming);
+                RowVectors::<W>::prefetch(exp_avg, coming);
+                RowVectors::<W>::prefetch(exp_avg_sq, coming);
             }
-            if i < count {
-                let Rows { columns, exp_avg, exp_avg_sq, stamp, .. } = &self.view;
-                pasts[i % 2].load([columns, exp_avg, exp_avg_sq], stamp, (self.row_of)(i));
-            }
-            if i > 0 {
-                evaluate(self.at, &pasts[(i - 1) % 2], &mut value);
-                value.store(&mut self.out, i - 1);
+            let row = (self.row_of)(i);
+            let past = Past::<W> {
+                value: RowVectors::load(columns, row),
+                m: RowVectors::load(exp_avg, row),
+                v: RowVectors::load(exp_avg_sq, row),
+                stamp: stamp[row],
+            };
+            match evaluate(self.at, &past) {
+                Some(now) => now.store(&mut self.out, i),
+                None => evaluate_directly(self.at, &self.view, row, &mut self.out, i),
             }
         }
     }
 }
 
-/// A row as its last update left it. Loaded a row ahead of its turn: the narrow columns come in pieces, and a vector of
-/// them cannot be read before all have arrived.
-#[derive(Clone, Copy)]
+/// A row as its last update left it.
 struct Past<const W: usize> {
     value: RowVectors<W>,
     m: RowVectors<W>,
@@ -146,36 +147,20 @@ struct Past<const W: usize> {
     stamp: u32,
 }
 
-impl<const W: usize> Past<W> {
-    #[inline(always)]
-    fn zero() -> Self {
-        Past { value: RowVectors::zero(), m: RowVectors::zero(), v: RowVectors::zero(), stamp: 0 }
-    }
-
-    #[inline(always)]
-    fn load(&mut self, [value, m, v]: [&ColumnsRef<'_>; 3], stamp: &[u32], row: usize) {
-        self.value.load(value, row);
-        self.m.load(m, row);
-        self.v.load(v, row);
-        self.stamp = stamp[row];
-    }
-}
-
-/// What the values of a row are now.
+/// What the values of a row are now; nothing where eps touches one of them.
 #[inline(always)]
-fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>, now: &mut RowVectors<W>) {
+fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>) -> Option<RowVectors<W>> {
     if past.stamp >= at.now() {
-        *now = past.value;
-        return;
+        return Some(past.value);
     }
     let (EpsFloor { eps, floor }, rates) = (at.adam().eps_floor(), at.adam().lane_rates());
-    let (value, m, v, now) = (&past.value.0, &past.m.0, &past.v.0, &mut now.0);
+    let (value, m, v) = (&past.value.0, &past.m.0, &past.v.0);
     let mut direct = false;
     for l in 0..RowVectors::<W>::USED {
         direct |= needs_direct_sum(m[l], v[l], floor);
     }
     if direct {
-        return evaluate_directly(at, past, now);
+        return None;
     }
     let drift = at.drift(past.stamp);
     let (means, others) = ([drift[0], drift[1], drift[2]], [drift[4], drift[5], drift[6]]);
@@ -186,23 +171,27 @@ fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>, now: &mut RowVecto
             sums[p][l] = if l < 3 { means[p] } else { others[p] };
         }
     }
+    let mut now = [0.0; BLOCK_LANES];
     for l in 0..SH_N_LANE {
         now[l] = drifted(value[l], m[l], v[l], [sums[0][l], sums[1][l], sums[2][l]], rates.narrow[l], eps);
     }
     for l in SH_N_LANE..RowVectors::<W>::USED {
         now[l] = drifted(value[l], m[l], v[l], others, rates.sh_n, eps);
     }
+    Some(RowVectors(now))
 }
 
-/// The same for a row with a value that eps touches.
+/// A row with a value that eps touches: its values now, into row `to` of `out`. Loads the row itself: what is handed to
+/// another function cannot stay in registers.
 #[cold]
 #[inline(never)]
-fn evaluate_directly<const W: usize>(at: &AdamNow<'_>, past: &Past<W>, now: &mut RowBlock) {
-    let mut block = past.value.to_block();
-    at.evaluate_block_directly(&mut block, &past.m.to_block(), &past.v.to_block(), past.stamp);
-    let mut moved = past.value;
-    moved.set(&block);
-    *now = moved.0;
+fn evaluate_directly(at: &AdamNow<'_>, view: &Rows<'_>, row: usize, out: &mut ColumnsMut<'_>, to: usize) {
+    let [mut value, mut m, mut v] = [[0.0; BLOCK_LANES]; 3];
+    view.columns.load_row_any(row, &mut value);
+    view.exp_avg.load_row_any(row, &mut m);
+    view.exp_avg_sq.load_row_any(row, &mut v);
+    at.evaluate_block_directly(&mut value, &m, &v, view.stamp[row]);
+    out.store_row_any(to, &value);
 }
 
 /// Something of every lane of a row; all of `sh_n` has the same.
@@ -231,13 +220,11 @@ impl OfLanes {
 
 /// Moves the values of one row of any width to now.
 pub(super) fn evaluate_block(at: &AdamNow<'_>, value: &mut RowBlock, m: &RowBlock, v: &RowBlock, stamp: u32) {
-    let mut past = Past::<45> { stamp, ..Past::zero() };
-    past.value.set(value);
-    past.m.set(m);
-    past.v.set(v);
-    let mut now = past.value;
-    evaluate(at, &past, &mut now);
-    *value = now.to_block();
+    let [then, m_vectors, v_vectors] = [&*value, m, v].map(RowVectors::of_block);
+    match evaluate(at, &Past::<45> { value: then, m: m_vectors, v: v_vectors, stamp }) {
+        Some(now) => *value = now.to_block(),
+        None => at.evaluate_block_directly(value, m, v, stamp),
+    }
 }
 
 /// One optimizer step on listed rows of a view.
@@ -245,6 +232,8 @@ pub(super) struct StepRows<'k, 'a, const W: usize> {
     pub at: &'k AdamNow<'a>,
     pub view: RowsMut<'k>,
     pub rows: &'k [u32],
+    /// The listed rows as they are now: what [`EvaluateRows`] makes of them.
+    pub values: ColumnsRef<'k>,
     pub grads: ColumnsRef<'k>,
 }
 
@@ -252,27 +241,20 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
     type Out = StepCounts;
     #[inline(always)]
     fn run<const FMA: bool>(self) -> StepCounts {
-        let StepRows { at, view, rows, grads } = self;
+        let StepRows { at, view, rows, values, grads } = self;
         let RowsMut { mut columns, mut exp_avg, mut exp_avg_sq, stamp, .. } = view;
         let constants = StepConstants::new(at);
-        let (mut pasts, mut gradients) = ([Past::<W>::zero(); 2], [RowVectors::<W>::zero(); 2]);
-        let mut value = RowVectors::<W>::zero();
         let mut counts = StepCounts::default();
-        for i in 0..=rows.len() {
+        for (i, &row) in rows.iter().enumerate() {
             if let Some(&coming) = rows.get(i + AHEAD) {
                 let coming = coming as usize - view.first_row;
                 RowVectors::<W>::prefetch(&grads, i + AHEAD);
+                RowVectors::<W>::prefetch(&values, i + AHEAD);
                 RowVectors::<W>::prefetch(&columns.as_ref(), coming);
                 RowVectors::<W>::prefetch(&exp_avg.as_ref(), coming);
                 RowVectors::<W>::prefetch(&exp_avg_sq.as_ref(), coming);
             }
-            if let Some(&row) = rows.get(i) {
-                gradients[i % 2].load(&grads, i);
-                let tables = [&columns.as_ref(), &exp_avg.as_ref(), &exp_avg_sq.as_ref()];
-                pasts[i % 2].load(tables, stamp, row as usize - view.first_row);
-            }
-            let Some(&row) = i.checked_sub(1).and_then(|i| rows.get(i)) else { continue };
-            let (past, g) = (&mut pasts[(i - 1) % 2], &gradients[(i - 1) % 2]);
+            let g = RowVectors::<W>::load(&grads, i);
             // Without their signs floats are ordered as integers, with what is not finite behind all others.
             let mut largest = 0;
             for l in 0..RowVectors::<W>::USED {
@@ -284,16 +266,17 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
                 continue;
             }
             let row = row as usize - view.first_row;
-            evaluate(at, past, &mut value);
-            let powers = at.adam().beta_power(at.now().saturating_sub(past.stamp));
-            let Past { m, v, .. } = past;
-            constants.step(&mut value, m, v, g, powers);
-            if at.adam().moments() == Moments::Bf16 {
-                round::<W>(m, v, view.uid[row], at.now() + 1);
-            }
+            let mut value = RowVectors::<W>::load(&values, i);
+            let mut m = RowVectors::<W>::load(&exp_avg.as_ref(), row);
+            let mut v = RowVectors::<W>::load(&exp_avg_sq.as_ref(), row);
+            let powers = at.adam().beta_power(at.now().saturating_sub(stamp[row]));
+            constants.step(&mut value, &mut m, &mut v, &g, powers);
             value.store(&mut columns, row);
             m.store(&mut exp_avg, row);
             v.store(&mut exp_avg_sq, row);
+            if at.adam().moments() == Moments::Bf16 {
+                round_row::<W>(&mut exp_avg, &mut exp_avg_sq, row, view.uid[row], at.now() + 1);
+            }
             stamp[row] = at.now() + 1;
             counts.updated += 1;
         }
@@ -301,13 +284,15 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
     }
 }
 
-/// Rounds the moments of a row to what is kept of them.
+/// Rounds the moments of a stored row that contains `steps` steps to what is kept of them.
 #[inline(never)]
-fn round<const W: usize>(m: &mut RowVectors<W>, v: &mut RowVectors<W>, uid: u64, steps: u32) {
-    let (mut m_block, mut v_block) = (m.to_block(), v.to_block());
+fn round_row<const W: usize>(m: &mut ColumnsMut<'_>, v: &mut ColumnsMut<'_>, row: usize, uid: u64, steps: u32) {
+    let [mut m_block, mut v_block] = [[0.0; BLOCK_LANES]; 2];
+    m.as_ref().load_row::<W>(row, &mut m_block);
+    v.as_ref().load_row::<W>(row, &mut v_block);
     round_block::<W>(&mut m_block, &mut v_block, uid, steps);
-    m.set(&m_block);
-    v.set(&v_block);
+    m.store_row::<W>(row, &m_block);
+    v.store_row::<W>(row, &v_block);
 }
 
 /// Constants of one ordinary Adam step.

@@ -6,23 +6,24 @@
 
 use super::columns::{Column, sh_n_width};
 
-/// Floats of a [`RowBlock`]: 16 for the columns of fixed width (14 used), 48 for `sh_n` (45 used at degree 3).
+/// Floats of a [`RowBlock`]: 16 for the columns of fixed width, the narrow ones (14 used), 48 for `sh_n` (45 used at degree 3).
 pub const BLOCK_LANES: usize = 64;
 /// First lane of `sh_n` in a [`RowBlock`].
 pub const SH_N_LANE: usize = 16;
 
-/// One row of any table with the shape of the columns: means 0..3, quats 3..7, scales 7..10, opacity 10,
-/// sh0 11..14, `sh_n` from [`SH_N_LANE`].
+/// One row of any table with the shape of the columns: means 0..3, opacity 3, quats 4..8, scales 8..11, sh0 12..15, `sh_n`
+/// from [`SH_N_LANE`]. No column lies across a multiple of four lanes: so a compiler can put the narrow ones together from
+/// quarters of a vector, without a way through memory.
 pub type RowBlock = [f32; BLOCK_LANES];
 
 /// First lane of a column in a [`RowBlock`].
 pub const fn first_lane(column: Column) -> usize {
     match column {
         Column::Means => 0,
-        Column::Quats => 3,
-        Column::Scales => 7,
-        Column::Opacities => 10,
-        Column::Sh0 => 11,
+        Column::Opacities => 3,
+        Column::Quats => 4,
+        Column::Scales => 8,
+        Column::Sh0 => 12,
         Column::ShN => SH_N_LANE,
     }
 }
@@ -71,6 +72,18 @@ impl<'a> ColumnsRef<'a> {
         self.opacities.len()
     }
 
+    /// The values of one column.
+    pub fn column(&self, column: Column) -> &'a [f32] {
+        match column {
+            Column::Means => self.means,
+            Column::Quats => self.quats,
+            Column::Scales => self.scales,
+            Column::Opacities => self.opacities,
+            Column::Sh0 => self.sh0,
+            Column::ShN => self.sh_n,
+        }
+    }
+
     /// The rows before `row`, and the rest.
     pub fn split_at(self, row: usize) -> (ColumnsRef<'a>, ColumnsRef<'a>) {
         let sh_degree = self.sh_degree;
@@ -98,20 +111,17 @@ impl<'a> ColumnsRef<'a> {
     /// vector moves. Lanes that the row does not use are left alone.
     #[inline(always)]
     pub fn load_row<const W: usize>(&self, row: usize, block: &mut RowBlock) {
-        if let Some(narrow) = block.first_chunk_mut() {
-            self.load_narrow(row, narrow);
-        }
+        block[..SH_N_LANE].copy_from_slice(&self.narrow(row));
         block[SH_N_LANE..SH_N_LANE + W].copy_from_slice(&self.sh_n[row * W..row * W + W]);
     }
 
-    /// Copies all of one row but `sh_n`, as [`ColumnsRef::load_row`] does.
+    /// The lanes of one row before `sh_n`.
     #[inline(always)]
-    pub fn load_narrow(&self, row: usize, lanes: &mut [f32; SH_N_LANE]) {
-        lanes[0..3].copy_from_slice(&self.means[row * 3..row * 3 + 3]);
-        lanes[3..7].copy_from_slice(&self.quats[row * 4..row * 4 + 4]);
-        lanes[7..10].copy_from_slice(&self.scales[row * 3..row * 3 + 3]);
-        lanes[10] = self.opacities[row];
-        lanes[11..14].copy_from_slice(&self.sh0[row * 3..row * 3 + 3]);
+    pub fn narrow(&self, row: usize) -> [f32; SH_N_LANE] {
+        let (m, q) = (&self.means.as_chunks::<3>().0[row], &self.quats.as_chunks::<4>().0[row]);
+        let (s, c) = (&self.scales.as_chunks::<3>().0[row], &self.sh0.as_chunks::<3>().0[row]);
+        let o = self.opacities[row];
+        [m[0], m[1], m[2], o, q[0], q[1], q[2], q[3], s[0], s[1], s[2], 0.0, c[0], c[1], c[2], 0.0]
     }
 
     /// [`ColumnsRef::load_row`] for a degree known only at run time.
@@ -171,20 +181,18 @@ impl<'a> ColumnsMut<'a> {
     /// Copies the lanes of a block into one row; `W` is the width of `sh_n`.
     #[inline(always)]
     pub fn store_row<const W: usize>(&mut self, row: usize, block: &RowBlock) {
-        if let Some(narrow) = block.first_chunk() {
-            self.store_narrow(row, narrow);
-        }
+        self.store_narrow(row, block);
         self.sh_n[row * W..row * W + W].copy_from_slice(&block[SH_N_LANE..SH_N_LANE + W]);
     }
 
     /// Copies the lanes of all columns but `sh_n` into one row.
     #[inline(always)]
-    pub fn store_narrow(&mut self, row: usize, lanes: &[f32; SH_N_LANE]) {
-        self.means[row * 3..row * 3 + 3].copy_from_slice(&lanes[0..3]);
-        self.quats[row * 4..row * 4 + 4].copy_from_slice(&lanes[3..7]);
-        self.scales[row * 3..row * 3 + 3].copy_from_slice(&lanes[7..10]);
-        self.opacities[row] = lanes[10];
-        self.sh0[row * 3..row * 3 + 3].copy_from_slice(&lanes[11..14]);
+    pub fn store_narrow(&mut self, row: usize, block: &RowBlock) {
+        self.means.as_chunks_mut::<3>().0[row].copy_from_slice(&block[0..3]);
+        self.opacities[row] = block[3];
+        self.quats.as_chunks_mut::<4>().0[row].copy_from_slice(&block[4..8]);
+        self.scales.as_chunks_mut::<3>().0[row].copy_from_slice(&block[8..11]);
+        self.sh0.as_chunks_mut::<3>().0[row].copy_from_slice(&block[12..15]);
     }
 
     /// [`ColumnsMut::store_row`] for a degree known only at run time.

@@ -89,7 +89,8 @@ pub fn train_step(
         outcome.skipped = !value.loss.is_finite();
     }
     if rendered.is_ok() && !outcome.skipped {
-        let of_step = StepGradients { step, rows: row_from_working, gradients, size: [camera.width, camera.height] };
+        let of_step =
+            StepGradients { step, rows: row_from_working, columns, gradients, size: [camera.width, camera.height] };
         let counts = update_pages(scene, &mut pages, &of_step, collects);
         outcome.updated = counts.updated as u64;
         outcome.rows_skipped = counts.skipped_non_finite as u64;

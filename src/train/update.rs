@@ -8,6 +8,7 @@ use crate::densify::stats::accumulate;
 use crate::optim::deferred::StepCounts;
 use crate::paging::pinned::PinnedPage;
 use crate::render::Gradients;
+use crate::scene::columns::Columns;
 use crate::scene::rows::ColumnsRef;
 use rayon::prelude::*;
 
@@ -17,6 +18,8 @@ pub(super) struct StepGradients<'a> {
     pub step: u32,
     /// Rows of the pinned pages, numbered through, ascending.
     pub rows: &'a [u32],
+    /// The listed rows at this step.
+    pub columns: &'a Columns,
     /// One entry per listed row.
     pub gradients: &'a Gradients,
     /// Width and height of the view.
@@ -30,6 +33,7 @@ struct PageShare<'a> {
     /// Where its rows lie in the list.
     listed: std::ops::Range<usize>,
     rows: &'a [u32],
+    values: ColumnsRef<'a>,
     grads: ColumnsRef<'a>,
     touched: bool,
 }
@@ -46,7 +50,7 @@ pub(super) fn update_pages(
     let counts: Vec<StepCounts> = shares
         .par_iter_mut()
         .map(|share| {
-            let counts = at.step_rows(share.page.rows_mut(share.first_row), share.rows, share.grads);
+            let counts = at.step_rows(share.page.rows_mut(share.first_row), share.rows, share.values, share.grads);
             share.touched = counts.updated > 0;
             counts
         })
@@ -70,9 +74,9 @@ pub(super) fn update_pages(
     })
 }
 
-/// Cuts listed rows and gradients at the borders of the pages.
+/// Cuts listed rows, their values and gradients at the borders of the pages.
 fn shares<'a>(pages: &'a mut [PinnedPage], of_step: &StepGradients<'a>) -> Vec<PageShare<'a>> {
-    let (mut rest, mut grads) = (of_step.rows, of_step.gradients.columns.view());
+    let (mut rest, mut values, mut grads) = (of_step.rows, of_step.columns.view(), of_step.gradients.columns.view());
     let (mut first_row, mut first_listed) = (0, 0);
     let mut shares = Vec::with_capacity(pages.len());
     for page in pages {
@@ -80,11 +84,20 @@ fn shares<'a>(pages: &'a mut [PinnedPage], of_step: &StepGradients<'a>) -> Vec<P
         first_row += page.meta.rows as usize;
         let count = rest.partition_point(|&row| (row as usize) < first_row);
         let (rows, rest_rows) = rest.split_at(count);
-        let (of_page, rest_grads) = grads.split_at(count);
+        let (own_values, rest_values) = values.split_at(count);
+        let (own_grads, rest_grads) = grads.split_at(count);
         first_listed += count;
         let listed = listed..first_listed;
-        shares.push(PageShare { page, first_row: first, listed, rows, grads: of_page, touched: false });
-        (rest, grads) = (rest_rows, rest_grads);
+        shares.push(PageShare {
+            page,
+            first_row: first,
+            listed,
+            rows,
+            values: own_values,
+            grads: own_grads,
+            touched: false,
+        });
+        (rest, values, grads) = (rest_rows, rest_values, rest_grads);
     }
     shares
 }

@@ -2,7 +2,8 @@
 //! copy on the same machine.
 //!
 //! Forwarding (a step's gather) reads value and both moments of every listed row, moves the value to now and writes it into
-//! the working set; the optimizer reads these and a gradient, and writes all three. That is 4 and 7 floats a parameter.
+//! the working set; the optimizer reads that value, both moments and a gradient, and writes value and moments. That is 4
+//! and 7 floats a parameter.
 //! Rows lie in pages as in a run. The three are timed in turns, so that whatever else the machine does hits them alike.
 //! Prints one line of JSON for each share of rows that is listed.
 
@@ -59,6 +60,8 @@ pub struct Args {
 struct World {
     scene: PagedScene,
     pages: Vec<PinnedPage>,
+    /// The rows of the last forwarding.
+    values: Columns,
     degree: u8,
     step: u32,
 }
@@ -116,10 +119,11 @@ impl World {
         let mut scene = PagedScene::new(&random_columns(rows, degree, 1.0, 1), pager, options)?;
         let all: Vec<_> = (0..scene.pager.index().len() as u32).map(gsscale::base::ids::PageNo).collect();
         let pages = scene.pager.acquire_pages(&all)?;
-        let mut world = World { scene, pages, degree, step: 0 };
+        let mut world = World { scene, pages, values: Columns::zeros(0, degree), degree, step: 0 };
         // Every row gets a past, a different one for every page.
         let everything: Vec<u32> = (0..rows as u32).collect();
         let gradients = random_columns(rows, degree, 1e-3, 2);
+        world.forward(&everything);
         world.optimize(&everything, &gradients);
         world.fall_asleep();
         Ok(world)
@@ -137,22 +141,29 @@ impl World {
         self.step = SLEEP_STEPS + 1;
     }
 
-    /// The optimizer's step on listed rows, page by page in parallel, as a training step does it.
+    /// The values of listed rows now.
+    fn forward(&mut self, rows: &[u32]) {
+        gather(&numbered(&self.pages), self.degree, &self.scene.rules.adam, self.step, rows, &mut self.values);
+        black_box(&self.values);
+    }
+
+    /// The optimizer's step on the rows that were forwarded, page by page in parallel, as a training step does it.
     fn optimize(&mut self, rows: &[u32], gradients: &Columns) {
         let at = self.scene.rules.adam.at(self.step);
-        let (mut rest, mut grads, mut first_row) = (rows, gradients.view(), 0);
+        let (mut rest, mut values, mut grads, mut first_row) = (rows, self.values.view(), gradients.view(), 0);
         let mut shares = Vec::with_capacity(self.pages.len());
         for page in &mut self.pages {
             let first = first_row;
             first_row += page.meta.rows as usize;
             let count = rest.partition_point(|&row| (row as usize) < first_row);
             let (own, rest_rows) = rest.split_at(count);
+            let (own_values, rest_values) = values.split_at(count);
             let (own_grads, rest_grads) = grads.split_at(count);
-            shares.push((page, first, own, own_grads));
-            (rest, grads) = (rest_rows, rest_grads);
+            shares.push((page, first, own, own_values, own_grads));
+            (rest, values, grads) = (rest_rows, rest_values, rest_grads);
         }
-        shares.into_par_iter().for_each(|(page, first, own, own_grads)| {
-            at.step_rows(page.rows_mut(first), own, own_grads);
+        shares.into_par_iter().for_each(|(page, first, own, own_values, own_grads)| {
+            at.step_rows(page.rows_mut(first), own, own_values, own_grads);
         });
         self.step += 1;
     }
@@ -163,21 +174,13 @@ impl World {
         let stamps = 4.0 * rows.len() as f64;
         let touched = [4.0 * 4.0 * parameters + stamps, 7.0 * 4.0 * parameters + 2.0 * stamps];
         let gradients = random_columns(rows.len(), self.degree, 1e-3, 3);
-        let mut out = Columns::zeros(0, self.degree);
         let mut copy = PlainCopy::new(touched[1] as usize / 8);
         let mut rates: [Vec<f64>; 3] = Default::default();
         // The first round takes memory from the system and is not counted.
         for round in 0..=rounds {
             self.fall_asleep();
-            let seconds = [
-                timed(|| {
-                    let tables = numbered(&self.pages);
-                    gather(&tables, self.degree, &self.scene.rules.adam, self.step, rows, &mut out);
-                    black_box(&out);
-                }),
-                timed(|| self.optimize(rows, &gradients)),
-                timed(|| copy.run()),
-            ];
+            let seconds =
+                [timed(|| self.forward(rows)), timed(|| self.optimize(rows, &gradients)), timed(|| copy.run())];
             if round > 0 {
                 let bytes = [touched[0], touched[1], copy.bytes()];
                 (0..3).for_each(|i| rates[i].push(bytes[i] / seconds[i]));
