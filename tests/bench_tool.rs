@@ -92,8 +92,12 @@ fn touched_bytes_are_timed_beside_a_copy() {
     let listed: Vec<f64> = lines.iter().map(|line| number(line, "rows_listed")).collect();
     assert!(listed[0] == 5000.0 && (2200.0..2800.0).contains(&listed[1]), "{listed:?}");
     for line in &lines {
-        for key in ["forwarding_over_copy", "optimizer_over_copy", "both_over_copy", "copy_bytes_per_second"] {
-            assert!(number(line, key) > 0.0, "{line}");
+        for of in ["forwarding", "optimizer", "copy", "plain_forwarding", "plain_optimizer"] {
+            assert!(number(line, &format!("{of}_bytes_per_second")) > 0.0, "{line}");
+        }
+        for of in ["forwarding", "optimizer", "both"] {
+            assert!(number(line, &format!("{of}_over_copy")) > 0.0, "{line}");
+            assert!(number(line, &format!("{of}_over_plain")) > 0.0, "{line}");
         }
     }
 }

@@ -27,9 +27,15 @@ fn every_run_ends_with_a_report_that_stands_alone() {
     let folder = TempDir::new().unwrap();
     let out = small_run(folder.path());
     let html = std::fs::read_to_string(out.join("report.html")).expect("the run wrote its report");
-    for part in
-        ["PSNR, held-out views", "Gaussians", "<svg", "data:image/jpeg;base64,", "class=\"slider\"", "ssim-lambda"]
-    {
+    for part in [
+        "PSNR, held-out views",
+        "and of the held-out views",
+        "Gaussians",
+        "<svg",
+        "data:image/jpeg;base64,",
+        "class=\"slider\"",
+        "ssim-lambda",
+    ] {
         assert!(html.contains(part), "{part} is missing");
     }
     // The namespace of SVG is a name, not an address that is fetched.

@@ -197,8 +197,9 @@ fn an_interrupt_finishes_the_step_and_writes_the_scene() {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 16, 96, 64, 400);
     let out = folder.path().join("run");
-    let mut child = std::process::Command::new(env!("CARGO_BIN_EXE_gsscale-train"))
-        .args([text(&scene), "--out", text(&out), "--quiet", "--log-every", "1", "--steps", "1000000"])
+    let child = std::process::Command::new(env!("CARGO_BIN_EXE_gsscale-train"))
+        .args([text(&scene), "--out", text(&out), "--log-every", "1", "--steps", "1000000"])
+        .stderr(std::process::Stdio::piped())
         .spawn()
         .unwrap();
     let metrics = out.join("metrics.jsonl");
@@ -208,10 +209,13 @@ fn an_interrupt_finishes_the_step_and_writes_the_scene() {
         std::thread::sleep(std::time::Duration::from_millis(20));
     }
     std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
-    let status = child.wait().unwrap();
-    assert_eq!(status.code(), Some(130));
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130));
     assert!(out.join("point_cloud.ply").is_file());
     let summary = summary(&out);
     assert_eq!(summary["finished"], false);
     assert!(summary["steps"].as_u64().unwrap() > 0);
+    // There are held-out photos, but nobody looked at them: neither the words nor the report say otherwise.
+    assert!(stderr(&output).contains("of training; not evaluated"), "{}", stderr(&output));
+    assert!(!std::fs::read_to_string(out.join("report.html")).unwrap().contains("held-out"));
 }

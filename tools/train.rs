@@ -180,10 +180,14 @@ impl Drop for Scratch {
 
 fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
     if let (Some(summary), false) = (&outcome.summary, quiet) {
-        let test = summary.test.map_or(String::from("no photos held out"), |t| {
-            let corrected = t.words_of_color_corrected();
-            format!("test PSNR {:.2} dB, SSIM {:.4}{corrected} on {} held-out views", t.psnr, t.ssim, t.views)
-        });
+        let test = match &summary.test {
+            Some(t) => {
+                let corrected = t.words_of_color_corrected();
+                format!("test PSNR {:.2} dB, SSIM {:.4}{corrected} on {} held-out views", t.psnr, t.ssim, t.views)
+            }
+            None if summary.finished => String::from("no photos held out"),
+            None => String::from("not evaluated"),
+        };
         eprintln!(
             "{} {} steps, {} Gaussians, {:.1} s of training; {test}",
             if summary.finished { "done:" } else { "stopped after" },

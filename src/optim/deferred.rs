@@ -5,7 +5,7 @@
 //! whom rows are read, evicted or loaded. Which rows are drawn, and who hands them in, is not decided here.
 //!
 //! Invariants: 1. a row is rewritten only when its gradient is non-zero in some column or an event reaches it
-//! ([`RowsNow::settle_row`]), and then whole; 2. one function evaluates, for reading and for updating; 3. the same
+//! ([`RowsNow::settle_row`]), and then whole; 2. one function evaluates, and an update goes on from what it gave; 3. the same
 //! bits on every instruction path and for any number of threads; 4. nothing non-finite enters the state.
 
 use super::adam::AdamConfig;
@@ -80,7 +80,7 @@ impl DeferredAdam {
     /// ([`super::method::Method::Sparse`]).
     #[must_use]
     pub fn without_catch_up(self) -> Self {
-        DeferredAdam { tables: self.tables.still(), beta_powers: Vec::new(), ..self }
+        DeferredAdam { tables: self.tables.still(), beta_powers: vec![[1.0; 2]; POWERS], ..self }
     }
 
     /// What rows keep of their moments.
@@ -210,8 +210,9 @@ impl<'a> AdamNow<'a> {
         if gap < RECENT { &self.recent[gap] } else { self.adam.tables.limit(stamp) }
     }
 
-    /// The step on a view of rows: as [`DeferredAdam::step`], `rows` counted in the table that the view was cut from. `values`
-    /// are the listed rows as they are now, as [`AdamNow::evaluate_rows`] gives them: whoever has gradients had these before.
+    /// The step on a view of rows: as [`DeferredAdam::step`], `rows` counted in the table that the view was cut from, each
+    /// larger than the one before. `values` are the listed rows as they are now, as [`AdamNow::evaluate_rows`] gives them:
+    /// whoever has gradients had these before. Panics when the numbers of rows, or the degrees, do not fit each other.
     pub fn step_rows(
         &self,
         view: RowsMut<'_>,
@@ -239,8 +240,12 @@ impl<'a> AdamNow<'a> {
                 skipped_non_finite: a.skipped_non_finite + b.skipped_non_finite,
             };
         }
+        let degree = view.columns.sh_degree;
+        assert_eq!([values.rows(), grads.rows()], [rows.len(); 2], "values and gradients of the listed rows");
+        assert_eq!([values.sh_degree, grads.sh_degree], [degree; 2], "values or gradients of another degree");
+        debug_assert!(rows.is_sorted_by(|a, b| a < b), "listed rows ascend");
         debug_assert!(self.are_values_of(&view.as_ref(), rows, &values), "values of another step");
-        match grads.sh_degree {
+        match degree {
             0 => dispatch(self.adam.simd, StepRows::<0> { at: self, view, rows, values, grads }),
             1 => dispatch(self.adam.simd, StepRows::<9> { at: self, view, rows, values, grads }),
             2 => dispatch(self.adam.simd, StepRows::<24> { at: self, view, rows, values, grads }),

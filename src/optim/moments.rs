@@ -5,12 +5,16 @@
 //! what is cut off, so that the mean is right. Rounding to nearest would stop a second moment from ever changing by
 //! less than 0.4 % at a time, which at beta2 = 0.999 is nearly always.
 //!
-//! Invariants: 1. the draw depends on the row's uid, the number of steps contained and the lane, not on who holds the
-//! row or when it is stored; 2. zero stays zero, and what is exact stays as it is; 3. the lower halves are zero, so
+//! Invariants: 1. the draw depends on the row's uid, the number of steps contained and the column's element, not on who
+//! holds the row, when it is stored, or in which order a block has its lanes; 2. zero stays zero, and what is exact stays as it is; 3. the lower halves are zero, so
 //! that pages can leave them out.
 
 use crate::base::rng::mix64;
 use crate::scene::rows::{RowBlock, SH_N_LANE};
+
+/// The number that each lane of the narrow columns has in draws: by means, quats, scales, opacity, sh0, whatever the order of
+/// the lanes, which may change while the bits of a run may not.
+const DRAW_FROM_LANE: [u32; SH_N_LANE] = [0, 1, 2, 10, 3, 4, 5, 6, 7, 8, 9, 14, 11, 12, 13, 15];
 
 /// What a run keeps of moments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -43,7 +47,7 @@ pub(crate) fn round_block<const W: usize>(m: &mut RowBlock, v: &mut RowBlock, ui
     let key = mix64(uid ^ mix64(u64::from(steps)));
     let (low, high) = (key as u32, (key >> 32) as u32);
     for l in 0..SH_N_LANE {
-        (m[l], v[l]) = rounded(m[l], v[l], low, high, l as u32);
+        (m[l], v[l]) = rounded(m[l], v[l], low, high, DRAW_FROM_LANE[l]);
     }
     for l in SH_N_LANE..SH_N_LANE + W.next_multiple_of(16) {
         (m[l], v[l]) = rounded(m[l], v[l], low, high, l as u32);
@@ -51,9 +55,9 @@ pub(crate) fn round_block<const W: usize>(m: &mut RowBlock, v: &mut RowBlock, ui
 }
 
 #[inline(always)]
-fn rounded(m: f32, v: f32, low: u32, high: u32, lane: u32) -> (f32, f32) {
-    // The finaliser of MurmurHash3 over the lane, with both halves of the key: 16 bits for each moment.
-    let mut draw = low ^ lane.wrapping_mul(0x9e37_79b9);
+fn rounded(m: f32, v: f32, low: u32, high: u32, number: u32) -> (f32, f32) {
+    // The finaliser of MurmurHash3 over the number, with both halves of the key: 16 bits for each moment.
+    let mut draw = low ^ number.wrapping_mul(0x9e37_79b9);
     draw = (draw ^ (draw >> 16)).wrapping_mul(0x85eb_ca6b).wrapping_add(high);
     draw = (draw ^ (draw >> 13)).wrapping_mul(0xc2b2_ae35);
     draw ^= draw >> 16;

@@ -4,13 +4,13 @@
 //! A row is worked on in whole vectors: one of the narrow columns, the others of `sh_n`. Where the last of these would not
 //! be full it starts earlier instead, and what it shares with the one before it comes to the same in both: so every
 //! load and store is one of a whole vector, and none has to wait for parts of another. That is right in place because a row is
-//! loaded whole before any of it is stored. From load to store a row stays in registers.
+//! loaded whole before any of it is stored. Where there are registers enough (AVX-512) it stays in them from load to store.
 //!
-//! The step takes the values of its rows from whoever forwarded them: what they are now costs a root and a quotient for
-//! every value, more than all the rest of the step.
+//! The step takes the values of its rows from whoever forwarded them: to find them again would cost a second root and a
+//! second quotient for every value.
 //!
 //! Floor: the bytes, 4 floats a parameter for forwarding and 7 for the step; `gsscale-bench touched` prints both beside a
-//! plain copy.
+//! plain copy and beside plain passes of the same reads and writes.
 //!
 //! Invariant: the bits are those of [`RowsNow`], whatever the instruction path.
 
@@ -227,7 +227,7 @@ pub(super) fn evaluate_block(at: &AdamNow<'_>, value: &mut RowBlock, m: &RowBloc
     }
 }
 
-/// One optimizer step on listed rows of a view.
+/// One optimizer step on listed rows of a view, which ascend: one listed twice would lose its first step.
 pub(super) struct StepRows<'k, 'a, const W: usize> {
     pub at: &'k AdamNow<'a>,
     pub view: RowsMut<'k>,

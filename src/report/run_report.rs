@@ -139,15 +139,13 @@ fn training_charts(metrics: &[Value]) -> Vec<(String, String)> {
     let loss = |m: &Value| m["loss"].as_f64().filter(|l| *l < 1e30);
     let mut charts = Vec::new();
     for (x, unit) in [("step", "step"), ("seconds", "seconds of training")] {
-        let chart = Chart::new("PSNR", unit, "dB").with("training view", curve(metrics, x, train), Mark::Line).with(
-            "held-out views",
-            curve(metrics, x, test),
-            Mark::LineAndDots,
-        );
-        charts.push((
-            chart.svg(),
-            format!("PSNR of the view of each logged step and of the held-out views, over {unit}."),
-        ));
+        let mut chart = Chart::new("PSNR", unit, "dB").with("training view", curve(metrics, x, train), Mark::Line);
+        let (held_out, mut of) = (curve(metrics, x, test), "");
+        if !held_out.is_empty() {
+            chart = chart.with("held-out views", held_out, Mark::LineAndDots);
+            of = " and of the held-out views";
+        }
+        charts.push((chart.svg(), format!("PSNR of the view of each logged step{of}, over {unit}.")));
         let chart = Chart::new("Loss", unit, "loss").with("", curve(metrics, x, loss), Mark::Line).zero_based();
         charts.push((chart.svg(), format!("Loss of the view of each logged step, over {unit}.")));
     }

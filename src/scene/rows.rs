@@ -12,7 +12,7 @@ pub const BLOCK_LANES: usize = 64;
 pub const SH_N_LANE: usize = 16;
 
 /// One row of any table with the shape of the columns: means 0..3, opacity 3, quats 4..8, scales 8..11, sh0 12..15, `sh_n`
-/// from [`SH_N_LANE`]. No column lies across a multiple of four lanes: so a compiler can put the narrow ones together from
+/// from [`SH_N_LANE`]. No narrow column lies across a multiple of four lanes: so a compiler can put the narrow ones together from
 /// quarters of a vector, without a way through memory.
 pub type RowBlock = [f32; BLOCK_LANES];
 
@@ -108,7 +108,7 @@ impl<'a> ColumnsRef<'a> {
     }
 
     /// Copies one row into the lanes of a block. `W` is the width of `sh_n`: fixed, so that the copy is a few
-    /// vector moves. Lanes that the row does not use are left alone.
+    /// vector moves. Lanes of `sh_n` beyond it are left alone.
     #[inline(always)]
     pub fn load_row<const W: usize>(&self, row: usize, block: &mut RowBlock) {
         block[..SH_N_LANE].copy_from_slice(&self.narrow(row));

@@ -1,7 +1,8 @@
 //! One training step, top to bottom. Nothing here opens a file.
 //!
 //! Invariants: 1. every pinned page is released, whatever happens; 2. a step whose rendering fails, or whose loss is not
-//! finite, changes no row, except that events which were due on the pinned pages are applied; 3. the result is the same
+//! finite, changes no row, except that events which were due on the pinned pages are applied; 3. from gathering to the update
+//! nobody changes the pinned rows or the working set's values: the update goes on from these; 4. the result is the same
 //! for any number of threads and frames.
 
 use super::catch_up::{gather, visible_rows};
@@ -18,7 +19,7 @@ use crate::scene::image::Target;
 pub struct WorkingSet {
     /// Row of the pinned pages, numbered through, for each row of the working set, ascending.
     pub row_from_working: Vec<u32>,
-    /// Values now.
+    /// Values now; the renderer reads them, and the update goes on from them.
     pub columns: Columns,
     /// Gradients of the step.
     pub gradients: Gradients,

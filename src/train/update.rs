@@ -18,7 +18,7 @@ pub(super) struct StepGradients<'a> {
     pub step: u32,
     /// Rows of the pinned pages, numbered through, ascending.
     pub rows: &'a [u32],
-    /// The listed rows at this step.
+    /// The listed rows as they were gathered at this step.
     pub columns: &'a Columns,
     /// One entry per listed row.
     pub gradients: &'a Gradients,

@@ -22,7 +22,7 @@ A published run, ours beside the paper's figures: gsscale-bench run rubble --dat
 Other measurements: gsscale-bench tiers --help (through the disk tier against in memory),
 gsscale-bench orders --help (orders of views: quality against bytes), gsscale-bench commit --help (what commits cost),
 gsscale-bench sizes --help (step time against the size of the scene), gsscale-bench touched --help (optimizer and
-forwarding against a plain copy), gsscale-bench bounded --help (a city far larger than memory under a hard limit),
+forwarding against plain passes), gsscale-bench bounded --help (a city far larger than memory under a hard limit),
 gsscale-bench ladder --help (from naive offloading to memory), gsscale-bench pareto --help (what every knob costs and
 saves), gsscale-bench compare --help (finished runs).
 

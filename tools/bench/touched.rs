@@ -4,7 +4,10 @@
 //! Forwarding (a step's gather) reads value and both moments of every listed row, moves the value to now and writes it into
 //! the working set; the optimizer reads that value, both moments and a gradient, and writes value and moments. That is 4
 //! and 7 floats a parameter.
-//! Rows lie in pages as in a run. The three are timed in turns, so that whatever else the machine does hits them alike.
+//! The optimizer also fetches the old value's line, which it overwrites in parts; that is not counted.
+//! A large copy writes past the caches; whoever computes what it writes fetches it first. So beside the copy stand two
+//! passes of plain additions over as many tables, read and written alike: what there is to reach.
+//! Rows lie in pages as in a run. All are timed in turns, so that whatever else the machine does hits them alike.
 //! Prints one line of JSON for each share of rows that is listed.
 
 use super::statistics::median;
@@ -31,12 +34,13 @@ Examples:
   gsscale-bench touched --rows 2000000 --rounds 21 --listed 100,65,10 --threads 1
 
 65 % is about what views list of the rows in their pages. The copy is one of each thread's own floats, as many bytes in all
-as the optimizer touches; bytes read and bytes written both count.";
+as the optimizer touches; bytes read and bytes written both count. The plain passes are additions that read and write
+tables as forwarding and the optimizer do. Takes 5 kB a row at degree 3.";
 
 /// Steps from the oldest stamp to now: rows sleep that long at most.
 const SLEEP_STEPS: u32 = 500;
 
-/// Times forwarding and the optimizer against a plain copy, and prints a line of JSON for each share of rows.
+/// Times forwarding and the optimizer against a plain copy and plain passes, and prints a line of JSON for each share of rows.
 #[derive(Parser)]
 #[command(name = "gsscale-bench touched", bin_name = "gsscale-bench touched", version, after_help = EXAMPLES)]
 pub struct Args {
@@ -175,28 +179,40 @@ impl World {
         let touched = [4.0 * 4.0 * parameters + stamps, 7.0 * 4.0 * parameters + 2.0 * stamps];
         let gradients = random_columns(rows.len(), self.degree, 1e-3, 3);
         let mut copy = PlainCopy::new(touched[1] as usize / 8);
-        let mut rates: [Vec<f64>; 3] = Default::default();
+        let mut plain = PlainPasses::new(rows.len() * row_width(self.degree));
+        let bytes = [touched[0], touched[1], copy.bytes(), plain.floats() * 16.0, plain.floats() * 28.0];
+        let mut rates: [Vec<f64>; 5] = Default::default();
         // The first round takes memory from the system and is not counted.
         for round in 0..=rounds {
             self.fall_asleep();
-            let seconds =
-                [timed(|| self.forward(rows)), timed(|| self.optimize(rows, &gradients)), timed(|| copy.run())];
+            let seconds = [
+                timed(|| self.forward(rows)),
+                timed(|| self.optimize(rows, &gradients)),
+                timed(|| copy.run()),
+                timed(|| plain.forward()),
+                timed(|| plain.optimize()),
+            ];
             if round > 0 {
-                let bytes = [touched[0], touched[1], copy.bytes()];
-                (0..3).for_each(|i| rates[i].push(bytes[i] / seconds[i]));
+                (0..5).for_each(|i| rates[i].push(bytes[i] / seconds[i]));
             }
         }
-        let [forwarding, optimizer, plain] = &rates;
-        let ratio = |of: &[f64]| median(of.iter().zip(plain).map(|(own, plain)| own / plain));
+        let both = |[forwarding, optimizer]: [usize; 2]| -> Vec<f64> {
+            let seconds = |i: usize| touched[0] / rates[forwarding][i] + touched[1] / rates[optimizer][i];
+            (0..rounds as usize).map(|i| (touched[0] + touched[1]) / seconds(i)).collect()
+        };
+        let ratio = |own: &[f64], other: &[f64]| median(own.iter().zip(other).map(|(own, other)| own / other));
+        let [forwarding, optimizer, copied, plain_forwarding, plain_optimizer] = &rates;
         json!({
             "forwarding_bytes_per_second": median(forwarding.iter().copied()),
             "optimizer_bytes_per_second": median(optimizer.iter().copied()),
-            "copy_bytes_per_second": median(plain.iter().copied()),
-            "forwarding_over_copy": ratio(forwarding), "optimizer_over_copy": ratio(optimizer),
-            "both_over_copy": median((0..plain.len()).map(|i| {
-                let seconds = touched[0] / forwarding[i] + touched[1] / optimizer[i];
-                (touched[0] + touched[1]) / seconds / plain[i]
-            })),
+            "copy_bytes_per_second": median(copied.iter().copied()),
+            "plain_forwarding_bytes_per_second": median(plain_forwarding.iter().copied()),
+            "plain_optimizer_bytes_per_second": median(plain_optimizer.iter().copied()),
+            "forwarding_over_copy": ratio(forwarding, copied), "optimizer_over_copy": ratio(optimizer, copied),
+            "both_over_copy": ratio(&both([0, 1]), copied),
+            "forwarding_over_plain": ratio(forwarding, plain_forwarding),
+            "optimizer_over_plain": ratio(optimizer, plain_optimizer),
+            "both_over_plain": ratio(&both([0, 1]), &both([3, 4])),
         })
     }
 }
@@ -228,5 +244,48 @@ impl PlainCopy {
     fn run(&mut self) {
         self.pairs.par_iter_mut().for_each(|(from, to)| to.copy_from_slice(black_box(from)));
         black_box(&self.pairs);
+    }
+}
+
+/// Additions over five tables of floats, one stretch for each thread.
+struct PlainPasses {
+    tables: Vec<[Vec<f32>; 5]>,
+}
+
+impl PlainPasses {
+    /// Over tables of this many floats in all.
+    fn new(floats: usize) -> PlainPasses {
+        let threads = rayon::current_num_threads();
+        let each = floats.div_ceil(threads).max(1);
+        PlainPasses { tables: (0..threads).map(|_| std::array::from_fn(|_| vec![1.0; each])).collect() }
+    }
+
+    /// Floats of a table, all stretches.
+    fn floats(&self) -> f64 {
+        self.tables.iter().map(|[a, ..]| a.len() as f64).sum()
+    }
+
+    /// As forwarding: reads value and moments, writes what they come to.
+    fn forward(&mut self) {
+        self.tables.par_iter_mut().for_each(|[value, m, v, now, _]| forward_plainly(value, m, v, now));
+        black_box(&self.tables);
+    }
+
+    /// As the optimizer: reads what they came to, moments and gradients, writes value and moments.
+    fn optimize(&mut self) {
+        self.tables.par_iter_mut().for_each(|[value, m, v, now, grads]| optimize_plainly(value, m, v, now, grads));
+        black_box(&self.tables);
+    }
+}
+
+fn forward_plainly(value: &[f32], m: &[f32], v: &[f32], now: &mut [f32]) {
+    for (((value, m), v), now) in value.iter().zip(m).zip(v).zip(now) {
+        *now = *value + *m + *v;
+    }
+}
+
+fn optimize_plainly(value: &mut [f32], m: &mut [f32], v: &mut [f32], now: &[f32], grads: &[f32]) {
+    for ((((value, m), v), now), g) in value.iter_mut().zip(m).zip(v).zip(now).zip(grads) {
+        (*value, *m, *v) = (*now + *g, *m + *g, *v + *g);
     }
 }
