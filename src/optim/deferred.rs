@@ -181,6 +181,7 @@ impl DeferredAdam {
         }
     }
 
+    /// The same beyond the table.
     #[cold]
     #[inline(never)]
     fn far_beta_power(&self, k: u32) -> [f32; 2] {

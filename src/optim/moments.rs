@@ -78,8 +78,19 @@ mod tests {
     use crate::optim::deferred::DeferredAdam;
     use crate::optim::rates::Rates;
     use crate::scene::columns::{Column, Columns};
-    use crate::scene::rows::BLOCK_LANES;
+    use crate::scene::rows::{BLOCK_LANES, first_lane};
     use crate::scene::state::SceneState;
+
+    #[test]
+    fn draws_are_numbered_by_the_columns_whatever_their_lanes() {
+        let mut number = 0;
+        for column in Column::ALL.into_iter().filter(|&c| c != Column::ShN) {
+            for i in 0..column.width(3) {
+                assert_eq!(DRAW_FROM_LANE[first_lane(column) + i], number, "{column:?} {i}");
+                number += 1;
+            }
+        }
+    }
 
     fn nearest(x: f32) -> f32 {
         cut(x, 0x7fff + (x.to_bits() >> 16 & 1))

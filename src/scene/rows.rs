@@ -72,7 +72,7 @@ impl<'a> ColumnsRef<'a> {
         self.opacities.len()
     }
 
-    /// The values of one column.
+    /// The values of one column, `[rows][width]`.
     pub fn column(&self, column: Column) -> &'a [f32] {
         match column {
             Column::Means => self.means,
@@ -115,7 +115,7 @@ impl<'a> ColumnsRef<'a> {
         block[SH_N_LANE..SH_N_LANE + W].copy_from_slice(&self.sh_n[row * W..row * W + W]);
     }
 
-    /// The lanes of one row before `sh_n`.
+    /// The lanes of one row before `sh_n`, as a [`RowBlock`] has them. Panics beyond the last row.
     #[inline(always)]
     pub fn narrow(&self, row: usize) -> [f32; SH_N_LANE] {
         let (m, q) = (&self.means.as_chunks::<3>().0[row], &self.quats.as_chunks::<4>().0[row]);
