@@ -6,6 +6,7 @@ use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::optim::adam::{AdamConfig, DenseAdam};
 use gsscale::optim::deferred::DeferredAdam;
+use gsscale::optim::moments::Moments;
 use gsscale::optim::rates::Rates;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::rows::{BLOCK_LANES, RowsNow, first_lane};
@@ -216,6 +217,45 @@ fn gradients_that_are_not_finite_or_zero_leave_their_row_alone() {
     // A runaway log-scale is brought back to the limit when its row is updated.
     assert_eq!(state.columns.scales[15], 30.0);
     assert!(Column::ALL.into_iter().all(|c| state.columns.column(c).iter().all(|x| x.is_finite())));
+}
+
+/// A row is loaded together with a little of the one behind it, and the last row of a table is worked on by other code.
+#[test]
+fn a_row_comes_to_the_same_whatever_rows_lie_beside_it() {
+    for (degree, moments) in [(0, Moments::F32), (1, Moments::F32), (2, Moments::Bf16), (3, Moments::F32)] {
+        let rows = 23;
+        let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), SimdPath::best());
+        let adam = adam.with_moments(moments);
+        let mut together = SceneState::from_columns(random_columns(rows, degree, 1.0, 8));
+        let mut alone: Vec<SceneState> = (0..rows as u32).map(|row| together.select(&[row])).collect();
+        for (step, now) in [3, 4, 40, 900].into_iter().enumerate() {
+            let listed: Vec<u32> = (0..rows as u32).filter(|row| (row + step as u32) % 4 != 0).collect();
+            let mut grads = grads_at(&listed, degree, now);
+            for i in 0..listed.len() {
+                // Rows without a gradient and rows that are skipped lie before and behind others.
+                let of = [None, Some(0.0), None, Some(f32::NAN), Some(0.0), None, None][(i + step) % 7];
+                if let Some(value) = of {
+                    Column::ALL.into_iter().for_each(|column| grads.row_mut(column, i).fill(value));
+                }
+            }
+            let counts = adam.step(&mut together, &listed, &grads, now);
+            let mut counted = (0, 0);
+            for (i, &row) in listed.iter().enumerate() {
+                let mut own = Columns::zeros(1, degree);
+                Column::ALL.into_iter().for_each(|c| own.row_mut(c, 0).copy_from_slice(grads.row(c, i)));
+                let of_row = adam.step(&mut alone[row as usize], &[0], &own, now);
+                counted = (counted.0 + of_row.updated, counted.1 + of_row.skipped_non_finite);
+            }
+            assert_eq!((counts.updated, counts.skipped_non_finite), counted);
+            assert!(counted.0 > 0 && counted.1 > 0 && counted.0 + counted.1 < listed.len());
+            let values = evaluate_all(&together, &adam, now + 20);
+            for (row, own) in alone.iter().enumerate() {
+                assert_eq!(&together.select(&[row as u32]), own, "row {row} at degree {degree}");
+                let own_values = evaluate_all(own, &adam, now + 20);
+                Column::ALL.into_iter().for_each(|c| assert_eq!(values.row(c, row), own_values.row(c, 0)));
+            }
+        }
+    }
 }
 
 #[test]

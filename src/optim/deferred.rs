@@ -84,6 +84,7 @@ impl DeferredAdam {
     }
 
     /// What rows keep of their moments.
+    #[inline(always)]
     pub fn moments(&self) -> Moments {
         self.moments
     }
@@ -132,6 +133,7 @@ impl DeferredAdam {
         &self.lane_rates
     }
 
+    #[inline(always)]
     pub(super) fn tables(&self) -> &DriftTables {
         &self.tables
     }
@@ -195,6 +197,7 @@ impl DeferredAdam {
 
 impl<'a> AdamNow<'a> {
     /// The optimizer.
+    #[inline(always)]
     pub fn adam(&self) -> &'a DeferredAdam {
         self.adam
     }
@@ -286,6 +289,7 @@ impl<'a> AdamNow<'a> {
 }
 
 impl RowsNow for AdamNow<'_> {
+    #[inline(always)]
     fn now(&self) -> u32 {
         self.now
     }

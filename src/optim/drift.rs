@@ -136,6 +136,7 @@ impl DriftTables {
     }
 
     /// The movement over any number of further steps, from a state of `stamp` steps.
+    #[inline(always)]
     pub(crate) fn limit(&self, stamp: u32) -> &Drift {
         &self.limits[(stamp as usize).min(self.limits.len() - 1)]
     }
@@ -212,6 +213,12 @@ pub(crate) fn needs_direct_sum(m: f32, v: f32, floor: f32) -> bool {
 #[inline(always)]
 pub(crate) fn flush(x: f32) -> f32 {
     if x.abs() < f32::MIN_POSITIVE { 0.0 } else { x }
+}
+
+/// [`flush`] of what is not negative, as second moments are.
+#[inline(always)]
+pub(crate) fn flush_positive(x: f32) -> f32 {
+    if x < f32::MIN_POSITIVE { 0.0 } else { x }
 }
 
 fn rounded(t: [f64; 6]) -> Drift {

@@ -9,3 +9,4 @@ pub mod method;
 pub mod moments;
 pub mod rates;
 mod row_kernels;
+mod row_vectors;

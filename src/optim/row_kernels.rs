@@ -1,10 +1,8 @@
 //! The two loops that go through all the optimizer's bytes: forwarding (values of listed rows as they are now) and the
 //! step, compiled for every instruction path.
 //!
-//! A row is worked on in whole vectors: one of the narrow columns, the others of `sh_n`. Where the last of these would not
-//! be full it starts earlier instead, and what it shares with the one before it comes to the same in both: so every
-//! load and store is one of a whole vector, and none has to wait for parts of another. That is right in place because a row is
-//! loaded whole before any of it is stored. Where there are registers enough (AVX-512) it stays in them from load to store.
+//! A row is worked on in whole vectors ([`super::row_vectors`]), which where there are registers enough (AVX-512) stay in them
+//! from load to store.
 //!
 //! The step takes the values of its rows from whoever forwarded them: to find them again would cost a second root and a
 //! second quotient for every value.
@@ -16,9 +14,10 @@
 
 use super::adam::AdamConfig;
 use super::deferred::{AdamNow, StepCounts};
-use super::drift::{EpsFloor, drifted, flush, needs_direct_sum};
+use super::drift::{EpsFloor, drifted, flush, flush_positive, needs_direct_sum};
 use super::moments::{Moments, round_block};
-use crate::base::simd::{Kernel, LANES, prefetch};
+use super::row_vectors::{RowVectors, Table, TableMut};
+use crate::base::simd::{Kernel, LANES};
 use crate::scene::columns::Column;
 use crate::scene::rows::{
     BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, RowsNow, SH_N_LANE, first_lane,
@@ -36,72 +35,6 @@ const AHEAD: usize = 16;
 /// The sign of a float.
 const SIGN: u32 = 1 << 31;
 
-/// One row of columns whose `sh_n` is `W` wide: the lanes of a [`RowBlock`] before `sh_n`, then the vectors of `sh_n`. Lanes
-/// that hold nothing are zero.
-#[derive(Clone, Copy)]
-struct RowVectors<const W: usize>(RowBlock);
-
-impl<const W: usize> RowVectors<W> {
-    /// Lanes in use.
-    const USED: usize = SH_N_LANE + W.next_multiple_of(LANES);
-
-    /// The vectors of `sh_n`: the lane that each starts at, where in `sh_n` that is, and how many of its lanes are in use.
-    #[inline(always)]
-    fn parts() -> impl Iterator<Item = (usize, usize, usize)> {
-        (0..W.div_ceil(LANES)).map(|i| {
-            let start = if W < LANES { 0 } else { (i * LANES).min(W - LANES) };
-            (SH_N_LANE + i * LANES, start, W.min(LANES))
-        })
-    }
-
-    #[inline(always)]
-    fn load(columns: &ColumnsRef<'_>, row: usize) -> Self {
-        let mut block = [0.0; BLOCK_LANES];
-        block[..SH_N_LANE].copy_from_slice(&columns.narrow(row));
-        let sh_n = &columns.sh_n[row * W..row * W + W];
-        for (lane, start, len) in Self::parts() {
-            block[lane..lane + len].copy_from_slice(&sh_n[start..start + len]);
-        }
-        RowVectors(block)
-    }
-
-    /// Asks for `sh_n` of a row that will be loaded soon, but for what lies in a last line of a few values; the narrow
-    /// columns come by themselves, many rows to a line.
-    #[inline(always)]
-    fn prefetch(columns: &ColumnsRef<'_>, row: usize) {
-        for line in 0..W.div_ceil(LANES) {
-            prefetch(columns.sh_n, row * W + line * LANES);
-        }
-    }
-
-    #[inline(always)]
-    fn store(&self, columns: &mut ColumnsMut<'_>, row: usize) {
-        columns.store_narrow(row, &self.0);
-        let sh_n = &mut columns.sh_n[row * W..row * W + W];
-        for (lane, start, len) in Self::parts() {
-            sh_n[start..start + len].copy_from_slice(&self.0[lane..lane + len]);
-        }
-    }
-
-    fn to_block(self) -> RowBlock {
-        let mut block = [0.0; BLOCK_LANES];
-        block[..SH_N_LANE].copy_from_slice(&self.0[..SH_N_LANE]);
-        for (lane, start, len) in Self::parts() {
-            block[SH_N_LANE + start..][..len].copy_from_slice(&self.0[lane..lane + len]);
-        }
-        block
-    }
-
-    fn of_block(block: &RowBlock) -> Self {
-        let mut lanes = [0.0; BLOCK_LANES];
-        lanes[..SH_N_LANE].copy_from_slice(&block[..SH_N_LANE]);
-        for (lane, start, len) in Self::parts() {
-            lanes[lane..lane + len].copy_from_slice(&block[SH_N_LANE + start..][..len]);
-        }
-        RowVectors(lanes)
-    }
-}
-
 /// Evaluates listed rows into a table.
 pub(super) struct EvaluateRows<'k, 'a, const W: usize, F> {
     pub at: &'k AdamNow<'a>,
@@ -114,26 +47,26 @@ pub(super) struct EvaluateRows<'k, 'a, const W: usize, F> {
 impl<const W: usize, F: Fn(usize) -> usize> Kernel for EvaluateRows<'_, '_, W, F> {
     type Out = ();
     #[inline(always)]
-    fn run<const FMA: bool>(mut self) {
-        let Rows { columns, exp_avg, exp_avg_sq, stamp, .. } = &self.view;
-        for i in 0..self.out.rows() {
-            if i + AHEAD < self.out.rows() {
-                let coming = (self.row_of)(i + AHEAD);
-                RowVectors::<W>::prefetch(columns, coming);
-                RowVectors::<W>::prefetch(exp_avg, coming);
-                RowVectors::<W>::prefetch(exp_avg_sq, coming);
+    fn run<const FMA: bool>(self) {
+        let EvaluateRows { at, view, row_of, mut out } = self;
+        let (rows, listed) = (view.rows(), out.rows());
+        let value = Table::<W>::new(&view.columns, rows);
+        let (m, v) = (Table::<W>::new(&view.exp_avg, rows), Table::<W>::new(&view.exp_avg_sq, rows));
+        let mut out = TableMut::<W>::new(&mut out, listed);
+        for i in 0..listed {
+            if i + AHEAD < listed {
+                let coming = row_of(i + AHEAD);
+                value.prefetch(coming);
+                m.prefetch(coming);
+                v.prefetch(coming);
             }
-            let row = (self.row_of)(i);
-            let past = Past::<W> {
-                value: RowVectors::load(columns, row),
-                m: RowVectors::load(exp_avg, row),
-                v: RowVectors::load(exp_avg_sq, row),
-                stamp: stamp[row],
-            };
-            match evaluate(self.at, &past) {
-                Some(now) => now.store(&mut self.out, i),
-                None => evaluate_directly(self.at, &self.view, row, &mut self.out, i),
+            let row = row_of(i);
+            let mut now = None;
+            if row + 1 < rows {
+                let stamp = view.stamp[row];
+                now = evaluate(at, &Past { value: value.load(row), m: m.load(row), v: v.load(row), stamp });
             }
+            out.store(i, &now.unwrap_or_else(|| evaluate_alone(at, &view, row)));
         }
     }
 }
@@ -181,17 +114,14 @@ fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>) -> Option<RowVecto
     Some(RowVectors(now))
 }
 
-/// A row with a value that eps touches: its values now, into row `to` of `out`. Loads the row itself: what is handed to
-/// another function cannot stay in registers.
+/// The last row of a table, or one with a value that eps touches. Loads the row itself: what is handed to another function
+/// cannot stay in registers.
 #[cold]
 #[inline(never)]
-fn evaluate_directly(at: &AdamNow<'_>, view: &Rows<'_>, row: usize, out: &mut ColumnsMut<'_>, to: usize) {
-    let [mut value, mut m, mut v] = [[0.0; BLOCK_LANES]; 3];
-    view.columns.load_row_any(row, &mut value);
-    view.exp_avg.load_row_any(row, &mut m);
-    view.exp_avg_sq.load_row_any(row, &mut v);
-    at.evaluate_block_directly(&mut value, &m, &v, view.stamp[row]);
-    out.store_row_any(to, &value);
+fn evaluate_alone<const W: usize>(at: &AdamNow<'_>, view: &Rows<'_>, row: usize) -> RowVectors<W> {
+    let mut now = [0.0; BLOCK_LANES];
+    at.evaluate_row(view, row, &mut now);
+    RowVectors::of_block(&now)
 }
 
 /// Something of every lane of a row; all of `sh_n` has the same.
@@ -241,47 +171,125 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
     type Out = StepCounts;
     #[inline(always)]
     fn run<const FMA: bool>(self) -> StepCounts {
-        let StepRows { at, view, rows, values, grads } = self;
-        let RowsMut { mut columns, mut exp_avg, mut exp_avg_sq, stamp, .. } = view;
+        let StepRows { at, mut view, rows, values, grads } = self;
+        let (first_row, count) = (view.first_row, view.rows());
+        let Some((&last, before)) = rows.split_last() else { return StepCounts::default() };
+        let mut columns = TableMut::<W>::new(&mut view.columns, count);
+        let mut exp_avg = TableMut::<W>::new(&mut view.exp_avg, count);
+        let mut exp_avg_sq = TableMut::<W>::new(&mut view.exp_avg_sq, count);
+        let (value, grad) = (Table::<W>::new(&values, rows.len()), Table::<W>::new(&grads, rows.len()));
+        let stamp = &mut view.stamp[..count];
         let constants = StepConstants::new(at);
-        let mut counts = StepCounts::default();
-        for (i, &row) in rows.iter().enumerate() {
+        let (mut skipped, mut updated) = (0, 0);
+        for (i, &row) in before.iter().enumerate() {
             if let Some(&coming) = rows.get(i + AHEAD) {
-                let coming = coming as usize - view.first_row;
-                RowVectors::<W>::prefetch(&grads, i + AHEAD);
-                RowVectors::<W>::prefetch(&values, i + AHEAD);
-                RowVectors::<W>::prefetch(&columns.as_ref(), coming);
-                RowVectors::<W>::prefetch(&exp_avg.as_ref(), coming);
-                RowVectors::<W>::prefetch(&exp_avg_sq.as_ref(), coming);
+                let coming = coming as usize - first_row;
+                grad.prefetch(i + AHEAD);
+                value.prefetch(i + AHEAD);
+                columns.as_ref().prefetch(coming);
+                exp_avg.as_ref().prefetch(coming);
+                exp_avg_sq.as_ref().prefetch(coming);
             }
-            let g = RowVectors::<W>::load(&grads, i);
-            // Without their signs floats are ordered as integers, with what is not finite behind all others.
-            let mut largest = 0;
-            for l in 0..RowVectors::<W>::USED {
-                largest = largest.max(g.0[l].to_bits() & !SIGN);
-            }
-            let is_bad = largest > LARGEST_GRAD.to_bits();
-            counts.skipped_non_finite += usize::from(is_bad);
-            if is_bad || largest == 0 {
+            let row = row as usize - first_row;
+            // Before the loads, so that nothing comes between them and what is done with them.
+            let powers = at.adam().beta_power(at.now().saturating_sub(stamp[row]));
+            let g = grad.load(i);
+            let kind = GradKind::of(&g);
+            if kind != GradKind::Usable {
+                skipped += usize::from(kind == GradKind::Bad);
                 continue;
             }
-            let row = row as usize - view.first_row;
-            let mut value = RowVectors::<W>::load(&values, i);
-            let mut m = RowVectors::<W>::load(&exp_avg.as_ref(), row);
-            let mut v = RowVectors::<W>::load(&exp_avg_sq.as_ref(), row);
-            let powers = at.adam().beta_power(at.now().saturating_sub(stamp[row]));
-            constants.step(&mut value, &mut m, &mut v, &g, powers);
-            value.store(&mut columns, row);
-            m.store(&mut exp_avg, row);
-            v.store(&mut exp_avg_sq, row);
-            if at.adam().moments() == Moments::Bf16 {
-                round_row::<W>(&mut exp_avg, &mut exp_avg_sq, row, view.uid[row], at.now() + 1);
-            }
+            updated += 1;
+            let mut now = value.load(i);
+            let (mut m, mut v) = (exp_avg.as_ref().load(row), exp_avg_sq.as_ref().load(row));
+            constants.step(&mut now, &mut m, &mut v, &g, powers);
+            columns.store(row, &now);
+            exp_avg.store(row, &m);
+            exp_avg_sq.store(row, &v);
             stamp[row] = at.now() + 1;
-            counts.updated += 1;
+        }
+        let mut counts = StepCounts { skipped_non_finite: skipped, updated };
+        step_alone::<W>(at, &constants, &mut view, last as usize - first_row, [&values, &grads], &mut counts);
+        if at.adam().moments() == Moments::Bf16 {
+            for row in rows.iter().map(|&row| row as usize - first_row) {
+                // No stamp is ahead of now but those of this step.
+                if view.stamp[row] > at.now() {
+                    round_row::<W>(&mut view.exp_avg, &mut view.exp_avg_sq, row, view.uid[row], at.now() + 1);
+                }
+            }
         }
         counts
     }
+}
+
+/// What a row's gradient is to it.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum GradKind {
+    /// Zero in every column: the row is left as it is.
+    Zero,
+    /// Something to step by.
+    Usable,
+    /// Not finite, or too large.
+    Bad,
+}
+
+impl GradKind {
+    /// Lane by lane until the two questions, which are then answered by one comparison each.
+    #[inline(always)]
+    fn of<const W: usize>(g: &RowVectors<W>) -> GradKind {
+        // Without their signs floats are ordered as integers, with what is not finite behind all others.
+        let mut largest = [0; LANES];
+        for first in (0..RowVectors::<W>::USED).step_by(LANES) {
+            for l in 0..LANES {
+                let without_sign = if RowVectors::<W>::is_own(first + l) { !SIGN } else { 0 };
+                largest[l] = largest[l].max(g.0[first + l].to_bits() & without_sign);
+            }
+        }
+        let (mut is_bad, mut is_some) = (false, false);
+        for bits in largest {
+            is_bad |= bits > LARGEST_GRAD.to_bits();
+            is_some |= bits != 0;
+        }
+        match (is_bad, is_some) {
+            (true, _) => GradKind::Bad,
+            (false, true) => GradKind::Usable,
+            (false, false) => GradKind::Zero,
+        }
+    }
+}
+
+/// The step on the last listed row, which may be the last of its table.
+#[cold]
+#[inline(never)]
+fn step_alone<const W: usize>(
+    at: &AdamNow<'_>,
+    constants: &StepConstants,
+    view: &mut RowsMut<'_>,
+    row: usize,
+    [values, grads]: [&ColumnsRef<'_>; 2],
+    counts: &mut StepCounts,
+) {
+    let load = |columns: &ColumnsRef<'_>, row: usize| {
+        let mut block = [0.0; BLOCK_LANES];
+        columns.load_row::<W>(row, &mut block);
+        RowVectors::<W>::of_block(&block)
+    };
+    let last = values.rows() - 1;
+    let g = load(grads, last);
+    let kind = GradKind::of(&g);
+    if kind != GradKind::Usable {
+        counts.skipped_non_finite += usize::from(kind == GradKind::Bad);
+        return;
+    }
+    counts.updated += 1;
+    let mut now = load(values, last);
+    let [mut m, mut v] = [&view.exp_avg, &view.exp_avg_sq].map(|moments| load(&moments.as_ref(), row));
+    let powers = at.adam().beta_power(at.now().saturating_sub(view.stamp[row]));
+    constants.step(&mut now, &mut m, &mut v, &g, powers);
+    view.columns.store_row::<W>(row, &now.to_block());
+    view.exp_avg.store_row::<W>(row, &m.to_block());
+    view.exp_avg_sq.store_row::<W>(row, &v.to_block());
+    view.stamp[row] = at.now() + 1;
 }
 
 /// Rounds the moments of a stored row that contains `steps` steps to what is kept of them.
@@ -297,6 +305,8 @@ fn round_row<const W: usize>(m: &mut ColumnsMut<'_>, v: &mut ColumnsMut<'_>, row
 
 /// Constants of one ordinary Adam step.
 struct StepConstants {
+    /// What values are kept within.
+    limits: OfLanes,
     /// lr / (1 - beta1^t).
     sizes: OfLanes,
     inv_root_correction: f32,
@@ -311,6 +321,7 @@ impl StepConstants {
         let [inv_bias1, inv_root] = tables.bias(now + 1);
         let AdamConfig { beta1, beta2, eps } = tables.config();
         StepConstants {
+            limits: OfLanes::new(|column| if column == Column::Scales { LOG_SCALE_LIMIT } else { f32::INFINITY }),
             sizes: OfLanes::new(|column| (tables.rates().at(column, now) * inv_bias1) as f32),
             inv_root_correction: inv_root as f32,
             one_minus_b1: (1.0 - beta1) as f32,
@@ -336,19 +347,21 @@ impl StepConstants {
         for l in SH_N_LANE..RowVectors::<W>::USED {
             (value[l], m[l], v[l]) = self.step_value(value[l], m[l], v[l], g[l], powers, self.sizes.sh_n);
         }
-        let scales = first_lane(Column::Scales);
-        for l in scales..scales + 3 {
-            value[l] = value[l].clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT);
+        for l in 0..SH_N_LANE {
+            let limit = self.limits.narrow[l];
+            // Not f32::clamp, which checks its limits.
+            value[l] = if value[l] > limit { limit } else { value[l] };
+            value[l] = if value[l] < -limit { -limit } else { value[l] };
         }
     }
 
     #[inline(always)]
     fn step_value(&self, value: f32, m: f32, v: f32, g: f32, powers: [f32; 2], step_size: f32) -> (f32, f32, f32) {
-        let (m, v) = (flush(m * powers[0]), flush(v * powers[1]));
+        let (m, v) = (flush(m * powers[0]), flush_positive(v * powers[1]));
         // m + (1 - beta)(g - m) rather than beta m + (1 - beta) g: f32 holds 0.001 to 5e-8 of itself but 0.999 only to
         // 1.3e-5 of its distance from 1, which would show in every second moment.
         let m = flush(m + (g - m) * self.one_minus_b1);
-        let v = flush(v + (g * g - v) * self.one_minus_b2);
+        let v = flush_positive(v + (g * g - v) * self.one_minus_b2);
         let root = v.sqrt() * self.inv_root_correction + self.eps;
         (flush(value - step_size * (m / root)), m, v)
     }

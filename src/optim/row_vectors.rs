@@ -1,0 +1,170 @@
+//! One row of a table in whole vectors: how the loops over rows ([`super::row_kernels`]) load and store it, in as few instructions
+//! as there are.
+//!
+//! The narrow columns make one vector, `sh_n` the others. Where the last of these would not be full it starts earlier
+//! instead, and what it shares with the one before it comes to the same in both: so every load and store is one of a whole
+//! vector, and none has to wait for parts of another. That is right in place because a row is loaded whole before any of
+//! it is stored. Columns of three values are loaded four at a time, into lanes that nobody uses; so the last row of a table is
+//! left to [`RowVectors::of_block`].
+//!
+//! Invariants: 1. all columns of a [`Table`] have the same number of rows, so that one check of a row number does for all;
+//! 2. lanes 11 and 15 hold the row behind, or zero, and nothing that is stored or counted depends on them.
+
+use crate::base::simd::{LANES, prefetch};
+use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, SH_N_LANE};
+
+/// One row of columns whose `sh_n` is `W` wide: the lanes of a [`RowBlock`] before `sh_n`, then the vectors of `sh_n`.
+#[derive(Clone, Copy)]
+pub(super) struct RowVectors<const W: usize>(pub RowBlock);
+
+/// The vectors of `sh_n` of width `W`: the lane that each starts at, where in `sh_n` that is, and how many of its lanes are in use.
+#[inline(always)]
+fn parts<const W: usize>() -> impl Iterator<Item = (usize, usize, usize)> {
+    (0..W.div_ceil(LANES)).map(|i| {
+        let start = if W < LANES { 0 } else { (i * LANES).min(W - LANES) };
+        (SH_N_LANE + i * LANES, start, W.min(LANES))
+    })
+}
+
+impl<const W: usize> RowVectors<W> {
+    /// Lanes in use.
+    pub const USED: usize = SH_N_LANE + W.next_multiple_of(LANES);
+
+    /// Whether a lane is one of the row itself.
+    #[inline(always)]
+    pub const fn is_own(lane: usize) -> bool {
+        lane != 11 && lane != 15
+    }
+
+    /// The same row with its columns one after the other.
+    pub fn to_block(self) -> RowBlock {
+        let mut block = [0.0; BLOCK_LANES];
+        block[..SH_N_LANE].copy_from_slice(&self.0[..SH_N_LANE]);
+        for (lane, start, len) in parts::<W>() {
+            block[SH_N_LANE + start..][..len].copy_from_slice(&self.0[lane..lane + len]);
+        }
+        block
+    }
+
+    /// From a row with its columns one after the other.
+    pub fn of_block(block: &RowBlock) -> Self {
+        let mut lanes = [0.0; BLOCK_LANES];
+        lanes[..SH_N_LANE].copy_from_slice(&block[..SH_N_LANE]);
+        for (lane, start, len) in parts::<W>() {
+            lanes[lane..lane + len].copy_from_slice(&block[SH_N_LANE + start..][..len]);
+        }
+        RowVectors(lanes)
+    }
+}
+
+/// Rows of columns whose `sh_n` is `W` wide.
+#[derive(Clone, Copy)]
+pub(super) struct Table<'a, const W: usize> {
+    means: &'a [[f32; 3]],
+    quats: &'a [[f32; 4]],
+    scales: &'a [[f32; 3]],
+    opacities: &'a [f32],
+    sh0: &'a [[f32; 3]],
+    sh_n: &'a [f32],
+}
+
+impl<'a, const W: usize> Table<'a, W> {
+    /// The first `rows` rows. Panics where there are fewer.
+    #[inline(always)]
+    pub fn new(columns: &ColumnsRef<'a>, rows: usize) -> Self {
+        Table {
+            means: &columns.means.as_chunks().0[..rows],
+            quats: &columns.quats.as_chunks().0[..rows],
+            scales: &columns.scales.as_chunks().0[..rows],
+            opacities: &columns.opacities[..rows],
+            sh0: &columns.sh0.as_chunks().0[..rows],
+            sh_n: &columns.sh_n[..rows * W],
+        }
+    }
+
+    /// A row. Panics at the last one.
+    #[inline(always)]
+    pub fn load(&self, row: usize) -> RowVectors<W> {
+        let (m, q, o) = (&self.means[row], &self.quats[row], self.opacities[row]);
+        let (s, c) = (&self.scales[row], &self.sh0[row]);
+        let (behind_s, behind_c) = (self.scales[row + 1][0], self.sh0[row + 1][0]);
+        let narrow =
+            [m[0], m[1], m[2], o, q[0], q[1], q[2], q[3], s[0], s[1], s[2], behind_s, c[0], c[1], c[2], behind_c];
+        let mut block = [0.0; BLOCK_LANES];
+        block[..SH_N_LANE].copy_from_slice(&narrow);
+        let sh_n = &self.sh_n[row * W..][..W];
+        for (lane, start, len) in parts::<W>() {
+            block[lane..lane + len].copy_from_slice(&sh_n[start..start + len]);
+        }
+        RowVectors(block)
+    }
+
+    /// Asks for `sh_n` of a row that will be loaded soon, but for what lies in a last line of a few values; the narrow
+    /// columns come by themselves, many rows to a line.
+    #[inline(always)]
+    pub fn prefetch(&self, row: usize) {
+        for line in 0..W.div_ceil(LANES) {
+            prefetch(self.sh_n, row * W + line * LANES);
+        }
+    }
+}
+
+/// [`Table`] to write to.
+pub(super) struct TableMut<'a, const W: usize> {
+    means: &'a mut [[f32; 3]],
+    quats: &'a mut [[f32; 4]],
+    scales: &'a mut [[f32; 3]],
+    opacities: &'a mut [f32],
+    sh0: &'a mut [[f32; 3]],
+    sh_n: &'a mut [f32],
+    /// Where the last vector of `sh_n` starts.
+    last_start: usize,
+}
+
+impl<'a, const W: usize> TableMut<'a, W> {
+    /// The first `rows` rows. Panics where there are fewer.
+    #[inline(always)]
+    pub fn new(columns: &'a mut ColumnsMut<'_>, rows: usize) -> Self {
+        TableMut {
+            means: &mut columns.means.as_chunks_mut().0[..rows],
+            quats: &mut columns.quats.as_chunks_mut().0[..rows],
+            scales: &mut columns.scales.as_chunks_mut().0[..rows],
+            opacities: &mut columns.opacities[..rows],
+            sh0: &mut columns.sh0.as_chunks_mut().0[..rows],
+            sh_n: &mut columns.sh_n[..rows * W],
+            // Kept from the compiler: it would cut the store before the last one down to what that does not overwrite,
+            // and three stores are slower than one.
+            last_start: std::hint::black_box(W.saturating_sub(LANES)),
+        }
+    }
+
+    /// The same rows, shared.
+    #[inline(always)]
+    pub fn as_ref(&self) -> Table<'_, W> {
+        Table {
+            means: self.means,
+            quats: self.quats,
+            scales: self.scales,
+            opacities: self.opacities,
+            sh0: self.sh0,
+            sh_n: self.sh_n,
+        }
+    }
+
+    /// Writes a row.
+    #[inline(always)]
+    pub fn store(&mut self, row: usize, vectors: &RowVectors<W>) {
+        let block = &vectors.0;
+        self.means[row].copy_from_slice(&block[0..3]);
+        self.opacities[row] = block[3];
+        self.quats[row].copy_from_slice(&block[4..8]);
+        self.scales[row].copy_from_slice(&block[8..11]);
+        self.sh0[row].copy_from_slice(&block[12..15]);
+        let sh_n = &mut self.sh_n[row * W..][..W];
+        for (lane, start, len) in parts::<W>() {
+            let is_last = W > LANES && start == W - LANES;
+            let start = if is_last { self.last_start } else { start };
+            sh_n[start..start + len].copy_from_slice(&block[lane..lane + len]);
+        }
+    }
+}
