@@ -229,7 +229,7 @@ fn a_row_comes_to_the_same_whatever_rows_lie_beside_it() {
         let mut together = SceneState::from_columns(random_columns(rows, degree, 1.0, 8));
         let mut alone: Vec<SceneState> = (0..rows as u32).map(|row| together.select(&[row])).collect();
         for (step, now) in [3, 4, 40, 900].into_iter().enumerate() {
-            let listed: Vec<u32> = (0..rows as u32).filter(|row| (row + step as u32) % 4 != 0).collect();
+            let listed: Vec<u32> = (0..rows as u32).filter(|row| !(row + step as u32).is_multiple_of(4)).collect();
             let mut grads = grads_at(&listed, degree, now);
             for i in 0..listed.len() {
                 // Rows without a gradient and rows that are skipped lie before and behind others.
