@@ -84,7 +84,6 @@ impl DeferredAdam {
     }
 
     /// What rows keep of their moments.
-    #[inline(always)]
     pub fn moments(&self) -> Moments {
         self.moments
     }
@@ -133,7 +132,6 @@ impl DeferredAdam {
         &self.lane_rates
     }
 
-    #[inline(always)]
     pub(super) fn tables(&self) -> &DriftTables {
         &self.tables
     }
@@ -216,7 +214,8 @@ impl<'a> AdamNow<'a> {
 
     /// The step on a view of rows: as [`DeferredAdam::step`], `rows` counted in the table that the view was cut from, each
     /// larger than the one before. `values` are the listed rows as they are now, as [`AdamNow::evaluate_rows`] gives them:
-    /// whoever has gradients had these before. Panics when the numbers of rows, or the degrees, do not fit each other.
+    /// whoever has gradients had these before. Panics when the numbers of rows, or the degrees, do not fit each other, and
+    /// when the list does not ascend.
     pub fn step_rows(
         &self,
         view: RowsMut<'_>,
@@ -247,7 +246,11 @@ impl<'a> AdamNow<'a> {
         let degree = view.columns.sh_degree;
         assert_eq!([values.rows(), grads.rows()], [rows.len(); 2], "values and gradients of the listed rows");
         assert_eq!([values.sh_degree, grads.sh_degree], [degree; 2], "values or gradients of another degree");
-        debug_assert!(rows.is_sorted_by(|a, b| a < b), "listed rows ascend");
+        assert!(rows.is_sorted_by(|a, b| a < b), "listed rows ascend");
+        debug_assert!(
+            rows.iter().all(|&row| view.stamp[row as usize - view.first_row] <= self.now),
+            "a step taken twice"
+        );
         debug_assert!(self.are_values_of(&view.as_ref(), rows, &values), "values of another step");
         match degree {
             0 => dispatch(self.adam.simd, StepRows::<0> { at: self, view, rows, values, grads }),

@@ -16,7 +16,7 @@ use super::adam::AdamConfig;
 use super::deferred::{AdamNow, StepCounts};
 use super::drift::{EpsFloor, drifted, flush, flush_positive, needs_direct_sum};
 use super::moments::{Moments, round_block};
-use super::row_vectors::{RowVectors, Table, TableMut};
+use super::row_vectors::{RowVectors, Table, TableMut, is_of_row_behind};
 use crate::base::simd::{Kernel, LANES};
 use crate::scene::columns::Column;
 use crate::scene::rows::{
@@ -31,7 +31,7 @@ const LARGEST_GRAD: f32 = 1e18;
 const LOG_SCALE_LIMIT: f32 = 30.0;
 
 /// Rows that are asked for ahead of their turn.
-const AHEAD: usize = 16;
+const AHEAD: usize = 8;
 /// The sign of a float.
 const SIGN: u32 = 1 << 31;
 
@@ -80,7 +80,7 @@ struct Past<const W: usize> {
     stamp: u32,
 }
 
-/// What the values of a row are now; nothing where eps touches one of them.
+/// What the values of a row are now; nothing where eps touches one of them, or of those loaded with them.
 #[inline(always)]
 fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>) -> Option<RowVectors<W>> {
     if past.stamp >= at.now() {
@@ -114,7 +114,7 @@ fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>) -> Option<RowVecto
     Some(RowVectors(now))
 }
 
-/// The last row of a table, or one with a value that eps touches. Loads the row itself: what is handed to another function
+/// The last row of a table, or one that [`evaluate`] has nothing for. Loads the row itself: what is handed to another function
 /// cannot stay in registers.
 #[cold]
 #[inline(never)]
@@ -191,8 +191,6 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
                 exp_avg_sq.as_ref().prefetch(coming);
             }
             let row = row as usize - first_row;
-            // Before the loads, so that nothing comes between them and what is done with them.
-            let powers = at.adam().beta_power(at.now().saturating_sub(stamp[row]));
             let g = grad.load(i);
             let kind = GradKind::of(&g);
             if kind != GradKind::Usable {
@@ -200,6 +198,8 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
                 continue;
             }
             updated += 1;
+            // Before the loads, so that nothing comes between them and what is done with them.
+            let powers = at.adam().beta_power(at.now().saturating_sub(stamp[row]));
             let mut now = value.load(i);
             let (mut m, mut v) = (exp_avg.as_ref().load(row), exp_avg_sq.as_ref().load(row));
             constants.step(&mut now, &mut m, &mut v, &g, powers);
@@ -208,17 +208,20 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
             exp_avg_sq.store(row, &v);
             stamp[row] = at.now() + 1;
         }
-        let mut counts = StepCounts { skipped_non_finite: skipped, updated };
-        step_alone::<W>(at, &constants, &mut view, last as usize - first_row, [&values, &grads], &mut counts);
+        let kind = step_last::<W>(at, &constants, &mut view, last as usize - first_row, &values, &grads);
         if at.adam().moments() == Moments::Bf16 {
+            // In a loop of its own, which leaves the other one its registers.
             for row in rows.iter().map(|&row| row as usize - first_row) {
-                // No stamp is ahead of now but those of this step.
+                // Stamps are not ahead of now but for those of this step.
                 if view.stamp[row] > at.now() {
                     round_row::<W>(&mut view.exp_avg, &mut view.exp_avg_sq, row, view.uid[row], at.now() + 1);
                 }
             }
         }
-        counts
+        StepCounts {
+            updated: updated + usize::from(kind == GradKind::Usable),
+            skipped_non_finite: skipped + usize::from(kind == GradKind::Bad),
+        }
     }
 }
 
@@ -241,7 +244,7 @@ impl GradKind {
         let mut largest = [0; LANES];
         for first in (0..RowVectors::<W>::USED).step_by(LANES) {
             for l in 0..LANES {
-                let without_sign = if RowVectors::<W>::is_own(first + l) { !SIGN } else { 0 };
+                let without_sign = if is_of_row_behind(first + l) { 0 } else { !SIGN };
                 largest[l] = largest[l].max(g.0[first + l].to_bits() & without_sign);
             }
         }
@@ -258,42 +261,40 @@ impl GradKind {
     }
 }
 
-/// The step on the last listed row, which may be the last of its table.
+/// The step on the last listed row, which is row `row` of the view and may be its last. Cold: once for a thousand rows.
 #[cold]
 #[inline(never)]
-fn step_alone<const W: usize>(
+fn step_last<const W: usize>(
     at: &AdamNow<'_>,
     constants: &StepConstants,
     view: &mut RowsMut<'_>,
     row: usize,
-    [values, grads]: [&ColumnsRef<'_>; 2],
-    counts: &mut StepCounts,
-) {
+    values: &ColumnsRef<'_>,
+    grads: &ColumnsRef<'_>,
+) -> GradKind {
     let load = |columns: &ColumnsRef<'_>, row: usize| {
         let mut block = [0.0; BLOCK_LANES];
         columns.load_row::<W>(row, &mut block);
         RowVectors::<W>::of_block(&block)
     };
-    let last = values.rows() - 1;
-    let g = load(grads, last);
+    let i = grads.rows() - 1;
+    let g = load(grads, i);
     let kind = GradKind::of(&g);
-    if kind != GradKind::Usable {
-        counts.skipped_non_finite += usize::from(kind == GradKind::Bad);
-        return;
+    if kind == GradKind::Usable {
+        let mut now = load(values, i);
+        let [mut m, mut v] = [&view.exp_avg, &view.exp_avg_sq].map(|moments| load(&moments.as_ref(), row));
+        let powers = at.adam().beta_power(at.now().saturating_sub(view.stamp[row]));
+        constants.step(&mut now, &mut m, &mut v, &g, powers);
+        view.columns.store_row::<W>(row, &now.to_block());
+        view.exp_avg.store_row::<W>(row, &m.to_block());
+        view.exp_avg_sq.store_row::<W>(row, &v.to_block());
+        view.stamp[row] = at.now() + 1;
     }
-    counts.updated += 1;
-    let mut now = load(values, last);
-    let [mut m, mut v] = [&view.exp_avg, &view.exp_avg_sq].map(|moments| load(&moments.as_ref(), row));
-    let powers = at.adam().beta_power(at.now().saturating_sub(view.stamp[row]));
-    constants.step(&mut now, &mut m, &mut v, &g, powers);
-    view.columns.store_row::<W>(row, &now.to_block());
-    view.exp_avg.store_row::<W>(row, &m.to_block());
-    view.exp_avg_sq.store_row::<W>(row, &v.to_block());
-    view.stamp[row] = at.now() + 1;
+    kind
 }
 
 /// Rounds the moments of a stored row that contains `steps` steps to what is kept of them.
-#[inline(never)]
+#[inline(always)]
 fn round_row<const W: usize>(m: &mut ColumnsMut<'_>, v: &mut ColumnsMut<'_>, row: usize, uid: u64, steps: u32) {
     let [mut m_block, mut v_block] = [[0.0; BLOCK_LANES]; 2];
     m.as_ref().load_row::<W>(row, &mut m_block);

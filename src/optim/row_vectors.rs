@@ -1,23 +1,32 @@
-//! One row of a table in whole vectors: how the loops over rows ([`super::row_kernels`]) load and store it, in as few instructions
-//! as there are.
+//! One row of a table in whole vectors: how the loops over rows ([`super::row_kernels`]) load and store it, in as few
+//! instructions as there are.
 //!
 //! The narrow columns make one vector, `sh_n` the others. Where the last of these would not be full it starts earlier
-//! instead, and what it shares with the one before it comes to the same in both: so every load and store is one of a whole
-//! vector, and none has to wait for parts of another. That is right in place because a row is loaded whole before any of
-//! it is stored. Columns of three values are loaded four at a time, into lanes that nobody uses; so the last row of a table is
-//! left to [`RowVectors::of_block`].
+//! instead, and what it shares with the one before it comes to the same in both: so no load of `sh_n` has to wait for
+//! parts of a vector. That is right in place because a row is loaded whole before any of it is stored. Columns of three
+//! values are loaded four at a time, the fourth being the first one of the row behind; so the last row of a table is left
+//! to [`RowVectors::of_block`].
 //!
 //! Invariants: 1. all columns of a [`Table`] have the same number of rows, so that one check of a row number does for all;
-//! 2. lanes 11 and 15 hold the row behind, or zero, and nothing that is stored or counted depends on them.
+//! 2. the lanes of the row behind hold anything: they may send a row to slower code of the same bits, but nothing that is
+//! stored or counted depends on them.
 
 use crate::base::simd::{LANES, prefetch};
-use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, SH_N_LANE};
+use crate::scene::columns::Column;
+use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, SH_N_LANE, first_lane};
 
 /// One row of columns whose `sh_n` is `W` wide: the lanes of a [`RowBlock`] before `sh_n`, then the vectors of `sh_n`.
 #[derive(Clone, Copy)]
-pub(super) struct RowVectors<const W: usize>(pub RowBlock);
+pub(super) struct RowVectors<const W: usize>(pub [f32; BLOCK_LANES]);
 
-/// The vectors of `sh_n` of width `W`: the lane that each starts at, where in `sh_n` that is, and how many of its lanes are in use.
+/// Whether a lane of a loaded row is one of the row behind it.
+#[inline(always)]
+pub(super) const fn is_of_row_behind(lane: usize) -> bool {
+    lane == first_lane(Column::Scales) + 3 || lane == first_lane(Column::Sh0) + 3
+}
+
+/// The vectors of `sh_n` of width `W`: the lane that each starts at, where in `sh_n` that is, and how many of its lanes
+/// are in use.
 #[inline(always)]
 fn parts<const W: usize>() -> impl Iterator<Item = (usize, usize, usize)> {
     (0..W.div_ceil(LANES)).map(|i| {
@@ -27,14 +36,8 @@ fn parts<const W: usize>() -> impl Iterator<Item = (usize, usize, usize)> {
 }
 
 impl<const W: usize> RowVectors<W> {
-    /// Lanes in use.
+    /// Lanes that are worked on.
     pub const USED: usize = SH_N_LANE + W.next_multiple_of(LANES);
-
-    /// Whether a lane is one of the row itself.
-    #[inline(always)]
-    pub const fn is_own(lane: usize) -> bool {
-        lane != 11 && lane != 15
-    }
 
     /// The same row with its columns one after the other.
     pub fn to_block(self) -> RowBlock {

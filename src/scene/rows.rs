@@ -117,7 +117,7 @@ impl<'a> ColumnsRef<'a> {
 
     /// The lanes of one row before `sh_n`, as a [`RowBlock`] has them. Panics beyond the last row.
     #[inline(always)]
-    pub fn narrow(&self, row: usize) -> [f32; SH_N_LANE] {
+    fn narrow(&self, row: usize) -> [f32; SH_N_LANE] {
         let (m, q) = (&self.means.as_chunks::<3>().0[row], &self.quats.as_chunks::<4>().0[row]);
         let (s, c) = (&self.scales.as_chunks::<3>().0[row], &self.sh0.as_chunks::<3>().0[row]);
         let o = self.opacities[row];
@@ -187,7 +187,7 @@ impl<'a> ColumnsMut<'a> {
 
     /// Copies the lanes of all columns but `sh_n` into one row.
     #[inline(always)]
-    pub fn store_narrow(&mut self, row: usize, block: &RowBlock) {
+    fn store_narrow(&mut self, row: usize, block: &RowBlock) {
         self.means.as_chunks_mut::<3>().0[row].copy_from_slice(&block[0..3]);
         self.opacities[row] = block[3];
         self.quats.as_chunks_mut::<4>().0[row].copy_from_slice(&block[4..8]);
