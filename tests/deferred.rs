@@ -268,6 +268,18 @@ fn a_row_comes_to_the_same_whatever_rows_lie_beside_it() {
 }
 
 #[test]
+fn a_list_that_does_not_ascend_is_refused_before_any_row_is_changed() {
+    let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), SimdPath::best());
+    for list in [vec![3, 1, 2], vec![1, 1], vec![0, 5, 4]] {
+        let mut state = SceneState::from_columns(random_columns(6, 3, 1.0, 5));
+        let (before, grads) = (state.clone(), grads_at(&list, 3, 0));
+        let step = std::panic::AssertUnwindSafe(|| adam.step(&mut state, &list, &grads, 9));
+        assert!(std::panic::catch_unwind(step).is_err(), "{list:?}");
+        assert_eq!(state, before, "{list:?}");
+    }
+}
+
+#[test]
 fn without_catching_up_rows_stand_still_while_they_have_no_gradient() {
     let (rows, degree) = (40, 1);
     let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), SimdPath::best());

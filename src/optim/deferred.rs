@@ -163,6 +163,7 @@ impl DeferredAdam {
 
     /// The optimizer step `now` (0-based) on the rows of the ascending list `rows`; `grads` has one row per entry of it.
     /// Rows whose gradient is zero in every column are left untouched: they take the step when somebody looks.
+    /// Panics as [`AdamNow::step_rows`] does, and at rows that the state has not.
     pub fn step(&self, state: &mut SceneState, rows: &[u32], grads: &Columns, now: u32) -> StepCounts {
         assert_eq!(rows.len(), grads.rows(), "one gradient row per listed row");
         assert_eq!(state.sh_degree(), grads.sh_degree, "gradients of another degree");
@@ -268,7 +269,8 @@ impl<'a> AdamNow<'a> {
         Column::ALL.into_iter().all(|column| has_same_bits(now.column(column), values.column(column)))
     }
 
-    /// Evaluates rows into `out`: its row i is row `row_of(i)` of the view as it is now.
+    /// Evaluates rows into `out`: its row i is row `row_of(i)` of the view (counted from its first) as it is now, in any
+    /// order. Panics at rows that the view has not, and when the degrees differ.
     pub fn evaluate_rows(&self, view: Rows<'_>, row_of: impl Fn(usize) -> usize, out: ColumnsMut<'_>) {
         assert_eq!(view.columns.sh_degree, out.sh_degree, "values of another degree");
         match out.sh_degree {

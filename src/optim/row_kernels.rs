@@ -1,8 +1,8 @@
 //! The two loops that go through all the optimizer's bytes: forwarding (values of listed rows as they are now) and the
 //! step, compiled for every instruction path.
 //!
-//! A row is worked on in whole vectors ([`super::row_vectors`]), which where there are registers enough (AVX-512) stay in them
-//! from load to store.
+//! A row is worked on in whole vectors ([`super::row_vectors`]), which where there are registers enough (AVX-512) stay in
+//! them from load to store.
 //!
 //! The step takes the values of its rows from whoever forwarded them: to find them again would cost a second root and a
 //! second quotient for every value.
@@ -114,8 +114,8 @@ fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>) -> Option<RowVecto
     Some(RowVectors(now))
 }
 
-/// The last row of a table, or one that [`evaluate`] has nothing for. Loads the row itself: what is handed to another function
-/// cannot stay in registers.
+/// The last row of a table, or one that [`evaluate`] has nothing for. Loads the row itself: what is handed to another
+/// function cannot stay in registers.
 #[cold]
 #[inline(never)]
 fn evaluate_alone<const W: usize>(at: &AdamNow<'_>, view: &Rows<'_>, row: usize) -> RowVectors<W> {
@@ -306,8 +306,8 @@ fn round_row<const W: usize>(m: &mut ColumnsMut<'_>, v: &mut ColumnsMut<'_>, row
 
 /// Constants of one ordinary Adam step.
 struct StepConstants {
-    /// What values are kept within.
-    limits: OfLanes,
+    /// What the magnitudes of the narrow columns are kept within, by lane.
+    limits: [f32; LANES],
     /// lr / (1 - beta1^t).
     sizes: OfLanes,
     inv_root_correction: f32,
@@ -322,7 +322,7 @@ impl StepConstants {
         let [inv_bias1, inv_root] = tables.bias(now + 1);
         let AdamConfig { beta1, beta2, eps } = tables.config();
         StepConstants {
-            limits: OfLanes::new(|column| if column == Column::Scales { LOG_SCALE_LIMIT } else { f32::INFINITY }),
+            limits: OfLanes::new(|c| if c == Column::Scales { LOG_SCALE_LIMIT } else { f32::INFINITY }).narrow,
             sizes: OfLanes::new(|column| (tables.rates().at(column, now) * inv_bias1) as f32),
             inv_root_correction: inv_root as f32,
             one_minus_b1: (1.0 - beta1) as f32,
@@ -349,7 +349,7 @@ impl StepConstants {
             (value[l], m[l], v[l]) = self.step_value(value[l], m[l], v[l], g[l], powers, self.sizes.sh_n);
         }
         for l in 0..SH_N_LANE {
-            let limit = self.limits.narrow[l];
+            let limit = self.limits[l];
             // Not f32::clamp, which checks its limits.
             value[l] = if value[l] > limit { limit } else { value[l] };
             value[l] = if value[l] < -limit { -limit } else { value[l] };

@@ -60,7 +60,7 @@ impl<const W: usize> RowVectors<W> {
     }
 }
 
-/// Rows of columns whose `sh_n` is `W` wide.
+/// Rows of columns, `[rows][width]` each as in [`ColumnsRef`]; `sh_n` is `[rows * W]`.
 #[derive(Clone, Copy)]
 pub(super) struct Table<'a, const W: usize> {
     means: &'a [[f32; 3]],
@@ -85,7 +85,7 @@ impl<'a, const W: usize> Table<'a, W> {
         }
     }
 
-    /// A row. Panics at the last one.
+    /// A row with what lies behind it. Panics at the last row and beyond.
     #[inline(always)]
     pub fn load(&self, row: usize) -> RowVectors<W> {
         let (m, q, o) = (&self.means[row], &self.quats[row], self.opacities[row]);
@@ -154,7 +154,7 @@ impl<'a, const W: usize> TableMut<'a, W> {
         }
     }
 
-    /// Writes a row.
+    /// Writes a row, and nothing of the one behind it. Panics beyond the last row.
     #[inline(always)]
     pub fn store(&mut self, row: usize, vectors: &RowVectors<W>) {
         let block = &vectors.0;
