@@ -61,12 +61,16 @@ impl<const W: usize, F: Fn(usize) -> usize> Kernel for EvaluateRows<'_, '_, W, F
                 v.prefetch(coming);
             }
             let row = row_of(i);
-            let mut now = None;
             if row + 1 < rows {
-                let stamp = view.stamp[row];
-                now = evaluate(at, &Past { value: value.load(row), m: m.load(row), v: v.load(row), stamp });
+                let past = Past { value: value.load(row), m: m.load(row), v: v.load(row), stamp: view.stamp[row] };
+                if let Some(now) = evaluate(at, &past) {
+                    // Stored here and not with what another function returns, which lies in memory: joined with that
+                    // every row would go through memory.
+                    out.store(i, &now);
+                    continue;
+                }
             }
-            out.store(i, &now.unwrap_or_else(|| evaluate_alone(at, &view, row)));
+            out.store_alone(i, &evaluate_alone(at, &view, row));
         }
     }
 }

@@ -154,6 +154,13 @@ impl<'a, const W: usize> TableMut<'a, W> {
         }
     }
 
+    /// [`TableMut::store`] of a row that comes from memory. Cold: once for a thousand rows.
+    #[cold]
+    #[inline(never)]
+    pub fn store_alone(&mut self, row: usize, vectors: &RowVectors<W>) {
+        self.store(row, vectors);
+    }
+
     /// Writes a row, and nothing of the one behind it. Panics beyond the last row.
     #[inline(always)]
     pub fn store(&mut self, row: usize, vectors: &RowVectors<W>) {
