@@ -16,7 +16,7 @@ use bench::{Bench, EVENTLESS, Ply, ckpt, failed, json, pin, train_from};
 use gsscale::exchange::ply::{PlyMeta, write_gaussians};
 use gsscale::page::format::checksum;
 use gsscale::scene::columns::{Column, Columns};
-use scenes::{stderr, text};
+use scenes::{stderr, text, train};
 use serde_json::Value;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
@@ -251,7 +251,7 @@ fn a_store_that_a_run_was_started_from_is_free_once_the_run_goes_on() {
     let with_budget = |budget: &str| {
         let out = bench.path("none");
         let flags = ["--init-ply", text(&seed), "--host-mem", budget, "--out", text(&out), "--steps", "1"];
-        scenes::train(&[&[text(&bench.path("scene"))], &flags[..]].concat())
+        train(&[&[text(&bench.path("scene"))], &flags[..]].concat())
     };
     let said = stderr(&with_budget("48MiB"));
     assert!(said.contains("48.0 MiB are too little for this store"), "{said}");
@@ -508,7 +508,7 @@ fn other_folders_and_other_versions_are_refused_by_name() {
             let said = failed(command);
             assert!(words.iter().all(|word| said.contains(word)) && said.contains("remedy"), "{said}");
         }
-        let said = stderr(&scenes::train(&["--resume", text(&out), "--quiet"]));
+        let said = stderr(&train(&["--resume", text(&out), "--quiet"]));
         assert!(words.iter().all(|word| said.contains(word)), "the trainer: {said}");
     };
     with(8, 2);
@@ -536,6 +536,24 @@ fn wave(rows: usize) -> Columns {
         values.for_each(|(i, v)| *v = ((i * (at + 3)) % 1009) as f32 * 0.003 - 1.5);
     }
     columns
+}
+
+#[test]
+fn gaussians_that_do_not_fit_are_refused_by_the_header_with_the_way_through_a_store() {
+    let folder = tempfile::tempdir().unwrap();
+    let ply = folder.path().join("in.ply");
+    write_gaussians(&ply, &wave(40_000), &PlyMeta::default()).unwrap();
+    let scene = scenes::city(folder.path(), 8, 32, 24, 200);
+    let (out, spill) = (folder.path().join("out"), folder.path().join("spill"));
+    let args = [text(&scene), "--out", text(&out), "--init-ply", text(&ply), "--host-mem", "8MiB"];
+    for more in [&[][..], &["--spill-dir", text(&spill)]] {
+        let output = train(&[&args, more].concat());
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(said.contains("in.ply") && said.contains("40000 Gaussians take"), "{said}");
+        assert!(said.contains("gsscale-ckpt import"), "{said}");
+        assert!(!spill.exists(), "something was begun");
+    }
 }
 
 #[test]

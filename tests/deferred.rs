@@ -4,6 +4,7 @@
 
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
+use gsscale::densify::ops::reset_opacities;
 use gsscale::optim::adam::{AdamConfig, DenseAdam};
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::moments::Moments;
@@ -105,6 +106,71 @@ fn values_follow_dense_adam_in_f64() {
             }
         }
         assert!(sum_deferred < sum_dense_f32, "deferred {sum_deferred} is further off than f32 {sum_dense_f32}");
+    }
+}
+
+/// A long run in which rows are seen at random, a row in fifty at a step, and opacities are reset every 3,000 steps.
+/// Two values a row have gradients: a position, whose rate falls, and the opacity.
+#[test]
+fn ten_thousand_rows_follow_dense_adam_over_a_long_run_with_resets() {
+    const RUN: u32 = 50_000;
+    let (rows, resets) = (10_000, 3_000);
+    let cap = (0.02f32 / 0.98).ln();
+    let rates = Rates::new(3.0, RUN);
+    let adam = DeferredAdam::new(rates, AdamConfig::default(), SimdPath::best());
+    let mut start = Columns::zeros(rows, 0);
+    let mut draws = Stream::new(21, Purpose::Test, 0, 0);
+    (0..rows).for_each(|row| start.means[3 * row] = draws.normal() as f32);
+    start.opacities.iter_mut().for_each(|x| *x = draws.normal() as f32);
+    let mut state = SceneState::from_columns(start.clone());
+    let first: Vec<f64> = start.means.iter().step_by(3).map(|&x| f64::from(x)).collect();
+    let mut means = DenseAdam::<f64>::new(AdamConfig::default(), first);
+    let logits = start.opacities.iter().map(|&x| f64::from(x)).collect();
+    let mut opacities = DenseAdam::<f64>::new(AdamConfig::default(), logits);
+    let mut writes = vec![0.0f64; rows];
+    for step in 0..RUN {
+        let mut listed: Vec<u32> = (0..rows / 50).map(|_| draws.below(rows as u64) as u32).collect();
+        listed.sort_unstable();
+        listed.dedup();
+        let mut grads = Columns::zeros(listed.len(), 0);
+        let mut dense = [vec![0.0f64; rows], vec![0.0f64; rows]];
+        for (i, &row) in listed.iter().enumerate() {
+            let row = row as usize;
+            let size = libm::pow(10.0, -((row % 8) as f64));
+            let [a, b] = [0.3, -0.1].map(|mean| ((draws.normal() + mean) * size) as f32);
+            (grads.means[3 * i], grads.opacities[i]) = (a, b);
+            (dense[0][row], dense[1][row]) = (f64::from(a), f64::from(b));
+            writes[row] += 1.0;
+        }
+        adam.step(&mut state, &listed, &grads, step);
+        means.step(&dense[0], rates.at(Column::Means, step));
+        opacities.step(&dense[1], rates.at(Column::Opacities, step));
+        if (step + 1) % resets == 0 {
+            reset_opacities(&adam.at(step + 1), &mut state, 0.02);
+            opacities.values.iter_mut().for_each(|x| *x = x.min(f64::from(cap)));
+            opacities.exp_avg.fill(0.0);
+            opacities.exp_avg_sq.fill(0.0);
+            // It settles rows: one more rounding of a value.
+            writes.iter_mut().for_each(|w| *w += 1.0);
+        }
+        if (step + 1) % 5_000 != 0 {
+            continue;
+        }
+        let now = evaluate_all(&state, &adam, step + 1);
+        let base = |column| rates.base(column);
+        for row in 0..rows {
+            let values = [
+                (now.means[3 * row], means.values[row], base(Column::Means)),
+                (now.opacities[row], opacities.values[row], base(Column::Opacities)),
+            ];
+            for (got, want, rate) in values {
+                // As in the test above: a rounding of the value and 1e-6 of the rate for every write and this reading.
+                let half_ulp = want.abs().max(1.0) * f64::from(f32::EPSILON) / 2.0;
+                let slack = (1.0 + writes[row]) * (half_ulp + 1e-6 * rate);
+                let error = (f64::from(got) - want).abs();
+                assert!(error <= slack, "row {row} after step {step}: {error:e} > {slack:e}");
+            }
+        }
     }
 }
 

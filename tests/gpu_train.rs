@@ -21,7 +21,7 @@ use gsscale::train::pages::PagedScene;
 use gsscale::train::run::{Prepared, prepare};
 use gsscale::train::step::{WorkingSet, train_step};
 use gsscale::train::trainer::Trainer;
-use scenes::{city, eval, psnr, stderr, summary, text, train};
+use scenes::{city, eval, psnr, stderr, summary, text, train, wide_city};
 use std::path::Path;
 use std::process::Command;
 use tempfile::TempDir;
@@ -81,6 +81,33 @@ fn a_gpu_trains_as_the_cpu_does() {
     // The PLY alone gives the run's numbers, on the device that its config names.
     let report = eval(&[text(&on_gpu), text(&scene)]);
     assert!(report.status.success(), "{}", stderr(&report));
+}
+
+#[test]
+fn pages_from_a_drive_train_the_same_scene_on_a_gpu() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = wide_city(folder.path(), 6_000);
+    let [in_memory, paged, spill] = ["memory", "paged", "spill"].map(|name| folder.path().join(name));
+    let grow = |out: &Path, more: &[&str]| {
+        let growing = ["--steps", "60", "--refine-start", "20", "--refine-every", "15", "--grow-grad2d", "0.001"];
+        let paths = [text(&scene), "--out", text(out), "--device", "gpu", "--page-rows", "32"];
+        let output = train(&[&paths[..], &growing, more].concat());
+        assert!(output.status.success(), "{}", stderr(&output));
+    };
+    grow(&in_memory, &[]);
+    let whole = summary(&in_memory);
+    let frames = whole["pages_pinned_max"].as_u64().unwrap();
+    assert!(frames < whole["pages"].as_u64().unwrap() / 2, "a view sees too much");
+    let frames = frames.to_string();
+    grow(&paged, &["--frames", &frames, "--spill-dir", text(&spill)]);
+    let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
+    assert!(ply(&in_memory) == ply(&paged), "pages from the drive give another scene");
+    let traffic = summary(&paged);
+    assert!(traffic["pages_read"].as_u64().unwrap() > 0 && traffic["evictions"].as_u64().unwrap() > 0, "{traffic}");
+    assert_ne!(traffic["gaussians"], 6_000, "no round changed anything");
 }
 
 #[test]

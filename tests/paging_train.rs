@@ -144,3 +144,24 @@ fn a_tenth_of_a_city_in_memory_gives_the_same_city() {
     let read = steps - number(&summary, "other_bytes_read");
     assert!(bound > 0 && bound <= read && read < bound + bound / 2, "{read} read by steps, {bound} at least");
 }
+
+/// 16-bit moments are another training, but paged they are the same one: on the drive they take half the bytes.
+#[test]
+fn moments_in_16_bits_page_to_the_same_bits() {
+    let folder = TempDir::new().unwrap();
+    let scene = scenes::wide_city(folder.path(), 8_000);
+    let base = [&["--page-rows", "32", "--steps", "120", "--grow-grad2d", "0.001"], BUSY].concat();
+    let halves = [&base[..], &["--moments", "bf16"]].concat();
+    let in_memory = How { frames: 0, io: "", threads: "2", more: &[] };
+    let (want, whole) = run(folder.path(), &scene, &halves, &in_memory);
+    let frames = number(&whole, "pages_pinned_max");
+    assert!(frames < number(&whole, "pages") / 2, "a view sees too much");
+    for (threads, more) in [("2", &[][..]), ("1", &["--spill-codec", "zstd:1"])] {
+        let how = How { frames, io: "auto", threads, more };
+        let (got, summary) = run(folder.path(), &scene, &halves, &how);
+        assert!(got == want, "{how:?} gives another scene");
+        assert!(number(&summary, "pages_read") > 0 && number(&summary, "evictions") > 0, "{summary}");
+    }
+    let (exact, _) = run(folder.path(), &scene, &base, &in_memory);
+    assert!(exact != want, "the moments were not rounded");
+}

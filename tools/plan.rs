@@ -71,7 +71,7 @@ struct Args {
     #[arg(long, default_value = "256MiB", value_name = "SIZE", help_heading = "Drive")]
     read_ahead: ByteSize,
     /// Bytes that the drive is rated to write in its life
-    #[arg(long, default_value = "600TB", value_name = "SIZE", help_heading = "Drive")]
+    #[arg(long, default_value = "300TB", value_name = "SIZE", help_heading = "Drive")]
     endurance: ByteSize,
     /// Memory that the planning itself may take; with less the plan looks less far
     #[arg(long, default_value = "1GiB", value_name = "SIZE", help_heading = "Plan")]

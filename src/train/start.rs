@@ -12,6 +12,7 @@ use super::stores::StoredStart;
 use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
+use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::colmap;
@@ -22,7 +23,7 @@ use crate::dataset::model::{PointCloud, TakePoint};
 use crate::dataset::read::{ReadOptions, read_scene};
 use crate::exchange::ply;
 use crate::paging::pager::Pager;
-use crate::scene::columns::Columns;
+use crate::scene::columns::{Columns, row_width};
 use crate::scene::init::InitOptions;
 use crate::scene::partition::first_fill;
 use std::path::{Path, PathBuf};
@@ -58,7 +59,7 @@ impl Start {
     /// As [`prepare`].
     pub fn read(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
         if config.spill_dir.is_empty() && !Path::new(&config.init_ply).is_dir() {
-            return Start::in_memory(scene, config);
+            return Start::in_memory(scene, config, host_mem);
         }
         Start::look(scene, config, &folder_beside(Path::new(&config.spill_dir)), host_mem)
     }
@@ -74,11 +75,12 @@ impl Start {
         }
         match Start::stream(scene, config, &budget(folder, host_mem))? {
             Some(start) => Ok(start),
-            None => Start::in_memory(scene, config),
+            None => Start::in_memory(scene, config, host_mem),
         }
     }
 
-    fn in_memory(scene: &Path, config: &TrainConfig) -> InputResult<Start> {
+    fn in_memory(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
+        check_gaussians_fit(config, host_mem)?;
         let Prepared { dataset, columns, sh_degree_start } = prepare(scene, config)?;
         let points = match dataset.points.as_slice() {
             [] => columns_print(&columns),
@@ -198,6 +200,26 @@ pub(super) fn folder_beside(spill_dir: &Path) -> PathBuf {
 /// The spill directory, or as long as it is not there the folder above it that is: what tells of its drive.
 pub(super) fn drive_of(spill_dir: &Path) -> PathBuf {
     if spill_dir.is_dir() { spill_dir.to_path_buf() } else { folder_beside(spill_dir) }
+}
+
+/// A PLY of Gaussians is read whole: one that cannot fit is refused by its header, before memory runs out.
+fn check_gaussians_fit(config: &TrainConfig, host_mem: Option<u64>) -> InputResult<()> {
+    let file = Path::new(&config.init_ply);
+    let is_read = !config.init_ply.is_empty() && is_ply(file);
+    let Some(budget) = host_mem.filter(|_| is_read) else { return Ok(()) };
+    let rows = ply::rows_promised(file)?;
+    let bytes = rows.saturating_mul(row_width(config.sh_degree) as u64 * 4);
+    if bytes <= budget || !ply::holds_gaussians(file)? {
+        return Ok(());
+    }
+    let problem = format!(
+        "its {rows} Gaussians take {} while they are read, above --host-mem {}",
+        format_bytes(bytes),
+        format_bytes(budget)
+    );
+    let remedy = "make a store of them, which takes little memory: gsscale-ckpt import FILE.ply --out DIR; then train with \
+                  --init-ply DIR and --spill-dir";
+    Err(InputError::new(file, problem, remedy))
 }
 
 fn is_ply(file: &Path) -> bool {

@@ -18,7 +18,9 @@ mod read;
 mod rows;
 mod write;
 
-pub use read::{ROW_HEAD, holds_gaussians, parse_ply, push_row, read_ply, stream_gaussians, stream_points};
+pub use read::{
+    ROW_HEAD, holds_gaussians, parse_ply, push_row, read_ply, rows_promised, stream_gaussians, stream_points,
+};
 pub use write::{PlyWriter, PlyWritten, write_gaussians};
 
 use crate::scene::columns::Columns;

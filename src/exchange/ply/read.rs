@@ -31,6 +31,15 @@ pub fn holds_gaussians(path: &Path) -> InputResult<bool> {
     Ok(vertex_of(&header, path)?.1.find("f_dc_0").is_some())
 }
 
+/// Gaussians or points that the header of `path` promises.
+///
+/// # Errors
+/// The file cannot be opened, or its header cannot be read.
+pub fn rows_promised(path: &Path) -> InputResult<u64> {
+    let header = parse_header(&mut open(path)?.0, path)?;
+    Ok(vertex_of(&header, path)?.1.count)
+}
+
 /// Hands the coloured points of `path` to `take`, in the file's order and without keeping them; returns how many were
 /// dropped because they are not finite. Gaussians count as points of the default colour.
 ///
