@@ -146,7 +146,7 @@ impl DriftTables {
     }
 
     /// How far a value moves from a state of `stamp` steps with moments `m` and `v` to one of `now` steps, at unit base rate,
-    /// on the schedule of the means or the constant one: what [`drifted`] and [`DriftTables::direct_sum`] do in f32, for
+    /// on the schedule of the means or the constant one: what `drifted` and `direct_sum` do in f32, for
     /// state in f64. The oracle of the formula; nothing is trained by it.
     pub fn movement(&self, [m, v]: [f64; 2], stamp: u32, now: u32, of_means: bool) -> f64 {
         let root = v.sqrt();
