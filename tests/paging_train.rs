@@ -145,7 +145,7 @@ fn a_tenth_of_a_city_in_memory_gives_the_same_city() {
     assert!(bound > 0 && bound <= read && read < bound + bound / 2, "{read} read by steps, {bound} at least");
 }
 
-/// 16-bit moments are another training, but paged they are the same one: on the drive they take half the bytes.
+/// 16-bit moments are another training, but paged they are the same one.
 #[test]
 fn moments_in_16_bits_page_to_the_same_bits() {
     let folder = TempDir::new().unwrap();
