@@ -59,3 +59,52 @@ fn pages_made_in_memory_are_not_read() {
     bound.step(2, [(PageNo(2), 7)].into_iter());
     assert_eq!((bound.pages(), bound.bytes()), (1, 7));
 }
+
+/// The fewest pages that any cache reads whose frames differ from step to step: every content that it could have.
+fn fewest(steps: &[(usize, u32)], pages: u32) -> u64 {
+    let mut reads: Vec<Option<u64>> = vec![None; 1 << pages];
+    reads[0] = Some(0);
+    for &(frames, needed) in steps {
+        let mut next = vec![None; 1 << pages];
+        for (held, read) in reads.iter().enumerate().filter_map(|(held, read)| read.map(|r| (held as u32, r))) {
+            let then = read + u64::from((needed & !held).count_ones());
+            for content in 0..1u32 << pages {
+                let is_possible = content & needed == needed && content & !(held | needed) == 0;
+                if is_possible && content.count_ones() as usize <= frames {
+                    let best = &mut next[content as usize];
+                    *best = Some(best.map_or(then, |b: u64| b.min(then)));
+                }
+            }
+        }
+        reads = next;
+    }
+    reads.into_iter().flatten().min().unwrap()
+}
+
+#[test]
+fn frames_may_be_taken_away_between_steps() {
+    let mut draws = Stream::new(6, Purpose::Test, 1, 1);
+    let mut differs = 0;
+    for round in 0..200 {
+        let pages = 6;
+        let mut frames = 5;
+        let steps: Vec<(usize, u32)> = (0..14)
+            .map(|_| {
+                frames -= usize::from(frames > 2 && draws.below(4) == 0);
+                let needed = (0..frames).fold(0, |needed, _| needed | 1u32 << draws.below(pages));
+                (frames, needed)
+            })
+            .collect();
+        let bound = |frames_at: &dyn Fn(usize) -> usize| {
+            let mut bound = FewestReads::default();
+            for &(frames, needed) in &steps {
+                let list = (0..pages as u32).filter(|page| needed >> page & 1 == 1).map(|page| (PageNo(page), 1));
+                bound.step(frames_at(frames), list);
+            }
+            bound.pages()
+        };
+        assert_eq!(bound(&|frames| frames), fewest(&steps, pages as u32), "round {round}: {steps:?}");
+        differs += u32::from(bound(&|frames| frames) != bound(&|_| 5));
+    }
+    assert!(differs > 20, "in {differs} rounds the frames that were taken away made a difference");
+}

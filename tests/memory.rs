@@ -49,4 +49,9 @@ fn the_announced_memory_is_what_a_run_takes() {
     let growing = ["--max-gaussians", "66000", "--refine-start", "9", "--refine-every", "10", "--grow-grad2d", "0"];
     let gaussians = check(folder.path(), &scene, "growing", &[&two[..], &growing].concat());
     assert!(gaussians > 64_000, "the scene hardly grew ({gaussians}), so the last case shows little");
+    // Large pages, many of which split, with all bands.
+    let growing =
+        ["--max-gaussians", "150000", "--refine-start", "9", "--refine-every", "5", "--grow-grad2d", "0.00002"];
+    let gaussians = check(folder.path(), &scene, "grown", &[&two[..], &growing, &["--sh-start", "3"]].concat());
+    assert!(gaussians > 140_000, "the scene hardly grew ({gaussians}), so the last case shows little");
 }

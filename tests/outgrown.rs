@@ -96,3 +96,90 @@ fn a_cap_that_the_frames_hold_is_no_reason_to_warn() {
     let warned = said("600000");
     assert!(warned.contains("--max-gaussians 600000") && warned.contains("200 frames"), "{warned}");
 }
+
+/// What the drive tier is for: a scene that outgrows the memory it was given.
+fn large_scene(folder: &Path) -> PathBuf {
+    let scene = folder.join("scene");
+    let (views, width, height, points, blocks) = (33, 160, 120, 60_000, Some(12));
+    let city = CityOptions { seed: 5, views, width, height, points, blocks, supersample: 1, ..CityOptions::default() };
+    write_city(&scene, &city, &|_, _| {}).unwrap();
+    scene
+}
+
+/// Grows sixfold, a round every 20 steps, all bands in use.
+const GROWING_MUCH: &str = "--steps 120 --page-rows 64 --grow-grad2d 0.00005 --refine-start 20 --refine-every 20 --view-order \
+    groups:4 --test-every 11 --commit-every 0 --device cpu --threads 2 --image-cache 4MiB --prefetch-bytes 1MiB \
+    --log-every 5 --sh-start 3";
+
+fn frames_logged(out: &Path) -> Vec<u64> {
+    let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
+    let frames = |line| serde_json::from_str::<serde_json::Value>(line).unwrap()["frames"].as_u64().unwrap();
+    metrics.lines().map(frames).collect()
+}
+
+#[test]
+fn a_scene_that_grows_stays_within_its_memory() {
+    const BUDGET: f64 = 160.0 * 1048576.0;
+    let folder = TempDir::new().unwrap();
+    let scene = large_scene(folder.path());
+    let path = |name: &str| folder.path().join(name);
+    let (alone, out, spill) = (path("alone"), path("out"), path("spill"));
+    let flags: Vec<&str> = GROWING_MUCH.split_whitespace().collect();
+    let output = train(&[&[text(&scene), "--out", text(&alone), "--quiet"], &flags[..]].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let within = ["--out", text(&out), "--spill-dir", text(&spill), "--host-mem", "160MiB"];
+    let output = train(&[&[text(&scene)], &within[..], &flags[..]].concat());
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    assert!(said.contains("there is no cap on it") && said.contains("for all that there are"), "{said}");
+    // Without a folder for its pages it begins in memory, and finds the drive of its results when it does not fit.
+    let moved = path("moved");
+    let output = train(&[&[text(&scene), "--out", text(&moved), "--host-mem", "160MiB"], &flags[..]].concat());
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    assert!(said.contains(&format!("its pages move between memory and {}/checkpoint", text(&moved))), "{said}");
+    assert!(!moved.join("checkpoint").exists(), "removed at a clean end");
+    let in_memory = summary(&alone);
+    let peak = |summary: &serde_json::Value| summary["host_bytes_peak"].as_f64().unwrap();
+    assert!(peak(&in_memory) > 1.8 * BUDGET, "{:.1} MB in memory: it hardly grew", peak(&in_memory) / 1e6);
+    assert_eq!(in_memory["bytes_read"], 0);
+    for out in [&out, &moved] {
+        // The promise is a tenth.
+        let done = summary(out);
+        assert!(peak(&done) <= 1.1 * BUDGET, "{:.1} MB at the peak", peak(&done) / 1e6);
+        let frames = frames_logged(out);
+        let (most, last) = (frames.iter().max().unwrap(), frames.last().unwrap());
+        assert!(last * 4 < most * 3, "none gave way: {frames:?}");
+        let read = |key: &str| done[key].as_u64().unwrap();
+        assert!(read("bytes_read") > read("other_bytes_read"), "no step read a page: {done}");
+        let [got, want] = [out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
+        assert!(got == want, "another scene than in memory");
+    }
+}
+
+#[test]
+fn a_scene_that_grows_beyond_its_memory_stops_with_the_need_and_goes_on_with_it() {
+    let folder = TempDir::new().unwrap();
+    let scene = large_scene(folder.path());
+    let (out, spill) = (folder.path().join("out"), folder.path().join("spill"));
+    let flags: Vec<&str> = GROWING_MUCH.split_whitespace().collect();
+    let within = ["--out", text(&out), "--spill-dir", text(&spill), "--host-mem", "112MiB"];
+    let output = train(&[&[text(&scene)], &within[..], &flags[..]].concat());
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    for words in ["the view view_00", ".jpg of step", "pages in memory at once", "--host-mem"] {
+        assert!(said.contains(words), "{words} is not in: {said}");
+    }
+    let stopped = summary(&out);
+    let peak = stopped["host_bytes_peak"].as_f64().unwrap();
+    assert!(peak <= 1.1 * 112.0 * 1048576.0, "{:.1} MB at the peak", peak / 1e6);
+    assert!(stopped["gaussians"].as_u64() > Some(70_000), "it stopped before it grew: {stopped}");
+    // Once more with what it names, which is more than it had.
+    let line = said.lines().find(|l| l.starts_with("to go on from the last commit")).unwrap();
+    let named = line.split("--host-mem ").nth(1).and_then(|rest| rest.split_whitespace().next()).unwrap();
+    let output = train(&["--resume", text(&out), "--host-mem", named, "--quiet"]);
+    let steps = summary(&out)["steps"].as_u64().unwrap();
+    assert!(steps > stopped["steps"].as_u64().unwrap(), "{named} did not help: {}", stderr(&output));
+    let output = train(&["--resume", text(&out), "--host-mem", "200MiB", "--quiet"]);
+    assert!(output.status.success() && summary(&out)["finished"] == true, "{}", stderr(&output));
+}

@@ -24,6 +24,11 @@ impl PageId {
         (half > 0).then_some([PageId(self.0 - half), PageId(self.0 + half)])
     }
 
+    /// Whether it is part of a page that split.
+    pub fn is_part(self) -> bool {
+        self.0 as u32 != 1 << (PATH_BITS - 1)
+    }
+
     /// As a number, for files.
     pub fn to_bits(self) -> u64 {
         self.0
@@ -86,6 +91,10 @@ mod tests {
         let [low_low, low_high] = low.children().unwrap_or([root; 2]);
         assert!(PageId::initial(6) < low_low && low_low < low_high && low_high < high && high < PageId::initial(8));
         assert_eq!(format!("{root} {low} {high} {low_high}"), "7 7.0 7.1 7.0.1");
+        assert_eq!(
+            [root, low, high, low_high, PageId::initial(0)].map(PageId::is_part),
+            [false, true, true, true, false]
+        );
         for page in [root, low, high, low_high] {
             assert_eq!(page.to_string().parse(), Ok(page));
         }

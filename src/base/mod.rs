@@ -6,5 +6,6 @@ pub mod ids;
 pub mod machine;
 pub mod math;
 pub mod rng;
+pub mod room;
 pub mod simd;
 pub mod units;

@@ -1,7 +1,7 @@
 //! One frame: the place in host memory of one page.
 //!
 //! Invariant: a frame has its buffer exactly when it is free or resident; otherwise somebody else holds it: the store
-//! (loading, writing) or the caller (pinned, lent).
+//! (loading, writing) or the caller (pinned, lent), or it was given back to the system (retired).
 
 use super::evict::NEVER;
 use crate::base::ids::PageNo;
@@ -22,13 +22,20 @@ pub enum FrameState {
     Pinned,
     /// The store writes the buffer; the page is free for nothing else meanwhile.
     Writing,
+    /// Has no memory: it was taken away, and may be given back.
+    Retired,
+}
+
+impl FrameState {
+    /// How many there are.
+    pub(super) const COUNT: usize = FrameState::Retired as usize + 1;
 }
 
 /// A frame and what the cache knows of its page.
 #[derive(Debug)]
 pub(super) struct Frame {
     pub state: FrameState,
-    /// The page; meaningless for free and lent frames.
+    /// The page; meaningless for free, lent and retired frames.
     pub page: PageNo,
     /// Whether the page differs from what the store holds.
     pub dirty: bool,

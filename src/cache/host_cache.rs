@@ -4,8 +4,9 @@
 //! ended. Methods panic when told of a move that the page's state does not allow: that is a bug of the caller, and going
 //! on would lose a page.
 //!
-//! Invariants: 1. a page is in at most one frame; 2. there are never more frames than allowed, and each keeps its
-//! buffer for life: buffers move between frame, store and caller, and are never copied; 3. exactly the resident frames
+//! Invariants: 1. a page is in at most one frame; 2. no frame is taken while there are as many as allowed, and each keeps
+//! its buffer: buffers move between frame, store and caller, and are never copied. Where fewer are allowed than there are,
+//! those that are free or become free give their memory back until there are no more than that; 3. exactly the resident frames
 //! are in the eviction order; 4. a dirty page leaves only through [`HostCache::evict`] of a clean one: it must be
 //! written first.
 
@@ -47,11 +48,13 @@ pub struct HostCache {
     frames: Vec<Frame>,
     free: Vec<u32>,
     lent: Vec<u32>,
+    /// Frames without memory.
+    retired: Vec<u32>,
     frame_from_page: Vec<u32>,
     clean: EvictQueue,
     dirty: EvictQueue,
     /// Frames by state, indexed by `FrameState as usize`.
-    counts: [usize; 6],
+    counts: [usize; FrameState::COUNT],
     clock: u32,
 }
 
@@ -65,10 +68,11 @@ impl HostCache {
             frames: Vec::new(),
             free: Vec::new(),
             lent: Vec::new(),
+            retired: Vec::new(),
             frame_from_page: Vec::new(),
             clean: EvictQueue::new(policy),
             dirty: EvictQueue::new(policy),
-            counts: [0; 6],
+            counts: [0; FrameState::COUNT],
             clock: 0,
         }
     }
@@ -78,9 +82,14 @@ impl HostCache {
         self.frames_max
     }
 
-    /// Frames whose memory was taken.
+    /// Frames that have memory.
     pub fn frames(&self) -> usize {
-        self.frames.len()
+        self.frames.len() - self.retired.len()
+    }
+
+    /// Frames that have memory beyond those that there may be: they lose it as they become free.
+    pub fn excess(&self) -> usize {
+        self.frames().saturating_sub(self.frames_max)
     }
 
     /// Bytes of one frame.
@@ -98,9 +107,19 @@ impl HostCache {
         self.frames_max = self.frames_max.max(frames_max);
     }
 
-    /// Allows one frame more.
+    /// Allows fewer frames; never more. Free ones give their memory back at once, others when their pages have left.
+    pub fn limit_frames(&mut self, frames_max: usize) {
+        self.frames_max = self.frames_max.min(frames_max);
+        while self.excess() > 0
+            && let Some(frame) = self.free.pop()
+        {
+            self.retire(frame as usize);
+        }
+    }
+
+    /// Allows one frame more than there are, or than there may be.
     pub fn add_frame(&mut self) {
-        self.frames_max = self.frames_max.saturating_add(1);
+        self.frames_max = self.frames_max.max(self.frames()).saturating_add(1);
     }
 
     /// What a page's frame is doing; `None` for a page that is not in memory.
@@ -115,12 +134,12 @@ impl HostCache {
 
     /// Frames that could be taken without evicting.
     pub fn free_frames(&self) -> usize {
-        self.free.len() + (self.frames_max - self.frames.len())
+        self.free.len() + self.frames_max.saturating_sub(self.frames())
     }
 
     /// All pages in memory, whatever their frames are doing.
     pub fn held(&self) -> impl Iterator<Item = Held> {
-        let holds_page = |f: &&Frame| !matches!(f.state, FrameState::Free | FrameState::Lent);
+        let holds_page = |f: &&Frame| !matches!(f.state, FrameState::Free | FrameState::Lent | FrameState::Retired);
         self.frames.iter().filter(holds_page).map(|f| Held { page: f.page, next_use: f.next_use, last_use: f.last_use })
     }
 
@@ -153,11 +172,19 @@ impl HostCache {
             self.lent.push(frame);
             return self.frames[frame as usize].buffer.take();
         }
-        (self.frames.len() < self.frames_max).then(|| {
-            self.lent.push(self.frames.len() as u32);
-            self.frames.push(Frame::lent());
-            self.counts[FrameState::Lent as usize] += 1;
-            PageBuffer::zeroed(self.frame_bytes)
+        (self.frames() < self.frames_max).then(|| {
+            match self.retired.pop() {
+                Some(frame) => {
+                    self.set_state(frame as usize, FrameState::Lent);
+                    self.lent.push(frame);
+                }
+                None => {
+                    self.lent.push(self.frames.len() as u32);
+                    self.frames.push(Frame::lent());
+                    self.counts[FrameState::Lent as usize] += 1;
+                }
+            }
+            PageBuffer::mapped(self.frame_bytes)
         })
     }
 
@@ -236,14 +263,13 @@ impl HostCache {
         self.set_resident(frame, buffer);
     }
 
-    /// Evicts a resident clean page; its frame is free.
+    /// Evicts a resident clean page; its frame is free, or gone if there are more than there may be.
     pub fn evict(&mut self, page: PageNo) {
         let frame = self.frame_in(page, FrameState::Resident);
         assert!(!self.frames[frame].dirty, "a dirty page is written before it is evicted");
         let buffer = self.unqueue(frame, FrameState::Free);
         self.frame_from_page[page.index()] = ABSENT;
-        self.frames[frame].buffer = Some(buffer);
-        self.free.push(frame as u32);
+        self.set_free(frame, buffer);
     }
 
     /// The page that should leave first.
@@ -317,9 +343,19 @@ impl HostCache {
     }
 
     fn set_free(&mut self, frame: usize, buffer: PageBuffer) {
+        if self.excess() > 0 {
+            return self.retire(frame);
+        }
         self.set_state(frame, FrameState::Free);
         self.frames[frame].buffer = Some(buffer);
         self.free.push(frame as u32);
+    }
+
+    /// Takes the memory of a frame without a page.
+    fn retire(&mut self, frame: usize) {
+        self.set_state(frame, FrameState::Retired);
+        self.frames[frame].buffer = None;
+        self.retired.push(frame as u32);
     }
 
     fn set_resident(&mut self, frame: usize, buffer: PageBuffer) {
@@ -393,6 +429,40 @@ mod tests {
         let (first, last) = (cache.pin(PageNo(0), true).unwrap().0, cache.pin(PageNo(1), true).unwrap().0);
         assert_eq!((first.as_slice()[0], last.as_slice()[0]), (0, 1));
         assert!(cache.victim().is_none() && cache.count(FrameState::Pinned) == 2);
+    }
+
+    #[test]
+    fn frames_that_are_taken_away_give_their_memory_back_as_their_pages_leave() {
+        let mut cache = HostCache::new(6, 4096, EvictPolicy::FarthestNextUse);
+        (0..5).for_each(|i| load(&mut cache, i, 10 + i, i as u8));
+        let lent = cache.lend().unwrap();
+        cache.take_back(lent);
+        let pinned = cache.pin(PageNo(0), true).unwrap().0;
+        cache.limit_frames(3);
+        // The free one went at once.
+        assert_eq!((cache.frames(), cache.frames_max(), cache.excess(), cache.free_frames()), (5, 3, 2, 0));
+        cache.limit_frames(4);
+        assert_eq!(cache.frames_max(), 3, "a limit allows no more than before");
+        assert!(cache.lend().is_none() && cache.begin_load(PageNo(9), 1).is_none());
+        cache.evict(PageNo(4));
+        cache.drop_pinned(PageNo(0), pinned);
+        assert_eq!((cache.frames(), cache.excess(), cache.free_frames(), cache.held().count()), (3, 0, 0, 3));
+        // From now on a page that leaves makes room for another.
+        cache.evict(PageNo(3));
+        assert_eq!((cache.frames(), cache.free_frames()), (3, 1));
+        load(&mut cache, 7, 1, 77);
+        // One frame more, although there was an excess: frames that have no memory get it again.
+        cache.limit_frames(1);
+        assert_eq!(cache.excess(), 2);
+        cache.add_frame();
+        assert_eq!((cache.excess(), cache.free_frames()), (0, 1));
+        load(&mut cache, 8, 2, 88);
+        cache.allow_frames(6);
+        (10..12).for_each(|i| load(&mut cache, i, 3, i as u8));
+        assert_eq!((cache.frames(), cache.free_frames(), cache.count(FrameState::Retired)), (6, 0, 0));
+        for (page, mark) in [(7, 77), (8, 88), (11, 11), (1, 1)] {
+            assert_eq!(cache.pin(PageNo(page), true).unwrap().0.as_slice()[0], mark);
+        }
     }
 
     #[test]

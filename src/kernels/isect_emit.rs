@@ -9,6 +9,7 @@
 use super::constants::TILE;
 use super::radix_sort::chunk_len;
 use super::splats::{Grid, Packed, Span, Splat, rows_in_column, tile_rows};
+use crate::base::room;
 use crate::base::simd::{Kernel, SimdPath, dispatch, prefetch};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -123,7 +124,7 @@ pub fn emit(
 ) {
     let tiles = grid.tiles();
     let len = chunk_len(order.len(), ROWS_PER_CHUNK, CHUNKS_MAX);
-    isects.resize_with(total as usize, AtomicU64::default);
+    room::resize_with(isects, total as usize, AtomicU64::default);
     if tiles == 0 {
         return;
     }

@@ -8,6 +8,7 @@
 //! determinant of the 2D covariance is a sum of squares, so that needles keep their short side in f32.
 
 use crate::base::math::{exp32, sigmoid};
+use crate::base::room;
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use crate::kernels::constants::{ALPHA_MIN, EXTENT_SIGMAS};
 use crate::kernels::lanes::{ROWS_PER_CHUNK, block_of, block_of_mut, chunk_of, gather, lane, scatter, set_lane};
@@ -38,11 +39,11 @@ impl Projected {
 
     /// Changes the number of rows; keeps the allocation.
     pub fn resize(&mut self, rows: usize) {
-        self.means2d.resize(rows, [0.0; 2]);
-        self.conics.resize(rows, [0.0; 3]);
-        self.depths.resize(rows, 0.0);
-        self.radii.resize(rows, [0; 2]);
-        self.opacities.resize(rows, 0.0);
+        room::resize(&mut self.means2d, rows, [0.0; 2]);
+        room::resize(&mut self.conics, rows, [0.0; 3]);
+        room::resize(&mut self.depths, rows, 0.0);
+        room::resize(&mut self.radii, rows, [0; 2]);
+        room::resize(&mut self.opacities, rows, 0.0);
     }
 }
 

@@ -13,6 +13,7 @@ use super::project_fwd::Projected;
 use super::rasterize_fwd::{Lanes, Lists, Raster, TILE_PIXELS, copy_lanes, exp2_bounded, log2_max_alpha};
 use super::splats::{LOG2_ALPHA_MIN, ROWS_PER_CHUNK};
 use super::tile_block::{Block, ROWS, prefetch_splats};
+use crate::base::room;
 use crate::base::simd::{Kernel, LANES, dispatch, fma};
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -284,7 +285,7 @@ pub fn rasterize_bwd(
     partials: &mut Vec<Partial>,
 ) {
     let cap = log2_max_alpha(lists.max_alpha, lists.simd);
-    partials.resize_with(lists.isects.len(), Partial::default);
+    room::resize_with(partials, lists.isects.len(), Partial::default);
     // Zeros for all, in order of memory: cheaper than writing them one by one where a splat takes no part.
     partials.par_chunks_mut(16_384).for_each(|partials| {
         partials.iter_mut().flatten().for_each(|sum| *sum.get_mut() = 0);
@@ -308,10 +309,10 @@ pub fn fold_rows(
     out: &mut FootprintGradients,
 ) {
     let rows = projected.rows();
-    out.v_means2d.resize(rows, [0.0; 2]);
-    out.v_conics.resize(rows, [0.0; 3]);
-    out.v_colors.resize(rows, [0.0; 3]);
-    out.v_opacities.resize(rows, 0.0);
+    room::resize(&mut out.v_means2d, rows, [0.0; 2]);
+    room::resize(&mut out.v_conics, rows, [0.0; 3]);
+    room::resize(&mut out.v_colors, rows, [0.0; 3]);
+    room::resize(&mut out.v_opacities, rows, 0.0);
     let geometry = (out.v_means2d.par_chunks_mut(ROWS_PER_CHUNK), out.v_conics.par_chunks_mut(ROWS_PER_CHUNK));
     let looks = (out.v_colors.par_chunks_mut(ROWS_PER_CHUNK), out.v_opacities.par_chunks_mut(ROWS_PER_CHUNK));
     let chunks = geometry.into_par_iter().zip(looks.into_par_iter()).enumerate();

@@ -5,6 +5,7 @@
 //! Invariants: 1. the basis has the signs and the order of the 3DGS code, so that files can be exchanged; 2. nothing
 //! is fused: the same bits on every instruction path; 3. culled rows are neither read nor computed, their colour is 0.
 
+use crate::base::room;
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use crate::kernels::lanes::{Lanes, ROWS_PER_CHUNK, block_of, block_of_mut, chunk_of, gather, lane, set_lane};
 use crate::kernels::project_fwd::{Projected, dot};
@@ -100,7 +101,7 @@ pub fn sh_fwd(
 ) {
     assert!(sh_degree <= rows.sh_degree, "the rows are stored with degree {}", rows.sh_degree);
     assert_eq!(projected.rows(), rows.rows(), "one entry per row");
-    colors.resize(rows.rows(), [0.0; 3]);
+    room::resize(colors, rows.rows(), [0.0; 3]);
     let centre = camera.centre();
     colors.par_chunks_mut(ROWS_PER_CHUNK).enumerate().for_each(|(chunk, colors)| {
         let stored = ShChunk::new(rows, projected, centre, chunk);

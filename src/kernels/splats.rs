@@ -10,6 +10,7 @@
 use super::constants::TILE;
 use super::lanes::{block_of, gather};
 use super::project_fwd::Projected;
+use crate::base::room;
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use rayon::prelude::*;
 
@@ -226,10 +227,10 @@ pub const ROWS_PER_CHUNK: usize = 2048;
 /// Packs all rows. `colors` has one entry per row.
 pub fn pack(projected: &Projected, colors: &[[f32; 3]], grid: Grid, simd: SimdPath, out: &mut Packed) {
     let rows = projected.rows();
-    out.splats.resize(rows, Splat::default());
-    out.spans.resize(rows, Span::default());
-    out.counts.resize(rows, 0);
-    out.chunk_counts.resize(rows.div_ceil(ROWS_PER_CHUNK), 0);
+    room::resize(&mut out.splats, rows, Splat::default());
+    room::resize(&mut out.spans, rows, Span::default());
+    room::resize(&mut out.counts, rows, 0);
+    room::resize(&mut out.chunk_counts, rows.div_ceil(ROWS_PER_CHUNK), 0);
     let chunks = (out.splats.par_chunks_mut(ROWS_PER_CHUNK), out.spans.par_chunks_mut(ROWS_PER_CHUNK));
     let counts = (out.counts.par_chunks_mut(ROWS_PER_CHUNK), out.chunk_counts.par_iter_mut()).into_par_iter();
     chunks.into_par_iter().zip(counts).enumerate().for_each(|(chunk, ((splats, spans), (counts, sum)))| {

@@ -1,18 +1,29 @@
 //! Memory for one version of one page, aligned for direct I/O.
 //!
 //! Invariants: 1. the first byte lies on a multiple of [`ALIGNMENT`], and stays there when the buffer is moved: the bytes
-//! live on the heap; 2. the length is a multiple of [`ALIGNMENT`]; 3. a fresh buffer is zero, and its memory is taken from
-//! the machine only as it is written to.
+//! live elsewhere; 2. the length is a multiple of [`ALIGNMENT`]; 3. a fresh buffer is zero; 4. a mapped one takes memory from
+//! the machine only as it is written to, and gives all of it back at its end, whatever the heap looks like by then.
+
+use memmap2::MmapMut;
 
 /// Alignment of memory, offsets and lengths that every drive accepts for direct I/O, bytes.
 pub const ALIGNMENT: usize = 4096;
 
+/// Smaller buffers are not worth a map of their own, bytes.
+const MAPPED_LEAST: usize = 32 << 10;
+
 /// An aligned buffer of fixed length. Moved, never copied, between frames and transfers.
 pub struct PageBuffer {
-    /// Longer than the buffer by up to one alignment.
-    bytes: Vec<u8>,
+    memory: Memory,
     start: usize,
     len: usize,
+}
+
+enum Memory {
+    /// Longer than the buffer by up to one alignment.
+    Heap(Vec<u8>),
+    /// Begins on a page of the machine, which is a multiple of the alignment.
+    Mapped(MmapMut),
 }
 
 impl PageBuffer {
@@ -21,7 +32,18 @@ impl PageBuffer {
         let len = bytes.next_multiple_of(ALIGNMENT);
         let bytes = vec![0; len + ALIGNMENT];
         let start = bytes.as_ptr().align_offset(ALIGNMENT);
-        PageBuffer { bytes, start, len }
+        PageBuffer { memory: Memory::Heap(bytes), start, len }
+    }
+
+    /// As [`PageBuffer::zeroed`], for buffers that stay: in memory of its own, if it is large enough and the machine has
+    /// another map to give.
+    pub fn mapped(bytes: usize) -> PageBuffer {
+        let len = bytes.next_multiple_of(ALIGNMENT);
+        let map = (len >= MAPPED_LEAST).then(|| MmapMut::map_anon(len).ok()).flatten();
+        match map.filter(|map| map.as_ptr().align_offset(ALIGNMENT) == 0) {
+            Some(map) => PageBuffer { memory: Memory::Mapped(map), start: 0, len },
+            None => PageBuffer::zeroed(bytes),
+        }
     }
 
     /// Bytes of the buffer.
@@ -36,12 +58,18 @@ impl PageBuffer {
 
     /// All bytes.
     pub fn as_slice(&self) -> &[u8] {
-        &self.bytes[self.start..self.start + self.len]
+        match &self.memory {
+            Memory::Heap(bytes) => &bytes[self.start..self.start + self.len],
+            Memory::Mapped(map) => &map[..self.len],
+        }
     }
 
     /// All bytes.
     pub fn as_mut_slice(&mut self) -> &mut [u8] {
-        &mut self.bytes[self.start..self.start + self.len]
+        match &mut self.memory {
+            Memory::Heap(bytes) => &mut bytes[self.start..self.start + self.len],
+            Memory::Mapped(map) => &mut map[..self.len],
+        }
     }
 }
 
@@ -57,15 +85,23 @@ mod tests {
 
     #[test]
     fn buffers_are_aligned_wherever_they_go() {
-        let buffers: Vec<PageBuffer> = [0, 1, 4096, 749_568].map(PageBuffer::zeroed).into();
-        for (buffer, len) in buffers.iter().zip([0, 4096, 4096, 749_568]) {
-            assert_eq!(buffer.len(), len);
-            assert_eq!(buffer.as_slice().as_ptr().align_offset(ALIGNMENT), 0);
-            assert!(buffer.as_slice().iter().all(|&b| b == 0));
+        for make in [PageBuffer::zeroed, PageBuffer::mapped] {
+            let buffers: Vec<PageBuffer> = [0, 1, 4096, 749_568].map(make).into();
+            for (buffer, len) in buffers.iter().zip([0, 4096, 4096, 749_568]) {
+                assert_eq!(buffer.len(), len);
+                assert_eq!(buffer.as_slice().as_ptr().align_offset(ALIGNMENT), 0);
+                assert!(buffer.as_slice().iter().all(|&b| b == 0));
+            }
+            let mut boxed = Box::new(buffers);
+            boxed[3].as_mut_slice()[749_567] = 7;
+            assert_eq!(boxed[3].as_slice().as_ptr().align_offset(ALIGNMENT), 0);
+            assert_eq!(boxed[3].as_slice()[749_567], 7);
         }
-        let mut boxed = Box::new(buffers);
-        boxed[3].as_mut_slice()[749_567] = 7;
-        assert_eq!(boxed[3].as_slice().as_ptr().align_offset(ALIGNMENT), 0);
-        assert_eq!(boxed[3].as_slice()[749_567], 7);
+    }
+
+    #[test]
+    fn small_buffers_and_empty_ones_are_not_mapped() {
+        let is_mapped = |bytes| matches!(PageBuffer::mapped(bytes).memory, Memory::Mapped(_));
+        assert_eq!([0, 4096, 32 << 10, 749_568].map(is_mapped), [false, false, true, true]);
     }
 }

@@ -130,7 +130,7 @@ impl Pager {
     }
 
     /// Takes the ends of transfers that nobody waits for.
-    fn settle_for_nobody(&mut self, wait: bool) {
+    pub(super) fn settle_for_nobody(&mut self, wait: bool) {
         for Failure { is_write, error, .. } in self.settle(wait, &mut Vec::new()) {
             if is_write {
                 // The next step gets the error.

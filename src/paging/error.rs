@@ -13,12 +13,12 @@ pub enum PagingError {
     /// A working set is larger than the frames.
     #[error(
         "{what} needs {pages} pages in memory at once ({}), but there are {frames} frames ({})\n  remedy: a larger \
-         --host-mem or --frames (at least {pages}), or smaller --page-rows; a lower resolution does not help",
+         --host-mem or --frames (at least {pages}), or in a new run smaller --page-rows or --max-gaussians; a lower resolution hardly helps",
         format_bytes(*pages as u64 * *frame_bytes as u64),
         format_bytes(*frames as u64 * *frame_bytes as u64)
     )]
     WorkingSet {
-        /// Who asked: `the view of step 17`, `a list of pages`.
+        /// Who asked: `the view DJI_17.JPG of step 17`, `a list of pages`.
         what: String,
         /// Pages needed at once, at least.
         pages: usize,

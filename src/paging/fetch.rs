@@ -173,12 +173,12 @@ impl Pager {
     }
 
     /// Makes a frame free: at once if a clean page leaves first, otherwise by beginning to write dirty ones, as many as
-    /// there are frames wanted. Returns whether a frame is free now.
-    fn make_room(&mut self, wanted: usize, asker: Asker) -> Result<bool, PagingError> {
+    /// there are frames wanted. Returns whether a frame is free now, or one less too many.
+    pub(super) fn make_room(&mut self, wanted: usize, asker: Asker) -> Result<bool, PagingError> {
         loop {
             // Pages that are written to leave come first: a nearer one must not leave in their place.
             let leaving = self.cache.count(FrameState::Writing) - self.ahead[WRITES] / self.cache.frame_bytes();
-            if leaving >= wanted {
+            if leaving >= wanted + self.cache.excess() {
                 return Ok(false);
             }
             let victim = if self.writes_stopped { self.cache.clean_victim() } else { self.cache.victim() };

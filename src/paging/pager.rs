@@ -158,6 +158,34 @@ impl Pager {
         self.config.frames = self.cache.frames_max();
     }
 
+    /// Allows no more than so many frames from now on. Between steps: pages leave until there are no more, and dirty ones
+    /// are written for it; the time counts as waited for. If one could not be written the next step gets the error, and
+    /// its frame goes when it is.
+    pub fn limit_frames(&mut self, frames: usize) {
+        self.cache.limit_frames(frames);
+        self.config.frames = self.cache.frames_max();
+        while self.cache.excess() > 0 {
+            match self.make_room(0, Asker::Step) {
+                Ok(true) => {}
+                Ok(false) if self.in_flight() == 0 => return,
+                Ok(false) => self.settle_for_nobody(true),
+                Err(error) => {
+                    self.failed_write.get_or_insert(error);
+                    return;
+                }
+            }
+        }
+    }
+
+    /// A pager whose pages were all in memory, and whose store holds all of them, keeps no more than so many frames from now
+    /// on. The sizes are those of [`PagerConfig`].
+    pub fn begin_paging(&mut self, frames: usize, prefetch_bytes: usize, plan_bytes: usize) {
+        assert!(self.store.is_some(), "pages that leave memory have a store to go to");
+        self.config = PagerConfig { prefetch_bytes, plan_bytes, ..self.config };
+        self.window = Window::new(plan_bytes);
+        self.limit_frames(frames);
+    }
+
     /// Moves pages at these times from now on.
     pub fn set_transfers(&mut self, transfers: Transfers) {
         self.transfers = transfers;

@@ -31,6 +31,7 @@ use super::gpu_rows::{DeviceColumns, FOOTPRINT_BYTES, RowStages, band_into_sh_n}
 use super::gpu_tiles::{Blend, Demand, DemandReadback, Frame, Ranks, TileStages, splat_bytes};
 use super::gpu_tiles_bwd::PictureGradients;
 use super::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
+use crate::base::room;
 use crate::gpu::{Buffer, DeviceKind, Gpu, GpuResult, Readback, Recorder, Traffic};
 use crate::kernels::image_loss::LossPlan;
 use crate::kernels::splats::Grid;
@@ -349,7 +350,7 @@ impl GpuRenderer {
             bytes.copy_to(&self.gpu, to)?;
         }
         let footprints = &mut self.scratch.footprints;
-        footprints.resize(rows, [0.0; 4]);
+        room::resize(footprints, rows, [0.0; 4]);
         back.footprints.copy_to(&self.gpu, footprints)?;
         grads.radii.clear();
         grads.radii.extend(footprints.iter().map(|f| [f[2] as u32, f[3] as u32]));

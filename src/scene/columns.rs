@@ -4,6 +4,8 @@
 //! necessarily unit; 2. every column holds exactly `rows * width` floats, row-major; 3. `sh_n` is coefficient-major
 //! (`[K-1][3]`, band 1 first), the order of the field's tensors; PLY's channel-major order is the exchange's matter.
 
+use crate::base::room;
+
 /// One attribute of a Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Column {
@@ -96,7 +98,7 @@ impl Columns {
     pub fn resize(&mut self, rows: usize) {
         for column in Column::ALL {
             let width = column.width(self.sh_degree);
-            self.column_mut(column).resize(rows * width, 0.0);
+            room::resize(self.column_mut(column), rows * width, 0.0);
         }
     }
 

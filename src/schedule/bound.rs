@@ -21,8 +21,8 @@ const ABSENT: u32 = u32::MAX;
 pub struct FewestReads {
     /// By page: the step that last had it, counted here.
     last_use: Vec<u32>,
-    /// Frames taken at the steps from `first` on: by the pages that were needed, and by those that are kept for later.
-    taken: VecDeque<u32>,
+    /// Frames to spare at the steps from `first` on: beside the pages that were needed, and those that are kept for later.
+    spare: VecDeque<u32>,
     /// Steps before it have no frame to spare, or are of no interest because of one behind them that has none.
     first: u32,
     /// Pages read.
@@ -46,17 +46,19 @@ impl FewestReads {
 
     /// A new page, made in memory: at the start, or by a split in the last step.
     pub fn add(&mut self, page: PageNo) {
-        let now = (self.first + self.taken.len() as u32).saturating_sub(1);
+        let now = (self.first + self.spare.len() as u32).saturating_sub(1);
         self.set_last_use(page, now);
     }
 
-    /// The next step needs these pages, each named once, with its bytes on the drive; the cache has `frames` frames.
+    /// The next step needs these pages, each named once, with its bytes on the drive; the cache has `frames` frames at this
+    /// step.
     pub fn step(&mut self, frames: usize, pages: impl Iterator<Item = (PageNo, u64)>) {
-        if self.first == 0 && self.taken.is_empty() {
+        let frames = u32::try_from(frames).unwrap_or(u32::MAX);
+        if self.first == 0 && self.spare.is_empty() {
             // Step 0 made the first pages, and at step 1 those that were chosen are in the frames.
-            self.taken.extend([0, 0]);
+            self.spare.extend([frames, frames]);
         }
-        let now = self.first + self.taken.len() as u32;
+        let now = self.first + self.spare.len() as u32;
         self.order.clear();
         for (page, bytes) in pages {
             let last = self.last_use.get(page.index()).copied().unwrap_or(ABSENT);
@@ -64,33 +66,33 @@ impl FewestReads {
         }
         // The latest first; those that were never there count as the oldest.
         self.order.sort_unstable_by_key(|&(last, page, _)| (std::cmp::Reverse(last.wrapping_add(1)), page));
-        let needed = self.order.len();
+        let needed = self.order.len() as u32;
         let order = std::mem::take(&mut self.order);
         for &(last, page, bytes) in &order {
-            if !self.keep(last, now, frames) {
+            if !self.keep(last, now) {
                 self.pages += 1;
                 self.bytes += bytes;
             }
             self.set_last_use(page, now);
         }
         self.order = order;
-        self.taken.push_back(needed as u32);
+        self.spare.push_back(frames.saturating_sub(needed));
         if needed >= frames {
             self.forget_until(now);
         }
     }
 
     /// Keeps a page between two steps, if there is a frame for it all the time.
-    fn keep(&mut self, last: u32, now: u32, frames: usize) -> bool {
+    fn keep(&mut self, last: u32, now: u32) -> bool {
         // A step without a frame to spare is before `first`; the page's own steps have one for it.
         if last == ABSENT || last + 1 < self.first {
             return false;
         }
         let mut full = None;
         for step in last + 1..now {
-            let taken = &mut self.taken[(step - self.first) as usize];
-            *taken += 1;
-            if *taken as usize >= frames {
+            let spare = &mut self.spare[(step - self.first) as usize];
+            *spare -= 1;
+            if *spare == 0 {
                 full = Some(step);
             }
         }
@@ -102,7 +104,7 @@ impl FewestReads {
 
     /// Nothing can be kept across `step`.
     fn forget_until(&mut self, step: u32) {
-        self.taken.drain(..(step + 1 - self.first) as usize);
+        self.spare.drain(..(step + 1 - self.first) as usize);
         self.first = step + 1;
     }
 

@@ -8,6 +8,7 @@
 //! allocated.
 
 use crate::base::math::exp32;
+use crate::base::room;
 use crate::base::simd::{Kernel, dispatch};
 use crate::optim::deferred::{AdamNow, DeferredAdam, ROWS_PER_TASK};
 use crate::optim::lanes::{LANES, LaneDrifts, drifted_lanes, tables_of};
@@ -21,7 +22,7 @@ use crate::scene::rows::{ColumnsMut, Rows, RowsNow};
 pub fn visible_rows(tables: &[Rows<'_>], adam: &DeferredAdam, now: u32, camera: &Camera, out: &mut Vec<u32>) {
     let at = adam.at(now);
     let frustum = Frustum::new(camera);
-    out.resize(rows_of(tables), 0);
+    room::resize(out, rows_of(tables), 0);
     let found = cull(&at, &frustum, tables, out);
     out.truncate(found);
 }

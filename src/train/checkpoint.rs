@@ -133,6 +133,11 @@ impl Checkpoint {
         self.is_optional = is_optional;
     }
 
+    /// Where it is, or will be.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
     /// The next commit is kept under `name`, whatever is committed later.
     pub fn keep_next_as(&mut self, name: String) {
         self.name = Some(name);

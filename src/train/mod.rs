@@ -1,5 +1,6 @@
 //! The glue, in one direction: [`run`] sets a run up and sees it through ([`tiers`] says where pages live, [`memory`] and
-//! [`preflight`] whether that fits), [`trainer`] loops over steps, [`step`] is one step from top to bottom,
+//! [`preflight`] whether that fits), [`budget`] keeps it fitting as the scene grows, and `outgrown` says when it cannot,
+//! [`trainer`] loops over steps, [`step`] is one step from top to bottom,
 //! [`checkpoint`] commits it (`first_commit` that of a run in memory), [`full_drive`] finds it space, [`resume`] goes on from a
 //! commit if nothing changed (`changes`, [`dataset_print`]), [`pages`] has the rows of a run in pages and brings them to now with [`catch_up`],
 //! `update` changes them, `dense` all of them at every step, [`costs`] counts what steps took, [`eval`] looks at
@@ -7,6 +8,7 @@
 //! hears Ctrl-C, [`start`] gives the first Gaussians, [`out_folder`] is where results go, [`page_map`] draws where pages lie,
 //! [`stores`] is what tools do with checkpoints.
 
+pub mod budget;
 pub mod catch_up;
 mod changes;
 pub mod checkpoint;
@@ -19,6 +21,7 @@ pub mod full_drive;
 pub mod machine;
 pub mod memory;
 pub mod out_folder;
+mod outgrown;
 pub mod page_map;
 pub mod pages;
 pub mod preflight;

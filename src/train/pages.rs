@@ -11,6 +11,7 @@ use super::start::not_stored;
 use super::step::WorkingSet;
 use super::trainer::TrainError;
 use crate::base::ids::{PageId, PageNo};
+use crate::base::room;
 use crate::config::limits::RunOptions;
 use crate::dataset::import::{ImportOptions, PointSource, import_points};
 use crate::densify::replay::{PageEdit, PendingEvents, Replay};
@@ -34,7 +35,7 @@ use crate::scene::state::SceneState;
 use rayon::prelude::*;
 
 /// Pages that are brought to now together: their copies are in memory at once.
-const PAGES_PER_BATCH: usize = 32;
+pub(super) const PAGES_PER_BATCH: usize = 32;
 
 /// What all pages share.
 pub struct PageRules {
@@ -445,6 +446,6 @@ fn first_rows(columns: &Columns, rows: &[u32], sh_degree: u8) -> SceneState {
 
 fn append(to: &mut Columns, more: &Columns) {
     for column in Column::ALL {
-        to.column_mut(column).extend_from_slice(more.column(column));
+        room::extend(to.column_mut(column), more.column(column));
     }
 }

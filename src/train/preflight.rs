@@ -3,10 +3,11 @@
 //! Invariant: a run that cannot fit is refused here, with the numbers and the alternatives; what only might not fit,
 //! because the scene grows, is a warning.
 
+use super::budget::HostBudget;
 use super::memory::{MemoryEstimate, estimate, rows_at_most};
 use super::run::Prepared;
 use super::start::{Start, drive_of};
-use super::tiers::{PLAN_BYTES, Tiers, first_staging_bytes, staging_bytes};
+use super::tiers::{PLAN_BYTES, Tiers, budget_in_memory, first_staging_bytes, staging_bytes};
 use super::trainer::{TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
@@ -29,6 +30,10 @@ use std::path::Path;
 const ENDURANCE_BYTES: f64 = 300e12;
 /// Epochs that are played through to see what a run will write.
 const PLAYED_EPOCHS: u32 = 3;
+/// Pages are numbered in 32 bits.
+const PAGES_MOST: u64 = u32::MAX as u64;
+/// Scenes hardly ever grow to this many times their points, so that nothing is said of it.
+const GROWTH_UNLIKELY: f64 = 20.0;
 /// Versions of a page that may lie on the drive: two commits', and the one that is written for the next.
 const VERSIONS: u64 = 3;
 /// Slots that writes in flight take beside those of the pages.
@@ -39,6 +44,8 @@ const SLOTS_IN_FLIGHT: u64 = 64;
 pub struct TierPlan {
     /// Pages now, and as far as is known at most.
     pub pages: [u64; 2],
+    /// More frames than these would stay empty; the most there is, where nothing caps the growth of the scene.
+    frames_of_use: u64,
     /// Bytes of a frame and of a slot on the drive.
     pub frame_bytes: u64,
     /// Frames; `None` for as many as there are pages.
@@ -73,6 +80,11 @@ pub fn settle(
     let largest_view = largest_view(dataset, trainer);
     let mut plan = TierPlan {
         pages: [index, pages_max],
+        frames_of_use: if config.strategy != "none" && config.max_gaussians == 0 {
+            PAGES_MOST
+        } else {
+            pages_max.max(1)
+        },
         frame_bytes,
         frames: None,
         bytes_written: 0.0,
@@ -81,24 +93,30 @@ pub fn settle(
     };
     if trainer.scene.pager.stats().frames_max == usize::MAX {
         check_in_memory(memory, host_mem)?;
+        if let Some(budget) = host_mem {
+            trainer.set_budget(budget_in_memory(config, budget, &memory[0]));
+        }
         return Ok(plan);
     }
     let staging = staging_bytes(trainer.scene.pager.prefetch_bytes(), &tiers.codec);
     memory.iter_mut().for_each(|m| m.staging = staging);
     let frames = match config.frames {
-        // By what is known for certain: the cap may never be reached.
+        // By what is known for certain: the cap may never be reached. What grows takes from the frames in its time.
         0 => frames_of_budget(&plan, host_mem, &memory[0])?,
         frames => u64::from(frames),
     };
     check_view(&plan, frames)?;
     trainer.scene.pager.allow_frames(frames as usize);
+    if let Some(budget) = host_mem.filter(|_| config.frames == 0) {
+        trainer.set_budget(HostBudget::new(budget, &memory[0]));
+    }
     plan.frames = Some(frames);
     memory.iter_mut().for_each(|m| m.frames = m.frames.min(frames * frame_bytes));
     if config.view_order == "auto" {
         trainer.set_view_order(auto_order(config, dataset, trainer, frames, &plan)?, dataset);
     }
-    warn_of_growth(config, &plan, frames);
-    plan.bytes_written = bytes_written(config, dataset, trainer, frames as usize);
+    warn_of_growth(config, &plan, host_mem, memory);
+    plan.bytes_written = bytes_written(config, dataset, trainer, frames.min(plan.pages[0].max(1)) as usize);
     check_drive(&plan, tiers)?;
     Ok(plan)
 }
@@ -197,6 +215,7 @@ pub fn frames_within(config: &TrainConfig, prepared: Prepared, host_mem: u64) ->
     memory.staging = first_staging_bytes(config, pages as usize, host_mem);
     let plan = TierPlan {
         pages: [pages, u64::MAX],
+        frames_of_use: PAGES_MOST,
         frame_bytes: trainer.scene.pager.frame_bytes() as u64,
         frames: None,
         bytes_written: 0.0,
@@ -206,25 +225,38 @@ pub fn frames_within(config: &TrainConfig, prepared: Prepared, host_mem: u64) ->
     Ok(frames_of_budget(&plan, Some(host_mem), &memory)?)
 }
 
-/// Says when the scene may outgrow its frames: the largest view needs about as many times more pages as there are more
-/// Gaussians.
-fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, frames: u64) {
-    let [now, most] = plan.pages;
-    let (needed, view, _) = &plan.largest_view;
-    if config.strategy == "none" || frames >= most {
+/// Says when the scene may outgrow its memory: the largest view needs about as many times more pages as there are more
+/// Gaussians, and leaves fewer frames for them.
+fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, memory: &[MemoryEstimate; 2]) {
+    let ([now, most], Some(frames)) = (plan.pages, plan.frames) else { return };
+    if config.strategy == "none" {
         return;
     }
-    let times = frames as f64 / (*needed).max(1) as f64;
+    let (needed, view, _) = &plan.largest_view;
     let then = (*needed as f64 * most as f64 / now.max(1) as f64).ceil() as u64;
+    let left = match host_mem.filter(|_| config.frames == 0) {
+        None => frames,
+        Some(budget) => budget.saturating_sub(memory[1].fixed()) / plan.frame_bytes,
+    };
+    let times = times_to_outgrow(plan, frames, memory[0].view - memory[0].view_pixels, config.frames > 0);
     let until = match config.max_gaussians {
+        0 if times >= GROWTH_UNLIKELY => return,
         0 => "there is no cap on it (--max-gaussians)".to_string(),
-        _ if then <= frames => return,
-        cap => format!("with --max-gaussians {cap} it may come to need {then}"),
+        _ if then <= left => return,
+        cap => format!("with --max-gaussians {cap} it may come to need {then}, with {left} left for them"),
     };
     eprintln!(
         "warning: the view {view} needs {needed} pages, there are {frames} frames, and {until}: when the scene has grown to about \
          {times:.1} times what it is, the run may stop; it can then go on with --resume and more --frames or --host-mem"
     );
+}
+
+/// How many times as many Gaussians as now leave the largest view just the frames that it needs.
+fn times_to_outgrow(plan: &TierPlan, frames: u64, of_rows: u64, are_fixed: bool) -> f64 {
+    // Frames that were named do not give way to the rows of a view.
+    let of_rows = if are_fixed { 0 } else { of_rows };
+    let needed = plan.largest_view.0 * plan.frame_bytes;
+    (frames * plan.frame_bytes + of_rows) as f64 / (needed + of_rows).max(1) as f64
 }
 
 /// Bytes that the run will write to the drive: some epochs of it played through with the pages as they are now.
@@ -270,8 +302,9 @@ fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -
     }
     if most.total() > budget {
         eprintln!(
-            "warning: the run may need {}, but has {}: lower --max-gaussians, --image-cache, --sh-degree or the size \
-             of the photos, or name a folder on a fast drive with --spill-dir",
+            "warning: the run may need {}, but has {}: once it needs more its pages move between memory and its checkpoint; name \
+             a folder on a fast drive with --spill-dir, or lower --max-gaussians, --image-cache, --sh-degree or the size \
+             of the photos",
             format_bytes(most.total()),
             format_bytes(budget)
         );
@@ -281,11 +314,11 @@ fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -
 
 fn frames_of_budget(plan: &TierPlan, host_mem: Option<u64>, memory: &MemoryEstimate) -> InputResult<u64> {
     // Where the system tells nothing, everything fits until it does not.
-    let Some(budget) = host_mem else { return Ok(plan.pages[1]) };
+    let Some(budget) = host_mem else { return Ok(plan.frames_of_use) };
     let frames = budget.saturating_sub(memory.fixed()) / plan.frame_bytes;
     let (needed, view, _) = &plan.largest_view;
     if frames >= *needed {
-        return Ok(frames.min(plan.pages[1].max(1)));
+        return Ok(frames.min(plan.frames_of_use));
     }
     let problem = format!(
         "{} are too little: {} go to one view, photos, staging and tables, which leaves {frames} pages of {}, but the \
@@ -372,6 +405,9 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
     );
     let frames = match plan.frames {
         None => String::from("Gaussians with their optimizer state"),
+        Some(frames) if plan.frames_of_use == PAGES_MOST && frames > plan.pages[0] => {
+            String::from("frames of pages, for all that there are")
+        }
         Some(frames) => format!("{frames} frames of pages"),
     };
     text.push_str(&format!("memory  about {} at the peak\n", format_bytes(memory.total())));

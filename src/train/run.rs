@@ -28,7 +28,6 @@ use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, PlyWritten, read_ply, to_local};
-use crate::paging::error::PagingError;
 use crate::render::Renderer;
 use crate::report::run_report::{PAGES_FILE, write_run_report};
 use crate::scene::columns::{Columns, sh_n_width};
@@ -270,12 +269,7 @@ pub(super) fn see_through(
     }
     let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun);
     if tiers.can_resume() {
-        let more = match &outcome {
-            Err(TrainError::Paging(PagingError::WorkingSet { pages, .. })) => {
-                format!(" --frames {pages} (at least), or with a larger --host-mem")
-            }
-            _ => String::new(),
-        };
+        let more = outcome.as_ref().err().map_or(String::new(), |error| error.more_memory(config, host_mem));
         let elsewhere = spill_dir_flag(request);
         eprintln!("to go on from the last commit: gsscale-train --resume {}{elsewhere}{more}", request.out.display());
     }

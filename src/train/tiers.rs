@@ -3,8 +3,10 @@
 //! Invariants: 1. nothing here changes a bit of the result, only what is kept where; 2. [`Tiers::close`] removes the
 //! checkpoint (the spill directory, or that of a run in memory), unless a run can go on from it: see [`Tiers::is_done`].
 
+use super::budget::HostBudget;
 use super::checkpoint::Checkpoint;
 use super::first_commit::{FirstCommit, MAP_CACHE_BYTES, codec};
+use super::memory::MemoryEstimate;
 use super::start::drive_of;
 use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
@@ -96,7 +98,6 @@ fn pager_config(config: &TrainConfig, pages: usize, host_mem: u64) -> PagerConfi
     let mut pager = PagerConfig {
         frames: config.frames as usize,
         policy: policy(config),
-        prefetch_bytes: config.prefetch_bytes.0 as usize,
         plan_bytes: PLAN_BYTES,
         ..PagerConfig::in_memory(config.page_rows as usize, config.sh_degree)
     };
@@ -104,13 +105,26 @@ fn pager_config(config: &TrainConfig, pages: usize, host_mem: u64) -> PagerConfi
     if pager.frames == 0 {
         pager.frames = (affordable / PREFETCH_SHARE).max(FIRST_FRAMES).min(pages.max(1));
     }
-    if pager.prefetch_bytes == 0 {
-        let frames = if config.frames > 0 { pager.frames } else { affordable };
-        pager.prefetch_bytes = (frames / PREFETCH_SHARE).saturating_mul(pager.frame_bytes()).min(PREFETCH_BYTES_MAX);
-    }
-    // At least one page each way, or nothing would ever be ahead.
-    pager.prefetch_bytes = pager.prefetch_bytes.max(pager.frame_bytes());
+    let frames = if config.frames > 0 { pager.frames } else { affordable };
+    pager.prefetch_bytes = prefetch_bytes(config, frames, pager.frame_bytes());
     pager
+}
+
+/// Bytes of pages in flight ahead of their step, each way, with so many frames.
+fn prefetch_bytes(config: &TrainConfig, frames: usize, frame_bytes: usize) -> usize {
+    let bytes = match config.prefetch_bytes.0 as usize {
+        0 => (frames / PREFETCH_SHARE).saturating_mul(frame_bytes).min(PREFETCH_BYTES_MAX),
+        bytes => bytes,
+    };
+    // At least one page each way, or nothing would ever be ahead.
+    bytes.max(frame_bytes)
+}
+
+/// The memory of a run whose pages are all in it as long as they fit.
+pub(super) fn budget_in_memory(config: &TrainConfig, host_mem: u64, memory: &MemoryEstimate) -> HostBudget {
+    let frame_bytes = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes();
+    let ahead = prefetch_bytes(config, (host_mem / frame_bytes as u64) as usize, frame_bytes);
+    HostBudget::new(host_mem, memory).with_staging(ahead, staging_bytes(2 * ahead, &codec(config).to_string()))
 }
 
 /// The pager with its pages moving when `--transfers` says.

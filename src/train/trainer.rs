@@ -4,6 +4,7 @@
 //! cadences of logging and evaluation; 2. a step whose loss is not finite changes nothing, and three in a row end
 //! the run with what the last good step left.
 
+use super::budget::HostBudget;
 use super::checkpoint::Checkpoint;
 use super::dense::settle_all;
 use super::eval::{EvalRequest, evaluate};
@@ -98,7 +99,7 @@ pub struct Trainer {
     options: RunOptions,
     order: ViewOrder,
     train_views: Vec<usize>,
-    working: WorkingSet,
+    pub(super) working: WorkingSet,
     pub(super) step: u32,
     pub(super) rows_skipped: u64,
     pub(super) steps_skipped: u32,
@@ -106,6 +107,8 @@ pub struct Trainer {
     pub(super) train_seconds: f64,
     /// The last evaluation on the held-out views.
     pub(super) last_test: Option<LastTest>,
+    /// What the frames share with all else, where their number follows from it.
+    pub(super) budget: Option<HostBudget>,
     /// Bytes that the best of caches would have read in earlier lives of the run, which the pager knows nothing of.
     pub(super) past_belady_bytes: u64,
 }
@@ -175,6 +178,7 @@ impl Trainer {
             steps_skipped_in_a_row: 0,
             train_seconds: 0.0,
             last_test: None,
+            budget: None,
             past_belady_bytes: 0,
         }
     }
@@ -268,18 +272,20 @@ impl Trainer {
             *position = self.train_views[*position];
         }
         targets.prefetch(&ahead);
+        self.fit_frames();
         self.look_ahead(dataset);
         let target = targets.get(view)?;
         let started = Instant::now();
         let render = self.render_options();
-        let outcome = train_step(
+        let stepped = train_step(
             &mut self.scene,
             &mut self.working,
             &mut *self.renderer,
             (self.step, &dataset.views[view].camera, &target),
             (&render, &self.options.loss),
             self.options.densify.is_some_and(|d| d.collects(self.step)),
-        )?;
+        );
+        let outcome = stepped.map_err(|error| error.of_view(&dataset.views[view].name, self.step))?;
         self.count(&outcome, &dataset.views[view].name)?;
         if self.options.optimizer == Method::Dense {
             settle_all(&mut self.scene, self.step + 1)?;
@@ -292,8 +298,7 @@ impl Trainer {
 
     /// Tells the pager which views come next, now and then: it plans by pages, which costs more than a step should.
     fn look_ahead(&mut self, dataset: &Dataset) {
-        let spills = self.scene.pager.stats().frames_max != usize::MAX;
-        if !spills || !self.step.is_multiple_of(LOOK_AHEAD_EVERY) {
+        if self.is_in_memory() || !self.step.is_multiple_of(LOOK_AHEAD_EVERY) {
             return;
         }
         // Every page of the scene is needed within the next two epochs, if it ever is.
@@ -338,18 +343,6 @@ impl Trainer {
         }
     }
 
-    /// A step that needed more frames than there are changed nothing that doing it again does not: the run as it is now is
-    /// committed, so that it can go on with more memory.
-    fn keep_outgrown(&mut self, error: TrainError, outputs: &mut LoopOutputs<'_>) -> TrainError {
-        let is_outgrown = matches!(error, TrainError::Paging(PagingError::WorkingSet { .. }));
-        if let Some(checkpoint) = outputs.checkpoint.as_deref_mut().filter(|_| is_outgrown)
-            && let Err(second) = checkpoint.commit(self, outputs.metrics)
-        {
-            eprintln!("warning: the run could not be committed: {second}");
-        }
-        error
-    }
-
     /// Runs to the last step or until asked to stop.
     ///
     /// # Errors
@@ -361,6 +354,7 @@ impl Trainer {
         outputs: &mut LoopOutputs<'_>,
     ) -> Result<(), TrainError> {
         while self.step < self.options.steps && outputs.stop.exit_code().is_none() {
+            self.move_out_if_outgrown(outputs)?;
             let step = self.step;
             let before = self.renderer.traffic();
             let Some(outcome) = self.step_with_space(dataset, targets, outputs)? else { break };

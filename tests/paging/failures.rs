@@ -111,3 +111,24 @@ fn a_segment_that_cannot_be_made_says_why_and_what_helps() {
         assert!(!error.is_out_of_space() && text.contains(remedy) && !text.contains("free space"), "{text}");
     }
 }
+
+#[test]
+fn frames_that_cannot_be_emptied_go_when_there_is_space_again() {
+    let frames = frames_of(4);
+    let faults = Faults::new();
+    let mut run = run(4, 2 * frames, &faults);
+    (0..STEPS / 2).for_each(|_| run.step().unwrap());
+    faults.add(Operation::Write, faults.count(Operation::Write), true, Fault::Error(ErrorKind::StorageFull));
+    run.pager.limit_frames(frames);
+    let stats = run.pager.stats();
+    assert!(stats.frames > frames && stats.frames_max == frames, "{stats:?}");
+    let error = run.step().expect_err("the step after it is told");
+    assert!(error.is_out_of_space(), "{error}");
+    faults.clear();
+    while (run.step as usize) < STEPS {
+        run.pager.limit_frames(frames);
+        assert_eq!(run.pager.stats().frames, frames);
+        run.step().unwrap();
+    }
+    run.check_all(4).unwrap();
+}

@@ -58,6 +58,31 @@ fn pages_hold_what_was_put_into_them_whatever_the_frames() {
 }
 
 #[test]
+fn frames_that_are_taken_away_cost_no_page() {
+    for seed in 0..8 {
+        let mut memory = in_memory(seed);
+        (0..STEPS).for_each(|_| memory.step().unwrap());
+        let fewest = memory.pager.stats().pinned_max;
+        for codec in [Codec::Raw, Codec::Zstd { level: 1 }] {
+            let faults = Faults::new();
+            faults.reorder(seed + 100);
+            let pager = Pager::new(config(3 * fewest), store(codec, &faults));
+            let mut run = Run::new(pager, seed, PAGES, STEPS).unwrap();
+            for step in 0..STEPS {
+                run.step().unwrap();
+                let frames = (3 * fewest).saturating_sub(step * 4 * fewest / STEPS).max(fewest);
+                run.pager.limit_frames(frames);
+                let stats = run.pager.stats();
+                assert!(stats.frames <= frames && stats.frames_max == frames, "step {step}: {stats:?}");
+            }
+            assert_eq!(run.pager.stats().frames, fewest);
+            run.check_all(fewest).unwrap();
+            assert_eq!(run.model, memory.model);
+        }
+    }
+}
+
+#[test]
 fn one_frame_less_than_the_largest_view_is_refused_with_the_need() {
     for seed in 0..4 {
         let mut memory = in_memory(seed);

@@ -1,0 +1,48 @@
+//! Vectors that grow a little at a time: with an eighth to spare, where a `Vec` takes the double of what it had. What a run
+//! may take is bounded, and these are its largest parts.
+
+/// Changes the length as [`Vec::resize`] does; keeps the allocation while it is large enough.
+pub fn resize<T: Copy>(values: &mut Vec<T>, len: usize, value: T) {
+    reserve(values, len);
+    values.resize(len, value);
+}
+
+/// Changes the length as [`Vec::resize_with`] does; keeps the allocation while it is large enough.
+pub fn resize_with<T>(values: &mut Vec<T>, len: usize, value: impl FnMut() -> T) {
+    reserve(values, len);
+    values.resize_with(len, value);
+}
+
+/// Appends values.
+pub fn extend<T: Copy>(values: &mut Vec<T>, more: &[T]) {
+    reserve(values, values.len() + more.len());
+    values.extend_from_slice(more);
+}
+
+/// Room for `len` values in all. The first allocation is exact: what is made once has nothing to spare.
+fn reserve<T>(values: &mut Vec<T>, len: usize) {
+    if len > values.capacity() {
+        let to_spare = if values.capacity() == 0 { 0 } else { len / 8 };
+        values.reserve_exact(len + to_spare - values.len());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn there_is_little_to_spare() {
+        let mut values = Vec::new();
+        resize(&mut values, 1000, 1.0f32);
+        assert_eq!((values.len(), values.capacity()), (1000, 1000));
+        resize(&mut values, 1001, 2.0);
+        assert_eq!((values.len(), values.capacity(), values[999], values[1000]), (1001, 1126, 1.0, 2.0));
+        extend(&mut values, &[3.0; 125]);
+        assert_eq!((values.len(), values.capacity()), (1126, 1126));
+        extend(&mut values, &[4.0]);
+        assert_eq!((values.len(), values.capacity(), values[1126]), (1127, 1267, 4.0));
+        resize_with(&mut values, 10, f32::default);
+        assert_eq!((values.len(), values.capacity()), (10, 1267));
+    }
+}

@@ -1,0 +1,85 @@
+//! Scenes that outgrow their memory. One that was all in memory goes on with pages on the drive of its checkpoint. A view
+//! that needs more pages than there are frames ends the run: which photo it is of, what is kept, and what would do.
+//!
+//! Invariant: nothing is lost, and no bit is another. The step that could not be done changed nothing that doing it again
+//! does not.
+
+use super::tiers::PLAN_BYTES;
+use super::trainer::{LoopOutputs, TrainError, Trainer};
+use crate::base::units::{MIB, format_bytes};
+use crate::config::file::TrainConfig;
+use crate::paging::error::PagingError;
+
+impl TrainError {
+    /// The same of a step whose photo is known.
+    pub(super) fn of_view(mut self, name: &str, step: u32) -> TrainError {
+        if let TrainError::Paging(PagingError::WorkingSet { what, .. }) = &mut self {
+            *what = format!("the view {name} of step {step}");
+        }
+        self
+    }
+
+    /// Flags with which a run that stopped for want of frames may go on; empty for other errors. It may have been the first
+    /// view of many to outgrow them, so that there is some room to grow.
+    pub(super) fn more_memory(&self, config: &TrainConfig, host_mem: Option<u64>) -> String {
+        let TrainError::Paging(PagingError::WorkingSet { pages, frames, frame_bytes, .. }) = self else {
+            return String::new();
+        };
+        match host_mem.filter(|_| config.frames == 0) {
+            None => format!(" --frames {pages} (at least)"),
+            Some(budget) => {
+                let least = budget + (pages.saturating_sub(*frames) * frame_bytes) as u64;
+                format!(" --host-mem {}MiB (at least {}MiB)", (least + least / 2) / MIB, least.div_ceil(MIB))
+            }
+        }
+    }
+}
+
+impl Trainer {
+    /// Lets the pages of a run in memory leave it from now on, if they do not fit any more: all of them are committed, and
+    /// what is committed can be read again. Between steps.
+    ///
+    /// # Errors
+    /// They could not be committed, for another reason than space.
+    pub(super) fn move_out_if_outgrown(&mut self, outputs: &mut LoopOutputs<'_>) -> Result<(), TrainError> {
+        let Some(budget) = self.budget.filter(|_| self.is_in_memory()) else { return Ok(()) };
+        let view = self.view_at_last();
+        if budget.holds_all(&self.scene, view) {
+            return Ok(());
+        }
+        let outgrown =
+            format!("from step {} on the scene does not fit into {}", self.step, format_bytes(budget.bytes()));
+        // Once: what cannot be helped now is not tried at every step.
+        self.budget = None;
+        let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else { return Ok(()) };
+        match checkpoint.commit(self, outputs.metrics) {
+            Ok(()) if checkpoint.has_commit() => {}
+            Err(error) if !error.is_out_of_space() => return Err(error),
+            failed => {
+                let why = failed.err().map_or(String::new(), |error| format!(": {error}"));
+                eprintln!("warning: {outgrown} (--host-mem), and its pages cannot be moved to a drive{why}");
+                return Ok(());
+            }
+        }
+        checkpoint.set_optional(false);
+        eprintln!(
+            "warning: {outgrown} (--host-mem): its pages move between memory and {}; with --spill-dir from its start a \
+             run may choose an order of views that moves fewer",
+            checkpoint.folder().display()
+        );
+        self.budget = Some(budget);
+        self.scene.pager.begin_paging(budget.frames(&self.scene, view), budget.prefetch_bytes, PLAN_BYTES);
+        Ok(())
+    }
+
+    /// Commits the run as it is when it has outgrown its frames, so that it can go on with more memory.
+    pub(super) fn keep_outgrown(&mut self, error: TrainError, outputs: &mut LoopOutputs<'_>) -> TrainError {
+        let is_outgrown = matches!(error, TrainError::Paging(PagingError::WorkingSet { .. }));
+        if let Some(checkpoint) = outputs.checkpoint.as_deref_mut().filter(|_| is_outgrown)
+            && let Err(second) = checkpoint.commit(self, outputs.metrics)
+        {
+            eprintln!("warning: the run could not be committed: {second}");
+        }
+        error
+    }
+}
