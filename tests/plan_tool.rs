@@ -4,7 +4,7 @@
 #[path = "support/scenes.rs"]
 mod scenes;
 
-use scenes::{city, text};
+use scenes::{city, stderr, summary, text, train, wide_city};
 use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Output};
@@ -44,7 +44,7 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
     );
     assert_eq!(plans[4]["view_order"], "shuffle");
     let table = with(&["--compare-frames", "70%", "--compare-orders", orders]);
-    assert_eq!(table.lines().count(), 3 + 4, "{table}");
+    assert_eq!(table.lines().count(), 4 + 4, "{table}");
     // The exact lists of two steps: what leaves makes room for what enters.
     let lists = with(&["--compare-frames", "70%", "--view-order", "shuffle", "--lists", "700..740"]);
     let lines: Vec<&str> = lists.lines().collect();
@@ -73,4 +73,96 @@ fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         assert!(!output.status.success() && words.iter().all(|word| said.contains(word)), "{said}");
     }
+}
+
+/// What the plan says beforehand is what the run does: frames for a budget, bytes read, bytes written.
+#[test]
+fn a_run_does_what_was_planned() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 150, 96, 64, 8000);
+    let (out, spill) = (folder.path().join("out"), folder.path().join("spill"));
+    let common = [
+        "--page-rows",
+        "16",
+        "--test-every",
+        "0",
+        "--strategy",
+        "none",
+        "--steps",
+        "450",
+        "--sh-start",
+        "3",
+        "--means-lr",
+        "1e-9",
+        "--scales-lr",
+        "1e-9",
+    ];
+    let common = [&common[..], &["--view-order", "groups:9", "--prefetch-bytes", "1MiB"]].concat();
+    let planned = |more: &[&str]| -> Value {
+        serde_json::from_str(&stdout(&plan(&scene, &[&common[..], &["--json"], more].concat()))).unwrap()
+    };
+    let flags = ["--out", text(&out), "--spill-dir", text(&spill), "--commit-every", "0", "--device", "cpu"];
+    let common = [&common[..], &["--host-mem", "42MiB"]].concat();
+    let trained = train(&[&[text(&scene)][..], &common, &flags].concat());
+    let said = stderr(&trained);
+    assert!(trained.status.success(), "{said}");
+    let done = summary(&out);
+    let within = planned(&["--host-mem", "42MiB"]);
+    assert!(within["pages"] == done["pages"] && within["gaussians"] == done["gaussians"], "{within} {done}");
+    let number = |value: &Value| value.as_f64().unwrap();
+    let near = |what: &str, planned: &Value, real: f64, tolerance: f64| {
+        let off = (number(planned) / real - 1.0).abs();
+        assert!(off <= tolerance, "{what}: {planned} planned, {real} in the run, {:.1} % off", 100.0 * off);
+    };
+    // The plan renders the view with the most pages alone, the run some others as well, which may take a little more.
+    near("frames", &within["plans"][0]["frames"], number(&done["frames"]), 0.1);
+    assert!(number(&done["frames"]) < 0.9 * number(&done["pages"]), "everything fits: {done}");
+    let plan = planned(&["--frames", &done["frames"].to_string()]);
+    // The plan knows all views and pages that do not move, and that is what these Gaussians hardly do.
+    let plan = &plan["plans"][0];
+    near("the bound", &plan["bytes_read"], number(&done["belady_bytes_read"]), 0.01);
+    let read = number(&done["bytes_read"]) - number(&done["other_bytes_read"]);
+    near("bytes read", &plan["bytes_read"], read, 0.05);
+    // It counts pages as changed that a view sees; those in which no row has a gradient need not be written.
+    let (most, written) =
+        (number(&plan["bytes_written"]), number(&done["bytes_written"]) - number(&done["commit_bytes"]));
+    assert!(written <= most && most <= 1.6 * written, "{most} bytes to be written at most, {written} were");
+    // The run itself says the same before its first step.
+    let line = said.lines().find(|line| line.starts_with("drive")).unwrap();
+    let told = line.split("about ").nth(1).and_then(|rest| rest.split(" MiB to be written, commits apart").next());
+    let told = told.and_then(|number| number.parse::<f64>().ok()).expect(line) * 1048576.0;
+    assert!((told / most - 1.0).abs() < 0.1, "{told} told by the run, {most} by the plan");
+}
+
+#[test]
+fn the_drive_of_the_pages_is_measured_unless_its_rates_are_named() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 12, 64, 48, 800);
+    let spill = folder.path().join("spill");
+    let rates = |more: &[&str]| {
+        let args = [&["--page-rows", "16", "--compare-frames", "100%", "--json"], more].concat();
+        let value: Value = serde_json::from_str(&stdout(&plan(&scene, &args))).unwrap();
+        ["drive_read_bytes_per_second", "drive_write_bytes_per_second"].map(|key| value[key].as_f64().unwrap())
+    };
+    assert_eq!(rates(&[]), [3e9, 2e9]);
+    assert_eq!(rates(&["--drive-read", "5GB", "--drive-write", "4GB", "--spill-dir", text(&spill)]), [5e9, 4e9]);
+    let [read, write] = rates(&["--drive-read", "5GB", "--spill-dir", text(&spill)]);
+    assert!(read == 5e9 && write > 1e6 && write != 2e9, "{write} bytes a second");
+    let left: Vec<_> = folder.path().read_dir().unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(left, ["scene"], "a plan leaves no file");
+}
+
+#[test]
+fn a_scene_larger_than_memory_is_planned_within_it() {
+    let folder = TempDir::new().unwrap();
+    let scene = wide_city(folder.path(), 200_000);
+    let (budget, bytes) = ("100MiB", 100 << 20);
+    let args = ["--host-mem", budget, "--page-rows", "128", "--image-cache", "4MiB", "--prefetch-bytes", "1MiB"];
+    let value: Value =
+        serde_json::from_str(&stdout(&plan(&scene, &[&args[..], &["--json", "--plan-mem", "16MiB"]].concat())))
+            .unwrap();
+    assert!(value["gaussians"].as_u64() > Some(190_000) && value["state_bytes"].as_u64() > Some(bytes), "{value}");
+    assert!(value["host_bytes_peak"].as_u64() <= Some(bytes), "{value}");
+    let (plan, pages) = (&value["plans"][0], value["pages"].as_u64());
+    assert!(plan["frames"].as_u64() < pages && plan["frames"].as_u64() > value["pages_of_largest_view"].as_u64());
 }

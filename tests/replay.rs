@@ -171,7 +171,7 @@ fn bytes_follow_pages_and_everything_that_leaves_is_written() {
 
 fn traffic(read: &[u64]) -> Replay {
     let step = |&bytes_read: &u64| StepTraffic { pages: 10, pages_read: 1, bytes_read, bytes_written: bytes_read };
-    Replay { steps: read.iter().map(step).collect(), views: 1000, is_exact: true }
+    Replay { steps: read.iter().map(step).collect(), views: 1000, first_bytes: 0, is_exact: true }
 }
 
 #[test]

@@ -1,22 +1,23 @@
 //! `gsscale-plan`: what a run would read and write through the disk tier, before any training. Parses, calls the
-//! library, prints; writes no file.
+//! library, prints; leaves no file.
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::units::format_bytes;
 use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides, parse_command_line};
+use gsscale::page::drive_rate::DriveRate;
 use gsscale::page::format::transfer_bytes;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::page_layout::capacity_bytes;
+use gsscale::scene::page_meta::PageMeta;
 use gsscale::schedule::auto::automatic_order;
-use gsscale::schedule::first_pages::{FirstPages, first_pages};
 use gsscale::schedule::model::{CacheModel, Policy, StepChange, TooFewFrames};
 use gsscale::schedule::order::{Order, ViewOrder};
 use gsscale::schedule::plan::Plan;
 use gsscale::schedule::replay::{DriveModel, Figures, Replay, ReplayOptions, Stall, WINDOW_STEPS, replay};
 use gsscale::schedule::visibility::ViewPages;
-use gsscale::train::preflight;
-use gsscale::train::run::prepare;
+use gsscale::train::first_look::first_look;
+use gsscale::train::memory::host_bytes_peak;
 use gsscale::train::trainer::TrainError;
 use serde_json::{Value, json};
 use std::ops::Range;
@@ -31,8 +32,10 @@ Examples:
 
 Pages are those of the first Gaussians; --growth 5 plans as if each page had grown to five.
 Shares of a step's pages that are read, 'of a plan' and 'lru', are those of the optimal cache and of one that drops what
-was used longest ago. Waiting assumes that the drive does one thing at a time.";
+was used longest ago. Waiting assumes that the drive does one thing at a time, and --step-seconds for a step.";
 
+/// Bytes per second that a common NVMe drive reads and writes.
+const COMMON_DRIVE: [f64; 2] = [3e9, 2e9];
 /// Epochs that are gone through; later ones are counted like the mean of those after the first.
 const EPOCHS: u32 = 4;
 
@@ -58,12 +61,12 @@ struct Args {
     /// Print the exact pages that enter and leave in these steps, for the first order and number of frames
     #[arg(long, value_parser = parse_range, value_name = "A..B", help_heading = "Plan")]
     lists: Option<Range<u32>>,
-    /// Bytes per second that the drive reads
-    #[arg(long, default_value = "3GB", value_name = "SIZE", help_heading = "Drive")]
-    drive_read: ByteSize,
-    /// Bytes per second that the drive writes
-    #[arg(long, default_value = "2GB", value_name = "SIZE", help_heading = "Drive")]
-    drive_write: ByteSize,
+    /// Bytes per second that the drive reads; without it the drive of --spill-dir is measured, and with neither it is 3GB
+    #[arg(long, value_name = "SIZE", help_heading = "Drive")]
+    drive_read: Option<ByteSize>,
+    /// Bytes per second that the drive writes; without it measured likewise, or 2GB
+    #[arg(long, value_name = "SIZE", help_heading = "Drive")]
+    drive_write: Option<ByteSize>,
     /// Seconds of a step that waits for nothing
     #[arg(long, default_value_t = 0.3, value_name = "S", help_heading = "Drive")]
     step_seconds: f64,
@@ -94,13 +97,15 @@ fn parse_range(text: &str) -> Result<Range<u32>, String> {
 struct Scene {
     config: TrainConfig,
     cameras: Vec<Camera>,
-    pages: FirstPages,
+    index: Vec<PageMeta>,
     /// On disk, by page, header and padding included.
     page_bytes: Vec<u32>,
     /// Of one frame.
     frame_bytes: u64,
+    /// Bytes per second that the drive reads and writes.
+    drive: [f64; 2],
     views: ViewPages,
-    gaussians: usize,
+    gaussians: u64,
     /// Frames that --host-mem leaves beside what else a run holds, where it was given.
     frames_within: Option<u64>,
 }
@@ -146,8 +151,9 @@ fn start(args: &Args) -> InputResult<String> {
     if args.json {
         let value = json!({
             "gaussians": scene.gaussians, "views": scene.cameras.len(), "steps": scene.config.steps,
-            "pages": scene.pages.index.len(), "page_rows": scene.config.page_rows, "frame_bytes": scene.frame_bytes,
-            "state_bytes": state_bytes(&scene), "pages_of_largest_view": scene.views.most(),
+            "pages": scene.index.len(), "page_rows": scene.config.page_rows, "frame_bytes": scene.frame_bytes,
+            "state_bytes": state_bytes(&scene), "host_bytes_peak": host_bytes_peak(), "pages_of_largest_view": scene.views.most(),
+            "drive_read_bytes_per_second": scene.drive[0], "drive_write_bytes_per_second": scene.drive[1],
             "plans": rows.iter().map(|row| json_of(args, row)).collect::<Vec<_>>(),
         });
         return Ok(format!("{value:#}"));
@@ -166,7 +172,7 @@ fn load(args: &Args) -> InputResult<Scene> {
         let problem = "--growth and --step-seconds must be numbers from 1 and 0 on";
         return Err(InputError::new("--growth, --step-seconds", problem, "leave them out"));
     }
-    if args.drive_read.0 == 0 || args.drive_write.0 == 0 {
+    if [args.drive_read, args.drive_write].iter().flatten().any(|rate| rate.0 == 0) {
         return Err(InputError::new(
             "--drive-read, --drive-write",
             "a rate of 0",
@@ -174,32 +180,40 @@ fn load(args: &Args) -> InputResult<Scene> {
         ));
     }
     let path = if is_run { scene_of_run(&run_config)? } else { args.scene.clone() };
-    let prepared = prepare(&path, &config)?;
-    let dataset = &prepared.dataset;
-    let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
-    let page_rows = config.page_rows as usize;
-    let pages = first_pages(&prepared.columns, page_rows, config.strategy == "default");
+    let drive = drive_rates(args, &config)?;
+    let look = first_look(&path, &config, &folder_for(&config)).map_err(not_planned)?;
+    let cameras: Vec<Camera> = look.dataset.train_views().iter().map(|&v| look.dataset.views[v].camera).collect();
     let grown = |bytes: usize| (bytes as f64 * args.growth) as u64;
     let slot = |&bytes: &u32| grown(transfer_bytes(bytes as usize)).min(u64::from(u32::MAX)) as u32;
-    let gaussians = prepared.columns.rows();
-    let frame_bytes = transfer_bytes(capacity_bytes(page_rows, config.sh_degree));
-    let frames_within = match config.host_mem.0 {
-        0 => None,
-        budget => {
-            let frames = preflight::frames_within(&config, prepared, budget).map_err(not_planned)?;
-            Some((frames as f64 / args.growth) as u64)
-        }
-    };
+    let frame_bytes = transfer_bytes(capacity_bytes(config.page_rows as usize, config.sh_degree));
     Ok(Scene {
-        views: ViewPages::new(&pages.index, &cameras),
-        page_bytes: pages.bytes.iter().map(slot).collect(),
+        views: ViewPages::new(&look.index, &cameras),
+        page_bytes: look.page_bytes.iter().map(slot).collect(),
         frame_bytes: grown(frame_bytes),
-        gaussians,
-        frames_within,
+        drive,
+        gaussians: look.gaussians,
+        frames_within: look.frames.map(|frames| (frames as f64 / args.growth) as u64),
         config,
         cameras,
-        pages,
+        index: look.index,
     })
+}
+
+/// Where lists go that outgrow memory: beside the pages if it is known where these would be.
+fn folder_for(config: &TrainConfig) -> PathBuf {
+    let above = Path::new(&config.spill_dir).ancestors().find(|folder| folder.is_dir()).map(Path::to_path_buf);
+    above.filter(|_| !config.spill_dir.is_empty()).unwrap_or_else(std::env::temp_dir)
+}
+
+/// What the flags say, what the drive of the spill directory does, or else what common drives do.
+fn drive_rates(args: &Args, config: &TrainConfig) -> InputResult<[f64; 2]> {
+    let named = [args.drive_read, args.drive_write].map(|rate| rate.map(|rate| rate.0 as f64));
+    let measured = match named {
+        [Some(_), Some(_)] => COMMON_DRIVE,
+        _ if config.spill_dir.is_empty() => COMMON_DRIVE,
+        _ => DriveRate::look(&folder_for(config)).map(|rate| [rate.read, rate.write])?,
+    };
+    Ok([0, 1].map(|way| named[way].unwrap_or(measured[way])))
 }
 
 fn not_planned(error: TrainError) -> InputError {
@@ -224,7 +238,7 @@ fn state_bytes(scene: &Scene) -> u64 {
 
 /// The numbers of frames to plan for.
 fn frames(args: &Args, scene: &Scene) -> InputResult<Vec<usize>> {
-    let pages = scene.pages.index.len();
+    let pages = scene.index.len();
     let config = &scene.config;
     let mut frames = Vec::new();
     if args.compare_frames.is_empty() && config.frames > 0 {
@@ -268,7 +282,7 @@ fn order(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<O
     if text != "auto" {
         return text.parse().map_err(|problem| InputError::new("--view-order", problem, "or auto"));
     }
-    let pages = scene.pages.index.len();
+    let pages = scene.index.len();
     automatic_order(&scene.views, &scene.cameras, pages, frames, scene.config.seed, args.plan_mem.0)
         .map_err(|e| too_few(scene, &e))
 }
@@ -291,8 +305,8 @@ fn row(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Row
     let (planned, lru) = (run(Policy::Farthest)?, run(Policy::LeastRecent)?);
     let figures = planned.figures(planned.steady());
     let drive = DriveModel {
-        read_rate: args.drive_read.0 as f64,
-        write_rate: args.drive_write.0 as f64,
+        read_rate: scene.drive[0],
+        write_rate: scene.drive[1],
         step_seconds: args.step_seconds,
         ahead_bytes: args.read_ahead.0,
     };
@@ -305,7 +319,8 @@ fn row(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Row
         frames,
         lru: lru.figures(lru.steady()),
         stall,
-        total_read: read as f64 + rest * figures.read_per_step,
+        // The import leaves pages in the frames.
+        total_read: (read - planned.first_bytes) as f64 + rest * figures.read_per_step,
         // Every page is written once before the first step.
         total_written: state_bytes(scene) as f64 + written as f64 + rest * figures.written_per_step,
         planned,
@@ -331,7 +346,7 @@ fn json_of(args: &Args, row: &Row) -> Value {
 
 fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
     let size = |bytes: f64| format_bytes(bytes as u64);
-    let pages = scene.pages.index.len();
+    let pages = scene.index.len();
     let mut text = format!(
         "{} Gaussians in {pages} pages of at most {} rows, {} on disk; {} views need {:.1} % of the pages on average, {:.1} % at most",
         scene.gaussians,
@@ -376,9 +391,12 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
         );
     }
     text += &format!(
-        "\nwritten: by all {} steps and the import, as a share of {}; worst 20: read and written; * chosen by auto",
+        "\nwritten: by all {} steps and the import, as a share of {}, commits not counted; worst 20: read and written; * chosen by auto\
+         \nwait: for a drive that reads {}/s and writes {}/s",
         scene.config.steps,
-        format_bytes(args.endurance.0)
+        format_bytes(args.endurance.0),
+        size(scene.drive[0]),
+        size(scene.drive[1]),
     );
     if rows.iter().any(|row| !row.planned.is_exact) {
         text += "\nThe plan did not reach two epochs ahead: with a larger --plan-mem less may be read.";

@@ -58,6 +58,15 @@ impl DriveRate {
         Ok(rate)
     }
 
+    /// The rates that `folder` remembers, or else measures (about a second); writes nothing that stays.
+    ///
+    /// # Errors
+    /// As [`DriveRate::of`].
+    pub fn look(folder: &Path) -> InputResult<DriveRate> {
+        let device = device_of(folder);
+        remembered(folder).filter(|r| r.device == device).map_or_else(|| measure(folder), Ok)
+    }
+
     /// Bytes per second of as many reads as writes.
     pub fn both(&self) -> f64 {
         2.0 / (1.0 / self.read + 1.0 / self.write)
@@ -140,6 +149,11 @@ mod tests {
             std::fs::write(folder.path().join(FILE_NAME), text).unwrap();
             assert!(DriveRate::of(folder.path()).unwrap().read > 0.0);
         }
+        remember(folder.path(), &slow).unwrap();
+        assert_eq!(DriveRate::look(folder.path()).unwrap(), slow);
+        let other = tempfile::tempdir().unwrap();
+        assert!(DriveRate::look(other.path()).unwrap().read > 0.0);
+        assert_eq!(std::fs::read_dir(other.path()).unwrap().count(), 0);
         let names: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
         assert_eq!(names, [FILE_NAME]);
     }

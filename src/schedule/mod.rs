@@ -2,7 +2,6 @@
 
 pub mod auto;
 pub mod bound;
-pub mod first_pages;
 pub mod model;
 pub mod order;
 pub mod places;

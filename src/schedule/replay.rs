@@ -54,6 +54,9 @@ pub struct Replay {
     pub steps: Vec<StepTraffic>,
     /// Steps of an epoch.
     pub views: usize,
+    /// Of the bytes read, those of the pages that are needed first, as many as there are frames: a run that has just made its
+    /// pages has them in memory.
+    pub first_bytes: u64,
     /// Whether every next use was known whenever a page left: then reads under [`Policy::Farthest`] are Belady's bound.
     pub is_exact: bool,
 }
@@ -79,6 +82,7 @@ pub fn replay(
         pages.iter().map(|p| page_bytes.get(p.index()).map_or(0, |&b| u64::from(b))).sum()
     };
     let (mut pages, mut steps) = (Vec::new(), Vec::with_capacity(options.steps as usize));
+    let (mut first_bytes, mut frames_left) = (0, options.frames);
     for step in 0..options.steps {
         // The run ends; what would come after it is not needed by anyone.
         while plan.steps().end < options.steps.min(step.saturating_add(reach)) {
@@ -90,6 +94,10 @@ pub fn replay(
         pages.clear();
         pages.extend(plan.pages(step));
         cache.step(step, &pages, |page| plan.next_use(page, step + 1), &mut change)?;
+        // As long as there are frames without a page nothing leaves, so that each of these is read for the first time.
+        let first = change.admit.len().min(frames_left);
+        frames_left -= first;
+        first_bytes += bytes(&change.admit[..first]);
         steps.push(StepTraffic {
             pages: pages.len() as u32,
             pages_read: change.admit.len() as u32,
@@ -98,7 +106,7 @@ pub fn replay(
         });
         plan.pop();
     }
-    Ok(Replay { steps, views: views.views(), is_exact })
+    Ok(Replay { steps, views: views.views(), first_bytes, is_exact })
 }
 
 /// What a drive does and how long a step takes without it.

@@ -98,13 +98,22 @@ pub(super) fn points_print(points: &dyn PointSource) -> InputResult<(u64, u64)> 
     Ok((digest.digest(), count))
 }
 
-/// Digest of Gaussians that a run starts from.
-pub(super) fn columns_print(columns: &Columns) -> u64 {
-    let mut digest = Xxh3::new();
-    for column in Column::ALL {
-        digest.update(bytemuck::cast_slice(columns.column(column)));
+/// Digest of Gaussians that a run starts from, one after the other: streamed or not, it is the same.
+#[derive(Default)]
+pub(super) struct GaussiansPrint(Xxh3);
+
+impl GaussiansPrint {
+    /// Takes the next ones.
+    pub fn add(&mut self, columns: &Columns) {
+        for row in 0..columns.rows() {
+            Column::ALL.into_iter().for_each(|column| self.0.update(bytemuck::cast_slice(columns.row(column, row))));
+        }
     }
-    digest.digest()
+
+    /// Of all that were taken.
+    pub fn digest(&self) -> u64 {
+        self.0.digest()
+    }
 }
 
 /// Where a dataset differs from the one that a run began with, a line each.

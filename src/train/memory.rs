@@ -13,7 +13,7 @@ use crate::scene::columns::row_width;
 use crate::scene::partition::first_fill;
 use crate::scene::state::row_bytes;
 
-/// Views rendered to see what a view takes.
+/// Views, spread over all, rendered to see what a view takes.
 const PROBE_VIEWS: usize = 6;
 /// What is kept of a page that is not in memory: its entry, its place on the drive, its uses in the plan.
 pub(super) const INDEX_BYTES: u64 = 256;
@@ -71,9 +71,33 @@ pub fn rows_at_most(config: &TrainConfig, rows: u64) -> u64 {
     if config.strategy == "none" { rows } else { rows.max(config.max_gaussians) }
 }
 
-/// Estimates a run before its first step, with all pages in memory: if nothing grows, and if it grows to its cap. `driver` bytes were taken by the graphics driver when
-/// it was looked for a device. The trainer renders a few views for it and keeps the memory for its own
-/// steps: allocating it twice would break the heap into pieces and the promise with it.
+/// What an estimate is made of.
+#[derive(Debug, Clone)]
+pub struct Probe {
+    /// Views that are rendered to see what a view takes.
+    pub views: Vec<usize>,
+    /// Gaussians of the scene.
+    pub rows: u64,
+    /// Its pages.
+    pub pages: usize,
+    /// Bytes that the graphics driver took when it was looked for a device.
+    pub driver: u64,
+}
+
+impl Probe {
+    /// Of a run: `largest`, the view that needs most pages, and a few spread over the dataset. The largest comes first, so that
+    /// what it takes is taken at once, with nothing to spare for growing.
+    pub fn of_run(dataset: &Dataset, trainer: &Trainer, largest: Option<usize>, driver: u64) -> Probe {
+        let every = dataset.views.len().div_ceil(PROBE_VIEWS).max(1);
+        let spread = (0..dataset.views.len()).step_by(every).filter(|view| largest != Some(*view));
+        let views = largest.into_iter().chain(spread).collect();
+        Probe { views, rows: trainer.scene.rows(), pages: trainer.scene.pager.index().len(), driver }
+    }
+}
+
+/// Estimates a run before its first step, with all pages in memory: if nothing grows, and if it grows to its cap. The trainer
+/// renders the views of the probe for it and keeps the memory for its own steps: allocating it twice would break the heap
+/// into pieces and the promise with it.
 ///
 /// # Errors
 /// A view cannot be rendered.
@@ -81,10 +105,10 @@ pub fn estimate(
     config: &TrainConfig,
     dataset: &Dataset,
     trainer: &mut Trainer,
-    driver: u64,
+    probe: &Probe,
 ) -> Result<[MemoryEstimate; 2], TrainError> {
-    let rows = trainer.scene.rows();
-    let pixels = trainer.probe_views(dataset, PROBE_VIEWS)? as u64;
+    let rows = probe.rows;
+    let pixels = trainer.probe_views(dataset, &probe.views)? as u64;
     let [working, rendering] = trainer.view_bytes();
     // Image, coverage, gradient, and the tiles' copies of them.
     let of_pixels = (pixels * 4 * (3 + 1 + 3 + 6)).min(rendering);
@@ -95,11 +119,11 @@ pub fn estimate(
     let of_rows = working as f64 * wider + (rendering - of_pixels) as f64;
     let decoders = rayon::current_num_threads();
     let targets = config.image_cache.0.min(TargetCache::bytes_to_keep_all(&dataset.views, decoders));
-    let pages = trainer.scene.pager.index().len() as f64;
+    let pages = probe.pages as f64;
     // Pages that take part in a round of densification are copied.
     let copies = if config.strategy == "none" { 0.0 } else { pages.min(PAGES_PER_BATCH as f64) };
     let copies = copies as u64 * trainer.scene.pager.frame_bytes() as u64;
-    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + driver + copies;
+    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver + copies;
     Ok([rows, rows_at_most(config, rows)].map(|rows_then| {
         let growth = rows_then as f64 / rows.max(1) as f64;
         let page_rows = config.page_rows as usize;

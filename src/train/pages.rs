@@ -137,10 +137,10 @@ impl PagedScene {
         let mut scene = PagedScene::empty(pager, options);
         let mut failed = None;
         let imported = import_points(source, import, &mut |page| {
-            let mut state = SceneState::from_columns(page.columns);
-            state.uid.iter_mut().zip(&page.rows).for_each(|(uid, &row)| *uid = u64::from(row));
+            let id = page.id;
+            let mut state = page.into_state();
             state.raise_sh_degree(scene.rules.sh_degree);
-            scene.insert_first_page(page.id, &state).map_err(|error| not_stored(failed.insert(error)))
+            scene.insert_first_page(id, &state).map_err(|error| not_stored(failed.insert(error)))
         });
         match failed {
             Some(error) => Err(error.into()),
@@ -426,7 +426,7 @@ pub fn numbered(pages: &[PinnedPage]) -> Vec<Rows<'_>> {
 
 /// The listed rows of `columns` as fresh rows with their numbers as identities, stored with `sh_degree`: bands above it
 /// are left out.
-fn first_rows(columns: &Columns, rows: &[u32], sh_degree: u8) -> SceneState {
+pub(super) fn first_rows(columns: &Columns, rows: &[u32], sh_degree: u8) -> SceneState {
     let mut out = Columns::zeros(rows.len(), sh_degree);
     for column in Column::ALL {
         let width = column.width(sh_degree);

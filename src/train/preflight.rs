@@ -4,19 +4,16 @@
 //! because the scene grows, is a warning.
 
 use super::budget::HostBudget;
-use super::memory::{MemoryEstimate, estimate, rows_at_most};
-use super::run::Prepared;
+use super::memory::{MemoryEstimate, Probe, estimate, rows_at_most};
 use super::start::{Start, drive_of};
 use super::tiers::{PLAN_BYTES, Tiers, budget_in_memory, first_staging_bytes, staging_bytes};
 use super::trainer::{TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
-use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::page::file_system::free_bytes;
 use crate::paging::pager::PagerConfig;
-use crate::render::cpu::CpuRenderer;
 use crate::scene::camera::Camera;
 use crate::scene::partition::first_fill;
 use crate::schedule::auto::automatic_order;
@@ -52,7 +49,7 @@ pub struct TierPlan {
     pub frames: Option<u64>,
     /// Pages of the view that needs most, its name, and the mean over views.
     pub largest_view: (u64, String, f64),
-    /// Bytes that the run is expected to write to the drive.
+    /// Bytes that the run is expected to write to the drive, commits apart.
     pub bytes_written: f64,
     /// Free bytes of the drive, where one is used and the system tells.
     pub free_bytes: Option<u64>,
@@ -77,7 +74,7 @@ pub fn settle(
     let grown = (index as f64 * rows_max as f64 / trainer.scene.rows().max(1) as f64).ceil() as u64;
     let pages_max = grown.max(rows_max.div_ceil(fill));
     let frame_bytes = trainer.scene.pager.frame_bytes() as u64;
-    let largest_view = largest_view(dataset, trainer);
+    let (largest_view, _) = largest_view(dataset, trainer);
     let mut plan = TierPlan {
         pages: [index, pages_max],
         frames_of_use: if config.strategy != "none" && config.max_gaussians == 0 {
@@ -150,7 +147,7 @@ pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Op
 }
 
 /// Gives a pager whose frames follow from the budget as many as the largest training view of `dataset` needs, so that views can
-/// be looked at; [`settle`] gives it the rest once it is known what a view takes.
+/// be looked at; [`settle`] gives it the rest once it is known what a view takes. Returns which view that is.
 ///
 /// # Errors
 /// The budget does not even hold the pages of that view.
@@ -159,11 +156,11 @@ pub fn hold_a_view(
     dataset: &Dataset,
     trainer: &mut Trainer,
     host_mem: Option<u64>,
-) -> InputResult<()> {
+) -> InputResult<Option<usize>> {
+    let ((needed, view, _), number) = largest_view(dataset, trainer);
     if config.frames > 0 || trainer.scene.pager.stats().frames_max == usize::MAX {
-        return Ok(());
+        return Ok(number);
     }
-    let (needed, view, _) = largest_view(dataset, trainer);
     let bytes = needed * trainer.scene.pager.frame_bytes() as u64;
     if let Some(budget) = host_mem.filter(|budget| bytes > *budget) {
         let problem = format!(
@@ -176,7 +173,7 @@ pub fn hold_a_view(
         return Err(InputError::new("--host-mem", problem, remedy));
     }
     trainer.scene.pager.allow_frames(needed as usize);
-    Ok(())
+    Ok(number)
 }
 
 /// What `--view-order auto` stands for. Of a scene that grows, the pages as they are now stand for what it may come to, and
@@ -201,26 +198,29 @@ fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
     dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect()
 }
 
-/// Frames that `host_mem` bytes leave for the pages of a scene, as [`settle`] gives them to a run. For planning without
-/// one: the first Gaussians are in memory for it.
+/// Frames that `host_mem` bytes leave for the pages of a scene, as [`settle`] gives them to a run. For planning without one:
+/// the trainer has the pages of the largest view, whose number and name are given.
 ///
 /// # Errors
-/// The budget does not hold a view, or a view cannot be rendered.
-pub fn frames_within(config: &TrainConfig, prepared: Prepared, host_mem: u64) -> Result<u64, TrainError> {
-    let Prepared { dataset, columns, sh_degree_start } = prepared;
-    let options = RunOptions { sh_degree_start, ..RunOptions::new(config, dataset.scene_scale) };
-    let mut trainer = Trainer::new(columns, &dataset, Box::new(CpuRenderer::new()), options)?;
-    let [mut memory, _] = estimate(config, &dataset, &mut trainer, 0)?;
-    let pages = trainer.scene.pager.index().len() as u64;
-    memory.staging = first_staging_bytes(config, pages as usize, host_mem);
+/// The budget does not hold that view, or it cannot be rendered.
+pub fn frames_within(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &mut Trainer,
+    probe: &Probe,
+    (needed, view): (u64, String),
+    host_mem: u64,
+) -> Result<u64, TrainError> {
+    let [mut memory, _] = estimate(config, dataset, trainer, probe)?;
+    memory.staging = first_staging_bytes(config, probe.pages, host_mem);
     let plan = TierPlan {
-        pages: [pages, u64::MAX],
+        pages: [probe.pages as u64, u64::MAX],
         frames_of_use: PAGES_MOST,
         frame_bytes: trainer.scene.pager.frame_bytes() as u64,
         frames: None,
         bytes_written: 0.0,
         free_bytes: None,
-        largest_view: largest_view(&dataset, &trainer),
+        largest_view: (needed, view, needed as f64),
     };
     Ok(frames_of_budget(&plan, Some(host_mem), &memory)?)
 }
@@ -259,7 +259,8 @@ fn times_to_outgrow(plan: &TierPlan, frames: u64, of_rows: u64, are_fixed: bool)
     (frames * plan.frame_bytes + of_rows) as f64 / (needed + of_rows).max(1) as f64
 }
 
-/// Bytes that the run will write to the drive: some epochs of it played through with the pages as they are now.
+/// Bytes that the run will write to the drive, commits apart: the import, and some epochs played through with the pages as
+/// they are now.
 fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, frames: usize) -> f64 {
     let cameras = train_cameras(dataset);
     let index = trainer.scene.pager.index();
@@ -269,22 +270,26 @@ fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, fra
     let page_bytes = vec![trainer.scene.pager.frame_bytes() as u32; index.len()];
     let played = replay(&ViewPages::new(index, &cameras), &page_bytes, trainer.view_order(), &options);
     let written: u64 = played.map_or(0, |p| p.steps.iter().map(|s| s.bytes_written).sum());
-    written as f64 * f64::from(config.steps) / f64::from(steps.max(1))
+    let done = trainer.steps_done();
+    let import = if done == 0 { page_bytes.iter().map(|&b| f64::from(b)).sum() } else { 0.0 };
+    import + written as f64 * f64::from(config.steps - done) / f64::from(steps.max(1))
 }
 
-/// The training view that needs most pages by the bounds as they are now. Evaluation takes its views page by page.
-fn largest_view(dataset: &Dataset, trainer: &Trainer) -> (u64, String, f64) {
-    let mut largest = (0, String::new());
+/// The training view that needs most pages by the bounds as they are now, as [`TierPlan`] has it and by its number.
+/// Evaluation takes its views page by page.
+fn largest_view(dataset: &Dataset, trainer: &Trainer) -> ((u64, String, f64), Option<usize>) {
+    let (mut largest, mut number) = ((0, String::new()), None);
     let mut sum = 0;
     let views = dataset.train_views();
-    for view in views.iter().map(|&v| &dataset.views[v]) {
+    for &v in &views {
+        let view = &dataset.views[v];
         let pages = trainer.scene.pager.pages_of_view(&view.camera).len() as u64;
         sum += pages;
         if pages > largest.0 {
-            largest = (pages, view.name.clone());
+            (largest, number) = ((pages, view.name.clone()), Some(v));
         }
     }
-    (largest.0, largest.1, sum as f64 / views.len().max(1) as f64)
+    ((largest.0, largest.1, sum as f64 / views.len().max(1) as f64), number)
 }
 
 fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -> InputResult<()> {
@@ -421,7 +426,7 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
     text.push_str(&part("program and tables", memory.base));
     if tiers.spills() {
         text.push_str(&format!(
-            "drive   {} of pages by {} ({}), {} free; about {} to be written, {:.2} % of what a common drive is rated for\n",
+            "drive   {} of pages by {} ({}), {} free; about {} to be written, commits apart, {:.2} % of what a common drive is rated for\n",
             format_bytes(plan.pages[0] * plan.frame_bytes),
             tiers.engine,
             tiers.codec,

@@ -9,7 +9,7 @@ use super::costs::{Meter, StepCosts};
 use super::dataset_print::dataset_print;
 use super::eval::ply_warnings;
 use super::machine;
-use super::memory::{estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
+use super::memory::{Probe, estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
 use super::out_folder;
 use super::page_map::write_page_map;
 use super::preflight;
@@ -107,14 +107,7 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
         }
         None => (first_gaussians(scene, &mut dataset, config)?, limits::first_sh_degree(config)),
     };
-    if columns.rows() == 0 {
-        let problem = "no Gaussian is left to start from: all are too far from the cameras";
-        return Err(InputError::new(scene, problem, "give a PLY of this scene with --init-ply"));
-    }
-    if config.max_gaussians > 0 && columns.rows() as u64 > config.max_gaussians {
-        let problem = format!("the start has {} Gaussians, above --max-gaussians", columns.rows());
-        return Err(InputError::new(scene, problem, "raise --max-gaussians or start from fewer"));
-    }
+    check_first_rows(scene, config, columns.rows() as u64)?;
     Ok(Prepared { dataset, columns, sh_degree_start })
 }
 
@@ -125,6 +118,19 @@ pub(super) fn check_train_views(scene: &Path, dataset: &Dataset) -> InputResult<
     }
     let problem = "no view is left to train on";
     Err(InputError::new(scene, problem, "hold out fewer photos: see --test-every and --test-after"))
+}
+
+/// There must be Gaussians to start from, and no more than may be.
+pub(super) fn check_first_rows(from: &Path, config: &TrainConfig, rows: u64) -> InputResult<()> {
+    if rows == 0 {
+        let problem = "no Gaussian is left to start from: all are too far from the cameras";
+        return Err(InputError::new(from, problem, "give a PLY of this scene with --init-ply"));
+    }
+    if config.max_gaussians > 0 && rows > config.max_gaussians {
+        let problem = format!("the start has {rows} Gaussians, above --max-gaussians");
+        return Err(InputError::new(from, problem, "raise --max-gaussians or start from fewer"));
+    }
+    Ok(())
 }
 
 fn first_gaussians(scene: &Path, dataset: &mut Dataset, config: &TrainConfig) -> InputResult<Columns> {
@@ -253,8 +259,9 @@ pub(super) fn see_through(
     begun: Begun,
 ) -> Result<RunOutcome, TrainError> {
     let (config, host_mem) = (&request.config, begun.host_mem);
-    preflight::hold_a_view(config, dataset, &mut trainer, host_mem)?;
-    let mut memory = estimate(config, dataset, &mut trainer, begun.driver)?;
+    let largest = preflight::hold_a_view(config, dataset, &mut trainer, host_mem)?;
+    let probe = Probe::of_run(dataset, &trainer, largest, begun.driver);
+    let mut memory = estimate(config, dataset, &mut trainer, &probe)?;
     let plan = preflight::settle(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
     if !request.quiet {
         let of_tiers = preflight::describe(&plan, &memory[1], &tiers);

@@ -1,13 +1,15 @@
-//! What a run starts from: first Gaussians in memory, or points that go into pages one page at a time.
+//! What a run starts from: first Gaussians in memory, or points or Gaussians that go into pages one page at a time.
 //!
-//! Points are streamed when there is a spill directory: then the scene may be larger than memory; so are the Gaussians of a
-//! store. Gaussians from a PLY and points drawn at random are made in memory.
+//! What is in files is streamed when there is a spill directory: then the scene may be larger than memory; the Gaussians of
+//! a store always are. Points drawn at random are made in memory.
 //!
 //! Invariant: both ways give the same pages, bit for bit ([`crate::dataset::import`]).
 
-use super::dataset_print::{columns_print, points_print};
-use super::pages::PagedScene;
-use super::run::{Prepared, check_train_views, prepare};
+use super::dataset_print::{GaussiansPrint, points_print};
+use super::eval::ply_warnings;
+use super::gaussian_pages::{GaussianFile, GaussianSpace, GaussianWriter};
+use super::pages::{PagedScene, first_rows};
+use super::run::{Prepared, check_first_rows, check_train_views, prepare};
 use super::stores::StoredStart;
 use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
@@ -17,15 +19,16 @@ use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::colmap;
 use crate::dataset::frame::Extent;
-use crate::dataset::import::{Budget, Cloud, ImportOptions, LocalCloud};
+use crate::dataset::import::{Budget, Cloud, ImportOptions, LocalCloud, import_points};
 use crate::dataset::loader::{Dataset, load_dataset, load_dataset_with_cloud};
-use crate::dataset::model::{PointCloud, TakePoint};
+use crate::dataset::model::{PointCloud, RawScene, TakePoint};
 use crate::dataset::read::{ReadOptions, read_scene};
 use crate::exchange::ply;
 use crate::paging::pager::Pager;
 use crate::scene::columns::{Columns, row_width};
 use crate::scene::init::InitOptions;
-use crate::scene::partition::first_fill;
+use crate::scene::partition::{first_fill, partition};
+use crate::scene::state::SceneState;
 use std::path::{Path, PathBuf};
 
 /// Memory of an import where no budget is known, bytes.
@@ -49,6 +52,7 @@ pub struct Start {
 enum FirstRows {
     Columns(Columns),
     Points { cloud: Cloud, extent: Extent, init: InitOptions },
+    Gaussians(GaussianFile),
     Store(Box<StoredStart>),
 }
 
@@ -83,7 +87,11 @@ impl Start {
         check_gaussians_fit(config, host_mem)?;
         let Prepared { dataset, columns, sh_degree_start } = prepare(scene, config)?;
         let points = match dataset.points.as_slice() {
-            [] => columns_print(&columns),
+            [] => {
+                let mut print = GaussiansPrint::default();
+                print.add(&columns);
+                print.digest()
+            }
             points => points_print(&(points, dataset.colors.as_slice()))?.0,
         };
         Ok(Start { dataset, sh_degree_start, rows: columns.rows() as u64, points, from: FirstRows::Columns(columns) })
@@ -102,16 +110,32 @@ impl Start {
         let dataset = load_dataset(raw, &limits::load_options(config))?;
         check_train_views(scene, &dataset)?;
         let rows = store.rows_at_most();
-        if config.max_gaussians > 0 && rows > config.max_gaussians {
-            let problem = format!("the start has {rows} Gaussians, above --max-gaussians");
-            return Err(InputError::new(folder, problem, "raise --max-gaussians or start from fewer"));
-        }
+        check_first_rows(folder, config, rows)?;
         let sh_degree_start = store.sh_degree().max(limits::first_sh_degree(config));
         let points = store.digest()?;
         Ok(Start { dataset, sh_degree_start, rows, points, from: FirstRows::Store(Box::new(store)) })
     }
 
-    /// `None` where there are no points in a file.
+    /// From the Gaussians of a file, which are read once here to know that all of them can be.
+    fn of_gaussians(scene: &Path, config: &TrainConfig, mut raw: RawScene, file: &Path) -> InputResult<Start> {
+        raw.points = PointCloud::default();
+        let mut dataset = load_dataset(raw, &limits::load_options(config))?;
+        check_train_views(scene, &dataset)?;
+        let frame = (dataset.frame.origin.to_array(), dataset.frame.scale);
+        let gaussians = GaussianFile::open(file, config.sh_degree, frame)?;
+        let (mut print, mut rows) = (GaussiansPrint::default(), 0);
+        let (meta, far) = gaussians.read(&mut |columns| {
+            print.add(columns);
+            rows += columns.rows() as u64;
+            Ok(())
+        })?;
+        dataset.warnings.extend(ply_warnings(file, &meta, far));
+        check_first_rows(scene, config, rows)?;
+        let sh_degree_start = gaussians.sh_degree().max(limits::first_sh_degree(config));
+        Ok(Start { dataset, sh_degree_start, rows, points: print.digest(), from: FirstRows::Gaussians(gaussians) })
+    }
+
+    /// `None` where neither points nor Gaussians are in a file.
     fn stream(scene: &Path, config: &TrainConfig, budget: &Budget<'_>) -> InputResult<Option<Start>> {
         let mut raw = read_scene(scene, &ReadOptions { points_later: true, ..limits::read_options(config) })?;
         let file = match config.init_ply.as_str() {
@@ -120,7 +144,7 @@ impl Start {
         };
         let Some(file) = file else { return Ok(None) };
         if is_ply(&file) && ply::holds_gaussians(&file)? {
-            return Ok(None);
+            return Start::of_gaussians(scene, config, raw, &file).map(Some);
         }
         let mut warnings = Vec::new();
         let cloud = Cloud::gather(budget, |take| read_points(&file, &mut warnings, take))?;
@@ -150,39 +174,82 @@ impl Start {
     /// The dataset, and the Gaussians in the pages of `pager`.
     ///
     /// # Errors
-    /// The points cannot be read again, or a page could not be stored.
+    /// What they are made from cannot be read again, or a page could not be stored.
     pub fn into_pages(
-        self,
+        mut self,
         pager: Pager,
         options: &RunOptions,
         config: &TrainConfig,
         host_mem: Option<u64>,
     ) -> Result<(Dataset, PagedScene), TrainError> {
-        let Start { dataset, from, .. } = self;
-        let scene = match from {
-            FirstRows::Columns(columns) => PagedScene::new(&columns, pager, options)?,
+        let mut scene = PagedScene::empty(pager, options);
+        let folder = folder_beside(Path::new(&config.spill_dir));
+        self.for_each_page(options, &folder, host_mem, &mut |id, state| Ok(scene.insert_first_page(id, &state)?))?;
+        Ok((self.dataset, scene))
+    }
+
+    /// Hands out the first pages in the order of their names, with the bands that are in use from the first step. `folder` is
+    /// for what does not fit in memory. May be asked again.
+    ///
+    /// # Errors
+    /// What they are made from cannot be read again, or `take` failed.
+    pub(super) fn for_each_page(
+        &mut self,
+        options: &RunOptions,
+        folder: &Path,
+        host_mem: Option<u64>,
+        take: &mut dyn FnMut(PageId, SceneState) -> Result<(), TrainError>,
+    ) -> Result<(), TrainError> {
+        let (sh_degree, budget) = (options.sh_degree_at(0), budget(folder, host_mem));
+        let fill = first_fill(options.page_rows, options.densify.is_some());
+        let frame = self.dataset.frame;
+        let mut failed = None;
+        // Not what the import says of its taker's errors, but these themselves.
+        let mut take_state = |id, mut state: SceneState| {
+            state.raise_sh_degree(sh_degree);
+            take(id, state).map_err(|error| not_stored(failed.insert(error)))
+        };
+        let done = match &mut self.from {
+            FirstRows::Columns(columns) => first_pages(columns, fill, sh_degree, &mut take_state),
             FirstRows::Points { cloud, extent, init } => {
-                let folder = folder_beside(Path::new(&config.spill_dir));
-                let fill = first_fill(options.page_rows, options.densify.is_some());
-                let import = ImportOptions { init: &init, fill, budget: budget(&folder, host_mem) };
-                let source = LocalCloud { cloud: &cloud, extent, frame: dataset.frame };
-                PagedScene::import(&source, &import, pager, options)?
+                let import = ImportOptions { init, fill, budget };
+                let source = LocalCloud { cloud, extent: *extent, frame };
+                let taken = import_points(&source, &import, &mut |page| take_state(page.id, page.into_state()));
+                taken.map(|_| ())
+            }
+            FirstRows::Gaussians(file) => {
+                let mut rows = GaussianWriter::new(file.path(), GaussianSpace { folder, memory: budget.bytes });
+                let read = file.read(&mut |columns| rows.push_all(columns));
+                read.and_then(|_| rows.finish()).and_then(|rows| rows.for_each_page(fill, &mut take_state))
             }
             FirstRows::Store(store) => {
-                let mut scene = PagedScene::empty(pager, options);
-                let frame = (dataset.frame.origin.to_array(), dataset.frame.scale);
-                let sizes = (options.page_rows, scene.rules.sh_degree());
+                let (frame, sizes) = ((frame.origin.to_array(), frame.scale), (options.page_rows, sh_degree));
                 let mut number = 0;
-                store.for_each_page(frame, sizes, &mut |state| {
-                    scene.insert_first_page(PageId::initial(number), &state)?;
+                return store.for_each_page(frame, sizes, &mut |state| {
+                    take(PageId::initial(number), state)?;
                     number += 1;
                     Ok(())
-                })?;
-                scene
+                });
             }
         };
-        Ok((dataset, scene))
+        match failed {
+            Some(error) => Err(error),
+            None => Ok(done?),
+        }
     }
+}
+
+/// Pages of Gaussians that are in memory, with the bands up to `sh_degree`. Each row keeps its number as its identity.
+fn first_pages(
+    columns: &Columns,
+    fill: usize,
+    sh_degree: u8,
+    take: &mut dyn FnMut(PageId, SceneState) -> InputResult<()>,
+) -> InputResult<()> {
+    let pages = partition(&columns.means, &columns.scales, fill);
+    (0..)
+        .zip(pages.iter())
+        .try_for_each(|(page, rows)| take(PageId::initial(page), first_rows(columns, rows, sh_degree)))
 }
 
 /// A third of the memory: the frames have a share already, and the system keeps what was just written.
@@ -202,7 +269,8 @@ pub(super) fn drive_of(spill_dir: &Path) -> PathBuf {
     if spill_dir.is_dir() { spill_dir.to_path_buf() } else { folder_beside(spill_dir) }
 }
 
-/// A PLY of Gaussians is read whole: one that cannot fit is refused by its header, before memory runs out.
+/// Without a spill directory a PLY of Gaussians is read whole: one that cannot fit is refused by its header, before memory
+/// runs out.
 fn check_gaussians_fit(config: &TrainConfig, host_mem: Option<u64>) -> InputResult<()> {
     let file = Path::new(&config.init_ply);
     let is_read = !config.init_ply.is_empty() && is_ply(file);
@@ -217,8 +285,7 @@ fn check_gaussians_fit(config: &TrainConfig, host_mem: Option<u64>) -> InputResu
         format_bytes(bytes),
         format_bytes(budget)
     );
-    let remedy = "make a store of them, which takes little memory: gsscale-ckpt import FILE.ply --out DIR; then train with \
-                  --init-ply DIR and --spill-dir";
+    let remedy = "name a folder on a fast drive with --spill-dir: then they go into pages, a few at a time";
     Err(InputError::new(file, problem, remedy))
 }
 

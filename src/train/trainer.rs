@@ -183,16 +183,16 @@ impl Trainer {
         }
     }
 
-    /// Renders `count` views spread over the dataset, forward and backward, so that the memory of a view is allocated;
-    /// changes no state. Returns the most pixels of a view.
+    /// Renders views of the dataset, forward and backward, so that the memory of a view is allocated; changes no state.
+    /// Returns the most pixels of a view.
     ///
     /// # Errors
     /// A view cannot be rendered.
-    pub fn probe_views(&mut self, dataset: &Dataset, count: usize) -> Result<usize, TrainError> {
+    pub fn probe_views(&mut self, dataset: &Dataset, views: &[usize]) -> Result<usize, TrainError> {
         let render = self.render_options();
         let mut pixels = 0;
-        for view in dataset.views.iter().step_by(dataset.views.len().div_ceil(count)) {
-            let camera = &view.camera;
+        for &view in views {
+            let camera = &dataset.views[view].camera;
             self.scene.gather_view(camera, self.step, &mut self.working)?;
             let WorkingSet { columns, gradients, .. } = &mut self.working;
             self.renderer.forward(columns, camera, &render)?;

@@ -24,6 +24,7 @@ use crate::scene::columns::Columns;
 use crate::scene::init::{FirstPoint, InitOptions, ScaleRule, first_gaussians, middle_rank, subsample_key};
 use crate::scene::partition::{GiantCut, Pages, Placed, giants};
 use crate::scene::select::RankSearch;
+use crate::scene::state::SceneState;
 use std::path::Path;
 
 /// Points that can be read again and again, in the same order.
@@ -85,6 +86,15 @@ pub struct FirstPage {
     pub rows: Vec<u32>,
     /// Its Gaussians.
     pub columns: Columns,
+}
+
+impl FirstPage {
+    /// As rows of a scene, with their identities.
+    pub fn into_state(self) -> SceneState {
+        let mut state = SceneState::from_columns(self.columns);
+        state.uid.iter_mut().zip(&self.rows).for_each(|(uid, &row)| *uid = u64::from(row));
+        state
+    }
 }
 
 /// What was imported.

@@ -19,7 +19,8 @@ mod rows;
 mod write;
 
 pub use read::{
-    ROW_HEAD, holds_gaussians, parse_ply, push_row, read_ply, rows_promised, stream_gaussians, stream_points,
+    ROW_HEAD, gaussians_header, holds_gaussians, parse_ply, push_row, read_ply, rows_promised, stream_gaussians,
+    stream_points, take_row,
 };
 pub use write::{PlyWriter, PlyWritten, write_gaussians};
 

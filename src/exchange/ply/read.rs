@@ -174,6 +174,16 @@ pub fn stream_gaussians(path: &Path, take: &mut dyn FnMut(&[f32]) -> InputResult
     stream_gaussian_rows(&mut body, &header, vertex, take)
 }
 
+/// What the header of a file of Gaussians says of them, and the degree of their bands. Nothing was dropped yet.
+///
+/// # Errors
+/// As [`parse_ply`], of the header.
+pub fn gaussians_header(path: &Path) -> InputResult<(PlyMeta, u8)> {
+    let header = parse_header(&mut open(path)?.0, path)?;
+    let (_, vertex) = vertex_of(&header, path)?;
+    Ok((meta_from_comments(path, &header.comments)?, sh_degree_of(path, vertex)?))
+}
+
 fn read_gaussians<R: BufRead>(body: &mut Body<'_, R>, header: &Header, vertex: &Element) -> InputResult<PlyContent> {
     let path = body.path;
     let sh_degree = sh_degree_of(path, vertex)?;
@@ -197,6 +207,15 @@ pub fn push_row(columns: &mut Columns, row: &[f32]) {
     columns.scales.extend_from_slice(&row[7..10]);
     columns.quats.extend_from_slice(&row[10..ROW_HEAD]);
     columns.sh_n.extend_from_slice(&row[ROW_HEAD..]);
+}
+
+/// Row `row` as [`push_row`] takes it.
+pub fn take_row(columns: &Columns, row: usize, values: &mut Vec<f32>) {
+    let of = |column| columns.row(column, row);
+    values.clear();
+    for column in [Column::Means, Column::Sh0, Column::Opacities, Column::Scales, Column::Quats, Column::ShN] {
+        values.extend_from_slice(of(column));
+    }
 }
 
 /// Hands on the Gaussians of a body.

@@ -1,7 +1,6 @@
 //! Gaussians of a PLY as a fresh store, however many there are.
 //!
-//! Rows go through files beside the store into pages, as a run's first Gaussians do: the largest 0.5 % apart, the others
-//! by median splits. Values are those of the file, bit for bit, in the file's own frame; moments are zero; no step is done.
+//! Rows go through files beside the store into pages, as a run's first Gaussians do. Values are those of the file, bit for bit, in the file's own frame; moments are zero; no step is done.
 //!
 //! Invariants: 1. memory is bounded by the budget; 2. pages are a function of the file, `page_rows` and nothing else; 3. the
 //! store is there whole or not at all.
@@ -12,17 +11,16 @@ use crate::base::units::{MIB, format_bytes};
 use crate::checkpoint::run_state::{DatasetPrint, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
-use crate::dataset::import::{Division, Spool, SpoolSpace, SpoolWriter};
-use crate::exchange::ply::{ExportFrame, PlyMeta, ROW_HEAD, holds_gaussians, push_row, stream_gaussians};
+use crate::exchange::ply::{ExportFrame, PlyMeta, holds_gaussians, stream_gaussians};
 use crate::page::codec::Codec;
 use crate::page::commit::CommitError;
 use crate::page::new_store::{NewStore, refuse_existing};
 use crate::page::slots::SlotLayout;
 use crate::paging::label::label;
-use crate::scene::columns::Columns;
 use crate::scene::page_layout::{PageLayout, capacity_bytes, write_page};
-use crate::scene::partition::{GiantCut, Pages, Placed, first_fill};
+use crate::scene::partition::first_fill;
 use crate::scene::state::SceneState;
+use crate::train::gaussian_pages::{GaussianSpace, GaussianWriter};
 use crate::train::memory::host_bytes_peak;
 use crate::train::pages::PageRules;
 use crate::train::trainer::TrainError;
@@ -64,37 +62,6 @@ pub struct Imported {
     pub host_bytes_peak: u64,
 }
 
-/// A Gaussian with its number, on its way into a page.
-#[derive(Debug, Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
-#[repr(C)]
-struct Row {
-    head: [f32; ROW_HEAD],
-    sh_n: [[f32; 15]; 3],
-    row: u32,
-}
-
-impl Row {
-    fn of(values: &[f32], row: u32) -> Row {
-        let mut of = Row { head: [0.0; ROW_HEAD], sh_n: [[0.0; 15]; 3], row };
-        of.head.copy_from_slice(&values[..ROW_HEAD]);
-        of.sh_n.as_flattened_mut()[..values.len() - ROW_HEAD].copy_from_slice(&values[ROW_HEAD..]);
-        of
-    }
-
-    fn size_key(&self) -> u64 {
-        GiantCut::key(self.head[7].max(self.head[8]).max(self.head[9]), self.row)
-    }
-}
-
-impl Placed for Row {
-    fn point(&self) -> [f32; 3] {
-        [self.head[0], self.head[1], self.head[2]]
-    }
-    fn row(&self) -> u32 {
-        self.row
-    }
-}
-
 /// Imports a PLY.
 ///
 /// # Errors
@@ -106,35 +73,26 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
         return Err(InputError::new(&request.file, "it holds points, not Gaussians", remedy).into());
     }
     let (memory, beside) = (memory_for_rows(request)?, folder_of(&request.out));
-    let space = SpoolSpace { folder: &beside, memory: memory / 10 };
-    let (rows, meta, sh_degree) = spool_rows(&request.file, space)?;
-    let count = rows.len();
+    let space = GaussianSpace { folder: &beside, memory };
+    let mut rows = GaussianWriter::new(&request.file, space);
+    let meta = stream_gaussians(&request.file, &mut |values| rows.push(values))?;
+    let rows = rows.finish()?;
+    let (count, sh_degree) = (rows.rows(), rows.sh_degree());
     let (config, options) = options_for(request, sh_degree, &meta)?;
     let layout =
         SlotLayout::new(capacity_bytes(options.page_rows, sh_degree), count.div_ceil(options.page_rows) as u64);
     let mut pages = PageWriter {
         store: NewStore::create(&request.out, layout, request.codec)?,
         rules: PageRules::new(&options),
-        sh_degree,
         payload: vec![0; capacity_bytes(options.page_rows, sh_degree).div_ceil(8)],
         pages: 0,
         failed: None,
     };
-    let (small, large) = split_giants(rows, space)?;
     let fill = first_fill(options.page_rows, options.densify.is_some());
-    for part in [small, large] {
-        let of_part = Pages::of(part.len(), fill);
-        let records_in_memory = (memory / 2 / (2 * size_of::<Row>())).max(fill);
-        let division = Division { space, pages: of_part, records_in_memory };
-        let written = division.run(part, &mut |range, rows| {
-            let first = of_part.start(range.start);
-            let mut numbers = range;
-            numbers.try_for_each(|n| pages.write(&rows[of_part.start(n) - first..of_part.start(n + 1) - first]))
-        });
-        match pages.failed.take() {
-            Some(error) => return Err(error),
-            None => written?,
-        }
+    let written = rows.for_each_page(fill, &mut |id, state| pages.write(id, &state));
+    match pages.failed.take() {
+        Some(error) => return Err(error),
+        None => written?,
     }
     let state = first_state(&config, &meta, count as u64, sh_degree)?;
     pages.store.commit(&state, format!("imported from {}", request.file.display()).as_bytes(), &[])?;
@@ -154,7 +112,6 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
 struct PageWriter {
     store: NewStore,
     rules: PageRules,
-    sh_degree: u8,
     /// Words, so that tables are aligned.
     payload: Vec<u64>,
     pages: u32,
@@ -162,21 +119,10 @@ struct PageWriter {
 }
 
 impl PageWriter {
-    fn write(&mut self, rows: &[Row]) -> InputResult<()> {
-        let mut columns = Columns::zeros(0, self.sh_degree);
-        let bands = crate::scene::columns::sh_n_width(self.sh_degree);
-        let mut values = [0.0; ROW_HEAD + 45];
-        for row in rows {
-            values[..ROW_HEAD].copy_from_slice(&row.head);
-            values[ROW_HEAD..].copy_from_slice(row.sh_n.as_flattened());
-            push_row(&mut columns, &values[..ROW_HEAD + bands]);
-        }
-        let mut state = SceneState::from_columns(columns);
-        state.uid.iter_mut().zip(rows).for_each(|(uid, row)| *uid = u64::from(row.row));
+    fn write(&mut self, id: PageId, state: &SceneState) -> InputResult<()> {
         let payload: &mut [u8] = bytemuck::cast_slice_mut(&mut self.payload);
-        let layout: PageLayout = write_page(&state, payload);
-        let id = PageId::initial(self.pages);
-        let meta = self.rules.meta(id, &state);
+        let layout: PageLayout = write_page(state, payload);
+        let meta = self.rules.meta(id, state);
         self.pages += 1;
         self.store.put(id, &label(&meta), &payload[..layout.bytes()]).map_err(|error| {
             let told = InputError::new("the new store", error.to_string(), "see the cause");
@@ -201,39 +147,6 @@ fn memory_for_rows(request: &ImportRequest) -> InputResult<usize> {
 /// Where lists go that outgrow memory: the drive of the new store.
 fn folder_of(out: &Path) -> PathBuf {
     out.parent().filter(|p| !p.as_os_str().is_empty()).map_or_else(|| PathBuf::from("."), Path::to_path_buf)
-}
-
-fn spool_rows(file: &Path, space: SpoolSpace<'_>) -> InputResult<(Spool<Row>, PlyMeta, u8)> {
-    let mut rows = SpoolWriter::new(space);
-    let (mut next, mut width) = (0u32, ROW_HEAD);
-    let meta = stream_gaussians(file, &mut |values| {
-        rows.push(Row::of(values, next))?;
-        width = values.len();
-        let too_many = || InputError::new(file, "it has 2^32 Gaussians or more", "thin it out");
-        next = next.checked_add(1).ok_or_else(too_many)?;
-        Ok(())
-    })?;
-    let sh_degree = (0..=3).find(|&d| crate::scene::columns::sh_n_width(d) == width - ROW_HEAD).unwrap_or(0);
-    Ok((rows.finish()?, meta, sh_degree))
-}
-
-/// The ordinary rows and the giants.
-fn split_giants(rows: Spool<Row>, space: SpoolSpace<'_>) -> InputResult<(Spool<Row>, Spool<Row>)> {
-    let mut search = GiantCut::search(rows.len());
-    while !search.is_done() {
-        rows.for_each(|row| {
-            search.count(row.size_key());
-            Ok(())
-        })?;
-        search.next_pass();
-    }
-    let cut = GiantCut::found(&search);
-    let (mut small, mut large) = (SpoolWriter::new(space), SpoolWriter::new(space));
-    rows.for_each(|row| {
-        let size = row.head[7].max(row.head[8]).max(row.head[9]);
-        if cut.is_giant(size, row.row) { large.push(*row) } else { small.push(*row) }
-    })?;
-    Ok((small.finish()?, large.finish()?))
 }
 
 /// The defaults, for Gaussians that have all their bands in use.

@@ -64,12 +64,12 @@ impl StoredStart {
     }
 
     /// Hands out first pages: at most `page_rows` rows each, in the local frame of `origin` and `scale`, with the bands up
-    /// to `sh_degree` and their identities.
+    /// to `sh_degree` and their identities. May be asked again.
     ///
     /// # Errors
     /// A page cannot be read or leaves f32 in the new frame, or `take` failed.
     pub fn for_each_page(
-        mut self,
+        &mut self,
         (origin, scale): ([f64; 3], f64),
         (page_rows, sh_degree): (usize, u8),
         take: &mut dyn FnMut(SceneState) -> Result<(), TrainError>,

@@ -1,0 +1,102 @@
+//! The pages of a run's first Gaussians without the run: what planning looks at.
+//!
+//! Invariants: 1. nothing is stored; 2. of the Gaussians no more is in memory at once than an import takes, and then the
+//! pages of one view; 3. pages and bounds are those that the run begins with.
+
+use super::memory::{Probe, host_budget};
+use super::pages::{PageRules, PagedScene};
+use super::preflight;
+use super::start::Start;
+use super::trainer::{TrainError, Trainer};
+use crate::base::ids::PageNo;
+use crate::config::file::TrainConfig;
+use crate::config::limits::RunOptions;
+use crate::dataset::loader::Dataset;
+use crate::paging::pager::{Pager, PagerConfig};
+use crate::render::cpu::CpuRenderer;
+use crate::scene::camera::Camera;
+use crate::scene::page_layout::PageLayout;
+use crate::scene::page_meta::PageMeta;
+use crate::schedule::visibility::visible_pages;
+use std::path::Path;
+
+/// What a run would begin with.
+pub struct FirstLook {
+    /// Views and frame.
+    pub dataset: Dataset,
+    /// The pages.
+    pub index: Vec<PageMeta>,
+    /// Bytes of each on disk with all bands in use, without header and padding.
+    pub page_bytes: Vec<u32>,
+    /// Gaussians.
+    pub gaussians: u64,
+    /// Frames that the memory which the config names leaves for pages, as a run gets them; `None` if it names none.
+    pub frames: Option<u64>,
+}
+
+/// Looks at what a run of `scene` would begin with. `folder` is for what does not fit in memory; what is written there has no
+/// name.
+///
+/// # Errors
+/// As [`Start::look`]; the memory that the config names does not hold a view, or one cannot be rendered.
+pub fn first_look(scene: &Path, config: &TrainConfig, folder: &Path) -> Result<FirstLook, TrainError> {
+    let host_mem = host_budget(config);
+    let mut start = Start::look(scene, config, folder, host_mem)?;
+    let options =
+        RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
+    let rules = PageRules::new(&options);
+    let mut index = Vec::new();
+    start.for_each_page(&options, folder, host_mem, &mut |id, state| {
+        index.push(rules.meta(id, &state));
+        Ok(())
+    })?;
+    let frames = match config.host_mem.0 {
+        0 => None,
+        budget => Some(frames_within(config, &mut start, (&options, &index), folder, budget)?),
+    };
+    let bytes = |page: &PageMeta| PageLayout { rows: page.rows as usize, sh_degree: config.sh_degree }.bytes() as u32;
+    Ok(FirstLook {
+        dataset: start.into_dataset(),
+        page_bytes: index.iter().map(bytes).collect(),
+        gaussians: index.iter().map(|page| u64::from(page.rows)).sum(),
+        index,
+        frames,
+    })
+}
+
+/// Frames that `host_mem` leaves beside what the largest view takes, which is rendered for it.
+fn frames_within(
+    config: &TrainConfig,
+    start: &mut Start,
+    (options, index): (&RunOptions, &[PageMeta]),
+    folder: &Path,
+    host_mem: u64,
+) -> Result<u64, TrainError> {
+    let Some((view, pages)) = largest_view(&start.dataset, index) else { return Ok(0) };
+    let mut scene =
+        PagedScene::empty(Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree)), options);
+    let mut number = 0;
+    start.for_each_page(options, folder, Some(host_mem), &mut |id, state| {
+        if pages.binary_search(&PageNo(number)).is_ok() {
+            scene.insert_first_page(id, &state)?;
+        }
+        number += 1;
+        Ok(())
+    })?;
+    let name = start.dataset.views[view].name.clone();
+    let mut trainer = Trainer::of_scene(scene, &start.dataset, Box::new(CpuRenderer::new()), options.clone());
+    let rows = index.iter().map(|page| u64::from(page.rows)).sum();
+    let probe = Probe { views: vec![view], rows, pages: index.len(), driver: 0 };
+    preflight::frames_within(config, &start.dataset, &mut trainer, &probe, (pages.len() as u64, name), host_mem)
+}
+
+/// The training view that needs most pages, and these, ascending.
+fn largest_view(dataset: &Dataset, index: &[PageMeta]) -> Option<(usize, Vec<PageNo>)> {
+    let pages_of = |camera: &Camera| {
+        let mut pages = Vec::new();
+        visible_pages(index, camera, &mut pages);
+        pages
+    };
+    let views = dataset.train_views().into_iter();
+    views.map(|view| (view, pages_of(&dataset.views[view].camera))).max_by_key(|(_, pages)| pages.len())
+}
