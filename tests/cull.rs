@@ -3,15 +3,23 @@
 
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
+use gsscale::config::file::TrainConfig;
+use gsscale::config::limits::RunOptions;
 use gsscale::kernels::constants::EPS2D;
 use gsscale::kernels::project_fwd::{Projected, project_fwd};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
+use gsscale::paging::error::PagingError;
+use gsscale::paging::pager::{Pager, PagerConfig};
+use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
+use gsscale::scene::image::Target;
 use gsscale::scene::state::SceneState;
 use gsscale::train::catch_up::{evaluate_all, gather, visible_rows};
+use gsscale::train::pages::PagedScene;
+use gsscale::train::step::{WorkingSet, train_step};
 
 fn rotation(q: [f64; 4]) -> [[f64; 3]; 3] {
     let n = q.iter().map(|x| x * x).sum::<f64>().sqrt();
@@ -139,6 +147,57 @@ fn no_row_that_the_projection_kernel_draws_is_left_out() {
         }
     }
     assert!(drawn > 50_000, "{drawn}");
+}
+
+/// From the pages to the picture: what was not selected would not have changed a bit of it.
+#[test]
+fn no_row_outside_of_the_selected_pages_changes_a_picture() {
+    const STEPS: u32 = 60;
+    let config = TrainConfig { page_rows: 32, sh_degree: 0, means_lr: 0.02, ..TrainConfig::default() };
+    let options = RunOptions::new(&TrainConfig { strategy: "none".to_string(), ..config }, 1.0);
+    let adam = DeferredAdam::new(options.rates, AdamConfig::default(), SimdPath::best());
+    let columns = scene(4000, &adam).columns;
+    let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
+    let mut pages = PagedScene::new(&columns, pager, &options).unwrap();
+    let (mut working, mut renderer) = (WorkingSet::default(), CpuRenderer::new());
+    let mut draws = Stream::new(7, Purpose::Test, 1, 2);
+    let small = |camera: Camera| {
+        let [width, height] = [camera.width / 4, camera.height / 4];
+        let [fx, fy, cx, cy] = [camera.fx, camera.fy, camera.cx, camera.cy].map(|x| x / 4.0);
+        Camera { width, height, fx, fy, cx, cy, ..camera }
+    };
+    let how = (&options.render, &options.loss);
+    for step in 0..STEPS {
+        let camera = small(camera(&mut draws));
+        let rgb = (0..3 * camera.pixels()).map(|_| draws.below(256) as u8).collect();
+        let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
+        train_step(&mut pages, &mut working, &mut renderer, (step, &camera, &target), how, false).unwrap();
+    }
+    let mut all = Columns::zeros(0, 0);
+    let mut append = |rows: &Columns| {
+        Column::ALL.iter().for_each(|&column| all.column_mut(column).extend_from_slice(rows.column(column)));
+        Ok::<(), PagingError>(())
+    };
+    pages.for_all_rows(STEPS, &mut append).unwrap();
+    let (mut left_out, mut drawn, mut selected) = (0, 0, 0);
+    for view in 0..150 {
+        let camera = small(camera(&mut draws));
+        selected += pages.pager.pages_of_view(&camera).len();
+        pages.gather_view(&camera, STEPS, &mut working).unwrap();
+        left_out += all.rows() - working.columns.rows();
+        let [of_view, of_all] = [&working.columns, &all].map(|rows| {
+            renderer.forward(rows, &camera, &options.render);
+            renderer.image().rgb.clone()
+        });
+        drawn += usize::from(of_all.iter().any(|&x| x != 0.0));
+        assert!(of_view.iter().zip(&of_all).all(|(a, b)| a.to_bits() == b.to_bits()), "view {view}: {camera:?}");
+    }
+    // Views look everywhere, many of them past the scene; boxes of pages meet more of them than rows do.
+    let share = selected as f64 / (150 * pages.pager.index().len()) as f64;
+    assert!(
+        drawn > 100 && left_out > 150 * 1000 && share < 0.9,
+        "{drawn} drawn, {left_out} left out, {share} selected"
+    );
 }
 
 #[test]

@@ -145,40 +145,6 @@ fn a_window_that_moves_knows_what_lies_in_it_and_stays_within_its_bytes() {
 }
 
 #[test]
-fn pages_that_came_out_of_splits_are_needed_where_their_parents_are() {
-    let mut draws = Stream::new(4, Purpose::Test, 50, 0);
-    let mut plan = Plan::new(0, 1 << 20);
-    // What the plan should say, by step.
-    let mut want: Steps = Vec::new();
-    let mut pages = 10;
-    for first in 0..200 {
-        while want.len() < first + 30 {
-            let step = steps(&mut draws, 1, pages, 0, 6).remove(0);
-            assert!(plan.push(&step));
-            want.push(step);
-        }
-        if draws.below(4) == 0 {
-            let (parent, child) = (PageNo(draws.below(u64::from(pages)) as u32), PageNo(pages));
-            pages += 1;
-            plan.split(parent, child);
-            want[first..].iter_mut().filter(|s| s.contains(&parent)).for_each(|s| s.push(child));
-        }
-        for step in first..want.len() {
-            let mut got: Vec<PageNo> = plan.pages(step as u32).collect();
-            let mut expected = want[step].clone();
-            got.sort_unstable();
-            expected.sort_unstable();
-            assert_eq!(got, expected, "step {step} at {first}");
-        }
-        for page in (0..pages).map(PageNo) {
-            assert_eq!(plan.next_use(page, first as u32 + 1), next_use(&want, page, first + 1));
-        }
-        plan.pop();
-    }
-    assert!(pages > 40);
-}
-
-#[test]
 fn planned_changes_are_those_that_happen_and_print_exactly() {
     let all: Steps =
         [vec![0, 1], vec![1, 2], vec![0, 3], vec![1, 2]].map(|s| s.into_iter().map(PageNo).collect()).into();

@@ -128,3 +128,83 @@ fn a_budget_that_was_refused_trains_with_what_the_remedy_names() {
     assert!(done["frames"].as_u64().unwrap() >= done["pages_pinned_max"].as_u64().unwrap());
     assert!(done["frames"].as_u64().unwrap() < done["pages"].as_u64().unwrap(), "not all pages fit");
 }
+
+/// What `auto` stood for when a run began is its order for good, also where another budget would have chosen another.
+#[test]
+fn an_order_that_was_chosen_is_kept_under_another_budget() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 150, 48, 32, 8000);
+    let path = |name: &str| folder.path().join(name);
+    let (out, spill, alone) = (path("out"), path("spill"), path("alone"));
+    let common = ["--page-rows", "16", "--strategy", "none", "--device", "cpu", "--test-every", "0", "--quiet"];
+    let begin =
+        ["--steps", "60", "--frames", "330", "--spill-dir", text(&spill), "--keep-checkpoint", "--out", text(&out)];
+    let begun = train(&[&[text(&scene)], &common[..], &begin].concat());
+    assert!(begun.status.success(), "{}", stderr(&begun));
+    let order_of = |out: &Path| {
+        let config = std::fs::read_to_string(out.join("config.toml")).unwrap();
+        let line = config.lines().find(|line| line.starts_with("view-order = ")).unwrap();
+        line.split('"').nth(1).unwrap().to_string()
+    };
+    let order = order_of(&out);
+    assert!(order.starts_with("groups:"), "{order}");
+    // All pages fit now.
+    let more = ["--steps", "200", "--frames", "1000", "--keep-checkpoint=false", "--quiet"];
+    let resumed = train(&[&["--resume", text(&out)], &more[..]].concat());
+    assert!(resumed.status.success(), "{}", stderr(&resumed));
+    assert_eq!(order_of(&out), order);
+    let with_order = |order: &str| {
+        let flags =
+            ["--steps", "200", "--schedule-steps", "60", "--overwrite", "--view-order", order, "--out", text(&alone)];
+        let output = train(&[&[text(&scene)], &common[..], &flags].concat());
+        assert!(output.status.success(), "{}", stderr(&output));
+        std::fs::read(alone.join("point_cloud.ply")).unwrap()
+    };
+    let got = std::fs::read(out.join("point_cloud.ply")).unwrap();
+    assert!(got == with_order(&order), "another scene than with {order} from the start");
+    assert!(got != with_order("auto"), "in memory auto is a shuffle, so this shows nothing");
+}
+
+#[test]
+fn metrics_and_progress_tell_what_moves() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 150, 48, 32, 8000);
+    let spill = folder.path().join("spill");
+    let flags = [
+        "--frames",
+        "330",
+        "--page-rows",
+        "16",
+        "--strategy",
+        "none",
+        "--spill-dir",
+        text(&spill),
+        "--test-every",
+        "0",
+    ];
+    let more = ["--steps", "120", "--log-every", "10", "--view-order", "shuffle", "--device", "cpu"];
+    let out = folder.path().join("out");
+    let output = train(&[&[text(&scene), "--out", text(&out)], &flags[..], &more].concat());
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    let last = said.lines().rfind(|line| line.starts_with("step 120/120")).expect(&said);
+    for word in ["/s", "loss", "psnr", " gaussians", " read ", " written ", " waited ", "left"] {
+        assert!(last.contains(word), "{word} is not in: {last}");
+    }
+    let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
+    let lines: Vec<serde_json::Value> = metrics.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(lines.len(), 12);
+    // Totals since the start, which the summary has at the end.
+    let done = summary(&out);
+    for key in
+        ["pages_needed", "pages_read", "late_misses", "bytes_read", "bytes_written", "stall_seconds", "host_bytes_peak"]
+    {
+        let values: Vec<f64> = lines.iter().map(|line| line[key].as_f64().expect(key)).collect();
+        assert!(values.windows(2).all(|pair| pair[0] <= pair[1]), "{key}: {values:?}");
+        let total = done[key].as_f64().expect(key);
+        assert!(total >= values[11], "{key}: {total} in the summary, {values:?}");
+        // Nothing moves that was not planned, and what is planned need not be waited for.
+        assert!(values[11] > 0.0 || ["late_misses", "stall_seconds"].contains(&key), "{key}: {values:?}");
+    }
+    assert!(done["belady_bytes_read"].as_u64() > Some(0), "{done}");
+}

@@ -1,7 +1,8 @@
 //! The coming steps with the pages that they need, and when each page is needed next.
 //!
 //! A [`Plan`] is a window: steps are pushed at its end as their views become known and popped at its front as they are
-//! done, both at the cost of their own pages. Not here: what a cache does with it (`model`), which views come (`order`).
+//! done, both at the cost of their own pages. Not here: what a cache does with it (`model`), which views come (`order`), and
+//! pages that move or split while a run goes on (`paging`'s own window).
 //!
 //! Invariants: 1. steps are consecutive; 2. the entries of one page form a chain in the order of steps, so the next use
 //! of a page is at the front of its chain; 3. entries never take more than the bytes given, whatever is pushed (but one
@@ -9,7 +10,7 @@
 
 use super::model::{CacheModel, StepChange, TooFewFrames};
 use crate::base::ids::PageNo;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::fmt;
 use std::ops::Range;
 
@@ -32,14 +33,6 @@ struct Chain {
     last: u64,
 }
 
-/// A page that shares the planned uses of another, up to a step.
-#[derive(Debug, Clone, Copy)]
-struct Kin {
-    page: PageNo,
-    /// First step that this does not hold for.
-    end: u32,
-}
-
 /// The window of planned steps.
 #[derive(Debug, Clone)]
 pub struct Plan {
@@ -51,10 +44,6 @@ pub struct Plan {
     first_step: u32,
     chains: Vec<Chain>,
     max_entries: usize,
-    /// Pages that came out of a page by splits since its entries were planned.
-    children: BTreeMap<PageNo, Vec<Kin>>,
-    /// The reverse.
-    parents: BTreeMap<PageNo, Vec<Kin>>,
 }
 
 impl Plan {
@@ -67,8 +56,6 @@ impl Plan {
             first_step,
             chains: Vec::new(),
             max_entries: (max_bytes / size_of::<Entry>() as u64).try_into().unwrap_or(usize::MAX),
-            children: BTreeMap::new(),
-            parents: BTreeMap::new(),
         }
     }
 
@@ -79,11 +66,9 @@ impl Plan {
 
     /// Bytes that the plan has reserved.
     pub fn bytes(&self) -> u64 {
-        let kin = self.children.values().chain(self.parents.values()).map(Vec::capacity).sum::<usize>();
         (self.entries.capacity() * size_of::<Entry>()
             + self.counts.capacity() * size_of::<u32>()
-            + self.chains.capacity() * size_of::<Chain>()
-            + kin * size_of::<Kin>()) as u64
+            + self.chains.capacity() * size_of::<Chain>()) as u64
     }
 
     /// Forgets all steps and begins again at `first_step`; keeps the allocations.
@@ -93,8 +78,6 @@ impl Plan {
         self.counts.clear();
         self.chains.fill(Chain { first: NONE, last: NONE });
         self.first_step = first_step;
-        self.children.clear();
-        self.parents.clear();
     }
 
     /// Plans the step after the last one: `pages` are what it needs, each once. Returns false, and changes nothing, when
@@ -138,28 +121,9 @@ impl Plan {
             self.front += 1;
         }
         self.first_step += 1;
-        let first = self.first_step;
-        for kin in [&mut self.children, &mut self.parents] {
-            kin.retain(|_, list| {
-                list.retain(|k| k.end > first);
-                !list.is_empty()
-            });
-        }
     }
 
-    /// Tells that `child` came out of `parent` just now: in the steps planned so far it is needed where `parent` is.
-    pub fn split(&mut self, parent: PageNo, child: PageNo) {
-        let end = self.steps().end;
-        let mut from = self.parents.get(&parent).cloned().unwrap_or_default();
-        from.push(Kin { page: parent, end });
-        for kin in from {
-            self.parents.entry(child).or_default().push(kin);
-            self.children.entry(kin.page).or_default().push(Kin { page: child, end: kin.end });
-        }
-    }
-
-    /// The pages that a planned step needs; nothing for a step outside of the plan. Pages that came out of splits since
-    /// the step was planned follow the page that they came from.
+    /// The pages that a planned step needs; nothing for a step outside of the plan.
     pub fn pages(&self, step: u32) -> impl Iterator<Item = PageNo> {
         let at = step.wrapping_sub(self.first_step) as usize;
         let range = if self.steps().contains(&step) {
@@ -169,21 +133,11 @@ impl Plan {
         } else {
             0..0
         };
-        self.entries.range(range).flat_map(move |entry| {
-            let children = self.children.get(&entry.page).map_or(&[][..], Vec::as_slice);
-            std::iter::once(entry.page).chain(children.iter().filter(move |k| step < k.end).map(|k| k.page))
-        })
+        self.entries.range(range).map(|entry| entry.page)
     }
 
     /// The first planned step at or after `step` that needs `page`; `None` when the plan has none.
     pub fn next_use(&self, page: PageNo, step: u32) -> Option<u32> {
-        let own = self.next_entry(page, step);
-        let Some(parents) = self.parents.get(&page) else { return own };
-        let inherited = parents.iter().filter_map(|k| self.next_entry(k.page, step).filter(|&s| s < k.end));
-        inherited.chain(own).min()
-    }
-
-    fn next_entry(&self, page: PageNo, step: u32) -> Option<u32> {
         let mut at = self.chains.get(page.index())?.first;
         while at != NONE {
             let entry = &self.entries[(at - self.front) as usize];

@@ -9,6 +9,8 @@ use gsscale::page::faulty_store::Faults;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::stats::PagerStats;
 use gsscale::scene::camera::Camera;
+use gsscale::schedule::model::{CacheModel, Policy};
+use gsscale::schedule::plan::Plan;
 use gsscale::schedule::visibility::visible_pages;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -105,6 +107,39 @@ fn reads_are_the_least_that_the_frames_allow() {
         assert!(recent.pages_read > least, "{frames}: {recent:?}");
         // The import wrote most pages once; what is only read is not written again.
         assert!(touches || ahead.pages_written <= u64::from(PAGES), "{frames}: {ahead:?}");
+    }
+}
+
+/// `gsscale-plan` prints what a [`Plan`] and a [`CacheModel`] say; the run has a window and a cache of its own. As long as no
+/// page moves and nothing is done ahead they are one: step by step as many pages enter, and the same ones but where two leave
+/// equally late.
+#[test]
+fn the_run_reads_what_the_printed_plan_lists() {
+    let cameras = cameras();
+    let views = pages_of(&cameras);
+    let coming: Vec<&Camera> = cameras.iter().collect();
+    for frames in [12, 20, 35, 60] {
+        let mut pager =
+            Pager::new(PagerConfig { prefetch_bytes: 0, ..config(frames) }, store(Codec::Raw, &Faults::new()));
+        scene(&mut pager);
+        // What the import left in memory enters the model as a step of its own, before the first.
+        let mut plan = Plan::new(0, 1 << 24);
+        let start: Vec<PageNo> = (0..PAGES).map(PageNo).filter(|&p| pager.is_in_memory(p)).collect();
+        assert!(plan.push(&start));
+        assert!(views.iter().all(|view| plan.push(&view.iter().copied().map(PageNo).collect::<Vec<_>>())));
+        let planned = plan.changes(&CacheModel::new(frames, Policy::Farthest), 0..u32::MAX).unwrap();
+        let (mut entered, mut same) = (0, 0);
+        for (step, camera) in cameras.iter().enumerate() {
+            let in_memory: BTreeSet<PageNo> = (0..PAGES).map(PageNo).filter(|&p| pager.is_in_memory(p)).collect();
+            pager.look_ahead(step as u32, &coming[step..]);
+            let pages = pager.acquire(step as u32, camera).unwrap();
+            let admitted: BTreeSet<PageNo> = pages.iter().map(|p| p.page).filter(|p| !in_memory.contains(p)).collect();
+            let listed: BTreeSet<PageNo> = planned[step + 1].change.admit.iter().copied().collect();
+            assert_eq!(admitted.len(), listed.len(), "step {step} with {frames} frames: {admitted:?}, {listed:?}");
+            (entered, same) = (entered + listed.len(), same + listed.intersection(&admitted).count());
+            pager.release(pages);
+        }
+        assert!(entered > 100 && same * 10 > entered * 9, "{same} of {entered} are the same with {frames} frames");
     }
 }
 
