@@ -75,6 +75,13 @@ fn a_dry_run_touches_no_spill_directory() {
     let output = train(&[text(&scene), "--dry-run", "--spill-dir", text(&spill)]);
     assert!(output.status.success(), "{}", stderr(&output));
     assert!(!spill.exists());
+    assert!(!stderr(&output).contains("warning"), "{}", stderr(&output));
+    // Checkpoints that are kept may each come to hold every page.
+    let kept = ["--spill-dir", text(&spill), "--save-every", "1", "--steps", "3000000"];
+    let output = train(&[&[text(&scene), "--dry-run"], &kept[..]].concat());
+    let said = stderr(&output);
+    assert!(output.status.success() && said.contains("2999999 named checkpoints may grow to"), "{said}");
+    assert!(said.contains("--save-every"), "{said}");
     // Frames count in a dry run as they do in a run.
     let output = train(&[text(&scene), "--dry-run", "--frames", "2", "--page-rows", "64"]);
     assert!(output.status.code() == Some(1) && stderr(&output).contains("--frames: 2"), "{}", stderr(&output));

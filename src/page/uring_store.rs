@@ -6,8 +6,8 @@
 //! Neither registered files nor registered buffers: on the drive that was measured they were faster in some cases and
 //! slower in as many, and frames, which move between owners, would have to be registered again and again.
 //!
-//! Safety: the kernel reads and writes page buffers while this process goes on. The bytes of a [`PageBuffer`] lie on
-//! the heap and stay there when the buffer is moved; a transfer is moved into its flight when it is submitted, nothing
+//! Safety: the kernel reads and writes page buffers while this process goes on. The bytes of a [`PageBuffer`] stay
+//! where they are when the buffer is moved; a transfer is moved into its flight when it is submitted, nothing
 //! touches its bytes there, and it leaves only after the kernel has answered every request that names it. Dropping the
 //! store waits for all answers; forgetting it leaks the buffers.
 //!

@@ -114,7 +114,7 @@ pub fn settle(
     }
     warn_of_growth(config, &plan, host_mem, memory);
     plan.bytes_written = bytes_written(config, dataset, trainer, frames.min(plan.pages[0].max(1)) as usize);
-    check_drive(&plan, tiers)?;
+    check_drive(&plan, tiers, checkpoints_kept(config))?;
     Ok(plan)
 }
 
@@ -383,15 +383,24 @@ fn refuse_small_drive(free: u64, pages: u64, frame_bytes: u64) -> InputResult<()
     Err(InputError::new("--spill-dir", problem, remedy))
 }
 
-fn check_drive(plan: &TierPlan, tiers: &Tiers) -> InputResult<()> {
+/// Checkpoints that `--save-every` keeps by name: each may come to hold a version of every page.
+fn checkpoints_kept(config: &TrainConfig) -> u64 {
+    u64::from(config.steps.saturating_sub(1).checked_div(config.save_every).unwrap_or(0))
+}
+
+fn check_drive(plan: &TierPlan, tiers: &Tiers, kept: u64) -> InputResult<()> {
     let Some(free) = plan.free_bytes.filter(|_| tiers.spills()) else { return Ok(()) };
     let [now, most] = plan.pages;
     refuse_small_drive(free, now, plan.frame_bytes)?;
-    let with_past = drive_bytes(most, plan.frame_bytes).saturating_mul(VERSIONS);
+    let with_past = drive_bytes(most, plan.frame_bytes).saturating_mul(VERSIONS.saturating_add(kept));
     if free < with_past {
+        let (named, fewer) = match kept {
+            0 => (String::new(), ""),
+            kept => (format!(" and {kept} named checkpoints"), ", keep fewer checkpoints with --save-every"),
+        };
         eprintln!(
-            "warning: the scene and its last two commits may grow to {} on the drive, which has {} free: lower \
-             --max-gaussians, or commit less often with --commit-every",
+            "warning: the scene with its last two commits{named} may grow to {} on the drive, which has {} free: lower \
+             --max-gaussians{fewer}, or commit less often with --commit-every",
             format_bytes(with_past),
             format_bytes(free)
         );
