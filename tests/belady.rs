@@ -82,7 +82,7 @@ fn fewest(steps: &[(usize, u32)], pages: u32) -> u64 {
 }
 
 #[test]
-fn frames_may_be_taken_away_between_steps() {
+fn frames_may_be_taken_away_and_given_back_between_steps() {
     let mut draws = Stream::new(6, Purpose::Test, 1, 1);
     let mut differs = 0;
     for round in 0..200 {
@@ -90,7 +90,8 @@ fn frames_may_be_taken_away_between_steps() {
         let mut frames = 5;
         let steps: Vec<(usize, u32)> = (0..14)
             .map(|_| {
-                frames -= usize::from(frames > 2 && draws.below(4) == 0);
+                frames -= usize::from(frames > 2 && draws.below(3) == 0);
+                frames += usize::from(frames < 5 && draws.below(6) == 0);
                 let needed = (0..frames).fold(0, |needed, _| needed | 1u32 << draws.below(pages));
                 (frames, needed)
             })

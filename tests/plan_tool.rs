@@ -62,6 +62,10 @@ fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
     std::fs::write(run.join("config.toml"), format!("steps = 77\n[resolved]\nscene = {:?}\n", text(&scene))).unwrap();
     let told = stdout(&plan(&run, &["--page-rows", "16", "--compare-frames", "100%"]));
     assert!(told.contains("by all 77 steps"), "{told}");
+    // Frames that are named need no memory that was.
+    for named in [["--frames", "80"], ["--compare-frames", "100%"]] {
+        stdout(&plan(&run, &[&["--page-rows", "16", "--host-mem", "1MiB"], &named[..]].concat()));
+    }
     for (args, words) in [
         (&["--page-rows", "16", "--frames", "2"][..], ["2 frames", "--host-mem"]),
         (&["--compare-frames", "many"], ["'many'", "25%"]),

@@ -2,7 +2,8 @@
 //!
 //! Invariants: 1. the first byte lies on a multiple of [`ALIGNMENT`], and stays there when the buffer is moved: the bytes
 //! live elsewhere; 2. the length is a multiple of [`ALIGNMENT`]; 3. a fresh buffer is zero; 4. a mapped one takes memory from
-//! the machine only as it is written to, and gives all of it back at its end, whatever the heap looks like by then.
+//! the machine only as it is written to (in pieces of 2 MiB, where the system makes huge pages unasked), and gives all of it
+//! back at its end, whatever the heap looks like by then.
 
 use memmap2::MmapMut;
 

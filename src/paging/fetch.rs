@@ -173,7 +173,8 @@ impl Pager {
     }
 
     /// Makes a frame free: at once if a clean page leaves first, otherwise by beginning to write dirty ones, as many as
-    /// there are frames wanted. Returns whether a frame is free now, or one less too many.
+    /// there are frames wanted. Returns whether a page has left: its frame is free now, unless there were
+    /// more than there may be.
     pub(super) fn make_room(&mut self, wanted: usize, asker: Asker) -> Result<bool, PagingError> {
         loop {
             // Pages that are written to leave come first: a nearer one must not leave in their place.

@@ -159,6 +159,16 @@ impl Checkpoint {
         self.done > 0
     }
 
+    /// How much was committed since then.
+    pub(super) fn commits_done(&self) -> u64 {
+        self.done
+    }
+
+    /// The folder that the first commit of a run in memory made.
+    pub(super) fn spill(&self) -> Option<&SpillDir> {
+        self.spill.as_ref()
+    }
+
     /// Step of the last commit since the store was opened.
     pub fn last_step(&self) -> Option<u32> {
         self.last_step

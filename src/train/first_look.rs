@@ -30,7 +30,8 @@ pub struct FirstLook {
     pub page_bytes: Vec<u32>,
     /// Gaussians.
     pub gaussians: u64,
-    /// Frames that the memory which the config names leaves for pages, as a run gets them; `None` if it names none.
+    /// Frames that the memory which the config names leaves for pages, about as a run on the CPU gets them; `None` if it names
+    /// none, or frames.
     pub frames: Option<u64>,
 }
 
@@ -51,6 +52,7 @@ pub fn first_look(scene: &Path, config: &TrainConfig, folder: &Path) -> Result<F
         Ok(())
     })?;
     let frames = match config.host_mem.0 {
+        _ if config.frames > 0 => None,
         0 => None,
         budget => Some(frames_within(config, &mut start, (&options, &index), folder, budget)?),
     };

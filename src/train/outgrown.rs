@@ -7,30 +7,33 @@
 use super::tiers::PLAN_BYTES;
 use super::trainer::{LoopOutputs, TrainError, Trainer};
 use crate::base::units::{MIB, format_bytes};
-use crate::config::file::TrainConfig;
 use crate::paging::error::PagingError;
 
 impl TrainError {
     /// The same of a step whose photo is known.
     pub(super) fn of_view(mut self, name: &str, step: u32) -> TrainError {
         if let TrainError::Paging(PagingError::WorkingSet { what, .. }) = &mut self {
-            *what = format!("the view {name} of step {step}");
+            let (of_step, splits) = (format!("of step {step}"), what.contains("splits"));
+            *what = if splits {
+                format!("{what} in the view {name} {of_step}")
+            } else {
+                format!("the view {name} {of_step}")
+            };
         }
         self
     }
 
     /// Flags with which a run that stopped for want of frames may go on; empty for other errors. It may have been the first
     /// view of many to outgrow them, so that there is some room to grow.
-    pub(super) fn more_memory(&self, config: &TrainConfig, host_mem: Option<u64>) -> String {
-        let TrainError::Paging(PagingError::WorkingSet { pages, frames, frame_bytes, .. }) = self else {
-            return String::new();
-        };
-        match host_mem.filter(|_| config.frames == 0) {
-            None => format!(" --frames {pages} (at least)"),
-            Some(budget) => {
-                let least = budget + (pages.saturating_sub(*frames) * frame_bytes) as u64;
+    pub(super) fn more_memory(&self) -> String {
+        match self {
+            TrainError::Outgrown { least: Some(least), .. } => {
                 format!(" --host-mem {}MiB (at least {}MiB)", (least + least / 2) / MIB, least.div_ceil(MIB))
             }
+            TrainError::Outgrown { source: PagingError::WorkingSet { pages, .. }, .. } => {
+                format!(" --frames {pages} (at least)")
+            }
+            _ => String::new(),
         }
     }
 }
@@ -51,15 +54,36 @@ impl Trainer {
             format!("from step {} on the scene does not fit into {}", self.step, format_bytes(budget.bytes()));
         // Once: what cannot be helped now is not tried at every step.
         self.budget = None;
-        let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else { return Ok(()) };
+        let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else {
+            eprintln!("warning: {outgrown} (--host-mem), and there is no drive to move its pages to (--spill-dir)");
+            return Ok(());
+        };
+        let commits = Some(checkpoint.commits_done());
+        if budget.tried_after == commits {
+            self.budget = Some(budget);
+            return Ok(());
+        }
+        let needed = self.scene.pager.stats().pinned_max;
+        let frames = budget.frames(&self.scene, view, needed);
+        if frames < needed && !budget.is_named {
+            eprintln!(
+                "warning: {outgrown}, and a view needs more than it holds: all of it stays in memory (--host-mem)"
+            );
+            return Ok(());
+        }
         match checkpoint.commit(self, outputs.metrics) {
             Ok(()) if checkpoint.has_commit() => {}
-            Err(error) if !error.is_out_of_space() => return Err(error),
-            failed => {
-                let why = failed.err().map_or(String::new(), |error| format!(": {error}"));
-                eprintln!("warning: {outgrown} (--host-mem), and its pages cannot be moved to a drive{why}");
+            Ok(()) => {
+                eprintln!("warning: {outgrown} (--host-mem), and without commits its pages cannot be moved to a drive");
                 return Ok(());
             }
+            Err(error) if error.is_out_of_space() => {
+                eprintln!("warning: {outgrown} (--host-mem), and its pages cannot be moved to a drive: {error}");
+                // After the next commit that finds space.
+                self.budget = Some(budget.tried(commits));
+                return Ok(());
+            }
+            Err(error) => return Err(error),
         }
         checkpoint.set_optional(false);
         eprintln!(
@@ -68,18 +92,19 @@ impl Trainer {
             checkpoint.folder().display()
         );
         self.budget = Some(budget);
-        self.scene.pager.begin_paging(budget.frames(&self.scene, view), budget.prefetch_bytes, PLAN_BYTES);
+        self.scene.pager.begin_paging(frames, budget.prefetch_bytes, PLAN_BYTES);
         Ok(())
     }
 
     /// Commits the run as it is when it has outgrown its frames, so that it can go on with more memory.
     pub(super) fn keep_outgrown(&mut self, error: TrainError, outputs: &mut LoopOutputs<'_>) -> TrainError {
-        let is_outgrown = matches!(error, TrainError::Paging(PagingError::WorkingSet { .. }));
-        if let Some(checkpoint) = outputs.checkpoint.as_deref_mut().filter(|_| is_outgrown)
+        let TrainError::Paging(source @ PagingError::WorkingSet { pages, .. }) = error else { return error };
+        if let Some(checkpoint) = outputs.checkpoint.as_deref_mut().filter(|_| !self.is_torn)
             && let Err(second) = checkpoint.commit(self, outputs.metrics)
         {
             eprintln!("warning: the run could not be committed: {second}");
         }
-        error
+        let least = self.budget.map(|budget| budget.least_for(&self.scene, self.view_at_last(), pages));
+        TrainError::Outgrown { source, least }
     }
 }

@@ -89,7 +89,10 @@ pub fn settle(
         largest_view,
     };
     if trainer.scene.pager.stats().frames_max == usize::MAX {
-        check_in_memory(memory, host_mem)?;
+        if trainer.scene.pager.slot_space().is_none() {
+            // A run that goes on has a drive already, to which its pages move if they do not fit.
+            check_in_memory(memory, host_mem)?;
+        }
         if let Some(budget) = host_mem {
             trainer.set_budget(budget_in_memory(config, budget, &memory[0]));
         }
@@ -105,7 +108,7 @@ pub fn settle(
     check_view(&plan, frames)?;
     trainer.scene.pager.allow_frames(frames as usize);
     if let Some(budget) = host_mem.filter(|_| config.frames == 0) {
-        trainer.set_budget(HostBudget::new(budget, &memory[0]));
+        trainer.set_budget(HostBudget::new(budget, &memory[0]).with_frames(frames as usize));
     }
     plan.frames = Some(frames);
     memory.iter_mut().for_each(|m| m.frames = m.frames.min(frames * frame_bytes));
@@ -320,7 +323,9 @@ fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -
 fn frames_of_budget(plan: &TierPlan, host_mem: Option<u64>, memory: &MemoryEstimate) -> InputResult<u64> {
     // Where the system tells nothing, everything fits until it does not.
     let Some(budget) = host_mem else { return Ok(plan.frames_of_use) };
-    let frames = budget.saturating_sub(memory.fixed()) / plan.frame_bytes;
+    // Vectors of a view that is a little larger than those that were rendered grow by an eighth.
+    let spare = (memory.view - memory.view_pixels) / 8;
+    let frames = budget.saturating_sub(memory.fixed() + spare) / plan.frame_bytes;
     let (needed, view, _) = &plan.largest_view;
     if frames >= *needed {
         return Ok(frames.min(plan.frames_of_use));
@@ -332,7 +337,7 @@ fn frames_of_budget(plan: &TierPlan, host_mem: Option<u64>, memory: &MemoryEstim
         format_bytes(memory.fixed()),
         format_bytes(plan.frame_bytes)
     );
-    let least = memory.fixed() + needed * plan.frame_bytes;
+    let least = memory.fixed() + spare + needed * plan.frame_bytes;
     let remedy = format!(
         "give at least {}, or lower --image-cache, --prefetch-bytes, --page-rows, --sh-degree or the size of the photos",
         format_bytes(least + least / 50)

@@ -276,7 +276,7 @@ pub(super) fn see_through(
     }
     let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun);
     if tiers.can_resume() {
-        let more = outcome.as_ref().err().map_or(String::new(), |error| error.more_memory(config, host_mem));
+        let more = outcome.as_ref().err().map_or(String::new(), TrainError::more_memory);
         let elsewhere = spill_dir_flag(request);
         eprintln!("to go on from the last commit: gsscale-train --resume {}{elsewhere}{more}", request.out.display());
     }

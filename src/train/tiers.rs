@@ -124,7 +124,8 @@ fn prefetch_bytes(config: &TrainConfig, frames: usize, frame_bytes: usize) -> us
 pub(super) fn budget_in_memory(config: &TrainConfig, host_mem: u64, memory: &MemoryEstimate) -> HostBudget {
     let frame_bytes = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes();
     let ahead = prefetch_bytes(config, (host_mem / frame_bytes as u64) as usize, frame_bytes);
-    HostBudget::new(host_mem, memory).with_staging(ahead, staging_bytes(2 * ahead, &codec(config).to_string()))
+    let staging = staging_bytes(2 * ahead, &codec(config).to_string());
+    HostBudget::new(host_mem, memory).in_memory(ahead, staging, config.host_mem.0 > 0)
 }
 
 /// The pager with its pages moving when `--transfers` says.
@@ -155,7 +156,8 @@ pub fn first_staging_bytes(config: &TrainConfig, pages: usize, host_mem: u64) ->
 pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Result<(Pager, Tiers), TrainError> {
     let (page_rows, sh_degree) = (config.page_rows as usize, config.sh_degree);
     if config.spill_dir.is_empty() && config.frames == 0 {
-        return Ok((Pager::in_memory(PagerConfig::in_memory(page_rows, sh_degree)), Tiers::default()));
+        let in_memory = PagerConfig { policy: policy(config), ..PagerConfig::in_memory(page_rows, sh_degree) };
+        return Ok((with_transfers(Pager::in_memory(in_memory), config), Tiers::default()));
     }
     let pager = pager_config(config, pages, host_mem);
     let layout = SlotLayout::new(capacity_bytes(page_rows, sh_degree), pages as u64);
@@ -235,7 +237,8 @@ impl Stored {
         // A run in memory stays there while that is no question; otherwise its checkpoint serves as a spill directory.
         let is_in_memory = config.spill_dir.is_empty() && config.frames == 0 && bytes <= host_mem / 2;
         if is_in_memory {
-            pager = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree);
+            let in_memory = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree);
+            pager = PagerConfig { policy: policy(config), ..in_memory };
         }
         let layout = spill.format().layout;
         if layout.slot_bytes != pager.frame_bytes() as u64 {
@@ -309,7 +312,8 @@ impl Tiers {
     pub fn drive_bytes(&self) -> u64 {
         let of =
             |spill: &SpillDir| spill.segments().map_or(0, |s| s.len() as u64 * spill.format().layout.segment_bytes());
-        self.spill.as_ref().map_or(0, of)
+        let made = self.checkpoint.as_ref().and_then(Checkpoint::spill);
+        self.spill.as_ref().or(made).map_or(0, of)
     }
 
     /// Bytes that pages may take on the drive: what is free, and what they have already, of a run that goes on or of the

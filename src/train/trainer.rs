@@ -76,6 +76,14 @@ pub enum TrainError {
         /// Step of the last commit of this process.
         last_step: Option<u32>,
     },
+    /// The scene has outgrown its frames.
+    #[error("{source}")]
+    Outgrown {
+        /// Who needed how many.
+        source: PagingError,
+        /// Memory with which the step could have been done, where frames follow from it.
+        least: Option<u64>,
+    },
     /// The loss was not finite several times in a row.
     #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
     NonFinite {
@@ -107,6 +115,8 @@ pub struct Trainer {
     pub(super) train_seconds: f64,
     /// The last evaluation on the held-out views.
     pub(super) last_test: Option<LastTest>,
+    /// A step failed after it had changed rows: there is nothing to commit.
+    pub(super) is_torn: bool,
     /// What the frames share with all else, where their number follows from it.
     pub(super) budget: Option<HostBudget>,
     /// Bytes that the best of caches would have read in earlier lives of the run, which the pager knows nothing of.
@@ -178,6 +188,7 @@ impl Trainer {
             steps_skipped_in_a_row: 0,
             train_seconds: 0.0,
             last_test: None,
+            is_torn: false,
             budget: None,
             past_belady_bytes: 0,
         }
@@ -272,7 +283,7 @@ impl Trainer {
             *position = self.train_views[*position];
         }
         targets.prefetch(&ahead);
-        self.fit_frames();
+        self.fit_frames(&dataset.views[view].camera);
         self.look_ahead(dataset);
         let target = targets.get(view)?;
         let started = Instant::now();
@@ -288,7 +299,10 @@ impl Trainer {
         let outcome = stepped.map_err(|error| error.of_view(&dataset.views[view].name, self.step))?;
         self.count(&outcome, &dataset.views[view].name)?;
         if self.options.optimizer == Method::Dense {
+            // The step has changed rows: if this fails, what is there now belongs to no step.
+            self.is_torn = true;
             settle_all(&mut self.scene, self.step + 1)?;
+            self.is_torn = false;
         }
         self.log_events();
         self.step += 1;

@@ -58,7 +58,7 @@ fn pages_hold_what_was_put_into_them_whatever_the_frames() {
 }
 
 #[test]
-fn frames_that_are_taken_away_cost_no_page() {
+fn frames_that_are_taken_away_and_given_back_cost_no_page() {
     for seed in 0..8 {
         let mut memory = in_memory(seed);
         (0..STEPS).for_each(|_| memory.step().unwrap());
@@ -68,14 +68,22 @@ fn frames_that_are_taken_away_cost_no_page() {
             faults.reorder(seed + 100);
             let pager = Pager::new(config(3 * fewest), store(codec, &faults));
             let mut run = Run::new(pager, seed, PAGES, STEPS).unwrap();
+            let mut is_least = false;
             for step in 0..STEPS {
                 run.step().unwrap();
                 let frames = (3 * fewest).saturating_sub(step * 4 * fewest / STEPS).max(fewest);
-                run.pager.limit_frames(frames);
+                if step < 3 * STEPS / 4 {
+                    run.pager.limit_frames(frames);
+                } else {
+                    // And given back.
+                    run.pager.allow_frames(2 * fewest);
+                }
                 let stats = run.pager.stats();
-                assert!(stats.frames <= frames && stats.frames_max == frames, "step {step}: {stats:?}");
+                assert!(stats.frames <= stats.frames_max, "step {step}: {stats:?}");
+                assert_eq!(stats.frames_max, if step < 3 * STEPS / 4 { frames } else { 2 * fewest });
+                is_least |= stats.frames == fewest;
             }
-            assert_eq!(run.pager.stats().frames, fewest);
+            assert!(is_least && run.pager.stats().frames > fewest, "{:?}", run.pager.stats());
             run.check_all(fewest).unwrap();
             assert_eq!(run.model, memory.model);
         }
