@@ -177,7 +177,7 @@ fn a_scene_that_grows_beyond_its_memory_stops_with_the_need_and_goes_on_with_it(
     let output = train(&[&[text(&scene)], &within[..], &flags[..]].concat());
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
-    for words in ["the view view_00", ".jpg of step", "pages in memory at once", "--host-mem"] {
+    for words in ["(view_00", ".jpg) needs", "pages in memory at once", "--host-mem"] {
         assert!(said.contains(words), "{words} is not in: {said}");
     }
     let stopped = summary(&out);

@@ -181,12 +181,10 @@ fn load(args: &Args) -> InputResult<Scene> {
     }
     let path = if is_run { scene_of_run(&run_config)? } else { args.scene.clone() };
     let drive = drive_rates(args, &config)?;
-    let mut wanted = config.clone();
-    if !args.compare_frames.is_empty() {
-        // Frames are named: what a memory would hold is not asked for.
-        wanted.frames = wanted.frames.max(1);
-    }
-    let look = first_look(&path, &wanted, &folder_for(&config)).map_err(not_planned)?;
+    // Where frames are named, what a memory would hold is not asked for.
+    let is_asked = args.compare_frames.is_empty() && config.frames == 0 && config.host_mem.0 > 0;
+    let for_memory = is_asked.then_some(config.host_mem.0);
+    let look = first_look(&path, &config, &folder_for(&config), for_memory).map_err(not_planned)?;
     let cameras: Vec<Camera> = look.dataset.train_views().iter().map(|&v| look.dataset.views[v].camera).collect();
     let grown = |bytes: usize| (bytes as f64 * args.growth) as u64;
     let slot = |&bytes: &u32| grown(transfer_bytes(bytes as usize)).min(u64::from(u32::MAX)) as u32;

@@ -18,7 +18,7 @@ pub enum PagingError {
         format_bytes(*frames as u64 * *frame_bytes as u64)
     )]
     WorkingSet {
-        /// Who asked: `the view DJI_17.JPG of step 17`, `a list of pages`.
+        /// Who asked: `the view of step 17`, `a list of pages`.
         what: String,
         /// Pages needed at once, at least.
         pages: usize,

@@ -159,7 +159,7 @@ impl Checkpoint {
         self.done > 0
     }
 
-    /// How much was committed since then.
+    /// Commits since the store was opened.
     pub(super) fn commits_done(&self) -> u64 {
         self.done
     }

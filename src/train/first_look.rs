@@ -14,7 +14,6 @@ use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::cpu::CpuRenderer;
-use crate::scene::camera::Camera;
 use crate::scene::page_layout::PageLayout;
 use crate::scene::page_meta::PageMeta;
 use crate::schedule::visibility::visible_pages;
@@ -30,17 +29,21 @@ pub struct FirstLook {
     pub page_bytes: Vec<u32>,
     /// Gaussians.
     pub gaussians: u64,
-    /// Frames that the memory which the config names leaves for pages, about as a run on the CPU gets them; `None` if it names
-    /// none, or frames.
+    /// Frames that the memory asked about leaves for pages, about as a run on the CPU gets them.
     pub frames: Option<u64>,
 }
 
-/// Looks at what a run of `scene` would begin with. `folder` is for what does not fit in memory; what is written there has no
-/// name.
+/// Looks at what a run of `scene` would begin with, and, where `for_memory` names bytes, for how many frames they are good.
+/// `folder` is for what does not fit in memory; what is written there has no name.
 ///
 /// # Errors
-/// As [`Start::look`]; the memory that the config names does not hold a view, or one cannot be rendered.
-pub fn first_look(scene: &Path, config: &TrainConfig, folder: &Path) -> Result<FirstLook, TrainError> {
+/// As [`Start::look`]; `for_memory` does not hold a view, or one cannot be rendered.
+pub fn first_look(
+    scene: &Path,
+    config: &TrainConfig,
+    folder: &Path,
+    for_memory: Option<u64>,
+) -> Result<FirstLook, TrainError> {
     let host_mem = host_budget(config);
     let mut start = Start::look(scene, config, folder, host_mem)?;
     let options =
@@ -51,11 +54,8 @@ pub fn first_look(scene: &Path, config: &TrainConfig, folder: &Path) -> Result<F
         index.push(rules.meta(id, &state));
         Ok(())
     })?;
-    let frames = match config.host_mem.0 {
-        _ if config.frames > 0 => None,
-        0 => None,
-        budget => Some(frames_within(config, &mut start, (&options, &index), folder, budget)?),
-    };
+    let frames =
+        for_memory.map(|bytes| frames_within(config, &mut start, (&options, &index), folder, bytes)).transpose()?;
     let bytes = |page: &PageMeta| PageLayout { rows: page.rows as usize, sh_degree: config.sh_degree }.bytes() as u32;
     Ok(FirstLook {
         dataset: start.into_dataset(),
@@ -74,7 +74,10 @@ fn frames_within(
     folder: &Path,
     host_mem: u64,
 ) -> Result<u64, TrainError> {
-    let Some((view, pages)) = largest_view(&start.dataset, index) else { return Ok(0) };
+    let largest = preflight::largest_view(&start.dataset, index);
+    let Some(view) = largest.view else { return Ok(0) };
+    let mut pages = Vec::new();
+    visible_pages(index, &start.dataset.views[view].camera, &mut pages);
     let mut scene =
         PagedScene::empty(Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree)), options);
     let mut number = 0;
@@ -85,20 +88,8 @@ fn frames_within(
         number += 1;
         Ok(())
     })?;
-    let name = start.dataset.views[view].name.clone();
     let mut trainer = Trainer::of_scene(scene, &start.dataset, Box::new(CpuRenderer::new()), options.clone());
     let rows = index.iter().map(|page| u64::from(page.rows)).sum();
     let probe = Probe { views: vec![view], rows, pages: index.len(), driver: 0 };
-    preflight::frames_within(config, &start.dataset, &mut trainer, &probe, (pages.len() as u64, name), host_mem)
-}
-
-/// The training view that needs most pages, and these, ascending.
-fn largest_view(dataset: &Dataset, index: &[PageMeta]) -> Option<(usize, Vec<PageNo>)> {
-    let pages_of = |camera: &Camera| {
-        let mut pages = Vec::new();
-        visible_pages(index, camera, &mut pages);
-        pages
-    };
-    let views = dataset.train_views().into_iter();
-    views.map(|view| (view, pages_of(&dataset.views[view].camera))).max_by_key(|(_, pages)| pages.len())
+    preflight::frames_within(config, &start.dataset, &mut trainer, &probe, largest, host_mem)
 }

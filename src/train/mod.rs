@@ -5,8 +5,8 @@
 //! commit if nothing changed (`changes`, [`dataset_print`]), [`pages`] has the rows of a run in pages and brings them to now with [`catch_up`],
 //! `update` changes them, `dense` all of them at every step, [`costs`] counts what steps took, [`eval`] looks at
 //! held-out views, [`report`] writes what happened, [`progress`] shows it, [`machine`] starts its threads, [`signals`]
-//! hears Ctrl-C, [`start`] gives the first Gaussians, [`first_look`] looks at them for a plan
-//! (`gaussian_pages` those of a file of any size), [`out_folder`] is where results go, [`page_map`] draws where pages lie,
+//! hears Ctrl-C, [`start`] gives the first Gaussians
+//! (`gaussian_pages` those of a file of any size), [`first_look`] looks at them for a plan, [`out_folder`] is where results go, [`page_map`] draws where pages lie,
 //! [`stores`] is what tools do with checkpoints.
 
 pub mod budget;

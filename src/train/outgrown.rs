@@ -10,15 +10,10 @@ use crate::base::units::{MIB, format_bytes};
 use crate::paging::error::PagingError;
 
 impl TrainError {
-    /// The same of a step whose photo is known.
-    pub(super) fn of_view(mut self, name: &str, step: u32) -> TrainError {
+    /// The same of a step on the photo `name`.
+    pub(super) fn of_view(mut self, name: &str) -> TrainError {
         if let TrainError::Paging(PagingError::WorkingSet { what, .. }) = &mut self {
-            let (of_step, splits) = (format!("of step {step}"), what.contains("splits"));
-            *what = if splits {
-                format!("{what} in the view {name} {of_step}")
-            } else {
-                format!("the view {name} {of_step}")
-            };
+            *what = format!("{what} ({name})");
         }
         self
     }

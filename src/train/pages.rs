@@ -115,11 +115,7 @@ impl PagedScene {
     pub fn new(columns: &Columns, pager: Pager, options: &RunOptions) -> Result<PagedScene, PagingError> {
         let mut scene = PagedScene::empty(pager, options);
         let fill = first_fill(options.page_rows, options.densify.is_some());
-        let pages = partition(&columns.means, &columns.scales, fill);
-        for (index, rows) in pages.iter().enumerate() {
-            let state = first_rows(columns, rows, scene.rules.sh_degree);
-            scene.insert_first_page(PageId::initial(index as u32), &state)?;
-        }
+        first_pages(columns, fill, scene.rules.sh_degree, &mut |id, state| scene.insert_first_page(id, &state))?;
         Ok(scene)
     }
 
@@ -426,7 +422,24 @@ pub fn numbered(pages: &[PinnedPage]) -> Vec<Rows<'_>> {
 
 /// The listed rows of `columns` as fresh rows with their numbers as identities, stored with `sh_degree`: bands above it
 /// are left out.
-pub(super) fn first_rows(columns: &Columns, rows: &[u32], sh_degree: u8) -> SceneState {
+/// Hands out the first pages of Gaussians that are in memory, at most `fill` rows each, with the bands up to `sh_degree`.
+/// Each row keeps its number in `columns` as its identity.
+///
+/// # Errors
+/// Those of `take`.
+pub(super) fn first_pages<E>(
+    columns: &Columns,
+    fill: usize,
+    sh_degree: u8,
+    take: &mut dyn FnMut(PageId, SceneState) -> Result<(), E>,
+) -> Result<(), E> {
+    let pages = partition(&columns.means, &columns.scales, fill);
+    (0..)
+        .zip(pages.iter())
+        .try_for_each(|(page, rows)| take(PageId::initial(page), first_rows(columns, rows, sh_degree)))
+}
+
+fn first_rows(columns: &Columns, rows: &[u32], sh_degree: u8) -> SceneState {
     let mut out = Columns::zeros(rows.len(), sh_degree);
     for column in Column::ALL {
         let width = column.width(sh_degree);

@@ -15,12 +15,13 @@ use crate::dataset::loader::Dataset;
 use crate::page::file_system::free_bytes;
 use crate::paging::pager::PagerConfig;
 use crate::scene::camera::Camera;
+use crate::scene::page_meta::PageMeta;
 use crate::scene::partition::first_fill;
 use crate::schedule::auto::automatic_order;
 use crate::schedule::model::Policy;
 use crate::schedule::order::Order;
 use crate::schedule::replay::{ReplayOptions, replay};
-use crate::schedule::visibility::ViewPages;
+use crate::schedule::visibility::{ViewPages, visible_pages};
 use std::path::Path;
 
 /// Bytes that a common drive of 500 GB is rated to take in its life.
@@ -47,8 +48,8 @@ pub struct TierPlan {
     pub frame_bytes: u64,
     /// Frames; `None` for as many as there are pages.
     pub frames: Option<u64>,
-    /// Pages of the view that needs most, its name, and the mean over views.
-    pub largest_view: (u64, String, f64),
+    /// The view that needs most pages.
+    pub(super) largest_view: LargestView,
     /// Bytes that the run is expected to write to the drive, commits apart.
     pub bytes_written: f64,
     /// Free bytes of the drive, where one is used and the system tells.
@@ -74,7 +75,7 @@ pub fn settle(
     let grown = (index as f64 * rows_max as f64 / trainer.scene.rows().max(1) as f64).ceil() as u64;
     let pages_max = grown.max(rows_max.div_ceil(fill));
     let frame_bytes = trainer.scene.pager.frame_bytes() as u64;
-    let (largest_view, _) = largest_view(dataset, trainer);
+    let largest_view = largest_view(dataset, trainer.scene.pager.index());
     let mut plan = TierPlan {
         pages: [index, pages_max],
         frames_of_use: if config.strategy != "none" && config.max_gaussians == 0 {
@@ -160,7 +161,8 @@ pub fn hold_a_view(
     trainer: &mut Trainer,
     host_mem: Option<u64>,
 ) -> InputResult<Option<usize>> {
-    let ((needed, view, _), number) = largest_view(dataset, trainer);
+    let LargestView { view: number, name: view, pages: needed, .. } =
+        largest_view(dataset, trainer.scene.pager.index());
     if config.frames > 0 || trainer.scene.pager.stats().frames_max == usize::MAX {
         return Ok(number);
     }
@@ -202,16 +204,16 @@ fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
 }
 
 /// Frames that `host_mem` bytes leave for the pages of a scene, as [`settle`] gives them to a run. For planning without one:
-/// the trainer has the pages of the largest view, whose number and name are given.
+/// the trainer has the pages of the largest view.
 ///
 /// # Errors
 /// The budget does not hold that view, or it cannot be rendered.
-pub fn frames_within(
+pub(super) fn frames_within(
     config: &TrainConfig,
     dataset: &Dataset,
     trainer: &mut Trainer,
     probe: &Probe,
-    (needed, view): (u64, String),
+    largest_view: LargestView,
     host_mem: u64,
 ) -> Result<u64, TrainError> {
     let [mut memory, _] = estimate(config, dataset, trainer, probe)?;
@@ -223,7 +225,7 @@ pub fn frames_within(
         frames: None,
         bytes_written: 0.0,
         free_bytes: None,
-        largest_view: (needed, view, needed as f64),
+        largest_view,
     };
     Ok(frames_of_budget(&plan, Some(host_mem), &memory)?)
 }
@@ -235,7 +237,7 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
     if config.strategy == "none" {
         return;
     }
-    let (needed, view, _) = &plan.largest_view;
+    let LargestView { pages: needed, name: view, .. } = &plan.largest_view;
     let then = (*needed as f64 * most as f64 / now.max(1) as f64).ceil() as u64;
     let left = match host_mem.filter(|_| config.frames == 0) {
         None => frames,
@@ -258,7 +260,7 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
 fn times_to_outgrow(plan: &TierPlan, frames: u64, of_rows: u64, are_fixed: bool) -> f64 {
     // Frames that were named do not give way to the rows of a view.
     let of_rows = if are_fixed { 0 } else { of_rows };
-    let needed = plan.largest_view.0 * plan.frame_bytes;
+    let needed = plan.largest_view.pages * plan.frame_bytes;
     (frames * plan.frame_bytes + of_rows) as f64 / (needed + of_rows).max(1) as f64
 }
 
@@ -278,21 +280,32 @@ fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, fra
     import + written as f64 * f64::from(config.steps - done) / f64::from(steps.max(1))
 }
 
-/// The training view that needs most pages by the bounds as they are now, as [`TierPlan`] has it and by its number.
-/// Evaluation takes its views page by page.
-fn largest_view(dataset: &Dataset, trainer: &Trainer) -> ((u64, String, f64), Option<usize>) {
-    let (mut largest, mut number) = ((0, String::new()), None);
-    let mut sum = 0;
+/// The training view that needs most pages by the bounds of `index`.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(super) struct LargestView {
+    /// Its number among the dataset's views; `None` where no view sees anything.
+    pub view: Option<usize>,
+    /// Its name.
+    pub name: String,
+    /// Pages that it needs.
+    pub pages: u64,
+    /// Mean over the training views.
+    pub mean: f64,
+}
+
+/// Evaluation takes its views page by page, so held-out views do not count.
+pub(super) fn largest_view(dataset: &Dataset, index: &[PageMeta]) -> LargestView {
+    let (mut largest, mut sum, mut list) = (LargestView::default(), 0, Vec::new());
     let views = dataset.train_views();
-    for &v in &views {
-        let view = &dataset.views[v];
-        let pages = trainer.scene.pager.pages_of_view(&view.camera).len() as u64;
+    for &view in &views {
+        visible_pages(index, &dataset.views[view].camera, &mut list);
+        let pages = list.len() as u64;
         sum += pages;
-        if pages > largest.0 {
-            (largest, number) = ((pages, view.name.clone()), Some(v));
+        if pages > largest.pages {
+            largest = LargestView { view: Some(view), name: dataset.views[view].name.clone(), pages, mean: 0.0 };
         }
     }
-    ((largest.0, largest.1, sum as f64 / views.len().max(1) as f64), number)
+    LargestView { mean: sum as f64 / views.len().max(1) as f64, ..largest }
 }
 
 fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -> InputResult<()> {
@@ -326,7 +339,7 @@ fn frames_of_budget(plan: &TierPlan, host_mem: Option<u64>, memory: &MemoryEstim
     // Vectors of a view that is a little larger than those that were rendered grow by an eighth.
     let spare = (memory.view - memory.view_pixels) / 8;
     let frames = budget.saturating_sub(memory.fixed() + spare) / plan.frame_bytes;
-    let (needed, view, _) = &plan.largest_view;
+    let LargestView { pages: needed, name: view, .. } = &plan.largest_view;
     if frames >= *needed {
         return Ok(frames.min(plan.frames_of_use));
     }
@@ -346,7 +359,7 @@ fn frames_of_budget(plan: &TierPlan, host_mem: Option<u64>, memory: &MemoryEstim
 }
 
 fn check_view(plan: &TierPlan, frames: u64) -> InputResult<()> {
-    let (needed, view, _) = &plan.largest_view;
+    let LargestView { pages: needed, name: view, .. } = &plan.largest_view;
     if frames >= *needed {
         return Ok(());
     }
@@ -416,7 +429,7 @@ fn check_drive(plan: &TierPlan, tiers: &Tiers, kept: u64) -> InputResult<()> {
 /// The tiers' part of what is said at the start.
 pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> String {
     let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
-    let (largest, _, mean) = &plan.largest_view;
+    let LargestView { pages: largest, mean, .. } = &plan.largest_view;
     let mut text = format!(
         "pages   {} of up to {}; a view needs {mean:.0} on average, {largest} at most\n",
         plan.pages[0],

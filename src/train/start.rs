@@ -8,7 +8,7 @@
 use super::dataset_print::{GaussiansPrint, points_print};
 use super::eval::ply_warnings;
 use super::gaussian_pages::{GaussianFile, GaussianSpace, GaussianWriter};
-use super::pages::{PagedScene, first_rows};
+use super::pages::{PagedScene, first_pages};
 use super::run::{Prepared, check_first_rows, check_train_views, prepare};
 use super::stores::StoredStart;
 use super::trainer::TrainError;
@@ -27,7 +27,7 @@ use crate::exchange::ply;
 use crate::paging::pager::Pager;
 use crate::scene::columns::{Columns, row_width};
 use crate::scene::init::InitOptions;
-use crate::scene::partition::{first_fill, partition};
+use crate::scene::partition::first_fill;
 use crate::scene::state::SceneState;
 use std::path::{Path, PathBuf};
 
@@ -237,19 +237,6 @@ impl Start {
             None => Ok(done?),
         }
     }
-}
-
-/// Pages of Gaussians that are in memory, with the bands up to `sh_degree`. Each row keeps its number as its identity.
-fn first_pages(
-    columns: &Columns,
-    fill: usize,
-    sh_degree: u8,
-    take: &mut dyn FnMut(PageId, SceneState) -> InputResult<()>,
-) -> InputResult<()> {
-    let pages = partition(&columns.means, &columns.scales, fill);
-    (0..)
-        .zip(pages.iter())
-        .try_for_each(|(page, rows)| take(PageId::initial(page), first_rows(columns, rows, sh_degree)))
 }
 
 /// A third of the memory: the frames have a share already, and the system keeps what was just written.

@@ -296,7 +296,7 @@ impl Trainer {
             (&render, &self.options.loss),
             self.options.densify.is_some_and(|d| d.collects(self.step)),
         );
-        let outcome = stepped.map_err(|error| error.of_view(&dataset.views[view].name, self.step))?;
+        let outcome = stepped.map_err(|error| error.of_view(&dataset.views[view].name))?;
         self.count(&outcome, &dataset.views[view].name)?;
         if self.options.optimizer == Method::Dense {
             // The step has changed rows: if this fails, what is there now belongs to no step.
