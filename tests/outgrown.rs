@@ -134,7 +134,8 @@ fn a_scene_that_grows_stays_within_its_memory() {
     assert!(said.contains("there is no cap on it") && said.contains("for all that there are"), "{said}");
     // Without a folder for its pages it begins in memory, and finds the drive of its results when it does not fit.
     let moved = path("moved");
-    let output = train(&[&[text(&scene), "--out", text(&moved), "--host-mem", "160MiB"], &flags[..]].concat());
+    let other = ["--out", text(&moved), "--host-mem", "160MiB", "--spill-codec", "zstd:1", "--evict", "lru"];
+    let output = train(&[&[text(&scene)], &other[..], &flags[..]].concat());
     let said = stderr(&output);
     assert!(output.status.success(), "{said}");
     assert!(said.contains(&format!("its pages move between memory and {}/checkpoint", text(&moved))), "{said}");
