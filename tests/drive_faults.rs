@@ -5,6 +5,8 @@
 
 #[path = "support/scenes.rs"]
 mod scenes;
+#[path = "support/small_drive.rs"]
+mod small_drive;
 
 use gsscale::checkpoint::interval::CommitEvery;
 use gsscale::config::file::TrainConfig;
@@ -30,6 +32,7 @@ use gsscale::train::signals::StopFlag;
 use gsscale::train::start::Start;
 use gsscale::train::trainer::{LoopOutputs, TrainError, Trainer};
 use scenes::{stderr, summary, text, train};
+use small_drive::Small;
 use std::io::{ErrorKind, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -288,35 +291,6 @@ fn args<'a>(scene: &'a Path, out: &'a Path, spill: &'a Path) -> Vec<&'a str> {
     args.extend(["--steps", "60", "--page-rows", "32", "--refine-start", "1000", "--max-gaussians", "7000"]);
     args.extend(["--view-order", "groups:4", "--test-every", "24", "--device", "cpu", "--log-every", "7"]);
     args
-}
-
-/// A tmpfs of `bytes`, unmounted at the end; `None` where this user may not mount.
-struct Small(PathBuf);
-
-impl Small {
-    fn mount(folder: &Path, bytes: u64) -> Option<Small> {
-        std::fs::create_dir(folder).unwrap();
-        let options = format!("size={bytes}");
-        let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", &options, "tmpfs", text(folder)]).output();
-        match mounted {
-            Ok(output) if output.status.success() => Some(Small(folder.to_path_buf())),
-            other => {
-                println!("skipped: a small drive cannot be mounted here ({other:?})");
-                None
-            }
-        }
-    }
-
-    fn resize(&self, bytes: u64) {
-        let options = format!("remount,size={bytes}");
-        assert!(Command::new("mount").args(["-o", &options, text(&self.0)]).status().unwrap().success());
-    }
-}
-
-impl Drop for Small {
-    fn drop(&mut self) {
-        let _ = Command::new("umount").arg("-l").arg(&self.0).status();
-    }
 }
 
 /// A drive that has room for the pages once, and not for the versions of two commits.

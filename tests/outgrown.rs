@@ -4,6 +4,9 @@
 
 #[path = "support/scenes.rs"]
 mod scenes;
+#[cfg(target_os = "linux")]
+#[path = "support/small_drive.rs"]
+mod small_drive;
 
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use scenes::{stderr, summary, text, train};
@@ -199,4 +202,47 @@ fn a_scene_that_grows_beyond_its_memory_stops_with_the_need_and_goes_on_with_it(
     assert!(tight.join("point_cloud.ply").is_file() && tight.join("summary.json").is_file(), "{said}");
     let output = train(&["--resume", text(&out), "--host-mem", "200MiB", "--quiet"]);
     assert!(output.status.success() && summary(&out)["finished"] == true, "{}", stderr(&output));
+}
+
+/// Steps in which the scene grows beyond 160 MiB, and no further.
+const GROWING_FEWER: [&str; 2] = ["--steps 120", "--steps 72"];
+
+/// Every row is updated at every step: pages that are in memory beside those that a step has just read.
+#[test]
+fn a_run_that_updates_every_row_moves_out_as_well() {
+    let folder = TempDir::new().unwrap();
+    let scene = large_scene(folder.path());
+    let (alone, out) = (folder.path().join("alone"), folder.path().join("out"));
+    let dense = GROWING_MUCH.replace(GROWING_FEWER[0], GROWING_FEWER[1]) + " --optimizer dense --quiet";
+    let flags: Vec<&str> = dense.split_whitespace().collect();
+    let output = train(&[&[text(&scene), "--out", text(&alone)], &flags[..]].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let output = train(&[&[text(&scene), "--out", text(&out), "--host-mem", "160MiB"], &flags[..]].concat());
+    let said = stderr(&output);
+    assert!(output.status.success() && said.contains("move between memory and"), "{said}");
+    let peak = summary(&out)["host_bytes_peak"].as_f64().unwrap();
+    assert!(peak <= 1.1 * 160.0 * 1048576.0, "{:.1} MB at the peak", peak / 1e6);
+    let [got, want] = [&out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
+    assert!(got == want, "another scene than in memory");
+}
+
+/// The drive of the results is full when the pages should move there: the run says so and goes on in memory.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_run_with_no_drive_to_move_to_goes_on_in_memory() {
+    let folder = TempDir::new().unwrap();
+    let scene = large_scene(folder.path());
+    let Some(drive) = small_drive::Small::mount(&folder.path().join("drive"), 100 << 20) else { return };
+    let (alone, out) = (folder.path().join("alone"), drive.0.join("out"));
+    let fewer = GROWING_MUCH.replace(GROWING_FEWER[0], GROWING_FEWER[1]);
+    let flags: Vec<&str> = fewer.split_whitespace().collect();
+    let output = train(&[&[text(&scene), "--out", text(&alone), "--quiet"], &flags[..]].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let output = train(&[&[text(&scene), "--out", text(&out), "--host-mem", "160MiB", "--quiet"], &flags[..]].concat());
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    assert_eq!(said.matches("its pages cannot be moved to a drive").count(), 1, "once, not at every step: {said}");
+    assert_eq!(summary(&out)["bytes_read"], 0);
+    let [got, want] = [&out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
+    assert!(got == want, "another scene than in memory");
 }

@@ -1,15 +1,16 @@
 //! Whole runs of the cache on made-up aerial surveys.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
-use gsscale::base::ids::PageId;
+use gsscale::base::ids::{PageId, PageNo};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::page_meta::{PageBounds, PageMeta};
 use gsscale::schedule::auto::automatic_order;
 use gsscale::schedule::model::Policy;
 use gsscale::schedule::order::{Order, ViewOrder};
-use gsscale::schedule::replay::{DriveModel, Replay, ReplayOptions, Stall, StepTraffic, replay};
+use gsscale::schedule::replay::{DriveModel, Replay, ReplayOptions, STEPS_AHEAD, Stall, StepTraffic, replay};
 use gsscale::schedule::visibility::ViewPages;
+use std::collections::BTreeSet;
 
 /// A camera at `centre` that looks down, tilted by `tilt` off the vertical towards `heading`, radians.
 fn camera(centre: [f64; 3], heading: f64, tilt: f64) -> Camera {
@@ -149,7 +150,7 @@ fn orders_and_policies_read_in_the_order_of_the_design() {
 fn bytes_follow_pages_and_everything_that_leaves_is_written() {
     let survey = survey(100, 16, 0.1, 0.7);
     let pages = ViewPages::new(&survey.index, &survey.cameras);
-    let needed: std::collections::BTreeSet<u32> = (0..100).flat_map(|v| pages.of(v).iter().map(|p| p.0)).collect();
+    let needed: BTreeSet<u32> = (0..100).flat_map(|v| pages.of(v).iter().map(|p| p.0)).collect();
     let planned = run(&survey, &pages, Order::Shuffle, Policy::Farthest, 0.4, 3);
     let (read, written) = planned.totals();
     let frames = (0.4 * 256.0) as u64;
@@ -170,26 +171,70 @@ fn bytes_follow_pages_and_everything_that_leaves_is_written() {
 }
 
 fn traffic(read: &[u64]) -> Replay {
-    let step = |&bytes_read: &u64| StepTraffic { pages: 10, pages_read: 1, bytes_read, bytes_written: bytes_read };
+    let step = |&bytes_read: &u64| StepTraffic {
+        pages: 10,
+        pages_read: 1,
+        bytes_read,
+        bytes_written: bytes_read,
+        steps_ahead: 1,
+        bytes_late: 0,
+    };
     Replay { steps: read.iter().map(step).collect(), views: 1000, first_bytes: 0, is_exact: true }
 }
 
 #[test]
 fn stalls_are_what_the_drive_cannot_do_in_time() {
     // 10 bytes take a second to read and a second to write; a step takes 2 s.
-    let drive = DriveModel { read_rate: 10.0, write_rate: 10.0, step_seconds: 2.0, ahead_bytes: 0 };
-    let seconds = |read: &[u64], drive: &DriveModel| traffic(read).stall(0..read.len(), drive);
-    assert_eq!(seconds(&[500, 10, 10, 10], &drive), Stall::default(), "the drive keeps up");
-    // 30 bytes are 6 s of reading and writing, begun with the step before, which takes 2 s.
-    assert_eq!(seconds(&[0, 0, 0, 30], &drive), Stall { seconds: 4.0, worst_seconds: 4.0, steps: 1 });
+    let drive = DriveModel { read_rate: 10.0, write_rate: 10.0, step_seconds: 2.0 };
+    let with = |read: &[u64], steps_ahead: u32, bytes_late: u64, drive: &DriveModel| {
+        let mut run = traffic(read);
+        run.steps.iter_mut().for_each(|s| (s.steps_ahead, s.bytes_late) = (steps_ahead, bytes_late.min(s.bytes_read)));
+        run.stall(0..read.len(), drive)
+    };
+    assert_eq!(with(&[500, 10, 10, 10], 1, 0, &drive), Stall::default(), "the drive keeps up");
+    // 30 bytes are 6 s of reading and writing, begun with the step before, which takes 2 s; also where the frames hold no
+    // other step, but all of its pages.
+    let late = Stall { seconds: 4.0, worst_seconds: 4.0, steps: 1 };
+    assert_eq!((with(&[0, 0, 0, 30], 1, 0, &drive), with(&[0, 0, 0, 30], 0, 0, &drive)), (late, late));
     // Begun two steps earlier they cost nothing.
-    let ahead = DriveModel { ahead_bytes: 30, ..drive };
-    assert_eq!(seconds(&[0, 0, 0, 30], &ahead), Stall::default());
+    assert_eq!(with(&[0, 0, 0, 30], 3, 0, &drive), Stall::default());
     // But reading ahead does not make the drive faster: 4 s for each step of 2 s, the first two begun with step 0.
-    let ahead = DriveModel { ahead_bytes: 1000, ..drive };
-    assert_eq!(seconds(&[0, 20, 20, 20], &ahead).seconds, 3.0 * 4.0 - 3.0 * 2.0);
+    assert_eq!(with(&[0, 20, 20, 20], 3, 0, &drive).seconds, 3.0 * 4.0 - 3.0 * 2.0);
+    // 10 of the bytes have no frame before the step before has ended, nor have those that they take the place of: 2 s, after
+    // the other 4 s, which end 2 s late as well.
+    assert_eq!(with(&[0, 0, 0, 30], 0, 10, &drive).seconds, 4.0);
+    assert_eq!(with(&[0, 0, 0, 20], 0, 10, &drive).seconds, 2.0);
     let slow = DriveModel { step_seconds: 0.0, ..drive };
-    assert_eq!(seconds(&[0, 20, 20], &slow).seconds, 8.0);
+    assert_eq!(with(&[0, 20, 20], 1, 0, &slow).seconds, 8.0);
+}
+
+/// How far ahead pages may be read, against sets of pages.
+#[test]
+fn pages_are_read_ahead_as_far_as_the_frames_hold_all_steps_between() {
+    let survey = survey(120, 16, 0.12, 0.7);
+    let views = ViewPages::new(&survey.index, &survey.cameras);
+    let order = ViewOrder::new(Order::Groups(4), 3, &survey.cameras);
+    let (mut kinds, most) = ([0; 4], views.most());
+    for frames in [most, most + most / 4, 2 * most, 4 * most, 256] {
+        let options = ReplayOptions { frames, policy: Policy::Farthest, steps: 240, plan_bytes: 1 << 28 };
+        let run = replay(&views, &vec![4096; 256], &order, &options).unwrap();
+        let mut coming = order.clone();
+        let needed: Vec<BTreeSet<PageNo>> =
+            (0..240).map(|step| views.of(coming.view_at(step)).iter().copied().collect()).collect();
+        let count = |first: usize, last: usize| needed[first..=last].iter().flatten().collect::<BTreeSet<_>>().len();
+        for (step, traffic) in run.steps.iter().enumerate().skip(1) {
+            let first = (step.saturating_sub(STEPS_AHEAD as usize)..=step).find(|&first| count(first, step) <= frames);
+            let ahead = step - first.unwrap();
+            assert_eq!(traffic.steps_ahead as usize, ahead, "step {step} of {frames} frames");
+            let crowded = count(step - 1, step).saturating_sub(frames) as u64;
+            assert_eq!(traffic.bytes_late, crowded * 4096, "step {step} of {frames} frames");
+            assert!(traffic.bytes_late <= traffic.bytes_read);
+            kinds[usize::from(crowded > 0)] += 1;
+            kinds[2] += usize::from(ahead > 1 && ahead < STEPS_AHEAD as usize);
+            kinds[3] += usize::from(ahead == STEPS_AHEAD as usize);
+        }
+    }
+    assert!(kinds.iter().all(|&count| count > 20), "hardly tested: {kinds:?}");
 }
 
 #[test]

@@ -3,7 +3,7 @@
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::base::units::format_bytes;
+use gsscale::base::units::{format_bytes, format_seconds};
 use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::page::drive_rate::DriveRate;
 use gsscale::page::format::transfer_bytes;
@@ -16,7 +16,7 @@ use gsscale::schedule::order::{Order, ViewOrder};
 use gsscale::schedule::plan::Plan;
 use gsscale::schedule::replay::{DriveModel, Figures, Replay, ReplayOptions, Stall, WINDOW_STEPS, replay};
 use gsscale::schedule::visibility::ViewPages;
-use gsscale::train::first_look::first_look;
+use gsscale::train::first_look::{LookFor, first_look};
 use gsscale::train::memory::host_bytes_peak;
 use gsscale::train::trainer::TrainError;
 use serde_json::{Value, json};
@@ -27,12 +27,14 @@ use std::process::ExitCode;
 const EXAMPLES: &str = "\
 Examples:
   gsscale-plan scans/village --compare-frames 10%,25%,50% --compare-orders shuffle,groups:9,groups:25,tour
-  gsscale-plan scans/city --host-mem 4GiB --steps 200000 --drive-read 3GB --step-seconds 0.4
+  gsscale-plan scans/city --host-mem 4GiB --steps 200000 --spill-dir /nvme/pages
+  gsscale-plan scans/city --host-mem 4GiB --drive-read 3GB --step-seconds 0.05      another machine's drive and GPU
   gsscale-plan runs/city --host-mem 2GiB --lists 100..110
 
 Pages are those of the first Gaussians; --growth 5 plans as if each page had grown to five.
 Shares of a step's pages that are read, 'of a plan' and 'lru', are those of the optimal cache and of one that drops what
-was used longest ago. Waiting assumes that the drive does one thing at a time, and --step-seconds for a step.";
+was used longest ago. Waiting assumes that the drive does one thing at a time, and that every step takes --step-seconds.
+Time is that of all steps, for the Gaussians of the start: a scene that grows takes longer.";
 
 /// Bytes per second that a common NVMe drive reads and writes.
 const COMMON_DRIVE: [f64; 2] = [3e9, 2e9];
@@ -67,12 +69,9 @@ struct Args {
     /// Bytes per second that the drive writes; without it measured likewise, or 2GB
     #[arg(long, value_name = "SIZE", help_heading = "Drive")]
     drive_write: Option<ByteSize>,
-    /// Seconds of a step that waits for nothing
-    #[arg(long, default_value_t = 0.3, value_name = "S", help_heading = "Drive")]
-    step_seconds: f64,
-    /// Bytes that are read ahead beyond the next step's
-    #[arg(long, default_value = "256MiB", value_name = "SIZE", help_heading = "Drive")]
-    read_ahead: ByteSize,
+    /// Seconds of a step that waits for nothing; without it a few steps on the CPU are timed
+    #[arg(long, value_name = "S", help_heading = "Drive")]
+    step_seconds: Option<f64>,
     /// Bytes that the drive is rated to write in its life
     #[arg(long, default_value = "300TB", value_name = "SIZE", help_heading = "Drive")]
     endurance: ByteSize,
@@ -102,8 +101,7 @@ struct Scene {
     page_bytes: Vec<u32>,
     /// Of one frame.
     frame_bytes: u64,
-    /// Bytes per second that the drive reads and writes.
-    drive: [f64; 2],
+    drive: DriveModel,
     views: ViewPages,
     gaussians: u64,
     /// Frames that --host-mem leaves beside what else a run holds, where it was given.
@@ -119,6 +117,8 @@ struct Row {
     figures: Figures,
     lru: Figures,
     stall: Stall,
+    /// Of all steps.
+    seconds: f64,
     total_read: f64,
     total_written: f64,
 }
@@ -153,7 +153,8 @@ fn start(args: &Args) -> InputResult<String> {
             "gaussians": scene.gaussians, "views": scene.cameras.len(), "steps": scene.config.steps,
             "pages": scene.index.len(), "page_rows": scene.config.page_rows, "frame_bytes": scene.frame_bytes,
             "state_bytes": state_bytes(&scene), "host_bytes_peak": host_bytes_peak(), "pages_of_largest_view": scene.views.most(),
-            "drive_read_bytes_per_second": scene.drive[0], "drive_write_bytes_per_second": scene.drive[1],
+            "drive_read_bytes_per_second": scene.drive.read_rate, "drive_write_bytes_per_second": scene.drive.write_rate,
+            "step_seconds": scene.drive.step_seconds,
             "plans": rows.iter().map(|row| json_of(args, row)).collect::<Vec<_>>(),
         });
         return Ok(format!("{value:#}"));
@@ -168,7 +169,7 @@ fn load(args: &Args) -> InputResult<Scene> {
     let mut config = config_path.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
     args.keys.clone().apply(&mut config);
     config.check()?;
-    if !(1.0..=1e6).contains(&args.growth) || args.step_seconds.is_nan() {
+    if !(1.0..=1e6).contains(&args.growth) || args.step_seconds.is_some_and(|s| !(0.0..=1e6).contains(&s)) {
         let problem = "--growth and --step-seconds must be numbers from 1 and 0 on";
         return Err(InputError::new("--growth, --step-seconds", problem, "leave them out"));
     }
@@ -180,11 +181,14 @@ fn load(args: &Args) -> InputResult<Scene> {
         ));
     }
     let path = if is_run { scene_of_run(&run_config)? } else { args.scene.clone() };
-    let drive = drive_rates(args, &config)?;
+    let [read_rate, write_rate] = drive_rates(args, &config)?;
     // Where frames are named, what a memory would hold is not asked for.
     let is_asked = args.compare_frames.is_empty() && config.frames == 0 && config.host_mem.0 > 0;
-    let for_memory = is_asked.then_some(config.host_mem.0);
-    let look = first_look(&path, &config, &folder_for(&config), for_memory).map_err(not_planned)?;
+    let look_for = LookFor {
+        frames_within: is_asked.then_some(config.host_mem.0),
+        step_seconds: args.step_seconds.is_none() && args.lists.is_none(),
+    };
+    let look = first_look(&path, &config, &folder_for(&config), look_for).map_err(not_planned)?;
     let cameras: Vec<Camera> = look.dataset.train_views().iter().map(|&v| look.dataset.views[v].camera).collect();
     let grown = |bytes: usize| (bytes as f64 * args.growth) as u64;
     let slot = |&bytes: &u32| grown(transfer_bytes(bytes as usize)).min(u64::from(u32::MAX)) as u32;
@@ -193,7 +197,11 @@ fn load(args: &Args) -> InputResult<Scene> {
         views: ViewPages::new(&look.index, &cameras),
         page_bytes: look.page_bytes.iter().map(slot).collect(),
         frame_bytes: grown(frame_bytes),
-        drive,
+        drive: DriveModel {
+            read_rate,
+            write_rate,
+            step_seconds: args.step_seconds.or(look.step_seconds).unwrap_or_default(),
+        },
         gaussians: look.gaussians,
         frames_within: look.frames.map(|frames| (frames as f64 / args.growth) as u64),
         config,
@@ -307,13 +315,8 @@ fn row(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Row
     };
     let (planned, lru) = (run(Policy::Farthest)?, run(Policy::LeastRecent)?);
     let figures = planned.figures(planned.steady());
-    let drive = DriveModel {
-        read_rate: scene.drive[0],
-        write_rate: scene.drive[1],
-        step_seconds: args.step_seconds,
-        ahead_bytes: args.read_ahead.0,
-    };
-    let stall = planned.stall(planned.steady(), &drive);
+    let stall = planned.stall(planned.steady(), &scene.drive);
+    let waits_per_step = stall.seconds / f64::from(figures.steps.max(1));
     let (read, written) = planned.totals();
     let rest = f64::from(scene.config.steps - steps);
     Ok(Row {
@@ -321,6 +324,7 @@ fn row(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Row
         is_automatic: text == "auto",
         frames,
         lru: lru.figures(lru.steady()),
+        seconds: f64::from(scene.config.steps) * (scene.drive.step_seconds + waits_per_step),
         stall,
         // The import leaves pages in the frames.
         total_read: (read - planned.first_bytes) as f64 + rest * figures.read_per_step,
@@ -341,7 +345,7 @@ fn json_of(args: &Args, row: &Row) -> Value {
         "heaviest_5_percent_share": f.heaviest_share,
         "worst_window": { "first_step": f.worst_window, "steps": WINDOW_STEPS, "bytes_per_step": f.worst_per_step },
         "stall_seconds_per_step": row.stall.seconds / steps, "stall_seconds_worst": row.stall.worst_seconds,
-        "steps_that_wait": f64::from(row.stall.steps) / steps,
+        "steps_that_wait": f64::from(row.stall.steps) / steps, "seconds": row.seconds,
         "bytes_read": row.total_read, "bytes_written": row.total_written,
         "share_of_endurance": row.total_written / args.endurance.0 as f64,
     })
@@ -360,7 +364,7 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
         100.0 * scene.views.most() as f64 / pages as f64,
     );
     text += &format!(
-        "\n{:12} {:>14} {:>9} {:>9} {:>10} {:>10} {:>12} {:>9} {:>8} {:>10} {:>7}",
+        "\n{:12} {:>14} {:>9} {:>9} {:>10} {:>10} {:>12} {:>9} {:>8} {:>8} {:>10} {:>7}",
         "order",
         "frames",
         "of a plan",
@@ -370,6 +374,7 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
         "worst 20/step",
         "wait/step",
         "longest",
+        "time",
         "written",
         "life"
     );
@@ -381,7 +386,7 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
         }
         let memory = format!("{} {}", row.frames, size(row.frames as f64 * scene.frame_bytes as f64));
         text += &format!(
-            "\n{name:12} {memory:>14} {:>9.3} {:>9.3} {:>10} {:>10} {:>13} {:>8.3}s {:>7.2}s {:>10} {:>6.1}%",
+            "\n{name:12} {memory:>14} {:>9.3} {:>9.3} {:>10} {:>10} {:>13} {:>8.4}s {:>7.2}s {:>8} {:>10} {:>6.1}%",
             1.0 - f.hit_rate,
             1.0 - row.lru.hit_rate,
             size(f.read_per_step),
@@ -389,17 +394,20 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
             size(f.worst_per_step),
             row.stall.seconds / f64::from(f.steps),
             row.stall.worst_seconds,
+            format_seconds(row.seconds),
             size(row.total_written),
             100.0 * row.total_written / args.endurance.0 as f64,
         );
     }
     text += &format!(
         "\nwritten: by all {} steps and the import, as a share of {}, commits not counted; worst 20: read and written; * chosen by auto\
-         \nwait: for a drive that reads {}/s and writes {}/s",
+         \nwait: for a drive that reads {}/s and writes {}/s, and steps of {:.3} s{}; time: of all steps, if nothing grows",
         scene.config.steps,
         format_bytes(args.endurance.0),
-        size(scene.drive[0]),
-        size(scene.drive[1]),
+        size(scene.drive.read_rate),
+        size(scene.drive.write_rate),
+        scene.drive.step_seconds,
+        if args.step_seconds.is_none() { ", as this CPU takes for a view of middling size" } else { "" },
     );
     if rows.iter().any(|row| !row.planned.is_exact) {
         text += "\nThe plan did not reach two epochs ahead: with a larger --plan-mem less may be read.";

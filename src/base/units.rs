@@ -1,4 +1,4 @@
-//! Byte sizes as people write them: `512MiB`, `4GiB`, `2GB`, `1048576`.
+//! Sizes and times as people write them: `512MiB`, `4GiB`, `2GB`, `1048576`; `45 s`, `12 min`, `3.4 h`.
 
 /// Bytes in one MiB.
 pub const MIB: u64 = 1 << 20;
@@ -43,6 +43,15 @@ pub fn format_bytes(bytes: u64) -> String {
     }
 }
 
+/// A time for people: two or three digits and a unit.
+pub fn format_seconds(seconds: f64) -> String {
+    const UNITS: [(f64, &str); 4] = [(1.0, "s"), (60.0, "min"), (3600.0, "h"), (86400.0, "d")];
+    // A unit ends where its number would have three digits.
+    let (size, unit) = UNITS.into_iter().find(|(size, _)| seconds < 99.5 * size).unwrap_or(UNITS[3]);
+    let value = seconds / size;
+    if value < 9.95 { format!("{value:.1} {unit}") } else { format!("{value:.0} {unit}") }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -57,5 +66,7 @@ mod tests {
         assert!(parse_bytes("4 parsecs").is_err());
         assert_eq!(format_bytes(4 * GIB), "4.0 GiB");
         assert_eq!(format_bytes(900), "900 B");
+        let times = [0.25, 45.2, 99.4, 99.6, 5000.0, 7200.0, 345_600.0, 864_000.0];
+        assert_eq!(times.map(format_seconds), ["0.2 s", "45 s", "99 s", "1.7 min", "83 min", "2.0 h", "96 h", "10 d"]);
     }
 }

@@ -19,11 +19,10 @@ use crate::base::ids::PageNo;
 use crate::cache::evict::EvictPolicy;
 use crate::cache::frame::FrameState;
 use crate::cache::host_cache::Victim;
+use crate::schedule::replay::STEPS_AHEAD;
 use std::collections::{BinaryHeap, VecDeque};
 use std::str::FromStr;
 
-/// Steps that are played through at most.
-const STEPS_AHEAD: u32 = 16;
 /// Steps that are planned anew, by the bounds as they are now, counted from the present one: the next, the last that is
 /// played through, and one far enough for pages to be kept for it. Pages were planned up to two epochs before, and their
 /// rows move. Without the latter two a cache for half of a small survey read 8 % more, for half of a large one 2 %.

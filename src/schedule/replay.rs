@@ -5,8 +5,9 @@
 //! views in the same order.
 //!
 //! The model of time: one drive that serves one request after the other, reads in the order of steps, each preceded by
-//! the writes that free its frames; reads of coming steps start as early as the read-ahead in bytes allows; a step takes
-//! the same time everywhere. What a run waits for is the sum over steps of what is still missing when they could start.
+//! the writes that free its frames; reads of a coming step start as early as the frames allow, which hold the pages of all
+//! steps in between as well, but at most [`STEPS_AHEAD`] steps before it; a step takes the same time everywhere. What a run
+//! waits for is the sum over steps of what is still missing when they could start.
 //!
 //! Invariants: 1. nothing here knows clocks or files: the same input gives the same report; 2. bytes are counted when a
 //! page moves, whole pages only; every page that leaves was changed and is written, unless its share says otherwise.
@@ -16,10 +17,14 @@ use super::order::ViewOrder;
 use super::plan::Plan;
 use super::visibility::ViewPages;
 use crate::base::ids::PageNo;
+use std::collections::VecDeque;
 use std::ops::Range;
 
 /// Steps of the window whose heaviest place is reported.
 pub const WINDOW_STEPS: usize = 20;
+
+/// Steps before its own in which a page may be read.
+pub const STEPS_AHEAD: u32 = 16;
 
 /// What is simulated.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -45,6 +50,10 @@ pub struct StepTraffic {
     pub bytes_read: u64,
     /// Bytes of the pages that left for it.
     pub bytes_written: u64,
+    /// Earlier steps that its pages may be read in: the frames hold the pages of all from there on.
+    pub steps_ahead: u32,
+    /// Of the bytes read, those for which there is no frame before the step before it has ended.
+    pub bytes_late: u64,
 }
 
 /// All steps of a replay.
@@ -83,6 +92,7 @@ pub fn replay(
     };
     let (mut pages, mut steps) = (Vec::new(), Vec::with_capacity(options.steps as usize));
     let (mut first_bytes, mut frames_left) = (0, options.frames);
+    let mut together = Together::default();
     for step in 0..options.steps {
         // The run ends; what would come after it is not needed by anyone.
         while plan.steps().end < options.steps.min(step.saturating_add(reach)) {
@@ -98,15 +108,56 @@ pub fn replay(
         let first = change.admit.len().min(frames_left);
         frames_left -= first;
         first_bytes += bytes(&change.admit[..first]);
+        let (steps_ahead, crowded) = together.push(&pages, options.frames);
+        let bytes_read = bytes(&change.admit);
         steps.push(StepTraffic {
             pages: pages.len() as u32,
             pages_read: change.admit.len() as u32,
-            bytes_read: bytes(&change.admit),
+            bytes_read,
             bytes_written: bytes(&change.evict),
+            steps_ahead,
+            // Pages are about as large as each other.
+            bytes_late: (bytes_read * crowded as u64).checked_div(change.admit.len() as u64).unwrap_or(0),
         });
         plan.pop();
     }
     Ok(Replay { steps, views: views.views(), first_bytes, is_exact })
+}
+
+/// The last steps whose pages fit into the frames together.
+#[derive(Debug, Default)]
+struct Together {
+    steps: VecDeque<Vec<PageNo>>,
+    /// By page: how many of these steps need it.
+    uses: Vec<u32>,
+    /// Pages that any of them needs.
+    pages: usize,
+}
+
+impl Together {
+    /// Takes the next step: how many steps before it fit into the frames with it, and for how many of its pages there is no
+    /// frame as long as the step before it lasts.
+    fn push(&mut self, pages: &[PageNo], frames: usize) -> (u32, usize) {
+        for page in pages {
+            if self.uses.len() <= page.index() {
+                self.uses.resize(page.index() + 1, 0);
+            }
+            self.pages += usize::from(self.uses[page.index()] == 0);
+            self.uses[page.index()] += 1;
+        }
+        self.steps.push_back(pages.to_vec());
+        let mut crowded = 0;
+        while self.steps.len() > 1 && (self.pages > frames || self.steps.len() > STEPS_AHEAD as usize + 1) {
+            if self.steps.len() == 2 {
+                crowded = self.pages - frames;
+            }
+            for page in self.steps.pop_front().into_iter().flatten() {
+                self.uses[page.index()] -= 1;
+                self.pages -= usize::from(self.uses[page.index()] == 0);
+            }
+        }
+        (self.steps.len() as u32 - 1, crowded)
+    }
 }
 
 /// What a drive does and how long a step takes without it.
@@ -118,8 +169,6 @@ pub struct DriveModel {
     pub write_rate: f64,
     /// Seconds of a step that waits for nothing.
     pub step_seconds: f64,
-    /// Bytes that may be read before the step before theirs has begun: reads go further ahead only within them.
-    pub ahead_bytes: u64,
 }
 
 /// Waiting for the drive.
@@ -206,20 +255,19 @@ impl Replay {
     pub fn stall(&self, range: Range<usize>, drive: &DriveModel) -> Stall {
         let steps = &self.steps[range];
         let mut stall = Stall::default();
-        // When each step began; its pages may be worked on until the next begins.
         let mut began = vec![0.0f64; steps.len()];
-        let (mut drive_free, mut ahead, mut from) = (0.0f64, 0, 0);
+        let mut drive_free = 0.0f64;
         for step in 1..steps.len() {
-            // Reads of this step may start when step `from` begins: from there to here no more bytes than allowed.
-            ahead += steps[step].bytes_read;
-            while from + 1 < step && ahead > drive.ahead_bytes {
-                from += 1;
-                ahead -= steps[from].bytes_read;
-            }
-            let StepTraffic { bytes_read, bytes_written, .. } = steps[step];
-            let busy = bytes_read as f64 / drive.read_rate + bytes_written as f64 / drive.write_rate;
-            drive_free = drive_free.max(began[from]) + busy;
+            let StepTraffic { bytes_read, bytes_written, steps_ahead, bytes_late, .. } = steps[step];
+            let busy = |read: u64, written: u64| read as f64 / drive.read_rate + written as f64 / drive.write_rate;
+            // What is late takes the place of pages that the step before it has just changed.
+            let written_late = bytes_written.min(bytes_late);
+            let from = step.saturating_sub(steps_ahead.max(1) as usize);
+            drive_free = drive_free.max(began[from]) + busy(bytes_read - bytes_late, bytes_written - written_late);
             let ready = began[step - 1] + drive.step_seconds;
+            if bytes_late > 0 {
+                drive_free = drive_free.max(ready) + busy(bytes_late, written_late);
+            }
             let waits = if bytes_read > 0 { (drive_free - ready).max(0.0) } else { 0.0 };
             began[step] = ready + waits;
             stall.seconds += waits;

@@ -12,16 +12,21 @@ use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides};
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
+use gsscale::page::drive_rate::DriveRate;
 use gsscale::paging::stats::PagerStats;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::camera::Camera;
 use gsscale::schedule::auto::automatic_order;
+use gsscale::schedule::model::Policy;
+use gsscale::schedule::order::ViewOrder;
+use gsscale::schedule::replay::{DriveModel, ReplayOptions, replay};
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::memory::host_bytes_peak;
 use gsscale::train::run::{Prepared, prepare};
 use gsscale::train::tiers::{self, Tiers};
 use gsscale::train::trainer::{TrainError, Trainer};
 use serde_json::{Value, json};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -119,7 +124,8 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         "pages_of_largest_view": most, "threads": rayon::current_num_threads(), "host_bytes_peak": host_bytes_peak(),
         "version": env!("CARGO_PKG_VERSION"),
     });
-    let lines: Vec<Value> = contenders.iter().map(|c| c.line(&contenders[0], &facts)).collect();
+    let predicted = Prediction::new(&config, (dataset, warm_up), &contenders[0])?;
+    let lines: Vec<Value> = contenders.iter().map(|c| c.line(&contenders[0], &predicted, &facts)).collect();
     lines.iter().for_each(print);
     Ok(())
 }
@@ -187,7 +193,7 @@ fn contender(
 
 fn take_turns(
     contenders: &mut [Contender],
-    (steps, turn): (std::ops::Range<u32>, u32),
+    (steps, turn): (Range<u32>, u32),
     dataset: &Dataset,
     targets: &TargetCache,
     measures: bool,
@@ -231,7 +237,7 @@ impl Contender {
     }
 
     /// What was measured, beside the run in memory and what holds for all.
-    fn line(&self, in_memory: &Contender, facts: &Value) -> Value {
+    fn line(&self, in_memory: &Contender, predicted: &Prediction, facts: &Value) -> Value {
         let steps = self.seconds.len().max(1) as f64;
         let sum = |of: &Contender| of.seconds.iter().sum::<f64>();
         let cpu = |of: &Contender| of.cpu_seconds[0] + of.cpu_seconds[1];
@@ -271,10 +277,48 @@ impl Contender {
                 "share_absent_least": self.demand.fewest_absent(now.frames_max) as f64 / needed,
                 "share_late_misses": (now.late_misses - before.late_misses) as f64 / needed,
                 "stall_seconds": now.stall_seconds - before.stall_seconds,
+                "stall_seconds_predicted": predicted.stall_seconds(now.frames_max),
             });
             extend(&mut line, &tier);
         }
         extend(&mut line, facts);
         line
+    }
+}
+
+/// What planning says beforehand of the same steps.
+struct Prediction {
+    views: ViewPages,
+    page_bytes: Vec<u32>,
+    order: ViewOrder,
+    steps: Range<u32>,
+    drive: DriveModel,
+}
+
+impl Prediction {
+    /// For the drive as it is now, and steps as long as those in memory were.
+    fn new(
+        config: &TrainConfig,
+        (dataset, warm_up): (&Dataset, u32),
+        in_memory: &Contender,
+    ) -> Result<Prediction, TrainError> {
+        let rate = DriveRate::look(Path::new(&config.spill_dir))?;
+        let trainer = &in_memory.trainer;
+        let step_seconds = in_memory.seconds.iter().sum::<f64>() / in_memory.seconds.len().max(1) as f64;
+        Ok(Prediction {
+            views: views(dataset, trainer),
+            page_bytes: page_bytes(trainer.scene.pager.index()).into_iter().map(|bytes| bytes as u32).collect(),
+            order: trainer.view_order().clone(),
+            steps: warm_up..config.steps,
+            drive: DriveModel { read_rate: rate.read, write_rate: rate.write, step_seconds },
+        })
+    }
+
+    /// Seconds that the measured steps wait for the drive, with so many frames.
+    fn stall_seconds(&self, frames: usize) -> Option<f64> {
+        let options =
+            ReplayOptions { frames, policy: Policy::Farthest, steps: self.steps.end, plan_bytes: ORDER_BYTES };
+        let run = replay(&self.views, &self.page_bytes, &self.order, &options).ok()?;
+        Some(run.stall(self.steps.start as usize..self.steps.end as usize, &self.drive).seconds)
     }
 }
