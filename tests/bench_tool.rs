@@ -28,6 +28,7 @@ fn shares_of_the_state_train_to_the_bits_of_the_run_in_memory() {
         assert_eq!(share[key], in_memory[key], "{key}");
     }
     assert!(number(share, "overfetch") >= 1.0 && number(share, "seconds_per_step_median") > 0.0);
+    assert!((0.0..1e6).contains(&number(share, "stall_seconds_predicted")), "{share}");
     // The bound starts and ends where the measurement does; only what was read ahead at either end may differ, which an
     // eighth of the frames bounds.
     let reads = number(share, "pages_read_per_step") * 40.0;

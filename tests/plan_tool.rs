@@ -72,6 +72,8 @@ fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
         (&["--compare-orders", "random"], ["'random'", "groups:<n>"]),
         (&["--drive-read", "0"], ["--drive-read", "bytes per second"]),
         (&["--lists", "5..5"], ["5..5", "100..110"]),
+        (&["--step-seconds", "nan"], ["--step-seconds", "leave them out"]),
+        (&["--optimizer", "dense"], ["every page at every step", "deferred"]),
     ] {
         let output = plan(&run, args);
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -162,11 +164,46 @@ fn a_scene_larger_than_memory_is_planned_within_it() {
     let scene = wide_city(folder.path(), 200_000);
     let (budget, bytes) = ("100MiB", 100 << 20);
     let args = ["--host-mem", budget, "--page-rows", "128", "--image-cache", "4MiB", "--prefetch-bytes", "1MiB"];
+    let args = [&args[..], &["--device", "cpu"]].concat();
     let value: Value =
         serde_json::from_str(&stdout(&plan(&scene, &[&args[..], &["--json", "--plan-mem", "16MiB"]].concat())))
             .unwrap();
     assert!(value["gaussians"].as_u64() > Some(190_000) && value["state_bytes"].as_u64() > Some(bytes), "{value}");
     assert!(value["host_bytes_peak"].as_u64() <= Some(bytes), "{value}");
+    assert!(value["step_timed_on"].is_string(), "a view of middling size fits: {value}");
     let (plan, pages) = (&value["plans"][0], value["pages"].as_u64());
     assert!(plan["frames"].as_u64() < pages && plan["frames"].as_u64() > value["pages_of_largest_view"].as_u64());
+}
+
+/// Steps are timed on the device of the run unless somebody says how long they take; all of them and what they wait make the
+/// time of the run.
+#[test]
+fn the_time_of_a_run_is_that_of_its_steps_and_what_they_wait() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 300, 32, 24, 8000);
+    let common = ["--page-rows", "32", "--test-every", "0", "--compare-frames", "70%", "--view-order", "shuffle"];
+    let common = [&common[..], &["--device", "cpu", "--drive-write", "100MB"]].concat();
+    let planned = |more: &[&str]| -> Value {
+        serde_json::from_str(&stdout(&plan(&scene, &[&common[..], &["--json"], more].concat()))).unwrap()
+    };
+    let number = |value: &Value| value.as_f64().unwrap();
+    let timed = planned(&["--steps", "1000"]);
+    assert!(number(&timed["step_seconds"]) > 1e-6 && timed["step_timed_on"] == "cpu", "{timed}");
+    // As many steps as are gone through one by one, and many more, which are like the later ones of these.
+    for steps in [1200.0, 24_000.0] {
+        let of = |rate| planned(&["--steps", &steps.to_string(), "--step-seconds", "0.002", "--drive-read", rate]);
+        let (slow, fast) = (of("1MB"), of("1000GB"));
+        assert!(slow["step_seconds"] == 0.002 && slow["step_timed_on"].is_null(), "{slow}");
+        let [slow, fast] = [&slow, &fast].map(|value| &value["plans"][0]);
+        // Reading takes far longer than the steps: the run takes as long as its reads and writes.
+        let moved = number(&slow["bytes_read"]) / 1e6 + (number(&slow["bytes_written"])) / 100e6;
+        let seconds = number(&slow["seconds"]);
+        assert!((seconds / moved - 1.0).abs() < 0.05, "{seconds} s to move {slow} in {moved} s");
+        assert!(number(&fast["seconds"]) >= 0.002 * steps && number(&fast["seconds"]) < 0.1 * seconds, "{fast}");
+    }
+    // With all pages in memory nothing is waited for, not even the first time.
+    let all = planned(&["--steps", "30", "--step-seconds", "0.5", "--compare-frames", "100%"]);
+    assert_eq!(number(&all["plans"][1]["seconds"]), 15.0, "{all}");
+    let table = stdout(&plan(&scene, &[&common[..], &["--steps", "100", "--step-seconds", "72"]].concat()));
+    assert!(table.contains("2.0 h") && table.contains("72.0000 s;"), "{table}");
 }

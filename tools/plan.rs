@@ -1,5 +1,5 @@
-//! `gsscale-plan`: what a run would read and write through the disk tier, before any training. Parses, calls the
-//! library, prints; leaves no file.
+//! `gsscale-plan`: what a run would read and write through the disk tier, and how long it would take, before it. Parses,
+//! calls the library, prints; leaves no file.
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
@@ -17,6 +17,7 @@ use gsscale::schedule::plan::Plan;
 use gsscale::schedule::replay::{DriveModel, Figures, Replay, ReplayOptions, Stall, WINDOW_STEPS, replay};
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::first_look::{LookFor, first_look};
+use gsscale::train::machine::set_up;
 use gsscale::train::memory::host_bytes_peak;
 use gsscale::train::trainer::TrainError;
 use serde_json::{Value, json};
@@ -28,20 +29,27 @@ const EXAMPLES: &str = "\
 Examples:
   gsscale-plan scans/village --compare-frames 10%,25%,50% --compare-orders shuffle,groups:9,groups:25,tour
   gsscale-plan scans/city --host-mem 4GiB --steps 200000 --spill-dir /nvme/pages
-  gsscale-plan scans/city --host-mem 4GiB --drive-read 3GB --step-seconds 0.05      another machine's drive and GPU
+  gsscale-plan scans/city --host-mem 4GiB --drive-read 3GB --step-seconds 0.05   # another machine's drive and GPU
   gsscale-plan runs/city --host-mem 2GiB --lists 100..110
 
 Pages are those of the first Gaussians; --growth 5 plans as if each page had grown to five.
 Shares of a step's pages that are read, 'of a plan' and 'lru', are those of the optimal cache and of one that drops what
 was used longest ago. Waiting assumes that the drive does one thing at a time, and that every step takes --step-seconds.
-Time is that of all steps, for the Gaussians of the start: a scene that grows takes longer.";
+Time is that of all steps for the Gaussians of the start (a scene that grows takes longer), without import, evaluation, commits,
+and photos that have to be decoded again (--image-cache).";
 
 /// Bytes per second that a common NVMe drive reads and writes.
 const COMMON_DRIVE: [f64; 2] = [3e9, 2e9];
 /// Epochs that are gone through; later ones are counted like the mean of those after the first.
 const EPOCHS: u32 = 4;
 
-/// Says what a run would read and write through the disk tier, for any memory, page size and order of views.
+/// Step of a scene in which nothing can be timed, seconds.
+const STEP_ASSUMED: f64 = 0.3;
+/// Twice the Gaussians make a step take 1.45 times as long (`gsscale-bench pareto`): a step grows with this power of them.
+const STEP_GROWTH: f64 = 0.54;
+
+/// Says what a run would read and write through the disk tier and how long it would take, for any memory, page size and order
+/// of views.
 #[derive(Parser)]
 #[command(name = "gsscale-plan", version, after_help = EXAMPLES)]
 struct Args {
@@ -69,7 +77,7 @@ struct Args {
     /// Bytes per second that the drive writes; without it measured likewise, or 2GB
     #[arg(long, value_name = "SIZE", help_heading = "Drive")]
     drive_write: Option<ByteSize>,
-    /// Seconds of a step that waits for nothing; without it a few steps on the CPU are timed
+    /// Seconds of a step that waits for nothing; without it a few steps on the device of the run are timed
     #[arg(long, value_name = "S", help_heading = "Drive")]
     step_seconds: Option<f64>,
     /// Bytes that the drive is rated to write in its life
@@ -102,6 +110,8 @@ struct Scene {
     /// Of one frame.
     frame_bytes: u64,
     drive: DriveModel,
+    /// What rendered the steps that were timed.
+    timed_on: Option<String>,
     views: ViewPages,
     gaussians: u64,
     /// Frames that --host-mem leaves beside what else a run holds, where it was given.
@@ -154,7 +164,7 @@ fn start(args: &Args) -> InputResult<String> {
             "pages": scene.index.len(), "page_rows": scene.config.page_rows, "frame_bytes": scene.frame_bytes,
             "state_bytes": state_bytes(&scene), "host_bytes_peak": host_bytes_peak(), "pages_of_largest_view": scene.views.most(),
             "drive_read_bytes_per_second": scene.drive.read_rate, "drive_write_bytes_per_second": scene.drive.write_rate,
-            "step_seconds": scene.drive.step_seconds,
+            "step_seconds": scene.drive.step_seconds, "step_timed_on": scene.timed_on,
             "plans": rows.iter().map(|row| json_of(args, row)).collect::<Vec<_>>(),
         });
         return Ok(format!("{value:#}"));
@@ -169,6 +179,11 @@ fn load(args: &Args) -> InputResult<Scene> {
     let mut config = config_path.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
     args.keys.clone().apply(&mut config);
     config.check()?;
+    set_up(&config)?;
+    if config.optimizer == "dense" {
+        let problem = "dense reads and writes every page at every step, which is not planned";
+        return Err(InputError::new("--optimizer", problem, "plan for deferred, which gives the same"));
+    }
     if !(1.0..=1e6).contains(&args.growth) || args.step_seconds.is_some_and(|s| !(0.0..=1e6).contains(&s)) {
         let problem = "--growth and --step-seconds must be numbers from 1 and 0 on";
         return Err(InputError::new("--growth, --step-seconds", problem, "leave them out"));
@@ -186,7 +201,7 @@ fn load(args: &Args) -> InputResult<Scene> {
     let is_asked = args.compare_frames.is_empty() && config.frames == 0 && config.host_mem.0 > 0;
     let look_for = LookFor {
         frames_within: is_asked.then_some(config.host_mem.0),
-        step_seconds: args.step_seconds.is_none() && args.lists.is_none(),
+        step: args.step_seconds.is_none() && args.lists.is_none(),
     };
     let look = first_look(&path, &config, &folder_for(&config), look_for).map_err(not_planned)?;
     let cameras: Vec<Camera> = look.dataset.train_views().iter().map(|&v| look.dataset.views[v].camera).collect();
@@ -200,8 +215,13 @@ fn load(args: &Args) -> InputResult<Scene> {
         drive: DriveModel {
             read_rate,
             write_rate,
-            step_seconds: args.step_seconds.or(look.step_seconds).unwrap_or_default(),
+            step_seconds: match (args.step_seconds, &look.step) {
+                (Some(named), _) => named,
+                (None, Some(timed)) => timed.seconds * args.growth.powf(STEP_GROWTH),
+                (None, None) => STEP_ASSUMED,
+            },
         },
+        timed_on: look.step.map(|step| step.device),
         gaussians: look.gaussians,
         frames_within: look.frames.map(|frames| (frames as f64 / args.growth) as u64),
         config,
@@ -230,7 +250,7 @@ fn drive_rates(args: &Args, config: &TrainConfig) -> InputResult<[f64; 2]> {
 fn not_planned(error: TrainError) -> InputError {
     match error {
         TrainError::Input(error) => error,
-        other => InputError::new("--host-mem", other.to_string(), "plan for --frames instead"),
+        other => InputError::new("--host-mem", other.to_string(), "plan for --frames and --step-seconds instead"),
     }
 }
 
@@ -316,18 +336,19 @@ fn row(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Row
     let (planned, lru) = (run(Policy::Farthest)?, run(Policy::LeastRecent)?);
     let figures = planned.figures(planned.steady());
     let stall = planned.stall(planned.steady(), &scene.drive);
-    let waits_per_step = stall.seconds / f64::from(figures.steps.max(1));
-    let (read, written) = planned.totals();
+    let (_, written) = planned.totals();
     let rest = f64::from(scene.config.steps - steps);
     Ok(Row {
         order,
         is_automatic: text == "auto",
         frames,
         lru: lru.figures(lru.steady()),
-        seconds: f64::from(scene.config.steps) * (scene.drive.step_seconds + waits_per_step),
+        seconds: f64::from(scene.config.steps) * scene.drive.step_seconds
+            + planned.stall(0..planned.steps.len(), &scene.drive).seconds
+            + rest * stall.seconds / f64::from(figures.steps.max(1)),
         stall,
         // The import leaves pages in the frames.
-        total_read: (read - planned.first_bytes) as f64 + rest * figures.read_per_step,
+        total_read: planned.read_by_run() as f64 + rest * figures.read_per_step,
         // Every page is written once before the first step.
         total_written: state_bytes(scene) as f64 + written as f64 + rest * figures.written_per_step,
         planned,
@@ -401,13 +422,17 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
     }
     text += &format!(
         "\nwritten: by all {} steps and the import, as a share of {}, commits not counted; worst 20: read and written; * chosen by auto\
-         \nwait: for a drive that reads {}/s and writes {}/s, and steps of {:.3} s{}; time: of all steps, if nothing grows",
+         \nwait: for a drive that reads {}/s and writes {}/s, and steps of {:.4} s{}; time: of all steps, with these Gaussians",
         scene.config.steps,
         format_bytes(args.endurance.0),
         size(scene.drive.read_rate),
         size(scene.drive.write_rate),
         scene.drive.step_seconds,
-        if args.step_seconds.is_none() { ", as this CPU takes for a view of middling size" } else { "" },
+        match (args.step_seconds, &scene.timed_on) {
+            (Some(_), _) => String::new(),
+            (None, Some(device)) => format!(" ({device}, a view of middling size)"),
+            (None, None) => " (assumed: no view fits)".to_string(),
+        },
     );
     if rows.iter().any(|row| !row.planned.is_exact) {
         text += "\nThe plan did not reach two epochs ahead: with a larger --plan-mem less may be read.";

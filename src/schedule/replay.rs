@@ -7,7 +7,8 @@
 //! The model of time: one drive that serves one request after the other, reads in the order of steps, each preceded by
 //! the writes that free its frames; reads of a coming step start as early as the frames allow, which hold the pages of all
 //! steps in between as well, but at most [`STEPS_AHEAD`] steps before it; a step takes the same time everywhere. What a run
-//! waits for is the sum over steps of what is still missing when they could start.
+//! waits for is the sum over steps of what is still missing when they could start. A run waits longer than that where the
+//! page that should leave is one that has just been used, and where few bytes may be in flight: neither is modelled.
 //!
 //! Invariants: 1. nothing here knows clocks or files: the same input gives the same report; 2. bytes are counted when a
 //! page moves, whole pages only; every page that leaves was changed and is written, unless its share says otherwise.
@@ -48,6 +49,9 @@ pub struct StepTraffic {
     pub pages_read: u32,
     /// Bytes of these.
     pub bytes_read: u64,
+    /// Of these, bytes of the pages that are needed before any other page has to leave: a run that has just made its pages
+    /// has them in memory.
+    pub bytes_first: u64,
     /// Bytes of the pages that left for it.
     pub bytes_written: u64,
     /// Earlier steps that its pages may be read in: the frames hold the pages of all from there on.
@@ -63,9 +67,6 @@ pub struct Replay {
     pub steps: Vec<StepTraffic>,
     /// Steps of an epoch.
     pub views: usize,
-    /// Of the bytes read, those of the pages that are needed first, as many as there are frames: a run that has just made its
-    /// pages has them in memory.
-    pub first_bytes: u64,
     /// Whether every next use was known whenever a page left: then reads under [`Policy::Farthest`] are Belady's bound.
     pub is_exact: bool,
 }
@@ -91,7 +92,7 @@ pub fn replay(
         pages.iter().map(|p| page_bytes.get(p.index()).map_or(0, |&b| u64::from(b))).sum()
     };
     let (mut pages, mut steps) = (Vec::new(), Vec::with_capacity(options.steps as usize));
-    let (mut first_bytes, mut frames_left) = (0, options.frames);
+    let mut frames_left = options.frames;
     let mut together = Together::default();
     for step in 0..options.steps {
         // The run ends; what would come after it is not needed by anyone.
@@ -107,21 +108,21 @@ pub fn replay(
         // As long as there are frames without a page nothing leaves, so that each of these is read for the first time.
         let first = change.admit.len().min(frames_left);
         frames_left -= first;
-        first_bytes += bytes(&change.admit[..first]);
         let (steps_ahead, crowded) = together.push(&pages, options.frames);
         let bytes_read = bytes(&change.admit);
         steps.push(StepTraffic {
             pages: pages.len() as u32,
             pages_read: change.admit.len() as u32,
             bytes_read,
+            bytes_first: bytes(&change.admit[..first]),
             bytes_written: bytes(&change.evict),
             steps_ahead,
-            // Pages are about as large as each other.
-            bytes_late: (bytes_read * crowded as u64).checked_div(change.admit.len() as u64).unwrap_or(0),
+            // Pages are about as large as each other; there are at least as many.
+            bytes_late: bytes_read.checked_div(change.admit.len() as u64).unwrap_or(0) * crowded as u64,
         });
         plan.pop();
     }
-    Ok(Replay { steps, views: views.views(), first_bytes, is_exact })
+    Ok(Replay { steps, views: views.views(), is_exact })
 }
 
 /// The last steps whose pages fit into the frames together.
@@ -215,6 +216,11 @@ impl Replay {
         self.steps.iter().fold((0, 0), |(read, written), s| (read + s.bytes_read, written + s.bytes_written))
     }
 
+    /// Bytes that a run reads which has just made its pages.
+    pub fn read_by_run(&self) -> u64 {
+        self.steps.iter().map(|s| s.bytes_read - s.bytes_first).sum()
+    }
+
     /// Figures over a range of steps.
     pub fn figures(&self, range: Range<usize>) -> Figures {
         let steps = &self.steps[range.clone()];
@@ -250,15 +256,17 @@ impl Replay {
         }
     }
 
-    /// How long a range of steps waits for the drive. The first step's reads count as done: the run waits for them once,
-    /// before it begins.
+    /// How long a range of steps waits for the drive, in a run that has just made its pages. The range's first reads count as
+    /// done: the run waits for them once, before it begins.
     pub fn stall(&self, range: Range<usize>, drive: &DriveModel) -> Stall {
         let steps = &self.steps[range];
         let mut stall = Stall::default();
         let mut began = vec![0.0f64; steps.len()];
         let mut drive_free = 0.0f64;
         for step in 1..steps.len() {
-            let StepTraffic { bytes_read, bytes_written, steps_ahead, bytes_late, .. } = steps[step];
+            let StepTraffic { bytes_read, bytes_first, bytes_written, steps_ahead, .. } = steps[step];
+            let bytes_read = bytes_read - bytes_first;
+            let bytes_late = steps[step].bytes_late.min(bytes_read);
             let busy = |read: u64, written: u64| read as f64 / drive.read_rate + written as f64 / drive.write_rate;
             // What is late takes the place of pages that the step before it has just changed.
             let written_late = bytes_written.min(bytes_late);

@@ -1,8 +1,9 @@
 //! The pages of a run's first Gaussians without the run: what planning looks at, and how long a step on them takes.
 //!
 //! Invariants: 1. nothing is stored; 2. of the Gaussians no more is in memory at once than an import takes, and then the
-//! pages of one view; 3. pages and bounds are those that the run begins with.
+//! pages of one view: the largest, if that is asked about, and one to time that is small enough; 3. pages and bounds are those that the run begins with.
 
+use super::machine;
 use super::memory::{Probe, host_budget};
 use super::pages::{PageRules, PagedScene};
 use super::preflight;
@@ -23,10 +24,12 @@ use crate::schedule::visibility::visible_pages;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Steps are timed until this much time has passed, but the first is not counted ...
+/// Steps are timed until this much time has passed ...
 const TIMED: Duration = Duration::from_secs(1);
 /// ... and no more than so many are.
 const TIMED_STEPS: u32 = 8;
+/// Pages of the view that is timed take at most this share of the memory.
+const TIMED_SHARE: u64 = 4;
 
 /// What a run would begin with.
 pub struct FirstLook {
@@ -40,24 +43,33 @@ pub struct FirstLook {
     pub gaussians: u64,
     /// Frames that the memory asked about leaves for pages, about as a run on the CPU gets them.
     pub frames: Option<u64>,
-    /// Seconds of a step with all bands on this machine's CPU, where that was asked for and there is anything to see.
-    pub step_seconds: Option<f64>,
+    /// How long a step takes here, where that was asked for and a view that sees anything fits into memory.
+    pub step: Option<StepTime>,
 }
 
-/// What else to look for, which costs rendering a view each.
+/// How long a step takes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StepTime {
+    /// With the bands of the last step, on a view that needs as many pages as half of those that see anything do at most.
+    pub seconds: f64,
+    /// What rendered it.
+    pub device: String,
+}
+
+/// What else to look for: reads the Gaussians once more and renders a view, each.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct LookFor {
     /// For how many frames so many bytes of memory are good.
     pub frames_within: Option<u64>,
     /// How long a step takes.
-    pub step_seconds: bool,
+    pub step: bool,
 }
 
 /// Looks at what a run of `scene` would begin with. `folder` is for what does not fit in memory; what is written there has
 /// no name.
 ///
 /// # Errors
-/// As [`Start::look`]; the memory asked about does not hold a view, or one cannot be rendered.
+/// As [`Start::look`]; the memory asked about does not hold a view, one cannot be rendered, or there is no such device.
 pub fn first_look(
     scene: &Path,
     config: &TrainConfig,
@@ -76,7 +88,7 @@ pub fn first_look(
     })?;
     let mut world = World { config, start, index, folder };
     let frames = look_for.frames_within.map(|bytes| world.frames_within(&options, bytes)).transpose()?;
-    let step_seconds = if look_for.step_seconds { world.step_seconds(host_mem)? } else { None };
+    let step = if look_for.step { world.step_time(host_mem)? } else { None };
     let World { start, index, .. } = world;
     let bytes = |page: &PageMeta| PageLayout { rows: page.rows as usize, sh_degree: config.sh_degree }.bytes() as u32;
     Ok(FirstLook {
@@ -85,7 +97,7 @@ pub fn first_look(
         gaussians: index.iter().map(|page| u64::from(page.rows)).sum(),
         index,
         frames,
-        step_seconds,
+        step,
     })
 }
 
@@ -127,38 +139,51 @@ impl World<'_> {
         Ok(scene)
     }
 
-    /// Seconds of a step on the view that needs as many pages as half of the views do at most, with all bands and a black
-    /// photo. The shortest of a few: what else the machine does only makes them longer.
-    fn step_seconds(&mut self, host_mem: Option<u64>) -> Result<Option<f64>, TrainError> {
-        let dataset = &self.start.dataset;
-        let mut list = Vec::new();
-        let mut views: Vec<(usize, usize)> = Vec::new();
-        for view in dataset.train_views() {
-            visible_pages(&self.index, &dataset.views[view].camera, &mut list);
-            views.push((list.len(), view));
-        }
-        views.sort_unstable();
-        let Some(&(1.., view)) = views.get(views.len() / 2) else { return Ok(None) };
-        let (camera, scale) = (dataset.views[view].camera, dataset.scene_scale);
-        let options = RunOptions { sh_degree_start: self.config.sh_degree, ..RunOptions::new(self.config, scale) };
+    /// Times steps with a black photo. The shortest counts: what else the machine does only makes them longer.
+    fn step_time(&mut self, host_mem: Option<u64>) -> Result<Option<StepTime>, TrainError> {
+        let options = RunOptions::new(self.config, self.start.dataset.scene_scale);
+        let options = RunOptions { sh_degree_start: options.sh_degree_at(options.steps.saturating_sub(1)), ..options };
+        let frame_bytes = PagerConfig::in_memory(options.page_rows, options.sh_degree).frame_bytes() as u64;
+        let pages_most = host_mem.map_or(u64::MAX, |bytes| bytes / TIMED_SHARE / frame_bytes);
+        let Some(view) = self.middling_view(pages_most) else { return Ok(None) };
         let mut scene = self.pages_of(view, &options, host_mem)?;
+        let camera = self.start.dataset.views[view].camera;
         let render = RenderOptions { sh_degree: scene.rules.sh_degree(), ..options.render };
-        let (mut working, mut renderer) = (WorkingSet::default(), CpuRenderer::new());
+        let (mut renderer, _) = machine::renderer(self.config)?;
+        let mut working = WorkingSet::default();
         let rgb = vec![0; 3 * camera.pixels()];
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-        let (mut shortest, began) = (f64::INFINITY, Instant::now());
-        for step in 0..=TIMED_STEPS {
-            let (what, how) = ((step, &camera, &target), (&render, &options.loss));
-            let started = Instant::now();
-            train_step(&mut scene, &mut working, &mut renderer, what, how, false)?;
-            // The first takes memory from the system.
-            if step > 0 {
-                shortest = shortest.min(started.elapsed().as_secs_f64());
-                if began.elapsed() > TIMED {
-                    break;
-                }
+        let mut step = |number| {
+            let (what, how) = ((number, &camera, &target), (&render, &options.loss));
+            let began = Instant::now();
+            train_step(&mut scene, &mut working, &mut *renderer, what, how, false)?;
+            Ok::<_, TrainError>(began.elapsed().as_secs_f64())
+        };
+        // The first takes memory from the system.
+        step(0)?;
+        let (mut seconds, began) = (f64::INFINITY, Instant::now());
+        for number in 1..=TIMED_STEPS {
+            seconds = seconds.min(step(number)?);
+            if began.elapsed() > TIMED {
+                break;
             }
         }
-        Ok(Some(shortest))
+        Ok(Some(StepTime { seconds, device: renderer.device() }))
+    }
+
+    /// Of the training views that see anything, the one in the middle by pages, or else the largest with no more than so many.
+    fn middling_view(&self, pages_most: u64) -> Option<usize> {
+        let dataset = &self.start.dataset;
+        let mut pages = Vec::new();
+        let mut views = Vec::new();
+        for view in dataset.train_views() {
+            visible_pages(&self.index, &dataset.views[view].camera, &mut pages);
+            if !pages.is_empty() {
+                views.push((pages.len() as u64, view));
+            }
+        }
+        views.sort_unstable();
+        let middle = views.len().div_ceil(2);
+        views[..middle].iter().rev().find(|(pages, _)| *pages <= pages_most).map(|&(_, view)| view)
     }
 }

@@ -9,10 +9,10 @@
 use super::run::cut_sh;
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
-use crate::dataset::import::{Division, Spool, SpoolSpace, SpoolWriter};
+use crate::dataset::import::{Grown, PageSpace, Spool, SpoolSpace, SpoolWriter, paginate};
 use crate::exchange::ply::{PlyMeta, ROW_HEAD, gaussians_header, push_row, stream_gaussians, take_row, to_local};
 use crate::scene::columns::{Columns, sh_n_width};
-use crate::scene::partition::{GiantCut, Pages, Placed};
+use crate::scene::partition::Placed;
 use crate::scene::state::SceneState;
 use std::path::{Path, PathBuf};
 
@@ -28,18 +28,18 @@ struct Row {
     row: u32,
 }
 
-impl Row {
-    fn size(&self) -> f32 {
-        self.head[7].max(self.head[8]).max(self.head[9])
-    }
-}
-
 impl Placed for Row {
     fn point(&self) -> [f32; 3] {
         [self.head[0], self.head[1], self.head[2]]
     }
     fn row(&self) -> u32 {
         self.row
+    }
+}
+
+impl Grown for Row {
+    fn log_size(&self) -> f32 {
+        self.head[7].max(self.head[8]).max(self.head[9])
     }
 }
 
@@ -195,22 +195,9 @@ impl GaussianSpool<'_> {
         take: &mut dyn FnMut(PageId, SceneState) -> InputResult<()>,
     ) -> InputResult<()> {
         let GaussianSpool { space, rows, sh_degree } = self;
-        let (small, large) = split_giants(rows, space.of_list())?;
-        let mut pages_before = 0;
-        for part in [small, large] {
-            let pages = Pages::of(part.len(), fill);
-            let records_in_memory = (space.memory / 2 / (2 * size_of::<Row>())).max(fill);
-            let division = Division { space: space.of_list(), pages, records_in_memory };
-            division.run(part, &mut |range, rows| {
-                let first = pages.start(range.start);
-                for page in range {
-                    let rows = &rows[pages.start(page) - first..pages.start(page + 1) - first];
-                    take(PageId::initial((pages_before + page) as u32), state_of(rows, sh_degree))?;
-                }
-                Ok(())
-            })?;
-            pages_before += pages.pages;
-        }
+        let records = (space.memory / 2 / (2 * size_of::<Row>())).max(fill);
+        let space = PageSpace { list: space.of_list(), records };
+        paginate(rows, fill, space, &mut |id, rows| take(id, state_of(rows, sh_degree)))?;
         Ok(())
     }
 }
@@ -226,20 +213,4 @@ fn state_of(rows: &[Row], sh_degree: u8) -> SceneState {
     let mut state = SceneState::from_columns(columns);
     state.uid.iter_mut().zip(rows).for_each(|(uid, row)| *uid = u64::from(row.row));
     state
-}
-
-/// The ordinary rows and the giants.
-fn split_giants(rows: Spool<Row>, space: SpoolSpace<'_>) -> InputResult<(Spool<Row>, Spool<Row>)> {
-    let mut search = GiantCut::search(rows.len());
-    while !search.is_done() {
-        rows.for_each(|row| {
-            search.count(GiantCut::key(row.size(), row.row));
-            Ok(())
-        })?;
-        search.next_pass();
-    }
-    let cut = GiantCut::found(&search);
-    let (mut small, mut large) = (SpoolWriter::new(space), SpoolWriter::new(space));
-    rows.for_each(|row| if cut.is_giant(row.size(), row.row) { large.push(*row) } else { small.push(*row) })?;
-    Ok((small.finish()?, large.finish()?))
 }

@@ -114,6 +114,8 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     }
     let warm_up = args.warm_up.unwrap_or(dataset.train_views().len() as u32).min(config.steps / 2);
     super::decode_all(dataset, &targets, &config)?;
+    // Without it nothing is predicted; what is measured stands.
+    let rate = DriveRate::look(Path::new(&config.spill_dir)).ok();
     take_turns(&mut contenders, (0..warm_up, args.turn), dataset, &targets, false)?;
     contenders.iter_mut().for_each(Contender::begin);
     take_turns(&mut contenders, (warm_up..config.steps, args.turn), dataset, &targets, true)?;
@@ -124,8 +126,8 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         "pages_of_largest_view": most, "threads": rayon::current_num_threads(), "host_bytes_peak": host_bytes_peak(),
         "version": env!("CARGO_PKG_VERSION"),
     });
-    let predicted = Prediction::new(&config, (dataset, warm_up), &contenders[0])?;
-    let lines: Vec<Value> = contenders.iter().map(|c| c.line(&contenders[0], &predicted, &facts)).collect();
+    let predicted = rate.map(|rate| Prediction::new(&config, (dataset, warm_up), &contenders[0], rate));
+    let lines: Vec<Value> = contenders.iter().map(|c| c.line(&contenders[0], predicted.as_ref(), &facts)).collect();
     lines.iter().for_each(print);
     Ok(())
 }
@@ -237,7 +239,7 @@ impl Contender {
     }
 
     /// What was measured, beside the run in memory and what holds for all.
-    fn line(&self, in_memory: &Contender, predicted: &Prediction, facts: &Value) -> Value {
+    fn line(&self, in_memory: &Contender, predicted: Option<&Prediction>, facts: &Value) -> Value {
         let steps = self.seconds.len().max(1) as f64;
         let sum = |of: &Contender| of.seconds.iter().sum::<f64>();
         let cpu = |of: &Contender| of.cpu_seconds[0] + of.cpu_seconds[1];
@@ -277,7 +279,7 @@ impl Contender {
                 "share_absent_least": self.demand.fewest_absent(now.frames_max) as f64 / needed,
                 "share_late_misses": (now.late_misses - before.late_misses) as f64 / needed,
                 "stall_seconds": now.stall_seconds - before.stall_seconds,
-                "stall_seconds_predicted": predicted.stall_seconds(now.frames_max),
+                "stall_seconds_predicted": predicted.and_then(|p| p.stall_seconds(now.frames_max)),
             });
             extend(&mut line, &tier);
         }
@@ -286,7 +288,7 @@ impl Contender {
     }
 }
 
-/// What planning says beforehand of the same steps.
+/// What the model of planning says of the same steps.
 struct Prediction {
     views: ViewPages,
     page_bytes: Vec<u32>,
@@ -296,22 +298,22 @@ struct Prediction {
 }
 
 impl Prediction {
-    /// For the drive as it is now, and steps as long as those in memory were.
+    /// For a drive of this rate, and steps as long as those in memory were.
     fn new(
         config: &TrainConfig,
         (dataset, warm_up): (&Dataset, u32),
         in_memory: &Contender,
-    ) -> Result<Prediction, TrainError> {
-        let rate = DriveRate::look(Path::new(&config.spill_dir))?;
+        rate: DriveRate,
+    ) -> Prediction {
         let trainer = &in_memory.trainer;
         let step_seconds = in_memory.seconds.iter().sum::<f64>() / in_memory.seconds.len().max(1) as f64;
-        Ok(Prediction {
+        Prediction {
             views: views(dataset, trainer),
             page_bytes: page_bytes(trainer.scene.pager.index()).into_iter().map(|bytes| bytes as u32).collect(),
             order: trainer.view_order().clone(),
             steps: warm_up..config.steps,
             drive: DriveModel { read_rate: rate.read, write_rate: rate.write, step_seconds },
-        })
+        }
     }
 
     /// Seconds that the measured steps wait for the drive, with so many frames.

@@ -10,7 +10,7 @@ use bytemuck::Pod;
 use std::ops::Range;
 
 /// Division of one list.
-pub struct Division<'a> {
+pub(super) struct Division<'a> {
     /// Where halves go that outgrow memory.
     pub space: SpoolSpace<'a>,
     /// Pages to divide into.
@@ -20,7 +20,7 @@ pub struct Division<'a> {
 }
 
 /// Takes the records of some consecutive pages, sorted as [`Pages::divide`] sorts them.
-pub type TakePages<'a, E> = dyn FnMut(Range<usize>, Vec<E>) -> InputResult<()> + 'a;
+pub(super) type TakePages<'a, E> = dyn FnMut(Range<usize>, Vec<E>) -> InputResult<()> + 'a;
 
 impl Division<'_> {
     /// Divides `records` and hands the pages out in order, as many at a time as fit in memory.

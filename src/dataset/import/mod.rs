@@ -12,17 +12,18 @@
 mod cloud;
 mod distances;
 mod divide;
+mod paginate;
 mod spool;
 
 pub use cloud::{Cloud, LocalCloud};
-pub use divide::{Division, TakePages};
+pub use paginate::{Grown, PageSpace, TakePage, paginate};
 pub use spool::{Spool, SpoolSpace, SpoolWriter};
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::scene::columns::Columns;
 use crate::scene::init::{FirstPoint, InitOptions, ScaleRule, first_gaussians, middle_rank, subsample_key};
-use crate::scene::partition::{GiantCut, Pages, Placed, giants};
+use crate::scene::partition::Placed;
 use crate::scene::select::RankSearch;
 use crate::scene::state::SceneState;
 use std::path::Path;
@@ -145,6 +146,12 @@ impl Placed for SizedPoint {
     }
 }
 
+impl Grown for SizedPoint {
+    fn log_size(&self) -> f32 {
+        self.log_scale
+    }
+}
+
 /// Makes the first Gaussians of all points and hands them out page by page, in the order of the pages' names.
 ///
 /// # Errors
@@ -159,32 +166,18 @@ pub fn import_points(
     let rows = points.len();
     let measured = distances::measure(points, budget)?;
     let sized = size_points(measured, options)?;
-    let (small, large) = split_giants(sized, budget)?;
-    let mut pages_before = 0;
-    for part in [small, large] {
-        let pages = Pages::of(part.len(), options.fill);
-        let records_in_memory = budget.records(2 * size_of::<SizedPoint>());
-        let division = Division { space: budget.space(), pages, records_in_memory };
-        division.run(part, &mut |range, entries| {
-            let first = pages.start(range.start);
-            for page in range {
-                let entries = &entries[pages.start(page) - first..pages.start(page + 1) - first];
-                take(first_page((pages_before + page) as u32, entries, options.init))?;
-            }
-            Ok(())
-        })?;
-        pages_before += pages.pages;
-    }
-    Ok(ImportSummary { rows: rows as u64, pages: pages_before as u64, points: read })
+    let space = PageSpace { list: budget.space(), records: budget.records(2 * size_of::<SizedPoint>()) };
+    let pages = paginate(sized, options.fill, space, &mut |id, entries| take(first_page(id, entries, options.init)))?;
+    Ok(ImportSummary { rows: rows as u64, pages: pages as u64, points: read })
 }
 
-fn first_page(number: u32, entries: &[SizedPoint], init: &InitOptions) -> FirstPage {
+fn first_page(id: PageId, entries: &[SizedPoint], init: &InitOptions) -> FirstPage {
     let point = |i: usize| {
         let SizedPoint { point, row, color: [r, g, b, _], log_scale } = entries[i];
         FirstPoint { point, row, color: [r, g, b], log_scale }
     };
     FirstPage {
-        id: PageId::initial(number),
+        id,
         rows: entries.iter().map(|e| e.row).collect(),
         columns: first_gaussians(entries.len(), point, init),
     }
@@ -277,23 +270,6 @@ fn size_points(measured: distances::Measured, options: &ImportOptions<'_>) -> In
         }
     }
     sized.finish()
-}
-
-/// The ordinary rows and the giants.
-fn split_giants(sized: Spool<SizedPoint>, budget: &Budget<'_>) -> InputResult<(Spool<SizedPoint>, Spool<SizedPoint>)> {
-    let mut search = GiantCut::search(sized.len());
-    while !search.is_done() {
-        sized.for_each(|p| {
-            search.count(GiantCut::key(p.log_scale, p.row));
-            Ok(())
-        })?;
-        search.next_pass();
-    }
-    let cut = GiantCut::found(&search);
-    let (mut small, mut large) = (SpoolWriter::new(budget.space()), SpoolWriter::new(budget.space()));
-    sized.for_each(|p| if cut.is_giant(p.log_scale, p.row) { large.push(*p) } else { small.push(*p) })?;
-    debug_assert_eq!(large.len(), giants(sized.len()));
-    Ok((small.finish()?, large.finish()?))
 }
 
 #[cfg(test)]
