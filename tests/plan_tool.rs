@@ -45,6 +45,13 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
     assert_eq!(plans[4]["view_order"], "shuffle");
     let table = with(&["--compare-frames", "70%", "--compare-orders", orders]);
     assert_eq!(table.lines().count(), 4 + 4, "{table}");
+    // Shares that nobody named hold the largest view.
+    let open: Value = serde_json::from_str(&with(&["--view-order", "shuffle", "--json"])).unwrap();
+    let frames = |value: &Value| -> Vec<u64> {
+        value["plans"].as_array().unwrap().iter().map(|plan| plan["frames"].as_u64().unwrap()).collect()
+    };
+    let (most, pages) = (open["pages_of_largest_view"].as_u64().unwrap(), open["pages"].as_u64().unwrap());
+    assert!(most > pages / 2 && frames(&open) == [most, pages], "{open}");
     // The exact lists of two steps: what leaves makes room for what enters.
     let lists = with(&["--compare-frames", "70%", "--view-order", "shuffle", "--lists", "700..740"]);
     let lines: Vec<&str> = lists.lines().collect();

@@ -43,6 +43,8 @@ const COMMON_DRIVE: [f64; 2] = [3e9, 2e9];
 /// Epochs that are gone through; later ones are counted like the mean of those after the first.
 const EPOCHS: u32 = 4;
 
+/// Frames that are compared when none are named, percent of the pages.
+const SHARES: [usize; 4] = [10, 25, 50, 100];
 /// Step of a scene in which nothing can be timed, seconds.
 const STEP_ASSUMED: f64 = 0.3;
 /// Twice the Gaussians make a step take 1.45 times as long (`gsscale-bench pareto`): a step grows with this power of them.
@@ -59,7 +61,7 @@ struct Args {
     #[arg(long)]
     config: Option<PathBuf>,
     /// Numbers of frames, or their shares of all pages, to compare; without it --frames or --host-mem, or else
-    /// 10%,25%,50%
+    /// 10%,25%,50%,100%, but as many as the largest view needs
     #[arg(long, value_delimiter = ',', value_name = "N|N%", help_heading = "Plan")]
     compare_frames: Vec<String>,
     /// Orders of views to compare: auto, shuffle, groups:N, tour; without it --view-order, or else auto and shuffle
@@ -276,10 +278,13 @@ fn frames(args: &Args, scene: &Scene) -> InputResult<Vec<usize>> {
         return Ok(vec![config.frames as usize]);
     }
     frames.extend(scene.frames_within.map(|frames| frames as usize));
-    let shares = ["10%", "25%", "50%"].map(String::from);
-    let is_open = args.compare_frames.is_empty() && frames.is_empty();
-    let texts = if is_open { &shares[..] } else { &args.compare_frames[..] };
-    for text in texts {
+    if args.compare_frames.is_empty() && frames.is_empty() {
+        // Nobody named these: they are as many as it takes.
+        let share = |percent: usize| (percent * pages).div_ceil(100).max(scene.views.most());
+        frames.extend(SHARES.map(share));
+        frames.dedup();
+    }
+    for text in &args.compare_frames {
         let count = match text.strip_suffix('%') {
             Some(share) => share
                 .parse()
