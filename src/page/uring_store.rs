@@ -4,7 +4,8 @@
 //! No more requests are handed over than the ring has entries, so neither of its queues overflows. Direct I/O where
 //! the file system allows it. Neither SQPOLL (it costs a core) nor IOPOLL (it never completes on virtual drives).
 //! Neither registered files nor registered buffers: on the drive that was measured they were faster in some cases and
-//! slower in as many, and frames, which move between owners, would have to be registered again and again.
+//! slower in as many, and registered memory stays taken until it is given up in the ring as well, while frames give theirs
+//! back as a scene grows. So nothing here counts against the limit on locked memory.
 //!
 //! Safety: the kernel reads and writes page buffers while this process goes on. The bytes of a [`PageBuffer`] stay
 //! where they are when the buffer is moved; a transfer is moved into its flight when it is submitted, nothing
