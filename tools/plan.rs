@@ -35,8 +35,8 @@ Examples:
 Pages are those of the first Gaussians; --growth 5 plans as if each page had grown to five.
 Shares of a step's pages that are read, 'of a plan' and 'lru', are those of the optimal cache and of one that drops what
 was used longest ago. Waiting assumes that the drive does one thing at a time, and that every step takes --step-seconds.
-Time is that of all steps for the Gaussians of the start (a scene that grows takes longer), without import, evaluation, commits,
-and photos that have to be decoded again (--image-cache).";
+Time is that of all steps for the Gaussians of the start (a scene that grows takes longer), without import, evaluation, commits
+and the decoding of photos: a run takes up to a third more than the steps that were timed.";
 
 /// Bytes per second that a common NVMe drive reads and writes.
 const COMMON_DRIVE: [f64; 2] = [3e9, 2e9];
