@@ -2,6 +2,7 @@
 //! to training size, offset and scale are taken out, and each view gets its set.
 //!
 //! Not responsible for reading models (the readers are) or pixels ([`super::photo`], [`super::target_cache`]).
+//! Longer than other files: the checks share what they leave out and warn of.
 //!
 //! Invariants: 1. every view of a dataset has a photo whose header and end marker were seen and whose shape can
 //! belong to its camera; 2. frame, scene scale and split depend on the views that the model registers, so a photo

@@ -88,7 +88,7 @@ pub fn first_look(
     })?;
     let mut world = World { config, start, index, folder };
     let frames = look_for.frames_within.map(|bytes| world.frames_within(&options, bytes)).transpose()?;
-    let step = if look_for.step { world.step_time(host_mem)? } else { None };
+    let step = if look_for.step { world.step_time(options, host_mem)? } else { None };
     let World { start, index, .. } = world;
     let bytes = |page: &PageMeta| PageLayout { rows: page.rows as usize, sh_degree: config.sh_degree }.bytes() as u32;
     Ok(FirstLook {
@@ -141,8 +141,7 @@ impl World<'_> {
 
     /// Times steps with a black photo: their median. Those of a run are up to a third longer, since their rows were not in a
     /// cache a step before.
-    fn step_time(&mut self, host_mem: Option<u64>) -> Result<Option<StepTime>, TrainError> {
-        let options = RunOptions::new(self.config, self.start.dataset.scene_scale);
+    fn step_time(&mut self, options: RunOptions, host_mem: Option<u64>) -> Result<Option<StepTime>, TrainError> {
         let options = RunOptions { sh_degree_start: options.sh_degree_at(options.steps.saturating_sub(1)), ..options };
         let frame_bytes = PagerConfig::in_memory(options.page_rows, options.sh_degree).frame_bytes() as u64;
         let pages_most = host_mem.map_or(u64::MAX, |bytes| bytes / TIMED_SHARE / frame_bytes);

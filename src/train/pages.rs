@@ -420,8 +420,6 @@ pub fn numbered(pages: &[PinnedPage]) -> Vec<Rows<'_>> {
     tables
 }
 
-/// The listed rows of `columns` as fresh rows with their numbers as identities, stored with `sh_degree`: bands above it
-/// are left out.
 /// Hands out the first pages of Gaussians that are in memory, at most `fill` rows each, with the bands up to `sh_degree`.
 /// Each row keeps its number in `columns` as its identity.
 ///
@@ -439,6 +437,8 @@ pub(super) fn first_pages<E>(
         .try_for_each(|(page, rows)| take(PageId::initial(page), first_rows(columns, rows, sh_degree)))
 }
 
+/// The listed rows of `columns` as fresh rows with their numbers as identities, stored with `sh_degree`: bands above it
+/// are left out.
 fn first_rows(columns: &Columns, rows: &[u32], sh_degree: u8) -> SceneState {
     let mut out = Columns::zeros(rows.len(), sh_degree);
     for column in Column::ALL {

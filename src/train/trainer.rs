@@ -1,4 +1,6 @@
 //! The loop over steps: views in order, events where they are due, metrics, evaluation and saves.
+//! Longer than other files: all of it is the loop's own state and the order in which things happen to it; what is done at each
+//! point lies elsewhere.
 //!
 //! Invariants: 1. the state after step s is a function of dataset, config and s alone, not of threads, budgets or
 //! cadences of logging and evaluation; 2. a step whose loss is not finite changes nothing, and three in a row end
