@@ -65,7 +65,10 @@ fn move_one(store: &mut dyn PageStore, transfer: Transfer) -> Completion {
 }
 
 fn random_buffer(draws: &mut Stream, bytes: usize) -> PageBuffer {
-    let mut buffer = PageBuffer::zeroed(bytes);
+    filled(draws, PageBuffer::zeroed(bytes))
+}
+
+fn filled(draws: &mut Stream, mut buffer: PageBuffer) -> PageBuffer {
     for word in buffer.as_mut_slice().chunks_exact_mut(8) {
         word.copy_from_slice(&draws.next_u64().to_le_bytes());
     }
@@ -119,7 +122,9 @@ fn what_is_written_comes_back_with_many_in_flight() {
             let blocks = if token % 7 == 0 { 257 + draws.below(512) } else { 1 + draws.below(120) };
             let bytes = blocks as usize * ALIGNMENT;
             let Some(place) = model.free_place(&mut draws, bytes) else { continue };
-            let mut buffer = random_buffer(&mut draws, bytes + ALIGNMENT * (token % 3) as usize);
+            // Every second one is in memory of its own, as frames are: the ring registers those.
+            let make = if token % 2 == 0 { PageBuffer::zeroed } else { PageBuffer::mapped };
+            let mut buffer = filled(&mut draws, make(bytes + ALIGNMENT * (token % 3) as usize));
             let direction = if draws.below(2) == 0 { Direction::Read } else { Direction::Write };
             if direction == Direction::Write {
                 let there = &mut model.segments[place.segment as usize][place.offset as usize..][..bytes];
@@ -373,6 +378,100 @@ fn auto_takes_what_works_and_says_what_does_not() {
         let opened = open_engine(engine, folder.path(), 8).unwrap();
         assert_eq!(opened.store.name(), engine.name());
     }
+}
+
+/// Bytes of this process that the kernel holds in place.
+#[cfg(target_os = "linux")]
+fn pinned_bytes() -> usize {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let kib = status.lines().find_map(|line| line.strip_prefix("VmPin:")).and_then(|v| v.trim().strip_suffix(" kB"));
+    kib.unwrap().trim().parse::<usize>().unwrap() << 10
+}
+
+/// Writes other bytes from each buffer and reads them back into it.
+#[cfg(target_os = "linux")]
+fn write_and_read(store: &mut dyn PageStore, draws: &mut Stream, buffers: Vec<PageBuffer>) -> Vec<PageBuffer> {
+    let turn = |(i, buffer): (usize, PageBuffer)| {
+        let buffer = filled(draws, buffer);
+        let bytes = buffer.as_slice().to_vec();
+        let at = (i * bytes.len()) as u64;
+        let end = move_one(store, transfer(1, Direction::Write, 0, at, buffer));
+        end.result.unwrap();
+        let mut buffer = end.transfer.buffer;
+        buffer.as_mut_slice().fill(0);
+        let end = move_one(store, transfer(2, Direction::Read, 0, at, buffer));
+        end.result.unwrap();
+        assert!(end.transfer.buffer.as_slice() == bytes, "other bytes in buffer {i}");
+        end.transfer.buffer
+    };
+    buffers.into_iter().enumerate().map(turn).collect()
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn the_ring_holds_buffers_that_stay_and_lets_go_of_them() {
+    use gsscale::page::uring_store::UringStore;
+    const BYTES: usize = 256 << 10;
+    if in_child("the_ring_holds_buffers_that_stay_and_lets_go_of_them") {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let open = || UringStore::open(folder.path(), 8, true);
+    let Ok(mut store) = open() else { return eprintln!("skipped: io_uring is refused here") };
+    store.create_segment(0, SEGMENT).unwrap();
+    let mut draws = Stream::new(5, Purpose::Test, 0, 0);
+    // Not registered: memory of the heap's, and buffers of which little moves.
+    write_and_read(&mut store, &mut draws, (0..4).map(|_| PageBuffer::zeroed(BYTES)).collect());
+    let short = Transfer { bytes: BYTES / 4, ..transfer(3, Direction::Read, 0, 0, PageBuffer::mapped(BYTES)) };
+    move_one(&mut store, short).result.unwrap();
+    assert_eq!(store.registered(), 0);
+    let before = pinned_bytes();
+
+    let mut buffers: Vec<PageBuffer> = (0..8).map(|_| PageBuffer::mapped(BYTES)).collect();
+    for _ in 0..3 {
+        buffers = write_and_read(&mut store, &mut draws, buffers);
+        assert_eq!((store.registered(), pinned_bytes() - before), (8, 8 * BYTES), "once each");
+    }
+    // Frames that go give their memory back, and others take their places in the table.
+    buffers.truncate(3);
+    store.complete(false, &mut Vec::new());
+    assert_eq!((store.registered(), pinned_bytes() - before), (3, 3 * BYTES));
+    buffers.extend((0..4).map(|_| PageBuffer::mapped(BYTES)));
+    buffers = write_and_read(&mut store, &mut draws, buffers);
+    assert_eq!((store.registered(), pinned_bytes() - before), (7, 7 * BYTES));
+    // A buffer outlives its ring and is another one's then.
+    drop(store);
+    let mut store = open().unwrap();
+    buffers = write_and_read(&mut store, &mut draws, buffers);
+    assert_eq!(store.registered(), 7);
+    drop(buffers);
+    store.complete(false, &mut Vec::new());
+    assert_eq!(store.registered(), 0);
+}
+
+/// Who may lock any amount of memory gives that right up first; both hold for this child only.
+#[cfg(target_os = "linux")]
+#[test]
+fn beyond_the_limit_on_locked_memory_buffers_move_unregistered() {
+    use gsscale::page::uring_store::UringStore;
+    use rustix::thread::{CapabilitySet, capabilities, set_capabilities};
+    const BYTES: usize = 256 << 10;
+    if in_child("beyond_the_limit_on_locked_memory_buffers_move_unregistered") {
+        return;
+    }
+    setrlimit(Resource::Memlock, Rlimit { current: Some(1 << 20), maximum: Some(1 << 20) }).unwrap();
+    let mut own = capabilities(None).unwrap();
+    own.effective.remove(CapabilitySet::IPC_LOCK);
+    set_capabilities(None, own).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let Ok(mut store) = UringStore::open(folder.path(), 8, true) else { return eprintln!("skipped: no io_uring here") };
+    store.create_segment(0, SEGMENT).unwrap();
+    let mut draws = Stream::new(6, Purpose::Test, 0, 0);
+    let buffers = (0..16).map(|_| PageBuffer::mapped(BYTES)).collect();
+    let buffers = write_and_read(&mut store, &mut draws, buffers);
+    // Others of the same user may have locked some of it.
+    assert!(store.registered() <= (1 << 20) / BYTES, "{}", store.registered());
+    write_and_read(&mut store, &mut draws, buffers);
 }
 
 /// Containers forbid io_uring with a seccomp filter; so does this thread to itself, and only to itself.

@@ -3,8 +3,10 @@
 //! Invariants: 1. the first byte lies on a multiple of [`ALIGNMENT`], and stays there when the buffer is moved: the bytes
 //! live elsewhere; 2. the length is a multiple of [`ALIGNMENT`]; 3. a fresh buffer is zero; 4. a mapped one takes memory from
 //! the machine only as it is written to (in pieces of 2 MiB, where the system makes huge pages unasked), and gives all of it
-//! back at its end, whatever the heap looks like by then.
+//! back at its end, whatever the heap looks like by then; one that a ring has registered, when the ring is used next.
 
+#[cfg(target_os = "linux")]
+use super::registered::Registration;
 use memmap2::MmapMut;
 
 /// Alignment of memory, offsets and lengths that every drive accepts for direct I/O, bytes.
@@ -18,6 +20,9 @@ pub struct PageBuffer {
     memory: Memory,
     start: usize,
     len: usize,
+    /// Its place in the table of the ring that moves it.
+    #[cfg(target_os = "linux")]
+    pub(super) registration: Option<Registration>,
 }
 
 enum Memory {
@@ -33,7 +38,7 @@ impl PageBuffer {
         let len = bytes.next_multiple_of(ALIGNMENT);
         let bytes = vec![0; len + ALIGNMENT];
         let start = bytes.as_ptr().align_offset(ALIGNMENT);
-        PageBuffer { memory: Memory::Heap(bytes), start, len }
+        PageBuffer::of(Memory::Heap(bytes), start, len)
     }
 
     /// As [`PageBuffer::zeroed`], for buffers that stay: in memory of its own, if it is large enough and the machine has
@@ -42,9 +47,24 @@ impl PageBuffer {
         let len = bytes.next_multiple_of(ALIGNMENT);
         let map = (len >= MAPPED_LEAST).then(|| MmapMut::map_anon(len).ok()).flatten();
         match map.filter(|map| map.as_ptr().align_offset(ALIGNMENT) == 0) {
-            Some(map) => PageBuffer { memory: Memory::Mapped(map), start: 0, len },
+            Some(map) => PageBuffer::of(Memory::Mapped(map), 0, len),
             None => PageBuffer::zeroed(bytes),
         }
+    }
+
+    fn of(memory: Memory, start: usize, len: usize) -> PageBuffer {
+        PageBuffer {
+            memory,
+            start,
+            len,
+            #[cfg(target_os = "linux")]
+            registration: None,
+        }
+    }
+
+    /// Whether it is in memory of its own.
+    pub fn is_mapped(&self) -> bool {
+        matches!(self.memory, Memory::Mapped(_))
     }
 
     /// Bytes of the buffer.
@@ -102,7 +122,7 @@ mod tests {
 
     #[test]
     fn small_buffers_and_empty_ones_are_not_mapped() {
-        let is_mapped = |bytes| matches!(PageBuffer::mapped(bytes).memory, Memory::Mapped(_));
+        let is_mapped = |bytes| PageBuffer::mapped(bytes).is_mapped();
         assert_eq!([0, 4096, 32 << 10, 749_568].map(is_mapped), [false, false, true, true]);
     }
 }

@@ -30,6 +30,8 @@ pub mod page_error;
 pub mod paged_store;
 pub mod pread_store;
 pub mod reading;
+#[cfg(target_os = "linux")]
+mod registered;
 mod resume;
 pub mod scan;
 pub mod seal;

@@ -117,7 +117,7 @@ impl PagedStore {
 
     /// A buffer for one page of this store: header room and the longest payload, zeroed.
     pub fn new_buffer(&self) -> PageBuffer {
-        PageBuffer::zeroed(self.config.layout.slot_bytes as usize)
+        PageBuffer::mapped(self.config.layout.slot_bytes as usize)
     }
 
     /// The engine's name, for people.

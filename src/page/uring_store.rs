@@ -3,9 +3,8 @@
 //! Transfers are cut into requests of at most [`REQUEST_BYTES`], since larger ones may end in the middle with EAGAIN.
 //! No more requests are handed over than the ring has entries, so neither of its queues overflows. Direct I/O where
 //! the file system allows it. Neither SQPOLL (it costs a core) nor IOPOLL (it never completes on virtual drives).
-//! Neither registered files nor registered buffers: on the drive that was measured they were faster in some cases and
-//! slower in as many, and registered memory stays taken until it is given up in the ring as well, while frames give theirs
-//! back as a scene grows. So nothing here counts against the limit on locked memory.
+//! Buffers that stay are registered as far as the limit on locked memory allows; files are not, since a
+//! run opens few and holds them for as many requests as there are.
 //!
 //! Safety: the kernel reads and writes page buffers while this process goes on. The bytes of a [`PageBuffer`] stay
 //! where they are when the buffer is moved; a transfer is moved into its flight when it is submitted, nothing
@@ -19,6 +18,7 @@
 
 use super::buffer::PageBuffer;
 use super::page_cache::{WriteBehind, forget};
+use super::registered::RegisteredBuffers;
 use super::resume::Resume;
 use super::segment_io::{SegmentIo, too_many_files};
 use super::slab::Slab;
@@ -42,6 +42,7 @@ const SHORTAGES: [i32; 3] = [11, 16, 12];
 /// Segments as files, moved by the kernel's ring.
 pub struct UringStore {
     ring: IoUring,
+    registered: RegisteredBuffers,
     segments: SegmentIo,
     behind: WriteBehind,
     flights: Slab<Flight>,
@@ -62,6 +63,8 @@ struct Flight {
     transfer: Transfer,
     /// Address of the buffer's first byte, as a number: only the kernel goes through it.
     address: usize,
+    /// The buffer's number in the ring's table.
+    registered: Option<u16>,
     file: Option<Arc<File>>,
     requests_left: usize,
     error: Option<io::Error>,
@@ -85,6 +88,7 @@ impl UringStore {
         let entries = entries.clamp(1, 4096).next_power_of_two();
         let ring = working_ring(entries as u32)?;
         Ok(UringStore {
+            registered: RegisteredBuffers::of(&ring.submitter()),
             ring,
             segments: SegmentIo::new(folder, direct)?,
             behind: WriteBehind::default(),
@@ -102,6 +106,11 @@ impl UringStore {
     /// Whether bytes go past the page cache.
     pub fn is_direct(&self) -> bool {
         self.segments.is_direct()
+    }
+
+    /// Buffers in the ring's table.
+    pub fn registered(&self) -> usize {
+        self.registered.len()
     }
 
     /// Puts waiting requests into the ring while it has room.
@@ -152,9 +161,11 @@ impl UringStore {
         let offset = flight.transfer.place.offset + from as u64;
         let file = types::Fd(flight.file.as_ref().map_or(-1, |f| f.as_raw_fd()));
         let memory = std::ptr::with_exposed_provenance_mut::<u8>(flight.address + from);
-        let entry = match flight.transfer.direction {
-            Direction::Read => opcode::Read::new(file, memory, bytes).offset(offset).build(),
-            Direction::Write => opcode::Write::new(file, memory, bytes).offset(offset).build(),
+        let entry = match (flight.transfer.direction, flight.registered) {
+            (Direction::Read, None) => opcode::Read::new(file, memory, bytes).offset(offset).build(),
+            (Direction::Write, None) => opcode::Write::new(file, memory, bytes).offset(offset).build(),
+            (Direction::Read, Some(n)) => opcode::ReadFixed::new(file, memory, bytes, n).offset(offset).build(),
+            (Direction::Write, Some(n)) => opcode::WriteFixed::new(file, memory, bytes, n).offset(offset).build(),
         };
         // Once refused for the moment, a request may block on a thread of the kernel's instead.
         let flags = if request.resume.tries > 0 { squeue::Flags::ASYNC } else { squeue::Flags::empty() };
@@ -264,8 +275,10 @@ impl PageStore for UringStore {
             return;
         }
         let (address, total) = (address_of(&mut transfer.buffer), transfer.bytes);
+        let registered = self.registered.number_of(&self.ring.submitter(), &mut transfer.buffer, total);
         let requests_left = total.div_ceil(REQUEST_BYTES);
-        let flight = self.flights.insert(Flight { transfer, address, file: None, requests_left, error: None });
+        let flight = Flight { transfer, address, registered, file: None, requests_left, error: None };
+        let flight = self.flights.insert(flight);
         for start in (0..total).step_by(REQUEST_BYTES) {
             let bytes = REQUEST_BYTES.min(total - start);
             let id = self.requests.insert(Request { flight, start, bytes, resume: Resume::default() });
@@ -278,6 +291,7 @@ impl PageStore for UringStore {
     }
 
     fn complete(&mut self, wait: bool, done: &mut Vec<Completion>) {
+        self.registered.clear_ended(&self.ring.submitter());
         self.take_answers();
         self.fill_ring();
         while wait && self.done.is_empty() && self.with_kernel > 0 {
