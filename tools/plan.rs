@@ -340,7 +340,8 @@ fn row(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Row
     };
     let (planned, lru) = (run(Policy::Farthest)?, run(Policy::LeastRecent)?);
     let figures = planned.figures(planned.steady());
-    let stall = planned.stall(planned.steady(), &scene.drive);
+    let timed = run(Policy::Ahead)?;
+    let stall = timed.stall(timed.steady(), &scene.drive);
     let (_, written) = planned.totals();
     let rest = f64::from(scene.config.steps - steps);
     Ok(Row {
@@ -349,7 +350,7 @@ fn row(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Row
         frames,
         lru: lru.figures(lru.steady()),
         seconds: f64::from(scene.config.steps) * scene.drive.step_seconds
-            + planned.stall(0..planned.steps.len(), &scene.drive).seconds
+            + timed.stall(0..timed.steps.len(), &scene.drive).seconds
             + rest * stall.seconds / f64::from(figures.steps.max(1)),
         stall,
         // The import leaves pages in the frames.

@@ -19,6 +19,7 @@ use crate::base::ids::PageNo;
 use crate::cache::evict::EvictPolicy;
 use crate::cache::frame::FrameState;
 use crate::cache::host_cache::Victim;
+use crate::schedule::model::FAR_STEPS;
 use crate::schedule::replay::STEPS_AHEAD;
 use std::collections::{BinaryHeap, VecDeque};
 use std::str::FromStr;
@@ -27,12 +28,6 @@ use std::str::FromStr;
 /// played through, and one far enough for pages to be kept for it. Pages were planned up to two epochs before, and their
 /// rows move. Without the latter two a cache for half of a small survey read 8 % more, for half of a large one 2 %.
 const PLANNED_ANEW: [u32; 3] = [1, STEPS_AHEAD, 4 * STEPS_AHEAD];
-/// A page that is not needed for so many steps may leave for a page that the next step would wait for: at most one read
-/// more in so many steps. With frames for a tenth of a large survey, of which a view needs 5 % of the pages, 4, 16 and 40
-/// steps read 4.3, 1.7 and 1.4 % more than need be (measured while only the next step was planned anew: .3 % since), and 2.5,
-/// 3.1 and 3.1 % of the pages had to be waited for; with less reading 40 was the fastest, in small surveys as well.
-const FAR_STEPS: u32 = 40;
-
 /// When pages move. None of these changes what a step gets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Transfers {

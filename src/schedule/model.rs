@@ -4,7 +4,7 @@
 //! leaves before its frame is needed; 3. under [`Policy::Farthest`] the page whose next use is farthest leaves first,
 //! and with the whole future known no cache of this size reads fewer pages (Belady 1966, "A study of replacement
 //! algorithms for virtual-storage computers"; for sets of pages the same exchange argument holds, and a test compares
-//! with all possible choices); 4. ties leave in the order of their last use, then by page number, so a run of the
+//! with all possible choices); [`Policy::Ahead`] reads a little more, so that its frames are free earlier; 4. ties leave in the order of their last use, then by page number, so a run of the
 //! model is a function of what it is told.
 
 use crate::base::ids::PageNo;
@@ -14,23 +14,33 @@ use std::collections::BinaryHeap;
 /// A page that the plan does not know a use of.
 const UNKNOWN: u32 = u32::MAX;
 
+/// A page that is not needed for so many steps may leave for a page that the next step would wait for: at most one read
+/// more in so many steps. With frames for a tenth of a large survey, of which a view needs 5 % of the pages, 4, 16 and 40
+/// steps read 4.3, 1.7 and 1.4 % more than need be (measured while only the next step was planned anew: .3 % since), and 2.5,
+/// 3.1 and 3.1 % of the pages had to be waited for; with less reading 40 was the fastest, in small surveys as well.
+pub const FAR_STEPS: u32 = 40;
+
 /// Which page leaves first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Policy {
     /// The one with the farthest next use.
     Farthest,
+    /// As [`Policy::Farthest`], but a page of the step before only where no other is unneeded for [`FAR_STEPS`]: the frame
+    /// of another is free while that step computes. So does a run that reads ahead.
+    Ahead,
     /// The one with the oldest last use.
     LeastRecent,
 }
 
 impl Policy {
-    /// Both.
-    pub const ALL: [Policy; 2] = [Policy::Farthest, Policy::LeastRecent];
+    /// The best and the most common.
+    pub const COMPARED: [Policy; 2] = [Policy::Farthest, Policy::LeastRecent];
 
     /// Name on command lines and in reports.
     pub fn name(self) -> &'static str {
         match self {
             Policy::Farthest => "belady",
+            Policy::Ahead => "ahead",
             Policy::LeastRecent => "lru",
         }
     }
@@ -43,6 +53,8 @@ pub struct StepChange {
     pub admit: Vec<PageNo>,
     /// Their frames are taken.
     pub evict: Vec<PageNo>,
+    /// The step that last needed each of these.
+    pub last_uses: Vec<u32>,
 }
 
 /// A step needs more pages at once than there are frames.
@@ -112,13 +124,15 @@ impl CacheModel {
         }
         change.admit.clear();
         change.evict.clear();
+        change.last_uses.clear();
         if let Some(last) = pages.iter().max()
             && self.pages.len() <= last.index()
         {
             self.pages.resize(last.index() + 1, PageState::default());
         }
-        let next_use = |page| match self.policy {
-            Policy::Farthest => next_use(page).unwrap_or(UNKNOWN),
+        let policy = self.policy;
+        let next_use = |page| match policy {
+            Policy::Farthest | Policy::Ahead => next_use(page).unwrap_or(UNKNOWN),
             Policy::LeastRecent => UNKNOWN,
         };
         for &page in pages {
@@ -129,21 +143,26 @@ impl CacheModel {
                 change.admit.push(page);
             }
         }
+        // Pages of the step before, while others leave in their place.
+        let mut spared = Vec::new();
+        let mut spares = policy == Policy::Ahead;
         while self.resident + change.admit.len() > self.frames {
-            let Some((bound, Reverse(last_use), Reverse(page))) = self.heap.pop() else { break };
-            let state = &mut self.pages[page.index()];
-            if !state.is_resident || state.last_use != last_use {
+            let top = self.pop_exact(next_use);
+            if spares {
+                match top {
+                    Some(key) if key.1.0 + 1 == step => spared.push(key),
+                    Some(key) if key.0 > step.saturating_add(FAR_STEPS) => self.evict(key, change),
+                    other => {
+                        spares = false;
+                        self.heap.extend(spared.drain(..).chain(other));
+                    }
+                }
                 continue;
             }
-            let exact = next_use(page);
-            if exact < bound {
-                self.heap.push((exact, Reverse(last_use), Reverse(page)));
-                continue;
-            }
-            state.is_resident = false;
-            self.resident -= 1;
-            change.evict.push(page);
+            let Some(key) = top else { break };
+            self.evict(key, change);
         }
+        self.heap.extend(spared);
         for &page in &change.admit {
             self.pages[page.index()].is_resident = true;
         }
@@ -151,6 +170,29 @@ impl CacheModel {
         self.heap.extend(pages.iter().map(|&page| (next_use(page), Reverse(step), Reverse(page))));
         self.drop_old_entries();
         Ok(())
+    }
+
+    /// The page that leaves first of those that are not needed now.
+    fn pop_exact(&mut self, next_use: impl Fn(PageNo) -> u32) -> Option<Key> {
+        loop {
+            let (bound, last_use, page) = self.heap.pop()?;
+            let state = self.pages[page.0.index()];
+            if !state.is_resident || state.last_use != last_use.0 {
+                continue;
+            }
+            let exact = next_use(page.0);
+            if exact >= bound {
+                return Some((bound, last_use, page));
+            }
+            self.heap.push((exact, last_use, page));
+        }
+    }
+
+    fn evict(&mut self, (_, last_use, page): Key, change: &mut StepChange) {
+        self.pages[page.0.index()].is_resident = false;
+        self.resident -= 1;
+        change.evict.push(page.0);
+        change.last_uses.push(last_use.0);
     }
 
     /// Entries that are out of date but never reach the top are dropped when they are the greater part.

@@ -182,7 +182,7 @@ pub struct PlannedStep {
 
 impl fmt::Display for PlannedStep {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let StepChange { admit, evict } = &self.change;
+        let StepChange { admit, evict, .. } = &self.change;
         write!(f, "step {}: {} pages, admit {}, evict {}", self.step, self.pages, admit.len(), evict.len())?;
         for (sign, list) in [('+', admit), ('-', evict)] {
             if !list.is_empty() {

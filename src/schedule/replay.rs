@@ -5,10 +5,11 @@
 //! views in the same order.
 //!
 //! The model of time: one drive that serves one request after the other, reads in the order of steps, each preceded by
-//! the writes that free its frames; reads of a coming step start as early as the frames allow, which hold the pages of all
-//! steps in between as well, but at most [`STEPS_AHEAD`] steps before it; a step takes the same time everywhere. What a run
-//! waits for is the sum over steps of what is still missing when they could start. A run waits longer than that where the
-//! page that should leave is one that has just been used, and where few bytes may be in flight: neither is modelled.
+//! the write of the page that leaves for it; a page leaves at the end of the step that last needs it, but at most
+//! [`STEPS_AHEAD`] steps before the one that it leaves for, and any frame serves any read; a step takes the same time
+//! everywhere. What a run waits for is the sum over steps of what is still missing when they could start. With
+//! [`Policy::Ahead`] pages leave as they do in a run. Not modelled: how many bytes may be in flight, and when in a step the
+//! run looks what has ended.
 //!
 //! Invariants: 1. nothing here knows clocks or files: the same input gives the same report; 2. bytes are counted when a
 //! page moves, whole pages only; every page that leaves was changed and is written, unless its share says otherwise.
@@ -18,7 +19,6 @@ use super::order::ViewOrder;
 use super::plan::Plan;
 use super::visibility::ViewPages;
 use crate::base::ids::PageNo;
-use std::collections::VecDeque;
 use std::ops::Range;
 
 /// Steps of the window whose heaviest place is reported.
@@ -52,12 +52,12 @@ pub struct StepTraffic {
     /// Of these, bytes of the pages that are needed before any other page has to leave: a run that has just made its pages
     /// has them in memory.
     pub bytes_first: u64,
+    /// The number of these pages.
+    pub pages_first: u32,
     /// Bytes of the pages that left for it.
     pub bytes_written: u64,
-    /// Earlier steps that its pages may be read in: the frames hold the pages of all from there on.
-    pub steps_ahead: u32,
-    /// Of the bytes read, those for which there is no frame before the step before it has ended.
-    pub bytes_late: u64,
+    /// Frames whose pages leave, for this step or a later one, and that no step needs from this one's begin on.
+    pub frames_freed: u32,
 }
 
 /// All steps of a replay.
@@ -93,7 +93,7 @@ pub fn replay(
     };
     let (mut pages, mut steps) = (Vec::new(), Vec::with_capacity(options.steps as usize));
     let mut frames_left = options.frames;
-    let mut together = Together::default();
+    let mut frames_freed = vec![0; options.steps as usize];
     for step in 0..options.steps {
         // The run ends; what would come after it is not needed by anyone.
         while plan.steps().end < options.steps.min(step.saturating_add(reach)) {
@@ -108,57 +108,22 @@ pub fn replay(
         // As long as there are frames without a page nothing leaves, so that each of these is read for the first time.
         let first = change.admit.len().min(frames_left);
         frames_left -= first;
-        let (steps_ahead, crowded) = together.push(&pages, options.frames);
-        let bytes_read = bytes(&change.admit);
+        for last_use in &change.last_uses {
+            frames_freed[(last_use + 1).max(step.saturating_sub(STEPS_AHEAD)) as usize] += 1;
+        }
         steps.push(StepTraffic {
             pages: pages.len() as u32,
             pages_read: change.admit.len() as u32,
-            bytes_read,
+            bytes_read: bytes(&change.admit),
             bytes_first: bytes(&change.admit[..first]),
+            pages_first: first as u32,
             bytes_written: bytes(&change.evict),
-            steps_ahead,
-            // Pages are about as large as each other; there are at least as many.
-            bytes_late: bytes_read.checked_div(change.admit.len() as u64).unwrap_or(0) * crowded as u64,
+            frames_freed: 0,
         });
         plan.pop();
     }
+    steps.iter_mut().zip(frames_freed).for_each(|(traffic, frames)| traffic.frames_freed = frames);
     Ok(Replay { steps, views: views.views(), is_exact })
-}
-
-/// The last steps whose pages fit into the frames together.
-#[derive(Debug, Default)]
-struct Together {
-    steps: VecDeque<Vec<PageNo>>,
-    /// By page: how many of these steps need it.
-    uses: Vec<u32>,
-    /// Pages that any of them needs.
-    pages: usize,
-}
-
-impl Together {
-    /// Takes the next step: how many steps before it fit into the frames with it, and for how many of its pages there is no
-    /// frame as long as the step before it lasts.
-    fn push(&mut self, pages: &[PageNo], frames: usize) -> (u32, usize) {
-        for page in pages {
-            if self.uses.len() <= page.index() {
-                self.uses.resize(page.index() + 1, 0);
-            }
-            self.pages += usize::from(self.uses[page.index()] == 0);
-            self.uses[page.index()] += 1;
-        }
-        self.steps.push_back(pages.to_vec());
-        let mut crowded = 0;
-        while self.steps.len() > 1 && (self.pages > frames || self.steps.len() > STEPS_AHEAD as usize + 1) {
-            if self.steps.len() == 2 {
-                crowded = self.pages - frames;
-            }
-            for page in self.steps.pop_front().into_iter().flatten() {
-                self.uses[page.index()] -= 1;
-                self.pages -= usize::from(self.uses[page.index()] == 0);
-            }
-        }
-        (self.steps.len() as u32 - 1, crowded)
-    }
 }
 
 /// What a drive does and how long a step takes without it.
@@ -259,24 +224,36 @@ impl Replay {
     /// How long a range of steps waits for the drive, in a run that has just made its pages. The range's first reads count as
     /// done: the run waits for them once, before it begins.
     pub fn stall(&self, range: Range<usize>, drive: &DriveModel) -> Stall {
-        let steps = &self.steps[range];
         let mut stall = Stall::default();
-        let mut began = vec![0.0f64; steps.len()];
+        let mut began = vec![0.0f64; range.end];
         let mut drive_free = 0.0f64;
-        for step in 1..steps.len() {
-            let StepTraffic { bytes_read, bytes_first, bytes_written, steps_ahead, .. } = steps[step];
-            let bytes_read = bytes_read - bytes_first;
-            let bytes_late = steps[step].bytes_late.min(bytes_read);
-            let busy = |read: u64, written: u64| read as f64 / drive.read_rate + written as f64 / drive.write_rate;
-            // What is late takes the place of pages that the step before it has just changed.
-            let written_late = bytes_written.min(bytes_late);
-            let from = step.saturating_sub(steps_ahead.max(1) as usize);
-            drive_free = drive_free.max(began[from]) + busy(bytes_read - bytes_late, bytes_written - written_late);
-            let ready = began[step - 1] + drive.step_seconds;
-            if bytes_late > 0 {
-                drive_free = drive_free.max(ready) + busy(bytes_late, written_late);
+        // Frames free in the steps up to `freed_by`, beyond those of the reads so far.
+        let (mut freed_by, mut free) = (0, self.steps.first().map_or(0, |s| i64::from(s.frames_freed)));
+        for (step, traffic) in self.steps[..range.end].iter().enumerate() {
+            let mut pages = i64::from(traffic.pages_read - traffic.pages_first);
+            let page = 1.0 / pages.max(1) as f64;
+            let read = page * (traffic.bytes_read - traffic.bytes_first) as f64 / drive.read_rate;
+            let busy = read + page * traffic.bytes_written as f64 / drive.write_rate;
+            let is_timed = step > range.start;
+            let ready = if is_timed { began[step - 1] + drive.step_seconds } else { 0.0 };
+            let waited = pages > 0;
+            while pages > 0 {
+                if free <= 0 && freed_by < step {
+                    freed_by += 1;
+                    free += i64::from(self.steps[freed_by].frames_freed);
+                    continue;
+                }
+                // The frames that this step waits for are free when it could start.
+                let (now, from) = if freed_by < step { (free.min(pages), began[freed_by]) } else { (pages, ready) };
+                if is_timed {
+                    drive_free = drive_free.max(from) + now as f64 * busy;
+                }
+                (pages, free) = (pages - now, free - now);
             }
-            let waits = if bytes_read > 0 { (drive_free - ready).max(0.0) } else { 0.0 };
+            if !is_timed {
+                continue;
+            }
+            let waits = if waited { (drive_free - ready).max(0.0) } else { 0.0 };
             began[step] = ready + waits;
             stall.seconds += waits;
             stall.worst_seconds = stall.worst_seconds.max(waits);

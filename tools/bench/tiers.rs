@@ -318,8 +318,7 @@ impl Prediction {
 
     /// Seconds that the measured steps wait for the drive, with so many frames.
     fn stall_seconds(&self, frames: usize) -> Option<f64> {
-        let options =
-            ReplayOptions { frames, policy: Policy::Farthest, steps: self.steps.end, plan_bytes: ORDER_BYTES };
+        let options = ReplayOptions { frames, policy: Policy::Ahead, steps: self.steps.end, plan_bytes: ORDER_BYTES };
         let run = replay(&self.views, &self.page_bytes, &self.order, &options).ok()?;
         Some(run.stall(self.steps.start as usize..self.steps.end as usize, &self.drive).seconds)
     }
