@@ -7,20 +7,22 @@
 //! The optimizer also fetches the old value's line, which it overwrites in parts; that is not counted.
 //! A large copy writes past the caches; whoever computes what it writes fetches it first. So beside the copy stand two
 //! passes of plain additions over as many tables, read and written alike: what there is to reach.
-//! Rows lie in pages as in a run. All are timed in turns, so that whatever else the machine does hits them alike.
-//! Prints one line of JSON for each share of rows that is listed.
+//! Rows lie in pages as in a run; those that are listed are drawn, or are what views of a scene see. All are timed in turns, so that whatever else the machine does hits them alike.
+//! Prints one line of JSON for each share of rows that is listed, or for each view.
 
-use super::statistics::median;
+use super::statistics::{extend, median};
 use clap::Parser;
 use gsscale::base::error::InputError;
+use gsscale::base::ids::PageNo;
 use gsscale::base::rng::{Purpose, Stream};
-use gsscale::config::file::TrainOverrides;
+use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::RunOptions;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::pinned::PinnedPage;
 use gsscale::scene::columns::{Column, Columns, row_width};
-use gsscale::train::catch_up::gather;
+use gsscale::train::catch_up::{gather, visible_rows};
 use gsscale::train::pages::{PagedScene, numbered};
+use gsscale::train::run::prepare;
 use gsscale::train::trainer::TrainError;
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -32,25 +34,33 @@ const EXAMPLES: &str = "\
 Examples:
   gsscale-bench touched
   gsscale-bench touched --rows 2000000 --rounds 21 --listed 100,65,10 --threads 1
+  gsscale-bench touched scans/city --views 5
 
 65 % is about what views list of the rows in their pages. The copy is one of each thread's own floats, as many bytes in all
 as the optimizer touches; bytes read and bytes written both count. The plain passes are additions that read and write
-tables as forwarding and the optimizer do. Takes 5 kB a row at degree 3.";
+tables as forwarding and the optimizer do. Rows that a view sees lie in runs of rows_in_a_run on average; drawn ones, being apart,
+use less of each line of memory. Takes 5 kB a row at degree 3, of a scene 1 kB and 4 kB for each row of a view.";
 
 /// Steps from the oldest stamp to now: rows sleep that long at most.
 const SLEEP_STEPS: u32 = 500;
 
-/// Times forwarding and the optimizer against a plain copy and plain passes, and prints a line of JSON for each share of rows.
+/// Times forwarding and the optimizer against a plain copy and plain passes, and prints a line of JSON for each share of rows
+/// or view.
 #[derive(Parser)]
 #[command(name = "gsscale-bench touched", bin_name = "gsscale-bench touched", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// Rows
+    /// Scene whose views list the rows; without one, random rows in the order in which they were drawn
+    scene: Option<PathBuf>,
+    /// Views of the scene, evenly through its training views
+    #[arg(long, default_value_t = 3, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    views: u32,
+    /// Rows, without a scene
     #[arg(long, default_value_t = 500_000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     rows: u32,
     /// Times that each is measured
     #[arg(long, default_value_t = 15, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     rounds: u32,
-    /// Rows that a step lists, in percent
+    /// Rows that a step lists, in percent, without a scene
     #[arg(long, value_delimiter = ',', default_value = "100,65", value_name = "P")]
     listed: Vec<f64>,
     /// Config file; flags override it
@@ -60,7 +70,7 @@ pub struct Args {
     keys: TrainOverrides,
 }
 
-/// Pages of random rows, all with a past.
+/// Rows in pages, of which some are pinned, all with a past.
 struct World {
     scene: PagedScene,
     pages: Vec<PinnedPage>,
@@ -83,20 +93,53 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     // All bands are in use, and no row grows.
     config.sh_start = config.sh_degree;
     config.strategy = "none".to_string();
-    let mut world = World::new(args.rows as usize, &RunOptions::new(&config, 1.0))?;
-    for &share in &args.listed {
-        let rows = listed(args.rows, share / 100.0);
-        let line = world.measure(&rows, args.rounds);
-        let mut line = line;
-        let facts = json!({
-            "listed_percent": share, "rows_listed": rows.len(), "rows": args.rows, "page_rows": config.page_rows,
-            "sh_degree": world.degree, "rounds": args.rounds, "threads": rayon::current_num_threads(),
-            "simd": gsscale::config::limits::simd_path(&config).name(), "version": env!("CARGO_PKG_VERSION"),
-        });
-        super::statistics::extend(&mut line, &facts);
+    let Some(scene) = &args.scene else {
+        let options = RunOptions::new(&config, 1.0);
+        let mut world = World::new(&random_columns(args.rows as usize, options.sh_degree, 1.0, 1), &options)?;
+        let all: Vec<PageNo> = (0..world.scene.pager.index().len() as u32).map(PageNo).collect();
+        world.pin(&all)?;
+        for &share in &args.listed {
+            print(&line(args, &config, &mut world, &listed(args.rows, share / 100.0)));
+        }
+        return Ok(());
+    };
+    let prepared = prepare(scene, &config)?;
+    let views = prepared.dataset.train_views();
+    let mut world = World::new(&prepared.columns, &RunOptions::new(&config, prepared.dataset.scene_scale))?;
+    for number in 0..args.views as usize {
+        let view = views[number * views.len() / args.views as usize];
+        let camera = &prepared.dataset.views[view].camera;
+        world.pin(&world.scene.pager.pages_of_view(camera))?;
+        let mut list = Vec::new();
+        visible_rows(&numbered(&world.pages), &world.scene.rules.adam, world.step, camera, &mut list);
+        let mut line = match list.is_empty() {
+            true => json!({ "rows_listed": 0 }),
+            false => line(args, &config, &mut world, &list),
+        };
+        extend(&mut line, &json!({ "scene": scene, "view": prepared.dataset.views[view].name }));
         print(&line);
     }
     Ok(())
+}
+
+/// What one list of the pinned rows costs.
+fn line(args: &Args, config: &TrainConfig, world: &mut World, list: &[u32]) -> Value {
+    let rows = world.rows();
+    let mut line = world.measure(list, args.rounds);
+    let facts = json!({
+        "listed_percent": 100.0 * list.len() as f64 / rows as f64, "rows_listed": list.len(), "rows": rows,
+        "rows_in_a_run": rows_in_a_run(list), "page_rows": config.page_rows, "sh_degree": world.degree,
+        "rounds": args.rounds, "threads": rayon::current_num_threads(),
+        "simd": gsscale::config::limits::simd_path(config).name(), "version": env!("CARGO_PKG_VERSION"),
+    });
+    extend(&mut line, &facts);
+    line
+}
+
+/// Rows one after the other that are all listed, on average.
+fn rows_in_a_run(list: &[u32]) -> f64 {
+    let runs = list.windows(2).filter(|pair| pair[0] + 1 != pair[1]).count() + 1;
+    list.len() as f64 / runs as f64
 }
 
 /// A share of the rows, drawn.
@@ -117,20 +160,31 @@ fn random_columns(rows: usize, degree: u8, scale: f64, number: u64) -> Columns {
 }
 
 impl World {
-    fn new(rows: usize, options: &RunOptions) -> Result<World, TrainError> {
+    fn new(columns: &Columns, options: &RunOptions) -> Result<World, TrainError> {
         let degree = options.sh_degree;
         let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, degree));
-        let mut scene = PagedScene::new(&random_columns(rows, degree, 1.0, 1), pager, options)?;
-        let all: Vec<_> = (0..scene.pager.index().len() as u32).map(gsscale::base::ids::PageNo).collect();
-        let pages = scene.pager.acquire_pages(&all)?;
-        let mut world = World { scene, pages, values: Columns::zeros(0, degree), degree, step: 0 };
-        // Every row gets a past, a different one for every page.
-        let everything: Vec<u32> = (0..rows as u32).collect();
-        let gradients = random_columns(rows, degree, 1e-3, 2);
-        world.forward(&everything);
-        world.optimize(&everything, &gradients);
-        world.fall_asleep();
-        Ok(world)
+        let scene = PagedScene::new(columns, pager, options)?;
+        Ok(World { scene, pages: Vec::new(), values: Columns::zeros(0, degree), degree, step: 0 })
+    }
+
+    /// Goes on with these pages. Each of their rows gets a past, a different one for every page.
+    fn pin(&mut self, pages: &[PageNo]) -> Result<(), TrainError> {
+        let mut before = std::mem::take(&mut self.pages);
+        before.iter_mut().for_each(|page| page.dirty = true);
+        self.scene.pager.release(before);
+        self.pages = self.scene.pager.acquire_pages(pages)?;
+        let everything: Vec<u32> = (0..self.rows() as u32).collect();
+        let gradients = random_columns(everything.len(), self.degree, 1e-3, 2);
+        self.step = 0;
+        self.forward(&everything);
+        self.optimize(&everything, &gradients);
+        self.fall_asleep();
+        Ok(())
+    }
+
+    /// Rows of the pinned pages.
+    fn rows(&self) -> usize {
+        self.pages.iter().map(|page| page.meta.rows as usize).sum()
     }
 
     /// Every row was touched last at a step of its own again: a call that is timed finds work to catch up with. The
