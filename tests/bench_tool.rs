@@ -103,6 +103,23 @@ fn touched_bytes_are_timed_beside_a_copy() {
     }
 }
 
+#[test]
+fn touched_bytes_of_the_rows_that_views_list() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 24, 64, 48, 3000);
+    let lines = lines(&["touched", text(&scene), "--views", "2", "--rounds", "2", "--page-rows", "64"]);
+    assert_eq!(lines.len(), 2);
+    assert_ne!(lines[0]["view"], lines[1]["view"]);
+    for line in &lines {
+        let (listed, rows, run) = (number(line, "rows_listed"), number(line, "rows"), number(line, "rows_in_a_run"));
+        assert!(listed >= 1.0 && listed <= rows && (1.0..=listed).contains(&run), "{line}");
+        // Neighbours lie side by side, so that a view lists them together; drawn ones would be apart.
+        let share = listed / rows;
+        assert!(share == 1.0 || run > 1.0 / (1.0 - share), "{line}");
+        assert!(number(line, "both_over_copy") > 0.0, "{line}");
+    }
+}
+
 /// A control group is made where this user may make one; else the line says why not.
 #[test]
 #[cfg(unix)]
@@ -144,6 +161,7 @@ fn a_run_needs_no_name_and_wrong_input_is_refused() {
     refuses(&["sizes", text(&scene)], "--spill-dir");
     refuses(&["sizes", text(&scene), "--spill-dir", spill, "--copies", "1,0"], "--copies");
     refuses(&["touched", "--listed", "0"], "--listed");
+    refuses(&["touched", text(&folder.path().join("nowhere"))], "nowhere");
     let taken = text(folder.path());
     refuses(&["bounded", "--dir", taken], "exists already");
     let new = folder.path().join("new");

@@ -188,11 +188,14 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
         for (i, &row) in before.iter().enumerate() {
             if let Some(&coming) = rows.get(i + AHEAD) {
                 let coming = coming as usize - first_row;
-                grad.prefetch(i + AHEAD);
-                value.prefetch(i + AHEAD);
-                columns.as_ref().prefetch(coming);
-                exp_avg.as_ref().prefetch(coming);
-                exp_avg_sq.as_ref().prefetch(coming);
+                for (table, row) in [(&grad, i + AHEAD), (&value, i + AHEAD)] {
+                    table.prefetch(row);
+                    table.prefetch_narrow(row);
+                }
+                for table in [columns.as_ref(), exp_avg.as_ref(), exp_avg_sq.as_ref()] {
+                    table.prefetch(coming);
+                    table.prefetch_narrow(coming);
+                }
             }
             let row = row as usize - first_row;
             let g = grad.load(i);

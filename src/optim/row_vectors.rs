@@ -102,13 +102,23 @@ impl<'a, const W: usize> Table<'a, W> {
         RowVectors(block)
     }
 
-    /// Asks for `sh_n` of a row that will be loaded soon, but for what lies in a last line of a few values; the narrow
-    /// columns come by themselves, many rows to a line.
+    /// Asks for `sh_n` of a row that will be loaded soon, but for what lies in a last line of a few values.
     #[inline(always)]
     pub fn prefetch(&self, row: usize) {
         for line in 0..W.div_ceil(LANES) {
             prefetch(self.sh_n, row * W + line * LANES);
         }
+    }
+
+    /// The same for the narrow columns. They come by themselves, many rows to a line, as long as the processor follows all
+    /// tables: forwarding is no faster for being asked, the step on its five tables is by a tenth to a fifth (AMD Milan).
+    #[inline(always)]
+    pub fn prefetch_narrow(&self, row: usize) {
+        prefetch(self.means, row);
+        prefetch(self.quats, row);
+        prefetch(self.scales, row);
+        prefetch(self.opacities, row);
+        prefetch(self.sh0, row);
     }
 }
 

@@ -175,7 +175,8 @@ impl World {
         self.pages = self.scene.pager.acquire_pages(pages)?;
         let everything: Vec<u32> = (0..self.rows() as u32).collect();
         let gradients = random_columns(everything.len(), self.degree, 1e-3, 2);
-        self.step = 0;
+        // They may have one already, of an earlier view.
+        self.fall_asleep();
         self.forward(&everything);
         self.optimize(&everything, &gradients);
         self.fall_asleep();
