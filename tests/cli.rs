@@ -404,3 +404,27 @@ fn help_is_grouped_and_has_examples() {
         assert!(said.contains(word), "{word} is not in --help");
     }
 }
+
+/// `gsscale-plan ... | head` ends well, whatever is left to print.
+#[test]
+fn a_reader_that_has_gone_is_no_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let args: [(&str, &[&str]); 2] = [
+        (env!("CARGO_BIN_EXE_gsscale-bench"), &["touched", "--rows", "500", "--rounds", "1"]),
+        (env!("CARGO_BIN_EXE_gsscale-iotune"), &[".", "--file", "64MiB", "--seconds", "1", "--written", "16MiB"]),
+    ];
+    for (program, args) in args {
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let output = std::process::Command::new(program)
+            .args(args)
+            .current_dir(folder.path())
+            .stdout(writer)
+            .stderr(std::process::Stdio::piped())
+            .spawn()
+            .and_then(std::process::Child::wait_with_output)
+            .unwrap();
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success() && !errors.contains("panicked"), "{program}: {errors}");
+    }
+}

@@ -61,7 +61,7 @@ fn main() -> ExitCode {
         }
         is
     };
-    let mut print = |line: &Value| println!("{line}");
+    let mut print = |line: &Value| gsscale::say!("{line}");
     let done = if named("tiers") {
         tiers::start(&parse_arguments(&arguments), &mut print)
     } else if named("commit") {

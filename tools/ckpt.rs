@@ -113,7 +113,7 @@ fn print(json: bool, value: &impl Serialize, text: impl FnOnce() -> String) -> R
             .map_err(|e| InputError::new("--json", format!("writing JSON failed: {e}"), "report this as a bug"))?,
         false => text(),
     };
-    println!("{}", text.trim_end_matches('\n'));
+    gsscale::say!("{}", text.trim_end_matches('\n'));
     Ok(())
 }
 

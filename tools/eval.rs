@@ -70,7 +70,7 @@ fn start(args: Args) -> Result<(), TrainError> {
     let report = evaluate_ply(&ply, &args.scene, &config, &extras)?;
     let text = serde_json::to_string_pretty(&report)
         .map_err(|e| InputError::new(&ply, format!("writing JSON failed: {e}"), "report this as a bug"))?;
-    println!("{text}");
+    gsscale::say!("{text}");
     if let Some(path) = &args.json {
         write_whole(path, (text + "\n").as_bytes())?;
     }

@@ -89,9 +89,9 @@ fn run(flags: &Flags) -> InputResult<()> {
     let sweep = sweep(&flags.dir, &cases, limits, &mut |share| bar.set_position((share * 1000.0) as u64));
     bar.finish_and_clear();
     let sweep = sweep?;
-    sweep.notes.iter().for_each(|note| println!("note: {note}"));
+    sweep.notes.iter().for_each(|note| gsscale::say!("note: {note}"));
     print_tables(&sweep);
-    println!(
+    gsscale::say!(
         "\n{} whole rounds, {} written to the drive; nothing of it stays.",
         sweep.rounds,
         format_bytes(sweep.written_bytes)
@@ -101,9 +101,9 @@ fn run(flags: &Flags) -> InputResult<()> {
 
 fn warn_about(folder: &Path) {
     match FileSystem::of(folder) {
-        Ok(FileSystem::Memory) => println!("note: this folder lies in memory; these are no figures of a drive"),
+        Ok(FileSystem::Memory) => gsscale::say!("note: this folder lies in memory; these are no figures of a drive"),
         Ok(FileSystem::Remote(kind)) => {
-            println!("note: this folder lies on {kind}; training refuses it as --spill-dir")
+            gsscale::say!("note: this folder lies on {kind}; training refuses it as --spill-dir")
         }
         // An unreadable folder is told of when it is used.
         _ => {}
@@ -131,14 +131,14 @@ fn find(sweep: &Sweep, engine: IoEngine, bytes: usize, depth: usize) -> Option<&
 fn print_tables(sweep: &Sweep) {
     let heads: Vec<String> = ENGINES.iter().map(|e| format!("{:>15}", e.name())).collect();
     let heads = heads.concat();
-    println!("MB/s, random reads / durable random writes\n");
-    println!("{:>22}{heads}", format!("{USUAL_DEPTH} at once"));
+    gsscale::say!("MB/s, random reads / durable random writes\n");
+    gsscale::say!("{:>22}{heads}", format!("{USUAL_DEPTH} at once"));
     let pages = PAGE_ROWS.map(|rows| (format!("page of {rows} rows"), page_bytes(rows)));
     let powers = POWERS.map(|bytes| (format_bytes(bytes as u64), bytes));
     for (name, bytes) in pages.into_iter().chain(powers) {
         print_line(sweep, &name, bytes, USUAL_DEPTH);
     }
-    println!("\n{:>22}{heads}", format!("page of {USUAL_ROWS} rows"));
+    gsscale::say!("\n{:>22}{heads}", format!("page of {USUAL_ROWS} rows"));
     for depth in DEPTHS {
         print_line(sweep, &format!("{depth} at once"), page_bytes(USUAL_ROWS), depth);
     }
@@ -152,7 +152,7 @@ fn print_line(sweep: &Sweep, name: &str, bytes: usize, depth: usize) {
         let text = measured.map_or("-".into(), |m| format!("{} / {}", rate(m.read), rate(m.write)));
         line.push_str(&format!("{text:>15}"));
     }
-    println!("{line}");
+    gsscale::say!("{line}");
 }
 
 /// What follows from the figures.
@@ -180,10 +180,10 @@ fn print_advice(folder: &Path, sweep: &Sweep) -> InputResult<()> {
         let problem = "the time was too short to measure anything";
         return Err(InputError::new(folder, problem, "give it more with --seconds, or measure with a smaller --file"));
     };
-    println!("\n# for this drive; page-rows belongs to a run and cannot be changed when it is resumed");
-    println!("io = \"{}\"", advice.engine);
-    println!("page-rows = {}", advice.page_rows);
-    println!("spill-codec = \"{}\"", advice.codec);
+    gsscale::say!("\n# for this drive; page-rows belongs to a run and cannot be changed when it is resumed");
+    gsscale::say!("io = \"{}\"", advice.engine);
+    gsscale::say!("page-rows = {}", advice.page_rows);
+    gsscale::say!("spill-codec = \"{}\"", advice.codec);
     Ok(())
 }
 

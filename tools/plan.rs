@@ -138,7 +138,7 @@ struct Row {
 fn main() -> ExitCode {
     match start(&parse_command_line()) {
         Ok(text) => {
-            println!("{text}");
+            gsscale::say!("{text}");
             ExitCode::SUCCESS
         }
         Err(error) => {

@@ -134,25 +134,33 @@ fn report(flags: &Flags, options: &CityOptions, s: &CitySummary, seconds: f64) {
     let dir = &flags.dir;
     let size = |sub: &str| format_bytes(folder_bytes(&dir.join(sub)));
     let rate = s.rays as f64 / seconds / 1e6;
-    println!("A city of {0}x{0} blocks ({1:.0} m), {2} solids, seed {3}", s.blocks, s.side, s.solids, options.seed);
+    gsscale::say!(
+        "A city of {0}x{0} blocks ({1:.0} m), {2} solids, seed {3}",
+        s.blocks,
+        s.side,
+        s.solids,
+        options.seed
+    );
     if options.tiles != [1, 1] {
-        println!("in {}x{} copies side by side", options.tiles[0], options.tiles[1]);
+        gsscale::say!("in {}x{} copies side by side", options.tiles[0], options.tiles[1]);
     }
     if flags.layout == Layout::Colmap {
-        println!("{}/", dir.display());
-        println!("  images/    {} photos of {}x{}, {}", s.views, options.width, options.height, size("images"));
+        gsscale::say!("{}/", dir.display());
+        gsscale::say!("  images/    {} photos of {}x{}, {}", s.views, options.width, options.height, size("images"));
         let sparse = size("sparse/0");
-        println!(
+        gsscale::say!(
             "  sparse/0/  1 camera, {} poses, {} points in {} observations, {sparse}",
-            s.views, s.points, s.observations
+            s.views,
+            s.points,
+            s.observations
         );
     } else {
         let (width, height, layout) = (options.width, options.height, flags.layout.name());
-        println!("{} photos of {width}x{height} in {}, laid out as {layout}", s.views, dir.display());
-        println!("{}", flags.layout.tree());
+        gsscale::say!("{} photos of {width}x{height} in {}, laid out as {layout}", s.views, dir.display());
+        gsscale::say!("{}", flags.layout.tree());
     }
-    println!("{seconds:.1} s, {rate:.1} million camera rays per second");
-    println!("next: gsscale-train {} --out <run>", dir.display());
+    gsscale::say!("{seconds:.1} s, {rate:.1} million camera rays per second");
+    gsscale::say!("next: gsscale-train {} --out <run>", dir.display());
 }
 
 fn folder_bytes(folder: &Path) -> u64 {

@@ -84,9 +84,9 @@ fn main() -> ExitCode {
 /// One line for each adapter; the CPU renderer is always there.
 fn list_devices() {
     for adapter in gsscale::gpu::list_adapters() {
-        println!("{adapter}");
+        gsscale::say!("{adapter}");
     }
-    println!("cpu: the CPU renderer");
+    gsscale::say!("cpu: the CPU renderer");
 }
 
 fn start(args: Args) -> Result<RunOutcome, TrainError> {

@@ -7,5 +7,6 @@ pub mod machine;
 pub mod math;
 pub mod rng;
 pub mod room;
+pub mod say;
 pub mod simd;
 pub mod units;

@@ -201,11 +201,11 @@ fn list(args: &Args, runs: &[Planned], surroundings: &Surroundings) -> Result<()
             }
             (None, None) => "to do".to_string(),
         };
-        println!("{name:<52} seed {:<4} {:>6} steps  {state}", run.config.seed, run.config.steps);
+        gsscale::say!("{name:<52} seed {:<4} {:>6} steps  {state}", run.config.seed, run.config.steps);
     }
     match mean {
-        Some(_) => println!("{} runs; about {:.0} min for those to do", runs.len(), left / 60.0),
-        None => println!("{} runs; no run is done yet, so there is no estimate: try --max-runs 1", runs.len()),
+        Some(_) => gsscale::say!("{} runs; about {:.0} min for those to do", runs.len(), left / 60.0),
+        None => gsscale::say!("{} runs; no run is done yet, so there is no estimate: try --max-runs 1", runs.len()),
     }
     Ok(())
 }
