@@ -107,9 +107,17 @@ fn touched_bytes_are_timed_beside_a_copy() {
 fn touched_bytes_of_the_rows_that_views_list() {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 24, 64, 48, 3000);
-    let lines = lines(&["touched", text(&scene), "--views", "2", "--rounds", "2", "--page-rows", "64"]);
+    let of = |views: &str, rounds: &str| {
+        lines(&["touched", text(&scene), "--views", views, "--rounds", rounds, "--page-rows", "64"])
+    };
+    let lines = of("2", "2");
     assert_eq!(lines.len(), 2);
     assert_ne!(lines[0]["view"], lines[1]["view"]);
+    // What is listed does not depend on what was measured before, and no view is measured twice.
+    let more = of("1000", "5");
+    assert_eq!((&more[0]["rows_listed"], more.len()), (&lines[0]["rows_listed"], 21));
+    let second = more.iter().find(|line| line["view"] == lines[1]["view"]).unwrap();
+    assert_eq!(second["rows_listed"], lines[1]["rows_listed"]);
     for line in &lines {
         let (listed, rows, run) = (number(line, "rows_listed"), number(line, "rows"), number(line, "rows_in_a_run"));
         assert!(listed >= 1.0 && listed <= rows && (1.0..=listed).contains(&run), "{line}");

@@ -340,7 +340,7 @@ fn row(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Row
     };
     let (planned, lru) = (run(Policy::Farthest)?, run(Policy::LeastRecent)?);
     let figures = planned.figures(planned.steady());
-    let timed = run(Policy::Ahead)?;
+    let timed = run(if scene.config.evict == "lru" { Policy::LeastRecent } else { Policy::Ahead })?;
     let stall = timed.stall(timed.steady(), &scene.drive);
     let (_, written) = planned.totals();
     let rest = f64::from(scene.config.steps - steps);

@@ -3,7 +3,7 @@
 //! Invariants: 1. the first byte lies on a multiple of [`ALIGNMENT`], and stays there when the buffer is moved: the bytes
 //! live elsewhere; 2. the length is a multiple of [`ALIGNMENT`]; 3. a fresh buffer is zero; 4. a mapped one takes memory from
 //! the machine only as it is written to (in pieces of 2 MiB, where the system makes huge pages unasked), and gives all of it
-//! back at its end, whatever the heap looks like by then; one that a ring has registered, when the ring is used next.
+//! back at its end, whatever the heap looks like by then; of one that a ring has registered, once the ring has been used again.
 
 #[cfg(target_os = "linux")]
 use super::registered::Registration;

@@ -2,11 +2,12 @@
 //!
 //! A buffer that stays (a frame's) is registered when it first moves mostly full, keeps its number in the ring's table as
 //! long as it lives, and is taken out of the table after its end. What the kernel holds counts against the limit on locked
-//! memory (`ulimit -l`) of whoever is bound by it: the first refusal is the last attempt, and buffers without a number move
-//! by requests that name their memory.
+//! memory (`ulimit -l`) of whoever is bound by it: after a few refusals no more buffers are offered until others have ended,
+//! and those without a number move by requests that name their memory.
 //!
 //! Invariants: 1. a number belongs to one buffer of one ring until that buffer has ended and its entry was cleared; 2. the
-//! kernel holds memory of a buffer that has ended no longer than until the ring is used next.
+//! kernel is told of a buffer that has ended when the ring is used next. It lets go of the memory then (Linux before 6.4:
+//! about a second later), but of a huge page, which several buffers may share, only with the last of them.
 //!
 //! Safety: the kernel takes hold of the memory itself, not of the address: an entry whose buffer has ended names memory that
 //! nobody else has. Requests name addresses within the entry's buffer, which their flight owns.
@@ -19,6 +20,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Most entries of a table: the kernel's own limit.
 const ENTRIES: u16 = 1 << 14;
+
+/// Longest buffer that the kernel registers, bytes.
+const BYTES_MAX: usize = 1 << 30;
+/// Buffers that the kernel may refuse before no more are offered.
+const REFUSALS_MAX: u32 = 8;
 
 /// Numbers whose buffers have ended, on whatever thread.
 type Ended = Arc<Mutex<Vec<u16>>>;
@@ -39,8 +45,10 @@ impl Drop for Registration {
 /// The table of one ring.
 #[derive(Debug, Default)]
 pub struct RegisteredBuffers {
-    /// Whether the kernel gave a table, and has taken every buffer so far.
-    is_open: bool,
+    /// Whether the kernel gave a table.
+    is_there: bool,
+    /// Buffers that it refused since it last took or let go of one.
+    refusals: u32,
     /// Entries that were used so far.
     used: u16,
     /// Of these, entries that are clear.
@@ -51,8 +59,13 @@ pub struct RegisteredBuffers {
 impl RegisteredBuffers {
     /// An empty table for a ring; one that takes nothing where the kernel knows no such tables.
     pub fn of(ring: &Submitter<'_>) -> RegisteredBuffers {
-        let is_open = ring.register_buffers_sparse(ENTRIES.into()).is_ok();
-        RegisteredBuffers { is_open, ..RegisteredBuffers::default() }
+        let is_there = ring.register_buffers_sparse(ENTRIES.into()).is_ok();
+        RegisteredBuffers { is_there, ..RegisteredBuffers::default() }
+    }
+
+    /// Whether the kernel gave a table.
+    pub fn is_there(&self) -> bool {
+        self.is_there
     }
 
     /// Buffers that are registered, those that have just ended included.
@@ -68,7 +81,8 @@ impl RegisteredBuffers {
             return Some(registration.number);
         }
         // The kernel would take all of a buffer's memory from the machine, also what pages with few rows never touch.
-        if !self.is_open || !buffer.is_mapped() || 2 * bytes < buffer.len() {
+        let is_worth_it = buffer.is_mapped() && 2 * bytes >= buffer.len() && buffer.len() <= BYTES_MAX;
+        if !self.is_there || self.refusals >= REFUSALS_MAX || !is_worth_it {
             return None;
         }
         let number = self.clear.pop().or_else(|| (self.used < ENTRIES).then_some(self.used))?;
@@ -76,10 +90,11 @@ impl RegisteredBuffers {
         let memory = buffer.as_mut_slice();
         let entry = libc::iovec { iov_base: memory.as_mut_ptr().cast(), iov_len: memory.len() };
         if set(ring, number, entry).is_err() {
-            self.is_open = false;
+            self.refusals += 1;
             self.clear.push(number);
             return None;
         }
+        self.refusals = 0;
         buffer.registration = Some(Registration { number, ended: Arc::clone(&self.ended) });
         Some(number)
     }
@@ -87,12 +102,16 @@ impl RegisteredBuffers {
     /// Lets go of the memory of buffers that have ended.
     pub fn clear_ended(&mut self, ring: &Submitter<'_>) {
         let mut ended = self.ended.lock().unwrap_or_else(PoisonError::into_inner);
-        for number in ended.drain(..) {
+        // What could not be cleared is tried again the next time.
+        ended.retain(|&number| {
             let nothing = libc::iovec { iov_base: std::ptr::null_mut(), iov_len: 0 };
-            if set(ring, number, nothing).is_ok() {
+            let is_clear = set(ring, number, nothing).is_ok();
+            if is_clear {
                 self.clear.push(number);
+                self.refusals = 0;
             }
-        }
+            !is_clear
+        });
     }
 }
 

@@ -3,8 +3,8 @@
 //! Transfers are cut into requests of at most [`REQUEST_BYTES`], since larger ones may end in the middle with EAGAIN.
 //! No more requests are handed over than the ring has entries, so neither of its queues overflows. Direct I/O where
 //! the file system allows it. Neither SQPOLL (it costs a core) nor IOPOLL (it never completes on virtual drives).
-//! Buffers that stay are registered as far as the limit on locked memory allows; files are not, since a
-//! run opens few and holds them for as many requests as there are.
+//! Buffers that stay are registered as far as the limit on locked memory allows. Files are not: there
+//! are few, and finding one costs a request nothing beside its mebibyte.
 //!
 //! Safety: the kernel reads and writes page buffers while this process goes on. The bytes of a [`PageBuffer`] stay
 //! where they are when the buffer is moved; a transfer is moved into its flight when it is submitted, nothing
@@ -106,6 +106,11 @@ impl UringStore {
     /// Whether bytes go past the page cache.
     pub fn is_direct(&self) -> bool {
         self.segments.is_direct()
+    }
+
+    /// Whether the kernel has a table for buffers: since Linux 5.19.
+    pub fn has_table(&self) -> bool {
+        self.registered.is_there()
     }
 
     /// Buffers in the ring's table.

@@ -28,6 +28,7 @@ use std::str::FromStr;
 /// played through, and one far enough for pages to be kept for it. Pages were planned up to two epochs before, and their
 /// rows move. Without the latter two a cache for half of a small survey read 8 % more, for half of a large one 2 %.
 const PLANNED_ANEW: [u32; 3] = [1, STEPS_AHEAD, 4 * STEPS_AHEAD];
+
 /// When pages move. None of these changes what a step gets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Transfers {

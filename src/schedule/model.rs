@@ -4,8 +4,8 @@
 //! leaves before its frame is needed; 3. under [`Policy::Farthest`] the page whose next use is farthest leaves first,
 //! and with the whole future known no cache of this size reads fewer pages (Belady 1966, "A study of replacement
 //! algorithms for virtual-storage computers"; for sets of pages the same exchange argument holds, and a test compares
-//! with all possible choices); [`Policy::Ahead`] reads a little more, so that its frames are free earlier; 4. ties leave in the order of their last use, then by page number, so a run of the
-//! model is a function of what it is told.
+//! with all possible choices); [`Policy::Ahead`] reads a little more, so that its frames are free earlier; 4. ties leave in
+//! the order of their last use, then by page number, so a run of the model is a function of what it is told.
 
 use crate::base::ids::PageNo;
 use std::cmp::Reverse;

@@ -56,7 +56,8 @@ pub struct StepTraffic {
     pub pages_first: u32,
     /// Bytes of the pages that left for it.
     pub bytes_written: u64,
-    /// Frames whose pages leave, for this step or a later one, and that no step needs from this one's begin on.
+    /// Frames whose pages leave for this step or one of the next [`STEPS_AHEAD`], and that are free for it from this one's
+    /// begin on, and not before.
     pub frames_freed: u32,
 }
 

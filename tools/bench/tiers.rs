@@ -294,6 +294,7 @@ struct Prediction {
     page_bytes: Vec<u32>,
     order: ViewOrder,
     steps: Range<u32>,
+    policy: Policy,
     drive: DriveModel,
 }
 
@@ -312,13 +313,14 @@ impl Prediction {
             page_bytes: page_bytes(trainer.scene.pager.index()).into_iter().map(|bytes| bytes as u32).collect(),
             order: trainer.view_order().clone(),
             steps: warm_up..config.steps,
+            policy: if config.evict == "lru" { Policy::LeastRecent } else { Policy::Ahead },
             drive: DriveModel { read_rate: rate.read, write_rate: rate.write, step_seconds },
         }
     }
 
     /// Seconds that the measured steps wait for the drive, with so many frames.
     fn stall_seconds(&self, frames: usize) -> Option<f64> {
-        let options = ReplayOptions { frames, policy: Policy::Ahead, steps: self.steps.end, plan_bytes: ORDER_BYTES };
+        let options = ReplayOptions { frames, policy: self.policy, steps: self.steps.end, plan_bytes: ORDER_BYTES };
         let run = replay(&self.views, &self.page_bytes, &self.order, &options).ok()?;
         Some(run.stall(self.steps.start as usize..self.steps.end as usize, &self.drive).seconds)
     }

@@ -7,7 +7,8 @@
 //! The optimizer also fetches the old value's line, which it overwrites in parts; that is not counted.
 //! A large copy writes past the caches; whoever computes what it writes fetches it first. So beside the copy stand two
 //! passes of plain additions over as many tables, read and written alike: what there is to reach.
-//! Rows lie in pages as in a run; those that are listed are drawn, or are what views of a scene see. All are timed in turns, so that whatever else the machine does hits them alike.
+//! Rows lie in pages as in a run; those that are listed are drawn, or are what views of a scene see before its first step.
+//! All are timed in turns, so that whatever else the machine does hits them alike.
 //! Prints one line of JSON for each share of rows that is listed, or for each view.
 
 use super::statistics::{extend, median};
@@ -17,6 +18,7 @@ use gsscale::base::ids::PageNo;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::RunOptions;
+use gsscale::dataset::loader::Dataset;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::pinned::PinnedPage;
 use gsscale::scene::columns::{Column, Columns, row_width};
@@ -52,16 +54,16 @@ pub struct Args {
     /// Scene whose views list the rows; without one, random rows in the order in which they were drawn
     scene: Option<PathBuf>,
     /// Views of the scene, evenly through its training views
-    #[arg(long, default_value_t = 3, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, default_value_t = 3, value_name = "N", value_parser = clap::value_parser!(u32).range(1..), requires = "scene")]
     views: u32,
     /// Rows, without a scene
-    #[arg(long, default_value_t = 500_000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, default_value_t = 500_000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..), conflicts_with = "scene")]
     rows: u32,
     /// Times that each is measured
     #[arg(long, default_value_t = 15, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     rounds: u32,
     /// Rows that a step lists, in percent, without a scene
-    #[arg(long, value_delimiter = ',', default_value = "100,65", value_name = "P")]
+    #[arg(long, value_delimiter = ',', default_value = "100,65", value_name = "P", conflicts_with = "scene")]
     listed: Vec<f64>,
     /// Config file; flags override it
     #[arg(long)]
@@ -104,19 +106,22 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         return Ok(());
     };
     let prepared = prepare(scene, &config)?;
-    let views = prepared.dataset.train_views();
-    let mut world = World::new(&prepared.columns, &RunOptions::new(&config, prepared.dataset.scene_scale))?;
-    for number in 0..args.views as usize {
-        let view = views[number * views.len() / args.views as usize];
-        let camera = &prepared.dataset.views[view].camera;
-        world.pin(&world.scene.pager.pages_of_view(camera))?;
-        let mut list = Vec::new();
-        visible_rows(&numbered(&world.pages), &world.scene.rules.adam, world.step, camera, &mut list);
+    let dataset = &prepared.dataset;
+    let mut world = World::new(&prepared.columns, &RunOptions::new(&config, dataset.scene_scale))?;
+    let views = dataset.train_views();
+    let count = views.len().min(args.views as usize);
+    // All before the first is measured, which moves rows.
+    let lists: Result<Vec<_>, TrainError> =
+        (0..count).map(|i| views[i * views.len() / count]).map(|view| Ok((view, world.seen(dataset, view)?))).collect();
+    for (view, (pages, list)) in lists? {
         let mut line = match list.is_empty() {
             true => json!({ "rows_listed": 0 }),
-            false => line(args, &config, &mut world, &list),
+            false => {
+                world.pin(&pages)?;
+                line(args, &config, &mut world, &list)
+            }
         };
-        extend(&mut line, &json!({ "scene": scene, "view": prepared.dataset.views[view].name }));
+        extend(&mut line, &json!({ "scene": scene, "view": dataset.views[view].name }));
         print(&line);
     }
     Ok(())
@@ -165,6 +170,17 @@ impl World {
         let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, degree));
         let scene = PagedScene::new(columns, pager, options)?;
         Ok(World { scene, pages: Vec::new(), values: Columns::zeros(0, degree), degree, step: 0 })
+    }
+
+    /// The pages of a view, and which of their rows it lists.
+    fn seen(&mut self, dataset: &Dataset, view: usize) -> Result<(Vec<PageNo>, Vec<u32>), TrainError> {
+        let camera = &dataset.views[view].camera;
+        let numbers = self.scene.pager.pages_of_view(camera);
+        let pages = self.scene.pager.acquire_pages(&numbers)?;
+        let mut list = Vec::new();
+        visible_rows(&numbered(&pages), &self.scene.rules.adam, self.step, camera, &mut list);
+        self.scene.pager.release(pages);
+        Ok((numbers, list))
     }
 
     /// Goes on with these pages. Each of their rows gets a past, a different one for every page.
