@@ -388,14 +388,11 @@ fn pinned_bytes() -> usize {
     kib.unwrap().trim().parse::<usize>().unwrap() << 10
 }
 
-/// Waits until the kernel holds so many bytes: before Linux 6.4 it lets go a second late. Where the system makes huge pages
-/// unasked, it holds these whole.
+/// Waits until the kernel holds so many bytes: before Linux 6.4 it lets go a second late.
 #[cfg(target_os = "linux")]
 fn expect_pinned(bytes: usize) {
-    let huge = std::fs::read_to_string("/sys/kernel/mm/transparent_hugepage/enabled").unwrap_or_default();
-    let is = |pinned: usize| pinned == bytes || (huge.contains("[always]") && pinned >= bytes);
     let began = std::time::Instant::now();
-    while !is(pinned_bytes()) {
+    while pinned_bytes() != bytes {
         assert!(began.elapsed().as_secs() < 10, "{} bytes are held, not {bytes}", pinned_bytes());
         std::thread::sleep(std::time::Duration::from_millis(20));
     }
@@ -507,8 +504,7 @@ fn beyond_the_limit_on_locked_memory_buffers_move_unregistered() {
     assert!(registered <= limit as usize / BYTES, "{registered}");
     // Of a user who is not bound nothing else counts against the limit but the ring itself, which is smaller than a buffer:
     // the refusals came after these.
-    let huge = std::fs::read_to_string("/sys/kernel/mm/transparent_hugepage/enabled").unwrap_or_default();
-    let least = if was_free && !huge.contains("[always]") { (limit as usize / BYTES).saturating_sub(1) } else { 0 };
+    let least = if was_free { (limit as usize / BYTES).saturating_sub(1) } else { 0 };
     assert!(registered >= least, "{registered} of {least}");
     let mut buffers = write_and_read(&mut store, &mut draws, buffers);
     assert_eq!(store.registered(), registered);

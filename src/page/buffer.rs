@@ -2,8 +2,8 @@
 //!
 //! Invariants: 1. the first byte lies on a multiple of [`ALIGNMENT`], and stays there when the buffer is moved: the bytes
 //! live elsewhere; 2. the length is a multiple of [`ALIGNMENT`]; 3. a fresh buffer is zero; 4. a mapped one takes memory from
-//! the machine only as it is written to (in pieces of 2 MiB, where the system makes huge pages unasked), and gives all of it
-//! back at its end, whatever the heap looks like by then; of one that a ring has registered, once the ring has been used again.
+//! the machine only as it is written to, never in huge pages that it would share with others, and gives all of it back at its
+//! end, whatever the heap looks like by then; of one that a ring has registered, once the ring has been used again.
 
 #[cfg(target_os = "linux")]
 use super::registered::Registration;
@@ -46,6 +46,11 @@ impl PageBuffer {
     pub fn mapped(bytes: usize) -> PageBuffer {
         let len = bytes.next_multiple_of(ALIGNMENT);
         let map = (len >= MAPPED_LEAST).then(|| MmapMut::map_anon(len).ok()).flatten();
+        #[cfg(target_os = "linux")]
+        if let Some(map) = &map {
+            // Refused by kernels without huge pages, which make none. Steps took as long with them.
+            let _ = map.advise(memmap2::Advice::NoHugePage);
+        }
         match map.filter(|map| map.as_ptr().align_offset(ALIGNMENT) == 0) {
             Some(map) => PageBuffer::of(Memory::Mapped(map), 0, len),
             None => PageBuffer::zeroed(bytes),

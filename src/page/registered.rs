@@ -7,7 +7,7 @@
 //!
 //! Invariants: 1. a number belongs to one buffer of one ring until that buffer has ended and its entry was cleared; 2. the
 //! kernel is told of a buffer that has ended when the ring is used next. It lets go of the memory then (Linux before 6.4:
-//! about a second later), but of a huge page, which several buffers may share, only with the last of them.
+//! about a second later).
 //!
 //! Safety: the kernel takes hold of the memory itself, not of the address: an entry whose buffer has ended names memory that
 //! nobody else has. Requests name addresses within the entry's buffer, which their flight owns.
