@@ -1,6 +1,7 @@
 //! Buffers that the kernel's ring knows beforehand: their memory is looked up and held once, not for every request.
 //!
-//! A buffer that stays (a frame's) is registered when it first moves mostly full, keeps its number in the ring's table as
+//! A buffer that stays (a frame's) is registered when it first moves, as far as bytes of it move, since the kernel takes all
+//! that it holds from the machine; it is registered again when more of it moves. It keeps its number in the ring's table as
 //! long as it lives, and is taken out of the table after its end. What the kernel holds counts against the limit on locked
 //! memory (`ulimit -l`) of whoever is bound by it: after a few refusals no more buffers are offered until others have ended,
 //! and those without a number move by requests that name their memory.
@@ -33,6 +34,8 @@ type Ended = Arc<Mutex<Vec<u16>>>;
 #[derive(Debug)]
 pub struct Registration {
     number: u16,
+    /// Bytes that the kernel holds, from the start.
+    bytes: usize,
     ended: Ended,
 }
 
@@ -73,29 +76,34 @@ impl RegisteredBuffers {
         usize::from(self.used) - self.clear.len()
     }
 
-    /// The number of a buffer of which `bytes` bytes will move; `None` for one that is not registered.
+    /// The number of a buffer whose first `bytes` bytes will move; `None` where these are not registered.
     pub fn number_of(&mut self, ring: &Submitter<'_>, buffer: &mut PageBuffer, bytes: usize) -> Option<u16> {
         self.clear_ended(ring);
         let own = buffer.registration.as_ref().filter(|r| Arc::ptr_eq(&r.ended, &self.ended));
-        if let Some(registration) = own {
-            return Some(registration.number);
+        let own = own.map(|registration| (registration.number, registration.bytes));
+        if let Some((number, _)) = own.filter(|&(_, held)| held >= bytes) {
+            return Some(number);
         }
-        // The kernel would take all of a buffer's memory from the machine, also what pages with few rows never touch.
-        let is_worth_it = buffer.is_mapped() && 2 * bytes >= buffer.len() && buffer.len() <= BYTES_MAX;
-        if !self.is_there || self.refusals >= REFUSALS_MAX || !is_worth_it {
+        let may_be = self.is_there && self.refusals < REFUSALS_MAX;
+        if !may_be || !buffer.is_mapped() || bytes > BYTES_MAX.min(buffer.len()) {
             return None;
         }
-        let number = self.clear.pop().or_else(|| (self.used < ENTRIES).then_some(self.used))?;
+        let unused = || (self.used < ENTRIES).then_some(self.used);
+        let number = own.map(|(number, _)| number).or_else(|| self.clear.pop()).or_else(unused)?;
         self.used = self.used.max(number + 1);
-        let memory = buffer.as_mut_slice();
-        let entry = libc::iovec { iov_base: memory.as_mut_ptr().cast(), iov_len: memory.len() };
+        let entry = libc::iovec { iov_base: buffer.as_mut_slice().as_mut_ptr().cast(), iov_len: bytes };
         if set(ring, number, entry).is_err() {
             self.refusals += 1;
-            self.clear.push(number);
+            if own.is_none() {
+                self.clear.push(number);
+            }
             return None;
         }
         self.refusals = 0;
-        buffer.registration = Some(Registration { number, ended: Arc::clone(&self.ended) });
+        match &mut buffer.registration {
+            Some(registration) if own.is_some() => registration.bytes = bytes,
+            other => *other = Some(Registration { number, bytes, ended: Arc::clone(&self.ended) }),
+        }
         Some(number)
     }
 
