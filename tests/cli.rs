@@ -428,3 +428,15 @@ fn a_reader_that_has_gone_is_no_error() {
         assert!(output.status.success() && !errors.contains("panicked"), "{program}: {errors}");
     }
 }
+
+/// What was asked for and cannot be written is an error that says so.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_full_standard_output_is_an_error() {
+    let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
+    let mut program = std::process::Command::new(env!("CARGO_BIN_EXE_gsscale-bench"));
+    let output = program.args(["touched", "--rows", "500", "--rounds", "1"]).stdout(full).output().unwrap();
+    let errors = stderr(&output);
+    assert!(!output.status.success() && errors.contains("standard output") && errors.contains("remedy"), "{errors}");
+    assert!(!errors.contains("panicked"), "{errors}");
+}
