@@ -197,38 +197,97 @@ fn reading_any_number_of_times_changes_no_bit_and_late_equals_on_time() {
     assert_eq!(evaluate_all(&quiet, &adam, 3000), evaluate_all(&read, &adam, 3000));
 }
 
-#[test]
-fn the_same_bits_on_every_instruction_path_and_from_every_way_of_reading() {
-    let (rows, degree) = (2100, 3);
+/// All floats of a state, and its stamps.
+fn bits_of(state: &SceneState) -> Vec<u32> {
+    let tables = [&state.columns, &state.exp_avg, &state.exp_avg_sq];
+    let floats = tables.iter().flat_map(|t| Column::ALL.into_iter().flat_map(|c| t.column(c)));
+    floats.map(|x| x.to_bits()).chain(state.stamp.iter().copied()).collect()
+}
+
+/// Rows some of whose values are too small for a normal float, or are log-scales beyond their limits.
+fn eventful_start(degree: u8) -> SceneState {
+    let mut state = SceneState::from_columns(random_columns(2100, degree, 1.0, 3));
+    for column in Column::ALL {
+        state.columns.column_mut(column).iter_mut().step_by(37).for_each(|x| *x = 1e-40);
+    }
+    state.columns.scales.iter_mut().step_by(41).for_each(|x| *x = if *x < 0.0 { -80.0 } else { 80.0 });
+    state
+}
+
+/// 60 steps with what each loop has a branch for: rows without a gradient and with one that is skipped, first moments of
+/// zero, seconds that eps touches.
+fn eventful_steps(simd: SimdPath, degree: u8, moments: Moments) -> (DeferredAdam, SceneState, [usize; 2]) {
     // eps of 1e-8 so that some rows (gradients down to 1e-7) take the direct sum.
     let config = AdamConfig { eps: 1e-8, ..AdamConfig::default() };
-    let run = |simd: SimdPath| {
-        let adam = DeferredAdam::new(Rates::new(1.0, 100), config, simd);
-        let mut state = SceneState::from_columns(random_columns(rows, degree, 1.0, 3));
-        for step in 0..60 {
-            let listed: Vec<u32> = (0..rows as u32).filter(|r| (r * 7 + step) % 11 < 3).collect();
-            adam.step(&mut state, &listed, &grads_at(&listed, degree, step), step);
+    let adam = DeferredAdam::new(Rates::new(1.0, 100), config, simd).with_moments(moments);
+    let mut state = eventful_start(degree);
+    let rows = state.rows();
+    let mut counts = [0, 0];
+    for step in 0..60 {
+        let listed: Vec<u32> = (0..rows as u32).filter(|r| (r * 7 + step) % 11 < 3).collect();
+        let mut grads = grads_at(&listed, degree, step);
+        for i in (0..listed.len()).step_by(5) {
+            match i % 3 {
+                0 => Column::ALL.into_iter().for_each(|column| grads.row_mut(column, i).fill(0.0)),
+                1 => grads.row_mut(Column::Sh0, i)[2] = f32::NAN,
+                _ => grads.row_mut(Column::Means, i)[1] = 0.0,
+            }
         }
-        (adam, state)
-    };
-    let (adam, state) = run(SimdPath::Baseline);
-    for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
-        assert!(run(simd).1 == state, "{}", simd.name());
+        let of_step = adam.step(&mut state, &listed, &grads, step);
+        counts = [counts[0] + of_step.updated, counts[1] + of_step.skipped_non_finite];
     }
-    for now in [60, 61, 77, 459, 460, 461, 5000] {
-        let all = evaluate_all(&state, &adam, now);
-        let at = adam.at(now);
-        for row in (0..rows).step_by(13) {
-            let mut block = [0.0; BLOCK_LANES];
-            at.evaluate_row(&state.view(), row, &mut block);
-            for column in Column::ALL {
-                for (i, &x) in all.row(column, row).iter().enumerate() {
-                    assert_eq!(x.to_bits(), block[first_lane(column) + i].to_bits());
-                    assert_eq!(x.to_bits(), at.evaluate_element(&state.view(), column, row, i).to_bits());
-                    let (m, v) = (state.exp_avg.row(column, row)[i], state.exp_avg_sq.row(column, row)[i]);
-                    let value = state.columns.row(column, row)[i];
-                    let one = adam.evaluate(column, value, m, v, state.stamp[row], now);
-                    assert_eq!(x.to_bits(), one.to_bits());
+    (adam, state, counts)
+}
+
+/// Rows of a list of any order, with rows that are listed twice, after `now` steps.
+fn evaluate_listed(state: &SceneState, adam: &DeferredAdam, now: u32) -> Columns {
+    let rows = state.rows();
+    let mut out = Columns::zeros(rows + 130, state.sh_degree());
+    adam.at(now).evaluate_rows(state.view(), |i| (rows - 1 - i % rows) * 11 % rows, out.view_mut());
+    out
+}
+
+#[test]
+fn the_same_bits_on_every_instruction_path_whatever_happens_to_rows() {
+    for (degree, moments) in [(0, Moments::F32), (1, Moments::F32), (2, Moments::Bf16), (3, Moments::F32)] {
+        let (plain, state, counts) = eventful_steps(SimdPath::Baseline, degree, moments);
+        assert!(counts[0] > 10_000 && counts[1] > 1000, "{counts:?}");
+        for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+            let (adam, same, same_counts) = eventful_steps(simd, degree, moments);
+            assert!(bits_of(&same) == bits_of(&state), "{} at degree {degree}", simd.name());
+            assert_eq!(same_counts, counts);
+            let start = eventful_start(degree);
+            for now in [0, 58, 59, 60, 61, 77, 459, 460, 5000] {
+                let state = if now == 0 { &start } else { &state };
+                let (want, got) = (evaluate_listed(state, &plain, now), evaluate_listed(state, &adam, now));
+                for column in Column::ALL {
+                    let bits = |c: &Columns| -> Vec<u32> { c.column(column).iter().map(|x| x.to_bits()).collect() };
+                    assert!(bits(&got) == bits(&want), "{} at degree {degree}: {column:?} at {now}", simd.name());
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn the_same_bits_from_every_way_of_reading() {
+    for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+        let (adam, state, _) = eventful_steps(simd, 3, Moments::F32);
+        for now in [60, 61, 77, 459, 460, 461, 5000] {
+            let all = evaluate_all(&state, &adam, now);
+            let at = adam.at(now);
+            for row in (0..state.rows()).step_by(13) {
+                let mut block = [0.0; BLOCK_LANES];
+                at.evaluate_row(&state.view(), row, &mut block);
+                for column in Column::ALL {
+                    for (i, &x) in all.row(column, row).iter().enumerate() {
+                        assert_eq!(x.to_bits(), block[first_lane(column) + i].to_bits());
+                        assert_eq!(x.to_bits(), at.evaluate_element(&state.view(), column, row, i).to_bits());
+                        let (m, v) = (state.exp_avg.row(column, row)[i], state.exp_avg_sq.row(column, row)[i]);
+                        let value = state.columns.row(column, row)[i];
+                        let one = adam.evaluate(column, value, m, v, state.stamp[row], now);
+                        assert_eq!(x.to_bits(), one.to_bits());
+                    }
                 }
             }
         }

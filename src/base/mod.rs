@@ -1,6 +1,8 @@
 //! What every layer may use: errors, random draws, deterministic math, instruction paths, sizes.
 //! Nothing here knows a Gaussian, a picture or a disk format.
 
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod eight;
 pub mod error;
 pub mod ids;
 pub mod machine;

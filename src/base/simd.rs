@@ -6,7 +6,7 @@
 //! roundings on the baseline. So AVX2 and AVX-512 give the same bits as each other; the baseline gives others.
 //! Bits are promised per path, and the path is recorded in the run's config.
 //!
-//! The `unsafe` of the crate's compute half lives here and nowhere else.
+//! The `unsafe` of the crate's compute half lives here and in `eight`, and nowhere else.
 #![allow(unsafe_code)] // calling a function compiled for a detected instruction set
 
 use std::sync::OnceLock;

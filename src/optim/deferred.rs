@@ -13,8 +13,12 @@ use super::drift::{Drift, DriftTables, EpsFloor, RECENT, drifted, flush, needs_d
 use super::lanes::SizeRows;
 use super::moments::{Moments, round_block};
 use super::rates::Rates;
+#[cfg(target_arch = "x86_64")]
+use super::row_eights::Eights;
 use super::row_kernels::{EvaluateRows, OfLanes, StepRows, evaluate_block};
-use crate::base::simd::{SimdPath, dispatch};
+#[cfg(target_arch = "x86_64")]
+use crate::base::eight::{EightKernel, with_avx2};
+use crate::base::simd::{Kernel, SimdPath, dispatch};
 use crate::scene::columns::{Column, Columns};
 use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, RowsNow, first_lane};
 use crate::scene::state::SceneState;
@@ -254,10 +258,10 @@ impl<'a> AdamNow<'a> {
         );
         debug_assert!(self.are_values_of(&view.as_ref(), rows, &values), "values of another step");
         match degree {
-            0 => dispatch(self.adam.simd, StepRows::<0> { at: self, view, rows, values, grads }),
-            1 => dispatch(self.adam.simd, StepRows::<9> { at: self, view, rows, values, grads }),
-            2 => dispatch(self.adam.simd, StepRows::<24> { at: self, view, rows, values, grads }),
-            _ => dispatch(self.adam.simd, StepRows::<45> { at: self, view, rows, values, grads }),
+            0 => over_rows(self.adam.simd, StepRows::<0> { at: self, view, rows, values, grads }),
+            1 => over_rows(self.adam.simd, StepRows::<9> { at: self, view, rows, values, grads }),
+            2 => over_rows(self.adam.simd, StepRows::<24> { at: self, view, rows, values, grads }),
+            _ => over_rows(self.adam.simd, StepRows::<45> { at: self, view, rows, values, grads }),
         }
     }
 
@@ -274,10 +278,10 @@ impl<'a> AdamNow<'a> {
     pub fn evaluate_rows(&self, view: Rows<'_>, row_of: impl Fn(usize) -> usize, out: ColumnsMut<'_>) {
         assert_eq!(view.columns.sh_degree, out.sh_degree, "values of another degree");
         match out.sh_degree {
-            0 => dispatch(self.adam.simd, EvaluateRows::<0, _> { at: self, view, row_of, out }),
-            1 => dispatch(self.adam.simd, EvaluateRows::<9, _> { at: self, view, row_of, out }),
-            2 => dispatch(self.adam.simd, EvaluateRows::<24, _> { at: self, view, row_of, out }),
-            _ => dispatch(self.adam.simd, EvaluateRows::<45, _> { at: self, view, row_of, out }),
+            0 => over_rows(self.adam.simd, EvaluateRows::<0, _> { at: self, view, row_of, out }),
+            1 => over_rows(self.adam.simd, EvaluateRows::<9, _> { at: self, view, row_of, out }),
+            2 => over_rows(self.adam.simd, EvaluateRows::<24, _> { at: self, view, row_of, out }),
+            _ => over_rows(self.adam.simd, EvaluateRows::<45, _> { at: self, view, row_of, out }),
         }
     }
 
@@ -340,4 +344,24 @@ impl RowsNow for AdamNow<'_> {
         rows.exp_avg_sq.store_row_any(row, &v);
         rows.stamp[row] = self.now;
     }
+}
+
+/// Runs a loop over rows in the form that is written for the path.
+#[cfg(target_arch = "x86_64")]
+#[inline]
+fn over_rows<K: Kernel>(path: SimdPath, kernel: K) -> K::Out
+where
+    Eights<K>: EightKernel<Out = K::Out>,
+{
+    if path != SimdPath::Avx2 {
+        return dispatch(path, kernel);
+    }
+    with_avx2(Eights(kernel)).unwrap_or_else(|Eights(kernel)| dispatch(path, kernel))
+}
+
+/// Runs a loop over rows.
+#[cfg(not(target_arch = "x86_64"))]
+#[inline]
+fn over_rows<K: Kernel>(path: SimdPath, kernel: K) -> K::Out {
+    dispatch(path, kernel)
 }

@@ -8,5 +8,7 @@ pub(crate) mod lanes;
 pub mod method;
 pub mod moments;
 pub mod rates;
+#[cfg(target_arch = "x86_64")]
+mod row_eights;
 mod row_kernels;
 mod row_vectors;

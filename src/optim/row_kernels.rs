@@ -2,7 +2,7 @@
 //! step, compiled for every instruction path.
 //!
 //! A row is worked on in whole vectors ([`super::row_vectors`]), which where there are registers enough (AVX-512) stay in
-//! them from load to store.
+//! them from load to store. With AVX2 there are not; there these loops are those of `super::row_eights`.
 //!
 //! The step takes the values of its rows from whoever forwarded them: to find them again would cost a second root and a
 //! second quotient for every value.
@@ -25,13 +25,13 @@ use crate::scene::rows::{
 
 /// Gradients beyond this are treated like non-finite ones: their square must not overflow the second moment. With it
 /// every number that an update computes from finite state is finite.
-const LARGEST_GRAD: f32 = 1e18;
+pub(super) const LARGEST_GRAD: f32 = 1e18;
 /// Log-scales are kept within this at every update: standard deviations of 1e-13 to 1e13 scene units, whose squares
 /// and projections stay finite. Out of reach of training that works.
 const LOG_SCALE_LIMIT: f32 = 30.0;
 
 /// Rows that are asked for ahead of their turn.
-const AHEAD: usize = 8;
+pub(super) const AHEAD: usize = 8;
 /// The sign of a float.
 const SIGN: u32 = 1 << 31;
 
@@ -122,7 +122,7 @@ fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>) -> Option<RowVecto
 /// function cannot stay in registers.
 #[cold]
 #[inline(never)]
-fn evaluate_alone<const W: usize>(at: &AdamNow<'_>, view: &Rows<'_>, row: usize) -> RowVectors<W> {
+pub(super) fn evaluate_alone<const W: usize>(at: &AdamNow<'_>, view: &Rows<'_>, row: usize) -> RowVectors<W> {
     let mut now = [0.0; BLOCK_LANES];
     at.evaluate_row(view, row, &mut now);
     RowVectors::of_block(&now)
@@ -184,7 +184,7 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
         let (value, grad) = (Table::<W>::new(&values, rows.len()), Table::<W>::new(&grads, rows.len()));
         let stamp = &mut view.stamp[..count];
         let constants = StepConstants::new(at);
-        let (mut skipped, mut updated) = (0, 0);
+        let mut counts = StepCounts::default();
         for (i, &row) in before.iter().enumerate() {
             if let Some(&coming) = rows.get(i + AHEAD) {
                 let coming = coming as usize - first_row;
@@ -201,10 +201,10 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
             let g = grad.load(i);
             let kind = GradKind::of(&g);
             if kind != GradKind::Usable {
-                skipped += usize::from(kind == GradKind::Bad);
+                counts.skipped_non_finite += usize::from(kind == GradKind::Bad);
                 continue;
             }
-            updated += 1;
+            counts.updated += 1;
             // Before the loads, so that nothing comes between them and what is done with them.
             let powers = at.adam().beta_power(at.now().saturating_sub(stamp[row]));
             let mut now = value.load(i);
@@ -215,26 +215,39 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
             exp_avg_sq.store(row, &v);
             stamp[row] = at.now() + 1;
         }
-        let kind = step_last::<W>(at, &constants, &mut view, last as usize - first_row, &values, &grads);
-        if at.adam().moments() == Moments::Bf16 {
-            // In a loop of its own, which leaves the other one its registers.
-            for row in rows.iter().map(|&row| row as usize - first_row) {
-                // Stamps are not ahead of now but for those of this step.
-                if view.stamp[row] > at.now() {
-                    round_row::<W>(&mut view.exp_avg, &mut view.exp_avg_sq, row, view.uid[row], at.now() + 1);
-                }
+        finish_step::<W>(at, &constants, &mut view, (rows, last), [&values, &grads], counts)
+    }
+}
+
+/// What remains when the step has been taken on all listed `rows` but the last.
+#[inline(always)]
+pub(super) fn finish_step<const W: usize>(
+    at: &AdamNow<'_>,
+    constants: &StepConstants,
+    view: &mut RowsMut<'_>,
+    (rows, last): (&[u32], u32),
+    [values, grads]: [&ColumnsRef<'_>; 2],
+    counts: StepCounts,
+) -> StepCounts {
+    let kind = step_last::<W>(at, constants, view, last as usize - view.first_row, values, grads);
+    if at.adam().moments() == Moments::Bf16 {
+        // In a loop of its own, which leaves the other one its registers.
+        for row in rows.iter().map(|&row| row as usize - view.first_row) {
+            // Stamps are not ahead of now but for those of this step.
+            if view.stamp[row] > at.now() {
+                round_row::<W>(&mut view.exp_avg, &mut view.exp_avg_sq, row, view.uid[row], at.now() + 1);
             }
         }
-        StepCounts {
-            updated: updated + usize::from(kind == GradKind::Usable),
-            skipped_non_finite: skipped + usize::from(kind == GradKind::Bad),
-        }
+    }
+    StepCounts {
+        updated: counts.updated + usize::from(kind == GradKind::Usable),
+        skipped_non_finite: counts.skipped_non_finite + usize::from(kind == GradKind::Bad),
     }
 }
 
 /// What a row's gradient is to it.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum GradKind {
+pub(super) enum GradKind {
     /// Zero in every column: the row is left as it is.
     Zero,
     /// Something to step by.
@@ -312,19 +325,19 @@ fn round_row<const W: usize>(m: &mut ColumnsMut<'_>, v: &mut ColumnsMut<'_>, row
 }
 
 /// Constants of one ordinary Adam step.
-struct StepConstants {
+pub(super) struct StepConstants {
     /// What the magnitudes of the narrow columns are kept within, by lane.
-    limits: [f32; LANES],
+    pub limits: [f32; LANES],
     /// lr / (1 - beta1^t).
-    sizes: OfLanes,
-    inv_root_correction: f32,
-    one_minus_b1: f32,
-    one_minus_b2: f32,
-    eps: f32,
+    pub sizes: OfLanes,
+    pub inv_root_correction: f32,
+    pub one_minus_b1: f32,
+    pub one_minus_b2: f32,
+    pub eps: f32,
 }
 
 impl StepConstants {
-    fn new(at: &AdamNow<'_>) -> Self {
+    pub fn new(at: &AdamNow<'_>) -> Self {
         let (tables, now) = (at.adam().tables(), at.now());
         let [inv_bias1, inv_root] = tables.bias(now + 1);
         let AdamConfig { beta1, beta2, eps } = tables.config();
