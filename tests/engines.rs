@@ -5,7 +5,7 @@
 
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::page::buffer::{ALIGNMENT, PageBuffer};
-use gsscale::page::engine::{IoEngine, open_engine};
+use gsscale::page::engine::{DEPTH, IoEngine, open_engine};
 use gsscale::page::memory_store::MemoryStore;
 use gsscale::page::mmap_store::MmapStore;
 use gsscale::page::pread_store::PreadStore;
@@ -377,6 +377,36 @@ fn auto_takes_what_works_and_says_what_does_not() {
     for engine in [IoEngine::Pread, IoEngine::Mmap, IoEngine::Memory] {
         let opened = open_engine(engine, folder.path(), 8).unwrap();
         assert_eq!(opened.store.name(), engine.name());
+    }
+}
+
+/// While a step computes nobody takes answers; the drive must have something to do all the same.
+#[test]
+fn three_times_the_usual_depth_moves_without_being_asked() {
+    const COUNT: usize = 3 * DEPTH;
+    const BYTES: usize = 64 << 10;
+    for engine in [IoEngine::Auto, IoEngine::Pread, IoEngine::Mmap] {
+        let folder = tempfile::tempdir().unwrap();
+        let mut store = open_engine(engine, folder.path(), DEPTH).unwrap().store;
+        store.create_segment(0, SEGMENT).unwrap();
+        let mut draws = Stream::new(1, Purpose::Test, 48, 0);
+        for i in 0..COUNT {
+            let buffer = random_buffer(&mut draws, BYTES);
+            store.submit(transfer(i as u64, Direction::Write, 0, (i * BYTES) as u64, buffer));
+        }
+        let file = folder.path().join(segment_file_name(0));
+        let is_written =
+            |bytes: &[u8]| bytes.chunks(BYTES).take(COUNT).all(|at| at[BYTES - 64..].iter().any(|&b| b != 0));
+        let began = std::time::Instant::now();
+        while !is_written(&std::fs::read(&file).unwrap()) {
+            assert!(began.elapsed().as_secs() < 20, "{}: some of {COUNT} writes wait to be asked for", store.name());
+            std::thread::sleep(std::time::Duration::from_millis(20));
+        }
+        let mut done = Vec::new();
+        while store.in_flight() > 0 {
+            store.complete(true, &mut done);
+        }
+        assert!(done.len() == COUNT && done.iter().all(|end| end.result.is_ok()));
     }
 }
 
