@@ -10,7 +10,7 @@ use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::moments::Moments;
 use gsscale::optim::rates::Rates;
 use gsscale::scene::columns::{Column, Columns};
-use gsscale::scene::rows::{BLOCK_LANES, RowsNow, first_lane};
+use gsscale::scene::rows::{BLOCK_LANES, RowsMut, RowsNow, first_lane};
 use gsscale::scene::state::SceneState;
 use gsscale::train::catch_up;
 
@@ -214,6 +214,27 @@ fn eventful_start(degree: u8) -> SceneState {
     state
 }
 
+/// Gradients that decide what is done with their row: what all values are set to, if anything, then a column, a place in
+/// its row (0 the first, 1 the last value) and the value there.
+const ODD_GRADS: [(Option<f32>, Column, f64, f32); 16] = [
+    (Some(0.0), Column::Means, 0.0, 0.0),
+    (Some(-0.0), Column::Means, 0.0, 0.0),
+    (Some(0.0), Column::ShN, 1.0, 1e-3),
+    (Some(0.0), Column::ShN, 0.0, 1e-3),
+    (Some(0.0), Column::Scales, 1.0, 1e-3),
+    (Some(0.0), Column::Sh0, 1.0, 1e-3),
+    (Some(0.0), Column::Opacities, 0.0, -1e-3),
+    (Some(0.0), Column::Quats, 1.0, 1e-45),
+    (None, Column::Means, 0.5, 0.0),
+    (None, Column::Sh0, 1.0, f32::NAN),
+    (None, Column::ShN, 0.0, f32::NAN),
+    (None, Column::ShN, 1.0, -f32::NAN),
+    (None, Column::Quats, 0.0, f32::INFINITY),
+    (None, Column::Scales, 0.0, f32::NEG_INFINITY),
+    (None, Column::Means, 1.0, 1e18),
+    (None, Column::Means, 1.0, -1.0000001e18),
+];
+
 /// 60 steps with what each loop has a branch for: rows without a gradient and with one that is skipped, first moments of
 /// zero, seconds that eps touches.
 fn eventful_steps(simd: SimdPath, degree: u8, moments: Moments) -> (DeferredAdam, SceneState, [usize; 2]) {
@@ -226,11 +247,15 @@ fn eventful_steps(simd: SimdPath, degree: u8, moments: Moments) -> (DeferredAdam
     for step in 0..60 {
         let listed: Vec<u32> = (0..rows as u32).filter(|r| (r * 7 + step) % 11 < 3).collect();
         let mut grads = grads_at(&listed, degree, step);
-        for i in (0..listed.len()).step_by(5) {
-            match i % 3 {
-                0 => Column::ALL.into_iter().for_each(|column| grads.row_mut(column, i).fill(0.0)),
-                1 => grads.row_mut(Column::Sh0, i)[2] = f32::NAN,
-                _ => grads.row_mut(Column::Means, i)[1] = 0.0,
+        for (k, i) in (step as usize % 3..listed.len()).step_by(5).enumerate() {
+            let (others, column, of_row, value) = ODD_GRADS[k % ODD_GRADS.len()];
+            if let Some(others) = others {
+                Column::ALL.into_iter().for_each(|column| grads.row_mut(column, i).fill(others));
+            }
+            let row = grads.row_mut(column, i);
+            let at = ((row.len() as f64 - 1.0) * of_row) as usize;
+            if let Some(x) = row.get_mut(at) {
+                *x = value;
             }
         }
         let of_step = adam.step(&mut state, &listed, &grads, step);
@@ -318,7 +343,11 @@ fn settling_a_row_leaves_its_later_values_where_they_were() {
 
 #[test]
 fn gradients_that_are_not_finite_or_zero_leave_their_row_alone() {
-    let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), SimdPath::best());
+    SimdPath::ALL.into_iter().filter(|p| p.is_supported()).for_each(bad_gradients_leave_their_row_alone);
+}
+
+fn bad_gradients_leave_their_row_alone(simd: SimdPath) {
+    let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), simd);
     let mut state = SceneState::from_columns(random_columns(6, 3, 1.0, 5));
     state.columns.scales[15] = 80.0;
     let all: Vec<u32> = (0..6).collect();
@@ -347,13 +376,17 @@ fn gradients_that_are_not_finite_or_zero_leave_their_row_alone() {
 /// A row is loaded together with a little of the one behind it, and the last row of a table is worked on by other code.
 #[test]
 fn a_row_comes_to_the_same_whatever_rows_lie_beside_it() {
+    SimdPath::ALL.into_iter().filter(|p| p.is_supported()).for_each(rows_beside_it_change_no_bit);
+}
+
+fn rows_beside_it_change_no_bit(simd: SimdPath) {
     let bits = |values: &[f32]| -> Vec<u32> { values.iter().map(|x| x.to_bits()).collect() };
     for (degree, moments, eps) in
         [(0, Moments::F32, 1e-15), (1, Moments::F32, 1e-8), (2, Moments::Bf16, 1e-15), (3, Moments::F32, 1e-8)]
     {
         let rows = 23;
         let config = AdamConfig { eps, ..AdamConfig::default() };
-        let adam = DeferredAdam::new(Rates::new(1.0, 2000), config, SimdPath::best()).with_moments(moments);
+        let adam = DeferredAdam::new(Rates::new(1.0, 2000), config, simd).with_moments(moments);
         let mut together = SceneState::from_columns(random_columns(rows, degree, 1.0, 8));
         let mut alone: Vec<SceneState> = (0..rows as u32).map(|row| together.select(&[row])).collect();
         for (step, now) in [3, 4, 40, 900].into_iter().enumerate() {
@@ -401,6 +434,33 @@ fn a_list_that_does_not_ascend_is_refused_before_any_row_is_changed() {
         let step = std::panic::AssertUnwindSafe(|| adam.step(&mut state, &list, &grads, 9));
         assert!(std::panic::catch_unwind(step).is_err(), "{list:?}");
         assert_eq!(state, before, "{list:?}");
+    }
+}
+
+/// A view of rows 3000 to 5200 of a table, which is worked on in pieces.
+#[test]
+fn a_list_that_does_not_fit_the_view_is_refused_before_any_row_is_changed() {
+    for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+        let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), simd);
+        let all: Vec<u32> = (3000..5200).collect();
+        let (grads, values) = (grads_at(&all, 3, 0), random_columns(all.len(), 3, 1.0, 5));
+        let start = SceneState::from_columns(values.clone());
+        for (shift, swapped, is_right) in
+            [(0, None, true), (-1, None, false), (1, None, false), (0, Some(2100), false), (0, Some(10), false)]
+        {
+            let mut list: Vec<u32> = all.iter().map(|&row| (i64::from(row) + shift) as u32).collect();
+            if let Some(at) = swapped {
+                list.swap(at, at + 1);
+            }
+            let mut state = start.clone();
+            let step = std::panic::AssertUnwindSafe(|| {
+                let view = RowsMut { first_row: 3000, ..state.view_mut() };
+                adam.at(9).step_rows(view, &list, values.view(), grads.view())
+            });
+            let counts = std::panic::catch_unwind(step).ok().map(|counts| counts.updated);
+            assert_eq!(counts, is_right.then_some(all.len()), "{} {shift} {swapped:?}", simd.name());
+            assert_eq!(bits_of(&state) == bits_of(&start), !is_right, "{} {shift} {swapped:?}", simd.name());
+        }
     }
 }
 

@@ -1,11 +1,11 @@
 //! Eight floats in one register of AVX2, for the loops in which what the compiler makes of arrays is not good enough.
 //!
-//! Values come from an [`Avx2`] alone, and that comes from [`with_avx2`] alone, inside a function compiled for it: whoever
-//! holds a value runs on a processor that has the instructions. Every operation is one or two of them; comparisons give
-//! lanes of all ones or all zeros.
+//! Values come from an [`Avx2`] alone, and that comes from [`with_avx2`] alone, inside a function compiled for it:
+//! whoever holds a value runs on a processor that has the instructions. Every operation is one or two of them;
+//! comparisons give lanes of all ones or all zeros.
 //!
-//! Not here: what is computed. Invariant: sums, differences, products, quotients and roots round as those of `f32` do, lane
-//! by lane, and nothing is contracted; so a loop of these gives the bits of a plain one.
+//! Not here: what is computed. Invariant: sums, differences, products, quotients and roots round as those of `f32` do,
+//! lane by lane, and nothing is contracted; so a loop of these gives the bits of a plain one.
 #![allow(unsafe_code)] // instructions that not every processor has
 
 use super::simd::SimdPath;
@@ -22,7 +22,8 @@ pub struct Avx2(());
 pub trait EightKernel {
     /// What it returns.
     type Out;
-    /// The work. Mark the implementation, and every function it calls in its inner loop, `#[inline(always)]`.
+    /// The work. Mark the implementation, and every function it calls in its inner loop, `#[inline(always)]`: what is not
+    /// inlined is compiled without the instructions, and gets its values through memory.
     fn run(self, avx2: Avx2) -> Self::Out;
 }
 
@@ -36,7 +37,8 @@ pub fn with_avx2<K: EightKernel>(kernel: K) -> Result<K::Out, K> {
     Ok(unsafe { run(kernel) })
 }
 
-#[target_feature(enable = "avx2,fma")]
+// Without fma, which `SimdPath::Avx2` has as well: nothing can be contracted then.
+#[target_feature(enable = "avx2")]
 fn run<K: EightKernel>(kernel: K) -> K::Out {
     kernel.run(Avx2(()))
 }
@@ -120,11 +122,9 @@ impl Eight {
         at_most(b) = _mm256_cmp_ps::<_CMP_LE_OQ>;
         /// Where the lane is not less than that of `b`: so where one is no number, too.
         not_less(b) = _mm256_cmp_ps::<_CMP_NLT_UQ>;
-        /// Where the lane is not at most that of `b`: so where one is no number, too.
-        not_at_most(b) = _mm256_cmp_ps::<_CMP_NLE_UQ>;
-        /// The smaller one; `b` where one is no number.
+        /// The smaller one; `b` where they are equal or one is no number.
         smaller(b) = _mm256_min_ps;
-        /// The larger one; `b` where one is no number.
+        /// The larger one; `b` where they are equal or one is no number.
         larger(b) = _mm256_max_ps;
     }
 
@@ -157,6 +157,26 @@ impl Eight {
     pub fn any(self) -> bool {
         // SAFETY: AVX, which there is: only an `Avx2` makes values.
         unsafe { _mm256_testz_ps(self.0, self.0) == 0 }
+    }
+
+    /// Whether a bit of a lane is set.
+    #[inline(always)]
+    pub fn any_bit(self) -> bool {
+        // SAFETY: AVX, which there is: only an `Avx2` makes values.
+        unsafe {
+            let bits = _mm256_castps_si256(self.0);
+            _mm256_testz_si256(bits, bits) == 0
+        }
+    }
+
+    /// Whether the bits of a lane are above `most` as whole numbers.
+    #[inline(always)]
+    pub fn any_bits_above(self, most: i32) -> bool {
+        // SAFETY: AVX2, which there is: only an `Avx2` makes values.
+        unsafe {
+            let above = _mm256_cmpgt_epi32(_mm256_castps_si256(self.0), _mm256_set1_epi32(most));
+            _mm256_testz_si256(above, above) == 0
+        }
     }
 
     /// To memory.
@@ -192,9 +212,10 @@ impl Eight {
 /// The first three lanes.
 #[inline(always)]
 fn store_three(from: __m128, to: &mut [f32; 3]) {
-    // SAFETY: SSE4.1, which there is where an `Eight` was; two of the three floats of `to` are written.
+    // SAFETY: SSE4.1, which there is where an `Eight` was; two of the three floats of `to` are written, by an instruction that
+    // takes any address (that of doubles, `_mm_storel_pd`, wants one that is a multiple of 8 in Rust).
     unsafe {
-        _mm_storel_pd(to.as_mut_ptr().cast(), _mm_castps_pd(from));
+        _mm_storeu_si64(to.as_mut_ptr().cast(), _mm_castps_si128(from));
         to[2] = f32::from_bits(_mm_extract_ps::<2>(from) as u32);
     }
 }

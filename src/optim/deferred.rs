@@ -10,11 +10,11 @@
 
 use super::adam::AdamConfig;
 use super::drift::{Drift, DriftTables, EpsFloor, RECENT, drifted, flush, needs_direct_sum};
+#[cfg(target_arch = "x86_64")]
+use super::eights::Eights;
 use super::lanes::SizeRows;
 use super::moments::{Moments, round_block};
 use super::rates::Rates;
-#[cfg(target_arch = "x86_64")]
-use super::row_eights::Eights;
 use super::row_kernels::{EvaluateRows, OfLanes, StepRows, evaluate_block};
 #[cfg(target_arch = "x86_64")]
 use crate::base::eight::{EightKernel, with_avx2};
@@ -220,8 +220,27 @@ impl<'a> AdamNow<'a> {
     /// The step on a view of rows: as [`DeferredAdam::step`], `rows` counted in the table that the view was cut from, each
     /// larger than the one before. `values` are the listed rows as they are now, as [`AdamNow::evaluate_rows`] gives them:
     /// whoever has gradients had these before. Panics when the numbers of rows, or the degrees, do not fit each other, and
-    /// when the list does not ascend.
+    /// when the list does not ascend or names rows that the view has not; no row is changed then.
     pub fn step_rows(
+        &self,
+        view: RowsMut<'_>,
+        rows: &[u32],
+        values: ColumnsRef<'_>,
+        grads: ColumnsRef<'_>,
+    ) -> StepCounts {
+        let (Some(&first), Some(&last)) = (rows.first(), rows.last()) else { return StepCounts::default() };
+        let degree = view.columns.sh_degree;
+        // All of this before any row is changed: none is to be left with half a step.
+        assert_eq!([values.rows(), grads.rows()], [rows.len(); 2], "values and gradients of the listed rows");
+        assert_eq!([values.sh_degree, grads.sh_degree], [degree; 2], "values or gradients of another degree");
+        assert!(rows.is_sorted_by(|a, b| a < b), "listed rows ascend");
+        let of_view = view.first_row..view.first_row + view.rows();
+        assert!(of_view.contains(&(first as usize)) && of_view.contains(&(last as usize)), "listed rows of the view");
+        self.step_checked(view, rows, values, grads)
+    }
+
+    /// [`AdamNow::step_rows`] on a list that fits the view.
+    fn step_checked(
         &self,
         view: RowsMut<'_>,
         rows: &[u32],
@@ -240,24 +259,20 @@ impl<'a> AdamNow<'a> {
             let (head_values, tail_values) = values.split_at(listed);
             let (head_grads, tail_grads) = grads.split_at(listed);
             let (a, b) = rayon::join(
-                || self.step_rows(head, &rows[..listed], head_values, head_grads),
-                || self.step_rows(tail, &rows[listed..], tail_values, tail_grads),
+                || self.step_checked(head, &rows[..listed], head_values, head_grads),
+                || self.step_checked(tail, &rows[listed..], tail_values, tail_grads),
             );
             return StepCounts {
                 updated: a.updated + b.updated,
                 skipped_non_finite: a.skipped_non_finite + b.skipped_non_finite,
             };
         }
-        let degree = view.columns.sh_degree;
-        assert_eq!([values.rows(), grads.rows()], [rows.len(); 2], "values and gradients of the listed rows");
-        assert_eq!([values.sh_degree, grads.sh_degree], [degree; 2], "values or gradients of another degree");
-        assert!(rows.is_sorted_by(|a, b| a < b), "listed rows ascend");
         debug_assert!(
             rows.iter().all(|&row| view.stamp[row as usize - view.first_row] <= self.now),
             "a step taken twice"
         );
         debug_assert!(self.are_values_of(&view.as_ref(), rows, &values), "values of another step");
-        match degree {
+        match view.columns.sh_degree {
             0 => over_rows(self.adam.simd, StepRows::<0> { at: self, view, rows, values, grads }),
             1 => over_rows(self.adam.simd, StepRows::<9> { at: self, view, rows, values, grads }),
             2 => over_rows(self.adam.simd, StepRows::<24> { at: self, view, rows, values, grads }),
@@ -274,7 +289,8 @@ impl<'a> AdamNow<'a> {
     }
 
     /// Evaluates rows into `out`: its row i is row `row_of(i)` of the view (counted from its first) as it is now, in any
-    /// order. Panics at rows that the view has not, and when the degrees differ.
+    /// order. `row_of` is asked several times for a row: it is to be cheap, and to answer alike. Panics at rows that the
+    /// view has not, and when the degrees differ.
     pub fn evaluate_rows(&self, view: Rows<'_>, row_of: impl Fn(usize) -> usize, out: ColumnsMut<'_>) {
         assert_eq!(view.columns.sh_degree, out.sh_degree, "values of another degree");
         match out.sh_degree {
@@ -356,7 +372,7 @@ where
     if path != SimdPath::Avx2 {
         return dispatch(path, kernel);
     }
-    with_avx2(Eights(kernel)).unwrap_or_else(|Eights(kernel)| dispatch(path, kernel))
+    with_avx2(Eights(kernel)).unwrap_or_else(|Eights(kernel)| dispatch(SimdPath::Baseline, kernel))
 }
 
 /// Runs a loop over rows.

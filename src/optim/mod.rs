@@ -4,11 +4,11 @@ pub mod adam;
 pub mod bounds;
 pub mod deferred;
 pub mod drift;
+#[cfg(target_arch = "x86_64")]
+mod eights;
 pub(crate) mod lanes;
 pub mod method;
 pub mod moments;
 pub mod rates;
-#[cfg(target_arch = "x86_64")]
-mod row_eights;
 mod row_kernels;
 mod row_vectors;

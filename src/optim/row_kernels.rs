@@ -1,8 +1,8 @@
 //! The two loops that go through all the optimizer's bytes: forwarding (values of listed rows as they are now) and the
-//! step, compiled for every instruction path.
+//! step, as every instruction path but AVX2 runs them.
 //!
 //! A row is worked on in whole vectors ([`super::row_vectors`]), which where there are registers enough (AVX-512) stay in
-//! them from load to store. With AVX2 there are not; there these loops are those of `super::row_eights`.
+//! them from load to store. With AVX2 there are not: see `super::eights`.
 //!
 //! The step takes the values of its rows from whoever forwarded them: to find them again would cost a second root and a
 //! second quotient for every value.

@@ -3,9 +3,9 @@
 //!
 //! The narrow columns make one vector, `sh_n` the others. Where the last of these would not be full it starts earlier
 //! instead, and what it shares with the one before it comes to the same in both: so no load of `sh_n` has to wait for
-//! parts of a vector. That is right in place because a row, or at least its last vector, is loaded before any of it is stored. Columns of three
-//! values are loaded four at a time, the fourth being the first one of the row behind; so the last row of a table is left
-//! to [`RowVectors::of_block`].
+//! parts of a vector. That is right in place because a row, or at least its last vector, is loaded before any of it is
+//! stored. Columns of three values are loaded four at a time, the fourth being the first one of the row behind; so the
+//! last row of a table is left to [`RowVectors::of_block`].
 //!
 //! Invariants: 1. all columns of a [`Table`] have the same number of rows, so that one check of a row number does for all;
 //! 2. the lanes of the row behind hold anything: they may send a row to slower code of the same bits, but nothing that is

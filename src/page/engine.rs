@@ -12,11 +12,13 @@ use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
 
-/// Requests at a drive at once, where nothing else is known: more gained nothing on any drive that was measured.
+/// Requests at a drive at once, for engines with threads and for measurements: more gained nothing on any drive that was
+/// measured.
 pub const DEPTH: usize = 16;
-/// Requests in a ring at least. Threads go on by themselves, but a ring gets its next requests only when somebody takes the
-/// answers, and a step looks four times: with 16 the drive stood still between, and steps with a tenth of the pages in memory waited
-/// 5 % of the time; with 64 they wait 1.8 % of it, which is what a drive that is never idle costs. 256 gained nothing more.
+/// Requests in a ring at least. Threads go on by themselves, but a ring gets its next requests only when somebody asks
+/// for answers, and a step does so four times: with 16 the drive stood still between, and steps with a tenth of the
+/// pages in memory waited 5 % of the time. With 64 they wait 1.8 %, as a drive would cost that is never idle; 256 gained
+/// nothing more (pages of 512 rows, steps of 50 ms, one NVMe drive).
 const RING_DEPTH: usize = 64;
 
 /// What moves pages: the values of `--io`.
@@ -75,8 +77,8 @@ pub struct OpenedEngine {
     pub notes: Vec<String>,
 }
 
-/// Opens `engine` on the segments in `folder`, with `depth` requests (for engines with threads: as many threads) at
-/// the drive at once; a ring has 64 at least, which it works on without being asked.
+/// Opens `engine` on the segments in `folder`, with `depth` threads, or a ring of `depth` requests of at most 1 MiB, but 64
+/// at least: it works on these without being asked. Who wants fewer transfers at the drive submits fewer.
 ///
 /// # Errors
 /// The folder cannot be used; an engine that was asked for by name does not work here (`auto` takes another).

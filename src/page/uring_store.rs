@@ -289,6 +289,8 @@ impl PageStore for UringStore {
             let id = self.requests.insert(Request { flight, start, bytes, resume: Resume::default() });
             self.waiting.push_back(id);
         }
+        // What has ended makes room in the ring, although nobody has asked for it yet.
+        self.take_answers();
         self.fill_ring();
         if !self.offered.is_empty() {
             self.enter(0);

@@ -1,0 +1,71 @@
+//! The loops of [`super::row_kernels`] in registers of eight floats ([`crate::base::eight`]): what runs with AVX2.
+//!
+//! Sixteen registers do not hold a row with its moments. What the compiler makes of arrays then is stored in pieces
+//! and loaded whole, and such a load waits for every store before it, of other rows too. So here a vector is loaded,
+//! worked on and stored before the next one is; a row that turns out to need slower code is written a second time.
+//!
+//! A block of rows is gone through once for the narrow columns and once for `sh_n`: fewer tables at a time, which the
+//! processor's own prefetching follows better.
+//!
+//! Here: what both loops share. Invariants: 1. the bits are those of [`super::row_kernels`]; 2. what a lane of the row
+//! behind holds is neither stored nor counted.
+
+mod evaluate;
+mod step;
+
+use crate::base::eight::{Avx2, EIGHT, Eight};
+
+/// Rows of a block: one bit of a word each.
+const BLOCK: usize = 64;
+
+/// A loop over rows, to be run in this form.
+pub(super) struct Eights<K>(pub K);
+
+/// Numbers that every row is compared with or masked by.
+struct Numbers {
+    avx2: Avx2,
+    zero: Eight,
+    /// The sign bit.
+    sign: Eight,
+    /// The smallest normal float.
+    smallest: Eight,
+}
+
+impl Numbers {
+    #[inline(always)]
+    fn new(avx2: Avx2) -> Self {
+        let smallest = avx2.splat(f32::MIN_POSITIVE);
+        Numbers { avx2, zero: avx2.splat(0.0), sign: avx2.splat(-0.0), smallest }
+    }
+
+    /// [`super::drift::flush`].
+    #[inline(always)]
+    fn flush(&self, x: Eight) -> Eight {
+        x.and(self.sign.not_and(x).not_less(self.smallest))
+    }
+
+    /// [`super::drift::flush_positive`].
+    #[inline(always)]
+    fn flush_positive(&self, x: Eight) -> Eight {
+        x.and(x.not_less(self.smallest))
+    }
+}
+
+/// Something of the lanes of a row: of means, opacity and quats; of scales and sh0; of `sh_n`.
+#[inline(always)]
+fn of_lanes(avx2: Avx2, narrow: &[f32; 2 * EIGHT], sh_n: f32) -> [Eight; 3] {
+    let narrow = narrow.as_chunks().0;
+    [avx2.load(&narrow[0]), avx2.load(&narrow[1]), avx2.splat(sh_n)]
+}
+
+/// Eight values from `start` on.
+#[inline(always)]
+fn load(avx2: Avx2, values: &[f32], start: usize) -> Eight {
+    avx2.load(&values[start..].as_chunks().0[0])
+}
+
+/// Eight values from `start` on, to write to.
+#[inline(always)]
+fn eight_mut(values: &mut [f32], start: usize) -> &mut [f32; EIGHT] {
+    &mut values[start..].as_chunks_mut().0[0]
+}
