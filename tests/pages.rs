@@ -85,48 +85,74 @@ fn is_drawn(root: u64, uid: u64, step: u32) -> bool {
 }
 
 /// A scene trained in one table, every event applied at once, and what that was.
-struct OnTime {
+struct OnTime<'a> {
+    adam: &'a DeferredAdam,
     state: SceneState,
     log: EventLog,
+    /// Of the rows since the last round.
+    histogram: GradHistogram,
     /// Histogram before each event.
     histograms: Vec<GradHistogram>,
     /// First row that a row descends from.
     root_from_uid: HashMap<u64, u64>,
 }
 
-fn on_time(start: &SceneState, adam: &DeferredAdam) -> OnTime {
-    let config = DensifyConfig {
+impl<'a> OnTime<'a> {
+    fn new(start: &SceneState, adam: &'a DeferredAdam) -> OnTime<'a> {
+        OnTime {
+            adam,
+            state: start.clone(),
+            log: EventLog::default(),
+            histogram: GradHistogram::default(),
+            histograms: Vec::new(),
+            root_from_uid: start.uid.iter().map(|&u| (u, u)).collect(),
+        }
+    }
+
+    fn step(&mut self, step: u32) {
+        let root_from_uid = &self.root_from_uid;
+        touch(&mut self.state, self.adam, step, &mut self.histogram, |uid| is_drawn(root_from_uid[&uid], uid, step));
+    }
+
+    fn apply(&mut self, event: Event) {
+        let index = self.log.push(event);
+        for uid in &self.state.uid {
+            let root = self.root_from_uid[uid];
+            self.root_from_uid.extend((0..2).map(|child| (child_uid(*uid, index as u64, child), root)));
+        }
+        self.histograms.push(self.histogram.clone());
+        apply_event(&mut self.state, self.adam, SEED, index, &event);
+        if matches!(event.kind, EventKind::Densify(_)) {
+            self.histogram.clear();
+        }
+    }
+}
+
+fn densify(max_gaussians: u64) -> DensifyConfig {
+    DensifyConfig {
         refine_start: 20,
         refine_every: 30,
         reset_every: 70,
         refine_stop: 240,
         grow_grad2d: 2e-4,
-        max_gaussians: start.rows() as u64 * 3 / 2,
+        max_gaussians,
         ..DensifyConfig::default()
-    };
-    let (mut state, mut log, mut histogram) = (start.clone(), EventLog::default(), GradHistogram::default());
-    let mut root_from_uid: HashMap<u64, u64> = start.uid.iter().map(|&u| (u, u)).collect();
-    let mut histograms = Vec::new();
+    }
+}
+
+fn on_time<'a>(start: &SceneState, adam: &'a DeferredAdam) -> OnTime<'a> {
+    let config = densify(start.rows() as u64 * 3 / 2);
+    let mut whole = OnTime::new(start, adam);
     for step in 0..STEPS {
-        touch(&mut state, adam, step, &mut histogram, |uid| is_drawn(root_from_uid[&uid], uid, step));
-        let mut kinds: Vec<EventKind> = config.events_after(step, 1.0, state.rows() as u64, &histogram).collect();
+        whole.step(step);
+        let rows = whole.state.rows() as u64;
+        let mut kinds: Vec<EventKind> = config.events_after(step, 1.0, rows, &whole.histogram).collect();
         if step % 85 == 84 {
             kinds.push(EventKind::RaiseShDegree { degree: (step / 85) as u8 + 1 });
         }
-        for kind in kinds {
-            let index = log.push(Event { step, kind });
-            for uid in state.uid.clone() {
-                let root = root_from_uid[&uid];
-                root_from_uid.extend((0..2).map(|child| (child_uid(uid, index as u64, child), root)));
-            }
-            histograms.push(histogram.clone());
-            apply_event(&mut state, adam, SEED, index, &log.events()[index]);
-            if matches!(kind, EventKind::Densify(_)) {
-                histogram.clear();
-            }
-        }
+        kinds.into_iter().for_each(|kind| whole.apply(Event { step, kind }));
     }
-    OnTime { state, log, histograms, root_from_uid }
+    whole
 }
 
 /// A page as a trainer keeps it: its rows in bytes.
@@ -209,6 +235,14 @@ impl InPages<'_> {
         }
     }
 
+    /// What becomes of the statistics and of the bound on the rows when an event enters the log.
+    fn log_event(&mut self, event: Event) {
+        if let EventKind::Densify(thresholds) = event.kind {
+            self.rows_bound += self.histogram.promised(thresholds.grow_grad2d) as i64;
+            self.histogram.clear();
+        }
+    }
+
     fn rows(&self) -> i64 {
         self.pages.values().map(|page| page.layout.rows as i64).sum()
     }
@@ -265,10 +299,7 @@ fn late_equals_at_once(adam: &DeferredAdam, cases: &[(usize, usize, u64)]) -> Sc
             for (index, event) in whole.log.pending(log.len()).filter(|(_, e)| e.step == step).collect::<Vec<_>>() {
                 assert!(pages.histogram == whole.histograms[index], "what a round decides by, event {index}");
                 log.push(event);
-                if let EventKind::Densify(thresholds) = event.kind {
-                    pages.rows_bound += pages.histogram.promised(thresholds.grow_grad2d) as i64;
-                    pages.histogram.clear();
-                }
+                pages.log_event(event);
             }
         }
         let case = format!("{page_rows} rows a page, chance {chance}");
@@ -291,6 +322,56 @@ fn late_equals_at_once(adam: &DeferredAdam, cases: &[(usize, usize, u64)]) -> Sc
         assert!(pages.unchanged > 0 || page_rows != 7, "{case}: no round left a page alone");
     }
     whole.state
+}
+
+/// As a run decides its rounds, in which no row is looked at for them: by the histogram and the rows that there may be,
+/// where rows that a page has yet to prune still count. The cap is kept at every step, and what comes of it is what the
+/// same events applied at once give.
+#[test]
+fn a_cap_by_which_pages_decide_is_never_exceeded_and_gives_the_rows_of_events_applied_at_once() {
+    let adam = adam(1.0);
+    let start = scene(2000);
+    let mut decided_otherwise = 0;
+    for (cap, page_rows, first_rows, chance) in
+        [(2040, 128, 100, 0), (2150, 90, 90, 30), (2150, 40, 40, 1000), (2400, 7, 5, 10), (1000, 64, 60, 0)]
+    {
+        let config = densify(cap);
+        let mut whole = OnTime::new(&start, &adam);
+        let mut pages = in_pages(&start, &adam, page_rows, first_rows);
+        let most = cap.max(2000) as i64;
+        let (mut capped, mut case) = (0, format!("cap {cap}, {page_rows} rows a page, chance {chance}"));
+        for step in 0..STEPS {
+            pages.step(step, &whole.log, &whole.root_from_uid, chance);
+            whole.step(step);
+            assert!(pages.histogram == whole.histogram, "{case}: statistics at step {step}");
+            let rows = [whole.state.rows() as i64, pages.rows()];
+            assert!(rows.iter().all(|rows| *rows <= pages.rows_bound), "{case}: {rows:?} at step {step}");
+            assert!(chance < 1000 || pages.rows_bound == rows[0], "{case}: every page is up to date at every step");
+            let bound = pages.rows_bound as u64;
+            let kinds: Vec<EventKind> = config.events_after(step, 1.0, bound, &pages.histogram).collect();
+            let at_once: Vec<EventKind> = config.events_after(step, 1.0, rows[0] as u64, &whole.histogram).collect();
+            decided_otherwise += usize::from(kinds != at_once);
+            for kind in kinds {
+                if let EventKind::Densify(thresholds) = kind {
+                    capped += usize::from(thresholds.grow_grad2d > config.grow_grad2d);
+                }
+                let event = Event { step, kind };
+                pages.log_event(event);
+                whole.apply(event);
+            }
+            let now = pages.rows_bound.max(whole.state.rows() as i64);
+            assert!(now <= most, "{case}: {now} rows after step {step}");
+        }
+        for id in pages.pages.keys().copied().collect::<Vec<_>>() {
+            pages.acquire(id, &whole.log);
+        }
+        case += &format!(", {} rows at the end", whole.state.rows());
+        assert!(capped > 0, "{case}: no round met the cap");
+        assert_eq!(pages.rows_bound, whole.state.rows() as i64, "{case}: promises are kept to the row");
+        let states: Vec<SceneState> = pages.pages.values().map(Page::state).collect();
+        assert!(by_uid(&states) == by_uid([&whole.state]), "{case}");
+    }
+    assert!(decided_otherwise > 0, "no prune was ever waiting, so it does not matter how they count");
 }
 
 /// Rows with moments from a few steps, down to sizes where eps shows, and statistics.

@@ -16,22 +16,14 @@ use std::path::Path;
 use support::real_scene;
 use tempfile::TempDir;
 
-/// Every event several times within 200 steps.
-const BUSY: &[&str] = &[
-    "--refine-start",
-    "100",
-    "--refine-every",
-    "50",
-    "--reset-every",
-    "200",
-    "--sh-every",
-    "100",
-    "--view-order",
-    "groups:4",
-    "--test-every",
-    "24",
-    "--quiet",
-];
+const COMMON: &[&str] = &["--view-order", "groups:4", "--test-every", "24", "--quiet"];
+
+/// Events of the runs of 600 steps.
+const EVENTS: &[&str] = &["--refine-start", "100", "--refine-every", "50", "--reset-every", "200", "--sh-every", "100"];
+
+/// Every event at least twice within 120 steps.
+const MORE_EVENTS: &[&str] =
+    &["--refine-start", "20", "--refine-every", "25", "--reset-every", "45", "--sh-every", "30"];
 
 /// Where pages are and how they get there.
 #[derive(Debug, Clone)]
@@ -78,7 +70,8 @@ fn frames_engines_and_threads_change_no_bit() {
     let folder = TempDir::new().unwrap();
     let is_full = std::env::var_os("GSSCALE_PAGING_FULL").is_some();
     let steps = if is_full { "600" } else { "200" };
-    let base = [&["--data-factor", "4", "--page-rows", "128", "--steps", steps], BUSY].concat();
+    let events = if is_full { EVENTS } else { MORE_EVENTS };
+    let base = [&["--data-factor", "4", "--page-rows", "128", "--steps", steps], COMMON, events].concat();
     let in_memory = How { frames: 0, io: "", threads: "2", more: &[] };
     let (want, whole) = run(folder.path(), &scene, &base, &in_memory);
     let (pages, fewest) = (number(&whole, "frames"), number(&whole, "pages_pinned_max"));
@@ -94,6 +87,7 @@ fn frames_engines_and_threads_change_no_bit() {
             }
         }
     } else {
+        // A quarter of the frames, or the fewest where a view needs more than that.
         let io = |i: usize| engines[i % engines.len()];
         grid.push(how(pages, io(1), "1", &[]));
         grid.push(how(pages / 2, io(0), "2", &[]));
@@ -114,28 +108,41 @@ fn frames_engines_and_threads_change_no_bit() {
     }
 }
 
+/// Of runs on cities.
+const CITY: &[&str] = &["--page-rows", "32", "--steps", "120", "--grow-grad2d", "0.001"];
+
 #[test]
 fn a_tenth_of_a_city_in_memory_gives_the_same_city() {
     let folder = TempDir::new().unwrap();
     let scene = folder.path().join("scene");
     let options = CityOptions {
         seed: 5,
-        views: 60,
+        views: 96,
         width: 48,
         height: 36,
-        points: 30_000,
-        blocks: Some(60),
+        points: 1_500,
+        tiles: [8, 6],
+        blocks: Some(12),
         supersample: 1,
         ..CityOptions::default()
     };
     write_city(&scene, &options, &|_, _| {}).unwrap();
-    let base = [&["--page-rows", "32", "--steps", "120", "--grow-grad2d", "0.001"], BUSY].concat();
-    let (want, whole) = run(folder.path(), &scene, &base, &How { frames: 0, io: "", threads: "2", more: &[] });
+    let base = [CITY, COMMON, MORE_EVENTS].concat();
+    let in_memory = |more| How { frames: 0, io: "", threads: "2", more };
+    let (want, whole) = run(folder.path(), &scene, &base, &in_memory(&[]));
+    for (flag, never) in [("--refine-every", "1000"), ("--reset-every", "0"), ("--sh-every", "1000")] {
+        let mut without = base.clone();
+        let at = without.iter().position(|word| *word == flag).unwrap();
+        without[at + 1] = never;
+        let (other, _) = run(folder.path(), &scene, &without, &in_memory(&[]));
+        assert!(other != want, "{flag} {never} changes nothing, so such events happened in vain");
+    }
     let frames = number(&whole, "pages") / 10;
     let (got, summary) = run(folder.path(), &scene, &base, &How { frames, io: "auto", threads: "2", more: &[] });
     assert!(got == want);
-    let seen = number(&summary, "pages_needed") as f64 / 120.0 / number(&summary, "pages") as f64;
-    assert!(seen < 0.03, "a view sees {seen} of the pages");
+    // Of the pages of the start at least, which are the fewest.
+    let seen = number(&summary, "pages_pinned_max") as f64 / (f64::from(48 * options.points) / 32.0);
+    assert!(seen < 0.03, "a view sees {seen} of the pages: {summary}");
     assert!(number(&summary, "evictions") > 0 && number(&summary, "pages_read") > 0, "{summary}");
     // Export and evaluation looked at every page, which is not counted as the steps' need.
     assert!(number(&summary, "other_pages_needed") >= number(&summary, "pages"), "{summary}");
@@ -145,12 +152,39 @@ fn a_tenth_of_a_city_in_memory_gives_the_same_city() {
     assert!(bound > 0 && bound <= read && read < bound + bound / 2, "{read} read by steps, {bound} at least");
 }
 
+/// Pages that no view has looked at since a round have promised growth that counts: the cap on the Gaussians holds at every
+/// step, whatever is in memory, and is reached.
+#[test]
+fn a_cap_on_the_gaussians_holds_at_every_step_and_pages_to_the_same_bits() {
+    let folder = TempDir::new().unwrap();
+    let scene = scenes::wide_city(folder.path(), 8_000);
+    let cap = 8_400;
+    // Rounds are close to each other, so that most pages with growth were not looked at between two of them; and nothing
+    // is pruned, which would make room again, nor reset to opacities that do not exist.
+    let rounds = ["--refine-start", "20", "--refine-every", "4", "--prune-opa", "0", "--reset-every", "45"];
+    let capped = ["--max-gaussians", "8400", "--log-every", "1"];
+    let base = [CITY, COMMON, &rounds, &capped].concat();
+    let (want, whole) = run(folder.path(), &scene, &base, &How { frames: 0, io: "", threads: "2", more: &[] });
+    let frames = number(&whole, "pages_pinned_max");
+    assert!(frames < number(&whole, "pages") / 2, "a view sees too much");
+    let (got, summary) = run(folder.path(), &scene, &base, &How { frames, io: "auto", threads: "2", more: &[] });
+    assert!(got == want);
+    assert_eq!(number(&summary, "gaussians"), number(&whole, "gaussians"));
+    let metrics = std::fs::read_to_string(folder.path().join("out/metrics.jsonl")).unwrap();
+    let rows: Vec<u64> = metrics.lines().map(|l| number(&serde_json::from_str(l).unwrap(), "gaussians")).collect();
+    assert_eq!(rows.len(), 119, "a line after each step but the first");
+    assert!(rows.iter().all(|&rows| rows <= cap), "{rows:?}");
+    // A bin of the histogram that does not fit as a whole is left out.
+    let end = number(&summary, "gaussians");
+    assert!(end <= cap && end + 40 > cap, "{end} of {cap}");
+}
+
 /// 16-bit moments are another training, but paged they are the same one.
 #[test]
 fn moments_in_16_bits_page_to_the_same_bits() {
     let folder = TempDir::new().unwrap();
     let scene = scenes::wide_city(folder.path(), 8_000);
-    let base = [&["--page-rows", "32", "--steps", "120", "--grow-grad2d", "0.001"], BUSY].concat();
+    let base = [CITY, COMMON, MORE_EVENTS].concat();
     let halves = [&base[..], &["--moments", "bf16"]].concat();
     let in_memory = How { frames: 0, io: "", threads: "2", more: &[] };
     let (want, whole) = run(folder.path(), &scene, &halves, &in_memory);

@@ -217,6 +217,13 @@ impl RunState {
             return refuse("an event lies in its future");
         }
         let is_too_high = |e: &Event| matches!(e.kind, EventKind::RaiseShDegree { degree } if degree > 3);
+        let is_no_opacity = |event: &Event| match event.kind {
+            EventKind::ResetOpacity { max_opacity } => !(max_opacity > 0.0 && max_opacity < 1.0),
+            _ => false,
+        };
+        if log.events().iter().any(is_no_opacity) {
+            return refuse("an event resets opacities to none");
+        }
         if self.sh_degree_start > 3 || log.events().iter().any(is_too_high) {
             return refuse("a degree is above 3");
         }
@@ -327,6 +334,9 @@ mod tests {
         };
         refused(|s| s.step = 8);
         refused(|s| s.events.reverse());
+        refused(|s| s.events[0].kind = EventKind::ResetOpacity { max_opacity: 0.0 });
+        refused(|s| s.events[0].kind = EventKind::ResetOpacity { max_opacity: 1.0 });
+        refused(|s| s.events[0].kind = EventKind::ResetOpacity { max_opacity: f32::NAN });
         refused(|s| s.sh_degree_start = 4);
         refused(|s| s.histogram = vec![(32768, 1)]);
         refused(|s| s.histogram.reverse());

@@ -147,13 +147,13 @@ config_keys! {
         refine_stop: u32 = 15_000;
         /// Steps between rounds
         refine_every: u32 = 100;
-        /// Steps between opacity resets; 0 = never
+        /// Steps between opacity resets, to twice --prune-opa; 0 = never
         reset_every: u32 = 3000;
         /// Grow Gaussians whose mean screen-space gradient exceeds this
         grow_grad2d: f64 = 2e-4;
         /// Growing Gaussians up to this size (times the scene scale) are cloned, larger ones split
         grow_scale3d: f64 = 0.01;
-        /// Remove Gaussians with a lower opacity
+        /// Remove Gaussians with a lower opacity; 0 = none, and no opacity resets
         prune_opa: f64 = 0.005;
         /// Remove Gaussians larger than this (times the scene scale), after the first reset
         prune_scale3d: f64 = 0.1;

@@ -59,9 +59,10 @@ impl DensifyConfig {
         step > self.refine_start && step < self.refine_stop && step.is_multiple_of(self.refine_every)
     }
 
-    /// Whether an opacity reset follows this step (after its round).
+    /// Whether an opacity reset follows this step (after its round). Without pruning by opacity there is none: it would
+    /// reset to nothing, whose logit is no number.
     pub fn is_reset(&self, step: u32) -> bool {
-        step > 0 && step < self.refine_stop && step.is_multiple_of(self.reset_every)
+        self.prune_opa > 0.0 && step > 0 && step < self.refine_stop && step.is_multiple_of(self.reset_every)
     }
 
     /// What bounds of pages must count on: no round's thresholds are lower.
@@ -154,6 +155,8 @@ mod tests {
         assert_eq!(config.thresholds(3100, 2.0, 10, &GradHistogram::default()).prune_scale, 0.2);
         let never = DensifyConfig { refine_every: 0, reset_every: 0, ..config };
         assert!((0..20_000).all(|s| !never.is_round(s) && !never.is_reset(s)));
+        let unpruned = DensifyConfig { prune_opa: 0.0, ..DensifyConfig::default() };
+        assert!((0..20_000).all(|s| !unpruned.is_reset(s)));
         assert_eq!(never.thresholds(9000, 1.0, 10, &GradHistogram::default()).prune_scale, f32::INFINITY);
     }
 
