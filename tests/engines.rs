@@ -338,15 +338,25 @@ fn more_segments_than_open_files() {
     }
 }
 
-/// The system refuses to write behind the first 2 MiB of any file, in the middle of a transfer.
+/// So that a write behind the limit on file sizes is an error: without a handler the signal that comes with it ends the
+/// process.
+fn outlive_the_signal_of_large_files() {
+    let told = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
+    signal_hook::flag::register(signal_hook::consts::SIGXFSZ, told).unwrap();
+}
+
+/// From now on the system writes nothing behind so many bytes of any file.
+fn limit_files(bytes: Option<u64>) {
+    setrlimit(Resource::Fsize, Rlimit { current: bytes, maximum: None }).unwrap();
+}
+
+/// The system refuses to write behind the first 2.5 MiB of any file, in the middle of a request.
 #[test]
 fn refused_writes_are_errors_with_their_buffers() {
     if !in_child("refused_writes_are_errors_with_their_buffers") {
         return;
     }
-    // Without a handler the signal that comes with the refusal ends the process.
-    let told = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
-    signal_hook::flag::register(signal_hook::consts::SIGXFSZ, told).unwrap();
+    outlive_the_signal_of_large_files();
     let engines = file_engines();
     let stores: Vec<_> = engines
         .iter()
@@ -357,13 +367,61 @@ fn refused_writes_are_errors_with_their_buffers() {
             (name, folder, store)
         })
         .collect();
-    setrlimit(Resource::Fsize, Rlimit { current: Some(2 << 20), maximum: Some(2 << 20) }).unwrap();
-    for (name, _folder, mut store) in stores {
-        let end = move_one(&mut *store, transfer(1, Direction::Write, 0, 1 << 20, PageBuffer::zeroed(3 << 20)));
+    limit_files(Some(5 << 19));
+    for (name, folder, mut store) in stores {
+        let mut buffer = PageBuffer::zeroed(3 << 20);
+        buffer.as_mut_slice().fill(7);
+        let end = move_one(&mut *store, transfer(1, Direction::Write, 0, 1 << 20, buffer));
         assert_eq!(end.result.unwrap_err().kind(), ErrorKind::FileTooLarge, "{name}");
         assert_eq!(end.transfer.buffer.len(), 3 << 20);
+        let file = std::fs::read(folder.path().join(segment_file_name(0))).unwrap();
+        // The request that met the limit was short, and only what was left of it refused.
+        let wrote = |from: usize, to: usize| file[from..to].iter().all(|&b| b == 7);
+        assert!(wrote(2 << 20, 5 << 19), "{name}: nothing of the last request came through");
         let end = move_one(&mut *store, transfer(2, Direction::Write, 0, 0, PageBuffer::zeroed(2 << 20)));
         end.result.unwrap_or_else(|e| panic!("{name}: {e}"));
+    }
+}
+
+/// A ring's request that the system ends in the middle goes on from there. The limit is gone when the answer is taken.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_short_answer_of_the_ring_is_resumed() {
+    use gsscale::page::uring_store::{REQUEST_BYTES, UringStore};
+    const { assert!(REQUEST_BYTES <= 1 << 20, "larger requests may end with EAGAIN") };
+    if !in_child("a_short_answer_of_the_ring_is_resumed") {
+        return;
+    }
+    outlive_the_signal_of_large_files();
+    for direct in [true, false] {
+        let folder = tempfile::tempdir().unwrap();
+        let mut store = match UringStore::open(folder.path(), 32, direct) {
+            Ok(store) => store,
+            Err(error) => return eprintln!("skipped: io_uring is refused here: {error}"),
+        };
+        store.create_segment(0, SEGMENT).unwrap();
+        let buffer = random_buffer(&mut Stream::new(3, Purpose::Test, 0, 0), 3 << 20);
+        let bytes = buffer.as_slice().to_vec();
+        let (cut, path) = (5 << 19, folder.path().join(segment_file_name(0)));
+        limit_files(Some(cut as u64));
+        store.submit(transfer(1, Direction::Write, 0, 0, buffer));
+        let began = std::time::Instant::now();
+        while std::fs::read(&path).unwrap()[..cut] != bytes[..cut] {
+            assert!(began.elapsed().as_secs() < 20, "nothing was written");
+            std::thread::sleep(std::time::Duration::from_millis(20));
+        }
+        // What the kernel tries by itself, it has tried by now.
+        std::thread::sleep(std::time::Duration::from_millis(200));
+        let file = std::fs::read(&path).unwrap();
+        assert!(file[cut..].iter().all(|&b| b == 0), "the request was not cut short");
+        limit_files(None);
+        let mut done = Vec::new();
+        while store.in_flight() > 0 {
+            store.complete(true, &mut done);
+        }
+        done.remove(0).result.unwrap();
+        let file = std::fs::read(&path).unwrap();
+        assert!(file[..bytes.len()] == bytes && file[bytes.len()..].iter().all(|&b| b == 0), "direct {direct}");
     }
 }
 
@@ -380,31 +438,36 @@ fn auto_takes_what_works_and_says_what_does_not() {
     }
 }
 
-/// Submits writes of random bytes to places `from..to` of segment 0, asks for no answer, and waits until all are in the file.
-fn write_unasked(store: &mut dyn PageStore, folder: &Path, places: std::ops::Range<usize>) {
-    const BYTES: usize = 64 << 10;
+/// Submits writes of random bytes, each of `bytes`, to places `from..to` of segment 0, asks for no answer, and waits until
+/// all are in the file.
+fn write_unasked(store: &mut dyn PageStore, folder: &Path, places: std::ops::Range<usize>, bytes: usize) {
+    const PIECE: usize = 64 << 10;
     let mut draws = Stream::new(1, Purpose::Test, 48, 0);
     for i in places.clone() {
-        let buffer = random_buffer(&mut draws, BYTES);
-        store.submit(transfer(i as u64, Direction::Write, 0, (i * BYTES) as u64, buffer));
+        let buffer = random_buffer(&mut draws, bytes);
+        store.submit(transfer(i as u64, Direction::Write, 0, (i * bytes) as u64, buffer));
     }
     let began = std::time::Instant::now();
     loop {
         let file = std::fs::read(folder.join(segment_file_name(0))).unwrap();
-        let lacks = |i: &usize| file[(i + 1) * BYTES - 64..(i + 1) * BYTES].iter().all(|&b| b == 0);
-        let missing: Vec<usize> = places.clone().filter(lacks).collect();
+        let lacks = |i: &usize| file[(i + 1) * PIECE - 64..(i + 1) * PIECE].iter().all(|&b| b == 0);
+        let missing: Vec<usize> = (places.start * bytes / PIECE..places.end * bytes / PIECE).filter(lacks).collect();
         if missing.is_empty() {
             return;
         }
-        assert!(began.elapsed().as_secs() < 20, "{}: writes {missing:?} wait to be asked for", store.name());
+        assert!(began.elapsed().as_secs() < 20, "{}: pieces {missing:?} wait to be asked for", store.name());
         std::thread::sleep(std::time::Duration::from_millis(20));
     }
 }
 
-/// While a step computes nobody takes answers; the drive must have something to do all the same.
+/// While a step computes nobody takes answers; the drive must have something to do all the same. The ring's requests come
+/// from one transfer, since each further one makes room by taking answers.
 #[test]
 fn three_times_the_usual_depth_moves_without_being_asked() {
-    for engine in [IoEngine::Uring, IoEngine::Pread, IoEngine::Mmap] {
+    const MIB: usize = 1 << 20;
+    let cases =
+        [(IoEngine::Uring, 1, 3 * DEPTH * MIB), (IoEngine::Pread, 3 * DEPTH, MIB), (IoEngine::Mmap, 3 * DEPTH, MIB)];
+    for (engine, transfers, bytes) in cases {
         let folder = tempfile::tempdir().unwrap();
         let mut store = match open_engine(engine, folder.path(), DEPTH) {
             Ok(opened) => opened.store,
@@ -414,13 +477,13 @@ fn three_times_the_usual_depth_moves_without_being_asked() {
             }
             Err(error) => panic!("{error}"),
         };
-        store.create_segment(0, SEGMENT).unwrap();
-        write_unasked(&mut *store, folder.path(), 0..3 * DEPTH);
+        store.create_segment(0, (transfers * bytes) as u64).unwrap();
+        write_unasked(&mut *store, folder.path(), 0..transfers, bytes);
         let mut done = Vec::new();
         while store.in_flight() > 0 {
             store.complete(true, &mut done);
         }
-        assert!(done.len() == 3 * DEPTH && done.iter().all(|end| end.result.is_ok()));
+        assert!(done.len() == transfers && done.iter().all(|end| end.result.is_ok()));
     }
 }
 
@@ -435,7 +498,7 @@ fn a_ring_of_ended_requests_is_not_full() {
     };
     store.create_segment(0, SEGMENT).unwrap();
     for first in (0..16).step_by(4) {
-        write_unasked(&mut store, folder.path(), first..first + 4);
+        write_unasked(&mut store, folder.path(), first..first + 4, 64 << 10);
         // What is in the file is answered soon, but not at once.
         std::thread::sleep(std::time::Duration::from_millis(100));
     }

@@ -35,7 +35,10 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
         assert!(number(plan, "hit_rate") >= number(plan, "lru_hit_rate") && plan["is_belady_bound"] == true);
         // Each page is written by the import; beyond it everything that is read pushes something out.
         assert!(number(plan, "bytes_written") >= number(&value, "state_bytes"));
-        assert!(number(plan, "bytes_read") > 0.0 && number(plan, "share_of_endurance") < 1.0);
+        assert!(number(plan, "bytes_read") > 0.0);
+        // Of a common drive, 300 TB.
+        let share = number(plan, "bytes_written") / 300e12;
+        assert!((number(plan, "share_of_endurance") / share - 1.0).abs() < 1e-9, "{plan}");
     }
     assert!(number(&plans[1], "hit_rate") < number(&plans[3], "hit_rate"), "a tour reads less than a shuffle");
     // When everything fits nothing is read again, and auto is a shuffle.
@@ -45,6 +48,11 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
     assert_eq!(plans[4]["view_order"], "shuffle");
     let table = with(&["--compare-frames", "70%", "--compare-orders", orders]);
     assert_eq!(table.lines().count(), 4 + 4, "{table}");
+    assert!(table.lines().nth(1).unwrap().contains("hit rate    of lru"), "{table}");
+    for (plan, line) in plans[..4].iter().zip(table.lines().skip(2)) {
+        let shown = format!(" {:.3} {:9.3} ", number(plan, "hit_rate"), number(plan, "lru_hit_rate"));
+        assert!(line.contains(&shown), "{shown} is not in: {table}");
+    }
     // Shares that nobody named hold the largest view.
     let open: Value = serde_json::from_str(&with(&["--view-order", "shuffle", "--json"])).unwrap();
     let frames = |value: &Value| -> Vec<u64> {
@@ -141,10 +149,40 @@ fn a_run_does_what_was_planned() {
         (number(&plan["bytes_written"]), number(&done["bytes_written"]) - number(&done["commit_bytes"]));
     assert!(written <= most && most <= 1.6 * written, "{most} bytes to be written at most, {written} were");
     // The run itself says the same before its first step.
-    let line = said.lines().find(|line| line.starts_with("drive")).unwrap();
-    let told = line.split("about ").nth(1).and_then(|rest| rest.split(" MiB to be written, commits apart").next());
-    let told = told.and_then(|number| number.parse::<f64>().ok()).expect(line) * 1048576.0;
+    let told = told_to_be_written(&said);
     assert!((told / most - 1.0).abs() < 0.1, "{told} told by the run, {most} by the plan");
+}
+
+/// Bytes that a run says it will write.
+fn told_to_be_written(said: &str) -> f64 {
+    let line = said.lines().find(|line| line.starts_with("drive")).unwrap();
+    let text = line.split("; about ").nth(1).and_then(|rest| rest.split(" to be written, commits apart").next());
+    let (number, unit) = text.and_then(|text| text.split_once(' ')).expect(line);
+    let power = ["B", "KiB", "MiB", "GiB", "TiB"].iter().position(|u| *u == unit).expect(line);
+    number.parse::<f64>().expect(line) * 1024f64.powi(power as i32)
+}
+
+/// What a run says of the life of a drive is the bytes it will write over those that a common drive is rated for.
+#[test]
+fn a_run_says_what_it_takes_of_the_life_of_a_drive() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 150, 96, 64, 8000);
+    let spill = folder.path().join("spill");
+    let flags = ["--page-rows", "16", "--frames", "330", "--view-order", "shuffle", "--strategy", "none"];
+    for steps in ["4000000", "10000000"] {
+        let more = ["--steps", steps, "--dry-run", "--spill-dir", text(&spill)];
+        let output = train(&[&[text(&scene)][..], &flags, &more].concat());
+        let said = stderr(&output);
+        assert!(output.status.success(), "{said}");
+        let told = said.split("commits apart, ").nth(1).and_then(|rest| rest.split(" % of what").next()).expect(&said);
+        let share = told.parse::<f64>().expect(&said) / 100.0;
+        let expected = told_to_be_written(&said) / 300e12;
+        // Both are rounded to be read: the share to a hundredth of a percent, the bytes to a tenth of their unit.
+        assert!(
+            expected > 0.005 && (share - expected).abs() < 0.00005 + 0.05 * expected,
+            "{share}, {expected}: {said}"
+        );
+    }
 }
 
 #[test]

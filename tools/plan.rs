@@ -33,8 +33,8 @@ Examples:
   gsscale-plan runs/city --host-mem 2GiB --lists 100..110
 
 Pages are those of the first Gaussians; --growth 5 plans as if each page had grown to five.
-Shares of a step's pages that are read, 'of a plan' and 'lru', are those of the optimal cache and of one that drops what
-was used longest ago. Waiting assumes that the drive does one thing at a time, and that every step takes --step-seconds.
+Hit rates are shares of a step's pages that are in memory already: of a cache that knows the plan, and 'of lru', one that
+drops what was used longest ago. Waiting assumes that the drive does one thing at a time, and that every step takes --step-seconds.
 Time is that of all steps for the Gaussians of the start (a scene that grows takes longer), without import, evaluation, commits
 and the decoding of photos: a run takes up to a third more than the steps that were timed.";
 
@@ -394,8 +394,8 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
         "\n{:12} {:>14} {:>9} {:>9} {:>10} {:>10} {:>12} {:>9} {:>8} {:>8} {:>10} {:>7}",
         "order",
         "frames",
-        "of a plan",
-        "lru",
+        "hit rate",
+        "of lru",
         "read/step",
         "write/step",
         "worst 20/step",
@@ -414,8 +414,8 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
         let memory = format!("{} {}", row.frames, size(row.frames as f64 * scene.frame_bytes as f64));
         text += &format!(
             "\n{name:12} {memory:>14} {:>9.3} {:>9.3} {:>10} {:>10} {:>13} {:>8.4}s {:>7.2}s {:>8} {:>10} {:>6.1}%",
-            1.0 - f.hit_rate,
-            1.0 - row.lru.hit_rate,
+            f.hit_rate,
+            row.lru.hit_rate,
             size(f.read_per_step),
             size(f.written_per_step),
             size(f.worst_per_step),

@@ -115,15 +115,23 @@ pub fn too_many_files(error: &io::Error) -> bool {
 /// # Errors
 /// Of the drive; `UnexpectedEof` where the file ends too early.
 pub fn move_bytes(file: &File, transfer: &mut Transfer) -> io::Result<()> {
+    move_parts(transfer, |direction, bytes, at| match direction {
+        Direction::Read => read_at(file, bytes, at),
+        Direction::Write => write_at(file, bytes, at),
+    })
+}
+
+/// Asks `move_part` for what is left of a transfer, as (direction, bytes, their place in the file), until all has moved.
+fn move_parts(
+    transfer: &mut Transfer,
+    mut move_part: impl FnMut(Direction, &mut [u8], u64) -> io::Result<usize>,
+) -> io::Result<()> {
     let (direction, total, start) = (transfer.direction, transfer.bytes, transfer.place.offset);
     let mut resume = Resume::default();
     while resume.done < total {
         let at = start + resume.done as u64;
-        let rest = resume.done..total;
-        let outcome = match direction {
-            Direction::Read => read_at(file, &mut transfer.buffer.as_mut_slice()[rest], at),
-            Direction::Write => write_at(file, &transfer.buffer.as_slice()[rest], at),
-        };
+        let rest = &mut transfer.buffer.as_mut_slice()[resume.done..total];
+        let outcome = move_part(direction, rest, at);
         resume.advance(direction, outcome, total)?;
         if resume.tries > 1 {
             std::thread::sleep(Duration::from_micros(50 * u64::from(resume.tries)));
@@ -150,4 +158,65 @@ fn read_at(file: &File, bytes: &mut [u8], offset: u64) -> io::Result<usize> {
 #[cfg(windows)]
 fn write_at(file: &File, bytes: &[u8], offset: u64) -> io::Result<usize> {
     std::os::windows::fs::FileExt::seek_write(file, bytes, offset)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::base::rng::{Purpose, Stream};
+    use crate::page::buffer::PageBuffer;
+    use crate::page::store::Place;
+
+    const BYTES: usize = 37 * ALIGNMENT;
+    const OFFSET: usize = 3 * ALIGNMENT;
+
+    /// Carries a transfer out against `drive`, which moves as little as it likes and is disturbed often. Returns how
+    /// often it was asked.
+    fn move_in_parts(transfer: &mut Transfer, drive: &mut [u8], draws: &mut Stream) -> usize {
+        let mut asked = 0;
+        let moved = move_parts(transfer, |direction, bytes, at| {
+            asked += 1;
+            match asked % 4 {
+                1 => return Err(io::Error::from(io::ErrorKind::Interrupted)),
+                2 => return Err(io::Error::from(io::ErrorKind::WouldBlock)),
+                _ => {}
+            }
+            // Less than a block at times: never often enough in a row to give up, and what does not fill a block moves again.
+            let count =
+                (draws.below(4) as usize * ALIGNMENT + 1 + draws.below(ALIGNMENT as u64) as usize).min(bytes.len());
+            let there = &mut drive[at as usize..][..count];
+            match direction {
+                Direction::Read => bytes[..count].copy_from_slice(there),
+                Direction::Write => there.copy_from_slice(&bytes[..count]),
+            }
+            Ok(count)
+        });
+        moved.unwrap();
+        asked
+    }
+
+    #[test]
+    fn what_moves_in_parts_and_is_disturbed_arrives_whole() {
+        for seed in 0..50 {
+            let mut draws = Stream::new(seed, Purpose::Test, 0, 0);
+            let mut drive: Vec<u8> = (0..OFFSET + BYTES + ALIGNMENT).map(|_| draws.next_u64() as u8).collect();
+            let before = drive.clone();
+            let place = Place { segment: 0, offset: OFFSET as u64 };
+            // The buffer is longer than what moves.
+            let buffer = PageBuffer::zeroed(BYTES + ALIGNMENT);
+            let mut transfer = Transfer { token: 1, direction: Direction::Read, place, bytes: BYTES, buffer };
+            let asked = move_in_parts(&mut transfer, &mut drive, &mut draws);
+            assert!(asked > 30, "asked {asked} times: too easy");
+            let (moved, rest) = transfer.buffer.as_slice().split_at(BYTES);
+            assert!(drive == before && *moved == before[OFFSET..OFFSET + BYTES], "seed {seed}: other bytes were read");
+            assert!(rest.iter().all(|&b| b == 0));
+            transfer.buffer.as_mut_slice().iter_mut().for_each(|b| *b = !*b);
+            transfer.direction = Direction::Write;
+            move_in_parts(&mut transfer, &mut drive, &mut draws);
+            let is_right =
+                |(i, b): (usize, &u8)| *b == if (OFFSET..OFFSET + BYTES).contains(&i) { !before[i] } else { before[i] };
+            assert!(drive.iter().enumerate().all(is_right), "seed {seed}: other bytes were written");
+        }
+    }
 }

@@ -104,11 +104,12 @@ fn adam_dense_f32_equals_torch() {
     }
 }
 
-/// The fixture's values as means, three to a row, so that both schedules go through the trainer's own path.
+/// The fixture's values as means, one to a row, so that each is touched by its own schedule alone and both rate schedules
+/// go through the trainer's own path.
 fn state_of(case: &Case) -> SceneState {
-    let mut columns = Columns::zeros(case.values.div_ceil(3), 0);
-    for (i, x) in case.file.f32("param0").into_iter().enumerate() {
-        columns.means[i] = x;
+    let mut columns = Columns::zeros(case.values, 0);
+    for (row, x) in case.file.f32("param0").into_iter().enumerate() {
+        columns.means[3 * row] = x;
     }
     SceneState::from_columns(columns)
 }
@@ -174,7 +175,7 @@ fn adam_deferred_equals_torch_at_every_snapshot() {
         let mut largest = vec![[0.0f64; 2]; case.values];
         for step in 1..=case.lrs.len() {
             for (i, g) in case.grads(step).into_iter().enumerate() {
-                grads.means[i] = g as f32;
+                grads.means[3 * i] = g as f32;
             }
             let counts = adam.step(&mut state, &all, &grads, step as u32 - 1);
             let touched = all.iter().filter(|&&r| grads.row(Column::Means, r as usize).iter().any(|&g| g != 0.0));
@@ -182,8 +183,9 @@ fn adam_deferred_equals_torch_at_every_snapshot() {
             let Some(snap) = case.snaps.iter().position(|&s| s == step) else { continue };
             let stored = state.clone();
             let value = |i: usize| {
-                let (value, m, v) = (state.columns.means[i], state.exp_avg.means[i], state.exp_avg_sq.means[i]);
-                f64::from(adam.evaluate(Column::Means, value, m, v, state.stamp[i / 3], step as u32))
+                let first = |table: &Columns| table.means[3 * i];
+                let (value, m, v) = (first(&state.columns), first(&state.exp_avg), first(&state.exp_avg_sq));
+                f64::from(adam.evaluate(Column::Means, value, m, v, state.stamp[i], step as u32))
             };
             let error = max_abs((0..case.values).map(value), case.snapshot("param_f64", snap));
             // The README's limit for f32 is 2e-4; a deferred value takes fewer roundings than a dense one.
@@ -199,7 +201,9 @@ fn adam_deferred_equals_torch_at_every_snapshot() {
     }
 }
 
-/// At most twice the errors of torch in f32, for every touch schedule and every gradient size (largest over the others).
+/// At most twice the errors of torch in f32: for every touch schedule and every gradient size (largest over the others),
+/// and for single values but for a few. Of one value both errors are a matter of which way the roundings of its second
+/// moment happen to fall, in torch as here: where its own were lucky, twice of it is less than they are expected to be.
 fn compare_with_torch_in_f32(case: &Case, name: &str, largest: &[[f64; 2]]) {
     let over = |of: &dyn Fn(usize) -> bool| {
         let chosen = largest.iter().enumerate().filter(|&(i, _)| of(i));
@@ -213,4 +217,7 @@ fn compare_with_torch_in_f32(case: &Case, name: &str, largest: &[[f64; 2]]) {
         let [ours, torch] = over(&|i| i % case.columns == column);
         assert!(ours <= 2.0 * torch, "{name} gradient size {column}: {ours:e}, torch in f32 {torch:e}");
     }
+    let unlucky: Vec<_> = largest.iter().enumerate().filter(|(_, [ours, torch])| *ours > 2.0 * torch).collect();
+    assert!(unlucky.len() <= 2, "{name}: of {} values {unlucky:?}", largest.len());
+    assert!(unlucky.iter().all(|(_, [ours, torch])| *ours <= 10.0 * torch), "{name}: {unlucky:?}");
 }

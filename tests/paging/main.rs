@@ -5,6 +5,7 @@
 mod beside;
 mod failures;
 mod full;
+mod slow;
 mod staging;
 mod traffic;
 mod world;

@@ -1,6 +1,7 @@
 //! The optimizer's step in vectors of eight.
 //!
-//! A block's gradients are looked at first, so that rows without one cost no loads of their state.
+//! A block's gradients are looked at first; of rows without one the state is asked for ahead (which rows those are is not
+//! known across blocks), but not worked on.
 //! Not here: the last listed row, and the rounding of moments that are kept in 16 bits, which are those of every path.
 //! Invariant: bits and counts are those of [`StepRows`] as a plain loop.
 
