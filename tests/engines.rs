@@ -11,7 +11,7 @@ use gsscale::page::mmap_store::MmapStore;
 use gsscale::page::pread_store::PreadStore;
 use gsscale::page::segment_files::segment_file_name;
 use gsscale::page::store::{Completion, Direction, PageStore, Place, Transfer};
-use rustix::process::{Resource, Rlimit, setrlimit};
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::io::ErrorKind;
 use std::path::Path;
 
@@ -345,9 +345,10 @@ fn outlive_the_signal_of_large_files() {
     signal_hook::flag::register(signal_hook::consts::SIGXFSZ, told).unwrap();
 }
 
-/// From now on the system writes nothing behind so many bytes of any file.
+/// From now on the system writes nothing behind so many bytes of any file; `None`: as it would without that.
 fn limit_files(bytes: Option<u64>) {
-    setrlimit(Resource::Fsize, Rlimit { current: bytes, maximum: None }).unwrap();
+    let maximum = getrlimit(Resource::Fsize).maximum;
+    setrlimit(Resource::Fsize, Rlimit { current: bytes.or(maximum), maximum }).unwrap();
 }
 
 /// The system refuses to write behind the first 2.5 MiB of any file, in the middle of a request.
@@ -455,7 +456,7 @@ fn write_unasked(store: &mut dyn PageStore, folder: &Path, places: std::ops::Ran
         if missing.is_empty() {
             return;
         }
-        assert!(began.elapsed().as_secs() < 20, "{}: pieces {missing:?} wait to be asked for", store.name());
+        assert!(began.elapsed().as_secs() < 60, "{}: pieces {missing:?} wait to be asked for", store.name());
         std::thread::sleep(std::time::Duration::from_millis(20));
     }
 }

@@ -169,20 +169,16 @@ fn a_run_says_what_it_takes_of_the_life_of_a_drive() {
     let scene = city(folder.path(), 150, 96, 64, 8000);
     let spill = folder.path().join("spill");
     let flags = ["--page-rows", "16", "--frames", "330", "--view-order", "shuffle", "--strategy", "none"];
-    for steps in ["4000000", "10000000"] {
-        let more = ["--steps", steps, "--dry-run", "--spill-dir", text(&spill)];
-        let output = train(&[&[text(&scene)][..], &flags, &more].concat());
-        let said = stderr(&output);
-        assert!(output.status.success(), "{said}");
-        let told = said.split("commits apart, ").nth(1).and_then(|rest| rest.split(" % of what").next()).expect(&said);
-        let share = told.parse::<f64>().expect(&said) / 100.0;
-        let expected = told_to_be_written(&said) / 300e12;
-        // Both are rounded to be read: the share to a hundredth of a percent, the bytes to a tenth of their unit.
-        assert!(
-            expected > 0.005 && (share - expected).abs() < 0.00005 + 0.05 * expected,
-            "{share}, {expected}: {said}"
-        );
-    }
+    // As many as make some 900 GiB.
+    let more = ["--steps", "2000000", "--dry-run", "--spill-dir", text(&spill)];
+    let output = train(&[&[text(&scene)][..], &flags, &more].concat());
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    let told = said.split("commits apart, ").nth(1).and_then(|rest| rest.split(" % of what").next()).expect(&said);
+    let share = told.parse::<f64>().expect(&said) / 100.0;
+    let expected = told_to_be_written(&said) / 300e12;
+    // Both are rounded to be read: the share to a hundredth of a percent, the bytes to three digits.
+    assert!(expected > 0.002 && (share - expected).abs() < 0.00005 + 0.005 * expected, "{share}, {expected}: {said}");
 }
 
 #[test]

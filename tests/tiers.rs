@@ -182,7 +182,8 @@ fn the_codec_follows_from_what_the_spill_directory_remembers_of_its_drive() {
     let begun = run(folder.path(), &scene, &more);
     assert!(begun.status.success(), "{}", stderr(&begun));
     let file = spill.join("drive-rate.json");
-    let measured: serde_json::Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    let measured = std::fs::read(&file).unwrap_or_else(|e| panic!("not measured: {e}: {}", stderr(&begun)));
+    let measured: serde_json::Value = serde_json::from_slice(&measured).unwrap();
     let of_drive = |rate: [f64; 2]| if 2.0 / (1.0 / rate[0] + 1.0 / rate[1]) < 5e8 { "zstd:1" } else { "raw" };
     let rate = ["read", "write"].map(|key| measured[key].as_f64().unwrap());
     assert!(codec_of(&begun) == of_drive(rate), "{measured}: {}", stderr(&begun));

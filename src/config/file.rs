@@ -155,7 +155,7 @@ config_keys! {
         grow_scale3d: f64 = 0.01;
         /// Remove Gaussians with a lower opacity; 0 = none, and no opacity resets
         prune_opa: f64 = 0.005;
-        /// Remove Gaussians larger than this (times the scene scale), after the first reset
+        /// Remove Gaussians larger than this (times the scene scale), after the first --reset-every steps
         prune_scale3d: f64 = 0.1;
     }
     "Output" {
@@ -367,7 +367,8 @@ impl TrainConfig {
                 return refuse(key, "a number from 0 on");
             }
         }
-        if self.prune_opa >= 0.5 {
+        // As the events of a run have it.
+        if self.prune_opa as f32 >= 0.5 {
             return refuse("prune-opa", "less than 0.5");
         }
         Ok(())
@@ -520,6 +521,9 @@ mod tests {
         assert!(bad.check().is_err_and(|e| e.to_string().contains("--sh-degree")));
         let bad = TrainConfig { simd: "neon".into(), ..TrainConfig::default() };
         assert!(bad.check().is_err_and(|e| e.to_string().contains("neon")));
+        // As a 32-bit number this is half.
+        let bad = TrainConfig { prune_opa: 0.499_999_999, ..TrainConfig::default() };
+        assert!(bad.check().is_err_and(|e| e.to_string().contains("--prune-opa")));
         assert!(TrainConfig::default().check().is_ok());
     }
 }

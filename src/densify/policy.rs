@@ -18,7 +18,7 @@ pub struct DensifyConfig {
     pub grow_scale3d: f32,
     /// Rows are pruned whose opacity is smaller.
     pub prune_opa: f32,
-    /// Rows are pruned that are larger than this, once a reset has happened; share of the scene scale.
+    /// Rows are pruned that are larger than this, after the first `reset_every` steps; share of the scene scale.
     pub prune_scale3d: f32,
     /// No round at or before this step.
     pub refine_start: u32,
