@@ -16,6 +16,7 @@ use std::path::Path;
 use support::real_scene;
 use tempfile::TempDir;
 
+/// Of all runs.
 const COMMON: &[&str] = &["--view-order", "groups:4", "--test-every", "24", "--quiet"];
 
 /// Events of the runs of 600 steps.
@@ -87,10 +88,10 @@ fn frames_engines_and_threads_change_no_bit() {
             }
         }
     } else {
-        // A quarter of the frames, or the fewest where a view needs more than that.
         let io = |i: usize| engines[i % engines.len()];
         grid.push(how(pages, io(1), "1", &[]));
         grid.push(how(pages / 2, io(0), "2", &[]));
+        // Or the fewest, where a view needs more than a quarter.
         grid.push(how(pages / 4, io(1), "2", &["--evict", "lru", "--prefetch-bytes", "1MiB"]));
         grid.push(how(pages / 4, "", "1", &[]));
         grid.push(how(fewest, io(0), "1", &["--spill-codec", "zstd:1"]));

@@ -217,15 +217,15 @@ impl RunState {
             return refuse("an event lies in its future");
         }
         let is_too_high = |e: &Event| matches!(e.kind, EventKind::RaiseShDegree { degree } if degree > 3);
-        let is_no_opacity = |event: &Event| match event.kind {
-            EventKind::ResetOpacity { max_opacity } => !(max_opacity > 0.0 && max_opacity < 1.0),
-            _ => false,
-        };
-        if log.events().iter().any(is_no_opacity) {
-            return refuse("an event resets opacities to none");
-        }
         if self.sh_degree_start > 3 || log.events().iter().any(is_too_high) {
             return refuse("a degree is above 3");
+        }
+        // Logits of others would be infinite, or no numbers.
+        let is_opacity = |x: f32| x > 0.0 && x < 1.0;
+        let is_wrong =
+            |e: &Event| matches!(e.kind, EventKind::ResetOpacity { max_opacity } if !is_opacity(max_opacity));
+        if log.events().iter().any(is_wrong) {
+            return refuse("an event resets opacities to what is none");
         }
         let ascends = self.histogram.windows(2).all(|pair| pair[0].0 < pair[1].0);
         if !ascends || self.histogram.last().is_some_and(|last| last.0 >= BINS) {

@@ -1,16 +1,13 @@
 //! A drive that ends nothing until somebody waits for it: what is on its way stays within its bound in bytes, and pages
 //! that come as a surprise are counted.
 
-use super::world::{self, PAGE_ROWS, SH_DEGREE, camera, config};
-use gsscale::base::ids::{PageId, PageNo};
+use super::world::{self, camera, config};
+use gsscale::base::ids::PageNo;
 use gsscale::page::codec::Codec;
 use gsscale::page::memory_store::MemoryStore;
-use gsscale::page::paged_store::{PagedStore, PagedStoreConfig};
-use gsscale::page::slots::SlotLayout;
 use gsscale::page::store::{Completion, Direction, PageStore, Transfer};
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::scene::camera::Camera;
-use gsscale::scene::page_layout::capacity_bytes;
 use std::collections::VecDeque;
 use std::io;
 use std::sync::{Arc, Mutex};
@@ -70,13 +67,8 @@ fn slow_pager(config: PagerConfig) -> (Pager, OnTheWay) {
     let on_the_way = OnTheWay::default();
     let inner = MemoryStore::new();
     let engine = SlowStore { inner, queue: VecDeque::new(), on_the_way: Arc::clone(&on_the_way) };
-    let layout = SlotLayout::new(capacity_bytes(PAGE_ROWS, SH_DEGREE), 16);
-    let store = PagedStoreConfig { store: 5, layout, codec: Codec::Raw, generation: 1, serial: 0 };
-    let mut pager = Pager::new(config, PagedStore::new(Box::new(engine), store));
-    for i in 0..PAGES {
-        let meta = world::meta(PageId::initial(i), f64::from(i), 3, 1);
-        pager.insert(meta, |payload| world::fill(payload, &meta, 0)).unwrap();
-    }
+    let mut pager = Pager::new(config, world::store_over(Box::new(engine), Codec::Raw));
+    world::insert_pages(&mut pager, PAGES);
     (pager, on_the_way)
 }
 

@@ -1,7 +1,7 @@
 //! How much is read and written: as little as a cache of that size can, and never more because of what is done ahead.
 
 use super::world::{self, camera, config, store};
-use gsscale::base::ids::{PageId, PageNo};
+use gsscale::base::ids::PageNo;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::cache::evict::EvictPolicy;
 use gsscale::page::codec::Codec;
@@ -16,13 +16,6 @@ use std::collections::{BTreeMap, BTreeSet};
 
 const PAGES: u32 = 100;
 
-fn scene(pager: &mut Pager) {
-    for i in 0..PAGES {
-        let meta = world::meta(PageId::initial(i), f64::from(i), 3, 1);
-        pager.insert(meta, |payload| world::fill(payload, &meta, 0)).unwrap();
-    }
-}
-
 /// Views in groups of neighbours, as aerial flights have them.
 fn cameras() -> Vec<Camera> {
     let mut draws = Stream::new(9, Purpose::Test, 1, 1);
@@ -32,7 +25,7 @@ fn cameras() -> Vec<Camera> {
 /// Steps that touch every page, or that only read; the whole future is known. Also the pages in memory at the start.
 fn drive(config: PagerConfig, cameras: &[Camera], touches: bool, calls: usize) -> (PagerStats, Vec<u32>) {
     let mut pager = Pager::new(config, store(Codec::Raw, &Faults::new()));
-    scene(&mut pager);
+    world::insert_pages(&mut pager, PAGES);
     let coming: Vec<&Camera> = cameras.iter().collect();
     let before = pager.stats();
     let start = (0..PAGES).filter(|&p| pager.is_in_memory(PageNo(p))).collect();
@@ -73,7 +66,7 @@ fn belady(views: &[Vec<u32>], frames: usize, start: &[u32]) -> u64 {
 
 fn pages_of(cameras: &[Camera]) -> Vec<Vec<u32>> {
     let mut pager = Pager::in_memory(PagerConfig::in_memory(world::PAGE_ROWS, world::SH_DEGREE));
-    scene(&mut pager);
+    world::insert_pages(&mut pager, PAGES);
     let mut pages = Vec::new();
     let list = |camera: &Camera| {
         visible_pages(pager.index(), camera, &mut pages);
@@ -121,7 +114,7 @@ fn the_run_reads_what_the_printed_plan_lists() {
     for frames in [12, 20, 35, 60] {
         let mut pager =
             Pager::new(PagerConfig { prefetch_bytes: 0, ..config(frames) }, store(Codec::Raw, &Faults::new()));
-        scene(&mut pager);
+        world::insert_pages(&mut pager, PAGES);
         // What the import left in memory enters the model as a step of its own, before the first.
         let mut plan = Plan::new(0, 1 << 24);
         let start: Vec<PageNo> = (0..PAGES).map(PageNo).filter(|&p| pager.is_in_memory(p)).collect();
@@ -148,7 +141,7 @@ fn the_run_reads_what_the_printed_plan_lists() {
 fn a_page_that_moves_into_a_later_view_is_kept_for_it() {
     const LATER: usize = 17;
     let mut pager = Pager::new(config(14), store(Codec::Raw, &Faults::new()));
-    scene(&mut pager);
+    world::insert_pages(&mut pager, PAGES);
     let at = |step: usize| match step {
         0 => 0.0,
         LATER => 80.0,

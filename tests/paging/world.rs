@@ -9,6 +9,7 @@ use gsscale::page::format::HEADER_BYTES;
 use gsscale::page::memory_store::MemoryStore;
 use gsscale::page::paged_store::{PagedStore, PagedStoreConfig};
 use gsscale::page::slots::SlotLayout;
+use gsscale::page::store::PageStore;
 use gsscale::paging::error::PagingError;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::pinned::PinnedPage;
@@ -34,9 +35,20 @@ pub fn config(frames: usize) -> PagerConfig {
 
 /// A store in memory that fails by `faults`.
 pub fn store(codec: Codec, faults: &Faults) -> PagedStore {
+    store_over(Box::new(FaultyStore::new(Box::new(MemoryStore::new()), faults.clone())), codec)
+}
+
+pub fn store_over(engine: Box<dyn PageStore>, codec: Codec) -> PagedStore {
     let layout = SlotLayout::new(capacity_bytes(PAGE_ROWS, SH_DEGREE), 16);
-    let engine = FaultyStore::new(Box::new(MemoryStore::new()), faults.clone());
-    PagedStore::new(Box::new(engine), PagedStoreConfig { store: 5, layout, codec, generation: 1, serial: 0 })
+    PagedStore::new(engine, PagedStoreConfig { store: 5, layout, codec, generation: 1, serial: 0 })
+}
+
+/// Puts `pages` pages of three rows in a row.
+pub fn insert_pages(pager: &mut Pager, pages: u32) {
+    for i in 0..pages {
+        let meta = meta(PageId::initial(i), f64::from(i), 3, 1);
+        pager.insert(meta, |payload| fill(payload, &meta, 0)).unwrap();
+    }
 }
 
 pub fn camera(x: f64) -> Camera {
