@@ -8,7 +8,9 @@ mod scenes;
 #[path = "support/small_drive.rs"]
 mod small_drive;
 
+use gsscale::base::identity::RunId;
 use gsscale::checkpoint::interval::CommitEvery;
+use gsscale::checkpoint::run_state::RunIdentity;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::{RunOptions, simd_path};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
@@ -148,6 +150,7 @@ impl World {
         let mut trainer = Trainer::of_scene(scene, &dataset, Box::new(CpuRenderer::new()), options);
         let resolved = Resolved {
             version: String::new(),
+            run: RunId::UNKNOWN,
             scene: self.scene.clone(),
             simd: simd_path(&config).name().to_string(),
             threads: 1,
@@ -165,7 +168,13 @@ impl World {
         checkpoint.fill_reserve()?;
         assert!(spill_dir.join(RESERVE_NAME).exists());
         let (simd, text) = (resolved.simd, toml::to_string(&config).unwrap());
-        checkpoint.set_origin(Origin { config: text, simd, sh_degree_start, dataset: print });
+        checkpoint.set_origin(Origin {
+            config: text,
+            simd,
+            sh_degree_start,
+            dataset: print,
+            run: RunIdentity::default(),
+        });
         let mut metrics = MetricsLog::create(&out.join("metrics.jsonl"))?;
         let targets = TargetCache::new(&dataset.views, 1 << 26, 1)?;
         for _ in 0..FIRST_STEPS {

@@ -102,6 +102,22 @@ fn removing_leaves_what_is_not_ours() {
     assert_eq!(std::fs::read(&outside).unwrap(), b"mine");
 }
 
+/// Somebody removed the folder while it was in use, and another run made its own there.
+#[test]
+fn a_store_that_took_the_place_of_ours_is_not_removed() {
+    let parent = tempfile::tempdir().unwrap();
+    let folder = parent.path().join("spill");
+    let ours = create(&folder).unwrap();
+    std::fs::remove_dir_all(&folder).unwrap();
+    let theirs = create(&folder).unwrap();
+    write_segment(&folder, 0, theirs.format().store);
+    let before = contents(&folder);
+    let error = ours.remove().unwrap_err();
+    assert!(error.problem.contains("not the one that this run used"), "{error}");
+    assert!(contents(&folder) == before);
+    assert_eq!(theirs.remove().unwrap(), [""; 0]);
+}
+
 #[test]
 fn folders_of_something_else_are_refused_and_untouched() {
     let parent = tempfile::tempdir().unwrap();

@@ -330,6 +330,12 @@ fn a_folder_with_something_in_it_is_refused_unless_told_otherwise() {
     let error = write_city(folder.path(), &CityOptions { overwrite: true, ..small() }, &|_, _| {}).unwrap_err();
     assert!(error.to_string().contains("DSC_0001.jpg"), "{error}");
     assert!(files(folder.path()) == before);
+    // So is a model that no generated photo lies beside.
+    std::fs::remove_dir_all(folder.path().join("images")).unwrap();
+    let before = files(folder.path());
+    let error = write_city(folder.path(), &CityOptions { overwrite: true, ..small() }, &|_, _| {}).unwrap_err();
+    assert!(error.to_string().contains("model without photos"), "{error}");
+    assert!(files(folder.path()) == before);
 }
 
 #[test]

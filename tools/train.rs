@@ -4,7 +4,7 @@ use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
-use gsscale::train::out_folder::remedy_of_existing;
+use gsscale::train::out_folder::{Existing, remedy_of_existing};
 use gsscale::train::resume::{ResumeRequest, resume};
 use gsscale::train::run::{RunOutcome, RunRequest, run};
 use gsscale::train::trainer::TrainError;
@@ -113,7 +113,7 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
         out,
         config,
         dry_run: args.dry_run,
-        overwrite: args.overwrite || args.demo,
+        existing: if args.overwrite || args.demo { Existing::Overwrite } else { Existing::Refuse },
         quiet: args.quiet,
     })
 }

@@ -1,9 +1,10 @@
-//! What every layer may use: errors, random draws, deterministic math, instruction paths, sizes.
+//! What every layer may use: errors, identities, random draws, deterministic math, instruction paths, sizes.
 //! Nothing here knows a Gaussian, a picture or a disk format.
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod eight;
 pub mod error;
+pub mod identity;
 pub mod ids;
 pub mod machine;
 pub mod math;

@@ -8,13 +8,15 @@
 //! Version 2 added what tools list and what a run that goes on counts from ([`RunState::test`], [`RunState::traffic`]),
 //! and a dataset print that knows photos, points and the local frame. No program was released with version 1.
 //! Version 3 added the last five of [`TrafficSoFar`]; of a state of version 2 they are 0.
+//! Version 4 added [`RunState::run`]; of an older state the run is unknown.
 
+use crate::base::identity::RunId;
 use crate::page::encoding::{self, EncodingError};
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
-pub const VERSION: u32 = 3;
+pub const VERSION: u32 = 4;
 /// The oldest that is read.
 const OLDEST: u32 = 2;
 /// Bins of the statistics.
@@ -96,6 +98,17 @@ pub struct TrafficSoFar {
     pub belady_bytes_read: u64,
 }
 
+/// Which run a state belongs to, and where the run was.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RunIdentity {
+    /// Its identity.
+    pub id: RunId,
+    /// Its output folder, absolute; empty where unknown.
+    pub out: String,
+    /// Its scene, absolute; empty where unknown.
+    pub scene: String,
+}
+
 /// A run between two steps.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunState {
@@ -133,6 +146,8 @@ pub struct RunState {
     pub test: Option<LastTest>,
     /// What moved between the tiers so far.
     pub traffic: TrafficSoFar,
+    /// Whose state it is.
+    pub run: RunIdentity,
 }
 
 /// Why bytes are not the state of a run.
@@ -170,6 +185,7 @@ impl RunState {
             metrics_bytes: 0,
             test: None,
             traffic: TrafficSoFar::default(),
+            run: RunIdentity::default(),
         }
     }
 
@@ -194,8 +210,11 @@ impl RunState {
             return Err(RunStateError::Version(version));
         }
         let mut body = body.to_vec();
-        if version == 2 {
+        if version < 3 {
             body.extend(of_version_3()?);
+        }
+        if version < 4 {
+            body.extend(encoding::to_bytes(&RunIdentity::default())?);
         }
         let state: RunState = encoding::from_bytes(&body)?;
         state.check()?;
@@ -302,6 +321,11 @@ mod tests {
                 belady_bytes_read: 3,
                 ..TrafficSoFar::default()
             },
+            run: RunIdentity {
+                id: "00112233445566778899aabbccddeeff".parse().unwrap(),
+                out: "/runs/a".to_string(),
+                scene: "/scans/a".to_string(),
+            },
         }
     }
 
@@ -314,12 +338,16 @@ mod tests {
     }
 
     #[test]
-    fn states_of_version_2_have_counted_less() {
+    fn older_states_know_no_run_and_have_counted_less() {
         let bytes = sample().to_bytes().unwrap();
+        let before_version_4 = bytes.len() - encoding::to_bytes(&sample().run).unwrap().len();
+        let of_version_3 = [&3u32.to_le_bytes(), &bytes[4..before_version_4]].concat();
+        let unknown = RunState { run: RunIdentity::default(), ..sample() };
+        assert_eq!(RunState::from_bytes(&of_version_3).unwrap(), unknown);
         // Five numbers fewer, all of eight bytes.
-        let bytes = [&2u32.to_le_bytes(), &bytes[4..bytes.len() - 40]].concat();
+        let of_version_2 = [&2u32.to_le_bytes(), &bytes[4..before_version_4 - 40]].concat();
         let traffic = TrafficSoFar { bytes_read: 9, stall_seconds: 0.25, ..TrafficSoFar::default() };
-        assert_eq!(RunState::from_bytes(&bytes).unwrap(), RunState { traffic, ..sample() });
+        assert_eq!(RunState::from_bytes(&of_version_2).unwrap(), RunState { traffic, ..unknown });
         let of_version_1 = [&1u32.to_le_bytes(), &bytes[4..]].concat();
         assert_eq!(RunState::from_bytes(&of_version_1), Err(RunStateError::Version(1)));
     }

@@ -45,6 +45,7 @@ pub mod spill_dir;
 pub mod spill_format;
 pub mod store;
 mod transfer_pool;
+pub mod uncommitted;
 #[cfg(target_os = "linux")]
 pub mod uring_store;
 pub mod verify;

@@ -291,6 +291,15 @@ pub fn commit_config(store: u128) -> CommitConfig {
     CommitConfig { store, cache_bytes: CACHE_BYTES, reserve_bytes: 0 }
 }
 
+/// The last generation that the map of `store` in `folder` holds, 0 before the first commit. Takes no lock: the caller has it.
+///
+/// # Errors
+/// There is no map, it is damaged, or it is older than its witness.
+pub(super) fn latest_generation(folder: &Path, store: u128) -> Result<u64, ReadError> {
+    let (_, content) = open_map(folder, store, WitnessRule::Obeyed, false)?;
+    Ok(content.counters.latest)
+}
+
 /// What the FORMAT file of `folder` says.
 ///
 /// # Errors

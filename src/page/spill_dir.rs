@@ -13,6 +13,7 @@ use super::segment_files::{segment_from_file_name, sync_folder, with_safe_flags}
 use super::slots::SlotLayout;
 use super::spill_format::{FORMAT_BYTES, FormatError, Purpose, SpillFormat};
 use crate::base::error::{InputError, InputResult};
+use crate::base::identity::draw_identity;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
@@ -34,7 +35,7 @@ pub struct SpillDir {
     /// Whether this process made the folder itself, and so may remove it.
     made_folder: bool,
     /// Holds the lock.
-    _lock: File,
+    lock: File,
 }
 
 impl SpillDir {
@@ -85,9 +86,9 @@ impl SpillDir {
         }
         tighten(folder)?;
         sign_lock(folder, &lock)?;
-        let format = SpillFormat { store: new_identity(), purpose, layout };
+        let format = SpillFormat { store: draw_identity(), purpose, layout };
         write_format(folder, &format)?;
-        Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder, _lock: lock })
+        Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder, lock })
     }
 
     /// Opens a spill directory that exists.
@@ -109,7 +110,7 @@ impl SpillDir {
         let lock = take_lock(folder)?;
         let format = read()?;
         sign_lock(folder, &lock)?;
-        Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder: false, _lock: lock })
+        Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder: false, lock })
     }
 
     /// Whether there is one, of whatever version and in whatever state, without touching it.
@@ -150,12 +151,26 @@ impl SpillDir {
         Ok(segments)
     }
 
+    /// Refuses a folder whose lock or FORMAT file is no longer the one that this process holds: somebody removed the store
+    /// and made another one under the same path.
+    fn check_identity(&self) -> InputResult<()> {
+        let is_same_lock = is_still_there(&self.folder.join(LOCK), &self.lock);
+        let is_same_store = matches!(read_format(&self.folder)?, Some(Ok(format)) if format.store == self.format.store);
+        if is_same_lock && is_same_store {
+            return Ok(());
+        }
+        let problem = "the store in it is not the one that this run used, so nothing in it is removed";
+        let remedy = format!("see what it holds: gsscale-ckpt ls {}", self.folder.display());
+        Err(InputError::new(&self.folder, problem, remedy))
+    }
+
     /// Removes the files of this store, and the folder if this process made it. Gives the names of files that stay
     /// because they are not this store's.
     ///
     /// # Errors
-    /// A file cannot be removed.
+    /// Another store has taken the place of this one (nothing is removed), or a file cannot be removed.
     pub fn remove(self) -> InputResult<Vec<String>> {
+        self.check_identity()?;
         let mut foreign = Vec::new();
         let mut ours = [
             MAP_NAME,
@@ -382,15 +397,6 @@ fn host_name() -> String {
     name.map_or_else(|| "unknown".to_string(), |n| n.trim().to_string())
 }
 
-/// A number that no other store has.
-fn new_identity() -> u128 {
-    use std::hash::{BuildHasher, Hasher, RandomState};
-    // The standard library draws the keys of its hash maps from the system.
-    let draw = || RandomState::new().build_hasher().finish();
-    let time = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_nanos());
-    (u128::from(draw()) << 64 | u128::from(draw())) ^ time ^ u128::from(std::process::id()) << 96
-}
-
 /// What the FORMAT file says; `None` when there is none.
 pub(super) fn read_format(folder: &Path) -> InputResult<Option<Result<SpillFormat, FormatError>>> {
     Ok(format_bytes_of(folder)?.map(|bytes| SpillFormat::from_bytes(&bytes)))
@@ -460,13 +466,5 @@ mod tests {
     fn folders_of_others_are_refused() {
         let error = check_owner(Path::new("x"), 1000, 0).unwrap_err();
         assert!(error.problem.contains("1000") && check_owner(Path::new("x"), 7, 7).is_ok());
-    }
-
-    #[test]
-    fn identities_differ() {
-        let mut drawn: Vec<u128> = (0..100).map(|_| new_identity()).collect();
-        drawn.sort_unstable();
-        drawn.dedup();
-        assert_eq!(drawn.len(), 100);
     }
 }

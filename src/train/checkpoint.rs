@@ -13,7 +13,7 @@ use super::first_commit::FirstCommit;
 use super::report::MetricsLog;
 use super::trainer::{TrainError, Trainer};
 use crate::checkpoint::interval::{CommitCost, CommitInterval, CommitReport};
-use crate::checkpoint::run_state::{DatasetPrint, RunState, TrafficSoFar};
+use crate::checkpoint::run_state::{DatasetPrint, RunIdentity, RunState, TrafficSoFar};
 use crate::config::file::TrainConfig;
 use crate::page::commit::{CommitError, Commits};
 use crate::page::spill_dir::SpillDir;
@@ -85,6 +85,8 @@ pub struct Origin {
     pub sh_degree_start: u8,
     /// The dataset.
     pub dataset: DatasetPrint,
+    /// The run that commits.
+    pub run: RunIdentity,
 }
 
 impl Checkpoint {
@@ -349,7 +351,7 @@ fn bytes_of(state: &RunState) -> Result<Vec<u8>, CommitError> {
 impl Trainer {
     /// The run between two steps, beside its pages.
     pub fn run_state(&self, origin: &Origin, metrics_bytes: u64) -> RunState {
-        let Origin { config, simd, sh_degree_start, dataset } = origin.clone();
+        let Origin { config, simd, sh_degree_start, dataset, run } = origin.clone();
         RunState {
             step: self.step,
             config,
@@ -368,6 +370,7 @@ impl Trainer {
             metrics_bytes,
             test: self.last_test,
             traffic: traffic_of(&self.scene.pager.stats(), self.past_belady_bytes),
+            run,
         }
     }
 

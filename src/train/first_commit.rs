@@ -14,6 +14,7 @@ use crate::page::paged_store::PagedStore;
 use crate::page::slots::SlotLayout;
 use crate::page::spill_dir::SpillDir;
 use crate::page::spill_format::Purpose;
+use crate::page::uncommitted::remove_uncommitted;
 use crate::paging::pager::Pager;
 use crate::scene::page_layout::capacity_bytes;
 use std::path::{Path, PathBuf};
@@ -54,6 +55,8 @@ impl FirstCommit {
     /// Makes it, and gives it to the pager.
     pub fn make(&self, pager: &mut Pager) -> Result<(SpillDir, Commits), TrainError> {
         let layout = SlotLayout::new(self.capacity_bytes, pager.index().len() as u64);
+        // A kill in the middle of an earlier life's first commit leaves a store without commits.
+        remove_uncommitted(&self.folder, true)?;
         // On a network file system too: it is where the user wants the results.
         let spill = SpillDir::create(&self.folder, Purpose::Checkpoint, layout, true)?;
         match self.make_in(&spill, layout) {

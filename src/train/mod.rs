@@ -6,7 +6,7 @@
 //! `update` changes them, `dense` all of them at every step, [`costs`] counts what steps took, [`eval`] looks at
 //! held-out views, [`report`] writes what happened, [`progress`] shows it, [`machine`] starts its threads, [`signals`]
 //! hears Ctrl-C, [`start`] gives the first Gaussians
-//! (`gaussian_pages` those of a file of any size), [`first_look`] looks at them for a plan, [`out_folder`] is where results go, [`page_map`] draws where pages lie,
+//! (`gaussian_pages` those of a file of any size), [`first_look`] looks at them for a plan, [`out_folder`] is where results go, `ownership` says which store belongs to which run and who may delete what, [`page_map`] draws where pages lie,
 //! [`stores`] is what tools do with checkpoints.
 
 pub mod budget;
@@ -25,6 +25,7 @@ pub mod machine;
 pub mod memory;
 pub mod out_folder;
 mod outgrown;
+mod ownership;
 pub mod page_map;
 pub mod pages;
 pub mod preflight;

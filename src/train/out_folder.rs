@@ -1,19 +1,51 @@
 //! The output folder of a run that begins: refused where a run is in it already, made, and cleared of an earlier run when
 //! the user says so.
 //!
-//! Invariants: 1. nothing is removed but files under this program's names beside a run's config, and a checkpoint that
-//! tells itself as one; 2. a run that could go on is named with the command that does so.
+//! Invariants: 1. nothing is removed but files under this program's names beside a run's config, and that run's own
+//! checkpoint (`ownership`); 2. a run that could go on is named with the command that does so.
 
 use super::first_commit::checkpoint_folder;
+use super::ownership::{check_removable, remove_checkpoint_in};
+use super::report::{folder_of, read_resolved};
+use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
+use crate::base::identity::RunId;
 use crate::config::file::TrainConfig;
 use crate::exchange::tensorboard::is_event_file;
+use crate::page::segment_files::sync_folder;
 use crate::page::spill_dir::SpillDir;
 use crate::report::run_report::{PAGES_FILE, REPORT_FILE};
 use std::path::Path;
 
-/// Refuses a folder that has something in it, and says what to do about it.
-pub(super) fn check_new(out: &Path) -> InputResult<()> {
+/// What a run does with an output folder that is there already.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Existing {
+    /// Refuses it, unless it is empty.
+    Refuse,
+    /// Removes the earlier run's results and its checkpoint in the folder.
+    Overwrite,
+    /// Takes it as its own: this run was cut off before its first commit.
+    BeginAgain,
+}
+
+/// Refuses an output folder that a run may not begin in, and says what to do about it.
+///
+/// # Errors
+/// The folder has something in it and is not to be overwritten, or its checkpoint is not the earlier run's.
+pub(super) fn check(out: &Path, existing: Existing) -> Result<(), TrainError> {
+    match existing {
+        Existing::Refuse => Ok(check_new(out)?),
+        Existing::Overwrite => check_removable(&checkpoint_folder(out), run_in(out)),
+        Existing::BeginAgain => Ok(()),
+    }
+}
+
+/// Identity of the run whose config lies in `out`.
+fn run_in(out: &Path) -> RunId {
+    read_resolved(&out.join("config.toml")).map_or(RunId::UNKNOWN, |resolved| resolved.run)
+}
+
+fn check_new(out: &Path) -> InputResult<()> {
     if !out.exists() {
         return Ok(());
     }
@@ -44,37 +76,67 @@ pub fn remedy_of_existing(out: &Path) -> String {
     )
 }
 
-/// Makes the folder, proves that it can be written, and removes what an earlier run left there under our names.
-pub(super) fn make(out: &Path, overwrite: bool) -> InputResult<()> {
+/// Makes the folder, durably.
+///
+/// # Errors
+/// It cannot be made.
+pub(super) fn make_folder(out: &Path) -> InputResult<()> {
     let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
+    let is_new = !out.exists();
     std::fs::create_dir_all(out).map_err(io)?;
+    // Other folders on the way to it that were made just now are left to the file system.
+    if is_new { sync_folder(folder_of(out)).map_err(io) } else { Ok(()) }
+}
+
+/// Makes the folder, proves that it can be written, and removes what an earlier run left there under our names.
+///
+/// # Errors
+/// The folder cannot be written, or its checkpoint is not the earlier run's.
+pub(super) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
+    let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
+    make_folder(out)?;
     let probe = out.join(".gsscale-probe");
     std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(io)?;
     // Without a run's config the files under our names are somebody else's (the points of a scene, say).
-    if !overwrite || !out.join("config.toml").is_file() {
+    if existing == Existing::Refuse || !out.join("config.toml").is_file() {
         return Ok(());
     }
-    // First, because a run that is still at work in it ends this one here.
-    let checkpoint = checkpoint_folder(out);
-    if SpillDir::is_one(&checkpoint) {
-        SpillDir::open(&checkpoint, true)?.remove()?;
-        // Only if nothing else is in it.
-        let _ = std::fs::remove_dir(&checkpoint);
+    if existing == Existing::Overwrite {
+        // First, because a run that is still at work in it ends this one here.
+        remove_checkpoint_in(&checkpoint_folder(out), run_in(out))?;
+        remove_file(&out.join("config.toml"))?;
     }
-    for name in ["config.toml", "metrics.jsonl", "summary.json", "point_cloud.ply", REPORT_FILE, PAGES_FILE] {
-        let path = out.join(name);
-        if path.is_file() {
-            std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
-        }
+    for name in ["metrics.jsonl", "summary.json", "point_cloud.ply", REPORT_FILE, PAGES_FILE] {
+        remove_file(&out.join(name))?;
     }
     remove_saved(out)?;
     remove_evaluation(out)?;
     remove_events(&out.join("tensorboard"))?;
-    let pictures = out.join("renders/test");
-    if pictures.is_dir() {
-        let io = |e: std::io::Error| InputError::io(&pictures, "removing the earlier run's pictures", &e);
-        std::fs::remove_dir_all(&pictures).map_err(io)?;
+    Ok(remove_pictures(&out.join("renders/test"))?)
+}
+
+fn remove_file(path: &Path) -> InputResult<()> {
+    if !path.is_file() {
+        return Ok(());
     }
+    std::fs::remove_file(path).map_err(|e| InputError::io(path, "removing the earlier run's file", &e))
+}
+
+/// Removes the pictures of an earlier evaluation, which lie in folders where the photos do, and folders that are empty then.
+fn remove_pictures(folder: &Path) -> InputResult<()> {
+    if !folder.is_dir() {
+        return Ok(());
+    }
+    let entries = std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "listing the folder", &e))?;
+    for entry in entries.flatten() {
+        let path = entry.path();
+        match entry.file_type() {
+            Ok(kind) if kind.is_dir() => remove_pictures(&path)?,
+            Ok(kind) if kind.is_file() && path.extension().is_some_and(|e| e == "png") => remove_file(&path)?,
+            _ => {}
+        }
+    }
+    let _ = std::fs::remove_dir(folder);
     Ok(())
 }
 
@@ -133,18 +195,18 @@ mod tests {
             EventFile::create(&events, None).unwrap().write(1, &[("loss/train", 0.5)]).unwrap();
         }
         let count = || std::fs::read_dir(&events).map_or(0, Iterator::count);
-        make(out, true).unwrap();
+        make(out, Existing::Overwrite).unwrap();
         assert_eq!(count(), 2, "no run's config, so they are not a run's");
         std::fs::write(out.join("config.toml"), "").unwrap();
         std::fs::write(events.join("events.out.tfevents.0123456789.host.1.0"), "of another program").unwrap();
-        make(out, true).unwrap();
+        make(out, Existing::Overwrite).unwrap();
         assert_eq!(count(), 1);
         std::fs::remove_file(events.join("events.out.tfevents.0123456789.host.1.0")).unwrap();
         std::fs::write(out.join("config.toml"), "").unwrap();
         for name in ["evaluated.json", "evaluated-as.toml"] {
             std::fs::write(out.join(name), "of the earlier run").unwrap();
         }
-        make(out, true).unwrap();
+        make(out, Existing::Overwrite).unwrap();
         assert!(!events.exists());
         assert!(!out.join("evaluated.json").exists() && !out.join("evaluated-as.toml").exists());
     }

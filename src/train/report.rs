@@ -5,15 +5,17 @@
 
 use super::costs::StepCosts;
 use crate::base::error::{InputError, InputResult};
+use crate::base::identity::RunId;
 use crate::base::units::format_bytes;
 use crate::checkpoint::interval::CommitReport;
 use crate::config::file::TrainConfig;
 use crate::exchange::tensorboard::EventFile;
+use crate::page::segment_files::sync_folder;
 use crate::paging::pager::Pager;
 use crate::render::color_correct::ColorCorrect;
 use serde::{Deserialize, Serialize};
 use std::fs::{File, OpenOptions};
-use std::io::{BufWriter, Write};
+use std::io::{BufRead, BufReader, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 /// PSNR that stands for a perfect image.
@@ -241,19 +243,24 @@ impl MetricsLog {
         bytes.map_or_else(|| MetricsLog::create(path), |bytes| MetricsLog::resume(path, bytes))
     }
 
-    /// Goes on after the first `bytes` bytes of the file; what follows them belongs to steps that are done again.
+    /// Appends after the first `bytes` bytes of the file; what follows them belongs to steps that are done again. Where some
+    /// of these bytes are missing the log goes on after the last whole line, with a warning: no step depends on it.
     ///
     /// # Errors
-    /// The file is missing, shorter, or cannot be written.
+    /// The file cannot be read or written.
     pub fn resume(path: &Path, bytes: u64) -> InputResult<Self> {
         let io = |e: std::io::Error| InputError::io(path, "going on with the metrics file", &e);
-        let file = OpenOptions::new().append(true).open(path).map_err(io)?;
+        let mut options = OpenOptions::new();
+        let file = options.read(true).append(true).create(true).open(path).map_err(io)?;
         let there = file.metadata().map_err(io)?.len();
+        let kept = if there < bytes { end_of_whole_lines(&file).map_err(io)? } else { bytes };
         if there < bytes {
-            let problem = format!("it has {there} bytes, but the run had written {bytes}");
-            return Err(InputError::new(path, problem, "bring back the file of the run that stopped"));
+            eprintln!(
+                "warning: {} has {there} of the {bytes} bytes that the run had written: the curves of the report have a gap",
+                path.display()
+            );
         }
-        file.set_len(bytes).map_err(io)?;
+        file.set_len(kept).map_err(io)?;
         Ok(MetricsLog { path: path.to_path_buf(), file: BufWriter::new(file), events: None })
     }
 
@@ -284,6 +291,16 @@ impl MetricsLog {
     }
 }
 
+/// Bytes up to the end of the last line that ends.
+fn end_of_whole_lines(file: &File) -> std::io::Result<u64> {
+    let (mut reader, mut line, mut end) = (BufReader::new(file), Vec::new(), 0);
+    while reader.read_until(b'\n', &mut line)? > 0 && line.ends_with(b"\n") {
+        end += line.len() as u64;
+        line.clear();
+    }
+    Ok(end)
+}
+
 fn write_scalars(events: &mut EventFile, line: &StepLine) -> InputResult<()> {
     let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
     let mut scalars = vec![
@@ -309,7 +326,7 @@ fn write_scalars(events: &mut EventFile, line: &StepLine) -> InputResult<()> {
     events.write(line.step, &scalars)
 }
 
-/// Writes a whole file by way of a temporary one beside it.
+/// Writes a whole file by way of a temporary one beside it; file and name are durable when this returns.
 ///
 /// # Errors
 /// The folder cannot be written.
@@ -320,7 +337,14 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> InputResult<()> {
     let io = |e: std::io::Error| InputError::io(path, "writing", &e);
     let mut file = File::create(&part).map_err(io)?;
     file.write_all(bytes).and_then(|()| file.sync_all()).map_err(io)?;
-    std::fs::rename(&part, path).map_err(io)
+    std::fs::rename(&part, path).map_err(io)?;
+    // Without it a power cut can leave the folder without the new name.
+    sync_folder(folder_of(path)).map_err(io)
+}
+
+/// The folder that a path lies in.
+pub(super) fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// Writes summary.json.
@@ -333,10 +357,13 @@ pub fn write_summary(path: &Path, summary: &Summary) -> InputResult<()> {
 }
 
 /// Facts of a run that follow from its config and machine.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Resolved {
     /// Version of the program.
     pub version: String,
+    /// Identity of the run; its commits hold it too.
+    #[serde(default)]
+    pub run: RunId,
     /// The scene.
     pub scene: PathBuf,
     /// Instruction path in use.

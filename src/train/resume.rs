@@ -1,22 +1,27 @@
-//! Going on with a run that stopped, or that ended and kept its checkpoint: from its output folder to the end.
+//! Resuming a run that stopped, or that ended and kept its checkpoint: from its output folder to the end.
 //!
-//! Invariants: 1. a run that goes on ends with the bytes that it would have had without the stop; 2. keys that change
-//! numbers, and the dataset, are those of the run, or it is refused with the difference, unless the user accepts it: then
-//! every page is brought to the step of the change as it was trained, once, and goes on from there by the new rules; 3. a
-//! refused resume leaves everything as it was.
+//! Invariants: 1. a resumed run ends with the bytes that it would have had without the stop; 2. keys that change
+//! numbers, and the dataset, are those of the run, or the resume is refused with the difference, unless the user accepts it:
+//! then every page is brought to the step of the change as it was trained, once, and goes on from there by the new rules; 3. a
+//! refused resume leaves everything as it was; 4. the checkpoint alone is enough: of the output folder nothing is needed but
+//! what says which checkpoint is meant, and files that are missing there are made again; 5. a checkpoint of another run is
+//! neither used nor removed (`ownership`).
 
 use super::changes::{Changes, kept_config};
 use super::dataset_print::dataset_print;
 use super::first_commit::checkpoint_folder;
 use super::machine;
 use super::memory::host_budget;
+use super::out_folder::Existing;
+use super::ownership::open_own;
 use super::pages::PagedScene;
-use super::report::{Summary, read_resolved};
-use super::run::{Begun, Past, RunOutcome, RunRequest, begin, see_through};
+use super::report::{Resolved, StepLine, Summary, read_resolved};
+use super::run::{Begun, Past, RunOutcome, RunRequest, begin, run, see_through};
 use super::start::Start;
 use super::tiers::Stored;
 use super::trainer::{TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
+use crate::base::identity::RunId;
 use crate::base::simd::SimdPath;
 use crate::checkpoint::run_state::{DatasetPrint, RunState, RunStateError};
 use crate::config::file::{TrainConfig, TrainOverrides};
@@ -50,25 +55,112 @@ pub struct ResumeRequest {
 /// There is no run that could go on, or it is not the same any more (nothing is changed then); else as
 /// [`super::run::run`].
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
-    let file = request.out.join("config.toml");
-    let of_file = TrainConfig::read(&file)?;
-    let scene = request.scene.clone().map_or_else(|| read_resolved(&file).map(|resolved| resolved.scene), Ok)?;
-    let mut config = of_file.clone();
+    let earlier = Earlier::find(request)?;
+    let mut config = earlier.config.clone();
     request.keys.clone().apply(&mut config);
     config.check()?;
-    let folder = stored_folder(&request.out, &config);
-    let is_its_own = folder == stored_folder(&request.out, &of_file);
-    if let Some(outcome) = already_done(request, &config, &folder, is_its_own)? {
+    if let Some(outcome) = already_done(request, &config, &earlier)? {
         return Ok(outcome);
     }
+    let folder = stored_folder(&request.out, &config);
+    match open_own(&folder, earlier.run, config.spill_dir.is_empty()) {
+        Ok(Some(stored)) => go_on(request, &earlier, config, stored),
+        Ok(None) => begin_again(request, &earlier, config),
+        // A run in memory makes its checkpoint with its first commit.
+        Err(_) if config.spill_dir.is_empty() && !SpillDir::is_one(&folder) && !has_past(&request.out) => {
+            begin_again(request, &earlier, config)
+        }
+        Err(error) => Err(error),
+    }
+}
+
+/// What is known of a run before its checkpoint is opened.
+struct Earlier {
+    /// config.toml, whether it is there or not.
+    path: PathBuf,
+    /// What it says; `None` where it is missing.
+    file: Option<(TrainConfig, Resolved)>,
+    /// Its config, from the file or from the checkpoint.
+    config: TrainConfig,
+    /// Its scene.
+    scene: PathBuf,
+    /// Its identity; unknown where config.toml is missing, and the checkpoint was named by the user.
+    run: RunId,
+}
+
+impl Earlier {
+    /// From config.toml, or where it is missing from the checkpoint in the output folder or in the spill directory that
+    /// the user named.
+    fn find(request: &ResumeRequest) -> Result<Earlier, TrainError> {
+        let path = request.out.join("config.toml");
+        if path.exists() {
+            let (config, facts) = (TrainConfig::read(&path)?, read_resolved(&path)?);
+            let scene = request.scene.clone().unwrap_or_else(|| facts.scene.clone());
+            return Ok(Earlier { run: facts.run, file: Some((config.clone(), facts)), config, scene, path });
+        }
+        let named = request.keys.spill_dir.as_deref().filter(|folder| !folder.is_empty());
+        let folder = named.map_or_else(|| checkpoint_folder(&request.out), PathBuf::from);
+        let nothing = || {
+            let problem = format!("there is neither a config.toml nor a checkpoint in {}", folder.display());
+            let remedy =
+                "name the output folder of a run; if its pages lie in a spill directory, name it too: --spill-dir";
+            InputError::new(&request.out, problem, remedy)
+        };
+        if !folder.exists() {
+            return Err(nothing().into());
+        }
+        let state = Stored::open(&folder, named.is_none())?.ok_or_else(nothing)?.run_state;
+        let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
+        eprintln!("warning: {} is missing: it is made again from the checkpoint", path.display());
+        // A checkpoint may have been moved, and a run that committed to its output folder names no spill directory.
+        let config = TrainConfig { spill_dir: named.unwrap_or("").to_string(), ..then };
+        let scene = request.scene.clone().unwrap_or_else(|| PathBuf::from(&state.run.scene));
+        Ok(Earlier { run: state.run.id, file: None, config, scene, path })
+    }
+}
+
+/// Whether the run in `out` left something that beginning again would destroy: a result, or a logged commit whose
+/// checkpoint may lie elsewhere.
+fn has_past(out: &Path) -> bool {
+    let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap_or_default();
+    let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
+    let has = |name: &str| out.join(name).exists();
+    has("point_cloud.ply") || has("summary.json") || metrics.lines().filter_map(commits).any(|commits| commits > 0)
+}
+
+/// Begins a run again that was cut off before its first commit: its config says all that the run needs.
+///
+/// # Errors
+/// The run left results, which would be replaced; else as [`run`].
+fn begin_again(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
+    if has_past(&request.out) {
+        let problem = "the run left results, but no commit to go on from: a run that ends without --keep-checkpoint removes \
+                       its checkpoint";
+        let remedy = "start a new run from its Gaussians with another --out and --init-ply point_cloud.ply, or start over \
+                      with --overwrite";
+        return Err(InputError::new(&request.out, problem, remedy).into());
+    }
+    let (out, scene, quiet) = (request.out.clone(), earlier.scene.clone(), request.quiet);
+    eprintln!("{} was cut off before its first commit: it begins again", out.display());
+    let existing = Existing::BeginAgain;
+    run(&RunRequest { scene, out, config, dry_run: false, existing, quiet })
+}
+
+/// Goes on from a checkpoint.
+fn go_on(
+    request: &ResumeRequest,
+    earlier: &Earlier,
+    mut config: TrainConfig,
+    stored: Stored,
+) -> Result<RunOutcome, TrainError> {
+    let (file, scene) = (&earlier.path, earlier.scene.clone());
     machine::set_up(&config)?;
     let host_mem = host_budget(&config);
-    let stored = Stored::open(&folder, config.spill_dir.is_empty())?;
     let state = stored.run_state.clone();
     keep_schedule(&mut config, &request.keys, &state);
     check_steps(&config, &state)?;
-    let mut changes = Changes::of_config(&file, &state, &config)?;
-    changes.check(&file, request.accept_changes)?;
+    let mut changes = Changes::of_config(file, &state, &config)?;
+    changes.check(file, request.accept_changes)?;
     if !scene.is_dir() {
         let remedy = format!("if it was moved: gsscale-train --resume {} SCENE", request.out.display());
         return Err(InputError::new(&scene, "the scene of this run is not there", remedy).into());
@@ -90,12 +182,24 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     };
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
     trainer.restore_counts(&state);
-    let kept = kept_config(&file, &of_file, &config)?;
-    let past = Past { config: kept, metrics_bytes: state.metrics_bytes, step: state.step, has_changed };
-    let begun = Begun { print, sh_degree_start: state.sh_degree_start, past: Some(past), host_mem, driver };
+    let past = Past {
+        config: kept_config(file, &earlier.config, &config)?,
+        metrics_bytes: state.metrics_bytes,
+        step: state.step,
+        has_changed,
+        file: earlier.file.clone(),
+        first_rows: state.dataset.first_rows,
+    };
+    let run = identity_of(earlier.run, &state);
+    let begun = Begun { print, sh_degree_start: state.sh_degree_start, past: Some(past), host_mem, driver, run };
     let (out, quiet) = (request.out.clone(), request.quiet);
-    let request = RunRequest { scene, out, config, dry_run: false, overwrite: false, quiet };
+    let request = RunRequest { scene, out, config, dry_run: false, existing: Existing::BeginAgain, quiet };
     see_through(&request, &dataset, tiers, trainer, begun)
+}
+
+/// The identity of a run that goes on: its own, that of its checkpoint, or a new one where neither is known.
+fn identity_of(run: RunId, state: &RunState) -> RunId {
+    [run, state.run.id].into_iter().find(|id| id.is_known()).unwrap_or_else(RunId::draw)
 }
 
 /// Where the checkpoint of a run is.
@@ -144,28 +248,36 @@ fn say(request: &ResumeRequest, state: &RunState, config: &TrainConfig, changes:
     eprintln!("resume  {} after {} of {} steps{other}", request.out.display(), state.step, config.steps);
 }
 
-/// A run that did all of its steps and wrote its results. If it was killed before its checkpoint was gone, what is left of
-/// that is removed, and nothing is trained; where it is to be kept, it stays, and a folder that is not `is_its_own` too.
-/// One that was rolled back since is not done.
+/// A run that did all of its steps and wrote its results: nothing is trained. If it was killed before its checkpoint was
+/// gone, what is left of the checkpoint is removed, unless it is to be kept or the user named another folder than the run's.
+/// A checkpoint of another run, or one that cannot be opened, stays. A run that was rolled back since is not done.
 fn already_done(
     request: &ResumeRequest,
     config: &TrainConfig,
-    folder: &Path,
-    is_its_own: bool,
-) -> InputResult<Option<RunOutcome>> {
+    earlier: &Earlier,
+) -> Result<Option<RunOutcome>, TrainError> {
     let text = std::fs::read_to_string(request.out.join("summary.json")).unwrap_or_default();
     let summary: Option<Summary> = serde_json::from_str(&text).ok();
     let Some(summary) = summary.filter(|s| s.finished && s.steps >= config.steps) else { return Ok(None) };
-    let stored = Stored::open(folder, config.spill_dir.is_empty()).ok();
+    let folder = stored_folder(&request.out, config);
+    let is_its_place = folder == stored_folder(&request.out, &earlier.config);
+    let stored = if SpillDir::is_one(&folder) {
+        open_own(&folder, earlier.run, config.spill_dir.is_empty()).unwrap_or_else(|error| {
+            eprintln!("warning: {} is left alone: {error}", folder.display());
+            None
+        })
+    } else {
+        None
+    };
     if stored.as_ref().is_some_and(|stored| stored.run_state.step < config.steps && stored.is_whole()) {
         return Ok(None);
     }
-    drop(stored);
-    // Without its FORMAT, or in use, it is left alone.
-    let spill = SpillDir::open(folder, config.spill_dir.is_empty()).ok();
-    let is_kept = config.keep_checkpoint && spill.is_some();
-    if let Some(spill) = spill.filter(|_| is_its_own && !config.keep_checkpoint) {
-        spill.remove()?;
+    let is_kept = config.keep_checkpoint && stored.is_some();
+    let is_its_own = |stored: &Stored| earlier.run.is_known() && stored.run_state.run.id == earlier.run;
+    if let Some(stored) = stored.filter(|stored| is_its_place && !config.keep_checkpoint && is_its_own(stored)) {
+        stored.remove()?;
+        // Empty where an earlier life of the run made the folder in its results.
+        let _ = std::fs::remove_dir(checkpoint_folder(&request.out));
     }
     write_run_report(&request.out)?;
     if !request.quiet {

@@ -10,17 +10,18 @@ use super::dataset_print::dataset_print;
 use super::eval::ply_warnings;
 use super::machine;
 use super::memory::{Probe, estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
-use super::out_folder;
+use super::out_folder::{self, Existing};
 use super::page_map::write_page_map;
 use super::preflight;
 use super::progress::Progress;
-use super::report::{MetricsLog, Resolved, Summary, read_resolved, write_config, write_summary};
+use super::report::{MetricsLog, Resolved, Summary, write_config, write_summary};
 use super::signals::StopFlag;
 use super::start::Start;
 use super::tiers::{self, Tiers};
 use super::trainer::{LoopOutputs, TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
-use crate::checkpoint::run_state::DatasetPrint;
+use crate::base::identity::RunId;
+use crate::checkpoint::run_state::{DatasetPrint, RunIdentity};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
@@ -28,6 +29,7 @@ use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, PlyWritten, read_ply, to_local};
+use crate::page::uncommitted::remove_uncommitted;
 use crate::render::Renderer;
 use crate::report::run_report::{PAGES_FILE, write_run_report};
 use crate::scene::columns::{Columns, sh_n_width};
@@ -46,8 +48,8 @@ pub struct RunRequest {
     pub config: TrainConfig,
     /// Print what was understood and stop.
     pub dry_run: bool,
-    /// An existing output folder may be replaced.
-    pub overwrite: bool,
+    /// What becomes of an output folder that is there already.
+    pub existing: Existing,
     /// Nothing but errors on the terminal.
     pub quiet: bool,
 }
@@ -178,6 +180,10 @@ pub(super) struct Past {
     pub step: u32,
     /// It goes on with other numbers: that is committed at once.
     pub has_changed: bool,
+    /// What its config.toml says; `None` where the file is missing and is made again.
+    pub file: Option<(TrainConfig, Resolved)>,
+    /// Gaussians that it began with.
+    pub first_rows: u64,
 }
 
 /// What a run begins or goes on with.
@@ -192,6 +198,8 @@ pub(super) struct Begun {
     pub host_mem: Option<u64>,
     /// Bytes that the graphics driver took.
     pub driver: u64,
+    /// Identity of the run.
+    pub run: RunId,
 }
 
 /// Runs a request from beginning to end.
@@ -202,8 +210,8 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
     config.check()?;
     machine::set_up(config)?;
-    if !request.dry_run && !request.overwrite {
-        out_folder::check_new(&request.out)?;
+    if !request.dry_run {
+        out_folder::check(&request.out, request.existing)?;
     }
     let host_mem = host_budget(config);
     let start = Start::read(&request.scene, config, host_mem)?;
@@ -213,6 +221,9 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
             eprintln!("{known}");
         }
         return Ok(RunOutcome { summary: None, exit_code: 0 });
+    }
+    if !request.dry_run && !config.spill_dir.is_empty() && remove_uncommitted(Path::new(&config.spill_dir), false)? {
+        eprintln!("{} held a run that was cut off before its first commit: its pages are removed", config.spill_dir);
     }
     preflight::check_first_drive(config, start.rows)?;
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
@@ -227,7 +238,8 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let print = dataset_print(&start)?;
     let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
     let trainer = Trainer::of_scene(scene, &dataset, renderer, options);
-    see_through(request, &dataset, tiers, trainer, Begun { print, sh_degree_start, past: None, host_mem, driver })
+    let run = RunId::draw();
+    see_through(request, &dataset, tiers, trainer, Begun { print, sh_degree_start, past: None, host_mem, driver, run })
 }
 
 /// What begins alike for all runs once the scene was read: warnings, options, the renderer and the bytes it took.
@@ -271,8 +283,10 @@ pub(super) fn see_through(
         return Ok(RunOutcome { summary: None, exit_code: 0 });
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
-    if begun.past.is_none() {
-        out_folder::make(&request.out, request.overwrite)?;
+    match begun.past {
+        None => out_folder::make(&request.out, request.existing)?,
+        // It may be missing: the checkpoint is elsewhere.
+        Some(_) => out_folder::make_folder(&request.out)?,
     }
     let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun);
     if tiers.can_resume() {
@@ -308,22 +322,26 @@ fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun
         Some(past) => {
             // Of the Gaussians that were here before.
             out_folder::remove_evaluation(&request.out)?;
-            let before = read_resolved(&path)?;
-            let scene = absolute_scene(request);
-            if TrainConfig::read(&path)? != past.config || before.scene != scene {
-                write_config(&path, &past.config, &Resolved { scene, ..before })?;
+            let made_again = Resolved { gaussians: past.first_rows, ..resolved(request, dataset, trainer, begun.run) };
+            let before = past.file.as_ref().map_or(&made_again, |(_, facts)| facts);
+            let facts = Resolved { run: begun.run, scene: absolute(&request.scene), ..before.clone() };
+            let kept = (past.config.clone(), facts);
+            if past.file.as_ref() != Some(&kept) {
+                write_config(&path, &kept.0, &kept.1)?;
             }
-            past.config.clone()
+            kept.0
         }
         None => {
             let settled = settled(&request.config, trainer);
-            write_config(&path, &settled, &resolved(request, dataset, trainer))?;
+            write_config(&path, &settled, &resolved(request, dataset, trainer, begun.run))?;
             settled
         }
     };
     let fail = |e: toml::ser::Error| InputError::new(&path, e.to_string(), "report this as a bug");
     let config = toml::to_string(&config).map_err(fail)?;
-    Ok(Origin { config, simd, sh_degree_start: begun.sh_degree_start, dataset: begun.print.clone() })
+    let [out, scene] = [&request.out, &request.scene].map(|path| absolute(path).to_string_lossy().into_owned());
+    let run = RunIdentity { id: begun.run, out, scene };
+    Ok(Origin { config, simd, sh_degree_start: begun.sh_degree_start, dataset: begun.print.clone(), run })
 }
 
 fn train_into(
@@ -427,14 +445,15 @@ fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
     }
 }
 
-fn absolute_scene(request: &RunRequest) -> PathBuf {
-    std::path::absolute(&request.scene).unwrap_or_else(|_| request.scene.clone())
+fn absolute(path: &Path) -> PathBuf {
+    std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
 }
 
-fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer) -> Resolved {
+fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, run: RunId) -> Resolved {
     Resolved {
         version: env!("CARGO_PKG_VERSION").to_string(),
-        scene: absolute_scene(request),
+        run,
+        scene: absolute(&request.scene),
         simd: limits::simd_path(&request.config).name().to_string(),
         threads: rayon::current_num_threads(),
         device: trainer.renderer.device(),

@@ -193,30 +193,46 @@ pub struct Stored {
 }
 
 impl Stored {
-    /// Opens the checkpoint of a run at its last commit; `allow_remote`, also on a network file system.
+    /// Opens the checkpoint in `folder` at its last commit; `None` where nothing was committed in it, or the folder is
+    /// empty. `allow_remote`: also on a network file system.
     ///
     /// # Errors
-    /// It is gone or damaged, in use, or nothing was committed in it.
-    pub fn open(folder: &Path, allow_remote: bool) -> Result<Stored, TrainError> {
-        let again = "start the run again with --overwrite; with --spill-dir, name another folder or remove this one";
+    /// There is none, it is damaged, or in use.
+    pub fn open(folder: &Path, allow_remote: bool) -> Result<Option<Stored>, TrainError> {
         if !SpillDir::is_one(folder) {
+            if std::fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_none()) {
+                return Ok(None);
+            }
             let problem = "the checkpoint of this run is not there: it is removed when a run ends without \
                            --keep-checkpoint, and made by the first commit";
-            return Err(InputError::new(folder, problem, again).into());
+            let remedy = "start the run again with --overwrite; if its pages were moved, name their folder with --spill-dir; \
+                          if their drive is not mounted, mount it";
+            return Err(InputError::new(folder, problem, remedy).into());
         }
         let spill = SpillDir::open(folder, allow_remote)?;
-        let nothing = || InputError::new(folder, "this run was cut off before its first commit", again);
+        if spill.holds_no_commit()? {
+            return Ok(None);
+        }
         let opened = match Commits::open(Box::new(DriveFolder::new(folder)), commit_config(&spill)) {
-            Err(CommitError::NoStore) => return Err(nothing().into()),
+            Err(error @ CommitError::NoStore) => {
+                let remedy = "gsscale-ckpt salvage rebuilds the map from the pages, in another folder";
+                return Err(InputError::new(folder, error.to_string(), remedy).into());
+            }
             opened => opened?,
         };
-        if opened.commits.generations().latest() == 0 {
-            return Err(nothing().into());
-        }
         let run_state = RunState::from_bytes(&opened.run_state).map_err(|e| {
             InputError::new(folder, e.to_string(), "go on with the program that made it, or start the run again")
         })?;
-        Ok(Stored { spill, opened, run_state })
+        Ok(Some(Stored { spill, opened, run_state }))
+    }
+
+    /// Removes the checkpoint. Gives the names of files that stay because they are not the store's.
+    ///
+    /// # Errors
+    /// A file cannot be removed.
+    pub fn remove(self) -> InputResult<Vec<String>> {
+        drop(self.opened);
+        self.spill.remove()
     }
 
     /// Whether every segment that it names is there. A kill while a checkpoint is removed leaves a map without them.

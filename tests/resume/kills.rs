@@ -85,20 +85,6 @@ fn counters_go_on(bench: &Bench) {
     }
 }
 
-#[test]
-fn a_run_that_was_cut_off_before_its_first_commit_says_so() {
-    for (place, words) in [(Place::Spill(4000), "before its first commit"), (Place::Memory, "made by the first commit")]
-    {
-        let bench = Bench::new();
-        let mut child = bench.begin(place, &super::bench::SELDOM);
-        bench.wait_for_lines(&mut child, 0);
-        child.kill().unwrap();
-        ended(child);
-        let said = super::bench::refused(bench.go_on(&[]));
-        assert!(said.contains(words), "{said}");
-    }
-}
-
 /// A kill while the checkpoint of a finished run is being removed leaves a map whose segments are gone.
 #[test]
 fn a_run_that_was_done_is_not_trained_again() {

@@ -8,6 +8,7 @@ use clap::Parser;
 use gsscale::base::error::InputError;
 use gsscale::base::ids::PageId;
 use gsscale::base::machine::process_cpu_seconds;
+use gsscale::checkpoint::run_state::RunIdentity;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::{RunOptions, simd_path};
 use gsscale::dataset::loader::Dataset;
@@ -109,6 +110,7 @@ fn train(args: &Args, config: &TrainConfig) -> Result<Value, TrainError> {
         simd: simd_path(config).name().to_string(),
         sh_degree_start: start.sh_degree_start,
         dataset: dataset_print(&start)?,
+        run: RunIdentity::default(),
     };
     let fill = first_fill(options.page_rows, options.densify.is_some());
     let pages = start.rows.div_ceil(fill as u64) as usize;

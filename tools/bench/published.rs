@@ -15,6 +15,7 @@ use gsscale::dataset::model::{RawScene, Split};
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use gsscale::render::lpips::InputRange;
 use gsscale::train::eval::{EvalExtras, evaluate_ply};
+use gsscale::train::out_folder::Existing;
 use gsscale::train::report::{Summary, write_whole};
 use gsscale::train::run::{RunRequest, run};
 use gsscale::train::trainer::{TrainError, Trainer};
@@ -203,7 +204,7 @@ fn train(args: &Args, setting: &Setting, config: &TrainConfig) -> Result<Result<
         out: setting.out.clone(),
         config: config.clone(),
         dry_run: args.dry_run,
-        overwrite: args.overwrite,
+        existing: if args.overwrite { Existing::Overwrite } else { Existing::Refuse },
         quiet: args.quiet,
     })?;
     if outcome.exit_code == 0 {

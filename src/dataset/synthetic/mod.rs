@@ -187,6 +187,12 @@ fn prepare(folder: &Path, overwrite: bool) -> InputResult<()> {
                 "choose another folder",
             ));
         }
+        // A model without photos of ours is somebody's own: photos are written before it, and removed after it.
+        let model = folder.join("sparse");
+        if photos.is_empty() && model.symlink_metadata().is_ok() {
+            let problem = "there is a model without photos of a generated city, so nothing is overwritten";
+            return Err(InputError::new(&model, problem, "choose another folder"));
+        }
         // The model goes first: without it the rest is no scene.
         for name in ["sparse", "sparse.partial", "images"] {
             let path = folder.join(name);

@@ -9,7 +9,7 @@ use crate::page::codec::Codec;
 use crate::page::commit::Commits;
 use crate::page::engine::{IoEngine, open_engine};
 use crate::page::folder::DriveFolder;
-use crate::page::reading::{Access, StoreReader, WitnessRule, commit_config};
+use crate::page::reading::{Access, StoreReader, commit_config};
 use crate::page::spill_dir::SpillDir;
 use crate::train::trainer::TrainError;
 use serde::Serialize;
@@ -35,21 +35,34 @@ pub struct RolledBack {
 /// # Errors
 /// The store is in use or cannot be opened, or the generation is not kept.
 pub fn rollback(place: &StorePlace, generation: &str, yes: bool) -> Result<RolledBack, TrainError> {
-    let (generation, step, dropped, dropped_names) = {
-        let store = StoreReader::open(&place.folder, Access::Pages, WitnessRule::Obeyed)?;
+    let (generation, step, dropped, dropped_names, store) = {
+        let store = place.open(Access::Pages)?;
         let generation = store.find(Some(generation))?;
         let pins = store.generations().pins().iter();
         let names: Vec<String> = pins.filter(|(_, g)| **g > generation).map(|(name, _)| name.clone()).collect();
         let dropped: Vec<u64> = store.generations().kept().filter(|g| *g > generation).collect();
-        (generation, run_state_of(&store, generation)?.step, dropped, names)
+        (generation, run_state_of(&store, generation)?.step, dropped, names, store.format().store)
     };
     let is_done = yes && !dropped.is_empty();
     if is_done {
-        let spill = SpillDir::open(&place.folder, true)?;
+        let spill = open_same(place, store)?;
         let opened = Commits::open(Box::new(DriveFolder::new(&place.folder)), commit_config(spill.format().store))?;
         opened.commits.rollback(generation)?;
     }
     Ok(RolledBack { generation, step, dropped, dropped_names, is_done })
+}
+
+/// Opens the store for writing that was looked at before.
+fn open_same(place: &StorePlace, store: u128) -> Result<SpillDir, InputError> {
+    let spill = SpillDir::open(&place.folder, true)?;
+    if spill.format().store == store {
+        return Ok(spill);
+    }
+    Err(InputError::new(
+        &place.folder,
+        "another store took the place of this one meanwhile",
+        "look at it again: gsscale-ckpt ls",
+    ))
 }
 
 /// Which names go.
@@ -83,7 +96,7 @@ pub struct Pruned {
 /// # Errors
 /// The store is in use or cannot be opened, or a name is not there.
 pub fn prune(place: &StorePlace, request: &PruneRequest) -> Result<Pruned, TrainError> {
-    let before = StoreReader::open(&place.folder, Access::Pages, WitnessRule::Obeyed)?;
+    let before = place.open(Access::Pages)?;
     let pins = before.generations().pins();
     if let Some(unknown) = request.names.iter().find(|name| !pins.contains_key(*name)) {
         let names: Vec<&str> = pins.keys().map(String::as_str).collect();
@@ -111,16 +124,17 @@ pub fn prune(place: &StorePlace, request: &PruneRequest) -> Result<Pruned, Train
     let mut bytes_freed = 0;
     if is_done {
         // A reader's lock keeps writers out, this process's own too.
+        let store = before.format().store;
         drop(before);
-        write_pins(place, &dropped_names)?;
-        let after = StoreReader::open(&place.folder, Access::Pages, WitnessRule::Obeyed)?;
+        write_pins(place, store, &dropped_names)?;
+        let after = place.open(Access::Pages)?;
         bytes_freed = bytes_before - bytes_of(&after)?;
     }
     Ok(Pruned { dropped_names, dropped, kept, bytes_freed, is_done })
 }
 
-fn write_pins(place: &StorePlace, dropped_names: &[String]) -> Result<(), TrainError> {
-    let spill = SpillDir::open(&place.folder, true)?;
+fn write_pins(place: &StorePlace, store: u128, dropped_names: &[String]) -> Result<(), TrainError> {
+    let spill = open_same(place, store)?;
     let mut opened = Commits::open(Box::new(DriveFolder::new(&place.folder)), commit_config(spill.format().store))?;
     let engine = open_engine(IoEngine::Pread, &place.folder, 1)?;
     let mut store = opened.paged_store(engine.store, spill.format().layout, Codec::Raw)?;

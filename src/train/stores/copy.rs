@@ -9,7 +9,7 @@ use crate::base::ids::PageId;
 use crate::page::codec::Codec;
 use crate::page::format::{SlotRef, StoredAs};
 use crate::page::new_store::{NewStore, refuse_existing};
-use crate::page::reading::{Access, StoreReader, WitnessRule};
+use crate::page::reading::Access;
 use crate::page::segment_files::segment_file_name;
 use crate::page::slots::SlotLayout;
 use crate::train::trainer::TrainError;
@@ -36,7 +36,7 @@ pub struct Copied {
 /// The store is in use or damaged (the page is named), or the drive of `to` refuses. There is no store at `to` then.
 pub fn clone_store(place: &StorePlace, to: &Path) -> Result<Copied, TrainError> {
     refuse_existing(to)?;
-    let store = StoreReader::open(&place.folder, Access::Pages, WitnessRule::Obeyed)?;
+    let store = place.open(Access::Pages)?;
     store.find(None)?;
     let live = store.live_versions()?;
     let codec = usual_codec(live.iter().map(|(_, slot, _)| slot));

@@ -3,7 +3,7 @@
 use super::{StorePlace, run_state_of};
 use crate::base::ids::PageId;
 use crate::page::opening::StoredPage;
-use crate::page::reading::{Access, StoreReader, WitnessRule};
+use crate::page::reading::Access;
 use crate::paging::label::meta_from_label;
 use crate::train::trainer::TrainError;
 use serde::Serialize;
@@ -50,7 +50,7 @@ pub struct StoreDiff {
 /// # Errors
 /// The store cannot be opened, or a generation is not kept.
 pub fn diff(place: &StorePlace, from: &str, to: &str, names: bool) -> Result<StoreDiff, TrainError> {
-    let store = StoreReader::open(&place.folder, Access::Map, WitnessRule::Obeyed)?;
+    let store = place.open(Access::Map)?;
     let (from, to) = (store.find(Some(from))?, store.find(Some(to))?);
     let steps = [run_state_of(&store, from)?.step, run_state_of(&store, to)?.step];
     let before: BTreeMap<PageId, StoredPage> = by_id(store.pages_at(from)?);

@@ -15,7 +15,7 @@ use crate::config::limits::RunOptions;
 use crate::densify::stats::GradHistogram;
 use crate::exchange::ply::{ExportFrame, PlyMeta, PlyWriter};
 use crate::page::commit::CommitError;
-use crate::page::reading::{Access, StoreReader, WitnessRule};
+use crate::page::reading::{Access, StoreReader};
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::scene::columns::{Column, Columns};
 use crate::scene::partition::GiantCut;
@@ -83,7 +83,7 @@ pub struct Exported {
 /// # Errors
 /// The store cannot be opened or is damaged, the budget is too small, no Gaussian is left, or the file cannot be written.
 pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, TrainError> {
-    let store = StoreReader::open(&place.folder, Access::Pages, WitnessRule::Obeyed)?;
+    let store = place.open(Access::Pages)?;
     let generation = store.find(request.generation.as_deref())?;
     let state = run_state_of(&store, generation)?;
     let (_, options) = options_of(&place.folder, &state)?;

@@ -7,7 +7,7 @@ use crate::base::math::exp32;
 use crate::checkpoint::run_state::RunState;
 use crate::config::file::TrainConfig;
 use crate::page::format::StoredAs;
-use crate::page::reading::{Access, StoreReader, WitnessRule};
+use crate::page::reading::Access;
 use crate::page::segment_files::segment_file_name;
 use crate::paging::label::meta_from_label;
 use crate::paging::stored::{check_values, layout_of};
@@ -62,7 +62,7 @@ pub struct Inspected {
 /// # Errors
 /// The store cannot be opened, or the generation is not kept.
 pub fn inspect(place: &StorePlace, generation: Option<&str>) -> Result<Inspected, TrainError> {
-    let store = StoreReader::open(&place.folder, Access::Map, WitnessRule::Obeyed)?;
+    let store = place.open(Access::Map)?;
     let generation = store.find(generation)?;
     let state = run_state_of(&store, generation)?;
     let (config, _) = options_of(&place.folder, &state)?;
@@ -204,7 +204,7 @@ pub struct PageInspected {
 /// # Errors
 /// The store is in use or cannot be opened, or the page is not there or damaged.
 pub fn inspect_page(place: &StorePlace, generation: Option<&str>, id: PageId) -> Result<PageInspected, TrainError> {
-    let store = StoreReader::open(&place.folder, Access::Pages, WitnessRule::Obeyed)?;
+    let store = place.open(Access::Pages)?;
     let generation = store.find(generation)?;
     let state = run_state_of(&store, generation)?;
     let pages = store.pages_at(generation)?;

@@ -1,7 +1,7 @@
 //! The kept generations of a store.
 
 use super::{StorePlace, run_state_of};
-use crate::page::reading::{Access, StoreReader, WitnessRule};
+use crate::page::reading::Access;
 use crate::train::trainer::TrainError;
 use serde::Serialize;
 use std::path::Path;
@@ -47,7 +47,7 @@ pub struct Listed {
 /// # Errors
 /// The store cannot be opened, or a run state is of another program.
 pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
-    let store = StoreReader::open(&place.folder, Access::Map, WitnessRule::Obeyed)?;
+    let store = place.open(Access::Map)?;
     let tests = place.run.as_deref().map(tests_of).unwrap_or_default();
     let mut generations = Vec::new();
     for used in store.uses()? {

@@ -27,12 +27,15 @@ pub use salvage::{LostPage, SalvageRequest, Salvaged, salvage};
 pub use start::StoredStart;
 pub use verify::{Fault, Verdict, verify};
 
+use super::ownership::check_owner;
+use super::report::read_resolved;
 use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
+use crate::base::identity::RunId;
 use crate::checkpoint::run_state::RunState;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
-use crate::page::reading::{ReadError, StoreReader, segments_in};
+use crate::page::reading::{Access, ReadError, StoreReader, WitnessRule, segments_in};
 use std::path::{Path, PathBuf};
 
 impl From<ReadError> for TrainError {
@@ -51,6 +54,32 @@ pub struct StorePlace {
     pub folder: PathBuf,
     /// The output folder of its run, if that was named.
     pub run: Option<PathBuf>,
+    /// Identity of that run; unknown where the store itself was named.
+    pub id: RunId,
+}
+
+impl StorePlace {
+    /// Opens the store, which must be that of the run that was named.
+    ///
+    /// # Errors
+    /// It cannot be opened, is in use (where pages are asked for), or holds the checkpoint of another run.
+    fn open(&self, access: Access) -> Result<StoreReader, TrainError> {
+        let store = StoreReader::open(&self.folder, access, WitnessRule::Obeyed)?;
+        self.check_owner(&store)?;
+        Ok(store)
+    }
+
+    /// Refuses the checkpoint of another run than the one that was named: the path in a run's config may lead to it by now.
+    ///
+    /// # Errors
+    /// It is another run's.
+    fn check_owner(&self, store: &StoreReader) -> Result<(), TrainError> {
+        let latest = store.generations().latest();
+        if latest == 0 || !self.id.is_known() {
+            return Ok(());
+        }
+        Ok(check_owner(&self.folder, &run_state_of(store, latest)?.run, self.id)?)
+    }
 }
 
 /// The store of a run's output folder, or the spill directory itself.
@@ -67,7 +96,7 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
     }
     // A FORMAT file that was lost leaves the segments.
     if dir.join("FORMAT").exists() || segments_in(dir).is_ok_and(|segments| !segments.is_empty()) {
-        return Ok(StorePlace { folder: dir.to_path_buf(), run: None });
+        return Ok(StorePlace { folder: dir.to_path_buf(), run: None, id: RunId::UNKNOWN });
     }
     let file = dir.join("config.toml");
     if !file.is_file() {
@@ -80,7 +109,8 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
         spill_dir => PathBuf::from(spill_dir),
     };
     if folder.is_dir() {
-        return Ok(StorePlace { folder, run: Some(dir.to_path_buf()) });
+        let id = read_resolved(&file)?.run;
+        return Ok(StorePlace { folder, run: Some(dir.to_path_buf()), id });
     }
     let problem =
         format!("the checkpoint of this run, {}, is not there: it is removed when a run ends", folder.display());

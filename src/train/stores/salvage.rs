@@ -14,7 +14,7 @@ use super::copy::{layout_for, usual_codec};
 use super::{StorePlace, options_of, run_state_of};
 use crate::base::error::InputError;
 use crate::base::ids::PageId;
-use crate::checkpoint::run_state::{DatasetPrint, RunState};
+use crate::checkpoint::run_state::{DatasetPrint, RunIdentity, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::page::commit::CommitError;
@@ -105,7 +105,10 @@ pub fn salvage(place: &StorePlace, request: &SalvageRequest) -> Result<Salvaged,
     let _lock = refuse_if_in_use(&place.folder)?;
     let mut notes = Vec::new();
     let map = match StoreReader::open(&place.folder, Access::Pages, WitnessRule::Ignored) {
-        Ok(store) if store.generations().latest() > 0 => Some(store),
+        Ok(store) if store.generations().latest() > 0 => {
+            place.check_owner(&store)?;
+            Some(store)
+        }
         Ok(_) => {
             notes.push("nothing was committed: pages are taken by their headers".to_string());
             None
@@ -282,11 +285,12 @@ fn without_state(place: &StorePlace, mut source: Source, request: &SalvageReques
         return Err(InputError::new(&place.folder, problem, "there is nothing to salvage").into());
     }
     let mut config = config_for(place, request, &kept, &mut source)?;
+    let run = RunIdentity { id: place.id, ..RunIdentity::default() };
     let degree =
         kept.iter().filter_map(|(id, h)| meta_from_label(*id, &h.label)).map(|m| m.sh_degree).max().unwrap_or(0);
     let (rows, step) = measure(&mut reader, &kept, &source)?;
     config.0.steps = config.0.steps.max(step);
-    let state = state_for(&config, rows, step, degree)?;
+    let state = RunState { run, ..state_for(&config, rows, step, degree)? };
     let (_, options) = options_of(&source.folder, &state)?;
     let layout = SlotLayout::new(capacity_bytes(options.page_rows, options.sh_degree), kept.len() as u64);
     let mut copy = NewStore::create(&request.to, layout, usual_codec(kept.values().map(|h| &h.slot)))?;

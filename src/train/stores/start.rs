@@ -9,7 +9,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageNo;
 use crate::checkpoint::run_state::RunState;
 use crate::exchange::ply::{ExportFrame, PlyMeta, to_local};
-use crate::page::reading::{Access, StoreReader, WitnessRule};
+use crate::page::reading::{Access, StoreReader};
 use crate::scene::columns::Columns;
 use crate::scene::state::SceneState;
 use crate::train::catch_up::evaluate_all;
@@ -34,8 +34,9 @@ impl StoredStart {
     /// # Errors
     /// It cannot be opened, is in use, or the budget, of which it gets one part in `share`, is too small for it.
     pub fn open(dir: &Path, host_mem: u64, share: u64) -> Result<StoredStart, TrainError> {
-        let folder = find_store(dir)?.folder;
-        let store = StoreReader::open(&folder, Access::Pages, WitnessRule::Obeyed)?;
+        let place = find_store(dir)?;
+        let store = place.open(Access::Pages)?;
+        let folder = place.folder;
         let generation = store.find(None)?;
         let state = run_state_of(&store, generation)?;
         let (_, options) = options_of(&folder, &state)?;

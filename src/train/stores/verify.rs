@@ -62,6 +62,7 @@ pub fn verify(place: &StorePlace, deep: bool) -> Result<Verdict, TrainError> {
         }
         store => store?,
     };
+    place.check_owner(&store)?;
     let limits = check_states(&store, &mut verdict);
     let versions = match store.live_versions() {
         Err(error) => {

@@ -5,7 +5,7 @@ use super::with_mode;
 use crate::Target;
 use gsscale::base::ids::PageId;
 use gsscale::cache::evict::EvictPolicy;
-use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, RunState, TrafficSoFar, ViewPrint};
+use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, RunIdentity, RunState, TrafficSoFar, ViewPrint};
 use gsscale::densify::stats::GradHistogram;
 use gsscale::page::codec::Codec;
 use gsscale::page::commit::{CommitConfig, Commits, Cut, MAP_NAME, PageChange, WITNESS_NAME};
@@ -229,6 +229,11 @@ fn sample() -> RunState {
         metrics_bytes: 1234,
         test: Some(LastTest { step: 8, views: 2, psnr: 20.5, ssim: 0.75 }),
         traffic: TrafficSoFar { bytes_read: 9, ..TrafficSoFar::default() },
+        run: RunIdentity {
+            id: "00112233445566778899aabbccddeeff".parse().unwrap(),
+            out: "/a".into(),
+            scene: "/b".into(),
+        },
     }
 }
 

@@ -1,0 +1,100 @@
+//! Identities: 128-bit numbers that tell one run or one store from every other.
+//!
+//! Invariant: two draws are equal with no practical chance, on one machine or on two. An identity has no meaning
+//! beyond being equal to itself.
+
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use std::fmt;
+use std::hash::{BuildHasher, Hasher, RandomState};
+use std::str::FromStr;
+
+/// Draws a number that no other call returns, here or elsewhere.
+pub fn draw_identity() -> u128 {
+    // The standard library draws the keys of its hash maps from the system.
+    let draw = || RandomState::new().build_hasher().finish();
+    let time = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_nanos());
+    (u128::from(draw()) << 64 | u128::from(draw())) ^ time ^ u128::from(std::process::id()) << 96
+}
+
+/// Identity of a training run, the same over all its lives. The run's config.toml and every commit hold it.
+///
+/// As text (config.toml) it is 32 hexadecimal digits, in binary (run state) a number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct RunId(u128);
+
+impl RunId {
+    /// Identity of no run: of a store that was imported, or salvaged without the config of its run.
+    pub const UNKNOWN: RunId = RunId(0);
+
+    /// The identity of a run that begins.
+    pub fn draw() -> RunId {
+        RunId(draw_identity().max(1))
+    }
+
+    /// Whether the identity is that of a run.
+    pub fn is_known(self) -> bool {
+        self != RunId::UNKNOWN
+    }
+
+    /// Whether both are known and differ: then what one of them made is not the other's to change.
+    pub fn is_other_than(self, other: RunId) -> bool {
+        self.is_known() && other.is_known() && self != other
+    }
+}
+
+impl fmt::Display for RunId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:032x}", self.0)
+    }
+}
+
+impl FromStr for RunId {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<RunId, String> {
+        let is_hex = text.len() == 32 && text.bytes().all(|b| b.is_ascii_hexdigit());
+        let number = u128::from_str_radix(text, 16).ok().filter(|_| is_hex);
+        number.map(RunId).ok_or_else(|| format!("'{text}' is not the identity of a run: 32 hexadecimal digits"))
+    }
+}
+
+impl Serialize for RunId {
+    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        if to.is_human_readable() { to.collect_str(self) } else { to.serialize_u128(self.0) }
+    }
+}
+
+impl<'de> Deserialize<'de> for RunId {
+    fn deserialize<D: Deserializer<'de>>(from: D) -> Result<RunId, D::Error> {
+        match from.is_human_readable() {
+            true => String::deserialize(from)?.parse().map_err(serde::de::Error::custom),
+            false => u128::deserialize(from).map(RunId),
+        }
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    #[test]
+    fn identities_differ() {
+        let mut drawn: Vec<u128> = (0..100).map(|_| draw_identity()).collect();
+        drawn.sort_unstable();
+        drawn.dedup();
+        assert_eq!(drawn.len(), 100);
+    }
+
+    #[test]
+    fn text_gives_the_identity_back_and_other_text_is_refused() {
+        let id = RunId::draw();
+        assert_eq!(id.to_string().parse(), Ok(id));
+        let json = serde_json::to_string(&id).unwrap();
+        assert_eq!(serde_json::from_str::<RunId>(&json).unwrap(), id);
+        for wrong in ["", "12", &format!("+{}", "0".repeat(31)), &"0".repeat(33)] {
+            assert!(wrong.parse::<RunId>().is_err(), "{wrong}");
+        }
+        assert!(!RunId::UNKNOWN.is_other_than(id) && !id.is_other_than(id) && id.is_other_than(RunId::draw()));
+    }
+}

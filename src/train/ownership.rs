@@ -1,0 +1,107 @@
+//! Which store belongs to which run, and who may delete what.
+//!
+//! A run draws an identity when it begins ([`RunId`]) and writes it to its config.toml and into every commit. A path is no
+//! identity: a spill directory can be removed and made again by another run under the same name.
+//!
+//! | who | may delete | only if |
+//! | --- | --- | --- |
+//! | a run that begins with `--spill-dir P` | the store in `P` | the store holds no commit ([`crate::page::uncommitted`]) |
+//! | a run in memory, at its first commit | the store in `OUT/checkpoint` | the store holds no commit |
+//! | a run that ends, `--keep-checkpoint` absent | the store that it made or went on from | this process holds the store's lock, and FORMAT has the store's identity |
+//! | a run that is refused or fails before its first commit | the store that it made | as above |
+//! | `--resume OUT` of a run that is done | the checkpoint that a kill left at the run's own place | the last commit has the identity of the run in `OUT`, and `--keep-checkpoint` is absent |
+//! | `--overwrite` | the store in `OUT/checkpoint` | the store holds no commit, or its last commit has the identity of the run in `OUT` |
+//! | `--overwrite` | results in `OUT`, by name; pictures in `renders/test` | there is a config.toml beside them |
+//! | `gsscale-ckpt rollback`, `prune` with `OUT` | generations and names of the store that `OUT` leads to | the last commit has the identity of the run in `OUT` |
+//! | `gsscale-ckpt clone`, `salvage`, `import` | their own unfinished store | the folder was made by this process |
+//! | a sweep of `gsscale-bench` | its own unfinished runs and their pages | the folder has the sweep's mark in its name, or its record in it |
+//!
+//! Whatever the row: files inside a spill directory go by the store's identity ([`SpillDir::remove`]), other files stay, and a
+//! store that cannot be opened stays.
+
+use super::tiers::Stored;
+use super::trainer::TrainError;
+use crate::base::error::{InputError, InputResult};
+use crate::base::identity::RunId;
+use crate::checkpoint::run_state::{RunIdentity, RunState};
+use crate::page::reading::{Access, StoreReader, WitnessRule};
+use crate::page::spill_dir::SpillDir;
+use crate::page::uncommitted::remove_uncommitted;
+use std::path::Path;
+
+/// Refuses the checkpoint of another run.
+///
+/// # Errors
+/// `of_store` and `run` are both known and differ.
+pub(super) fn check_owner(folder: &Path, of_store: &RunIdentity, run: RunId) -> InputResult<()> {
+    if !of_store.id.is_other_than(run) {
+        return Ok(());
+    }
+    let (problem, remedy) = match of_store.out.as_str() {
+        "" => (
+            String::from("it holds the checkpoint of another run"),
+            String::from("name the folder that holds the pages of this run with --spill-dir"),
+        ),
+        out => (
+            format!("it holds the checkpoint of another run, that of {out}"),
+            format!(
+                "name the folder that holds the pages of this run with --spill-dir; the other one goes on with gsscale-train --resume {out}"
+            ),
+        ),
+    };
+    Err(InputError::new(folder, problem, remedy))
+}
+
+/// The checkpoint in `folder`, if it belongs to `run`; `None` where nothing was committed in it.
+///
+/// # Errors
+/// It belongs to another run, cannot be opened, or is in use.
+pub(super) fn open_own(folder: &Path, run: RunId, allow_remote: bool) -> Result<Option<Stored>, TrainError> {
+    // Opening a map for writing changes its file, so its owner is asked for by reading. What cannot be read is refused below.
+    if let Ok(state) = last_state(folder, Access::Map) {
+        check_owner(folder, &state.run, run)?;
+    }
+    let Some(stored) = Stored::open(folder, allow_remote)? else { return Ok(None) };
+    check_owner(folder, &stored.run_state.run, run)?;
+    Ok(Some(stored))
+}
+
+/// The run state of the last commit, read without writing anything.
+fn last_state(folder: &Path, access: Access) -> Result<RunState, TrainError> {
+    let store = StoreReader::open(folder, access, WitnessRule::Obeyed)?;
+    super::stores::run_state_of(&store, store.find(None)?)
+}
+
+/// Removes the checkpoint that the run of `out` left in its output folder, for a run that starts over there.
+///
+/// # Errors
+/// It belongs to another run, cannot be opened, or is in use: it stays, and the new run must not begin.
+pub(super) fn remove_checkpoint_in(folder: &Path, run: RunId) -> Result<(), TrainError> {
+    check_removable(folder, run)?;
+    if SpillDir::is_one(folder) && !remove_uncommitted(folder, true)? {
+        SpillDir::open(folder, true)?.remove()?;
+    }
+    // Only if nothing else is in it.
+    let _ = std::fs::remove_dir(folder);
+    Ok(())
+}
+
+/// As [`remove_checkpoint_in`], without removing anything.
+///
+/// # Errors
+/// As [`remove_checkpoint_in`].
+pub(super) fn check_removable(folder: &Path, run: RunId) -> Result<(), TrainError> {
+    if !SpillDir::is_one(folder) || SpillDir::open(folder, true)?.holds_no_commit()? {
+        return Ok(());
+    }
+    let by_hand =
+        format!("if it is of no use any more, remove it (rm -r {}), or choose another --out", folder.display());
+    let refuse = |problem: String| InputError::new(folder, problem, by_hand.clone());
+    let state = last_state(folder, Access::Pages)
+        .map_err(|e| refuse(format!("the checkpoint in it cannot be opened, so it is not removed: {e}")))?;
+    if state.run.id.is_known() && state.run.id == run {
+        return Ok(());
+    }
+    let whose = if state.run.out.is_empty() { String::new() } else { format!(", that of {}", state.run.out) };
+    Err(refuse(format!("it holds the checkpoint of another run{whose}, so it is not removed")).into())
+}
