@@ -10,4 +10,5 @@ mod changes;
 mod events;
 mod kills;
 mod more_steps;
+mod paths;
 mod stops;
