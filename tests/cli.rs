@@ -324,9 +324,20 @@ fn numbers_that_no_machine_can_hold_are_refused() {
         ("--threads", "4000000000"),
         ("--init-points", "4000000000"),
         ("--adam-eps", "1e-40"),
+        ("--adam-eps", "0"),
+        ("--adam-eps", "9.9e-17"),
+        ("--adam-eps", "1.5"),
+        ("--adam-eps", "nan"),
     ] {
         refuses(&folder, &scene, &[flag, value], &[flag, "out of range"]);
     }
+    // From a file as from the command line; and the limit is told and allowed.
+    let file = folder.path().join("eps.toml");
+    std::fs::write(&file, "adam-eps = 1e-30\n").unwrap();
+    refuses(&folder, &scene, &["--config", text(&file)], &["--adam-eps", "1e-30", "f32 rounds to zero", "1e-16 to 1"]);
+    let help = train(&["--help"]);
+    assert!(String::from_utf8_lossy(&help.stdout).contains("epsilon: 1e-16 to 1"));
+    trains(&folder, &scene, &["--adam-eps", "1e-16"]);
 }
 
 #[test]

@@ -4,7 +4,8 @@
 //! compiler vectorises; [`dispatch`] calls it inside a function compiled for the path. `FMA` tells the kernel
 //! whether fused multiply-add is an instruction there: use [`fma`], which is fused on AVX2 and AVX-512 and two
 //! roundings on the baseline. So AVX2 and AVX-512 give the same bits as each other; the baseline gives others.
-//! Bits are promised per path, and the path is recorded in the run's config.
+//! Bits are promised per class of paths ([`BitsClass`]). A checkpoint records the path, and a run may go on with any
+//! path of the same class.
 //!
 //! The `unsafe` of the crate's compute half lives here and in `eight`, and nowhere else.
 #![allow(unsafe_code)] // calling a function compiled for a detected instruction set
@@ -13,6 +14,22 @@ use std::sync::OnceLock;
 
 /// Width of inner loops: one tile row, one AVX-512 register, two AVX2 registers.
 pub const LANES: usize = 16;
+
+/// Instruction paths that give the same bits as each other.
+///
+/// Tests compare the paths that their machine has: the picture, its gradients and the loss
+/// (`the_paths_of_a_class_give_the_same_bits` of the oracle tests), the optimizer (`tests/deferred.rs`, where the baseline
+/// gives the same bits too, since nothing is fused there), culling (`tests/cull.rs`), bounds of pages (their unit test), and a
+/// whole run (`tests/resume/paths.rs`).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum BitsClass {
+    /// Multiplication and addition are one instruction that rounds once: AVX2 and AVX-512. Inner loops are 16 wide on both,
+    /// so sums are taken in the same order.
+    Fused,
+    /// They are two instructions that round twice: the baseline, which has no fused one. To imitate it in software would
+    /// be far slower than the path is.
+    RoundedTwice,
+}
 
 /// An instruction path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -41,6 +58,14 @@ impl SimdPath {
     /// The path with this name.
     pub fn from_name(name: &str) -> Option<SimdPath> {
         SimdPath::ALL.into_iter().find(|p| p.name() == name)
+    }
+
+    /// Which paths give the same bits as this one.
+    pub fn bits_class(self) -> BitsClass {
+        match self {
+            SimdPath::Avx512 | SimdPath::Avx2 => BitsClass::Fused,
+            SimdPath::Baseline => BitsClass::RoundedTwice,
+        }
     }
 
     /// Whether this machine can run it.

@@ -8,6 +8,7 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::parse_bytes;
 use crate::checkpoint::interval::CommitEvery;
+use crate::optim::adam::EPS_MIN;
 use crate::page::codec::Codec;
 use crate::schedule::order::Order;
 use serde::{Deserialize, Serialize};
@@ -120,7 +121,7 @@ config_keys! {
         sh0_lr: f64 = 2.5e-3;
         /// Rate of the higher colour bands
         shn_lr: f64 = 2.5e-3 / 20.0;
-        /// Adam's epsilon
+        /// Adam's epsilon: 1e-16 to 1, because below 1e-16 it vanishes beside what f32 rounds off second moments
         adam_eps: f64 = 1e-15;
         /// Which Gaussians take an optimizer step: deferred (all; those without a gradient when they are next looked at),
         /// dense (all, at once: slow, for comparison), or sparse (only those with a gradient, which is not exact)
@@ -391,11 +392,23 @@ impl TrainConfig {
         if !(self.means_lr_final > 0.0 && self.means_lr_final <= 1.0) {
             return refuse("means-lr-final", "a number above 0 and up to 1");
         }
-        // It is used in f32, where it must not vanish: a root of 0 is divided by it.
-        if !(1e-30..=1.0).contains(&self.adam_eps) {
-            return refuse("adam-eps", "1e-30 to 1");
+        self.check_adam_eps()
+    }
+
+    /// Checks Adam's epsilon: alone, where it is that of a checkpoint.
+    ///
+    /// # Errors
+    /// It is out of range.
+    pub fn check_adam_eps(&self) -> InputResult<()> {
+        if (EPS_MIN..=1.0).contains(&self.adam_eps) {
+            return Ok(());
         }
-        Ok(())
+        let problem = format!(
+            "{:e} is out of range: below 1e-16 it does not cover the second moments that f32 rounds to zero, so Gaussians \
+             would leave the bounds of their pages, and above 1 nothing moves",
+            self.adam_eps
+        );
+        Err(InputError::new("--adam-eps", problem, "use 1e-16 to 1; 1e-15 is usual"))
     }
 
     fn check_names(&self) -> InputResult<()> {

@@ -189,7 +189,7 @@ impl PublishedRun {
 }
 
 /// Keys that say where and how fast a run computes, or what it writes and keeps, and never change what it reaches; only
-/// other keys make a run another one than the published. `ssim-variant` is none of them: it changes no Gaussian, but
+/// other keys make a run another one than the published. (`simd` and `device` change last bits, as the seed does.) `ssim-variant` is none of them: it changes no Gaussian, but
 /// the figure that stands beside the published one.
 const NEVER_CHANGES_RESULTS: [&str; 25] = [
     "images",

@@ -7,6 +7,15 @@
 
 use std::ops::{Add, Div, Mul, Sub};
 
+/// The smallest eps that training may use.
+///
+/// State in f32 has no second moment below the smallest normal float, whose root is 1.1e-19: what is smaller becomes
+/// zero. A value with such a moment moves by m / eps instead of m / (root + eps), so eps must be far larger than that
+/// root; at 1e-16 the movement errs by 1e-3, which the bounds of pages allow for ([`super::bounds`]), and below it by
+/// more. Further down (400 eps)^2, where the series ends ([`super::drift`]), is no normal float either, m / eps
+/// overflows, and rows have no finite bounds at all.
+pub const EPS_MIN: f64 = 1e-16;
+
 /// A float that dense Adam can run in.
 pub trait Real: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> {
     /// Rounds to the type.
@@ -40,7 +49,7 @@ pub struct AdamConfig {
     pub beta1: f64,
     /// Decay of the second moment per step.
     pub beta2: f64,
-    /// Added to the bias-corrected root.
+    /// Added to the bias-corrected root; training refuses less than [`EPS_MIN`].
     pub eps: f64,
 }
 

@@ -236,9 +236,10 @@ mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};
     use crate::base::simd::SimdPath;
-    use crate::optim::adam::AdamConfig;
+    use crate::optim::adam::{AdamConfig, EPS_MIN};
     use crate::optim::rates::Rates;
     use crate::scene::columns::Columns;
+    use crate::scene::rows::RowsNow;
     use crate::scene::state::SceneState;
 
     #[test]
@@ -273,5 +274,39 @@ mod tests {
             assert_eq!(of(simd, &state.view()), want, "{}", simd.name());
         }
         assert!(of(SimdPath::best(), &SceneState::empty(0).view()).is_empty());
+    }
+
+    /// The smallest eps that is allowed, with second moments down to where f32 ends: rewriting flushes them to zero, and
+    /// only eps is left to divide by.
+    #[test]
+    fn bounds_hold_at_every_eps_that_is_allowed() {
+        for eps in [EPS_MIN, 1e-15, 1e-8, 1.0] {
+            let config = AdamConfig { eps, ..AdamConfig::default() };
+            let adam = DeferredAdam::new(Rates::new(1.0, 500), config, SimdPath::best());
+            for seed in 0..3000 {
+                let mut draws = Stream::new(seed, Purpose::Test, 0, 0);
+                let mut state = SceneState::from_columns(Columns::zeros(1, 0));
+                for c in 0..3 {
+                    let root = libm::pow(10.0, -draws.range(6.0, 18.9));
+                    state.columns.means[c] = (draws.normal() * libm::pow(10.0, -draws.range(0.0, 9.0))) as f32;
+                    state.exp_avg.means[c] = (draws.normal() * root) as f32;
+                    state.exp_avg_sq.means[c] = (root * root) as f32;
+                }
+                state.stamp[0] = draws.below(600) as u32;
+                let bounds = adam.page_bounds(&state.view(), &SplitLimits::NEVER);
+                let mut now = state.stamp[0];
+                for _ in 0..6 {
+                    now += 1 + draws.below(60) as u32;
+                    let at = adam.at(now);
+                    for c in 0..3 {
+                        let mean = at.evaluate_element(&state.view(), Column::Means, 0, c);
+                        let [lo, hi] = [bounds.lo[c], bounds.hi[c]];
+                        assert!(lo.is_finite() && hi.is_finite() && (lo..=hi).contains(&mean), "{eps:e} seed {seed}");
+                    }
+                    // As an event does on the way.
+                    at.settle_row(&mut state.view_mut(), 0);
+                }
+            }
+        }
     }
 }

@@ -9,6 +9,7 @@
 //! bits on every instruction path and for any number of threads; 4. nothing non-finite enters the state.
 
 use super::adam::AdamConfig;
+use super::decay::Decay;
 use super::drift::{Drift, DriftTables, EpsFloor, RECENT, drifted, flush, needs_direct_sum};
 #[cfg(target_arch = "x86_64")]
 use super::eights::Eights;
@@ -25,8 +26,8 @@ use crate::scene::state::SceneState;
 
 /// Rows of one unit of parallel work.
 pub const ROWS_PER_TASK: usize = 1024;
-/// Powers of the betas that are tabled; rarer gaps are computed.
-const POWERS: usize = 4096;
+/// Gaps whose decay is tabled; rarer ones are computed.
+const TABLED_GAPS: usize = 4096;
 
 /// The optimizer of a run: rates, tables, instruction path. Holds no state of rows.
 #[derive(Debug, Clone)]
@@ -35,8 +36,8 @@ pub struct DeferredAdam {
     /// Base rates.
     lane_rates: OfLanes,
     eps: EpsFloor,
-    /// `[k]`: beta1^k, beta2^k.
-    beta_powers: Vec<[f32; 2]>,
+    /// `[k]`: the decay of the moments over k steps.
+    decays: Vec<Decay>,
     simd: SimdPath,
     moments: Moments,
 }
@@ -63,12 +64,11 @@ impl DeferredAdam {
     /// Tables for these rates; panics as [`DriftTables::new`] does.
     pub fn new(rates: Rates, config: AdamConfig, simd: SimdPath) -> Self {
         let lane_rates = OfLanes::new(|column| rates.base(column) as f32);
-        let power = |b: f64, k: usize| flush(libm::pow(b, k as f64) as f32);
         DeferredAdam {
             tables: DriftTables::new(rates, config),
             lane_rates,
             eps: EpsFloor::new(config.eps),
-            beta_powers: (0..POWERS).map(|k| [power(config.beta1, k), power(config.beta2, k)]).collect(),
+            decays: (0..TABLED_GAPS as u32).map(|k| Decay::new(config, k)).collect(),
             simd,
             moments: Moments::F32,
         }
@@ -84,7 +84,7 @@ impl DeferredAdam {
     /// ([`super::method::Method::Sparse`]).
     #[must_use]
     pub fn without_catch_up(self) -> Self {
-        DeferredAdam { tables: self.tables.still(), beta_powers: vec![[1.0; 2]; POWERS], ..self }
+        DeferredAdam { tables: self.tables.still(), ..self }
     }
 
     /// What rows keep of their moments.
@@ -99,7 +99,7 @@ impl DeferredAdam {
 
     /// Bytes of the tables.
     pub fn bytes(&self) -> usize {
-        self.tables.bytes() + self.beta_powers.len() * 8
+        self.tables.bytes() + self.decays.len() * size_of::<Decay>()
     }
 
     /// The optimizer when `now` steps have been taken. Costs about a microsecond.
@@ -177,24 +177,20 @@ impl DeferredAdam {
         at.step_rows(state.view_mut(), rows, values.view(), grads.view())
     }
 
-    /// beta1^k and beta2^k.
+    /// The decay of the moments over `k` steps.
     #[inline(always)]
-    pub(super) fn beta_power(&self, k: u32) -> [f32; 2] {
-        match self.beta_powers.get(k as usize) {
-            Some(&power) => power,
-            None => self.far_beta_power(k),
+    fn decay(&self, k: u32) -> Decay {
+        match self.decays.get(k as usize) {
+            Some(&decay) => decay,
+            None => self.far_decay(k),
         }
     }
 
     /// The same beyond the table.
     #[cold]
     #[inline(never)]
-    fn far_beta_power(&self, k: u32) -> [f32; 2] {
-        if self.tables.is_still() {
-            return [1.0, 1.0];
-        }
-        let AdamConfig { beta1, beta2, .. } = self.tables.config();
-        [beta1, beta2].map(|b| flush(libm::pow(b, f64::from(k)) as f32))
+    fn far_decay(&self, k: u32) -> Decay {
+        Decay::new(self.tables.config(), k)
     }
 }
 
@@ -208,6 +204,20 @@ impl<'a> AdamNow<'a> {
     /// Instruction path of the run.
     pub fn simd(&self) -> SimdPath {
         self.adam.simd
+    }
+
+    /// Steps without a gradient over which the moments of a row of this stamp decay.
+    #[inline(always)]
+    fn missed(&self, stamp: u32) -> u32 {
+        if self.adam.tables.is_still() { 0 } else { self.now.saturating_sub(stamp) }
+    }
+
+    /// The decay that the coming step applies to the moments of a row of this stamp: of the first moment over the
+    /// steps that the row missed, of the second moment over these and the step itself.
+    #[inline(always)]
+    pub(super) fn step_decay(&self, stamp: u32) -> Decay {
+        let missed = self.missed(stamp);
+        Decay { first: self.adam.decay(missed).first, ..self.adam.decay(missed.saturating_add(1)) }
     }
 
     /// Series sums for a row of this stamp.
@@ -347,12 +357,12 @@ impl RowsNow for AdamNow<'_> {
         let mut value = [0.0; BLOCK_LANES];
         self.evaluate_row(&rows.as_ref(), row, &mut value);
         rows.columns.store_row_any(row, &value);
-        let [power1, power2] = self.adam.beta_power(self.now - stamp);
+        let decay = self.adam.decay(self.missed(stamp));
         let (mut m, mut v) = ([0.0; BLOCK_LANES], [0.0; BLOCK_LANES]);
         rows.exp_avg.as_ref().load_row_any(row, &mut m);
         rows.exp_avg_sq.as_ref().load_row_any(row, &mut v);
-        m.iter_mut().for_each(|x| *x = flush(*x * power1));
-        v.iter_mut().for_each(|x| *x = flush(*x * power2));
+        m.iter_mut().for_each(|x| *x = decay.first_moment(*x));
+        v.iter_mut().for_each(|x| *x = decay.second_moment(*x, 0.0));
         if self.adam.moments == Moments::Bf16 {
             round_block::<45>(&mut m, &mut v, rows.uid[row], self.now);
         }

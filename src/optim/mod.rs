@@ -2,6 +2,7 @@
 
 pub mod adam;
 pub mod bounds;
+mod decay;
 pub mod deferred;
 pub mod drift;
 #[cfg(target_arch = "x86_64")]

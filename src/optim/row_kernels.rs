@@ -13,8 +13,9 @@
 //! Invariant: the bits are those of [`RowsNow`], whatever the instruction path.
 
 use super::adam::AdamConfig;
+use super::decay::Decay;
 use super::deferred::{AdamNow, StepCounts};
-use super::drift::{EpsFloor, drifted, flush, flush_positive, needs_direct_sum};
+use super::drift::{EpsFloor, drifted, flush, needs_direct_sum};
 use super::moments::{Moments, round_block};
 use super::row_vectors::{RowVectors, Table, TableMut, is_of_row_behind};
 use crate::base::simd::{Kernel, LANES};
@@ -206,10 +207,10 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
             }
             counts.updated += 1;
             // Before the loads, so that nothing comes between them and what is done with them.
-            let powers = at.adam().beta_power(at.now().saturating_sub(stamp[row]));
+            let decay = at.step_decay(stamp[row]);
             let mut now = value.load(i);
             let (mut m, mut v) = (exp_avg.as_ref().load(row), exp_avg_sq.as_ref().load(row));
-            constants.step(&mut now, &mut m, &mut v, &g, powers);
+            constants.step(&mut now, &mut m, &mut v, &g, decay);
             columns.store(row, &now);
             exp_avg.store(row, &m);
             exp_avg_sq.store(row, &v);
@@ -303,8 +304,8 @@ fn step_last<const W: usize>(
     if kind == GradKind::Usable {
         let mut now = load(values, i);
         let [mut m, mut v] = [&view.exp_avg, &view.exp_avg_sq].map(|moments| load(&moments.as_ref(), row));
-        let powers = at.adam().beta_power(at.now().saturating_sub(view.stamp[row]));
-        constants.step(&mut now, &mut m, &mut v, &g, powers);
+        let decay = at.step_decay(view.stamp[row]);
+        constants.step(&mut now, &mut m, &mut v, &g, decay);
         view.columns.store_row::<W>(row, &now.to_block());
         view.exp_avg.store_row::<W>(row, &m.to_block());
         view.exp_avg_sq.store_row::<W>(row, &v.to_block());
@@ -351,7 +352,7 @@ impl StepConstants {
         }
     }
 
-    /// Decays the moments of a loaded row to now (`powers` of the betas), then takes the step with gradient `g`.
+    /// Decays the moments of a loaded row ([`AdamNow::step_decay`]), then takes the step with gradient `g`.
     #[inline(always)]
     fn step<const W: usize>(
         &self,
@@ -359,14 +360,14 @@ impl StepConstants {
         m: &mut RowVectors<W>,
         v: &mut RowVectors<W>,
         g: &RowVectors<W>,
-        powers: [f32; 2],
+        decay: Decay,
     ) {
         let (value, m, v, g) = (&mut value.0, &mut m.0, &mut v.0, &g.0);
         for l in 0..SH_N_LANE {
-            (value[l], m[l], v[l]) = self.step_value(value[l], m[l], v[l], g[l], powers, self.sizes.narrow[l]);
+            (value[l], m[l], v[l]) = self.step_value(value[l], m[l], v[l], g[l], decay, self.sizes.narrow[l]);
         }
         for l in SH_N_LANE..RowVectors::<W>::USED {
-            (value[l], m[l], v[l]) = self.step_value(value[l], m[l], v[l], g[l], powers, self.sizes.sh_n);
+            (value[l], m[l], v[l]) = self.step_value(value[l], m[l], v[l], g[l], decay, self.sizes.sh_n);
         }
         for l in 0..SH_N_LANE {
             let limit = self.limits[l];
@@ -377,12 +378,11 @@ impl StepConstants {
     }
 
     #[inline(always)]
-    fn step_value(&self, value: f32, m: f32, v: f32, g: f32, powers: [f32; 2], step_size: f32) -> (f32, f32, f32) {
-        let (m, v) = (flush(m * powers[0]), flush_positive(v * powers[1]));
-        // m + (1 - beta)(g - m) rather than beta m + (1 - beta) g: f32 holds 0.001 to 5e-8 of itself but 0.999 only to
-        // 1.3e-5 of its distance from 1, which would show in every second moment.
+    fn step_value(&self, value: f32, m: f32, v: f32, g: f32, decay: Decay, step_size: f32) -> (f32, f32, f32) {
+        let m = decay.first_moment(m);
+        // Not beta m + (1 - beta) g, for the reason that `super::decay` gives.
         let m = flush(m + (g - m) * self.one_minus_b1);
-        let v = flush_positive(v + (g * g - v) * self.one_minus_b2);
+        let v = decay.second_moment(v, g * g * self.one_minus_b2);
         let root = v.sqrt() * self.inv_root_correction + self.eps;
         (flush(value - step_size * (m / root)), m, v)
     }

@@ -5,6 +5,7 @@
 
 use super::dataset_print::{DatasetChanges, dataset_changes};
 use crate::base::error::{InputError, InputResult};
+use crate::base::simd::SimdPath;
 use crate::checkpoint::run_state::{DatasetPrint, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits;
@@ -72,6 +73,15 @@ pub(super) fn with_absolute_paths(config: TrainConfig) -> TrainConfig {
     TrainConfig { spill_dir: absolute(&config.spill_dir), init_ply: absolute(&config.init_ply), ..config }
 }
 
+/// Refuses to go on from pages that were trained with too small an epsilon: their bounds do not hold, and another epsilon
+/// from now on does not bring them back. No earlier check can: the config in the run's folder may be another by now.
+fn check_eps_of_commit(file: &Path, then: &TrainConfig) -> InputResult<()> {
+    let Err(error) = then.check_adam_eps() else { return Ok(()) };
+    let problem = format!("the last commit was trained with an --adam-eps that is refused by now: {}", error.problem);
+    let remedy = "start a new run from its Gaussians: gsscale-ckpt export, then --init-ply with that file";
+    Err(InputError::new(file, problem, remedy))
+}
+
 /// What is other than it was, a line each.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Changes {
@@ -106,15 +116,27 @@ impl Changes {
             lines.push(format!("{key} was {then} and is {now}"));
         }
         let then = TrainConfig::parse(&state.config).map_err(broken)?;
+        check_eps_of_commit(file, &then)?;
         let [was, is] = [&then, config].map(limits::schedule_steps);
         if was != is {
             changes.numbers.push(format!("schedule-steps was {was} and is {is}"));
         }
-        let simd = limits::simd_path(config).name();
-        if simd != state.simd {
-            changes.numbers.push(format!("simd was {} and is {simd}", state.simd));
-        }
+        changes.add_path(&state.simd, limits::simd_path(config));
         Ok(changes)
+    }
+
+    /// Adds another instruction path than that of the last commit: one of the same bits changes no number.
+    fn add_path(&mut self, there: &str, here: SimdPath) {
+        if there == here.name() {
+            return;
+        }
+        let line = format!("simd was {there} and is {}", here.name());
+        let has_same_bits = SimdPath::from_name(there).is_some_and(|path| path.bits_class() == here.bits_class());
+        if has_same_bits {
+            self.free.push(format!("{line} (the same bits)"));
+        } else {
+            self.numbers.push(line);
+        }
     }
 
     /// Adds what is other in the dataset.
@@ -151,6 +173,26 @@ impl Changes {
 mod tests {
     use super::*;
     use crate::config::file::KEYS;
+
+    #[test]
+    fn another_path_changes_numbers_where_its_bits_are_others() {
+        let changes = |there: &str, here: SimdPath| {
+            let mut changes = Changes::default();
+            changes.add_path(there, here);
+            [changes.free.len(), changes.numbers.len(), changes.fixed.len()]
+        };
+        for path in SimdPath::ALL {
+            assert_eq!(changes(path.name(), path), [0, 0, 0]);
+            // A path that only another program knows.
+            assert_eq!(changes("neon", path), [0, 1, 0]);
+        }
+        assert_eq!(changes("avx512", SimdPath::Avx2), [1, 0, 0]);
+        assert_eq!(changes("avx2", SimdPath::Avx512), [1, 0, 0]);
+        for fused in [SimdPath::Avx2, SimdPath::Avx512] {
+            assert_eq!(changes("baseline", fused), [0, 1, 0]);
+            assert_eq!(changes(fused.name(), SimdPath::Baseline), [0, 1, 0]);
+        }
+    }
 
     #[test]
     fn the_lists_name_keys_and_what_lasts_is_kept() {

@@ -306,11 +306,15 @@ fn changed_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result
     Ok(pages)
 }
 
-/// The config that the pages were trained by, on the path that the bits were made on if this machine has it, else on that
-/// of the config or on the best that there is: a path changes roundings, other rates the scene.
+/// The config that the pages were trained by, on a path that gives the bits that they have if this machine has one, else
+/// on the path of the config or on the best that there is: a path changes roundings, other rates the scene.
 fn rules_then(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath) -> bool) -> Option<TrainConfig> {
     let on = |simd: &str| TrainConfig { simd: simd.to_string(), ..then.clone() };
-    [on(simd), on(&then.simd), on("auto")].into_iter().find(|c| is_supported(limits::simd_path(c)))
+    let class = SimdPath::from_name(simd).map(SimdPath::bits_class);
+    let of_class = SimdPath::ALL.into_iter().filter(|path| Some(path.bits_class()) == class);
+    let of_class = of_class.map(|path| on(path.name()));
+    let mut all = std::iter::once(on(simd)).chain(of_class).chain([on(&then.simd), on("auto")]);
+    all.find(|c| is_supported(limits::simd_path(c)))
 }
 
 /// The options by which pages come back: with the band that was in use from their first step, from which the events of
@@ -339,13 +343,15 @@ mod tests {
         let here = |paths: &[SimdPath]| rules_then(&then, "avx512", |path| paths.contains(&path));
         let with = |simd: &str| Some(TrainConfig { simd: simd.into(), ..then.clone() });
         assert_eq!(here(&SimdPath::ALL), with("avx512"));
-        // What `auto` stands for depends on the machine: it is the third that is asked for.
+        assert_eq!(here(&[SimdPath::Avx2, SimdPath::Baseline]), with("avx2"), "the same bits on another path");
+        // What `auto` stands for depends on the machine: it is asked for after the path itself, the two of its class, and
+        // that of the config.
         let asked = std::cell::Cell::new(0);
-        let third = |_| asked.replace(asked.get() + 1) == 2;
-        assert_eq!(rules_then(&then, "avx512", third), with("auto"));
+        let last = |_| asked.replace(asked.get() + 1) == 4;
+        assert_eq!(rules_then(&then, "avx512", last), with("auto"));
         let baseline = TrainConfig { simd: "baseline".into(), ..then.clone() };
         let found = rules_then(&baseline, "avx512", |path| path == SimdPath::Baseline);
-        assert_eq!(found, Some(baseline), "that of the config comes second");
+        assert_eq!(found, Some(baseline), "that of the config comes next");
         // Never by another config.
         assert_eq!(here(&[]), None);
     }

@@ -2,6 +2,7 @@
 //! "never", gradients of 1 to 1e-14, two eps, two rate schedules.
 
 use crate::support::Fixture;
+use crate::torch32::Torch32;
 use gsscale::base::simd::SimdPath;
 use gsscale::optim::adam::{AdamConfig, DenseAdam, Real};
 use gsscale::optim::deferred::DeferredAdam;
@@ -104,6 +105,29 @@ fn adam_dense_f32_equals_torch() {
     }
 }
 
+/// The rival of `adam_seeds` is torch in f32: nearly every value has torch's own bits. (Which operations torch's compiler
+/// fused is a guess, and wrong for some tails of its loops; with no fused operation, or others, more than 8 % differ in
+/// every file.)
+#[test]
+fn torch_in_f32_is_imitated() {
+    for name in FILES {
+        let Some(case) = Case::open(name) else { return };
+        let mut torch = Torch32::new(case.config, case.file.f32("param0"));
+        let (mut same, mut all) = (0, 0);
+        for (i, &lr) in case.lrs.iter().enumerate() {
+            let grads: Vec<f32> = case.grads(i + 1).into_iter().map(|g| g as f32).collect();
+            torch.step(&grads, lr);
+            if let Some(snap) = case.snaps.iter().position(|&s| s == i + 1) {
+                let want = case.snapshot("param_f32", snap);
+                same += torch.values.iter().zip(want).filter(|&(&a, &b)| f64::from(a) == b).count();
+                all += want.len();
+            }
+        }
+        // Measured: 91 to 98 %.
+        assert!(same * 10 >= all * 9, "{name}: {same} of {all}");
+    }
+}
+
 /// The fixture's values as means, one to a row, so that each is touched by its own schedule alone and both rate schedules
 /// go through the trainer's own path.
 fn state_of(case: &Case) -> SceneState {
@@ -165,6 +189,7 @@ fn adam_deferred_in_f64_is_within_a_millionth_of_a_rate() {
 
 #[test]
 fn adam_deferred_equals_torch_at_every_snapshot() {
+    let (mut unlucky, mut values) = (0, 0);
     for name in FILES {
         let Some(case) = Case::open(name) else { return };
         let adam = DeferredAdam::new(rates_of(&case), case.config, SimdPath::best());
@@ -197,14 +222,18 @@ fn adam_deferred_equals_torch_at_every_snapshot() {
                 *largest = std::array::from_fn(|k| largest[k].max(errors[k]));
             }
         }
-        compare_with_torch_in_f32(&case, name, &largest);
+        unlucky += compare_with_torch_in_f32(&case, name, &largest);
+        values += case.values;
     }
+    // Of the values of other seeds (`adam_seeds`) less than one in a hundred, too.
+    assert!(unlucky * 67 <= values, "{unlucky} of {values} values");
 }
 
 /// At most twice the errors of torch in f32: for every touch schedule and every gradient size (largest over the others),
 /// and for single values but for a few. Of one value both errors are a matter of which way the roundings of its second
 /// moment happen to fall, in torch as here: where its own were lucky, twice of it is less than they are expected to be.
-fn compare_with_torch_in_f32(case: &Case, name: &str, largest: &[[f64; 2]]) {
+/// Returns how many of them there are.
+fn compare_with_torch_in_f32(case: &Case, name: &str, largest: &[[f64; 2]]) -> usize {
     let over = |of: &dyn Fn(usize) -> bool| {
         let chosen = largest.iter().enumerate().filter(|&(i, _)| of(i));
         chosen.fold([0.0f64; 2], |a, (_, b)| [a[0].max(b[0]), a[1].max(b[1])])
@@ -217,7 +246,7 @@ fn compare_with_torch_in_f32(case: &Case, name: &str, largest: &[[f64; 2]]) {
         let [ours, torch] = over(&|i| i % case.columns == column);
         assert!(ours <= 2.0 * torch, "{name} gradient size {column}: {ours:e}, torch in f32 {torch:e}");
     }
-    let unlucky: Vec<_> = largest.iter().enumerate().filter(|(_, [ours, torch])| *ours > 2.0 * torch).collect();
-    assert!(unlucky.len() <= 2, "{name}: of {} values {unlucky:?}", largest.len());
-    assert!(unlucky.iter().all(|(_, [ours, torch])| *ours <= 10.0 * torch), "{name}: {unlucky:?}");
+    let unlucky: Vec<_> = largest.iter().copied().filter(|[ours, torch]| *ours > 2.0 * torch).collect();
+    assert!(unlucky.iter().all(|[ours, torch]| *ours <= 10.0 * torch), "{name}: {unlucky:?}");
+    unlucky.len()
 }

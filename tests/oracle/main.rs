@@ -6,7 +6,9 @@
 mod support;
 
 mod adam;
+mod adam_seeds;
 mod loss;
 mod projection;
 mod raster;
 mod sh;
+mod torch32;

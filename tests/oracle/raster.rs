@@ -6,7 +6,7 @@ use gsscale::base::simd::SimdPath;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::{Gradients, LossOptions, RenderOptions, Renderer, SsimPadding};
 use gsscale::scene::camera::Camera;
-use gsscale::scene::columns::Columns;
+use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::Target;
 
 const FILES: [&str; 9] = [
@@ -120,6 +120,27 @@ fn own_gradients(grads: &Gradients, sh_width: usize) -> Vec<Vec<f32>> {
 /// The instruction paths of this machine.
 fn paths() -> impl Iterator<Item = SimdPath> {
     SimdPath::ALL.into_iter().filter(|path| path.is_supported())
+}
+
+/// Pictures and gradients as bits. A run may go on with another path of its class, so no bit may tell them apart.
+#[test]
+fn the_paths_of_a_class_give_the_same_bits() {
+    if !(SimdPath::Avx512.is_supported() && SimdPath::Avx2.is_supported()) {
+        println!("SKIPPED: this machine lacks AVX-512 or AVX2");
+        return;
+    }
+    for name in FILES {
+        let Some(mut scene) = Scene::open(name) else { return };
+        let mut bits = |simd: SimdPath| -> Vec<u32> {
+            scene.options.simd = simd;
+            let mut renderer = CpuRenderer::new();
+            let rgb = renderer.forward(&scene.rows, &scene.camera, &scene.options).rgb.clone();
+            let g = scene.backward();
+            let floats = Column::ALL.into_iter().flat_map(|column| g.columns.column(column).to_vec());
+            rgb.into_iter().chain(renderer.alpha().iter().copied()).chain(floats).map(f32::to_bits).collect()
+        };
+        assert!(bits(SimdPath::Avx512) == bits(SimdPath::Avx2), "{name}");
+    }
 }
 
 #[test]

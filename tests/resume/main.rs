@@ -11,4 +11,5 @@ mod events;
 mod kills;
 mod more_steps;
 mod ownership;
+mod paths;
 mod stops;

@@ -5,6 +5,7 @@
 //! Not here: the last listed row, and the rounding of moments that are kept in 16 bits, which are those of every path.
 //! Invariant: bits and counts are those of [`StepRows`] as a plain loop.
 
+use super::super::decay::Decay;
 use super::super::deferred::StepCounts;
 use super::super::row_kernels::{AHEAD, GradKind, LARGEST_GRAD, StepConstants, StepRows, finish_step};
 use super::super::row_vectors::{Table, TableMut, start_of_eight};
@@ -39,14 +40,14 @@ impl<const W: usize> EightKernel for Eights<StepRows<'_, '_, W>> {
         for first in (0..before.len()).step_by(BLOCK) {
             let block = first..(first + BLOCK).min(before.len());
             let row_of = |i: usize| before[i] as usize - first_row;
-            let (mut usable, mut powers) = (0u64, [[0.0; 2]; BLOCK]);
+            let (mut usable, mut decays) = (0u64, [Decay::NONE; BLOCK]);
             for i in block.clone() {
                 match stepping.kind_of(i) {
                     GradKind::Zero => {}
                     GradKind::Bad => counts.skipped_non_finite += 1,
                     GradKind::Usable => {
                         let stamp = &mut stamp[row_of(i)];
-                        powers[i - first] = at.adam().beta_power(at.now().saturating_sub(*stamp));
+                        decays[i - first] = at.step_decay(*stamp);
                         *stamp = at.now() + 1;
                         usable |= 1 << (i - first);
                     }
@@ -54,7 +55,7 @@ impl<const W: usize> EightKernel for Eights<StepRows<'_, '_, W>> {
             }
             counts.updated += usable.count_ones() as usize;
             for i in block.clone().filter(|i| usable >> (i - first) & 1 != 0) {
-                stepping.narrow(row_of(i), i, powers[i - first]);
+                stepping.narrow(row_of(i), i, decays[i - first]);
             }
             if W == 0 {
                 continue;
@@ -64,7 +65,7 @@ impl<const W: usize> EightKernel for Eights<StepRows<'_, '_, W>> {
                     stepping.prefetch(row_of(i + AHEAD), i + AHEAD);
                 }
                 if usable >> (i - first) & 1 != 0 {
-                    stepping.sh_n(row_of(i), i, powers[i - first]);
+                    stepping.sh_n(row_of(i), i, decays[i - first]);
                 }
             }
         }
@@ -129,13 +130,13 @@ impl<const W: usize> Stepping<'_, W> {
 
     /// The narrow columns of a row, which is listed as `i`.
     #[inline(always)]
-    fn narrow(&mut self, row: usize, i: usize, powers: [f32; 2]) {
+    fn narrow(&mut self, row: usize, i: usize, decay: Decay) {
         let avx2 = self.numbers.avx2;
-        let powers = [avx2.splat(powers[0]), avx2.splat(powers[1])];
+        let decay = [avx2.splat(decay.first), avx2.splat(decay.kept), avx2.splat(decay.lost)];
         let (now, g) = (self.values.load_narrow(avx2, i), self.grads.load_narrow(avx2, i));
         let (m, v) = (self.m.as_ref().load_narrow(avx2, row), self.v.as_ref().load_narrow(avx2, row));
-        let low = self.step([now[0], m[0], v[0]], g[0], powers, self.sizes[0]);
-        let high = self.step([now[1], m[1], v[1]], g[1], powers, self.sizes[1]);
+        let low = self.step([now[0], m[0], v[0]], g[0], decay, self.sizes[0]);
+        let high = self.step([now[1], m[1], v[1]], g[1], decay, self.sizes[1]);
         let now = [self.limited(low[0], 0), self.limited(high[0], 1)];
         self.columns.store_narrow(row, now);
         self.m.store_narrow(row, [low[1], high[1]]);
@@ -144,9 +145,9 @@ impl<const W: usize> Stepping<'_, W> {
 
     /// The same for `sh_n`.
     #[inline(always)]
-    fn sh_n(&mut self, row: usize, i: usize, powers: [f32; 2]) {
+    fn sh_n(&mut self, row: usize, i: usize, decay: Decay) {
         let avx2 = self.numbers.avx2;
-        let powers = [avx2.splat(powers[0]), avx2.splat(powers[1])];
+        let decay = [avx2.splat(decay.first), avx2.splat(decay.kept), avx2.splat(decay.lost)];
         let (now, g) = (self.values.sh_n_of(i), self.grads.sh_n_of(i));
         // The last vector shares lanes with the one before: its moments are loaded before those are stored.
         let (parts, last) = (W.div_ceil(EIGHT), W.saturating_sub(EIGHT));
@@ -157,7 +158,7 @@ impl<const W: usize> Stepping<'_, W> {
                 true => last_moments,
                 false => [load(avx2, self.m.sh_n_of(row), start), load(avx2, self.v.sh_n_of(row), start)],
             };
-            let next = self.step([load(avx2, now, start), m, v], load(avx2, g, start), powers, self.sizes[2]);
+            let next = self.step([load(avx2, now, start), m, v], load(avx2, g, start), decay, self.sizes[2]);
             next[0].store(eight_mut(self.columns.sh_n_of(row), start));
             next[1].store(eight_mut(self.m.sh_n_of(row), start));
             next[2].store(eight_mut(self.v.sh_n_of(row), start));
@@ -166,11 +167,13 @@ impl<const W: usize> Stepping<'_, W> {
 
     /// What [`StepConstants`] does to a value and its moments.
     #[inline(always)]
-    fn step(&self, [value, m, v]: [Eight; 3], g: Eight, powers: [Eight; 2], size: Eight) -> [Eight; 3] {
+    fn step(&self, [value, m, v]: [Eight; 3], g: Eight, decay: [Eight; 3], size: Eight) -> [Eight; 3] {
         let numbers = &self.numbers;
-        let (m, v) = (numbers.flush(m.times(powers[0])), numbers.flush_positive(v.times(powers[1])));
+        let [first, kept, lost] = decay;
+        let m = numbers.flush(m.times(first));
         let m = numbers.flush(m.plus(g.minus(m).times(self.one_minus_b1)));
-        let v = numbers.flush_positive(v.plus(g.times(g).minus(v).times(self.one_minus_b2)));
+        let gained = g.times(g).times(self.one_minus_b2);
+        let v = numbers.flush_positive(v.times(kept).plus(gained.minus(v.times(lost))));
         let root = v.sqrt().times(self.inv_root_correction).plus(self.eps);
         [numbers.flush(value.minus(size.times(m.over(root)))), m, v]
     }
