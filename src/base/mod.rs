@@ -7,6 +7,7 @@ pub mod error;
 pub mod ids;
 pub mod machine;
 pub mod math;
+pub mod png_pixels;
 pub mod rng;
 pub mod room;
 pub mod say;
