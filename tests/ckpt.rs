@@ -425,8 +425,8 @@ fn growth_goes_on_after_a_salvage_without_a_map() {
     let bench = Bench::new();
     // The rounds lie behind the stop, with room for half of the growth that there would be without a cap.
     let more = ["--refine-every", "150", "--refine-stop", "400", "--grow-grad2d", "0.0001", "--max-gaussians", "4000"];
-    let alone = bench.path("alone");
-    let args = [&[text(&bench.path("scene")), "--out", text(&alone)], &bench::with(&more)[..]].concat();
+    let (scene, alone) = (bench.path("scene"), bench.path("alone"));
+    let args = [&[text(&scene), "--out", text(&alone)], &bench::with(&more)[..]].concat();
     let output = train(&args);
     assert!(output.status.success(), "{}", stderr(&output));
     let out = bench.stopped(&more);

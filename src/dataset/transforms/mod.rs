@@ -250,13 +250,13 @@ impl<'j> Prescribed<'j> {
             Names::Bad(problem, remedy) => Err(json.top().error(LISTS[list], problem, remedy)),
         };
         let Some(train) = names(0)? else { return Ok(None) };
-        let (list, held_out) = match names(2)? {
-            Some(test) => (2, Some(test)),
-            None => (1, names(1)?),
+        let held_out = match names(2)? {
+            Some(test) => Some(test),
+            None => names(1)?,
         };
         if let Some(name) = held_out.and_then(|names| train.intersection(names).next()) {
             let problem = format!("'{name}' is in the train and in the held-out list");
-            return Err(json.top().error(LISTS[list], problem, "a photo belongs to one of them"));
+            return Err(json.top().error(LISTS[0], problem, "a photo belongs to one of them"));
         }
         Ok(Some(Prescribed { train, held_out }))
     }
