@@ -8,6 +8,7 @@ pub mod identity;
 pub mod ids;
 pub mod machine;
 pub mod math;
+pub mod png_pixels;
 pub mod rng;
 pub mod room;
 pub mod say;

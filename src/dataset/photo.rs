@@ -6,8 +6,9 @@
 //! stored pixels.
 //!
 //! Invariants: 1. a target depends on its [`PhotoSource`] and the files alone, never on budgets or threads; 2. the
-//! memory used at any moment of [`decode`] is at most [`PhotoSource::decode_bytes`]; 3. distorted photos are
-//! undistorted at full size, row by row into the area average: the full-size result never exists.
+//! memory used at any moment of [`decode`] is at most [`PhotoSource::decode_bytes`], whatever the files hold beside their
+//! pixels: colour profiles, texts and previews are skipped or counted; 3. distorted photos are undistorted at full size,
+//! row by row into the area average: the full-size result never exists.
 
 use super::masks::{self, MaskSource};
 use super::model::{Intrinsics, Lens};
@@ -15,9 +16,10 @@ use super::photo_header::{PhotoFormat, PhotoHeader};
 use super::resize::{AreaResizer, Size, resize_area};
 use super::undistort::Undistorter;
 use crate::base::error::{InputError, InputResult};
+use crate::base::png_pixels::{PNG_BUFFERS, PixelChunks};
 use crate::scene::image::Target;
 use image::codecs::{jpeg::JpegDecoder, png::PngDecoder};
-use image::{DynamicImage, ImageDecoder, ImageError};
+use image::{DynamicImage, ImageDecoder, ImageError, Limits};
 use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
@@ -49,7 +51,7 @@ impl PhotoSource {
     pub fn decode_bytes(&self) -> u64 {
         let photo = self.header.decode_bytes + self.target_bytes();
         let undone = if self.intrinsics.lens == Lens::Pinhole { 0 } else { self.target_pixels() };
-        let mask = self.mask.as_ref().map_or(0, |m| m.header.decode_bytes + self.target_pixels());
+        let mask = self.mask.as_ref().map_or(0, |m| m.header.gray_bytes() + self.target_pixels());
         photo.max(mask + self.target_bytes()) + undone
     }
 
@@ -150,7 +152,13 @@ fn read_picture(path: &Path, header: &PhotoHeader) -> InputResult<DynamicImage> 
     let reader = BufReader::new(file);
     match header.format {
         PhotoFormat::Jpeg => decode_with(JpegDecoder::new(reader).map_err(|e| undecodable(path, &e))?, path, header),
-        PhotoFormat::Png => decode_with(PngDecoder::new(reader).map_err(|e| undecodable(path, &e))?, path, header),
+        PhotoFormat::Png => {
+            let pixels = PixelChunks::new(reader).map_err(|e| InputError::io(path, "reading the photo", &e))?;
+            let mut limits = Limits::no_limits();
+            limits.max_alloc = Some(PNG_BUFFERS);
+            let decoder = PngDecoder::with_limits(pixels, limits).map_err(|e| undecodable(path, &e))?;
+            decode_with(decoder, path, header)
+        }
     }
 }
 

@@ -1,6 +1,13 @@
 //! What a photo file says about itself, without decoding it: format, size, whether its end is there, and how much
 //! memory decoding will take.
 //!
+//! That memory is counted from what the decoders do (crates png 0.18 and zune-jpeg 0.5), buffers of a few rows apart.
+//! A PNG takes its pixels as they are decoded (1 to 8 bytes each) and as they are converted, since
+//! [`crate::base::png_pixels`] keeps everything else from the decoder. A JPEG takes its file twice, since the decoder
+//! copies metadata wherever they stand; the metadata before its pixels once more, since the decoder puts together what is
+//! in parts; its pixels; and, where a scan does not hold all of a pixel (progressive files, and others with a scan for
+//! each component), 2 bytes for every coefficient, in whole blocks.
+//!
 //! Invariants: 1. nothing is allocated in proportion to a number in the file; 2. a file that passes has a complete
 //! header and its format's end marker behind the start of the pixel data; 3. EXIF orientation is ignored, as COLMAP
 //! ignores it: sizes are those of the stored pixels.
@@ -37,6 +44,13 @@ pub struct PhotoHeader {
     pub height: u32,
     /// Bytes that the decoder needs at its peak, the 8-bit RGB result included.
     pub decode_bytes: u64,
+}
+
+impl PhotoHeader {
+    /// As [`PhotoHeader::decode_bytes`], where the result is 8-bit gray, made from RGB at worst.
+    pub fn gray_bytes(&self) -> u64 {
+        self.decode_bytes.max(4 * u64::from(self.width) * u64::from(self.height))
+    }
 }
 
 /// Reads and checks the header and the end of a photo file.
@@ -90,6 +104,30 @@ fn foreign_format(magic: &[u8; 16]) -> Option<&'static str> {
     })
 }
 
+/// The frame header of a JPEG.
+struct JpegFrame {
+    code: u8,
+    width: u32,
+    height: u32,
+    pixels: u64,
+    components: u8,
+    /// Of all components, in whole blocks and units.
+    coefficients: u64,
+}
+
+impl JpegFrame {
+    /// Of a file of `bytes`, `metadata` of them before the first scan, which holds so many components.
+    fn header(&self, bytes: u64, metadata: u64, in_first_scan: u8) -> PhotoHeader {
+        // Result, then RGB made from it when it is gray.
+        let result = if self.components == 1 { 4 } else { 3 } * self.pixels;
+        // All coefficients are kept until the last scan.
+        let has_scans = self.code == 0xc2 || in_first_scan != self.components;
+        let of_scans = if has_scans { 2 * self.coefficients } else { 0 };
+        let decode_bytes = 2 * bytes + metadata + result + of_scans;
+        PhotoHeader { format: PhotoFormat::Jpeg, width: self.width, height: self.height, decode_bytes }
+    }
+}
+
 struct HeaderReader<'a> {
     path: &'a Path,
     file: BufReader<File>,
@@ -124,7 +162,7 @@ impl HeaderReader<'_> {
     fn jpeg(mut self) -> InputResult<PhotoHeader> {
         let mut at = 2u64;
         let mut frame = None;
-        let mut segments = 0;
+        let (mut segments, mut metadata) = (0, 0);
         loop {
             segments += 1;
             if segments > MOST_SEGMENTS {
@@ -148,36 +186,56 @@ impl HeaderReader<'_> {
                     if (0xc0..=0xcf).contains(&code) && ![0xc4, 0xc8, 0xcc].contains(&code) {
                         frame = Some(self.jpeg_frame(code, at)?);
                     }
+                    if (0xe0..=0xef).contains(&code) {
+                        metadata += length;
+                    }
                     at += 2 + length;
                 }
                 _ => return Err(self.damaged(at, "a JPEG marker is expected here")),
             }
         }
-        let Some(header) = frame else {
+        let Some(frame) = frame else {
             return Err(self.damaged(at, "its pixels begin before its size is stated"));
         };
+        let mut scan = [0u8; 3];
+        self.read(&mut scan, "the header of its first scan")?;
+        let header = frame.header(self.bytes, metadata, scan[2]);
         // Pixel data cannot contain this pair (a 255 in it is followed by 0), a preview in the header can: so only
         // what follows the start of the scan counts. Anything may follow the marker.
         self.require_end(at, &[0xff, 0xd9], "the end marker (FF D9)")?;
         Ok(header)
     }
 
-    fn jpeg_frame(&mut self, code: u8, at: u64) -> InputResult<PhotoHeader> {
+    fn jpeg_frame(&mut self, code: u8, at: u64) -> InputResult<JpegFrame> {
         let mut f = [0u8; 6];
         self.read(&mut f, "its frame header")?;
         let (height, width) = (u16::from_be_bytes([f[1], f[2]]), u16::from_be_bytes([f[3], f[4]]));
-        let components = u64::from(f[5]);
         if code > 0xc2 || f[0] != 8 {
             let problem = "its JPEG coding (lossless, arithmetic or 12-bit) cannot be read";
             let remedy = "save the photo again as an ordinary 8-bit JPEG or as PNG";
             return Err(InputError::new(self.path, problem, remedy).at(format!("byte {at}")));
         }
         let pixels = self.check_size(u32::from(width), u32::from(height), at)?;
-        // Result, then RGB made from it when it is gray; a progressive file keeps all 16-bit coefficients.
-        let result = if components == 1 { 4 } else { 3 };
-        let coefficients = if code == 0xc2 { 2 * components.min(4) } else { 0 };
-        let decode_bytes = self.bytes + pixels * (result + coefficients);
-        Ok(PhotoHeader { format: PhotoFormat::Jpeg, width: width.into(), height: height.into(), decode_bytes })
+        let components = f[5];
+        if !(1..=4).contains(&components) {
+            return Err(self.damaged(at, &format!("it has {components} components; 1 to 4 can be")));
+        }
+        let (mut blocks, mut most) = (0, [1, 1]);
+        for _ in 0..components {
+            let mut c = [0u8; 3];
+            self.read(&mut c, "its frame header")?;
+            let sampling = [u64::from(c[1] >> 4), u64::from(c[1] & 15)];
+            if sampling.iter().any(|s| !(1..=4).contains(s)) {
+                return Err(self.damaged(at, "a component is sampled in a way that does not exist"));
+            }
+            blocks += sampling[0] * sampling[1];
+            most = [most[0].max(sampling[0]), most[1].max(sampling[1])];
+        }
+        // One component alone is not sampled down, whatever its factors say.
+        let (blocks, most) = if components == 1 { (1, [1, 1]) } else { (blocks, most) };
+        let units = u64::from(width).div_ceil(8 * most[0]) * u64::from(height).div_ceil(8 * most[1]);
+        let (width, height) = (width.into(), height.into());
+        Ok(JpegFrame { code, width, height, pixels, components, coefficients: 64 * blocks * units })
     }
 
     /// Signature, IHDR and IEND (PNG specification, sections 5 and 11.2).
@@ -191,24 +249,43 @@ impl HeaderReader<'_> {
         let width = u32::from_be_bytes([h[8], h[9], h[10], h[11]]);
         let height = u32::from_be_bytes([h[12], h[13], h[14], h[15]]);
         let pixels = self.check_size(width, height, 16)?;
-        let samples = match h[17] {
-            0 => 1,
-            2 | 3 => 3,
-            4 => 2,
-            6 => 4,
+        let (at, is_transparent) = self.png_pixels()?;
+        let depth = if h[16] == 16 { 2 } else { 1 };
+        // As they are decoded, and with what they are converted to: RGB at once, or RGBA first where there is alpha.
+        let (colors, has_alpha) = match h[17] {
+            0 => (1, is_transparent),
+            2 | 3 => (3, is_transparent),
+            4 => (1, true),
+            6 => (3, true),
             _ => return Err(self.damaged(25, "its colour type does not exist")),
         };
-        let decoded = if h[16] == 16 { 2 * samples } else { samples };
-        // An 8-bit RGB result is used as it is; others are converted, with an RGBA copy between when there is alpha.
-        let converted = match (h[17], h[16]) {
-            (2 | 3, 1..=8) => 0,
-            (4 | 6, _) => 4 + 3,
-            _ => 3,
+        let decoded = depth * (colors + u64::from(has_alpha));
+        let per_pixel = match (has_alpha, decoded) {
+            (true, _) => (decoded + 4).max(4 + 3),
+            (false, 3) => 3,
+            (false, _) => decoded + 3,
         };
-        // A palette may carry alpha (tRNS): counted as RGBA with its conversion.
-        let per_pixel = if h[17] == 3 || h[17] == 2 { (decoded + converted).max(4 + 3) } else { decoded + converted };
-        self.require_end(33, b"IEND\xae\x42\x60\x82", "the end chunk (IEND)")?;
+        self.require_end(at, b"IEND\xae\x42\x60\x82", "the end chunk (IEND)")?;
         Ok(PhotoHeader { format: PhotoFormat::Png, width, height, decode_bytes: pixels * per_pixel })
+    }
+
+    /// Walks the chunks up to the first pixels: where they are, and whether a tRNS chunk makes some of them transparent.
+    fn png_pixels(&mut self) -> InputResult<(u64, bool)> {
+        let (mut at, mut is_transparent) = (33u64, false);
+        for _ in 0..MOST_SEGMENTS {
+            self.file.seek(SeekFrom::Start(at)).map_err(|e| self.io(&e))?;
+            let mut head = [0u8; 8];
+            self.read(&mut head, "a chunk before its pixels")?;
+            let [a, b, c, d, kind @ ..] = head;
+            match &kind {
+                b"IDAT" => return Ok((at, is_transparent)),
+                b"IEND" => return Err(self.damaged(at, "it ends before its pixels begin")),
+                b"tRNS" => is_transparent = true,
+                _ => {}
+            }
+            at += 12 + u64::from(u32::from_be_bytes([a, b, c, d]));
+        }
+        Err(self.damaged(at, "its header does not end"))
     }
 
     fn check_size(&self, width: u32, height: u32, at: u64) -> InputResult<u64> {

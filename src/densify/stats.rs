@@ -2,7 +2,8 @@
 //!
 //! Invariants: 1. only drawn rows change; 2. sums are in NDC units, so thresholds do not depend on the image size;
 //! 3. the histogram counts every row that has statistics, exactly once, in the bin of its mean: integers only, so the
-//! order in which rows were touched leaves no trace in it.
+//! order in which rows were touched leaves no trace in it; 4. no counter wraps: a row that is taken out of an empty bin, as
+//! only statistics that do not belong to the histogram can be, is counted as uncounted ([`GradHistogram::uncounted`]).
 
 pub use crate::scene::rows::mean_grad2d;
 use crate::scene::rows::{Rows, RowsMut};
@@ -14,11 +15,12 @@ const BINS: usize = 1 << 15;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GradHistogram {
     bins: Vec<u32>,
+    uncounted: u64,
 }
 
 impl Default for GradHistogram {
     fn default() -> Self {
-        GradHistogram { bins: vec![0; BINS] }
+        GradHistogram { bins: vec![0; BINS], uncounted: 0 }
     }
 }
 
@@ -42,9 +44,26 @@ impl GradHistogram {
         self.bins[bin(mean)] += 1;
     }
 
+    /// Counts the rows of a view that have statistics.
+    pub fn add_rows(&mut self, rows: &Rows<'_>) {
+        for (&grad2d, &count) in rows.grad2d.iter().zip(rows.count).filter(|(_, count)| **count > 0) {
+            self.add(mean_grad2d(grad2d, count));
+        }
+    }
+
     /// Takes a row with this mean out again.
     pub fn remove(&mut self, mean: f32) {
-        self.bins[bin(mean)] -= 1;
+        let rows = &mut self.bins[bin(mean)];
+        match rows.checked_sub(1) {
+            Some(left) => *rows = left,
+            None => self.uncounted += 1,
+        }
+    }
+
+    /// Rows that were taken out without having been counted: 0, unless rows have statistics that this histogram was not
+    /// made of.
+    pub fn uncounted(&self) -> u64 {
+        self.uncounted
     }
 
     /// Forgets all rows; after a round.
@@ -150,6 +169,19 @@ mod tests {
         assert_eq!(histogram.threshold(2e-4, 1), 2e-4);
         let threshold = histogram.threshold(2e-4, 0);
         assert!(threshold >= mean_grad2d(state.grad2d[0], 2));
+    }
+
+    #[test]
+    fn rows_that_were_never_counted_are_noticed_and_no_counter_wraps() {
+        let mut state = SceneState::from_columns(Columns::zeros(2, 0));
+        (state.grad2d[1], state.count[1]) = (3.0, 2);
+        let mut histogram = GradHistogram::default();
+        let v = [[1.0, 0.0], [1.0, 0.0]];
+        accumulate(&mut state.view_mut(), &[0, 1], &v, &[[1, 1]; 2], [2, 2], &mut histogram);
+        assert_eq!((histogram.uncounted(), histogram.rows()), (1, 2));
+        let mut counted = GradHistogram::default();
+        counted.add_rows(&state.view());
+        assert_eq!((counted.filled(), counted.uncounted()), (histogram.filled(), 0));
     }
 
     #[test]

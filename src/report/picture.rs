@@ -1,19 +1,25 @@
 //! Pictures for pages: the render-beside-photo files of an evaluation, cut in two, shrunk, with a map of differences,
 //! as data URIs.
 //!
-//! Invariant: sizes are bounded before anything is decoded.
+//! Invariant: sizes are bounded before anything is decoded, and the decoder gets pixels alone.
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::png_pixels::{PNG_BUFFERS, PixelChunks};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use image::codecs::jpeg::JpegEncoder;
+use image::codecs::png::PngDecoder;
 use image::imageops::{FilterType, crop_imm, resize};
-use image::{ImageReader, Limits, RgbImage};
+use image::{DynamicImage, ImageDecoder, Limits, RgbImage};
+use std::fs::File;
+use std::io::BufReader;
 use std::path::Path;
 
 /// Widest picture in a page, pixels.
 const WIDTH_MAX: u32 = 800;
 const JPEG_QUALITY: u8 = 88;
+/// The most that a decoded file may take, bytes.
+const DECODED_MAX: u64 = 1 << 30;
 /// A difference of this many levels (of 255) is shown at full strength.
 const FULL_DIFFERENCE: f32 = 64.0;
 
@@ -27,18 +33,23 @@ pub struct ViewPictures {
     pub difference: String,
 }
 
-/// Reads a picture whose left half is the render and whose right half is the photo.
+/// Reads a PNG whose left half is the render and whose right half is the photo.
 ///
 /// # Errors
 /// The file cannot be read or decoded, or is larger than any view.
 pub fn view_pictures(path: &Path) -> InputResult<ViewPictures> {
     let bad = |e: image::ImageError| InputError::new(path, format!("is no picture: {e}"), "evaluate the run again");
-    let mut reader = ImageReader::open(path).map_err(|e| InputError::io(path, "reading the picture", &e))?;
+    let io = |e: std::io::Error| InputError::io(path, "reading the picture", &e);
+    let file = File::open(path).map_err(io)?;
     let mut limits = Limits::default();
     (limits.max_image_width, limits.max_image_height) = (Some(1 << 16), Some(1 << 15));
-    limits.max_alloc = Some(1 << 30);
-    reader.limits(limits);
-    let both = reader.decode().map_err(bad)?.to_rgb8();
+    limits.max_alloc = Some(PNG_BUFFERS);
+    let pixels = PixelChunks::new(BufReader::new(file)).map_err(io)?;
+    let decoder = PngDecoder::with_limits(pixels, limits).map_err(bad)?;
+    if decoder.total_bytes() > DECODED_MAX {
+        return Err(InputError::new(path, "is larger than any view", "evaluate the run again"));
+    }
+    let both = DynamicImage::from_decoder(decoder).map_err(bad)?.into_rgb8();
     let (width, height) = (both.width() / 2, both.height());
     if width == 0 || height == 0 {
         return Err(InputError::new(path, "is empty", "evaluate the run again"));

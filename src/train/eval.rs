@@ -1,6 +1,7 @@
 //! Looking at held-out views: PSNR, SSIM, and pictures of render beside photo. Changes no state.
 
 use super::machine;
+use super::memory::{check_photos_fit, host_budget};
 use super::pages::PagedScene;
 use super::report::{ColorCorrected, TestMetrics, json_psnr};
 use super::step::WorkingSet;
@@ -171,6 +172,7 @@ pub fn evaluate_ply(
         return Err(InputError::new(ply, problem, "give the point_cloud.ply of a run").into());
     };
     let dataset = load_dataset(read_scene(scene, &limits::read_options(config))?, &limits::load_options(config))?;
+    check_photos_fit(&dataset, host_budget(config))?;
     let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
     for warning in dataset.warnings.iter().chain(&ply_warnings(ply, &meta, far)) {
         eprintln!("warning: {warning}");

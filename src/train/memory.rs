@@ -5,9 +5,11 @@
 
 use super::pages::PAGES_PER_BATCH;
 use super::trainer::{TrainError, Trainer};
+use crate::base::error::{InputError, InputResult};
 use crate::base::machine::memory_available;
+use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
-use crate::dataset::loader::Dataset;
+use crate::dataset::loader::{Dataset, View};
 use crate::dataset::target_cache::TargetCache;
 use crate::scene::columns::row_width;
 use crate::scene::partition::first_fill;
@@ -118,7 +120,9 @@ pub fn estimate(
     let wider = row_width(last) as f64 / row_width(first) as f64;
     let of_rows = working as f64 * wider + (rendering - of_pixels) as f64;
     let decoders = rayon::current_num_threads();
-    let targets = config.image_cache.0.min(TargetCache::bytes_to_keep_all(&dataset.views, decoders));
+    // A view that a step waits for is decoded even where the cache is smaller.
+    let keep_all = TargetCache::bytes_to_keep_all(&dataset.views, decoders);
+    let targets = config.image_cache.0.min(keep_all).max(largest_decode(dataset).0);
     let pages = probe.pages as f64;
     // Pages that take part in a round of densification are copied.
     let copies = if config.strategy == "none" { 0.0 } else { pages.min(PAGES_PER_BATCH as f64) };
@@ -138,6 +142,31 @@ pub fn estimate(
             base,
         }
     }))
+}
+
+/// The most that decoding a photo with its mask takes, bytes, and the view whose it is.
+fn largest_decode(dataset: &Dataset) -> (u64, Option<&View>) {
+    let largest = dataset.views.iter().max_by_key(|view| view.photo.decode_bytes());
+    (largest.map_or(0, |view| view.photo.decode_bytes()), largest)
+}
+
+/// Refuses a photo that cannot be decoded within the memory of the run, before it is decoded. What a photo takes follows from
+/// its header ([`crate::dataset::photo_header`]).
+///
+/// # Errors
+/// The photo that takes most takes more than `host_mem`.
+pub(super) fn check_photos_fit(dataset: &Dataset, host_mem: Option<u64>) -> InputResult<()> {
+    let (bytes, Some(view)) = largest_decode(dataset) else { return Ok(()) };
+    let Some(budget) = host_mem.filter(|budget| bytes > *budget) else { return Ok(()) };
+    let header = &view.photo.header;
+    let problem = format!(
+        "decoding it takes up to {}, more than the memory that there is for everything ({})",
+        format_bytes(bytes),
+        format_bytes(budget)
+    );
+    let remedy = "raise --host-mem, or make the photos smaller and give their folder with --images";
+    let place = format!("view {}, {} x {} pixels", view.name, header.width, header.height);
+    Err(InputError::new(&view.photo.image_path, problem, remedy).at(place))
 }
 
 /// Memory of the pages of so many rows at a degree when all are in it; `has_grown` once pages were full and split.

@@ -261,7 +261,9 @@ impl PagedScene {
         page.dirty = true;
         for round in rounds {
             self.rows = self.rows.saturating_add_signed(round.rows_change);
-            self.rows_bound = (self.rows_bound - round.promised).saturating_add_signed(round.rows_change);
+            // Pages whose statistics are not those of the round take back more than was promised for them.
+            let promised = self.rows_bound.saturating_sub(round.promised).saturating_add_signed(round.rows_change);
+            self.rows_bound = promised.max(self.rows);
         }
         Ok(())
     }
@@ -298,20 +300,24 @@ impl PagedScene {
 
     /// Brings every page to `now`, the number of steps done, by the rules that it was trained by, and goes on by those of
     /// `options`: rows take the steps that they missed at the old rates, and bounds are renewed. Reads and rewrites every
-    /// page, once.
+    /// page, once, and counts the histogram anew on the way; says whether it was another than the one that came with the
+    /// pages, as it is after a salvage that had to leave statistics out.
     ///
     /// # Errors
     /// Pages could not be had.
-    pub(super) fn change_rules(&mut self, options: &RunOptions, now: u32) -> Result<(), TrainError> {
+    pub(super) fn change_rules(&mut self, options: &RunOptions, now: u32) -> Result<bool, TrainError> {
         let mut rules = PageRules::new(options);
         rules.events = self.rules.events.clone();
         rules.sh_degree = self.rules.sh_degree;
         let batch = (self.pager.stats().frames_max / 2).clamp(1, PAGES_PER_BATCH);
         let pages: Vec<PageNo> = (0..self.pager.index().len() as u32).map(PageNo).collect();
+        let mut histogram = GradHistogram::default();
         for pages in pages.chunks(batch) {
             let mut pinned = self.pager.acquire_pages(pages)?;
             let applied = self.apply_pending(&mut pinned);
             if applied.is_ok() {
+                // Parts of pages that split are pinned too, so that every row is counted.
+                pinned.iter().for_each(|page| histogram.add_rows(&page.rows(0)));
                 let at = self.rules.adam.at(now);
                 pinned.par_iter_mut().for_each(|page| {
                     let mut rows = page.rows_mut(0);
@@ -324,7 +330,9 @@ impl PagedScene {
             applied?;
         }
         self.rules = rules;
-        Ok(())
+        let is_other = histogram != self.histogram;
+        self.histogram = histogram;
+        Ok(is_other)
     }
 
     /// Collects into `working` the rows that `camera` may draw after `now` steps, as though their pages had been touched

@@ -302,7 +302,9 @@ fn changed_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result
         .ok_or_else(|| CommitError::Contradiction("no instruction path of this machine is known".to_string()))?;
     let old = of_state(&RunOptions::new(&then, state.dataset.scene_scale), state);
     let mut pages = restore_pages(pager, &old, state)?;
-    pages.change_rules(options, state.step)?;
+    if pages.change_rules(options, state.step)? {
+        eprintln!("warning: the statistics of the rows were not those that the run had counted, and are counted anew");
+    }
     Ok(pages)
 }
 

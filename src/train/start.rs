@@ -8,6 +8,7 @@
 use super::dataset_print::{GaussiansPrint, points_print};
 use super::eval::ply_warnings;
 use super::gaussian_pages::{GaussianFile, GaussianSpace, GaussianWriter};
+use super::memory::check_photos_fit;
 use super::pages::{PagedScene, first_pages};
 use super::run::{Prepared, check_first_rows, check_train_views, prepare};
 use super::stores::StoredStart;
@@ -63,7 +64,7 @@ impl Start {
     /// As [`prepare`].
     pub fn read(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
         if config.spill_dir.is_empty() && !Path::new(&config.init_ply).is_dir() {
-            return Start::in_memory(scene, config, host_mem);
+            return Start::in_memory(scene, config, host_mem)?.with_photos_that_fit(host_mem);
         }
         Start::look(scene, config, &folder_beside(Path::new(&config.spill_dir)), host_mem)
     }
@@ -75,12 +76,19 @@ impl Start {
     /// As [`prepare`].
     pub fn look(scene: &Path, config: &TrainConfig, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
         if Path::new(&config.init_ply).is_dir() {
-            return Start::of_store(scene, config, host_mem);
+            return Start::of_store(scene, config, host_mem)?.with_photos_that_fit(host_mem);
         }
-        match Start::stream(scene, config, &budget(folder, host_mem))? {
-            Some(start) => Ok(start),
-            None => Start::in_memory(scene, config, host_mem),
-        }
+        let start = match Start::stream(scene, config, &budget(folder, host_mem))? {
+            Some(start) => start,
+            None => Start::in_memory(scene, config, host_mem)?,
+        };
+        start.with_photos_that_fit(host_mem)
+    }
+
+    /// Refused where a photo cannot be decoded in `host_mem`.
+    fn with_photos_that_fit(self, host_mem: Option<u64>) -> InputResult<Start> {
+        check_photos_fit(&self.dataset, host_mem)?;
+        Ok(self)
     }
 
     fn in_memory(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {

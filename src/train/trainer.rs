@@ -16,7 +16,7 @@ use super::progress::Progress;
 use super::report::{MetricsLog, StepLine, TestMetrics, TierTraffic, json_psnr};
 use super::signals::StopFlag;
 use super::step::{StepOutcome, WorkingSet, train_step};
-use crate::base::error::InputError;
+use crate::base::error::{InputError, InputResult};
 use crate::checkpoint::run_state::LastTest;
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
@@ -374,6 +374,7 @@ impl Trainer {
             let step = self.step;
             let before = self.renderer.traffic();
             let Some(outcome) = self.step_with_space(dataset, targets, outputs)? else { break };
+            self.check_statistics(outputs)?;
             let traffic = self.renderer.traffic();
             let is_last = self.step == self.options.steps;
             let due = |every: u32| step > 0 && step.is_multiple_of(every);
@@ -440,6 +441,19 @@ impl Trainer {
                 return Ok(None);
             }
         }
+    }
+
+    /// Stops where rows have statistics that the run never counted: growth would go by numbers that are not so.
+    fn check_statistics(&self, outputs: &LoopOutputs<'_>) -> InputResult<()> {
+        let rows = self.scene.histogram.uncounted();
+        if rows == 0 {
+            return Ok(());
+        }
+        let store = outputs.checkpoint.as_deref().map_or(outputs.out, Checkpoint::folder);
+        let problem = format!("the pages have statistics of {rows} rows that the state of the run has not counted");
+        let remedy = "nothing was committed since: make a store that agrees with itself with gsscale-ckpt salvage, and go on \
+                      with gsscale-train --resume and --spill-dir";
+        Err(InputError::new(store, problem, remedy).at(format!("step {}", self.step)))
     }
 
     /// Space after `error`, by the checkpoint where there is one.

@@ -52,6 +52,12 @@ const BUSY: &[&str] = &[
 /// A run whose scene is its rows alone.
 pub const EVENTLESS: &[&str] = &["--strategy", "none", "--sh-every", "0"];
 
+/// What every run is told; a key of `more` takes the place of the usual one.
+pub fn with<'a>(more: &[&'a str]) -> Vec<&'a str> {
+    let pairs = BUSY.chunks(2).filter(|pair| !more.contains(&pair[0]));
+    pairs.flatten().chain(more).copied().collect()
+}
+
 /// A scene, and one run of it at a time.
 pub struct Bench {
     folder: TempDir,
@@ -95,9 +101,7 @@ impl Bench {
     pub fn running(&self, more: &[&str]) -> (PathBuf, Child) {
         let (out, spill) = (self.path("out"), self.spill());
         let mut args = vec![text(&self.scene), "--out", text(&out), "--spill-dir", text(&spill)];
-        // A key that is given anew takes the place of the usual one.
-        let pairs = BUSY.chunks(2).filter(|pair| !more.contains(&pair[0]));
-        args.extend(pairs.flatten().chain(more));
+        args.extend(with(more));
         let mut child = spawn(&args);
         self.wait_for_lines(&mut child, 20);
         (out, child)

@@ -193,3 +193,16 @@ tests!(
     torch,
     photo,
 );
+
+/// What [`gsscale::dataset::photo_header`] announces, held against what decoding holds, for every kind of pixels.
+#[test]
+fn photos_are_decoded_within_what_their_headers_announce() {
+    let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
+    for (name, bytes) in targets::pictures() {
+        for (what, peak, announced) in targets::decoded(&bytes) {
+            // Windows of the decompressor and rows: less than half a byte for each of 3 million pixels, so that a byte too
+            // few is found out.
+            assert!(peak <= announced + (1 << 20), "{name} as {what}: {peak} bytes were held, {announced} announced");
+        }
+    }
+}

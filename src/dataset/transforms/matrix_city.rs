@@ -66,8 +66,7 @@ pub fn read_matrix_city(folder: &Path, options: &ReadOptions) -> InputResult<Raw
     reading.root = Some(folder.to_path_buf());
     let mut scene = RawScene::default();
     for (file, split) in &files {
-        let top = json::load(file)?;
-        reading.add_file(file, &top, Some(*split), &mut scene)?;
+        reading.add_file(file, &json::load(file)?, Some(*split), &mut scene)?;
     }
     reading.report(&files[0].0, &mut scene.warnings)?;
     scene.views = reading.views;

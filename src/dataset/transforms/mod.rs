@@ -12,6 +12,9 @@
 //!
 //! Poses are taken as they stand: `applied_transform` and `applied_scale` tell how they came about, and
 //! `ply_file_path` is in the same frame.
+//!
+//! Memory: at most 16 times the size of the files (measured: up to 11), the names of their folders apart, whatever stands in
+//! them. Frames are read one at a time, and the first one that lacks what it needs is refused (`json`).
 
 mod intrinsics;
 mod json;
@@ -25,14 +28,11 @@ use crate::dataset::model::{PointCloud, RawScene, RawView, Split};
 use crate::dataset::paths::{clean_name, safe_join};
 use crate::dataset::read::ReadOptions;
 use intrinsics::Levels;
-use json::{FIX_KEY, Node};
+use json::{FIX_KEY, JsonFile, LISTS, Names, Node, STAY_INSIDE};
 pub use matrix_city::{looks_like_matrix_city, read_matrix_city};
-use serde_json::{Map, Value};
-use std::collections::BTreeMap;
+use serde_json::Value;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-
-const STAY_INSIDE: &str = "paths must be relative to the JSON and stay in its folder: move the JSON to a folder above the \
-                           files that it names and write the paths from there";
 
 /// Whether [`read_transforms`] finds something in this folder.
 pub fn looks_like_transforms(folder: &Path) -> bool {
@@ -50,8 +50,7 @@ pub fn read_transforms(path: &Path, options: &ReadOptions) -> InputResult<RawSce
     let mut scene = RawScene { points: PointCloud::default(), ..RawScene::default() };
     let files = choose_files(path, &mut scene.warnings)?;
     for (file, split) in &files {
-        let top = json::load(file)?;
-        reading.add_file(file, &top, *split, &mut scene)?;
+        reading.add_file(file, &json::load(file)?, *split, &mut scene)?;
     }
     let file = &files[0].0;
     reading.report(file, &mut scene.warnings)?;
@@ -113,25 +112,21 @@ impl<'a> Reading<'a> {
         let (views, bad_poses, missing, unlisted) = Default::default();
         Reading { options, views, bad_poses, missing, unlisted, root: None }
     }
+
     fn add_file(
         &mut self,
         file: &Path,
-        map: &Map<String, Value>,
+        json: &JsonFile,
         split: Option<Split>,
         scene: &mut RawScene,
     ) -> InputResult<()> {
-        let top = Node { file, map, frame: None };
+        let top = json.top();
         let folder = file.parent().unwrap_or(Path::new(""));
-        let frames = top.array("frames")?.ok_or_else(|| top.error("frames", "the key is missing", FIX_KEY))?;
-        if frames.is_empty() && split != Some(Split::Test) {
+        if json.frame_count()? == 0 && split != Some(Split::Test) {
             return Err(top.error("frames", "no frames", "write the file again with its frames"));
         }
-        let prescribed = prescribed_splits(&top)?;
-        for (i, frame) in frames.iter().enumerate() {
-            let map = frame.as_object().ok_or_else(|| top.error(&format!("frames[{i}]"), "not an object", FIX_KEY))?;
-            let levels = Levels { frame: Node { file, map, frame: Some(i) }, top };
-            self.add_frame(folder, &levels, split, prescribed.as_ref())?;
-        }
+        let prescribed = Prescribed::of(json)?;
+        json.for_each_frame(&mut |frame| self.add_frame(folder, &Levels { frame, top }, split, prescribed.as_ref()))?;
         if scene.points_path.is_none() {
             scene.points_path = points_path(&top, folder, &mut scene.warnings)?;
         }
@@ -143,19 +138,19 @@ impl<'a> Reading<'a> {
         folder: &Path,
         levels: &Levels<'_>,
         split: Option<Split>,
-        prescribed: Option<&BTreeMap<String, Split>>,
+        prescribed: Option<&Prescribed<'_>>,
     ) -> InputResult<()> {
         let frame = &levels.frame;
         let (key, stated) = stated_path(frame)?;
         let refused = |problem: String| frame.error(key, problem, STAY_INSIDE);
         let split = match prescribed {
             None => split,
-            Some(splits) => match splits.get(&clean_name(&stated).map_err(refused)?) {
+            Some(lists) => match lists.split_of(&clean_name(&stated).map_err(refused)?) {
                 None => {
                     self.unlisted.push(stated.into_owned());
                     return Ok(());
                 }
-                found => found.copied(),
+                found => found,
             },
         };
         let images = self.options.images.as_deref();
@@ -240,25 +235,37 @@ fn stated_path<'a>(frame: &Node<'a>) -> InputResult<(&'static str, std::borrow::
     Err(frame.error("file_path", "the key is missing", FIX_KEY))
 }
 
-/// nerfstudio's lists of file names, if the file has them: the split of each name that is used.
-fn prescribed_splits(top: &Node<'_>) -> InputResult<Option<BTreeMap<String, Split>>> {
-    let [train, val, test] = [top.array("train_filenames")?, top.array("val_filenames")?, top.array("test_filenames")?];
-    if train.is_none() {
-        return Ok(None);
-    }
-    let mut splits = BTreeMap::new();
-    let held_out = if test.is_some() { ("test_filenames", test) } else { ("val_filenames", val) };
-    for ((key, names), split) in [(held_out, Split::Test), (("train_filenames", train), Split::Train)] {
-        for name in names.into_iter().flatten() {
-            let name = name.as_str().ok_or_else(|| top.error(key, "not a list of strings", FIX_KEY))?;
-            let name = clean_name(name).map_err(|p| top.error(key, p, STAY_INSIDE))?;
-            if splits.insert(name.clone(), split).is_some_and(|before| before != split) {
-                let problem = format!("'{name}' is in the train and in the held-out list");
-                return Err(top.error(key, problem, "a photo belongs to one of them"));
-            }
+/// nerfstudio's lists of file names, as far as they are used.
+struct Prescribed<'j> {
+    train: &'j BTreeSet<String>,
+    held_out: Option<&'j BTreeSet<String>>,
+}
+
+impl<'j> Prescribed<'j> {
+    /// The lists of a file, if it has them: of the held-out ones `test_filenames` where it is there.
+    fn of(json: &'j JsonFile) -> InputResult<Option<Prescribed<'j>>> {
+        let names = |list: usize| match json.names(list) {
+            Names::Absent => Ok(None),
+            Names::Listed(names) => Ok(Some(names)),
+            Names::Bad(problem, remedy) => Err(json.top().error(LISTS[list], problem, remedy)),
+        };
+        let Some(train) = names(0)? else { return Ok(None) };
+        let held_out = match names(2)? {
+            Some(test) => Some(test),
+            None => names(1)?,
+        };
+        if let Some(name) = held_out.and_then(|names| train.intersection(names).next()) {
+            let problem = format!("'{name}' is in the train and in the held-out list");
+            return Err(json.top().error(LISTS[0], problem, "a photo belongs to one of them"));
         }
+        Ok(Some(Prescribed { train, held_out }))
     }
-    Ok(Some(splits))
+
+    fn split_of(&self, name: &str) -> Option<Split> {
+        let is_held_out = self.held_out.is_some_and(|names| names.contains(name));
+        let is_train = self.train.contains(name);
+        (is_held_out || is_train).then_some(if is_train { Split::Train } else { Split::Test })
+    }
 }
 
 /// The PLY that the file names, if it exists.

@@ -1,8 +1,8 @@
 //! From a frame's `file_path` to the photo's file.
 
-use crate::base::error::{InputError, InputResult};
+use crate::base::error::InputResult;
 use crate::dataset::paths::clean_name;
-use image::ImageReader;
+use crate::dataset::photo_header::read_header;
 use std::path::{Path, PathBuf};
 
 /// Endings tried after the name as it stands: Blender's exporter leaves `.png` out.
@@ -55,17 +55,11 @@ fn with_ending(path: &Path, ending: &str) -> PathBuf {
     PathBuf::from(path)
 }
 
-/// Width and height from the photo's header.
+/// Width and height from the photo's header; nothing is decoded.
 pub(super) fn read_size(path: &Path) -> InputResult<(u64, u64)> {
-    let reader = ImageReader::open(path)
-        .and_then(ImageReader::with_guessed_format)
-        .map_err(|e| InputError::io(path, "opening the photo", &e))?;
-    let (width, height) = reader.into_dimensions().map_err(|e| {
-        InputError::new(
-            path,
-            format!("the photo's size cannot be read: {e}"),
-            "copy the photo again; JPEG and PNG can be read",
-        )
+    let header = read_header(path).map_err(|mut error| {
+        error.problem.insert_str(0, "the photo's size cannot be read: ");
+        error
     })?;
-    Ok((u64::from(width), u64::from(height)))
+    Ok((u64::from(header.width), u64::from(header.height)))
 }

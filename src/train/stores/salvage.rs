@@ -6,9 +6,14 @@
 //! Where the map is lost, the newest whole version of every page is taken by number of write, whether it was committed or
 //! not; numbers of a process that ended before its first commit are used again, so it may be an earlier one. A page that
 //! was split counts as replaced by its parts. The trainer's state was in the map: what is left is a scene at the step of
-//! its newest row, to be exported or started from, with its moments, and without the events that were still pending.
+//! its newest row, to be exported, started from or gone on with, with its moments, and without the events that were still
+//! pending.
 //!
-//! Invariants: 1. the damaged store is not written; 2. everything that is missing is said.
+//! Invariants: 1. the damaged store is not written; 2. everything that is missing is said; 3. the histogram of a state that
+//! is written here counts exactly the statistics of the rows in the pages, those apart that belong to a round which their
+//! page has yet to apply. Where the map is lost, so are the events, and a page that had applied fewer of them than others
+//! has statistics of a round that will never be applied: they are cleared. Where no page at all had applied the last
+//! round, all pages keep theirs, and the next round looks further back.
 
 use super::copy::{layout_for, usual_codec};
 use super::{StorePlace, options_of, run_state_of};
@@ -17,6 +22,7 @@ use crate::base::ids::PageId;
 use crate::checkpoint::run_state::{DatasetPrint, RunIdentity, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
+use crate::densify::stats::GradHistogram;
 use crate::page::commit::CommitError;
 use crate::page::format::{SlotHeader, SlotRef};
 use crate::page::new_store::{NewStore, refuse_existing};
@@ -27,8 +33,10 @@ use crate::page::slots::SlotLayout;
 use crate::page::spill_format::SpillFormat;
 use crate::paging::label::{label, meta_from_label};
 use crate::paging::stored::{check_values, layout_of};
+use crate::scene::events::EventKind;
 use crate::scene::page_layout::{capacity_bytes, read_page, write_page};
 use crate::scene::page_meta::PageMeta;
+use crate::scene::state::SceneState;
 use crate::train::pages::PageRules;
 use crate::train::report::read_resolved;
 use crate::train::trainer::TrainError;
@@ -217,13 +225,21 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
         layout_for(source.layout, kept.len() as u64),
         usual_codec(kept.values().map(|k| &k.slot)),
     )?;
+    let mut histogram = GradHistogram::default();
     for (id, Kept { slot, label, is_older }) in &kept {
         let payload = reader.payload(*id, slot).map_err(|what| changed(&source.folder, *id, &what))?;
-        match meta_from_label(*id, label).filter(|_| *is_older) {
+        let meta = meta_from_label(*id, label);
+        match meta.filter(|_| *is_older) {
             Some(meta) => copy.put(*id, label, &without_statistics(&meta, payload))?,
-            None => copy.put(*id, label, payload)?,
+            None => {
+                if let Some(meta) = meta.filter(|meta| !misses_a_round(meta, &state)) {
+                    histogram.add_rows(&layout_of(&meta).rows(payload, 0));
+                }
+                copy.put(*id, label, payload)?;
+            }
         }
     }
+    state.histogram = histogram.filled();
     copy.skip_to(latest);
     commit(copy, &state, &source)?;
     if !lost.is_empty() {
@@ -233,17 +249,28 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
     Ok(Salvaged { to, has_state: true, step, gaussians: rows, pages, lost, notes: source.notes })
 }
 
-/// A page without the statistics of its rows. Those of an older version are not what the run has counted: its histogram
-/// holds the newer ones, and of rounds that only the newer version had gone through nothing is promised any more. Without
-/// statistics rows neither grow in such a round nor are taken out of the histogram.
+/// Whether the statistics of a page belong to a round that the page has yet to apply, so that the histogram of the next one
+/// does not count them.
+fn misses_a_round(meta: &PageMeta, state: &RunState) -> bool {
+    let missed = state.events.get(meta.events_applied as usize..).unwrap_or_default();
+    missed.iter().any(|event| matches!(event.kind, EventKind::Densify(_)))
+}
+
+/// A page without the statistics of its rows. The statistics of an older version are not those that the run has counted: the
+/// run's histogram holds the newer ones, and nothing is promised any more for rounds that only the newer version had gone
+/// through. Rows without statistics neither grow in such a round nor are taken out of the histogram.
 fn without_statistics(meta: &PageMeta, payload: &[u8]) -> Vec<u8> {
     let mut page = read_page(&layout_of(meta).rows(payload, 0));
-    page.grad2d.fill(0.0);
-    page.count.fill(0);
+    clear_statistics(&mut page);
     let mut words = vec![0u64; payload.len().div_ceil(8)];
     let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
     let written = write_page(&page, bytes).bytes();
     bytes[..written].to_vec()
+}
+
+fn clear_statistics(page: &mut SceneState) {
+    page.grad2d.fill(0.0);
+    page.count.fill(0);
 }
 
 fn commit(mut copy: NewStore, state: &RunState, source: &Source) -> Result<(), TrainError> {
@@ -290,23 +317,31 @@ fn without_state(place: &StorePlace, mut source: Source, request: &SalvageReques
         kept.iter().filter_map(|(id, h)| meta_from_label(*id, &h.label)).map(|m| m.sh_degree).max().unwrap_or(0);
     let (rows, step) = measure(&mut reader, &kept, &source)?;
     config.0.steps = config.0.steps.max(step);
-    let state = RunState { run, ..state_for(&config, rows, step, degree)? };
+    let mut state = RunState { run, ..state_for(&config, rows, step, degree)? };
     let (_, options) = options_of(&source.folder, &state)?;
     let layout = SlotLayout::new(capacity_bytes(options.page_rows, options.sh_degree), kept.len() as u64);
     let mut copy = NewStore::create(&request.to, layout, usual_codec(kept.values().map(|h| &h.slot)))?;
     let rules = PageRules::new(&options);
     let mut words = vec![0u64; capacity_bytes(options.page_rows, options.sh_degree).div_ceil(8)];
+    let metas = kept.iter().filter_map(|(id, header)| meta_from_label(*id, &header.label));
+    let applied = metas.map(|meta| meta.events_applied).max().unwrap_or(0);
+    let mut histogram = GradHistogram::default();
     for (id, header) in &kept {
         let payload = reader.payload(*id, &header.slot).map_err(|what| changed(&source.folder, *id, &what))?;
         let Some(meta) = meta_from_label(*id, &header.label) else { continue };
         let mut page = read_page(&layout_of(&meta).rows(payload, 0));
         page.raise_sh_degree(degree);
+        if meta.events_applied < applied {
+            clear_statistics(&mut page);
+        }
+        histogram.add_rows(&page.view());
         let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
         let written = write_page(&page, bytes).bytes();
         // Events are gone with the map: none is pending any more.
         let meta = PageMeta { events_applied: 0, ..rules.meta(*id, &page) };
         copy.put(*id, &label(&meta), &bytes[..written])?;
     }
+    state.histogram = histogram.filled();
     commit(copy, &state, &source)?;
     source.notes.push(format!(
         "the trainer's state is lost: export the scene (gsscale-ckpt export {} --out FILE.ply) and start from it with \

@@ -12,7 +12,7 @@ mod torch;
 pub use config::config;
 pub use map::{map_values, run_state};
 pub use pages::{page_payload, slot_header};
-pub use photos::photo;
+pub use photos::{decoded, photo, pictures};
 pub use ply::ply;
 pub use scenes::{colmap_binary, colmap_text, image_names, transforms};
 pub use store_dir::store_dir;

@@ -1,10 +1,12 @@
 //! JPEG and PNG: what their headers say, and decoding within what was announced.
 
 use crate::Target;
+use crate::allocation::peak_of;
 use crate::scene_folder::scratch;
+use gsscale::dataset::masks::MaskSource;
 use gsscale::dataset::model::{Intrinsics, Lens};
 use gsscale::dataset::photo::{PhotoSource, decode};
-use gsscale::dataset::photo_header::read_header;
+use gsscale::dataset::photo_header::{PhotoHeader, read_header};
 use image::{ExtendedColorType, ImageEncoder, ImageFormat};
 use std::io::Cursor;
 
@@ -53,4 +55,62 @@ fn run(input: &[u8]) {
     if let Ok(target) = decode(&source) {
         assert_eq!(target.rgb.len(), 3 * target.width as usize * target.height as usize);
     }
+}
+
+/// A file of every kind of pixels that decoders make, 2000 x 1500.
+pub fn pictures() -> Vec<(String, Vec<u8>)> {
+    let rgb = image::RgbImage::from_fn(2000, 1500, |x, y| image::Rgb([x as u8, y as u8, (x / 100 * y) as u8]));
+    let rgb = image::DynamicImage::from(rgb);
+    let mut files = vec![
+        ("a gray JPEG".to_string(), encoded(&rgb.to_luma8().into(), ImageFormat::Jpeg)),
+        ("a colour JPEG".to_string(), encoded(&rgb, ImageFormat::Jpeg)),
+    ];
+    let pngs: [(&str, image::DynamicImage, &[u8]); 8] = [
+        ("gray", rgb.to_luma8().into(), &[0; 2]),
+        ("gray with alpha", rgb.to_luma_alpha8().into(), &[]),
+        ("colour", rgb.to_rgb8().into(), &[0; 6]),
+        ("colour with alpha", rgb.to_rgba8().into(), &[]),
+        ("16-bit gray", rgb.to_luma16().into(), &[0; 2]),
+        ("16-bit gray with alpha", rgb.to_luma_alpha16().into(), &[]),
+        ("16-bit colour", rgb.to_rgb16().into(), &[0; 6]),
+        ("16-bit colour with alpha", rgb.to_rgba16().into(), &[]),
+    ];
+    for (name, picture, transparent) in pngs {
+        let bytes = encoded(&picture, ImageFormat::Png);
+        if !transparent.is_empty() {
+            files.push((format!("a {name} PNG with a transparent colour"), with_transparency(&bytes, transparent)));
+        }
+        files.push((format!("a {name} PNG"), bytes));
+    }
+    files
+}
+
+/// A PNG with a tRNS chunk before its pixels.
+fn with_transparency(png: &[u8], colour: &[u8]) -> Vec<u8> {
+    let mut crc = flate2::Crc::new();
+    crc.update(b"tRNS");
+    crc.update(colour);
+    let length = (colour.len() as u32).to_be_bytes();
+    [&png[..33], &length, b"tRNS", colour, &crc.sum().to_be_bytes(), &png[33..]].concat()
+}
+
+/// Decodes a file as a photo and as the mask of a small photo: the most bytes held, and those announced.
+pub fn decoded(bytes: &[u8]) -> [(&'static str, u64, u64); 2] {
+    let folder = scratch();
+    let (path, small) = (folder.path().join("a"), folder.path().join("b"));
+    std::fs::write(&path, bytes).unwrap();
+    std::fs::write(&small, encoded(&image::DynamicImage::new_rgb8(16, 12), ImageFormat::Png)).unwrap();
+    let (header, of_small) = (read_header(&path).unwrap(), read_header(&small).unwrap());
+    let source = |image_path, header: PhotoHeader, mask| {
+        let (width, height) = (header.width, header.height);
+        let intrinsics = Intrinsics { width, height, fx: 50.0, fy: 50.0, cx: 1.0, cy: 1.0, lens: Lens::Pinhole };
+        PhotoSource { image_path, header, intrinsics, target: (16, 12), mask }
+    };
+    let mask = Some(MaskSource { path: path.clone(), header, invert: false });
+    [("a photo", source(path.clone(), header, None)), ("a mask", source(small, of_small, mask))].map(
+        |(what, source)| {
+            let peak = peak_of(|| assert!(decode(&source).is_ok()));
+            (what, peak, source.decode_bytes())
+        },
+    )
 }

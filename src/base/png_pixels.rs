@@ -1,0 +1,166 @@
+//! The part of a PNG that its pixels come from, as a stream for a decoder.
+//!
+//! A decoder keeps every chunk of text and every EXIF block, and inflates a colour profile into memory as large as the file
+//! says: 3 MB of a file become 3 GB. None of that changes a pixel here, since profiles are not applied. So the decoder does
+//! not get to see it: [`PixelChunks`] passes on the critical chunks and the transparency, and skips the rest.
+//!
+//! Invariants: 1. nothing is allocated; 2. the bytes that are passed on are those of the file, in their order; 3. a file
+//! that is cut short ends early, for the decoder to notice.
+
+use std::io::{BufRead, Error, ErrorKind, Read, Result, Seek, SeekFrom};
+
+/// Bytes that a decoder may take beside the picture: two rows of the widest picture that is read (65,535 pixels of 8 bytes
+/// each), and chunks that are at most 768 bytes long.
+pub const PNG_BUFFERS: u64 = 2 << 20;
+
+/// Whether a chunk has a part in the pixels: critical chunks (upper case, PNG specification, section 5.4) and tRNS. A decoder
+/// refuses critical chunks that it does not know, and none of those that it knows is of any length.
+pub fn makes_pixels(kind: [u8; 4]) -> bool {
+    kind[0].is_ascii_uppercase() || &kind == b"tRNS"
+}
+
+/// A PNG without the chunks that make no pixels.
+#[derive(Debug)]
+pub struct PixelChunks<R> {
+    inner: R,
+    /// The signature or the head of a chunk, not yet passed on from `passed` on.
+    head: [u8; 8],
+    passed: usize,
+    filled: usize,
+    /// Bytes of the current chunk that follow, with its checksum.
+    left: u64,
+}
+
+impl<R: BufRead> PixelChunks<R> {
+    /// From the first byte of a file that is a PNG.
+    ///
+    /// # Errors
+    /// The file cannot be read.
+    pub fn new(mut inner: R) -> Result<PixelChunks<R>> {
+        let mut head = [0; 8];
+        let filled = read_up_to(&mut inner, &mut head)?;
+        Ok(PixelChunks { inner, head, passed: 0, filled, left: 0 })
+    }
+
+    /// Goes to the next byte that is passed on.
+    fn advance(&mut self) -> Result<()> {
+        while self.passed == self.filled && self.left == 0 {
+            (self.passed, self.filled) = (0, read_up_to(&mut self.inner, &mut self.head)?);
+            if self.filled < self.head.len() {
+                return Ok(());
+            }
+            let [a, b, c, d, kind @ ..] = self.head;
+            let length = u64::from(u32::from_be_bytes([a, b, c, d])) + 4;
+            if makes_pixels(kind) {
+                self.left = length;
+            } else {
+                self.passed = self.filled;
+                skip(&mut self.inner, length)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+fn read_up_to(from: &mut impl BufRead, into: &mut [u8; 8]) -> Result<usize> {
+    let mut filled = 0;
+    while filled < into.len() {
+        match from.read(&mut into[filled..]) {
+            Ok(0) => break,
+            Ok(read) => filled += read,
+            Err(e) if e.kind() == ErrorKind::Interrupted => {}
+            Err(e) => return Err(e),
+        }
+    }
+    Ok(filled)
+}
+
+fn skip(from: &mut impl BufRead, mut bytes: u64) -> Result<()> {
+    while bytes > 0 {
+        let here = from.fill_buf()?.len().min(usize::try_from(bytes).unwrap_or(usize::MAX));
+        if here == 0 {
+            return Ok(());
+        }
+        from.consume(here);
+        bytes -= here as u64;
+    }
+    Ok(())
+}
+
+impl<R: BufRead> BufRead for PixelChunks<R> {
+    fn fill_buf(&mut self) -> Result<&[u8]> {
+        self.advance()?;
+        if self.passed < self.filled {
+            return Ok(&self.head[self.passed..self.filled]);
+        }
+        if self.left == 0 {
+            return Ok(&[]);
+        }
+        let here = self.inner.fill_buf()?;
+        let passed = here.len().min(usize::try_from(self.left).unwrap_or(usize::MAX));
+        Ok(&here[..passed])
+    }
+
+    fn consume(&mut self, bytes: usize) {
+        if self.passed < self.filled {
+            self.passed += bytes;
+        } else {
+            self.inner.consume(bytes);
+            self.left -= bytes as u64;
+        }
+    }
+}
+
+impl<R: BufRead> Read for PixelChunks<R> {
+    fn read(&mut self, into: &mut [u8]) -> Result<usize> {
+        let here = self.fill_buf()?;
+        let bytes = here.len().min(into.len());
+        into[..bytes].copy_from_slice(&here[..bytes]);
+        self.consume(bytes);
+        Ok(bytes)
+    }
+}
+
+/// The decoder's type asks for it; decoding a picture from its beginning to its end does not seek.
+impl<R: BufRead> Seek for PixelChunks<R> {
+    fn seek(&mut self, _: SeekFrom) -> Result<u64> {
+        Err(Error::new(ErrorKind::Unsupported, "a PNG is read from its beginning to its end"))
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    const SIGNATURE: &[u8] = b"\x89PNG\r\n\x1a\n";
+
+    fn chunk(kind: &[u8; 4], data: &[u8]) -> Vec<u8> {
+        [&(data.len() as u32).to_be_bytes()[..], kind, data, b"csum"].concat()
+    }
+
+    fn passed(bytes: &[u8], buffer: usize) -> Vec<u8> {
+        let mut chunks = PixelChunks::new(std::io::BufReader::with_capacity(buffer, bytes)).unwrap();
+        let mut out = Vec::new();
+        chunks.read_to_end(&mut out).unwrap();
+        out
+    }
+
+    #[test]
+    fn chunks_of_pixels_pass_and_all_others_do_not() {
+        let kept = [chunk(b"IHDR", &[1; 13]), chunk(b"tRNS", &[2; 6]), chunk(b"IDAT", &[3; 500]), chunk(b"IEND", &[])];
+        let others =
+            [chunk(b"iCCP", &[7; 300]), chunk(b"eXIf", &[]), chunk(b"acTL", &[8; 8]), chunk(b"zTXt", &[9; 41])];
+        let file: Vec<u8> =
+            SIGNATURE.iter().copied().chain(kept.iter().zip(&others).flat_map(|(k, o)| [&k[..], o].concat())).collect();
+        let want = [SIGNATURE, &kept.concat()].concat();
+        // Whatever part of a chunk the buffer holds.
+        for buffer in [1, 7, 8, 64, 4096] {
+            assert_eq!(passed(&file, buffer), want, "{buffer}");
+        }
+        // A file that is cut short gives a beginning of the same bytes.
+        for cut in 0..file.len() {
+            assert!(want.starts_with(&passed(&file[..cut], 64)), "{cut}");
+        }
+    }
+}
