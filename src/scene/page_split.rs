@@ -40,6 +40,14 @@ pub fn split_page(
     Ok(parts.into_iter().map(|(id, rows)| (id, state.select(&rows))).collect())
 }
 
+/// Pages that [`split_page`] makes of so many rows.
+pub fn parts_of(rows: usize, page_rows: usize) -> usize {
+    if rows <= page_rows.max(1) {
+        return 1;
+    }
+    parts_of(rows / 2, page_rows) + parts_of(rows - rows / 2, page_rows)
+}
+
 fn cut(
     id: PageId,
     mut entries: Vec<PointRow>,
@@ -93,6 +101,7 @@ mod tests {
             seen.sort_unstable();
             assert_eq!(seen, (0..rows as u32).collect::<Vec<_>>());
             assert_eq!(parts.len() == 1, rows <= page_rows);
+            assert_eq!(parts.len(), parts_of(rows, page_rows), "{rows} rows in pages of {page_rows}");
         }
     }
 

@@ -1,14 +1,21 @@
 //! Keeps a run within its memory while its scene grows: what a view takes is taken from the frames, and a scene that was
-//! all in memory is so no more when it does not fit (see `outgrown`).
+//! all in memory moves out of it when it does not fit any more (see `outgrown`).
 //!
-//! Invariants: 1. frames are taken away before the step that needs their memory, by the most that its view may have grown
-//! since the last one; what was taken for growth that did not come is given back; 2. nobody stops for growth that may come:
-//! the view of a step has its frames as long as what is known to be needed leaves them; 3. no bit of the result depends
-//! on it.
+//! Invariants: 1. the number of frames follows from bytes alone: what the run holds beside its frames, and what is left;
+//! never from a number of pages that was guessed at the start. Frames take memory when pages fill them; 2. frames are taken
+//! away before the step that needs their memory, by the most that its view may have grown since the last one; what was
+//! taken for growth that did not come is given back; 3. no run stops for growth that may come: a step gets the frames that
+//! it needs as long as what the run holds now leaves memory for them. A run that was not told how much memory it may take
+//! goes beyond its first share for that, as far as the machine has memory available; 4. no bit of the result depends on
+//! any of this.
 
-use super::memory::{INDEX_BYTES, MemoryEstimate, frames_in_memory};
+use super::memory::{INDEX_BYTES, MemoryEstimate, bytes_of_copies, frames_in_memory, within_reach};
 use super::pages::PagedScene;
+use super::tiers::with_staging;
 use super::trainer::Trainer;
+use crate::base::units::format_bytes;
+use crate::page::format::HEADER_BYTES;
+use crate::paging::error::PagingError;
 use crate::scene::camera::Camera;
 use crate::scene::columns::row_width;
 
@@ -19,6 +26,33 @@ const UNEVEN: f64 = 2.0;
 const FRAMES_LEAST: usize = 2;
 /// Frames are given back when there are more than one in so many.
 const WORTH_GIVING: usize = 16;
+/// A step that needs frames gets one in so many on top, and a run that needs memory one byte in so many, so that the next
+/// steps of a growing scene need not ask again.
+const SPARE_SHARE: usize = 8;
+/// Vectors of a view that is a little larger than those before it grow by an eighth.
+const VIEW_SPARE: f64 = 1.125;
+
+/// Memory of a page in memory beside its rows, bytes: the header, and half of the last page of the system's that they
+/// begin. Nothing for pages of a thousand rows, a fifth for those of 32.
+const AROUND_ROWS: f64 = HEADER_BYTES as f64 + 2048.0;
+
+/// What one view takes, bytes.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ViewMemory {
+    /// The largest view so far, as wide as its rows are with the bands that are in use.
+    pub now: u64,
+    /// The same with the bands of the last step.
+    pub at_last: u64,
+}
+
+/// A view that needs more than there is.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ViewNeed {
+    /// Pages that it needs at once, with those into which its pages will split.
+    pub pages: usize,
+    /// Its rows, over those of the largest view so far; at least 1.
+    pub growth: f64,
+}
 
 /// The memory of a run whose frames follow from it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,14 +61,16 @@ pub struct HostBudget {
     bytes: u64,
     /// What does not grow with the scene, staging apart.
     constant: u64,
+    /// Whether rounds of densification copy pages.
+    copies_pages: bool,
     /// For pages that move.
     staging: u64,
     /// What of a view grows with its pixels alone.
     of_pixels: u64,
-    /// Frames that the run has a use for.
-    frames_most: usize,
-    /// The user named this memory, so that it counts more than going on.
-    pub(super) is_named: bool,
+    /// The user named this memory: the run never takes more.
+    is_named: bool,
+    /// It is more than the run set out with.
+    is_raised: bool,
     /// Commits that there were when pages could not be moved out for want of space.
     pub(super) tried_after: Option<u64>,
     /// Pages in flight ahead of their step, each way, once those of a run in memory move.
@@ -42,29 +78,29 @@ pub struct HostBudget {
 }
 
 impl HostBudget {
-    /// Of a run that may take `bytes` and is expected to take `memory`.
-    pub fn new(bytes: u64, memory: &MemoryEstimate) -> HostBudget {
-        let (constant, of_pixels) = (memory.base + memory.targets, memory.view_pixels);
+    /// Of a run that may take `bytes`, which the user named or not, and is expected to take `memory`.
+    pub fn new(bytes: u64, memory: &MemoryEstimate, is_named: bool) -> HostBudget {
         HostBudget {
             bytes,
-            constant,
-            of_pixels,
+            constant: memory.base + memory.targets,
+            copies_pages: memory.copies > 0,
             staging: memory.staging,
-            frames_most: usize::MAX,
-            is_named: false,
+            of_pixels: memory.view_pixels,
+            is_named,
+            is_raised: false,
             tried_after: None,
             prefetch_bytes: 0,
         }
     }
 
-    /// Of a run that has no use for more than so many frames.
-    pub fn with_frames(self, frames_most: usize) -> HostBudget {
-        HostBudget { frames_most, ..self }
+    /// Of a run that takes more from its start than it would by itself, which was said.
+    pub(super) fn raised_at_start(self) -> HostBudget {
+        HostBudget { is_raised: true, ..self }
     }
 
-    /// Of a run in memory: what moving its pages would take, if it comes to that, and whether the user named the memory.
-    pub fn in_memory(self, prefetch_bytes: usize, staging: u64, is_named: bool) -> HostBudget {
-        HostBudget { prefetch_bytes, staging, is_named, ..self }
+    /// Of a run in memory: what moving its pages would take, if it comes to that.
+    pub fn in_memory(self, prefetch_bytes: usize, staging: u64) -> HostBudget {
+        HostBudget { prefetch_bytes, staging, ..self }
     }
 
     /// The same, once pages could not be moved out for want of space, after so many commits.
@@ -78,34 +114,66 @@ impl HostBudget {
     }
 
     /// Frames for a step whose view needs `needed` pages: those that are left beside what the run holds now and what the view
-    /// may need more, since its rows may have become more after they were last counted; but no fewer than the view needs, with
-    /// some for pages that split, if what the run holds now leaves them. `view` is what the largest view took so far, bytes.
-    pub(super) fn frames(&self, scene: &PagedScene, view: u64, needed: usize) -> usize {
-        let left = |growth| {
-            let taken = self.taken(scene, view, growth) + self.staging;
-            (self.bytes.saturating_sub(taken) / scene.pager.frame_bytes() as u64) as usize
-        };
-        let enough = left(1.0).min(needed + needed / 4 + 1);
-        left(growth_due(scene)).max(enough).clamp(FRAMES_LEAST, self.frames_most.max(FRAMES_LEAST))
+    /// may need more, since its rows may have become more after they were last counted. If those are too few for the view, it
+    /// gets what it needs, with some for pages that split, from what would be left if nothing grew.
+    pub(super) fn frames(&self, scene: &PagedScene, view: ViewMemory, needed: usize) -> usize {
+        let with_splits = self.left(scene, view.at_last, 1.0).min(needed + needed / 4 + 1);
+        let bare = self.frames_at_most(scene, view).min(needed);
+        self.left(scene, view.at_last, growth_due(scene)).max(with_splits).max(bare).max(FRAMES_LEAST)
     }
 
-    /// Memory with which a view that needs `needed` pages would have its frames.
-    pub(super) fn least_for(&self, scene: &PagedScene, view: u64, needed: usize) -> u64 {
-        self.taken(scene, view, growth_due(scene)) + self.staging + (needed * scene.pager.frame_bytes()) as u64
+    /// Frames that what the run holds now leaves memory for.
+    pub(super) fn frames_at_most(&self, scene: &PagedScene, view: ViewMemory) -> usize {
+        self.left(scene, view.now, 1.0)
+    }
+
+    fn left(&self, scene: &PagedScene, view: u64, growth: f64) -> usize {
+        let taken = self.taken(scene, view, growth) + self.staging;
+        (self.bytes.saturating_sub(taken) / scene.pager.frame_bytes() as u64) as usize
+    }
+
+    /// Memory with which a run that goes on from here gets the frames that all of these views need: always more than this.
+    pub(super) fn least_for(&self, scene: &PagedScene, view: ViewMemory, needs: &[ViewNeed]) -> u64 {
+        let frame_bytes = scene.pager.frame_bytes() as u64;
+        let need = |need: &ViewNeed| {
+            let of_rows = view.at_last.saturating_sub(self.of_pixels) as f64 * need.growth * VIEW_SPARE;
+            let rest = self.taken(scene, self.of_pixels + of_rows as u64, 1.0) + need.pages as u64 * frame_bytes;
+            with_staging(rest, self.staging, self.bytes)
+        };
+        let least = needs.iter().map(need).max().unwrap_or(0);
+        // A fiftieth for what the run that goes on measures anew.
+        (least + least / 50).max(self.bytes + frame_bytes)
+    }
+
+    /// This budget with `bytes` bytes and some to spare, where nobody named it and the machine has them; `None` where not.
+    fn raised(&self, bytes: u64) -> Option<HostBudget> {
+        let most = if self.is_named { None } else { within_reach() }?;
+        let raised = (bytes + bytes / SPARE_SHARE as u64).min(most).max(self.bytes);
+        (bytes <= most).then_some(HostBudget { bytes: raised, is_raised: true, ..*self })
     }
 
     /// Whether all pages fit beside it, of a run that keeps them in memory.
     pub fn holds_all(&self, scene: &PagedScene, view: u64) -> bool {
-        let left = self.bytes.saturating_sub(self.taken(scene, view, growth_due(scene)));
-        let pages = |have_split| frames_in_memory(scene.rows_bound(), scene.rules.sh_degree(), have_split);
         // Pages are looked at only where it depends on them.
-        pages(true) <= left || (pages(false) <= left && !scene.pager.index().iter().any(|page| page.id.is_part()))
+        self.bytes_of_all(scene, view, true) <= self.bytes
+            || (self.bytes_of_all(scene, view, false) <= self.bytes
+                && !scene.pager.index().iter().any(|page| page.id.is_part()))
+    }
+
+    /// Memory of a run that keeps all pages in it, with those that split if they do.
+    fn bytes_of_all(&self, scene: &PagedScene, view: u64, have_split: bool) -> u64 {
+        let growth = growth_due(scene);
+        let rows = frames_in_memory(scene.rows_bound(), scene.rules.sh_degree(), have_split);
+        let around_rows = scene.pager.index().len() as f64 * growth * AROUND_ROWS;
+        self.taken(scene, view, growth) + rows + around_rows as u64
     }
 
     fn taken(&self, scene: &PagedScene, view: u64, growth: f64) -> u64 {
         let of_rows = view.saturating_sub(self.of_pixels) as f64 * growth;
-        let index = scene.pager.index().len() as f64 * growth * INDEX_BYTES as f64;
-        self.constant + self.of_pixels + (of_rows + index) as u64
+        let pages = scene.pager.index().len();
+        let index = pages as f64 * growth * INDEX_BYTES as f64;
+        let copies = if self.copies_pages { bytes_of_copies(pages, scene.pager.frame_bytes()) } else { 0 };
+        self.constant + copies + self.of_pixels + (of_rows + index) as u64
     }
 }
 
@@ -121,11 +189,13 @@ impl Trainer {
         self.budget = Some(budget);
     }
 
-    /// What the largest view took so far, as wide as its rows will be when all bands are in use.
-    pub(super) fn view_at_last(&self) -> u64 {
+    /// What the largest view took so far.
+    pub(super) fn view_memory(&self) -> ViewMemory {
         let [working, rendering] = self.view_bytes();
-        let [now, last] = [self.working.columns.sh_degree, self.sh_degrees().1].map(|degree| row_width(degree) as u64);
-        working / now * last + rendering
+        let width = row_width(self.working.columns.sh_degree) as u64;
+        let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degrees().1]
+            .map(|degree| working / width * row_width(degree) as u64 + rendering);
+        ViewMemory { now, at_last }
     }
 
     /// Takes away the frames that the scene, as it has grown, leaves no memory for, and gives back what was taken for growth
@@ -133,7 +203,10 @@ impl Trainer {
     pub(super) fn fit_frames(&mut self, camera: &Camera) {
         let Some(budget) = self.budget.filter(|_| !self.is_in_memory()) else { return };
         let needed = self.scene.pager.pages_of_view(camera).len();
-        let frames = budget.frames(&self.scene, self.view_at_last(), needed);
+        let mut frames = budget.frames(&self.scene, self.view_memory(), needed);
+        if frames < needed && self.raise_for_frames(budget, needed) {
+            frames = needed;
+        }
         let pager = &mut self.scene.pager;
         let now = pager.stats().frames_max;
         if frames > now + now / WORTH_GIVING || (frames > now && needed >= now) {
@@ -141,6 +214,47 @@ impl Trainer {
         } else {
             pager.limit_frames(frames);
         }
+    }
+
+    /// Gives a step the frames that `error` says it lacked, if memory is left for them; then the step can be tried again.
+    /// Each time there are more frames than before.
+    pub(super) fn find_frames(&mut self, error: &PagingError) -> bool {
+        let PagingError::WorkingSet { pages: needed, frames: now, .. } = *error else { return false };
+        let Some(budget) = self.budget.filter(|_| !self.is_in_memory() && needed > now) else { return false };
+        let most = budget.frames_at_most(&self.scene, self.view_memory());
+        if most < needed && !self.raise_for_frames(budget, needed) {
+            return false;
+        }
+        let wanted = needed + needed / SPARE_SHARE;
+        self.scene.pager.allow_frames(wanted.min(most).max(needed));
+        true
+    }
+
+    /// Takes more memory for a step that needs so many frames, if nobody named the run's memory and the machine has it.
+    fn raise_for_frames(&mut self, budget: HostBudget, needed: usize) -> bool {
+        let frames = (needed * self.scene.pager.frame_bytes()) as u64;
+        let bytes = budget.taken(&self.scene, self.view_memory().now, 1.0) + budget.staging + frames;
+        self.raise_budget(budget, bytes)
+    }
+
+    /// Takes more memory to go on with all pages in it, if nobody named the run's memory and the machine has it.
+    pub(super) fn raise_for_all(&mut self, budget: HostBudget) -> bool {
+        let bytes = budget.bytes_of_all(&self.scene, self.view_memory().at_last, true);
+        self.raise_budget(budget, bytes)
+    }
+
+    fn raise_budget(&mut self, budget: HostBudget, bytes: u64) -> bool {
+        let Some(raised) = budget.raised(bytes) else { return false };
+        if !budget.is_raised {
+            eprintln!(
+                "warning: from step {} on the scene needs more than {}, the share of the free memory that a run takes by itself: \
+                 it takes more as long as the machine has it; --host-mem sets a limit",
+                self.step,
+                format_bytes(budget.bytes)
+            );
+        }
+        self.budget = Some(raised);
+        true
     }
 
     /// Whether no page ever leaves memory.

@@ -27,6 +27,9 @@ const BASE_BYTES: u64 = 12 << 20;
 
 /// Share of the memory that is available which a run takes when it is not told how much, percent.
 const BUDGET_PERCENT: u64 = 70;
+/// Share of the available memory that a run without a named budget may take beyond its first share, percent: what a run
+/// holds is known to a tenth.
+const REACH_PERCENT: u64 = 90;
 
 /// What a run is expected to hold in memory at its peak, by part, bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -43,14 +46,16 @@ pub struct MemoryEstimate {
     pub targets: u64,
     /// The index of the pages, in memory or not.
     pub index: u64,
-    /// Everything else, with the optimizer's tables and copies of pages that change.
+    /// Copies of pages that take part in a round of densification.
+    pub copies: u64,
+    /// Everything else, with the optimizer's tables.
     pub base: u64,
 }
 
 impl MemoryEstimate {
     /// All parts but the frames.
     pub fn fixed(&self) -> u64 {
-        self.base + self.view + self.staging + self.targets + self.index
+        self.base + self.copies + self.view + self.staging + self.targets + self.index
     }
 
     /// All parts.
@@ -66,6 +71,14 @@ pub fn host_budget(config: &TrainConfig) -> Option<u64> {
         0 => memory_available().map(|bytes| bytes / 100 * BUDGET_PERCENT),
         bytes => Some(bytes),
     }
+}
+
+/// Bytes that this process could come to hold on this machine: what it holds, and most of what it could still get; `None`
+/// where the system does not tell. For runs that were not told how much they may take and need more than they set out with.
+pub fn within_reach() -> Option<u64> {
+    // Not what it holds of files: that memory can go, and counts as available already.
+    let held = status_field("RssAnon:").or_else(host_bytes_now)?;
+    Some(held + memory_available()? / 100 * REACH_PERCENT)
 }
 
 /// Rows that a run may come to, as far as it is known: those there are, or the cap.
@@ -124,10 +137,9 @@ pub fn estimate(
     let keep_all = TargetCache::bytes_to_keep_all(&dataset.views, decoders);
     let targets = config.image_cache.0.min(keep_all).max(largest_decode(dataset).0);
     let pages = probe.pages as f64;
-    // Pages that take part in a round of densification are copied.
-    let copies = if config.strategy == "none" { 0.0 } else { pages.min(PAGES_PER_BATCH as f64) };
-    let copies = copies as u64 * trainer.scene.pager.frame_bytes() as u64;
-    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver + copies;
+    let is_growing = config.strategy != "none";
+    let copies = if is_growing { bytes_of_copies(probe.pages, trainer.scene.pager.frame_bytes()) } else { 0 };
+    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver;
     Ok([rows, rows_at_most(config, rows)].map(|rows_then| {
         let growth = rows_then as f64 / rows.max(1) as f64;
         let page_rows = config.page_rows as usize;
@@ -139,6 +151,7 @@ pub fn estimate(
             view_pixels: of_pixels,
             targets,
             index: (pages * growth) as u64 * INDEX_BYTES,
+            copies,
             base,
         }
     }))
@@ -167,6 +180,11 @@ pub(super) fn check_photos_fit(dataset: &Dataset, host_mem: Option<u64>) -> Inpu
     let remedy = "raise --host-mem, or make the photos smaller and give their folder with --images";
     let place = format!("view {}, {} x {} pixels", view.name, header.width, header.height);
     Err(InputError::new(&view.photo.image_path, problem, remedy).at(place))
+}
+
+/// Memory of the copies that a round of densification makes of the pages of a scene, a batch at a time.
+pub(super) fn bytes_of_copies(pages: usize, frame_bytes: usize) -> u64 {
+    (pages.min(PAGES_PER_BATCH) * frame_bytes) as u64
 }
 
 /// Memory of the pages of so many rows at a degree when all are in it; `has_grown` once pages were full and split.

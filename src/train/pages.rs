@@ -82,6 +82,11 @@ impl PageRules {
         self.sh_degree
     }
 
+    /// Rows that a page holds at most.
+    pub(super) fn page_rows(&self) -> usize {
+        self.page_rows
+    }
+
     /// Bounds of rows that were changed, for the index.
     pub(super) fn bounds(&self, rows: &Rows<'_>) -> PageBounds {
         self.adam.page_bounds(rows, &self.splits)

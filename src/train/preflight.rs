@@ -4,9 +4,9 @@
 //! because the scene grows, is a warning.
 
 use super::budget::HostBudget;
-use super::memory::{MemoryEstimate, Probe, estimate, rows_at_most};
+use super::memory::{MemoryEstimate, Probe, estimate, rows_at_most, within_reach};
 use super::start::{Start, drive_of};
-use super::tiers::{PLAN_BYTES, Tiers, budget_in_memory, first_staging_bytes, staging_bytes};
+use super::tiers::{PLAN_BYTES, Tiers, budget_in_memory, first_staging_bytes, staging_bytes, with_staging};
 use super::trainer::{TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
@@ -42,12 +42,12 @@ const SLOTS_IN_FLIGHT: u64 = 64;
 pub struct TierPlan {
     /// Pages now, and as far as is known at most.
     pub pages: [u64; 2],
-    /// More frames than these would stay empty; the most there is, where nothing caps the growth of the scene.
-    frames_of_use: u64,
     /// Bytes of a frame and of a slot on the drive.
     pub frame_bytes: u64,
-    /// Frames; `None` for as many as there are pages.
+    /// Frames, which may be more than there are pages; `None` for a run in memory, which has one for every page.
     pub frames: Option<u64>,
+    /// The user named their number.
+    frames_are_named: bool,
     /// The view that needs most pages.
     pub(super) largest_view: LargestView,
     /// Bytes that the run is expected to write to the drive, commits apart.
@@ -78,38 +78,35 @@ pub fn settle(
     let largest_view = largest_view(dataset, trainer.scene.pager.index());
     let mut plan = TierPlan {
         pages: [index, pages_max],
-        frames_of_use: if config.strategy != "none" && config.max_gaussians == 0 {
-            PAGES_MOST
-        } else {
-            pages_max.max(1)
-        },
         frame_bytes,
         frames: None,
+        frames_are_named: config.frames > 0,
         bytes_written: 0.0,
         free_bytes: tiers.free_bytes()?,
         largest_view,
     };
     if trainer.scene.pager.stats().frames_max == usize::MAX {
+        let asked = host_mem;
+        let host_mem = enough_memory(config, asked, memory[0].total());
         if trainer.scene.pager.slot_space().is_none() {
             // A run that goes on has a drive already, to which its pages move if they do not fit.
             check_in_memory(memory, host_mem)?;
         }
         if let Some(budget) = host_mem {
-            trainer.set_budget(budget_in_memory(config, budget, &memory[0]));
+            let first = budget_in_memory(config, budget, &memory[0]);
+            trainer.set_budget(if host_mem == asked { first } else { first.raised_at_start() });
         }
         return Ok(plan);
     }
     let staging = staging_bytes(trainer.scene.pager.prefetch_bytes(), &tiers.codec);
     memory.iter_mut().for_each(|m| m.staging = staging);
-    let frames = match config.frames {
-        // By what is known for certain: the cap may never be reached. What grows takes from the frames in its time.
-        0 => frames_of_budget(&plan, host_mem, &memory[0])?,
-        frames => u64::from(frames),
-    };
-    check_view(&plan, frames)?;
+    let asked = host_mem;
+    let (frames, host_mem) = first_frames(config, &plan, asked, &memory[0])?;
     trainer.scene.pager.allow_frames(frames as usize);
+    trainer.scene.pager.limit_frames(frames as usize);
     if let Some(budget) = host_mem.filter(|_| config.frames == 0) {
-        trainer.set_budget(HostBudget::new(budget, &memory[0]).with_frames(frames as usize));
+        let first = HostBudget::new(budget, &memory[0], config.host_mem.0 > 0);
+        trainer.set_budget(if host_mem == asked { first } else { first.raised_at_start() });
     }
     plan.frames = Some(frames);
     memory.iter_mut().for_each(|m| m.frames = m.frames.min(frames * frame_bytes));
@@ -167,7 +164,9 @@ pub fn hold_a_view(
         return Ok(number);
     }
     let bytes = needed * trainer.scene.pager.frame_bytes() as u64;
-    if let Some(budget) = host_mem.filter(|budget| bytes > *budget) {
+    // What nobody named may become more once it is known what a view takes.
+    let most = if config.host_mem.0 == 0 { host_mem.and(within_reach()).max(host_mem) } else { host_mem };
+    if let Some(budget) = most.filter(|budget| bytes > *budget) {
         let problem = format!(
             "{} are too little: the view {view} needs {needed} pages of {} at once, which is {}",
             format_bytes(budget),
@@ -217,12 +216,12 @@ pub(super) fn frames_within(
     host_mem: u64,
 ) -> Result<u64, TrainError> {
     let [mut memory, _] = estimate(config, dataset, trainer, probe)?;
-    memory.staging = first_staging_bytes(config, probe.pages, host_mem);
+    memory.staging = first_staging_bytes(config, host_mem);
     let plan = TierPlan {
         pages: [probe.pages as u64, u64::MAX],
-        frames_of_use: PAGES_MOST,
         frame_bytes: trainer.scene.pager.frame_bytes() as u64,
         frames: None,
+        frames_are_named: false,
         bytes_written: 0.0,
         free_bytes: None,
         largest_view,
@@ -333,15 +332,57 @@ fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -
     Ok(())
 }
 
+/// Frames that a run starts with, and the memory that they follow from.
+fn first_frames(
+    config: &TrainConfig,
+    plan: &TierPlan,
+    host_mem: Option<u64>,
+    memory: &MemoryEstimate,
+) -> InputResult<(u64, Option<u64>)> {
+    if config.frames > 0 {
+        check_view(plan, u64::from(config.frames))?;
+        return Ok((u64::from(config.frames), host_mem));
+    }
+    // By what is known for certain: the cap may never be reached. What grows takes from the frames in its time.
+    if let Ok(frames) = frames_of_budget(plan, host_mem, memory) {
+        return Ok((frames, host_mem));
+    }
+    let host_mem = enough_memory(config, host_mem, least_memory(plan, memory, host_mem));
+    Ok((frames_of_budget(plan, host_mem, memory)?, host_mem))
+}
+
+/// `host_mem`, or `least` bytes where it is less, nobody named it, and the machine has them.
+fn enough_memory(config: &TrainConfig, host_mem: Option<u64>, least: u64) -> Option<u64> {
+    let budget = host_mem.filter(|&budget| config.host_mem.0 == 0 && least > budget);
+    let Some(short) = budget.filter(|_| within_reach().is_some_and(|most| least <= most)) else { return host_mem };
+    eprintln!(
+        "warning: the run needs {} from its start, more than {}, the share of the free memory that it takes by itself: it \
+         takes more as long as the machine has it; --host-mem sets a limit",
+        format_bytes(least),
+        format_bytes(short)
+    );
+    Some(least)
+}
+
+/// Memory with which the largest view has its frames.
+fn least_memory(plan: &TierPlan, memory: &MemoryEstimate, host_mem: Option<u64>) -> u64 {
+    let rest = memory.fixed() - memory.staging + view_spare(memory) + plan.largest_view.pages * plan.frame_bytes;
+    let least = with_staging(rest, memory.staging, host_mem.unwrap_or(u64::MAX));
+    least + least / 50
+}
+
+/// Vectors of a view that is a little larger than those that were rendered grow by an eighth.
+fn view_spare(memory: &MemoryEstimate) -> u64 {
+    (memory.view - memory.view_pixels) / 8
+}
+
 fn frames_of_budget(plan: &TierPlan, host_mem: Option<u64>, memory: &MemoryEstimate) -> InputResult<u64> {
     // Where the system tells nothing, everything fits until it does not.
-    let Some(budget) = host_mem else { return Ok(plan.frames_of_use) };
-    // Vectors of a view that is a little larger than those that were rendered grow by an eighth.
-    let spare = (memory.view - memory.view_pixels) / 8;
-    let frames = budget.saturating_sub(memory.fixed() + spare) / plan.frame_bytes;
+    let Some(budget) = host_mem else { return Ok(PAGES_MOST) };
+    let frames = budget.saturating_sub(memory.fixed() + view_spare(memory)) / plan.frame_bytes;
     let LargestView { pages: needed, name: view, .. } = &plan.largest_view;
     if frames >= *needed {
-        return Ok(frames.min(plan.frames_of_use));
+        return Ok(frames.min(PAGES_MOST));
     }
     let problem = format!(
         "{} are too little: {} go to one view, photos, staging and tables, which leaves {frames} pages of {}, but the \
@@ -350,10 +391,9 @@ fn frames_of_budget(plan: &TierPlan, host_mem: Option<u64>, memory: &MemoryEstim
         format_bytes(memory.fixed()),
         format_bytes(plan.frame_bytes)
     );
-    let least = memory.fixed() + spare + needed * plan.frame_bytes;
     let remedy = format!(
         "give at least {}, or lower --image-cache, --prefetch-bytes, --page-rows, --sh-degree or the size of the photos",
-        format_bytes(least + least / 50)
+        format_bytes(least_memory(plan, memory, host_mem))
     );
     Err(InputError::new("--host-mem", problem, remedy))
 }
@@ -437,7 +477,7 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
     );
     let frames = match plan.frames {
         None => String::from("Gaussians with their optimizer state"),
-        Some(frames) if plan.frames_of_use == PAGES_MOST && frames > plan.pages[0] => {
+        Some(frames) if !plan.frames_are_named && frames >= plan.pages[1] => {
             String::from("frames of pages, for all that there are")
         }
         Some(frames) => format!("{frames} frames of pages"),
@@ -450,7 +490,7 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
         text.push_str(&part("pages on their way that are encoded, and the plan", memory.staging));
     }
     text.push_str(&part("index of the pages", memory.index));
-    text.push_str(&part("program and tables", memory.base));
+    text.push_str(&part("program and tables", memory.base + memory.copies));
     if tiers.spills() {
         text.push_str(&format!(
             "drive   {} of pages by {} ({}), {} free; about {} to be written, commits apart, {:.2} % of what a common drive is rated for\n",

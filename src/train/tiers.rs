@@ -93,8 +93,8 @@ fn chosen_codec(config: &TrainConfig, folder: Option<&Path>, notes: &mut Vec<Str
     }
 }
 
-/// Sizes of the pager of a scene of about `pages` pages, within `host_mem` bytes.
-fn pager_config(config: &TrainConfig, pages: usize, host_mem: u64) -> PagerConfig {
+/// Sizes of the pager of a run within `host_mem` bytes.
+fn pager_config(config: &TrainConfig, host_mem: u64) -> PagerConfig {
     let mut pager = PagerConfig {
         frames: config.frames as usize,
         policy: policy(config),
@@ -103,7 +103,7 @@ fn pager_config(config: &TrainConfig, pages: usize, host_mem: u64) -> PagerConfi
     };
     let affordable = (host_mem / pager.frame_bytes() as u64) as usize;
     if pager.frames == 0 {
-        pager.frames = (affordable / PREFETCH_SHARE).max(FIRST_FRAMES).min(pages.max(1));
+        pager.frames = (affordable / PREFETCH_SHARE).max(FIRST_FRAMES);
     }
     let frames = if config.frames > 0 { pager.frames } else { affordable };
     pager.prefetch_bytes = prefetch_bytes(config, frames, pager.frame_bytes());
@@ -125,7 +125,7 @@ pub(super) fn budget_in_memory(config: &TrainConfig, host_mem: u64, memory: &Mem
     let frame_bytes = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes();
     let ahead = prefetch_bytes(config, (host_mem / frame_bytes as u64) as usize, frame_bytes);
     let staging = staging_bytes(2 * ahead, &codec(config).to_string());
-    HostBudget::new(host_mem, memory).in_memory(ahead, staging, config.host_mem.0 > 0)
+    HostBudget::new(host_mem, memory, config.host_mem.0 > 0).in_memory(ahead, staging)
 }
 
 /// The pager with its pages moving when `--transfers` says.
@@ -140,11 +140,20 @@ pub fn staging_bytes(prefetch_bytes: usize, codec: &str) -> u64 {
     (PLAN_BYTES + if codec == Codec::Raw.to_string() { 0 } else { prefetch_bytes }) as u64
 }
 
+/// The memory that a run needs which holds `rest` bytes beside its staging, where staging took `staging` of `budget` bytes:
+/// more memory means more frames, an eighth of which may be on their way.
+pub(super) fn with_staging(rest: u64, staging: u64, budget: u64) -> u64 {
+    let of_plan = staging.min(PLAN_BYTES as u64);
+    let share = ((staging - of_plan) as f64 / budget.max(1) as f64).min(0.5);
+    let most = of_plan + (staging - of_plan).max(2 * PREFETCH_BYTES_MAX as u64);
+    (((rest + of_plan) as f64 / (1.0 - share)) as u64).min(rest + most).max(rest + staging)
+}
+
 /// The same of a run that was not begun, with this budget and a drive that is fast enough for raw pages where the codec is
 /// chosen by its speed.
-pub fn first_staging_bytes(config: &TrainConfig, pages: usize, host_mem: u64) -> u64 {
+pub fn first_staging_bytes(config: &TrainConfig, host_mem: u64) -> u64 {
     let codec = chosen_codec(config, None, &mut Vec::new()).to_string();
-    staging_bytes(2 * pager_config(config, pages, host_mem).prefetch_bytes, &codec)
+    staging_bytes(2 * pager_config(config, host_mem).prefetch_bytes, &codec)
 }
 
 /// Opens the tiers for a scene of about `pages` pages, within `host_mem` bytes. The pager has few frames at first where
@@ -159,7 +168,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
         let in_memory = PagerConfig { policy: policy(config), ..PagerConfig::in_memory(page_rows, sh_degree) };
         return Ok((with_transfers(Pager::in_memory(in_memory), config), Tiers::default()));
     }
-    let pager = pager_config(config, pages, host_mem);
+    let pager = pager_config(config, host_mem);
     let layout = SlotLayout::new(capacity_bytes(page_rows, sh_degree), pages as u64);
     let mut tiers = Tiers::default();
     tiers.keeps = config.keep_checkpoint;
@@ -248,7 +257,7 @@ impl Stored {
     /// The I/O engine does not work here, or what is stored contradicts itself. The directory stays as it is.
     pub fn into_tiers(self, config: &TrainConfig, host_mem: u64) -> Result<(Pager, Tiers), TrainError> {
         let Stored { spill, opened, run_state } = self;
-        let mut pager = pager_config(config, opened.pages.len(), host_mem);
+        let mut pager = pager_config(config, host_mem);
         let bytes = (opened.pages.len() * pager.frame_bytes()) as u64;
         // A run in memory stays there while that is no question; otherwise its checkpoint serves as a spill directory.
         let is_in_memory = config.spill_dir.is_empty() && config.frames == 0 && bytes <= host_mem / 2;

@@ -290,14 +290,21 @@ impl Trainer {
         let target = targets.get(view)?;
         let started = Instant::now();
         let render = self.render_options();
-        let stepped = train_step(
-            &mut self.scene,
-            &mut self.working,
-            &mut *self.renderer,
-            (self.step, &dataset.views[view].camera, &target),
-            (&render, &self.options.loss),
-            self.options.densify.is_some_and(|d| d.collects(self.step)),
-        );
+        let stepped = loop {
+            let stepped = train_step(
+                &mut self.scene,
+                &mut self.working,
+                &mut *self.renderer,
+                (self.step, &dataset.views[view].camera, &target),
+                (&render, &self.options.loss),
+                self.options.densify.is_some_and(|d| d.collects(self.step)),
+            );
+            // A step without its frames changed nothing that doing it again does not.
+            match stepped {
+                Err(TrainError::Paging(error)) if self.find_frames(&error) => {}
+                stepped => break stepped,
+            }
+        };
         let outcome = stepped.map_err(|error| error.of_view(&dataset.views[view].name))?;
         self.count(&outcome, &dataset.views[view].name)?;
         if self.options.optimizer == Method::Dense {
@@ -435,7 +442,7 @@ impl Trainer {
             match self.step(dataset, targets) {
                 Ok(outcome) => return Ok(Some(outcome)),
                 Err(error) if error.is_out_of_space() => self.make_space(outputs, error)?,
-                Err(error) => return Err(self.keep_outgrown(error, outputs)),
+                Err(error) => return Err(self.keep_outgrown(error, dataset, outputs)),
             }
             if outputs.stop.exit_code().is_some() {
                 return Ok(None);
