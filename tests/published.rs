@@ -1,5 +1,5 @@
 //! Published runs: the files against the tables they come from, and the way from a dataset's folder to a table of ours
-//! beside the paper's, on look-alikes through the real binaries, as README.md tells it.
+//! beside the paper's, on look-alikes through the real binaries, as configs/README.md tells it.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
 #[path = "support/scenes.rs"]
@@ -368,10 +368,10 @@ fn an_incomplete_folder_is_told_from_a_complete_one() {
     assert!(stderr(&output).contains("--data"));
 }
 
-/// The commands of README.md's walk through a look-alike, each of one line.
-fn walk() -> Vec<String> {
-    let readme = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("README.md")).unwrap();
-    let section = readme.split("## Published runs").nth(1).expect("README has the section");
+/// The commands of configs/README.md that train a look-alike, each on one line.
+fn commands_of_look_alike() -> Vec<String> {
+    let readme = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/README.md")).unwrap();
+    let section = readme.split("## Published runs").nth(1).expect("configs/README.md has the section");
     let section = section.split("\n## ").next().unwrap();
     let block = section.split("```sh\n").skip(1).map(|b| b.split("```").next().unwrap());
     let block = block.into_iter().find(|b| b.contains("gsscale-synth")).expect("a block that makes a look-alike");
@@ -379,10 +379,10 @@ fn walk() -> Vec<String> {
 }
 
 #[test]
-fn the_walk_in_the_readme_ends_at_the_table() {
+fn the_commands_for_a_look_alike_end_at_the_table() {
     let folder = TempDir::new().unwrap();
     let mut said = String::new();
-    for line in walk() {
+    for line in commands_of_look_alike() {
         let words: Vec<&str> = line.split_whitespace().collect();
         let ["cargo", "run", "--release", "--bin", program, "--", args @ ..] = &words[..] else { panic!("{line}") };
         let program = match *program {

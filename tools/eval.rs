@@ -31,7 +31,7 @@ struct Args {
     /// Write render-beside-photo pictures here
     #[arg(long)]
     renders: Option<PathBuf>,
-    /// Measure LPIPS too, with these weights (safetensors; README.md says how to make them)
+    /// Measure LPIPS too, with these weights (safetensors; tools/README.md says how to make them)
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
     /// What LPIPS's network is fed: signed (-1..1, what it was trained for) or unit (0..1, as the 3DGS code does)

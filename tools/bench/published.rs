@@ -49,7 +49,7 @@ pub struct Args {
     /// Densification tier of the config, S0 (fewest Gaussians) to S5 (most)
     #[arg(long)]
     tier: Option<String>,
-    /// Measure LPIPS too, with these weights (safetensors; README.md says how to make them)
+    /// Measure LPIPS too, with these weights (safetensors; tools/README.md says how to make them)
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
     /// What LPIPS's network is fed: signed (-1..1) or unit (0..1)

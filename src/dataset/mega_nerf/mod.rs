@@ -26,7 +26,7 @@ use crate::dataset::transforms::pose::make_pose;
 use std::path::{Path, PathBuf};
 use torch_file::TorchFile;
 
-const REMEDY: &str = "fetch or write the dataset again; README.md has the layout";
+const REMEDY: &str = "fetch or write the dataset again; configs/README.md has the layout";
 
 /// Whether [`read_mega_nerf`] finds something in this folder.
 pub fn looks_like_mega_nerf(folder: &Path) -> bool {

@@ -16,7 +16,7 @@ use std::path::Path;
 
 /// The largest file that is read: VGG has 59 MB, and a file may hold the tensors of its classifier or copies.
 const FILE_BYTES_MAX: u64 = 1 << 30;
-const REMEDY: &str = "make it with the one-line export in README.md, section LPIPS";
+const REMEDY: &str = "make it with the one-line export in tools/README.md, section LPIPS";
 
 /// Reads a network with its weights.
 ///
