@@ -10,12 +10,12 @@
 pub mod support;
 
 use gsscale::base::ids::PageId;
-use gsscale::page::codec::Codec;
-use gsscale::page::commit::{CommitConfig, CommitError, Commits, Cut, PageChange};
-use gsscale::page::engine::{IoEngine, open_engine};
-use gsscale::page::folder::DriveFolder;
-use gsscale::page::paged_store::{PageMoved, PagedStore};
-use gsscale::page::slots::SlotLayout;
+use gsscale::page::engine::open::{IoEngine, open_engine};
+use gsscale::page::folder::protocol_files::DriveFolder;
+use gsscale::page::format::codec::Codec;
+use gsscale::page::map::commit::{CommitConfig, CommitError, Commits, Cut, PageChange};
+use gsscale::page::versions::paged_store::{PageMoved, PagedStore};
+use gsscale::page::versions::slots::SlotLayout;
 use std::path::PathBuf;
 use std::time::Instant;
 use support::Args;

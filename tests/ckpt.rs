@@ -14,7 +14,7 @@ mod scenes;
 
 use bench::{Bench, EVENTLESS, Ply, ckpt, failed, json, pin, train_from};
 use gsscale::exchange::ply::{PlyMeta, write_gaussians};
-use gsscale::page::format::checksum;
+use gsscale::page::format::slot_header::checksum;
 use gsscale::scene::columns::{Column, Columns};
 use scenes::{stderr, summary, text, train};
 use serde_json::Value;

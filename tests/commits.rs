@@ -2,21 +2,21 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
 use gsscale::base::ids::PageId;
-use gsscale::page::codec::Codec;
-use gsscale::page::commit::{
+use gsscale::page::engine::open::{IoEngine, open_engine};
+use gsscale::page::engine::segment_files::segment_file_name;
+use gsscale::page::folder::protocol_files::{DriveFolder, Folder};
+use gsscale::page::folder::spill_dir::SpillDir;
+use gsscale::page::format::codec::Codec;
+use gsscale::page::format::slot_header::{HEADER_BYTES, SlotRef};
+use gsscale::page::format::spill_format::Purpose;
+use gsscale::page::map::commit::{
     CommitConfig, CommitError, Commits, Cut, MAP_NAME, PageChange, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME,
 };
-use gsscale::page::engine::{IoEngine, open_engine};
-use gsscale::page::folder::{DriveFolder, Folder};
-use gsscale::page::format::{HEADER_BYTES, SlotRef};
-use gsscale::page::manifest::{Manifest, MapBatch, MapError};
-use gsscale::page::opening::Opened;
-use gsscale::page::paged_store::{PageMoved, PagedStore};
-use gsscale::page::reading::{Access, ReadError, StoreReader, WitnessRule, commit_config};
-use gsscale::page::segment_files::segment_file_name;
-use gsscale::page::slots::SlotLayout;
-use gsscale::page::spill_dir::SpillDir;
-use gsscale::page::spill_format::Purpose;
+use gsscale::page::map::manifest::{Manifest, MapBatch, MapError};
+use gsscale::page::map::opening::Opened;
+use gsscale::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule, commit_config};
+use gsscale::page::versions::paged_store::{PageMoved, PagedStore};
+use gsscale::page::versions::slots::SlotLayout;
 use redb::backends::InMemoryBackend;
 use redb::{Builder, ReadableDatabase, StorageBackend, TableDefinition};
 use std::path::Path;

@@ -4,13 +4,13 @@
 #![cfg(unix)]
 
 use gsscale::base::rng::{Purpose, Stream};
-use gsscale::page::buffer::{ALIGNMENT, PageBuffer};
-use gsscale::page::engine::{DEPTH, IoEngine, open_engine};
-use gsscale::page::memory_store::MemoryStore;
-use gsscale::page::mmap_store::MmapStore;
-use gsscale::page::pread_store::PreadStore;
-use gsscale::page::segment_files::segment_file_name;
-use gsscale::page::store::{Completion, Direction, PageStore, Place, Transfer};
+use gsscale::page::engine::buffer::{ALIGNMENT, PageBuffer};
+use gsscale::page::engine::memory::MemoryStore;
+use gsscale::page::engine::mmap::MmapStore;
+use gsscale::page::engine::open::{DEPTH, IoEngine, open_engine};
+use gsscale::page::engine::pread::PreadStore;
+use gsscale::page::engine::segment_files::segment_file_name;
+use gsscale::page::engine::transfers::{Completion, Direction, PageStore, Place, Transfer};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::io::ErrorKind;
 use std::path::Path;
@@ -28,7 +28,7 @@ fn file_engines() -> Vec<(&'static str, Open)> {
     ];
     #[cfg(target_os = "linux")]
     {
-        use gsscale::page::uring_store::UringStore;
+        use gsscale::page::engine::uring::UringStore;
         match UringStore::open(&std::env::temp_dir(), 1, true) {
             Ok(_) => {
                 // A ring of 4 is always full here.
@@ -388,7 +388,7 @@ fn refused_writes_are_errors_with_their_buffers() {
 #[cfg(target_os = "linux")]
 #[test]
 fn a_short_answer_of_the_ring_is_resumed() {
-    use gsscale::page::uring_store::{REQUEST_BYTES, UringStore};
+    use gsscale::page::engine::uring::{REQUEST_BYTES, UringStore};
     const { assert!(REQUEST_BYTES <= 1 << 20, "larger requests may end with EAGAIN") };
     if !in_child("a_short_answer_of_the_ring_is_resumed") {
         return;
@@ -493,7 +493,7 @@ fn three_times_the_usual_depth_moves_without_being_asked() {
 #[test]
 fn a_ring_of_ended_requests_is_not_full() {
     let folder = tempfile::tempdir().unwrap();
-    let mut store = match gsscale::page::uring_store::UringStore::open(folder.path(), 4, true) {
+    let mut store = match gsscale::page::engine::uring::UringStore::open(folder.path(), 4, true) {
         Ok(store) => store,
         Err(error) => return eprintln!("skipped: io_uring is refused here: {error}"),
     };
@@ -530,8 +530,8 @@ fn expect_pinned(bytes: usize) {
 
 /// A ring, unless this system has none, or none that knows buffers.
 #[cfg(target_os = "linux")]
-fn ring_with_table(folder: &Path) -> Option<gsscale::page::uring_store::UringStore> {
-    let store = gsscale::page::uring_store::UringStore::open(folder, 8, true);
+fn ring_with_table(folder: &Path) -> Option<gsscale::page::engine::uring::UringStore> {
+    let store = gsscale::page::engine::uring::UringStore::open(folder, 8, true);
     match &store {
         Ok(store) if store.has_table() => {}
         Ok(_) => eprintln!("skipped: this kernel has no table for buffers"),

@@ -6,7 +6,7 @@
 //! | process killed anywhere | opens at the last acknowledged commit, or the one under way | crash: no_acknowledged_commit_is_lost_and_no_wrong_byte_returned; resume: a_run_that_is_killed_at_any_time_ends_with_the_same_bytes |
 //! | power loss: writes lost, torn, reordered | the same | crash: every_crash_point_of_a_small_run_opens_at_an_acknowledged_state |
 //! | folder entry lost | nothing durable names a file whose entry is not | crash: every_mutant_is_noticed |
-//! | short, interrupted, EAGAIN | resumed a bounded number of times, then an error | ../src/page/resume: what_never_moves_ends_as_an_error; ../src/page/segment_io: what_moves_in_parts_and_is_disturbed_arrives_whole; engines: a_short_answer_of_the_ring_is_resumed; crash: every_call_of_a_small_run_may_fail |
+//! | short, interrupted, EAGAIN | resumed a bounded number of times, then an error | ../src/page/engine/short_transfers: what_never_moves_ends_as_an_error; ../src/page/engine/segment_io: what_moves_in_parts_and_is_disturbed_arrives_whole; engines: a_short_answer_of_the_ring_is_resumed; crash: every_call_of_a_small_run_may_fail |
 //! | EIO on read | read once more; then named with page, generation and place; an earlier generation can be gone back to | store: what_another_read_mends_is_not_an_error; commits: generations_come_back_and_a_rollback_brings_an_older_one |
 //! | EIO on write or sync | nothing is written any more; the last acknowledged commit stands | store: a_failed_write_or_sync_ends_all_writing; crash: every_call_of_a_small_run_may_fail; paging: a_drive_that_fails_for_ever_loses_nothing_that_is_in_memory |
 //! | ENOSPC | no poison: the same call works when there is space; the reserve is used | store: a_full_drive_is_survived; paging: a_full_drive_can_be_waited_for; commits: the_reserve_is_there_until_it_is_given_up |
@@ -34,16 +34,16 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
 use gsscale::base::ids::PageId;
-use gsscale::page::codec::Codec;
-use gsscale::page::commit::{CommitConfig, CommitError, Commits, Cut, MAP_NAME, PageChange, WITNESS_NAME};
-use gsscale::page::engine::{IoEngine, open_engine};
-use gsscale::page::folder::DriveFolder;
-use gsscale::page::format::{HEADER_BYTES, SlotRef};
-use gsscale::page::manifest::Manifest;
-use gsscale::page::opening::Opened;
-use gsscale::page::page_error::PageError;
-use gsscale::page::paged_store::{PageMoved, PagedStore};
-use gsscale::page::slots::SlotLayout;
+use gsscale::page::engine::open::{IoEngine, open_engine};
+use gsscale::page::folder::protocol_files::DriveFolder;
+use gsscale::page::format::codec::Codec;
+use gsscale::page::format::slot_header::{HEADER_BYTES, SlotRef};
+use gsscale::page::map::commit::{CommitConfig, CommitError, Commits, Cut, MAP_NAME, PageChange, WITNESS_NAME};
+use gsscale::page::map::manifest::Manifest;
+use gsscale::page::map::opening::Opened;
+use gsscale::page::versions::page_error::PageError;
+use gsscale::page::versions::paged_store::{PageMoved, PagedStore};
+use gsscale::page::versions::slots::SlotLayout;
 use redb::StorageBackend;
 use redb::backends::InMemoryBackend;
 use std::path::{Path, PathBuf};
@@ -289,5 +289,5 @@ fn no_decision_reads_the_wall_clock() {
         }
     }
     readers.sort();
-    assert_eq!(readers, ["src/exchange/tensorboard.rs", "src/page/spill_dir.rs"]);
+    assert_eq!(readers, ["src/exchange/tensorboard.rs", "src/page/folder/spill_dir.rs"]);
 }

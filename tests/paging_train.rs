@@ -61,7 +61,7 @@ fn number(summary: &serde_json::Value, key: &str) -> u64 {
 /// Engines that work here: containers often forbid io_uring.
 fn engines() -> Vec<&'static str> {
     let folder = TempDir::new().unwrap();
-    let works = |io: &&str| gsscale::page::engine::open_engine(io.parse().unwrap(), folder.path(), 4).is_ok();
+    let works = |io: &&str| gsscale::page::engine::open::open_engine(io.parse().unwrap(), folder.path(), 4).is_ok();
     ["uring", "mmap", "pread"].into_iter().filter(works).collect()
 }
 

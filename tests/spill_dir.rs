@@ -6,13 +6,13 @@
 
 use gsscale::base::error::InputError;
 use gsscale::base::ids::PageId;
-use gsscale::page::buffer::PageBuffer;
-use gsscale::page::format::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs};
-use gsscale::page::segment_files::{SegmentFiles, segment_file_name};
-use gsscale::page::slots::SlotLayout;
-use gsscale::page::spill_dir::SpillDir;
-use gsscale::page::spill_format::Purpose;
-use gsscale::page::store::Place;
+use gsscale::page::engine::buffer::PageBuffer;
+use gsscale::page::engine::segment_files::{SegmentFiles, segment_file_name};
+use gsscale::page::engine::transfers::Place;
+use gsscale::page::folder::spill_dir::SpillDir;
+use gsscale::page::format::slot_header::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs};
+use gsscale::page::format::spill_format::Purpose;
+use gsscale::page::versions::slots::SlotLayout;
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::fs::{FileExt, MetadataExt, PermissionsExt, chown, symlink};

@@ -4,15 +4,15 @@
 
 use gsscale::base::ids::PageId;
 use gsscale::base::rng::mix64;
-use gsscale::page::buffer::PageBuffer;
-use gsscale::page::codec::Codec;
-use gsscale::page::faulty_store::{Fault, Faults, FaultyStore, Operation};
-use gsscale::page::format::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs};
-use gsscale::page::memory_store::MemoryStore;
-use gsscale::page::page_error::PageError;
-use gsscale::page::paged_store::{PageDone, PageMoved, PagedStore, PagedStoreConfig};
-use gsscale::page::slots::{SlotLayout, SlotState};
-use gsscale::page::store::{Completion, PageStore, Place, Transfer};
+use gsscale::page::engine::buffer::PageBuffer;
+use gsscale::page::engine::faulty::{Fault, Faults, FaultyStore, Operation};
+use gsscale::page::engine::memory::MemoryStore;
+use gsscale::page::engine::transfers::{Completion, PageStore, Place, Transfer};
+use gsscale::page::format::codec::Codec;
+use gsscale::page::format::slot_header::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs};
+use gsscale::page::versions::page_error::PageError;
+use gsscale::page::versions::paged_store::{PageDone, PageMoved, PagedStore, PagedStoreConfig};
+use gsscale::page::versions::slots::{SlotLayout, SlotState};
 use std::collections::BTreeMap;
 use std::io;
 use std::sync::{Arc, Mutex};

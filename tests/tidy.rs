@@ -68,9 +68,9 @@ const LAYERS: &[(&str, &[&str])] = &[
 const UNSAFE_FILES: &[&str] = &[
     "src/base/eight.rs",
     "src/base/simd.rs",
-    "src/page/mmap_store.rs",
-    "src/page/registered.rs",
-    "src/page/uring_store.rs",
+    "src/page/engine/mmap.rs",
+    "src/page/engine/registered.rs",
+    "src/page/engine/uring.rs",
 ];
 
 const FUNCTION_LINES_MAX: usize = 80;

@@ -24,8 +24,8 @@ mod verify;
 
 use clap::{Parser, Subcommand};
 use gsscale::base::error::InputError;
-use gsscale::page::commit::CommitError;
-use gsscale::page::manifest::MapError;
+use gsscale::page::map::commit::CommitError;
+use gsscale::page::map::manifest::MapError;
 use gsscale::train::trainer::TrainError;
 use serde::Serialize;
 use std::process::ExitCode;

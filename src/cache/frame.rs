@@ -5,7 +5,7 @@
 
 use super::evict::NEVER;
 use crate::base::ids::PageNo;
-use crate::page::buffer::PageBuffer;
+use crate::page::engine::buffer::PageBuffer;
 
 /// What a frame is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

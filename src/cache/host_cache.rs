@@ -13,7 +13,7 @@
 use super::evict::{EvictPolicy, EvictQueue};
 use super::frame::{Frame, FrameState};
 use crate::base::ids::PageNo;
-use crate::page::buffer::PageBuffer;
+use crate::page::engine::buffer::PageBuffer;
 
 /// In the table of pages: not in memory.
 const ABSENT: u32 = u32::MAX;

@@ -4,14 +4,14 @@
 //! program's state is told from damage; 3. bytes that nobody vouches for give a state within its limits or an error,
 //! never a panic.
 //!
-//! Layout: [`VERSION`] as u32, then the fields of [`RunState`] in their order, as [`crate::page::encoding`] writes them.
+//! Layout: [`VERSION`] as u32, then the fields of [`RunState`] in their order, as [`crate::page::format::encoding`] writes them.
 //! Version 2 added what tools list and what a run that goes on counts from ([`RunState::test`], [`RunState::traffic`]),
 //! and a dataset print that knows photos, points and the local frame. No program was released with version 1.
 //! Version 3 added the last five of [`TrafficSoFar`]; of a state of version 2 they are 0.
 //! Version 4 added [`RunState::run`]; of an older state the run is unknown.
 
 use crate::base::identity::RunId;
-use crate::page::encoding::{self, EncodingError};
+use crate::page::format::encoding::{self, EncodingError};
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 

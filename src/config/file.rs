@@ -9,7 +9,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::units::parse_bytes;
 use crate::checkpoint::interval::CommitEvery;
 use crate::optim::adam::EPS_MIN;
-use crate::page::codec::Codec;
+use crate::page::format::codec::Codec;
 use crate::schedule::order::Order;
 use serde::{Deserialize, Serialize};
 use std::fs::File;

@@ -13,10 +13,10 @@ use super::stored::PageLimits;
 use super::transfers::Failure;
 use crate::base::ids::{PageId, PageNo};
 use crate::cache::frame::FrameState;
-use crate::page::commit::{CommitError, Commits, Cut, PageChange};
-use crate::page::format::SlotRef;
-use crate::page::opening::StoredPage;
-use crate::page::paged_store::PagedStore;
+use crate::page::format::slot_header::SlotRef;
+use crate::page::map::commit::{CommitError, Commits, Cut, PageChange};
+use crate::page::map::opening::StoredPage;
+use crate::page::versions::paged_store::PagedStore;
 use std::collections::BTreeMap;
 
 /// Writes in flight at once: each may need a buffer of its own to be encoded in.

@@ -5,7 +5,7 @@
 
 use crate::base::ids::PageId;
 use crate::base::units::format_bytes;
-use crate::page::page_error::PageError;
+use crate::page::versions::page_error::PageError;
 
 /// Why pages could not be had.
 #[derive(Debug, thiserror::Error)]

@@ -12,7 +12,7 @@ use super::transfers::{Failure, WRITES};
 use crate::base::ids::PageNo;
 use crate::cache::evict::NEVER;
 use crate::cache::frame::FrameState;
-use crate::page::buffer::PageBuffer;
+use crate::page::engine::buffer::PageBuffer;
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Instant;
 

@@ -16,8 +16,8 @@ use super::pager::Pager;
 use super::transfers::Failure;
 use crate::base::ids::{PageId, PageNo};
 use crate::cache::frame::FrameState;
-use crate::page::commit::{CommitError, Commits, Cut, PageChange};
-use crate::page::format::SlotRef;
+use crate::page::format::slot_header::SlotRef;
+use crate::page::map::commit::{CommitError, Commits, Cut, PageChange};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
 

@@ -4,8 +4,8 @@
 //! 2. whoever changes rows, meta or layout sets `dirty`.
 
 use crate::base::ids::PageNo;
-use crate::page::buffer::PageBuffer;
-use crate::page::format::HEADER_BYTES;
+use crate::page::engine::buffer::PageBuffer;
+use crate::page::format::slot_header::HEADER_BYTES;
 use crate::scene::page_layout::PageLayout;
 use crate::scene::page_meta::PageMeta;
 use crate::scene::rows::{Rows, RowsMut};

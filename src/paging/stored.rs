@@ -5,7 +5,7 @@
 
 use super::label::meta_from_label;
 use crate::base::ids::PageId;
-use crate::page::format::SlotRef;
+use crate::page::format::slot_header::SlotRef;
 use crate::scene::page_layout::{PageLayout, capacity_bytes};
 use crate::scene::page_meta::PageMeta;
 use crate::scene::rows::{ColumnsRef, Rows};

@@ -10,9 +10,9 @@ use super::fetch::Asker;
 use super::label::label;
 use super::pager::Pager;
 use crate::base::ids::PageNo;
-use crate::page::format::{SlotRef, StoredAs};
-use crate::page::page_error::PageError;
-use crate::page::paged_store::{PageDone, PageMoved};
+use crate::page::format::slot_header::{SlotRef, StoredAs};
+use crate::page::versions::page_error::PageError;
+use crate::page::versions::paged_store::{PageDone, PageMoved};
 use crate::scene::page_layout::PageLayout;
 use std::time::Instant;
 

@@ -14,7 +14,7 @@ use super::pages::PagedScene;
 use super::tiers::with_staging;
 use super::trainer::Trainer;
 use crate::base::units::format_bytes;
-use crate::page::format::HEADER_BYTES;
+use crate::page::format::slot_header::HEADER_BYTES;
 use crate::paging::error::PagingError;
 use crate::scene::camera::Camera;
 use crate::scene::columns::row_width;

@@ -15,8 +15,8 @@ use super::trainer::{TrainError, Trainer};
 use crate::checkpoint::interval::{CommitCost, CommitInterval, CommitReport};
 use crate::checkpoint::run_state::{DatasetPrint, RunIdentity, RunState, TrafficSoFar};
 use crate::config::file::TrainConfig;
-use crate::page::commit::{CommitError, Commits};
-use crate::page::spill_dir::SpillDir;
+use crate::page::folder::spill_dir::SpillDir;
+use crate::page::map::commit::{CommitError, Commits};
 use crate::paging::stats::{PagerStats, SlotSpace};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -329,7 +329,7 @@ impl Checkpoint {
     /// Whether a commit is needed for its space alone.
     fn space_is_short(&self, trainer: &Trainer) -> bool {
         let Some(space) = trainer.scene.pager.slot_space().filter(is_worth_a_commit) else { return false };
-        let left = crate::page::file_system::free_bytes(&self.folder).ok().flatten();
+        let left = crate::page::folder::file_system::free_bytes(&self.folder).ok().flatten();
         left.is_some_and(|left| left < space.segment_bytes)
     }
 }

@@ -6,15 +6,15 @@
 
 use super::trainer::TrainError;
 use crate::config::file::TrainConfig;
-use crate::page::codec::Codec;
-use crate::page::commit::{CommitConfig, Commits};
-use crate::page::engine::{DEPTH, IoEngine, open_engine};
-use crate::page::folder::DriveFolder;
-use crate::page::paged_store::PagedStore;
-use crate::page::slots::SlotLayout;
-use crate::page::spill_dir::SpillDir;
-use crate::page::spill_format::Purpose;
-use crate::page::uncommitted::remove_uncommitted;
+use crate::page::engine::open::{DEPTH, IoEngine, open_engine};
+use crate::page::folder::protocol_files::DriveFolder;
+use crate::page::folder::spill_dir::SpillDir;
+use crate::page::folder::uncommitted::remove_uncommitted;
+use crate::page::format::codec::Codec;
+use crate::page::format::spill_format::Purpose;
+use crate::page::map::commit::{CommitConfig, Commits};
+use crate::page::versions::paged_store::PagedStore;
+use crate::page::versions::slots::SlotLayout;
 use crate::paging::pager::Pager;
 use crate::scene::page_layout::capacity_bytes;
 use std::path::{Path, PathBuf};

@@ -11,8 +11,8 @@ use super::report::MetricsLog;
 use super::signals::StopFlag;
 use super::trainer::{TrainError, Trainer};
 use crate::base::units::format_bytes;
-use crate::page::commit::Commits;
-use crate::page::file_system::free_bytes;
+use crate::page::folder::file_system::free_bytes;
+use crate::page::map::commit::Commits;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -161,7 +161,7 @@ impl Checkpoint {
 
     /// What the page map may grow by for one commit, bytes: it doubles at most.
     fn map_growth(&self) -> u64 {
-        std::fs::metadata(self.folder.join(crate::page::commit::MAP_NAME)).map_or(0, |map| map.len())
+        std::fs::metadata(self.folder.join(crate::page::map::commit::MAP_NAME)).map_or(0, |map| map.len())
     }
 }
 

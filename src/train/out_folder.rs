@@ -12,8 +12,8 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::config::file::TrainConfig;
 use crate::exchange::tensorboard::is_event_file;
-use crate::page::segment_files::sync_folder;
-use crate::page::spill_dir::SpillDir;
+use crate::page::engine::segment_files::sync_folder;
+use crate::page::folder::spill_dir::SpillDir;
 use crate::report::run_report::{PAGES_FILE, REPORT_FILE};
 use std::path::Path;
 

@@ -19,7 +19,7 @@ use crate::densify::stats::GradHistogram;
 use crate::optim::bounds::SplitLimits;
 use crate::optim::deferred::DeferredAdam;
 use crate::optim::method::Method;
-use crate::page::format::HEADER_BYTES;
+use crate::page::format::slot_header::HEADER_BYTES;
 use crate::paging::error::PagingError;
 use crate::paging::pager::Pager;
 use crate::paging::pinned::PinnedPage;

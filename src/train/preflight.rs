@@ -12,7 +12,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
-use crate::page::file_system::free_bytes;
+use crate::page::folder::file_system::free_bytes;
 use crate::paging::pager::PagerConfig;
 use crate::scene::camera::Camera;
 use crate::scene::page_meta::PageMeta;

@@ -10,7 +10,7 @@ use crate::base::units::format_bytes;
 use crate::checkpoint::interval::CommitReport;
 use crate::config::file::TrainConfig;
 use crate::exchange::tensorboard::EventFile;
-use crate::page::segment_files::sync_folder;
+use crate::page::engine::segment_files::sync_folder;
 use crate::paging::pager::Pager;
 use crate::render::color_correct::ColorCorrect;
 use serde::{Deserialize, Serialize};

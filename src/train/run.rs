@@ -29,7 +29,7 @@ use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyContent, PlyWritten, read_ply, to_local};
-use crate::page::uncommitted::remove_uncommitted;
+use crate::page::folder::uncommitted::remove_uncommitted;
 use crate::render::Renderer;
 use crate::report::run_report::{PAGES_FILE, write_run_report};
 use crate::scene::columns::{Columns, sh_n_width};

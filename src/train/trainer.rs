@@ -23,7 +23,7 @@ use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{self, PlyMeta};
 use crate::optim::method::Method;
-use crate::page::commit::CommitError;
+use crate::page::map::commit::CommitError;
 use crate::paging::error::PagingError;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::{RenderError, RenderOptions, Renderer};

@@ -2,12 +2,12 @@
 
 use crate::scenes::{stderr, text, train};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
-use gsscale::page::codec::Codec;
-use gsscale::page::commit::Commits;
-use gsscale::page::engine::{IoEngine, open_engine};
-use gsscale::page::folder::DriveFolder;
-use gsscale::page::reading::commit_config;
-use gsscale::page::spill_dir::SpillDir;
+use gsscale::page::engine::open::{IoEngine, open_engine};
+use gsscale::page::folder::protocol_files::DriveFolder;
+use gsscale::page::folder::spill_dir::SpillDir;
+use gsscale::page::format::codec::Codec;
+use gsscale::page::map::commit::Commits;
+use gsscale::page::tool::reading::commit_config;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};

@@ -5,8 +5,8 @@
 
 use crate::bench::{Bench, ckpt, json};
 use crate::scenes::text;
-use gsscale::page::format::checksum;
-use gsscale::page::reading::{Access, StoreReader, WitnessRule};
+use gsscale::page::format::slot_header::checksum;
+use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule};
 use serde_json::Value;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
@@ -90,7 +90,11 @@ fn stores_of_every_version_open_and_hold_what_they_held() {
     if std::env::var_os("GSSCALE_WRITE_FIXTURE").is_some() {
         write_present_version();
     }
-    assert_eq!(VERSIONS.last(), Some(&gsscale::page::format::FORMAT_VERSION), "a new version needs a fixture");
+    assert_eq!(
+        VERSIONS.last(),
+        Some(&gsscale::page::format::slot_header::FORMAT_VERSION),
+        "a new version needs a fixture"
+    );
     for &version in VERSIONS {
         let folder = tempfile::tempdir().unwrap();
         let store = folder.path().join("store");

@@ -4,9 +4,9 @@
 use crate::life::{End, Life};
 use crate::oracle::{Acknowledged, Snapshot, fill, payload_bytes};
 use gsscale::base::ids::PageId;
-use gsscale::page::commit::{Cut, PageChange};
-use gsscale::page::format::{HEADER_BYTES, SlotRef};
-use gsscale::page::paged_store::PageMoved;
+use gsscale::page::format::slot_header::{HEADER_BYTES, SlotRef};
+use gsscale::page::map::commit::{Cut, PageChange};
+use gsscale::page::versions::paged_store::PageMoved;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A generation that was cut and is not committed yet.

@@ -4,7 +4,7 @@ use crate::disk::{Disk, Rng};
 use crate::life::{CONFIG, paged_store};
 use crate::oracle::Oracle;
 use crate::tamper;
-use gsscale::page::commit::{Commits, MAP_NAME};
+use gsscale::page::map::commit::{Commits, MAP_NAME};
 
 /// Damages a copy of the disk and opens it. Returns whether the damage was noticed; an error is wrong data or a commit
 /// lost without a word.
@@ -75,7 +75,7 @@ pub fn open_spoilt(disk: &Disk, oracle: &Oracle) -> Result<bool, String> {
         Err(_) => {
             let changed = before.iter().find(|(name, bytes)| disk.contents(name) != *bytes);
             // Only the witness may be brought up to date before a store is refused.
-            match changed.filter(|(name, _)| name != gsscale::page::commit::WITNESS_NAME) {
+            match changed.filter(|(name, _)| name != gsscale::page::map::commit::WITNESS_NAME) {
                 Some((name, _)) => Err(format!("a refused store was changed: {name}")),
                 None => Ok(true),
             }

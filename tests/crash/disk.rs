@@ -6,7 +6,7 @@
 //! Images share their blocks, so a copy of the whole disk costs little.
 
 use gsscale::base::rng::mix64;
-use gsscale::page::folder::Folder;
+use gsscale::page::folder::protocol_files::Folder;
 use redb::StorageBackend;
 use std::collections::BTreeMap;
 use std::io;

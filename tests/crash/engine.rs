@@ -3,9 +3,9 @@
 //! Transfers end one at a time and in any order.
 
 use crate::disk::{Disk, DiskFile, Rng};
-use gsscale::page::mutants::{Mutant, active};
-use gsscale::page::segment_files::segment_file_name;
-use gsscale::page::store::{Completion, Direction, PageStore, Transfer};
+use gsscale::page::engine::segment_files::segment_file_name;
+use gsscale::page::engine::transfers::{Completion, Direction, PageStore, Transfer};
+use gsscale::page::map::mutants::{Mutant, active};
 use redb::StorageBackend;
 use std::collections::BTreeMap;
 use std::io;
@@ -68,7 +68,7 @@ impl PageStore for SimStore {
         if active(Mutant::FolderNotSyncedForSegment) {
             return Ok(());
         }
-        gsscale::page::folder::Folder::sync(&self.disk)
+        gsscale::page::folder::protocol_files::Folder::sync(&self.disk)
     }
 
     fn submit(&mut self, mut transfer: Transfer) {

@@ -2,11 +2,11 @@
 
 use gsscale::base::ids::PageId;
 use gsscale::base::rng::mix64;
-use gsscale::page::commit::{CommitError, Commits};
-use gsscale::page::format::{HEADER_BYTES, SlotRef};
-use gsscale::page::opening::{Opened, StoredPage};
-use gsscale::page::page_error::PageError;
-use gsscale::page::paged_store::{PageMoved, PagedStore};
+use gsscale::page::format::slot_header::{HEADER_BYTES, SlotRef};
+use gsscale::page::map::commit::{CommitError, Commits};
+use gsscale::page::map::opening::{Opened, StoredPage};
+use gsscale::page::versions::page_error::PageError;
+use gsscale::page::versions::paged_store::{PageMoved, PagedStore};
 use std::collections::BTreeMap;
 
 /// The pages of a generation by the number of their version, and the run state.

@@ -4,7 +4,7 @@ use crate::decay;
 use crate::disk::{Disk, Fault, FaultPlan, Rng, Survival};
 use crate::life::{CONFIG, End, end_of, open};
 use crate::oracle::{Acknowledged, Oracle};
-use gsscale::page::commit::Commits;
+use gsscale::page::map::commit::Commits;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};

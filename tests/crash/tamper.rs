@@ -2,8 +2,8 @@
 //! written. Made with the library.
 
 use crate::disk::{Disk, Rng};
-use gsscale::page::folder::Folder;
-use gsscale::page::map_file::MapFile;
+use gsscale::page::folder::protocol_files::Folder;
+use gsscale::page::map::map_file::MapFile;
 use redb::{Builder, ReadableTable, TableDefinition};
 
 const PAGES: TableDefinition<'_, (u64, u64), &[u8]> = TableDefinition::new("pages");

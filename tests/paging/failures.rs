@@ -2,8 +2,8 @@
 
 use super::world::{Run, config, store};
 use super::{PAGES, STEPS, in_memory};
-use gsscale::page::codec::Codec;
-use gsscale::page::faulty_store::{Fault, Faults, Operation};
+use gsscale::page::engine::faulty::{Fault, Faults, Operation};
+use gsscale::page::format::codec::Codec;
 use gsscale::paging::error::PagingError;
 use gsscale::paging::pager::Pager;
 use std::io::ErrorKind;

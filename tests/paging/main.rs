@@ -11,8 +11,8 @@ mod traffic;
 mod world;
 
 use gsscale::cache::evict::EvictPolicy;
-use gsscale::page::codec::Codec;
-use gsscale::page::faulty_store::Faults;
+use gsscale::page::engine::faulty::Faults;
+use gsscale::page::format::codec::Codec;
 use gsscale::paging::error::PagingError;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use world::{PAGE_ROWS, Run, SH_DEGREE, config, store};

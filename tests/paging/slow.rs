@@ -3,9 +3,9 @@
 
 use super::world::{self, camera, config};
 use gsscale::base::ids::PageNo;
-use gsscale::page::codec::Codec;
-use gsscale::page::memory_store::MemoryStore;
-use gsscale::page::store::{Completion, Direction, PageStore, Transfer};
+use gsscale::page::engine::memory::MemoryStore;
+use gsscale::page::engine::transfers::{Completion, Direction, PageStore, Transfer};
+use gsscale::page::format::codec::Codec;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::scene::camera::Camera;
 use std::collections::VecDeque;

@@ -2,9 +2,9 @@
 
 use super::world::{PAGE_ROWS, config, meta, store};
 use gsscale::base::ids::{PageId, PageNo};
-use gsscale::page::codec::Codec;
-use gsscale::page::faulty_store::Faults;
-use gsscale::page::format::HEADER_BYTES;
+use gsscale::page::engine::faulty::Faults;
+use gsscale::page::format::codec::Codec;
+use gsscale::page::format::slot_header::HEADER_BYTES;
 use gsscale::paging::pager::{Pager, PagerConfig};
 
 const FRAMES: usize = 70;

@@ -3,9 +3,9 @@
 use super::bench::{Bench, Place, SELDOM, STEPS, ended, logged, ply, signal, succeeded};
 use super::scenes::{summary, text, train};
 use gsscale::checkpoint::run_state::RunState;
-use gsscale::page::commit::{CommitConfig, Commits};
-use gsscale::page::folder::DriveFolder;
-use gsscale::page::spill_dir::SpillDir;
+use gsscale::page::folder::protocol_files::DriveFolder;
+use gsscale::page::folder::spill_dir::SpillDir;
+use gsscale::page::map::commit::{CommitConfig, Commits};
 use std::path::Path;
 
 fn open(folder: &Path) -> (SpillDir, Commits) {

@@ -5,11 +5,11 @@ use super::bench::{Bench, Place, ply, refused, succeeded};
 use super::scenes::{stderr, text, train};
 use gsscale::base::simd::SimdPath;
 use gsscale::checkpoint::run_state::RunState;
-use gsscale::page::codec::Codec;
-use gsscale::page::commit::{CommitConfig, Commits, Cut};
-use gsscale::page::engine::{IoEngine, open_engine};
-use gsscale::page::folder::DriveFolder;
-use gsscale::page::spill_dir::SpillDir;
+use gsscale::page::engine::open::{IoEngine, open_engine};
+use gsscale::page::folder::protocol_files::DriveFolder;
+use gsscale::page::folder::spill_dir::SpillDir;
+use gsscale::page::format::codec::Codec;
+use gsscale::page::map::commit::{CommitConfig, Commits, Cut};
 use std::path::Path;
 
 /// Commits the store in `folder` once more, with another run state and the same pages.

@@ -4,7 +4,7 @@
 //! step, as the measured cache did, so the two differ by decisions alone.
 
 use gsscale::base::ids::PageNo;
-use gsscale::page::format::transfer_bytes;
+use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::paging::pager::Pager;
 use gsscale::scene::page_layout::PageLayout;
 use gsscale::scene::page_meta::PageMeta;

@@ -12,7 +12,7 @@ use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides};
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
-use gsscale::page::drive_rate::DriveRate;
+use gsscale::page::engine::drive_rate::DriveRate;
 use gsscale::paging::stats::PagerStats;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::camera::Camera;

@@ -2,7 +2,7 @@
 
 use gsscale::base::units::format_bytes;
 use gsscale::config::file::ByteSize;
-use gsscale::page::codec::Codec;
+use gsscale::page::format::codec::Codec;
 use gsscale::train::stores::{ImportRequest, import};
 use gsscale::train::trainer::TrainError;
 use std::path::PathBuf;

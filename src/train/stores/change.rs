@@ -5,12 +5,12 @@
 
 use super::{StorePlace, run_state_of};
 use crate::base::error::InputError;
-use crate::page::codec::Codec;
-use crate::page::commit::Commits;
-use crate::page::engine::{IoEngine, open_engine};
-use crate::page::folder::DriveFolder;
-use crate::page::reading::{Access, StoreReader, commit_config};
-use crate::page::spill_dir::SpillDir;
+use crate::page::engine::open::{IoEngine, open_engine};
+use crate::page::folder::protocol_files::DriveFolder;
+use crate::page::folder::spill_dir::SpillDir;
+use crate::page::format::codec::Codec;
+use crate::page::map::commit::Commits;
+use crate::page::tool::reading::{Access, StoreReader, commit_config};
 use crate::train::trainer::TrainError;
 use serde::Serialize;
 

@@ -6,12 +6,12 @@
 use super::StorePlace;
 use crate::base::error::InputError;
 use crate::base::ids::PageId;
-use crate::page::codec::Codec;
-use crate::page::format::{SlotRef, StoredAs};
-use crate::page::new_store::{NewStore, refuse_existing};
-use crate::page::reading::Access;
-use crate::page::segment_files::segment_file_name;
-use crate::page::slots::SlotLayout;
+use crate::page::engine::segment_files::segment_file_name;
+use crate::page::format::codec::Codec;
+use crate::page::format::slot_header::{SlotRef, StoredAs};
+use crate::page::tool::new_store::{NewStore, refuse_existing};
+use crate::page::tool::reading::Access;
+use crate::page::versions::slots::SlotLayout;
 use crate::train::trainer::TrainError;
 use serde::Serialize;
 use std::collections::BTreeMap;

@@ -2,8 +2,8 @@
 
 use super::{StorePlace, run_state_of};
 use crate::base::ids::PageId;
-use crate::page::opening::StoredPage;
-use crate::page::reading::Access;
+use crate::page::map::opening::StoredPage;
+use crate::page::tool::reading::Access;
 use crate::paging::label::meta_from_label;
 use crate::train::trainer::TrainError;
 use serde::Serialize;

@@ -1,7 +1,7 @@
 //! The kept generations of a store.
 
 use super::{StorePlace, run_state_of};
-use crate::page::reading::Access;
+use crate::page::tool::reading::Access;
 use crate::train::trainer::TrainError;
 use serde::Serialize;
 use std::path::Path;

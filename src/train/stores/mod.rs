@@ -2,7 +2,7 @@
 //!
 //! Each file is one of these. They give plain structs, which the tool prints as text or JSON.
 //!
-//! Invariants: 1. what only looks writes nothing ([`crate::page::reading`]); 2. what makes a store or a file makes it whole
+//! Invariants: 1. what only looks writes nothing ([`crate::page::tool::reading`]); 2. what makes a store or a file makes it whole
 //! or not at all; 3. values of rows come from the code that the trainer uses.
 
 mod change;
@@ -35,7 +35,7 @@ use crate::base::identity::RunId;
 use crate::checkpoint::run_state::RunState;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
-use crate::page::reading::{Access, ReadError, StoreReader, WitnessRule, segments_in};
+use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule, segments_in};
 use std::path::{Path, PathBuf};
 
 impl From<ReadError> for TrainError {

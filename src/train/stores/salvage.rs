@@ -23,14 +23,14 @@ use crate::checkpoint::run_state::{DatasetPrint, RunIdentity, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::densify::stats::GradHistogram;
-use crate::page::commit::CommitError;
-use crate::page::format::{SlotHeader, SlotRef};
-use crate::page::new_store::{NewStore, refuse_existing};
-use crate::page::reading::{Access, ReadError, StoreReader, WitnessRule, format_at, refuse_if_in_use};
-use crate::page::scan::{Scan, scan_slots};
-use crate::page::slot_reader::SlotReader;
-use crate::page::slots::SlotLayout;
-use crate::page::spill_format::SpillFormat;
+use crate::page::format::slot_header::{SlotHeader, SlotRef};
+use crate::page::format::spill_format::SpillFormat;
+use crate::page::map::commit::CommitError;
+use crate::page::tool::new_store::{NewStore, refuse_existing};
+use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule, format_at, refuse_if_in_use};
+use crate::page::tool::scan::{Scan, scan_slots};
+use crate::page::tool::slot_reader::SlotReader;
+use crate::page::versions::slots::SlotLayout;
 use crate::paging::label::{label, meta_from_label};
 use crate::paging::stored::{check_values, layout_of};
 use crate::scene::events::EventKind;
@@ -158,7 +158,10 @@ fn source_of(
         notes.push(format!("{} slots of another store ({other:032x}) are left out", found.len()));
     }
     for (segment, bytes) in &scan.short {
-        notes.push(format!("{} ends after {bytes} bytes", crate::page::segment_files::segment_file_name(*segment)));
+        notes.push(format!(
+            "{} ends after {bytes} bytes",
+            crate::page::engine::segment_files::segment_file_name(*segment)
+        ));
     }
     for (at, what) in &scan.broken {
         notes.push(format!("segment {} offset {}: {what}", at.segment, at.offset));

@@ -9,7 +9,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageNo;
 use crate::checkpoint::run_state::RunState;
 use crate::exchange::ply::{ExportFrame, PlyMeta, to_local};
-use crate::page::reading::{Access, StoreReader};
+use crate::page::tool::reading::{Access, StoreReader};
 use crate::scene::columns::Columns;
 use crate::scene::state::SceneState;
 use crate::train::catch_up::evaluate_all;

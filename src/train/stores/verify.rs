@@ -6,10 +6,10 @@
 
 use super::{StorePlace, options_of};
 use crate::checkpoint::run_state::RunState;
-use crate::page::commit::CommitError;
-use crate::page::format::SlotRef;
-use crate::page::reading::{Access, ReadError, StoreReader, WitnessRule};
-use crate::page::segment_files::segment_file_name;
+use crate::page::engine::segment_files::segment_file_name;
+use crate::page::format::slot_header::SlotRef;
+use crate::page::map::commit::CommitError;
+use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule};
 use crate::paging::stored::{PageLimits, check_values, layout_of};
 use crate::train::trainer::TrainError;
 use serde::Serialize;
@@ -155,7 +155,7 @@ fn check_segments(store: &StoreReader, slots: &[SlotRef], verdict: &mut Verdict)
 fn fault_of_map(error: &CommitError) -> Fault {
     let file = match error {
         CommitError::File { name, .. } => name,
-        _ => crate::page::commit::MAP_NAME,
+        _ => crate::page::map::commit::MAP_NAME,
     };
     // The remedy has its place in messages for people.
     let what = error.to_string().lines().next().unwrap_or_default().to_string();

@@ -3,7 +3,7 @@
 use crate::Target;
 use gsscale::base::units::parse_bytes;
 use gsscale::config::file::{TrainConfig, default_file};
-use gsscale::page::codec::Codec;
+use gsscale::page::format::codec::Codec;
 use gsscale::schedule::order::Order;
 
 pub fn config() -> Target {

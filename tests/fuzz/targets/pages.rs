@@ -3,14 +3,16 @@
 use super::{split_mode, with_mode};
 use crate::Target;
 use gsscale::base::ids::PageId;
-use gsscale::page::buffer::PageBuffer;
-use gsscale::page::codec::{Codec, decode, encode_as};
-use gsscale::page::format::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, checksum, transfer_bytes};
-use gsscale::page::memory_store::MemoryStore;
-use gsscale::page::paged_store::{PageMoved, PagedStore, PagedStoreConfig};
-use gsscale::page::slots::SlotLayout;
-use gsscale::page::spill_format::{FORMAT_BYTES, Purpose, SpillFormat};
-use gsscale::page::store::{Direction, PageStore, Place, Transfer};
+use gsscale::page::engine::buffer::PageBuffer;
+use gsscale::page::engine::memory::MemoryStore;
+use gsscale::page::engine::transfers::{Direction, PageStore, Place, Transfer};
+use gsscale::page::format::codec::{Codec, decode, encode_as};
+use gsscale::page::format::slot_header::{
+    HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, checksum, transfer_bytes,
+};
+use gsscale::page::format::spill_format::{FORMAT_BYTES, Purpose, SpillFormat};
+use gsscale::page::versions::paged_store::{PageMoved, PagedStore, PagedStoreConfig};
+use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::label::{label, meta_from_label};
 use gsscale::scene::page_layout::PageLayout;
 use gsscale::scene::page_meta::{PageBounds, PageMeta};

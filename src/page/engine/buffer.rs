@@ -1,0 +1,133 @@
+//! Memory for one version of one page, aligned for direct I/O.
+//!
+//! Invariants: 1. the first byte lies on a multiple of [`ALIGNMENT`], and stays there when the buffer is moved: the bytes
+//! live elsewhere; 2. the length is a multiple of [`ALIGNMENT`]; 3. a fresh buffer is zero; 4. a mapped one takes memory from
+//! the machine only as it is written to, never in huge pages that it would share with others, and gives all of it back at its
+//! end, whatever the heap looks like by then; of one that a ring has registered, once the ring has been used again.
+
+#[cfg(target_os = "linux")]
+use crate::page::engine::registered::Registration;
+use memmap2::MmapMut;
+
+/// Alignment of memory, offsets and lengths that every drive accepts for direct I/O, bytes.
+pub const ALIGNMENT: usize = 4096;
+
+/// Smaller buffers are not worth a map of their own, bytes.
+const MAPPED_LEAST: usize = 32 << 10;
+
+/// An aligned buffer of fixed length. Moved, never copied, between frames and transfers.
+pub struct PageBuffer {
+    memory: Memory,
+    start: usize,
+    len: usize,
+    /// Its place in the table of the ring that moves it.
+    #[cfg(target_os = "linux")]
+    pub(in crate::page) registration: Option<Registration>,
+}
+
+enum Memory {
+    /// Longer than the buffer by up to one alignment.
+    Heap(Vec<u8>),
+    /// Begins on a page of the machine, which is a multiple of the alignment.
+    Mapped(MmapMut),
+}
+
+impl PageBuffer {
+    /// A buffer of zeros of at least `bytes` bytes.
+    pub fn zeroed(bytes: usize) -> PageBuffer {
+        let len = bytes.next_multiple_of(ALIGNMENT);
+        let bytes = vec![0; len + ALIGNMENT];
+        let start = bytes.as_ptr().align_offset(ALIGNMENT);
+        PageBuffer::of(Memory::Heap(bytes), start, len)
+    }
+
+    /// As [`PageBuffer::zeroed`], for buffers that stay: in memory of its own, if it is large enough and the machine has
+    /// another map to give.
+    pub fn mapped(bytes: usize) -> PageBuffer {
+        let len = bytes.next_multiple_of(ALIGNMENT);
+        let map = (len >= MAPPED_LEAST).then(|| MmapMut::map_anon(len).ok()).flatten();
+        #[cfg(target_os = "linux")]
+        if let Some(map) = &map {
+            // Refused by kernels without huge pages, which make none. Steps took as long with them.
+            let _ = map.advise(memmap2::Advice::NoHugePage);
+        }
+        match map.filter(|map| map.as_ptr().align_offset(ALIGNMENT) == 0) {
+            Some(map) => PageBuffer::of(Memory::Mapped(map), 0, len),
+            None => PageBuffer::zeroed(bytes),
+        }
+    }
+
+    fn of(memory: Memory, start: usize, len: usize) -> PageBuffer {
+        PageBuffer {
+            memory,
+            start,
+            len,
+            #[cfg(target_os = "linux")]
+            registration: None,
+        }
+    }
+
+    /// Whether it is in memory of its own.
+    pub fn is_mapped(&self) -> bool {
+        matches!(self.memory, Memory::Mapped(_))
+    }
+
+    /// Bytes of the buffer.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether it has no bytes.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// All bytes.
+    pub fn as_slice(&self) -> &[u8] {
+        match &self.memory {
+            Memory::Heap(bytes) => &bytes[self.start..self.start + self.len],
+            Memory::Mapped(map) => &map[..self.len],
+        }
+    }
+
+    /// All bytes.
+    pub fn as_mut_slice(&mut self) -> &mut [u8] {
+        match &mut self.memory {
+            Memory::Heap(bytes) => &mut bytes[self.start..self.start + self.len],
+            Memory::Mapped(map) => &mut map[..self.len],
+        }
+    }
+}
+
+impl std::fmt::Debug for PageBuffer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "PageBuffer({} bytes)", self.len)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn buffers_are_aligned_wherever_they_go() {
+        for make in [PageBuffer::zeroed, PageBuffer::mapped] {
+            let buffers: Vec<PageBuffer> = [0, 1, 4096, 749_568].map(make).into();
+            for (buffer, len) in buffers.iter().zip([0, 4096, 4096, 749_568]) {
+                assert_eq!(buffer.len(), len);
+                assert_eq!(buffer.as_slice().as_ptr().align_offset(ALIGNMENT), 0);
+                assert!(buffer.as_slice().iter().all(|&b| b == 0));
+            }
+            let mut boxed = Box::new(buffers);
+            boxed[3].as_mut_slice()[749_567] = 7;
+            assert_eq!(boxed[3].as_slice().as_ptr().align_offset(ALIGNMENT), 0);
+            assert_eq!(boxed[3].as_slice()[749_567], 7);
+        }
+    }
+
+    #[test]
+    fn small_buffers_and_empty_ones_are_not_mapped() {
+        let is_mapped = |bytes| PageBuffer::mapped(bytes).is_mapped();
+        assert_eq!([0, 4096, 32 << 10, 749_568].map(is_mapped), [false, false, true, true]);
+    }
+}

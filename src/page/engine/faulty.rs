@@ -1,0 +1,226 @@
+//! A store that fails on purpose, around one that works.
+//!
+//! Every operation is counted by kind; rules say which one fails, how, and whether all later ones of the kind fail
+//! too. The rules can be changed while the store is in use. It keeps the first of [`PageStore`]'s invariants (every
+//! buffer comes back, as it was handed over) and breaks the others as it is told.
+
+use crate::base::rng::mix64;
+use crate::page::engine::buffer::ALIGNMENT;
+use crate::page::engine::transfers::{Completion, Direction, PageStore, Place, Transfer};
+use std::collections::BTreeMap;
+use std::io;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// Kinds of operations, counted apart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Operation {
+    /// A transfer from the store.
+    Read,
+    /// A transfer to the store.
+    Write,
+    /// [`PageStore::sync`].
+    Sync,
+    /// [`PageStore::create_segment`].
+    Create,
+}
+
+/// How an operation fails.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fault {
+    /// An error is reported and nothing is done. `Other` stands for EIO.
+    Error(io::ErrorKind),
+    /// Only the first half is moved, and reported as an error.
+    Short,
+    /// Only the first half is moved, and reported as all of it: a torn page.
+    Torn,
+    /// One bit on the way is flipped: this bit of the transfer.
+    FlipBit(u64),
+    /// Nothing is done, and reported as done.
+    Lost,
+    /// The transfer goes to or comes from another place.
+    Misdirected(Place),
+}
+
+/// Which operation fails how.
+#[derive(Debug, Clone, Copy)]
+pub struct Rule {
+    /// Kind of operation.
+    pub on: Operation,
+    /// Number of the operation of this kind, from 0.
+    pub nth: u64,
+    /// Whether all later ones fail as well.
+    pub for_ever: bool,
+    /// How.
+    pub fault: Fault,
+}
+
+#[derive(Debug, Default)]
+struct Plan {
+    rules: Vec<Rule>,
+    counts: BTreeMap<Operation, u64>,
+    /// Seed of the order of completions, when they are to be out of order.
+    reorder: Option<u64>,
+}
+
+/// The rules of a store, shared with whoever tests it.
+#[derive(Debug, Clone, Default)]
+pub struct Faults(Arc<Mutex<Plan>>);
+
+impl Faults {
+    /// No faults yet.
+    pub fn new() -> Faults {
+        Faults::default()
+    }
+
+    /// Adds a rule; the first one that fits an operation counts.
+    pub fn add(&self, on: Operation, nth: u64, for_ever: bool, fault: Fault) {
+        self.plan().rules.push(Rule { on, nth, for_ever, fault });
+    }
+
+    /// Forgets the rules; counts go on.
+    pub fn clear(&self) {
+        self.plan().rules.clear();
+    }
+
+    /// From now on transfers complete one by one, in an order that follows from the seed.
+    pub fn reorder(&self, seed: u64) {
+        self.plan().reorder = Some(seed);
+    }
+
+    /// Operations of a kind so far.
+    pub fn count(&self, on: Operation) -> u64 {
+        self.plan().counts.get(&on).copied().unwrap_or(0)
+    }
+
+    fn plan(&self) -> MutexGuard<'_, Plan> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Counts an operation and says how it is to fail.
+    fn next(&self, on: Operation) -> Option<Fault> {
+        let mut plan = self.plan();
+        let count = plan.counts.entry(on).or_default();
+        let n = *count;
+        *count += 1;
+        let hit = |r: &&Rule| r.on == on && (r.nth == n || r.for_ever && r.nth < n);
+        plan.rules.iter().find(hit).map(|r| r.fault)
+    }
+
+    /// A number below `n` if completions are out of order.
+    fn pick(&self, n: usize) -> Option<usize> {
+        let mut plan = self.plan();
+        let seed = plan.reorder.as_mut()?;
+        *seed = mix64(*seed);
+        Some((*seed % n.max(1) as u64) as usize)
+    }
+}
+
+/// A transfer that was changed on its way in, as it was.
+#[derive(Debug)]
+struct Changed {
+    fault: Fault,
+    place: Place,
+    bytes: usize,
+}
+
+/// The failing store.
+pub struct FaultyStore {
+    inner: Box<dyn PageStore>,
+    faults: Faults,
+    changed: BTreeMap<u64, Changed>,
+    ended: Vec<Completion>,
+}
+
+impl FaultyStore {
+    /// Around `inner`, after the rules of `faults`.
+    pub fn new(inner: Box<dyn PageStore>, faults: Faults) -> FaultyStore {
+        FaultyStore { inner, faults, changed: BTreeMap::new(), ended: Vec::new() }
+    }
+
+    /// Puts a transfer back as it was handed over and reports its end as the fault wants it.
+    fn restore(&mut self, mut completion: Completion) -> Completion {
+        let Some(Changed { fault, place, bytes }) = self.changed.remove(&completion.transfer.token) else {
+            return completion;
+        };
+        let transfer = &mut completion.transfer;
+        (transfer.place, transfer.bytes) = (place, bytes);
+        match fault {
+            Fault::Short => completion.result = Err(io::ErrorKind::UnexpectedEof.into()),
+            // On a read, what arrives; on a write, the caller's memory is as it was.
+            Fault::FlipBit(bit) => flip(transfer, bit),
+            _ => {}
+        }
+        completion
+    }
+}
+
+fn flip(transfer: &mut Transfer, bit: u64) {
+    let bit = bit as usize % (transfer.bytes * 8).max(1);
+    transfer.buffer.as_mut_slice()[bit / 8] ^= 1 << (bit % 8);
+}
+
+impl PageStore for FaultyStore {
+    fn name(&self) -> &'static str {
+        self.inner.name()
+    }
+
+    fn create_segment(&mut self, segment: u32, bytes: u64) -> io::Result<()> {
+        match self.faults.next(Operation::Create) {
+            Some(Fault::Error(kind)) => Err(kind.into()),
+            Some(_) => Err(io::ErrorKind::Other.into()),
+            None => self.inner.create_segment(segment, bytes),
+        }
+    }
+
+    fn check_segment(&self, segment: u32, bytes: u64) -> io::Result<()> {
+        self.inner.check_segment(segment, bytes)
+    }
+
+    fn submit(&mut self, mut transfer: Transfer) {
+        let on = match transfer.direction {
+            Direction::Read => Operation::Read,
+            Direction::Write => Operation::Write,
+        };
+        let Some(fault) = self.faults.next(on) else { return self.inner.submit(transfer) };
+        match fault {
+            Fault::Error(kind) => return self.ended.push(Completion { transfer, result: Err(kind.into()) }),
+            Fault::Lost => return self.ended.push(Completion { transfer, result: Ok(()) }),
+            _ => {}
+        }
+        self.changed.insert(transfer.token, Changed { fault, place: transfer.place, bytes: transfer.bytes });
+        match fault {
+            Fault::Short | Fault::Torn => transfer.bytes = transfer.bytes / 2 / ALIGNMENT * ALIGNMENT,
+            Fault::FlipBit(bit) if on == Operation::Write => flip(&mut transfer, bit),
+            Fault::Misdirected(place) => transfer.place = place,
+            _ => {}
+        }
+        self.inner.submit(transfer);
+    }
+
+    fn complete(&mut self, wait: bool, done: &mut Vec<Completion>) {
+        let mut completions = Vec::new();
+        self.inner.complete(wait && self.ended.is_empty(), &mut completions);
+        for completion in completions {
+            let restored = self.restore(completion);
+            self.ended.push(restored);
+        }
+        match self.faults.pick(self.ended.len()) {
+            Some(chosen) if !self.ended.is_empty() => done.push(self.ended.swap_remove(chosen)),
+            Some(_) => {}
+            None => done.append(&mut self.ended),
+        }
+    }
+
+    fn in_flight(&self) -> usize {
+        self.inner.in_flight() + self.ended.len()
+    }
+
+    fn sync(&mut self) -> io::Result<()> {
+        match self.faults.next(Operation::Sync) {
+            Some(Fault::Error(kind)) => Err(kind.into()),
+            Some(Fault::Lost) => Ok(()),
+            Some(_) => Err(io::ErrorKind::Other.into()),
+            None => self.inner.sync(),
+        }
+    }
+}

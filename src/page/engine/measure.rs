@@ -1,0 +1,392 @@
+//! How fast a drive moves pages: by engine, request size and number of requests at once.
+//!
+//! Measures with the very engines that a run uses, each on a segment of its own (direct I/O on bytes that the page
+//! cache holds is another thing than either), which have no names any more while they are measured, so that nothing is
+//! left behind however the process ends. Reads are cold as far as this machine goes (direct I/O, or
+//! bytes that the page cache was told to forget); a drive's own cache, or a host's below a virtual drive, is part of
+//! what is measured.
+//!
+//! Invariants: 1. rounds visit every case in turn, so that a drive whose speed wanders treats all alike; figures are
+//! medians over rounds; 2. bytes on the drive, bytes written and seconds are bounded by [`Limits`] (a case that was
+//! begun ends, and the first one is always measured).
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::rng::{Purpose, Stream};
+use crate::base::units::format_bytes;
+use crate::page::engine::buffer::PageBuffer;
+use crate::page::engine::open::{IoEngine, open_engine};
+use crate::page::engine::segment_files::segment_file_name;
+use crate::page::engine::transfers::{Completion, Direction, PageStore, Place, Transfer};
+use crate::page::folder::file_system::free_bytes;
+use std::io;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+/// Rounds that are aimed at.
+const ROUNDS: usize = 5;
+/// Requests of the first fill.
+const FILL_BYTES: usize = 1 << 20;
+/// At once, while filling.
+const FILL_DEPTH: usize = 8;
+
+/// Bounds of a measurement.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limits {
+    /// Bytes on the drive, shared by the engines.
+    pub file_bytes: u64,
+    /// Seconds for everything, about.
+    pub seconds: f64,
+    /// Bytes written besides the first fill, about.
+    pub written_bytes: u64,
+}
+
+/// One way of moving bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Case {
+    /// What moves them.
+    pub engine: IoEngine,
+    /// Bytes of a transfer.
+    pub bytes: usize,
+    /// Transfers in flight.
+    pub depth: usize,
+}
+
+/// A case with its rates, bytes per second; `None` where the time did not reach.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Measured {
+    /// What was measured.
+    pub case: Case,
+    /// Of reads at random places.
+    pub read: Option<f64>,
+    /// Of writes at random places, made durable.
+    pub write: Option<f64>,
+}
+
+impl Measured {
+    /// Bytes per second of as many reads as writes, which is what training does: nearly every page read is changed.
+    pub fn both(&self) -> Option<f64> {
+        Some(2.0 / (1.0 / self.read? + 1.0 / self.write?))
+    }
+}
+
+/// Everything a sweep found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sweep {
+    /// In the order of the cases.
+    pub measured: Vec<Measured>,
+    /// What users should know: engines that do not work here, no direct I/O.
+    pub notes: Vec<String>,
+    /// Rounds that were finished.
+    pub rounds: usize,
+    /// Bytes written to the drive in all.
+    pub written_bytes: u64,
+}
+
+/// Measures all `cases` on the drive of `folder`. Cases whose engine does not work here stay without rates. Calls
+/// `progress` with the share done.
+///
+/// # Errors
+/// Too little space, the folder cannot be written, the drive fails.
+pub fn sweep(folder: &Path, cases: &[Case], limits: Limits, progress: &mut dyn FnMut(f64)) -> InputResult<Sweep> {
+    let begin = Instant::now();
+    let depth_max = cases.iter().map(|c| c.depth).max().unwrap_or(1);
+    let mut engines: Vec<IoEngine> = Vec::new();
+    cases.iter().filter(|c| c.depth > 0).for_each(|c| {
+        if !engines.contains(&c.engine) {
+            engines.push(c.engine);
+        }
+    });
+    let mut scratch = Scratch::new(folder, &engines, limits.file_bytes, depth_max)?;
+    let failed = |e: io::Error| InputError::io(folder, "measuring the drive", &e);
+    scratch.fill(Duration::from_secs_f64(limits.seconds / 2.0)).map_err(failed)?;
+    let slice = (limits.seconds - begin.elapsed().as_secs_f64()) / (2 * ROUNDS * cases.len().max(1)) as f64;
+    let slice = Duration::from_secs_f64(slice.max(0.005));
+    let written_max = limits.written_bytes / (ROUNDS * cases.len().max(1)) as u64;
+    let mut rates = vec![[const { Vec::new() }; 2]; cases.len()];
+    let mut rounds = 0;
+    'rounds: while rounds < ROUNDS {
+        for turn in 0..cases.len() {
+            // Each round begins elsewhere: what comes last is what time may run out for.
+            let i = (turn + rounds * cases.len() / ROUNDS) % cases.len();
+            let case = cases[i];
+            if !scratch.has(case.engine) {
+                continue;
+            }
+            for direction in [Direction::Read, Direction::Write] {
+                let begun = rounds > 0 || turn > 0;
+                if begun && begin.elapsed().as_secs_f64() > limits.seconds {
+                    break 'rounds;
+                }
+                let bytes_max = if direction == Direction::Write { written_max } else { u64::MAX };
+                let rate = scratch.rate(case, direction, slice, bytes_max).map_err(failed)?;
+                rates[i][usize::from(direction == Direction::Write)].push(rate);
+            }
+            progress(begin.elapsed().as_secs_f64() / limits.seconds);
+        }
+        rounds += 1;
+    }
+    let measured = cases.iter().zip(&mut rates).map(|(&case, [read, write])| Measured {
+        case,
+        read: median(read),
+        write: median(write),
+    });
+    let measured = measured.collect();
+    Ok(Sweep { measured, notes: scratch.notes, rounds, written_bytes: scratch.written_bytes })
+}
+
+/// The middle value; `None` of nothing.
+pub(in crate::page) fn median(values: &mut [f64]) -> Option<f64> {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied()
+}
+
+/// Segments without names, one for each engine.
+pub(in crate::page) struct Scratch {
+    engines: Vec<Opened>,
+    segment_bytes: u64,
+    buffers: Vec<PageBuffer>,
+    draws: Stream,
+    /// As in [`Sweep::notes`].
+    pub notes: Vec<String>,
+    /// As in [`Sweep::written_bytes`].
+    pub written_bytes: u64,
+}
+
+/// An engine at work.
+struct Opened {
+    engine: IoEngine,
+    segment: u32,
+    store: Box<dyn PageStore>,
+    /// Bytes from the start that were written at least once; others would not be read from the drive.
+    filled_bytes: u64,
+}
+
+impl Scratch {
+    /// Makes the segments, of `file_bytes` bytes together, and opens them in all `engines` that work here.
+    ///
+    /// # Errors
+    /// Too little space; the folder cannot be written; no engine works.
+    pub fn new(folder: &Path, engines: &[IoEngine], file_bytes: u64, depth: usize) -> InputResult<Scratch> {
+        let failed = |doing: &'static str| move |e: io::Error| InputError::io(folder, doing, &e);
+        let free = free_bytes(folder).map_err(failed("asking for the free space"))?;
+        if let Some(free) = free.filter(|&free| free < file_bytes + file_bytes / 4) {
+            let problem =
+                format!("{} are free, measuring takes {}", format_bytes(free), format_bytes(file_bytes * 5 / 4));
+            return Err(InputError::new(folder, problem, "free space on that drive, or measure with a smaller file"));
+        }
+        let own = folder.join(format!("gsscale-measure-{}", std::process::id()));
+        std::fs::create_dir(&own).map_err(failed("making a folder to measure in"))?;
+        let opened = Scratch::open_all(&own, engines, file_bytes, depth);
+        // From here on the segments have no names: the system takes their space back when this process ends or before.
+        for segment in 0..engines.len() as u32 {
+            // Missing where an engine did not come so far; what cannot be removed is told with the folder.
+            let _ = std::fs::remove_file(own.join(segment_file_name(segment)));
+        }
+        let removed = std::fs::remove_dir(&own);
+        let scratch = opened?;
+        removed.map_err(failed("removing the folder that was measured in"))?;
+        Ok(scratch)
+    }
+
+    fn open_all(own: &Path, engines: &[IoEngine], file_bytes: u64, depth: usize) -> InputResult<Scratch> {
+        let mut scratch = Scratch {
+            engines: Vec::new(),
+            segment_bytes: file_bytes / engines.len().max(1) as u64 / FILL_BYTES as u64 * FILL_BYTES as u64,
+            buffers: Vec::new(),
+            draws: Stream::new(1, Purpose::Test, 0, 0),
+            notes: Vec::new(),
+            written_bytes: 0,
+        };
+        let mut refused = None;
+        for (segment, &engine) in (0..).zip(engines) {
+            let mut opened = match open_engine(engine, own, depth) {
+                Ok(opened) => opened,
+                Err(error) => {
+                    scratch.notes.push(format!("{}: {}", error.file.display(), error.problem));
+                    refused = Some(error);
+                    continue;
+                }
+            };
+            let failed = |e: io::Error| InputError::io(own, "making a file to measure with", &e);
+            opened.store.create_segment(segment, scratch.segment_bytes).map_err(failed)?;
+            // The engine opens the file now, while it has a name, and keeps it.
+            let buffer = PageBuffer::zeroed(4096);
+            let place = Place { segment, offset: 0 };
+            opened.store.submit(Transfer { token: 0, direction: Direction::Read, place, bytes: 4096, buffer });
+            finish(&mut *opened.store).map_err(failed)?;
+            scratch.engines.push(Opened { engine, segment, store: opened.store, filled_bytes: 0 });
+            scratch.notes.extend(opened.notes);
+        }
+        scratch.notes.dedup();
+        match refused {
+            Some(error) if scratch.engines.is_empty() => Err(error),
+            _ => Ok(scratch),
+        }
+    }
+
+    fn has(&self, engine: IoEngine) -> bool {
+        self.engines.iter().any(|o| o.engine == engine)
+    }
+
+    /// Writes every segment from its start, until it is full or its share of the time ends; returns bytes per second,
+    /// made durable.
+    ///
+    /// # Errors
+    /// Of the drive.
+    pub fn fill(&mut self, time: Duration) -> io::Result<f64> {
+        self.prepare_buffers(FILL_DEPTH, FILL_BYTES);
+        let (begin, written_before) = (Instant::now(), self.written_bytes);
+        let share = time / self.engines.len().max(1) as u32;
+        for opened in &mut self.engines {
+            let places = (0..self.segment_bytes / FILL_BYTES as u64).map(|i| i * FILL_BYTES as u64);
+            let way = Way { direction: Direction::Write, bytes: FILL_BYTES, depth: FILL_DEPTH };
+            opened.filled_bytes = opened.run(way, places, &mut self.buffers, Instant::now() + share)?;
+            opened.store.sync()?;
+            self.written_bytes += opened.filled_bytes;
+        }
+        Ok((self.written_bytes - written_before) as f64 / begin.elapsed().as_secs_f64())
+    }
+
+    /// Bytes per second of one case, over about `time` and at most about `bytes_max` bytes.
+    ///
+    /// # Errors
+    /// Of the drive.
+    pub fn rate(&mut self, case: Case, direction: Direction, time: Duration, bytes_max: u64) -> io::Result<f64> {
+        self.prepare_buffers(case.depth, case.bytes);
+        let bytes = case.bytes as u64;
+        let Some(opened) = self.engines.iter_mut().find(|o| o.engine == case.engine) else {
+            return Err(io::ErrorKind::Unsupported.into());
+        };
+        let mut places: Vec<u64> = (0..opened.filled_bytes / bytes).map(|i| i * bytes).collect();
+        for i in (1..places.len()).rev() {
+            places.swap(i, self.draws.below(i as u64 + 1) as usize);
+        }
+        // Never fewer than keep the drive busy as the case wants it.
+        places.truncate((bytes_max / bytes).max(2 * case.depth as u64) as usize);
+        let begin = Instant::now();
+        let way = Way { direction, bytes: case.bytes, depth: case.depth };
+        let moved = opened.run(way, places.into_iter(), &mut self.buffers, begin + time)?;
+        if direction == Direction::Write {
+            opened.store.sync()?;
+            self.written_bytes += moved;
+        }
+        Ok(moved as f64 / begin.elapsed().as_secs_f64())
+    }
+
+    /// At least `depth` buffers of at least `bytes` bytes, full of noise that no drive can compress.
+    fn prepare_buffers(&mut self, depth: usize, bytes: usize) {
+        if self.buffers.iter().filter(|b| b.len() >= bytes).count() >= depth {
+            return;
+        }
+        self.buffers.retain(|b| b.len() >= bytes);
+        while self.buffers.len() < depth {
+            let mut buffer = PageBuffer::zeroed(bytes);
+            for word in buffer.as_mut_slice().chunks_exact_mut(8) {
+                word.copy_from_slice(&self.draws.next_u64().to_le_bytes());
+            }
+            self.buffers.push(buffer);
+        }
+    }
+}
+
+/// How bytes are moved.
+#[derive(Clone, Copy)]
+struct Way {
+    direction: Direction,
+    bytes: usize,
+    depth: usize,
+}
+
+impl Opened {
+    /// Moves bytes at `places` until they or the time end. Returns how many bytes were moved.
+    fn run(
+        &mut self,
+        way: Way,
+        mut places: impl Iterator<Item = u64>,
+        buffers: &mut Vec<PageBuffer>,
+        end: Instant,
+    ) -> io::Result<u64> {
+        let Way { direction, bytes, depth } = way;
+        let mut moved = 0;
+        let mut done: Vec<Completion> = Vec::new();
+        let mut error = None;
+        loop {
+            while self.store.in_flight() < depth && error.is_none() && (moved == 0 || Instant::now() < end) {
+                let Some(at) = buffers.iter().position(|b| b.len() >= bytes) else { break };
+                let Some(offset) = places.next() else { break };
+                let place = Place { segment: self.segment, offset };
+                let buffer = buffers.swap_remove(at);
+                self.store.submit(Transfer { token: offset, direction, place, bytes, buffer });
+            }
+            if self.store.in_flight() == 0 {
+                return error.map_or(Ok(moved), Err);
+            }
+            self.store.complete(true, &mut done);
+            for completion in done.drain(..) {
+                moved += completion.transfer.bytes as u64;
+                buffers.push(completion.transfer.buffer);
+                error = error.or(completion.result.err());
+            }
+        }
+    }
+}
+
+/// Waits for everything in flight.
+fn finish(store: &mut dyn PageStore) -> io::Result<()> {
+    let mut done = Vec::new();
+    while store.in_flight() > 0 {
+        store.complete(true, &mut done);
+    }
+    done.into_iter().try_for_each(|c| c.result)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_small_sweep_measures_every_case_and_leaves_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let engines = [IoEngine::Pread, IoEngine::Mmap];
+        let sizes = [(65_536, 1), (753_664, 4), (3 << 20, 2)];
+        let cases: Vec<Case> =
+            engines.iter().flat_map(|&engine| sizes.map(|(bytes, depth)| Case { engine, bytes, depth })).collect();
+        let limits = Limits { file_bytes: 16 << 20, seconds: 30.0, written_bytes: 1 << 20 };
+        let mut last = 0.0;
+        let mut sweep =
+            |seconds| sweep(folder.path(), &cases, Limits { seconds, ..limits }, &mut |share| last = share).unwrap();
+        let short = sweep(0.5);
+        assert!(short.measured.len() == cases.len() && short.written_bytes >= FILL_BYTES as u64);
+        // Buffers go back and forth between the cases; each needs at least its depth, twice, for each round.
+        for measured in &short.measured {
+            assert!(measured.read.is_none_or(|r| r > 0.0) && measured.write.is_none_or(|w| w > 0.0));
+        }
+        assert!(short.measured[0].both().is_some(), "the first case of the first round is always measured");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "nothing is left");
+        assert!(last > 0.0);
+    }
+
+    #[test]
+    fn too_little_space_is_refused_before_anything_is_made() {
+        let folder = tempfile::tempdir().unwrap();
+        let case = Case { engine: IoEngine::Pread, bytes: 65_536, depth: 1 };
+        let limits = Limits { file_bytes: 1 << 60, seconds: 1.0, written_bytes: 0 };
+        let refused = sweep(folder.path(), &[case], limits, &mut |_| ()).unwrap_err().to_string();
+        assert!(refused.contains("free") && refused.contains("smaller"), "{refused}");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn medians() {
+        assert_eq!(median(&mut []), None);
+        assert_eq!(median(&mut [3.0]), Some(3.0));
+        assert_eq!(median(&mut [3.0, 9.0, 1.0]), Some(3.0));
+        let both = |read, write| {
+            let case = Case { engine: IoEngine::Pread, bytes: 1, depth: 1 };
+            Measured { case, read, write }.both()
+        };
+        assert_eq!(both(Some(2.0), Some(2.0)), Some(2.0));
+        assert_eq!(both(Some(1.0), None), None);
+    }
+}

@@ -1,0 +1,23 @@
+//! Moves bytes of pages between memory and segment files: the trait every I/O engine implements, the engines (memory, pread,
+//! mmap, io_uring), what they share, and how fast a drive is. Knows neither versions nor commits.
+
+pub mod buffer;
+pub mod drive_rate;
+pub mod faulty;
+pub mod measure;
+pub mod memory;
+pub mod mmap;
+pub mod open;
+pub(in crate::page) mod page_cache;
+pub mod pread;
+#[cfg(target_os = "linux")]
+pub(in crate::page) mod registered;
+pub mod segment_files;
+pub(in crate::page) mod segment_io;
+pub(in crate::page) mod short_transfers;
+#[cfg(target_os = "linux")]
+pub(in crate::page) mod slab;
+pub(in crate::page) mod transfer_pool;
+pub mod transfers;
+#[cfg(target_os = "linux")]
+pub mod uring;

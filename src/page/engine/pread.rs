@@ -1,0 +1,108 @@
+//! Plain positioned reads and writes on worker threads: the engine that works everywhere.
+//!
+//! Direct I/O where the file system allows it; else through the page cache, of which it keeps as little as it can.
+//! Invariants: those of [`PageStore`].
+
+use crate::page::engine::page_cache::{WriteBehind, forget};
+use crate::page::engine::segment_io::{SegmentIo, move_bytes};
+use crate::page::engine::transfer_pool::TransferPool;
+use crate::page::engine::transfers::{Completion, Direction, PageStore, Transfer};
+use std::io;
+use std::path::Path;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// Segments as files, moved by threads that block.
+pub struct PreadStore {
+    shared: Arc<Shared>,
+    pool: TransferPool,
+}
+
+struct Shared {
+    segments: Mutex<SegmentIo>,
+    behind: Mutex<WriteBehind>,
+    direct: bool,
+}
+
+impl PreadStore {
+    /// Opens a folder of segments with `threads` threads; the drive sees at most that many requests at once. With
+    /// `direct`, past the page cache where the file system allows it.
+    ///
+    /// # Errors
+    /// The folder cannot be used, or no thread can be started.
+    pub fn open(folder: &Path, threads: usize, direct: bool) -> io::Result<PreadStore> {
+        PreadStore::over(SegmentIo::new(folder, direct)?, threads)
+    }
+
+    /// As [`PreadStore::open`] for a store that must stay as it is: writes fail.
+    ///
+    /// # Errors
+    /// No thread can be started.
+    pub fn open_read_only(folder: &Path, threads: usize) -> io::Result<PreadStore> {
+        PreadStore::over(SegmentIo::read_only(folder), threads)
+    }
+
+    fn over(segments: SegmentIo, threads: usize) -> io::Result<PreadStore> {
+        let direct = segments.is_direct();
+        let shared = Arc::new(Shared { segments: Mutex::new(segments), behind: Mutex::default(), direct });
+        let worker = Arc::clone(&shared);
+        let pool = TransferPool::new("pread", threads, move |transfer| worker.carry_out(transfer))?;
+        Ok(PreadStore { shared, pool })
+    }
+
+    /// Whether bytes go past the page cache.
+    pub fn is_direct(&self) -> bool {
+        self.shared.direct
+    }
+}
+
+impl Shared {
+    fn carry_out(&self, transfer: &mut Transfer) -> io::Result<()> {
+        let file = lock(&self.segments).file_of(transfer)?;
+        move_bytes(&file, transfer)?;
+        if !self.direct {
+            match transfer.direction {
+                Direction::Read => forget(&file, transfer.place.offset, transfer.bytes as u64),
+                Direction::Write => {
+                    lock(&self.behind).wrote(&file, transfer.place.offset, transfer.bytes as u64);
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl PageStore for PreadStore {
+    fn name(&self) -> &'static str {
+        "pread"
+    }
+
+    fn create_segment(&mut self, segment: u32, bytes: u64) -> io::Result<()> {
+        lock(&self.shared.segments).create(segment, bytes)
+    }
+
+    fn check_segment(&self, segment: u32, bytes: u64) -> io::Result<()> {
+        lock(&self.shared.segments).check(segment, bytes)
+    }
+
+    fn submit(&mut self, transfer: Transfer) {
+        self.pool.submit(transfer);
+    }
+
+    fn complete(&mut self, wait: bool, done: &mut Vec<Completion>) {
+        self.pool.complete(wait, done);
+    }
+
+    fn in_flight(&self) -> usize {
+        self.pool.in_flight()
+    }
+
+    fn sync(&mut self) -> io::Result<()> {
+        let result = lock(&self.shared.segments).sync();
+        lock(&self.shared.behind).forget_all();
+        result
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

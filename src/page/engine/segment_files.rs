@@ -1,0 +1,395 @@
+//! The files behind the segments: made so that writes do not run out of space, opened so that no link is followed,
+//! and never more of them open than the process may have. Shared by the engines that work on files.
+//!
+//! Knows nothing of slots or pages. Invariants: 1. a segment that was made has its full length allocated, and it and
+//! its entry in the folder are durable before [`SegmentFiles::create`] returns; 2. a file that was asked for writing
+//! is synced before it is closed or forgotten; 3. nothing outside the folder is opened: names are made here, and a
+//! symbolic link in place of a segment is an error.
+
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+const PREFIX: &str = "seg-";
+const SUFFIX: &str = ".dat";
+/// Files that the rest of a process may need while it trains: photos, logs, sockets, the map.
+const FILES_OF_OTHERS: u64 = 32;
+
+/// Name of the file of segment `segment`.
+pub fn segment_file_name(segment: u32) -> String {
+    format!("{PREFIX}{segment:08}{SUFFIX}")
+}
+
+/// Number of the segment that a file name stands for; `None` for names that [`segment_file_name`] never gives.
+pub fn segment_from_file_name(name: &str) -> Option<u32> {
+    let number = name.strip_prefix(PREFIX)?.strip_suffix(SUFFIX)?.parse().ok()?;
+    (segment_file_name(number) == name).then_some(number)
+}
+
+#[derive(Debug)]
+struct OpenFile {
+    file: Arc<File>,
+    last_used: u64,
+    is_dirty: bool,
+}
+
+/// The segment files of one folder.
+#[derive(Debug)]
+pub struct SegmentFiles {
+    folder: PathBuf,
+    /// Held open, so that a segment can be made durable whatever the process has open.
+    entries: Option<File>,
+    direct: bool,
+    read_only: bool,
+    open: BTreeMap<u32, OpenFile>,
+    open_max: usize,
+    clock: u64,
+}
+
+impl SegmentFiles {
+    /// The segments in `folder`. With `direct`, files bypass the page cache; where the file system refuses that,
+    /// [`SegmentFiles::is_direct`] tells.
+    ///
+    /// # Errors
+    /// The folder cannot be read.
+    pub fn new(folder: &Path, direct: bool) -> io::Result<SegmentFiles> {
+        let direct = direct && direct_works(folder)?;
+        let open_max = open_files_max();
+        // Other systems do not open folders; there a file's entry is durable with the file.
+        let entries = if cfg!(unix) { Some(File::open(folder)?) } else { None };
+        let open = BTreeMap::new();
+        let (folder, read_only) = (folder.to_path_buf(), false);
+        Ok(SegmentFiles { folder, entries, direct, read_only, open, open_max, clock: 0 })
+    }
+
+    /// The segments in `folder`, which may be on a drive that cannot be written: nothing can be written through them.
+    pub fn read_only(folder: &Path) -> SegmentFiles {
+        let (open_max, folder) = (open_files_max(), folder.to_path_buf());
+        SegmentFiles {
+            folder,
+            entries: None,
+            direct: false,
+            read_only: true,
+            open: BTreeMap::new(),
+            open_max,
+            clock: 0,
+        }
+    }
+
+    /// Whether files bypass the page cache. Then memory, offsets and lengths must be multiples of
+    /// [`crate::page::engine::buffer::ALIGNMENT`].
+    pub fn is_direct(&self) -> bool {
+        self.direct
+    }
+
+    /// Most files held open at once; transfers in flight may hold more.
+    pub fn open_max(&self) -> usize {
+        self.open_max
+    }
+
+    /// Path of a segment.
+    pub fn path(&self, segment: u32) -> PathBuf {
+        self.folder.join(segment_file_name(segment))
+    }
+
+    /// Makes a segment of `bytes` bytes, durably. One that exists with that size is left as it is, a shorter one
+    /// (a crash while it was made) is brought to its length.
+    ///
+    /// # Errors
+    /// No space; the folder cannot be written; the file is longer, a link, or not a file.
+    pub fn create(&mut self, segment: u32, bytes: u64) -> io::Result<()> {
+        self.refuse_if_read_only()?;
+        let path = self.path(segment);
+        let make = |path: &Path| {
+            with_safe_flags(OpenOptions::new().read(true).write(true).create(true).truncate(false)).open(path)
+        };
+        let file = self.open_with_room(&path, make)?;
+        let there = file.metadata()?;
+        if !there.is_file() || there.len() > bytes {
+            let what = if there.is_file() { "exists with another length" } else { "is not a file" };
+            return Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{} {what}", path.display())));
+        }
+        if there.len() < bytes
+            && let Err(error) = allocate(&file, there.len(), bytes)
+        {
+            // What was allocated before space ran out is given back; a file that was here stays as it was.
+            let _ = if there.len() == 0 { std::fs::remove_file(&path) } else { file.set_len(there.len()) };
+            return Err(error);
+        }
+        // Also when nothing seems missing: whoever made it may have been killed before these calls.
+        file.sync_all()?;
+        self.entries.as_ref().map_or(Ok(()), File::sync_all)
+    }
+
+    /// Whether the file of a segment is there with exactly `bytes` bytes. It is not opened.
+    ///
+    /// # Errors
+    /// It is missing, shorter, longer, a link, or not a file.
+    pub fn check(&self, segment: u32, bytes: u64) -> io::Result<()> {
+        let there = std::fs::symlink_metadata(self.path(segment))?;
+        let wrong = |what: String| Err(io::Error::new(io::ErrorKind::InvalidData, what));
+        match there.len() {
+            _ if !there.is_file() => wrong("is not a file".to_string()),
+            len if len != bytes => wrong(format!("has {len} bytes instead of {bytes}")),
+            _ => Ok(()),
+        }
+    }
+
+    /// The file of a segment, for reading.
+    ///
+    /// # Errors
+    /// It does not exist or cannot be opened.
+    pub fn file(&mut self, segment: u32) -> io::Result<Arc<File>> {
+        self.clock += 1;
+        if let Some(open) = self.open.get_mut(&segment) {
+            open.last_used = self.clock;
+            return Ok(Arc::clone(&open.file));
+        }
+        while self.open.len() >= self.open_max && self.close_oldest()? {}
+        let (direct, read_only) = (self.direct, self.read_only);
+        let open = |path: &Path| if read_only { open_for_reading(path) } else { open_segment(path, direct) };
+        let file = Arc::new(self.open_with_room(&self.path(segment), open)?);
+        let open = OpenFile { file: Arc::clone(&file), last_used: self.clock, is_dirty: false };
+        self.open.insert(segment, open);
+        Ok(file)
+    }
+
+    /// The file of a segment, for writing: it counts as changed until [`SegmentFiles::sync`].
+    ///
+    /// # Errors
+    /// It does not exist or cannot be opened.
+    pub fn file_for_write(&mut self, segment: u32) -> io::Result<Arc<File>> {
+        self.refuse_if_read_only()?;
+        let file = self.file(segment)?;
+        if let Some(open) = self.open.get_mut(&segment) {
+            open.is_dirty = true;
+        }
+        Ok(file)
+    }
+
+    /// Makes everything durable that completed writes changed.
+    ///
+    /// # Errors
+    /// The drive reported an error. It reports it once: nothing that was not synced before may be trusted, and
+    /// calling again proves nothing.
+    pub fn sync(&mut self) -> io::Result<()> {
+        for open in self.open.values_mut().filter(|o| o.is_dirty) {
+            open.file.sync_data()?;
+            open.is_dirty = false;
+        }
+        Ok(())
+    }
+
+    fn refuse_if_read_only(&self) -> io::Result<()> {
+        if self.read_only { Err(io::ErrorKind::ReadOnlyFilesystem.into()) } else { Ok(()) }
+    }
+
+    /// Opens a file; where others of this process hold more files than was reckoned with, closes some of ours.
+    fn open_with_room(&mut self, path: &Path, open: impl Fn(&Path) -> io::Result<File>) -> io::Result<File> {
+        loop {
+            match open(path) {
+                Err(error) if is_too_many_files(&error) && self.close_oldest()? => {}
+                opened => return opened,
+            }
+        }
+    }
+
+    /// Closes the file that was not used for longest, except those that a transfer in flight still holds: a write
+    /// that ends after the sync would be missed by the next. Tells whether there was one.
+    fn close_oldest(&mut self) -> io::Result<bool> {
+        let idle = self.open.iter().filter(|(_, open)| Arc::strong_count(&open.file) == 1);
+        let Some((&segment, _)) = idle.min_by_key(|(_, open)| open.last_used) else { return Ok(false) };
+        // The kernel may forget a failed write-back of a file that nobody has open.
+        if let Some(open) = self.open.remove(&segment).filter(|o| o.is_dirty) {
+            open.file.sync_data()?;
+        }
+        Ok(true)
+    }
+}
+
+/// Whether a file could not be opened because the process or the system has too many open.
+fn is_too_many_files(error: &io::Error) -> bool {
+    cfg!(unix) && matches!(error.raw_os_error(), Some(23 | 24)) // ENFILE, EMFILE everywhere
+}
+
+/// Opens a file of the store for reading: no link is followed.
+///
+/// # Errors
+/// It is not there or cannot be read.
+pub fn open_for_reading(path: &Path) -> io::Result<File> {
+    with_safe_flags(OpenOptions::new().read(true)).open(path)
+}
+
+/// Makes the entries of a folder durable.
+///
+/// # Errors
+/// The drive reported an error.
+pub fn sync_folder(folder: &Path) -> io::Result<()> {
+    if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
+}
+
+/// Adds: private to its owner, no link followed, no waiting on a pipe that somebody put there. (Handles are never
+/// inherited: the standard library sees to it.)
+pub fn with_safe_flags(options: &mut OpenOptions) -> &mut OpenOptions {
+    #[cfg(unix)]
+    {
+        use rustix::fs::OFlags;
+        use std::os::unix::fs::OpenOptionsExt;
+        options.mode(0o600).custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32);
+    }
+    options
+}
+
+#[cfg(target_os = "linux")]
+fn open_segment(path: &Path, direct: bool) -> io::Result<File> {
+    use rustix::fs::OFlags;
+    use std::os::unix::fs::OpenOptionsExt;
+    let direct = if direct { OFlags::DIRECT } else { OFlags::empty() };
+    let flags = (OFlags::NOFOLLOW | direct).bits() as i32;
+    OpenOptions::new().read(true).write(true).custom_flags(flags).open(path)
+}
+
+#[cfg(not(target_os = "linux"))]
+fn open_segment(path: &Path, _direct: bool) -> io::Result<File> {
+    with_safe_flags(OpenOptions::new().read(true).write(true)).open(path)
+}
+
+/// Whether files of this folder can be opened around the page cache: asked of a file that has no name.
+#[cfg(target_os = "linux")]
+fn direct_works(folder: &Path) -> io::Result<bool> {
+    use rustix::fs::{Mode, OFlags, open};
+    match open(folder, OFlags::TMPFILE | OFlags::RDWR | OFlags::DIRECT | OFlags::CLOEXEC, Mode::RUSR | Mode::WUSR) {
+        Ok(_) => Ok(true),
+        // Either the flag or files without a name are not supported; both mean an unusual file system.
+        Err(rustix::io::Errno::INVAL | rustix::io::Errno::OPNOTSUPP | rustix::io::Errno::ISDIR) => Ok(false),
+        Err(error) => Err(error.into()),
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+fn direct_works(_folder: &Path) -> io::Result<bool> {
+    Ok(false)
+}
+
+/// Takes the space `from..to` from the file system. A longer length alone would not: writes could then still find the
+/// drive full. The file's length is `from` before and `to` after it.
+#[cfg(unix)]
+pub(in crate::page) fn allocate(file: &File, from: u64, to: u64) -> io::Result<()> {
+    use rustix::fs::{FallocateFlags, fallocate};
+    use rustix::io::Errno;
+    loop {
+        match fallocate(file, FallocateFlags::empty(), from, to - from) {
+            Err(Errno::INTR) => {}
+            Err(Errno::OPNOTSUPP | Errno::NOSYS) => return write_zeros(file, from, to),
+            other => return Ok(other?),
+        }
+    }
+}
+
+#[cfg(not(unix))]
+pub(in crate::page) fn allocate(file: &File, from: u64, to: u64) -> io::Result<()> {
+    write_zeros(file, from, to)
+}
+
+fn write_zeros(mut file: &File, from: u64, to: u64) -> io::Result<()> {
+    use std::io::{Seek, Write};
+    let zeros = vec![0; 1 << 20];
+    file.seek(io::SeekFrom::Start(from))?;
+    let mut left = to - from;
+    while left > 0 {
+        let bytes = left.min(zeros.len() as u64);
+        file.write_all(&zeros[..bytes as usize])?;
+        left -= bytes;
+    }
+    Ok(())
+}
+
+/// How many segments may be open at once, from the limit of the process.
+#[cfg(unix)]
+fn open_files_max() -> usize {
+    let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current.unwrap_or(1024);
+    limit.saturating_sub(FILES_OF_OTHERS).clamp(4, 512) as usize
+}
+
+#[cfg(not(unix))]
+fn open_files_max() -> usize {
+    256 + FILES_OF_OTHERS as usize
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_come_back_and_others_are_nobodys() {
+        for segment in [0, 1, 99_999_999, 100_000_000, u32::MAX] {
+            assert_eq!(segment_from_file_name(&segment_file_name(segment)), Some(segment));
+        }
+        for name in
+            ["seg-1.dat", "seg-+0000001.dat", "seg-00000001.dat2", "seg-000000001.dat", "seg-99999999999.dat", ""]
+        {
+            assert_eq!(segment_from_file_name(name), None, "{name}");
+        }
+    }
+
+    #[test]
+    fn segments_are_allocated_private_and_left_alone_when_they_exist() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut files = SegmentFiles::new(folder.path(), true).unwrap();
+        std::fs::write(files.path(0), b"cut short").unwrap();
+        files.create(0, 1 << 20).unwrap();
+        files.create(1, 1 << 20).unwrap();
+        files.create(1, 1 << 20).unwrap();
+        assert_eq!(files.create(1, 4096).unwrap_err().kind(), io::ErrorKind::AlreadyExists);
+        assert_eq!(&std::fs::read(files.path(0)).unwrap()[..9], b"cut short");
+        let metadata = std::fs::metadata(files.path(1)).unwrap();
+        assert_eq!(metadata.len(), 1 << 20);
+        #[cfg(unix)]
+        {
+            use std::os::unix::fs::MetadataExt;
+            assert_eq!(metadata.mode() & 0o777, 0o600);
+            assert!(metadata.blocks() * 512 >= 1 << 20, "the space was not taken");
+        }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn links_are_not_followed() {
+        let folder = tempfile::tempdir().unwrap();
+        let foreign = folder.path().join("foreign");
+        std::fs::write(&foreign, b"mine").unwrap();
+        let mut files = SegmentFiles::new(folder.path(), false).unwrap();
+        std::os::unix::fs::symlink(&foreign, files.path(0)).unwrap();
+        assert!(files.create(0, 4096).is_err() && files.file(0).is_err());
+        assert_eq!(std::fs::read(&foreign).unwrap(), b"mine");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn few_files_are_enough_for_many_segments() {
+        use std::os::unix::fs::FileExt;
+        let folder = tempfile::tempdir().unwrap();
+        let mut files = SegmentFiles::new(folder.path(), false).unwrap();
+        files.open_max = 3;
+        for segment in 0..10 {
+            files.create(segment, 4096).unwrap();
+            files.file_for_write(segment).unwrap().write_all_at(&[segment as u8 + 1], 7).unwrap();
+            assert!(files.open.len() <= 3);
+        }
+        // A transfer in flight keeps its file open and changed until its end.
+        let in_flight = files.file_for_write(0).unwrap();
+        (1..10).for_each(|segment| drop(files.file(segment).unwrap()));
+        assert!(files.open[&0].is_dirty && files.open.len() == 3);
+        drop(in_flight);
+        files.sync().unwrap();
+        assert!(files.open.values().all(|o| !o.is_dirty));
+        for segment in 0..10 {
+            let mut byte = [0];
+            files.file(segment).unwrap().read_exact_at(&mut byte, 7).unwrap();
+            assert_eq!(byte[0], segment as u8 + 1);
+        }
+    }
+}

@@ -1,0 +1,113 @@
+//! What to do when the system moved less than it was asked to.
+//!
+//! Every engine drives its requests with a [`Resume`]: short transfers go on where they ended, interrupted ones are
+//! tried again, and what never moves ends as an error instead of a loop without end.
+//!
+//! Invariants: 1. a resumed request begins on a multiple of [`ALIGNMENT`] of its first byte, as direct I/O needs, so
+//! bytes behind the last whole block are moved again; 2. at most [`TRIES_MAX`] outcomes in a row without a whole
+//! block of progress are forgiven.
+
+use crate::page::engine::buffer::ALIGNMENT;
+use crate::page::engine::transfers::Direction;
+use std::io;
+
+/// Outcomes in a row without progress that are forgiven.
+pub const TRIES_MAX: u8 = 32;
+/// `ECANCELED` on Linux: the ring gives it to requests whose thread ended; they may be sent again.
+const CANCELED: i32 = 125;
+
+/// Progress of one request.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Resume {
+    /// Bytes moved so far.
+    pub done: usize,
+    /// Outcomes since the last progress.
+    pub tries: u8,
+}
+
+impl Resume {
+    /// Takes in the outcome of the request for the bytes from `self.done` to `total`. Says whether all is moved.
+    ///
+    /// # Errors
+    /// The outcome's error if trying again is no help; `UnexpectedEof` or `WriteZero` where the file ends.
+    pub fn advance(&mut self, direction: Direction, outcome: io::Result<usize>, total: usize) -> io::Result<bool> {
+        match outcome {
+            Ok(0) if self.done < total => Err(match direction {
+                Direction::Read => io::Error::new(io::ErrorKind::UnexpectedEof, "the file ends before the page does"),
+                Direction::Write => io::Error::new(io::ErrorKind::WriteZero, "the drive takes no more bytes"),
+            }),
+            Ok(moved) => {
+                let reached = self.done + moved;
+                if reached >= total {
+                    self.done = total;
+                    return Ok(true);
+                }
+                let whole = reached - reached % ALIGNMENT;
+                if whole > self.done {
+                    *self = Resume { done: whole, tries: 0 };
+                    return Ok(false);
+                }
+                self.try_again(|| io::Error::new(io::ErrorKind::TimedOut, "the drive moves only parts of a block"))
+            }
+            Err(error) if may_pass(&error) => self.try_again(|| error),
+            Err(error) => Err(error),
+        }
+    }
+
+    fn try_again(&mut self, error: impl FnOnce() -> io::Error) -> io::Result<bool> {
+        self.tries += 1;
+        if self.tries > TRIES_MAX { Err(error()) } else { Ok(false) }
+    }
+}
+
+/// Whether the same request may succeed when it is sent again.
+fn may_pass(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::Interrupted | io::ErrorKind::WouldBlock)
+        || (cfg!(target_os = "linux") && error.raw_os_error() == Some(CANCELED))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    #[test]
+    fn short_outcomes_go_on_at_the_last_whole_block() {
+        let mut resume = Resume::default();
+        let total = 6 * ALIGNMENT;
+        assert!(!resume.advance(Direction::Write, Ok(ALIGNMENT + 512), total).unwrap());
+        assert_eq!(resume.done, ALIGNMENT);
+        assert!(!resume.advance(Direction::Write, Ok(2 * ALIGNMENT), total).unwrap());
+        assert_eq!(resume.done, 3 * ALIGNMENT);
+        assert!(resume.advance(Direction::Write, Ok(3 * ALIGNMENT), total).unwrap());
+        assert_eq!(resume.done, total);
+    }
+
+    #[test]
+    fn what_never_moves_ends_as_an_error() {
+        for raw in [4, 11, 125] {
+            let mut resume = Resume::default();
+            let again = || Err(io::Error::from_raw_os_error(raw));
+            for _ in 0..TRIES_MAX {
+                assert!(!resume.advance(Direction::Read, again(), ALIGNMENT).unwrap());
+            }
+            let end = resume.advance(Direction::Read, again(), ALIGNMENT).unwrap_err();
+            assert_eq!(end.raw_os_error(), Some(raw));
+        }
+        let mut resume = Resume::default();
+        let end = (0..=TRIES_MAX).map(|_| resume.advance(Direction::Read, Ok(100), ALIGNMENT)).find_map(Result::err);
+        assert_eq!(end.unwrap().kind(), io::ErrorKind::TimedOut);
+    }
+
+    #[test]
+    fn the_end_of_a_file_and_real_errors_are_told_at_once() {
+        let mut resume = Resume::default();
+        let end = resume.advance(Direction::Read, Ok(0), ALIGNMENT).unwrap_err();
+        assert_eq!(end.kind(), io::ErrorKind::UnexpectedEof);
+        let end = resume.advance(Direction::Write, Ok(0), ALIGNMENT).unwrap_err();
+        assert_eq!(end.kind(), io::ErrorKind::WriteZero);
+        let end = resume.advance(Direction::Read, Err(io::Error::from_raw_os_error(5)), ALIGNMENT).unwrap_err();
+        assert_eq!(end.raw_os_error(), Some(5));
+        assert_eq!(resume.tries, 0);
+    }
+}

@@ -1,0 +1,260 @@
+//! How payloads are stored: as they are, or shuffled and compressed.
+//!
+//! Invariants: 1. decoding gives exactly the length that the index says or an error, whatever the bytes are, and
+//! never more memory than that; 2. a payload that does not become smaller is stored raw, so the stored form is never
+//! longer than the payload; 3. the same payload gives the same bytes on every machine and any number of threads.
+
+use crate::page::format::halves;
+use crate::page::format::slot_header::StoredAs;
+use std::cell::RefCell;
+use std::io;
+use zstd::zstd_safe::CParameter;
+
+/// Bytes of a word whose bytes the shuffle takes apart: payloads are mostly 32-bit floats.
+const WORD: usize = 4;
+/// Levels of zstd that are worth offering.
+const LEVELS: std::ops::RangeInclusive<i32> = 1..=19;
+
+/// How pages are to be stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Codec {
+    /// As they are: no work, no copy.
+    #[default]
+    Raw,
+    /// Bytes shuffled, then zstd at this level. Pays on drives below about 1 GB/s.
+    Zstd {
+        /// 1 to 19.
+        level: i32,
+    },
+    /// Lines of 32-bit words with empty lower halves take half: for moments of 16 bits. One cheap pass.
+    Halves,
+}
+
+impl std::str::FromStr for Codec {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Codec, String> {
+        let level = text.strip_prefix("zstd:").and_then(|level| level.parse().ok());
+        match (text, level) {
+            ("raw", _) => Ok(Codec::Raw),
+            ("halves", _) => Ok(Codec::Halves),
+            (_, Some(level)) if LEVELS.contains(&level) => Ok(Codec::Zstd { level }),
+            _ => Err(format!("`{text}` is no codec: write raw, halves, or zstd:1 to zstd:{}", LEVELS.end())),
+        }
+    }
+}
+
+impl std::fmt::Display for Codec {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Codec::Raw => write!(f, "raw"),
+            Codec::Halves => write!(f, "halves"),
+            Codec::Zstd { level } => write!(f, "zstd:{level}"),
+        }
+    }
+}
+
+/// Memory that encoding and decoding of one thread uses again and again.
+#[derive(Default)]
+struct Scratch {
+    shuffled: Vec<u8>,
+    compressor: Option<zstd::bulk::Compressor<'static>>,
+    decompressor: Option<zstd::bulk::Decompressor<'static>>,
+}
+
+thread_local! {
+    static SCRATCH: RefCell<Scratch> = RefCell::default();
+}
+
+/// Encodes `payload` into `stored`, which is at least as long; gives the length of the result and how it is stored. `None`
+/// if it would not become smaller, or for [`Codec::Raw`].
+///
+/// # Errors
+/// zstd refuses the level or memory.
+pub fn encode_as(codec: Codec, payload: &[u8], stored: &mut [u8]) -> io::Result<Option<(usize, StoredAs)>> {
+    match codec {
+        Codec::Raw => Ok(None),
+        Codec::Zstd { level } => Ok(encode(payload, level, stored)?.map(|bytes| (bytes, StoredAs::ShuffledZstd))),
+        Codec::Halves if halves::encoded_bytes(payload) >= payload.len().min(stored.len()) => Ok(None),
+        Codec::Halves => Ok(Some((halves::encode(payload, stored), StoredAs::Halves))),
+    }
+}
+
+/// Shuffles and compresses `payload` into `stored`, which is at least as long; gives the length. `None` if it would not
+/// become smaller (`stored` then holds nothing of use).
+///
+/// # Errors
+/// zstd refuses the level or memory.
+fn encode(payload: &[u8], level: i32, stored: &mut [u8]) -> io::Result<Option<usize>> {
+    SCRATCH.with_borrow_mut(|scratch| {
+        scratch.shuffled.resize(payload.len(), 0);
+        shuffle(payload, &mut scratch.shuffled);
+        let compressor = match &mut scratch.compressor {
+            Some(compressor) => compressor,
+            none => none.insert(zstd::bulk::Compressor::new(level)?),
+        };
+        compressor.set_parameter(CParameter::CompressionLevel(level))?;
+        let room = payload.len().saturating_sub(1).min(stored.len());
+        match compressor.compress_to_buffer(&scratch.shuffled, &mut stored[..room]) {
+            Ok(bytes) => Ok(Some(bytes)),
+            // The one failure that input can cause: no room, which means not smaller.
+            Err(_) => Ok(None),
+        }
+    })
+}
+
+/// Decodes `stored` into all of `payload`.
+///
+/// # Errors
+/// The bytes are damaged, or are not `payload.len()` bytes when decoded.
+pub fn decode(stored: &[u8], codec: StoredAs, payload: &mut [u8]) -> io::Result<()> {
+    let wrong = |what: &str| io::Error::new(io::ErrorKind::InvalidData, what.to_string());
+    match codec {
+        StoredAs::Raw if stored.len() == payload.len() => payload.copy_from_slice(stored),
+        StoredAs::Raw => return Err(wrong("the stored length is not the payload's")),
+        StoredAs::Halves => halves::decode(stored, payload).map_err(|e| wrong(&e.to_string()))?,
+        StoredAs::ShuffledZstd => SCRATCH.with_borrow_mut(|scratch| {
+            let decompressor = match &mut scratch.decompressor {
+                Some(decompressor) => decompressor,
+                none => none.insert(zstd::bulk::Decompressor::new()?),
+            };
+            scratch.shuffled.resize(payload.len(), 0);
+            // In one call, straight to where the bytes belong: a window named by the frame takes no memory.
+            let bytes = decompressor.decompress_to_buffer(stored, scratch.shuffled.as_mut_slice())?;
+            if bytes != payload.len() {
+                return Err(wrong("the payload is shorter than it should be when decoded"));
+            }
+            unshuffle(&scratch.shuffled, payload);
+            Ok(())
+        })?,
+    }
+    Ok(())
+}
+
+/// All first bytes of the words, then all second bytes, and so on; a rest shorter than a word stays at the end.
+fn shuffle(from: &[u8], to: &mut [u8]) {
+    let words = from.len() / WORD;
+    for (lane, lane_bytes) in to[..words * WORD].chunks_exact_mut(words.max(1)).enumerate() {
+        for (byte, word) in lane_bytes.iter_mut().zip(from.chunks_exact(WORD)) {
+            *byte = word[lane];
+        }
+    }
+    to[words * WORD..].copy_from_slice(&from[words * WORD..]);
+}
+
+/// The inverse of [`shuffle`].
+fn unshuffle(from: &[u8], to: &mut [u8]) {
+    let words = from.len() / WORD;
+    let (lanes, rest) = from.split_at(words * WORD);
+    let (a, b) = lanes.split_at(words * 2);
+    let ((a, b), (c, d)) = (a.split_at(words), b.split_at(words));
+    for (i, word) in to.chunks_exact_mut(WORD).enumerate() {
+        word.copy_from_slice(&[a[i], b[i], c[i], d[i]]);
+    }
+    to[words * WORD..].copy_from_slice(rest);
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::base::rng::mix64;
+
+    fn floats(n: usize) -> Vec<u8> {
+        (0..n).flat_map(|i| ((i as f32 * 0.37).sin() * 3.0 + 10.0).to_le_bytes()).collect()
+    }
+
+    fn noise(n: usize) -> Vec<u8> {
+        (0..n).map(|i| mix64(i as u64) as u8).collect()
+    }
+
+    #[test]
+    fn payloads_come_back_to_the_bit() {
+        for n in [1, 255, 256, 4096, 186_368] {
+            for rest in [0, 1, 3] {
+                let mut payload = floats(n);
+                payload.extend(noise(rest));
+                let mut stored = vec![0; payload.len()];
+                for level in [1, 3, 19] {
+                    let Some(bytes) = encode(&payload, level, &mut stored).unwrap() else {
+                        assert!(n < 256, "{n} smooth floats did not become smaller");
+                        continue;
+                    };
+                    assert!(bytes < payload.len());
+                    let mut back = vec![1; payload.len()];
+                    decode(&stored[..bytes], StoredAs::ShuffledZstd, &mut back).unwrap();
+                    assert!(back == payload, "{n} floats, {rest} bytes, level {level}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_does_not_become_smaller_stays_raw() {
+        let payload = noise(10_000);
+        assert_eq!(encode(&payload, 1, &mut vec![0; 10_000]).unwrap(), None);
+        assert_eq!(encode(&[], 1, &mut []).unwrap(), None);
+        let mut back = vec![0; 10_000];
+        decode(&payload, StoredAs::Raw, &mut back).unwrap();
+        assert_eq!(back, payload);
+        assert!(decode(&payload, StoredAs::Raw, &mut back[1..]).is_err());
+    }
+
+    /// Too long, too short, cut, damaged, a window of gigabytes: an error, in memory of the payload's size.
+    #[test]
+    fn hostile_bytes_end_in_an_error() {
+        let payload = floats(4096);
+        let mut stored = vec![0; payload.len()];
+        let bytes = encode(&payload, 1, &mut stored).unwrap().unwrap();
+        let stored = &stored[..bytes];
+        let read = |stored: &[u8], bytes: usize| decode(stored, StoredAs::ShuffledZstd, &mut vec![0; bytes]);
+        assert!(read(stored, payload.len()).is_ok());
+        for bytes in [0, 1, payload.len() - 1, payload.len() + 1, payload.len() * 2] {
+            assert!(read(stored, bytes).is_err(), "{bytes}");
+        }
+        assert!((0..stored.len()).step_by(7).all(|cut| read(&stored[..cut], payload.len()).is_err()));
+        for seed in 0..500 {
+            let mut damaged = stored.to_vec();
+            let at = mix64(seed) as usize % damaged.len();
+            damaged[at] ^= 1 << (seed % 8);
+            // Without its checksum (the store checks that first) a flipped literal may decode; it may not do more.
+            let _ = read(&damaged, payload.len());
+        }
+        let bomb = zstd::bulk::compress(&vec![0; 64 << 20], 1).unwrap();
+        assert!(read(&bomb, payload.len()).is_err());
+        let wide_window = [0x28, 0xb5, 0x2f, 0xfd, 0x00, 0xa8, 0x01, 0x00, 0x00];
+        assert!(read(&wide_window, 4096).is_err());
+    }
+
+    #[test]
+    fn codecs_have_names() {
+        for (text, codec) in [("raw", Codec::Raw), ("halves", Codec::Halves), ("zstd:1", Codec::Zstd { level: 1 })] {
+            assert_eq!(text.parse(), Ok(codec));
+            assert_eq!(codec.to_string(), text);
+        }
+        for wrong in ["zstd", "zstd:0", "zstd:20", "zstd:-1", "lz4", "", "zstd:1x"] {
+            assert!(
+                wrong.parse::<Codec>().is_err_and(|e| e.contains("write raw, halves, or zstd:1 to zstd:19")),
+                "{wrong}"
+            );
+        }
+    }
+
+    #[test]
+    fn halved_lines_come_back_and_what_gains_nothing_is_raw() {
+        let mut payload = vec![0u8; 4096];
+        payload.chunks_exact_mut(4).for_each(|word| word[2..].copy_from_slice(&[0x80, 0x3f]));
+        payload[100] = 7;
+        let mut stored = vec![0; 4096];
+        let (bytes, stored_as) = encode_as(Codec::Halves, &payload, &mut stored).unwrap().unwrap();
+        // A table of one line, 63 halved lines and one whole.
+        assert_eq!((bytes, stored_as), (64 + 63 * 32 + 64, StoredAs::Halves));
+        let mut back = vec![1; 4096];
+        decode(&stored[..bytes], stored_as, &mut back).unwrap();
+        assert_eq!(back, payload);
+        assert!(decode(&stored[..bytes - 1], stored_as, &mut back).is_err());
+        payload.fill(0x55);
+        assert_eq!(encode_as(Codec::Halves, &payload, &mut stored).unwrap(), None);
+        assert_eq!(encode_as(Codec::Raw, &payload, &mut stored).unwrap(), None);
+    }
+}

@@ -1,0 +1,377 @@
+//! What stands on the drive in front of a page, and how a version of a page is named by the index.
+//!
+//! A slot holds [`HEADER_BYTES`] of header, then the stored payload, then zeros up to the next multiple of
+//! [`ALIGNMENT`]. The header says what the slot holds and where it was meant to be written, so that a page that was
+//! read from or written to the wrong place is found out, and so that the index can be rebuilt from the slots alone.
+//! All numbers are little-endian.
+//!
+//! Invariants: 1. every bit of the header and of the padded payload is under a checksum; 2. decoding bytes that
+//! nobody vouches for neither allocates by their word nor panics; 3. a [`SlotRef`] says everything that is needed to
+//! tell whether the bytes of a slot are that version of that page and no other.
+
+use crate::base::ids::PageId;
+use crate::page::engine::buffer::ALIGNMENT;
+use crate::page::engine::transfers::Place;
+use xxhash_rust::xxh3::xxh3_128;
+
+#[cfg(target_endian = "big")]
+compile_error!("slots are little-endian; nothing was tested on big-endian machines");
+
+/// Bytes in front of the payload of every slot, and of every frame in memory.
+pub const HEADER_BYTES: usize = 4096;
+/// Longest label, bytes.
+pub const LABEL_BYTES_MAX: usize = 512;
+/// Version of the layout of slots. A store of a newer version is refused.
+pub const FORMAT_VERSION: u32 = 1;
+/// Features that a reader must know to read the store, one bit each: a store with another bit is refused. None yet.
+pub const KNOWN_FEATURES: u32 = 0;
+/// Features that a reader may pass over, one bit each: other bits are ignored. None yet.
+pub const KNOWN_COMPATIBLE: u32 = 0;
+
+const MAGIC: [u8; 8] = *b"gsscpage";
+const CHECKSUM_AT: usize = HEADER_BYTES - 16;
+const LABEL_AT: usize = 112;
+
+/// How a payload is stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum StoredAs {
+    /// The bytes themselves.
+    Raw,
+    /// Bytes shuffled by their place in four-byte words, then one zstd frame.
+    ShuffledZstd,
+    /// Lines of words with empty lower halves as their upper halves alone.
+    Halves,
+}
+
+impl StoredAs {
+    fn to_byte(self) -> u8 {
+        match self {
+            StoredAs::Raw => 0,
+            StoredAs::ShuffledZstd => 1,
+            StoredAs::Halves => 2,
+        }
+    }
+
+    fn from_byte(byte: u8) -> Option<StoredAs> {
+        match byte {
+            0 => Some(StoredAs::Raw),
+            1 => Some(StoredAs::ShuffledZstd),
+            2 => Some(StoredAs::Halves),
+            _ => None,
+        }
+    }
+}
+
+/// Where one version of a page is, and what its bytes must be. Kept by the index.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(into = "Vec<u8>", try_from = "Vec<u8>")]
+pub struct SlotRef {
+    /// Place of the slot.
+    pub place: Place,
+    /// Bytes of the payload as stored, without padding.
+    pub stored_bytes: u32,
+    /// Bytes of the payload as it is used.
+    pub payload_bytes: u32,
+    /// First generation that this version can belong to.
+    pub generation: u64,
+    /// xxh3-128 of the stored payload with its padding.
+    pub checksum: u128,
+    /// How the payload is stored.
+    pub codec: StoredAs,
+}
+
+impl SlotRef {
+    /// Length of the encoded form, bytes.
+    pub const ENCODED_BYTES: usize = 45;
+
+    /// Bytes that are moved to read or write this version: header, payload, padding.
+    pub fn transfer_bytes(&self) -> usize {
+        transfer_bytes(self.stored_bytes as usize)
+    }
+
+    /// As bytes, for the index on the drive.
+    pub fn to_bytes(&self) -> [u8; SlotRef::ENCODED_BYTES] {
+        let mut bytes = [0; SlotRef::ENCODED_BYTES];
+        let mut at = Put { bytes: &mut bytes, at: 0 };
+        at.put(&self.place.segment.to_le_bytes());
+        at.put(&self.place.offset.to_le_bytes());
+        at.put(&self.stored_bytes.to_le_bytes());
+        at.put(&self.payload_bytes.to_le_bytes());
+        at.put(&self.generation.to_le_bytes());
+        at.put(&self.checksum.to_le_bytes());
+        at.put(&[self.codec.to_byte()]);
+        bytes
+    }
+
+    /// From bytes of [`SlotRef::to_bytes`]; `None` for bytes that it never gives.
+    pub fn from_bytes(bytes: &[u8; SlotRef::ENCODED_BYTES]) -> Option<SlotRef> {
+        let mut at = Take { bytes, at: 0 };
+        let slot = SlotRef {
+            place: Place { segment: at.u32(), offset: at.u64() },
+            stored_bytes: at.u32(),
+            payload_bytes: at.u32(),
+            generation: at.u64(),
+            checksum: at.u128(),
+            codec: StoredAs::from_byte(at.take::<1>()[0])?,
+        };
+        let is_aligned = slot.place.offset.is_multiple_of(ALIGNMENT as u64);
+        (is_aligned && lengths_agree(slot.codec, slot.stored_bytes, slot.payload_bytes)).then_some(slot)
+    }
+}
+
+impl From<SlotRef> for Vec<u8> {
+    fn from(slot: SlotRef) -> Vec<u8> {
+        slot.to_bytes().into()
+    }
+}
+
+impl TryFrom<Vec<u8>> for SlotRef {
+    type Error = &'static str;
+
+    fn try_from(bytes: Vec<u8>) -> Result<SlotRef, &'static str> {
+        let bytes = bytes.as_slice().try_into().ok();
+        bytes.and_then(SlotRef::from_bytes).ok_or("these bytes refer to no slot")
+    }
+}
+
+/// Bytes that are moved for a payload of `stored_bytes`: header, payload, padding.
+pub fn transfer_bytes(stored_bytes: usize) -> usize {
+    HEADER_BYTES + stored_bytes.next_multiple_of(ALIGNMENT)
+}
+
+/// Checksum of a stored payload with its padding, and of anything else that this store keeps.
+pub fn checksum(bytes: &[u8]) -> u128 {
+    xxh3_128(bytes)
+}
+
+fn lengths_agree(codec: StoredAs, stored: u32, payload: u32) -> bool {
+    match codec {
+        StoredAs::Raw => stored == payload,
+        StoredAs::ShuffledZstd | StoredAs::Halves => stored < payload,
+    }
+}
+
+/// What the header of a slot says.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SlotHeader {
+    /// Identity of the store.
+    pub store: u128,
+    /// The page.
+    pub page: PageId,
+    /// Number of the write in the life of the store; tells which of two versions of a page is the later one, unless one of
+    /// them comes from a process that ended before it committed anything: the next one gives the same numbers again.
+    pub serial: u64,
+    /// Place, lengths, generation and checksum.
+    pub slot: SlotRef,
+    /// Opaque to this layer, at most [`LABEL_BYTES_MAX`]: what the layer above needs to index the page again.
+    pub label: Vec<u8>,
+}
+
+/// Why bytes are not the header of a slot.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum HeaderError {
+    /// Never written, or overwritten with something else.
+    #[error("there is no slot header here")]
+    NoHeader,
+    /// Bits changed since it was written.
+    #[error("the checksum of the slot header does not match")]
+    Checksum,
+    /// Written by a newer program.
+    #[error("the slot has format version {found} (features {features:#x}); this program knows {FORMAT_VERSION}")]
+    Version {
+        /// Version of the slot.
+        found: u32,
+        /// Feature bits of the slot.
+        features: u32,
+    },
+    /// The checksum matches, but this program would not have written it.
+    #[error("the slot header has an impossible {field}")]
+    Field {
+        /// Which field.
+        field: &'static str,
+    },
+}
+
+impl SlotHeader {
+    /// Writes the header over the first [`HEADER_BYTES`] of `bytes`. A label beyond [`LABEL_BYTES_MAX`] is cut; the
+    /// writer checks it before.
+    pub fn encode(&self, bytes: &mut [u8; HEADER_BYTES]) {
+        bytes.fill(0);
+        let label = &self.label[..self.label.len().min(LABEL_BYTES_MAX)];
+        let mut at = Put { bytes: bytes.as_mut_slice(), at: 0 };
+        at.put(&MAGIC);
+        at.put(&FORMAT_VERSION.to_le_bytes());
+        at.put(&KNOWN_FEATURES.to_le_bytes());
+        at.put(&self.store.to_le_bytes());
+        at.put(&self.page.to_bits().to_le_bytes());
+        at.put(&self.serial.to_le_bytes());
+        at.put(&(label.len() as u16).to_le_bytes());
+        at.put(&self.slot.to_bytes());
+        debug_assert!(at.at <= LABEL_AT);
+        at.at = LABEL_AT;
+        at.put(label);
+        let sum = checksum(&bytes[..CHECKSUM_AT]);
+        bytes[CHECKSUM_AT..].copy_from_slice(&sum.to_le_bytes());
+    }
+
+    /// Reads a header.
+    ///
+    /// # Errors
+    /// The bytes are not a header of this program's format.
+    pub fn decode(bytes: &[u8; HEADER_BYTES]) -> Result<SlotHeader, HeaderError> {
+        let mut at = Take { bytes, at: 0 };
+        if at.take::<8>() != MAGIC {
+            return Err(HeaderError::NoHeader);
+        }
+        // The checksum first: a flipped bit in the version is damage, not a newer program. Every version keeps the
+        // checksum in this place.
+        let sum = Take { bytes, at: CHECKSUM_AT }.u128();
+        if sum != checksum(&bytes[..CHECKSUM_AT]) {
+            return Err(HeaderError::Checksum);
+        }
+        let (found, features) = (at.u32(), at.u32());
+        if found != FORMAT_VERSION || features & !KNOWN_FEATURES != 0 {
+            return Err(HeaderError::Version { found, features });
+        }
+        let store = at.u128();
+        let page = PageId::from_bits(at.u64()).ok_or(HeaderError::Field { field: "page id" })?;
+        let serial = at.u64();
+        let label_len = usize::from(u16::from_le_bytes(at.take()));
+        let slot = SlotRef::from_bytes(&at.take()).ok_or(HeaderError::Field { field: "place, length or codec" })?;
+        let label = bytes[LABEL_AT..][..LABEL_BYTES_MAX].get(..label_len);
+        let label = label.ok_or(HeaderError::Field { field: "label length" })?.to_vec();
+        Ok(SlotHeader { store, page, serial, slot, label })
+    }
+}
+
+/// Appends to a slice.
+struct Put<'a> {
+    bytes: &'a mut [u8],
+    at: usize,
+}
+
+impl Put<'_> {
+    fn put(&mut self, bytes: &[u8]) {
+        self.bytes[self.at..][..bytes.len()].copy_from_slice(bytes);
+        self.at += bytes.len();
+    }
+}
+
+/// Reads fields from a slice that is long enough.
+struct Take<'a> {
+    bytes: &'a [u8],
+    at: usize,
+}
+
+impl Take<'_> {
+    fn take<const N: usize>(&mut self) -> [u8; N] {
+        let mut out = [0; N];
+        out.copy_from_slice(&self.bytes[self.at..][..N]);
+        self.at += N;
+        out
+    }
+
+    fn u32(&mut self) -> u32 {
+        u32::from_le_bytes(self.take())
+    }
+
+    fn u64(&mut self) -> u64 {
+        u64::from_le_bytes(self.take())
+    }
+
+    fn u128(&mut self) -> u128 {
+        u128::from_le_bytes(self.take())
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::base::rng::mix64;
+
+    fn header() -> SlotHeader {
+        let place = Place { segment: 3, offset: 8192 };
+        let slot = SlotRef {
+            place,
+            stored_bytes: 700,
+            payload_bytes: 1000,
+            generation: 9,
+            checksum: u128::MAX / 3,
+            codec: StoredAs::ShuffledZstd,
+        };
+        SlotHeader { store: 77, page: PageId::initial(5), serial: 12, slot, label: vec![0xab; LABEL_BYTES_MAX] }
+    }
+
+    #[test]
+    fn headers_come_back_and_every_flipped_bit_is_found() {
+        let mut bytes = [1; HEADER_BYTES];
+        header().encode(&mut bytes);
+        assert_eq!(SlotHeader::decode(&bytes), Ok(header()));
+        for bit in 0..HEADER_BYTES * 8 {
+            bytes[bit / 8] ^= 1 << (bit % 8);
+            assert!(SlotHeader::decode(&bytes).is_err(), "bit {bit}");
+            bytes[bit / 8] ^= 1 << (bit % 8);
+        }
+    }
+
+    /// The layout of version 1, held by its bytes: whoever changes it must raise the version.
+    #[test]
+    fn the_layout_of_version_1_does_not_move() {
+        let mut bytes = [0; HEADER_BYTES];
+        header().encode(&mut bytes);
+        assert_eq!(&bytes[..16], b"gsscpage\x01\0\0\0\0\0\0\0");
+        assert_eq!((bytes[16], bytes[36], bytes[40], &bytes[48..50]), (77, 5, 12, [0, 2].as_slice()));
+        assert_eq!((bytes[50], u16::from_le_bytes([bytes[54], bytes[55]])), (3, 8192));
+        assert_eq!((bytes[LABEL_AT], bytes[LABEL_AT + 511], bytes[LABEL_AT + 512]), (0xab, 0xab, 0));
+    }
+
+    #[test]
+    fn newer_versions_are_refused_by_name() {
+        let mut bytes = [0; HEADER_BYTES];
+        for (at, value, message) in [(8, 2, "format version 2 (features 0x0)"), (12, 4, "(features 0x4)")] {
+            header().encode(&mut bytes);
+            bytes[at] = value;
+            let sum = checksum(&bytes[..CHECKSUM_AT]);
+            bytes[CHECKSUM_AT..].copy_from_slice(&sum.to_le_bytes());
+            let error = SlotHeader::decode(&bytes).expect_err("a newer slot was read");
+            assert!(error.to_string().contains(message) && error.to_string().contains("knows 1"), "{error}");
+        }
+    }
+
+    /// Random bytes under a right magic and checksum: refused or read, never a panic, never a label beyond its room.
+    #[test]
+    fn hostile_headers_neither_panic_nor_allocate() {
+        let mut bytes = [0; HEADER_BYTES];
+        for seed in 0..2000u64 {
+            header().encode(&mut bytes);
+            for i in 0..8 {
+                let at = 8 + mix64(seed * 8 + i) as usize % (LABEL_AT - 8);
+                bytes[at] = mix64(seed * 8 + i + (1 << 40)) as u8;
+            }
+            let sum = checksum(&bytes[..CHECKSUM_AT]);
+            bytes[CHECKSUM_AT..].copy_from_slice(&sum.to_le_bytes());
+            if let Ok(read) = SlotHeader::decode(&bytes) {
+                assert!(read.label.len() <= LABEL_BYTES_MAX && read.slot.place.offset % 4096 == 0);
+            }
+        }
+    }
+
+    #[test]
+    fn references_come_back_and_impossible_ones_do_not() {
+        let slot = header().slot;
+        assert_eq!(SlotRef::from_bytes(&slot.to_bytes()), Some(slot));
+        let raw = SlotRef { codec: StoredAs::Raw, stored_bytes: 1000, ..slot };
+        assert_eq!(SlotRef::from_bytes(&raw.to_bytes()), Some(raw));
+        for wrong in [
+            SlotRef { stored_bytes: 1000, ..slot },
+            SlotRef { codec: StoredAs::Raw, ..slot },
+            SlotRef { place: Place { segment: 0, offset: 4097 }, ..slot },
+        ] {
+            assert_eq!(SlotRef::from_bytes(&wrong.to_bytes()), None);
+        }
+        let mut bytes = slot.to_bytes();
+        bytes[SlotRef::ENCODED_BYTES - 1] = 3;
+        assert_eq!(SlotRef::from_bytes(&bytes), None);
+    }
+}

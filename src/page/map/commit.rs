@@ -1,0 +1,485 @@
+//! Commits: from written pages to a generation that survives anything, and back at opening.
+//!
+//! The order of a commit at a step boundary: 1. every write has ended with its full length (the pager has written the
+//! dirty pages to free slots before); 2. the segments are synced; 3. one transaction of the page map, durable when it
+//! returns, names the new versions; 4. the witness learns of it: acknowledged; 5. only then slots and map entries that no
+//! kept generation sees become free.
+//!
+//! Invariants: 1. a store opens at the last acknowledged generation or at one whose commit was under way, never at
+//! another and never at a mixture; 2. after a failed write, sync or transaction nothing is committed any more by this
+//! process; 3. running out of space is not that: the map is opened again, the reserve is given up, and the commit may
+//! be tried again; 4. nothing durable names a file whose folder entry is not durable.
+//!
+//! The store belongs to one process at a time; the lock on its folder is the caller's.
+
+use crate::base::ids::PageId;
+use crate::page::folder::protocol_files::Folder;
+use crate::page::format::slot_header::SlotRef;
+use crate::page::map::generations::Generations;
+use crate::page::map::manifest::{Manifest, MapBatch, MapError};
+use crate::page::map::mutants::{Mutant, active};
+use crate::page::map::opening::Opened;
+use crate::page::map::witness::Witness;
+use crate::page::versions::page_error::PageError;
+use crate::page::versions::paged_store::{PageDone, PagedStore};
+use std::io;
+
+/// The page map's file.
+pub const MAP_NAME: &str = "map.redb";
+/// The page map while it is made.
+pub const MAP_NEW_NAME: &str = "map.redb.new";
+/// The witness's file.
+pub const WITNESS_NAME: &str = "witness";
+/// Space set aside for a last commit on a full drive.
+pub const RESERVE_NAME: &str = "reserve";
+/// The reserve while it is filled.
+pub const RESERVE_NEW_NAME: &str = "reserve.new";
+/// The reserve is filled in pieces of this many bytes.
+const RESERVE_PIECE_BYTES: usize = 1 << 20;
+
+/// What does not change while a store is open.
+#[derive(Debug, Clone, Copy)]
+pub struct CommitConfig {
+    /// Identity of the store; every value and slot carries it.
+    pub store: u128,
+    /// Memory for the map's cache, bytes.
+    pub cache_bytes: usize,
+    /// Bytes of the reserve: room for one segment and for the map to grow. 0: none.
+    pub reserve_bytes: u64,
+}
+
+/// A page that is not as the last generation knows it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PageChange {
+    /// The page.
+    pub page: PageId,
+    /// Its slot and its label; `None`: the page is gone.
+    pub version: Option<(SlotRef, Vec<u8>)>,
+}
+
+/// What a generation consists of beside the pages that did not change.
+#[derive(Debug, Clone, Copy)]
+pub struct Cut<'a> {
+    /// All pages that changed since the last acknowledged commit, each once.
+    pub changes: &'a [PageChange],
+    /// Everything that the trainer needs to go on.
+    pub run_state: &'a [u8],
+    /// A few bytes for lists of generations.
+    pub note: &'a [u8],
+    /// Keep this generation under this name.
+    pub pin: Option<&'a str>,
+}
+
+/// Why a store cannot be made, opened, or committed to.
+#[derive(Debug, thiserror::Error)]
+pub enum CommitError {
+    /// Pages could not be made durable.
+    #[error(transparent)]
+    Pages(#[from] PageError),
+    /// The map failed.
+    #[error("{0}\n  remedy: what was acknowledged before is still there; check the drive, then start again")]
+    Map(#[from] MapError),
+    /// There is no space. Nothing is lost; the commit may be tried again when there is.
+    #[error("there is no space for a commit: {0}\n  remedy: free space on the drive of the spill directory")]
+    Full(io::Error),
+    /// The files beside the map cannot be used.
+    #[error("{name} cannot be used: {source}\n  remedy: check the drive; `gsscale-ckpt salvage` can rebuild the map")]
+    File {
+        /// Name of the file in the store's folder.
+        name: &'static str,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// An earlier error ended all commits of this process.
+    #[error(
+        "nothing is committed any more after an error of the drive ({0})\n  remedy: check the drive, then start again"
+    )]
+    Poisoned(String),
+    /// There is no store in the folder.
+    #[error("there is no page map in this folder")]
+    NoStore,
+    /// The map is whole, and what it says cannot be.
+    #[error("the page map contradicts itself: {0}\n  remedy: `gsscale-ckpt salvage` can rebuild it from the pages")]
+    Contradiction(String),
+    /// Segments that must be there are missing or have another length.
+    #[error(
+        "pages are missing: {0}\n  remedy: put the files back as they were; `gsscale-ckpt salvage` saves what is left"
+    )]
+    Segments(String),
+    /// A generation that is not kept was asked for.
+    #[error("generation {0} is not kept\n  remedy: `gsscale-ckpt ls` lists those that are")]
+    NotKept(u64),
+}
+
+impl CommitError {
+    /// Whether it is only space that is missing: the same may work later.
+    pub fn is_out_of_space(&self) -> bool {
+        match self {
+            CommitError::Full(_) | CommitError::Map(MapError::Full(_)) => true,
+            CommitError::Pages(error) => error.is_out_of_space(),
+            _ => false,
+        }
+    }
+}
+
+/// The commits of one open store.
+pub struct Commits {
+    folder: Box<dyn Folder>,
+    config: CommitConfig,
+    /// `None` after the drive was full: to be opened again.
+    manifest: Option<Manifest>,
+    witness: Witness,
+    generations: Generations,
+    poison: Option<String>,
+}
+
+impl Commits {
+    /// Makes an empty store in `folder`, durable when this returns. What an interrupted making left is overwritten.
+    ///
+    /// # Errors
+    /// The folder cannot be written, or a store is there already.
+    pub fn create(folder: Box<dyn Folder>, config: CommitConfig) -> Result<Opened, CommitError> {
+        if folder.open(MAP_NAME).map_err(|source| CommitError::File { name: MAP_NAME, source })?.is_some() {
+            let source = io::Error::new(io::ErrorKind::AlreadyExists, "there is a store in this folder");
+            return Err(CommitError::File { name: MAP_NAME, source });
+        }
+        let witness = folder.create(WITNESS_NAME).and_then(|file| Witness::create(file, config.store));
+        witness.map_err(|source| CommitError::File { name: WITNESS_NAME, source })?;
+        let file = folder.create(MAP_NEW_NAME).map_err(|source| CommitError::File { name: MAP_NAME, source })?;
+        drop(Manifest::create(file, config.store, config.cache_bytes)?);
+        // Entries may become durable in any order: first all files, then the name that makes them a store.
+        let named = sync_entries(folder.as_ref()).and_then(|()| folder.rename(MAP_NEW_NAME, MAP_NAME));
+        let named = named.and_then(|()| sync_entries(folder.as_ref()));
+        named.map_err(|source| CommitError::File { name: MAP_NAME, source })?;
+        Commits::open(folder, config)
+    }
+
+    /// Opens the store in `folder`: verifies the whole map and finds the last generation. Page data is not read.
+    ///
+    /// # Errors
+    /// There is no store, it is damaged or older than what was acknowledged, or it cannot be read or written. Files of a
+    /// refused store stay as they were.
+    pub fn open(folder: Box<dyn Folder>, config: CommitConfig) -> Result<Opened, CommitError> {
+        let file = folder.open(MAP_NAME).map_err(|source| CommitError::File { name: MAP_NAME, source })?;
+        let file = file.ok_or(CommitError::NoStore)?;
+        let witness_error = |source| CommitError::File { name: WITNESS_NAME, source };
+        let witness = folder.open(WITNESS_NAME).map_err(witness_error)?;
+        let witness = witness.ok_or_else(|| witness_error(io::ErrorKind::NotFound.into()))?;
+        let mut witness = Witness::open(witness, config.store).map_err(witness_error)?;
+        // A process that was killed may have left entries that only memory knows; from here on they can be counted on.
+        sync_entries(folder.as_ref()).map_err(|source| CommitError::File { name: "the folder", source })?;
+        let (manifest, content) = Manifest::open(file, config.store, witness.sequence(), config.cache_bytes)?;
+        // A commit that was durable and not yet acknowledged is acknowledged now.
+        if witness.sequence() < content.counters.sequence {
+            witness.record(content.counters.sequence).map_err(witness_error)?;
+        }
+        let generations = Generations::of(&content);
+        let run_state = match content.counters.latest {
+            0 => Vec::new(),
+            latest => manifest.run_state(latest)?,
+        };
+        let commits = Commits { folder, config, manifest: Some(manifest), witness, generations, poison: None };
+        Opened::new(commits, content, run_state)
+    }
+
+    /// What does not change.
+    pub fn config(&self) -> CommitConfig {
+        self.config
+    }
+
+    /// Generations, kept ones and names.
+    pub fn generations(&self) -> &Generations {
+        &self.generations
+    }
+
+    /// Why nothing is committed any more, if so.
+    pub fn poison(&self) -> Option<&str> {
+        self.poison.as_deref()
+    }
+
+    /// Commits: returns the number of the generation, which is durable. Pages whose writes ended meanwhile are in `done`.
+    ///
+    /// # Errors
+    /// Nothing was acknowledged. Unless [`CommitError::is_out_of_space`], nothing is committed any more: the store opens
+    /// at the last acknowledged generation or at this one.
+    pub fn commit(
+        &mut self,
+        store: &mut PagedStore,
+        done: &mut Vec<PageDone>,
+        cut: &Cut<'_>,
+    ) -> Result<u64, CommitError> {
+        self.commit_generation(store, done, None, cut)
+    }
+
+    /// As [`Commits::commit`], of a generation that was [cut](PagedStore::cut) before, and whose pages were written for it
+    /// since.
+    ///
+    /// # Errors
+    /// As [`Commits::commit`].
+    pub fn commit_cut(
+        &mut self,
+        store: &mut PagedStore,
+        done: &mut Vec<PageDone>,
+        generation: u64,
+        cut: &Cut<'_>,
+    ) -> Result<u64, CommitError> {
+        self.commit_generation(store, done, Some(generation), cut)
+    }
+
+    fn commit_generation(
+        &mut self,
+        store: &mut PagedStore,
+        done: &mut Vec<PageDone>,
+        generation: Option<u64>,
+        cut: &Cut<'_>,
+    ) -> Result<u64, CommitError> {
+        self.refuse_if_poisoned()?;
+        let result = self.commit_steps(store, done, generation, cut);
+        if let Err(error) = &result {
+            self.poison_unless_full(store, error);
+        }
+        result
+    }
+
+    fn commit_steps(
+        &mut self,
+        store: &mut PagedStore,
+        done: &mut Vec<PageDone>,
+        generation: Option<u64>,
+        cut: &Cut<'_>,
+    ) -> Result<u64, CommitError> {
+        if !active(Mutant::SegmentsNotSynced) && !active(Mutant::SegmentsSyncedAfterMap) {
+            let first = done.len();
+            store.sync(done)?;
+            // A page that could not be written for want of space is not durable, though nothing else is wrong.
+            let short = done[first..].iter().find_map(|d| d.result.as_ref().err().filter(|e| e.is_out_of_space()));
+            if let Some(error) = short {
+                return Err(CommitError::Full(io::Error::new(io::ErrorKind::StorageFull, error.to_string())));
+            }
+        }
+        self.ensure_open()?;
+        let generation = generation.unwrap_or_else(|| store.cut());
+        let put = cut.changes.iter().map(|c| (c.page, c.version.as_ref().map(|(slot, label)| value_of(slot, label))));
+        let texts = (cut.note.to_vec(), cut.run_state.to_vec());
+        let batch = self.generations.plan_commit(generation, put.collect(), texts, cut.pin);
+        if active(Mutant::SlotsFreedBeforeAcknowledgement) {
+            self.free_slots_without(store, &batch);
+        }
+        self.acknowledge(&batch)?;
+        if active(Mutant::SegmentsSyncedAfterMap) {
+            store.sync(done)?;
+        }
+        self.free_slots(store);
+        Ok(generation)
+    }
+
+    /// Gives kept generations names and takes names away; what only those kept becomes free.
+    ///
+    /// # Errors
+    /// A generation is not kept; else as [`Commits::commit`].
+    pub fn pin(&mut self, store: &mut PagedStore, put: &[(String, u64)], drop: &[String]) -> Result<(), CommitError> {
+        self.refuse_if_poisoned()?;
+        if let Some((_, generation)) = put.iter().find(|(_, generation)| !self.generations.is_kept(*generation)) {
+            return Err(CommitError::NotKept(*generation));
+        }
+        let result = self.ensure_open().and_then(|()| {
+            let batch = self.generations.plan_pins(put, drop);
+            self.acknowledge(&batch)
+        });
+        if let Err(error) = &result {
+            self.poison_unless_full(store, error);
+        }
+        result?;
+        self.free_slots(store);
+        Ok(())
+    }
+
+    /// Makes a kept generation the latest again and drops the later ones with their names. The store is closed by it.
+    ///
+    /// # Errors
+    /// The generation is not kept; else as [`Commits::commit`].
+    pub fn rollback(mut self, generation: u64) -> Result<(), CommitError> {
+        self.refuse_if_poisoned()?;
+        if !self.generations.is_kept(generation) {
+            return Err(CommitError::NotKept(generation));
+        }
+        let batch = self.generations.plan_rollback(generation);
+        self.acknowledge(&batch)
+    }
+
+    /// The run state of a kept generation.
+    ///
+    /// # Errors
+    /// It is not kept, or cannot be read.
+    pub fn run_state(&self, generation: u64) -> Result<Vec<u8>, CommitError> {
+        if !self.generations.is_kept(generation) {
+            return Err(CommitError::NotKept(generation));
+        }
+        let manifest = self.manifest.as_ref().ok_or(MapError::Poisoned)?;
+        Ok(manifest.run_state(generation)?)
+    }
+
+    /// Sets the reserve aside, if it is not; returns whether it is there now.
+    ///
+    /// # Errors
+    /// It cannot be made for another reason than space.
+    pub fn fill_reserve(&mut self) -> Result<bool, CommitError> {
+        let bytes = self.config.reserve_bytes;
+        match fill_reserve(self.folder.as_ref(), bytes) {
+            Ok(()) => Ok(true),
+            Err(error) if crate::page::versions::page_error::is_out_of_space(&error) => {
+                self.give_up_reserve()?;
+                Ok(false)
+            }
+            Err(source) => Err(CommitError::File { name: RESERVE_NAME, source }),
+        }
+    }
+
+    /// Gives the reserve up: its space is free for segments and the map. Returns whether there was one.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub fn give_up_reserve(&mut self) -> Result<bool, CommitError> {
+        let error = |source| CommitError::File { name: RESERVE_NAME, source };
+        let mut was_there = false;
+        for name in [RESERVE_NAME, RESERVE_NEW_NAME] {
+            was_there |= self.folder.open(name).map_err(error)?.is_some();
+            self.folder.remove(name).map_err(error)?;
+        }
+        Ok(was_there)
+    }
+
+    /// The transaction, then the witness, then the books. On a full drive once more with the reserve's space.
+    fn acknowledge(&mut self, batch: &MapBatch) -> Result<(), CommitError> {
+        if active(Mutant::WitnessBeforeMap) {
+            let next = self.witness.sequence() + 1;
+            self.witness.record(next).map_err(|source| CommitError::File { name: WITNESS_NAME, source })?;
+        }
+        let mut applied = self.apply(batch);
+        if applied.is_err() && active(Mutant::MapCommitRetried) {
+            self.manifest = None;
+            applied = self.open_again().and_then(|_| self.apply(batch));
+        }
+        if matches!(applied, Err(MapError::Full(_))) && self.give_up_reserve()? {
+            // What the interrupted transaction left is found and counted: it may have been durable after all.
+            applied = match self.open_again() {
+                Ok(true) => return Ok(()),
+                Ok(false) => self.apply(batch),
+                Err(error) => Err(error),
+            };
+        }
+        match applied {
+            Err(MapError::Full(source)) => return Err(CommitError::Full(source)),
+            other => other?,
+        }
+        let sequence = self.manifest.as_ref().map_or(0, |m| m.counters().sequence);
+        self.witness.record(sequence).map_err(|source| CommitError::File { name: WITNESS_NAME, source })?;
+        self.generations.adopt(batch);
+        Ok(())
+    }
+
+    /// One transaction. A map that found no space is closed: it takes no more until it is opened again.
+    fn apply(&mut self, batch: &MapBatch) -> Result<(), MapError> {
+        let manifest = self.manifest.as_mut().ok_or(MapError::Poisoned)?;
+        let result = manifest.apply(batch);
+        if matches!(result, Err(MapError::Full(_))) {
+            self.manifest = None;
+        }
+        result
+    }
+
+    /// Opens a map that had been closed. Returns whether the interrupted transaction was durable: it is acknowledged
+    /// and in the books then.
+    fn open_again(&mut self) -> Result<bool, MapError> {
+        if self.manifest.is_some() {
+            return Ok(false);
+        }
+        let file = self.folder.open(MAP_NAME)?;
+        let file = file.ok_or_else(|| MapError::Damaged("the file is gone".to_string()))?;
+        let acknowledged = self.witness.sequence();
+        let (manifest, content) = Manifest::open(file, self.config.store, acknowledged, self.config.cache_bytes)?;
+        self.manifest = Some(manifest);
+        self.generations = Generations::of(&content);
+        let was_durable = content.counters.sequence > acknowledged;
+        if was_durable {
+            self.witness.record(content.counters.sequence)?;
+        }
+        Ok(was_durable)
+    }
+
+    fn ensure_open(&mut self) -> Result<(), CommitError> {
+        match self.open_again() {
+            Err(MapError::Full(source)) => Err(CommitError::Full(source)),
+            other => Ok(other.map(|_| ())?),
+        }
+    }
+
+    fn free_slots(&self, store: &mut PagedStore) {
+        let kept: Vec<u64> = self.generations.kept().collect();
+        let kept = if active(Mutant::SlotsFreedAtOnce) { Vec::new() } else { kept };
+        store.commit_done(self.generations.latest(), &kept);
+    }
+
+    /// Frees as though `batch` were acknowledged: a mistake that the crash tests make on purpose.
+    fn free_slots_without(&self, store: &mut PagedStore, batch: &MapBatch) {
+        let kept: Vec<u64> = self.generations.kept().filter(|g| !batch.drop_generations.contains(g)).collect();
+        store.commit_done(batch.latest, &kept);
+    }
+
+    fn refuse_if_poisoned(&self) -> Result<(), CommitError> {
+        match &self.poison {
+            Some(cause) if !active(Mutant::PoisonIgnored) => Err(CommitError::Poisoned(cause.clone())),
+            _ => Ok(()),
+        }
+    }
+
+    fn poison_unless_full(&mut self, store: &mut PagedStore, error: &CommitError) {
+        if !error.is_out_of_space() {
+            let cause = error.to_string();
+            store.poison_with(cause.clone());
+            self.poison.get_or_insert(cause);
+        }
+    }
+}
+
+impl std::fmt::Debug for Commits {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Commits({:?}, {:?}, poison: {:?})", self.manifest, self.witness, self.poison)
+    }
+}
+
+fn sync_entries(folder: &dyn Folder) -> io::Result<()> {
+    if active(Mutant::FolderNotSyncedForMap) { Ok(()) } else { folder.sync() }
+}
+
+/// What the map keeps about a version of a page: the slot, then the label.
+fn value_of(slot: &SlotRef, label: &[u8]) -> Vec<u8> {
+    let mut value = slot.to_bytes().to_vec();
+    value.extend_from_slice(label);
+    value
+}
+
+/// Really writes the bytes: some drives and file systems do not keep space that was only promised. The name comes last: what
+/// has it is filled, also when a process was killed or the power failed meanwhile.
+fn fill_reserve(folder: &dyn Folder, bytes: u64) -> io::Result<()> {
+    if bytes == 0 {
+        return folder.remove(RESERVE_NEW_NAME).and_then(|()| folder.remove(RESERVE_NAME));
+    }
+    if let Some(file) = folder.open(RESERVE_NAME)?
+        && file.len()? >= bytes
+    {
+        return Ok(());
+    }
+    // One that is too small gives its space to the new one.
+    folder.remove(RESERVE_NAME)?;
+    let file = folder.create(RESERVE_NEW_NAME)?;
+    file.set_len(bytes)?;
+    let piece = vec![0x5a; RESERVE_PIECE_BYTES];
+    for at in (0..bytes).step_by(RESERVE_PIECE_BYTES) {
+        file.write(at, &piece[..(bytes - at).min(RESERVE_PIECE_BYTES as u64) as usize])?;
+    }
+    file.sync_data()?;
+    drop(file);
+    folder.rename(RESERVE_NEW_NAME, RESERVE_NAME)?;
+    folder.sync()
+}

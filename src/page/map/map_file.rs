@@ -1,0 +1,299 @@
+//! The file under the page map: what redb reads and writes.
+//!
+//! Two things are held here that redb does not give. Opening changes nothing until it is known to be wanted: what redb
+//! writes while it repairs and marks the file is held back, and reaches the drive in the same order only after the map was
+//! verified; a refused file stays as it was found. And closing changes nothing: the last acknowledged commit is the
+//! last write, so every opening goes the way of an opening after a crash, which is the way that is tested.
+//!
+//! Invariants: 1. held-back operations are carried out in their order, syncs included; 2. once shut, nothing is read or
+//! written any more.
+
+use crate::page::engine::segment_files::allocate;
+use redb::{BackendError, StorageBackend};
+use std::fs::File;
+use std::io;
+use std::ops::Bound;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// One operation that is held back.
+#[derive(Debug)]
+enum Held {
+    Write(u64, Vec<u8>),
+    Length(u64),
+    Sync,
+}
+
+/// Operations of an opening that is not decided yet.
+#[derive(Debug)]
+struct HeldBack {
+    operations: Vec<Held>,
+    len: u64,
+}
+
+#[derive(Debug)]
+struct Shared {
+    file: Arc<dyn StorageBackend>,
+    held_back: Mutex<Option<HeldBack>>,
+    shut: AtomicBool,
+    failure: Mutex<Option<(io::ErrorKind, String)>>,
+}
+
+/// A handle on the file; clones are the same file.
+#[derive(Debug, Clone)]
+pub struct MapFile(Arc<Shared>);
+
+impl MapFile {
+    /// Passes everything through.
+    pub fn new(file: Arc<dyn StorageBackend>) -> MapFile {
+        let (held_back, failure) = (Mutex::new(None), Mutex::new(None));
+        MapFile(Arc::new(Shared { file, held_back, shut: AtomicBool::new(false), failure }))
+    }
+
+    /// Holds back what is written, until [`MapFile::let_through`].
+    ///
+    /// # Errors
+    /// The length of the file cannot be read.
+    pub fn holding_back(file: Arc<dyn StorageBackend>) -> io::Result<MapFile> {
+        let len = file.len()?;
+        let map = MapFile::new(file);
+        *map.held_back() = Some(HeldBack { operations: Vec::new(), len });
+        Ok(map)
+    }
+
+    /// Carries out what was held back; from now on everything passes through.
+    ///
+    /// # Errors
+    /// The first operation that failed; the file is shut then.
+    pub fn let_through(&self) -> io::Result<()> {
+        let operations = self.held_back().take().map(|held| held.operations).unwrap_or_default();
+        for operation in operations {
+            let done = match operation {
+                Held::Write(offset, bytes) => self.0.file.write(offset, &bytes),
+                Held::Length(len) => self.0.file.set_len(len),
+                Held::Sync => self.0.file.sync_data(),
+            };
+            if let Err(error) = done {
+                self.shut();
+                return Err(error);
+            }
+        }
+        Ok(())
+    }
+
+    /// Ends all access. What was held back is dropped.
+    pub fn shut(&self) {
+        self.0.shut.store(true, Ordering::Release);
+        *self.held_back() = None;
+    }
+
+    /// The first error that the drive gave; the library reports some of them only as "an earlier one".
+    pub fn failure(&self) -> Option<io::Error> {
+        let failure = self.0.failure.lock().unwrap_or_else(PoisonError::into_inner);
+        failure.as_ref().map(|(kind, text)| io::Error::new(*kind, text.clone()))
+    }
+
+    fn held_back(&self) -> MutexGuard<'_, Option<HeldBack>> {
+        self.0.held_back.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn check_open(&self) -> io::Result<()> {
+        if self.0.shut.load(Ordering::Acquire) { Err(io::Error::other("the map was closed")) } else { Ok(()) }
+    }
+
+    fn noted<T>(&self, result: io::Result<T>) -> io::Result<T> {
+        if let Err(error) = &result {
+            let mut failure = self.0.failure.lock().unwrap_or_else(PoisonError::into_inner);
+            failure.get_or_insert_with(|| (error.kind(), error.to_string()));
+        }
+        result
+    }
+}
+
+/// What `out`, read from `offset`, would hold after `operations`.
+fn overlay(operations: &[Held], offset: u64, out: &mut [u8]) {
+    let end = offset + out.len() as u64;
+    for operation in operations {
+        match operation {
+            Held::Write(at, bytes) => {
+                let (from, to) = ((*at).max(offset), (at + bytes.len() as u64).min(end));
+                if from < to {
+                    let source = &bytes[(from - at) as usize..(to - at) as usize];
+                    out[(from - offset) as usize..(to - offset) as usize].copy_from_slice(source);
+                }
+            }
+            Held::Length(len) if *len < end => out[len.saturating_sub(offset) as usize..].fill(0),
+            Held::Length(_) | Held::Sync => {}
+        }
+    }
+}
+
+impl StorageBackend for MapFile {
+    fn len(&self) -> io::Result<u64> {
+        self.check_open()?;
+        match self.held_back().as_ref() {
+            Some(held) => Ok(held.len),
+            None => self.noted(self.0.file.len()),
+        }
+    }
+
+    fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
+        self.check_open()?;
+        let held = self.held_back();
+        let Some(held) = held.as_ref() else { return self.noted(self.0.file.read(offset, out)) };
+        if offset.checked_add(out.len() as u64).is_none_or(|end| end > held.len) {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        let stored = self.0.file.len()?.saturating_sub(offset).min(out.len() as u64) as usize;
+        let (front, back) = out.split_at_mut(stored);
+        if !front.is_empty() {
+            self.0.file.read(offset, front)?;
+        }
+        back.fill(0);
+        overlay(&held.operations, offset, out);
+        Ok(())
+    }
+
+    fn set_len(&self, len: u64) -> io::Result<()> {
+        self.check_open()?;
+        if let Some(held) = self.held_back().as_mut() {
+            held.operations.push(Held::Length(len));
+            held.len = len;
+            return Ok(());
+        }
+        self.noted(self.0.file.set_len(len))
+    }
+
+    fn sync_data(&self) -> io::Result<()> {
+        self.check_open()?;
+        if let Some(held) = self.held_back().as_mut() {
+            held.operations.push(Held::Sync);
+            return Ok(());
+        }
+        if crate::page::map::mutants::active(crate::page::map::mutants::Mutant::MapNotDurable) {
+            return Ok(());
+        }
+        self.noted(self.0.file.sync_data())
+    }
+
+    fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
+        self.check_open()?;
+        if let Some(held) = self.held_back().as_mut() {
+            held.operations.push(Held::Write(offset, data.to_vec()));
+            return Ok(());
+        }
+        self.noted(self.0.file.write(offset, data))
+    }
+
+    // The folder of the store is locked as a whole, so the file needs no lock of its own.
+    fn try_lock_range(&self, _start: Bound<u64>, _end: Bound<u64>) -> Result<bool, BackendError> {
+        Err(BackendError::Unsupported)
+    }
+}
+
+/// A file on a drive. Space is taken when it grows, so that a full drive is met before anything is overwritten.
+#[derive(Debug)]
+pub struct DriveFile(File);
+
+impl DriveFile {
+    /// `file` must be open for reading and writing.
+    pub fn new(file: File) -> DriveFile {
+        DriveFile(file)
+    }
+}
+
+impl StorageBackend for DriveFile {
+    fn len(&self) -> io::Result<u64> {
+        Ok(self.0.metadata()?.len())
+    }
+
+    #[cfg(unix)]
+    fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
+        std::os::unix::fs::FileExt::read_exact_at(&self.0, out, offset)
+    }
+
+    #[cfg(not(unix))]
+    fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
+        use std::io::{Read, Seek};
+        (&self.0).seek(io::SeekFrom::Start(offset))?;
+        (&self.0).read_exact(out)
+    }
+
+    fn set_len(&self, len: u64) -> io::Result<()> {
+        let now = self.0.metadata()?.len();
+        if len <= now {
+            return self.0.set_len(len);
+        }
+        allocate(&self.0, now, len).inspect_err(|_| {
+            // What was taken before space ran out is given back, as far as that works.
+            let _ = self.0.set_len(now);
+        })
+    }
+
+    fn sync_data(&self) -> io::Result<()> {
+        self.0.sync_data()
+    }
+
+    #[cfg(unix)]
+    fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
+        std::os::unix::fs::FileExt::write_all_at(&self.0, data, offset)
+    }
+
+    #[cfg(not(unix))]
+    fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
+        use std::io::{Seek, Write};
+        (&self.0).seek(io::SeekFrom::Start(offset))?;
+        (&self.0).write_all(data)
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use redb::backends::InMemoryBackend;
+
+    #[cfg(unix)]
+    #[test]
+    fn a_file_that_grows_takes_its_space() {
+        use std::os::unix::fs::MetadataExt;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map");
+        let open = File::options().read(true).write(true).create_new(true).open(&path).unwrap();
+        let file = DriveFile::new(open);
+        for (len, taken) in [(1 << 20, 1 << 20), (3 << 20, 3 << 20), (1 << 20, 1 << 20)] {
+            file.set_len(len).unwrap();
+            let there = std::fs::metadata(&path).unwrap();
+            assert!(there.len() == len && there.blocks() * 512 >= taken, "{} blocks", there.blocks());
+        }
+    }
+
+    #[test]
+    fn what_is_held_back_is_read_but_not_written() {
+        let inner: Arc<dyn StorageBackend> = Arc::new(InMemoryBackend::new());
+        inner.set_len(16).unwrap();
+        inner.write(0, &[1; 16]).unwrap();
+        let map = MapFile::holding_back(Arc::clone(&inner)).unwrap();
+        map.write(4, &[2; 4]).unwrap();
+        map.set_len(24).unwrap();
+        map.write(20, &[3; 4]).unwrap();
+        map.sync_data().unwrap();
+        let mut seen = [9; 24];
+        map.read(0, &mut seen).unwrap();
+        assert_eq!(seen, [1, 1, 1, 1, 2, 2, 2, 2, 1, 1, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 3, 3, 3, 3]);
+        map.set_len(18).unwrap();
+        map.set_len(24).unwrap();
+        map.read(0, &mut seen).unwrap();
+        assert_eq!(seen[16..], [0; 8], "bytes cut off come back as zeros");
+        assert!(map.read(20, &mut [0; 5]).is_err(), "beyond the end");
+        let mut stored = [0; 16];
+        inner.read(0, &mut stored).unwrap();
+        assert_eq!((inner.len().unwrap(), stored), (16, [1; 16]), "nothing may reach the drive");
+        map.let_through().unwrap();
+        let mut after = [9; 24];
+        inner.read(0, &mut after).unwrap();
+        assert_eq!(after, seen);
+        map.shut();
+        assert!(map.read(0, &mut after).is_err() && map.write(0, &[1]).is_err() && map.len().is_err());
+    }
+}

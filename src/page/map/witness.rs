@@ -1,0 +1,124 @@
+//! The witness: how far the map has been acknowledged, kept outside the map.
+//!
+//! One flipped bit in the map's file can make its library open the transaction before the last one, which is whole and
+//! whose checksums fit (the bit that says which of its two roots counts is in no checksum); so can a restored old copy of
+//! the file. The witness holds the number of the last acknowledged transaction; a map that is older is refused by name.
+//!
+//! The file is two slots of 4 KiB, written in turns, each synced before the next is touched: after a crash at least one
+//! is whole, and it is at most one transaction behind. A witness behind its map is an ordinary crash.
+
+use crate::page::format::seal::{SEAL_BYTES, SealScope};
+use crate::page::map::mutants::{Mutant, active};
+use redb::StorageBackend;
+use std::io;
+use std::sync::Arc;
+
+/// Bytes of one slot, a sector's worth on every drive.
+const SLOT_BYTES: usize = 4096;
+const SLOTS: u64 = 2;
+const TABLE: u8 = 255;
+const MAGIC: [u8; 8] = *b"gsw\x01ack\n";
+/// Magic and sequence.
+const BODY_BYTES: usize = 16;
+
+/// The file that holds the number of the last acknowledged transaction.
+#[derive(Debug)]
+pub struct Witness {
+    file: Arc<dyn StorageBackend>,
+    store: u128,
+    sequence: u64,
+}
+
+impl Witness {
+    /// Fills `file`, which is empty, and syncs it. The folder is the caller's to sync.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn create(file: Arc<dyn StorageBackend>, store: u128) -> io::Result<Witness> {
+        file.set_len(SLOTS * SLOT_BYTES as u64)?;
+        let mut witness = Witness { file, store, sequence: 0 };
+        witness.record(0)?;
+        Ok(witness)
+    }
+
+    /// Reads `file`. A slot that is not whole is passed over.
+    ///
+    /// # Errors
+    /// The file cannot be read, or holds no whole slot: [`io::ErrorKind::InvalidData`].
+    pub fn open(file: Arc<dyn StorageBackend>, store: u128) -> io::Result<Witness> {
+        let mut sequence = None;
+        for slot in 0..SLOTS {
+            let mut bytes = [0u8; SLOT_BYTES];
+            if file.len()? < (slot + 1) * SLOT_BYTES as u64 {
+                continue;
+            }
+            file.read(slot * SLOT_BYTES as u64, &mut bytes)?;
+            sequence = sequence.max(read_slot(store, slot, &bytes));
+        }
+        match sequence {
+            Some(sequence) => Ok(Witness { file, store, sequence }),
+            None => Err(io::Error::new(io::ErrorKind::InvalidData, "neither slot of the witness is whole")),
+        }
+    }
+
+    /// The last acknowledged transaction that the file knows.
+    pub fn sequence(&self) -> u64 {
+        self.sequence
+    }
+
+    /// Writes `sequence` durably.
+    ///
+    /// # Errors
+    /// The file cannot be written; what it holds then is the old or the new number.
+    pub fn record(&mut self, sequence: u64) -> io::Result<()> {
+        let slot = if active(Mutant::WitnessInOneSlot) { 0 } else { sequence % SLOTS };
+        let mut body = MAGIC.to_vec();
+        body.extend_from_slice(&sequence.to_le_bytes());
+        let mut bytes = scope(self.store).seal(&slot.to_le_bytes(), &body);
+        bytes.resize(SLOT_BYTES, 0);
+        self.file.write(slot * SLOT_BYTES as u64, &bytes)?;
+        self.file.sync_data()?;
+        self.sequence = sequence;
+        Ok(())
+    }
+}
+
+fn scope(store: u128) -> SealScope {
+    SealScope { store, table: TABLE }
+}
+
+fn read_slot(store: u128, slot: u64, bytes: &[u8]) -> Option<u64> {
+    let sealed = bytes.get(..SEAL_BYTES + BODY_BYTES)?;
+    let (body, _) = scope(store).unseal(&slot.to_le_bytes(), sealed).ok()?;
+    let (magic, sequence) = body.split_first_chunk::<8>()?;
+    (*magic == MAGIC).then_some(u64::from_le_bytes(sequence.try_into().ok()?))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use redb::backends::InMemoryBackend;
+
+    #[test]
+    fn one_damaged_slot_costs_one_step_and_two_are_refused() {
+        let file: Arc<dyn StorageBackend> = Arc::new(InMemoryBackend::new());
+        let mut witness = Witness::create(Arc::clone(&file), 9).unwrap();
+        for sequence in 1..6 {
+            witness.record(sequence).unwrap();
+        }
+        assert_eq!(Witness::open(Arc::clone(&file), 9).unwrap().sequence(), 5);
+        assert!(Witness::open(Arc::clone(&file), 8).is_err(), "another store's witness");
+        let mut newest = [0u8; SLOT_BYTES];
+        file.read(SLOT_BYTES as u64, &mut newest).unwrap();
+        newest[17] ^= 4;
+        file.write(SLOT_BYTES as u64, &newest).unwrap();
+        assert_eq!(Witness::open(Arc::clone(&file), 9).unwrap().sequence(), 4);
+        // The good slot's bytes in the wrong place count for nothing.
+        let mut older = [0u8; SLOT_BYTES];
+        file.read(0, &mut older).unwrap();
+        file.write(SLOT_BYTES as u64, &older).unwrap();
+        file.write(0, &newest).unwrap();
+        assert_eq!(Witness::open(file, 9).unwrap_err().kind(), io::ErrorKind::InvalidData);
+    }
+}

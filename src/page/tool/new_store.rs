@@ -1,0 +1,177 @@
+//! A store that is written by a tool: pages one after the other, then generations, then its name.
+//!
+//! It is made beside its target under another name and renamed when it is complete.
+//!
+//! Invariants: 1. the target is a whole store or nothing: a tool that fails or is killed leaves at most a folder with
+//! [`PART_SUFFIX`], which the next attempt refuses to overwrite; 2. memory is bounded by sixteen pages, and by as many
+//! more where they are encoded.
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::ids::PageId;
+use crate::page::engine::buffer::PageBuffer;
+use crate::page::engine::open::{IoEngine, open_engine};
+use crate::page::engine::segment_files::sync_folder;
+use crate::page::folder::protocol_files::DriveFolder;
+use crate::page::folder::spill_dir::SpillDir;
+use crate::page::format::codec::Codec;
+use crate::page::format::slot_header::{HEADER_BYTES, SlotRef};
+use crate::page::format::spill_format::Purpose;
+use crate::page::map::commit::{Commits, Cut, PageChange};
+use crate::page::map::opening::Opened;
+use crate::page::tool::reading::{ReadError, commit_config};
+use crate::page::versions::paged_store::{PageDone, PageMoved, PagedStore};
+use crate::page::versions::slots::SlotLayout;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// What the name of an unfinished store ends in.
+pub const PART_SUFFIX: &str = ".part";
+/// Pages being written at once.
+const IN_FLIGHT: usize = 16;
+
+/// A store that is being made.
+#[derive(Debug)]
+pub struct NewStore {
+    target: PathBuf,
+    part: PathBuf,
+    /// `None` once the store is in its place.
+    spill: Option<SpillDir>,
+    commits: Commits,
+    store: PagedStore,
+    free: Vec<PageBuffer>,
+    /// Labels of pages whose write has not ended.
+    labels: BTreeMap<PageId, Vec<u8>>,
+    changes: BTreeMap<PageId, Option<(SlotRef, Vec<u8>)>>,
+}
+
+/// A folder name that nothing has yet.
+///
+/// # Errors
+/// Something is there.
+pub fn refuse_existing(target: &Path) -> InputResult<PathBuf> {
+    let mut name = target.as_os_str().to_os_string();
+    name.push(PART_SUFFIX);
+    for path in [target.to_path_buf(), PathBuf::from(&name)] {
+        if std::fs::symlink_metadata(&path).is_ok() {
+            let remedy = "name a folder that does not exist; its parent must";
+            return Err(InputError::new(&path, "exists already", remedy));
+        }
+    }
+    Ok(PathBuf::from(name))
+}
+
+impl NewStore {
+    /// Begins a store that will be at `target`, where nothing is yet.
+    ///
+    /// # Errors
+    /// Something is there, or the drive refuses.
+    pub fn create(target: &Path, layout: SlotLayout, codec: Codec) -> Result<NewStore, ReadError> {
+        let part = refuse_existing(target)?;
+        let spill = SpillDir::create(&part, Purpose::Checkpoint, layout, false)?;
+        let begin = || -> Result<(Commits, PagedStore), ReadError> {
+            let opened: Opened =
+                Commits::create(Box::new(DriveFolder::new(&part)), commit_config(spill.format().store))?;
+            let engine = open_engine(IoEngine::Auto, &part, IN_FLIGHT)?;
+            let store = opened.paged_store(engine.store, layout, codec)?;
+            Ok((opened.commits, store))
+        };
+        match begin() {
+            Ok((commits, store)) => {
+                let (free, labels, changes) = (Vec::new(), BTreeMap::new(), BTreeMap::new());
+                let target = target.to_path_buf();
+                Ok(NewStore { target, part, spill: Some(spill), commits, store, free, labels, changes })
+            }
+            Err(error) => {
+                let _ = spill.remove();
+                Err(error)
+            }
+        }
+    }
+
+    /// Stores a version of `page`, in the next generation.
+    ///
+    /// # Errors
+    /// The drive refuses.
+    pub fn put(&mut self, page: PageId, label: &[u8], payload: &[u8]) -> Result<(), ReadError> {
+        while self.store.in_flight() >= IN_FLIGHT {
+            self.settle(true)?;
+        }
+        let mut buffer = self.free.pop().unwrap_or_else(|| self.store.new_buffer());
+        let room = buffer.as_mut_slice().get_mut(HEADER_BYTES..).and_then(|b| b.get_mut(..payload.len()));
+        if let Some(room) = room {
+            room.copy_from_slice(payload);
+        }
+        self.labels.insert(page, label.to_vec());
+        let written = self.store.write(0, page, label, payload.len(), buffer);
+        written.map_err(|(error, _)| ReadError::Commit(error.into()))
+    }
+
+    /// Leaves `page` out of the next generation.
+    pub fn remove(&mut self, page: PageId) {
+        self.changes.insert(page, None);
+    }
+
+    /// Gives the next generation this number, at least that which it would have.
+    pub fn skip_to(&mut self, generation: u64) {
+        self.store.skip_to(generation);
+    }
+
+    /// Commits what was stored since the last commit, under `names`; returns the generation.
+    ///
+    /// # Errors
+    /// The drive refuses.
+    pub fn commit(&mut self, run_state: &[u8], note: &[u8], names: &[String]) -> Result<u64, ReadError> {
+        while self.store.in_flight() > 0 {
+            self.settle(true)?;
+        }
+        let changes = std::mem::take(&mut self.changes).into_iter();
+        let changes: Vec<PageChange> = changes.map(|(page, version)| PageChange { page, version }).collect();
+        let pin = names.first().map(String::as_str);
+        let cut = Cut { changes: &changes, run_state, note, pin };
+        let mut done = Vec::new();
+        let generation = self.commits.commit(&mut self.store, &mut done, &cut)?;
+        let more: Vec<(String, u64)> = names.iter().skip(1).map(|name| (name.clone(), generation)).collect();
+        if !more.is_empty() {
+            self.commits.pin(&mut self.store, &more, &[])?;
+        }
+        Ok(generation)
+    }
+
+    /// Puts the store in its place.
+    ///
+    /// # Errors
+    /// Something is there by now, or the drive refuses.
+    pub fn finish(mut self) -> Result<(), ReadError> {
+        let failed = |e: std::io::Error| InputError::io(&self.target, "putting the store in its place", &e);
+        if std::fs::symlink_metadata(&self.target).is_ok() {
+            return Err(InputError::new(&self.target, "exists by now", "name another folder and start again").into());
+        }
+        std::fs::rename(&self.part, &self.target).map_err(failed)?;
+        self.spill = None;
+        let parent = self.target.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        sync_folder(parent).map_err(failed)?;
+        Ok(())
+    }
+
+    fn settle(&mut self, wait: bool) -> Result<(), ReadError> {
+        let mut done = Vec::new();
+        self.store.complete(wait, &mut done);
+        for PageDone { page, buffer, result, .. } in done {
+            self.free.push(buffer);
+            if let PageMoved::Written(slot) = result.map_err(|e| ReadError::Commit(e.into()))? {
+                let label = self.labels.remove(&page).unwrap_or_default();
+                self.changes.insert(page, Some((slot, label)));
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Drop for NewStore {
+    fn drop(&mut self) {
+        // An unfinished one is of no use; what cannot be removed keeps its telling name.
+        if let Some(spill) = self.spill.take() {
+            let _ = spill.remove();
+        }
+    }
+}

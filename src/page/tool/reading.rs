@@ -1,0 +1,422 @@
+//! A store opened to be looked at: its map, its generations, and where their pages are. Nothing is ever written, not even
+//! the repairs that opening a map brings with it.
+//!
+//! A store that a process is using can be looked at as far as its map goes: a copy of the file is taken and verified
+//! until one is whole. Its pages cannot: slots of the last generation may be written again meanwhile.
+//!
+//! Invariants: 1. no file of the folder is opened for writing, made, or removed; 2. who holds a [`StoreReader`] of a store
+//! that is not in use keeps others from using it.
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::ids::PageId;
+use crate::page::engine::pread::PreadStore;
+use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name};
+use crate::page::engine::transfers::Place;
+use crate::page::folder::spill_dir::{LOCK, LOCK_MAGIC, bad_format, format_bytes_of, read_format};
+use crate::page::format::slot_header::SlotRef;
+use crate::page::format::spill_format::{FormatFeatures, SpillFormat, features_of};
+use crate::page::map::commit::{CommitConfig, CommitError, MAP_NAME, WITNESS_NAME};
+use crate::page::map::generations::Generations;
+use crate::page::map::manifest::{Manifest, MapContent, MapError};
+use crate::page::map::map_file::DriveFile;
+use crate::page::map::opening::{StoredPage, check_segments, pages_at, slot_and_label};
+use crate::page::map::witness::Witness;
+use crate::page::tool::slot_reader::SlotReader;
+use crate::page::versions::paged_store::{PagedStore, PagedStoreConfig};
+use redb::StorageBackend;
+use redb::backends::InMemoryBackend;
+use std::collections::{BTreeMap, HashMap};
+use std::fs::{File, TryLockError};
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Memory for the map's cache, bytes.
+const CACHE_BYTES: usize = 8 << 20;
+/// How often a map in use is copied until a copy is whole.
+const COPIES_MAX: u32 = 20;
+
+/// Why a store cannot be looked at.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadError {
+    /// The folder, its FORMAT, or who uses it.
+    #[error(transparent)]
+    Input(#[from] InputError),
+    /// The map.
+    #[error(transparent)]
+    Commit(#[from] CommitError),
+}
+
+impl From<MapError> for ReadError {
+    fn from(error: MapError) -> ReadError {
+        CommitError::Map(error).into()
+    }
+}
+
+/// What is to be read of a store.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Access {
+    /// The map: also of a store in use.
+    Map,
+    /// Pages as well: a store in use is refused.
+    Pages,
+}
+
+/// Whether the map must be at least as far as the witness says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WitnessRule {
+    /// It must, and there must be a witness.
+    Obeyed,
+    /// Whatever the witness says, or without one: for salvage.
+    Ignored,
+}
+
+/// A store that is looked at.
+#[derive(Debug)]
+pub struct StoreReader {
+    folder: PathBuf,
+    format: SpillFormat,
+    features: FormatFeatures,
+    manifest: Manifest,
+    content: MapContent,
+    generations: Generations,
+    used_by: Option<String>,
+    /// Keeps writers out.
+    _lock: Option<File>,
+}
+
+/// A kept generation.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct GenerationUse {
+    /// Its number.
+    pub generation: u64,
+    /// Its names.
+    pub names: Vec<String>,
+    /// Pages that it sees.
+    pub pages: u64,
+    /// Bytes of their slots, headers and padding included.
+    pub bytes: u64,
+    /// Of these, bytes that no other kept generation sees.
+    pub bytes_alone: u64,
+}
+
+impl StoreReader {
+    /// Opens the store in `folder` and verifies its whole map. Page data is not read.
+    ///
+    /// # Errors
+    /// There is none, it is of another version, it is in use and pages were asked for, or its map is damaged.
+    pub fn open(folder: &Path, access: Access, rule: WitnessRule) -> Result<StoreReader, ReadError> {
+        let (format, features) = format_at(folder)?;
+        let (lock, used_by) = match lock_for_reading(folder)? {
+            ReadLock::Taken(file) => (Some(file), None),
+            ReadLock::Nobody => (None, None),
+            ReadLock::InUse(who) => (None, Some(who)),
+        };
+        if let Some(who) = used_by.as_ref().filter(|_| access == Access::Pages) {
+            return Err(in_use(folder, who).into());
+        }
+        let (manifest, content) = match used_by {
+            None => open_map(folder, format.store, rule, false)?,
+            Some(_) => open_copy(folder, format.store, rule)?,
+        };
+        let generations = Generations::of(&content);
+        let folder = folder.to_path_buf();
+        Ok(StoreReader { folder, format, features, manifest, content, generations, used_by, _lock: lock })
+    }
+
+    /// The folder.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Identity and sizes.
+    pub fn format(&self) -> &SpillFormat {
+        &self.format
+    }
+
+    /// Version and features.
+    pub fn features(&self) -> FormatFeatures {
+        self.features
+    }
+
+    /// Who uses the store at the moment, as its lock says.
+    pub fn used_by(&self) -> Option<&str> {
+        self.used_by.as_deref()
+    }
+
+    /// Generations, kept ones and names.
+    pub fn generations(&self) -> &Generations {
+        &self.generations
+    }
+
+    /// Transactions of the map so far.
+    pub fn transactions(&self) -> u64 {
+        self.content.counters.sequence
+    }
+
+    /// Entries of the map.
+    pub fn entries(&self) -> usize {
+        self.content.versions.len()
+    }
+
+    /// The kept generation of this number or name; the latest without one.
+    ///
+    /// # Errors
+    /// There is none; the message lists those that there are.
+    pub fn find(&self, generation: Option<&str>) -> InputResult<u64> {
+        let refuse = |problem: String| {
+            let pins = self.generations.pins().iter().map(|(name, g)| format!("{g} ({name})"));
+            let unnamed = self.generations.kept().filter(|g| !self.generations.pins().values().any(|p| p == g));
+            let list: Vec<String> = unnamed.map(|g| g.to_string()).chain(pins).collect();
+            let list = if list.is_empty() { "none".to_string() } else { list.join(", ") };
+            Err(InputError::new(&self.folder, problem, format!("generations that are kept: {list}")))
+        };
+        let Some(word) = generation else {
+            let latest = self.generations.latest();
+            return if latest > 0 { Ok(latest) } else { refuse("nothing was committed in this store yet".into()) };
+        };
+        let named = self.generations.pins().get(word).copied();
+        let found = named.or_else(|| word.parse().ok().filter(|g| self.generations.is_kept(*g)));
+        found.map_or_else(|| refuse(format!("generation '{word}' is not kept")), Ok)
+    }
+
+    /// Pages of a kept generation, ascending by id.
+    ///
+    /// # Errors
+    /// It is not kept, or the map contradicts itself.
+    pub fn pages_at(&self, generation: u64) -> Result<Vec<StoredPage>, CommitError> {
+        if !self.generations.is_kept(generation) {
+            return Err(CommitError::NotKept(generation));
+        }
+        pages_at(&self.content.versions, generation)
+    }
+
+    /// The run state of a kept generation.
+    ///
+    /// # Errors
+    /// It is not kept, or cannot be read.
+    pub fn run_state(&self, generation: u64) -> Result<Vec<u8>, CommitError> {
+        if !self.generations.is_kept(generation) {
+            return Err(CommitError::NotKept(generation));
+        }
+        Ok(self.manifest.run_state(generation)?)
+    }
+
+    /// The note of a kept generation.
+    pub fn note(&self, generation: u64) -> &[u8] {
+        self.content.generations.get(&generation).map_or(&[], Vec::as_slice)
+    }
+
+    /// Every kept generation with what it takes on the drive, ascending.
+    ///
+    /// # Errors
+    /// The map contradicts itself.
+    pub fn uses(&self) -> Result<Vec<GenerationUse>, CommitError> {
+        let kept: Vec<u64> = self.generations.kept().collect();
+        let mut seen: HashMap<Place, (u32, u64, u64)> = HashMap::new();
+        let mut uses = Vec::new();
+        for &generation in &kept {
+            let pages = self.pages_at(generation)?;
+            let mut bytes = 0;
+            for page in &pages {
+                let slot_bytes = page.slot.transfer_bytes() as u64;
+                bytes += slot_bytes;
+                seen.entry(page.slot.place).or_insert((0, generation, slot_bytes)).0 += 1;
+            }
+            let pins = self.generations.pins().iter().filter(|(_, g)| **g == generation);
+            let names = pins.map(|(name, _)| name.clone()).collect();
+            uses.push(GenerationUse { generation, names, pages: pages.len() as u64, bytes, bytes_alone: 0 });
+        }
+        for (times, generation, bytes) in seen.into_values() {
+            let of = uses.iter_mut().find(|u| u.generation == generation && times == 1);
+            of.into_iter().for_each(|u| u.bytes_alone += bytes);
+        }
+        Ok(uses)
+    }
+
+    /// Every version that some kept generation sees, each once, in the order of their places.
+    ///
+    /// # Errors
+    /// The map contradicts itself.
+    pub fn live_versions(&self) -> Result<Vec<(PageId, SlotRef, Vec<u8>)>, CommitError> {
+        let mut live: BTreeMap<Place, (PageId, SlotRef, Vec<u8>)> = BTreeMap::new();
+        for version in &self.content.versions {
+            if let Some((slot, label)) = slot_and_label(version)? {
+                live.insert(slot.place, (version.page, slot, label.to_vec()));
+            }
+        }
+        Ok(live.into_values().collect())
+    }
+
+    /// Numbers and lengths of the segment files that are there, ascending.
+    ///
+    /// # Errors
+    /// The folder cannot be read.
+    pub fn segments(&self) -> InputResult<Vec<(u32, u64)>> {
+        segments_in(&self.folder)
+    }
+
+    /// Reads single slots.
+    pub fn slot_reader(&self) -> SlotReader {
+        SlotReader::new(&self.folder, self.format.store, self.format.layout.slot_bytes)
+    }
+
+    /// These pages behind an engine that cannot write.
+    ///
+    /// # Errors
+    /// The map names a slot that cannot be; segments up to the last that these pages lie in are missing or have another
+    /// length; or the engine cannot be started.
+    pub fn paged_store(&self, pages: &[StoredPage], threads: usize) -> Result<PagedStore, ReadError> {
+        let engine = PreadStore::open_read_only(&self.folder, threads)
+            .map_err(|e| InputError::io(&self.folder, "opening the pages", &e))?;
+        let SpillFormat { store, layout, .. } = self.format;
+        let config = PagedStoreConfig {
+            store,
+            layout,
+            codec: crate::page::format::codec::Codec::Raw,
+            generation: self.generations.next(),
+            serial: 0,
+        };
+        let last = pages.iter().map(|p| p.slot.place.segment).max();
+        let segments = check_segments(&engine, layout, last)?;
+        let used = pages.iter().map(|p| &p.slot);
+        let opened = PagedStore::open(Box::new(engine), config, segments, used);
+        opened.map_err(|e| CommitError::Contradiction(e.to_string()).into())
+    }
+}
+
+/// How the commits of a store are opened by tools that write to it.
+pub fn commit_config(store: u128) -> CommitConfig {
+    CommitConfig { store, cache_bytes: CACHE_BYTES, reserve_bytes: 0 }
+}
+
+/// The last generation that the map of `store` in `folder` holds, 0 before the first commit. Takes no lock: the caller has it.
+///
+/// # Errors
+/// There is no map, it is damaged, or it is older than its witness.
+pub(in crate::page) fn latest_generation(folder: &Path, store: u128) -> Result<u64, ReadError> {
+    let (_, content) = open_map(folder, store, WitnessRule::Obeyed, false)?;
+    Ok(content.counters.latest)
+}
+
+/// What the FORMAT file of `folder` says.
+///
+/// # Errors
+/// There is none, it is damaged, or of another version.
+pub fn format_at(folder: &Path) -> InputResult<(SpillFormat, FormatFeatures)> {
+    let no_store = || {
+        let remedy = "name a run's output folder or its spill directory; if its FORMAT file was lost, gsscale-ckpt \
+                      salvage can still find its pages";
+        InputError::new(folder, "there is no store in it: it has no FORMAT file", remedy)
+    };
+    let format = read_format(folder)?.ok_or_else(no_store)?.map_err(|error| bad_format(folder, &error))?;
+    let bytes = format_bytes_of(folder)?.ok_or_else(no_store)?;
+    Ok((format, features_of(&bytes).map_err(|error| bad_format(folder, &error))?))
+}
+
+/// Numbers and lengths of the segment files in `folder`, ascending.
+///
+/// # Errors
+/// The folder cannot be read.
+pub fn segments_in(folder: &Path) -> InputResult<Vec<(u32, u64)>> {
+    let failed = |e: io::Error| InputError::io(folder, "reading the folder", &e);
+    let mut segments = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(failed)? {
+        let entry = entry.map_err(failed)?;
+        let about = entry.metadata().map_err(failed)?;
+        let number = entry.file_name().to_str().and_then(segment_from_file_name);
+        segments.extend(number.filter(|_| about.is_file()).map(|segment| (segment, about.len())));
+    }
+    segments.sort_unstable();
+    Ok(segments)
+}
+
+/// Refuses a folder that a process uses.
+///
+/// # Errors
+/// It is in use, or its lock cannot be read.
+pub fn refuse_if_in_use(folder: &Path) -> InputResult<Option<File>> {
+    match lock_for_reading(folder)? {
+        ReadLock::Taken(file) => Ok(Some(file)),
+        ReadLock::Nobody => Ok(None),
+        ReadLock::InUse(who) => Err(in_use(folder, &who)),
+    }
+}
+
+fn in_use(folder: &Path, who: &str) -> InputError {
+    let problem = format!("a process is writing to this store ({who}), so its pages cannot be read");
+    InputError::new(
+        folder,
+        problem,
+        "wait for it to end, or stop it (Ctrl-C commits first); ls and diff work meanwhile",
+    )
+}
+
+enum ReadLock {
+    Taken(File),
+    /// No process ever locked it.
+    Nobody,
+    InUse(String),
+}
+
+/// A lock that readers share and no writer gets meanwhile.
+fn lock_for_reading(folder: &Path) -> InputResult<ReadLock> {
+    let path = folder.join(LOCK);
+    let failed = |e: io::Error| InputError::io(&path, "asking who uses the store", &e);
+    let file = match open_for_reading(&path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(ReadLock::Nobody),
+        file => file.map_err(failed)?,
+    };
+    match file.try_lock_shared() {
+        Ok(()) => Ok(ReadLock::Taken(file)),
+        Err(TryLockError::Error(error)) => Err(failed(error)),
+        Err(TryLockError::WouldBlock) => {
+            let mut text = String::new();
+            // Somebody else's file may be anything; then the holder stays unknown.
+            let _ = (&file).take(512).read_to_string(&mut text);
+            let who = text.strip_prefix(LOCK_MAGIC).unwrap_or("unknown").trim().replace('\n', ", ");
+            Ok(ReadLock::InUse(who))
+        }
+    }
+}
+
+/// The map, from its file or from a copy of it in memory.
+fn open_map(folder: &Path, store: u128, rule: WitnessRule, copied: bool) -> Result<(Manifest, MapContent), ReadError> {
+    let acknowledged = match rule {
+        WitnessRule::Obeyed => {
+            let failed = |source| CommitError::File { name: WITNESS_NAME, source };
+            let file = open_for_reading(&folder.join(WITNESS_NAME)).map_err(failed)?;
+            Witness::open(Arc::new(DriveFile::new(file)), store).map_err(failed)?.sequence()
+        }
+        WitnessRule::Ignored => 0,
+    };
+    let mut file = match open_for_reading(&folder.join(MAP_NAME)) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Err(CommitError::NoStore.into()),
+        file => file.map_err(|source| CommitError::File { name: MAP_NAME, source })?,
+    };
+    let backend: Arc<dyn StorageBackend> = if copied {
+        let mut bytes = Vec::new();
+        let memory = InMemoryBackend::new();
+        let read = file.read_to_end(&mut bytes).and_then(|_| memory.set_len(bytes.len() as u64));
+        read.and_then(|()| memory.write(0, &bytes)).map_err(|source| CommitError::File { name: MAP_NAME, source })?;
+        Arc::new(memory)
+    } else {
+        Arc::new(DriveFile::new(file))
+    };
+    Ok(Manifest::look(backend, store, acknowledged, CACHE_BYTES)?)
+}
+
+/// As [`open_map`] while a process commits to it.
+fn open_copy(folder: &Path, store: u128, rule: WitnessRule) -> Result<(Manifest, MapContent), ReadError> {
+    let mut copies = 1;
+    loop {
+        match open_map(folder, store, rule, true) {
+            Err(ReadError::Commit(CommitError::Map(_))) if copies < COPIES_MAX => {
+                std::thread::sleep(Duration::from_millis(10 * u64::from(copies)));
+                copies += 1;
+            }
+            opened => return opened,
+        }
+    }
+}

@@ -1,0 +1,71 @@
+//! Finds versions of pages by their slot headers alone, for a store whose map is lost.
+//!
+//! Invariants: 1. nothing is written; 2. memory is bounded by the headers that are found; 3. what is found is only what
+//! headers claim: whether a payload is whole is for [`super::slot_reader`] to say.
+
+use crate::base::error::{InputError, InputResult};
+use crate::page::engine::buffer::ALIGNMENT;
+use crate::page::engine::segment_files::{open_for_reading, segment_file_name};
+use crate::page::engine::transfers::Place;
+use crate::page::format::slot_header::{HEADER_BYTES, HeaderError, SlotHeader};
+use crate::page::map::map_file::DriveFile;
+use crate::page::tool::reading::segments_in;
+use crate::page::versions::slots::SlotLayout;
+use redb::StorageBackend;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// What the segments of a folder hold.
+#[derive(Debug, Default)]
+pub struct Scan {
+    /// Headers that stand where they were meant to be written, by store.
+    pub found: BTreeMap<u128, Vec<SlotHeader>>,
+    /// Places that hold a header with a broken checksum or of another place, and why.
+    pub broken: Vec<(Place, String)>,
+    /// Segments that end before their last slot, with their lengths.
+    pub short: Vec<(u32, u64)>,
+    /// Segment files that were read.
+    pub segments: u64,
+}
+
+/// Reads the header of every slot. Without the layout of the store, looks at every multiple of [`ALIGNMENT`].
+///
+/// # Errors
+/// The folder or a segment cannot be read.
+pub fn scan_slots(folder: &Path, layout: Option<SlotLayout>) -> InputResult<Scan> {
+    let mut scan = Scan::default();
+    for (segment, bytes) in segments_in(folder)? {
+        let path = folder.join(segment_file_name(segment));
+        let file = open_for_reading(&path).map_err(|e| InputError::io(&path, "opening the segment", &e))?;
+        let file = DriveFile::new(file);
+        scan.segments += 1;
+        if layout.is_some_and(|l| bytes < l.segment_bytes()) {
+            scan.short.push((segment, bytes));
+        }
+        let step = layout.map_or(ALIGNMENT as u64, |l| l.slot_bytes);
+        for offset in (0..bytes.saturating_sub(HEADER_BYTES as u64 - 1)).step_by(step as usize) {
+            let mut header = [0; HEADER_BYTES];
+            file.read(offset, &mut header)
+                .map_err(|e| InputError::io(&path, "reading the segment", &e).at(format!("byte {offset}")))?;
+            scan.take(Place { segment, offset }, &header);
+        }
+    }
+    Ok(scan)
+}
+
+impl Scan {
+    fn take(&mut self, place: Place, header: &[u8; HEADER_BYTES]) {
+        match SlotHeader::decode(header) {
+            Ok(header) if header.slot.place == place => self.found.entry(header.store).or_default().push(header),
+            Ok(header) => {
+                let meant = header.slot.place;
+                let what =
+                    format!("page {} was meant for segment {} offset {}", header.page, meant.segment, meant.offset);
+                self.broken.push((place, what));
+            }
+            // Never written, or the inside of a payload.
+            Err(HeaderError::NoHeader) => {}
+            Err(error) => self.broken.push((place, error.to_string())),
+        }
+    }
+}

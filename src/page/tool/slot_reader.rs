@@ -1,0 +1,112 @@
+//! Reads slots one at a time for tools that look at a store: no engine, no threads, nothing is written.
+//!
+//! Invariants: 1. bytes are given out as good only if [`super::verify`] found them to be the version that was asked for;
+//! 2. memory is taken for what a slot and its file really can hold, not for what the sizes of the store allow.
+
+use crate::base::ids::PageId;
+use crate::page::engine::buffer::PageBuffer;
+use crate::page::engine::segment_files::{open_for_reading, segment_file_name};
+use crate::page::engine::transfers::Place;
+use crate::page::format::slot_header::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs, transfer_bytes};
+use crate::page::format::verify::{verify, verify_identity};
+use crate::page::map::map_file::DriveFile;
+use redb::StorageBackend;
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// Reads the slots of one store.
+#[derive(Debug)]
+pub struct SlotReader {
+    folder: PathBuf,
+    store: u128,
+    slot_bytes: u64,
+    /// The segment that was read last, and its length.
+    file: Option<(u32, DriveFile, u64)>,
+    stored: PageBuffer,
+    decoded: PageBuffer,
+}
+
+impl SlotReader {
+    /// For the slots of store `store`, of `slot_bytes` bytes each, in `folder`.
+    pub fn new(folder: &Path, store: u128, slot_bytes: u64) -> SlotReader {
+        let buffer = || PageBuffer::zeroed(HEADER_BYTES);
+        SlotReader { folder: folder.to_path_buf(), store, slot_bytes, file: None, stored: buffer(), decoded: buffer() }
+    }
+
+    /// Whether version `slot` of `page` is there, by its header alone.
+    ///
+    /// # Errors
+    /// What is wrong, for people.
+    pub fn check_header(&mut self, page: PageId, slot: &SlotRef) -> Result<SlotHeader, String> {
+        let header = self.header_at(slot.place)?;
+        verify_identity(self.store, page, slot, &header)?;
+        let end = slot.place.offset.saturating_add(slot.transfer_bytes() as u64);
+        match &self.file {
+            Some((_, _, bytes)) if end > *bytes => Err("the segment ends inside the slot".to_string()),
+            _ => Ok(header),
+        }
+    }
+
+    /// The header at `place`, whatever page it is of.
+    ///
+    /// # Errors
+    /// What is wrong, for people.
+    pub fn header_at(&mut self, place: Place) -> Result<SlotHeader, String> {
+        let mut bytes = [0; HEADER_BYTES];
+        self.read(place, HEADER_BYTES, |from| bytes.copy_from_slice(from))?;
+        SlotHeader::decode(&bytes).map_err(|e| e.to_string())
+    }
+
+    /// The payload of version `slot` of `page`, verified and decoded; aligned for its tables.
+    ///
+    /// # Errors
+    /// What is wrong, for people.
+    pub fn payload(&mut self, page: PageId, slot: &SlotRef) -> Result<&[u8], String> {
+        let bytes = slot.transfer_bytes();
+        let needed = bytes.max(transfer_bytes(slot.payload_bytes as usize));
+        if needed as u64 > self.slot_bytes {
+            return Err(format!("the index gives it {bytes} bytes, more than a slot holds"));
+        }
+        self.read(slot.place, bytes, |_| ())?;
+        if slot.codec != StoredAs::Raw {
+            make_longer(&mut self.decoded, needed);
+        }
+        let decoded = self.decoded.as_mut_slice();
+        verify(self.store, page, slot, &self.stored.as_slice()[..bytes], Some(decoded))?;
+        let whole = if slot.codec == StoredAs::Raw { &self.stored } else { &self.decoded };
+        Ok(&whole.as_slice()[HEADER_BYTES..][..slot.payload_bytes as usize])
+    }
+
+    /// Brings bytes into the buffer and hands them to `take`.
+    fn read(&mut self, place: Place, bytes: usize, take: impl FnOnce(&[u8])) -> Result<(), String> {
+        let failed = |e: io::Error| match e.kind() {
+            io::ErrorKind::NotFound => format!("{} is missing", segment_file_name(place.segment)),
+            io::ErrorKind::UnexpectedEof => "the segment ends inside the slot".to_string(),
+            _ => format!("it cannot be read: {e}"),
+        };
+        if self.file.as_ref().is_none_or(|(segment, ..)| *segment != place.segment) {
+            let file = open_for_reading(&self.folder.join(segment_file_name(place.segment))).map_err(failed)?;
+            let length = file.metadata().map_err(failed)?;
+            if !length.is_file() {
+                return Err(format!("{} is not a file", segment_file_name(place.segment)));
+            }
+            self.file = Some((place.segment, DriveFile::new(file), length.len()));
+        }
+        let Some((_, file, length)) = &self.file else { return Ok(()) };
+        if place.offset.saturating_add(bytes as u64) > *length {
+            return Err(failed(io::ErrorKind::UnexpectedEof.into()));
+        }
+        make_longer(&mut self.stored, bytes);
+        let buffer = &mut self.stored.as_mut_slice()[..bytes];
+        file.read(place.offset, buffer).map_err(failed)?;
+        take(buffer);
+        Ok(())
+    }
+}
+
+/// Makes a buffer at least so long; what it held is lost then.
+fn make_longer(buffer: &mut PageBuffer, bytes: usize) {
+    if buffer.len() < bytes {
+        *buffer = PageBuffer::zeroed(bytes);
+    }
+}

@@ -1,0 +1,8 @@
+//! Versions of pages over an engine: which slot holds which version, and what becomes of slots that nobody needs any more.
+
+pub(in crate::page) mod cut;
+pub(in crate::page) mod page_done;
+pub mod page_error;
+pub mod paged_store;
+pub mod slots;
+pub(in crate::page) mod waiting;
