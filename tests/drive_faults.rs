@@ -8,6 +8,10 @@ mod scenes;
 #[path = "support/small_drive.rs"]
 mod small_drive;
 
+#[path = "support/faulty_engine.rs"]
+mod faulty_engine;
+
+use faulty_engine::{Fault, Faults, FaultyEngine, Operation};
 use gsscale::base::identity::RunId;
 use gsscale::checkpoint::interval::CommitEvery;
 use gsscale::checkpoint::run_state::RunIdentity;
@@ -15,7 +19,6 @@ use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::{RunOptions, simd_path};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::dataset::target_cache::TargetCache;
-use gsscale::page::engine::faulty::{Fault, Faults, FaultyStore, Operation};
 use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
@@ -138,7 +141,7 @@ impl World {
         let of_commits = CommitConfig { store: spill.format().store, cache_bytes: 1 << 20, reserve_bytes: 1 << 20 };
         let opened = Commits::create(Box::new(DriveFolder::new(&spill_dir)), of_commits)?;
         let engine = open_engine(IoEngine::Pread, &spill_dir, 4)?.store;
-        let engine = Box::new(FaultyStore::new(engine, faults.clone()));
+        let engine = Box::new(FaultyEngine::new(engine, faults.clone()));
         let store = opened.paged_store(engine, layout, Codec::Raw)?;
         let sizes = PagerConfig {
             frames: self.fewest.saturating_add(20),

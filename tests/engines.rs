@@ -5,36 +5,36 @@
 
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::page::engine::buffer::{ALIGNMENT, PageBuffer};
-use gsscale::page::engine::memory::MemoryStore;
-use gsscale::page::engine::mmap::MmapStore;
+use gsscale::page::engine::memory::MemoryEngine;
+use gsscale::page::engine::mmap::MmapEngine;
 use gsscale::page::engine::open::{DEPTH, IoEngine, open_engine};
-use gsscale::page::engine::pread::PreadStore;
+use gsscale::page::engine::page_engine::{Completion, Direction, PageEngine, Place, Transfer};
+use gsscale::page::engine::pread::PreadEngine;
 use gsscale::page::engine::segment_files::segment_file_name;
-use gsscale::page::engine::transfers::{Completion, Direction, PageStore, Place, Transfer};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::io::ErrorKind;
 use std::path::Path;
 
 const SEGMENT: u64 = 8 << 20;
 
-type Open = fn(&Path) -> Box<dyn PageStore>;
+type Open = fn(&Path) -> Box<dyn PageEngine>;
 
 /// The engines that work on files, with and without the page cache, by name.
 fn file_engines() -> Vec<(&'static str, Open)> {
     let mut engines: Vec<(&str, Open)> = vec![
-        ("pread", |folder| Box::new(PreadStore::open(folder, 6, true).unwrap())),
-        ("pread, buffered", |folder| Box::new(PreadStore::open(folder, 6, false).unwrap())),
-        ("mmap", |folder| Box::new(MmapStore::open(folder, 6).unwrap())),
+        ("pread", |folder| Box::new(PreadEngine::open(folder, 6, true).unwrap())),
+        ("pread, buffered", |folder| Box::new(PreadEngine::open(folder, 6, false).unwrap())),
+        ("mmap", |folder| Box::new(MmapEngine::open(folder, 6).unwrap())),
     ];
     #[cfg(target_os = "linux")]
     {
-        use gsscale::page::engine::uring::UringStore;
-        match UringStore::open(&std::env::temp_dir(), 1, true) {
+        use gsscale::page::engine::uring::UringEngine;
+        match UringEngine::open(&std::env::temp_dir(), 1, true) {
             Ok(_) => {
                 // A ring of 4 is always full here.
-                engines.push(("uring", |folder| Box::new(UringStore::open(folder, 32, true).unwrap())));
-                engines.push(("uring of 4", |folder| Box::new(UringStore::open(folder, 4, true).unwrap())));
-                engines.push(("uring, buffered", |folder| Box::new(UringStore::open(folder, 32, false).unwrap())));
+                engines.push(("uring", |folder| Box::new(UringEngine::open(folder, 32, true).unwrap())));
+                engines.push(("uring of 4", |folder| Box::new(UringEngine::open(folder, 4, true).unwrap())));
+                engines.push(("uring, buffered", |folder| Box::new(UringEngine::open(folder, 32, false).unwrap())));
             }
             Err(error) => eprintln!("io_uring is left out: {error}"),
         }
@@ -44,7 +44,7 @@ fn file_engines() -> Vec<(&'static str, Open)> {
 
 fn all_engines() -> Vec<(&'static str, Open)> {
     let mut engines = file_engines();
-    engines.push(("memory", |_| Box::new(MemoryStore::new())));
+    engines.push(("memory", |_| Box::new(MemoryEngine::new())));
     engines
 }
 
@@ -53,7 +53,7 @@ fn transfer(token: u64, direction: Direction, segment: u32, offset: u64, buffer:
 }
 
 /// Carries out one transfer alone.
-fn move_one(store: &mut dyn PageStore, transfer: Transfer) -> Completion {
+fn move_one(store: &mut dyn PageEngine, transfer: Transfer) -> Completion {
     let mut done = Vec::new();
     store.submit(transfer);
     assert_eq!(store.in_flight(), 1);
@@ -388,7 +388,7 @@ fn refused_writes_are_errors_with_their_buffers() {
 #[cfg(target_os = "linux")]
 #[test]
 fn a_short_answer_of_the_ring_is_resumed() {
-    use gsscale::page::engine::uring::{REQUEST_BYTES, UringStore};
+    use gsscale::page::engine::uring::{REQUEST_BYTES, UringEngine};
     const { assert!(REQUEST_BYTES <= 1 << 20, "larger requests may end with EAGAIN") };
     if !in_child("a_short_answer_of_the_ring_is_resumed") {
         return;
@@ -396,7 +396,7 @@ fn a_short_answer_of_the_ring_is_resumed() {
     outlive_the_signal_of_large_files();
     for direct in [true, false] {
         let folder = tempfile::tempdir().unwrap();
-        let mut store = match UringStore::open(folder.path(), 32, direct) {
+        let mut store = match UringEngine::open(folder.path(), 32, direct) {
             Ok(store) => store,
             Err(error) => return eprintln!("skipped: io_uring is refused here: {error}"),
         };
@@ -441,7 +441,7 @@ fn auto_takes_what_works_and_says_what_does_not() {
 
 /// Submits writes of random bytes, each of `bytes`, to places `from..to` of segment 0, asks for no answer, and waits until
 /// all are in the file.
-fn write_unasked(store: &mut dyn PageStore, folder: &Path, places: std::ops::Range<usize>, bytes: usize) {
+fn write_unasked(store: &mut dyn PageEngine, folder: &Path, places: std::ops::Range<usize>, bytes: usize) {
     const PIECE: usize = 64 << 10;
     let mut draws = Stream::new(1, Purpose::Test, 48, 0);
     for i in places.clone() {
@@ -493,7 +493,7 @@ fn three_times_the_usual_depth_moves_without_being_asked() {
 #[test]
 fn a_ring_of_ended_requests_is_not_full() {
     let folder = tempfile::tempdir().unwrap();
-    let mut store = match gsscale::page::engine::uring::UringStore::open(folder.path(), 4, true) {
+    let mut store = match gsscale::page::engine::uring::UringEngine::open(folder.path(), 4, true) {
         Ok(store) => store,
         Err(error) => return eprintln!("skipped: io_uring is refused here: {error}"),
     };
@@ -530,8 +530,8 @@ fn expect_pinned(bytes: usize) {
 
 /// A ring, unless this system has none, or none that knows buffers.
 #[cfg(target_os = "linux")]
-fn ring_with_table(folder: &Path) -> Option<gsscale::page::engine::uring::UringStore> {
-    let store = gsscale::page::engine::uring::UringStore::open(folder, 8, true);
+fn ring_with_table(folder: &Path) -> Option<gsscale::page::engine::uring::UringEngine> {
+    let store = gsscale::page::engine::uring::UringEngine::open(folder, 8, true);
     match &store {
         Ok(store) if store.has_table() => {}
         Ok(_) => eprintln!("skipped: this kernel has no table for buffers"),
@@ -542,7 +542,7 @@ fn ring_with_table(folder: &Path) -> Option<gsscale::page::engine::uring::UringS
 
 /// Writes other bytes from each buffer and reads them back into it.
 #[cfg(target_os = "linux")]
-fn write_and_read(store: &mut dyn PageStore, draws: &mut Stream, buffers: Vec<PageBuffer>) -> Vec<PageBuffer> {
+fn write_and_read(store: &mut dyn PageEngine, draws: &mut Stream, buffers: Vec<PageBuffer>) -> Vec<PageBuffer> {
     let turn = |(i, buffer): (usize, PageBuffer)| {
         let buffer = filled(draws, buffer);
         let bytes = buffer.as_slice().to_vec();

@@ -7,8 +7,8 @@
 use gsscale::base::error::InputError;
 use gsscale::base::ids::PageId;
 use gsscale::page::engine::buffer::PageBuffer;
+use gsscale::page::engine::page_engine::Place;
 use gsscale::page::engine::segment_files::{SegmentFiles, segment_file_name};
-use gsscale::page::engine::transfers::Place;
 use gsscale::page::folder::spill_dir::SpillDir;
 use gsscale::page::format::slot_header::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs};
 use gsscale::page::format::spill_format::Purpose;

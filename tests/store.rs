@@ -2,12 +2,15 @@
 //! generation overwritten, whatever fails.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
+#[path = "support/faulty_engine.rs"]
+mod faulty_engine;
+
+use faulty_engine::{Fault, Faults, FaultyEngine, Operation};
 use gsscale::base::ids::PageId;
 use gsscale::base::rng::mix64;
 use gsscale::page::engine::buffer::PageBuffer;
-use gsscale::page::engine::faulty::{Fault, Faults, FaultyStore, Operation};
-use gsscale::page::engine::memory::MemoryStore;
-use gsscale::page::engine::transfers::{Completion, PageStore, Place, Transfer};
+use gsscale::page::engine::memory::MemoryEngine;
+use gsscale::page::engine::page_engine::{Completion, PageEngine, Place, Transfer};
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs};
 use gsscale::page::versions::page_error::PageError;
@@ -23,9 +26,9 @@ const CODECS: [Codec; 2] = [Codec::Raw, Codec::Zstd { level: 1 }];
 
 /// A memory store that the test can reach into, and open a second time.
 #[derive(Clone, Default)]
-struct Shared(Arc<Mutex<MemoryStore>>);
+struct Shared(Arc<Mutex<MemoryEngine>>);
 
-impl PageStore for Shared {
+impl PageEngine for Shared {
     fn name(&self) -> &'static str {
         "memory"
     }
@@ -63,7 +66,7 @@ fn config(codec: Codec) -> PagedStoreConfig {
 
 fn faulty(codec: Codec) -> (PagedStore, Faults, Shared) {
     let (shared, faults) = (Shared::default(), Faults::new());
-    let engine = FaultyStore::new(Box::new(shared.clone()), faults.clone());
+    let engine = FaultyEngine::new(Box::new(shared.clone()), faults.clone());
     (PagedStore::new(Box::new(engine), config(codec)), faults, shared)
 }
 
@@ -145,7 +148,7 @@ fn assert_damaged(store: &mut PagedStore, page: u64, slot: &SlotRef, why: &str) 
 #[test]
 fn pages_come_back_to_the_bit() {
     for codec in CODECS {
-        let mut store = PagedStore::new(Box::new(MemoryStore::new()), config(codec));
+        let mut store = PagedStore::new(Box::new(MemoryEngine::new()), config(codec));
         let mut kept = Vec::new();
         for page in 0..14 {
             let payload = payload(page, 0, [0, 1, 4095, 4096, 4097, 12_345, CAPACITY][page as usize % 7]);

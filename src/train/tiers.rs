@@ -14,9 +14,9 @@ use crate::cache::evict::EvictPolicy;
 use crate::checkpoint::run_state::RunState;
 use crate::config::file::TrainConfig;
 use crate::page::engine::drive_rate::DriveRate;
-use crate::page::engine::memory::MemoryStore;
+use crate::page::engine::memory::MemoryEngine;
 use crate::page::engine::open::{DEPTH, IoEngine, open_engine};
-use crate::page::engine::transfers::PageStore;
+use crate::page::engine::page_engine::PageEngine;
 use crate::page::folder::file_system::free_bytes;
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
@@ -175,7 +175,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     if dry || config.spill_dir.is_empty() {
         let drive = Some(drive_of(Path::new(&config.spill_dir)));
         tiers.planned_on = drive.filter(|_| !config.spill_dir.is_empty());
-        let engine = Box::new(MemoryStore::new());
+        let engine = Box::new(MemoryEngine::new());
         let codec = chosen_codec(config, None, &mut tiers.notes);
         (tiers.engine, tiers.codec) = (engine.name().to_string(), codec.to_string());
         let of_store = PagedStoreConfig { store: 0, layout, codec, generation: 1, serial: 1 };
@@ -291,7 +291,7 @@ fn commit_config(spill: &SpillDir) -> CommitConfig {
 
 impl Tiers {
     /// Takes over a spill directory and starts what moves its pages.
-    fn take_spill(&mut self, spill: SpillDir, config: &TrainConfig) -> InputResult<(Box<dyn PageStore>, Codec)> {
+    fn take_spill(&mut self, spill: SpillDir, config: &TrainConfig) -> InputResult<(Box<dyn PageEngine>, Codec)> {
         self.notes.extend(spill.warnings().iter().filter(|_| !self.is_in_memory).cloned());
         let folder = spill.folder().to_path_buf();
         self.spill = Some(spill);

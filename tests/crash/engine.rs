@@ -3,8 +3,8 @@
 //! Transfers end one at a time and in any order.
 
 use crate::disk::{Disk, DiskFile, Rng};
+use gsscale::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use gsscale::page::engine::segment_files::segment_file_name;
-use gsscale::page::engine::transfers::{Completion, Direction, PageStore, Transfer};
 use gsscale::page::map::mutants::{Mutant, active};
 use redb::StorageBackend;
 use std::collections::BTreeMap;
@@ -50,7 +50,7 @@ impl SimStore {
     }
 }
 
-impl PageStore for SimStore {
+impl PageEngine for SimStore {
     fn name(&self) -> &'static str {
         "simulated"
     }

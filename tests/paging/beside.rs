@@ -3,9 +3,9 @@
 
 use super::world::{Model, PAGE_ROWS, Run, SH_DEGREE, check, config};
 use super::{PAGES, STEPS, in_memory};
+use crate::faulty_engine::{Fault, Faults, FaultyEngine, Operation};
 use gsscale::base::ids::PageNo;
 use gsscale::base::rng::{Purpose, Stream};
-use gsscale::page::engine::faulty::{Fault, Faults, FaultyStore, Operation};
 use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::format::codec::Codec;
@@ -24,7 +24,7 @@ pub const COMMITS: CommitConfig = CommitConfig { store: 9, cache_bytes: 1 << 20,
 pub fn paged_store(opened: &Opened, folder: &Path, codec: Codec, faults: &Faults) -> PagedStore {
     let engine = open_engine(IoEngine::Pread, folder, 3).unwrap().store;
     let layout = SlotLayout::new(capacity_bytes(PAGE_ROWS, SH_DEGREE), 40);
-    opened.paged_store(Box::new(FaultyStore::new(engine, faults.clone())), layout, codec).unwrap()
+    opened.paged_store(Box::new(FaultyEngine::new(engine, faults.clone())), layout, codec).unwrap()
 }
 
 /// The store holds exactly the pages of `model` that have rows.

@@ -2,7 +2,7 @@
 
 use super::world::{Run, config, store};
 use super::{PAGES, STEPS, in_memory};
-use gsscale::page::engine::faulty::{Fault, Faults, Operation};
+use crate::faulty_engine::{Fault, Faults, Operation};
 use gsscale::page::format::codec::Codec;
 use gsscale::paging::error::PagingError;
 use gsscale::paging::pager::Pager;

@@ -2,6 +2,9 @@
 //! the pages that its view needs, with the bytes that were last put into them.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
+#[path = "../support/faulty_engine.rs"]
+mod faulty_engine;
+
 mod beside;
 mod failures;
 mod full;
@@ -10,8 +13,8 @@ mod staging;
 mod traffic;
 mod world;
 
+use crate::faulty_engine::Faults;
 use gsscale::cache::evict::EvictPolicy;
-use gsscale::page::engine::faulty::Faults;
 use gsscale::page::format::codec::Codec;
 use gsscale::paging::error::PagingError;
 use gsscale::paging::pager::{Pager, PagerConfig};

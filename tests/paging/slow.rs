@@ -3,8 +3,8 @@
 
 use super::world::{self, camera, config};
 use gsscale::base::ids::PageNo;
-use gsscale::page::engine::memory::MemoryStore;
-use gsscale::page::engine::transfers::{Completion, Direction, PageStore, Transfer};
+use gsscale::page::engine::memory::MemoryEngine;
+use gsscale::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use gsscale::page::format::codec::Codec;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::scene::camera::Camera;
@@ -20,7 +20,7 @@ type OnTheWay = Arc<Mutex<[usize; 2]>>;
 
 /// A store in memory whose transfers end one by one, oldest first, and only while somebody waits.
 struct SlowStore {
-    inner: MemoryStore,
+    inner: MemoryEngine,
     queue: VecDeque<Transfer>,
     on_the_way: OnTheWay,
 }
@@ -29,7 +29,7 @@ fn kind(transfer: &Transfer) -> usize {
     usize::from(transfer.direction == Direction::Write)
 }
 
-impl PageStore for SlowStore {
+impl PageEngine for SlowStore {
     fn name(&self) -> &'static str {
         "slow"
     }
@@ -65,7 +65,7 @@ impl PageStore for SlowStore {
 
 fn slow_pager(config: PagerConfig) -> (Pager, OnTheWay) {
     let on_the_way = OnTheWay::default();
-    let inner = MemoryStore::new();
+    let inner = MemoryEngine::new();
     let engine = SlowStore { inner, queue: VecDeque::new(), on_the_way: Arc::clone(&on_the_way) };
     let mut pager = Pager::new(config, world::store_over(Box::new(engine), Codec::Raw));
     world::insert_pages(&mut pager, PAGES);

@@ -1,8 +1,8 @@
 //! Memory for encoded pages on their way: never more than what a run reckons with.
 
 use super::world::{PAGE_ROWS, config, meta, store};
+use crate::faulty_engine::Faults;
 use gsscale::base::ids::{PageId, PageNo};
-use gsscale::page::engine::faulty::Faults;
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::HEADER_BYTES;
 use gsscale::paging::pager::{Pager, PagerConfig};

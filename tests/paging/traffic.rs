@@ -1,10 +1,10 @@
 //! How much is read and written: as little as a cache of that size can, and never more because of what is done ahead.
 
 use super::world::{self, camera, config, store};
+use crate::faulty_engine::Faults;
 use gsscale::base::ids::PageNo;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::cache::evict::EvictPolicy;
-use gsscale::page::engine::faulty::Faults;
 use gsscale::page::format::codec::Codec;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::stats::PagerStats;

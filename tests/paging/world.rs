@@ -1,11 +1,11 @@
 //! Pages in a row along x, cameras that look at some of them, and a plain model of what every page holds.
 
+use crate::faulty_engine::{Faults, FaultyEngine};
 use gsscale::base::ids::{PageId, PageNo};
 use gsscale::base::rng::{Purpose, Stream, mix64};
 use gsscale::cache::evict::EvictPolicy;
-use gsscale::page::engine::faulty::{Faults, FaultyStore};
-use gsscale::page::engine::memory::MemoryStore;
-use gsscale::page::engine::transfers::PageStore;
+use gsscale::page::engine::memory::MemoryEngine;
+use gsscale::page::engine::page_engine::PageEngine;
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::HEADER_BYTES;
 use gsscale::page::versions::paged_store::{PagedStore, PagedStoreConfig};
@@ -35,10 +35,10 @@ pub fn config(frames: usize) -> PagerConfig {
 
 /// A store in memory that fails by `faults`.
 pub fn store(codec: Codec, faults: &Faults) -> PagedStore {
-    store_over(Box::new(FaultyStore::new(Box::new(MemoryStore::new()), faults.clone())), codec)
+    store_over(Box::new(FaultyEngine::new(Box::new(MemoryEngine::new()), faults.clone())), codec)
 }
 
-pub fn store_over(engine: Box<dyn PageStore>, codec: Codec) -> PagedStore {
+pub fn store_over(engine: Box<dyn PageEngine>, codec: Codec) -> PagedStore {
     let layout = SlotLayout::new(capacity_bytes(PAGE_ROWS, SH_DEGREE), 16);
     PagedStore::new(engine, PagedStoreConfig { store: 5, layout, codec, generation: 1, serial: 0 })
 }

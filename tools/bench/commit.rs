@@ -13,7 +13,7 @@ use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::{RunOptions, simd_path};
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
-use gsscale::page::engine::memory::MemoryStore;
+use gsscale::page::engine::memory::MemoryEngine;
 use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::engine::segment_files::segment_file_name;
 use gsscale::page::folder::protocol_files::DriveFolder;
@@ -190,7 +190,7 @@ fn fill_and_open(at: &Path, pages: u32, config: &TrainConfig) -> Result<f64, Tra
     let of_commits = CommitConfig { store: 0xbe, cache_bytes: 8 << 20, reserve_bytes: 0 };
     let layout = SlotLayout::new(capacity_bytes(config.page_rows as usize, config.sh_degree), u64::from(pages));
     let opened = Commits::create(Box::new(DriveFolder::new(at)), of_commits)?;
-    let mut store = opened.paged_store(Box::new(MemoryStore::new()), layout, Codec::Raw)?;
+    let mut store = opened.paged_store(Box::new(MemoryEngine::new()), layout, Codec::Raw)?;
     let change = |page: u32| {
         let (place, checksum) = (layout.place(u64::from(page)), u128::from(page) << 64);
         let codec = StoredAs::Raw;

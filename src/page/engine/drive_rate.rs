@@ -7,8 +7,8 @@
 use crate::base::error::InputResult;
 use crate::page::engine::measure::{Case, Scratch};
 use crate::page::engine::open::{DEPTH, IoEngine};
+use crate::page::engine::page_engine::Direction;
 use crate::page::engine::segment_files::with_safe_flags;
-use crate::page::engine::transfers::Direction;
 use crate::page::format::codec::Codec;
 use serde::{Deserialize, Serialize};
 use std::fs::{File, OpenOptions};

@@ -15,8 +15,8 @@ use crate::base::rng::{Purpose, Stream};
 use crate::base::units::format_bytes;
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::engine::open::{IoEngine, open_engine};
+use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Place, Transfer};
 use crate::page::engine::segment_files::segment_file_name;
-use crate::page::engine::transfers::{Completion, Direction, PageStore, Place, Transfer};
 use crate::page::folder::file_system::free_bytes;
 use std::io;
 use std::path::Path;
@@ -156,7 +156,7 @@ pub(in crate::page) struct Scratch {
 struct Opened {
     engine: IoEngine,
     segment: u32,
-    store: Box<dyn PageStore>,
+    store: Box<dyn PageEngine>,
     /// Bytes from the start that were written at least once; others would not be read from the drive.
     filled_bytes: u64,
 }
@@ -332,7 +332,7 @@ impl Opened {
 }
 
 /// Waits for everything in flight.
-fn finish(store: &mut dyn PageStore) -> io::Result<()> {
+fn finish(store: &mut dyn PageEngine) -> io::Result<()> {
     let mut done = Vec::new();
     while store.in_flight() > 0 {
         store.complete(true, &mut done);

@@ -1,22 +1,22 @@
 //! A store in memory: the oracle of the others, and the store of runs that fit.
 //!
-//! Invariants: those of [`PageStore`]; besides, transfers happen when they are submitted and complete in order.
+//! Invariants: those of [`PageEngine`]; besides, transfers happen when they are submitted and complete in order.
 
-use crate::page::engine::transfers::{Completion, Direction, PageStore, Transfer};
+use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use std::collections::{BTreeMap, VecDeque};
 use std::io;
 
 /// Segments as plain memory. Memory is taken from the machine as it is written to.
 #[derive(Debug, Default)]
-pub struct MemoryStore {
+pub struct MemoryEngine {
     segments: BTreeMap<u32, Vec<u8>>,
     done: VecDeque<Completion>,
 }
 
-impl MemoryStore {
+impl MemoryEngine {
     /// Without segments.
-    pub fn new() -> MemoryStore {
-        MemoryStore::default()
+    pub fn new() -> MemoryEngine {
+        MemoryEngine::default()
     }
 
     /// The bytes of a segment, for tests that damage them.
@@ -39,7 +39,7 @@ impl MemoryStore {
     }
 }
 
-impl PageStore for MemoryStore {
+impl PageEngine for MemoryEngine {
     fn name(&self) -> &'static str {
         "memory"
     }
@@ -85,9 +85,9 @@ impl PageStore for MemoryStore {
 mod tests {
     use super::*;
     use crate::page::engine::buffer::PageBuffer;
-    use crate::page::engine::transfers::Place;
+    use crate::page::engine::page_engine::Place;
 
-    fn move_bytes(store: &mut MemoryStore, direction: Direction, place: Place, buffer: PageBuffer) -> Completion {
+    fn move_bytes(store: &mut MemoryEngine, direction: Direction, place: Place, buffer: PageBuffer) -> Completion {
         store.submit(Transfer { token: 1, direction, place, bytes: buffer.len(), buffer });
         let mut done = Vec::new();
         store.complete(true, &mut done);
@@ -97,7 +97,7 @@ mod tests {
 
     #[test]
     fn bytes_come_back_and_buffers_too() {
-        let mut store = MemoryStore::new();
+        let mut store = MemoryEngine::new();
         store.create_segment(2, 8192).unwrap();
         store.create_segment(2, 8192).unwrap();
         assert_eq!(store.create_segment(2, 4096).unwrap_err().kind(), io::ErrorKind::AlreadyExists);

@@ -8,14 +8,14 @@
 //! in between, leave that signal possible: `--io uring` and `pread` have no such case.) What was copied is forgotten
 //! by the page cache: the frame holds it now, and evicted pages come back at another place if they changed.
 //!
-//! Invariants: those of [`PageStore`]; besides, no reference to mapped bytes is ever made, only copies through raw
+//! Invariants: those of [`PageEngine`]; besides, no reference to mapped bytes is ever made, only copies through raw
 //! pointers, since the bytes change under a map when a write is done.
 #![allow(unsafe_code)] // copying out of a map, and dropping its pages
 
 use crate::page::engine::page_cache::{WriteBehind, forget};
+use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Place, Transfer};
 use crate::page::engine::segment_io::{SegmentIo, move_bytes};
 use crate::page::engine::transfer_pool::TransferPool;
-use crate::page::engine::transfers::{Completion, Direction, PageStore, Place, Transfer};
 use memmap2::{MmapOptions, MmapRaw};
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -24,7 +24,7 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Segments as read-only maps, and as files for writing.
-pub struct MmapStore {
+pub struct MmapEngine {
     shared: Arc<Shared>,
     pool: TransferPool,
 }
@@ -36,17 +36,17 @@ struct Shared {
     behind: Mutex<WriteBehind>,
 }
 
-impl MmapStore {
+impl MmapEngine {
     /// Opens a folder of segments with `threads` threads that copy and write.
     ///
     /// # Errors
     /// The folder cannot be used, or no thread can be started.
-    pub fn open(folder: &Path, threads: usize) -> io::Result<MmapStore> {
+    pub fn open(folder: &Path, threads: usize) -> io::Result<MmapEngine> {
         let segments = Mutex::new(SegmentIo::new(folder, false)?);
         let shared = Arc::new(Shared { segments, maps: Mutex::default(), behind: Mutex::default() });
         let worker = Arc::clone(&shared);
         let pool = TransferPool::new("mmap", threads, move |transfer| worker.carry_out(transfer))?;
-        Ok(MmapStore { shared, pool })
+        Ok(MmapEngine { shared, pool })
     }
 }
 
@@ -132,7 +132,7 @@ fn copy_out(map: &MmapRaw, offset: u64, out: &mut [u8]) -> io::Result<()> {
     Ok(())
 }
 
-impl PageStore for MmapStore {
+impl PageEngine for MmapEngine {
     fn name(&self) -> &'static str {
         "mmap"
     }

@@ -3,12 +3,12 @@
 
 pub mod buffer;
 pub mod drive_rate;
-pub mod faulty;
 pub mod measure;
 pub mod memory;
 pub mod mmap;
 pub mod open;
 pub(in crate::page) mod page_cache;
+pub mod page_engine;
 pub mod pread;
 #[cfg(target_os = "linux")]
 pub(in crate::page) mod registered;
@@ -18,6 +18,5 @@ pub(in crate::page) mod short_transfers;
 #[cfg(target_os = "linux")]
 pub(in crate::page) mod slab;
 pub(in crate::page) mod transfer_pool;
-pub mod transfers;
 #[cfg(target_os = "linux")]
 pub mod uring;

@@ -4,10 +4,10 @@
 //! threads. No engine changes a bit of any result, so a run may be resumed with another.
 
 use crate::base::error::{InputError, InputResult};
-use crate::page::engine::memory::MemoryStore;
-use crate::page::engine::mmap::MmapStore;
-use crate::page::engine::pread::PreadStore;
-use crate::page::engine::transfers::PageStore;
+use crate::page::engine::memory::MemoryEngine;
+use crate::page::engine::mmap::MmapEngine;
+use crate::page::engine::page_engine::PageEngine;
+use crate::page::engine::pread::PreadEngine;
 use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
@@ -72,7 +72,7 @@ impl fmt::Display for IoEngine {
 /// An engine at work, and what a user should know of how it was chosen.
 pub struct OpenedEngine {
     /// Moves the pages.
-    pub store: Box<dyn PageStore>,
+    pub store: Box<dyn PageEngine>,
     /// What was taken instead of what, and why: whole sentences, to be printed. Empty when all went as asked.
     pub notes: Vec<String>,
 }
@@ -85,13 +85,13 @@ pub struct OpenedEngine {
 pub fn open_engine(engine: IoEngine, folder: &Path, depth: usize) -> InputResult<OpenedEngine> {
     let mut notes = Vec::new();
     if engine == IoEngine::Memory {
-        return Ok(OpenedEngine { store: Box::new(MemoryStore::new()), notes });
+        return Ok(OpenedEngine { store: Box::new(MemoryEngine::new()), notes });
     }
     outlive_length_limits();
     // So that what fails below is the engine's fault and not the folder's.
     std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "opening the folder of pages", &e))?;
-    let store: Box<dyn PageStore> = match engine {
-        IoEngine::Mmap => Box::new(MmapStore::open(folder, depth).map_err(|e| not_opened(engine, &e))?),
+    let store: Box<dyn PageEngine> = match engine {
+        IoEngine::Mmap => Box::new(MmapEngine::open(folder, depth).map_err(|e| not_opened(engine, &e))?),
         IoEngine::Pread => open_pread(folder, depth, &mut notes)?,
         IoEngine::Uring => open_uring(folder, depth, &mut notes).map_err(|e| not_opened(engine, &e))?,
         _ => match open_uring(folder, depth, &mut notes) {
@@ -123,19 +123,19 @@ fn outlive_length_limits() {
 }
 
 #[cfg(target_os = "linux")]
-fn open_uring(folder: &Path, depth: usize, notes: &mut Vec<String>) -> std::io::Result<Box<dyn PageStore>> {
-    let store = crate::page::engine::uring::UringStore::open(folder, depth.max(RING_DEPTH), true)?;
+fn open_uring(folder: &Path, depth: usize, notes: &mut Vec<String>) -> std::io::Result<Box<dyn PageEngine>> {
+    let store = crate::page::engine::uring::UringEngine::open(folder, depth.max(RING_DEPTH), true)?;
     note_buffered(store.is_direct(), notes);
     Ok(Box::new(store))
 }
 
 #[cfg(not(target_os = "linux"))]
-fn open_uring(_folder: &Path, _depth: usize, _notes: &mut Vec<String>) -> std::io::Result<Box<dyn PageStore>> {
+fn open_uring(_folder: &Path, _depth: usize, _notes: &mut Vec<String>) -> std::io::Result<Box<dyn PageEngine>> {
     Err(std::io::Error::new(std::io::ErrorKind::Unsupported, "only Linux has io_uring"))
 }
 
-fn open_pread(folder: &Path, depth: usize, notes: &mut Vec<String>) -> InputResult<Box<dyn PageStore>> {
-    let store = PreadStore::open(folder, depth, true).map_err(|e| not_opened(IoEngine::Pread, &e))?;
+fn open_pread(folder: &Path, depth: usize, notes: &mut Vec<String>) -> InputResult<Box<dyn PageEngine>> {
+    let store = PreadEngine::open(folder, depth, true).map_err(|e| not_opened(IoEngine::Pread, &e))?;
     note_buffered(store.is_direct(), notes);
     Ok(Box::new(store))
 }

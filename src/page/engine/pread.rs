@@ -1,18 +1,18 @@
 //! Plain positioned reads and writes on worker threads: the engine that works everywhere.
 //!
 //! Direct I/O where the file system allows it; else through the page cache, of which it keeps as little as it can.
-//! Invariants: those of [`PageStore`].
+//! Invariants: those of [`PageEngine`].
 
 use crate::page::engine::page_cache::{WriteBehind, forget};
+use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use crate::page::engine::segment_io::{SegmentIo, move_bytes};
 use crate::page::engine::transfer_pool::TransferPool;
-use crate::page::engine::transfers::{Completion, Direction, PageStore, Transfer};
 use std::io;
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Segments as files, moved by threads that block.
-pub struct PreadStore {
+pub struct PreadEngine {
     shared: Arc<Shared>,
     pool: TransferPool,
 }
@@ -23,30 +23,30 @@ struct Shared {
     direct: bool,
 }
 
-impl PreadStore {
+impl PreadEngine {
     /// Opens a folder of segments with `threads` threads; the drive sees at most that many requests at once. With
     /// `direct`, past the page cache where the file system allows it.
     ///
     /// # Errors
     /// The folder cannot be used, or no thread can be started.
-    pub fn open(folder: &Path, threads: usize, direct: bool) -> io::Result<PreadStore> {
-        PreadStore::over(SegmentIo::new(folder, direct)?, threads)
+    pub fn open(folder: &Path, threads: usize, direct: bool) -> io::Result<PreadEngine> {
+        PreadEngine::over(SegmentIo::new(folder, direct)?, threads)
     }
 
-    /// As [`PreadStore::open`] for a store that must stay as it is: writes fail.
+    /// As [`PreadEngine::open`] for a store that must stay as it is: writes fail.
     ///
     /// # Errors
     /// No thread can be started.
-    pub fn open_read_only(folder: &Path, threads: usize) -> io::Result<PreadStore> {
-        PreadStore::over(SegmentIo::read_only(folder), threads)
+    pub fn open_read_only(folder: &Path, threads: usize) -> io::Result<PreadEngine> {
+        PreadEngine::over(SegmentIo::read_only(folder), threads)
     }
 
-    fn over(segments: SegmentIo, threads: usize) -> io::Result<PreadStore> {
+    fn over(segments: SegmentIo, threads: usize) -> io::Result<PreadEngine> {
         let direct = segments.is_direct();
         let shared = Arc::new(Shared { segments: Mutex::new(segments), behind: Mutex::default(), direct });
         let worker = Arc::clone(&shared);
         let pool = TransferPool::new("pread", threads, move |transfer| worker.carry_out(transfer))?;
-        Ok(PreadStore { shared, pool })
+        Ok(PreadEngine { shared, pool })
     }
 
     /// Whether bytes go past the page cache.
@@ -71,7 +71,7 @@ impl Shared {
     }
 }
 
-impl PageStore for PreadStore {
+impl PageEngine for PreadEngine {
     fn name(&self) -> &'static str {
         "pread"
     }

@@ -5,9 +5,9 @@
 //! failed, every later one fails too: the system reports a lost write only once.
 
 use crate::page::engine::buffer::ALIGNMENT;
+use crate::page::engine::page_engine::{Direction, Transfer};
 use crate::page::engine::segment_files::SegmentFiles;
 use crate::page::engine::short_transfers::Resume;
-use crate::page::engine::transfers::{Direction, Transfer};
 use std::fs::File;
 use std::io;
 use std::path::Path;
@@ -44,7 +44,7 @@ impl SegmentIo {
         self.files.is_direct()
     }
 
-    /// As [`crate::page::engine::transfers::PageStore::create_segment`].
+    /// As [`crate::page::engine::page_engine::PageEngine::create_segment`].
     ///
     /// # Errors
     /// No space, another size, or the folder cannot be written.
@@ -52,7 +52,7 @@ impl SegmentIo {
         self.files.create(segment, bytes)
     }
 
-    /// As [`crate::page::engine::transfers::PageStore::check_segment`].
+    /// As [`crate::page::engine::page_engine::PageEngine::check_segment`].
     ///
     /// # Errors
     /// It is missing, or not as it was made.
@@ -166,7 +166,7 @@ mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};
     use crate::page::engine::buffer::PageBuffer;
-    use crate::page::engine::transfers::Place;
+    use crate::page::engine::page_engine::Place;
 
     const BYTES: usize = 37 * ALIGNMENT;
     const OFFSET: usize = 3 * ALIGNMENT;

@@ -8,7 +8,7 @@
 //! block of progress are forgiven.
 
 use crate::page::engine::buffer::ALIGNMENT;
-use crate::page::engine::transfers::Direction;
+use crate::page::engine::page_engine::Direction;
 use std::io;
 
 /// Outcomes in a row without progress that are forgiven.

@@ -5,7 +5,7 @@
 //! Invariants: 1. every submitted transfer comes back exactly once, with its buffer, also when the work panics;
 //! 2. dropping the pool carries out what was submitted and then ends the threads.
 
-use crate::page::engine::transfers::{Completion, Transfer};
+use crate::page::engine::page_engine::{Completion, Transfer};
 use std::collections::VecDeque;
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -128,7 +128,7 @@ impl Shared {
 mod tests {
     use super::*;
     use crate::page::engine::buffer::PageBuffer;
-    use crate::page::engine::transfers::{Direction, Place};
+    use crate::page::engine::page_engine::{Direction, Place};
 
     #[test]
     fn every_buffer_comes_back_also_when_the_work_panics() {

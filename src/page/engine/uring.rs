@@ -11,18 +11,18 @@
 //! touches its bytes there, and it leaves only after the kernel has answered every request that names it. Dropping the
 //! store waits for all answers; forgetting it leaks the buffers.
 //!
-//! Invariants: those of [`PageStore`]; besides, 1. a request counts as with the kernel from the moment it is put into
+//! Invariants: those of [`PageEngine`]; besides, 1. a request counts as with the kernel from the moment it is put into
 //! the ring until its answer is taken out; 2. nothing waits when nothing is with the kernel; 3. when the kernel
 //! refuses the ring itself, requests it has not taken end as errors and those it has are waited for.
 #![allow(unsafe_code)] // the ring takes addresses of buffers that it owns
 
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::engine::page_cache::{WriteBehind, forget};
+use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use crate::page::engine::registered::RegisteredBuffers;
 use crate::page::engine::segment_io::{SegmentIo, too_many_files};
 use crate::page::engine::short_transfers::Resume;
 use crate::page::engine::slab::Slab;
-use crate::page::engine::transfers::{Completion, Direction, PageStore, Transfer};
 use io_uring::{IoUring, opcode, squeue, types};
 use std::collections::VecDeque;
 use std::fs::File;
@@ -40,7 +40,7 @@ const REFUSALS_MAX: u32 = 5000;
 const SHORTAGES: [i32; 3] = [11, 16, 12];
 
 /// Segments as files, moved by the kernel's ring.
-pub struct UringStore {
+pub struct UringEngine {
     ring: IoUring,
     registered: RegisteredBuffers,
     segments: SegmentIo,
@@ -78,16 +78,16 @@ struct Request {
     resume: Resume,
 }
 
-impl UringStore {
+impl UringEngine {
     /// Opens a folder of segments with a ring of `entries` requests (rounded up to a power of two, at most 4096). With
     /// `direct`, past the page cache where the file system allows it.
     ///
     /// # Errors
     /// The kernel refuses the ring (too old, or forbidden as in many containers), or the folder cannot be used.
-    pub fn open(folder: &Path, entries: usize, direct: bool) -> io::Result<UringStore> {
+    pub fn open(folder: &Path, entries: usize, direct: bool) -> io::Result<UringEngine> {
         let entries = entries.clamp(1, 4096).next_power_of_two();
         let ring = working_ring(entries as u32)?;
-        Ok(UringStore {
+        Ok(UringEngine {
             registered: RegisteredBuffers::of(&ring.submitter()),
             ring,
             segments: SegmentIo::new(folder, direct)?,
@@ -259,7 +259,7 @@ impl UringStore {
     }
 }
 
-impl PageStore for UringStore {
+impl PageEngine for UringEngine {
     fn name(&self) -> &'static str {
         "uring"
     }
@@ -323,7 +323,7 @@ impl PageStore for UringStore {
     }
 }
 
-impl Drop for UringStore {
+impl Drop for UringEngine {
     fn drop(&mut self) {
         let mut done = Vec::new();
         while self.in_flight() > 0 {

@@ -11,7 +11,7 @@
 
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::ALIGNMENT;
-use crate::page::engine::transfers::Place;
+use crate::page::engine::page_engine::Place;
 use xxhash_rust::xxh3::xxh3_128;
 
 #[cfg(target_endian = "big")]

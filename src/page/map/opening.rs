@@ -4,8 +4,8 @@
 //! another kept generation does, and free otherwise; so a crash cannot leave a list that disagrees with the map.
 
 use crate::base::ids::PageId;
+use crate::page::engine::page_engine::{PageEngine, Place};
 use crate::page::engine::segment_files::segment_file_name;
-use crate::page::engine::transfers::{PageStore, Place};
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::SlotRef;
 use crate::page::map::commit::{CommitError, Commits};
@@ -90,7 +90,7 @@ impl Opened {
     /// Segments are missing or have another length; the map names a slot that cannot be, or one twice.
     pub fn paged_store(
         &self,
-        engine: Box<dyn PageStore>,
+        engine: Box<dyn PageEngine>,
         layout: SlotLayout,
         codec: Codec,
     ) -> Result<PagedStore, CommitError> {
@@ -118,7 +118,7 @@ impl Opened {
 /// Looks at all segments up to the `last` one that is named: they were made one after the other, and are written to as a
 /// store grows. So a map that names a segment beyond all that there are costs neither time nor memory. Gives their number.
 pub(in crate::page) fn check_segments(
-    engine: &dyn PageStore,
+    engine: &dyn PageEngine,
     layout: SlotLayout,
     last: Option<u32>,
 ) -> Result<u32, CommitError> {

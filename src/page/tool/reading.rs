@@ -9,9 +9,9 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
-use crate::page::engine::pread::PreadStore;
+use crate::page::engine::page_engine::Place;
+use crate::page::engine::pread::PreadEngine;
 use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name};
-use crate::page::engine::transfers::Place;
 use crate::page::folder::spill_dir::{LOCK, LOCK_MAGIC, bad_format, format_bytes_of, read_format};
 use crate::page::format::slot_header::SlotRef;
 use crate::page::format::spill_format::{FormatFeatures, SpillFormat, features_of};
@@ -268,7 +268,7 @@ impl StoreReader {
     /// The map names a slot that cannot be; segments up to the last that these pages lie in are missing or have another
     /// length; or the engine cannot be started.
     pub fn paged_store(&self, pages: &[StoredPage], threads: usize) -> Result<PagedStore, ReadError> {
-        let engine = PreadStore::open_read_only(&self.folder, threads)
+        let engine = PreadEngine::open_read_only(&self.folder, threads)
             .map_err(|e| InputError::io(&self.folder, "opening the pages", &e))?;
         let SpillFormat { store, layout, .. } = self.format;
         let config = PagedStoreConfig {

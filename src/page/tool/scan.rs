@@ -5,8 +5,8 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::page::engine::buffer::ALIGNMENT;
+use crate::page::engine::page_engine::Place;
 use crate::page::engine::segment_files::{open_for_reading, segment_file_name};
-use crate::page::engine::transfers::Place;
 use crate::page::format::slot_header::{HEADER_BYTES, HeaderError, SlotHeader};
 use crate::page::map::map_file::DriveFile;
 use crate::page::tool::reading::segments_in;

@@ -5,8 +5,8 @@
 
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::PageBuffer;
+use crate::page::engine::page_engine::Place;
 use crate::page::engine::segment_files::{open_for_reading, segment_file_name};
-use crate::page::engine::transfers::Place;
 use crate::page::format::slot_header::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs, transfer_bytes};
 use crate::page::format::verify::{verify, verify_identity};
 use crate::page::map::map_file::DriveFile;

@@ -3,8 +3,8 @@
 //! Invariant: an error about stored bytes names the segment file, the offset, the page and its generation.
 
 use crate::base::ids::PageId;
+use crate::page::engine::page_engine::Place;
 use crate::page::engine::segment_files::segment_file_name;
-use crate::page::engine::transfers::Place;
 use crate::page::format::slot_header::LABEL_BYTES_MAX;
 use std::io;
 

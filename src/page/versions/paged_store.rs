@@ -12,7 +12,7 @@
 
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::PageBuffer;
-use crate::page::engine::transfers::{Completion, Direction, PageStore, Place, Transfer};
+use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Place, Transfer};
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, transfer_bytes};
 use crate::page::format::verify::verify;
@@ -58,7 +58,7 @@ struct Pending {
 
 /// Pages in slots. One owner.
 pub struct PagedStore {
-    engine: Box<dyn PageStore>,
+    engine: Box<dyn PageEngine>,
     pub(in crate::page) config: PagedStoreConfig,
     pub(in crate::page) slots: Slots,
     pending: BTreeMap<u64, Pending>,
@@ -76,7 +76,7 @@ pub struct PagedStore {
 
 impl PagedStore {
     /// A store without pages.
-    pub fn new(engine: Box<dyn PageStore>, config: PagedStoreConfig) -> PagedStore {
+    pub fn new(engine: Box<dyn PageEngine>, config: PagedStoreConfig) -> PagedStore {
         PagedStore::with_slots(engine, config, Slots::new(config.layout))
     }
 
@@ -85,7 +85,7 @@ impl PagedStore {
     /// # Errors
     /// The index names a slot twice, or one that does not exist.
     pub fn open<'a>(
-        engine: Box<dyn PageStore>,
+        engine: Box<dyn PageEngine>,
         config: PagedStoreConfig,
         segments: u32,
         used: impl IntoIterator<Item = &'a SlotRef>,
@@ -94,7 +94,7 @@ impl PagedStore {
         Ok(PagedStore::with_slots(engine, config, slots))
     }
 
-    fn with_slots(engine: Box<dyn PageStore>, config: PagedStoreConfig, slots: Slots) -> PagedStore {
+    fn with_slots(engine: Box<dyn PageEngine>, config: PagedStoreConfig, slots: Slots) -> PagedStore {
         PagedStore {
             engine,
             config,

@@ -8,7 +8,7 @@
 //! retired slots add up to all slots, each is exactly one of the three.
 
 use crate::page::engine::buffer::ALIGNMENT;
-use crate::page::engine::transfers::Place;
+use crate::page::engine::page_engine::Place;
 use crate::page::format::slot_header::{HEADER_BYTES, transfer_bytes};
 use std::collections::BTreeSet;
 

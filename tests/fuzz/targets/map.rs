@@ -7,8 +7,8 @@ use gsscale::base::ids::PageId;
 use gsscale::cache::evict::EvictPolicy;
 use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, RunIdentity, RunState, TrafficSoFar, ViewPrint};
 use gsscale::densify::stats::GradHistogram;
-use gsscale::page::engine::memory::MemoryStore;
-use gsscale::page::engine::transfers::Place;
+use gsscale::page::engine::memory::MemoryEngine;
+use gsscale::page::engine::page_engine::Place;
 use gsscale::page::folder::protocol_files::Folder;
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::encoding;
@@ -178,7 +178,7 @@ const PAGES: PagerConfig = PagerConfig {
 /// The pages of a map over an engine without segments.
 fn store_of(opened: &Opened) -> Option<PagedStore> {
     let layout = SlotLayout { slot_bytes: PAGES.frame_bytes() as u64, slots_per_segment: 4 };
-    opened.paged_store(Box::new(MemoryStore::new()), layout, Codec::Raw).ok()
+    opened.paged_store(Box::new(MemoryEngine::new()), layout, Codec::Raw).ok()
 }
 
 /// Opens the pages, if the map allows it, and commits once more: as they are, or without any.

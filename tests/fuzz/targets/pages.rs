@@ -4,8 +4,8 @@ use super::{split_mode, with_mode};
 use crate::Target;
 use gsscale::base::ids::PageId;
 use gsscale::page::engine::buffer::PageBuffer;
-use gsscale::page::engine::memory::MemoryStore;
-use gsscale::page::engine::transfers::{Direction, PageStore, Place, Transfer};
+use gsscale::page::engine::memory::MemoryEngine;
+use gsscale::page::engine::page_engine::{Direction, PageEngine, Place, Transfer};
 use gsscale::page::format::codec::{Codec, decode, encode_as};
 use gsscale::page::format::slot_header::{
     HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, checksum, transfer_bytes,
@@ -178,7 +178,7 @@ fn run_slot(input: &[u8]) {
         wanted.checksum = checksum(&buffer.as_slice()[HEADER_BYTES..][..padded]);
     }
     buffer.as_mut_slice()[..HEADER_BYTES].copy_from_slice(&header(wanted));
-    let mut engine = MemoryStore::new();
+    let mut engine = MemoryEngine::new();
     engine.create_segment(0, layout.segment_bytes()).unwrap();
     let place = Place { segment: 0, offset: 0 };
     let len = buffer.len();

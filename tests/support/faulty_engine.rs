@@ -1,12 +1,14 @@
 //! A store that fails on purpose, around one that works.
 //!
 //! Every operation is counted by kind; rules say which one fails, how, and whether all later ones of the kind fail
-//! too. The rules can be changed while the store is in use. It keeps the first of [`PageStore`]'s invariants (every
+//! too. The rules can be changed while the store is in use. It keeps the first of [`PageEngine`]'s invariants (every
 //! buffer comes back, as it was handed over) and breaks the others as it is told.
 
-use crate::base::rng::mix64;
-use crate::page::engine::buffer::ALIGNMENT;
-use crate::page::engine::transfers::{Completion, Direction, PageStore, Place, Transfer};
+#![allow(dead_code)] // each test binary uses a part of it
+
+use gsscale::base::rng::mix64;
+use gsscale::page::engine::buffer::ALIGNMENT;
+use gsscale::page::engine::page_engine::{Completion, Direction, PageEngine, Place, Transfer};
 use std::collections::BTreeMap;
 use std::io;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -18,9 +20,9 @@ pub enum Operation {
     Read,
     /// A transfer to the store.
     Write,
-    /// [`PageStore::sync`].
+    /// [`PageEngine::sync`].
     Sync,
-    /// [`PageStore::create_segment`].
+    /// [`PageEngine::create_segment`].
     Create,
 }
 
@@ -124,17 +126,17 @@ struct Changed {
 }
 
 /// The failing store.
-pub struct FaultyStore {
-    inner: Box<dyn PageStore>,
+pub struct FaultyEngine {
+    inner: Box<dyn PageEngine>,
     faults: Faults,
     changed: BTreeMap<u64, Changed>,
     ended: Vec<Completion>,
 }
 
-impl FaultyStore {
+impl FaultyEngine {
     /// Around `inner`, after the rules of `faults`.
-    pub fn new(inner: Box<dyn PageStore>, faults: Faults) -> FaultyStore {
-        FaultyStore { inner, faults, changed: BTreeMap::new(), ended: Vec::new() }
+    pub fn new(inner: Box<dyn PageEngine>, faults: Faults) -> FaultyEngine {
+        FaultyEngine { inner, faults, changed: BTreeMap::new(), ended: Vec::new() }
     }
 
     /// Puts a transfer back as it was handed over and reports its end as the fault wants it.
@@ -159,7 +161,7 @@ fn flip(transfer: &mut Transfer, bit: u64) {
     transfer.buffer.as_mut_slice()[bit / 8] ^= 1 << (bit % 8);
 }
 
-impl PageStore for FaultyStore {
+impl PageEngine for FaultyEngine {
     fn name(&self) -> &'static str {
         self.inner.name()
     }

@@ -7,7 +7,7 @@
 //! Invariants of every implementation: 1. each submitted transfer yields exactly one [`Completion`] with its buffer;
 //! 2. a completion without an error moved exactly [`Transfer::bytes`] bytes: short transfers are resumed inside; 3. transfers
 //! may finish in any order; two transfers of one place are never in flight together (the caller sees to it); 4. bytes
-//! written are durable only after [`PageStore::sync`] returned without error; after a failed write or sync nothing that
+//! written are durable only after [`PageEngine::sync`] returned without error; after a failed write or sync nothing that
 //! was not synced before may be trusted.
 
 use crate::page::engine::buffer::PageBuffer;
@@ -56,7 +56,7 @@ pub struct Completion {
 }
 
 /// Moves page bytes. One owner; engines use their own threads or the kernel's.
-pub trait PageStore: Send {
+pub trait PageEngine: Send {
     /// For people: `uring`, `mmap`, `pread`, `memory`.
     fn name(&self) -> &'static str;
 
