@@ -50,6 +50,8 @@ impl Rows64 {
 #[derive(Debug, Clone, Copy)]
 pub struct Splat64 {
     pub mean2d: [f64; 2],
+    /// xx, yy of the covariance with its blur, px^2.
+    pub variances: [f64; 2],
     /// xx, xy, yy of the inverse covariance.
     pub conic: [f64; 3],
     pub depth: f64,
@@ -182,6 +184,7 @@ pub fn project(rows: &Rows64, camera: &Camera, settings: &Settings, row: usize) 
     let (color, color_margin) = color(rows, row, centre, settings.sh_degree);
     Some(Splat64 {
         mean2d: std::array::from_fn(|i| focal[i] * p[i] / p[2] + principal[i]),
+        variances: [xx, yy],
         conic: [yy / det, -xy / det, xx / det],
         depth: p[2],
         color,
