@@ -153,15 +153,16 @@ fn the_memory_that_a_stopped_run_names_is_more_than_it_had_and_enough() {
     let folder = TempDir::new().unwrap();
     let wide = folder.path().join("wide");
     std::fs::create_dir(&wide).unwrap();
-    let (alone, out) = (folder.path().join("alone"), folder.path().join("out"));
-    for (scene, more) in [
+    let alone = folder.path().join("alone");
+    for (name, scene, more) in [
         (
+            "compact",
             compact_city(folder.path()),
             "--grow-grad2d 0.0005 --steps 60 --quiet --spill-codec zstd:1 --image-cache 64KiB",
         ),
-        (scenes::wide_city(&wide, 8_000), "--grow-grad2d 0.0002 --steps 60 --quiet"),
+        ("large", scenes::wide_city(&wide, 8_000), "--grow-grad2d 0.0002 --steps 60 --quiet"),
     ] {
-        let flags = words(more);
+        let (out, flags) = (folder.path().join(name), words(more));
         let output =
             train(&[&[text(&scene), "--out", text(&alone), "--overwrite"], &words(EVENTS)[..], &flags].concat());
         assert!(output.status.success(), "{}", stderr(&output));
