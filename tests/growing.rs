@@ -65,7 +65,8 @@ fn floor(scene: &Path, out: &Path, flags: &[&str]) -> f64 {
     mebibytes(&named(&stderr(&output), "give at least "))
 }
 
-/// A capped run and one without a cap, in no memory, much, and little more than the least: the bytes of the run in memory.
+/// Runs with a cap and without one, each without a named memory, with much, and with little more than the least: all write
+/// the bytes of the run in memory.
 fn finishes_in_every_memory(folder: &Path, scene: &Path, first: u32, moves: bool) {
     let (alone, out) = (folder.join("alone"), folder.join("out"));
     // Caps that are reached in the first rounds and later: pages are full, half empty, and both.
