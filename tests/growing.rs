@@ -65,7 +65,8 @@ fn floor(scene: &Path, out: &Path, flags: &[&str]) -> f64 {
     mebibytes(&named(&stderr(&output), "give at least "))
 }
 
-/// A capped run and one without a cap, in no memory, much, and little more than the least: the bytes of the run in memory.
+/// Runs with a cap and without one, each without a named memory, with much, and with little more than the least: all write
+/// the bytes of the run in memory.
 fn finishes_in_every_memory(folder: &Path, scene: &Path, first: u32, moves: bool) {
     let (alone, out) = (folder.join("alone"), folder.join("out"));
     // Caps that are reached in the first rounds and later: pages are full, half empty, and both.
@@ -153,15 +154,16 @@ fn the_memory_that_a_stopped_run_names_is_more_than_it_had_and_enough() {
     let folder = TempDir::new().unwrap();
     let wide = folder.path().join("wide");
     std::fs::create_dir(&wide).unwrap();
-    let (alone, out) = (folder.path().join("alone"), folder.path().join("out"));
-    for (scene, more) in [
+    let alone = folder.path().join("alone");
+    for (name, scene, more) in [
         (
+            "compact",
             compact_city(folder.path()),
             "--grow-grad2d 0.0005 --steps 60 --quiet --spill-codec zstd:1 --image-cache 64KiB",
         ),
-        (scenes::wide_city(&wide, 8_000), "--grow-grad2d 0.0002 --steps 60 --quiet"),
+        ("large", scenes::wide_city(&wide, 8_000), "--grow-grad2d 0.0002 --steps 60 --quiet"),
     ] {
-        let flags = words(more);
+        let (out, flags) = (folder.path().join(name), words(more));
         let output =
             train(&[&[text(&scene), "--out", text(&alone), "--overwrite"], &words(EVENTS)[..], &flags].concat());
         assert!(output.status.success(), "{}", stderr(&output));

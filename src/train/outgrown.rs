@@ -41,8 +41,8 @@ impl TrainError {
 
 impl Trainer {
     /// Lets the pages of a run in memory leave it from now on, if they do not fit any more: all of them are committed, and
-    /// what is committed can be read again. Between steps. A run whose memory nobody named, and whose views would not fit
-    /// beside each other then, keeps all pages in memory as long as the machine has it.
+    /// what is committed can be read again. Between steps. A run whose memory nobody named, and which would have
+    /// too few frames for its views then, keeps all pages in memory as long as the machine has it.
     ///
     /// # Errors
     /// They could not be committed, for another reason than space.
