@@ -18,7 +18,7 @@ use gsscale::render::Traffic;
 use gsscale::render::gpu::GpuRenderer;
 use gsscale::scene::columns::Column;
 use gsscale::train::pages::PagedScene;
-use gsscale::train::run::{Prepared, prepare};
+use gsscale::train::prepare::{Prepared, prepare};
 use gsscale::train::step::{WorkingSet, train_step};
 use gsscale::train::trainer::Trainer;
 use scenes::{city, eval, psnr, stderr, summary, text, train, wide_city};

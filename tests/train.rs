@@ -10,7 +10,7 @@ use gsscale::config::limits::RunOptions;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::events::EventKind;
-use gsscale::train::run::{Prepared, prepare};
+use gsscale::train::prepare::{Prepared, prepare};
 use gsscale::train::trainer::Trainer;
 use scenes::{TextModel, city, eval, psnr, stderr, summary, text, train};
 use std::path::Path;

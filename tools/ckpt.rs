@@ -26,7 +26,7 @@ use clap::{Parser, Subcommand};
 use gsscale::base::error::InputError;
 use gsscale::page::map::commit::CommitError;
 use gsscale::page::map::manifest::MapError;
-use gsscale::train::trainer::TrainError;
+use gsscale::train::error::TrainError;
 use serde::Serialize;
 use std::process::ExitCode;
 

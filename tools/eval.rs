@@ -4,9 +4,9 @@ use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::render::lpips::InputRange;
+use gsscale::train::error::TrainError;
 use gsscale::train::eval::{EvalExtras, evaluate_ply};
-use gsscale::train::report::write_whole;
-use gsscale::train::trainer::TrainError;
+use gsscale::train::whole_file::write_whole;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 

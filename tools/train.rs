@@ -4,10 +4,10 @@ use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
+use gsscale::train::error::TrainError;
 use gsscale::train::out_folder::{Existing, remedy_of_existing};
 use gsscale::train::resume::{ResumeRequest, resume};
 use gsscale::train::run::{RunOutcome, RunRequest, run};
-use gsscale::train::trainer::TrainError;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 

@@ -11,24 +11,17 @@
 
 use super::memory::{INDEX_BYTES, MemoryEstimate, bytes_of_copies, frames_in_memory, within_reach};
 use super::pages::PagedScene;
-use super::tiers::with_staging;
-use super::trainer::Trainer;
-use crate::base::units::format_bytes;
+use super::staging::with_staging;
 use crate::page::format::slot_header::HEADER_BYTES;
-use crate::paging::error::PagingError;
-use crate::scene::camera::Camera;
-use crate::scene::columns::row_width;
 
 /// A page may hold more new rows than the mean of all pages: this many times its share.
 const UNEVEN: f64 = 2.0;
 
 /// Frames that are left in any case: with none nothing could be written out.
 const FRAMES_LEAST: usize = 2;
-/// Frames are given back when there are more than one in so many.
-const WORTH_GIVING: usize = 16;
 /// A step that needs frames gets one in so many on top, and a run that needs memory one byte in so many, so that the next
 /// steps of a growing scene need not ask again.
-const SPARE_SHARE: usize = 8;
+pub(super) const SPARE_SHARE: usize = 8;
 /// Vectors of a view that is a little larger than those before it grow by an eighth.
 const VIEW_SPARE: f64 = 1.125;
 
@@ -58,19 +51,19 @@ pub(super) struct ViewNeed {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct HostBudget {
     /// All that the run may take, bytes.
-    bytes: u64,
+    pub(super) bytes: u64,
     /// What does not grow with the scene, staging apart.
     constant: u64,
     /// Whether rounds of densification copy pages.
     copies_pages: bool,
     /// For pages that move.
-    staging: u64,
+    pub(super) staging: u64,
     /// What of a view grows with its pixels alone.
     of_pixels: u64,
     /// The user named this memory: the run never takes more.
     is_named: bool,
     /// It is more than the run set out with.
-    is_raised: bool,
+    pub(super) is_raised: bool,
     /// Commits that there were when pages could not be moved out for want of space.
     pub(super) tried_after: Option<u64>,
     /// Pages in flight ahead of their step, each way, once those of a run in memory move.
@@ -146,7 +139,7 @@ impl HostBudget {
     }
 
     /// This budget with `bytes` bytes and some to spare, where nobody named it and the machine has them; `None` where not.
-    fn raised(&self, bytes: u64) -> Option<HostBudget> {
+    pub(super) fn raised(&self, bytes: u64) -> Option<HostBudget> {
         let most = if self.is_named { None } else { within_reach() }?;
         let raised = (bytes + bytes / SPARE_SHARE as u64).min(most).max(self.bytes);
         (bytes <= most).then_some(HostBudget { bytes: raised, is_raised: true, ..*self })
@@ -161,14 +154,14 @@ impl HostBudget {
     }
 
     /// Memory of a run that keeps all pages in it, with those that split if they do.
-    fn bytes_of_all(&self, scene: &PagedScene, view: u64, have_split: bool) -> u64 {
+    pub(super) fn bytes_of_all(&self, scene: &PagedScene, view: u64, have_split: bool) -> u64 {
         let growth = growth_due(scene);
         let rows = frames_in_memory(scene.rows_bound(), scene.rules.sh_degree(), have_split);
         let around_rows = scene.pager.index().len() as f64 * growth * AROUND_ROWS;
         self.taken(scene, view, growth) + rows + around_rows as u64
     }
 
-    fn taken(&self, scene: &PagedScene, view: u64, growth: f64) -> u64 {
+    pub(super) fn taken(&self, scene: &PagedScene, view: u64, growth: f64) -> u64 {
         let of_rows = view.saturating_sub(self.of_pixels) as f64 * growth;
         let pages = scene.pager.index().len();
         let index = pages as f64 * growth * INDEX_BYTES as f64;
@@ -181,84 +174,4 @@ impl HostBudget {
 fn growth_due(scene: &PagedScene) -> f64 {
     let (rows, bound) = (scene.rows().max(1) as f64, scene.rows_bound() as f64);
     1.0 + UNEVEN * (bound / rows - 1.0).max(0.0)
-}
-
-impl Trainer {
-    /// Stays within this memory from now on, as far as frames that give way can do it.
-    pub fn set_budget(&mut self, budget: HostBudget) {
-        self.budget = Some(budget);
-    }
-
-    /// What the largest view took so far.
-    pub(super) fn view_memory(&self) -> ViewMemory {
-        let [working, rendering] = self.view_bytes();
-        let width = row_width(self.working.columns.sh_degree) as u64;
-        let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degrees().1]
-            .map(|degree| working / width * row_width(degree) as u64 + rendering);
-        ViewMemory { now, at_last }
-    }
-
-    /// Takes away the frames that the scene, as it has grown, leaves no memory for, and gives back what was taken for growth
-    /// that did not come. Between steps; the next one has this camera.
-    pub(super) fn fit_frames(&mut self, camera: &Camera) {
-        let Some(budget) = self.budget.filter(|_| !self.is_in_memory()) else { return };
-        let needed = self.scene.pager.pages_of_view(camera).len();
-        let mut frames = budget.frames(&self.scene, self.view_memory(), needed);
-        if frames < needed && self.raise_for_frames(budget, needed) {
-            frames = needed;
-        }
-        let pager = &mut self.scene.pager;
-        let now = pager.stats().frames_max;
-        if frames > now + now / WORTH_GIVING || (frames > now && needed >= now) {
-            pager.allow_frames(frames);
-        } else {
-            pager.limit_frames(frames);
-        }
-    }
-
-    /// Gives a step the frames that `error` says it lacked, if memory is left for them; then the step can be tried again.
-    /// Each time there are more frames than before.
-    pub(super) fn find_frames(&mut self, error: &PagingError) -> bool {
-        let PagingError::WorkingSet { pages: needed, frames: now, .. } = *error else { return false };
-        let Some(budget) = self.budget.filter(|_| !self.is_in_memory() && needed > now) else { return false };
-        let most = budget.frames_at_most(&self.scene, self.view_memory());
-        if most < needed && !self.raise_for_frames(budget, needed) {
-            return false;
-        }
-        let wanted = needed + needed / SPARE_SHARE;
-        self.scene.pager.allow_frames(wanted.min(most).max(needed));
-        true
-    }
-
-    /// Takes more memory for a step that needs so many frames, if nobody named the run's memory and the machine has it.
-    fn raise_for_frames(&mut self, budget: HostBudget, needed: usize) -> bool {
-        let frames = (needed * self.scene.pager.frame_bytes()) as u64;
-        let bytes = budget.taken(&self.scene, self.view_memory().now, 1.0) + budget.staging + frames;
-        self.raise_budget(budget, bytes)
-    }
-
-    /// Takes more memory to go on with all pages in it, if nobody named the run's memory and the machine has it.
-    pub(super) fn raise_for_all(&mut self, budget: HostBudget) -> bool {
-        let bytes = budget.bytes_of_all(&self.scene, self.view_memory().at_last, true);
-        self.raise_budget(budget, bytes)
-    }
-
-    fn raise_budget(&mut self, budget: HostBudget, bytes: u64) -> bool {
-        let Some(raised) = budget.raised(bytes) else { return false };
-        if !budget.is_raised {
-            eprintln!(
-                "warning: from step {} on the scene needs more than {}, the share of the free memory that a run takes by itself: \
-                 it takes more as long as the machine has it; --host-mem sets a limit",
-                self.step,
-                format_bytes(budget.bytes)
-            );
-        }
-        self.budget = Some(raised);
-        true
-    }
-
-    /// Whether no page ever leaves memory.
-    pub(super) fn is_in_memory(&self) -> bool {
-        self.scene.pager.stats().frames_max == usize::MAX
-    }
 }

@@ -9,9 +9,10 @@
 //! nothing else; 4. a run in memory makes its checkpoint when it first commits, so a short one writes none; a full drive
 //! costs such a run its commits, and nothing else.
 
+use super::error::TrainError;
 use super::first_commit::FirstCommit;
 use super::report::MetricsLog;
-use super::trainer::{TrainError, Trainer};
+use super::trainer::Trainer;
 use crate::checkpoint::interval::{CommitCost, CommitInterval, CommitReport};
 use crate::checkpoint::run_state::{DatasetPrint, RunIdentity, RunState, TrafficSoFar};
 use crate::config::file::TrainConfig;

@@ -1,28 +1,9 @@
 //! What the steps of a run took: CPU, bytes and memory, loading, the last evaluation and export left out.
 
+use super::report::StepCosts;
 use super::tiers::Tiers;
 use super::trainer::Trainer;
 use crate::base::machine::process_cpu_seconds;
-use serde::{Deserialize, Serialize};
-
-/// Costs of the steps that this process did (a run that was resumed: since then).
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct StepCosts {
-    /// CPU seconds of all threads during the steps; absent where the system does not tell.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub train_cpu_seconds: Option<f64>,
-    /// Bytes read from the drive by the steps.
-    pub train_bytes_read: u64,
-    /// Bytes written to it by the steps and their commits' pages.
-    pub train_bytes_written: u64,
-    /// Seconds that the steps waited for the drive.
-    pub train_stall_seconds: f64,
-    /// Most bytes allocated on the device; 0 on the CPU.
-    pub device_bytes_peak: u64,
-    /// Bytes of the segment files on the drive, which never shrink; 0 without a spill directory.
-    pub drive_bytes_peak: u64,
-}
 
 /// Costs that are being counted.
 pub(super) struct Meter {

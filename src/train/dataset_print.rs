@@ -6,14 +6,12 @@
 //! that compresses moves what follows them, and the length). It is no guard against single flipped bits; those end in
 //! decoding, or in one photo of thousands. Points are read whole at the start of a run anyway, so all of them count.
 
-use super::start::Start;
 use crate::base::error::{InputError, InputResult};
 use crate::checkpoint::run_state::{DatasetPrint, ViewPrint};
 use crate::dataset::import::PointSource;
 use crate::dataset::loader::{Dataset, View};
 use crate::dataset::model::Split;
 use crate::scene::columns::{Column, Columns};
-use rayon::prelude::*;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
@@ -26,24 +24,7 @@ const SAMPLE_BYTES: u64 = 64 << 10;
 /// Differences that are listed before they are only counted.
 const LISTED: usize = 10;
 
-/// The print of what a run starts from.
-///
-/// # Errors
-/// A photo or a mask cannot be read.
-pub fn dataset_print(start: &Start) -> InputResult<DatasetPrint> {
-    let dataset = &start.dataset;
-    let views: InputResult<Vec<ViewPrint>> = dataset.views.par_iter().map(view_print).collect();
-    Ok(DatasetPrint {
-        views: views?,
-        first_rows: start.rows,
-        points: start.points,
-        scene_scale: dataset.scene_scale,
-        origin: dataset.frame.origin.to_array(),
-        scale: dataset.frame.scale,
-    })
-}
-
-fn view_print(view: &View) -> InputResult<ViewPrint> {
+pub(super) fn view_print(view: &View) -> InputResult<ViewPrint> {
     let camera = &view.camera;
     let mut pose = Xxh3::new();
     pose.update(view.name.as_bytes());

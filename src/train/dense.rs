@@ -7,8 +7,8 @@
 //! decisions are those of the deferred run up to roundings; 2. no more than [`PAGES_PER_BATCH`] pages, and half of the
 //! frames, are pinned at once.
 
+use super::error::TrainError;
 use super::pages::PagedScene;
-use super::trainer::TrainError;
 use crate::base::ids::PageNo;
 use crate::scene::rows::RowsNow;
 use rayon::prelude::*;

@@ -1,18 +1,19 @@
 //! Looking at held-out views: PSNR, SSIM, and pictures of render beside photo. Changes no state.
 
+use super::error::TrainError;
 use super::machine;
 use super::memory::{check_photos_fit, host_budget};
 use super::pages::PagedScene;
+use super::prepare::ply_warnings;
 use super::report::{ColorCorrected, TestMetrics, json_psnr};
 use super::step::WorkingSet;
-use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
-use crate::exchange::ply::{PlyContent, PlyMeta, read_ply, to_local};
+use crate::exchange::ply::{PlyContent, read_ply, to_local};
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
 use crate::render::lpips::weights::read_lpips;
@@ -125,22 +126,6 @@ pub struct EvalReport {
     pub lpips_variant: Option<String>,
     /// Means over the held-out views; absent when there are none.
     pub test: Option<TestMetrics>,
-}
-
-/// What to say about Gaussians that were read from `ply`, of which `far` did not survive the change of frame.
-pub fn ply_warnings(ply: &Path, meta: &PlyMeta, far: u64) -> Vec<String> {
-    let mut warnings = Vec::new();
-    if meta.dropped > 0 {
-        warnings.push(format!("{}: {} Gaussians are not finite and are dropped", ply.display(), meta.dropped));
-    }
-    if far > 0 {
-        warnings.push(format!("{}: {far} Gaussians are too far from this scene and are dropped", ply.display()));
-    }
-    if meta.antialiased {
-        let file = ply.display();
-        warnings.push(format!("{file}: trained with opacity compensation (antialiased), which is not rendered here"));
-    }
-    warnings
 }
 
 /// What an evaluation of a PLY gives besides PSNR and SSIM.

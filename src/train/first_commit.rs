@@ -4,7 +4,8 @@
 //! since the last one, from the memory that they lie in. Invariant: a checkpoint that could not be made leaves nothing
 //! behind, and the pager as it was.
 
-use super::trainer::TrainError;
+use super::error::TrainError;
+use super::places::checkpoint_folder;
 use crate::config::file::TrainConfig;
 use crate::page::engine::open::{DEPTH, IoEngine, open_engine};
 use crate::page::folder::protocol_files::DriveFolder;
@@ -21,11 +22,6 @@ use std::path::{Path, PathBuf};
 
 /// Memory for the cache of the page map, bytes.
 pub(super) const MAP_CACHE_BYTES: usize = 8 << 20;
-
-/// Where the checkpoint of a run in memory is.
-pub(super) fn checkpoint_folder(out: &Path) -> PathBuf {
-    out.join("checkpoint")
-}
 
 /// What making a checkpoint takes.
 #[derive(Debug, Clone)]

@@ -3,13 +3,15 @@
 //! Invariants: 1. nothing is stored; 2. of the Gaussians no more is in memory at once than an import takes, and then the
 //! pages of one view: the largest, if that is asked about, and one to time that is small enough; 3. pages and bounds are those that the run begins with.
 
+use super::error::TrainError;
 use super::machine;
-use super::memory::{Probe, host_budget};
+use super::memory::host_budget;
 use super::pages::{PageRules, PagedScene};
 use super::preflight;
+use super::probe::Probe;
 use super::start::Start;
 use super::step::{WorkingSet, train_step};
-use super::trainer::{TrainError, Trainer};
+use super::trainer::Trainer;
 use crate::base::ids::PageNo;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;

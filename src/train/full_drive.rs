@@ -7,9 +7,10 @@
 //! Invariants: 1. nothing of the run is changed or lost while it waits; 2. whatever happens, the last commit stands.
 
 use super::checkpoint::Checkpoint;
+use super::error::TrainError;
 use super::report::MetricsLog;
 use super::signals::StopFlag;
-use super::trainer::{TrainError, Trainer};
+use super::trainer::Trainer;
 use crate::base::units::format_bytes;
 use crate::page::folder::file_system::free_bytes;
 use crate::page::map::commit::Commits;

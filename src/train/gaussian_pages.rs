@@ -6,7 +6,7 @@
 //! Invariants: 1. memory is bounded by what is given; 2. pages have the rows of [`crate::scene::partition::partition`], in
 //! its order, and each row the number that it was read with.
 
-use super::run::cut_sh;
+use super::prepare::cut_sh;
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::dataset::import::{Grown, PageSpace, Spool, SpoolSpace, SpoolWriter, paginate};

@@ -4,26 +4,20 @@
 //! Gaussians; what is simple arithmetic is computed. The promise is 10 % of the peak that a run without growth has.
 
 use super::pages::PAGES_PER_BATCH;
-use super::trainer::{TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
 use crate::base::machine::memory_available;
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::{Dataset, View};
-use crate::dataset::target_cache::TargetCache;
-use crate::scene::columns::row_width;
-use crate::scene::partition::first_fill;
 use crate::scene::state::row_bytes;
 
-/// Views, spread over all, rendered to see what a view takes.
-const PROBE_VIEWS: usize = 6;
 /// What is kept of a page that is not in memory: its entry, its place on the drive, its uses in the plan.
 pub(super) const INDEX_BYTES: u64 = 256;
 /// Pages that split have been full, and half of their rows left for another page: memory of the frames of a scene that has
 /// grown over that of its rows. Measured: 1.18 with 64 rows to a page, 1.25 with 1024.
 const GROWN_SPARE: f64 = 1.25;
 /// Program, libraries and thread stacks, measured on an empty run: 16 MiB with the tables of a short one.
-const BASE_BYTES: u64 = 12 << 20;
+pub(super) const BASE_BYTES: u64 = 12 << 20;
 
 /// Share of the memory that is available which a run takes when it is not told how much, percent.
 const BUDGET_PERCENT: u64 = 70;
@@ -86,79 +80,8 @@ pub fn rows_at_most(config: &TrainConfig, rows: u64) -> u64 {
     if config.strategy == "none" { rows } else { rows.max(config.max_gaussians) }
 }
 
-/// What an estimate is made of.
-#[derive(Debug, Clone)]
-pub struct Probe {
-    /// Views that are rendered to see what a view takes.
-    pub views: Vec<usize>,
-    /// Gaussians of the scene.
-    pub rows: u64,
-    /// Its pages.
-    pub pages: usize,
-    /// Bytes that the graphics driver took when it was looked for a device.
-    pub driver: u64,
-}
-
-impl Probe {
-    /// Of a run: `largest`, the view that needs most pages, and a few spread over the dataset. The largest comes first, so that
-    /// what it takes is taken at once, with nothing to spare for growing.
-    pub fn of_run(dataset: &Dataset, trainer: &Trainer, largest: Option<usize>, driver: u64) -> Probe {
-        let every = dataset.views.len().div_ceil(PROBE_VIEWS).max(1);
-        let spread = (0..dataset.views.len()).step_by(every).filter(|view| largest != Some(*view));
-        let views = largest.into_iter().chain(spread).collect();
-        Probe { views, rows: trainer.scene.rows(), pages: trainer.scene.pager.index().len(), driver }
-    }
-}
-
-/// Estimates a run before its first step, with all pages in memory: if nothing grows, and if it grows to its cap. The trainer
-/// renders the views of the probe for it and keeps the memory for its own steps: allocating it twice would break the heap
-/// into pieces and the promise with it.
-///
-/// # Errors
-/// A view cannot be rendered.
-pub fn estimate(
-    config: &TrainConfig,
-    dataset: &Dataset,
-    trainer: &mut Trainer,
-    probe: &Probe,
-) -> Result<[MemoryEstimate; 2], TrainError> {
-    let rows = probe.rows;
-    let pixels = trainer.probe_views(dataset, &probe.views)? as u64;
-    let [working, rendering] = trainer.view_bytes();
-    // Image, coverage, gradient, and the tiles' copies of them.
-    let of_pixels = (pixels * 4 * (3 + 1 + 3 + 6)).min(rendering);
-    // More Gaussians make a view's part grow in proportion, and bands that come into use its rows; the part of its
-    // pixels stays.
-    let (first, last) = trainer.sh_degrees();
-    let wider = row_width(last) as f64 / row_width(first) as f64;
-    let of_rows = working as f64 * wider + (rendering - of_pixels) as f64;
-    let decoders = rayon::current_num_threads();
-    // A view that a step waits for is decoded even where the cache is smaller.
-    let keep_all = TargetCache::bytes_to_keep_all(&dataset.views, decoders);
-    let targets = config.image_cache.0.min(keep_all).max(largest_decode(dataset).0);
-    let pages = probe.pages as f64;
-    let is_growing = config.strategy != "none";
-    let copies = if is_growing { bytes_of_copies(probe.pages, trainer.scene.pager.frame_bytes()) } else { 0 };
-    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver;
-    Ok([rows, rows_at_most(config, rows)].map(|rows_then| {
-        let growth = rows_then as f64 / rows.max(1) as f64;
-        let page_rows = config.page_rows as usize;
-        let fills_up = growth * first_fill(page_rows, true) as f64 > page_rows as f64;
-        MemoryEstimate {
-            frames: frames_in_memory(rows_then, last, fills_up),
-            staging: 0,
-            view: of_pixels + (of_rows * growth) as u64,
-            view_pixels: of_pixels,
-            targets,
-            index: (pages * growth) as u64 * INDEX_BYTES,
-            copies,
-            base,
-        }
-    }))
-}
-
 /// The most that decoding a photo with its mask takes, bytes, and the view whose it is.
-fn largest_decode(dataset: &Dataset) -> (u64, Option<&View>) {
+pub(super) fn largest_decode(dataset: &Dataset) -> (u64, Option<&View>) {
     let largest = dataset.views.iter().max_by_key(|view| view.photo.decode_bytes());
     (largest.map_or(0, |view| view.photo.decode_bytes()), largest)
 }

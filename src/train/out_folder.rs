@@ -4,10 +4,11 @@
 //! Invariants: 1. nothing is removed but files under this program's names beside a run's config, and that run's own
 //! checkpoint (`ownership`); 2. a run that could go on is named with the command that does so.
 
-use super::first_commit::checkpoint_folder;
+use super::error::TrainError;
+use super::facts::read_resolved;
 use super::ownership::{check_removable, remove_checkpoint_in};
-use super::report::{folder_of, read_resolved};
-use super::trainer::TrainError;
+use super::places::checkpoint_folder;
+use super::whole_file::folder_of;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::config::file::TrainConfig;

@@ -6,9 +6,11 @@
 
 use super::budget::ViewNeed;
 use super::catch_up::visible_rows;
+use super::error::TrainError;
 use super::preflight::largest_view;
-use super::tiers::PLAN_BYTES;
-use super::trainer::{LoopOutputs, TrainError, Trainer};
+use super::staging::PLAN_BYTES;
+use super::trainer::Trainer;
+use super::training_loop::LoopOutputs;
 use crate::base::units::{MIB, format_bytes};
 use crate::dataset::loader::Dataset;
 use crate::paging::error::PagingError;

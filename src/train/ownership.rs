@@ -19,8 +19,8 @@
 //! Whatever the row: files inside a spill directory go by the store's identity ([`SpillDir::remove`]), other files stay, and a
 //! store that cannot be opened stays.
 
+use super::error::TrainError;
 use super::tiers::Stored;
-use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{RunIdentity, RunState};
@@ -69,7 +69,9 @@ pub(super) fn open_own(folder: &Path, run: RunId, allow_remote: bool) -> Result<
 /// The run state of the last commit, read without writing anything.
 fn last_state(folder: &Path, access: Access) -> Result<RunState, TrainError> {
     let store = StoreReader::open(folder, access, WitnessRule::Obeyed)?;
-    super::stores::run_state_of(&store, store.find(None)?)
+    let bytes = store.run_state(store.find(None)?)?;
+    let wrong = |problem: String| InputError::new(folder, problem, "use the program that made it");
+    Ok(RunState::from_bytes(&bytes).map_err(|e| wrong(e.to_string()))?)
 }
 
 /// Removes the checkpoint that the run of `out` left in its output folder, for a run that starts over there.

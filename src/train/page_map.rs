@@ -1,7 +1,7 @@
 //! pages.json: the pages of a scene along its shortest axis, for the map in the report.
 
-use super::report::write_whole;
 use super::trainer::Trainer;
+use super::whole_file::write_whole;
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageNo;
 use crate::dataset::loader::Dataset;

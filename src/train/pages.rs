@@ -7,9 +7,9 @@
 //! number of rows that there would be if every page had applied every event.
 
 use super::catch_up::{evaluate_all, gather, visible_rows};
-use super::start::not_stored;
+use super::error::TrainError;
+use super::error::not_stored;
 use super::step::WorkingSet;
-use super::trainer::TrainError;
 use crate::base::ids::{PageId, PageNo};
 use crate::base::room;
 use crate::config::limits::RunOptions;

@@ -4,10 +4,14 @@
 //! because the scene grows, is a warning.
 
 use super::budget::HostBudget;
-use super::memory::{MemoryEstimate, Probe, estimate, rows_at_most, within_reach};
-use super::start::{Start, drive_of};
-use super::tiers::{PLAN_BYTES, Tiers, budget_in_memory, first_staging_bytes, staging_bytes, with_staging};
-use super::trainer::{TrainError, Trainer};
+use super::error::TrainError;
+use super::memory::{MemoryEstimate, rows_at_most, within_reach};
+use super::places::drive_of;
+use super::probe::{Probe, estimate};
+use super::staging::{PLAN_BYTES, staging_bytes, with_staging};
+use super::start::Start;
+use super::tiers::{Tiers, budget_in_memory, first_staging_bytes};
+use super::trainer::Trainer;
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;

@@ -3,14 +3,11 @@
 //! Invariants: 1. every number written is finite (JSON knows neither infinity nor NaN: see [`json_psnr`]); 2. whole
 //! files appear by rename, so a reader never sees half of one.
 
-use super::costs::StepCosts;
+use super::whole_file::write_whole;
 use crate::base::error::{InputError, InputResult};
-use crate::base::identity::RunId;
 use crate::base::units::format_bytes;
 use crate::checkpoint::interval::CommitReport;
-use crate::config::file::TrainConfig;
 use crate::exchange::tensorboard::EventFile;
-use crate::page::engine::segment_files::sync_folder;
 use crate::paging::pager::Pager;
 use crate::render::color_correct::ColorCorrect;
 use serde::{Deserialize, Serialize};
@@ -165,6 +162,25 @@ impl TestMetrics {
         self.color_corrected
             .map_or(String::new(), |c| format!(", colour-corrected PSNR ({}) {:.2} dB", c.method.name(), c.cc_psnr))
     }
+}
+
+/// Costs of the steps that this process did (a run that was resumed: since then).
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct StepCosts {
+    /// CPU seconds of all threads during the steps; absent where the system does not tell.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub train_cpu_seconds: Option<f64>,
+    /// Bytes read from the drive by the steps.
+    pub train_bytes_read: u64,
+    /// Bytes written to it by the steps and their commits' pages.
+    pub train_bytes_written: u64,
+    /// Seconds that the steps waited for the drive.
+    pub train_stall_seconds: f64,
+    /// Most bytes allocated on the device; 0 on the CPU.
+    pub device_bytes_peak: u64,
+    /// Bytes of the segment files on the drive, which never shrink; 0 without a spill directory.
+    pub drive_bytes_peak: u64,
 }
 
 /// What summary.json holds.
@@ -326,27 +342,6 @@ fn write_scalars(events: &mut EventFile, line: &StepLine) -> InputResult<()> {
     events.write(line.step, &scalars)
 }
 
-/// Writes a whole file by way of a temporary one beside it; file and name are durable when this returns.
-///
-/// # Errors
-/// The folder cannot be written.
-pub fn write_whole(path: &Path, bytes: &[u8]) -> InputResult<()> {
-    let mut name = path.file_name().unwrap_or_default().to_os_string();
-    name.push(".part");
-    let part = path.with_file_name(name);
-    let io = |e: std::io::Error| InputError::io(path, "writing", &e);
-    let mut file = File::create(&part).map_err(io)?;
-    file.write_all(bytes).and_then(|()| file.sync_all()).map_err(io)?;
-    std::fs::rename(&part, path).map_err(io)?;
-    // Without it a power cut can leave the folder without the new name.
-    sync_folder(folder_of(path)).map_err(io)
-}
-
-/// The folder that a path lies in.
-pub(super) fn folder_of(path: &Path) -> &Path {
-    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
-}
-
 /// Writes summary.json.
 ///
 /// # Errors
@@ -354,60 +349,6 @@ pub(super) fn folder_of(path: &Path) -> &Path {
 pub fn write_summary(path: &Path, summary: &Summary) -> InputResult<()> {
     let text = serde_json::to_string_pretty(summary).map_err(|e| InputError::io(path, "writing", &e.into()))?;
     write_whole(path, (text + "\n").as_bytes())
-}
-
-/// Facts of a run that follow from its config and machine.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Resolved {
-    /// Version of the program.
-    pub version: String,
-    /// Identity of the run; its commits hold it too.
-    #[serde(default)]
-    pub run: RunId,
-    /// The scene.
-    pub scene: PathBuf,
-    /// Instruction path in use.
-    pub simd: String,
-    /// Worker threads in use.
-    pub threads: usize,
-    /// What renders: "cpu", or the name of the GPU with its driver.
-    pub device: String,
-    /// Training views.
-    pub train_views: usize,
-    /// Held-out views.
-    pub test_views: usize,
-    /// Gaussians at the start.
-    pub gaussians: u64,
-    /// Origin removed from the dataset's coordinates.
-    pub origin: [f64; 3],
-    /// Scale removed from the dataset's coordinates.
-    pub scale: f64,
-    /// Scene scale, dataset units.
-    pub scene_scale: f64,
-}
-
-/// Writes config.toml: every key, then the facts.
-///
-/// # Errors
-/// The folder cannot be written.
-pub fn write_config(path: &Path, config: &TrainConfig, resolved: &Resolved) -> InputResult<()> {
-    let fail = |e: toml::ser::Error| InputError::new(path, format!("writing failed: {e}"), "report this as a bug");
-    let mut text = toml::to_string(config).map_err(fail)?;
-    text.push_str("\n[resolved]\n");
-    text.push_str(&toml::to_string(resolved).map_err(fail)?);
-    write_whole(path, text.as_bytes())
-}
-
-/// Reads the facts back from a run's config.toml.
-///
-/// # Errors
-/// It is not a run's.
-pub fn read_resolved(path: &Path) -> InputResult<Resolved> {
-    let text = std::fs::read_to_string(path).map_err(|e| InputError::io(path, "reading the config", &e))?;
-    let refuse = |problem: String| InputError::new(path, problem, "name the output folder of a run");
-    let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| refuse(e.to_string()))?;
-    let resolved = table.remove("resolved").ok_or_else(|| refuse("it has no table [resolved]".to_string()))?;
-    Resolved::deserialize(resolved).map_err(|e| refuse(e.to_string()))
 }
 
 #[cfg(test)]

@@ -8,18 +8,20 @@
 //! neither used nor removed (`ownership`).
 
 use super::changes::{Changes, kept_config};
-use super::dataset_print::dataset_print;
-use super::first_commit::checkpoint_folder;
+use super::error::TrainError;
+use super::facts::{Resolved, read_resolved};
 use super::machine;
 use super::memory::host_budget;
 use super::out_folder::Existing;
 use super::ownership::open_own;
 use super::pages::PagedScene;
-use super::report::{Resolved, StepLine, Summary, read_resolved};
+use super::places::checkpoint_folder;
+use super::report::{StepLine, Summary};
 use super::run::{Begun, Past, RunOutcome, RunRequest, begin, run, see_through};
 use super::start::Start;
+use super::start::dataset_print;
 use super::tiers::Stored;
-use super::trainer::{TrainError, Trainer};
+use super::trainer::Trainer;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::simd::SimdPath;

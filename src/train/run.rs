@@ -5,35 +5,35 @@
 
 use super::changes::with_absolute_paths;
 use super::checkpoint::{Checkpoint, Origin};
-use super::costs::{Meter, StepCosts};
-use super::dataset_print::dataset_print;
-use super::eval::ply_warnings;
+use super::costs::Meter;
+use super::error::TrainError;
+use super::facts::{Resolved, write_config};
 use super::machine;
-use super::memory::{Probe, estimate, host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
+use super::memory::{host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
 use super::out_folder::{self, Existing};
 use super::page_map::write_page_map;
 use super::preflight;
+use super::probe::{Probe, estimate};
 use super::progress::Progress;
-use super::report::{MetricsLog, Resolved, Summary, write_config, write_summary};
+use super::report::StepCosts;
+use super::report::{MetricsLog, Summary, write_summary};
 use super::signals::StopFlag;
 use super::start::Start;
+use super::start::dataset_print;
 use super::tiers::{self, Tiers};
-use super::trainer::{LoopOutputs, TrainError, Trainer};
+use super::trainer::Trainer;
+use super::training_loop::LoopOutputs;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{DatasetPrint, RunIdentity};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
-use crate::dataset::loader::{Dataset, load_dataset};
-use crate::dataset::model::PointCloud;
-use crate::dataset::read::read_scene;
+use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
-use crate::exchange::ply::{ExportFrame, PlyContent, PlyWritten, read_ply, to_local};
+use crate::exchange::ply::{ExportFrame, PlyWritten};
 use crate::page::folder::uncommitted::remove_uncommitted;
 use crate::render::Renderer;
 use crate::report::run_report::{PAGES_FILE, write_run_report};
-use crate::scene::columns::{Columns, sh_n_width};
-use crate::scene::init::{gaussians_from_points, random_points_in_frusta};
 use crate::scene::partition::first_fill;
 use std::path::{Path, PathBuf};
 
@@ -61,113 +61,6 @@ pub struct RunOutcome {
     pub summary: Option<Summary>,
     /// Exit code of the process: 0, or 130/143 when asked to stop.
     pub exit_code: i32,
-}
-
-/// A dataset with the Gaussians that training starts from.
-pub struct Prepared {
-    /// Views and frame.
-    pub dataset: Dataset,
-    /// First Gaussians, local frame. Bands that are not in use yet may be missing.
-    pub columns: Columns,
-    /// Degree in use from the first step: what they were trained with, or what was asked for.
-    pub sh_degree_start: u8,
-}
-
-/// Reads the scene and makes first Gaussians.
-///
-/// # Errors
-/// Whatever is wrong with the scene or the PLY, by file, place and remedy.
-pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
-    let mut raw = read_scene(scene, &limits::read_options(config))?;
-    let mut gaussians = None;
-    let mut dropped = None;
-    let points_file = match (config.init_ply.as_str(), &raw.points_path) {
-        ("", path) => path.clone(),
-        (path, _) => Some(PathBuf::from(path)),
-    };
-    if let Some(path) = points_file {
-        match read_ply(&path)? {
-            PlyContent::Gaussians { columns, meta, .. } => {
-                raw.points = PointCloud::default();
-                gaussians = Some((columns, meta, path));
-            }
-            PlyContent::Points { positions, colors, dropped: count } => {
-                raw.points = PointCloud { positions, colors };
-                dropped = (count > 0).then(|| format!("{}: {count} points are not finite, dropped", path.display()));
-            }
-        }
-    }
-    raw.warnings.extend(dropped);
-    let mut dataset = load_dataset(raw, &limits::load_options(config))?;
-    check_train_views(scene, &dataset)?;
-    let (columns, sh_degree_start) = match gaussians {
-        Some((mut columns, meta, ply)) => {
-            let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
-            dataset.warnings.extend(ply_warnings(&ply, &meta, far));
-            let in_use = columns.sh_degree.max(limits::first_sh_degree(config));
-            (cut_sh(columns, config.sh_degree), in_use)
-        }
-        None => (first_gaussians(scene, &mut dataset, config)?, limits::first_sh_degree(config)),
-    };
-    check_first_rows(scene, config, columns.rows() as u64)?;
-    Ok(Prepared { dataset, columns, sh_degree_start })
-}
-
-/// There must be views to train on.
-pub(super) fn check_train_views(scene: &Path, dataset: &Dataset) -> InputResult<()> {
-    if !dataset.train_views().is_empty() {
-        return Ok(());
-    }
-    let problem = "no view is left to train on";
-    Err(InputError::new(scene, problem, "hold out fewer photos: see --test-every and --test-after"))
-}
-
-/// There must be Gaussians to start from, and no more than may be.
-pub(super) fn check_first_rows(from: &Path, config: &TrainConfig, rows: u64) -> InputResult<()> {
-    if rows == 0 {
-        let problem = "no Gaussian is left to start from: all are too far from the cameras";
-        return Err(InputError::new(from, problem, "give a PLY of this scene with --init-ply"));
-    }
-    if config.max_gaussians > 0 && rows > config.max_gaussians {
-        let problem = format!("the start has {rows} Gaussians, above --max-gaussians");
-        return Err(InputError::new(from, problem, "raise --max-gaussians or start from fewer"));
-    }
-    Ok(())
-}
-
-fn first_gaussians(scene: &Path, dataset: &mut Dataset, config: &TrainConfig) -> InputResult<Columns> {
-    let mut options = limits::init_options(config);
-    options.scene_scale = dataset.scene_scale;
-    if !dataset.points.is_empty() {
-        return Ok(gaussians_from_points(&dataset.points, &dataset.colors, &options));
-    }
-    if config.init_points == 0 {
-        return Err(InputError::new(
-            scene,
-            "the dataset has no points and --init-points is 0",
-            "give points with --init-ply, or let --init-points N draw them in the views' frusta",
-        ));
-    }
-    dataset.warnings.push(format!(
-        "there are no points to start from: {} random ones are drawn in what the cameras see",
-        config.init_points
-    ));
-    let cameras: Vec<_> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
-    let count = config.init_points as usize;
-    // Aerial and object captures both have their subject within a few camera-spreads of the cameras.
-    let (near, far) = (0.1 * dataset.scene_scale, 3.0 * dataset.scene_scale);
-    let (points, colors) = random_points_in_frusta(&cameras, count, near, far, config.seed);
-    Ok(gaussians_from_points(&points, &colors, &options))
-}
-
-/// The same rows without the bands above a degree.
-pub(super) fn cut_sh(columns: Columns, sh_degree: u8) -> Columns {
-    if columns.sh_degree <= sh_degree {
-        return columns;
-    }
-    let (from, to) = (sh_n_width(columns.sh_degree), sh_n_width(sh_degree));
-    let sh_n = columns.sh_n.chunks_exact(from).flat_map(|row| &row[..to]).copied().collect();
-    Columns { sh_degree, sh_n, ..columns }
 }
 
 /// What a run that goes on has behind it.

@@ -5,17 +5,21 @@
 //!
 //! Invariant: both ways give the same pages, bit for bit ([`crate::dataset::import`]).
 
+use super::dataset_print::view_print;
 use super::dataset_print::{GaussiansPrint, points_print};
-use super::eval::ply_warnings;
+use super::error::TrainError;
+use super::error::not_stored;
 use super::gaussian_pages::{GaussianFile, GaussianSpace, GaussianWriter};
 use super::memory::check_photos_fit;
 use super::pages::{PagedScene, first_pages};
-use super::run::{Prepared, check_first_rows, check_train_views, prepare};
+use super::places::folder_beside;
+use super::prepare::ply_warnings;
+use super::prepare::{Prepared, check_first_rows, check_train_views, prepare};
 use super::stores::StoredStart;
-use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::base::units::format_bytes;
+use crate::checkpoint::run_state::{DatasetPrint, ViewPrint};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::colmap;
@@ -30,6 +34,7 @@ use crate::scene::columns::{Columns, row_width};
 use crate::scene::init::InitOptions;
 use crate::scene::partition::first_fill;
 use crate::scene::state::SceneState;
+use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 
 /// Memory of an import where no budget is known, bytes.
@@ -252,18 +257,6 @@ fn budget(folder: &Path, host_mem: Option<u64>) -> Budget<'_> {
     Budget { folder, bytes: (host_mem.unwrap_or(BUDGET_DEFAULT) / BUDGET_SHARE) as usize }
 }
 
-/// A folder on the drive of the spill directory, which may not be there yet and must stay empty: the nearest one above
-/// it. What is written there has no name.
-pub(super) fn folder_beside(spill_dir: &Path) -> PathBuf {
-    let above = spill_dir.ancestors().skip(1).find(|folder| folder.is_dir());
-    above.map_or_else(|| PathBuf::from("."), Path::to_path_buf)
-}
-
-/// The spill directory, or as long as it is not there the folder above it that is: what tells of its drive.
-pub(super) fn drive_of(spill_dir: &Path) -> PathBuf {
-    if spill_dir.is_dir() { spill_dir.to_path_buf() } else { folder_beside(spill_dir) }
-}
-
 /// Without a spill directory a PLY of Gaussians is read whole: one that cannot fit is refused by its header, before memory
 /// runs out.
 fn check_gaussians_fit(config: &TrainConfig, host_mem: Option<u64>) -> InputResult<()> {
@@ -299,7 +292,19 @@ fn read_points(file: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>
     Ok(())
 }
 
-/// The error of a page that could not be stored, on its way through an import.
-pub(super) fn not_stored(error: &impl std::fmt::Display) -> InputError {
-    InputError::new("--spill-dir", format!("a page could not be stored: {error}"), "see the cause")
+/// The print of what a run starts from.
+///
+/// # Errors
+/// A photo or a mask cannot be read.
+pub fn dataset_print(start: &Start) -> InputResult<DatasetPrint> {
+    let dataset = &start.dataset;
+    let views: InputResult<Vec<ViewPrint>> = dataset.views.par_iter().map(view_print).collect();
+    Ok(DatasetPrint {
+        views: views?,
+        first_rows: start.rows,
+        points: start.points,
+        scene_scale: dataset.scene_scale,
+        origin: dataset.frame.origin.to_array(),
+        scale: dataset.frame.scale,
+    })
 }

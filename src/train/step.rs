@@ -6,8 +6,8 @@
 //! for any number of threads and frames.
 
 use super::catch_up::{gather, visible_rows};
+use super::error::TrainError;
 use super::pages::{PagedScene, numbered};
-use super::trainer::TrainError;
 use super::update::{StepGradients, update_pages};
 use crate::render::{Gradients, LossOptions, LossValue, RenderOptions, Renderer};
 use crate::scene::camera::Camera;

@@ -5,10 +5,11 @@
 
 use super::budget::HostBudget;
 use super::checkpoint::Checkpoint;
+use super::error::TrainError;
 use super::first_commit::{FirstCommit, MAP_CACHE_BYTES, codec};
 use super::memory::MemoryEstimate;
-use super::start::drive_of;
-use super::trainer::TrainError;
+use super::places::drive_of;
+use super::staging::{PLAN_BYTES, PREFETCH_BYTES_MAX, staging_bytes};
 use crate::base::error::{InputError, InputResult};
 use crate::cache::evict::EvictPolicy;
 use crate::checkpoint::run_state::RunState;
@@ -32,11 +33,8 @@ use std::path::{Path, PathBuf};
 
 /// Fewest frames that a run gets before its views were looked at: enough for importing and probing.
 const FIRST_FRAMES: usize = 64;
-/// Share of the frames that may be filled ahead of their step, and the most bytes of it.
+/// One frame in so many may be filled ahead of its step.
 const PREFETCH_SHARE: usize = 8;
-const PREFETCH_BYTES_MAX: usize = 256 << 20;
-/// Memory for the plan of the coming steps, bytes.
-pub const PLAN_BYTES: usize = 16 << 20;
 
 /// Space set aside for a last commit on a full drive: room for a segment, at least for the map to grow, bytes.
 const RESERVE_BYTES_LEAST: u64 = 2 << 20;
@@ -132,21 +130,6 @@ pub(super) fn budget_in_memory(config: &TrainConfig, host_mem: u64, memory: &Mem
 fn with_transfers(mut pager: Pager, config: &TrainConfig) -> Pager {
     pager.set_transfers(config.transfers.parse().unwrap_or_default());
     pager
-}
-
-/// Bytes that the plan takes beside the frames, and pages on their way of which `prefetch_bytes` may be in flight: raw
-/// pages move between frames and drive without a copy.
-pub fn staging_bytes(prefetch_bytes: usize, codec: &str) -> u64 {
-    (PLAN_BYTES + if codec == Codec::Raw.to_string() { 0 } else { prefetch_bytes }) as u64
-}
-
-/// The memory that a run needs which holds `rest` bytes beside its staging, where staging took `staging` of `budget` bytes:
-/// more memory means more frames, an eighth of which may be on their way.
-pub(super) fn with_staging(rest: u64, staging: u64, budget: u64) -> u64 {
-    let of_plan = staging.min(PLAN_BYTES as u64);
-    let share = ((staging - of_plan) as f64 / budget.max(1) as f64).min(0.5);
-    let most = of_plan + (staging - of_plan).max(2 * PREFETCH_BYTES_MAX as u64);
-    (((rest + of_plan) as f64 / (1.0 - share)) as u64).min(rest + most).max(rest + staging)
 }
 
 /// The same of a run that was not begun, with this budget and a drive that is fast enough for raw pages where the codec is

@@ -12,7 +12,7 @@ use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::page::folder::file_system::free_bytes;
 use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::scene::page_layout::capacity_bytes;
-use gsscale::train::trainer::TrainError;
+use gsscale::train::error::TrainError;
 use serde_json::{Value, json};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};

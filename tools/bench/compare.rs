@@ -2,8 +2,8 @@
 
 use clap::Parser;
 use gsscale::report::compare_report::compare_report;
-use gsscale::train::report::write_whole;
-use gsscale::train::trainer::TrainError;
+use gsscale::train::error::TrainError;
+use gsscale::train::whole_file::write_whole;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\

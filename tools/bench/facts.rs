@@ -8,9 +8,9 @@ use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::scene::camera::Camera;
 use gsscale::schedule::auto::automatic_order;
 use gsscale::schedule::visibility::ViewPages;
+use gsscale::train::error::TrainError;
 use gsscale::train::pages::PagedScene;
-use gsscale::train::run::prepare;
-use gsscale::train::trainer::TrainError;
+use gsscale::train::prepare::prepare;
 use std::path::Path;
 
 /// Memory that choosing an order of views may take, bytes.

@@ -7,7 +7,7 @@ use super::facts::Facts;
 use super::sweep::Planned;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::config::file::TrainConfig;
-use gsscale::train::trainer::TrainError;
+use gsscale::train::error::TrainError;
 use std::path::Path;
 
 /// Names of all knobs, in the order in which they are tried.

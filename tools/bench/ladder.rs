@@ -10,8 +10,8 @@ use clap::Parser;
 use gsscale::base::error::InputError;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::report::ladder_page::{LadderRung, ladder_page};
-use gsscale::train::report::write_whole;
-use gsscale::train::trainer::TrainError;
+use gsscale::train::error::TrainError;
+use gsscale::train::whole_file::write_whole;
 use serde_json::Value;
 use std::path::PathBuf;
 

@@ -10,8 +10,8 @@ use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::ResultsLog;
 use gsscale::report::sweep_page::sweep_page;
-use gsscale::train::report::write_whole;
-use gsscale::train::trainer::TrainError;
+use gsscale::train::error::TrainError;
+use gsscale::train::whole_file::write_whole;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 

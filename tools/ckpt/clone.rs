@@ -1,8 +1,8 @@
 //! `gsscale-ckpt clone`: a store on another drive.
 
 use gsscale::base::units::format_bytes;
+use gsscale::train::error::TrainError;
 use gsscale::train::stores::{clone_store, find_store};
-use gsscale::train::trainer::TrainError;
 use std::path::PathBuf;
 use std::process::ExitCode;
 

@@ -1,8 +1,8 @@
 //! `gsscale-ckpt diff`: what changed between two generations.
 
 use gsscale::base::units::format_bytes;
+use gsscale::train::error::TrainError;
 use gsscale::train::stores::{StoreDiff, diff, find_store};
-use gsscale::train::trainer::TrainError;
 use std::path::PathBuf;
 use std::process::ExitCode;
 

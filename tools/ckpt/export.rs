@@ -2,8 +2,8 @@
 
 use gsscale::base::units::format_bytes;
 use gsscale::config::file::ByteSize;
+use gsscale::train::error::TrainError;
 use gsscale::train::stores::{ExportRequest, export, find_store};
-use gsscale::train::trainer::TrainError;
 use std::path::PathBuf;
 use std::process::ExitCode;
 

@@ -3,8 +3,8 @@
 use gsscale::base::units::format_bytes;
 use gsscale::config::file::ByteSize;
 use gsscale::page::format::codec::Codec;
+use gsscale::train::error::TrainError;
 use gsscale::train::stores::{ImportRequest, import};
-use gsscale::train::trainer::TrainError;
 use std::path::PathBuf;
 use std::process::ExitCode;
 

@@ -2,8 +2,8 @@
 
 use gsscale::base::ids::PageId;
 use gsscale::base::units::format_bytes;
+use gsscale::train::error::TrainError;
 use gsscale::train::stores::{Inspected, PageInspected, find_store, inspect, inspect_page};
-use gsscale::train::trainer::TrainError;
 use std::path::PathBuf;
 use std::process::ExitCode;
 

@@ -1,8 +1,8 @@
 //! `gsscale-ckpt ls`: generations and named checkpoints.
 
 use gsscale::base::units::format_bytes;
+use gsscale::train::error::TrainError;
 use gsscale::train::stores::{GenerationLine, find_store, list};
-use gsscale::train::trainer::TrainError;
 use std::path::PathBuf;
 use std::process::ExitCode;
 

@@ -1,8 +1,8 @@
 //! `gsscale-ckpt prune`: takes names of checkpoints away.
 
 use gsscale::base::units::format_bytes;
+use gsscale::train::error::TrainError;
 use gsscale::train::stores::{PruneRequest, Pruned, find_store, prune};
-use gsscale::train::trainer::TrainError;
 use std::path::PathBuf;
 use std::process::ExitCode;
 

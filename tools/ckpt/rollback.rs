@@ -1,7 +1,7 @@
 //! `gsscale-ckpt rollback`: makes an earlier generation the last one.
 
+use gsscale::train::error::TrainError;
 use gsscale::train::stores::{RolledBack, find_store, rollback};
-use gsscale::train::trainer::TrainError;
 use std::path::PathBuf;
 use std::process::ExitCode;
 

@@ -1,7 +1,7 @@
 //! `gsscale-ckpt salvage`: a damaged store, rebuilt elsewhere.
 
+use gsscale::train::error::TrainError;
 use gsscale::train::stores::{SalvageRequest, Salvaged, find_store, salvage};
-use gsscale::train::trainer::TrainError;
 use std::path::PathBuf;
 use std::process::ExitCode;
 

@@ -1,8 +1,8 @@
 //! `gsscale-ckpt verify`: whether a store is whole.
 
 use gsscale::base::units::format_bytes;
+use gsscale::train::error::TrainError;
 use gsscale::train::stores::{Fault, Verdict, find_store, verify};
-use gsscale::train::trainer::TrainError;
 use std::path::PathBuf;
 use std::process::ExitCode;
 

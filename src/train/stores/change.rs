@@ -11,7 +11,7 @@ use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
 use crate::page::map::commit::Commits;
 use crate::page::tool::reading::{Access, StoreReader, commit_config};
-use crate::train::trainer::TrainError;
+use crate::train::error::TrainError;
 use serde::Serialize;
 
 /// What going back did, or would do.

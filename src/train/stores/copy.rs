@@ -12,7 +12,7 @@ use crate::page::format::slot_header::{SlotRef, StoredAs};
 use crate::page::tool::new_store::{NewStore, refuse_existing};
 use crate::page::tool::reading::Access;
 use crate::page::versions::slots::SlotLayout;
-use crate::train::trainer::TrainError;
+use crate::train::error::TrainError;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

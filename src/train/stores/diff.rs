@@ -5,7 +5,7 @@ use crate::base::ids::PageId;
 use crate::page::map::opening::StoredPage;
 use crate::page::tool::reading::Access;
 use crate::paging::label::meta_from_label;
-use crate::train::trainer::TrainError;
+use crate::train::error::TrainError;
 use serde::Serialize;
 use std::collections::BTreeMap;
 

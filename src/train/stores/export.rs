@@ -20,10 +20,10 @@ use crate::paging::pager::{Pager, PagerConfig};
 use crate::scene::columns::{Column, Columns};
 use crate::scene::partition::GiantCut;
 use crate::scene::select::RankSearch;
+use crate::train::error::TrainError;
 use crate::train::memory::host_bytes_peak;
 use crate::train::pages::PagedScene;
-use crate::train::run::cut_sh;
-use crate::train::trainer::TrainError;
+use crate::train::prepare::cut_sh;
 use serde::Serialize;
 use std::path::PathBuf;
 

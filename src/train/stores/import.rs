@@ -20,10 +20,10 @@ use crate::paging::label::label;
 use crate::scene::page_layout::{PageLayout, capacity_bytes, write_page};
 use crate::scene::partition::first_fill;
 use crate::scene::state::SceneState;
+use crate::train::error::TrainError;
 use crate::train::gaussian_pages::{GaussianSpace, GaussianWriter};
 use crate::train::memory::host_bytes_peak;
 use crate::train::pages::PageRules;
-use crate::train::trainer::TrainError;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 

@@ -13,7 +13,7 @@ use crate::paging::label::meta_from_label;
 use crate::paging::stored::{check_values, layout_of};
 use crate::scene::events::EventKind;
 use crate::scene::rows::Rows;
-use crate::train::trainer::TrainError;
+use crate::train::error::TrainError;
 use serde::Serialize;
 
 /// A store as a whole, and one of its generations.

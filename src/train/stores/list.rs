@@ -2,7 +2,7 @@
 
 use super::{StorePlace, run_state_of};
 use crate::page::tool::reading::Access;
-use crate::train::trainer::TrainError;
+use crate::train::error::TrainError;
 use serde::Serialize;
 use std::path::Path;
 

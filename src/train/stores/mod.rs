@@ -27,9 +27,9 @@ pub use salvage::{LostPage, SalvageRequest, Salvaged, salvage};
 pub use start::StoredStart;
 pub use verify::{Fault, Verdict, verify};
 
+use super::error::TrainError;
+use super::facts::read_resolved;
 use super::ownership::check_owner;
-use super::report::read_resolved;
-use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::RunState;

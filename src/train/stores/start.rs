@@ -13,9 +13,9 @@ use crate::page::tool::reading::{Access, StoreReader};
 use crate::scene::columns::Columns;
 use crate::scene::state::SceneState;
 use crate::train::catch_up::evaluate_all;
+use crate::train::error::TrainError;
 use crate::train::pages::PagedScene;
-use crate::train::run::cut_sh;
-use crate::train::trainer::TrainError;
+use crate::train::prepare::cut_sh;
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_64;
 

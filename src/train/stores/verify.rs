@@ -11,7 +11,7 @@ use crate::page::format::slot_header::SlotRef;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule};
 use crate::paging::stored::{PageLimits, check_values, layout_of};
-use crate::train::trainer::TrainError;
+use crate::train::error::TrainError;
 use serde::Serialize;
 
 /// Something that is not as it should be.

@@ -1,0 +1,64 @@
+//! config.toml of a run: every setting, and the facts that followed from it (`[resolved]`).
+//!
+//! Invariant: the file is a valid `--config`; its facts are read by what goes on with the run or evaluates it.
+
+use super::whole_file::write_whole;
+use crate::base::error::{InputError, InputResult};
+use crate::base::identity::RunId;
+use crate::config::file::TrainConfig;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Facts of a run that follow from its config and machine.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Resolved {
+    /// Version of the program.
+    pub version: String,
+    /// Identity of the run; its commits hold it too.
+    #[serde(default)]
+    pub run: RunId,
+    /// The scene.
+    pub scene: PathBuf,
+    /// Instruction path in use.
+    pub simd: String,
+    /// Worker threads in use.
+    pub threads: usize,
+    /// What renders: "cpu", or the name of the GPU with its driver.
+    pub device: String,
+    /// Training views.
+    pub train_views: usize,
+    /// Held-out views.
+    pub test_views: usize,
+    /// Gaussians at the start.
+    pub gaussians: u64,
+    /// Origin removed from the dataset's coordinates.
+    pub origin: [f64; 3],
+    /// Scale removed from the dataset's coordinates.
+    pub scale: f64,
+    /// Scene scale, dataset units.
+    pub scene_scale: f64,
+}
+
+/// Writes config.toml: every key, then the facts.
+///
+/// # Errors
+/// The folder cannot be written.
+pub fn write_config(path: &Path, config: &TrainConfig, resolved: &Resolved) -> InputResult<()> {
+    let fail = |e: toml::ser::Error| InputError::new(path, format!("writing failed: {e}"), "report this as a bug");
+    let mut text = toml::to_string(config).map_err(fail)?;
+    text.push_str("\n[resolved]\n");
+    text.push_str(&toml::to_string(resolved).map_err(fail)?);
+    write_whole(path, text.as_bytes())
+}
+
+/// Reads the facts back from a run's config.toml.
+///
+/// # Errors
+/// It is not a run's.
+pub fn read_resolved(path: &Path) -> InputResult<Resolved> {
+    let text = std::fs::read_to_string(path).map_err(|e| InputError::io(path, "reading the config", &e))?;
+    let refuse = |problem: String| InputError::new(path, problem, "name the output folder of a run");
+    let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| refuse(e.to_string()))?;
+    let resolved = table.remove("resolved").ok_or_else(|| refuse("it has no table [resolved]".to_string()))?;
+    Resolved::deserialize(resolved).map_err(|e| refuse(e.to_string()))
+}

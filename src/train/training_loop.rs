@@ -1,0 +1,159 @@
+//! The loop over steps: evaluation, saves, metrics, progress and commits where they are due, until the last step or a stop.
+//!
+//! Invariants: 1. when the loop logs, evaluates, saves or commits changes no bit of the run; 2. a step that fails for want of
+//! space or frames is done again once there is some, or the run ends with its last good step committed.
+
+use super::checkpoint::Checkpoint;
+use super::error::TrainError;
+use super::memory::host_bytes_peak;
+use super::progress::Progress;
+use super::report::{MetricsLog, StepLine, TestMetrics, TierTraffic, json_psnr};
+use super::signals::StopFlag;
+use super::step::StepOutcome;
+use super::trainer::Trainer;
+use crate::base::error::{InputError, InputResult};
+use crate::dataset::loader::Dataset;
+use crate::dataset::target_cache::TargetCache;
+use std::path::Path;
+
+/// Where a loop writes, and how it is watched.
+pub struct LoopOutputs<'a> {
+    /// Output folder.
+    pub out: &'a Path,
+    /// metrics.jsonl.
+    pub metrics: &'a mut MetricsLog,
+    /// Bar or lines.
+    pub progress: &'a mut Progress,
+    /// Ctrl-C.
+    pub stop: &'a StopFlag,
+    /// Where the run is committed to, if anywhere.
+    pub checkpoint: Option<&'a mut Checkpoint>,
+}
+
+impl Trainer {
+    /// Runs to the last step or until asked to stop.
+    ///
+    /// # Errors
+    /// As [`Trainer::step`], or an output cannot be written.
+    pub fn run(
+        &mut self,
+        dataset: &Dataset,
+        targets: &TargetCache,
+        outputs: &mut LoopOutputs<'_>,
+    ) -> Result<(), TrainError> {
+        while self.step < self.options.steps && outputs.stop.exit_code().is_none() {
+            self.move_out_if_outgrown(outputs)?;
+            let step = self.step;
+            let before = self.renderer.traffic();
+            let Some(outcome) = self.step_with_space(dataset, targets, outputs)? else { break };
+            self.check_statistics(outputs)?;
+            let traffic = self.renderer.traffic();
+            let is_last = self.step == self.options.steps;
+            let due = |every: u32| step > 0 && step.is_multiple_of(every);
+            let psnr = json_psnr(-10.0 * outcome.loss.mse.log10());
+            let mut test: Option<TestMetrics> = None;
+            if due(self.options.eval_every) && !is_last {
+                test = self.evaluate(dataset, targets, None)?;
+            }
+            if due(self.options.save_every) && !is_last {
+                self.save_if_space(dataset, &outputs.out.join(format!("point_cloud_{step:06}.ply")))?;
+                if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
+                    checkpoint.keep_next_as(format!("step-{step}"));
+                }
+            }
+            if due(self.options.log_every) || is_last || due(self.options.eval_every) {
+                let line = StepLine {
+                    step,
+                    loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },
+                    psnr,
+                    gaussians: self.scene.rows(),
+                    seconds: self.train_seconds,
+                    host_bytes_peak: host_bytes_peak().unwrap_or(0),
+                    bytes_uploaded: traffic.bytes_uploaded - before.bytes_uploaded,
+                    bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
+                    device_bytes_peak: traffic.device_bytes_peak,
+                    tiers: self.tier_traffic(),
+                    commits: outputs.checkpoint.as_deref().map(Checkpoint::report),
+                    test,
+                };
+                let written = outputs.metrics.write(&line).map_err(TrainError::from);
+                written.or_else(|error| self.make_space(outputs, error))?;
+            }
+            let (gaussians, last_test) = (self.scene.rows(), self.last_test);
+            outputs.progress.step(self.step, || {
+                let test = last_test.map_or(String::new(), |t| format!(" test {:.2}", t.psnr));
+                let tiers = TierTraffic::of(&self.scene.pager).words();
+                let commits = outputs.checkpoint.as_deref().map_or(String::new(), |c| c.report().words());
+                format!("loss {:.4} psnr {psnr:.2}{test} {gaussians} gaussians{tiers}{commits}", outcome.loss.loss)
+            });
+            if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
+                let done = checkpoint.between_steps(self, outputs.metrics);
+                done.or_else(|error| self.make_space(outputs, error))?;
+            }
+        }
+        self.commit_last(outputs)?;
+        outputs.progress.finish();
+        Ok(())
+    }
+
+    /// A step; where its drive is full, another try once there is space. `None`: asked to stop while waiting for it.
+    fn step_with_space(
+        &mut self,
+        dataset: &Dataset,
+        targets: &TargetCache,
+        outputs: &mut LoopOutputs<'_>,
+    ) -> Result<Option<StepOutcome>, TrainError> {
+        loop {
+            match self.step(dataset, targets) {
+                Ok(outcome) => return Ok(Some(outcome)),
+                Err(error) if error.is_out_of_space() => self.make_space(outputs, error)?,
+                Err(error) => return Err(self.keep_outgrown(error, dataset, outputs)),
+            }
+            if outputs.stop.exit_code().is_some() {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// Stops where rows have statistics that the run never counted: growth would go by numbers that are not so.
+    fn check_statistics(&self, outputs: &LoopOutputs<'_>) -> InputResult<()> {
+        let rows = self.scene.histogram.uncounted();
+        if rows == 0 {
+            return Ok(());
+        }
+        let store = outputs.checkpoint.as_deref().map_or(outputs.out, Checkpoint::folder);
+        let problem = format!("the pages have statistics of {rows} rows that the state of the run has not counted");
+        let remedy = "nothing was committed since: make a store that agrees with itself with gsscale-ckpt salvage, and go on \
+                      with gsscale-train --resume and --spill-dir";
+        Err(InputError::new(store, problem, remedy).at(format!("step {}", self.step)))
+    }
+
+    /// Space after `error`, by the checkpoint where there is one.
+    fn make_space(&mut self, outputs: &mut LoopOutputs<'_>, error: TrainError) -> Result<(), TrainError> {
+        match outputs.checkpoint.as_deref_mut() {
+            Some(checkpoint) => checkpoint.make_space(self, outputs.metrics, outputs.stop, error),
+            None => Err(error),
+        }
+    }
+
+    /// The commit after the last step. Without space for it a run that is done needs none, and one that was asked to stop
+    /// stops.
+    fn commit_last(&mut self, outputs: &mut LoopOutputs<'_>) -> Result<(), TrainError> {
+        let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else { return Ok(()) };
+        match self.step < self.options.steps || checkpoint.wants_last() {
+            true => checkpoint.commit_or_warn(self, outputs.metrics),
+            false => Ok(()),
+        }
+    }
+
+    /// As [`Trainer::save`], of a file that the run does not need: on a full drive it is left out, and said.
+    fn save_if_space(&mut self, dataset: &Dataset, path: &Path) -> Result<(), TrainError> {
+        match self.save(dataset, path) {
+            Err(error) if error.is_out_of_space() => {
+                eprintln!("warning: {} is not written: {error}", path.display());
+                Ok(())
+            }
+            done => done.map(|_| ()),
+        }
+    }
+}
