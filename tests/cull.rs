@@ -19,7 +19,8 @@ use gsscale::scene::image::Target;
 use gsscale::scene::state::SceneState;
 use gsscale::train::catch_up::{evaluate_all, gather, visible_rows};
 use gsscale::train::pages::PagedScene;
-use gsscale::train::step::{WorkingSet, train_step};
+use gsscale::train::step::train_step;
+use gsscale::train::working_set::WorkingSet;
 
 fn rotation(q: [f64; 4]) -> [[f64; 3]; 3] {
     let n = q.iter().map(|x| x * x).sum::<f64>().sqrt();

@@ -135,6 +135,78 @@ fn the_layer_reader_sees_what_it_should() {
     assert_eq!(named_layers(text), ["scene", "optim", "base"]);
 }
 
+/// Rooms whose files form no circle.
+const ROOMS_WITHOUT_CIRCLES: &[&str] = &["config", "train"];
+
+/// Files of a room (a folder in it counts as one) that a file of the room imports, tests left out.
+fn imported_files(room: &str, name: &str, text: &str) -> Vec<String> {
+    let depth = Path::new(name).components().count() - if name.ends_with("/mod.rs") { 1 } else { 0 };
+    // From src/ROOM/file.rs the room is one step up, from src/ROOM/folder/file.rs two.
+    let prefixes = ["super::".repeat(depth.saturating_sub(2)), format!("crate::{room}::")];
+    let code = text.split("#[cfg(test)]").next().unwrap_or("");
+    let mut found = Vec::new();
+    for statement in code.split("use ").skip(1).map(|rest| rest.split(';').next().unwrap_or("")) {
+        let Some(rest) = prefixes.iter().filter(|p| !p.is_empty()).find_map(|p| statement.strip_prefix(p.as_str()))
+        else {
+            continue;
+        };
+        let names = rest.strip_prefix('{').map_or(vec![rest], |list| list.trim_end_matches('}').split(',').collect());
+        let first = |path: &str| path.trim().split("::").next().unwrap_or("").to_string();
+        found.extend(names.into_iter().map(first).filter(|n| n != "super" && !n.is_empty()));
+    }
+    found
+}
+
+/// The files from `at` back to `at`, if there is such a way.
+fn circle_from(at: &str, edges: &BTreeMap<String, Vec<String>>) -> Option<Vec<String>> {
+    let mut ways = vec![vec![at.to_string()]];
+    let mut seen: Vec<String> = Vec::new();
+    while let Some(way) = ways.pop() {
+        for next in edges.get(way.last()?).into_iter().flatten() {
+            let longer = [way.as_slice(), &[next.clone()]].concat();
+            if next == at {
+                return Some(longer);
+            }
+            if !seen.contains(next) {
+                seen.push(next.clone());
+                ways.push(longer);
+            }
+        }
+    }
+    None
+}
+
+#[test]
+fn files_of_a_room_form_no_circle() {
+    for room in ROOMS_WITHOUT_CIRCLES {
+        let mut edges: BTreeMap<String, Vec<String>> = BTreeMap::new();
+        for (name, text) in rust_files(&[&format!("src/{room}")]) {
+            let inside = name.strip_prefix(&format!("src/{room}/")).unwrap();
+            let file = inside.split('/').next().unwrap().trim_end_matches(".rs").to_string();
+            if file == "mod" {
+                continue;
+            }
+            let mut imported = imported_files(room, &name, &text);
+            imported.retain(|other| *other != file);
+            edges.entry(file).or_default().extend(imported);
+        }
+        let circle = edges.keys().find_map(|file| circle_from(file, &edges));
+        assert_eq!(circle, None, "files of {room} import each other in a circle");
+    }
+}
+
+#[test]
+fn the_reader_of_imports_sees_what_it_should() {
+    let text =
+        "use super::a::X;\nuse super::{b, c::Y};\nuse crate::train::d;\n#[cfg(test)]\nmod tests { use super::e::Z; }\n";
+    assert_eq!(imported_files("train", "src/train/f.rs", text), ["a", "b", "c", "d"]);
+    let text = "use super::super::a::X;\nuse super::b::Y;\n";
+    assert_eq!(imported_files("train", "src/train/stores/f.rs", text), ["a"]);
+    let edges = [("a", "b"), ("b", "c"), ("c", "b")].map(|(from, to)| (from.to_string(), vec![to.to_string()]));
+    assert_eq!(circle_from("b", &edges.clone().into()).map(|way| way.len()), Some(3));
+    assert_eq!(circle_from("a", &edges.into()), None);
+}
+
 #[test]
 fn unsafe_stands_only_where_it_is_argued() {
     let mut wrong = Vec::new();
@@ -178,8 +250,9 @@ fn functions_stay_readable() {
         let lines: Vec<&str> = text.lines().collect();
         for (start, line) in lines.iter().enumerate() {
             let code = line.trim_start();
-            let is_function =
-                ["fn ", "pub fn ", "pub(crate) fn ", "pub(super) fn "].iter().any(|p| code.starts_with(p));
+            let is_function = ["fn ", "pub fn ", "pub(crate) fn ", "pub(super) fn ", "pub(in crate::page) fn "]
+                .iter()
+                .any(|p| code.starts_with(p));
             if !is_function || line.ends_with('}') {
                 continue;
             }

@@ -121,6 +121,8 @@ pub(super) fn dataset_changes(dataset: &Dataset, there: &DatasetPrint, here: &Da
                 lines.push(format!("{} more views have {what}", views.len() - LISTED));
             }
         }
+    } else if there.views.is_empty() {
+        lines.push("which photos it was trained on is not known: its state was lost and salvaged".to_string());
     } else {
         lines.push(format!("the dataset had {} views and has {}", there.views.len(), here.views.len()));
     }

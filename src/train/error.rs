@@ -28,8 +28,8 @@ pub enum TrainError {
     Commit(#[from] CommitError),
     /// The drive is full, and nobody freed space in time.
     #[error(
-        "the drive of {folder} is full: it needs {needed} more{stands}\n  remedy: free space on it, then go on with \
-         gsscale-train --resume and the output folder",
+        "the drive of {folder} is full: it needs {needed} more{stands}\n  remedy: free space on it, then go on from the last \
+         commit with gsscale-train --resume and the output folder; a run that committed nothing starts again with --overwrite",
         stands = .last_step.map_or(String::new(), |step| format!("; the commit after step {step} stands"))
     )]
     DriveFull {

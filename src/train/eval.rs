@@ -6,7 +6,7 @@ use super::memory::{check_photos_fit, host_budget};
 use super::pages::PagedScene;
 use super::prepare::ply_warnings;
 use super::report::{ColorCorrected, TestMetrics, json_psnr};
-use super::step::WorkingSet;
+use super::working_set::WorkingSet;
 use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};

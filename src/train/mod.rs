@@ -49,3 +49,4 @@ pub mod trainer;
 pub mod training_loop;
 mod update;
 pub mod whole_file;
+pub mod working_set;

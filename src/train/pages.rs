@@ -9,7 +9,7 @@
 use super::catch_up::{evaluate_all, gather, visible_rows};
 use super::error::TrainError;
 use super::error::not_stored;
-use super::step::WorkingSet;
+use super::working_set::WorkingSet;
 use crate::base::ids::{PageId, PageNo};
 use crate::base::room;
 use crate::config::limits::RunOptions;

@@ -9,29 +9,10 @@ use super::catch_up::{gather, visible_rows};
 use super::error::TrainError;
 use super::pages::{PagedScene, numbered};
 use super::update::{StepGradients, update_pages};
-use crate::render::{Gradients, LossOptions, LossValue, RenderOptions, Renderer};
+use super::working_set::WorkingSet;
+use crate::render::{LossOptions, LossValue, RenderOptions, Renderer};
 use crate::scene::camera::Camera;
-use crate::scene::columns::Columns;
 use crate::scene::image::Target;
-
-/// The rows that a view needs, evaluated at its step, and their gradients; kept between steps for its allocations.
-#[derive(Default)]
-pub struct WorkingSet {
-    /// Row of the pinned pages, numbered through, for each row of the working set, ascending.
-    pub row_from_working: Vec<u32>,
-    /// Values now; the renderer reads them, and the update goes on from them.
-    pub columns: Columns,
-    /// Gradients of the step.
-    pub gradients: Gradients,
-}
-
-impl WorkingSet {
-    /// Bytes held.
-    pub fn bytes(&self) -> usize {
-        let columns = self.columns.bytes() + self.gradients.columns.bytes();
-        self.row_from_working.capacity() * 4 + columns + self.gradients.means2d.capacity() * 16
-    }
-}
 
 /// What a step did.
 #[derive(Debug, Clone, Copy, Default)]

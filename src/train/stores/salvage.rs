@@ -347,9 +347,9 @@ fn without_state(place: &StorePlace, mut source: Source, request: &SalvageReques
     state.histogram = histogram.filled();
     commit(copy, &state, &source)?;
     source.notes.push(format!(
-        "the trainer's state is lost: export the scene (gsscale-ckpt export {} --out FILE.ply) and start from it with \
-         gsscale-train --init-ply FILE.ply",
-        request.to.display()
+        "the trainer's state is lost. To train on from the step of its newest row: gsscale-train --resume OUT --spill-dir {to} \
+         --accept-changes. To keep the scene alone: gsscale-ckpt export {to} --out FILE.ply",
+        to = request.to.display()
     ));
     let (pages, to) = (kept.len() as u64, request.to.clone());
     Ok(Salvaged { to, has_state: false, step, gaussians: rows, pages, lost, notes: source.notes })
