@@ -24,12 +24,13 @@ use gsscale::render::gpu::GpuRenderer;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::image::Target;
 use gsscale::train::pages::PagedScene;
-use gsscale::train::step::{WorkingSet, train_step};
+use gsscale::train::step::train_step;
+use gsscale::train::working_set::WorkingSet;
 use serde_json::{Map, json};
 use std::time::Instant;
 use support::cases::{Case, PHOTO_CASES, photo_case, terrain_case};
 use support::device_bytes::{Counts, stage_bytes};
-use support::{Args, Hash, Seconds, machine, time};
+use support::{Args, Hash, Seconds, checked, machine, time};
 
 /// Views of a round.
 const VIEWS: usize = 8;
@@ -81,11 +82,6 @@ pub fn tiny() -> Option<u64> {
     let timed = renderer.gpu().summary().timestamps;
     assert!(!timed || stages.iter().any(|s| s.name == "rasterize_bwd" && s.seconds > 0.0 && s.floor > 0.0));
     Some(run.hash)
-}
-
-/// A result of the device, without which there is nothing to measure.
-fn checked<T>(result: GpuResult<T>) -> T {
-    result.unwrap_or_else(|error| panic!("{error}"))
 }
 
 /// Bytes read and written a second by copies from buffer to buffer: the best of some runs.

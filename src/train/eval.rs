@@ -3,8 +3,8 @@
 use super::machine;
 use super::pages::PagedScene;
 use super::report::{ColorCorrected, TestMetrics, json_psnr};
-use super::step::WorkingSet;
 use super::trainer::TrainError;
+use super::working_set::WorkingSet;
 use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
@@ -56,7 +56,7 @@ pub fn evaluate(
         let target = targets.get(view)?;
         let camera = &dataset.views[view].camera;
         scene.gather_view(camera, now, working)?;
-        renderer.forward(&working.columns, camera, options)?;
+        renderer.draw(&working.columns, camera, options)?;
         let image = renderer.image()?;
         if target.counts() {
             psnrs.push(json_psnr(psnr(image, &target)));

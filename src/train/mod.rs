@@ -9,6 +9,7 @@
 //! (`gaussian_pages` those of a file of any size), [`first_look`] looks at them for a plan, [`out_folder`] is where results go, [`page_map`] draws where pages lie,
 //! [`stores`] is what tools do with checkpoints.
 
+pub mod batch;
 pub mod budget;
 pub mod catch_up;
 mod changes;
@@ -39,3 +40,4 @@ pub mod stores;
 pub mod tiers;
 pub mod trainer;
 mod update;
+pub mod working_set;

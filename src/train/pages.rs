@@ -8,8 +8,8 @@
 
 use super::catch_up::{evaluate_all, gather, visible_rows};
 use super::start::not_stored;
-use super::step::WorkingSet;
 use super::trainer::TrainError;
+use super::working_set::WorkingSet;
 use crate::base::ids::{PageId, PageNo};
 use crate::base::room;
 use crate::config::limits::RunOptions;
