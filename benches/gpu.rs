@@ -30,7 +30,7 @@ use serde_json::{Map, json};
 use std::time::Instant;
 use support::cases::{Case, PHOTO_CASES, photo_case, terrain_case};
 use support::device_bytes::{Counts, stage_bytes};
-use support::{Args, Hash, Seconds, machine, time};
+use support::{Args, Hash, Seconds, checked, machine, time};
 
 /// Views of a round.
 const VIEWS: usize = 8;
@@ -82,11 +82,6 @@ pub fn tiny() -> Option<u64> {
     let timed = renderer.gpu().summary().timestamps;
     assert!(!timed || stages.iter().any(|s| s.name == "rasterize_bwd" && s.seconds > 0.0 && s.floor > 0.0));
     Some(run.hash)
-}
-
-/// A result of the device, without which there is nothing to measure.
-fn checked<T>(result: GpuResult<T>) -> T {
-    result.unwrap_or_else(|error| panic!("{error}"))
 }
 
 /// Bytes read and written a second by copies from buffer to buffer: the best of some runs.

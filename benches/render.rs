@@ -21,11 +21,11 @@ use gsscale::kernels::rasterize_fwd::{Lists, Raster, TILE_PIXELS, rasterize_fwd}
 use gsscale::kernels::splats::{Grid, Splat};
 use gsscale::kernels::stages::STAGES;
 use gsscale::render::cpu::CpuRenderer;
-use gsscale::render::{Gradients, RenderOptions};
+use gsscale::render::{Gradients, RenderOptions, Renderer};
 use std::sync::atomic::AtomicU64;
 use std::time::Duration;
 use support::floor::bare_blend_rate;
-use support::{Args, Hash, machine, steady_time, terrain};
+use support::{Args, Hash, checked, machine, steady_time, terrain};
 
 fn main() {
     let args = Args::read();
@@ -127,12 +127,13 @@ fn measure(n: usize, width: u32, height: u32, simd: SimdPath, floor: f64, least:
     let mut grads = Gradients::default();
     let mut stages = [("", f64::INFINITY); STAGES.len()];
     let forward = steady_time(least, || {
-        renderer.forward(&rows, &camera, &options);
+        checked(renderer.draw(&rows, &camera, &options));
         note_stages(&renderer, &mut stages);
     });
-    let v_rgb: Vec<f32> = renderer.image().rgb.iter().map(|x| x - 0.5).collect();
+    let v_rgb: Vec<f32> = checked(renderer.image()).rgb.iter().map(|x| x - 0.5).collect();
+    checked(renderer.picture_gradient()).v_rgb.copy_from_slice(&v_rgb);
     let backward = steady_time(least, || {
-        renderer.backward(&rows, &v_rgb, None, &mut grads);
+        checked(renderer.backpropagate(&rows, &mut grads));
         note_stages(&renderer, &mut stages);
     });
     let stats = renderer.stats();

@@ -23,7 +23,7 @@ use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::cpu::CpuRenderer;
-use gsscale::render::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
+use gsscale::render::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Columns, row_width};
 use gsscale::scene::image::{Image, Target};
@@ -286,12 +286,12 @@ impl StepResult {
     }
 }
 
-/// The CPU renderer with a note of when its parts begin and end.
+/// The CPU renderer with a note of when its stages begin and end.
 #[derive(Default)]
 struct Watched {
     inner: CpuRenderer,
     begin: Option<Instant>,
-    backward_done: Option<Instant>,
+    rows_out: Option<Instant>,
     parts: Vec<(&'static str, f64)>,
 }
 
@@ -305,10 +305,10 @@ impl Watched {
 
     /// The step has ended: what came after the renderer is the optimizer's.
     fn note_end(&mut self) {
-        let optimizer = self.backward_done.map_or(0.0, |t| t.elapsed().as_secs_f64());
+        let optimizer = self.rows_out.map_or(0.0, |t| t.elapsed().as_secs_f64());
         let stages: Vec<(&'static str, f64)> = self.inner.stage_seconds().collect();
         for (name, seconds) in stages {
-            if seconds > 0.0 && name != "image_loss" {
+            if seconds > 0.0 {
                 self.add(name, seconds);
             }
         }
@@ -325,31 +325,47 @@ impl Renderer for Watched {
         self.inner.host_bytes()
     }
 
-    fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
+    fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: usize) -> Result<(), RenderError> {
         let before = self.begin.map_or(0.0, |t| t.elapsed().as_secs_f64());
         self.add("acquire+cull+gather", before);
-        Renderer::forward(&mut self.inner, rows, camera, options)
+        self.inner.begin_view(camera, options, batches)
+    }
+
+    fn rows_in(&mut self, rows: &Columns) -> Result<(), RenderError> {
+        self.inner.rows_in(rows)
+    }
+
+    fn picture(&mut self) -> Result<(), RenderError> {
+        self.inner.picture()
     }
 
     fn image(&mut self) -> Result<&Image, RenderError> {
-        Renderer::image(&mut self.inner)
+        self.inner.image()
     }
 
-    fn loss_backward(
-        &mut self,
-        rows: &Columns,
-        target: &Target,
-        options: &LossOptions,
-        grads: &mut Gradients,
-    ) -> Result<LossValue, RenderError> {
-        let start = Instant::now();
-        let value = self.inner.loss_backward(rows, target, options, grads);
-        let whole = start.elapsed().as_secs_f64();
-        // The stages of the backward pass have their own clocks; what is left is the loss, and copying two columns.
-        let names = ["rasterize_bwd", "sh_bwd", "project_bwd"];
-        let stages: f64 = self.inner.stage_seconds().filter(|(n, _)| names.contains(n)).map(|(_, s)| s).sum();
-        self.add("image_loss", (whole - stages).max(0.0));
-        self.backward_done = Some(Instant::now());
-        value
+    fn picture_mut(&mut self) -> Result<&mut [f32], RenderError> {
+        self.inner.picture_mut()
+    }
+
+    fn loss(&mut self, target: &Target, options: &LossOptions) -> Result<(), RenderError> {
+        self.inner.loss(target, options)
+    }
+
+    fn picture_gradient(&mut self) -> Result<&mut PictureGradient, RenderError> {
+        self.inner.picture_gradient()
+    }
+
+    fn picture_back(&mut self) -> Result<(), RenderError> {
+        self.inner.picture_back()
+    }
+
+    fn rows_out(&mut self, batch: usize, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError> {
+        let done = self.inner.rows_out(batch, rows, grads);
+        self.rows_out = Some(Instant::now());
+        done
+    }
+
+    fn loss_value(&mut self) -> Result<LossValue, RenderError> {
+        self.inner.loss_value()
     }
 }

@@ -17,6 +17,11 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::Columns;
 use std::time::{Duration, Instant};
 
+/// A result without which there is nothing to measure.
+pub fn checked<T, E: std::fmt::Display>(result: Result<T, E>) -> T {
+    result.unwrap_or_else(|error| panic!("{error}"))
+}
+
 /// What was asked for on the command line.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Args {

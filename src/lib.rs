@@ -27,7 +27,7 @@
 //! | [`checkpoint`] | the state of a run beside its pages, as bytes; how often a run is committed |
 //! | [`gpu`] | a device and its memory, shaders, recording of work; knows no Gaussians |
 //! | [`kernels`] | the ordered table of stages and each stage as a function on plain slices |
-//! | [`render`] | the stages in order: forward, loss, backward; image metrics |
+//! | [`render`] | the stages in order, on the CPU or a device: rows in, picture, loss, picture back, rows out; image metrics |
 //! | [`optim`] | learning rates as a function of the step; dense Adam (oracle) and deferred Adam |
 //! | [`densify`] | statistics, decisions and edits that change the number of Gaussians |
 //! | [`exchange`] | PLY in and out; what TensorBoard reads |
@@ -39,7 +39,7 @@
 //!
 //! One word, one thing: a *row* is one Gaussian inside a working set, a *column* one attribute of all of them, a
 //! *view* a photo with its pose, a *target* its pixels, a *tile* 16x16 pixels, a *stage* one kernel of the pipeline,
-//! a *step* one optimizer iteration, an *event* one global change that every row applies. A *page* is a group of rows that
+//! a *batch* the part of a view's rows that a renderer takes in at once, a *step* one optimizer iteration, an *event* one global change that every row applies. A *page* is a group of rows that
 //! travel together, a *slot* its place on disk, a *frame* its place in memory, a *plan* which pages coming steps need.
 
 pub mod base;

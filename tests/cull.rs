@@ -12,6 +12,7 @@ use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
 use gsscale::paging::error::PagingError;
 use gsscale::paging::pager::{Pager, PagerConfig};
+use gsscale::render::Renderer;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
@@ -141,7 +142,7 @@ fn no_row_that_the_projection_kernel_draws_is_left_out() {
     for now in 12..212 {
         let camera = camera(&mut draws);
         visible_rows(&[state.view()], &adam, now, &camera, &mut out);
-        project_fwd(&evaluate_all(&[state.view()], 0, &adam, now), &camera, EPS2D, simd, &mut projected);
+        project_fwd(&evaluate_all(&[state.view()], 0, &adam, now), &camera, EPS2D, simd, 0, &mut projected);
         for (row, radii) in projected.radii.iter().enumerate().filter(|(_, r)| **r != [0, 0]) {
             drawn += 1;
             assert!(out.binary_search(&(row as u32)).is_ok(), "row {row} with radii {radii:?} is missing");
@@ -187,8 +188,8 @@ fn no_row_outside_of_the_selected_pages_changes_a_picture() {
         pages.gather_view(&camera, STEPS, &mut working).unwrap();
         left_out += all.rows() - working.columns.rows();
         let [of_view, of_all] = [&working.columns, &all].map(|rows| {
-            renderer.forward(rows, &camera, &options.render);
-            renderer.image().rgb.clone()
+            renderer.draw(rows, &camera, &options.render).unwrap();
+            renderer.image().unwrap().rgb.clone()
         });
         drawn += usize::from(of_all.iter().any(|&x| x != 0.0));
         assert!(of_view.iter().zip(&of_all).all(|(a, b)| a.to_bits() == b.to_bits()), "view {view}: {camera:?}");

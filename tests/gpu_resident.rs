@@ -60,8 +60,10 @@ fn views_whose_counts_are_all_new_leave_no_memory_behind() {
             before = resident();
         }
         let rows = rows(ROWS - 7 * view);
-        renderer.forward(&rows, &camera, &RenderOptions::default()).unwrap();
-        renderer.loss_backward(&rows, &target, &loss, &mut grads).unwrap();
+        renderer.draw(&rows, &camera, &RenderOptions::default()).unwrap();
+        renderer.loss(&target, &loss).unwrap();
+        renderer.backpropagate(&rows, &mut grads).unwrap();
+        assert!(renderer.loss_value().unwrap().loss > 0.0);
     }
     let (Some(before), Some(after)) = (before, resident()) else {
         println!("SKIPPED: this system does not tell resident memory");

@@ -269,6 +269,16 @@ fn wrong_bindings_and_copies_are_errors_that_name_them() {
     let (one, two) = (gpu.begin("one"), gpu.begin("two"));
     assert!(gpu.submit(one).unwrap_err().to_string().contains("two recorders"));
     gpu.submit(two).unwrap();
+    // What is set aside counts as open, until it is submitted or given up.
+    let mut recorder = gpu.begin("three");
+    recorder.upload(&a.view(), &[7u32; 4]).unwrap();
+    let recording = recorder.set_aside();
+    assert!(gpu.submit(gpu.begin("four")).unwrap_err().to_string().contains("two recorders"));
+    let mut recorder = gpu.resume(recording);
+    let sevens = recorder.read_back("three", &a.slice(0, 16)).unwrap();
+    gpu.submit(recorder).unwrap();
+    assert_eq!(sevens.to_vec::<u32>(&gpu).unwrap(), [7; 4]);
+    drop(gpu.begin("five").set_aside());
     assert_eq!(run_add(&gpu, &[1, 2], 1, &[]).unwrap(), [2, 3], "the device is as good as before");
 }
 

@@ -16,7 +16,7 @@ use gsscale::kernels::project_fwd::{Projected, project_fwd};
 use gsscale::kernels::sh_bwd::sh_bwd;
 use gsscale::kernels::sh_fwd::sh_fwd;
 use gsscale::render::cpu::CpuRenderer;
-use gsscale::render::{Gradients, RenderOptions};
+use gsscale::render::{Gradients, PictureGradient, RenderOptions, Renderer};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use support::Fixture;
@@ -180,7 +180,8 @@ fn check_pipeline(recipe: &Recipe) -> Render64 {
     let v_rgb: Vec<f32> = (0..3 * pixels).map(|_| rng.normal() as f32).collect();
     let v_alpha: Vec<f32> = (0..pixels).map(|_| rng.normal() as f32).collect();
     let mut renderer = CpuRenderer::new();
-    let image = renderer.forward(&rows, &camera, &options);
+    renderer.draw(&rows, &camera, &options).unwrap();
+    let image = renderer.image().unwrap();
     for (i, rgb) in picture.rgb.iter().enumerate() {
         for c in 0..3 {
             // f32 sums of some ten contributions of size 1.
@@ -188,7 +189,9 @@ fn check_pipeline(recipe: &Recipe) -> Render64 {
         }
     }
     let mut grads = Gradients::default();
-    renderer.backward(&rows, &v_rgb, Some(&v_alpha), &mut grads);
+    let gradient = PictureGradient { v_rgb: v_rgb.clone(), v_alpha: Some(v_alpha.clone()) };
+    *renderer.picture_gradient().unwrap() = gradient;
+    renderer.backpropagate(&rows, &mut grads).unwrap();
     let loss = |rows: &Rows64| -> f64 {
         let picture = render(rows, &camera, &settings);
         let of_pixel = |i: usize| {
@@ -221,10 +224,11 @@ fn projection_and_colours_have_the_gradients_of_finite_differences() {
     let (rows, _) = FAINT.scene();
     let (camera, settings, simd) = (camera(), FAINT.settings(), SimdPath::best());
     let (n, degree) = (rows.rows(), FAINT.sh_degree);
-    let (mut projected, mut colors) = (Projected::default(), Vec::new());
-    project_fwd(&rows, &camera, 0.3, simd, &mut projected);
-    sh_fwd(&rows, &camera, degree, &projected, simd, &mut colors);
-    assert!(projected.radii.iter().all(|r| *r != [0, 0]), "every row is drawn");
+    let (mut projected, mut colors) = (Projected::default(), vec![[0.0; 3]; n]);
+    project_fwd(&rows, &camera, 0.3, simd, 0, &mut projected);
+    let radii = &projected.radii;
+    sh_fwd(&rows, &camera, degree, radii, simd, &mut colors);
+    assert!(radii.iter().all(|r| *r != [0, 0]), "every row is drawn");
     let mut rng = Stream::new(78, Purpose::Test, 3, 0);
     let mut draw = || rng.normal() as f32;
     let v_means2d: Vec<[f32; 2]> = (0..n).map(|_| std::array::from_fn(|_| draw())).collect();
@@ -233,8 +237,8 @@ fn projection_and_colours_have_the_gradients_of_finite_differences() {
     let v_colors: Vec<[f32; 3]> = (0..n).map(|_| std::array::from_fn(|_| 10.0 * draw())).collect();
     let v_opacities: Vec<f32> = (0..n).map(|_| draw()).collect();
     let mut grads = Columns::default();
-    sh_bwd(&rows, &camera, degree, &projected, &colors, &v_colors, simd, &mut grads);
-    project_bwd(&rows, &camera, 0.3, &projected, &v_means2d, &v_conics, &v_opacities, simd, &mut grads);
+    sh_bwd(&rows, &camera, degree, radii, &colors, &v_colors, simd, &mut grads);
+    project_bwd(&rows, &camera, 0.3, radii, &v_means2d, &v_conics, &v_opacities, simd, &mut grads);
     let weigh = |v: &[f32], x: &[f64]| v.iter().zip(x).map(|(v, x)| f64::from(*v) * x).sum::<f64>();
     let loss = |rows: &Rows64| -> f64 {
         let of_row = |r: usize| {

@@ -1,12 +1,12 @@
 //! The scenes that whole steps are measured on: photos beside which peers were measured, and a made-up terrain.
 //! Measures nothing itself.
 
-use super::terrain;
+use super::{checked, terrain};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::config::file::TrainConfig;
 use gsscale::dataset::photo::decode;
-use gsscale::render::RenderOptions;
 use gsscale::render::cpu::CpuRenderer;
+use gsscale::render::{RenderOptions, Renderer};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::Columns;
 use gsscale::scene::image::Target;
@@ -129,8 +129,8 @@ pub fn terrain_case(n: usize, width: u32, height: u32, views: usize) -> Case {
         let turn = i as f32 * 2.4;
         camera.viewmat[0][3] = 0.4 * turn.cos();
         camera.viewmat[2][3] += 0.4 * turn.sin();
-        let image = renderer.forward(&columns, &camera, &RenderOptions::default());
-        (camera, Target { width, height, rgb: image.to_rgb8(), mask: None })
+        checked(renderer.draw(&columns, &camera, &RenderOptions::default()));
+        (camera, Target { width, height, rgb: checked(renderer.image()).to_rgb8(), mask: None })
     });
     let views = views.collect();
     let mut draws = Stream::new(2, Purpose::Test, n as u64, 0);

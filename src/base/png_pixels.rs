@@ -47,6 +47,8 @@ impl<R: BufRead> PixelChunks<R> {
         while self.passed == self.filled && self.left == 0 {
             (self.passed, self.filled) = (0, read_up_to(&mut self.inner, &mut self.head)?);
             if self.filled < self.head.len() {
+                // Cut short within a head: which chunk it begins is not known.
+                (self.passed, self.filled) = (0, 0);
                 return Ok(());
             }
             let [a, b, c, d, kind @ ..] = self.head;

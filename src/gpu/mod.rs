@@ -20,7 +20,7 @@
 //! 3. Counts come from uniforms or buffers, never from `arrayLength`: a view of an empty buffer still spans some bytes.
 //! 4. No workgroup waits for another one; no invocation loops more than 65,535 times in total.
 //! 5. Contents of a fresh buffer are arbitrary (it may be recycled): [`Recorder::clear`] where zeros are needed.
-//! 6. One recorder at a time: its commands and its recycled buffers are in one order only then.
+//! 6. One recorder at a time, set aside or not: its commands and its recycled buffers are in one order only then.
 
 mod belt;
 mod buffers;
@@ -41,7 +41,7 @@ pub use injected::{FaultKind, InjectedFault};
 pub use layout::StructLayout;
 pub use profile::StageTime;
 pub use readback::Readback;
-pub use record::{Recorder, Submission, groups_1d};
+pub use record::{Recorder, Recording, Submission, groups_1d};
 pub use shader::{
     Binding, BindingKind, Defines, Pipeline, Reflection, Source, preprocess, reflect, validate, variants,
 };

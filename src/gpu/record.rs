@@ -4,7 +4,8 @@
 //! is submitted after an error; (2) commands run in the order recorded, also across submissions; (3) uploads beyond one
 //! staging set submit what is recorded so far and go on.
 
-use std::sync::atomic::Ordering;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use super::belt::SET_BYTES;
 use super::buffers::{Buffer, BufferView};
@@ -66,34 +67,54 @@ pub struct Submission {
     name: &'static str,
 }
 
-/// Work being recorded.
-pub struct Recorder<'g> {
-    gpu: &'g Gpu,
+/// Counts a recording as open as long as it lives.
+#[derive(Debug)]
+struct Open(Arc<AtomicU32>);
+
+impl Open {
+    fn new(recorders: &Arc<AtomicU32>) -> Open {
+        recorders.fetch_add(1, Ordering::Relaxed);
+        Open(Arc::clone(recorders))
+    }
+}
+
+impl Drop for Open {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+/// What a recorder has recorded and not submitted, set aside between two calls of its owner; [`Gpu::resume`] goes on
+/// with it. Until then it counts as an open recorder: no other one can be submitted.
+#[derive(Debug)]
+#[must_use]
+pub struct Recording {
     name: &'static str,
     encoder: wgpu::CommandEncoder,
     pass: Option<(wgpu::ComputePass<'static>, &'static str)>,
     uniforms: Vec<Vec<u8>>,
     readbacks: Vec<PendingMap>,
+    _open: Open,
 }
 
-impl Drop for Recorder<'_> {
-    fn drop(&mut self) {
-        self.gpu.recorders.fetch_sub(1, Ordering::Relaxed);
-    }
+/// Work being recorded.
+pub struct Recorder<'g> {
+    gpu: &'g Gpu,
+    work: Recording,
 }
 
 impl Gpu {
     /// Begins to record; `name` appears in errors that no stage can be blamed for.
     pub fn begin(&self, name: &'static str) -> Recorder<'_> {
-        self.recorders.fetch_add(1, Ordering::Relaxed);
-        Recorder {
-            gpu: self,
-            name,
-            encoder: new_encoder(&self.device, name),
-            pass: None,
-            uniforms: Vec::new(),
-            readbacks: Vec::new(),
-        }
+        let encoder = new_encoder(&self.device, name);
+        let (uniforms, readbacks) = (Vec::new(), Vec::new());
+        let work = Recording { name, encoder, pass: None, uniforms, readbacks, _open: Open::new(&self.recorders) };
+        Recorder { gpu: self, work }
+    }
+
+    /// Goes on with a recording that was begun on this device and set aside.
+    pub fn resume(&self, recording: Recording) -> Recorder<'_> {
+        Recorder { gpu: self, work: recording }
     }
 
     /// Submits; does not wait, unless [`super::GpuOptions::serial`] asks for it.
@@ -103,7 +124,7 @@ impl Gpu {
     pub fn submit(&self, mut recorder: Recorder<'_>) -> GpuResult<Submission> {
         if self.recorders.load(Ordering::Relaxed) > 1 {
             let problem = "two recorders are open at once".into();
-            return Err(GpuError::Bindings { stage: recorder.name.into(), problem });
+            return Err(GpuError::Bindings { stage: recorder.work.name.into(), problem });
         }
         let submission = recorder.flush()?;
         if self.serial {
@@ -131,6 +152,11 @@ fn new_encoder(device: &wgpu::Device, name: &'static str) -> wgpu::CommandEncode
 }
 
 impl Recorder<'_> {
+    /// Sets the work aside without submitting it.
+    pub fn set_aside(self) -> Recording {
+        self.work
+    }
+
     /// A uniform struct for dispatches of this recorder: what binding 0 expects.
     ///
     /// # Errors
@@ -141,14 +167,14 @@ impl Recorder<'_> {
         let alignment = ring.alignment;
         let fits =
             |chunk: &Vec<u8>| (chunk.len() as u64).next_multiple_of(alignment) + bytes.len() as u64 <= UNIFORM_CHUNK;
-        if !self.uniforms.last().is_some_and(fits) {
-            self.uniforms.push(Vec::new());
+        if !self.work.uniforms.last().is_some_and(fits) {
+            self.work.uniforms.push(Vec::new());
         }
-        let index = self.uniforms.len() - 1;
+        let index = self.work.uniforms.len() - 1;
         let raw = ring.chunk(&self.gpu.device, index);
         drop(ring);
         self.gpu.faults.check()?;
-        let chunk = &mut self.uniforms[index];
+        let chunk = &mut self.work.uniforms[index];
         let offset = (chunk.len() as u64).next_multiple_of(alignment);
         chunk.resize(usize::try_from(offset).unwrap_or(chunk.len()), 0);
         chunk.extend_from_slice(bytes);
@@ -199,13 +225,13 @@ impl Recorder<'_> {
     }
 
     fn upload_words(&mut self, view: &BufferView, mut at: u64, mut bytes: &[u8]) -> GpuResult<()> {
-        self.pass = None;
+        self.work.pass = None;
         self.gpu.faults.doing(view.label);
         self.gpu.uploaded.fetch_add(bytes.len() as u64, Ordering::Relaxed);
         while !bytes.is_empty() {
             let mut belt = lock(&self.gpu.belt);
             let (device, faults) = (&self.gpu.device, &self.gpu.faults);
-            let done = belt.write(device, faults, &mut self.encoder, &view.raw, view.offset + at, bytes)?;
+            let done = belt.write(device, faults, &mut self.work.encoder, &view.raw, view.offset + at, bytes)?;
             drop(belt);
             bytes = &bytes[done..];
             at += done as u64;
@@ -222,9 +248,9 @@ impl Recorder<'_> {
     /// The view does not lie on multiples of 4 bytes.
     pub fn clear(&mut self, view: &BufferView) -> GpuResult<()> {
         self.check_copy("clear", view, view.size)?;
-        self.pass = None;
+        self.work.pass = None;
         self.gpu.faults.doing(view.label);
-        self.encoder.clear_buffer(&view.raw, view.offset, Some(view.size));
+        self.work.encoder.clear_buffer(&view.raw, view.offset, Some(view.size));
         Ok(())
     }
 
@@ -237,11 +263,11 @@ impl Recorder<'_> {
         self.check_copy("copy", to, from.size)?;
         if from.raw == to.raw {
             let problem = format!("a copy of {} within one buffer", from.label);
-            return Err(GpuError::Bindings { stage: self.name.into(), problem });
+            return Err(GpuError::Bindings { stage: self.work.name.into(), problem });
         }
-        self.pass = None;
+        self.work.pass = None;
         self.gpu.faults.doing(to.label);
-        self.encoder.copy_buffer_to_buffer(&from.raw, from.offset, &to.raw, to.offset, from.size);
+        self.work.encoder.copy_buffer_to_buffer(&from.raw, from.offset, &to.raw, to.offset, from.size);
         Ok(())
     }
 
@@ -251,10 +277,10 @@ impl Recorder<'_> {
     /// The view does not lie on multiples of 4 bytes, or there is no memory for staging.
     pub fn read_back(&mut self, stage: &'static str, view: &BufferView) -> GpuResult<Readback> {
         self.check_copy("read_back", view, view.size)?;
-        self.pass = None;
+        self.work.pass = None;
         self.gpu.faults.doing(stage);
-        let (readback, pending) = Readback::record(self.gpu, &mut self.encoder, stage, view)?;
-        self.readbacks.push(pending);
+        let (readback, pending) = Readback::record(self.gpu, &mut self.work.encoder, stage, view)?;
+        self.work.readbacks.push(pending);
         Ok(readback)
     }
 
@@ -326,15 +352,15 @@ impl Recorder<'_> {
         });
         self.gpu.faults.check()?;
         let mut profiler = lock(&self.gpu.profiler);
-        let reusable = self.pass.take_if(|(_, of)| !profiler.is_on() || *of == stage);
+        let reusable = self.work.pass.take_if(|(_, of)| !profiler.is_on() || *of == stage);
         let pass = match reusable {
             Some((pass, _)) => pass,
             None => {
-                self.pass = None; // ends the pass of the stage before
-                profiler.begin_pass(&mut self.encoder, stage)
+                self.work.pass = None; // ends the pass of the stage before
+                profiler.begin_pass(&mut self.work.encoder, stage)
             }
         };
-        let (pass, _) = self.pass.insert((pass, stage));
+        let (pass, _) = self.work.pass.insert((pass, stage));
         pass.set_pipeline(&pipeline.raw);
         pass.set_bind_group(0, &group, &[]);
         Ok(pass)
@@ -390,7 +416,7 @@ impl Recorder<'_> {
         } else {
             return Ok(());
         };
-        Err(GpuError::Bindings { stage: self.name.into(), problem })
+        Err(GpuError::Bindings { stage: self.work.name.into(), problem })
     }
 
     /// Lets the fault happen that is planned for this submission, if one is.
@@ -400,7 +426,7 @@ impl Recorder<'_> {
             Some(FaultKind::Lost) => self.gpu.device.destroy(),
             Some(FaultKind::Validation) => {
                 let raw = lock(&self.gpu.uniforms).chunk(&self.gpu.device, 0);
-                self.encoder.clear_buffer(&raw, 0, Some(2 * UNIFORM_CHUNK)); // beyond its end
+                self.work.encoder.clear_buffer(&raw, 0, Some(2 * UNIFORM_CHUNK)); // beyond its end
             }
             Some(FaultKind::OutOfMemory) => {
                 self.gpu.faults.report(&wgpu::Error::OutOfMemory { source: "a fault on purpose".into() });
@@ -425,18 +451,18 @@ impl Recorder<'_> {
     /// Submits what is recorded so far and goes on with an empty encoder.
     fn flush(&mut self) -> GpuResult<Submission> {
         let gpu = self.gpu;
-        self.pass = None;
+        self.work.pass = None;
         let mut profiler = lock(&gpu.profiler);
-        let stamps = profiler.resolve(gpu, &mut self.encoder)?;
+        let stamps = profiler.resolve(gpu, &mut self.work.encoder)?;
         drop(profiler);
-        self.readbacks.extend(stamps);
-        gpu.faults.doing(self.name);
+        self.work.readbacks.extend(stamps);
+        gpu.faults.doing(self.work.name);
         self.strike();
-        let encoder = std::mem::replace(&mut self.encoder, new_encoder(&gpu.device, self.name));
+        let encoder = std::mem::replace(&mut self.work.encoder, new_encoder(&gpu.device, self.work.name));
         let commands = encoder.finish();
         gpu.faults.check()?;
         let mut ring = lock(&gpu.uniforms);
-        for (index, bytes) in self.uniforms.drain(..).enumerate() {
+        for (index, bytes) in self.work.uniforms.drain(..).enumerate() {
             gpu.uploaded.fetch_add(bytes.len() as u64, Ordering::Relaxed);
             gpu.queue.write_buffer(&ring.chunk(&gpu.device, index), 0, &bytes);
         }
@@ -446,15 +472,15 @@ impl Recorder<'_> {
         let index = gpu.queue.submit([commands]);
         belt.submitted(&index);
         drop(belt);
-        for pending in self.readbacks.drain(..) {
+        for pending in self.work.readbacks.drain(..) {
             pending.start(&index);
         }
         // Without a poll the loss of the device would go unnoticed: a submission to it is silently dropped.
         let polled = gpu.device.poll(wgpu::PollType::Poll);
         gpu.faults.check()?;
-        polled.map_err(|e| GpuError::Validation { stage: self.name.into(), message: e.to_string() })?;
+        polled.map_err(|e| GpuError::Validation { stage: self.work.name.into(), message: e.to_string() })?;
         lock(&gpu.profiler).collect(gpu, 4)?;
-        Ok(Submission { index, name: self.name })
+        Ok(Submission { index, name: self.work.name })
     }
 }
 

@@ -21,7 +21,7 @@
 use crate::base::math::exp32;
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use crate::kernels::lanes::{ROWS_PER_CHUNK, block_of, block_of_mut, chunk_of, gather, lane, scatter, set_lane};
-use crate::kernels::project_fwd::{Geometry, Projected, StoredChunk, View, geometry};
+use crate::kernels::project_fwd::{Geometry, StoredChunk, View, geometry};
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use rayon::prelude::*;
@@ -109,12 +109,12 @@ pub fn sigmoid_slope(logit: f32) -> f32 {
 /// log-scales) and `grads.opacities` (to the logits).
 ///
 /// `v_means2d`, `v_conics` (see [`geometry_vjp`]) and `v_opacities` (with respect to the activated opacity) hold one
-/// entry per row; those of culled rows are not used. `grads` is resized to the rows.
+/// entry per row; those of culled rows, whose `radii` are [0, 0], are not used. `grads` is resized to the rows.
 pub fn project_bwd(
     rows: &Columns,
     camera: &Camera,
     eps2d: f32,
-    projected: &Projected,
+    radii: &[[u32; 2]],
     v_means2d: &[[f32; 2]],
     v_conics: &[[f32; 3]],
     v_opacities: &[f32],
@@ -122,7 +122,7 @@ pub fn project_bwd(
     grads: &mut Columns,
 ) {
     let n = rows.rows();
-    assert_eq!([projected.rows(), v_means2d.len(), v_conics.len(), v_opacities.len()], [n; 4], "one entry per row");
+    assert_eq!([radii.len(), v_means2d.len(), v_conics.len(), v_opacities.len()], [n; 4], "one entry per row");
     grads.sh_degree = rows.sh_degree;
     grads.resize(n);
     let view = View::new(camera, eps2d);
@@ -137,7 +137,7 @@ pub fn project_bwd(
                 ProjectBwdChunk {
                     view: &view,
                     stored: StoredChunk::new(rows, chunk),
-                    radii: chunk_of(&projected.radii, chunk, 1),
+                    radii: chunk_of(radii, chunk, 1),
                     v_means2d: chunk_of(v_means2d, chunk, 1),
                     v_conics: chunk_of(v_conics, chunk, 1),
                     v_opacities: chunk_of(v_opacities, chunk, 1),

@@ -277,15 +277,16 @@ pub fn footprint(view: &View, g: &Geometry, opacity: f32) -> Footprint {
     }
 }
 
-/// Projects every row for `camera`. `out` is resized and overwritten.
-pub fn project_fwd(rows: &Columns, camera: &Camera, eps2d: f32, simd: SimdPath, out: &mut Projected) {
-    out.resize(rows.rows());
+/// Projects every row of a batch for `camera`. The footprints are written to `out` from row `first` on, and `out` ends
+/// with them.
+pub fn project_fwd(rows: &Columns, camera: &Camera, eps2d: f32, simd: SimdPath, first: usize, out: &mut Projected) {
+    out.resize(first + rows.rows());
     let view = View::new(camera, eps2d);
     let Projected { means2d, conics, depths, radii, opacities } = out;
-    (means2d.par_chunks_mut(ROWS_PER_CHUNK), conics.par_chunks_mut(ROWS_PER_CHUNK))
+    (means2d[first..].par_chunks_mut(ROWS_PER_CHUNK), conics[first..].par_chunks_mut(ROWS_PER_CHUNK))
         .into_par_iter()
-        .zip((depths.par_chunks_mut(ROWS_PER_CHUNK), radii.par_chunks_mut(ROWS_PER_CHUNK)))
-        .zip(opacities.par_chunks_mut(ROWS_PER_CHUNK))
+        .zip((depths[first..].par_chunks_mut(ROWS_PER_CHUNK), radii[first..].par_chunks_mut(ROWS_PER_CHUNK)))
+        .zip(opacities[first..].par_chunks_mut(ROWS_PER_CHUNK))
         .enumerate()
         .for_each(|(chunk, (((means2d, conics), (depths, radii)), opacities))| {
             let stored = StoredChunk::new(rows, chunk);
@@ -392,7 +393,7 @@ mod tests {
 
     fn project(rows: &Columns, simd: SimdPath) -> Projected {
         let mut out = Projected::default();
-        project_fwd(rows, &camera(), 0.3, simd, &mut out);
+        project_fwd(rows, &camera(), 0.3, simd, 0, &mut out);
         out
     }
 

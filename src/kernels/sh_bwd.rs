@@ -7,7 +7,7 @@
 
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use crate::kernels::lanes::{ROWS_PER_CHUNK, block_of, block_of_mut, chunk_of, lane};
-use crate::kernels::project_fwd::{Projected, dot};
+use crate::kernels::project_fwd::dot;
 use crate::kernels::sh_fwd::{BASIS, C1, C2, C3, ShChunk, basis_len};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Columns, sh_n_width};
@@ -49,19 +49,20 @@ pub fn unit_direction_vjp(unit: [f32; 3], inv_len: f32, v_unit: [f32; 3]) -> [f3
 
 /// Backward of `sh_fwd`: writes `grads.means`, `grads.sh0` and `grads.sh_n`.
 ///
-/// `colors` is what `sh_fwd` gave and `v_colors` its gradient, one entry per row. `grads` is resized to the rows.
+/// `colors` is what `sh_fwd` gave and `v_colors` its gradient, `radii` are those that `sh_fwd` was given: one entry per row.
+/// `grads` is resized to the rows.
 pub fn sh_bwd(
     rows: &Columns,
     camera: &Camera,
     sh_degree: u8,
-    projected: &Projected,
+    radii: &[[u32; 2]],
     colors: &[[f32; 3]],
     v_colors: &[[f32; 3]],
     simd: SimdPath,
     grads: &mut Columns,
 ) {
     assert!(sh_degree <= rows.sh_degree, "the rows are stored with degree {}", rows.sh_degree);
-    assert_eq!([projected.rows(), colors.len(), v_colors.len()], [rows.rows(); 3], "one entry per row");
+    assert_eq!([radii.len(), colors.len(), v_colors.len()], [rows.rows(); 3], "one entry per row");
     grads.sh_degree = rows.sh_degree;
     grads.resize(rows.rows());
     let centre = camera.centre();
@@ -69,7 +70,7 @@ pub fn sh_bwd(
     let sh_n_chunk = (sh_n_width(rows.sh_degree) * ROWS_PER_CHUNK).max(1);
     let Columns { means, sh0, sh_n, .. } = grads;
     let chunk_task = |chunk: usize, means, sh0, sh_n| {
-        let stored = ShChunk::new(rows, projected, centre, chunk);
+        let stored = ShChunk::new(rows, radii, centre, chunk);
         let colors = chunk_of(colors, chunk, 1);
         let v_colors = chunk_of(v_colors, chunk, 1);
         match sh_degree {
@@ -217,20 +218,16 @@ mod tests {
             for column in [&mut rows.means, &mut rows.sh0, &mut rows.sh_n] {
                 column.fill_with(|| rng.range(-1.0, 1.0) as f32);
             }
-            let mut projected = Projected::default();
-            projected.resize(n);
-            for row in 0..n {
-                projected.radii[row] = if row % 3 == 0 { [0, 0] } else { [2, 1] };
-            }
+            let radii: Vec<[u32; 2]> = (0..n).map(|row| if row % 3 == 0 { [0, 0] } else { [2, 1] }).collect();
             // Nothing of a culled row may be read into a result.
             rows.means[..3].fill(f32::NAN);
             rows.sh0[..3].fill(f32::NAN);
             let v_colors: Vec<[f32; 3]> = (0..n).map(|_| std::array::from_fn(|_| rng.normal() as f32)).collect();
             let run = |simd| {
-                let (mut colors, mut grads) = (Vec::new(), Columns::zeros(n, stored));
+                let (mut colors, mut grads) = (vec![[f32::NAN; 3]; n], Columns::zeros(n, stored));
                 grads.means.fill(f32::NAN);
-                sh_fwd(&rows, &camera(), stored, &projected, simd, &mut colors);
-                sh_bwd(&rows, &camera(), stored, &projected, &colors, &v_colors, simd, &mut grads);
+                sh_fwd(&rows, &camera(), stored, &radii, simd, &mut colors);
+                sh_bwd(&rows, &camera(), stored, &radii, &colors, &v_colors, simd, &mut grads);
                 (colors, grads)
             };
             let want = run(SimdPath::Baseline);

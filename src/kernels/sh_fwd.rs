@@ -5,10 +5,9 @@
 //! Invariants: 1. the basis has the signs and the order of the 3DGS code, so that files can be exchanged; 2. nothing
 //! is fused: the same bits on every instruction path; 3. culled rows are neither read nor computed, their colour is 0.
 
-use crate::base::room;
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use crate::kernels::lanes::{Lanes, ROWS_PER_CHUNK, block_of, block_of_mut, chunk_of, gather, lane, set_lane};
-use crate::kernels::project_fwd::{Projected, dot};
+use crate::kernels::project_fwd::dot;
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Columns, sh_n_width};
 use rayon::prelude::*;
@@ -87,7 +86,8 @@ pub fn sh_color(basis: &[f32], sh0: [f32; 3], sh_n: &[f32]) -> [f32; 3] {
     c.map(|x| if x > 0.0 { x } else { 0.0 })
 }
 
-/// Colours of the rows that `projected` has not culled, 0 for the others; `colors` is resized to the rows.
+/// Colours of the rows whose `radii` are not [0, 0], and 0 for the culled rows. `radii` and `colors` have one entry per
+/// row.
 ///
 /// `sh_degree` is the highest band in use and at most `rows.sh_degree`. The direction is from the camera's centre to
 /// the mean.
@@ -95,16 +95,15 @@ pub fn sh_fwd(
     rows: &Columns,
     camera: &Camera,
     sh_degree: u8,
-    projected: &Projected,
+    radii: &[[u32; 2]],
     simd: SimdPath,
-    colors: &mut Vec<[f32; 3]>,
+    colors: &mut [[f32; 3]],
 ) {
     assert!(sh_degree <= rows.sh_degree, "the rows are stored with degree {}", rows.sh_degree);
-    assert_eq!(projected.rows(), rows.rows(), "one entry per row");
-    room::resize(colors, rows.rows(), [0.0; 3]);
+    assert_eq!([radii.len(), colors.len()], [rows.rows(); 2], "one entry per row");
     let centre = camera.centre();
     colors.par_chunks_mut(ROWS_PER_CHUNK).enumerate().for_each(|(chunk, colors)| {
-        let stored = ShChunk::new(rows, projected, centre, chunk);
+        let stored = ShChunk::new(rows, radii, centre, chunk);
         match sh_degree {
             0 => dispatch(simd, Colors::<0> { stored, colors }),
             1 => dispatch(simd, Colors::<1> { stored, colors }),
@@ -127,11 +126,11 @@ pub(crate) struct ShChunk<'a> {
 }
 
 impl<'a> ShChunk<'a> {
-    pub fn new(rows: &'a Columns, projected: &'a Projected, centre: [f32; 3], chunk: usize) -> Self {
+    pub fn new(rows: &'a Columns, radii: &'a [[u32; 2]], centre: [f32; 3], chunk: usize) -> Self {
         let sh_n_width = sh_n_width(rows.sh_degree);
         ShChunk {
             centre,
-            radii: chunk_of(&projected.radii, chunk, 1),
+            radii: chunk_of(radii, chunk, 1),
             means: chunk_of(&rows.means, chunk, 3),
             sh0: chunk_of(&rows.sh0, chunk, 3),
             sh_n: chunk_of(&rows.sh_n, chunk, sh_n_width),

@@ -1,10 +1,11 @@
 //! The stages in order on the CPU, forward and backward, with the memory that they share.
 //!
-//! Invariants: 1. nothing is allocated per view once the largest view was seen; 2. the result has the same bits for any
-//! number of threads, and on the AVX2 and AVX-512 paths; 3. `backward` belongs to the last `forward` and must be given
-//! the same rows.
+//! Invariants: 1. the columns of a view are allocated only when a view is larger than all before; 2. the result has the
+//! same bits for any number of threads, for any cut of the rows into batches, and on the AVX2 and AVX-512 paths.
 
-use super::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
+use super::sequence::{Sequence, ViewOptions};
+use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer};
+use crate::base::room;
 use crate::kernels::image_loss::ImageLoss;
 use crate::kernels::isect_emit::{count, emit};
 use crate::kernels::isect_offsets::isect_offsets;
@@ -35,30 +36,36 @@ pub struct RenderStats {
     pub evaluated: u64,
 }
 
-/// Seconds of each stage of [`STAGES`] in the last view.
+/// Seconds of each stage of [`STAGES`] in the last view, summed over its batches.
 #[derive(Debug, Default)]
 struct StageClock {
     seconds: [f64; STAGES.len()],
 }
 
 impl StageClock {
-    /// Runs the stage of this name and notes its time.
+    /// Runs the stage of this name and adds its time.
     fn time<T>(&mut self, stage: &str, work: impl FnOnce() -> T) -> T {
         let start = Instant::now();
         let out = work();
         if let Some(at) = STAGES.iter().position(|s| s.name == stage) {
-            self.seconds[at] = start.elapsed().as_secs_f64();
+            self.seconds[at] += start.elapsed().as_secs_f64();
         }
         out
+    }
+
+    /// Forgets the times of the stages of these names, which run again.
+    fn restart(&mut self, stages: &[&str]) {
+        let stages = STAGES.iter().zip(&mut self.seconds).filter(|(s, _)| stages.contains(&s.name));
+        stages.for_each(|(_, seconds)| *seconds = 0.0);
     }
 }
 
 /// Renders views on the CPU.
 #[derive(Debug, Default)]
 pub struct CpuRenderer {
+    sequence: Sequence,
     image: Image,
     alpha: Vec<f32>,
-    view: Option<(Camera, RenderOptions)>,
     projected: Projected,
     colors: Vec<[f32; 3]>,
     depth_sort: DepthSort,
@@ -74,7 +81,8 @@ pub struct CpuRenderer {
     partials: Vec<Partial>,
     footprints: FootprintGradients,
     image_loss: ImageLoss,
-    v_rgb: Vec<f32>,
+    loss_value: Option<LossValue>,
+    gradient: PictureGradient,
     stats: RenderStats,
     clock: StageClock,
 }
@@ -83,46 +91,6 @@ impl CpuRenderer {
     /// A renderer without memory yet.
     pub fn new() -> Self {
         CpuRenderer::default()
-    }
-
-    /// Renders `rows` as seen by `camera`.
-    ///
-    /// # Panics
-    /// When a side of the image is above [`Grid::SIDE_MAX`], or there are 2^32 rows or more.
-    pub fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> &Image {
-        let side = camera.width.max(camera.height);
-        assert!(side <= Grid::SIDE_MAX, "images are at most {} pixels on a side, not {side}", Grid::SIDE_MAX);
-        assert!(rows.rows() < u32::MAX as usize, "too many rows in one view");
-        let grid = Grid::new(camera.width, camera.height);
-        let mut clock = StageClock::default();
-        let simd = options.simd;
-        clock.time("project_fwd", || project_fwd(rows, camera, options.eps2d, simd, &mut self.projected));
-        clock.time("sh_fwd", || {
-            sh_fwd(rows, camera, options.sh_degree, &self.projected, simd, &mut self.colors);
-        });
-        clock.time("radix_sort", || {
-            self.depth_sort.sort(&self.projected.depths, &self.projected.radii, &mut self.order);
-        });
-        let total = clock.time("scan", || {
-            pack(&self.projected, &self.colors, grid, simd, &mut self.packed);
-            scan(&self.packed.chunk_counts, &mut self.chunk_offsets)
-        });
-        clock.time("isect_offsets", || {
-            count(&self.order, &self.packed, grid, simd, &mut self.tile_counts);
-            isect_offsets(&self.tile_counts, grid.tiles(), &mut self.tile_offsets, &mut self.cursors);
-        });
-        clock.time("isect_emit", || {
-            emit(&self.order, &self.packed, grid, simd, total, &mut self.cursors, &mut self.isects)
-        });
-        self.view = Some((*camera, *options));
-        clock.time("rasterize_fwd", || self.rasterize(grid, options));
-        self.clock = clock;
-        self.stats = RenderStats {
-            visible: self.order.len() as u64,
-            isects: total,
-            evaluated: self.raster.evaluated.iter().sum(),
-        };
-        &self.image
     }
 
     fn rasterize(&mut self, grid: Grid, options: &RenderOptions) {
@@ -148,58 +116,25 @@ impl CpuRenderer {
         }
     }
 
-    /// The picture of the last [`CpuRenderer::forward`].
-    pub fn image(&self) -> &Image {
-        &self.image
-    }
-
-    /// Its coverage 1 - T, `[height][width]`.
+    /// Coverage 1 - T of the last picture, `[height][width]`.
     pub fn alpha(&self) -> &[f32] {
         &self.alpha
     }
 
-    /// What the last forward pass left of each tile.
+    /// What the last picture left of each tile.
     pub fn raster(&self) -> &Raster {
         &self.raster
     }
 
-    /// Footprints of the last view, one entry per row.
+    /// Footprints of the last view, one entry per row of all its batches.
     pub fn projected(&self) -> &Projected {
         &self.projected
     }
 
-    /// Gradients of the last view's rows, from `v_rgb` (`[3][height][width]`) and `v_alpha` (`[height][width]`).
-    /// Every entry of `grads` is written; rows that were not drawn get zeros.
-    ///
-    /// # Panics
-    /// Without a forward pass before it, or when sizes disagree with it.
-    pub fn backward(&mut self, rows: &Columns, v_rgb: &[f32], v_alpha: Option<&[f32]>, grads: &mut Gradients) {
-        assert_eq!(self.projected.radii.len(), rows.rows(), "backward needs the rows of the last forward");
-        assert_eq!(v_rgb.len(), self.image.rgb.len(), "v_rgb has the size of the image");
-        assert!(v_alpha.is_none_or(|v| v.len() == self.alpha.len()), "v_alpha has the size of the image");
-        let Some((camera, options)) = self.view else { panic!("backward needs a forward pass before it") };
-        let grid = Grid::new(camera.width, camera.height);
-        let mut clock = std::mem::take(&mut self.clock);
-        clock.time("rasterize_bwd", || self.rasterize_back(grid, &options, &Upstream { v_rgb, v_alpha }));
-        let columns = &mut grads.columns;
-        columns.sh_degree = rows.sh_degree;
-        columns.resize(rows.rows());
-        let (projected, simd, out) = (&self.projected, options.simd, &self.footprints);
-        clock.time("sh_bwd", || {
-            sh_bwd(rows, &camera, options.sh_degree, projected, &self.colors, &out.v_colors, simd, columns);
-        });
-        let (v_means2d, v_conics, v_opacities) = (&out.v_means2d, &out.v_conics, &out.v_opacities);
-        clock.time("project_bwd", || {
-            project_bwd(rows, &camera, options.eps2d, projected, v_means2d, v_conics, v_opacities, simd, columns);
-        });
-        grads.means2d.clone_from(&out.v_means2d);
-        grads.radii.clone_from(&projected.radii);
-        self.clock = clock;
-    }
-
-    fn rasterize_back(&mut self, grid: Grid, options: &RenderOptions, upstream: &Upstream<'_>) {
+    fn rasterize_back(&mut self, grid: Grid, options: &RenderOptions) {
         let mut partials = std::mem::take(&mut self.partials);
-        rasterize_bwd(&self.lists(grid, options), &self.chunk_offsets, &self.raster, upstream, &mut partials);
+        let upstream = Upstream { v_rgb: &self.gradient.v_rgb, v_alpha: self.gradient.v_alpha.as_deref() };
+        rasterize_bwd(&self.lists(grid, options), &self.chunk_offsets, &self.raster, &upstream, &mut partials);
         self.partials = partials;
         fold_rows(&self.packed.counts, &self.chunk_offsets, &self.partials, &self.projected, &mut self.footprints);
     }
@@ -222,7 +157,7 @@ impl CpuRenderer {
             + self.raster.bytes()
             + bytes(&self.image.rgb)
             + bytes(&self.alpha)
-            + bytes(&self.v_rgb)
+            + self.gradient.bytes()
             + (bytes(&p.means2d) + bytes(&p.conics) + bytes(&p.depths) + bytes(&p.radii) + bytes(&p.opacities))
             + (bytes(&self.colors) + bytes(&self.order) + bytes(&self.packed.splats))
             + (bytes(&self.packed.counts)
@@ -245,35 +180,112 @@ impl Renderer for CpuRenderer {
         self.scratch_bytes()
     }
 
-    fn forward(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
-        super::check_view(rows, camera, options)?;
-        self.forward(rows, camera, options);
+    fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: usize) -> Result<(), RenderError> {
+        self.sequence.begin(camera, options, batches, usize::MAX)?;
+        (self.clock, self.stats, self.loss_value) = (StageClock::default(), RenderStats::default(), None);
+        Ok(())
+    }
+
+    fn rows_in(&mut self, rows: &Columns) -> Result<(), RenderError> {
+        let (ViewOptions { camera, options }, place) = self.sequence.rows_in(rows)?;
+        let RenderOptions { eps2d, sh_degree, simd, .. } = options;
+        let Self { clock, projected, colors, .. } = self;
+        clock.time("project_fwd", || project_fwd(rows, &camera, eps2d, simd, place.start, projected));
+        clock.time("sh_fwd", || {
+            room::resize(colors, place.end, [0.0; 3]);
+            sh_fwd(rows, &camera, sh_degree, &projected.radii[place.clone()], simd, &mut colors[place]);
+        });
+        Ok(())
+    }
+
+    fn picture(&mut self) -> Result<(), RenderError> {
+        let ViewOptions { camera, options } = self.sequence.picture()?;
+        let grid = Grid::new(camera.width, camera.height);
+        let mut clock = std::mem::take(&mut self.clock);
+        let simd = options.simd;
+        clock.time("radix_sort", || {
+            self.depth_sort.sort(&self.projected.depths, &self.projected.radii, &mut self.order);
+        });
+        let total = clock.time("scan", || {
+            pack(&self.projected, &self.colors, grid, simd, &mut self.packed);
+            scan(&self.packed.chunk_counts, &mut self.chunk_offsets)
+        });
+        clock.time("isect_offsets", || {
+            count(&self.order, &self.packed, grid, simd, &mut self.tile_counts);
+            isect_offsets(&self.tile_counts, grid.tiles(), &mut self.tile_offsets, &mut self.cursors);
+        });
+        clock.time("isect_emit", || {
+            emit(&self.order, &self.packed, grid, simd, total, &mut self.cursors, &mut self.isects)
+        });
+        clock.time("rasterize_fwd", || self.rasterize(grid, &options));
+        self.clock = clock;
+        self.stats = RenderStats {
+            visible: self.order.len() as u64,
+            isects: total,
+            evaluated: self.raster.evaluated.iter().sum(),
+        };
         Ok(())
     }
 
     fn image(&mut self) -> Result<&Image, RenderError> {
-        if self.view.is_some() { Ok(&self.image) } else { Err(RenderError::NoForward) }
+        self.sequence.image()?;
+        Ok(&self.image)
     }
 
-    fn loss_backward(
-        &mut self,
-        rows: &Columns,
-        target: &Target,
-        options: &LossOptions,
-        grads: &mut Gradients,
-    ) -> Result<LossValue, RenderError> {
-        if self.view.is_none() || self.projected.rows() != rows.rows() {
-            return Err(RenderError::NoForward);
+    fn picture_mut(&mut self) -> Result<&mut [f32], RenderError> {
+        self.sequence.image()?;
+        Ok(&mut self.image.rgb)
+    }
+
+    fn loss(&mut self, target: &Target, options: &LossOptions) -> Result<(), RenderError> {
+        self.sequence.loss(target)?;
+        let Self { clock, image_loss, image, gradient: PictureGradient { v_rgb, v_alpha }, .. } = self;
+        *v_alpha = None;
+        clock.restart(&["image_loss"]);
+        let value = clock.time("image_loss", || image_loss.value_and_gradient(image, target, options, v_rgb));
+        self.loss_value = Some(value);
+        Ok(())
+    }
+
+    fn picture_gradient(&mut self) -> Result<&mut PictureGradient, RenderError> {
+        let (view, was_there) = self.sequence.picture_gradient()?;
+        if !was_there {
+            self.gradient.reset(view.camera.pixels());
         }
-        let image = (self.image.width, self.image.height);
-        if (target.width, target.height) != image {
-            return Err(RenderError::TargetSize { target: (target.width, target.height), image });
-        }
-        let mut v_rgb = std::mem::take(&mut self.v_rgb);
-        let value = self.image_loss.value_and_gradient(&self.image, target, options, &mut v_rgb);
-        self.backward(rows, &v_rgb, None, grads);
-        self.v_rgb = v_rgb;
-        Ok(value)
+        Ok(&mut self.gradient)
+    }
+
+    fn picture_back(&mut self) -> Result<(), RenderError> {
+        let ViewOptions { camera, options } = self.sequence.picture_back(Some(&self.gradient))?;
+        let grid = Grid::new(camera.width, camera.height);
+        let mut clock = std::mem::take(&mut self.clock);
+        clock.restart(&["rasterize_bwd", "sh_bwd", "project_bwd"]);
+        clock.time("rasterize_bwd", || self.rasterize_back(grid, &options));
+        self.clock = clock;
+        Ok(())
+    }
+
+    fn rows_out(&mut self, batch: usize, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError> {
+        let (ViewOptions { camera, options }, place) = self.sequence.rows_out(batch, rows)?;
+        let RenderOptions { eps2d, sh_degree, simd, .. } = options;
+        let Self { clock, projected, colors, footprints: v, .. } = self;
+        let (radii, colors) = (&projected.radii[place.clone()], &colors[place.clone()]);
+        let (v_means2d, v_conics) = (&v.v_means2d[place.clone()], &v.v_conics[place.clone()]);
+        let (v_colors, v_opacities) = (&v.v_colors[place.clone()], &v.v_opacities[place]);
+        let columns = &mut grads.columns;
+        clock.time("sh_bwd", || sh_bwd(rows, &camera, sh_degree, radii, colors, v_colors, simd, columns));
+        clock.time("project_bwd", || {
+            project_bwd(rows, &camera, eps2d, radii, v_means2d, v_conics, v_opacities, simd, columns);
+        });
+        grads.means2d.clear();
+        grads.means2d.extend_from_slice(v_means2d);
+        grads.radii.clear();
+        grads.radii.extend_from_slice(radii);
+        Ok(())
+    }
+
+    fn loss_value(&mut self) -> Result<LossValue, RenderError> {
+        self.loss_value.ok_or(RenderError::OutOfOrder { call: "loss_value", needs: "loss" })
     }
 }
 
@@ -287,6 +299,8 @@ mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};
     use crate::base::simd::SimdPath;
+    use crate::kernels::image_loss::SsimPadding;
+    use crate::scene::columns::Column;
 
     /// `rows` Gaussians in front of a camera, some of them large, opaque, behind it or off the picture.
     fn scene(rows: usize, width: u32, height: u32) -> (Columns, Camera) {
@@ -306,20 +320,25 @@ mod tests {
         values.iter().map(|x| x.to_bits()).collect()
     }
 
+    fn random_gradient(camera: &Camera) -> PictureGradient {
+        let mut draws = Stream::new(12, Purpose::Test, 0, 0);
+        let v_rgb = (0..3 * camera.pixels()).map(|_| draws.normal() as f32).collect();
+        PictureGradient { v_rgb, v_alpha: Some((0..camera.pixels()).map(|_| draws.normal() as f32).collect()) }
+    }
+
     /// Bits of image, alpha and all gradients on a path with a number of threads.
     fn render_bits(rows: &Columns, camera: &Camera, simd: SimdPath, threads: usize) -> Vec<Vec<u32>> {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
             let mut renderer = CpuRenderer::new();
             let options = RenderOptions { sh_degree: 2, background: [0.2, 0.4, 0.1], simd, ..RenderOptions::default() };
-            renderer.forward(rows, camera, &options);
-            let mut draws = Stream::new(12, Purpose::Test, 0, 0);
-            let v_rgb: Vec<f32> = renderer.image().rgb.iter().map(|_| draws.normal() as f32).collect();
-            let v_alpha: Vec<f32> = renderer.alpha().iter().map(|_| draws.normal() as f32).collect();
+            renderer.draw(rows, camera, &options).unwrap();
+            *renderer.picture_gradient().unwrap() = random_gradient(camera);
             let mut grads = Gradients::default();
-            renderer.backward(rows, &v_rgb, Some(&v_alpha), &mut grads);
-            let mut all = vec![bits(&renderer.image().rgb), bits(renderer.alpha()), bits(grads.means2d.as_flattened())];
-            all.extend(crate::scene::columns::Column::ALL.map(|c| bits(grads.columns.column(c))));
+            renderer.backpropagate(rows, &mut grads).unwrap();
+            let rgb = bits(&renderer.image().unwrap().rgb);
+            let mut all = vec![rgb, bits(renderer.alpha()), bits(grads.means2d.as_flattened())];
+            all.extend(Column::ALL.map(|c| bits(grads.columns.column(c))));
             all
         })
     }
@@ -333,6 +352,101 @@ mod tests {
         for threads in [2, 16] {
             assert!(one == render_bits(&rows, &camera, SimdPath::best(), threads), "{threads} threads");
         }
+    }
+
+    fn part(rows: &Columns, place: std::ops::Range<usize>) -> Columns {
+        let mut part = Columns { sh_degree: rows.sh_degree, ..Columns::default() };
+        for column in Column::ALL {
+            let width = column.width(rows.sh_degree);
+            *part.column_mut(column) = rows.column(column)[place.start * width..place.end * width].to_vec();
+        }
+        part
+    }
+
+    /// As [`render_bits`] from a loss, with the rows in batches that end at `ends`, which come out backwards.
+    fn bits_of_batches(renderer: &mut CpuRenderer, rows: &Columns, camera: &Camera, ends: &[usize]) -> Vec<Vec<u32>> {
+        let options = RenderOptions { sh_degree: 2, background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
+        let firsts = std::iter::once(&0).chain(ends);
+        let batches: Vec<Columns> = firsts.zip(ends).map(|(&first, &end)| part(rows, first..end)).collect();
+        renderer.begin_view(camera, &options, batches.len()).unwrap();
+        batches.iter().for_each(|batch| renderer.rows_in(batch).unwrap());
+        renderer.picture().unwrap();
+        let rgb = (0..3 * camera.pixels()).map(|i| (i % 251) as u8).collect();
+        let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
+        let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
+        renderer.loss(&target, &loss).unwrap();
+        renderer.picture_back().unwrap();
+        let mut all = vec![Vec::new(); 8];
+        for (i, batch) in batches.iter().enumerate().rev() {
+            let mut grads = Gradients::default();
+            renderer.rows_out(i, batch, &mut grads).unwrap();
+            let mut of_batch = vec![bits(grads.means2d.as_flattened()), grads.radii.as_flattened().to_vec()];
+            of_batch.extend(Column::ALL.map(|c| bits(grads.columns.column(c))));
+            for (all, mut of_batch) in all.iter_mut().zip(of_batch) {
+                of_batch.append(all);
+                *all = of_batch;
+            }
+        }
+        let value = renderer.loss_value().unwrap().loss.to_bits();
+        all.extend([bits(&renderer.image().unwrap().rgb), vec![value as u32, (value >> 32) as u32]]);
+        all
+    }
+
+    #[test]
+    fn batches_do_not_change_a_bit() {
+        // Batches that are no multiples of blocks or chunks, one row, and nothing; larger and smaller views in turn.
+        let mut renderer = CpuRenderer::new();
+        for (n, cuts) in
+            [(20_000, vec![vec![9_001], vec![1, 1, 4_096, 13_313], vec![0, 20_000]]), (900, vec![vec![450]])]
+        {
+            let (rows, camera) = scene(n, 123, 77);
+            let one = bits_of_batches(&mut renderer, &rows, &camera, &[n]);
+            assert!(one.iter().all(|values| values.iter().any(|b| *b != 0)));
+            for mut ends in cuts {
+                ends.push(n);
+                assert!(
+                    one == bits_of_batches(&mut renderer, &rows, &camera, &ends),
+                    "{n} rows, batches end at {ends:?}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn stages_out_of_order_are_errors_and_change_nothing() {
+        let (rows, camera) = scene(600, 40, 30);
+        let (options, mut grads) = (RenderOptions { sh_degree: 2, ..RenderOptions::default() }, Gradients::default());
+        let is_order = |result: Result<(), RenderError>| matches!(result, Err(RenderError::OutOfOrder { .. }));
+        let mut renderer = CpuRenderer::new();
+        assert!(is_order(renderer.rows_in(&rows)) && is_order(renderer.picture()));
+        let none = RenderError::Batches { asked: 0, most: usize::MAX };
+        assert_eq!(renderer.begin_view(&camera, &options, 0), Err(none));
+        renderer.begin_view(&camera, &options, 2).unwrap();
+        renderer.rows_in(&rows).unwrap();
+        assert!(is_order(renderer.picture()), "a batch is missing");
+        renderer.rows_in(&rows).unwrap();
+        assert!(is_order(renderer.rows_in(&rows)) && is_order(renderer.image().map(|_| ())));
+        renderer.picture().unwrap();
+        assert!(is_order(renderer.picture_back()) && is_order(renderer.loss_value().map(|_| ())));
+        *renderer.picture_gradient().unwrap() = random_gradient(&camera);
+        assert!(is_order(renderer.rows_out(0, &rows, &mut grads)));
+        renderer.picture_back().unwrap();
+        renderer.rows_out(1, &rows, &mut grads).unwrap();
+        let want = grads.clone();
+        assert!(is_order(renderer.rows_out(1, &rows, &mut grads)), "this batch is out");
+        assert!(is_order(renderer.picture_gradient().map(|_| ())), "the other one is not");
+        let other = RenderError::BatchRows { batch: 0, given: 1 };
+        assert_eq!(renderer.rows_out(0, &part(&rows, 0..1), &mut grads), Err(other));
+        let beyond = RenderError::BatchRows { batch: 2, given: 600 };
+        assert_eq!(renderer.rows_out(2, &rows, &mut grads), Err(beyond));
+        renderer.rows_out(0, &rows, &mut grads).unwrap();
+        // The way back may be gone again, from the same gradient.
+        renderer.picture_back().unwrap();
+        renderer.rows_out(1, &rows, &mut grads).unwrap();
+        assert!(grads.columns == want.columns && grads.radii == want.radii);
+        renderer.rows_out(0, &rows, &mut grads).unwrap();
+        renderer.picture_gradient().unwrap().v_alpha = Some(Vec::new());
+        assert_eq!(renderer.picture_back(), Err(RenderError::GradientSize { pixels: 40 * 30 }));
     }
 
     #[test]
@@ -355,11 +469,12 @@ mod tests {
             let (mut rows, camera) = scene(n, width, height);
             // All behind the camera.
             rows.means.iter_mut().for_each(|x| *x -= 10.0);
-            let image = renderer.forward(&rows, &camera, &options);
+            renderer.draw(&rows, &camera, &options).unwrap();
             let pixels = camera.pixels();
             let want: Vec<f32> = [0.25, 0.5, 0.75].iter().flat_map(|&c| vec![c; pixels]).collect();
-            assert_eq!(image.rgb, want);
-            renderer.backward(&rows, &want, None, &mut grads);
+            assert_eq!(renderer.image().unwrap().rgb, want);
+            renderer.picture_gradient().unwrap().v_rgb = want;
+            renderer.backpropagate(&rows, &mut grads).unwrap();
             assert_eq!(grads.columns, Columns::zeros(n, 2));
             assert_eq!(grads.radii, vec![[0, 0]; n]);
             assert_eq!(renderer.stats(), RenderStats::default());
@@ -374,8 +489,10 @@ mod tests {
         let mut grads = Gradients::default();
         let mut held = Vec::new();
         for _ in 0..3 {
-            let v_rgb = renderer.forward(&rows, &camera, &options).rgb.clone();
-            renderer.backward(&rows, &v_rgb, None, &mut grads);
+            renderer.draw(&rows, &camera, &options).unwrap();
+            let v_rgb = renderer.image().unwrap().rgb.clone();
+            renderer.picture_gradient().unwrap().v_rgb.copy_from_slice(&v_rgb);
+            renderer.backpropagate(&rows, &mut grads).unwrap();
             held.push(renderer.scratch_bytes());
         }
         assert!(held[0] > 0 && held[1] == held[0] && held[2] == held[0], "{held:?}");

@@ -11,9 +11,9 @@ use crate::kernels::uniforms_tiles::{
 };
 use std::ops::Range;
 
-/// Gradients of the picture: what the backward pass starts from.
+/// Gradient of the picture on the device: what the backward pass starts from.
 #[derive(Debug, Clone, Copy)]
-pub struct PictureGradients<'a> {
+pub struct PictureGradientBuffers<'a> {
     /// `[3][height][width]` f32.
     pub v_rgb: &'a BufferView,
     /// `[height][width]` f32; none: zeros.
@@ -40,7 +40,7 @@ impl TileStages {
         ranks: &Ranks,
         frame: &Frame,
         demand: Demand,
-        picture: PictureGradients<'_>,
+        picture: PictureGradientBuffers<'_>,
         v_splats: &BufferView,
     ) -> GpuResult<()> {
         let grid = frame.blend.grid;
@@ -82,7 +82,7 @@ impl TileStages {
         frame: &Frame,
         segments: u32,
         isects: Range<u32>,
-        PictureGradients { v_rgb, v_alpha }: PictureGradients<'_>,
+        PictureGradientBuffers { v_rgb, v_alpha }: PictureGradientBuffers<'_>,
         (splats, carry, partials): (&BufferView, &BufferView, &BufferView),
     ) -> GpuResult<()> {
         let tiles = frame.blend.grid.tiles_x * frame.blend.grid.tiles_y;

@@ -58,7 +58,7 @@ pub fn evaluate(
         let target = targets.get(view)?;
         let camera = &dataset.views[view].camera;
         scene.gather_view(camera, now, working)?;
-        renderer.forward(&working.columns, camera, options)?;
+        renderer.draw(&working.columns, camera, options)?;
         let image = renderer.image()?;
         if target.counts() {
             psnrs.push(json_psnr(psnr(image, &target)));

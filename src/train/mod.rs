@@ -9,6 +9,7 @@
 //! (`gaussian_pages` those of a file of any size), [`first_look`] looks at them for a plan, [`out_folder`] is where results go, `ownership` says which store belongs to which run and who may delete what, [`page_map`] draws where pages lie,
 //! [`stores`] is what tools do with checkpoints.
 
+pub mod batch;
 pub mod budget;
 pub mod catch_up;
 mod changes;

@@ -1,16 +1,14 @@
 //! One training step, top to bottom. Nothing here opens a file.
 //!
 //! Invariants: 1. every pinned page is released, whatever happens; 2. a step whose rendering fails, or whose loss is not
-//! finite, changes no row, except that events which were due on the pinned pages are applied; 3. from gathering to the update
-//! nobody changes the pinned rows or the working set's values: the update goes on from these; 4. the result is the same
+//! finite, changes no row, except that events which were due on the pinned pages are applied; 3. the result is the same
 //! for any number of threads and frames.
 
-use super::catch_up::{gather, visible_rows};
+use super::batch::{gather, update};
 use super::error::TrainError;
-use super::pages::{PagedScene, numbered};
-use super::update::{StepGradients, update_pages};
+use super::pages::PagedScene;
 use super::working_set::WorkingSet;
-use crate::render::{LossOptions, LossValue, RenderOptions, Renderer};
+use crate::render::{LossOptions, LossValue, RenderError, RenderOptions, Renderer};
 use crate::scene::camera::Camera;
 use crate::scene::image::Target;
 
@@ -33,8 +31,8 @@ pub struct StepOutcome {
     pub skipped: bool,
 }
 
-/// Trains on one view at 0-based `step`: acquire, catch up with events, cull, gather, forward, loss, backward, optimizer,
-/// and the statistics of densification while they are collected, bounds, release.
+/// Trains on one view at 0-based `step`, whose pages are one batch: pins them, applies the events that are due, gathers
+/// the rows, renders them forward and backward, updates the rows, and releases the pages.
 ///
 /// # Errors
 /// Pages could not be had, or the renderer failed; the rows are as they were before the step.
@@ -54,30 +52,45 @@ pub fn train_step(
     }
     // Again and again, since what was read and written since may let more be read.
     scene.pager.prefetch(step);
-    let WorkingSet { row_from_working, columns, gradients } = working;
-    let tables = numbered(&pages);
-    visible_rows(&tables, &scene.rules.adam, step, camera, row_from_working);
-    gather(&tables, scene.rules.sh_degree(), &scene.rules.adam, step, row_from_working, columns);
-    let rows_pinned = tables.iter().map(|t| t.rows()).sum();
-    let rendered = renderer.forward(columns, camera, render).and_then(|()| {
-        scene.pager.prefetch(step);
-        renderer.loss_backward(columns, target, loss, gradients)
-    });
+    gather(&scene.rules, &pages, step, camera, working);
+    let rendered = differentiate(working, renderer, (camera, target), (render, loss), || scene.pager.prefetch(step));
     scene.pager.prefetch(step);
-    let mut outcome =
-        StepOutcome { rows: row_from_working.len(), rows_pinned, pages: pages.len(), ..StepOutcome::default() };
+    let rows_pinned = pages.iter().map(|page| page.meta.rows as usize).sum();
+    let rows = working.row_from_working.len();
+    let mut outcome = StepOutcome { rows, rows_pinned, pages: pages.len(), ..StepOutcome::default() };
     if let Ok(value) = rendered {
         outcome.loss = value;
         outcome.skipped = !value.loss.is_finite();
     }
     if rendered.is_ok() && !outcome.skipped {
-        let of_step =
-            StepGradients { step, rows: row_from_working, columns, gradients, size: [camera.width, camera.height] };
-        let counts = update_pages(scene, &mut pages, &of_step, collects);
+        let counts = update(scene, &mut pages, step, camera, working, collects);
         outcome.updated = counts.updated as u64;
         outcome.rows_skipped = counts.skipped_non_finite as u64;
     }
     scene.pager.release(pages);
     rendered?;
     Ok(outcome)
+}
+
+/// Renders the rows of the working set, compares the picture with the photo, and takes the loss back to the gradients of
+/// the rows. `meanwhile` runs while a device may be at work on the picture.
+///
+/// # Errors
+/// Those of the renderer.
+pub(super) fn differentiate(
+    working: &mut WorkingSet,
+    renderer: &mut dyn Renderer,
+    (camera, target): (&Camera, &Target),
+    (render, loss): (&RenderOptions, &LossOptions),
+    meanwhile: impl FnOnce(),
+) -> Result<LossValue, RenderError> {
+    let WorkingSet { columns, gradients, .. } = working;
+    renderer.begin_view(camera, render, 1)?;
+    renderer.rows_in(columns)?;
+    renderer.picture()?;
+    meanwhile();
+    renderer.loss(target, loss)?;
+    renderer.picture_back()?;
+    renderer.rows_out(0, columns, gradients)?;
+    renderer.loss_value()
 }

@@ -12,7 +12,7 @@ use super::error::TrainError;
 use super::eval::{EvalRequest, evaluate};
 use super::pages::PagedScene;
 use super::report::{TestMetrics, TierTraffic};
-use super::step::{StepOutcome, train_step};
+use super::step::{StepOutcome, differentiate, train_step};
 use super::working_set::WorkingSet;
 use crate::checkpoint::run_state::LastTest;
 use crate::config::limits::RunOptions;
@@ -133,11 +133,10 @@ impl Trainer {
         for &view in views {
             let camera = &dataset.views[view].camera;
             self.scene.gather_view(camera, self.step, &mut self.working)?;
-            let WorkingSet { columns, gradients, .. } = &mut self.working;
-            self.renderer.forward(columns, camera, &render)?;
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-            self.renderer.loss_backward(columns, &target, &self.options.loss, gradients)?;
+            let how = (&render, &self.options.loss);
+            differentiate(&mut self.working, &mut *self.renderer, (camera, &target), how, || ())?;
             pixels = pixels.max(camera.pixels());
         }
         Ok(pixels)

@@ -1,4 +1,4 @@
-//! The working set of a step: the rows that its view needs, with their gradients.
+//! The rows that a view needs, on their way through a step.
 
 use crate::render::Gradients;
 use crate::scene::columns::Columns;

@@ -202,7 +202,7 @@ fn projections_of_other_seeds_agree() {
         let camera = random_camera(&mut draws, width, height);
         let rows = random_rows(&mut draws, &camera, ROWS);
         let mut projected = Projected::default();
-        project_fwd(&rows, &camera, EPS2D, SimdPath::best(), &mut projected);
+        project_fwd(&rows, &camera, EPS2D, SimdPath::best(), 0, &mut projected);
         let rows = Rows64::new(&rows);
         let (mut compared, mut drawn, mut largest, mut worst) = (0, 0, 0, [0.0f64; 3]);
         for row in 0..ROWS {
@@ -343,7 +343,7 @@ fn stages_on_stored_columns_agree() {
         let Some(scene) = Scene::open(name) else { return };
         let rows = scene.columns();
         let mut projected = Projected::default();
-        project_fwd(&rows, &scene.camera, EPS2D, SimdPath::best(), &mut projected);
+        project_fwd(&rows, &scene.camera, EPS2D, SimdPath::best(), 0, &mut projected);
         let wanted = |tensor: &str| scene.file.f32(tensor);
         let v_means2d = wanted("v_means2d").as_chunks::<2>().0.to_vec();
         let v_conics = wanted("v_conics").as_chunks::<3>().0.to_vec();
@@ -351,7 +351,7 @@ fn stages_on_stored_columns_agree() {
         let mut grads = Columns::zeros(scene.rows, 0);
         grads.means.fill(5.0);
         let (camera, simd) = (&scene.camera, SimdPath::best());
-        project_bwd(&rows, camera, EPS2D, &projected, &v_means2d, &v_conics, &v_opacities, simd, &mut grads);
+        project_bwd(&rows, camera, EPS2D, &projected.radii, &v_means2d, &v_conics, &v_opacities, simd, &mut grads);
         let mut culled = 0;
         for row in 0..scene.rows {
             let opacity = scene.vector::<1>("opacities", row)[0];

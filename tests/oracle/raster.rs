@@ -4,7 +4,7 @@ use crate::projection::camera_of;
 use crate::support::Fixture;
 use gsscale::base::simd::SimdPath;
 use gsscale::render::cpu::CpuRenderer;
-use gsscale::render::{Gradients, LossOptions, RenderOptions, Renderer, SsimPadding};
+use gsscale::render::{Gradients, LossOptions, PictureGradient, RenderOptions, Renderer, SsimPadding};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::Target;
@@ -78,9 +78,11 @@ impl Scene {
     /// Own gradients from the file's upstream.
     fn backward(&self) -> Gradients {
         let mut renderer = CpuRenderer::new();
-        renderer.forward(&self.rows, &self.camera, &self.options);
+        renderer.draw(&self.rows, &self.camera, &self.options).unwrap();
         let mut grads = Gradients::default();
-        renderer.backward(&self.rows, &self.planar("v_rgb"), Some(&self.file.f32("v_alpha")), &mut grads);
+        let (v_rgb, v_alpha) = (self.planar("v_rgb"), Some(self.file.f32("v_alpha").to_vec()));
+        *renderer.picture_gradient().unwrap() = PictureGradient { v_rgb, v_alpha };
+        renderer.backpropagate(&self.rows, &mut grads).unwrap();
         grads
     }
 
@@ -134,7 +136,8 @@ fn the_paths_of_a_class_give_the_same_bits() {
         let mut bits = |simd: SimdPath| -> Vec<u32> {
             scene.options.simd = simd;
             let mut renderer = CpuRenderer::new();
-            let rgb = renderer.forward(&scene.rows, &scene.camera, &scene.options).rgb.clone();
+            renderer.draw(&scene.rows, &scene.camera, &scene.options).unwrap();
+            let rgb = renderer.image().unwrap().rgb.clone();
             let g = scene.backward();
             let floats = Column::ALL.into_iter().flat_map(|column| g.columns.column(column).to_vec());
             rgb.into_iter().chain(renderer.alpha().iter().copied()).chain(floats).map(f32::to_bits).collect()
@@ -160,7 +163,8 @@ fn pictures_agree() {
 /// Largest difference in colour and alpha, and the number of pixels compared; early stops must agree.
 fn worst_pixel(scene: &Scene) -> (f64, usize) {
     let mut renderer = CpuRenderer::new();
-    let image = renderer.forward(&scene.rows, &scene.camera, &scene.options).clone();
+    renderer.draw(&scene.rows, &scene.camera, &scene.options).unwrap();
+    let image = renderer.image().unwrap().clone();
     let (ambiguous, terminated) = (scene.file.f64("ambiguous"), scene.file.f64("terminated"));
     let (rgb, alpha) = (scene.planar("rgb"), scene.file.f64("alpha"));
     let (width, pixels) = (scene.camera.width as usize, scene.camera.pixels());
@@ -295,8 +299,10 @@ fn a_short_training_run_follows_the_reference() {
     let curve = file.f64("curve_f64");
     let mut psnr = 0.0;
     for step in 1..=file.shape("lrs")[0] {
-        Renderer::forward(&mut renderer, &rows, &camera, &options).unwrap();
-        let value = renderer.loss_backward(&rows, &target, &loss, &mut grads).unwrap();
+        renderer.draw(&rows, &camera, &options).unwrap();
+        renderer.loss(&target, &loss).unwrap();
+        renderer.backpropagate(&rows, &mut grads).unwrap();
+        let value = renderer.loss_value().unwrap();
         let want = &curve[4 * (step - 1)..4 * step];
         psnr = -10.0 * value.mse.log10();
         // In f32 the reference is 1e-7 off to step 10, 6e-7 at 50, 7e-6 at 200; suggested 1e-5 to 20, 1e-4 to 100.

@@ -2,7 +2,6 @@
 
 use crate::support::Fixture;
 use gsscale::base::simd::SimdPath;
-use gsscale::kernels::project_fwd::Projected;
 use gsscale::kernels::sh_bwd::sh_bwd;
 use gsscale::kernels::sh_fwd::{basis_len, sh_basis, sh_fwd, unit_direction};
 use gsscale::scene::camera::Camera;
@@ -24,13 +23,6 @@ fn camera_at_origin() -> Camera {
         near_plane: 0.01,
         far_plane: 1e10,
     }
-}
-
-fn all_visible(rows: usize) -> Projected {
-    let mut p = Projected::default();
-    p.resize(rows);
-    p.radii.fill([1, 1]);
-    p
 }
 
 /// Rows of the fixture stored with `stored` bands, the bands above the fixture's own filled with a value that must
@@ -91,9 +83,10 @@ fn colours_and_gradients_agree() {
 fn compare(file: &Fixture, degree: u8, stored: u8) {
     let what = |name: &str| format!("degree {degree} of {stored}, {name}");
     let rows = rows_of(file, degree, stored);
-    let (n, camera, projected, simd) = (rows.rows(), camera_at_origin(), all_visible(rows.rows()), SimdPath::best());
-    let mut colors = Vec::new();
-    sh_fwd(&rows, &camera, degree, &projected, simd, &mut colors);
+    let (n, camera, simd) = (rows.rows(), camera_at_origin(), SimdPath::best());
+    // All of them are drawn.
+    let (radii, mut colors) = (vec![[1, 1]; n], vec![[0.0; 3]; n]);
+    sh_fwd(&rows, &camera, degree, &radii, simd, &mut colors);
     let want = file.f64("colors");
     assert_close(&what("colours"), colors.iter().flatten().copied(), want, largest(want).max(1.0));
 
@@ -106,7 +99,7 @@ fn compare(file: &Fixture, degree: u8, stored: u8) {
     for column in [&mut grads.means, &mut grads.sh0, &mut grads.sh_n] {
         column.fill(9.0);
     }
-    sh_bwd(&rows, &camera, degree, &projected, &colors, &v_colors, simd, &mut grads);
+    sh_bwd(&rows, &camera, degree, &radii, &colors, &v_colors, simd, &mut grads);
     let k = basis_len(degree);
     let width = 3 * (basis_len(stored) - 1);
     let in_use = (0..n).flat_map(|r| {

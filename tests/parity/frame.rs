@@ -8,10 +8,12 @@ use crate::support::Fixture;
 use crate::support::gpu::open;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
-use gsscale::gpu::{GpuError, GpuOptions};
+use gsscale::gpu::{FaultKind, GpuError, GpuOptions, InjectedFault};
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::gpu::GpuRenderer;
-use gsscale::render::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer, SsimPadding};
+use gsscale::render::{
+    Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, SsimPadding,
+};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::{Image, Target};
@@ -57,8 +59,10 @@ fn results(
 ) -> Results {
     let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
     let mut grads = Gradients::default();
-    renderer.forward(rows, camera, options).unwrap();
-    let value = renderer.loss_backward(rows, target, &loss, &mut grads).unwrap();
+    renderer.draw(rows, camera, options).unwrap();
+    renderer.loss(target, &loss).unwrap();
+    renderer.backpropagate(rows, &mut grads).unwrap();
+    let value = renderer.loss_value().unwrap();
     Results { image: renderer.image().unwrap().clone(), value, grads }
 }
 
@@ -265,7 +269,7 @@ fn views_that_do_not_fit_are_errors_that_name_need_limit_and_remedy() {
     for options in cases {
         let Some(mut gpu) = renderer(&options) else { return };
         let (rows, camera) = scene(4000, 160, 112);
-        let error = gpu.forward(&rows, &camera, &RenderOptions::default()).unwrap_err();
+        let error = gpu.draw(&rows, &camera, &RenderOptions::default()).unwrap_err();
         let text = format!("{error} {}", error.remedy().unwrap_or_default());
         assert!(text.contains("--device-mem") || text.contains("--max-resolution"), "{text}");
         match error {
@@ -275,12 +279,13 @@ fn views_that_do_not_fit_are_errors_that_name_need_limit_and_remedy() {
             }
             other => panic!("{other}"),
         }
-        assert_eq!(gpu.image().unwrap_err(), RenderError::NoForward, "no picture after an error");
+        let error = gpu.image().unwrap_err();
+        assert!(matches!(error, RenderError::OutOfOrder { .. }), "no picture after an error: {error}");
         // Smaller views still work.
         let (small, camera) = scene(20, 32, 32);
         gpu.set_capacity(1000);
         if options.budget.is_none() {
-            gpu.forward(&small, &camera, &RenderOptions::default()).unwrap();
+            gpu.draw(&small, &camera, &RenderOptions::default()).unwrap();
         }
     }
 }
@@ -304,22 +309,119 @@ fn a_view_allocates_nothing_once_warm_and_uploads_its_rows_only() {
     assert!((least..least + (64 << 10)).contains(&uploaded), "{uploaded} bytes, {least} at least");
 }
 
+/// The stages are calls of their own, but the device gets no more submissions than their overlap needs: five a view. The
+/// stage in which a fault at a submission ends the view says which stage submitted it.
+#[test]
+fn stages_share_five_submissions() {
+    let (rows, camera) = scene(300, 40, 30);
+    let (target, options) = (photo(40, 30, false), RenderOptions::default());
+    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
+    let submitted = ["rows_in", "picture", "loss", "rows_out", "rows_out"];
+    for (submission, want) in (1..).zip(submitted.into_iter().chain(submitted)) {
+        let fault = Some(InjectedFault { kind: FaultKind::OutOfMemory, submission });
+        let Some(mut gpu) = renderer(&GpuOptions { fault, ..GpuOptions::default() }) else { return };
+        let mut grads = Gradients::default();
+        let mut view = || -> Result<(), (&str, RenderError)> {
+            let of = |stage| move |error| (stage, error);
+            gpu.begin_view(&camera, &options, 1).map_err(of("begin_view"))?;
+            gpu.rows_in(&rows).map_err(of("rows_in"))?;
+            gpu.picture().map_err(of("picture"))?;
+            gpu.loss(&target, &loss).map_err(of("loss"))?;
+            gpu.picture_back().map_err(of("picture_back"))?;
+            gpu.rows_out(0, &rows, &mut grads).map_err(of("rows_out"))?;
+            gpu.loss_value().map(|_| ()).map_err(of("loss_value"))
+        };
+        let (stage, error) = view().and_then(|()| view()).unwrap_err();
+        assert_eq!(stage, want, "submission {submission}: {error}");
+        let is_gone = gpu.loss_value().unwrap_err();
+        assert!(matches!(is_gone, RenderError::OutOfOrder { .. }), "no view after an error of the device: {is_gone}");
+    }
+}
+
 #[test]
 fn misuse_is_an_error() {
     let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
     let (rows, camera) = scene(10, 32, 32);
     let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
     let mut grads = Gradients::default();
-    let mut backward = |gpu: &mut GpuRenderer, rows: &Columns, target: &Target| {
-        gpu.loss_backward(rows, target, &loss, &mut grads).unwrap_err()
-    };
-    assert_eq!(backward(&mut gpu, &rows, &photo(32, 32, false)), RenderError::NoForward);
-    gpu.forward(&rows, &camera, &RenderOptions::default()).unwrap();
-    assert_eq!(backward(&mut gpu, &scene(9, 32, 32).0, &photo(32, 32, false)), RenderError::NoForward);
-    let wrong = backward(&mut gpu, &rows, &photo(16, 32, false));
+    let is_order = |result: Result<(), RenderError>| matches!(result, Err(RenderError::OutOfOrder { .. }));
+    let (options, small) = (RenderOptions::default(), scene(9, 32, 32).0);
+    assert!(
+        is_order(gpu.rows_in(&rows)) && is_order(gpu.picture()) && is_order(gpu.loss(&photo(32, 32, false), &loss))
+    );
+    gpu.begin_view(&camera, &options, 1).unwrap();
+    assert!(is_order(gpu.picture()));
+    gpu.rows_in(&rows).unwrap();
+    assert!(is_order(gpu.rows_in(&rows)) && is_order(gpu.picture_back()));
+    gpu.picture().unwrap();
+    let wrong = gpu.loss(&photo(16, 32, false), &loss).unwrap_err();
     assert!(matches!(wrong, RenderError::TargetSize { .. }));
+    assert!(is_order(gpu.picture_back()) && is_order(gpu.loss_value().map(|_| ())));
+    gpu.loss(&photo(32, 32, false), &loss).unwrap();
+    gpu.picture_back().unwrap();
+    assert!(is_order(gpu.image().map(|_| ())) && is_order(gpu.loss(&photo(32, 32, false), &loss)));
+    let wrong = gpu.rows_out(0, &small, &mut grads).unwrap_err();
+    assert_eq!(wrong, RenderError::BatchRows { batch: 0, given: 9 });
+    gpu.rows_out(0, &rows, &mut grads).unwrap();
+    assert!(is_order(gpu.rows_out(0, &rows, &mut grads)));
+    gpu.picture_gradient().unwrap().v_rgb.pop();
+    assert_eq!(gpu.picture_back(), Err(RenderError::GradientSize { pixels: 32 * 32 }));
+    // Begun, and begun anew before the recorded colours were submitted.
+    gpu.begin_view(&camera, &options, 1).unwrap();
+    gpu.rows_in(&rows).unwrap();
+    gpu.draw(&small, &camera, &options).unwrap();
+    assert_eq!(gpu.begin_view(&camera, &options, 2), Err(RenderError::Batches { asked: 2, most: 1 }));
     let high = RenderOptions { sh_degree: 3, ..RenderOptions::default() };
-    assert!(matches!(gpu.forward(&Columns::zeros(1, 1), &camera, &high), Err(RenderError::ShDegree { .. })));
+    assert!(matches!(gpu.draw(&Columns::zeros(1, 1), &camera, &high), Err(RenderError::ShDegree { .. })));
+}
+
+/// A second term of the loss adds its gradient on the host: both backends go on from the sum.
+#[test]
+fn gradients_that_the_caller_adds_to_reach_the_rows() {
+    let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
+    let (rows, camera) = scene(900, 65, 47);
+    let (target, options) = (photo(65, 47, true), RenderOptions::default());
+    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
+    let mut draws = Stream::new(5, Purpose::Test, 0, 0);
+    let scale = 1.0 / camera.pixels() as f32;
+    let term: Vec<f32> = (0..3 * camera.pixels()).map(|_| scale * draws.normal() as f32).collect();
+    let with_term = |renderer: &mut dyn Renderer, weight: Option<f32>| {
+        let mut grads = Gradients::default();
+        renderer.draw(&rows, &camera, &options).unwrap();
+        renderer.loss(&target, &loss).unwrap();
+        if let Some(weight) = weight {
+            let gradient = renderer.picture_gradient().unwrap();
+            gradient.v_rgb.iter_mut().zip(&term).for_each(|(v, term)| *v += weight * term);
+        }
+        renderer.backpropagate(&rows, &mut grads).unwrap();
+        let value = renderer.loss_value().unwrap();
+        Results { image: renderer.image().unwrap().clone(), value, grads }
+    };
+    let (plain, want) = (with_term(&mut gpu, None), with_term(&mut CpuRenderer::new(), Some(1.0)));
+    assert!(bits(&with_term(&mut gpu, Some(0.0))) == bits(&plain), "to the host and back no bit changes");
+    let got = with_term(&mut gpu, Some(1.0));
+    assert_same("a second term", &got, &want);
+    assert!(l2(&got.grads.columns.sh0, &plain.grads.columns.sh0) > 0.1, "the term is not lost in the loss");
+    assert_eq!(got.value, plain.value, "the value is that of the loss alone");
+    // With a correction of the picture before the loss, and its gradient taken back through the correction.
+    let with_exposure = |renderer: &mut dyn Renderer, exposure: f32| {
+        let mut grads = Gradients::default();
+        renderer.draw(&rows, &camera, &options).unwrap();
+        renderer.picture_mut().unwrap().iter_mut().for_each(|x| *x *= exposure);
+        renderer.loss(&target, &loss).unwrap();
+        renderer.picture_gradient().unwrap().v_rgb.iter_mut().for_each(|v| *v *= exposure);
+        renderer.backpropagate(&rows, &mut grads).unwrap();
+        let value = renderer.loss_value().unwrap();
+        Results { image: renderer.image().unwrap().clone(), value, grads }
+    };
+    assert!(bits(&with_exposure(&mut gpu, 1.0)) == bits(&plain));
+    let (corrected, want) = (with_exposure(&mut gpu, 1.25), with_exposure(&mut CpuRenderer::new(), 1.25));
+    assert_same("an exposure", &corrected, &want);
+    assert!((corrected.value.loss - plain.value.loss).abs() > 1e-3, "the loss compares the corrected picture");
+    // A frame that was too small is found out by whoever asks first: here the caller who wants the gradient.
+    gpu.set_capacity(100);
+    assert!(bits(&with_term(&mut gpu, Some(1.0))) == bits(&got));
+    assert_eq!(gpu.frames_again(), 1);
 }
 
 /// The reference files: see `tests/oracle/raster.rs`, whose limits are those of the files' README.
@@ -377,7 +479,7 @@ fn views_are_those_of_the_reference() {
     let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
     for name in FILES {
         let Some((file, rows, camera, options)) = open_reference(name) else { return };
-        gpu.forward(&rows, &camera, &options).unwrap();
+        gpu.draw(&rows, &camera, &options).unwrap();
         let (rgb, want) = (gpu.image().unwrap().rgb.clone(), planar(&file.f32("rgb")));
         let (alpha, want_alpha) = (gpu.alpha().unwrap(), file.f64("alpha"));
         let (ambiguous, pixels) = (file.f64("ambiguous"), camera.pixels());
@@ -389,7 +491,9 @@ fn views_are_those_of_the_reference() {
             assert!((f64::from(alpha[p]) - want_alpha[p]).abs() < 5e-5, "{name}: coverage of pixel {p}");
         }
         let mut grads = Gradients::default();
-        gpu.backward(&rows, &planar(&file.f32("v_rgb")), Some(&file.f32("v_alpha")), &mut grads).unwrap();
+        let (v_rgb, v_alpha) = (planar(&file.f32("v_rgb")), Some(file.f32("v_alpha").to_vec()));
+        *gpu.picture_gradient().unwrap() = PictureGradient { v_rgb, v_alpha };
+        gpu.backpropagate(&rows, &mut grads).unwrap();
         assert_gradients(name, &file, &grads);
     }
 }

@@ -68,15 +68,16 @@ struct Results {
 
 fn on_cpu(rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]]) -> Results {
     let simd = SimdPath::best();
-    let (mut p, mut colors, mut grads) = (Projected::default(), Vec::new(), Columns::zeros(rows.rows(), 3));
-    project_fwd(rows, camera, EPS2D, simd, &mut p);
-    sh_fwd(rows, camera, degree, &p, simd, &mut colors);
+    let (mut p, mut colors, mut grads) =
+        (Projected::default(), vec![[0.0; 3]; rows.rows()], Columns::zeros(rows.rows(), 3));
+    project_fwd(rows, camera, EPS2D, simd, 0, &mut p);
+    sh_fwd(rows, camera, degree, &p.radii, simd, &mut colors);
     let v_colors: Vec<_> = v.iter().map(|v| [v[8], v[9], v[10]]).collect();
     let v_means2d: Vec<_> = v.iter().map(|v| [v[0], v[1]]).collect();
     let v_conics: Vec<_> = v.iter().map(|v| [v[4], v[5], v[6]]).collect();
     let v_opacities: Vec<_> = v.iter().map(|v| v[3]).collect();
-    sh_bwd(rows, camera, degree, &p, &colors, &v_colors, simd, &mut grads);
-    project_bwd(rows, camera, EPS2D, &p, &v_means2d, &v_conics, &v_opacities, simd, &mut grads);
+    sh_bwd(rows, camera, degree, &p.radii, &colors, &v_colors, simd, &mut grads);
+    project_bwd(rows, camera, EPS2D, &p.radii, &v_means2d, &v_conics, &v_opacities, simd, &mut grads);
     let projected = (0..rows.rows()).map(|i| record_of(&p, i, [0.0; 3])).collect();
     Results { projected, colors, grads }
 }

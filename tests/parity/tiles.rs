@@ -13,7 +13,7 @@ use gsscale::kernels::rasterize_fwd::{Lists, Raster, rasterize_fwd, untile};
 use gsscale::kernels::scan::scan;
 use gsscale::kernels::splats::{Grid, Packed, pack};
 use gsscale::render::gpu_tiles::{Blend, Pairs, TileStages, splat_bytes};
-use gsscale::render::gpu_tiles_bwd::PictureGradients;
+use gsscale::render::gpu_tiles_bwd::PictureGradientBuffers;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// The device on each path that it has: subgroups of 8, subgroups of any size, none.
@@ -250,7 +250,7 @@ fn on_gpu(gpu: &Gpu, stages: &mut TileStages, scene: &Scene, v_rgb: &[f32], v_al
     let (ranks, frame, demand) = stages.forward(gpu, &splats.view(), rows, scene.blend).unwrap();
     let mut recorder = gpu.begin("backward");
     let (from, to) = (splats.view(), v_splats.view());
-    let picture = PictureGradients { v_rgb: &v_rgb.view(), v_alpha: v_alpha_view.as_ref() };
+    let picture = PictureGradientBuffers { v_rgb: &v_rgb.view(), v_alpha: v_alpha_view.as_ref() };
     stages.backward(gpu, &mut recorder, &from, &ranks, &frame, demand, picture, &to).unwrap();
     let read = [
         &ranks.order,
