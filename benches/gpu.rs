@@ -14,6 +14,7 @@
 pub mod support;
 
 use gsscale::base::simd::SimdPath;
+use gsscale::config::choice::Chosen;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::gpu::{DeviceChoice, Gpu, GpuOptions, GpuResult};
@@ -115,7 +116,7 @@ fn steps<R: Renderer>(
     [warm, rounds]: [usize; 2],
     isects: impl Fn(&R) -> u64,
 ) -> Run {
-    let config = TrainConfig { simd: simd.name().to_string(), sh_every: 0, ..TrainConfig::default() };
+    let config = TrainConfig { simd: Chosen(Some(simd)), sh_every: 0, ..TrainConfig::default() };
     let options = RunOptions::new(&config, case.scene_scale);
     let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
     let made = PagedScene::new(&case.columns, pager, &options);

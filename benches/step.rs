@@ -19,6 +19,7 @@
 pub mod support;
 
 use gsscale::base::simd::SimdPath;
+use gsscale::config::choice::Chosen;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::paging::pager::{Pager, PagerConfig};
@@ -133,7 +134,7 @@ struct StepResult {
 }
 
 fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult {
-    let config = TrainConfig { simd: simd.name().to_string(), sh_every: 0, ..TrainConfig::default() };
+    let config = TrainConfig { simd: Chosen(Some(simd)), sh_every: 0, ..TrainConfig::default() };
     let options = RunOptions::new(&config, case.scene_scale);
     let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
     let made = PagedScene::new(&case.columns, pager, &options);

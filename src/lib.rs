@@ -29,9 +29,9 @@
 //! | [`kernels`] | the ordered table of stages and each stage as a function on plain slices |
 //! | [`render`] | the stages in order, on the CPU or a device: rows in, picture, loss, picture back, rows out; image metrics |
 //! | [`optim`] | learning rates as a function of the step; dense Adam (oracle) and deferred Adam |
-//! | [`densify`] | statistics, decisions and edits that change the number of Gaussians |
+//! | [`densify`] | what changes the number of Gaussians: strategies, the statistics they decide by, the events they log, applying these |
 //! | [`exchange`] | PLY in and out; what TensorBoard reads |
-//! | [`config`] | what the user wrote and what follows from it |
+//! | [`config`] | what the user wrote, parsed once into the types of the rooms above, and what follows from it |
 //! | [`report`] | pages for people: charts and pictures of what a run left behind |
 //! | [`train`] | the only place where all of it meets: one step, the loop, evaluation, commits and `--resume`, what tools do with checkpoints |
 //!

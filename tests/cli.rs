@@ -317,6 +317,76 @@ fn switches_may_stand_before_the_scene() {
 }
 
 #[test]
+fn unknown_words_are_refused_with_the_words_that_are_known() {
+    let (folder, scene, _) = small();
+    let help = train(&["--help"]);
+    let help = String::from_utf8_lossy(&help.stdout).split_whitespace().collect::<Vec<_>>().join(" ");
+    for (key, words, listed) in [
+        ("view-order", "auto, shuffle, groups:N or tour", "auto, shuffle, groups:N, tour"),
+        ("ssim-padding", "valid or same", "valid, same"),
+        ("optimizer", "deferred, dense or sparse", "deferred, dense, sparse"),
+        ("moments", "f32 or bf16", "f32, bf16"),
+        ("strategy", "default or none", "default, none"),
+        ("log", "json or tensorboard", "json, tensorboard"),
+        ("ssim-variant", "same, valid or reflect", "same, valid, reflect"),
+        ("color-correct", "off, affine or quadratic", "off, affine, quadratic"),
+        ("export-frame", "dataset or local", "dataset, local"),
+        ("io", "auto, uring, mmap or pread", "auto, uring, mmap, pread"),
+        ("spill-codec", "raw, halves, zstd:LEVEL or auto", "raw, halves, zstd:LEVEL, auto"),
+        ("evict", "belady or lru", "belady, lru"),
+        ("transfers", "overlap, ahead or demand", "overlap, ahead, demand"),
+        ("simd", "auto, avx512, avx2 or baseline", "auto, avx512, avx2, baseline"),
+    ] {
+        let sentence = format!("unknown --{key} 'memory': use {words}");
+        let out = folder.path().join("refused");
+        let output = train(&[text(&scene), "--out", text(&out), &format!("--{key}"), "memory"]);
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.starts_with(&format!("error: {sentence}\n")), "{said}");
+        assert!(!out.exists(), "something was left behind: {said}");
+        let file = folder.path().join("unknown.toml");
+        std::fs::write(&file, format!("{key} = \"memory\"\n")).unwrap();
+        refuses(&folder, &scene, &["--config", text(&file)], &["unknown.toml", &sentence]);
+        assert!(help.contains(&format!("[possible values: {listed}]")), "--help does not list the words of --{key}");
+    }
+    let output = train(&[text(&scene), "--out", text(&folder.path().join("refused")), "--device", " "]);
+    assert!(stderr(&output).contains("unknown --device ' ': use auto, gpu, cpu"), "{}", stderr(&output));
+}
+
+/// The words of a config.toml are those that the user wrote: an older program reads them, and `--resume` compares them.
+#[test]
+fn a_run_keeps_the_words_that_were_written() {
+    let (folder, scene, _) = small();
+    let out = folder.path().join("words");
+    let words = [
+        ("view-order", "groups:2"),
+        ("ssim-padding", "same"),
+        ("optimizer", "sparse"),
+        ("moments", "bf16"),
+        ("strategy", "none"),
+        ("log", "tensorboard"),
+        ("ssim-variant", "reflect"),
+        ("color-correct", "quadratic"),
+        ("export-frame", "local"),
+        ("io", "pread"),
+        ("spill-codec", "zstd:3"),
+        ("evict", "lru"),
+        ("transfers", "demand"),
+        ("simd", "baseline"),
+        ("device", "cpu"),
+    ];
+    let flags: Vec<String> = words.iter().flat_map(|(key, word)| [format!("--{key}"), word.to_string()]).collect();
+    let mut args = vec![text(&scene), "--out", text(&out), "--steps", "2"];
+    args.extend(flags.iter().map(String::as_str));
+    let output = train(&args);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let config = std::fs::read_to_string(out.join("config.toml")).unwrap();
+    for (key, word) in words {
+        assert!(config.lines().any(|line| line == format!("{key} = \"{word}\"")), "{key}: {config}");
+    }
+}
+
+#[test]
 fn numbers_that_no_machine_can_hold_are_refused() {
     let (folder, scene, _) = small();
     for (flag, value) in [

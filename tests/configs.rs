@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
 use gsscale::config::file::{KEYS, TrainConfig, default_file};
+use gsscale::config::key::Key;
 use std::path::PathBuf;
 
 fn configs() -> PathBuf {
@@ -22,9 +23,8 @@ fn default_file_is_the_default() {
         "configs/default.toml is out of date: run the test once with GSSCALE_WRITE_DEFAULT_CONFIG=1"
     );
     assert_eq!(TrainConfig::read(&path).unwrap(), TrainConfig::default());
-    for (_, name, _) in KEYS {
-        let key = format!("\n{} = ", name.replace('_', "-"));
-        assert!(written.contains(&key), "{name} is not in default.toml");
+    for name in KEYS.iter().map(Key::name) {
+        assert!(written.contains(&format!("\n{name} = ")), "{name} is not in default.toml");
     }
 }
 

@@ -5,6 +5,7 @@ use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
+use gsscale::densify::strategy::StrategyName;
 use gsscale::kernels::constants::EPS2D;
 use gsscale::kernels::project_fwd::{Projected, project_fwd};
 use gsscale::optim::adam::AdamConfig;
@@ -156,7 +157,7 @@ fn no_row_that_the_projection_kernel_draws_is_left_out() {
 fn no_row_outside_of_the_selected_pages_changes_a_picture() {
     const STEPS: u32 = 60;
     let config = TrainConfig { page_rows: 32, sh_degree: 0, means_lr: 0.02, ..TrainConfig::default() };
-    let options = RunOptions::new(&TrainConfig { strategy: "none".to_string(), ..config }, 1.0);
+    let options = RunOptions::new(&TrainConfig { strategy: StrategyName::None, ..config }, 1.0);
     let adam = DeferredAdam::new(options.rates, AdamConfig::default(), SimdPath::best());
     let columns = scene(4000, &adam).columns;
     let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));

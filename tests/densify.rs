@@ -4,10 +4,11 @@
 
 use gsscale::base::rng::{Purpose, Stream, hash64};
 use gsscale::base::simd::SimdPath;
+use gsscale::densify::default::DefaultStrategy;
 use gsscale::densify::ops::child_uid;
-use gsscale::densify::policy::DensifyConfig;
 use gsscale::densify::replay::apply_event;
 use gsscale::densify::stats::{GradHistogram, accumulate};
+use gsscale::densify::strategy::Strategy;
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
@@ -146,14 +147,14 @@ fn row_is_drawn(uid: u64, step: u32) -> bool {
 #[test]
 fn events_applied_late_to_parts_give_the_rows_of_events_applied_on_time() {
     let (adam, start, parts, steps) = (adam(), scene(1200, 1), 6, 260u32);
-    let config = DensifyConfig {
+    let config = DefaultStrategy {
         refine_start: 20,
         refine_every: 30,
         reset_every: 70,
         refine_stop: 240,
         grow_grad2d: 3e-4,
         max_gaussians: 1330,
-        ..DensifyConfig::default()
+        ..DefaultStrategy::default()
     };
     // On time, the whole scene in one table.
     let (mut whole, mut log, mut histogram) = (start.clone(), EventLog::default(), GradHistogram::default());
@@ -162,7 +163,7 @@ fn events_applied_late_to_parts_give_the_rows_of_events_applied_on_time() {
         touch(&mut whole, &adam, step, &mut histogram, |uid| {
             part_is_drawn(part_from_uid[&uid], step) && row_is_drawn(uid, step)
         });
-        let kinds: Vec<EventKind> = config.events_after(step, 1.0, whole.rows() as u64, &histogram).collect();
+        let kinds: Vec<EventKind> = config.events_after(step, 1.0, whole.rows() as u64, &histogram);
         for kind in kinds {
             let index = log.push(Event { step, kind });
             for &uid in &whole.uid {
@@ -217,14 +218,14 @@ fn the_cap_is_reached_and_never_exceeded() {
     for max_gaussians in [500, 2000, 2001, 2040, 2300] {
         let (adam, mut state, mut histogram) = (adam(), scene(2000, 0), GradHistogram::default());
         // Nothing is pruned, so that only the cap limits.
-        let config = DensifyConfig { prune_opa: 0.0, reset_every: 0, max_gaussians, ..DensifyConfig::default() };
+        let config = DefaultStrategy { prune_opa: 0.0, reset_every: 0, max_gaussians, ..DefaultStrategy::default() };
         for (index, step) in [600u32, 700, 800].into_iter().enumerate() {
             for s in step - 5..step {
                 touch(&mut state, &adam, s, &mut histogram, |uid| row_is_drawn(uid, s));
             }
             assert_eq!(histogram, histogram_of(&state));
             let rows = state.rows() as u64;
-            let kind = config.events_after(step, 1.0, rows, &histogram).next().unwrap();
+            let kind = config.events_after(step, 1.0, rows, &histogram)[0];
             apply_event(&mut state, &adam, SEED, index, &Event { step, kind });
             histogram.clear();
             assert!(state.rows() as u64 <= max_gaussians.max(2000), "{} of {max_gaussians}", state.rows());

@@ -15,10 +15,12 @@ use faulty_engine::{Fault, Faults, FaultyEngine, Operation};
 use gsscale::base::identity::RunId;
 use gsscale::checkpoint::interval::CommitEvery;
 use gsscale::checkpoint::run_state::RunIdentity;
+use gsscale::config::choice::{Chosen, Device};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::{RunOptions, simd_path};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::dataset::target_cache::TargetCache;
+use gsscale::optim::method::Method;
 use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
@@ -29,6 +31,7 @@ use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::page_layout::capacity_bytes;
+use gsscale::schedule::order::Order;
 use gsscale::train::checkpoint::{Checkpoint, Origin};
 use gsscale::train::error::TrainError;
 use gsscale::train::facts::{Resolved, write_config};
@@ -61,12 +64,12 @@ fn config(spill: &Path) -> TrainConfig {
         refine_every: 10,
         reset_every: 25,
         sh_every: 15,
-        view_order: "groups:4".into(),
+        view_order: Chosen(Some(Order::Groups(4))),
         log_every: 7,
         test_every: 24,
-        device: "cpu".into(),
+        device: Device::Cpu,
         spill_dir: text(spill).into(),
-        spill_codec: "raw".into(),
+        spill_codec: Chosen(Some(Codec::Raw)),
         commit_every: CommitEvery::Seconds(0.05),
         disk_full_wait: 30.0,
         ..TrainConfig::default()
@@ -98,7 +101,7 @@ struct World {
     fewest: usize,
     /// The run can go on without its commits.
     is_optional: bool,
-    optimizer: &'static str,
+    optimizer: Method,
 }
 
 /// How a life on a misbehaving drive ended.
@@ -109,10 +112,10 @@ struct Life {
 
 impl World {
     fn new() -> World {
-        World::of("deferred")
+        World::of(Method::Deferred)
     }
 
-    fn of(optimizer: &'static str) -> World {
+    fn of(optimizer: Method) -> World {
         let folder = TempDir::new().unwrap();
         let scene = make_scene(folder.path());
         let mut world = World { folder, scene, want: Vec::new(), fewest: usize::MAX, is_optional: false, optimizer };
@@ -134,7 +137,7 @@ impl World {
 
     fn train_in(&self, out: &Path, faults: &Faults, plan: impl FnOnce(&Faults)) -> Result<(), TrainError> {
         let spill_dir = out.join("spill");
-        let config = TrainConfig { optimizer: self.optimizer.into(), ..config(&spill_dir) };
+        let config = TrainConfig { optimizer: self.optimizer, ..config(&spill_dir) };
         let start = Start::read(&self.scene, &config, None)?;
         let print = dataset_print(&start).unwrap();
         let sh_degree_start = start.sh_degree_start;
@@ -392,7 +395,7 @@ fn a_run_in_memory_goes_on_when_the_drive_of_its_commits_is_full() {
 /// Its steps go on changing rows after they have changed those of their view.
 #[test]
 fn so_does_a_run_in_memory_that_updates_every_row() {
-    loses_commits_alone(World::of("dense"));
+    loses_commits_alone(World::of(Method::Dense));
 }
 
 fn loses_commits_alone(mut world: World) {

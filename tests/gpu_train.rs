@@ -11,6 +11,7 @@ use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::photo::decode;
 use gsscale::dataset::target_cache::TargetCache;
+use gsscale::densify::strategy::StrategyName;
 use gsscale::gpu::GpuOptions;
 use gsscale::kernels::stages::STAGES;
 use gsscale::paging::pager::{Pager, PagerConfig};
@@ -215,7 +216,7 @@ fn a_device_without_memory_left_leaves_the_last_good_step() {
 fn bits_of_steps(scene: &Path, options: &GpuOptions, capacity: u32) -> Option<(Vec<u32>, u32, u64)> {
     let mut renderer = GpuRenderer::new(gpu::open(options)?).unwrap();
     renderer.set_capacity(capacity);
-    let config = TrainConfig { steps: 10, strategy: "none".into(), sh_every: 0, ..TrainConfig::default() };
+    let config = TrainConfig { steps: 10, strategy: StrategyName::None, sh_every: 0, ..TrainConfig::default() };
     let Prepared { dataset, mut columns, .. } = prepare(scene, &config).unwrap();
     // Large enough for several tiles each.
     columns.scales.iter_mut().for_each(|s| *s += 0.7);
@@ -273,7 +274,7 @@ fn windows_waits_and_second_tries_change_no_bit_of_whole_steps() {
 /// What the third and fourth step upload and allocate, of a scene `times` as large whose other rows no camera sees.
 fn steps_of_a_scene(scene: &Path, times: usize) -> Option<(Vec<usize>, Traffic, Traffic)> {
     let renderer = GpuRenderer::new(gpu::open(&GpuOptions::default())?).unwrap();
-    let config = TrainConfig { steps: 10, strategy: "none".into(), ..TrainConfig::default() };
+    let config = TrainConfig { steps: 10, strategy: StrategyName::None, ..TrainConfig::default() };
     let Prepared { dataset, mut columns, .. } = prepare(scene, &config).unwrap();
     let rows = columns.rows();
     // Against the direction in which the cameras look, all of them: they look down on the city.

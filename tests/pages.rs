@@ -5,10 +5,11 @@
 use gsscale::base::ids::PageId;
 use gsscale::base::rng::{Purpose, Stream, hash64};
 use gsscale::base::simd::SimdPath;
+use gsscale::densify::default::DefaultStrategy;
 use gsscale::densify::ops::child_uid;
-use gsscale::densify::policy::DensifyConfig;
 use gsscale::densify::replay::{PageEdit, PendingEvents, apply_event};
 use gsscale::densify::stats::{GradHistogram, accumulate};
+use gsscale::densify::strategy::Strategy;
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::bounds::SplitLimits;
 use gsscale::optim::deferred::DeferredAdam;
@@ -128,15 +129,15 @@ impl<'a> OnTime<'a> {
     }
 }
 
-fn densify(max_gaussians: u64) -> DensifyConfig {
-    DensifyConfig {
+fn densify(max_gaussians: u64) -> DefaultStrategy {
+    DefaultStrategy {
         refine_start: 20,
         refine_every: 30,
         reset_every: 70,
         refine_stop: 240,
         grow_grad2d: 2e-4,
         max_gaussians,
-        ..DensifyConfig::default()
+        ..DefaultStrategy::default()
     }
 }
 
@@ -146,7 +147,7 @@ fn on_time<'a>(start: &SceneState, adam: &'a DeferredAdam) -> OnTime<'a> {
     for step in 0..STEPS {
         whole.step(step);
         let rows = whole.state.rows() as u64;
-        let mut kinds: Vec<EventKind> = config.events_after(step, 1.0, rows, &whole.histogram).collect();
+        let mut kinds: Vec<EventKind> = config.events_after(step, 1.0, rows, &whole.histogram);
         if step % 85 == 84 {
             kinds.push(EventKind::RaiseShDegree { degree: (step / 85) as u8 + 1 });
         }
@@ -348,8 +349,8 @@ fn a_cap_by_which_pages_decide_is_never_exceeded_and_gives_the_rows_of_events_ap
             assert!(rows.iter().all(|rows| *rows <= pages.rows_bound), "{case}: {rows:?} at step {step}");
             assert!(chance < 1000 || pages.rows_bound == rows[0], "{case}: every page is up to date at every step");
             let bound = pages.rows_bound as u64;
-            let kinds: Vec<EventKind> = config.events_after(step, 1.0, bound, &pages.histogram).collect();
-            let at_once: Vec<EventKind> = config.events_after(step, 1.0, rows[0] as u64, &whole.histogram).collect();
+            let kinds: Vec<EventKind> = config.events_after(step, 1.0, bound, &pages.histogram);
+            let at_once: Vec<EventKind> = config.events_after(step, 1.0, rows[0] as u64, &whole.histogram);
             decided_otherwise += usize::from(kinds != at_once);
             for kind in kinds {
                 if let EventKind::Densify(thresholds) = kind {

@@ -5,11 +5,16 @@
 #[path = "support/scenes.rs"]
 mod scenes;
 
+use gsscale::config::choice::Chosen;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::published::{BUILT_IN, PublishedRun};
 use gsscale::dataset::layout::Layout;
 use gsscale::dataset::lookalike::write_lookalike;
 use gsscale::dataset::synthetic::CityOptions;
+use gsscale::densify::strategy::StrategyName;
+use gsscale::render::SsimPadding;
+use gsscale::render::metrics::SsimVariant;
+use gsscale::schedule::order::Order;
 use scenes::{eval, stderr, text, train};
 use serde_json::Value;
 use std::fs;
@@ -68,7 +73,7 @@ fn shared() -> TrainConfig {
         init_opacity: 0.1,
         init_scale: 1.0,
         ssim_lambda: 0.2,
-        ssim_padding: "valid".into(),
+        ssim_padding: SsimPadding::Valid,
         near_plane: 0.01,
         max_alpha: 0.999,
         background: "0,0,0".parse().unwrap(),
@@ -78,15 +83,15 @@ fn shared() -> TrainConfig {
         sh0_lr: 0.0025,
         shn_lr: 0.0025 / 20.0,
         adam_eps: 1e-15,
-        strategy: "default".into(),
+        strategy: StrategyName::Default,
         max_gaussians: 0,
         refine_start: 500,
         refine_every: 100,
         reset_every: 3000,
         prune_opa: 0.005,
         prune_scale3d: 0.1,
-        ssim_variant: "reflect".into(),
-        view_order: "shuffle".into(),
+        ssim_variant: SsimVariant::Reflect,
+        view_order: Chosen(Some(Order::Shuffle)),
         ..TrainConfig::default()
     }
 }
@@ -135,7 +140,7 @@ fn the_files_hold_the_published_figures() {
         };
         let e = facts.expected.unwrap();
         assert_eq!([e.original_psnr, e.original_ssim, e.original_lpips, e.psnr, e.ssim, e.lpips], *figures, "{name}");
-        assert_eq!((e.ssim_variant.as_str(), e.lpips_variant.as_str()), ("reflect", "alex, signed"));
+        assert_eq!((e.ssim_variant, e.lpips_variant.as_str()), (SsimVariant::Reflect, "alex, signed"));
         let memory = facts.memory.unwrap();
         assert_eq!((memory.saving_range, memory.saving_mean), ([3.3, 5.6], 3.98));
         assert_eq!(memory.saving, (name == "aerial").then_some(5.5));

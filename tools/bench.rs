@@ -40,10 +40,12 @@ mod touched;
 
 use clap::Parser;
 use gsscale::base::error::InputError;
+use gsscale::config::choice::{Choice, Device};
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::config::limits::simd_path;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
+use gsscale::gpu::DeviceChoice;
 use gsscale::train::error::TrainError;
 use serde_json::Value;
 use std::ffi::OsString;
@@ -103,7 +105,7 @@ fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, Tra
     keys.clone().apply(&mut config);
     config.check()?;
     if !simd_path(&config).is_supported() {
-        let problem = format!("this machine cannot run {}", config.simd);
+        let problem = format!("this machine cannot run {}", config.simd.word());
         return Err(InputError::new("--simd", problem, "use --simd auto").into());
     }
     if config.threads > 0 {
@@ -115,8 +117,8 @@ fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, Tra
 
 /// Refuses a device other than the CPU: this measurement is of the CPU path.
 fn refuse_devices(config: &TrainConfig) -> Result<(), TrainError> {
-    match config.device.as_str() {
-        "auto" | "cpu" => Ok(()),
+    match &config.device {
+        Device::Cpu | Device::Gpu(DeviceChoice::Auto) => Ok(()),
         other => {
             let problem = format!("this measurement is of the CPU path, not of '{other}'");
             Err(InputError::new("--device", problem, "leave it out, or use gsscale-bench pareto or ladder").into())
@@ -128,7 +130,7 @@ fn refuse_devices(config: &TrainConfig) -> Result<(), TrainError> {
 fn refuse_tiers(config: &TrainConfig) -> Result<(), TrainError> {
     refuse_devices(config)?;
     let given = [
-        ("--spill-dir", !config.spill_dir.is_empty()),
+        ("--spill-dir", config.residence().spill_dir().is_some()),
         ("--frames", config.frames > 0),
         ("--host-mem", config.host_mem.0 > 0),
     ];

@@ -4,7 +4,10 @@
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::units::{format_bytes, format_seconds};
+use gsscale::cache::evict::EvictPolicy;
+use gsscale::config::choice::Chosen;
 use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides, parse_command_line};
+use gsscale::optim::method::Method;
 use gsscale::page::engine::drive_rate::DriveRate;
 use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::scene::camera::Camera;
@@ -66,7 +69,7 @@ struct Args {
     compare_frames: Vec<String>,
     /// Orders of views to compare: auto, shuffle, groups:N, tour; without it --view-order, or else auto and shuffle
     #[arg(long, value_delimiter = ',', value_name = "ORDER", help_heading = "Plan")]
-    compare_orders: Vec<String>,
+    compare_orders: Vec<Chosen<Order>>,
     /// Plan as if every page had grown to this many
     #[arg(long, default_value_t = 1.0, value_name = "X", help_heading = "Plan")]
     growth: f64,
@@ -156,8 +159,8 @@ fn start(args: &Args) -> InputResult<String> {
     }
     let mut rows = Vec::new();
     for &frames in &frames {
-        for text in &orders(args, &scene.config) {
-            rows.push(row(args, &scene, frames, text)?);
+        for order in orders(args, &scene.config) {
+            rows.push(row(args, &scene, frames, order)?);
         }
     }
     if args.json {
@@ -182,7 +185,7 @@ fn load(args: &Args) -> InputResult<Scene> {
     args.keys.clone().apply(&mut config);
     config.check()?;
     set_up(&config)?;
-    if config.optimizer == "dense" {
+    if config.optimizer == Method::Dense {
         let problem = "dense reads and writes every page at every step, which is not planned";
         return Err(InputError::new("--optimizer", problem, "plan for deferred, which gives the same"));
     }
@@ -234,8 +237,8 @@ fn load(args: &Args) -> InputResult<Scene> {
 
 /// Where lists go that outgrow memory: beside the pages if it is known where these would be.
 fn folder_for(config: &TrainConfig) -> PathBuf {
-    let above = Path::new(&config.spill_dir).ancestors().find(|folder| folder.is_dir()).map(Path::to_path_buf);
-    above.filter(|_| !config.spill_dir.is_empty()).unwrap_or_else(std::env::temp_dir)
+    let above = config.residence().spill_dir().and_then(|dir| dir.ancestors().find(|folder| folder.is_dir()));
+    above.map_or_else(std::env::temp_dir, Path::to_path_buf)
 }
 
 /// What the flags say, what the drive of the spill directory does, or else what common drives do.
@@ -243,7 +246,7 @@ fn drive_rates(args: &Args, config: &TrainConfig) -> InputResult<[f64; 2]> {
     let named = [args.drive_read, args.drive_write].map(|rate| rate.map(|rate| rate.0 as f64));
     let measured = match named {
         [Some(_), Some(_)] => COMMON_DRIVE,
-        _ if config.spill_dir.is_empty() => COMMON_DRIVE,
+        _ if config.residence().spill_dir().is_none() => COMMON_DRIVE,
         _ => DriveRate::look(&folder_for(config)).map(|rate| [rate.read, rate.write])?,
     };
     Ok([0, 1].map(|way| named[way].unwrap_or(measured[way])))
@@ -305,18 +308,18 @@ fn frames(args: &Args, scene: &Scene) -> InputResult<Vec<usize>> {
     Ok(frames)
 }
 
-/// The orders to plan for, as text.
-fn orders(args: &Args, config: &TrainConfig) -> Vec<String> {
-    match (args.compare_orders.is_empty(), config.view_order.as_str()) {
+/// The orders to plan for.
+fn orders(args: &Args, config: &TrainConfig) -> Vec<Chosen<Order>> {
+    match (args.compare_orders.is_empty(), config.view_order) {
         (false, _) => args.compare_orders.clone(),
-        (true, "auto") => vec!["auto".into(), "shuffle".into()],
-        (true, order) => vec![order.into()],
+        (true, Chosen(None)) => vec![Chosen(None), Chosen(Some(Order::Shuffle))],
+        (true, order) => vec![order],
     }
 }
 
-fn order(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Order> {
-    if text != "auto" {
-        return text.parse().map_err(|problem| InputError::new("--view-order", problem, "or auto"));
+fn order(args: &Args, scene: &Scene, frames: usize, asked: Chosen<Order>) -> InputResult<Order> {
+    if let Chosen(Some(order)) = asked {
+        return Ok(order);
     }
     let pages = scene.index.len();
     automatic_order(&scene.views, &scene.cameras, pages, frames, scene.config.seed, args.plan_mem.0)
@@ -330,8 +333,8 @@ fn too_few(scene: &Scene, error: &TooFewFrames) -> InputError {
     InputError::new("--frames", error.to_string(), remedy)
 }
 
-fn row(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Row> {
-    let order = order(args, scene, frames, text)?;
+fn row(args: &Args, scene: &Scene, frames: usize, asked: Chosen<Order>) -> InputResult<Row> {
+    let order = order(args, scene, frames, asked)?;
     let views = ViewOrder::new(order, scene.config.seed, &scene.cameras);
     let steps = scene.config.steps.min((EPOCHS * scene.cameras.len() as u32).max(1));
     let run = |policy| {
@@ -340,13 +343,16 @@ fn row(args: &Args, scene: &Scene, frames: usize, text: &str) -> InputResult<Row
     };
     let (planned, lru) = (run(Policy::Farthest)?, run(Policy::LeastRecent)?);
     let figures = planned.figures(planned.steady());
-    let timed = run(if scene.config.evict == "lru" { Policy::LeastRecent } else { Policy::Ahead })?;
+    let timed = run(match scene.config.evict {
+        EvictPolicy::FarthestNextUse => Policy::Ahead,
+        EvictPolicy::LeastRecentlyUsed => Policy::LeastRecent,
+    })?;
     let stall = timed.stall(timed.steady(), &scene.drive);
     let (_, written) = planned.totals();
     let rest = f64::from(scene.config.steps - steps);
     Ok(Row {
         order,
-        is_automatic: text == "auto",
+        is_automatic: asked.0.is_none(),
         frames,
         lru: lru.figures(lru.steady()),
         seconds: f64::from(scene.config.steps) * scene.drive.step_seconds
@@ -448,7 +454,7 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
 
 /// The exact pages that enter and leave in some steps.
 fn lists(args: &Args, scene: &Scene, frames: usize, range: Range<u32>) -> InputResult<String> {
-    let order = order(args, scene, frames, &orders(args, &scene.config)[0])?;
+    let order = order(args, scene, frames, orders(args, &scene.config)[0])?;
     let mut views = ViewOrder::new(order, scene.config.seed, &scene.cameras);
     let mut plan = Plan::new(0, args.plan_mem.0);
     let mut cache = CacheModel::new(frames, Policy::Farthest);

@@ -1,20 +1,38 @@
-//! Every key of a run, once: the TOML file, the command line and the defaults come from the one list below.
+//! Every key of a run, once: the TOML file, the command line, the defaults and the class of each key come from the one
+//! list below.
 //!
 //! Invariants: 1. a key has the same kebab-case spelling in the file and as a flag; 2. flags override the file, the
 //! file overrides the defaults; 3. unknown keys are refused; 4. what a run resolved is written to its config.toml,
 //! which is itself a valid config file (its `[resolved]` table states facts and is ignored when read, as are the tables
 //! of [`super::published`]).
 
+use super::choice::{Chosen, Device, LogFormat};
+use super::key::{Class, Key};
 use crate::base::error::{InputError, InputResult};
+use crate::base::simd::SimdPath;
 use crate::base::units::parse_bytes;
+use crate::cache::evict::EvictPolicy;
 use crate::checkpoint::interval::CommitEvery;
+use crate::densify::strategy::StrategyName;
+use crate::exchange::ply::ExportFrame;
+use crate::gpu::DeviceChoice;
 use crate::optim::adam::EPS_MIN;
+use crate::optim::method::Method;
+use crate::optim::moments::Moments;
+use crate::page::engine::open::IoEngine;
 use crate::page::format::codec::Codec;
+use crate::paging::ahead::Transfers;
+use crate::render::SsimPadding;
+use crate::render::color_correct::ColorCorrect;
+use crate::render::metrics::SsimVariant;
 use crate::schedule::order::Order;
 use serde::{Deserialize, Serialize};
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
+
+/// Tables of a config file that state something and set nothing.
+pub(super) const TABLES: [&str; 3] = ["resolved", "published", "tier"];
 
 /// Longest config file, bytes; one with every key has some 8 KB.
 const FILE_BYTES_MAX: u64 = 1 << 20;
@@ -30,7 +48,7 @@ const PAGE_ROWS_MIN: u32 = 16;
 const PAGE_ROWS_MAX: u32 = 65_536;
 
 macro_rules! config_keys {
-    ($($heading:literal { $( $(#[doc = $doc:literal])+ $([$($arg:tt)+])? $name:ident: $ty:ty = $default:expr; )+ })+) => {
+    ($($heading:literal { $( $(#[doc = $doc:literal])+ $([$($arg:tt)+])? $name:ident: $ty:ty = $default:expr => $class:ident; )+ })+) => {
         /// All keys of a run with their values.
         #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
         #[serde(deny_unknown_fields, default, rename_all = "kebab-case")]
@@ -51,174 +69,176 @@ macro_rules! config_keys {
             pub fn apply(self, config: &mut TrainConfig) { $($( if let Some(v) = self.$name { config.$name = v; } )+)+ }
         }
 
-        /// Heading, kebab-case name and meaning of every key, in order.
-        pub const KEYS: &[(&str, &str, &str)] = &[$($( ($heading, stringify!($name), concat!($($doc, "\n"),+)), )+)+];
+        /// Every key, in order.
+        pub const KEYS: &[Key] = &[$($(
+            Key { heading: $heading, field: stringify!($name), meaning: concat!($($doc, "\n"),+), class: Class::$class },
+        )+)+];
     };
 }
 
 config_keys! {
     "Dataset" {
         /// Folder of the photos inside the scene; empty = where the dataset says (COLMAP: images)
-        images: String = String::new();
+        images: String = String::new() => Place;
         /// Reduce photos by this factor (may be fractional: 3.4175)
-        data_factor: f64 = 1.0;
+        data_factor: f64 = 1.0 => Numbers;
         /// Longest side of a photo in pixels after --data-factor; 0 = no limit
-        max_resolution: u32 = 0;
+        max_resolution: u32 = 0 => Numbers;
         /// Hold out every N-th photo, names in sorted order (index % N == 0); 0 = none
-        test_every: u32 = 8;
+        test_every: u32 = 8 => Numbers;
         /// Hold out every photo whose index is greater than N; -1 = off. Takes the place of --test-every
-        [allow_negative_numbers = true] test_after: i64 = -1;
+        [allow_negative_numbers = true] test_after: i64 = -1 => Numbers;
         /// Use masks found in masks/ (white = keep)
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] masks: bool = true;
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] masks: bool = true => Numbers;
         /// Masks mark what to leave out instead of what to keep
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] invert_masks: bool = false;
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] invert_masks: bool = false => Numbers;
         /// Train without the photos that are registered but missing
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] allow_missing: bool = false;
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] allow_missing: bool = false => Place;
         /// Memory for decoded photos
-        image_cache: ByteSize = ByteSize(1 << 30);
+        image_cache: ByteSize = ByteSize(1 << 30) => Free;
         /// Near plane, relative to the size of the scene
-        near_plane: f64 = 0.01;
+        near_plane: f64 = 0.01 => Numbers;
         /// Start from this PLY: Gaussians if it has f_dc_0, else coloured points; or from the last generation of this store,
         /// a folder (see gsscale-ckpt import): it may be larger than memory. Empty = the dataset's points
-        init_ply: String = String::new();
+        init_ply: String = String::new() => Derived;
         /// Random points in the views' frusta when the dataset has none; 0 = refuse such a dataset
-        init_points: u32 = 100_000;
+        init_points: u32 = 100_000 => Numbers;
     }
     "Training" {
         /// Total number of steps. A run that ended or stopped may go on to more: see --resume and --keep-checkpoint
-        steps: u32 = 30_000;
+        steps: u32 = 30_000 => Length;
         /// Steps over which the rate of positions decays; it stays there afterwards. 0 = --steps. A run that goes on to
         /// more steps keeps the one it began with
-        schedule_steps: u32 = 0;
+        schedule_steps: u32 = 0 => Derived;
         /// Seed of every random draw
-        seed: u64 = 42;
+        seed: u64 = 42 => Numbers;
         /// Highest band of spherical harmonics, 0 to 3
-        sh_degree: u8 = 3;
+        sh_degree: u8 = 3 => Layout;
         /// Raise the band in use every N steps; 0 = all from the start
-        sh_every: u32 = 1000;
+        sh_every: u32 = 1000 => Numbers;
         /// Band in use from the first step
-        sh_start: u8 = 0;
+        sh_start: u8 = 0 => Numbers;
         /// Order of the photos: auto, shuffle, groups:N (n spatial groups, shuffled within) or tour (along the way).
         /// auto is shuffle where the scene fits in memory or little has to be read, else groups
-        view_order: String = "auto".into();
+        view_order: Chosen<Order> = Chosen(None) => Numbers;
         /// Gaussians that a page holds. Part of a run: other pages give other roundings
-        page_rows: u32 = 1024;
+        page_rows: u32 = 1024 => Layout;
         /// Weight of 1 - SSIM in the loss; L1 has the rest
-        ssim_lambda: f64 = 0.2;
+        ssim_lambda: f64 = 0.2 => Numbers;
         /// Pixels that the loss's SSIM covers: valid (windows inside the image) or same (zero padded)
-        ssim_padding: String = "valid".into();
+        ssim_padding: SsimPadding = SsimPadding::Valid => Numbers;
         /// Rate of positions, times the scene scale
-        means_lr: f64 = 1.6e-4;
+        means_lr: f64 = 1.6e-4 => Numbers;
         /// Factor that the rate of positions has decayed to at the last step
-        means_lr_final: f64 = 0.01;
+        means_lr_final: f64 = 0.01 => Numbers;
         /// Rate of log-scales
-        scales_lr: f64 = 5e-3;
+        scales_lr: f64 = 5e-3 => Numbers;
         /// Rate of quaternions
-        quats_lr: f64 = 1e-3;
+        quats_lr: f64 = 1e-3 => Numbers;
         /// Rate of logit opacities
-        opacities_lr: f64 = 5e-2;
+        opacities_lr: f64 = 5e-2 => Numbers;
         /// Rate of the constant colour band
-        sh0_lr: f64 = 2.5e-3;
+        sh0_lr: f64 = 2.5e-3 => Numbers;
         /// Rate of the higher colour bands
-        shn_lr: f64 = 2.5e-3 / 20.0;
+        shn_lr: f64 = 2.5e-3 / 20.0 => Numbers;
         /// Adam's epsilon: 1e-16 to 1, because below 1e-16 it vanishes beside what f32 rounds off second moments
-        adam_eps: f64 = 1e-15;
+        adam_eps: f64 = 1e-15 => Numbers;
         /// Which Gaussians take an optimizer step: deferred (all; those without a gradient when they are next looked at),
         /// dense (all, at once: slow, for comparison), or sparse (only those with a gradient, which is not exact)
-        optimizer: String = "deferred".into();
+        optimizer: Method = Method::Deferred => Numbers;
         /// What is kept of Adam's moments between steps: f32, or bf16, which is not exact and halves what they take on disk
-        moments: String = "f32".into();
+        moments: Moments = Moments::F32 => Numbers;
         /// Opacity of first Gaussians
-        init_opacity: f64 = 0.1;
+        init_opacity: f64 = 0.1 => Numbers;
         /// Size of first Gaussians, times the distance to their three nearest neighbours
-        init_scale: f64 = 1.0;
+        init_scale: f64 = 1.0 => Numbers;
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
-        max_alpha: f64 = 0.99;
+        max_alpha: f64 = 0.99 => Numbers;
         /// Background colour, RGB in 0..1
-        [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]);
+        [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }
     "Densification" {
         /// default (clone, split, prune, reset) or none
-        strategy: String = "default".into();
+        strategy: StrategyName = StrategyName::Default => Numbers;
         /// Never more Gaussians than this; 0 = no cap
-        max_gaussians: u64 = 0;
+        max_gaussians: u64 = 0 => Numbers;
         /// First step after which rounds may run
-        refine_start: u32 = 500;
+        refine_start: u32 = 500 => Numbers;
         /// Step at which rounds and resets end
-        refine_stop: u32 = 15_000;
+        refine_stop: u32 = 15_000 => Numbers;
         /// Steps between rounds
-        refine_every: u32 = 100;
+        refine_every: u32 = 100 => Numbers;
         /// Steps between opacity resets, to twice --prune-opa; 0 = never
-        reset_every: u32 = 3000;
+        reset_every: u32 = 3000 => Numbers;
         /// Grow Gaussians whose mean screen-space gradient exceeds this
-        grow_grad2d: f64 = 2e-4;
+        grow_grad2d: f64 = 2e-4 => Numbers;
         /// Growing Gaussians up to this size (times the scene scale) are cloned, larger ones split
-        grow_scale3d: f64 = 0.01;
+        grow_scale3d: f64 = 0.01 => Numbers;
         /// Remove Gaussians with a lower opacity; 0 = none, and no opacity resets
-        prune_opa: f64 = 0.005;
+        prune_opa: f64 = 0.005 => Numbers;
         /// Remove Gaussians larger than this (times the scene scale), after the first --reset-every steps
-        prune_scale3d: f64 = 0.1;
+        prune_scale3d: f64 = 0.1 => Numbers;
     }
     "Output" {
         /// Evaluate on the held-out photos every N steps; 0 = only at the end
-        eval_every: u32 = 0;
+        eval_every: u32 = 0 => Free;
         /// Write a PLY every N steps and keep the run as it is then as a named checkpoint, step-N; 0 = only at the end
-        save_every: u32 = 0;
+        save_every: u32 = 0 => Free;
         /// Write a line of metrics every N steps
-        log_every: u32 = 100;
+        log_every: u32 = 100 => Free;
         /// Where numbers go while training: json (metrics.jsonl), or tensorboard for event files beside it
-        log: String = "json".into();
+        log: LogFormat = LogFormat::Json => Free;
         /// SSIM that is reported: same (zero padded, as the 3DGS code), valid or reflect
-        ssim_variant: String = "same".into();
+        ssim_variant: SsimVariant = SsimVariant::Same => Reported;
         /// Report colour-corrected PSNR beside PSNR: affine (per channel, gsplat's), quadratic (Zip-NeRF's, nerfstudio's)
         /// or off. It is another measure than PSNR, never comparable with it, and always named
-        [alias = "colour-correct"] color_correct: String = "off".into();
+        [alias = "colour-correct"] color_correct: Chosen<ColorCorrect> = Chosen(None) => Free;
         /// Coordinates of the PLY: dataset or local
-        export_frame: String = "dataset".into();
+        export_frame: ExportFrame = ExportFrame::Dataset => Free;
     }
     "Memory and disk" {
         /// Memory that the run may take; 0 = 70 % of what this machine, or its control group, has available
-        host_mem: ByteSize = ByteSize(0);
+        host_mem: ByteSize = ByteSize(0) => Free;
         /// Folder for pages that do not fit in memory, on a fast drive; empty = all pages stay in memory. It is the
         /// checkpoint of the run as well; that of a run in memory is the folder `checkpoint` inside --out
-        spill_dir: String = String::new();
+        spill_dir: String = String::new() => Lasting;
         /// Keep the checkpoint (the spill directory, or `checkpoint` inside --out) at the end of the run too, to go on to
         /// more steps later or to look at it with gsscale-ckpt. Without it, it is kept only when the run stops early
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] keep_checkpoint: bool = false;
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] keep_checkpoint: bool = false => Lasting;
         /// Pages held in memory at once; 0 = as many as --host-mem allows
-        frames: u32 = 0;
+        frames: u32 = 0 => Free;
         /// How pages are read and written: auto, uring, mmap or pread. Never changes results
-        io: String = "auto".into();
+        io: IoEngine = IoEngine::Auto => Free;
         /// How pages are stored: raw, halves (for --moments bf16), zstd:LEVEL, or auto (what the drive's speed and the
         /// moments favour). Never changes results
-        spill_codec: String = "auto".into();
+        spill_codec: Chosen<Codec> = Chosen(None) => Free;
         /// Seconds from one commit to the next: a run that is killed loses no more. 0 = only when it is asked to stop, and
         /// after the last step. auto = 10 to 60: as often as commits hold training up for less than 1 % of the time, and
         /// later only where they would write more than 256 GiB an hour. Never changes results
-        commit_every: CommitEvery = CommitEvery::Auto;
+        commit_every: CommitEvery = CommitEvery::Auto => Free;
         /// Seconds that a run waits for space when the drive of --spill-dir is full, before it stops with its last commit
-        disk_full_wait: f64 = 600.0;
+        disk_full_wait: f64 = 600.0 => Free;
         /// Which page leaves memory first: belady (next used last) or lru. Never changes results
-        evict: String = "belady".into();
+        evict: EvictPolicy = EvictPolicy::FarthestNextUse => Free;
         /// When pages move: overlap (while steps compute), ahead (before they are needed, but the step waits for it) or
         /// demand (when a step needs them). The last two are for comparison. Never changes results
-        transfers: String = "overlap".into();
+        transfers: Transfers = Transfers::Overlap => Free;
         /// Bytes of pages that may be read ahead of their step; 0 = an eighth of the frames
-        prefetch_bytes: ByteSize = ByteSize(0);
+        prefetch_bytes: ByteSize = ByteSize(0) => Free;
     }
     "Machine" {
         /// Worker threads; 0 = one per core. Never changes results
-        threads: u32 = 0;
+        threads: u32 = 0 => Free;
         /// Instruction path: auto, avx512, avx2 or baseline. Results are the same bits per path
-        simd: String = "auto".into();
+        simd: Chosen<SimdPath> = Chosen(None) => Instructions;
         /// What renders: auto (a hardware GPU if there is one, else the CPU), gpu (a software adapter counts too), cpu,
         /// or a part of the name of one of --list-devices
-        device: String = "auto".into();
+        device: Device = Device::Gpu(DeviceChoice::Auto) => Free;
         /// The same command gives the same bits again on the same device. Every run does so, at no cost: there is no
         /// faster way that does not
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] deterministic: bool = true;
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] deterministic: bool = true => Free;
         /// Memory that may be taken on the device; 0 = what the device has
-        device_mem: ByteSize = ByteSize(0);
+        device_mem: ByteSize = ByteSize(0) => Free;
     }
 }
 
@@ -282,7 +302,7 @@ impl TrainConfig {
     /// Parses a config text over the defaults; the error is a sentence.
     pub fn parse(text: &str) -> Result<TrainConfig, String> {
         let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| e.to_string())?;
-        for name in super::published::TABLES {
+        for name in TABLES {
             table.remove(name);
         }
         TrainConfig::deserialize(table).map_err(|e| e.to_string())
@@ -352,8 +372,7 @@ impl TrainConfig {
             return refuse("log-every", "1 or more");
         }
         self.check_thresholds()?;
-        self.check_rates()?;
-        self.check_names()
+        self.check_rates()
     }
 
     fn check_thresholds(&self) -> InputResult<()> {
@@ -410,44 +429,6 @@ impl TrainConfig {
         );
         Err(InputError::new("--adam-eps", problem, "use 1e-16 to 1; 1e-15 is usual"))
     }
-
-    fn check_names(&self) -> InputResult<()> {
-        if self.device.trim().is_empty() {
-            return refuse("device", "auto, gpu, cpu, or a part of the name of one of --list-devices");
-        }
-        let written = |key: &str, problem: String| InputError::new(format!("--{key}"), problem, "or write auto");
-        if self.view_order != "auto" {
-            self.view_order.parse::<Order>().map_err(|problem| written("view-order", problem))?;
-        }
-        if self.spill_codec != "auto" {
-            self.spill_codec.parse::<Codec>().map_err(|problem| written("spill-codec", problem))?;
-        }
-        let names: [(&str, &str, &[&str]); 12] = [
-            ("io", &self.io, &["auto", "uring", "mmap", "pread"]),
-            ("evict", &self.evict, &["belady", "lru"]),
-            ("ssim-padding", &self.ssim_padding, &["valid", "same"]),
-            ("transfers", &self.transfers, &["overlap", "ahead", "demand"]),
-            ("optimizer", &self.optimizer, &["deferred", "dense", "sparse"]),
-            ("moments", &self.moments, &["f32", "bf16"]),
-            ("strategy", &self.strategy, &["default", "none"]),
-            ("log", &self.log, &["json", "tensorboard"]),
-            ("ssim-variant", &self.ssim_variant, &["same", "valid", "reflect"]),
-            ("color-correct", &self.color_correct, &["off", "affine", "quadratic"]),
-            ("export-frame", &self.export_frame, &["dataset", "local"]),
-            ("simd", &self.simd, &["auto", "avx512", "avx2", "baseline"]),
-        ];
-        for (key, value, allowed) in names {
-            if !allowed.contains(&value) {
-                let problem = format!("'{value}' is not known");
-                return Err(InputError::new(
-                    format!("--{key}"),
-                    problem,
-                    format!("use one of: {}", allowed.join(", ")),
-                ));
-            }
-        }
-        Ok(())
-    }
 }
 
 /// The error about a key whose value is out of range.
@@ -470,13 +451,13 @@ pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments
 /// the config file's value alone.)
 fn help_with_defaults(mut command: clap::Command) -> clap::Command {
     let defaults = toml::Table::try_from(TrainConfig::default()).unwrap_or_default();
-    for (_, name, _) in KEYS {
-        let Some(value) = defaults.get(&name.replace('_', "-")) else { continue };
+    for key in KEYS {
+        let Some(value) = defaults.get(&key.name()) else { continue };
         let value = value.as_str().map_or_else(|| value.to_string(), str::to_string);
         if value.is_empty() {
             continue;
         }
-        command = command.mut_arg(name, |arg| {
+        command = command.mut_arg(key.field, |arg| {
             let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
             arg.help(format!("{help} [default: {value}]"))
         });
@@ -492,17 +473,17 @@ pub fn default_file() -> String {
          # flags of the same name override it.\n",
     );
     let mut last_heading = "";
-    for (heading, name, meaning) in KEYS {
-        if *heading != last_heading {
-            text.push_str(&format!("\n## {heading}\n"));
-            last_heading = heading;
+    for key in KEYS {
+        if key.heading != last_heading {
+            text.push_str(&format!("\n## {}\n", key.heading));
+            last_heading = key.heading;
         }
-        let key = name.replace('_', "-");
-        for line in meaning.lines() {
+        for line in key.meaning.lines() {
             text.push_str(&format!("\n#{line}"));
         }
-        let value = defaults.get(&key).map(ToString::to_string).unwrap_or_default();
-        text.push_str(&format!("\n{key} = {value}\n"));
+        let name = key.name();
+        let value = defaults.get(&name).map(ToString::to_string).unwrap_or_default();
+        text.push_str(&format!("\n{name} = {value}\n"));
     }
     text
 }
@@ -532,8 +513,6 @@ mod tests {
     fn values_out_of_range_are_refused_by_name() {
         let bad = TrainConfig { sh_degree: 4, ..TrainConfig::default() };
         assert!(bad.check().is_err_and(|e| e.to_string().contains("--sh-degree")));
-        let bad = TrainConfig { simd: "neon".into(), ..TrainConfig::default() };
-        assert!(bad.check().is_err_and(|e| e.to_string().contains("neon")));
         // As a 32-bit number this is half.
         let bad = TrainConfig { prune_opa: 0.499_999_999, ..TrainConfig::default() };
         assert!(bad.check().is_err_and(|e| e.to_string().contains("--prune-opa")));

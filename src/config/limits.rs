@@ -6,7 +6,8 @@ use super::file::TrainConfig;
 use crate::base::simd::SimdPath;
 use crate::dataset::loader::LoadOptions;
 use crate::dataset::read::ReadOptions;
-use crate::densify::policy::DensifyConfig;
+use crate::densify::default::DefaultStrategy;
+use crate::densify::strategy::{NoStrategy, Strategy, StrategyName};
 use crate::exchange::ply::ExportFrame;
 use crate::optim::adam::AdamConfig;
 use crate::optim::method::Method;
@@ -14,9 +15,10 @@ use crate::optim::moments::Moments;
 use crate::optim::rates::Rates;
 use crate::render::color_correct::ColorCorrect;
 use crate::render::metrics::SsimVariant;
-use crate::render::{LossOptions, RenderOptions, SsimPadding};
+use crate::render::{LossOptions, RenderOptions};
 use crate::scene::init::InitOptions;
 use crate::schedule::order::Order;
+use std::sync::Arc;
 
 /// Everything that the training loop needs, resolved.
 #[derive(Debug, Clone)]
@@ -49,8 +51,8 @@ pub struct RunOptions {
     pub optimizer: Method,
     /// What is kept of its moments.
     pub moments: Moments,
-    /// Densification; `None` for `--strategy none`.
-    pub densify: Option<DensifyConfig>,
+    /// When the scene densifies, and how.
+    pub strategy: Arc<dyn Strategy>,
     /// Scene scale, local units.
     pub scene_scale: f32,
     /// SSIM that is reported.
@@ -71,7 +73,6 @@ impl RunOptions {
     /// Options of a checked config for a scene of this scale (local units).
     pub fn new(config: &TrainConfig, scene_scale: f32) -> RunOptions {
         let simd = simd_path(config);
-        let padding = if config.ssim_padding == "same" { SsimPadding::Same } else { SsimPadding::Valid };
         RunOptions {
             steps: config.steps,
             seed: config.seed,
@@ -80,7 +81,7 @@ impl RunOptions {
             sh_degree_start: first_sh_degree(config),
             max_gaussians: config.max_gaussians as usize,
             page_rows: config.page_rows as usize,
-            view_order: config.view_order.parse().unwrap_or(Order::Shuffle),
+            view_order: config.view_order.0.unwrap_or(Order::Shuffle),
             render: RenderOptions {
                 sh_degree: config.sh_degree,
                 max_alpha: config.max_alpha as f32,
@@ -88,7 +89,7 @@ impl RunOptions {
                 simd,
                 ..RenderOptions::default()
             },
-            loss: LossOptions { ssim_lambda: config.ssim_lambda as f32, padding, simd },
+            loss: LossOptions { ssim_lambda: config.ssim_lambda as f32, padding: config.ssim_padding, simd },
             rates: Rates {
                 means: config.means_lr * f64::from(scene_scale),
                 means_final_factor: config.means_lr_final,
@@ -100,13 +101,13 @@ impl RunOptions {
                 steps: schedule_steps(config),
             },
             adam: AdamConfig { eps: config.adam_eps, ..AdamConfig::default() },
-            optimizer: config.optimizer.parse().unwrap_or_default(),
-            moments: Moments::from_name(&config.moments).unwrap_or_default(),
-            densify: (config.strategy == "default").then(|| densify(config)),
+            optimizer: config.optimizer,
+            moments: config.moments,
+            strategy: strategy(config),
             scene_scale,
-            ssim_variant: SsimVariant::from_name(&config.ssim_variant).unwrap_or(SsimVariant::Same),
-            color_correct: ColorCorrect::from_name(&config.color_correct),
-            export_frame: if config.export_frame == "local" { ExportFrame::Local } else { ExportFrame::Dataset },
+            ssim_variant: config.ssim_variant,
+            color_correct: config.color_correct.0,
+            export_frame: config.export_frame,
             eval_every: config.eval_every,
             save_every: config.save_every,
             log_every: config.log_every,
@@ -120,9 +121,17 @@ impl RunOptions {
     }
 }
 
-fn densify(config: &TrainConfig) -> DensifyConfig {
+/// The strategy that a config names, with its keys.
+fn strategy(config: &TrainConfig) -> Arc<dyn Strategy> {
+    match config.strategy {
+        StrategyName::None => Arc::new(NoStrategy),
+        StrategyName::Default => Arc::new(default_strategy(config)),
+    }
+}
+
+fn default_strategy(config: &TrainConfig) -> DefaultStrategy {
     let never_if_zero = |n: u32| if n == 0 { u32::MAX } else { n };
-    DensifyConfig {
+    DefaultStrategy {
         grow_grad2d: config.grow_grad2d as f32,
         grow_scale3d: config.grow_scale3d as f32,
         prune_opa: config.prune_opa as f32,
@@ -142,7 +151,7 @@ pub fn schedule_steps(config: &TrainConfig) -> u32 {
 
 /// The instruction path that a config asks for on this machine.
 pub fn simd_path(config: &TrainConfig) -> SimdPath {
-    SimdPath::from_name(&config.simd).unwrap_or_else(SimdPath::best)
+    config.simd.0.unwrap_or_else(SimdPath::best)
 }
 
 /// How the scene is to be read.

@@ -7,9 +7,11 @@
 //! The files' values are GS-Scale's: the dictionary `configs` at the end of its trainers, its paper (arXiv 2509.15645)
 //! and what its code does; each file names the traps.
 
-use super::file::TrainConfig;
+use super::file::{KEYS, TABLES, TrainConfig};
+use super::key::Key;
 use super::limits::schedule_steps;
 use crate::base::error::{InputError, InputResult};
+use crate::render::metrics::SsimVariant;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -25,9 +27,6 @@ pub const BUILT_IN: [(&str, &str); 8] = [
     ("sztu", include_str!("../../configs/sztu.toml")),
     ("aerial", include_str!("../../configs/aerial.toml")),
 ];
-
-/// Tables of a config file that state something and set nothing.
-pub(super) const TABLES: [&str; 3] = ["resolved", "published", "tier"];
 
 /// A published run.
 #[derive(Debug, Clone, PartialEq)]
@@ -83,8 +82,8 @@ pub struct Expected {
     pub psnr: f64,
     /// Structural similarity.
     pub ssim: f64,
-    /// Which one: a value of `ssim-variant`.
-    pub ssim_variant: String,
+    /// Which one.
+    pub ssim_variant: SsimVariant,
     /// LPIPS.
     pub lpips: f64,
     /// Network and input range of it: `alex, signed`.
@@ -188,43 +187,15 @@ impl PublishedRun {
     }
 }
 
-/// Keys that say where and how fast a run computes, or what it writes and keeps, and never change what it reaches; only
-/// other keys make a run another one than the published. (`simd` and `device` change last bits, as the seed does.) `ssim-variant` is none of them: it changes no Gaussian, but
-/// the figure that stands beside the published one.
-const NEVER_CHANGES_RESULTS: [&str; 25] = [
-    "images",
-    "allow-missing",
-    "image-cache",
-    "eval-every",
-    "save-every",
-    "log-every",
-    "log",
-    "export-frame",
-    "color-correct",
-    "host-mem",
-    "spill-dir",
-    "keep-checkpoint",
-    "frames",
-    "io",
-    "spill-codec",
-    "commit-every",
-    "disk-full-wait",
-    "evict",
-    "transfers",
-    "prefetch-bytes",
-    "threads",
-    "simd",
-    "device",
-    "deterministic",
-    "device-mem",
-];
-
 /// Settings of `used` that make it another run than `published`: `steps = 200 instead of 200000`.
 pub fn differences(published: &TrainConfig, used: &TrainConfig) -> Vec<String> {
     let [before, after] = [published, used].map(|c| toml::Table::try_from(c).unwrap_or_default());
     // A run that went on to more steps has the number written that 0 stood for.
     let is_same_schedule = schedule_steps(published) == schedule_steps(used);
-    let is_free = |key: &str| NEVER_CHANGES_RESULTS.contains(&key) || (key == "schedule-steps" && is_same_schedule);
+    let is_free = |name: &str| {
+        let same_run = |key: &Key| key.name() == name && !key.class.makes_another_run();
+        KEYS.iter().any(|key| same_run(key)) || (name == "schedule-steps" && is_same_schedule)
+    };
     let changed = after.iter().filter(|(key, value)| !is_free(key.as_str()) && before.get(*key) != Some(*value));
     changed
         .map(|(key, v)| {
@@ -235,9 +206,10 @@ pub fn differences(published: &TrainConfig, used: &TrainConfig) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::file::{ByteSize, KEYS};
+    use super::super::file::ByteSize;
     use super::*;
     use crate::checkpoint::interval::CommitEvery;
+    use crate::paging::ahead::Transfers;
 
     #[test]
     fn keys_that_never_change_results_make_no_difference() {
@@ -245,14 +217,14 @@ mod tests {
         let used = TrainConfig {
             keep_checkpoint: true,
             disk_full_wait: 5.0,
-            transfers: "demand".into(),
+            transfers: Transfers::Demand,
             commit_every: CommitEvery::Seconds(0.0),
             host_mem: ByteSize(1 << 30),
             schedule_steps: 200,
             ..published.clone()
         };
         assert_eq!(differences(&published, &used), Vec::<String>::new());
-        let other = TrainConfig { ssim_variant: "valid".into(), schedule_steps: 100, seed: 7, ..used };
+        let other = TrainConfig { ssim_variant: SsimVariant::Valid, schedule_steps: 100, seed: 7, ..used };
         let want = [
             "schedule-steps = 100 instead of 0",
             "seed = 7 instead of 42",
@@ -265,15 +237,11 @@ mod tests {
     }
 
     #[test]
-    fn the_list_agrees_with_the_keys_and_what_they_say() {
-        let name = |name: &str| name.replace('_', "-");
-        for listed in NEVER_CHANGES_RESULTS {
-            assert!(KEYS.iter().any(|(_, key, _)| name(key) == listed), "{listed} is no key");
-        }
-        for (_, key, meaning) in KEYS {
-            let meaning = meaning.split_whitespace().collect::<Vec<_>>().join(" ");
-            let is_listed = NEVER_CHANGES_RESULTS.contains(&name(key).as_str());
-            assert!(is_listed || !meaning.contains("Never changes results"), "{key} is not listed");
+    fn the_classes_agree_with_what_the_keys_say() {
+        for key in KEYS {
+            let meaning = key.meaning.split_whitespace().collect::<Vec<_>>().join(" ");
+            let says_so = meaning.contains("Never changes results");
+            assert!(!says_so || !key.class.makes_another_run(), "{} is {:?}", key.name(), key.class);
         }
     }
 }

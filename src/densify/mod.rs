@@ -1,6 +1,9 @@
-//! Statistics, decisions and edits that change the number of Gaussians.
+//! What changes the number of Gaussians: strategies ([`strategy`]; gsplat's: [`mod@default`]), the statistics that they decide
+//! by ([`stats`]), the edits that their rounds make to rows ([`ops`]), and applying logged events, late or on time
+//! ([`replay`]).
 
+pub mod default;
 pub mod ops;
-pub mod policy;
 pub mod replay;
 pub mod stats;
+pub mod strategy;

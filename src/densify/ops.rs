@@ -1,5 +1,5 @@
 //! Edits that rounds and resets make to rows: growing, pruning, resetting, on values, moments, stamps, identities and
-//! statistics together. What to do with a row is decided by [`super::policy`].
+//! statistics together. What becomes of a row is decided by the [`Round`].
 //!
 //! Rows are judged as they are at the event's time. A row that is neither grown, pruned nor reset is not rewritten:
 //! it goes on from its stored state. So applying an event late gives what applying it on time would have given, as a
@@ -9,11 +9,11 @@
 //! random draws depend on (seed, parent's uid, event, child) only; 3. rows that stay keep their order, new rows follow
 //! in the order of their parents.
 
-use super::policy::{Fate, fate};
+use super::strategy::{Fate, Round, RowFacts};
 use crate::base::math::{exp32, logit};
 use crate::base::rng::{Purpose, Stream, hash64};
 use crate::scene::columns::{Column, Columns};
-use crate::scene::events::{RoundThresholds, SPLIT_SIGMAS};
+use crate::scene::events::SPLIT_SIGMAS;
 use crate::scene::rows::{BLOCK_LANES, RowBlock, Rows, RowsMut, RowsNow, first_lane, mean_grad2d};
 use crate::scene::state::SceneState;
 use rayon::prelude::*;
@@ -46,13 +46,7 @@ pub struct RoundEdits {
 }
 
 /// Decides a round for the rows of a view, reading only.
-pub fn plan_round<V: RowsNow>(
-    values: &V,
-    rows: &Rows<'_>,
-    thresholds: &RoundThresholds,
-    seed: u64,
-    event: u64,
-) -> RoundEdits {
+pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, seed: u64, event: u64) -> RoundEdits {
     let mut removed = Vec::new();
     let mut born = NewRows { columns: Columns::zeros(0, rows.columns.sh_degree), uid: Vec::new() };
     let mut counts = RoundCounts::default();
@@ -60,8 +54,11 @@ pub fn plan_round<V: RowsNow>(
     let (mut log_scales, mut opacities) = (vec![0.0; rows.rows()], vec![0.0; rows.rows()]);
     values.sizes_and_opacities(rows, &mut log_scales, &mut opacities);
     for row in 0..rows.rows() {
-        let mean_grad2d = mean_grad2d(rows.grad2d[row], rows.count[row]);
-        let fate = fate(thresholds, mean_grad2d, log_scales[row], opacities[row]);
+        let fate = round.fate(&RowFacts {
+            mean_grad2d: mean_grad2d(rows.grad2d[row], rows.count[row]),
+            log_scale: log_scales[row],
+            opacity: opacities[row],
+        });
         if matches!(fate, Fate::Split { .. } | Fate::Duplicate { pruned: false }) {
             values.evaluate_row(rows, row, &mut block);
         }
@@ -102,13 +99,13 @@ pub fn plan_round<V: RowsNow>(
 pub fn apply_round<V: RowsNow>(
     values: &V,
     state: &mut SceneState,
-    thresholds: &RoundThresholds,
+    round: &dyn Round,
     seed: u64,
     event: u64,
 ) -> RoundCounts {
     let chunks = state.chunks(ROWS_PER_TASK);
     let edits: Vec<(usize, RoundEdits)> =
-        chunks.par_iter().map(|rows| (rows.first_row, plan_round(values, rows, thresholds, seed, event))).collect();
+        chunks.par_iter().map(|rows| (rows.first_row, plan_round(values, rows, round, seed, event))).collect();
     apply_edits(state, &edits)
 }
 

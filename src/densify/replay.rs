@@ -9,16 +9,15 @@
 //! at most one of the rounds that a page missed, so it has at most doubled by then.
 
 use super::ops::{self, RoundCounts, RoundEdits};
-use super::stats::promised_growth;
+use super::strategy::{Effect, Extremes, Round, effect_of};
 use crate::base::ids::PageId;
-use crate::base::math::sigmoid;
 use crate::optim::bounds::SplitLimits;
 use crate::optim::deferred::{AdamNow, DeferredAdam};
 use crate::scene::columns::Column;
-use crate::scene::events::{Event, EventKind, EventLog, RoundThresholds};
+use crate::scene::events::{Event, EventLog};
 use crate::scene::page_layout::read_page;
 use crate::scene::page_split::{SplitTooDeep, split_page};
-use crate::scene::rows::{Rows, RowsMut, RowsNow, mean_grad2d};
+use crate::scene::rows::{Rows, RowsMut, RowsNow};
 use crate::scene::state::SceneState;
 use std::sync::OnceLock;
 
@@ -31,7 +30,8 @@ pub struct EventOutcome {
     pub reset_rows: usize,
 }
 
-/// Applies event number `index` of the log to all rows of a table: the whole scene or one page of it.
+/// Applies event number `index` of the log to all rows of a table, the whole scene or one page of it, when it happens and
+/// without shortcuts: what [`PendingEvents`] must amount to.
 pub fn apply_event(
     state: &mut SceneState,
     adam: &DeferredAdam,
@@ -39,20 +39,17 @@ pub fn apply_event(
     index: usize,
     event: &Event,
 ) -> EventOutcome {
-    match event.kind {
-        EventKind::RaiseShDegree { degree } => {
-            state.raise_sh_degree(degree);
-            EventOutcome::default()
+    let mut outcome = EventOutcome::default();
+    match effect_of(&event.kind) {
+        Effect::Round(round) => {
+            outcome.round = ops::apply_round(&adam.at(event.now()), state, round, seed, index as u64);
         }
-        EventKind::ResetOpacity { max_opacity } => {
-            let at = adam.at(event.now());
-            EventOutcome { reset_rows: ops::reset_opacities(&at, state, max_opacity), ..EventOutcome::default() }
+        Effect::ResetOpacity { max_opacity } => {
+            outcome.reset_rows = ops::reset_opacities(&adam.at(event.now()), state, max_opacity);
         }
-        EventKind::Densify(thresholds) => {
-            let round = ops::apply_round(&adam.at(event.now()), state, &thresholds, seed, index as u64);
-            EventOutcome { round, ..EventOutcome::default() }
-        }
+        Effect::RaiseShDegree { degree } => state.raise_sh_degree(degree),
     }
+    outcome
 }
 
 /// What one round did to a page.
@@ -128,36 +125,10 @@ impl<'a> PendingEvents<'a> {
     /// The page must be split and cannot be.
     pub fn apply(&self, id: PageId, applied: usize, rows: &mut RowsMut<'_>) -> Result<Replay, SplitTooDeep> {
         let mut replay = Replay::default();
-        let mut quiet = None;
-        for index in applied..self.events.len() {
-            let edits = match self.events[index].kind {
-                EventKind::RaiseShDegree { degree } if degree <= rows.columns.sh_degree => continue,
-                EventKind::RaiseShDegree { .. } => None,
-                EventKind::ResetOpacity { max_opacity } => {
-                    let reset_rows = ops::reset_opacity_rows(self.at(index), rows, max_opacity);
-                    (replay.reset_rows, quiet) = (replay.reset_rows + reset_rows, None);
-                    replay.touch(reset_rows > 0);
-                    continue;
-                }
-                EventKind::Densify(thresholds) => {
-                    let (round, edits) = self.plan(index, &thresholds, &rows.as_ref(), &mut quiet);
-                    replay.rounds.push(round);
-                    if edits.is_none() {
-                        replay.touch(clear_statistics(rows));
-                        continue;
-                    }
-                    edits
-                }
-            };
-            // From here on the rows are a table of their own.
-            let mut state = read_page(&rows.as_ref());
-            let rest = index + usize::from(edits.is_some());
-            if let Some(edits) = edits {
-                ops::apply_edits(&mut state, &[(0, edits)]);
-            }
-            self.replay_table(rest, &mut state, &mut replay);
+        let mut edited = EditedRows { page: rows, table: None };
+        self.replay(applied, &mut edited, &mut replay);
+        if let Some(state) = edited.table {
             replay.edit = PageEdit::Replaced(self.split(id, state)?);
-            break;
         }
         Ok(replay)
     }
@@ -165,26 +136,33 @@ impl<'a> PendingEvents<'a> {
     /// Applies the events from number `applied` on to a table that nobody splits or stores: rows as evaluation and
     /// export see them.
     pub fn apply_to_table(&self, applied: usize, state: &mut SceneState) {
-        self.replay_table(applied, state, &mut Replay::default());
+        let mut no_page = SceneState::default();
+        let mut edited = EditedRows { page: &mut no_page.view_mut(), table: Some(std::mem::take(state)) };
+        self.replay(applied, &mut edited, &mut Replay::default());
+        *state = edited.table.unwrap_or_default();
     }
 
-    fn replay_table(&self, from: usize, state: &mut SceneState, replay: &mut Replay) {
-        let mut quiet = None;
+    /// Applies the events from number `from` on.
+    fn replay(&self, from: usize, rows: &mut EditedRows<'_, '_>, replay: &mut Replay) {
+        // Of rows that were not rewritten since.
+        let mut extremes = None;
         for index in from..self.events.len() {
-            match self.events[index].kind {
-                EventKind::RaiseShDegree { degree } => state.raise_sh_degree(degree),
-                EventKind::ResetOpacity { max_opacity } => {
-                    replay.reset_rows += ops::reset_opacities(self.at(index), state, max_opacity);
-                    quiet = None;
+            match effect_of(&self.events[index].kind) {
+                Effect::RaiseShDegree { degree } => rows.raise_sh_degree(degree),
+                Effect::ResetOpacity { max_opacity } => {
+                    let reset_rows = rows.reset_opacities(self.at(index), max_opacity);
+                    replay.reset_rows += reset_rows;
+                    replay.touch(reset_rows > 0);
+                    extremes = None;
                 }
-                EventKind::Densify(thresholds) => {
-                    let (round, edits) = self.plan(index, &thresholds, &state.view(), &mut quiet);
-                    replay.rounds.push(round);
+                Effect::Round(round) => {
+                    let (done, edits) = self.plan(index, round, &rows.view(), &mut extremes);
+                    replay.rounds.push(done);
                     if let Some(edits) = edits {
-                        ops::apply_edits(state, &[(0, edits)]);
-                        quiet = None;
+                        ops::apply_edits(rows.table(), &[(0, edits)]);
+                        extremes = None;
                     } else {
-                        clear_statistics(&mut state.view_mut());
+                        replay.touch(rows.clear_statistics());
                     }
                 }
             }
@@ -195,21 +173,28 @@ impl<'a> PendingEvents<'a> {
     fn plan(
         &self,
         index: usize,
-        thresholds: &RoundThresholds,
+        round: &dyn Round,
         rows: &Rows<'_>,
-        quiet: &mut Option<Extremes>,
+        extremes: &mut Option<Extremes>,
     ) -> (PageRound, Option<RoundEdits>) {
-        let promised = promised_growth(rows, thresholds.grow_grad2d);
-        let mut round = PageRound { event: index, rows_change: 0, promised, counts: RoundCounts::default() };
-        let nothing_grows = promised == 0 && !may_grow(rows, thresholds);
-        if nothing_grows && quiet.get_or_insert_with(|| Extremes::of(self.adam, rows)).survive(thresholds) {
-            return (round, None);
+        let promised = round.promised_rows(rows);
+        let mut done = PageRound { event: index, rows_change: 0, promised, counts: RoundCounts::default() };
+        let nothing_grows = promised == 0 && !round.may_grow(rows);
+        if nothing_grows && round.spares(extremes.get_or_insert_with(|| self.extremes(rows))) {
+            return (done, None);
         }
-        let edits = ops::plan_round(self.at(index), rows, thresholds, self.seed, index as u64);
-        round.rows_change = edits.added.rows() as i64 - edits.removed.len() as i64;
-        round.counts = edits.counts;
+        let edits = ops::plan_round(self.at(index), rows, round, self.seed, index as u64);
+        done.rows_change = edits.added.rows() as i64 - edits.removed.len() as i64;
+        done.counts = edits.counts;
         let is_nothing = edits.removed.is_empty() && edits.added.rows() == 0;
-        (round, (!is_nothing).then_some(edits))
+        (done, (!is_nothing).then_some(edits))
+    }
+
+    fn extremes(&self, rows: &Rows<'_>) -> Extremes {
+        Extremes {
+            lowest_opacity: self.adam.lowest_opacity(rows),
+            sigma_max: self.adam.page_bounds(rows, &SplitLimits::NEVER).sigma_max,
+        }
     }
 
     /// The table as pages within the capacity, cut by the positions after the last event.
@@ -239,30 +224,45 @@ impl Default for Replay {
     }
 }
 
-/// Bounds of what rows that nobody touches are pruned by, at any later step. A page that sleeps through many rounds is
-/// looked at once, unless some row comes close to being pruned.
-struct Extremes {
-    lowest_opacity: f32,
-    sigma_max: f32,
+/// Rows that events are applied to.
+struct EditedRows<'a, 'r> {
+    /// The rows of a page, edited where they are while there is no table.
+    page: &'a mut RowsMut<'r>,
+    /// The rows from when their number or their width changes.
+    table: Option<SceneState>,
 }
 
-impl Extremes {
-    fn of(adam: &DeferredAdam, rows: &Rows<'_>) -> Extremes {
-        let sigma_max = adam.page_bounds(rows, &SplitLimits::NEVER).sigma_max;
-        Extremes { lowest_opacity: adam.lowest_opacity(rows), sigma_max }
+impl EditedRows<'_, '_> {
+    fn view(&self) -> Rows<'_> {
+        self.table.as_ref().map_or_else(|| self.page.as_ref(), SceneState::view)
     }
 
-    /// Whether no row is pruned. The slack is for the roundings of the sigmoid, some 4e-7.
-    fn survive(&self, thresholds: &RoundThresholds) -> bool {
-        sigmoid(self.lowest_opacity) >= thresholds.prune_opacity * (1.0 + 1e-5)
-            && self.sigma_max <= thresholds.prune_scale
+    /// The rows as a table.
+    fn table(&mut self) -> &mut SceneState {
+        self.table.get_or_insert_with(|| read_page(&self.page.as_ref()))
     }
-}
 
-/// Whether the statistics of some row exceed the threshold.
-fn may_grow(rows: &Rows<'_>, thresholds: &RoundThresholds) -> bool {
-    let means = rows.grad2d.iter().zip(rows.count).map(|(&grad2d, &count)| mean_grad2d(grad2d, count));
-    means.fold(false, |any, mean| any | (mean > thresholds.grow_grad2d))
+    fn raise_sh_degree(&mut self, degree: u8) {
+        if degree > self.view().columns.sh_degree {
+            self.table().raise_sh_degree(degree);
+        }
+    }
+
+    /// Returns the number of rows that were rewritten.
+    fn reset_opacities(&mut self, values: &AdamNow<'_>, max_opacity: f32) -> usize {
+        match &mut self.table {
+            Some(state) => ops::reset_opacities(values, state, max_opacity),
+            None => ops::reset_opacity_rows(values, self.page, max_opacity),
+        }
+    }
+
+    /// Returns whether there were any.
+    fn clear_statistics(&mut self) -> bool {
+        match &mut self.table {
+            Some(state) => clear_statistics(&mut state.view_mut()),
+            None => clear_statistics(self.page),
+        }
+    }
 }
 
 /// Forgets the statistics of rows; returns whether there were any.

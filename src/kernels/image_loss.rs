@@ -18,7 +18,6 @@ use crate::scene::image::{Image, Target};
 use rayon::prelude::*;
 use std::fmt;
 use std::ops::Range;
-use std::str::FromStr;
 
 /// Rows of a band at most: few enough for every core to get one, many enough that the ten rows read twice cost little.
 const BAND_ROWS: usize = 64;
@@ -56,25 +55,11 @@ impl SsimVariant {
             SsimVariant::Reflect => "reflect",
         }
     }
-
-    /// The variant with this name.
-    pub fn from_name(name: &str) -> Option<SsimVariant> {
-        SsimVariant::ALL.into_iter().find(|v| v.name() == name)
-    }
 }
 
 impl fmt::Display for SsimVariant {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())
-    }
-}
-
-impl FromStr for SsimVariant {
-    type Err = String;
-
-    fn from_str(name: &str) -> Result<Self, String> {
-        SsimVariant::from_name(name)
-            .ok_or_else(|| format!("'{name}' is not an SSIM variant; use same, valid or reflect"))
     }
 }
 

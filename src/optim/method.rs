@@ -1,7 +1,5 @@
 //! When Gaussians take the optimizer steps in which they have no gradient.
 
-use std::str::FromStr;
-
 /// What a step does to rows without a gradient.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Method {
@@ -13,16 +11,4 @@ pub enum Method {
     /// They never take it: values and moments stay as their last gradient left them. Not Adam; what trainers with
     /// "sparse" or "selective" optimizers do.
     Sparse,
-}
-
-impl FromStr for Method {
-    type Err = String;
-    fn from_str(name: &str) -> Result<Self, String> {
-        match name {
-            "deferred" => Ok(Method::Deferred),
-            "dense" => Ok(Method::Dense),
-            "sparse" => Ok(Method::Sparse),
-            _ => Err(format!("'{name}' is no optimizer")),
-        }
-    }
 }

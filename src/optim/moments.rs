@@ -34,11 +34,6 @@ impl Moments {
             Moments::Bf16 => "bf16",
         }
     }
-
-    /// The choice with this name.
-    pub fn from_name(name: &str) -> Option<Moments> {
-        [Moments::F32, Moments::Bf16].into_iter().find(|m| m.name() == name)
-    }
 }
 
 /// Rounds both moments of a loaded row that contains `steps` steps; `W` is the width of `sh_n`.

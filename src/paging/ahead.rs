@@ -22,7 +22,6 @@ use crate::cache::host_cache::Victim;
 use crate::schedule::model::FAR_STEPS;
 use crate::schedule::replay::STEPS_AHEAD;
 use std::collections::{BinaryHeap, VecDeque};
-use std::str::FromStr;
 
 /// Steps that are planned anew, by the bounds as they are now, counted from the present one: the next, the last that is
 /// played through, and one far enough for pages to be kept for it. Pages were planned up to two epochs before, and their
@@ -39,18 +38,6 @@ pub enum Transfers {
     Ahead,
     /// When a step needs them: neither plan nor overlap, for comparison.
     Demand,
-}
-
-impl FromStr for Transfers {
-    type Err = String;
-    fn from_str(name: &str) -> Result<Self, String> {
-        match name {
-            "overlap" => Ok(Transfers::Overlap),
-            "ahead" => Ok(Transfers::Ahead),
-            "demand" => Ok(Transfers::Demand),
-            _ => Err(format!("'{name}' is no time for transfers")),
-        }
-    }
 }
 
 /// A page that a coming step will need.

@@ -1,52 +1,18 @@
 //! What is other than it was when a run goes on: its config, key by key, and its dataset.
 //!
-//! Three kinds of keys: those that change no number of the result may be given anew and are only said; those that do are
-//! refused unless the user accepts it; those that the stored pages are laid out by cannot change at all.
+//! A key's class ([`Class`]) stands beside the key. Keys that change no number of the result may be given anew, which is only
+//! said; keys that do are refused unless the user accepts it; keys that the stored pages are laid out by cannot change.
 
 use super::dataset_print::{DatasetChanges, dataset_changes};
 use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
 use crate::checkpoint::run_state::{DatasetPrint, RunState};
-use crate::config::file::TrainConfig;
+use crate::config::file::{KEYS, TrainConfig};
+use crate::config::key::{Class, Key};
 use crate::config::limits;
 use crate::dataset::loader::Dataset;
 use serde::Deserialize;
 use std::path::Path;
-
-/// Keys that change no number of the steps.
-const FREE_KEYS: &[&str] = &[
-    "image-cache",
-    "eval-every",
-    "save-every",
-    "log-every",
-    "log",
-    "ssim-variant",
-    "color-correct",
-    "export-frame",
-    "host-mem",
-    "spill-dir",
-    "keep-checkpoint",
-    "frames",
-    "io",
-    "spill-codec",
-    "commit-every",
-    "disk-full-wait",
-    "evict",
-    "transfers",
-    "prefetch-bytes",
-    "threads",
-    "device",
-    "deterministic",
-    "device-mem",
-    // How far a run goes; what its rates follow is compared as schedule-steps.
-    "steps",
-];
-/// Of these, keys that hold for all later lives of a run too, not for this one alone.
-const LASTING_KEYS: &[&str] = &["steps", "keep-checkpoint", "spill-dir"];
-/// Keys by which stored pages are laid out.
-const LAYOUT_KEYS: &[&str] = &["page-rows", "sh-degree"];
-/// Compared as what follows from them; of init-ply that is the digest of first Gaussians, wherever the file lies now.
-const DERIVED_KEYS: &[&str] = &["simd", "schedule-steps", "init-ply"];
 
 /// The config that a run keeps when it goes on with `config`: that of its file, with what changes numbers and how far it
 /// goes and where its checkpoint is as they are now.
@@ -57,8 +23,8 @@ pub(super) fn kept_config(file: &Path, of_file: &TrainConfig, config: &TrainConf
     let broken = |e: String| InputError::new(file, e, "report this as a bug");
     let table = |config: &TrainConfig| toml::Table::try_from(config).map_err(|e| broken(e.to_string()));
     let (of_file, mut kept) = (table(of_file)?, table(config)?);
-    for key in FREE_KEYS.iter().filter(|key| !LASTING_KEYS.contains(key)) {
-        kept.extend(of_file.get(*key).map(|value| (key.to_string(), value.clone())));
+    for name in KEYS.iter().filter(|key| !key.class.lasts()).map(Key::name) {
+        kept.extend(of_file.get(&name).map(|value| (name, value.clone())));
     }
     let kept = TrainConfig::deserialize(kept).map_err(|e| broken(e.to_string()))?;
     Ok(with_absolute_paths(kept))
@@ -100,22 +66,28 @@ impl Changes {
     /// The config of the commit cannot be read.
     pub fn of_config(file: &Path, state: &RunState, config: &TrainConfig) -> InputResult<Changes> {
         let broken = |e: String| InputError::new(file, e, "start the run again");
-        let there: toml::Table = state.config.parse().map_err(|e: toml::de::Error| broken(e.to_string()))?;
-        let here = toml::Table::try_from(config).map_err(|e| broken(e.to_string()))?;
-        let mut changes = Changes::default();
-        let differs = |(key, now): &(&String, &toml::Value)| {
-            !DERIVED_KEYS.contains(&key.as_str()) && there.get(key.as_str()) != Some(*now)
+        let written: toml::Table = state.config.parse().map_err(|e: toml::de::Error| broken(e.to_string()))?;
+        let then = TrainConfig::parse(&state.config).map_err(broken)?;
+        let table = |config: &TrainConfig| {
+            toml::Table::try_from(config).map_err(|e| InputError::new(file, e.to_string(), "report this as a bug"))
         };
-        for (key, now) in here.iter().filter(differs) {
-            let then = there.get(key).map_or_else(|| "not there".to_string(), toml::Value::to_string);
-            let lines = match key.as_str() {
-                key if FREE_KEYS.contains(&key) => &mut changes.free,
-                key if LAYOUT_KEYS.contains(&key) => &mut changes.fixed,
+        let (there, here) = (table(&then)?, table(config)?);
+        let mut changes = Changes::default();
+        for (name, now) in &here {
+            let Some(class) = KEYS.iter().find(|key| key.name() == *name).map(|key| key.class) else { continue };
+            // A key that an older commit did not know has the default since, and the user hears of it.
+            let then = there.get(name).filter(|_| written.contains_key(name));
+            if class.is_derived() || then == Some(now) {
+                continue;
+            }
+            let lines = match class {
+                Class::Layout => &mut changes.fixed,
+                class if class.is_free() => &mut changes.free,
                 _ => &mut changes.numbers,
             };
-            lines.push(format!("{key} was {then} and is {now}"));
+            let then = then.map_or_else(|| "not there".to_string(), toml::Value::to_string);
+            lines.push(format!("{name} was {then} and is {now}"));
         }
-        let then = TrainConfig::parse(&state.config).map_err(broken)?;
         check_eps_of_commit(file, &then)?;
         let [was, is] = [&then, config].map(limits::schedule_steps);
         if was != is {
@@ -172,7 +144,6 @@ impl Changes {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
-    use crate::config::file::KEYS;
 
     #[test]
     fn another_path_changes_numbers_where_its_bits_are_others() {
@@ -195,11 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn the_lists_name_keys_and_what_lasts_is_kept() {
-        let keys: Vec<String> = KEYS.iter().map(|(_, name, _)| name.replace('_', "-")).collect();
-        let named = [FREE_KEYS, LASTING_KEYS, LAYOUT_KEYS, DERIVED_KEYS].concat();
-        let unknown: Vec<&&str> = named.iter().filter(|name| !keys.iter().any(|key| key == **name)).collect();
-        assert!(unknown.is_empty(), "{unknown:?}");
+    fn what_lasts_is_kept() {
         let of_file = TrainConfig { threads: 3, frames: 7, seed: 1, ..TrainConfig::default() };
         let now = TrainConfig { threads: 1, steps: 9, seed: 2, keep_checkpoint: true, ..TrainConfig::default() };
         let kept = kept_config(Path::new("config.toml"), &of_file, &now).unwrap();

@@ -194,7 +194,7 @@ pub fn evaluate_ply(
         ply: ply.to_path_buf(),
         scene: scene.to_path_buf(),
         gaussians,
-        ssim_variant: config.ssim_variant.clone(),
+        ssim_variant: config.ssim_variant.to_string(),
         lpips_variant: of_lpips.map(|(lpips, range)| format!("{}, {}", lpips.network().name(), range.name())),
         test,
     })

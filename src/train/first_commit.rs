@@ -5,8 +5,9 @@
 //! behind, and the pager as it was.
 
 use super::error::TrainError;
-use super::places::checkpoint_folder;
 use crate::config::file::TrainConfig;
+use crate::config::residence::checkpoint_folder;
+use crate::optim::moments::Moments;
 use crate::page::engine::open::{DEPTH, IoEngine, open_engine};
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
@@ -37,7 +38,7 @@ impl FirstCommit {
     pub fn of(out: &Path, config: &TrainConfig) -> FirstCommit {
         FirstCommit {
             folder: checkpoint_folder(out),
-            io: config.io.parse().unwrap_or(IoEngine::Auto),
+            io: config.io,
             codec: codec(config),
             capacity_bytes: capacity_bytes(config.page_rows as usize, config.sh_degree),
         }
@@ -78,6 +79,8 @@ impl FirstCommit {
 
 /// As `--spill-codec` says; `auto` does not measure the drive, of which little is asked.
 pub(super) fn codec(config: &TrainConfig) -> Codec {
-    let auto = if config.moments == "bf16" { Codec::Halves } else { Codec::Raw };
-    config.spill_codec.parse().unwrap_or(auto)
+    config.spill_codec.0.unwrap_or(match config.moments {
+        Moments::F32 => Codec::Raw,
+        Moments::Bf16 => Codec::Halves,
+    })
 }

@@ -2,6 +2,7 @@
 //! work.
 
 use crate::base::error::{InputError, InputResult};
+use crate::config::choice::Device;
 use crate::config::file::TrainConfig;
 use crate::config::limits::simd_path;
 use crate::gpu::{DeviceChoice, Gpu, GpuError, GpuOptions, GpuResult};
@@ -34,21 +35,19 @@ pub fn set_up(config: &TrainConfig) -> InputResult<()> {
 /// # Errors
 /// The device that was asked for does not exist or cannot be used.
 pub fn renderer(config: &TrainConfig) -> InputResult<(Box<dyn Renderer>, Option<String>)> {
-    let choice = match config.device.as_str() {
-        "cpu" => return Ok((Box::new(CpuRenderer::new()), None)),
-        "auto" => DeviceChoice::Auto,
-        "gpu" => DeviceChoice::Gpu,
-        name => DeviceChoice::Named(name.to_string()),
+    let choice = match &config.device {
+        Device::Cpu => return Ok((Box::new(CpuRenderer::new()), None)),
+        Device::Gpu(choice) => choice,
     };
     let budget = (config.device_mem.0 > 0).then_some(config.device_mem.0);
-    let opened = Gpu::open_with(&choice, &GpuOptions { budget, ..GpuOptions::default() }).and_then(gpu_renderer);
+    let opened = Gpu::open_with(choice, &GpuOptions { budget, ..GpuOptions::default() }).and_then(gpu_renderer);
     match opened {
         Ok(renderer) => Ok((renderer, None)),
         Err(GpuError::NoHardwareGpu { .. }) => {
             let word = "there is no hardware GPU: the CPU renders (--list-devices shows what was found)";
             Ok((Box::new(CpuRenderer::new()), Some(word.to_string())))
         }
-        Err(error) if choice == DeviceChoice::Auto => {
+        Err(error) if *choice == DeviceChoice::Auto => {
             let word = format!("the GPU cannot be used, so the CPU renders: {error}");
             Ok((Box::new(CpuRenderer::new()), Some(word)))
         }

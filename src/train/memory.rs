@@ -77,7 +77,7 @@ pub fn within_reach() -> Option<u64> {
 
 /// Rows that a run may come to, as far as it is known: those there are, or the cap.
 pub fn rows_at_most(config: &TrainConfig, rows: u64) -> u64 {
-    if config.strategy == "none" { rows } else { rows.max(config.max_gaussians) }
+    if config.strategy.grows() { rows.max(config.max_gaussians) } else { rows }
 }
 
 /// The most that decoding a photo with its mask takes, bytes, and the view whose it is.

@@ -7,11 +7,11 @@
 use super::error::TrainError;
 use super::facts::read_resolved;
 use super::ownership::{check_removable, remove_checkpoint_in};
-use super::places::checkpoint_folder;
 use super::whole_file::folder_of;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::config::file::TrainConfig;
+use crate::config::residence::checkpoint_folder;
 use crate::exchange::tensorboard::is_event_file;
 use crate::page::engine::segment_files::sync_folder;
 use crate::page::folder::spill_dir::SpillDir;
@@ -61,15 +61,13 @@ fn check_new(out: &Path) -> InputResult<()> {
 pub fn remedy_of_existing(out: &Path) -> String {
     let start_over = "choose another --out, or replace it with --overwrite";
     let Ok(config) = TrainConfig::read(&out.join("config.toml")) else { return start_over.to_string() };
-    let spill = Path::new(&config.spill_dir);
-    let in_memory = config.spill_dir.is_empty();
-    let checkpoint = if in_memory { checkpoint_folder(out) } else { spill.to_path_buf() };
-    if !SpillDir::is_one(&checkpoint) {
+    let residence = config.residence();
+    if !SpillDir::is_one(&residence.checkpoint_folder(out)) {
         return start_over.to_string();
     }
-    let over = match in_memory {
-        true => "--overwrite".to_string(),
-        false => format!("--overwrite after removing {}", spill.display()),
+    let over = match residence.spill_dir() {
+        None => "--overwrite".to_string(),
+        Some(spill_dir) => format!("--overwrite after removing {}", spill_dir.display()),
     };
     format!(
         "it holds a run that can go on: gsscale-train --resume {}; or choose another --out, or start over with {over}",

@@ -16,6 +16,7 @@ use crate::config::limits::RunOptions;
 use crate::dataset::import::{ImportOptions, PointSource, import_points};
 use crate::densify::replay::{PageEdit, PendingEvents, Replay};
 use crate::densify::stats::GradHistogram;
+use crate::densify::strategy::{Effect, Strategy, effect_of};
 use crate::optim::bounds::SplitLimits;
 use crate::optim::deferred::DeferredAdam;
 use crate::optim::method::Method;
@@ -33,6 +34,7 @@ use crate::scene::partition::{first_fill, partition};
 use crate::scene::rows::{Rows, RowsNow};
 use crate::scene::state::SceneState;
 use rayon::prelude::*;
+use std::sync::Arc;
 
 /// Pages that are brought to now together: their copies are in memory at once.
 pub(super) const PAGES_PER_BATCH: usize = 32;
@@ -44,6 +46,8 @@ pub struct PageRules {
     events: EventLog,
     seed: u64,
     page_rows: usize,
+    /// What steps collect, and when rounds follow.
+    pub(super) strategy: Arc<dyn Strategy>,
     /// When rows may split before they are seen again.
     splits: SplitLimits,
     sh_degree: u8,
@@ -72,7 +76,8 @@ impl PageRules {
             events: EventLog::default(),
             seed: options.seed,
             page_rows: options.page_rows,
-            splits: options.densify.map_or(SplitLimits::NEVER, |d| d.split_limits(options.scene_scale)),
+            strategy: options.strategy.clone(),
+            splits: options.strategy.split_limits(options.scene_scale),
             sh_degree: options.sh_degree_at(0),
         }
     }
@@ -119,7 +124,7 @@ impl PagedScene {
     /// A page could not be stored.
     pub fn new(columns: &Columns, pager: Pager, options: &RunOptions) -> Result<PagedScene, PagingError> {
         let mut scene = PagedScene::empty(pager, options);
-        let fill = first_fill(options.page_rows, options.densify.is_some());
+        let fill = first_fill(options.page_rows, options.strategy.grows());
         first_pages(columns, fill, scene.rules.sh_degree, &mut |id, state| scene.insert_first_page(id, &state))?;
         Ok(scene)
     }
@@ -202,16 +207,16 @@ impl PagedScene {
     }
 
     /// Logs an event: pages apply it when they are next pinned by a step. A round is promised the growth of all rows
-    /// that may exceed its threshold, and clears the statistics.
+    /// that may grow in it, and clears the statistics.
     pub fn log_event(&mut self, event: Event) {
         self.rules.events.push(event);
-        match event.kind {
-            EventKind::RaiseShDegree { degree } => self.rules.sh_degree = degree,
-            EventKind::Densify(thresholds) => {
-                self.rows_bound += self.histogram.promised(thresholds.grow_grad2d);
+        match effect_of(&event.kind) {
+            Effect::RaiseShDegree { degree } => self.rules.sh_degree = degree,
+            Effect::Round(round) => {
+                self.rows_bound += round.promised(self.rows_bound, &self.histogram);
                 self.histogram.clear();
             }
-            EventKind::ResetOpacity { .. } => {}
+            Effect::ResetOpacity { .. } => {}
         }
     }
 

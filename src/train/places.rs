@@ -1,4 +1,5 @@
-//! Where files of a run lie: its checkpoint, the drive of its spill directory, and a folder for what has no name.
+//! Where files of a run lie: the drive of its spill directory, and a folder for what has no name. Where its checkpoint lies:
+//! [`crate::config::residence`].
 
 use std::path::{Path, PathBuf};
 
@@ -12,9 +13,4 @@ pub(super) fn folder_beside(spill_dir: &Path) -> PathBuf {
 /// The spill directory, or as long as it is not there the folder above it that is: what tells of its drive.
 pub(super) fn drive_of(spill_dir: &Path) -> PathBuf {
     if spill_dir.is_dir() { spill_dir.to_path_buf() } else { folder_beside(spill_dir) }
-}
-
-/// Where the checkpoint of a run in memory is.
-pub(super) fn checkpoint_folder(out: &Path) -> PathBuf {
-    out.join("checkpoint")
 }

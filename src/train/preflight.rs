@@ -14,6 +14,7 @@ use super::tiers::{Tiers, budget_in_memory, first_staging_bytes};
 use super::trainer::Trainer;
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
+use crate::cache::evict::EvictPolicy;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::page::folder::file_system::free_bytes;
@@ -26,7 +27,6 @@ use crate::schedule::model::Policy;
 use crate::schedule::order::Order;
 use crate::schedule::replay::{ReplayOptions, replay};
 use crate::schedule::visibility::{ViewPages, visible_pages};
-use std::path::Path;
 
 /// Bytes that a common drive of 500 GB is rated to take in its life.
 const ENDURANCE_BYTES: f64 = 300e12;
@@ -74,7 +74,7 @@ pub fn settle(
 ) -> InputResult<TierPlan> {
     let index = trainer.scene.pager.index().len() as u64;
     let rows_max = rows_at_most(config, trainer.scene.rows());
-    let fill = first_fill(config.page_rows as usize, config.strategy != "none") as u64;
+    let fill = first_fill(config.page_rows as usize, config.strategy.grows()) as u64;
     // Pages are not all full (giants have their own), and what grows is filled like what is there.
     let grown = (index as f64 * rows_max as f64 / trainer.scene.rows().max(1) as f64).ceil() as u64;
     let pages_max = grown.max(rows_max.div_ceil(fill));
@@ -102,7 +102,7 @@ pub fn settle(
         }
         return Ok(plan);
     }
-    let staging = staging_bytes(trainer.scene.pager.prefetch_bytes(), &tiers.codec);
+    let staging = staging_bytes(trainer.scene.pager.prefetch_bytes(), tiers.codec);
     memory.iter_mut().for_each(|m| m.staging = staging);
     let asked = host_mem;
     let (frames, host_mem) = first_frames(config, &plan, asked, &memory[0])?;
@@ -114,7 +114,7 @@ pub fn settle(
     }
     plan.frames = Some(frames);
     memory.iter_mut().for_each(|m| m.frames = m.frames.min(frames * frame_bytes));
-    if config.view_order == "auto" {
+    if config.view_order.0.is_none() {
         trainer.set_view_order(auto_order(config, dataset, trainer, frames, &plan)?, dataset);
     }
     warn_of_growth(config, &plan, host_mem, memory);
@@ -126,13 +126,13 @@ pub fn settle(
 /// What is known of a scene whose pages a dry run cannot look at, since they do not fit in memory and it writes none;
 /// `None` where they do fit. A dry run keeps what would lie on the drive in memory, in half of the budget at most.
 pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Option<u64>) -> Option<String> {
-    let budget = host_mem.filter(|_| !config.spill_dir.is_empty())?;
+    let (spill_dir, budget) = (config.residence().spill_dir()?, host_mem?);
     let frame = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes() as u64;
-    let pages = start.rows.div_ceil(first_fill(config.page_rows as usize, config.strategy != "none") as u64);
+    let pages = start.rows.div_ceil(first_fill(config.page_rows as usize, config.strategy.grows()) as u64);
     if pages.saturating_mul(frame) <= budget / 2 {
         return None;
     }
-    let free = free_bytes(&drive_of(Path::new(&config.spill_dir))).ok().flatten();
+    let free = free_bytes(&drive_of(spill_dir)).ok().flatten();
     Some(format!(
         "scene   {} views to train on, {} held out\n\
          start   {} Gaussians\n\
@@ -237,7 +237,7 @@ pub(super) fn frames_within(
 /// Gaussians, and leaves fewer frames for them.
 fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, memory: &[MemoryEstimate; 2]) {
     let ([now, most], Some(frames)) = (plan.pages, plan.frames) else { return };
-    if config.strategy == "none" {
+    if !config.strategy.grows() {
         return;
     }
     let LargestView { pages: needed, name: view, .. } = &plan.largest_view;
@@ -272,7 +272,10 @@ fn times_to_outgrow(plan: &TierPlan, frames: u64, of_rows: u64, are_fixed: bool)
 fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, frames: usize) -> f64 {
     let cameras = train_cameras(dataset);
     let index = trainer.scene.pager.index();
-    let policy = if config.evict == "lru" { Policy::LeastRecent } else { Policy::Farthest };
+    let policy = match config.evict {
+        EvictPolicy::FarthestNextUse => Policy::Farthest,
+        EvictPolicy::LeastRecentlyUsed => Policy::LeastRecent,
+    };
     let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
     let options = ReplayOptions { frames, policy, steps, plan_bytes: PLAN_BYTES as u64 };
     let page_bytes = vec![trainer.scene.pager.frame_bytes() as u32; index.len()];
@@ -416,12 +419,10 @@ fn check_view(plan: &TierPlan, frames: u64) -> InputResult<()> {
 /// # Errors
 /// It is too small; a drive that does not tell what is free is large enough.
 pub fn check_first_drive(config: &TrainConfig, rows: u64) -> InputResult<()> {
-    if config.spill_dir.is_empty() {
-        return Ok(());
-    }
-    let free = free_bytes(&drive_of(Path::new(&config.spill_dir))).ok().flatten();
+    let Some(spill_dir) = config.residence().spill_dir() else { return Ok(()) };
+    let free = free_bytes(&drive_of(spill_dir)).ok().flatten();
     let frame_bytes = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes() as u64;
-    let pages = rows.div_ceil(first_fill(config.page_rows as usize, config.strategy != "none") as u64);
+    let pages = rows.div_ceil(first_fill(config.page_rows as usize, config.strategy.grows()) as u64);
     free.map_or(Ok(()), |free| refuse_small_drive(free, pages, frame_bytes))
 }
 

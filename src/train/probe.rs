@@ -65,7 +65,7 @@ pub fn estimate(
     let keep_all = TargetCache::bytes_to_keep_all(&dataset.views, decoders);
     let targets = config.image_cache.0.min(keep_all).max(largest_decode(dataset).0);
     let pages = probe.pages as f64;
-    let is_growing = config.strategy != "none";
+    let is_growing = config.strategy.grows();
     let copies = if is_growing { bytes_of_copies(probe.pages, trainer.scene.pager.frame_bytes()) } else { 0 };
     let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver;
     Ok([rows, rows_at_most(config, rows)].map(|rows_then| {

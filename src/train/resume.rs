@@ -15,7 +15,6 @@ use super::memory::host_budget;
 use super::out_folder::Existing;
 use super::ownership::open_own;
 use super::pages::PagedScene;
-use super::places::checkpoint_folder;
 use super::report::{StepLine, Summary};
 use super::run::{Begun, Past, RunOutcome, RunRequest, begin, run, see_through};
 use super::start::Start;
@@ -26,8 +25,10 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::simd::SimdPath;
 use crate::checkpoint::run_state::{DatasetPrint, RunState, RunStateError};
+use crate::config::choice::Chosen;
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits::{self, RunOptions};
+use crate::config::residence::checkpoint_folder;
 use crate::densify::stats::GradHistogram;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::CommitError;
@@ -65,11 +66,12 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
         return Ok(outcome);
     }
     let folder = stored_folder(&request.out, &config);
-    match open_own(&folder, earlier.run, config.spill_dir.is_empty()) {
+    let is_in_output = config.residence().spill_dir().is_none();
+    match open_own(&folder, earlier.run, is_in_output) {
         Ok(Some(stored)) => go_on(request, &earlier, config, stored),
         Ok(None) => begin_again(request, &earlier, config),
         // A run in memory makes its checkpoint with its first commit.
-        Err(_) if config.spill_dir.is_empty() && !SpillDir::is_one(&folder) && !has_past(&request.out) => {
+        Err(_) if is_in_output && !SpillDir::is_one(&folder) && !has_past(&request.out) => {
             begin_again(request, &earlier, config)
         }
         Err(error) => Err(error),
@@ -206,10 +208,7 @@ fn identity_of(run: RunId, state: &RunState) -> RunId {
 
 /// Where the checkpoint of a run is.
 fn stored_folder(out: &Path, config: &TrainConfig) -> PathBuf {
-    match config.spill_dir.as_str() {
-        "" => checkpoint_folder(out),
-        folder => PathBuf::from(folder),
-    }
+    config.residence().checkpoint_folder(out)
 }
 
 /// More steps do not stretch the rates of a run.
@@ -264,7 +263,7 @@ fn already_done(
     let folder = stored_folder(&request.out, config);
     let is_its_place = folder == stored_folder(&request.out, &earlier.config);
     let stored = if SpillDir::is_one(&folder) {
-        open_own(&folder, earlier.run, config.spill_dir.is_empty()).unwrap_or_else(|error| {
+        open_own(&folder, earlier.run, config.residence().spill_dir().is_none()).unwrap_or_else(|error| {
             eprintln!("warning: {} is left alone: {error}", folder.display());
             None
         })
@@ -313,11 +312,12 @@ fn changed_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result
 /// The config that the pages were trained by, on a path that gives the bits that they have if this machine has one, else
 /// on the path of the config or on the best that there is: a path changes roundings, other rates the scene.
 fn rules_then(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath) -> bool) -> Option<TrainConfig> {
-    let on = |simd: &str| TrainConfig { simd: simd.to_string(), ..then.clone() };
-    let class = SimdPath::from_name(simd).map(SimdPath::bits_class);
+    let on = |simd: Option<SimdPath>| TrainConfig { simd: Chosen(simd), ..then.clone() };
+    let path = SimdPath::from_name(simd);
+    let class = path.map(SimdPath::bits_class);
     let of_class = SimdPath::ALL.into_iter().filter(|path| Some(path.bits_class()) == class);
-    let of_class = of_class.map(|path| on(path.name()));
-    let mut all = std::iter::once(on(simd)).chain(of_class).chain([on(&then.simd), on("auto")]);
+    let of_class = of_class.map(|path| on(Some(path)));
+    let mut all = std::iter::once(on(path)).chain(of_class).chain([on(then.simd.0), on(None)]);
     all.find(|c| is_supported(limits::simd_path(c)))
 }
 
@@ -343,17 +343,22 @@ mod tests {
 
     #[test]
     fn pages_go_on_by_their_own_config_on_a_machine_without_its_path() {
-        let then = TrainConfig { means_lr: 0.5, seed: 9, simd: "avx512".into(), ..TrainConfig::default() };
+        let then =
+            TrainConfig { means_lr: 0.5, seed: 9, simd: Chosen(Some(SimdPath::Avx512)), ..TrainConfig::default() };
         let here = |paths: &[SimdPath]| rules_then(&then, "avx512", |path| paths.contains(&path));
-        let with = |simd: &str| Some(TrainConfig { simd: simd.into(), ..then.clone() });
-        assert_eq!(here(&SimdPath::ALL), with("avx512"));
-        assert_eq!(here(&[SimdPath::Avx2, SimdPath::Baseline]), with("avx2"), "the same bits on another path");
+        let with = |simd: Option<SimdPath>| Some(TrainConfig { simd: Chosen(simd), ..then.clone() });
+        assert_eq!(here(&SimdPath::ALL), with(Some(SimdPath::Avx512)));
+        assert_eq!(
+            here(&[SimdPath::Avx2, SimdPath::Baseline]),
+            with(Some(SimdPath::Avx2)),
+            "the same bits on another path"
+        );
         // What `auto` stands for depends on the machine: it is asked for after the path itself, the two of its class, and
         // that of the config.
         let asked = std::cell::Cell::new(0);
         let last = |_| asked.replace(asked.get() + 1) == 4;
-        assert_eq!(rules_then(&then, "avx512", last), with("auto"));
-        let baseline = TrainConfig { simd: "baseline".into(), ..then.clone() };
+        assert_eq!(rules_then(&then, "avx512", last), with(None));
+        let baseline = TrainConfig { simd: Chosen(Some(SimdPath::Baseline)), ..then.clone() };
         let found = rules_then(&baseline, "avx512", |path| path == SimdPath::Baseline);
         assert_eq!(found, Some(baseline), "that of the config comes next");
         // Never by another config.

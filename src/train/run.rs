@@ -26,8 +26,10 @@ use super::training_loop::LoopOutputs;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{DatasetPrint, RunIdentity};
+use crate::config::choice::{Chosen, LogFormat};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
+use crate::config::residence::Residence;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyWritten};
@@ -115,12 +117,14 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
         }
         return Ok(RunOutcome { summary: None, exit_code: 0 });
     }
-    if !request.dry_run && !config.spill_dir.is_empty() && remove_uncommitted(Path::new(&config.spill_dir), false)? {
-        eprintln!("{} held a run that was cut off before its first commit: its pages are removed", config.spill_dir);
+    if let Some(spill_dir) = config.residence().spill_dir().filter(|_| !request.dry_run)
+        && remove_uncommitted(spill_dir, false)?
+    {
+        eprintln!("{} held a run that was cut off before its first commit: its pages are removed", spill_dir.display());
     }
     preflight::check_first_drive(config, start.rows)?;
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
-    let fill = first_fill(config.page_rows as usize, options.densify.is_some());
+    let fill = first_fill(config.page_rows as usize, options.strategy.grows());
     let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
     // Dropped after the trainer, whose pages may lie there.
     let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
@@ -203,7 +207,7 @@ fn spill_dir_flag(request: &RunRequest) -> String {
 
 /// The config as it is kept: settled, and with paths that do not depend on where the program was started.
 fn settled(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
-    let view_order = trainer.view_order().order().to_string();
+    let view_order = Chosen(Some(trainer.view_order().order()));
     with_absolute_paths(TrainConfig { view_order, ..config.clone() })
 }
 
@@ -247,7 +251,7 @@ fn train_into(
     let (config, out) = (&request.config, &request.out);
     let origin = begin_files(request, dataset, &trainer, &begun)?;
     let mut metrics = MetricsLog::open(&out.join("metrics.jsonl"), begun.past.as_ref().map(|p| p.metrics_bytes))?;
-    if config.log == "tensorboard" {
+    if config.log == LogFormat::Tensorboard {
         metrics = metrics.with_events(&out.join("tensorboard"), begun.past.as_ref().map(|p| p.step))?;
     }
     let keeps = tiers.keeps_checkpoint();
@@ -305,7 +309,7 @@ fn train_into(
 
 /// Says where the final PLY is not what was asked for.
 fn warn_of_ply(config: &TrainConfig, written: &PlyWritten, ply: &Path) {
-    if written.frame == ExportFrame::Local && config.export_frame == "dataset" {
+    if written.frame == ExportFrame::Local && config.export_frame == ExportFrame::Dataset {
         eprintln!(
             "warning: the scene lies too far from its origin for f32, so {} holds local positions; \
              its comments give origin and scale",
@@ -328,7 +332,7 @@ fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
         test: None,
         scene: request.scene.clone(),
         version: env!("CARGO_PKG_VERSION").to_string(),
-        ssim_variant: request.config.ssim_variant.clone(),
+        ssim_variant: request.config.ssim_variant.to_string(),
         finished: false,
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
@@ -364,8 +368,8 @@ fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, tiers: &
     let (config, rows) = (&request.config, trainer.scene.rows());
     let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
     let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
-    let growth = match (config.strategy.as_str(), config.max_gaussians) {
-        ("none", _) => String::from(" (no densification)"),
+    let growth = match (config.strategy.grows(), config.max_gaussians) {
+        (false, _) => String::from(" (no densification)"),
         (_, 0) => String::from(" (densification without a cap: memory grows with them; see --max-gaussians)"),
         (_, cap) => format!(" growing to at most {cap}"),
     };
@@ -373,10 +377,10 @@ fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, tiers: &
         true => String::new(),
         false => format!(", results in {}", request.out.display()),
     };
-    let commits = match (config.spill_dir.as_str(), config.frames) {
-        ("", 0) => "to checkpoint/ in the results (see --commit-every)",
-        ("", _) => "nowhere: --frames without --spill-dir is for comparisons",
-        _ => "to the spill directory (see --commit-every)",
+    let commits = match config.residence() {
+        Residence::Memory => "to checkpoint/ in the results (see --commit-every)",
+        Residence::Frames => "nowhere: --frames without --spill-dir is for comparisons",
+        Residence::SpillDir(_) => "to the spill directory (see --commit-every)",
     };
     let text = format!(
         "scene   {}: {} views to train on, {} held out, at most {size}\n\

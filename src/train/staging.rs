@@ -10,8 +10,8 @@ pub const PLAN_BYTES: usize = 16 << 20;
 
 /// Bytes that the plan takes beside the frames, and pages on their way of which `prefetch_bytes` may be in flight: raw
 /// pages move between frames and drive without a copy.
-pub fn staging_bytes(prefetch_bytes: usize, codec: &str) -> u64 {
-    (PLAN_BYTES + if codec == Codec::Raw.to_string() { 0 } else { prefetch_bytes }) as u64
+pub fn staging_bytes(prefetch_bytes: usize, codec: Codec) -> u64 {
+    (PLAN_BYTES + if codec == Codec::Raw { 0 } else { prefetch_bytes }) as u64
 }
 
 /// The memory that a run needs which holds `rest` bytes beside its staging, where staging took `staging` of `budget` bytes:

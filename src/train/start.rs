@@ -68,7 +68,7 @@ impl Start {
     /// # Errors
     /// As [`prepare`].
     pub fn read(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
-        if config.spill_dir.is_empty() && !Path::new(&config.init_ply).is_dir() {
+        if config.residence().spill_dir().is_none() && !Path::new(&config.init_ply).is_dir() {
             return Start::in_memory(scene, config, host_mem)?.with_photos_that_fit(host_mem);
         }
         Start::look(scene, config, &folder_beside(Path::new(&config.spill_dir)), host_mem)
@@ -214,7 +214,7 @@ impl Start {
         take: &mut dyn FnMut(PageId, SceneState) -> Result<(), TrainError>,
     ) -> Result<(), TrainError> {
         let (sh_degree, budget) = (options.sh_degree_at(0), budget(folder, host_mem));
-        let fill = first_fill(options.page_rows, options.densify.is_some());
+        let fill = first_fill(options.page_rows, options.strategy.grows());
         let frame = self.dataset.frame;
         let mut failed = None;
         // Not what the import says of its taker's errors, but these themselves.

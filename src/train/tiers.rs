@@ -11,9 +11,10 @@ use super::memory::MemoryEstimate;
 use super::places::drive_of;
 use super::staging::{PLAN_BYTES, PREFETCH_BYTES_MAX, staging_bytes};
 use crate::base::error::{InputError, InputResult};
-use crate::cache::evict::EvictPolicy;
 use crate::checkpoint::run_state::RunState;
 use crate::config::file::TrainConfig;
+use crate::config::residence::Residence;
+use crate::optim::moments::Moments;
 use crate::page::engine::drive_rate::DriveRate;
 use crate::page::engine::memory::MemoryEngine;
 use crate::page::engine::open::{DEPTH, IoEngine, open_engine};
@@ -60,28 +61,23 @@ pub struct Tiers {
     planned_on: Option<PathBuf>,
     /// What moves pages, for reports; empty when all stay in memory.
     pub engine: String,
-    /// How pages are stored, for reports.
-    pub codec: String,
+    /// How pages are stored.
+    pub codec: Codec,
     /// What the user should know of how they were chosen.
     pub notes: Vec<String>,
-}
-
-/// Which pages leave memory first, as `--evict` says.
-fn policy(config: &TrainConfig) -> EvictPolicy {
-    if config.evict == "lru" { EvictPolicy::LeastRecentlyUsed } else { EvictPolicy::FarthestNextUse }
 }
 
 /// How pages are stored, as `--spill-codec` says; `auto` measures the drive of `folder`, and is raw without one or where
 /// it cannot be measured.
 fn chosen_codec(config: &TrainConfig, folder: Option<&Path>, notes: &mut Vec<String>) -> Codec {
-    if let Ok(codec) = config.spill_codec.parse() {
+    if let Some(codec) = config.spill_codec.0 {
         return codec;
     }
     match folder.map(DriveRate::of) {
         None => Codec::Raw,
         Some(Ok(rate)) => match rate.codec() {
             // Costs one pass and saves a third of the bytes, on any drive.
-            Codec::Raw if config.moments == "bf16" => Codec::Halves,
+            Codec::Raw if config.moments == Moments::Bf16 => Codec::Halves,
             codec => codec,
         },
         Some(Err(error)) => {
@@ -95,7 +91,7 @@ fn chosen_codec(config: &TrainConfig, folder: Option<&Path>, notes: &mut Vec<Str
 fn pager_config(config: &TrainConfig, host_mem: u64) -> PagerConfig {
     let mut pager = PagerConfig {
         frames: config.frames as usize,
-        policy: policy(config),
+        policy: config.evict,
         plan_bytes: PLAN_BYTES,
         ..PagerConfig::in_memory(config.page_rows as usize, config.sh_degree)
     };
@@ -122,21 +118,21 @@ fn prefetch_bytes(config: &TrainConfig, frames: usize, frame_bytes: usize) -> us
 pub(super) fn budget_in_memory(config: &TrainConfig, host_mem: u64, memory: &MemoryEstimate) -> HostBudget {
     let frame_bytes = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes();
     let ahead = prefetch_bytes(config, (host_mem / frame_bytes as u64) as usize, frame_bytes);
-    let staging = staging_bytes(2 * ahead, &codec(config).to_string());
+    let staging = staging_bytes(2 * ahead, codec(config));
     HostBudget::new(host_mem, memory, config.host_mem.0 > 0).in_memory(ahead, staging)
 }
 
 /// The pager with its pages moving when `--transfers` says.
 fn with_transfers(mut pager: Pager, config: &TrainConfig) -> Pager {
-    pager.set_transfers(config.transfers.parse().unwrap_or_default());
+    pager.set_transfers(config.transfers);
     pager
 }
 
 /// The same of a run that was not begun, with this budget and a drive that is fast enough for raw pages where the codec is
 /// chosen by its speed.
 pub fn first_staging_bytes(config: &TrainConfig, host_mem: u64) -> u64 {
-    let codec = chosen_codec(config, None, &mut Vec::new()).to_string();
-    staging_bytes(2 * pager_config(config, host_mem).prefetch_bytes, &codec)
+    let codec = chosen_codec(config, None, &mut Vec::new());
+    staging_bytes(2 * pager_config(config, host_mem).prefetch_bytes, codec)
 }
 
 /// Opens the tiers for a scene of about `pages` pages, within `host_mem` bytes. The pager has few frames at first where
@@ -147,30 +143,30 @@ pub fn first_staging_bytes(config: &TrainConfig, host_mem: u64) -> u64 {
 /// The spill directory cannot be used, or the I/O engine does not work here.
 pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Result<(Pager, Tiers), TrainError> {
     let (page_rows, sh_degree) = (config.page_rows as usize, config.sh_degree);
-    if config.spill_dir.is_empty() && config.frames == 0 {
-        let in_memory = PagerConfig { policy: policy(config), ..PagerConfig::in_memory(page_rows, sh_degree) };
+    let residence = config.residence();
+    if residence == Residence::Memory {
+        let in_memory = PagerConfig { policy: config.evict, ..PagerConfig::in_memory(page_rows, sh_degree) };
         return Ok((with_transfers(Pager::in_memory(in_memory), config), Tiers::default()));
     }
     let pager = pager_config(config, host_mem);
     let layout = SlotLayout::new(capacity_bytes(page_rows, sh_degree), pages as u64);
     let mut tiers = Tiers::default();
     tiers.keeps = config.keep_checkpoint;
-    if dry || config.spill_dir.is_empty() {
-        let drive = Some(drive_of(Path::new(&config.spill_dir)));
-        tiers.planned_on = drive.filter(|_| !config.spill_dir.is_empty());
+    let Some(spill_dir) = residence.spill_dir().filter(|_| !dry) else {
+        tiers.planned_on = residence.spill_dir().map(drive_of);
         let engine = Box::new(MemoryEngine::new());
         let codec = chosen_codec(config, None, &mut tiers.notes);
-        (tiers.engine, tiers.codec) = (engine.name().to_string(), codec.to_string());
+        (tiers.engine, tiers.codec) = (engine.name().to_string(), codec);
         let of_store = PagedStoreConfig { store: 0, layout, codec, generation: 1, serial: 1 };
         return Ok((with_transfers(Pager::new(pager, PagedStore::new(engine, of_store)), config), tiers));
-    }
-    let spill = SpillDir::create(Path::new(&config.spill_dir), Purpose::Checkpoint, layout, false)?;
+    };
+    let spill = SpillDir::create(spill_dir, Purpose::Checkpoint, layout, false)?;
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
     // From here on an error removes the directory.
     let (engine, codec) = tiers.take_spill(spill, config)?;
     let opened = Commits::create(Box::new(folder), of_commits)?;
     let store = opened.paged_store(engine, layout, codec)?;
-    let mut checkpoint = Checkpoint::new(opened.commits, Path::new(&config.spill_dir), config);
+    let mut checkpoint = Checkpoint::new(opened.commits, spill_dir, config);
     checkpoint.fill_reserve()?;
     tiers.checkpoint = Some(checkpoint);
     Ok((with_transfers(Pager::new(pager, store), config), tiers))
@@ -243,10 +239,10 @@ impl Stored {
         let mut pager = pager_config(config, host_mem);
         let bytes = (opened.pages.len() * pager.frame_bytes()) as u64;
         // A run in memory stays there while that is no question; otherwise its checkpoint serves as a spill directory.
-        let is_in_memory = config.spill_dir.is_empty() && config.frames == 0 && bytes <= host_mem / 2;
+        let is_in_memory = config.residence() == Residence::Memory && bytes <= host_mem / 2;
         if is_in_memory {
             let in_memory = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree);
-            pager = PagerConfig { policy: policy(config), ..in_memory };
+            pager = PagerConfig { policy: config.evict, ..in_memory };
         }
         let layout = spill.format().layout;
         if layout.slot_bytes != pager.frame_bytes() as u64 {
@@ -254,7 +250,7 @@ impl Stored {
         }
         let mut tiers = Tiers::default();
         (tiers.has_past, tiers.is_in_memory, tiers.keeps) = (true, is_in_memory, config.keep_checkpoint);
-        tiers.is_in_output = config.spill_dir.is_empty();
+        tiers.is_in_output = config.residence().spill_dir().is_none();
         let folder = spill.folder().to_path_buf();
         let (engine, codec) = tiers.take_spill(spill, config)?;
         let store = opened.paged_store(engine, layout, codec)?;
@@ -282,16 +278,16 @@ impl Tiers {
             true => codec(config),
             false => chosen_codec(config, Some(&folder), &mut self.notes),
         };
-        let opened = open_engine(config.io.parse().unwrap_or(IoEngine::Auto), &folder, DEPTH)?;
+        let opened = open_engine(config.io, &folder, DEPTH)?;
         self.notes.extend(opened.notes);
-        (self.engine, self.codec) = (opened.store.name().to_string(), codec.to_string());
+        (self.engine, self.codec) = (opened.store.name().to_string(), codec);
         Ok((opened.store, codec))
     }
 
     /// A run whose pages stay in memory commits to its output folder `out`, from its first commit on. Nothing for other
     /// runs: those with a spill directory commit there, and `--frames` alone, which is for comparisons, has no drive.
     pub fn commit_in(&mut self, out: &Path, config: &TrainConfig) {
-        if config.spill_dir.is_empty() && config.frames == 0 {
+        if config.residence() == Residence::Memory {
             self.checkpoint = Some(Checkpoint::later(FirstCommit::of(out, config), config));
             (self.is_in_memory, self.is_in_output, self.keeps) = (true, true, config.keep_checkpoint);
         }

@@ -222,7 +222,7 @@ impl Trainer {
                 &mut *self.renderer,
                 (self.step, &dataset.views[view].camera, &target),
                 (&render, &self.options.loss),
-                self.options.densify.is_some_and(|d| d.collects(self.step)),
+                self.options.strategy.collects(self.step),
             );
             // A step without its frames changed nothing that doing it again does not.
             match stepped {
@@ -280,11 +280,9 @@ impl Trainer {
     /// Events fire after the update of their step, on values that contain it; here they are decided and logged.
     fn log_events(&mut self) {
         let (step, scale) = (self.step, self.options.scene_scale);
-        if let Some(densify) = self.options.densify {
-            let rows = self.scene.rows_bound();
-            let kinds: Vec<_> = densify.events_after(step, scale, rows, &self.scene.histogram).collect();
-            kinds.into_iter().for_each(|kind| self.scene.log_event(Event { step, kind }));
-        }
+        let rows = self.scene.rows_bound();
+        let kinds = self.options.strategy.events_after(step, scale, rows, &self.scene.histogram);
+        kinds.into_iter().for_each(|kind| self.scene.log_event(Event { step, kind }));
         let degree = self.options.sh_degree_at(step + 1);
         if degree > self.scene.rules.sh_degree() {
             self.scene.log_event(Event { step, kind: EventKind::RaiseShDegree { degree } });

@@ -4,7 +4,7 @@
 //! threads; 2. a page of which nothing was changed stays clean; 3. the bounds of every page that was changed are renewed.
 
 use super::pages::PagedScene;
-use crate::densify::stats::accumulate;
+use crate::densify::strategy::DrawnRows;
 use crate::optim::deferred::StepCounts;
 use crate::paging::pinned::PinnedPage;
 use crate::render::Gradients;
@@ -57,10 +57,16 @@ pub(super) fn update_pages(
         .collect();
     if collects {
         let Gradients { means2d, radii, .. } = of_step.gradients;
+        let strategy = &scene.rules.strategy;
         for share in &mut shares {
-            let (v, radii) = (&means2d[share.listed.clone()], &radii[share.listed.clone()]);
+            let drawn = DrawnRows {
+                rows: share.rows,
+                v_means2d: &means2d[share.listed.clone()],
+                radii: &radii[share.listed.clone()],
+                image_size: of_step.size,
+            };
             let mut view = share.page.rows_mut(share.first_row);
-            share.touched |= accumulate(&mut view, share.rows, v, radii, of_step.size, &mut scene.histogram) > 0;
+            share.touched |= strategy.collect(&mut view, &drawn, &mut scene.histogram) > 0;
         }
     }
     let rules = &scene.rules;

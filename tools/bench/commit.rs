@@ -88,7 +88,7 @@ impl Steps {
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let mut config = super::settle(args.config.as_deref(), &args.keys)?;
     super::refuse_devices(&config)?;
-    if config.spill_dir.is_empty() {
+    if config.residence().spill_dir().is_none() {
         let remedy = "name a folder on the drive to measure";
         return Err(InputError::new("--spill-dir", "there is no drive to measure", remedy).into());
     }
@@ -113,7 +113,7 @@ fn train(args: &Args, config: &TrainConfig) -> Result<Value, TrainError> {
         dataset: dataset_print(&start)?,
         run: RunIdentity::default(),
     };
-    let fill = first_fill(options.page_rows, options.densify.is_some());
+    let fill = first_fill(options.page_rows, options.strategy.grows());
     let pages = start.rows.div_ceil(fill as u64) as usize;
     // Dropped after the trainer, whose pages lie there.
     let (pager, mut tiers) = tiers::open(config, pages, host_mem.unwrap_or(u64::MAX), false)?;
@@ -147,7 +147,7 @@ fn train(args: &Args, config: &TrainConfig) -> Result<Value, TrainError> {
         "commit_overhead_percent": 100.0 * report.commit_seconds / seconds.max(1e-9),
         "steps_beside_commits": steps.beside.len(), "beside_percent": 100.0 * slower / seconds.max(1e-9),
         "commit_interval": report.commit_interval, "commit_loss_seconds": report.commit_loss_seconds,
-        "engine": tiers.engine, "codec": tiers.codec, "host_bytes_peak": host_bytes_peak(),
+        "engine": tiers.engine, "codec": tiers.codec.to_string(), "host_bytes_peak": host_bytes_peak(),
         "threads": rayon::current_num_threads(), "version": env!("CARGO_PKG_VERSION"),
     }))
 }

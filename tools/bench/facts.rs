@@ -7,6 +7,7 @@ use gsscale::dataset::loader::Dataset;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::scene::camera::Camera;
 use gsscale::schedule::auto::automatic_order;
+use gsscale::schedule::order::Order;
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::error::TrainError;
 use gsscale::train::pages::PagedScene;
@@ -88,17 +89,16 @@ impl Facts {
     ///
     /// # Errors
     /// The frames do not hold a view.
-    pub fn order(&self, frames: u64, seed: u64) -> InputResult<String> {
+    pub fn order(&self, frames: u64, seed: u64) -> InputResult<Order> {
         let (pages, frames) = (self.pages as usize, frames.max(self.largest_view) as usize);
         automatic_order(&self.views, &self.cameras, pages, frames, seed, ORDER_BYTES)
-            .map(|order| order.to_string())
             .map_err(|e| gsscale::base::error::InputError::new("--share", e.to_string(), "give a larger share"))
     }
 }
 
 fn growth(gaussians: u64, config: &TrainConfig) -> f64 {
-    match (config.strategy.as_str(), config.max_gaussians) {
-        ("none", _) => 1.0,
+    match (config.strategy.grows(), config.max_gaussians) {
+        (false, _) => 1.0,
         _ if config.steps <= config.refine_start => 1.0,
         (_, 0) => UNCAPPED_GROWTH * SPLIT_GROWTH,
         (_, cap) => (cap as f64 / gaussians.max(1) as f64).max(1.0) * SPLIT_GROWTH,

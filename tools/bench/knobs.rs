@@ -6,7 +6,12 @@
 use super::facts::Facts;
 use super::sweep::Planned;
 use gsscale::base::error::{InputError, InputResult};
+use gsscale::config::choice::{Choice, Chosen};
 use gsscale::config::file::TrainConfig;
+use gsscale::optim::method::Method;
+use gsscale::optim::moments::Moments;
+use gsscale::page::format::codec::Codec;
+use gsscale::schedule::order::Order;
 use gsscale::train::error::TrainError;
 use std::path::Path;
 
@@ -15,7 +20,7 @@ pub const KNOBS: [&str; 11] =
     ["optimizer", "order", "budget", "page", "codec", "moments", "sh", "cap", "resolution", "steps", "together"];
 
 /// Orders of views that are tried.
-const ORDERS: [&str; 5] = ["shuffle", "groups:4", "groups:9", "groups:25", "tour"];
+const ORDERS: [Order; 5] = [Order::Shuffle, Order::Groups(4), Order::Groups(9), Order::Groups(25), Order::Tour];
 /// Frames that are tried, in percent of the pages.
 const BUDGETS: [f64; 4] = [75.0, 50.0, 25.0, 10.0];
 /// Share of the pages for knobs that do nothing in memory, where the base is in memory.
@@ -65,12 +70,12 @@ impl Knobs<'_> {
     fn of_knob(&self, knob: &str) -> Result<Vec<Planned>, TrainError> {
         let base = &self.base.config;
         Ok(match knob {
-            "optimizer" => self.each(knob, ["sparse", "dense"], |c, name| c.optimizer = name.into()),
-            "order" => self.each(knob, ORDERS, |c, name| c.view_order = name.into()),
+            "optimizer" => self.choices(knob, [Method::Sparse, Method::Dense], |c| &mut c.optimizer),
+            "order" => self.choices(knob, ORDERS.map(|order| Chosen(Some(order))), |c| &mut c.view_order),
             "budget" => self.budgets(),
             "page" => return self.page_sizes(),
             "codec" => self.codecs(),
-            "moments" => self.each(knob, ["bf16"], |c, name| c.moments = name.into()),
+            "moments" => self.choices(knob, [Moments::Bf16], |c| &mut c.moments),
             "sh" => self.each(knob, ["2", "1", "0"], |c, degree| lower_sh(c, degree.parse().unwrap_or(0))),
             "cap" => self.caps(),
             "resolution" => self.each(knob, ["1/1.5", "1/2"], |c, text| {
@@ -81,6 +86,21 @@ impl Knobs<'_> {
             }),
             _ => self.together(),
         })
+    }
+
+    /// One run for each value of a key but the base's.
+    fn choices<T: Choice, const N: usize>(
+        &self,
+        knob: &str,
+        values: [T; N],
+        key: fn(&mut TrainConfig) -> &mut T,
+    ) -> Vec<Planned> {
+        let turned = values.map(|value| {
+            let mut planned = self.named(knob, &value.word());
+            *key(&mut planned.config) = value;
+            planned
+        });
+        turned.into_iter().filter(|p| p.config != self.base.config).collect()
     }
 
     /// One run for each name, the base turned by `turn`; those that come to the base are left out.
@@ -134,15 +154,15 @@ impl Knobs<'_> {
 
     fn codecs(&self) -> Vec<Planned> {
         let Some((frames, at)) = self.drive(self.facts) else { return Vec::new() };
-        let codec = |name: &str| {
-            let mut planned = self.named("codec", &format!("{name}{at}")).on_drive(frames);
-            planned.config.spill_codec = name.into();
+        let codec = |codec: Codec| {
+            let mut planned = self.named("codec", &format!("{codec}{at}")).on_drive(frames);
+            planned.config.spill_codec = Chosen(Some(codec));
             planned
         };
-        let mut all = vec![codec("raw"), codec("zstd:1")];
-        let mut halves = codec("halves");
+        let mut all = vec![codec(Codec::Raw), codec(Codec::Zstd { level: 1 })];
+        let mut halves = codec(Codec::Halves);
         halves.label = format!("bf16 moments, halves{at}");
-        halves.config.moments = "bf16".into();
+        halves.config.moments = Moments::Bf16;
         all.push(halves);
         all.retain(|p| p.config != self.base.config);
         all
@@ -170,7 +190,7 @@ impl Knobs<'_> {
 
     fn caps(&self) -> Vec<Planned> {
         let (config, start) = (&self.base.config, self.facts.gaussians);
-        if config.strategy == "none" {
+        if !config.strategy.grows() {
             return Vec::new();
         }
         let caps = match config.max_gaussians {
@@ -190,7 +210,7 @@ impl Knobs<'_> {
         let turns: [(&str, Turn); 3] = [
             ("SH 1 and bf16 moments", |c| {
                 lower_sh(c, 1);
-                c.moments = "bf16".into();
+                c.moments = Moments::Bf16;
             }),
             ("half the steps at 1/1.5 of the resolution", |c| {
                 c.steps = c.steps.div_ceil(2);
@@ -198,7 +218,7 @@ impl Knobs<'_> {
             }),
             ("SH 1 and the sparse optimizer", |c| {
                 lower_sh(c, 1);
-                c.optimizer = "sparse".into();
+                c.optimizer = Method::Sparse;
             }),
         ];
         let turned = turns.map(|(label, turn)| {

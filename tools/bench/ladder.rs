@@ -8,8 +8,14 @@ use super::pareto::bench_config;
 use super::sweep::{Planned, Sweep};
 use clap::Parser;
 use gsscale::base::error::InputError;
+use gsscale::cache::evict::EvictPolicy;
+use gsscale::config::choice::Choice;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::optim::method::Method;
+use gsscale::page::format::codec::Codec;
+use gsscale::paging::ahead::Transfers;
 use gsscale::report::ladder_page::{LadderRung, ladder_page};
+use gsscale::schedule::order::Order;
 use gsscale::train::error::TrainError;
 use gsscale::train::whole_file::write_whole;
 use serde_json::Value;
@@ -67,16 +73,16 @@ const RUNGS: [Rung; 5] = [
         name: "naive",
         what: "naive offloading: dense updates, pages on demand, LRU",
         turn: |c| {
-            c.optimizer = "dense".into();
-            (c.transfers, c.evict) = ("demand".into(), "lru".into());
+            c.optimizer = Method::Dense;
+            (c.transfers, c.evict) = (Transfers::Demand, EvictPolicy::LeastRecentlyUsed);
         },
     },
     Rung {
         name: "deferred",
         what: "+ deferred Adam",
-        turn: |c| (c.transfers, c.evict) = ("demand".into(), "lru".into()),
+        turn: |c| (c.transfers, c.evict) = (Transfers::Demand, EvictPolicy::LeastRecentlyUsed),
     },
-    Rung { name: "planned", what: "+ planned cache and prefetch", turn: |c| c.transfers = "ahead".into() },
+    Rung { name: "planned", what: "+ planned cache and prefetch", turn: |c| c.transfers = Transfers::Ahead },
     Rung { name: "overlap", what: "+ overlap with compute", turn: |_| {} },
     Rung { name: "memory", what: "all in memory", turn: |c| (c.spill_dir, c.frames) = (String::new(), 0) },
 ];
@@ -121,7 +127,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         facts.pages,
         config.page_rows,
         facts.largest_view,
-        config.view_order,
+        config.view_order.word(),
     );
     eprintln!("{facts}");
     let base = Planned::base(&config).on_drive(frames);
@@ -147,12 +153,8 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
 /// What must be the same on every rung, whatever it would choose by itself.
 fn settle(config: &mut TrainConfig) {
     (config.spill_dir, config.frames) = (String::new(), 0);
-    if config.view_order == "auto" {
-        config.view_order = "shuffle".into();
-    }
-    if config.spill_codec == "auto" {
-        config.spill_codec = "raw".into();
-    }
+    config.view_order.0.get_or_insert(Order::Shuffle);
+    config.spill_codec.0.get_or_insert(Codec::Raw);
     // What rungs differ in, each names for itself.
     let best = TrainConfig::default();
     (config.optimizer, config.evict, config.transfers) = (best.optimizer, best.evict, best.transfers);

@@ -6,7 +6,9 @@ use super::sweep::{Planned, Surroundings, Sweep};
 use clap::Parser;
 use gsscale::base::error::InputError;
 use gsscale::checkpoint::interval::CommitEvery;
+use gsscale::config::choice::Choice;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::page::format::codec::Codec;
 use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::ResultsLog;
 use gsscale::report::sweep_page::sweep_page;
@@ -136,10 +138,8 @@ pub fn bench_config(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainC
 /// The base with its order settled, and the settings beside it.
 fn plan(args: &Args, names: &[String], mut config: TrainConfig) -> Result<(Planned, Vec<Planned>), TrainError> {
     (config.spill_dir, config.frames) = (String::new(), 0);
-    if config.spill_codec == "auto" {
-        // What is chosen by itself may change with the drive's mood.
-        config.spill_codec = "raw".into();
-    }
+    // What is chosen by itself may change with the drive's mood.
+    config.spill_codec.0.get_or_insert(Codec::Raw);
     let facts = Facts::of(&args.scene, &config)?;
     let frames = match args.share {
         0.0 => None,
@@ -154,8 +154,8 @@ fn plan(args: &Args, names: &[String], mut config: TrainConfig) -> Result<(Plann
             InputError::new("--share", problem, format!("use --share {least} or more, or smaller --page-rows"))
         })?),
     };
-    if config.view_order == "auto" {
-        config.view_order = facts.order(frames.unwrap_or(facts.pages), config.seed)?;
+    if config.view_order.0.is_none() {
+        config.view_order.0 = Some(facts.order(frames.unwrap_or(facts.pages), config.seed)?);
     }
     let base = Planned::base(&config);
     let base = match frames {
@@ -227,11 +227,11 @@ fn write_page(args: &Args, base: &Planned, runs: &[Planned], sweep: &Sweep) -> R
     let facts = format!(
         "base: {} steps, {}, {place}, pages of {} rows, SH {}, {}{machine}",
         config.steps,
-        config.view_order,
+        config.view_order.word(),
         config.page_rows,
         config.sh_degree,
-        match (config.strategy.as_str(), config.max_gaussians) {
-            ("none", _) => "no densification".to_string(),
+        match (config.strategy.grows(), config.max_gaussians) {
+            (false, _) => "no densification".to_string(),
             (_, 0) => "densification without a cap".to_string(),
             (_, cap) => format!("at most {cap} Gaussians"),
         },

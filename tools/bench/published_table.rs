@@ -6,6 +6,8 @@
 use gsscale::base::units::format_bytes;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::published::PublishedRun;
+use gsscale::optim::moments::Moments;
+use gsscale::render::metrics::SsimVariant;
 use gsscale::report::html::{Cell, Page};
 use gsscale::train::report::{Summary, TestMetrics};
 use serde_json::{Value, json};
@@ -16,7 +18,7 @@ pub struct Ours {
     /// Means over the held-out views.
     pub test: Option<TestMetrics>,
     /// Which SSIM they hold.
-    pub ssim_variant: String,
+    pub ssim_variant: SsimVariant,
     /// Which LPIPS they hold.
     pub lpips_variant: Option<String>,
     summary: Summary,
@@ -28,10 +30,13 @@ impl Ours {
     /// Of a run that ended.
     pub fn new(summary: Summary, config: &TrainConfig) -> Ours {
         let floats = 11 + 3 * (u64::from(config.sh_degree) + 1).pow(2);
-        let moment_bytes = if config.moments == "bf16" { 2 } else { 4 };
+        let moment_bytes = match config.moments {
+            Moments::F32 => 4,
+            Moments::Bf16 => 2,
+        };
         Ours {
             test: summary.test,
-            ssim_variant: config.ssim_variant.clone(),
+            ssim_variant: config.ssim_variant,
             lpips_variant: None,
             state_bytes: summary.gaussians * floats * (4 + 2 * moment_bytes),
             summary,

@@ -98,7 +98,7 @@ struct Size {
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let config = super::settle(args.config.as_deref(), &args.keys)?;
     super::refuse_devices(&config)?;
-    if config.spill_dir.is_empty() {
+    if config.residence().spill_dir().is_none() {
         let remedy = "name a folder on the drive to measure";
         return Err(InputError::new("--spill-dir", "there is no drive to measure", remedy).into());
     }
@@ -160,10 +160,9 @@ fn behind_the_cameras(dataset: &Dataset) -> [f32; 3] {
 }
 
 fn size(config: &TrainConfig, points: &Copies<'_>, frames: usize) -> Result<Size, TrainError> {
-    let own = match config.spill_dir.as_str() {
-        "" => config.clone(),
-        dir => {
-            let above = Path::new(dir);
+    let own = match config.residence().spill_dir() {
+        None => config.clone(),
+        Some(above) => {
             std::fs::create_dir_all(above).map_err(|e| InputError::io(above, "making the folder", &e))?;
             let spill_dir = above.join(format!("copies-{}", points.count)).display().to_string();
             TrainConfig { spill_dir, frames: frames as u32, ..config.clone() }
@@ -176,7 +175,7 @@ fn size(config: &TrainConfig, points: &Copies<'_>, frames: usize) -> Result<Size
     let init = InitOptions { scene_scale: dataset.scene_scale, ..limits::init_options(&own) };
     let folder = std::env::temp_dir();
     let beside = Path::new(&own.spill_dir).parent().filter(|p| p.is_dir()).unwrap_or(&folder);
-    let fill = first_fill(options.page_rows, options.densify.is_some());
+    let fill = first_fill(options.page_rows, options.strategy.grows());
     let import = ImportOptions { init: &init, fill, budget: Budget { folder: beside, bytes: IMPORT_BYTES } };
     let scene = PagedScene::import(points, &import, pager, &options)?;
     let trainer = Trainer::of_scene(scene, dataset, Box::new(CpuRenderer::new()), options);

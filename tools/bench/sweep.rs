@@ -8,6 +8,7 @@
 
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::cpu_model;
+use gsscale::config::choice::Choice;
 use gsscale::config::file::{ByteSize, TrainConfig};
 use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::ResultsLog;
@@ -150,7 +151,7 @@ impl Sweep {
         let part = self.out.join("runs").join(format!("{name}.part"));
         let mut config = planned.config.clone();
         let spill = self.spill.join(format!("{name}-{}.part", self.surroundings.mark));
-        if !config.spill_dir.is_empty() {
+        if config.residence().spill_dir().is_some() {
             make_folder(&self.spill)?;
             config.spill_dir = spill.display().to_string();
         }
@@ -211,7 +212,7 @@ impl Sweep {
         record.host_bytes_peak = summary.host_bytes_peak;
         record.device_bytes_peak = summary.costs.device_bytes_peak;
         record.drive_bytes_peak = summary.costs.drive_bytes_peak;
-        record.view_order = TrainConfig::read(&folder.join("config.toml"))?.view_order;
+        record.view_order = TrainConfig::read(&folder.join("config.toml"))?.view_order.word().into_owned();
         let photos = |c: &TrainConfig| (c.data_factor, c.max_resolution);
         if photos(config) != photos(&self.base) {
             // Smaller photos are easier: all are judged on the photos of the base.

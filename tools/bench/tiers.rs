@@ -8,6 +8,8 @@ use super::statistics::{extend, median};
 use clap::Parser;
 use gsscale::base::error::InputError;
 use gsscale::base::machine::process_cpu_split;
+use gsscale::cache::evict::EvictPolicy;
+use gsscale::config::choice::Chosen;
 use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides};
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::loader::Dataset;
@@ -90,7 +92,7 @@ struct Contender {
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let mut config = super::settle(args.config.as_deref(), &args.keys)?;
     super::refuse_devices(&config)?;
-    if config.spill_dir.is_empty() {
+    if config.residence().spill_dir().is_none() {
         let remedy = "name a folder on the drive to measure";
         return Err(InputError::new("--spill-dir", "there is no drive to measure", remedy).into());
     }
@@ -148,14 +150,14 @@ fn settle_order(
     trainer: &mut Trainer,
     frames: impl Iterator<Item = usize>,
 ) -> Result<(), TrainError> {
-    if config.view_order != "auto" {
+    if config.view_order.0.is_some() {
         return Ok(());
     }
     let (views, pages) = (views(dataset, trainer), trainer.scene.pager.index().len());
     let frames = frames.min().unwrap_or(pages).max(views.most());
     let order = automatic_order(&views, &cameras(dataset), pages, frames, config.seed, ORDER_BYTES)
         .map_err(|e| InputError::new("--shares", e.to_string(), "give larger shares"))?;
-    config.view_order = order.to_string();
+    config.view_order = Chosen(Some(order));
     trainer.set_view_order(order, dataset);
     Ok(())
 }
@@ -314,7 +316,10 @@ impl Prediction {
             page_bytes: page_bytes(trainer.scene.pager.index()).into_iter().map(|bytes| bytes as u32).collect(),
             order: trainer.view_order().clone(),
             steps: warm_up..config.steps,
-            policy: if config.evict == "lru" { Policy::LeastRecent } else { Policy::Ahead },
+            policy: match config.evict {
+                EvictPolicy::FarthestNextUse => Policy::Ahead,
+                EvictPolicy::LeastRecentlyUsed => Policy::LeastRecent,
+            },
             drive: DriveModel { read_rate: rate.read, write_rate: rate.write, step_seconds },
         }
     }

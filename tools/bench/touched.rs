@@ -19,6 +19,7 @@ use gsscale::base::rng::{Purpose, Stream};
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::loader::Dataset;
+use gsscale::densify::strategy::StrategyName;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::pinned::PinnedPage;
 use gsscale::scene::columns::{Column, Columns, row_width};
@@ -94,7 +95,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     }
     // All bands are in use, and no row grows.
     config.sh_start = config.sh_degree;
-    config.strategy = "none".to_string();
+    config.strategy = StrategyName::None;
     let Some(scene) = &args.scene else {
         let options = RunOptions::new(&config, 1.0);
         let mut world = World::new(&random_columns(args.rows as usize, options.sh_degree, 1.0, 1), &options)?;

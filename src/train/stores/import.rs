@@ -88,7 +88,7 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
         pages: 0,
         failed: None,
     };
-    let fill = first_fill(options.page_rows, options.densify.is_some());
+    let fill = first_fill(options.page_rows, options.strategy.grows());
     let written = rows.for_each_page(fill, &mut |id, state| pages.write(id, &state));
     match pages.failed.take() {
         Some(error) => return Err(error),
@@ -156,7 +156,7 @@ fn options_for(request: &ImportRequest, sh_degree: u8, meta: &PlyMeta) -> InputR
         sh_degree,
         sh_every: 0,
         init_ply: std::path::absolute(&request.file).unwrap_or_else(|_| request.file.clone()).display().to_string(),
-        export_frame: meta.frame.name().to_string(),
+        export_frame: meta.frame,
         ..TrainConfig::default()
     };
     config.check()?;

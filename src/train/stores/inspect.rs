@@ -5,7 +5,9 @@ use crate::base::error::InputError;
 use crate::base::ids::PageId;
 use crate::base::math::exp32;
 use crate::checkpoint::run_state::RunState;
+use crate::config::choice::Choice;
 use crate::config::file::TrainConfig;
+use crate::densify::strategy::{Effect, effect_of};
 use crate::page::engine::segment_files::segment_file_name;
 use crate::page::format::slot_header::StoredAs;
 use crate::page::tool::reading::Access;
@@ -112,10 +114,10 @@ fn codec_number(codec: StoredAs) -> usize {
 
 /// The trainer's state in words.
 fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
-    let count = |is: fn(&EventKind) -> bool| state.events.iter().filter(|e| is(&e.kind)).count();
-    let rounds = count(|k| matches!(k, EventKind::Densify(_)));
-    let resets = count(|k| matches!(k, EventKind::ResetOpacity { .. }));
-    let raises = count(|k| matches!(k, EventKind::RaiseShDegree { .. }));
+    let count = |is: fn(Effect<'_>) -> bool| state.events.iter().filter(|e| is(effect_of(&e.kind))).count();
+    let rounds = count(|effect| matches!(effect, Effect::Round(_)));
+    let resets = count(|effect| matches!(effect, Effect::ResetOpacity { .. }));
+    let raises = count(|effect| matches!(effect, Effect::RaiseShDegree { .. }));
     let raised = state.events.iter().rev().find_map(|e| match e.kind {
         EventKind::RaiseShDegree { degree } => Some(degree),
         _ => None,
@@ -131,7 +133,10 @@ fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
         format!("{} events: {rounds} rounds, {resets} opacity resets, {raises} SH raises{last}", state.events.len()),
         format!(
             "strategy {}, view order {}, seed {}, moments {}",
-            config.strategy, config.view_order, config.seed, config.moments
+            config.strategy.word(),
+            config.view_order.word(),
+            config.seed,
+            config.moments.word()
         ),
         format!("rendered by {}, instruction path {}", state.device, state.simd),
         format!(

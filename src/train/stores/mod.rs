@@ -104,10 +104,7 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
         return Err(InputError::new(dir, "it is neither a store nor a run's output folder", remedy));
     }
     let config = TrainConfig::read(&file)?;
-    let folder = match config.spill_dir.as_str() {
-        "" => dir.join("checkpoint"),
-        spill_dir => PathBuf::from(spill_dir),
-    };
+    let folder = config.residence().checkpoint_folder(dir);
     if folder.is_dir() {
         let id = read_resolved(&file)?.run;
         return Ok(StorePlace { folder, run: Some(dir.to_path_buf()), id });

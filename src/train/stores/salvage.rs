@@ -23,6 +23,7 @@ use crate::checkpoint::run_state::{DatasetPrint, RunIdentity, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::densify::stats::GradHistogram;
+use crate::densify::strategy::{Effect, effect_of};
 use crate::page::format::slot_header::{SlotHeader, SlotRef};
 use crate::page::format::spill_format::SpillFormat;
 use crate::page::map::commit::CommitError;
@@ -33,7 +34,6 @@ use crate::page::tool::slot_reader::SlotReader;
 use crate::page::versions::slots::SlotLayout;
 use crate::paging::label::{label, meta_from_label};
 use crate::paging::stored::{check_values, layout_of};
-use crate::scene::events::EventKind;
 use crate::scene::page_layout::{capacity_bytes, read_page, write_page};
 use crate::scene::page_meta::PageMeta;
 use crate::scene::state::SceneState;
@@ -256,7 +256,7 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
 /// does not count them.
 fn misses_a_round(meta: &PageMeta, state: &RunState) -> bool {
     let missed = state.events.get(meta.events_applied as usize..).unwrap_or_default();
-    missed.iter().any(|event| matches!(event.kind, EventKind::Densify(_)))
+    missed.iter().any(|event| matches!(effect_of(&event.kind), Effect::Round(_)))
 }
 
 /// A page without the statistics of its rows. The statistics of an older version are not those that the run has counted: the

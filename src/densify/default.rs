@@ -1,17 +1,19 @@
-//! When to densify and what becomes of a row: the rules of gsplat's `DefaultStrategy`, without side effects.
+//! gsplat's `DefaultStrategy`: rows whose position in the picture has a large gradient are cloned or split, faint and large
+//! ones are pruned, and opacities are reset now and then.
 //!
-//! Invariants: 1. decisions are functions of their arguments; 2. a round never leaves more than `max_gaussians` rows;
-//! 3. a cadence of 0 means never.
+//! Invariants: 1. a round never leaves more than `max_gaussians` rows; 2. a cadence of 0 means never.
 
 use super::ops::{child_log_scale, sigma};
-use super::stats::GradHistogram;
+use super::stats::{GradHistogram, promised_growth};
+use super::strategy::{Extremes, Fate, Round, RowFacts, Strategy};
 use crate::base::math::sigmoid;
 use crate::optim::bounds::SplitLimits;
 use crate::scene::events::{EventKind, RoundThresholds};
+use crate::scene::rows::{Rows, mean_grad2d};
 
-/// Densification of a run.
+/// The strategy with its keys.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct DensifyConfig {
+pub struct DefaultStrategy {
     /// Rows grow whose mean gradient norm (NDC units) is greater.
     pub grow_grad2d: f32,
     /// Growing rows up to this size are duplicated, larger ones split; share of the scene scale.
@@ -32,9 +34,9 @@ pub struct DensifyConfig {
     pub max_gaussians: u64,
 }
 
-impl Default for DensifyConfig {
+impl Default for DefaultStrategy {
     fn default() -> Self {
-        DensifyConfig {
+        DefaultStrategy {
             grow_grad2d: 2e-4,
             grow_scale3d: 0.01,
             prune_opa: 0.005,
@@ -48,12 +50,7 @@ impl Default for DensifyConfig {
     }
 }
 
-impl DensifyConfig {
-    /// Whether the gradients of this step go into the statistics.
-    pub fn collects(&self, step: u32) -> bool {
-        step < self.refine_stop
-    }
-
+impl DefaultStrategy {
     /// Whether a round follows this step.
     pub fn is_round(&self, step: u32) -> bool {
         step > self.refine_start && step < self.refine_stop && step.is_multiple_of(self.refine_every)
@@ -63,26 +60,6 @@ impl DensifyConfig {
     /// reset to nothing, whose logit is no number.
     pub fn is_reset(&self, step: u32) -> bool {
         self.prune_opa > 0.0 && step > 0 && step < self.refine_stop && step.is_multiple_of(self.reset_every)
-    }
-
-    /// What bounds of pages must count on: no round's thresholds are lower.
-    pub fn split_limits(&self, scene_scale: f32) -> SplitLimits {
-        SplitLimits { grow_grad2d: self.grow_grad2d, split_scale: self.grow_scale3d * scene_scale }
-    }
-
-    /// The events that follow this step, in order: a round, a reset. `rows` is the number of rows before the round,
-    /// `histogram` holds their statistics. The caller clears the histogram after a round.
-    pub fn events_after(
-        &self,
-        step: u32,
-        scene_scale: f32,
-        rows: u64,
-        histogram: &GradHistogram,
-    ) -> impl Iterator<Item = EventKind> {
-        let round =
-            self.is_round(step).then(|| EventKind::Densify(self.thresholds(step, scene_scale, rows, histogram)));
-        let reset = self.is_reset(step).then_some(EventKind::ResetOpacity { max_opacity: 2.0 * self.prune_opa });
-        round.into_iter().chain(reset)
     }
 
     /// Thresholds of the round after this step. Every growing row adds one, so the cap leaves room for as many as rows
@@ -100,38 +77,65 @@ impl DensifyConfig {
     }
 }
 
-/// What a round does with a row.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Fate {
-    /// Nothing.
-    Keep,
-    /// Removed.
-    Prune,
-    /// Gets a copy of itself; or, when what it is would be pruned, both go.
-    Duplicate {
-        /// Whether the row and its copy are pruned at once.
-        pruned: bool,
-    },
-    /// Replaced by two smaller children; or by nothing, when those would be pruned.
-    Split {
-        /// Whether the children are pruned at once.
-        children_pruned: bool,
-    },
+impl Strategy for DefaultStrategy {
+    fn grows(&self) -> bool {
+        true
+    }
+
+    fn collects(&self, step: u32) -> bool {
+        step < self.refine_stop
+    }
+
+    /// A round, then a reset.
+    fn events_after(&self, step: u32, scene_scale: f32, rows: u64, histogram: &GradHistogram) -> Vec<EventKind> {
+        let mut events = Vec::new();
+        if self.is_round(step) {
+            events.push(EventKind::Densify(self.thresholds(step, scene_scale, rows, histogram)));
+        }
+        if self.is_reset(step) {
+            events.push(EventKind::ResetOpacity { max_opacity: 2.0 * self.prune_opa });
+        }
+        events
+    }
+
+    /// No round's thresholds are lower than the keys.
+    fn split_limits(&self, scene_scale: f32) -> SplitLimits {
+        SplitLimits { grow_grad2d: self.grow_grad2d, split_scale: self.grow_scale3d * scene_scale }
+    }
 }
 
-/// What becomes of a row: growth first, then pruning of everything that is there afterwards. `log_scale` is the row's
-/// largest, `opacity` its logit.
-pub fn fate(thresholds: &RoundThresholds, mean_grad2d: f32, log_scale: f32, opacity: f32) -> Fate {
-    let is_faint = sigmoid(opacity) < thresholds.prune_opacity;
-    let is_pruned = |log_scale: f32| is_faint || sigma(log_scale) > thresholds.prune_scale;
-    let grows = mean_grad2d > thresholds.grow_grad2d;
-    if !grows {
-        return if is_pruned(log_scale) { Fate::Prune } else { Fate::Keep };
+impl Round for RoundThresholds {
+    /// Growth first, then pruning of everything that is there afterwards.
+    fn fate(&self, row: &RowFacts) -> Fate {
+        let is_faint = sigmoid(row.opacity) < self.prune_opacity;
+        let is_pruned = |log_scale: f32| is_faint || sigma(log_scale) > self.prune_scale;
+        let grows = row.mean_grad2d > self.grow_grad2d;
+        if !grows {
+            return if is_pruned(row.log_scale) { Fate::Prune } else { Fate::Keep };
+        }
+        if sigma(row.log_scale) <= self.split_scale {
+            Fate::Duplicate { pruned: is_pruned(row.log_scale) }
+        } else {
+            Fate::Split { children_pruned: is_pruned(child_log_scale(row.log_scale)) }
+        }
     }
-    if sigma(log_scale) <= thresholds.split_scale {
-        Fate::Duplicate { pruned: is_pruned(log_scale) }
-    } else {
-        Fate::Split { children_pruned: is_pruned(child_log_scale(log_scale)) }
+
+    fn may_grow(&self, rows: &Rows<'_>) -> bool {
+        let means = rows.grad2d.iter().zip(rows.count).map(|(&grad2d, &count)| mean_grad2d(grad2d, count));
+        means.fold(false, |any, mean| any | (mean > self.grow_grad2d))
+    }
+
+    /// The slack is for the roundings of the sigmoid, some 4e-7.
+    fn spares(&self, extremes: &Extremes) -> bool {
+        sigmoid(extremes.lowest_opacity) >= self.prune_opacity * (1.0 + 1e-5) && extremes.sigma_max <= self.prune_scale
+    }
+
+    fn promised(&self, _: u64, histogram: &GradHistogram) -> u64 {
+        histogram.promised(self.grow_grad2d)
+    }
+
+    fn promised_rows(&self, rows: &Rows<'_>) -> u64 {
+        promised_growth(rows, self.grow_grad2d)
     }
 }
 
@@ -142,20 +146,20 @@ mod tests {
 
     #[test]
     fn the_schedule_is_that_of_the_default_strategy() {
-        let config = DensifyConfig::default();
+        let config = DefaultStrategy::default();
         let rounds: Vec<u32> = (0..20_000).filter(|&s| config.is_round(s)).collect();
         assert_eq!((rounds[0], rounds[1], rounds[rounds.len() - 1]), (600, 700, 14_900));
         let resets: Vec<u32> = (0..20_000).filter(|&s| config.is_reset(s)).collect();
         assert_eq!(resets, [3000, 6000, 9000, 12_000]);
         assert!(config.collects(14_999) && !config.collects(15_000));
-        let events: Vec<EventKind> = config.events_after(3000, 1.0, 10, &GradHistogram::default()).collect();
+        let events = config.events_after(3000, 1.0, 10, &GradHistogram::default());
         let EventKind::Densify(round) = events[0] else { panic!("{events:?}") };
         assert_eq!(round.prune_scale, f32::INFINITY);
         assert_eq!(events[1], EventKind::ResetOpacity { max_opacity: 0.01 });
         assert_eq!(config.thresholds(3100, 2.0, 10, &GradHistogram::default()).prune_scale, 0.2);
-        let never = DensifyConfig { refine_every: 0, reset_every: 0, ..config };
+        let never = DefaultStrategy { refine_every: 0, reset_every: 0, ..config };
         assert!((0..20_000).all(|s| !never.is_round(s) && !never.is_reset(s)));
-        let unpruned = DensifyConfig { prune_opa: 0.0, ..DensifyConfig::default() };
+        let unpruned = DefaultStrategy { prune_opa: 0.0, ..DefaultStrategy::default() };
         assert!((0..20_000).all(|s| !unpruned.is_reset(s)));
         assert_eq!(never.thresholds(9000, 1.0, 10, &GradHistogram::default()).prune_scale, f32::INFINITY);
     }
@@ -164,7 +168,9 @@ mod tests {
     fn rows_grow_before_they_are_pruned() {
         let t = RoundThresholds { grow_grad2d: 1.0, split_scale: 0.1, prune_opacity: 0.005, prune_scale: 0.5 };
         let (solid, faint) = (logit(0.5), logit(0.004));
-        let of = |sigma: f32, grad: f32, opacity: f32| fate(&t, grad, sigma.ln(), opacity);
+        let of = |sigma: f32, mean_grad2d: f32, opacity: f32| {
+            t.fate(&RowFacts { mean_grad2d, log_scale: sigma.ln(), opacity })
+        };
         assert_eq!(of(0.05, 1.0, solid), Fate::Keep);
         assert_eq!(of(0.05, 1.1, solid), Fate::Duplicate { pruned: false });
         assert_eq!(of(0.05, 1.1, faint), Fate::Duplicate { pruned: true });

@@ -1,0 +1,331 @@
+//! Keys whose value is one of a few words: the words of every key, how a word becomes a value, and how a value is
+//! written. A value is parsed once, by the config file or by the command line; nothing later compares text.
+//!
+//! Invariants: 1. a value is written as the word that it is read from; 2. a file and a flag refuse a word with the same
+//! sentence; 3. this file knows no default and no meaning of a value.
+
+use crate::base::simd::SimdPath;
+use crate::cache::evict::EvictPolicy;
+use crate::densify::strategy::StrategyName;
+use crate::exchange::ply::ExportFrame;
+use crate::gpu::DeviceChoice;
+use crate::optim::method::Method;
+use crate::optim::moments::Moments;
+use crate::page::engine::open::IoEngine;
+use crate::page::format::codec::Codec;
+use crate::paging::ahead::Transfers;
+use crate::render::SsimPadding;
+use crate::render::color_correct::ColorCorrect;
+use crate::render::metrics::SsimVariant;
+use crate::schedule::order::Order;
+use clap::builder::{PossibleValue, TypedValueParser, ValueParserFactory};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use std::borrow::Cow;
+use std::marker::PhantomData;
+
+/// The value of a key that is written as a word.
+pub trait Choice: Clone + Send + Sync + 'static {
+    /// The key, in kebab-case.
+    const KEY: &'static str;
+    /// The words that a user may write, as help and errors list them; `groups:N` stands for all of its kind.
+    const WORDS: &'static [&'static str];
+
+    /// The value of a word; `None` for a word that a user may not write.
+    fn from_word(word: &str) -> Option<Self>;
+
+    /// The word of a value.
+    fn word(&self) -> Cow<'static, str>;
+}
+
+/// The value of a word.
+///
+/// # Errors
+/// The word is unknown; the error is a sentence that names the key and the words.
+pub fn parse_choice<T: Choice>(word: &str) -> Result<T, String> {
+    T::from_word(word).ok_or_else(|| unknown::<T>(T::KEY, word))
+}
+
+fn unknown<T: Choice>(flag: &str, word: &str) -> String {
+    format!("unknown --{flag} '{word}': use {}", listed(T::WORDS))
+}
+
+/// `a, b or c`.
+fn listed(words: &[&str]) -> String {
+    match words {
+        [] => String::new(),
+        [word] => word.to_string(),
+        [first @ .., last] => format!("{} or {last}", first.join(", ")),
+    }
+}
+
+/// A choice that a run may leave open: the key's word for none is `auto`, or `off` for what a run can do without.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Chosen<T>(pub Option<T>);
+
+/// Where training logs its numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LogFormat {
+    /// metrics.jsonl alone.
+    Json,
+    /// Event files of TensorBoard beside it.
+    Tensorboard,
+}
+
+/// Implements [`Choice`], reading and writing for enums whose values have one word each. Values after `hidden` are written
+/// but never read.
+macro_rules! choices {
+    ($($key:literal: $type:ident { $($value:ident = $word:literal),+ } $(hidden { $($other:ident = $other_word:literal),+ })?)+) => { $(
+        impl Choice for $type {
+            const KEY: &'static str = $key;
+            const WORDS: &'static [&'static str] = &[$($word),+];
+
+            fn from_word(word: &str) -> Option<$type> {
+                match word { $($word => Some($type::$value),)+ _ => None }
+            }
+
+            fn word(&self) -> Cow<'static, str> {
+                let word = match self { $($type::$value => $word,)+ $($($type::$other => $other_word,)+)? };
+                Cow::Borrowed(word)
+            }
+        }
+
+        reading_and_writing!($type);
+    )+ };
+}
+
+/// Reading and writing in config files, and parsing of flags, of a type that implements [`Choice`].
+macro_rules! reading_and_writing {
+    ($type:ident) => {
+        impl Serialize for $type {
+            fn serialize<S: Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
+                s.serialize_str(&self.word())
+            }
+        }
+
+        impl<'de> Deserialize<'de> for $type {
+            fn deserialize<D: Deserializer<'de>>(d: D) -> Result<$type, D::Error> {
+                deserialize_choice(d)
+            }
+        }
+
+        impl ValueParserFactory for $type {
+            type Parser = ChoiceParser<$type>;
+
+            fn value_parser() -> ChoiceParser<$type> {
+                ChoiceParser(PhantomData)
+            }
+        }
+    };
+}
+
+choices! {
+    "io": IoEngine { Auto = "auto", Uring = "uring", Mmap = "mmap", Pread = "pread" } hidden { Memory = "memory" }
+    "evict": EvictPolicy { FarthestNextUse = "belady", LeastRecentlyUsed = "lru" }
+    "transfers": Transfers { Overlap = "overlap", Ahead = "ahead", Demand = "demand" }
+    "ssim-padding": SsimPadding { Valid = "valid", Same = "same" }
+    "optimizer": Method { Deferred = "deferred", Dense = "dense", Sparse = "sparse" }
+    "moments": Moments { F32 = "f32", Bf16 = "bf16" }
+    "log": LogFormat { Json = "json", Tensorboard = "tensorboard" }
+    "ssim-variant": SsimVariant { Same = "same", Valid = "valid", Reflect = "reflect" }
+    "export-frame": ExportFrame { Dataset = "dataset", Local = "local" }
+}
+
+impl Choice for StrategyName {
+    const KEY: &'static str = "strategy";
+    const WORDS: &'static [&'static str] = &StrategyName::NAMES;
+
+    fn from_word(word: &str) -> Option<StrategyName> {
+        StrategyName::from_name(word)
+    }
+
+    fn word(&self) -> Cow<'static, str> {
+        Cow::Borrowed(self.name())
+    }
+}
+
+reading_and_writing!(StrategyName);
+
+/// Implements [`Choice`] for choices that may be left open, with the word that leaves them open.
+macro_rules! open_choices {
+    ($($key:literal: $type:ident, $none:literal in [$($word:literal),+], $from:expr, $to:expr;)+) => { $(
+        impl Choice for Chosen<$type> {
+            const KEY: &'static str = $key;
+            const WORDS: &'static [&'static str] = &[$($word),+];
+
+            fn from_word(word: &str) -> Option<Self> {
+                if word == $none { Some(Chosen(None)) } else { $from(word).map(|value| Chosen(Some(value))) }
+            }
+
+            fn word(&self) -> Cow<'static, str> {
+                self.0.map_or(Cow::Borrowed($none), |value| Cow::Owned($to(value)))
+            }
+        }
+    )+ };
+}
+
+open_choices! {
+    "view-order": Order, "auto" in ["auto", "shuffle", "groups:N", "tour"], parsed, |order: Order| order.to_string();
+    "spill-codec": Codec, "auto" in ["raw", "halves", "zstd:LEVEL", "auto"], parsed, |codec: Codec| codec.to_string();
+    "simd": SimdPath, "auto" in ["auto", "avx512", "avx2", "baseline"], SimdPath::from_name, |path: SimdPath| path.name().to_string();
+    "color-correct": ColorCorrect, "off" in ["off", "affine", "quadratic"], ColorCorrect::from_name, |fit: ColorCorrect| fit.name().to_string();
+}
+
+fn parsed<T: std::str::FromStr>(word: &str) -> Option<T> {
+    word.parse().ok()
+}
+
+impl<T> Serialize for Chosen<T>
+where
+    Chosen<T>: Choice,
+{
+    fn serialize<S: Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
+        s.serialize_str(&self.word())
+    }
+}
+
+impl<'de, T> Deserialize<'de> for Chosen<T>
+where
+    Chosen<T>: Choice,
+{
+    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
+        deserialize_choice(d)
+    }
+}
+
+impl<T> ValueParserFactory for Chosen<T>
+where
+    Chosen<T>: Choice,
+{
+    type Parser = ChoiceParser<Chosen<T>>;
+
+    fn value_parser() -> ChoiceParser<Chosen<T>> {
+        ChoiceParser(PhantomData)
+    }
+}
+
+fn deserialize_choice<'de, T: Choice, D: Deserializer<'de>>(d: D) -> Result<T, D::Error> {
+    parse_choice(&String::deserialize(d)?).map_err(serde::de::Error::custom)
+}
+
+/// Parses a flag whose value is a choice: help lists the words.
+#[derive(Clone)]
+pub struct ChoiceParser<T>(PhantomData<T>);
+
+impl<T: Choice> TypedValueParser for ChoiceParser<T> {
+    type Value = T;
+
+    fn parse_ref(
+        &self,
+        command: &clap::Command,
+        flag: Option<&clap::Arg>,
+        value: &std::ffi::OsStr,
+    ) -> Result<T, clap::Error> {
+        let word = value.to_string_lossy();
+        T::from_word(&word).ok_or_else(|| {
+            let flag = flag.and_then(clap::Arg::get_long).unwrap_or(T::KEY);
+            command.clone().error(clap::error::ErrorKind::InvalidValue, unknown::<T>(flag, &word))
+        })
+    }
+
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        Some(Box::new(T::WORDS.iter().map(PossibleValue::new)))
+    }
+}
+
+/// What renders: the value of `--device`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Device {
+    /// The CPU.
+    Cpu,
+    /// The GPU that this chooses; the CPU where [`DeviceChoice::Auto`] finds none.
+    Gpu(DeviceChoice),
+}
+
+impl std::str::FromStr for Device {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "cpu" => Ok(Device::Cpu),
+            "auto" => Ok(Device::Gpu(DeviceChoice::Auto)),
+            "gpu" => Ok(Device::Gpu(DeviceChoice::Gpu)),
+            name if name.trim().is_empty() => Err(format!(
+                "unknown --device '{name}': use auto, gpu, cpu, or a part of the name of one of --list-devices"
+            )),
+            name => Ok(Device::Gpu(DeviceChoice::Named(name.to_string()))),
+        }
+    }
+}
+
+impl std::fmt::Display for Device {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Device::Cpu => "cpu",
+            Device::Gpu(DeviceChoice::Auto) => "auto",
+            Device::Gpu(DeviceChoice::Gpu) => "gpu",
+            Device::Gpu(DeviceChoice::Named(name)) => name,
+        })
+    }
+}
+
+impl Serialize for Device {
+    fn serialize<S: Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
+        s.collect_str(self)
+    }
+}
+
+impl<'de> Deserialize<'de> for Device {
+    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
+        String::deserialize(d)?.parse().map_err(serde::de::Error::custom)
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::config::file::{KEYS, TrainConfig};
+
+    fn check<T: Choice + PartialEq + std::fmt::Debug>() {
+        assert!(KEYS.iter().any(|key| key.name() == T::KEY), "{} is no key", T::KEY);
+        for word in T::WORDS {
+            let word = word.replace(":N", ":3").replace(":LEVEL", ":19");
+            assert_eq!(parse_choice::<T>(&word).unwrap().word(), word);
+            let config = TrainConfig::parse(&format!("{} = \"{word}\"", T::KEY)).unwrap();
+            assert!(toml::to_string(&config).unwrap().contains(&format!("{} = \"{word}\"", T::KEY)));
+        }
+        let problem = parse_choice::<T>("x y").unwrap_err();
+        assert!(problem.starts_with(&format!("unknown --{} 'x y': use ", T::KEY)), "{problem}");
+        let of_file = TrainConfig::parse(&format!("{} = \"x y\"", T::KEY)).unwrap_err();
+        assert!(of_file.contains(&problem), "{of_file}");
+    }
+
+    #[test]
+    fn every_word_is_written_as_it_is_read() {
+        check::<IoEngine>();
+        check::<EvictPolicy>();
+        check::<Transfers>();
+        check::<SsimPadding>();
+        check::<Method>();
+        check::<Moments>();
+        check::<StrategyName>();
+        check::<LogFormat>();
+        check::<SsimVariant>();
+        check::<ExportFrame>();
+        check::<Chosen<Order>>();
+        check::<Chosen<Codec>>();
+        check::<Chosen<SimdPath>>();
+        check::<Chosen<ColorCorrect>>();
+        let problem = parse_choice::<Transfers>("x").unwrap_err();
+        assert_eq!(problem, "unknown --transfers 'x': use overlap, ahead or demand");
+        // An engine that only tests and dry runs open.
+        assert!(parse_choice::<IoEngine>("memory").is_err());
+    }
+
+    #[test]
+    fn a_device_is_written_as_it_is_read() {
+        for text in ["auto", "gpu", "cpu", "RTX 4070"] {
+            assert_eq!(text.parse::<Device>().unwrap().to_string(), text);
+        }
+        assert!(" ".parse::<Device>().is_err());
+    }
+}
