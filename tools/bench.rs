@@ -24,6 +24,7 @@ use clap::Parser;
 use gsscale::base::error::InputError;
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::config::limits::simd_path;
+use gsscale::config::published::BUILT_IN;
 use gsscale::train::error::TrainError;
 use serde_json::Value;
 use std::ffi::OsString;
@@ -40,9 +41,8 @@ Measures training, and prints one line of JSON a run.
   gsscale-bench pareto SCENE --out DIR what each setting costs and saves
   gsscale-bench ladder SCENE --out DIR what each idea of out-of-core training brings
 
-Published scenes: rubble, building, residence, sciart, lfls, sziit, sztu, aerial.
 Each command has --help with examples: gsscale-bench run --help, gsscale-bench run rubble --help.
-";
+Published scenes:";
 
 fn main() -> ExitCode {
     let mut arguments: Vec<OsString> = std::env::args_os().collect();
@@ -57,7 +57,7 @@ fn main() -> ExitCode {
     };
     let mut print = |line: &Value| gsscale::say!("{line}");
     let done = if named("help") || named("--help") || named("-h") {
-        gsscale::say!("{HELP}");
+        gsscale::say!("{HELP} {}", BUILT_IN.map(|(name, _)| name).join(", "));
         Ok(())
     } else if named("ladder") {
         ladder::start(&parse_arguments(&arguments), &mut print)
