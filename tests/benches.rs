@@ -33,7 +33,7 @@ mod tiers;
 
 use clap::Parser;
 use gsscale::config::file::parse_arguments;
-use gsscale::train::trainer::TrainError;
+use gsscale::train::error::TrainError;
 use scene_of_a_bench::{large_city, number};
 use scenes::{city, text};
 use serde_json::Value;

@@ -6,7 +6,7 @@ use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::simd_path;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
-use gsscale::train::trainer::TrainError;
+use gsscale::train::error::TrainError;
 use serde_json::Value;
 use std::ffi::OsString;
 use std::ops::Range;
