@@ -1,9 +1,10 @@
 //! Step time against the size of the scene, at an equal visible set.
 //!
 //! `cargo bench --bench sizes -- SCENE --spill-dir DIR` trains scenes of several sizes.
-//! The points of one scene are repeated behind its cameras, where no view sees the copies: what a step does stays the
-//! same, what lies on the drive grows. All sizes train in one process, with equally many frames, in turns of a few steps,
-//! step by step on the same views. Prints one line of JSON for each.
+//!
+//! The benchmark repeats the points of one scene behind its cameras, where no view sees the copies: the work of a step stays
+//! the same, and the pages on the drive grow in number. All sizes train in one process with the same number of frames, in
+//! turns of a few steps, on the same views step by step. The benchmark prints one line of JSON for each size.
 
 pub mod support;
 
