@@ -1,18 +1,24 @@
-//! Time to commit, on a real drive. (Opening a store, and what commits cost a run: `gsscale-bench commit`.)
+//! Time to commit to a store and to open a store, on a real drive. (What commits cost a run is in the run's
+//! `summary.json`: `commit_overhead_percent`, `commit_bytes`, `commit_interval`.)
 //!
-//! `cargo bench --bench commit` commits 64 and 1,000 dirty pages of 728 KiB; numbers choose other counts. Files lie in the
-//! folder of temporary files (`TMPDIR`). Inside a test run it does the same with a few small pages.
+//! `cargo bench --bench commit` commits 64 and 1,000 dirty pages of 728 KiB (numbers choose other counts), and opens a store
+//! of 100,000 pages. Files lie in the folder of temporary files (`TMPDIR`). Inside a test run it does the same with a few
+//! small pages.
 //!
-//! A commit is its writes, the sync of the segments, the map's transaction and the witness.
+//! A commit is its writes, the sync of the segments, the map's transaction and the witness. The opened store has segments
+//! of holes, because opening reads the map and no page.
 
 #![allow(clippy::expect_used)] // a benchmark that cannot run ends
 
 pub mod support;
 
 use gsscale::base::ids::PageId;
+use gsscale::page::engine::memory::MemoryEngine;
 use gsscale::page::engine::open::{IoEngine, open_engine};
+use gsscale::page::engine::segment_files::segment_file_name;
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::format::codec::Codec;
+use gsscale::page::format::slot_header::{SlotRef, StoredAs};
 use gsscale::page::map::commit::{CommitConfig, CommitError, Commits, Cut, PageChange};
 use gsscale::page::versions::paged_store::{PageMoved, PagedStore};
 use gsscale::page::versions::slots::SlotLayout;
@@ -20,6 +26,8 @@ use std::path::PathBuf;
 use std::time::Instant;
 use support::Args;
 
+/// Bytes of a page of 1,024 rows at SH degree 3.
+const PAGE_BYTES: usize = 745_472;
 const CONFIG: CommitConfig = CommitConfig { store: 0xbe, cache_bytes: 16 << 20, reserve_bytes: 0 };
 /// Like bounds and counts of a page.
 const LABEL: [u8; 64] = [7; 64];
@@ -89,10 +97,40 @@ pub fn commit_seconds(pages: u32, bytes: usize, times: usize) -> Result<CommitTi
     Ok(CommitTime { write, commit: support::median(measured.iter().map(|m| m.1)) })
 }
 
-/// Small sizes: commits, and says whether times are times.
+/// Seconds to open a store whose map names `pages` pages that were just written.
+pub fn open_seconds(pages: u32) -> Result<f64, CommitError> {
+    let (at, layout) = (folder("open"), layout(PAGE_BYTES));
+    let opened = Commits::create(Box::new(DriveFolder::new(&at)), CONFIG)?;
+    let mut store = opened.paged_store(Box::new(MemoryEngine::new()), layout, Codec::Raw)?;
+    let change = |page: u32| {
+        let (place, checksum) = (layout.place(u64::from(page)), u128::from(page) << 64);
+        let codec = StoredAs::Raw;
+        let slot = SlotRef { place, stored_bytes: 9, payload_bytes: 9, generation: 1, checksum, codec };
+        PageChange { page: PageId::initial(page), version: Some((slot, LABEL.to_vec())) }
+    };
+    let changes: Vec<PageChange> = (0..pages).map(change).collect();
+    let mut commits = opened.commits;
+    let cut = Cut { changes: &changes, run_state: &[1; 4096], note: b"", pin: None };
+    commits.commit(&mut store, &mut Vec::new(), &cut)?;
+    drop((commits, store));
+    for segment in 0..=layout.place(u64::from(pages - 1)).segment {
+        let made = std::fs::File::create(at.join(segment_file_name(segment)));
+        made.and_then(|file| file.set_len(layout.segment_bytes())).expect("the drive takes a file of holes");
+    }
+    let began = Instant::now();
+    let opened = Commits::open(Box::new(DriveFolder::new(&at)), CONFIG)?;
+    let engine = open_engine(IoEngine::Pread, &at, 8).expect("plain reads work everywhere").store;
+    opened.paged_store(engine, layout, Codec::Raw)?;
+    let seconds = began.elapsed().as_secs_f64();
+    let _ = std::fs::remove_dir_all(at);
+    Ok(seconds)
+}
+
+/// Small sizes: commits, opens, and says whether times are times.
 pub fn tiny() -> bool {
     let commit = commit_seconds(5, 5000, 3).expect("a store takes commits");
-    commit.write > 0.0 && commit.commit > 0.0
+    let open = open_seconds(300).expect("a store opens");
+    commit.write > 0.0 && commit.commit > 0.0 && open > 0.0
 }
 
 fn main() {
@@ -103,11 +141,15 @@ fn main() {
     }
     let sizes = if args.sizes.is_empty() { vec![64, 1000] } else { args.sizes.clone() };
     for dirty in sizes {
-        match commit_seconds(dirty as u32, 745_472, 5) {
+        match commit_seconds(dirty as u32, PAGE_BYTES, 5) {
             Ok(CommitTime { write, commit }) => {
                 println!("commit {dirty} pages of 728 KiB: write {write:.3} s, commit {:.1} ms", commit * 1e3);
             }
             Err(error) => println!("commit: {error}"),
         }
+    }
+    match open_seconds(100_000) {
+        Ok(seconds) => println!("open a store of 100,000 pages: {seconds:.3} s"),
+        Err(error) => println!("open: {error}"),
     }
 }

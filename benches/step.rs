@@ -2,7 +2,8 @@
 //!
 //! `cargo bench --bench step` measures real scenes (where `GSSCALE_DATA`, or `../shared/data`, has them) and a made-up
 //! terrain. Numbers choose sizes, words choose cases, `--path avx2` the instruction path, `--json` the form,
-//! `RAYON_NUM_THREADS` the threads. Inside a test run it does a few steps of a tiny terrain.
+//! `RAYON_NUM_THREADS` the threads. Inside a test run it does a few steps of a tiny terrain. The cases `touched_100_percent`
+//! and `touched_65_percent` measure the gather and the optimizer alone (`support::touched`).
 //!
 //! Real scenes start from their points with the program's own defaults and all colour bands in use; densification is
 //! off but its statistics are collected. Each repetition trains once on the same views; the figure is the median
@@ -37,6 +38,7 @@ use std::time::{Duration, Instant};
 use support::cases::{Case, PHOTO_CASES, photo_case, terrain_case};
 use support::cpu_bytes::{CpuCounts, part_bytes};
 use support::floor::{bare_blend_rate, copy_rate};
+use support::touched::touched;
 use support::{Args, Hash, Seconds, machine, median, time};
 
 /// How much is measured.
@@ -65,6 +67,15 @@ fn main() {
     if !args.json {
         println!("{}", machine(simd));
         println!("floor a thread: {:.2} Gpixel-Gaussians/s, {:.1} GB/s", floor.pairs / 1e9, floor.bytes / 1e9);
+    }
+    for percent in [100, 65] {
+        let name = format!("touched_{percent}_percent");
+        if args.wants(&name) {
+            let found = touched(500_000, percent, 15, simd);
+            let line =
+                if args.json { found.json(&name, floor.bytes).to_string() } else { found.text(&name, floor.bytes) };
+            println!("{line}");
+        }
     }
     for real in &PHOTO_CASES {
         measure(&args, real.name, floor, || photo_case(real, REAL.views));

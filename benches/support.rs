@@ -9,6 +9,8 @@ pub mod cases;
 pub mod cpu_bytes;
 pub mod device_bytes;
 pub mod floor;
+pub mod touched;
+pub mod training;
 
 use gsscale::base::machine::cpu_model;
 use gsscale::base::rng::{Purpose, Stream};

@@ -3,6 +3,9 @@
 #![allow(clippy::duplicate_mod)] // each benchmark is a program of its own, with its own support
 
 #[allow(dead_code)] // its `main`
+#[path = "../benches/bounded.rs"]
+mod bounded;
+#[allow(dead_code)] // its `main`
 #[path = "../benches/commit.rs"]
 mod commit;
 #[allow(dead_code)] // its `main`
@@ -14,11 +17,54 @@ mod image_loss;
 #[allow(dead_code)] // its `main`
 #[path = "../benches/render.rs"]
 mod render;
+#[path = "support/bench.rs"]
+mod scene_of_a_bench;
+#[path = "support/scenes.rs"]
+mod scenes;
+#[allow(dead_code)] // its `main`
+#[path = "../benches/sizes.rs"]
+mod sizes;
 #[allow(dead_code)] // its `main`
 #[path = "../benches/step.rs"]
 mod step;
+#[allow(dead_code)] // its `main`
+#[path = "../benches/tiers.rs"]
+mod tiers;
 
+use clap::Parser;
+use gsscale::config::file::parse_arguments;
+use gsscale::train::error::TrainError;
+use scene_of_a_bench::{large_city, number};
+use scenes::{city, text};
+use serde_json::Value;
+use std::ffi::OsString;
+use step::support::touched::touched;
 use step::support::{Args, median};
+use tempfile::TempDir;
+
+type Lines = Result<Vec<Value>, TrainError>;
+
+/// The arguments of a benchmark behind its name.
+fn arguments(args: &[&str]) -> Vec<OsString> {
+    std::iter::once("bench").chain(args.iter().copied()).map(OsString::from).collect()
+}
+
+fn collected(start: impl FnOnce(&mut dyn FnMut(&Value)) -> Result<(), TrainError>) -> Lines {
+    let mut lines = Vec::new();
+    start(&mut |line| lines.push(line.clone())).map(|()| lines)
+}
+
+fn tiers(args: &[&str]) -> Lines {
+    collected(|print| tiers::start(&parse_arguments(&arguments(args)), print))
+}
+
+fn sizes(args: &[&str]) -> Lines {
+    collected(|print| sizes::start(&parse_arguments(&arguments(args)), print))
+}
+
+fn bounded(args: &[&str]) -> Lines {
+    collected(|print| bounded::start(&bounded::Args::parse_from(arguments(args)), print))
+}
 
 #[test]
 fn commit_runs() {
@@ -47,6 +93,99 @@ fn step_runs_with_the_same_losses_for_any_number_of_threads() {
         pool.install(step::tiny)
     };
     assert_eq!(with(1), with(3));
+}
+
+#[test]
+fn touched_rows_are_timed_beside_a_copy() {
+    let [all, some] = [100, 65].map(|percent| touched(5000, percent, 3, gsscale::base::simd::SimdPath::best()));
+    let line = |of: &step::support::touched::Touched| of.json("", 1e9);
+    let rows = number(&line(&some), "rows");
+    assert!(number(&line(&all), "rows") == 5000.0 && (3000.0..3500.0).contains(&rows), "{rows}");
+    for line in [line(&all), line(&some)] {
+        for key in ["gather_cpu_seconds", "optimizer_cpu_seconds", "bytes", "share_of_copy"] {
+            assert!(number(&line, key) > 0.0, "{line}");
+        }
+    }
+}
+
+#[test]
+fn shares_of_the_state_train_to_the_bits_of_the_run_in_memory() {
+    let folder = TempDir::new().unwrap();
+    let scene = large_city(folder.path());
+    let spill = folder.path().join("spill");
+    let sizes = ["--steps", "100", "--turn", "7", "--warm-up", "60", "--page-rows", "16", "--strategy", "none"];
+    let more = ["--spill-dir", text(&spill), "--shares", "70,0.1", "--view-order", "groups:9"];
+    let lines = tiers(&[&[text(&scene)][..], &sizes, &more].concat()).unwrap();
+    let [too_small, in_memory, share] = &lines[..] else { panic!("{lines:?}") };
+    assert!(number(too_small, "frames") < number(too_small, "pages_of_largest_view"));
+    assert_eq!((number(in_memory, "ratio_of_sums"), &in_memory["frames"]), (1.0, &Value::Null));
+    assert_eq!(share["same_last_loss"], true);
+    for key in ["steps", "pages", "overfetch", "rows_per_step", "view_order"] {
+        assert_eq!(share[key], in_memory[key], "{key}");
+    }
+    assert!(number(share, "overfetch") >= 1.0 && number(share, "seconds_per_step_median") > 0.0);
+    assert!((0.0..1e6).contains(&number(share, "stall_seconds_predicted")), "{share}");
+    // The bound starts and ends where the measurement does; only what was read ahead at either end may differ, which an
+    // eighth of the frames bounds.
+    let reads = number(share, "pages_read_per_step") * 40.0;
+    let bound = number(share, "belady_pages_per_step") * 40.0;
+    assert!(bound > 0.0 && reads + number(share, "frames") / 8.0 >= bound, "{reads} pages read, {bound} at least");
+    assert!(spill.is_dir() && spill.read_dir().unwrap().next().is_none(), "scratch is removed");
+}
+
+#[test]
+fn sizes_see_the_same_rows_whatever_lies_behind_them() {
+    let folder = TempDir::new().unwrap();
+    let scene = large_city(folder.path());
+    let spill = folder.path().join("spill");
+    let options = ["--steps", "60", "--turn", "7", "--page-rows", "16", "--strategy", "none", "--copies", "1,3"];
+    let lines = sizes(&[&[text(&scene), "--spill-dir", text(&spill)][..], &options].concat()).unwrap();
+    let [one, three] = &lines[..] else { panic!("{lines:?}") };
+    assert_eq!(number(three, "gaussians"), 3.0 * number(one, "gaussians"));
+    assert_eq!((&one["frames"], number(one, "ratio_of_medians")), (&three["frames"], 1.0));
+    // Neighbours at the ends of a copy may differ, and with them a few first scales.
+    assert!((number(three, "rows_ratio") - 1.0).abs() < 0.01, "{three}");
+    assert!((number(three, "pages_per_step") / number(one, "pages_per_step") - 1.0).abs() < 0.2, "{one} {three}");
+    assert!(number(three, "pages") > 2.5 * number(one, "pages") && number(three, "seconds_per_step_median") > 0.0);
+    assert!(spill.read_dir().unwrap().next().is_none(), "scratch is removed");
+}
+
+/// A control group is made where this user may make one; else the line says why not.
+#[test]
+#[cfg(unix)]
+fn a_city_larger_than_memory_trains_under_a_hard_limit() {
+    let folder = TempDir::new().unwrap();
+    let dir = folder.path().join("bounded");
+    let sizes = ["--gaussians", "240000", "--city", "20000", "--views", "24", "--steps", "12", "--page-rows", "128"];
+    let lines = bounded(&[&["--dir", text(&dir), "--host-mem", "128MiB"][..], &sizes].concat()).unwrap();
+    let [line] = &lines[..] else { panic!("{lines:?}") };
+    assert_eq!((number(line, "gaussians"), number(line, "steps")), (240_000.0, 12.0), "{line}");
+    assert!(line["is_bounded"] == true && line["finished"] == true, "{line}");
+    assert_ne!(line["limited_by"].is_null(), line["no_limit_because"].is_null(), "{line}");
+    assert!(number(line, "state_bytes") > number(line, "limit_bytes"), "{line}");
+    assert!(number(line, "host_bytes_peak") <= number(line, "limit_bytes"), "{line}");
+    assert!(!dir.exists(), "all of it is removed");
+}
+
+#[test]
+fn benchmarks_that_train_refuse_wrong_input() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 10, 64, 48, 300);
+    let (scene, spill) = (text(&scene), text(folder.path()));
+    let refused = |lines: Lines, words: &str| {
+        let error = lines.unwrap_err().to_string();
+        assert!(error.contains(words) && error.contains("remedy"), "{error}");
+    };
+    refused(tiers(&[scene]), "--spill-dir");
+    refused(tiers(&[scene, "--spill-dir", spill, "--shares", "0"]), "--shares");
+    refused(tiers(&[scene, "--spill-dir", spill, "--device", "gpu"]), "--device");
+    refused(sizes(&[scene]), "--spill-dir");
+    refused(sizes(&[scene, "--spill-dir", spill, "--copies", "1,0"]), "--copies");
+    refused(bounded(&["--dir", spill]), "exists already");
+    let new = folder.path().join("new");
+    refused(bounded(&["--dir", text(&new), "--gaussians", "lots"]), "--gaussians");
+    refused(bounded(&["--dir", text(&new), "--gaussians", "999"]), "fewer than");
+    assert!(!new.exists());
 }
 
 #[test]

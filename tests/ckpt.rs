@@ -12,7 +12,7 @@ mod fixture;
 #[path = "support/scenes.rs"]
 mod scenes;
 
-use bench::{Bench, EVENTLESS, Ply, ckpt, failed, json, pin, train_from};
+use bench::{Bench, EVENTLESS, Ply, changed_pages, ckpt, failed, json, pin, train_from};
 use gsscale::exchange::ply::{PlyMeta, write_gaussians};
 use gsscale::page::format::slot_header::checksum;
 use gsscale::scene::columns::{Column, Columns};
@@ -47,27 +47,13 @@ fn looking_at_a_store_says_what_the_run_left_and_changes_nothing() {
     let words = ckpt(&["ls", text(&out)]);
     assert!(words.contains("PSNR") && words.contains("(last)"), "{words}");
 
-    let found = json(&["diff", text(&out), &a.to_string(), &b.to_string(), "--names"]);
-    let number = |part: &str, key: &str| found[part][key].as_i64().unwrap();
-    let grown = number("added", "rows") - number("removed", "rows") + number("changed", "rows")
-        - found["changed_rows_before"].as_i64().unwrap();
-    let rows: Vec<i64> = found["rows"].as_array().unwrap().iter().map(|r| r.as_i64().unwrap()).collect();
-    assert_eq!(rows[1] - rows[0], grown);
-    assert_eq!(rows[1] as u64, last["gaussians"].as_u64().unwrap());
-    assert!(
-        number("changed", "pages") > 0
-            && found["names"][2].as_array().unwrap().len() as i64 == number("changed", "pages")
-    );
-    let same = json(&["diff", text(&out), &b.to_string(), &b.to_string()]);
-    assert_eq!((same["added"]["pages"].as_u64(), same["changed"]["pages"].as_u64()), (Some(0), Some(0)));
-    assert_eq!(same["same"]["pages"], last["pages"]);
-
+    let changed = changed_pages(&bench.spill(), a, b);
     let whole = json(&["inspect", text(&out)]);
     assert_eq!((whole["format_version"].as_u64(), whole["generation"].as_u64()), (Some(1), Some(b)));
     assert_eq!((&whole["pages"], &whole["segment_bytes"]), (&last["pages"], &listed["segment_bytes"]));
     let state = whole["state"].to_string();
     assert!(state.contains(&format!("step {} of", last["step"])) && state.contains("rounds"), "{state}");
-    let name = found["names"][2][0].as_str().unwrap();
+    let name = changed[0].as_str();
     let page = json(&["inspect", text(&out), "--page", name]);
     assert_eq!(page["since"].as_u64(), Some(b));
     assert!(page["fault"].is_null() && page["rows"].as_u64().unwrap() > 0);
@@ -193,7 +179,7 @@ fn names_keep_generations_until_they_are_pruned() {
     let copy = bench.copy("clone", &out);
     assert_eq!(json(&["ls", text(&copy)])["generations"][0]["names"].to_string(), r#"["also-early","early"]"#);
     assert!(std::fs::read(bench.export(&copy, &["--generation", "early"])).unwrap() == std::fs::read(whole).unwrap());
-    assert!(json(&["diff", text(&out), "early", &kept[2].to_string()])["changed"]["pages"].as_u64() > Some(0));
+    assert!(!changed_pages(&bench.spill(), first, kept[2]).is_empty());
 
     let said = failed(&["prune", text(&out), "nosuch"]);
     assert!(said.contains("'nosuch'") && said.contains("also-early"), "{said}");
@@ -287,9 +273,8 @@ fn flipped_bits_in_pages_are_named_and_older_versions_take_their_place() {
     let out = bench.stopped(&[]);
     let listed = json(&["ls", text(&out)]);
     let [a, b] = generations(&listed)[..] else { panic!("{listed}") };
-    let found = json(&["diff", text(&out), &a.to_string(), &b.to_string(), "--names"]);
-    let names: Vec<&str> = found["names"][2].as_array().unwrap().iter().map(|n| n.as_str().unwrap()).collect();
-    let (payload, header) = (names[0], names[1]);
+    let names = changed_pages(&bench.spill(), a, b);
+    let (payload, header) = (names[0].as_str(), names[1].as_str());
     let (file, offset) = slot_of(&out, payload);
     flip(&bench.spill().join(file), offset + 4096 + 77);
     assert!(json(&["verify", text(&out)])["faults"].as_array().unwrap().is_empty(), "headers do not know");
@@ -352,10 +337,9 @@ fn goes_on_from_older_pages(more: &[&str]) {
     let out = bench.stopped(more);
     let listed = json(&["ls", text(&out)]);
     let [a, b] = generations(&listed)[..] else { panic!("{listed}") };
-    let found = json(&["diff", text(&out), &a.to_string(), &b.to_string(), "--names"]);
-    let names = found["names"][2].as_array().unwrap();
-    for name in names {
-        let (file, offset) = slot_of(&out, name.as_str().unwrap());
+    let names = changed_pages(&bench.spill(), a, b);
+    for name in &names {
+        let (file, offset) = slot_of(&out, name);
         flip(&bench.spill().join(file), offset + 4096 + 77);
     }
     let rescued = bench.path("rescued");
@@ -669,7 +653,7 @@ fn a_run_starts_from_a_store_as_from_the_file_that_it_was_made_of() {
 #[test]
 fn every_subcommand_has_help_with_examples() {
     let help = ckpt(&["--help"]);
-    for name in ["ls", "inspect", "verify", "diff", "rollback", "prune", "export", "import", "clone", "salvage"] {
+    for name in ["ls", "inspect", "verify", "rollback", "prune", "export", "import", "clone", "salvage"] {
         assert!(help.contains(&format!("\n  {name} ")), "{help}");
         let of = ckpt(&[name, "--help"]);
         assert!(of.contains("Examples:") && of.contains("--json"), "{of}");

@@ -5,7 +5,7 @@
 
 #[cfg(target_os = "linux")]
 #[allow(dead_code)] // the bench reads more of it
-#[path = "../tools/bench/memory_group.rs"]
+#[path = "../benches/support/memory_group.rs"]
 mod memory_group;
 #[path = "support/scenes.rs"]
 mod scenes;

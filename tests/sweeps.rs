@@ -177,7 +177,7 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     refuses(&["compare", scene, scene, "--out", out], "metrics.jsonl");
     assert!(!Path::new(out).exists(), "bad input leaves nothing behind");
     refuses(&["ladder", scene, "--out", out], "nothing would leave memory");
-    refuses(&["orders", scene, "--spill-dir", out], "--spill-dir");
+    refuses(&[scene, "--spill-dir", out], "--spill-dir");
     refuses(&[scene, "--steps", "1", "--device", "gpu"], "--device");
     assert!(!Path::new(out).exists(), "nor does a flag that means nothing here");
 

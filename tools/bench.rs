@@ -1,24 +1,14 @@
-//! `gsscale-bench`: measures training and prints lines of JSON. Which measurement is the first argument; without one of
-//! their names it is `run`. Parses, calls, prints.
+//! `gsscale-bench`: measures training and prints lines of JSON. The first argument names the measurement; without a name it
+//! is `run`. Parses, calls, prints. (Measurements of the program's own parts are benchmarks: `benches/`.)
 
-#[path = "bench/bounded.rs"]
-mod bounded;
-#[path = "bench/commit.rs"]
-mod commit;
 #[path = "bench/compare.rs"]
 mod compare;
-#[path = "bench/demand.rs"]
-mod demand;
 #[path = "bench/facts.rs"]
 mod facts;
 #[path = "bench/knobs.rs"]
 mod knobs;
 #[path = "bench/ladder.rs"]
 mod ladder;
-#[path = "bench/memory_group.rs"]
-mod memory_group;
-#[path = "bench/orders.rs"]
-mod orders;
 #[path = "bench/pareto.rs"]
 mod pareto;
 #[path = "bench/published.rs"]
@@ -27,30 +17,33 @@ mod published;
 mod published_table;
 #[path = "bench/run.rs"]
 mod run;
-#[path = "bench/sizes.rs"]
-mod sizes;
-#[path = "bench/statistics.rs"]
-mod statistics;
 #[path = "bench/sweep.rs"]
 mod sweep;
-#[path = "bench/tiers.rs"]
-mod tiers;
-#[path = "bench/touched.rs"]
-mod touched;
 
 use clap::Parser;
 use gsscale::base::error::InputError;
 use gsscale::config::choice::{Choice, Device};
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::config::limits::simd_path;
-use gsscale::dataset::loader::Dataset;
-use gsscale::dataset::target_cache::TargetCache;
-use gsscale::gpu::DeviceChoice;
+use gsscale::config::published::BUILT_IN;
 use gsscale::train::error::TrainError;
 use serde_json::Value;
 use std::ffi::OsString;
 use std::path::Path;
 use std::process::ExitCode;
+
+/// Measurements, in the order in which one comes to use them.
+const HELP: &str = "\
+Measures training, and prints one line of JSON a run.
+
+  gsscale-bench SCENE                  trains a scene (the same as run SCENE)
+  gsscale-bench run NAME --data DIR    trains a published scene; prints our figures beside the published figures
+  gsscale-bench compare A B --out F    shows finished runs side by side on one page
+  gsscale-bench pareto SCENE --out DIR what each setting costs and saves
+  gsscale-bench ladder SCENE --out DIR what each idea of out-of-core training brings
+
+Each command has --help with examples: gsscale-bench run --help, gsscale-bench run rubble --help.
+Published scenes:";
 
 fn main() -> ExitCode {
     let mut arguments: Vec<OsString> = std::env::args_os().collect();
@@ -64,18 +57,9 @@ fn main() -> ExitCode {
         is
     };
     let mut print = |line: &Value| gsscale::say!("{line}");
-    let done = if named("tiers") {
-        tiers::start(&parse_arguments(&arguments), &mut print)
-    } else if named("commit") {
-        commit::start(&parse_arguments(&arguments), &mut print)
-    } else if named("orders") {
-        orders::start(&parse_arguments(&arguments), &mut print)
-    } else if named("bounded") {
-        bounded::start(&bounded::Args::parse_from(&arguments), &mut print)
-    } else if named("sizes") {
-        sizes::start(&parse_arguments(&arguments), &mut print)
-    } else if named("touched") {
-        touched::start(&parse_arguments(&arguments), &mut print)
+    let done = if named("help") || named("--help") || named("-h") {
+        gsscale::say!("{HELP} {}", BUILT_IN.map(|(name, _)| name).join(", "));
+        Ok(())
     } else if named("ladder") {
         ladder::start(&parse_arguments(&arguments), &mut print)
     } else if named("pareto") {
@@ -113,42 +97,4 @@ fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, Tra
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
     }
     Ok(config)
-}
-
-/// Refuses a device other than the CPU: this measurement is of the CPU path.
-fn refuse_devices(config: &TrainConfig) -> Result<(), TrainError> {
-    match &config.device {
-        Device::Cpu | Device::Gpu(DeviceChoice::Auto) => Ok(()),
-        other => {
-            let problem = format!("this measurement is of the CPU path, not of '{other}'");
-            Err(InputError::new("--device", problem, "leave it out, or use gsscale-bench pareto or ladder").into())
-        }
-    }
-}
-
-/// As [`refuse_devices`], and refuses a drive: this measurement is of a run in memory.
-fn refuse_tiers(config: &TrainConfig) -> Result<(), TrainError> {
-    refuse_devices(config)?;
-    let given = [
-        ("--spill-dir", config.residence().spill_dir().is_some()),
-        ("--frames", config.frames > 0),
-        ("--host-mem", config.host_mem.0 > 0),
-    ];
-    match given.into_iter().find(|(_, is_given)| *is_given) {
-        None => Ok(()),
-        Some((flag, _)) => {
-            let remedy = "leave it out, or use gsscale-bench tiers or ladder for the drive";
-            Err(InputError::new(flag, "this measurement keeps all pages in memory", remedy).into())
-        }
-    }
-}
-
-/// Decodes every photo, so that no contender of a comparison does it for the others; where the cache does not hold all of
-/// them, all decode alike as they go.
-fn decode_all(dataset: &Dataset, targets: &TargetCache, config: &TrainConfig) -> Result<(), TrainError> {
-    if TargetCache::bytes_to_keep_all(&dataset.views, rayon::current_num_threads()) > config.image_cache.0 {
-        return Ok(());
-    }
-    dataset.train_views().into_iter().try_for_each(|view| targets.get(view).map(|_| ()))?;
-    Ok(())
 }

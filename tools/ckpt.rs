@@ -3,8 +3,6 @@
 
 #[path = "ckpt/clone.rs"]
 mod clone;
-#[path = "ckpt/diff.rs"]
-mod diff;
 #[path = "ckpt/export.rs"]
 mod export;
 #[path = "ckpt/import.rs"]
@@ -39,7 +37,7 @@ Examples:
   gsscale-ckpt clone runs/village /mnt/other/village   to another drive
   gsscale-ckpt salvage runs/village --out rescued      when verify says that the map is damaged
 
-DIR is the output folder of a run, or its spill directory. ls, inspect, verify, diff, export, clone and salvage never
+DIR is the output folder of a run, or its spill directory. ls, inspect, verify, export, clone and salvage never
 write to it. `gsscale-ckpt COMMAND --help` has examples of each.";
 
 /// Looks at checkpoints, verifies, exports, imports, copies and repairs them.
@@ -58,8 +56,6 @@ enum Command {
     Inspect(inspect::Args),
     /// Verifies a store and lists every fault; exit code 1 if there is one
     Verify(verify::Args),
-    /// Compares two generations
-    Diff(diff::Args),
     /// Makes an earlier generation the last one
     Rollback(rollback::Args),
     /// Takes names of checkpoints away; what only they kept becomes free
@@ -79,7 +75,6 @@ fn main() -> ExitCode {
         Command::Ls(args) => ls::run(&args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Verify(args) => verify::run(&args),
-        Command::Diff(args) => diff::run(&args),
         Command::Rollback(args) => rollback::run(&args),
         Command::Prune(args) => prune::run(&args),
         Command::Export(args) => export::run(&args),

@@ -1,14 +1,11 @@
 //! Everything that a run needs beside its pages to go on as though it had never stopped, as bytes.
 //!
-//! Invariants: 1. what the bytes give back is what went in, bit for bit; 2. the version comes first, so that a newer
+//! Invariants: 1. what the bytes give back is what went in, bit for bit; 2. the version comes first, so that another
 //! program's state is told from damage; 3. bytes that nobody vouches for give a state within its limits or an error,
 //! never a panic.
 //!
 //! Layout: [`VERSION`] as u32, then the fields of [`RunState`] in their order, as [`crate::page::format::encoding`] writes them.
-//! Version 2 added what tools list and what a run that goes on counts from ([`RunState::test`], [`RunState::traffic`]),
-//! and a dataset print that knows photos, points and the local frame. No program was released with version 1.
-//! Version 3 added the last five of [`TrafficSoFar`]; of a state of version 2 they are 0.
-//! Version 4 added [`RunState::run`]; of an older state the run is unknown.
+//! Only version 4 is read; no program was released with versions 1 to 3.
 
 use crate::base::identity::RunId;
 use crate::page::format::encoding::{self, EncodingError};
@@ -17,8 +14,6 @@ use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
 pub const VERSION: u32 = 4;
-/// The oldest that is read.
-const OLDEST: u32 = 2;
 /// Bins of the statistics.
 const BINS: u16 = 1 << 15;
 
@@ -202,21 +197,14 @@ impl RunState {
     /// From bytes.
     ///
     /// # Errors
-    /// They are not the state of a run, or that of a newer program.
+    /// They are not the state of a run, or of another version.
     pub fn from_bytes(bytes: &[u8]) -> Result<RunState, RunStateError> {
         let (version, body) = bytes.split_first_chunk().ok_or(RunStateError::Impossible("it is empty"))?;
         let version = u32::from_le_bytes(*version);
-        if !(OLDEST..=VERSION).contains(&version) {
+        if version != VERSION {
             return Err(RunStateError::Version(version));
         }
-        let mut body = body.to_vec();
-        if version < 3 {
-            body.extend(of_version_3()?);
-        }
-        if version < 4 {
-            body.extend(encoding::to_bytes(&RunIdentity::default())?);
-        }
-        let state: RunState = encoding::from_bytes(&body)?;
+        let state: RunState = encoding::from_bytes(body)?;
         state.check()?;
         Ok(state)
     }
@@ -266,13 +254,6 @@ impl RunState {
         }
         Ok(())
     }
-}
-
-/// What version 3 added at the end, as it is of a state without it.
-fn of_version_3() -> Result<Vec<u8>, EncodingError> {
-    let TrafficSoFar { absent, other_pages_needed, other_bytes_read, other_stall_seconds, belady_bytes_read, .. } =
-        TrafficSoFar::default();
-    encoding::to_bytes(&(absent, other_pages_needed, other_bytes_read, other_stall_seconds, belady_bytes_read))
 }
 
 #[cfg(test)]
@@ -333,23 +314,10 @@ mod tests {
     fn states_come_back_and_other_versions_do_not() {
         let mut bytes = sample().to_bytes().unwrap();
         assert_eq!(RunState::from_bytes(&bytes).unwrap(), sample());
-        bytes[0] += 1;
-        assert_eq!(RunState::from_bytes(&bytes), Err(RunStateError::Version(VERSION + 1)));
-    }
-
-    #[test]
-    fn older_states_know_no_run_and_have_counted_less() {
-        let bytes = sample().to_bytes().unwrap();
-        let before_version_4 = bytes.len() - encoding::to_bytes(&sample().run).unwrap().len();
-        let of_version_3 = [&3u32.to_le_bytes(), &bytes[4..before_version_4]].concat();
-        let unknown = RunState { run: RunIdentity::default(), ..sample() };
-        assert_eq!(RunState::from_bytes(&of_version_3).unwrap(), unknown);
-        // Five numbers fewer, all of eight bytes.
-        let of_version_2 = [&2u32.to_le_bytes(), &bytes[4..before_version_4 - 40]].concat();
-        let traffic = TrafficSoFar { bytes_read: 9, stall_seconds: 0.25, ..TrafficSoFar::default() };
-        assert_eq!(RunState::from_bytes(&of_version_2).unwrap(), RunState { traffic, ..unknown });
-        let of_version_1 = [&1u32.to_le_bytes(), &bytes[4..]].concat();
-        assert_eq!(RunState::from_bytes(&of_version_1), Err(RunStateError::Version(1)));
+        for other in [VERSION - 1, VERSION + 1] {
+            bytes[..4].copy_from_slice(&other.to_le_bytes());
+            assert_eq!(RunState::from_bytes(&bytes), Err(RunStateError::Version(other)));
+        }
     }
 
     #[test]

@@ -7,7 +7,7 @@
 //! The step takes the values of its rows from whoever forwarded them: to find them again would cost a second root and a
 //! second quotient for every value.
 //!
-//! Floor: the bytes, 4 floats a parameter for forwarding and 7 for the step; `gsscale-bench touched` prints both beside a
+//! Floor: the bytes, 4 floats a parameter for forwarding and 7 for the step; `cargo bench --bench step touched` prints both beside a
 //! plain copy and beside plain passes of the same reads and writes.
 //!
 //! Invariant: the bits are those of [`RowsNow`], whatever the instruction path.

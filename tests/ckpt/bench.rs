@@ -7,7 +7,8 @@ use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
 use gsscale::page::format::codec::Codec;
 use gsscale::page::map::commit::Commits;
-use gsscale::page::tool::reading::commit_config;
+use gsscale::page::map::opening::StoredPage;
+use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule, commit_config};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -48,6 +49,14 @@ const BUSY: &[&str] = &[
     "0",
     "--quiet",
 ];
+
+/// Names of the pages that two generations of a store have in different versions.
+pub fn changed_pages(store: &Path, from: u64, to: u64) -> Vec<String> {
+    let store = StoreReader::open(store, Access::Map, WitnessRule::Obeyed).unwrap();
+    let before = store.pages_at(from).unwrap();
+    let is_changed = |page: &StoredPage| before.iter().any(|b| b.page == page.page && b.slot != page.slot);
+    store.pages_at(to).unwrap().iter().filter(|page| is_changed(page)).map(|page| page.page.to_string()).collect()
+}
 
 /// A run whose scene is its rows alone.
 pub const EVENTLESS: &[&str] = &["--strategy", "none", "--sh-every", "0"];

@@ -130,7 +130,7 @@ pub fn bench_config(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainC
         // All bands are in use for most of a short run, as they are for nearly all of a long one.
         keys.sh_every.get_or_insert((steps / SH_RAISES).max(1));
     }
-    // What commits cost goes by the clock and would count as bytes moved; gsscale-bench commit measures it.
+    // Commits go by the clock, and their bytes would count as the setting's.
     keys.commit_every.get_or_insert(CommitEvery::Seconds(0.0));
     super::settle(file, &keys)
 }

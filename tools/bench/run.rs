@@ -1,8 +1,9 @@
 //! `gsscale-bench run`: trains a scene for some steps and prints one line of JSON about what it took. Writes no file.
 
 use clap::Parser;
+use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::{cpu_model, process_cpu_seconds};
-use gsscale::config::file::TrainOverrides;
+use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::{RunOptions, simd_path};
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::render::cpu::CpuRenderer;
@@ -19,20 +20,14 @@ Examples:
   gsscale-bench scans/village --steps 500 --strategy none
   gsscale-bench scans/village --steps 2000 --max-gaussians 200000 --threads 1 >> runs.jsonl
 
-A published run, ours beside the paper's figures: gsscale-bench run rubble --data DIR (see gsscale-bench run rubble --help).
-Other measurements: gsscale-bench tiers --help (through the disk tier against in memory),
-gsscale-bench orders --help (orders of views: quality against bytes), gsscale-bench commit --help (what commits cost),
-gsscale-bench sizes --help (step time against the size of the scene), gsscale-bench touched --help (optimizer and
-forwarding against plain passes), gsscale-bench bounded --help (a city far larger than memory under a hard limit),
-gsscale-bench ladder --help (from naive offloading to memory), gsscale-bench pareto --help (what every knob costs and
-saves), gsscale-bench compare --help (finished runs).
+gsscale-bench help lists the other measurements.
 
 cpu_seconds_per_step counts all threads during the steps, decoding of photos included; loading and evaluation are not
 in it. host_bytes_peak is without the copy that writing a PLY takes.";
 
 /// Trains a scene and prints one line of JSON: steps, seconds, CPU seconds, peak memory, PSNR, SSIM, machine.
 #[derive(Parser)]
-#[command(name = "gsscale-bench", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench run", bin_name = "gsscale-bench run", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     scene: PathBuf,
@@ -46,13 +41,30 @@ pub struct Args {
     keys: TrainOverrides,
 }
 
+/// This measurement runs the CPU path with all pages in memory.
+fn refuse_what_is_not_measured(config: &TrainConfig) -> InputResult<()> {
+    let given = [
+        ("--device", !matches!(config.device.as_str(), "auto" | "cpu")),
+        ("--spill-dir", !config.spill_dir.is_empty()),
+        ("--frames", config.frames > 0),
+        ("--host-mem", config.host_mem.0 > 0),
+    ];
+    match given.into_iter().find(|(_, is_given)| *is_given) {
+        None => Ok(()),
+        Some((flag, _)) => {
+            let problem = "this measurement runs on the CPU with all pages in memory";
+            Err(InputError::new(flag, problem, "leave it out, or use gsscale-bench pareto or ladder"))
+        }
+    }
+}
+
 /// Measures.
 ///
 /// # Errors
 /// As a run.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let config = super::settle(args.config.as_deref(), &args.keys)?;
-    super::refuse_tiers(&config)?;
+    refuse_what_is_not_measured(&config)?;
     let began = Instant::now();
     let prepared = prepare(&args.scene, &config)?;
     let dataset = prepared.dataset;

@@ -15,8 +15,6 @@ pub(in crate::page) mod registered;
 pub mod segment_files;
 pub(in crate::page) mod segment_io;
 pub(in crate::page) mod short_transfers;
-#[cfg(target_os = "linux")]
-pub(in crate::page) mod slab;
 pub(in crate::page) mod transfer_pool;
 #[cfg(target_os = "linux")]
 pub mod uring;

@@ -22,8 +22,8 @@ use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transf
 use crate::page::engine::registered::RegisteredBuffers;
 use crate::page::engine::segment_io::{SegmentIo, too_many_files};
 use crate::page::engine::short_transfers::Resume;
-use crate::page::engine::slab::Slab;
 use io_uring::{IoUring, opcode, squeue, types};
+use slab::Slab;
 use std::collections::VecDeque;
 use std::fs::File;
 use std::io;
@@ -92,8 +92,8 @@ impl UringEngine {
             ring,
             segments: SegmentIo::new(folder, direct)?,
             behind: WriteBehind::default(),
-            flights: Slab::default(),
-            requests: Slab::default(),
+            flights: Slab::new(),
+            requests: Slab::new(),
             waiting: VecDeque::new(),
             offered: VecDeque::new(),
             with_kernel: 0,
@@ -122,15 +122,15 @@ impl UringEngine {
     fn fill_ring(&mut self) {
         while self.with_kernel < self.entries {
             let Some(&id) = self.waiting.front() else { return };
-            let flight_id = self.requests.get(id).flight;
+            let flight_id = self.requests[id].flight;
             if let Err(error) = self.prepare(flight_id) {
                 if too_many_files(&error) && self.with_kernel > 0 {
                     return; // an answer will let go of a file
                 }
-                self.flights.get_mut(flight_id).error.get_or_insert(error);
+                self.flights[flight_id].error.get_or_insert(error);
             }
             self.waiting.pop_front();
-            if self.flights.get(flight_id).error.is_some() {
+            if self.flights[flight_id].error.is_some() {
                 self.end_request(id);
                 continue;
             }
@@ -148,7 +148,7 @@ impl UringEngine {
 
     /// Makes sure that a flight has its file.
     fn prepare(&mut self, flight: usize) -> io::Result<()> {
-        let flight = self.flights.get_mut(flight);
+        let flight = &mut self.flights[flight];
         if let Some(raw) = self.broken {
             return Err(io::Error::from_raw_os_error(raw));
         }
@@ -159,8 +159,8 @@ impl UringEngine {
     }
 
     fn entry_of(&self, id: usize) -> squeue::Entry {
-        let request = self.requests.get(id);
-        let flight = self.flights.get(request.flight);
+        let request = &self.requests[id];
+        let flight = &self.flights[request.flight];
         let from = request.start + request.resume.done;
         let bytes = (request.bytes - request.resume.done) as u32;
         let offset = flight.transfer.place.offset + from as u64;
@@ -212,8 +212,8 @@ impl UringEngine {
     fn give_up_offered(&mut self) {
         let raw = self.broken.unwrap_or(0);
         for id in std::mem::take(&mut self.offered) {
-            let flight = self.requests.get(id).flight;
-            self.flights.get_mut(flight).error.get_or_insert_with(|| io::Error::from_raw_os_error(raw));
+            let flight = self.requests[id].flight;
+            self.flights[flight].error.get_or_insert_with(|| io::Error::from_raw_os_error(raw));
             self.with_kernel -= 1;
             self.end_request(id);
         }
@@ -226,8 +226,8 @@ impl UringEngine {
             let id = answer.user_data() as usize;
             self.with_kernel -= 1;
             let outcome = usize::try_from(answer.result()).map_err(|_| io::Error::from_raw_os_error(-answer.result()));
-            let request = self.requests.get_mut(id);
-            let flight = self.flights.get_mut(request.flight);
+            let request = &mut self.requests[id];
+            let flight = &mut self.flights[request.flight];
             match request.resume.advance(flight.transfer.direction, outcome, request.bytes) {
                 Ok(false) => self.waiting.push_front(id),
                 Ok(true) => self.end_request(id),
@@ -241,7 +241,7 @@ impl UringEngine {
 
     fn end_request(&mut self, id: usize) {
         let request = self.requests.remove(id);
-        let flight = self.flights.get_mut(request.flight);
+        let flight = &mut self.flights[request.flight];
         flight.requests_left -= 1;
         if flight.requests_left > 0 {
             return;

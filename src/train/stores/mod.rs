@@ -1,4 +1,4 @@
-//! What tools do with checkpoints: list, look, verify, compare, export, import, copy, rebuild, go back, forget.
+//! What tools do with checkpoints: list, look, verify, export, import, copy, rebuild, go back, forget.
 //!
 //! Each file is one of these. They give plain structs, which the tool prints as text or JSON.
 //!
@@ -7,7 +7,6 @@
 
 mod change;
 mod copy;
-mod diff;
 mod export;
 mod import;
 mod inspect;
@@ -18,7 +17,6 @@ mod verify;
 
 pub use change::{PruneRequest, Pruned, RolledBack, prune, rollback};
 pub use copy::{Copied, clone_store};
-pub use diff::{StoreDiff, diff};
 pub use export::{ExportRequest, Exported, export};
 pub use import::{ImportRequest, Imported, import};
 pub use inspect::{Inspected, PageInspected, Spread, inspect, inspect_page};

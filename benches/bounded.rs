@@ -1,10 +1,14 @@
-//! `gsscale-bench bounded`: a city far larger than the memory that the run gets, imported and trained by
-//! `gsscale-train` under a hard limit of `--host-mem` and a tenth.
+//! A city far larger than the memory of the run, imported and trained by `gsscale-train` under a hard limit: `--host-mem` and
+//! a tenth of it.
 //!
-//! The city is drawn small and repeated side by side (`gsscale-synth --tile`), so it takes no memory here. Prints one line
-//! of JSON. Everything is written below one new folder, which is removed at the end.
+//! `cargo bench --bench bounded -- --dir DIR` draws a small city and repeats it side by side (`gsscale-synth --tile`), which
+//! takes no memory here. The benchmark prints one line of JSON. It writes only below one new folder, and removes the folder
+//! at the end.
 
-use super::memory_group::MemoryGroup;
+#[path = "support/memory_group.rs"]
+mod memory_group;
+pub mod support;
+
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::config::file::{ByteSize, TrainConfig};
@@ -13,17 +17,19 @@ use gsscale::page::folder::file_system::free_bytes;
 use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::train::error::TrainError;
+use memory_group::MemoryGroup;
 use serde_json::{Value, json};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
-use std::process::{Command, ExitStatus, Stdio};
+use std::process::{Command, ExitCode, ExitStatus, Stdio};
 use std::time::Instant;
+use support::training::run_with_arguments;
 
 const EXAMPLES: &str = "\
 Examples:
-  gsscale-bench bounded --dir /mnt/nvme/bounded                      20 million Gaussians in 2 GiB, 200 steps
-  gsscale-bench bounded --dir /mnt/nvme/bounded --gaussians max      as many as leave a fifth of the free drive free
-  gsscale-bench bounded --dir /mnt/nvme/bounded --gaussians 5000000 --host-mem 512MiB
+  cargo bench --bench bounded -- --dir /mnt/nvme/bounded                      20 million Gaussians in 2 GiB, 200 steps
+  cargo bench --bench bounded -- --dir /mnt/nvme/bounded --gaussians max      as many as leave a fifth of the free drive free
+  cargo bench --bench bounded -- --dir /mnt/nvme/bounded --gaussians 5000000 --host-mem 512MiB
 
 The limit is a memory control group of Linux (it takes a user who may make one, such as root); where there is none the
 line says so, and the peak that the run measured of itself is all there is. 20 million Gaussians take some 17 GB of the
@@ -36,7 +42,7 @@ const DRIVE_SHARE: f64 = 0.8;
 
 /// Trains a city far larger than memory under a hard limit, and prints a line of JSON about what it took.
 #[derive(Parser)]
-#[command(name = "gsscale-bench bounded", bin_name = "gsscale-bench bounded", version, after_help = EXAMPLES)]
+#[command(name = "bounded", bin_name = "cargo bench --bench bounded --", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Folder to make on the drive; it must not exist, and is removed at the end
     #[arg(long, value_name = "DIR")]
@@ -61,10 +67,14 @@ pub struct Args {
     page_rows: u32,
 }
 
+fn main() -> ExitCode {
+    run_with_arguments("bounded", |arguments, print| start(&Args::parse_from(arguments), print))
+}
+
 /// Measures.
 ///
 /// # Errors
-/// The folder cannot be made, or the program beside this one cannot be started. A run that fails is a result.
+/// The folder cannot be made, or `gsscale-train` cannot be started. A run that fails is a result.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     if args.dir.symlink_metadata().is_ok() {
         return Err(InputError::new(&args.dir, "exists already", "name a folder that does not").into());
@@ -152,7 +162,7 @@ struct Run {
 }
 
 fn train(args: &Args) -> InputResult<Run> {
-    let program = trainer()?;
+    let program = Path::new(env!("CARGO_BIN_EXE_gsscale-train"));
     let path = |name: &str| args.dir.join(name).into_os_string();
     let flags = [
         ("--out", path("out")),
@@ -170,16 +180,16 @@ fn train(args: &Args) -> InputResult<Run> {
     arguments.extend(flags.into_iter().flat_map(|(flag, value)| [flag.into(), value]));
     let group = MemoryGroup::new(limit(args));
     let mut command = match &group {
-        Ok(group) => group.command(&program, &arguments),
+        Ok(group) => group.command(program, &arguments),
         Err(_) => {
-            let mut command = Command::new(&program);
+            let mut command = Command::new(program);
             command.args(&arguments);
             command
         }
     };
     let began = Instant::now();
     let output = command.stdout(Stdio::null()).stderr(Stdio::piped()).output();
-    let output = output.map_err(|e| InputError::io(&program, "starting the trainer", &e))?;
+    let output = output.map_err(|e| InputError::io(program, "starting the trainer", &e))?;
     let said = String::from_utf8_lossy(&output.stderr).trim().to_string();
     Ok(Run {
         status: output.status,
@@ -189,16 +199,6 @@ fn train(args: &Args) -> InputResult<Run> {
         seconds: began.elapsed().as_secs_f64(),
         last_words: (!said.is_empty()).then_some(said),
     })
-}
-
-/// `gsscale-train` beside this program.
-fn trainer() -> InputResult<PathBuf> {
-    let own = std::env::current_exe().map_err(|e| InputError::io("gsscale-bench", "finding itself", &e))?;
-    let program = own.with_file_name(format!("gsscale-train{}", std::env::consts::EXE_SUFFIX));
-    if program.is_file() {
-        return Ok(program);
-    }
-    Err(InputError::new(&program, "is not there", "build all programs: cargo build --release"))
 }
 
 fn read_summary(path: &Path) -> Value {

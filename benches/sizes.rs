@@ -1,14 +1,17 @@
-//! `gsscale-bench sizes`: step time against the size of the scene, at an equal visible set.
+//! Step time against the size of the scene, at an equal visible set.
 //!
-//! The points of one scene are repeated behind its cameras, where no view sees the copies: what a step does stays the
-//! same, what lies on the drive grows. All sizes train in one process, with equally many frames, in turns of a few steps,
-//! step by step on the same views. Prints one line of JSON for each.
+//! `cargo bench --bench sizes -- SCENE --spill-dir DIR` trains scenes of several sizes.
+//!
+//! The benchmark repeats the points of one scene behind its cameras, where no view sees the copies: the work of a step stays
+//! the same, and the pages on the drive grow in number. All sizes train in one process with the same number of frames, in
+//! turns of a few steps, on the same views step by step. The benchmark prints one line of JSON for each size.
 
-use super::statistics::median;
+pub mod support;
+
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::process_cpu_seconds;
-use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::config::limits::{self, RunOptions};
 use gsscale::dataset::import::{Budget, ImportOptions, PointSource};
 use gsscale::dataset::loader::{Dataset, load_dataset};
@@ -25,12 +28,15 @@ use gsscale::train::tiers::{self, Tiers};
 use gsscale::train::trainer::Trainer;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 use std::time::Instant;
+use support::median;
+use support::training::{config_with_drive, decode_all, extend, in_turns, run_with_arguments};
 
 const EXAMPLES: &str = "\
 Examples:
-  gsscale-bench sizes scans/city --spill-dir /mnt/nvme/bench --steps 400 --strategy none --view-order groups:25
-  gsscale-bench sizes scans/city --spill-dir /mnt/nvme/bench --copies 1,20 --frames 400
+  cargo bench --bench sizes -- scans/city --spill-dir /mnt/nvme/bench --steps 400 --strategy none --view-order groups:25
+  cargo bench --bench sizes -- scans/city --spill-dir /mnt/nvme/bench --copies 1,20 --frames 400
 
 With a city of a million points the sizes are 1, 4 and 20 million Gaussians, which takes 19 GB of the drive.";
 
@@ -41,13 +47,10 @@ const VIEWS_IN_FRAMES: usize = 3;
 
 /// Trains scenes of several sizes on the same visible Gaussians, in turns, and prints a line of JSON for each.
 #[derive(Parser)]
-#[command(name = "gsscale-bench sizes", bin_name = "gsscale-bench sizes", version, after_help = EXAMPLES)]
+#[command(name = "sizes", bin_name = "cargo bench --bench sizes --", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Scene with points: a COLMAP folder (images/, sparse/), or a folder with transforms.json
     scene: PathBuf,
-    /// Config file; flags override it
-    #[arg(long)]
-    config: Option<PathBuf>,
     /// Sizes in copies of the scene's points; the first is what the others are compared with
     #[arg(long, value_delimiter = ',', default_value = "1,4,20", value_name = "N")]
     copies: Vec<u32>,
@@ -91,17 +94,16 @@ struct Size {
     rows: u64,
 }
 
+fn main() -> ExitCode {
+    run_with_arguments("sizes", |arguments, print| start(&parse_arguments(arguments), print))
+}
+
 /// Measures.
 ///
 /// # Errors
 /// Bad input, or a step that fails.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
-    let config = super::settle(args.config.as_deref(), &args.keys)?;
-    super::refuse_devices(&config)?;
-    if config.residence().spill_dir().is_none() {
-        let remedy = "name a folder on the drive to measure";
-        return Err(InputError::new("--spill-dir", "there is no drive to measure", remedy).into());
-    }
+    let config = config_with_drive(&args.keys)?;
     if args.copies.is_empty() || args.copies.contains(&0) {
         return Err(InputError::new("--copies", "a scene of nothing", "write for example 1,4,20").into());
     }
@@ -119,10 +121,10 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         sizes.push(size(&config, &Copies { dataset: &dataset, count, shift }, frames)?);
     }
     let warm_up = args.warm_up.unwrap_or(config.steps / 4).min(config.steps / 2);
-    super::decode_all(&dataset, &targets, &config)?;
-    take_turns(&mut sizes, (0..warm_up, args.turn), (&dataset, &targets), false)?;
+    decode_all(&dataset, &targets, &config)?;
+    in_turns(&mut sizes, 0..warm_up, args.turn, |size| size.step(&dataset, &targets, false))?;
     sizes.iter_mut().for_each(|size| size.before = size.trainer.scene.pager.stats());
-    take_turns(&mut sizes, (warm_up..config.steps, args.turn), (&dataset, &targets), true)?;
+    in_turns(&mut sizes, warm_up..config.steps, args.turn, |size| size.step(&dataset, &targets, true))?;
     let facts = json!({
         "scene": args.scene, "page_rows": config.page_rows, "steps": config.steps - warm_up, "frames": frames,
         "threads": rayon::current_num_threads(), "version": env!("CARGO_PKG_VERSION"),
@@ -184,25 +186,6 @@ fn size(config: &TrainConfig, points: &Copies<'_>, frames: usize) -> Result<Size
     Ok(Size { copies, trainer, tiers, before, seconds: Vec::new(), cpu_seconds: 0.0, rows: 0 })
 }
 
-fn take_turns(
-    sizes: &mut [Size],
-    (steps, turn): (std::ops::Range<u32>, u32),
-    (dataset, targets): (&Dataset, &TargetCache),
-    measures: bool,
-) -> Result<(), TrainError> {
-    let mut first = steps.start;
-    while first < steps.end {
-        let end = first.saturating_add(turn).min(steps.end);
-        for size in &mut *sizes {
-            for _ in first..end {
-                size.step(dataset, targets, measures)?;
-            }
-        }
-        first = end;
-    }
-    Ok(())
-}
-
 impl Size {
     fn step(&mut self, dataset: &Dataset, targets: &TargetCache, measures: bool) -> Result<(), TrainError> {
         let (began, cpu) = (Instant::now(), process_cpu_seconds());
@@ -230,7 +213,7 @@ impl Size {
             "bytes_read_per_step": (now.bytes_read - before.bytes_read) as f64 / steps,
             "stall_seconds": now.stall_seconds - before.stall_seconds, "host_bytes_peak": host_bytes_peak(),
         });
-        super::statistics::extend(&mut line, facts);
+        extend(&mut line, facts);
         line
     }
 }

@@ -1,16 +1,20 @@
-//! `gsscale-bench tiers`: the same training in memory and through the disk tier with frames for shares of the state.
+//! The same training in memory and through the drive, with frames for shares of the pages.
 //!
-//! All of them run in one process, in turns of a few steps, so that whatever else the machine does hits them alike; step
-//! by step they train on the same views. Prints one line of JSON for each.
+//! `cargo bench --bench tiers -- SCENE --spill-dir DIR` trains all contenders in one process, in turns of a few steps, so
+//! that other load on the machine slows all alike. All contenders train on the same views, step by step. Prints one line of
+//! JSON for each contender.
 
-use super::demand::{Demand, page_bytes};
-use super::statistics::{extend, median};
+#[path = "support/demand.rs"]
+mod demand;
+pub mod support;
+
 use clap::Parser;
+use demand::{Demand, page_bytes};
 use gsscale::base::error::InputError;
 use gsscale::base::machine::process_cpu_split;
 use gsscale::cache::evict::EvictPolicy;
 use gsscale::config::choice::Chosen;
-use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides};
+use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
@@ -31,12 +35,15 @@ use gsscale::train::trainer::Trainer;
 use serde_json::{Value, json};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 use std::time::Instant;
+use support::median;
+use support::training::{config_with_drive, decode_all, extend, in_turns, run_with_arguments};
 
 const EXAMPLES: &str = "\
 Examples:
-  gsscale-bench tiers scans/city --spill-dir /mnt/nvme/bench --steps 600 --strategy none --view-order groups:25
-  gsscale-bench tiers scans/city --spill-dir /mnt/nvme/bench --steps 600 --shares 10,5 --page-rows 256
+  cargo bench --bench tiers -- scans/city --spill-dir /mnt/nvme/bench --steps 600 --strategy none --view-order groups:25
+  cargo bench --bench tiers -- scans/city --spill-dir /mnt/nvme/bench --steps 600 --shares 10,5 --page-rows 256
 
 share_misses of the pages were not in memory when a step asked, of these share_absent not even on their way; where the
 pages of two steps in a row do not fit into the frames together, share_absent_least cannot be helped.
@@ -49,13 +56,10 @@ const ORDER_BYTES: u64 = 256 << 20;
 
 /// Trains a scene in memory and with frames for shares of it, in turns, and prints a line of JSON for each.
 #[derive(Parser)]
-#[command(name = "gsscale-bench tiers", bin_name = "gsscale-bench tiers", version, after_help = EXAMPLES)]
+#[command(name = "tiers", bin_name = "cargo bench --bench tiers --", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     scene: PathBuf,
-    /// Config file; flags override it
-    #[arg(long)]
-    config: Option<PathBuf>,
     /// Frames, in percent of the pages of the start
     #[arg(long, value_delimiter = ',', default_value = "50,25,10", value_name = "P")]
     shares: Vec<f64>,
@@ -85,17 +89,16 @@ struct Contender {
     last_loss: f64,
 }
 
+fn main() -> ExitCode {
+    run_with_arguments("tiers", |arguments, print| start(&parse_arguments(arguments), print))
+}
+
 /// Measures.
 ///
 /// # Errors
 /// Bad input, or a step that fails.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
-    let mut config = super::settle(args.config.as_deref(), &args.keys)?;
-    super::refuse_devices(&config)?;
-    if config.residence().spill_dir().is_none() {
-        let remedy = "name a folder on the drive to measure";
-        return Err(InputError::new("--spill-dir", "there is no drive to measure", remedy).into());
-    }
+    let mut config = config_with_drive(&args.keys)?;
     if let Some(share) = args.shares.iter().find(|s| !(**s > 0.0 && **s <= 100.0)) {
         let problem = format!("{share} is no share");
         return Err(InputError::new("--shares", problem, "write for example 50,25,10").into());
@@ -116,12 +119,12 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         contenders.push(contender(&prepared, &config, Some(share), frames(share))?);
     }
     let warm_up = args.warm_up.unwrap_or(dataset.train_views().len() as u32).min(config.steps / 2);
-    super::decode_all(dataset, &targets, &config)?;
+    decode_all(dataset, &targets, &config)?;
     // Without it nothing is predicted; what is measured stands.
     let rate = DriveRate::look(Path::new(&config.spill_dir)).ok();
-    take_turns(&mut contenders, (0..warm_up, args.turn), dataset, &targets, false)?;
+    in_turns(&mut contenders, 0..warm_up, args.turn, |c| c.step(dataset, &targets, false))?;
     contenders.iter_mut().for_each(Contender::begin);
-    take_turns(&mut contenders, (warm_up..config.steps, args.turn), dataset, &targets, true)?;
+    in_turns(&mut contenders, warm_up..config.steps, args.turn, |c| c.step(dataset, &targets, true))?;
     let facts = json!({
         "scene": args.scene, "page_rows": config.page_rows, "pages": pages, "gaussians": contenders[0].trainer.scene.rows(),
         "view_order": contenders[0].trainer.view_order().order().to_string(), "steps": config.steps - warm_up,
@@ -194,26 +197,6 @@ fn contender(
         rows_pinned: 0,
         last_loss: 0.0,
     })
-}
-
-fn take_turns(
-    contenders: &mut [Contender],
-    (steps, turn): (Range<u32>, u32),
-    dataset: &Dataset,
-    targets: &TargetCache,
-    measures: bool,
-) -> Result<(), TrainError> {
-    let mut first = steps.start;
-    while first < steps.end {
-        let end = first.saturating_add(turn).min(steps.end);
-        for contender in &mut *contenders {
-            for _ in first..end {
-                contender.step(dataset, targets, measures)?;
-            }
-        }
-        first = end;
-    }
-    Ok(())
 }
 
 impl Contender {
