@@ -1,9 +1,8 @@
-//! Things with numbers that stay theirs until they are taken out; then the numbers are used again.
+//! Values with stable indices; the index of a removed value is used again.
 //!
-//! Invariant: a number is valid from `insert` to `remove`. Using one outside of that is a mistake of the program and
-//! panics.
+//! Invariant: an index is valid from `insert` to `remove`. Using it at another time is a bug and panics.
 
-/// Numbered things.
+/// Values with stable indices.
 #[derive(Debug)]
 pub struct Slab<T> {
     things: Vec<Option<T>>,
@@ -17,7 +16,7 @@ impl<T> Default for Slab<T> {
 }
 
 impl<T> Slab<T> {
-    /// Puts a thing in; returns its number.
+    /// Inserts a value; returns its index.
     pub fn insert(&mut self, thing: T) -> usize {
         if let Some(id) = self.free.pop() {
             self.things[id] = Some(thing);
@@ -27,26 +26,26 @@ impl<T> Slab<T> {
         self.things.len() - 1
     }
 
-    /// The thing of that number.
+    /// The value at an index.
     pub fn get(&self, id: usize) -> &T {
         let Some(thing) = &self.things[id] else { unreachable!("number {id} is not in use") };
         thing
     }
 
-    /// The thing of that number.
+    /// The value at an index.
     pub fn get_mut(&mut self, id: usize) -> &mut T {
         let Some(thing) = &mut self.things[id] else { unreachable!("number {id} is not in use") };
         thing
     }
 
-    /// Takes a thing out.
+    /// Removes a value and returns it.
     pub fn remove(&mut self, id: usize) -> T {
         let Some(thing) = self.things[id].take() else { unreachable!("number {id} is not in use") };
         self.free.push(id);
         thing
     }
 
-    /// How many things are in.
+    /// Number of values.
     pub fn len(&self) -> usize {
         self.things.len() - self.free.len()
     }
@@ -57,7 +56,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_stay_and_are_used_again() {
+    fn indices_are_stable_and_used_again() {
         let mut slab = Slab::default();
         let (a, b) = (slab.insert("a"), slab.insert("b"));
         assert_eq!((*slab.get(a), slab.remove(b), slab.len()), ("a", "b", 1));

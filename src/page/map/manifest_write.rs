@@ -1,4 +1,4 @@
-//! Writing a transaction of the page map, and keeping its counts: every entry that goes in or out is in the sums.
+//! Writes a transaction of the page map, and keeps the counters: every entry added or removed changes the sums.
 
 use crate::page::format::encoding;
 use crate::page::format::seal::SealScope;
@@ -8,14 +8,14 @@ use crate::page::map::manifest::{
 };
 use redb::Table;
 
-/// Writes one batch and keeps the counts.
+/// Writes one batch and keeps the counters.
 pub(in crate::page) struct Writer {
     pub(in crate::page) store: u128,
     pub(in crate::page) counters: Counters,
 }
 
 impl Writer {
-    /// Everything of `batch`, into the tables of `transaction`.
+    /// Writes all of `batch` into the tables of `transaction`.
     pub(in crate::page) fn write(
         &mut self,
         transaction: &redb::WriteTransaction,
