@@ -343,7 +343,7 @@ fn hostile_files_are_refused_with_place_and_remedy() {
         (with_header("property float f_rest_44", "property float other"), "44 f_rest"),
         (with_header("property float f_rest_44", "property float f_rest_45"), "'f_rest_44'"),
         (with_header("property float rot_3", "property list uchar float rot_3"), "is a list"),
-        (with_header("property float rot_3", "property list float float rot_3"), "counted by fractions"),
+        (with_header("property float rot_3", "property list float float rot_3"), "is a floating-point type"),
         (with_header("property float rot_3", "property quad rot_3"), "unknown type"),
         (with_header("property float rot_3", "nonsense"), "unknown keyword"),
         (with_header("comment frame local", "comment frame sideways"), "frame sideways"),
@@ -372,7 +372,7 @@ fn broken_rows_are_named_by_line_or_byte() {
     assert!(error_of(&cut).contains("line 9: the file ends before the last row"));
     let listed = "list uchar int l,float x,float y,float z";
     let error = error_of(&ascii_points(listed, &["4000000000 1 2 3"]));
-    assert!(error.contains("list 'l' does not hold"), "{error}");
+    assert!(error.contains("list 'l' does not have as many"), "{error}");
 
     let binary = |count: &str, list: &[u8]| {
         let head = "ply\nformat binary_little_endian 1.0\nelement face 1\n";

@@ -1,8 +1,8 @@
-//! Recording of work: uploads, dispatches, copies and read-backs in the order in which they will run.
+//! Records work: uploads, dispatches, copies and read-backs in the order in which they run.
 //!
-//! Invariants: (1) what a dispatch binds is checked here, so that an error names the stage and the variable, and nothing
-//! is submitted after an error; (2) commands run in the order recorded, also across submissions; (3) uploads beyond one
-//! staging set submit what is recorded so far and go on.
+//! Invariants: (1) bindings of a dispatch are checked here, so that an error names the stage and the variable, and
+//! nothing is submitted after an error; (2) commands run in the order recorded, also across submissions; (3) when
+//! uploads fill a staging set, the commands recorded so far are submitted and recording continues.
 
 use std::sync::atomic::Ordering;
 
@@ -16,8 +16,8 @@ use super::shader::{BindingKind, Pipeline};
 
 /// Workgroups for `count` invocations in workgroups of `workgroup`, folded into two dimensions beyond 65,535.
 ///
-/// The shader finds its place with `linear_group` or `linear_index` of `shared/dispatch.wgsl`, and ignores places at
-/// or beyond its count. Indices stay within 32 bits for counts up to 2^32 - 2^24.
+/// The shader computes its index with `linear_group` or `linear_index` of `shared/dispatch.wgsl`, and ignores indices
+/// at or beyond its count. Indices stay within 32 bits for counts up to 2^32 - 2^24.
 pub fn groups_1d(count: u32, workgroup: u32) -> [u32; 3] {
     let groups = count.div_ceil(workgroup.max(1));
     if groups <= GROUPS_MAX {
@@ -30,11 +30,11 @@ pub fn groups_1d(count: u32, workgroup: u32) -> [u32; 3] {
 /// Bytes of one uniform buffer of the ring.
 const UNIFORM_CHUNK: u64 = 64 << 10;
 
-/// Bytes of a buffer that fills the device on purpose, and most of them: a tebibyte.
+/// Bytes of a buffer for an injected memory fault, and most such buffers: a tebibyte in total.
 const FILL_BYTES: u64 = 128 << 20;
 const FILL_BUFFERS: usize = 8192;
 
-/// Uniform buffers that every submission fills anew.
+/// Uniform buffers, refilled by every submission.
 #[derive(Debug)]
 pub(super) struct UniformRing {
     chunks: Vec<wgpu::Buffer>,
@@ -66,7 +66,7 @@ pub struct Submission {
     name: &'static str,
 }
 
-/// Work being recorded.
+/// A recording of work.
 pub struct Recorder<'g> {
     gpu: &'g Gpu,
     name: &'static str,
@@ -83,7 +83,7 @@ impl Drop for Recorder<'_> {
 }
 
 impl Gpu {
-    /// Begins to record; `name` appears in errors that no stage can be blamed for.
+    /// Starts a recording; `name` appears in errors that belong to no stage.
     pub fn begin(&self, name: &'static str) -> Recorder<'_> {
         self.recorders.fetch_add(1, Ordering::Relaxed);
         Recorder {
@@ -96,7 +96,7 @@ impl Gpu {
         }
     }
 
-    /// Submits; does not wait, unless [`super::GpuOptions::serial`] asks for it.
+    /// Submits without waiting, unless [`super::GpuOptions::serial`] is set.
     ///
     /// # Errors
     /// The API refused the commands, the device was lost or ran out of memory, or two recorders were open at once.
@@ -131,7 +131,7 @@ fn new_encoder(device: &wgpu::Device, name: &'static str) -> wgpu::CommandEncode
 }
 
 impl Recorder<'_> {
-    /// A uniform struct for dispatches of this recorder: what binding 0 expects.
+    /// Uploads a uniform struct for dispatches of this recorder; binds as binding 0.
     ///
     /// # Errors
     /// The device has no memory left.
@@ -158,7 +158,7 @@ impl Recorder<'_> {
         Ok(BufferView { raw, label: "uniforms", offset, size })
     }
 
-    /// A fresh buffer holding `data`.
+    /// A new buffer containing `data`.
     ///
     /// # Errors
     /// As [`Gpu::buffer`] and [`Recorder::upload`].
@@ -168,7 +168,7 @@ impl Recorder<'_> {
         Ok(buffer)
     }
 
-    /// A fresh buffer of zeros.
+    /// A new zeroed buffer.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
@@ -178,7 +178,7 @@ impl Recorder<'_> {
         Ok(buffer)
     }
 
-    /// Uploads `data` to the beginning of `view`; the last word is filled up with zero bytes.
+    /// Uploads `data` to the start of `view`; the last word is padded with zero bytes.
     ///
     /// # Errors
     /// The data is longer than the view, or the device failed.
@@ -216,10 +216,10 @@ impl Recorder<'_> {
         Ok(())
     }
 
-    /// Zeros `view`.
+    /// Zeroes `view`.
     ///
     /// # Errors
-    /// The view does not lie on multiples of 4 bytes.
+    /// The view is not aligned to 4 bytes.
     pub fn clear(&mut self, view: &BufferView) -> GpuResult<()> {
         self.check_copy("clear", view, view.size)?;
         self.pass = None;
@@ -228,10 +228,10 @@ impl Recorder<'_> {
         Ok(())
     }
 
-    /// Copies `from` to the beginning of `to`, which is another buffer.
+    /// Copies `from` to the start of `to`, which is another buffer.
     ///
     /// # Errors
-    /// `to` is shorter, both lie in one buffer, or one does not lie on multiples of 4 bytes.
+    /// `to` is shorter, both are in one buffer, or one is not aligned to 4 bytes.
     pub fn copy(&mut self, from: &BufferView, to: &BufferView) -> GpuResult<()> {
         self.check_copy("copy", from, from.size)?;
         self.check_copy("copy", to, from.size)?;
@@ -245,10 +245,10 @@ impl Recorder<'_> {
         Ok(())
     }
 
-    /// Records that `view`, as it is at this point, be read back.
+    /// Records the read-back of `view` as it is at this point.
     ///
     /// # Errors
-    /// The view does not lie on multiples of 4 bytes, or there is no memory for staging.
+    /// The view is not aligned to 4 bytes, or there is no memory for staging.
     pub fn read_back(&mut self, stage: &'static str, view: &BufferView) -> GpuResult<Readback> {
         self.check_copy("read_back", view, view.size)?;
         self.pass = None;
@@ -258,10 +258,11 @@ impl Recorder<'_> {
         Ok(readback)
     }
 
-    /// Runs a stage: `views` in the order of the binding numbers that its entry point uses. Zero groups do nothing.
+    /// Dispatches a stage; `views` are in the order of the binding numbers that its entry point uses. Zero groups do
+    /// nothing.
     ///
     /// # Errors
-    /// A view does not fit its binding; the message names the stage and the variable.
+    /// A view does not match its binding; the message names the stage and the variable.
     pub fn dispatch(
         &mut self,
         stage: &'static str,
@@ -280,7 +281,7 @@ impl Recorder<'_> {
         self.gpu.faults.check()
     }
 
-    /// Runs a stage with the three workgroup counts that `groups` holds on the device.
+    /// Dispatches a stage; `groups` holds the three workgroup counts on the device.
     ///
     /// # Errors
     /// As [`Recorder::dispatch`].
@@ -330,7 +331,7 @@ impl Recorder<'_> {
         let pass = match reusable {
             Some((pass, _)) => pass,
             None => {
-                self.pass = None; // ends the pass of the stage before
+                self.pass = None; // ends the previous stage's pass
                 profiler.begin_pass(&mut self.encoder, stage)
             }
         };
@@ -379,21 +380,21 @@ impl Recorder<'_> {
         Ok(())
     }
 
-    /// Whether `size` bytes fit at the beginning of `view`, on multiples of 4.
+    /// Checks that `size` bytes fit at the start of `view`, aligned to 4.
     fn check_copy(&self, what: &str, view: &BufferView, size: u64) -> GpuResult<()> {
         let problem = if !view.is_inside() {
             format!("{what}: a range beyond the end of {}", view.label)
         } else if size > view.size {
             format!("{what}: {size} bytes do not fit the {} of {}", view.size, view.label)
         } else if !view.offset.is_multiple_of(4) || !size.is_multiple_of(4) {
-            format!("{what}: {size} bytes at {} of {} are not whole words", view.offset, view.label)
+            format!("{what}: {size} bytes at {} of {} are not aligned to 4 bytes", view.offset, view.label)
         } else {
             return Ok(());
         };
         Err(GpuError::Bindings { stage: self.name.into(), problem })
     }
 
-    /// Lets the fault happen that is planned for this submission, if one is.
+    /// Injects the fault planned for this submission, if any.
     fn strike(&mut self) {
         match self.gpu.injector.next() {
             None => {}
@@ -403,13 +404,13 @@ impl Recorder<'_> {
                 self.encoder.clear_buffer(&raw, 0, Some(2 * UNIFORM_CHUNK)); // beyond its end
             }
             Some(FaultKind::OutOfMemory) => {
-                self.gpu.faults.report(&wgpu::Error::OutOfMemory { source: "a fault on purpose".into() });
+                self.gpu.faults.report(&wgpu::Error::OutOfMemory { source: "injected fault".into() });
             }
             Some(FaultKind::Full) => self.fill_device(),
         }
     }
 
-    /// Asks for memory until the driver refuses, as another program may do, and gives it back: the refusal stays reported.
+    /// Allocates memory until the driver refuses, then frees it; the refusal stays reported.
     fn fill_device(&self) {
         let mut taken = Vec::new();
         while !self.gpu.faults.is_reported() && taken.len() < FILL_BUFFERS {
@@ -422,7 +423,7 @@ impl Recorder<'_> {
         }
     }
 
-    /// Submits what is recorded so far and goes on with an empty encoder.
+    /// Submits the commands recorded so far and continues with an empty encoder.
     fn flush(&mut self) -> GpuResult<Submission> {
         let gpu = self.gpu;
         self.pass = None;
@@ -449,7 +450,7 @@ impl Recorder<'_> {
         for pending in self.readbacks.drain(..) {
             pending.start(&index);
         }
-        // Without a poll the loss of the device would go unnoticed: a submission to it is silently dropped.
+        // Without a poll a lost device would go unnoticed, because submissions to it are silently dropped.
         let polled = gpu.device.poll(wgpu::PollType::Poll);
         gpu.faults.check()?;
         polled.map_err(|e| GpuError::Validation { stage: self.name.into(), message: e.to_string() })?;
