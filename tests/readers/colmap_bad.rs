@@ -100,7 +100,7 @@ fn cameras_that_contradict_are_refused() {
     refused_in_both(&m, "images", &["image 'a b.jpg'", "camera 99"]);
     let mut m = model(1);
     m.cameras[1].id = 1;
-    refused_in_both(&m, "cameras", &["camera 1", "before"]);
+    refused_in_both(&m, "cameras", &["camera 1", "second definition"]);
 }
 
 #[test]

@@ -95,7 +95,7 @@ fn a_broken_model_beside_a_good_one_is_passed_over() {
     fs::write(broken.join("images.bin"), (1u64 << 60).to_le_bytes()).unwrap();
     let found = read(scene.path());
     assert_eq!(found.views.len(), 4);
-    warned(&found, &["sparse/0", "passed over", "1152921504606846976 images"]);
+    warned(&found, &["sparse/0", "is skipped", "1152921504606846976 images"]);
 }
 
 #[test]

@@ -211,5 +211,5 @@ fn a_ply_that_is_not_there_is_a_warning() {
     top["ply_file_path"] = "points.ply".into();
     let found = read(scene(top, vec![frame("a.png")]).path());
     assert_eq!(found.points_path, None);
-    warned(&found, &["points.ply", "not there"]);
+    warned(&found, &["points.ply", "does not exist"]);
 }

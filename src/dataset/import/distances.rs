@@ -1,9 +1,9 @@
-//! Distances to the nearest neighbours in a cloud that does not fit in memory: block by block, and across blocks where
-//! a block's box is near enough to matter.
+//! Distances to the nearest neighbours in a cloud larger than memory: block by block, and across blocks whose boxes are
+//! near enough.
 //!
 //! Invariant: the distances are those of [`crate::scene::neighbours::nearest_dist2`] over the whole cloud, bit for bit,
-//! whatever fits in memory: a neighbour in another block is nearer than the third of the own block only if that
-//! block's box is.
+//! for any memory budget: a neighbour in another block can be nearer than the third nearest in the own block only if
+//! that block's box is.
 
 use super::divide::Division;
 use super::spool::{Spool, SpoolSpace, SpoolWriter};
@@ -15,23 +15,23 @@ use crate::scene::partition::Pages;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Bytes that a point takes while its block is searched: record, position, tree, distances.
+/// Bytes per point while its block is searched: record, position, tree, distances.
 const SEARCH_BYTES: usize = 96;
 
-/// A question to another block.
+/// A query to another block.
 #[derive(Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C)]
 struct Question {
     point: [f32; 3],
-    /// Only what is nearer than this matters.
+    /// Only points nearer than this matter.
     limit: f32,
-    /// Place of the asking point in the sorted cloud.
+    /// Index of the querying point in the sorted cloud.
     at: u32,
-    /// Whom it asks.
+    /// The block to query.
     block: u32,
 }
 
-/// What another block knew.
+/// The result of a query to another block.
 #[derive(Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C)]
 struct Answer {
@@ -39,13 +39,13 @@ struct Answer {
     dist2: [f32; NEIGHBOURS],
 }
 
-/// The cloud in spatial order, and for each point the root mean square distance of its neighbours.
+/// The cloud in spatial order, and for each point the root mean square distance to its neighbours.
 pub(super) struct Measured {
     pub points: Spool<CloudPoint>,
     pub distances: Spool<f64>,
 }
 
-/// The search over one cloud.
+/// The search in one cloud.
 struct Search<'a> {
     space: SpoolSpace<'a>,
     blocks: Vec<Range<usize>>,
@@ -87,7 +87,7 @@ impl Search<'_> {
         Ok(bounds)
     }
 
-    /// The questions of all points whose third neighbour is farther than another block's box.
+    /// The queries of all points whose third neighbour is farther than another block's box.
     fn ask(&self, bounds: &[Bounds]) -> InputResult<Spool<Question>> {
         let mut questions = SpoolWriter::new(self.space);
         for (from, block) in self.blocks.iter().enumerate() {
@@ -112,7 +112,7 @@ impl Search<'_> {
         }
         for (number, block) in self.blocks.iter().enumerate() {
             let tree = NeighbourTree::new(&self.positions(block)?);
-            // As many questions at a time as there are points: they are smaller than what a point takes.
+            // A batch has as many queries as a block has points: a query is smaller than a point's memory.
             let mut batch = Vec::new();
             let mut reply = |batch: &mut Vec<Question>| {
                 let known = batch.par_iter().map(|q| Answer { at: q.at, dist2: tree.nearer(q.point, q.limit) });
