@@ -127,7 +127,7 @@ fn an_export_is_the_trainers_file_byte_for_byte_and_can_be_a_part_of_it() {
 
     let said = failed(&["export", text(&out), "--out", text(&file), "--crop", "1e8,1e8,1e8,2e8,2e8,2e8"]);
     assert!(said.contains("no Gaussian lies in this box"), "{said}");
-    assert!(failed(&["export", text(&out), "--out", text(&file), "--crop", "1,2,3"]).contains("is no box"));
+    assert!(failed(&["export", text(&out), "--out", text(&file), "--crop", "1,2,3"]).contains("is not a box"));
     let said = failed(&["export", text(&out), "--out", text(&bench.path("no/folder.ply"))]);
     assert!(said.contains("no/folder.ply"), "{said}");
 }
@@ -146,7 +146,7 @@ fn a_run_that_was_rolled_back_or_cloned_ends_with_the_same_bytes() {
     assert_eq!(json(&["rollback", text(&out), &a.to_string(), "--yes"])["dropped"][0].as_u64(), Some(b));
     let now = json(&["ls", text(&out)]);
     assert_eq!((generations(&now), &now["generations"][0]["step"]), (vec![a], &listed["generations"][0]["step"]));
-    assert!(ckpt(&["rollback", text(&out), &a.to_string()]).contains("the last one already"));
+    assert!(ckpt(&["rollback", text(&out), &a.to_string()]).contains("already the latest"));
     assert!(json(&["verify", text(&out), "--deep"])["faults"].as_array().unwrap().is_empty());
 
     // The copy has both generations, under their numbers, in slots that are its own.
@@ -218,7 +218,7 @@ fn a_store_in_use_is_not_written_and_what_only_looks_says_so() {
     let busy = json(&["ls", text(&out)]);
     assert!(busy["used_by"].as_str().unwrap().contains(&format!("process {}", child.id())), "{busy}");
     assert!(ckpt(&["ls", text(&out)]).contains("in use"));
-    assert!(ckpt(&["inspect", text(&out)]).contains("as of its last commit"));
+    assert!(ckpt(&["inspect", text(&out)]).contains("that of the last commit"));
     let generation = generations(&busy)[0].to_string();
     let (file, to) = (bench.path("x.ply"), bench.path("copy"));
     for command in [

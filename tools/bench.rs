@@ -1,5 +1,5 @@
-//! `gsscale-bench`: measures training and prints lines of JSON. Which measurement is the first argument; without one of
-//! their names it is `run`. Parses, calls, prints.
+//! `gsscale-bench`: measures training and prints lines of JSON. The first argument names the measurement; without a
+//! name it is `run`. Parses, calls, prints.
 
 #[path = "bench/bounded.rs"]
 mod bounded;
@@ -56,7 +56,8 @@ fn main() -> ExitCode {
     let mut named = |known: &str| {
         let is = name.as_deref() == Some(known);
         if is {
-            // What is left is parsed as a program of its own, whose usage line names the measurement.
+            // The remaining arguments are parsed as those of a program of its own, whose usage line names the
+            // measurement.
             arguments.remove(1);
         }
         is
@@ -97,7 +98,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// The config of a measurement, checked, with its worker threads started.
+/// The checked config of a measurement; starts its worker threads.
 fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, TrainError> {
     let mut config = file.map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
     keys.clone().apply(&mut config);
@@ -107,13 +108,13 @@ fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, Tra
         return Err(InputError::new("--simd", problem, "use --simd auto").into());
     }
     if config.threads > 0 {
-        // Fails only where the pool exists already, which it does not at the start of main.
+        // Fails only if the pool exists already, which it does not at the start of main.
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
     }
     Ok(config)
 }
 
-/// Refuses a device other than the CPU: this measurement is of the CPU path.
+/// Refuses devices other than the CPU: the measurement covers the CPU path.
 fn refuse_devices(config: &TrainConfig) -> Result<(), TrainError> {
     match config.device.as_str() {
         "auto" | "cpu" => Ok(()),
@@ -124,7 +125,7 @@ fn refuse_devices(config: &TrainConfig) -> Result<(), TrainError> {
     }
 }
 
-/// As [`refuse_devices`], and refuses a drive: this measurement is of a run in memory.
+/// As [`refuse_devices`]; also refuses a drive: the measurement covers a run in memory.
 fn refuse_tiers(config: &TrainConfig) -> Result<(), TrainError> {
     refuse_devices(config)?;
     let given = [
@@ -141,8 +142,8 @@ fn refuse_tiers(config: &TrainConfig) -> Result<(), TrainError> {
     }
 }
 
-/// Decodes every photo, so that no contender of a comparison does it for the others; where the cache does not hold all of
-/// them, all decode alike as they go.
+/// Decodes every photo first, so that no contender of a comparison decodes for the others; if the cache is too small
+/// for all photos, all contenders decode equally.
 fn decode_all(dataset: &Dataset, targets: &TargetCache, config: &TrainConfig) -> Result<(), TrainError> {
     if TargetCache::bytes_to_keep_all(&dataset.views, rayon::current_num_threads()) > config.image_cache.0 {
         return Ok(());

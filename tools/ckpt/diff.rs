@@ -1,4 +1,4 @@
-//! `gsscale-ckpt diff`: what changed between two generations.
+//! `gsscale-ckpt diff`: compares two generations.
 
 use gsscale::base::units::format_bytes;
 use gsscale::train::error::TrainError;
@@ -11,7 +11,7 @@ Examples:
   gsscale-ckpt diff runs/village 41 47
   gsscale-ckpt diff runs/village before-resets 47 --names --json
 
-A page that was split is removed, its halves are added. Works while the run trains.";
+A page that was split counts as removed, its halves as added. Works while the run trains.";
 
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
@@ -21,10 +21,10 @@ pub struct Args {
     /// Number or name of the first generation
     #[arg(value_name = "A")]
     from: String,
-    /// Number or name of the other one
+    /// Number or name of the second generation
     #[arg(value_name = "B")]
     to: String,
-    /// List the pages
+    /// List the pages that differ
     #[arg(long)]
     names: bool,
     /// Print JSON
