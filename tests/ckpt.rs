@@ -26,7 +26,7 @@ fn generations(listed: &Value) -> Vec<u64> {
 }
 
 #[test]
-fn looking_at_a_store_says_what_the_run_left_and_changes_nothing() {
+fn inspecting_a_store_reports_what_the_run_left_and_changes_nothing() {
     let bench = Bench::new();
     let out = bench.stopped(&[]);
     let before = bench.store_files();
@@ -212,7 +212,7 @@ fn names_keep_generations_until_they_are_pruned() {
 }
 
 #[test]
-fn a_store_in_use_is_not_written_and_what_only_looks_says_so() {
+fn a_store_in_use_is_never_written_and_readers_report_the_use() {
     let bench = Bench::new();
     let (out, mut child) = bench.running(&["--steps", "20000", "--commit-every", "0.02"]);
     let busy = json(&["ls", text(&out)]);
@@ -340,7 +340,7 @@ fn flipped_bits_in_pages_are_named_and_older_versions_take_their_place() {
 
 /// Older versions have other statistics than the run has counted, and rounds ahead that its newer ones had behind them.
 #[test]
-fn a_run_goes_on_from_many_older_pages() {
+fn a_run_resumes_from_many_older_pages() {
     // With rounds between the generations that grow much, and with statistics that no round cleared.
     for (every, grow) in [("10", "0.0001"), ("150", "0.001")] {
         goes_on_from_older_pages(&["--refine-stop", "200", "--refine-every", every, "--grow-grad2d", grow]);
@@ -611,7 +611,7 @@ fn gaussians_that_do_not_fit_are_refused_by_the_header_or_go_into_pages() {
 }
 
 #[test]
-fn gaussians_go_into_a_store_and_out_again_within_the_budget() {
+fn gaussians_round_trip_through_a_store_within_the_budget() {
     let rows = std::env::var("GSSCALE_CKPT_GAUSSIANS").ok().map_or(40_000, |n| n.parse().unwrap());
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);

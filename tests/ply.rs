@@ -63,7 +63,7 @@ fn header_of(bytes: &[u8]) -> (String, &[u8]) {
 }
 
 #[test]
-fn the_local_frame_comes_back_bit_for_bit() {
+fn the_local_frame_round_trips_bit_for_bit() {
     let folder = tempfile::tempdir().unwrap();
     for sh_degree in 0..=3 {
         // More than one block of rows.
@@ -85,7 +85,7 @@ fn the_local_frame_comes_back_bit_for_bit() {
 }
 
 #[test]
-fn the_dataset_frame_comes_back_within_rounding() {
+fn the_dataset_frame_round_trips_within_rounding() {
     let columns = scene(300, 3);
     let meta = meta(ExportFrame::Dataset);
     let (mut back, back_meta) = gaussians(parse(&written(&columns, &meta)).unwrap());
@@ -142,7 +142,7 @@ fn an_offset_too_far_for_f32_stays_local_and_says_so() {
 }
 
 #[test]
-fn properties_stand_in_the_order_of_the_field() {
+fn properties_are_in_the_fields_order() {
     let mut columns = Columns::zeros(1, 2);
     columns.means.copy_from_slice(&[1.0, 2.0, 3.0]);
     columns.sh0.copy_from_slice(&[4.0, 5.0, 6.0]);
@@ -386,7 +386,7 @@ fn broken_rows_are_named_by_line_or_byte() {
 }
 
 #[test]
-fn no_byte_soup_panics() {
+fn random_bytes_never_panic() {
     let columns = scene(3, 1);
     let samples = [
         written(&columns, &meta(ExportFrame::Dataset)),

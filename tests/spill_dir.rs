@@ -82,7 +82,7 @@ fn a_clean_end_leaves_nothing_behind() {
 }
 
 #[test]
-fn removing_leaves_what_is_not_ours() {
+fn removal_keeps_foreign_files() {
     let parent = tempfile::tempdir().unwrap();
     let folder = parent.path().join("spill");
     let outside = parent.path().join("outside");
@@ -104,7 +104,7 @@ fn removing_leaves_what_is_not_ours() {
 
 /// Somebody removed the folder while it was in use, and another run made its own there.
 #[test]
-fn a_store_that_took_the_place_of_ours_is_not_removed() {
+fn a_store_that_replaced_ours_is_not_removed() {
     let parent = tempfile::tempdir().unwrap();
     let folder = parent.path().join("spill");
     let ours = create(&folder).unwrap();
@@ -225,7 +225,7 @@ fn folders_of_or_open_to_others_are_refused() {
 }
 
 #[test]
-fn memory_is_warned_of() {
+fn a_spill_directory_in_memory_is_warned_about() {
     let memory = Path::new("/dev/shm");
     let mounts = std::fs::read_to_string("/proc/mounts").unwrap_or_default();
     if !mounts.contains(" /dev/shm tmpfs ") {
@@ -341,7 +341,7 @@ fn two_processes_never_share_a_directory() {
 }
 
 #[test]
-fn of_many_that_race_one_wins() {
+fn of_many_racing_processes_one_wins() {
     let parent = tempfile::tempdir().unwrap();
     for round in 0..4 {
         let folder = parent.path().join(format!("spill{round}"));

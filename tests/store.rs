@@ -146,7 +146,7 @@ fn assert_damaged(store: &mut PagedStore, page: u64, slot: &SlotRef, why: &str) 
 }
 
 #[test]
-fn pages_come_back_to_the_bit() {
+fn pages_round_trip_bit_for_bit() {
     for codec in CODECS {
         let mut store = PagedStore::new(Box::new(MemoryEngine::new()), config(codec));
         let mut kept = Vec::new();
@@ -207,7 +207,7 @@ fn every_flipped_bit_is_found_and_named() {
 }
 
 #[test]
-fn what_another_read_mends_is_not_an_error() {
+fn a_fault_that_a_second_read_mends_is_not_an_error() {
     let faults = [Fault::FlipBit(40_000), Fault::Error(io::ErrorKind::Other), Fault::Short, Fault::Torn, Fault::Lost];
     for (fault, codec) in faults.iter().flat_map(|fault| CODECS.map(|codec| (*fault, codec))) {
         let (mut store, faults, _) = faulty(codec);

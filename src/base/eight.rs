@@ -139,7 +139,7 @@ impl Eight {
     /// Lanes of `b` where those of `mask` are all ones, lanes of `self` elsewhere.
     #[inline(always)]
     #[must_use]
-    pub fn but(self, mask: Eight, b: Eight) -> Eight {
+    pub fn blend(self, mask: Eight, b: Eight) -> Eight {
         // SAFETY: AVX is available: only an `Avx2` makes values.
         Eight(unsafe { _mm256_blendv_ps(self.0, b.0, mask.0) })
     }
@@ -147,7 +147,7 @@ impl Eight {
     /// Lanes 0 to 2 of `b`, 3 to 7 of `self`.
     #[inline(always)]
     #[must_use]
-    pub fn but_first_three(self, b: Eight) -> Eight {
+    pub fn blend_first_three(self, b: Eight) -> Eight {
         // SAFETY: AVX is available: only an `Avx2` makes values.
         Eight(unsafe { _mm256_blend_ps::<0b111>(self.0, b.0) })
     }

@@ -15,7 +15,7 @@ pub const PNG_BUFFERS: u64 = 2 << 20;
 
 /// Whether a chunk affects the pixels: critical chunks (upper case, PNG specification, section 5.4) and tRNS. A decoder
 /// refuses unknown critical chunks, and all known ones have bounded length.
-pub fn makes_pixels(kind: [u8; 4]) -> bool {
+pub fn affects_pixels(kind: [u8; 4]) -> bool {
     kind[0].is_ascii_uppercase() || &kind == b"tRNS"
 }
 
@@ -51,7 +51,7 @@ impl<R: BufRead> PixelChunks<R> {
             }
             let [a, b, c, d, kind @ ..] = self.head;
             let length = u64::from(u32::from_be_bytes([a, b, c, d])) + 4;
-            if makes_pixels(kind) {
+            if affects_pixels(kind) {
                 self.left = length;
             } else {
                 self.passed = self.filled;

@@ -145,7 +145,7 @@ pub fn load_dataset_with_cloud<'c>(
     let mut dropped = BTreeMap::new();
     cloud.for_each(|position, _| {
         if !extent.is_plausible(position) {
-            *dropped.entry(why_dropped(position)).or_default() += 1;
+            *dropped.entry(drop_reason(position)).or_default() += 1;
         }
         Ok(())
     })?;
@@ -477,14 +477,14 @@ fn local_points(
             points.push(frame.to_local(position).as_vec3().to_array());
             kept_colors.push(color);
         } else {
-            *dropped.entry(why_dropped(position)).or_default() += 1;
+            *dropped.entry(drop_reason(position)).or_default() += 1;
         }
     }
     warn_about_dropped(dropped, warnings);
     (points, kept_colors)
 }
 
-fn why_dropped(position: DVec3) -> &'static str {
+fn drop_reason(position: DVec3) -> &'static str {
     if position.is_finite() { "are more than a million scene sizes away" } else { "are not finite" }
 }
 

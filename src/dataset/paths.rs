@@ -51,7 +51,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_that_stay_inside_pass() {
+    fn names_inside_the_folder_are_accepted() {
         for (given, clean) in [
             ("a.jpg", "a.jpg"),
             ("./images/a b.jpg", "images/a b.jpg"),

@@ -121,7 +121,7 @@ impl Pool {
             Some(raw) => raw,
             None => {
                 self.make_room(&mut state, label, class)?;
-                faults.doing(label);
+                faults.set_stage(label);
                 let raw = device.create_buffer(&wgpu::BufferDescriptor {
                     label: Some(label),
                     size: class,

@@ -134,7 +134,7 @@ struct FaultState {
 
 impl Faults {
     /// Names the stage that the following calls belong to.
-    pub(super) fn doing(&self, what: &str) {
+    pub(super) fn set_stage(&self, what: &str) {
         let mut state = lock(&self.state);
         state.doing.clear();
         state.doing.push_str(what);

@@ -137,7 +137,7 @@ impl Readback {
         if self.state.load(Ordering::Acquire) == RECORDED {
             return Err(self.failed("read before its commands were submitted"));
         }
-        gpu.faults.doing(self.stage);
+        gpu.faults.set_stage(self.stage);
         while self.state.load(Ordering::Acquire) == MAPPING {
             // Waits for this read-back's own submission only: the device may work on later ones meanwhile.
             let submission_index = self.submission.get().cloned();

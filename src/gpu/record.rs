@@ -117,7 +117,7 @@ impl Gpu {
     /// # Errors
     /// The device was lost or ran out of memory.
     pub fn wait(&self, submission: &Submission) -> GpuResult<()> {
-        self.faults.doing(submission.name);
+        self.faults.set_stage(submission.name);
         let index = Some(submission.index.clone());
         let waited = self.device.poll(wgpu::PollType::Wait { submission_index: index, timeout: None });
         self.faults.check()?;
@@ -200,7 +200,7 @@ impl Recorder<'_> {
 
     fn upload_words(&mut self, view: &BufferView, mut at: u64, mut bytes: &[u8]) -> GpuResult<()> {
         self.pass = None;
-        self.gpu.faults.doing(view.label);
+        self.gpu.faults.set_stage(view.label);
         self.gpu.uploaded.fetch_add(bytes.len() as u64, Ordering::Relaxed);
         while !bytes.is_empty() {
             let mut belt = lock(&self.gpu.belt);
@@ -223,7 +223,7 @@ impl Recorder<'_> {
     pub fn clear(&mut self, view: &BufferView) -> GpuResult<()> {
         self.check_copy("clear", view, view.size)?;
         self.pass = None;
-        self.gpu.faults.doing(view.label);
+        self.gpu.faults.set_stage(view.label);
         self.encoder.clear_buffer(&view.raw, view.offset, Some(view.size));
         Ok(())
     }
@@ -240,7 +240,7 @@ impl Recorder<'_> {
             return Err(GpuError::Bindings { stage: self.name.into(), problem });
         }
         self.pass = None;
-        self.gpu.faults.doing(to.label);
+        self.gpu.faults.set_stage(to.label);
         self.encoder.copy_buffer_to_buffer(&from.raw, from.offset, &to.raw, to.offset, from.size);
         Ok(())
     }
@@ -252,7 +252,7 @@ impl Recorder<'_> {
     pub fn read_back(&mut self, stage: &'static str, view: &BufferView) -> GpuResult<Readback> {
         self.check_copy("read_back", view, view.size)?;
         self.pass = None;
-        self.gpu.faults.doing(stage);
+        self.gpu.faults.set_stage(stage);
         let (readback, pending) = Readback::record(self.gpu, &mut self.encoder, stage, view)?;
         self.readbacks.push(pending);
         Ok(readback)
@@ -305,7 +305,7 @@ impl Recorder<'_> {
         views: &[BufferView],
     ) -> GpuResult<&mut wgpu::ComputePass<'static>> {
         self.check_bindings(stage, pipeline, views)?;
-        self.gpu.faults.doing(stage);
+        self.gpu.faults.set_stage(stage);
         let entries: Vec<wgpu::BindGroupEntry<'_>> = pipeline
             .reflection
             .bindings
@@ -395,7 +395,7 @@ impl Recorder<'_> {
     }
 
     /// Injects the fault planned for this submission, if any.
-    fn strike(&mut self) {
+    fn inject_fault(&mut self) {
         match self.gpu.injector.next() {
             None => {}
             Some(FaultKind::Lost) => self.gpu.device.destroy(),
@@ -431,8 +431,8 @@ impl Recorder<'_> {
         let stamps = profiler.resolve(gpu, &mut self.encoder)?;
         drop(profiler);
         self.readbacks.extend(stamps);
-        gpu.faults.doing(self.name);
-        self.strike();
+        gpu.faults.set_stage(self.name);
+        self.inject_fault();
         let encoder = std::mem::replace(&mut self.encoder, new_encoder(&gpu.device, self.name));
         let commands = encoder.finish();
         gpu.faults.check()?;

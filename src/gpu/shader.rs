@@ -119,7 +119,7 @@ impl Gpu {
         }
         let reflection = reflect(source.name, &text, entry, self.subgroups())?;
         self.check_workgroup(source.name, &reflection)?;
-        self.faults.doing(source.name);
+        self.faults.set_stage(source.name);
         let entries: Vec<_> = reflection
             .bindings
             .iter()

@@ -230,7 +230,7 @@ impl PointBox {
     pub fn of<E: Placed>(entries: &[E]) -> PointBox {
         if entries.len() >= 8 * SERIAL_BELOW {
             let parts = entries.par_chunks(SERIAL_BELOW).map(PointBox::of);
-            return parts.reduce(|| PointBox::EMPTY, PointBox::and);
+            return parts.reduce(|| PointBox::EMPTY, PointBox::union);
         }
         let mut all = PointBox::EMPTY;
         entries.iter().for_each(|e| all.add(e.point()));
@@ -247,7 +247,7 @@ impl PointBox {
 
     /// The smallest box that contains both.
     #[must_use]
-    pub fn and(mut self, other: PointBox) -> PointBox {
+    pub fn union(mut self, other: PointBox) -> PointBox {
         for i in 0..3 {
             self.lo[i] = self.lo[i].min(other.lo[i]);
             self.hi[i] = self.hi[i].max(other.hi[i]);

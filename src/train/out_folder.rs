@@ -64,7 +64,7 @@ pub fn remedy_of_existing(out: &Path) -> String {
     let spill = Path::new(&config.spill_dir);
     let in_memory = config.spill_dir.is_empty();
     let checkpoint = if in_memory { checkpoint_folder(out) } else { spill.to_path_buf() };
-    if !SpillDir::is_one(&checkpoint) {
+    if !SpillDir::exists_in(&checkpoint) {
         return start_over.to_string();
     }
     let over = match in_memory {

@@ -188,7 +188,7 @@ fn a_missing_scene_model_or_image_folder_is_named() {
 }
 
 #[test]
-fn text_that_is_no_model_is_refused_by_line() {
+fn text_that_is_not_a_model_is_refused_by_line() {
     let m = model(3);
     let cases = [
         ("cameras.txt", m.cameras_txt().replace("640 480", "640 tall"), "line 4", "\"tall\""),

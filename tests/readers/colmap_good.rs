@@ -87,7 +87,7 @@ fn every_place_is_searched_and_the_largest_model_wins() {
 }
 
 #[test]
-fn a_broken_model_beside_a_good_one_is_passed_over() {
+fn a_broken_model_beside_a_good_one_is_skipped() {
     let scene = scene_folder();
     model(2).write_bin(&scene.path().join("sparse/1"));
     let broken = scene.path().join("sparse/0");

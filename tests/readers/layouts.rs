@@ -222,7 +222,7 @@ fn parts_that_are_broken_are_named() {
 }
 
 #[test]
-fn what_a_folder_lacks_is_said_with_the_tree_and_the_source() {
+fn missing_parts_are_reported_with_the_tree_and_the_source() {
     let folder = lookalike(Layout::MegaNerf);
     fs::remove_dir_all(folder.path().join("val/rgbs")).unwrap();
     let fetch = ["https://example.org/data".to_string()];

@@ -162,7 +162,7 @@ fn matrixcity_rotations_are_scaled_and_its_frames_numbered() {
 }
 
 #[test]
-fn poses_that_are_none_are_left_out_by_name() {
+fn invalid_poses_are_dropped_by_name() {
     let mut frames: Vec<_> = ["a.png", "b.png", "c.png", "d.png"].map(frame).into();
     frames[1]["transform_matrix"][0][3] = Value::Null; // how some writers put NaN
     frames[2]["transform_matrix"][0][0] = json!(2.0);

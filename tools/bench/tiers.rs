@@ -116,7 +116,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let warm_up = args.warm_up.unwrap_or(dataset.train_views().len() as u32).min(config.steps / 2);
     super::decode_all(dataset, &targets, &config)?;
     // Without it nothing is predicted; what is measured stands.
-    let rate = DriveRate::look(Path::new(&config.spill_dir)).ok();
+    let rate = DriveRate::of_without_caching(Path::new(&config.spill_dir)).ok();
     take_turns(&mut contenders, (0..warm_up, args.turn), dataset, &targets, false)?;
     contenders.iter_mut().for_each(Contender::begin);
     take_turns(&mut contenders, (warm_up..config.steps, args.turn), dataset, &targets, true)?;

@@ -187,7 +187,7 @@ fn first_page(id: PageId, entries: &[SizedPoint], init: &InitOptions) -> FirstPa
 fn spool_points(source: &dyn PointSource, options: &ImportOptions<'_>) -> InputResult<(Spool<CloudPoint>, u64)> {
     let first_gone = match options.init.max_gaussians {
         None => None,
-        Some(most) => first_key_that_goes(source, most as u64, options.init.seed)?,
+        Some(most) => first_excluded_key(source, most as u64, options.init.seed)?,
     };
     let mut points = SpoolWriter::new(options.budget.space());
     let (mut index, mut row) = (0, 0u32);
@@ -207,7 +207,7 @@ fn is_finite(point: [f32; 3]) -> bool {
 }
 
 /// At most `most` points stay, those with the smallest keys. Returns the smallest key of the others, if any.
-fn first_key_that_goes(source: &dyn PointSource, most: u64, seed: u64) -> InputResult<Option<u64>> {
+fn first_excluded_key(source: &dyn PointSource, most: u64, seed: u64) -> InputResult<Option<u64>> {
     let mut finite = 0;
     source.read(&mut |point, _| {
         finite += u64::from(is_finite(point));

@@ -20,7 +20,7 @@ mod rows;
 mod write;
 
 pub use read::{
-    ROW_HEAD, gaussians_header, holds_gaussians, parse_ply, push_row, read_ply, rows_promised, stream_gaussians,
+    ROW_HEAD, gaussians_header, holds_gaussians, parse_ply, push_row, read_ply, stated_rows, stream_gaussians,
     stream_points, take_row,
 };
 pub use write::{PlyWriter, PlyWritten, write_gaussians};
@@ -57,7 +57,7 @@ impl ExportFrame {
     /// The frame that f32 can hold: `Local` if `origin` is more than [`MAX_OFFSET_RADII`] times `scene_radius` (dataset
     /// units) from zero, otherwise the requested one.
     #[must_use]
-    pub fn that_fits(self, origin: [f64; 3], scene_radius: f64) -> ExportFrame {
+    pub fn fitting_f32(self, origin: [f64; 3], scene_radius: f64) -> ExportFrame {
         let offset = libm::sqrt(origin.iter().map(|x| x * x).sum());
         if offset > MAX_OFFSET_RADII * scene_radius { ExportFrame::Local } else { self }
     }
@@ -76,7 +76,7 @@ pub struct PlyMeta {
     /// dataset's.
     pub frame: ExportFrame,
     /// When writing: extent of the scene in dataset units, which decides whether f32 can hold the dataset frame (see
-    /// [`ExportFrame::that_fits`]). Not stored; reading sets it to `scale`.
+    /// [`ExportFrame::fitting_f32`]). Not stored; reading sets it to `scale`.
     pub scene_radius: f64,
     /// When reading: whether training used an opacity compensation ("mip", "antialiased") that this renderer lacks.
     pub antialiased: bool,
@@ -198,9 +198,9 @@ mod tests {
     #[test]
     fn far_offsets_stay_local() {
         let utm = [500_000.0, 5_000_000.0, 100.0];
-        assert_eq!(ExportFrame::Dataset.that_fits(utm, 200.0), ExportFrame::Local);
-        assert_eq!(ExportFrame::Dataset.that_fits(utm, 20_000.0), ExportFrame::Dataset);
-        assert_eq!(ExportFrame::Local.that_fits([0.0; 3], 1.0), ExportFrame::Local);
-        assert_eq!(ExportFrame::Dataset.that_fits([0.0; 3], 0.0), ExportFrame::Dataset);
+        assert_eq!(ExportFrame::Dataset.fitting_f32(utm, 200.0), ExportFrame::Local);
+        assert_eq!(ExportFrame::Dataset.fitting_f32(utm, 20_000.0), ExportFrame::Dataset);
+        assert_eq!(ExportFrame::Local.fitting_f32([0.0; 3], 1.0), ExportFrame::Local);
+        assert_eq!(ExportFrame::Dataset.fitting_f32([0.0; 3], 0.0), ExportFrame::Dataset);
     }
 }

@@ -35,7 +35,7 @@ pub fn holds_gaussians(path: &Path) -> InputResult<bool> {
 ///
 /// # Errors
 /// The file cannot be opened, or its header cannot be read.
-pub fn rows_promised(path: &Path) -> InputResult<u64> {
+pub fn stated_rows(path: &Path) -> InputResult<u64> {
     let header = parse_header(&mut open(path)?.0, path)?;
     Ok(vertex_of(&header, path)?.1.count)
 }

@@ -73,7 +73,7 @@ impl PlyWriter {
     pub fn create(path: &Path, sh_degree: u8, rows_at_most: u64, meta: &PlyMeta) -> InputResult<PlyWriter> {
         let name =
             path.file_name().ok_or_else(|| InputError::new(path, "this path has no file name", "give a file name"))?;
-        let frame = meta.frame.that_fits(meta.origin, meta.scene_radius);
+        let frame = meta.frame.fitting_f32(meta.origin, meta.scene_radius);
         let mut part_name = std::ffi::OsString::from(".");
         part_name.push(name);
         part_name.push(".part");

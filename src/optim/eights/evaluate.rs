@@ -84,7 +84,7 @@ impl Constants {
         let moved = self.numbers.flush(value.minus(m.times(inv).times(series).times(rate)));
         let still = m.equal(self.numbers.zero);
         *direct = direct.or(still.not_and(v.at_most(self.floor)));
-        moved.but(still, value)
+        moved.blend(still, value)
     }
 }
 
@@ -121,9 +121,9 @@ impl<const W: usize, F: Fn(usize) -> usize> Drifting<'_, '_, W, F> {
             let means = of.splat3([drift[0], drift[1], drift[2]]);
             let others = of.splat3([drift[4], drift[5], drift[6]]);
             let low = [
-                others[0].but_first_three(means[0]),
-                others[1].but_first_three(means[1]),
-                others[2].but_first_three(means[2]),
+                others[0].blend_first_three(means[0]),
+                others[1].blend_first_three(means[1]),
+                others[2].blend_first_three(means[2]),
             ];
             let (m, v, mut direct) = (self.m.load_narrow(avx2, row), self.v.load_narrow(avx2, row), of.numbers.zero);
             let low = of.drifted([value[0], m[0], v[0]], low, of.rates[0], &mut direct);

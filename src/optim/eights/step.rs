@@ -1,7 +1,7 @@
 //! The optimizer's step in vectors of eight.
 //!
-//! The gradients of a block are checked first. The state of rows without a gradient is prefetched as well (their gaps
-//! are unknown across blocks), but not processed.
+//! The gradients of a block are checked first. The state of rows without a gradient is prefetched as well, because the
+//! gradients of the next block are not known yet, but it is not processed.
 //! Not here: the last listed row, and the rounding of 16-bit moments, which use the code shared by all paths.
 //! Invariant: bits and counts are those of [`StepRows`] as a plain loop.
 

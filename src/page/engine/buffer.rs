@@ -48,7 +48,7 @@ impl PageBuffer {
         let map = (len >= MAPPED_LEAST).then(|| MmapMut::map_anon(len).ok()).flatten();
         #[cfg(target_os = "linux")]
         if let Some(map) = &map {
-            // Kernels without huge pages refuse this call, and need it not. Huge pages made steps no faster.
+            // Kernels without huge pages refuse this call and do not need it. Huge pages made steps no faster.
             let _ = map.advise(memmap2::Advice::NoHugePage);
         }
         match map.filter(|map| map.as_ptr().align_offset(ALIGNMENT) == 0) {

@@ -62,7 +62,7 @@ impl DriveRate {
     ///
     /// # Errors
     /// As [`DriveRate::of`].
-    pub fn look(folder: &Path) -> InputResult<DriveRate> {
+    pub fn of_without_caching(folder: &Path) -> InputResult<DriveRate> {
         let device = device_of(folder);
         remembered(folder).filter(|r| r.device == device).map_or_else(|| measure(folder), Ok)
     }
@@ -150,9 +150,9 @@ mod tests {
             assert!(DriveRate::of(folder.path()).unwrap().read > 0.0);
         }
         remember(folder.path(), &slow).unwrap();
-        assert_eq!(DriveRate::look(folder.path()).unwrap(), slow);
+        assert_eq!(DriveRate::of_without_caching(folder.path()).unwrap(), slow);
         let other = tempfile::tempdir().unwrap();
-        assert!(DriveRate::look(other.path()).unwrap().read > 0.0);
+        assert!(DriveRate::of_without_caching(other.path()).unwrap().read > 0.0);
         assert_eq!(std::fs::read_dir(other.path()).unwrap().count(), 0);
         let names: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
         assert_eq!(names, [FILE_NAME]);

@@ -12,7 +12,7 @@
 //! pointers, because a write changes the bytes under a map.
 #![allow(unsafe_code)] // copying out of a map, and dropping its pages
 
-use crate::page::engine::page_cache::{WriteBehind, forget};
+use crate::page::engine::page_cache::{WriteBehind, drop_cached};
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Place, Transfer};
 use crate::page::engine::segment_io::{SegmentIo, move_bytes};
 use crate::page::engine::transfer_pool::TransferPool;
@@ -58,11 +58,11 @@ impl Shared {
             Direction::Read => {
                 let map = self.map_of(place.segment, &file)?;
                 copy_out(&map, place.offset, &mut transfer.buffer.as_mut_slice()[..bytes])?;
-                forget(&file, place.offset, bytes as u64);
+                drop_cached(&file, place.offset, bytes as u64);
             }
             Direction::Write => {
                 move_bytes(&file, transfer)?;
-                lock(&self.behind).wrote(&file, place.offset, bytes as u64);
+                lock(&self.behind).record_write(&file, place.offset, bytes as u64);
             }
         }
         Ok(())
@@ -162,7 +162,7 @@ impl PageEngine for MmapEngine {
 
     fn sync(&mut self) -> io::Result<()> {
         let result = lock(&self.shared.segments).sync();
-        lock(&self.shared.behind).forget_all();
+        lock(&self.shared.behind).drop_all();
         result
     }
 }

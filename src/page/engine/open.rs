@@ -87,7 +87,7 @@ pub fn open_engine(engine: IoEngine, folder: &Path, depth: usize) -> InputResult
     if engine == IoEngine::Memory {
         return Ok(OpenedEngine { store: Box::new(MemoryEngine::new()), notes });
     }
-    outlive_length_limits();
+    ignore_file_size_signal();
     // An unusable folder is reported here, so that later failures are the engine's own.
     std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "opening the folder of pages", &e))?;
     let store: Box<dyn PageEngine> = match engine {
@@ -109,7 +109,7 @@ pub fn open_engine(engine: IoEngine, folder: &Path, depth: usize) -> InputResult
 
 /// Makes a write beyond the limit on file length (`ulimit -f`) an error, as on a full drive. By default the signal
 /// SIGXFSZ ends the process.
-fn outlive_length_limits() {
+fn ignore_file_size_signal() {
     #[cfg(unix)]
     {
         use std::sync::atomic::AtomicBool;

@@ -12,7 +12,7 @@ const BEHIND_BYTES: u64 = 64 << 20;
 
 /// Starts write-back of the dirty bytes of a range and drops its clean ones. A second call, later, therefore drops what
 /// the first began to write. `bytes` 0 means to the end of the file.
-pub fn forget(file: &File, offset: u64, bytes: u64) {
+pub fn drop_cached(file: &File, offset: u64, bytes: u64) {
     #[cfg(any(target_os = "linux", target_os = "android", target_os = "freebsd"))]
     // If refused, the cached copy only costs memory.
     let _ = rustix::fs::fadvise(file, offset, std::num::NonZeroU64::new(bytes), rustix::fs::Advice::DontNeed);
@@ -30,26 +30,26 @@ pub struct WriteBehind {
 
 impl WriteBehind {
     /// Records a completed write and starts its write-back.
-    pub fn wrote(&mut self, file: &Arc<File>, offset: u64, bytes: u64) {
-        forget(file, offset, bytes);
+    pub fn record_write(&mut self, file: &Arc<File>, offset: u64, bytes: u64) {
+        drop_cached(file, offset, bytes);
         self.ranges.push_back((Arc::downgrade(file), offset, bytes));
         self.bytes += bytes;
         while self.bytes > BEHIND_BYTES {
-            self.forget_oldest();
+            self.drop_oldest();
         }
     }
 
     /// Drops all recorded ranges; call after a sync.
-    pub fn forget_all(&mut self) {
+    pub fn drop_all(&mut self) {
         while !self.ranges.is_empty() {
-            self.forget_oldest();
+            self.drop_oldest();
         }
     }
 
-    fn forget_oldest(&mut self) {
+    fn drop_oldest(&mut self) {
         if let Some((file, offset, bytes)) = self.ranges.pop_front() {
             if let Some(file) = file.upgrade() {
-                forget(&file, offset, bytes);
+                drop_cached(&file, offset, bytes);
             }
             self.bytes -= bytes;
         }

@@ -3,7 +3,7 @@
 //! Uses direct I/O where the file system allows it, else the page cache, from which it drops what it can.
 //! Invariants: those of [`PageEngine`].
 
-use crate::page::engine::page_cache::{WriteBehind, forget};
+use crate::page::engine::page_cache::{WriteBehind, drop_cached};
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use crate::page::engine::segment_io::{SegmentIo, move_bytes};
 use crate::page::engine::transfer_pool::TransferPool;
@@ -61,9 +61,9 @@ impl Shared {
         move_bytes(&file, transfer)?;
         if !self.direct {
             match transfer.direction {
-                Direction::Read => forget(&file, transfer.place.offset, transfer.bytes as u64),
+                Direction::Read => drop_cached(&file, transfer.place.offset, transfer.bytes as u64),
                 Direction::Write => {
-                    lock(&self.behind).wrote(&file, transfer.place.offset, transfer.bytes as u64);
+                    lock(&self.behind).record_write(&file, transfer.place.offset, transfer.bytes as u64);
                 }
             }
         }
@@ -98,7 +98,7 @@ impl PageEngine for PreadEngine {
 
     fn sync(&mut self) -> io::Result<()> {
         let result = lock(&self.shared.segments).sync();
-        lock(&self.shared.behind).forget_all();
+        lock(&self.shared.behind).drop_all();
         result
     }
 }

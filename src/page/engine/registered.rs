@@ -50,7 +50,7 @@ impl Drop for Registration {
 #[derive(Debug, Default)]
 pub struct RegisteredBuffers {
     /// Whether the kernel supports the table.
-    is_there: bool,
+    is_supported: bool,
     /// Refusals since the kernel last accepted or released a buffer.
     refusals: u32,
     /// Indices handed out so far.
@@ -63,13 +63,13 @@ pub struct RegisteredBuffers {
 impl RegisteredBuffers {
     /// An empty table for a ring; registers nothing if the kernel has no such tables.
     pub fn of(ring: &Submitter<'_>) -> RegisteredBuffers {
-        let is_there = ring.register_buffers_sparse(ENTRIES.into()).is_ok();
-        RegisteredBuffers { is_there, ..RegisteredBuffers::default() }
+        let is_supported = ring.register_buffers_sparse(ENTRIES.into()).is_ok();
+        RegisteredBuffers { is_supported, ..RegisteredBuffers::default() }
     }
 
     /// Whether the kernel supports the table.
-    pub fn is_there(&self) -> bool {
-        self.is_there
+    pub fn is_supported(&self) -> bool {
+        self.is_supported
     }
 
     /// Registered buffers, including dropped ones whose entry is not cleared yet.
@@ -85,7 +85,7 @@ impl RegisteredBuffers {
         if let Some((number, _)) = own.filter(|&(_, held)| held >= bytes) {
             return Some(number);
         }
-        let may_be = self.is_there && self.refusals < REFUSALS_MAX;
+        let may_be = self.is_supported && self.refusals < REFUSALS_MAX;
         if !may_be || !buffer.is_mapped() || bytes > BYTES_MAX.min(buffer.len()) {
             return None;
         }

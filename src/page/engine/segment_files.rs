@@ -105,7 +105,7 @@ impl SegmentFiles {
         let make = |path: &Path| {
             with_safe_flags(OpenOptions::new().read(true).write(true).create(true).truncate(false)).open(path)
         };
-        let file = self.open_with_room(&path, make)?;
+        let file = self.open_closing_others(&path, make)?;
         let there = file.metadata()?;
         if !there.is_file() || there.len() > bytes {
             let what = if there.is_file() { "exists with another length" } else { "is not a file" };
@@ -150,7 +150,7 @@ impl SegmentFiles {
         while self.open.len() >= self.open_max && self.close_oldest()? {}
         let (direct, read_only) = (self.direct, self.read_only);
         let open = |path: &Path| if read_only { open_for_reading(path) } else { open_segment(path, direct) };
-        let file = Arc::new(self.open_with_room(&self.path(segment), open)?);
+        let file = Arc::new(self.open_closing_others(&self.path(segment), open)?);
         let open = OpenFile { file: Arc::clone(&file), last_used: self.clock, is_dirty: false };
         self.open.insert(segment, open);
         Ok(file)
@@ -187,7 +187,7 @@ impl SegmentFiles {
     }
 
     /// Opens a file. If the process has run out of file descriptors, closes some of the store's own and tries again.
-    fn open_with_room(&mut self, path: &Path, open: impl Fn(&Path) -> io::Result<File>) -> io::Result<File> {
+    fn open_closing_others(&mut self, path: &Path, open: impl Fn(&Path) -> io::Result<File>) -> io::Result<File> {
         loop {
             match open(path) {
                 Err(error) if is_too_many_files(&error) && self.close_oldest()? => {}

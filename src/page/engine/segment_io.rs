@@ -79,7 +79,7 @@ impl SegmentIo {
             Direction::Write => self.files.file_for_write(transfer.place.segment),
         };
         // Opening one file may sync and close another, whose error must be kept.
-        let file = opened.inspect_err(|e| self.note_if_lost(e))?;
+        let file = opened.inspect_err(|e| self.remember_lost_sync(e))?;
         if offset.checked_add(bytes as u64).is_none_or(|end| file.metadata().is_ok_and(|m| end > m.len())) {
             let problem = "the place lies beyond the end of the segment";
             return Err(io::Error::new(io::ErrorKind::UnexpectedEof, problem));
@@ -98,7 +98,7 @@ impl SegmentIo {
         self.files.sync().inspect_err(|e| self.lost = Some((e.kind(), e.to_string())))
     }
 
-    fn note_if_lost(&mut self, error: &io::Error) {
+    fn remember_lost_sync(&mut self, error: &io::Error) {
         use io::ErrorKind as K;
         // These errors never come from a sync; any other may.
         let harmless = matches!(error.kind(), K::NotFound | K::PermissionDenied) || error.raw_os_error() == Some(ELOOP);

@@ -17,7 +17,7 @@
 #![allow(unsafe_code)] // the ring takes addresses of buffers that it owns
 
 use crate::page::engine::buffer::PageBuffer;
-use crate::page::engine::page_cache::{WriteBehind, forget};
+use crate::page::engine::page_cache::{WriteBehind, drop_cached};
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use crate::page::engine::registered::RegisteredBuffers;
 use crate::page::engine::segment_io::{SegmentIo, too_many_files};
@@ -109,8 +109,8 @@ impl UringEngine {
     }
 
     /// Whether the kernel supports registered buffers: since Linux 5.19.
-    pub fn has_table(&self) -> bool {
-        self.registered.is_there()
+    pub fn supports_registration(&self) -> bool {
+        self.registered.is_supported()
     }
 
     /// Number of registered buffers.
@@ -199,7 +199,7 @@ impl UringEngine {
         let not_taken = self.ring.submission().len();
         self.offered.drain(..self.offered.len().saturating_sub(not_taken));
         if self.broken.is_some() {
-            self.give_up_offered();
+            self.fail_offered();
             if want > 0 && self.ring.completion().is_empty() {
                 // Completions of taken requests arrive without a system call.
                 std::thread::sleep(Duration::from_millis(1));
@@ -209,7 +209,7 @@ impl UringEngine {
 
     /// Ends the requests that a broken ring still holds. The kernel reads the queue only during a system call, and none
     /// follows.
-    fn give_up_offered(&mut self) {
+    fn fail_offered(&mut self) {
         let raw = self.broken.unwrap_or(0);
         for id in std::mem::take(&mut self.offered) {
             let flight = self.requests.get(id).flight;
@@ -250,8 +250,8 @@ impl UringEngine {
         if let Some(file) = flight.file.as_ref().filter(|_| !self.segments.is_direct()) {
             let (offset, bytes) = (flight.transfer.place.offset, flight.transfer.bytes as u64);
             match flight.transfer.direction {
-                Direction::Read => forget(file, offset, bytes),
-                Direction::Write => self.behind.wrote(file, offset, bytes),
+                Direction::Read => drop_cached(file, offset, bytes),
+                Direction::Write => self.behind.record_write(file, offset, bytes),
             }
         }
         let result = flight.error.map_or(Ok(()), Err);
@@ -318,7 +318,7 @@ impl PageEngine for UringEngine {
 
     fn sync(&mut self) -> io::Result<()> {
         let result = self.segments.sync();
-        self.behind.forget_all();
+        self.behind.drop_all();
         result
     }
 }

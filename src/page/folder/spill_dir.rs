@@ -85,7 +85,7 @@ impl SpillDir {
             }
             Some(Err(error)) => return Err(bad_format(folder, &error)),
         }
-        tighten(folder)?;
+        make_private(folder)?;
         sign_lock(folder, &lock)?;
         let format = SpillFormat { store: draw_identity(), purpose, layout };
         write_format(folder, &format)?;
@@ -115,7 +115,7 @@ impl SpillDir {
     }
 
     /// Whether `folder` contains a spill directory of any version and in any state; changes nothing.
-    pub fn is_one(folder: &Path) -> bool {
+    pub fn exists_in(folder: &Path) -> bool {
         !matches!(read_format(folder), Ok(None))
     }
 
@@ -155,7 +155,7 @@ impl SpillDir {
     /// Refuses a folder whose lock or FORMAT file is no longer the one that this process holds: somebody removed the
     /// store and created another one under the same path.
     fn check_identity(&self) -> InputResult<()> {
-        let is_same_lock = is_still_there(&self.folder.join(LOCK), &self.lock);
+        let is_same_lock = is_same_file(&self.folder.join(LOCK), &self.lock);
         let is_same_store = matches!(read_format(&self.folder)?, Some(Ok(format)) if format.store == self.format.store);
         if is_same_lock && is_same_store {
             return Ok(());
@@ -275,7 +275,7 @@ fn check_owner(folder: &Path, owner: u32, user: u32) -> InputResult<()> {
 }
 
 /// Makes an empty folder private.
-fn tighten(folder: &Path) -> InputResult<()> {
+fn make_private(folder: &Path) -> InputResult<()> {
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt;
@@ -365,7 +365,7 @@ fn take_lock(folder: &Path) -> InputResult<File> {
             }
             Err(TryLockError::Error(error)) => return Err(failed(error)),
         }
-        if is_still_there(&path, &file) {
+        if is_same_file(&path, &file) {
             return Ok(file);
         }
     }
@@ -385,14 +385,14 @@ fn sign_lock(folder: &Path, mut lock: &File) -> InputResult<()> {
 }
 
 #[cfg(unix)]
-fn is_still_there(path: &Path, file: &File) -> bool {
+fn is_same_file(path: &Path, file: &File) -> bool {
     use std::os::unix::fs::MetadataExt;
     let same = |a: &std::fs::Metadata, b: &std::fs::Metadata| a.dev() == b.dev() && a.ino() == b.ino();
     matches!((std::fs::symlink_metadata(path), file.metadata()), (Ok(a), Ok(b)) if same(&a, &b))
 }
 
 #[cfg(not(unix))]
-fn is_still_there(_path: &Path, _file: &File) -> bool {
+fn is_same_file(_path: &Path, _file: &File) -> bool {
     // These systems do not let anyone remove an open file.
     true
 }

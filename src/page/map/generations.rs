@@ -126,7 +126,7 @@ impl Generations {
             next: generation + 1,
             ..self.plan_with(self.kept_with(generation, &pins), generation)
         }
-        .without_needless(self)
+        .with_unseen_dropped(self)
     }
 
     /// Plans the transaction that pins and unpins generations.
@@ -144,7 +144,7 @@ impl Generations {
             drop_pins: drop.iter().filter(|name| self.pins.contains_key(*name)).cloned().collect(),
             ..self.plan_with(kept, self.latest)
         }
-        .without_needless(self)
+        .with_unseen_dropped(self)
     }
 
     /// Plans the transaction that makes the kept generation `to` the latest again; later ones are dropped with their
@@ -208,7 +208,7 @@ impl Generations {
 
 impl MapBatch {
     /// Adds the entries that no kept generation sees after this transaction to those to drop.
-    fn without_needless(mut self, before: &Generations) -> MapBatch {
+    fn with_unseen_dropped(mut self, before: &Generations) -> MapBatch {
         let mut kept = before.kept.clone();
         kept.extend(self.put_generation.iter().map(|(generation, ..)| *generation));
         self.drop_generations.iter().for_each(|g| {

@@ -211,8 +211,8 @@ impl Manifest {
         acknowledged: u64,
         cache_bytes: usize,
     ) -> Result<(Manifest, MapContent), MapError> {
-        let (mut manifest, content) = Manifest::look(file, store, acknowledged, cache_bytes)?;
-        manifest.file.let_through()?;
+        let (mut manifest, content) = Manifest::open_read_only(file, store, acknowledged, cache_bytes)?;
+        manifest.file.release_held()?;
         manifest.poisoned = false;
         Ok((manifest, content))
     }
@@ -221,7 +221,7 @@ impl Manifest {
     ///
     /// # Errors
     /// As [`Manifest::open`].
-    pub fn look(
+    pub fn open_read_only(
         file: Arc<dyn StorageBackend>,
         store: u128,
         acknowledged: u64,

@@ -80,7 +80,7 @@ impl Writer {
         let sealed = scope.seal(bound(key_bytes), body);
         let before = table.insert(key, sealed.as_slice())?;
         if let Some(before) = before {
-            self.forget(unseal(scope, key_bytes, before.value(), "overwritten entry")?.1);
+            self.subtract(unseal(scope, key_bytes, before.value(), "overwritten entry")?.1);
         }
         self.counters.entries += 1;
         self.counters.tally = self.counters.tally.wrapping_add(scope.checksum(bound(key_bytes), body));
@@ -95,11 +95,11 @@ impl Writer {
         key_bytes: &[u8],
     ) -> Result<(), Fault> {
         let before = table.remove(key)?.ok_or_else(|| damaged("entry to remove", "it is not there"))?;
-        self.forget(unseal(self.scope(seal), key_bytes, before.value(), "entry to remove")?.1);
+        self.subtract(unseal(self.scope(seal), key_bytes, before.value(), "entry to remove")?.1);
         Ok(())
     }
 
-    fn forget(&mut self, checksum: u64) {
+    fn subtract(&mut self, checksum: u64) {
         self.counters.entries = self.counters.entries.wrapping_sub(1);
         self.counters.tally = self.counters.tally.wrapping_sub(checksum);
     }

@@ -50,7 +50,7 @@ impl MapFile {
         MapFile(Arc::new(Shared { file, held_back, shut: AtomicBool::new(false), failure }))
     }
 
-    /// A file that holds writes back until [`MapFile::let_through`].
+    /// A file that holds writes back until [`MapFile::release_held`].
     ///
     /// # Errors
     /// The length of the file cannot be read.
@@ -65,7 +65,7 @@ impl MapFile {
     ///
     /// # Errors
     /// The first operation that failed; the file is then shut.
-    pub fn let_through(&self) -> io::Result<()> {
+    pub fn release_held(&self) -> io::Result<()> {
         let operations = self.held_back().take().map(|held| held.operations).unwrap_or_default();
         for operation in operations {
             let done = match operation {
@@ -289,7 +289,7 @@ mod tests {
         let mut stored = [0; 16];
         inner.read(0, &mut stored).unwrap();
         assert_eq!((inner.len().unwrap(), stored), (16, [1; 16]), "nothing may reach the drive");
-        map.let_through().unwrap();
+        map.release_held().unwrap();
         let mut after = [9; 24];
         inner.read(0, &mut after).unwrap();
         assert_eq!(after, seen);

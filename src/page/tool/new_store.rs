@@ -94,7 +94,7 @@ impl NewStore {
     /// The drive fails.
     pub fn put(&mut self, page: PageId, label: &[u8], payload: &[u8]) -> Result<(), ReadError> {
         while self.store.in_flight() >= IN_FLIGHT {
-            self.settle(true)?;
+            self.collect_completed(true)?;
         }
         let mut buffer = self.free.pop().unwrap_or_else(|| self.store.new_buffer());
         let room = buffer.as_mut_slice().get_mut(HEADER_BYTES..).and_then(|b| b.get_mut(..payload.len()));
@@ -122,7 +122,7 @@ impl NewStore {
     /// The drive fails.
     pub fn commit(&mut self, run_state: &[u8], note: &[u8], names: &[String]) -> Result<u64, ReadError> {
         while self.store.in_flight() > 0 {
-            self.settle(true)?;
+            self.collect_completed(true)?;
         }
         let changes = std::mem::take(&mut self.changes).into_iter();
         let changes: Vec<PageChange> = changes.map(|(page, version)| PageChange { page, version }).collect();
@@ -155,7 +155,7 @@ impl NewStore {
         Ok(())
     }
 
-    fn settle(&mut self, wait: bool) -> Result<(), ReadError> {
+    fn collect_completed(&mut self, wait: bool) -> Result<(), ReadError> {
         let mut done = Vec::new();
         self.store.complete(wait, &mut done);
         for PageDone { page, buffer, result, .. } in done {

@@ -212,7 +212,7 @@ impl StoreReader {
     ///
     /// # Errors
     /// The map contradicts itself.
-    pub fn uses(&self) -> Result<Vec<GenerationUse>, CommitError> {
+    pub fn disk_use(&self) -> Result<Vec<GenerationUse>, CommitError> {
         let kept: Vec<u64> = self.generations.kept().collect();
         let mut seen: HashMap<Place, (u32, u64, u64)> = HashMap::new();
         let mut uses = Vec::new();
@@ -404,7 +404,7 @@ fn open_map(folder: &Path, store: u128, rule: WitnessRule, copied: bool) -> Resu
     } else {
         Arc::new(DriveFile::new(file))
     };
-    Ok(Manifest::look(backend, store, acknowledged, CACHE_BYTES)?)
+    Ok(Manifest::open_read_only(backend, store, acknowledged, CACHE_BYTES)?)
 }
 
 /// As [`open_map`], while a process commits to it.
