@@ -32,7 +32,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn there_is_little_to_spare() {
+    fn growth_leaves_little_to_spare() {
         let mut values = Vec::new();
         resize(&mut values, 1000, 1.0f32);
         assert_eq!((values.len(), values.capacity()), (1000, 1000));

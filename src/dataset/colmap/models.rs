@@ -93,7 +93,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn parameters_land_where_colmap_means_them() {
+    fn parameters_map_to_their_meaning_in_colmap() {
         let lens = |id: i32, p: &[f64]| {
             let i = intrinsics(by_id(id).unwrap(), (640, 480), p).unwrap();
             (i.fx, i.fy, i.cx, i.cy, i.lens)

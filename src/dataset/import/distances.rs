@@ -21,7 +21,7 @@ const SEARCH_BYTES: usize = 96;
 /// A query to another block.
 #[derive(Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C)]
-struct Question {
+struct Query {
     point: [f32; 3],
     /// Only points nearer than this matter.
     limit: f32,
@@ -64,9 +64,9 @@ pub(super) fn measure(points: Spool<CloudPoint>, budget: &Budget<'_>) -> InputRe
     division.run(points, &mut |_, entries| entries.into_iter().try_for_each(|e| sorted.push(e)))?;
     let mut search = Search { space, blocks, points: sorted.finish()?, own: SpoolWriter::new(space).finish()? };
     let bounds = search.search_own_blocks()?;
-    let questions = search.ask(&bounds)?;
-    let answers = search.answer(&questions)?;
-    let distances = search.conclude(&answers)?;
+    let queries = search.query_other_blocks(&bounds)?;
+    let answers = search.answer_queries(&queries)?;
+    let distances = search.merge_answers(&answers)?;
     Ok(Measured { points: search.points, distances })
 }
 
@@ -88,8 +88,8 @@ impl Search<'_> {
     }
 
     /// The queries of all points whose third neighbour is farther than another block's box.
-    fn ask(&self, bounds: &[Bounds]) -> InputResult<Spool<Question>> {
-        let mut questions = SpoolWriter::new(self.space);
+    fn query_other_blocks(&self, bounds: &[Bounds]) -> InputResult<Spool<Query>> {
+        let mut queries = SpoolWriter::new(self.space);
         for (from, block) in self.blocks.iter().enumerate() {
             let (points, own) = (self.positions(block)?, self.own.range(block.clone())?);
             for (i, (&point, dist2)) in points.iter().zip(&own).enumerate() {
@@ -97,30 +97,30 @@ impl Search<'_> {
                 for (to, other) in bounds.iter().enumerate() {
                     if to != from && other.dist2(point) < limit {
                         let at = (block.start + i) as u32;
-                        questions.push(Question { point, limit, at, block: to as u32 })?;
+                        queries.push(Query { point, limit, at, block: to as u32 })?;
                     }
                 }
             }
         }
-        questions.finish()
+        queries.finish()
     }
 
-    fn answer(&self, questions: &Spool<Question>) -> InputResult<Spool<Answer>> {
+    fn answer_queries(&self, queries: &Spool<Query>) -> InputResult<Spool<Answer>> {
         let mut answers = SpoolWriter::new(self.space);
-        if questions.is_empty() {
+        if queries.is_empty() {
             return answers.finish();
         }
         for (number, block) in self.blocks.iter().enumerate() {
             let tree = NeighbourTree::new(&self.positions(block)?);
             // A batch has as many queries as a block has points: a query is smaller than a point's memory.
             let mut batch = Vec::new();
-            let mut reply = |batch: &mut Vec<Question>| {
+            let mut reply = |batch: &mut Vec<Query>| {
                 let known = batch.par_iter().map(|q| Answer { at: q.at, dist2: tree.nearer(q.point, q.limit) });
                 let known: Vec<Answer> = known.collect();
                 batch.clear();
                 known.into_iter().filter(|a| a.dist2[0].is_finite()).try_for_each(|a| answers.push(a))
             };
-            questions.for_each(|q| {
+            queries.for_each(|q| {
                 if q.block as usize == number {
                     batch.push(*q);
                 }
@@ -131,7 +131,7 @@ impl Search<'_> {
         answers.finish()
     }
 
-    fn conclude(&self, answers: &Spool<Answer>) -> InputResult<Spool<f64>> {
+    fn merge_answers(&self, answers: &Spool<Answer>) -> InputResult<Spool<f64>> {
         let mut distances = SpoolWriter::new(self.space);
         for block in &self.blocks {
             let mut dist2 = self.own.range(block.clone())?;

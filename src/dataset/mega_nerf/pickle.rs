@@ -339,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn attacks_end_in_a_sentence() {
+    fn attacks_give_an_error_message() {
         for (text, word) in [
             (&b"cos\nsystem\n."[..], "os system"),
             (b"cbuiltins\neval\n(X\x01\x00\x00\x001tR.", "builtins eval"),

@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_come_back_and_buffers_too() {
+    fn bytes_round_trip_and_buffers_are_returned() {
         let mut store = MemoryEngine::new();
         store.create_segment(2, 8192).unwrap();
         store.create_segment(2, 8192).unwrap();

@@ -156,7 +156,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_come_back_and_others_are_refused() {
+    fn names_round_trip_and_others_are_refused() {
         for engine in IoEngine::ALL {
             assert_eq!(engine.name().parse(), Ok(engine));
         }
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_that_is_none_is_told_by_name() {
+    fn a_missing_folder_is_named() {
         for engine in [IoEngine::Auto, IoEngine::Pread, IoEngine::Mmap] {
             let refused = open_engine(engine, Path::new("no/such/folder"), 4).err().map(|e| e.to_string());
             assert!(refused.is_some_and(|e| e.contains("no/such/folder") && e.contains("remedy")));

@@ -325,7 +325,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_come_back_and_others_are_nobodys() {
+    fn names_round_trip_and_others_are_not_segments() {
         for segment in [0, 1, 99_999_999, 100_000_000, u32::MAX] {
             assert_eq!(segment_from_file_name(&segment_file_name(segment)), Some(segment));
         }

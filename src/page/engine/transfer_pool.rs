@@ -131,7 +131,7 @@ mod tests {
     use crate::page::engine::page_engine::{Direction, Place};
 
     #[test]
-    fn every_buffer_comes_back_also_when_the_work_panics() {
+    fn every_buffer_is_returned_even_if_the_work_panics() {
         let mut pool = TransferPool::new("test", 3, |transfer| match transfer.token % 3 {
             0 => Ok(()),
             1 => Err(io::Error::from_raw_os_error(5)),

@@ -91,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn kinds_are_told_by_their_number() {
+    fn kinds_follow_from_their_number() {
         let numbers = [
             (0xef53, FileSystem::Local),      // ext4
             (0x5846_5342, FileSystem::Local), // XFS
@@ -115,7 +115,7 @@ mod tests {
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn memory_is_told_from_drives() {
+    fn memory_is_distinguished_from_drives() {
         assert!(FileSystem::of(Path::new("/nowhere")).is_err());
         assert!(free_bytes(&std::env::temp_dir()).unwrap().is_some_and(|bytes| bytes > 0));
         let memory = Path::new("/dev/shm");

@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn payloads_come_back_to_the_bit() {
+    fn payloads_round_trip_bit_for_bit() {
         for n in [1, 255, 256, 4096, 186_368] {
             for rest in [0, 1, 3] {
                 let mut payload = floats(n);

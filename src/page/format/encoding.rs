@@ -69,7 +69,7 @@ mod tests {
     }
 
     #[test]
-    fn values_come_back_and_their_bytes_do_not_move() {
+    fn values_round_trip_and_their_encoding_is_fixed() {
         let bytes = to_bytes(&sample()).unwrap();
         assert_eq!(from_bytes::<Sample>(&bytes).unwrap(), sample());
         // Fixed lengths: 4, then 8 + 2 x 4, then 8 + 6, then 1 + 8.

@@ -303,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn headers_come_back_and_every_flipped_bit_is_found() {
+    fn headers_round_trip_and_every_flipped_bit_is_detected() {
         let mut bytes = [1; HEADER_BYTES];
         header().encode(&mut bytes);
         assert_eq!(SlotHeader::decode(&bytes), Ok(header()));
