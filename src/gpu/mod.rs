@@ -13,10 +13,10 @@
 //! Rules that hold for every shader:
 //!
 //! 1. All bindings are in `@group(0)`, numbered from 0 without gaps in a file. Views are given to
-//! [`Recorder::dispatch`] in the order of the numbers that the entry point uses. A uniform struct, if any, is
-//! binding 0.
+//!    [`Recorder::dispatch`] in the order of the numbers that the entry point uses. A uniform struct, if any, is
+//!    binding 0.
 //! 2. Workgroups are 1-D. Beyond 65,535 workgroups [`groups_1d`] folds them into two dimensions, and the shader finds
-//! its index with `linear_group` of `shared/dispatch.wgsl`.
+//!    its index with `linear_group` of `shared/dispatch.wgsl`.
 //! 3. Counts come from uniforms or buffers, never from `arrayLength`: a view of an empty buffer still spans some bytes.
 //! 4. No workgroup waits for another; no invocation loops more than 65,535 times in total.
 //! 5. Contents of a new buffer are arbitrary (it may be reused): use [`Recorder::clear`] where zeros are needed.

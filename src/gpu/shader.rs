@@ -5,7 +5,7 @@
 //! - `#import "shared/x.wgsl"`: inserts the file, each file once;
 //! - `#ifdef NAME`, `#ifndef NAME`, `#else`, `#endif`;
 //! - `#param NAME 0 1 2 3`: replaces `NAME` by a value; the first one unless a define selects another, and only listed
-//! values are accepted, so that every variant can be tested;
+//!   values are accepted, so that every variant can be tested;
 //! - `#repeat NAME 0u 1u` ... `#end`: repeats the lines between, once for each value of `NAME`.
 //!
 //! Invariants: (1) a define that a shader does not know is an error, except `SUBGROUPS`, set for all shaders of a

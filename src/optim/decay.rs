@@ -21,7 +21,7 @@
 //! ([`super::deferred`]), and the same arithmetic in vectors of eight (`super::eights`).
 //!
 //! Invariants: 1. a decay is a function of the betas and k alone; 2. the same bits on every instruction path: only
-//! + - x, nothing contracted; 3. no second moment becomes negative; 4. results below the smallest normal float are zero.
+//! `+ - x`, nothing contracted; 3. no second moment becomes negative; 4. results below the smallest normal float are zero.
 
 use super::adam::AdamConfig;
 use super::drift::{flush, flush_positive};

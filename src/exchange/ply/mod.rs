@@ -4,8 +4,8 @@
 //!
 //! Invariants:
 //! 1. The written property order is that of the 3DGS code, which viewers expect: `x y z nx ny nz f_dc_* f_rest_*
-//! opacity scale_* rot_*`, binary little endian f32, `f_rest` channel-major (all red coefficients, then green,
-//! then blue), scales as logs, opacity as a logit, `rot` w-first and of unit length.
+//!    opacity scale_* rot_*`, binary little endian f32, `f_rest` channel-major (all red coefficients, then green,
+//!    then blue), scales as logs, opacity as a logit, `rot` w-first and of unit length.
 //! 2. A target path holds either the whole new file or its old content: files are written beside it and renamed.
 //! 3. Files are untrusted: every count is checked against the bytes left before anything is allocated.
 //! 4. All returned values are finite.
