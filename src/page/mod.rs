@@ -4,7 +4,7 @@
 //! | folder | what it is responsible for |
 //! | --- | --- |
 //! | [`engine`] | moving bytes between memory and segment files: io_uring, pread, mmap, memory |
-//! | [`format`] | the bytes of a slot: headers, codecs, checksums, the FORMAT file |
+//! | [`mod@format`] | the bytes of a slot: headers, codecs, checksums, the FORMAT file |
 //! | [`versions`] | which slot holds which version of a page |
 //! | [`map`] | the page map, generations, commits, the witness |
 //! | [`folder`] | the spill directory: lock, identity, clean-up |

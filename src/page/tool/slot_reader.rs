@@ -1,6 +1,6 @@
 //! Reads single slots for tools that inspect a store: no engine, no threads, no writes.
 //!
-//! Invariants: 1. bytes are returned only if [`super::verify`] found them to be the requested version; 2. memory is
+//! Invariants: 1. bytes are returned only if [`crate::page::format::verify`] found them to be the requested version; 2. memory is
 //! bounded by the actual size of a slot and its file, not by the largest size that the layout could state.
 
 use crate::base::ids::PageId;
