@@ -5,49 +5,49 @@
 /// Values with stable indices.
 #[derive(Debug)]
 pub struct Slab<T> {
-    things: Vec<Option<T>>,
+    values: Vec<Option<T>>,
     free: Vec<usize>,
 }
 
 impl<T> Default for Slab<T> {
     fn default() -> Self {
-        Slab { things: Vec::new(), free: Vec::new() }
+        Slab { values: Vec::new(), free: Vec::new() }
     }
 }
 
 impl<T> Slab<T> {
     /// Inserts a value; returns its index.
-    pub fn insert(&mut self, thing: T) -> usize {
+    pub fn insert(&mut self, value: T) -> usize {
         if let Some(id) = self.free.pop() {
-            self.things[id] = Some(thing);
+            self.values[id] = Some(value);
             return id;
         }
-        self.things.push(Some(thing));
-        self.things.len() - 1
+        self.values.push(Some(value));
+        self.values.len() - 1
     }
 
     /// The value at an index.
     pub fn get(&self, id: usize) -> &T {
-        let Some(thing) = &self.things[id] else { unreachable!("number {id} is not in use") };
-        thing
+        let Some(value) = &self.values[id] else { unreachable!("number {id} is not in use") };
+        value
     }
 
     /// The value at an index.
     pub fn get_mut(&mut self, id: usize) -> &mut T {
-        let Some(thing) = &mut self.things[id] else { unreachable!("number {id} is not in use") };
-        thing
+        let Some(value) = &mut self.values[id] else { unreachable!("number {id} is not in use") };
+        value
     }
 
     /// Removes a value and returns it.
     pub fn remove(&mut self, id: usize) -> T {
-        let Some(thing) = self.things[id].take() else { unreachable!("number {id} is not in use") };
+        let Some(value) = self.values[id].take() else { unreachable!("number {id} is not in use") };
         self.free.push(id);
-        thing
+        value
     }
 
     /// Number of values.
     pub fn len(&self) -> usize {
-        self.things.len() - self.free.len()
+        self.values.len() - self.free.len()
     }
 }
 

@@ -1,7 +1,7 @@
 //! Reads single slots for tools that inspect a store: no engine, no threads, no writes.
 //!
-//! Invariants: 1. bytes are returned only if [`crate::page::format::verify`] found them to be the requested version; 2. memory is
-//! bounded by the actual size of a slot and its file, not by the largest size that the layout could state.
+//! Invariants: 1. bytes are returned only if [`crate::page::format::verify`] found them to be the requested version; 2.
+//! memory is bounded by the actual size of a slot and its file, not by the largest size that the layout could state.
 
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::PageBuffer;
