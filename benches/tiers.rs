@@ -121,7 +121,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let warm_up = args.warm_up.unwrap_or(dataset.train_views().len() as u32).min(config.steps / 2);
     decode_all(dataset, &targets, &config)?;
     // Without it nothing is predicted; what is measured stands.
-    let rate = DriveRate::look(Path::new(&config.spill_dir)).ok();
+    let rate = DriveRate::of_without_caching(Path::new(&config.spill_dir)).ok();
     in_turns(&mut contenders, 0..warm_up, args.turn, |c| c.step(dataset, &targets, false))?;
     contenders.iter_mut().for_each(Contender::begin);
     in_turns(&mut contenders, warm_up..config.steps, args.turn, |c| c.step(dataset, &targets, true))?;

@@ -1,5 +1,5 @@
-// Stage "image_loss": (1 - lambda) L1 + lambda (1 - SSIM) of a picture and its gradient. The twin of
-// src/kernels/image_loss.rs and src/kernels/ssim_band.rs, which have the formulas and say what a mask does.
+// Stage "image_loss": (1 - lambda) L1 + lambda (1 - SSIM) of a picture, and its gradient. The twin of
+// src/kernels/image_loss.rs and src/kernels/ssim_band.rs, which document the formulas and masks.
 //
 // Three entry points, run in this order:
 //   ssim_map     one workgroup per tile and channel: SSIM's three derivative maps, and the tile's sum of SSIM;
@@ -8,9 +8,10 @@
 //                first four of a row of the patch, then four pixels of a column;
 //   sum_partials one workgroup per 4,096 partial sums: adds them up in a fixed order. Run again until one is left.
 // ssim_map and gradient cover `channel_count` channels from `first_channel` on, so that the derivative maps, 12 bytes
-// per pixel and channel, may be kept for one channel at a time.
+// per pixel and channel, can be stored for one channel at a time.
 //
-// Sums are f32, added as trees: no atomics, so the same bits on every run of a device. No loop is longer than 64 turns.
+// Sums are f32, added as trees: no atomics, so every run on a device gives the same bits. No loop has more than 64
+// iterations.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 
@@ -19,40 +20,40 @@ struct LossUniforms {
     height: u32,
     first_channel: u32,
     channel_count: u32,
-    /// Pixels at each border that are left out of the SSIM map: 5 or 0.
+    /// Pixels at each border that the SSIM map does not cover: 5 or 0.
     margin: u32,
-    /// Derivative of the loss by the sum of absolute differences, and by the sum of the SSIM map.
+    /// Derivatives of the loss with respect to the sum of absolute differences, and to the sum of the SSIM map.
     l1_weight: f32,
     ssim_weight: f32,
-    /// Partial sums that sum_partials reads.
+    /// Number of partial sums that sum_partials reads.
     partial_count: u32,
 }
 
 @group(0) @binding(0) var<uniform> loss: LossUniforms;
 /// The picture, planar [3][height][width].
 @group(0) @binding(1) var<storage, read> rgb: array<f32>;
-/// The photo: red in the lowest byte, then green, blue, and the mask (0: the pixel is left out).
+/// The photo: red in the lowest byte, then green, blue, and the mask (0: the pixel is excluded).
 @group(0) @binding(2) var<storage, read> target_pixels: array<u32>;
 /// dS/dmx, dS/dE[xx], dS/dE[xy], planar [channel_count][3][height][width].
 @group(0) @binding(3) var<storage, read_write> derivatives: array<f32>;
 /// Planar [3][height][width].
 @group(0) @binding(4) var<storage, read_write> v_rgb: array<f32>;
-/// Absolute differences, squared differences, SSIM, 0: one for each channel and tile.
+/// Absolute differences, squared differences, SSIM, 0: one entry per channel and tile.
 @group(0) @binding(5) var<storage, read_write> partials: array<vec4<f32>>;
-/// What sum_partials makes of them.
+/// Output of sum_partials.
 @group(0) @binding(6) var<storage, read_write> sums: array<vec4<f32>>;
 
-/// Invocations of a workgroup of ssim_map and gradient: one for every four pixels of a tile.
+/// Invocations per workgroup of ssim_map and gradient: one per four pixels of a tile.
 const LANES: u32 = 64u;
-/// Invocations of a workgroup of sum_partials.
+/// Invocations per workgroup of sum_partials.
 const WORKGROUP: u32 = 256u;
 const RADIUS: u32 = 5u;
-/// Side of a tile with the window's margin.
+/// Side of a tile including the window's margin.
 const PATCH: u32 = 26u;
-/// 26 * 26 values of a patch, and 26 * 16 once it is filtered along its rows.
+/// Values of a patch (26 * 26), and those after filtering along rows (26 * 16).
 const PATCH_LEN: u32 = 676u;
 const FILTERED_LEN: u32 = 416u;
-/// Partial sums that one invocation of sum_partials adds up.
+/// Partial sums per invocation of sum_partials.
 const PARTIALS_EACH: u32 = 16u;
 /// (0.01 L)^2 and (0.03 L)^2 for the value range L = 1.
 const SSIM_C1: f32 = 1e-4;
@@ -72,7 +73,7 @@ var<workgroup> patch_one: array<f32, PATCH_LEN>;
 /// Filtered along rows: x, y, x^2 + y^2, x y; or the three maps.
 var<workgroup> filtered: array<vec4<f32>, FILTERED_LEN>;
 
-/// Where an invocation stands.
+/// Position of an invocation in the dispatch.
 struct Place {
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
@@ -84,15 +85,15 @@ struct Place {
 #endif
 }
 
-/// The part of the work that a workgroup does.
+/// The share of work of a workgroup.
 struct Job {
-    /// 0 red, 1 green, 2 blue; and counted from first_channel.
+    /// 0 red, 1 green, 2 blue; and the same counted from first_channel.
     channel: u32,
     plane: u32,
     /// First pixel of the tile.
     x0: u32,
     y0: u32,
-    /// Where its sums go.
+    /// Index of its partial sums.
     partial: u32,
     exists: bool,
 }
@@ -109,15 +110,15 @@ fn job(group: u32) -> Job {
     return Job(channel, plane, TILE * (tile % columns), TILE * (tile / columns), channel * tiles + tile, exists);
 }
 
-/// Pixel index of a place of the patch, or 0xffffffff outside the picture. Patch column 0 is 5 left of the tile.
+/// Pixel index of a place in the patch, or 0xffffffff outside the picture. Patch column 0 is 5 left of the tile.
 fn pixel_of_patch(j: Job, at: u32) -> u32 {
-    // Below 0 wraps around to far beyond the picture.
+    // A value below 0 wraps to far beyond the picture.
     let x = j.x0 + at % PATCH - RADIUS;
     let y = j.y0 + at / PATCH - RADIUS;
     return select(0xffffffffu, y * loss.width + x, x < loss.width && y < loss.height);
 }
 
-/// Picture and photo at a pixel; the photo twice where the pixel is left out.
+/// Picture and photo at a pixel; the photo twice if the pixel is excluded.
 fn values(channel: u32, pixel: u32) -> vec2<f32> {
     let photo = target_pixels[pixel];
     let y = f32((photo >> (8u * channel)) & 255u) / 255.0;
@@ -130,23 +131,23 @@ fn windowed(v0: vec4<f32>, v1: vec4<f32>, v2: vec4<f32>, v3: vec4<f32>, v4: vec4
     return TAP0 * v0 + TAP1 * v1 + TAP2 * v2 + TAP3 * v3 + TAP4 * v4 + TAP5 * v5;
 }
 
-/// x, y, x^2 + y^2 and x y at a place of the patch.
+/// x, y, x^2 + y^2 and x y at a place in the patch.
 fn four(at: u32) -> vec4<f32> {
     let both = patch_two[at];
     return vec4<f32>(both, both.x * both.x + both.y * both.y, both.x * both.y);
 }
 
-/// The three derivatives at a place of the patch.
+/// The three derivatives at a place in the patch.
 fn three(at: u32) -> vec4<f32> {
     return vec4<f32>(patch_two[at], patch_one[at], 0.0);
 }
 
-/// Fours of places side by side in the rows of a patch.
+/// Groups of four adjacent places in the rows of a patch.
 const FOURS_LEN: u32 = 104u;
-/// What the windows of four neighbours span.
+/// Values covered by the windows of four neighbours.
 const SPAN: u32 = 14u;
 
-/// The window at four places side by side.
+/// The window at four adjacent places.
 fn windowed_4(v: array<vec4<f32>, SPAN>) -> array<vec4<f32>, 4> {
     return array<vec4<f32>, 4>(
 #repeat K 0u 1u 2u 3u
@@ -155,7 +156,7 @@ fn windowed_4(v: array<vec4<f32>, SPAN>) -> array<vec4<f32>, 4> {
     );
 }
 
-/// The window down a column of what was filtered along rows, at four pixels from place t on.
+/// The window down a column of the row-filtered values, at four pixels from place t on.
 fn down_4(t: u32) -> array<vec4<f32>, 4> {
     var v: array<vec4<f32>, SPAN>;
 #repeat K 0u 1u 2u 3u 4u 5u 6u 7u 8u 9u 10u 11u 12u 13u
@@ -164,7 +165,7 @@ fn down_4(t: u32) -> array<vec4<f32>, 4> {
     return windowed_4(v);
 }
 
-/// Adds up the lanes' sums in the memory of the patch, which nobody reads any more; the first lane has the result.
+/// Adds the lanes' sums in the memory of the patch, which is no longer needed; the first lane gets the result.
 #ifdef SUBGROUPS
 fn sum_lanes(place: Place, lanes: u32, value: vec3<f32>) -> vec3<f32> {
     let part = subgroupAdd(value);
@@ -187,7 +188,7 @@ fn sum_lanes(place: Place, lanes: u32, value: vec3<f32>) -> vec3<f32> {
     patch_two[lane] = value.xy;
     patch_one[lane] = value.z;
     workgroupBarrier();
-    // Sixteen parts of as many lanes as it takes.
+    // Sixteen parts of equally many lanes.
     let each = lanes / 16u;
     var sum = vec3<f32>();
     if lane < 16u {
@@ -218,7 +219,7 @@ fn ssim_point(mx: f32, my: f32, squares: f32, products: f32) -> vec4<f32> {
     let a1 = 2.0 * mean_product + SSIM_C1;
     let a2 = 2.0 * (products - mean_product) + SSIM_C2;
     let b1 = mean_squares + SSIM_C1;
-    // Rounding can take the sum of two variances below zero: a bright flat patch.
+    // Rounding can make the sum of two variances negative, for a bright flat patch.
     let b2 = max(squares - mean_squares, 0.0) + SSIM_C2;
     let inverse = 1.0 / (b1 * b2);
     let ssim = a1 * a2 * inverse;

@@ -1,8 +1,9 @@
-// One intersection for each row and tile that it can reach, the twin of src/kernels/isect_emit.rs: rows in depth order,
-// the tiles of a row column by column. One invocation finds one intersection, so a row that covers the picture costs no
-// more than its share.
+// Emits one intersection for each row and tile that the row can reach, the twin of src/kernels/isect_emit.rs: rows in
+// depth order, the tiles of a row column by column. One invocation finds one intersection, so a row that covers the
+// picture costs only its share.
 //
-// Nothing is written beyond the capacity: the scan's total tells the demand, and the caller runs again with more room.
+// Nothing is written beyond the capacity: the scan's total gives the demand, and the caller runs again with larger
+// buffers.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/footprint.wgsl"
@@ -10,7 +11,7 @@
 struct IsectUniforms {
     grid: Grid,
     row_count: u32,
-    /// Intersections that the buffers hold.
+    /// Capacity of the buffers, in intersections.
     capacity: u32,
     pad: vec2<u32>,
 }
@@ -19,19 +20,19 @@ struct IsectUniforms {
 @group(0) @binding(1) var<storage, read> splats: array<vec4<f32>>;
 /// Rows by rank.
 @group(0) @binding(2) var<storage, read> order: array<u32>;
-/// Where each rank's intersections begin; row_count + 1 entries.
+/// First intersection of each rank; row_count + 1 entries.
 @group(0) @binding(3) var<storage, read> offsets: array<u32>;
 @group(0) @binding(4) var<storage, read_write> tiles: array<u32>;
-/// The numbers 0, 1, 2, ... that the sort by tile carries along.
+/// The numbers 0, 1, 2, ..., which the sort by tile permutes.
 @group(0) @binding(5) var<storage, read_write> isects: array<u32>;
-/// NO_ROW where the intersection was counted and then not found.
+/// NO_ROW if the intersection was counted but not found.
 @group(0) @binding(6) var<storage, read_write> row_from_isect: array<u32>;
-/// By rank: how many tiles the row can reach. The scan makes the offsets of them.
+/// By rank: number of tiles that the row can reach, from which the scan computes the offsets.
 @group(0) @binding(7) var<storage, read_write> counts: array<u32>;
 
 const NO_ROW: u32 = 0xffffffffu;
 
-/// Counts before anything is emitted.
+/// Counts intersections before any is emitted.
 @compute @workgroup_size(256)
 fn isect_count(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -52,7 +53,7 @@ fn isect_count(
     counts[rank] = count;
 }
 
-/// The last rank whose intersections begin at or before this one.
+/// The last rank whose intersections start at or before this one.
 fn rank_from_isect(isect: u32) -> u32 {
     var low = 0u;
     var high = view.row_count;
@@ -82,7 +83,8 @@ fn isect_emit(
     let at = SPLAT_STRIDE * row;
     let reach = reach_of(splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]), view.grid);
     var left = isect - offsets[rank];
-    // Should the roundings of the two entry points ever differ, an intersection that is not found goes behind all tiles.
+    // If the roundings of the two entry points ever differ, an intersection that is not found is sorted after all
+    // tiles.
     var tile = view.grid.tiles_x * view.grid.tiles_y;
     var found = NO_ROW;
     for (var tile_x = reach.box.x; tile_x < reach.box.z; tile_x++) {

@@ -1,4 +1,4 @@
-// Where each tile's list begins in the intersections sorted by tile, the twin of src/kernels/isect_offsets.rs, and the
+// Start of each tile's list in the intersections sorted by tile, the twin of src/kernels/isect_offsets.rs, and the
 // length of the longest list.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
@@ -6,7 +6,7 @@
 struct OffsetsUniforms {
     tile_count: u32,
     capacity: u32,
-    /// The number of intersections is live[live_at], but never more than the capacity.
+    /// The number of intersections is live[live_at], limited to the capacity.
     live_at: u32,
     pad: u32,
 }
@@ -16,10 +16,10 @@ struct OffsetsUniforms {
 @group(0) @binding(2) var<storage, read> tiles: array<u32>;
 /// tile_count + 1 entries.
 @group(0) @binding(3) var<storage, read_write> tile_offsets: array<u32>;
-/// One entry, cleared before.
+/// One entry, zeroed before.
 @group(0) @binding(4) var<storage, read_write> longest: atomic<u32>;
 
-/// The first intersection whose tile is not before this one.
+/// The first intersection of this tile or a later one.
 fn first_of_tile(tile: u32, count: u32) -> u32 {
     var low = 0u;
     var high = count;

@@ -1,5 +1,5 @@
 // Stage "project", backward: gradients of footprints to gradients of means, quats, scales and opacities.
-// The twin of src/kernels/project_bwd.rs, which has the formulas. Adds to v_means, which sh_bwd wrote before.
+// The twin of src/kernels/project_bwd.rs, which documents the formulas. Adds to v_means, which sh_bwd wrote before.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/math.wgsl"
@@ -19,10 +19,10 @@
 @group(0) @binding(9) var<storage, read_write> v_scales: array<f32>;
 /// With respect to the logits.
 @group(0) @binding(10) var<storage, read_write> v_opacities: array<f32>;
-/// What densification needs of each row: v_mean2d.x, v_mean2d.y, radius.x, radius.y; zeros for a culled row.
+/// Input of densification for each row: v_mean2d.x, v_mean2d.y, radius.x, radius.y; zeros for a culled row.
 @group(0) @binding(11) var<storage, read_write> footprints: array<vec4<f32>>;
 
-/// The image of axis k times the conic, from its image and minor and those of the two axes after it in turn.
+/// The image of axis k times the conic, from the image and minor of axis k and of the two axes after it, cyclically.
 fn axis_by_conic(g: Geometry, eps2d: f32, k: vec2<f32>, l: vec2<f32>, m: vec2<f32>, by_l: f32, by_m: f32) -> vec2<f32> {
     let perp_l = vec2<f32>(-l.y, l.x);
     let perp_m = vec2<f32>(-m.y, m.x);
@@ -62,7 +62,7 @@ fn geometry_vjp(g: Geometry, v_mean2d: vec2<f32>, v_conic: vec3<f32>) -> Geometr
         2.0 * dot2(w2, vw0) * (s.x - s.z),
         2.0 * dot2(w0, vw1) * (s.y - s.x),
     );
-    // A turn by t about the own axes moves the unit quaternion by q (0, t) / 2.
+    // A rotation by t about the own axes moves the unit quaternion by q (0, t) / 2.
     let q = g.quat;
     out.quat = (2.0 * g.inv_quat_norm) * vec4<f32>(
         -q.y * turn.x - q.z * turn.y - q.w * turn.z,
@@ -75,7 +75,7 @@ fn geometry_vjp(g: Geometry, v_mean2d: vec2<f32>, v_conic: vec3<f32>) -> Geometr
     let c = g.cov2d;
     let y_tilt = (1.0 / g.det) * vec2<f32>(c.z * tilt.x - c.y * tilt.y, c.x * tilt.y - c.y * tilt.x);
     let slope_all = 2.0 * (view.focal * g.inv_depth) * y_tilt;
-    // Where the slope is cut it no longer follows the mean.
+    // Where the slope is clamped it does not depend on the mean.
     let v_slope = select(vec2<f32>(), slope_all, g.slope == g.ray);
     let v_ray = view.focal * v_mean2d + v_slope;
     var camera = vec3<f32>(g.inv_depth * v_ray, -g.inv_depth * (out.log_scale.x + out.log_scale.y + out.log_scale.z));
@@ -87,7 +87,7 @@ fn geometry_vjp(g: Geometry, v_mean2d: vec2<f32>, v_conic: vec3<f32>) -> Geometr
     return out;
 }
 
-/// Derivative of the sigmoid at a logit, without the cancellation near 1.
+/// Derivative of the sigmoid at a logit, without cancellation near 1.
 fn sigmoid_slope(logit: f32) -> f32 {
     let e = exp32(-abs(logit));
     let d = 1.0 + e;

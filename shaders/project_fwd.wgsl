@@ -15,7 +15,7 @@
 @group(0) @binding(4) var<storage, read> opacities: array<f32>;
 @group(0) @binding(5) var<storage, read_write> splats: array<vec4<f32>>;
 
-/// Natural logarithm for x in [1, 256), within 3e-7 + 2e-7 ln x; outside some number that is not used.
+/// Natural logarithm for x in [1, 256), within 3e-7 + 2e-7 ln x; unspecified outside.
 fn ln_1_to_256(x: f32) -> f32 {
     // Subtracting the bits of 2/3 first puts m into [2/3, 4/3).
     let shifted = bitcast<u32>(x) - 0x3f2aaaabu;
@@ -27,7 +27,7 @@ fn ln_1_to_256(x: f32) -> f32 {
     return e * 0.693147181 + 2.0 * r * series;
 }
 
-/// Whether the box mean +- radius meets the pixels 0..size along one side, and both are numbers.
+/// Whether the box mean +- radius overlaps the pixels 0..size along one side, and neither is NaN.
 fn on_screen(mean: f32, radius: f32, size: f32) -> bool {
     return is_finite(mean) && is_finite(radius) && radius > 0.0 && mean + radius > 0.0 && mean - radius < size;
 }

@@ -1,17 +1,17 @@
-// One pass of a stable sort of 32-bit keys with 32-bit values by 4 bits of the key: every block of 2048 keys moves its
-// keys to the places that the scanned histogram keeps for it. On a device this serves twice: rows by the bits of their
-// depth (the twin of src/kernels/radix_sort.rs), and intersections by tile.
+// One pass of a stable sort of 32-bit keys with 32-bit values, by 4 bits of the key: every block of 2048 keys moves its
+// keys to the places that the scanned histogram reserves for it. Used twice: for rows by the bits of their depth (the
+// twin of src/kernels/radix_sort.rs), and for intersections by tile.
 //
-// No workgroup waits for another, and which order workgroups run in cannot change a place.
+// No workgroup waits for another, and the execution order of workgroups cannot change a place.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/splat.wgsl"
 
 struct SortUniforms {
-    /// The number of keys is live[live_at], but never more than this.
+    /// The number of keys is live[live_at], limited to this.
     capacity: u32,
     live_at: u32,
-    /// Blocks that the histogram has room for.
+    /// Number of blocks in the histogram.
     blocks: u32,
     /// Lowest bit of this pass's digit.
     shift: u32,
@@ -25,18 +25,18 @@ struct SortUniforms {
 @group(0) @binding(4) var<storage, read> places: array<u32>;
 @group(0) @binding(5) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(6) var<storage, read_write> values_out: array<u32>;
-/// [digits][blocks]: how many keys of each digit every block has; every entry is written, also of blocks without keys.
+/// [digits][blocks]: number of keys of each digit in every block; every entry is written, even for blocks without keys.
 @group(0) @binding(7) var<storage, read_write> histogram: array<u32>;
 @group(0) @binding(8) var<storage, read> splats: array<vec4<f32>>;
 
-/// Keys of one invocation; they stand side by side, so that the order within a block is that of the invocations.
+/// Keys per invocation; they are adjacent, so that the order within a block is that of the invocations.
 const KEYS: u32 = 8u;
 const BLOCK_KEYS: u32 = 2048u;
 const DIGITS: u32 = 16u;
-/// Words in which an invocation's counts are kept: digits w and w + 8 in the halves of word w.
+/// Words with an invocation's counts: digits w and w + 8 in the halves of word w.
 const WORDS: u32 = 8u;
 
-/// How many keys of each digit one invocation has, 4 bits each (a count of 8 fits): digits 0 to 7, then 8 to 15.
+/// Number of keys of each digit in one invocation, 4 bits each (a count of 8 fits): digits 0 to 7, then 8 to 15.
 struct DigitCounts {
     low: u32,
     high: u32,
@@ -59,21 +59,21 @@ fn digit_word(counts: DigitCounts, word: u32) -> u32 {
     return ((counts.low >> (4u * word)) & 15u) | (((counts.high >> (4u * word)) & 15u) << 16u);
 }
 
-/// Invocations of a word stand side by side with one word of padding after every 8, against bank conflicts.
+/// The invocations' entries of a word are adjacent, with one word of padding after every 8, against bank conflicts.
 const WORD_STRIDE: u32 = 288u;
 /// [words][invocations]: counts, then counts of the invocations before.
 var<workgroup> counts_before: array<u32, 2304>;
 /// [words][parts]
 var<workgroup> part_counts: array<u32, 512>;
-/// Where this block's keys of each digit begin.
+/// First place of this block's keys of each digit.
 var<workgroup> block_places: array<u32, 16>;
 
 fn counts_at(word: u32, lane: u32) -> u32 {
     return word * WORD_STRIDE + lane + lane / 8u;
 }
 
-/// Keys and values of the sort by depth: the bits of a drawn row's depth (positive, so they order as the depths do) and
-/// the row. Rows that are not drawn go behind all others. The capacity is the number of rows.
+/// Keys and values of the sort by depth: the bits of a drawn row's depth (positive, so they sort like the depths) and
+/// the row. Rows that are not drawn come last. The capacity is the number of rows.
 @compute @workgroup_size(256)
 fn depth_keys(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -145,7 +145,7 @@ fn radix_histogram(
     }
 }
 
-/// Second half of a pass, behind the scan of the histogram: moves keys and values.
+/// Second half of a pass, after the scan of the histogram: moves keys and values.
 @compute @workgroup_size(256)
 fn radix_sort(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -165,7 +165,7 @@ fn radix_sort(
     }
     var counts = DigitCounts(0u, 0u);
     var key: array<u32, KEYS>;
-    /// Keys of the same digit that the invocation has before this one.
+    /// Number of earlier keys of the same digit in this invocation.
     var rank: array<u32, KEYS>;
     for (var i = 0u; i < KEYS; i++) {
         if first + i < count {
@@ -199,7 +199,7 @@ fn radix_sort(
         counts_before[counts_at(word, lane)] = digit_word(counts, word);
     }
     workgroupBarrier();
-    // 32 parts of 8 invocations to a word: each invocation takes one part of one word.
+    // 32 parts of 8 invocations per word: each invocation processes one part of one word.
     let word = lane / 32u;
     let part = lane % 32u;
     var sum = 0u;

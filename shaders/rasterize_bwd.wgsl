@@ -1,11 +1,11 @@
 // Gradients of footprints and colours from the gradient of the image, back to front through each tile's list: the twin
-// of src/kernels/rasterize_bwd.rs, which has the formulas. Nine sums for each splat of a tile: h, h dx, h dy, h dx^2,
-// h dx dy, h dy^2 and weight v_rgb; fold_rows makes gradients of them.
+// of src/kernels/rasterize_bwd.rs, which documents the formulas. Nine sums per splat and tile: h, h dx, h dy, h dx^2, h
+// dx dy, h dy^2 and weight v_rgb; fold_rows converts them to gradients.
 //
 // No float atomics: the sums of an invocation's pixels are added within the subgroup (without subgroups, each
-// invocation is a part of its own), the parts through workgroup memory in a fixed order, and one invocation writes them
-// to the place that belongs to this intersection. Where subgroups have 8 invocations, sums within one are written out,
-// 8 splats at a time. So a device gives the same bits whenever it runs again.
+// invocation is a part), the parts are added through workgroup memory in a fixed order, and one invocation writes the
+// result to the place of this intersection. If subgroups have 8 invocations, sums within one are written out, 8 splats
+// at a time. So every run on a device gives the same bits.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/raster.wgsl"
@@ -23,16 +23,16 @@
 @group(0) @binding(8) var<storage, read> v_alpha: array<f32>;
 /// [intersections of the window][9]
 @group(0) @binding(9) var<storage, read_write> partials: array<f32>;
-/// [height][width][2]: t and behind, where the list has more than one segment.
+/// [height][width][2]: t and behind, if the list has more than one segment.
 @group(0) @binding(10) var<storage, read_write> carry: array<vec2<f32>>;
 /// Rows by rank.
 @group(0) @binding(11) var<storage, read> order: array<u32>;
-/// Where each rank's intersections begin; row_count + 1 entries.
+/// First intersection of each rank; row_count + 1 entries.
 @group(0) @binding(12) var<storage, read> offsets: array<u32>;
 @group(0) @binding(13) var<storage, read_write> v_splats: array<vec4<f32>>;
 
 const SUMS: u32 = 9u;
-/// Parts of the sums of one splat, times splats of a batch.
+/// Parts of the sums of one splat, times the splats of a batch.
 const PARTS_OF_BATCH: u32 = 256u;
 
 var<workgroup> batch: array<TileSplat, TILE_LANES>;
@@ -44,9 +44,9 @@ var<workgroup> tile_stop: atomic<u32>;
 
 /// An invocation's four pixels.
 struct Pixels {
-    /// Transmittance behind the splats passed so far.
+    /// Transmittance behind the splats processed so far.
     t: vec4<f32>,
-    /// What is seen behind them, dotted with v_rgb.
+    /// Colour seen behind them, dotted with v_rgb.
     behind: vec4<f32>,
     stop: vec4<u32>,
     v_red: vec4<f32>,
@@ -86,7 +86,7 @@ fn pixels_behind(at: u32, plane: u32, inside: vec4<bool>) -> Pixels {
     return p;
 }
 
-/// Takes a splat off the pixels where it takes part.
+/// Removes a splat from the pixels that it affects.
 fn take_off(
     pixels: ptr<function, Pixels>,
     splat: TileSplat,
@@ -101,7 +101,7 @@ fn take_off(
     let v_red = (*pixels).v_red;
     let v_green = (*pixels).v_green;
     let v_blue = (*pixels).v_blue;
-    // alpha dL/dalpha = weight (what the splat shows - what it hides)
+    // alpha dL/dalpha = weight (colour of the splat - colour it hides)
     let over = splat.color.x * v_red + (splat.color.y * v_green + splat.color.z * v_blue) - (*pixels).behind;
     let h = select(vec4<f32>(0.0), weight * over, e <= vec4<f32>(view.log2_max_alpha));
     (*pixels).t = before;
@@ -130,15 +130,15 @@ fn write_sums(to: u32, parts: u32, s: Sums) {
 }
 
 #ifdef SUBGROUPS_OF_8
-/// The sum over a subgroup of 8, known to all of it.
+/// The sum over a subgroup of 8, in all its invocations.
 fn sum_of_8(v: vec3<f32>) -> vec3<f32> {
     let low = (subgroupBroadcast(v, 0u) + subgroupBroadcast(v, 1u)) + (subgroupBroadcast(v, 2u) + subgroupBroadcast(v, 3u));
     let high = (subgroupBroadcast(v, 4u) + subgroupBroadcast(v, 5u)) + (subgroupBroadcast(v, 6u) + subgroupBroadcast(v, 7u));
     return low + high;
 }
 
-/// Takes off the splats [first, first + 8) that lie below `size` and leaves their sums in workgroup memory: each
-/// invocation of the subgroup loads one, the others take it over from there, and it keeps that splat's sums.
+/// Removes the splats [first, first + 8) below `size` and leaves their sums in workgroup memory: each invocation of the
+/// subgroup loads one splat, the others receive it from there, and it keeps that splat's sums.
 fn take_off_8(pixels: ptr<function, Pixels>, first: u32, list_index: u32, size: u32, x: vec4<f32>, y: f32, part: u32, own_lane: u32) {
     var own = batch[min(first + own_lane, size - 1u)];
     // Beyond the end: far below every threshold.
@@ -198,7 +198,7 @@ fn rasterize_bwd(
 #endif
     let tile = linear_group(workgroup, workgroups);
     let grid = view.grid;
-    // Uniform in the workgroup.
+    // Uniform across the workgroup.
     if tile >= grid.tiles_x * grid.tiles_y {
         return;
     }
@@ -229,7 +229,7 @@ fn rasterize_bwd(
             batch[lane] = tile_splat(splat_unpack(splats[record], splats[record + 1u], splats[record + 2u]));
         }
         workgroupBarrier();
-        // Uniform: nothing changes it behind the first barrier.
+        // Uniform: nothing changes it after the first barrier.
         let reached = first < atomicLoad(&tile_stop);
 #ifdef SUBGROUPS_OF_8
         for (var i = (size + 7u) / 8u * 8u; reached && i > 0u;) {
@@ -271,7 +271,7 @@ fn rasterize_bwd(
                         sum += sums[i * parts + p];
                     }
                 } else {
-                    // By fours, to stay below the limit on iterations; the number of parts is a power of two.
+                    // Four at a time, to stay below the limit on iterations; the number of parts is a power of two.
                     for (var p = i * parts; p < (i + 1u) * parts; p += 4u) {
                         sum += (sums[p] + sums[p + 1u]) + (sums[p + 2u] + sums[p + 3u]);
                     }
@@ -292,19 +292,19 @@ fn rasterize_bwd(
     }
 }
 
-/// Rows of a workgroup; its last four invocations rest.
+/// Rows per workgroup; its last four invocations are idle.
 const GROUP_ROWS: u32 = 28u;
 
 var<workgroup> row_sums: array<f32, 256>;
 
-/// One sum of one intersection; nothing where it was counted and then not found, since no tile wrote it.
+/// One sum of one intersection; 0 if it was counted but not found, because no tile wrote it.
 fn partial(isect: u32, row: u32, which: u32) -> f32 {
     return select(0.0, partials[(isect - view.window_first) * SUMS + which], row_from_isect[isect] == row);
 }
 
-/// Folds the sums of each row over its intersections, in emit order (tiles column by column), and turns them into
-/// gradients. Nine invocations take a row, one for each sum. A row that ends beyond the window leaves its sums where its
-/// gradients will be, in the order of the sums, and the next window goes on from there.
+/// Folds the sums of each row over its intersections, in emit order (tiles column by column), and converts them to
+/// gradients. Nine invocations process a row, one per sum. A row that ends beyond the window stores its sums in place
+/// of its gradients, in the order of the sums, and the next window continues from there.
 @compute @workgroup_size(256)
 fn fold_rows(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -325,7 +325,7 @@ fn fold_rows(
             let carried = v_splats[SPLAT_STRIDE * row + which / 4u];
             sum = carried[which % 4u];
         }
-        // By fours, to stay below the limit on iterations; the order of the additions is that of the intersections.
+        // Four at a time, to stay below the limit on iterations; the additions are in the order of the intersections.
         while isect + 4u <= end {
             let p0 = partial(isect, row, which);
             let p1 = partial(isect + 1u, row, which);
@@ -350,12 +350,13 @@ fn fold_rows(
     let s = lane * SUMS;
     let row_end = min(offsets[own_rank + 1u], view.isect_count);
     let row_first = min(offsets[own_rank], row_end);
-    // A row without intersections belongs to the first window, another to each that has some of its own.
+    // A row without intersections belongs to the first window, any other row to each window that has some of its
+    // intersections.
     let is_here = select(view.window_first == 0u, row_first < view.window_end && row_end > view.window_first, row_end > row_first);
     if !is_here {
         return;
     }
-    // More to come. (A row without intersections is complete, wherever its place would be.)
+    // More windows follow. (A row without intersections is complete, wherever its place would be.)
     if row_end > view.window_end && row_end > row_first {
         v_splats[at] = vec4<f32>(row_sums[s], row_sums[s + 1u], row_sums[s + 2u], row_sums[s + 3u]);
         v_splats[at + 1u] = vec4<f32>(row_sums[s + 4u], row_sums[s + 5u], row_sums[s + 6u], row_sums[s + 7u]);
@@ -366,7 +367,7 @@ fn fold_rows(
     // dL/dsigma = -h; sigma = (A dx^2 + C dy^2) / 2 + B dx dy with dx = pixel - mean.
     let conic = splat.conic;
     let v_mean = vec2<f32>(conic.x * row_sums[s + 1u] + conic.y * row_sums[s + 2u], conic.y * row_sums[s + 1u] + conic.z * row_sums[s + 2u]);
-    // A row that is not drawn has no opacity, and no sums either.
+    // A row that is not drawn has neither opacity nor sums.
     let v_opacity = select(0.0, row_sums[s] / splat.opacity, splat.opacity > 0.0);
     v_splats[at] = vec4<f32>(v_mean, 0.0, v_opacity);
     v_splats[at + 1u] = vec4<f32>(-0.5 * row_sums[s + 3u], -row_sums[s + 4u], -0.5 * row_sums[s + 5u], 0.0);

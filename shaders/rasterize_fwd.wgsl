@@ -1,10 +1,11 @@
-// Blends each tile's list of splats front to back, the twin of src/kernels/rasterize_fwd.rs, which has the contract.
+// Blends each tile's list of splats front to back, the twin of src/kernels/rasterize_fwd.rs, which documents the
+// contract.
 //
 // Dead pixels (stopped, or outside the image) keep t = 0, so they add nothing, and a floor of -1, so they never stop
 // again.
 //
-// Where subgroups have 8 invocations, each goes through the list by itself, 8 splats at a time: every invocation loads
-// one and the others take it over from there. Elsewhere the workgroup loads batches into its memory.
+// If subgroups have 8 invocations, each subgroup processes the list by itself, 8 splats at a time: every invocation
+// loads one, and the others receive it from there. Otherwise the workgroup loads batches into its memory.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/raster.wgsl"
@@ -17,7 +18,7 @@
 @group(0) @binding(4) var<storage, read> tile_offsets: array<u32>;
 /// [3][height][width]
 @group(0) @binding(5) var<storage, read_write> rgb: array<f32>;
-/// [height][width]: transmittance behind the last contribution.
+/// [height][width]: transmittance after the last contribution.
 @group(0) @binding(6) var<storage, read_write> t_final: array<f32>;
 /// [height][width]: list index of the splat at which the pixel stopped, or NEVER.
 @group(0) @binding(7) var<storage, read_write> stops: array<u32>;
@@ -26,9 +27,9 @@
 struct Pixels {
     /// Transmittance, 0 once dead.
     t: vec4<f32>,
-    /// The transmittance that stops a pixel, or -1 once it is dead.
+    /// The transmittance at which a pixel stops, or -1 once it is dead.
     low: vec4<f32>,
-    /// Transmittance where it stopped.
+    /// Transmittance at which it stopped.
     end_t: vec4<f32>,
     stop: vec4<u32>,
     red: vec4<f32>,
@@ -57,7 +58,7 @@ fn blend(pixels: ptr<function, Pixels>, splat: TileSplat, e: vec4<f32>, index: u
     (*pixels).blue += weight * splat.color.z;
 }
 
-/// The pixels as they are before the segment.
+/// State of the pixels before the segment.
 fn pixels_before(at: u32, plane: u32, inside: vec4<bool>) -> Pixels {
     var p: Pixels;
     p.t = select(vec4<f32>(0.0), vec4<f32>(1.0), inside);
@@ -105,7 +106,7 @@ fn splat_of(entry: u32) -> TileSplat {
 }
 
 var<workgroup> batch: array<TileSplat, TILE_LANES>;
-/// Invocations whose four pixels are dead.
+/// Number of invocations whose four pixels are all dead.
 var<workgroup> finished: atomic<u32>;
 
 @compute @workgroup_size(64)
@@ -119,7 +120,7 @@ fn rasterize_fwd(
 ) {
     let tile = linear_group(workgroup, workgroups);
     let grid = view.grid;
-    // Uniform in the workgroup.
+    // Uniform across the workgroup.
     if tile >= grid.tiles_x * grid.tiles_y {
         return;
     }
@@ -164,7 +165,7 @@ fn rasterize_fwd(
     }
     for (var first = view.first; first < end; first += TILE_LANES) {
         workgroupBarrier();
-        // Every invocation reads between two barriers and adds behind the second: all see the same number.
+        // Every invocation reads between two barriers and adds after the second: all see the same number.
         if atomicLoad(&finished) == TILE_LANES {
             break;
         }

@@ -1,16 +1,17 @@
-// Exclusive prefix sum, the twin of src/kernels/scan.rs: blocks of 2048 values, each from the sum of the blocks before it.
+// Exclusive prefix sum, the twin of src/kernels/scan.rs: blocks of 2048 values, each starting from the sum of the
+// earlier blocks.
 //
-// Reduce, then scan: scan_reduce sums blocks, level by level until one block is left; then every level is scanned
-// from the top down with the scanned sums as bases. No workgroup waits for another. Offsets are 32-bit and saturate:
-// a last entry of 0xffffffff means that the true total is that or more.
+// Reduce, then scan: scan_reduce sums blocks, level by level until one block is left; then every level is scanned from
+// the top down with the scanned sums as bases. No workgroup waits for another. Offsets are 32-bit and saturate: a last
+// entry of 0xffffffff means that the true total is that or more.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/workgroup_scan.wgsl"
 
 struct ScanUniforms {
-    /// Values of this level.
+    /// Number of values of this level.
     count: u32,
-    /// 1: `bases` holds the sum before each block; 0: there is one block, and its base is 0.
+    /// 1: `bases` holds the sum before each block; 0: there is a single block with base 0.
     has_bases: u32,
     pad: vec2<u32>,
 }
@@ -18,7 +19,7 @@ struct ScanUniforms {
 @group(0) @binding(0) var<uniform> level: ScanUniforms;
 @group(0) @binding(1) var<storage, read> values: array<u32>;
 @group(0) @binding(2) var<storage, read> bases: array<u32>;
-/// One more than there are values: the last is the total. Of scan_reduce: the sums of blocks.
+/// One more entry than values: the last is the total. For scan_reduce: the sums of blocks.
 @group(0) @binding(3) var<storage, read_write> offsets: array<u32>;
 
 const ITEMS: u32 = 8u;
@@ -87,7 +88,7 @@ fn scan(
             offsets[first + i] = saturating_add(base, before[i]);
         }
     }
-    // The invocation of the last value also knows the total; with no values the first one does.
+    // The invocation with the last value writes the total; without values the first invocation does.
     if first < level.count && first + ITEMS >= level.count {
         offsets[level.count] = saturating_add(base, sum);
     } else if level.count == 0u && first == 0u {

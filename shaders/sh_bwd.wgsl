@@ -1,7 +1,7 @@
 // Stage "sh", backward: gradients of colours to gradients of sh0, the higher bands and, through the viewing
 // direction, means. The twin of src/kernels/sh_bwd.rs.
-// Every entry of v_means, v_sh0 and of the bands in use is written, zeros for culled rows. The gradients of bands out
-// of use are zeros that nobody has to store: they are not bound.
+// Every entry of v_means, v_sh0 and of the bands in use is written, with zeros for culled rows. The gradients of unused
+// bands are zero and not stored: they are not bound.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/math.wgsl"
@@ -71,7 +71,7 @@ fn sh_bwd(
         clear_row(i);
         return;
     }
-    // A channel that was cut at 0 passes nothing.
+    // A channel clamped at 0 passes no gradient.
     let v = select(vec3<f32>(), v_splats[at + 2u].xyz, splats[at + 2u].xyz > vec3<f32>());
     for (var c = 0u; c < 3u; c++) {
         v_sh0[3u * i + c] = SH_C0 * v[c];
@@ -114,7 +114,7 @@ fn sh_bwd(
     v_dir += sh_band3_vjp(dir.unit, v_basis3);
 #endif
 #endif
-    // From the unit direction to the mean: the part across it, by 1/length.
+    // Gradient of the mean from that of the unit direction: the tangential part, divided by the length.
     v_dir = (v_dir - dot3(dir.unit, v_dir) * dir.unit) * dir.inv_len;
 #endif
     for (var c = 0u; c < 3u; c++) {

@@ -1,6 +1,6 @@
-// Stage "sh": colours of the rows that projection left, written into their splats.
-// The twin of src/kernels/sh_fwd.rs. Each band is a buffer of its own, [rows][2 l + 1][3], so that none outgrows a
-// binding before the others; SH_DEGREE_1 to SH_DEGREE_3 say which are in use.
+// Stage "sh": colours of the rows that projection has not culled, written into their splats. The twin of
+// src/kernels/sh_fwd.rs. Each band has its own buffer, [rows][2 l + 1][3], so that none exceeds the size of a binding
+// before the others; SH_DEGREE_1 to SH_DEGREE_3 select the bands in use.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/math.wgsl"
@@ -61,6 +61,6 @@ fn sh_fwd(
 #endif
 #endif
 #endif
-    // NaN gives 0.
+    // NaN becomes 0.
     splats[at + 2u] = vec4<f32>(select(vec3<f32>(), color, color > vec3<f32>()), splats[at + 2u].w);
 }

@@ -146,7 +146,7 @@ fn masks_with_huge_profiles_stay_within_the_budget() {
 
 /// transforms.json that does not state the size: it is read from the photos.
 #[test]
-fn looking_for_the_size_of_a_photo_inflates_nothing() {
+fn reading_the_size_of_a_photo_inflates_nothing() {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 4, 64, 48, 500);
     make_png(&scene, &profile_bomb());

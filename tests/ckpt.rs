@@ -26,7 +26,7 @@ fn generations(listed: &Value) -> Vec<u64> {
 }
 
 #[test]
-fn looking_at_a_store_says_what_the_run_left_and_changes_nothing() {
+fn inspecting_a_store_reports_what_the_run_left_and_changes_nothing() {
     let bench = Bench::new();
     let out = bench.stopped(&[]);
     let before = bench.store_files();
@@ -113,7 +113,7 @@ fn an_export_is_the_trainers_file_byte_for_byte_and_can_be_a_part_of_it() {
 
     let said = failed(&["export", text(&out), "--out", text(&file), "--crop", "1e8,1e8,1e8,2e8,2e8,2e8"]);
     assert!(said.contains("no Gaussian lies in this box"), "{said}");
-    assert!(failed(&["export", text(&out), "--out", text(&file), "--crop", "1,2,3"]).contains("is no box"));
+    assert!(failed(&["export", text(&out), "--out", text(&file), "--crop", "1,2,3"]).contains("is not a box"));
     let said = failed(&["export", text(&out), "--out", text(&bench.path("no/folder.ply"))]);
     assert!(said.contains("no/folder.ply"), "{said}");
 }
@@ -132,7 +132,7 @@ fn a_run_that_was_rolled_back_or_cloned_ends_with_the_same_bytes() {
     assert_eq!(json(&["rollback", text(&out), &a.to_string(), "--yes"])["dropped"][0].as_u64(), Some(b));
     let now = json(&["ls", text(&out)]);
     assert_eq!((generations(&now), &now["generations"][0]["step"]), (vec![a], &listed["generations"][0]["step"]));
-    assert!(ckpt(&["rollback", text(&out), &a.to_string()]).contains("the last one already"));
+    assert!(ckpt(&["rollback", text(&out), &a.to_string()]).contains("already the latest"));
     assert!(json(&["verify", text(&out), "--deep"])["faults"].as_array().unwrap().is_empty());
 
     // The copy has both generations, under their numbers, in slots that are its own.
@@ -198,13 +198,13 @@ fn names_keep_generations_until_they_are_pruned() {
 }
 
 #[test]
-fn a_store_in_use_is_not_written_and_what_only_looks_says_so() {
+fn a_store_in_use_is_never_written_and_readers_report_the_use() {
     let bench = Bench::new();
     let (out, mut child) = bench.running(&["--steps", "20000", "--commit-every", "0.02"]);
     let busy = json(&["ls", text(&out)]);
     assert!(busy["used_by"].as_str().unwrap().contains(&format!("process {}", child.id())), "{busy}");
     assert!(ckpt(&["ls", text(&out)]).contains("in use"));
-    assert!(ckpt(&["inspect", text(&out)]).contains("as of its last commit"));
+    assert!(ckpt(&["inspect", text(&out)]).contains("that of the last commit"));
     let generation = generations(&busy)[0].to_string();
     let (file, to) = (bench.path("x.ply"), bench.path("copy"));
     for command in [
@@ -325,7 +325,7 @@ fn flipped_bits_in_pages_are_named_and_older_versions_take_their_place() {
 
 /// Older versions have other statistics than the run has counted, and rounds ahead that its newer ones had behind them.
 #[test]
-fn a_run_goes_on_from_many_older_pages() {
+fn a_run_resumes_from_many_older_pages() {
     // With rounds between the generations that grow much, and with statistics that no round cleared.
     for (every, grow) in [("10", "0.0001"), ("150", "0.001")] {
         goes_on_from_older_pages(&["--refine-stop", "200", "--refine-every", every, "--grow-grad2d", grow]);
@@ -595,7 +595,7 @@ fn gaussians_that_do_not_fit_are_refused_by_the_header_or_go_into_pages() {
 }
 
 #[test]
-fn gaussians_go_into_a_store_and_out_again_within_the_budget() {
+fn gaussians_round_trip_through_a_store_within_the_budget() {
     let rows = std::env::var("GSSCALE_CKPT_GAUSSIANS").ok().map_or(40_000, |n| n.parse().unwrap());
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);

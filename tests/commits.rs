@@ -70,7 +70,7 @@ fn read(store: &mut PagedStore, page: u32, slot: &SlotRef) -> u8 {
 }
 
 #[test]
-fn generations_come_back_and_a_rollback_brings_an_older_one() {
+fn generations_reopen_and_a_rollback_restores_an_older_one() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     assert!(matches!(open(at), Err(CommitError::NoStore)));
@@ -195,7 +195,7 @@ fn hostile_maps_are_refused() {
         map.apply(&MapBatch { latest, next, put_generation, ..MapBatch::default() }).unwrap();
         drop(map);
         let error = Manifest::open(file, 5, 0, 1 << 18).err().unwrap();
-        assert!(matches!(&error, MapError::Damaged(what) if what.contains("no store gets to")), "{error}");
+        assert!(matches!(&error, MapError::Damaged(what) if what.contains("is impossible")), "{error}");
     }
 }
 
@@ -278,7 +278,7 @@ fn a_reserve_that_was_not_filled_is_filled_again() {
 }
 
 #[test]
-fn the_reserve_is_there_until_it_is_given_up() {
+fn the_reserve_exists_until_it_is_given_up() {
     let folder = tempfile::tempdir().unwrap();
     let mut commits = create(folder.path()).unwrap().commits;
     assert!(commits.fill_reserve().unwrap() && commits.fill_reserve().unwrap());
@@ -387,7 +387,7 @@ fn one_flipped_bit_makes_redb_forget_a_durable_commit() {
 }
 
 #[test]
-fn the_witness_notices_what_the_library_does_not() {
+fn the_witness_detects_a_stale_map_that_redb_accepts() {
     let shared = memory();
     let mut map = Manifest::create(Arc::new(shared.clone()), 5, 1 << 20).unwrap();
     for generation in 1..=2 {

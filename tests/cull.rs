@@ -228,7 +228,7 @@ fn lists_do_not_depend_on_threads_or_on_the_instruction_path() {
 }
 
 #[test]
-fn gathered_rows_are_the_evaluated_ones() {
+fn gathered_rows_equal_evaluated_rows() {
     let adam = DeferredAdam::new(Rates::new(1.0, 500), AdamConfig::default(), SimdPath::best());
     let state = scene(4000, &adam);
     let rows: Vec<u32> = (0..4000).step_by(3).collect();

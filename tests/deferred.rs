@@ -306,7 +306,7 @@ fn the_same_bits_on_every_instruction_path_whatever_happens_to_rows() {
 
 /// Which values are no numbers is the same on every path, and the others keep their bits: nothing hides that a state broke.
 #[test]
-fn values_that_are_no_numbers_stay_so_on_every_instruction_path() {
+fn nan_stays_nan_on_every_instruction_path() {
     let (plain, mut state, _) = eventful_steps(SimdPath::Baseline, 3, Moments::F32);
     for (table, every) in [(&mut state.columns, 29), (&mut state.exp_avg, 31), (&mut state.exp_avg_sq, 37)] {
         Column::ALL.into_iter().for_each(|c| table.column_mut(c).iter_mut().step_by(every).for_each(|x| *x = f32::NAN));
@@ -328,7 +328,7 @@ fn values_that_are_no_numbers_stay_so_on_every_instruction_path() {
 }
 
 #[test]
-fn the_same_bits_from_every_way_of_reading() {
+fn every_way_of_reading_gives_the_same_bits() {
     for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
         let (adam, state, _) = eventful_steps(simd, 3, Moments::F32);
         for now in [60, 61, 77, 459, 460, 461, 5000] {
@@ -353,7 +353,7 @@ fn the_same_bits_from_every_way_of_reading() {
 }
 
 #[test]
-fn settling_a_row_leaves_its_later_values_where_they_were() {
+fn settling_a_row_keeps_its_later_values() {
     let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), SimdPath::best());
     let mut state = SceneState::from_columns(random_columns(20, 1, 1.0, 4));
     let all: Vec<u32> = (0..20).collect();
@@ -408,7 +408,7 @@ fn bad_gradients_leave_their_row_alone(simd: SimdPath) {
 
 /// A row is loaded together with a little of the one behind it, and the last row of a table is worked on by other code.
 #[test]
-fn a_row_comes_to_the_same_whatever_rows_lie_beside_it() {
+fn a_rows_result_does_not_depend_on_its_neighbours() {
     SimdPath::ALL.into_iter().filter(|p| p.is_supported()).for_each(rows_beside_it_change_no_bit);
 }
 
@@ -502,7 +502,7 @@ fn a_list_that_does_not_fit_the_view_is_refused_before_any_row_is_changed() {
 }
 
 #[test]
-fn without_catching_up_rows_stand_still_while_they_have_no_gradient() {
+fn without_catch_up_rows_keep_their_values_without_a_gradient() {
     let (rows, degree) = (40, 1);
     let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), SimdPath::best());
     let sparse = adam.clone().without_catch_up();

@@ -267,7 +267,7 @@ fn a_drive_that_fails_ends_the_run_and_its_last_commit_stands() {
             (Operation::Write, _) => ["writing page", "check the drive"],
             (Operation::Read, Fault::FlipBit(_) | Fault::Torn) => ["is damaged", "seg-"],
             (Operation::Read, _) => ["cannot be read", "seg-"],
-            _ => ["did not keep what was written", "check the drive"],
+            _ => ["could not make writes durable", "check the drive"],
         };
         assert!(names.iter().all(|name| error.contains(name)), "case {i}: {error}");
         assert!(error.contains("remedy"), "case {i}: {error}");

@@ -107,7 +107,7 @@ impl Model {
 }
 
 #[test]
-fn what_is_written_comes_back_with_many_in_flight() {
+fn pages_round_trip_with_many_in_flight() {
     for (name, open) in all_engines() {
         let folder = tempfile::tempdir().unwrap();
         let mut store = open(folder.path());
@@ -464,7 +464,7 @@ fn write_unasked(store: &mut dyn PageEngine, folder: &Path, places: std::ops::Ra
 /// While a step computes nobody takes answers; the drive must have something to do all the same. The ring's requests come
 /// from one transfer, since each further one makes room by taking answers.
 #[test]
-fn three_times_the_usual_depth_moves_without_being_asked() {
+fn three_times_the_usual_depth_completes_without_polling() {
     const MIB: usize = 1 << 20;
     let cases =
         [(IoEngine::Uring, 1, 3 * DEPTH * MIB), (IoEngine::Pread, 3 * DEPTH, MIB), (IoEngine::Mmap, 3 * DEPTH, MIB)];
@@ -533,11 +533,11 @@ fn expect_pinned(bytes: usize) {
 fn ring_with_table(folder: &Path) -> Option<gsscale::page::engine::uring::UringEngine> {
     let store = gsscale::page::engine::uring::UringEngine::open(folder, 8, true);
     match &store {
-        Ok(store) if store.has_table() => {}
+        Ok(store) if store.supports_registration() => {}
         Ok(_) => eprintln!("skipped: this kernel has no table for buffers"),
         Err(error) => eprintln!("skipped: io_uring is refused here: {error}"),
     }
-    store.ok().filter(|store| store.has_table())
+    store.ok().filter(|store| store.supports_registration())
 }
 
 /// Writes other bytes from each buffer and reads them back into it.
@@ -561,12 +561,12 @@ fn write_and_read(store: &mut dyn PageEngine, draws: &mut Stream, buffers: Vec<P
 
 #[cfg(target_os = "linux")]
 #[test]
-fn the_ring_holds_buffers_that_stay_and_lets_go_of_them() {
+fn the_ring_registers_long_lived_buffers_and_releases_them() {
     use rustix::thread::{CapabilitySet, capabilities};
     // Two of them are within the smallest common limit on locked memory, which others of this user use as well.
     let all = capabilities(None).unwrap().effective.contains(CapabilitySet::IPC_LOCK);
     let bytes = if all { 256 << 10 } else { 32 << 10 };
-    if in_child("the_ring_holds_buffers_that_stay_and_lets_go_of_them") {
+    if in_child("the_ring_registers_long_lived_buffers_and_releases_them") {
         return;
     }
     let folder = tempfile::tempdir().unwrap();

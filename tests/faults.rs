@@ -7,14 +7,14 @@
 //! | power loss: writes lost, torn, reordered | the same | crash: every_crash_point_of_a_small_run_opens_at_an_acknowledged_state |
 //! | folder entry lost | nothing durable names a file whose entry is not | crash: every_mutant_is_noticed |
 //! | short, interrupted, EAGAIN | resumed a bounded number of times, then an error | ../src/page/engine/short_transfers: what_never_moves_ends_as_an_error; ../src/page/engine/segment_io: what_moves_in_parts_and_is_disturbed_arrives_whole; engines: a_short_answer_of_the_ring_is_resumed; crash: every_call_of_a_small_run_may_fail |
-//! | EIO on read | read once more; then named with page, generation and place; an earlier generation can be gone back to | store: what_another_read_mends_is_not_an_error; commits: generations_come_back_and_a_rollback_brings_an_older_one |
+//! | EIO on read | read once more; then named with page, generation and place; an earlier generation can be gone back to | store: a_fault_that_a_second_read_mends_is_not_an_error; commits: generations_reopen_and_a_rollback_restores_an_older_one |
 //! | EIO on write or sync | nothing is written any more; the last acknowledged commit stands | store: a_failed_write_or_sync_ends_all_writing; crash: every_call_of_a_small_run_may_fail; paging: a_drive_that_fails_for_ever_loses_nothing_that_is_in_memory |
-//! | ENOSPC | no poison: the same call works when there is space; the reserve is used | store: a_full_drive_is_survived; paging: a_full_drive_can_be_waited_for; commits: the_reserve_is_there_until_it_is_given_up |
+//! | ENOSPC | no poison: the same call works when there is space; the reserve is used | store: a_full_drive_is_survived; paging: a_full_drive_can_be_waited_for; commits: the_reserve_exists_until_it_is_given_up |
 //! | limit on the length of files | as ENOSPC, for segments and the map | faults: a_limit_on_the_length_of_files_is_a_full_drive |
 //! | flipped bit in a page or its header | found and named, never returned as good | store: every_flipped_bit_is_found_and_named |
 //! | flipped bit in map, witness or FORMAT | refused, or nothing is different | faults: a_flipped_bit_anywhere_in_the_map_is_noticed_or_harmless; spill_dir: left_over_directories_are_refused_with_the_remedy |
 //! | misdirected read or write, lost write | named as damage, at both places | store: misdirected_and_lost_transfers_are_found |
-//! | old map put back | refused | commits: the_witness_notices_what_the_library_does_not |
+//! | old map put back | refused | commits: the_witness_detects_a_stale_map_that_redb_accepts |
 //! | old map and old witness put back | that older generation, whole; pages that were overwritten since are named | faults: an_older_map_with_its_witness_is_that_generation_or_names_pages |
 //! | segment missing, cut, longer, or one more | refused with a list; one more stays untouched | commits: missing_cut_and_longer_segments_are_refused_by_name |
 //! | anything in the folder damaged | one of the above | fuzz: store_dir; fuzz: map_values |
@@ -23,7 +23,7 @@
 //! | drive read-only or rights lost later | as EIO | store: any_operation_may_fail_in_any_way |
 //! | folder moved away in use | what was acknowledged is where the folder is; growing is an error | faults: a_folder_that_is_moved_away_keeps_its_commits |
 //! | few file handles | files are closed and opened again | spill_dir: sixty_four_files_are_enough_for_two_hundred_segments; engines: more_segments_than_open_files |
-//! | two processes | exactly one has the folder | spill_dir: of_many_that_race_one_wins; spill_dir: two_processes_never_share_a_directory |
+//! | two processes | exactly one has the folder | spill_dir: of_many_racing_processes_one_wins; spill_dir: two_processes_never_share_a_directory |
 //! | clock jumps, sleep | no decision reads the wall clock | faults: no_decision_reads_the_wall_clock |
 //! | slow drive | transfers in flight are bounded in bytes; others may end in any order and time | paging: what_moves_ahead_at_a_slow_drive_is_bounded_in_bytes; store: transfers_may_end_in_any_order |
 //! | device lost | named, last good step written | gpu_train: a_device_that_fails_in_mid_run_leaves_the_last_good_step |
@@ -274,7 +274,7 @@ fn a_limit_on_the_length_of_files_is_a_full_drive() {
     assert!(ended.status.success(), "{}\n{}", ended.status, String::from_utf8_lossy(&ended.stderr));
 }
 
-/// The wall clock may jump. It is asked for the name of a store and for the times in event files, and for nothing else.
+/// The wall clock may jump. It is asked for identities and for the times in event files, and for nothing else.
 #[test]
 fn no_decision_reads_the_wall_clock() {
     let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
@@ -289,5 +289,5 @@ fn no_decision_reads_the_wall_clock() {
         }
     }
     readers.sort();
-    assert_eq!(readers, ["src/exchange/tensorboard.rs", "src/page/folder/spill_dir.rs"]);
+    assert_eq!(readers, ["src/base/identity.rs", "src/exchange/tensorboard.rs"]);
 }

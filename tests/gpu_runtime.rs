@@ -150,7 +150,7 @@ fn uploads_larger_than_the_staging_arrive_whole() {
 }
 
 #[test]
-fn bytes_that_are_no_whole_words_arrive() {
+fn uploads_of_partial_words_arrive() {
     let Some(gpu) = open(&GpuOptions::default()) else { return };
     for len in [1usize, 3, 4, 5, 4097] {
         let bytes: Vec<u8> = (0..len).map(|i| (i * 7 + 1) as u8).collect();

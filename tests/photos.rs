@@ -83,7 +83,7 @@ fn has_warning(dataset: &Dataset, part: &str) -> bool {
 }
 
 #[test]
-fn a_plain_scene_loads_without_a_word() {
+fn a_plain_scene_loads_without_warnings() {
     let (folder, raw) = noise_scene(9);
     let dataset = load(&raw);
     assert_eq!(dataset.warnings, Vec::<String>::new());
@@ -320,7 +320,7 @@ fn undistort_direction(lens: &Lens, xd: f64, yd: f64) -> (f64, f64) {
 }
 
 #[test]
-fn distortion_is_taken_out() {
+fn distortion_is_removed() {
     let (width, height) = (320u32, 240u32);
     let lenses = [
         Lens::Radial([-0.18, 0.06, 0.002, -0.003, 0.01, 0.02, 0.0, 0.0]),

@@ -63,7 +63,7 @@ fn header_of(bytes: &[u8]) -> (String, &[u8]) {
 }
 
 #[test]
-fn the_local_frame_comes_back_bit_for_bit() {
+fn the_local_frame_round_trips_bit_for_bit() {
     let folder = tempfile::tempdir().unwrap();
     for sh_degree in 0..=3 {
         // More than one block of rows.
@@ -85,7 +85,7 @@ fn the_local_frame_comes_back_bit_for_bit() {
 }
 
 #[test]
-fn the_dataset_frame_comes_back_within_rounding() {
+fn the_dataset_frame_round_trips_within_rounding() {
     let columns = scene(300, 3);
     let meta = meta(ExportFrame::Dataset);
     let (mut back, back_meta) = gaussians(parse(&written(&columns, &meta)).unwrap());
@@ -142,7 +142,7 @@ fn an_offset_too_far_for_f32_stays_local_and_says_so() {
 }
 
 #[test]
-fn properties_stand_in_the_order_of_the_field() {
+fn properties_are_in_the_fields_order() {
     let mut columns = Columns::zeros(1, 2);
     columns.means.copy_from_slice(&[1.0, 2.0, 3.0]);
     columns.sh0.copy_from_slice(&[4.0, 5.0, 6.0]);
@@ -343,7 +343,7 @@ fn hostile_files_are_refused_with_place_and_remedy() {
         (with_header("property float f_rest_44", "property float other"), "44 f_rest"),
         (with_header("property float f_rest_44", "property float f_rest_45"), "'f_rest_44'"),
         (with_header("property float rot_3", "property list uchar float rot_3"), "is a list"),
-        (with_header("property float rot_3", "property list float float rot_3"), "counted by fractions"),
+        (with_header("property float rot_3", "property list float float rot_3"), "is a floating-point type"),
         (with_header("property float rot_3", "property quad rot_3"), "unknown type"),
         (with_header("property float rot_3", "nonsense"), "unknown keyword"),
         (with_header("comment frame local", "comment frame sideways"), "frame sideways"),
@@ -372,7 +372,7 @@ fn broken_rows_are_named_by_line_or_byte() {
     assert!(error_of(&cut).contains("line 9: the file ends before the last row"));
     let listed = "list uchar int l,float x,float y,float z";
     let error = error_of(&ascii_points(listed, &["4000000000 1 2 3"]));
-    assert!(error.contains("list 'l' does not hold"), "{error}");
+    assert!(error.contains("list 'l' does not have as many"), "{error}");
 
     let binary = |count: &str, list: &[u8]| {
         let head = "ply\nformat binary_little_endian 1.0\nelement face 1\n";
@@ -386,7 +386,7 @@ fn broken_rows_are_named_by_line_or_byte() {
 }
 
 #[test]
-fn no_byte_soup_panics() {
+fn random_bytes_never_panic() {
     let columns = scene(3, 1);
     let samples = [
         written(&columns, &meta(ExportFrame::Dataset)),

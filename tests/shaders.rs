@@ -169,7 +169,7 @@ fn every_shader_file_is_in_the_table_and_stages_have_their_twins() {
 }
 
 #[test]
-fn every_struct_of_the_tables_stands_in_a_shader() {
+fn every_struct_of_the_tables_is_in_a_shader() {
     let mut names = BTreeSet::new();
     for source in SOURCES {
         for variant in variants(source).unwrap() {

@@ -82,7 +82,7 @@ fn a_clean_end_leaves_nothing_behind() {
 }
 
 #[test]
-fn removing_leaves_what_is_not_ours() {
+fn removal_keeps_foreign_files() {
     let parent = tempfile::tempdir().unwrap();
     let folder = parent.path().join("spill");
     let outside = parent.path().join("outside");
@@ -104,7 +104,7 @@ fn removing_leaves_what_is_not_ours() {
 
 /// Somebody removed the folder while it was in use, and another run made its own there.
 #[test]
-fn a_store_that_took_the_place_of_ours_is_not_removed() {
+fn a_store_that_replaced_ours_is_not_removed() {
     let parent = tempfile::tempdir().unwrap();
     let folder = parent.path().join("spill");
     let ours = create(&folder).unwrap();
@@ -113,7 +113,7 @@ fn a_store_that_took_the_place_of_ours_is_not_removed() {
     write_segment(&folder, 0, theirs.format().store);
     let before = contents(&folder);
     let error = ours.remove().unwrap_err();
-    assert!(error.problem.contains("not the one that this run used"), "{error}");
+    assert!(error.problem.contains("another store has replaced"), "{error}");
     assert!(contents(&folder) == before);
     assert_eq!(theirs.remove().unwrap(), [""; 0]);
 }
@@ -128,17 +128,17 @@ fn folders_of_something_else_are_refused_and_untouched() {
     };
     let full = folder("full");
     std::fs::write(full.join("photo.jpg"), b"mine").unwrap();
-    assert_refused(&full, "it is not empty (there is \"photo.jpg\")");
+    assert_refused(&full, "it is neither empty nor a spill directory (it contains \"photo.jpg\")");
     let format = folder("format");
     std::fs::write(format.join("FORMAT"), b"of another program").unwrap();
     assert_refused(&format, "not the FORMAT file of a spill directory");
     assert!(SpillDir::open(&format, false).unwrap_err().to_string().contains("not the FORMAT file"));
     let lock = folder("lock");
     std::fs::write(lock.join("LOCK"), b"of another program").unwrap();
-    assert_refused(&lock, "it is a file of something else");
+    assert_refused(&lock, "this LOCK file is not from gsscale");
     let pipe = folder("pipe");
     rustix::fs::mknodat(rustix::fs::CWD, pipe.join("LOCK"), rustix::fs::FileType::Fifo, 0o600.into(), 0).unwrap();
-    assert_refused(&pipe, "it is a file of something else");
+    assert_refused(&pipe, "this LOCK file is not from gsscale");
     let links = folder("links");
     symlink(full.join("photo.jpg"), links.join("FORMAT")).unwrap();
     assert_refused(&links, "reading failed");
@@ -148,7 +148,7 @@ fn folders_of_something_else_are_refused_and_untouched() {
     assert_eq!(std::fs::read(full.join("photo.jpg")).unwrap(), b"mine");
     // Open never makes anything.
     let empty = folder("empty");
-    assert!(SpillDir::open(&empty, false).unwrap_err().to_string().contains("there is no FORMAT file"));
+    assert!(SpillDir::open(&empty, false).unwrap_err().to_string().contains("it has no FORMAT file"));
     assert!(contents(&empty).is_empty());
 }
 
@@ -165,7 +165,7 @@ fn links_and_files_and_missing_parents_are_refused() {
     assert!(error(&parent.path().join("dangling")).contains("is a symbolic link"));
     assert!(error(&file).contains("is not a folder"));
     // A drive that is not mounted must not become a folder of the drive below.
-    assert!(error(&parent.path().join("nowhere/spill")).contains("making the spill directory failed"));
+    assert!(error(&parent.path().join("nowhere/spill")).contains("creating the spill directory failed"));
     assert!(contents(&real).is_empty() && !parent.path().join("nowhere").exists());
 }
 
@@ -174,7 +174,7 @@ fn left_over_directories_are_refused_with_the_remedy() {
     let parent = tempfile::tempdir().unwrap();
     let folder = parent.path().join("spill");
     drop(create(&folder).unwrap());
-    assert_refused(&folder, "a run that was cut off");
+    assert_refused(&folder, "an interrupted run");
     assert!(create(&folder).unwrap_err().remedy.contains("rm -r"));
     let kept = parent.path().join("kept");
     let store = SpillDir::create(&kept, Purpose::Checkpoint, LAYOUT, false).unwrap().format().store;
@@ -212,7 +212,7 @@ fn folders_of_or_open_to_others_are_refused() {
     drop(create(&open).unwrap());
     assert_eq!(open.metadata().unwrap().mode() & 0o777, 0o700, "an empty folder becomes private");
     may(0o770);
-    assert!(SpillDir::open(&open, false).unwrap_err().to_string().contains("other users may write"));
+    assert!(SpillDir::open(&open, false).unwrap_err().to_string().contains("other users have write permission"));
     let foreign = if is_root() {
         let folder = parent.path().join("foreign");
         std::fs::create_dir(&folder).unwrap();
@@ -225,7 +225,7 @@ fn folders_of_or_open_to_others_are_refused() {
 }
 
 #[test]
-fn memory_is_warned_of() {
+fn a_spill_directory_in_memory_is_warned_about() {
     let memory = Path::new("/dev/shm");
     let mounts = std::fs::read_to_string("/proc/mounts").unwrap_or_default();
     if !mounts.contains(" /dev/shm tmpfs ") {
@@ -334,14 +334,14 @@ fn two_processes_never_share_a_directory() {
     // Killed, not ended: the lock goes with the process, what it left is told for what it is.
     holder.kill().unwrap();
     holder.wait().unwrap();
-    assert_refused(&folder, "a run that was cut off");
+    assert_refused(&folder, "an interrupted run");
     let in_use = SpillDir::open(&folder, false).unwrap();
     assert!(ask("create", &folder).contains(&format!("process {}", std::process::id())));
     assert_eq!(in_use.remove().unwrap(), [""; 0]);
 }
 
 #[test]
-fn of_many_that_race_one_wins() {
+fn of_many_racing_processes_one_wins() {
     let parent = tempfile::tempdir().unwrap();
     for round in 0..4 {
         let folder = parent.path().join(format!("spill{round}"));

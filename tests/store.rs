@@ -146,7 +146,7 @@ fn assert_damaged(store: &mut PagedStore, page: u64, slot: &SlotRef, why: &str) 
 }
 
 #[test]
-fn pages_come_back_to_the_bit() {
+fn pages_round_trip_bit_for_bit() {
     for codec in CODECS {
         let mut store = PagedStore::new(Box::new(MemoryEngine::new()), config(codec));
         let mut kept = Vec::new();
@@ -207,7 +207,7 @@ fn every_flipped_bit_is_found_and_named() {
 }
 
 #[test]
-fn what_another_read_mends_is_not_an_error() {
+fn a_fault_that_a_second_read_mends_is_not_an_error() {
     let faults = [Fault::FlipBit(40_000), Fault::Error(io::ErrorKind::Other), Fault::Short, Fault::Torn, Fault::Lost];
     for (fault, codec) in faults.iter().flat_map(|fault| CODECS.map(|codec| (*fault, codec))) {
         let (mut store, faults, _) = faulty(codec);
@@ -233,13 +233,13 @@ fn misdirected_and_lost_transfers_are_found() {
         let bytes = 9000;
         let [a, b] = [1, 2].map(|page| write(&mut store, page, &payload(page, 0, bytes)));
         faults.add(Operation::Read, 0, true, Fault::Misdirected(b.place));
-        assert_damaged(&mut store, 1, &a, "page 2 is there instead");
+        assert_damaged(&mut store, 1, &a, "it holds page 2 instead");
         faults.clear();
         // A write that went to the slot of another page: both are found out.
         faults.add(Operation::Write, 2, false, Fault::Misdirected(b.place));
         let c = write(&mut store, 4, &payload(4, 0, bytes));
         assert_damaged(&mut store, 4, &c, "there is no slot header here");
-        assert_damaged(&mut store, 2, &b, "page 4 is there instead");
+        assert_damaged(&mut store, 2, &b, "it holds page 4 instead");
         // A write that went nowhere, over nothing, over an older version of the same page, and a torn one.
         store.free(&c);
         faults.add(Operation::Write, 3, true, Fault::Lost);
@@ -259,7 +259,7 @@ fn misdirected_and_lost_transfers_are_found() {
         shared.at(good.place, |slot| copy.copy_from_slice(&slot[..good.transfer_bytes()]));
         let moved = SlotRef { place: f.place, ..good };
         shared.at(f.place, |slot| slot[..copy.len()].copy_from_slice(&copy));
-        assert_damaged(&mut store, 6, &moved, "it was meant for segment");
+        assert_damaged(&mut store, 6, &moved, "its header names another place");
         let other = PagedStoreConfig { store: STORE + 1, ..config(codec) };
         let mut other = PagedStore::open(Box::new(shared), other, 2, [&good]).unwrap();
         assert_damaged(&mut other, 6, &good, "it belongs to another store");

@@ -22,7 +22,7 @@ mod sweep;
 
 use clap::Parser;
 use gsscale::base::error::InputError;
-use gsscale::config::choice::{Choice, Device};
+use gsscale::config::choice::Choice;
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::config::limits::simd_path;
 use gsscale::config::published::BUILT_IN;
@@ -51,7 +51,8 @@ fn main() -> ExitCode {
     let mut named = |known: &str| {
         let is = name.as_deref() == Some(known);
         if is {
-            // What is left is parsed as a program of its own, whose usage line names the measurement.
+            // The remaining arguments are parsed as those of a program of its own, whose usage line names the
+            // measurement.
             arguments.remove(1);
         }
         is
@@ -83,7 +84,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// The config of a measurement, checked, with its worker threads started.
+/// The checked config of a measurement; starts its worker threads.
 fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, TrainError> {
     let mut config = file.map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
     keys.clone().apply(&mut config);
@@ -93,7 +94,7 @@ fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, Tra
         return Err(InputError::new("--simd", problem, "use --simd auto").into());
     }
     if config.threads > 0 {
-        // Fails only where the pool exists already, which it does not at the start of main.
+        // Fails only if the pool exists already, which it does not at the start of main.
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
     }
     Ok(config)

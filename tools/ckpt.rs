@@ -1,5 +1,5 @@
-//! `gsscale-ckpt`: looks at checkpoints, verifies, exports, imports, copies and repairs them. Parses, calls the library,
-//! prints; one file a subcommand.
+//! `gsscale-ckpt`: lists, verifies, exports, imports, copies and repairs checkpoints. Parses, calls the library,
+//! prints; one file per subcommand.
 
 #[path = "ckpt/clone.rs"]
 mod clone;
@@ -31,16 +31,16 @@ use std::process::ExitCode;
 const EXAMPLES: &str = "\
 Examples:
   gsscale-ckpt ls runs/village                         generations: step, PSNR, Gaussians, bytes
-  gsscale-ckpt verify runs/village --deep              every checksum and value; exit code 1 if anything is damaged
+  gsscale-ckpt verify runs/village --deep              verifies every checksum and value; exit code 1 on damage
   gsscale-ckpt export runs/village --out village.ply   the PLY as of the last commit
-  gsscale-ckpt rollback runs/village 41 --yes          the next --resume goes on from generation 41
-  gsscale-ckpt clone runs/village /mnt/other/village   to another drive
-  gsscale-ckpt salvage runs/village --out rescued      when verify says that the map is damaged
+  gsscale-ckpt rollback runs/village 41 --yes          the next --resume continues from generation 41
+  gsscale-ckpt clone runs/village /mnt/other/village   copies the store to another drive
+  gsscale-ckpt salvage runs/village --out rescued      if verify reports a damaged map
 
 DIR is the output folder of a run, or its spill directory. ls, inspect, verify, export, clone and salvage never
 write to it. `gsscale-ckpt COMMAND --help` has examples of each.";
 
-/// Looks at checkpoints, verifies, exports, imports, copies and repairs them.
+/// Lists, verifies, exports, imports, copies and repairs checkpoints.
 #[derive(Parser)]
 #[command(name = "gsscale-ckpt", version, after_help = EXAMPLES)]
 struct Args {
@@ -52,21 +52,21 @@ struct Args {
 enum Command {
     /// Lists generations and named checkpoints
     Ls(ls::Args),
-    /// Shows a store, its trainer's state, or one page
+    /// Shows a store, its training state, or one page
     Inspect(inspect::Args),
     /// Verifies a store and lists every fault; exit code 1 if there is one
     Verify(verify::Args),
     /// Makes an earlier generation the last one
     Rollback(rollback::Args),
-    /// Takes names of checkpoints away; what only they kept becomes free
+    /// Removes names of checkpoints, and frees what only they kept
     Prune(prune::Args),
     /// Writes the Gaussians of a generation as a PLY
     Export(export::Args),
-    /// Makes a store of the Gaussians of a PLY
+    /// Makes a store from the Gaussians of a PLY
     Import(import::Args),
     /// Copies a store to another drive
     Clone(clone::Args),
-    /// Rebuilds a damaged store elsewhere from what is whole
+    /// Rebuilds a damaged store elsewhere from its intact pages
     Salvage(salvage::Args),
 }
 
@@ -101,7 +101,7 @@ fn is_damaged_map(error: &TrainError) -> bool {
     )
 }
 
-/// Prints `value` as JSON, or lines of text.
+/// Prints `value` as JSON or as text.
 fn print(json: bool, value: &impl Serialize, text: impl FnOnce() -> String) -> Result<(), TrainError> {
     let text = match json {
         true => serde_json::to_string_pretty(value)
@@ -112,7 +112,7 @@ fn print(json: bool, value: &impl Serialize, text: impl FnOnce() -> String) -> R
     Ok(())
 }
 
-/// Rows of words as columns: the first left, the others right.
+/// Formats rows of words as columns, the first left-aligned, the others right-aligned.
 fn table(rows: &[Vec<String>]) -> String {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let widths: Vec<usize> = (0..columns)

@@ -28,16 +28,16 @@ struct Args {
     /// Config file; by default the run's own, or the defaults for a bare PLY. Flags override it
     #[arg(long)]
     config: Option<PathBuf>,
-    /// Write render-beside-photo pictures here
+    /// Write pictures of render and photo side by side into this folder
     #[arg(long)]
     renders: Option<PathBuf>,
-    /// Measure LPIPS too, with these weights (safetensors; tools/README.md says how to make them)
+    /// Measure LPIPS as well, with these weights (safetensors; see tools/README.md)
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
-    /// What LPIPS's network is fed: signed (-1..1, what it was trained for) or unit (0..1, as the 3DGS code does)
+    /// Input range of LPIPS's network: signed (-1..1, as it was trained) or unit (0..1, as in the 3DGS code)
     #[arg(long, default_value = "signed", value_name = "RANGE")]
     lpips_range: InputRange,
-    /// Write the numbers here as JSON too
+    /// Also write the numbers to this file, as JSON
     #[arg(long)]
     json: Option<PathBuf>,
     #[command(flatten)]

@@ -1,4 +1,4 @@
-//! `gsscale-iotune`: measures how a drive moves pages and prints the lines for a config. Parses flags, calls the
+//! `gsscale-iotune`: measures how fast a drive moves pages and prints lines for a config. Parses flags, calls the
 //! library, prints.
 
 use clap::Parser;
@@ -17,42 +17,42 @@ use std::process::ExitCode;
 
 const EXAMPLES: &str = "\
 Examples:
-  gsscale-iotune /mnt/nvme                        about 20 s, a file of 512 MiB, some 4 GiB written
-  gsscale-iotune /mnt/nvme --seconds 60           steadier figures
+  gsscale-iotune /mnt/nvme                        takes about 20 s, a test file of 512 MiB, writes up to 4 GiB
+  gsscale-iotune /mnt/nvme --seconds 60           more stable figures
   gsscale-iotune /mnt/nvme --file 4GiB            larger than the drive's own cache
 
-Figures are medians over rounds that visit every case in turn. Nothing stays on the drive.
+Figures are medians over rounds of all cases. No file stays on the drive.
 Put the printed lines into a config file: gsscale-train SCENE --config FILE --spill-dir DIR";
 
-/// Rows of the page sizes that are tried.
+/// Page sizes to measure, rows.
 const PAGE_ROWS: [usize; 6] = [128, 256, 512, 1024, 2048, 4096];
-/// The page size at which engines and depths are compared.
+/// Page size at which engines and depths are compared, rows.
 const USUAL_ROWS: usize = 1024;
-/// Transfers in flight at which sizes are compared.
+/// Queue depth at which sizes are compared.
 const USUAL_DEPTH: usize = 8;
 const DEPTHS: [usize; 6] = [1, 2, 4, 8, 16, 32];
-/// Sizes besides those of pages, bytes.
+/// Transfer sizes besides those of pages, bytes.
 const POWERS: [usize; 7] = [64 << 10, 128 << 10, 256 << 10, 512 << 10, 1 << 20, 2 << 20, 4 << 20];
-/// In this order engines win ties: less work for the processor first.
+/// Engines in the order in which they win ties: least CPU work first.
 const ENGINES: [IoEngine; 3] = [IoEngine::Uring, IoEngine::Pread, IoEngine::Mmap];
-/// Share of the best rate that counts as just as good: rates of one drive differ by more from day to day.
+/// Fraction of the best rate that counts as equal: rates of one drive vary by more from day to day.
 const AS_GOOD: f64 = 0.9;
-/// Bands of the pages that are tried.
+/// SH degree of the measured pages.
 const SH_DEGREE: u8 = 3;
 
-/// Measure how fast a drive moves pages, and print what to put into a config
+/// Measure how fast a drive moves pages, and print lines for a config
 #[derive(Debug, Parser)]
 #[command(name = "gsscale-iotune", version, after_help = EXAMPLES)]
 struct Flags {
     /// A folder on the drive
     dir: PathBuf,
-    /// Size of the file that is measured with
+    /// Size of the test file
     #[arg(long, default_value = "512MiB", value_name = "SIZE", value_parser = parse_bytes)]
     file: u64,
-    /// Time for everything, seconds
+    /// Total time, seconds
     #[arg(long, default_value_t = 20.0)]
     seconds: f64,
-    /// Most bytes written besides the file itself
+    /// Most bytes to write besides the test file
     #[arg(long, default_value = "4GiB", value_name = "SIZE", value_parser = parse_bytes)]
     written: u64,
 }
@@ -71,7 +71,7 @@ fn run(flags: &Flags) -> InputResult<()> {
     if !(1.0..=3600.0).contains(&flags.seconds) {
         return Err(InputError::new("--seconds", "the value is out of range", "use 1 to 3600"));
     }
-    // The largest transfers that are tried must find the drive busy.
+    // The file must be large enough to keep the drive busy with the largest transfers.
     if !((64 << 20)..=(1 << 40)).contains(&flags.file) {
         return Err(InputError::new("--file", "the value is out of range", "use 64MiB to 1TiB"));
     }
@@ -92,7 +92,7 @@ fn run(flags: &Flags) -> InputResult<()> {
     sweep.notes.iter().for_each(|note| gsscale::say!("note: {note}"));
     print_tables(&sweep);
     gsscale::say!(
-        "\n{} whole rounds, {} written to the drive; nothing of it stays.",
+        "\n{} complete rounds, {} written to the drive; the test files are removed.",
         sweep.rounds,
         format_bytes(sweep.written_bytes)
     );
@@ -101,21 +101,23 @@ fn run(flags: &Flags) -> InputResult<()> {
 
 fn warn_about(folder: &Path) {
     match FileSystem::of(folder) {
-        Ok(FileSystem::Memory) => gsscale::say!("note: this folder lies in memory; these are no figures of a drive"),
-        Ok(FileSystem::Remote(kind)) => {
-            gsscale::say!("note: this folder lies on {kind}; training refuses it as --spill-dir")
+        Ok(FileSystem::Memory) => {
+            gsscale::say!("note: this folder is in memory, so the figures are not those of a drive")
         }
-        // An unreadable folder is told of when it is used.
+        Ok(FileSystem::Remote(kind)) => {
+            gsscale::say!("note: this folder is on {kind}; training refuses it as --spill-dir")
+        }
+        // An unreadable folder is reported when it is used.
         _ => {}
     }
 }
 
-/// Bytes that are moved for a full page.
+/// Bytes transferred for a full page.
 fn page_bytes(rows: usize) -> usize {
     transfer_bytes(capacity_bytes(rows, SH_DEGREE))
 }
 
-/// The usual page with the usual depth first, since it matters most; then depths, then sizes.
+/// The cases: the usual page at the usual depth first, since it matters most; then depths, then sizes.
 fn cases() -> Vec<Case> {
     let usual = page_bytes(USUAL_ROWS);
     let depths = [USUAL_DEPTH].into_iter().chain(DEPTHS.into_iter().filter(|&d| d != USUAL_DEPTH));
@@ -155,7 +157,7 @@ fn print_line(sweep: &Sweep, name: &str, bytes: usize, depth: usize) {
     gsscale::say!("{line}");
 }
 
-/// What follows from the figures.
+/// Recommended settings.
 #[derive(Debug, PartialEq)]
 struct Advice {
     engine: IoEngine,
@@ -163,7 +165,7 @@ struct Advice {
     codec: Codec,
 }
 
-/// The first engine as good as the best one, then its smallest page as good as its best one (smaller pages waste
+/// The first engine that equals the best one, then its smallest page that equals its best page (smaller pages waste
 /// fewer rows on views that see only part of them).
 fn advise(sweep: &Sweep) -> Option<Advice> {
     let both = |engine, rows| find(sweep, engine, page_bytes(rows), USUAL_DEPTH).and_then(Measured::both);
@@ -178,9 +180,13 @@ fn advise(sweep: &Sweep) -> Option<Advice> {
 fn print_advice(folder: &Path, sweep: &Sweep) -> InputResult<()> {
     let Some(advice) = advise(sweep) else {
         let problem = "the time was too short to measure anything";
-        return Err(InputError::new(folder, problem, "give it more with --seconds, or measure with a smaller --file"));
+        return Err(InputError::new(
+            folder,
+            problem,
+            "give more time with --seconds, or measure with a smaller --file",
+        ));
     };
-    gsscale::say!("\n# for this drive; page-rows belongs to a run and cannot be changed when it is resumed");
+    gsscale::say!("\n# for this drive; a resumed run cannot change page-rows");
     gsscale::say!("io = \"{}\"", advice.engine);
     gsscale::say!("page-rows = {}", advice.page_rows);
     gsscale::say!("spill-codec = \"{}\"", advice.codec);
@@ -192,7 +198,7 @@ fn print_advice(folder: &Path, sweep: &Sweep) -> InputResult<()> {
 mod tests {
     use super::*;
 
-    /// A drive whose rates are known: requests cost a fixed time, then bytes per second that differ by engine.
+    /// A drive of known rates: requests cost a fixed time, plus bytes at a rate that depends on the engine.
     fn imagined(rate_of: impl Fn(IoEngine) -> f64, seconds_per_request: f64) -> Sweep {
         let measured = cases().into_iter().map(|case| {
             let bytes = case.bytes as f64;
@@ -208,7 +214,7 @@ mod tests {
         assert_eq!(same, Advice { engine: IoEngine::Uring, page_rows: 128, codec: Codec::Raw });
         let slow_ring = |engine| if engine == IoEngine::Uring { 1e9 } else { 3e9 };
         assert_eq!(advise(&imagined(slow_ring, 0.0)).unwrap().engine, IoEngine::Pread);
-        // Of 3 MB a page of 4096 rows takes 1 ms to move, so requests of 0.1 ms count at smaller pages.
+        // At 3 GB/s a page of 4096 rows takes 1 ms, so 0.1 ms per request matters for smaller pages.
         let costly = advise(&imagined(|_| 3e9, 1e-4)).unwrap();
         assert!(costly.page_rows > 512, "{costly:?}");
         let disk = advise(&imagined(|_| 2e8, 0.0)).unwrap();

@@ -1,4 +1,4 @@
-//! `gsscale-plan`: what a run would read and write through the disk tier, and how long it would take, before it. Parses,
+//! `gsscale-plan`: predicts what a run would read and write through the disk tier, and how long it would take. Parses,
 //! calls the library, prints; leaves no file.
 
 use clap::Parser;
@@ -35,26 +35,27 @@ Examples:
   gsscale-plan scans/city --host-mem 4GiB --drive-read 3GB --step-seconds 0.05   # another machine's drive and GPU
   gsscale-plan runs/city --host-mem 2GiB --lists 100..110
 
-Pages are those of the first Gaussians; --growth 5 plans as if each page had grown to five.
-Hit rates are shares of a step's pages that are in memory already: of a cache that knows the plan, and 'of lru', one that
-drops what was used longest ago. Waiting assumes that the drive does one thing at a time, and that every step takes --step-seconds.
-Time is that of all steps for the Gaussians of the start (a scene that grows takes longer), without import, evaluation, commits
-and the decoding of photos: a run takes up to a third more than the steps that were timed.";
+Pages are those of the first Gaussians; --growth 5 plans as if each page had grown five times as large.
+'hit rate' is the fraction of a step's pages that are already in memory, for a cache that knows the plan; 'of lru' the same for
+least-recently-used eviction. Waiting assumes that the drive does one transfer at a time, and that every step takes --step-seconds.
+Time is that of all steps with the Gaussians of the start (a scene that grows takes longer), without import, evaluation, commits
+and decoding of photos: a run takes up to a third longer than the timed steps.";
 
-/// Bytes per second that a common NVMe drive reads and writes.
+/// Read and write rates of a common NVMe drive, bytes per second.
 const COMMON_DRIVE: [f64; 2] = [3e9, 2e9];
-/// Epochs that are gone through; later ones are counted like the mean of those after the first.
+/// Epochs to simulate; later ones count as the mean of those after the first.
 const EPOCHS: u32 = 4;
 
-/// Frames that are compared when none are named, percent of the pages.
+/// Numbers of frames to compare by default, percent of the pages.
 const SHARES: [usize; 4] = [10, 25, 50, 100];
-/// Step of a scene in which nothing can be timed, seconds.
+/// Assumed step time of a scene in which nothing can be timed, seconds.
 const STEP_ASSUMED: f64 = 0.3;
-/// Twice the Gaussians make a step take 1.45 times as long (`gsscale-bench pareto`): a step grows with this power of them.
+/// With twice the Gaussians a step takes 1.45 times as long (`gsscale-bench pareto`): step time grows with this power
+/// of their number.
 const STEP_GROWTH: f64 = 0.54;
 
-/// Says what a run would read and write through the disk tier and how long it would take, for any memory, page size and order
-/// of views.
+/// Predicts what a run would read and write through the disk tier and how long it would take, for any memory, page size
+/// and view order.
 #[derive(Parser)]
 #[command(name = "gsscale-plan", version, after_help = EXAMPLES)]
 struct Args {
@@ -63,32 +64,33 @@ struct Args {
     /// Config file; flags override it
     #[arg(long)]
     config: Option<PathBuf>,
-    /// Numbers of frames, or their shares of all pages, to compare; without it --frames or --host-mem, or else
-    /// 10%,25%,50%,100%, but as many as the largest view needs
+    /// Numbers of frames to compare, or percentages of all pages; default: --frames or --host-mem if given, otherwise
+    /// 10%,25%,50%,100%, but at least as many as the largest view needs
     #[arg(long, value_delimiter = ',', value_name = "N|N%", help_heading = "Plan")]
     compare_frames: Vec<String>,
-    /// Orders of views to compare: auto, shuffle, groups:N, tour; without it --view-order, or else auto and shuffle
+    /// View orders to compare: auto, shuffle, groups:N, tour; default: --view-order if given, otherwise auto and
+    /// shuffle
     #[arg(long, value_delimiter = ',', value_name = "ORDER", help_heading = "Plan")]
     compare_orders: Vec<Chosen<Order>>,
     /// Plan as if every page had grown to this many
     #[arg(long, default_value_t = 1.0, value_name = "X", help_heading = "Plan")]
     growth: f64,
-    /// Print the exact pages that enter and leave in these steps, for the first order and number of frames
+    /// List the pages read and evicted in these steps, for the first order and number of frames
     #[arg(long, value_parser = parse_range, value_name = "A..B", help_heading = "Plan")]
     lists: Option<Range<u32>>,
-    /// Bytes per second that the drive reads; without it the drive of --spill-dir is measured, and with neither it is 3GB
+    /// Read rate of the drive, bytes per second; default: measured on the drive of --spill-dir, or 3GB without one
     #[arg(long, value_name = "SIZE", help_heading = "Drive")]
     drive_read: Option<ByteSize>,
-    /// Bytes per second that the drive writes; without it measured likewise, or 2GB
+    /// Write rate of the drive, bytes per second; default: measured likewise, or 2GB
     #[arg(long, value_name = "SIZE", help_heading = "Drive")]
     drive_write: Option<ByteSize>,
-    /// Seconds of a step that waits for nothing; without it a few steps on the device of the run are timed
+    /// Seconds per step without waiting for pages; default: timed in a few steps on the run's device
     #[arg(long, value_name = "S", help_heading = "Drive")]
     step_seconds: Option<f64>,
-    /// Bytes that the drive is rated to write in its life
+    /// Bytes that the drive is rated to write in its lifetime
     #[arg(long, default_value = "300TB", value_name = "SIZE", help_heading = "Drive")]
     endurance: ByteSize,
-    /// Memory that the planning itself may take; with less the plan looks less far
+    /// Memory for the planning itself; with less the plan looks less far ahead
     #[arg(long, default_value = "1GiB", value_name = "SIZE", help_heading = "Plan")]
     plan_mem: ByteSize,
     /// Print JSON
@@ -99,31 +101,31 @@ struct Args {
 }
 
 fn parse_range(text: &str) -> Result<Range<u32>, String> {
-    let wrong = || format!("'{text}' is no range of steps; write for example 100..110");
+    let wrong = || format!("'{text}' is not a range of steps; write for example 100..110");
     let (from, to) = text.split_once("..").ok_or_else(wrong)?;
     let range = from.parse().map_err(|_| wrong())?..to.parse().map_err(|_| wrong())?;
     if range.is_empty() { Err(wrong()) } else { Ok(range) }
 }
 
-/// What all plans of this program have in common.
+/// Data shared by all plans of this program.
 struct Scene {
     config: TrainConfig,
     cameras: Vec<Camera>,
     index: Vec<PageMeta>,
-    /// On disk, by page, header and padding included.
+    /// Bytes of each page on disk, including header and padding.
     page_bytes: Vec<u32>,
-    /// Of one frame.
+    /// Bytes of one frame.
     frame_bytes: u64,
     drive: DriveModel,
-    /// What rendered the steps that were timed.
+    /// The device that rendered the timed steps.
     timed_on: Option<String>,
     views: ViewPages,
     gaussians: u64,
-    /// Frames that --host-mem leaves beside what else a run holds, where it was given.
+    /// Number of frames that fit in --host-mem besides the run's other memory, if it was given.
     frames_within: Option<u64>,
 }
 
-/// One line of the answer.
+/// One line of the result.
 struct Row {
     order: Order,
     is_automatic: bool,
@@ -132,7 +134,7 @@ struct Row {
     figures: Figures,
     lru: Figures,
     stall: Stall,
-    /// Of all steps.
+    /// Time of all steps, seconds.
     seconds: f64,
     total_read: f64,
     total_written: f64,
@@ -190,7 +192,7 @@ fn load(args: &Args) -> InputResult<Scene> {
         return Err(InputError::new("--optimizer", problem, "plan for deferred, which gives the same"));
     }
     if !(1.0..=1e6).contains(&args.growth) || args.step_seconds.is_some_and(|s| !(0.0..=1e6).contains(&s)) {
-        let problem = "--growth and --step-seconds must be numbers from 1 and 0 on";
+        let problem = "--growth must be at least 1, --step-seconds at least 0";
         return Err(InputError::new("--growth, --step-seconds", problem, "leave them out"));
     }
     if [args.drive_read, args.drive_write].iter().flatten().any(|rate| rate.0 == 0) {
@@ -202,7 +204,7 @@ fn load(args: &Args) -> InputResult<Scene> {
     }
     let path = if is_run { scene_of_run(&run_config)? } else { args.scene.clone() };
     let [read_rate, write_rate] = drive_rates(args, &config)?;
-    // Where frames are named, what a memory would hold is not asked for.
+    // If frames are given, the memory limit is not needed.
     let is_asked = args.compare_frames.is_empty() && config.frames == 0 && config.host_mem.0 > 0;
     let look_for = LookFor {
         frames_within: is_asked.then_some(config.host_mem.0),
@@ -235,13 +237,13 @@ fn load(args: &Args) -> InputResult<Scene> {
     })
 }
 
-/// Where lists go that outgrow memory: beside the pages if it is known where these would be.
+/// Folder for lists that exceed memory: beside the pages, if their folder is known.
 fn folder_for(config: &TrainConfig) -> PathBuf {
     let above = config.residence().spill_dir().and_then(|dir| dir.ancestors().find(|folder| folder.is_dir()));
     above.map_or_else(std::env::temp_dir, Path::to_path_buf)
 }
 
-/// What the flags say, what the drive of the spill directory does, or else what common drives do.
+/// Read and write rates: from the flags, measured on the drive of the spill directory, or those of a common drive.
 fn drive_rates(args: &Args, config: &TrainConfig) -> InputResult<[f64; 2]> {
     let named = [args.drive_read, args.drive_write].map(|rate| rate.map(|rate| rate.0 as f64));
     let measured = match named {
@@ -263,9 +265,7 @@ fn scene_of_run(config: &Path) -> InputResult<PathBuf> {
     let text = std::fs::read_to_string(config).map_err(|e| InputError::io(config, "reading", &e))?;
     let scene =
         text.parse::<toml::Table>().ok().and_then(|t| t.get("resolved")?.get("scene")?.as_str().map(PathBuf::from));
-    scene.ok_or_else(|| {
-        InputError::new(config, "it does not say which scene it is of", "give the scene's folder instead")
-    })
+    scene.ok_or_else(|| InputError::new(config, "it does not name its scene", "give the scene's folder instead"))
 }
 
 fn state_bytes(scene: &Scene) -> u64 {
@@ -282,7 +282,7 @@ fn frames(args: &Args, scene: &Scene) -> InputResult<Vec<usize>> {
     }
     frames.extend(scene.frames_within.map(|frames| frames as usize));
     if args.compare_frames.is_empty() && frames.is_empty() {
-        // Nobody named these: they are as many as it takes.
+        // Default numbers are raised to what the largest view needs.
         let share = |percent: usize| (percent * pages).div_ceil(100).max(scene.views.most());
         frames.extend(SHARES.map(share));
         frames.dedup();
@@ -299,7 +299,7 @@ fn frames(args: &Args, scene: &Scene) -> InputResult<Vec<usize>> {
         let wrong = || {
             InputError::new(
                 "--compare-frames",
-                format!("'{text}' is no number of frames"),
+                format!("'{text}' is not a number of frames"),
                 "write for example 2000 or 25%",
             )
         };
@@ -329,7 +329,8 @@ fn order(args: &Args, scene: &Scene, frames: usize, asked: Chosen<Order>) -> Inp
 fn too_few(scene: &Scene, error: &TooFewFrames) -> InputError {
     let most = scene.views.most().max(error.needed);
     let bytes = format_bytes(most as u64 * scene.frame_bytes);
-    let remedy = format!("the largest view needs --frames {most}, {bytes} of --host-mem beside what else a run holds");
+    let remedy =
+        format!("the largest view needs --frames {most}, {bytes} of --host-mem besides the run's other memory");
     InputError::new("--frames", error.to_string(), remedy)
 }
 
@@ -359,7 +360,7 @@ fn row(args: &Args, scene: &Scene, frames: usize, asked: Chosen<Order>) -> Input
             + timed.stall(0..timed.steps.len(), &scene.drive).seconds
             + rest * stall.seconds / f64::from(figures.steps.max(1)),
         stall,
-        // The import leaves pages in the frames.
+        // The import leaves pages in the frames, so that the run need not read them.
         total_read: planned.read_by_run() as f64 + rest * figures.read_per_step,
         // Every page is written once before the first step.
         total_written: state_bytes(scene) as f64 + written as f64 + rest * figures.written_per_step,
@@ -447,12 +448,12 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
         },
     );
     if rows.iter().any(|row| !row.planned.is_exact) {
-        text += "\nThe plan did not reach two epochs ahead: with a larger --plan-mem less may be read.";
+        text += "\nThe plan reached less than two epochs ahead: a larger --plan-mem may reduce reads.";
     }
     text
 }
 
-/// The exact pages that enter and leave in some steps.
+/// The pages read and evicted in some steps.
 fn lists(args: &Args, scene: &Scene, frames: usize, range: Range<u32>) -> InputResult<String> {
     let order = order(args, scene, frames, orders(args, &scene.config)[0])?;
     let mut views = ViewOrder::new(order, scene.config.seed, &scene.cameras);

@@ -21,14 +21,14 @@ Examples:
   gsscale-synth utm --offset 500000,4600000,120       coordinates as large as UTM's
   gsscale-synth rubble --layout colmap-merged         a look-alike of Mill-19, for gsscale-bench run rubble
 
-The same flags give the same bytes, whatever the number of threads.
-Then: gsscale-train city --out runs/city";
+The same flags give the same bytes for any number of threads.
+Next: gsscale-train city --out runs/city";
 
-/// Make a city, fly over it, and write the photos as a COLMAP scene
+/// Generate a city, fly over it, and write the photos as a COLMAP scene
 #[derive(Debug, Parser)]
 #[command(name = "gsscale-synth", version, after_help = EXAMPLES)]
 struct Flags {
-    /// Folder to write: images/ and sparse/0/, or what --layout says
+    /// Folder to write: images/ and sparse/0/, or the layout of --layout
     dir: PathBuf,
     /// Number of photos; the city grows with it
     #[arg(long, default_value_t = 60, help_heading = "Size")]
@@ -36,36 +36,36 @@ struct Flags {
     /// Size of a photo, pixels
     #[arg(long, default_value = "480x320", value_name = "WxH", value_parser = parse_size, help_heading = "Size")]
     resolution: (u32, u32),
-    /// Number of points, as structure from motion would find them
+    /// Number of points, as if from structure from motion
     #[arg(long, default_value_t = 20_000, help_heading = "Size")]
     points: u32,
-    /// Side of the city in blocks of 60 m [default: what the views cover]
+    /// Side of the city in blocks of 60 m [default: covers the views]
     #[arg(long, help_heading = "Size")]
     blocks: Option<u32>,
-    /// Repeat the city so many times along x and y: --points times AxB points in all, written in bounded memory. The
-    /// photos are shared out among the copies; what they show of the neighbours is missing
+    /// Repeat the city this many times along x and y: --points times AxB points in total, written in bounded memory.
+    /// The photos are divided among the copies, and do not show neighbouring copies
     #[arg(long, default_value = "1x1", value_name = "AxB", value_parser = parse_size, help_heading = "Size")]
     tile: (u32, u32),
-    /// Another seed is another city
+    /// Seed of the city
     #[arg(long, default_value_t = 1, help_heading = "Size")]
     seed: u64,
     /// Standard deviation of the photos' brightness: 0.03 is 3 %
     #[arg(long, default_value_t = 0.0, help_heading = "Camera")]
     exposure: f64,
-    /// Standard deviation of the sensor noise as a share of white
+    /// Standard deviation of the sensor noise as a fraction of white
     #[arg(long, default_value_t = 0.0, help_heading = "Camera")]
     noise: f64,
-    /// N casts NxN rays through a pixel where surfaces meet
+    /// Cast NxN rays through a pixel where surfaces meet
     #[arg(long, default_value_t = 3, value_name = "N", help_heading = "Camera")]
     supersample: u32,
-    /// Added to all coordinates, metres
+    /// Offset added to all coordinates, metres
     #[arg(long, default_value = "0,0,0", value_name = "X,Y,Z", value_parser = parse_offset, allow_hyphen_values = true, help_heading = "Output")]
     offset: [f64; 3],
-    /// Folders and files as in a published dataset: colmap, colmap-merged (Mill-19 with COLMAP models in train and val),
-    /// mega-nerf (Mill-19), gauu (GauU-Scene) or matrixcity
+    /// Layout of the files, as in a published dataset: colmap, colmap-merged (Mill-19 with COLMAP models in train and
+    /// val), mega-nerf (Mill-19), gauu (GauU-Scene) or matrixcity
     #[arg(long, default_value = "colmap", help_heading = "Output")]
     layout: Layout,
-    /// Hold out every N-th photo, where the layout has a folder for them (--layout)
+    /// Hold out every N-th photo, in layouts with a held-out folder (--layout)
     #[arg(long, default_value_t = 8, value_name = "N", help_heading = "Output")]
     test_every: usize,
     /// Threads [default: all]
@@ -101,7 +101,7 @@ fn main() -> ExitCode {
 
 fn run(flags: &Flags) -> InputResult<()> {
     if let Some(threads) = flags.threads {
-        // Fails only where the pool exists already, which it does not at the start of main.
+        // Fails only if the pool exists already, which it does not at the start of main.
         let _ = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
     }
     let options = CityOptions {

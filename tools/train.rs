@@ -13,14 +13,14 @@ use std::process::ExitCode;
 
 const EXAMPLES: &str = "\
 Examples:
-  gsscale-train --demo --out runs/demo              a generated city, from nothing to pictures
+  gsscale-train --demo --out runs/demo              generate a city, train on it, write pictures
   gsscale-train scans/village --out runs/village    a COLMAP scene: images/ and sparse/0/
   gsscale-train scans/village --out runs/quick --steps 7000 --max-resolution 800
   gsscale-train scans/village --out runs/big --max-gaussians 2000000 --config configs/in_core.toml
-  gsscale-train scans/village --out runs/gpu --device gpu   on a GPU; --list-devices shows which there are
-  gsscale-train --resume runs/village               go on with a run that stopped or was cut off
-  gsscale-train --resume runs/village --steps 60000 more steps for a run that was made with --keep-checkpoint
-  gsscale-train scans/village --dry-run             what was understood, and the memory it will take
+  gsscale-train scans/village --out runs/gpu --device gpu   on a GPU; --list-devices lists the GPUs
+  gsscale-train --resume runs/village               resume a stopped or interrupted run
+  gsscale-train --resume runs/village --steps 60000 more steps for a run with --keep-checkpoint
+  gsscale-train scans/village --dry-run             print the settings and the memory needed
 
 Results in --out: point_cloud.ply (opens in any splat viewer), renders/test/*.png (render beside photo),
 report.html (open it in a browser), summary.json, metrics.jsonl, pages.json, config.toml (every setting of the run; usable with --config).";
@@ -38,27 +38,27 @@ struct Args {
     /// Config file; flags override it
     #[arg(long)]
     config: Option<PathBuf>,
-    /// Generate a small city into `scene` inside --out and train on it
+    /// Generate a small city in the folder `scene` inside --out and train on it
     #[arg(long, conflicts_with = "scene")]
     demo: bool,
-    /// Go on with the run in this output folder, which stopped, was cut off, or kept its checkpoint; its config and scene
-    /// are used. Memory, frames, threads, I/O, device and logging may be given anew, more --steps, and the scene or
-    /// --init-ply where they were moved
+    /// Resume the run in this output folder, which was stopped, interrupted, or kept its checkpoint, with its config
+    /// and scene. These may be given anew: memory, frames, threads, I/O, device and logging; more --steps; the scene or
+    /// --init-ply if they moved
     #[arg(long, value_name = "OUT", conflicts_with_all = ["out", "config", "demo", "dry_run", "overwrite"])]
     resume: Option<PathBuf>,
-    /// With --resume: go on although the dataset changed, or with other values of keys that change numbers
+    /// With --resume: continue although the dataset changed, or with other values of keys that change numbers
     #[arg(long, requires = "resume")]
     accept_changes: bool,
-    /// Print what was understood and the memory it will take, then stop
+    /// Print the resolved settings and the memory they need, then stop
     #[arg(long)]
     dry_run: bool,
-    /// Print the GPUs that --device can choose from, best first, then stop
+    /// Print the GPUs available to --device, best first, then stop
     #[arg(long)]
     list_devices: bool,
     /// Replace the results of an earlier run in --out
     #[arg(long)]
     overwrite: bool,
-    /// Print nothing but warnings and errors
+    /// Print only warnings and errors
     #[arg(long, short)]
     quiet: bool,
     #[command(flatten)]
@@ -81,7 +81,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// One line for each adapter; the CPU renderer is always there.
+/// Prints one line per adapter, and one for the CPU renderer, which always exists.
 fn list_devices() {
     for adapter in gsscale::gpu::list_adapters() {
         gsscale::say!("{adapter}");
@@ -118,7 +118,7 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
     })
 }
 
-/// What the demo changes: enough steps for a picture worth looking at within minutes on two cores.
+/// Config of the demo: enough steps for a good picture within minutes on two cores.
 fn demo_config() -> TrainConfig {
     TrainConfig {
         steps: 4000,
@@ -132,10 +132,10 @@ fn demo_config() -> TrainConfig {
     }
 }
 
-/// The generated city beside the results; that of an earlier demo with the same seed is used again.
+/// Generates the city beside the results, or reuses that of an earlier demo with the same seed.
 fn demo_scene(out: &Path, config: &TrainConfig, overwrite: bool, quiet: bool) -> Result<PathBuf, TrainError> {
     let scene = out.join("scene");
-    // A demo that was stopped before its first step left its city and nothing else.
+    // A demo that was stopped before its first step left only its city.
     let is_foreign = |entry: std::fs::DirEntry| entry.file_name() != "scene";
     let is_taken = std::fs::read_dir(out).is_ok_and(|entries| entries.flatten().any(is_foreign));
     if !overwrite && (is_taken || out.is_file()) {
@@ -150,14 +150,14 @@ fn demo_scene(out: &Path, config: &TrainConfig, overwrite: bool, quiet: bool) ->
 
 fn make_city(scene: &Path, config: &TrainConfig, quiet: bool) -> Result<PathBuf, TrainError> {
     if !quiet {
-        eprintln!("making a city in {}", scene.display());
+        eprintln!("generating a city in {}", scene.display());
     }
     let options = CityOptions { seed: config.seed, overwrite: true, ..CityOptions::default() };
     write_city(scene, &options, &|_, _| {})?;
     Ok(scene.to_path_buf())
 }
 
-/// A folder for what a dry run has to write to know what it would take; gone when the program ends.
+/// Scratch folder of a dry run, for files needed to compute its requirements; removed when the program ends.
 struct Scratch {
     /// Inside the system's temporary folder.
     folder: PathBuf,
@@ -166,14 +166,14 @@ struct Scratch {
 impl Scratch {
     fn new() -> InputResult<Self> {
         let folder = std::env::temp_dir().join(format!("gsscale-dry-{}", std::process::id()));
-        std::fs::create_dir(&folder).map_err(|e| InputError::io(&folder, "making a scratch folder", &e))?;
+        std::fs::create_dir(&folder).map_err(|e| InputError::io(&folder, "creating a scratch folder", &e))?;
         Ok(Scratch { folder })
     }
 }
 
 impl Drop for Scratch {
     fn drop(&mut self) {
-        // What is left in the system's folder for such things is cleared by the system.
+        // The system clears its temporary folder of anything left.
         let _ = std::fs::remove_dir_all(&self.folder);
     }
 }

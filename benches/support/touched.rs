@@ -10,6 +10,7 @@ use super::{median, terrain, time};
 use gsscale::base::ids::PageNo;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
+use gsscale::config::choice::Chosen;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::paging::pager::{Pager, PagerConfig};
@@ -62,7 +63,7 @@ impl Touched {
 /// Medians of `rounds` rounds over `percent` of `rows` rows in pages.
 pub fn touched(rows: usize, percent: u32, rounds: usize, simd: SimdPath) -> Touched {
     // All colour bands are in use from the first step.
-    let config = TrainConfig { simd: simd.name().to_string(), sh_every: 0, ..TrainConfig::default() };
+    let config = TrainConfig { simd: Chosen(Some(simd)), sh_every: 0, ..TrainConfig::default() };
     let options = RunOptions::new(&config, 1.0);
     let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
     let made = PagedScene::new(&terrain(rows, 64, 64).0, pager, &options);

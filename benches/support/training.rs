@@ -2,10 +2,12 @@
 //! Measures nothing itself.
 
 use gsscale::base::error::InputError;
+use gsscale::config::choice::Device;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::simd_path;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
+use gsscale::gpu::DeviceChoice;
 use gsscale::train::error::TrainError;
 use serde_json::Value;
 use std::ffi::OsString;
@@ -41,15 +43,15 @@ pub fn config_with_drive(keys: &TrainOverrides) -> Result<TrainConfig, TrainErro
     let mut config = TrainConfig::default();
     keys.clone().apply(&mut config);
     config.check()?;
-    if !matches!(config.device.as_str(), "auto" | "cpu") {
+    if !matches!(config.device, Device::Cpu | Device::Gpu(DeviceChoice::Auto)) {
         let problem = format!("this benchmark measures the CPU path, not '{}'", config.device);
         return Err(InputError::new("--device", problem, "leave it out").into());
     }
     if !simd_path(&config).is_supported() {
-        let problem = format!("this machine cannot run {}", config.simd);
+        let problem = format!("this machine cannot run {}", simd_path(&config).name());
         return Err(InputError::new("--simd", problem, "use --simd auto").into());
     }
-    if config.spill_dir.is_empty() {
+    if config.residence().spill_dir().is_none() {
         let remedy = "name a folder on the drive to measure";
         return Err(InputError::new("--spill-dir", "there is no drive to measure", remedy).into());
     }

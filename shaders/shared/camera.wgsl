@@ -1,4 +1,4 @@
-// What the stages on rows need of a view: the uniform of project_fwd, sh_fwd, sh_bwd and project_bwd. Its values are
+// Camera constants of the per-row stages: the uniform of project_fwd, sh_fwd, sh_bwd and project_bwd. Its values are
 // those of `View` in src/kernels/project_fwd.rs, computed once per view on the CPU; src/kernels/uniforms.rs mirrors the
 // struct.
 //
@@ -20,12 +20,12 @@ struct RowsUniforms {
     principal: vec2<f32>,
     /// Pixels.
     size: vec2<f32>,
-    /// Depths that are drawn lie strictly between these.
+    /// Drawn depths are strictly between these.
     depth_range: vec2<f32>,
-    /// Where X/Z and Y/Z are cut inside the Jacobian.
+    /// Limits of X/Z and Y/Z inside the Jacobian.
     slope_low: vec2<f32>,
     slope_high: vec2<f32>,
-    /// Rows of this window.
+    /// Number of rows of this window.
     row_count: u32,
     pad0: u32,
     pad1: u32,

@@ -1,17 +1,17 @@
 // One row seen by a view: the projected ellipsoid before inversion. The twin of `geometry` in
-// src/kernels/project_fwd.rs, which has the derivation: the determinant is a sum of squares (the 2x2 minors of the
-// projected axes), because c0 c2 - c1^2 cancels for needles.
+// src/kernels/project_fwd.rs, which documents the derivation: the determinant is a sum of squares (the 2x2 minors of
+// the projected axes), because c0 c2 - c1^2 cancels for needles.
 #import "shared/camera.wgsl"
 #import "shared/math.wgsl"
 
-/// A quaternion whose squared length is outside of this range has no usable direction: the row is culled.
+/// A quaternion whose squared length is outside this range has no usable direction: its row is culled.
 const QUAT_NORM_SQ_MIN: f32 = 1e-30;
 const QUAT_NORM_SQ_MAX: f32 = 1e30;
 
 struct Geometry {
     depth: f32,
     inv_depth: f32,
-    /// X/Z, Y/Z; and the same, cut for the Jacobian.
+    /// X/Z, Y/Z; and the same, clamped for the Jacobian.
     ray: vec2<f32>,
     slope: vec2<f32>,
     /// Unit quaternion, w x y z, and 1 / length of the stored one.
@@ -32,7 +32,7 @@ struct Geometry {
     det: f32,
 }
 
-/// Sum in the order of the CPU twin.
+/// Sums in the order of the CPU twin.
 fn dot3(a: vec3<f32>, b: vec3<f32>) -> f32 {
     return a.x * b.x + a.y * b.y + a.z * b.z;
 }

@@ -1,7 +1,7 @@
-// Where an invocation stands in a dispatch that may be folded into two dimensions (beyond 65,535 workgroups).
+// Position of an invocation in a dispatch that may be folded into two dimensions (beyond 65,535 workgroups).
 
-// Index of the workgroup, as if the dispatch had one dimension. The last row may hold workgroups beyond the work:
-// the caller compares with its count.
+// Index of the workgroup, as if the dispatch had one dimension. The last row may contain workgroups beyond the work:
+// the caller compares the index with its count.
 fn linear_group(workgroup_id: vec3<u32>, num_workgroups: vec3<u32>) -> u32 {
     return workgroup_id.x + workgroup_id.y * num_workgroups.x;
 }

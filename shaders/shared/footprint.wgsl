@@ -1,8 +1,8 @@
-// A splat as the tile stages see it, and which tiles it can reach: the twin of `Splat`, `Ellipse` and `rows_in` in
-// src/kernels/splats.rs, which has the reasons.
+// A splat in the form that the tile stages use, and the tiles it can reach: the twin of `Splat`, `Ellipse` and
+// `rows_in` in src/kernels/splats.rs, which documents the reasons.
 //
-// A tile is left out only where every pixel's alpha is computed below 1/255. Roundings of a device may move the border
-// of the ellipse by less than the padding, so counts may differ from the CPU's there, pictures cannot.
+// A tile is skipped only if the computed alpha of all its pixels is below 1/255. A device's rounding may move the
+// border of the ellipse by less than the padding, so counts there may differ from the CPU's, but pictures cannot.
 #import "shared/math.wgsl"
 #import "shared/splat.wgsl"
 
@@ -19,7 +19,7 @@ struct Exponent {
     log2_opacity: f32,
 }
 
-/// log2 of positive normal numbers, within 1.2e-7: compilers' own may err by more near 1.
+/// log2 of positive normal numbers, within 1.2e-7: the built-in one may err by more near 1.
 fn log2_positive(x: f32) -> f32 {
     let bits = bitcast<u32>(x);
     let exponent = bitcast<i32>(bits - 0x3f3504f3u) >> 23u;
@@ -47,7 +47,7 @@ struct Grid {
     tiles_y: u32,
 }
 
-/// Where a splat can reach.
+/// The region that a splat can reach.
 struct Reach {
     mean: vec2<f32>,
     /// Half extents of the ellipse.
@@ -59,19 +59,19 @@ struct Reach {
     /// dy of the chord's middle is slope dx.
     slope: f32,
     pad: f32,
-    /// Not a proper ellipse: everything in the box counts as reached.
+    /// Whether this is not a proper ellipse: then everything in the box counts as reached.
     all: bool,
     /// First tile column and row, and one past the last.
     box: vec4<u32>,
 }
 
-/// The tile that holds a pixel coordinate, clamped to the grid; for the end of a range, rounded up.
+/// The tile that contains a pixel coordinate, clamped to the grid; for the end of a range, rounded up.
 fn tile_from_pixel(pixel: f32, tiles: u32, end: bool) -> u32 {
     let tile = pixel * (1.0 / 16.0);
     return u32(clamp(select(floor(tile), ceil(tile), end), 0.0, f32(tiles)));
 }
 
-/// x as a sum of two floats of 12 bits each, whose products are exact. Done on the bits, so that no compiler can
+/// Splits x into two floats of 12 bits each, whose products are exact. Works on the bits, so that no compiler can
 /// contract or simplify it. Magnitudes below 2^-80 lose the second part.
 fn halves(x: f32) -> vec2<f32> {
     let bits = bitcast<u32>(x);
@@ -81,8 +81,8 @@ fn halves(x: f32) -> vec2<f32> {
     return vec2<f32>(high, select(0.0, f32(bits & 0xfffu) * unit, exponent > 47u));
 }
 
-/// p r - q^2 within 2^-35 of p r: it cancels for needles. The large products are exact in f32, so their difference is
-/// exact wherever it cancels, fused or not.
+/// p r - q^2, within 2^-35 of p r although it cancels for needles. The large products are exact in f32, so their
+/// difference is exact wherever it cancels, fused or not.
 fn determinant(p: f32, q: f32, r: f32) -> f32 {
     let ph = halves(p);
     let qh = halves(q);
@@ -108,7 +108,7 @@ fn reach_of(splat: Splat, grid: Grid) -> Reach {
         tile_from_pixel(high.x, grid.tiles_x, true),
         tile_from_pixel(high.y, grid.tiles_y, true),
     );
-    // A row that is not drawn, and an opacity of 0 (log2 is then anything), have no tiles.
+    // A row that is not drawn has no tiles, nor has one of opacity 0 (whose log2 is unspecified).
     if !(splat.radii.x > 0.0 && splat.opacity > 0.0 && reach > 0.0) {
         out.box = vec4<u32>();
     }
@@ -129,7 +129,7 @@ fn half_chord(reach: Reach, dx: f32) -> f32 {
     return sqrt(max(reach.chord.x - reach.chord.y * dx * dx, 0.0));
 }
 
-/// First tile row and one past the last that the splat can reach in a tile column; none where they are equal.
+/// First tile row and one past the last that the splat can reach in a tile column; equal if there are none.
 fn tile_rows_in(reach: Reach, grid: Grid, tile_x: u32) -> vec2<u32> {
     let box_rows = vec2<i32>(i32(reach.box.y * 16u), i32(min(reach.box.w * 16u, grid.height)) - 1);
     if reach.all {
@@ -145,13 +145,13 @@ fn tile_rows_in(reach: Reach, grid: Grid, tile_x: u32) -> vec2<u32> {
     let dx_high = clamp(-reach.tilt, left, right);
     let low = reach.slope * dx_low - half_chord(reach, dx_low) - reach.pad;
     let high = reach.slope * dx_high + half_chord(reach, dx_high) + reach.pad;
-    // Far beyond any picture, within what converts to an integer everywhere.
+    // A limit far beyond any picture that converts to an integer on every device.
     let first = i32(clamp(ceil(reach.mean.y + low - 0.5), -1e6, 1e6));
     let last = i32(clamp(floor(reach.mean.y + high - 0.5), -1e6, 1e6));
     return rows_to_tiles(vec2<i32>(max(first, box_rows.x), min(last, box_rows.y)));
 }
 
-/// From the first and last pixel row.
+/// Converts the first and last pixel row to tile rows.
 fn rows_to_tiles(rows: vec2<i32>) -> vec2<u32> {
     if rows.y < rows.x {
         return vec2<u32>();

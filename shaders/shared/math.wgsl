@@ -1,5 +1,5 @@
-// Scalar functions with the polynomials of src/base/math.rs, so that devices differ from the CPU by roundings only.
-// Not finite is tested on the bits: compilers may assume that comparisons never see NaN.
+// Scalar functions with the polynomials of src/base/math.rs, so that devices differ from the CPU only by rounding.
+// Finiteness is tested on the bits, because compilers may assume that comparisons never see NaN.
 
 fn is_finite(x: f32) -> bool {
     return (bitcast<u32>(x) & 0x7f800000u) != 0x7f800000u;
@@ -23,7 +23,7 @@ fn exp32(x: f32) -> f32 {
     p = p * r + 1.0;
     var value = p * bitcast<f32>(u32(i32(n) + 127) << 23u);
     value = select(value, 0.0, x < -87.0);
-    // 0x7f800000 is infinity, which has no literal.
+    // 0x7f800000 is infinity, for which there is no literal.
     var bits = select(bitcast<u32>(value), 0x7f800000u, x > 88.0);
     bits = select(bits, bitcast<u32>(x), is_nan(x));
     return bitcast<f32>(bits);

@@ -1,26 +1,26 @@
-// What both directions of the rasterizer share: a workgroup of 64 invocations takes a tile, an invocation four pixels
-// side by side, and splats come in batches through workgroup memory.
+// Shared by both directions of the rasterizer: a workgroup of 64 invocations processes a tile, each invocation four
+// adjacent pixels, and splats arrive in batches through workgroup memory.
 //
-// An invocation makes at most 65,535 loop iterations on some drivers, which then go on silently with wrong results. So
-// a dispatch takes one segment of every tile's list, and what a pixel knows is carried from segment to segment.
+// Some drivers limit an invocation to 65,535 loop iterations and then silently continue with wrong results. So a
+// dispatch processes one segment of every tile's list, and a pixel's state is carried from segment to segment.
 #import "shared/footprint.wgsl"
 
 struct RasterUniforms {
     grid: Grid,
-    /// RGB behind everything.
+    /// Background colour.
     background: vec3<f32>,
     max_alpha: f32,
     /// log2 of max_alpha.
     log2_max_alpha: f32,
-    /// List index at which the segment begins, and one past its last.
+    /// First list index of the segment, and one past the last.
     first: u32,
     end: u32,
-    /// Sum of SEGMENT_FIRST, SEGMENT_LAST (in the order in which this direction goes) and HAS_V_ALPHA.
+    /// Sum of SEGMENT_FIRST, SEGMENT_LAST (in this direction's order) and HAS_V_ALPHA.
     flags: u32,
-    /// Rows of the view and their intersections, for fold_rows.
+    /// Numbers of rows of the view and of their intersections, for fold_rows.
     row_count: u32,
     isect_count: u32,
-    /// The intersections, by emit index, whose sums the backward rasterizer keeps this time.
+    /// The intersections, by emit index, whose sums the backward rasterizer stores in this dispatch.
     window_first: u32,
     window_end: u32,
 }
@@ -29,9 +29,9 @@ const SEGMENT_FIRST: u32 = 1u;
 const SEGMENT_LAST: u32 = 2u;
 const HAS_V_ALPHA: u32 = 4u;
 
-/// Invocations of a tile.
+/// Invocations per tile.
 const TILE_LANES: u32 = 64u;
-/// Stop position of a pixel that went through its whole list.
+/// Stop position of a pixel that processed its whole list.
 const NEVER: u32 = 0xffffffffu;
 
 struct TileSplat {
@@ -53,7 +53,7 @@ fn exponents(splat: TileSplat, dx: vec4<f32>, dy: f32) -> vec4<f32> {
     return (splat.a * dx + splat.b * dy) * dx + (splat.c * dy * dy + splat.log2_opacity);
 }
 
-/// Alpha before the threshold is applied. The form below 0 can only be rounding and counts as 0.
+/// Alpha before the threshold is applied. A sigma below 0 is a rounding error and counts as 0.
 fn alphas(e: vec4<f32>, log2_opacity: f32, max_alpha: f32) -> vec4<f32> {
     return min(exp2(min(e, vec4<f32>(log2_opacity))), vec4<f32>(max_alpha));
 }

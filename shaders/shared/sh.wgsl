@@ -1,21 +1,21 @@
-// The real spherical harmonics of bands 0 to 3, signs and order of src/kernels/sh_fwd.rs.
-// Degree 2 defines SH_DEGREE_1 and SH_DEGREE_2; a switch without those below it counts for nothing in the stages.
+// The real spherical harmonics of bands 0 to 3, with the signs and order of src/kernels/sh_fwd.rs. Degree 2 defines
+// SH_DEGREE_1 and SH_DEGREE_2; a switch without the lower ones has no effect in the stages.
 #import "shared/math.wgsl"
 
 const SH_C0: f32 = 0.28209479;
 const SH_C1: f32 = 0.48860251;
 const SH_C2 = vec3<f32>(1.0925484, 0.31539157, 0.5462742);
 const SH_C3 = array<f32, 5>(0.5900436, 2.8906114, 0.4570458, 0.37317634, 1.4453057);
-/// The least positive f32 that is not denormal.
+/// The smallest positive normal f32.
 const LEAST_NORMAL: f32 = 1.17549435e-38;
 
 struct Direction {
     unit: vec3<f32>,
-    /// 1 / the length it had.
+    /// 1 / the original length.
     inv_len: f32,
 }
 
-/// A direction of length 1; zeros where the length is 0 or its square leaves f32.
+/// The direction at length 1; zeros if the length is 0 or its square overflows f32.
 fn unit_direction(dir: vec3<f32>) -> Direction {
     let len_sq = dir.x * dir.x + dir.y * dir.y + dir.z * dir.z;
     if !(is_finite(len_sq) && len_sq >= LEAST_NORMAL) {
@@ -30,7 +30,7 @@ fn sh_band1(d: vec3<f32>) -> array<f32, 3> {
     return array<f32, 3>(-SH_C1 * d.y, SH_C1 * d.z, -SH_C1 * d.x);
 }
 
-/// Gradient of sum_k v[k] basis_k with respect to the direction, taken as if its parts were free.
+/// Gradient of sum_k v[k] basis_k with respect to the direction, with its components treated as independent.
 fn sh_band1_vjp(v: array<f32, 3>) -> vec3<f32> {
     return vec3<f32>(-SH_C1 * v[2], -SH_C1 * v[0], SH_C1 * v[1]);
 }

@@ -1,19 +1,20 @@
-// A splat: what projection and colours leave for the tile stages. One record per row of the view, 48 bytes, three vec4:
+// A splat: the output of projection and colours for the tile stages. One record per row of the view, 48 bytes, three
+// vec4:
 //
 //   splats[3 row]     = mean2d.x, mean2d.y, depth, opacity       (pixels, camera-space z, after activation)
 //   splats[3 row + 1] = conic.xx, conic.xy, conic.yy, radius.x   (1/px^2; whole pixels, as float)
 //   splats[3 row + 2] = red, green, blue, radius.y
 //
-// project_fwd writes the record with colour 0; sh_fwd then fills in the colour. A culled row is all zeros, and
-// radius.x > 0 exactly for the rows that are drawn (radius.y is then above 0 too).
+// project_fwd writes the record with colour 0; sh_fwd then writes the colour. A culled row is all zeros, and radius.x >
+// 0 exactly for the drawn rows (radius.y is then above 0 too).
 //
-// The gradient of a splat has the same places:
+// The gradient of a splat has the same layout:
 //
 //   v_splats[3 row]     = v_mean2d.x, v_mean2d.y, 0, v_opacity
 //   v_splats[3 row + 1] = v_conic.xx, v_conic.xy, v_conic.yy, 0  (xy counted once: sigma holds conic.xy dx dy)
 //   v_splats[3 row + 2] = v_red, v_green, v_blue, 0              (with respect to the colour after its clamp at 0)
 //
-// Entries of culled rows are not read by sh_bwd and project_bwd.
+// sh_bwd and project_bwd ignore entries of culled rows.
 
 struct Splat {
     mean2d: vec2<f32>,

@@ -1,7 +1,7 @@
-// Exclusive prefix sum over the 256 invocations of a workgroup. Sums saturate: 0xffffffff means "this much or more",
-// which stays true whatever is added, so an overflow anywhere shows in the total.
+// Exclusive prefix sum over the 256 invocations of a workgroup. Sums saturate: 0xffffffff means "this or more" and
+// stays so whatever is added, so an overflow anywhere shows in the total.
 
-/// Its invocations, or its subgroups where the adapter has them.
+/// One entry per invocation, or per subgroup if the adapter has subgroups.
 var<workgroup> scan_parts: array<u32, 256>;
 var<workgroup> scan_segments: array<u32, 16>;
 
@@ -18,13 +18,13 @@ fn saturating_add(a: u32, b: u32) -> u32 {
 }
 
 #ifdef SUBGROUPS
-/// A sum that was formed apart for the low and the high 16 bits of its terms.
+/// Joins a sum that was computed separately for the low and the high 16 bits of its terms.
 fn saturating_join(low: u32, high: u32) -> u32 {
     let top = high + (low >> 16u);
     return select((top << 16u) | (low & 0xffffu), 0xffffffffu, top > 0xffffu);
 }
 
-/// Every invocation of the workgroup must call it, and pass a barrier before it is called again.
+/// Every invocation of the workgroup must call this, and pass a barrier before the next call.
 fn workgroup_scan(value: u32, lane: u32, subgroup: u32, subgroups: u32, subgroup_lane: u32) -> WorkgroupScan {
     let low = value & 0xffffu;
     let high = value >> 16u;
@@ -43,7 +43,7 @@ fn workgroup_scan(value: u32, lane: u32, subgroup: u32, subgroups: u32, subgroup
     return WorkgroupScan(saturating_add(base, before), total);
 }
 #else
-/// Every invocation of the workgroup must call it, and pass a barrier before it is called again.
+/// Every invocation of the workgroup must call this, and pass a barrier before the next call.
 fn workgroup_scan(value: u32, lane: u32) -> WorkgroupScan {
     scan_parts[lane] = value;
     workgroupBarrier();

@@ -1,12 +1,12 @@
-//! Eight floats in one register of AVX2, for the loops in which what the compiler makes of arrays is not good enough.
+//! Eight floats in one AVX2 register, for loops that the compiler vectorises poorly.
 //!
-//! Values come from an [`Avx2`] alone, and that comes from [`with_avx2`] alone, inside a function compiled for it:
-//! whoever holds a value runs on a processor that has the instructions. Every operation is one or two of them;
-//! comparisons give lanes of all ones or all zeros.
+//! An [`Eight`] can only be made through an [`Avx2`], and an [`Avx2`] only by [`with_avx2`], inside a function compiled
+//! for AVX2: so code that holds a value runs on a processor that has the instructions. Every operation is one or two
+//! instructions; comparisons give lanes of all ones or all zeros.
 //!
-//! Not here: what is computed. Invariant: sums, differences, products, quotients and roots round as those of `f32` do,
-//! lane by lane, and nothing is contracted; so a loop of these gives the bits of a plain one.
-#![allow(unsafe_code)] // instructions that not every processor has
+//! Not here: the computations. Invariant: sums, differences, products, quotients and roots round as those of `f32`,
+//! lane by lane, and nothing is contracted; so a loop of these gives the same bits as a scalar loop.
+#![allow(unsafe_code)] // AVX2 instructions, which some processors lack
 
 use super::simd::SimdPath;
 use std::arch::x86_64::*;
@@ -14,20 +14,20 @@ use std::arch::x86_64::*;
 /// Lanes of an [`Eight`].
 pub const EIGHT: usize = 8;
 
-/// That the processor has AVX2.
+/// Proof that the processor has AVX2.
 #[derive(Clone, Copy)]
 pub struct Avx2(());
 
-/// Work that is written in [`Eight`]s.
+/// A kernel written in [`Eight`]s.
 pub trait EightKernel {
-    /// What it returns.
+    /// Its result.
     type Out;
-    /// The work. Mark the implementation, and every function it calls in its inner loop, `#[inline(always)]`: what is not
-    /// inlined is compiled without the instructions, and gets its values through memory.
+    /// Runs the kernel. Mark the implementation, and every function it calls in its inner loop, `#[inline(always)]`:
+    /// other functions are compiled without AVX2 and receive their values through memory.
     fn run(self, avx2: Avx2) -> Self::Out;
 }
 
-/// Runs `kernel` where the processor has AVX2, and hands it back elsewhere.
+/// Runs `kernel` if the processor has AVX2, otherwise returns it.
 #[inline]
 pub fn with_avx2<K: EightKernel>(kernel: K) -> Result<K::Out, K> {
     if !SimdPath::Avx2.is_supported() {
@@ -37,7 +37,7 @@ pub fn with_avx2<K: EightKernel>(kernel: K) -> Result<K::Out, K> {
     Ok(unsafe { run(kernel) })
 }
 
-// Without fma, which `SimdPath::Avx2` has as well: nothing can be contracted then.
+// Compiled without fma, although `SimdPath::Avx2` has it: so nothing can be contracted.
 #[target_feature(enable = "avx2")]
 fn run<K: EightKernel>(kernel: K) -> K::Out {
     kernel.run(Avx2(()))
@@ -48,35 +48,35 @@ fn run<K: EightKernel>(kernel: K) -> K::Out {
 pub struct Eight(__m256);
 
 impl Avx2 {
-    /// The same in every lane.
+    /// The same value in every lane.
     #[inline(always)]
     pub fn splat(self, x: f32) -> Eight {
-        // SAFETY: AVX, which `self` stands for.
+        // SAFETY: `self` proves AVX.
         Eight(unsafe { _mm256_set1_ps(x) })
     }
 
-    /// Eight floats from memory.
+    /// Loads eight floats from memory.
     #[inline(always)]
     pub fn load(self, from: &[f32; EIGHT]) -> Eight {
-        // SAFETY: AVX, which `self` stands for; the reference is to as many floats as are read.
+        // SAFETY: `self` proves AVX; the reference covers all floats read.
         Eight(unsafe { _mm256_loadu_ps(from.as_ptr()) })
     }
 
-    /// Lanes 0 to 3: a row of three and another value; 4 to 7: a row of four. The row behind the one of three is not used,
-    /// but must be there: it makes the load a whole quarter.
+    /// Lanes 0 to 2: a row of three; 3: `one`; 4 to 7: a row of four. `three` includes the next row, so that the load
+    /// of a whole quarter stays in bounds; that row is not used.
     #[inline(always)]
     pub fn load_three_one_four(self, three: &[[f32; 3]; 2], one: f32, four: &[f32; 4]) -> Eight {
-        // SAFETY: AVX, which `self` stands for; four of the six floats of `three` and the four of `four` are read.
+        // SAFETY: `self` proves AVX; four of the six floats of `three` and the four of `four` are read.
         Eight(unsafe {
             let low = _mm_insert_ps::<0x30>(_mm_loadu_ps(three.as_ptr().cast()), _mm_set_ss(one));
             _mm256_insertf128_ps::<1>(_mm256_castps128_ps256(low), _mm_loadu_ps(four.as_ptr()))
         })
     }
 
-    /// Lanes 0 to 3 and 4 to 7: a row of three each, and the first value of the row behind it.
+    /// Lanes 0 to 3 and 4 to 7: each a row of three and the first value of the next row.
     #[inline(always)]
     pub fn load_threes(self, low: &[[f32; 3]; 2], high: &[[f32; 3]; 2]) -> Eight {
-        // SAFETY: AVX, which `self` stands for; four of the six floats of each are read.
+        // SAFETY: `self` proves AVX; four of the six floats of each argument are read.
         Eight(unsafe {
             let low = _mm_loadu_ps(low.as_ptr().cast());
             _mm256_insertf128_ps::<1>(_mm256_castps128_ps256(low), _mm_loadu_ps(high.as_ptr().cast()))
@@ -92,7 +92,7 @@ macro_rules! lane_by_lane {
         pub fn $name(self $(, $arg: Eight)*) -> Eight {
             let x = self.0;
             $(let $arg = $arg.0;)*
-            // SAFETY: AVX2, which there is: only an `Avx2` makes values.
+            // SAFETY: AVX2 is available: only an `Avx2` makes values.
             Eight(unsafe { $body(x $(, $arg)*) })
         })*
     };
@@ -108,112 +108,112 @@ impl Eight {
         times(b) = _mm256_mul_ps;
         /// Quotient.
         over(b) = _mm256_div_ps;
-        /// Root.
+        /// Square root.
         sqrt() = _mm256_sqrt_ps;
-        /// The bits that both have.
+        /// Bitwise and.
         and(b) = _mm256_and_ps;
-        /// The bits that either has.
+        /// Bitwise or.
         or(b) = _mm256_or_ps;
-        /// The bits of `b` that this has not.
+        /// Bits of `b` that are not set in `self`.
         not_and(b) = _mm256_andnot_ps;
-        /// Where the lanes are equal.
+        /// Mask of lanes that are equal.
         equal(b) = _mm256_cmp_ps::<_CMP_EQ_OQ>;
-        /// Where the lane is at most that of `b`.
+        /// Mask of lanes that are at most those of `b`.
         at_most(b) = _mm256_cmp_ps::<_CMP_LE_OQ>;
-        /// Where the lane is not less than that of `b`: so where one is no number, too.
+        /// Mask of lanes that are not less than those of `b`; also set where one is NaN.
         not_less(b) = _mm256_cmp_ps::<_CMP_NLT_UQ>;
-        /// The smaller one; `b` where they are equal or one is no number.
+        /// The smaller lane; `b` where they are equal or one is NaN.
         smaller(b) = _mm256_min_ps;
-        /// The larger one; `b` where they are equal or one is no number.
+        /// The larger lane; `b` where they are equal or one is NaN.
         larger(b) = _mm256_max_ps;
     }
 
-    /// The larger one of the bits as whole numbers.
+    /// Per lane the larger of the bits as integers.
     #[inline(always)]
     #[must_use]
     pub fn larger_bits(self, b: Eight) -> Eight {
-        // SAFETY: AVX2, which there is: only an `Avx2` makes values.
+        // SAFETY: AVX2 is available: only an `Avx2` makes values.
         Eight(unsafe { _mm256_castsi256_ps(_mm256_max_epi32(_mm256_castps_si256(self.0), _mm256_castps_si256(b.0))) })
     }
 
-    /// Lanes of `b` where those of `mask` are all ones, of `self` elsewhere.
+    /// Lanes of `b` where those of `mask` are all ones, lanes of `self` elsewhere.
     #[inline(always)]
     #[must_use]
-    pub fn but(self, mask: Eight, b: Eight) -> Eight {
-        // SAFETY: AVX, which there is: only an `Avx2` makes values.
+    pub fn blend(self, mask: Eight, b: Eight) -> Eight {
+        // SAFETY: AVX is available: only an `Avx2` makes values.
         Eight(unsafe { _mm256_blendv_ps(self.0, b.0, mask.0) })
     }
 
     /// Lanes 0 to 2 of `b`, 3 to 7 of `self`.
     #[inline(always)]
     #[must_use]
-    pub fn but_first_three(self, b: Eight) -> Eight {
-        // SAFETY: AVX, which there is: only an `Avx2` makes values.
+    pub fn blend_first_three(self, b: Eight) -> Eight {
+        // SAFETY: AVX is available: only an `Avx2` makes values.
         Eight(unsafe { _mm256_blend_ps::<0b111>(self.0, b.0) })
     }
 
-    /// Whether a lane has its sign: after a comparison, whether it holds somewhere.
+    /// Whether the sign bit of any lane is set: for a mask, whether any lane is set.
     #[inline(always)]
     pub fn any(self) -> bool {
-        // SAFETY: AVX, which there is: only an `Avx2` makes values.
+        // SAFETY: AVX is available: only an `Avx2` makes values.
         unsafe { _mm256_testz_ps(self.0, self.0) == 0 }
     }
 
-    /// Whether a bit of a lane is set.
+    /// Whether any bit of any lane is set.
     #[inline(always)]
     pub fn any_bit(self) -> bool {
-        // SAFETY: AVX, which there is: only an `Avx2` makes values.
+        // SAFETY: AVX is available: only an `Avx2` makes values.
         unsafe {
             let bits = _mm256_castps_si256(self.0);
             _mm256_testz_si256(bits, bits) == 0
         }
     }
 
-    /// Whether the bits of a lane are above `most` as whole numbers.
+    /// Whether the bits of any lane, as an integer, exceed `most`.
     #[inline(always)]
     pub fn any_bits_above(self, most: i32) -> bool {
-        // SAFETY: AVX2, which there is: only an `Avx2` makes values.
+        // SAFETY: AVX2 is available: only an `Avx2` makes values.
         unsafe {
             let above = _mm256_cmpgt_epi32(_mm256_castps_si256(self.0), _mm256_set1_epi32(most));
             _mm256_testz_si256(above, above) == 0
         }
     }
 
-    /// To memory.
+    /// Stores all lanes to memory.
     #[inline(always)]
     pub fn store(self, to: &mut [f32; EIGHT]) {
-        // SAFETY: AVX, which there is; the reference is to as many floats as are written.
+        // SAFETY: AVX is available; the reference covers all floats written.
         unsafe { _mm256_storeu_ps(to.as_mut_ptr(), self.0) }
     }
 
-    /// Lanes 0 to 2, 3 and 4 to 7.
+    /// Stores lanes 0 to 2, lane 3, and lanes 4 to 7.
     #[inline(always)]
     pub fn store_three_one_four(self, three: &mut [f32; 3], one: &mut f32, four: &mut [f32; 4]) {
-        // SAFETY: AVX, which there is; `four` is as many floats as are written.
+        // SAFETY: AVX is available; `four` covers all floats written.
         let low = unsafe {
             _mm_storeu_ps(four.as_mut_ptr(), _mm256_extractf128_ps::<1>(self.0));
             _mm256_castps256_ps128(self.0)
         };
         store_three(low, three);
-        // SAFETY: SSE4.1, which there is with AVX.
+        // SAFETY: SSE4.1 is available wherever AVX is.
         *one = f32::from_bits(unsafe { _mm_extract_ps::<3>(low) } as u32);
     }
 
-    /// Lanes 0 to 2 and 4 to 6.
+    /// Stores lanes 0 to 2 and 4 to 6.
     #[inline(always)]
     pub fn store_threes(self, low: &mut [f32; 3], high: &mut [f32; 3]) {
-        // SAFETY: AVX, which there is.
+        // SAFETY: AVX is available.
         let halves = unsafe { (_mm256_castps256_ps128(self.0), _mm256_extractf128_ps::<1>(self.0)) };
         store_three(halves.0, low);
         store_three(halves.1, high);
     }
 }
 
-/// The first three lanes.
+/// Stores the first three lanes.
 #[inline(always)]
 fn store_three(from: __m128, to: &mut [f32; 3]) {
-    // SAFETY: SSE4.1, which there is where an `Eight` was; two of the three floats of `to` are written, by an instruction that
-    // takes any address (that of doubles, `_mm_storel_pd`, wants one that is a multiple of 8 in Rust).
+    // SAFETY: SSE4.1 is available wherever an `Eight` was made. Two of the three floats of `to` are written by an
+    // instruction that takes any address (in Rust the one for doubles, `_mm_storel_pd`, requires a multiple of 8).
     unsafe {
         _mm_storeu_si64(to.as_mut_ptr().cast(), _mm_castps_si128(from));
         to[2] = f32::from_bits(_mm_extract_ps::<2>(from) as u32);

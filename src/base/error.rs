@@ -1,27 +1,27 @@
-//! One error type for everything that comes from outside: files, flags, folders.
+//! The error type for all outside input: files, flags, folders.
 //!
-//! Invariant: an [`InputError`] always names the file (or flag), the place in it, and what the user can do.
-//! Errors are made where the facts are known and passed upward unchanged; nobody logs one and returns it too.
+//! Invariant: an [`InputError`] always names the file (or flag), the place in it, and the remedy. Errors are made where
+//! the facts are known and passed upward unchanged; no function both logs and returns one.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-/// Bad input: the file, the place in it, what is wrong, and the remedy.
+/// An input error: the file, the place in it, the problem, and the remedy.
 #[derive(Debug, Clone)]
 pub struct InputError {
-    /// File, folder or flag that is at fault.
+    /// The file, folder or flag at fault.
     pub file: PathBuf,
-    /// Where in it: a byte offset, a line, a key, an image name; empty when the whole file is meant.
+    /// Place in the file: a byte offset, a line, a key, an image name; empty for the whole file.
     pub place: String,
-    /// What is wrong.
+    /// The problem.
     pub problem: String,
     /// What the user can do about it.
     pub remedy: String,
-    /// The kind of the system call's error that is behind it, if one is.
+    /// Kind of the underlying I/O error, if any.
     pub kind: Option<std::io::ErrorKind>,
 }
 
-/// Result of everything that reads what a user gave.
+/// Result of reading user input.
 pub type InputResult<T> = Result<T, InputError>;
 
 impl InputError {
@@ -36,7 +36,7 @@ impl InputError {
         }
     }
 
-    /// Whether it is only space on a drive that is missing.
+    /// Whether the error is only a lack of disk space.
     pub fn is_out_of_space(&self) -> bool {
         use std::io::ErrorKind as K;
         matches!(self.kind, Some(K::StorageFull | K::QuotaExceeded | K::FileTooLarge))
@@ -56,7 +56,7 @@ impl InputError {
             K::NotFound => "check the path",
             K::PermissionDenied => "check the permissions of the file and its folder",
             K::StorageFull => "free space on that disk or choose another folder",
-            K::ReadOnlyFilesystem => "choose a folder on a disk that can be written",
+            K::ReadOnlyFilesystem => "choose a folder on a writable disk",
             K::NotADirectory | K::IsADirectory => "check whether a file or a folder is meant",
             K::UnexpectedEof => "the file is cut short: copy or write it again",
             _ => "check the disk and the path, then try again",

@@ -1,42 +1,41 @@
-//! Identities: 128-bit numbers that tell one run or one store from every other.
+//! Identities: random 128-bit numbers that distinguish runs and stores.
 //!
-//! Invariant: two draws are equal with no practical chance, on one machine or on two. An identity has no meaning
-//! beyond being equal to itself.
+//! Invariant: two draws are practically never equal, on one machine or on two. An identity can only be compared.
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::str::FromStr;
 
-/// Draws a number that no other call returns, here or elsewhere.
+/// Draws a number that practically no other call returns, on any machine.
 pub fn draw_identity() -> u128 {
-    // The standard library draws the keys of its hash maps from the system.
+    // The standard library draws the keys of its hash maps from the system's random source.
     let draw = || RandomState::new().build_hasher().finish();
     let time = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_nanos());
     (u128::from(draw()) << 64 | u128::from(draw())) ^ time ^ u128::from(std::process::id()) << 96
 }
 
-/// Identity of a training run, the same over all its lives. The run's config.toml and every commit hold it.
+/// Identity of a training run, kept across resumes. The run's config.toml and every commit contain it.
 ///
 /// As text (config.toml) it is 32 hexadecimal digits, in binary (run state) a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RunId(u128);
 
 impl RunId {
-    /// Identity of no run: of a store that was imported, or salvaged without the config of its run.
+    /// No run's identity: for a store that was imported, or salvaged without its run's config.
     pub const UNKNOWN: RunId = RunId(0);
 
-    /// The identity of a run that begins.
+    /// Draws the identity of a new run.
     pub fn draw() -> RunId {
         RunId(draw_identity().max(1))
     }
 
-    /// Whether the identity is that of a run.
+    /// Whether this identifies a run.
     pub fn is_known(self) -> bool {
         self != RunId::UNKNOWN
     }
 
-    /// Whether both are known and differ: then what one of them made is not the other's to change.
+    /// Whether both are known and differ: then one run must not change what the other made.
     pub fn is_other_than(self, other: RunId) -> bool {
         self.is_known() && other.is_known() && self != other
     }
@@ -54,7 +53,7 @@ impl FromStr for RunId {
     fn from_str(text: &str) -> Result<RunId, String> {
         let is_hex = text.len() == 32 && text.bytes().all(|b| b.is_ascii_hexdigit());
         let number = u128::from_str_radix(text, 16).ok().filter(|_| is_hex);
-        number.map(RunId).ok_or_else(|| format!("'{text}' is not the identity of a run: 32 hexadecimal digits"))
+        number.map(RunId).ok_or_else(|| format!("'{text}' is not a run's identity, which is 32 hexadecimal digits"))
     }
 }
 
@@ -87,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn text_gives_the_identity_back_and_other_text_is_refused() {
+    fn text_round_trips_and_other_text_is_refused() {
         let id = RunId::draw();
         assert_eq!(id.to_string().parse(), Ok(id));
         let json = serde_json::to_string(&id).unwrap();

@@ -1,14 +1,14 @@
-//! Names of pages.
+//! Page ids.
 //!
-//! Invariants: 1. a page's id tells where it came from, not when: the same splits give the same ids in any order of
-//! time, on any budget; 2. ids of pages that exist at the same time are ordered as their places in the tree of splits:
-//! all descendants of a page lie between its neighbours.
+//! Invariants: 1. a page's id depends on where it came from, not when: the same splits give the same ids in any order
+//! of time and under any budget; 2. ids of pages that exist at the same time are ordered as their places in the tree of
+//! splits: all descendants of a page come between its neighbours.
 
-/// Bits of the path inside an initial page.
+/// Bits of the path within an initial page.
 const PATH_BITS: u32 = 32;
 
-/// Name of a page by lineage: the number of the initial page (upper 32 bits) and the way down the splits since (lower
-/// 32 bits, the in-order label of a binary tree: the root is 2^31, a child lies half its parent's lowest set bit away).
+/// Id of a page by lineage: the number of the initial page (upper 32 bits) and the path down the splits since (lower 32
+/// bits, the in-order label of a binary tree: the root is 2^31, a child is half its parent's lowest set bit away).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct PageId(u64);
 
@@ -24,7 +24,7 @@ impl PageId {
         (half > 0).then_some([PageId(self.0 - half), PageId(self.0 + half)])
     }
 
-    /// Whether it is part of a page that split.
+    /// Whether this page came from a split.
     pub fn is_part(self) -> bool {
         self.0 as u32 != 1 << (PATH_BITS - 1)
     }
@@ -34,18 +34,18 @@ impl PageId {
         self.0
     }
 
-    /// From a file's number; `None` for one that no page can have.
+    /// Decodes a file's number; `None` for an impossible one.
     pub fn from_bits(bits: u64) -> Option<PageId> {
         (bits & u64::from(u32::MAX) != 0).then_some(PageId(bits))
     }
 }
 
-/// As [`PageId`] is displayed: `7`, `7.0`, `7.0.1`.
+/// Parses the displayed form of [`PageId`]: `7`, `7.0`, `7.0.1`.
 impl std::str::FromStr for PageId {
     type Err = String;
 
     fn from_str(text: &str) -> Result<PageId, String> {
-        let wrong = || format!("'{text}' names no page; write for example 7 or 7.0.1");
+        let wrong = || format!("'{text}' is not a page id; write for example 7 or 7.0.1");
         let mut parts = text.split('.');
         let first = parts.next().and_then(|n| n.parse().ok()).ok_or_else(wrong)?;
         parts.try_fold(PageId::initial(first), |id, part| {
@@ -69,7 +69,7 @@ impl std::fmt::Display for PageId {
     }
 }
 
-/// Number of a page in the resident index: dense, in order of appearance. Means nothing outside one process.
+/// Number of a page in the resident index: dense, in order of appearance. Valid only within one process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct PageNo(pub u32);
 

@@ -1,21 +1,21 @@
-//! What the system tells about this machine and this process, for reports. No result of training depends on it.
+//! Facts about this machine and process, for reports. No training result depends on them.
 
 use std::path::{Path, PathBuf};
 
-/// CPU seconds, user and system, of all threads that this process has had; `None` where the system does not tell.
+/// CPU seconds, user and system, of all threads of this process so far; `None` if the system does not tell.
 ///
 /// From /proc/self/stat, whose ticks are hundredths of a second on every Linux (USER_HZ).
 pub fn process_cpu_seconds() -> Option<f64> {
     process_cpu_split().map(|[user, system]| user + system)
 }
 
-/// The same, user and system apart.
+/// As [`process_cpu_seconds`], user and system separately.
 pub fn process_cpu_split() -> Option<[f64; 2]> {
     cpu_seconds_of(&std::fs::read_to_string("/proc/self/stat").ok()?)
 }
 
-/// Fields 14 and 15 are the ticks. The second field is the program's name in parentheses, which may hold anything, so
-/// fields are counted from its end.
+/// Fields 14 and 15 are the ticks. The second field is the program's name in parentheses, which may contain anything,
+/// so fields are counted from its end.
 fn cpu_seconds_of(stat: &str) -> Option<[f64; 2]> {
     let after_name = &stat[stat.rfind(')')? + 1..];
     let mut fields = after_name.split_whitespace().skip(11);
@@ -31,8 +31,8 @@ pub fn cpu_model() -> String {
     name.unwrap_or(std::env::consts::ARCH).to_string()
 }
 
-/// Memory that this process could still take, bytes: what the machine has available, or what is left of the limit of a
-/// control group that it is in, whichever is less. `None` where the system does not tell.
+/// Memory that this process may still take, bytes: what the machine has available, or what a control group's limit
+/// leaves, whichever is less. `None` if the system does not tell.
 pub fn memory_available() -> Option<u64> {
     let machine = meminfo_available(&std::fs::read_to_string("/proc/meminfo").ok()?)?;
     let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
@@ -46,7 +46,7 @@ fn meminfo_available(text: &str) -> Option<u64> {
     Some(kib * 1024)
 }
 
-/// Names of the files of a control group: limit, use, and the part of the use that is page cache that can go.
+/// File names of a control group: limit, use, and the reclaimable page cache within the use.
 struct GroupFiles {
     limit: &'static str,
     used: &'static str,
@@ -57,8 +57,8 @@ const GROUP_V1: GroupFiles =
     GroupFiles { limit: "memory.limit_in_bytes", used: "memory.usage_in_bytes", cache: "total_inactive_file" };
 const GROUP_V2: GroupFiles = GroupFiles { limit: "memory.max", used: "memory.current", cache: "inactive_file" };
 
-/// The folders of the memory groups that the lines of /proc/self/cgroup name, each with those above it: every one may
-/// have a limit. A container may see its own group as the root, so folders that are not there are tried all the same.
+/// Folders of the memory groups that the lines of /proc/self/cgroup name, each with its ancestors: any of them may have
+/// a limit. A container may see its own group as the root, so missing folders are tried as well.
 fn group_folders(groups: &str) -> Vec<(PathBuf, &'static GroupFiles)> {
     let mut folders = Vec::new();
     for line in groups.lines() {
@@ -77,7 +77,7 @@ fn group_folders(groups: &str) -> Vec<(PathBuf, &'static GroupFiles)> {
 
 fn left_in_group(folder: &Path, files: &GroupFiles) -> Option<u64> {
     let number = |name: &str| std::fs::read_to_string(folder.join(name)).ok()?.trim().parse::<u64>().ok();
-    // `max` in v2; in v1 a number near 2^63 says the same and does no harm.
+    // No limit is `max` in v2, and a number near 2^63 in v1, which needs no special case.
     let (limit, used) = (number(files.limit)?, number(files.used)?);
     let stat = std::fs::read_to_string(folder.join("memory.stat")).unwrap_or_default();
     let cache = stat.lines().find_map(|l| l.strip_prefix(files.cache)?.trim().parse::<u64>().ok()).unwrap_or(0);
@@ -89,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn groups_are_found_with_all_above_them_in_both_versions() {
+    fn groups_are_found_with_their_ancestors_in_both_versions() {
         let folders = |text: &str| -> Vec<String> {
             group_folders(text).iter().map(|(folder, files)| format!("{} {}", folder.display(), files.limit)).collect()
         };
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_of_a_limit_counts_cache_that_can_go() -> std::io::Result<()> {
+    fn reclaimable_cache_counts_as_left_within_a_limit() -> std::io::Result<()> {
         let folder = std::env::temp_dir().join(format!("gsscale-group-{}", std::process::id()));
         std::fs::create_dir_all(&folder)?;
         let write = |name: &str, text: &str| std::fs::write(folder.join(name), text);

@@ -1,8 +1,8 @@
-//! Scalar functions with the same bits on every platform and instruction path: only + - * / sqrt and integer moves,
-//! nothing contracted.
+//! Scalar functions with the same bits on every platform and instruction path: they use only + - * / sqrt and integer
+//! moves, never contracted.
 
-/// e^x in f32, within 2 ulp for x in [-87, 88]; 0 below (results under the smallest normal are flushed), infinity
-/// above, NaN for NaN. Written without branches so that loops over it vectorise.
+/// e^x in f32, within 2 ulp for x in [-87, 88]; 0 below (subnormal results are flushed), infinity above, NaN for NaN.
+/// Branch-free, so that loops over it vectorise.
 ///
 /// Range reduction by n = round(x log2 e) with ln 2 in two parts (Cody and Waite), then the Taylor terms to x^6/720
 /// on [-ln2/2, ln2/2] (remainder 1.2e-7 relative).
@@ -13,7 +13,7 @@ pub fn exp32(x: f32) -> f32 {
     const LN2_LOW: f32 = -2.121_944_4e-4;
     // Adding 1.5 * 2^23 rounds to an integer in the low mantissa bits.
     const ROUND: f32 = 12_582_912.0;
-    // max() and min() drop NaN; it is put back at the end.
+    // max() and min() lose NaN; it is restored at the end.
     let y = x.clamp(-87.0, 88.0);
     let shifted = y * LOG2E + ROUND;
     let n = shifted - ROUND;
@@ -54,7 +54,7 @@ mod tests {
         while x < 87.9 {
             let want = libm::exp(f64::from(x));
             let got = f64::from(exp32(x));
-            // 2 ulp = 2^-22; the fixed-point rounding of the range reduction adds nothing beyond it.
+            // 2 ulp = 2^-22; the fixed-point rounding of the range reduction stays within that.
             assert!(((got - want) / want).abs() < 2.4e-7, "exp({x}) = {got}, want {want}");
             x += 0.0037;
         }

@@ -1,5 +1,5 @@
-//! What every layer may use: errors, identities, random draws, deterministic math, instruction paths, sizes.
-//! Nothing here knows a Gaussian, a picture or a disk format.
+//! Shared by every layer: errors, identities, random draws, deterministic math, instruction paths, sizes. Knows neither
+//! Gaussians, pictures nor disk formats.
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod eight;

@@ -1,38 +1,38 @@
-//! The part of a PNG that its pixels come from, as a stream for a decoder.
+//! Passes a decoder only those chunks of a PNG that affect its pixels.
 //!
-//! A decoder keeps every chunk of text and every EXIF block, and inflates a colour profile into memory as large as the file
-//! says: 3 MB of a file become 3 GB. None of that changes a pixel here, since profiles are not applied. So the decoder does
-//! not get to see it: [`PixelChunks`] passes on the critical chunks and the transparency, and skips the rest.
+//! A decoder keeps every text chunk and EXIF block, and inflates a colour profile into as much memory as the file says:
+//! a file of 3 MB can take 3 GB. None of these changes a pixel here, because profiles are not applied. So
+//! [`PixelChunks`] passes the critical chunks and the transparency to the decoder, and skips the rest.
 //!
-//! Invariants: 1. nothing is allocated; 2. the bytes that are passed on are those of the file, in their order; 3. a file
-//! that is cut short ends early, for the decoder to notice.
+//! Invariants: 1. nothing is allocated; 2. the bytes passed are those of the file, in order; 3. a file that is cut
+//! short ends early, which the decoder detects.
 
 use std::io::{BufRead, Error, ErrorKind, Read, Result, Seek, SeekFrom};
 
-/// Bytes that a decoder may take beside the picture: two rows of the widest picture that is read (65,535 pixels of 8 bytes
-/// each), and chunks that are at most 768 bytes long.
+/// Bytes that a decoder may take beside the picture: two rows of the widest accepted picture (65,535 pixels of 8 bytes
+/// each), and chunks of at most 768 bytes.
 pub const PNG_BUFFERS: u64 = 2 << 20;
 
-/// Whether a chunk has a part in the pixels: critical chunks (upper case, PNG specification, section 5.4) and tRNS. A decoder
-/// refuses critical chunks that it does not know, and none of those that it knows is of any length.
-pub fn makes_pixels(kind: [u8; 4]) -> bool {
+/// Whether a chunk affects the pixels: critical chunks (upper case, PNG specification, section 5.4) and tRNS. A decoder
+/// refuses unknown critical chunks, and all known ones have bounded length.
+pub fn affects_pixels(kind: [u8; 4]) -> bool {
     kind[0].is_ascii_uppercase() || &kind == b"tRNS"
 }
 
-/// A PNG without the chunks that make no pixels.
+/// A PNG without the chunks that do not affect pixels.
 #[derive(Debug)]
 pub struct PixelChunks<R> {
     inner: R,
-    /// The signature or the head of a chunk, not yet passed on from `passed` on.
+    /// The signature or a chunk's head; the bytes from `passed` on have not been passed yet.
     head: [u8; 8],
     passed: usize,
     filled: usize,
-    /// Bytes of the current chunk that follow, with its checksum.
+    /// Bytes left in the current chunk, including its checksum.
     left: u64,
 }
 
 impl<R: BufRead> PixelChunks<R> {
-    /// From the first byte of a file that is a PNG.
+    /// Starts at the first byte of a PNG file.
     ///
     /// # Errors
     /// The file cannot be read.
@@ -42,7 +42,7 @@ impl<R: BufRead> PixelChunks<R> {
         Ok(PixelChunks { inner, head, passed: 0, filled, left: 0 })
     }
 
-    /// Goes to the next byte that is passed on.
+    /// Advances to the next byte to pass on.
     fn advance(&mut self) -> Result<()> {
         while self.passed == self.filled && self.left == 0 {
             (self.passed, self.filled) = (0, read_up_to(&mut self.inner, &mut self.head)?);
@@ -53,7 +53,7 @@ impl<R: BufRead> PixelChunks<R> {
             }
             let [a, b, c, d, kind @ ..] = self.head;
             let length = u64::from(u32::from_be_bytes([a, b, c, d])) + 4;
-            if makes_pixels(kind) {
+            if affects_pixels(kind) {
                 self.left = length;
             } else {
                 self.passed = self.filled;
@@ -123,10 +123,10 @@ impl<R: BufRead> Read for PixelChunks<R> {
     }
 }
 
-/// The decoder's type asks for it; decoding a picture from its beginning to its end does not seek.
+/// Required by the decoder's type; decoding a picture from start to end never seeks.
 impl<R: BufRead> Seek for PixelChunks<R> {
     fn seek(&mut self, _: SeekFrom) -> Result<u64> {
-        Err(Error::new(ErrorKind::Unsupported, "a PNG is read from its beginning to its end"))
+        Err(Error::new(ErrorKind::Unsupported, "a PNG stream cannot seek"))
     }
 }
 
@@ -156,11 +156,11 @@ mod tests {
         let file: Vec<u8> =
             SIGNATURE.iter().copied().chain(kept.iter().zip(&others).flat_map(|(k, o)| [&k[..], o].concat())).collect();
         let want = [SIGNATURE, &kept.concat()].concat();
-        // Whatever part of a chunk the buffer holds.
+        // For any split of a chunk by the buffer.
         for buffer in [1, 7, 8, 64, 4096] {
             assert_eq!(passed(&file, buffer), want, "{buffer}");
         }
-        // A file that is cut short gives a beginning of the same bytes.
+        // A file that is cut short yields a prefix of the same bytes.
         for cut in 0..file.len() {
             assert!(want.starts_with(&passed(&file[..cut], 64)), "{cut}");
         }

@@ -1,18 +1,18 @@
-//! Random draws as a pure function of what they are for.
+//! Random draws as pure functions of their purpose.
 //!
-//! Invariants: 1. a [`Stream`] is keyed by (seed, purpose, two numbers), never by call order or thread, so a draw
-//! for one Gaussian is the same whoever asks first; 2. only integer arithmetic, + - * / sqrt and `libm` are used, so
+//! Invariants: 1. a [`Stream`] is keyed by (seed, purpose, two numbers), never by call order or thread, so a draw for
+//! one Gaussian does not depend on who draws first; 2. only integer arithmetic, + - * / sqrt and `libm` are used, so
 //! the bits are the same on every platform.
 
-/// What a draw is for. The number is part of the key: never renumber.
+/// Purpose of a draw. The number is part of the key: never renumber.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u64)]
 pub enum Purpose {
     /// Order of the views in an epoch; keys: epoch, 0.
     ViewOrder = 1,
-    /// First rotations of Gaussians; keys: uid, 0.
+    /// Initial rotations of Gaussians; keys: uid, 0.
     InitQuat = 2,
-    /// Points in the frusta when the dataset has none; keys: point index, 0.
+    /// Points in the view frusta if the dataset has none; keys: point index, 0.
     InitPoint = 3,
     /// Offsets of the two children of a split; keys: uid of the child, event.
     Split = 4,
@@ -80,7 +80,7 @@ impl Stream {
         libm::sqrt(-2.0 * libm::log(u)) * libm::cos(2.0 * std::f64::consts::PI * v)
     }
 
-    /// Standard normal cut at `limit` sigmas: draws beyond it are drawn again.
+    /// Standard normal truncated at `limit` sigmas, by drawing again.
     pub fn normal_within(&mut self, limit: f64) -> f64 {
         loop {
             let x = self.normal();

@@ -1,13 +1,13 @@
-//! Vectors that grow a little at a time: with an eighth to spare, where a `Vec` takes the double of what it had. What a run
-//! may take is bounded, and these are its largest parts.
+//! Vectors that grow with an eighth to spare instead of doubling as `Vec` does, because a run's memory is bounded and
+//! these are its largest parts.
 
-/// Changes the length as [`Vec::resize`] does; keeps the allocation while it is large enough.
+/// As [`Vec::resize`]; keeps the allocation while it is large enough.
 pub fn resize<T: Copy>(values: &mut Vec<T>, len: usize, value: T) {
     reserve(values, len);
     values.resize(len, value);
 }
 
-/// Changes the length as [`Vec::resize_with`] does; keeps the allocation while it is large enough.
+/// As [`Vec::resize_with`]; keeps the allocation while it is large enough.
 pub fn resize_with<T>(values: &mut Vec<T>, len: usize, value: impl FnMut() -> T) {
     reserve(values, len);
     values.resize_with(len, value);
@@ -19,7 +19,7 @@ pub fn extend<T: Copy>(values: &mut Vec<T>, more: &[T]) {
     values.extend_from_slice(more);
 }
 
-/// Room for `len` values in all. The first allocation is exact: what is made once has nothing to spare.
+/// Reserves capacity for `len` values in total. The first allocation is exact, for vectors that never grow.
 fn reserve<T>(values: &mut Vec<T>, len: usize) {
     if len > values.capacity() {
         let to_spare = if values.capacity() == 0 { 0 } else { len / 8 };
@@ -32,7 +32,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn there_is_little_to_spare() {
+    fn growth_leaves_little_to_spare() {
         let mut values = Vec::new();
         resize(&mut values, 1000, 1.0f32);
         assert_eq!((values.len(), values.capacity()), (1000, 1000));

@@ -1,13 +1,12 @@
 //! Instruction paths: the same kernel code compiled for several instruction sets, chosen at run time.
 //!
 //! A kernel implements [`Kernel::run`] once, `#[inline(always)]`, on plain slices in 16-wide inner loops that the
-//! compiler vectorises; [`dispatch`] calls it inside a function compiled for the path. `FMA` tells the kernel
-//! whether fused multiply-add is an instruction there: use [`fma`], which is fused on AVX2 and AVX-512 and two
-//! roundings on the baseline. So AVX2 and AVX-512 give the same bits as each other; the baseline gives others.
-//! Bits are promised per class of paths ([`BitsClass`]). A checkpoint records the path, and a run may go on with any
-//! path of the same class.
+//! compiler vectorises; [`dispatch`] calls it inside a function compiled for the path. `FMA` tells the kernel whether
+//! the path has fused multiply-add: use [`fma`], which is fused on AVX2 and AVX-512 and rounds twice on the baseline.
+//! So AVX2 and AVX-512 give the same bits, and the baseline gives others. Equal bits are promised per class of paths
+//! ([`BitsClass`]). A checkpoint records the path, and a run may resume with any path of the same class.
 //!
-//! The `unsafe` of the crate's compute half lives here and in `eight`, and nowhere else.
+//! The `unsafe` of the crate's compute half is confined to this file and `eight`.
 #![allow(unsafe_code)] // calling a function compiled for a detected instruction set
 
 use std::sync::OnceLock;
@@ -15,19 +14,19 @@ use std::sync::OnceLock;
 /// Width of inner loops: one tile row, one AVX-512 register, two AVX2 registers.
 pub const LANES: usize = 16;
 
-/// Instruction paths that give the same bits as each other.
+/// A class of instruction paths that give the same bits.
 ///
-/// Tests compare the paths that their machine has: the picture, its gradients and the loss
-/// (`the_paths_of_a_class_give_the_same_bits` of the oracle tests), the optimizer (`tests/deferred.rs`, where the baseline
-/// gives the same bits too, since nothing is fused there), culling (`tests/cull.rs`), bounds of pages (their unit test), and a
-/// whole run (`tests/resume/paths.rs`).
+/// Tests compare the paths available on their machine: the picture, its gradients and the loss
+/// (`the_paths_of_a_class_give_the_same_bits` of the oracle tests), the optimizer (`tests/deferred.rs`, where the
+/// baseline gives the same bits too, because nothing is fused there), culling (`tests/cull.rs`), bounds of pages (their
+/// unit test), and a whole run (`tests/resume/paths.rs`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum BitsClass {
-    /// Multiplication and addition are one instruction that rounds once: AVX2 and AVX-512. Inner loops are 16 wide on both,
-    /// so sums are taken in the same order.
+    /// AVX2 and AVX-512: multiply-add is one instruction that rounds once. Inner loops are 16 wide on both, so sums are
+    /// taken in the same order.
     Fused,
-    /// They are two instructions that round twice: the baseline, which has no fused one. To imitate it in software would
-    /// be far slower than the path is.
+    /// The baseline: multiply-add is two instructions that round twice. Emulating the fused one in software would be
+    /// far slower.
     RoundedTwice,
 }
 
@@ -38,7 +37,7 @@ pub enum SimdPath {
     Avx512,
     /// AVX2 with FMA.
     Avx2,
-    /// Whatever the target's baseline is (SSE2 on x86-64).
+    /// The target's baseline (SSE2 on x86-64).
     Baseline,
 }
 
@@ -60,7 +59,7 @@ impl SimdPath {
         SimdPath::ALL.into_iter().find(|p| p.name() == name)
     }
 
-    /// Which paths give the same bits as this one.
+    /// The class of paths that give the same bits as this one.
     pub fn bits_class(self) -> BitsClass {
         match self {
             SimdPath::Avx512 | SimdPath::Avx2 => BitsClass::Fused,
@@ -68,7 +67,7 @@ impl SimdPath {
         }
     }
 
-    /// Whether this machine can run it.
+    /// Whether this machine supports the path.
     #[cfg(target_arch = "x86_64")]
     pub fn is_supported(self) -> bool {
         match self {
@@ -84,7 +83,7 @@ impl SimdPath {
         }
     }
 
-    /// Whether this machine can run it.
+    /// Whether this machine supports the path.
     #[cfg(not(target_arch = "x86_64"))]
     pub fn is_supported(self) -> bool {
         self == SimdPath::Baseline
@@ -97,22 +96,22 @@ impl SimdPath {
     }
 }
 
-/// Work that [`dispatch`] compiles for each path.
+/// A kernel that [`dispatch`] compiles for each path.
 pub trait Kernel {
-    /// What it returns.
+    /// Its result.
     type Out;
-    /// The work. Mark the implementation, and every function it calls in its inner loop, `#[inline(always)]`.
+    /// Runs the kernel. Mark the implementation, and every function it calls in its inner loop, `#[inline(always)]`.
     fn run<const FMA: bool>(self) -> Self::Out;
 }
 
-/// `a * b + c`: fused when `FMA`, otherwise rounded twice.
+/// `a * b + c`: fused if `FMA`, otherwise rounded twice.
 #[inline(always)]
 pub fn fma<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
 }
 
-/// Asks for the cache line of `values[at]`, which will be read soon; costs nothing but the request. Does nothing where there
-/// is no such instruction. Beyond the end is allowed: a check would cost more than the request.
+/// Prefetches the cache line of `values[at]`; does nothing on processors without such an instruction. `at` may be out
+/// of bounds: a check would cost more than the prefetch.
 #[inline(always)]
 pub fn prefetch<T>(values: &[T], at: usize) {
     let address = values.as_ptr().wrapping_add(at);
@@ -125,7 +124,7 @@ pub fn prefetch<T>(values: &[T], at: usize) {
     let _ = address;
 }
 
-/// Runs `kernel` on `path`; a path that this machine lacks falls back to the baseline.
+/// Runs `kernel` on `path`, or on the baseline if this machine lacks `path`.
 #[inline]
 pub fn dispatch<K: Kernel>(path: SimdPath, kernel: K) -> K::Out {
     #[cfg(target_arch = "x86_64")]

@@ -1,4 +1,4 @@
-//! Sizes and times as people write them: `512MiB`, `4GiB`, `2GB`, `1048576`; `45 s`, `12 min`, `3.4 h`.
+//! Sizes and times in human notation: `512MiB`, `4GiB`, `2GB`, `1048576`; `45 s`, `12 min`, `3.4 h`.
 
 /// Bytes in one MiB.
 pub const MIB: u64 = 1 << 20;
@@ -27,7 +27,7 @@ pub fn parse_bytes(text: &str) -> Result<u64, String> {
     if bytes.is_finite() && bytes < 9e18 { Ok(bytes as u64) } else { Err(format!("'{text}' is out of range")) }
 }
 
-/// A size for people: two or three digits and a binary unit.
+/// Formats a size with two or three digits and a binary unit.
 pub fn format_bytes(bytes: u64) -> String {
     let units = ["B", "KiB", "MiB", "GiB", "TiB"];
     let mut value = bytes as f64;
@@ -43,10 +43,10 @@ pub fn format_bytes(bytes: u64) -> String {
     }
 }
 
-/// A time for people: two or three digits and a unit.
+/// Formats a time with two or three digits and a unit.
 pub fn format_seconds(seconds: f64) -> String {
     const UNITS: [(f64, &str); 4] = [(1.0, "s"), (60.0, "min"), (3600.0, "h"), (86400.0, "d")];
-    // A unit ends where its number would have three digits.
+    // The next unit starts where the number would have three digits.
     let (size, unit) = UNITS.into_iter().find(|(size, _)| seconds < 99.5 * size).unwrap_or(UNITS[3]);
     let value = seconds / size;
     if value < 9.95 { format!("{value:.1} {unit}") } else { format!("{value:.0} {unit}") }

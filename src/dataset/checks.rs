@@ -1,22 +1,22 @@
-//! What both readers check before a number from a file is believed, and how they say what they left out.
+//! Checks that all readers apply to the numbers in a file, and the wording of their warnings.
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::model::{Intrinsics, Lens, RawView};
 use std::path::Path;
 
-/// Largest width or height accepted, pixels: the limit of JPEG, and beyond every photo there is.
+/// Largest width or height accepted, pixels: the limit of JPEG.
 const MAX_SIDE: u64 = 65_535;
-/// Focal lengths accepted, in units of the longer side. Satellite views come near the upper end.
+/// Range of focal lengths accepted, in units of the longer side. Satellite views come near the upper end.
 const FOCAL_RANGE: (f64, f64) = (1e-3, 1e6);
-/// Farthest principal point accepted, in units of the longer side (crops lie off centre, but not further).
+/// Farthest principal point accepted, in units of the longer side (crops are off centre, but less than this).
 const MAX_CENTRE: f64 = 1e3;
-/// Farthest coordinate of a pose that is believed.
+/// Largest coordinate of a pose that is accepted.
 pub(super) const MAX_COORDINATE: f64 = 1e15;
 /// Names listed in one warning.
 const LISTED: usize = 10;
 
-/// Intrinsics whose numbers can belong to a camera, or what is wrong with them. A radial lens without distortion
-/// becomes a pinhole, which is the same map.
+/// Checks that the numbers can be a camera's intrinsics, and returns them or the problem. A radial lens without
+/// distortion becomes a pinhole, which is the same mapping.
 pub(super) fn checked_intrinsics(
     (width, height): (u64, u64),
     focal: [f64; 2],
@@ -57,7 +57,7 @@ pub(super) fn checked_intrinsics(
     })
 }
 
-/// Sorts the views by name and refuses two of the same name.
+/// Sorts the views by name and refuses duplicate names.
 pub(super) fn sort_views(file: &Path, views: &mut [RawView]) -> InputResult<()> {
     views.sort_by(|a, b| a.name.cmp(&b.name));
     match views.windows(2).find(|pair| pair[0].name == pair[1].name) {
@@ -71,7 +71,7 @@ pub(super) fn sort_views(file: &Path, views: &mut [RawView]) -> InputResult<()> 
     }
 }
 
-/// The first names of a list and how many more there are.
+/// The first names of a list, and the number of further ones.
 pub(super) fn listed(names: &[String]) -> String {
     let shown = names.iter().take(LISTED).map(|n| format!("'{n}'")).collect::<Vec<_>>().join(", ");
     match names.len().saturating_sub(LISTED) {

@@ -3,9 +3,9 @@
 //! Format: COLMAP, "Output Format" in its documentation, binary files of `src/colmap/scene/reconstruction_io.cc`;
 //! little-endian, quaternions w first, world to camera.
 //!
-//! Invariants: 1. image and point ids count from 1, camera id is 1; 2. tracks and the images' point lists agree in
-//! both directions; 3. a file appears under its name only when all its bytes are on disk, and the model's folder
-//! only when all its files are.
+//! Invariants: 1. image and point ids count from 1, the camera id is 1; 2. tracks and the images' point lists agree in
+//! both directions; 3. a file gets its final name only when all its bytes are on disk, and the model's folder only when
+//! all its files are.
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::model::{Intrinsics, Lens, Pose};
@@ -14,10 +14,10 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
-/// Number of the PINHOLE camera model (fx, fy, cx, cy).
+/// Id of the PINHOLE camera model (fx, fy, cx, cy).
 const PINHOLE: i32 = 1;
 
-/// A model of one camera.
+/// A model with one camera.
 #[derive(Debug, Clone)]
 pub struct Model {
     /// The camera of all images; a pinhole.
@@ -26,8 +26,8 @@ pub struct Model {
     pub images: Vec<ModelImage>,
     /// The points.
     pub points: Vec<Point>,
-    /// The points are written once for each of these, moved by it (at least one): so a model may be larger than memory.
-    /// Image k sees the points of number k modulo their count, its pose being where those are.
+    /// Offsets (at least one): the points are written once per offset, moved by it, so that a model may be larger than
+    /// memory. Image k sees the points of offset number k modulo their count, and its pose is there.
     pub tiles: Vec<[f64; 3]>,
 }
 
@@ -49,11 +49,11 @@ pub struct Point {
     pub rgb: [u8; 3],
     /// Mean reprojection error, pixels.
     pub error: f64,
-    /// Who sees it.
+    /// The images that see it.
     pub observations: Vec<Observation>,
 }
 
-/// A point seen in an image.
+/// A sighting of a point in an image.
 #[derive(Debug, Clone, Copy)]
 pub struct Observation {
     /// Index into the images, from 0.
@@ -65,32 +65,36 @@ pub struct Observation {
 /// Writes `<sparse>/0/*.bin`; `sparse` must not exist and its parent must.
 ///
 /// # Errors
-/// A camera with distortion, an observation of an image that is not there, anything that cannot be written.
+/// The camera has distortion, an observation names a missing image, or a file cannot be written.
 pub fn write_model(sparse: &Path, model: &Model) -> InputResult<()> {
     let images = model.images.len();
     if model.intrinsics.lens != Lens::Pinhole {
         return Err(InputError::new(sparse, "only pinhole cameras are written", "undistort the images first"));
     }
     if model.points.iter().flat_map(|p| &p.observations).any(|o| o.image as usize >= images) {
-        return Err(InputError::new(sparse, format!("a track names an image beyond the {images} there are"), ""));
+        return Err(InputError::new(
+            sparse,
+            format!("a track names an image that does not exist; there are {images}"),
+            "",
+        ));
     }
     if model.tiles.is_empty() {
-        return Err(InputError::new(sparse, "the points lie nowhere", "give at least one tile"));
+        return Err(InputError::new(sparse, "the model has no tiles", "give at least one tile"));
     }
     let partial = sparse.with_extension("partial");
     let folder = partial.join("0");
-    std::fs::create_dir_all(&folder).map_err(|e| InputError::io(&folder, "making the folder", &e))?;
+    std::fs::create_dir_all(&folder).map_err(|e| InputError::io(&folder, "creating the folder", &e))?;
     write_file(&folder.join("cameras.bin"), |out| cameras(out, &model.intrinsics))?;
     let order = observation_order(model);
     write_file(&folder.join("images.bin"), |out| images_bin(out, model, &order))?;
     write_file(&folder.join("points3D.bin"), |out| points_bin(out, model))?;
-    std::fs::rename(&partial, sparse).map_err(|e| InputError::io(sparse, "naming the model's folder", &e))
+    std::fs::rename(&partial, sparse).map_err(|e| InputError::io(sparse, "renaming the model's folder", &e))
 }
 
-/// Writes a file under a temporary name, waits until its bytes are on disk, and then gives it its name.
+/// Writes a file under a temporary name, syncs it, and renames it.
 ///
 /// # Errors
-/// Whatever the system says, with the file's name.
+/// The system's errors, with the file's name.
 pub fn write_file(path: &Path, fill: impl FnOnce(&mut dyn Write) -> std::io::Result<()>) -> InputResult<()> {
     let mut name = path.file_name().unwrap_or_default().to_os_string();
     name.push(".partial");
@@ -104,7 +108,7 @@ pub fn write_file(path: &Path, fill: impl FnOnce(&mut dyn Write) -> std::io::Res
         std::fs::rename(&partial, path)
     };
     write().map_err(|e| {
-        // What is left of the attempt is of no use; that it may not be there is no second error.
+        // The remains of the attempt are useless, and may not exist.
         let _ = std::fs::remove_file(&partial);
         InputError::io(path, "writing", &e)
     })
@@ -159,7 +163,7 @@ fn images_bin(out: &mut dyn Write, model: &Model, order: &[Vec<(u64, [f64; 2])>]
 }
 
 fn points_bin(out: &mut dyn Write, model: &Model) -> std::io::Result<()> {
-    // The place of an observation in its image's list: lists are in the order of the points.
+    // The index of an observation in its image's list: lists are in the order of the points.
     let mut written = vec![0u32; model.images.len()];
     let (points, tiles) = (model.points.len() as u64, model.tiles.len() as u64);
     out.write_all(&(points * tiles).to_le_bytes())?;

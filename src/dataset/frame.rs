@@ -1,24 +1,24 @@
-//! The local frame: which offset and scale are taken out of a dataset before anything becomes f32, and how large
-//! the scene is.
+//! The local frame: the offset and scale removed from a dataset before anything is converted to f32, and the size of
+//! the scene.
 //!
-//! Responsible for medians of cameras and points, and for moving positions and poses between frames. Not
-//! responsible for photos or for which views exist.
+//! Here: medians of cameras and points, conversion of positions and poses between frames. Not here: photos, and the
+//! choice of views.
 //!
-//! Invariants: 1. subtraction of the origin happens in f64, so a map-projection offset of 5e5 m changes local values
-//! by less than f32 rounding; 2. the scale is finite and positive whatever the input; 3. only medians decide origin
-//! and scale, so fewer than half of the cameras or points can be anywhere without moving them far.
+//! Invariants: 1. the origin is subtracted in f64, so a map-projection offset of 5e5 m changes local values by less
+//! than f32 rounding; 2. the scale is finite and positive for any input; 3. only medians decide origin and scale, so a
+//! minority of bad cameras or points cannot move them far.
 
 use super::model::Pose;
 use glam::DVec3;
 use std::convert::Infallible;
 
-/// Coordinates larger than this are treated like non-finite ones: their squares would overflow.
+/// Larger coordinates are treated as non-finite: their squares would overflow.
 pub const LARGEST_COORDINATE: f64 = 1e100;
 
-/// A length below this share of the distance to the points (or 1e-12 of the coordinates) counts as zero.
+/// A length below this fraction of the distance to the points (or 1e-12 of the coordinates) counts as zero.
 const NEGLIGIBLE: f64 = 1e-6;
 
-/// How many robust extents away a position may be before it is called absurd.
+/// Farthest plausible position, in robust extents.
 const ABSURD: f64 = 1e6;
 
 /// Local = (world - origin) / scale, axes unchanged.
@@ -31,25 +31,26 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// The frame in which local and world are the same.
+    /// The frame in which local and world coordinates are equal.
     pub fn identity() -> Self {
         Frame { origin: DVec3::ZERO, scale: 1.0 }
     }
 
-    /// A world position in local coordinates.
+    /// Converts a world position to local coordinates.
     pub fn to_local(&self, world: DVec3) -> DVec3 {
         (world - self.origin) / self.scale
     }
 
-    /// A local position in world coordinates.
+    /// Converts a local position to world coordinates.
     pub fn to_world(&self, local: DVec3) -> DVec3 {
         self.origin + local * self.scale
     }
 
-    /// World-to-camera pose as the local-to-camera matrix `[R | t]`, row-major, with camera lengths in local units.
+    /// Converts a world-to-camera pose to the local-to-camera matrix `[R | t]`, row-major, with camera lengths in local
+    /// units.
     ///
-    /// From `R (origin + scale p) + t`, divided by the scale: the rotation stays and t becomes
-    /// `(R origin + t) / scale`.
+    /// From `R (origin + scale p) + t`, divided by the scale: the rotation stays and t becomes `(R origin + t) /
+    /// scale`.
     pub fn viewmat(&self, pose: &Pose) -> [[f32; 4]; 3] {
         let translation = (pose.rotation * self.origin + pose.translation) / self.scale;
         std::array::from_fn(|i| {
@@ -59,19 +60,19 @@ impl Frame {
     }
 }
 
-/// Robust lengths of a scene, world units.
+/// Robust measures of a scene, world units.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Extent {
     /// Coordinate-wise median of the camera positions.
     pub centre: DVec3,
-    /// Median distance of the cameras from `centre`; 0 where it is negligible (one camera, or all in one place).
+    /// Median distance of the cameras from `centre`; 0 if negligible (one camera, or all in one place).
     pub camera_radius: f64,
     /// Median distance of the points from `centre`; 0 without points.
     pub point_distance: f64,
 }
 
 impl Extent {
-    /// Measures cameras and points. Positions that are not [`usable`] are passed over.
+    /// Measures cameras and points. Positions that are not [`usable`] are ignored.
     pub fn measure(centres: &[DVec3], points: &[[f64; 3]]) -> Self {
         let distances = |centre: DVec3| {
             let points = points.iter().map(|&p| DVec3::from_array(p)).filter(|&p| usable(p));
@@ -83,10 +84,10 @@ impl Extent {
         }
     }
 
-    /// As [`Extent::measure`], where `point_distance` gives the median distance of the usable points from a position.
+    /// As [`Extent::measure`], with `point_distance` giving the median distance of the usable points from a position.
     ///
     /// # Errors
-    /// What `point_distance` says.
+    /// Those of `point_distance`.
     pub fn measure_by<E>(centres: &[DVec3], point_distance: impl FnOnce(DVec3) -> Result<f64, E>) -> Result<Self, E> {
         let centres: Vec<DVec3> = centres.iter().copied().filter(|&c| usable(c)).collect();
         let centre = DVec3::from_array(std::array::from_fn(|axis| median(centres.iter().map(|c| c[axis]).collect())));
@@ -99,8 +100,8 @@ impl Extent {
     }
 
     /// The local frame: the origin is the median camera; one unit is the median distance of the cameras from it, so
-    /// that half of the cameras are within 1 and `scene_scale` of an ordinary flight is about 2. Cameras in one place
-    /// use the median distance to the points; without points the world's unit stays.
+    /// that half of the cameras are within 1 and `scene_scale` of an ordinary flight is about 2. If all cameras are in
+    /// one place, the unit is the median distance to the points; without points it is the world's unit.
     pub fn frame(&self) -> Frame {
         let scale = [self.camera_radius, self.point_distance].into_iter().find(|&s| s > 0.0).unwrap_or(1.0);
         Frame { origin: self.centre, scale }
@@ -112,12 +113,12 @@ impl Extent {
         usable(position) && (extent == 0.0 || position.distance(self.centre) <= ABSURD * extent)
     }
 
-    /// `scene_scale` in world units: 1.1 times the largest distance of a camera from the mean of the cameras; and the
-    /// indices of the cameras that are left out of it as outliers.
+    /// `scene_scale` in world units: 1.1 times the largest distance of a camera from the mean of the cameras, without
+    /// outliers; and the indices of these outliers.
     ///
-    /// A camera is an outlier when its distance from the median camera exceeds the median of these distances by more
-    /// than ten times that median and ten times their spread (1.4826 times the median absolute deviation). With all
-    /// cameras in one place the result is the median distance to the points, without points 1.
+    /// A camera is an outlier if its distance from the median camera exceeds the median of these distances by more than
+    /// ten times that median and ten times their spread (1.4826 times the median absolute deviation). If all cameras
+    /// are in one place the result is the median distance to the points; without points it is 1.
     pub fn scene_scale(&self, centres: &[DVec3]) -> (f64, Vec<usize>) {
         let distances: Vec<f64> = centres.iter().map(|c| c.distance(self.centre)).collect();
         let typical = median(distances.clone());
@@ -127,7 +128,7 @@ impl Extent {
         for (i, &distance) in distances.iter().enumerate() {
             if distance <= limit { inliers.push(centres[i]) } else { outliers.push(i) }
         }
-        // The offset is taken out before the sum, so that the mean of large coordinates loses nothing.
+        // The offset is removed before the sum, so that the mean of large coordinates stays accurate.
         let sum = inliers.iter().fold(DVec3::ZERO, |sum, &c| sum + (c - self.centre));
         let mean = self.centre + sum / inliers.len().max(1) as f64;
         let largest = inliers.iter().map(|c| c.distance(mean)).fold(0.0, f64::max);
@@ -141,7 +142,7 @@ impl Extent {
     }
 }
 
-/// Whether every coordinate is finite and small enough to be squared.
+/// Whether every coordinate is finite and its square does not overflow.
 pub fn usable(position: DVec3) -> bool {
     position.to_array().iter().all(|x| x.abs() <= LARGEST_COORDINATE)
 }
@@ -150,7 +151,7 @@ fn negligible(point_distance: f64, centre: DVec3) -> f64 {
     (NEGLIGIBLE * point_distance).max(1e-12 * centre.abs().max_element())
 }
 
-/// The middle value (the mean of the two middle ones for an even count); 0 for none.
+/// The median (the mean of the two middle values for an even count); 0 for an empty list.
 fn median(mut values: Vec<f64>) -> f64 {
     if values.is_empty() {
         return 0.0;

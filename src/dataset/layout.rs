@@ -1,7 +1,7 @@
-//! The shapes of folders in which scenes are published: their names, what they look like, and what a folder lacks of one.
+//! The folder layouts of published scenes: names, appearance, and what a folder lacks of one.
 //!
-//! The readers decide what can be read ([`super::read`]); this is for saying, before anything else, which layout a
-//! folder has and, where it has none, exactly what is missing. Only names are looked at, no file is opened.
+//! The readers decide what can be read ([`super::read`]). This file tells the user beforehand which layout a folder has
+//! or, if none, exactly what is missing. It checks only names and opens no file.
 
 use super::colmap::{self, parts};
 use super::mega_nerf::looks_like_mega_nerf;
@@ -9,16 +9,17 @@ use super::transforms::{looks_like_matrix_city, looks_like_transforms};
 use crate::base::error::{InputError, InputResult};
 use std::path::{Path, PathBuf};
 
-/// A shape of folder.
+/// A folder layout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Layout {
     /// A COLMAP model and its photos.
     Colmap,
-    /// COLMAP models and photos in a training and a held-out folder; or one model, the photos in these two.
+    /// COLMAP models and photos in a training and a held-out folder; or one model, with the photos in these two
+    /// folders.
     ColmapMerged,
     /// Mega-NeRF's: torch files with poses.
     MegaNerf,
-    /// GauU-Scene's: a COLMAP model and its photos, under the names of the drone.
+    /// GauU-Scene's: a COLMAP model and its photos, under the drone's names.
     Gauu,
     /// MatrixCity's: JSON files over folders of photos, and a PLY cloud.
     MatrixCity,
@@ -27,7 +28,7 @@ pub enum Layout {
 }
 
 impl Layout {
-    /// All of them, in the order in which a folder that has several is read.
+    /// All layouts, in the order of preference for a folder that has several.
     pub const ALL: [Layout; 6] =
         [Layout::Colmap, Layout::Gauu, Layout::ColmapMerged, Layout::Transforms, Layout::MatrixCity, Layout::MegaNerf];
 
@@ -43,7 +44,7 @@ impl Layout {
         }
     }
 
-    /// The folder as a tree, for people.
+    /// The layout as a tree, for messages.
     pub fn tree(self) -> &'static str {
         match self {
             Layout::Colmap => {
@@ -95,7 +96,7 @@ without pose/, train/*/transforms.json and test/*/transforms.json are read"
         }
     }
 
-    /// What a folder lacks of this layout: paths and what they should be. Nothing: the folder has it.
+    /// What a folder lacks of this layout: paths and their expected content. Empty if it has the layout.
     pub fn missing(self, folder: &Path) -> Vec<String> {
         let mut missing = Vec::new();
         let mut need = |is_there: bool, what: &str| {
@@ -145,15 +146,15 @@ impl std::str::FromStr for Layout {
     fn from_str(text: &str) -> Result<Layout, String> {
         let names: Vec<&str> = Layout::ALL.iter().map(|l| l.name()).collect();
         let found = Layout::ALL.into_iter().find(|l| l.name() == text);
-        found.ok_or_else(|| format!("'{text}' is no layout; there are {}", names.join(", ")))
+        found.ok_or_else(|| format!("unknown layout '{text}'; use one of {}", names.join(", ")))
     }
 }
 
-/// Which of `accepted` (not empty) the folder has: the first that lacks nothing.
+/// The first layout of `accepted` (not empty) of which the folder lacks nothing.
 ///
 /// # Errors
-/// The folder is not there, or has none of them: says what each lacks, how the folders must look, and `fetch`, where
-/// the data is to be had.
+/// The folder does not exist or has none of the layouts: the error names what each lacks, shows the expected trees, and
+/// `fetch`, where to get the data.
 pub fn find_layout(folder: &Path, accepted: &[Layout], fetch: &[String]) -> InputResult<Layout> {
     let remedy = |layouts: &[Layout]| {
         let trees: Vec<String> = layouts.iter().map(|l| format!("{}:\n{}", l.name(), l.tree())).collect();
@@ -161,7 +162,7 @@ pub fn find_layout(folder: &Path, accepted: &[Layout], fetch: &[String]) -> Inpu
         format!("fetch it and arrange the folder like this\n{}\npublished at{fetch}", indented(&trees.join("\nor\n")))
     };
     if !folder.is_dir() {
-        return Err(InputError::new(folder, "the dataset's folder is not there", remedy(accepted)));
+        return Err(InputError::new(folder, "the dataset's folder does not exist", remedy(accepted)));
     }
     let lacks: Vec<(Layout, Vec<String>)> = accepted.iter().map(|l| (*l, l.missing(folder))).collect();
     if let Some((layout, _)) = lacks.iter().find(|(_, missing)| missing.is_empty()) {
@@ -169,7 +170,7 @@ pub fn find_layout(folder: &Path, accepted: &[Layout], fetch: &[String]) -> Inpu
     }
     let each: Vec<String> =
         lacks.iter().map(|(l, missing)| format!("  as {}: {} missing", l.name(), missing.join(", "))).collect();
-    // A folder that has some of a layout is meant to be that one: its tree comes first.
+    // A folder that has part of a layout is meant to be that layout: its tree comes first.
     let nowhere = folder.join("nothing of this name");
     let has = |(layout, missing): &(Layout, Vec<String>)| layout.missing(&nowhere).len() - missing.len();
     let mut near = lacks;

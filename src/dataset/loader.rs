@@ -1,12 +1,12 @@
-//! From a [`RawScene`] to a checked [`Dataset`]: every photo's header and end are looked at, intrinsics are brought
-//! to training size, offset and scale are taken out, and each view gets its set.
+//! Turns a [`RawScene`] into a checked [`Dataset`]: checks every photo's header and end, scales intrinsics to training
+//! size, removes offset and scale, and assigns each view to a set.
 //!
-//! Not responsible for reading models (the readers are) or pixels ([`super::photo`], [`super::target_cache`]).
-//! Longer than other files: the checks share what they leave out and warn of.
+//! Not here: reading models (the readers) and pixels ([`super::photo`], [`super::target_cache`]). Longer than other
+//! files, because the checks share their lists of dropped views and warnings.
 //!
-//! Invariants: 1. every view of a dataset has a photo whose header and end marker were seen and whose shape can
-//! belong to its camera; 2. frame, scene scale and split depend on the views that the model registers, so a photo
-//! left out with `allow_missing` changes none of them; 3. whatever is left out or repaired is in `warnings`.
+//! Invariants: 1. every view of a dataset has a photo whose header and end marker exist and whose shape matches its
+//! camera; 2. frame, scene scale and split depend on the views registered in the model, so dropping a photo with
+//! `allow_missing` changes none of them; 3. everything dropped or repaired is in `warnings`.
 
 use super::frame::{Extent, Frame, usable};
 use super::import::{Cloud, LocalCloud};
@@ -22,33 +22,33 @@ use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// Names that a message lists before it only counts.
+/// Most names that a message lists.
 const NAMES_LISTED: usize = 20;
 
-/// Depth beyond which nothing is drawn, local units.
+/// Far plane, local units.
 const FAR_PLANE: f32 = 1e10;
 
-/// What the user chose about photos, split and frame.
+/// The user's options for photos, split and frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoadOptions {
-    /// Photos are made smaller by this, at least 1; each side is rounded to nearest.
+    /// Photos are downscaled by this factor, at least 1; each side is rounded to nearest.
     pub data_factor: f64,
     /// Limit of the longer side after `data_factor`, pixels.
     pub max_resolution: Option<u32>,
-    /// Every N-th registered view in sorted order of the names (index % N == 0) is a test view; `None` or 0: none.
+    /// Every N-th registered view, sorted by name (index % N == 0), is a test view; `None` or 0: none.
     pub test_every: Option<u32>,
-    /// Registered views with index > N are test views; wins over `test_every`.
+    /// Registered views with index > N are test views; overrides `test_every`.
     pub test_after: Option<u32>,
     /// Whether masks are used.
     pub masks: bool,
-    /// Black is kept instead of white.
+    /// Keep black instead of white.
     pub invert_masks: bool,
-    /// Views without a photo are left out instead of refused.
+    /// Drop views without a photo instead of failing.
     pub allow_missing: bool,
-    /// Near plane in robust scene sizes, the local unit (see [`Extent::frame`]): 0.01 is what gsplat uses in a scene
-    /// normalised to a median camera distance of 1.
+    /// Near plane in robust scene sizes, the local unit (see [`Extent::frame`]): gsplat uses 0.01 in a scene normalised
+    /// to a median camera distance of 1.
     pub near_plane: f64,
-    /// Folder that the views' names are relative to; `None`: found from the first view's name and path.
+    /// Folder that the views' names are relative to; `None`: derived from the first view's name and path.
     pub image_folder: Option<PathBuf>,
 }
 
@@ -71,32 +71,32 @@ impl Default for LoadOptions {
 /// A scene ready for training.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Dataset {
-    /// Views in sorted order of their names.
+    /// Views, sorted by name.
     pub views: Vec<View>,
     /// Points, local frame, finite.
     pub points: Vec<[f32; 3]>,
     /// sRGB, one per point.
     pub colors: Vec<[u8; 3]>,
-    /// What was taken out of the dataset's coordinates.
+    /// The local frame.
     pub frame: Frame,
-    /// 1.1 times the largest camera distance from the mean of the cameras, outliers left out; local units, > 0.
+    /// 1.1 times the largest camera distance from the mean of the cameras, without outliers; local units, > 0.
     pub scene_scale: f32,
-    /// What was left out or repaired, one sentence each: the reader's, then the loader's.
+    /// Everything dropped or repaired, one sentence each: the reader's, then the loader's.
     pub warnings: Vec<String>,
     /// Folder that the views' names are relative to.
     pub image_folder: PathBuf,
 }
 
-/// One view: what is rendered and what it is compared with.
+/// One view: its camera and its photo.
 #[derive(Debug, Clone, PartialEq)]
 pub struct View {
     /// Name in the dataset.
     pub name: String,
     /// Its set.
     pub split: Split,
-    /// Pose and intrinsics, local frame, without distortion, at training size.
+    /// Pose and intrinsics in the local frame, without distortion, at training size.
     pub camera: Camera,
-    /// Where its pixels come from.
+    /// Source of its pixels.
     pub photo: PhotoSource,
 }
 
@@ -116,11 +116,11 @@ impl Dataset {
     }
 }
 
-/// Checks photos and brings a scene into the local frame.
+/// Checks photos and converts a scene to the local frame.
 ///
 /// Errors: options out of range, no usable view, no training view; missing photos (listed by name) unless
-/// `allow_missing`; photos or masks that are empty, cut short, not JPEG or PNG, or of a shape that cannot belong to
-/// the camera.
+/// `allow_missing`; photos or masks that are empty, cut short, not JPEG or PNG, or whose shape does not match the
+/// camera.
 pub fn load_dataset(mut raw: RawScene, options: &LoadOptions) -> InputResult<Dataset> {
     let points = std::mem::take(&mut raw.points);
     let measure = |centres: &[DVec3]| Ok(Extent::measure(centres, &points.positions));
@@ -130,7 +130,7 @@ pub fn load_dataset(mut raw: RawScene, options: &LoadOptions) -> InputResult<Dat
     Ok(dataset)
 }
 
-/// As [`load_dataset`], for points that may not fit in memory: the dataset has none, the source gives them one by one.
+/// As [`load_dataset`], for points that may exceed memory: the dataset has no points, the source streams them.
 ///
 /// # Errors
 /// As [`load_dataset`]; or the cloud's file cannot be read.
@@ -145,7 +145,7 @@ pub fn load_dataset_with_cloud<'c>(
     let mut dropped = BTreeMap::new();
     cloud.for_each(|position, _| {
         if !extent.is_plausible(position) {
-            *dropped.entry(why_dropped(position)).or_default() += 1;
+            *dropped.entry(drop_reason(position)).or_default() += 1;
         }
         Ok(())
     })?;
@@ -223,15 +223,15 @@ fn check_options(options: &LoadOptions) -> InputResult<()> {
     Ok(())
 }
 
-/// The folder such that folder / name is the first view's path; its parent where that does not hold.
+/// The folder such that folder / name is the first view's path; that path's parent if there is none.
 fn image_folder_of(views: &[RawView]) -> PathBuf {
     let Some(view) = views.first() else { return PathBuf::from(".") };
     let up = if view.image_path.ends_with(&view.name) { Path::new(&view.name).components().count() } else { 1 };
     view.image_path.ancestors().nth(up).unwrap_or(Path::new(".")).to_path_buf()
 }
 
-/// The set of every registered view: the dataset's own, else by index in the sorted list of registered views (also
-/// those whose photo turns out to be missing: their absence must not shift the others).
+/// The set of every registered view: the dataset's own, otherwise by index in the sorted list of registered views
+/// (including views without a photo, whose absence must not shift the others).
 fn split_views(views: &[RawView], options: &LoadOptions, warnings: &mut Vec<String>) -> InputResult<Vec<Split>> {
     let by_index = |index: usize| {
         let is_test = match (options.test_after, options.test_every) {
@@ -257,7 +257,7 @@ fn split_views(views: &[RawView], options: &LoadOptions, warnings: &mut Vec<Stri
     Err(InputError::new("--test-every", problem, "give 2 or more, or 0 to hold none out"))
 }
 
-/// Leaves out views whose pose or intrinsics are not finite, or that are absurdly far from all others.
+/// Drops views whose pose or intrinsics are not finite, or that are implausibly far from all others.
 fn drop_unusable_poses(
     registered: Vec<(RawView, Split)>,
     extent: &Extent,
@@ -292,7 +292,7 @@ fn lens_is_finite(lens: &Lens) -> bool {
     }
 }
 
-/// Photos of the views' folders that no view uses.
+/// Warns about photos in the views' folders that no view uses.
 fn warn_about_extra_photos(views: &[(RawView, Split)], warnings: &mut Vec<String>) {
     let used: BTreeSet<&Path> = views.iter().map(|(view, _)| view.image_path.as_path()).collect();
     let folders: BTreeSet<&Path> = used.iter().filter_map(|path| path.parent()).collect();
@@ -345,7 +345,7 @@ fn drop_missing(
     Ok(present)
 }
 
-/// Headers, shapes and masks of all views, in parallel; the first bad one in view order is the error.
+/// Checks headers, shapes and masks of all views, in parallel; returns the first error in view order.
 fn check_photos(
     views: &[(RawView, Split)],
     options: &LoadOptions,
@@ -372,7 +372,7 @@ fn check_photos(
         warnings.push("--invert-masks has no effect: there is no mask".to_string());
     } else if masked > 0 && masked < photos.len() {
         warnings.push(format!(
-            "{} of {} photos have no mask: all of their pixels count",
+            "{} of {} photos have no mask: all of their pixels are used",
             photos.len() - masked,
             photos.len()
         ));
@@ -408,7 +408,7 @@ fn check_mask(path: &Path, photo: Size, invert: bool) -> InputResult<MaskSource>
     Ok(MaskSource { path: path.to_path_buf(), header, invert })
 }
 
-/// A lens whose parameters are all zero does nothing.
+/// A lens whose parameters are all zero becomes a pinhole.
 fn effective_lens(lens: &Lens) -> Lens {
     match lens {
         Lens::Radial(k) if k.iter().all(|&x| x == 0.0) => Lens::Pinhole,
@@ -416,8 +416,8 @@ fn effective_lens(lens: &Lens) -> Lens {
     }
 }
 
-/// Size of the target: the photo's divided by `data_factor`; where the longer side then exceeds `max_resolution`,
-/// the photo's scaled to it instead (one rounding, from the full size).
+/// Size of the target: the photo's divided by `data_factor`; if the longer side then exceeds `max_resolution`, the
+/// photo's scaled to that limit instead (one rounding, from the full size).
 fn target_size(photo: Size, options: &LoadOptions) -> Size {
     let size = divided_size(photo, options.data_factor);
     let longest = photo.0.max(photo.1);
@@ -461,7 +461,7 @@ fn camera_of(view: &RawView, photo: &PhotoSource, frame: &Frame, options: &LoadO
     }
 }
 
-/// Points in the local frame; what is not finite or absurdly far is dropped and counted.
+/// Points in the local frame; non-finite and implausibly far ones are dropped and counted.
 fn local_points(
     positions: Vec<[f64; 3]>,
     colors: Vec<[u8; 3]>,
@@ -477,14 +477,14 @@ fn local_points(
             points.push(frame.to_local(position).as_vec3().to_array());
             kept_colors.push(color);
         } else {
-            *dropped.entry(why_dropped(position)).or_default() += 1;
+            *dropped.entry(drop_reason(position)).or_default() += 1;
         }
     }
     warn_about_dropped(dropped, warnings);
     (points, kept_colors)
 }
 
-fn why_dropped(position: DVec3) -> &'static str {
+fn drop_reason(position: DVec3) -> &'static str {
     if position.is_finite() { "are more than a million scene sizes away" } else { "are not finite" }
 }
 

@@ -1,8 +1,8 @@
-//! Look-alikes: a generated city in the folder layouts of the published datasets, so that a run of theirs can be tried
-//! from beginning to end before gigabytes are fetched.
+//! Look-alikes: a generated city in the folder layouts of published datasets, to try a published run from start to end
+//! before gigabytes are downloaded.
 //!
-//! The city is written as a COLMAP scene first and rearranged then; photos are moved (MatrixCity's are PNG and written
-//! anew, of the same pixels), views keep the order of the flight.
+//! The city is first written as a COLMAP scene and then rearranged; photos are moved (MatrixCity's are rewritten as PNG
+//! with the same pixels), and views keep the order of the flight.
 //!
 //! Invariant: nothing is overwritten: the folder must be new or empty.
 
@@ -20,11 +20,11 @@ use std::path::Path;
 /// World units of MatrixCity's poses, metres.
 const MATRIX_CITY_UNIT: f64 = 100.0;
 
-/// Makes a city and writes it to `folder` in a layout; every `test_every`th photo is held out by the layouts that say so
-/// themselves. `progress(done, views)` is called after each photo.
+/// Generates a city and writes it to `folder` in a layout. Layouts with a held-out folder put every `test_every`th
+/// photo there. `progress(done, views)` is called after each photo.
 ///
 /// # Errors
-/// As [`write_city`]; a folder that is not empty, or a layout that is not written.
+/// As [`write_city`]; also if the folder is not empty, or the layout cannot be written.
 pub fn write_lookalike(
     folder: &Path,
     options: &CityOptions,
@@ -36,7 +36,7 @@ pub fn write_lookalike(
     }
     if layout == Layout::Transforms || test_every == 0 {
         let (flag, problem) = match test_every {
-            0 => ("--test-every", "0 holds no photo out, but this layout has a folder for those that are"),
+            0 => ("--test-every", "0 holds out no photo, but this layout has a folder of held-out photos"),
             _ => ("--layout", "this layout is read, not written"),
         };
         return Err(InputError::new(flag, problem, "see gsscale-synth --help"));
@@ -55,7 +55,7 @@ pub fn write_lookalike(
         _ => merged(folder, &city, test_every)?,
     }
     let images = folder.join("images");
-    // The photos were moved out of it, but for GauU-Scene's.
+    // The photos were moved out of it, except for GauU-Scene.
     if std::fs::read_dir(&images).is_ok_and(|mut entries| entries.next().is_none()) {
         remove(&images)?;
     }
@@ -63,11 +63,11 @@ pub fn write_lookalike(
 }
 
 fn remove(folder: &Path) -> InputResult<()> {
-    std::fs::remove_dir_all(folder).map_err(|e| InputError::io(folder, "removing what is rearranged", &e))
+    std::fs::remove_dir_all(folder).map_err(|e| InputError::io(folder, "removing the folder of the first layout", &e))
 }
 
 fn make_folder(folder: &Path) -> InputResult<()> {
-    std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "making the folder", &e))
+    std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder", &e))
 }
 
 /// A model of some views under other names, with the city's points.
@@ -83,7 +83,7 @@ fn model_of<'a>(city: &RawScene, views: impl Iterator<Item = (String, &'a RawVie
     }
 }
 
-/// GauU-Scene: COLMAP, photos as a drone names them.
+/// GauU-Scene: COLMAP, photos with a drone's names.
 fn gauu(folder: &Path, city: &RawScene) -> InputResult<()> {
     let named = |(i, view)| (format!("DJI_{:04}.JPG", i + 1), view);
     for (name, view) in city.views.iter().enumerate().map(named) {
@@ -142,7 +142,7 @@ fn matrix_city(folder: &Path, city: &RawScene, test_every: usize) -> InputResult
     write_cloud(&folder.join("points.ply"), city)
 }
 
-/// Camera to world with OpenGL's axes, the rotation and the position each times a factor.
+/// Camera to world in OpenGL axes, rotation and position each times a factor.
 fn matrix(view: &RawView, rotation: f64, position: f64) -> [[f64; 4]; 4] {
     let r = view.pose.rotation;
     let centre = view.pose.centre();
@@ -157,13 +157,13 @@ fn write_json(path: &Path, value: &Value) -> InputResult<()> {
     write_file(path, |out| out.write_all(value.to_string().as_bytes()))
 }
 
-/// The same pixels as PNG; the photo it is made from is removed.
+/// Rewrites a photo as PNG with the same pixels, and removes the original.
 fn to_png(from: &Path, to: &Path) -> InputResult<()> {
     let wrong = |e: image::ImageError| {
         InputError::new(to, format!("turning {} into PNG failed: {e}", from.display()), "check the disk and its space")
     };
     image::open(from).and_then(|photo| photo.save(to)).map_err(wrong)?;
-    std::fs::remove_file(from).map_err(|e| InputError::io(from, "removing what became PNG", &e))
+    std::fs::remove_file(from).map_err(|e| InputError::io(from, "removing the original photo", &e))
 }
 
 /// The city's points in MatrixCity's unit, as its published clouds are: doubles and bytes.

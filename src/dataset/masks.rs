@@ -1,12 +1,12 @@
-//! Masks: which file belongs to which photo, and which pixels it keeps.
+//! Masks: finds the mask of each photo, and decodes the pixels to keep.
 //!
-//! A mask is a picture of the photo's shape: white (128 and above) is kept, black is left out of loss and metrics. A
-//! transparent mask pixel counts as black. Masks lie in `masks/` beside (or inside) the image folder, under the
-//! photo's relative name: the same name, the name with `.png` appended, or the name with another picture extension.
-//! Extensions compare without case.
+//! A mask is a picture of the photo's shape: white (128 and above) is kept, black is excluded from loss and metrics. A
+//! transparent mask pixel counts as black. Masks are in `masks/` beside (or inside) the image folder, under the photo's
+//! relative name: the same name, the name with `.png` appended, or with another picture extension. Extensions are
+//! compared case-insensitively.
 //!
-//! Invariants: 1. the folder is listed once, never followed out of itself through a link; 2. mask size may differ
-//! from photo size, not its shape; 3. a target pixel is kept when at least half of its area is.
+//! Invariants: 1. the folder is listed once, without following links out of it; 2. a mask's size may differ from the
+//! photo's, its shape may not; 3. a target pixel is kept if at least half of its area is.
 
 use super::model::{Intrinsics, Lens};
 use super::photo::{self, intrinsics_at};
@@ -25,21 +25,21 @@ const DEEPEST: usize = 16;
 pub struct MaskSource {
     /// The mask's file.
     pub path: PathBuf,
-    /// What its header says.
+    /// Its header.
     pub header: PhotoHeader,
-    /// Black is kept instead of white.
+    /// Whether black is kept instead of white.
     pub invert: bool,
 }
 
-/// Files of the mask folders by relative name.
+/// Mask files by relative name.
 #[derive(Debug, Clone, Default)]
 pub struct MaskIndex {
     files: BTreeMap<String, PathBuf>,
 }
 
 impl MaskIndex {
-    /// Lists `masks/` in the scene's folder, beside the image folder when that lies deeper, and inside it; the first
-    /// wins. Nothing outside the scene is looked at; missing folders are empty.
+    /// Lists `masks/` in the scene's folder, beside the image folder if that is deeper, and inside the image folder;
+    /// the first match wins. Searches nothing outside the scene; missing folders count as empty.
     pub fn scan(root: &Path, image_folder: &Path) -> Self {
         let mut index = MaskIndex::default();
         index.add_folder(&root.join("masks"), "", 0);
@@ -50,7 +50,7 @@ impl MaskIndex {
         index
     }
 
-    /// Whether there is no mask at all.
+    /// Whether there are no masks.
     pub fn is_empty(&self) -> bool {
         self.files.is_empty()
     }
@@ -95,7 +95,7 @@ fn normalised(name: &str) -> String {
     }
 }
 
-/// Decodes a mask for a photo with these full-size intrinsics: one byte per target pixel, 255 = keep, 0 = leave out.
+/// Decodes a mask for a photo with these full-size intrinsics: one byte per target pixel, 255 = keep, 0 = exclude.
 pub fn decode_mask(mask: &MaskSource, intrinsics: &Intrinsics, target: Size) -> InputResult<Vec<u8>> {
     let mut keep = photo::read_luma(&mask.path, &mask.header)?;
     for value in &mut keep {
@@ -119,7 +119,7 @@ pub fn decode_mask(mask: &MaskSource, intrinsics: &Intrinsics, target: Size) -> 
     Ok(share)
 }
 
-/// Shares of 0 to 255 become 0 or 255; half or more is kept.
+/// Converts coverage of 0 to 255 to 0 or 255; half or more is kept.
 pub fn threshold(share: &mut [u8]) {
     for value in share {
         *value = if *value >= 128 { 255 } else { 0 };

@@ -1,6 +1,7 @@
-//! Where views come from. A reader (COLMAP, transforms.json, MatrixCity, Mega-NeRF) fills a [`model::RawScene`] in the dataset's own f64
-//! coordinates; the loader checks the photos against it and turns it into a [`loader::Dataset`] in the local frame.
-//! Pixels are decoded later, a few views ahead of their use, by [`target_cache`].
+//! Datasets: the source of views. A reader (COLMAP, transforms.json, MatrixCity, Mega-NeRF) fills a [`model::RawScene`]
+//! in the dataset's own f64 coordinates; the loader checks the photos against it and converts it to a
+//! [`loader::Dataset`] in the local frame. Pixels are decoded later, a few views ahead of their use, by
+//! [`target_cache`].
 
 mod checks;
 pub mod colmap;

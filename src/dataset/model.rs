@@ -1,15 +1,15 @@
-//! What a reader finds, before any photo is opened: plain data in the dataset's own coordinates, all f64.
+//! The result of a reader, before any photo is opened: plain data in the dataset's own coordinates, all f64.
 
 use crate::base::error::InputResult;
 use glam::{DMat3, DVec3};
 use std::path::PathBuf;
 
-/// Camera models that can be used, with COLMAP's parameter order in the comments.
+/// Supported lens models, with COLMAP's parameter order in the comments.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Lens {
     /// No distortion.
     Pinhole,
-    /// k1, k2, p1, p2, k3, k4, k5, k6: radial (rational when k4..k6 are not 0) and tangential, as OpenCV's.
+    /// k1, k2, p1, p2, k3, k4, k5, k6: radial (rational if k4..k6 are not 0) and tangential, as OpenCV's.
     /// SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV are cases of it.
     Radial([f64; 8]),
     /// k1, k2, k3, k4 on the angle (equidistant fisheye), as OpenCV's fisheye.
@@ -64,21 +64,21 @@ pub enum Split {
 /// One registered photo.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RawView {
-    /// Name as in the dataset, `/`-separated, relative to the image folder; proven to stay inside it.
+    /// Name in the dataset, `/`-separated, relative to the image folder and checked to stay inside it.
     pub name: String,
     /// The photo's file.
     pub image_path: PathBuf,
-    /// Intrinsics at the size that the dataset states.
+    /// Intrinsics at the size stated by the dataset.
     pub intrinsics: Intrinsics,
     /// Pose.
     pub pose: Pose,
-    /// A mask named by the dataset itself; masks found by folder are the loader's matter.
+    /// A mask named by the dataset itself; the loader finds masks by folder.
     pub mask_path: Option<PathBuf>,
-    /// The split that the dataset itself prescribes (transforms_train/val/test.json), if it does.
+    /// The split that the dataset prescribes (transforms_train/val/test.json), if any.
     pub split: Option<Split>,
 }
 
-/// Takes points one by one: position in dataset coordinates, sRGB.
+/// Receives points one by one: position in dataset coordinates, sRGB.
 pub type TakePoint<'a> = dyn FnMut([f64; 3], [u8; 3]) -> InputResult<()> + 'a;
 
 /// Coloured points.
@@ -90,19 +90,19 @@ pub struct PointCloud {
     pub colors: Vec<[u8; 3]>,
 }
 
-/// Everything a reader found.
+/// Everything that a reader found.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct RawScene {
-    /// The scene's own folder, where `masks/` may lie; empty when a scene was not read from files.
+    /// The scene's own folder, which may contain `masks/`; empty if the scene was not read from files.
     pub root: PathBuf,
-    /// Views in sorted order of their names, names unique.
+    /// Views sorted by name; names are unique.
     pub views: Vec<RawView>,
     /// Points; may be empty.
     pub points: PointCloud,
-    /// A file of points that exists and is the caller's to read: a PLY that the dataset names, since this module knows no
-    /// PLY; or, with [`super::read::ReadOptions::points_later`], the model's own points3D file
+    /// An existing file of points that the caller must read: a PLY that the dataset names, because this module does not
+    /// read PLY; or, with [`super::read::ReadOptions::points_later`], the model's own points3D file
     /// ([`super::colmap::stream_points`]).
     pub points_path: Option<PathBuf>,
-    /// What was left out or repaired, one sentence each, for the user.
+    /// Everything dropped or repaired, one sentence each, for the user.
     pub warnings: Vec<String>,
 }

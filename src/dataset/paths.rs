@@ -1,15 +1,15 @@
-//! Names that come from files, turned into paths that stay inside a folder. Nothing here touches the disk.
+//! Converts names from files to paths that stay inside a folder. Nothing here accesses the disk.
 //!
-//! Invariants: 1. a name that passes is relative, has no `..` component, no drive letter, no control character and
-//! at most [`MAX_NAME_BYTES`] bytes; 2. both `/` and `\` separate components, on every platform, so that a name
-//! means the same file wherever the dataset is read. Links inside the folder are the user's own and are followed.
+//! Invariants: 1. an accepted name is relative and has no `..` component, drive letter or control character, and at
+//! most [`MAX_NAME_BYTES`] bytes; 2. both `/` and `\` separate components, on every platform, so that a name means the
+//! same file everywhere. Links inside the folder belong to the user and are followed.
 
 use std::path::{Path, PathBuf};
 
 /// Longest name accepted, bytes: the usual limit of a path.
 pub const MAX_NAME_BYTES: usize = 4096;
 
-/// The name with `/` between its components and without `.` and empty ones, or why it is refused.
+/// The name with `/` between its components and without `.` and empty ones, or the reason for refusal.
 pub fn clean_name(name: &str) -> Result<String, String> {
     if name.len() > MAX_NAME_BYTES {
         return Err(format!("a name of {} bytes is longer than {MAX_NAME_BYTES}", name.len()));
@@ -34,12 +34,12 @@ pub fn clean_name(name: &str) -> Result<String, String> {
         }
     }
     if parts.is_empty() {
-        return Err(format!("the name {name:?} names no file"));
+        return Err(format!("the name {name:?} is not a file name"));
     }
     Ok(parts.join("/"))
 }
 
-/// `folder` joined with a name from a file: the cleaned name and the path, or why the name is refused.
+/// `folder` joined with a name from a file: the cleaned name and the path, or the reason for refusal.
 pub fn safe_join(folder: &Path, name: &str) -> Result<(String, PathBuf), String> {
     let name = clean_name(name)?;
     let path = folder.join(&name);
@@ -51,7 +51,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_that_stay_inside_pass() {
+    fn names_inside_the_folder_are_accepted() {
         for (given, clean) in [
             ("a.jpg", "a.jpg"),
             ("./images/a b.jpg", "images/a b.jpg"),

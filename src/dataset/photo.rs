@@ -1,14 +1,13 @@
-//! From a photo file to a training target: decode, take the distortion out, average down, apply the mask.
+//! Converts a photo file to a training target: decodes, undistorts, downscales, applies the mask.
 //!
-//! Every picture becomes 8-bit RGB: 16-bit samples are rounded, gray is repeated, CMYK is converted. Transparent
-//! pixels are composited over black, the colour the renderer starts from, so that a cut-out object (Blender's RGBA
-//! renders) is learned as an object in front of nothing. EXIF orientation is ignored: COLMAP poses refer to the
-//! stored pixels.
+//! Every picture becomes 8-bit RGB: 16-bit samples are rounded, gray is repeated, CMYK is converted. Transparent pixels
+//! are composited over black, the renderer's background, so that a cut-out object (Blender's RGBA renders) is learned
+//! as an object in empty space. EXIF orientation is ignored: COLMAP poses refer to the stored pixels.
 //!
-//! Invariants: 1. a target depends on its [`PhotoSource`] and the files alone, never on budgets or threads; 2. the
-//! memory used at any moment of [`decode`] is at most [`PhotoSource::decode_bytes`], whatever the files hold beside their
-//! pixels: colour profiles, texts and previews are skipped or counted; 3. distorted photos are undistorted at full size,
-//! row by row into the area average: the full-size result never exists.
+//! Invariants: 1. a target depends on its [`PhotoSource`] and the files alone, never on budgets or threads; 2.
+//! [`decode`] never uses more memory than [`PhotoSource::decode_bytes`], whatever the files contain besides pixels:
+//! colour profiles, texts and previews are skipped or counted; 3. distorted photos are undistorted at full size, row by
+//! row into the area average: the full-size result never exists in memory.
 
 use super::masks::{self, MaskSource};
 use super::model::{Intrinsics, Lens};
@@ -24,14 +23,14 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
-/// All that decoding a view's target needs; the files were checked at load.
+/// Everything needed to decode a view's target; the files were checked at load.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PhotoSource {
     /// The photo's file.
     pub image_path: PathBuf,
-    /// What its header said at load.
+    /// Its header, as read at load.
     pub header: PhotoHeader,
-    /// Intrinsics at the photo's true size, with the lens to be undone.
+    /// Intrinsics at the photo's true size, with the lens to undo.
     pub intrinsics: Intrinsics,
     /// Size of the target, pixels.
     pub target: Size,
@@ -40,14 +39,14 @@ pub struct PhotoSource {
 }
 
 impl PhotoSource {
-    /// Bytes that the decoded target keeps, at most (a mask may turn out to be unnecessary).
+    /// Most bytes of the decoded target (a mask may turn out to be unnecessary).
     pub fn target_bytes(&self) -> u64 {
         let has_mask = self.mask.is_some() || self.intrinsics.lens != Lens::Pinhole;
         self.target_pixels() * if has_mask { 4 } else { 3 }
     }
 
-    /// Bytes that [`decode`] holds at its peak: the larger of the photo's and the mask's turn, with the target.
-    /// Buffers of a few rows are not counted.
+    /// Peak memory of [`decode`], bytes: the larger of the photo's and the mask's, plus the target. Buffers of a few
+    /// rows are not counted.
     pub fn decode_bytes(&self) -> u64 {
         let photo = self.header.decode_bytes + self.target_bytes();
         let undone = if self.intrinsics.lens == Lens::Pinhole { 0 } else { self.target_pixels() };
@@ -60,8 +59,8 @@ impl PhotoSource {
     }
 }
 
-/// Intrinsics for the same photo at another size: each axis scaled by its own ratio. The lens acts on directions and
-/// stays.
+/// Intrinsics of the same photo at another size: each axis is scaled by its own ratio. The lens is unchanged because it
+/// acts on directions.
 pub fn intrinsics_at(intrinsics: &Intrinsics, size: Size) -> Intrinsics {
     let sx = f64::from(size.0) / f64::from(intrinsics.width);
     let sy = f64::from(size.1) / f64::from(intrinsics.height);
@@ -101,7 +100,7 @@ pub fn decode(source: &PhotoSource) -> InputResult<Target> {
     Ok(Target { width: source.target.0, height: source.target.1, rgb, mask })
 }
 
-/// The photo without its distortion at target size, and the pixels of which at least half lies inside the photo.
+/// The undistorted photo at target size, and the pixels of which at least half are inside the photo.
 fn undistorted(rgb: &[u8], source: &PhotoSource) -> (Vec<u8>, Option<Vec<u8>>) {
     let full = (source.header.width, source.header.height);
     let undistorter = Undistorter::new(source.intrinsics);

@@ -1,16 +1,15 @@
-//! What a photo file says about itself, without decoding it: format, size, whether its end is there, and how much
-//! memory decoding will take.
+//! Checks a photo file without decoding it: format, size, presence of its end, and the memory that decoding takes.
 //!
-//! That memory is counted from what the decoders do (crates png 0.18 and zune-jpeg 0.5), buffers of a few rows apart.
-//! A PNG takes its pixels as they are decoded (1 to 8 bytes each) and as they are converted, since
-//! [`crate::base::png_pixels`] keeps everything else from the decoder. A JPEG takes its file twice, since the decoder
-//! copies metadata wherever they stand; the metadata before its pixels once more, since the decoder puts together what is
-//! in parts; its pixels; and, where a scan does not hold all of a pixel (progressive files, and others with a scan for
-//! each component), 2 bytes for every coefficient, in whole blocks.
+//! The memory is computed from what the decoders do (crates png 0.18 and zune-jpeg 0.5), except buffers of a few rows.
+//! A PNG takes its pixels as decoded (1 to 8 bytes each) and as converted, because [`crate::base::png_pixels`] hides
+//! everything else from the decoder. A JPEG takes: its file twice, because the decoder copies metadata anywhere in it;
+//! the metadata before its pixels once more, because the decoder joins metadata that is in parts; its pixels; and, if a
+//! scan does not hold all of a pixel (progressive files, and others with a scan per component), 2 bytes per
+//! coefficient, in whole blocks.
 //!
-//! Invariants: 1. nothing is allocated in proportion to a number in the file; 2. a file that passes has a complete
-//! header and its format's end marker behind the start of the pixel data; 3. EXIF orientation is ignored, as COLMAP
-//! ignores it: sizes are those of the stored pixels.
+//! Invariants: 1. no allocation is proportional to a number in the file; 2. an accepted file has a complete header, and
+//! its format's end marker after the start of the pixel data; 3. EXIF orientation is ignored, as in COLMAP: sizes are
+//! those of the stored pixels.
 
 use super::resize::LARGEST_SIDE;
 use crate::base::error::{InputError, InputResult};
@@ -18,10 +17,10 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
-/// Photos with more pixels are refused: no camera makes them, and a broken header easily claims them.
+/// Photos with more pixels are refused: no camera makes them, but a broken header may state them.
 pub const MOST_PIXELS: u64 = 500_000_000;
 
-/// How much of a file's end is searched for the end marker before the whole file is.
+/// Bytes at the end of a file that are searched for the end marker before the whole file is.
 const TAIL: u64 = 64 * 1024;
 
 /// File formats that can be decoded.
@@ -33,7 +32,7 @@ pub enum PhotoFormat {
     Png,
 }
 
-/// What the header of a photo says.
+/// Header of a photo.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PhotoHeader {
     /// File format.
@@ -42,12 +41,12 @@ pub struct PhotoHeader {
     pub width: u32,
     /// Stored height, pixels.
     pub height: u32,
-    /// Bytes that the decoder needs at its peak, the 8-bit RGB result included.
+    /// Peak memory of the decoder, bytes, including the 8-bit RGB result.
     pub decode_bytes: u64,
 }
 
 impl PhotoHeader {
-    /// As [`PhotoHeader::decode_bytes`], where the result is 8-bit gray, made from RGB at worst.
+    /// As [`PhotoHeader::decode_bytes`] for an 8-bit gray result, made from RGB in the worst case.
     pub fn gray_bytes(&self) -> u64 {
         self.decode_bytes.max(4 * u64::from(self.width) * u64::from(self.height))
     }
@@ -73,7 +72,7 @@ pub fn read_header(path: &Path) -> InputResult<PhotoHeader> {
     } else {
         let problem = match foreign_format(&magic) {
             Some(name) => format!("this is a {name} file; photos must be JPEG or PNG"),
-            // The shortest picture of either format is longer than this: what is there is the beginning of one.
+            // The shortest picture of either format is longer: this must be the start of one.
             None if bytes < 8 => {
                 return Err(InputError::new(path, format!("the photo is cut short ({bytes} bytes)"), COPY_AGAIN));
             }
@@ -84,8 +83,8 @@ pub fn read_header(path: &Path) -> InputResult<PhotoHeader> {
     }
 }
 
-/// Segments and fill bytes before the pixels of a JPEG: each costs a look at the file, and a photo with a large colour
-/// profile and previews has some hundred.
+/// Most segments and fill bytes before the pixels of a JPEG: each costs a read, and a photo with a large colour profile
+/// and previews has some hundred.
 const MOST_SEGMENTS: u32 = 10_000;
 
 const COPY_AGAIN: &str = "copy the photo again from its source, or remove it and use --allow-missing";
@@ -111,14 +110,15 @@ struct JpegFrame {
     height: u32,
     pixels: u64,
     components: u8,
-    /// Of all components, in whole blocks and units.
+    /// Coefficients of all components, in whole blocks and units.
     coefficients: u64,
 }
 
 impl JpegFrame {
-    /// Of a file of `bytes`, `metadata` of them before the first scan, which holds so many components.
+    /// The header for a file of `bytes`, with `metadata` bytes before the first scan, which has `in_first_scan`
+    /// components.
     fn header(&self, bytes: u64, metadata: u64, in_first_scan: u8) -> PhotoHeader {
-        // Result, then RGB made from it when it is gray.
+        // The result, plus the RGB made from it if it is gray.
         let result = if self.components == 1 { 4 } else { 3 } * self.pixels;
         // All coefficients are kept until the last scan.
         let has_scans = self.code == 0xc2 || in_first_scan != self.components;
@@ -151,7 +151,7 @@ impl HeaderReader<'_> {
     }
 
     fn truncated(&self, place: String, what: &str) -> InputError {
-        InputError::new(self.path, format!("the photo is cut short: {what} is not there"), COPY_AGAIN).at(place)
+        InputError::new(self.path, format!("the photo is cut short: {what} is missing"), COPY_AGAIN).at(place)
     }
 
     fn damaged(&self, at: u64, problem: &str) -> InputError {
@@ -200,8 +200,8 @@ impl HeaderReader<'_> {
         let mut scan = [0u8; 3];
         self.read(&mut scan, "the header of its first scan")?;
         let header = frame.header(self.bytes, metadata, scan[2]);
-        // Pixel data cannot contain this pair (a 255 in it is followed by 0), a preview in the header can: so only
-        // what follows the start of the scan counts. Anything may follow the marker.
+        // Pixel data cannot contain this pair (a 255 in it is followed by 0), but a preview in the header can: so the
+        // search starts after the start of the scan. Anything may follow the marker.
         self.require_end(at, &[0xff, 0xd9], "the end marker (FF D9)")?;
         Ok(header)
     }
@@ -218,7 +218,7 @@ impl HeaderReader<'_> {
         let pixels = self.check_size(u32::from(width), u32::from(height), at)?;
         let components = f[5];
         if !(1..=4).contains(&components) {
-            return Err(self.damaged(at, &format!("it has {components} components; 1 to 4 can be")));
+            return Err(self.damaged(at, &format!("it has {components} components; supported are 1 to 4")));
         }
         let (mut blocks, mut most) = (0, [1, 1]);
         for _ in 0..components {
@@ -226,12 +226,12 @@ impl HeaderReader<'_> {
             self.read(&mut c, "its frame header")?;
             let sampling = [u64::from(c[1] >> 4), u64::from(c[1] & 15)];
             if sampling.iter().any(|s| !(1..=4).contains(s)) {
-                return Err(self.damaged(at, "a component is sampled in a way that does not exist"));
+                return Err(self.damaged(at, "a component has an invalid sampling factor"));
             }
             blocks += sampling[0] * sampling[1];
             most = [most[0].max(sampling[0]), most[1].max(sampling[1])];
         }
-        // One component alone is not sampled down, whatever its factors say.
+        // A single component is never subsampled, whatever its factors say.
         let (blocks, most) = if components == 1 { (1, [1, 1]) } else { (blocks, most) };
         let units = u64::from(width).div_ceil(8 * most[0]) * u64::from(height).div_ceil(8 * most[1]);
         let (width, height) = (width.into(), height.into());
@@ -251,7 +251,7 @@ impl HeaderReader<'_> {
         let pixels = self.check_size(width, height, 16)?;
         let (at, is_transparent) = self.png_pixels()?;
         let depth = if h[16] == 16 { 2 } else { 1 };
-        // As they are decoded, and with what they are converted to: RGB at once, or RGBA first where there is alpha.
+        // Bytes as decoded, and as converted: RGB directly, or RGBA first if there is alpha.
         let (colors, has_alpha) = match h[17] {
             0 => (1, is_transparent),
             2 | 3 => (3, is_transparent),
@@ -269,7 +269,7 @@ impl HeaderReader<'_> {
         Ok(PhotoHeader { format: PhotoFormat::Png, width, height, decode_bytes: pixels * per_pixel })
     }
 
-    /// Walks the chunks up to the first pixels: where they are, and whether a tRNS chunk makes some of them transparent.
+    /// Walks the chunks up to the first pixels: their position, and whether a tRNS chunk makes some transparent.
     fn png_pixels(&mut self) -> InputResult<(u64, bool)> {
         let (mut at, mut is_transparent) = (33u64, false);
         for _ in 0..MOST_SEGMENTS {
@@ -303,7 +303,7 @@ impl HeaderReader<'_> {
         Ok(pixels)
     }
 
-    /// Requires `marker` somewhere behind `from`: first in the file's last 64 KiB, then anywhere.
+    /// Requires `marker` somewhere after `from`: first searches the file's last 64 KiB, then all of it.
     fn require_end(&mut self, from: u64, marker: &[u8], what: &str) -> InputResult<()> {
         let tail = self.bytes.saturating_sub(TAIL).max(from);
         for (start, end) in [(tail, self.bytes), (from, self.bytes)] {
@@ -314,7 +314,7 @@ impl HeaderReader<'_> {
         Err(self.truncated(format!("byte {}", self.bytes), what))
     }
 
-    /// Whether `marker` occurs in bytes `start..end`, read in blocks that overlap by a marker's length.
+    /// Whether `marker` occurs in bytes `start..end`; reads blocks that overlap by a marker's length.
     fn find(&mut self, start: u64, end: u64, marker: &[u8]) -> InputResult<bool> {
         let mut block = vec![0u8; TAIL as usize];
         let overlap = marker.len() as u64 - 1;
@@ -352,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn whole_files_pass_also_with_data_appended() {
+    fn complete_files_pass_even_with_data_appended() {
         for (format, want) in
             [(image::ImageFormat::Jpeg, PhotoFormat::Jpeg), (image::ImageFormat::Png, PhotoFormat::Png)]
         {
@@ -367,14 +367,14 @@ mod tests {
     }
 
     #[test]
-    fn every_cut_is_noticed_and_no_garbage_panics() {
+    fn every_cut_is_detected_and_garbage_never_panics() {
         for format in [image::ImageFormat::Jpeg, image::ImageFormat::Png] {
             let bytes = encoded(format);
             for length in 0..bytes.len() {
                 let error = check(&bytes[..length]).unwrap_err();
                 assert!(!error.remedy.is_empty() && !error.problem.is_empty());
             }
-            // The header with every byte set to extremes: any answer will do, a panic will not.
+            // The header with every byte set to extremes: any result is fine, but no panic.
             for at in 0..bytes.len().min(200) {
                 for value in [0, 1, 0x7f, 0xff] {
                     let mut broken = bytes.clone();

@@ -1,28 +1,28 @@
-//! Which reader a path is for.
+//! Chooses the reader for a path.
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::model::RawScene;
 use crate::dataset::{colmap, mega_nerf, transforms};
 use std::path::Path;
 
-/// What the user says about where things are.
+/// The user's options for reading a scene.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ReadOptions {
-    /// Image folder, relative to the scene; `None` is `images`. transforms.json names its photos with their folder:
-    /// there, `images` is only a second place to look, and any other folder replaces the one in the name.
+    /// Image folder, relative to the scene; `None` is `images`. Photo names in transforms.json include their folder:
+    /// for these, `images` is only a second place to look, and any other folder replaces the one in the name.
     pub images: Option<String>,
-    /// A photo that is needed now (its size is not in the JSON) and is missing: leave the view out with a warning
-    /// instead of failing. Photos whose size is known are the loader's to miss.
+    /// Drop a view with a warning, instead of failing, if its missing photo is needed now (the JSON does not state its
+    /// size). The loader reports missing photos whose size is known.
     pub allow_missing: bool,
-    /// Points stay in their file, whose path is given: they may not fit in memory.
+    /// Leave points in their file and return its path: they may exceed memory.
     pub points_later: bool,
 }
 
-/// Reads a scene: a folder with a COLMAP model, with one for each of `train` and `val`, with `transforms*.json`, in
-/// MatrixCity's or in Mega-NeRF's layout, or such a JSON file. A folder that holds several is read as the first of them.
+/// Reads a scene: a folder with a COLMAP model, with a model for each of `train` and `val`, with `transforms*.json`, in
+/// MatrixCity's or in Mega-NeRF's layout, or such a JSON file. If a folder matches several, the first of these applies.
 ///
 /// # Errors
-/// Whatever is wrong with the files; a path with neither says what was looked for.
+/// Any problem with the files; if nothing matches, the error lists what was searched for.
 pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let facts = std::fs::metadata(path).map_err(|e| InputError::io(path, "opening the scene", &e))?;
     let root = if facts.is_file() { path.parent().unwrap_or(Path::new("")) } else { path };

@@ -1,17 +1,17 @@
 //! Downscaling by exact area average.
 //!
 //! Every target pixel is the mean of the source rectangle that it covers, with fractional coverage at the edges. All
-//! sums are integers in units of 1 / (source size x target size), so there is no rounding but the last one (to
-//! nearest, halves up) and the result cannot depend on order or instruction set.
+//! sums are integers in units of 1 / (source size x target size), so the only rounding is the last one (to nearest,
+//! halves up) and the result cannot depend on order or instruction set.
 //!
-//! Invariants: 1. a constant picture stays constant; 2. equal sizes return the source unchanged; 3. rows are taken
-//! one by one, so a source that is made row by row never has to exist whole. Enlarging works too (each target pixel
-//! averages the less than one source pixel that it covers), but nobody should want it.
+//! Invariants: 1. a constant picture stays constant; 2. equal sizes return the source unchanged; 3. rows are pushed one
+//! by one, so a source that is made row by row never has to exist as a whole. Enlarging is possible (each target pixel
+//! averages less than one source pixel), but has no use.
 
-/// Largest side that the integer sums are proven for.
+/// Largest side for which the integer sums are proven not to overflow.
 pub const LARGEST_SIDE: u32 = 65_535;
 
-/// How far width and height may disagree about the scale between two sizes of one shape.
+/// Tolerated difference between the scales of width and height for sizes of one shape.
 const SHAPE_TOLERANCE: f64 = 0.01;
 
 /// Width and height, pixels.
@@ -23,14 +23,14 @@ pub fn divided_size(full: Size, factor: f64) -> Size {
     (side(full.0), side(full.1))
 }
 
-/// Whether one size is the other, scaled: aspect ratios within 1 %, or a side within rounding (1.5 pixels).
+/// Whether the sizes are equal up to scale: aspect ratios within 1 %, or a side within rounding (1.5 pixels).
 pub fn same_shape(size: Size, stated: Size) -> bool {
     let [w, h, sw, sh] = [size.0, size.1, stated.0, stated.1].map(f64::from);
     let (x, y) = (w / sw, h / sh);
     (x / y - 1.0).abs() <= SHAPE_TOLERANCE || (w - sw * y).abs() <= 1.5 && (h - sh * x).abs() <= 1.5
 }
 
-/// One target pixel's stretch of a source row.
+/// The range of a source row that one target pixel covers.
 #[derive(Debug, Clone, Copy)]
 struct Span {
     start: u32,
@@ -39,7 +39,7 @@ struct Span {
     last_weight: u32,
 }
 
-/// Receives source rows, returns the averaged picture.
+/// Averages source rows into a smaller picture.
 #[derive(Debug)]
 pub struct AreaResizer {
     channels: usize,
@@ -85,7 +85,7 @@ impl AreaResizer {
             n => panic!("{n} channels"),
         }
         let (source_height, target_height) = (u64::from(self.source.1), u64::from(self.target.1));
-        // This row covers [top, bottom) in units in which a source row is target_height high.
+        // This row covers [top, bottom), in units in which a source row is target_height high.
         let top = u64::from(self.rows_taken) * target_height;
         let bottom = top + target_height;
         let mut j = top / source_height;
@@ -109,7 +109,7 @@ impl AreaResizer {
         self.out
     }
 
-    /// Horizontal pass: `reduced[j]` = sum of the covered samples, weights in 1 / target width of a source pixel.
+    /// Horizontal pass: `reduced[j]` = sum of the covered samples, weighted in 1 / target width of a source pixel.
     fn reduce<const C: usize, S: Copy + Into<u32>>(&mut self, row: &[S]) {
         let inner_weight = self.target.0;
         for (out, span) in self.reduced.chunks_exact_mut(C).zip(&self.spans) {
@@ -141,13 +141,13 @@ impl AreaResizer {
     }
 }
 
-/// Target pixel `j` covers [j source, (j + 1) source) in units in which a source pixel is `target` wide.
+/// Target pixel `j` covers [j source, (j + 1) source), in units in which a source pixel is `target` wide.
 fn span(j: u32, source: u32, target: u32) -> Span {
     let (source, target, j) = (u64::from(source), u64::from(target), u64::from(j));
     let (left, right) = (j * source, (j + 1) * source);
     let start = left / target;
     let end = right.div_ceil(target);
-    // All weights of a span add up to `source`; one that lies in a single pixel has all of it in the first.
+    // All weights of a span add up to `source`; a span within a single pixel has its whole weight in the first.
     let first_weight = right.min((start + 1) * target) - left;
     let last_weight = if end - start > 1 { right - (end - 1) * target } else { 0 };
     Span { start: start as u32, end: end as u32, first_weight: first_weight as u32, last_weight: last_weight as u32 }

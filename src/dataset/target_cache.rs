@@ -1,15 +1,15 @@
-//! Decoded targets within a byte budget, decoded ahead of their use on threads of their own.
+//! A cache of decoded targets within a byte budget; its own threads decode ahead of use.
 //!
-//! The trainer says which views come next ([`TargetCache::prefetch`]) and takes them one by one
-//! ([`TargetCache::get`]). What no coming step needs is evicted first, longest unused first; then what is needed
-//! last. A view is never evicted for one that is needed later than it.
+//! The trainer announces the coming views ([`TargetCache::prefetch`]) and takes them one by one ([`TargetCache::get`]).
+//! Eviction order: first targets that no coming step needs, least recently used first; then those needed last. A view
+//! is never evicted for one that is needed later.
 //!
-//! Invariants: 1. bytes of decoded targets (also those that a caller still holds) plus the peak bytes of decodes in
-//! flight, taken from the files' headers, never exceed the budget, with one exception: 2. a view that a caller is
-//! waiting for is decoded even if it does not fit, but only alone, with everything else evicted that nobody holds.
-//! So the least that is used, whatever the budget, is one decode plus the targets that callers hold; 3. targets that
-//! fit the budget together, with room for the decodes in flight, are decoded once; 4. the bits of a target never
-//! depend on budget, threads or order.
+//! Invariants: 1. the bytes of decoded targets (including those that a caller still holds) plus the peak bytes of
+//! decodes in flight, computed from the files' headers, never exceed the budget, except: 2. a view that a caller waits
+//! for is decoded even if it does not fit, but alone, and after evicting everything that nobody holds. So the least
+//! memory used under any budget is one decode plus the targets that callers hold; 3. targets that fit the budget
+//! together, with room for the decodes in flight, are decoded once; 4. the bits of a target never depend on budget,
+//! threads or order.
 
 use super::loader::View;
 use super::photo::{PhotoSource, decode};
@@ -20,22 +20,22 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-/// A cache of decoded targets, indexed like the views it was made for. Shared by reference between threads; dropping
-/// it waits for the decodes in flight.
+/// A cache of decoded targets, indexed like its views. Threads share it by reference; dropping it waits for the decodes
+/// in flight.
 #[derive(Debug)]
 pub struct TargetCache {
     shared: Arc<Shared>,
     workers: Vec<JoinHandle<()>>,
 }
 
-/// What a cache did so far.
+/// Statistics of a cache.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct CacheStats {
     /// Bytes in use now: targets and decodes in flight.
     pub bytes: u64,
     /// The most bytes ever in use.
     pub peak_bytes: u64,
-    /// Decodes that were finished.
+    /// Finished decodes.
     pub decodes: u64,
     /// Calls of `get` that found their target decoded.
     pub hits: u64,
@@ -48,9 +48,9 @@ struct Shared {
     photos: Vec<PhotoSource>,
     budget: u64,
     state: Mutex<State>,
-    /// Told when there may be work for a worker.
+    /// Notified when there may be work for a worker.
     work: Condvar,
-    /// Told when a decode ended.
+    /// Notified when a decode has ended.
     done: Condvar,
 }
 
@@ -73,7 +73,7 @@ struct Slot {
     content: Content,
     /// Positions of this view in the plan, ascending.
     uses: VecDeque<u64>,
-    /// Callers inside `get` that have not taken it yet; it is not evicted under them.
+    /// Callers in `get` that have not taken the target yet; it is not evicted meanwhile.
     waiters: u32,
     last_used: u64,
 }
@@ -87,12 +87,12 @@ enum Content {
     Failed(InputError),
 }
 
-/// Position of the next use of a view that no coming step needs.
+/// Next use of a view that no coming step needs.
 const NEVER: u64 = u64::MAX;
 
 impl TargetCache {
-    /// A cache for these views that uses at most `budget_bytes` and decodes on `threads` threads of its own. With 0,
-    /// callers of `get` decode and nothing is done ahead.
+    /// A cache for these views that uses at most `budget_bytes` and decodes on `threads` threads of its own. With 0
+    /// threads, callers of `get` decode, and nothing is prefetched.
     ///
     /// Errors: the system refuses to start a thread.
     pub fn new(views: &[View], budget_bytes: u64, threads: usize) -> InputResult<Self> {
@@ -114,8 +114,8 @@ impl TargetCache {
         Ok(cache)
     }
 
-    /// Says which views come next, in order, the next one first; replaces what was said before. Decoding starts at
-    /// once, as far ahead as the budget allows. Indices must be valid.
+    /// Announces the coming views, the next one first; replaces the previous announcement. Decoding starts at once, as
+    /// far ahead as the budget allows. Indices must be valid.
     pub fn prefetch(&self, coming: &[usize]) {
         let mut state = self.shared.lock();
         for slot in &mut state.slots {
@@ -132,8 +132,8 @@ impl TargetCache {
         self.shared.work.notify_all();
     }
 
-    /// The target of a view; waits until it is decoded. Views of the plan up to and including this one's first place
-    /// in it count as past.
+    /// The target of a view; waits until it is decoded. Views of the plan up to and including this one's first position
+    /// count as past.
     ///
     /// Errors: the photo or mask cannot be decoded (the same error every time).
     pub fn get(&self, view: usize) -> InputResult<Arc<Target>> {
@@ -152,7 +152,7 @@ impl TargetCache {
                 Content::Failed(error) => break Err(error.clone()),
                 Content::Absent | Content::Decoding => {}
             }
-            // Without workers the caller does their job, unless another caller is at it.
+            // Without workers the caller decodes, unless another caller is decoding this view.
             let next = if self.workers.is_empty() { shared.start_next(&mut state) } else { None };
             state = match next {
                 Some(next) => shared.decode_unlocked(state, next),
@@ -169,18 +169,18 @@ impl TargetCache {
             state.stats.hits += 1;
         }
         drop(state);
-        // A plan that moved on, or a target that a caller gave back since, may have made room.
+        // The advanced plan, or a target that a caller has dropped, may have made room.
         shared.work.notify_all();
         result
     }
 
-    /// What the cache did so far.
+    /// Statistics so far.
     pub fn stats(&self) -> CacheStats {
         self.shared.lock().stats
     }
 
-    /// The budget with which a cache with `decodes` threads never evicts a target, and so the most that it ever uses:
-    /// all targets plus the largest decodes.
+    /// The budget at which a cache with `decodes` threads never evicts a target, and so the most that it ever uses: all
+    /// targets plus the largest decodes.
     pub fn bytes_to_keep_all(views: &[View], decodes: usize) -> u64 {
         let mut peaks: Vec<u64> = views.iter().map(|v| v.photo.decode_bytes()).collect();
         peaks.sort_unstable_by(|a, b| b.cmp(a));
@@ -194,7 +194,7 @@ impl Drop for TargetCache {
         self.shared.lock().stop = true;
         self.shared.work.notify_all();
         for worker in self.workers.drain(..) {
-            // A worker catches its own panics; there is nothing to do about one that did not.
+            // Workers catch their own panics, so there is no error to report.
             let _ = worker.join();
         }
     }
@@ -216,7 +216,7 @@ impl Shared {
         }
     }
 
-    /// Decodes a view that [`Shared::start_next`] chose, without holding the lock meanwhile.
+    /// Decodes a view that [`Shared::start_next`] chose, without holding the lock.
     fn decode_unlocked<'a>(&'a self, state: MutexGuard<'a, State>, view: usize) -> MutexGuard<'a, State> {
         drop(state);
         let result = decode_caught(&self.photos[view]);
@@ -227,7 +227,7 @@ impl Shared {
         state
     }
 
-    /// Chooses the next view to decode, makes room and reserves its bytes; `None` when there is nothing to do now.
+    /// Chooses the next view to decode, makes room and reserves its bytes; `None` if there is nothing to do now.
     fn start_next(&self, state: &mut State) -> Option<usize> {
         while let Some(&view) = state.wanted.front() {
             match state.slots[view].content {
@@ -270,9 +270,9 @@ impl Shared {
         };
     }
 
-    /// Evicts until the decode of `view` fits the budget: only targets that nobody holds or waits for and, for a
-    /// decode ahead of its use at position `needed_at`, only those that are needed later than that. Where it would
-    /// not fit even so, nothing is evicted, except for a view that is waited for while no other decode is in flight.
+    /// Evicts targets until the decode of `view` fits the budget: only targets that nobody holds or waits for and, for
+    /// a prefetch at position `needed_at`, only those needed later. If it would still not fit, nothing is evicted,
+    /// except for a view that is waited for while no other decode is in flight.
     fn make_room(&self, state: &mut State, view: usize, needed_at: Option<u64>) -> bool {
         let needed = self.photos[view].decode_bytes();
         let mut victims: Vec<(u64, u64, usize, u64)> = Vec::new();
@@ -286,7 +286,7 @@ impl Shared {
                 victims.push((next_use, u64::MAX - slot.last_used, i, target.bytes()));
             }
         }
-        // Farthest next use last; among those never needed again, the longest unused last.
+        // Farthest next use last; among targets never needed again, the least recently used last.
         victims.sort_unstable();
         let room: u64 = victims.iter().map(|v| v.3).sum();
         let fits = state.stats.bytes - room + needed <= self.budget;
@@ -303,7 +303,7 @@ impl Shared {
 }
 
 impl State {
-    /// Drops the plan up to and including the first place of `view`, if it is in the plan.
+    /// Drops the plan up to and including the first position of `view`, if it is in the plan.
     fn pass(&mut self, view: usize) {
         let Some(&until) = self.slots[view].uses.front() else { return };
         while let Some(&(position, past)) = self.plan.front()

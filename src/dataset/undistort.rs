@@ -1,21 +1,21 @@
-//! Taking lens distortion out of pixels.
+//! Removes lens distortion from pixels.
 //!
-//! The ideal photo keeps size, focal lengths and principal point of the real one; for each of its pixels the lens
-//! model says directly where in the real photo it is (no iteration), and that place is sampled bilinearly. Pixels
-//! whose place is outside the real photo repeat its border and are reported as not valid.
+//! The ideal photo keeps size, focal lengths and principal point of the real one. For each of its pixels the lens model
+//! directly gives the place in the real photo (no iteration), which is sampled bilinearly. Pixels whose place is
+//! outside the real photo repeat its border and are reported as invalid.
 //!
 //! Models and parameter order are OpenCV's (documentation of its calib3d and fisheye modules), which COLMAP's
 //! RADIAL, OPENCV, FULL_OPENCV and *_FISHEYE follow.
 //!
-//! Invariants: 1. only + - * / sqrt and libm, no contraction: the same bits everywhere; 2. a polynomial that folds
-//! back (the distorted radius stops growing) is used only up to the fold; beyond it pixels are not valid.
+//! Invariants: 1. only + - * / sqrt and libm, no contraction: the same bits everywhere; 2. a polynomial that folds back
+//! (the distorted radius stops growing) is used only up to the fold; pixels beyond it are invalid.
 
 use super::model::{Intrinsics, Lens};
 
-/// Places where the fold of a lens is looked for, between the axis and the farthest corner.
+/// Number of radii, from the axis to the farthest corner, at which the fold of a lens is searched.
 const FOLD_STEPS: u32 = 4096;
 
-/// Pixels of an ideal photo as places in the real one.
+/// Maps pixels of an ideal photo to places in the real one.
 #[derive(Debug, Clone, Copy)]
 pub struct Undistorter {
     intrinsics: Intrinsics,
@@ -24,13 +24,13 @@ pub struct Undistorter {
 }
 
 impl Undistorter {
-    /// For photos with these intrinsics; their width and height are those of the photo.
+    /// For photos with these intrinsics, whose width and height are those of the photo.
     pub fn new(intrinsics: Intrinsics) -> Self {
         Undistorter { intrinsics, fold_radius: fold_radius(&intrinsics) }
     }
 
-    /// Place in the real photo of the ideal photo's point (u, v), both in pixels with the first pixel's centre at
-    /// (0.5, 0.5); `None` beyond the fold of the lens model.
+    /// Place in the real photo of the ideal photo's point (u, v), both in pixels with the first pixel's centre at (0.5,
+    /// 0.5); `None` beyond the fold.
     pub fn source_of(&self, u: f64, v: f64) -> Option<[f64; 2]> {
         let k = &self.intrinsics;
         let (x, y) = ((u - k.cx) / k.fx, (v - k.cy) / k.fy);
@@ -68,10 +68,10 @@ impl Undistorter {
     }
 }
 
-/// The two pixels around a coordinate, clamped to the photo, and the share of the second.
+/// The two pixels around a coordinate, clamped to the photo, and the weight of the second.
 fn neighbours(x: f64, size: usize) -> (usize, usize, f32) {
     let last = size - 1;
-    // A NaN becomes 0 by the cast; such a pixel is not valid anyway.
+    // The cast turns NaN into 0; such a pixel is invalid anyway.
     let x = (x - 0.5).clamp(0.0, last as f64);
     let low = x as usize;
     (low, (low + 1).min(last), (x - low as f64) as f32)
@@ -111,7 +111,7 @@ fn fisheye_radius(k: &[f64; 4], r: f64) -> f64 {
     angle * (1.0 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))))
 }
 
-/// The radius up to which the distorted radius grows, looked for as far as the photo's corners.
+/// The radius up to which the distorted radius grows, searched as far as the photo's corners.
 fn fold_radius(k: &Intrinsics) -> f64 {
     let side = |c: f64, f: f64, size: u32| (c.abs()).max((f64::from(size) - c).abs()) / f;
     let (x, y) = (side(k.cx, k.fx, k.width), side(k.cy, k.fy, k.height));

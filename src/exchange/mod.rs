@@ -1,4 +1,4 @@
-//! Scenes in and out of other programs: PLY; what TensorBoard reads.
+//! Exchange with other programs: scenes in and out as PLY, scalars for TensorBoard.
 
 pub mod ply;
 pub mod tensorboard;

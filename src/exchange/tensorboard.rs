@@ -3,11 +3,11 @@
 //! An event file is a sequence of records: length (u64), its checksum, the bytes, their checksum; the bytes are a
 //! protocol-buffer message `Event { wall_time = 1: double, step = 2: int64, file_version = 3: string, summary = 5 }` with
 //! `Summary { value = 1: repeated { tag = 1: string, simple_value = 2: float } }`. Only these fields are written, by hand:
-//! a dozen lines in place of a code generator. A run that goes on writes `session_log = 7 { status = 1: START }` with its
-//! first step, upon which TensorBoard forgets what earlier files say of that step and later ones.
+//! a dozen lines in place of a code generator. A resumed run writes `session_log = 7 { status = 1: START }` with its
+//! first step, upon which TensorBoard discards what earlier files say of that step and later ones.
 //!
-//! Invariants: 1. every record is whole when [`EventFile::write`] returns, so a reader that follows the file never sees
-//! half of one for long; 2. values that are not finite are left out.
+//! Invariants: 1. every record is complete when [`EventFile::write`] returns, so a reader that follows the file sees
+//! half a record at most for a moment; 2. non-finite values are left out.
 
 use crate::base::error::{InputError, InputResult};
 use std::fs::File;
@@ -18,18 +18,17 @@ use std::time::{SystemTime, UNIX_EPOCH};
 /// `SessionLog { status = 1: START }`.
 const SESSION_START: [u8; 2] = [0x08, 0x01];
 
-/// An event file that grows.
+/// An event file that records are appended to.
 pub struct EventFile {
     path: PathBuf,
     file: File,
-    /// Bytes of whole records.
+    /// Length of all complete records, bytes.
     end: u64,
 }
 
 impl EventFile {
-    /// Creates an event file in `folder`, under a name that TensorBoard recognises. For a run that goes on,
-    /// `first_step` is the first step that this file may tell of: what earlier files say of it and of later ones is void.
-    ///
+    /// Creates an event file in `folder`, under a name that TensorBoard recognises. For a resumed run `first_step` is
+    /// its first step: what earlier files say of this step and later ones becomes void.
     /// # Errors
     /// The folder cannot be written.
     pub fn create(folder: &Path, first_step: Option<u32>) -> InputResult<EventFile> {
@@ -55,7 +54,7 @@ impl EventFile {
     /// Appends the scalars of a step: (tag, value), a tag like `loss/train`.
     ///
     /// # Errors
-    /// The disk refuses.
+    /// The disk fails.
     pub fn write(&mut self, step: u32, scalars: &[(&str, f64)]) -> InputResult<()> {
         let mut summary = Vec::new();
         for (tag, value) in scalars.iter().filter(|(_, value)| value.is_finite()) {
@@ -89,8 +88,8 @@ impl EventFile {
     }
 }
 
-/// Appends all of a record; where that fails, `cut` takes back what was written of it, as far as the drive allows: readers
-/// would take what follows half a record for the rest of it.
+/// Appends a whole record. On failure `cut` removes the partial record, as far as the drive allows: readers would take
+/// later records for the rest of it.
 fn append_whole<W: Write>(
     file: &mut W,
     record: &[u8],
@@ -98,13 +97,13 @@ fn append_whole<W: Write>(
 ) -> std::io::Result<()> {
     let written = file.write_all(record);
     if written.is_err() {
-        // What made it fail is the error to be told.
+        // The append's error is the one to report.
         let _ = cut(file);
     }
     written
 }
 
-/// A file that was not there: lives of a run may begin within one second. Names sort in the order of time, which is the
+/// Creates a file of a new name: a run may be resumed within one second. Names sort by time, which is the
 /// order in which TensorBoard reads them.
 fn new_file(folder: &Path) -> InputResult<(PathBuf, File)> {
     let seconds = seconds_now() as u64;
@@ -154,14 +153,14 @@ fn bytes(out: &mut Vec<u8>, field: u64, value: &[u8]) {
     out.extend_from_slice(value);
 }
 
-/// Castagnoli's checksum, bit by bit: records are a few hundred bytes.
+/// Castagnoli's checksum (CRC-32C), bit by bit: records are only a few hundred bytes.
 fn crc32c(data: &[u8]) -> u32 {
     !data.iter().fold(!0u32, |crc, &byte| {
         (0..8).fold(crc ^ u32::from(byte), |c, _| (c >> 1) ^ (0x82f6_3b78 & 0u32.wrapping_sub(c & 1)))
     })
 }
 
-/// Checksums inside records are rotated and shifted, so that the checksum of a record is not a fixed value.
+/// The format rotates and shifts checksums, so that a record that contains a checksum does not get a fixed one.
 fn masked(crc: u32) -> u32 {
     crc.rotate_right(15).wrapping_add(0xa282_ead8)
 }
@@ -176,7 +175,7 @@ mod tests {
         assert_eq!(crc32c(b"123456789"), 0xe306_9283);
     }
 
-    /// Takes so many bytes.
+    /// A writer with room for a given number of bytes.
     struct Full(Vec<u8>, usize);
 
     impl Write for Full {
@@ -191,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn half_a_record_is_taken_back() {
+    fn a_partial_record_is_removed() {
         let mut file = Full(Vec::new(), 10);
         let mut append = |record: &[u8]| {
             let end = file.0.len();
@@ -230,7 +229,7 @@ mod tests {
         want.push(0x15);
         want.extend_from_slice(&0.25f32.to_le_bytes());
         assert_eq!(&messages[2][9..], want);
-        // Another file within the same second takes nothing away.
+        // Another file within the same second leaves the first one unchanged.
         let second = EventFile::create(&folder.path().join("tb"), None).expect("created");
         assert!(second.path > events.path && std::fs::read(&events.path).expect("readable") == data);
     }

@@ -1,20 +1,20 @@
-//! Uploads through staging memory that is reused: two sets, so that one is filled while the device reads the other.
+//! Uploads through reused staging memory: two sets, so that one is filled while the device reads the other.
 //!
 //! Invariants: (1) a chunk is written only while it is mapped, and unmapped before the commands that read it are
-//! submitted; (2) a set is filled again only after its submission has finished; (3) a set never holds more than
-//! [`SET_BYTES`]: the recorder submits what it has when a set is full.
+//! submitted; (2) a set is refilled only after its submission has finished; (3) a set holds at most [`SET_BYTES`]: when
+//! a set is full, the recorder submits what it has recorded.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 
 use super::error::{Faults, GpuError, GpuResult};
 
-/// Bytes of one staging buffer: within the range where copies run fastest.
+/// Bytes of one staging buffer: in the range where copies run fastest.
 const CHUNK_BYTES: u64 = 4 << 20;
-/// Most bytes that wait in one set.
+/// Most bytes staged in one set.
 pub(super) const SET_BYTES: u64 = 32 << 20;
 
-/// Mapped ranges begin at multiples of this.
+/// Alignment of mapped ranges.
 const MAP_ALIGNMENT: u64 = wgpu::MAP_ALIGNMENT;
 
 const PENDING: u8 = 0;
@@ -34,20 +34,20 @@ struct Set {
     submission: Option<wgpu::SubmissionIndex>,
 }
 
-/// Both sets; the first is being filled.
+/// Both sets; the first one is being filled.
 #[derive(Debug, Default)]
 pub(super) struct Belt {
     sets: [Set; 2],
 }
 
 impl Belt {
-    /// Host memory held, bytes.
+    /// Host memory of the staging buffers, bytes.
     pub(super) fn bytes(&self) -> u64 {
         self.sets.iter().map(|s| s.chunks.len() as u64 * CHUNK_BYTES).sum()
     }
 
-    /// Records copies of the beginning of `bytes` to `target` at `offset`; says how many bytes found room. Less than
-    /// all means that the set is full. `bytes.len()` is a multiple of 4.
+    /// Stages as much of `bytes` as fits and records its copy to `target` at `offset`; returns the number of bytes
+    /// staged. Fewer than all means that the set is full. `bytes.len()` is a multiple of 4.
     pub(super) fn write(
         &mut self,
         device: &wgpu::Device,
@@ -76,7 +76,7 @@ impl Belt {
         Ok(done)
     }
 
-    /// Before a submission: what was written becomes visible to the device.
+    /// Unmaps the staged chunks before a submission, which makes them visible to the device.
     pub(super) fn finish(&mut self) {
         for chunk in self.sets[0].chunks.iter_mut().filter(|c| c.used > 0) {
             chunk.state.store(PENDING, Ordering::Release);
@@ -84,7 +84,7 @@ impl Belt {
         }
     }
 
-    /// After it: the set waits for the device, the other one is next.
+    /// Swaps the sets after a submission: this one waits for the device, the other one is next.
     pub(super) fn submitted(&mut self, submission: &wgpu::SubmissionIndex) {
         let mut any = false;
         for chunk in self.sets[0].chunks.iter_mut().filter(|c| c.used > 0) {
@@ -103,14 +103,14 @@ impl Belt {
 }
 
 impl Set {
-    /// Until the device has read what was last in this set.
+    /// Waits until the device has read the last content of this set.
     fn wait(&mut self, device: &wgpu::Device, faults: &Faults) -> GpuResult<()> {
         let Some(submission) = self.submission.take() else { return Ok(()) };
         let waited = device.poll(wgpu::PollType::Wait { submission_index: Some(submission), timeout: None });
         faults.check()?;
         waited.map_err(|e| mapping_failed(&e.to_string()))?;
         if self.chunks.iter().any(|c| c.state.load(Ordering::Acquire) != MAPPED) {
-            return Err(mapping_failed("staging memory did not come back"));
+            return Err(mapping_failed("staging memory could not be mapped again"));
         }
         Ok(())
     }

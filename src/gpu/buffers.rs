@@ -1,18 +1,18 @@
-//! Device memory: buffers from a pool of size classes, with every byte taken from one budget.
+//! Device memory: buffers from a pool of size classes, charged to one budget.
 //!
-//! Invariants: (1) allocated bytes, in use or waiting for reuse, never exceed the budget; (2) a buffer is reused only
-//! within its class, which is at most a quarter larger than what was asked for; (3) a buffer that is dropped goes back
-//! to the pool, where commands recorded later may use it: that is right because commands run in the order recorded.
+//! Invariants: (1) allocated bytes, in use or free in the pool, never exceed the budget; (2) a buffer is reused only
+//! within its class, which is at most a quarter larger than the requested size; (3) a dropped buffer returns to the
+//! pool, and commands recorded later may use it; this is safe because commands run in the order recorded.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
 use super::error::{Faults, GpuError, GpuResult, lock};
 
-/// Smallest buffer, bytes; also what a view of an empty buffer spans.
+/// Smallest buffer, bytes; also the size of a view of an empty buffer.
 const CLASS_MIN: u64 = 256;
 
-/// Memory on the device. Goes back to the pool when dropped.
+/// A buffer on the device; returns to the pool when dropped.
 #[derive(Debug)]
 pub struct Buffer {
     raw: wgpu::Buffer,
@@ -22,8 +22,8 @@ pub struct Buffer {
     pool: Arc<Pool>,
 }
 
-/// A range of a buffer, as shaders and copies see it. Holds the memory alive, not its place in the budget: keep the
-/// [`Buffer`] for as long as its contents matter.
+/// A range of a buffer, as shaders and copies use it. It keeps the memory alive, but not its charge to the budget: keep
+/// the [`Buffer`] for as long as its contents matter.
 #[derive(Debug, Clone)]
 pub struct BufferView {
     pub(super) raw: wgpu::Buffer,
@@ -38,26 +38,26 @@ impl BufferView {
         self.size
     }
 
-    /// Whether the range lies within its buffer.
+    /// Whether the range is within its buffer.
     pub(super) fn is_inside(&self) -> bool {
         self.offset.checked_add(self.size).is_some_and(|end| end <= self.raw.size())
     }
 }
 
 impl Buffer {
-    /// Bytes that were asked for.
+    /// The requested size, bytes.
     pub fn size(&self) -> u64 {
         self.size
     }
 
-    /// All of it: the bytes asked for rounded up to a multiple of 4, or 256 if none were.
+    /// A view of the whole buffer: the requested size rounded up to a multiple of 4, or 256 if it is 0.
     pub fn view(&self) -> BufferView {
         let size = if self.size == 0 { CLASS_MIN } else { self.size.next_multiple_of(4) };
         BufferView { raw: self.raw.clone(), label: self.label, offset: 0, size }
     }
 
-    /// `size` bytes from `offset`; as a binding, the offset must be a multiple of [`super::Gpu::offset_alignment`],
-    /// and in any case of 4. A range beyond the buffer is an error of the command that uses it.
+    /// A view of `size` bytes from `offset`. The offset must be a multiple of 4, and for a binding a multiple of
+    /// [`super::Gpu::offset_alignment`]. A range beyond the buffer is an error of the command that uses it.
     pub fn slice(&self, offset: u64, size: u64) -> BufferView {
         BufferView { raw: self.raw.clone(), label: self.label, offset, size }
     }
@@ -71,7 +71,7 @@ impl Drop for Buffer {
     }
 }
 
-/// The pool and its books.
+/// The pool with its accounting.
 #[derive(Debug)]
 pub(super) struct Pool {
     state: Mutex<PoolState>,
@@ -88,7 +88,7 @@ struct PoolState {
     allocations: u64,
 }
 
-/// The books of the pool, bytes.
+/// The pool's accounting, bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct PoolUse {
     pub(super) in_use: u64,
@@ -121,7 +121,7 @@ impl Pool {
             Some(raw) => raw,
             None => {
                 self.make_room(&mut state, label, class)?;
-                faults.doing(label);
+                faults.set_stage(label);
                 let raw = device.create_buffer(&wgpu::BufferDescriptor {
                     label: Some(label),
                     size: class,
@@ -142,7 +142,7 @@ impl Pool {
         Ok(Buffer { raw, label, size, class, pool: Arc::clone(self) })
     }
 
-    /// Gives free buffers back to the device, the largest first, until `class` bytes fit.
+    /// Returns free buffers to the device, largest first, until `class` bytes fit the budget.
     fn make_room(&self, state: &mut PoolState, label: &str, class: u64) -> GpuResult<()> {
         if state.in_use.saturating_add(class) > self.budget {
             return Err(GpuError::OutOfBudget {
@@ -165,7 +165,7 @@ impl Pool {
         Ok(())
     }
 
-    /// Gives all free buffers back to the device.
+    /// Returns all free buffers to the device.
     pub(super) fn trim(&self) {
         let mut state = lock(&self.state);
         state.allocated = state.in_use;
@@ -178,7 +178,7 @@ impl Pool {
     }
 }
 
-/// The class of a size, at least 256: four classes between a power of two and the next.
+/// The size class for a size, at least 256: four classes per power of two.
 pub(super) fn size_class(size: u64) -> u64 {
     if size <= CLASS_MIN {
         return CLASS_MIN;

@@ -1,7 +1,7 @@
-//! Choice and opening of a device, and the handle that everything else goes through.
+//! Chooses and opens a device; the handle that all GPU work uses.
 //!
 //! Invariants: (1) discrete GPUs come before integrated ones, both before software adapters; (2) every limit that the
-//! shaders count on is asked for, and an adapter that has less is refused by name; (3) no call here panics.
+//! shaders need is requested, and an adapter with less is refused with the name of the limit; (3) no call here panics.
 
 use std::fmt;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
@@ -16,70 +16,72 @@ use super::readback::Staging;
 use super::record::UniformRing;
 use super::shader::PipelineCache;
 
-/// Storage buffers that one stage may use.
+/// Storage buffers that a stage may use.
 const STORAGE_BUFFERS_NEEDED: u32 = 16;
-/// Workgroup memory that every shader can count on, bytes; up to twice this is taken where the adapter has it.
+/// Workgroup memory that every shader may use, bytes; up to twice this is requested if the adapter has it.
 const WORKGROUP_STORAGE_NEEDED: u32 = 16 << 10;
-/// Smallest binding limit that is worth starting with: the WebGPU default.
+/// Smallest accepted limit on bindings, bytes: the WebGPU default.
 const BINDING_NEEDED: u64 = 128 << 20;
-/// Largest binding that is ever used: the API caps it at 2^31-1 bytes, and windows must start at aligned offsets.
+/// Largest binding used, bytes: the API's cap is 2^31-1, and windows must start at aligned offsets.
 const BINDING_MAX: u64 = (1 << 31) - 256;
 
-/// Which device the user wants.
+/// The device that the user requests.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum DeviceChoice {
     /// The best hardware GPU; [`GpuError::NoHardwareGpu`] if there is none.
     Auto,
-    /// The best adapter, a software one if there is nothing else.
+    /// The best adapter, even a software one.
     Gpu,
-    /// The best adapter whose name contains this text, letters of either case.
+    /// The best adapter whose name contains this text, ignoring case.
     Named(String),
 }
 
-/// What a test, or the user's budget, changes about a device.
+/// Options that a test or the user's budget sets.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct GpuOptions {
     /// Lowers the largest binding, bytes.
     pub max_binding_bytes: Option<u64>,
-    /// Lowers the rows of a window of columns.
+    /// Lowers the number of rows of a column window.
     pub window_rows: Option<u64>,
-    /// Waits for each submission before anything else is done: the plain path, beside which overlap is tested.
+    /// Waits for each submission before continuing: the baseline in tests of overlap.
     pub serial: bool,
-    /// `Some(false)` takes the plain path where the adapter has subgroup operations.
+    /// `Some(false)` disables subgroup operations.
     pub subgroups: Option<bool>,
-    /// `Some(false)` takes the path for subgroups of any size where all have 8 invocations.
+    /// `Some(false)` disables the path for adapters whose subgroups all have 8 invocations, in favour of the general
+    /// one.
     pub subgroups_of_8: Option<bool>,
-    /// Device memory that may be allocated, bytes (`--device-mem`); none: whatever the device has.
+    /// Most device memory to allocate, bytes (`--device-mem`); `None`: no limit.
     pub budget: Option<u64>,
-    /// Measures the time of every stage where the adapter can.
+    /// Measures the time of every stage, if the adapter can.
     pub profile: bool,
-    /// Whether shaders read their uniforms as uniform blocks or as storage; none: as storage on software adapters.
+    /// Whether shaders read uniforms as uniform blocks (`Some(true)`) or as storage; `None`: as storage on software
+    /// adapters.
     ///
-    /// Mesa's lavapipe folds the values of a uniform block that decide branches into the shader, once for every set of
-    /// values, and keeps each such copy for as long as the pipeline lives: a view whose counts are new costs it time
-    /// and some 100 KB of host memory that never come back.
+    /// Mesa's lavapipe specialises a shader for the uniform values that decide branches, once per set of values, and
+    /// keeps every variant as long as the pipeline: a view with new counts then costs time and some 100 KB of host
+    /// memory that are never freed.
     pub uniform_blocks: Option<bool>,
-    /// A fault on purpose; none: what the environment variable `GSSCALE_GPU_FAULT` asks for, if anything.
+    /// A fault to inject; `None`: the one that the environment variable `GSSCALE_GPU_FAULT` requests, if any.
     pub fault: Option<InjectedFault>,
 }
 
 /// Kind of an adapter, best first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum DeviceKind {
-    /// With memory of its own.
+    /// Has memory of its own.
     Discrete,
     /// Shares the processor's memory.
     Integrated,
-    /// Of a virtual machine, or of unknown kind.
+    /// A virtual machine's, or of unknown kind.
     Other,
-    /// A processor that plays GPU.
+    /// A software renderer on the processor.
     Software,
 }
 
 /// One adapter, as `--list-devices` shows it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AdapterSummary {
-    /// Name by the driver.
+    /// Name given by the driver.
     pub name: String,
     /// Kind.
     pub kind: DeviceKind,
@@ -95,7 +97,7 @@ pub struct AdapterSummary {
     pub subgroup_sizes: Option<(u32, u32)>,
     /// Whether stages can be timed.
     pub timestamps: bool,
-    /// Why it cannot be used, if so.
+    /// Why the adapter cannot be used, if so.
     pub refusal: Option<String>,
 }
 
@@ -128,20 +130,20 @@ impl fmt::Display for AdapterSummary {
     }
 }
 
-/// What crossed the bus since the device was opened, and its memory.
+/// Traffic over the bus since the device was opened, and memory.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Traffic {
     /// Bytes from the host to the device: uploads and uniforms.
     pub bytes_uploaded: u64,
     /// Bytes from the device to the host.
     pub bytes_read_back: u64,
-    /// Device memory in use by buffers now.
+    /// Device memory of live buffers, bytes.
     pub device_bytes: u64,
-    /// Most device memory ever allocated, buffers waiting for reuse included.
+    /// Most device memory ever allocated, bytes, including free buffers in the pool.
     pub device_bytes_peak: u64,
-    /// Buffers that were allocated so far: constant once warm.
+    /// Buffers allocated so far: constant once warmed up.
     pub device_allocations: u64,
-    /// Host memory of the staging buffers.
+    /// Host memory of the staging buffers, bytes.
     pub staging_bytes: u64,
 }
 
@@ -176,12 +178,12 @@ impl fmt::Debug for Gpu {
 }
 
 impl Gpu {
-    /// Opens the device that `choice` names, without a budget or other options.
+    /// Opens the device that `choice` requests, with default options.
     pub fn open(choice: &DeviceChoice) -> GpuResult<Gpu> {
         Gpu::open_with(choice, &GpuOptions::default())
     }
 
-    /// Opens the device that `choice` names.
+    /// Opens the device that `choice` requests.
     pub fn open_with(choice: &DeviceChoice, options: &GpuOptions) -> GpuResult<Gpu> {
         let (adapter, summary) = choose(choice)?;
         let features = adapter.features();
@@ -241,7 +243,7 @@ impl Gpu {
         self.subgroups
     }
 
-    /// The defines that all shaders which know them are compiled with.
+    /// The defines for subgroups, applied to every shader that knows them.
     pub(super) fn subgroup_defines(&self) -> &'static [&'static str] {
         match (self.subgroups, self.subgroups_of_8) {
             (false, _) => &[],
@@ -250,7 +252,7 @@ impl Gpu {
         }
     }
 
-    /// Whether shaders read their uniforms as uniform blocks; else as storage.
+    /// Whether shaders read uniforms as uniform blocks; otherwise as storage.
     pub(super) fn uniform_blocks(&self) -> bool {
         self.uniform_blocks
     }
@@ -260,17 +262,17 @@ impl Gpu {
         self.max_binding_bytes
     }
 
-    /// Most rows of a window of columns, whatever a binding holds.
+    /// Most rows of a column window, regardless of the binding limit.
     pub fn window_rows(&self) -> u64 {
         self.window_rows
     }
 
-    /// Offsets of bound windows are multiples of this, bytes.
+    /// Alignment of the offsets of bound windows, bytes.
     pub fn offset_alignment(&self) -> u64 {
         u64::from(self.limits.min_storage_buffer_offset_alignment)
     }
 
-    /// Most rows of `row_bytes` in one binding, such that windows of so many rows begin at offsets that can be bound.
+    /// Most rows of `row_bytes` in one binding, such that every window starts at an offset that can be bound.
     pub fn rows_per_window(&self, row_bytes: u64) -> u64 {
         let row_bytes = row_bytes.max(1);
         let alignment = self.offset_alignment();
@@ -286,17 +288,17 @@ impl Gpu {
     /// A buffer of `size` bytes with arbitrary contents; see [`super::Recorder::clear`].
     ///
     /// # Errors
-    /// The budget or the device cannot hold it.
+    /// The buffer exceeds the budget or the device's memory.
     pub fn buffer(&self, label: &'static str, size: u64) -> GpuResult<Buffer> {
         self.pool.take(&self.device, &self.faults, label, size)
     }
 
-    /// Gives buffers that wait for reuse back to the device.
+    /// Returns free buffers to the device.
     pub fn trim(&self) {
         self.pool.trim();
     }
 
-    /// What crossed the bus, and memory in use.
+    /// Traffic over the bus, and memory in use.
     pub fn traffic(&self) -> Traffic {
         let pool = self.pool.usage();
         Traffic {
@@ -310,7 +312,7 @@ impl Gpu {
     }
 }
 
-/// Every adapter of the machine, best first, those that cannot be used included.
+/// Every adapter of the machine, best first, including unusable ones.
 pub fn list_adapters() -> Vec<AdapterSummary> {
     adapters().into_iter().map(|(_, summary)| summary).collect()
 }
@@ -357,7 +359,7 @@ fn summarize(adapter: &wgpu::Adapter) -> AdapterSummary {
     }
 }
 
-/// What an adapter lacks of the limits that every shader counts on.
+/// The first limit of an adapter that is too low for the shaders.
 fn refusal(has: &wgpu::Limits) -> Option<String> {
     let needs: [(&str, u64, u64); 6] = [
         ("storage buffers per stage", STORAGE_BUFFERS_NEEDED.into(), has.max_storage_buffers_per_shader_stage.into()),
@@ -368,10 +370,10 @@ fn refusal(has: &wgpu::Limits) -> Option<String> {
         ("bytes per binding", BINDING_NEEDED, has.max_storage_buffer_binding_size),
     ];
     let (what, need, has) = needs.into_iter().find(|(_, need, has)| has < need)?;
-    Some(format!("it has {has} {what}, {need} are needed"))
+    Some(format!("it has {has} {what}, but {need} are needed"))
 }
 
-/// Workgroups in one dimension of a dispatch, everywhere.
+/// Most workgroups in one dimension of a dispatch, on every device.
 pub(super) const GROUPS_MAX: u32 = 65_535;
 
 fn limits_to_ask(has: &wgpu::Limits) -> wgpu::Limits {
@@ -444,10 +446,10 @@ mod tests {
     }
 
     #[test]
-    fn an_adapter_that_lacks_something_is_refused_by_name() {
+    fn an_adapter_below_a_limit_is_refused_with_the_name_of_the_limit() {
         let enough = wgpu::Limits { max_storage_buffers_per_shader_stage: 16, ..Default::default() };
         assert_eq!(refusal(&enough), None);
         let few = wgpu::Limits { max_storage_buffers_per_shader_stage: 8, ..Default::default() };
-        assert_eq!(refusal(&few).as_deref(), Some("it has 8 storage buffers per stage, 16 are needed"));
+        assert_eq!(refusal(&few).as_deref(), Some("it has 8 storage buffers per stage, but 16 are needed"));
     }
 }

@@ -1,32 +1,32 @@
-//! What can go wrong on a device, and the one place where asynchronous reports of the driver are gathered.
+//! GPU errors, and the collector of the driver's asynchronous error reports.
 //!
-//! Invariants: (1) every error that concerns work names the stage that was being recorded or waited for; (2) a lost
-//! device stays lost: every later call says so; (3) any other report is handed out exactly once, by the call that
-//! caused it or, if it came late, by the next one.
+//! Invariants: (1) every error about work names the stage that was being recorded or waited for; (2) a lost device
+//! stays lost: every later call reports it; (3) any other error is returned exactly once, by the call that caused it
+//! or, if the report came late, by the next call.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// Locks; a panic of another holder is no reason to panic too, since every holder leaves valid data.
+/// Locks, even after another holder panicked: every holder leaves valid data.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Why the device could not do what was asked.
+/// Why the device failed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum GpuError {
-    /// `auto` was asked for and there is no hardware GPU: the caller takes the CPU renderer.
+    /// `auto` was requested and there is no hardware GPU: the caller uses the CPU renderer.
     #[error("no hardware GPU was found (found: {found})")]
     NoHardwareGpu {
-        /// The adapters that there are, or "none".
+        /// The adapters found, or "none".
         found: String,
     },
-    /// The device that was asked for does not exist or cannot be used.
+    /// The requested device does not exist or cannot be used.
     #[error("no usable GPU matches {wanted:?}; found: {found}\n  remedy: choose one of `gsscale-train --list-devices`")]
     NoSuchDevice {
-        /// What the user asked for.
+        /// The user's request.
         wanted: String,
-        /// The adapters that there are, each with the reason if it cannot be used.
+        /// The adapters found, each with the reason if it cannot be used.
         found: String,
     },
     /// The driver refused to open the device.
@@ -34,7 +34,7 @@ pub enum GpuError {
     Open {
         /// Name of the adapter.
         device: String,
-        /// The driver's words.
+        /// The driver's message.
         message: String,
     },
     /// The budget of `--device-mem` cannot hold a buffer.
@@ -43,9 +43,9 @@ pub enum GpuError {
          --device-mem, or train with smaller pictures (--data-factor)"
     )]
     OutOfBudget {
-        /// Name of the buffer.
+        /// Label of the buffer.
         what: String,
-        /// Bytes that it needs.
+        /// Bytes that the buffer needs.
         need: u64,
         /// Bytes in use by other buffers.
         in_use: u64,
@@ -57,20 +57,20 @@ pub enum GpuError {
     OutOfMemory {
         /// Stage or buffer.
         stage: String,
-        /// The driver's words.
+        /// The driver's message.
         message: String,
     },
     /// One buffer is larger than the device allows.
     #[error("{what} needs one buffer of {need} bytes; the device allows {limit}")]
     BufferTooLarge {
-        /// Name of the buffer.
+        /// Label of the buffer.
         what: String,
-        /// Bytes that it needs.
+        /// Bytes that the buffer needs.
         need: u64,
         /// Largest buffer of the device, bytes.
         limit: u64,
     },
-    /// One binding is larger than the device (or the test's limit) allows.
+    /// One binding is larger than the device, or the test's limit, allows.
     #[error("{stage}: binding {binding} would span {need} bytes; the device allows {limit} in one binding")]
     BindingTooLarge {
         /// Stage.
@@ -82,28 +82,28 @@ pub enum GpuError {
         /// Bytes allowed.
         limit: u64,
     },
-    /// The views given do not fit the shader, or a copy does not fit its ends.
+    /// The views do not match the shader, or a copy does not match its source or target.
     #[error("{stage}: {problem}")]
     Bindings {
         /// Stage.
         stage: String,
-        /// What does not fit.
+        /// The mismatch.
         problem: String,
     },
     /// A shader does not preprocess, parse or validate.
     #[error("shader {shader}: {problem}")]
     Shader {
-        /// Name in the table of sources.
+        /// Name of the shader.
         shader: String,
-        /// What is wrong with it.
+        /// The problem.
         problem: String,
     },
-    /// The API refused a call: a defect of this program.
+    /// The API refused a call: a bug in this program.
     #[error("{stage}: the graphics API refused the work: {message}")]
     Validation {
         /// Stage.
         stage: String,
-        /// The API's words.
+        /// The API's message.
         message: String,
     },
     /// The device is gone: unplugged, reset by the driver, or hung.
@@ -111,15 +111,15 @@ pub enum GpuError {
     DeviceLost {
         /// Stage.
         stage: String,
-        /// The driver's words.
+        /// The driver's message.
         message: String,
     },
 }
 
-/// Result of everything that talks to a device.
+/// Result of calls that use a device.
 pub type GpuResult<T> = Result<T, GpuError>;
 
-/// Reports of the driver, gathered until the next check.
+/// The driver's error reports, collected until the next check.
 #[derive(Debug, Default)]
 pub(super) struct Faults {
     state: Mutex<FaultState>,
@@ -133,14 +133,14 @@ struct FaultState {
 }
 
 impl Faults {
-    /// Names what the calls from here on belong to.
-    pub(super) fn doing(&self, what: &str) {
+    /// Names the stage that the following calls belong to.
+    pub(super) fn set_stage(&self, what: &str) {
         let mut state = lock(&self.state);
         state.doing.clear();
         state.doing.push_str(what);
     }
 
-    /// Keeps the first report; later ones are its consequences.
+    /// Keeps the first report; later ones are consequences of it.
     pub(super) fn report(&self, error: &wgpu::Error) {
         let mut state = lock(&self.state);
         let stage = state.doing.clone();
@@ -151,20 +151,20 @@ impl Faults {
         });
     }
 
-    /// Whether anything was reported that nobody was told yet.
+    /// Whether an error was reported and not yet returned.
     pub(super) fn is_reported(&self) -> bool {
         let state = lock(&self.state);
         state.first.is_some() || state.lost.is_some()
     }
 
-    /// The device is gone.
+    /// Records the loss of the device.
     pub(super) fn lost(&self, message: String) {
         let mut state = lock(&self.state);
         let stage = state.doing.clone();
         state.lost.get_or_insert(GpuError::DeviceLost { stage, message });
     }
 
-    /// Hands out what was reported.
+    /// Returns the collected error, if any.
     pub(super) fn check(&self) -> GpuResult<()> {
         let mut state = lock(&self.state);
         if let Some(lost) = &state.lost {

@@ -1,38 +1,38 @@
-//! Faults of a device on purpose, so that how a program ends after one can be tried and tested with the real thing.
+//! Injected device faults, to test how a program ends after a fault with the real error path.
 //!
-//! Not here: how faults are reported (`error`). Without a plan nothing happens and nothing is read but a counter.
+//! Not here: the reporting of faults (`error`). Without a plan the only cost is a counter.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// What goes wrong.
+/// Kind of a fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FaultKind {
-    /// The device is destroyed, as when it is unplugged or reset.
+    /// The device is destroyed, as if unplugged or reset.
     Lost,
     /// A command is recorded that the graphics API refuses.
     Validation,
-    /// The driver says that it has no memory left. Reported as the driver would: filling a device that shares the
-    /// machine's memory would take the machine with it.
+    /// The driver reports that memory has run out. The report is simulated, because really filling a device that shares
+    /// the machine's memory would exhaust the machine.
     OutOfMemory,
-    /// The device is filled until the driver refuses, for real. On one that shares the machine's memory, do this under a
-    /// limit of the address space (`ulimit -v`).
+    /// The device's memory is really filled until the driver refuses. On a device that shares the machine's memory,
+    /// limit the address space first (`ulimit -v`).
     Full,
 }
 
-/// A fault at one submission.
+/// A fault at a given submission.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct InjectedFault {
-    /// What goes wrong.
+    /// Kind of the fault.
     pub kind: FaultKind,
-    /// At which submission since the device was opened, counted from 1.
+    /// Number of the submission, counted from 1 since the device was opened.
     pub submission: u64,
 }
 
-/// Names a fault for any program: `lost@40`, `validation@40`, `memory@40`, `full@40`.
+/// Environment variable that injects a fault into any program: `lost@40`, `validation@40`, `memory@40`, `full@40`.
 const VARIABLE: &str = "GSSCALE_GPU_FAULT";
 
 impl InjectedFault {
-    /// Reads `lost@40`.
+    /// Parses text such as `lost@40`.
     pub fn parse(text: &str) -> Option<InjectedFault> {
         let (kind, at) = text.split_once('@')?;
         let kind = match kind {
@@ -45,13 +45,13 @@ impl InjectedFault {
         Some(InjectedFault { kind, submission: at.parse().ok()? })
     }
 
-    /// What the environment asks for.
+    /// The fault that the environment requests.
     pub(super) fn from_environment() -> Option<InjectedFault> {
         InjectedFault::parse(std::env::var(VARIABLE).ok()?.as_str())
     }
 }
 
-/// A plan with the count of submissions.
+/// The planned fault and the count of submissions.
 #[derive(Debug, Default)]
 pub(super) struct Injector {
     plan: Option<InjectedFault>,
@@ -63,7 +63,7 @@ impl Injector {
         Injector { plan, submissions: AtomicU64::new(0) }
     }
 
-    /// Counts a submission; what is to go wrong in it.
+    /// Counts a submission; returns the fault to inject into it.
     pub(super) fn next(&self) -> Option<FaultKind> {
         let number = self.submissions.fetch_add(1, Ordering::Relaxed) + 1;
         self.plan.filter(|plan| plan.submission == number).map(|plan| plan.kind)
@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_plan_strikes_once_at_its_submission() {
+    fn a_planned_fault_happens_once_at_its_submission() {
         let plan = InjectedFault::parse("memory@2");
         assert_eq!(plan, Some(InjectedFault { kind: FaultKind::OutOfMemory, submission: 2 }));
         let injector = Injector::new(plan);

@@ -1,18 +1,18 @@
-//! Rust twins of WGSL structs: one macro declares the struct and the layout that `tests/shaders.rs` compares with what
-//! the shader compiler computed.
+//! Rust twins of WGSL structs: one macro declares the struct and its layout, which `tests/shaders.rs` compares with the
+//! layout computed by the shader compiler.
 
 /// Layout of the Rust twin of a WGSL struct.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StructLayout {
     /// Name of the struct, the same in both languages.
     pub name: &'static str,
-    /// Bytes.
+    /// Size, bytes.
     pub size: usize,
     /// Name and byte offset of each field, in order.
     pub fields: &'static [(&'static str, usize)],
 }
 
-/// Declares a `#[repr(C)]` struct that can be uploaded, with its `LAYOUT`.
+/// Declares an uploadable `#[repr(C)]` struct with its `LAYOUT`.
 ///
 /// ```
 /// gsscale::wgsl_struct! {
@@ -42,7 +42,7 @@ macro_rules! wgsl_struct {
         }
 
         impl $name {
-            /// What the shader's struct of this name must look like.
+            /// The layout that the shader's struct of this name must have.
             $vis const LAYOUT: $crate::gpu::StructLayout = $crate::gpu::StructLayout {
                 name: stringify!($name),
                 size: std::mem::size_of::<$name>(),

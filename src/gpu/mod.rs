@@ -1,5 +1,5 @@
 //! Compute on a GPU through wgpu: the device, its memory, shaders, and recording of work. Knows neither Gaussians nor
-//! stages: [`crate::base`] is all it builds on.
+//! stages; depends only on [`crate::base`].
 //!
 //! How the parts work together:
 //!
@@ -12,9 +12,9 @@
 //!
 //! Rules that hold for every shader:
 //!
-//! 1. All bindings are in `@group(0)`, numbered from 0 without holes in a file. Views are given to
-//!    [`Recorder::dispatch`] in the order of the numbers that the entry point uses. A uniform struct, where there is
-//!    one, is binding 0.
+//! 1. All bindings are in `@group(0)`, numbered from 0 without gaps in a file. Views are given to
+//!    [`Recorder::dispatch`] in the order of the numbers that the entry point uses. A uniform struct, if any, is
+//!    binding 0.
 //! 2. Workgroups are 1-D. Beyond 65,535 workgroups [`groups_1d`] folds them into two dimensions, and the shader finds
 //!    its index with `linear_group` of `shared/dispatch.wgsl`.
 //! 3. Counts come from uniforms or buffers, never from `arrayLength`: a view of an empty buffer still spans some bytes.
@@ -47,5 +47,5 @@ pub use shader::{
 };
 pub use sources::SOURCES;
 
-/// Invocations of a workgroup, unless a shader has a reason for another number.
+/// Invocations of a workgroup, unless a shader needs another number.
 pub const WORKGROUP: u32 = 256;

@@ -1,27 +1,27 @@
 //! Time of every stage on the device, from timestamps around its compute passes.
 //!
 //! Invariants: (1) without timestamps on the adapter, or with profiling off, nothing is recorded and the list is empty:
-//! no figure is ever guessed; (2) a pass holds dispatches of one stage only while profiling.
+//! no figure is estimated; (2) a pass is limited to dispatches of one stage only while profiling.
 
 use super::device::Gpu;
 use super::error::{GpuResult, lock};
 use super::readback::{PendingMap, Readback};
 
-/// Passes of one recorder that can be timed; later ones are not.
+/// Most passes of one recorder that are timed; further ones are not.
 const PASSES_MAX: u32 = 1024;
 
 /// Time of one stage since the device was opened.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageTime {
-    /// Stage.
+    /// The stage's name.
     pub stage: &'static str,
-    /// Timed passes.
+    /// Number of timed passes.
     pub passes: u64,
-    /// Their time together, seconds.
+    /// Their total time, seconds.
     pub seconds: f64,
 }
 
-/// Timestamps on their way, and the sums of those that arrived.
+/// Timestamps in flight, and the sums of those read back.
 #[derive(Debug)]
 pub(super) struct Profiler {
     queries: Option<(wgpu::QuerySet, wgpu::Buffer)>,
@@ -60,7 +60,7 @@ impl Profiler {
         self.queries.is_some()
     }
 
-    /// Begins a pass for `stage`, timed if there is room.
+    /// Begins a pass for `stage`, timed while there is room.
     pub(super) fn begin_pass(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
@@ -83,7 +83,7 @@ impl Profiler {
         pass
     }
 
-    /// Records that the stamps of this submission be read back.
+    /// Records the read-back of this submission's timestamps.
     pub(super) fn resolve(&mut self, gpu: &Gpu, encoder: &mut wgpu::CommandEncoder) -> GpuResult<Option<PendingMap>> {
         let Some((set, resolved)) = &self.queries else { return Ok(None) };
         if self.recorded.is_empty() {
@@ -99,7 +99,7 @@ impl Profiler {
         Ok(Some(pending))
     }
 
-    /// Adds what is under way to the sums, waiting for all but the last `leave`.
+    /// Adds timestamps in flight to the sums, waiting for all but the last `leave` submissions.
     pub(super) fn collect(&mut self, gpu: &Gpu, leave: usize) -> GpuResult<()> {
         while self.under_way.len() > leave {
             let (readback, stages) = self.under_way.remove(0);
@@ -120,7 +120,7 @@ impl Profiler {
 }
 
 impl Gpu {
-    /// Time of every stage so far, in the order of their first use; empty without profiling. Waits for the device.
+    /// Time of every stage so far, in order of first use; empty without profiling. Waits for the device.
     ///
     /// # Errors
     /// The device was lost.

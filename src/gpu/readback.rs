@@ -1,8 +1,8 @@
-//! Reading results back: copies into staging memory that is mapped when the device has finished. Staging is reused,
-//! two buffers of a class at most, so that one is read while the other is filled.
+//! Read-back of results: copies into staging memory that is mapped when the device has finished. Staging buffers are
+//! reused, at most two per size class, so that one is read while the other is filled.
 //!
-//! Invariants: (1) a read-back yields the bytes at the place in the recording where it was asked for; (2) it is empty
-//! until its recorder was submitted, and asking then is an error, not a wait without end.
+//! Invariants: (1) a read-back returns the bytes as of its place in the recording; (2) reading before the recorder was
+//! submitted is an error, never an endless wait.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
@@ -17,7 +17,7 @@ const MAPPING: u8 = 1;
 const MAPPED: u8 = 2;
 const FAILED: u8 = 3;
 
-/// Staging buffers that wait for reuse, by class, and the count of bytes read.
+/// Free staging buffers by class, and the number of bytes read.
 #[derive(Debug, Default)]
 pub(super) struct Staging {
     free: Mutex<BTreeMap<u64, Vec<wgpu::Buffer>>>,
@@ -29,13 +29,13 @@ impl Staging {
         self.read.load(Ordering::Relaxed)
     }
 
-    /// Host memory that waits for reuse.
+    /// Host memory of the free staging buffers, bytes.
     pub(super) fn bytes(&self) -> u64 {
         lock(&self.free).iter().map(|(class, free)| class * free.len() as u64).sum()
     }
 }
 
-/// Bytes on their way to the host.
+/// A read-back in flight.
 #[derive(Debug)]
 #[must_use]
 pub struct Readback {
@@ -48,7 +48,7 @@ pub struct Readback {
     staging: Arc<Staging>,
 }
 
-/// The part of a read-back that its recorder keeps until it is submitted.
+/// The part of a read-back that its recorder keeps until submission.
 #[derive(Debug)]
 pub(super) struct PendingMap {
     raw: wgpu::Buffer,
@@ -58,7 +58,7 @@ pub(super) struct PendingMap {
 }
 
 impl PendingMap {
-    /// Asks for the mapping; called right after the submission.
+    /// Requests the mapping; called right after the submission.
     pub(super) fn start(self, submission: &wgpu::SubmissionIndex) {
         let _ = self.submission.set(submission.clone()); // starts once
         self.state.store(MAPPING, Ordering::Release);
@@ -98,12 +98,12 @@ impl Readback {
         Ok((Readback { raw, stage, size, class, state, submission, staging }, pending))
     }
 
-    /// Bytes.
+    /// Size, bytes.
     pub fn size(&self) -> u64 {
         self.size
     }
 
-    /// Waits, then yields the elements.
+    /// Waits, then returns the elements.
     ///
     /// # Errors
     /// The recorder was not submitted, the device was lost, or its work failed.
@@ -113,7 +113,7 @@ impl Readback {
         Ok(out)
     }
 
-    /// Waits, then fills the beginning of `out`, or all of it if there are more bytes.
+    /// Waits, then fills `out` from its start with as many elements as there are.
     ///
     /// # Errors
     /// The recorder was not submitted, the device was lost, or its work failed.
@@ -135,11 +135,11 @@ impl Readback {
 
     fn wait(&self, gpu: &Gpu) -> GpuResult<()> {
         if self.state.load(Ordering::Acquire) == RECORDED {
-            return Err(self.failed("read back before its commands were submitted"));
+            return Err(self.failed("read before its commands were submitted"));
         }
-        gpu.faults.doing(self.stage);
+        gpu.faults.set_stage(self.stage);
         while self.state.load(Ordering::Acquire) == MAPPING {
-            // For its own submission, not for later ones: the device may go on meanwhile.
+            // Waits for this read-back's own submission only: the device may work on later ones meanwhile.
             let submission_index = self.submission.get().cloned();
             let waited = gpu.device.poll(wgpu::PollType::Wait { submission_index, timeout: None });
             gpu.faults.check()?;

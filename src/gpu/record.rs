@@ -1,8 +1,8 @@
-//! Recording of work: uploads, dispatches, copies and read-backs in the order in which they will run.
+//! Records work: uploads, dispatches, copies and read-backs in the order in which they run.
 //!
-//! Invariants: (1) what a dispatch binds is checked here, so that an error names the stage and the variable, and nothing
-//! is submitted after an error; (2) commands run in the order recorded, also across submissions; (3) uploads beyond one
-//! staging set submit what is recorded so far and go on.
+//! Invariants: (1) bindings of a dispatch are checked here, so that an error names the stage and the variable, and
+//! nothing is submitted after an error; (2) commands run in the order recorded, also across submissions; (3) when
+//! uploads fill a staging set, the commands recorded so far are submitted and recording continues.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -17,8 +17,8 @@ use super::shader::{BindingKind, Pipeline};
 
 /// Workgroups for `count` invocations in workgroups of `workgroup`, folded into two dimensions beyond 65,535.
 ///
-/// The shader finds its place with `linear_group` or `linear_index` of `shared/dispatch.wgsl`, and ignores places at
-/// or beyond its count. Indices stay within 32 bits for counts up to 2^32 - 2^24.
+/// The shader computes its index with `linear_group` or `linear_index` of `shared/dispatch.wgsl`, and ignores indices
+/// at or beyond its count. Indices stay within 32 bits for counts up to 2^32 - 2^24.
 pub fn groups_1d(count: u32, workgroup: u32) -> [u32; 3] {
     let groups = count.div_ceil(workgroup.max(1));
     if groups <= GROUPS_MAX {
@@ -31,11 +31,11 @@ pub fn groups_1d(count: u32, workgroup: u32) -> [u32; 3] {
 /// Bytes of one uniform buffer of the ring.
 const UNIFORM_CHUNK: u64 = 64 << 10;
 
-/// Bytes of a buffer that fills the device on purpose, and most of them: a tebibyte.
+/// Bytes of a buffer for an injected memory fault, and most such buffers: a tebibyte in total.
 const FILL_BYTES: u64 = 128 << 20;
 const FILL_BUFFERS: usize = 8192;
 
-/// Uniform buffers that every submission fills anew.
+/// Uniform buffers, refilled by every submission.
 #[derive(Debug)]
 pub(super) struct UniformRing {
     chunks: Vec<wgpu::Buffer>,
@@ -104,7 +104,7 @@ pub struct Recorder<'g> {
 }
 
 impl Gpu {
-    /// Begins to record; `name` appears in errors that no stage can be blamed for.
+    /// Starts a recording; `name` appears in errors that belong to no stage.
     pub fn begin(&self, name: &'static str) -> Recorder<'_> {
         let encoder = new_encoder(&self.device, name);
         let (uniforms, readbacks) = (Vec::new(), Vec::new());
@@ -117,7 +117,7 @@ impl Gpu {
         Recorder { gpu: self, work: recording }
     }
 
-    /// Submits; does not wait, unless [`super::GpuOptions::serial`] asks for it.
+    /// Submits without waiting, unless [`super::GpuOptions::serial`] is set.
     ///
     /// # Errors
     /// The API refused the commands, the device was lost or ran out of memory, or two recorders were open at once.
@@ -138,7 +138,7 @@ impl Gpu {
     /// # Errors
     /// The device was lost or ran out of memory.
     pub fn wait(&self, submission: &Submission) -> GpuResult<()> {
-        self.faults.doing(submission.name);
+        self.faults.set_stage(submission.name);
         let index = Some(submission.index.clone());
         let waited = self.device.poll(wgpu::PollType::Wait { submission_index: index, timeout: None });
         self.faults.check()?;
@@ -184,7 +184,7 @@ impl Recorder<'_> {
         Ok(BufferView { raw, label: "uniforms", offset, size })
     }
 
-    /// A fresh buffer holding `data`.
+    /// A new buffer containing `data`.
     ///
     /// # Errors
     /// As [`Gpu::buffer`] and [`Recorder::upload`].
@@ -194,7 +194,7 @@ impl Recorder<'_> {
         Ok(buffer)
     }
 
-    /// A fresh buffer of zeros.
+    /// A new zeroed buffer.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
@@ -204,7 +204,7 @@ impl Recorder<'_> {
         Ok(buffer)
     }
 
-    /// Uploads `data` to the beginning of `view`; the last word is filled up with zero bytes.
+    /// Uploads `data` to the start of `view`; the last word is padded with zero bytes.
     ///
     /// # Errors
     /// The data is longer than the view, or the device failed.
@@ -226,7 +226,7 @@ impl Recorder<'_> {
 
     fn upload_words(&mut self, view: &BufferView, mut at: u64, mut bytes: &[u8]) -> GpuResult<()> {
         self.work.pass = None;
-        self.gpu.faults.doing(view.label);
+        self.gpu.faults.set_stage(view.label);
         self.gpu.uploaded.fetch_add(bytes.len() as u64, Ordering::Relaxed);
         while !bytes.is_empty() {
             let mut belt = lock(&self.gpu.belt);
@@ -242,22 +242,22 @@ impl Recorder<'_> {
         Ok(())
     }
 
-    /// Zeros `view`.
+    /// Zeroes `view`.
     ///
     /// # Errors
-    /// The view does not lie on multiples of 4 bytes.
+    /// The view is not aligned to 4 bytes.
     pub fn clear(&mut self, view: &BufferView) -> GpuResult<()> {
         self.check_copy("clear", view, view.size)?;
         self.work.pass = None;
-        self.gpu.faults.doing(view.label);
+        self.gpu.faults.set_stage(view.label);
         self.work.encoder.clear_buffer(&view.raw, view.offset, Some(view.size));
         Ok(())
     }
 
-    /// Copies `from` to the beginning of `to`, which is another buffer.
+    /// Copies `from` to the start of `to`, which is another buffer.
     ///
     /// # Errors
-    /// `to` is shorter, both lie in one buffer, or one does not lie on multiples of 4 bytes.
+    /// `to` is shorter, both are in one buffer, or one is not aligned to 4 bytes.
     pub fn copy(&mut self, from: &BufferView, to: &BufferView) -> GpuResult<()> {
         self.check_copy("copy", from, from.size)?;
         self.check_copy("copy", to, from.size)?;
@@ -266,28 +266,29 @@ impl Recorder<'_> {
             return Err(GpuError::Bindings { stage: self.work.name.into(), problem });
         }
         self.work.pass = None;
-        self.gpu.faults.doing(to.label);
+        self.gpu.faults.set_stage(to.label);
         self.work.encoder.copy_buffer_to_buffer(&from.raw, from.offset, &to.raw, to.offset, from.size);
         Ok(())
     }
 
-    /// Records that `view`, as it is at this point, be read back.
+    /// Records the read-back of `view` as it is at this point.
     ///
     /// # Errors
-    /// The view does not lie on multiples of 4 bytes, or there is no memory for staging.
+    /// The view is not aligned to 4 bytes, or there is no memory for staging.
     pub fn read_back(&mut self, stage: &'static str, view: &BufferView) -> GpuResult<Readback> {
         self.check_copy("read_back", view, view.size)?;
         self.work.pass = None;
-        self.gpu.faults.doing(stage);
+        self.gpu.faults.set_stage(stage);
         let (readback, pending) = Readback::record(self.gpu, &mut self.work.encoder, stage, view)?;
         self.work.readbacks.push(pending);
         Ok(readback)
     }
 
-    /// Runs a stage: `views` in the order of the binding numbers that its entry point uses. Zero groups do nothing.
+    /// Dispatches a stage; `views` are in the order of the binding numbers that its entry point uses. Zero groups do
+    /// nothing.
     ///
     /// # Errors
-    /// A view does not fit its binding; the message names the stage and the variable.
+    /// A view does not match its binding; the message names the stage and the variable.
     pub fn dispatch(
         &mut self,
         stage: &'static str,
@@ -306,7 +307,7 @@ impl Recorder<'_> {
         self.gpu.faults.check()
     }
 
-    /// Runs a stage with the three workgroup counts that `groups` holds on the device.
+    /// Dispatches a stage; `groups` holds the three workgroup counts on the device.
     ///
     /// # Errors
     /// As [`Recorder::dispatch`].
@@ -330,7 +331,7 @@ impl Recorder<'_> {
         views: &[BufferView],
     ) -> GpuResult<&mut wgpu::ComputePass<'static>> {
         self.check_bindings(stage, pipeline, views)?;
-        self.gpu.faults.doing(stage);
+        self.gpu.faults.set_stage(stage);
         let entries: Vec<wgpu::BindGroupEntry<'_>> = pipeline
             .reflection
             .bindings
@@ -405,22 +406,22 @@ impl Recorder<'_> {
         Ok(())
     }
 
-    /// Whether `size` bytes fit at the beginning of `view`, on multiples of 4.
+    /// Checks that `size` bytes fit at the start of `view`, aligned to 4.
     fn check_copy(&self, what: &str, view: &BufferView, size: u64) -> GpuResult<()> {
         let problem = if !view.is_inside() {
             format!("{what}: a range beyond the end of {}", view.label)
         } else if size > view.size {
             format!("{what}: {size} bytes do not fit the {} of {}", view.size, view.label)
         } else if !view.offset.is_multiple_of(4) || !size.is_multiple_of(4) {
-            format!("{what}: {size} bytes at {} of {} are not whole words", view.offset, view.label)
+            format!("{what}: {size} bytes at {} of {} are not aligned to 4 bytes", view.offset, view.label)
         } else {
             return Ok(());
         };
         Err(GpuError::Bindings { stage: self.work.name.into(), problem })
     }
 
-    /// Lets the fault happen that is planned for this submission, if one is.
-    fn strike(&mut self) {
+    /// Injects the fault planned for this submission, if any.
+    fn inject_fault(&mut self) {
         match self.gpu.injector.next() {
             None => {}
             Some(FaultKind::Lost) => self.gpu.device.destroy(),
@@ -429,13 +430,13 @@ impl Recorder<'_> {
                 self.work.encoder.clear_buffer(&raw, 0, Some(2 * UNIFORM_CHUNK)); // beyond its end
             }
             Some(FaultKind::OutOfMemory) => {
-                self.gpu.faults.report(&wgpu::Error::OutOfMemory { source: "a fault on purpose".into() });
+                self.gpu.faults.report(&wgpu::Error::OutOfMemory { source: "injected fault".into() });
             }
             Some(FaultKind::Full) => self.fill_device(),
         }
     }
 
-    /// Asks for memory until the driver refuses, as another program may do, and gives it back: the refusal stays reported.
+    /// Allocates memory until the driver refuses, then frees it; the refusal stays reported.
     fn fill_device(&self) {
         let mut taken = Vec::new();
         while !self.gpu.faults.is_reported() && taken.len() < FILL_BUFFERS {
@@ -448,7 +449,7 @@ impl Recorder<'_> {
         }
     }
 
-    /// Submits what is recorded so far and goes on with an empty encoder.
+    /// Submits the commands recorded so far and continues with an empty encoder.
     fn flush(&mut self) -> GpuResult<Submission> {
         let gpu = self.gpu;
         self.work.pass = None;
@@ -456,8 +457,8 @@ impl Recorder<'_> {
         let stamps = profiler.resolve(gpu, &mut self.work.encoder)?;
         drop(profiler);
         self.work.readbacks.extend(stamps);
-        gpu.faults.doing(self.work.name);
-        self.strike();
+        gpu.faults.set_stage(self.work.name);
+        self.inject_fault();
         let encoder = std::mem::replace(&mut self.work.encoder, new_encoder(&gpu.device, self.work.name));
         let commands = encoder.finish();
         gpu.faults.check()?;
@@ -475,7 +476,7 @@ impl Recorder<'_> {
         for pending in self.work.readbacks.drain(..) {
             pending.start(&index);
         }
-        // Without a poll the loss of the device would go unnoticed: a submission to it is silently dropped.
+        // Without a poll a lost device would go unnoticed, because submissions to it are silently dropped.
         let polled = gpu.device.poll(wgpu::PollType::Poll);
         gpu.faults.check()?;
         polled.map_err(|e| GpuError::Validation { stage: self.work.name.into(), message: e.to_string() })?;

@@ -1,16 +1,17 @@
-//! Shaders: a small preprocessor, reflection by the shader compiler, pipelines with explicit layouts.
+//! Shaders: a small preprocessor, reflection by the shader compiler (naga), pipelines with explicit layouts.
 //!
-//! The preprocessor knows, at the beginning of a line:
+//! The preprocessor knows these directives, at the start of a line:
 //!
-//! - `#import "shared/x.wgsl"`: the file at this place, each file once;
+//! - `#import "shared/x.wgsl"`: inserts the file, each file once;
 //! - `#ifdef NAME`, `#ifndef NAME`, `#else`, `#endif`;
-//! - `#param NAME 0 1 2 3`: `NAME` stands for a value; the first one unless a define says otherwise, and only values
-//!   of the list are accepted, so that every variant can be tested;
-//! - `#repeat NAME 0u 1u` ... `#end`: the lines between, once for each value of `NAME`.
+//! - `#param NAME 0 1 2 3`: replaces `NAME` by a value; the first one unless a define selects another, and only listed
+//!   values are accepted, so that every variant can be tested;
+//! - `#repeat NAME 0u 1u` ... `#end`: repeats the lines between, once for each value of `NAME`.
 //!
-//! Invariants: (1) a define that a shader does not know is an error, but for `SUBGROUPS`, which is set for all shaders
-//! of a device with subgroup operations, and `SUBGROUPS_OF_8`, where all of them have 8 invocations; (2) layouts follow from what the entry point uses, not from what a caller
-//! declares; (3) equal (shader, entry, defines) give the same pipeline, compiled once.
+//! Invariants: (1) a define that a shader does not know is an error, except `SUBGROUPS`, set for all shaders of a
+//! device with subgroup operations, and `SUBGROUPS_OF_8`, set if all subgroups have 8 invocations; (2) layouts are
+//! derived from what the entry point uses, never declared by a caller; (3) equal (shader, entry, defines) give the same
+//! pipeline, compiled once.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -21,19 +22,19 @@ use super::device::Gpu;
 use super::error::{GpuError, GpuResult, lock};
 use super::sources::SOURCES;
 
-/// A shader file: its path under `shaders/` and its text.
+/// A shader file.
 #[derive(Debug, Clone, Copy)]
 pub struct Source {
     /// Path under `shaders/`, with forward slashes.
     pub name: &'static str,
-    /// WGSL with the preprocessor's directives.
+    /// WGSL with preprocessor directives.
     pub text: &'static str,
 }
 
 /// Names and values; a switch for `#ifdef` has an empty value.
 pub type Defines<'a> = &'a [(&'a str, &'a str)];
 
-/// How a binding is bound.
+/// Kind of a binding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BindingKind {
     /// `var<uniform>`
@@ -51,20 +52,20 @@ pub struct Binding {
     pub number: u32,
     /// Name of the variable.
     pub name: String,
-    /// How it is bound.
+    /// Kind of the binding.
     pub kind: BindingKind,
-    /// Bytes that a view must span at least: one element of a runtime-sized array.
+    /// Least bytes that a view must span; for a runtime-sized array, one element.
     pub min_size: u64,
 }
 
-/// What the compiler says about an entry point.
+/// The compiler's reflection of an entry point.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Reflection {
-    /// Used bindings, by number.
+    /// Bindings used, by number.
     pub bindings: Vec<Binding>,
     /// Invocations of a workgroup, per dimension.
     pub workgroup_size: [u32; 3],
-    /// Bytes of workgroup memory.
+    /// Workgroup memory, bytes.
     pub workgroup_storage: u64,
 }
 
@@ -73,7 +74,7 @@ pub struct Reflection {
 pub struct Pipeline {
     pub(super) raw: wgpu::ComputePipeline,
     pub(super) layout: wgpu::BindGroupLayout,
-    /// What the compiler says about it.
+    /// The compiler's reflection.
     pub reflection: Reflection,
 }
 
@@ -81,7 +82,7 @@ pub struct Pipeline {
 pub(super) type PipelineCache = BTreeMap<(String, String, Vec<(String, String)>), Arc<Pipeline>>;
 
 impl Gpu {
-    /// The pipeline of an entry point of a shader of [`SOURCES`]; compiled at its first use.
+    /// The pipeline of an entry point of a shader in [`SOURCES`]; compiled on first use.
     ///
     /// # Errors
     /// The shader does not exist or does not compile, or a define is unknown to it.
@@ -90,7 +91,7 @@ impl Gpu {
         self.pipeline_from(source, entry, defines)
     }
 
-    /// As [`Gpu::pipeline`], of a source outside the table (which its imports still come from).
+    /// As [`Gpu::pipeline`], for a source outside the table; its imports still come from the table.
     ///
     /// # Errors
     /// As [`Gpu::pipeline`].
@@ -113,12 +114,12 @@ impl Gpu {
     fn compile(&self, source: &Source, entry: &str, defines: Defines<'_>) -> GpuResult<Pipeline> {
         let mut text = preprocess(source, defines)?;
         if !self.uniform_blocks() {
-            // A struct that may stand in a uniform block has the same layout in storage.
+            // A struct that is valid in a uniform block has the same layout in storage.
             text = text.replace("var<uniform>", "var<storage, read>");
         }
         let reflection = reflect(source.name, &text, entry, self.subgroups())?;
         self.check_workgroup(source.name, &reflection)?;
-        self.faults.doing(source.name);
+        self.faults.set_stage(source.name);
         let entries: Vec<_> = reflection
             .bindings
             .iter()
@@ -175,7 +176,7 @@ fn failed(shader: &str, problem: impl Into<String>) -> GpuError {
     GpuError::Shader { shader: shader.into(), problem: problem.into() }
 }
 
-/// A source with its imports in place, without directives of the preprocessor.
+/// A source with its imports inserted.
 fn stitch(source: &Source, seen: &mut BTreeSet<&'static str>, out: &mut Vec<String>) -> GpuResult<()> {
     for line in source.text.lines() {
         let Some(rest) = line.trim_start().strip_prefix("#import") else {
@@ -200,7 +201,7 @@ fn stitched(source: &Source) -> GpuResult<Vec<String>> {
     Ok(lines)
 }
 
-/// The stitched lines with repetitions written out.
+/// The stitched lines with repetitions expanded.
 fn repeated(source: &Source) -> GpuResult<Vec<String>> {
     let mut out = Vec::new();
     let mut open: Option<(String, Vec<String>, Vec<String>)> = None;
@@ -229,7 +230,7 @@ fn repeated(source: &Source) -> GpuResult<Vec<String>> {
     }
 }
 
-/// A line of the preprocessor: its words, the first without `#`.
+/// The words of a preprocessor line, without the `#`.
 fn directive(line: &str) -> Option<Vec<&str>> {
     line.trim_start().strip_prefix('#').map(|rest| rest.split_whitespace().collect())
 }
@@ -328,7 +329,7 @@ pub fn preprocess(source: &Source, defines: Defines<'_>) -> GpuResult<String> {
     Ok(out)
 }
 
-/// A line with the names of parameters, as whole words, replaced by their values.
+/// A line with parameter names, as whole words, replaced by their values.
 fn replaced(line: &str, values: &BTreeMap<String, String>) -> String {
     if values.is_empty() {
         return line.to_string();
@@ -349,7 +350,7 @@ fn replaced(line: &str, values: &BTreeMap<String, String>) -> String {
 /// Parses and validates a preprocessed text.
 ///
 /// # Errors
-/// The compiler's message with the line at fault.
+/// The compiler's message with the faulty line.
 pub fn validate(name: &str, text: &str, subgroups: bool) -> GpuResult<(naga::Module, naga::valid::ModuleInfo)> {
     let module = naga::front::wgsl::parse_str(text).map_err(|e| failed(name, e.emit_to_string(text)))?;
     let mut capabilities = naga::valid::Capabilities::empty();
@@ -359,7 +360,7 @@ pub fn validate(name: &str, text: &str, subgroups: bool) -> GpuResult<(naga::Mod
     Ok((module, info))
 }
 
-/// What the compiler says about an entry point of a preprocessed text.
+/// Reflects an entry point of a preprocessed text.
 ///
 /// # Errors
 /// The text does not validate, the entry point does not exist, or a binding is outside group 0.

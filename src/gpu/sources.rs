@@ -1,4 +1,4 @@
-//! The table of shaders that are part of the program. A shader file that is missing here fails `tests/shaders.rs`.
+//! The table of shaders built into the program. `tests/shaders.rs` fails if a shader file is missing from it.
 
 use super::shader::Source;
 

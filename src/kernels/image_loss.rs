@@ -1,16 +1,16 @@
-//! The training loss of one picture and its gradient: (1 - lambda) L1 + lambda (1 - SSIM).
-//! Cuts the picture into bands of rows and adds up what `ssim_band` finds in them; knows no files and no renderer.
+//! The training loss of a picture and its gradient: (1 - lambda) L1 + lambda (1 - SSIM). Cuts the picture into bands of
+//! rows and sums the results of `ssim_band`; knows neither files nor a renderer.
 //!
-//! Masks: a pixel with mask byte 0 is left out of the means of L1 and squared differences and has gradient 0. For SSIM
-//! the picture is replaced by the reference there before filtering, so it adds no difference to its neighbours' windows,
-//! and the map is averaged over the pixels that count only. Nothing counts (all masked, or no pixels): loss and gradient
-//! are 0, SSIM is 1.
+//! Masks: a pixel with mask byte 0 is excluded from the means of L1 and squared differences and has gradient 0. For
+//! SSIM such pixels take the reference's values before filtering, so they add no difference to their neighbours'
+//! windows, and the map is averaged over the used pixels only. If no pixel is used (all masked, or an empty picture),
+//! loss and gradient are 0 and SSIM is 1.
 //!
-//! `SsimVariant::Valid` on a picture with a side under 11 pixels would have no window at all: it falls back to `Same`.
+//! `SsimVariant::Valid` has no window on a picture with a side under 11 pixels: it falls back to `Same`.
 //!
 //! Invariants: 1. bands depend on the height alone and their f64 sums are added in order, so the bits are the same for any
-//! number of threads; 2. nothing is allocated by a call whose picture is no larger than earlier ones; 3. a picture with
-//! NaN or infinity at a pixel that counts gives a loss that is not finite, and never a panic.
+//! number of threads; 2. a call allocates nothing if its picture is no larger than earlier ones; 3. a picture with NaN
+//! or infinity at a used pixel gives a non-finite loss, never a panic.
 
 use super::ssim_band::{BandKernel, BandSums, GradientBand, WINDOW, domain};
 use crate::base::simd::{SimdPath, dispatch};
@@ -19,27 +19,27 @@ use rayon::prelude::*;
 use std::fmt;
 use std::ops::Range;
 
-/// Rows of a band at most: few enough for every core to get one, many enough that the ten rows read twice cost little.
+/// Most rows of a band: few enough to give every core one, enough that the ten rows read twice cost little.
 const BAND_ROWS: usize = 64;
 
-/// Which pixels the SSIM map of the loss covers.
+/// The pixels that the SSIM map of the loss covers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SsimPadding {
-    /// Only windows that lie inside the image (the default of the loss).
+    /// Only windows inside the image (the default of the loss).
     Valid,
-    /// Every pixel, zeros outside (the 3DGS code).
+    /// Every pixel, with zeros outside (the 3DGS code).
     Same,
 }
 
-/// Which SSIM is meant; published figures use all three, and they differ in the third digit.
+/// Variants of SSIM; published figures use all three, and they differ in the third digit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum SsimVariant {
-    /// Mean over every pixel, zeros outside the picture: the 3DGS code.
+    /// Mean over every pixel, with zeros outside the picture: the 3DGS code.
     #[default]
     Same,
-    /// Mean over the windows that lie inside the picture: scikit-image, pytorch-msssim.
+    /// Mean over the windows inside the picture: scikit-image, pytorch-msssim.
     Valid,
-    /// Mean over every pixel, the picture mirrored at its borders: torchmetrics.
+    /// Mean over every pixel, with the picture mirrored at its borders: torchmetrics.
     Reflect,
 }
 
@@ -72,12 +72,12 @@ impl From<SsimPadding> for SsimVariant {
     }
 }
 
-/// What the loss weighs.
+/// Options of the loss.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LossOptions {
-    /// Weight of 1 - SSIM; L1 has the rest.
+    /// Weight of 1 - SSIM; L1 has weight 1 - lambda.
     pub ssim_lambda: f32,
-    /// Pixels that the SSIM map covers.
+    /// Pixels covered by the SSIM map.
     pub padding: SsimPadding,
     /// Instruction path of the CPU kernels.
     pub simd: SimdPath,
@@ -96,34 +96,34 @@ pub struct LossValue {
     pub mse: f64,
 }
 
-/// Pixels that a picture is compared with.
+/// The reference picture.
 #[derive(Debug, Clone, Copy)]
 pub enum Reference<'a> {
-    /// Interleaved `[height][width][3]`, a byte meaning byte / 255.
+    /// Interleaved `[height][width][3]`; a byte stands for byte / 255.
     Bytes(&'a [u8]),
     /// Planar `[3][height][width]`.
     Planar(&'a [f32]),
 }
 
-/// Two pictures of one size on plain slices.
+/// A picture and its reference, of one size, on plain slices.
 #[derive(Debug, Clone, Copy)]
 pub struct ImagePair<'a> {
     /// Width, pixels.
     pub width: usize,
     /// Height, pixels.
     pub height: usize,
-    /// The picture that is judged, planar `[3][height][width]`.
+    /// The picture to judge, planar `[3][height][width]`.
     pub rgb: &'a [f32],
-    /// What it should look like.
+    /// The reference.
     pub reference: Reference<'a>,
-    /// One byte per pixel, 0 = left out; `None`: every pixel counts.
+    /// One byte per pixel, 0 = excluded; `None`: every pixel is used.
     pub mask: Option<&'a [u8]>,
-    /// Compare the values cut to 0..1, as metrics do. No gradient knows of it: keep it `false` for the loss.
+    /// Clamp the values to 0..1 first, as metrics do. The gradient ignores the clamp: keep it `false` for the loss.
     pub clamp: bool,
 }
 
 impl<'a> ImagePair<'a> {
-    /// A picture and the photo it is compared with.
+    /// A picture and its photo.
     pub fn new(image: &'a Image, target: &'a Target) -> Self {
         assert_eq!((image.width, image.height), (target.width, target.height), "picture and target differ in size");
         ImagePair {
@@ -136,22 +136,22 @@ impl<'a> ImagePair<'a> {
         }
     }
 
-    /// Pixels in the picture.
+    /// Number of pixels.
     pub fn pixels(&self) -> usize {
         self.width * self.height
     }
 
-    /// Pixels of the picture that count.
+    /// Number of used pixels.
     pub fn counted_pixels(&self) -> usize {
         counted(self.mask, self.width, 0..self.height, 0..self.width)
     }
 
-    /// Pixels of the SSIM map that count.
+    /// Number of used pixels in the SSIM map.
     fn counted_windows(&self, variant: SsimVariant) -> usize {
         counted_windows(self.mask, self.width, self.height, variant)
     }
 
-    /// The variant that can be computed at this size.
+    /// The variant that is possible at this size.
     fn possible(&self, variant: SsimVariant) -> SsimVariant {
         possible(self.width, self.height, variant)
     }
@@ -167,7 +167,7 @@ impl<'a> ImagePair<'a> {
     }
 }
 
-/// Pixels that count, in a part of a picture.
+/// Number of used pixels in a part of a picture.
 fn counted(mask: Option<&[u8]>, width: usize, rows: Range<usize>, columns: Range<usize>) -> usize {
     let Some(mask) = mask else { return rows.len() * columns.len() };
     rows.map(|row| {
@@ -186,14 +186,14 @@ fn possible(width: usize, height: usize, variant: SsimVariant) -> SsimVariant {
     if small && variant == SsimVariant::Valid { SsimVariant::Same } else { variant }
 }
 
-/// How the sums over a picture make the loss: what every backend decides in the same way before it adds anything up.
+/// Weights that turn the sums over a picture into the loss; computed by the same code for every backend.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LossPlan {
-    /// The SSIM that can be computed at this size.
+    /// The SSIM variant that is possible at this size.
     pub variant: SsimVariant,
-    /// Values that count: three for each pixel.
+    /// Number of used values: three per pixel.
     pub samples: f64,
-    /// Values of the SSIM map that count.
+    /// Number of used values of the SSIM map.
     pub windows: f64,
     /// Derivative of the loss with respect to the sum of absolute differences.
     pub l1_weight: f32,
@@ -203,7 +203,7 @@ pub struct LossPlan {
 }
 
 impl LossPlan {
-    /// For a picture of this size; `mask` as in [`ImagePair::mask`].
+    /// The plan for a picture of this size; `mask` as in [`ImagePair::mask`].
     pub fn new(width: usize, height: usize, mask: Option<&[u8]>, options: &LossOptions) -> Self {
         let variant = possible(width, height, options.padding.into());
         let lambda = f64::from(options.ssim_lambda);
@@ -213,15 +213,15 @@ impl LossPlan {
             variant,
             samples,
             windows,
-            // Nothing counts: no gradient.
+            // No used pixel: no gradient.
             l1_weight: if samples > 0.0 { ((1.0 - lambda) / samples) as f32 } else { 0.0 },
-            // Every window is masked but some pixel at the border counts: L1 alone is left.
+            // If every window is masked but some border pixel is used, only L1 remains.
             ssim_weight: if windows > 0.0 { (-lambda / windows) as f32 } else { 0.0 },
             lambda,
         }
     }
 
-    /// Pixels at each border that are not in the SSIM map.
+    /// Pixels at each border that the SSIM map does not cover.
     pub fn margin(&self) -> usize {
         domain(self.variant, WINDOW).start
     }
@@ -237,14 +237,14 @@ impl LossPlan {
     }
 }
 
-/// Computes losses; keeps the sums of bands between calls so that nothing is allocated once it is warm.
+/// Computes losses; keeps the sums of bands between calls, so that later calls allocate nothing.
 #[derive(Debug, Default)]
 pub struct ImageLoss {
     sums: Vec<BandSums>,
 }
 
 impl ImageLoss {
-    /// One for any size of picture.
+    /// A loss for pictures of any size.
     pub fn new() -> Self {
         ImageLoss::default()
     }
@@ -253,7 +253,7 @@ impl ImageLoss {
     /// (planar `[3][height][width]`, resized; sign(0) = 0 in the L1 part).
     ///
     /// # Panics
-    /// When sizes disagree.
+    /// The sizes differ.
     pub fn value_and_gradient(
         &mut self,
         image: &Image,
@@ -264,10 +264,10 @@ impl ImageLoss {
         self.pair_value_and_gradient(&ImagePair::new(image, target), options, v_rgb)
     }
 
-    /// The same on plain slices; the reference need not be 8-bit.
+    /// The same on plain slices; the reference may also be f32.
     ///
     /// # Panics
-    /// When lengths disagree with the size.
+    /// A length does not match the size.
     pub fn pair_value_and_gradient(
         &mut self,
         pair: &ImagePair,
@@ -299,10 +299,10 @@ impl ImageLoss {
     }
 }
 
-/// Mean of the SSIM map over pixels and channels; NaN when no pixel of the map counts.
+/// Mean of the SSIM map over pixels and channels; NaN if no pixel of the map is used.
 ///
 /// # Panics
-/// When lengths disagree with the size.
+/// A length does not match the size.
 pub fn mean_ssim(pair: &ImagePair, variant: SsimVariant, simd: SimdPath) -> f64 {
     pair.check();
     let variant = pair.possible(variant);
@@ -325,7 +325,7 @@ fn band_rows(band: usize, height: usize) -> Range<usize> {
     band * BAND_ROWS..((band + 1) * BAND_ROWS).min(height)
 }
 
-/// Sums in the order of channels and bands.
+/// Adds sums in the order of channels and bands.
 fn add_up(bands: &[BandSums]) -> BandSums {
     bands.iter().fold(BandSums::default(), |total, band| BandSums {
         l1: total.l1 + band.l1,

@@ -1,10 +1,10 @@
-//! One intersection for each row and tile that it can reach.
+//! Emits one intersection for each row and tile that the row can reach.
 //!
 //! Invariants: 1. a row's tiles are enumerated column by column (tile x outer, tile y inner), and the k-th of them has
-//! emit index `first emit index of the row + k`: per-row sums are folded in that order; 2. a tile, and a pixel row of a tile, is left
-//! out only where every pixel's alpha is computed below 1/255, so leaving it out cannot change the image;
-//! 3. [`count`] and [`emit`] walk through the same enumeration as the counts of [`super::splats::pack`]; 4. the result
-//! does not depend on the number of threads.
+//! emit index `first emit index of the row + k`: per-row sums are folded in that order; 2. a tile, or a pixel row of a
+//! tile, is skipped only if the computed alpha of all its pixels is below 1/255, so skipping cannot change the image;
+//! 3. [`count`] and [`emit`] use the same enumeration as the counts of [`super::splats::pack`]; 4. the result does not
+//! depend on the number of threads.
 
 use super::constants::TILE;
 use super::radix_sort::chunk_len;
@@ -20,23 +20,23 @@ const CHUNKS_MAX: usize = 32;
 /// One intersection, packed in 64 bits: row (32), first pixel row in the tile (4), last pixel row (4), k (24).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Isect {
-    /// The Gaussian.
+    /// The row of the Gaussian.
     pub row: u32,
     /// First and last pixel row of the tile, 0 to 15, that it can reach.
     pub pixel_rows: [u8; 2],
-    /// Its number among the row's intersections, below 2^24.
+    /// Its index among the row's intersections, below 2^24.
     pub k: u32,
 }
 
 impl Isect {
-    /// To 64 bits.
+    /// Packs into 64 bits.
     #[inline(always)]
     pub fn pack(self) -> u64 {
         let [first, last] = self.pixel_rows.map(u64::from);
         u64::from(self.row) | first << 32 | last << 36 | u64::from(self.k) << 40
     }
 
-    /// From 64 bits.
+    /// Unpacks from 64 bits.
     #[inline(always)]
     pub fn unpack(bits: u64) -> Self {
         let pixel_rows = [(bits >> 32) as u8 & 15, (bits >> 36) as u8 & 15];
@@ -66,7 +66,7 @@ fn for_each_tile(splat: &Splat, span: &Span, grid: Grid, mut each: impl FnMut(us
     }
 }
 
-/// Rows come in order of depth, which is no order in memory: asks for a span some rows ahead.
+/// Prefetches a span some rows ahead, because depth order is random order in memory.
 #[inline(always)]
 fn prefetch_ahead(spans: &[Span], order: &[u32], i: usize) {
     if let Some(&row) = order.get(i + 24) {
@@ -74,7 +74,7 @@ fn prefetch_ahead(spans: &[Span], order: &[u32], i: usize) {
     }
 }
 
-/// Counts intersections as `[chunks][tiles]` for [`super::isect_offsets`]; chunks are parts of `order`, the drawn rows
+/// Counts intersections as `[chunks][tiles]` for [`super::isect_offsets`]; a chunk is a part of `order`, the drawn rows
 /// front to back.
 pub fn count(order: &[u32], packed: &Packed, grid: Grid, simd: SimdPath, tile_counts: &mut Vec<u32>) {
     let tiles = grid.tiles();
@@ -111,8 +111,8 @@ impl Kernel for CountChunk<'_> {
     }
 }
 
-/// Writes each intersection (as [`Isect::pack`]) to its place in its tile's list. `cursors` comes from
-/// [`super::isect_offsets`] and is used up; `isects` is resized to `total`.
+/// Writes each intersection (as [`Isect::pack`]) to its place in its tile's list. Consumes `cursors`, which comes from
+/// [`super::isect_offsets`]; `isects` is resized to `total`.
 pub fn emit(
     order: &[u32],
     packed: &Packed,
@@ -170,7 +170,7 @@ mod tests {
     use crate::kernels::scan::scan;
     use crate::kernels::splats::LOG2_ALPHA_MIN;
 
-    /// Footprints of all kinds, in no order of depth.
+    /// Footprints of all kinds, unsorted by depth.
     fn random_rows(n: usize, needles: bool, seed: u64, grid: Grid) -> (Packed, Projected) {
         let mut draws = Stream::new(5, Purpose::Test, seed, u64::from(needles));
         let mut p = Projected::default();
@@ -191,7 +191,7 @@ mod tests {
         (packed, p)
     }
 
-    /// Every pixel of the box whose exponent reaches the threshold must be in a tile and row that was emitted.
+    /// Every pixel of the box whose exponent reaches the threshold must be in an emitted tile and row.
     #[test]
     fn no_contribution_is_left_out() {
         let grid = Grid::new(107, 75);
@@ -235,7 +235,7 @@ mod tests {
     #[test]
     fn lists_are_in_depth_order_and_k_counts_columns_first() {
         let grid = Grid::new(107, 75);
-        // More than two chunks, in an order that is not that of the rows.
+        // More than two chunks, in an order other than that of the rows.
         let (packed, _) = random_rows(5000, false, 1, grid);
         let order: Vec<u32> = (0..5000).map(|i| i * 7 % 5000).collect();
         let mut rank = vec![0; 5000];

@@ -1,12 +1,11 @@
-//! Where each tile's list begins: from tile counts to places.
+//! Converts tile counts to offsets: the start of each tile's list.
 //!
-//! Invariant: within a tile, intersections stand in depth order, because the chunks of the counting sort are cut in
-//! depth order and each writes in it.
+//! Invariant: intersections of a tile are in depth order, because the chunks of the counting sort are cut in depth
+//! order and each chunk writes in that order.
 
-/// `tile_counts` is `[chunks][tiles]`: how many intersections each chunk of the drawn rows has in
-/// each tile. On return,
-/// `tile_offsets` (tiles + 1 entries, the last is the total) says where each tile's list begins, and `cursors`
-/// (`[chunks][tiles]`) where each chunk's part of it begins.
+/// `tile_counts` is `[chunks][tiles]`: the number of intersections of each chunk of the drawn rows in each tile. On
+/// return `tile_offsets` (tiles + 1 entries, the last is the total) holds the start of each tile's list, and `cursors`
+/// (`[chunks][tiles]`) the start of each chunk's part of it.
 pub fn isect_offsets(tile_counts: &[u32], tiles: usize, tile_offsets: &mut Vec<u64>, cursors: &mut Vec<u64>) {
     tile_offsets.clear();
     tile_offsets.resize(tiles + 1, 0);

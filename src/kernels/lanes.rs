@@ -1,17 +1,17 @@
-//! Blocks of rows as arrays of components, for the per-row stages: what they share to run vectorised.
+//! Blocks of rows as arrays of components, which let the per-row stages run vectorised.
 //!
-//! Invariants: 1. a block holds [`LANES`] rows, and lanes beyond the last row hold zeros; 2. chunks have a fixed
-//! number of rows whatever the number of threads, and no row depends on another, so results do not either.
+//! Invariants: 1. a block holds [`LANES`] rows, and lanes beyond the last row hold zeros; 2. chunks have a fixed number
+//! of rows for any number of threads, and rows are independent of each other, so results do not depend on threads.
 
 use crate::base::simd::LANES;
 
-/// Rows of one parallel task: a multiple of [`LANES`], some 100 KiB of columns.
+/// Rows per parallel task: a multiple of [`LANES`], some 100 KiB of columns.
 pub const ROWS_PER_CHUNK: usize = 2048;
 
 /// `W` components of a block of rows, one array per component.
 pub type Lanes<const W: usize> = [[f32; LANES]; W];
 
-/// A block from row-major values: `src` holds up to [`LANES`] rows of `W` floats.
+/// Gathers a block from row-major values: `src` holds up to [`LANES`] rows of `W` floats.
 #[inline(always)]
 pub fn gather<const W: usize>(src: &[f32]) -> Lanes<W> {
     let mut out = [[0.0; LANES]; W];
@@ -32,7 +32,7 @@ pub fn gather<const W: usize>(src: &[f32]) -> Lanes<W> {
     out
 }
 
-/// Row-major values from a block: as many rows as `dst` holds.
+/// Scatters a block to row-major values: as many rows as `dst` holds.
 #[inline(always)]
 pub fn scatter<const W: usize>(src: &Lanes<W>, dst: &mut [f32]) {
     let (rows, _) = dst.as_chunks_mut::<W>();
@@ -64,7 +64,7 @@ pub fn block_of<T>(values: &[T], block: usize, width: usize) -> &[T] {
     &values[start..values.len().min(start + LANES * width)]
 }
 
-/// As [`block_of`], to write to.
+/// As [`block_of`], mutable.
 #[inline(always)]
 pub fn block_of_mut<T>(values: &mut [T], block: usize, width: usize) -> &mut [T] {
     let start = block * LANES * width;

@@ -1,4 +1,4 @@
-//! One file per stage of the pipeline, on plain slices. No files, no GPU types, no optimizer.
+//! The stages of the pipeline on the CPU, one file each, on plain slices. Knows no files, GPU types or optimizer.
 
 pub mod constants;
 pub mod image_loss;

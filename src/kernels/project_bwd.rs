@@ -1,21 +1,22 @@
 //! Stage "project", backward: gradients of footprints to gradients of means, quats, scales and opacities.
 //!
-//! Not here: the colour's path to the mean, which `sh_bwd` writes first.
+//! Not here: the gradient of the mean through the colour, which `sh_bwd` writes first.
 //!
-//! Invariants: 1. culled rows get exactly 0 and add nothing; 2. as forward, the same bits on every instruction path;
-//! 3. no step subtracts large numbers to get a small one, so needles have gradients in f32.
+//! Invariants: 1. culled rows get exactly 0 and add nothing; 2. the same bits on every instruction path, as in the
+//! forward stage; 3. no step subtracts large numbers to get a small one, so the gradients of needles are accurate in
+//! f32.
 //!
 //! The formulas. Let b_k be the image of the ellipsoid's axis k, s_k its standard deviation, Y the inverse (the conic)
-//! of the covariance C = sum s_k^2 b_k b_k^T + eps I, and V the symmetric 2x2 of the conic's gradient, B's halved off
-//! the diagonal. dY = -Y dC Y. With w_k = Y b_k and E_kl = w_k^T V w_l the gradients are
+//! of the covariance C = sum s_k^2 b_k b_k^T + eps I, and V the symmetric 2x2 matrix of the conic's gradient, with B's
+//! half off the diagonal. dY = -Y dC Y. With w_k = Y b_k and E_kl = w_k^T V w_l the gradients are
 //!
 //! - log-scale k: -2 s_k^2 E_kk;
 //! - rotation about the ellipsoid's own axes: 2 E_12 (s_2^2 - s_1^2), and the same with the indices turned;
 //! - depth through the Jacobian's 1/z: -(sum of the log-scale gradients) / z;
 //! - the Jacobian's slopes (tx, ty): 2 f/z Y V sum_k s_k^2 z_k w_k, z_k the camera-space z of axis k.
 //!
-//! The conic of a needle times its long axis is a small difference of large numbers; the adjugate written with cross
-//! products is not: adj(C) b_k = eps b_k + sum_l s_l^2 perp(b_l) (b_l x b_k), in which the long axis has no part in
+//! For a needle, the conic times the long axis is a small difference of large numbers. The adjugate in cross products
+//! avoids it: adj(C) b_k = eps b_k + sum_l s_l^2 perp(b_l) (b_l x b_k), in which the long axis does not contribute to
 //! its own w_k.
 
 use crate::base::math::exp32;
@@ -37,7 +38,7 @@ pub struct GeometryGradient {
     pub log_scale: [f32; 3],
 }
 
-/// The images of the axes times the conic: w_k = Y b_k (see the module's text).
+/// The images of the axes times the conic: w_k = Y b_k (see the module page).
 #[inline(always)]
 fn axes_by_conic(g: &Geometry, eps2d: f32) -> [[f32; 2]; 3] {
     let perp = g.axes.map(|b| [-b[1], b[0]]);
@@ -51,7 +52,7 @@ fn axes_by_conic(g: &Geometry, eps2d: f32) -> [[f32; 2]; 3] {
     [combine(0, 1, 2), combine(1, 2, 0), combine(2, 0, 1)]
 }
 
-/// Gradient of one visible row from those of its pixel position and of its conic. `v_conic[1]` is with respect to
+/// Gradient of one visible row from the gradients of its pixel position and its conic. `v_conic[1]` is with respect to
 /// B in sigma = (A dx^2 + C dy^2) / 2 + B dx dy.
 #[inline(always)]
 pub fn geometry_vjp(view: &View, g: &Geometry, v_mean2d: [f32; 2], v_conic: [f32; 3]) -> GeometryGradient {
@@ -64,8 +65,8 @@ pub fn geometry_vjp(view: &View, g: &Geometry, v_mean2d: [f32; 2], v_conic: [f32
     let log_scale: [f32; 3] = std::array::from_fn(|k| -2.0 * (s[k] * e(k, k)));
 
     let turn = [2.0 * e(1, 2) * (s[2] - s[1]), 2.0 * e(2, 0) * (s[0] - s[2]), 2.0 * e(0, 1) * (s[1] - s[0])];
-    // A turn by t about the own axes moves the unit quaternion by q (0, t) / 2; the columns of that map are
-    // orthonormal up to the half, so its transpose-inverse is twice the map. The result is tangent already.
+    // A rotation by t about the own axes moves the unit quaternion by q (0, t) / 2; the columns of that map are
+    // orthonormal up to the factor 1/2, so its transpose-inverse is twice the map. The result is already tangent.
     let [qw, qx, qy, qz] = g.quat;
     let by = 2.0 * g.inv_quat_norm;
     let quat = [
@@ -86,7 +87,7 @@ pub fn geometry_vjp(view: &View, g: &Geometry, v_mean2d: [f32; 2], v_conic: [f32
     for i in 0..2 {
         let per_unit = view.focal[i] * g.inv_depth;
         let v_slope = 2.0 * per_unit * y_tilt[i];
-        // Where the slope is cut it no longer follows the mean.
+        // Where the slope is clamped it does not depend on the mean.
         let v_slope = if g.slope[i] == g.ray[i] { v_slope } else { 0.0 };
         let v_ray = view.focal[i] * v_mean2d[i] + v_slope;
         camera[i] = g.inv_depth * v_ray;
@@ -97,7 +98,7 @@ pub fn geometry_vjp(view: &View, g: &Geometry, v_mean2d: [f32; 2], v_conic: [f32
     GeometryGradient { mean, quat, log_scale }
 }
 
-/// Derivative of the activation of the opacity at a logit: o (1 - o), without the cancellation near o = 1.
+/// Derivative of the sigmoid at a logit: o (1 - o), without cancellation near o = 1.
 #[inline(always)]
 pub fn sigmoid_slope(logit: f32) -> f32 {
     let e = exp32(-logit.abs());

@@ -3,9 +3,9 @@
 //!
 //! Not here: colours, tiles, gradients (`project_bwd` reuses [`geometry`]).
 //!
-//! Invariants: 1. a row whose numbers are not finite, or that no pixel can see, is culled: radii [0, 0] and zeros
+//! Invariants: 1. a row with non-finite numbers, or one that no pixel can see, is culled: radii [0, 0] and zeros
 //! elsewhere, never NaN; 2. only + - * / sqrt, nothing fused: the same bits on every instruction path; 3. the
-//! determinant of the 2D covariance is a sum of squares, so that needles keep their short side in f32.
+//! determinant of the 2D covariance is a sum of squares, so the short side of needles stays accurate in f32.
 
 use crate::base::math::{exp32, sigmoid};
 use crate::base::room;
@@ -16,7 +16,7 @@ use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use rayon::prelude::*;
 
-/// Footprints of rows, one entry per row of the working set; entries of culled rows are not read.
+/// Footprints of rows, one entry per row of the working set; entries of culled rows are not valid.
 #[derive(Debug, Clone, Default)]
 pub struct Projected {
     /// Pixel position of the mean.
@@ -47,10 +47,10 @@ impl Projected {
     }
 }
 
-/// A quaternion whose squared length is outside of this range has no usable direction in f32: the row is culled.
+/// A quaternion whose squared length is outside this range has no usable direction in f32: its row is culled.
 const QUAT_NORM_SQ: std::ops::Range<f32> = 1e-30..1e30;
 
-/// What the projection needs of a camera, computed once per view.
+/// Camera constants of the projection, computed once per view.
 #[derive(Debug, Clone, Copy)]
 pub struct View {
     /// Rows of the world-to-camera rotation.
@@ -65,18 +65,18 @@ pub struct View {
     pub principal: [f32; 2],
     /// Image size, pixels.
     pub size: [f32; 2],
-    /// Where X/Z and Y/Z are cut inside the Jacobian: the image plus 15 % of it on each side.
+    /// Lower limit of X/Z and Y/Z inside the Jacobian: the image plus 15 % of it on each side.
     pub slope_low: [f32; 2],
-    /// The upper cut.
+    /// Upper limit.
     pub slope_high: [f32; 2],
-    /// Depths that are drawn lie strictly between these.
+    /// Drawn depths are strictly between these.
     pub depth_range: [f32; 2],
     /// Blur, px^2.
     pub eps2d: f32,
 }
 
 impl View {
-    /// The constants of a camera.
+    /// The constants for a camera.
     pub fn new(camera: &Camera, eps2d: f32) -> View {
         let m = &camera.viewmat;
         let rotation: [[f32; 3]; 3] = std::array::from_fn(|i| [m[i][0], m[i][1], m[i][2]]);
@@ -99,7 +99,7 @@ impl View {
     }
 }
 
-/// One row seen by a view: the projected ellipsoid before inversion, and what the gradient needs again.
+/// One row seen by a view: the projected ellipsoid before inversion, and what the gradient reuses.
 ///
 /// With T = J W (2x3, the Jacobian of the projection times the world-to-camera rotation) and R the row's rotation,
 /// `axes[k]` is column k of T R: the image of the unit vector along the ellipsoid's axis k.
@@ -111,7 +111,7 @@ pub struct Geometry {
     pub inv_depth: f32,
     /// X/Z, Y/Z.
     pub ray: [f32; 2],
-    /// The same, cut for the Jacobian.
+    /// The same, clamped for the Jacobian.
     pub slope: [f32; 2],
     /// Unit quaternion, w x y z.
     pub quat: [f32; 4],
@@ -216,7 +216,7 @@ pub fn geometry(view: &View, mean: [f32; 3], quat: [f32; 4], scale: [f32; 3]) ->
 /// Footprint of one row.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Footprint {
-    /// Whether it is drawn; if not, everything else is zero.
+    /// Whether the row is drawn; if not, all other fields are zero.
     pub visible: bool,
     /// Pixel position of the mean.
     pub mean2d: [f32; 2],
@@ -231,7 +231,7 @@ pub struct Footprint {
 }
 
 /// Natural logarithm for x in [1, 256), within 3e-7 + 2e-7 |ln x|: x = m 2^e, ln m = 2 atanh((m - 1) / (m + 1)).
-/// Outside of the range some number that the caller does not use.
+/// Returns an unspecified number outside this range.
 #[inline(always)]
 fn ln_1_to_256(x: f32) -> f32 {
     // Subtracting the bits of 2/3 first puts m into [2/3, 4/3).
@@ -244,7 +244,7 @@ fn ln_1_to_256(x: f32) -> f32 {
     e * std::f32::consts::LN_2 + 2.0 * r * series
 }
 
-/// Inverts the covariance, bounds the region where alpha can reach 1/255, and decides whether the row is drawn.
+/// Inverts the covariance, bounds the region where alpha can reach 1/255, and decides whether to draw the row.
 ///
 /// alpha = opacity exp(-r^2/2) reaches 1/255 at r = sqrt(2 ln(255 opacity)) standard deviations; the box of that
 /// ellipse has half extents r sqrt(cov_xx), r sqrt(cov_yy).
@@ -294,7 +294,7 @@ pub fn project_fwd(rows: &Columns, camera: &Camera, eps2d: f32, simd: SimdPath, 
         });
 }
 
-/// The stored geometry of one chunk of rows.
+/// The stored geometry of a chunk of rows.
 #[derive(Clone, Copy)]
 pub(crate) struct StoredChunk<'a> {
     pub means: &'a [f32],
@@ -397,7 +397,7 @@ mod tests {
         out
     }
 
-    /// A row in front of the camera that is drawn.
+    /// A row in front of the camera, which is drawn.
     fn one_row() -> Columns {
         let mut rows = Columns::zeros(1, 0);
         rows.quats[0] = 1.0;
@@ -461,7 +461,7 @@ mod tests {
     }
 
     #[test]
-    fn flat_rows_and_rows_of_no_size_are_drawn() {
+    fn flat_rows_and_rows_of_size_zero_are_drawn() {
         for scales in [[-200.0, -2.0, -2.0], [-200.0, -200.0, -200.0]] {
             let mut rows = one_row();
             rows.scales.copy_from_slice(&scales);

@@ -1,11 +1,11 @@
-//! Visible rows, front to back.
+//! Sorts the visible rows front to back.
 //!
-//! Invariants: 1. the order is by the bits of the depth, which for depths beyond the near plane (positive floats) is
-//! the order of the depths; 2. rows of equal depth stay in row order; 3. the result does not depend on the number of
-//! threads: the work is cut into a number of chunks that follows from the number of rows alone.
+//! Invariants: 1. the key is the bits of the depth, which for depths beyond the near plane (positive floats) sort like
+//! the depths; 2. rows of equal depth stay in row order; 3. the result does not depend on the number of threads: the
+//! number of chunks depends on the number of rows alone.
 //!
 //! Least-significant-digit radix sort with 11-bit digits. Every chunk owns the places that its histogram reserved, so
-//! the parallel scatter writes each place once; relaxed atomic stores are how safe Rust says that.
+//! the parallel scatter writes each place once; relaxed atomic stores express this in safe Rust.
 
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -15,7 +15,7 @@ const DIGITS: usize = 1 << DIGIT_BITS;
 const ROWS_PER_CHUNK: usize = 16_384;
 const CHUNKS_MAX: usize = 32;
 
-/// Memory of [`DepthSort::sort`], kept between views.
+/// Scratch memory of [`DepthSort::sort`], kept between views.
 #[derive(Debug, Default)]
 pub struct DepthSort {
     /// Depth bits in the high half, row in the low half.
@@ -31,8 +31,8 @@ pub(crate) fn chunk_len(n: usize, least: usize, chunks_max: usize) -> usize {
 }
 
 impl DepthSort {
-    /// Writes to `order` the rows with `radii` other than [0, 0], by depth, ties by row.
-    /// `depths` and `radii` have one entry per row; rows number less than 2^32.
+    /// Writes the rows with `radii` other than [0, 0] to `order`, by depth, ties by row. `depths` and `radii` have one
+    /// entry per row; there are fewer than 2^32 rows.
     pub fn sort(&mut self, depths: &[f32], radii: &[[u32; 2]], order: &mut Vec<u32>) {
         let visible = radii.iter().filter(|r| **r != [0, 0]).count();
         self.keys.resize_with(visible, AtomicU64::default);
@@ -84,7 +84,7 @@ impl DepthSort {
         std::mem::swap(&mut self.keys, &mut self.other);
     }
 
-    /// Bytes that are kept between views.
+    /// Bytes kept between views.
     pub fn bytes(&self) -> u64 {
         (8 * (self.keys.capacity() + self.other.capacity()) + 4 * self.places.capacity()) as u64
     }

@@ -1,10 +1,11 @@
 //! Gradients of footprints and colours from the gradient of the image, back to front through each tile's list.
 //!
-//! With h = alpha dL/dalpha (zero where alpha is clamped), a splat needs from a tile only nine sums over its pixels:
-//! h, h dx, h dy, h dx^2, h dx dy, h dy^2 and weight v_rgb. Everything else is linear in them and is done once per row.
+//! With h = alpha dL/dalpha (zero where alpha is clamped), a splat needs only nine sums over a tile's pixels: h, h dx,
+//! h dy, h dx^2, h dx dy, h dy^2 and weight v_rgb. The gradients are linear in these sums and are computed once per
+//! row.
 //!
-//! Invariants: 1. no gradient passes through alpha where opacity exp(-sigma) > max_alpha; the colour's does; 2. a
-//! splat that contributes to no pixel gets exact zeros; 3. the nine sums of a row are folded over its tiles from left
+//! Invariants: 1. where opacity exp(-sigma) > max_alpha, no gradient passes through alpha, only through the colour; 2.
+//! a splat that contributes to no pixel gets exact zeros; 3. the nine sums of a row are folded over its tiles from left
 //! to right in emit order (tiles column by column), starting from zero: this order is part of the result's definition,
 //! so that a view may be cut at tile columns without changing a bit; 4. threads cannot change a bit.
 
@@ -22,8 +23,8 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 /// Sums of one intersection: h, hx, hy, hxx, hxy, hyy, red, green, blue.
 pub const SUMS: usize = 9;
 
-/// The sums of one intersection as f32 bits. Every place is written by one tile; relaxed stores are how safe Rust
-/// says that the writes of different tiles do not meet.
+/// The sums of one intersection as f32 bits. Every place is written by one tile only; relaxed stores express this in
+/// safe Rust.
 pub type Partial = [AtomicU32; SUMS];
 
 /// Gradient of the loss with respect to the image.
@@ -35,7 +36,7 @@ pub struct Upstream<'a> {
     pub v_alpha: Option<&'a [f32]>,
 }
 
-/// Gradients of footprints and colours, one entry per row; zeros for rows that were not drawn.
+/// Gradients of footprints and colours, one entry per row; zeros for rows that are not drawn.
 #[derive(Debug, Clone, Default)]
 pub struct FootprintGradients {
     /// Pixel units, signed.
@@ -48,25 +49,25 @@ pub struct FootprintGradients {
     pub v_opacities: Vec<f32>,
 }
 
-/// State of one row of a tile on its way back. One block of memory, so that the compiler sees that its parts do not
-/// overlap.
+/// State of one row of a tile in the backward pass. One block of memory, so that the compiler sees that its parts do
+/// not overlap.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 struct Row {
-    /// T in front of the splats passed so far (first: T behind everything).
+    /// Transmittance in front of the splats processed so far (initially: behind everything).
     t: Lanes,
-    /// What is seen behind the splats passed so far, dotted with v_rgb, as though nothing stood in front: behind
-    /// everything that is the background, less v_alpha.
+    /// Colour seen behind the splats processed so far, dotted with v_rgb, as if nothing were in front; initially that
+    /// of the background, minus v_alpha.
     behind: Lanes,
     v_rgb: [Lanes; 3],
-    /// List index at which the lane stopped: it takes no part there and beyond.
+    /// List index at which the lane stopped: entries from there on do not affect it.
     stop: [u32; LANES],
 }
 
-/// Splats that are prepared together: half of a first-level cache with their sums.
+/// Splats prepared together: with their sums, half of a first-level cache.
 const BLOCK: usize = 32;
 
-/// State of one tile on its way back.
+/// State of one tile in the backward pass.
 struct Tile {
     rows: [Row; ROWS],
     /// Largest stop of each row.
@@ -77,7 +78,7 @@ struct Tile {
 }
 
 thread_local! {
-    /// Each thread keeps one: building it anew for every tile would cost as much as going through some hundred splats.
+    /// One per thread: making it anew for every tile would cost as much as some hundred splats.
     static SCRATCH: RefCell<Box<Tile>> = RefCell::new(Box::new(Tile {
         rows: [Row::EMPTY; ROWS],
         row_stop: [0; ROWS],
@@ -152,7 +153,7 @@ impl Kernel for BackTile<'_> {
             prefetch_splats(&all[number.saturating_sub(1) * BLOCK..number * BLOCK], lists.splats);
             let mut touched = 0;
             for (reach, &stop) in block.reach.iter_mut().zip(row_stop.iter()) {
-                // Splats at or behind the row's last stop take no part.
+                // Splats at or after the row's last stop have no effect.
                 let before = stop.saturating_sub(first);
                 *reach &= if before < BLOCK as u32 { (1u64 << before) - 1 } else { u64::MAX };
                 touched |= *reach;
@@ -180,7 +181,7 @@ impl Kernel for BackTile<'_> {
     }
 }
 
-/// Numbers of the bits that are set, upwards.
+/// Indices of the set bits, ascending.
 #[inline(always)]
 fn bits(mut set: u64) -> impl Iterator<Item = usize> {
     std::iter::from_fn(move || {
@@ -207,7 +208,7 @@ struct Sums {
 struct Halves([[f32; 8]; SUMS]);
 
 impl Sums {
-    /// First step of the sum over lanes (halves upon halves, the same order on every path). dx is constant in a lane,
+    /// First step of the sum over lanes (pairwise halving, in the same order on every path). dx is constant in a lane,
     /// so its moments are formed here.
     #[inline(always)]
     fn halves(&self, x: &Lanes, mean_x: f32) -> Halves {
@@ -227,8 +228,7 @@ impl Sums {
     }
 }
 
-/// One row of a tile, whose pixel centres are at `x`, back through a block that begins at list index
-/// `first`.
+/// Processes one row of a tile, whose pixel centres are at `x`, through a block that begins at list index `first`.
 #[inline(always)]
 fn back_row<const FMA: bool>(
     row: &mut Row,
@@ -246,7 +246,7 @@ fn back_row<const FMA: bool>(
         reach ^= 1 << i;
         let (local, acc) = (&block.locals[i], &mut sums[i]);
         let at = first + i as u32;
-        // Read once: a load under the loop's conditions would become a gather.
+        // Loaded once: a load under the loop's conditions would become a gather.
         let (dy, bdy, cdy, top, color) = (local.dy[y], local.bdy[y], local.cdy[y], local.top, local.color);
         for lane in 0..LANES {
             let dx = x[lane] - local.mean_x;
@@ -258,7 +258,7 @@ fn back_row<const FMA: bool>(
             let weight = alpha * before;
             let q = color[2] * v_blue[lane];
             let q = fma::<FMA>(color[0], v_red[lane], fma::<FMA>(color[1], v_green[lane], q));
-            // alpha dL/dalpha = weight (what the splat shows - what it hides)
+            // alpha dL/dalpha = weight (colour of the splat - colour it hides)
             let over = q - behind[lane];
             let h = if e <= cap { weight * over } else { 0.0 };
             t[lane] = before;
@@ -276,7 +276,7 @@ fn back_row<const FMA: bool>(
 }
 
 /// Writes the sums of every intersection to its emit index in `partials`, which is resized. `chunk_offsets` are the
-/// emit indices at which chunks of [`ROWS_PER_CHUNK`] rows begin.
+/// first emit indices of the chunks of [`ROWS_PER_CHUNK`] rows.
 pub fn rasterize_bwd(
     lists: &Lists<'_>,
     chunk_offsets: &[u64],
@@ -286,7 +286,7 @@ pub fn rasterize_bwd(
 ) {
     let cap = log2_max_alpha(lists.max_alpha, lists.simd);
     room::resize_with(partials, lists.isects.len(), Partial::default);
-    // Zeros for all, in order of memory: cheaper than writing them one by one where a splat takes no part.
+    // Zeroes everything in memory order: cheaper than writing single zeros for splats without effect.
     partials.par_chunks_mut(16_384).for_each(|partials| {
         partials.iter_mut().flatten().for_each(|sum| *sum.get_mut() = 0);
     });
@@ -299,8 +299,8 @@ pub fn rasterize_bwd(
     });
 }
 
-/// Folds the sums of each row over its intersections and turns them into gradients. `counts` says how many
-/// intersections a row has.
+/// Folds the sums of each row over its intersections and converts them to gradients. `counts` holds the number of
+/// intersections of each row.
 pub fn fold_rows(
     counts: &[u32],
     chunk_offsets: &[u64],
@@ -330,7 +330,7 @@ pub fn fold_rows(
             let [h, hx, hy, hxx, hxy, hyy, red, green, blue] = sums;
             v_colors[i] = [red, green, blue];
             if first == last {
-                // The footprint of a culled row is not to be read.
+                // The footprint of a culled row is not valid.
                 (v_means2d[i], v_conics[i], v_opacities[i]) = ([0.0; 2], [0.0; 3], 0.0);
                 continue;
             }
@@ -389,7 +389,7 @@ mod tests {
                     let isect = Isect::unpack(bits.load(Relaxed));
                     *bits.get_mut() = Isect { pixel_rows: [0, 15], ..isect }.pack();
                 }
-                // == and not bits: a sum of nothing is 0.0, a sum of zeros may be -0.0.
+                // Compared as values, not bits: a sum of nothing is 0.0, a sum of zeros may be -0.0.
                 assert!(fast == sums(&scene.lists(simd), &scene.chunk_offsets), "{simd:?} {n}");
                 assert!(fast.iter().any(|x| *x != 0.0) && fast.iter().all(|x| x.is_finite()));
             }

@@ -1,16 +1,16 @@
 //! Blends each tile's list of splats front to back.
 //!
-//! Contract: a pixel (centre +0.5) goes through its tile's list in depth order. A splat contributes
-//! `alpha = min(max_alpha, opacity exp(-sigma))`; below 1/255 it is skipped; where T (1 - alpha) <= 1e-4 the pixel
-//! stops without it; otherwise `rgb += T alpha color` and `T *= 1 - alpha`. At the end `rgb += T background`.
+//! Contract: a pixel (centre +0.5) processes its tile's list in depth order. A splat contributes `alpha =
+//! min(max_alpha, opacity exp(-sigma))`; below 1/255 it is skipped; if T (1 - alpha) <= 1e-4 the pixel stops without
+//! it; otherwise `rgb += T alpha color` and `T *= 1 - alpha`. At the end `rgb += T background`.
 //!
-//! Invariants: 1. sigma below 0 can only be rounding (conics are positive definite) and counts as 0; 2. skipped rows of
-//! a tile have no contribution, so the image has the same bits as the plain loop over all splats of the tile; 3. AVX2
+//! Invariants: 1. a sigma below 0 is a rounding error (conics are positive definite) and counts as 0; 2. skipped rows
+//! of a tile have no contribution, so the image has the same bits as a plain loop over all splats of the tile; 3. AVX2
 //! and AVX-512 give the same bits; 4. tiles are independent, so threads cannot change a bit.
 //!
-//! The unit of work is a pixel row of a tile, 16 lanes, through a block of splats (see `tile_block`). Dead
-//! lanes (stopped, or outside the image) keep T = 0, so they add nothing, and a `floor` of -1, so they never stop
-//! again: that spares the inner loop every other test.
+//! The unit of work is a pixel row of a tile, 16 lanes, through a block of splats (see `tile_block`). Dead lanes
+//! (stopped, or outside the image) keep T = 0, so they add nothing, and a `floor` of -1, so they never stop again: the
+//! inner loop needs no other test.
 
 use super::constants::{TILE, TRANSMITTANCE_MIN};
 use super::splats::{Grid, LOG2_ALPHA_MIN, Splat};
@@ -20,14 +20,14 @@ use rayon::prelude::*;
 use std::cell::RefCell;
 use std::sync::atomic::AtomicU64;
 
-/// One value for each pixel of a row of a tile.
+/// One value per pixel of a row of a tile.
 pub type Lanes = [f32; LANES];
 /// Pixels of a tile.
 pub const TILE_PIXELS: usize = (TILE * TILE) as usize;
-/// Stop position of a pixel that went through its whole list.
+/// Stop position of a pixel that processed its whole list.
 pub const NEVER: u32 = u32::MAX;
 
-/// What both directions of the rasterizer read.
+/// Input of both directions of the rasterizer.
 #[derive(Debug, Clone, Copy)]
 pub struct Lists<'a> {
     /// The tiles.
@@ -36,11 +36,11 @@ pub struct Lists<'a> {
     pub splats: &'a [Splat],
     /// Packed [`super::isect_emit::Isect`]s, tile by tile.
     pub isects: &'a [AtomicU64],
-    /// Where each tile's list begins; tiles + 1 entries.
+    /// Start of each tile's list; tiles + 1 entries.
     pub tile_offsets: &'a [u64],
     /// Upper clamp of alpha.
     pub max_alpha: f32,
-    /// Added behind everything.
+    /// Background colour.
     pub background: [f32; 3],
     /// Instruction path.
     pub simd: SimdPath,
@@ -54,21 +54,21 @@ impl Lists<'_> {
     }
 }
 
-/// What the forward pass leaves, tile by tile (`[tiles][...][16][16]`).
+/// Output of the forward pass, tile by tile (`[tiles][...][16][16]`).
 #[derive(Debug, Clone, Default)]
 pub struct Raster {
     /// `[tiles][3][16][16]` colours.
     pub rgb: Vec<f32>,
-    /// `[tiles][16][16]` transmittance behind the last contribution.
+    /// `[tiles][16][16]` transmittance after the last contribution.
     pub t_final: Vec<f32>,
     /// `[tiles][16][16]` index in the tile's list of the splat at which the pixel stopped, or [`NEVER`].
     pub stop: Vec<u32>,
-    /// `[tiles]` pixel-splat pairs that were evaluated.
+    /// `[tiles]` number of pixel-splat pairs evaluated.
     pub evaluated: Vec<u64>,
 }
 
 impl Raster {
-    /// Sets the size, keeping allocations; the content is then unspecified.
+    /// Sets the size, keeping allocations; the content is unspecified.
     pub fn resize(&mut self, tiles: usize) {
         self.rgb.resize(tiles * 3 * TILE_PIXELS, 0.0);
         self.t_final.resize(tiles * TILE_PIXELS, 0.0);
@@ -76,17 +76,18 @@ impl Raster {
         self.evaluated.resize(tiles, 0);
     }
 
-    /// Bytes that are kept between views.
+    /// Bytes kept between views.
     pub fn bytes(&self) -> u64 {
         let words = self.rgb.capacity() + self.t_final.capacity() + self.stop.capacity();
         (4 * words + 8 * self.evaluated.capacity()) as u64
     }
 }
 
-/// 2^x for x in [-30, 30], within 2.7e-7 relative; outside, any value (no trap).
+/// 2^x for x in [-30, 30], within 2.7e-7 relative; unspecified outside, but never a trap.
 ///
-/// Rounds to the nearest integer by adding 1.5 x 2^23, then a minimax polynomial of degree 5 on [-1/2, 1/2] (Remez;
-/// 0.75e-7, 0.72e-7 more because the constant is moved to 1, and two roundings). Contracted where the path has fused multiply-add.
+/// Rounds to the nearest integer by adding 1.5 x 2^23, then evaluates a minimax polynomial of degree 5 on [-1/2, 1/2]
+/// (Remez; 0.75e-7, another 0.72e-7 because the constant is moved to 1, and two roundings). Contracted on paths with
+/// fused multiply-add.
 #[inline(always)]
 pub fn exp2_bounded<const FMA: bool>(x: f32) -> f32 {
     const ROUND: f32 = 12_582_912.0;
@@ -118,7 +119,7 @@ pub fn log2_max_alpha(max_alpha: f32, simd: SimdPath) -> f32 {
     dispatch(simd, Find(max_alpha))
 }
 
-/// Splats that are prepared together: their locals fill a quarter of a first-level cache.
+/// Splats prepared together: their locals fill a quarter of a first-level cache.
 const BLOCK: usize = 64;
 
 /// State of one row of a tile.
@@ -126,12 +127,12 @@ const BLOCK: usize = 64;
 #[repr(C, align(64))]
 struct Row {
     t: Lanes,
-    /// T at or below which the lane stops; -1 for dead lanes.
+    /// A lane stops when its T would fall to this or below; -1 for dead lanes.
     floor: Lanes,
     rgb: [Lanes; 3],
     t_final: Lanes,
     stop: [u32; LANES],
-    /// Some lane lives.
+    /// Whether any lane is alive.
     alive: bool,
 }
 
@@ -145,7 +146,7 @@ impl Row {
         alive: false,
     };
 
-    /// The lane at list index `at`: those whose next transmittance is at or below their floor stop there.
+    /// Stops the lanes whose next transmittance is at or below their floor, at list index `at`.
     #[cold]
     #[inline(never)]
     fn stop_lanes(&mut self, at: u32, t: &Lanes, next: &mut Lanes, weight: &mut Lanes) {
@@ -169,7 +170,7 @@ struct Tile {
 }
 
 thread_local! {
-    /// Each thread keeps one: building it anew for every tile would cost as much as blending a few hundred splats.
+    /// One per thread: making it anew for every tile would cost as much as blending a few hundred splats.
     static SCRATCH: RefCell<Box<Tile>> = RefCell::new(Box::new(Tile { rows: [Row::DEAD; ROWS], block: Block::new() }));
 }
 
@@ -211,7 +212,7 @@ struct BlendTile<'a> {
 }
 
 impl Kernel for BlendTile<'_> {
-    /// Rows evaluated.
+    /// Number of splats evaluated.
     type Out = u64;
 
     #[inline(always)]
@@ -251,7 +252,7 @@ fn blend_row<const FMA: bool>(row: &mut Row, y: usize, first: u32, block: &Block
         let i = reach.trailing_zeros() as usize % BLOCK;
         reach &= reach - 1;
         let local = &block.locals[i];
-        // Read once: a load under the loop's conditions would become a gather.
+        // Loaded once: a load under the loop's conditions would become a gather.
         let (bdy, cdy, top) = (local.bdy[y], local.cdy[y], local.top);
         let (mut weight, mut next) = ([0.0; LANES], [0.0; LANES]);
         let mut stops = false;
@@ -302,7 +303,7 @@ pub fn rasterize_fwd(lists: &Lists<'_>, out: &mut Raster) {
         });
 }
 
-/// Copies up to a tile's row of values; whole rows without a library call each.
+/// Copies up to a tile's row of values; whole rows without a library call.
 #[inline(always)]
 pub(super) fn copy_lanes(out: &mut [f32], from: &[f32]) {
     let n = out.len();
@@ -350,7 +351,7 @@ pub(in crate::kernels) mod tests {
     use crate::kernels::scan::scan;
     use crate::kernels::splats::{Packed, pack};
 
-    /// Footprints of all kinds, depths in the order of rows, and their intersections.
+    /// Footprints of all kinds, depths in row order, with their intersections.
     pub(in crate::kernels) struct Scene {
         pub grid: Grid,
         pub radii: Vec<[u32; 2]>,
@@ -374,7 +375,7 @@ pub(in crate::kernels) mod tests {
             p.means2d.push([draws.range(-20.0, 90.0) as f32, draws.range(-20.0, 60.0) as f32]);
             p.conics.push(conic.map(|x| x as f32));
             p.radii.push([conic[2], conic[0]].map(|x| (3.33 * (x / (u * v)).sqrt()).ceil() as u32));
-            // A third of them can reach the clamp.
+            // A third of the opacities can reach the clamp.
             p.opacities.push((draws.range(0.0, 1.5) as f32).min(1.0));
             p.depths.push(1.0);
             colors.push([0; 3].map(|_| draws.range(0.0, 1.5) as f32));
@@ -405,7 +406,7 @@ pub(in crate::kernels) mod tests {
         }
     }
 
-    /// One pixel by the contract, over every splat whose box holds it.
+    /// One pixel by the contract, over every splat whose box contains it.
     struct PlainPixel<'a> {
         lists: &'a Lists<'a>,
         radii: &'a [[u32; 2]],

@@ -1,9 +1,9 @@
 //! Stage "sh", backward: gradients of colours to gradients of sh0, sh_n and, through the viewing direction, means.
 //!
-//! Not here: the other path to the means, which `project_bwd` adds afterwards.
+//! Not here: the gradient of the means through the projection, which `project_bwd` adds afterwards.
 //!
-//! Invariants: 1. every entry of `means`, `sh0` and `sh_n` is written, bands out of use and culled rows with exactly 0;
-//! 2. a channel whose colour was cut at 0 passes no gradient; 3. the same bits on every instruction path.
+//! Invariants: 1. every entry of `means`, `sh0` and `sh_n` is written, with exactly 0 for unused bands and culled rows;
+//! 2. a channel whose colour was clamped at 0 passes no gradient; 3. the same bits on every instruction path.
 
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use crate::kernels::lanes::{ROWS_PER_CHUNK, block_of, block_of_mut, chunk_of, lane};
@@ -40,7 +40,8 @@ pub fn sh_basis_vjp(degree: u8, dir: [f32; 3], v_basis: &[f32; BASIS]) -> [f32; 
     g
 }
 
-/// From a gradient at the unit direction to one at the direction it was made from: the part across it, by 1/length.
+/// Converts a gradient at the unit direction to one at the unnormalised direction: its tangential part, divided by the
+/// length.
 #[inline(always)]
 pub fn unit_direction_vjp(unit: [f32; 3], inv_len: f32, v_unit: [f32; 3]) -> [f32; 3] {
     let along = dot(unit, v_unit);
@@ -66,7 +67,7 @@ pub fn sh_bwd(
     grads.sh_degree = rows.sh_degree;
     grads.resize(rows.rows());
     let centre = camera.centre();
-    // A chunk of no floats is refused by rayon; without higher bands `sh_n` is empty and the chunk size is unused.
+    // rayon refuses chunks of zero floats; without higher bands `sh_n` is empty and the chunk size is unused.
     let sh_n_chunk = (sh_n_width(rows.sh_degree) * ROWS_PER_CHUNK).max(1);
     let Columns { means, sh0, sh_n, .. } = grads;
     let chunk_task = |chunk: usize, means, sh0, sh_n| {
@@ -148,7 +149,7 @@ impl<const DEGREE: u8> Kernel for ShBwdChunk<'_, DEGREE> {
             for l in 0..LANES {
                 let unit = lane(&dirs, l);
                 let v_unit = sh_basis_vjp(DEGREE, unit, &lane(&v_basis, l));
-                // Rows of zeros may have any direction; what comes out for them must still be zero, not NaN.
+                // Rows of zeros may have any direction; their result must still be zero, not NaN.
                 let v = unit_direction_vjp(unit, inv_lens[l], v_unit);
                 for c in 0..3 {
                     v_means[c][l] = v[c];
@@ -200,8 +201,8 @@ mod tests {
                     };
                     let ((x1, y1), (x0, y0)) = (at(5e-3), at(-5e-3));
                     let want = (y1 - y0) / (x1 - x0);
-                    // Rounding gives 1e-7 / 1e-2 = 1e-5; the third derivative (at most some 60 / length^3 in band 3)
-                    // times h^2 / 6 = 4e-6 the rest.
+                    // Rounding contributes 1e-7 / 1e-2 = 1e-5; the third derivative (at most some 60 / length^3 in band
+                    // 3) times h^2 / 6 = 4e-6 the rest.
                     let limit = 3e-5 + 3e-4 * f64::from(inv_len).powi(3);
                     assert!((f64::from(got[c]) - want).abs() < limit, "basis {k}, axis {c}: {} {want}", got[c]);
                 }

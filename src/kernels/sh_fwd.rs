@@ -2,8 +2,8 @@
 //!
 //! Not here: gradients (`sh_bwd`).
 //!
-//! Invariants: 1. the basis has the signs and the order of the 3DGS code, so that files can be exchanged; 2. nothing
-//! is fused: the same bits on every instruction path; 3. culled rows are neither read nor computed, their colour is 0.
+//! Invariants: 1. the basis has the signs and the order of the 3DGS code, so that files can be exchanged; 2. nothing is
+//! fused: the same bits on every instruction path; 3. culled rows are neither read nor computed; their colour is 0.
 
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use crate::kernels::lanes::{Lanes, ROWS_PER_CHUNK, block_of, block_of_mut, chunk_of, gather, lane, set_lane};
@@ -24,7 +24,7 @@ pub(crate) const C2: [f32; 3] = [1.092_548_4, 0.315_391_57, 0.546_274_2];
 /// Band 3: 1/4 sqrt(35/(2 pi)), 1/2 sqrt(105/pi), 1/4 sqrt(21/(2 pi)), 1/4 sqrt(7/pi), 1/4 sqrt(105/pi).
 pub(crate) const C3: [f32; 5] = [0.590_043_6, 2.890_611_4, 0.457_045_8, 0.373_176_34, 1.445_305_7];
 
-/// A direction of length 1 and 1 / the length it had; both zero where the length is 0 or its square leaves f32.
+/// The direction at length 1, and 1 / its original length; both zero if the length is 0 or its square overflows f32.
 #[inline(always)]
 pub fn unit_direction(dir: [f32; 3]) -> ([f32; 3], f32) {
     let len_sq = dot(dir, dir);
@@ -66,7 +66,7 @@ pub fn sh_basis(degree: u8, dir: [f32; 3]) -> [f32; BASIS] {
     b
 }
 
-/// Basis functions of a degree: (degree + 1)^2.
+/// Number of basis functions at a degree: (degree + 1)^2.
 #[inline(always)]
 pub fn basis_len(degree: u8) -> usize {
     (degree as usize + 1) * (degree as usize + 1)
@@ -82,7 +82,7 @@ pub fn sh_color(basis: &[f32], sh0: [f32; 3], sh_n: &[f32]) -> [f32; 3] {
             c[i] += b * coefficient[i];
         }
     }
-    // Written so that NaN gives 0.
+    // Written so that NaN becomes 0.
     c.map(|x| if x > 0.0 { x } else { 0.0 })
 }
 
@@ -113,7 +113,7 @@ pub fn sh_fwd(
     });
 }
 
-/// What the colours of one chunk of rows depend on.
+/// Input of the colours of one chunk of rows.
 #[derive(Clone, Copy)]
 pub(crate) struct ShChunk<'a> {
     pub centre: [f32; 3],

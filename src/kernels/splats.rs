@@ -1,11 +1,11 @@
-//! Footprints packed for the tile loops, one cache line for each row, and which pixels each can reach.
+//! Footprints packed for the tile loops, one cache line per row, and the pixels that each can reach.
 //!
-//! Invariants: 1. splats and spans have one entry per row; those of culled rows are not read; 2. the exponent of a
-//! splat is kept to base 2 with its opacity folded in: `e = a dx^2 + b dx dy + c dy^2 + log2_opacity`, so that
-//! `alpha = 2^e`; 3. [`Splat::reach`] bounds the rounding of the tile loops: where the exact form falls more than
-//! `reach` below `log2_opacity`, the loops compute an alpha below 1/255 whatever the order of their operations;
-//! 4. spans are conservative: they never leave out a pixel that has a contribution; 5. nothing here is contracted, so
-//! every instruction path gives the same bits.
+//! Invariants: 1. splats and spans have one entry per row; those of culled rows are not valid; 2. the exponent of a
+//! splat is to base 2 and includes its opacity: `e = a dx^2 + b dx dy + c dy^2 + log2_opacity`, so that `alpha = 2^e`;
+//! 3. [`Splat::reach`] includes the rounding errors of the tile loops: where the exact form is more than `reach` below
+//! `log2_opacity`, the loops compute an alpha below 1/255 for any order of operations; 4. spans are conservative: they
+//! include every pixel with a contribution; 5. nothing here is contracted, so every instruction path gives the same
+//! bits.
 
 use super::constants::TILE;
 use super::lanes::{block_of, gather};
@@ -52,7 +52,7 @@ impl Grid {
     }
 }
 
-/// One row as the tile loops read it.
+/// One row in the form that the tile loops read.
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(C, align(64))]
 pub struct Splat {
@@ -68,31 +68,31 @@ pub struct Splat {
     pub log2_opacity: f32,
     /// Colour.
     pub color: [f32; 3],
-    /// How far the exponent may fall before no contribution is possible; not positive when none is possible at all.
+    /// How far the exponent may fall before no contribution is possible; not positive if none is possible at all.
     pub reach: f32,
     /// Emit index of its first intersection, counted from its chunk's first (see [`Packed::chunk_counts`]).
     pub emit: u64,
 }
 
-/// What a row can reach: the intersection stages read only this of most rows.
+/// The tiles and pixel rows that a row can reach; for most rows the intersection stages read only this.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 #[repr(C, align(16))]
 pub struct Span {
     /// First tile column, first tile row, one past the last column, one past the last row.
     pub tiles: [u16; 4],
     /// First and last pixel row of the image (inclusive) that the row reaches in its first and in its second tile
-    /// column; last < first where there is none. Further columns are worked out by [`Ellipse::rows_in`].
+    /// column; last < first if there is none. [`Ellipse::rows_in`] computes further columns.
     pub rows: [[u16; 2]; 2],
 }
 
-/// Where splats can reach: an ellipse (quantities of one row, or of a block of rows by lane).
+/// The region that splats can reach: an ellipse (for one row, or for a block of rows by lane).
 ///
 /// With P = -a, Q = -b/2, R = -c it is P dx^2 + 2 Q dx dy + R dy^2 = reach; det = P R - Q^2 is formed in f64, where the
 /// products of two f32 are exact, because it cancels for needles.
 #[derive(Debug, Clone, Copy)]
 pub struct Ellipse {
     mean: [f32; 2],
-    /// Half extents, rounding included.
+    /// Half extents, including rounding errors.
     half: [f32; 2],
     /// dx of the lowest dy is `tilt`, of the highest `-tilt`.
     tilt: f32,
@@ -100,9 +100,9 @@ pub struct Ellipse {
     chord: [f32; 2],
     /// dy of the chord's middle is `slope * dx`.
     slope: f32,
-    /// Added to dy at both ends.
+    /// Margin added to dy at both ends.
     pad: f32,
-    /// Not a proper ellipse: everything counts as reached.
+    /// Whether this is not a proper ellipse: then everything counts as reached.
     all: bool,
 }
 
@@ -128,13 +128,13 @@ impl Splat {
             chord: [self.reach * inv_r, det * inv_r * inv_r],
             slope: -q * inv_r,
             pad: pad[1],
-            // Written so that NaN is not sound.
+            // Written so that NaN counts as not sound.
             all: !((det > 0.0) & (p > 0.0) & (r > 0.0) & (sound < 1e9)),
         }
     }
 }
 
-/// The smallest integer at or above `x`, cut to what tile arithmetic can hold. Without the library call that the
+/// The smallest integer at or above `x`, clamped to the range of tile arithmetic. Avoids the library call that the
 /// baseline path would make for each lane.
 #[inline(always)]
 fn ceil(x: f32) -> i32 {
@@ -142,14 +142,14 @@ fn ceil(x: f32) -> i32 {
     cut + i32::from((cut as f32) < x)
 }
 
-/// The largest integer at or below `x`, cut likewise.
+/// The largest integer at or below `x`, clamped likewise.
 #[inline(always)]
 fn floor(x: f32) -> i32 {
     let cut = within_i32(x) as i32;
     cut - i32::from((cut as f32) > x)
 }
 
-/// `x` cut to +-2^24; NaN becomes -2^24.
+/// `x` clamped to +-2^24; NaN becomes -2^24.
 #[inline(always)]
 fn within_i32(x: f32) -> f32 {
     const LIMIT: f32 = 16_777_216.0;
@@ -158,8 +158,8 @@ fn within_i32(x: f32) -> f32 {
 }
 
 impl Ellipse {
-    /// First and last pixel row (inclusive, not clipped) that the ellipse can reach in the pixel columns whose
-    /// centres lie in `x0..=x1`; last < first where there is none. Conservative: never too small.
+    /// First and last pixel row (inclusive, not clipped) that the ellipse can reach in the pixel columns whose centres
+    /// are in `x0..=x1`; last < first if there is none. Conservative: never too small.
     #[inline(always)]
     pub fn rows_in(&self, x0: f32, x1: f32) -> [i32; 2] {
         let left = x0 - self.mean[0];
@@ -182,7 +182,7 @@ impl Ellipse {
         [if self.all { i32::MIN } else { first }, if self.all { i32::MAX } else { last }]
     }
 
-    /// First and last pixel column (inclusive, not clipped) that it can reach.
+    /// First and last pixel column (inclusive, not clipped) that the ellipse can reach.
     #[inline(always)]
     fn columns(&self) -> [i32; 2] {
         let first = ceil(self.mean[0] - self.half[0] - 0.5);
@@ -191,14 +191,14 @@ impl Ellipse {
     }
 }
 
-/// Pixel rows of a tile column, clipped to the box and the image; last < first where there is none.
+/// Pixel rows of a tile column, clipped to the box and the image; last < first if there is none.
 #[inline(always)]
 pub(super) fn rows_in_column(ellipse: &Ellipse, grid: Grid, tiles: [u16; 4], column: u16) -> [u16; 2] {
     let x0 = (u32::from(column) * TILE) as f32 + 0.5;
     let [first, last] = ellipse.rows_in(x0, x0 + (TILE - 1) as f32);
     let first = first.max(i32::from(tiles[1]) * TILE as i32);
     let last = last.min(i32::from(tiles[3]) * TILE as i32 - 1).min(grid.height as i32 - 1);
-    // An empty range is kept as 1..=0, since -1 has no place here.
+    // An empty range is stored as 1..=0, because -1 cannot be represented.
     if last < first { [1, 0] } else { [first as u16, last as u16] }
 }
 
@@ -208,20 +208,20 @@ pub(super) fn tile_rows([first, last]: [u16; 2]) -> std::ops::Range<u32> {
     if last < first { 0..0 } else { u32::from(first) / TILE..u32::from(last) / TILE + 1 }
 }
 
-/// What [`pack`] makes of a view's rows.
+/// Output of [`pack`] for a view's rows.
 #[derive(Debug, Clone, Default)]
 pub struct Packed {
     /// Splats by row.
     pub splats: Vec<Splat>,
-    /// Their reach by row.
+    /// Spans by row.
     pub spans: Vec<Span>,
-    /// Tiles that each row reaches; 0 for culled rows.
+    /// Number of tiles that each row reaches; 0 for culled rows.
     pub counts: Vec<u32>,
     /// Sums of `counts` over chunks of [`ROWS_PER_CHUNK`] rows: their prefix sums are the chunks' emit offsets.
     pub chunk_counts: Vec<u64>,
 }
 
-/// Rows whose emit indices are counted together.
+/// Rows per chunk of emit indices.
 pub const ROWS_PER_CHUNK: usize = 2048;
 
 /// Packs all rows. `colors` has one entry per row.
@@ -287,8 +287,8 @@ impl Kernel for PackChunk<'_> {
     }
 }
 
-/// log2 of positive normal numbers, within 1.2e-7 (absolute, or relative where larger): the mantissa is brought to
-/// [1/sqrt 2, sqrt 2), then 2 log2(e) atanh((m - 1) / (m + 1)) by its series to the ninth power.
+/// log2 of positive normal numbers, within 1.2e-7 (absolute, or relative for larger results): scales the mantissa to
+/// [1/sqrt 2, sqrt 2), then sums the series of 2 log2(e) atanh((m - 1) / (m + 1)) to the ninth power.
 #[inline(always)]
 fn log2_lanes(x: &Lanes) -> Lanes {
     const SQRT_HALF_BITS: u32 = 0x3f35_04f3;
@@ -327,9 +327,9 @@ impl PackedLanes {
             let [xx, xy, yy] = [conics[0][lane], conics[1][lane], conics[2][lane]];
             let radii = [radii[0][lane], radii[1][lane]];
             let (a, b, c) = (-0.5 * LOG2E * xx, -LOG2E * xy, -0.5 * LOG2E * yy);
-            // A tile of the box is at most its side beyond the radius. The exponent takes some six roundings of terms
-            // no larger than |a| dx^2 + |c| dy^2 in sum twice (|b dx dy| is below that sum): 12 x 6e-8 of it, doubled
-            // for safety.
+            // A tile of the box extends at most one tile side beyond the radius. The exponent takes some six roundings
+            // of terms whose sum is at most twice |a| dx^2 + |c| dy^2 (|b dx dy| is below that sum): 12 x 6e-8 of it,
+            // doubled for safety.
             let (dx, dy) = (radii[0] + TILE as f32 + 1.0, radii[1] + TILE as f32 + 1.0);
             let rounding = 2e-6 * (a.abs() * dx * dx + c.abs() * dy * dy) + 1e-4;
             let reach = logs[lane] - LOG2_ALPHA_MIN + rounding;
@@ -350,7 +350,7 @@ impl PackedLanes {
                 let [first, last] = ellipse.rows_in(left, left + (TILE - 1) as f32);
                 let first = first.max(y0 << SHIFT);
                 let last = last.min((y1 << SHIFT) - 1).min(height - 1);
-                // An empty range is kept as 1..=0, since -1 has no place in a span.
+                // An empty range is stored as 1..=0, because -1 cannot be represented in a span.
                 out.rows[2 * column][lane] = if last < first { 1 } else { first };
                 out.rows[2 * column + 1][lane] = if last < first { 0 } else { last };
             }
@@ -399,7 +399,7 @@ mod tests {
         for i in 1..100_000 {
             let x = i as f32 / 1e5;
             let error = f64::from(log2_lanes(&[x; LANES])[3]) - libm::log2(f64::from(x));
-            // Two roundings of 6e-8 of the result, or of 1 where it is below.
+            // Two roundings of 6e-8, relative to the result, or absolute for results below 1.
             let unit = f64::from(libm::log2f(x).abs().max(1.0));
             assert!(error.abs() < 1.2e-7 * unit, "log2 {x}: {error}");
         }

@@ -1,9 +1,10 @@
 //! The arithmetic of the image loss on one band of rows of one channel: windowed sums, SSIM map, its derivative, L1.
-//! What to average, what to weigh and which bands there are is decided by `image_loss`.
+//! `image_loss` decides averages, weights and bands.
 //!
-//! A band is walked in tiles of at most [`TILE`] columns, each row by row from top to bottom: an input row enters a ring
-//! of eleven, the map row five above it becomes computable, and the gradient row ten above it. Only these rings are
-//! kept (about 100 KB on the stack), so memory does not grow with the picture and stays in the second-level cache.
+//! A band is processed in tiles of at most [`TILE`] columns, each row by row from top to bottom: an input row enters a
+//! ring of eleven; then the map row five above it can be computed, and the gradient row ten above it. Only these rings
+//! are stored (about 100 KB on the stack), so memory does not grow with the picture and stays in the second-level
+//! cache.
 //!
 //! SSIM (Wang, Bovik, Sheikh and Simoncelli 2004) with means m, over an 11x11 Gaussian window of sigma 1.5:
 //! S = (2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sxx + syy + C2)). Only the sum sxx + syy occurs, so four windowed
@@ -11,7 +12,7 @@
 //! dS/dx = W * dS/dmx + 2 x (W * dS/dE[xx]) + y (W * dS/dE[xy]).
 //!
 //! Invariants: 1. each value of a pixel comes from the same operations in the same order wherever the band or tile
-//! borders lie; 2. each pixel is counted once in the sums, by the band and tile that own it; 3. where the mask is 0 the
+//! borders are; 2. each pixel is counted once in the sums, by the band and tile that own it; 3. where the mask is 0 the
 //! picture is replaced by the reference, the map has weight 0 and the gradient is exactly 0.
 
 use super::image_loss::{ImagePair, Reference, SsimVariant};
@@ -19,7 +20,7 @@ use crate::base::simd::{Kernel, LANES, fma};
 use std::array::from_fn;
 use std::ops::Range;
 
-/// Pixels on a side of the SSIM window.
+/// Side of the SSIM window, pixels.
 pub(super) const WINDOW: usize = 11;
 /// Pixels on each side of the window's centre.
 pub(super) const RADIUS: usize = 5;
@@ -27,7 +28,7 @@ pub(super) const RADIUS: usize = 5;
 const TILE: usize = 16 * LANES - 2 * RADIUS;
 /// Columns (and rows) of input that a gradient needs on each side.
 const HALO: usize = 2 * RADIUS;
-/// Floats in one row of scratch: 16 vectors of map and one more to read the window's right half from.
+/// Floats in one row of scratch: 16 vectors of map and another one for loads of the window's right half.
 const STRIDE: usize = 17 * LANES;
 
 /// (0.01 L)^2 and (0.03 L)^2 for the value range L = 1.
@@ -52,7 +53,7 @@ const TAPS: [f32; WINDOW] = [
 type Lane = [f32; LANES];
 type Row = [f32; STRIDE];
 
-/// Sums over the pixels of one band that count.
+/// Sums over the used pixels of one band.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct BandSums {
     /// Sum of absolute differences; 0 without a gradient.
@@ -63,7 +64,7 @@ pub(super) struct BandSums {
     pub ssim: f64,
 }
 
-/// Where the gradient of a band goes, and what the derivatives of the sums are multiplied with.
+/// Gradient output of a band, and the factors of the sums' derivatives.
 pub(super) struct GradientBand<'a> {
     /// The band's rows of the channel's plane.
     pub v_plane: &'a mut [f32],
@@ -73,17 +74,17 @@ pub(super) struct GradientBand<'a> {
     pub ssim_weight: f32,
 }
 
-/// One band of one channel. Run through `base::simd::dispatch`.
+/// One band of one channel; run it with `base::simd::dispatch`.
 pub(super) struct BandKernel<'a> {
     /// The two pictures.
     pub pair: &'a ImagePair<'a>,
-    /// Pixels of the map that count, and what lies outside the picture.
+    /// Determines the pixels that the map covers, and the values outside the picture.
     pub variant: SsimVariant,
     /// 0, 1, 2: red, green, blue.
     pub channel: usize,
     /// Image rows that the band owns.
     pub rows: Range<usize>,
-    /// `None`: only the SSIM sum is wanted.
+    /// `None`: only the SSIM sum is computed.
     pub gradient: Option<GradientBand<'a>>,
 }
 
@@ -104,7 +105,7 @@ struct Scratch {
 struct Tile {
     /// Image columns that the tile owns.
     own: Range<usize>,
-    /// Image columns that exist within the halo.
+    /// Image columns of the halo that exist.
     loaded: Range<usize>,
     /// Position of `loaded.start` in a scratch row; scratch column 0 is image column `own.start - HALO`.
     at: usize,
@@ -156,13 +157,13 @@ impl BandKernel<'_> {
                 self.map_row::<FMA>(tile, row - RADIUS as isize, i, scratch, sums);
             }
             if i >= 4 * RADIUS && self.gradient.is_some() {
-                // Both margins are in: the row is one of the band's own.
+                // Both margins are loaded: the row is one of the band's own.
                 self.gradient_row::<FMA>(tile, i - 4 * RADIUS, i, scratch, sums);
             }
         }
     }
 
-    /// Which columns of the map have weight, and which of them this tile sums.
+    /// Marks the columns of the map that have weight, and those that this tile sums.
     fn mark_columns(&self, tile: &Tile, scratch: &mut Scratch) {
         let inside = domain(self.variant, self.pair.width);
         for j in 0..STRIDE {
@@ -173,7 +174,7 @@ impl BandKernel<'_> {
         }
     }
 
-    /// Fills one ring entry with image row `row`, which may lie outside the picture.
+    /// Fills one ring entry with image row `row`, which may be outside the picture.
     #[inline(always)]
     fn load_row<const FMA: bool>(&self, tile: &Tile, row: isize, entry: &mut InputRow) {
         let height = self.pair.height;
@@ -206,7 +207,7 @@ impl BandKernel<'_> {
         }
     }
 
-    /// Values and weights of the columns that exist.
+    /// Loads values and weights of the existing columns.
     #[inline(always)]
     fn copy_row(&self, row: usize, tile: &Tile, x: &mut [f32], y: &mut [f32], weight: &mut [f32]) {
         let (width, pixels) = (self.pair.width, self.pair.width * self.pair.height);
@@ -224,7 +225,7 @@ impl BandKernel<'_> {
             Reference::Planar(values) => y.copy_from_slice(&values[plane + span.start..plane + span.end]),
         }
         if self.pair.clamp {
-            // clamp() keeps NaN, so a broken picture still shows in the result.
+            // clamp() keeps NaN, so that a broken picture shows in the result.
             x.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
             y.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
         }
@@ -250,7 +251,7 @@ impl BandKernel<'_> {
         }
     }
 
-    /// SSIM and its three derivatives along map row `row`, once its last input row, ring index `i`, is in.
+    /// Computes SSIM and its three derivatives along map row `row`, whose last input row is at ring index `i`.
     #[inline(always)]
     fn map_row<const FMA: bool>(&self, tile: &Tile, row: isize, i: usize, scratch: &mut Scratch, sums: &mut LaneSums) {
         let Scratch { input, derivatives, columns, domain: in_domain, owned } = scratch;
@@ -298,7 +299,7 @@ impl BandKernel<'_> {
         }
     }
 
-    /// Gradient of the band's row `own_row`, ten above ring index `i`, and the plain differences along it.
+    /// Computes the gradient of the band's row `own_row`, ten above ring index `i`, and the differences along it.
     #[inline(always)]
     fn gradient_row<const FMA: bool>(
         &mut self,
@@ -338,7 +339,7 @@ impl BandKernel<'_> {
                 v_pixel[l] = weight[l] * fma::<FMA>(out.ssim_weight, v_ssim, above - below);
             }
             v.copy_from_slice(&v_pixel[..v.len()]);
-            // Columns beyond the tile belong to the next one.
+            // Columns beyond the tile belong to the next tile.
             difference[v.len()..].fill(0.0);
             for l in 0..LANES {
                 let difference = f64::from(difference[l]);
@@ -357,7 +358,7 @@ fn ssim_point<const FMA: bool>(mx: f32, my: f32, squares: f32, products: f32) ->
     let a1 = fma::<FMA>(2.0, mean_product, C1);
     let a2 = fma::<FMA>(2.0, products - mean_product, C2);
     let b1 = mean_squares + C1;
-    // Rounding can take the sum of two variances below zero by 1e-7 of the squares: a bright flat patch.
+    // Rounding can make the sum of two variances negative by 1e-7 of the squares, for a bright flat patch.
     let b2 = (squares - mean_squares).max(0.0) + C2;
     let inverse = 1.0 / (b1 * b2);
     let ssim = a1 * a2 * inverse;
@@ -374,7 +375,7 @@ fn add_scaled<const FMA: bool>(tap: f32, v: Lane, mut sum: Lane) -> Lane {
     sum
 }
 
-/// The window along a row: sixteen results, the first from columns `at..at + 11`.
+/// Applies the window along a row: sixteen results, the first from columns `at..at + 11`.
 #[inline(always)]
 fn across<const FMA: bool>(row: &Row, at: usize) -> Lane {
     let mut sum = [0.0; LANES];
@@ -404,7 +405,7 @@ fn multiply(mut a: Lane, b: Lane) -> Lane {
     a
 }
 
-/// Positions along one side at which the map counts.
+/// Positions along one side that the map covers.
 pub(super) fn domain(variant: SsimVariant, side: usize) -> Range<usize> {
     match variant {
         SsimVariant::Valid => RADIUS..side.saturating_sub(RADIUS),
@@ -412,7 +413,7 @@ pub(super) fn domain(variant: SsimVariant, side: usize) -> Range<usize> {
     }
 }
 
-/// Index of the mirror image of `i` in `0..side`, the border element not repeated.
+/// Index of the mirror image of `i` in `0..side`; the border element is not repeated.
 fn reflect(i: isize, side: usize) -> usize {
     let period = 2 * (side as isize - 1).max(1);
     let i = i.rem_euclid(period);

@@ -1,19 +1,19 @@
-//! The stages of one training step, in the order in which they run. Every backend follows this table: a stage's name
-//! is the stem of its file here, of its twin on other devices, and its key in profiles.
+//! The stages of one training step, in execution order. Every backend follows this table: a stage's name is its file
+//! stem here, that of its twin on other devices, and its key in profiles.
 
 /// One stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Stage {
     /// File stem and profile key.
     pub name: &'static str,
-    /// What it does, one line.
+    /// One-line description.
     pub doc: &'static str,
 }
 
 /// The stages in order.
 ///
-/// The sort by tile that stands between `isect_emit` and `isect_offsets` on a device is a counting sort on the CPU:
-/// there `isect_offsets` counts tiles and turns the counts into places, and `isect_emit` writes straight to them.
+/// On a device a sort by tile stands between `isect_emit` and `isect_offsets`. On the CPU it is a counting sort:
+/// `isect_offsets` counts tiles and converts the counts to places, and `isect_emit` writes directly to them.
 pub const STAGES: [Stage; 11] = [
     Stage { name: "project_fwd", doc: "rows to footprints on the screen; culls" },
     Stage { name: "sh_fwd", doc: "colours of the visible rows from their view directions" },

@@ -1,8 +1,8 @@
-//! A block of consecutive splats of one tile's list, made ready for loops over the tile's pixel rows.
+//! A block of consecutive splats of one tile's list, prepared for loops over the tile's pixel rows.
 //!
 //! Both directions of the rasterizer go block by block, and within a block row by row, so that a row's state stays in
 //! registers and the inner loop is long: a loop over the few rows of each splat would cost a mispredicted branch and a
-//! drained pipeline per splat, as much time as the blending itself. For each row a bit set says which splats reach it.
+//! drained pipeline per splat, as much time as the blending itself. For each row a bit set tells which splats reach it.
 
 use super::constants::TILE;
 use super::isect_emit::Isect;
@@ -13,27 +13,27 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 pub(super) const ROWS: usize = TILE as usize;
 
-/// A splat against one tile.
+/// A splat relative to one tile.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 pub(super) struct Local {
-    /// By row.
+    /// dy by row.
     pub dy: Lanes,
-    /// b dy, by row.
+    /// b dy by row.
     pub bdy: Lanes,
-    /// c dy^2 + log2_opacity, by row.
+    /// c dy^2 + log2_opacity by row.
     pub cdy: Lanes,
     /// x of the mean.
     pub mean_x: f32,
     /// Coefficient of dx^2.
     pub a: f32,
-    /// Upper bound of the exponent: the opacity's, or the clamp's where it is lower.
+    /// Upper bound of the exponent: the opacity's, or that of the clamp if lower.
     pub top: f32,
     /// Colour.
     pub color: [f32; 3],
-    /// The Gaussian.
+    /// The row of the Gaussian.
     pub row: u32,
-    /// Emit index of this intersection, counted from that of its chunk of rows.
+    /// Emit index of this intersection, relative to its chunk of rows.
     pub emit: u64,
 }
 
@@ -45,7 +45,7 @@ pub(super) struct Block<const N: usize> {
     pub reach: [u64; ROWS],
 }
 
-/// Asks for the splats of a list, which will be filled into a block soon.
+/// Prefetches the splats of a list that will soon be filled into a block.
 #[inline(always)]
 pub(super) fn prefetch_splats(list: &[AtomicU64], splats: &[Splat]) {
     for bits in list {

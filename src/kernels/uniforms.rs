@@ -1,8 +1,8 @@
-//! What the host hands to the device stages on rows and to the image loss: uniforms and packed targets.
+//! Uniforms and packed targets for the device's per-row stages and image loss.
 //!
 //! Not here: buffers, dispatches, the uniforms of the tile stages.
 //!
-//! Invariants: 1. each struct has the places of its twin in `shaders/`, where its fields are described; 2. numbers that
+//! Invariants: 1. each struct has the layout of its twin in `shaders/`, which documents its fields; 2. numbers that
 //! both backends need are computed once, by the same code.
 
 use crate::kernels::image_loss::LossPlan;
@@ -27,11 +27,11 @@ crate::wgsl_struct! {
         pub principal: [f32; 2],
         /// Image size, pixels.
         pub size: [f32; 2],
-        /// Depths that are drawn lie strictly between these.
+        /// Drawn depths are strictly between these.
         pub depth_range: [f32; 2],
-        /// Lower cut of X/Z and Y/Z inside the Jacobian.
+        /// Lower limit of X/Z and Y/Z inside the Jacobian.
         pub slope_low: [f32; 2],
-        /// Upper cut.
+        /// Upper limit.
         pub slope_high: [f32; 2],
         /// Rows of the window.
         pub row_count: u32,
@@ -45,7 +45,7 @@ crate::wgsl_struct! {
 }
 
 impl RowsUniforms {
-    /// For a window of `row_count` rows.
+    /// Uniforms for a window of `row_count` rows.
     pub fn new(camera: &Camera, eps2d: f32, row_count: u32) -> Self {
         let view = View::new(camera, eps2d);
         let with_last = |row: [f32; 3], last: f32| [row[0], row[1], row[2], last];
@@ -79,22 +79,22 @@ crate::wgsl_struct! {
         pub first_channel: u32,
         /// Channels of this dispatch.
         pub channel_count: u32,
-        /// Pixels at each border that are left out of the SSIM map.
+        /// Pixels at each border that the SSIM map does not cover.
         pub margin: u32,
         /// Derivative of the loss with respect to the sum of absolute differences.
         pub l1_weight: f32,
         /// Derivative of the loss with respect to the sum of the SSIM map.
         pub ssim_weight: f32,
-        /// Partial sums that `sum_partials` reads.
+        /// Number of partial sums that `sum_partials` reads.
         pub partial_count: u32,
     }
 }
 
 impl LossUniforms {
-    /// Partial sums that one workgroup of `sum_partials` adds up.
+    /// Partial sums per workgroup of `sum_partials`.
     pub const PARTIALS_PER_GROUP: u32 = 4096;
 
-    /// For all three channels in one dispatch; `partial_count` is that of the first run of `sum_partials`.
+    /// Uniforms for all three channels in one dispatch; `partial_count` is that of the first run of `sum_partials`.
     pub fn new(width: u32, height: u32, plan: &LossPlan) -> Self {
         LossUniforms {
             width,
@@ -108,14 +108,14 @@ impl LossUniforms {
         }
     }
 
-    /// Workgroups of `ssim_map` and `gradient` for each channel.
+    /// Workgroups of `ssim_map` and `gradient` per channel.
     pub fn tiles(width: u32, height: u32) -> u32 {
         let side = super::constants::TILE;
         width.div_ceil(side) * height.div_ceil(side)
     }
 }
 
-/// Packs a photo as `image_loss` reads it: one word per pixel, red in the lowest byte, then green, blue and the mask.
+/// Packs a photo for `image_loss`: one word per pixel, red in the lowest byte, then green, blue and the mask.
 pub fn pack_target(target: &Target, words: &mut Vec<u32>) {
     let (pixels, _) = target.rgb.as_chunks::<3>();
     words.clear();

@@ -1,22 +1,23 @@
-//! Dense Adam, one step at a time: the definition that the deferred form is held to.
+//! Dense Adam, one step at a time: the reference for the deferred form.
 //!
-//! Not used in training: every value takes every step, seen or not. Kingma and Ba 2015 (arXiv 1412.6980), with eps
-//! outside the bias-corrected root as in torch: `value -= lr / (1 - beta1^t) * m / (sqrt(v) / sqrt(1 - beta2^t) + eps)`.
+//! Training never uses it: every value takes every step, seen or not. Kingma and Ba 2015 (arXiv 1412.6980), with eps
+//! outside the bias-corrected root as in torch: `value -= lr / (1 - beta1^t) * m / (sqrt(v) / sqrt(1 - beta2^t) +
+//! eps)`.
 //!
 //! Invariant: t counts steps from 1.
 
 use std::ops::{Add, Div, Mul, Sub};
 
-/// The smallest eps that training may use.
+/// The smallest eps allowed in training.
 ///
-/// State in f32 has no second moment below the smallest normal float, whose root is 1.1e-19: what is smaller becomes
-/// zero. A value with such a moment moves by m / eps instead of m / (root + eps), so eps must be far larger than that
-/// root; at 1e-16 the movement errs by 1e-3, which the bounds of pages allow for ([`super::bounds`]), and below it by
-/// more. Further down (400 eps)^2, where the series ends ([`super::drift`]), is no normal float either, m / eps
-/// overflows, and rows have no finite bounds at all.
+/// State in f32 flushes second moments below the smallest normal float, whose root is 1.1e-19, to zero. A value with
+/// such a moment moves by m / eps instead of m / (root + eps), so eps must be far larger than that root. At 1e-16 the
+/// movement errs by 1e-3, which the bounds of pages allow for ([`super::bounds`]); at smaller eps it errs by more. For
+/// still smaller eps, (400 eps)^2, where the series ends ([`super::drift`]), is subnormal as well, m / eps overflows,
+/// and rows have no finite bounds.
 pub const EPS_MIN: f64 = 1e-16;
 
-/// A float that dense Adam can run in.
+/// A float type for dense Adam.
 pub trait Real: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> {
     /// Rounds to the type.
     fn from_f64(x: f64) -> Self;
@@ -42,14 +43,14 @@ impl Real for f64 {
     }
 }
 
-/// Decay of the moments and the floor of the root.
+/// Decay rates of the moments, and eps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamConfig {
     /// Decay of the first moment per step.
     pub beta1: f64,
     /// Decay of the second moment per step.
     pub beta2: f64,
-    /// Added to the bias-corrected root; training refuses less than [`EPS_MIN`].
+    /// Added to the bias-corrected root; training refuses values below [`EPS_MIN`].
     pub eps: f64,
 }
 
@@ -59,7 +60,7 @@ impl Default for AdamConfig {
     }
 }
 
-/// Values with their moments, all stepped together.
+/// Values with their moments; each step updates all of them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DenseAdam<F> {
     config: AdamConfig,
@@ -74,13 +75,13 @@ pub struct DenseAdam<F> {
 }
 
 impl<F: Real> DenseAdam<F> {
-    /// Fresh moments for these values.
+    /// These values with zero moments.
     pub fn new(config: AdamConfig, values: Vec<F>) -> Self {
         let zeros = vec![F::from_f64(0.0); values.len()];
         DenseAdam { config, steps: 0, values, exp_avg: zeros.clone(), exp_avg_sq: zeros }
     }
 
-    /// One step at rate `lr` with a gradient for every value.
+    /// Takes one step at rate `lr`, with a gradient for every value.
     pub fn step(&mut self, grads: &[F], lr: f64) {
         assert_eq!(grads.len(), self.values.len());
         self.steps += 1;
@@ -107,10 +108,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_step_is_one_rate_long_whatever_the_gradient() {
+    fn the_first_step_has_the_length_of_the_rate_for_any_gradient() {
         let mut adam = DenseAdam::new(AdamConfig::default(), vec![1.0f64, 1.0, 1.0]);
         adam.step(&[3.0, -2e-5, 0.0], 0.25);
-        // eps shifts it by 1e-15 / |g| at most.
+        // eps shifts it by at most 1e-15 / |g|.
         assert!((adam.values[0] - 0.75).abs() < 1e-14);
         assert!((adam.values[1] - 1.25).abs() < 1e-9);
         assert_eq!(adam.values[2], 1.0);

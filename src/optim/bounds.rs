@@ -1,15 +1,15 @@
-//! Where the rows of a page can be, from now until somebody touches the page again.
+//! Bounds of the rows of a page, valid from now until the page is next touched.
 //!
-//! An untouched value moves by its momentum, without turning back, towards a limit ([`super::drift`]): value and
-//! limit bound it for ever. Opacity resets may rewrite a row on the way, which changes roundings only; rounds may
-//! split it, once at most, because they clear the statistics by which it grew. Its children then lie around it. They
-//! are put into the box itself, rather than counted as a larger sigma (1.63 times: 3.33 + 3.33 / 1.6 of 3.33): a row
-//! must not be missed whose parent lies before the near plane, and the room is that of the row, not of the page's
-//! largest.
+//! An untouched value moves by its momentum, monotonically, towards a limit ([`super::drift`]): value and limit bound
+//! it for all later steps. An opacity reset may rewrite a row in between, which changes only roundings. A densification
+//! round may split it, at most once, because the round clears the statistics that made it grow; its children then lie
+//! around it. The children are included in the box, rather than in a larger sigma (1.63 times: 3.33 + 3.33 / 1.6 of
+//! 3.33), for two reasons: a row must not be missed if its parent is before the near plane, and the margin is then that
+//! of the row instead of the page's largest.
 //!
-//! Invariants: 1. bounds are a function of the stored rows and the run's configuration alone, not of the step at
-//! which they are asked for; 2. they hold for every later step, whatever events are pending, in the f32 arithmetic of
-//! the evaluation; 3. the same bits on every instruction path.
+//! Invariants: 1. bounds are a function of the stored rows and the run's configuration alone, not of the step at which
+//! they are computed; 2. they hold for every later step, whatever events are pending, in the f32 arithmetic of the
+//! evaluation; 3. the same bits on every instruction path.
 
 use super::deferred::DeferredAdam;
 use super::lanes::{Coordinates, LANES, LaneDrifts, by_coordinate, drifted_lanes, drifted_opacities, tables_of};
@@ -21,31 +21,33 @@ use crate::scene::events::SPLIT_SIGMAS;
 use crate::scene::page_meta::PageBounds;
 use crate::scene::rows::{Rows, mean_grad2d};
 
-/// Slack per movement. Rewriting a row on the way rounds its moments (1e-7 each), may change between series and direct
-/// sum (1e-6 apart), and may flush a second moment of 1e-38 to zero, which eps = 1e-15 hides but for 1e-4.
+/// Relative slack of a movement. Rewriting a row in between rounds its moments (1e-7 each), may switch between series
+/// and direct sum (which differ by 1e-6), and may flush a second moment of 1e-38 to zero, which with eps = 1e-15
+/// changes the movement by 1e-4.
 const MOVEMENT_SLACK: f32 = 1e-3;
-/// The same where rewriting rounds moments to 16 bits: by up to 0.8 % each, the second one under a root.
+/// The same if rewriting rounds moments to 16 bits: an error of up to 0.8 % each, the second one under a root.
 const MOVEMENT_SLACK_BF16: f32 = 2e-2;
-/// Slack per value: four roundings on the way there, one for the child of a split, three for this file's own.
+/// Relative slack of a value: four roundings in the evaluation, one for the child of a split, three in this file.
 const VALUE_SLACK: f32 = 8.0 * 0.5 * f32::EPSILON;
 /// Slack of a value that is flushed to zero.
 const FLUSH_SLACK: f32 = 2.0 * f32::MIN_POSITIVE;
-/// Slack per standard deviation: [`exp32`] is within two ulp, here and where it is compared.
+/// Relative slack of a standard deviation: [`exp32`] is within two ulp, both here and in the test of a row.
 const SIGMA_SLACK: f32 = 1e-6;
-/// Reach of a split, in standard deviations of the parent. The slack is for the roundings of its rotation and scales.
+/// Reach of a split, in standard deviations of the parent. The factor allows for the roundings of its rotation and
+/// scales.
 const SPLIT_REACH: f32 = SPLIT_SIGMAS as f32 * (1.0 + 1e-4);
 
-/// When rows may split: the lowest thresholds that a round of the run can have.
+/// The lowest thresholds for splitting that any round of the run can have.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SplitLimits {
-    /// Rows whose mean gradient norm is not greater do not grow.
+    /// Rows grow only above this mean gradient norm.
     pub grow_grad2d: f32,
-    /// Growing rows whose largest standard deviation is not greater do not split.
+    /// Growing rows split only above this largest standard deviation.
     pub split_scale: f32,
 }
 
 impl SplitLimits {
-    /// Of a run without rounds.
+    /// For a run without rounds.
     pub const NEVER: SplitLimits = SplitLimits { grow_grad2d: f32::INFINITY, split_scale: f32::INFINITY };
 }
 
@@ -55,8 +57,8 @@ impl DeferredAdam {
         dispatch(self.simd(), BoundRows { adam: self, rows, splits })
     }
 
-    /// A lower bound of the opacities (logit) of rows that nobody touches; infinity without rows. Opacity resets are not
-    /// in it.
+    /// A lower bound, for all later steps, of the opacities (logit) of untouched rows; infinity without rows. Does not
+    /// account for opacity resets.
     pub fn lowest_opacity(&self, rows: &Rows<'_>) -> f32 {
         dispatch(self.simd(), LowestOpacity { adam: self, rows })
     }
@@ -121,7 +123,7 @@ impl Kernel for BoundRows<'_> {
     }
 }
 
-/// Bounds of the rows in each lane.
+/// Bounds of the rows in each lane, separately.
 struct LaneBounds {
     lo: Coordinates,
     hi: Coordinates,
@@ -132,7 +134,8 @@ impl LaneBounds {
     const EMPTY: LaneBounds =
         LaneBounds { lo: [[f32::INFINITY; LANES]; 3], hi: [[f32::NEG_INFINITY; LANES]; 3], sigma_max: [0.0; LANES] };
 
-    /// Adds [`LANES`] rows from `first` on; or none, and says so, when one of them needs the direct sum.
+    /// Adds [`LANES`] rows from `first` on and returns true; if one of them needs the direct sum, adds none and returns
+    /// false.
     #[inline(always)]
     fn add(&mut self, adam: &DeferredAdam, rows: &Rows<'_>, splits: &SplitLimits, first: usize) -> bool {
         let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| adam.limit_drift(stamp));
@@ -166,7 +169,7 @@ impl LaneBounds {
         true
     }
 
-    /// All lanes and what is in `bounds`.
+    /// Combines all lanes with `bounds`.
     #[inline(always)]
     fn fold(&self, mut bounds: PageBounds) -> PageBounds {
         for l in 0..LANES {
@@ -202,7 +205,7 @@ fn movement_slack(adam: &DeferredAdam) -> f32 {
     if adam.moments() == Moments::Bf16 { MOVEMENT_SLACK_BF16 } else { MOVEMENT_SLACK }
 }
 
-/// The range that a value passes through on its way to its limit, in the arithmetic of the evaluation.
+/// The range that a value passes through on its way to its limit, in the evaluation's arithmetic.
 #[inline(always)]
 fn hull(value: f32, limit: f32, movement_slack: f32) -> [f32; 2] {
     let (lo, hi) = (value.min(limit), value.max(limit));
@@ -210,11 +213,11 @@ fn hull(value: f32, limit: f32, movement_slack: f32) -> [f32; 2] {
     [lo - slack, hi + slack]
 }
 
-/// A bound moved by `reach`, and by the rounding of that.
+/// A bound moved outwards by `reach` plus the rounding of that sum.
 #[inline(always)]
 fn outwards(bound: f32, reach: f32) -> f32 {
     let moved = bound + reach;
-    // Only rows that split are moved; the others have been rounded outwards already.
+    // Only bounds of rows that may split are moved; the others are rounded outwards already.
     let slack = if reach == 0.0 { 0.0 } else { f32::EPSILON * moved.abs() };
     if reach < 0.0 { moved - slack } else { moved + slack }
 }
@@ -224,7 +227,7 @@ fn sigma(log_scale: f32) -> f32 {
     exp32(log_scale) * (1.0 + SIGMA_SLACK)
 }
 
-/// How far the children of a row may lie from it.
+/// Largest distance of a row's children from it.
 #[inline(always)]
 fn split_reach(splits: &SplitLimits, grad2d: f32, count: u32, sigma: f32) -> f32 {
     let splits = (mean_grad2d(grad2d, count) > splits.grow_grad2d) & (sigma > splits.split_scale);
@@ -255,7 +258,7 @@ mod tests {
                     (&mut state.exp_avg.means, &mut state.exp_avg_sq.means),
                     (&mut state.exp_avg.scales, &mut state.exp_avg_sq.scales),
                 ] {
-                    // Some second moments so small that eps shows, some of both zero.
+                    // Some second moments are so small that eps matters, some rows have both moments zero.
                     let size = libm::pow(10.0, -draws.range(0.0, if row % 16 == 3 { 18.0 } else { 9.0 }));
                     (m[c], v[c]) = ((draws.normal() * size) as f32, (size * size) as f32);
                 }
@@ -276,10 +279,10 @@ mod tests {
         assert!(of(SimdPath::best(), &SceneState::empty(0).view()).is_empty());
     }
 
-    /// The smallest eps that is allowed, with second moments down to where f32 ends: rewriting flushes them to zero, and
-    /// only eps is left to divide by.
+    /// The smallest allowed eps, with second moments down to the smallest floats: rewriting flushes them to zero, which
+    /// leaves only eps to divide by.
     #[test]
-    fn bounds_hold_at_every_eps_that_is_allowed() {
+    fn bounds_hold_for_every_allowed_eps() {
         for eps in [EPS_MIN, 1e-15, 1e-8, 1.0] {
             let config = AdamConfig { eps, ..AdamConfig::default() };
             let adam = DeferredAdam::new(Rates::new(1.0, 500), config, SimdPath::best());
@@ -303,7 +306,7 @@ mod tests {
                         let [lo, hi] = [bounds.lo[c], bounds.hi[c]];
                         assert!(lo.is_finite() && hi.is_finite() && (lo..=hi).contains(&mean), "{eps:e} seed {seed}");
                     }
-                    // As an event does on the way.
+                    // As an event in between does.
                     at.settle_row(&mut state.view_mut(), 0);
                 }
             }

@@ -1,46 +1,47 @@
-//! How much of its moments a row keeps over k steps.
+//! Decay of a row's moments over k steps.
 //!
 //! Adam multiplies the first moment by beta1 and the second by beta2 at every step. A deferred row takes k of these
-//! products at once, in f32, and beta2^k cannot simply be rounded to f32 for that. Near 1 the spacing of f32 is 6e-8, so
-//! the rounding of 0.995 is up to 3e-8. A row with a regular schedule meets the same rounding at every update, always to
-//! the same side, and a second moment remembers about a thousand steps: at 160 updates in that time the errors add up to
-//! 5e-6 of the moment. What is lost, 1 - beta2^k, is small and f32 holds it to 6e-8 of itself. So the second moment is
-//! decayed as v - v (1 - beta2^k), and one rounding of v to nearest remains, which errs to either side.
+//! products at once, in f32, but rounding beta2^k to f32 is not accurate enough. Near 1 the spacing of f32 is 6e-8, so
+//! rounding 0.995 errs by up to 3e-8. A row with a regular schedule meets the same rounding at every update, always in
+//! the same direction, and a second moment remembers about a thousand steps: with 160 updates in that time the errors
+//! add up to 5e-6 of the moment. The lost part, 1 - beta2^k, is small, and f32 holds it to a relative 6e-8. So the
+//! second moment is decayed as v - v (1 - beta2^k), which leaves one rounding of v to nearest, with errors of either
+//! sign.
 //!
 //! The step itself decays the second moment once more and adds (1 - beta2) g^2. Both decays are taken together:
 //! v + ((1 - beta2) g^2 - v (1 - beta2^(k+1))) rounds v once for each update.
 //!
-//! Over more than 692 steps less than half is left. There v - v (1 - beta2^k) cancels: after 10,000 steps a rounding of v
-//! is 1e-3 of what is left. From there on the moment is multiplied by beta2^k as f32 holds it, which errs by 6e-8 of the
-//! moment at most, and no memory holds two such gaps. Both cases are v kept + (gained - v lost).
+//! Over more than 692 steps less than half remains. There v - v (1 - beta2^k) cancels: after 10,000 steps a rounding of
+//! v is 1e-3 of the remainder. Beyond 692 steps the moment is therefore multiplied by beta2^k rounded to f32, which
+//! errs by a relative 6e-8 at most, and no moment remembers two such gaps. Both cases are v kept + (gained - v lost).
 //!
-//! The first moment remembers ten steps, in which few roundings meet: it is multiplied by beta1^k.
+//! The first moment remembers ten steps, which contain few roundings: it is multiplied by beta1^k.
 //!
-//! Here: the factors of one gap and what they do to one value. Not here: the table of the usual gaps
+//! Here: the factors of one gap and their effect on one value. Not here: the table of common gaps
 //! ([`super::deferred`]), and the same arithmetic in vectors of eight (`super::eights`).
 //!
 //! Invariants: 1. a decay is a function of the betas and k alone; 2. the same bits on every instruction path: only
-//! + - x, nothing contracted; 3. no second moment becomes negative; 4. results below the smallest normal float are zero.
+//! `+ - x`, nothing contracted; 3. no second moment becomes negative; 4. results below the smallest normal float are zero.
 
 use super::adam::AdamConfig;
 use super::drift::{flush, flush_positive};
 
-/// What moments keep over a number of steps.
+/// Decay of the moments over a number of steps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Decay {
     /// Factor of the first moment.
     pub first: f32,
     /// Factor of the second moment: 1, or beta2^k rounded.
     pub kept: f32,
-    /// Where `kept` is 1: 1 - beta2^k, computed in f64 and rounded once. Else 0.
+    /// If `kept` is 1: 1 - beta2^k, computed in f64 and rounded once. Otherwise 0.
     pub lost: f32,
 }
 
 impl Decay {
-    /// Over no steps.
+    /// Decay over no steps.
     pub const NONE: Decay = Decay { first: 1.0, kept: 1.0, lost: 0.0 };
 
-    /// Over `k` steps.
+    /// Decay over `k` steps.
     pub fn new(config: AdamConfig, k: u32) -> Decay {
         let steps = f64::from(k);
         let first = flush(libm::pow(config.beta1, steps) as f32);
@@ -51,13 +52,13 @@ impl Decay {
         Decay { first, kept: flush_positive(libm::pow(config.beta2, steps) as f32), lost: 0.0 }
     }
 
-    /// What is left of a first moment.
+    /// A first moment after the decay.
     #[inline(always)]
     pub fn first_moment(&self, m: f32) -> f32 {
         flush(m * self.first)
     }
 
-    /// What is left of a second moment, and `gained`.
+    /// A second moment after the decay, plus `gained`.
     #[inline(always)]
     pub fn second_moment(&self, v: f32, gained: f32) -> f32 {
         flush_positive(v * self.kept + (gained - v * self.lost))
@@ -86,9 +87,10 @@ mod tests {
                 assert!(error.abs() < 1.2e-7, "{k} steps of {v}: {error:e}");
                 sum += error;
             }
-            // The usual gaps, of which the memory of a moment holds many: errors of both signs. Two even draws of half a
-            // spacing have a standard deviation of 4.9e-8, and the mean of 1024 one of 1.5e-9: six of these. What is the
-            // same for every v is the rounding of `lost`, 6e-8 of it at most. (That of beta2^k is up to 3e-8 of all.)
+            // The common gaps, of which a moment remembers many, have errors of both signs. Two uniform draws of half a
+            // spacing have a standard deviation of 4.9e-8, and the mean of 1024 one of 1.5e-9: the limit is six of
+            // these. Equal for every v is only the rounding of `lost`, at most a relative 6e-8. (For beta2^k it would
+            // be up to 3e-8 of the moment.)
             let mean = sum / f64::from(VALUES);
             let limit = 9e-9 + 6e-8 * f64::from(decay.lost);
             assert!(k > 300 || mean.abs() < limit, "{k} steps: errors of {mean:e} on average");
@@ -96,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_too_small_is_zero_and_nothing_becomes_negative() {
+    fn tiny_results_are_flushed_to_zero_and_none_is_negative() {
         let config = AdamConfig::default();
         for k in [0, 1, 5, 692, 693, 694, 5000, 80_000, 87_000, 88_000, 100_000, 1_000_000, u32::MAX] {
             let decay = Decay::new(config, k);

@@ -1,12 +1,13 @@
-//! Deferred Adam: dense Adam whose steps without a gradient are taken when somebody looks.
+//! Deferred Adam: dense Adam, with the steps without a gradient computed only when the row is read.
 //!
-//! A row's stored state is what its last gradient left, with the number of steps that it contains. Its value now is
-//! a pure function of that ([`super::drift`]); reading stores nothing. So it does not matter how often, when and by
-//! whom rows are read, evicted or loaded. Which rows are drawn, and who hands them in, is not decided here.
+//! A row's stored state is the state after its last gradient, with the number of steps that it contains. Its current
+//! value is a pure function of that state ([`super::drift`]), and reading stores nothing. So it does not matter how
+//! often, when and by whom rows are read, evicted or loaded. Not decided here: which rows are drawn, and who passes
+//! them in.
 //!
 //! Invariants: 1. a row is rewritten only when its gradient is non-zero in some column or an event reaches it
-//! ([`RowsNow::settle_row`]), and then whole; 2. one function evaluates, and an update goes on from what it gave; 3. the same
-//! bits on every instruction path and for any number of threads; 4. nothing non-finite enters the state.
+//! ([`RowsNow::settle_row`]), and then as a whole; 2. one function evaluates, and an update starts from its result; 3.
+//! the same bits on every instruction path and for any number of threads; 4. no non-finite value enters the state.
 
 use super::adam::AdamConfig;
 use super::decay::Decay;
@@ -24,44 +25,44 @@ use crate::scene::columns::{Column, Columns};
 use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, RowsNow, first_lane};
 use crate::scene::state::SceneState;
 
-/// Rows of one unit of parallel work.
+/// Rows per task of parallel work.
 pub const ROWS_PER_TASK: usize = 1024;
-/// Gaps whose decay is tabled; rarer ones are computed.
+/// Gaps whose decay is tabulated; longer ones are computed.
 const TABLED_GAPS: usize = 4096;
 
-/// The optimizer of a run: rates, tables, instruction path. Holds no state of rows.
+/// The optimizer of a run: rates, tables, instruction path. Holds no row state.
 #[derive(Debug, Clone)]
 pub struct DeferredAdam {
     tables: DriftTables,
     /// Base rates.
     lane_rates: OfLanes,
     eps: EpsFloor,
-    /// `[k]`: the decay of the moments over k steps.
+    /// `[k]`: decay of the moments over k steps.
     decays: Vec<Decay>,
     simd: SimdPath,
     moments: Moments,
 }
 
-/// What a step did.
+/// Counts of one step.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct StepCounts {
     /// Rows that were rewritten.
     pub updated: usize,
-    /// Rows whose gradient was not finite (or beyond 1e18) and that were left as they were.
+    /// Rows left unchanged because their gradient was not finite (or beyond 1e18).
     pub skipped_non_finite: usize,
 }
 
-/// The optimizer at one moment: everything that evaluating at it needs, so that the work per row is a look-up.
+/// The optimizer at one step: everything that evaluation at this step needs, so that the work per row is a look-up.
 #[derive(Debug, Clone)]
 pub struct AdamNow<'a> {
     adam: &'a DeferredAdam,
     now: u32,
-    /// Drift of a row that missed `[k]` steps.
+    /// `[k]`: drift of a row that missed k steps.
     recent: [Drift; RECENT],
 }
 
 impl DeferredAdam {
-    /// Tables for these rates; panics as [`DriftTables::new`] does.
+    /// Builds the tables for these rates; panics as [`DriftTables::new`] does.
     pub fn new(rates: Rates, config: AdamConfig, simd: SimdPath) -> Self {
         let lane_rates = OfLanes::new(|column| rates.base(column) as f32);
         DeferredAdam {
@@ -74,20 +75,20 @@ impl DeferredAdam {
         }
     }
 
-    /// The same optimizer for rows that keep their moments so.
+    /// The same optimizer with another storage format of moments.
     #[must_use]
     pub fn with_moments(self, moments: Moments) -> Self {
         DeferredAdam { moments, ..self }
     }
 
-    /// The same optimizer without catching up: rows without a gradient keep their values and their moments
+    /// The same optimizer without catching up: rows without a gradient keep their values and moments
     /// ([`super::method::Method::Sparse`]).
     #[must_use]
     pub fn without_catch_up(self) -> Self {
         DeferredAdam { tables: self.tables.still(), ..self }
     }
 
-    /// What rows keep of their moments.
+    /// Storage format of moments.
     pub fn moments(&self) -> Moments {
         self.moments
     }
@@ -102,30 +103,30 @@ impl DeferredAdam {
         self.tables.bytes() + self.decays.len() * size_of::<Decay>()
     }
 
-    /// The optimizer when `now` steps have been taken. Costs about a microsecond.
+    /// The optimizer after `now` steps. Costs about a microsecond.
     pub fn at(&self, now: u32) -> AdamNow<'_> {
         let recent = std::array::from_fn(|k| self.tables.drift(now.saturating_sub(k as u32), now));
         AdamNow { adam: self, now, recent }
     }
 
-    /// One value as it is after `now` steps, from its state after `stamp` steps. The definition for one number:
-    /// [`AdamNow`] gives the same bits for rows.
+    /// One value after `now` steps, from its state after `stamp` steps. This defines a single value; [`AdamNow`] gives
+    /// the same bits for rows.
     pub fn evaluate(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32, now: u32) -> f32 {
         self.evaluate_with(&self.tables.drift(stamp, now), column, value, m, v, stamp, now)
     }
 
-    /// Series sums of the movement for ever, for a row of this stamp.
+    /// Series sums of the movement to the limit, for a row of this stamp.
     #[inline(always)]
     pub(crate) fn limit_drift(&self, stamp: u32) -> &Drift {
         self.tables.limit(stamp)
     }
 
-    /// What one value comes to when it never gets a gradient again; it moves there from `value` without turning back.
+    /// The limit of a value that gets no more gradients; it moves there from `value` monotonically.
     pub(crate) fn limit(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32) -> f32 {
         self.evaluate_with(self.tables.limit(stamp), column, value, m, v, stamp, u32::MAX)
     }
 
-    /// Instruction path of the run.
+    /// The run's instruction path.
     pub(crate) fn simd(&self) -> SimdPath {
         self.simd
     }
@@ -140,7 +141,7 @@ impl DeferredAdam {
         &self.tables
     }
 
-    /// eps and the second moment above which the series holds.
+    /// eps, and the second moment above which the series is valid.
     #[inline(always)]
     pub(crate) fn eps_floor(&self) -> EpsFloor {
         self.eps
@@ -165,9 +166,9 @@ impl DeferredAdam {
         drifted(value, m, v, sums, rate, self.eps.eps)
     }
 
-    /// The optimizer step `now` (0-based) on the rows of the ascending list `rows`; `grads` has one row per entry of it.
-    /// Rows whose gradient is zero in every column are left untouched: they take the step when somebody looks.
-    /// Panics as [`AdamNow::step_rows`] does, and at rows that the state has not.
+    /// Takes optimizer step `now` (0-based) on the rows of the ascending list `rows`; `grads` has one row per entry.
+    /// Rows whose gradient is zero in every column stay untouched: they take the step when they are next read. Panics
+    /// as [`AdamNow::step_rows`] does, and for rows outside the state.
     pub fn step(&self, state: &mut SceneState, rows: &[u32], grads: &Columns, now: u32) -> StepCounts {
         assert_eq!(rows.len(), grads.rows(), "one gradient row per listed row");
         assert_eq!(state.sh_degree(), grads.sh_degree, "gradients of another degree");
@@ -186,7 +187,7 @@ impl DeferredAdam {
         }
     }
 
-    /// The same beyond the table.
+    /// The decay over `k` steps beyond the table.
     #[cold]
     #[inline(never)]
     fn far_decay(&self, k: u32) -> Decay {
@@ -201,19 +202,19 @@ impl<'a> AdamNow<'a> {
         self.adam
     }
 
-    /// Instruction path of the run.
+    /// The run's instruction path.
     pub fn simd(&self) -> SimdPath {
         self.adam.simd
     }
 
-    /// Steps without a gradient over which the moments of a row of this stamp decay.
+    /// Number of steps without a gradient over which the moments of a row of this stamp decay.
     #[inline(always)]
     fn missed(&self, stamp: u32) -> u32 {
         if self.adam.tables.is_still() { 0 } else { self.now.saturating_sub(stamp) }
     }
 
-    /// The decay that the coming step applies to the moments of a row of this stamp: of the first moment over the
-    /// steps that the row missed, of the second moment over these and the step itself.
+    /// The decay that the current step applies to the moments of a row of this stamp: for the first moment over the
+    /// missed steps, for the second moment over the missed steps and this one.
     #[inline(always)]
     pub(super) fn step_decay(&self, stamp: u32) -> Decay {
         let missed = self.missed(stamp);
@@ -227,10 +228,10 @@ impl<'a> AdamNow<'a> {
         if gap < RECENT { &self.recent[gap] } else { self.adam.tables.limit(stamp) }
     }
 
-    /// The step on a view of rows: as [`DeferredAdam::step`], `rows` counted in the table that the view was cut from, each
-    /// larger than the one before. `values` are the listed rows as they are now, as [`AdamNow::evaluate_rows`] gives them:
-    /// whoever has gradients had these before. Panics when the numbers of rows, or the degrees, do not fit each other, and
-    /// when the list does not ascend or names rows that the view has not; no row is changed then.
+    /// Takes the step on a view of rows, as [`DeferredAdam::step`]. `rows` are numbered in the table that the view was
+    /// cut from and ascend strictly. `values` are the current values of the listed rows, from
+    /// [`AdamNow::evaluate_rows`]: whoever has gradients has evaluated the rows before. Panics, before any row changes,
+    /// if row counts or degrees differ, if the list does not ascend, or if it names rows outside the view.
     pub fn step_rows(
         &self,
         view: RowsMut<'_>,
@@ -240,7 +241,7 @@ impl<'a> AdamNow<'a> {
     ) -> StepCounts {
         let (Some(&first), Some(&last)) = (rows.first(), rows.last()) else { return StepCounts::default() };
         let degree = view.columns.sh_degree;
-        // All of this before any row is changed: none is to be left with half a step.
+        // All checks come before the first change, so that no row is left with half a step.
         assert_eq!([values.rows(), grads.rows()], [rows.len(); 2], "values and gradients of the listed rows");
         assert_eq!([values.sh_degree, grads.sh_degree], [degree; 2], "values or gradients of another degree");
         assert!(rows.is_sorted_by(|a, b| a < b), "listed rows ascend");
@@ -249,7 +250,7 @@ impl<'a> AdamNow<'a> {
         self.step_checked(view, rows, values, grads)
     }
 
-    /// [`AdamNow::step_rows`] on a list that fits the view.
+    /// [`AdamNow::step_rows`] on a checked list.
     fn step_checked(
         &self,
         view: RowsMut<'_>,
@@ -261,7 +262,7 @@ impl<'a> AdamNow<'a> {
             return StepCounts::default();
         }
         if view.rows() > ROWS_PER_TASK {
-            // Halved at whole tasks, so that the pieces are the same for any number of threads.
+            // Split at whole tasks, so that the pieces are the same for any number of threads.
             let at = view.rows().div_ceil(ROWS_PER_TASK) / 2 * ROWS_PER_TASK;
             let bound = view.first_row + at;
             let listed = rows.partition_point(|&row| (row as usize) < bound);
@@ -290,7 +291,7 @@ impl<'a> AdamNow<'a> {
         }
     }
 
-    /// Whether `values` are the listed rows as they are now, to the bit.
+    /// Whether `values` equal the current values of the listed rows, to the bit.
     fn are_values_of(&self, view: &Rows<'_>, rows: &[u32], values: &ColumnsRef<'_>) -> bool {
         let mut now = Columns::zeros(rows.len(), values.sh_degree);
         self.evaluate_rows(*view, |i| rows[i] as usize - view.first_row, now.view_mut());
@@ -298,9 +299,9 @@ impl<'a> AdamNow<'a> {
         Column::ALL.into_iter().all(|column| has_same_bits(now.column(column), values.column(column)))
     }
 
-    /// Evaluates rows into `out`: its row i is row `row_of(i)` of the view (counted from its first) as it is now, in any
-    /// order. `row_of` is asked several times for a row: it is to be cheap, and to answer alike. Panics at rows that the
-    /// view has not, and when the degrees differ.
+    /// Evaluates rows into `out`: row i of `out` is the current value of row `row_of(i)` of the view (counted from its
+    /// first), in any order. `row_of` is called several times per row, so it must be cheap and consistent. Panics for
+    /// rows outside the view, and if the degrees differ.
     pub fn evaluate_rows(&self, view: Rows<'_>, row_of: impl Fn(usize) -> usize, out: ColumnsMut<'_>) {
         assert_eq!(view.columns.sh_degree, out.sh_degree, "values of another degree");
         match out.sh_degree {
@@ -311,7 +312,7 @@ impl<'a> AdamNow<'a> {
         }
     }
 
-    /// Moves the values of one loaded row with a value that eps touches to now, lane by lane.
+    /// Moves the values of one loaded row to now, lane by lane, if eps affects one of them.
     pub(super) fn evaluate_block_directly(&self, value: &mut RowBlock, m: &RowBlock, v: &RowBlock, stamp: u32) {
         let drift = self.drift(stamp);
         for column in Column::ALL {
@@ -372,7 +373,7 @@ impl RowsNow for AdamNow<'_> {
     }
 }
 
-/// Runs a loop over rows in the form that is written for the path.
+/// Runs a loop over rows in the form written for the path.
 #[cfg(target_arch = "x86_64")]
 #[inline]
 fn over_rows<K: Kernel>(path: SimdPath, kernel: K) -> K::Out

@@ -1,5 +1,5 @@
-//! How far dense Adam moves a value over steps in which its gradient is zero, for any gap and rate schedule, as a
-//! pure function of the stored moments and two step numbers. Knows no rows; [`super::deferred`] applies it to them.
+//! Movement of a value under dense Adam over steps with zero gradient, for any gap and rate schedule, as a pure
+//! function of the stored moments and two step numbers. Knows no rows; [`super::deferred`] applies it to rows.
 //!
 //! A value whose state contains s steps, with moments m and v, moves over the next k zero-gradient steps by
 //!
@@ -7,11 +7,11 @@
 //! sum over j = 1..k of  lr(s+j) beta1^j m / ((1 - beta1^(s+j)) (sqrt(beta2^j v) / sqrt(1 - beta2^(s+j)) + eps))
 //! ```
 //!
-//! Without eps that is (m / sqrt v) (S(s) - r^k S(s+k)), where r = beta1 / sqrt beta2,
-//! c(t) = lr(t) sqrt(1 - beta2^t) / (1 - beta1^t) and S(s) = r (c(s+1) + S(s+1)), which is filled backwards once. Expanding
-//! 1 / (root + eps) gives the same series with the square and the cube of the corrected root, here T2 and T3, T1 = S:
-//! (m / sqrt v) (T1 - e T2 + e^2 T3) with e = eps / sqrt v. Where e is not small the sum itself is taken, 200 terms of it:
-//! the rest is below 1e-9 of it.
+//! Without eps this is (m / sqrt v) (S(s) - r^k S(s+k)), where r = beta1 / sqrt beta2, c(t) = lr(t) sqrt(1 - beta2^t) /
+//! (1 - beta1^t) and S(s) = r (c(s+1) + S(s+1)), filled backwards once. Expanding 1 / (root + eps) gives the same
+//! series with the square and the cube of the corrected root, here T2 and T3, with T1 = S: (m / sqrt v) (T1 - e T2 +
+//! e^2 T3) with e = eps / sqrt v. If e is not small, the sum itself is computed with 200 terms: the rest is below 1e-9
+//! of it.
 //!
 //! Invariants: 1. the same bits on every instruction path: + - * / sqrt only, nothing contracted, sums in a fixed
 //! order; 2. tables depend on the rates and the betas alone; 3. results below the smallest normal float are zero.
@@ -19,26 +19,27 @@
 use super::adam::AdamConfig;
 use super::rates::Rates;
 
-/// Gaps from which the term r^k S(s+k) is below a rounding of S(s).
+/// From this gap on the term r^k S(s+k) is below a rounding of S(s).
 pub(super) const RECENT: usize = 400;
 /// Terms of the direct sum.
 const DIRECT_TERMS: usize = 200;
 /// After this many steps every bias correction is 1 in f64 (0.999^40000 = 4e-18).
 const BIAS_STEPS: u32 = 40_000;
-/// The series is used where sqrt(v) is more than this many eps; what it leaves out is e^3 < 1.6e-8 of the movement.
+/// The series is used if sqrt(v) exceeds this many eps; the omitted terms are e^3 < 1.6e-8 of the movement.
 const SERIES_FLOOR: f32 = 400.0;
 
-/// Series sums of one gap, at unit base rate: T1, T2, T3 of the schedule of the means, 0, then of the constant one, 0.
+/// Series sums of one gap at unit base rate: T1, T2, T3, 0 for the schedule of the means, then the same for the
+/// constant one.
 pub(crate) type Drift = [f32; 8];
 
-/// Tables of a run: 88 bytes per step (of at least 40,000), and 0.6 MB.
+/// Tables of a run: 88 bytes per step (at least 40,000 steps), plus 0.6 MB.
 #[derive(Debug, Clone)]
 pub struct DriftTables {
     rates: Rates,
     config: AdamConfig,
     /// `[s]`: T1, T2, T3 for the means' schedule and for the constant one.
     series: Vec<[f64; 6]>,
-    /// `series` rounded: the movement over endless gaps.
+    /// `series` rounded: the movement over infinite gaps.
     limits: Vec<Drift>,
     /// `[k]`: r_1^k, r_2^k, r_3^k.
     ratio_powers: Vec<[f64; 3]>,
@@ -48,13 +49,13 @@ pub struct DriftTables {
     decay_powers: Vec<[f64; 2]>,
     /// `[step]`, 0-based: factor on the rate of the means.
     means_factor: Vec<f64>,
-    /// Nothing moves without a gradient.
+    /// Whether values stay in place without a gradient.
     is_still: bool,
 }
 
 impl DriftTables {
-    /// Fills the tables. Panics when the betas are so slow that a gap of 400 steps still matters
-    /// (beta1 > 0.91 at beta2 = 0.999): that is a mistake of the program, not of the input.
+    /// Fills the tables. Panics if the betas are so slow that a gap of 400 steps still matters (beta1 > 0.91 at beta2 =
+    /// 0.999): that is a bug in the program, not bad input.
     pub fn new(rates: Rates, config: AdamConfig) -> Self {
         let root = libm::sqrt(config.beta2);
         let ratios: [f64; 3] = std::array::from_fn(|p| config.beta1 / libm::pow(root, p as f64 + 1.0));
@@ -67,7 +68,7 @@ impl DriftTables {
         let means_factor: Vec<f64> = (0..=rates.steps).map(|step| rates.means_factor(step)).collect();
         let bias = bias_table(config);
         let mut series = vec![[0.0; 6]; horizon + 1];
-        // Row s needs the factors of 1-based step s + 1. Beyond the horizon they stay the same: a geometric series.
+        // Row s needs the factors of 1-based step s + 1. Beyond the horizon they are constant: a geometric series.
         let term = |s: usize| {
             let [inv_bias1, inv_root] = bias[(s + 1).min(bias.len() - 1)];
             let means = means_factor[s.min(means_factor.len() - 1)];
@@ -93,7 +94,7 @@ impl DriftTables {
         }
     }
 
-    /// The same tables for values that stay where they are while they have no gradient: every sum is zero.
+    /// The same tables for values that stay in place without a gradient: every sum is zero.
     #[must_use]
     pub fn still(mut self) -> Self {
         self.series.fill([0.0; 6]);
@@ -102,17 +103,17 @@ impl DriftTables {
         self
     }
 
-    /// Whether the tables are those of [`DriftTables::still`].
+    /// Whether these are tables of [`DriftTables::still`].
     pub fn is_still(&self) -> bool {
         self.is_still
     }
 
-    /// The rates that the tables were made for.
+    /// The rates of the tables.
     pub fn rates(&self) -> &Rates {
         &self.rates
     }
 
-    /// The decays that the tables were made for.
+    /// The betas and eps of the tables.
     pub fn config(&self) -> AdamConfig {
         self.config
     }
@@ -126,7 +127,7 @@ impl DriftTables {
             + self.means_factor.len() * 8
     }
 
-    /// Series sums of the gap from a state of `stamp` steps to one of `now` steps.
+    /// Series sums for the gap from a state of `stamp` steps to one of `now` steps.
     pub(crate) fn drift(&self, stamp: u32, now: u32) -> Drift {
         let gap = now.saturating_sub(stamp) as usize;
         if gap >= self.ratio_powers.len() {
@@ -135,7 +136,7 @@ impl DriftTables {
         rounded(self.sums(stamp, now))
     }
 
-    /// [`DriftTables::drift`] before it is rounded: T1, T2, T3 for the means' schedule and for the constant one.
+    /// [`DriftTables::drift`] before rounding: T1, T2, T3 for the means' schedule and for the constant one.
     fn sums(&self, stamp: u32, now: u32) -> [f64; 6] {
         let gap = now.saturating_sub(stamp) as usize;
         let from = (stamp as usize).min(self.series.len() - 1);
@@ -145,9 +146,9 @@ impl DriftTables {
         std::array::from_fn(|i| start[i] - power[i % 3] * end[i])
     }
 
-    /// How far a value moves from a state of `stamp` steps with moments `m` and `v` to one of `now` steps, at unit base rate,
-    /// on the schedule of the means or the constant one: what `drifted` and `direct_sum` do in f32, for
-    /// state in f64. The oracle of the formula; nothing is trained by it.
+    /// Movement of a value from a state of `stamp` steps with moments `m` and `v` to one of `now` steps, at unit base
+    /// rate, on the schedule of the means or the constant one. Computes in f64 what `drifted` and `direct_sum` compute
+    /// in f32: the oracle of the formula, unused in training.
     pub fn movement(&self, [m, v]: [f64; 2], stamp: u32, now: u32, of_means: bool) -> f64 {
         let root = v.sqrt();
         if m == 0.0 || now <= stamp {
@@ -161,7 +162,7 @@ impl DriftTables {
         m / root * (t1 - e * (t2 - e * t3))
     }
 
-    /// The movement over any number of further steps, from a state of `stamp` steps.
+    /// Series sums of the movement to the limit, from a state of `stamp` steps.
     #[inline(always)]
     pub(crate) fn limit(&self, stamp: u32) -> &Drift {
         &self.limits[(stamp as usize).min(self.limits.len() - 1)]
@@ -172,12 +173,12 @@ impl DriftTables {
         self.bias[(t as usize).min(self.bias.len() - 1)]
     }
 
-    /// The movement at unit base rate, term by term with eps in its place; for roots that eps touches.
+    /// The movement at unit base rate, summed term by term with eps; for roots small enough that eps matters.
     pub(crate) fn direct_sum(&self, m: f32, v: f32, stamp: u32, now: u32, of_means: bool) -> f32 {
         self.direct(f64::from(m), f64::from(v).sqrt(), stamp, now, of_means) as f32
     }
 
-    /// [`DriftTables::direct_sum`] from the root of the second moment.
+    /// [`DriftTables::direct_sum`], given the root of the second moment.
     fn direct(&self, m: f64, root: f64, stamp: u32, now: u32, of_means: bool) -> f64 {
         const LANES: usize = 8;
         if self.is_still {
@@ -197,12 +198,12 @@ impl DriftTables {
     }
 }
 
-/// What the movement of one value needs besides its moments.
+/// Constants for the movement of a value.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct EpsFloor {
     /// eps.
     pub eps: f32,
-    /// Second moments must be greater than this for the series.
+    /// The series is valid for second moments greater than this.
     pub floor: f32,
 }
 
@@ -210,7 +211,7 @@ impl EpsFloor {
     pub(crate) fn new(eps: f64) -> Self {
         let eps = eps as f32;
         let largest_root = SERIES_FLOOR * eps;
-        // The largest second moment whose root is not above that: comparing with it saves a root for every value.
+        // The largest second moment whose root is at most that: comparing with it saves a root per value.
         let mut floor = largest_root * largest_root;
         while floor.sqrt() > largest_root {
             floor = floor.next_down();
@@ -222,31 +223,31 @@ impl EpsFloor {
     }
 }
 
-/// The value after a gap by the series. Only for second moments above the floor: see [`needs_direct_sum`].
-/// Rounding: at most 4e-7 of the movement, and half an ulp of the value.
+/// The value after a gap, by the series. Only for second moments above the floor: see [`needs_direct_sum`]. Rounding
+/// error: at most 4e-7 of the movement and half an ulp of the value.
 #[inline(always)]
 pub(crate) fn drifted(value: f32, m: f32, v: f32, sums: [f32; 3], rate: f32, eps: f32) -> f32 {
     let inv = 1.0 / v.sqrt();
     let e = eps * inv;
     let moved = flush(value - (m * inv) * (sums[0] - e * (sums[1] - e * sums[2])) * rate);
-    // Without a first moment nothing moves; and the quotient above may be 0 / 0.
+    // Without a first moment nothing moves, and the quotient above may be 0 / 0.
     if m == 0.0 { value } else { moved }
 }
 
-/// Whether the series is too coarse for this second moment.
+/// Whether the series is too inaccurate for this second moment.
 #[inline(always)]
 pub(crate) fn needs_direct_sum(m: f32, v: f32, floor: f32) -> bool {
-    // Written so that a NaN is not asked for 200 terms of NaN.
+    // Written so that a NaN does not cause 200 terms of NaN.
     (m != 0.0) & (v <= floor)
 }
 
-/// Zero for values below the smallest normal float, so that hardware that flushes them gives the same bits.
+/// Flushes values below the smallest normal float to zero, so that hardware that flushes them gives the same bits.
 #[inline(always)]
 pub(crate) fn flush(x: f32) -> f32 {
     if x.abs() < f32::MIN_POSITIVE { 0.0 } else { x }
 }
 
-/// [`flush`] of what is not negative, as second moments are.
+/// [`flush`] for non-negative values such as second moments.
 #[inline(always)]
 pub(crate) fn flush_positive(x: f32) -> f32 {
     if x < f32::MIN_POSITIVE { 0.0 } else { x }
@@ -273,7 +274,7 @@ fn bias_table(config: AdamConfig) -> Vec<[f64; 2]> {
 mod tests {
     use super::*;
 
-    /// The definition, in f64, for any number of terms.
+    /// The definition, in f64, for any gap.
     fn by_loop(tables: &DriftTables, m: f64, v: f64, stamp: u32, now: u32, of_means: bool) -> f64 {
         let AdamConfig { beta1, beta2, eps } = tables.config;
         let mut moved = 0.0;
@@ -326,14 +327,14 @@ mod tests {
         } else {
             -drifted(0.0, m, v, sums, 1.0, floor.eps)
         };
-        // 4e-7 for the roundings, a few times 1.6e-8 for what is left out at the edge of the series, 1e-9 for the tail that
-        // the direct sum leaves out.
+        // 4e-7 for the roundings, a few times 1.6e-8 for the terms omitted at the edge of the series, 1e-9 for the tail
+        // omitted by the direct sum.
         let slack = 5e-7 * want.abs() + 1e-30;
         assert!((f64::from(got) - want).abs() <= slack, "{stamp}..{now} v {v}: {got} {want} direct {direct}");
     }
 
     #[test]
-    fn the_floor_is_the_last_second_moment_with_so_small_a_root() {
+    fn the_floor_is_the_largest_second_moment_with_a_root_below_the_limit() {
         for eps in [1e-15, 1e-8] {
             let EpsFloor { eps, floor } = EpsFloor::new(eps);
             let root = SERIES_FLOOR * eps;
@@ -341,7 +342,7 @@ mod tests {
         }
     }
 
-    /// A run of 200,000 steps, first touched at every hundredth of them, then left alone for any time up to its end.
+    /// A run of 200,000 steps, sampled at every hundredth of them, with any gap up to its end.
     #[test]
     fn a_long_run_is_followed_from_every_hundredth_step_to_its_end() {
         const STEPS: u32 = 200_000;
@@ -358,7 +359,7 @@ mod tests {
                     for (&gap, &want) in checked.iter().zip(&want) {
                         let now = stamp + gap;
                         let got = tables.movement([f64::from(m), f64::from(v)], stamp, now, of_means);
-                        // As in `check`, without the roundings of f32.
+                        // As in `check`, but without the roundings of f32.
                         let slack = 1e-7 * want.abs() + 1e-30;
                         assert!((got - want).abs() <= slack, "{stamp}..{now} root {root} eps {eps}: {got} {want}");
                         check_against(&tables, floor, [m, v], stamp, now, of_means, want);
@@ -374,7 +375,7 @@ mod tests {
         let (mut decay1, mut decay2, mut moved, mut j) = (1.0, 1.0, 0.0, 0);
         let mut all = Vec::with_capacity(gaps.len());
         for &gap in gaps {
-            // Terms fall by a tenth each: behind the 800th they are below 1e-36 of the first.
+            // Each term is a tenth smaller: after the 800th they are below 1e-36 of the first.
             while j < gap.min(800) {
                 j += 1;
                 (decay1, decay2) = (decay1 * beta1, decay2 * beta2);

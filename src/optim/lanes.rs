@@ -1,9 +1,9 @@
-//! Sixteen rows at a time: the three coordinates of a column moved by the series, one vector per coordinate.
+//! Sixteen rows at a time: moves the three coordinates of a column by the series, one vector per coordinate.
 //!
-//! Not here: rows whose second moments are so small that eps shows; they are reported, and the caller evaluates them
-//! one by one.
+//! Not here: rows with second moments so small that eps matters; they are reported, and the caller evaluates them one
+//! by one.
 //!
-//! Invariant: the bits are those of [`RowsNow`](crate::scene::rows::RowsNow), whatever the instruction path.
+//! Invariant: the bits are those of [`RowsNow`](crate::scene::rows::RowsNow) on every instruction path.
 
 use super::deferred::{AdamNow, DeferredAdam};
 use super::drift::{Drift, EpsFloor, drifted, needs_direct_sum};
@@ -11,7 +11,7 @@ use crate::base::simd::Kernel;
 use crate::scene::columns::Column;
 use crate::scene::rows::{Rows, RowsNow};
 
-/// Rows of one vector.
+/// Rows per vector.
 pub(crate) const LANES: usize = 16;
 
 /// Series sums of [`LANES`] rows, one vector per sum: T1, T2, T3 of the means, then of the other columns.
@@ -23,7 +23,7 @@ pub(crate) struct LaneDrifts {
 pub(crate) type Coordinates = [[f32; LANES]; 3];
 
 impl LaneDrifts {
-    /// The sums of the rows with these stamps.
+    /// Gathers the sums of the rows with these stamps.
     #[inline(always)]
     pub(crate) fn gather<'d>(stamps: &[u32], drift_of: impl Fn(u32) -> &'d Drift) -> LaneDrifts {
         let mut sums = [[0.0; LANES]; 8];
@@ -54,7 +54,7 @@ pub(crate) fn tables_of<'a>(rows: &Rows<'a>, column: Column) -> [&'a [f32]; 3] {
     }
 }
 
-/// The coordinates of rows `first..` after their drifts, and whether some of them need the direct sum instead.
+/// The coordinates of rows `first..` after their drift, and whether one of them needs the direct sum instead.
 #[inline(always)]
 pub(crate) fn drifted_lanes(
     adam: &DeferredAdam,
@@ -67,7 +67,8 @@ pub(crate) fn drifted_lanes(
     let rate = adam.base_rate(column);
     let sums = drifts.of(column);
     let (from, to) = (first * 3, (first + LANES) * 3);
-    // Not `map` over the tables: its closure is not always inlined, and then runs without the vector instructions.
+    // Not `map` over the tables: its closure is not always inlined, and would then be compiled without vector
+    // instructions.
     let value = by_coordinate(&tables[0][from..to]);
     let m = by_coordinate(&tables[1][from..to]);
     let v = by_coordinate(&tables[2][from..to]);
@@ -99,7 +100,7 @@ pub(crate) fn by_coordinate(rows: &[f32]) -> Coordinates {
     out
 }
 
-/// The opacities (logit) of rows `first..` after their drifts, and whether some of them need the direct sum instead.
+/// The opacities (logit) of rows `first..` after their drift, and whether one of them needs the direct sum instead.
 #[inline(always)]
 pub(crate) fn drifted_opacities(
     adam: &DeferredAdam,
@@ -122,7 +123,7 @@ pub(crate) fn drifted_opacities(
     (out, direct)
 }
 
-/// The largest log-scale and the opacity of every row as they are now.
+/// Computes the current largest log-scale and opacity of every row.
 pub(crate) struct SizeRows<'k, 'a> {
     pub at: &'k AdamNow<'a>,
     pub rows: &'k Rows<'k>,

@@ -1,14 +1,14 @@
-//! When Gaussians take the optimizer steps in which they have no gradient.
+//! The three ways of handling optimizer steps without a gradient.
 
 /// What a step does to rows without a gradient.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Method {
-    /// They take the step when somebody looks: dense Adam's values at the cost of the rows that are seen.
+    /// They take the step when they are next read: dense Adam's values at the cost of the seen rows only.
     #[default]
     Deferred,
-    /// They take it at once: every row is rewritten at every step. Slow; what the deferred form is compared with.
+    /// They take it at once: every row is rewritten at every step. Slow; the reference for the deferred form.
     Dense,
-    /// They never take it: values and moments stay as their last gradient left them. Not Adam; what trainers with
-    /// "sparse" or "selective" optimizers do.
+    /// They never take it: values and moments stay as their last gradient left them. This is not Adam; trainers with
+    /// "sparse" or "selective" optimizers do it.
     Sparse,
 }

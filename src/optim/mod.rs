@@ -1,4 +1,4 @@
-//! Learning rates and Adam: dense as the definition, deferred as what runs.
+//! Learning rates and Adam: the dense form as reference, the deferred form for training.
 
 pub mod adam;
 pub mod bounds;

@@ -1,28 +1,27 @@
-//! Moments in 16 bits: what a row keeps of them between its updates, when a run chooses so. Not exact: against f32 the
-//! second moments are off by 0.2 % in the mean of their roundings.
+//! Optional 16-bit storage of moments between updates. Inexact: second moments differ from f32 by 0.2 % on average.
 //!
-//! A moment is rounded to bfloat16 (the upper half of an f32) after each update, at random: up with the probability of
-//! what is cut off, so that the mean is right. Rounding to nearest would stop a second moment from ever changing by
-//! less than 0.4 % at a time, which at beta2 = 0.999 is nearly always.
+//! After each update a moment is rounded to bfloat16 (the upper half of an f32) stochastically: up with the probability
+//! of the cut fraction, so that the mean is right. Rounding to nearest would prevent any change of a second moment
+//! below 0.4 % at a time, which at beta2 = 0.999 is nearly every change.
 //!
-//! Invariants: 1. the draw depends on the row's uid, the number of steps contained and the column's element, not on who
-//! holds the row, when it is stored, or in which order a block has its lanes; 2. zero stays zero, and what is exact stays as it is; 3. the lower halves are zero, so
-//! that pages can leave them out.
+//! Invariants: 1. the draw depends on the row's uid, the number of steps contained and the column's element, not on
+//! where the row is, when it is stored, or the order of lanes in a block; 2. zero and other exactly representable
+//! values stay unchanged; 3. the lower halves are zero, so that pages can omit them.
 
 use crate::base::rng::mix64;
 use crate::scene::rows::{RowBlock, SH_N_LANE};
 
-/// The number that each lane of the narrow columns has in draws: by means, quats, scales, opacity, sh0, whatever the order of
-/// the lanes, which may change while the bits of a run may not.
+/// The number of each narrow lane in draws: by means, quats, scales, opacity, sh0. It is independent of the lanes'
+/// order, which may change while the bits of a run may not.
 const DRAW_FROM_LANE: [u32; SH_N_LANE] = [0, 1, 2, 10, 3, 4, 5, 6, 7, 8, 9, 14, 11, 12, 13, 15];
 
-/// What a run keeps of moments.
+/// Storage format of moments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Moments {
-    /// All of them.
+    /// All 32 bits.
     #[default]
     F32,
-    /// The upper half.
+    /// The upper 16 bits.
     Bf16,
 }
 
@@ -51,7 +50,7 @@ pub(crate) fn round_block<const W: usize>(m: &mut RowBlock, v: &mut RowBlock, ui
 
 #[inline(always)]
 fn rounded(m: f32, v: f32, low: u32, high: u32, number: u32) -> (f32, f32) {
-    // The finaliser of MurmurHash3 over the number, with both halves of the key: 16 bits for each moment.
+    // The finaliser of MurmurHash3 over the number and both halves of the key gives 16 bits for each moment.
     let mut draw = low ^ number.wrapping_mul(0x9e37_79b9);
     draw = (draw ^ (draw >> 16)).wrapping_mul(0x85eb_ca6b).wrapping_add(high);
     draw = (draw ^ (draw >> 13)).wrapping_mul(0xc2b2_ae35);
@@ -59,7 +58,7 @@ fn rounded(m: f32, v: f32, low: u32, high: u32, number: u32) -> (f32, f32) {
     (cut(m, draw & 0xffff), cut(v, draw >> 16))
 }
 
-/// The upper half after adding `draw` (16 bits) to the lower one. Finite numbers that moments can be stay finite.
+/// The upper half after adding `draw` (16 bits) to the lower one. Moments that are finite stay finite.
 #[inline(always)]
 fn cut(x: f32, draw: u32) -> f32 {
     f32::from_bits(x.to_bits().wrapping_add(draw) & 0xffff_0000)
@@ -92,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn rounding_is_right_in_the_mean_and_leaves_exact_numbers_alone() {
+    fn rounding_is_unbiased_and_keeps_exact_numbers() {
         let x = 1.0 + 1.0 / 512.0 + 1.0 / 2048.0; // 5/16 of the way from 1 to the next bfloat16
         let (mut ups, rows) = ([0u32; 2], 40_000);
         for uid in 0..rows {
@@ -113,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn second_moments_follow_where_rounding_to_nearest_stands_still() {
+    fn second_moments_follow_where_rounding_to_nearest_gets_stuck() {
         let adam = |moments| {
             DeferredAdam::new(Rates::new(1.0, 5000), AdamConfig::default(), SimdPath::best()).with_moments(moments)
         };
@@ -132,7 +131,7 @@ mod tests {
         // 4 - 3 * 0.999^2000 = 3.594.
         assert!((exact.exp_avg_sq.means[0] - 3.594).abs() < 1e-3);
         let mean = bf16.exp_avg_sq.means.iter().sum::<f32>() / 96.0;
-        // A rounding errs by up to an ulp of 2^-6, at random; over the memory of some 500 steps, in 96 values: 2 %.
+        // A rounding errs by up to an ulp of 2^-6, at random; over a memory of some 500 steps, in 96 values: 2 %.
         assert!((mean / 3.594 - 1.0).abs() < 0.02, "{mean}");
         let (mut stuck, b2) = (1.0f32, 0.001f32);
         (0..2000).for_each(|_| stuck = nearest(stuck + (4.0 - stuck) * b2));
@@ -142,7 +141,7 @@ mod tests {
                 assert!(table.column(column).iter().all(|x| x.to_bits() & 0xffff == 0), "{column:?}");
             }
         }
-        // The values hardly differ: steps of one rate's length each, 2,000 of them, with the root off by 1 %.
+        // The values hardly differ: 2,000 steps of one rate each, with the root off by 1 %.
         let moved = (exact.columns.means[0], bf16.columns.means[0]);
         assert!((moved.0 / moved.1 - 1.0).abs() < 0.01, "{moved:?}");
     }

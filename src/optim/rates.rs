@@ -1,8 +1,8 @@
 //! Learning rates: a pure function of column and step.
 //!
-//! Invariants: 1. steps are 0-based; 2. the rate of the means falls exponentially from `means` at step 0 to
-//! `means * means_final_factor` at step `steps` and stays there; the others are constant; 3. a rate depends on nothing
-//! else, so a resumed run has the same rates.
+//! Invariants: 1. steps are 0-based; 2. the rate of the means falls exponentially from `means` at step 0 to `means *
+//! means_final_factor` at step `steps` and stays there; the others are constant; 3. a rate depends on nothing else, so
+//! a resumed run has the same rates.
 
 use crate::scene::columns::Column;
 
@@ -21,7 +21,7 @@ pub struct Rates {
     pub sh0: f64,
     /// Higher colour bands.
     pub sh_n: f64,
-    /// Share of the rate of the means that is left at the end of the schedule.
+    /// Fraction of the means' rate that remains at the end of the schedule.
     pub means_final_factor: f64,
     /// Steps over which the rate of the means falls.
     pub steps: u32,
@@ -79,7 +79,7 @@ mod tests {
     fn only_the_means_decay() {
         let rates = Rates::new(2.0, 1000);
         assert_eq!(rates.at(Column::Means, 0), 3.2e-4);
-        // Half way in the exponent: a tenth. The slack is a few roundings of pow.
+        // Half way in the exponent: a tenth. The slack allows for a few roundings of pow.
         assert!((rates.at(Column::Means, 500) / 3.2e-5 - 1.0).abs() < 1e-12);
         assert!((rates.at(Column::Means, 1000) / 3.2e-6 - 1.0).abs() < 1e-12);
         assert_eq!(rates.at(Column::Means, 5000), rates.at(Column::Means, 1000));

@@ -1,16 +1,16 @@
-//! The two loops that go through all the optimizer's bytes: forwarding (values of listed rows as they are now) and the
-//! step, as every instruction path but AVX2 runs them.
+//! The two loops over all the optimizer's bytes: forwarding (current values of listed rows) and the step, for every
+//! instruction path except AVX2.
 //!
-//! A row is worked on in whole vectors ([`super::row_vectors`]), which where there are registers enough (AVX-512) stay in
-//! them from load to store. With AVX2 there are not: see `super::eights`.
+//! A row is processed in whole vectors ([`super::row_vectors`]), which stay in registers from load to store where there
+//! are enough of them (AVX-512). AVX2 has too few: see `super::eights`.
 //!
-//! The step takes the values of its rows from whoever forwarded them: to find them again would cost a second root and a
-//! second quotient for every value.
+//! The step receives the rows' current values from the forwarding pass: computing them again would cost another root
+//! and quotient per value.
 //!
 //! Floor: the bytes, 4 floats a parameter for forwarding and 7 for the step; `cargo bench --bench step touched` prints both beside a
 //! plain copy and beside plain passes of the same reads and writes.
 //!
-//! Invariant: the bits are those of [`RowsNow`], whatever the instruction path.
+//! Invariant: the bits are those of [`RowsNow`] on every instruction path.
 
 use super::adam::AdamConfig;
 use super::decay::Decay;
@@ -24,23 +24,23 @@ use crate::scene::rows::{
     BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, RowsNow, SH_N_LANE, first_lane,
 };
 
-/// Gradients beyond this are treated like non-finite ones: their square must not overflow the second moment. With it
-/// every number that an update computes from finite state is finite.
+/// Larger gradients are treated as non-finite: their square must not overflow the second moment. Below this limit every
+/// number that an update computes from finite state is finite.
 pub(super) const LARGEST_GRAD: f32 = 1e18;
-/// Log-scales are kept within this at every update: standard deviations of 1e-13 to 1e13 scene units, whose squares
-/// and projections stay finite. Out of reach of training that works.
+/// Log-scales are clamped to this at every update: standard deviations of 1e-13 to 1e13 scene units, whose squares and
+/// projections stay finite. Successful training never reaches it.
 const LOG_SCALE_LIMIT: f32 = 30.0;
 
-/// Rows that are asked for ahead of their turn.
+/// Rows to prefetch ahead.
 pub(super) const AHEAD: usize = 8;
-/// The sign of a float.
+/// The sign bit of a float.
 const SIGN: u32 = 1 << 31;
 
 /// Evaluates listed rows into a table.
 pub(super) struct EvaluateRows<'k, 'a, const W: usize, F> {
     pub at: &'k AdamNow<'a>,
     pub view: Rows<'k>,
-    /// Row of the view for a row of `out`.
+    /// Row of the view for each row of `out`.
     pub row_of: F,
     pub out: ColumnsMut<'k>,
 }
@@ -65,8 +65,8 @@ impl<const W: usize, F: Fn(usize) -> usize> Kernel for EvaluateRows<'_, '_, W, F
             if row + 1 < rows {
                 let past = Past { value: value.load(row), m: m.load(row), v: v.load(row), stamp: view.stamp[row] };
                 if let Some(now) = evaluate(at, &past) {
-                    // Stored here and not with what another function returns, which lies in memory: joined with that
-                    // every row would go through memory.
+                    // Stored here, instead of where the other function's result is handled: that result is in memory,
+                    // and merging both would send every row through memory.
                     out.store(i, &now);
                     continue;
                 }
@@ -76,16 +76,16 @@ impl<const W: usize, F: Fn(usize) -> usize> Kernel for EvaluateRows<'_, '_, W, F
     }
 }
 
-/// A row as its last update left it.
+/// A row as stored by its last update.
 struct Past<const W: usize> {
     value: RowVectors<W>,
     m: RowVectors<W>,
     v: RowVectors<W>,
-    /// Steps that it contains.
+    /// Number of steps that it contains.
     stamp: u32,
 }
 
-/// What the values of a row are now; nothing where eps touches one of them, or of those loaded with them.
+/// The current values of a row; `None` if eps affects one of them or a value loaded with them.
 #[inline(always)]
 fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>) -> Option<RowVectors<W>> {
     if past.stamp >= at.now() {
@@ -105,7 +105,7 @@ fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>) -> Option<RowVecto
     let mut sums = [[0.0; SH_N_LANE]; 3];
     for p in 0..3 {
         for l in 0..SH_N_LANE {
-            // Means are the first lanes.
+            // The first lanes are the means.
             sums[p][l] = if l < 3 { means[p] } else { others[p] };
         }
     }
@@ -119,8 +119,8 @@ fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>) -> Option<RowVecto
     Some(RowVectors(now))
 }
 
-/// The last row of a table, or one that [`evaluate`] has nothing for. Loads the row itself: what is handed to another
-/// function cannot stay in registers.
+/// Evaluates the last row of a table, or one for which [`evaluate`] returned `None`. Loads the row itself, because an
+/// argument could not stay in registers.
 #[cold]
 #[inline(never)]
 pub(super) fn evaluate_alone<const W: usize>(at: &AdamNow<'_>, view: &Rows<'_>, row: usize) -> RowVectors<W> {
@@ -129,7 +129,7 @@ pub(super) fn evaluate_alone<const W: usize>(at: &AdamNow<'_>, view: &Rows<'_>, 
     RowVectors::of_block(&now)
 }
 
-/// Something of every lane of a row; all of `sh_n` has the same.
+/// A value per lane of a row; all lanes of `sh_n` share one.
 #[derive(Debug, Clone)]
 pub(super) struct OfLanes {
     pub narrow: [f32; LANES],
@@ -137,7 +137,7 @@ pub(super) struct OfLanes {
 }
 
 impl OfLanes {
-    /// From something of every column.
+    /// From a value per column.
     pub fn new(of: impl Fn(Column) -> f32) -> Self {
         let mut narrow = [0.0; LANES];
         for column in Column::ALL.into_iter().filter(|&c| c != Column::ShN) {
@@ -146,7 +146,7 @@ impl OfLanes {
         OfLanes { narrow, sh_n: of(Column::ShN) }
     }
 
-    /// What a column has.
+    /// The value of a column.
     #[inline(always)]
     pub fn of(&self, column: Column) -> f32 {
         if column == Column::ShN { self.sh_n } else { self.narrow[first_lane(column)] }
@@ -162,12 +162,12 @@ pub(super) fn evaluate_block(at: &AdamNow<'_>, value: &mut RowBlock, m: &RowBloc
     }
 }
 
-/// One optimizer step on listed rows of a view, which ascend: one listed twice would lose its first step.
+/// One optimizer step on listed rows of a view. The rows ascend, because a row listed twice would lose its first step.
 pub(super) struct StepRows<'k, 'a, const W: usize> {
     pub at: &'k AdamNow<'a>,
     pub view: RowsMut<'k>,
     pub rows: &'k [u32],
-    /// The listed rows as they are now: what [`EvaluateRows`] makes of them.
+    /// Current values of the listed rows, from [`EvaluateRows`].
     pub values: ColumnsRef<'k>,
     pub grads: ColumnsRef<'k>,
 }
@@ -206,7 +206,7 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
                 continue;
             }
             counts.updated += 1;
-            // Before the loads, so that nothing comes between them and what is done with them.
+            // Placed before the loads, so that nothing separates them from their use.
             let decay = at.step_decay(stamp[row]);
             let mut now = value.load(i);
             let (mut m, mut v) = (exp_avg.as_ref().load(row), exp_avg_sq.as_ref().load(row));
@@ -220,7 +220,7 @@ impl<const W: usize> Kernel for StepRows<'_, '_, W> {
     }
 }
 
-/// What remains when the step has been taken on all listed `rows` but the last.
+/// Finishes the step that all listed `rows` except the last have taken.
 #[inline(always)]
 pub(super) fn finish_step<const W: usize>(
     at: &AdamNow<'_>,
@@ -232,9 +232,9 @@ pub(super) fn finish_step<const W: usize>(
 ) -> StepCounts {
     let kind = step_last::<W>(at, constants, view, last as usize - view.first_row, values, grads);
     if at.adam().moments() == Moments::Bf16 {
-        // In a loop of its own, which leaves the other one its registers.
+        // A loop of its own, so that the main loop keeps its registers.
         for row in rows.iter().map(|&row| row as usize - view.first_row) {
-            // Stamps are not ahead of now but for those of this step.
+            // Only rows of this step have stamps ahead of now.
             if view.stamp[row] > at.now() {
                 round_row::<W>(&mut view.exp_avg, &mut view.exp_avg_sq, row, view.uid[row], at.now() + 1);
             }
@@ -246,22 +246,22 @@ pub(super) fn finish_step<const W: usize>(
     }
 }
 
-/// What a row's gradient is to it.
+/// Kind of a row's gradient.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum GradKind {
-    /// Zero in every column: the row is left as it is.
+    /// Zero in every column: the row stays unchanged.
     Zero,
-    /// Something to step by.
+    /// Finite and usable.
     Usable,
     /// Not finite, or too large.
     Bad,
 }
 
 impl GradKind {
-    /// Lane by lane until the two questions, which are then answered by one comparison each.
+    /// Lane by lane up to the two final comparisons.
     #[inline(always)]
     fn of<const W: usize>(g: &RowVectors<W>) -> GradKind {
-        // Without their signs floats are ordered as integers, with what is not finite behind all others.
+        // Without signs, floats are ordered as integers, with non-finite ones after all others.
         let mut largest = [0; LANES];
         for first in (0..RowVectors::<W>::USED).step_by(LANES) {
             for l in 0..LANES {
@@ -282,7 +282,7 @@ impl GradKind {
     }
 }
 
-/// The step on the last listed row, which is row `row` of the view and may be its last. Cold: once for a thousand rows.
+/// The step on the last listed row, row `row` of the view, which may be the view's last. Cold: once per thousand rows.
 #[cold]
 #[inline(never)]
 fn step_last<const W: usize>(
@@ -314,7 +314,7 @@ fn step_last<const W: usize>(
     kind
 }
 
-/// Rounds the moments of a stored row that contains `steps` steps to what is kept of them.
+/// Rounds the moments of a stored row that contains `steps` steps to the storage format.
 #[inline(always)]
 fn round_row<const W: usize>(m: &mut ColumnsMut<'_>, v: &mut ColumnsMut<'_>, row: usize, uid: u64, steps: u32) {
     let [mut m_block, mut v_block] = [[0.0; BLOCK_LANES]; 2];
@@ -327,7 +327,7 @@ fn round_row<const W: usize>(m: &mut ColumnsMut<'_>, v: &mut ColumnsMut<'_>, row
 
 /// Constants of one ordinary Adam step.
 pub(super) struct StepConstants {
-    /// What the magnitudes of the narrow columns are kept within, by lane.
+    /// Limits on the magnitudes of the narrow columns, by lane.
     pub limits: [f32; LANES],
     /// lr / (1 - beta1^t).
     pub sizes: OfLanes,
@@ -380,7 +380,7 @@ impl StepConstants {
     #[inline(always)]
     fn step_value(&self, value: f32, m: f32, v: f32, g: f32, decay: Decay, step_size: f32) -> (f32, f32, f32) {
         let m = decay.first_moment(m);
-        // Not beta m + (1 - beta) g, for the reason that `super::decay` gives.
+        // Not beta m + (1 - beta) g, for the reason in `super::decay`.
         let m = flush(m + (g - m) * self.one_minus_b1);
         let v = decay.second_moment(v, g * g * self.one_minus_b2);
         let root = v.sqrt() * self.inv_root_correction + self.eps;

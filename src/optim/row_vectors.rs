@@ -1,15 +1,15 @@
-//! One row of a table in whole vectors: how the loops over rows ([`super::row_kernels`]) load and store it, in as few
-//! instructions as there are.
+//! One row of a table in whole vectors: how the loops over rows ([`super::row_kernels`]) load and store it with the
+//! fewest instructions.
 //!
-//! The narrow columns make one vector, `sh_n` the others. Where the last of these would not be full it starts earlier
-//! instead, and what it shares with the one before it comes to the same in both: so no load of `sh_n` has to wait for
-//! parts of a vector. That is right in place because a row, or at least its last vector, is loaded before any of it is
-//! stored. Columns of three values are loaded four at a time, the fourth being the first one of the row behind; so the
-//! last row of a table is left to [`RowVectors::of_block`].
+//! The narrow columns form one vector, `sh_n` the others. If the last of these would not be full, it starts earlier;
+//! the lanes that it shares with the previous vector get the same result in both. So no load of `sh_n` waits for parts
+//! of a vector. This is correct in place because a row, or at least its last vector, is loaded before any of it is
+//! stored. Columns of three values are loaded four at a time, where the fourth belongs to the next row; so the last row
+//! of a table is left to [`RowVectors::of_block`].
 //!
-//! Invariants: 1. all columns of a [`Table`] have the same number of rows, so that one check of a row number does for all;
-//! 2. the lanes of the row behind hold anything: they may send a row to slower code of the same bits, but nothing that is
-//! stored or counted depends on them.
+//! Invariants: 1. all columns of a [`Table`] have the same number of rows, so that one bounds check of a row number
+//! suffices; 2. lanes of the next row may hold anything: they may send a row to slower code with the same bits, but no
+//! stored or counted result depends on them.
 
 #[cfg(target_arch = "x86_64")]
 use crate::base::eight::{Avx2, EIGHT, Eight};
@@ -21,14 +21,14 @@ use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, SH_N_LAN
 #[derive(Clone, Copy)]
 pub(super) struct RowVectors<const W: usize>(pub [f32; BLOCK_LANES]);
 
-/// Whether a lane of a loaded row is one of the row behind it.
+/// Whether a lane of a loaded row belongs to the next row.
 #[inline(always)]
 pub(super) const fn is_of_row_behind(lane: usize) -> bool {
     lane == first_lane(Column::Scales) + 3 || lane == first_lane(Column::Sh0) + 3
 }
 
-/// The vectors of `sh_n` of width `W`: the lane that each starts at, where in `sh_n` that is, and how many of its lanes
-/// are in use.
+/// The vectors of `sh_n` of width `W`: the first lane of each, its position in `sh_n`, and the number of its lanes in
+/// use.
 #[inline(always)]
 fn parts<const W: usize>() -> impl Iterator<Item = (usize, usize, usize)> {
     (0..W.div_ceil(LANES)).map(|i| {
@@ -38,7 +38,7 @@ fn parts<const W: usize>() -> impl Iterator<Item = (usize, usize, usize)> {
 }
 
 impl<const W: usize> RowVectors<W> {
-    /// Lanes that are worked on.
+    /// Number of lanes processed.
     pub const USED: usize = SH_N_LANE + W.next_multiple_of(LANES);
 
     /// The same row with its columns one after the other.
@@ -51,7 +51,7 @@ impl<const W: usize> RowVectors<W> {
         block
     }
 
-    /// From a row with its columns one after the other.
+    /// Builds the vectors from a row with its columns one after the other.
     pub fn of_block(block: &RowBlock) -> Self {
         let mut lanes = [0.0; BLOCK_LANES];
         lanes[..SH_N_LANE].copy_from_slice(&block[..SH_N_LANE]);
@@ -62,7 +62,8 @@ impl<const W: usize> RowVectors<W> {
     }
 }
 
-/// Where the vectors of eight of an `sh_n` of width `W` start: the last one where it still ends within, see above.
+/// Start of each vector of eight of an `sh_n` of width `W`; the last one starts so that it ends within `sh_n`, see
+/// above.
 #[cfg(target_arch = "x86_64")]
 pub(super) const fn start_of_eight<const W: usize>(part: usize) -> usize {
     let last = W.saturating_sub(EIGHT);
@@ -81,7 +82,7 @@ pub(super) struct Table<'a, const W: usize> {
 }
 
 impl<'a, const W: usize> Table<'a, W> {
-    /// The first `rows` rows. Panics where there are fewer.
+    /// The first `rows` rows. Panics if there are fewer.
     #[inline(always)]
     pub fn new(columns: &ColumnsRef<'a>, rows: usize) -> Self {
         Table {
@@ -94,7 +95,7 @@ impl<'a, const W: usize> Table<'a, W> {
         }
     }
 
-    /// A row with what lies behind it. Panics at the last row and beyond.
+    /// Loads a row, with lanes of the next one. Panics at the last row and beyond.
     #[inline(always)]
     pub fn load(&self, row: usize) -> RowVectors<W> {
         let (m, q, o) = (&self.means[row], &self.quats[row], self.opacities[row]);
@@ -111,7 +112,7 @@ impl<'a, const W: usize> Table<'a, W> {
         RowVectors(block)
     }
 
-    /// Asks for `sh_n` of a row that will be loaded soon, but for what lies in a last line of a few values.
+    /// Prefetches `sh_n` of a row, except a last cache line of only a few values.
     #[inline(always)]
     pub fn prefetch(&self, row: usize) {
         for line in 0..W.div_ceil(LANES) {
@@ -119,9 +120,9 @@ impl<'a, const W: usize> Table<'a, W> {
         }
     }
 
-    /// The same for the narrow columns. They come by themselves, many rows to a line, as long as the processor follows all
-    /// tables: forwarding is no faster for being asked, the step on its five tables is by a tenth to a fifth (AMD Milan). The
-    /// loops in vectors of eight take fewer tables at a time, and are no faster.
+    /// Prefetches the narrow columns. The hardware prefetcher loads them, many rows to a line, as long as it can follow
+    /// all tables: forwarding gains nothing from this call, the step with its five tables a tenth to a fifth (AMD
+    /// Milan). The loops in vectors of eight use fewer tables at a time and gain nothing.
     #[inline(always)]
     pub fn prefetch_narrow(&self, row: usize) {
         prefetch(self.means, row);
@@ -134,14 +135,14 @@ impl<'a, const W: usize> Table<'a, W> {
 
 #[cfg(target_arch = "x86_64")]
 impl<'a, const W: usize> Table<'a, W> {
-    /// The narrow columns of a row: means, opacity and quats; scales and sh0. Panics at the last row and beyond.
+    /// Loads the narrow columns of a row: means, opacity and quats; scales and sh0. Panics at the last row and beyond.
     #[inline(always)]
     pub fn load_narrow(&self, avx2: Avx2, row: usize) -> [Eight; 2] {
         let low = avx2.load_three_one_four(with_behind(self.means, row), self.opacities[row], &self.quats[row]);
         [low, avx2.load_threes(with_behind(self.scales, row), with_behind(self.sh0, row))]
     }
 
-    /// Rows.
+    /// Number of rows.
     #[inline(always)]
     pub fn rows(&self) -> usize {
         self.opacities.len()
@@ -154,14 +155,14 @@ impl<'a, const W: usize> Table<'a, W> {
     }
 }
 
-/// A row and the one behind it.
+/// A row and the next one.
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
 fn with_behind(rows: &[[f32; 3]], row: usize) -> &[[f32; 3]; 2] {
     &rows[row..row + 2].as_chunks().0[0]
 }
 
-/// [`Table`] to write to.
+/// A mutable [`Table`].
 pub(super) struct TableMut<'a, const W: usize> {
     means: &'a mut [[f32; 3]],
     quats: &'a mut [[f32; 4]],
@@ -169,12 +170,12 @@ pub(super) struct TableMut<'a, const W: usize> {
     opacities: &'a mut [f32],
     sh0: &'a mut [[f32; 3]],
     sh_n: &'a mut [f32],
-    /// Where the last vector of `sh_n` starts.
+    /// Start of the last vector of `sh_n`.
     last_start: usize,
 }
 
 impl<'a, const W: usize> TableMut<'a, W> {
-    /// The first `rows` rows. Panics where there are fewer.
+    /// The first `rows` rows. Panics if there are fewer.
     #[inline(always)]
     pub fn new(columns: &'a mut ColumnsMut<'_>, rows: usize) -> Self {
         TableMut {
@@ -184,8 +185,8 @@ impl<'a, const W: usize> TableMut<'a, W> {
             opacities: &mut columns.opacities[..rows],
             sh0: &mut columns.sh0.as_chunks_mut().0[..rows],
             sh_n: &mut columns.sh_n[..rows * W],
-            // Kept from the compiler: it would cut the store before the last one down to what that does not overwrite,
-            // and three stores are slower than one.
+            // Hidden from the compiler: it would shorten the store before the last to the part that the last does not
+            // overwrite, and three stores are slower than one.
             last_start: std::hint::black_box(W.saturating_sub(LANES)),
         }
     }
@@ -203,14 +204,14 @@ impl<'a, const W: usize> TableMut<'a, W> {
         }
     }
 
-    /// [`TableMut::store`] of a row that comes from memory. Cold: once for a thousand rows.
+    /// [`TableMut::store`] for a row that comes from memory. Cold: once per thousand rows.
     #[cold]
     #[inline(never)]
     pub fn store_alone(&mut self, row: usize, vectors: &RowVectors<W>) {
         self.store(row, vectors);
     }
 
-    /// Writes a row, and nothing of the one behind it. Panics beyond the last row.
+    /// Stores a row without touching the next one. Panics beyond the last row.
     #[inline(always)]
     pub fn store(&mut self, row: usize, vectors: &RowVectors<W>) {
         let block = &vectors.0;
@@ -230,7 +231,7 @@ impl<'a, const W: usize> TableMut<'a, W> {
 
 #[cfg(target_arch = "x86_64")]
 impl<const W: usize> TableMut<'_, W> {
-    /// Writes the narrow columns of a row, lanes as in [`Table::load_narrow`], and nothing of the row behind it.
+    /// Stores the narrow columns of a row, lanes as in [`Table::load_narrow`], without touching the next row.
     #[inline(always)]
     pub fn store_narrow(&mut self, row: usize, [low, high]: [Eight; 2]) {
         low.store_three_one_four(&mut self.means[row], &mut self.opacities[row], &mut self.quats[row]);

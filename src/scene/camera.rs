@@ -1,9 +1,9 @@
 //! Camera: pose, pinhole intrinsics and size of one view, in the trainer's local frame.
 //!
-//! OpenCV axes: x right, y down, z forward. Distortion is removed from the pixels at load, so cameras here are
-//! pinholes. The centre of pixel (0, 0) is (0.5, 0.5).
+//! OpenCV axes: x right, y down, z forward. Loading removes distortion from the photos, so cameras are pinholes. The
+//! centre of pixel (0, 0) is (0.5, 0.5).
 
-/// A pinhole camera with a pose.
+/// A posed pinhole camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     /// World to camera, row-major 3x4: `p_cam = R p + t`, rows of `[R | t]`.
@@ -33,7 +33,7 @@ impl Camera {
         std::array::from_fn(|i| -(m[0][i] * m[0][3] + m[1][i] * m[1][3] + m[2][i] * m[2][3]))
     }
 
-    /// Pixels in the image.
+    /// Number of pixels.
     pub fn pixels(&self) -> usize {
         self.width as usize * self.height as usize
     }

@@ -1,8 +1,8 @@
-//! The six columns of a Gaussian and a table of rows in them.
+//! The six columns of a Gaussian, and a table of rows of them.
 //!
 //! Invariants: 1. values are stored *before* activation: log-scales, logit opacities, quaternions w-first and not
 //! necessarily unit; 2. every column holds exactly `rows * width` floats, row-major; 3. `sh_n` is coefficient-major
-//! (`[K-1][3]`, band 1 first), the order of the field's tensors; PLY's channel-major order is the exchange's matter.
+//! (`[K-1][3]`, band 1 first), the order of the field's tensors; the exchange converts to PLY's channel-major order.
 
 use crate::base::room;
 
@@ -62,7 +62,7 @@ pub fn row_width(sh_degree: u8) -> usize {
     14 + sh_n_width(sh_degree)
 }
 
-/// Rows of Gaussians by column. Also used for what has the same shape: gradients (`v_*`), `exp_avg`, `exp_avg_sq`.
+/// Rows of Gaussians by column; also gradients (`v_*`), `exp_avg` and `exp_avg_sq`, which have the same shape.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Columns {
     /// Degree that `sh_n` is stored with, 0 to 3.
@@ -102,7 +102,7 @@ impl Columns {
         }
     }
 
-    /// Makes room for the bands up to `degree`, as zeros; nothing happens when they are there already.
+    /// Adds the bands up to `degree`, as zeros, if they are missing.
     pub fn raise_sh_degree(&mut self, degree: u8) {
         if degree <= self.sh_degree {
             return;
@@ -111,7 +111,7 @@ impl Columns {
         let mut sh_n = vec![0.0; self.rows() * to];
         if from > 0 {
             for (wide, narrow) in sh_n.chunks_exact_mut(to).zip(self.sh_n.chunks_exact(from)) {
-                // Bands follow each other, lowest first.
+                // Bands are stored lowest first.
                 wide[..from].copy_from_slice(narrow);
             }
         }

@@ -1,40 +1,40 @@
-//! The log of global changes: what every row applies, now or when it is next touched.
+//! The log of global changes that every row applies, now or when it is next touched.
 //!
-//! An event of step s acts on rows as the optimizer step s left them, so on values that contain s + 1 steps. Whether
-//! it is applied at once or later makes no difference: its thresholds are decided when it is logged, and a row that
-//! nobody touched in between still is a function of its stored state.
+//! An event of step s acts on rows as optimizer step s left them, so on values that contain s + 1 steps. Applying it
+//! later gives the same result: its thresholds are fixed when it is logged, and an untouched row remains a function of
+//! its stored state.
 //!
-//! Invariants: 1. the log only grows; 2. steps never decrease in it; 3. the index of an event is its name: it is
-//! part of the uids of the rows that it makes.
+//! Invariants: 1. the log only grows; 2. its steps never decrease; 3. an event is identified by its index, which is
+//! part of the uids of the rows it creates.
 
 use serde::{Deserialize, Serialize};
 
-/// Children of a split lie within this many standard deviations of their parent, in its own axes: bounds of pages
-/// count on it. 1.1 % of draws are drawn again.
+/// Children of a split are drawn within this many standard deviations of their parent, along its own axes: bounds of
+/// pages rely on it. 1.1 % of draws are repeated.
 pub const SPLIT_SIGMAS: f64 = 3.33;
 
-/// What a densification round decides by. Everything absolute, so that a late application decides the same.
+/// Thresholds of a densification round. All are absolute, so that a late application decides the same.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RoundThresholds {
-    /// Rows grow whose mean gradient norm (NDC units) is greater. Infinite: nothing grows.
+    /// Rows with a greater mean gradient norm (NDC units) grow. Infinity: none grows.
     pub grow_grad2d: f32,
-    /// Growing rows whose largest standard deviation is greater are split, the others duplicated.
+    /// Growing rows with a greater largest standard deviation are split, the others duplicated.
     pub split_scale: f32,
-    /// Rows are pruned whose opacity is smaller.
+    /// Rows with a smaller opacity are pruned.
     pub prune_opacity: f32,
-    /// Rows are pruned whose largest standard deviation is greater. Infinite: none.
+    /// Rows with a greater largest standard deviation are pruned. Infinity: none.
     pub prune_scale: f32,
 }
 
-/// One kind of global change.
+/// A kind of global change.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum EventKind {
-    /// Opacities above the given one are set to it; the moments of all opacities become zero.
+    /// Opacities above the given one are lowered to it; the moments of all opacities become zero.
     ResetOpacity {
-        /// Largest opacity (after activation) that remains.
+        /// Largest remaining opacity (after activation).
         max_opacity: f32,
     },
-    /// Bands up to this degree are rendered from now on. Rows that are stored without them get zeros.
+    /// Bands up to this degree are rendered from now on. Rows stored without them get zeros.
     RaiseShDegree {
         /// The degree.
         degree: u8,
@@ -43,12 +43,12 @@ pub enum EventKind {
     Densify(RoundThresholds),
 }
 
-/// One global change and its time.
+/// A global change and its step.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Event {
     /// 0-based optimizer step after which it happens.
     pub step: u32,
-    /// What happens.
+    /// The change.
     pub kind: EventKind,
 }
 
@@ -66,12 +66,12 @@ pub struct EventLog {
 }
 
 impl EventLog {
-    /// A log from its entries, for instance read back from a checkpoint; `None` when their steps decrease.
+    /// A log from its entries, for instance from a checkpoint; `None` if steps decrease.
     pub fn from_events(events: Vec<Event>) -> Option<Self> {
         events.windows(2).all(|pair| pair[0].step <= pair[1].step).then_some(EventLog { events })
     }
 
-    /// Appends an event and returns its index. Panics when its step lies before the last one's.
+    /// Appends an event and returns its index. Panics if its step is before the last one's.
     pub fn push(&mut self, event: Event) -> usize {
         assert!(self.events.last().is_none_or(|last| last.step <= event.step), "events are logged in order of time");
         self.events.push(event);
@@ -83,7 +83,7 @@ impl EventLog {
         self.events.len()
     }
 
-    /// Whether nothing has happened yet.
+    /// Whether the log is empty.
     pub fn is_empty(&self) -> bool {
         self.events.is_empty()
     }
@@ -93,7 +93,7 @@ impl EventLog {
         &self.events
     }
 
-    /// The events that rows still miss which have applied the first `applied` ones, with their indices.
+    /// The events after the first `applied` ones, with their indices.
     pub fn pending(&self, applied: usize) -> impl Iterator<Item = (usize, Event)> + '_ {
         self.events.iter().copied().enumerate().skip(applied)
     }

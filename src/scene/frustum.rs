@@ -1,11 +1,10 @@
-//! What a camera can draw, as half-spaces: the test of one row and the test of one page.
+//! The view frustum as half-spaces: tests whether a camera may draw a row or a page.
 //!
 //! Not here: evaluating rows, listing pages (`schedule::visibility`).
 //!
-//! Invariants: 1. both tests are conservative: whatever its rotation and opacity, a row that the projection would draw
-//! passes the row test, and a row that passes the row test lies in no page that fails the page test (if the page's
-//! bounds hold the row); 2. NaN counts as drawn; 3. only + - * / sqrt, nothing contracted: the same answer on every
-//! instruction path.
+//! Invariants: 1. both tests are conservative: a row that the projection would draw, with any rotation and opacity,
+//! passes the row test; and a page fails the page test only if every row within its bounds fails the row test; 2. NaN
+//! counts as drawn; 3. only + - * / sqrt, nothing contracted: the same answer on every instruction path.
 
 use super::camera::Camera;
 use super::page_meta::PageBounds;
@@ -15,24 +14,26 @@ pub const EPS2D: f32 = 0.3;
 /// Largest extent of a footprint, in standard deviations: beyond it alpha is below 1/255 even at opacity 1.
 pub const EXTENT_SIGMAS: f32 = 3.33;
 
-/// The view angle at which the projection's Jacobian is clamped lies this share of the half field of view outside it.
+/// The projection's Jacobian is clamped at a view angle outside the field of view by this fraction of its half.
 const CLAMP_MARGIN: f32 = 0.3;
-/// Rounding slack of a camera coordinate, per unit of position: sixteen times what a dot product of four terms loses.
+/// Rounding slack of a camera coordinate, per unit of position: sixteen times the rounding error of a dot product of
+/// four terms.
 const POSITION_SLACK: f32 = 4e-6;
-/// Relative slack on slopes and footprints, for the roundings of the projection itself.
+/// Relative slack on slopes and footprints, for the projection's own roundings.
 const RELATIVE_SLACK: f32 = 1e-4;
-/// The page test's slack: that of the row test, and as much again for the roundings of both tests (each loses at most
-/// eight roundings of 6e-8 per unit of position, together a quarter of what is given here).
+/// Slack of the page test: that of the row test, and as much again for the roundings of both tests (each at most eight
+/// roundings of 6e-8 per unit of position, together a quarter of this slack).
 const PAGE_POSITION_SLACK: f32 = 2.0 * POSITION_SLACK;
-/// Footprints in the page test are this much longer: sixteen roundings.
+/// Factor on footprints in the page test: sixteen roundings.
 const PAGE_REACH: f32 = 1.0 + 1e-6;
 
 /// Half-spaces of a camera in its own axes, each shifted outwards by a multiple of the row's largest sigma.
 ///
-/// A row is drawn when z lies between the planes and its box meets the image. The box's half width is at most
-/// ceil(3.33 sqrt(c_xx)), with c_xx <= (sigma_max fx / z)^2 (1 + lim^2) + 0.3, lim being the angle at which the Jacobian is
+/// A row is drawn if z is between the planes and its box meets the image. The box's half width is at most ceil(3.33
+/// sqrt(c_xx)), with c_xx <= (sigma_max fx / z)^2 (1 + lim^2) + 0.3, where lim is the angle at which the Jacobian is
 /// clamped; the square root of a sum is at most the sum of the roots. Multiplied by z / fx, the box meets the image
-/// only if  x <= ((W - cx) + 3.33 sqrt 0.3 + 1) / fx z + 3.33 sigma_max sqrt(1 + lim^2),  and likewise on the other sides.
+/// only if  x <= ((W - cx) + 3.33 sqrt 0.3 + 1) / fx z + 3.33 sigma_max sqrt(1 + lim^2),  and likewise on the other
+/// sides.
 #[derive(Debug, Clone, Copy)]
 pub struct Frustum {
     viewmat: [[f32; 4]; 3],
@@ -40,9 +41,9 @@ pub struct Frustum {
     translation: f32,
     near: f32,
     far: f32,
-    /// Slopes of the planes at x low, x high, y low, y high; outwards positive.
+    /// Slopes of the planes at x low, x high, y low, y high; positive outwards.
     slopes: [f32; 4],
-    /// Sigmas that a footprint reaches beyond its mean, in x and y.
+    /// Reach of a footprint beyond its mean in x and y, in sigmas.
     reach: [f32; 2],
 }
 
@@ -71,14 +72,15 @@ impl Frustum {
         }
     }
 
-    /// Steepest side plane: a camera coordinate's rounding error enters a side test times one plus this.
+    /// The steepest side plane: a camera coordinate's rounding error enters a side test multiplied by one plus this
+    /// slope.
     #[inline(always)]
     fn steepest(&self) -> f32 {
         let slopes = &self.slopes;
         slopes[0].abs().max(slopes[1].abs()).max(slopes[2].abs()).max(slopes[3].abs())
     }
 
-    /// Whether a row at `p` with this largest sigma may be drawn. Comparisons are such that a NaN counts as drawn.
+    /// Whether a row at `p` with this largest sigma may be drawn. NaN counts as drawn.
     #[inline(always)]
     pub fn may_draw(&self, p: [f32; 3], sigma_max: f32) -> bool {
         let m = &self.viewmat;
@@ -98,10 +100,10 @@ impl Frustum {
         !outside
     }
 
-    /// The same half-spaces over world positions, for boxes.
+    /// The same half-spaces in world coordinates, for boxes.
     pub fn planes(&self) -> PagePlanes {
         let m = &self.viewmat;
-        // A row is outside when  sign * (row `axis` of the pose) - slope * z  exceeds its reach.
+        // A row is outside if  sign * (row `axis` of the pose) - slope * z  exceeds its reach.
         let side = |axis: usize, sign: f32, slope: f32| {
             let at = |i: usize| sign * m[axis][i] - slope * m[2][i];
             PagePlane {
@@ -132,11 +134,11 @@ impl Frustum {
     }
 }
 
-/// One half-space: a box lies outside when `normal . p + offset` exceeds `reach * sigma_max + slack * size` at every
-/// corner, `size` being the largest sum of coordinates of the box plus that of the camera.
+/// One half-space: a box is outside if `normal . p + offset` exceeds `reach * sigma_max + slack * size` at every
+/// corner. `size` is the largest sum of coordinates of the box plus that of the camera.
 #[derive(Debug, Clone, Copy)]
 pub struct PagePlane {
-    /// Outwards, not of unit length.
+    /// Points outwards; not of unit length.
     pub normal: [f32; 3],
     /// Value at the origin.
     pub offset: f32,
@@ -146,7 +148,7 @@ pub struct PagePlane {
     pub slack: f32,
 }
 
-/// The six half-spaces of a camera over world positions.
+/// The six half-spaces of a camera in world coordinates.
 #[derive(Debug, Clone, Copy)]
 pub struct PagePlanes {
     /// Near, far, x low, x high, y low, y high.
@@ -156,7 +158,7 @@ pub struct PagePlanes {
 }
 
 impl PagePlanes {
-    /// Whether a row inside of these bounds may be drawn. `schedule::visibility` does the same for many pages at once.
+    /// Whether a row within these bounds may be drawn. `schedule::visibility` computes the same for many pages at once.
     pub fn may_meet(&self, bounds: &PageBounds) -> bool {
         if bounds.is_empty() {
             return false;

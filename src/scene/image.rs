@@ -1,4 +1,4 @@
-//! Images as data: what the renderer makes and what it is compared with.
+//! Images as data: rendered pictures and the photos they are compared with.
 
 /// A rendered picture: planar f32, `[3][height][width]`, not clamped.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -20,7 +20,7 @@ pub struct Target {
     pub height: u32,
     /// Interleaved RGB, row-major.
     pub rgb: Vec<u8>,
-    /// One byte per pixel, 255 = counts, 0 = is left out of loss and metrics; `None` when every pixel counts.
+    /// One byte per pixel: 255 = used, 0 = excluded from loss and metrics; `None` if every pixel is used.
     pub mask: Option<Vec<u8>>,
 }
 
@@ -30,12 +30,12 @@ impl Image {
         Image { width, height, rgb: vec![0.0; 3 * width as usize * height as usize] }
     }
 
-    /// Pixels in one plane.
+    /// Number of pixels in one plane.
     pub fn pixels(&self) -> usize {
         self.width as usize * self.height as usize
     }
 
-    /// Interleaved 8-bit copy, clamped and rounded to nearest.
+    /// An interleaved 8-bit copy, clamped and rounded to nearest.
     pub fn to_rgb8(&self) -> Vec<u8> {
         let n = self.pixels();
         let mut out = Vec::with_capacity(3 * n);
@@ -49,17 +49,17 @@ impl Image {
 }
 
 impl Target {
-    /// Pixels in the image.
+    /// Number of pixels.
     pub fn pixels(&self) -> usize {
         self.width as usize * self.height as usize
     }
 
-    /// Whether any pixel counts.
+    /// Whether any pixel is used.
     pub fn counts(&self) -> bool {
         self.mask.as_ref().is_none_or(|mask| mask.iter().any(|&byte| byte != 0))
     }
 
-    /// Bytes that this target keeps in memory.
+    /// Bytes in memory.
     pub fn bytes(&self) -> u64 {
         (self.rgb.len() + self.mask.as_ref().map_or(0, Vec::len)) as u64
     }

@@ -1,9 +1,9 @@
-//! First Gaussians from points; points where the dataset has none.
+//! Creates the first Gaussians from points, and random points for datasets without any.
 //!
 //! Not here: reading points, choosing the local frame.
 //!
-//! Invariants: 1. every value made here is finite, whatever the points; 2. a draw depends on the seed and the row
-//! (or point) alone; 3. row i holds the i-th point that was kept, and its uid is i.
+//! Invariants: 1. every value made here is finite, for any points; 2. a draw depends on the seed and the row (or point)
+//! alone; 3. row i holds the i-th point kept, and its uid is i.
 
 use super::camera::Camera;
 use super::columns::{Column, Columns};
@@ -15,16 +15,16 @@ use rayon::prelude::*;
 /// Value of the constant SH basis function, 1 / (2 sqrt(pi)): colour = C0 sh0 + 1/2 at degree 0.
 pub const SH_C0: f64 = 0.282_094_791_773_878_14;
 
-/// First word of the hash that chooses among too many points.
+/// First word of the hash that selects points when there are too many.
 const SUBSAMPLE: u64 = 0x7375_6273_616d_706c;
 
-/// Scale of a row when no two points of the cloud differ, in units of the scene scale.
+/// Scale of the rows if all points coincide, in units of the scene scale.
 const LONE_POINT_SCALE: f64 = 0.01;
 
-/// What first Gaussians depend on besides the points.
+/// Options for the first Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InitOptions {
-    /// Degree that the rows are stored with, 0 to 3. The higher bands start at zero.
+    /// SH degree of the stored rows, 0 to 3. The higher bands start at zero.
     pub sh_degree: u8,
     /// First opacity, in (0, 1).
     pub opacity: f32,
@@ -32,13 +32,13 @@ pub struct InitOptions {
     pub scale_factor: f32,
     /// Seed of the run.
     pub seed: u64,
-    /// At most this many rows.
+    /// Most rows.
     pub max_gaussians: Option<usize>,
-    /// Size of the scene, local units: what the two guards refer to.
+    /// Size of the scene, local units; the two limits below are multiples of it.
     pub scene_scale: f32,
-    /// No first scale is below this many scene scales.
+    /// Smallest first scale, in scene scales.
     pub min_scale: f32,
-    /// No first scale is above this many scene scales.
+    /// Largest first scale, in scene scales.
     pub max_scale: f32,
 }
 
@@ -57,17 +57,17 @@ impl Default for InitOptions {
     }
 }
 
-/// One isotropic Gaussian per point, as gsplat's trainer starts: the scale is the root mean square distance to the
-/// three nearest points times `scale_factor`, the rotation is random, the colour is the point's.
+/// Creates one isotropic Gaussian per point, as gsplat's trainer does: the scale is the root mean square distance to
+/// the three nearest points times `scale_factor`, the rotation is random, the colour is the point's.
 ///
-/// Differences to gsplat, all for clouds that it cannot start from: with fewer than four points the mean is over
-/// those there are; a point whose neighbours all coincide with it gets the median distance of the others (0.01 scene
-/// scales when there are none); scales are kept within the guards of [`InitOptions`]; points that are not finite get
-/// no row. Rotations are uniform on the sphere and of unit length, where gsplat's are uniform in [0, 1)^4: at first
-/// the Gaussians are round, so this shows in no picture.
+/// Differences to gsplat concern clouds that it cannot start from: with fewer than four points the mean is over the
+/// existing neighbours; a point whose neighbours all coincide with it gets the median distance of the others (0.01
+/// scene scales if there are none); scales are limited by [`InitOptions`]; non-finite points get no row. Rotations are
+/// uniform on the sphere and of unit length, where gsplat's are uniform in [0, 1)^4; since the first Gaussians are
+/// round, no picture shows the difference.
 ///
-/// Beyond `max_gaussians` the points with the smallest hashes of (seed, index) stay, in their order, and distances
-/// are those among the points that stay.
+/// If there are more than `max_gaussians` points, those with the smallest hashes of (seed, index) are kept, in order,
+/// and distances are those among the kept points.
 pub fn gaussians_from_points(points: &[[f32; 3]], colors: &[[u8; 3]], options: &InitOptions) -> Columns {
     let kept = kept_points(points, options);
     let means: Vec<[f32; 3]> = kept.iter().map(|&i| points[i]).collect();
@@ -81,12 +81,12 @@ pub fn gaussians_from_points(points: &[[f32; 3]], colors: &[[u8; 3]], options: &
     first_gaussians(kept.len(), point, options)
 }
 
-/// A point with the size that its Gaussian starts with.
+/// A point with the first size of its Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FirstPoint {
     /// Position.
     pub point: [f32; 3],
-    /// Row among all that start: part of the key of its random rotation.
+    /// Row among all first Gaussians: part of the key of its random rotation.
     pub row: u32,
     /// sRGB.
     pub color: [u8; 3],
@@ -94,7 +94,7 @@ pub struct FirstPoint {
     pub log_scale: f32,
 }
 
-/// The first Gaussians of some points.
+/// Creates the first Gaussians of some points.
 pub fn first_gaussians(rows: usize, point: impl Fn(usize) -> FirstPoint, options: &InitOptions) -> Columns {
     let mut columns = Columns::zeros(rows, options.sh_degree);
     columns.opacities.fill(logit(options.opacity));
@@ -121,20 +121,20 @@ fn kept_points(points: &[[f32; 3]], options: &InitOptions) -> Vec<usize> {
     kept
 }
 
-/// Orders points for the choice among too many: the smallest stay. For one seed a bijection of the index, so there are
-/// no ties.
+/// Key for selecting points when there are too many: those with the smallest keys stay. For one seed a bijection of the
+/// index, so there are no ties.
 pub fn subsample_key(seed: u64, index: u64) -> u64 {
     hash64(&[seed, SUBSAMPLE, index])
 }
 
-/// Root mean square of the distances to the neighbours that there are; 0 without any.
+/// Root mean square of the distances to the existing neighbours; 0 without any.
 pub fn rms_distance(dist2: &[f32; 3]) -> f64 {
     let there = dist2.iter().filter(|d| d.is_finite());
     let (sum, count) = there.fold((0.0, 0u32), |(sum, count), &d| (sum + f64::from(d), count + 1));
     if count == 0 { 0.0 } else { libm::sqrt(sum / f64::from(count)) }
 }
 
-/// From distances to first log-scales.
+/// Converts distances to first log-scales.
 #[derive(Debug, Clone, Copy)]
 pub struct ScaleRule {
     factor: f64,
@@ -144,7 +144,7 @@ pub struct ScaleRule {
 }
 
 impl ScaleRule {
-    /// The rule; `typical` is the median of the distances above zero ([`middle_rank`]), if there are any.
+    /// The rule; `typical` is the median of the positive distances ([`middle_rank`]), if any.
     pub fn new(options: &InitOptions, typical: Option<f64>) -> ScaleRule {
         let scene_scale = f64::from(options.scene_scale);
         ScaleRule {
@@ -155,15 +155,15 @@ impl ScaleRule {
         }
     }
 
-    /// Log of the first scale at a distance.
+    /// Log of the first scale for a distance.
     pub fn log_scale(&self, distance: f64) -> f32 {
         let distance = if distance > 0.0 { distance } else { self.fallback };
-        // max, then min: not clamp, which panics when the options are the wrong way round.
+        // max, then min: clamp would panic if the limits are swapped.
         libm::log((distance * self.factor).max(self.low).min(self.high)) as f32
     }
 }
 
-/// Rank of the value that stands for a median.
+/// Rank of the value used as the median.
 pub fn middle_rank(count: usize) -> usize {
     count / 2
 }
@@ -189,7 +189,7 @@ fn random_rotation(stream: &mut Stream) -> [f32; 4] {
     let mut in_disk = || loop {
         let (a, b) = (stream.range(-1.0, 1.0), stream.range(-1.0, 1.0));
         let r2 = a * a + b * b;
-        // The lower end keeps the division below finite.
+        // The lower limit keeps the division below finite.
         if r2 < 1.0 && r2 > 1e-12 {
             return (a, b, r2);
         }
@@ -200,9 +200,9 @@ fn random_rotation(stream: &mut Stream) -> [f32; 4] {
     [w as f32, x as f32, (y * stretch) as f32, (z * stretch) as f32]
 }
 
-/// `count` points with random colours in what the cameras see, for datasets without points: a random camera, a random
-/// place of its image, a depth uniform in [near, far). Uniform depth thins out as 1/z^2 in space, which is as many
-/// points per pixel near as far. Empty when there are no cameras.
+/// `count` points with random colours in the views' frusta, for datasets without points: a random camera, a random
+/// pixel, a depth uniform in [near, far). Uniform depth thins out as 1/z^2 in space, which gives as many points per
+/// pixel near as far. Empty without cameras.
 pub fn random_points_in_frusta(
     cameras: &[Camera],
     count: usize,

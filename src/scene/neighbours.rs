@@ -1,13 +1,13 @@
 //! Exact distances to the three nearest neighbours of every point of a cloud, by a k-d tree over sorted arrays.
 //!
-//! A cloud that is only there in parts is searched part by part: [`NeighbourTree::nearer`] gives what one part adds.
+//! A cloud that is loaded in parts is searched part by part: [`NeighbourTree::nearer`] gives what one part adds.
 //!
-//! Not here: what the distances are for.
+//! Not here: the use of the distances.
 //!
-//! Invariants: 1. distances are those of a brute-force search in f32, bit for bit: bounds of boxes are computed with
-//! the same operations in the same order as distances of points, and rounding is monotone, so that a box is never
-//! farther than a point in it; 2. the result does not depend on threads; 3. O(n log n) however the points cluster:
-//! the tree halves the points, not the space, and equal points may lie on both sides.
+//! Invariants: 1. distances are those of a brute-force search in f32, bit for bit: distances to boxes use the same
+//! operations in the same order as distances to points, and rounding is monotone, so a box is never farther than a
+//! point in it; 2. the result does not depend on threads; 3. O(n log n) for any clustering: the tree halves the points,
+//! not the space, and equal points may be on both sides.
 
 use rayon::prelude::*;
 
@@ -25,7 +25,7 @@ struct Entry {
     index: u32,
 }
 
-/// The box of some points.
+/// The bounding box of some points.
 #[derive(Debug, Clone, Copy)]
 pub struct Bounds {
     /// Lower corner.
@@ -34,16 +34,16 @@ pub struct Bounds {
     pub high: [f32; 3],
 }
 
-/// A balanced tree: every node halves its range of `entries`, all leaves are at depth `levels`. `boxes` is in
-/// preorder: the left child of a node follows it, the right child of one with `l` levels below is 2^l further.
+/// A balanced tree: every node halves its range of `entries`, and all leaves are at depth `levels`. `boxes` is in
+/// preorder: a node's left child is next to it, the right child of a node with `l` levels below is 2^l further.
 pub struct NeighbourTree {
     entries: Vec<Entry>,
     boxes: Vec<Bounds>,
     levels: u32,
 }
 
-/// Squared distances of every point to its three nearest other points, ascending; infinity where there are fewer
-/// points. Other points at the same place count, at distance 0. Coordinates that are not finite have no neighbours.
+/// Squared distances of every point to its three nearest other points, ascending; infinity if there are fewer. Other
+/// points at the same place count, with distance 0. Points with non-finite coordinates have no neighbours.
 ///
 /// # Panics
 /// With 2^32 points or more.
@@ -52,7 +52,7 @@ pub fn nearest_dist2(points: &[[f32; 3]]) -> Vec<[f32; NEIGHBOURS]> {
 }
 
 impl NeighbourTree {
-    /// The tree of some points.
+    /// Builds the tree of some points.
     ///
     /// # Panics
     /// With 2^32 points or more.
@@ -75,7 +75,7 @@ impl NeighbourTree {
         by_entry.par_chunks_mut(QUERIES_PER_TASK).enumerate().for_each(|(task, out)| {
             let first = task * QUERIES_PER_TASK;
             for (entry, out) in self.entries[first..].iter().zip(out) {
-                // The point itself is found too, at distance 0, which no other point can undercut.
+                // The search also finds the point itself, at distance 0, which no other point can undercut.
                 let mut best = [f32::INFINITY; NEIGHBOURS + 1];
                 self.search(0, self.levels, 0, self.entries.len(), entry.point, &mut best);
                 out.copy_from_slice(&best[1..]);
@@ -88,8 +88,8 @@ impl NeighbourTree {
         by_point
     }
 
-    /// Squared distances below `limit` from `q`, which is no point of the tree, to its nearest points, ascending;
-    /// infinity where there are fewer.
+    /// Squared distances below `limit` from `q`, which is not a point of the tree, to its nearest points, ascending;
+    /// infinity if there are fewer.
     pub fn nearer(&self, q: [f32; 3], limit: f32) -> [f32; NEIGHBOURS] {
         let mut best = [limit; NEIGHBOURS + 1];
         if self.bounds().dist2(q) < limit {
@@ -98,7 +98,7 @@ impl NeighbourTree {
         std::array::from_fn(|i| if best[i] < limit { best[i] } else { f32::INFINITY })
     }
 
-    /// The box of all points.
+    /// The bounding box of all points.
     pub fn bounds(&self) -> Bounds {
         self.boxes[0]
     }
@@ -138,7 +138,7 @@ impl Bounds {
         b
     }
 
-    /// Squared distance of the box from a point; never above that of a point in it.
+    /// Squared distance of the box from a point; never greater than that of a point in the box.
     #[inline]
     pub fn dist2(&self, q: [f32; 3]) -> f32 {
         dist2(std::array::from_fn(|i| (self.low[i] - q[i]).max(q[i] - self.high[i]).max(0.0)))
@@ -150,14 +150,14 @@ fn dist2(d: [f32; 3]) -> f32 {
     d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
 }
 
-/// The smallest of two lists, ascending.
+/// The smallest values of two lists, ascending.
 pub fn merged(a: [f32; NEIGHBOURS], b: [f32; NEIGHBOURS]) -> [f32; NEIGHBOURS] {
     let mut best = [a[0], a[1], a[2], f32::INFINITY];
     b.into_iter().for_each(|value| insert(&mut best, value));
     [best[0], best[1], best[2]]
 }
 
-/// Keeps the smallest values, ascending. NaN is never kept.
+/// Keeps the smallest values, ascending; never NaN.
 #[inline]
 fn insert(best: &mut [f32; 4], value: f32) {
     if value < best[3] {
@@ -179,7 +179,7 @@ fn build(entries: &mut [Entry], boxes: &mut [Bounds], levels: u32) {
     let extent = |i: usize| boxes[0].high[i] - boxes[0].low[i];
     let axis = (1..3).fold(0, |widest, i| if extent(i) > extent(widest) { i } else { widest });
     let middle = entries.len() / 2;
-    // Ties by index make the two halves a function of the points alone.
+    // Ties are ordered by index, so that the two halves are a function of the points alone.
     entries.select_nth_unstable_by(middle, |a, b| a.point[axis].total_cmp(&b.point[axis]).then(a.index.cmp(&b.index)));
     let serial = entries.len() < SERIAL_BELOW;
     let (left, right) = entries.split_at_mut(middle);
@@ -222,7 +222,7 @@ mod tests {
                 }
                 // A coarse lattice: nearly every point has duplicates and ties.
                 2 => std::array::from_fn(|_| s.below(4) as f32),
-                // A surface with offsets that eat most of f32.
+                // A surface with offsets that use up most of f32's precision.
                 _ => [1e4 + s.uniform() as f32, -2e4 + s.uniform() as f32, 300.0],
             }
         };
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_points_and_broken_points_are_survived() {
+    fn equal_and_non_finite_points_are_handled() {
         assert_eq!(nearest_dist2(&[[2.5; 3]; 500]), vec![[0.0; 3]; 500]);
         let mut points = cloud(200, 0);
         points[7] = [f32::NAN; 3];

@@ -1,11 +1,11 @@
-//! Where the rows of one page lie in its bytes: the same in memory and, uncompressed, on disk.
+//! Layout of a page's rows in its bytes: the same in memory and, uncompressed, on disk.
 //!
 //! Tables follow each other, each padded to [`TABLE_ALIGNMENT`]: identities and statistics, then the column groups
 //! geometry (means, quats, scales), appearance (opacities, sh0) and the higher bands, each column as values, first
-//! moments, second moments. Bands that a page does not use take no bytes: its degree is part of the layout.
+//! moments, second moments. Unused bands take no bytes: the page's degree is part of the layout.
 //!
 //! Invariants: 1. a layout is a function of (rows, degree) alone; 2. tables do not overlap and their padding is zero;
-//! 3. more rows or a higher degree never make the payload shorter. Little-endian machines only, which is checked at
+//! 3. more rows or a higher degree never shorten the payload. Only for little-endian machines, which is checked at
 //! compile time.
 
 use super::columns::{Column, Columns};
@@ -15,7 +15,7 @@ use bytemuck::{AnyBitPattern, NoUninit};
 
 const _: () = assert!(cfg!(target_endian = "little"), "pages on disk are little-endian");
 
-/// Every table starts at a multiple of this within the payload, bytes: one vector register, one cache line.
+/// Alignment of every table within the payload, bytes: one vector register, one cache line.
 pub const TABLE_ALIGNMENT: usize = 64;
 
 /// The layout of a page's payload.
@@ -23,20 +23,20 @@ pub const TABLE_ALIGNMENT: usize = 64;
 pub struct PageLayout {
     /// Rows in the page.
     pub rows: usize,
-    /// Degree that the page is stored with, 0 to 3.
+    /// SH degree of the stored page, 0 to 3.
     pub sh_degree: u8,
 }
 
 impl PageLayout {
-    /// Bytes of the payload: at least [`super::state::row_bytes`] a row, plus padding.
+    /// Bytes of the payload: at least [`super::state::row_bytes`] per row, plus padding.
     pub fn bytes(&self) -> usize {
         let floats = |width: usize| padded(self.rows * width * 4);
         let columns: usize = Column::ALL.iter().map(|c| 3 * floats(c.width(self.sh_degree))).sum();
         padded(self.rows * 8) + 3 * floats(1) + columns
     }
 
-    /// The rows in `payload`, numbered from `first_row` in the table of a working set. Panics when it is shorter than
-    /// [`PageLayout::bytes`] or not aligned to 8 bytes.
+    /// The rows in `payload`, numbered from `first_row` in the table of a working set. Panics if `payload` is shorter
+    /// than [`PageLayout::bytes`] or not aligned to 8 bytes.
     pub fn rows<'a>(&self, payload: &'a [u8], first_row: usize) -> Rows<'a> {
         let mut rest = payload;
         let uid = take(&mut rest, self.rows);
@@ -52,7 +52,7 @@ impl PageLayout {
         Rows { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count }
     }
 
-    /// As [`PageLayout::rows`], exclusive.
+    /// As [`PageLayout::rows`], mutable.
     pub fn rows_mut<'a>(&self, payload: &'a mut [u8], first_row: usize) -> RowsMut<'a> {
         let mut rest = payload;
         let uid = take_mut(&mut rest, self.rows);
@@ -70,13 +70,13 @@ impl PageLayout {
     }
 }
 
-/// Payload bytes of a full page of `page_rows` rows at the degree of the scene.
+/// Payload bytes of a full page of `page_rows` rows at the scene's degree.
 pub fn capacity_bytes(page_rows: usize, sh_degree: u8) -> usize {
     PageLayout { rows: page_rows, sh_degree }.bytes()
 }
 
-/// Writes all rows of `state` as a page; returns its layout. The rest of `payload` is left alone, padding is zeroed.
-/// Panics when `payload` is too short.
+/// Writes all rows of `state` as a page; returns its layout. Zeroes the padding and leaves the rest of `payload`
+/// unchanged. Panics if `payload` is too short.
 pub fn write_page(state: &SceneState, payload: &mut [u8]) -> PageLayout {
     let layout = PageLayout { rows: state.rows(), sh_degree: state.sh_degree() };
     payload[..layout.bytes()].fill(0);
@@ -95,7 +95,7 @@ pub fn write_page(state: &SceneState, payload: &mut [u8]) -> PageLayout {
     layout
 }
 
-/// The rows of a page as a table of their own.
+/// Copies the rows of a page into a table of their own.
 pub fn read_page(rows: &Rows<'_>) -> SceneState {
     let table = |from: ColumnsRef<'_>| {
         let mut from = from;
@@ -178,7 +178,7 @@ mod tests {
     use crate::scene::state::row_bytes;
 
     #[test]
-    fn rows_go_into_a_page_and_come_back() {
+    fn rows_round_trip_through_a_page() {
         for (rows, sh_degree) in [(0, 3), (1, 0), (7, 1), (128, 2), (1000, 3)] {
             let mut columns = Columns::zeros(rows, sh_degree);
             let mut next = 0.0f32;
@@ -201,7 +201,7 @@ mod tests {
             let layout = write_page(&state, payload);
             assert_eq!(layout.bytes(), bytes);
             assert_eq!(read_page(&layout.rows(payload, 5)), state);
-            assert!(payload[bytes..].iter().all(|&b| b == 0xff), "nothing behind the page is touched");
+            assert!(payload[bytes..].iter().all(|&b| b == 0xff), "bytes after the page stay unchanged");
             assert_eq!(layout.rows_mut(payload, 5).first_row, 5);
         }
     }

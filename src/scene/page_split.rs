@@ -1,29 +1,29 @@
-//! Pages that outgrew their capacity: cut in two along the longest axis of their means, at the median, again and
-//! again. Who decides when, and where the parts are stored, is not known here.
+//! Splits pages that outgrew their capacity: in two along the longest axis of their means, at the median, repeatedly.
+//! When to split and where to store the parts is decided elsewhere.
 //!
-//! Invariants: 1. the parts are a function of the rows in their order and of the positions given; 2. rows keep their
-//! relative order; 3. the parts are named by lineage and ordered by name.
+//! Invariants: 1. the parts are a function of the rows in their order and of the given positions; 2. rows keep their
+//! relative order; 3. the ids of the parts follow lineage, and the parts are ordered by id.
 
 use super::partition::{PointBox, PointRow, axis_key};
 use super::state::SceneState;
 use crate::base::ids::PageId;
 
-/// A page was split 31 times in a row and must be split again: a spot where everything else was pruned between as many
-/// rounds of growth.
+/// A page was split 31 times in a row and must be split again: in one spot, growth round after growth round, everything
+/// else was pruned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error(
     "page {page} cannot be split any further\n  remedy: use larger pages (--page-rows) or fewer Gaussians (--max-gaussians)"
 )]
 pub struct SplitTooDeep {
-    /// The page.
+    /// The page's id.
     pub page: PageId,
 }
 
-/// The rows of page `id` as pages of at most `page_rows` rows (at least 1). `means` (`[rows][3]`) are the positions by
-/// which to cut: where the rows are now, not where they were stored.
+/// Splits the rows of page `id` into pages of at most `page_rows` rows (at least 1). `means` (`[rows][3]`) are the
+/// positions to cut by: the current ones, not the stored ones.
 ///
 /// # Errors
-/// The names of a lineage ran out.
+/// The lineage has no more ids.
 pub fn split_page(
     id: PageId,
     state: SceneState,
@@ -40,7 +40,7 @@ pub fn split_page(
     Ok(parts.into_iter().map(|(id, rows)| (id, state.select(&rows))).collect())
 }
 
-/// Pages that [`split_page`] makes of so many rows.
+/// Number of pages that [`split_page`] makes of `rows` rows.
 pub fn parts_of(rows: usize, page_rows: usize) -> usize {
     if rows <= page_rows.max(1) {
         return 1;
@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn names_run_out_with_an_error() {
+    fn running_out_of_ids_is_an_error() {
         let mut id = PageId::initial(1);
         while let Some([low, _]) = id.children() {
             id = low;

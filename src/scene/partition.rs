@@ -1,32 +1,32 @@
-//! First pages: which rows go together, from positions and sizes alone.
+//! Divides the first rows into pages, from positions and sizes alone.
 //!
-//! The rows are halved along the longest axis of their box, again and again, until every part is a page; where the
-//! number of pages is odd, the halves are as unequal as the pages. The largest rows are divided the same way among
-//! themselves: one giant in a page of small rows would make every view need that page.
+//! The rows are halved along the longest axis of their box, repeatedly, until every part is a page; with an odd number
+//! of pages the halves differ by one page. The largest rows are divided the same way among themselves: one giant in a
+//! page of small rows would make every view need that page.
 //!
-//! Not here: what a page stores, and pages that outgrow their capacity ([`super::page_split`]). A cloud that does not
-//! fit in memory is divided through files, with the same result.
+//! Not here: the stored form of a page, and pages that outgrow their capacity ([`super::page_split`]). A cloud larger
+//! than memory is divided through files, with the same result.
 //!
-//! Invariants: 1. every row is in exactly one page; 2. pages differ by one row at most (giants among themselves);
-//! 3. the result is a function of positions and sizes, not of threads: equal coordinates are ordered by row; 4. the
-//! rows of a page ascend.
+//! Invariants: 1. every row is in exactly one page; 2. pages differ by one row at most (pages of giants among
+//! themselves); 3. the result is a function of positions and sizes, not of threads: equal coordinates are ordered by
+//! row; 4. the rows of a page ascend.
 
 use super::select::{RankSearch, float_key};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// One row of this many is a giant.
+/// One row in this many is a giant.
 const ROWS_PER_GIANT: usize = 200;
-/// Parts below this many rows are divided by one thread.
+/// Parts with fewer rows are divided by one thread.
 const SERIAL_BELOW: usize = 8192;
-/// With densification on, pages start this full, in percent: most grow, and a split costs a half-empty page.
+/// With densification, pages start filled to this percentage: most pages grow, and a split leaves half-empty pages.
 const FILL_PERCENT: usize = 70;
 
-/// What can be divided: something with a position and the number of a row, which no two of them share.
+/// An entry to divide: it has a position and a unique row number.
 pub trait Placed: Copy + Send + Sync {
     /// Position.
     fn point(&self) -> [f32; 3];
-    /// Row.
+    /// Row number.
     fn row(&self) -> u32;
 }
 
@@ -39,12 +39,12 @@ impl Placed for PointRow {
     }
 }
 
-/// A position and the number of its row.
+/// A position and its row number.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointRow {
     /// Position.
     pub point: [f32; 3],
-    /// Row.
+    /// Row number.
     pub row: u32,
 }
 
@@ -53,7 +53,7 @@ pub struct PointRow {
 pub struct Partition {
     /// Rows, page after page.
     rows: Vec<u32>,
-    /// Where each page starts in `rows`, and the end.
+    /// Start of each page in `rows`, and the end.
     starts: Vec<u32>,
 }
 
@@ -74,18 +74,18 @@ impl Partition {
     }
 }
 
-/// Rows that a first page gets at most: all it holds, or less when pages are going to grow.
+/// Most rows of a first page: its capacity, or less if pages will grow.
 pub fn first_fill(page_rows: usize, is_growing: bool) -> usize {
     if is_growing { (page_rows * FILL_PERCENT / 100).max(1) } else { page_rows.max(1) }
 }
 
-/// Number of giants among so many rows.
+/// Number of giants among `rows` rows.
 pub fn giants(rows: usize) -> usize {
     rows / ROWS_PER_GIANT
 }
 
 /// Divides rows into pages of at most `fill` rows (at least 1). `means` and `scales` (log) are `[rows][3]`. Takes 16
-/// bytes per row on top of the result.
+/// bytes per row besides the result.
 ///
 /// # Panics
 /// With 2^32 rows or more.
@@ -113,7 +113,7 @@ fn largest(scales: &[f32]) -> f32 {
     scales[0].max(scales[1]).max(scales[2])
 }
 
-/// Which rows are giants: the largest half percent, equal sizes by row.
+/// Selects the giants: the largest half percent of rows; equal sizes are ordered by row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct GiantCut {
     /// Key of the smallest giant.
@@ -121,7 +121,7 @@ pub struct GiantCut {
 }
 
 impl GiantCut {
-    /// From the size of every row: any number that grows with it, the same for [`GiantCut::is_giant`].
+    /// From the size of every row: any number that increases with it, used consistently with [`GiantCut::is_giant`].
     pub fn find(rows: usize, size: impl Fn(usize) -> f32) -> GiantCut {
         let mut search = GiantCut::search(rows);
         while !search.is_done() {
@@ -131,55 +131,55 @@ impl GiantCut {
         GiantCut::found(&search)
     }
 
-    /// The search for the cut among so many rows, for those who see sizes one after the other: count
-    /// [`GiantCut::key`] of every row in every pass.
+    /// A search for the cut among `rows` rows whose sizes are streamed: count [`GiantCut::key`] of every row in every
+    /// pass.
     pub fn search(rows: usize) -> RankSearch {
-        // Without giants any rank does: `found` is not asked.
+        // Without giants any rank is valid: `found` is not called.
         RankSearch::new((rows - giants(rows)) as u64, rows as u64)
     }
 
-    /// The cut after the last pass.
+    /// The cut, after the last pass.
     pub fn found(search: &RankSearch) -> GiantCut {
         GiantCut { smallest: search.key().unwrap_or(u64::MAX) }
     }
 
-    /// Orders rows by size, equal sizes by row, the first row counting as the largest.
+    /// Key that orders rows by size, equal sizes by row; the first row counts as the larger.
     pub fn key(size: f32, row: u32) -> u64 {
         u64::from(float_key(size)) << 32 | u64::from(!row)
     }
 
-    /// Whether a row is among the largest.
+    /// Whether a row is a giant.
     pub fn is_giant(self, size: f32, row: u32) -> bool {
         GiantCut::key(size, row) >= self.smallest
     }
 }
 
-/// Pages of nearly equal size for so many rows.
+/// Pages of nearly equal size for a number of rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pages {
-    /// Rows in all.
+    /// Number of rows.
     pub rows: usize,
-    /// Pages in all.
+    /// Number of pages.
     pub pages: usize,
 }
 
 impl Pages {
-    /// As few pages as hold `rows` rows with at most `fill` each.
+    /// The fewest pages that hold `rows` rows with at most `fill` each.
     pub fn of(rows: usize, fill: usize) -> Pages {
         Pages { rows, pages: rows.div_ceil(fill.max(1)) }
     }
 
-    /// Rows in the pages before this one.
+    /// Number of rows in the pages before this one.
     pub fn start(&self, page: usize) -> usize {
         (self.rows as u128 * page as u128 / self.pages.max(1) as u128) as usize
     }
 
-    /// The page at which the pages `range` are cut in two.
+    /// The page at which the range of pages is halved.
     pub fn middle(range: &Range<usize>) -> usize {
         range.start + range.len() / 2
     }
 
-    /// Sorts the rows into pages: page p holds what lies from `start(p)` to `start(p + 1)` afterwards, ascending.
+    /// Sorts the rows into pages: afterwards page p holds entries `start(p)` to `start(p + 1)`, ascending.
     pub fn divide<E: Placed>(&self, entries: &mut [E]) {
         assert_eq!(entries.len(), self.rows);
         if self.pages > 0 {
@@ -187,7 +187,7 @@ impl Pages {
         }
     }
 
-    /// The same for the rows of the pages `range` (at least one), of which there must be the right number.
+    /// The same for the rows of the pages `range` (at least one); `entries` must have their number of rows.
     pub fn divide_range<E: Placed>(&self, entries: &mut [E], range: Range<usize>) {
         if range.len() == 1 {
             return entries.sort_unstable_by_key(E::row);
@@ -208,36 +208,36 @@ impl Pages {
     }
 }
 
-/// Orders rows along an axis, equal coordinates by row.
+/// Key that orders rows along an axis, equal coordinates by row.
 pub fn axis_key<E: Placed>(entry: &E, axis: usize) -> u64 {
     u64::from(float_key(entry.point()[axis])) << 32 | u64::from(entry.row())
 }
 
-/// The box of some points.
+/// The bounding box of some points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointBox {
-    /// Lower corner; above `hi` without points.
+    /// Lower corner; greater than `hi` without points.
     pub lo: [f32; 3],
     /// Upper corner.
     pub hi: [f32; 3],
 }
 
 impl PointBox {
-    /// No points.
+    /// The box of no points.
     pub const EMPTY: PointBox = PointBox { lo: [f32::INFINITY; 3], hi: [f32::NEG_INFINITY; 3] };
 
     /// The box of all entries.
     pub fn of<E: Placed>(entries: &[E]) -> PointBox {
         if entries.len() >= 8 * SERIAL_BELOW {
             let parts = entries.par_chunks(SERIAL_BELOW).map(PointBox::of);
-            return parts.reduce(|| PointBox::EMPTY, PointBox::and);
+            return parts.reduce(|| PointBox::EMPTY, PointBox::union);
         }
         let mut all = PointBox::EMPTY;
         entries.iter().for_each(|e| all.add(e.point()));
         all
     }
 
-    /// Makes room for a point.
+    /// Extends the box to include a point.
     pub fn add(&mut self, point: [f32; 3]) {
         for i in 0..3 {
             self.lo[i] = self.lo[i].min(point[i]);
@@ -245,9 +245,9 @@ impl PointBox {
         }
     }
 
-    /// The box of both.
+    /// The smallest box that contains both.
     #[must_use]
-    pub fn and(mut self, other: PointBox) -> PointBox {
+    pub fn union(mut self, other: PointBox) -> PointBox {
         for i in 0..3 {
             self.lo[i] = self.lo[i].min(other.lo[i]);
             self.hi[i] = self.hi[i].max(other.hi[i]);
@@ -255,7 +255,7 @@ impl PointBox {
         self
     }
 
-    /// The axis along which the box is longest; the first of equal ones.
+    /// The longest axis of the box; the first of equal ones.
     pub fn longest_axis(&self) -> usize {
         let extent = |i: usize| self.hi[i] - self.lo[i];
         (1..3).fold(0, |widest, i| if extent(i) > extent(widest) { i } else { widest })
@@ -269,14 +269,14 @@ mod tests {
 
     fn cloud(rows: usize) -> (Vec<f32>, Vec<f32>) {
         let mut draws = Stream::new(1, Purpose::Test, rows as u64, 7);
-        // A third of the coordinates on a coarse lattice: many ties.
+        // A third of the coordinates is on a coarse lattice, for many ties.
         let mean = |d: &mut Stream| if d.below(3) == 0 { d.below(5) as f32 } else { (d.normal() * 3.0) as f32 };
         let means = (0..rows * 3).map(|i| mean(&mut draws) * [1.0, 4.0, 0.5][i % 3]).collect();
         let scales = (0..rows * 3).map(|_| (draws.below(64) as f32 - 300.0) * 0.02).collect();
         (means, scales)
     }
 
-    /// The definition: sort along the axis, cut, again.
+    /// The definition: sort along the axis, cut, repeat.
     fn plainly(
         means: &[f32],
         mut rows: Vec<usize>,
@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn pages_are_those_of_sorting_and_cutting_and_giants_are_apart() {
+    fn pages_equal_sorting_and_cutting_and_giants_are_separate() {
         for (rows, fill) in [(1, 4), (7, 4), (1000, 7), (1000, 1000), (23_456, 100), (70_000, 716)] {
             let (means, scales) = cloud(rows);
             let size = |row: usize| scales[row * 3..row * 3 + 3].iter().copied().fold(f32::NEG_INFINITY, f32::max);
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn pages_start_with_room_when_they_are_going_to_grow() {
+    fn first_pages_leave_room_if_pages_will_grow() {
         assert_eq!((first_fill(1024, false), first_fill(1024, true), first_fill(1, true)), (1024, 716, 1));
     }
 }

@@ -1,19 +1,20 @@
-//! Views of rows: what an operation on rows borrows, whether the rows live in one table in memory or in a page.
+//! Views of rows: borrowed by operations on rows, whether the rows are in one table in memory or in a page.
 //!
-//! Invariants: 1. every slice of a view covers the same rows; 2. row numbers given to a view's methods count from its
-//! own first row; 3. splitting a view gives disjoint views, so rows can be worked on in parallel without locks;
-//! 4. a [`RowBlock`] holds one whole row in a fixed order of lanes, whatever the degree: unused lanes are zero.
+//! Invariants: 1. every slice of a view covers the same rows; 2. row numbers in a view's methods count from the view's
+//! first row; 3. splitting a view gives disjoint views, so rows can be processed in parallel without locks; 4. a
+//! [`RowBlock`] holds one whole row in a fixed order of lanes, whatever the degree; unused lanes are zero.
 
 use super::columns::{Column, sh_n_width};
 
-/// Floats of a [`RowBlock`]: 16 for the columns of fixed width, the narrow ones (14 used), 48 for `sh_n` (45 used at degree 3).
+/// Floats of a [`RowBlock`]: 16 for the narrow columns, those of fixed width (14 used), 48 for `sh_n` (45 used at
+/// degree 3).
 pub const BLOCK_LANES: usize = 64;
 /// First lane of `sh_n` in a [`RowBlock`].
 pub const SH_N_LANE: usize = 16;
 
-/// One row of any table with the shape of the columns: means 0..3, opacity 3, quats 4..8, scales 8..11, sh0 12..15, `sh_n`
-/// from [`SH_N_LANE`]. No narrow column lies across a multiple of four lanes: so a compiler can put the narrow ones together from
-/// quarters of a vector, without a way through memory.
+/// One row of any table with the shape of the columns: means 0..3, opacity 3, quats 4..8, scales 8..11, sh0 12..15,
+/// `sh_n` from [`SH_N_LANE`]. No narrow column crosses a multiple of four lanes, so that a compiler can assemble the
+/// narrow columns from quarters of a vector, without going through memory.
 pub type RowBlock = [f32; BLOCK_LANES];
 
 /// First lane of a column in a [`RowBlock`].
@@ -107,15 +108,15 @@ impl<'a> ColumnsRef<'a> {
         )
     }
 
-    /// Copies one row into the lanes of a block. `W` is the width of `sh_n`: fixed, so that the copy is a few
-    /// vector moves. Lanes of `sh_n` beyond it are left alone.
+    /// Copies one row into the lanes of a block. `W` is the width of `sh_n`: constant, so that the copy takes a few
+    /// vector moves. Lanes of `sh_n` beyond it stay unchanged.
     #[inline(always)]
     pub fn load_row<const W: usize>(&self, row: usize, block: &mut RowBlock) {
         block[..SH_N_LANE].copy_from_slice(&self.narrow(row));
         block[SH_N_LANE..SH_N_LANE + W].copy_from_slice(&self.sh_n[row * W..row * W + W]);
     }
 
-    /// The lanes of one row before `sh_n`, as a [`RowBlock`] has them. Panics beyond the last row.
+    /// The lanes of one row before `sh_n`, in the order of a [`RowBlock`]. Panics beyond the last row.
     #[inline(always)]
     fn narrow(&self, row: usize) -> [f32; SH_N_LANE] {
         let (m, q) = (&self.means.as_chunks::<3>().0[row], &self.quats.as_chunks::<4>().0[row]);
@@ -141,7 +142,7 @@ impl<'a> ColumnsMut<'a> {
         self.opacities.len()
     }
 
-    /// The same rows, shared.
+    /// A shared view of the same rows.
     #[inline(always)]
     pub fn as_ref(&self) -> ColumnsRef<'_> {
         ColumnsRef {
@@ -185,7 +186,7 @@ impl<'a> ColumnsMut<'a> {
         self.sh_n[row * W..row * W + W].copy_from_slice(&block[SH_N_LANE..SH_N_LANE + W]);
     }
 
-    /// Copies the lanes of all columns but `sh_n` into one row.
+    /// Copies the lanes of all columns except `sh_n` into one row.
     #[inline(always)]
     fn store_narrow(&mut self, row: usize, block: &RowBlock) {
         self.means.as_chunks_mut::<3>().0[row].copy_from_slice(&block[0..3]);
@@ -206,16 +207,16 @@ impl<'a> ColumnsMut<'a> {
     }
 }
 
-/// Shared view of rows with all that training keeps of them.
+/// Shared view of rows with their whole training state.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Rows<'a> {
     /// Number of the first row in the table that the view was cut from.
     pub first_row: usize,
     /// Values after the last update of each row.
     pub columns: ColumnsRef<'a>,
-    /// First moments after it.
+    /// First moments after the last update.
     pub exp_avg: ColumnsRef<'a>,
-    /// Second moments after it.
+    /// Second moments after the last update.
     pub exp_avg_sq: ColumnsRef<'a>,
     /// Optimizer steps contained in the row.
     pub stamp: &'a [u32],
@@ -227,16 +228,16 @@ pub struct Rows<'a> {
     pub count: &'a [u32],
 }
 
-/// Exclusive view of rows with all that training keeps of them.
+/// Mutable view of rows with their whole training state.
 #[derive(Debug)]
 pub struct RowsMut<'a> {
     /// Number of the first row in the table that the view was cut from.
     pub first_row: usize,
     /// Values after the last update of each row.
     pub columns: ColumnsMut<'a>,
-    /// First moments after it.
+    /// First moments after the last update.
     pub exp_avg: ColumnsMut<'a>,
-    /// Second moments after it.
+    /// Second moments after the last update.
     pub exp_avg_sq: ColumnsMut<'a>,
     /// Optimizer steps contained in the row.
     pub stamp: &'a mut [u32],
@@ -286,7 +287,7 @@ impl<'a> RowsMut<'a> {
         self.stamp.len()
     }
 
-    /// The same rows, shared.
+    /// A shared view of the same rows.
     pub fn as_ref(&self) -> Rows<'_> {
         Rows {
             first_row: self.first_row,
@@ -332,18 +333,18 @@ pub fn mean_grad2d(grad2d: f32, count: u32) -> f32 {
     grad2d / count.max(1) as f32
 }
 
-/// What rows are at one moment of training. The optimizer implements it; events act on rows through it, because an
-/// untouched row still moves by its momentum.
+/// Current values of rows at one step of training. The optimizer implements it; events act on rows through it, because
+/// an untouched row still moves by its momentum.
 pub trait RowsNow: Sync {
-    /// The moment: number of optimizer steps contained in every value that this gives.
+    /// The step: number of optimizer steps contained in every value returned.
     fn now(&self) -> u32;
-    /// The whole row as it is now. Lanes that the degree does not use are zero.
+    /// Evaluates the whole row as of now. Lanes that the degree does not use are zero.
     fn evaluate_row(&self, rows: &Rows<'_>, row: usize, out: &mut RowBlock);
-    /// One value of one column of a row as it is now; `element` counts within the row.
+    /// Evaluates one value of one column of a row as of now; `element` counts within the row.
     fn evaluate_element(&self, rows: &Rows<'_>, column: Column, row: usize, element: usize) -> f32;
-    /// What rounds decide by, for all rows as they are now: the largest log-scale and the opacity (logit). One entry
-    /// per row each.
+    /// Evaluates for all rows, as of now, what densification rounds decide by: the largest log-scale and the opacity
+    /// (logit), one entry per row each.
     fn sizes_and_opacities(&self, rows: &Rows<'_>, log_scales: &mut [f32], opacities: &mut [f32]);
-    /// Rewrites the row as what it is now: values, decayed moments, stamp.
+    /// Rewrites the row with its state as of now: values, decayed moments, stamp.
     fn settle_row(&self, rows: &mut RowsMut<'_>, row: usize);
 }

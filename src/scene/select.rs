@@ -1,25 +1,25 @@
-//! The key of a given rank among keys that are only seen one after the other, exactly, in 512 KiB.
+//! Finds the key of a given rank among streamed keys, exactly, in 512 KiB.
 //!
-//! Invariants: 1. the same keys in any order give the same answer; 2. at most four passes.
+//! Invariants: 1. the order of the keys does not matter; 2. at most four passes.
 
-/// Bits that one pass decides.
+/// Bits decided per pass.
 const PASS_BITS: u32 = 16;
 
-/// A search in passes: [`RankSearch::count`] every key, then [`RankSearch::next_pass`], until it is done.
+/// A search in passes: call [`RankSearch::count`] for every key, then [`RankSearch::next_pass`], until done.
 #[derive(Debug, Clone)]
 pub struct RankSearch {
     /// Rank among the keys that share the known prefix.
     rank: u64,
-    /// The leading bits that are known, at their place.
+    /// The known leading bits, in place.
     prefix: u64,
-    /// How many of them.
+    /// Number of known bits.
     known: u32,
     bins: Vec<u64>,
     exists: bool,
 }
 
 impl RankSearch {
-    /// Looks for the key with `rank` smaller ones among `count` keys, all different.
+    /// Searches for the key with `rank` smaller ones among `count` keys, all different.
     pub fn new(rank: u64, count: u64) -> RankSearch {
         let exists = rank < count;
         RankSearch { rank, prefix: 0, known: if exists { 0 } else { u64::BITS }, bins: vec![0; 1 << PASS_BITS], exists }
@@ -33,7 +33,7 @@ impl RankSearch {
     /// Counts one key of this pass.
     #[inline]
     pub fn count(&mut self, key: u64) {
-        // A shift by 64 is no shift: nothing is known in the first pass.
+        // In the first pass nothing is known, and a shift by 64 would be no shift.
         if self.known == 0 || (key ^ self.prefix) >> (u64::BITS - self.known) == 0 {
             let bin = key >> (u64::BITS - PASS_BITS - self.known) & ((1 << PASS_BITS) - 1);
             self.bins[bin as usize] += 1;
@@ -55,17 +55,17 @@ impl RankSearch {
         self.bins.fill(0);
     }
 
-    /// The key; `None` before the last pass, or when there are fewer keys than its rank.
+    /// The key found; `None` before the last pass, or if there are not more keys than its rank.
     pub fn key(&self) -> Option<u64> {
         (self.exists && self.is_done()).then_some(self.prefix)
     }
 }
 
-/// Orders like [`f32::total_cmp`], as an unsigned number.
+/// Unsigned key in the order of [`f32::total_cmp`].
 #[inline(always)]
 pub fn float_key(x: f32) -> u32 {
     let bits = x.to_bits();
-    // Negative: all bits turn, so that larger magnitudes come first. Positive: only the sign.
+    // Negative: flip all bits, so that larger magnitudes come first. Positive: flip only the sign.
     bits ^ (((bits as i32 >> 31) as u32) | 0x8000_0000)
 }
 

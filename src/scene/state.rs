@@ -1,26 +1,26 @@
 //! The trainable state of rows: values, moments, stamps, identities, statistics.
 //!
-//! Invariants: 1. every vector has one entry (or one column width) per row; 2. `columns` is the value that the last
-//! update left, not the value now: [`crate::optim::deferred`] evaluates what it is now; 3. a row is rewritten whole;
-//! 4. rows are removed and appended in all vectors at once, and the rows that stay keep their order.
+//! Invariants: 1. every vector has one entry (or one column width) per row; 2. `columns` holds the values after the
+//! last update, not the current ones: [`crate::optim::deferred`] evaluates those; 3. a row is rewritten as a whole; 4.
+//! rows are removed and appended in all vectors at once, and remaining rows keep their order.
 
 use super::columns::{Column, Columns, row_width};
 use super::rows::{ColumnsMut, ColumnsRef, Rows, RowsMut};
 use rayon::prelude::*;
 use std::collections::TryReserveError;
 
-/// Rows with all that training keeps of them.
+/// Rows with their whole training state.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct SceneState {
     /// Values after the last update of each row.
     pub columns: Columns,
-    /// First moments after it, without bias correction.
+    /// First moments after the last update, without bias correction.
     pub exp_avg: Columns,
-    /// Second moments after it.
+    /// Second moments after the last update, without bias correction.
     pub exp_avg_sq: Columns,
-    /// Number of optimizer steps already contained in the row: a row that was updated in 0-based step s holds s + 1.
+    /// Number of optimizer steps contained in the row: s + 1 after an update in 0-based step s.
     pub stamp: Vec<u32>,
-    /// Identity that survives moves: the initial index, then a hash of (parent, event, child).
+    /// Identity, kept when the row moves: the initial index, or a hash of (parent, event, child).
     pub uid: Vec<u64>,
     /// Sum of the norms of the screen-space mean gradients (NDC units) since the last round.
     pub grad2d: Vec<f32>,
@@ -28,18 +28,18 @@ pub struct SceneState {
     pub count: Vec<u32>,
 }
 
-/// Bytes that one row takes in memory at a degree: values and two moments, stamp, uid, statistics (728 at degree 3).
+/// Bytes of one row in memory at a degree: values and two moments, stamp, uid, statistics (728 at degree 3).
 pub fn row_bytes(sh_degree: u8) -> usize {
     row_width(sh_degree) * 4 * 3 + 4 + 8 + 4 + 4
 }
 
 impl SceneState {
-    /// No rows, at a degree.
+    /// A state without rows, at a degree.
     pub fn empty(sh_degree: u8) -> Self {
         SceneState::from_columns(Columns::zeros(0, sh_degree))
     }
 
-    /// Fresh rows: uids 0..n, zero moments, no step contained, no statistics.
+    /// New rows: uids 0..n, zero moments, no step contained, no statistics.
     pub fn from_columns(columns: Columns) -> Self {
         let rows = columns.rows();
         let sh_degree = columns.sh_degree;
@@ -64,7 +64,7 @@ impl SceneState {
         self.columns.sh_degree
     }
 
-    /// Bytes reserved by all vectors.
+    /// Bytes allocated by all vectors.
     pub fn bytes(&self) -> usize {
         let tables = [&self.columns, &self.exp_avg, &self.exp_avg_sq];
         let floats: usize =
@@ -76,7 +76,7 @@ impl SceneState {
             + self.count.capacity() * 4
     }
 
-    /// All rows, shared.
+    /// A shared view of all rows.
     pub fn view(&self) -> Rows<'_> {
         Rows {
             first_row: 0,
@@ -90,7 +90,7 @@ impl SceneState {
         }
     }
 
-    /// All rows, exclusive.
+    /// A mutable view of all rows.
     pub fn view_mut(&mut self) -> RowsMut<'_> {
         RowsMut {
             first_row: 0,
@@ -117,7 +117,7 @@ impl SceneState {
         chunks
     }
 
-    /// Consecutive exclusive views of `rows_per_chunk` rows (the last may be shorter); at least 1.
+    /// Consecutive mutable views of `rows_per_chunk` rows (the last may be shorter); at least 1.
     pub fn chunks_mut(&mut self, rows_per_chunk: usize) -> Vec<RowsMut<'_>> {
         let size = rows_per_chunk.max(1);
         let mut chunks = Vec::with_capacity(self.rows().div_ceil(size));
@@ -131,13 +131,13 @@ impl SceneState {
         chunks
     }
 
-    /// Keeps the rows for which `keep` says so, in their order.
+    /// Keeps the rows for which `keep` returns true, in order.
     pub fn retain(&mut self, keep: impl Fn(usize) -> bool) {
         let removed: Vec<u32> = (0..self.rows()).filter(|&row| !keep(row)).map(|row| row as u32).collect();
         self.remove(&removed);
     }
 
-    /// Removes the rows named by `removed` (ascending, each once); the others keep their order.
+    /// Removes the rows in `removed` (ascending, each once); the others keep their order.
     pub fn remove(&mut self, removed: &[u32]) {
         if removed.is_empty() {
             return;
@@ -153,11 +153,11 @@ impl SceneState {
         remove_runs(count, 1, removed);
     }
 
-    /// Makes room for `more` further rows, and no more than that: what a scene takes follows from its rows, not from
-    /// the doubling of vectors. Growing moves one vector at a time.
+    /// Reserves memory for exactly `more` further rows, so that a scene's memory is determined by its rows and not by
+    /// the doubling of vectors. Grows one vector at a time.
     ///
     /// # Errors
-    /// There is not that much memory; some of the vectors may have grown then.
+    /// Not enough memory; some of the vectors may have grown.
     pub fn try_reserve_exact(&mut self, more: usize) -> Result<(), TryReserveError> {
         let sh_degree = self.sh_degree();
         for table in [&mut self.columns, &mut self.exp_avg, &mut self.exp_avg_sq] {
@@ -171,14 +171,14 @@ impl SceneState {
         self.count.try_reserve_exact(more)
     }
 
-    /// Makes room for the bands up to `degree`, as zeros without moments, which is what they are until then.
+    /// Adds the bands up to `degree`, as zeros with zero moments.
     pub fn raise_sh_degree(&mut self, degree: u8) {
         self.columns.raise_sh_degree(degree);
         self.exp_avg.raise_sh_degree(degree);
         self.exp_avg_sq.raise_sh_degree(degree);
     }
 
-    /// The listed rows, in the order of the list.
+    /// A copy of the listed rows, in the order of the list.
     #[must_use]
     pub fn select(&self, rows: &[u32]) -> SceneState {
         let of = |from: &Columns| {
@@ -201,7 +201,7 @@ impl SceneState {
         }
     }
 
-    /// Appends all rows of `other`, which must be stored at the same degree.
+    /// Appends all rows of `other`, which must have the same SH degree.
     pub fn append(&mut self, other: &SceneState) {
         assert_eq!(self.sh_degree(), other.sh_degree(), "rows of another degree cannot be appended");
         for (table, more) in [
@@ -221,7 +221,7 @@ impl SceneState {
 }
 
 impl Columns {
-    /// All rows, shared.
+    /// A shared view of all rows.
     pub fn view(&self) -> ColumnsRef<'_> {
         ColumnsRef {
             sh_degree: self.sh_degree,
@@ -234,7 +234,7 @@ impl Columns {
         }
     }
 
-    /// All rows, exclusive.
+    /// A mutable view of all rows.
     pub fn view_mut(&mut self) -> ColumnsMut<'_> {
         ColumnsMut {
             sh_degree: self.sh_degree,
@@ -270,7 +270,7 @@ fn column_vecs(columns: &mut Columns) -> [(Column, &mut Vec<f32>); 6] {
     ]
 }
 
-/// Closes the gaps that the removed rows leave, one move per run of rows that stay.
+/// Closes the gaps of removed rows, with one move per run of remaining rows.
 fn remove_runs<T: Copy>(values: &mut Vec<T>, width: usize, removed: &[u32]) {
     let Some(&first) = removed.first() else { return };
     if width == 0 {
@@ -303,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn removing_and_appending_keeps_every_vector_in_step() {
+    fn removing_and_appending_keeps_all_vectors_consistent() {
         (0..=3).for_each(removing_and_appending);
     }
 
@@ -330,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn chunks_cover_all_rows_once_and_blocks_go_and_come_back() {
+    fn chunks_cover_all_rows_once_and_blocks_round_trip() {
         let mut state = numbered(11, 1);
         let copy = state.clone();
         let mut seen = Vec::new();

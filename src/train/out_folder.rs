@@ -62,7 +62,7 @@ pub fn remedy_of_existing(out: &Path) -> String {
     let start_over = "choose another --out, or replace it with --overwrite";
     let Ok(config) = TrainConfig::read(&out.join("config.toml")) else { return start_over.to_string() };
     let residence = config.residence();
-    if !SpillDir::is_one(&residence.checkpoint_folder(out)) {
+    if !SpillDir::exists_in(&residence.checkpoint_folder(out)) {
         return start_over.to_string();
     }
     let over = match residence.spill_dir() {

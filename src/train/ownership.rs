@@ -80,7 +80,7 @@ fn last_state(folder: &Path, access: Access) -> Result<RunState, TrainError> {
 /// It belongs to another run, cannot be opened, or is in use: it stays, and the new run must not begin.
 pub(super) fn remove_checkpoint_in(folder: &Path, run: RunId) -> Result<(), TrainError> {
     check_removable(folder, run)?;
-    if SpillDir::is_one(folder) && !remove_uncommitted(folder, true)? {
+    if SpillDir::exists_in(folder) && !remove_uncommitted(folder, true)? {
         SpillDir::open(folder, true)?.remove()?;
     }
     // Only if nothing else is in it.
@@ -93,7 +93,7 @@ pub(super) fn remove_checkpoint_in(folder: &Path, run: RunId) -> Result<(), Trai
 /// # Errors
 /// As [`remove_checkpoint_in`].
 pub(super) fn check_removable(folder: &Path, run: RunId) -> Result<(), TrainError> {
-    if !SpillDir::is_one(folder) || SpillDir::open(folder, true)?.holds_no_commit()? {
+    if !SpillDir::exists_in(folder) || SpillDir::open(folder, true)?.holds_no_commit()? {
         return Ok(());
     }
     let by_hand =

@@ -71,7 +71,7 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
         Ok(Some(stored)) => go_on(request, &earlier, config, stored),
         Ok(None) => begin_again(request, &earlier, config),
         // A run in memory makes its checkpoint with its first commit.
-        Err(_) if is_in_output && !SpillDir::is_one(&folder) && !has_past(&request.out) => {
+        Err(_) if is_in_output && !SpillDir::exists_in(&folder) && !has_past(&request.out) => {
             begin_again(request, &earlier, config)
         }
         Err(error) => Err(error),
@@ -262,7 +262,7 @@ fn already_done(
     let Some(summary) = summary.filter(|s| s.finished && s.steps >= config.steps) else { return Ok(None) };
     let folder = stored_folder(&request.out, config);
     let is_its_place = folder == stored_folder(&request.out, &earlier.config);
-    let stored = if SpillDir::is_one(&folder) {
+    let stored = if SpillDir::exists_in(&folder) {
         open_own(&folder, earlier.run, config.residence().spill_dir().is_none()).unwrap_or_else(|error| {
             eprintln!("warning: {} is left alone: {error}", folder.display());
             None

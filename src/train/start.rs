@@ -263,7 +263,7 @@ fn check_gaussians_fit(config: &TrainConfig, host_mem: Option<u64>) -> InputResu
     let file = Path::new(&config.init_ply);
     let is_read = !config.init_ply.is_empty() && is_ply(file);
     let Some(budget) = host_mem.filter(|_| is_read) else { return Ok(()) };
-    let rows = ply::rows_promised(file)?;
+    let rows = ply::stated_rows(file)?;
     let bytes = rows.saturating_mul(row_width(config.sh_degree) as u64 * 4);
     if bytes <= budget || !ply::holds_gaussians(file)? {
         return Ok(());

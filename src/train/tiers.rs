@@ -187,7 +187,7 @@ impl Stored {
     /// # Errors
     /// There is none, it is damaged, or in use.
     pub fn open(folder: &Path, allow_remote: bool) -> Result<Option<Stored>, TrainError> {
-        if !SpillDir::is_one(folder) {
+        if !SpillDir::exists_in(folder) {
             if std::fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_none()) {
                 return Ok(None);
             }

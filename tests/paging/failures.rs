@@ -99,8 +99,8 @@ fn an_import_that_fails_names_the_page() {
 #[test]
 fn a_segment_that_cannot_be_made_says_why_and_what_helps() {
     for (kind, remedy) in [
-        (ErrorKind::PermissionDenied, "can be written"),
-        (ErrorKind::AlreadyExists, "take the file out"),
+        (ErrorKind::PermissionDenied, "make the spill directory writable"),
+        (ErrorKind::AlreadyExists, "remove the file"),
         (ErrorKind::Other, "check the drive"),
     ] {
         let faults = Faults::new();

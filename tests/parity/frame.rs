@@ -135,7 +135,7 @@ fn views_are_those_of_the_cpu() {
 }
 
 #[test]
-fn a_view_of_nothing_is_the_background() {
+fn a_view_without_rows_is_the_background() {
     let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
     let (mut rows, camera) = scene(0, 33, 17);
     let options = RenderOptions { background: [0.25, 0.5, 0.75], ..RenderOptions::default() };

@@ -137,7 +137,7 @@ fn masks_are_those_of_the_cpu() {
 }
 
 #[test]
-fn poison_shows_unless_it_is_masked() {
+fn non_finite_pixels_show_unless_masked() {
     let Some(gpu) = open(&GpuOptions::default()) else { return };
     let (clean, mut target) = pair(65, 47);
     let place = 30 * 65 + 33;

@@ -292,7 +292,7 @@ fn set_depth(rows: &mut Columns, row: usize, depth: f32) {
 }
 
 #[test]
-fn poison_is_culled_as_on_the_cpu_and_does_not_spread() {
+fn non_finite_rows_are_culled_as_on_the_cpu_and_do_not_spread() {
     let Some(gpu) = open(&GpuOptions::default()) else { return };
     let n = 10 * POISON.len() + 3;
     let mut rows = random_rows(n);

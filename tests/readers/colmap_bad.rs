@@ -100,7 +100,7 @@ fn cameras_that_contradict_are_refused() {
     refused_in_both(&m, "images", &["image 'a b.jpg'", "camera 99"]);
     let mut m = model(1);
     m.cameras[1].id = 1;
-    refused_in_both(&m, "cameras", &["camera 1", "before"]);
+    refused_in_both(&m, "cameras", &["camera 1", "second definition"]);
 }
 
 #[test]
@@ -188,7 +188,7 @@ fn a_missing_scene_model_or_image_folder_is_named() {
 }
 
 #[test]
-fn text_that_is_no_model_is_refused_by_line() {
+fn text_that_is_not_a_model_is_refused_by_line() {
     let m = model(3);
     let cases = [
         ("cameras.txt", m.cameras_txt().replace("640 480", "640 tall"), "line 4", "\"tall\""),

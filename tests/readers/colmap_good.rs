@@ -87,7 +87,7 @@ fn every_place_is_searched_and_the_largest_model_wins() {
 }
 
 #[test]
-fn a_broken_model_beside_a_good_one_is_passed_over() {
+fn a_broken_model_beside_a_good_one_is_skipped() {
     let scene = scene_folder();
     model(2).write_bin(&scene.path().join("sparse/1"));
     let broken = scene.path().join("sparse/0");
@@ -95,7 +95,7 @@ fn a_broken_model_beside_a_good_one_is_passed_over() {
     fs::write(broken.join("images.bin"), (1u64 << 60).to_le_bytes()).unwrap();
     let found = read(scene.path());
     assert_eq!(found.views.len(), 4);
-    warned(&found, &["sparse/0", "passed over", "1152921504606846976 images"]);
+    warned(&found, &["sparse/0", "is skipped", "1152921504606846976 images"]);
 }
 
 #[test]

@@ -222,7 +222,7 @@ fn parts_that_are_broken_are_named() {
 }
 
 #[test]
-fn what_a_folder_lacks_is_said_with_the_tree_and_the_source() {
+fn missing_parts_are_reported_with_the_tree_and_the_source() {
     let folder = lookalike(Layout::MegaNerf);
     fs::remove_dir_all(folder.path().join("val/rgbs")).unwrap();
     let fetch = ["https://example.org/data".to_string()];
@@ -234,5 +234,5 @@ fn what_a_folder_lacks_is_said_with_the_tree_and_the_source() {
     let [near, far] = ["mega-nerf:\n", "colmap-merged:\n"].map(|tree| said.find(tree).unwrap());
     assert!(near < far, "the nearest layout's tree comes first");
     let said = find_layout(&folder.path().join("nothing"), &accepted, &fetch).unwrap_err().to_string();
-    assert!(said.contains("not there") && said.contains("https://example.org/data"), "{said}");
+    assert!(said.contains("does not exist") && said.contains("https://example.org/data"), "{said}");
 }

@@ -53,7 +53,7 @@ fn files_of_pytorch_are_read_with_their_poses() {
 }
 
 #[test]
-fn a_city_in_this_layout_is_the_city() {
+fn a_city_in_this_layout_reads_as_the_same_scene() {
     let folder = TempDir::new().unwrap();
     let options = CityOptions { views: 6, width: 48, height: 32, points: 50, ..CityOptions::default() };
     write_city(folder.path(), &options, &|_, _| {}).unwrap();
@@ -86,7 +86,7 @@ fn with_metadata(bytes: &[u8]) -> String {
 #[test]
 fn hostile_files_are_refused_by_name() {
     let good = std::fs::read(fixture("000000.pt")).unwrap();
-    assert!(with_metadata(b"\x80\x02ccos\nsystem\n").contains("no file of torch.save"));
+    assert!(with_metadata(b"\x80\x02ccos\nsystem\n").contains("not a file of torch.save"));
     // Another function under the same length: found by the checksum of the archive or by its name, never called.
     let mut evil = good.clone();
     let at = evil.windows(11).position(|w| w == b"torch._util").unwrap();
@@ -107,7 +107,7 @@ fn hostile_files_are_refused_by_name() {
 }
 
 #[test]
-fn every_flipped_byte_ends_in_an_answer() {
+fn every_flipped_byte_gives_a_result_or_an_error() {
     let good = std::fs::read(fixture("000000.pt")).unwrap();
     let folder = scene_of_pytorch();
     let path = folder.path().join("train/metadata/000000.pt");

@@ -162,7 +162,7 @@ fn matrixcity_rotations_are_scaled_and_its_frames_numbered() {
 }
 
 #[test]
-fn poses_that_are_none_are_left_out_by_name() {
+fn invalid_poses_are_dropped_by_name() {
     let mut frames: Vec<_> = ["a.png", "b.png", "c.png", "d.png"].map(frame).into();
     frames[1]["transform_matrix"][0][3] = Value::Null; // how some writers put NaN
     frames[2]["transform_matrix"][0][0] = json!(2.0);
@@ -211,5 +211,5 @@ fn a_ply_that_is_not_there_is_a_warning() {
     top["ply_file_path"] = "points.ply".into();
     let found = read(scene(top, vec![frame("a.png")]).path());
     assert_eq!(found.points_path, None);
-    warned(&found, &["points.ply", "not there"]);
+    warned(&found, &["points.ply", "does not exist"]);
 }

@@ -3,9 +3,11 @@
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::{cpu_model, process_cpu_seconds};
+use gsscale::config::choice::Device;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::{RunOptions, simd_path};
 use gsscale::dataset::target_cache::TargetCache;
+use gsscale::gpu::DeviceChoice;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::train::error::TrainError;
 use gsscale::train::memory::host_bytes_peak;
@@ -44,8 +46,8 @@ pub struct Args {
 /// This measurement runs the CPU path with all pages in memory.
 fn refuse_what_is_not_measured(config: &TrainConfig) -> InputResult<()> {
     let given = [
-        ("--device", !matches!(config.device.as_str(), "auto" | "cpu")),
-        ("--spill-dir", !config.spill_dir.is_empty()),
+        ("--device", !matches!(config.device, Device::Cpu | Device::Gpu(DeviceChoice::Auto))),
+        ("--spill-dir", config.residence().spill_dir().is_some()),
         ("--frames", config.frames > 0),
         ("--host-mem", config.host_mem.0 > 0),
     ];

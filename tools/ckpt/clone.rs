@@ -1,4 +1,4 @@
-//! `gsscale-ckpt clone`: a store on another drive.
+//! `gsscale-ckpt clone`: copies a store to another drive.
 
 use gsscale::base::units::format_bytes;
 use gsscale::train::error::TrainError;
@@ -9,16 +9,16 @@ use std::process::ExitCode;
 const EXAMPLES: &str = "\
 Examples:
   gsscale-ckpt clone runs/village /mnt/other/village
-  gsscale-train --resume runs/village --spill-dir /mnt/other/village    goes on with the copy
+  gsscale-train --resume runs/village --spill-dir /mnt/other/village    resumes from the copy
 
-All kept generations with their names and numbers; only slots that they need. Every page is verified while it is read.";
+The copy has all kept generations with their names and numbers, and only the slots they need. Every page read is verified.";
 
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Args {
     /// A run's output folder, or a spill directory
     dir: PathBuf,
-    /// The copy: a folder that does not exist
+    /// The copy: a folder that does not exist yet
     to: PathBuf,
     /// Print JSON
     #[arg(long)]
@@ -29,7 +29,7 @@ pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
     let done = clone_store(&find_store(&args.dir)?, &args.to)?;
     super::print(args.json, &done, || {
         format!(
-            "{}: {} generations, {} versions of pages, {} read and verified\n\
+            "{}: {} generations, {} page versions, {} read and verified\n\
              go on with it: gsscale-train --resume OUT --spill-dir {}",
             done.to.display(),
             done.generations.len(),

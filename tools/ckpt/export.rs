@@ -1,4 +1,4 @@
-//! `gsscale-ckpt export`: a generation as a PLY.
+//! `gsscale-ckpt export`: writes a generation as a PLY.
 
 use gsscale::base::units::format_bytes;
 use gsscale::config::file::ByteSize;
@@ -15,8 +15,8 @@ Examples:
   gsscale-ckpt export runs/city --out block.ply --crop 350,120,-5,420,190,60
   gsscale-ckpt export runs/city --out city.ply --host-mem 256MiB
 
-Pages are read one after the other: memory is bounded by --host-mem, whatever the scene's size. Without a choice of
-Gaussians the file is the one that gsscale-train would have written after that step.";
+Pages are read one by one: --host-mem bounds the memory for a scene of any size. Without --max-gaussians, --crop
+and --sh-degree the file is the one that gsscale-train would have written after that step.";
 
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
@@ -26,19 +26,19 @@ pub struct Args {
     /// The PLY to write
     #[arg(long, short, value_name = "FILE.ply")]
     out: PathBuf,
-    /// Number or name of a generation; the last one without
+    /// Number or name of a generation [default: the latest]
     #[arg(long, value_name = "GEN|NAME")]
     generation: Option<String>,
-    /// Only this many Gaussians, those that can cover most of a picture
+    /// Export only this many Gaussians, those that can cover the most of a picture
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     max_gaussians: Option<u64>,
-    /// Only Gaussians whose means lie in this box of dataset coordinates
+    /// Export only Gaussians whose means are in this box of dataset coordinates
     #[arg(long, value_name = "MINX,MINY,MINZ,MAXX,MAXY,MAXZ", value_parser = parse_box, allow_hyphen_values = true)]
     crop: Option<[f64; 6]>,
-    /// Only bands of spherical harmonics up to this degree
+    /// Export only spherical harmonics up to this degree
     #[arg(long, value_name = "0..3", value_parser = clap::value_parser!(u8).range(0..=3))]
     sh_degree: Option<u8>,
-    /// Memory that it may take
+    /// Most memory to use
     #[arg(long, default_value = "1GiB", value_name = "SIZE")]
     host_mem: ByteSize,
     /// Print JSON
@@ -47,7 +47,7 @@ pub struct Args {
 }
 
 fn parse_box(text: &str) -> Result<[f64; 6], String> {
-    let wrong = || format!("'{text}' is no box; write minx,miny,minz,maxx,maxy,maxz");
+    let wrong = || format!("'{text}' is not a box; write minx,miny,minz,maxx,maxy,maxz");
     let values: Result<Vec<f64>, _> = text.split(',').map(|v| v.trim().parse()).collect();
     let corners: [f64; 6] = values.map_err(|_| wrong())?.try_into().map_err(|_| wrong())?;
     let is_box = corners.iter().all(|x| x.is_finite()) && (0..3).all(|i| corners[i] <= corners[3 + i]);
@@ -66,7 +66,7 @@ pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
     let done = export(&find_store(&args.dir)?, &request)?;
     super::print(args.json, &done, || {
         let mut text = format!(
-            "{}: {} Gaussians as of generation {} (step {}), {}; {} of pages read, {} of memory at most\n",
+            "{}: {} Gaussians as of generation {} (step {}), {}; {} of pages read, at most {} of memory used\n",
             done.file.display(),
             done.gaussians,
             done.generation,
@@ -76,7 +76,7 @@ pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
             format_bytes(done.host_bytes_peak),
         );
         if done.is_local {
-            text += "positions are local: see the comments of the file for origin and scale\n";
+            text += "positions are local: the file's comments give origin and scale\n";
         }
         if done.skipped > 0 {
             text += &format!("{} Gaussians are not finite and were left out\n", done.skipped);

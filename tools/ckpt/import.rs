@@ -1,4 +1,4 @@
-//! `gsscale-ckpt import`: a store of the Gaussians of a PLY.
+//! `gsscale-ckpt import`: makes a store from the Gaussians of a PLY.
 
 use gsscale::base::units::format_bytes;
 use gsscale::config::file::ByteSize;
@@ -24,16 +24,16 @@ pub struct Args {
     /// A PLY of Gaussians
     #[arg(value_name = "FILE.ply")]
     file: PathBuf,
-    /// The store to make: a folder that does not exist
+    /// The store to make: a folder that does not exist yet
     #[arg(long, short, value_name = "DIR")]
     out: PathBuf,
-    /// Memory that it may take
+    /// Most memory to use
     #[arg(long, default_value = "1GiB", value_name = "SIZE")]
     host_mem: ByteSize,
-    /// Gaussians that a page holds
+    /// Gaussians per page
     #[arg(long, default_value_t = 1024, value_name = "N", value_parser = clap::value_parser!(u32).range(16..=65_536))]
     page_rows: u32,
-    /// How pages are stored: raw, halves, or zstd:LEVEL
+    /// Codec of the pages: raw, halves, or zstd:LEVEL
     #[arg(long, default_value = "raw", value_name = "CODEC")]
     spill_codec: Codec,
     /// Print JSON
@@ -51,7 +51,7 @@ pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
     })?;
     super::print(args.json, &done, || {
         let mut text = format!(
-            "{}: {} Gaussians with SH degree {} in {} pages, {} of memory at most\n",
+            "{}: {} Gaussians with SH degree {} in {} pages, at most {} of memory used\n",
             done.store.display(),
             done.gaussians,
             done.sh_degree,

@@ -1,4 +1,4 @@
-//! `gsscale-ckpt inspect`: a store, its trainer's state, one page.
+//! `gsscale-ckpt inspect`: shows a store, its training state, or one page.
 
 use gsscale::base::ids::PageId;
 use gsscale::base::units::format_bytes;
@@ -18,7 +18,7 @@ Examples:
 pub struct Args {
     /// A run's output folder, or a spill directory
     dir: PathBuf,
-    /// Number or name of a generation; the last one without
+    /// Number or name of a generation [default: the latest]
     #[arg(long, value_name = "GEN|NAME")]
     generation: Option<String>,
     /// Show this page: 17, or 17.0.1 for a part of it
@@ -49,11 +49,11 @@ fn store_text(s: &Inspected) -> String {
     let [d0, d1, d2, d3] = s.pages_by_degree;
     let mut text = format!(
         "store       {} ({})\n\
-         format      version {}, features {:#x} (to be known), {:#x} (to be passed over)\n\
+         format      version {}, features {:#x} (incompatible), {:#x} (compatible)\n\
          slots       {} each, {} a segment\n\
          segments    {} files, {}\n\
          map         {} transactions\n\
-         generation  {}: {} pages, {} behind the last event\n\
+         generation  {}: {} pages, {} with pending events\n\
          codec       {raw} raw, {zstd} zstd, {halves} halves; {} of payload in {}\n\
          degrees     {d0} pages with degree 0, {d1} with 1, {d2} with 2, {d3} with 3\n",
         s.identity,
@@ -76,7 +76,7 @@ fn store_text(s: &Inspected) -> String {
         text += &format!("{:<12}{word}\n", if i == 0 { "trainer" } else { "" });
     }
     if let Some(who) = &s.used_by {
-        text += &format!("in use ({who}): this is as of its last commit\n");
+        text += &format!("in use ({who}): the state shown is that of the last commit\n");
     }
     text
 }
@@ -90,7 +90,7 @@ fn page_text(p: &PageInspected) -> String {
          rows        {} with SH degree {}, {} of {} events applied\n\
          means       {:?} to {:?}, sigma at most {}\n\
          updated     step {}\n\
-         moments     {} rows have none\n\
+         moments     zero in {} rows\n\
          opacity     {}\n\
          sigma       {}\n\
          views       {} since the last round\n",

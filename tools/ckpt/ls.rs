@@ -1,4 +1,4 @@
-//! `gsscale-ckpt ls`: generations and named checkpoints.
+//! `gsscale-ckpt ls`: lists generations and named checkpoints.
 
 use gsscale::base::units::format_bytes;
 use gsscale::train::error::TrainError;
@@ -11,7 +11,7 @@ Examples:
   gsscale-ckpt ls runs/village
   gsscale-ckpt ls /mnt/nvme/pages --json
 
-'alone' are the bytes that only this generation needs, 'bytes' those of all its pages. Works while the run trains.";
+'bytes' counts all pages of a generation, 'alone' those that no other generation needs. Works while the run trains.";
 
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
@@ -31,11 +31,11 @@ pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
         rows.extend(listed.generations.iter().map(row));
         let mut text = super::table(&rows);
         if listed.generations.is_empty() {
-            text = "nothing was committed yet".to_string();
+            text = "no commit yet".to_string();
         }
         text += &format!("\nsegment files: {}", format_bytes(listed.segment_bytes));
         if let Some(who) = &listed.used_by {
-            text += &format!("\nin use ({who}): this is as of its last commit");
+            text += &format!("\nin use ({who}): the state shown is that of the last commit");
         }
         text
     })?;

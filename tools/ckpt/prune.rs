@@ -1,4 +1,4 @@
-//! `gsscale-ckpt prune`: takes names of checkpoints away.
+//! `gsscale-ckpt prune`: removes names of checkpoints.
 
 use gsscale::base::units::format_bytes;
 use gsscale::train::error::TrainError;
@@ -8,11 +8,11 @@ use std::process::ExitCode;
 
 const EXAMPLES: &str = "\
 Examples:
-  gsscale-ckpt prune runs/village --keep 3            the three newest named checkpoints stay
-  gsscale-ckpt prune runs/village step-7000           this one goes
+  gsscale-ckpt prune runs/village --keep 3            keep the three newest named checkpoints
+  gsscale-ckpt prune runs/village step-7000           remove this one
   gsscale-ckpt prune runs/village --keep 0 --dry-run
 
-The last two generations stay in any case. Slots that become free are written again by the run; the segment files keep
+The last two generations always stay. The run reuses slots that become free; the segment files keep
 their length.";
 
 #[derive(clap::Args)]
@@ -20,13 +20,13 @@ their length.";
 pub struct Args {
     /// A run's output folder, or a spill directory
     dir: PathBuf,
-    /// Names that go
+    /// Names to remove
     #[arg(value_name = "NAME", required_unless_present = "keep")]
     names: Vec<String>,
     /// Keep this many of the newest named checkpoints
     #[arg(long, value_name = "N", conflicts_with = "names")]
     keep: Option<usize>,
-    /// Only say what would go
+    /// Only print what would be removed
     #[arg(long)]
     dry_run: bool,
     /// Print JSON
@@ -47,17 +47,17 @@ fn text_of(pruned: &Pruned) -> String {
         numbers => numbers.iter().map(u64::to_string).collect::<Vec<_>>().join(", "),
     };
     if pruned.dropped_names.is_empty() {
-        return format!("no name goes; kept generations: {}", list(&pruned.kept));
+        return format!("no name to remove; kept generations: {}", list(&pruned.kept));
     }
     let (names, gone) = (pruned.dropped_names.join(", "), list(&pruned.dropped));
     match pruned.is_done {
         true => format!(
-            "names that went: {names}; generations that went: {gone}; kept: {}; {} free for the run",
+            "removed names: {names}; removed generations: {gone}; kept: {}; {} free for the run",
             list(&pruned.kept),
             format_bytes(pruned.bytes_freed)
         ),
         false => {
-            format!("names that would go: {names}; generations that would go: {gone}; kept: {}", list(&pruned.kept))
+            format!("would remove names: {names}; would remove generations: {gone}; kept: {}", list(&pruned.kept))
         }
     }
 }

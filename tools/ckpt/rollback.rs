@@ -1,4 +1,4 @@
-//! `gsscale-ckpt rollback`: makes an earlier generation the last one.
+//! `gsscale-ckpt rollback`: makes an earlier generation the latest one.
 
 use gsscale::train::error::TrainError;
 use gsscale::train::stores::{RolledBack, find_store, rollback};
@@ -7,18 +7,18 @@ use std::process::ExitCode;
 
 const EXAMPLES: &str = "\
 Examples:
-  gsscale-ckpt rollback runs/village 41          says what would be lost
-  gsscale-ckpt rollback runs/village 41 --yes    then gsscale-train --resume runs/village goes on from there";
+  gsscale-ckpt rollback runs/village 41          prints what would be lost
+  gsscale-ckpt rollback runs/village 41 --yes    then gsscale-train --resume runs/village continues from there";
 
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Args {
     /// A run's output folder, or a spill directory
     dir: PathBuf,
-    /// Number or name of the generation to go back to
+    /// Number or name of the generation to roll back to
     #[arg(value_name = "GEN|NAME")]
     generation: String,
-    /// Do it: later generations and their names are lost
+    /// Do it: removes later generations and their names
     #[arg(long)]
     yes: bool,
     /// Print JSON
@@ -32,14 +32,14 @@ pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
     if done.is_done || done.dropped.is_empty() {
         return Ok(ExitCode::SUCCESS);
     }
-    eprintln!("nothing was done\n  remedy: give --yes to go back");
+    eprintln!("nothing was changed\n  remedy: give --yes to roll back");
     Ok(ExitCode::FAILURE)
 }
 
 fn text_of(done: &RolledBack) -> String {
     let RolledBack { generation, step, dropped, dropped_names, is_done } = done;
     if dropped.is_empty() {
-        return format!("generation {generation} (step {step}) is the last one already");
+        return format!("generation {generation} (step {step}) is already the latest");
     }
     let list: Vec<String> = dropped.iter().map(u64::to_string).collect();
     let names = match dropped_names.as_slice() {

@@ -1,4 +1,4 @@
-//! `gsscale-ckpt salvage`: a damaged store, rebuilt elsewhere.
+//! `gsscale-ckpt salvage`: rebuilds a damaged store elsewhere.
 
 use gsscale::train::error::TrainError;
 use gsscale::train::stores::{SalvageRequest, Salvaged, find_store, salvage};
@@ -11,19 +11,19 @@ Examples:
   gsscale-ckpt salvage /mnt/nvme/pages --out rescued --config runs/village/config.toml
   gsscale-ckpt export rescued --out rescued.ply
 
-Where the map is whole, damaged pages are replaced by their newest older versions, and gsscale-train --resume OUT
---spill-dir TO goes on. Where it is lost, the newest whole version of every page is taken: a scene to export and to start
-from. What is missing is listed. DIR is never written.";
+If the map is intact, damaged pages are replaced by their newest older versions, and gsscale-train --resume OUT
+--spill-dir TO continues. If the map is lost, the newest intact version of every page is taken: a scene to export or to
+start from. Missing pages are listed. DIR is never written.";
 
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Args {
     /// A run's output folder, or a spill directory
     dir: PathBuf,
-    /// The new store: a folder that does not exist
+    /// The new store: a folder that does not exist yet
     #[arg(long, short, value_name = "TO")]
     out: PathBuf,
-    /// config.toml of the run, where the map is lost and DIR is the spill directory
+    /// config.toml of the run, if the map is lost and DIR is the spill directory
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Print JSON
@@ -44,7 +44,7 @@ fn text_of(done: &Salvaged) -> String {
         let rows = page.rows.map_or(String::new(), |rows| format!(" of {rows} Gaussians"));
         let taken = match page.taken {
             Some(generation) => format!("its version of generation {generation} was taken"),
-            None => "it is lost".to_string(),
+            None => "the page is lost".to_string(),
         };
         text += &format!("page {}{rows}: {}; {taken}\n", page.page, page.what);
     }

@@ -1,4 +1,4 @@
-//! `gsscale-ckpt verify`: whether a store is whole.
+//! `gsscale-ckpt verify`: verifies a store.
 
 use gsscale::base::units::format_bytes;
 use gsscale::train::error::TrainError;
@@ -8,18 +8,18 @@ use std::process::ExitCode;
 
 const EXAMPLES: &str = "\
 Examples:
-  gsscale-ckpt verify runs/village           the map, every state, every segment's length, every slot's header
-  gsscale-ckpt verify runs/village --deep    and every page's checksum and values: reads everything
+  gsscale-ckpt verify runs/village           verify the map, every state, every segment's length, every slot's header
+  gsscale-ckpt verify runs/village --deep    also every page's checksum and values: reads everything
   gsscale-ckpt verify runs/village --deep --json | jq .faults
 
-Exit code 0: whole; 1: faults, which are listed, or the store could not be looked at.";
+Exit code 0: intact; 1: faults, which are listed, or the store cannot be read.";
 
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Args {
     /// A run's output folder, or a spill directory
     dir: PathBuf,
-    /// Read every page: its checksum, and whether its values are finite
+    /// Read every page: verify its checksum, and that its values are finite
     #[arg(long)]
     deep: bool,
     /// Print JSON
@@ -36,15 +36,15 @@ pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
 fn text_of(verdict: &Verdict, args: &Args) -> String {
     let mut text: String = verdict.faults.iter().map(|fault| line(fault) + "\n").collect();
     let read = if verdict.deep { format!(", {} read", format_bytes(verdict.bytes_read)) } else { String::new() };
-    let what = format!("{} generations, {} versions of pages{read}", verdict.generations, verdict.versions);
+    let what = format!("{} generations, {} page versions{read}", verdict.generations, verdict.versions);
     text += &match verdict.faults.len() {
-        0 if verdict.deep => format!("whole: {what}"),
-        0 => format!("whole as far as headers tell: {what}; --deep reads the pages"),
+        0 if verdict.deep => format!("intact: {what}"),
+        0 => format!("intact according to all headers: {what}; --deep reads the pages"),
         n => {
             let dir = args.dir.display();
             format!(
                 "{n} faults: {what}\n\
-                 remedy: go back to a generation without them (gsscale-ckpt rollback {dir} GEN), or save what is whole\n\
+                 remedy: roll back to a generation without them (gsscale-ckpt rollback {dir} GEN), or recover the intact pages\n\
                  (gsscale-ckpt salvage {dir} --out TO)"
             )
         }

@@ -1,7 +1,7 @@
-//! COLMAP's binary files, little-endian, read as a stream: memory grows with what is kept, never with what is skipped.
+//! COLMAP's binary files, little-endian, read as a stream: memory grows with the kept data, not with the skipped.
 //!
-//! Invariants: 1. every count is checked against the bytes left, at the smallest possible record, before anything is
-//! allocated; 2. every error says at which byte the record or field begins.
+//! Invariants: 1. every count is checked against the bytes left, assuming the smallest possible record, before anything
+//! is allocated; 2. every error names the byte at which the record or field starts.
 //!
 //! Layouts: cameras `u64 n, n x {u32 id, i32 model, u64 width, u64 height, f64 params[]}`; images `u64 n, n x {u32 id,
 //! f64 qw qx qy qz tx ty tz, u32 camera, name NUL, u64 m, m x {f64 x, f64 y, i64 point}}`; points `u64 n, n x {u64 id,
@@ -21,7 +21,7 @@ const POINT_MIN: u64 = 8 + 3 * 8 + 3 + 8 + 8;
 const OBSERVATION: u64 = 24;
 const TRACK_ELEMENT: u64 = 8;
 
-/// A binary file and where in it we are.
+/// A binary file with the read position.
 struct Source {
     path: PathBuf,
     reader: BufReader<File>,
@@ -81,7 +81,7 @@ impl Source {
         Ok(values)
     }
 
-    /// A count of records that must fit into the rest of the file.
+    /// Reads a count of records that must fit into the rest of the file.
     fn count(&mut self, what: &str, record_bytes: u64) -> InputResult<u64> {
         let at = self.offset;
         let count = self.u64(what)?;
@@ -92,7 +92,7 @@ impl Source {
         Ok(count)
     }
 
-    /// Passes over `bytes`, which the caller has checked to be there.
+    /// Skips `bytes`, which the caller has checked to exist.
     fn skip(&mut self, bytes: u64) -> InputResult<()> {
         let seek = i64::try_from(bytes).map_err(|_| self.cut_short("a record", bytes))?;
         self.reader
@@ -117,7 +117,7 @@ impl Source {
         String::from_utf8(bytes).map_err(|_| self.error(at, "an image name that is not UTF-8"))
     }
 
-    /// A warning when records end before the file does.
+    /// Adds a warning if bytes follow the last record.
     fn finish(&self, warnings: &mut Vec<String>) {
         if self.left() > 0 {
             let left = self.left();
@@ -146,19 +146,19 @@ pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResu
         }
         let intrinsics = models::intrinsics(model, size, &params[..model.params]).map_err(|p| wrong(p, DAMAGED))?;
         if cameras.insert(id, intrinsics).is_some() {
-            return Err(wrong("been defined before".into(), DAMAGED));
+            return Err(wrong("a second definition".into(), DAMAGED));
         }
     }
     source.finish(warnings);
     Ok(cameras)
 }
 
-/// The number of images that `images.bin` claims, if the file could hold them.
+/// The number of images that `images.bin` states, if the file is long enough for them.
 pub(super) fn count_images(path: &Path) -> InputResult<u64> {
     Source::open(path)?.count("images", IMAGE_MIN)
 }
 
-/// Reads `images.bin`; 2D points are passed over.
+/// Reads `images.bin`; skips 2D points.
 pub(super) fn read_images(path: &Path, warnings: &mut Vec<String>) -> InputResult<Vec<ImageRecord>> {
     let mut source = Source::open(path)?;
     let count = source.count("images", IMAGE_MIN)?;
@@ -177,7 +177,7 @@ pub(super) fn read_images(path: &Path, warnings: &mut Vec<String>) -> InputResul
     Ok(images)
 }
 
-/// Reads `points3D.bin`; tracks are passed over.
+/// Reads `points3D.bin`; skips tracks.
 pub(super) fn read_points(path: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>) -> InputResult<()> {
     let mut source = Source::open(path)?;
     let count = source.count("points", POINT_MIN)?;

@@ -1,11 +1,11 @@
-//! Reads a COLMAP scene: which model folder, what its files say, and views from it. Photos are not opened.
+//! Reads a COLMAP scene: chooses the model folder, parses its files, and makes views. Opens no photo.
 //!
-//! Invariants: 1. whatever the files hold, the result is a scene or an [`InputError`] with file, place and remedy;
-//! 2. memory grows with the views and points that are kept, not with tracks or 2D points; 3. a view is left out, with
-//! a warning that names it, only for its own pose; anything that makes the rest of a file doubtful is an error.
+//! Invariants: 1. for any file content the result is a scene or an [`InputError`] with file, place and remedy; 2.
+//! memory grows with the kept views and points, not with tracks or 2D points; 3. only a bad pose drops a view, with a
+//! warning that names it; anything that makes the rest of a file doubtful is an error.
 //!
-//! Camera models 0 to 6, 8 and 9 can be used (the table is in `models`); rigs and frames files are ignored, since the images file
-//! holds every pose. Image and point numbers are not looked at: views are identified by name.
+//! Camera models 0 to 6, 8 and 9 are supported (table in `models`). Rigs and frames files are ignored, because the
+//! images file holds every pose. Image and point ids are ignored: views are identified by name.
 
 mod binary;
 mod models;
@@ -21,18 +21,18 @@ use glam::{DMat3, DQuat, DVec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Where a model is looked for, in words.
+/// Places that are searched for a model, for messages.
 pub(super) const LOOKED_FOR: &str = "COLMAP's cameras and images files (.bin or .txt) in sparse/*, sparse, colmap/sparse/*, colmap/sparse and the folder itself";
-/// Remedy for a file that cannot be what COLMAP wrote.
+/// Remedy for a file that COLMAP cannot have written.
 const DAMAGED: &str = "the file is damaged or cut short: copy it again or export the model again";
-/// A quaternion whose largest component is smaller than this has no direction.
+/// A quaternion with a smaller largest component has no direction.
 const MIN_QUAT: f64 = 1e-6;
 
 type Cameras = BTreeMap<u32, Intrinsics>;
 
 /// One entry of an images file.
 struct ImageRecord {
-    /// Byte or line where the entry begins.
+    /// Byte or line where the entry starts.
     position: u64,
     camera_id: u32,
     /// w, x, y, z as in the file, world to camera.
@@ -67,18 +67,18 @@ impl ModelFolder {
     }
 }
 
-/// Whether a COLMAP model is found where [`read_colmap`] looks for one.
+/// Whether [`read_colmap`] would find a COLMAP model.
 pub fn looks_like_colmap(scene: &Path) -> bool {
     !find_models(scene).is_empty()
 }
 
-/// Reads the COLMAP model of a scene folder. Views come in the order of their names; `image_path` is
-/// `scene/<images>/<name>`. Points that are not finite are dropped and counted. Where there is no image folder but
-/// `train` and `val` with photos, these are looked through ([`parts`]).
+/// Reads the COLMAP model of a scene folder. Views are sorted by name; `image_path` is `scene/<images>/<name>`.
+/// Non-finite points are dropped and counted. If there is no image folder but `train` and `val` with photos, these are
+/// searched ([`parts`]).
 ///
 /// # Errors
-/// No model, no image folder, files that are truncated, contradict themselves or hold more than 1 % of points that are
-/// not finite, names that would leave the image folder or occur twice, cameras that cannot be used.
+/// No model, no image folder, files that are truncated, contradict themselves or have more than 1 % non-finite points,
+/// names that would leave the image folder or occur twice, unsupported cameras.
 pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     if !looks_like_colmap(scene) {
         return Err(no_model(scene));
@@ -88,7 +88,7 @@ pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene>
     if !image_folder.is_dir() && apart.is_empty() {
         return Err(InputError::new(
             &image_folder,
-            "the image folder is not there",
+            "the image folder does not exist",
             "name the folder of the photos, relative to the scene, with --images",
         ));
     }
@@ -98,7 +98,7 @@ pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene>
     Ok(RawScene { views, points, points_path, warnings, ..RawScene::default() })
 }
 
-/// What a model says.
+/// Content of a model.
 struct Model {
     views: Vec<RawView>,
     points: PointCloud,
@@ -106,8 +106,8 @@ struct Model {
     warnings: Vec<String>,
 }
 
-/// Reads the model of a folder whose photos lie in `image_folder`; of its points, whether they are read later, or
-/// `None` to leave them out.
+/// Reads the model of a folder whose photos are in `image_folder`. `points_later`: whether the caller reads the points
+/// later; `None` leaves them out.
 fn read_model(folder: &Path, image_folder: &Path, points_later: Option<bool>) -> InputResult<Model> {
     let mut warnings = Vec::new();
     let model = choose_model(folder, &mut warnings)?;
@@ -147,7 +147,7 @@ fn no_model(scene: &Path) -> InputError {
     InputError::new(scene, problem, "give the folder that holds 'sparse' and 'images'")
 }
 
-/// The model with the most images; the first of equals.
+/// The model with the most images; the first among equals.
 fn choose_model(scene: &Path, warnings: &mut Vec<String>) -> InputResult<ModelFolder> {
     let mut models = find_models(scene);
     if models.is_empty() {
@@ -164,7 +164,7 @@ fn choose_model(scene: &Path, warnings: &mut Vec<String>) -> InputResult<ModelFo
             Ok(count) if best.as_ref().is_none_or(|(most, _)| count > *most) => best = Some((count, model)),
             Ok(_) => {}
             Err(error) => {
-                warnings.push(format!("{}: this model is passed over: {}", model.folder.display(), error.problem));
+                warnings.push(format!("{}: this model is skipped: {}", model.folder.display(), error.problem));
                 first_error.get_or_insert(error);
             }
         }
@@ -221,31 +221,31 @@ fn make_views(
     Ok(views)
 }
 
-/// The pose of a w-first quaternion of any length and a translation; `None` when there is none.
+/// The pose of a w-first quaternion of any length and a translation; `None` if they are unusable.
 fn make_pose(quat: [f64; 4], translation: [f64; 3]) -> Option<Pose> {
     let largest = quat.iter().fold(0.0f64, |m, q| m.max(q.abs()));
     let finite = quat.iter().all(|q| q.is_finite()) && translation.iter().all(|t| t.abs() <= MAX_COORDINATE);
     if !finite || largest < MIN_QUAT {
         return None;
     }
-    // Divided by the largest first, so that squares of huge components stay finite.
+    // Divided by the largest component first, so that squares stay finite.
     let [w, x, y, z] = quat.map(|q| q / largest);
     let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
     Some(Pose { rotation, translation: DVec3::from_array(translation) })
 }
 
-/// Hands every point of a `points3D.bin` or `points3D.txt` to `take`, in the file's order; tracks are passed over, points
-/// that are not finite are left out and counted in a warning.
+/// Streams every point of a `points3D.bin` or `points3D.txt` to `take`, in file order; skips tracks, drops non-finite
+/// points and counts them in a warning.
 ///
 /// # Errors
-/// A file that is damaged or holds more than 1 % of points that are not finite; or `take` failed.
+/// The file is damaged or has more than 1 % non-finite points; or `take` failed.
 pub fn stream_points(file: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>) -> InputResult<()> {
     let is_text = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("txt"));
     if is_text { text::read_points(file, warnings, take) } else { binary::read_points(file, warnings, take) }
 }
 
-/// Points of the model: from either format, the images' own first. A `points3D.ply` is named for the caller instead, and
-/// any file when points are to be read `later`.
+/// Points of the model: from either format, that of the images first. A `points3D.ply` is left to the caller by path,
+/// and so is any file if points are to be read `later`.
 fn read_points(
     model: &ModelFolder,
     later: bool,
@@ -275,7 +275,7 @@ fn read_points(
     Ok((PointCloud::default(), None))
 }
 
-/// Counts points as they go by, and those that are not finite.
+/// Counts points, and the non-finite ones among them.
 #[derive(Default)]
 struct PointTally {
     total: u64,
@@ -284,7 +284,7 @@ struct PointTally {
 }
 
 impl PointTally {
-    /// Hands on a point unless it is not finite.
+    /// Passes a finite point on.
     fn add(&mut self, position: [f64; 3], color: [u8; 3], place: u64, take: &mut TakePoint<'_>) -> InputResult<()> {
         self.total += 1;
         if position.iter().all(|x| x.is_finite()) {
@@ -297,7 +297,7 @@ impl PointTally {
         Ok(())
     }
 
-    /// An error when more than 1 % were dropped.
+    /// Fails if more than 1 % were dropped.
     fn finish(self, path: &Path, unit: &str, warnings: &mut Vec<String>) -> InputResult<()> {
         let total = self.total;
         if self.dropped.saturating_mul(100) > total {

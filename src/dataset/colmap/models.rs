@@ -1,22 +1,22 @@
-//! COLMAP's camera models: numbers, names, parameter order, and the lens each one is here.
+//! COLMAP's camera models: ids, names, parameter order, and the corresponding lens.
 //!
 //! The table follows COLMAP's `src/colmap/sensor/models` (ids 0 to 17 in 2026).
 
 use crate::dataset::checks::checked_intrinsics;
 use crate::dataset::model::{Intrinsics, Lens};
 
-/// Remedy for a camera model that cannot be used.
+/// Remedy for an unsupported camera model.
 pub(super) const UNDISTORT: &str =
     "undistort the photos first, which writes PINHOLE cameras: colmap image_undistorter --output_type COLMAP";
 
-/// A camera model that COLMAP knows.
+/// A camera model known to COLMAP.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct CameraModel {
     /// COLMAP's number.
     pub id: i32,
     /// COLMAP's name.
     pub name: &'static str,
-    /// Parameters when the model can be used, 0 when it cannot.
+    /// Number of parameters of a supported model, 0 for an unsupported one.
     pub params: usize,
 }
 
@@ -45,7 +45,7 @@ static MODELS: [CameraModel; 18] = [
     model(17, "EQUIRECTANGULAR", 0),
 ];
 
-/// The usable model of this number, or why there is none.
+/// The supported model of this id, or the reason.
 pub(super) fn by_id(id: i32) -> Result<&'static CameraModel, String> {
     match MODELS.iter().find(|m| m.id == id) {
         Some(m) => usable(m),
@@ -53,7 +53,7 @@ pub(super) fn by_id(id: i32) -> Result<&'static CameraModel, String> {
     }
 }
 
-/// The usable model of this name, or why there is none.
+/// The supported model of this name, or the reason.
 pub(super) fn by_name(name: &str) -> Result<&'static CameraModel, String> {
     match MODELS.iter().find(|m| m.name == name) {
         Some(m) => usable(m),
@@ -93,7 +93,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn parameters_land_where_colmap_means_them() {
+    fn parameters_map_to_their_meaning_in_colmap() {
         let lens = |id: i32, p: &[f64]| {
             let i = intrinsics(by_id(id).unwrap(), (640, 480), p).unwrap();
             (i.fx, i.fy, i.cx, i.cy, i.lens)

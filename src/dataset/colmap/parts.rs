@@ -1,15 +1,15 @@
-//! Scenes whose photos lie in a training and a held-out folder, as Mill-19 and UrbanScene3D do once the COLMAP models
-//! that the CityGaussian line publishes were put beside them:
+//! Scenes with photos in a training and a held-out folder, such as Mill-19 and UrbanScene3D with the COLMAP models that
+//! the CityGaussian line publishes:
 //!
 //! ```text
 //! train/sparse/0/  train/rgbs/      val/sparse/0/  val/rgbs/
 //! ```
 //!
-//! or with one model of all photos in `sparse/0/`. They are read as though the folders were merged, and nothing is
-//! copied: a view keeps its own name, so that order and split by index are those of the merged folder.
+//! or with one model of all photos in `sparse/0/`. They are read as if the folders were merged, without copying: a view
+//! keeps its own name, so that order and split by index equal those of the merged folder.
 //!
-//! Invariants: 1. a photo name that both folders have is never guessed at: with two models it is told apart by its
-//! folder's name, with one model it is an error; 2. with two models the folders prescribe the split.
+//! Invariants: 1. a photo name that both folders have is resolved without guessing: with two models the folder's name
+//! distinguishes the views, with one model it is an error; 2. with two models the folders prescribe the split.
 
 use super::{Model, read_model};
 use crate::base::error::{InputError, InputResult};
@@ -19,17 +19,17 @@ use crate::dataset::read::ReadOptions;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Folders with photos inside a part: as CityGaussian renames them, as Mega-NeRF has them, as COLMAP's scripts do.
+/// Photo folders inside a part: CityGaussian's name, Mega-NeRF's, and that of COLMAP's scripts.
 const PHOTOS: [&str; 3] = ["images", "rgbs", "input"];
 /// Folders of held-out photos.
 const HELD_OUT: [&str; 2] = ["val", "test"];
 
-/// The folder with the photos of a part.
+/// The photo folder of a part.
 pub(in crate::dataset) fn photo_folder(part: &Path) -> Option<PathBuf> {
     PHOTOS.iter().map(|name| part.join(name)).find(|path| path.is_dir())
 }
 
-/// Photo folders of both parts, where there are any.
+/// The existing photo folders of both parts.
 pub(super) fn photo_folders(scene: &Path) -> Vec<PathBuf> {
     ["train", "val", "test"].iter().filter_map(|part| photo_folder(&scene.join(part))).collect()
 }
@@ -40,15 +40,15 @@ fn parts(scene: &Path) -> Option<[PathBuf; 2]> {
     Some([with_model("train")?, HELD_OUT.into_iter().find_map(with_model)?])
 }
 
-/// Whether [`read_parts`] finds something in this folder.
+/// Whether [`read_parts`] would find something in this folder.
 pub fn looks_like_parts(scene: &Path) -> bool {
     parts(scene).is_some()
 }
 
-/// Reads both parts; points are those of the training part.
+/// Reads both parts; the points are those of the training part.
 ///
 /// # Errors
-/// As [`super::read_colmap`] of either; or a part without photos.
+/// As [`super::read_colmap`] for either part; or a part has no photos.
 pub fn read_parts(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let Some(folders) = parts(scene) else {
         return Err(InputError::new(scene, "no models in train/sparse and val/sparse", "put them there"));
@@ -87,12 +87,12 @@ fn photos_of(part: &Path, options: &ReadOptions) -> InputResult<PathBuf> {
     })
 }
 
-/// For a model of all photos without a folder of all photos: each view's photo in one of `folders`.
+/// For one model of all photos without a common folder: finds each view's photo in one of `folders`.
 pub(super) fn find_photos(views: &mut [RawView], folders: &[PathBuf]) -> InputResult<()> {
     for view in views {
         let found: Vec<PathBuf> = folders.iter().map(|f| f.join(&view.name)).filter(|path| path.is_file()).collect();
         match &found[..] {
-            // Missing photos are the loader's matter.
+            // The loader reports missing photos.
             [] => {}
             [path] => view.image_path.clone_from(path),
             _ => {

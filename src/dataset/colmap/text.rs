@@ -1,6 +1,6 @@
-//! COLMAP's text files, read line by line: of a line only what is needed is kept, however long it is.
+//! COLMAP's text files, read line by line; of each line, however long, only the needed part is kept.
 //!
-//! Invariants: 1. no buffer is longer than [`LINE_BYTES`]; 2. every error says on which line it is.
+//! Invariants: 1. no buffer is longer than [`LINE_BYTES`]; 2. every error names its line.
 //!
 //! Layouts (`#` starts a comment line): cameras `id MODEL width height params...`; images `id qw qx qy qz tx ty tz
 //! camera name`, each followed by one line, possibly empty, of `x y point` triples; points `id x y z r g b error`, then
@@ -14,16 +14,16 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-/// Bytes of a line that are kept; the longest record (name of 4,096 bytes) is shorter.
+/// Bytes kept of a line; the longest record (with a name of 4,096 bytes) is shorter.
 const LINE_BYTES: usize = 8192;
 
-/// A text file and where in it we are.
+/// A text file with the read position.
 struct Lines {
     path: PathBuf,
     reader: BufReader<File>,
     line: u64,
     buffer: Vec<u8>,
-    /// The kept part of the last line is not all of it.
+    /// Whether the kept part of the last line is incomplete.
     cut: bool,
     /// The count in COLMAP's own comment `# Number of images: 12, ...`.
     stated: Option<u64>,
@@ -43,7 +43,7 @@ impl Lines {
         InputError::new(&self.path, problem, DAMAGED).at(format!("line {}", self.line))
     }
 
-    /// The next line into the buffer, at most [`LINE_BYTES`] of it; false at the end of the file.
+    /// Reads the next line into the buffer, at most [`LINE_BYTES`] of it; false at the end of the file.
     fn advance(&mut self) -> InputResult<bool> {
         let failed = |line: u64, e: &std::io::Error| {
             InputError::io(&self.path, "reading", e).at(format!("line {}", line.saturating_add(1)))
@@ -59,11 +59,11 @@ impl Lines {
         Ok(got > 0)
     }
 
-    /// The kept part of the current line as text without the white space around it.
+    /// The kept part of the current line as trimmed text.
     fn text(&self) -> InputResult<&str> {
         let valid = match std::str::from_utf8(&self.buffer) {
             Ok(text) => text,
-            // A character that only the cut has split is not an error.
+            // A character split by the cut is no error.
             Err(e) if self.cut && e.error_len().is_none() => {
                 std::str::from_utf8(&self.buffer[..e.valid_up_to()]).unwrap_or_default()
             }
@@ -86,7 +86,7 @@ impl Lines {
         Ok(false)
     }
 
-    /// A text file cut between two lines looks whole; COLMAP's comment gives it away.
+    /// A text file cut between two lines looks complete; COLMAP's comment reveals the cut.
     fn finish(&self, what: &str, read: u64, warnings: &mut Vec<String>) {
         if let Some(stated) = self.stated.filter(|&stated| stated != read) {
             let file = self.path.display();
@@ -123,7 +123,7 @@ impl<'a> Words<'a> {
 
     fn number<T: FromStr>(&mut self, what: &str) -> InputResult<T> {
         let word = self.next(what)?;
-        word.parse().map_err(|_| self.lines.error(format!("{what} is {word:?}, which is no such number")))
+        word.parse().map_err(|_| self.lines.error(format!("{what} is {word:?}, which is not a valid number")))
     }
 
     fn numbers<const N: usize>(&mut self, what: &str) -> InputResult<[f64; N]> {
@@ -152,7 +152,7 @@ pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResu
         let intrinsics = models::intrinsics(model, size, &params)
             .map_err(|p| lines.error(format!("camera {id} has a wrong entry: {p}")))?;
         if cameras.insert(id, intrinsics).is_some() {
-            return Err(lines.error(format!("camera {id} has been defined before")));
+            return Err(lines.error(format!("camera {id} has a second definition")));
         }
     }
     lines.finish("cameras", cameras.len() as u64, warnings);
@@ -170,7 +170,7 @@ pub(super) fn count_images(path: &Path) -> InputResult<u64> {
     Ok(count)
 }
 
-/// Reads `images.txt`; 2D points are passed over.
+/// Reads `images.txt`; skips 2D points.
 pub(super) fn read_images(path: &Path, warnings: &mut Vec<String>) -> InputResult<Vec<ImageRecord>> {
     let mut lines = Lines::open(path)?;
     let mut images = Vec::new();
@@ -196,7 +196,7 @@ pub(super) fn read_images(path: &Path, warnings: &mut Vec<String>) -> InputResul
     Ok(images)
 }
 
-/// The line of 2D points must look like one: a file without these lines would lose every second image.
+/// Checks that the line of 2D points looks like one: in a file without these lines every second image would be lost.
 fn check_observations(lines: &Lines) -> InputResult<()> {
     let mut words = lines.text()?.split_whitespace();
     let third_is_id = words.clone().nth(2).is_none_or(|w| w.parse::<i64>().is_ok());
@@ -212,7 +212,7 @@ fn check_observations(lines: &Lines) -> InputResult<()> {
     .at(format!("line {}", lines.line)))
 }
 
-/// Reads `points3D.txt`; tracks are passed over.
+/// Reads `points3D.txt`; skips tracks.
 pub(super) fn read_points(path: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>) -> InputResult<()> {
     let mut lines = Lines::open(path)?;
     let mut tally = PointTally::default();

@@ -1,6 +1,6 @@
-//! A dataset's own points, in its own coordinates, where they may not fit in memory.
+//! The dataset's points in its own coordinates; they may exceed memory.
 //!
-//! Invariants: 1. points keep the order of their file; 2. what is measured here is what is measured of points in memory
+//! Invariants: 1. points keep the order of their file; 2. measurements equal those of points in memory
 //! ([`Extent`](crate::dataset::frame::Extent)), bit for bit.
 
 use super::spool::{Spool, SpoolWriter};
@@ -19,28 +19,28 @@ struct RawPoint {
     color: [u8; 8],
 }
 
-/// Points read once from whatever file they came in.
+/// Points spooled from a file of any format.
 #[derive(Debug)]
 pub struct Cloud {
     points: Spool<RawPoint>,
 }
 
-/// The points of a [`Cloud`] in the local frame, those left out that are too far from everything.
+/// The points of a [`Cloud`] in the local frame, without implausibly far ones.
 #[derive(Debug)]
 pub struct LocalCloud<'a> {
     /// The points.
     pub cloud: &'a Cloud,
-    /// What is too far.
+    /// Decides which points are too far.
     pub extent: Extent,
     /// The local frame.
     pub frame: Frame,
 }
 
 impl Cloud {
-    /// Takes all points that `read` hands out.
+    /// Spools all points that `read` produces.
     ///
     /// # Errors
-    /// `read` failed, or the folder of the budget cannot be written.
+    /// `read` failed, or the budget's folder cannot be written.
     pub fn gather(budget: &Budget<'_>, read: impl FnOnce(&mut TakePoint<'_>) -> InputResult<()>) -> InputResult<Cloud> {
         let mut points = SpoolWriter::new(budget.space());
         read(&mut |position, [r, g, b]| points.push(RawPoint { position, color: [r, g, b, 0, 0, 0, 0, 0] }))?;
@@ -52,7 +52,7 @@ impl Cloud {
         self.points.len()
     }
 
-    /// Whether there are none.
+    /// Whether there are no points.
     pub fn is_empty(&self) -> bool {
         self.points.is_empty()
     }
@@ -65,7 +65,7 @@ impl Cloud {
         self.points.for_each(|p| take(DVec3::from_array(p.position), [p.color[0], p.color[1], p.color[2]]))
     }
 
-    /// Median distance of the usable points from a position (of an even number: the mean of the middle two); 0 without
+    /// Median distance of the usable points from a position (for an even number the mean of the middle two); 0 without
     /// points.
     ///
     /// # Errors
@@ -83,7 +83,7 @@ impl Cloud {
         while !above.is_done() {
             self.for_each(|p, _| {
                 if usable(p) {
-                    // Numbers that are not negative are ordered like their bits.
+                    // Non-negative numbers are ordered like their bits.
                     let key = p.distance(from).to_bits();
                     below.count(key);
                     above.count(key);
@@ -116,7 +116,7 @@ mod tests {
     use crate::base::rng::{Purpose, Stream};
 
     #[test]
-    fn extents_of_clouds_in_files_are_those_of_clouds_in_memory() {
+    fn extents_of_clouds_in_files_equal_those_in_memory() {
         let folder = tempfile::tempdir().unwrap();
         let centres: Vec<DVec3> = (0..9).map(|i| DVec3::new(f64::from(i), 2.0, -1.0)).collect();
         for count in [0, 1, 2, 7, 500, 501] {

@@ -1,9 +1,9 @@
-//! Distances to the nearest neighbours in a cloud that does not fit in memory: block by block, and across blocks where
-//! a block's box is near enough to matter.
+//! Distances to the nearest neighbours in a cloud larger than memory: block by block, and across blocks whose boxes are
+//! near enough.
 //!
 //! Invariant: the distances are those of [`crate::scene::neighbours::nearest_dist2`] over the whole cloud, bit for bit,
-//! whatever fits in memory: a neighbour in another block is nearer than the third of the own block only if that
-//! block's box is.
+//! for any memory budget: a neighbour in another block can be nearer than the third nearest in the own block only if
+//! that block's box is.
 
 use super::divide::Division;
 use super::spool::{Spool, SpoolSpace, SpoolWriter};
@@ -15,23 +15,23 @@ use crate::scene::partition::Pages;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Bytes that a point takes while its block is searched: record, position, tree, distances.
+/// Bytes per point while its block is searched: record, position, tree, distances.
 const SEARCH_BYTES: usize = 96;
 
-/// A question to another block.
+/// A query to another block.
 #[derive(Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C)]
-struct Question {
+struct Query {
     point: [f32; 3],
-    /// Only what is nearer than this matters.
+    /// Only points nearer than this matter.
     limit: f32,
-    /// Place of the asking point in the sorted cloud.
+    /// Index of the querying point in the sorted cloud.
     at: u32,
-    /// Whom it asks.
+    /// The block to query.
     block: u32,
 }
 
-/// What another block knew.
+/// The result of a query to another block.
 #[derive(Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C)]
 struct Answer {
@@ -39,13 +39,13 @@ struct Answer {
     dist2: [f32; NEIGHBOURS],
 }
 
-/// The cloud in spatial order, and for each point the root mean square distance of its neighbours.
+/// The cloud in spatial order, and for each point the root mean square distance to its neighbours.
 pub(super) struct Measured {
     pub points: Spool<CloudPoint>,
     pub distances: Spool<f64>,
 }
 
-/// The search over one cloud.
+/// The search in one cloud.
 struct Search<'a> {
     space: SpoolSpace<'a>,
     blocks: Vec<Range<usize>>,
@@ -64,9 +64,9 @@ pub(super) fn measure(points: Spool<CloudPoint>, budget: &Budget<'_>) -> InputRe
     division.run(points, &mut |_, entries| entries.into_iter().try_for_each(|e| sorted.push(e)))?;
     let mut search = Search { space, blocks, points: sorted.finish()?, own: SpoolWriter::new(space).finish()? };
     let bounds = search.search_own_blocks()?;
-    let questions = search.ask(&bounds)?;
-    let answers = search.answer(&questions)?;
-    let distances = search.conclude(&answers)?;
+    let queries = search.query_other_blocks(&bounds)?;
+    let answers = search.answer_queries(&queries)?;
+    let distances = search.merge_answers(&answers)?;
     Ok(Measured { points: search.points, distances })
 }
 
@@ -87,9 +87,9 @@ impl Search<'_> {
         Ok(bounds)
     }
 
-    /// The questions of all points whose third neighbour is farther than another block's box.
-    fn ask(&self, bounds: &[Bounds]) -> InputResult<Spool<Question>> {
-        let mut questions = SpoolWriter::new(self.space);
+    /// The queries of all points whose third neighbour is farther than another block's box.
+    fn query_other_blocks(&self, bounds: &[Bounds]) -> InputResult<Spool<Query>> {
+        let mut queries = SpoolWriter::new(self.space);
         for (from, block) in self.blocks.iter().enumerate() {
             let (points, own) = (self.positions(block)?, self.own.range(block.clone())?);
             for (i, (&point, dist2)) in points.iter().zip(&own).enumerate() {
@@ -97,30 +97,30 @@ impl Search<'_> {
                 for (to, other) in bounds.iter().enumerate() {
                     if to != from && other.dist2(point) < limit {
                         let at = (block.start + i) as u32;
-                        questions.push(Question { point, limit, at, block: to as u32 })?;
+                        queries.push(Query { point, limit, at, block: to as u32 })?;
                     }
                 }
             }
         }
-        questions.finish()
+        queries.finish()
     }
 
-    fn answer(&self, questions: &Spool<Question>) -> InputResult<Spool<Answer>> {
+    fn answer_queries(&self, queries: &Spool<Query>) -> InputResult<Spool<Answer>> {
         let mut answers = SpoolWriter::new(self.space);
-        if questions.is_empty() {
+        if queries.is_empty() {
             return answers.finish();
         }
         for (number, block) in self.blocks.iter().enumerate() {
             let tree = NeighbourTree::new(&self.positions(block)?);
-            // As many questions at a time as there are points: they are smaller than what a point takes.
+            // A batch has as many queries as a block has points: a query is smaller than a point's memory.
             let mut batch = Vec::new();
-            let mut reply = |batch: &mut Vec<Question>| {
+            let mut reply = |batch: &mut Vec<Query>| {
                 let known = batch.par_iter().map(|q| Answer { at: q.at, dist2: tree.nearer(q.point, q.limit) });
                 let known: Vec<Answer> = known.collect();
                 batch.clear();
                 known.into_iter().filter(|a| a.dist2[0].is_finite()).try_for_each(|a| answers.push(a))
             };
-            questions.for_each(|q| {
+            queries.for_each(|q| {
                 if q.block as usize == number {
                     batch.push(*q);
                 }
@@ -131,7 +131,7 @@ impl Search<'_> {
         answers.finish()
     }
 
-    fn conclude(&self, answers: &Spool<Answer>) -> InputResult<Spool<f64>> {
+    fn merge_answers(&self, answers: &Spool<Answer>) -> InputResult<Spool<f64>> {
         let mut distances = SpoolWriter::new(self.space);
         for block in &self.blocks {
             let mut dist2 = self.own.range(block.clone())?;

@@ -1,6 +1,6 @@
-//! Median splits of records that do not fit in memory: the halves are written to lists of their own until they do.
+//! Median splits of records larger than memory: halves are written to lists of their own until they fit.
 //!
-//! Invariant: the pages are those of [`Pages::divide`], whatever fits in memory.
+//! Invariant: the pages are those of [`Pages::divide`], for any memory budget.
 
 use super::spool::{Spool, SpoolSpace, SpoolWriter};
 use crate::base::error::InputResult;
@@ -11,19 +11,19 @@ use std::ops::Range;
 
 /// Division of one list.
 pub(super) struct Division<'a> {
-    /// Where halves go that outgrow memory.
+    /// Space for halves that exceed memory.
     pub space: SpoolSpace<'a>,
     /// Pages to divide into.
     pub pages: Pages,
-    /// Records that may be in memory to be divided there; one page always may.
+    /// Most records divided in memory; one page always may be.
     pub records_in_memory: usize,
 }
 
-/// Takes the records of some consecutive pages, sorted as [`Pages::divide`] sorts them.
+/// Receives the records of some consecutive pages, sorted as by [`Pages::divide`].
 pub(super) type TakePages<'a, E> = dyn FnMut(Range<usize>, Vec<E>) -> InputResult<()> + 'a;
 
 impl Division<'_> {
-    /// Divides `records` and hands the pages out in order, as many at a time as fit in memory.
+    /// Divides `records` and passes the pages on in order, as many at a time as fit in memory.
     ///
     /// # Errors
     /// A file cannot be written or read, or `take` failed.
@@ -61,7 +61,7 @@ impl Division<'_> {
         self.run_range(high.0, high.1, middle..range.end, take)
     }
 
-    /// The `count` lowest records along an axis, and the others, each with its box.
+    /// The `count` lowest records along an axis, and the others, each with its bounding box.
     #[allow(clippy::type_complexity)] // two lists with their boxes
     fn cut<E: Placed + Pod>(
         &self,

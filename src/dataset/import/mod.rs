@@ -1,13 +1,13 @@
-//! From points to the first pages of Gaussians within a memory budget, however many points there are.
+//! Import: converts any number of points to the first pages of Gaussians, within a memory budget.
 //!
-//! The points are sorted into blocks through files of the spill folder, measured against their neighbours block by
-//! block, and divided into pages, which are handed out one by one.
+//! Through files in the spill folder, the points are sorted into blocks, measured against their neighbours block by
+//! block, and divided into pages, which are passed on one by one.
 //!
-//! Not here: reading formats (a [`PointSource`] hands out positions in the local frame), storing pages.
+//! Not here: reading formats (a [`PointSource`] provides positions in the local frame), storing pages.
 //!
-//! Invariants: 1. rows, numbers and pages are those of [`crate::scene::init::gaussians_from_points`] and
-//! [`crate::scene::partition::partition`], bit for bit, whatever the budget; 2. memory is bounded by the budget and one
-//! page of Gaussians; 3. files of an import are gone when it is over.
+//! Invariants: 1. rows, values and pages are those of [`crate::scene::init::gaussians_from_points`] and
+//! [`crate::scene::partition::partition`], bit for bit, for any budget; 2. memory is bounded by the budget plus one
+//! page of Gaussians; 3. the import's files are removed when it ends.
 
 mod cloud;
 mod distances;
@@ -28,16 +28,16 @@ use crate::scene::select::RankSearch;
 use crate::scene::state::SceneState;
 use std::path::Path;
 
-/// Points that can be read again and again, in the same order.
+/// Points that can be read repeatedly, in the same order.
 pub trait PointSource {
-    /// Hands every point to `take`: position in the local frame, sRGB.
+    /// Passes every point to `take`: position in the local frame, sRGB.
     ///
     /// # Errors
     /// The points cannot be read, or `take` failed.
     fn read(&self, take: &mut dyn FnMut([f32; 3], [u8; 3]) -> InputResult<()>) -> InputResult<()>;
 }
 
-/// Points in memory, with colours; grey where those are missing.
+/// Points in memory, with colours; grey if a colour is missing.
 impl PointSource for (&[[f32; 3]], &[[u8; 3]]) {
     fn read(&self, take: &mut dyn FnMut([f32; 3], [u8; 3]) -> InputResult<()>) -> InputResult<()> {
         let colors = self.1.iter().copied().chain(std::iter::repeat([128; 3]));
@@ -45,52 +45,52 @@ impl PointSource for (&[[f32; 3]], &[[u8; 3]]) {
     }
 }
 
-/// What an import may use.
+/// The budget of an import.
 #[derive(Debug, Clone, Copy)]
 pub struct Budget<'a> {
-    /// An existing folder for what does not fit in memory.
+    /// An existing folder for data larger than memory.
     pub folder: &'a Path,
     /// Bytes of memory.
     pub bytes: usize,
 }
 
 impl<'a> Budget<'a> {
-    /// Of a list: at most four are alive that are not halves of halves, and those add up to one more. The rest is for
-    /// what is worked on.
+    /// The memory of one list: at most four lists are alive that are not halves of halves, and those add up to one
+    /// more. The rest of the budget is for working memory.
     fn space(&self) -> SpoolSpace<'a> {
         SpoolSpace { folder: self.folder, memory: self.bytes / 10 }
     }
 
-    /// Records that can be worked on at a time.
+    /// Most records processed at a time.
     fn records(&self, bytes_each: usize) -> usize {
         (self.bytes / 2 / bytes_each).max(16)
     }
 }
 
-/// How to import.
+/// Options of an import.
 #[derive(Debug, Clone, Copy)]
 pub struct ImportOptions<'a> {
-    /// What first Gaussians are.
+    /// Options of the first Gaussians.
     pub init: &'a InitOptions,
-    /// Rows that a first page gets at most ([`crate::scene::partition::first_fill`]).
+    /// Most rows of a first page ([`crate::scene::partition::first_fill`]).
     pub fill: usize,
-    /// Memory and folder.
+    /// The budget.
     pub budget: Budget<'a>,
 }
 
 /// A first page.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FirstPage {
-    /// Its name.
+    /// Its id.
     pub id: PageId,
-    /// Numbers of its rows among all that start, ascending: their uids.
+    /// Numbers of its rows among all first rows, ascending: their uids.
     pub rows: Vec<u32>,
     /// Its Gaussians.
     pub columns: Columns,
 }
 
 impl FirstPage {
-    /// As rows of a scene, with their identities.
+    /// Converts to rows of a scene, with their uids.
     pub fn into_state(self) -> SceneState {
         let mut state = SceneState::from_columns(self.columns);
         state.uid.iter_mut().zip(&self.rows).for_each(|(uid, &row)| *uid = u64::from(row));
@@ -98,14 +98,14 @@ impl FirstPage {
     }
 }
 
-/// What was imported.
+/// Counts of an import.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ImportSummary {
-    /// Gaussians.
+    /// Number of Gaussians.
     pub rows: u64,
-    /// Pages, those of giants included.
+    /// Number of pages, including those of giants.
     pub pages: u64,
-    /// Points that were read.
+    /// Number of points read.
     pub points: u64,
 }
 
@@ -118,7 +118,7 @@ struct CloudPoint {
     color: [u8; 4],
 }
 
-/// A point with its row and its first size.
+/// A point with its row and its first scale.
 #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C)]
 struct SizedPoint {
@@ -152,7 +152,7 @@ impl Grown for SizedPoint {
     }
 }
 
-/// Makes the first Gaussians of all points and hands them out page by page, in the order of the pages' names.
+/// Makes the first Gaussians of all points and passes them on page by page, in the order of the pages' ids.
 ///
 /// # Errors
 /// The points cannot be read, the folder cannot be written, there are 2^32 points or more, or `take` failed.
@@ -183,11 +183,11 @@ fn first_page(id: PageId, entries: &[SizedPoint], init: &InitOptions) -> FirstPa
     }
 }
 
-/// The points that get a row, numbered; and how many were read.
+/// The points that get a row, numbered; and the number of points read.
 fn spool_points(source: &dyn PointSource, options: &ImportOptions<'_>) -> InputResult<(Spool<CloudPoint>, u64)> {
     let first_gone = match options.init.max_gaussians {
         None => None,
-        Some(most) => first_key_that_goes(source, most as u64, options.init.seed)?,
+        Some(most) => first_excluded_key(source, most as u64, options.init.seed)?,
     };
     let mut points = SpoolWriter::new(options.budget.space());
     let (mut index, mut row) = (0, 0u32);
@@ -206,8 +206,8 @@ fn is_finite(point: [f32; 3]) -> bool {
     point.iter().all(|x| x.is_finite())
 }
 
-/// At most `most` points stay, those with the smallest keys: the smallest key of the others, if there are any.
-fn first_key_that_goes(source: &dyn PointSource, most: u64, seed: u64) -> InputResult<Option<u64>> {
+/// At most `most` points stay, those with the smallest keys. Returns the smallest key of the others, if any.
+fn first_excluded_key(source: &dyn PointSource, most: u64, seed: u64) -> InputResult<Option<u64>> {
     let mut finite = 0;
     source.read(&mut |point, _| {
         finite += u64::from(is_finite(point));
@@ -235,7 +235,7 @@ fn too_many() -> InputError {
     InputError::new("the point cloud", "has 2^32 points or more", "thin it out, or set --max-gaussians")
 }
 
-/// The first size of every point.
+/// The first scale of every point.
 fn size_points(measured: distances::Measured, options: &ImportOptions<'_>) -> InputResult<Spool<SizedPoint>> {
     let distances::Measured { points, distances } = measured;
     let mut positive = 0;
@@ -244,7 +244,7 @@ fn size_points(measured: distances::Measured, options: &ImportOptions<'_>) -> In
         Ok(())
     })?;
     let mut typical = None;
-    // Only points without a distance ask for it.
+    // The median is needed only by points without a distance.
     if positive < distances.len() {
         let mut search = RankSearch::new(middle_rank(positive) as u64, positive as u64);
         while !search.is_done() {
@@ -281,7 +281,7 @@ mod tests {
     use crate::scene::partition::partition;
     use crate::scene::state::SceneState;
 
-    /// Clusters far apart, duplicates, a lattice, lone points, broken ones.
+    /// Clusters far apart, duplicates, a lattice, lone points, non-finite points.
     fn cloud(count: u64) -> (Vec<[f32; 3]>, Vec<[u8; 3]>) {
         let point = |i: u64| {
             let mut s = Stream::new(6, Purpose::Test, i, count);
@@ -297,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn pages_are_those_made_in_memory_whatever_the_budget() {
+    fn pages_equal_those_made_in_memory_for_any_budget() {
         let folder = tempfile::tempdir().unwrap();
         for (count, most) in [(0, None), (1, None), (3, None), (7000, None), (7000, Some(5000)), (2000, Some(0))] {
             let (points, colors) = cloud(count);
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn failures_of_the_source_and_of_the_taker_come_back() {
+    fn errors_of_the_source_and_of_the_receiver_are_returned() {
         struct Broken;
         impl PointSource for Broken {
             fn read(&self, take: &mut dyn FnMut([f32; 3], [u8; 3]) -> InputResult<()>) -> InputResult<()> {

@@ -1,6 +1,6 @@
-//! Records of first Gaussians as first pages: the giants apart, each part divided by median splits.
+//! Divides records of first Gaussians into pages: giants separately, each part by median splits.
 //!
-//! Invariant: the pages are those of [`crate::scene::partition::partition`], in its order, whatever fits in memory.
+//! Invariant: the pages are those of [`crate::scene::partition::partition`], in its order, for any memory budget.
 
 use super::divide::Division;
 use super::spool::{Spool, SpoolSpace, SpoolWriter};
@@ -11,23 +11,24 @@ use bytemuck::Pod;
 
 /// A record with a size.
 pub trait Grown: Placed + Pod {
-    /// Logarithm of the largest standard deviation: what giants are told by.
+    /// Logarithm of the largest standard deviation, which determines the giants.
     fn log_size(&self) -> f32;
 }
 
-/// Where and in how much memory records become pages.
+/// Memory and folder for the division.
 #[derive(Debug, Clone, Copy)]
 pub struct PageSpace<'a> {
-    /// Of each list.
+    /// Space of each list.
     pub list: SpoolSpace<'a>,
-    /// Records that may be in memory to be divided there; one page always may.
+    /// Most records divided in memory; one page always may be.
     pub records: usize,
 }
 
-/// Takes the records of a page.
+/// Receives the records of a page.
 pub type TakePage<'a, E> = dyn FnMut(PageId, &[E]) -> InputResult<()> + 'a;
 
-/// Divides records into pages of at most `fill` and hands these out in the order of their names. Returns how many there are.
+/// Divides records into pages of at most `fill` and passes them on in the order of their ids. Returns the number of
+/// pages.
 ///
 /// # Errors
 /// The folder cannot be written, or `take` failed.
@@ -55,7 +56,7 @@ pub fn paginate<E: Grown>(
     Ok(pages_before)
 }
 
-/// The ordinary records and the giants.
+/// Separates the ordinary records from the giants.
 fn split_giants<E: Grown>(records: Spool<E>, space: SpoolSpace<'_>) -> InputResult<(Spool<E>, Spool<E>)> {
     let mut search = GiantCut::search(records.len());
     while !search.is_done() {

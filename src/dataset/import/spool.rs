@@ -1,7 +1,7 @@
-//! A long list of records that is written once and read in order: in memory while it is short, in a file beyond.
+//! A list of records, written once and read in order: in memory while short, then in a file.
 //!
-//! Invariants: 1. what is read does not depend on where the records are; 2. a list takes no more memory than it was
-//! allowed, plus one buffer; 3. its file is gone when the list is, and where the system allows it even when the process
+//! Invariants: 1. the content does not depend on where the records are; 2. a list takes no more memory than it is
+//! allowed, plus one buffer; 3. its file is removed with the list and, where the system allows it, even if the process
 //! is killed.
 
 use crate::base::error::{InputError, InputResult};
@@ -12,10 +12,10 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Bytes that are read or written at once.
+/// Bytes per read or write.
 const BUFFER_BYTES: usize = 1 << 20;
 
-/// Where lists go that outgrow memory.
+/// Space for lists that exceed memory.
 #[derive(Debug, Clone, Copy)]
 pub struct SpoolSpace<'a> {
     /// An existing folder.
@@ -29,13 +29,13 @@ pub struct SpoolSpace<'a> {
 pub struct SpoolWriter<T> {
     folder: PathBuf,
     memory: usize,
-    /// All records, or those that are not in the file yet.
+    /// All records, or those not yet in the file.
     waiting: Vec<T>,
     file: Option<SpoolFile>,
     in_file: usize,
 }
 
-/// A list that is complete.
+/// A complete list.
 #[derive(Debug)]
 pub struct Spool<T> {
     records: Vec<T>,
@@ -51,13 +51,13 @@ struct SpoolFile {
 
 impl SpoolFile {
     fn create(folder: &Path) -> InputResult<SpoolFile> {
-        // Two imports into one folder do not meet: the process is part of the name, and names are not reused.
+        // Two imports into one folder use different names: a name contains the process id and is never reused.
         static NEXT: AtomicU64 = AtomicU64::new(0);
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
         let path = folder.join(format!("import-{}-{number}.tmp", std::process::id()));
         let options = std::fs::OpenOptions::new().read(true).write(true).create_new(true).open(&path);
         let file = options.map_err(|e| InputError::io(&path, "making a file for points", &e))?;
-        // Nobody else needs the name; without it a killed process leaves nothing behind.
+        // Unlinked at once, so that a killed process leaves nothing behind.
         #[cfg(unix)]
         std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "unlinking a file for points", &e))?;
         Ok(SpoolFile { file, path })
@@ -92,7 +92,7 @@ impl<T: Pod> SpoolWriter<T> {
             self.flush()?;
         }
         if self.waiting.len() == self.waiting.capacity() {
-            // Doubling, but never beyond the limit: a vector's own growth would take up to twice that.
+            // Doubles, but never beyond the limit: a vector's own growth could take up to twice the limit.
             let more = self.waiting.len().max(1024).min(self.limit() - self.waiting.len());
             self.waiting.reserve_exact(more);
         }
@@ -100,7 +100,7 @@ impl<T: Pod> SpoolWriter<T> {
         Ok(())
     }
 
-    /// Records that wait at most.
+    /// Most records that wait in memory.
     fn limit(&self) -> usize {
         let bytes = if self.file.is_some() { self.memory.min(BUFFER_BYTES) } else { self.memory };
         (bytes / size_of::<T>()).max(1)
@@ -124,12 +124,12 @@ impl<T: Pod> SpoolWriter<T> {
         self.in_file + self.waiting.len()
     }
 
-    /// Whether there are none.
+    /// Whether the list is empty.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The complete list.
+    /// Completes the list.
     ///
     /// # Errors
     /// The folder cannot be written.
@@ -149,7 +149,7 @@ impl<T: Pod> Spool<T> {
         self.len
     }
 
-    /// Whether there are none.
+    /// Whether the list is empty.
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
@@ -171,7 +171,7 @@ impl<T: Pod> Spool<T> {
         Ok(())
     }
 
-    /// Some consecutive records.
+    /// Reads some consecutive records.
     ///
     /// # Errors
     /// The file cannot be read.
@@ -181,7 +181,7 @@ impl<T: Pod> Spool<T> {
         Ok(records)
     }
 
-    /// All records.
+    /// Reads all records.
     ///
     /// # Errors
     /// The file cannot be read.
@@ -214,7 +214,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn records_come_back_from_memory_and_from_files_and_no_file_stays() {
+    fn records_round_trip_through_memory_and_files_and_no_file_stays() {
         let folder = tempfile::tempdir().unwrap();
         for (count, memory) in [(0u32, 100), (5, 100), (25, 100), (26, 100), (1_000_000, 4000), (300, 0)] {
             let mut writer = SpoolWriter::new(SpoolSpace { folder: folder.path(), memory });

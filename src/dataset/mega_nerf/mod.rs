@@ -1,4 +1,4 @@
-//! Reads scenes in Mega-NeRF's layout, as Mill-19 and UrbanScene3D are published:
+//! Reads scenes in Mega-NeRF's layout, in which Mill-19 and UrbanScene3D are published:
 //!
 //! ```text
 //! coordinates.pt                  origin_drb [3], pose_scale_factor
@@ -6,13 +6,13 @@
 //! val/metadata/<stem>.pt          the same for the held-out photos; val/rgbs/<stem>.jpg
 //! ```
 //!
-//! Poses are camera to world, the camera's axes right-up-back (as OpenGL's), the world's axes down-right-back; positions
-//! are `(metres - origin_drb) / pose_scale_factor`, which is undone here, so that a scene has its real size. The layout has
-//! no points: a `points.ply` beside `coordinates.pt`, in metres and in the world's axes, is read where there is one; else
-//! give some with `--init-ply`, or random ones are drawn.
+//! Poses are camera to world, with the camera's axes right-up-back (as OpenGL's) and the world's axes down-right-back.
+//! Positions are `(metres - origin_drb) / pose_scale_factor`; this is undone here, so that a scene has its real size.
+//! The layout has no points: if a `points.ply` in metres and in the world's axes exists beside `coordinates.pt`, it is
+//! read; otherwise give points with `--init-ply`, or random ones are drawn.
 //!
-//! Invariants: 1. whatever the files hold, the result is a scene or an [`InputError`] that names file and key; 2. names come
-//! from the folder's listing, so none leaves it.
+//! Invariants: 1. for any file content the result is a scene or an [`InputError`] that names file and key; 2. names
+//! come from the folder's listing, so none leaves the folder.
 
 mod pickle;
 mod torch_file;
@@ -28,7 +28,7 @@ use torch_file::TorchFile;
 
 const REMEDY: &str = "fetch or write the dataset again; configs/README.md has the layout";
 
-/// Whether [`read_mega_nerf`] finds something in this folder.
+/// Whether [`read_mega_nerf`] would find something in this folder.
 pub fn looks_like_mega_nerf(folder: &Path) -> bool {
     folder.join("coordinates.pt").is_file()
 }
@@ -36,7 +36,7 @@ pub fn looks_like_mega_nerf(folder: &Path) -> bool {
 /// Reads a scene in Mega-NeRF's layout. `train` prescribes the training views, `val` the held-out ones.
 ///
 /// # Errors
-/// A file is missing, broken or holds impossible numbers; a photo is missing (unless that is allowed); no view is left.
+/// A file is missing, broken or holds impossible numbers; a photo is missing (unless allowed); no view is left.
 pub fn read_mega_nerf(folder: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let coordinates = TorchFile::open(&folder.join("coordinates.pt"))?;
     let origin = coordinates.numbers("origin_drb", &[&[3]])?;
@@ -94,7 +94,7 @@ impl Reading<'_> {
         let metadata = TorchFile::open(file)?;
         let size = |key: &str| -> InputResult<u64> {
             let n = metadata.number(key)?;
-            // What is no size becomes 0, which no image has: the check below names it.
+            // An invalid size becomes 0, which the check below refuses by name.
             Ok(if n.is_finite() && n >= 0.0 && n.fract() == 0.0 { n.min(1e9) as u64 } else { 0 })
         };
         let size = (size("W")?, size("H")?);
@@ -138,7 +138,7 @@ impl Reading<'_> {
         if !self.bad_poses.is_empty() {
             let (count, names) = (self.bad_poses.len(), listed(&self.bad_poses));
             warnings
-                .push(format!("{}: {count} view(s) left out, their pose is no rotation: {names}", folder.display()));
+                .push(format!("{}: {count} view(s) left out, their pose is not a rotation: {names}", folder.display()));
         }
         if self.views.is_empty() {
             return Err(InputError::new(folder, "no view is left in train/metadata and val/metadata", REMEDY));
@@ -153,7 +153,7 @@ fn files_with(folder: &Path, extension: &str) -> InputResult<Vec<PathBuf>> {
     let mut files: Vec<PathBuf> =
         entries.flatten().map(|e| e.path()).filter(|p| p.extension().is_some_and(|e| e == extension)).collect();
     if let Some(other) = files.iter().find(|p| !p.is_file()) {
-        // A pipe would be waited for.
+        // Opening a pipe would block.
         return Err(InputError::new(other, "not a regular file", REMEDY));
     }
     files.sort();

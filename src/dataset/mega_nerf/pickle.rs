@@ -1,21 +1,21 @@
-//! The few pickle instructions that PyTorch writes for dictionaries of numbers and tensors, read without executing
-//! anything: a name of a function is compared with the two that are known, and never called.
+//! Reads the few pickle instructions that PyTorch writes for dictionaries of numbers and tensors. Nothing is executed:
+//! a function's name is compared with the two known ones, and never called.
 //!
-//! Format: CPython's `pickletools`, protocol 2. What a tensor consists of: `torch._utils._rebuild_tensor_v2(storage,
-//! offset, sizes, strides, requires_grad, hooks)`, the storage being a persistent id ('storage', type, key, place, count).
+//! Format: CPython's `pickletools`, protocol 2. A tensor is `torch._utils._rebuild_tensor_v2(storage, offset, sizes,
+//! strides, requires_grad, hooks)`, where the storage is a persistent id ('storage', type, key, place, count).
 //!
-//! Invariants: 1. any byte string ends in a value or an error; 2. work and memory are bounded by the length of the text
+//! Invariants: 1. any byte string gives a value or an error; 2. work and memory are bounded by the length of the text
 //! and [`ITEMS_MAX`]; 3. values are plain data.
 
 use std::rc::Rc;
 
-/// Values that one file may make; a file of metadata has under a hundred.
+/// Most values of one file; a metadata file has under a hundred.
 const ITEMS_MAX: usize = 10_000;
 const TOO_MANY: &str = "holds more values than any file of metadata";
-/// Nested containers; recursion is over values only when they are compared or dropped.
+/// Deepest nesting; recursion over values happens only when they are compared or dropped.
 const DEPTH_MAX: usize = 64;
 
-/// A tensor as the pickle describes it; its numbers lie in another file of the archive.
+/// A tensor as described by the pickle; its numbers are in another file of the archive.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct TensorRef {
     /// Type of the storage, for instance `FloatStorage`.
@@ -24,16 +24,16 @@ pub(super) struct TensorRef {
     pub key: Rc<str>,
     /// First element.
     pub offset: usize,
-    /// Elements along each axis.
+    /// Number of elements along each axis.
     pub sizes: Vec<usize>,
-    /// Elements from one to the next along each axis.
+    /// Distance between elements along each axis.
     pub strides: Vec<usize>,
 }
 
-/// What a pickle can hold here.
+/// A value of a pickle.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Value {
-    /// None, or anything that says nothing, like an empty ordered dictionary.
+    /// None, or an object without content of interest, such as an empty ordered dictionary.
     Nothing,
     /// True or false.
     Bool(bool),
@@ -79,11 +79,12 @@ pub(super) fn read(text: &[u8]) -> Result<Value, String> {
     }
 }
 
-/// A value that the text has numbered.
+/// An entry of the memo.
 #[derive(Clone)]
 enum Memo {
     Unused,
-    /// A list or dictionary: never handed out again, so not kept; kept, each later change of it would be a copy.
+    /// A list or dictionary. It is never fetched from the memo and so not stored: a stored copy would make every later
+    /// change of it a copy.
     Container,
     Value(Value),
 }
@@ -91,7 +92,7 @@ enum Memo {
 struct Machine<'a> {
     rest: &'a [u8],
     stack: Vec<Value>,
-    /// Heights of the stack where tuples and dictionaries began.
+    /// Stack heights at which tuples and dictionaries began.
     marks: Vec<usize>,
     memo: Vec<Memo>,
     made: usize,
@@ -104,7 +105,7 @@ impl<'a> Machine<'a> {
             0x80 => {
                 let protocol = self.take(1)?[0];
                 if protocol > 4 {
-                    return Err(format!("is a pickle of protocol {protocol}; up to 4 are read"));
+                    return Err(format!("is a pickle of protocol {protocol}; supported are up to 4"));
                 }
             }
             0x95 => _ = self.take(8)?,
@@ -130,7 +131,7 @@ impl<'a> Machine<'a> {
                 let index = self.number(if code == b'h' { 1 } else { 4 })?;
                 match self.memo.get(index) {
                     Some(Memo::Value(value)) => self.push(value.clone())?,
-                    // Lists of lists of the same list would be endless to walk, and tensors need none of it.
+                    // Lists that contain the same list repeatedly could be endless to walk, and tensors need none.
                     Some(Memo::Container) => {
                         return Err("uses one container twice, which files of tensors do not".into());
                     }
@@ -146,7 +147,7 @@ impl<'a> Machine<'a> {
             b'c' => self.name()?,
             b'Q' => self.storage()?,
             b'R' => self.call()?,
-            // An attribute dictionary of an ordered dictionary: says nothing about numbers.
+            // The attributes of an ordered dictionary: they contain no numbers of interest.
             b'b' => _ = self.pop()?,
             other => return Err(format!("uses instruction {other:#04x}, which files of tensors do not have")),
         }
@@ -213,9 +214,9 @@ impl<'a> Machine<'a> {
             b'r' => self.number(4)?,
             _ => self.memo.len(),
         };
-        // Writers count upwards, once for each value; a number beyond what was made is an attack on memory.
+        // Writers number values consecutively; a larger number would be an attack on memory.
         if index > self.made {
-            return Err("numbers a value beyond all that it made".into());
+            return Err("numbers a value beyond those that exist".into());
         }
         if index >= self.memo.len() {
             self.memo.resize(index + 1, Memo::Unused);
@@ -233,7 +234,7 @@ impl<'a> Machine<'a> {
         self.push(Value::List(Rc::new(items)))
     }
 
-    /// One or more items appended to the list, or entries to the dictionary, below them.
+    /// Appends items to the list, or entries to the dictionary, below them on the stack.
     fn extend(&mut self, code: u8) -> Result<(), String> {
         let items = match code {
             b'e' | b'u' => self.since_mark()?,
@@ -255,7 +256,7 @@ impl<'a> Machine<'a> {
                 }
                 self.push(Value::Dict(dict))
             }
-            // Entries of an ordered dictionary that hangs on a tensor.
+            // Entries of an ordered dictionary attached to a tensor.
             (Value::Nothing, _) => self.push(Value::Nothing),
             _ => Err("is malformed: entries without their container".into()),
         }
@@ -278,7 +279,7 @@ impl<'a> Machine<'a> {
         self.push(Value::Name(name.into()))
     }
 
-    /// A persistent id: the storage of a tensor. It stays the list that it is.
+    /// A persistent id: the storage of a tensor, kept as a list.
     fn storage(&mut self) -> Result<(), String> {
         let id = self.pop()?;
         let is_storage =
@@ -300,7 +301,7 @@ impl<'a> Machine<'a> {
                 let tensor = tensor(&arguments).ok_or("describes a tensor in an unknown way")?;
                 self.push(Value::Tensor(Rc::new(tensor)))
             }
-            other => Err(format!("calls '{other}' with arguments that are not read")),
+            other => Err(format!("calls '{other}' with unsupported arguments")),
         }
     }
 }
@@ -338,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn attacks_end_in_a_sentence() {
+    fn attacks_give_an_error_message() {
         for (text, word) in [
             (&b"cos\nsystem\n."[..], "os system"),
             (b"cbuiltins\neval\n(X\x01\x00\x00\x001tR.", "builtins eval"),
@@ -355,11 +356,11 @@ mod tests {
             let said = read(text).err().unwrap_or_default();
             assert!(said.contains(word), "{said} for {text:?}");
         }
-        // Numbering a list again and again while it grows kept every version of it: 200 MB of 9 KB.
+        // Memoising a list repeatedly while it grows would keep every version of it: 200 MB from 9 KB.
         let grown = [&b"]"[..], &b"Na\x94".repeat(3000)[..], b"."].concat();
         assert!(matches!(read(&grown), Ok(Value::List(items)) if items.len() == 3000));
         assert!(read(&b"(".repeat(20_000)).is_err(), "too many marks");
-        // Numbers that run ahead of the values: a table that grows by as many entries as there are values, each time.
+        // Numbers ahead of the values: each would grow the table by as many entries as there are values.
         let ahead: Vec<u8> = (1..100u32).flat_map(|i| [&b"r"[..], &(i * 1000).to_le_bytes()].concat()).collect();
         assert!(read(&[&b"N".repeat(1000)[..], &ahead].concat()).is_err_and(|e| e.contains("beyond")));
         assert!(read(&[&b"N"[..], &b"\x94".repeat(20_000)].concat()).is_err_and(|e| e.contains("beyond")));

@@ -1,7 +1,7 @@
 //! Files of `torch.save`: a zip archive with a pickle (`<name>/data.pkl`) and one file of numbers per tensor
 //! (`<name>/data/<key>`), little-endian.
 //!
-//! Invariants: 1. nothing in a file is executed; 2. sizes are checked before anything is allocated: a file of metadata is
+//! Invariants: 1. nothing in a file is executed; 2. sizes are checked before anything is allocated: metadata files are
 //! small, and larger ones are refused.
 
 use super::pickle::{self, TensorRef, Value};
@@ -12,15 +12,15 @@ use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use zip::ZipArchive;
 
-/// Files of metadata have one or two kilobytes; this leaves room for what others may have added.
+/// Metadata files have one or two kilobytes; this leaves room for additions.
 const FILE_BYTES_MAX: u64 = 16 << 20;
 const REMEDY: &str = "save it again with torch.save (PyTorch 1.6 or later) as a dictionary of numbers and tensors";
 
-/// An opened file whose top value is a dictionary.
+/// An opened file whose top-level value is a dictionary.
 pub(super) struct TorchFile {
     path: PathBuf,
     archive: RefCell<ZipArchive<BufReader<File>>>,
-    /// Folder of the entries inside the archive, with `/`.
+    /// Folder of the entries inside the archive, ending in `/`.
     prefix: String,
     top: Value,
 }
@@ -29,7 +29,7 @@ impl TorchFile {
     /// Opens a file and reads its structure.
     ///
     /// # Errors
-    /// It cannot be read, is too large, is no zip archive of PyTorch, or holds more than numbers and tensors.
+    /// The file cannot be read, is too large, is not a PyTorch zip archive, or holds more than numbers and tensors.
     pub fn open(path: &Path) -> InputResult<TorchFile> {
         let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
         let bytes = file.metadata().map_err(|e| InputError::io(path, "opening", &e))?.len();
@@ -38,9 +38,9 @@ impl TorchFile {
             return Err(bad(format!("has {bytes} bytes, far more than a camera's metadata")));
         }
         let mut archive =
-            ZipArchive::new(BufReader::new(file)).map_err(|e| bad(format!("is no file of torch.save: {e}")))?;
+            ZipArchive::new(BufReader::new(file)).map_err(|e| bad(format!("is not a file of torch.save: {e}")))?;
         let pickle = archive.file_names().flatten().find(|n| n.ends_with("/data.pkl")).map(|n| n.to_string());
-        let pickle = pickle.ok_or_else(|| bad("is no file of torch.save: data.pkl is missing".into()))?;
+        let pickle = pickle.ok_or_else(|| bad("is not a file of torch.save: data.pkl is missing".into()))?;
         let text = entry(&mut archive, &pickle).map_err(bad)?;
         let top = pickle::read(&text).map_err(|problem| bad(problem).at("data.pkl"))?;
         let prefix = pickle[..pickle.len() - "data.pkl".len()].to_string();
@@ -50,7 +50,7 @@ impl TorchFile {
     /// The numbers under a key: a number, or a tensor of one of the `shapes`, row-major.
     ///
     /// # Errors
-    /// The key is missing, or what it holds is something else.
+    /// The key is missing, or its value is of another kind.
     pub fn numbers(&self, key: &str, shapes: &[&[usize]]) -> InputResult<Vec<f64>> {
         let wrong = |problem: String| InputError::new(&self.path, problem, REMEDY).at(format!("key '{key}'"));
         let value = self.top.get(key).ok_or_else(|| wrong("is missing".into()))?;
@@ -58,10 +58,8 @@ impl TorchFile {
             Value::Int(n) if shapes.contains(&&[][..]) => Ok(vec![*n as f64]),
             Value::Float(x) if shapes.contains(&&[][..]) => Ok(vec![*x]),
             Value::Tensor(tensor) if shapes.contains(&tensor.sizes.as_slice()) => self.tensor(tensor).map_err(wrong),
-            Value::Tensor(tensor) => {
-                Err(wrong(format!("is a tensor of {:?} where {shapes:?} is needed", tensor.sizes)))
-            }
-            _ => Err(wrong(format!("is not what it should be (a number or a tensor of {shapes:?})"))),
+            Value::Tensor(tensor) => Err(wrong(format!("is a tensor of {:?}, but {shapes:?} is needed", tensor.sizes))),
+            _ => Err(wrong(format!("must be a number or a tensor of {shapes:?}"))),
         }
     }
 
@@ -79,11 +77,11 @@ impl TorchFile {
             "DoubleStorage" => (8, |b| f64::from_le_bytes(std::array::from_fn(|i| b[i]))),
             "LongStorage" => (8, |b| i64::from_le_bytes(std::array::from_fn(|i| b[i])) as f64),
             "IntStorage" => (4, |b| f64::from(i32::from_le_bytes(std::array::from_fn(|i| b[i])))),
-            other => return Err(format!("is stored as {other}, which is not read")),
+            other => return Err(format!("is stored as {other}, which is not supported")),
         };
         let (width, decode) = decode;
         let bytes = entry(&mut self.archive.borrow_mut(), &format!("{}data/{}", self.prefix, tensor.key))?;
-        // Shapes were compared with short lists of known ones: the product is small.
+        // The shape equals one of a short list of known ones: the product is small.
         let count: usize = tensor.sizes.iter().product();
         let mut out = Vec::with_capacity(count);
         for i in 0..count {

@@ -1,7 +1,8 @@
-//! Writes scenes in Mega-NeRF's layout, as [`super::read_mega_nerf`] reads them: for trying a run of Mill-19 on a generated
-//! city before 20 GB are fetched.
+//! Writes scenes in Mega-NeRF's layout for [`super::read_mega_nerf`]: to try a run of Mill-19 on a generated city
+//! before 20 GB are downloaded.
 //!
-//! Files are what `torch.save` of a dictionary gives: a stored zip archive, protocol 2, little-endian tensors.
+//! Files are as written by `torch.save` for a dictionary: an uncompressed zip archive, protocol 2, little-endian
+//! tensors.
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::model::{RawScene, RawView, Split};
@@ -22,7 +23,7 @@ pub(super) enum Entry {
     Doubles(Vec<f64>),
 }
 
-/// Writes the views of `scene` to `folder`, every `test_every`th into `val`; photos are moved there from where they are.
+/// Writes the views of `scene` to `folder`, every `test_every`th one into `val`; photos are moved there.
 ///
 /// # Errors
 /// The folder cannot be written.
@@ -46,7 +47,7 @@ pub fn write_mega_nerf(folder: &Path, scene: &RawScene, test_every: usize) -> In
         let stem = format!("{i:06}");
         for sub in ["metadata", "rgbs"] {
             let sub = part.join(sub);
-            std::fs::create_dir_all(&sub).map_err(|e| InputError::io(&sub, "making the folder", &e))?;
+            std::fs::create_dir_all(&sub).map_err(|e| InputError::io(&sub, "creating the folder", &e))?;
         }
         write_metadata(&part.join("metadata").join(format!("{stem}.pt")), view, drb_from_world, origin, scale)?;
         let extension = view.image_path.extension().and_then(|e| e.to_str()).unwrap_or("jpg");
@@ -61,7 +62,7 @@ fn write_metadata(path: &Path, view: &RawView, drb: DMat3, origin: glam::DVec3, 
     let centre = (drb * view.pose.centre() - origin) / scale;
     let mut c2w = Vec::with_capacity(12);
     for row in 0..3 {
-        // The camera's axes right-up-back out of right-down-forward.
+        // Converts the camera's axes from right-down-forward to right-up-back.
         let r = rotation.row(row);
         c2w.extend([r.x as f32, -r.y as f32, -r.z as f32, centre[row] as f32]);
     }

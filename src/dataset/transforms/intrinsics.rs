@@ -1,4 +1,4 @@
-//! Intrinsics of a frame: its own keys, else those of the top level.
+//! Intrinsics of a frame: its own keys, or else those of the top level.
 //!
 //! Focal lengths come from `fl_x, fl_y` or `camera_angle_x, camera_angle_y` (f = side / 2 / tan(angle / 2)); one axis
 //! alone serves both. The principal point is the centre of the image unless `cx, cy` say otherwise.
@@ -10,7 +10,7 @@ use crate::dataset::model::{Intrinsics, Lens};
 
 const UNDISTORT: &str = "undistort the photos first, or export a PINHOLE, OPENCV or OPENCV_FISHEYE camera";
 
-/// A frame over its top level.
+/// A frame with its top level.
 #[derive(Clone, Copy)]
 pub(super) struct Levels<'a> {
     pub frame: Node<'a>,
@@ -30,14 +30,14 @@ impl<'a> Levels<'a> {
         node.error(key, problem, remedy)
     }
 
-    /// The stated size in pixels, if there is one.
+    /// The stated size in pixels, if any.
     pub fn size(&self) -> InputResult<Option<(u64, u64)>> {
         let side = |key: &str| -> InputResult<Option<u64>> {
             match self.number(key)? {
                 None => Ok(None),
                 // Some writers store whole numbers as floats.
                 Some(x) if x.fract() == 0.0 && (1.0..1e9).contains(&x) => Ok(Some(x as u64)),
-                Some(x) => Err(self.error(key, format!("{x} is no number of pixels"), FIX_KEY)),
+                Some(x) => Err(self.error(key, format!("{x} is not a number of pixels"), FIX_KEY)),
             }
         };
         Ok(side("w")?.zip(side("h")?))
@@ -54,7 +54,7 @@ impl<'a> Levels<'a> {
         }
     }
 
-    /// Both focal lengths; the frame's own keys win as a whole over the top level's.
+    /// Both focal lengths; if the frame has any such key, the top level's are ignored.
     fn focal(&self, (width, height): (u64, u64)) -> InputResult<[f64; 2]> {
         for node in [self.frame, self.top] {
             let x = self.focal_at(&node, "fl_x", "camera_angle_x", width)?;
@@ -70,8 +70,8 @@ impl<'a> Levels<'a> {
         ))
     }
 
-    /// Lens from `camera_model` and `k1..k6, p1, p2`. Without a model, or with a pinhole one, coefficients that are
-    /// not 0 count as OPENCV's, as in nerfstudio.
+    /// Lens from `camera_model` and `k1..k6, p1, p2`. Without a model, or with a pinhole one, non-zero coefficients
+    /// count as OPENCV's, as in nerfstudio.
     fn lens(&self) -> InputResult<Lens> {
         let mut k = [0.0; 6];
         for (i, value) in k.iter_mut().enumerate() {
@@ -87,7 +87,7 @@ impl<'a> Levels<'a> {
         match model.as_str() {
             "SIMPLE_PINHOLE" | "PINHOLE" | "PERSPECTIVE" | "SIMPLE_RADIAL" | "RADIAL" | "OPENCV" => {
                 match [4, 5, 6].into_iter().find(|&i| k[i - 1] != 0.0) {
-                    // Some programs mean r^8 by it, others a denominator.
+                    // Some programs use it for r^8, others for a denominator.
                     Some(i) => Err(self.error(
                         &format!("k{i}"),
                         format!("k{i} = {} is not defined for camera model {model}", k[i - 1]),

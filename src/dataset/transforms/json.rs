@@ -1,11 +1,11 @@
-//! JSON with a memory of where a value stood, so that every complaint names the file, the frame and the key.
+//! JSON that remembers the place of every value, so that errors name the file, the frame and the key.
 //!
-//! A file is gone through three times: for its syntax, for the keys of its top level, and frame by frame. Of an object only
-//! the keys that are known are kept ([`KNOWN`]), and of a key's value the first [`MOST_VALUES`] values: more than any key
-//! has a use for, so that what is longer is still seen to be too long.
+//! A file is parsed three times: for its syntax, for the keys of its top level, and frame by frame. Of an object only
+//! the known keys are kept ([`KNOWN`]), and of a key's value the first [`MOST_VALUES`] values: more than any key needs,
+//! so that a value that is too long can be recognised.
 //!
-//! Invariant: beside the file's bytes and what the caller makes of them, memory holds one frame, the top level and its lists
-//! of names: not a value for every character, as a tree of the whole file would.
+//! Invariant: besides the file's bytes and the caller's data, memory holds one frame, the top level and its lists of
+//! names, whereas a tree of the whole file could take a value per character.
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::paths::clean_name;
@@ -20,7 +20,7 @@ use std::path::{Path, PathBuf};
 
 /// Largest file read, bytes; a frame takes about 1 KiB.
 const MAX_BYTES: u64 = 128 << 20;
-/// Values kept of one key; a matrix of 4 x 4 has 21, its rows counted.
+/// Most values kept of one key; a matrix of 4 x 4 has 21, including its rows.
 const MOST_VALUES: usize = 64;
 
 /// Remedy for a value of the wrong kind.
@@ -29,7 +29,7 @@ pub(super) const FIX_KEY: &str = "correct the key in the JSON or write the file 
 pub(super) const STAY_INSIDE: &str = "paths must be relative to the JSON and stay in its folder: move the JSON to a folder \
                                       above the files that it names and write the paths from there";
 
-/// Keys of the top level and of frames that have a meaning, apart from `frames` and the lists of names.
+/// Known keys of the top level and of frames, apart from `frames` and the lists of names.
 const KNOWN: [&str; 25] = [
     "applied_scale",
     "camera_angle_x",
@@ -66,13 +66,13 @@ pub(super) const LISTS: [&str; 3] = ["train_filenames", "val_filenames", "test_f
 pub(super) enum Names {
     #[default]
     Absent,
-    /// Cleaned.
+    /// The cleaned names.
     Listed(BTreeSet<String>),
-    /// Not to be used: the problem and the remedy.
+    /// Unusable: the problem and the remedy.
     Bad(String, &'static str),
 }
 
-/// What stands under `frames`.
+/// The value of `frames`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Frames {
     Absent,
@@ -95,7 +95,7 @@ pub(super) struct JsonFile {
 pub(super) fn load(path: &Path) -> InputResult<JsonFile> {
     let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
     let length = file.metadata().map_err(|e| InputError::io(path, "reading", &e))?.len();
-    // Room for the whole file and the look for its end: nothing is moved to a larger place while it is read.
+    // Reserves room for the whole file and the check for its end, so that reading never reallocates.
     let mut bytes = Vec::with_capacity(length.min(MAX_BYTES) as usize + 64);
     file.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(|e| InputError::io(path, "reading", &e))?;
     if bytes.len() as u64 > MAX_BYTES {
@@ -116,7 +116,7 @@ pub(super) fn load(path: &Path) -> InputResult<JsonFile> {
     let (mut top, mut frames, mut names) = (Map::new(), Vec::new(), <[Names; 3]>::default());
     json.read_with(TopKeys { top: &mut top, frames: &mut frames, names: &mut names })?;
     if frames.len() > 1 {
-        let problem = format!("the key is there {} times", frames.len());
+        let problem = format!("the key appears {} times", frames.len());
         return Err(InputError::new(path, problem, "write the file again with its frames in one list").at("frames"));
     }
     (json.top, json.names, json.frames) = (top, names, frames.pop().unwrap_or(Frames::Absent));
@@ -129,7 +129,7 @@ fn invalid(path: &Path, e: &serde_json::Error) -> InputError {
 }
 
 impl JsonFile {
-    /// The top level.
+    /// The top-level object.
     pub fn top(&self) -> Node<'_> {
         Node { file: &self.path, map: &self.top, frame: None }
     }
@@ -139,10 +139,10 @@ impl JsonFile {
         &self.names[list]
     }
 
-    /// Frames in the file.
+    /// Number of frames in the file.
     ///
     /// # Errors
-    /// There is no list of them.
+    /// The list of frames is missing.
     pub fn frame_count(&self) -> InputResult<usize> {
         match self.frames {
             Frames::Array(count) => Ok(count),
@@ -151,7 +151,7 @@ impl JsonFile {
         }
     }
 
-    /// Hands out the frames one by one, each with its index.
+    /// Passes the frames to `take` one by one, each with its index.
     ///
     /// # Errors
     /// A frame is not an object, or `take` refused it.
@@ -180,7 +180,7 @@ impl JsonFile {
     }
 }
 
-/// The scalars of a visitor that takes all of them for the same; `null` apart.
+/// Visitor methods that treat all scalars alike, except `null`.
 macro_rules! scalars {
     ($value:expr, null: $null:expr) => {
         fn visit_bool<E>(self, _: bool) -> Result<Self::Value, E> {
@@ -204,13 +204,13 @@ macro_rules! scalars {
     };
 }
 
-/// A value that is looked at for its syntax alone; of an array, how long it is.
+/// A value that is parsed for its syntax only; of an array, its length.
 struct Skipped {
     kind: Frames,
 }
 
 impl<'de> Deserialize<'de> for Skipped {
-    // Not as an ignored value: of that serde_json looks neither at the range of numbers nor at the depth.
+    // Not serde's ignored value: for that serde_json checks neither the range of numbers nor the depth.
     fn deserialize<D: Deserializer<'de>>(source: D) -> Result<Self, D::Error> {
         struct Any;
         impl<'de> Visitor<'de> for Any {
@@ -235,7 +235,7 @@ impl<'de> Deserialize<'de> for Skipped {
     }
 }
 
-/// A value, as far as there are values left for it; of an object nothing but that it is one.
+/// A value, up to the remaining number of values; of an object only the fact that it is one.
 struct Kept<'l>(&'l mut usize);
 
 impl<'de> DeserializeSeed<'de> for Kept<'_> {
@@ -286,7 +286,7 @@ impl<'de> Visitor<'de> for Kept<'_> {
     }
 }
 
-/// Adds the value of a key, if it is known.
+/// Adds the value of a known key.
 fn keep_known<'de, A: MapAccess<'de>>(of: &mut A, key: String, map: &mut Map<String, Value>) -> Result<(), A::Error> {
     if KNOWN.contains(&key.as_str()) {
         let value = of.next_value_seed(Kept(&mut { MOST_VALUES }))?;
@@ -372,7 +372,7 @@ fn no_array() -> Names {
 
 /// The frames under `frames`, one by one, until one is refused.
 struct FrameList<'t> {
-    /// Gets the known keys of a frame, `None` of what is no object; says whether to go on.
+    /// Receives the known keys of a frame, `None` if it is not an object; returns whether to continue.
     take: &'t mut dyn FnMut(Option<Map<String, Value>>) -> bool,
 }
 
@@ -408,7 +408,7 @@ impl<'de> Visitor<'de> for FrameList<'_> {
     }
 }
 
-/// The known keys of a frame; `None` of what is no object.
+/// The known keys of a frame; `None` if it is not an object.
 struct OneFrame(Option<Map<String, Value>>);
 
 impl<'de> Deserialize<'de> for OneFrame {
@@ -462,17 +462,17 @@ impl<'a> Node<'a> {
         self.map.get(key).filter(|v| !v.is_null())
     }
 
-    /// A number, if the key is there.
+    /// A number, if the key exists.
     pub fn number(&self, key: &str) -> InputResult<Option<f64>> {
         self.typed(key, "a number", Value::as_f64)
     }
 
-    /// A string, if the key is there.
+    /// A string, if the key exists.
     pub fn text(&self, key: &str) -> InputResult<Option<&'a str>> {
         self.typed(key, "a string", Value::as_str)
     }
 
-    /// An array, if the key is there; the first values of one that is too long.
+    /// An array, if the key exists; its first values if it is too long.
     pub fn array(&self, key: &str) -> InputResult<Option<&'a Vec<Value>>> {
         self.typed(key, "an array", Value::as_array)
     }

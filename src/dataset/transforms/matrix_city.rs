@@ -1,4 +1,4 @@
-//! MatrixCity's own folders (`small_city/aerial`), as they are published:
+//! MatrixCity's folders (`small_city/aerial`), as published:
 //!
 //! ```text
 //! pose/block_all/transforms_train.json, transforms_test.json    positions in 100 m, file_path "../../train/block_1/0001.png"
@@ -6,11 +6,11 @@
 //! train/block_1/transforms.json ...                             positions in metres, rotations times 0.01, frame_index
 //! ```
 //!
-//! The files of `pose/block_all` are read where they are, else those of all blocks. The scale that a rotation carries is
-//! taken off positions and rotations alike, so that both give positions in 100 m: the unit of the published clouds
-//! (`point_cloud_ds20/aerial/Block_all.ply`).
+//! The files of `pose/block_all` are read if they exist, otherwise those of all blocks. The scale of a rotation is
+//! removed from both rotation and position, so that either source gives positions in 100 m, the unit of the published
+//! clouds (`point_cloud_ds20/aerial/Block_all.ply`).
 //!
-//! Invariant: paths may climb with `..` as those files do, but never above the scene's folder.
+//! Invariant: paths may contain `..`, as those files do, but never leave the scene's folder.
 
 use super::{Reading, json, photos};
 use crate::base::error::{InputError, InputResult};
@@ -19,7 +19,7 @@ use crate::dataset::model::{RawScene, Split};
 use crate::dataset::read::ReadOptions;
 use std::path::{Path, PathBuf};
 
-/// Folders inside a block's folder where the photos may lie: as the archive makes it or as others' scripts unpack it.
+/// Photo folders inside a block's folder: as in the archive, or as unpacked by other scripts.
 pub(super) const INSIDE_BLOCK: [&str; 3] = ["input", "rgb", "images"];
 /// Clouds of points, the first that exists.
 const CLOUDS: [&str; 3] = [
@@ -28,7 +28,7 @@ const CLOUDS: [&str; 3] = [
     "small_city_pointcloud/point_cloud_ds20/aerial/Block_all.ply",
 ];
 
-/// Whether [`read_matrix_city`] finds something in this folder.
+/// Whether [`read_matrix_city`] would find something in this folder.
 pub fn looks_like_matrix_city(folder: &Path) -> bool {
     pose_file(folder, "train").is_file() || !block_files(folder, "train").is_empty()
 }
@@ -49,14 +49,14 @@ fn block_files(folder: &Path, set: &str) -> Vec<PathBuf> {
 /// Reads MatrixCity's folders. `train` and `test` prescribe the split.
 ///
 /// # Errors
-/// As [`super::read_transforms`]; or a path climbs above `folder`.
+/// As [`super::read_transforms`]; or a path leaves `folder`.
 pub fn read_matrix_city(folder: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let mut files = Vec::new();
     for (set, split) in [("train", Split::Train), ("test", Split::Test)] {
         let pose = pose_file(folder, set);
         let of_set = if pose_file(folder, "train").is_file() { vec![pose] } else { block_files(folder, set) };
         if of_set.is_empty() || !of_set[0].is_file() {
-            let problem = format!("the poses of the {set} photos are not there");
+            let problem = format!("the poses of the {set} photos are missing");
             let at = of_set.into_iter().next().unwrap_or_else(|| folder.join(set));
             return Err(InputError::new(at, problem, "fetch small_city/aerial again, with its folder pose"));
         }
@@ -75,7 +75,7 @@ pub fn read_matrix_city(folder: &Path, options: &ReadOptions) -> InputResult<Raw
     Ok(scene)
 }
 
-/// The photo that `stated` names from `folder`, a folder inside `root`; its name is relative to `root`.
+/// The photo at `stated`, relative to `folder`, a folder inside `root`; its name is relative to `root`.
 pub(super) fn find_photo(
     root: &Path,
     folder: &Path,
@@ -97,7 +97,8 @@ pub(super) fn find_photo(
     Ok(photos::Photo { path: found.unwrap_or_else(|| root.join(&name)), name, exists })
 }
 
-/// `stated` from the folder `base`, both with `/`, without `..`; refused where it climbs above what `base` is relative to.
+/// `stated` relative to `base`, both with `/`, without `..`; refused if it leaves the folder that `base` is relative
+/// to.
 fn resolved(base: &str, stated: &str) -> Result<String, String> {
     let climbs = || format!("the name {stated:?} climbs out of the scene's folder with '..'");
     let mut parts: Vec<&str> = base.split(['/', '\\']).filter(|p| !p.is_empty()).collect();
@@ -108,7 +109,7 @@ fn resolved(base: &str, stated: &str) -> Result<String, String> {
         }
         rest = up;
     }
-    // Whatever climbs further down, and all else that a name must not be, is refused as everywhere.
+    // Further `..`, and everything else that names must not contain, is refused as elsewhere.
     let rest = crate::dataset::paths::clean_name(rest)?;
     parts.push(&rest);
     Ok(parts.join("/"))
@@ -119,7 +120,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_climb_to_the_root_and_no_further() {
+    fn names_may_climb_to_the_root_but_not_beyond() {
         let from = |stated| resolved("pose/block_all", stated);
         assert_eq!(from("../../train/block_1/0001.png").as_deref(), Ok("train/block_1/0001.png"));
         assert_eq!(from("./../x.png").as_deref(), Ok("pose/x.png"));

@@ -1,20 +1,21 @@
 //! Reads `transforms.json` scenes: nerfstudio's and instant-ngp's single file, Blender's
-//! `transforms_train/val/test.json`, and MatrixCity's folders of such files (`matrix_city`). Photos are opened only for their size, and only when the JSON does not state it.
+//! `transforms_train/val/test.json`, and MatrixCity's folders of such files (`matrix_city`). A photo is opened only for
+//! its size, and only if the JSON does not state it.
 //!
-//! Invariants: 1. whatever the JSON holds, the result is a scene or an [`InputError`] that names file and key; 2. a
-//! view is left out, with a warning that names it, only for its own pose or, when allowed, its missing photo.
+//! Invariants: 1. for any JSON content the result is a scene or an [`InputError`] that names file and key; 2. only a
+//! bad pose or, when allowed, a missing photo drops a view, with a warning that names it.
 //!
-//! Which files: a folder with `transforms_train.json` is read as a split scene, `transforms_test.json` being the test
-//! set. `transforms_val.json` is the test set only where there is no test file; otherwise its views are left out, with
-//! a warning. A folder without is read from `transforms.json`, whose `train_filenames`, `val_filenames` and
-//! `test_filenames`, if any, are obeyed in the same way. A JSON given by its path is read alone and prescribes no
-//! split by its own name.
+//! Files: a folder with `transforms_train.json` is read as a split scene, and `transforms_test.json` is the test set.
+//! `transforms_val.json` is the test set only if there is no test file; otherwise its views are dropped, with a
+//! warning. Any other folder is read from `transforms.json`, whose `train_filenames`, `val_filenames` and
+//! `test_filenames`, if present, apply in the same way. A JSON given by its path is read alone, and its name prescribes
+//! no split.
 //!
-//! Poses are taken as they stand: `applied_transform` and `applied_scale` tell how they came about, and
-//! `ply_file_path` is in the same frame.
+//! Poses are used as they are: `applied_transform` and `applied_scale` only document their origin, and `ply_file_path`
+//! is in the same frame.
 //!
-//! Memory: at most 16 times the size of the files (measured: up to 11), the names of their folders apart, whatever stands in
-//! them. Frames are read one at a time, and the first one that lacks what it needs is refused (`json`).
+//! Memory: at most 16 times the size of the files (measured: up to 11), plus the names in their folders, for any
+//! content. Frames are read one at a time, and the first incomplete one is refused (`json`).
 
 mod intrinsics;
 mod json;
@@ -34,17 +35,17 @@ use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Whether [`read_transforms`] finds something in this folder.
+/// Whether [`read_transforms`] would find something in this folder.
 pub fn looks_like_transforms(folder: &Path) -> bool {
     ["transforms_train.json", "transforms.json"].iter().any(|n| folder.join(n).is_file())
 }
 
 /// Reads a folder with `transforms*.json` or one such file. Paths in it are relative to its folder and must stay
-/// there. `points_path` is set when `ply_file_path` names a file that exists.
+/// inside. `points_path` is set if `ply_file_path` names an existing file.
 ///
 /// # Errors
-/// No JSON, broken JSON, keys of the wrong kind, cameras that cannot be used, names that leave the folder or occur
-/// twice, no view left, photos that are missing while their size is needed.
+/// No JSON, broken JSON, keys of the wrong kind, unsupported cameras, names that leave the folder or occur twice, no
+/// view left, missing photos whose size is needed.
 pub fn read_transforms(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let mut reading = Reading::new(options);
     let mut scene = RawScene { points: PointCloud::default(), ..RawScene::default() };
@@ -59,7 +60,7 @@ pub fn read_transforms(path: &Path, options: &ReadOptions) -> InputResult<RawSce
     Ok(scene)
 }
 
-/// The files to read and the split each prescribes; never empty.
+/// The files to read and the split that each prescribes; never empty.
 fn choose_files(path: &Path, warnings: &mut Vec<String>) -> InputResult<Vec<(PathBuf, Option<Split>)>> {
     if path.is_file() {
         return Ok(vec![(path.to_path_buf(), None)]);
@@ -78,7 +79,7 @@ fn choose_files(path: &Path, warnings: &mut Vec<String>) -> InputResult<Vec<(Pat
         };
     };
     if let Some(single) = single {
-        warnings.push(format!("{}: not read, since transforms_train.json is beside it", single.display()));
+        warnings.push(format!("{}: not read, because transforms_train.json exists beside it", single.display()));
     }
     let mut files = vec![(train, Some(Split::Train))];
     match (test, val) {
@@ -95,15 +96,15 @@ fn choose_files(path: &Path, warnings: &mut Vec<String>) -> InputResult<Vec<(Pat
     Ok(files)
 }
 
-/// What has been read so far.
+/// State of the reader.
 struct Reading<'a> {
     options: &'a ReadOptions,
     views: Vec<RawView>,
     bad_poses: Vec<String>,
     missing: Vec<String>,
-    /// Frames that are in none of the lists of file names that are used.
+    /// Frames that none of the used lists of file names contains.
     unlisted: Vec<String>,
-    /// MatrixCity's folder, when its files are read.
+    /// MatrixCity's folder, if its files are read.
     root: Option<PathBuf>,
 }
 
@@ -184,7 +185,7 @@ impl<'a> Reading<'a> {
         Ok(())
     }
 
-    /// Says what was left out; an error when a photo's size was needed or no view remains.
+    /// Warns about dropped views; fails if a photo's size was needed or no view remains.
     fn report(&self, file: &Path, warnings: &mut Vec<String>) -> InputResult<()> {
         let shown = file.display();
         if !self.missing.is_empty() {
@@ -222,7 +223,7 @@ impl<'a> Reading<'a> {
     }
 }
 
-/// The photo's path in a frame and the key it stands under; MatrixCity's own files number the photos instead.
+/// The photo's path in a frame and its key; MatrixCity's own files number the photos instead.
 fn stated_path<'a>(frame: &Node<'a>) -> InputResult<(&'static str, std::borrow::Cow<'a, str>)> {
     if let Some(path) = frame.text("file_path")? {
         return Ok(("file_path", path.into()));
@@ -235,14 +236,14 @@ fn stated_path<'a>(frame: &Node<'a>) -> InputResult<(&'static str, std::borrow::
     Err(frame.error("file_path", "the key is missing", FIX_KEY))
 }
 
-/// nerfstudio's lists of file names, as far as they are used.
+/// nerfstudio's lists of file names, as far as used.
 struct Prescribed<'j> {
     train: &'j BTreeSet<String>,
     held_out: Option<&'j BTreeSet<String>>,
 }
 
 impl<'j> Prescribed<'j> {
-    /// The lists of a file, if it has them: of the held-out ones `test_filenames` where it is there.
+    /// The lists of a file, if any; of the held-out lists `test_filenames` is preferred.
     fn of(json: &'j JsonFile) -> InputResult<Option<Prescribed<'j>>> {
         let names = |list: usize| match json.names(list) {
             Names::Absent => Ok(None),
@@ -275,6 +276,6 @@ fn points_path(top: &Node<'_>, folder: &Path, warnings: &mut Vec<String>) -> Inp
     if path.is_file() {
         return Ok(Some(path));
     }
-    warnings.push(format!("{}: ply_file_path names '{name}', which is not there", top.file.display()));
+    warnings.push(format!("{}: ply_file_path names '{name}', which does not exist", top.file.display()));
     Ok(None)
 }

@@ -1,14 +1,14 @@
-//! From a frame's `file_path` to the photo's file.
+//! Finds the photo file for a frame's `file_path`.
 
 use crate::base::error::InputResult;
 use crate::dataset::paths::clean_name;
 use crate::dataset::photo_header::read_header;
 use std::path::{Path, PathBuf};
 
-/// Endings tried after the name as it stands: Blender's exporter leaves `.png` out.
+/// Endings appended to the name in turn: Blender's exporter omits `.png`.
 const ENDINGS: [&str; 7] = ["", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG"];
 
-/// A photo as a frame names it.
+/// A photo named by a frame.
 pub(super) struct Photo {
     /// Cleaned name with its ending.
     pub name: String,
@@ -16,9 +16,8 @@ pub(super) struct Photo {
     pub exists: bool,
 }
 
-/// Where the photo that `stated` names may be: in `folder`, and in `folder/images` too when that folder is asked for,
-/// since it is what programs ask for by default; any other image folder is meant instead, with and without the first
-/// folder of the name.
+/// Possible places of the photo `name`: in `folder` and, if the image folder is `images` (many programs' default), in
+/// `folder/images` too. Any other image folder replaces these, with and without the first folder of the name.
 fn places(folder: &Path, images: Option<&str>, name: &str) -> Vec<PathBuf> {
     match images {
         None => vec![folder.join(name)],
@@ -31,8 +30,8 @@ fn places(folder: &Path, images: Option<&str>, name: &str) -> Vec<PathBuf> {
     }
 }
 
-/// Looks for the photo that `stated` names. Not found: the first place, with `.png` when the name has no ending.
-/// Refused names come back as text.
+/// Searches for the photo `stated`. If not found: the first place, with `.png` if the name has no ending. Refusals are
+/// returned as text.
 pub(super) fn find_photo(folder: &Path, images: Option<&str>, stated: &str) -> Result<Photo, String> {
     let name = clean_name(stated)?;
     let places = places(folder, images, &name);

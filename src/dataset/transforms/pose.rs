@@ -1,4 +1,4 @@
-//! Camera-to-world matrices in OpenGL axes (x right, y up, z backward), as poses.
+//! Converts camera-to-world matrices in OpenGL axes (x right, y up, z backward) to poses.
 
 use super::json::{FIX_KEY, Node};
 use crate::base::error::InputResult;
@@ -7,14 +7,14 @@ use crate::dataset::model::Pose;
 use glam::{DMat3, DVec3};
 use serde_json::Value;
 
-/// Relative difference of column lengths, and cosine between columns, up to which a matrix counts as a rounded
-/// rotation. Exporters print 6 digits or more; hand-held trackers are off by about 1e-3.
+/// Largest relative difference of column lengths, and largest cosine between columns, of a rounded rotation. Exporters
+/// print 6 digits or more; hand-held trackers are off by about 1e-3.
 const TOLERANCE: f64 = 1e-2;
 /// Shortest column accepted before scaling (MatrixCity has 0.01).
 const MIN_SCALE: f64 = 1e-9;
 
-/// The matrix under `transform_matrix`, or MatrixCity's `rot_mat`: 3 or 4 rows of 4 numbers, row-major; `null`, which
-/// some writers put for NaN, becomes NaN.
+/// Reads the matrix of `transform_matrix`, or MatrixCity's `rot_mat`: 3 or 4 rows of 4 numbers, row-major; `null`,
+/// which some writers use for NaN, becomes NaN.
 pub(super) fn read_matrix(frame: &Node<'_>) -> InputResult<[[f64; 4]; 4]> {
     let key = if frame.get("transform_matrix").is_none() && frame.get("rot_mat").is_some() {
         "rot_mat"
@@ -39,8 +39,8 @@ pub(super) fn read_matrix(frame: &Node<'_>) -> InputResult<[[f64; 4]; 4]> {
     Ok(matrix)
 }
 
-/// Takes the scale that the rotation carries off the position too: MatrixCity's rotations times 0.01 come with positions
-/// in metres, its plain rotations with positions in 100 m.
+/// Divides the position by the scale of the rotation as well: MatrixCity's rotations times 0.01 come with positions in
+/// metres, its plain rotations with positions in 100 m.
 pub(super) fn scale_position(m: &mut [[f64; 4]; 4]) {
     let scale = (0..3).map(|c| DVec3::new(m[0][c], m[1][c], m[2][c]).length()).sum::<f64>() / 3.0;
     for row in m.iter_mut().take(3) {
@@ -48,8 +48,8 @@ pub(super) fn scale_position(m: &mut [[f64; 4]; 4]) {
     }
 }
 
-/// The pose of a camera-to-world matrix whose rotation may carry one common scale; `None` when it is not finite or
-/// not a proper rotation.
+/// The pose of a camera-to-world matrix whose rotation may have a common scale; `None` if it is not finite or not a
+/// proper rotation.
 pub(in crate::dataset) fn make_pose(m: &[[f64; 4]; 4]) -> Option<Pose> {
     if !m.iter().flatten().all(|x| x.abs() <= MAX_COORDINATE) {
         return None;
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_rotation_is_refused() {
+    fn a_matrix_that_is_not_a_rotation_is_refused() {
         let good = [[1., 0., 0., 1.], [0., 1., 0., 2.], [0., 0., 1., 3.], [0., 0., 0., 1.]];
         for (row, column, value) in
             [(0, 0, -1.0), (0, 0, 0.5), (0, 1, 0.5), (1, 3, f64::NAN), (2, 2, f64::INFINITY), (3, 0, 1.0), (3, 3, 2.0)]

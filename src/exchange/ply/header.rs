@@ -1,20 +1,20 @@
 //! The header of a PLY file: format, elements, properties, comments.
 //!
-//! Not here: the values behind it, and what they mean.
+//! Not here: the values after the header, and their meaning.
 //!
-//! Invariants: 1. at most [`MAX_HEADER_BYTES`] are read, whatever the file says; 2. counts are numbers that the file
-//! states, nothing more: readers check them; 3. property names of one element are unique.
+//! Invariants: 1. at most [`MAX_HEADER_BYTES`] are read, whatever the file says; 2. counts are as stated by the file
+//! and unchecked: readers check them; 3. property names of one element are unique.
 
 use crate::base::error::{InputError, InputResult};
 use std::io::{BufRead, Read};
 use std::path::Path;
 
-/// Longest header that is read. A Gaussian's is 1.5 KB.
+/// Longest header that is read. The header of a file of Gaussians takes 1.5 KB.
 pub const MAX_HEADER_BYTES: u64 = 64 * 1024;
 
-const REMEDY: &str = "check that this is a PLY file and that it was copied whole";
+const REMEDY: &str = "check that this is a complete PLY file";
 
-/// How the values are stored.
+/// Encoding of the values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// Decimal numbers, one element per line.
@@ -71,7 +71,7 @@ impl Scalar {
         }
     }
 
-    /// Whether values are fractions.
+    /// Whether the type is a floating-point type.
     pub fn is_float(self) -> bool {
         matches!(self, Scalar::F32 | Scalar::F64)
     }
@@ -99,7 +99,7 @@ impl Scalar {
     }
 }
 
-/// One number or one list of numbers per element.
+/// Kind of a property: a number or a list of numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// One value.
@@ -113,7 +113,7 @@ pub enum Kind {
     },
 }
 
-/// A named value of an element.
+/// A property of an element.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Property {
     /// Name.
@@ -122,14 +122,14 @@ pub struct Property {
     pub kind: Kind,
 }
 
-/// A table of the file.
+/// An element: a table of the file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Element {
     /// Name: `vertex`, `face` ...
     pub name: String,
-    /// Rows that the header promises.
+    /// Number of rows that the header states.
     pub count: u64,
-    /// Values of a row, in order.
+    /// Properties of a row, in order.
     pub properties: Vec<Property>,
 }
 
@@ -139,7 +139,7 @@ impl Element {
         self.properties.iter().position(|p| p.name == name)
     }
 
-    /// Bytes of a row in a binary file with every list empty, and whether there are no lists, so that it is exact.
+    /// Bytes of a row in a binary file with all lists empty, and whether that is exact because there are no lists.
     pub fn row_bytes(&self) -> (u64, bool) {
         let mut exact = true;
         let mut bytes = 0;
@@ -159,9 +159,9 @@ impl Element {
 /// A parsed header.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Header {
-    /// Storage of the values.
+    /// Encoding of the values.
     pub format: Format,
-    /// Tables, in file order.
+    /// Elements, in file order.
     pub elements: Vec<Element>,
     /// Comments without the word `comment`, trimmed.
     pub comments: Vec<String>,
@@ -249,7 +249,7 @@ fn parse_property(rest: &str, element: &Element) -> Result<Property, String> {
         ["list", count, item, name] => {
             let (count, item) = (scalar(count)?, scalar(item)?);
             if count.is_float() {
-                return Err(format!("list '{}' is counted by fractions", shorten(name)));
+                return Err(format!("the count of list '{}' is a floating-point type", shorten(name)));
             }
             (Kind::List { count, item }, name)
         }
@@ -262,7 +262,7 @@ fn parse_property(rest: &str, element: &Element) -> Result<Property, String> {
     Ok(Property { name: name.to_string(), kind })
 }
 
-/// Text of a file as far as it fits into a message.
+/// Shortens text of a file to fit into a message.
 pub fn shorten(text: &str) -> String {
     let mut out: String = text.chars().take(40).map(|c| if c.is_control() { '?' } else { c }).collect();
     if text.chars().nth(40).is_some() {

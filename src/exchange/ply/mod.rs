@@ -1,17 +1,18 @@
-//! PLY: Gaussians out, Gaussians or coloured points in.
+//! PLY: writes Gaussians, reads Gaussians or coloured points.
 //!
-//! Not here: which frame a scene is trained in (the dataset's loader), what to do with points (`scene::init`).
+//! Not here: the choice of the training frame (the dataset's loader), the use of points (`scene::init`).
 //!
 //! Invariants:
-//! 1. What is written has the property order of the 3DGS code, which viewers expect: `x y z nx ny nz f_dc_* f_rest_*
+//! 1. The written property order is that of the 3DGS code, which viewers expect: `x y z nx ny nz f_dc_* f_rest_*
 //!    opacity scale_* rot_*`, binary little endian f32, `f_rest` channel-major (all red coefficients, then green,
 //!    then blue), scales as logs, opacity as a logit, `rot` w-first and of unit length.
-//! 2. A target path holds either the whole new file or what it held before: files are written beside it and renamed.
-//! 3. What is read is hostile: every count is checked against the bytes left before anything is allocated.
-//! 4. Everything handed out is finite.
+//! 2. A target path holds either the whole new file or its old content: files are written beside it and renamed.
+//! 3. Files are untrusted: every count is checked against the bytes left before anything is allocated.
+//! 4. All returned values are finite.
 //!
-//! Two frames. Scenes are trained in a *local* frame: `dataset = local * scale + origin`, all of it in f64. A file
-//! holds either frame and says which in its comments, together with origin and scale, so that both lead back.
+//! There are two frames. Scenes are trained in a *local* frame: `dataset = local * scale + origin`, computed in f64. A
+//! file holds either frame and names it in its comments, with origin and scale, so that each frame can be derived from
+//! the other.
 
 mod header;
 mod read;
@@ -19,23 +20,23 @@ mod rows;
 mod write;
 
 pub use read::{
-    ROW_HEAD, gaussians_header, holds_gaussians, parse_ply, push_row, read_ply, rows_promised, stream_gaussians,
+    ROW_HEAD, gaussians_header, holds_gaussians, parse_ply, push_row, read_ply, stated_rows, stream_gaussians,
     stream_points, take_row,
 };
 pub use write::{PlyWriter, PlyWritten, write_gaussians};
 
 use crate::scene::columns::Columns;
 
-/// Offsets beyond this many scene radii are not written into f32 positions: one unit in the last place of the offset
-/// would be more than 6e-5 radii there, which is pixels in a photo.
+/// Beyond this many scene radii an offset is not written into f32 positions: one unit in the last place of such an
+/// offset is more than 6e-5 radii, which is pixels in a photo.
 pub const MAX_OFFSET_RADII: f64 = 1000.0;
 
-/// The frame in which a file holds its Gaussians.
+/// The frame of the Gaussians in a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ExportFrame {
     /// The dataset's own coordinates.
     Dataset,
-    /// The trainer's coordinates: origin and scale removed.
+    /// The trainer's coordinates, without origin and scale.
     Local,
 }
 
@@ -53,32 +54,33 @@ impl ExportFrame {
         [ExportFrame::Dataset, ExportFrame::Local].into_iter().find(|f| f.name() == name)
     }
 
-    /// The frame that can really be written: `Local` when `origin` lies more than [`MAX_OFFSET_RADII`] times
-    /// `scene_radius` (dataset units) from zero, else the one asked for.
+    /// The frame that f32 can hold: `Local` if `origin` is more than [`MAX_OFFSET_RADII`] times `scene_radius` (dataset
+    /// units) from zero, otherwise the requested one.
     #[must_use]
-    pub fn that_fits(self, origin: [f64; 3], scene_radius: f64) -> ExportFrame {
+    pub fn fitting_f32(self, origin: [f64; 3], scene_radius: f64) -> ExportFrame {
         let offset = libm::sqrt(origin.iter().map(|x| x * x).sum());
         if offset > MAX_OFFSET_RADII * scene_radius { ExportFrame::Local } else { self }
     }
 }
 
-/// What a file says about its Gaussians besides their values.
+/// Metadata of the Gaussians in a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlyMeta {
-    /// Optimizer steps behind the values; `None` when the file does not say.
+    /// Optimizer steps done; `None` if the file does not say.
     pub step: Option<u64>,
-    /// Dataset coordinates of the local frame's zero. Zeros when the file does not say.
+    /// Origin of the local frame in dataset coordinates; zeros if the file does not say.
     pub origin: [f64; 3],
-    /// Dataset units per local unit. 1 when the file does not say.
+    /// Dataset units per local unit; 1 if the file does not say.
     pub scale: f64,
-    /// Writing: the frame asked for. Reading: the frame of the values. Files of other programs are in the dataset's.
+    /// When writing: the requested frame. When reading: the frame of the values; files of other programs are in the
+    /// dataset's.
     pub frame: ExportFrame,
-    /// Writing: how far the scene reaches, dataset units; decides whether f32 can hold the dataset frame (see
-    /// [`ExportFrame::that_fits`]). Not stored; reads back as `scale`.
+    /// When writing: extent of the scene in dataset units, which decides whether f32 can hold the dataset frame (see
+    /// [`ExportFrame::fitting_f32`]). Not stored; reading sets it to `scale`.
     pub scene_radius: f64,
-    /// Reading: the file was trained with an opacity compensation ("mip", "antialiased") that this renderer lacks.
+    /// When reading: whether training used an opacity compensation ("mip", "antialiased") that this renderer lacks.
     pub antialiased: bool,
-    /// Reading: rows left out because a value was not finite.
+    /// When reading: number of rows dropped because a value was not finite.
     pub dropped: u64,
 }
 
@@ -96,32 +98,32 @@ impl Default for PlyMeta {
     }
 }
 
-/// What a PLY file turned out to hold.
+/// Content of a PLY file.
 #[derive(Debug, Clone, PartialEq)]
 pub enum PlyContent {
     /// A trained scene (the file has `f_dc_0`).
     Gaussians {
         /// The rows, in the frame that `meta` names; quaternions are unit.
         columns: Columns,
-        /// What the comments say.
+        /// Metadata from the comments.
         meta: PlyMeta,
     },
     /// Coloured points.
     Points {
         /// Positions.
         positions: Vec<[f64; 3]>,
-        /// sRGB, one per position; mid grey when the file has no colours.
+        /// sRGB, one per position; mid grey if the file has no colours.
         colors: Vec<[u8; 3]>,
-        /// Rows left out because a value was not finite.
+        /// Number of rows dropped because a value was not finite.
         dropped: u64,
     },
 }
 
-/// Moves Gaussians that were read with `meta` into the local frame of `origin` and `scale`.
+/// Converts Gaussians that were read with `meta` into the local frame of `origin` and `scale`.
 ///
-/// In f64, then rounded once: `local = (p - origin) / scale` for a file in the dataset's frame; a file in another
-/// local frame goes through the dataset's. Log-scales get the log of the ratio of the scales. A file in this very
-/// frame keeps its bits. Rows whose values leave f32 on the way are removed; returns how many.
+/// Computed in f64 and rounded once: `local = (p - origin) / scale` for a file in the dataset's frame; a file in
+/// another local frame is first converted to the dataset's. The log of the ratio of scales is added to log-scales. A
+/// file already in this local frame keeps its bits. Rows whose values overflow f32 are removed; returns how many.
 pub fn to_local(columns: &mut Columns, meta: &PlyMeta, origin: [f64; 3], scale: f64) -> u64 {
     let (file_origin, file_scale) = match meta.frame {
         ExportFrame::Local => (meta.origin, meta.scale),
@@ -163,11 +165,11 @@ fn remove_rows_that_are_not_finite(columns: &mut Columns) -> u64 {
     (rows - kept) as u64
 }
 
-/// The same rotation at unit length. One that is unit already, to the rounding of f32, keeps its bits, so writing and
+/// Normalises a quaternion. One that is already of unit length, to f32 rounding, keeps its bits, so that writing and
 /// reading again changes nothing; all zeros become the identity. Finite input gives finite output.
 fn unit_quat(q: [f32; 4]) -> [f32; 4] {
     let norm2: f64 = q.iter().map(|&v| f64::from(v) * f64::from(v)).sum();
-    // Normalising in f64 and rounding leaves at most 2.4e-7 here.
+    // Normalising in f64 and rounding leaves an error of at most 2.4e-7.
     if (norm2 - 1.0).abs() <= 1e-6 {
         return q;
     }
@@ -187,7 +189,7 @@ mod tests {
         for q in [[0.3f32, -0.2, 0.9, 0.1], [1e-30, 1e-30, 0.0, 0.0], [3e38, 3e38, -3e38, 1.0], [0.0; 4]] {
             let once = unit_quat(q);
             let norm2: f64 = once.iter().map(|&v| f64::from(v).powi(2)).sum();
-            // Each of four squares is off by at most 2 * 2^-24 of itself.
+            // Each of the four squares has a relative error of at most 2 * 2^-24.
             assert!((norm2 - 1.0).abs() < 2.5e-7, "{q:?} -> {once:?}");
             assert_eq!(once, unit_quat(once));
         }
@@ -196,9 +198,9 @@ mod tests {
     #[test]
     fn far_offsets_stay_local() {
         let utm = [500_000.0, 5_000_000.0, 100.0];
-        assert_eq!(ExportFrame::Dataset.that_fits(utm, 200.0), ExportFrame::Local);
-        assert_eq!(ExportFrame::Dataset.that_fits(utm, 20_000.0), ExportFrame::Dataset);
-        assert_eq!(ExportFrame::Local.that_fits([0.0; 3], 1.0), ExportFrame::Local);
-        assert_eq!(ExportFrame::Dataset.that_fits([0.0; 3], 0.0), ExportFrame::Dataset);
+        assert_eq!(ExportFrame::Dataset.fitting_f32(utm, 200.0), ExportFrame::Local);
+        assert_eq!(ExportFrame::Dataset.fitting_f32(utm, 20_000.0), ExportFrame::Dataset);
+        assert_eq!(ExportFrame::Local.fitting_f32([0.0; 3], 1.0), ExportFrame::Local);
+        assert_eq!(ExportFrame::Dataset.fitting_f32([0.0; 3], 0.0), ExportFrame::Dataset);
     }
 }

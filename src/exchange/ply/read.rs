@@ -1,10 +1,10 @@
-//! A PLY file to Gaussians or coloured points.
+//! Reads a PLY file into Gaussians or coloured points.
 //!
-//! Not here: the header's grammar (`header`), how rows are cut out of bytes or lines (`rows`).
+//! Not here: the grammar of the header (`header`), splitting bytes or lines into rows (`rows`).
 //!
-//! Invariants: 1. nothing is allocated before the count it follows from was checked against the bytes left; 2. no
-//! byte makes this panic; 3. rows with a value that is not finite are dropped and counted, and more than 1 % of them
-//! is an error; 4. what is handed out has at least one row.
+//! Invariants: 1. a count is checked against the bytes left before anything is allocated for it; 2. no input makes this
+//! panic; 3. rows with a non-finite value are dropped and counted, and more than 1 % of them is an error; 4. a
+//! successful result has at least one row.
 
 use super::header::{Element, Header, Kind, Scalar, parse_header, shorten};
 use super::rows::{Body, read_rows};
@@ -22,7 +22,7 @@ pub fn read_ply(path: &Path) -> InputResult<PlyContent> {
     parse_ply(reader, total_bytes, path)
 }
 
-/// Whether `path` holds Gaussians rather than points.
+/// Whether `path` holds Gaussians; otherwise it holds points.
 ///
 /// # Errors
 /// The file cannot be opened, or its header cannot be read.
@@ -31,20 +31,20 @@ pub fn holds_gaussians(path: &Path) -> InputResult<bool> {
     Ok(vertex_of(&header, path)?.1.find("f_dc_0").is_some())
 }
 
-/// Gaussians or points that the header of `path` promises.
+/// Number of Gaussians or points that the header of `path` states.
 ///
 /// # Errors
 /// The file cannot be opened, or its header cannot be read.
-pub fn rows_promised(path: &Path) -> InputResult<u64> {
+pub fn stated_rows(path: &Path) -> InputResult<u64> {
     let header = parse_header(&mut open(path)?.0, path)?;
     Ok(vertex_of(&header, path)?.1.count)
 }
 
-/// Hands the coloured points of `path` to `take`, in the file's order and without keeping them; returns how many were
-/// dropped because they are not finite. Gaussians count as points of the default colour.
+/// Streams the coloured points of `path` to `take` in file order, without storing them; returns the number dropped
+/// because they are not finite. Gaussians count as points of the default colour.
 ///
 /// # Errors
-/// As [`parse_ply`]; or `take` failed.
+/// As [`parse_ply`], and those of `take`.
 pub fn stream_points(path: &Path, take: &mut dyn FnMut([f64; 3], [u8; 3]) -> InputResult<()>) -> InputResult<u64> {
     let (mut reader, total_bytes) = open(path)?;
     let header = parse_header(&mut reader, path)?;
@@ -53,25 +53,25 @@ pub fn stream_points(path: &Path, take: &mut dyn FnMut([f64; 3], [u8; 3]) -> Inp
 }
 
 fn open(path: &Path) -> InputResult<(BufReader<File>, u64)> {
-    // Asked before it is opened: opening a pipe would wait for somebody to write to it.
+    // Checked before opening: opening a pipe would block until somebody writes to it.
     let about = std::fs::metadata(path).map_err(|e| InputError::io(path, "opening", &e))?;
     if !about.is_file() {
         return Err(InputError::new(path, "this is not a regular file", "give a PLY file"));
     }
     let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
-    let bytes = file.metadata().map_err(|e| InputError::io(path, "asking for the length", &e))?.len();
+    let bytes = file.metadata().map_err(|e| InputError::io(path, "reading the length", &e))?.len();
     Ok((BufReader::with_capacity(1 << 20, file), bytes))
 }
 
 /// Reads a PLY of `total_bytes` bytes: Gaussians if its vertices have `f_dc_0`, else coloured points.
 ///
-/// ascii and both binary formats; properties in any order; other properties and elements, lists included, are passed
-/// over. Colours are `red green blue`, integers of 0 to 255 (16 bits: to 65,535) or fractions of 0 to 1.
-/// `path` only names the file in errors.
+/// Accepts ascii and both binary formats, with properties in any order; other properties and elements, including lists,
+/// are skipped. Colours are `red green blue`, integers of 0 to 255 (16 bits: to 65,535) or fractions of 0 to 1. `path`
+/// only names the file in errors.
 ///
 /// # Errors
-/// A file that is cut short, promises more than it holds, lacks a property, has another number of `f_rest` than 0, 9,
-/// 24 or 45, has no vertices, or has more than 1 % of rows with values that are not finite.
+/// The file is cut short, states more rows than it holds, lacks a property, has a number of `f_rest` properties other
+/// than 0, 9, 24 or 45, has no vertices, or more than 1 % of its rows have non-finite values.
 pub fn parse_ply<R: BufRead>(mut reader: R, total_bytes: u64, path: &Path) -> InputResult<PlyContent> {
     let header = parse_header(&mut reader, path)?;
     let (mut body, vertex) = body_at_vertices(reader, &header, total_bytes, path)?;
@@ -82,7 +82,7 @@ pub fn parse_ply<R: BufRead>(mut reader: R, total_bytes: u64, path: &Path) -> In
     }
 }
 
-/// The body of a file, passed over up to its vertices, which are checked to be there.
+/// The body of a file, positioned at its vertices, whose presence is checked.
 fn body_at_vertices<'p, 'h, R: BufRead>(
     reader: R,
     header: &'h Header,
@@ -98,7 +98,7 @@ fn body_at_vertices<'p, 'h, R: BufRead>(
     Ok((body, vertex))
 }
 
-/// The element of the vertices and its place; there is at least one of them.
+/// The vertex element and its index; it has at least one row.
 fn vertex_of<'h>(header: &'h Header, path: &Path) -> InputResult<(usize, &'h Element)> {
     let vertex_at = header.elements.iter().position(|e| e.name == "vertex").ok_or_else(|| {
         InputError::new(path, "the file has no element 'vertex'", "give a PLY of points or Gaussians").at("header")
@@ -116,7 +116,7 @@ fn vertex_of<'h>(header: &'h Header, path: &Path) -> InputResult<(usize, &'h Ele
     Ok((vertex_at, vertex))
 }
 
-/// Index of a number property, or an error that names it.
+/// Index of a number property.
 fn scalar_at(path: &Path, vertex: &Element, name: &str) -> InputResult<(usize, Scalar)> {
     let index = vertex.find(name);
     match index.map(|i| (i, vertex.properties[i].kind)) {
@@ -134,7 +134,7 @@ fn no_memory(path: &Path, rows: u64) -> impl Fn(TryReserveError) -> InputError {
     move |_| InputError::new(path, format!("no memory for {rows} rows"), "thin the file out or use a larger machine")
 }
 
-/// Rows that were dropped, with the place of the first.
+/// Number of dropped rows, and the first one.
 #[derive(Default)]
 struct Dropped {
     count: u64,
@@ -154,7 +154,7 @@ impl Dropped {
             return Ok(());
         }
         let problem = format!("{} of {rows} vertices have values that are not finite numbers", self.count);
-        let remedy = "more than 1 % is taken for a broken file: repair or export it again";
+        let remedy = "more than 1 % means that the file is broken: repair or export it again";
         Err(InputError::new(path, problem, remedy).at(format!("vertex {}", self.first)))
     }
 }
@@ -162,11 +162,12 @@ impl Dropped {
 /// Floats of a Gaussian before its higher bands: means, sh0, opacity, scales, quaternion.
 pub const ROW_HEAD: usize = 14;
 
-/// Hands the Gaussians of `path` to `take` one by one, in the file's order and without keeping them: means (3), sh0 (3),
-/// opacity, scales (3), quaternion (4), then the higher bands, coefficient by coefficient. What the comments say comes back.
+/// Streams the Gaussians of `path` to `take` one by one in file order, without storing them: means (3), sh0 (3),
+/// opacity, scales (3), quaternion (4), then the higher bands, coefficient by coefficient. Returns the metadata from
+/// the comments.
 ///
 /// # Errors
-/// As [`parse_ply`], or the file holds points; or `take` failed.
+/// As [`parse_ply`], and those of `take`; also if the file holds points.
 pub fn stream_gaussians(path: &Path, take: &mut dyn FnMut(&[f32]) -> InputResult<()>) -> InputResult<PlyMeta> {
     let (mut reader, total_bytes) = open(path)?;
     let header = parse_header(&mut reader, path)?;
@@ -174,10 +175,10 @@ pub fn stream_gaussians(path: &Path, take: &mut dyn FnMut(&[f32]) -> InputResult
     stream_gaussian_rows(&mut body, &header, vertex, take)
 }
 
-/// What the header of a file of Gaussians says of them, and the degree of their bands. Nothing was dropped yet.
+/// Metadata in the header of a file of Gaussians, and its SH degree. `dropped` is still 0.
 ///
 /// # Errors
-/// As [`parse_ply`], of the header.
+/// As [`parse_ply`], for the header.
 pub fn gaussians_header(path: &Path) -> InputResult<(PlyMeta, u8)> {
     let header = parse_header(&mut open(path)?.0, path)?;
     let (_, vertex) = vertex_of(&header, path)?;
@@ -199,7 +200,7 @@ fn read_gaussians<R: BufRead>(body: &mut Body<'_, R>, header: &Header, vertex: &
     Ok(PlyContent::Gaussians { columns, meta })
 }
 
-/// Appends a row as [`stream_gaussians`] hands it out.
+/// Appends a row in the layout of [`stream_gaussians`].
 pub fn push_row(columns: &mut Columns, row: &[f32]) {
     columns.means.extend_from_slice(&row[0..3]);
     columns.sh0.extend_from_slice(&row[3..6]);
@@ -209,7 +210,7 @@ pub fn push_row(columns: &mut Columns, row: &[f32]) {
     columns.sh_n.extend_from_slice(&row[ROW_HEAD..]);
 }
 
-/// Row `row` as [`push_row`] takes it.
+/// Reads row `row` in the layout of [`push_row`].
 pub fn take_row(columns: &Columns, row: usize, values: &mut Vec<f32>) {
     let of = |column| columns.row(column, row);
     values.clear();
@@ -218,7 +219,7 @@ pub fn take_row(columns: &Columns, row: usize, values: &mut Vec<f32>) {
     }
 }
 
-/// Hands on the Gaussians of a body.
+/// Streams the Gaussians of a body.
 fn stream_gaussian_rows<R: BufRead>(
     body: &mut Body<'_, R>,
     header: &Header,
@@ -262,17 +263,17 @@ fn stream_gaussian_rows<R: BufRead>(
     Ok(meta)
 }
 
-/// The degree that follows from the number of `f_rest` properties.
+/// SH degree from the number of `f_rest` properties.
 fn sh_degree_of(path: &Path, vertex: &Element) -> InputResult<u8> {
     let rest = vertex.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
     (0..=3).find(|&degree| sh_n_width(degree) == rest).ok_or_else(|| {
-        let problem = format!("{rest} f_rest properties belong to no SH degree from 0 to 3 (0, 9, 24 or 45 would)");
+        let problem = format!("{rest} f_rest properties match no SH degree from 0 to 3 (expected 0, 9, 24 or 45)");
         InputError::new(path, problem, "export the file with SH degree 3 or less").at("header")
     })
 }
 
-/// What the comments say. Our own words (`step`, `origin`, `scale`, `frame`) count only in files that say they are
-/// ours: elsewhere they may mean anything.
+/// Metadata from the comments. The words `step`, `origin`, `scale` and `frame` count only in files written by gsscale:
+/// in others they may mean anything.
 fn meta_from_comments(path: &Path, comments: &[String]) -> InputResult<PlyMeta> {
     let mut meta = PlyMeta::default();
     let ours = comments.iter().any(|c| c.starts_with("Generated by gsscale"));
@@ -318,7 +319,7 @@ fn read_points<R: BufRead>(body: &mut Body<'_, R>, vertex: &Element) -> InputRes
     Ok(PlyContent::Points { positions, colors, dropped })
 }
 
-/// Hands on the points of a body; returns how many were dropped.
+/// Streams the points of a body; returns the number dropped.
 fn stream_rows<R: BufRead>(
     body: &mut Body<'_, R>,
     vertex: &Element,
@@ -356,7 +357,7 @@ fn stream_rows<R: BufRead>(
     Ok(dropped.count)
 }
 
-/// A finite colour value as a byte; the type says its range.
+/// Converts a finite colour value to a byte; the type determines its range.
 fn color_byte(value: f64, kind: Scalar) -> u8 {
     let full = if kind.is_float() {
         1.0

@@ -1,8 +1,8 @@
-//! Rows of a PLY element, cut out of packed bytes or lines of text.
+//! Splits packed bytes or lines of text into the rows of a PLY element.
 //!
-//! Not here: what the values mean.
+//! Not here: the meaning of the values.
 //!
-//! Invariants: 1. buffers are bounded by a constant ([`BLOCK_BYTES`], [`MAX_LINE_BYTES`]) or by the header's cap;
+//! Invariants: 1. buffers are bounded by a constant ([`BLOCK_BYTES`], [`MAX_LINE_BYTES`]) or by the longest header;
 //! 2. no loop runs longer than the file has bytes; 3. errors name the byte offset (binary) or the line (ascii).
 
 use super::header::{Element, Format, Header, Kind, Scalar, shorten};
@@ -14,7 +14,7 @@ const BLOCK_BYTES: usize = 1 << 18;
 const MAX_LINE_BYTES: u64 = 1 << 20;
 const CUT_SHORT: &str = "the file is cut short or its header is wrong: copy or export it again";
 
-/// The file behind its header, and how far it has been read.
+/// The body of a file, with the read position.
 pub struct Body<'a, R> {
     /// For errors.
     pub path: &'a Path,
@@ -27,7 +27,7 @@ pub struct Body<'a, R> {
 }
 
 impl<'a, R: BufRead> Body<'a, R> {
-    /// The body of a file of `total_bytes` bytes; `reader` stands right behind the header.
+    /// The body of a file of `total_bytes` bytes; `reader` is positioned right after the header.
     pub fn new(reader: R, path: &'a Path, header: &Header, total_bytes: u64) -> Self {
         Body {
             path,
@@ -50,7 +50,7 @@ impl<'a, R: BufRead> Body<'a, R> {
 
     /// Refuses an element that cannot fit into the bytes left. Lists count as empty.
     ///
-    /// A value of text takes at least a digit and a separator, the last one of the file a digit.
+    /// A text value takes at least a digit and a separator; the last value of a file takes at least a digit.
     pub fn check_room(&self, element: &Element) -> InputResult<()> {
         let left = self.total_bytes.saturating_sub(self.position);
         let (row, exact) = element.row_bytes();
@@ -74,7 +74,7 @@ impl<'a, R: BufRead> Body<'a, R> {
         Err(self.error(problem, CUT_SHORT))
     }
 
-    /// Passes over all rows of an element.
+    /// Skips all rows of an element.
     pub fn skip(&mut self, element: &Element) -> InputResult<()> {
         if element.count == 0 {
             return Ok(());
@@ -88,7 +88,7 @@ impl<'a, R: BufRead> Body<'a, R> {
         }
         let (row_bytes, exact) = element.row_bytes();
         if exact {
-            // No overflow: the product was just compared with the bytes left.
+            // No overflow: the product was compared with the bytes left above.
             return self.skip_bytes(element.count * row_bytes);
         }
         for _ in 0..element.count {
@@ -118,7 +118,8 @@ impl<'a, R: BufRead> Body<'a, R> {
         if copied < count { Err(self.error("the file ends inside a row", CUT_SHORT)) } else { Ok(()) }
     }
 
-    /// Reads one binary row property by property; `number` gets the index and value of those that are no lists.
+    /// Reads one binary row property by property; `number` receives index and value of each property that is not a
+    /// list.
     fn walk_row(&mut self, element: &Element, mut number: impl FnMut(usize, f64)) -> InputResult<()> {
         let big_endian = self.format == Format::BigEndian;
         let mut raw = [0u8; 8];
@@ -142,7 +143,7 @@ impl<'a, R: BufRead> Body<'a, R> {
         Ok(())
     }
 
-    /// Brings the next line that is not blank into `text`.
+    /// Reads the next non-blank line into `text`.
     fn next_line(&mut self) -> InputResult<()> {
         loop {
             self.text.clear();
@@ -185,11 +186,11 @@ impl<'a, R: BufRead> Body<'a, R> {
                     }
                 },
                 Kind::List { .. } => {
-                    // A count beyond the words of the line ends in the error below or at the next property.
+                    // A count larger than the words of the line fails below or at the next property.
                     let length = word.parse::<u32>().ok();
                     let complete = length.is_some_and(|n| n == 0 || words.nth(n as usize - 1).is_some());
                     if !complete {
-                        let problem = format!("list '{}' does not hold what its count says", name(index));
+                        let problem = format!("list '{}' does not have as many values as its count says", name(index));
                         return Err(self.error(problem, CUT_SHORT));
                     }
                 }
@@ -205,8 +206,8 @@ impl<'a, R: BufRead> Body<'a, R> {
     }
 }
 
-/// Reads all rows of `element`; [`Body::check_room`] has passed. `slots` are the wanted properties, none of them a list;
-/// `each` gets the row's number and their values in the order of `slots`.
+/// Reads all rows of `element`, which has passed [`Body::check_room`]. `slots` are the wanted properties, none of them
+/// a list; `each` receives the row's number and the values in the order of `slots`.
 pub fn read_rows<R: BufRead>(
     body: &mut Body<'_, R>,
     element: &Element,
@@ -239,7 +240,7 @@ pub fn read_rows<R: BufRead>(
     Ok(())
 }
 
-/// Binary rows of one length: whole blocks of them at once.
+/// Reads binary rows of fixed length, in blocks.
 fn read_packed<R: BufRead>(
     body: &mut Body<'_, R>,
     element: &Element,

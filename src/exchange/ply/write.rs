@@ -1,12 +1,13 @@
-//! Gaussians to a PLY file.
+//! Writes Gaussians to a PLY file.
 //!
-//! Not here: when to write and where. The parent's page states the file's layout.
+//! Not here: when and where to write. The parent module documents the file's layout.
 //!
-//! Invariants: 1. memory beyond the rows given is one block of [`BLOCK_ROWS`] rows; 2. the bytes depend on the arguments
-//! alone; 3. the target is replaced whole, after the new bytes have reached the disk, or not at all; 4. a row with a
-//! value that is not finite, before or after the change of frame, is left out and counted.
+//! Invariants: 1. memory beyond the given rows is one block of [`BLOCK_ROWS`] rows; 2. the bytes depend on the
+//! arguments alone; 3. the target is replaced as a whole, after the new bytes have reached the disk, or not at all; 4.
+//! a row with a non-finite value, before or after the change of frame, is left out and counted.
 //!
-//! The comments follow the `element` line: the viewer of the 3DGS code takes the third line for it, unread.
+//! The comments follow the `element` line, because the viewer of the 3DGS code assumes that the third line is
+//! `element`.
 
 use super::{ExportFrame, PlyMeta, unit_quat};
 use crate::base::error::{InputError, InputResult};
@@ -18,38 +19,38 @@ use std::path::{Path, PathBuf};
 
 const BLOCK_ROWS: usize = 4096;
 
-/// What was written.
+/// Summary of a written file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PlyWritten {
-    /// The frame of the values: `Local` although `Dataset` was asked for, when f32 cannot hold the offset. Tell the user.
+    /// Frame of the values: `Local` instead of a requested `Dataset` if f32 cannot hold the offset. Tell the user.
     pub frame: ExportFrame,
     /// Rows in the file.
     pub rows: u64,
-    /// Rows left out because a value was not finite.
+    /// Number of rows left out because a value was not finite.
     pub skipped: u64,
     /// Length of the file, bytes.
     pub bytes: u64,
 }
 
-/// Writes rows of the local frame to `path`, in the frame that `meta` asks for where f32 can hold it: [`PlyWriter`] for
-/// rows that are all at hand.
+/// Writes rows of the local frame to `path`, in the frame that `meta` requests if f32 can hold it. For rows that are
+/// not all in memory use [`PlyWriter`].
 ///
 /// # Errors
-/// When the disk refuses, when `path` names no file, or when no row is finite. The target is then what it was.
+/// The disk fails, `path` names no file, or no row is finite. The target then stays unchanged.
 pub fn write_gaussians(path: &Path, columns: &Columns, meta: &PlyMeta) -> InputResult<PlyWritten> {
     let mut writer = PlyWriter::create(path, columns.sh_degree, columns.rows() as u64, meta)?;
     writer.write(columns)?;
     writer.finish()
 }
 
-/// A file that is written part by part.
+/// Writes a file in parts.
 ///
 /// In the dataset's frame positions are `means * scale + origin`, computed in f64 and rounded once, and `ln(scale)` is
-/// added to the log-scales. Quaternions are written at unit length, as viewers expect; the rotation is the same.
-/// Bands above those of the rows are zeros.
+/// added to the log-scales. Quaternions are written at unit length, as viewers expect; the rotation is the same. Bands
+/// above those of the rows are zeros.
 ///
-/// The number of rows stands in the header and is known at the end: the header is written again then, at the same
-/// length. Where the number turned out to have fewer digits than room was left for, its comment is padded with spaces.
+/// The header contains the number of rows, which is known only at the end: the header is then rewritten at the same
+/// length. If the number has fewer digits than reserved, a comment is padded with spaces.
 pub struct PlyWriter {
     path: PathBuf,
     part: PartFile,
@@ -65,14 +66,14 @@ pub struct PlyWriter {
 }
 
 impl PlyWriter {
-    /// Begins a file of at most `rows_at_most` rows with the bands of `sh_degree`, beside its target.
+    /// Starts a file of at most `rows_at_most` rows with the bands of `sh_degree`, beside its target.
     ///
     /// # Errors
-    /// When the disk refuses, or when `path` names no file.
+    /// The disk fails, or `path` names no file.
     pub fn create(path: &Path, sh_degree: u8, rows_at_most: u64, meta: &PlyMeta) -> InputResult<PlyWriter> {
         let name =
-            path.file_name().ok_or_else(|| InputError::new(path, "this path names no file", "give a file name"))?;
-        let frame = meta.frame.that_fits(meta.origin, meta.scene_radius);
+            path.file_name().ok_or_else(|| InputError::new(path, "this path has no file name", "give a file name"))?;
+        let frame = meta.frame.fitting_f32(meta.origin, meta.scene_radius);
         let mut part_name = std::ffi::OsString::from(".");
         part_name.push(name);
         part_name.push(".part");
@@ -96,15 +97,15 @@ impl PlyWriter {
         })
     }
 
-    /// Appends rows; those that are not finite are left out and counted.
+    /// Appends rows; non-finite ones are left out and counted.
     ///
     /// # Errors
-    /// When the disk refuses, or when there are more rows than were announced.
+    /// The disk fails, or there are more than `rows_at_most` rows.
     pub fn write(&mut self, columns: &Columns) -> InputResult<()> {
         let rows = columns.rows();
         self.given += rows as u64;
         if self.given > self.rows_at_most || columns.sh_degree > self.file_rows.sh_degree {
-            let problem = format!("{} rows came, {} were announced", self.given, self.rows_at_most);
+            let problem = format!("{} rows were given, but at most {} were announced", self.given, self.rows_at_most);
             return Err(InputError::new(&self.path, problem, "report this as a bug"));
         }
         for first in (0..rows).step_by(BLOCK_ROWS) {
@@ -116,14 +117,14 @@ impl PlyWriter {
         Ok(())
     }
 
-    /// Puts the file in the place of its target, after its bytes have reached the disk.
+    /// Syncs the file to the disk, then renames it to its target.
     ///
     /// # Errors
-    /// When the disk refuses, or when no row is finite. The target is then what it was.
+    /// The disk fails, or no row is finite. The target then stays unchanged.
     pub fn finish(self) -> InputResult<PlyWritten> {
         let PlyWriter { path, part, out, meta, frame, rows_at_most, given, rows, bytes, .. } = self;
         if rows == 0 {
-            let problem = format!("none of the {given} Gaussians is finite, so there is nothing to write");
+            let problem = format!("none of the {given} Gaussians is finite, so there is no row to write");
             let remedy = "the training diverged or lost all Gaussians: lower the rates";
             return Err(InputError::new(&path, problem, remedy));
         }
@@ -142,19 +143,19 @@ impl PlyWriter {
     }
 }
 
-/// The unfinished file; removed unless it was renamed away.
+/// The unfinished file; removed on drop unless it was renamed.
 struct PartFile {
     path: PathBuf,
 }
 
 impl Drop for PartFile {
     fn drop(&mut self) {
-        // After the rename there is nothing here, and that failure is the good case.
+        // After the rename the file no longer exists, and this call fails as expected.
         let _ = std::fs::remove_file(&self.path);
     }
 }
 
-/// Makes the rename itself durable. Not every file system can; the data is on the disk either way.
+/// Makes the rename durable. Some file systems cannot; the data is on the disk either way.
 fn sync_folder(path: &Path) {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     if let Ok(folder) = File::open(folder) {
@@ -162,7 +163,7 @@ fn sync_folder(path: &Path) {
     }
 }
 
-/// The header for `rows` rows, as long as the one for `rows_at_most`.
+/// The header for `rows` rows, padded to the length of the header for `rows_at_most`.
 fn header_text(sh_degree: u8, rows: u64, rows_at_most: u64, meta: &PlyMeta, frame: ExportFrame) -> String {
     let digits = |n: u64| n.checked_ilog10().unwrap_or(0) as usize;
     let padding = digits(rows_at_most) - digits(rows);
@@ -203,7 +204,7 @@ fn property_names(sh_degree: u8) -> Vec<String> {
     names
 }
 
-/// How the file holds rows.
+/// Layout of rows in the file.
 struct FileRows {
     sh_degree: u8,
     origin: [f64; 3],
@@ -223,7 +224,7 @@ impl FileRows {
         }
     }
 
-    /// Appends the bytes of the finite rows among `rows`; returns how many those are.
+    /// Appends the bytes of the finite rows among `rows`; returns their number.
     fn encode(&self, columns: &Columns, rows: std::ops::Range<usize>, out: &mut Vec<u8>) -> u64 {
         let mut values = vec![0.0; 17 + sh_n_width(self.sh_degree)];
         let mut finite = 0;
@@ -236,7 +237,7 @@ impl FileRows {
         finite
     }
 
-    /// The values of one row in file order; false when one is not finite. Bands that the rows lack are left alone.
+    /// Writes the values of one row in file order; false if one is not finite. Bands that the row lacks stay unchanged.
     fn fill(&self, c: &Columns, row: usize, out: &mut [f32]) -> bool {
         let (geometry, rest) = out.split_at_mut(9);
         let coefficients = sh_n_width(self.sh_degree) / 3;

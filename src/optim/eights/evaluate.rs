@@ -1,7 +1,7 @@
-//! Forwarding in vectors of eight: listed rows as they are now.
+//! Forwarding in vectors of eight: the current values of listed rows.
 //!
-//! Not here: rows that eps touches, and the last row of a table; they are evaluated alone, by the code of every path.
-//! Invariant: the bits are those of [`EvaluateRows`] as a plain loop.
+//! Not here: rows whose values eps affects, and the last row of a table; the code shared by all paths evaluates them
+//! one by one. Invariant: the bits are those of [`EvaluateRows`] as a plain loop.
 
 use super::super::deferred::AdamNow;
 use super::super::drift::EpsFloor;
@@ -44,14 +44,14 @@ impl<const W: usize, F: Fn(usize) -> usize> EightKernel for Eights<EvaluateRows<
     }
 }
 
-/// What is the same for all rows.
+/// Constants of all rows.
 struct Constants {
     numbers: Numbers,
     one: Eight,
-    /// Base rates of the lanes.
+    /// Base rates by lane.
     rates: [Eight; 3],
     eps: Eight,
-    /// Second moments above which the series holds.
+    /// The series is valid for second moments above this.
     floor: Eight,
 }
 
@@ -68,14 +68,14 @@ impl Constants {
         }
     }
 
-    // Not `map`: its closure is not always inlined, and then runs without the instructions.
+    // Not `map`: its closure is not always inlined, and would then be compiled without AVX2.
     #[inline(always)]
     fn splat3(&self, [a, b, c]: [f32; 3]) -> [Eight; 3] {
         let avx2 = self.numbers.avx2;
         [avx2.splat(a), avx2.splat(b), avx2.splat(c)]
     }
 
-    /// [`super::super::drift::drifted`]; and in `direct` the lanes for which it is too coarse.
+    /// [`super::super::drift::drifted`]; sets in `direct` the lanes for which the series is too inaccurate.
     #[inline(always)]
     fn drifted(&self, [value, m, v]: [Eight; 3], sums: [Eight; 3], rate: Eight, direct: &mut Eight) -> Eight {
         let inv = self.one.over(v.sqrt());
@@ -84,11 +84,11 @@ impl Constants {
         let moved = self.numbers.flush(value.minus(m.times(inv).times(series).times(rate)));
         let still = m.equal(self.numbers.zero);
         *direct = direct.or(still.not_and(v.at_most(self.floor)));
-        moved.but(still, value)
+        moved.blend(still, value)
     }
 }
 
-/// Rows that are moved to now.
+/// Rows being moved to now.
 struct Drifting<'k, 'a, const W: usize, F> {
     of: Constants,
     at: &'k AdamNow<'a>,
@@ -101,8 +101,8 @@ struct Drifting<'k, 'a, const W: usize, F> {
 }
 
 impl<const W: usize, F: Fn(usize) -> usize> Drifting<'_, '_, W, F> {
-    /// The narrow columns of a block. Returns a bit for every row that is to be evaluated alone: the last one of the table,
-    /// and those that eps touches, or with which it touches what is loaded with them.
+    /// Evaluates the narrow columns of a block. Returns a bit for every row that must be evaluated alone: the last one
+    /// of the table, and rows where eps affects a value or a lane loaded with them.
     #[inline(always)]
     fn narrow(&self, block: Range<usize>, out: &mut TableMut<'_, W>) -> u64 {
         let (of, avx2, mut alone) = (&self.of, self.of.numbers.avx2, 0);
@@ -121,9 +121,9 @@ impl<const W: usize, F: Fn(usize) -> usize> Drifting<'_, '_, W, F> {
             let means = of.splat3([drift[0], drift[1], drift[2]]);
             let others = of.splat3([drift[4], drift[5], drift[6]]);
             let low = [
-                others[0].but_first_three(means[0]),
-                others[1].but_first_three(means[1]),
-                others[2].but_first_three(means[2]),
+                others[0].blend_first_three(means[0]),
+                others[1].blend_first_three(means[1]),
+                others[2].blend_first_three(means[2]),
             ];
             let (m, v, mut direct) = (self.m.load_narrow(avx2, row), self.v.load_narrow(avx2, row), of.numbers.zero);
             let low = of.drifted([value[0], m[0], v[0]], low, of.rates[0], &mut direct);

@@ -1,14 +1,15 @@
-//! The loops of [`super::row_kernels`] in registers of eight floats ([`crate::base::eight`]): what runs with AVX2.
+//! The loops of [`super::row_kernels`] in registers of eight floats ([`crate::base::eight`]), for AVX2.
 //!
-//! Sixteen registers do not hold a row with its moments. What the compiler makes of arrays then is stored in pieces
-//! and loaded whole, and such a load waits for every store before it, of other rows too. So here a vector is loaded,
-//! worked on and stored before the next one is; a row that turns out to need slower code is written a second time.
+//! Sixteen registers cannot hold a row with its moments. The compiler's code for arrays would then store vectors in
+//! pieces and load them whole, and such a load waits for every earlier store, including those of other rows. So here
+//! each vector is loaded, processed and stored before the next one; a row that turns out to need slower code is written
+//! a second time.
 //!
-//! A block of rows is gone through once for the narrow columns and once for `sh_n`: fewer tables at a time, which the
-//! processor's own prefetching follows better.
+//! A block of rows is processed once for the narrow columns and once for `sh_n`: fewer tables at a time, which the
+//! hardware prefetcher follows better.
 //!
-//! Here: what both loops share. Invariants: 1. the bits are those of [`super::row_kernels`]; 2. what a lane of the row
-//! behind holds is neither stored nor counted.
+//! Here: the code shared by both loops. Invariants: 1. the bits are those of [`super::row_kernels`]; 2. lanes that
+//! belong to the next row are neither stored nor counted.
 
 mod evaluate;
 mod step;
@@ -18,10 +19,10 @@ use crate::base::eight::{Avx2, EIGHT, Eight};
 /// Rows of a block: one bit of a word each.
 const BLOCK: usize = 64;
 
-/// A loop over rows, to be run in this form.
+/// Wraps a loop over rows, to run it in vectors of eight.
 pub(super) struct Eights<K>(pub K);
 
-/// Numbers that every row is compared with or masked by.
+/// Constants that every row is compared with or masked by.
 struct Numbers {
     avx2: Avx2,
     zero: Eight,
@@ -51,20 +52,20 @@ impl Numbers {
     }
 }
 
-/// Something of the lanes of a row: of means, opacity and quats; of scales and sh0; of `sh_n`.
+/// A value per lane of a row: of means, opacity and quats; of scales and sh0; of `sh_n`.
 #[inline(always)]
 fn of_lanes(avx2: Avx2, narrow: &[f32; 2 * EIGHT], sh_n: f32) -> [Eight; 3] {
     let narrow = narrow.as_chunks().0;
     [avx2.load(&narrow[0]), avx2.load(&narrow[1]), avx2.splat(sh_n)]
 }
 
-/// Eight values from `start` on.
+/// Loads eight values from `start` on.
 #[inline(always)]
 fn load(avx2: Avx2, values: &[f32], start: usize) -> Eight {
     avx2.load(&values[start..].as_chunks().0[0])
 }
 
-/// Eight values from `start` on, to write to.
+/// Eight values from `start` on, as a store target.
 #[inline(always)]
 fn eight_mut(values: &mut [f32], start: usize) -> &mut [f32; EIGHT] {
     &mut values[start..].as_chunks_mut().0[0]

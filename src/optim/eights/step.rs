@@ -1,8 +1,8 @@
 //! The optimizer's step in vectors of eight.
 //!
-//! A block's gradients are looked at first; of rows without one the state is asked for ahead (which rows those are is not
-//! known across blocks), but not worked on.
-//! Not here: the last listed row, and the rounding of moments that are kept in 16 bits, which are those of every path.
+//! The gradients of a block are checked first. The state of rows without a gradient is prefetched as well, because the
+//! gradients of the next block are not known yet, but it is not processed.
+//! Not here: the last listed row, and the rounding of 16-bit moments, which use the code shared by all paths.
 //! Invariant: bits and counts are those of [`StepRows`] as a plain loop.
 
 use super::super::decay::Decay;
@@ -73,13 +73,13 @@ impl<const W: usize> EightKernel for Eights<StepRows<'_, '_, W>> {
     }
 }
 
-/// Rows that take a step.
+/// Rows taking a step.
 struct Stepping<'k, const W: usize> {
     numbers: Numbers,
-    /// lr / (1 - beta1^t) of the lanes.
+    /// lr / (1 - beta1^t) by lane.
     sizes: [Eight; 3],
     eps: Eight,
-    /// What the magnitudes of the narrow columns are kept within.
+    /// Limits on the magnitudes of the narrow columns.
     limits: &'k [f32; 2 * EIGHT],
     inv_root_correction: Eight,
     one_minus_b1: Eight,
@@ -87,16 +87,16 @@ struct Stepping<'k, const W: usize> {
     columns: TableMut<'k, W>,
     m: TableMut<'k, W>,
     v: TableMut<'k, W>,
-    /// Of the listed rows.
+    /// Values of the listed rows.
     values: Table<'k, W>,
     grads: Table<'k, W>,
 }
 
 impl<const W: usize> Stepping<'_, W> {
-    /// [`GradKind::of`] the gradient of listed row `i`.
+    /// [`GradKind::of`] for the gradient of listed row `i`.
     #[inline(always)]
     fn kind_of(&self, i: usize) -> GradKind {
-        // Bits that are left out: the sign everywhere, all of the row behind.
+        // Masked bits: the sign everywhere, and all bits of the next row's lanes.
         const ALL: f32 = f32::from_bits(u32::MAX);
         let (avx2, sign) = (self.numbers.avx2, self.numbers.sign);
         let left_out = sign.or(avx2.load(&[0.0, 0.0, 0.0, ALL, 0.0, 0.0, 0.0, ALL]));
@@ -104,7 +104,7 @@ impl<const W: usize> Stepping<'_, W> {
             self.grads.prefetch(i + AHEAD);
         }
         let [low, high] = self.grads.load_narrow(avx2, i);
-        // Without their signs floats are ordered as integers, with what is not finite behind all others.
+        // Without signs, floats are ordered as integers, with non-finite ones after all others.
         let mut largest = sign.not_and(low).larger_bits(left_out.not_and(high));
         let sh_n = self.grads.sh_n_of(i);
         for part in 0..W.div_ceil(EIGHT) {
@@ -119,7 +119,7 @@ impl<const W: usize> Stepping<'_, W> {
         }
     }
 
-    /// Asks for `sh_n` of a row, which is listed as `i`, and of its value; its gradient was loaded before.
+    /// Prefetches `sh_n` of a row, listed as `i`, and of its value; its gradient is loaded already.
     #[inline(always)]
     fn prefetch(&self, row: usize, i: usize) {
         self.values.prefetch(i);
@@ -128,7 +128,7 @@ impl<const W: usize> Stepping<'_, W> {
         self.v.as_ref().prefetch(row);
     }
 
-    /// The narrow columns of a row, which is listed as `i`.
+    /// Steps the narrow columns of a row, listed as `i`.
     #[inline(always)]
     fn narrow(&mut self, row: usize, i: usize, decay: Decay) {
         let avx2 = self.numbers.avx2;
@@ -149,7 +149,7 @@ impl<const W: usize> Stepping<'_, W> {
         let avx2 = self.numbers.avx2;
         let decay = [avx2.splat(decay.first), avx2.splat(decay.kept), avx2.splat(decay.lost)];
         let (now, g) = (self.values.sh_n_of(i), self.grads.sh_n_of(i));
-        // The last vector shares lanes with the one before: its moments are loaded before those are stored.
+        // The last vector shares lanes with the previous one: its moments are loaded before those are stored.
         let (parts, last) = (W.div_ceil(EIGHT), W.saturating_sub(EIGHT));
         let last_moments = [load(avx2, self.m.sh_n_of(row), last), load(avx2, self.v.sh_n_of(row), last)];
         for part in 0..parts {
@@ -165,7 +165,7 @@ impl<const W: usize> Stepping<'_, W> {
         }
     }
 
-    /// What [`StepConstants`] does to a value and its moments.
+    /// Applies [`StepConstants`] to a value and its moments.
     #[inline(always)]
     fn step(&self, [value, m, v]: [Eight; 3], g: Eight, decay: [Eight; 3], size: Eight) -> [Eight; 3] {
         let numbers = &self.numbers;
@@ -178,7 +178,7 @@ impl<const W: usize> Stepping<'_, W> {
         [numbers.flush(value.minus(size.times(m.over(root)))), m, v]
     }
 
-    /// A half of the narrow columns within its limits; what is no number stays.
+    /// A half of the narrow columns, clamped to its limits; NaN stays.
     #[inline(always)]
     fn limited(&self, value: Eight, half: usize) -> Eight {
         let limit = self.numbers.avx2.load(&self.limits.as_chunks().0[half]);

@@ -1,9 +1,9 @@
 //! Memory for one version of one page, aligned for direct I/O.
 //!
-//! Invariants: 1. the first byte lies on a multiple of [`ALIGNMENT`], and stays there when the buffer is moved: the bytes
-//! live elsewhere; 2. the length is a multiple of [`ALIGNMENT`]; 3. a fresh buffer is zero; 4. a mapped one takes memory from
-//! the machine only as it is written to, never in huge pages that it would share with others, and gives all of it back at its
-//! end, whatever the heap looks like by then; of one that a ring has registered, once the ring has been used again.
+//! Invariants: 1. the first byte is aligned to [`ALIGNMENT`]; moving the `PageBuffer` does not move its bytes; 2. the
+//! length is a multiple of [`ALIGNMENT`]; 3. a fresh buffer is zero; 4. a mapped buffer takes physical memory only as
+//! it is written, never uses huge pages, and returns all its memory when dropped; a buffer registered with a ring
+//! returns it when that ring is next used.
 
 #[cfg(target_os = "linux")]
 use crate::page::engine::registered::Registration;
@@ -12,7 +12,7 @@ use memmap2::MmapMut;
 /// Alignment of memory, offsets and lengths that every drive accepts for direct I/O, bytes.
 pub const ALIGNMENT: usize = 4096;
 
-/// Smaller buffers are not worth a map of their own, bytes.
+/// Buffers smaller than this, in bytes, come from the heap.
 const MAPPED_LEAST: usize = 32 << 10;
 
 /// An aligned buffer of fixed length. Moved, never copied, between frames and transfers.
@@ -20,20 +20,20 @@ pub struct PageBuffer {
     memory: Memory,
     start: usize,
     len: usize,
-    /// Its place in the table of the ring that moves it.
+    /// Its entry in the buffer table of the ring that transfers it.
     #[cfg(target_os = "linux")]
     pub(in crate::page) registration: Option<Registration>,
 }
 
 enum Memory {
-    /// Longer than the buffer by up to one alignment.
+    /// Longer than the buffer by [`ALIGNMENT`], so that an aligned start exists.
     Heap(Vec<u8>),
-    /// Begins on a page of the machine, which is a multiple of the alignment.
+    /// Starts on a page of the system, which is a multiple of [`ALIGNMENT`].
     Mapped(MmapMut),
 }
 
 impl PageBuffer {
-    /// A buffer of zeros of at least `bytes` bytes.
+    /// A zeroed buffer of at least `bytes` bytes on the heap.
     pub fn zeroed(bytes: usize) -> PageBuffer {
         let len = bytes.next_multiple_of(ALIGNMENT);
         let bytes = vec![0; len + ALIGNMENT];
@@ -41,14 +41,14 @@ impl PageBuffer {
         PageBuffer::of(Memory::Heap(bytes), start, len)
     }
 
-    /// As [`PageBuffer::zeroed`], for buffers that stay: in memory of its own, if it is large enough and the machine has
-    /// another map to give.
+    /// As [`PageBuffer::zeroed`], for long-lived buffers: an anonymous memory map of its own if the buffer is large
+    /// enough and the system grants another map, else the heap.
     pub fn mapped(bytes: usize) -> PageBuffer {
         let len = bytes.next_multiple_of(ALIGNMENT);
         let map = (len >= MAPPED_LEAST).then(|| MmapMut::map_anon(len).ok()).flatten();
         #[cfg(target_os = "linux")]
         if let Some(map) = &map {
-            // Refused by kernels without huge pages, which make none. Steps took as long with them.
+            // Kernels without huge pages refuse this call and do not need it. Huge pages made steps no faster.
             let _ = map.advise(memmap2::Advice::NoHugePage);
         }
         match map.filter(|map| map.as_ptr().align_offset(ALIGNMENT) == 0) {
@@ -67,7 +67,7 @@ impl PageBuffer {
         }
     }
 
-    /// Whether it is in memory of its own.
+    /// Whether the buffer is a memory map of its own.
     pub fn is_mapped(&self) -> bool {
         matches!(self.memory, Memory::Mapped(_))
     }
@@ -77,7 +77,7 @@ impl PageBuffer {
         self.len
     }
 
-    /// Whether it has no bytes.
+    /// Whether the buffer has no bytes.
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }

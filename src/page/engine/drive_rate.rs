@@ -1,8 +1,8 @@
-//! How fast a drive is, in about a second, to choose how pages are stored on it; remembered in the folder itself.
+//! Measures a drive's throughput in about a second, to choose the default codec of pages. The result is cached in the
+//! folder.
 //!
-//! Only a default follows from it, never a result. Invariants: 1. what the remembered file says is believed only for
-//! the drive that it names; anything unreadable means measuring again; 2. a drive that cannot be measured stores
-//! pages raw.
+//! The rate decides only a default, never a result. Invariants: 1. a cached rate is used only for the drive it was
+//! measured on; an unreadable cache file means a new measurement; 2. a drive that cannot be measured stores pages raw.
 
 use crate::base::error::InputResult;
 use crate::page::engine::measure::{Case, Scratch};
@@ -16,34 +16,34 @@ use std::io::{Read, Write};
 use std::path::Path;
 use std::time::Duration;
 
-/// Name of the file that remembers.
+/// Name of the cache file.
 pub const FILE_NAME: &str = "drive-rate.json";
-/// Longer files are not ours.
+/// A longer file is not a cache file of this program.
 const FILE_BYTES_MAX: u64 = 4096;
-/// Bytes per second below which compression pays: a core takes 0.8 GB/s in and gives 3.7 GB/s out for a seventh less
-/// to move, so on faster drives it only costs.
+/// Bytes per second below which compression pays. A core compresses 0.8 GB/s and decompresses 3.7 GB/s, and saves a
+/// seventh of the bytes, so on faster drives compression only costs.
 const CODEC_PAYS_BELOW: f64 = 0.5e9;
-/// Size of the file that is measured with.
+/// Size of the test file, bytes.
 const MEASURED_BYTES: u64 = 128 << 20;
-/// Of one transfer: about a page.
+/// Bytes of one transfer: about a page.
 const TRANSFER_BYTES: usize = 768 << 10;
-/// For each direction.
+/// Measuring time per direction.
 const TIME: Duration = Duration::from_millis(450);
 
 /// Rates of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DriveRate {
-    /// Bytes per second of reads at random places.
+    /// Bytes per second of random reads.
     pub read: f64,
-    /// Bytes per second of writes, made durable.
+    /// Bytes per second of writes, fsync included.
     pub write: f64,
-    /// Number of the file system that was measured; 0 where the system does not tell.
+    /// Device number of the file system that was measured; 0 where the system gives none.
     device: u64,
 }
 
 impl DriveRate {
-    /// The rates that `folder` remembers, or else measures (about a second) and remembers. Failing to remember is no
-    /// error.
+    /// The cached rates of `folder`, or else a new measurement (about a second), which is cached. Failing to write the
+    /// cache is no error.
     ///
     /// # Errors
     /// Too little space, the folder cannot be written, the drive fails.
@@ -53,32 +53,32 @@ impl DriveRate {
             return Ok(rate);
         }
         let rate = DriveRate { device, ..measure(folder)? };
-        // Next time it is measured again, then.
+        // Without the cache file the next run measures again.
         let _ = remember(folder, &rate);
         Ok(rate)
     }
 
-    /// The rates that `folder` remembers, or else measures (about a second); writes nothing that stays.
+    /// The cached rates of `folder`, or else a new measurement (about a second). Leaves no file behind.
     ///
     /// # Errors
     /// As [`DriveRate::of`].
-    pub fn look(folder: &Path) -> InputResult<DriveRate> {
+    pub fn of_without_caching(folder: &Path) -> InputResult<DriveRate> {
         let device = device_of(folder);
         remembered(folder).filter(|r| r.device == device).map_or_else(|| measure(folder), Ok)
     }
 
-    /// Bytes per second of as many reads as writes.
+    /// Bytes per second of an equal mix of reads and writes.
     pub fn both(&self) -> f64 {
         2.0 / (1.0 / self.read + 1.0 / self.write)
     }
 
-    /// How pages are best stored on such a drive.
+    /// The codec that suits such a drive.
     pub fn codec(&self) -> Codec {
         codec_for(self.both())
     }
 }
 
-/// How pages are best stored on a drive that moves this many bytes per second, reads and writes together.
+/// The codec for a drive that moves this many bytes per second, reads and writes mixed.
 pub fn codec_for(bytes_per_second: f64) -> Codec {
     if bytes_per_second < CODEC_PAYS_BELOW { Codec::Zstd { level: 1 } } else { Codec::Raw }
 }
@@ -91,7 +91,7 @@ fn measure(folder: &Path) -> InputResult<DriveRate> {
     let failed = |e: std::io::Error| crate::base::error::InputError::io(folder, "measuring the drive", &e);
     let engine = IoEngine::Auto;
     let mut scratch = Scratch::new(folder, &[engine], MEASURED_BYTES, DEPTH)?;
-    // Space that is written for the first time, as by an import and by the first spills.
+    // Writes to fresh space, as an import and the first spills do.
     let write = scratch.fill(TIME).map_err(failed)?;
     let case = Case { engine, bytes: TRANSFER_BYTES, depth: DEPTH / 2 };
     let read = scratch.rate(case, Direction::Read, TIME, u64::MAX).map_err(failed)?;
@@ -142,7 +142,7 @@ mod tests {
         remember(folder.path(), &slow).unwrap();
         assert_eq!(DriveRate::of(folder.path()).unwrap(), slow);
         assert_eq!(slow.codec(), Codec::Zstd { level: 1 });
-        // Another drive, or a file that nobody wrote like this: measured again.
+        // Another drive, or an invalid cache file: measured again.
         remember(folder.path(), &DriveRate { device: rate.device + 1, ..slow }).unwrap();
         assert_ne!(DriveRate::of(folder.path()).unwrap(), slow);
         for text in ["{\"read\": -1.0, \"write\": 1.0, \"device\": 0}", "\u{0}"] {
@@ -150,9 +150,9 @@ mod tests {
             assert!(DriveRate::of(folder.path()).unwrap().read > 0.0);
         }
         remember(folder.path(), &slow).unwrap();
-        assert_eq!(DriveRate::look(folder.path()).unwrap(), slow);
+        assert_eq!(DriveRate::of_without_caching(folder.path()).unwrap(), slow);
         let other = tempfile::tempdir().unwrap();
-        assert!(DriveRate::look(other.path()).unwrap().read > 0.0);
+        assert!(DriveRate::of_without_caching(other.path()).unwrap().read > 0.0);
         assert_eq!(std::fs::read_dir(other.path()).unwrap().count(), 0);
         let names: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
         assert_eq!(names, [FILE_NAME]);

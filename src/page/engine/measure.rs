@@ -1,14 +1,13 @@
-//! How fast a drive moves pages: by engine, request size and number of requests at once.
+//! Measures how fast a drive moves pages, by engine, request size and queue depth.
 //!
-//! Measures with the very engines that a run uses, each on a segment of its own (direct I/O on bytes that the page
-//! cache holds is another thing than either), which have no names any more while they are measured, so that nothing is
-//! left behind however the process ends. Reads are cold as far as this machine goes (direct I/O, or
-//! bytes that the page cache was told to forget); a drive's own cache, or a host's below a virtual drive, is part of
-//! what is measured.
+//! The measurement uses the same engines as a run. Each engine has a segment of its own, because direct I/O on bytes
+//! that the page cache holds behaves differently. The segment files are unlinked before the measurement, so nothing is
+//! left behind however the process ends. Reads are as cold as the machine allows (direct I/O, or dropped from the page
+//! cache); caches of the drive itself, or of the host below a virtual drive, are part of the figure.
 //!
-//! Invariants: 1. rounds visit every case in turn, so that a drive whose speed wanders treats all alike; figures are
-//! medians over rounds; 2. bytes on the drive, bytes written and seconds are bounded by [`Limits`] (a case that was
-//! begun ends, and the first one is always measured).
+//! Invariants: 1. every round visits every case, so that a drive whose speed varies treats all cases alike; figures are
+//! medians over rounds; 2. [`Limits`] bounds bytes on the drive, bytes written and seconds (a case that has started
+//! runs to its end, and the first case is always measured).
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::rng::{Purpose, Stream};
@@ -22,28 +21,28 @@ use std::io;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Rounds that are aimed at.
+/// Target number of rounds.
 const ROUNDS: usize = 5;
-/// Requests of the first fill.
+/// Bytes per request of the first fill.
 const FILL_BYTES: usize = 1 << 20;
-/// At once, while filling.
+/// Requests in flight during the first fill.
 const FILL_DEPTH: usize = 8;
 
-/// Bounds of a measurement.
+/// Limits of a measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
-    /// Bytes on the drive, shared by the engines.
+    /// Bytes on the drive, divided among the engines.
     pub file_bytes: u64,
-    /// Seconds for everything, about.
+    /// Approximate total time, seconds.
     pub seconds: f64,
-    /// Bytes written besides the first fill, about.
+    /// Approximate bytes written besides the first fill.
     pub written_bytes: u64,
 }
 
-/// One way of moving bytes.
+/// One combination of engine, transfer size and queue depth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Case {
-    /// What moves them.
+    /// The I/O engine.
     pub engine: IoEngine,
     /// Bytes of a transfer.
     pub bytes: usize,
@@ -51,39 +50,40 @@ pub struct Case {
     pub depth: usize,
 }
 
-/// A case with its rates, bytes per second; `None` where the time did not reach.
+/// A case with its rates, bytes per second; `None` if time ran out before it was measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Measured {
-    /// What was measured.
+    /// The case.
     pub case: Case,
-    /// Of reads at random places.
+    /// Rate of random reads.
     pub read: Option<f64>,
-    /// Of writes at random places, made durable.
+    /// Rate of random writes, fsync included.
     pub write: Option<f64>,
 }
 
 impl Measured {
-    /// Bytes per second of as many reads as writes, which is what training does: nearly every page read is changed.
+    /// Bytes per second of an equal mix of reads and writes, which is training's pattern: nearly every page read is
+    /// changed.
     pub fn both(&self) -> Option<f64> {
         Some(2.0 / (1.0 / self.read? + 1.0 / self.write?))
     }
 }
 
-/// Everything a sweep found.
+/// The result of a sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sweep {
-    /// In the order of the cases.
+    /// One entry per case, in the order of the cases.
     pub measured: Vec<Measured>,
-    /// What users should know: engines that do not work here, no direct I/O.
+    /// Messages for the user: engines that do not work here, missing direct I/O.
     pub notes: Vec<String>,
-    /// Rounds that were finished.
+    /// Finished rounds.
     pub rounds: usize,
-    /// Bytes written to the drive in all.
+    /// Total bytes written to the drive.
     pub written_bytes: u64,
 }
 
-/// Measures all `cases` on the drive of `folder`. Cases whose engine does not work here stay without rates. Calls
-/// `progress` with the share done.
+/// Measures all `cases` on the drive of `folder`. Cases whose engine does not work here get no rates. Calls `progress`
+/// with the fraction done.
 ///
 /// # Errors
 /// Too little space, the folder cannot be written, the drive fails.
@@ -106,7 +106,7 @@ pub fn sweep(folder: &Path, cases: &[Case], limits: Limits, progress: &mut dyn F
     let mut rounds = 0;
     'rounds: while rounds < ROUNDS {
         for turn in 0..cases.len() {
-            // Each round begins elsewhere: what comes last is what time may run out for.
+            // Each round starts at another case, because the last cases are the ones that may run out of time.
             let i = (turn + rounds * cases.len() / ROUNDS) % cases.len();
             let case = cases[i];
             if !scratch.has(case.engine) {
@@ -134,13 +134,13 @@ pub fn sweep(folder: &Path, cases: &[Case], limits: Limits, progress: &mut dyn F
     Ok(Sweep { measured, notes: scratch.notes, rounds, written_bytes: scratch.written_bytes })
 }
 
-/// The middle value; `None` of nothing.
+/// The median; `None` for an empty slice.
 pub(in crate::page) fn median(values: &mut [f64]) -> Option<f64> {
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied()
 }
 
-/// Segments without names, one for each engine.
+/// Unlinked segments, one per engine.
 pub(in crate::page) struct Scratch {
     engines: Vec<Opened>,
     segment_bytes: u64,
@@ -152,39 +152,40 @@ pub(in crate::page) struct Scratch {
     pub written_bytes: u64,
 }
 
-/// An engine at work.
+/// An open engine with its segment.
 struct Opened {
     engine: IoEngine,
     segment: u32,
     store: Box<dyn PageEngine>,
-    /// Bytes from the start that were written at least once; others would not be read from the drive.
+    /// Bytes from the start of the segment that were written at least once. Reads beyond would not reach the drive.
     filled_bytes: u64,
 }
 
 impl Scratch {
-    /// Makes the segments, of `file_bytes` bytes together, and opens them in all `engines` that work here.
+    /// Makes the segments, of `file_bytes` bytes together, and opens each engine of `engines` that works here.
     ///
     /// # Errors
     /// Too little space; the folder cannot be written; no engine works.
     pub fn new(folder: &Path, engines: &[IoEngine], file_bytes: u64, depth: usize) -> InputResult<Scratch> {
         let failed = |doing: &'static str| move |e: io::Error| InputError::io(folder, doing, &e);
-        let free = free_bytes(folder).map_err(failed("asking for the free space"))?;
+        let free = free_bytes(folder).map_err(failed("reading the free space"))?;
         if let Some(free) = free.filter(|&free| free < file_bytes + file_bytes / 4) {
             let problem =
-                format!("{} are free, measuring takes {}", format_bytes(free), format_bytes(file_bytes * 5 / 4));
+                format!("{} are free, but measuring needs {}", format_bytes(free), format_bytes(file_bytes * 5 / 4));
             return Err(InputError::new(folder, problem, "free space on that drive, or measure with a smaller file"));
         }
         let own = folder.join(format!("gsscale-measure-{}", std::process::id()));
-        std::fs::create_dir(&own).map_err(failed("making a folder to measure in"))?;
+        std::fs::create_dir(&own).map_err(failed("creating a folder for the measurement"))?;
         let opened = Scratch::open_all(&own, engines, file_bytes, depth);
-        // From here on the segments have no names: the system takes their space back when this process ends or before.
+        // Unlinks the segments: the system frees their space when this process ends, at the latest.
         for segment in 0..engines.len() as u32 {
-            // Missing where an engine did not come so far; what cannot be removed is told with the folder.
+            // The file may be missing if its engine failed earlier. A file that cannot be removed makes removing the
+            // folder fail below.
             let _ = std::fs::remove_file(own.join(segment_file_name(segment)));
         }
         let removed = std::fs::remove_dir(&own);
         let scratch = opened?;
-        removed.map_err(failed("removing the folder that was measured in"))?;
+        removed.map_err(failed("removing the folder of the measurement"))?;
         Ok(scratch)
     }
 
@@ -207,9 +208,9 @@ impl Scratch {
                     continue;
                 }
             };
-            let failed = |e: io::Error| InputError::io(own, "making a file to measure with", &e);
+            let failed = |e: io::Error| InputError::io(own, "creating a test file", &e);
             opened.store.create_segment(segment, scratch.segment_bytes).map_err(failed)?;
-            // The engine opens the file now, while it has a name, and keeps it.
+            // The engine opens the file now, while it has a name, and keeps it open.
             let buffer = PageBuffer::zeroed(4096);
             let place = Place { segment, offset: 0 };
             opened.store.submit(Transfer { token: 0, direction: Direction::Read, place, bytes: 4096, buffer });
@@ -228,11 +229,11 @@ impl Scratch {
         self.engines.iter().any(|o| o.engine == engine)
     }
 
-    /// Writes every segment from its start, until it is full or its share of the time ends; returns bytes per second,
-    /// made durable.
+    /// Writes every segment from its start until the segment is full or its share of the time is over. Returns bytes
+    /// per second, fsync included.
     ///
     /// # Errors
-    /// Of the drive.
+    /// The drive's I/O errors.
     pub fn fill(&mut self, time: Duration) -> io::Result<f64> {
         self.prepare_buffers(FILL_DEPTH, FILL_BYTES);
         let (begin, written_before) = (Instant::now(), self.written_bytes);
@@ -247,10 +248,10 @@ impl Scratch {
         Ok((self.written_bytes - written_before) as f64 / begin.elapsed().as_secs_f64())
     }
 
-    /// Bytes per second of one case, over about `time` and at most about `bytes_max` bytes.
+    /// Bytes per second of one case, measured over about `time` and at most about `bytes_max` bytes.
     ///
     /// # Errors
-    /// Of the drive.
+    /// The drive's I/O errors.
     pub fn rate(&mut self, case: Case, direction: Direction, time: Duration, bytes_max: u64) -> io::Result<f64> {
         self.prepare_buffers(case.depth, case.bytes);
         let bytes = case.bytes as u64;
@@ -261,7 +262,7 @@ impl Scratch {
         for i in (1..places.len()).rev() {
             places.swap(i, self.draws.below(i as u64 + 1) as usize);
         }
-        // Never fewer than keep the drive busy as the case wants it.
+        // At least twice the queue depth, so that the case's depth is reached.
         places.truncate((bytes_max / bytes).max(2 * case.depth as u64) as usize);
         let begin = Instant::now();
         let way = Way { direction, bytes: case.bytes, depth: case.depth };
@@ -273,7 +274,7 @@ impl Scratch {
         Ok(moved as f64 / begin.elapsed().as_secs_f64())
     }
 
-    /// At least `depth` buffers of at least `bytes` bytes, full of noise that no drive can compress.
+    /// At least `depth` buffers of at least `bytes` bytes, filled with incompressible noise.
     fn prepare_buffers(&mut self, depth: usize, bytes: usize) {
         if self.buffers.iter().filter(|b| b.len() >= bytes).count() >= depth {
             return;
@@ -298,7 +299,7 @@ struct Way {
 }
 
 impl Opened {
-    /// Moves bytes at `places` until they or the time end. Returns how many bytes were moved.
+    /// Moves bytes at `places` until all are moved or time is over. Returns the number of bytes moved.
     fn run(
         &mut self,
         way: Way,
@@ -331,7 +332,7 @@ impl Opened {
     }
 }
 
-/// Waits for everything in flight.
+/// Waits for all transfers in flight.
 fn finish(store: &mut dyn PageEngine) -> io::Result<()> {
     let mut done = Vec::new();
     while store.in_flight() > 0 {
@@ -358,7 +359,7 @@ mod tests {
             |seconds| sweep(folder.path(), &cases, Limits { seconds, ..limits }, &mut |share| last = share).unwrap();
         let short = sweep(0.5);
         assert!(short.measured.len() == cases.len() && short.written_bytes >= FILL_BYTES as u64);
-        // Buffers go back and forth between the cases; each needs at least its depth, twice, for each round.
+        // Cases share the buffers; each round needs at least its depth of them, twice.
         for measured in &short.measured {
             assert!(measured.read.is_none_or(|r| r > 0.0) && measured.write.is_none_or(|w| w > 0.0));
         }

@@ -1,12 +1,13 @@
-//! A store in memory: the oracle of the others, and the store of runs that fit.
+//! A page engine in memory: the oracle of the other engines, and the store of runs that fit in memory.
 //!
-//! Invariants: those of [`PageEngine`]; besides, transfers happen when they are submitted and complete in order.
+//! Invariants: those of [`PageEngine`]; besides, a transfer is carried out on submission, and transfers complete in
+//! order.
 
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use std::collections::{BTreeMap, VecDeque};
 use std::io;
 
-/// Segments as plain memory. Memory is taken from the machine as it is written to.
+/// Segments as plain memory. Physical memory is taken only as it is written.
 #[derive(Debug, Default)]
 pub struct MemoryEngine {
     segments: BTreeMap<u32, Vec<u8>>,
@@ -14,12 +15,12 @@ pub struct MemoryEngine {
 }
 
 impl MemoryEngine {
-    /// Without segments.
+    /// An engine without segments.
     pub fn new() -> MemoryEngine {
         MemoryEngine::default()
     }
 
-    /// The bytes of a segment, for tests that damage them.
+    /// The bytes of a segment, for tests that corrupt them.
     pub fn segment_mut(&mut self, segment: u32) -> Option<&mut [u8]> {
         self.segments.get_mut(&segment).map(Vec::as_mut_slice)
     }
@@ -96,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_come_back_and_buffers_too() {
+    fn bytes_round_trip_and_buffers_are_returned() {
         let mut store = MemoryEngine::new();
         store.create_segment(2, 8192).unwrap();
         store.create_segment(2, 8192).unwrap();

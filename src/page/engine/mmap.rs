@@ -1,18 +1,18 @@
-//! Reads through read-only memory maps that the system is advised about ahead of time; writes by plain positioned
-//! writes. Never a writable map: a full drive would kill the process, and errors would have no place to go.
+//! Reads through read-only memory maps with read-ahead advice; writes with plain positioned writes. Maps are never
+//! writable: on a full drive a write to a map would kill the process, and I/O errors could not be reported.
 //!
-//! Coherence: writes go through the page cache (no direct I/O here), and a shared map shows the very same cached
-//! pages, so a read that is submitted after a write completed sees its bytes. Submitting a read starts its read-ahead
-//! (`WILLNEED`); a worker then brings the pages in with `POPULATE_READ`, which reports a drive's error where touching
-//! the page would raise SIGBUS, and copies. (Systems without it, and pages that the system drops and cannot read again
-//! in between, leave that signal possible: `--io uring` and `pread` have no such case.) What was copied is forgotten
-//! by the page cache: the frame holds it now, and evicted pages come back at another place if they changed.
+//! Coherence: writes go through the page cache (no direct I/O here), and a shared map shows the same cached pages, so a
+//! read submitted after a write completed sees its bytes. Submitting a read starts its read-ahead (`WILLNEED`). A
+//! worker then faults the pages in with `POPULATE_READ`, which reports an I/O error where touching the page would raise
+//! SIGBUS, and copies them. (SIGBUS remains possible on systems without `POPULATE_READ`, and if the system drops a page
+//! in between and cannot read it again; `--io uring` and `--io pread` have no such case.) Copied pages are dropped from
+//! the page cache: the frame holds the bytes now, and a changed page is written to another slot.
 //!
 //! Invariants: those of [`PageEngine`]; besides, no reference to mapped bytes is ever made, only copies through raw
-//! pointers, since the bytes change under a map when a write is done.
+//! pointers, because a write changes the bytes under a map.
 #![allow(unsafe_code)] // copying out of a map, and dropping its pages
 
-use crate::page::engine::page_cache::{WriteBehind, forget};
+use crate::page::engine::page_cache::{WriteBehind, drop_cached};
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Place, Transfer};
 use crate::page::engine::segment_io::{SegmentIo, move_bytes};
 use crate::page::engine::transfer_pool::TransferPool;
@@ -31,7 +31,7 @@ pub struct MmapEngine {
 
 struct Shared {
     segments: Mutex<SegmentIo>,
-    /// Maps stay for the life of the store: they cost addresses, not memory, and no open file.
+    /// Maps live as long as the engine: they cost address space, but neither memory nor file descriptors.
     maps: Mutex<BTreeMap<u32, Arc<MmapRaw>>>,
     behind: Mutex<WriteBehind>,
 }
@@ -58,17 +58,17 @@ impl Shared {
             Direction::Read => {
                 let map = self.map_of(place.segment, &file)?;
                 copy_out(&map, place.offset, &mut transfer.buffer.as_mut_slice()[..bytes])?;
-                forget(&file, place.offset, bytes as u64);
+                drop_cached(&file, place.offset, bytes as u64);
             }
             Direction::Write => {
                 move_bytes(&file, transfer)?;
-                lock(&self.behind).wrote(&file, place.offset, bytes as u64);
+                lock(&self.behind).record_write(&file, place.offset, bytes as u64);
             }
         }
         Ok(())
     }
 
-    /// The map of a segment, made if there is none or if it is too short.
+    /// The map of a segment; made anew if missing or too short.
     fn map_of(&self, segment: u32, file: &File) -> io::Result<Arc<MmapRaw>> {
         let mut maps = lock(&self.maps);
         let bytes = file.metadata()?.len();
@@ -82,7 +82,7 @@ impl Shared {
         Ok(map)
     }
 
-    /// Starts reading the bytes of a transfer. Failures are met again, and told, when they are copied.
+    /// Starts read-ahead for a transfer. Errors are ignored here: the copy meets and reports them.
     fn read_ahead(&self, transfer: &Transfer) {
         #[cfg(unix)]
         {
@@ -98,7 +98,7 @@ impl Shared {
     }
 }
 
-/// Copies `out.len()` bytes of the map from `offset` on, and leaves the pages unmapped.
+/// Copies `out.len()` bytes of the map from `offset` on, and unmaps the pages.
 fn copy_out(map: &MmapRaw, offset: u64, out: &mut [u8]) -> io::Result<()> {
     let beyond = || io::Error::new(io::ErrorKind::UnexpectedEof, "the place lies beyond the end of the map");
     let start = usize::try_from(offset).map_err(|_| beyond())?;
@@ -111,7 +111,7 @@ fn copy_out(map: &MmapRaw, offset: u64, out: &mut [u8]) -> io::Result<()> {
     #[cfg(target_os = "linux")]
     if let Err(error) = map.advise_range(memmap2::Advice::PopulateRead, start, out.len()) {
         match error.raw_os_error() {
-            // EINVAL: a kernel before 5.14. The copy brings the pages in.
+            // EINVAL: a kernel before 5.14. The copy faults the pages in.
             Some(22) => {}
             // EFAULT: the page could not be read.
             Some(14) => return Err(io::Error::from_raw_os_error(5)),
@@ -124,9 +124,9 @@ fn copy_out(map: &MmapRaw, offset: u64, out: &mut [u8]) -> io::Result<()> {
     unsafe { std::ptr::copy_nonoverlapping(map.as_ptr().add(start), out.as_mut_ptr(), out.len()) };
     #[cfg(unix)]
     {
-        // Mapped pages are not forgotten by the page cache.
-        // SAFETY: the range lies in the map. Dropping the pages of a shared read-only map of a file loses nothing;
-        // they are read again from the file when they are touched again.
+        // The page cache does not drop mapped pages, so they are unmapped first.
+        // SAFETY: the range lies in the map. Dropping the pages of a shared read-only file map loses nothing; the next
+        // access reads them from the file again.
         let _ = unsafe { map.unchecked_advise_range(memmap2::UncheckedAdvice::DontNeed, start, out.len()) };
     }
     Ok(())
@@ -162,7 +162,7 @@ impl PageEngine for MmapEngine {
 
     fn sync(&mut self) -> io::Result<()> {
         let result = lock(&self.shared.segments).sync();
-        lock(&self.shared.behind).forget_all();
+        lock(&self.shared.behind).drop_all();
         result
     }
 }

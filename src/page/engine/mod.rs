@@ -1,5 +1,6 @@
-//! Moves bytes of pages between memory and segment files: the trait every I/O engine implements, the engines (memory, pread,
-//! mmap, io_uring), what they share, and how fast a drive is. Knows neither versions nor commits.
+//! I/O engines: move page bytes between memory and segment files. The trait that every engine implements, the four
+//! engines (memory, pread, mmap, io_uring), their shared code, and the measurement of drives. Knows neither versions
+//! nor commits.
 
 pub mod buffer;
 pub mod drive_rate;

@@ -1,7 +1,7 @@
-//! Which engine moves the pages of a run, and why not another.
+//! Chooses and opens the I/O engine of a run, and explains a fallback.
 //!
-//! `auto` takes io_uring where the kernel gives a ring (containers often forbid it), else plain reads and writes on
-//! threads. No engine changes a bit of any result, so a run may be resumed with another.
+//! `auto` takes io_uring where the kernel allows it (containers often forbid it), else positioned reads and writes on
+//! threads. The engine changes no bit of any result, so a run may resume with another.
 
 use crate::base::error::{InputError, InputResult};
 use crate::page::engine::memory::MemoryEngine;
@@ -12,32 +12,31 @@ use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
 
-/// Requests at a drive at once, for engines with threads and for measurements: more gained nothing on any drive that was
-/// measured.
+/// Queue depth for engines with threads and for measurements. A deeper queue gained nothing on any drive measured.
 pub const DEPTH: usize = 16;
-/// Requests in a ring at least. Threads go on by themselves, but a ring gets its next requests only when somebody asks
-/// for answers, and a step does so four times: with 16 the drive stood still between, and steps with a tenth of the
-/// pages in memory waited 5 % of the time. With 64 they wait 1.8 %, as a drive would cost that is never idle; 256 gained
-/// nothing more (pages of 512 rows, steps of 50 ms, one NVMe drive).
+/// Least number of entries of a ring. Threads start their next request by themselves, but a ring starts new requests
+/// only when it is polled, which a step does four times. With 16 entries the drive idled in between, and steps with a
+/// tenth of the pages in memory waited 5 % of the time. With 64 they waited 1.8 %, the cost of a drive that never
+/// idles; 256 gained nothing more (pages of 512 rows, steps of 50 ms, one NVMe drive).
 const RING_DEPTH: usize = 64;
 
-/// What moves pages: the values of `--io`.
+/// The I/O engine that moves pages: the values of `--io`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum IoEngine {
-    /// The best that works here.
+    /// The best engine that works here.
     Auto,
     /// io_uring with direct I/O; Linux only.
     Uring,
-    /// Read-only memory maps, advised ahead; plain writes.
+    /// Read-only memory maps with read-ahead; plain writes.
     Mmap,
     /// Plain positioned reads and writes on threads.
     Pread,
-    /// No files: segments in memory.
+    /// Segments in memory, no files.
     Memory,
 }
 
 impl IoEngine {
-    /// All values, as `--io` lists them.
+    /// All values, in the order that `--io` lists them.
     pub const ALL: [IoEngine; 5] = [IoEngine::Auto, IoEngine::Uring, IoEngine::Mmap, IoEngine::Pread, IoEngine::Memory];
 
     /// The value as `--io` writes it.
@@ -69,16 +68,17 @@ impl fmt::Display for IoEngine {
     }
 }
 
-/// An engine at work, and what a user should know of how it was chosen.
+/// An open engine, with notes for the user on how it was chosen.
 pub struct OpenedEngine {
-    /// Moves the pages.
+    /// The engine.
     pub store: Box<dyn PageEngine>,
-    /// What was taken instead of what, and why: whole sentences, to be printed. Empty when all went as asked.
+    /// Fallbacks and their reasons, as whole sentences to print. Empty if the engine asked for works in full.
     pub notes: Vec<String>,
 }
 
-/// Opens `engine` on the segments in `folder`, with `depth` threads, or a ring of `depth` requests of at most 1 MiB, but 64
-/// at least: it works on these without being asked. Who wants fewer transfers at the drive submits fewer.
+/// Opens `engine` on the segments in `folder`. `depth` is the number of threads, or of ring entries (requests of at
+/// most 1 MiB); a ring has at least 64, because it works on them without being polled. Callers that want fewer
+/// transfers in flight submit fewer.
 ///
 /// # Errors
 /// The folder cannot be used; an engine that was asked for by name does not work here (`auto` takes another).
@@ -87,8 +87,8 @@ pub fn open_engine(engine: IoEngine, folder: &Path, depth: usize) -> InputResult
     if engine == IoEngine::Memory {
         return Ok(OpenedEngine { store: Box::new(MemoryEngine::new()), notes });
     }
-    outlive_length_limits();
-    // So that what fails below is the engine's fault and not the folder's.
+    ignore_file_size_signal();
+    // An unusable folder is reported here, so that later failures are the engine's own.
     std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "opening the folder of pages", &e))?;
     let store: Box<dyn PageEngine> = match engine {
         IoEngine::Mmap => Box::new(MmapEngine::open(folder, depth).map_err(|e| not_opened(engine, &e))?),
@@ -107,15 +107,15 @@ pub fn open_engine(engine: IoEngine, folder: &Path, depth: usize) -> InputResult
     Ok(OpenedEngine { store, notes })
 }
 
-/// A write beyond the limit on the length of files (`ulimit -f`) is an error from here on, as on a full drive; by default it
-/// ends the process with a signal.
-fn outlive_length_limits() {
+/// Makes a write beyond the limit on file length (`ulimit -f`) an error, as on a full drive. By default the signal
+/// SIGXFSZ ends the process.
+fn ignore_file_size_signal() {
     #[cfg(unix)]
     {
         use std::sync::atomic::AtomicBool;
         use std::sync::{Arc, Once};
         static ONCE: Once = Once::new();
-        // Where the system refuses a handler, the signal does what it does without us.
+        // If the system refuses the handler, the signal keeps its default effect.
         ONCE.call_once(|| {
             let _ = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::new(AtomicBool::new(false)));
         });
@@ -156,7 +156,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_come_back_and_others_are_refused() {
+    fn names_round_trip_and_others_are_refused() {
         for engine in IoEngine::ALL {
             assert_eq!(engine.name().parse(), Ok(engine));
         }
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_that_is_none_is_told_by_name() {
+    fn a_missing_folder_is_named() {
         for engine in [IoEngine::Auto, IoEngine::Pread, IoEngine::Mmap] {
             let refused = open_engine(engine, Path::new("no/such/folder"), 4).err().map(|e| e.to_string());
             assert!(refused.is_some_and(|e| e.contains("no/such/folder") && e.contains("remedy")));

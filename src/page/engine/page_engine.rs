@@ -1,19 +1,19 @@
-//! What every engine that moves page bytes must do.
+//! The contract of an I/O engine.
 //!
-//! A store moves bytes between buffers and places in numbered segments. It owns the buffer of every transfer in flight
-//! and gives every one back with the outcome, also when it fails. It knows no page ids, checksums or generations: those
-//! are in the bytes, and [`super`]'s format checks them.
+//! An engine moves bytes between buffers and places in numbered segments. It owns the buffer of every transfer in
+//! flight and returns each one with the outcome, also on failure. It knows no page ids, checksums or generations: those
+//! are in the bytes, and `page::format` checks them.
 //!
 //! Invariants of every implementation: 1. each submitted transfer yields exactly one [`Completion`] with its buffer;
-//! 2. a completion without an error moved exactly [`Transfer::bytes`] bytes: short transfers are resumed inside; 3. transfers
-//! may finish in any order; two transfers of one place are never in flight together (the caller sees to it); 4. bytes
-//! written are durable only after [`PageEngine::sync`] returned without error; after a failed write or sync nothing that
-//! was not synced before may be trusted.
+//! 2. a completion without an error moved exactly [`Transfer::bytes`] bytes: the engine resumes short transfers; 3.
+//! transfers complete in any order; the caller never has two transfers of one place in flight; 4. written bytes are
+//! durable only after [`PageEngine::sync`] returned without error; after a failed write or sync, nothing unsynced may
+//! be trusted.
 
 use crate::page::engine::buffer::PageBuffer;
 use std::io;
 
-/// A place in the store: byte `offset` of a segment.
+/// A place in a store: byte `offset` of a segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Place {
     /// Number of the segment, from 0.
@@ -22,7 +22,7 @@ pub struct Place {
     pub offset: u64,
 }
 
-/// Which way bytes go.
+/// The direction of a transfer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Direction {
     /// From the store into the buffer.
@@ -31,47 +31,47 @@ pub enum Direction {
     Write,
 }
 
-/// One movement of bytes.
+/// One transfer between a buffer and a place.
 #[derive(Debug)]
 pub struct Transfer {
-    /// The caller's name for it.
+    /// An identifier chosen by the caller.
     pub token: u64,
-    /// Which way.
+    /// Read or write.
     pub direction: Direction,
-    /// Where in the store.
+    /// The place in the store.
     pub place: Place,
-    /// How many bytes, from the start of the buffer; a multiple of [`crate::page::engine::buffer::ALIGNMENT`].
+    /// Number of bytes, from the start of the buffer; a multiple of [`crate::page::engine::buffer::ALIGNMENT`].
     pub bytes: usize,
-    /// The memory.
+    /// The buffer.
     pub buffer: PageBuffer,
 }
 
-/// The end of a transfer.
+/// A finished transfer.
 #[derive(Debug)]
 pub struct Completion {
     /// The transfer, with its buffer.
     pub transfer: Transfer,
-    /// How it went.
+    /// The outcome.
     pub result: io::Result<()>,
 }
 
-/// Moves page bytes. One owner; engines use their own threads or the kernel's.
+/// Moves page bytes. Has one owner; engines use threads of their own or of the kernel.
 pub trait PageEngine: Send {
-    /// For people: `uring`, `mmap`, `pread`, `memory`.
+    /// Name for messages: `uring`, `mmap`, `pread`, `memory`.
     fn name(&self) -> &'static str;
 
-    /// Makes segment `segment` exist with `bytes` bytes of space that writes will not run out of; a segment that exists
-    /// with that size is left as it is.
+    /// Creates segment `segment` with `bytes` bytes of allocated space, so that writes into it cannot run out of space.
+    /// An existing segment of that size stays unchanged.
     ///
     /// # Errors
     /// No space, or the folder cannot be written.
     fn create_segment(&mut self, segment: u32, bytes: u64) -> io::Result<()>;
 
-    /// Whether segment `segment` is there with exactly `bytes` bytes, as it was made. A store that cannot have lost any says
-    /// nothing.
+    /// Checks that segment `segment` exists with exactly `bytes` bytes. An engine that cannot lose segments always
+    /// succeeds.
     ///
     /// # Errors
-    /// It is missing, has another length, or is not a file of this store.
+    /// The segment is missing, has another length, or is not a file of this store.
     fn check_segment(&self, segment: u32, bytes: u64) -> io::Result<()> {
         let _ = (segment, bytes);
         Ok(())
@@ -80,15 +80,15 @@ pub trait PageEngine: Send {
     /// Queues a transfer. It may start at once; errors come with its completion.
     fn submit(&mut self, transfer: Transfer);
 
-    /// Moves finished transfers to `done`. With `wait`, blocks until at least one is there, if any is in flight.
+    /// Moves finished transfers to `done`. With `wait`, blocks until at least one has finished, if any is in flight.
     fn complete(&mut self, wait: bool, done: &mut Vec<Completion>);
 
-    /// Transfers submitted whose completion was not taken yet.
+    /// Submitted transfers whose completion has not been collected.
     fn in_flight(&self) -> usize;
 
-    /// Makes everything written by completed transfers durable. Call with no write in flight.
+    /// Makes the writes of completed transfers durable. No write may be in flight.
     ///
     /// # Errors
-    /// The drive reported an error; what was not synced before is lost.
+    /// The drive reported an error; unsynced writes are lost.
     fn sync(&mut self) -> io::Result<()>;
 }

@@ -1,9 +1,9 @@
 //! Plain positioned reads and writes on worker threads: the engine that works everywhere.
 //!
-//! Direct I/O where the file system allows it; else through the page cache, of which it keeps as little as it can.
+//! Uses direct I/O where the file system allows it, else the page cache, from which it drops what it can.
 //! Invariants: those of [`PageEngine`].
 
-use crate::page::engine::page_cache::{WriteBehind, forget};
+use crate::page::engine::page_cache::{WriteBehind, drop_cached};
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use crate::page::engine::segment_io::{SegmentIo, move_bytes};
 use crate::page::engine::transfer_pool::TransferPool;
@@ -11,7 +11,7 @@ use std::io;
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Segments as files, moved by threads that block.
+/// Segments as files; worker threads make blocking calls.
 pub struct PreadEngine {
     shared: Arc<Shared>,
     pool: TransferPool,
@@ -24,8 +24,8 @@ struct Shared {
 }
 
 impl PreadEngine {
-    /// Opens a folder of segments with `threads` threads; the drive sees at most that many requests at once. With
-    /// `direct`, past the page cache where the file system allows it.
+    /// Opens a folder of segments with `threads` threads, which is also the most requests in flight at the drive.
+    /// `direct` bypasses the page cache where the file system allows it.
     ///
     /// # Errors
     /// The folder cannot be used, or no thread can be started.
@@ -33,7 +33,7 @@ impl PreadEngine {
         PreadEngine::over(SegmentIo::new(folder, direct)?, threads)
     }
 
-    /// As [`PreadEngine::open`] for a store that must stay as it is: writes fail.
+    /// As [`PreadEngine::open`] for a read-only store: writes fail.
     ///
     /// # Errors
     /// No thread can be started.
@@ -49,7 +49,7 @@ impl PreadEngine {
         Ok(PreadEngine { shared, pool })
     }
 
-    /// Whether bytes go past the page cache.
+    /// Whether transfers bypass the page cache.
     pub fn is_direct(&self) -> bool {
         self.shared.direct
     }
@@ -61,9 +61,9 @@ impl Shared {
         move_bytes(&file, transfer)?;
         if !self.direct {
             match transfer.direction {
-                Direction::Read => forget(&file, transfer.place.offset, transfer.bytes as u64),
+                Direction::Read => drop_cached(&file, transfer.place.offset, transfer.bytes as u64),
                 Direction::Write => {
-                    lock(&self.behind).wrote(&file, transfer.place.offset, transfer.bytes as u64);
+                    lock(&self.behind).record_write(&file, transfer.place.offset, transfer.bytes as u64);
                 }
             }
         }
@@ -98,7 +98,7 @@ impl PageEngine for PreadEngine {
 
     fn sync(&mut self) -> io::Result<()> {
         let result = lock(&self.shared.segments).sync();
-        lock(&self.shared.behind).forget_all();
+        lock(&self.shared.behind).drop_all();
         result
     }
 }

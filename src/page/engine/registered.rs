@@ -1,17 +1,18 @@
-//! Buffers that the kernel's ring knows beforehand: their memory is looked up and held once, not for every request.
+//! Buffers registered with an io_uring ring: the kernel looks up and pins their memory once instead of for every
+//! request.
 //!
-//! A buffer that stays (a frame's) is registered when it first moves, as far as bytes of it move, since the kernel takes all
-//! that it holds from the machine; it is registered again when more of it moves. It keeps its number in the ring's table as
-//! long as it lives, and is taken out of the table after its end. What the kernel holds counts against the limit on locked
-//! memory (`ulimit -l`) of whoever is bound by it: after a few refusals no more buffers are offered until others have ended,
-//! and those without a number move by requests that name their memory.
+//! A long-lived buffer (a frame's) is registered on its first transfer, for as many bytes as the transfer moves,
+//! because the kernel allocates all memory that it pins; a longer transfer registers it again. The buffer keeps its
+//! index in the ring's table until it is dropped. Pinned memory counts against the limit on locked memory (`ulimit -l`)
+//! of users who have one: after a few refusals no more buffers are registered until others are dropped, and
+//! unregistered buffers use ordinary requests.
 //!
-//! Invariants: 1. a number belongs to one buffer of one ring until that buffer has ended and its entry was cleared; 2. the
-//! kernel is told of a buffer that has ended when the ring is used next. It lets go of the memory then (Linux before 6.4:
+//! Invariants: 1. an index belongs to one buffer of one ring until that buffer is dropped and its entry cleared; 2. the
+//! entry of a dropped buffer is cleared when the ring is next used; the kernel then frees the memory (before Linux 6.4
 //! about a second later).
 //!
-//! Safety: the kernel takes hold of the memory itself, not of the address: an entry whose buffer has ended names memory that
-//! nobody else has. Requests name addresses within the entry's buffer, which their flight owns.
+//! Safety: the kernel pins the memory itself, not the address: the entry of a dropped buffer names memory that belongs
+//! to nobody else. Requests name addresses within the entry's buffer, which their flight owns.
 #![allow(unsafe_code)] // the table takes addresses of buffers
 
 use crate::page::engine::buffer::PageBuffer;
@@ -19,22 +20,22 @@ use io_uring::Submitter;
 use std::io;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Most entries of a table: the kernel's own limit.
+/// Most entries of a table: the kernel's limit.
 const ENTRIES: u16 = 1 << 14;
 
 /// Longest buffer that the kernel registers, bytes.
 const BYTES_MAX: usize = 1 << 30;
-/// Buffers that the kernel may refuse before no more are offered.
+/// Refusals by the kernel before registration pauses.
 const REFUSALS_MAX: u32 = 8;
 
-/// Numbers whose buffers have ended, on whatever thread.
+/// Indices whose buffers were dropped, on any thread.
 type Ended = Arc<Mutex<Vec<u16>>>;
 
-/// A buffer's place in the table of one ring; given up when it is dropped.
+/// A buffer's entry in the table of one ring; given up on drop.
 #[derive(Debug)]
 pub struct Registration {
     number: u16,
-    /// Bytes that the kernel holds, from the start.
+    /// Bytes that the kernel has pinned, from the start of the buffer.
     bytes: usize,
     ended: Ended,
 }
@@ -45,38 +46,38 @@ impl Drop for Registration {
     }
 }
 
-/// The table of one ring.
+/// The table of registered buffers of one ring.
 #[derive(Debug, Default)]
 pub struct RegisteredBuffers {
-    /// Whether the kernel gave a table.
-    is_there: bool,
-    /// Buffers that it refused since it last took or let go of one.
+    /// Whether the kernel supports the table.
+    is_supported: bool,
+    /// Refusals since the kernel last accepted or released a buffer.
     refusals: u32,
-    /// Entries that were used so far.
+    /// Indices handed out so far.
     used: u16,
-    /// Of these, entries that are clear.
+    /// Handed-out indices that are free again.
     clear: Vec<u16>,
     ended: Ended,
 }
 
 impl RegisteredBuffers {
-    /// An empty table for a ring; one that takes nothing where the kernel knows no such tables.
+    /// An empty table for a ring; registers nothing if the kernel has no such tables.
     pub fn of(ring: &Submitter<'_>) -> RegisteredBuffers {
-        let is_there = ring.register_buffers_sparse(ENTRIES.into()).is_ok();
-        RegisteredBuffers { is_there, ..RegisteredBuffers::default() }
+        let is_supported = ring.register_buffers_sparse(ENTRIES.into()).is_ok();
+        RegisteredBuffers { is_supported, ..RegisteredBuffers::default() }
     }
 
-    /// Whether the kernel gave a table.
-    pub fn is_there(&self) -> bool {
-        self.is_there
+    /// Whether the kernel supports the table.
+    pub fn is_supported(&self) -> bool {
+        self.is_supported
     }
 
-    /// Buffers that are registered, those that have just ended included.
+    /// Registered buffers, including dropped ones whose entry is not cleared yet.
     pub fn len(&self) -> usize {
         usize::from(self.used) - self.clear.len()
     }
 
-    /// The number of a buffer whose first `bytes` bytes will move; `None` where these are not registered.
+    /// The index of a buffer whose first `bytes` bytes will move; `None` if they are not registered.
     pub fn number_of(&mut self, ring: &Submitter<'_>, buffer: &mut PageBuffer, bytes: usize) -> Option<u16> {
         self.clear_ended(ring);
         let own = buffer.registration.as_ref().filter(|r| Arc::ptr_eq(&r.ended, &self.ended));
@@ -84,7 +85,7 @@ impl RegisteredBuffers {
         if let Some((number, _)) = own.filter(|&(_, held)| held >= bytes) {
             return Some(number);
         }
-        let may_be = self.is_there && self.refusals < REFUSALS_MAX;
+        let may_be = self.is_supported && self.refusals < REFUSALS_MAX;
         if !may_be || !buffer.is_mapped() || bytes > BYTES_MAX.min(buffer.len()) {
             return None;
         }
@@ -107,10 +108,10 @@ impl RegisteredBuffers {
         Some(number)
     }
 
-    /// Lets go of the memory of buffers that have ended.
+    /// Clears the entries of dropped buffers, which frees their memory.
     pub fn clear_ended(&mut self, ring: &Submitter<'_>) {
         let mut ended = self.ended.lock().unwrap_or_else(PoisonError::into_inner);
-        // What could not be cleared is tried again the next time.
+        // An entry that could not be cleared is tried again next time.
         ended.retain(|&number| {
             let nothing = libc::iovec { iov_base: std::ptr::null_mut(), iov_len: 0 };
             let is_clear = set(ring, number, nothing).is_ok();
@@ -123,9 +124,9 @@ impl RegisteredBuffers {
     }
 }
 
-/// Puts an entry into the table; one without memory clears it.
+/// Sets an entry of the table; an entry without memory clears it.
 fn set(ring: &Submitter<'_>, number: u16, entry: libc::iovec) -> io::Result<()> {
-    // SAFETY: the kernel holds the memory until the entry is cleared, whatever becomes of the address; see the head of this
-    // file.
+    // SAFETY: the kernel pins the memory until the entry is cleared, whatever happens to the address; see the head of
+    // this file.
     unsafe { ring.register_buffers_update(number.into(), &[entry], None) }
 }

@@ -1,10 +1,10 @@
-//! The files behind the segments: made so that writes do not run out of space, opened so that no link is followed,
-//! and never more of them open than the process may have. Shared by the engines that work on files.
+//! Segment files: allocated so that writes cannot run out of space, opened without following links, and with a bounded
+//! number open at once. Shared by the engines that use files.
 //!
-//! Knows nothing of slots or pages. Invariants: 1. a segment that was made has its full length allocated, and it and
-//! its entry in the folder are durable before [`SegmentFiles::create`] returns; 2. a file that was asked for writing
-//! is synced before it is closed or forgotten; 3. nothing outside the folder is opened: names are made here, and a
-//! symbolic link in place of a segment is an error.
+//! Knows neither slots nor pages. Invariants: 1. when [`SegmentFiles::create`] returns, the segment's full length is
+//! allocated, and the file and its folder entry are durable; 2. a file opened for writing is synced before it is closed
+//! or dropped; 3. nothing outside the folder is opened: file names are made here, and a symbolic link in place of a
+//! segment is an error.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -14,7 +14,7 @@ use std::sync::Arc;
 
 const PREFIX: &str = "seg-";
 const SUFFIX: &str = ".dat";
-/// Files that the rest of a process may need while it trains: photos, logs, sockets, the map.
+/// File descriptors reserved for the rest of the process: photos, logs, sockets, the map.
 const FILES_OF_OTHERS: u64 = 32;
 
 /// Name of the file of segment `segment`.
@@ -22,7 +22,7 @@ pub fn segment_file_name(segment: u32) -> String {
     format!("{PREFIX}{segment:08}{SUFFIX}")
 }
 
-/// Number of the segment that a file name stands for; `None` for names that [`segment_file_name`] never gives.
+/// Number of the segment that a file name stands for; `None` for names that [`segment_file_name`] never produces.
 pub fn segment_from_file_name(name: &str) -> Option<u32> {
     let number = name.strip_prefix(PREFIX)?.strip_suffix(SUFFIX)?.parse().ok()?;
     (segment_file_name(number) == name).then_some(number)
@@ -39,7 +39,7 @@ struct OpenFile {
 #[derive(Debug)]
 pub struct SegmentFiles {
     folder: PathBuf,
-    /// Held open, so that a segment can be made durable whatever the process has open.
+    /// The folder, kept open so that it can be synced even when no descriptor is left.
     entries: Option<File>,
     direct: bool,
     read_only: bool,
@@ -49,7 +49,7 @@ pub struct SegmentFiles {
 }
 
 impl SegmentFiles {
-    /// The segments in `folder`. With `direct`, files bypass the page cache; where the file system refuses that,
+    /// The segments in `folder`. With `direct`, files bypass the page cache if the file system allows it;
     /// [`SegmentFiles::is_direct`] tells.
     ///
     /// # Errors
@@ -57,14 +57,14 @@ impl SegmentFiles {
     pub fn new(folder: &Path, direct: bool) -> io::Result<SegmentFiles> {
         let direct = direct && direct_works(folder)?;
         let open_max = open_files_max();
-        // Other systems do not open folders; there a file's entry is durable with the file.
+        // Other systems cannot open folders; there a file's entry is durable with the file.
         let entries = if cfg!(unix) { Some(File::open(folder)?) } else { None };
         let open = BTreeMap::new();
         let (folder, read_only) = (folder.to_path_buf(), false);
         Ok(SegmentFiles { folder, entries, direct, read_only, open, open_max, clock: 0 })
     }
 
-    /// The segments in `folder`, which may be on a drive that cannot be written: nothing can be written through them.
+    /// The segments in `folder`, read-only; the drive may be mounted read-only.
     pub fn read_only(folder: &Path) -> SegmentFiles {
         let (open_max, folder) = (open_files_max(), folder.to_path_buf());
         SegmentFiles {
@@ -78,13 +78,13 @@ impl SegmentFiles {
         }
     }
 
-    /// Whether files bypass the page cache. Then memory, offsets and lengths must be multiples of
+    /// Whether files bypass the page cache. If so, memory, offsets and lengths must be multiples of
     /// [`crate::page::engine::buffer::ALIGNMENT`].
     pub fn is_direct(&self) -> bool {
         self.direct
     }
 
-    /// Most files held open at once; transfers in flight may hold more.
+    /// Most files kept open at once; transfers in flight may hold more.
     pub fn open_max(&self) -> usize {
         self.open_max
     }
@@ -94,8 +94,8 @@ impl SegmentFiles {
         self.folder.join(segment_file_name(segment))
     }
 
-    /// Makes a segment of `bytes` bytes, durably. One that exists with that size is left as it is, a shorter one
-    /// (a crash while it was made) is brought to its length.
+    /// Creates a segment of `bytes` bytes, durably. An existing segment of that size stays unchanged; a shorter one (a
+    /// crash during creation) is extended.
     ///
     /// # Errors
     /// No space; the folder cannot be written; the file is longer, a link, or not a file.
@@ -105,7 +105,7 @@ impl SegmentFiles {
         let make = |path: &Path| {
             with_safe_flags(OpenOptions::new().read(true).write(true).create(true).truncate(false)).open(path)
         };
-        let file = self.open_with_room(&path, make)?;
+        let file = self.open_closing_others(&path, make)?;
         let there = file.metadata()?;
         if !there.is_file() || there.len() > bytes {
             let what = if there.is_file() { "exists with another length" } else { "is not a file" };
@@ -114,19 +114,19 @@ impl SegmentFiles {
         if there.len() < bytes
             && let Err(error) = allocate(&file, there.len(), bytes)
         {
-            // What was allocated before space ran out is given back; a file that was here stays as it was.
+            // Space ran out: the new space is freed, and a file that existed keeps its old length.
             let _ = if there.len() == 0 { std::fs::remove_file(&path) } else { file.set_len(there.len()) };
             return Err(error);
         }
-        // Also when nothing seems missing: whoever made it may have been killed before these calls.
+        // Also for a complete file: its creator may have been killed before these calls.
         file.sync_all()?;
         self.entries.as_ref().map_or(Ok(()), File::sync_all)
     }
 
-    /// Whether the file of a segment is there with exactly `bytes` bytes. It is not opened.
+    /// Checks that the file of a segment exists with exactly `bytes` bytes, without opening it.
     ///
     /// # Errors
-    /// It is missing, shorter, longer, a link, or not a file.
+    /// The file is missing, shorter, longer, a link, or not a file.
     pub fn check(&self, segment: u32, bytes: u64) -> io::Result<()> {
         let there = std::fs::symlink_metadata(self.path(segment))?;
         let wrong = |what: String| Err(io::Error::new(io::ErrorKind::InvalidData, what));
@@ -140,7 +140,7 @@ impl SegmentFiles {
     /// The file of a segment, for reading.
     ///
     /// # Errors
-    /// It does not exist or cannot be opened.
+    /// The file does not exist or cannot be opened.
     pub fn file(&mut self, segment: u32) -> io::Result<Arc<File>> {
         self.clock += 1;
         if let Some(open) = self.open.get_mut(&segment) {
@@ -150,16 +150,16 @@ impl SegmentFiles {
         while self.open.len() >= self.open_max && self.close_oldest()? {}
         let (direct, read_only) = (self.direct, self.read_only);
         let open = |path: &Path| if read_only { open_for_reading(path) } else { open_segment(path, direct) };
-        let file = Arc::new(self.open_with_room(&self.path(segment), open)?);
+        let file = Arc::new(self.open_closing_others(&self.path(segment), open)?);
         let open = OpenFile { file: Arc::clone(&file), last_used: self.clock, is_dirty: false };
         self.open.insert(segment, open);
         Ok(file)
     }
 
-    /// The file of a segment, for writing: it counts as changed until [`SegmentFiles::sync`].
+    /// The file of a segment, for writing: it counts as dirty until [`SegmentFiles::sync`].
     ///
     /// # Errors
-    /// It does not exist or cannot be opened.
+    /// The file does not exist or cannot be opened.
     pub fn file_for_write(&mut self, segment: u32) -> io::Result<Arc<File>> {
         self.refuse_if_read_only()?;
         let file = self.file(segment)?;
@@ -169,11 +169,11 @@ impl SegmentFiles {
         Ok(file)
     }
 
-    /// Makes everything durable that completed writes changed.
+    /// Makes completed writes durable.
     ///
     /// # Errors
-    /// The drive reported an error. It reports it once: nothing that was not synced before may be trusted, and
-    /// calling again proves nothing.
+    /// The drive reported an error. The system reports a lost write only once: nothing unsynced may be trusted, and a
+    /// second call proves nothing.
     pub fn sync(&mut self) -> io::Result<()> {
         for open in self.open.values_mut().filter(|o| o.is_dirty) {
             open.file.sync_data()?;
@@ -186,8 +186,8 @@ impl SegmentFiles {
         if self.read_only { Err(io::ErrorKind::ReadOnlyFilesystem.into()) } else { Ok(()) }
     }
 
-    /// Opens a file; where others of this process hold more files than was reckoned with, closes some of ours.
-    fn open_with_room(&mut self, path: &Path, open: impl Fn(&Path) -> io::Result<File>) -> io::Result<File> {
+    /// Opens a file. If the process has run out of file descriptors, closes some of the store's own and tries again.
+    fn open_closing_others(&mut self, path: &Path, open: impl Fn(&Path) -> io::Result<File>) -> io::Result<File> {
         loop {
             match open(path) {
                 Err(error) if is_too_many_files(&error) && self.close_oldest()? => {}
@@ -196,12 +196,13 @@ impl SegmentFiles {
         }
     }
 
-    /// Closes the file that was not used for longest, except those that a transfer in flight still holds: a write
-    /// that ends after the sync would be missed by the next. Tells whether there was one.
+    /// Closes the least recently used file that no transfer in flight holds: a write that ends after the sync would be
+    /// missed by the next sync. Returns whether a file was closed.
     fn close_oldest(&mut self) -> io::Result<bool> {
         let idle = self.open.iter().filter(|(_, open)| Arc::strong_count(&open.file) == 1);
         let Some((&segment, _)) = idle.min_by_key(|(_, open)| open.last_used) else { return Ok(false) };
-        // The kernel may forget a failed write-back of a file that nobody has open.
+        // The kernel may forget a failed write-back of a file that nobody has open, so the file is synced before it is
+        // closed.
         if let Some(open) = self.open.remove(&segment).filter(|o| o.is_dirty) {
             open.file.sync_data()?;
         }
@@ -214,10 +215,10 @@ fn is_too_many_files(error: &io::Error) -> bool {
     cfg!(unix) && matches!(error.raw_os_error(), Some(23 | 24)) // ENFILE, EMFILE everywhere
 }
 
-/// Opens a file of the store for reading: no link is followed.
+/// Opens a file of the store for reading, without following links.
 ///
 /// # Errors
-/// It is not there or cannot be read.
+/// The file does not exist or cannot be read.
 pub fn open_for_reading(path: &Path) -> io::Result<File> {
     with_safe_flags(OpenOptions::new().read(true)).open(path)
 }
@@ -230,8 +231,8 @@ pub fn sync_folder(folder: &Path) -> io::Result<()> {
     if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
 }
 
-/// Adds: private to its owner, no link followed, no waiting on a pipe that somebody put there. (Handles are never
-/// inherited: the standard library sees to it.)
+/// Adds the flags: private to its owner, follow no link, do not block on a pipe in place of the file. (The standard
+/// library already keeps descriptors from being inherited.)
 pub fn with_safe_flags(options: &mut OpenOptions) -> &mut OpenOptions {
     #[cfg(unix)]
     {
@@ -256,13 +257,13 @@ fn open_segment(path: &Path, _direct: bool) -> io::Result<File> {
     with_safe_flags(OpenOptions::new().read(true).write(true)).open(path)
 }
 
-/// Whether files of this folder can be opened around the page cache: asked of a file that has no name.
+/// Whether files of this folder support direct I/O; tried on an unnamed file.
 #[cfg(target_os = "linux")]
 fn direct_works(folder: &Path) -> io::Result<bool> {
     use rustix::fs::{Mode, OFlags, open};
     match open(folder, OFlags::TMPFILE | OFlags::RDWR | OFlags::DIRECT | OFlags::CLOEXEC, Mode::RUSR | Mode::WUSR) {
         Ok(_) => Ok(true),
-        // Either the flag or files without a name are not supported; both mean an unusual file system.
+        // Either the flag or unnamed files are unsupported; both mean an unusual file system.
         Err(rustix::io::Errno::INVAL | rustix::io::Errno::OPNOTSUPP | rustix::io::Errno::ISDIR) => Ok(false),
         Err(error) => Err(error.into()),
     }
@@ -273,8 +274,8 @@ fn direct_works(_folder: &Path) -> io::Result<bool> {
     Ok(false)
 }
 
-/// Takes the space `from..to` from the file system. A longer length alone would not: writes could then still find the
-/// drive full. The file's length is `from` before and `to` after it.
+/// Allocates the space `from..to`. Setting the length would not reserve space: later writes could still find the drive
+/// full. The file's length is `from` before and `to` after.
 #[cfg(unix)]
 pub(in crate::page) fn allocate(file: &File, from: u64, to: u64) -> io::Result<()> {
     use rustix::fs::{FallocateFlags, fallocate};
@@ -306,7 +307,7 @@ fn write_zeros(mut file: &File, from: u64, to: u64) -> io::Result<()> {
     Ok(())
 }
 
-/// How many segments may be open at once, from the limit of the process.
+/// Most segments open at once, from the process's limit on file descriptors.
 #[cfg(unix)]
 fn open_files_max() -> usize {
     let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current.unwrap_or(1024);
@@ -324,7 +325,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_come_back_and_others_are_nobodys() {
+    fn names_round_trip_and_others_are_not_segments() {
         for segment in [0, 1, 99_999_999, 100_000_000, u32::MAX] {
             assert_eq!(segment_from_file_name(&segment_file_name(segment)), Some(segment));
         }
@@ -379,7 +380,7 @@ mod tests {
             files.file_for_write(segment).unwrap().write_all_at(&[segment as u8 + 1], 7).unwrap();
             assert!(files.open.len() <= 3);
         }
-        // A transfer in flight keeps its file open and changed until its end.
+        // A transfer in flight keeps its file open and dirty until it ends.
         let in_flight = files.file_for_write(0).unwrap();
         (1..10).for_each(|segment| drop(files.file(segment).unwrap()));
         assert!(files.open[&0].is_dirty && files.open.len() == 3);

@@ -1,8 +1,8 @@
-//! What the engines that work on files share: transfers checked against their segment, whole reads and writes at a
-//! place, and syncs whose failure is never forgotten.
+//! Shared by the engines that use files: checks transfers against their segment, completes partial reads and writes,
+//! and remembers a failed sync.
 //!
-//! Invariants: 1. no byte outside of a segment is read or written, whatever a transfer asks for; 2. after a sync
-//! failed, every later one fails too: the system reports a lost write only once.
+//! Invariants: 1. no transfer reads or writes a byte outside its segment; 2. after a failed sync every later sync fails
+//! too, because the system reports a lost write only once.
 
 use crate::page::engine::buffer::ALIGNMENT;
 use crate::page::engine::page_engine::{Direction, Transfer};
@@ -17,16 +17,16 @@ use std::time::Duration;
 /// A symbolic link where a segment should be, on Linux.
 const ELOOP: i32 = 40;
 
-/// The segments of a folder, for an engine.
+/// The segments of a folder, as an engine uses them.
 #[derive(Debug)]
 pub struct SegmentIo {
     files: SegmentFiles,
-    /// The first sync that failed.
+    /// The first failed sync.
     lost: Option<(io::ErrorKind, String)>,
 }
 
 impl SegmentIo {
-    /// The segments of `folder`; with `direct`, past the page cache where the file system allows it.
+    /// The segments of `folder`; `direct` bypasses the page cache where the file system allows it.
     ///
     /// # Errors
     /// The folder cannot be used.
@@ -34,12 +34,12 @@ impl SegmentIo {
         Ok(SegmentIo { files: SegmentFiles::new(folder, direct)?, lost: None })
     }
 
-    /// The segments of `folder`, which stays as it is.
+    /// The segments of `folder`, read-only.
     pub fn read_only(folder: &Path) -> SegmentIo {
         SegmentIo { files: SegmentFiles::read_only(folder), lost: None }
     }
 
-    /// Whether bytes go past the page cache.
+    /// Whether transfers bypass the page cache.
     pub fn is_direct(&self) -> bool {
         self.files.is_direct()
     }
@@ -55,28 +55,31 @@ impl SegmentIo {
     /// As [`crate::page::engine::page_engine::PageEngine::check_segment`].
     ///
     /// # Errors
-    /// It is missing, or not as it was made.
+    /// The segment is missing or has another size.
     pub fn check(&self, segment: u32, bytes: u64) -> io::Result<()> {
         self.files.check(segment, bytes)
     }
 
-    /// The file that `transfer` goes to. A write counts as not yet durable from here on.
+    /// The file of `transfer`. A write makes it dirty until the next sync.
     ///
     /// # Errors
-    /// `NotFound` without such a segment, `UnexpectedEof` for a place beyond its end, `InvalidInput` for bytes that
-    /// are not whole blocks of the buffer.
+    /// `NotFound` if the segment does not exist, `UnexpectedEof` for a place beyond its end, `InvalidInput` for a
+    /// length that is not a whole number of blocks within the buffer.
     pub fn file_of(&mut self, transfer: &Transfer) -> io::Result<Arc<File>> {
         let (offset, bytes) = (transfer.place.offset, transfer.bytes);
         let whole = offset.is_multiple_of(ALIGNMENT as u64) && bytes.is_multiple_of(ALIGNMENT);
         if !whole || bytes > transfer.buffer.len() {
-            return Err(io::Error::new(io::ErrorKind::InvalidInput, "a transfer moves whole blocks of its buffer"));
+            return Err(io::Error::new(
+                io::ErrorKind::InvalidInput,
+                "a transfer must move whole blocks within its buffer",
+            ));
         }
         let opened = match transfer.direction {
             Direction::Read => self.files.file(transfer.place.segment),
             Direction::Write => self.files.file_for_write(transfer.place.segment),
         };
-        // To open one file another may have to be synced and closed.
-        let file = opened.inspect_err(|e| self.note_if_lost(e))?;
+        // Opening one file may sync and close another, whose error must be kept.
+        let file = opened.inspect_err(|e| self.remember_lost_sync(e))?;
         if offset.checked_add(bytes as u64).is_none_or(|end| file.metadata().is_ok_and(|m| end > m.len())) {
             let problem = "the place lies beyond the end of the segment";
             return Err(io::Error::new(io::ErrorKind::UnexpectedEof, problem));
@@ -95,9 +98,9 @@ impl SegmentIo {
         self.files.sync().inspect_err(|e| self.lost = Some((e.kind(), e.to_string())))
     }
 
-    fn note_if_lost(&mut self, error: &io::Error) {
+    fn remember_lost_sync(&mut self, error: &io::Error) {
         use io::ErrorKind as K;
-        // None of these comes from a sync; anything else may.
+        // These errors never come from a sync; any other may.
         let harmless = matches!(error.kind(), K::NotFound | K::PermissionDenied) || error.raw_os_error() == Some(ELOOP);
         if !harmless && !too_many_files(error) {
             self.lost.get_or_insert((error.kind(), error.to_string()));
@@ -105,15 +108,15 @@ impl SegmentIo {
     }
 }
 
-/// Whether opening failed for want of file descriptors: closing another file helps.
+/// Whether opening failed because file descriptors ran out, which closing another file cures.
 pub fn too_many_files(error: &io::Error) -> bool {
     cfg!(unix) && matches!(error.raw_os_error(), Some(23 | 24))
 }
 
-/// Carries out a whole transfer with calls that block.
+/// Carries out a whole transfer with blocking calls.
 ///
 /// # Errors
-/// Of the drive; `UnexpectedEof` where the file ends too early.
+/// The drive's I/O errors; `UnexpectedEof` if the file ends too early.
 pub fn move_bytes(file: &File, transfer: &mut Transfer) -> io::Result<()> {
     move_parts(transfer, |direction, bytes, at| match direction {
         Direction::Read => read_at(file, bytes, at),
@@ -121,7 +124,8 @@ pub fn move_bytes(file: &File, transfer: &mut Transfer) -> io::Result<()> {
     })
 }
 
-/// Asks `move_part` for what is left of a transfer, as (direction, bytes, their place in the file), until all has moved.
+/// Calls `move_part` with the rest of a transfer, as (direction, bytes, their place in the file), until all bytes have
+/// moved.
 fn move_parts(
     transfer: &mut Transfer,
     mut move_part: impl FnMut(Direction, &mut [u8], u64) -> io::Result<usize>,
@@ -171,8 +175,8 @@ mod tests {
     const BYTES: usize = 37 * ALIGNMENT;
     const OFFSET: usize = 3 * ALIGNMENT;
 
-    /// Carries a transfer out against `drive`, which moves as little as it likes and is disturbed often. Returns how
-    /// often it was asked.
+    /// Carries out a transfer against `drive`, which moves few bytes at a time and interrupts often. Returns the number
+    /// of calls.
     fn move_in_parts(transfer: &mut Transfer, drive: &mut [u8], draws: &mut Stream) -> usize {
         let mut asked = 0;
         let moved = move_parts(transfer, |direction, bytes, at| {
@@ -182,7 +186,8 @@ mod tests {
                 2 => return Err(io::Error::from(io::ErrorKind::WouldBlock)),
                 _ => {}
             }
-            // Less than a block at times: never often enough in a row to give up, and what does not fill a block moves again.
+            // Sometimes less than a block: the rest of a partial block moves again, and progress comes before the limit
+            // on tries.
             let count =
                 (draws.below(4) as usize * ALIGNMENT + 1 + draws.below(ALIGNMENT as u64) as usize).min(bytes.len());
             let there = &mut drive[at as usize..][..count];
@@ -197,13 +202,13 @@ mod tests {
     }
 
     #[test]
-    fn what_moves_in_parts_and_is_disturbed_arrives_whole() {
+    fn a_transfer_in_interrupted_parts_arrives_whole() {
         for seed in 0..50 {
             let mut draws = Stream::new(seed, Purpose::Test, 0, 0);
             let mut drive: Vec<u8> = (0..OFFSET + BYTES + ALIGNMENT).map(|_| draws.next_u64() as u8).collect();
             let before = drive.clone();
             let place = Place { segment: 0, offset: OFFSET as u64 };
-            // The buffer is longer than what moves.
+            // The buffer is longer than the transfer.
             let buffer = PageBuffer::zeroed(BYTES + ALIGNMENT);
             let mut transfer = Transfer { token: 1, direction: Direction::Read, place, bytes: BYTES, buffer };
             let asked = move_in_parts(&mut transfer, &mut drive, &mut draws);

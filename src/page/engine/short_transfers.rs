@@ -1,19 +1,19 @@
-//! What to do when the system moved less than it was asked to.
+//! Resumes transfers of which the system moved only a part.
 //!
-//! Every engine drives its requests with a [`Resume`]: short transfers go on where they ended, interrupted ones are
-//! tried again, and what never moves ends as an error instead of a loop without end.
+//! Every engine drives its requests with a [`Resume`]: a short transfer continues where it ended, an interrupted one is
+//! tried again, and one that makes no progress ends with an error instead of looping forever.
 //!
-//! Invariants: 1. a resumed request begins on a multiple of [`ALIGNMENT`] of its first byte, as direct I/O needs, so
-//! bytes behind the last whole block are moved again; 2. at most [`TRIES_MAX`] outcomes in a row without a whole
-//! block of progress are forgiven.
+//! Invariants: 1. a resumed request starts at a multiple of [`ALIGNMENT`] from its first byte, as direct I/O requires,
+//! so bytes after the last whole block move again; 2. at most [`TRIES_MAX`] outcomes in a row without a whole block of
+//! progress are tolerated.
 
 use crate::page::engine::buffer::ALIGNMENT;
 use crate::page::engine::page_engine::Direction;
 use std::io;
 
-/// Outcomes in a row without progress that are forgiven.
+/// Most outcomes in a row without progress.
 pub const TRIES_MAX: u8 = 32;
-/// `ECANCELED` on Linux: the ring gives it to requests whose thread ended; they may be sent again.
+/// `ECANCELED` on Linux: the ring returns it for requests whose thread ended; they may be sent again.
 const CANCELED: i32 = 125;
 
 /// Progress of one request.
@@ -26,15 +26,16 @@ pub struct Resume {
 }
 
 impl Resume {
-    /// Takes in the outcome of the request for the bytes from `self.done` to `total`. Says whether all is moved.
+    /// Applies the outcome of the request for the bytes from `self.done` to `total`. Returns whether all bytes have
+    /// moved.
     ///
     /// # Errors
-    /// The outcome's error if trying again is no help; `UnexpectedEof` or `WriteZero` where the file ends.
+    /// The outcome's error if a retry cannot help; `UnexpectedEof` or `WriteZero` at the end of the file.
     pub fn advance(&mut self, direction: Direction, outcome: io::Result<usize>, total: usize) -> io::Result<bool> {
         match outcome {
             Ok(0) if self.done < total => Err(match direction {
                 Direction::Read => io::Error::new(io::ErrorKind::UnexpectedEof, "the file ends before the page does"),
-                Direction::Write => io::Error::new(io::ErrorKind::WriteZero, "the drive takes no more bytes"),
+                Direction::Write => io::Error::new(io::ErrorKind::WriteZero, "the drive accepts no more bytes"),
             }),
             Ok(moved) => {
                 let reached = self.done + moved;
@@ -47,7 +48,12 @@ impl Resume {
                     *self = Resume { done: whole, tries: 0 };
                     return Ok(false);
                 }
-                self.try_again(|| io::Error::new(io::ErrorKind::TimedOut, "the drive moves only parts of a block"))
+                self.try_again(|| {
+                    io::Error::new(
+                        io::ErrorKind::TimedOut,
+                        "the drive makes no progress: it moves only parts of a block",
+                    )
+                })
             }
             Err(error) if may_pass(&error) => self.try_again(|| error),
             Err(error) => Err(error),
@@ -60,7 +66,7 @@ impl Resume {
     }
 }
 
-/// Whether the same request may succeed when it is sent again.
+/// Whether a retry of the same request may succeed.
 fn may_pass(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::Interrupted | io::ErrorKind::WouldBlock)
         || (cfg!(target_os = "linux") && error.raw_os_error() == Some(CANCELED))
@@ -72,7 +78,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn short_outcomes_go_on_at_the_last_whole_block() {
+    fn a_short_transfer_resumes_at_the_last_whole_block() {
         let mut resume = Resume::default();
         let total = 6 * ALIGNMENT;
         assert!(!resume.advance(Direction::Write, Ok(ALIGNMENT + 512), total).unwrap());
@@ -84,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn what_never_moves_ends_as_an_error() {
+    fn a_transfer_without_progress_ends_with_an_error() {
         for raw in [4, 11, 125] {
             let mut resume = Resume::default();
             let again = || Err(io::Error::from_raw_os_error(raw));
@@ -100,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn the_end_of_a_file_and_real_errors_are_told_at_once() {
+    fn end_of_file_and_lasting_errors_are_reported_at_once() {
         let mut resume = Resume::default();
         let end = resume.advance(Direction::Read, Ok(0), ALIGNMENT).unwrap_err();
         assert_eq!(end.kind(), io::ErrorKind::UnexpectedEof);

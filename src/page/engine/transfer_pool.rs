@@ -1,9 +1,9 @@
-//! Worker threads that carry out transfers one after the other, for engines whose system calls block.
+//! Worker threads that carry out transfers, for engines whose system calls block.
 //!
-//! The number of waiting transfers is not bounded here: whoever submits owns a bounded number of buffers.
+//! The queue is unbounded: the submitter bounds it by owning a bounded number of buffers.
 //!
 //! Invariants: 1. every submitted transfer comes back exactly once, with its buffer, also when the work panics;
-//! 2. dropping the pool carries out what was submitted and then ends the threads.
+//! 2. dropping the pool carries out all submitted transfers and then ends the threads.
 
 use crate::page::engine::page_engine::{Completion, Transfer};
 use std::collections::VecDeque;
@@ -12,7 +12,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-/// Threads that carry out transfers.
+/// A pool of threads that carry out transfers.
 pub struct TransferPool {
     shared: Arc<Shared>,
     workers: Vec<JoinHandle<()>>,
@@ -24,9 +24,9 @@ type Work = dyn Fn(&mut Transfer) -> io::Result<()> + Send + Sync;
 struct Shared {
     work: Box<Work>,
     queue: Mutex<Queue>,
-    /// Told when a transfer waits, and when the pool ends.
+    /// Notified when a transfer is queued and when the pool ends.
     waiting: Condvar,
-    /// Told when a transfer is done.
+    /// Notified when a transfer has finished.
     done: Condvar,
 }
 
@@ -41,7 +41,7 @@ impl TransferPool {
     /// Starts `threads` threads (at least one) named `name` that do `work`.
     ///
     /// # Errors
-    /// The system refuses the first thread. With fewer than asked for the pool is slower, no more.
+    /// The system refuses the first thread. Fewer threads than requested only make the pool slower.
     pub fn new(
         name: &str,
         threads: usize,
@@ -65,14 +65,14 @@ impl TransferPool {
         Ok(pool)
     }
 
-    /// Queues a transfer, first come first served.
+    /// Queues a transfer; transfers start in order of submission.
     pub fn submit(&mut self, transfer: Transfer) {
         self.in_flight += 1;
         self.shared.lock().waiting.push_back(transfer);
         self.shared.waiting.notify_one();
     }
 
-    /// Moves finished transfers to `done`; with `wait`, blocks until there is one, if any is in flight.
+    /// Moves finished transfers to `done`. With `wait`, blocks until at least one has finished, if any is in flight.
     pub fn complete(&mut self, wait: bool, done: &mut Vec<Completion>) {
         let mut queue = self.shared.lock();
         while wait && self.in_flight > 0 && queue.done.is_empty() {
@@ -82,7 +82,7 @@ impl TransferPool {
         done.append(&mut queue.done);
     }
 
-    /// Transfers submitted whose completion was not taken yet.
+    /// Submitted transfers whose completion has not been collected.
     pub fn in_flight(&self) -> usize {
         self.in_flight
     }
@@ -93,7 +93,7 @@ impl Drop for TransferPool {
         self.shared.lock().ended = true;
         self.shared.waiting.notify_all();
         for worker in self.workers.drain(..) {
-            // A worker catches what its work throws; there is nothing left to tell.
+            // Workers catch the panics of their work, so there is no error to report.
             let _ = worker.join();
         }
     }
@@ -131,7 +131,7 @@ mod tests {
     use crate::page::engine::page_engine::{Direction, Place};
 
     #[test]
-    fn every_buffer_comes_back_also_when_the_work_panics() {
+    fn every_buffer_is_returned_even_if_the_work_panics() {
         let mut pool = TransferPool::new("test", 3, |transfer| match transfer.token % 3 {
             0 => Ok(()),
             1 => Err(io::Error::from_raw_os_error(5)),
@@ -154,6 +154,6 @@ mod tests {
             assert_eq!(completion.result.is_ok(), token % 3 == 0);
         }
         pool.complete(true, &mut done);
-        assert_eq!(done.len(), 30, "with nothing in flight there is nothing to wait for");
+        assert_eq!(done.len(), 30, "with nothing in flight, `complete` must not block");
     }
 }

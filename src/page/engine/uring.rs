@@ -1,23 +1,23 @@
-//! The kernel's submission ring (io_uring, Linux): many requests in flight without a thread for each.
+//! The io_uring engine (Linux): many requests in flight without a thread for each.
 //!
-//! Transfers are cut into requests of at most [`REQUEST_BYTES`], since larger ones may end in the middle with EAGAIN.
-//! No more requests are handed over than the ring has entries, so neither of its queues overflows. Direct I/O where
-//! the file system allows it. Neither SQPOLL (it costs a core) nor IOPOLL (it never completes on virtual drives).
-//! Buffers that stay are registered as far as the limit on locked memory allows. Files are not: there
-//! are few, and finding one costs a request nothing beside its mebibyte.
+//! Transfers are cut into requests of at most [`REQUEST_BYTES`], because larger ones may stop midway with EAGAIN. At
+//! most as many requests are submitted as the ring has entries, so neither queue overflows. Direct I/O is used where
+//! the file system allows it. SQPOLL is off (it costs a core), and so is IOPOLL (it never completes on virtual drives).
+//! Long-lived buffers are registered as far as the limit on locked memory allows. Files are not registered: there are
+//! few, and looking one up costs little next to moving a mebibyte.
 //!
-//! Safety: the kernel reads and writes page buffers while this process goes on. The bytes of a [`PageBuffer`] stay
-//! where they are when the buffer is moved; a transfer is moved into its flight when it is submitted, nothing
-//! touches its bytes there, and it leaves only after the kernel has answered every request that names it. Dropping the
-//! store waits for all answers; forgetting it leaks the buffers.
+//! Safety: the kernel reads and writes page buffers while this process runs. The bytes of a [`PageBuffer`] stay in
+//! place when the buffer is moved. A transfer is moved into its flight on submission; nothing touches its bytes there,
+//! and it leaves only after the kernel has completed every request that names it. Dropping the engine waits for all
+//! completions; leaking the engine leaks the buffers.
 //!
-//! Invariants: those of [`PageEngine`]; besides, 1. a request counts as with the kernel from the moment it is put into
-//! the ring until its answer is taken out; 2. nothing waits when nothing is with the kernel; 3. when the kernel
-//! refuses the ring itself, requests it has not taken end as errors and those it has are waited for.
+//! Invariants: those of [`PageEngine`]; besides, 1. a request counts as with the kernel from when it enters the
+//! submission queue until its completion is taken; 2. nothing blocks while no request is with the kernel; 3. if the
+//! kernel refuses the ring itself, requests not yet taken end with an error, and taken ones are waited for.
 #![allow(unsafe_code)] // the ring takes addresses of buffers that it owns
 
 use crate::page::engine::buffer::PageBuffer;
-use crate::page::engine::page_cache::{WriteBehind, forget};
+use crate::page::engine::page_cache::{WriteBehind, drop_cached};
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use crate::page::engine::registered::RegisteredBuffers;
 use crate::page::engine::segment_io::{SegmentIo, too_many_files};
@@ -34,12 +34,12 @@ use std::time::Duration;
 
 /// Most bytes of one request.
 pub const REQUEST_BYTES: usize = 1 << 20;
-/// Times that the kernel may refuse to take requests, a millisecond apart, before the ring counts as broken.
+/// Most refusals by the kernel to take requests, a millisecond apart, before the ring counts as broken.
 const REFUSALS_MAX: u32 = 5000;
-/// The kernel is short of something for the moment: EAGAIN, EBUSY, ENOMEM.
+/// Temporary shortages in the kernel: EAGAIN, EBUSY, ENOMEM.
 const SHORTAGES: [i32; 3] = [11, 16, 12];
 
-/// Segments as files, moved by the kernel's ring.
+/// Segments as files, transferred by io_uring.
 pub struct UringEngine {
     ring: IoUring,
     registered: RegisteredBuffers,
@@ -47,23 +47,23 @@ pub struct UringEngine {
     behind: WriteBehind,
     flights: Slab<Flight>,
     requests: Slab<Request>,
-    /// Requests that are not in the ring yet, first come first served.
+    /// Requests not yet in the submission queue, oldest first.
     waiting: VecDeque<usize>,
-    /// Requests in the ring that the kernel has not taken yet, oldest first.
+    /// Requests in the submission queue that the kernel has not taken, oldest first.
     offered: VecDeque<usize>,
-    /// Requests in the ring or taken by the kernel.
+    /// Requests in the submission queue or taken by the kernel.
     with_kernel: usize,
     entries: usize,
     done: Vec<Completion>,
     broken: Option<i32>,
 }
 
-/// A transfer with everything that is known of it.
+/// A transfer in flight.
 struct Flight {
     transfer: Transfer,
-    /// Address of the buffer's first byte, as a number: only the kernel goes through it.
+    /// Address of the buffer's first byte, as a number: only the kernel dereferences it.
     address: usize,
-    /// The buffer's number in the ring's table.
+    /// The buffer's index in the ring's table.
     registered: Option<u16>,
     file: Option<Arc<File>>,
     requests_left: usize,
@@ -79,8 +79,8 @@ struct Request {
 }
 
 impl UringEngine {
-    /// Opens a folder of segments with a ring of `entries` requests (rounded up to a power of two, at most 4096). With
-    /// `direct`, past the page cache where the file system allows it.
+    /// Opens a folder of segments with a ring of `entries` requests (rounded up to a power of two, at most 4096).
+    /// `direct` bypasses the page cache where the file system allows it.
     ///
     /// # Errors
     /// The kernel refuses the ring (too old, or forbidden as in many containers), or the folder cannot be used.
@@ -103,29 +103,29 @@ impl UringEngine {
         })
     }
 
-    /// Whether bytes go past the page cache.
+    /// Whether transfers bypass the page cache.
     pub fn is_direct(&self) -> bool {
         self.segments.is_direct()
     }
 
-    /// Whether the kernel has a table for buffers: since Linux 5.19.
-    pub fn has_table(&self) -> bool {
-        self.registered.is_there()
+    /// Whether the kernel supports registered buffers: since Linux 5.19.
+    pub fn supports_registration(&self) -> bool {
+        self.registered.is_supported()
     }
 
-    /// Buffers in the ring's table.
+    /// Number of registered buffers.
     pub fn registered(&self) -> usize {
         self.registered.len()
     }
 
-    /// Puts waiting requests into the ring while it has room.
+    /// Moves waiting requests into the submission queue while it has room.
     fn fill_ring(&mut self) {
         while self.with_kernel < self.entries {
             let Some(&id) = self.waiting.front() else { return };
             let flight_id = self.requests[id].flight;
             if let Err(error) = self.prepare(flight_id) {
                 if too_many_files(&error) && self.with_kernel > 0 {
-                    return; // an answer will let go of a file
+                    return; // a completion will free a file descriptor
                 }
                 self.flights[flight_id].error.get_or_insert(error);
             }
@@ -135,8 +135,8 @@ impl UringEngine {
                 continue;
             }
             let entry = self.entry_of(id);
-            // SAFETY: the entry names bytes of a buffer that the flight owns until the kernel has answered (see the
-            // head of this file) and a file that the flight keeps open as long.
+            // SAFETY: the entry names bytes of a buffer that the flight owns until the kernel has completed the request
+            // (see the head of this file), and a file that the flight keeps open for as long.
             if unsafe { self.ring.submission().push(&entry) }.is_err() {
                 self.waiting.push_front(id);
                 return;
@@ -146,7 +146,7 @@ impl UringEngine {
         }
     }
 
-    /// Makes sure that a flight has its file.
+    /// Opens the file of a flight, if it is not open yet.
     fn prepare(&mut self, flight: usize) -> io::Result<()> {
         let flight = &mut self.flights[flight];
         if let Some(raw) = self.broken {
@@ -172,12 +172,12 @@ impl UringEngine {
             (Direction::Read, Some(n)) => opcode::ReadFixed::new(file, memory, bytes, n).offset(offset).build(),
             (Direction::Write, Some(n)) => opcode::WriteFixed::new(file, memory, bytes, n).offset(offset).build(),
         };
-        // Once refused for the moment, a request may block on a thread of the kernel's instead.
+        // After a temporary refusal the request may block on a kernel thread instead.
         let flags = if request.resume.tries > 0 { squeue::Flags::ASYNC } else { squeue::Flags::empty() };
         entry.flags(flags).user_data(id as u64)
     }
 
-    /// Hands the ring to the kernel, and waits for `want` answers.
+    /// Submits the queue to the kernel and waits for `want` completions.
     fn enter(&mut self, want: usize) {
         let mut refusals = 0;
         while self.broken.is_none() {
@@ -199,17 +199,17 @@ impl UringEngine {
         let not_taken = self.ring.submission().len();
         self.offered.drain(..self.offered.len().saturating_sub(not_taken));
         if self.broken.is_some() {
-            self.give_up_offered();
+            self.fail_offered();
             if want > 0 && self.ring.completion().is_empty() {
-                // Answers to what the kernel has taken arrive without its being called.
+                // Completions of taken requests arrive without a system call.
                 std::thread::sleep(Duration::from_millis(1));
             }
         }
     }
 
-    /// Ends the requests that a broken ring still holds. The kernel reads the ring only when it is called, which does
-    /// not happen any more.
-    fn give_up_offered(&mut self) {
+    /// Ends the requests that a broken ring still holds. The kernel reads the queue only during a system call, and none
+    /// follows.
+    fn fail_offered(&mut self) {
         let raw = self.broken.unwrap_or(0);
         for id in std::mem::take(&mut self.offered) {
             let flight = self.requests[id].flight;
@@ -219,7 +219,7 @@ impl UringEngine {
         }
     }
 
-    /// Takes the kernel's answers.
+    /// Collects completions from the kernel.
     fn take_answers(&mut self) {
         loop {
             let Some(answer) = self.ring.completion().next() else { return };
@@ -250,8 +250,8 @@ impl UringEngine {
         if let Some(file) = flight.file.as_ref().filter(|_| !self.segments.is_direct()) {
             let (offset, bytes) = (flight.transfer.place.offset, flight.transfer.bytes as u64);
             match flight.transfer.direction {
-                Direction::Read => forget(file, offset, bytes),
-                Direction::Write => self.behind.wrote(file, offset, bytes),
+                Direction::Read => drop_cached(file, offset, bytes),
+                Direction::Write => self.behind.record_write(file, offset, bytes),
             }
         }
         let result = flight.error.map_or(Ok(()), Err);
@@ -274,7 +274,7 @@ impl PageEngine for UringEngine {
 
     fn submit(&mut self, mut transfer: Transfer) {
         if transfer.bytes > transfer.buffer.len() || transfer.bytes == 0 {
-            // Checked before any address is computed from it; the file says what is wrong.
+            // Checked before any address is computed from the length; `file_of` returns the error.
             let result = self.segments.file_of(&transfer).map(|_| ());
             self.done.push(Completion { transfer, result });
             return;
@@ -289,7 +289,7 @@ impl PageEngine for UringEngine {
             let id = self.requests.insert(Request { flight, start, bytes, resume: Resume::default() });
             self.waiting.push_back(id);
         }
-        // What has ended makes room in the ring, although nobody has asked for it yet.
+        // Collects completions to make room in the ring, before anyone polls.
         self.take_answers();
         self.fill_ring();
         if !self.offered.is_empty() {
@@ -318,7 +318,7 @@ impl PageEngine for UringEngine {
 
     fn sync(&mut self) -> io::Result<()> {
         let result = self.segments.sync();
-        self.behind.forget_all();
+        self.behind.drop_all();
         result
     }
 }
@@ -336,7 +336,7 @@ fn address_of(buffer: &mut PageBuffer) -> usize {
     buffer.as_mut_slice().as_mut_ptr().expose_provenance()
 }
 
-/// A ring that has answered a request. Where rings are forbidden, it may be their making or their use that is.
+/// A ring that has completed a request. Where rings are forbidden, creating one may fail, or using it.
 fn working_ring(entries: u32) -> io::Result<IoUring> {
     let mut ring = IoUring::new(entries)?;
     // SAFETY: the request names neither memory nor a file.
@@ -351,6 +351,6 @@ fn working_ring(entries: u32) -> io::Result<IoUring> {
     match answer {
         Some(0) => Ok(ring),
         Some(raw) => Err(io::Error::from_raw_os_error(-raw)),
-        None => Err(io::Error::other("the new ring does not answer")),
+        None => Err(io::Error::other("the new ring completes no request")),
     }
 }

@@ -1,21 +1,20 @@
-//! What kind of file system a folder lies on and how much space it has left.
+//! The kind of file system that a folder is on, and its free space.
 //!
-//! The kinds are told apart by the number that Linux gives each file system; elsewhere every one counts as a local
-//! drive.
+//! On Linux the magic number of `statfs` tells the kind; elsewhere every file system counts as a local drive.
 
 use std::io;
 use std::path::Path;
 
-/// Kinds that matter to pages on a drive.
+/// Kinds of file systems, as far as they matter to pages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FileSystem {
-    /// A drive of this machine, as far as can be told.
+    /// A drive of this machine, as far as the system tells.
     Local,
-    /// Files are memory.
+    /// Files are in memory.
     Memory,
-    /// Layers over another one, as in containers: slower, and often small.
+    /// Layers over another file system, as in containers: slower, and often small.
     Overlay,
-    /// Another machine or program stands behind it: locks and syncs may not mean what they say.
+    /// Served by another machine or program: locks and syncs may be unreliable.
     Remote(&'static str),
 }
 
@@ -44,35 +43,35 @@ const KINDS: &[(u32, FileSystem)] = &[
 ];
 
 impl FileSystem {
-    /// By the number that `statfs` gives on Linux.
+    /// The kind for a magic number of `statfs` on Linux.
     pub fn from_magic(magic: u32) -> FileSystem {
         KINDS.iter().find(|(number, _)| *number == magic).map_or(FileSystem::Local, |(_, kind)| *kind)
     }
 
-    /// Of a folder.
+    /// The kind of a folder's file system.
     ///
     /// # Errors
-    /// The folder cannot be asked.
+    /// The system does not tell.
     #[cfg(target_os = "linux")]
     pub fn of(folder: &Path) -> io::Result<FileSystem> {
         // The number has 32 bits; the field is wider and signed on some machines.
         Ok(FileSystem::from_magic(rustix::fs::statfs(folder)?.f_type as u32))
     }
 
-    /// Of a folder.
+    /// The kind of a folder's file system.
     ///
     /// # Errors
-    /// None here.
+    /// Never on this system.
     #[cfg(not(target_os = "linux"))]
     pub fn of(_folder: &Path) -> io::Result<FileSystem> {
         Ok(FileSystem::Local)
     }
 }
 
-/// Bytes that this user may still write to the drive of `folder`; `None` where the system does not tell.
+/// Bytes that this user may still write to the drive of `folder`; `None` if the system does not tell.
 ///
 /// # Errors
-/// The folder cannot be asked.
+/// The system call fails.
 pub fn free_bytes(folder: &Path) -> io::Result<Option<u64>> {
     #[cfg(unix)]
     {
@@ -92,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn kinds_are_told_by_their_number() {
+    fn kinds_follow_from_their_number() {
         let numbers = [
             (0xef53, FileSystem::Local),      // ext4
             (0x5846_5342, FileSystem::Local), // XFS
@@ -116,7 +115,7 @@ mod tests {
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn memory_is_told_from_drives() {
+    fn memory_is_distinguished_from_drives() {
         assert!(FileSystem::of(Path::new("/nowhere")).is_err());
         assert!(free_bytes(&std::env::temp_dir()).unwrap().is_some_and(|bytes| bytes > 0));
         let memory = Path::new("/dev/shm");

@@ -1,4 +1,4 @@
-//! The folder of a store: made, checked, locked, cleaned up.
+//! The folder of a store: creation, checks, lock, clean-up.
 
 pub mod file_system;
 pub mod protocol_files;

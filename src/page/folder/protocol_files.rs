@@ -1,7 +1,8 @@
-//! The folder of a store as the commit protocol sees it: a few files by name, and making their entries durable.
+//! The folder of a store as the commit protocol uses it: a few files by name, and syncs of folder entries.
 //!
-//! Invariants: 1. an entry is durable only after [`Folder::sync`]; 2. names are the protocol's own constants, so nothing
-//! outside the folder is reached; a symbolic link in place of a file is an error; 3. new files belong to their owner alone.
+//! Invariants: 1. an entry is durable only after [`Folder::sync`]; 2. names are the protocol's own constants, so
+//! nothing outside the folder is accessed; a symbolic link in place of a file is an error; 3. only the owner can access
+//! new files.
 
 use crate::page::engine::segment_files::{sync_folder, with_safe_flags};
 use crate::page::map::map_file::DriveFile;
@@ -13,25 +14,25 @@ use std::sync::Arc;
 
 /// Files of one folder.
 pub trait Folder: Send {
-    /// The file `name` for reading and writing; `None` if there is none.
+    /// Opens the file `name` for reading and writing; `None` if it does not exist.
     ///
     /// # Errors
-    /// It is there and cannot be opened.
+    /// The file exists and cannot be opened.
     fn open(&self, name: &str) -> io::Result<Option<Arc<dyn StorageBackend>>>;
 
-    /// A new, empty file `name`, in place of one that may be there.
+    /// Creates an empty file `name`, replacing an existing one.
     ///
     /// # Errors
     /// The folder cannot be written.
     fn create(&self, name: &str) -> io::Result<Arc<dyn StorageBackend>>;
 
-    /// Gives the file `from` the name `to`, in place of one that may have it.
+    /// Renames the file `from` to `to`, replacing an existing one.
     ///
     /// # Errors
-    /// There is no such file, or the folder cannot be written.
+    /// The file does not exist, or the folder cannot be written.
     fn rename(&self, from: &str, to: &str) -> io::Result<()>;
 
-    /// Takes the file `name` away; nothing happens if there is none.
+    /// Removes the file `name`, if it exists.
     ///
     /// # Errors
     /// The folder cannot be written.
@@ -40,7 +41,7 @@ pub trait Folder: Send {
     /// Makes the entries of the folder durable.
     ///
     /// # Errors
-    /// The drive reported an error: entries made since the last time may be lost.
+    /// The drive reported an error: entries changed since the last sync may be lost.
     fn sync(&self) -> io::Result<()>;
 }
 

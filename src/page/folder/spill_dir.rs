@@ -1,9 +1,9 @@
-//! A folder on a drive that belongs to one run: made, checked, locked, and cleaned up.
+//! The spill directory: a folder on a drive that belongs to one run; created, checked, locked, and cleaned up here.
 //!
-//! Knows files, not pages. Invariants: 1. nothing in the folder is changed before it is certain that the folder is
-//! empty or one of this program's, belongs to this user, and no other process uses it; 2. only files that this
-//! program made are ever removed, told by name and by the store's identity inside; 3. no symbolic link is followed,
-//! neither to the folder nor in it; 4. what is made is private to the user.
+//! Knows files, not pages. Invariants: 1. nothing in the folder changes before it is certain that the folder is empty
+//! or a spill directory, belongs to this user, and no other process uses it; 2. only files that this program created
+//! are ever removed, recognised by name and by the store's identity inside; 3. no symbolic link is followed, neither to
+//! the folder nor in it; 4. new files are private to the user.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
@@ -19,27 +19,27 @@ use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
 pub(in crate::page) const FORMAT: &str = "FORMAT";
-/// The file while it is written; then it is renamed.
+/// The FORMAT file while it is written; renamed when complete.
 const FORMAT_NEW: &str = "FORMAT.new";
 pub(in crate::page) const LOCK: &str = "LOCK";
-/// First line of the lock's file, to tell it from somebody else's.
+/// First line of the lock file, which distinguishes it from a foreign file.
 pub(in crate::page) const LOCK_MAGIC: &str = "gsscale spill directory\n";
 const OTHER_FOLDER: &str = "name another folder";
 
-/// A spill directory in use by this process. The lock is held until it is dropped.
+/// A spill directory in use by this process. Dropping it releases the lock.
 #[derive(Debug)]
 pub struct SpillDir {
     folder: PathBuf,
     format: SpillFormat,
     warnings: Vec<String>,
-    /// Whether this process made the folder itself, and so may remove it.
+    /// Whether this process created the folder, and so may remove it.
     made_folder: bool,
     /// Holds the lock.
     lock: File,
 }
 
 impl SpillDir {
-    /// Makes a spill directory of a folder that does not exist (its parent does) or is empty. With `allow_remote`,
+    /// Creates a spill directory in a folder that does not exist (its parent does) or is empty. With `allow_remote`,
     /// also on a network file system.
     ///
     /// # Errors
@@ -49,7 +49,7 @@ impl SpillDir {
         let made_folder = make_folder(folder)?;
         let result = SpillDir::create_in(folder, purpose, layout, allow_remote, made_folder);
         if result.is_err() && made_folder {
-            // Only if it is still empty; what is in it by now is somebody's.
+            // Removes the folder only if it is still empty; any content belongs to somebody else.
             let _ = std::fs::remove_dir(folder);
         }
         result
@@ -66,17 +66,18 @@ impl SpillDir {
         let warnings = check_file_system(folder, allow_remote)?;
         refuse_foreign_files(folder)?;
         let lock = take_lock(folder)?;
-        // Again: it may have been made just now.
+        // Checked again under the lock: another process may have created a store just now.
         match read_format(folder)? {
             None => {}
             Some(Ok(SpillFormat { purpose: Purpose::Scratch, .. })) => {
-                let problem = "it holds the pages of a run that was cut off; they are of no use to another";
+                let problem =
+                    "it holds the pages of an interrupted run without a checkpoint, which no other run can use";
                 let remedy = format!("remove the folder (rm -r {}) or {OTHER_FOLDER}", folder.display());
                 return Err(InputError::new(folder, problem, remedy));
             }
             Some(Ok(_)) => {
                 let remedy = format!(
-                    "go on with that run (gsscale-train --resume with its output folder), remove the folder (rm -r {}) or \
+                    "continue that run (gsscale-train --resume with its output folder), remove the folder (rm -r {}) or \
                      {OTHER_FOLDER}",
                     folder.display()
                 );
@@ -84,17 +85,17 @@ impl SpillDir {
             }
             Some(Err(error)) => return Err(bad_format(folder, &error)),
         }
-        tighten(folder)?;
+        make_private(folder)?;
         sign_lock(folder, &lock)?;
         let format = SpillFormat { store: draw_identity(), purpose, layout };
         write_format(folder, &format)?;
         Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder, lock })
     }
 
-    /// Opens a spill directory that exists.
+    /// Opens an existing spill directory.
     ///
     /// # Errors
-    /// As for [`SpillDir::create`], or there is none, or it is of a newer version or damaged.
+    /// As for [`SpillDir::create`]; also if there is none, or it is damaged or of a newer version.
     pub fn open(folder: &Path, allow_remote: bool) -> InputResult<SpillDir> {
         check_folder(folder)?;
         let warnings = check_file_system(folder, allow_remote)?;
@@ -102,10 +103,10 @@ impl SpillDir {
             Some(format) => format.map_err(|error| bad_format(folder, &error)),
             None => {
                 let remedy = "give the folder that was named by --spill-dir";
-                Err(InputError::new(folder, "it is no spill directory: there is no FORMAT file", remedy))
+                Err(InputError::new(folder, "it is not a spill directory: it has no FORMAT file", remedy))
             }
         };
-        // Asked before the lock is made as well, so that a folder of somebody else stays as it is.
+        // The first read comes before the lock file is created, so that a foreign folder stays unchanged.
         read()?;
         let lock = take_lock(folder)?;
         let format = read()?;
@@ -113,8 +114,8 @@ impl SpillDir {
         Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder: false, lock })
     }
 
-    /// Whether there is one, of whatever version and in whatever state, without touching it.
-    pub fn is_one(folder: &Path) -> bool {
+    /// Whether `folder` contains a spill directory of any version and in any state; changes nothing.
+    pub fn exists_in(folder: &Path) -> bool {
         !matches!(read_format(folder), Ok(None))
     }
 
@@ -123,25 +124,25 @@ impl SpillDir {
         &self.folder
     }
 
-    /// Identity and sizes.
+    /// Identity of the store and sizes of its slots.
     pub fn format(&self) -> &SpillFormat {
         &self.format
     }
 
-    /// What the user should know about the drive.
+    /// Warnings about the drive, for the user.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
 
-    /// Bytes that may still be written to the drive; `None` where the system does not tell.
+    /// Bytes that may still be written to the drive; `None` if the system does not tell.
     ///
     /// # Errors
-    /// The folder is gone.
+    /// The folder no longer exists.
     pub fn free_bytes(&self) -> InputResult<Option<u64>> {
-        free_bytes(&self.folder).map_err(|e| InputError::io(&self.folder, "asking for free space", &e))
+        free_bytes(&self.folder).map_err(|e| InputError::io(&self.folder, "reading the free space", &e))
     }
 
-    /// Numbers of the segments that are there, ascending.
+    /// Numbers of the existing segments, ascending.
     ///
     /// # Errors
     /// The folder cannot be read.
@@ -151,24 +152,24 @@ impl SpillDir {
         Ok(segments)
     }
 
-    /// Refuses a folder whose lock or FORMAT file is no longer the one that this process holds: somebody removed the store
-    /// and made another one under the same path.
+    /// Refuses a folder whose lock or FORMAT file is no longer the one that this process holds: somebody removed the
+    /// store and created another one under the same path.
     fn check_identity(&self) -> InputResult<()> {
-        let is_same_lock = is_still_there(&self.folder.join(LOCK), &self.lock);
+        let is_same_lock = is_same_file(&self.folder.join(LOCK), &self.lock);
         let is_same_store = matches!(read_format(&self.folder)?, Some(Ok(format)) if format.store == self.format.store);
         if is_same_lock && is_same_store {
             return Ok(());
         }
-        let problem = "the store in it is not the one that this run used, so nothing in it is removed";
-        let remedy = format!("see what it holds: gsscale-ckpt ls {}", self.folder.display());
+        let problem = "another store has replaced the one of this run, so nothing was removed";
+        let remedy = format!("look at that store: gsscale-ckpt ls {}", self.folder.display());
         Err(InputError::new(&self.folder, problem, remedy))
     }
 
-    /// Removes the files of this store, and the folder if this process made it. Gives the names of files that stay
-    /// because they are not this store's.
+    /// Removes the files of this store, and the folder if this process created it. Returns the names of files that stay
+    /// because they do not belong to this store.
     ///
     /// # Errors
-    /// Another store has taken the place of this one (nothing is removed), or a file cannot be removed.
+    /// Another store has replaced this one (then nothing is removed), or a file cannot be removed.
     pub fn remove(self) -> InputResult<Vec<String>> {
         self.check_identity()?;
         let mut foreign = Vec::new();
@@ -207,8 +208,8 @@ impl SpillDir {
         Ok(foreign)
     }
 
-    /// Whether a segment's first slot is of this store or was never written (also where the process ended while the
-    /// segment was made).
+    /// Whether a segment's first slot belongs to this store or was never written (also after a crash during the
+    /// segment's creation).
     fn is_our_segment(&self, path: &Path) -> bool {
         let mut header = Vec::new();
         let file = with_safe_flags(OpenOptions::new().read(true)).open(path);
@@ -226,7 +227,7 @@ impl SpillDir {
     }
 }
 
-/// Makes the folder, private, if there is nothing of that name. Tells whether it did.
+/// Creates the folder, private, if the name is free. Returns whether it did.
 fn make_folder(folder: &Path) -> InputResult<bool> {
     let mut builder = std::fs::DirBuilder::new();
     #[cfg(unix)]
@@ -237,15 +238,15 @@ fn make_folder(folder: &Path) -> InputResult<bool> {
     match builder.create(folder) {
         Ok(()) => Ok(true),
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(false),
-        Err(error) => Err(InputError::io(folder, "making the spill directory", &error)),
+        Err(error) => Err(InputError::io(folder, "creating the spill directory", &error)),
     }
 }
 
-/// The folder itself: not a link, this user's, not writable by others.
+/// Checks the folder itself: not a link, owned by this user, not writable by others.
 fn check_folder(folder: &Path) -> InputResult<()> {
-    let there = std::fs::symlink_metadata(folder).map_err(|e| InputError::io(folder, "looking at it", &e))?;
+    let there = std::fs::symlink_metadata(folder).map_err(|e| InputError::io(folder, "reading its metadata", &e))?;
     if there.is_symlink() {
-        let remedy = "name the folder that it leads to";
+        let remedy = "name the folder that the link points to";
         return Err(InputError::new(folder, "the spill directory is a symbolic link", remedy));
     }
     if !there.is_dir() {
@@ -257,8 +258,8 @@ fn check_folder(folder: &Path) -> InputResult<()> {
         check_owner(folder, there.uid(), rustix::process::geteuid().as_raw())?;
         let is_empty = names(folder)?.is_empty();
         if there.mode() & 0o022 != 0 && !is_empty {
-            let remedy = format!("take the right from them: chmod go-w {}", folder.display());
-            return Err(InputError::new(folder, "other users may write to it", remedy));
+            let remedy = format!("remove their permission: chmod go-w {}", folder.display());
+            return Err(InputError::new(folder, "other users have write permission", remedy));
         }
     }
     Ok(())
@@ -273,8 +274,8 @@ fn check_owner(folder: &Path, owner: u32, user: u32) -> InputResult<()> {
     Err(InputError::new(folder, problem, "name a folder of your own"))
 }
 
-/// An empty folder becomes private.
-fn tighten(folder: &Path) -> InputResult<()> {
+/// Makes an empty folder private.
+fn make_private(folder: &Path) -> InputResult<()> {
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt;
@@ -286,21 +287,21 @@ fn tighten(folder: &Path) -> InputResult<()> {
 }
 
 fn check_file_system(folder: &Path, allow_remote: bool) -> InputResult<Vec<String>> {
-    let kind = FileSystem::of(folder).map_err(|e| InputError::io(folder, "asking for its file system", &e))?;
+    let kind = FileSystem::of(folder).map_err(|e| InputError::io(folder, "reading its file system type", &e))?;
     warnings_for(folder, kind, allow_remote)
 }
 
-/// What to say about a kind of file system.
+/// Warnings about a kind of file system.
 fn warnings_for(folder: &Path, kind: FileSystem, allow_remote: bool) -> InputResult<Vec<String>> {
     let name = folder.display();
     match kind {
         FileSystem::Local => Ok(Vec::new()),
-        FileSystem::Memory => Ok(vec![format!("{name} is on tmpfs: pages that are spilled there take memory")]),
+        FileSystem::Memory => Ok(vec![format!("{name} is on tmpfs: spilled pages take memory there")]),
         FileSystem::Overlay => {
             Ok(vec![format!("{name} is on overlayfs, the file system of a container: a mounted drive is faster")])
         }
         FileSystem::Remote(what) if allow_remote => {
-            Ok(vec![format!("{name} is on {what}: locks and syncs may not hold what they promise there")])
+            Ok(vec![format!("{name} is on {what}: locks and syncs may be unreliable there")])
         }
         FileSystem::Remote(what) => {
             let remedy = "name a folder on a drive of this machine";
@@ -309,7 +310,7 @@ fn warnings_for(folder: &Path, kind: FileSystem, allow_remote: bool) -> InputRes
     }
 }
 
-/// Refuses a folder with files that are not a spill directory's.
+/// Refuses a folder that contains files foreign to a spill directory.
 fn refuse_foreign_files(folder: &Path) -> InputResult<()> {
     match read_format(folder)? {
         Some(Ok(_)) => return Ok(()),
@@ -317,17 +318,17 @@ fn refuse_foreign_files(folder: &Path) -> InputResult<()> {
         None => {}
     }
     let names = names(folder)?;
-    // A run that was cut off before its FORMAT file was there leaves these.
+    // A run that was interrupted before it wrote its FORMAT file leaves these.
     match names.iter().find(|n| ![LOCK, FORMAT_NEW].contains(&n.as_str())) {
         None => Ok(()),
         Some(foreign) => {
-            let problem = format!("it is not empty (there is {foreign:?}) and no spill directory");
+            let problem = format!("it is neither empty nor a spill directory (it contains {foreign:?})");
             Err(InputError::new(folder, problem, "name an empty folder, or one that does not exist"))
         }
     }
 }
 
-/// Names in the folder, sorted. Names that are not UTF-8 are kept readable; no file of this program has one.
+/// Names in the folder, sorted. Names that are not UTF-8 are made printable; no file of this program has one.
 fn names(folder: &Path) -> InputResult<Vec<String>> {
     let failed = |e: io::Error| InputError::io(folder, "reading the folder", &e);
     let mut names = Vec::new();
@@ -342,17 +343,17 @@ fn names(folder: &Path) -> InputResult<Vec<String>> {
 fn take_lock(folder: &Path) -> InputResult<File> {
     let path = folder.join(LOCK);
     let failed = |e: io::Error| InputError::io(&path, "locking the spill directory", &e);
-    // A process that ends may remove the file between our opening and locking it; then there is a new one to lock.
+    // A process that ends may remove the file between open and lock here; then there is a new file to lock.
     for _ in 0..16 {
         let mut options = OpenOptions::new();
         let file = with_safe_flags(options.read(true).write(true).create(true).truncate(false)).open(&path);
         let mut file = file.map_err(failed)?;
         let mut content = String::new();
-        // A foreign file may be anything, of any length.
+        // A foreign file may be of any kind and length.
         let is_file = file.metadata().is_ok_and(|m| m.is_file());
         let is_text = is_file && Read::by_ref(&mut file).take(512).read_to_string(&mut content).is_ok();
         if !is_text || !(content.is_empty() || content.starts_with(LOCK_MAGIC)) {
-            return Err(InputError::new(path, "it is a file of something else", OTHER_FOLDER));
+            return Err(InputError::new(path, "this LOCK file is not from gsscale", OTHER_FOLDER));
         }
         match file.try_lock() {
             Ok(()) => {}
@@ -364,14 +365,18 @@ fn take_lock(folder: &Path) -> InputResult<File> {
             }
             Err(TryLockError::Error(error)) => return Err(failed(error)),
         }
-        if is_still_there(&path, &file) {
+        if is_same_file(&path, &file) {
             return Ok(file);
         }
     }
-    Err(InputError::new(path, "it is removed again and again", "see which other process uses the folder"))
+    Err(InputError::new(
+        path,
+        "another process keeps removing this file",
+        "find out which other process uses the folder",
+    ))
 }
 
-/// Says in the lock's file who holds it, for the message to others.
+/// Writes the lock's holder into the lock file, for the message to other processes.
 fn sign_lock(folder: &Path, mut lock: &File) -> InputResult<()> {
     use std::io::Seek;
     let content = format!("{LOCK_MAGIC}process {}\nhost {}\n", std::process::id(), host_name());
@@ -380,15 +385,15 @@ fn sign_lock(folder: &Path, mut lock: &File) -> InputResult<()> {
 }
 
 #[cfg(unix)]
-fn is_still_there(path: &Path, file: &File) -> bool {
+fn is_same_file(path: &Path, file: &File) -> bool {
     use std::os::unix::fs::MetadataExt;
     let same = |a: &std::fs::Metadata, b: &std::fs::Metadata| a.dev() == b.dev() && a.ino() == b.ino();
     matches!((std::fs::symlink_metadata(path), file.metadata()), (Ok(a), Ok(b)) if same(&a, &b))
 }
 
 #[cfg(not(unix))]
-fn is_still_there(_path: &Path, _file: &File) -> bool {
-    // A file that is open cannot be removed there.
+fn is_same_file(_path: &Path, _file: &File) -> bool {
+    // These systems do not let anyone remove an open file.
     true
 }
 
@@ -397,12 +402,12 @@ fn host_name() -> String {
     name.map_or_else(|| "unknown".to_string(), |n| n.trim().to_string())
 }
 
-/// What the FORMAT file says; `None` when there is none.
+/// Content of the FORMAT file; `None` if there is none.
 pub(in crate::page) fn read_format(folder: &Path) -> InputResult<Option<Result<SpillFormat, FormatError>>> {
     Ok(format_bytes_of(folder)?.map(|bytes| SpillFormat::from_bytes(&bytes)))
 }
 
-/// The bytes of the FORMAT file, empty for one that is no file; `None` when there is none.
+/// Bytes of the FORMAT file, empty if it is not a regular file; `None` if there is none.
 pub(in crate::page) fn format_bytes_of(folder: &Path) -> InputResult<Option<Vec<u8>>> {
     let path = folder.join(FORMAT);
     let failed = |e: io::Error| InputError::io(&path, "reading", &e);
@@ -421,14 +426,14 @@ pub(in crate::page) fn format_bytes_of(folder: &Path) -> InputResult<Option<Vec<
 pub(in crate::page) fn bad_format(folder: &Path, error: &FormatError) -> InputError {
     let remedy = match error {
         FormatError::Version { .. } | FormatError::Features { .. } => {
-            "use the program that made it, or name another folder"
+            "use the program version that created it, or name another folder"
         }
         _ => OTHER_FOLDER,
     };
     InputError::new(folder.join(FORMAT), error.to_string(), remedy)
 }
 
-/// Writes the FORMAT file: whole or not at all, durable before anything else is.
+/// Writes the FORMAT file atomically, durable before anything else is.
 fn write_format(folder: &Path, format: &SpillFormat) -> InputResult<()> {
     let (new, path) = (folder.join(FORMAT_NEW), folder.join(FORMAT));
     let write = || {
@@ -437,7 +442,7 @@ fn write_format(folder: &Path, format: &SpillFormat) -> InputResult<()> {
         file.sync_all()?;
         std::fs::rename(&new, &path)?;
         sync_folder(folder)?;
-        // The folder's own entry: its parent may not be ours to open, then the first sync of a file has to do.
+        // The folder's own entry. If its parent cannot be opened, the first sync of a file must suffice.
         let _ = folder.parent().map(sync_folder);
         Ok(())
     };
@@ -460,7 +465,7 @@ mod tests {
         assert!(warnings_for(folder, FileSystem::Local, false).unwrap().is_empty());
     }
 
-    /// Root passes every check of rights, so the rule is tested by itself.
+    /// Root passes every permission check, so the rule is tested directly.
     #[cfg(unix)]
     #[test]
     fn folders_of_others_are_refused() {

@@ -1,10 +1,10 @@
-//! Stores in which nothing was ever committed: how they are told from checkpoints, and how the next run gets their folder.
+//! Stores without a commit: how to tell them from checkpoints, and their removal for the next run.
 //!
-//! A process that is killed before its first commit leaves a FORMAT file and perhaps segments. No run can go on from
-//! them, so nothing is lost when they are removed.
+//! A process that is killed before its first commit leaves a FORMAT file and perhaps segments. No run can resume from
+//! them, so removing them loses nothing.
 //!
-//! Invariants: 1. a store that cannot be opened counts as a checkpoint and is left alone; 2. the lock of the store is held
-//! from the first look to the last file that is removed.
+//! Invariants: 1. a store that cannot be opened counts as a checkpoint and stays; 2. the store's lock is held from the
+//! first check to the removal of the last file.
 
 use crate::base::error::InputResult;
 use crate::page::folder::spill_dir::SpillDir;
@@ -14,8 +14,8 @@ use crate::page::tool::reading::{latest_generation, segments_in};
 use std::path::Path;
 
 impl SpillDir {
-    /// Whether the store is known to hold no commit: its map says so, or it has neither a map nor a segment (a process was
-    /// killed while it made the store, or while it removed the store).
+    /// Whether the store certainly holds no commit: its map says so, or it has neither a map nor a segment (a process
+    /// was killed while it created or removed the store).
     ///
     /// # Errors
     /// The folder cannot be read.
@@ -27,13 +27,13 @@ impl SpillDir {
     }
 }
 
-/// Removes the store in `folder` if it holds no commit, so that a run can make its own there. Tells whether there was one.
-/// Everything else stays as it is: no store, a checkpoint, a store that cannot be opened or is in use.
+/// Removes the store in `folder` if it holds no commit, so that a run can create its own there. Returns whether it did.
+/// Everything else stays unchanged: no store, a checkpoint, a store that cannot be opened or is in use.
 ///
 /// # Errors
 /// A file of the store cannot be removed.
 pub fn remove_uncommitted(folder: &Path, allow_remote: bool) -> InputResult<bool> {
-    // Why a folder cannot be used is said where a store is made in it.
+    // Creating a store in this folder will report why it cannot be used.
     let Ok(spill) = SpillDir::open(folder, allow_remote) else { return Ok(false) };
     if spill.format().purpose != Purpose::Checkpoint || !spill.holds_no_commit()? {
         return Ok(false);

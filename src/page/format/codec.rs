@@ -1,8 +1,8 @@
-//! How payloads are stored: as they are, or shuffled and compressed.
+//! Codecs of payloads: raw, halves, or shuffled and compressed.
 //!
-//! Invariants: 1. decoding gives exactly the length that the index says or an error, whatever the bytes are, and
-//! never more memory than that; 2. a payload that does not become smaller is stored raw, so the stored form is never
-//! longer than the payload; 3. the same payload gives the same bytes on every machine and any number of threads.
+//! Invariants: 1. decoding yields exactly the length that the index states or an error, for any bytes, and takes no
+//! more memory than that; 2. a payload that compression does not shorten is stored raw, so the stored form is never
+//! longer than the payload; 3. the same payload gives the same bytes on every machine and for any number of threads.
 
 use crate::page::format::halves;
 use crate::page::format::slot_header::StoredAs;
@@ -10,23 +10,24 @@ use std::cell::RefCell;
 use std::io;
 use zstd::zstd_safe::CParameter;
 
-/// Bytes of a word whose bytes the shuffle takes apart: payloads are mostly 32-bit floats.
+/// Bytes per word of the shuffle: payloads are mostly 32-bit floats.
 const WORD: usize = 4;
-/// Levels of zstd that are worth offering.
+/// The zstd levels on offer.
 const LEVELS: std::ops::RangeInclusive<i32> = 1..=19;
 
-/// How pages are to be stored.
+/// The codec of new versions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Codec {
-    /// As they are: no work, no copy.
+    /// Stored unchanged: no work, no copy.
     #[default]
     Raw,
-    /// Bytes shuffled, then zstd at this level. Pays on drives below about 1 GB/s.
+    /// Bytes shuffled, then zstd at this level. Pays on drives below about 0.5 GB/s.
     Zstd {
         /// 1 to 19.
         level: i32,
     },
-    /// Lines of 32-bit words with empty lower halves take half: for moments of 16 bits. One cheap pass.
+    /// 64-byte lines whose 32-bit words all have an empty lower half take half the bytes: for 16-bit moments. One cheap
+    /// pass.
     Halves,
 }
 
@@ -39,7 +40,7 @@ impl std::str::FromStr for Codec {
             ("raw", _) => Ok(Codec::Raw),
             ("halves", _) => Ok(Codec::Halves),
             (_, Some(level)) if LEVELS.contains(&level) => Ok(Codec::Zstd { level }),
-            _ => Err(format!("`{text}` is no codec: write raw, halves, or zstd:1 to zstd:{}", LEVELS.end())),
+            _ => Err(format!("unknown codec `{text}`: write raw, halves, or zstd:1 to zstd:{}", LEVELS.end())),
         }
     }
 }
@@ -54,7 +55,7 @@ impl std::fmt::Display for Codec {
     }
 }
 
-/// Memory that encoding and decoding of one thread uses again and again.
+/// Scratch memory of one thread, reused by encoding and decoding.
 #[derive(Default)]
 struct Scratch {
     shuffled: Vec<u8>,
@@ -66,11 +67,11 @@ thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
-/// Encodes `payload` into `stored`, which is at least as long; gives the length of the result and how it is stored. `None`
-/// if it would not become smaller, or for [`Codec::Raw`].
+/// Encodes `payload` into `stored`, which is at least as long; returns the length and the form. `None` for
+/// [`Codec::Raw`], or if the result would not be shorter.
 ///
 /// # Errors
-/// zstd refuses the level or memory.
+/// zstd refuses the level, or runs out of memory.
 pub fn encode_as(codec: Codec, payload: &[u8], stored: &mut [u8]) -> io::Result<Option<(usize, StoredAs)>> {
     match codec {
         Codec::Raw => Ok(None),
@@ -80,11 +81,11 @@ pub fn encode_as(codec: Codec, payload: &[u8], stored: &mut [u8]) -> io::Result<
     }
 }
 
-/// Shuffles and compresses `payload` into `stored`, which is at least as long; gives the length. `None` if it would not
-/// become smaller (`stored` then holds nothing of use).
+/// Shuffles and compresses `payload` into `stored`, which is at least as long; returns the length. `None` if the result
+/// would not be shorter (`stored` then holds garbage).
 ///
 /// # Errors
-/// zstd refuses the level or memory.
+/// zstd refuses the level, or runs out of memory.
 fn encode(payload: &[u8], level: i32, stored: &mut [u8]) -> io::Result<Option<usize>> {
     SCRATCH.with_borrow_mut(|scratch| {
         scratch.shuffled.resize(payload.len(), 0);
@@ -97,21 +98,21 @@ fn encode(payload: &[u8], level: i32, stored: &mut [u8]) -> io::Result<Option<us
         let room = payload.len().saturating_sub(1).min(stored.len());
         match compressor.compress_to_buffer(&scratch.shuffled, &mut stored[..room]) {
             Ok(bytes) => Ok(Some(bytes)),
-            // The one failure that input can cause: no room, which means not smaller.
+            // The only failure that input can cause: the result does not fit, so it is not shorter.
             Err(_) => Ok(None),
         }
     })
 }
 
-/// Decodes `stored` into all of `payload`.
+/// Decodes `stored` so that it fills `payload`.
 ///
 /// # Errors
-/// The bytes are damaged, or are not `payload.len()` bytes when decoded.
+/// The bytes are damaged, or do not decode to `payload.len()` bytes.
 pub fn decode(stored: &[u8], codec: StoredAs, payload: &mut [u8]) -> io::Result<()> {
     let wrong = |what: &str| io::Error::new(io::ErrorKind::InvalidData, what.to_string());
     match codec {
         StoredAs::Raw if stored.len() == payload.len() => payload.copy_from_slice(stored),
-        StoredAs::Raw => return Err(wrong("the stored length is not the payload's")),
+        StoredAs::Raw => return Err(wrong("the stored length differs from the payload's")),
         StoredAs::Halves => halves::decode(stored, payload).map_err(|e| wrong(&e.to_string()))?,
         StoredAs::ShuffledZstd => SCRATCH.with_borrow_mut(|scratch| {
             let decompressor = match &mut scratch.decompressor {
@@ -119,10 +120,10 @@ pub fn decode(stored: &[u8], codec: StoredAs, payload: &mut [u8]) -> io::Result<
                 none => none.insert(zstd::bulk::Decompressor::new()?),
             };
             scratch.shuffled.resize(payload.len(), 0);
-            // In one call, straight to where the bytes belong: a window named by the frame takes no memory.
+            // A single call that writes to the final buffer: a huge window stated by the frame takes no memory.
             let bytes = decompressor.decompress_to_buffer(stored, scratch.shuffled.as_mut_slice())?;
             if bytes != payload.len() {
-                return Err(wrong("the payload is shorter than it should be when decoded"));
+                return Err(wrong("the decoded payload is too short"));
             }
             unshuffle(&scratch.shuffled, payload);
             Ok(())
@@ -131,7 +132,7 @@ pub fn decode(stored: &[u8], codec: StoredAs, payload: &mut [u8]) -> io::Result<
     Ok(())
 }
 
-/// All first bytes of the words, then all second bytes, and so on; a rest shorter than a word stays at the end.
+/// The first bytes of all words, then all second bytes, and so on; a remainder shorter than a word stays at the end.
 fn shuffle(from: &[u8], to: &mut [u8]) {
     let words = from.len() / WORD;
     for (lane, lane_bytes) in to[..words * WORD].chunks_exact_mut(words.max(1)).enumerate() {
@@ -169,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn payloads_come_back_to_the_bit() {
+    fn payloads_round_trip_bit_for_bit() {
         for n in [1, 255, 256, 4096, 186_368] {
             for rest in [0, 1, 3] {
                 let mut payload = floats(n);
@@ -190,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_become_smaller_stays_raw() {
+    fn incompressible_payloads_stay_raw() {
         let payload = noise(10_000);
         assert_eq!(encode(&payload, 1, &mut vec![0; 10_000]).unwrap(), None);
         assert_eq!(encode(&[], 1, &mut []).unwrap(), None);
@@ -200,7 +201,8 @@ mod tests {
         assert!(decode(&payload, StoredAs::Raw, &mut back[1..]).is_err());
     }
 
-    /// Too long, too short, cut, damaged, a window of gigabytes: an error, in memory of the payload's size.
+    /// Too long, too short, cut, damaged, a window of gigabytes: each gives an error, within memory of the payload's
+    /// size.
     #[test]
     fn hostile_bytes_end_in_an_error() {
         let payload = floats(4096);
@@ -217,7 +219,8 @@ mod tests {
             let mut damaged = stored.to_vec();
             let at = mix64(seed) as usize % damaged.len();
             damaged[at] ^= 1 << (seed % 8);
-            // Without its checksum (the store checks that first) a flipped literal may decode; it may not do more.
+            // Without its checksum (which the store checks first) a flipped literal may decode; memory and length stay
+            // bounded.
             let _ = read(&damaged, payload.len());
         }
         let bomb = zstd::bulk::compress(&vec![0; 64 << 20], 1).unwrap();
@@ -241,13 +244,13 @@ mod tests {
     }
 
     #[test]
-    fn halved_lines_come_back_and_what_gains_nothing_is_raw() {
+    fn halved_lines_round_trip_and_useless_halving_stays_raw() {
         let mut payload = vec![0u8; 4096];
         payload.chunks_exact_mut(4).for_each(|word| word[2..].copy_from_slice(&[0x80, 0x3f]));
         payload[100] = 7;
         let mut stored = vec![0; 4096];
         let (bytes, stored_as) = encode_as(Codec::Halves, &payload, &mut stored).unwrap().unwrap();
-        // A table of one line, 63 halved lines and one whole.
+        // A table of one line, 63 halved lines and a whole one.
         assert_eq!((bytes, stored_as), (64 + 63 * 32 + 64, StoredAs::Halves));
         let mut back = vec![1; 4096];
         decode(&stored[..bytes], stored_as, &mut back).unwrap();

@@ -1,37 +1,36 @@
-//! Small structs as bytes, for the index and the state of a run on the drive. The only file that knows which library
-//! does it.
+//! Small structs as bytes, for the index and the run state. The only file that knows the serialisation library.
 //!
-//! Invariants: 1. numbers are little-endian and of fixed length, so that equal values have equal bytes in every
-//! version of the program; 2. bytes that nobody vouches for take no more memory than their own length asks for, and a
-//! value must use up all of them. Types with lists of things without bytes (`Vec<()>`) do not belong here: their
-//! length would be believed.
+//! Invariants: 1. numbers are little-endian and of fixed length, so that equal values have equal bytes in every version
+//! of the program; 2. decoding untrusted bytes allocates no more than their length allows, and must consume all of
+//! them. Types with lists of zero-sized elements (`Vec<()>`) are not allowed: the length of such a list cannot be
+//! checked.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-/// Bytes that are not a value of the type, or a value that has no bytes.
+/// The bytes are not a value of the type, or the value cannot be encoded.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("not what should be here: {0}")]
+#[error("the bytes cannot be decoded: {0}")]
 pub struct EncodingError(String);
 
 /// Longest value, bytes.
 pub const VALUE_BYTES_MAX: usize = 256 << 20;
 
-/// A value as bytes.
+/// Encodes a value.
 ///
 /// # Errors
-/// The type holds something that cannot be written, such as a list of unknown length.
+/// The type contains something that cannot be encoded, such as a list of unknown length.
 pub fn to_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, EncodingError> {
     bincode::serde::encode_to_vec(value, bincode::config::legacy()).map_err(|e| EncodingError(e.to_string()))
 }
 
-/// The value that [`to_bytes`] made these bytes of.
+/// Decodes the bytes of [`to_bytes`].
 ///
 /// # Errors
 /// The bytes are not exactly one value of the type.
 pub fn from_bytes<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EncodingError> {
-    // A length inside the bytes is believed up to the limit, and the limit must be known to the compiler: so the
-    // smallest of these that holds the bytes.
+    // The decoder trusts lengths inside the bytes up to a limit that is a compile-time constant: take the smallest of
+    // these limits that holds the bytes.
     match bytes.len() {
         0..=0x100 => from_limited::<T, 0x100>(bytes),
         0x101..=0x1000 => from_limited::<T, 0x1000>(bytes),
@@ -70,7 +69,7 @@ mod tests {
     }
 
     #[test]
-    fn values_come_back_and_their_bytes_do_not_move() {
+    fn values_round_trip_and_their_encoding_is_fixed() {
         let bytes = to_bytes(&sample()).unwrap();
         assert_eq!(from_bytes::<Sample>(&bytes).unwrap(), sample());
         // Fixed lengths: 4, then 8 + 2 x 4, then 8 + 6, then 1 + 8.
@@ -84,7 +83,7 @@ mod tests {
         assert!((0..bytes.len()).all(|cut| from_bytes::<Sample>(&bytes[..cut]).is_err()));
         let longer = [bytes.as_slice(), &[0]].concat();
         assert!(from_bytes::<Sample>(&longer).unwrap_err().to_string().contains("1 bytes are left over"));
-        // Lengths of lists and strings beyond all bytes.
+        // Lengths of lists and strings that exceed the bytes.
         for at in [4, 20] {
             let mut huge = bytes.clone();
             huge[at..at + 8].fill(0x7f);

@@ -1,23 +1,24 @@
-//! Bytes of which many 32-bit words have an empty lower half: those lines are stored as their upper halves alone.
+//! A codec for payloads in which many 32-bit words have an empty lower half: such lines are stored as their upper
+//! halves.
 //!
-//! For numbers that were rounded to 16 bits and are worked on as 32-bit ones. Says nothing about what they are. One
-//! pass each way, and cheaper than any general codec; what does not fit the pattern stays as it is.
+//! Made for numbers rounded to 16 bits but kept in 32; the codec itself knows nothing of numbers. One pass each way,
+//! cheaper than any general codec; lines that do not fit the pattern stay whole.
 //!
-//! Stored: one bit per line of 64 bytes (1: halved), padded to a line; then the lines in order, 32 or 64 bytes each;
-//! then what was left of an incomplete last line.
+//! Stored form: one bit per 64-byte line (1: halved), padded to a line; then the lines in order, 32 or 64 bytes each;
+//! then the rest of an incomplete last line.
 //!
-//! Invariants: 1. decoding gives back every byte; 2. no stored bytes make decoding panic or write beyond its output.
+//! Invariants: 1. decoding restores every byte; 2. no stored bytes make decoding panic or write beyond its output.
 
-/// Bytes that are halved together, or not.
+/// Bytes of a line, the unit of halving.
 const LINE: usize = 64;
 
 /// Stored bytes that cannot be decoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("halved bytes: {stored} are stored, {expected} were expected")]
+#[error("the halves codec expected {expected} stored bytes and found {stored}")]
 pub struct HalvesError {
     /// Bytes given.
     pub stored: usize,
-    /// Bytes that their table of lines asks for (or the table itself, when that is cut short).
+    /// Bytes that the table of lines requires (or the table's own length, if the table is cut short).
     pub expected: usize,
 }
 
@@ -25,7 +26,7 @@ fn table_bytes(payload: usize) -> usize {
     (payload / LINE).div_ceil(8).next_multiple_of(LINE)
 }
 
-/// Longest encoding of so many bytes.
+/// Longest encoding of a payload of `payload` bytes.
 pub fn encoded_bytes_max(payload: usize) -> usize {
     table_bytes(payload) + payload
 }
@@ -36,7 +37,7 @@ pub fn encoded_bytes(payload: &[u8]) -> usize {
     encoded_bytes_max(payload.len()) - halved * LINE / 2
 }
 
-/// Encodes `payload` into the front of `out`, which has [`encoded_bytes`] bytes at least; returns the length.
+/// Encodes `payload` into the front of `out`, which has at least [`encoded_bytes`] bytes; returns the length.
 pub fn encode(payload: &[u8], out: &mut [u8]) -> usize {
     let (table, data) = out.split_at_mut(table_bytes(payload.len()));
     table.fill(0);
@@ -64,10 +65,10 @@ fn is_halvable(line: &[u8]) -> bool {
     lower == 0
 }
 
-/// Decodes into `payload`, whose length is that of what was encoded.
+/// Decodes into `payload`, whose length is that of the original.
 ///
 /// # Errors
-/// `stored` is not an encoding of so many bytes.
+/// `stored` is not an encoding of a payload of that length.
 pub fn decode(stored: &[u8], payload: &mut [u8]) -> Result<(), HalvesError> {
     let table_len = table_bytes(payload.len());
     let wrong = |expected| HalvesError { stored: stored.len(), expected };
@@ -104,7 +105,7 @@ mod tests {
     use crate::base::rng::{Purpose, Stream};
 
     #[test]
-    fn every_byte_comes_back_and_halved_lines_take_half() {
+    fn every_byte_round_trips_and_halved_lines_take_half() {
         for len in [0, 1, 63, 64, 65, 4096, 64 * 513 + 7, 700_000] {
             for halved in [0u64, 1, 2, 3] {
                 let mut draws = Stream::new(1, Purpose::Test, len as u64, halved);

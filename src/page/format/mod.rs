@@ -1,4 +1,4 @@
-//! Bytes on the drive: slot headers, codecs, checksums, the FORMAT file, small structs. No I/O.
+//! The bytes on the drive: slot headers, codecs, checksums, the FORMAT file, small structs. No I/O.
 
 pub mod codec;
 pub mod encoding;

@@ -1,20 +1,20 @@
-//! Checksums that are bound to the place of what they protect.
+//! Checksums bound to the place of the value they protect.
 //!
-//! A sealed value is a body with a checksum in front that covers the store's identity, the table and the key too, so that
-//! a value read from the wrong place, from another store or with a flipped bit is never taken for good. It protects
-//! against accidents, not against forgery.
+//! A sealed value is a body preceded by a checksum that also covers the store's identity, the table and the key. So a
+//! value from the wrong place, from another store or with a flipped bit is always recognised. Seals protect against
+//! accidents, not against forgery.
 
 use xxhash_rust::xxh3::Xxh3;
 
-/// Bytes that a seal adds in front of a body.
+/// Bytes that a seal adds before the body.
 pub const SEAL_BYTES: usize = 8;
 
-/// A value that was not sealed under this scope and key, or was changed since.
+/// The value was not sealed under this scope and key, or has changed since.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("its checksum does not match")]
 pub struct SealBroken;
 
-/// Whose values, and which table's: what every seal is bound to beside the key.
+/// The store and table that a seal is bound to, beside the key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SealScope {
     /// Identity of the store.
@@ -34,7 +34,7 @@ impl SealScope {
         hash.digest()
     }
 
-    /// `body` with its checksum in front.
+    /// `body` preceded by its checksum.
     pub fn seal(self, key: &[u8], body: &[u8]) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(SEAL_BYTES + body.len());
         bytes.extend_from_slice(&self.checksum(key, body).to_le_bytes());
@@ -42,10 +42,10 @@ impl SealScope {
         bytes
     }
 
-    /// The body of a sealed value and its checksum.
+    /// The body of a sealed value, and its checksum.
     ///
     /// # Errors
-    /// A value that was not sealed under this scope and key, or was changed since.
+    /// The value was not sealed under this scope and key, or has changed since.
     pub fn unseal<'a>(self, key: &[u8], sealed: &'a [u8]) -> Result<(&'a [u8], u64), SealBroken> {
         let (checksum, body) = sealed.split_first_chunk::<SEAL_BYTES>().ok_or(SealBroken)?;
         let checksum = u64::from_le_bytes(*checksum);
@@ -59,7 +59,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_flipped_bit_and_every_wrong_place_is_noticed() {
+    fn every_flipped_bit_and_every_wrong_place_is_detected() {
         let scope = SealScope { store: 7, table: 1 };
         let sealed = scope.seal(b"key", b"some body");
         assert_eq!(scope.unseal(b"key", &sealed).unwrap().0, b"some body");
@@ -74,7 +74,7 @@ mod tests {
         assert!(scope.unseal(b"kez", &sealed).is_err());
         assert!(SealScope { store: 8, table: 1 }.unseal(b"key", &sealed).is_err());
         assert!(SealScope { store: 7, table: 2 }.unseal(b"key", &sealed).is_err());
-        // The border between key and body is part of what is sealed.
+        // The border between key and body is sealed as well.
         assert!(scope.unseal(b"keys", &scope.seal(b"key", b"s")).is_err());
     }
 }

@@ -1,13 +1,12 @@
-//! What stands on the drive in front of a page, and how a version of a page is named by the index.
+//! The header of a slot, and the reference by which the index names a version of a page.
 //!
 //! A slot holds [`HEADER_BYTES`] of header, then the stored payload, then zeros up to the next multiple of
-//! [`ALIGNMENT`]. The header says what the slot holds and where it was meant to be written, so that a page that was
-//! read from or written to the wrong place is found out, and so that the index can be rebuilt from the slots alone.
-//! All numbers are little-endian.
+//! [`ALIGNMENT`]. The header states the slot's content and its intended place, so that a read or write at a wrong place
+//! is detected, and so that the index can be rebuilt from the slots alone. All numbers are little-endian.
 //!
-//! Invariants: 1. every bit of the header and of the padded payload is under a checksum; 2. decoding bytes that
-//! nobody vouches for neither allocates by their word nor panics; 3. a [`SlotRef`] says everything that is needed to
-//! tell whether the bytes of a slot are that version of that page and no other.
+//! Invariants: 1. checksums cover every bit of the header and of the padded payload; 2. decoding untrusted bytes
+//! neither panics nor allocates by lengths they state; 3. a [`SlotRef`] suffices to tell whether the bytes of a slot
+//! are that version of that page.
 
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::ALIGNMENT;
@@ -17,29 +16,29 @@ use xxhash_rust::xxh3::xxh3_128;
 #[cfg(target_endian = "big")]
 compile_error!("slots are little-endian; nothing was tested on big-endian machines");
 
-/// Bytes in front of the payload of every slot, and of every frame in memory.
+/// Bytes before the payload of every slot, and of every frame in memory.
 pub const HEADER_BYTES: usize = 4096;
 /// Longest label, bytes.
 pub const LABEL_BYTES_MAX: usize = 512;
-/// Version of the layout of slots. A store of a newer version is refused.
+/// Version of the slot layout. A store of a newer version is refused.
 pub const FORMAT_VERSION: u32 = 1;
-/// Features that a reader must know to read the store, one bit each: a store with another bit is refused. None yet.
+/// Features that a reader must know, one bit each: a store with any other bit is refused. None yet.
 pub const KNOWN_FEATURES: u32 = 0;
-/// Features that a reader may pass over, one bit each: other bits are ignored. None yet.
+/// Features that a reader may ignore, one bit each; unknown bits are ignored. None yet.
 pub const KNOWN_COMPATIBLE: u32 = 0;
 
 const MAGIC: [u8; 8] = *b"gsscpage";
 const CHECKSUM_AT: usize = HEADER_BYTES - 16;
 const LABEL_AT: usize = 112;
 
-/// How a payload is stored.
+/// The stored form of a payload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum StoredAs {
-    /// The bytes themselves.
+    /// The payload itself.
     Raw,
-    /// Bytes shuffled by their place in four-byte words, then one zstd frame.
+    /// Bytes shuffled by their position in four-byte words, then one zstd frame.
     ShuffledZstd,
-    /// Lines of words with empty lower halves as their upper halves alone.
+    /// 64-byte lines whose words have empty lower halves, stored as their upper halves.
     Halves,
 }
 
@@ -62,7 +61,7 @@ impl StoredAs {
     }
 }
 
-/// Where one version of a page is, and what its bytes must be. Kept by the index.
+/// Reference to one version of a page: its place and what its bytes must be. Kept by the index.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(into = "Vec<u8>", try_from = "Vec<u8>")]
 pub struct SlotRef {
@@ -70,13 +69,13 @@ pub struct SlotRef {
     pub place: Place,
     /// Bytes of the payload as stored, without padding.
     pub stored_bytes: u32,
-    /// Bytes of the payload as it is used.
+    /// Bytes of the decoded payload.
     pub payload_bytes: u32,
-    /// First generation that this version can belong to.
+    /// First generation that may name this version.
     pub generation: u64,
-    /// xxh3-128 of the stored payload with its padding.
+    /// xxh3-128 of the stored, padded payload.
     pub checksum: u128,
-    /// How the payload is stored.
+    /// The stored form.
     pub codec: StoredAs,
 }
 
@@ -84,12 +83,12 @@ impl SlotRef {
     /// Length of the encoded form, bytes.
     pub const ENCODED_BYTES: usize = 45;
 
-    /// Bytes that are moved to read or write this version: header, payload, padding.
+    /// Bytes read or written for this version: header, payload, padding.
     pub fn transfer_bytes(&self) -> usize {
         transfer_bytes(self.stored_bytes as usize)
     }
 
-    /// As bytes, for the index on the drive.
+    /// Encodes the reference, for the index on the drive.
     pub fn to_bytes(&self) -> [u8; SlotRef::ENCODED_BYTES] {
         let mut bytes = [0; SlotRef::ENCODED_BYTES];
         let mut at = Put { bytes: &mut bytes, at: 0 };
@@ -103,7 +102,7 @@ impl SlotRef {
         bytes
     }
 
-    /// From bytes of [`SlotRef::to_bytes`]; `None` for bytes that it never gives.
+    /// Decodes [`SlotRef::to_bytes`]; `None` for bytes that it never produces.
     pub fn from_bytes(bytes: &[u8; SlotRef::ENCODED_BYTES]) -> Option<SlotRef> {
         let mut at = Take { bytes, at: 0 };
         let slot = SlotRef {
@@ -130,16 +129,16 @@ impl TryFrom<Vec<u8>> for SlotRef {
 
     fn try_from(bytes: Vec<u8>) -> Result<SlotRef, &'static str> {
         let bytes = bytes.as_slice().try_into().ok();
-        bytes.and_then(SlotRef::from_bytes).ok_or("these bytes refer to no slot")
+        bytes.and_then(SlotRef::from_bytes).ok_or("these bytes are not a slot reference")
     }
 }
 
-/// Bytes that are moved for a payload of `stored_bytes`: header, payload, padding.
+/// Bytes read or written for a payload of `stored_bytes`: header, payload, padding.
 pub fn transfer_bytes(stored_bytes: usize) -> usize {
     HEADER_BYTES + stored_bytes.next_multiple_of(ALIGNMENT)
 }
 
-/// Checksum of a stored payload with its padding, and of anything else that this store keeps.
+/// The checksum (xxh3-128) of a stored, padded payload; also used for everything else in a store.
 pub fn checksum(bytes: &[u8]) -> u128 {
     xxh3_128(bytes)
 }
@@ -151,29 +150,29 @@ fn lengths_agree(codec: StoredAs, stored: u32, payload: u32) -> bool {
     }
 }
 
-/// What the header of a slot says.
+/// The decoded header of a slot.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SlotHeader {
     /// Identity of the store.
     pub store: u128,
     /// The page.
     pub page: PageId,
-    /// Number of the write in the life of the store; tells which of two versions of a page is the later one, unless one of
-    /// them comes from a process that ended before it committed anything: the next one gives the same numbers again.
+    /// Serial number of the write within the store: of two versions of a page the later one has the higher number.
+    /// Exception: a process that ended before its first commit; the next process uses the same numbers again.
     pub serial: u64,
     /// Place, lengths, generation and checksum.
     pub slot: SlotRef,
-    /// Opaque to this layer, at most [`LABEL_BYTES_MAX`]: what the layer above needs to index the page again.
+    /// Opaque to this layer, at most [`LABEL_BYTES_MAX`] bytes: what the layer above needs to rebuild its index entry.
     pub label: Vec<u8>,
 }
 
-/// Why bytes are not the header of a slot.
+/// Why bytes are not a slot header.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum HeaderError {
-    /// Never written, or overwritten with something else.
+    /// Never written, or overwritten by something else.
     #[error("there is no slot header here")]
     NoHeader,
-    /// Bits changed since it was written.
+    /// Bits changed since the write.
     #[error("the checksum of the slot header does not match")]
     Checksum,
     /// Written by a newer program.
@@ -184,17 +183,17 @@ pub enum HeaderError {
         /// Feature bits of the slot.
         features: u32,
     },
-    /// The checksum matches, but this program would not have written it.
+    /// The checksum matches, but this program never writes such a header.
     #[error("the slot header has an impossible {field}")]
     Field {
-        /// Which field.
+        /// The field in question.
         field: &'static str,
     },
 }
 
 impl SlotHeader {
-    /// Writes the header over the first [`HEADER_BYTES`] of `bytes`. A label beyond [`LABEL_BYTES_MAX`] is cut; the
-    /// writer checks it before.
+    /// Writes the header over the first [`HEADER_BYTES`] of `bytes`. A label longer than [`LABEL_BYTES_MAX`] is cut;
+    /// the writer checks the length first.
     pub fn encode(&self, bytes: &mut [u8; HEADER_BYTES]) {
         bytes.fill(0);
         let label = &self.label[..self.label.len().min(LABEL_BYTES_MAX)];
@@ -214,7 +213,7 @@ impl SlotHeader {
         bytes[CHECKSUM_AT..].copy_from_slice(&sum.to_le_bytes());
     }
 
-    /// Reads a header.
+    /// Decodes a header.
     ///
     /// # Errors
     /// The bytes are not a header of this program's format.
@@ -223,8 +222,8 @@ impl SlotHeader {
         if at.take::<8>() != MAGIC {
             return Err(HeaderError::NoHeader);
         }
-        // The checksum first: a flipped bit in the version is damage, not a newer program. Every version keeps the
-        // checksum in this place.
+        // The checksum comes first: a flipped bit in the version is damage, not a newer program. Every version keeps
+        // the checksum in this place.
         let sum = Take { bytes, at: CHECKSUM_AT }.u128();
         if sum != checksum(&bytes[..CHECKSUM_AT]) {
             return Err(HeaderError::Checksum);
@@ -304,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn headers_come_back_and_every_flipped_bit_is_found() {
+    fn headers_round_trip_and_every_flipped_bit_is_detected() {
         let mut bytes = [1; HEADER_BYTES];
         header().encode(&mut bytes);
         assert_eq!(SlotHeader::decode(&bytes), Ok(header()));
@@ -315,9 +314,9 @@ mod tests {
         }
     }
 
-    /// The layout of version 1, held by its bytes: whoever changes it must raise the version.
+    /// The bytes of layout version 1. A change of layout must raise the version.
     #[test]
-    fn the_layout_of_version_1_does_not_move() {
+    fn the_layout_of_version_1_is_fixed() {
         let mut bytes = [0; HEADER_BYTES];
         header().encode(&mut bytes);
         assert_eq!(&bytes[..16], b"gsscpage\x01\0\0\0\0\0\0\0");
@@ -339,7 +338,7 @@ mod tests {
         }
     }
 
-    /// Random bytes under a right magic and checksum: refused or read, never a panic, never a label beyond its room.
+    /// Random bytes under a valid magic and checksum: refused or decoded, without a panic and with a bounded label.
     #[test]
     fn hostile_headers_neither_panic_nor_allocate() {
         let mut bytes = [0; HEADER_BYTES];
@@ -358,7 +357,7 @@ mod tests {
     }
 
     #[test]
-    fn references_come_back_and_impossible_ones_do_not() {
+    fn references_round_trip_and_impossible_ones_are_refused() {
         let slot = header().slot;
         assert_eq!(SlotRef::from_bytes(&slot.to_bytes()), Some(slot));
         let raw = SlotRef { codec: StoredAs::Raw, stored_bytes: 1000, ..slot };

@@ -1,8 +1,8 @@
-//! The `FORMAT` file of a spill directory: whose it is, which program may read it, the sizes of its slots.
+//! The `FORMAT` file of a spill directory: the store's identity, the format version, the sizes of its slots.
 //!
-//! Written once. Invariants: 1. every bit is under a checksum, whose place is the same in all versions, so that damage
-//! is told from a newer version; 2. sizes that no store can have are refused; 3. another version and an unknown
-//! incompatible feature are refused by name, unknown compatible features are passed over.
+//! Written once. Invariants: 1. a checksum covers every bit, in the same place in all versions, so that damage is
+//! distinct from a newer version; 2. impossible sizes are refused; 3. another version and an unknown incompatible
+//! feature are refused by name; unknown compatible features are ignored.
 
 use crate::page::format::slot_header::{FORMAT_VERSION, KNOWN_COMPATIBLE, KNOWN_FEATURES, checksum};
 use crate::page::versions::slots::SlotLayout;
@@ -13,21 +13,21 @@ const CHECKSUM_AT: usize = FORMAT_BYTES - 16;
 const MAGIC: [u8; 8] = *b"gsscdir\n";
 const COMPATIBLE_AT: usize = 48;
 
-/// What becomes of the pages after the run.
+/// What happens to the pages after the run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
-    /// Nothing: removed at a clean end, of no use after any other.
+    /// Removed at a clean end, useless after any other.
     Scratch,
-    /// They are the checkpoint.
+    /// The pages are the checkpoint.
     Checkpoint,
 }
 
-/// What the file says.
+/// Content of the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SpillFormat {
-    /// Identity of the store, in every slot as well.
+    /// Identity of the store, also in every slot.
     pub store: u128,
-    /// What becomes of it.
+    /// What happens to the pages after the run.
     pub purpose: Purpose,
     /// Sizes of slots and segments.
     pub layout: SlotLayout,
@@ -38,19 +38,19 @@ pub struct SpillFormat {
 pub struct FormatFeatures {
     /// Version of the layout.
     pub version: u32,
-    /// Features that a reader must know.
+    /// Feature bits that a reader must know.
     pub incompatible: u32,
-    /// Features that a reader may pass over.
+    /// Feature bits that a reader may ignore.
     pub compatible: u32,
 }
 
-/// Why bytes are not such a file.
+/// Why bytes are not a FORMAT file.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FormatError {
-    /// Something else.
+    /// Some other file.
     #[error("it is not the FORMAT file of a spill directory")]
     Foreign,
-    /// Bits changed or are missing.
+    /// Bits have changed or are missing.
     #[error("its checksum does not match: it is damaged or cut short")]
     Damaged,
     /// Written by a program of another version.
@@ -64,7 +64,7 @@ pub enum FormatError {
         /// Its incompatible feature bits.
         features: u32,
     },
-    /// This version, but with something in it that this program cannot read.
+    /// This version, but with features that this program does not know.
     #[error(
         "it has format version {FORMAT_VERSION} with features that this program does not know (bits {:#x})",
         .features & !KNOWN_FEATURES
@@ -73,13 +73,13 @@ pub enum FormatError {
         /// Its incompatible feature bits.
         features: u32,
     },
-    /// The checksum matches, but no program of this version writes it.
+    /// The checksum matches, but no program of this version writes such sizes.
     #[error("it has impossible sizes")]
     Sizes,
 }
 
 impl SpillFormat {
-    /// As the bytes of the file.
+    /// Encodes the file.
     pub fn to_bytes(&self) -> [u8; FORMAT_BYTES] {
         let mut bytes = [0; FORMAT_BYTES];
         bytes[..8].copy_from_slice(&MAGIC);
@@ -94,10 +94,10 @@ impl SpillFormat {
         bytes
     }
 
-    /// From the bytes of the file.
+    /// Decodes the file.
     ///
     /// # Errors
-    /// They are not such a file of this version.
+    /// The bytes are not a FORMAT file of this version.
     pub fn from_bytes(bytes: &[u8]) -> Result<SpillFormat, FormatError> {
         let bytes = whole(bytes)?;
         let FormatFeatures { version, incompatible, .. } = features_in(bytes);
@@ -123,10 +123,10 @@ impl SpillFormat {
     }
 }
 
-/// Version and features of the bytes of the file, whichever program wrote it.
+/// Version and features in the bytes of a FORMAT file of any version.
 ///
 /// # Errors
-/// They are not such a file, or damaged.
+/// The bytes are not a FORMAT file, or damaged.
 pub fn features_of(bytes: &[u8]) -> Result<FormatFeatures, FormatError> {
     Ok(features_in(whole(bytes)?))
 }
@@ -136,7 +136,7 @@ fn features_in(bytes: &[u8; FORMAT_BYTES]) -> FormatFeatures {
     FormatFeatures { version: word(8), incompatible: word(12), compatible: word(COMPATIBLE_AT) }
 }
 
-/// The bytes, if they are as some program wrote them.
+/// The bytes, if their length, magic and checksum are right.
 fn whole(bytes: &[u8]) -> Result<&[u8; FORMAT_BYTES], FormatError> {
     if !bytes.starts_with(&MAGIC) {
         return Err(FormatError::Foreign);
@@ -187,12 +187,12 @@ mod tests {
     }
 
     #[test]
-    fn compatible_features_are_passed_over() {
+    fn unknown_compatible_features_are_ignored() {
         let bytes = with(COMPATIBLE_AT + 1, 0x80);
         assert_eq!(SpillFormat::from_bytes(&bytes), Ok(sample()));
         let features = FormatFeatures { version: FORMAT_VERSION, incompatible: 0, compatible: 0x8000 };
         assert_eq!(features_of(&bytes), Ok(features));
-        // Also of a store that this program cannot read.
+        // Also for a store that this program cannot read.
         assert_eq!(features_of(&with(8, 9)).map(|f| f.version), Ok(9));
     }
 

@@ -1,17 +1,17 @@
-//! Whether bytes from a slot are the version of the page that a reference names.
+//! Verifies that the bytes of a slot are the version that a reference names.
 //!
-//! Invariant: the payload is touched by decoding only after its checksum matched.
+//! Invariant: a payload is decoded only after its checksum matched.
 
 use crate::base::ids::PageId;
 use crate::page::format::codec;
 use crate::page::format::slot_header::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs, checksum};
 use crate::page::map::mutants::{Mutant, active};
 
-/// Checks the bytes of a slot: they are version `slot` of `page` in `store`, and nothing in them changed. If they are
-/// encoded, decodes them to `payload`, a buffer with header room; raw payloads stay where they are.
+/// Verifies that the bytes of a slot are version `slot` of `page` in `store`, unchanged. Decodes an encoded payload to
+/// `payload`, a buffer with header room; a raw payload stays where it is.
 ///
 /// # Errors
-/// What does not match, for people.
+/// The mismatch, as text for users.
 pub fn verify(
     store: u128,
     page: PageId,
@@ -19,7 +19,7 @@ pub fn verify(
     bytes: &[u8],
     payload: Option<&mut [u8]>,
 ) -> Result<(), String> {
-    let too_short = || "the slot is shorter than the version".to_string();
+    let too_short = || "the slot is shorter than the version it should hold".to_string();
     let (header, stored) = bytes.split_first_chunk::<HEADER_BYTES>().ok_or_else(too_short)?;
     let header = SlotHeader::decode(header).map_err(|e| e.to_string())?;
     if !active(Mutant::SlotIdentityNotVerified) {
@@ -38,11 +38,11 @@ pub fn verify(
             let payload = payload.get_mut(HEADER_BYTES..).and_then(|p| p.get_mut(..slot.payload_bytes as usize));
             codec::decode(stored, codec, payload.ok_or_else(too_short)?).map_err(|e| e.to_string())
         }
-        (_, None) => Err("there is no room to decode it".to_string()),
+        (_, None) => Err("there is no buffer to decode it into".to_string()),
     }
 }
 
-/// The header is that of version `slot` of `page`.
+/// Verifies that the header is that of version `slot` of `page`.
 pub(in crate::page) fn verify_identity(
     store: u128,
     page: PageId,
@@ -53,20 +53,20 @@ pub(in crate::page) fn verify_identity(
         return Err("it belongs to another store".to_string());
     }
     if header.page != page {
-        return Err(format!("page {} is there instead", header.page));
+        return Err(format!("it holds page {} instead", header.page));
     }
     if header.slot.place != slot.place {
         let there = header.slot.place;
-        return Err(format!("it was meant for segment {} offset {}", there.segment, there.offset));
+        return Err(format!("its header names another place: segment {} offset {}", there.segment, there.offset));
     }
     if active(Mutant::SlotGenerationNotVerified) {
         return Ok(());
     }
     if header.slot.generation != slot.generation {
-        return Err(format!("generation {} is there instead", header.slot.generation));
+        return Err(format!("it holds generation {} instead", header.slot.generation));
     }
     if header.slot != *slot {
-        return Err("another version of the page is there instead".to_string());
+        return Err("it holds another version of the page".to_string());
     }
     Ok(())
 }

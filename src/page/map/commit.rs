@@ -1,16 +1,16 @@
-//! Commits: from written pages to a generation that survives anything, and back at opening.
+//! Commits: make written pages a durable generation, and open the store at the last one.
 //!
-//! The order of a commit at a step boundary: 1. every write has ended with its full length (the pager has written the
-//! dirty pages to free slots before); 2. the segments are synced; 3. one transaction of the page map, durable when it
-//! returns, names the new versions; 4. the witness learns of it: acknowledged; 5. only then slots and map entries that no
-//! kept generation sees become free.
+//! A commit at a step boundary runs in this order: 1. every write has completed in full (the pager has written the
+//! dirty pages back to free slots); 2. the segments are synced; 3. one transaction of the page map, durable when it
+//! returns, names the new versions; 4. the witness records it: the commit is acknowledged; 5. only now slots and map
+//! entries that no kept generation sees become free.
 //!
-//! Invariants: 1. a store opens at the last acknowledged generation or at one whose commit was under way, never at
-//! another and never at a mixture; 2. after a failed write, sync or transaction nothing is committed any more by this
-//! process; 3. running out of space is not that: the map is opened again, the reserve is given up, and the commit may
-//! be tried again; 4. nothing durable names a file whose folder entry is not durable.
+//! Invariants: 1. a store opens at the last acknowledged generation or at one whose commit was in progress, never at
+//! another and never at a mixture; 2. after a failed write, sync or transaction this process commits nothing more,
+//! except after a lack of space: then the map is reopened, the reserve is given up, and the commit may be repeated; 3.
+//! nothing durable names a file whose folder entry is not durable.
 //!
-//! The store belongs to one process at a time; the lock on its folder is the caller's.
+//! One process at a time owns the store; the caller holds the lock on its folder.
 
 use crate::base::ids::PageId;
 use crate::page::folder::protocol_files::Folder;
@@ -24,95 +24,93 @@ use crate::page::versions::page_error::PageError;
 use crate::page::versions::paged_store::{PageDone, PagedStore};
 use std::io;
 
-/// The page map's file.
+/// File of the page map.
 pub const MAP_NAME: &str = "map.redb";
-/// The page map while it is made.
+/// File of the page map while it is created.
 pub const MAP_NEW_NAME: &str = "map.redb.new";
-/// The witness's file.
+/// File of the witness.
 pub const WITNESS_NAME: &str = "witness";
-/// Space set aside for a last commit on a full drive.
+/// File that reserves space for a last commit on a full drive.
 pub const RESERVE_NAME: &str = "reserve";
 /// The reserve while it is filled.
 pub const RESERVE_NEW_NAME: &str = "reserve.new";
-/// The reserve is filled in pieces of this many bytes.
+/// Bytes per write while the reserve is filled.
 const RESERVE_PIECE_BYTES: usize = 1 << 20;
 
-/// What does not change while a store is open.
+/// Settings that are fixed while a store is open.
 #[derive(Debug, Clone, Copy)]
 pub struct CommitConfig {
-    /// Identity of the store; every value and slot carries it.
+    /// Identity of the store, part of every value and slot.
     pub store: u128,
     /// Memory for the map's cache, bytes.
     pub cache_bytes: usize,
-    /// Bytes of the reserve: room for one segment and for the map to grow. 0: none.
+    /// Bytes of the reserve: room for one segment and for the map to grow. 0: no reserve.
     pub reserve_bytes: u64,
 }
 
-/// A page that is not as the last generation knows it.
+/// A page that changed since the last generation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PageChange {
     /// The page.
     pub page: PageId,
-    /// Its slot and its label; `None`: the page is gone.
+    /// Its slot and label; `None`: the page was removed.
     pub version: Option<(SlotRef, Vec<u8>)>,
 }
 
-/// What a generation consists of beside the pages that did not change.
+/// Content of a generation, beside the unchanged pages.
 #[derive(Debug, Clone, Copy)]
 pub struct Cut<'a> {
     /// All pages that changed since the last acknowledged commit, each once.
     pub changes: &'a [PageChange],
-    /// Everything that the trainer needs to go on.
+    /// The trainer's state, needed to resume.
     pub run_state: &'a [u8],
-    /// A few bytes for lists of generations.
+    /// A few bytes that lists of generations show.
     pub note: &'a [u8],
-    /// Keep this generation under this name.
+    /// If set, the generation is pinned under this name.
     pub pin: Option<&'a str>,
 }
 
-/// Why a store cannot be made, opened, or committed to.
+/// Why a store cannot be created, opened, or committed to.
 #[derive(Debug, thiserror::Error)]
 pub enum CommitError {
     /// Pages could not be made durable.
     #[error(transparent)]
     Pages(#[from] PageError),
     /// The map failed.
-    #[error("{0}\n  remedy: what was acknowledged before is still there; check the drive, then start again")]
+    #[error("{0}\n  remedy: acknowledged commits are intact; check the drive, then start again")]
     Map(#[from] MapError),
-    /// There is no space. Nothing is lost; the commit may be tried again when there is.
+    /// No space. Nothing is lost; the commit may be repeated once there is space.
     #[error("there is no space for a commit: {0}\n  remedy: free space on the drive of the spill directory")]
     Full(io::Error),
-    /// The files beside the map cannot be used.
+    /// A file beside the map cannot be used.
     #[error("{name} cannot be used: {source}\n  remedy: check the drive; `gsscale-ckpt salvage` can rebuild the map")]
     File {
         /// Name of the file in the store's folder.
         name: &'static str,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
     /// An earlier error ended all commits of this process.
-    #[error(
-        "nothing is committed any more after an error of the drive ({0})\n  remedy: check the drive, then start again"
-    )]
+    #[error("commits stopped after a drive error ({0})\n  remedy: check the drive, then start again")]
     Poisoned(String),
-    /// There is no store in the folder.
+    /// The folder contains no store.
     #[error("there is no page map in this folder")]
     NoStore,
-    /// The map is whole, and what it says cannot be.
+    /// The map is undamaged, but its content is impossible.
     #[error("the page map contradicts itself: {0}\n  remedy: `gsscale-ckpt salvage` can rebuild it from the pages")]
     Contradiction(String),
-    /// Segments that must be there are missing or have another length.
+    /// Segments are missing or have another length.
     #[error(
-        "pages are missing: {0}\n  remedy: put the files back as they were; `gsscale-ckpt salvage` saves what is left"
+        "pages are missing: {0}\n  remedy: restore the segment files; `gsscale-ckpt salvage` recovers the remaining pages"
     )]
     Segments(String),
-    /// A generation that is not kept was asked for.
-    #[error("generation {0} is not kept\n  remedy: `gsscale-ckpt ls` lists those that are")]
+    /// The requested generation is not kept.
+    #[error("generation {0} is not kept\n  remedy: `gsscale-ckpt ls` lists the kept generations")]
     NotKept(u64),
 }
 
 impl CommitError {
-    /// Whether it is only space that is missing: the same may work later.
+    /// Whether the error is only a lack of space: a later attempt may succeed.
     pub fn is_out_of_space(&self) -> bool {
         match self {
             CommitError::Full(_) | CommitError::Map(MapError::Full(_)) => true,
@@ -126,7 +124,7 @@ impl CommitError {
 pub struct Commits {
     folder: Box<dyn Folder>,
     config: CommitConfig,
-    /// `None` after the drive was full: to be opened again.
+    /// `None` after the drive was full: the map must be reopened.
     manifest: Option<Manifest>,
     witness: Witness,
     generations: Generations,
@@ -134,31 +132,33 @@ pub struct Commits {
 }
 
 impl Commits {
-    /// Makes an empty store in `folder`, durable when this returns. What an interrupted making left is overwritten.
+    /// Creates an empty store in `folder`, durable when this returns. Overwrites the remains of an interrupted
+    /// creation.
     ///
     /// # Errors
-    /// The folder cannot be written, or a store is there already.
+    /// The folder cannot be written, or contains a store already.
     pub fn create(folder: Box<dyn Folder>, config: CommitConfig) -> Result<Opened, CommitError> {
         if folder.open(MAP_NAME).map_err(|source| CommitError::File { name: MAP_NAME, source })?.is_some() {
-            let source = io::Error::new(io::ErrorKind::AlreadyExists, "there is a store in this folder");
+            let source = io::Error::new(io::ErrorKind::AlreadyExists, "this folder already contains a store");
             return Err(CommitError::File { name: MAP_NAME, source });
         }
         let witness = folder.create(WITNESS_NAME).and_then(|file| Witness::create(file, config.store));
         witness.map_err(|source| CommitError::File { name: WITNESS_NAME, source })?;
         let file = folder.create(MAP_NEW_NAME).map_err(|source| CommitError::File { name: MAP_NAME, source })?;
         drop(Manifest::create(file, config.store, config.cache_bytes)?);
-        // Entries may become durable in any order: first all files, then the name that makes them a store.
+        // Entries may become durable in any order: first sync all files, then give the map the name that makes them a
+        // store.
         let named = sync_entries(folder.as_ref()).and_then(|()| folder.rename(MAP_NEW_NAME, MAP_NAME));
         let named = named.and_then(|()| sync_entries(folder.as_ref()));
         named.map_err(|source| CommitError::File { name: MAP_NAME, source })?;
         Commits::open(folder, config)
     }
 
-    /// Opens the store in `folder`: verifies the whole map and finds the last generation. Page data is not read.
+    /// Opens the store in `folder`: verifies the whole map and finds the last generation. Reads no page data.
     ///
     /// # Errors
-    /// There is no store, it is damaged or older than what was acknowledged, or it cannot be read or written. Files of a
-    /// refused store stay as they were.
+    /// There is no store, it is damaged or older than the last acknowledged commit, or it cannot be read or written.
+    /// The files of a refused store stay unchanged.
     pub fn open(folder: Box<dyn Folder>, config: CommitConfig) -> Result<Opened, CommitError> {
         let file = folder.open(MAP_NAME).map_err(|source| CommitError::File { name: MAP_NAME, source })?;
         let file = file.ok_or(CommitError::NoStore)?;
@@ -166,10 +166,10 @@ impl Commits {
         let witness = folder.open(WITNESS_NAME).map_err(witness_error)?;
         let witness = witness.ok_or_else(|| witness_error(io::ErrorKind::NotFound.into()))?;
         let mut witness = Witness::open(witness, config.store).map_err(witness_error)?;
-        // A process that was killed may have left entries that only memory knows; from here on they can be counted on.
+        // A killed process may have left folder entries that are not durable; this sync makes them so.
         sync_entries(folder.as_ref()).map_err(|source| CommitError::File { name: "the folder", source })?;
         let (manifest, content) = Manifest::open(file, config.store, witness.sequence(), config.cache_bytes)?;
-        // A commit that was durable and not yet acknowledged is acknowledged now.
+        // A commit that was durable but not yet acknowledged is acknowledged now.
         if witness.sequence() < content.counters.sequence {
             witness.record(content.counters.sequence).map_err(witness_error)?;
         }
@@ -182,26 +182,27 @@ impl Commits {
         Opened::new(commits, content, run_state)
     }
 
-    /// What does not change.
+    /// The fixed settings.
     pub fn config(&self) -> CommitConfig {
         self.config
     }
 
-    /// Generations, kept ones and names.
+    /// The generations, kept ones and pins.
     pub fn generations(&self) -> &Generations {
         &self.generations
     }
 
-    /// Why nothing is committed any more, if so.
+    /// The error after which commits stopped, if any.
     pub fn poison(&self) -> Option<&str> {
         self.poison.as_deref()
     }
 
-    /// Commits: returns the number of the generation, which is durable. Pages whose writes ended meanwhile are in `done`.
+    /// Commits, and returns the number of the generation, which is then durable. Page writes that ended meanwhile are
+    /// in `done`.
     ///
     /// # Errors
-    /// Nothing was acknowledged. Unless [`CommitError::is_out_of_space`], nothing is committed any more: the store opens
-    /// at the last acknowledged generation or at this one.
+    /// Nothing was acknowledged. Unless [`CommitError::is_out_of_space`], this process commits nothing more; the store
+    /// then opens at the last acknowledged generation or at this one.
     pub fn commit(
         &mut self,
         store: &mut PagedStore,
@@ -211,8 +212,8 @@ impl Commits {
         self.commit_generation(store, done, None, cut)
     }
 
-    /// As [`Commits::commit`], of a generation that was [cut](PagedStore::cut) before, and whose pages were written for it
-    /// since.
+    /// As [`Commits::commit`], for a generation that was [cut](PagedStore::cut) earlier and whose pages have been
+    /// written since.
     ///
     /// # Errors
     /// As [`Commits::commit`].
@@ -251,7 +252,7 @@ impl Commits {
         if !active(Mutant::SegmentsNotSynced) && !active(Mutant::SegmentsSyncedAfterMap) {
             let first = done.len();
             store.sync(done)?;
-            // A page that could not be written for want of space is not durable, though nothing else is wrong.
+            // A page that could not be written for lack of space is not durable, although nothing else failed.
             let short = done[first..].iter().find_map(|d| d.result.as_ref().err().filter(|e| e.is_out_of_space()));
             if let Some(error) = short {
                 return Err(CommitError::Full(io::Error::new(io::ErrorKind::StorageFull, error.to_string())));
@@ -273,10 +274,10 @@ impl Commits {
         Ok(generation)
     }
 
-    /// Gives kept generations names and takes names away; what only those kept becomes free.
+    /// Pins kept generations under names and removes pins; frees what only the removed pins kept.
     ///
     /// # Errors
-    /// A generation is not kept; else as [`Commits::commit`].
+    /// A generation is not kept; otherwise as [`Commits::commit`].
     pub fn pin(&mut self, store: &mut PagedStore, put: &[(String, u64)], drop: &[String]) -> Result<(), CommitError> {
         self.refuse_if_poisoned()?;
         if let Some((_, generation)) = put.iter().find(|(_, generation)| !self.generations.is_kept(*generation)) {
@@ -294,10 +295,10 @@ impl Commits {
         Ok(())
     }
 
-    /// Makes a kept generation the latest again and drops the later ones with their names. The store is closed by it.
+    /// Makes a kept generation the latest again, drops the later ones with their pins, and closes the store.
     ///
     /// # Errors
-    /// The generation is not kept; else as [`Commits::commit`].
+    /// The generation is not kept; otherwise as [`Commits::commit`].
     pub fn rollback(mut self, generation: u64) -> Result<(), CommitError> {
         self.refuse_if_poisoned()?;
         if !self.generations.is_kept(generation) {
@@ -310,7 +311,7 @@ impl Commits {
     /// The run state of a kept generation.
     ///
     /// # Errors
-    /// It is not kept, or cannot be read.
+    /// The generation is not kept, or cannot be read.
     pub fn run_state(&self, generation: u64) -> Result<Vec<u8>, CommitError> {
         if !self.generations.is_kept(generation) {
             return Err(CommitError::NotKept(generation));
@@ -319,10 +320,10 @@ impl Commits {
         Ok(manifest.run_state(generation)?)
     }
 
-    /// Sets the reserve aside, if it is not; returns whether it is there now.
+    /// Creates the reserve, if missing; returns whether it exists now.
     ///
     /// # Errors
-    /// It cannot be made for another reason than space.
+    /// Creation failed for a reason other than space.
     pub fn fill_reserve(&mut self) -> Result<bool, CommitError> {
         let bytes = self.config.reserve_bytes;
         match fill_reserve(self.folder.as_ref(), bytes) {
@@ -335,7 +336,7 @@ impl Commits {
         }
     }
 
-    /// Gives the reserve up: its space is free for segments and the map. Returns whether there was one.
+    /// Deletes the reserve: its space is free for segments and the map. Returns whether there was one.
     ///
     /// # Errors
     /// The folder cannot be written.
@@ -349,7 +350,8 @@ impl Commits {
         Ok(was_there)
     }
 
-    /// The transaction, then the witness, then the books. On a full drive once more with the reserve's space.
+    /// Runs the transaction, records it in the witness, then updates the generations. On a full drive tries once more
+    /// with the reserve's space.
     fn acknowledge(&mut self, batch: &MapBatch) -> Result<(), CommitError> {
         if active(Mutant::WitnessBeforeMap) {
             let next = self.witness.sequence() + 1;
@@ -361,7 +363,8 @@ impl Commits {
             applied = self.open_again().and_then(|_| self.apply(batch));
         }
         if matches!(applied, Err(MapError::Full(_))) && self.give_up_reserve()? {
-            // What the interrupted transaction left is found and counted: it may have been durable after all.
+            // The interrupted transaction may have been durable after all: reopening the map tells, and counts it if
+            // so.
             applied = match self.open_again() {
                 Ok(true) => return Ok(()),
                 Ok(false) => self.apply(batch),
@@ -378,7 +381,7 @@ impl Commits {
         Ok(())
     }
 
-    /// One transaction. A map that found no space is closed: it takes no more until it is opened again.
+    /// Runs one transaction. A map that found no space is closed and must be reopened.
     fn apply(&mut self, batch: &MapBatch) -> Result<(), MapError> {
         let manifest = self.manifest.as_mut().ok_or(MapError::Poisoned)?;
         let result = manifest.apply(batch);
@@ -388,14 +391,14 @@ impl Commits {
         result
     }
 
-    /// Opens a map that had been closed. Returns whether the interrupted transaction was durable: it is acknowledged
-    /// and in the books then.
+    /// Reopens a closed map. Returns whether the interrupted transaction was durable; if so it is now acknowledged and
+    /// counted.
     fn open_again(&mut self) -> Result<bool, MapError> {
         if self.manifest.is_some() {
             return Ok(false);
         }
         let file = self.folder.open(MAP_NAME)?;
-        let file = file.ok_or_else(|| MapError::Damaged("the file is gone".to_string()))?;
+        let file = file.ok_or_else(|| MapError::Damaged("the file no longer exists".to_string()))?;
         let acknowledged = self.witness.sequence();
         let (manifest, content) = Manifest::open(file, self.config.store, acknowledged, self.config.cache_bytes)?;
         self.manifest = Some(manifest);
@@ -420,7 +423,7 @@ impl Commits {
         store.commit_done(self.generations.latest(), &kept);
     }
 
-    /// Frees as though `batch` were acknowledged: a mistake that the crash tests make on purpose.
+    /// Frees slots as though `batch` were acknowledged: a deliberate bug for the crash tests.
     fn free_slots_without(&self, store: &mut PagedStore, batch: &MapBatch) {
         let kept: Vec<u64> = self.generations.kept().filter(|g| !batch.drop_generations.contains(g)).collect();
         store.commit_done(batch.latest, &kept);
@@ -452,15 +455,15 @@ fn sync_entries(folder: &dyn Folder) -> io::Result<()> {
     if active(Mutant::FolderNotSyncedForMap) { Ok(()) } else { folder.sync() }
 }
 
-/// What the map keeps about a version of a page: the slot, then the label.
+/// The map's value for a version of a page: the slot reference, then the label.
 fn value_of(slot: &SlotRef, label: &[u8]) -> Vec<u8> {
     let mut value = slot.to_bytes().to_vec();
     value.extend_from_slice(label);
     value
 }
 
-/// Really writes the bytes: some drives and file systems do not keep space that was only promised. The name comes last: what
-/// has it is filled, also when a process was killed or the power failed meanwhile.
+/// Writes every byte, because some drives and file systems do not keep space that was only allocated. The rename comes
+/// last: a file of the final name is filled, even if the process was killed or the power failed.
 fn fill_reserve(folder: &dyn Folder, bytes: u64) -> io::Result<()> {
     if bytes == 0 {
         return folder.remove(RESERVE_NEW_NAME).and_then(|()| folder.remove(RESERVE_NAME));
@@ -470,7 +473,7 @@ fn fill_reserve(folder: &dyn Folder, bytes: u64) -> io::Result<()> {
     {
         return Ok(());
     }
-    // One that is too small gives its space to the new one.
+    // A reserve that is too small is deleted, so that the new one can use its space.
     folder.remove(RESERVE_NAME)?;
     let file = folder.create(RESERVE_NEW_NAME)?;
     file.set_len(bytes)?;

@@ -1,18 +1,18 @@
-//! Which generations are kept, which entries of the map they need, and what a commit adds and takes away.
+//! Which generations are kept, which map entries they need, and what a commit adds and removes.
 //!
-//! Pure bookkeeping: plans are made here, carried out by [`super::commit`], and adopted here once they are durable.
-//! A generation sees, of every page, the last entry that is not newer than itself.
+//! Bookkeeping without I/O: transactions are planned here, carried out by [`super::commit`], and adopted here once
+//! durable. A generation sees, of every page, the last entry that is not newer than itself.
 //!
-//! Invariants: 1. kept are the latest generation, the one before it and every pinned one; 2. an entry goes from the map
-//! only when no kept generation sees it; 3. a number is never given to two generations, so no slot of a dropped
-//! generation can be mistaken for one of a later generation.
+//! Invariants: 1. the latest generation, the one before it and every pinned one are kept; 2. an entry leaves the map
+//! only when no kept generation sees it; 3. no number is given to two generations, so a slot of a dropped generation
+//! cannot pass for one of a later generation.
 
 use crate::base::ids::PageId;
 use crate::page::map::manifest::{MapBatch, MapContent, MapVersion};
 use crate::page::map::mutants::{Mutant, active};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-/// An entry that generations `from..until` see.
+/// An entry, seen by generations `from..until`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Superseded {
     page: PageId,
@@ -36,15 +36,15 @@ pub struct Generations {
     next: u64,
     kept: BTreeSet<u64>,
     pins: BTreeMap<String, u64>,
-    /// Of every page that is there, the generation of its last entry.
+    /// For every existing page, the generation of its last entry.
     last: HashMap<PageId, u64>,
-    /// Of every page that is gone and that some kept generation still sees, the generation of the entry that says so.
+    /// For every removed page that a kept generation still sees, the generation of the entry that records the removal.
     gone: BTreeMap<PageId, u64>,
     superseded: Vec<Superseded>,
 }
 
 impl Generations {
-    /// As a map says.
+    /// The generations in a map.
     pub fn of(content: &MapContent) -> Generations {
         let mut generations = Generations {
             latest: content.counters.latest,
@@ -59,7 +59,7 @@ impl Generations {
         generations
     }
 
-    /// The generation that the store is at; 0 before the first commit.
+    /// The latest generation; 0 before the first commit.
     pub fn latest(&self) -> u64 {
         self.latest
     }
@@ -79,7 +79,7 @@ impl Generations {
         self.kept.contains(&generation)
     }
 
-    /// The names and what they stand for.
+    /// Pinned generations by name.
     pub fn pins(&self) -> &BTreeMap<String, u64> {
         &self.pins
     }
@@ -95,13 +95,13 @@ impl Generations {
         };
     }
 
-    /// Generation of the last entry of a page.
+    /// Generation of a page's last entry.
     fn last_entry(&self, page: PageId) -> Option<u64> {
         self.last.get(&page).or_else(|| self.gone.get(&page)).copied()
     }
 
-    /// The transaction that makes `generation` the latest: `put` are the pages that changed since the last one, in any
-    /// order, each once.
+    /// Plans the transaction that makes `generation` the latest. `put` holds the pages changed since the last
+    /// generation, in any order, each once.
     pub fn plan_commit(
         &self,
         generation: u64,
@@ -126,10 +126,10 @@ impl Generations {
             next: generation + 1,
             ..self.plan_with(self.kept_with(generation, &pins), generation)
         }
-        .without_needless(self)
+        .with_unseen_dropped(self)
     }
 
-    /// The transaction that gives a kept generation a name and takes names away.
+    /// Plans the transaction that pins and unpins generations.
     pub fn plan_pins(&self, put: &[(String, u64)], drop: &[String]) -> MapBatch {
         let mut pins = self.pins.clone();
         drop.iter().for_each(|name| {
@@ -144,11 +144,11 @@ impl Generations {
             drop_pins: drop.iter().filter(|name| self.pins.contains_key(*name)).cloned().collect(),
             ..self.plan_with(kept, self.latest)
         }
-        .without_needless(self)
+        .with_unseen_dropped(self)
     }
 
-    /// The transaction that makes the kept generation `to` the latest again; later ones are dropped with their names.
-    /// Not to be adopted: the store is opened anew after it.
+    /// Plans the transaction that makes the kept generation `to` the latest again; later ones are dropped with their
+    /// pins. Not for [`Generations::adopt`]: the store is reopened afterwards.
     pub fn plan_rollback(&self, to: u64) -> MapBatch {
         let entries = self.superseded.iter().map(|s| (s.page, s.from));
         let last = self.last.iter().chain(&self.gone).map(|(page, from)| (*page, *from));
@@ -163,7 +163,7 @@ impl Generations {
         }
     }
 
-    /// Takes over what `batch` did, once it is durable.
+    /// Applies `batch` to this bookkeeping, once it is durable.
     pub fn adopt(&mut self, batch: &MapBatch) {
         for version in &batch.put_versions {
             self.add(version);
@@ -207,8 +207,8 @@ impl Generations {
 }
 
 impl MapBatch {
-    /// Adds to the entries to drop those that no generation sees that is kept after this transaction.
-    fn without_needless(mut self, before: &Generations) -> MapBatch {
+    /// Adds the entries that no kept generation sees after this transaction to those to drop.
+    fn with_unseen_dropped(mut self, before: &Generations) -> MapBatch {
         let mut kept = before.kept.clone();
         kept.extend(self.put_generation.iter().map(|(generation, ..)| *generation));
         self.drop_generations.iter().for_each(|g| {

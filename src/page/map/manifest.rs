@@ -1,13 +1,14 @@
-//! The page map on the drive: which version of every page belongs to which generation, in redb.
+//! The page map on the drive: which version of every page belongs to which generation, stored in redb.
 //!
-//! redb decides which transaction counts after a crash; it does not tell a flipped bit in a value from a good one, and
-//! it may panic on a damaged file. So here: every value carries a checksum bound to its key; one sum over all entries
-//! tells a missing or doubled entry; opening verifies the library's own tree of checksums and every value before it
-//! changes anything; panics inside the library become [`MapError::Panicked`]; after any failed call the map takes no
-//! more. What a page's value means is not known here.
+//! redb decides which transaction counts after a crash. It does not detect a flipped bit in a value, and may panic on a
+//! damaged file. Therefore: every value carries a checksum bound to its key; a sum over all entries reveals a missing
+//! or doubled entry; opening verifies redb's own checksum tree and every value before it changes anything; panics
+//! inside redb become [`MapError::Panicked`]; after a failed call the map accepts no more calls. The meaning of a
+//! page's value is not known here.
 //!
-//! Entries are keyed (page, generation): the page is as the entry says from that generation on, until its next entry.
-//! Invariant: what [`Manifest::apply`] was given is in the map entirely or not at all, and durable when it returned.
+//! Entries are keyed (page, generation): an entry holds from its generation until the page's next entry.
+//! Invariant: a batch given to [`Manifest::apply`] is in the map entirely or not at all, and durable when `apply`
+//! returned.
 
 use crate::base::ids::PageId;
 use crate::page::format::encoding;
@@ -28,7 +29,7 @@ pub(in crate::page) const RUN_STATES: TableDefinition<'_, u64, &[u8]> = TableDef
 pub(in crate::page) const PINS: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("pins");
 pub(in crate::page) const HEADER: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("header");
 
-/// Numbers of the tables in seals.
+/// Table numbers in seals.
 pub(in crate::page) const PAGES_SEAL: u8 = 1;
 pub(in crate::page) const GENERATIONS_SEAL: u8 = 2;
 pub(in crate::page) const RUN_STATES_SEAL: u8 = 3;
@@ -37,36 +38,36 @@ pub(in crate::page) const HEADER_SEAL: u8 = 5;
 /// Key of the counters in the header table.
 pub(in crate::page) const COUNTERS: &str = "counters";
 
-/// Most transactions and generations: one a second for 68 years. Numbers of writes follow from generations, so beyond it
-/// they would run over.
+/// Most transactions and generations: one a second for 68 years. Serial numbers of writes are derived from generations
+/// and would overflow beyond this limit.
 const SEQUENCE_MAX: u64 = 1 << 31;
 const GENERATION_MAX: u64 = 1 << 31;
 
 /// Why the map cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum MapError {
-    /// Bytes of the map are not what was written.
+    /// The bytes of the map are not those written.
     #[error("the page map is damaged: {0}")]
     Damaged(String),
-    /// The map is whole, but older than what was acknowledged: a bit flipped, or an old copy was put in place.
-    #[error("the page map is at transaction {found}, but transaction {acknowledged} had been acknowledged")]
+    /// The map is undamaged, but older than the last acknowledged commit: a bit flipped, or an old copy was restored.
+    #[error("the page map is at transaction {found}, but transaction {acknowledged} was acknowledged")]
     Stale {
-        /// Transaction of the map.
+        /// Number of the map's last transaction.
         found: u64,
-        /// Transaction that the witness knows.
+        /// Number of the last transaction in the witness.
         acknowledged: u64,
     },
-    /// The library panicked.
+    /// redb panicked.
     #[error("the page map's library panicked: {0}")]
     Panicked(String),
-    /// The drive is full. Nothing was lost; the map must be opened again.
+    /// The drive is full. Nothing was lost; the map must be reopened.
     #[error("no space for the page map: {0}")]
     Full(io::Error),
     /// The drive failed.
     #[error("the page map cannot be read or written: {0}")]
     Io(io::Error),
     /// An earlier call failed.
-    #[error("the page map takes no more after an earlier error")]
+    #[error("the page map stopped after an earlier error")]
     Poisoned,
 }
 
@@ -86,7 +87,7 @@ impl From<redb::Error> for MapError {
     }
 }
 
-/// Runs calls of the library. A panic in it is an error.
+/// Runs calls of redb; a panic becomes an error.
 fn guarded<T>(calls: impl FnOnce() -> Result<T, Fault>) -> Result<T, MapError> {
     match catch_unwind(AssertUnwindSafe(calls)) {
         Ok(Ok(value)) => Ok(value),
@@ -100,7 +101,7 @@ fn guarded<T>(calls: impl FnOnce() -> Result<T, Fault>) -> Result<T, MapError> {
     }
 }
 
-/// What can go wrong inside [`guarded`].
+/// An error inside [`guarded`].
 pub(in crate::page) enum Fault {
     Library(Box<redb::Error>),
     Map(MapError),
@@ -116,18 +117,18 @@ pub(in crate::page) fn damaged(place: impl std::fmt::Display, problem: impl std:
     Fault::Map(MapError::Damaged(format!("{place}: {problem}")))
 }
 
-/// Counts of the whole map, written with every transaction.
+/// Counters of the whole map, written with every transaction.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Counters {
-    /// Transactions so far.
+    /// Number of transactions.
     pub sequence: u64,
-    /// The generation that the store is at; 0 before the first commit.
+    /// The latest generation; 0 before the first commit.
     pub latest: u64,
     /// Number of the next generation; never used twice.
     pub next: u64,
-    /// Entries of all tables but the header's.
+    /// Number of entries of all tables except the header's.
     pub(in crate::page) entries: u64,
-    /// Sum of the checksums of all these entries.
+    /// Sum of the checksums of these entries.
     pub(in crate::page) tally: u64,
 }
 
@@ -136,43 +137,43 @@ pub struct Counters {
 pub struct MapVersion {
     /// The page.
     pub page: PageId,
-    /// First generation that it belongs to.
+    /// First generation that sees it.
     pub generation: u64,
-    /// What the store keeps about it; `None`: from this generation on there is no such page.
+    /// The store's value; `None`: the page is removed from this generation on.
     pub value: Option<Vec<u8>>,
 }
 
-/// Everything in a map but the run states.
+/// Content of a map, except the run states.
 #[derive(Debug, Default)]
 pub struct MapContent {
-    /// Counts.
+    /// The counters.
     pub counters: Counters,
     /// All versions, ordered by page, then generation.
     pub versions: Vec<MapVersion>,
-    /// The kept generations and a note about each.
+    /// The kept generations with their notes.
     pub generations: BTreeMap<u64, Vec<u8>>,
-    /// Named generations.
+    /// Pinned generations by name.
     pub pins: BTreeMap<String, u64>,
 }
 
 /// One transaction.
 #[derive(Debug, Default)]
 pub struct MapBatch {
-    /// Versions that begin with a generation of this transaction.
+    /// New versions, which start with a generation of this transaction.
     pub put_versions: Vec<MapVersion>,
-    /// Versions that no kept generation needs.
+    /// Versions that no kept generation sees.
     pub drop_versions: Vec<(PageId, u64)>,
-    /// A new generation: number, note, run state.
+    /// The new generation: number, note, run state.
     pub put_generation: Option<(u64, Vec<u8>, Vec<u8>)>,
-    /// Generations that are not kept any longer.
+    /// Generations that are no longer kept.
     pub drop_generations: Vec<u64>,
-    /// Names to give.
+    /// Pins to add.
     pub put_pins: Vec<(String, u64)>,
-    /// Names to take away.
+    /// Pins to remove.
     pub drop_pins: Vec<String>,
-    /// The generation that the store is at afterwards.
+    /// The latest generation after this transaction.
     pub latest: u64,
-    /// Number of the next generation afterwards.
+    /// Number of the next generation after this transaction.
     pub next: u64,
 }
 
@@ -186,7 +187,7 @@ pub struct Manifest {
 }
 
 impl Manifest {
-    /// A new map in an empty file, durable when this returns. The folder is the caller's to sync.
+    /// Creates a map in an empty file, durable when this returns. The caller syncs the folder.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -199,28 +200,28 @@ impl Manifest {
         Ok(manifest)
     }
 
-    /// Opens the map in `file`, verifies all of it and reads what it holds. Unless it succeeds, `file` stays as it was.
+    /// Opens the map in `file`, verifies all of it and reads its content. On failure `file` stays unchanged.
     ///
     /// # Errors
     /// The map is damaged, older than transaction `acknowledged`, or cannot be read or written. [`MapError::Full`]: the
-    /// file is as a crash leaves it, and may be opened again.
+    /// file is in the state after a crash and may be reopened.
     pub fn open(
         file: Arc<dyn StorageBackend>,
         store: u128,
         acknowledged: u64,
         cache_bytes: usize,
     ) -> Result<(Manifest, MapContent), MapError> {
-        let (mut manifest, content) = Manifest::look(file, store, acknowledged, cache_bytes)?;
-        manifest.file.let_through()?;
+        let (mut manifest, content) = Manifest::open_read_only(file, store, acknowledged, cache_bytes)?;
+        manifest.file.release_held()?;
         manifest.poisoned = false;
         Ok((manifest, content))
     }
 
-    /// As [`Manifest::open`], but `file` stays as it is whatever happens: the map takes no transaction.
+    /// As [`Manifest::open`], but read-only: `file` never changes, and the map accepts no transaction.
     ///
     /// # Errors
     /// As [`Manifest::open`].
-    pub fn look(
+    pub fn open_read_only(
         file: Arc<dyn StorageBackend>,
         store: u128,
         acknowledged: u64,
@@ -241,15 +242,15 @@ impl Manifest {
         Ok((manifest, content))
     }
 
-    /// Counts after the last transaction.
+    /// Counters after the last transaction.
     pub fn counters(&self) -> Counters {
         self.counters
     }
 
-    /// Carries out one transaction: durable when this returns.
+    /// Runs one transaction; durable when this returns.
     ///
     /// # Errors
-    /// It may be durable or not; nothing but opening the map again tells. The map takes no more.
+    /// The transaction may or may not be durable; only reopening the map tells. The map accepts no more calls.
     pub fn apply(&mut self, batch: &MapBatch) -> Result<(), MapError> {
         if self.poisoned && !active(Mutant::PoisonIgnored) {
             return Err(MapError::Poisoned);
@@ -279,7 +280,7 @@ impl Manifest {
     /// The run state of a kept generation.
     ///
     /// # Errors
-    /// It is not there, damaged or cannot be read.
+    /// The run state is missing, damaged or cannot be read.
     pub fn run_state(&self, generation: u64) -> Result<Vec<u8>, MapError> {
         let database = self.database.as_ref().ok_or(MapError::Poisoned)?;
         let scope = self.scope(RUN_STATES_SEAL);
@@ -325,7 +326,7 @@ impl Manifest {
             }
             let fits = (sum.entries, sum.tally) == (content.counters.entries, content.counters.tally);
             if !fits && !active(Mutant::TallyNotVerified) {
-                return Err(damaged("entries", "some are missing, doubled or from another time"));
+                return Err(damaged("entries", "some are missing, doubled or outdated"));
             }
             check_generations(&content)?;
             Ok(content)
@@ -357,10 +358,10 @@ impl Manifest {
 
 impl Drop for Manifest {
     fn drop(&mut self) {
-        // The library would write while closing; the last acknowledged transaction is to be the last write.
+        // redb would write while closing, but the last acknowledged transaction must be the last write.
         self.file.shut();
         let database = self.database.take();
-        // A panic while closing a damaged map has nothing left to harm.
+        // A panic while closing a damaged map can do no more harm.
         let _ = catch_unwind(AssertUnwindSafe(move || drop(database)));
     }
 }
@@ -403,7 +404,7 @@ pub(in crate::page) fn unseal<'a>(
     }
 }
 
-/// Number and sum of checksums of entries.
+/// Number of entries and sum of their checksums.
 #[derive(Default)]
 struct Sum {
     entries: u64,
@@ -418,11 +419,11 @@ impl Sum {
     }
 }
 
-/// What a map says about generations cannot contradict itself.
+/// Checks that the generations in a map are consistent.
 fn check_generations(content: &MapContent) -> Result<(), Fault> {
     let Counters { sequence, latest, next, .. } = content.counters;
     if sequence > SEQUENCE_MAX || next > GENERATION_MAX {
-        return Err(damaged("counters", format!("no store gets to transaction {sequence} and generation {next}")));
+        return Err(damaged("counters", format!("transaction {sequence} or generation {next} is impossible")));
     }
     let known = |generation: u64| content.generations.contains_key(&generation);
     if next <= latest || (latest > 0 && !known(latest)) || content.generations.keys().any(|g| *g > latest || *g == 0) {

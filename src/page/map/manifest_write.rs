@@ -1,4 +1,4 @@
-//! Writing a transaction of the page map, and keeping its counts: every entry that goes in or out is in the sums.
+//! Writes a transaction of the page map, and keeps the counters: every entry added or removed changes the sums.
 
 use crate::page::format::encoding;
 use crate::page::format::seal::SealScope;
@@ -8,14 +8,14 @@ use crate::page::map::manifest::{
 };
 use redb::Table;
 
-/// Writes one batch and keeps the counts.
+/// Writes one batch and keeps the counters.
 pub(in crate::page) struct Writer {
     pub(in crate::page) store: u128,
     pub(in crate::page) counters: Counters,
 }
 
 impl Writer {
-    /// Everything of `batch`, into the tables of `transaction`.
+    /// Writes all of `batch` into the tables of `transaction`.
     pub(in crate::page) fn write(
         &mut self,
         transaction: &redb::WriteTransaction,
@@ -80,7 +80,7 @@ impl Writer {
         let sealed = scope.seal(bound(key_bytes), body);
         let before = table.insert(key, sealed.as_slice())?;
         if let Some(before) = before {
-            self.forget(unseal(scope, key_bytes, before.value(), "overwritten entry")?.1);
+            self.subtract(unseal(scope, key_bytes, before.value(), "overwritten entry")?.1);
         }
         self.counters.entries += 1;
         self.counters.tally = self.counters.tally.wrapping_add(scope.checksum(bound(key_bytes), body));
@@ -95,11 +95,11 @@ impl Writer {
         key_bytes: &[u8],
     ) -> Result<(), Fault> {
         let before = table.remove(key)?.ok_or_else(|| damaged("entry to remove", "it is not there"))?;
-        self.forget(unseal(self.scope(seal), key_bytes, before.value(), "entry to remove")?.1);
+        self.subtract(unseal(self.scope(seal), key_bytes, before.value(), "entry to remove")?.1);
         Ok(())
     }
 
-    fn forget(&mut self, checksum: u64) {
+    fn subtract(&mut self, checksum: u64) {
         self.counters.entries = self.counters.entries.wrapping_sub(1);
         self.counters.tally = self.counters.tally.wrapping_sub(checksum);
     }

@@ -1,12 +1,12 @@
-//! The file under the page map: what redb reads and writes.
+//! The file below the page map: the storage backend that redb reads and writes.
 //!
-//! Two things are held here that redb does not give. Opening changes nothing until it is known to be wanted: what redb
-//! writes while it repairs and marks the file is held back, and reaches the drive in the same order only after the map was
-//! verified; a refused file stays as it was found. And closing changes nothing: the last acknowledged commit is the
-//! last write, so every opening goes the way of an opening after a crash, which is the way that is tested.
+//! It adds two properties that redb lacks. First, opening changes nothing until the map is verified: redb's writes
+//! while it repairs and marks the file are held back, and reach the drive in the same order only after the
+//! verification; a refused file stays unchanged. Second, closing changes nothing: the last acknowledged commit is the
+//! last write, so every opening takes the path of an opening after a crash, which is the tested path.
 //!
-//! Invariants: 1. held-back operations are carried out in their order, syncs included; 2. once shut, nothing is read or
-//! written any more.
+//! Invariants: 1. held-back operations are carried out in order, syncs included; 2. once shut, the file is neither read
+//! nor written.
 
 use crate::page::engine::segment_files::allocate;
 use redb::{BackendError, StorageBackend};
@@ -16,7 +16,7 @@ use std::ops::Bound;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// One operation that is held back.
+/// One held-back operation.
 #[derive(Debug)]
 enum Held {
     Write(u64, Vec<u8>),
@@ -24,7 +24,7 @@ enum Held {
     Sync,
 }
 
-/// Operations of an opening that is not decided yet.
+/// Operations of an opening that is not verified yet.
 #[derive(Debug)]
 struct HeldBack {
     operations: Vec<Held>,
@@ -44,13 +44,13 @@ struct Shared {
 pub struct MapFile(Arc<Shared>);
 
 impl MapFile {
-    /// Passes everything through.
+    /// A file that passes everything through.
     pub fn new(file: Arc<dyn StorageBackend>) -> MapFile {
         let (held_back, failure) = (Mutex::new(None), Mutex::new(None));
         MapFile(Arc::new(Shared { file, held_back, shut: AtomicBool::new(false), failure }))
     }
 
-    /// Holds back what is written, until [`MapFile::let_through`].
+    /// A file that holds writes back until [`MapFile::release_held`].
     ///
     /// # Errors
     /// The length of the file cannot be read.
@@ -61,11 +61,11 @@ impl MapFile {
         Ok(map)
     }
 
-    /// Carries out what was held back; from now on everything passes through.
+    /// Carries out the held-back operations; from now on everything passes through.
     ///
     /// # Errors
-    /// The first operation that failed; the file is shut then.
-    pub fn let_through(&self) -> io::Result<()> {
+    /// The first operation that failed; the file is then shut.
+    pub fn release_held(&self) -> io::Result<()> {
         let operations = self.held_back().take().map(|held| held.operations).unwrap_or_default();
         for operation in operations {
             let done = match operation {
@@ -81,13 +81,13 @@ impl MapFile {
         Ok(())
     }
 
-    /// Ends all access. What was held back is dropped.
+    /// Ends all access and drops held-back operations.
     pub fn shut(&self) {
         self.0.shut.store(true, Ordering::Release);
         *self.held_back() = None;
     }
 
-    /// The first error that the drive gave; the library reports some of them only as "an earlier one".
+    /// The first error of the drive; redb reports some of them only as "an earlier error".
     pub fn failure(&self) -> Option<io::Error> {
         let failure = self.0.failure.lock().unwrap_or_else(PoisonError::into_inner);
         failure.as_ref().map(|(kind, text)| io::Error::new(*kind, text.clone()))
@@ -110,7 +110,7 @@ impl MapFile {
     }
 }
 
-/// What `out`, read from `offset`, would hold after `operations`.
+/// Applies `operations` to `out`, which was read from `offset`.
 fn overlay(operations: &[Held], offset: u64, out: &mut [u8]) {
     let end = offset + out.len() as u64;
     for operation in operations {
@@ -185,13 +185,13 @@ impl StorageBackend for MapFile {
         self.noted(self.0.file.write(offset, data))
     }
 
-    // The folder of the store is locked as a whole, so the file needs no lock of its own.
+    // The store's folder is locked as a whole, so the file needs no lock of its own.
     fn try_lock_range(&self, _start: Bound<u64>, _end: Bound<u64>) -> Result<bool, BackendError> {
         Err(BackendError::Unsupported)
     }
 }
 
-/// A file on a drive. Space is taken when it grows, so that a full drive is met before anything is overwritten.
+/// A file on a drive. Growing allocates space, so that a full drive is detected before anything is overwritten.
 #[derive(Debug)]
 pub struct DriveFile(File);
 
@@ -225,7 +225,7 @@ impl StorageBackend for DriveFile {
             return self.0.set_len(len);
         }
         allocate(&self.0, now, len).inspect_err(|_| {
-            // What was taken before space ran out is given back, as far as that works.
+            // Space that was allocated before the drive was full is freed, as far as possible.
             let _ = self.0.set_len(now);
         })
     }
@@ -269,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_held_back_is_read_but_not_written() {
+    fn held_back_writes_are_readable_but_not_on_the_drive() {
         let inner: Arc<dyn StorageBackend> = Arc::new(InMemoryBackend::new());
         inner.set_len(16).unwrap();
         inner.write(0, &[1; 16]).unwrap();
@@ -289,7 +289,7 @@ mod tests {
         let mut stored = [0; 16];
         inner.read(0, &mut stored).unwrap();
         assert_eq!((inner.len().unwrap(), stored), (16, [1; 16]), "nothing may reach the drive");
-        map.let_through().unwrap();
+        map.release_held().unwrap();
         let mut after = [9; 24];
         inner.read(0, &mut after).unwrap();
         assert_eq!(after, seen);

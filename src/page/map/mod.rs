@@ -1,4 +1,5 @@
-//! The map of versions and the commits that make it last: which version of every page belongs to which generation.
+//! The map of page versions and the commits that make it durable: which version of every page belongs to which
+//! generation.
 
 pub mod commit;
 pub mod generations;

@@ -1,9 +1,9 @@
-//! Deliberate mistakes of the commit protocol, switched on by the crash tests to prove that the tests would notice them.
+//! Deliberate bugs in the commit protocol, switched on by the crash tests to prove that the tests detect them.
 //!
-//! Builds without debug assertions, which users run, know no mutant: [`active`] is `false` there at compile time.
-//! Invariant: a mutant is active on the thread that chose it only, and nowhere by default.
+//! Builds without debug assertions, which users run, have no mutants: [`active`] is `false` there at compile time.
+//! Invariant: a mutant is active only on the thread that chose it, and nowhere by default.
 
-/// One mistake.
+/// One bug.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mutant {
     /// The map is committed before the segments are synced.
@@ -12,37 +12,37 @@ pub enum Mutant {
     SegmentsSyncedAfterMap,
     /// Slots of superseded versions become free before the map's commit.
     SlotsFreedBeforeAcknowledgement,
-    /// Slots of superseded versions become free at once, whichever generations are kept.
+    /// Slots of superseded versions become free at once, whatever generations are kept.
     SlotsFreedAtOnce,
-    /// The free list at opening is what the latest generation does not name.
+    /// At opening, every slot that the latest generation does not name is free.
     FreeListFromLatestOnly,
-    /// The free list at opening forgets one slot of the latest generation.
+    /// At opening, one slot of the latest generation is free.
     FreeListMissesOneSlot,
     /// Pinned generations do not keep their slots.
     PinsNotKept,
     /// Only the latest generation is kept, not the one before it.
     PreviousNotKept,
-    /// Map entries of a version go while a kept generation still needs them.
+    /// Map entries of a version are removed while a kept generation needs them.
     EntriesCollectedTooEarly,
     /// Map entries of superseded versions stay although their slots become free.
     EntriesNotCollected,
-    /// A page that was removed leaves no mark.
+    /// Removing a page records no entry.
     RemovalNotRecorded,
     /// Payload checksums of pages are not verified.
     PayloadNotVerified,
-    /// A slot with any good header and checksum is taken for the page that the map says is there.
+    /// A slot with any valid header and checksum passes for the page that the map names.
     SlotIdentityNotVerified,
-    /// A slot of the right page and place is taken for the right version.
+    /// A slot of the right page and place passes for the right version.
     SlotGenerationNotVerified,
-    /// A transfer of fewer bytes than asked for counts as done.
+    /// A partial transfer counts as complete.
     ShortAccepted,
     /// A failed write does not poison the store.
     WriteErrorIgnored,
-    /// A failed sync of segments is tried again and its second answer believed.
+    /// A failed sync of segments is repeated, and the second result is trusted.
     SyncRetried,
-    /// A failed transaction of the map is tried again.
+    /// A failed transaction of the map is repeated.
     MapCommitRetried,
-    /// The store goes on after it was poisoned.
+    /// A poisoned store continues.
     PoisonIgnored,
     /// The folder is not synced after a segment was created.
     FolderNotSyncedForSegment,
@@ -52,9 +52,9 @@ pub enum Mutant {
     ValuesNotVerified,
     /// Checksums of map values are not bound to their keys.
     ValuesNotBoundToKeys,
-    /// The map's sums over all its entries are not compared.
+    /// The map's sums over all entries are not compared.
     TallyNotVerified,
-    /// An older map than the acknowledged one is opened without a word.
+    /// A map older than the acknowledged one opens without an error.
     WitnessIgnored,
     /// The witness is written before the map's commit.
     WitnessBeforeMap,
@@ -62,9 +62,9 @@ pub enum Mutant {
     WitnessInOneSlot,
     /// The transaction of the map is not durable when it returns.
     MapNotDurable,
-    /// What is written after a cut for the generation that was cut counts as the next one's.
+    /// Writes after a cut for the generation that was cut count as the next one's.
     CutForgotten,
-    /// Generation numbers start again after a rollback.
+    /// A rollback resets the generation numbers.
     GenerationsReused,
 }
 
@@ -77,7 +77,7 @@ mod switch {
         static CHOSEN: Cell<Option<Mutant>> = const { Cell::new(None) };
     }
 
-    /// Whether `mutant` was chosen on this thread.
+    /// Whether `mutant` is active on this thread.
     pub fn active(mutant: Mutant) -> bool {
         CHOSEN.get() == Some(mutant)
     }

@@ -1,7 +1,7 @@
-//! What a store holds when it is opened: the pages of its last generation, and which slots are free.
+//! The content of a store at opening: the pages of its last generation, and the free slots.
 //!
-//! Nothing is kept on the drive about free slots. A slot is in use if the last generation names it, retired if only
-//! another kept generation does, and free otherwise; so a crash cannot leave a list that disagrees with the map.
+//! The drive holds no list of free slots. A slot is in use if the last generation names it, retired if only another
+//! kept generation does, and free otherwise; so no crash can leave a list that disagrees with the map.
 
 use crate::base::ids::PageId;
 use crate::page::engine::page_engine::{PageEngine, Place};
@@ -15,13 +15,13 @@ use crate::page::versions::paged_store::{PagedStore, PagedStoreConfig};
 use crate::page::versions::slots::SlotLayout;
 use std::collections::BTreeMap;
 
-/// Numbers of writes that a life of the store may use up between two commits: a life that opens a later generation begins
-/// beyond them. Lives that open the same generation, because those before them ended without a commit, begin at the same
-/// number. So of two versions whose slots name the same generation, the one with the larger number need not be the later
-/// one; the map never goes by these numbers, only a salvage without a map does.
+/// Serial numbers that one opening of the store may use between two commits: opening a later generation starts beyond
+/// them. Openings of the same generation, because the earlier ones ended without a commit, start at the same number. So
+/// of two versions whose slots name the same generation, the higher serial number may be the older version. The map
+/// never relies on serial numbers; only a salvage without a map does.
 const SERIALS_PER_LIFE: u64 = 1 << 32;
 
-/// Segments that an error names.
+/// Most segments that an error lists.
 const WRONG_SEGMENTS_LISTED: usize = 8;
 
 /// A page of a generation.
@@ -29,11 +29,11 @@ const WRONG_SEGMENTS_LISTED: usize = 8;
 pub struct StoredPage {
     /// The page.
     pub page: PageId,
-    /// Where its version is.
+    /// Its slot.
     pub slot: SlotRef,
-    /// What the layer above keeps about it.
+    /// The label, opaque to this layer.
     pub label: Vec<u8>,
-    /// The generation that brought this version.
+    /// The generation that wrote this version.
     pub since: u64,
 }
 
@@ -44,25 +44,25 @@ struct Past {
     until: u64,
 }
 
-/// A store that was just opened.
+/// A store as opened.
 #[derive(Debug)]
 pub struct Opened {
-    /// Its commits.
+    /// The store's commits.
     pub commits: Commits,
     /// Pages of the last generation, ascending by id; empty before the first commit.
     pub pages: Vec<StoredPage>,
     /// Run state of the last generation.
     pub run_state: Vec<u8>,
-    /// Everything that the map holds, for tools; the present pages are in `pages`.
+    /// The whole content of the map, for tools; the current pages are in `pages`.
     pub content: MapContent,
     past: Vec<Past>,
 }
 
 impl Opened {
-    /// Reads the values of `content`.
+    /// Decodes the values of `content`.
     ///
     /// # Errors
-    /// A value is not one, or two pages name one slot.
+    /// A value cannot be decoded, or two pages name one slot.
     pub(in crate::page) fn new(
         commits: Commits,
         content: MapContent,
@@ -76,7 +76,7 @@ impl Opened {
     /// Pages of a kept generation, ascending by id.
     ///
     /// # Errors
-    /// It is not kept.
+    /// The generation is not kept.
     pub fn pages_at(&self, generation: u64) -> Result<Vec<StoredPage>, CommitError> {
         if !self.commits.generations().is_kept(generation) {
             return Err(CommitError::NotKept(generation));
@@ -84,10 +84,10 @@ impl Opened {
         pages_at(&self.content.versions, generation)
     }
 
-    /// The slots of this store over an engine that has its segments.
+    /// The paged store on an engine that has the segments of this store.
     ///
     /// # Errors
-    /// Segments are missing or have another length; the map names a slot that cannot be, or one twice.
+    /// Segments are missing or have another length; the map names an impossible slot, or a slot twice.
     pub fn paged_store(
         &self,
         engine: Box<dyn PageEngine>,
@@ -115,8 +115,8 @@ impl Opened {
     }
 }
 
-/// Looks at all segments up to the `last` one that is named: they were made one after the other, and are written to as a
-/// store grows. So a map that names a segment beyond all that there are costs neither time nor memory. Gives their number.
+/// Checks all segments up to `last`, the highest one that the map names, and returns their number. Stops after a few
+/// wrong segments, so that a map naming an absurdly high segment costs neither time nor memory.
 pub(in crate::page) fn check_segments(
     engine: &dyn PageEngine,
     layout: SlotLayout,
@@ -157,7 +157,7 @@ fn past_slots(versions: &[MapVersion], present: &[StoredPage]) -> Result<Vec<Pas
     for pair in versions.windows(2).filter(|pair| pair[0].page == pair[1].page) {
         let (page, until) = (pair[0].page, pair[1].generation);
         let Some((slot, _)) = slot_and_label(&pair[0])? else { continue };
-        // A version whose label alone changed shares its slot with the next one of the same page.
+        // A version that differs only in its label shares its slot with the page's next version.
         match (present.get(&slot.place), past.get(&slot.place)) {
             (Some(other), _) | (_, Some((other, _))) if *other != page => {
                 let what = format!(
@@ -177,7 +177,7 @@ fn past_slots(versions: &[MapVersion], present: &[StoredPage]) -> Result<Vec<Pas
 
 pub(in crate::page) fn slot_and_label(version: &MapVersion) -> Result<Option<(SlotRef, &[u8])>, CommitError> {
     let Some(value) = &version.value else { return Ok(None) };
-    let wrong = || CommitError::Contradiction(format!("the value of page {} is none", version.page));
+    let wrong = || CommitError::Contradiction(format!("the value of page {} cannot be decoded", version.page));
     let (slot, label) = value.split_first_chunk().ok_or_else(wrong)?;
     Ok(Some((SlotRef::from_bytes(slot).ok_or_else(wrong)?, label)))
 }

@@ -1,11 +1,11 @@
-//! The witness: how far the map has been acknowledged, kept outside the map.
+//! The witness: the number of the last acknowledged map transaction, kept outside the map.
 //!
-//! One flipped bit in the map's file can make its library open the transaction before the last one, which is whole and
-//! whose checksums fit (the bit that says which of its two roots counts is in no checksum); so can a restored old copy of
-//! the file. The witness holds the number of the last acknowledged transaction; a map that is older is refused by name.
+//! One flipped bit in the map's file can make redb open the transaction before the last one, which is complete with
+//! valid checksums (the bit that selects one of redb's two roots is under no checksum). So can restoring an old copy of
+//! the file. The witness holds the number of the last acknowledged transaction; an older map is refused by name.
 //!
-//! The file is two slots of 4 KiB, written in turns, each synced before the next is touched: after a crash at least one
-//! is whole, and it is at most one transaction behind. A witness behind its map is an ordinary crash.
+//! The file has two slots of 4 KiB, written alternately, each synced before the other is touched. After a crash at
+//! least one is valid, and it is at most one transaction behind. A witness behind its map is an ordinary crash.
 
 use crate::page::format::seal::{SEAL_BYTES, SealScope};
 use crate::page::map::mutants::{Mutant, active};
@@ -13,12 +13,12 @@ use redb::StorageBackend;
 use std::io;
 use std::sync::Arc;
 
-/// Bytes of one slot, a sector's worth on every drive.
+/// Bytes of one slot: at least a sector on every drive.
 const SLOT_BYTES: usize = 4096;
 const SLOTS: u64 = 2;
 const TABLE: u8 = 255;
 const MAGIC: [u8; 8] = *b"gsw\x01ack\n";
-/// Magic and sequence.
+/// Bytes of magic and sequence number.
 const BODY_BYTES: usize = 16;
 
 /// The file that holds the number of the last acknowledged transaction.
@@ -30,7 +30,7 @@ pub struct Witness {
 }
 
 impl Witness {
-    /// Fills `file`, which is empty, and syncs it. The folder is the caller's to sync.
+    /// Fills the empty `file` and syncs it. The caller syncs the folder.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -41,10 +41,10 @@ impl Witness {
         Ok(witness)
     }
 
-    /// Reads `file`. A slot that is not whole is passed over.
+    /// Reads `file`; an invalid slot is ignored.
     ///
     /// # Errors
-    /// The file cannot be read, or holds no whole slot: [`io::ErrorKind::InvalidData`].
+    /// The file cannot be read, or has no valid slot: [`io::ErrorKind::InvalidData`].
     pub fn open(file: Arc<dyn StorageBackend>, store: u128) -> io::Result<Witness> {
         let mut sequence = None;
         for slot in 0..SLOTS {
@@ -57,11 +57,11 @@ impl Witness {
         }
         match sequence {
             Some(sequence) => Ok(Witness { file, store, sequence }),
-            None => Err(io::Error::new(io::ErrorKind::InvalidData, "neither slot of the witness is whole")),
+            None => Err(io::Error::new(io::ErrorKind::InvalidData, "neither slot of the witness is valid")),
         }
     }
 
-    /// The last acknowledged transaction that the file knows.
+    /// Number of the last acknowledged transaction.
     pub fn sequence(&self) -> u64 {
         self.sequence
     }
@@ -69,7 +69,7 @@ impl Witness {
     /// Writes `sequence` durably.
     ///
     /// # Errors
-    /// The file cannot be written; what it holds then is the old or the new number.
+    /// The file cannot be written; it then holds the old or the new number.
     pub fn record(&mut self, sequence: u64) -> io::Result<()> {
         let slot = if active(Mutant::WitnessInOneSlot) { 0 } else { sequence % SLOTS };
         let mut body = MAGIC.to_vec();
@@ -101,7 +101,7 @@ mod tests {
     use redb::backends::InMemoryBackend;
 
     #[test]
-    fn one_damaged_slot_costs_one_step_and_two_are_refused() {
+    fn one_damaged_slot_falls_back_one_transaction_and_two_are_refused() {
         let file: Arc<dyn StorageBackend> = Arc::new(InMemoryBackend::new());
         let mut witness = Witness::create(Arc::clone(&file), 9).unwrap();
         for sequence in 1..6 {
@@ -114,7 +114,7 @@ mod tests {
         newest[17] ^= 4;
         file.write(SLOT_BYTES as u64, &newest).unwrap();
         assert_eq!(Witness::open(Arc::clone(&file), 9).unwrap().sequence(), 4);
-        // The good slot's bytes in the wrong place count for nothing.
+        // A valid slot copied to the wrong place is ignored.
         let mut older = [0u8; SLOT_BYTES];
         file.read(0, &mut older).unwrap();
         file.write(SLOT_BYTES as u64, &older).unwrap();

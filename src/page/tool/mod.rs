@@ -1,4 +1,4 @@
-//! What tools need of a store beside a run's: looking without writing, building a new store, finding pages without a map.
+//! What tools need beyond a run: reading a store without writing, building a new store, finding pages without a map.
 
 pub mod new_store;
 pub mod reading;

@@ -1,10 +1,10 @@
-//! A store that is written by a tool: pages one after the other, then generations, then its name.
+//! Builds a store from a tool: pages, then generations, then the rename to its final name.
 //!
-//! It is made beside its target under another name and renamed when it is complete.
+//! The store is built beside its target under another name and renamed when complete.
 //!
-//! Invariants: 1. the target is a whole store or nothing: a tool that fails or is killed leaves at most a folder with
-//! [`PART_SUFFIX`], which the next attempt refuses to overwrite; 2. memory is bounded by sixteen pages, and by as many
-//! more where they are encoded.
+//! Invariants: 1. the target is a complete store or nothing: a tool that fails or is killed leaves at most a folder
+//! with suffix [`PART_SUFFIX`], which the next attempt refuses to overwrite; 2. memory is bounded by sixteen pages, and
+//! by sixteen more if they are encoded.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
@@ -24,30 +24,30 @@ use crate::page::versions::slots::SlotLayout;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// What the name of an unfinished store ends in.
+/// Suffix of the name of an unfinished store.
 pub const PART_SUFFIX: &str = ".part";
-/// Pages being written at once.
+/// Page writes in flight.
 const IN_FLIGHT: usize = 16;
 
-/// A store that is being made.
+/// A store under construction.
 #[derive(Debug)]
 pub struct NewStore {
     target: PathBuf,
     part: PathBuf,
-    /// `None` once the store is in its place.
+    /// `None` once the store has its final name.
     spill: Option<SpillDir>,
     commits: Commits,
     store: PagedStore,
     free: Vec<PageBuffer>,
-    /// Labels of pages whose write has not ended.
+    /// Labels of pages whose write has not completed.
     labels: BTreeMap<PageId, Vec<u8>>,
     changes: BTreeMap<PageId, Option<(SlotRef, Vec<u8>)>>,
 }
 
-/// A folder name that nothing has yet.
+/// The `.part` name for `target`, if neither exists.
 ///
 /// # Errors
-/// Something is there.
+/// One of them exists.
 pub fn refuse_existing(target: &Path) -> InputResult<PathBuf> {
     let mut name = target.as_os_str().to_os_string();
     name.push(PART_SUFFIX);
@@ -61,10 +61,10 @@ pub fn refuse_existing(target: &Path) -> InputResult<PathBuf> {
 }
 
 impl NewStore {
-    /// Begins a store that will be at `target`, where nothing is yet.
+    /// Starts a store for `target`, which does not exist.
     ///
     /// # Errors
-    /// Something is there, or the drive refuses.
+    /// `target` exists, or the drive fails.
     pub fn create(target: &Path, layout: SlotLayout, codec: Codec) -> Result<NewStore, ReadError> {
         let part = refuse_existing(target)?;
         let spill = SpillDir::create(&part, Purpose::Checkpoint, layout, false)?;
@@ -88,13 +88,13 @@ impl NewStore {
         }
     }
 
-    /// Stores a version of `page`, in the next generation.
+    /// Writes a version of `page` into the next generation.
     ///
     /// # Errors
-    /// The drive refuses.
+    /// The drive fails.
     pub fn put(&mut self, page: PageId, label: &[u8], payload: &[u8]) -> Result<(), ReadError> {
         while self.store.in_flight() >= IN_FLIGHT {
-            self.settle(true)?;
+            self.collect_completed(true)?;
         }
         let mut buffer = self.free.pop().unwrap_or_else(|| self.store.new_buffer());
         let room = buffer.as_mut_slice().get_mut(HEADER_BYTES..).and_then(|b| b.get_mut(..payload.len()));
@@ -106,23 +106,23 @@ impl NewStore {
         written.map_err(|(error, _)| ReadError::Commit(error.into()))
     }
 
-    /// Leaves `page` out of the next generation.
+    /// Removes `page` from the next generation.
     pub fn remove(&mut self, page: PageId) {
         self.changes.insert(page, None);
     }
 
-    /// Gives the next generation this number, at least that which it would have.
+    /// Raises the number of the next generation to this one, if it is higher.
     pub fn skip_to(&mut self, generation: u64) {
         self.store.skip_to(generation);
     }
 
-    /// Commits what was stored since the last commit, under `names`; returns the generation.
+    /// Commits the pages written since the last commit, pinned under `names`; returns the generation.
     ///
     /// # Errors
-    /// The drive refuses.
+    /// The drive fails.
     pub fn commit(&mut self, run_state: &[u8], note: &[u8], names: &[String]) -> Result<u64, ReadError> {
         while self.store.in_flight() > 0 {
-            self.settle(true)?;
+            self.collect_completed(true)?;
         }
         let changes = std::mem::take(&mut self.changes).into_iter();
         let changes: Vec<PageChange> = changes.map(|(page, version)| PageChange { page, version }).collect();
@@ -137,14 +137,16 @@ impl NewStore {
         Ok(generation)
     }
 
-    /// Puts the store in its place.
+    /// Renames the store to its target.
     ///
     /// # Errors
-    /// Something is there by now, or the drive refuses.
+    /// The target exists by now, or the drive fails.
     pub fn finish(mut self) -> Result<(), ReadError> {
-        let failed = |e: std::io::Error| InputError::io(&self.target, "putting the store in its place", &e);
+        let failed = |e: std::io::Error| InputError::io(&self.target, "renaming the store to its final name", &e);
         if std::fs::symlink_metadata(&self.target).is_ok() {
-            return Err(InputError::new(&self.target, "exists by now", "name another folder and start again").into());
+            return Err(
+                InputError::new(&self.target, "was created meanwhile", "name another folder and start again").into()
+            );
         }
         std::fs::rename(&self.part, &self.target).map_err(failed)?;
         self.spill = None;
@@ -153,7 +155,7 @@ impl NewStore {
         Ok(())
     }
 
-    fn settle(&mut self, wait: bool) -> Result<(), ReadError> {
+    fn collect_completed(&mut self, wait: bool) -> Result<(), ReadError> {
         let mut done = Vec::new();
         self.store.complete(wait, &mut done);
         for PageDone { page, buffer, result, .. } in done {
@@ -169,7 +171,7 @@ impl NewStore {
 
 impl Drop for NewStore {
     fn drop(&mut self) {
-        // An unfinished one is of no use; what cannot be removed keeps its telling name.
+        // An unfinished store is useless; a file that cannot be removed stays under the `.part` name.
         if let Some(spill) = self.spill.take() {
             let _ = spill.remove();
         }

@@ -1,11 +1,11 @@
-//! A store opened to be looked at: its map, its generations, and where their pages are. Nothing is ever written, not even
-//! the repairs that opening a map brings with it.
+//! A store opened read-only: its map, its generations, and the places of their pages. Nothing is written, not even the
+//! repairs that opening a map normally makes.
 //!
-//! A store that a process is using can be looked at as far as its map goes: a copy of the file is taken and verified
-//! until one is whole. Its pages cannot: slots of the last generation may be written again meanwhile.
+//! Of a store in use by another process only the map can be read: its file is copied until a copy verifies. The pages
+//! cannot be read, because slots of the last generation may be overwritten meanwhile.
 //!
-//! Invariants: 1. no file of the folder is opened for writing, made, or removed; 2. who holds a [`StoreReader`] of a store
-//! that is not in use keeps others from using it.
+//! Invariants: 1. no file of the folder is opened for writing, created, or removed; 2. a [`StoreReader`] of a store
+//! that is not in use keeps writers out.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
@@ -34,16 +34,16 @@ use std::time::Duration;
 
 /// Memory for the map's cache, bytes.
 const CACHE_BYTES: usize = 8 << 20;
-/// How often a map in use is copied until a copy is whole.
+/// Most copies of a map in use, until one verifies.
 const COPIES_MAX: u32 = 20;
 
-/// Why a store cannot be looked at.
+/// Why a store cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {
-    /// The folder, its FORMAT, or who uses it.
+    /// The folder or its FORMAT file cannot be used, or another process uses the store.
     #[error(transparent)]
     Input(#[from] InputError),
-    /// The map.
+    /// The map cannot be used.
     #[error(transparent)]
     Commit(#[from] CommitError),
 }
@@ -54,25 +54,25 @@ impl From<MapError> for ReadError {
     }
 }
 
-/// What is to be read of a store.
+/// The part of a store to read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
-    /// The map: also of a store in use.
+    /// The map only; works on a store in use.
     Map,
-    /// Pages as well: a store in use is refused.
+    /// Pages as well; a store in use is refused.
     Pages,
 }
 
-/// Whether the map must be at least as far as the witness says.
+/// Whether the map must be at least as new as the witness says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WitnessRule {
-    /// It must, and there must be a witness.
+    /// It must, and the witness must exist.
     Obeyed,
-    /// Whatever the witness says, or without one: for salvage.
+    /// The witness is ignored and may be missing: for salvage.
     Ignored,
 }
 
-/// A store that is looked at.
+/// A store opened read-only.
 #[derive(Debug)]
 pub struct StoreReader {
     folder: PathBuf,
@@ -89,23 +89,23 @@ pub struct StoreReader {
 /// A kept generation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GenerationUse {
-    /// Its number.
+    /// The generation's number.
     pub generation: u64,
-    /// Its names.
+    /// The names it is pinned under.
     pub names: Vec<String>,
     /// Pages that it sees.
     pub pages: u64,
     /// Bytes of their slots, headers and padding included.
     pub bytes: u64,
-    /// Of these, bytes that no other kept generation sees.
+    /// Bytes that no other kept generation sees.
     pub bytes_alone: u64,
 }
 
 impl StoreReader {
-    /// Opens the store in `folder` and verifies its whole map. Page data is not read.
+    /// Opens the store in `folder` and verifies its whole map. Reads no page data.
     ///
     /// # Errors
-    /// There is none, it is of another version, it is in use and pages were asked for, or its map is damaged.
+    /// There is no store, it has another version, its map is damaged, or it is in use and `access` includes pages.
     pub fn open(folder: &Path, access: Access, rule: WitnessRule) -> Result<StoreReader, ReadError> {
         let (format, features) = format_at(folder)?;
         let (lock, used_by) = match lock_for_reading(folder)? {
@@ -130,51 +130,51 @@ impl StoreReader {
         &self.folder
     }
 
-    /// Identity and sizes.
+    /// Identity of the store and sizes of its slots.
     pub fn format(&self) -> &SpillFormat {
         &self.format
     }
 
-    /// Version and features.
+    /// Format version and features.
     pub fn features(&self) -> FormatFeatures {
         self.features
     }
 
-    /// Who uses the store at the moment, as its lock says.
+    /// The process that uses the store, as its lock file says.
     pub fn used_by(&self) -> Option<&str> {
         self.used_by.as_deref()
     }
 
-    /// Generations, kept ones and names.
+    /// The generations, kept ones and pins.
     pub fn generations(&self) -> &Generations {
         &self.generations
     }
 
-    /// Transactions of the map so far.
+    /// Number of transactions of the map.
     pub fn transactions(&self) -> u64 {
         self.content.counters.sequence
     }
 
-    /// Entries of the map.
+    /// Number of entries of the map.
     pub fn entries(&self) -> usize {
         self.content.versions.len()
     }
 
-    /// The kept generation of this number or name; the latest without one.
+    /// The kept generation of this number or pin; the latest if `None`.
     ///
     /// # Errors
-    /// There is none; the message lists those that there are.
+    /// No such generation is kept; the message lists the kept ones.
     pub fn find(&self, generation: Option<&str>) -> InputResult<u64> {
         let refuse = |problem: String| {
             let pins = self.generations.pins().iter().map(|(name, g)| format!("{g} ({name})"));
             let unnamed = self.generations.kept().filter(|g| !self.generations.pins().values().any(|p| p == g));
             let list: Vec<String> = unnamed.map(|g| g.to_string()).chain(pins).collect();
             let list = if list.is_empty() { "none".to_string() } else { list.join(", ") };
-            Err(InputError::new(&self.folder, problem, format!("generations that are kept: {list}")))
+            Err(InputError::new(&self.folder, problem, format!("kept generations: {list}")))
         };
         let Some(word) = generation else {
             let latest = self.generations.latest();
-            return if latest > 0 { Ok(latest) } else { refuse("nothing was committed in this store yet".into()) };
+            return if latest > 0 { Ok(latest) } else { refuse("this store holds no commit yet".into()) };
         };
         let named = self.generations.pins().get(word).copied();
         let found = named.or_else(|| word.parse().ok().filter(|g| self.generations.is_kept(*g)));
@@ -184,7 +184,7 @@ impl StoreReader {
     /// Pages of a kept generation, ascending by id.
     ///
     /// # Errors
-    /// It is not kept, or the map contradicts itself.
+    /// The generation is not kept, or the map contradicts itself.
     pub fn pages_at(&self, generation: u64) -> Result<Vec<StoredPage>, CommitError> {
         if !self.generations.is_kept(generation) {
             return Err(CommitError::NotKept(generation));
@@ -195,7 +195,7 @@ impl StoreReader {
     /// The run state of a kept generation.
     ///
     /// # Errors
-    /// It is not kept, or cannot be read.
+    /// The run state is not kept, or cannot be read.
     pub fn run_state(&self, generation: u64) -> Result<Vec<u8>, CommitError> {
         if !self.generations.is_kept(generation) {
             return Err(CommitError::NotKept(generation));
@@ -208,11 +208,11 @@ impl StoreReader {
         self.content.generations.get(&generation).map_or(&[], Vec::as_slice)
     }
 
-    /// Every kept generation with what it takes on the drive, ascending.
+    /// Every kept generation with its disk use, ascending.
     ///
     /// # Errors
     /// The map contradicts itself.
-    pub fn uses(&self) -> Result<Vec<GenerationUse>, CommitError> {
+    pub fn disk_use(&self) -> Result<Vec<GenerationUse>, CommitError> {
         let kept: Vec<u64> = self.generations.kept().collect();
         let mut seen: HashMap<Place, (u32, u64, u64)> = HashMap::new();
         let mut uses = Vec::new();
@@ -235,7 +235,7 @@ impl StoreReader {
         Ok(uses)
     }
 
-    /// Every version that some kept generation sees, each once, in the order of their places.
+    /// Every version that a kept generation sees, each once, ordered by place.
     ///
     /// # Errors
     /// The map contradicts itself.
@@ -249,7 +249,7 @@ impl StoreReader {
         Ok(live.into_values().collect())
     }
 
-    /// Numbers and lengths of the segment files that are there, ascending.
+    /// Numbers and lengths of the existing segment files, ascending.
     ///
     /// # Errors
     /// The folder cannot be read.
@@ -257,15 +257,15 @@ impl StoreReader {
         segments_in(&self.folder)
     }
 
-    /// Reads single slots.
+    /// A reader of single slots.
     pub fn slot_reader(&self) -> SlotReader {
         SlotReader::new(&self.folder, self.format.store, self.format.layout.slot_bytes)
     }
 
-    /// These pages behind an engine that cannot write.
+    /// A paged store of `pages` on an engine that cannot write.
     ///
     /// # Errors
-    /// The map names a slot that cannot be; segments up to the last that these pages lie in are missing or have another
+    /// The map names an impossible slot; a segment up to the last one that `pages` use is missing or has another
     /// length; or the engine cannot be started.
     pub fn paged_store(&self, pages: &[StoredPage], threads: usize) -> Result<PagedStore, ReadError> {
         let engine = PreadEngine::open_read_only(&self.folder, threads)
@@ -286,29 +286,29 @@ impl StoreReader {
     }
 }
 
-/// How the commits of a store are opened by tools that write to it.
+/// Commit settings for tools that write to a store.
 pub fn commit_config(store: u128) -> CommitConfig {
     CommitConfig { store, cache_bytes: CACHE_BYTES, reserve_bytes: 0 }
 }
 
-/// The last generation that the map of `store` in `folder` holds, 0 before the first commit. Takes no lock: the caller has it.
+/// The last generation in the map of `store` in `folder`, 0 before the first commit. The caller holds the lock.
 ///
 /// # Errors
-/// There is no map, it is damaged, or it is older than its witness.
+/// The map is missing, damaged, or older than its witness.
 pub(in crate::page) fn latest_generation(folder: &Path, store: u128) -> Result<u64, ReadError> {
     let (_, content) = open_map(folder, store, WitnessRule::Obeyed, false)?;
     Ok(content.counters.latest)
 }
 
-/// What the FORMAT file of `folder` says.
+/// Content of the FORMAT file of `folder`.
 ///
 /// # Errors
-/// There is none, it is damaged, or of another version.
+/// The file is missing, damaged, or of another version.
 pub fn format_at(folder: &Path) -> InputResult<(SpillFormat, FormatFeatures)> {
     let no_store = || {
         let remedy = "name a run's output folder or its spill directory; if its FORMAT file was lost, gsscale-ckpt \
                       salvage can still find its pages";
-        InputError::new(folder, "there is no store in it: it has no FORMAT file", remedy)
+        InputError::new(folder, "it is not a store: it has no FORMAT file", remedy)
     };
     let format = read_format(folder)?.ok_or_else(no_store)?.map_err(|error| bad_format(folder, &error))?;
     let bytes = format_bytes_of(folder)?.ok_or_else(no_store)?;
@@ -332,10 +332,10 @@ pub fn segments_in(folder: &Path) -> InputResult<Vec<(u32, u64)>> {
     Ok(segments)
 }
 
-/// Refuses a folder that a process uses.
+/// Refuses a folder that a process is using.
 ///
 /// # Errors
-/// It is in use, or its lock cannot be read.
+/// The store is in use, or its lock cannot be read.
 pub fn refuse_if_in_use(folder: &Path) -> InputResult<Option<File>> {
     match lock_for_reading(folder)? {
         ReadLock::Taken(file) => Ok(Some(file)),
@@ -355,15 +355,15 @@ fn in_use(folder: &Path, who: &str) -> InputError {
 
 enum ReadLock {
     Taken(File),
-    /// No process ever locked it.
+    /// The store was never locked.
     Nobody,
     InUse(String),
 }
 
-/// A lock that readers share and no writer gets meanwhile.
+/// Takes a lock that readers share and that excludes writers.
 fn lock_for_reading(folder: &Path) -> InputResult<ReadLock> {
     let path = folder.join(LOCK);
-    let failed = |e: io::Error| InputError::io(&path, "asking who uses the store", &e);
+    let failed = |e: io::Error| InputError::io(&path, "finding out which process uses the store", &e);
     let file = match open_for_reading(&path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(ReadLock::Nobody),
         file => file.map_err(failed)?,
@@ -373,7 +373,7 @@ fn lock_for_reading(folder: &Path) -> InputResult<ReadLock> {
         Err(TryLockError::Error(error)) => Err(failed(error)),
         Err(TryLockError::WouldBlock) => {
             let mut text = String::new();
-            // Somebody else's file may be anything; then the holder stays unknown.
+            // A foreign lock file may contain anything; the holder then stays unknown.
             let _ = (&file).take(512).read_to_string(&mut text);
             let who = text.strip_prefix(LOCK_MAGIC).unwrap_or("unknown").trim().replace('\n', ", ");
             Ok(ReadLock::InUse(who))
@@ -381,7 +381,7 @@ fn lock_for_reading(folder: &Path) -> InputResult<ReadLock> {
     }
 }
 
-/// The map, from its file or from a copy of it in memory.
+/// The map, from its file or from an in-memory copy of it.
 fn open_map(folder: &Path, store: u128, rule: WitnessRule, copied: bool) -> Result<(Manifest, MapContent), ReadError> {
     let acknowledged = match rule {
         WitnessRule::Obeyed => {
@@ -404,10 +404,10 @@ fn open_map(folder: &Path, store: u128, rule: WitnessRule, copied: bool) -> Resu
     } else {
         Arc::new(DriveFile::new(file))
     };
-    Ok(Manifest::look(backend, store, acknowledged, CACHE_BYTES)?)
+    Ok(Manifest::open_read_only(backend, store, acknowledged, CACHE_BYTES)?)
 }
 
-/// As [`open_map`] while a process commits to it.
+/// As [`open_map`], while a process commits to it.
 fn open_copy(folder: &Path, store: u128, rule: WitnessRule) -> Result<(Manifest, MapContent), ReadError> {
     let mut copies = 1;
     loop {

@@ -1,7 +1,7 @@
-//! Finds versions of pages by their slot headers alone, for a store whose map is lost.
+//! Finds versions of pages by their slot headers, for a store whose map is lost.
 //!
-//! Invariants: 1. nothing is written; 2. memory is bounded by the headers that are found; 3. what is found is only what
-//! headers claim: whether a payload is whole is for [`super::slot_reader`] to say.
+//! Invariants: 1. nothing is written; 2. memory is bounded by the headers found; 3. a result is only what a header
+//! claims: [`super::slot_reader`] tells whether the payload is intact.
 
 use crate::base::error::{InputError, InputResult};
 use crate::page::engine::buffer::ALIGNMENT;
@@ -15,20 +15,20 @@ use redb::StorageBackend;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// What the segments of a folder hold.
+/// Result of a scan of all segments.
 #[derive(Debug, Default)]
 pub struct Scan {
-    /// Headers that stand where they were meant to be written, by store.
+    /// Headers that are at the place they name, by store.
     pub found: BTreeMap<u128, Vec<SlotHeader>>,
-    /// Places that hold a header with a broken checksum or of another place, and why.
+    /// Places whose header has a broken checksum or names another place, with the problem.
     pub broken: Vec<(Place, String)>,
     /// Segments that end before their last slot, with their lengths.
     pub short: Vec<(u32, u64)>,
-    /// Segment files that were read.
+    /// Number of segment files read.
     pub segments: u64,
 }
 
-/// Reads the header of every slot. Without the layout of the store, looks at every multiple of [`ALIGNMENT`].
+/// Reads the header of every slot. Without the store's layout, tries every multiple of [`ALIGNMENT`].
 ///
 /// # Errors
 /// The folder or a segment cannot be read.
@@ -59,11 +59,13 @@ impl Scan {
             Ok(header) if header.slot.place == place => self.found.entry(header.store).or_default().push(header),
             Ok(header) => {
                 let meant = header.slot.place;
-                let what =
-                    format!("page {} was meant for segment {} offset {}", header.page, meant.segment, meant.offset);
+                let what = format!(
+                    "the header of page {} names another place: segment {} offset {}",
+                    header.page, meant.segment, meant.offset
+                );
                 self.broken.push((place, what));
             }
-            // Never written, or the inside of a payload.
+            // Never written, or the middle of a payload.
             Err(HeaderError::NoHeader) => {}
             Err(error) => self.broken.push((place, error.to_string())),
         }

@@ -1,7 +1,7 @@
-//! Reads slots one at a time for tools that look at a store: no engine, no threads, nothing is written.
+//! Reads single slots for tools that inspect a store: no engine, no threads, no writes.
 //!
-//! Invariants: 1. bytes are given out as good only if [`super::verify`] found them to be the version that was asked for;
-//! 2. memory is taken for what a slot and its file really can hold, not for what the sizes of the store allow.
+//! Invariants: 1. bytes are returned only if [`crate::page::format::verify`] found them to be the requested version; 2.
+//! memory is bounded by the actual size of a slot and its file, not by the largest size that the layout could state.
 
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::PageBuffer;
@@ -20,23 +20,23 @@ pub struct SlotReader {
     folder: PathBuf,
     store: u128,
     slot_bytes: u64,
-    /// The segment that was read last, and its length.
+    /// The segment read last, and its length.
     file: Option<(u32, DriveFile, u64)>,
     stored: PageBuffer,
     decoded: PageBuffer,
 }
 
 impl SlotReader {
-    /// For the slots of store `store`, of `slot_bytes` bytes each, in `folder`.
+    /// A reader of the slots, of `slot_bytes` bytes each, of store `store` in `folder`.
     pub fn new(folder: &Path, store: u128, slot_bytes: u64) -> SlotReader {
         let buffer = || PageBuffer::zeroed(HEADER_BYTES);
         SlotReader { folder: folder.to_path_buf(), store, slot_bytes, file: None, stored: buffer(), decoded: buffer() }
     }
 
-    /// Whether version `slot` of `page` is there, by its header alone.
+    /// Checks by the header alone that version `slot` of `page` is in its place, and returns the header.
     ///
     /// # Errors
-    /// What is wrong, for people.
+    /// The problem, as text for users.
     pub fn check_header(&mut self, page: PageId, slot: &SlotRef) -> Result<SlotHeader, String> {
         let header = self.header_at(slot.place)?;
         verify_identity(self.store, page, slot, &header)?;
@@ -47,10 +47,10 @@ impl SlotReader {
         }
     }
 
-    /// The header at `place`, whatever page it is of.
+    /// The header at `place`, of whatever page.
     ///
     /// # Errors
-    /// What is wrong, for people.
+    /// The problem, as text for users.
     pub fn header_at(&mut self, place: Place) -> Result<SlotHeader, String> {
         let mut bytes = [0; HEADER_BYTES];
         self.read(place, HEADER_BYTES, |from| bytes.copy_from_slice(from))?;
@@ -60,12 +60,12 @@ impl SlotReader {
     /// The payload of version `slot` of `page`, verified and decoded; aligned for its tables.
     ///
     /// # Errors
-    /// What is wrong, for people.
+    /// The problem, as text for users.
     pub fn payload(&mut self, page: PageId, slot: &SlotRef) -> Result<&[u8], String> {
         let bytes = slot.transfer_bytes();
         let needed = bytes.max(transfer_bytes(slot.payload_bytes as usize));
         if needed as u64 > self.slot_bytes {
-            return Err(format!("the index gives it {bytes} bytes, more than a slot holds"));
+            return Err(format!("the map states {bytes} bytes, more than a slot holds"));
         }
         self.read(slot.place, bytes, |_| ())?;
         if slot.codec != StoredAs::Raw {
@@ -77,7 +77,7 @@ impl SlotReader {
         Ok(&whole.as_slice()[HEADER_BYTES..][..slot.payload_bytes as usize])
     }
 
-    /// Brings bytes into the buffer and hands them to `take`.
+    /// Reads bytes into the buffer and passes them to `take`.
     fn read(&mut self, place: Place, bytes: usize, take: impl FnOnce(&[u8])) -> Result<(), String> {
         let failed = |e: io::Error| match e.kind() {
             io::ErrorKind::NotFound => format!("{} is missing", segment_file_name(place.segment)),
@@ -104,7 +104,7 @@ impl SlotReader {
     }
 }
 
-/// Makes a buffer at least so long; what it held is lost then.
+/// Replaces the buffer with a longer one if it is too short; its content is then lost.
 fn make_longer(buffer: &mut PageBuffer, bytes: usize) {
     if buffer.len() < bytes {
         *buffer = PageBuffer::zeroed(bytes);

@@ -1,41 +1,41 @@
-//! Generations of a store: which one is being written, and when the slots of past versions become free.
+//! Generations of a store: which one is being written, and when slots of past versions become free.
 //!
-//! A cut ends a generation. What it consists of may still be written after it, for that generation by name, while
-//! versions for the next one are written beside it.
+//! A cut ends a generation. Versions of the ended generation may still be written after the cut, by its number, beside
+//! versions of the next one.
 //!
-//! Invariant: a slot is retired with the generations that may name it, never with fewer.
+//! Invariant: a retired slot keeps the whole range of generations that may name it.
 
 use crate::page::format::slot_header::SlotRef;
 use crate::page::versions::paged_store::PagedStore;
 
 impl PagedStore {
-    /// The version `slot` is no longer its page's. If no committed generation can name it, its slot is free at once,
-    /// otherwise after [`PagedStore::commit_done`]. A run that commits nothing never has to wait.
+    /// Version `slot` is superseded. If no committed generation can name it, its slot is free at once, otherwise after
+    /// [`PagedStore::commit_done`]. A run without commits thus frees every slot at once.
     pub fn free(&mut self, slot: &SlotRef) {
         self.free_from(slot, self.config.generation);
     }
 
-    /// As [`PagedStore::free`]: from generation `from` on, which was cut and is not committed yet, the version is no
-    /// longer its page's.
+    /// As [`PagedStore::free`], but superseded from generation `from` on, which is cut and not committed yet.
     pub fn free_from(&mut self, slot: &SlotRef, from: u64) {
         let was_in_use = self.slots.retire(slot.place, slot.generation, from);
         debug_assert!(was_in_use, "a slot was freed twice: {slot:?}");
     }
 
-    /// The index as of now is about to be committed as generation [`PagedStore::generation`]: what is written from here
-    /// on belongs to the next, unless [`PagedStore::write_for`] says otherwise. Before the commit
-    /// [`PagedStore::sync`] is called, after the last of these writes.
+    /// Ends generation [`PagedStore::generation`], which is about to be committed from the present index: later writes
+    /// belong to the next generation, unless [`PagedStore::write_for`] names the ended one. [`PagedStore::sync`] must
+    /// follow the last write of the generation and precede the commit.
     pub fn cut(&mut self) -> u64 {
         self.config.generation += 1;
         self.config.generation - 1
     }
 
-    /// Generation `durable` is committed, and of those before it `pinned` are kept: frees slots that none names.
+    /// Acknowledges the commit of generation `durable`; of the earlier ones `pinned` are kept. Frees the slots that
+    /// none of these names; returns how many.
     pub fn commit_done(&mut self, durable: u64, pinned: &[u64]) -> usize {
         self.slots.release_retired(durable, pinned)
     }
 
-    /// At opening: the version `slot`, in use so far, is one that only generations before `until` name.
+    /// At opening: only generations before `until` name version `slot`, which was marked in use.
     pub fn retire_past(&mut self, slot: &SlotRef, until: u64) {
         let was_in_use = self.slots.retire(slot.place, slot.generation, until);
         debug_assert!(was_in_use, "a slot was retired twice: {slot:?}");

@@ -1,4 +1,4 @@
-//! Versions of pages over an engine: which slot holds which version, and what becomes of slots that nobody needs any more.
+//! Versions of pages on an engine: which slot holds which version, and when a slot becomes free.
 
 pub(in crate::page) mod cut;
 pub(in crate::page) mod page_done;

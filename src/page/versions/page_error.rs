@@ -1,4 +1,4 @@
-//! What can go wrong with a page, with the place and the remedy.
+//! Errors of page reads and writes, with place and remedy.
 //!
 //! Invariant: an error about stored bytes names the segment file, the offset, the page and its generation.
 
@@ -8,14 +8,14 @@ use crate::page::engine::segment_files::segment_file_name;
 use crate::page::format::slot_header::LABEL_BYTES_MAX;
 use std::io;
 
-/// A version of a page in its slot, for messages.
+/// The slot of a version, for messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SlotName {
     /// The page.
     pub page: PageId,
-    /// Where its slot is.
+    /// Place of the slot.
     pub place: Place,
-    /// First generation that the version can belong to.
+    /// First generation that may name the version.
     pub generation: u64,
 }
 
@@ -30,74 +30,74 @@ impl std::fmt::Display for SlotName {
 /// Why a page could not be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum PageError {
-    /// The drive did not give the bytes, twice.
-    #[error("{at} cannot be read: {source}\n  remedy: check the drive and its cable; go back to an earlier checkpoint")]
+    /// Reading failed twice.
+    #[error(
+        "{at} cannot be read: {source}\n  remedy: check the drive and its cable; roll back to an earlier checkpoint"
+    )]
     Read {
-        /// Which version.
+        /// The version.
         at: SlotName,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// The bytes are not those that were written, twice.
-    #[error("{at} is damaged: {what}\n  remedy: check the drive; go back to an earlier checkpoint")]
+    /// The bytes read differ from those written, in two attempts.
+    #[error("{at} is damaged: {what}\n  remedy: check the drive; roll back to an earlier checkpoint")]
     Damaged {
-        /// Which version.
+        /// The version.
         at: SlotName,
-        /// What does not match.
+        /// The mismatch.
         what: String,
     },
-    /// The drive did not take the bytes. The store takes no more writes.
-    #[error("{at} cannot be written: {source}\n  remedy: check the drive; what was committed is still there")]
+    /// Writing failed. The store accepts no more writes.
+    #[error("{at} cannot be written: {source}\n  remedy: check the drive; committed generations are intact")]
     Write {
-        /// Which version it was to be.
+        /// The version being written.
         at: SlotName,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// There is no space for the bytes. Nothing is lost; it may be tried again.
+    /// No space for the bytes. Nothing is lost, and the write may be repeated.
     #[error("there is no space to write {at}: {source}\n  remedy: free space on the drive of the spill directory")]
     NoSpace {
-        /// Which version it was to be.
+        /// The version being written.
         at: SlotName,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// There is no space for another segment, or it cannot be made. Nothing is lost; it may be tried again.
-    #[error("{} ({bytes} bytes) cannot be made: {source}\n  remedy: {}", segment_file_name(*.segment), grow_remedy(.source))]
+    /// No space for another segment, or it cannot be created. Nothing is lost, and the attempt may be repeated.
+    #[error("{} ({bytes} bytes) cannot be created: {source}\n  remedy: {}", segment_file_name(*.segment), grow_remedy(.source))]
     Grow {
         /// Number of the segment.
         segment: u32,
         /// Its length.
         bytes: u64,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// The drive reported an error while it made writes durable. The store takes no more writes.
+    /// The drive failed to make writes durable. The store accepts no more writes.
     #[error(
-        "the drive did not keep what was written: {source}\n  remedy: check the drive; what was committed is still there"
+        "the drive could not make writes durable: {source}\n  remedy: check the drive; committed generations are intact"
     )]
     Sync {
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// A write or sync failed earlier, so nothing may be written on top.
-    #[error(
-        "nothing is written any more after an error of the drive ({cause})\n  remedy: check the drive, then start again"
-    )]
+    /// A write or sync failed earlier, so the store accepts no writes.
+    #[error("writing stopped after a drive error ({cause})\n  remedy: check the drive, then start again")]
     Poisoned {
         /// The first error.
         cause: String,
     },
-    /// The payload or its label is longer than there is room for.
+    /// The payload or its label is too long.
     #[error(
-        "page {page} has {payload_bytes} bytes and a label of {label_bytes}; there is room for {capacity_bytes} and {LABEL_BYTES_MAX}\n  remedy: report this, it is a mistake of the program"
+        "page {page} has {payload_bytes} bytes and a label of {label_bytes}; the limits are {capacity_bytes} and {LABEL_BYTES_MAX}\n  remedy: report this as a bug"
     )]
     TooLong {
         /// The page.
         page: PageId,
-        /// Its bytes.
+        /// Bytes of the payload.
         payload_bytes: usize,
-        /// Room for them.
+        /// Most bytes of a payload.
         capacity_bytes: usize,
         /// Bytes of the label.
         label_bytes: usize,
@@ -105,7 +105,7 @@ pub enum PageError {
 }
 
 impl PageError {
-    /// Whether it is only space that is missing: the same may work later.
+    /// Whether the error is only a lack of space: a later attempt may succeed.
     pub fn is_out_of_space(&self) -> bool {
         match self {
             PageError::NoSpace { .. } => true,
@@ -115,20 +115,20 @@ impl PageError {
     }
 }
 
-/// What helps where a segment cannot be made.
+/// The remedy when a segment cannot be created.
 fn grow_remedy(source: &io::Error) -> &'static str {
     match source.kind() {
-        // A limit on the length of files counts as a want of space, too; the message above says which it was.
+        // A limit on file length counts as a lack of space, too; the message above names the cause.
         _ if is_out_of_space(source) => "free space on the drive of the spill directory",
         io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => {
-            "see to it that the spill directory can be written, or name another one"
+            "make the spill directory writable, or name another one"
         }
-        io::ErrorKind::AlreadyExists => "take the file out of the spill directory if it is not of this run",
-        _ => "check the drive and the spill directory; what was committed is still there",
+        io::ErrorKind::AlreadyExists => "remove the file from the spill directory if it does not belong to this run",
+        _ => "check the drive and the spill directory; committed generations are intact",
     }
 }
 
-/// Whether the system refused bytes for want of space. Nothing was written then.
+/// Whether the system refused bytes for lack of space; then nothing was written.
 pub fn is_out_of_space(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded | io::ErrorKind::FileTooLarge)
 }

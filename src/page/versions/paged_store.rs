@@ -1,14 +1,14 @@
-//! Versions of pages over an engine: slots, headers, codec, checksums.
+//! Versions of pages on an engine: slots, headers, codec, checksums.
 //!
-//! The layer above hands over a page's buffer (header room first, then the payload) and gets a [`SlotRef`] to keep in
-//! its index, or hands over a [`SlotRef`] and gets the payload back, verified. Buffers are moved, and every one comes
-//! back, also when something fails.
+//! To write, the layer above hands over a page's buffer (header room, then payload) and receives a [`SlotRef`] for its
+//! index. To read, it hands over a [`SlotRef`] and receives the verified payload. Buffers are moved, and every one is
+//! returned, also on failure.
 //!
-//! Invariants: 1. bytes are given out as good only if header and payload are exactly the version that the reference
-//! names (store, page, generation, place, lengths, checksum); what fails that is read once more and then named;
-//! 2. a new version never overwrites a slot that a durable or pinned generation names; 3. after a failed write or
-//! sync no write is taken any more; running out of space is not that: nothing was written, and there may be space
-//! later; 4. every accepted transfer ends in exactly one [`PageDone`].
+//! Invariants: 1. a read succeeds only if header and payload are exactly the version that the reference names (store,
+//! page, generation, place, lengths, checksum); a mismatch is read once more and then reported; 2. a new version never
+//! overwrites a slot that a durable or pinned generation names; 3. after a failed write or sync the store accepts no
+//! more writes, except after a lack of space: then nothing was written, and space may be freed later; 4. every accepted
+//! transfer ends in exactly one [`PageDone`].
 
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::PageBuffer;
@@ -25,38 +25,38 @@ use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::io;
 
-/// Writes that wait to be encoded and checksummed together, so that all threads have work.
+/// Writes that are encoded and checksummed as one batch, so that all threads have work.
 const WRITE_BATCH: usize = 16;
 
-/// What a store is told at its making.
+/// Configuration of a store.
 #[derive(Debug, Clone, Copy)]
 pub struct PagedStoreConfig {
     /// Identity of the store, in every slot.
     pub store: u128,
     /// Sizes of slots and segments.
     pub layout: SlotLayout,
-    /// How new versions are stored; versions stored otherwise are read all the same.
+    /// Codec of new versions; versions in any codec can be read.
     pub codec: Codec,
-    /// Generation that is being written: one more than the last committed one.
+    /// The generation being written: one more than the last committed one.
     pub generation: u64,
-    /// Number of the next write; larger than that of any slot that counts.
+    /// Serial number of the next write; higher than that of any valid slot.
     pub serial: u64,
 }
 
-/// A transfer between acceptance and end.
+/// A transfer in flight.
 #[derive(Debug)]
 struct Pending {
     token: u64,
     page: PageId,
     slot: SlotRef,
     direction: Direction,
-    /// Set for the second and last attempt of a read.
+    /// Whether this is the second and last attempt of a read.
     is_repeated: bool,
-    /// The caller's buffer while the encoded form travels in one of the store's own.
+    /// The caller's buffer, while a staging buffer carries the encoded form.
     payload: Option<PageBuffer>,
 }
 
-/// Pages in slots. One owner.
+/// Pages in slots. Has one owner.
 pub struct PagedStore {
     engine: Box<dyn PageEngine>,
     pub(in crate::page) config: PagedStoreConfig,
@@ -64,11 +64,11 @@ pub struct PagedStore {
     pending: BTreeMap<u64, Pending>,
     next_transfer: u64,
     waiting: Vec<Waiting>,
-    /// Ends that were not taken yet.
+    /// Finished transfers not collected yet.
     ended: Vec<PageDone>,
-    /// Buffers of a slot's size that are not in use.
+    /// Free staging buffers, of a slot's size.
     staging: Vec<PageBuffer>,
-    /// Buffers of that kind that are in use.
+    /// Number of staging buffers in use.
     staged: usize,
     traffic: PageTraffic,
     poison: Option<String>,
@@ -80,7 +80,7 @@ impl PagedStore {
         PagedStore::with_slots(engine, config, Slots::new(config.layout))
     }
 
-    /// A store whose `segments` segments exist and hold the versions of an index.
+    /// A store whose `segments` segments exist and hold the versions that an index names.
     ///
     /// # Errors
     /// The index names a slot twice, or one that does not exist.
@@ -115,12 +115,12 @@ impl PagedStore {
         self.config.layout.slot_bytes as usize - HEADER_BYTES
     }
 
-    /// A buffer for one page of this store: header room and the longest payload, zeroed.
+    /// A zeroed buffer for one page of this store: header room and the longest payload.
     pub fn new_buffer(&self) -> PageBuffer {
         PageBuffer::mapped(self.config.layout.slot_bytes as usize)
     }
 
-    /// The engine's name, for people.
+    /// The engine's name, for messages.
     pub fn engine_name(&self) -> &'static str {
         self.engine.name()
     }
@@ -130,62 +130,62 @@ impl PagedStore {
         self.traffic
     }
 
-    /// The slots, to look at.
+    /// The slots, read-only.
     pub fn slots(&self) -> &Slots {
         &self.slots
     }
 
-    /// Reads and writes that were accepted and whose end was not taken yet.
+    /// Accepted reads and writes whose result has not been collected.
     pub fn in_flight(&self) -> usize {
         self.pending.len() + self.waiting.len() + self.ended.len()
     }
 
-    /// Memory of the store's own buffers, bytes: none while pages are stored raw, otherwise as much as was ever in flight
-    /// at once.
+    /// Memory of the staging buffers, bytes: none while pages are stored raw, else the most that was ever in flight.
     pub fn staging_bytes(&self) -> u64 {
         (self.staging.len() + self.staged) as u64 * self.config.layout.slot_bytes
     }
 
-    /// Buffers of the store's own that are in use: one for every page that is on its way encoded or waits to be.
+    /// Staging buffers in use: one per encoded page that is in flight or waiting.
     pub fn staged(&self) -> usize {
         self.staged
     }
 
-    /// Generation that is being written.
+    /// The generation being written.
     pub fn generation(&self) -> u64 {
         self.config.generation
     }
 
-    /// Raises the number of the generation that is being written, if `generation` is higher: for copies that keep numbers.
+    /// Raises the number of the generation being written to `generation`, if that is higher: for copies that keep
+    /// numbers.
     pub fn skip_to(&mut self, generation: u64) {
         self.config.generation = self.config.generation.max(generation);
     }
 
-    /// Number of the next write.
+    /// Serial number of the next write.
     pub fn serial(&self) -> u64 {
         self.config.serial
     }
 
-    /// Why the store takes no writes any more, if so.
+    /// The error after which the store accepts no writes, if any.
     pub fn poison(&self) -> Option<&str> {
         self.poison.as_deref()
     }
 
-    /// Starts to read the version `slot` of `page` into `buffer`, which is at least as long as a slot needs.
+    /// Starts reading version `slot` of `page` into `buffer`, which is at least as long as a slot.
     pub fn read(&mut self, token: u64, page: PageId, slot: &SlotRef, buffer: PageBuffer) {
         let pending =
             Pending { token, page, slot: *slot, direction: Direction::Read, is_repeated: false, payload: None };
         self.submit_read(pending, buffer);
     }
 
-    /// Accepts a new version of `page` for writing, which begins with [`PagedStore::begin_writes`]: the first
-    /// `payload_bytes` bytes behind the header room of `buffer`. `label` is what the index needs to know of the page, at
-    /// most [`LABEL_BYTES_MAX`] bytes. Header room and padding are overwritten; the payload stays as it is and comes back
-    /// with the end.
+    /// Accepts a new version of `page`; [`PagedStore::begin_writes`] starts the write. The payload is the first
+    /// `payload_bytes` bytes after the header room of `buffer`. `label` is what the layer above needs to rebuild its
+    /// index entry, at most [`LABEL_BYTES_MAX`] bytes. Header room and padding are overwritten; the payload is returned
+    /// unchanged with the result.
     ///
     /// # Errors
-    /// No space, the store is poisoned, or payload or label are too long; the buffer comes back at once. Nothing is in
-    /// flight then and no slot was taken.
+    /// No space, the store is poisoned, or payload or label are too long; the buffer is returned at once. Nothing is
+    /// then in flight, and no slot was taken.
     pub fn write(
         &mut self,
         token: u64,
@@ -197,8 +197,8 @@ impl PagedStore {
         self.write_for(self.config.generation, token, page, label, payload_bytes, buffer)
     }
 
-    /// As [`PagedStore::write`], for a generation: the present one, or the last that was [cut](PagedStore::cut) and is
-    /// not committed yet.
+    /// As [`PagedStore::write`], for a given generation: the current one, or the last one [cut](PagedStore::cut) if it
+    /// is not committed yet.
     ///
     /// # Errors
     /// As [`PagedStore::write`].
@@ -224,7 +224,8 @@ impl PagedStore {
         Ok(())
     }
 
-    /// Moves ended reads and writes to `done`. With `wait`, blocks until at least one is there, if any is in flight.
+    /// Moves finished reads and writes to `done`. With `wait`, blocks until at least one has finished, if any is in
+    /// flight.
     pub fn complete(&mut self, wait: bool, done: &mut Vec<PageDone>) {
         self.begin_writes();
         loop {
@@ -232,14 +233,14 @@ impl PagedStore {
             let mut completions = Vec::new();
             self.engine.complete(wait, &mut completions);
             self.finish_all(completions);
-            // A repeated read is no end yet.
+            // A read that is being repeated has not finished.
             if !wait || !self.ended.is_empty() {
                 return done.append(&mut self.ended);
             }
         }
     }
 
-    /// Waits for all reads and writes, then makes what was written durable.
+    /// Waits for all reads and writes, then makes the writes durable.
     ///
     /// # Errors
     /// The drive reported an error, now or earlier: the store is poisoned. Failed writes are in `done` as well.
@@ -258,7 +259,7 @@ impl PagedStore {
         })
     }
 
-    /// Takes no writes from now on: something else that belongs to the store failed.
+    /// Poisons the store, because another part of it failed: no more writes are accepted.
     pub fn poison_with(&mut self, cause: String) {
         self.poison.get_or_insert(cause);
     }
@@ -306,7 +307,7 @@ impl PagedStore {
         let (segment, bytes) = (self.slots.segments(), self.config.layout.segment_bytes());
         self.engine.create_segment(segment, bytes).map_err(|source| PageError::Grow { segment, bytes, source })?;
         self.slots.add_segment();
-        // A fresh segment has at least one slot.
+        // A new segment has at least one slot.
         self.slots.allocate().ok_or(PageError::Poisoned { cause: "a segment without slots".to_string() })
     }
 
@@ -320,12 +321,12 @@ impl PagedStore {
         self.staging.push(buffer);
     }
 
-    /// Hands the writes that were accepted to the engine. They begin by themselves when there are some more of them, or
-    /// with [`PagedStore::complete`].
+    /// Submits the accepted writes to the engine. This happens by itself when a batch is full and in
+    /// [`PagedStore::complete`].
     pub fn begin_writes(&mut self) {
         let (mut batch, codec) = (std::mem::take(&mut self.waiting), self.config.codec);
         match batch.as_mut_slice() {
-            // Handing one page to another thread costs more than it saves.
+            // For one page another thread costs more than it saves.
             [one] => one.seal(codec),
             many => many.par_iter_mut().for_each(|write| write.seal(codec)),
         }
@@ -343,7 +344,7 @@ impl PagedStore {
         }
     }
 
-    /// Puts the header in front and submits.
+    /// Writes the header before the payload and submits.
     fn submit_write(&mut self, mut pending: Pending, label: &[u8], mut buffer: PageBuffer) {
         if let Err(error) = self.refuse_if_poisoned() {
             self.slots.release(pending.slot.place);
@@ -374,13 +375,13 @@ impl PagedStore {
         self.submit(pending, buffer, bytes);
     }
 
-    /// Reads the slot of `pending`; encoded versions into a buffer of the store.
+    /// Submits the read of `pending`; an encoded version goes to a staging buffer.
     fn submit_read(&mut self, mut pending: Pending, buffer: PageBuffer) {
         let bytes = pending.slot.transfer_bytes();
         let needed = bytes.max(transfer_bytes(pending.slot.payload_bytes as usize));
         // A reference from a damaged index may ask for more than a slot holds.
         if needed > buffer.len().min(self.config.layout.slot_bytes as usize) {
-            let what = format!("the index gives it {needed} bytes, more than a slot holds");
+            let what = format!("the map states {needed} bytes, more than a slot holds");
             let error = PageError::Damaged { at: pending.name(), what };
             return self.ended.push(pending.end(buffer, Err(error)));
         }
@@ -403,7 +404,7 @@ impl PagedStore {
         self.engine.submit(Transfer { token, direction, place, bytes, buffer });
     }
 
-    /// Verifies what was read, all threads at once, and ends or repeats each transfer.
+    /// Verifies finished reads on all threads, then completes or repeats each transfer.
     fn finish_all(&mut self, completions: Vec<Completion>) {
         let mut checked: Vec<(Pending, Completion, Result<(), String>)> = completions
             .into_iter()
@@ -418,7 +419,7 @@ impl PagedStore {
             }
         };
         match checked.as_mut_slice() {
-            // Handing one page to another thread costs more than it saves.
+            // For one page another thread costs more than it saves.
             [one] => check(one),
             many => many.par_iter_mut().for_each(check),
         }

@@ -1,25 +1,25 @@
-//! Which slots of the segments are free, in use, or retired until a later commit.
+//! The state of every slot: free, in use, or retired until a later commit.
 //!
-//! Pure bookkeeping without I/O. Slots are numbered through all segments; a segment holds a fixed number of them.
+//! Bookkeeping without I/O. Slots are numbered across all segments; each segment holds the same number of slots.
 //!
-//! Invariants: 1. a slot that holds a version which a durable or pinned generation may name is never handed out:
-//! [`Slots::retire`] keeps it until [`Slots::release_retired`] is told that no such generation is left; 2. the lowest
-//! free slot is handed out first, so that an import writes the segments from front to back; 3. free, in use and
-//! retired slots add up to all slots, each is exactly one of the three.
+//! Invariants: 1. a slot whose version a durable or pinned generation may name is never handed out: [`Slots::retire`]
+//! keeps it until [`Slots::release_retired`] learns that no such generation is left; 2. the lowest free slot is handed
+//! out first, so that an import fills the segments front to back; 3. every slot is exactly one of free, in use and
+//! retired.
 
 use crate::page::engine::buffer::ALIGNMENT;
 use crate::page::engine::page_engine::Place;
 use crate::page::format::slot_header::{HEADER_BYTES, transfer_bytes};
 use std::collections::BTreeSet;
 
-/// Segments of small scenes are not made larger than this, bytes.
+/// Target size of a segment, bytes; segments of small scenes are smaller.
 const SEGMENT_BYTES: u64 = 256 << 20;
-/// No payload is longer than its length can say, so no slot is larger than this, bytes.
+/// Largest slot, bytes: the length of a payload is a 32-bit number.
 const SLOT_BYTES_MAX: u64 = HEADER_BYTES as u64 + (1 << 32);
-/// A scene is expected to lie in about this many segments at most: each costs an open file.
+/// Target number of segments of a scene: each costs a file descriptor.
 const SEGMENTS: u64 = 64;
 
-/// Sizes that never change in the life of a store.
+/// Sizes that are fixed for the life of a store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SlotLayout {
     /// Bytes of a slot; a multiple of [`ALIGNMENT`].
@@ -29,8 +29,8 @@ pub struct SlotLayout {
 }
 
 impl SlotLayout {
-    /// Slots for payloads of at most `capacity_bytes`, in segments fit for a scene of about `pages` pages: about
-    /// 256 MiB, less where the scene is smaller, more where it would need too many files.
+    /// Slots for payloads of at most `capacity_bytes`, in segments that suit a scene of about `pages` pages: about 256
+    /// MiB, less for a smaller scene, more where a scene would need too many files.
     pub fn new(capacity_bytes: usize, pages: u64) -> SlotLayout {
         let slot_bytes = transfer_bytes(capacity_bytes) as u64;
         let usual = (SEGMENT_BYTES / slot_bytes).min(pages);
@@ -43,19 +43,19 @@ impl SlotLayout {
         self.slot_bytes * u64::from(self.slots_per_segment)
     }
 
-    /// Where slot number `slot` is.
+    /// Place of slot number `slot`.
     pub fn place(&self, slot: u64) -> Place {
         let per = u64::from(self.slots_per_segment);
         Place { segment: (slot / per) as u32, offset: slot % per * self.slot_bytes }
     }
 
-    /// Number of the slot at `place`; `None` where no slot begins.
+    /// Number of the slot at `place`; `None` if no slot starts there.
     pub fn slot(&self, place: Place) -> Option<u64> {
         let begins = place.offset.is_multiple_of(self.slot_bytes) && place.offset < self.segment_bytes();
         begins.then(|| u64::from(place.segment) * u64::from(self.slots_per_segment) + place.offset / self.slot_bytes)
     }
 
-    /// Whether the sizes can be those of a store: aligned, not empty, no larger than a payload can be, segments
+    /// Whether a store can have these sizes: aligned, not empty, no larger than the longest payload, segments
     /// addressable.
     pub fn is_possible(&self) -> bool {
         self.slot_bytes > ALIGNMENT as u64
@@ -66,18 +66,18 @@ impl SlotLayout {
     }
 }
 
-/// What a slot is.
+/// State of a slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SlotState {
-    /// May be written.
+    /// May be handed out.
     Free,
-    /// Holds the present version of a page, or is being written.
+    /// Holds the current version of a page, or is being written.
     InUse,
     /// Holds a past version that a durable or pinned generation may name.
     Retired,
 }
 
-/// A past version: generations `written..retired` may name it.
+/// A past version, which generations `written..retired` may name.
 #[derive(Debug, Clone, Copy)]
 struct Retired {
     slot: u64,
@@ -94,27 +94,27 @@ pub struct Slots {
     retired: Vec<Retired>,
 }
 
-/// Why slots cannot be as an index says.
+/// Why slots cannot be as an index states.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SlotError {
-    /// No slot begins there, or the segment does not exist.
+    /// No slot starts there, or the segment does not exist.
     #[error("the index names segment {} offset {}, where there is no slot", .0.segment, .0.offset)]
     NoSlot(Place),
-    /// Two versions cannot share one.
+    /// Two versions name the same slot.
     #[error("the index names the slot at segment {} offset {} twice", .0.segment, .0.offset)]
     Twice(Place),
 }
 
 impl Slots {
-    /// No segments yet.
+    /// Slots of a store without segments.
     pub fn new(layout: SlotLayout) -> Slots {
         Slots { layout, states: Vec::new(), free: BTreeSet::new(), retired: Vec::new() }
     }
 
-    /// The slots of `segments` existing segments of which exactly the places in `used` are in use.
+    /// The slots of `segments` existing segments; exactly the places in `used` are in use.
     ///
     /// # Errors
-    /// A place is no slot, or is named twice.
+    /// A place is not a slot, or is named twice.
     pub fn with_used(
         layout: SlotLayout,
         segments: u32,
@@ -128,11 +128,11 @@ impl Slots {
         Ok(slots)
     }
 
-    /// Takes a free slot that an index names, at opening: of the present generation or of a pinned one. Past versions
-    /// are retired after that with [`Slots::retire`].
+    /// At opening, marks a free slot as in use because the index of the current or of a pinned generation names it.
+    /// [`Slots::retire`] then retires past versions.
     ///
     /// # Errors
-    /// The place is no slot, or is named twice.
+    /// The place is not a slot, or is named twice.
     pub fn mark_used(&mut self, place: Place) -> Result<(), SlotError> {
         let slot = self.number(place).ok_or(SlotError::NoSlot(place))?;
         if !self.free.remove(&slot) {
@@ -142,7 +142,7 @@ impl Slots {
         Ok(())
     }
 
-    /// The sizes.
+    /// The sizes of slots and segments.
     pub fn layout(&self) -> SlotLayout {
         self.layout
     }
@@ -152,7 +152,7 @@ impl Slots {
         (self.states.len() / self.layout.slots_per_segment as usize) as u32
     }
 
-    /// Number of all slots.
+    /// Number of slots.
     pub fn total(&self) -> u64 {
         self.states.len() as u64
     }
@@ -167,26 +167,26 @@ impl Slots {
         self.retired.len() as u64
     }
 
-    /// What the slot at `place` is; `None` where there is none.
+    /// State of the slot at `place`; `None` if no slot starts there.
     pub fn state(&self, place: Place) -> Option<SlotState> {
         self.number(place).map(|slot| self.states[slot as usize])
     }
 
-    /// Takes the lowest free slot; `None` when another segment is needed first.
+    /// Takes the lowest free slot; `None` if another segment is needed.
     pub fn allocate(&mut self) -> Option<Place> {
         let slot = self.free.pop_first()?;
         self.states[slot as usize] = SlotState::InUse;
         Some(self.layout.place(slot))
     }
 
-    /// Adds the slots of the next segment, number [`Slots::segments`], which exists by now.
+    /// Adds the slots of the next segment, number [`Slots::segments`], which must exist by now.
     pub fn add_segment(&mut self) {
         let first = self.states.len() as u64;
         self.states.resize(self.states.len() + self.layout.slots_per_segment as usize, SlotState::Free);
         self.free.extend(first..self.states.len() as u64);
     }
 
-    /// Gives a slot back at once: no generation names it. Returns whether it was in use.
+    /// Frees a slot that no generation names. Returns whether it was in use.
     pub fn release(&mut self, place: Place) -> bool {
         let Some(slot) = self.in_use(place) else { return false };
         self.states[slot as usize] = SlotState::Free;
@@ -194,9 +194,9 @@ impl Slots {
         true
     }
 
-    /// The version written for generation `written` is no longer the page's from generation `retired` on: its slot
-    /// waits until no durable or pinned generation between them is left. A version that no generation can have named
-    /// (`written == retired`) is free at once. Returns whether the slot was in use.
+    /// Retires the version that was written for generation `written` and superseded in generation `retired`: its slot
+    /// is freed when no durable or pinned generation between the two is left. A version that no generation can have
+    /// named (`written == retired`) is freed at once. Returns whether the slot was in use.
     pub fn retire(&mut self, place: Place, written: u64, retired: u64) -> bool {
         if written >= retired {
             return self.release(place);
@@ -207,8 +207,8 @@ impl Slots {
         true
     }
 
-    /// Generation `durable` was committed and `pinned` are the earlier ones to keep: frees the retired slots that none
-    /// of them names. Returns how many.
+    /// Frees the retired slots that neither generation `durable`, now committed, nor the earlier generations `pinned`
+    /// name. Returns how many.
     pub fn release_retired(&mut self, durable: u64, pinned: &[u64]) -> usize {
         let before = self.retired.len();
         let (states, free) = (&mut self.states, &mut self.free);
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn an_index_that_cannot_be_is_refused() {
+    fn an_impossible_index_is_refused() {
         let place = |segment, offset| Place { segment, offset };
         let slots = Slots::with_used(layout(2), 2, [place(1, 0), place(0, 8192)]).unwrap();
         assert_eq!((slots.total(), slots.free()), (4, 2));
@@ -292,21 +292,21 @@ mod tests {
         }
     }
 
-    /// A plain model: for every slot, the generations that name it.
+    /// A simple model: for every kept generation, the places it names.
     #[derive(Default)]
     struct Model {
-        /// Place and generation of the write.
+        /// Place, and generation of the write.
         present: BTreeMap<u8, (Place, u64)>,
-        /// Committed generations that are kept, with the places that they name.
+        /// Committed generations that are kept, with their places.
         kept: BTreeMap<u64, Vec<Place>>,
         pinned: Vec<u64>,
         generation: u64,
         durable: u64,
     }
 
-    /// All sequences of seven operations on two pages: write a page anew, cut and acknowledge a commit (with and
-    /// without a pin, with a write between cut and acknowledgement), drop the pins. After each one, no place that a
-    /// kept generation names was handed out, and the three states add up.
+    /// All sequences of seven operations on two pages: rewrite a page, cut and acknowledge a commit (with and without a
+    /// pin, with a write between cut and acknowledgement), drop the pins. After each operation, no place that a kept
+    /// generation names was handed out, and the three states add up.
     #[test]
     fn no_sequence_of_operations_hands_out_a_named_slot() {
         const OPERATIONS: u32 = 6;
@@ -333,7 +333,7 @@ mod tests {
             }
             drop_pins(&mut slots, &mut model);
             commit(&mut slots, &mut model, false, None);
-            assert_eq!(slots.retired(), 0, "sequence {code}: slots are lost for ever");
+            assert_eq!(slots.retired(), 0, "sequence {code}: slots have leaked");
         }
     }
 
@@ -350,7 +350,7 @@ mod tests {
 
     fn commit(slots: &mut Slots, model: &mut Model, pin: bool, write_meanwhile: Option<u8>) {
         let cut = model.generation;
-        // From the cut on, the generation being committed must be treated as named.
+        // From the cut on, the generation being committed counts as naming its places.
         model.kept.insert(cut, model.present.values().map(|p| p.0).collect());
         model.generation += 1;
         if let Some(page) = write_meanwhile {

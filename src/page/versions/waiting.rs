@@ -1,15 +1,15 @@
-//! A version of a page between its acceptance and its first byte on the drive: made into what will be stored.
+//! Prepares an accepted version for writing: encodes, pads and checksums it.
 //!
-//! Not here: the slot's header, which takes its number when the write is handed to the engine.
+//! The slot's header is written elsewhere: it gets its serial number when the write is submitted to the engine.
 //!
-//! Invariant: the payload stays as it is; what is encoded goes to a buffer of its own.
+//! Invariant: the payload stays unchanged; the encoded form goes to a staging buffer.
 
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::format::codec::{self, Codec};
 use crate::page::format::slot_header::{HEADER_BYTES, SlotRef, StoredAs, checksum};
 
-/// A write that waits to be encoded and checksummed.
+/// A write waiting to be encoded and checksummed.
 #[derive(Debug)]
 pub(in crate::page) struct Waiting {
     pub token: u64,
@@ -17,17 +17,17 @@ pub(in crate::page) struct Waiting {
     pub slot: SlotRef,
     pub label: Vec<u8>,
     pub payload: PageBuffer,
-    /// For the encoded form.
+    /// Receives the encoded form.
     pub staging: Option<PageBuffer>,
 }
 
 impl Waiting {
-    /// Encodes, pads with zeros and checksums what will be stored; sets codec, stored bytes and checksum of the slot.
+    /// Encodes, zero-pads and checksums the payload; sets codec, stored length and checksum in the slot reference.
     pub fn seal(&mut self, codec: Codec) {
         let slot = &mut self.slot;
         if let Some(staging) = &mut self.staging {
             let payload = &self.payload.as_slice()[HEADER_BYTES..][..slot.payload_bytes as usize];
-            // What cannot be encoded for whatever reason is stored raw.
+            // A payload that fails to encode for any reason is stored raw.
             if let Ok(Some((bytes, stored_as))) =
                 codec::encode_as(codec, payload, &mut staging.as_mut_slice()[HEADER_BYTES..])
             {

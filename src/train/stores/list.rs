@@ -50,7 +50,7 @@ pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
     let store = place.open(Access::Map)?;
     let tests = place.run.as_deref().map(tests_of).unwrap_or_default();
     let mut generations = Vec::new();
-    for used in store.uses()? {
+    for used in store.disk_use()? {
         let state = run_state_of(&store, used.generation)?;
         let in_metrics = || tests.iter().rfind(|(step, _)| *step < state.step).map(|(_, psnr)| *psnr);
         let psnr = state.test.map(|test| test.psnr).or_else(in_metrics);
