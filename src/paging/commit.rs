@@ -12,11 +12,11 @@ use super::pager::{Pager, PagerConfig};
 use super::stored::PageLimits;
 use super::transfers::Failure;
 use crate::base::ids::{PageId, PageNo};
-use crate::cache::frame::FrameState;
 use crate::page::format::slot_header::SlotRef;
 use crate::page::map::commit::{CommitError, Commits, Cut, PageChange};
 use crate::page::map::opening::StoredPage;
 use crate::page::versions::paged_store::PagedStore;
+use crate::paging::frames::frame::FrameState;
 use std::collections::BTreeMap;
 
 /// Writes in flight at once: each may need a buffer of its own to be encoded in.
@@ -52,13 +52,14 @@ impl Pager {
     /// # Errors
     /// A page could not be written. It is still in memory, and the call may be repeated.
     pub fn flush(&mut self) -> Result<(), PagingError> {
-        debug_assert_eq!(self.cache.count(FrameState::Pinned), 0, "a step holds pages");
+        debug_assert_eq!(self.frames.count(FrameState::Pinned), 0, "a step holds pages");
         self.thaw();
         // Pages whose write failed are dirty still: what was wrong with them is tried again here.
         self.failed_write = None;
         self.writes_stopped = false;
         self.settle_below(1)?;
-        let mut dirty: Vec<PageNo> = self.cache.held().map(|h| h.page).filter(|&p| self.cache.is_dirty(p)).collect();
+        let mut dirty: Vec<PageNo> =
+            self.frames.held().map(|(_, held)| held.page).filter(|&p| self.frames.is_dirty(p)).collect();
         dirty.sort_unstable();
         for page in dirty {
             self.settle_below(WRITES_IN_FLIGHT)?;

@@ -10,9 +10,9 @@ use super::pager::Pager;
 use super::pinned::PinnedPage;
 use super::transfers::{Failure, WRITES};
 use crate::base::ids::PageNo;
-use crate::cache::evict::NEVER;
-use crate::cache::frame::FrameState;
 use crate::page::engine::buffer::PageBuffer;
+use crate::paging::frames::evict::NEVER;
+use crate::paging::frames::frame::FrameState;
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Instant;
 
@@ -57,7 +57,7 @@ impl Pager {
     /// Pins pages with rows, in this order.
     pub(super) fn fetch(&mut self, what: &str, pages: &[PageNo], asker: Asker) -> Result<Vec<PinnedPage>, PagingError> {
         let held = self.held_by_callers();
-        if held + pages.len() > self.cache.frames_max() {
+        if held + pages.len() > self.frames.frames_max() {
             return Err(self.working_set(what, held + pages.len()));
         }
         let pinned = pages.iter().map(|_| None).collect();
@@ -67,7 +67,7 @@ impl Pager {
         let result = self.fetch_into(&mut fetch, pages);
         let pinned = fetch.pinned.into_iter().flatten();
         if let Err(error) = result {
-            pinned.for_each(|p| self.cache.unpin(p.page, p.buffer, false));
+            pinned.for_each(|p| self.frames.unpin(p.page, p.buffer, false));
             return Err(error);
         }
         let pinned: Vec<PinnedPage> = pinned.collect();
@@ -81,7 +81,7 @@ impl Pager {
         fetch.frozen = fetch.outstanding.keys().copied().filter(|&page| self.holds_frozen(page)).collect();
         let frozen = fetch.frozen.len();
         self.judge(fetch, failures)?;
-        let is_absent = |page: &PageNo| self.cache.state(*page).is_none();
+        let is_absent = |page: &PageNo| self.frames.state(*page).is_none();
         let mut to_read: VecDeque<PageNo> = pages.iter().copied().filter(is_absent).collect();
         if fetch.asker.is_step() {
             self.stats.pages_needed += pages.len() as u64;
@@ -141,7 +141,7 @@ impl Pager {
     /// Pins an outstanding page if it is resident and not frozen.
     fn pin_into(&mut self, fetch: &mut Fetch, page: PageNo) {
         let Some(&place) = fetch.outstanding.get(&page).filter(|_| !self.holds_frozen(page)) else { return };
-        if let Some((buffer, dirty)) = self.cache.pin(page, fetch.asker.is_step()) {
+        if let Some((buffer, dirty)) = self.frames.pin(page, fetch.asker.is_step()) {
             fetch.outstanding.remove(&page);
             fetch.pinned[place] = Some(PinnedPage { page, meta: self.index[page.index()], dirty, buffer });
         }
@@ -178,11 +178,11 @@ impl Pager {
     pub(super) fn make_room(&mut self, wanted: usize, asker: Asker) -> Result<bool, PagingError> {
         loop {
             // Pages that are written to leave come first: a nearer one must not leave in their place.
-            let leaving = self.cache.count(FrameState::Writing) - self.ahead[WRITES] / self.cache.frame_bytes();
-            if leaving >= wanted + self.cache.excess() {
+            let leaving = self.frames.count(FrameState::Writing) - self.ahead[WRITES] / self.config.frame_bytes();
+            if leaving >= wanted + self.frames.excess() {
                 return Ok(false);
             }
-            let victim = if self.writes_stopped { self.cache.clean_victim() } else { self.cache.victim() };
+            let victim = if self.writes_stopped { self.frames.clean_victim() } else { self.frames.victim() };
             match victim {
                 Some(victim) if !victim.dirty => {
                     self.evict(victim.page);
@@ -200,7 +200,7 @@ impl Pager {
                     && self.held_by_callers() == 0 =>
                 {
                     // Everything in memory is dirty and cannot leave: one frame more lets the scene be written out.
-                    self.cache.add_frame();
+                    self.frames.add_frame();
                     return Ok(true);
                 }
                 _ => return Ok(false),
@@ -224,21 +224,21 @@ impl Pager {
             return Err(cause);
         }
         self.failed_write = Some(cause);
-        self.cache.add_frame();
+        self.frames.add_frame();
         self.frame_for(Asker::Step)
     }
 
     /// A frame without a page, emptied if need be, for a step or for the import; a failed write ends the call for both.
     pub(super) fn frame_for(&mut self, asker: Asker) -> Result<PageBuffer, PagingError> {
         loop {
-            if let Some(buffer) = self.cache.lend() {
+            if let Some(buffer) = self.frames.lend(|| PageBuffer::mapped(self.config.frame_bytes())) {
                 return Ok(buffer);
             }
             if self.make_room(1, Asker::Step)? {
                 continue;
             }
             if self.in_flight() == 0 {
-                return Err(self.working_set("a page that splits", self.cache.frames_max() + 1));
+                return Err(self.working_set("a page that splits", self.frames.frames_max() + 1));
             }
             for Failure { is_write, error, .. } in self.settle_for(asker, &mut Vec::new()) {
                 if is_write {
@@ -251,7 +251,7 @@ impl Pager {
     /// Keeps an import at the speed of the drive: a frame that is clean already for the next page, and writes of those
     /// that are not.
     pub(super) fn write_behind(&mut self) -> Result<(), PagingError> {
-        if self.cache.has_free() || self.store.is_none() {
+        if self.frames.has_free() || self.store.is_none() {
             return Ok(());
         }
         for Failure { is_write, error, .. } in self.settle(false, &mut Vec::new()) {
@@ -260,24 +260,24 @@ impl Pager {
             }
         }
         while self.may_write_ahead()
-            && let Some(victim) = self.cache.dirty_victim()
+            && let Some(victim) = self.frames.dirty_victim()
         {
             if let Err(Failure { error, .. }) = self.begin_write(victim.page, true) {
                 self.stop_writes(error, Asker::Step)?;
             }
         }
-        if let Some(victim) = self.cache.clean_victim().filter(|v| v.next_use == NEVER) {
+        if let Some(victim) = self.frames.clean_victim().filter(|v| v.next_use == NEVER) {
             self.evict(victim.page);
         }
         Ok(())
     }
 
     fn held_by_callers(&self) -> usize {
-        self.cache.count(FrameState::Pinned) + self.cache.count(FrameState::Lent)
+        self.frames.held_by_callers()
     }
 
     fn working_set(&self, what: &str, pages: usize) -> PagingError {
-        let (frames, frame_bytes) = (self.cache.frames_max(), self.cache.frame_bytes());
+        let (frames, frame_bytes) = (self.frames.frames_max(), self.config.frame_bytes());
         PagingError::WorkingSet { what: what.to_string(), pages, frames, frame_bytes }
     }
 }

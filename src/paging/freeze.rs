@@ -15,9 +15,9 @@ use super::label::label;
 use super::pager::Pager;
 use super::transfers::Failure;
 use crate::base::ids::{PageId, PageNo};
-use crate::cache::frame::FrameState;
 use crate::page::format::slot_header::SlotRef;
 use crate::page::map::commit::{CommitError, Commits, Cut, PageChange};
+use crate::paging::frames::frame::FrameState;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
 
@@ -75,7 +75,7 @@ impl Pager {
     /// # Errors
     /// A write that ended meanwhile had failed.
     pub fn freeze(&mut self) -> Result<(), PagingError> {
-        debug_assert_eq!(self.cache.count(FrameState::Pinned), 0, "a step holds pages");
+        debug_assert_eq!(self.frames.count(FrameState::Pinned), 0, "a step holds pages");
         self.thaw();
         if let Some(Failure { error, .. }) = self.settle(false, &mut Vec::new()).into_iter().find(|f| f.is_write) {
             return Err(error);
@@ -86,11 +86,11 @@ impl Pager {
             if meta.rows == 0 {
                 continue;
             }
-            match (slot, self.cache.state(page)) {
+            match (slot, self.frames.state(page)) {
                 (_, Some(FrameState::Writing)) => {
                     frozen.writing.insert(page);
                 }
-                (_, Some(_)) if self.cache.is_dirty(page) => {
+                (_, Some(_)) if self.frames.is_dirty(page) => {
                     frozen.waiting.insert(page);
                 }
                 (Some(slot), _) => {
@@ -102,8 +102,8 @@ impl Pager {
                 (None, _) => frozen.nowhere = Some(meta.id),
             }
         }
-        let held = self.cache.held().filter(|h| frozen.waiting.contains(&h.page));
-        let mut order: Vec<(u32, PageNo)> = held.map(|h| (h.next_use, h.page)).collect();
+        let held = self.frames.held().filter(|(_, held)| frozen.waiting.contains(&held.page));
+        let mut order: Vec<(u32, PageNo)> = held.map(|(_, held)| (held.next_use, held.page)).collect();
         order.sort_unstable();
         frozen.order = order.into_iter().map(|(_, page)| page).collect();
         self.frozen = Some(frozen);
@@ -129,7 +129,7 @@ impl Pager {
     pub(super) fn may_write_frozen(&self, page: PageNo) -> bool {
         self.frozen.as_ref().is_some_and(|f| f.waiting.contains(&page) && f.writing.len() < WRITES_IN_FLIGHT)
             && self.has_staging()
-            && self.cache.state(page) == Some(FrameState::Resident)
+            && self.frames.state(page) == Some(FrameState::Resident)
     }
 
     /// Whether every page of the cut is written.
@@ -139,7 +139,7 @@ impl Pager {
 
     /// Begins writes of frozen pages, as many as may be in flight ahead of other work; never blocks.
     pub fn write_frozen(&mut self) {
-        let most = (self.config.prefetch_bytes / 2 / self.cache.frame_bytes()).max(FROZEN_WRITES_LEAST);
+        let most = (self.config.prefetch_bytes / 2 / self.config.frame_bytes()).max(FROZEN_WRITES_LEAST);
         let started = Instant::now();
         while !self.writes_stopped
             && self.has_staging()

@@ -8,24 +8,24 @@
 //! reads and writes never depends on frames, plan or store; 4. a page with rows that is not in memory has a slot, and the
 //! slot holds exactly what was last released.
 
-use super::ahead::{Coming, Transfers};
 use super::error::PagingError;
 use super::fetch::Asker;
 use super::freeze::Frozen;
 use super::pinned::PinnedPage;
+use super::prefetch::Transfers;
 use super::stats::{PagerStats, SlotSpace};
-use super::window::Window;
 use crate::base::ids::{PageId, PageNo};
-use crate::cache::evict::EvictPolicy;
-use crate::cache::frame::FrameState;
-use crate::cache::host_cache::HostCache;
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::format::slot_header::{HEADER_BYTES, SlotRef, transfer_bytes};
 use crate::page::versions::paged_store::PagedStore;
+use crate::paging::frames::evict::EvictPolicy;
+use crate::paging::frames::frame::FrameState;
+use crate::paging::frames::table::FrameTable;
+use crate::paging::plan::bound::FewestReads;
+use crate::paging::plan::look_ahead::LookAhead;
 use crate::scene::camera::Camera;
 use crate::scene::page_layout::{PageLayout, capacity_bytes};
 use crate::scene::page_meta::PageMeta;
-use crate::schedule::bound::FewestReads;
 use crate::schedule::visibility::visible_pages;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -67,8 +67,8 @@ pub struct Pager {
     pub(super) index: Vec<PageMeta>,
     /// By page: where its version on the drive is, current or not; `None` before its first write.
     pub(super) slots: Vec<Option<SlotRef>>,
-    pub(super) cache: HostCache,
-    pub(super) window: Window,
+    pub(super) frames: FrameTable<PageBuffer>,
+    pub(super) look_ahead: LookAhead,
     /// `None` for a pager whose pages never leave memory.
     pub(super) store: Option<PagedStore>,
     pub(super) stats: PagerStats,
@@ -86,8 +86,6 @@ pub struct Pager {
     pub(super) unsure: BTreeSet<PageId>,
     /// A cut that is being written.
     pub(super) frozen: Option<Frozen>,
-    /// What the coming steps will wait for.
-    pub(super) coming: Coming,
     /// What the steps so far would have made the best of caches read.
     bound: FewestReads,
 }
@@ -101,8 +99,8 @@ impl Pager {
     /// A pager that keeps every page in memory, in as many frames as needed.
     pub fn in_memory(config: PagerConfig) -> Pager {
         Pager {
-            cache: HostCache::new(config.frames, config.frame_bytes(), config.policy),
-            window: Window::new(config.plan_bytes),
+            frames: FrameTable::new(config.frames, config.policy),
+            look_ahead: LookAhead::new(config.policy, config.plan_bytes),
             config,
             index: Vec::new(),
             slots: Vec::new(),
@@ -115,7 +113,6 @@ impl Pager {
             committed: BTreeMap::new(),
             unsure: BTreeSet::new(),
             frozen: None,
-            coming: Coming::default(),
             bound: FewestReads::default(),
         }
     }
@@ -147,24 +144,24 @@ impl Pager {
         let mut buffer = self.frame_for(Asker::Other)?;
         fill(&mut buffer.as_mut_slice()[HEADER_BYTES..]);
         let page = self.add_entry(meta);
-        self.cache.adopt(page);
-        self.cache.unpin(page, buffer, true);
+        self.frames.adopt(page);
+        self.frames.unpin(page, buffer, true);
         Ok(page)
     }
 
     /// Allows more frames than the pager was made with, once it is known what memory is left for them.
     pub fn allow_frames(&mut self, frames: usize) {
-        self.cache.allow_frames(frames);
-        self.config.frames = self.cache.frames_max();
+        self.frames.allow_frames(frames);
+        self.config.frames = self.frames.frames_max();
     }
 
     /// Allows no more than so many frames from now on. Between steps: pages leave until there are no more, and dirty ones
     /// are written for it; the time counts as waited for. If one could not be written the next step gets the error, and
     /// its frame goes when it is.
     pub fn limit_frames(&mut self, frames: usize) {
-        self.cache.limit_frames(frames);
-        self.config.frames = self.cache.frames_max();
-        while self.cache.excess() > 0 {
+        self.frames.limit_frames(frames);
+        self.config.frames = self.frames.frames_max();
+        while self.frames.excess() > 0 {
             match self.make_room(0, Asker::Step) {
                 Ok(true) => {}
                 Ok(false) if self.in_flight() == 0 => return,
@@ -182,7 +179,7 @@ impl Pager {
     pub fn begin_paging(&mut self, frames: usize, prefetch_bytes: usize, plan_bytes: usize) {
         assert!(self.store.is_some(), "pages that leave memory have a store to go to");
         self.config = PagerConfig { prefetch_bytes, plan_bytes, ..self.config };
-        self.window = Window::new(plan_bytes);
+        self.look_ahead = LookAhead::new(self.config.policy, plan_bytes);
         self.limit_frames(frames);
     }
 
@@ -216,7 +213,7 @@ impl Pager {
     /// already for the same views costs nothing.
     pub fn look_ahead(&mut self, first_step: u32, cameras: &[&Camera]) {
         if self.store.is_some() {
-            self.window.renew(first_step, cameras, &self.index);
+            self.look_ahead.views.renew(first_step, cameras, &self.index);
             self.apply_changed_uses();
         }
     }
@@ -233,13 +230,13 @@ impl Pager {
             return Err(error);
         }
         let pages = self.pages_of_view(camera);
-        let planned = self.window.pages(step).map(<[PageNo]>::to_vec);
-        self.window.pass(step.saturating_add(1));
-        self.window.add_pages(&self.index);
+        let planned = self.look_ahead.views.pages(step).map(<[PageNo]>::to_vec);
+        self.look_ahead.views.pass(step.saturating_add(1));
+        self.look_ahead.views.add_pages(&self.index);
         self.apply_changed_uses();
-        self.cache.tick();
+        self.frames.begin_step(step);
         if let Some(planned) = planned {
-            let missed = |p: &&PageNo| planned.binary_search(p).is_err() && self.cache.state(**p).is_none();
+            let missed = |p: &&PageNo| planned.binary_search(p).is_err() && self.frames.state(**p).is_none();
             self.stats.late_misses += pages.iter().filter(missed).count() as u64;
         }
         let pinned = self.fetch(&format!("the view of step {step}"), &pages, Asker::Step)?;
@@ -257,7 +254,7 @@ impl Pager {
             let raw = || transfer_bytes(PageLayout { rows: rows as usize, sh_degree }.bytes());
             self.slots[page.index()].map_or_else(raw, |slot| slot.transfer_bytes()) as u64
         };
-        self.bound.step(self.cache.frames_max(), pages.iter().map(|&page| (page, bytes(page))));
+        self.bound.step(self.frames.frames_max(), pages.iter().map(|&page| (page, bytes(page))));
         self.stats.belady_bytes_read = self.bound.bytes();
     }
 
@@ -293,14 +290,14 @@ impl Pager {
 
     /// Gives back a frame that was taken for nothing.
     pub fn return_frame(&mut self, buffer: PageBuffer) {
-        self.cache.take_back(buffer);
+        self.frames.take_back(buffer);
     }
 
     /// Adds the upper half of a page that split: it gets a number, is pinned and dirty. The lower half keeps the number of
     /// the page; its new meta goes in by [`Pager::release`].
     pub fn add_split(&mut self, meta: PageMeta, buffer: PageBuffer) -> PinnedPage {
         let page = self.add_entry(meta);
-        self.cache.adopt(page);
+        self.frames.adopt(page);
         self.count_pinned();
         PinnedPage { page, meta, dirty: true, buffer }
     }
@@ -312,9 +309,9 @@ impl Pager {
             debug_assert!(meta == self.index[page.index()] || dirty, "a page whose entry changes is dirty");
             self.index[page.index()] = meta;
             if meta.rows > 0 {
-                self.cache.unpin(page, buffer, dirty);
+                self.frames.unpin(page, buffer, dirty);
             } else {
-                self.cache.drop_pinned(page, buffer);
+                self.frames.drop_pinned(page, buffer);
                 self.free_slot(page);
             }
         }
@@ -326,15 +323,15 @@ impl Pager {
         PagerStats {
             bytes_read: self.stats.bytes_read + traffic.bytes_read,
             bytes_written: self.stats.bytes_written + traffic.bytes_written,
-            frames: self.cache.frames(),
-            frames_max: self.cache.frames_max(),
+            frames: self.frames.frames(),
+            frames_max: self.frames.frames_max(),
             ..self.stats
         }
     }
 
     /// Whether a page has a frame.
     pub fn is_in_memory(&self, page: PageNo) -> bool {
-        self.cache.state(page).is_some()
+        self.frames.state(page).is_some()
     }
 
     /// Where the versions of the pages on the drive are, by page: for the index of a commit, once nothing is dirty.
@@ -360,13 +357,13 @@ impl Pager {
     }
 
     pub(super) fn count_pinned(&mut self) {
-        self.stats.pinned_max = self.stats.pinned_max.max(self.cache.count(FrameState::Pinned));
+        self.stats.pinned_max = self.stats.pinned_max.max(self.frames.count(FrameState::Pinned));
     }
 
     /// Tells the cache of next uses that changed.
     pub(super) fn apply_changed_uses(&mut self) {
-        for page in self.window.take_changed() {
-            self.cache.set_next_use(page, self.window.next_use(page));
+        for page in self.look_ahead.views.take_changed() {
+            self.frames.set_next_use(page, self.look_ahead.views.next_use(page));
         }
     }
 }

@@ -35,7 +35,7 @@ pub struct PagerStats {
     /// Seconds that they and the import waited for the store.
     pub other_stall_seconds: f64,
     /// Bytes that steps would have made a cache of this size read that knows the future
-    /// ([`crate::schedule::bound::FewestReads`]).
+    /// ([`crate::paging::plan::bound::FewestReads`]).
     pub belady_bytes_read: u64,
     /// The most pages pinned at once.
     pub pinned_max: usize,

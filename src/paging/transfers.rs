@@ -10,6 +10,7 @@ use super::fetch::Asker;
 use super::label::label;
 use super::pager::Pager;
 use crate::base::ids::PageNo;
+use crate::page::engine::buffer::PageBuffer;
 use crate::page::format::slot_header::{SlotRef, StoredAs};
 use crate::page::versions::page_error::PageError;
 use crate::page::versions::paged_store::{PageDone, PageMoved};
@@ -45,7 +46,7 @@ impl Pager {
         let most = match self.prefetch_bytes() {
             // Nobody reckoned with anything: pages that were all in memory are written.
             0 => WRITES_IN_FLIGHT,
-            bytes => (bytes / self.cache.frame_bytes()).max(STAGED_LEAST),
+            bytes => (bytes / self.config.frame_bytes()).max(STAGED_LEAST),
         };
         self.store.as_ref().is_none_or(|store| store.staged() < most)
     }
@@ -58,9 +59,11 @@ impl Pager {
     /// Begins to read a page that is not in memory, if there is a free frame for it.
     pub(super) fn begin_read(&mut self, page: PageNo, is_ahead: bool) -> bool {
         let (Some(store), Some(slot)) = (&mut self.store, self.slots[page.index()]) else { return false };
-        let Some(buffer) = self.cache.begin_load(page, self.window.next_use(page)) else { return false };
+        let (frame_bytes, next_use) = (self.config.frame_bytes(), self.look_ahead.views.next_use(page));
+        let make = || PageBuffer::mapped(frame_bytes);
+        let Some(buffer) = self.frames.begin_load(page, next_use, make) else { return false };
         store.read(token(page, is_ahead), self.index[page.index()].id, &slot, buffer);
-        self.ahead[READS] += if is_ahead { self.cache.frame_bytes() } else { 0 };
+        self.ahead[READS] += if is_ahead { self.config.frame_bytes() } else { 0 };
         self.stats.pages_read += 1;
         true
     }
@@ -70,18 +73,18 @@ impl Pager {
         let Some(store) = &mut self.store else { return Ok(()) };
         let meta = &self.index[page.index()];
         let layout = PageLayout { rows: meta.rows as usize, sh_degree: meta.sh_degree };
-        let buffer = self.cache.begin_write(page);
+        let buffer = self.frames.begin_write(page);
         let cut = self.frozen.as_mut().and_then(|f| f.begin_write(page).then_some(f.generation));
         let generation = cut.unwrap_or(store.generation());
         match store.write_for(generation, token(page, is_ahead), meta.id, &label(meta), layout.bytes(), buffer) {
             Ok(()) => {
-                self.ahead[WRITES] += if is_ahead { self.cache.frame_bytes() } else { 0 };
+                self.ahead[WRITES] += if is_ahead { self.config.frame_bytes() } else { 0 };
                 self.stats.pages_written += 1;
                 Ok(())
             }
             Err((source, buffer)) => {
                 self.thaw();
-                self.cache.finish_write(page, buffer, false);
+                self.frames.finish_write(page, buffer, false);
                 Err(self.failure(page, true, source))
             }
         }
@@ -89,7 +92,7 @@ impl Pager {
 
     /// Evicts a clean resident page.
     pub(super) fn evict(&mut self, page: PageNo) {
-        self.cache.evict(page);
+        self.frames.evict(page);
         self.stats.evictions += 1;
     }
 
@@ -136,22 +139,22 @@ impl Pager {
         let mut failures = Vec::new();
         for PageDone { token, buffer, result, .. } in done {
             let page = PageNo(token as u32);
-            let is_read = self.cache.is_loading(page);
+            let is_read = self.frames.is_loading(page);
             if token & AHEAD != 0 {
-                self.ahead[if is_read { READS } else { WRITES }] -= self.cache.frame_bytes();
+                self.ahead[if is_read { READS } else { WRITES }] -= self.config.frame_bytes();
             }
             match result {
-                Ok(PageMoved::Read { .. }) => self.cache.finish_load(page, buffer),
+                Ok(PageMoved::Read { .. }) => self.frames.finish_load(page, buffer),
                 Ok(PageMoved::Written(slot)) => {
-                    self.cache.finish_write(page, buffer, true);
+                    self.frames.finish_write(page, buffer, true);
                     self.take_version(page, slot);
                 }
                 Err(source) => {
                     match is_read {
-                        true => self.cache.fail_load(page, buffer),
+                        true => self.frames.fail_load(page, buffer),
                         false => {
                             self.thaw();
-                            self.cache.finish_write(page, buffer, false);
+                            self.frames.finish_write(page, buffer, false);
                         }
                     }
                     failures.push(self.failure(page, !is_read, source));

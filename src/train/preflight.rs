@@ -6,7 +6,7 @@
 use super::budget::HostBudget;
 use super::memory::{MemoryEstimate, Probe, estimate, rows_at_most, within_reach};
 use super::start::{Start, drive_of};
-use super::tiers::{PLAN_BYTES, Tiers, budget_in_memory, first_staging_bytes, staging_bytes, with_staging};
+use super::tiers::{PLAN_BYTES, Tiers, budget_in_memory, first_staging_bytes, policy, staging_bytes, with_staging};
 use super::trainer::{TrainError, Trainer};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
@@ -14,13 +14,12 @@ use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::page::folder::file_system::free_bytes;
 use crate::paging::pager::PagerConfig;
+use crate::paging::simulation::auto::automatic_order;
+use crate::paging::simulation::replay::{ReplayOptions, replay};
 use crate::scene::camera::Camera;
 use crate::scene::page_meta::PageMeta;
 use crate::scene::partition::first_fill;
-use crate::schedule::auto::automatic_order;
-use crate::schedule::model::Policy;
 use crate::schedule::order::Order;
-use crate::schedule::replay::{ReplayOptions, replay};
 use crate::schedule::visibility::{ViewPages, visible_pages};
 use std::path::Path;
 
@@ -268,9 +267,9 @@ fn times_to_outgrow(plan: &TierPlan, frames: u64, of_rows: u64, are_fixed: bool)
 fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, frames: usize) -> f64 {
     let cameras = train_cameras(dataset);
     let index = trainer.scene.pager.index();
-    let policy = if config.evict == "lru" { Policy::LeastRecent } else { Policy::Farthest };
     let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
-    let options = ReplayOptions { frames, policy, steps, plan_bytes: PLAN_BYTES as u64 };
+    let options =
+        ReplayOptions { frames, policy: policy(config), reads_ahead: false, steps, plan_bytes: PLAN_BYTES as u64 };
     let page_bytes = vec![trainer.scene.pager.frame_bytes() as u32; index.len()];
     let played = replay(&ViewPages::new(index, &cameras), &page_bytes, trainer.view_order(), &options);
     let written: u64 = played.map_or(0, |p| p.steps.iter().map(|s| s.bytes_written).sum());

@@ -10,7 +10,6 @@ use super::memory::MemoryEstimate;
 use super::start::drive_of;
 use super::trainer::TrainError;
 use crate::base::error::{InputError, InputResult};
-use crate::cache::evict::EvictPolicy;
 use crate::checkpoint::run_state::RunState;
 use crate::config::file::TrainConfig;
 use crate::page::engine::drive_rate::DriveRate;
@@ -26,6 +25,7 @@ use crate::page::map::commit::{CommitConfig, CommitError, Commits};
 use crate::page::map::opening::Opened;
 use crate::page::versions::paged_store::{PagedStore, PagedStoreConfig};
 use crate::page::versions::slots::SlotLayout;
+use crate::paging::frames::evict::EvictPolicy;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::scene::page_layout::capacity_bytes;
 use std::path::{Path, PathBuf};
@@ -68,9 +68,9 @@ pub struct Tiers {
     pub notes: Vec<String>,
 }
 
-/// Which pages leave memory first, as `--evict` says.
-fn policy(config: &TrainConfig) -> EvictPolicy {
-    if config.evict == "lru" { EvictPolicy::LeastRecentlyUsed } else { EvictPolicy::FarthestNextUse }
+/// Which page is evicted first, as `--evict` says.
+pub(super) fn policy(config: &TrainConfig) -> EvictPolicy {
+    config.evict.parse().unwrap_or_default()
 }
 
 /// How pages are stored, as `--spill-codec` says; `auto` measures the drive of `folder`, and is raw without one or where

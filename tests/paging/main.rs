@@ -14,9 +14,9 @@ mod traffic;
 mod world;
 
 use crate::faulty_engine::Faults;
-use gsscale::cache::evict::EvictPolicy;
 use gsscale::page::format::codec::Codec;
 use gsscale::paging::error::PagingError;
+use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use world::{PAGE_ROWS, Run, SH_DEGREE, config, store};
 

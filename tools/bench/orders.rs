@@ -1,7 +1,7 @@
 //! `gsscale-bench orders`: what orders of views cost in quality and save in bytes.
 //!
 //! Every order trains in memory, for every seed; what it would read with fewer frames follows from playing its steps
-//! through (`schedule::replay`) with the pages of the end. Prints one line of JSON for each run; with `--out` writes a
+//! through (`paging::simulation::replay`) with the pages of the end. Prints one line of JSON for each run; with `--out` writes a
 //! page with a table and a chart.
 
 use super::demand::page_bytes;
@@ -13,13 +13,13 @@ use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
+use gsscale::paging::frames::evict::EvictPolicy;
+use gsscale::paging::simulation::replay::{ReplayOptions, replay};
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::report::chart::{Chart, Mark};
 use gsscale::report::html::{Cell, Page};
 use gsscale::scene::camera::Camera;
-use gsscale::schedule::model::Policy;
 use gsscale::schedule::order::{Order, ViewOrder};
-use gsscale::schedule::replay::{ReplayOptions, replay};
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::report::write_whole;
 use gsscale::train::run::{Prepared, prepare};
@@ -160,7 +160,8 @@ fn reads(
     let bytes: Vec<u32> = page_bytes(index).iter().map(|&b| b as u32).collect();
     let options = ReplayOptions {
         frames: (share * index.len() as f64).ceil() as usize,
-        policy: Policy::Farthest,
+        policy: EvictPolicy::FarthestNextUse,
+        reads_ahead: false,
         steps: EPOCHS * cameras.len() as u32,
         plan_bytes: PLAN_BYTES,
     };

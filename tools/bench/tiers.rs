@@ -13,13 +13,13 @@ use gsscale::config::limits::RunOptions;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::page::engine::drive_rate::DriveRate;
+use gsscale::paging::frames::evict::EvictPolicy;
+use gsscale::paging::simulation::auto::automatic_order;
+use gsscale::paging::simulation::replay::{DriveModel, ReplayOptions, replay};
 use gsscale::paging::stats::PagerStats;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::camera::Camera;
-use gsscale::schedule::auto::automatic_order;
-use gsscale::schedule::model::Policy;
 use gsscale::schedule::order::ViewOrder;
-use gsscale::schedule::replay::{DriveModel, ReplayOptions, replay};
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::memory::host_bytes_peak;
 use gsscale::train::run::{Prepared, prepare};
@@ -294,7 +294,7 @@ struct Prediction {
     page_bytes: Vec<u32>,
     order: ViewOrder,
     steps: Range<u32>,
-    policy: Policy,
+    policy: EvictPolicy,
     drive: DriveModel,
 }
 
@@ -313,14 +313,15 @@ impl Prediction {
             page_bytes: page_bytes(trainer.scene.pager.index()).into_iter().map(|bytes| bytes as u32).collect(),
             order: trainer.view_order().clone(),
             steps: warm_up..config.steps,
-            policy: if config.evict == "lru" { Policy::LeastRecent } else { Policy::Ahead },
+            policy: config.evict.parse().unwrap_or_default(),
             drive: DriveModel { read_rate: rate.read, write_rate: rate.write, step_seconds },
         }
     }
 
     /// Seconds that the measured steps wait for the drive, with so many frames.
     fn stall_seconds(&self, frames: usize) -> Option<f64> {
-        let options = ReplayOptions { frames, policy: self.policy, steps: self.steps.end, plan_bytes: ORDER_BYTES };
+        let (policy, steps) = (self.policy, self.steps.end);
+        let options = ReplayOptions { frames, policy, reads_ahead: true, steps, plan_bytes: ORDER_BYTES };
         let run = replay(&self.views, &self.page_bytes, &self.order, &options).ok()?;
         Some(run.stall(self.steps.start as usize..self.steps.end as usize, &self.drive).seconds)
     }

@@ -1,0 +1,157 @@
+//! Prefetch: begins the reads that the coming steps will wait for, and the write-backs of the pages that are evicted for them.
+//!
+//! The look-ahead (`plan::look_ahead`) says which pages the coming steps will read and which pages are evicted for them: while
+//! step s computes, the pages of s and of s + 1 have to be in memory. Prefetch does as much of that as is possible already. An
+//! evicted page is unused until the step that it leaves for, so a prefetch reads nothing that the look-ahead's cache would not
+//! read. Any page that the look-ahead evicts is an equally good victim: if the first of them is in use, another one makes room.
+//! For the next step alone prefetch may also evict any other page that is far from its next use, which may cost a read.
+//!
+//! Invariants: 1. prefetch never blocks, but for [`Transfers::Ahead`]; 2. prefetch never evicts a page that the current step or a
+//! step up to the one that the frame is for needs; 3. reads and writes in flight are bounded in bytes; 4. nothing here changes
+//! what a step gets; 5. the look-ahead runs once for each step, and further calls in the same step cost what they begin.
+
+use super::fetch::Asker;
+use super::frames::frame::FrameState;
+use super::frames::table::Victim;
+use super::pager::Pager;
+use super::plan::cache_model::FAR_STEPS;
+use super::plan::look_ahead::Admit;
+use super::transfers::{Failure, READS, WRITES};
+use std::collections::VecDeque;
+use std::str::FromStr;
+
+/// When pages move. No choice changes what a step gets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Transfers {
+    /// Ahead of their step, while steps compute.
+    #[default]
+    Overlap,
+    /// Ahead of their step, but every call waits until its pages have moved: the plan without the overlap, for comparison.
+    Ahead,
+    /// When a step needs them: neither plan nor overlap, for comparison.
+    Demand,
+}
+
+impl FromStr for Transfers {
+    type Err = String;
+    fn from_str(name: &str) -> Result<Self, String> {
+        match name {
+            "overlap" => Ok(Transfers::Overlap),
+            "ahead" => Ok(Transfers::Ahead),
+            "demand" => Ok(Transfers::Demand),
+            _ => Err(format!("unknown --transfers '{name}': use overlap, ahead or demand")),
+        }
+    }
+}
+
+impl Pager {
+    /// Starts reads for the steps after `step` and writes of the dirty pages that leave for them, as far as [`Transfers`] says. Call it
+    /// when the pages of `step` are pinned. Calling it again during the step continues what became possible since.
+    pub fn prefetch(&mut self, step: u32) {
+        if self.transfers == Transfers::Demand {
+            return;
+        }
+        self.settle_for_nobody(false);
+        if self.store.is_none() {
+            return;
+        }
+        self.write_frozen();
+        if self.look_ahead.is_due(step) {
+            // By what is known now; a page that this step moves into the next one's view is a late miss at most.
+            self.look_ahead.refresh(step, &self.index);
+            self.apply_changed_uses();
+            self.look_ahead.play(step, &self.index, &self.frames);
+        }
+        let admits = self.look_ahead.take_admits();
+        let mut clean = self.leaving(&admits);
+        let mut lacking = 0;
+        for admit in &admits {
+            if !self.may_read_ahead() {
+                break;
+            }
+            if self.frames.state(admit.page).is_none() && !self.bring(admit, &mut clean, step) && admit.step == step + 1
+            {
+                lacking += 1;
+            }
+        }
+        self.clean_for_next_step(lacking, step);
+        self.look_ahead.return_admits(admits);
+        if let Some(store) = &mut self.store {
+            store.begin_writes();
+        }
+        while self.transfers == Transfers::Ahead && self.in_flight() > 0 {
+            self.settle_for_nobody(true);
+        }
+    }
+
+    /// Takes the ends of transfers that nobody waits for.
+    pub(super) fn settle_for_nobody(&mut self, wait: bool) {
+        for Failure { is_write, error, .. } in self.settle(wait, &mut Vec::new()) {
+            if is_write {
+                // The next step gets the error.
+                let _ = self.stop_writes(error, Asker::Other);
+            }
+        }
+    }
+
+    /// The pages that leave and can do so already: clean ones are returned, the first to leave first, dirty ones begin to
+    /// be written. As all of them leave unused, whichever is taken for whichever page costs nothing.
+    fn leaving(&mut self, admits: &[Admit]) -> VecDeque<Victim> {
+        let mut clean = VecDeque::new();
+        for Admit { leaves, step, .. } in admits {
+            let now = leaves.and_then(|page| self.frames.as_victim(page)).filter(|v| v.next_use > *step);
+            match now {
+                Some(victim) if !victim.dirty => clean.push_back(victim),
+                Some(victim) if self.may_write_ahead() => self.clean_early(victim),
+                _ => {}
+            }
+        }
+        clean
+    }
+
+    /// Begins to read a coming page, into a free frame or that of a page that leaves; `false` if there is none.
+    fn bring(&mut self, admit: &Admit, clean: &mut VecDeque<Victim>, step: u32) -> bool {
+        if !self.frames.has_free() {
+            let leaves = std::iter::from_fn(|| clean.pop_front()).find(|v| v.next_use > admit.step);
+            // For the next step any page that is not needed for long will do. It may have to be read once more than the
+            // cache that knows the future would, but waiting costs more.
+            let is_next = admit.step == step + 1;
+            let other = || self.frames.clean_victim().filter(|v| is_next && is_far(v, step));
+            let Some(victim) = leaves.or_else(other) else { return false };
+            self.evict(victim.page);
+        }
+        self.begin_read(admit.page, true)
+    }
+
+    /// Begins to write as many pages that are not needed for long as the next step lacks frames.
+    fn clean_for_next_step(&mut self, lacking: usize, step: u32) {
+        while self.frames.count(FrameState::Writing) < lacking
+            && self.may_write_ahead()
+            && let Some(victim) = self.frames.dirty_victim().filter(|v| is_far(v, step))
+        {
+            self.clean_early(victim);
+        }
+    }
+
+    fn clean_early(&mut self, victim: Victim) {
+        if let Err(Failure { error, .. }) = self.begin_write(victim.page, true) {
+            // The next step gets the error.
+            let _ = self.stop_writes(error, Asker::Other);
+        }
+    }
+
+    fn may_read_ahead(&self) -> bool {
+        self.has_staging() && self.ahead[READS] + self.config.frame_bytes() <= self.config.prefetch_bytes
+    }
+
+    pub(super) fn may_write_ahead(&self) -> bool {
+        !self.writes_stopped
+            && self.has_staging()
+            && self.ahead[WRITES] + self.config.frame_bytes() <= self.config.prefetch_bytes
+    }
+}
+
+/// Whether a page is not needed for long after `step`.
+fn is_far(victim: &Victim, step: u32) -> bool {
+    victim.next_use > step.saturating_add(1 + FAR_STEPS)
+}
