@@ -7,11 +7,12 @@
 //! Layout: [`VERSION`] as u32, then the fields of [`RunState`] in their order, as [`crate::page::format::encoding`] writes them.
 //! Version 2 added what tools list and what a run that goes on counts from ([`RunState::test`], [`RunState::traffic`]),
 //! and a dataset print that knows photos, points and the local frame. No program was released with version 1.
-//! Version 3 added the last five of [`TrafficSoFar`]; of a state of version 2 they are 0.
+//! Version 3 added the last five of [`PagerStats`]; of a state of version 2 they are 0.
 //! Version 4 added [`RunState::run`]; of an older state the run is unknown.
 
 use crate::base::identity::RunId;
 use crate::page::format::encoding::{self, EncodingError};
+use crate::paging::stats::PagerStats;
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
@@ -61,43 +62,6 @@ pub struct LastTest {
     pub ssim: f64,
 }
 
-/// What moved between the tiers since the run began, over all its lives.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-pub struct TrafficSoFar {
-    /// Bytes read from the store.
-    pub bytes_read: u64,
-    /// Bytes written to the store.
-    pub bytes_written: u64,
-    /// Pages read.
-    pub pages_read: u64,
-    /// Pages written.
-    pub pages_written: u64,
-    /// Pages asked for.
-    pub pages_needed: u64,
-    /// Of these, in memory.
-    pub hits: u64,
-    /// Of these, not there.
-    pub misses: u64,
-    /// Of the misses, those that the plan had left out.
-    pub late_misses: u64,
-    /// Pages that lost their frame.
-    pub evictions: u64,
-    /// Seconds that steps waited.
-    pub stall_seconds: f64,
-    /// The most pages pinned at once.
-    pub pinned_max: u64,
-    /// Of the misses, those that were not even on their way.
-    pub absent: u64,
-    /// Pages that all others than steps asked for.
-    pub other_pages_needed: u64,
-    /// Bytes read for them.
-    pub other_bytes_read: u64,
-    /// Seconds that they waited.
-    pub other_stall_seconds: f64,
-    /// Bytes that the best of caches would have read for the steps.
-    pub belady_bytes_read: u64,
-}
-
 /// Which run a state belongs to, and where the run was.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunIdentity {
@@ -145,7 +109,7 @@ pub struct RunState {
     /// The last evaluation, if there was one.
     pub test: Option<LastTest>,
     /// What moved between the tiers so far.
-    pub traffic: TrafficSoFar,
+    pub traffic: PagerStats,
     /// Whose state it is.
     pub run: RunIdentity,
 }
@@ -184,7 +148,7 @@ impl RunState {
             train_seconds: 0.0,
             metrics_bytes: 0,
             test: None,
-            traffic: TrafficSoFar::default(),
+            traffic: PagerStats::default(),
             run: RunIdentity::default(),
         }
     }
@@ -270,8 +234,8 @@ impl RunState {
 
 /// What version 3 added at the end, as it is of a state without it.
 fn of_version_3() -> Result<Vec<u8>, EncodingError> {
-    let TrafficSoFar { absent, other_pages_needed, other_bytes_read, other_stall_seconds, belady_bytes_read, .. } =
-        TrafficSoFar::default();
+    let PagerStats { absent, other_pages_needed, other_bytes_read, other_stall_seconds, belady_bytes_read, .. } =
+        PagerStats::default();
     encoding::to_bytes(&(absent, other_pages_needed, other_bytes_read, other_stall_seconds, belady_bytes_read))
 }
 
@@ -314,12 +278,12 @@ mod tests {
             train_seconds: 0.1,
             metrics_bytes: 1234,
             test: Some(LastTest { step: 8, views: 3, psnr: 21.5, ssim: 0.75 }),
-            traffic: TrafficSoFar {
+            traffic: PagerStats {
                 bytes_read: 9,
                 stall_seconds: 0.25,
                 other_bytes_read: 4,
                 belady_bytes_read: 3,
-                ..TrafficSoFar::default()
+                ..PagerStats::default()
             },
             run: RunIdentity {
                 id: "00112233445566778899aabbccddeeff".parse().unwrap(),
@@ -346,7 +310,7 @@ mod tests {
         assert_eq!(RunState::from_bytes(&of_version_3).unwrap(), unknown);
         // Five numbers fewer, all of eight bytes.
         let of_version_2 = [&2u32.to_le_bytes(), &bytes[4..before_version_4 - 40]].concat();
-        let traffic = TrafficSoFar { bytes_read: 9, stall_seconds: 0.25, ..TrafficSoFar::default() };
+        let traffic = PagerStats { bytes_read: 9, stall_seconds: 0.25, ..PagerStats::default() };
         assert_eq!(RunState::from_bytes(&of_version_2).unwrap(), RunState { traffic, ..unknown });
         let of_version_1 = [&1u32.to_le_bytes(), &bytes[4..]].concat();
         assert_eq!(RunState::from_bytes(&of_version_1), Err(RunStateError::Version(1)));

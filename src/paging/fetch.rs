@@ -114,7 +114,7 @@ impl Pager {
             let is_delayed = self.frozen.as_ref().is_some_and(|f| f.delays(fetch.outstanding.keys().copied()));
             let started = Instant::now();
             let failures = self.settle_for(fetch.asker, &mut ended);
-            self.stats.commit_seconds += if is_delayed { started.elapsed().as_secs_f64() } else { 0.0 };
+            self.commit_seconds += if is_delayed { started.elapsed().as_secs_f64() } else { 0.0 };
             ended.into_iter().for_each(|page| self.pin_into(fetch, page));
             self.judge(fetch, failures)?;
         }

@@ -155,7 +155,7 @@ impl Pager {
             }
         }
         if self.frozen.is_some() {
-            self.stats.commit_seconds += started.elapsed().as_secs_f64();
+            self.commit_seconds += started.elapsed().as_secs_f64();
         }
     }
 

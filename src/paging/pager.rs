@@ -71,7 +71,9 @@ pub struct Pager {
     pub(super) look_ahead: LookAhead,
     /// `None` for a pager whose pages never leave memory.
     pub(super) store: Option<PagedStore>,
+    /// Without what store and bound count themselves.
     pub(super) stats: PagerStats,
+    pub(super) commit_seconds: f64,
     /// A write that failed while nobody waited for it.
     pub(super) failed_write: Option<PagingError>,
     /// After a failed write nothing is written until a step asks for pages again.
@@ -106,6 +108,7 @@ impl Pager {
             slots: Vec::new(),
             store: None,
             stats: PagerStats::default(),
+            commit_seconds: 0.0,
             failed_write: None,
             writes_stopped: false,
             ahead: [0; 2],
@@ -126,8 +129,8 @@ impl Pager {
         (0..self.index.len()).for_each(|page| self.bound.add(PageNo(page as u32)));
     }
 
-    /// Counts on from what an earlier life of the run had counted.
-    pub fn count_on(&mut self, past: PagerStats) {
+    /// Continues the counters of an earlier life of the run.
+    pub fn restore_stats(&mut self, past: PagerStats) {
         self.stats = past;
     }
 
@@ -255,7 +258,6 @@ impl Pager {
             self.slots[page.index()].map_or_else(raw, |slot| slot.transfer_bytes()) as u64
         };
         self.bound.step(self.frames.frames_max(), pages.iter().map(|&page| (page, bytes(page))));
-        self.stats.belady_bytes_read = self.bound.bytes();
     }
 
     /// Pages with rows that `camera` may see by the bounds as they are now, ascending by id.
@@ -317,16 +319,30 @@ impl Pager {
         }
     }
 
-    /// What was done so far.
+    /// The counters, over all lives of the run.
     pub fn stats(&self) -> PagerStats {
         let traffic = self.store.as_ref().map(PagedStore::traffic).unwrap_or_default();
         PagerStats {
             bytes_read: self.stats.bytes_read + traffic.bytes_read,
             bytes_written: self.stats.bytes_written + traffic.bytes_written,
-            frames: self.frames.frames(),
-            frames_max: self.frames.frames_max(),
+            belady_bytes_read: self.stats.belady_bytes_read + self.bound.bytes(),
             ..self.stats
         }
+    }
+
+    /// Frames in use.
+    pub fn frames(&self) -> usize {
+        self.frames.frames()
+    }
+
+    /// The most frames that there may be; `usize::MAX` for as many as needed.
+    pub fn frames_max(&self) -> usize {
+        self.frames.frames_max()
+    }
+
+    /// Seconds that steps lost to commits beside them: they waited for frozen pages, or spent the time on writing them.
+    pub fn commit_seconds(&self) -> f64 {
+        self.commit_seconds
     }
 
     /// Whether a page has a frame.

@@ -84,7 +84,7 @@ pub fn settle(
         free_bytes: tiers.free_bytes()?,
         largest_view,
     };
-    if trainer.scene.pager.stats().frames_max == usize::MAX {
+    if trainer.scene.pager.frames_max() == usize::MAX {
         let asked = host_mem;
         let host_mem = enough_memory(config, asked, memory[0].total());
         if trainer.scene.pager.slot_space().is_none() {
@@ -159,7 +159,7 @@ pub fn hold_a_view(
 ) -> InputResult<Option<usize>> {
     let LargestView { view: number, name: view, pages: needed, .. } =
         largest_view(dataset, trainer.scene.pager.index());
-    if config.frames > 0 || trainer.scene.pager.stats().frames_max == usize::MAX {
+    if config.frames > 0 || trainer.scene.pager.frames_max() == usize::MAX {
         return Ok(number);
     }
     let bytes = needed * trainer.scene.pager.frame_bytes() as u64;

@@ -138,7 +138,7 @@ fn train(args: &Args, config: &TrainConfig) -> Result<Value, TrainError> {
     let (report, stats, slower) = (checkpoint.report(), trainer.scene.pager.stats(), steps.slower());
     Ok(json!({
         "scene": args.scene, "gaussians": trainer.scene.rows(), "pages": trainer.scene.pager.index().len(),
-        "frames": stats.frames, "page_rows": config.page_rows, "steps": trainer.steps_done(),
+        "frames": trainer.scene.pager.frames(), "page_rows": config.page_rows, "steps": trainer.steps_done(),
         "view_order": trainer.view_order().order().to_string(), "commit_every": config.commit_every.to_string(),
         "seconds": seconds, "cpu_seconds": cpu_seconds, "stall_seconds": stats.stall_seconds,
         "bytes_written": stats.bytes_written, "bytes_read": stats.bytes_read,

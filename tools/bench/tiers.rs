@@ -245,12 +245,13 @@ impl Contender {
         let cpu = |of: &Contender| of.cpu_seconds[0] + of.cpu_seconds[1];
         let pager = &self.trainer.scene.pager;
         let (now, before) = (pager.stats(), self.before);
+        let frames_max = pager.frames_max();
         let needed = (now.pages_needed - before.pages_needed).max(1) as f64;
         let pages_read = now.pages_read - before.pages_read;
         let bytes_read = now.bytes_read - before.bytes_read;
         let ratios = self.seconds.iter().zip(&in_memory.seconds).map(|(own, base)| own / base);
         let mut line = json!({
-            "share_percent": self.share, "frames": self.share.map(|_| now.frames_max), "engine": self.tiers.engine,
+            "share_percent": self.share, "frames": self.share.map(|_| frames_max), "engine": self.tiers.engine,
             "seconds_per_step_median": median(self.seconds.iter().copied()),
             "seconds_per_step": sum(self) / steps, "cpu_seconds_per_step": cpu(self) / steps,
             "cpu_system_seconds_per_step": self.cpu_seconds[1] / steps,
@@ -264,8 +265,8 @@ impl Contender {
         });
         if self.share.is_some() {
             let bytes = page_bytes(pager.index());
-            let bound = self.demand.fewest_reads(now.frames_max, &bytes);
-            let in_time = self.demand.fewest_reads_in_time(now.frames_max, &bytes);
+            let bound = self.demand.fewest_reads(frames_max, &bytes);
+            let in_time = self.demand.fewest_reads_in_time(frames_max, &bytes);
             let tier = json!({
                 "pages_read_per_step": pages_read as f64 / steps, "bytes_read_per_step": bytes_read as f64 / steps,
                 "bytes_written_per_step": (now.bytes_written - before.bytes_written) as f64 / steps,
@@ -276,10 +277,10 @@ impl Contender {
                 "belady_in_time_over_belady": bound.zip(in_time).map(|((_, a), (_, b))| b as f64 / a.max(1) as f64),
                 "share_misses": (now.misses - before.misses) as f64 / needed,
                 "share_absent": (now.absent - before.absent) as f64 / needed,
-                "share_absent_least": self.demand.fewest_absent(now.frames_max) as f64 / needed,
+                "share_absent_least": self.demand.fewest_absent(frames_max) as f64 / needed,
                 "share_late_misses": (now.late_misses - before.late_misses) as f64 / needed,
                 "stall_seconds": now.stall_seconds - before.stall_seconds,
-                "stall_seconds_predicted": predicted.and_then(|p| p.stall_seconds(now.frames_max)),
+                "stall_seconds_predicted": predicted.and_then(|p| p.stall_seconds(frames_max)),
             });
             extend(&mut line, &tier);
         }
