@@ -6,19 +6,27 @@
 //! | [`frames`] | which pages are in memory, in what state, and which is evicted next |
 //! | [`plan`] | what the coming steps need, and what a cache makes of it |
 //! | [`simulation`] | whole runs of the cache before they happen, by the same plan and the same order of eviction |
+//! | `index` | the entry of every page, and the slot of its version on the drive |
+//! | `mover` | transfers between frames and the store: what is in flight, and what failed |
+//! | `cut` | which pages the last commit names, and the pages of a commit beside training |
 //! | [`pager`] | the parts together: hands out the pages of a view and takes them back |
+//!
+//! The pager's calls that need several parts stand in `fetch`, `prefetch`, `transfers` and `commit`.
 
 mod commit;
+mod cut;
 pub mod error;
 mod fetch;
 pub mod frames;
-mod freeze;
+mod index;
 pub mod label;
+mod mover;
 pub mod pager;
 pub mod pinned;
 pub mod plan;
-pub mod prefetch;
+mod prefetch;
 pub mod simulation;
 pub mod stats;
 pub mod stored;
+pub mod timing;
 mod transfers;

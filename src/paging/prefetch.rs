@@ -10,39 +10,14 @@
 //! step up to the one that the frame is for needs; 3. reads and writes in flight are bounded in bytes; 4. nothing here changes
 //! what a step gets; 5. the look-ahead runs once for each step, and further calls in the same step cost what they begin.
 
-use super::fetch::Asker;
 use super::frames::frame::FrameState;
 use super::frames::table::Victim;
 use super::pager::Pager;
 use super::plan::cache_model::FAR_STEPS;
 use super::plan::look_ahead::Admit;
-use super::transfers::{Failure, READS, WRITES};
+use super::timing::Transfers;
+use super::transfers::Failure;
 use std::collections::VecDeque;
-use std::str::FromStr;
-
-/// When pages move. No choice changes what a step gets.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Transfers {
-    /// Ahead of their step, while steps compute.
-    #[default]
-    Overlap,
-    /// Ahead of their step, but every call waits until its pages have moved: the plan without the overlap, for comparison.
-    Ahead,
-    /// When a step needs them: neither plan nor overlap, for comparison.
-    Demand,
-}
-
-impl FromStr for Transfers {
-    type Err = String;
-    fn from_str(name: &str) -> Result<Self, String> {
-        match name {
-            "overlap" => Ok(Transfers::Overlap),
-            "ahead" => Ok(Transfers::Ahead),
-            "demand" => Ok(Transfers::Demand),
-            _ => Err(format!("unknown --transfers '{name}': use overlap, ahead or demand")),
-        }
-    }
-}
 
 impl Pager {
     /// Starts reads for the steps after `step` and writes of the dirty pages that leave for them, as far as [`Transfers`] says. Call it
@@ -52,21 +27,21 @@ impl Pager {
             return;
         }
         self.settle_for_nobody(false);
-        if self.store.is_none() {
+        if !self.mover.has_store() {
             return;
         }
         self.write_frozen();
         if self.look_ahead.is_due(step) {
             // By what is known now; a page that this step moves into the next one's view is a late miss at most.
-            self.look_ahead.refresh(step, &self.index);
+            self.look_ahead.refresh(step, self.index.metas());
             self.apply_changed_uses();
-            self.look_ahead.play(step, &self.index, &self.frames);
+            self.look_ahead.play(step, self.index.metas(), &self.frames);
         }
         let admits = self.look_ahead.take_admits();
         let mut clean = self.leaving(&admits);
         let mut lacking = 0;
         for admit in &admits {
-            if !self.may_read_ahead() {
+            if !self.mover.may_read_ahead() {
                 break;
             }
             if self.frames.state(admit.page).is_none() && !self.bring(admit, &mut clean, step) && admit.step == step + 1
@@ -76,45 +51,33 @@ impl Pager {
         }
         self.clean_for_next_step(lacking, step);
         self.look_ahead.return_admits(admits);
-        if let Some(store) = &mut self.store {
-            store.begin_writes();
-        }
-        while self.transfers == Transfers::Ahead && self.in_flight() > 0 {
+        self.mover.begin_writes();
+        while self.transfers == Transfers::Ahead && self.mover.in_flight() > 0 {
             self.settle_for_nobody(true);
         }
     }
 
-    /// Takes the ends of transfers that nobody waits for.
-    pub(super) fn settle_for_nobody(&mut self, wait: bool) {
-        for Failure { is_write, error, .. } in self.settle(wait, &mut Vec::new()) {
-            if is_write {
-                // The next step gets the error.
-                let _ = self.stop_writes(error, Asker::Other);
-            }
-        }
-    }
-
-    /// The pages that leave and can do so already: clean ones are returned, the first to leave first, dirty ones begin to
-    /// be written. As all of them leave unused, whichever is taken for whichever page costs nothing.
+    /// The pages that the look-ahead evicts and that are unused already: clean pages are returned, the first to be evicted first,
+    /// and write-backs of dirty pages begin. All of them are evicted unused, so any of them may make room for any page.
     fn leaving(&mut self, admits: &[Admit]) -> VecDeque<Victim> {
         let mut clean = VecDeque::new();
         for Admit { leaves, step, .. } in admits {
             let now = leaves.and_then(|page| self.frames.as_victim(page)).filter(|v| v.next_use > *step);
             match now {
                 Some(victim) if !victim.dirty => clean.push_back(victim),
-                Some(victim) if self.may_write_ahead() => self.clean_early(victim),
+                Some(victim) if self.mover.may_write_ahead() => self.clean_early(victim),
                 _ => {}
             }
         }
         clean
     }
 
-    /// Begins to read a coming page, into a free frame or that of a page that leaves; `false` if there is none.
+    /// Begins to read a coming page, into a free frame or that of an evicted page; `false` if there is neither.
     fn bring(&mut self, admit: &Admit, clean: &mut VecDeque<Victim>, step: u32) -> bool {
         if !self.frames.has_free() {
             let leaves = std::iter::from_fn(|| clean.pop_front()).find(|v| v.next_use > admit.step);
-            // For the next step any page that is not needed for long will do. It may have to be read once more than the
-            // cache that knows the future would, but waiting costs more.
+            // The next step may also evict any page that is not needed for long. That page may be read once more than by a cache
+            // that knows the future, but waiting costs more.
             let is_next = admit.step == step + 1;
             let other = || self.frames.clean_victim().filter(|v| is_next && is_far(v, step));
             let Some(victim) = leaves.or_else(other) else { return false };
@@ -123,10 +86,10 @@ impl Pager {
         self.begin_read(admit.page, true)
     }
 
-    /// Begins to write as many pages that are not needed for long as the next step lacks frames.
+    /// Begins write-backs of pages that are not needed for long, one for each frame that the next step lacks.
     fn clean_for_next_step(&mut self, lacking: usize, step: u32) {
         while self.frames.count(FrameState::Writing) < lacking
-            && self.may_write_ahead()
+            && self.mover.may_write_ahead()
             && let Some(victim) = self.frames.dirty_victim().filter(|v| is_far(v, step))
         {
             self.clean_early(victim);
@@ -136,18 +99,8 @@ impl Pager {
     fn clean_early(&mut self, victim: Victim) {
         if let Err(Failure { error, .. }) = self.begin_write(victim.page, true) {
             // The next step gets the error.
-            let _ = self.stop_writes(error, Asker::Other);
+            let _ = self.mover.stop_writes(error, false);
         }
-    }
-
-    fn may_read_ahead(&self) -> bool {
-        self.has_staging() && self.ahead[READS] + self.config.frame_bytes() <= self.config.prefetch_bytes
-    }
-
-    pub(super) fn may_write_ahead(&self) -> bool {
-        !self.writes_stopped
-            && self.has_staging()
-            && self.ahead[WRITES] + self.config.frame_bytes() <= self.config.prefetch_bytes
     }
 }
 

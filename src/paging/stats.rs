@@ -4,6 +4,8 @@
 //! and the state of a run holds it; 2. the order of its fields is the order of the bytes in the state of a run, so a new counter
 //! goes to the end, with a new version of the state.
 
+use super::plan::bound::FewestReads;
+use crate::page::versions::paged_store::PageTraffic;
 use serde::{Deserialize, Serialize};
 
 /// Totals over all lives of a run; subtract two of them for one step. Without a spill directory only commits write.
@@ -53,6 +55,29 @@ pub struct PagerStats {
     pub belady_bytes_read: u64,
 }
 
+/// The counters as a pager keeps them.
+#[derive(Debug, Default)]
+pub(super) struct Counters {
+    /// Without what the store and the bound count in this life of the run.
+    pub stats: PagerStats,
+    /// Seconds that steps lost to commits beside them.
+    pub commit_seconds: f64,
+    /// What a cache that knows the future would have read for the steps of this life.
+    pub bound: FewestReads,
+}
+
+impl Counters {
+    /// The counters over all lives, with what the store moved in this one.
+    pub fn total(&self, traffic: PageTraffic) -> PagerStats {
+        PagerStats {
+            bytes_read: self.stats.bytes_read + traffic.bytes_read,
+            bytes_written: self.stats.bytes_written + traffic.bytes_written,
+            belady_bytes_read: self.stats.belady_bytes_read + self.bound.bytes(),
+            ..self.stats
+        }
+    }
+}
+
 /// Slots of a store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SlotSpace {
@@ -70,6 +95,7 @@ pub struct SlotSpace {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use crate::base::ids::PageNo;
     use crate::page::format::encoding;
 
     /// What older programs wrote must be read back: bytes in the state of a run, names in the files of metrics.
@@ -117,5 +143,17 @@ mod tests {
         assert_eq!(json.as_object().unwrap().len(), names.len());
         assert!(names.iter().all(|&(name, value)| json[name].as_f64() == Some(f64::from(value))), "{json}");
         assert_eq!(serde_json::from_value::<PagerStats>(json).unwrap(), stats);
+    }
+
+    #[test]
+    fn restored_counters_continue_in_the_next_life() {
+        let past = PagerStats { bytes_read: 5, misses: 3, belady_bytes_read: 7, ..PagerStats::default() };
+        let mut counters = Counters { stats: past, ..Counters::default() };
+        assert_eq!(counters.total(PageTraffic::default()), past);
+        counters.bound.step(1, [(PageNo(0), 100)].into_iter());
+        counters.stats.misses += 1;
+        let traffic = PageTraffic { bytes_read: 10, ..PageTraffic::default() };
+        let now = counters.total(traffic);
+        assert_eq!((now.bytes_read, now.misses, now.belady_bytes_read), (15, 4, 107));
     }
 }
