@@ -12,20 +12,20 @@ use clap::Parser;
 use demand::{Demand, page_bytes};
 use gsscale::base::error::InputError;
 use gsscale::base::machine::process_cpu_split;
-use gsscale::cache::evict::EvictPolicy;
 use gsscale::config::choice::Chosen;
 use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::page::engine::drive_rate::DriveRate;
+use gsscale::paging::frames::evict::EvictPolicy;
+use gsscale::paging::frames::evict::EvictPolicy;
+use gsscale::paging::simulation::auto::automatic_order;
+use gsscale::paging::simulation::replay::{DriveModel, ReplayOptions, replay};
 use gsscale::paging::stats::PagerStats;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::camera::Camera;
-use gsscale::schedule::auto::automatic_order;
-use gsscale::schedule::model::Policy;
 use gsscale::schedule::order::ViewOrder;
-use gsscale::schedule::replay::{DriveModel, ReplayOptions, replay};
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::error::TrainError;
 use gsscale::train::memory::host_bytes_peak;
@@ -231,12 +231,13 @@ impl Contender {
         let cpu = |of: &Contender| of.cpu_seconds[0] + of.cpu_seconds[1];
         let pager = &self.trainer.scene.pager;
         let (now, before) = (pager.stats(), self.before);
+        let frames_max = pager.frames_max();
         let needed = (now.pages_needed - before.pages_needed).max(1) as f64;
         let pages_read = now.pages_read - before.pages_read;
         let bytes_read = now.bytes_read - before.bytes_read;
         let ratios = self.seconds.iter().zip(&in_memory.seconds).map(|(own, base)| own / base);
         let mut line = json!({
-            "share_percent": self.share, "frames": self.share.map(|_| now.frames_max), "engine": self.tiers.engine,
+            "share_percent": self.share, "frames": self.share.map(|_| frames_max), "engine": self.tiers.engine,
             "seconds_per_step_median": median(self.seconds.iter().copied()),
             "seconds_per_step": sum(self) / steps, "cpu_seconds_per_step": cpu(self) / steps,
             "cpu_system_seconds_per_step": self.cpu_seconds[1] / steps,
@@ -250,8 +251,8 @@ impl Contender {
         });
         if self.share.is_some() {
             let bytes = page_bytes(pager.index());
-            let bound = self.demand.fewest_reads(now.frames_max, &bytes);
-            let in_time = self.demand.fewest_reads_in_time(now.frames_max, &bytes);
+            let bound = self.demand.fewest_reads(frames_max, &bytes);
+            let in_time = self.demand.fewest_reads_in_time(frames_max, &bytes);
             let tier = json!({
                 "pages_read_per_step": pages_read as f64 / steps, "bytes_read_per_step": bytes_read as f64 / steps,
                 "bytes_written_per_step": (now.bytes_written - before.bytes_written) as f64 / steps,
@@ -262,10 +263,10 @@ impl Contender {
                 "belady_in_time_over_belady": bound.zip(in_time).map(|((_, a), (_, b))| b as f64 / a.max(1) as f64),
                 "share_misses": (now.misses - before.misses) as f64 / needed,
                 "share_absent": (now.absent - before.absent) as f64 / needed,
-                "share_absent_least": self.demand.fewest_absent(now.frames_max) as f64 / needed,
+                "share_absent_least": self.demand.fewest_absent(frames_max) as f64 / needed,
                 "share_late_misses": (now.late_misses - before.late_misses) as f64 / needed,
                 "stall_seconds": now.stall_seconds - before.stall_seconds,
-                "stall_seconds_predicted": predicted.and_then(|p| p.stall_seconds(now.frames_max)),
+                "stall_seconds_predicted": predicted.and_then(|p| p.stall_seconds(frames_max)),
             });
             extend(&mut line, &tier);
         }
@@ -280,7 +281,7 @@ struct Prediction {
     page_bytes: Vec<u32>,
     order: ViewOrder,
     steps: Range<u32>,
-    policy: Policy,
+    policy: EvictPolicy,
     drive: DriveModel,
 }
 
@@ -299,17 +300,15 @@ impl Prediction {
             page_bytes: page_bytes(trainer.scene.pager.index()).into_iter().map(|bytes| bytes as u32).collect(),
             order: trainer.view_order().clone(),
             steps: warm_up..config.steps,
-            policy: match config.evict {
-                EvictPolicy::FarthestNextUse => Policy::Ahead,
-                EvictPolicy::LeastRecentlyUsed => Policy::LeastRecent,
-            },
+            policy: config.evict,
             drive: DriveModel { read_rate: rate.read, write_rate: rate.write, step_seconds },
         }
     }
 
     /// Seconds that the measured steps wait for the drive, with so many frames.
     fn stall_seconds(&self, frames: usize) -> Option<f64> {
-        let options = ReplayOptions { frames, policy: self.policy, steps: self.steps.end, plan_bytes: ORDER_BYTES };
+        let (policy, steps) = (self.policy, self.steps.end);
+        let options = ReplayOptions { frames, policy, reads_ahead: true, steps, plan_bytes: ORDER_BYTES };
         let run = replay(&self.views, &self.page_bytes, &self.order, &options).ok()?;
         Some(run.stall(self.steps.start as usize..self.steps.end as usize, &self.drive).seconds)
     }

@@ -3,7 +3,7 @@
 //! ```text
 //!  photos, poses, points ──> dataset ──> scene (rows in pages, events)      drive
 //!                                          │                                 ^
-//!            schedule (views, plan) ──> paging ──> cache (frames)            │
+//!            schedule (views) ──> paging (plan, frames)                      │
 //!                                          │   └──> page (slots, engines) ───┘
 //!            config ──> train ─────────────┤ pinned pages of the view's working set
 //!                         │                v
@@ -20,10 +20,9 @@
 //! | [`base`] | errors, names of pages, random draws, deterministic math, instruction paths; knows neither Gaussians nor disks |
 //! | [`scene`] | Gaussians, cameras and images as data; first Gaussians from points; the log of global events |
 //! | [`dataset`] | where views come from: COLMAP, transforms.json, MatrixCity, Mega-NeRF, the generated city; decoding photos |
-//! | [`schedule`] | which view comes when, which pages it needs, what a cache should keep |
+//! | [`schedule`] | which view comes when, and which pages it needs |
 //! | [`page`] | pages as bytes: buffers, slots on disk, checksums, the engines that move them, the map of versions and the commits that make them last |
-//! | [`cache`] | which pages are in memory, in what state, and which leaves next; no I/O |
-//! | [`paging`] | brings the pages of a view into memory and takes them back; writes a commit's pages beside training |
+//! | [`paging`] | one cache and one plan, for runs and for simulations: brings the pages of a view into memory and takes them back; writes a commit's pages beside training |
 //! | [`checkpoint`] | the state of a run beside its pages, as bytes; how often a run is committed |
 //! | [`gpu`] | a device and its memory, shaders, recording of work; knows no Gaussians |
 //! | [`kernels`] | the ordered table of stages and each stage as a function on plain slices |
@@ -43,7 +42,6 @@
 //! travel together, a *slot* its place on disk, a *frame* its place in memory, a *plan* which pages coming steps need.
 
 pub mod base;
-pub mod cache;
 pub mod checkpoint;
 pub mod config;
 pub mod dataset;

@@ -3,13 +3,14 @@
 
 use gsscale::base::ids::PageNo;
 use gsscale::base::rng::{Purpose, Stream};
-use gsscale::schedule::bound::FewestReads;
-use gsscale::schedule::model::{CacheModel, Policy, StepChange};
+use gsscale::paging::frames::evict::EvictPolicy;
+use gsscale::paging::plan::bound::FewestReads;
+use gsscale::paging::plan::cache_model::{CacheModel, StepChange};
 
 /// What the cache that knows the future reads, from empty or with pages of a choice of its own at the start.
 fn model(steps: &[Vec<PageNo>], frames: usize, pages: u32, is_warm: bool) -> u64 {
     let next = |page: PageNo, from: usize| (from..steps.len()).find(|&s| steps[s].contains(&page)).map(|s| s as u32);
-    let mut cache = CacheModel::new(frames, Policy::Farthest);
+    let mut cache = CacheModel::new(frames, EvictPolicy::FarthestNextUse);
     let mut change = StepChange::default();
     let mut read = 0;
     let mut first: Vec<PageNo> = (0..pages).map(PageNo).collect();

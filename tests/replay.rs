@@ -3,12 +3,13 @@
 
 use gsscale::base::ids::{PageId, PageNo};
 use gsscale::base::rng::{Purpose, Stream};
+use gsscale::paging::frames::evict::EvictPolicy;
+use gsscale::paging::plan::cache_model::{FAR_STEPS, STEPS_AHEAD};
+use gsscale::paging::simulation::auto::automatic_order;
+use gsscale::paging::simulation::replay::{DriveModel, Replay, ReplayOptions, Stall, StepTraffic, replay};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::page_meta::{PageBounds, PageMeta};
-use gsscale::schedule::auto::automatic_order;
-use gsscale::schedule::model::{FAR_STEPS, Policy};
 use gsscale::schedule::order::{Order, ViewOrder};
-use gsscale::schedule::replay::{DriveModel, Replay, ReplayOptions, STEPS_AHEAD, Stall, StepTraffic, replay};
 use gsscale::schedule::visibility::ViewPages;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -89,12 +90,13 @@ fn survey(views: usize, side: usize, share: f64, tilt: f64) -> Survey {
     Survey { index: (0..side * side).map(page).collect(), cameras }
 }
 
-fn run(survey: &Survey, pages: &ViewPages, order: Order, policy: Policy, cache: f64, epochs: u32) -> Replay {
+fn run(survey: &Survey, pages: &ViewPages, order: Order, policy: EvictPolicy, cache: f64, epochs: u32) -> Replay {
     let order = ViewOrder::new(order, 5, &survey.cameras);
     let bytes = vec![1 << 20; survey.index.len()];
     let frames = (cache * survey.index.len() as f64) as usize;
     let steps = survey.cameras.len() as u32 * epochs;
-    replay(pages, &bytes, &order, &ReplayOptions { frames, policy, steps, plan_bytes: 1 << 30 }).unwrap()
+    replay(pages, &bytes, &order, &ReplayOptions { frames, policy, reads_ahead: false, steps, plan_bytes: 1 << 30 })
+        .unwrap()
 }
 
 fn miss(run: &Replay) -> f64 {
@@ -114,7 +116,7 @@ fn table() {
         println!("{name}: a view sees {share:.3} of the pages, at most {}", pages.most());
         for order in ["shuffle", "groups:4", "groups:9", "groups:16", "groups:25", "groups:49", "groups:100", "tour"] {
             let cells = [0.13, 0.25, 0.5].map(|cache| {
-                let [b, l] = Policy::COMPARED.map(|p| run(&survey, &pages, order.parse().unwrap(), p, cache, 4));
+                let [b, l] = EvictPolicy::ALL.map(|p| run(&survey, &pages, order.parse().unwrap(), p, cache, 4));
                 assert!(b.is_exact);
                 format!("{:.3} / {:.3}", miss(&l), miss(&b))
             });
@@ -132,18 +134,18 @@ fn orders_and_policies_read_in_the_order_of_the_design() {
     for cache in [0.18, 0.25, 0.5] {
         let of = |order: &str, policy| miss(&run(&survey, &pages, order.parse().unwrap(), policy, cache, 3));
         let table = ["shuffle", "groups:4", "groups:9", "groups:25"].map(|order| {
-            let (lru, known) = (of(order, Policy::LeastRecent), of(order, Policy::Farthest));
+            let (lru, known) = (of(order, EvictPolicy::LeastRecentlyUsed), of(order, EvictPolicy::FarthestNextUse));
             assert!(known <= lru, "{order}: knowing the future never reads more");
             known
         });
         // Each refinement of the order saves a good deal, until what is left is the way through the city itself.
         assert!(table[1] < 0.75 * table[0] && table[2] < 0.75 * table[1] + 0.01, "{table:?}");
         assert!(table[3] < 0.75 * table[2] + 0.01, "{table:?}");
-        assert!(of("tour", Policy::Farthest) < 0.15 * table[0] + 0.02);
+        assert!(of("tour", EvictPolicy::FarthestNextUse) < 0.15 * table[0] + 0.02);
     }
     // A shuffle that knows the future is about as good as least recent use with half as many pages missing.
     let shuffle = |policy| miss(&run(&survey, &pages, Order::Shuffle, policy, 0.25, 3));
-    let (lru, known) = (shuffle(Policy::LeastRecent), shuffle(Policy::Farthest));
+    let (lru, known) = (shuffle(EvictPolicy::LeastRecentlyUsed), shuffle(EvictPolicy::FarthestNextUse));
     assert!((0.6..0.85).contains(&lru) && (0.35..0.6).contains(&known), "{lru} {known}");
 }
 
@@ -152,18 +154,24 @@ fn bytes_follow_pages_and_everything_that_leaves_is_written() {
     let survey = survey(100, 16, 0.1, 0.7);
     let pages = ViewPages::new(&survey.index, &survey.cameras);
     let needed: BTreeSet<u32> = (0..100).flat_map(|v| pages.of(v).iter().map(|p| p.0)).collect();
-    let planned = run(&survey, &pages, Order::Shuffle, Policy::Farthest, 0.4, 3);
+    let planned = run(&survey, &pages, Order::Shuffle, EvictPolicy::FarthestNextUse, 0.4, 3);
     let (read, written) = planned.totals();
     let frames = (0.4 * 256.0) as u64;
     assert_eq!(read - written, frames << 20, "what was read and not written is what the frames hold");
     assert!(planned.steps.iter().all(|s| s.bytes_read == u64::from(s.pages_read) << 20 && s.pages_read <= s.pages));
     // With a frame for every page each page is read once and nothing is written.
-    let all = run(&survey, &pages, Order::Shuffle, Policy::Farthest, 1.0, 3);
+    let all = run(&survey, &pages, Order::Shuffle, EvictPolicy::FarthestNextUse, 1.0, 3);
     assert_eq!(all.totals(), ((needed.len() as u64) << 20, 0));
     assert_eq!(all.figures(all.steady()).hit_rate, 1.0);
     // A plan that looks less far reads no less, and says that it is no bound.
     let order = ViewOrder::new(Order::Shuffle, 5, &survey.cameras);
-    let options = ReplayOptions { frames: 102, policy: Policy::Farthest, steps: 300, plan_bytes: 3000 };
+    let options = ReplayOptions {
+        frames: 102,
+        policy: EvictPolicy::FarthestNextUse,
+        reads_ahead: false,
+        steps: 300,
+        plan_bytes: 3000,
+    };
     let short = replay(&pages, &vec![1 << 20; 256], &order, &options).unwrap();
     assert!(planned.is_exact && !short.is_exact && short.totals().0 > read);
     let options = ReplayOptions { frames: pages.most() - 1, ..options };
@@ -258,9 +266,15 @@ fn frames_are_free_when_no_step_needs_them_and_pages_just_used_are_spared() {
     let most = views.most();
     let (mut spared, mut busy) = (0, 0);
     for frames in [most, most + most / 4, 2 * most, 4 * most, 256] {
-        let options = ReplayOptions { frames, policy: Policy::Ahead, steps: 360, plan_bytes: 1 << 28 };
+        let options = ReplayOptions {
+            frames,
+            policy: EvictPolicy::FarthestNextUse,
+            reads_ahead: true,
+            steps: 360,
+            plan_bytes: 1 << 28,
+        };
         let run = replay(&views, &vec![4096; 256], &order, &options).unwrap();
-        let best = replay(&views, &vec![4096; 256], &order, &ReplayOptions { policy: Policy::Farthest, ..options });
+        let best = replay(&views, &vec![4096; 256], &order, &ReplayOptions { reads_ahead: false, ..options });
         let mut coming = order.clone();
         let needed: Vec<BTreeSet<PageNo>> =
             (0..360).map(|step| views.of(coming.view_at(step)).iter().copied().collect()).collect();

@@ -4,8 +4,9 @@
 
 use gsscale::base::ids::PageNo;
 use gsscale::base::rng::{Purpose, Stream};
-use gsscale::schedule::model::{CacheModel, Policy, StepChange, TooFewFrames};
-use gsscale::schedule::plan::Plan;
+use gsscale::paging::frames::evict::EvictPolicy;
+use gsscale::paging::plan::cache_model::{CacheModel, StepChange, TooFewFrames};
+use gsscale::paging::plan::steps::{Plan, USE_BYTES};
 
 type Steps = Vec<Vec<PageNo>>;
 
@@ -53,7 +54,7 @@ fn least_reads(steps: &Steps, pages: u32, frames: u32) -> u32 {
 }
 
 /// Runs the model over all steps; checks what holds of every change; returns the reads.
-fn reads(steps: &Steps, frames: usize, policy: Policy, next: impl Fn(PageNo, usize) -> Option<u32>) -> u32 {
+fn reads(steps: &Steps, frames: usize, policy: EvictPolicy, next: impl Fn(PageNo, usize) -> Option<u32>) -> u32 {
     let mut cache = CacheModel::new(frames, policy);
     let mut held: Vec<PageNo> = Vec::new();
     let mut change = StepChange::default();
@@ -80,8 +81,8 @@ fn farthest_next_use_reads_the_least_that_is_possible() {
         let steps = steps(&mut draws, 14, 9, 1, u64::from(frames));
         let least = least_reads(&steps, 9, frames);
         let known = |page, from| next_use(&steps, page, from);
-        assert_eq!(reads(&steps, frames as usize, Policy::Farthest, known), least);
-        lru_total += reads(&steps, frames as usize, Policy::LeastRecent, known);
+        assert_eq!(reads(&steps, frames as usize, EvictPolicy::FarthestNextUse, known), least);
+        lru_total += reads(&steps, frames as usize, EvictPolicy::LeastRecentlyUsed, known);
         least_total += least;
     }
     assert!(lru_total * 10 > least_total * 11, "these cases do not tell the policies apart");
@@ -102,9 +103,9 @@ fn least_recent_use_is_what_a_queue_does() {
             queue.extend(sorted);
             queue.drain(..queue.len().saturating_sub(12));
         }
-        assert_eq!(reads(&steps, 12, Policy::LeastRecent, |_, _| None), want);
+        assert_eq!(reads(&steps, 12, EvictPolicy::LeastRecentlyUsed, |_, _| None), want);
         // Without any knowledge of the future the planned cache does the same.
-        assert_eq!(reads(&steps, 12, Policy::Farthest, |_, _| None), want);
+        assert_eq!(reads(&steps, 12, EvictPolicy::FarthestNextUse, |_, _| None), want);
     }
 }
 
@@ -120,7 +121,7 @@ fn a_window_that_moves_knows_what_lies_in_it_and_stays_within_its_bytes() {
         }
         assert!(end > first && plan.steps() == (first as u32..end as u32));
         for step in first..end {
-            assert!(plan.pages(step as u32).eq(all[step].iter().copied()));
+            assert_eq!(plan.pages(step as u32), all[step]);
         }
         let window = all[..end].to_vec();
         for page in (0..60).map(PageNo) {
@@ -128,13 +129,13 @@ fn a_window_that_moves_knows_what_lies_in_it_and_stays_within_its_bytes() {
                 assert_eq!(plan.next_use(page, from as u32), next_use(&window, page, from));
             }
         }
-        // 60 chains of 16 bytes and the counts come on top of the 1500 bytes of entries.
-        assert!(plan.bytes() < 1500 + 1024 + 1024, "{}", plan.bytes());
+        assert_eq!(plan.uses(), all[first..end].iter().map(Vec::len).sum::<usize>());
+        assert!(plan.uses() * USE_BYTES <= 1500, "{} uses", plan.uses());
         let steps = 1 + draws.below(3) as usize;
-        (0..steps.min(end - first)).for_each(|_| plan.pop());
+        (0..steps.min(end - first)).for_each(|i| assert_eq!(plan.pop().as_ref(), Some(&all[first + i])));
         first += steps.min(end - first);
     }
-    assert!(plan.steps().is_empty() && plan.pages(400).next().is_none());
+    assert!(plan.steps().is_empty() && plan.pages(400).is_empty());
     plan.restart(7);
     assert!(
         plan.push(&(0..60).chain(0..60).map(PageNo).collect::<Vec<_>>()[..60])
@@ -150,8 +151,8 @@ fn planned_changes_are_those_that_happen_and_print_exactly() {
         [vec![0, 1], vec![1, 2], vec![0, 3], vec![1, 2]].map(|s| s.into_iter().map(PageNo).collect()).into();
     let mut plan = Plan::new(10, 1 << 20);
     assert!(all.iter().all(|step| plan.push(step)));
-    let cache = CacheModel::new(3, Policy::Farthest);
-    let planned = plan.changes(&cache, 10..99).unwrap();
+    let cache = CacheModel::new(3, EvictPolicy::FarthestNextUse);
+    let planned = cache.changes(&plan, 10..99).unwrap();
     let text: Vec<String> = planned.iter().map(ToString::to_string).collect();
     assert_eq!(
         text,
@@ -164,6 +165,6 @@ fn planned_changes_are_those_that_happen_and_print_exactly() {
         ]
     );
     assert_eq!(plan.to_string().lines().nth(3), Some("step 12: 0 3"));
-    let small = CacheModel::new(1, Policy::Farthest);
-    assert_eq!(plan.changes(&small, 10..11), Err(TooFewFrames { step: 10, needed: 2, frames: 1 }));
+    let small = CacheModel::new(1, EvictPolicy::FarthestNextUse);
+    assert_eq!(small.changes(&plan, 10..11), Err(TooFewFrames { step: 10, needed: 2, frames: 1 }));
 }

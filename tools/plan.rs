@@ -4,20 +4,21 @@
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::units::{format_bytes, format_seconds};
-use gsscale::cache::evict::EvictPolicy;
 use gsscale::config::choice::Chosen;
 use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::optim::method::Method;
 use gsscale::page::engine::drive_rate::DriveRate;
 use gsscale::page::format::slot_header::transfer_bytes;
+use gsscale::paging::frames::evict::EvictPolicy;
+use gsscale::paging::frames::evict::EvictPolicy;
+use gsscale::paging::plan::cache_model::{CacheModel, StepChange, TooFewFrames};
+use gsscale::paging::plan::steps::Plan;
+use gsscale::paging::simulation::auto::automatic_order;
+use gsscale::paging::simulation::replay::{DriveModel, Figures, Replay, ReplayOptions, Stall, WINDOW_STEPS, replay};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::scene::page_meta::PageMeta;
-use gsscale::schedule::auto::automatic_order;
-use gsscale::schedule::model::{CacheModel, Policy, StepChange, TooFewFrames};
 use gsscale::schedule::order::{Order, ViewOrder};
-use gsscale::schedule::plan::Plan;
-use gsscale::schedule::replay::{DriveModel, Figures, Replay, ReplayOptions, Stall, WINDOW_STEPS, replay};
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::error::TrainError;
 use gsscale::train::first_look::{LookFor, first_look};
@@ -338,16 +339,13 @@ fn row(args: &Args, scene: &Scene, frames: usize, asked: Chosen<Order>) -> Input
     let order = order(args, scene, frames, asked)?;
     let views = ViewOrder::new(order, scene.config.seed, &scene.cameras);
     let steps = scene.config.steps.min((EPOCHS * scene.cameras.len() as u32).max(1));
-    let run = |policy| {
-        let options = ReplayOptions { frames, policy, steps, plan_bytes: args.plan_mem.0 };
+    let run = |policy, reads_ahead| {
+        let options = ReplayOptions { frames, policy, reads_ahead, steps, plan_bytes: args.plan_mem.0 };
         replay(&scene.views, &scene.page_bytes, &views, &options).map_err(|e| too_few(scene, &e))
     };
-    let (planned, lru) = (run(Policy::Farthest)?, run(Policy::LeastRecent)?);
+    let (planned, lru) = (run(EvictPolicy::FarthestNextUse, false)?, run(EvictPolicy::LeastRecentlyUsed, false)?);
     let figures = planned.figures(planned.steady());
-    let timed = run(match scene.config.evict {
-        EvictPolicy::FarthestNextUse => Policy::Ahead,
-        EvictPolicy::LeastRecentlyUsed => Policy::LeastRecent,
-    })?;
+    let timed = run(scene.config.evict, true)?;
     let stall = timed.stall(timed.steady(), &scene.drive);
     let (_, written) = planned.totals();
     let rest = f64::from(scene.config.steps - steps);
@@ -458,7 +456,7 @@ fn lists(args: &Args, scene: &Scene, frames: usize, range: Range<u32>) -> InputR
     let order = order(args, scene, frames, orders(args, &scene.config)[0])?;
     let mut views = ViewOrder::new(order, scene.config.seed, &scene.cameras);
     let mut plan = Plan::new(0, args.plan_mem.0);
-    let mut cache = CacheModel::new(frames, Policy::Farthest);
+    let mut cache = CacheModel::new(frames, EvictPolicy::FarthestNextUse);
     let (end, mut change) = (range.end.min(scene.config.steps), StepChange::default());
     loop {
         let step = plan.steps().start;
@@ -470,11 +468,11 @@ fn lists(args: &Args, scene: &Scene, frames: usize, range: Range<u32>) -> InputR
         if step >= range.start.min(end) {
             break;
         }
-        let pages: Vec<_> = plan.pages(step).collect();
-        cache.step(step, &pages, |page| plan.next_use(page, step + 1), &mut change).map_err(|e| too_few(scene, &e))?;
+        let next_use = |page| plan.next_use(page, step + 1);
+        cache.step(step, plan.pages(step), next_use, &mut change).map_err(|e| too_few(scene, &e))?;
         plan.pop();
     }
-    let planned = plan.changes(&cache, range.start.min(end)..end).map_err(|e| too_few(scene, &e))?;
+    let planned = cache.changes(&plan, range.start.min(end)..end).map_err(|e| too_few(scene, &e))?;
     let lines: Vec<String> = planned.iter().map(ToString::to_string).collect();
     Ok(lines.join("\n"))
 }

@@ -5,10 +5,11 @@
 
 use gsscale::base::ids::PageNo;
 use gsscale::page::format::slot_header::transfer_bytes;
+use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::Pager;
+use gsscale::paging::plan::cache_model::{CacheModel, StepChange};
 use gsscale::scene::page_layout::PageLayout;
 use gsscale::scene::page_meta::PageMeta;
-use gsscale::schedule::model::{CacheModel, Policy, StepChange};
 use std::collections::BTreeSet;
 
 /// What a measurement asked of its cache.
@@ -51,7 +52,7 @@ impl Demand {
         for (pages, step) in steps.iter().zip(1..) {
             pages.iter().for_each(|p| uses[p.index()].push(step));
         }
-        let mut cache = CacheModel::new(frames, Policy::Farthest);
+        let mut cache = CacheModel::new(frames, EvictPolicy::FarthestNextUse);
         let mut change = StepChange::default();
         let mut total = (0, 0);
         // What is there at the beginning enters as a step of its own, which is not counted.

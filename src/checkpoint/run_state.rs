@@ -9,6 +9,7 @@
 
 use crate::base::identity::RunId;
 use crate::page::format::encoding::{self, EncodingError};
+use crate::paging::stats::PagerStats;
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
@@ -54,43 +55,6 @@ pub struct LastTest {
     pub psnr: f64,
     /// Mean SSIM.
     pub ssim: f64,
-}
-
-/// What moved between the tiers since the run began, over all its lives.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-pub struct TrafficSoFar {
-    /// Bytes read from the store.
-    pub bytes_read: u64,
-    /// Bytes written to the store.
-    pub bytes_written: u64,
-    /// Pages read.
-    pub pages_read: u64,
-    /// Pages written.
-    pub pages_written: u64,
-    /// Pages asked for.
-    pub pages_needed: u64,
-    /// Of these, in memory.
-    pub hits: u64,
-    /// Of these, not there.
-    pub misses: u64,
-    /// Of the misses, those that the plan had left out.
-    pub late_misses: u64,
-    /// Pages that lost their frame.
-    pub evictions: u64,
-    /// Seconds that steps waited.
-    pub stall_seconds: f64,
-    /// The most pages pinned at once.
-    pub pinned_max: u64,
-    /// Of the misses, those that were not even on their way.
-    pub absent: u64,
-    /// Pages that all others than steps asked for.
-    pub other_pages_needed: u64,
-    /// Bytes read for them.
-    pub other_bytes_read: u64,
-    /// Seconds that they waited.
-    pub other_stall_seconds: f64,
-    /// Bytes that the best of caches would have read for the steps.
-    pub belady_bytes_read: u64,
 }
 
 /// Which run a state belongs to, and where the run was.
@@ -140,7 +104,7 @@ pub struct RunState {
     /// The last evaluation, if there was one.
     pub test: Option<LastTest>,
     /// What moved between the tiers so far.
-    pub traffic: TrafficSoFar,
+    pub traffic: PagerStats,
     /// Whose state it is.
     pub run: RunIdentity,
 }
@@ -179,7 +143,7 @@ impl RunState {
             train_seconds: 0.0,
             metrics_bytes: 0,
             test: None,
-            traffic: TrafficSoFar::default(),
+            traffic: PagerStats::default(),
             run: RunIdentity::default(),
         }
     }
@@ -295,12 +259,12 @@ mod tests {
             train_seconds: 0.1,
             metrics_bytes: 1234,
             test: Some(LastTest { step: 8, views: 3, psnr: 21.5, ssim: 0.75 }),
-            traffic: TrafficSoFar {
+            traffic: PagerStats {
                 bytes_read: 9,
                 stall_seconds: 0.25,
                 other_bytes_read: 4,
                 belady_bytes_read: 3,
-                ..TrafficSoFar::default()
+                ..PagerStats::default()
             },
             run: RunIdentity {
                 id: "00112233445566778899aabbccddeeff".parse().unwrap(),

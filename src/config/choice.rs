@@ -5,7 +5,6 @@
 //! sentence; 3. this file knows no default and no meaning of a value.
 
 use crate::base::simd::SimdPath;
-use crate::cache::evict::EvictPolicy;
 use crate::densify::strategy::StrategyName;
 use crate::exchange::ply::ExportFrame;
 use crate::gpu::DeviceChoice;
@@ -13,7 +12,8 @@ use crate::optim::method::Method;
 use crate::optim::moments::Moments;
 use crate::page::engine::open::IoEngine;
 use crate::page::format::codec::Codec;
-use crate::paging::ahead::Transfers;
+use crate::paging::frames::evict::EvictPolicy;
+use crate::paging::timing::Transfers;
 use crate::render::SsimPadding;
 use crate::render::color_correct::ColorCorrect;
 use crate::render::metrics::SsimVariant;

@@ -209,7 +209,7 @@ mod tests {
     use super::super::file::ByteSize;
     use super::*;
     use crate::checkpoint::interval::CommitEvery;
-    use crate::paging::ahead::Transfers;
+    use crate::paging::timing::Transfers;
 
     #[test]
     fn keys_that_never_change_results_make_no_difference() {

@@ -1,26 +1,28 @@
-//! What a commit needs of the pages: all of them on the drive, and which differ from those of the last commit; and pages
-//! back from a store that was opened.
+//! Commits: all pages on the drive, and what differs from the last commit; and pages back from a store that was opened.
+//!
+//! A commit is either done at once, between two steps ([`Pager::flush`], [`Pager::commit`]), or beside training
+//! ([`Pager::freeze`] to [`Pager::commit_frozen`]; `cut` says how).
 //!
 //! Invariants: 1. after [`Pager::flush`] nothing is in flight and no page in memory is dirty; 2. a commit names every
-//! page with rows, by exactly the version that was last released; 3. only an acknowledged commit counts as the last one,
-//! but whatever the drive holds of those that were not acknowledged goes with the next; 4. entries from a store are taken
-//! over only if their slots can hold what they say.
+//! page with rows, by exactly the version that was last released; 3. a frozen page is never pinned, so what is written is what
+//! the page was at the cut; 4. when a write fails, the cut is given up; 5. entries from a store are taken over only if their slots
+//! can hold what they say.
 
+use super::cut::{Frozen, nowhere};
 use super::error::PagingError;
-use super::label::label;
+use super::mover::WRITES_IN_FLIGHT;
 use super::pager::{Pager, PagerConfig};
 use super::stored::PageLimits;
 use super::transfers::Failure;
-use crate::base::ids::{PageId, PageNo};
-use crate::cache::frame::FrameState;
-use crate::page::format::slot_header::SlotRef;
-use crate::page::map::commit::{CommitError, Commits, Cut, PageChange};
+use crate::base::ids::PageNo;
+use crate::page::map::commit::{CommitError, Commits, Cut};
 use crate::page::map::opening::StoredPage;
 use crate::page::versions::paged_store::PagedStore;
-use std::collections::BTreeMap;
+use crate::paging::frames::frame::FrameState;
+use std::time::Instant;
 
-/// Writes in flight at once: each may need a buffer of its own to be encoded in.
-pub(super) const WRITES_IN_FLIGHT: usize = 32;
+/// Frozen pages that are written at once at least, however little may be read ahead.
+const FROZEN_WRITES_LEAST: usize = 8;
 
 impl Pager {
     /// A pager over a store that holds these pages, none of them in memory. `events` is the length of the event log.
@@ -39,9 +41,8 @@ impl Pager {
             let meta = limits
                 .meta_of(stored.page, &stored.slot, &stored.label)
                 .map_err(|what| CommitError::Contradiction(format!("page {}: {what}", stored.page)))?;
-            pager.index.push(meta);
-            pager.slots.push(Some(stored.slot));
-            pager.committed.insert(stored.page, stored.slot.generation);
+            pager.index.push(meta, Some(stored.slot));
+            pager.cuts.add_committed(stored.page, stored.slot.generation);
         }
         Ok(pager)
     }
@@ -52,13 +53,14 @@ impl Pager {
     /// # Errors
     /// A page could not be written. It is still in memory, and the call may be repeated.
     pub fn flush(&mut self) -> Result<(), PagingError> {
-        debug_assert_eq!(self.cache.count(FrameState::Pinned), 0, "a step holds pages");
+        debug_assert_eq!(self.frames.count(FrameState::Pinned), 0, "a step holds pages");
         self.thaw();
-        // Pages whose write failed are dirty still: what was wrong with them is tried again here.
-        self.failed_write = None;
-        self.writes_stopped = false;
+        // Pages whose write failed are still dirty: they are written again here.
+        self.mover.take_failure();
+        self.mover.resume_writes();
         self.settle_below(1)?;
-        let mut dirty: Vec<PageNo> = self.cache.held().map(|h| h.page).filter(|&p| self.cache.is_dirty(p)).collect();
+        let mut dirty: Vec<PageNo> =
+            self.frames.held().map(|(_, held)| held.page).filter(|&p| self.frames.is_dirty(p)).collect();
         dirty.sort_unstable();
         for page in dirty {
             self.settle_below(WRITES_IN_FLIGHT)?;
@@ -71,7 +73,7 @@ impl Pager {
     /// read ahead is read when it is needed.
     pub(super) fn settle_below(&mut self, most: usize) -> Result<(), PagingError> {
         let mut first_error = None;
-        while self.in_flight() >= most || !self.has_staging() {
+        while self.mover.in_flight() >= most || !self.mover.has_staging() {
             for Failure { is_write, error, .. } in self.settle(true, &mut Vec::new()) {
                 if is_write {
                     first_error.get_or_insert(error);
@@ -93,60 +95,106 @@ impl Pager {
         note: &[u8],
         pin: Option<&str>,
     ) -> Result<Option<u64>, CommitError> {
-        debug_assert!(self.in_flight() == 0, "a commit comes after a flush");
-        if self.store.is_none() {
-            return Ok(None);
-        }
-        let (changes, now) = self.changes()?;
-        let Some(store) = &mut self.store else { return Ok(None) };
+        debug_assert!(self.mover.in_flight() == 0, "a commit comes after a flush");
+        let Some(store) = self.mover.store_mut() else { return Ok(None) };
+        let (changes, now) = self.cuts.changes(&self.index)?;
         let cut = Cut { changes: &changes, run_state, note, pin };
         let result = commits.commit(store, &mut Vec::new(), &cut);
-        self.end_commit(now, result).map(Some)
+        self.cuts.end_commit(now, result).map(Some)
     }
 
-    /// Takes over the end of a commit of the pages `now`.
-    pub(super) fn end_commit(
+    /// Freezes the pages as they are: between steps, no page is pinned. An earlier cut that was not committed is given
+    /// up. Nothing is frozen without a store.
+    ///
+    /// # Errors
+    /// A write that ended meanwhile had failed.
+    pub fn freeze(&mut self) -> Result<(), PagingError> {
+        debug_assert_eq!(self.frames.count(FrameState::Pinned), 0, "a step holds pages");
+        self.thaw();
+        if let Some(Failure { error, .. }) = self.settle(false, &mut Vec::new()).into_iter().find(|f| f.is_write) {
+            return Err(error);
+        }
+        let Some(store) = self.mover.store_mut() else { return Ok(()) };
+        let generation = store.cut();
+        self.cuts.freeze(generation, &self.index, &self.frames);
+        Ok(())
+    }
+
+    /// Gives up a cut that is not committed.
+    pub fn thaw(&mut self) {
+        self.cuts.thaw();
+    }
+
+    /// Whether there is a cut that is not committed yet; a failed write has given it up.
+    pub fn is_frozen(&self) -> bool {
+        self.cuts.is_frozen()
+    }
+
+    /// Whether the write of a frozen page may begin because a step waits for it.
+    pub(super) fn may_write_frozen(&self, page: PageNo) -> bool {
+        self.cuts.holds(page)
+            && self.cuts.writing() < WRITES_IN_FLIGHT
+            && self.mover.has_staging()
+            && self.frames.state(page) == Some(FrameState::Resident)
+    }
+
+    /// Whether every page of the cut is written.
+    pub fn is_frozen_written(&self) -> bool {
+        self.cuts.is_written()
+    }
+
+    /// Begins writes of frozen pages, as many as may be in flight ahead of other work; never blocks.
+    pub fn write_frozen(&mut self) {
+        let most = (self.config.prefetch_bytes / 2 / self.frame_bytes()).max(FROZEN_WRITES_LEAST);
+        let started = Instant::now();
+        while !self.mover.are_writes_stopped()
+            && self.mover.has_staging()
+            && self.cuts.writing() < most
+            && let Some(page) = self.cuts.next_waiting()
+        {
+            if let Err(Failure { error, .. }) = self.begin_write(page, true) {
+                // The next step gets the error.
+                let _ = self.mover.stop_writes(error, false);
+            }
+        }
+        if self.cuts.is_frozen() {
+            self.counters.commit_seconds += started.elapsed().as_secs_f64();
+        }
+    }
+
+    /// Writes what is left of the cut, and waits until nothing is in flight.
+    ///
+    /// # Errors
+    /// A page could not be written: the cut is given up.
+    pub fn finish_frozen(&mut self) -> Result<(), PagingError> {
+        while let Some(page) = self.cuts.next_waiting() {
+            self.settle_below(WRITES_IN_FLIGHT)?;
+            self.begin_write(page, false).map_err(|f| f.error)?;
+        }
+        self.settle_below(1)
+    }
+
+    /// Commits the cut, right after [`Pager::finish_frozen`]; returns its generation and the bytes that were written for
+    /// it, `None` where nothing is frozen.
+    ///
+    /// # Errors
+    /// As [`Commits::commit`]: the cut is given up.
+    pub fn commit_frozen(
         &mut self,
-        now: BTreeMap<PageId, u64>,
-        result: Result<u64, CommitError>,
-    ) -> Result<u64, CommitError> {
-        if result.is_ok() {
-            self.committed = now;
-            self.unsure.clear();
-        } else {
-            self.unsure.extend(now.into_keys());
+        commits: &mut Commits,
+        run_state: &[u8],
+        note: &[u8],
+    ) -> Result<Option<(u64, u64)>, CommitError> {
+        debug_assert!(self.mover.in_flight() == 0, "a commit comes after its writes");
+        let Some(frozen) = self.cuts.take() else { return Ok(None) };
+        let Frozen { generation, mut changes, now, bytes, nowhere: lost, .. } = frozen;
+        if let Some(page) = lost {
+            return Err(nowhere(page));
         }
-        result
+        changes.extend(self.cuts.gone_from(&now));
+        let Some(store) = self.mover.store_mut() else { return Ok(None) };
+        let cut = Cut { changes: &changes, run_state, note, pin: None };
+        let result = commits.commit_cut(store, &mut Vec::new(), generation, &cut);
+        self.cuts.end_commit(now, result).map(|generation| Some((generation, bytes)))
     }
-
-    /// Pages that the drive may hold as the last commit and that `now` has not.
-    pub(super) fn gone_from<'a>(&'a self, now: &'a BTreeMap<PageId, u64>) -> impl Iterator<Item = PageChange> + 'a {
-        let not_yet_named = self.unsure.iter().filter(|page| !self.committed.contains_key(page));
-        let gone = self.committed.keys().chain(not_yet_named).filter(|page| !now.contains_key(page));
-        gone.map(|&page| PageChange { page, version: None::<(SlotRef, Vec<u8>)> })
-    }
-
-    /// What differs from the last commit, and all pages with the generations of their versions. A page that is written
-    /// again after a commit belongs to a later generation, so the number tells versions of one page apart.
-    fn changes(&self) -> Result<(Vec<PageChange>, BTreeMap<PageId, u64>), CommitError> {
-        let mut changes = Vec::new();
-        let mut now = BTreeMap::new();
-        for (meta, slot) in self.index.iter().zip(&self.slots) {
-            if meta.rows == 0 {
-                continue;
-            }
-            let slot = slot.ok_or_else(|| nowhere(meta.id))?;
-            now.insert(meta.id, slot.generation);
-            if self.committed.get(&meta.id) != Some(&slot.generation) {
-                changes.push(PageChange { page: meta.id, version: Some((slot, label(meta).to_vec())) });
-            }
-        }
-        changes.extend(self.gone_from(&now));
-        Ok((changes, now))
-    }
-}
-
-/// A page with rows of which the drive has nothing: a commit without it would take it away.
-pub(super) fn nowhere(page: PageId) -> CommitError {
-    CommitError::Contradiction(format!("page {page} has rows and was never written"))
 }

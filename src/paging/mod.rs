@@ -1,15 +1,32 @@
-//! The only place where cache, store and plan meet: brings the pages of a view into memory, and takes them back.
-//! Knows pages as bytes, metas and bounds; neither the optimizer nor the renderer.
+//! One cache and one plan for every tier: brings the pages of a view into memory, takes them back, and writes the pages of a
+//! commit beside training. Knows pages as bytes, metas and bounds; neither the optimizer nor the renderer.
+//!
+//! | part | responsible for |
+//! | --- | --- |
+//! | [`frames`] | which pages are in memory, in what state, and which is evicted next |
+//! | [`plan`] | what the coming steps need, and what a cache makes of it |
+//! | [`simulation`] | whole runs of the cache before they happen, by the same plan and the same order of eviction |
+//! | `index` | the entry of every page, and the slot of its version on the drive |
+//! | `mover` | transfers between frames and the store: what is in flight, and what failed |
+//! | `cut` | which pages the last commit names, and the pages of a commit beside training |
+//! | [`pager`] | the parts together: hands out the pages of a view and takes them back |
+//!
+//! The pager's calls that need several parts stand in `fetch`, `prefetch`, `transfers` and `commit`.
 
-pub mod ahead;
 mod commit;
+mod cut;
 pub mod error;
 mod fetch;
-mod freeze;
+pub mod frames;
+mod index;
 pub mod label;
+mod mover;
 pub mod pager;
 pub mod pinned;
+pub mod plan;
+mod prefetch;
+pub mod simulation;
 pub mod stats;
 pub mod stored;
+pub mod timing;
 mod transfers;
-mod window;

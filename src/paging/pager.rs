@@ -1,46 +1,47 @@
-//! Hands out the pages of a view and takes them back.
+//! The pager hands out the pages of a view and takes them back.
 //!
-//! Here are the pages' entries and the calls of the trainer; `fetch` brings what is missing, `ahead` what will be
-//! missing, `transfers` talks to the store, `commit` makes what it holds last.
+//! The pager composes parts that know nothing of each other: `index` (entries and slots of the pages), `frames` (which pages are
+//! in memory), `plan` (what the coming steps need), `mover` (transfers), `cut` (commits). Calls that need several parts stand in
+//! files of their own: `fetch` brings what is needed now, `prefetch` what will be needed, `transfers` begins and ends reads and
+//! write-backs, `commit` makes what the pages hold durable.
 //!
 //! Invariants: 1. `acquire` gives every page that the view may see by the bounds as they are now, whatever was planned;
-//! 2. a page's buffer is in one place: with the cache, with the store, or with the caller who pinned it; 3. what a step
+//! 2. a page's buffer is in one place: in its frame, with the mover, or with the caller who pinned it; 3. what a step
 //! reads and writes never depends on frames, plan or store; 4. a page with rows that is not in memory has a slot, and the
 //! slot holds exactly what was last released.
 
-use super::ahead::{Coming, Transfers};
+use super::cut::Cuts;
 use super::error::PagingError;
-use super::fetch::Asker;
-use super::freeze::Frozen;
+use super::frames::evict::EvictPolicy;
+use super::frames::frame::FrameState;
+use super::frames::table::FrameTable;
+use super::index::PageIndex;
+use super::mover::Mover;
 use super::pinned::PinnedPage;
-use super::stats::{PagerStats, SlotSpace};
-use super::window::Window;
-use crate::base::ids::{PageId, PageNo};
-use crate::cache::evict::EvictPolicy;
-use crate::cache::frame::FrameState;
-use crate::cache::host_cache::HostCache;
+use super::plan::look_ahead::LookAhead;
+use super::stats::{Counters, PagerStats, SlotSpace};
+use super::timing::{Asker, Transfers};
+use crate::base::ids::PageNo;
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::format::slot_header::{HEADER_BYTES, SlotRef, transfer_bytes};
 use crate::page::versions::paged_store::PagedStore;
 use crate::scene::camera::Camera;
-use crate::scene::page_layout::{PageLayout, capacity_bytes};
+use crate::scene::page_layout::capacity_bytes;
 use crate::scene::page_meta::PageMeta;
-use crate::schedule::bound::FewestReads;
 use crate::schedule::visibility::visible_pages;
-use std::collections::{BTreeMap, BTreeSet};
 
 /// Sizes of a pager. None of them changes a bit of the rows.
 #[derive(Debug, Clone, Copy)]
 pub struct PagerConfig {
-    /// Rows that a page holds at most.
+    /// The most rows of a page.
     pub page_rows: usize,
-    /// Degree of the scene: frames hold a full page of it.
+    /// Degree of the scene: a frame holds a full page of that degree.
     pub sh_degree: u8,
-    /// Pages that memory holds at once; `usize::MAX` for as many as there are.
+    /// The most pages in memory; `usize::MAX` for as many as there are.
     pub frames: usize,
-    /// Which page leaves first.
+    /// Which page is evicted first.
     pub policy: EvictPolicy,
-    /// Bytes that [`Pager::prefetch`] has in flight at most, reads and writes each.
+    /// The most bytes that [`Pager::prefetch`] has in flight, reads and writes each.
     pub prefetch_bytes: usize,
     /// Bytes for the plan of the coming steps; what does not fit is planned later.
     pub plan_bytes: usize,
@@ -59,79 +60,52 @@ impl PagerConfig {
     }
 }
 
-/// The pages of a scene.
+/// The pages of a scene: the parts that hold, move and plan them.
 #[derive(Debug)]
 pub struct Pager {
     pub(super) config: PagerConfig,
-    /// By page.
-    pub(super) index: Vec<PageMeta>,
-    /// By page: where its version on the drive is, current or not; `None` before its first write.
-    pub(super) slots: Vec<Option<SlotRef>>,
-    pub(super) cache: HostCache,
-    pub(super) window: Window,
-    /// `None` for a pager whose pages never leave memory.
-    pub(super) store: Option<PagedStore>,
-    pub(super) stats: PagerStats,
-    /// A write that failed while nobody waited for it.
-    pub(super) failed_write: Option<PagingError>,
-    /// After a failed write nothing is written until a step asks for pages again.
-    pub(super) writes_stopped: bool,
-    /// Reads and writes that were started ahead of their need and are still in flight, bytes.
-    pub(super) ahead: [usize; 2],
+    pub(super) index: PageIndex,
+    pub(super) frames: FrameTable<PageBuffer>,
+    pub(super) look_ahead: LookAhead,
+    pub(super) mover: Mover,
+    pub(super) cuts: Cuts,
+    pub(super) counters: Counters,
     pub(super) transfers: Transfers,
-    /// Pages of the last acknowledged commit, with the generations of their versions.
-    pub(super) committed: BTreeMap<PageId, u64>,
-    /// Pages of commits since then that were not acknowledged. One that found no space may have been durable all the
-    /// same, and the next one goes on from it: of these, those that are gone by then must be taken away as well.
-    pub(super) unsure: BTreeSet<PageId>,
-    /// A cut that is being written.
-    pub(super) frozen: Option<Frozen>,
-    /// What the coming steps will wait for.
-    pub(super) coming: Coming,
-    /// What the steps so far would have made the best of caches read.
-    bound: FewestReads,
 }
 
 impl Pager {
     /// A pager with `config.frames` frames over a store whose slots are as large as the frames.
     pub fn new(config: PagerConfig, store: PagedStore) -> Pager {
-        Pager { store: Some(store), ..Pager::in_memory(config) }
+        let mut pager = Pager::in_memory(config);
+        pager.mover.attach(store);
+        pager
     }
 
     /// A pager that keeps every page in memory, in as many frames as needed.
     pub fn in_memory(config: PagerConfig) -> Pager {
         Pager {
-            cache: HostCache::new(config.frames, config.frame_bytes(), config.policy),
-            window: Window::new(config.plan_bytes),
-            config,
-            index: Vec::new(),
-            slots: Vec::new(),
-            store: None,
-            stats: PagerStats::default(),
-            failed_write: None,
-            writes_stopped: false,
-            ahead: [0; 2],
+            index: PageIndex::default(),
+            frames: FrameTable::new(config.frames, config.policy),
+            look_ahead: LookAhead::new(config.policy, config.plan_bytes),
+            mover: Mover::new(config.frame_bytes(), config.prefetch_bytes),
+            cuts: Cuts::default(),
+            counters: Counters::default(),
             transfers: Transfers::default(),
-            committed: BTreeMap::new(),
-            unsure: BTreeSet::new(),
-            frozen: None,
-            coming: Coming::default(),
-            bound: FewestReads::default(),
+            config,
         }
     }
 
-    /// Gives a pager whose pages never left memory a store of its frames' size, which is empty: from here on it can be
+    /// Gives a pager whose pages never left memory a store of its frames' size, which is empty: from here on the pager can be
     /// committed. Nothing is written before that.
     pub fn attach(&mut self, store: PagedStore) {
-        assert!(self.store.is_none(), "a pager has one store for life");
-        self.store = Some(store);
-        // They are there: no cache would have had to read them.
-        (0..self.index.len()).for_each(|page| self.bound.add(PageNo(page as u32)));
+        self.mover.attach(store);
+        // These pages are in memory: no cache would have had to read them.
+        (0..self.index.metas().len()).for_each(|page| self.counters.bound.add(PageNo(page as u32)));
     }
 
-    /// Counts on from what an earlier life of the run had counted.
-    pub fn count_on(&mut self, past: PagerStats) {
-        self.stats = past;
+    /// Continues the counters of an earlier life of the run.
+    pub fn restore_stats(&mut self, past: PagerStats) {
+        self.counters.stats = past;
     }
 
     /// Adds an initial page. `fill` writes its rows into the payload space (all of it is given; see
@@ -147,59 +121,60 @@ impl Pager {
         let mut buffer = self.frame_for(Asker::Other)?;
         fill(&mut buffer.as_mut_slice()[HEADER_BYTES..]);
         let page = self.add_entry(meta);
-        self.cache.adopt(page);
-        self.cache.unpin(page, buffer, true);
+        self.frames.adopt(page);
+        self.frames.unpin(page, buffer, true);
         Ok(page)
     }
 
-    /// Allows more frames than the pager was made with, once it is known what memory is left for them.
+    /// Raises the number of frames, once the memory that is left for them is known.
     pub fn allow_frames(&mut self, frames: usize) {
-        self.cache.allow_frames(frames);
-        self.config.frames = self.cache.frames_max();
+        self.frames.allow_frames(frames);
+        self.config.frames = self.frames.frames_max();
     }
 
-    /// Allows no more than so many frames from now on. Between steps: pages leave until there are no more, and dirty ones
-    /// are written for it; the time counts as waited for. If one could not be written the next step gets the error, and
-    /// its frame goes when it is.
+    /// Lowers the number of frames to `frames`. To be called between steps: pages are evicted, and dirty pages written back,
+    /// until no frame is in excess; the time counts as waited. If a page cannot be written, the next step gets the error, and the
+    /// frame is given up once the page is written.
     pub fn limit_frames(&mut self, frames: usize) {
-        self.cache.limit_frames(frames);
-        self.config.frames = self.cache.frames_max();
-        while self.cache.excess() > 0 {
+        self.frames.limit_frames(frames);
+        self.config.frames = self.frames.frames_max();
+        while self.frames.excess() > 0 {
             match self.make_room(0, Asker::Step) {
                 Ok(true) => {}
-                Ok(false) if self.in_flight() == 0 => return,
+                Ok(false) if self.mover.in_flight() == 0 => return,
                 Ok(false) => self.settle_for_nobody(true),
                 Err(error) => {
-                    self.failed_write.get_or_insert(error);
+                    self.mover.keep_failure(error);
                     return;
                 }
             }
         }
     }
 
-    /// A pager whose pages were all in memory, and whose store holds all of them, keeps no more than so many frames from now
-    /// on. The sizes are those of [`PagerConfig`].
+    /// Begins to move pages between memory and the store: for a pager whose pages were all in memory, and whose store holds all
+    /// of them. The sizes are those of [`PagerConfig`].
     pub fn begin_paging(&mut self, frames: usize, prefetch_bytes: usize, plan_bytes: usize) {
-        assert!(self.store.is_some(), "pages that leave memory have a store to go to");
+        assert!(self.mover.has_store(), "pages that leave memory have a store to go to");
         self.config = PagerConfig { prefetch_bytes, plan_bytes, ..self.config };
-        self.window = Window::new(plan_bytes);
+        self.mover.set_ahead_max(prefetch_bytes);
+        self.look_ahead = LookAhead::new(self.config.policy, plan_bytes);
         self.limit_frames(frames);
     }
 
-    /// Moves pages at these times from now on.
+    /// Sets when pages move.
     pub fn set_transfers(&mut self, transfers: Transfers) {
         self.transfers = transfers;
     }
 
-    /// Bytes that [`Pager::prefetch`] has in flight at most.
+    /// The most bytes that [`Pager::prefetch`] has in flight, reads and writes together.
     pub fn prefetch_bytes(&self) -> usize {
         2 * self.config.prefetch_bytes
     }
 
-    /// Memory of buffers for encoded pages, bytes: as much as was ever in use at once. At most [`Pager::prefetch_bytes`],
-    /// but a few pages in any case, and some more where nothing is ever ahead.
+    /// Memory of buffers for encoded pages, bytes: the most that was ever in use at once. The limit is
+    /// [`Pager::prefetch_bytes`], but a few pages are always allowed, and some more where nothing is read ahead.
     pub fn staging_bytes(&self) -> u64 {
-        self.store.as_ref().map_or(0, PagedStore::staging_bytes)
+        self.mover.staging_bytes()
     }
 
     /// Bytes of one frame.
@@ -209,14 +184,14 @@ impl Pager {
 
     /// The metas of all pages, by number.
     pub fn index(&self) -> &[PageMeta] {
-        &self.index
+        self.index.metas()
     }
 
-    /// Says which views come next: `cameras[i]` at step `first_step + i`. Replaces what was said before; what is known
-    /// already for the same views costs nothing.
+    /// Plans the coming views: `cameras[i]` at step `first_step + i`. Replaces the plan before; views that are planned already
+    /// cost nothing.
     pub fn look_ahead(&mut self, first_step: u32, cameras: &[&Camera]) {
-        if self.store.is_some() {
-            self.window.renew(first_step, cameras, &self.index);
+        if self.mover.has_store() {
+            self.look_ahead.views.renew(first_step, cameras, self.index.metas());
             self.apply_changed_uses();
         }
     }
@@ -228,56 +203,51 @@ impl Pager {
     /// The working set is larger than the frames; a page cannot be read; a page could not be written, now or since the
     /// last call. Nothing is pinned then, and every page keeps what it holds.
     pub fn acquire(&mut self, step: u32, camera: &Camera) -> Result<Vec<PinnedPage>, PagingError> {
-        self.writes_stopped = false;
-        if let Some(error) = self.failed_write.take() {
+        self.mover.resume_writes();
+        if let Some(error) = self.mover.take_failure() {
             return Err(error);
         }
         let pages = self.pages_of_view(camera);
-        let planned = self.window.pages(step).map(<[PageNo]>::to_vec);
-        self.window.pass(step.saturating_add(1));
-        self.window.add_pages(&self.index);
+        let planned = self.look_ahead.views.pages(step).map(<[PageNo]>::to_vec);
+        self.look_ahead.views.pass(step.saturating_add(1));
+        self.look_ahead.views.add_pages(self.index.metas());
         self.apply_changed_uses();
-        self.cache.tick();
+        self.frames.begin_step(step);
         if let Some(planned) = planned {
-            let missed = |p: &&PageNo| planned.binary_search(p).is_err() && self.cache.state(**p).is_none();
-            self.stats.late_misses += pages.iter().filter(missed).count() as u64;
+            let missed = |p: &&PageNo| planned.binary_search(p).is_err() && self.frames.state(**p).is_none();
+            self.counters.stats.late_misses += pages.iter().filter(missed).count() as u64;
         }
         let pinned = self.fetch(&format!("the view of step {step}"), &pages, Asker::Step)?;
         self.count_bound(&pages);
         Ok(pinned)
     }
 
-    /// Takes a step over into what the best of caches would have read.
+    /// Adds a step to the bound on reads.
     fn count_bound(&mut self, pages: &[PageNo]) {
-        if self.store.is_none() {
+        if !self.mover.has_store() {
             return;
         }
-        let bytes = |page: PageNo| {
-            let PageMeta { rows, sh_degree, .. } = self.index[page.index()];
-            let raw = || transfer_bytes(PageLayout { rows: rows as usize, sh_degree }.bytes());
-            self.slots[page.index()].map_or_else(raw, |slot| slot.transfer_bytes()) as u64
-        };
-        self.bound.step(self.cache.frames_max(), pages.iter().map(|&page| (page, bytes(page))));
-        self.stats.belady_bytes_read = self.bound.bytes();
+        let (index, frames) = (&self.index, self.frames.frames_max());
+        self.counters.bound.step(frames, pages.iter().map(|&page| (page, index.transfer_bytes(page))));
     }
 
     /// Pages with rows that `camera` may see by the bounds as they are now, ascending by id.
     pub fn pages_of_view(&self, camera: &Camera) -> Vec<PageNo> {
         let mut pages = Vec::new();
-        visible_pages(&self.index, camera, &mut pages);
-        pages.retain(|p| self.index[p.index()].rows > 0);
-        pages.sort_unstable_by_key(|p| self.index[p.index()].id);
+        visible_pages(self.index.metas(), camera, &mut pages);
+        pages.retain(|&p| self.index.has_rows(p));
+        pages.sort_unstable_by_key(|&p| self.index.meta(p).id);
         pages
     }
 
     /// Pins the listed pages (none of them pinned already, none twice) in this order, leaving out those without rows:
-    /// for evaluation and export. They do not count as used. Works also after writes failed, at least one page at a
-    /// time.
+    /// for evaluation and export. The pins do not count as uses. After failed writes the call still works, at least for one page
+    /// at a time.
     ///
     /// # Errors
     /// As [`Pager::acquire`], but without earlier failures.
     pub fn acquire_pages(&mut self, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
-        let pages: Vec<PageNo> = pages.iter().copied().filter(|p| self.index[p.index()].rows > 0).collect();
+        let pages: Vec<PageNo> = pages.iter().copied().filter(|&p| self.index.has_rows(p)).collect();
         self.fetch("a list of pages", &pages, Asker::Other)
     }
 
@@ -287,86 +257,90 @@ impl Pager {
     /// # Errors
     /// As [`Pager::acquire_pages`].
     pub fn acquire_in_step(&mut self, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
-        let pages: Vec<PageNo> = pages.iter().copied().filter(|p| self.index[p.index()].rows > 0).collect();
+        let pages: Vec<PageNo> = pages.iter().copied().filter(|&p| self.index.has_rows(p)).collect();
         self.fetch("a list of pages", &pages, Asker::RestOfStep)
     }
 
-    /// Gives back a frame that was taken for nothing.
+    /// Gives back a frame that was taken and is not needed.
     pub fn return_frame(&mut self, buffer: PageBuffer) {
-        self.cache.take_back(buffer);
+        self.frames.take_back(buffer);
     }
 
-    /// Adds the upper half of a page that split: it gets a number, is pinned and dirty. The lower half keeps the number of
-    /// the page; its new meta goes in by [`Pager::release`].
+    /// Adds the upper half of a page that split: the half gets a number, is pinned and dirty. The lower half keeps the number of
+    /// the page; [`Pager::release`] takes its new meta over.
     pub fn add_split(&mut self, meta: PageMeta, buffer: PageBuffer) -> PinnedPage {
         let page = self.add_entry(meta);
-        self.cache.adopt(page);
+        self.frames.adopt(page);
         self.count_pinned();
         PinnedPage { page, meta, dirty: true, buffer }
     }
 
-    /// Takes pages back: all that a step has pinned, or some of them. Metas and dirty flags go into the index. A page
-    /// that has no rows any more gives up its frame and its slot.
+    /// Unpins pages: all that a step has pinned, or some of them. Metas and dirty flags are taken over. A page
+    /// that has lost all rows gives up its frame and its slot.
     pub fn release(&mut self, pages: Vec<PinnedPage>) {
         for PinnedPage { page, meta, dirty, buffer } in pages {
-            debug_assert!(meta == self.index[page.index()] || dirty, "a page whose entry changes is dirty");
-            self.index[page.index()] = meta;
+            debug_assert!(meta == *self.index.meta(page) || dirty, "a page whose entry changes is dirty");
+            self.index.set_meta(page, meta);
             if meta.rows > 0 {
-                self.cache.unpin(page, buffer, dirty);
+                self.frames.unpin(page, buffer, dirty);
             } else {
-                self.cache.drop_pinned(page, buffer);
+                self.frames.drop_pinned(page, buffer);
                 self.free_slot(page);
             }
         }
     }
 
-    /// What was done so far.
+    /// The counters, over all lives of the run.
     pub fn stats(&self) -> PagerStats {
-        let traffic = self.store.as_ref().map(PagedStore::traffic).unwrap_or_default();
-        PagerStats {
-            bytes_read: self.stats.bytes_read + traffic.bytes_read,
-            bytes_written: self.stats.bytes_written + traffic.bytes_written,
-            frames: self.cache.frames(),
-            frames_max: self.cache.frames_max(),
-            ..self.stats
-        }
+        self.counters.total(self.mover.traffic())
+    }
+
+    /// Frames in use.
+    pub fn frames(&self) -> usize {
+        self.frames.frames()
+    }
+
+    /// The most frames that there may be; `usize::MAX` for as many as needed.
+    pub fn frames_max(&self) -> usize {
+        self.frames.frames_max()
+    }
+
+    /// Seconds that steps lost to commits beside them: they waited for frozen pages, or spent the time on writing them.
+    pub fn commit_seconds(&self) -> f64 {
+        self.counters.commit_seconds
     }
 
     /// Whether a page has a frame.
     pub fn is_in_memory(&self, page: PageNo) -> bool {
-        self.cache.state(page).is_some()
+        self.frames.state(page).is_some()
     }
 
-    /// Where the versions of the pages on the drive are, by page: for the index of a commit, once nothing is dirty.
+    /// The slots of the pages on the drive, by page: for the index of a commit, once no page is dirty.
     pub fn slots(&self) -> &[Option<SlotRef>] {
-        &self.slots
+        self.index.slots()
     }
 
-    /// What the slots of the store are, and the bytes of a segment; `None` for a pager without a store.
+    /// How full the store is; `None` for a pager without a store.
     pub fn slot_space(&self) -> Option<SlotSpace> {
-        let slots = self.store.as_ref()?.slots();
-        let segment_bytes = slots.layout().segment_bytes();
-        Some(SlotSpace { total: slots.total(), free: slots.free(), retired: slots.retired(), segment_bytes })
+        self.mover.slot_space()
     }
 
     fn add_entry(&mut self, meta: PageMeta) -> PageNo {
-        self.index.push(meta);
-        self.slots.push(None);
-        let page = PageNo(self.index.len() as u32 - 1);
-        if self.store.is_some() {
-            self.bound.add(page);
+        let page = self.index.push(meta, None);
+        if self.mover.has_store() {
+            self.counters.bound.add(page);
         }
         page
     }
 
     pub(super) fn count_pinned(&mut self) {
-        self.stats.pinned_max = self.stats.pinned_max.max(self.cache.count(FrameState::Pinned));
+        self.counters.stats.pinned_max = self.counters.stats.pinned_max.max(self.frames.count(FrameState::Pinned));
     }
 
-    /// Tells the cache of next uses that changed.
+    /// Tells the frame table of next uses that changed.
     pub(super) fn apply_changed_uses(&mut self) {
-        for page in self.window.take_changed() {
-            self.cache.set_next_use(page, self.window.next_use(page));
+        for page in self.look_ahead.views.take_changed() {
+            self.frames.set_next_use(page, self.look_ahead.views.next_use(page));
         }
     }
 }

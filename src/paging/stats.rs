@@ -1,8 +1,15 @@
-//! What a pager did so far, and how full its store is.
+//! The counters of a pager, and how full its store is.
+//!
+//! Invariants: 1. [`PagerStats`] is the only list of counters: `metrics.jsonl` and `summary.json` write it under the names below,
+//! and the state of a run holds it; 2. the order of its fields is the order of the bytes in the state of a run, so a new counter
+//! goes to the end, with a new version of the state.
 
-/// Totals since the pager was made, or since the run began that it goes on with ([`super::pager::Pager::count_on`]);
-/// subtract two of them for one step.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+use super::plan::bound::FewestReads;
+use crate::page::versions::paged_store::PageTraffic;
+use serde::{Deserialize, Serialize};
+
+/// Totals over all lives of a run; subtract two of them for one step. Without a spill directory only commits write.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct PagerStats {
     /// Bytes read from the store.
     pub bytes_read: u64,
@@ -11,38 +18,64 @@ pub struct PagerStats {
     /// Pages read from the store.
     pub pages_read: u64,
     /// Pages written to the store.
+    #[serde(default)]
     pub pages_written: u64,
-    /// Pages that steps asked for.
+    /// Pages that steps needed.
     pub pages_needed: u64,
-    /// Of these, pages that lay in memory.
+    /// Needed pages that were in memory.
+    #[serde(rename = "page_hits")]
     pub hits: u64,
-    /// Of these, pages that did not: on their way, or still to be read.
+    /// Needed pages that were not in memory: on their way, or still to be read.
+    #[serde(rename = "page_misses")]
     pub misses: u64,
-    /// Of the misses, those that were not even on their way.
-    pub absent: u64,
-    /// Of the misses, those that the plan of a planned step had left out.
+    /// Misses that the plan of a planned step had left out.
     pub late_misses: u64,
     /// Pages that lost their frame.
     pub evictions: u64,
     /// Seconds that steps waited for the store, commits between them included.
     pub stall_seconds: f64,
-    /// Seconds that steps lost to commits beside them: waited for frozen pages, or spent on writing them.
-    pub commit_seconds: f64,
-    /// Pages that all others asked for: evaluation, export, looking at views before the first step.
-    pub other_pages_needed: u64,
-    /// Bytes that were read for them.
-    pub other_bytes_read: u64,
-    /// Seconds that they and the import waited for the store.
-    pub other_stall_seconds: f64,
-    /// Bytes that steps would have made a cache of this size read that knows the future
-    /// ([`crate::schedule::bound::FewestReads`]).
-    pub belady_bytes_read: u64,
     /// The most pages pinned at once.
+    #[serde(rename = "pages_pinned_max")]
     pub pinned_max: usize,
-    /// Frames in use now, and the most that there may be (`usize::MAX` for as many as needed).
-    pub frames: usize,
-    /// See `frames`.
-    pub frames_max: usize,
+    /// Misses that were not even on their way.
+    #[serde(rename = "page_absent", default)]
+    pub absent: u64,
+    /// Pages that evaluation, export and a look at the views before the first step needed.
+    #[serde(default)]
+    pub other_pages_needed: u64,
+    /// Bytes read for those pages.
+    #[serde(default)]
+    pub other_bytes_read: u64,
+    /// Seconds that evaluation, export, such a look and the import waited for the store.
+    #[serde(default)]
+    pub other_stall_seconds: f64,
+    /// Bytes that a cache of this size which knows the future would have read for the steps
+    /// ([`super::plan::bound::FewestReads`]); to compare with `bytes_read` less `other_bytes_read`.
+    #[serde(default)]
+    pub belady_bytes_read: u64,
+}
+
+/// The counters as a pager keeps them.
+#[derive(Debug, Default)]
+pub(super) struct Counters {
+    /// Without what the store and the bound count in this life of the run.
+    pub stats: PagerStats,
+    /// Seconds that steps lost to commits beside them.
+    pub commit_seconds: f64,
+    /// What a cache that knows the future would have read for the steps of this life.
+    pub bound: FewestReads,
+}
+
+impl Counters {
+    /// The counters over all lives, with what the store moved in this one.
+    pub fn total(&self, traffic: PageTraffic) -> PagerStats {
+        PagerStats {
+            bytes_read: self.stats.bytes_read + traffic.bytes_read,
+            bytes_written: self.stats.bytes_written + traffic.bytes_written,
+            belady_bytes_read: self.stats.belady_bytes_read + self.bound.bytes(),
+            ..self.stats
+        }
+    }
 }
 
 /// Slots of a store.
@@ -56,4 +89,71 @@ pub struct SlotSpace {
     pub retired: u64,
     /// What the drive must have for more of them.
     pub segment_bytes: u64,
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::base::ids::PageNo;
+    use crate::page::format::encoding;
+
+    /// What older programs wrote must be read back: bytes in the state of a run, names in the files of metrics.
+    #[test]
+    fn the_order_of_the_bytes_and_the_names_stay() {
+        let stats = PagerStats {
+            bytes_read: 1,
+            bytes_written: 2,
+            pages_read: 3,
+            pages_written: 4,
+            pages_needed: 5,
+            hits: 6,
+            misses: 7,
+            late_misses: 8,
+            evictions: 9,
+            stall_seconds: 10.0,
+            pinned_max: 11,
+            absent: 12,
+            other_pages_needed: 13,
+            other_bytes_read: 14,
+            other_stall_seconds: 15.0,
+            belady_bytes_read: 16,
+        };
+        let ascending = ([1u64, 2, 3, 4, 5, 6, 7, 8, 9], 10.0f64, [11u64, 12, 13, 14], 15.0f64, 16u64);
+        assert_eq!(encoding::to_bytes(&stats).unwrap(), encoding::to_bytes(&ascending).unwrap());
+        let json = serde_json::to_value(stats).unwrap();
+        let names = [
+            ("bytes_read", 1),
+            ("bytes_written", 2),
+            ("pages_read", 3),
+            ("pages_written", 4),
+            ("pages_needed", 5),
+            ("page_hits", 6),
+            ("page_misses", 7),
+            ("late_misses", 8),
+            ("evictions", 9),
+            ("stall_seconds", 10),
+            ("pages_pinned_max", 11),
+            ("page_absent", 12),
+            ("other_pages_needed", 13),
+            ("other_bytes_read", 14),
+            ("other_stall_seconds", 15),
+            ("belady_bytes_read", 16),
+        ];
+        assert_eq!(json.as_object().unwrap().len(), names.len());
+        assert!(names.iter().all(|&(name, value)| json[name].as_f64() == Some(f64::from(value))), "{json}");
+        assert_eq!(serde_json::from_value::<PagerStats>(json).unwrap(), stats);
+    }
+
+    #[test]
+    fn restored_counters_continue_in_the_next_life() {
+        let past = PagerStats { bytes_read: 5, misses: 3, belady_bytes_read: 7, ..PagerStats::default() };
+        let mut counters = Counters { stats: past, ..Counters::default() };
+        assert_eq!(counters.total(PageTraffic::default()), past);
+        counters.bound.step(1, [(PageNo(0), 100)].into_iter());
+        counters.stats.misses += 1;
+        let traffic = PageTraffic { bytes_read: 10, ..PageTraffic::default() };
+        let now = counters.total(traffic);
+        assert_eq!((now.bytes_read, now.misses, now.belady_bytes_read), (15, 4, 107));
+    }
 }

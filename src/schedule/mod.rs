@@ -1,11 +1,6 @@
-//! Which view comes when and which pages it needs: pure planning, no I/O.
+//! Which view comes when, and which pages a view needs by their bounds. Not here: what a cache makes of it (`paging::plan`).
 
-pub mod auto;
-pub mod bound;
-pub mod model;
 pub mod order;
 pub mod places;
-pub mod plan;
-pub mod replay;
 pub mod tour;
 pub mod visibility;

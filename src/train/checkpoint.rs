@@ -14,11 +14,11 @@ use super::first_commit::FirstCommit;
 use super::report::MetricsLog;
 use super::trainer::Trainer;
 use crate::checkpoint::interval::{CommitCost, CommitInterval, CommitReport};
-use crate::checkpoint::run_state::{DatasetPrint, RunIdentity, RunState, TrafficSoFar};
+use crate::checkpoint::run_state::{DatasetPrint, RunIdentity, RunState};
 use crate::config::file::TrainConfig;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::{CommitError, Commits};
-use crate::paging::stats::{PagerStats, SlotSpace};
+use crate::paging::stats::SlotSpace;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -254,7 +254,7 @@ impl Checkpoint {
     fn begin(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         let Some(origin) = &self.origin else { return Ok(()) };
         let cut = Instant::now();
-        let pager_seconds = trainer.scene.pager.stats().commit_seconds;
+        let pager_seconds = trainer.scene.pager.commit_seconds();
         let state = trainer.run_state(origin, metrics.sync()?);
         let run_state = bytes_of(&state)?;
         trainer.scene.pager.freeze()?;
@@ -273,7 +273,7 @@ impl Checkpoint {
         let Some((_, bytes)) = pager.commit_frozen(commits, &beside.run_state, note.as_bytes())? else {
             return Ok(());
         };
-        let beside_steps = pager.stats().commit_seconds - beside.pager_seconds;
+        let beside_steps = pager.commit_seconds() - beside.pager_seconds;
         let waited = (beside.waited + began.elapsed()).as_secs_f64() + beside_steps;
         self.acknowledged(beside.step, beside.cut, waited, bytes);
         Ok(())
@@ -370,7 +370,7 @@ impl Trainer {
             train_seconds: self.train_seconds,
             metrics_bytes,
             test: self.last_test,
-            traffic: traffic_of(&self.scene.pager.stats(), self.past_belady_bytes),
+            traffic: self.scene.pager.stats(),
             run,
         }
     }
@@ -383,71 +383,13 @@ impl Trainer {
         self.steps_skipped_in_a_row = state.steps_skipped_in_a_row;
         self.train_seconds = state.train_seconds;
         self.last_test = state.test;
-        self.past_belady_bytes = state.traffic.belady_bytes_read;
-        self.scene.pager.count_on(stats_of(&state.traffic));
-    }
-}
-
-fn traffic_of(stats: &PagerStats, past_belady_bytes: u64) -> TrafficSoFar {
-    TrafficSoFar {
-        bytes_read: stats.bytes_read,
-        bytes_written: stats.bytes_written,
-        pages_read: stats.pages_read,
-        pages_written: stats.pages_written,
-        pages_needed: stats.pages_needed,
-        hits: stats.hits,
-        misses: stats.misses,
-        late_misses: stats.late_misses,
-        evictions: stats.evictions,
-        stall_seconds: stats.stall_seconds,
-        pinned_max: stats.pinned_max as u64,
-        absent: stats.absent,
-        other_pages_needed: stats.other_pages_needed,
-        other_bytes_read: stats.other_bytes_read,
-        other_stall_seconds: stats.other_stall_seconds,
-        belady_bytes_read: past_belady_bytes + stats.belady_bytes_read,
-    }
-}
-
-/// For a pager, which counts what the best of caches would have read anew in every life.
-fn stats_of(traffic: &TrafficSoFar) -> PagerStats {
-    PagerStats {
-        bytes_read: traffic.bytes_read,
-        bytes_written: traffic.bytes_written,
-        pages_read: traffic.pages_read,
-        pages_written: traffic.pages_written,
-        pages_needed: traffic.pages_needed,
-        hits: traffic.hits,
-        misses: traffic.misses,
-        late_misses: traffic.late_misses,
-        evictions: traffic.evictions,
-        stall_seconds: traffic.stall_seconds,
-        pinned_max: traffic.pinned_max as usize,
-        absent: traffic.absent,
-        other_pages_needed: traffic.other_pages_needed,
-        other_bytes_read: traffic.other_bytes_read,
-        other_stall_seconds: traffic.other_stall_seconds,
-        ..PagerStats::default()
+        self.scene.pager.restore_stats(state.traffic);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn traffic_is_counted_on_and_its_bound_once() {
-        let traffic = TrafficSoFar {
-            bytes_read: 100,
-            absent: 3,
-            other_pages_needed: 4,
-            other_bytes_read: 30,
-            other_stall_seconds: 0.5,
-            belady_bytes_read: 60,
-            ..TrafficSoFar::default()
-        };
-        assert_eq!(traffic_of(&stats_of(&traffic), traffic.belady_bytes_read), traffic);
-    }
 
     #[test]
     fn a_commit_before_its_time_must_be_needed_and_of_use() {

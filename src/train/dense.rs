@@ -26,7 +26,7 @@ pub(super) fn settle_all(scene: &mut PagedScene, now: u32) -> Result<(), TrainEr
     pages.retain(|p| index[p.index()].rows > 0);
     pages.sort_unstable_by_key(|p| index[p.index()].id);
     // The other half of the frames is for pages that split.
-    let batch = PAGES_PER_BATCH.min(scene.pager.stats().frames_max / 2).max(1);
+    let batch = PAGES_PER_BATCH.min(scene.pager.frames_max() / 2).max(1);
     for batch in pages.chunks(batch) {
         let mut pinned = scene.pager.acquire_in_step(batch)?;
         let applied = scene.apply_pending(&mut pinned);

@@ -35,7 +35,7 @@ impl Trainer {
             frames = needed;
         }
         let pager = &mut self.scene.pager;
-        let now = pager.stats().frames_max;
+        let now = pager.frames_max();
         if frames > now + now / WORTH_GIVING || (frames > now && needed >= now) {
             pager.allow_frames(frames);
         } else {
@@ -86,6 +86,6 @@ impl Trainer {
 
     /// Whether no page ever leaves memory.
     pub(super) fn is_in_memory(&self) -> bool {
-        self.scene.pager.stats().frames_max == usize::MAX
+        self.scene.pager.frames_max() == usize::MAX
     }
 }

@@ -319,7 +319,7 @@ impl PagedScene {
         let mut rules = PageRules::new(options);
         rules.events = self.rules.events.clone();
         rules.sh_degree = self.rules.sh_degree;
-        let batch = (self.pager.stats().frames_max / 2).clamp(1, PAGES_PER_BATCH);
+        let batch = (self.pager.frames_max() / 2).clamp(1, PAGES_PER_BATCH);
         let pages: Vec<PageNo> = (0..self.pager.index().len() as u32).map(PageNo).collect();
         let mut histogram = GradHistogram::default();
         for pages in pages.chunks(batch) {
@@ -397,7 +397,7 @@ impl PagedScene {
 
     /// Pins the pages batch by batch and hands their rows to `each`, with pending events applied to copies.
     pub(super) fn visit<E: From<PagingError>>(&mut self, pages: &[PageNo], each: &mut Visitor<'_, E>) -> Result<(), E> {
-        let batch = PAGES_PER_BATCH.min(self.pager.stats().frames_max).max(1);
+        let batch = PAGES_PER_BATCH.min(self.pager.frames_max()).max(1);
         for pages in pages.chunks(batch) {
             let pinned = self.pager.acquire_pages(pages)?;
             let rules = &self.rules;

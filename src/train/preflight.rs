@@ -14,18 +14,16 @@ use super::tiers::{Tiers, budget_in_memory, first_staging_bytes};
 use super::trainer::Trainer;
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
-use crate::cache::evict::EvictPolicy;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::page::folder::file_system::free_bytes;
 use crate::paging::pager::PagerConfig;
+use crate::paging::simulation::auto::automatic_order;
+use crate::paging::simulation::replay::{ReplayOptions, replay};
 use crate::scene::camera::Camera;
 use crate::scene::page_meta::PageMeta;
 use crate::scene::partition::first_fill;
-use crate::schedule::auto::automatic_order;
-use crate::schedule::model::Policy;
 use crate::schedule::order::Order;
-use crate::schedule::replay::{ReplayOptions, replay};
 use crate::schedule::visibility::{ViewPages, visible_pages};
 
 /// Bytes that a common drive of 500 GB is rated to take in its life.
@@ -89,7 +87,7 @@ pub fn settle(
         free_bytes: tiers.free_bytes()?,
         largest_view,
     };
-    if trainer.scene.pager.stats().frames_max == usize::MAX {
+    if trainer.scene.pager.frames_max() == usize::MAX {
         let asked = host_mem;
         let host_mem = enough_memory(config, asked, memory[0].total());
         if trainer.scene.pager.slot_space().is_none() {
@@ -164,7 +162,7 @@ pub fn hold_a_view(
 ) -> InputResult<Option<usize>> {
     let LargestView { view: number, name: view, pages: needed, .. } =
         largest_view(dataset, trainer.scene.pager.index());
-    if config.frames > 0 || trainer.scene.pager.stats().frames_max == usize::MAX {
+    if config.frames > 0 || trainer.scene.pager.frames_max() == usize::MAX {
         return Ok(number);
     }
     let bytes = needed * trainer.scene.pager.frame_bytes() as u64;
@@ -272,12 +270,9 @@ fn times_to_outgrow(plan: &TierPlan, frames: u64, of_rows: u64, are_fixed: bool)
 fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, frames: usize) -> f64 {
     let cameras = train_cameras(dataset);
     let index = trainer.scene.pager.index();
-    let policy = match config.evict {
-        EvictPolicy::FarthestNextUse => Policy::Farthest,
-        EvictPolicy::LeastRecentlyUsed => Policy::LeastRecent,
-    };
     let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
-    let options = ReplayOptions { frames, policy, steps, plan_bytes: PLAN_BYTES as u64 };
+    let options =
+        ReplayOptions { frames, policy: config.evict, reads_ahead: false, steps, plan_bytes: PLAN_BYTES as u64 };
     let page_bytes = vec![trainer.scene.pager.frame_bytes() as u32; index.len()];
     let played = replay(&ViewPages::new(index, &cameras), &page_bytes, trainer.view_order(), &options);
     let written: u64 = played.map_or(0, |p| p.steps.iter().map(|s| s.bytes_written).sum());

@@ -9,6 +9,7 @@ use crate::base::units::format_bytes;
 use crate::checkpoint::interval::CommitReport;
 use crate::exchange::tensorboard::EventFile;
 use crate::paging::pager::Pager;
+use crate::paging::stats::PagerStats;
 use crate::render::color_correct::ColorCorrect;
 use serde::{Deserialize, Serialize};
 use std::fs::{File, OpenOptions};
@@ -18,45 +19,12 @@ use std::path::{Path, PathBuf};
 /// PSNR that stands for a perfect image.
 pub const PSNR_PERFECT: f64 = 100.0;
 
-/// What moved between the tiers so far, over all lives of a run. Without a spill directory only commits write.
+/// The counters of the pager with the sizes that they belong to.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct TierTraffic {
-    /// Bytes read from the drive.
-    pub bytes_read: u64,
-    /// Bytes written to it.
-    pub bytes_written: u64,
-    /// Pages that steps needed.
-    pub pages_needed: u64,
-    /// Of these, pages that lay in memory.
-    pub page_hits: u64,
-    /// Of these, pages that did not: on their way, or still to be read.
-    pub page_misses: u64,
-    /// Of the misses, those that were not even on their way.
-    #[serde(default)]
-    pub page_absent: u64,
-    /// Of the misses, those that the plan had left out.
-    pub late_misses: u64,
-    /// Pages read from the drive.
-    pub pages_read: u64,
-    /// Pages that left memory.
-    pub evictions: u64,
-    /// Seconds that steps waited for the drive.
-    pub stall_seconds: f64,
-    /// Pages that evaluation, export and a look at the views before the first step needed.
-    #[serde(default)]
-    pub other_pages_needed: u64,
-    /// Bytes that were read for them.
-    #[serde(default)]
-    pub other_bytes_read: u64,
-    /// Seconds that they and the import waited for the drive.
-    #[serde(default)]
-    pub other_stall_seconds: f64,
-    /// Bytes that the steps would have made a cache of this size read that knows all views beforehand; beside
-    /// `bytes_read` less `other_bytes_read`.
-    #[serde(default)]
-    pub belady_bytes_read: u64,
-    /// The most pages that a step had at once.
-    pub pages_pinned_max: u64,
+    /// The counters.
+    #[serde(flatten)]
+    pub stats: PagerStats,
     /// Frames in use.
     pub frames: u64,
     /// Pages of the scene.
@@ -66,35 +34,17 @@ pub struct TierTraffic {
 impl TierTraffic {
     /// Of a pager.
     pub fn of(pager: &Pager) -> TierTraffic {
-        let stats = pager.stats();
-        TierTraffic {
-            bytes_read: stats.bytes_read,
-            bytes_written: stats.bytes_written,
-            pages_needed: stats.pages_needed,
-            page_hits: stats.hits,
-            page_misses: stats.misses,
-            page_absent: stats.absent,
-            late_misses: stats.late_misses,
-            pages_read: stats.pages_read,
-            evictions: stats.evictions,
-            stall_seconds: stats.stall_seconds,
-            other_pages_needed: stats.other_pages_needed,
-            other_bytes_read: stats.other_bytes_read,
-            other_stall_seconds: stats.other_stall_seconds,
-            belady_bytes_read: stats.belady_bytes_read,
-            pages_pinned_max: stats.pinned_max as u64,
-            frames: stats.frames as u64,
-            pages: pager.index().len() as u64,
-        }
+        TierTraffic { stats: pager.stats(), frames: pager.frames() as u64, pages: pager.index().len() as u64 }
     }
 
     /// For the progress line; empty while nothing was read or written.
     pub fn words(&self) -> String {
-        if self.bytes_read + self.bytes_written == 0 {
+        let PagerStats { bytes_read, bytes_written, stall_seconds, .. } = self.stats;
+        if bytes_read + bytes_written == 0 {
             return String::new();
         }
-        let (read, written) = (format_bytes(self.bytes_read), format_bytes(self.bytes_written));
-        format!(" read {read} written {written} waited {:.1} s", self.stall_seconds)
+        let (read, written) = (format_bytes(bytes_read), format_bytes(bytes_written));
+        format!(" read {read} written {written} waited {stall_seconds:.1} s")
     }
 }
 
@@ -325,9 +275,9 @@ fn write_scalars(events: &mut EventFile, line: &StepLine) -> InputResult<()> {
         ("gaussians", line.gaussians as f64),
         ("seconds", line.seconds),
         ("host_peak_mib", mib(line.host_bytes_peak)),
-        ("disk/read_mib", mib(line.tiers.bytes_read)),
-        ("disk/written_mib", mib(line.tiers.bytes_written)),
-        ("disk/stall_seconds", line.tiers.stall_seconds),
+        ("disk/read_mib", mib(line.tiers.stats.bytes_read)),
+        ("disk/written_mib", mib(line.tiers.stats.bytes_written)),
+        ("disk/stall_seconds", line.tiers.stats.stall_seconds),
     ];
     if let Some(test) = line.test {
         scalars.extend([("psnr/test", test.psnr), ("ssim/test", test.ssim)]);

@@ -61,8 +61,6 @@ pub struct Trainer {
     pub(super) is_torn: bool,
     /// What the frames share with all else, where their number follows from it.
     pub(super) budget: Option<HostBudget>,
-    /// Bytes that the best of caches would have read in earlier lives of the run, which the pager knows nothing of.
-    pub(super) past_belady_bytes: u64,
 }
 
 fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
@@ -118,7 +116,6 @@ impl Trainer {
             last_test: None,
             is_torn: false,
             budget: None,
-            past_belady_bytes: 0,
         }
     }
 
@@ -184,8 +181,7 @@ impl Trainer {
 
     /// What moved between the tiers since the run began, over all its lives.
     pub fn tier_traffic(&self) -> TierTraffic {
-        let tiers = TierTraffic::of(&self.scene.pager);
-        TierTraffic { belady_bytes_read: self.past_belady_bytes + tiers.belady_bytes_read, ..tiers }
+        TierTraffic::of(&self.scene.pager)
     }
 
     /// Options of a rendering now: with the bands that are in use.

@@ -120,14 +120,13 @@ fn frames_that_cannot_be_emptied_go_when_there_is_space_again() {
     (0..STEPS / 2).for_each(|_| run.step().unwrap());
     faults.add(Operation::Write, faults.count(Operation::Write), true, Fault::Error(ErrorKind::StorageFull));
     run.pager.limit_frames(frames);
-    let stats = run.pager.stats();
-    assert!(stats.frames > frames && stats.frames_max == frames, "{stats:?}");
+    assert!(run.pager.frames() > frames && run.pager.frames_max() == frames, "{} frames", run.pager.frames());
     let error = run.step().expect_err("the step after it is told");
     assert!(error.is_out_of_space(), "{error}");
     faults.clear();
     while (run.step as usize) < STEPS {
         run.pager.limit_frames(frames);
-        assert_eq!(run.pager.stats().frames, frames);
+        assert_eq!(run.pager.frames(), frames);
         run.step().unwrap();
     }
     run.check_all(4).unwrap();

@@ -3,7 +3,6 @@
 use crate::faulty_engine::{Faults, FaultyEngine};
 use gsscale::base::ids::{PageId, PageNo};
 use gsscale::base::rng::{Purpose, Stream, mix64};
-use gsscale::cache::evict::EvictPolicy;
 use gsscale::page::engine::memory::MemoryEngine;
 use gsscale::page::engine::page_engine::PageEngine;
 use gsscale::page::format::codec::Codec;
@@ -11,6 +10,7 @@ use gsscale::page::format::slot_header::HEADER_BYTES;
 use gsscale::page::versions::paged_store::{PagedStore, PagedStoreConfig};
 use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::error::PagingError;
+use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::pinned::PinnedPage;
 use gsscale::scene::camera::Camera;

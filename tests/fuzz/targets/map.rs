@@ -4,8 +4,7 @@ use super::pages::{PAGE_ROWS, label_of_a_page, payload_bytes_of_a_page};
 use super::with_mode;
 use crate::Target;
 use gsscale::base::ids::PageId;
-use gsscale::cache::evict::EvictPolicy;
-use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, RunIdentity, RunState, TrafficSoFar, ViewPrint};
+use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, RunIdentity, RunState, ViewPrint};
 use gsscale::densify::stats::GradHistogram;
 use gsscale::page::engine::memory::MemoryEngine;
 use gsscale::page::engine::page_engine::Place;
@@ -19,7 +18,9 @@ use gsscale::page::map::opening::Opened;
 use gsscale::page::map::witness::Witness;
 use gsscale::page::versions::paged_store::PagedStore;
 use gsscale::page::versions::slots::SlotLayout;
+use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
+use gsscale::paging::stats::PagerStats;
 use gsscale::scene::events::{Event, EventKind, RoundThresholds};
 use redb::StorageBackend;
 use redb::backends::InMemoryBackend;
@@ -228,7 +229,7 @@ fn sample() -> RunState {
         train_seconds: 0.1,
         metrics_bytes: 1234,
         test: Some(LastTest { step: 8, views: 2, psnr: 20.5, ssim: 0.75 }),
-        traffic: TrafficSoFar { bytes_read: 9, ..TrafficSoFar::default() },
+        traffic: PagerStats { bytes_read: 9, ..PagerStats::default() },
         run: RunIdentity {
             id: "00112233445566778899aabbccddeeff".parse().unwrap(),
             out: "/a".into(),

@@ -1,14 +1,14 @@
-//! The fewest pages that any cache could have read for the steps so far, kept up as they happen.
+//! Belady's bound: the fewest pages that any cache could have read for the steps so far, updated at every step.
 //!
-//! A page that is needed at two steps and at none between is either kept all the time between them, or read again.
-//! Keeping it takes a frame at every step in between, beside the pages that these steps need. The most such intervals
-//! that fit into the frames are found by taking them by their ends, the shorter of equal ends first, and keeping each
-//! that still fits: an interval that is left out could only take the place of one that ends no earlier. (Jain and Lin,
+//! A page that two steps need, and no step between them, is either kept for the whole interval between the two or read again.
+//! Keeping the page takes a frame at every step of the interval, beside the pages that those steps need. To keep as many
+//! intervals as possible, take the intervals by their ends, the shorter of equal ends first, and keep each that still fits: an
+//! interval that is left out could only replace one that ends no earlier. (Jain and Lin,
 //! "Back to the Future: Leveraging Belady's Algorithm for Improved Cache Replacement", ISCA 2016, do it for one access at
-//! a time.) So Belady's bound needs no knowledge of the future, only of the past.
+//! a time.) So the bound needs no knowledge of the future, only of the past.
 //!
-//! Invariants: 1. what is counted is never more than any cache of that many frames reads, and one that knows the future
-//! reads as much; 2. memory grows with the pages and with the steps since the last one that left no frame free.
+//! Invariants: 1. no cache of that many frames reads less than the bound, and a cache that knows the future reads as much;
+//! 2. memory grows with the pages and with the steps since the last one that left no frame free.
 
 use crate::base::ids::PageNo;
 use std::collections::VecDeque;
@@ -21,9 +21,9 @@ const ABSENT: u32 = u32::MAX;
 pub struct FewestReads {
     /// By page: the step that last had it, counted here.
     last_use: Vec<u32>,
-    /// Frames to spare at the steps from `first` on: beside the pages that were needed, and those that are kept for later.
+    /// Spare frames at the steps from `first` on: without the pages that the step needed, and the pages kept for later.
     spare: VecDeque<u32>,
-    /// Steps before it have no frame to spare, or are of no interest because of one behind them that has none.
+    /// No interval reaches back before this step: the step before it has no spare frame.
     first: u32,
     /// Pages read.
     pages: u64,
@@ -44,14 +44,14 @@ impl FewestReads {
         self.bytes
     }
 
-    /// A new page, made in memory: at the start, or by a split in the last step.
+    /// Adds a page that was made in memory: at the start, or by a split in the last step.
     pub fn add(&mut self, page: PageNo) {
         let now = (self.first + self.spare.len() as u32).saturating_sub(1);
         self.set_last_use(page, now);
     }
 
-    /// The next step needs these pages, each named once, with its bytes on the drive; the cache has `frames` frames at this
-    /// step.
+    /// Adds the next step: the pages that it needs, each named once, with their bytes on the drive, and the number of frames at
+    /// this step.
     pub fn step(&mut self, frames: usize, pages: impl Iterator<Item = (PageNo, u64)>) {
         let frames = u32::try_from(frames).unwrap_or(u32::MAX);
         if self.first == 0 && self.spare.is_empty() {
@@ -64,7 +64,7 @@ impl FewestReads {
             let last = self.last_use.get(page.index()).copied().unwrap_or(ABSENT);
             self.order.push((last, page, bytes));
         }
-        // The latest first; those that were never there count as the oldest.
+        // The latest use first; pages that were never in memory count as the oldest.
         self.order.sort_unstable_by_key(|&(last, page, _)| (std::cmp::Reverse(last.wrapping_add(1)), page));
         let needed = self.order.len() as u32;
         let order = std::mem::take(&mut self.order);
@@ -82,7 +82,7 @@ impl FewestReads {
         }
     }
 
-    /// Keeps a page between two steps, if there is a frame for it all the time.
+    /// Keeps a page between two steps, if every step between them has a spare frame.
     fn keep(&mut self, last: u32, now: u32) -> bool {
         // A step without a frame to spare is before `first`; the page's own steps have one for it.
         if last == ABSENT || last + 1 < self.first {

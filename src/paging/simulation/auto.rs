@@ -1,14 +1,15 @@
 //! `--view-order auto`: which order a run takes.
 //!
-//! When everything fits nothing is read, and the order is the one that training likes best: shuffle. Else the run is
-//! gone through for each number of groups (`replay`), and the fewest groups are taken that read little: randomness is
-//! given up only for bytes. The answer belongs to the run: it is found once and recorded.
+//! When all pages fit into memory, nothing is read and the order is the one that training likes best: shuffle. Otherwise the
+//! run is replayed for each number of groups (`replay`), and the smallest number of groups that reads little is taken:
+//! randomness is given up only for bytes. The order belongs to the run: it is found once and recorded.
 
-use super::model::{Policy, TooFewFrames};
-use super::order::{Order, ViewOrder};
 use super::replay::{ReplayOptions, replay};
-use super::visibility::ViewPages;
+use crate::paging::frames::evict::EvictPolicy;
+use crate::paging::plan::cache_model::TooFewFrames;
 use crate::scene::camera::Camera;
+use crate::schedule::order::{Order, ViewOrder};
+use crate::schedule::visibility::ViewPages;
 
 /// Numbers of groups that are tried.
 const GROUPS: [u32; 8] = [1, 4, 9, 16, 25, 36, 64, 100];
@@ -44,7 +45,8 @@ pub fn automatic_order(
             break;
         }
         // The second of two epochs: the first reads everything once, whatever the order.
-        let options = ReplayOptions { frames, policy: Policy::Farthest, steps: 2 * views.views() as u32, plan_bytes };
+        let (policy, steps) = (EvictPolicy::FarthestNextUse, 2 * views.views() as u32);
+        let options = ReplayOptions { frames, policy, reads_ahead: false, steps, plan_bytes };
         let run = replay(views, &[], &ViewOrder::new(Order::Groups(groups), seed, cameras), &options)?;
         let read = 1.0 - run.figures(run.steady()).hit_rate;
         tried.push((groups, read));

@@ -1,39 +1,38 @@
-//! A whole run of the cache before it happens: what every step reads and writes, and how long the run waits for it.
+//! A whole run of the cache before it happens: what every step reads and writes, and how long the run waits for the drive.
 //!
-//! [`replay`] takes steps through a [`Plan`] and a [`CacheModel`]. With [`Policy::Farthest`] and a plan that looks at
-//! least two epochs ahead it reads Belady's bound: no cache with that many frames can read fewer pages for the same
-//! views in the same order.
+//! [`replay`] takes steps through the [`Plan`] and the [`CacheModel`] that runs use too. Under
+//! [`EvictPolicy::FarthestNextUse`], without reading ahead, and with a plan that looks at least two epochs ahead, it reads
+//! Belady's bound: no cache with that many frames can read fewer pages for the same views in the same order.
 //!
-//! The model of time: one drive that serves one request after the other, reads in the order of steps, each preceded by
-//! the write of the page that leaves for it; a page leaves at the end of the step that last needs it, but at most
-//! [`STEPS_AHEAD`] steps before the one that it leaves for, and any frame serves any read; a step takes the same time
-//! everywhere. What a run waits for is the sum over steps of what is still missing when they could start. With
-//! [`Policy::Ahead`] pages leave as they do in a run. Not modelled: how many bytes may be in flight, and when in a step the
-//! run looks what has ended.
+//! The model of time: one drive serves one request after the other, reads in the order of steps. Each read is preceded by the
+//! write-back of the page that is evicted for it. A page is evicted at the end of the step that last needs it, but at most
+//! [`STEPS_AHEAD`] steps before the one that it is evicted for, and any frame serves any read. A step takes the same time
+//! everywhere. The run waits for what is still missing when a step could start. A replay that reads ahead evicts pages as a run
+//! does. Not modelled: how many bytes may be in flight, and when in a step the run looks what has ended.
 //!
 //! Invariants: 1. nothing here knows clocks or files: the same input gives the same report; 2. bytes are counted when a
-//! page moves, whole pages only; every page that leaves was changed and is written, unless its share says otherwise.
+//! page moves, whole pages only; every evicted page was changed and is written, unless its share says otherwise.
 
-use super::model::{CacheModel, Policy, StepChange, TooFewFrames};
-use super::order::ViewOrder;
-use super::plan::Plan;
-use super::visibility::ViewPages;
 use crate::base::ids::PageNo;
+use crate::paging::frames::evict::EvictPolicy;
+use crate::paging::plan::cache_model::{CacheModel, STEPS_AHEAD, StepChange, TooFewFrames};
+use crate::paging::plan::steps::Plan;
+use crate::schedule::order::ViewOrder;
+use crate::schedule::visibility::ViewPages;
 use std::ops::Range;
 
 /// Steps of the window whose heaviest place is reported.
 pub const WINDOW_STEPS: usize = 20;
-
-/// Steps before its own in which a page may be read.
-pub const STEPS_AHEAD: u32 = 16;
 
 /// What is simulated.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ReplayOptions {
     /// Frames of the cache.
     pub frames: usize,
-    /// Which page leaves first.
-    pub policy: Policy,
+    /// Which page is evicted first.
+    pub policy: EvictPolicy,
+    /// Whether pages are read ahead of their step, as runs do unless they move pages on demand.
+    pub reads_ahead: bool,
     /// Steps to go through.
     pub steps: u32,
     /// Bytes that the plan may take: fewer let it look less far.
@@ -68,7 +67,7 @@ pub struct Replay {
     pub steps: Vec<StepTraffic>,
     /// Steps of an epoch.
     pub views: usize,
-    /// Whether every next use was known whenever a page left: then reads under [`Policy::Farthest`] are Belady's bound.
+    /// Whether every next use was known whenever a page left: then reads under [`EvictPolicy::FarthestNextUse`] are Belady's bound.
     pub is_exact: bool,
 }
 
@@ -84,7 +83,8 @@ pub fn replay(
 ) -> Result<Replay, TooFewFrames> {
     let mut coming = order.clone();
     let mut plan = Plan::new(0, options.plan_bytes);
-    let mut cache = CacheModel::new(options.frames, options.policy);
+    let cache = CacheModel::new(options.frames, options.policy);
+    let mut cache = if options.reads_ahead { cache.reading_ahead() } else { cache };
     let mut change = StepChange::default();
     // Each page is needed in every epoch, so its next use lies less than two epochs ahead.
     let reach = 2 * views.views() as u32;
@@ -92,7 +92,7 @@ pub fn replay(
     let bytes = |pages: &[PageNo]| -> u64 {
         pages.iter().map(|p| page_bytes.get(p.index()).map_or(0, |&b| u64::from(b))).sum()
     };
-    let (mut pages, mut steps) = (Vec::new(), Vec::with_capacity(options.steps as usize));
+    let mut steps = Vec::with_capacity(options.steps as usize);
     let mut frames_left = options.frames;
     let mut frames_freed = vec![0; options.steps as usize];
     for step in 0..options.steps {
@@ -103,9 +103,8 @@ pub fn replay(
                 break;
             }
         }
-        pages.clear();
-        pages.extend(plan.pages(step));
-        cache.step(step, &pages, |page| plan.next_use(page, step + 1), &mut change)?;
+        let pages = plan.pages(step);
+        cache.step(step, pages, |page| plan.next_use(page, step + 1), &mut change)?;
         // As long as there are frames without a page nothing leaves, so that each of these is read for the first time.
         let first = change.admit.len().min(frames_left);
         frames_left -= first;

@@ -1,0 +1,318 @@
+//! The mover: reads and write-backs between frames and the store. It counts what is in flight, keeps what is ahead of its need
+//! within bytes, and remembers writes that failed while nobody waited for them.
+//!
+//! Not here: which page moves (`fetch`, `prefetch`, `commit`), and what an end means for frames and index (`transfers`).
+//!
+//! Invariants: 1. every buffer that goes to the store comes back, however the transfer ends; 2. transfers begin
+//! ahead of their need while [`Mover::may_read_ahead`] and [`Mover::may_write_ahead`] allow it, and a cut writes a few pages beyond; 3. after a failed write no other write begins ahead of its need until a step
+//! asks for pages again; 4. a mover without a store, of a run that stays in memory, moves nothing.
+
+use super::error::PagingError;
+use super::label::label;
+use super::stats::SlotSpace;
+use crate::base::ids::PageNo;
+use crate::page::engine::buffer::PageBuffer;
+use crate::page::format::slot_header::{SlotRef, StoredAs};
+use crate::page::versions::page_error::PageError;
+use crate::page::versions::paged_store::{PageDone, PageMoved, PageTraffic, PagedStore};
+use crate::scene::page_layout::PageLayout;
+use crate::scene::page_meta::PageMeta;
+
+/// Writes in flight at once: each may need a buffer of its own to be encoded in.
+pub(super) const WRITES_IN_FLIGHT: usize = 32;
+/// Encoded pages in flight that are always allowed, so that a tool which reads nothing ahead has work for a few threads.
+const STAGED_LEAST: usize = 4;
+
+/// Set in the token of a transfer that was started ahead of its need.
+const AHEAD: u64 = 1 << 32;
+/// Set in the token of a read.
+const READ: u64 = 1 << 33;
+
+/// What a transfer does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Direction {
+    Read,
+    Write,
+}
+
+/// A transfer that ended.
+#[derive(Debug)]
+pub(super) struct Ended {
+    pub page: PageNo,
+    pub direction: Direction,
+    pub buffer: PageBuffer,
+    pub result: Result<PageMoved, PageError>,
+}
+
+/// What moves the pages of a pager.
+#[derive(Debug)]
+pub(super) struct Mover {
+    /// `None` for a pager whose pages never leave memory.
+    store: Option<PagedStore>,
+    frame_bytes: usize,
+    /// Limit of `ahead`.
+    ahead_max: usize,
+    /// Reads and writes in flight that were started ahead of their need, bytes.
+    ahead: [usize; 2],
+    /// A write that failed while nobody waited for it.
+    failed_write: Option<PagingError>,
+    /// A write failed, and no step has asked for pages since.
+    writes_stopped: bool,
+}
+
+impl Mover {
+    /// A mover without a store.
+    pub fn new(frame_bytes: usize, ahead_max: usize) -> Mover {
+        Mover { store: None, frame_bytes, ahead_max, ahead: [0; 2], failed_write: None, writes_stopped: false }
+    }
+
+    /// Gives the mover its store.
+    pub fn attach(&mut self, store: PagedStore) {
+        assert!(self.store.is_none(), "a pager has one store for life");
+        self.store = Some(store);
+    }
+
+    /// Sets the bytes that may be in flight ahead of their need, reads and writes each.
+    pub fn set_ahead_max(&mut self, bytes: usize) {
+        self.ahead_max = bytes;
+    }
+
+    /// Whether there is a store.
+    pub fn has_store(&self) -> bool {
+        self.store.is_some()
+    }
+
+    /// The store, for commits.
+    pub fn store_mut(&mut self) -> Option<&mut PagedStore> {
+        self.store.as_mut()
+    }
+
+    /// Transfers whose end was not taken yet.
+    pub fn in_flight(&self) -> usize {
+        self.store.as_ref().map_or(0, PagedStore::in_flight)
+    }
+
+    /// Bytes moved so far.
+    pub fn traffic(&self) -> PageTraffic {
+        self.store.as_ref().map(PagedStore::traffic).unwrap_or_default()
+    }
+
+    /// Memory of buffers for encoded pages, bytes.
+    pub fn staging_bytes(&self) -> u64 {
+        self.store.as_ref().map_or(0, PagedStore::staging_bytes)
+    }
+
+    /// The slots of the store; `None` without a store.
+    pub fn slot_space(&self) -> Option<SlotSpace> {
+        let slots = self.store.as_ref()?.slots();
+        let segment_bytes = slots.layout().segment_bytes();
+        Some(SlotSpace { total: slots.total(), free: slots.free(), retired: slots.retired(), segment_bytes })
+    }
+
+    /// Whether another encoded page may be in flight, in a buffer beside its frame. Where it may not, transfers are in flight, so
+    /// a caller who waits for the permission has an end to wait for.
+    pub fn has_staging(&self) -> bool {
+        let most = match 2 * self.ahead_max {
+            // No budget was set aside for staging: pages that were all in memory are written.
+            0 => WRITES_IN_FLIGHT,
+            bytes => (bytes / self.frame_bytes).max(STAGED_LEAST),
+        };
+        self.store.as_ref().is_none_or(|store| store.staged() < most)
+    }
+
+    /// Whether a version may be read now, as far as buffers for encoded pages go.
+    pub fn may_decode(&self, slot: Option<SlotRef>) -> bool {
+        self.has_staging() || slot.is_some_and(|slot| slot.codec == StoredAs::Raw)
+    }
+
+    /// Whether a read may begin ahead of its need.
+    pub fn may_read_ahead(&self) -> bool {
+        self.has_staging() && self.may_be_ahead(Direction::Read)
+    }
+
+    /// Whether a write may begin ahead of its need.
+    pub fn may_write_ahead(&self) -> bool {
+        !self.writes_stopped && self.has_staging() && self.may_be_ahead(Direction::Write)
+    }
+
+    /// Writes in flight that were started ahead of their need.
+    pub fn writes_ahead(&self) -> usize {
+        self.ahead[Direction::Write as usize] / self.frame_bytes
+    }
+
+    /// Begins to read a version into a frame's memory.
+    pub fn read(&mut self, page: PageNo, meta: &PageMeta, slot: &SlotRef, buffer: PageBuffer, is_ahead: bool) {
+        if let Some(store) = &mut self.store {
+            store.read(token(page, Direction::Read, is_ahead), meta.id, slot, buffer);
+            self.ahead[Direction::Read as usize] += if is_ahead { self.frame_bytes } else { 0 };
+        }
+    }
+
+    /// Begins to write a page back, for the generation of a cut or else for the current one.
+    ///
+    /// # Errors
+    /// The store accepts no write; the buffer comes back.
+    pub fn write(
+        &mut self,
+        page: PageNo,
+        meta: &PageMeta,
+        cut: Option<u64>,
+        buffer: PageBuffer,
+        is_ahead: bool,
+    ) -> Result<(), (PageError, PageBuffer)> {
+        let Some(store) = &mut self.store else { return Ok(()) };
+        let layout = PageLayout { rows: meta.rows as usize, sh_degree: meta.sh_degree };
+        let token = token(page, Direction::Write, is_ahead);
+        let generation = cut.unwrap_or(store.generation());
+        store.write_for(generation, token, meta.id, &label(meta), layout.bytes(), buffer)?;
+        self.ahead[Direction::Write as usize] += if is_ahead { self.frame_bytes } else { 0 };
+        Ok(())
+    }
+
+    /// Hands accepted writes to the drive.
+    pub fn begin_writes(&mut self) {
+        if let Some(store) = &mut self.store {
+            store.begin_writes();
+        }
+    }
+
+    /// Takes the transfers that ended; with `wait`, blocks until one has ended, if any is in flight.
+    pub fn complete(&mut self, wait: bool) -> Vec<Ended> {
+        let Some(store) = &mut self.store else { return Vec::new() };
+        let mut done = Vec::new();
+        store.complete(wait, &mut done);
+        done.into_iter().map(|done| self.ended(done)).collect()
+    }
+
+    fn ended(&mut self, done: PageDone) -> Ended {
+        let PageDone { token, buffer, result, .. } = done;
+        let direction = if token & READ != 0 { Direction::Read } else { Direction::Write };
+        if token & AHEAD != 0 {
+            self.ahead[direction as usize] -= self.frame_bytes;
+        }
+        Ended { page: PageNo(token as u32), direction, buffer, result }
+    }
+
+    /// Gives a slot up: from the generation `cut` on, or else from the current one.
+    pub fn free(&mut self, slot: &SlotRef, cut: Option<u64>) {
+        match (&mut self.store, cut) {
+            (Some(store), Some(cut)) => store.free_from(slot, cut),
+            (Some(store), None) => store.free(slot),
+            (None, _) => {}
+        }
+    }
+
+    /// No more writes until a step asks for pages again. The error goes to the caller that waits (`waits`), or to the next step.
+    ///
+    /// # Errors
+    /// `error`, if the caller waits.
+    pub fn stop_writes(&mut self, error: PagingError, waits: bool) -> Result<(), PagingError> {
+        self.writes_stopped = true;
+        if waits {
+            return Err(error);
+        }
+        self.keep_failure(error);
+        Ok(())
+    }
+
+    /// Keeps an error for the next step; the first one counts.
+    pub fn keep_failure(&mut self, error: PagingError) {
+        self.failed_write.get_or_insert(error);
+    }
+
+    /// The write that failed while nobody waited for it.
+    pub fn take_failure(&mut self) -> Option<PagingError> {
+        self.failed_write.take()
+    }
+
+    /// Writes may begin again.
+    pub fn resume_writes(&mut self) {
+        self.writes_stopped = false;
+    }
+
+    /// Whether a write failed and no step has asked for pages since.
+    pub fn are_writes_stopped(&self) -> bool {
+        self.writes_stopped
+    }
+
+    fn may_be_ahead(&self, direction: Direction) -> bool {
+        self.ahead[direction as usize] + self.frame_bytes <= self.ahead_max
+    }
+}
+
+fn token(page: PageNo, direction: Direction, is_ahead: bool) -> u64 {
+    u64::from(page.0) | if is_ahead { AHEAD } else { 0 } | if direction == Direction::Read { READ } else { 0 }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::base::ids::PageId;
+    use crate::page::engine::memory::MemoryEngine;
+    use crate::page::format::codec::Codec;
+    use crate::page::format::slot_header::{HEADER_BYTES, transfer_bytes};
+    use crate::page::versions::paged_store::PagedStoreConfig;
+    use crate::page::versions::slots::SlotLayout;
+    use crate::scene::page_layout::capacity_bytes;
+    use crate::scene::page_meta::PageBounds;
+
+    const PAGE: PageNo = PageNo(7);
+
+    fn meta() -> PageMeta {
+        let bounds = PageBounds { lo: [0.0; 3], hi: [1.0; 3], sigma_max: 0.1 };
+        PageMeta { id: PageId::initial(7), rows: 2, sh_degree: 0, events_applied: 0, bounds }
+    }
+
+    /// A mover that may have one page ahead each way, and the bytes of a frame.
+    fn mover() -> (Mover, usize) {
+        let bytes = capacity_bytes(4, 0);
+        let layout = SlotLayout::new(bytes, 4);
+        let config = PagedStoreConfig { store: 1, layout, codec: Codec::Raw, generation: 1, serial: 1 };
+        let frame_bytes = transfer_bytes(bytes);
+        let mut mover = Mover::new(frame_bytes, frame_bytes);
+        mover.attach(PagedStore::new(Box::new(MemoryEngine::new()), config));
+        (mover, frame_bytes)
+    }
+
+    fn end_of(mover: &mut Mover) -> Ended {
+        mover.begin_writes();
+        mover.complete(true).pop().unwrap()
+    }
+
+    #[test]
+    fn a_page_comes_back_as_it_was_written_and_counts_as_ahead_until_its_end() {
+        let (mut mover, frame_bytes) = mover();
+        let mut buffer = PageBuffer::zeroed(frame_bytes);
+        buffer.as_mut_slice()[HEADER_BYTES] = 77;
+        mover.write(PAGE, &meta(), None, buffer, true).unwrap();
+        assert_eq!((mover.in_flight(), mover.writes_ahead(), mover.may_write_ahead()), (1, 1, false));
+        let written = end_of(&mut mover);
+        assert_eq!((written.page, written.direction), (PAGE, Direction::Write));
+        assert_eq!((mover.in_flight(), mover.writes_ahead(), mover.may_write_ahead()), (0, 0, true));
+        let Ok(PageMoved::Written(slot)) = written.result else { panic!("{:?}", written.result) };
+        mover.read(PAGE, &meta(), &slot, PageBuffer::zeroed(frame_bytes), true);
+        assert!(!mover.may_read_ahead() && mover.may_write_ahead());
+        let read = end_of(&mut mover);
+        assert!(read.result.is_ok() && mover.may_read_ahead());
+        assert_eq!((read.page, read.direction, read.buffer.as_slice()[HEADER_BYTES]), (PAGE, Direction::Read, 77));
+    }
+
+    #[test]
+    fn a_failed_write_stops_others_and_its_error_waits_for_the_next_step() {
+        let (mut mover, _) = mover();
+        let error = || PagingError::WorkingSet { what: "a test".to_string(), pages: 1, frames: 0, frame_bytes: 1 };
+        assert!(mover.stop_writes(error(), true).is_err() && mover.take_failure().is_none());
+        mover.stop_writes(error(), false).unwrap();
+        assert!(mover.are_writes_stopped() && !mover.may_write_ahead());
+        mover.resume_writes();
+        assert!(mover.may_write_ahead() && mover.take_failure().is_some() && mover.take_failure().is_none());
+    }
+
+    #[test]
+    fn a_mover_without_a_store_moves_nothing() {
+        let mut mover = Mover::new(4096, 0);
+        assert!(!mover.has_store() && mover.has_staging() && mover.slot_space().is_none());
+        assert!(mover.complete(true).is_empty() && mover.in_flight() == 0);
+    }
+}

@@ -1,0 +1,8 @@
+//! What the coming steps need, and what a cache makes of it. Runs and simulations use the same plan, the same model of a cache
+//! and the same order of eviction. No I/O.
+
+pub mod bound;
+pub mod cache_model;
+pub(super) mod look_ahead;
+pub mod steps;
+pub(super) mod views;

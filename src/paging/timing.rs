@@ -1,0 +1,51 @@
+//! When pages move, and for whom. Neither changes a bit of what a step gets.
+
+use std::str::FromStr;
+
+/// When pages move. No choice changes what a step gets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Transfers {
+    /// Ahead of their step, while steps compute.
+    #[default]
+    Overlap,
+    /// Ahead of their step, but every call waits until its pages have moved: the plan without the overlap, for comparison.
+    Ahead,
+    /// When a step needs them: neither plan nor overlap, for comparison.
+    Demand,
+}
+
+impl FromStr for Transfers {
+    type Err = String;
+    fn from_str(name: &str) -> Result<Self, String> {
+        match name {
+            "overlap" => Ok(Transfers::Overlap),
+            "ahead" => Ok(Transfers::Ahead),
+            "demand" => Ok(Transfers::Demand),
+            _ => Err(format!("unknown --transfers '{name}': use overlap, ahead or demand")),
+        }
+    }
+}
+
+/// Who asks for pages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Asker {
+    /// A training step, before it changes anything: a failed write ends the call, so that the step can be done again.
+    Step,
+    /// A training step that has changed rows already: uses and waits count as the step's. A failed write is left to the next step,
+    /// since this step must not be done twice.
+    RestOfStep,
+    /// Evaluation, export or checks.
+    Other,
+}
+
+impl Asker {
+    /// Whether uses, reads and waits count as a step's.
+    pub fn is_step(self) -> bool {
+        self != Asker::Other
+    }
+
+    /// Whether a failed write ends the call.
+    pub fn minds_writes(self) -> bool {
+        self == Asker::Step
+    }
+}
