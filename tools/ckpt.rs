@@ -38,7 +38,7 @@ Examples:
   gsscale-ckpt salvage runs/village --out rescued      if verify reports a damaged map
 
 DIR is the output folder of a run, or its spill directory. ls, inspect, verify, export, clone and salvage never
-write to it. `gsscale-ckpt COMMAND --help` has examples of each.";
+write to it. `gsscale-ckpt COMMAND --help` shows examples.";
 
 /// Lists, verifies, exports, imports, copies and repairs checkpoints.
 #[derive(Parser)]
@@ -56,7 +56,7 @@ enum Command {
     Inspect(inspect::Args),
     /// Verifies a store and lists every fault; exit code 1 if there is one
     Verify(verify::Args),
-    /// Makes an earlier generation the last one
+    /// Makes an earlier generation the latest one
     Rollback(rollback::Args),
     /// Removes names of checkpoints, and frees what only they kept
     Prune(prune::Args),

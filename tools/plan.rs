@@ -73,7 +73,7 @@ struct Args {
     /// shuffle
     #[arg(long, value_delimiter = ',', value_name = "ORDER", help_heading = "Plan")]
     compare_orders: Vec<Chosen<Order>>,
-    /// Plan as if every page had grown to this many
+    /// Plan as if every page had grown by this factor
     #[arg(long, default_value_t = 1.0, value_name = "X", help_heading = "Plan")]
     growth: f64,
     /// List the pages read and evicted in these steps, for the first order and number of frames
@@ -189,8 +189,8 @@ fn load(args: &Args) -> InputResult<Scene> {
     config.check()?;
     set_up(&config)?;
     if config.optimizer == Method::Dense {
-        let problem = "dense reads and writes every page at every step, which is not planned";
-        return Err(InputError::new("--optimizer", problem, "plan for deferred, which gives the same"));
+        let problem = "dense reads and writes every page at every step, which this tool does not plan";
+        return Err(InputError::new("--optimizer", problem, "plan for deferred, which gives the same result"));
     }
     if !(1.0..=1e6).contains(&args.growth) || args.step_seconds.is_some_and(|s| !(0.0..=1e6).contains(&s)) {
         let problem = "--growth must be at least 1, --step-seconds at least 0";
@@ -309,7 +309,7 @@ fn frames(args: &Args, scene: &Scene) -> InputResult<Vec<usize>> {
     Ok(frames)
 }
 
-/// The orders to plan for.
+/// The view orders to plan for.
 fn orders(args: &Args, config: &TrainConfig) -> Vec<Chosen<Order>> {
     match (args.compare_orders.is_empty(), config.view_order) {
         (false, _) => args.compare_orders.clone(),

@@ -18,9 +18,9 @@
 //! 2. Workgroups are 1-D. Beyond 65,535 workgroups [`groups_1d`] folds them into two dimensions, and the shader finds
 //!    its index with `linear_group` of `shared/dispatch.wgsl`.
 //! 3. Counts come from uniforms or buffers, never from `arrayLength`: a view of an empty buffer still spans some bytes.
-//! 4. No workgroup waits for another one; no invocation loops more than 65,535 times in total.
-//! 5. Contents of a fresh buffer are arbitrary (it may be recycled): [`Recorder::clear`] where zeros are needed.
-//! 6. One recorder at a time, set aside or not: its commands and its recycled buffers are in one order only then.
+//! 4. No workgroup waits for another; no invocation loops more than 65,535 times in total.
+//! 5. Contents of a new buffer are arbitrary (it may be reused): use [`Recorder::clear`] where zeros are needed.
+//! 6. One recorder at a time, set aside or not, because only then do its commands and its reused buffers share one order.
 
 mod belt;
 mod buffers;

@@ -67,7 +67,7 @@ pub struct Submission {
     name: &'static str,
 }
 
-/// Counts a recording as open as long as it lives.
+/// Counts a recording as open while it exists.
 #[derive(Debug)]
 struct Open(Arc<AtomicU32>);
 
@@ -84,8 +84,8 @@ impl Drop for Open {
     }
 }
 
-/// What a recorder has recorded and not submitted, set aside between two calls of its owner; [`Gpu::resume`] goes on
-/// with it. Until then it counts as an open recorder: no other one can be submitted.
+/// The unsubmitted work of a recorder, set aside between two calls of its owner; [`Gpu::resume`] continues it. Until then
+/// it counts as an open recorder: no other one can be submitted.
 #[derive(Debug)]
 #[must_use]
 pub struct Recording {
@@ -97,7 +97,7 @@ pub struct Recording {
     _open: Open,
 }
 
-/// Work being recorded.
+/// A recording of work.
 pub struct Recorder<'g> {
     gpu: &'g Gpu,
     work: Recording,
@@ -112,7 +112,7 @@ impl Gpu {
         Recorder { gpu: self, work }
     }
 
-    /// Goes on with a recording that was begun on this device and set aside.
+    /// Continues a recording of this device that was set aside.
     pub fn resume(&self, recording: Recording) -> Recorder<'_> {
         Recorder { gpu: self, work: recording }
     }
@@ -157,7 +157,7 @@ impl Recorder<'_> {
         self.work
     }
 
-    /// A uniform struct for dispatches of this recorder: what binding 0 expects.
+    /// Uploads a uniform struct for dispatches of this recorder; binds as binding 0.
     ///
     /// # Errors
     /// The device has no memory left.
@@ -357,7 +357,7 @@ impl Recorder<'_> {
         let pass = match reusable {
             Some((pass, _)) => pass,
             None => {
-                self.work.pass = None; // ends the pass of the stage before
+                self.work.pass = None; // ends the previous stage's pass
                 profiler.begin_pass(&mut self.work.encoder, stage)
             }
         };

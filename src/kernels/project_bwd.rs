@@ -110,7 +110,7 @@ pub fn sigmoid_slope(logit: f32) -> f32 {
 /// log-scales) and `grads.opacities` (to the logits).
 ///
 /// `v_means2d`, `v_conics` (see [`geometry_vjp`]) and `v_opacities` (with respect to the activated opacity) hold one
-/// entry per row; those of culled rows, whose `radii` are [0, 0], are not used. `grads` is resized to the rows.
+/// entry per row; those of culled rows, whose `radii` are [0, 0], are ignored. `grads` is resized to the rows.
 pub fn project_bwd(
     rows: &Columns,
     camera: &Camera,

@@ -50,8 +50,8 @@ pub fn unit_direction_vjp(unit: [f32; 3], inv_len: f32, v_unit: [f32; 3]) -> [f3
 
 /// Backward of `sh_fwd`: writes `grads.means`, `grads.sh0` and `grads.sh_n`.
 ///
-/// `colors` is what `sh_fwd` gave and `v_colors` its gradient, `radii` are those that `sh_fwd` was given: one entry per row.
-/// `grads` is resized to the rows.
+/// `colors` is the output of `sh_fwd` and `v_colors` its gradient; `radii` are those given to `sh_fwd`: one entry per row
+/// each. `grads` is resized to the rows.
 pub fn sh_bwd(
     rows: &Columns,
     camera: &Camera,
@@ -220,7 +220,7 @@ mod tests {
                 column.fill_with(|| rng.range(-1.0, 1.0) as f32);
             }
             let radii: Vec<[u32; 2]> = (0..n).map(|row| if row % 3 == 0 { [0, 0] } else { [2, 1] }).collect();
-            // Nothing of a culled row may be read into a result.
+            // No result may depend on a culled row.
             rows.means[..3].fill(f32::NAN);
             rows.sh0[..3].fill(f32::NAN);
             let v_colors: Vec<[f32; 3]> = (0..n).map(|_| std::array::from_fn(|_| rng.normal() as f32)).collect();

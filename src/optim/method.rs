@@ -1,6 +1,6 @@
 //! The three ways of handling optimizer steps without a gradient.
 
-/// What a step does to rows without a gradient.
+/// How a step treats rows without a gradient.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Method {
     /// They take the step when they are next read: dense Adam's values at the cost of the seen rows only.

@@ -7,8 +7,8 @@
 //! The step receives the rows' current values from the forwarding pass: computing them again would cost another root
 //! and quotient per value.
 //!
-//! Floor: the bytes, 4 floats a parameter for forwarding and 7 for the step; `cargo bench --bench step touched` prints both beside a
-//! plain copy and beside plain passes of the same reads and writes.
+//! Floor: memory traffic, 4 floats per parameter for forwarding and 7 for the step; `cargo bench --bench step touched`
+//! prints both beside a plain copy and plain passes of the same reads and writes.
 //!
 //! Invariant: the bits are those of [`RowsNow`] on every instruction path.
 
