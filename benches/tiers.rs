@@ -19,7 +19,6 @@ use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::page::engine::drive_rate::DriveRate;
 use gsscale::paging::frames::evict::EvictPolicy;
-use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::simulation::auto::automatic_order;
 use gsscale::paging::simulation::replay::{DriveModel, ReplayOptions, replay};
 use gsscale::paging::stats::PagerStats;

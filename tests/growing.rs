@@ -200,7 +200,7 @@ fn a_run_goes_on_in_less_memory_and_in_more() {
     let rest = ["--steps", "100", "--keep-checkpoint=false", "--quiet"];
     let spill = folder.path().join("spill");
     let to_spill = ["--spill-dir", text(&spill)];
-    let (much, little) = (["--host-mem", "2GiB"], ["--host-mem", "44MiB"]);
+    let (much, little) = (["--host-mem", "2GiB"], ["--host-mem", "54MiB"]);
     // In memory, in more than it needs, in less than all of it; then in less, in more, and unnamed.
     for (is_paged, then, now) in [
         (false, &[][..], &[&little[..], &["--image-cache", "64KiB"]].concat()[..]),

@@ -160,7 +160,7 @@ fn circle_from(at: &str, edges: &BTreeMap<String, Vec<String>>) -> Option<Vec<St
     let mut seen: Vec<String> = Vec::new();
     while let Some(way) = ways.pop() {
         for next in edges.get(way.last()?).into_iter().flatten() {
-            let longer = [way.as_slice(), &[next.clone()]].concat();
+            let longer = [way.as_slice(), std::slice::from_ref(next)].concat();
             if next == at {
                 return Some(longer);
             }

@@ -10,7 +10,6 @@ use gsscale::optim::method::Method;
 use gsscale::page::engine::drive_rate::DriveRate;
 use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::paging::frames::evict::EvictPolicy;
-use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::plan::cache_model::{CacheModel, StepChange, TooFewFrames};
 use gsscale::paging::plan::steps::Plan;
 use gsscale::paging::simulation::auto::automatic_order;

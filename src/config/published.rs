@@ -194,7 +194,7 @@ pub fn differences(published: &TrainConfig, used: &TrainConfig) -> Vec<String> {
     let is_same_schedule = schedule_steps(published) == schedule_steps(used);
     let is_free = |name: &str| {
         let same_run = |key: &Key| key.name() == name && !key.class.makes_another_run();
-        KEYS.iter().any(|key| same_run(key)) || (name == "schedule-steps" && is_same_schedule)
+        KEYS.iter().any(same_run) || (name == "schedule-steps" && is_same_schedule)
     };
     let changed = after.iter().filter(|(key, value)| !is_free(key.as_str()) && before.get(*key) != Some(*value));
     changed

@@ -58,7 +58,7 @@ pub struct TierPlan {
     pub free_bytes: Option<u64>,
 }
 
-/// Settles the frames and completes the estimates with them: [`super::memory::estimate`]'s, at the start and at most.
+/// Settles the frames and completes the estimates with them: [`super::probe::estimate`]'s, at the start and at most.
 ///
 /// # Errors
 /// The budget or the drive is too small.

@@ -112,7 +112,7 @@ fn outcome_of(run: &Run, simd: SimdPath) -> Outcome {
     let count = SCHEDULES * VALUES;
     let config = AdamConfig { eps: run.eps, ..AdamConfig::default() };
     let rates = Rates { means: RATE, means_final_factor: run.final_factor, ..Rates::new(1.0, run.steps) };
-    let adam = DeferredAdam::new(rates.clone(), config, simd);
+    let adam = DeferredAdam::new(rates, config, simd);
     let mut draws = Stream::new(run.seed, Purpose::Test, 0, 0);
     let mut columns = Columns::zeros(count, 0);
     (0..count).for_each(|i| columns.means[3 * i] = draws.normal() as f32);
