@@ -13,8 +13,10 @@ use std::io;
 
 /// Most outcomes in a row without progress.
 pub const TRIES_MAX: u8 = 32;
-/// `ECANCELED` on Linux: the ring returns it for requests whose thread ended; they may be sent again.
-const CANCELED: i32 = 125;
+/// `ECANCELED` and `EFAULT` on Linux: the ring returns them for requests whose thread ended. Such a request is cancelled, or the
+/// kernel continues it where the process's memory is not mapped. Buffers stay mapped until their transfer ends, so the
+/// request may be sent again.
+const THREAD_ENDED: [i32; 2] = [125, 14];
 
 /// Progress of one request.
 #[derive(Debug, Clone, Copy, Default)]
@@ -69,7 +71,7 @@ impl Resume {
 /// Whether a retry of the same request may succeed.
 fn may_pass(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::Interrupted | io::ErrorKind::WouldBlock)
-        || (cfg!(target_os = "linux") && error.raw_os_error() == Some(CANCELED))
+        || (cfg!(target_os = "linux") && error.raw_os_error().is_some_and(|raw| THREAD_ENDED.contains(&raw)))
 }
 
 #[cfg(test)]
@@ -91,7 +93,7 @@ mod tests {
 
     #[test]
     fn a_transfer_without_progress_ends_with_an_error() {
-        for raw in [4, 11, 125] {
+        for raw in [4, 11, 125, 14] {
             let mut resume = Resume::default();
             let again = || Err(io::Error::from_raw_os_error(raw));
             for _ in 0..TRIES_MAX {
