@@ -47,8 +47,8 @@ impl Pager {
         Ok(pager)
     }
 
-    /// Writes every dirty page and waits until nothing is in flight. Between steps: no page is pinned. A cut that is not
-    /// committed is given up.
+    /// Writes every dirty page back and waits until nothing is in flight. To be called between steps, when no page is pinned. A cut
+    /// that is not committed is given up.
     ///
     /// # Errors
     /// A page could not be written. It is still in memory, and the call may be repeated.
@@ -69,8 +69,8 @@ impl Pager {
         self.settle_below(1)
     }
 
-    /// Waits until fewer than `most` transfers are in flight and another page may be encoded. A page that could not be
-    /// read ahead is read when it is needed.
+    /// Waits until fewer than `most` transfers are in flight and another page may be encoded. Failed reads are ignored: the page
+    /// is read when it is needed.
     pub(super) fn settle_below(&mut self, most: usize) -> Result<(), PagingError> {
         let mut first_error = None;
         while self.mover.in_flight() >= most || !self.mover.has_staging() {
@@ -103,8 +103,8 @@ impl Pager {
         self.cuts.end_commit(now, result).map(Some)
     }
 
-    /// Freezes the pages as they are: between steps, no page is pinned. An earlier cut that was not committed is given
-    /// up. Nothing is frozen without a store.
+    /// Freezes the pages as they are. To be called between steps, when no page is pinned. An earlier cut that was not committed is
+    /// given up. Without a store nothing is frozen.
     ///
     /// # Errors
     /// A write that ended meanwhile had failed.

@@ -1,13 +1,13 @@
-//! What can go wrong between a view and its pages.
+//! Errors of the pager.
 //!
-//! Invariant: after an error no page is pinned by the call that failed, no buffer is lost, and every page that was in
-//! memory still is: a run can stop cleanly and write out what it holds.
+//! Invariant: after an error the failed call has no page pinned, no buffer is lost, and every page that was in
+//! memory is still in memory: a run can stop cleanly and write its pages.
 
 use crate::base::ids::PageId;
 use crate::base::units::format_bytes;
 use crate::page::versions::page_error::PageError;
 
-/// Why pages could not be had.
+/// Why the pager could not provide pages.
 #[derive(Debug, thiserror::Error)]
 pub enum PagingError {
     /// A working set is larger than the frames.

@@ -1,7 +1,7 @@
-//! What stands next to a page in its slot, so that the index can be built again from the slots alone.
+//! Labels: the entry of a page as bytes beside the page in its slot, so that the index can be rebuilt from the slots alone.
 //!
-//! Invariants: 1. a label is a function of the page's entry in the index, without its id, which the slot has anyway;
-//! 2. reading a label that nobody vouches for gives an entry or nothing, never a panic.
+//! Invariants: 1. a label is a function of the page's entry, without the id, which the slot holds anyway;
+//! 2. untrusted bytes give an entry or nothing, never a panic.
 
 use crate::base::ids::PageId;
 use crate::scene::page_meta::{PageBounds, PageMeta};

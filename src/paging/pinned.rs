@@ -1,4 +1,4 @@
-//! A page that a step holds: its meta and its frame's memory.
+//! A pinned page: its meta and the memory of its frame.
 //!
 //! Invariants: 1. the buffer holds space for a slot's header, then the payload that [`PinnedPage::layout`] describes;
 //! 2. whoever changes rows, meta or layout sets `dirty`.

@@ -1,7 +1,6 @@
-//! Whether a stored page can be one of a run: its entry against the sizes of the run, its values against what training
-//! can leave behind.
+//! Checks of stored pages: the entry against the sizes of the run, the values against what training can produce.
 //!
-//! Invariant: a page that passes can be read into a frame and used without another look.
+//! Invariant: a page that passes can be read into a frame and used without another check.
 
 use super::label::meta_from_label;
 use crate::base::ids::PageId;
@@ -10,7 +9,7 @@ use crate::scene::page_layout::{PageLayout, capacity_bytes};
 use crate::scene::page_meta::PageMeta;
 use crate::scene::rows::{ColumnsRef, Rows};
 
-/// What no page of a run exceeds.
+/// Limits of the pages of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PageLimits {
     /// Rows that a page holds.
@@ -49,8 +48,8 @@ pub fn layout_of(meta: &PageMeta) -> PageLayout {
     PageLayout { rows: meta.rows as usize, sh_degree: meta.sh_degree }
 }
 
-/// Every value is one that training can leave behind after at most `step` steps: finite, second moments and statistics
-/// not negative, no row from the future.
+/// Checks that training can produce every value in at most `step` steps: values are finite, second moments and statistics are not
+/// negative, no row is newer.
 ///
 /// # Errors
 /// The first value that is not.

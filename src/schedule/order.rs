@@ -3,11 +3,11 @@
 //! | order | an epoch |
 //! | --- | --- |
 //! | `shuffle` | all views in random order |
-//! | `groups:<n>` | n neighbourhoods of views one after the other, the views of each in random order; where the cuts lie and which neighbourhood comes when is drawn anew for every epoch |
-//! | `tour` | a short way through all views, there in one epoch and back in the next |
+//! | `groups:<n>` | n neighbourhoods of views one after the other, the views of each in random order; cuts and order of the neighbourhoods are drawn anew for every epoch |
+//! | `tour` | a short tour through all views, forth in one epoch and back in the next |
 //!
-//! Pages in memory serve the views of a neighbourhood again and again, so the fewer views there are between two that see
-//! the same pages, the fewer pages are read. Randomness, which training likes, is what that costs.
+//! Pages in memory serve the views of a neighbourhood again and again: the fewer views lie between two views of the same pages,
+//! the fewer pages are read. The price is randomness, which training likes.
 //!
 //! Invariants: 1. the view of a step is a pure function of (seed, cameras, order, step), so the future is known and a run
 //! can continue anywhere; 2. every epoch visits every view once.
@@ -20,8 +20,8 @@ use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;
 
-/// Cuts between groups move by up to this share of a group's size from epoch to epoch: so that no two views are always
-/// kept apart, and groups keep half to one and a half times their mean size.
+/// Cuts between groups move by up to this share of a group's size from epoch to epoch. So no two views are always in different
+/// groups, and groups keep half to one and a half times their mean size.
 const PLAY: f64 = 0.5;
 
 /// A resolved order.
@@ -149,8 +149,8 @@ impl ViewOrder {
     }
 }
 
-/// Neighbouring groups follow each other: a short way through their middles, begun at a random group, in a random
-/// direction. On a survey whose views see 7 % of the pages, with a quarter of the pages in memory, 25 groups read .021
+/// Orders groups along a short tour through their centres, from a random group in a random direction, so that neighbouring groups
+/// follow each other. On a survey whose views see 7 % of the pages, with a quarter of the pages in memory, 25 groups read .021
 /// of what they need in this order and .040 in random order, 100 groups .021 and .084 (`tests/replay.rs` prints such
 /// figures); what training loses is only that a group's neighbour comes next, which its next epoch turns round anyway.
 fn order_groups(places: &[Place], groups: &mut Vec<Vec<u32>>, draws: &mut Stream) {

@@ -1,8 +1,8 @@
-//! Where views look from and at, as points, and cuts of such points into neighbourhoods.
+//! Places: what views look at and from, as points; and cuts of such points into neighbourhoods.
 //!
-//! A place has six coordinates: the point that the camera looks at, the same depth in front of all cameras of a capture,
-//! and the camera's centre with a small weight. Views that look at the same point see the same pages, wherever they
-//! stand: on a tilted flight with strips of all headings, 25 groups by both with equal weight read .105 of the pages that
+//! A place has six coordinates: the camera's centre with a small weight, and the point that the camera looks at, which lies at the
+//! same depth in front of all cameras of a capture. Views that look at the same point see the same pages, wherever their cameras
+//! are: on a tilted flight with strips of all headings, 25 groups by both with equal weight read .105 of the pages that
 //! they need from a quarter of the frames, by these weights .029, by the point alone .029. Around an object the points
 //! are all the same, and centres decide.
 //!

@@ -1,10 +1,10 @@
-//! A short way through all places, each once.
+//! A short tour through all places, each visited once.
 //!
-//! Two starts (a serpentine over strips of the widest plane, and always going on to the nearest place that is left) are
-//! shortened by turning round parts of the way (Croes 1958, "A method for solving traveling-salesman problems"), and the
-//! shorter one is taken. Flights in strips are found by the first, orbits and walks by the second.
+//! Two first tours (a serpentine over strips of the widest plane, and a walk to the nearest unvisited place) are shortened by
+//! reversing parts of them (2-opt: Croes 1958, "A method for solving traveling-salesman problems"), and the shorter one is taken.
+//! The serpentine finds flights in strips, the walk finds orbits.
 //!
-//! Invariants: 1. a function of the places alone; 2. time grows with the number of places, but for the second start,
+//! Invariants: 1. the tour is a function of the places alone; 2. time grows with the number of places, but for the walk,
 //! which is tried up to `NEAREST_MAX` places.
 
 use super::places::{Place, distance_sq};

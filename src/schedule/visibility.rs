@@ -1,10 +1,10 @@
-//! Which pages a camera needs, by their bounds.
+//! Visibility: which pages a camera needs, by the bounds of the pages.
 //!
 //! Not here: the half-spaces and why they are conservative (`scene::frustum`).
 //!
 //! Invariants: 1. a page is listed unless its whole box lies outside of one half-space, so no row that the row test
 //! draws is in a page that is not listed; 2. pages without rows are never listed; 3. lists ascend and are the same on
-//! every instruction path; 4. nothing that grows with the scene is allocated but the list.
+//! every instruction path; 4. the list is the only allocation that grows with the scene.
 
 use crate::base::ids::PageNo;
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
