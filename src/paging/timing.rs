@@ -1,7 +1,5 @@
 //! When pages move, and for whom. Neither changes a bit of what a step gets.
 
-use std::str::FromStr;
-
 /// When pages move. No choice changes what a step gets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Transfers {
@@ -12,18 +10,6 @@ pub enum Transfers {
     Ahead,
     /// When a step needs them: neither plan nor overlap, for comparison.
     Demand,
-}
-
-impl FromStr for Transfers {
-    type Err = String;
-    fn from_str(name: &str) -> Result<Self, String> {
-        match name {
-            "overlap" => Ok(Transfers::Overlap),
-            "ahead" => Ok(Transfers::Ahead),
-            "demand" => Ok(Transfers::Demand),
-            _ => Err(format!("unknown --transfers '{name}': use overlap, ahead or demand")),
-        }
-    }
 }
 
 /// Who asks for pages.

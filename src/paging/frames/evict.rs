@@ -10,8 +10,6 @@
 use crate::base::ids::PageNo;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
-use std::fmt;
-use std::str::FromStr;
 
 /// Next use of a page that no planned step needs.
 pub const NEVER: u32 = u32::MAX;
@@ -32,29 +30,6 @@ pub enum EvictPolicy {
 impl EvictPolicy {
     /// All policies, the default first.
     pub const ALL: [EvictPolicy; 2] = [EvictPolicy::FarthestNextUse, EvictPolicy::LeastRecentlyUsed];
-
-    /// The name on command lines, in config files and in reports.
-    pub fn name(self) -> &'static str {
-        match self {
-            EvictPolicy::FarthestNextUse => "belady",
-            EvictPolicy::LeastRecentlyUsed => "lru",
-        }
-    }
-}
-
-impl fmt::Display for EvictPolicy {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
-impl FromStr for EvictPolicy {
-    type Err = String;
-
-    fn from_str(name: &str) -> Result<EvictPolicy, String> {
-        let found = EvictPolicy::ALL.into_iter().find(|policy| policy.name() == name);
-        found.ok_or_else(|| format!("unknown --evict '{name}': use belady or lru"))
-    }
 }
 
 /// A page that could be evicted.
@@ -213,12 +188,6 @@ mod tests {
         };
         assert_eq!(order(EvictPolicy::FarthestNextUse), [3, 1, 2, 4, 0]);
         assert_eq!(order(EvictPolicy::LeastRecentlyUsed), [0, 2, 4, 3, 1]);
-    }
-
-    #[test]
-    fn names_of_policies_are_read_back() {
-        assert!(EvictPolicy::ALL.into_iter().all(|policy| policy.to_string().parse() == Ok(policy)));
-        assert_eq!("random".parse::<EvictPolicy>(), Err("unknown --evict 'random': use belady or lru".to_string()));
     }
 
     /// Against a search through all pages, over insertions, changes and removals.
