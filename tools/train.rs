@@ -136,7 +136,7 @@ fn demo_config() -> TrainConfig {
 fn demo_scene(out: &Path, config: &TrainConfig, overwrite: bool, quiet: bool) -> Result<PathBuf, TrainError> {
     let scene = out.join("scene");
     // A demo that was stopped before its first step left only its city.
-    let is_foreign = |entry: std::fs::DirEntry| entry.file_name() != "scene";
+    let is_foreign = |entry: std::fs::DirEntry| entry.file_name() != "scene" && entry.file_name() != ".gsscale-lock";
     let is_taken = std::fs::read_dir(out).is_ok_and(|entries| entries.flatten().any(is_foreign));
     if !overwrite && (is_taken || out.is_file()) {
         return Err(InputError::new(out, "exists already", remedy_of_existing(out)).into());

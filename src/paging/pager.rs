@@ -161,6 +161,12 @@ impl Pager {
         self.limit_frames(frames);
     }
 
+    /// Limits the plan of the coming steps to about `bytes` bytes from now on: the farthest steps are dropped from it.
+    pub fn limit_plan(&mut self, bytes: usize) {
+        self.config.plan_bytes = bytes;
+        self.look_ahead.views.limit(bytes);
+    }
+
     /// Sets when pages move.
     pub fn set_transfers(&mut self, transfers: Transfers) {
         self.transfers = transfers;

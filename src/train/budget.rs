@@ -11,7 +11,7 @@
 
 use super::memory::{INDEX_BYTES, MemoryEstimate, bytes_of_copies, frames_in_memory, within_reach};
 use super::pages::PagedScene;
-use super::staging::with_staging;
+use super::staging::{PLAN_BYTES, PLAN_BYTES_LEAST, with_staging};
 use crate::page::format::slot_header::HEADER_BYTES;
 
 /// A page may hold more new rows than the mean of all pages: this many times its share.
@@ -64,6 +64,8 @@ pub struct HostBudget {
     is_named: bool,
     /// It is more than the run set out with.
     pub(super) is_raised: bool,
+    /// The plan of the coming steps gave way to frames.
+    is_plan_small: bool,
     /// Commits that there were when pages could not be moved out for want of space.
     pub(super) tried_after: Option<u64>,
     /// Pages in flight ahead of their step, each way, once those of a run in memory move.
@@ -81,6 +83,7 @@ impl HostBudget {
             of_pixels: memory.view_pixels,
             is_named,
             is_raised: false,
+            is_plan_small: false,
             tried_after: None,
             prefetch_bytes: 0,
         }
@@ -134,8 +137,16 @@ impl HostBudget {
             with_staging(rest, self.staging, self.bytes)
         };
         let least = needs.iter().map(need).max().unwrap_or(0);
-        // A fiftieth for what the run that goes on measures anew.
-        (least + least / 50).max(self.bytes + frame_bytes)
+        // A sixteenth for what the run that goes on measures anew before its first step, and for its whole plan.
+        let plan = if self.is_plan_small { (PLAN_BYTES - PLAN_BYTES_LEAST) as u64 } else { 0 };
+        (least + least / 16 + plan).max(self.bytes + frame_bytes)
+    }
+
+    /// This budget with a small plan, which leaves more for frames; `None` where the plan is small already.
+    pub(super) fn with_small_plan(&self) -> Option<HostBudget> {
+        let spare = (PLAN_BYTES - PLAN_BYTES_LEAST) as u64;
+        let staging = self.staging.checked_sub(spare).filter(|_| !self.is_plan_small)?;
+        Some(HostBudget { staging, is_plan_small: true, ..*self })
     }
 
     /// This budget with `bytes` bytes and some to spare, where nobody named it and the machine has them; `None` where not.

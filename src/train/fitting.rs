@@ -1,6 +1,7 @@
 //! The steps of a trainer within its memory: frames are taken and given back as the scene grows ([`super::budget`] says how many).
 
 use super::budget::{HostBudget, SPARE_SHARE, ViewMemory};
+use super::staging::PLAN_BYTES_LEAST;
 use super::trainer::Trainer;
 use crate::base::units::format_bytes;
 use crate::paging::error::PagingError;
@@ -48,8 +49,15 @@ impl Trainer {
     pub(super) fn find_frames(&mut self, error: &PagingError) -> bool {
         let PagingError::WorkingSet { pages: needed, frames: now, .. } = *error else { return false };
         let Some(budget) = self.budget.filter(|_| !self.is_in_memory() && needed > now) else { return false };
-        let most = budget.frames_at_most(&self.scene, self.view_memory());
-        if most < needed && !self.raise_for_frames(budget, needed) {
+        let mut most = budget.frames_at_most(&self.scene, self.view_memory());
+        if most < needed
+            && let Some(smaller) = budget.with_small_plan()
+        {
+            self.scene.pager.limit_plan(PLAN_BYTES_LEAST);
+            self.budget = Some(smaller);
+            most = smaller.frames_at_most(&self.scene, self.view_memory());
+        }
+        if most < needed && !self.budget.is_some_and(|budget| self.raise_for_frames(budget, needed)) {
             return false;
         }
         let wanted = needed + needed / SPARE_SHARE;

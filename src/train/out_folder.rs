@@ -16,7 +16,8 @@ use crate::exchange::tensorboard::is_event_file;
 use crate::page::engine::segment_files::sync_folder;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::report::run_report::{PAGES_FILE, REPORT_FILE};
-use std::path::Path;
+use std::fs::{File, OpenOptions, TryLockError};
+use std::path::{Path, PathBuf};
 
 /// What a run does with an output folder that is there already.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,6 +28,34 @@ pub enum Existing {
     Overwrite,
     /// Takes it as its own: this run was cut off before its first commit.
     BeginAgain,
+}
+
+/// The file that the process which trains into an output folder locks; it stays there, empty.
+const LOCK: &str = ".gsscale-lock";
+
+/// The right to train into an output folder, as long as it lives.
+#[derive(Debug)]
+pub(super) struct OutLock(#[allow(dead_code)] Option<File>); // the lock is held by the open file
+
+/// Locks an output folder that exists. Where the file system knows no locks, nothing is locked.
+///
+/// # Errors
+/// Another process trains into the folder.
+pub(super) fn lock(out: &Path) -> InputResult<OutLock> {
+    let file = OpenOptions::new().write(true).create(true).truncate(false).open(out.join(LOCK));
+    let Ok(file) = file else { return Ok(OutLock(None)) };
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => {
+            let remedy = "wait for it to end, stop it (Ctrl-C commits first), or choose another --out";
+            Err(InputError::new(out, "another process trains into this folder", remedy))
+        }
+        _ => Ok(OutLock(Some(file))),
+    }
+}
+
+/// Whether a folder has nothing in it but what [`lock`] makes.
+pub fn is_empty(out: &Path) -> bool {
+    std::fs::read_dir(out).is_ok_and(|mut entries| entries.all(|e| e.is_ok_and(|e| e.file_name() == LOCK)))
 }
 
 /// Refuses an output folder that a run may not begin in, and says what to do about it.
@@ -50,8 +79,7 @@ fn check_new(out: &Path) -> InputResult<()> {
     if !out.exists() {
         return Ok(());
     }
-    let is_empty_folder = std::fs::read_dir(out).is_ok_and(|mut entries| entries.next().is_none());
-    if is_empty_folder {
+    if is_empty(out) {
         return Ok(());
     }
     Err(InputError::new(out, "exists already", remedy_of_existing(out)))
@@ -105,12 +133,17 @@ pub(super) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
         remove_checkpoint_in(&checkpoint_folder(out), run_in(out))?;
         remove_file(&out.join("config.toml"))?;
     }
-    for name in ["metrics.jsonl", "summary.json", "point_cloud.ply", REPORT_FILE, PAGES_FILE] {
+    remove_file(&out.join("metrics.jsonl"))?;
+    remove_events(&out.join("tensorboard"))?;
+    if existing == Existing::BeginAgain {
+        // A run that was cut off before its first commit left nothing else, and results are nobody's to remove here.
+        return Ok(());
+    }
+    for name in ["summary.json", "point_cloud.ply", REPORT_FILE, PAGES_FILE] {
         remove_file(&out.join(name))?;
     }
     remove_saved(out)?;
     remove_evaluation(out)?;
-    remove_events(&out.join("tensorboard"))?;
     Ok(remove_pictures(&out.join("renders/test"))?)
 }
 
@@ -166,17 +199,20 @@ pub(super) fn remove_evaluation(out: &Path) -> InputResult<()> {
     Ok(())
 }
 
-/// Removes what `--save-every` of an earlier run left: point_cloud_<step>.ply.
+/// Removes what `--save-every` of an earlier run left.
 fn remove_saved(out: &Path) -> InputResult<()> {
+    saved(out)?.iter().try_for_each(|path| remove_file(path))
+}
+
+/// What `--save-every` left in the folder: point_cloud_<step>.ply.
+pub(super) fn saved(out: &Path) -> InputResult<Vec<PathBuf>> {
     let entries = std::fs::read_dir(out).map_err(|e| InputError::io(out, "listing the folder", &e))?;
-    for path in entries.flatten().map(|entry| entry.path()) {
+    let is_saved = |path: &PathBuf| {
         let name = path.file_name().and_then(|n| n.to_str()).unwrap_or("");
         let step = name.strip_prefix("point_cloud_").and_then(|rest| rest.strip_suffix(".ply"));
-        if step.is_some_and(|s| s.len() >= 6 && s.bytes().all(|b| b.is_ascii_digit())) {
-            std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
-        }
-    }
-    Ok(())
+        step.is_some_and(|s| s.len() >= 6 && s.bytes().all(|b| b.is_ascii_digit()))
+    };
+    Ok(entries.flatten().map(|entry| entry.path()).filter(is_saved).collect())
 }
 
 #[cfg(test)]

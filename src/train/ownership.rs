@@ -11,6 +11,8 @@
 //! | a run that is refused or fails before its first commit | the store that it made | as above |
 //! | `--resume OUT` of a run that is done | the checkpoint that a kill left at the run's own place | the last commit has the identity of the run in `OUT`, and `--keep-checkpoint` is absent |
 //! | `--overwrite` | the store in `OUT/checkpoint` | the store holds no commit, or its last commit has the identity of the run in `OUT` |
+//! | any run | anything in `OUT` | it holds the lock of `OUT` |
+//! | `--resume OUT` of a run that was cut off before its first commit | metrics and event files in `OUT` | there is neither a result nor a saved PLY nor a logged commit |
 //! | `--overwrite` | results in `OUT`, by name; pictures in `renders/test` | there is a config.toml beside them |
 //! | `gsscale-ckpt rollback`, `prune` with `OUT` | generations and names of the store that `OUT` leads to | the last commit has the identity of the run in `OUT` |
 //! | `gsscale-ckpt clone`, `salvage`, `import` | their own unfinished store | the folder was made by this process |
@@ -20,6 +22,7 @@
 //! store that cannot be opened stays.
 
 use super::error::TrainError;
+use super::places::absolute;
 use super::tiers::Stored;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
@@ -52,17 +55,46 @@ pub(super) fn check_owner(folder: &Path, of_store: &RunIdentity, run: RunId) -> 
     Err(InputError::new(folder, problem, remedy))
 }
 
-/// The checkpoint in `folder`, if it belongs to `run`; `None` where nothing was committed in it.
+/// The run that a checkpoint must belong to.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Claim<'a> {
+    /// Its identity; unknown where its config.toml has none.
+    pub run: RunId,
+    /// Its output folder.
+    pub out: &'a Path,
+    /// The user named the folder of the checkpoint for this very call.
+    pub is_named: bool,
+}
+
+impl Claim<'_> {
+    /// Refuses the checkpoint of another run. A run without an identity owns a checkpoint that says so, or that was named.
+    fn check(&self, folder: &Path, of_store: &RunIdentity) -> InputResult<()> {
+        let out = absolute(self.out);
+        let is_here = Path::new(&of_store.out) == out;
+        if !self.run.is_known() && of_store.id.is_known() && !self.is_named && !is_here {
+            return check_owner(folder, of_store, RunId::draw());
+        }
+        if is_here && of_store.id.is_other_than(self.run) {
+            let problem = "it holds the checkpoint of an earlier run in the same output folder";
+            let remedy = "name the folder that holds the pages of this run with --spill-dir; to go on with the earlier run, \
+                          name an output folder that does not exist yet and this folder with --spill-dir";
+            return Err(InputError::new(folder, problem, remedy));
+        }
+        check_owner(folder, of_store, self.run)
+    }
+}
+
+/// The checkpoint in `folder`, if it belongs to the run; `None` where nothing was committed in it.
 ///
 /// # Errors
 /// It belongs to another run, cannot be opened, or is in use.
-pub(super) fn open_own(folder: &Path, run: RunId, allow_remote: bool) -> Result<Option<Stored>, TrainError> {
+pub(super) fn open_own(folder: &Path, claim: Claim<'_>, allow_remote: bool) -> Result<Option<Stored>, TrainError> {
     // Opening a map for writing changes its file, so its owner is asked for by reading. What cannot be read is refused below.
     if let Ok(state) = last_state(folder, Access::Map) {
-        check_owner(folder, &state.run, run)?;
+        claim.check(folder, &state.run)?;
     }
     let Some(stored) = Stored::open(folder, allow_remote)? else { return Ok(None) };
-    check_owner(folder, &stored.run_state.run, run)?;
+    claim.check(folder, &stored.run_state.run)?;
     Ok(Some(stored))
 }
 

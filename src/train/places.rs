@@ -14,3 +14,8 @@ pub(super) fn folder_beside(spill_dir: &Path) -> PathBuf {
 pub(super) fn drive_of(spill_dir: &Path) -> PathBuf {
     if spill_dir.is_dir() { spill_dir.to_path_buf() } else { folder_beside(spill_dir) }
 }
+
+/// A path that does not depend on where the program was started.
+pub(super) fn absolute(path: &Path) -> PathBuf {
+    std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
+}

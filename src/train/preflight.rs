@@ -175,7 +175,8 @@ pub fn hold_a_view(
             format_bytes(trainer.scene.pager.frame_bytes() as u64),
             format_bytes(bytes)
         );
-        let remedy = format!("give at least {}, or lower --page-rows or --sh-degree", format_bytes(bytes + bytes / 4));
+        let remedy = "give more than these pages and what a view, photos and tables take beside them, or lower --page-rows or \
+                      --sh-degree";
         return Err(InputError::new("--host-mem", problem, remedy));
     }
     trainer.scene.pager.allow_frames(needed as usize);

@@ -12,9 +12,10 @@ use super::error::TrainError;
 use super::facts::{Resolved, read_resolved};
 use super::machine;
 use super::memory::host_budget;
-use super::out_folder::Existing;
-use super::ownership::open_own;
+use super::out_folder::{self, Existing};
+use super::ownership::{Claim, open_own};
 use super::pages::PagedScene;
+use super::places::absolute;
 use super::report::{StepLine, Summary};
 use super::run::{Begun, Past, RunOutcome, RunRequest, begin, run, see_through};
 use super::start::Start;
@@ -37,6 +38,10 @@ use crate::render::Renderer;
 use crate::report::run_report::write_run_report;
 use std::path::{Path, PathBuf};
 
+/// What to do about a config.toml that cannot be used.
+const REMEDY_DAMAGED: &str = "remove the file: gsscale-train --resume makes it again from the checkpoint; where the pages lie in \
+                              a spill directory, name it with --spill-dir";
+
 /// Which run, and what it is given now.
 #[derive(Debug, Clone)]
 pub struct ResumeRequest {
@@ -58,6 +63,8 @@ pub struct ResumeRequest {
 /// There is no run that could go on, or it is not the same any more (nothing is changed then); else as
 /// [`super::run::run`].
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
+    // Of a run that is at work nothing is read that it may be writing, and nothing is removed.
+    let lock = if request.out.is_dir() { Some(out_folder::lock(&request.out)?) } else { None };
     let earlier = Earlier::find(request)?;
     let mut config = earlier.config.clone();
     request.keys.clone().apply(&mut config);
@@ -67,7 +74,10 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     }
     let folder = stored_folder(&request.out, &config);
     let is_in_output = config.residence().spill_dir().is_none();
-    match open_own(&folder, earlier.run, is_in_output) {
+    let found = open_own(&folder, earlier.claim(request), is_in_output);
+    // The run takes it again.
+    drop(lock);
+    match found {
         Ok(Some(stored)) => go_on(request, &earlier, config, stored),
         Ok(None) => begin_again(request, &earlier, config),
         // A run in memory makes its checkpoint with its first commit.
@@ -98,7 +108,8 @@ impl Earlier {
     fn find(request: &ResumeRequest) -> Result<Earlier, TrainError> {
         let path = request.out.join("config.toml");
         if path.exists() {
-            let (config, facts) = (TrainConfig::read(&path)?, read_resolved(&path)?);
+            let facts = read_resolved(&path).map_err(|e| InputError { remedy: REMEDY_DAMAGED.to_string(), ..e })?;
+            let config = TrainConfig::read(&path)?;
             let scene = request.scene.clone().unwrap_or_else(|| facts.scene.clone());
             return Ok(Earlier { run: facts.run, file: Some((config.clone(), facts)), config, scene, path });
         }
@@ -115,11 +126,23 @@ impl Earlier {
         }
         let state = Stored::open(&folder, named.is_none())?.ok_or_else(nothing)?.run_state;
         let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
+        if Path::new(&state.run.out) != absolute(&request.out) && has_past(&request.out) {
+            let problem =
+                format!("it holds results, and the checkpoint in {} is that of {}", folder.display(), state.run.out);
+            let remedy = "name that output folder, or one that does not exist yet";
+            return Err(InputError::new(&request.out, problem, remedy).into());
+        }
         eprintln!("warning: {} is missing: it is made again from the checkpoint", path.display());
         // A checkpoint may have been moved, and a run that committed to its output folder names no spill directory.
         let config = TrainConfig { spill_dir: named.unwrap_or("").to_string(), ..then };
         let scene = request.scene.clone().unwrap_or_else(|| PathBuf::from(&state.run.scene));
         Ok(Earlier { run: state.run.id, file: None, config, scene, path })
+    }
+
+    /// The checkpoint that the run may go on from.
+    fn claim<'a>(&self, request: &'a ResumeRequest) -> Claim<'a> {
+        let is_named = request.keys.spill_dir.as_ref().is_some_and(|folder| !folder.is_empty());
+        Claim { run: self.run, out: &request.out, is_named }
     }
 }
 
@@ -129,7 +152,11 @@ fn has_past(out: &Path) -> bool {
     let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap_or_default();
     let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
     let has = |name: &str| out.join(name).exists();
-    has("point_cloud.ply") || has("summary.json") || metrics.lines().filter_map(commits).any(|commits| commits > 0)
+    let has_saved = || out_folder::saved(out).is_ok_and(|saved| !saved.is_empty());
+    has("point_cloud.ply")
+        || has("summary.json")
+        || has_saved()
+        || metrics.lines().filter_map(commits).any(|commits| commits > 0)
 }
 
 /// Begins a run again that was cut off before its first commit: its config says all that the run needs.
@@ -263,7 +290,7 @@ fn already_done(
     let folder = stored_folder(&request.out, config);
     let is_its_place = folder == stored_folder(&request.out, &earlier.config);
     let stored = if SpillDir::exists_in(&folder) {
-        open_own(&folder, earlier.run, config.residence().spill_dir().is_none()).unwrap_or_else(|error| {
+        open_own(&folder, earlier.claim(request), config.residence().spill_dir().is_none()).unwrap_or_else(|error| {
             eprintln!("warning: {} is left alone: {error}", folder.display());
             None
         })

@@ -12,6 +12,7 @@ use super::machine;
 use super::memory::{host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
 use super::out_folder::{self, Existing};
 use super::page_map::write_page_map;
+use super::places::absolute;
 use super::preflight;
 use super::probe::{Probe, estimate};
 use super::progress::Progress;
@@ -180,10 +181,11 @@ pub(super) fn see_through(
         return Ok(RunOutcome { summary: None, exit_code: 0 });
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
-    match begun.past {
-        None => out_folder::make(&request.out, request.existing)?,
-        // It may be missing: the checkpoint is elsewhere.
-        Some(_) => out_folder::make_folder(&request.out)?,
+    out_folder::make_folder(&request.out)?;
+    // Held to the end, and taken before anything is removed.
+    let _lock = out_folder::lock(&request.out)?;
+    if begun.past.is_none() {
+        out_folder::make(&request.out, request.existing)?;
     }
     let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun);
     if tiers.can_resume() {
@@ -340,10 +342,6 @@ fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
         tiers: trainer.tier_traffic(),
         commits: None,
     }
-}
-
-fn absolute(path: &Path) -> PathBuf {
-    std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
 }
 
 fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, run: RunId) -> Resolved {

@@ -2,6 +2,8 @@
 
 use crate::page::format::codec::Codec;
 
+/// The plan of a run whose next step needs the rest of [`PLAN_BYTES`], bytes: enough for the steps that are read ahead.
+pub(super) const PLAN_BYTES_LEAST: usize = 1 << 20;
 /// The most bytes of frames that may be filled ahead of their step.
 pub(super) const PREFETCH_BYTES_MAX: usize = 256 << 20;
 

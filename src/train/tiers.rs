@@ -181,16 +181,13 @@ pub struct Stored {
 }
 
 impl Stored {
-    /// Opens the checkpoint in `folder` at its last commit; `None` where nothing was committed in it, or the folder is
-    /// empty. `allow_remote`: also on a network file system.
+    /// Opens the checkpoint in `folder` at its last commit; `None` where a store is there in which nothing was committed. An
+    /// empty folder is no such store: it may be the mount point of a drive that is not mounted. `allow_remote`: also on a network file system.
     ///
     /// # Errors
     /// There is none, it is damaged, or in use.
     pub fn open(folder: &Path, allow_remote: bool) -> Result<Option<Stored>, TrainError> {
         if !SpillDir::exists_in(folder) {
-            if std::fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_none()) {
-                return Ok(None);
-            }
             let problem = "the checkpoint of this run is not there: it is removed when a run ends without \
                            --keep-checkpoint, and made by the first commit";
             let remedy = "start the run again with --overwrite; if its pages were moved, name their folder with --spill-dir; \

@@ -243,3 +243,75 @@ fn a_copy_of_an_output_folder_is_the_same_run() {
     let said = refused(bench.go_on(&[]));
     assert!(said.contains("no commit to go on from"), "{said}");
 }
+
+/// A run that is at work is not begun again, gone on with or overwritten by another process.
+#[test]
+fn one_process_at_a_time_trains_into_a_folder() {
+    let bench = Bench::new();
+    let out = bench.path("out");
+    let mut child = bench.begin(Place::Memory, &SELDOM);
+    bench.wait_for_lines(&mut child, 1);
+    let config = std::fs::read(out.join("config.toml")).unwrap();
+    let said = refused(bench.go_on(&[]));
+    assert!(said.contains("another process trains into this folder"), "{said}");
+    let said = refused(bench.begin(Place::Memory, &["--overwrite"]));
+    assert!(said.contains("another process trains into this folder"), "{said}");
+    assert!(std::fs::read(out.join("config.toml")).unwrap() == config);
+    signal(&child, "INT");
+    assert_eq!(ended(child).status.code(), Some(130));
+    succeeded(bench.go_on(&[]));
+}
+
+/// Saved scenes and the mount point of a drive that is not mounted are no reasons to begin again.
+#[test]
+fn a_run_with_a_past_is_not_begun_again() {
+    let bench = Bench::new();
+    let (out, spill) = (bench.path("out"), bench.path("spill"));
+    let mut child = bench.begin(Place::Memory, &["--frames", "4000", "--save-every", "20"]);
+    bench.wait_for_lines(&mut child, 5);
+    child.kill().unwrap();
+    ended(child);
+    let saved = out.join("point_cloud_000020.ply");
+    let before = std::fs::read(&saved).unwrap();
+    refused(bench.go_on(&[]));
+    assert!(std::fs::read(&saved).unwrap() == before, "a saved scene is gone");
+    std::fs::remove_dir_all(&out).unwrap();
+    let mut child = bench.begin(Place::Spill(4000), &SELDOM);
+    bench.wait_for_lines(&mut child, 1);
+    child.kill().unwrap();
+    ended(child);
+    std::fs::remove_dir_all(&spill).unwrap();
+    std::fs::create_dir(&spill).unwrap();
+    assert!(refused(bench.go_on(&[])).contains("not mounted"));
+    assert_eq!(std::fs::read_dir(&spill).unwrap().count(), 0, "something was written to a mount point");
+}
+
+/// An output folder whose config.toml tells no run, or is missing or damaged, does not get another run's checkpoint.
+#[test]
+fn a_folder_that_does_not_know_its_run_takes_no_other() {
+    let bench = Bench::new();
+    let alone = bench.alone(&[]);
+    let (out, spill, first) = (bench.path("out"), bench.path("spill"), bench.path("first"));
+    let place = Place::Spill(alone.fewest);
+    bench.stopped(place, 4);
+    std::fs::rename(&out, &first).unwrap();
+    std::fs::remove_dir_all(&spill).unwrap();
+    bench.stopped(place, 4);
+    let config = std::fs::read_to_string(first.join("config.toml")).unwrap();
+    let without: Vec<&str> = config.lines().filter(|line| !line.starts_with("run = ")).collect();
+    assert!(without.len() + 1 == config.lines().count());
+    std::fs::write(first.join("config.toml"), without.join("\n")).unwrap();
+    let before = (files(&spill), files(&first));
+    assert!(refused(bench.go_on_in("first", &[])).contains("the checkpoint of another run"));
+    assert!((files(&spill), files(&first)) == before);
+    std::fs::remove_file(first.join("config.toml")).unwrap();
+    let said = refused(bench.go_on_in("first", &["--spill-dir", text(&spill)]));
+    assert!(said.contains("it holds results") && said.contains(text(&out)), "{said}");
+    assert!(files(&spill) == before.0);
+    // The remedy for a damaged config.toml, followed to the letter.
+    std::fs::write(out.join("config.toml"), "").unwrap();
+    assert!(refused(bench.go_on(&[])).contains("remove the file"));
+    std::fs::remove_file(out.join("config.toml")).unwrap();
+    succeeded(bench.go_on(&["--spill-dir", text(&spill)]));
+    assert!(ply(&out) == alone.ply, "the scene is another");
+}

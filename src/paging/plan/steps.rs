@@ -36,6 +36,16 @@ impl Plan {
         Plan { uses_max, uses_held: 0, first_step, steps: VecDeque::new(), uses: Vec::new() }
     }
 
+    /// Limits the plan to about `max_bytes` bytes from now on; steps that do not fit stay until they are dropped.
+    pub fn limit(&mut self, max_bytes: u64) {
+        self.uses_max = (max_bytes / USE_BYTES as u64).try_into().unwrap_or(usize::MAX);
+    }
+
+    /// Whether it holds more than it may.
+    pub fn is_over(&self) -> bool {
+        self.uses_held > self.uses_max
+    }
+
     /// The planned steps.
     pub fn steps(&self) -> Range<u32> {
         self.first_step..self.first_step + self.steps.len() as u32

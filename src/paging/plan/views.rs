@@ -126,6 +126,14 @@ impl ViewPlan {
         self.changed.extend(pages.iter().copied().filter(|&page| plan.next_use(page, 0) == Some(step)));
     }
 
+    /// Limits the plan to about `bytes` bytes: the farthest steps are dropped.
+    pub fn limit(&mut self, bytes: usize) {
+        self.plan.limit(bytes as u64);
+        while self.plan.is_over() && !self.cameras.is_empty() {
+            self.truncate(self.cameras.len() - 1);
+        }
+    }
+
     fn truncate(&mut self, len: usize) {
         while self.cameras.len() > len
             && let Some(dropped) = self.plan.pop_last()
@@ -154,6 +162,22 @@ mod tests {
     fn page(number: u32, x: f32) -> PageMeta {
         let bounds = PageBounds { lo: [x, -1.0, 5.0], hi: [x + 0.5, 1.0, 6.0], sigma_max: 0.01 };
         PageMeta { id: PageId::initial(number), rows: 1, sh_degree: 0, events_applied: 0, bounds }
+    }
+
+    /// A plan that is limited drops its farthest steps, and reports the pages that are not needed any more.
+    #[test]
+    fn a_smaller_limit_drops_the_farthest_steps() {
+        let index: Vec<PageMeta> = (0..40).map(|i| page(i, i as f32)).collect();
+        let cameras: Vec<Camera> = (0..8).map(|i| camera(5.0 * i as f32)).collect();
+        let mut plan = ViewPlan::new(1 << 20);
+        plan.renew(0, &cameras.iter().collect::<Vec<_>>(), &index);
+        let uses = plan.plan.uses();
+        let last = plan.pages(7).unwrap()[plan.pages(7).unwrap().len() - 1];
+        plan.take_changed();
+        plan.limit(12 * uses / 2);
+        assert!(plan.plan.uses() <= uses / 2 && plan.plan.uses() > 0, "{} of {uses}", plan.plan.uses());
+        assert!(plan.pages(0).is_some() && plan.pages(7).is_none());
+        assert!(plan.next_use(last) == NEVER && plan.take_changed().contains(&last));
     }
 
     /// Against lists made anew from the cameras, through renewals, moved pages, splits and bounded plans.
