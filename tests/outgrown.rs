@@ -236,7 +236,7 @@ fn a_run_that_updates_every_row_moves_out_as_well() {
 fn a_run_with_no_drive_to_move_to_goes_on_in_memory() {
     let folder = TempDir::new().unwrap();
     let scene = large_scene(folder.path());
-    let Some(drive) = small_drive::Small::mount(&folder.path().join("drive"), 100 << 20) else { return };
+    let Some(drive) = small_drive::Small::mount(&folder.path().join("drive"), 60 << 20) else { return };
     let (alone, out) = (folder.path().join("alone"), drive.0.join("out"));
     let fewer = growing_less();
     let flags: Vec<&str> = fewer.split_whitespace().collect();
