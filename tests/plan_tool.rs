@@ -84,7 +84,7 @@ fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
     for (args, words) in [
         (&["--page-rows", "16", "--frames", "2"][..], ["2 frames", "--host-mem"]),
         (&["--compare-frames", "many"], ["'many'", "25%"]),
-        (&["--compare-orders", "random"], ["'random'", "groups:<n>"]),
+        (&["--compare-orders", "random"], ["'random'", "groups:N"]),
         (&["--drive-read", "0"], ["--drive-read", "bytes per second"]),
         (&["--lists", "5..5"], ["5..5", "100..110"]),
         (&["--step-seconds", "nan"], ["--step-seconds", "leave them out"]),
