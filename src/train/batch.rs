@@ -3,7 +3,7 @@
 //! Between them the step works on the [`WorkingSet`] alone. A backend that keeps rows on a device replaces these two
 //! functions together with the renderer.
 //!
-//! Invariants: from [`gather`] to [`update`] nobody changes the pinned rows or the values of the working set, since the
+//! Invariants: from [`gather`] to `update` nobody changes the pinned rows or the values of the working set, since the
 //! update starts from these values.
 
 use super::catch_up;

@@ -53,7 +53,7 @@ pub(super) fn lock(out: &Path) -> InputResult<OutLock> {
     }
 }
 
-/// Whether a folder has nothing in it but what [`lock`] makes.
+/// Whether a folder has nothing in it but the file of the lock.
 pub fn is_empty(out: &Path) -> bool {
     std::fs::read_dir(out).is_ok_and(|mut entries| entries.all(|e| e.is_ok_and(|e| e.file_name() == LOCK)))
 }
