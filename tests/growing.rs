@@ -161,7 +161,8 @@ fn the_memory_that_a_stopped_run_names_is_more_than_it_had_and_enough() {
             compact_city(folder.path()),
             "--grow-grad2d 0.0005 --steps 60 --quiet --spill-codec zstd:1 --image-cache 64KiB",
         ),
-        ("large", scenes::wide_city(&wide, 8_000), "--grow-grad2d 0.0002 --steps 60 --quiet"),
+        // Enough growth that a small plan does not help.
+        ("large", scenes::wide_city(&wide, 8_000), "--grow-grad2d 0.00002 --steps 110 --quiet"),
     ] {
         let (out, flags) = (folder.path().join(name), words(more));
         let output =

@@ -130,16 +130,17 @@ impl HostBudget {
 
     /// Memory with which a run that goes on from here gets the frames that all of these views need: always more than this.
     pub(super) fn least_for(&self, scene: &PagedScene, view: ViewMemory, needs: &[ViewNeed]) -> u64 {
+        // The run that goes on has its whole plan again.
+        let staging = self.staging + if self.is_plan_small { (PLAN_BYTES - PLAN_BYTES_LEAST) as u64 } else { 0 };
         let frame_bytes = scene.pager.frame_bytes() as u64;
         let need = |need: &ViewNeed| {
             let of_rows = view.at_last.saturating_sub(self.of_pixels) as f64 * need.growth * VIEW_SPARE;
             let rest = self.taken(scene, self.of_pixels + of_rows as u64, 1.0) + need.pages as u64 * frame_bytes;
-            with_staging(rest, self.staging, self.bytes)
+            with_staging(rest, staging, self.bytes)
         };
         let least = needs.iter().map(need).max().unwrap_or(0);
-        // A sixteenth for what the run that goes on measures anew before its first step, and for its whole plan.
-        let plan = if self.is_plan_small { (PLAN_BYTES - PLAN_BYTES_LEAST) as u64 } else { 0 };
-        (least + least / 16 + plan).max(self.bytes + frame_bytes)
+        // A sixteenth for what the run that goes on measures anew before its first step.
+        (least + least / 16).max(self.bytes + frame_bytes)
     }
 
     /// This budget with a small plan, which leaves more for frames; `None` where the plan is small already.

@@ -50,15 +50,15 @@ impl Trainer {
         let PagingError::WorkingSet { pages: needed, frames: now, .. } = *error else { return false };
         let Some(budget) = self.budget.filter(|_| !self.is_in_memory() && needed > now) else { return false };
         let mut most = budget.frames_at_most(&self.scene, self.view_memory());
-        if most < needed
-            && let Some(smaller) = budget.with_small_plan()
-        {
+        if most < needed && !self.raise_for_frames(budget, needed) {
+            // The plan is advice: with a small one the run reads more, and goes on.
+            let Some(smaller) = budget.with_small_plan() else { return false };
+            most = smaller.frames_at_most(&self.scene, self.view_memory());
+            if most < needed {
+                return false;
+            }
             self.scene.pager.limit_plan(PLAN_BYTES_LEAST);
             self.budget = Some(smaller);
-            most = smaller.frames_at_most(&self.scene, self.view_memory());
-        }
-        if most < needed && !self.budget.is_some_and(|budget| self.raise_for_frames(budget, needed)) {
-            return false;
         }
         let wanted = needed + needed / SPARE_SHARE;
         self.scene.pager.allow_frames(wanted.min(most).max(needed));

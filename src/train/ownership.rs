@@ -99,7 +99,10 @@ pub(super) fn open_own(folder: &Path, claim: Claim<'_>, allow_remote: bool) -> R
 }
 
 /// The run state of the last commit, read without writing anything.
-fn last_state(folder: &Path, access: Access) -> Result<RunState, TrainError> {
+///
+/// # Errors
+/// Nothing was committed, or the store cannot be opened.
+pub(super) fn last_state(folder: &Path, access: Access) -> Result<RunState, TrainError> {
     let store = StoreReader::open(folder, access, WitnessRule::Obeyed)?;
     let bytes = store.run_state(store.find(None)?)?;
     let wrong = |problem: String| InputError::new(folder, problem, "use the program that made it");

@@ -13,7 +13,7 @@ use super::facts::{Resolved, read_resolved};
 use super::machine;
 use super::memory::host_budget;
 use super::out_folder::{self, Existing};
-use super::ownership::{Claim, open_own};
+use super::ownership::{Claim, last_state, open_own};
 use super::pages::PagedScene;
 use super::places::absolute;
 use super::report::{StepLine, Summary};
@@ -33,6 +33,7 @@ use crate::config::residence::checkpoint_folder;
 use crate::densify::stats::GradHistogram;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::CommitError;
+use crate::page::tool::reading::Access;
 use crate::paging::pager::Pager;
 use crate::render::Renderer;
 use crate::report::run_report::write_run_report;
@@ -121,10 +122,10 @@ impl Earlier {
                 "name the output folder of a run; if its pages lie in a spill directory, name it too: --spill-dir";
             InputError::new(&request.out, problem, remedy)
         };
-        if !folder.exists() {
+        if !SpillDir::exists_in(&folder) {
             return Err(nothing().into());
         }
-        let state = Stored::open(&folder, named.is_none())?.ok_or_else(nothing)?.run_state;
+        let state = last_state(&folder, Access::Map)?;
         let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
         if Path::new(&state.run.out) != absolute(&request.out) && has_past(&request.out) {
             let problem =

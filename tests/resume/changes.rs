@@ -30,9 +30,9 @@ fn what_changed_is_said_and_left_as_it_was() {
     let out = bench.path("out");
     let mut child = bench.begin(Place::Spill(alone.fewest), &SELDOM);
     bench.wait_for_lines(&mut child, 2);
-    // In use: a second process is kept out, by this file or by the missing one of a run that has not committed.
+    // In use: a second process is kept out.
     let said = refused(bench.go_on(&[]));
-    assert!(said.contains("use"), "{said}");
+    assert!(said.contains("another process"), "{said}");
     signal(&child, "INT");
     assert_eq!(ended(child).status.code(), Some(130));
     // Every key that differs, and what it was.
