@@ -191,6 +191,8 @@ fn a_kill_in_the_first_second_is_in_nobodys_way() {
         std::thread::sleep(std::time::Duration::from_millis(milliseconds));
         child.kill().unwrap();
         ended(child);
+        // The lines to wait for are those of the second process.
+        let _ = std::fs::remove_file(out.join("metrics.jsonl"));
         let mut again = match out.join("config.toml").exists() {
             true => bench.go_on(&SELDOM),
             false => bench.begin(Place::Spill(alone.fewest), &SELDOM),
