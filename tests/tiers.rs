@@ -40,9 +40,14 @@ fn budgets_that_are_too_small_are_refused_with_numbers_and_alternatives() {
     refuses(folder.path(), &scene, &with_drive, &["8.0 MiB", "needs", "at least"]);
     assert!(!spill.exists(), "a refused run leaves no spill directory");
     refuses(folder.path(), &scene, &["--frames", "2", "--page-rows", "64"], &["--frames: 2", "pages at once"]);
-    refuses(folder.path(), &scene, &["--io", "floppy"], &["--io", "uring"]);
-    refuses(folder.path(), &scene, &["--spill-codec", "zip"], &["--spill-codec", "zstd:"]);
-    refuses(folder.path(), &scene, &["--view-order", "groups:0"], &["--view-order", "groups:"]);
+    // A word that a flag does not know is an error of usage.
+    for (flag, word, known) in
+        [("--io", "floppy", "uring"), ("--spill-codec", "zip", "zstd:"), ("--view-order", "groups:0", "groups:")]
+    {
+        let output = run(folder.path(), &scene, &[flag, word]);
+        assert_eq!(output.status.code(), Some(2), "{}", stderr(&output));
+        assert!(stderr(&output).contains(flag) && stderr(&output).contains(known), "{}", stderr(&output));
+    }
     refuses(folder.path(), &scene, &["--page-rows", "3"], &["--page-rows"]);
     refuses(folder.path(), &scene, &["--sh-degree", "1", "--sh-start", "2"], &["--sh-start"]);
 }
