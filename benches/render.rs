@@ -20,6 +20,7 @@ use gsscale::kernels::isect_emit::Isect;
 use gsscale::kernels::rasterize_fwd::{Lists, Raster, TILE_PIXELS, rasterize_fwd};
 use gsscale::kernels::splats::{Grid, Splat};
 use gsscale::kernels::stages::STAGES;
+use gsscale::kernels::tile_range::TileRange;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::{Gradients, RenderOptions, Renderer};
 use std::sync::atomic::AtomicU64;
@@ -77,6 +78,7 @@ fn inner_loop(simd: SimdPath, threads: usize, least: Duration) -> Vec<f32> {
         let tile_offsets: Vec<u64> = (0..=grid.tiles()).map(|tile| (tile * INNER_SPLATS) as u64).collect();
         let lists = Lists {
             grid,
+            range: TileRange::all(grid),
             splats: &splats,
             isects: &isects,
             tile_offsets: &tile_offsets,

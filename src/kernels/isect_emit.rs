@@ -8,7 +8,8 @@
 
 use super::constants::TILE;
 use super::radix_sort::chunk_len;
-use super::splats::{Grid, Packed, Span, Splat, rows_in_column, tile_rows};
+use super::splats::{Grid, Packed, ROWS_PER_CHUNK as ROWS_PER_EMIT_CHUNK, Span, Splat, rows_in_column, tile_rows};
+use super::tile_range::TileRange;
 use crate::base::room;
 use crate::base::simd::{Kernel, SimdPath, dispatch, prefetch};
 use rayon::prelude::*;
@@ -24,7 +25,7 @@ pub struct Isect {
     pub row: u32,
     /// First and last pixel row of the tile, 0 to 15, that it can reach.
     pub pixel_rows: [u8; 2],
-    /// Its index among the row's intersections, below 2^24.
+    /// Its index among the row's intersections with the tiles of the range, below 2^24.
     pub k: u32,
 }
 
@@ -44,24 +45,40 @@ impl Isect {
     }
 }
 
-/// Calls `each(tile, pixel rows within the tile)` for every tile that a row can reach, in emit order.
+/// Calls `each(tile, pixel rows within the tile)` for every tile that a row can reach, in emit order; with `CUT`, for every
+/// such tile of the range.
 #[inline(always)]
-fn for_each_tile(splat: &Splat, span: &Span, grid: Grid, mut each: impl FnMut(usize, [u8; 2])) {
+fn for_each_tile<const CUT: bool>(
+    splat: &Splat,
+    span: &Span,
+    grid: Grid,
+    range: &TileRange,
+    mut each: impl FnMut(usize, [u8; 2]),
+) {
     let mut column = |x: u16, rows: [u16; 2]| {
         for y in tile_rows(rows) {
+            if CUT && !(u32::from(range.rows[0])..u32::from(range.rows[1])).contains(&y) {
+                continue;
+            }
             let top = (y * TILE) as i32;
             let [first, last] = rows.map(|row| (i32::from(row) - top).clamp(0, TILE as i32 - 1) as u8);
             each(y as usize * grid.tiles_x as usize + usize::from(x), [first, last]);
         }
     };
     let [x0, _, x1, _] = span.tiles;
+    let within = |x: u16| !CUT || (range.columns[0]..range.columns[1]).contains(&x);
     for (x, rows) in (x0..x1).zip(span.rows) {
-        column(x, rows);
+        if within(x) {
+            column(x, rows);
+        }
     }
     if x1.saturating_sub(x0) > 2 {
-        let ellipse = splat.ellipse();
-        for x in x0 + 2..x1 {
-            column(x, rows_in_column(&ellipse, grid, span.tiles, x));
+        let (from, to) = if CUT { ((x0 + 2).max(range.columns[0]), x1.min(range.columns[1])) } else { (x0 + 2, x1) };
+        if from < to {
+            let ellipse = splat.ellipse();
+            for x in from..to {
+                column(x, rows_in_column(&ellipse, grid, span.tiles, x));
+            }
         }
     }
 }
@@ -74,9 +91,9 @@ fn prefetch_ahead(spans: &[Span], order: &[u32], i: usize) {
     }
 }
 
-/// Counts intersections as `[chunks][tiles]` for [`super::isect_offsets`]; a chunk is a part of `order`, the drawn rows
-/// front to back.
-pub fn count(order: &[u32], packed: &Packed, grid: Grid, simd: SimdPath, tile_counts: &mut Vec<u32>) {
+/// Counts the intersections with the tiles of `range` as `[chunks][tiles]` for [`super::isect_offsets`]; a chunk is a part
+/// of `order`, the drawn rows front to back.
+pub fn count(order: &[u32], packed: &Packed, grid: Grid, range: TileRange, simd: SimdPath, tile_counts: &mut Vec<u32>) {
     let tiles = grid.tiles();
     let len = chunk_len(order.len(), ROWS_PER_CHUNK, CHUNKS_MAX);
     tile_counts.clear();
@@ -85,18 +102,23 @@ pub fn count(order: &[u32], packed: &Packed, grid: Grid, simd: SimdPath, tile_co
         return;
     }
     order.par_chunks(len).zip(tile_counts.par_chunks_mut(tiles)).for_each(|(order, tile_counts)| {
-        dispatch(simd, CountChunk { order, packed, grid, tile_counts });
+        if range.is_all(grid) {
+            dispatch(simd, CountChunk::<false> { order, packed, grid, range, tile_counts });
+        } else {
+            dispatch(simd, CountChunk::<true> { order, packed, grid, range, tile_counts });
+        }
     });
 }
 
-struct CountChunk<'a> {
+struct CountChunk<'a, const CUT: bool> {
     order: &'a [u32],
     packed: &'a Packed,
     grid: Grid,
+    range: TileRange,
     tile_counts: &'a mut [u32],
 }
 
-impl Kernel for CountChunk<'_> {
+impl<const CUT: bool> Kernel for CountChunk<'_, CUT> {
     type Out = ();
 
     #[inline(always)]
@@ -104,19 +126,21 @@ impl Kernel for CountChunk<'_> {
         let Packed { splats, spans, .. } = self.packed;
         for (i, &row) in self.order.iter().enumerate() {
             prefetch_ahead(spans, self.order, i);
-            for_each_tile(&splats[row as usize], &spans[row as usize], self.grid, |tile, _| {
+            let (splat, span) = (&splats[row as usize], &spans[row as usize]);
+            for_each_tile::<CUT>(splat, span, self.grid, &self.range, |tile, _| {
                 self.tile_counts[tile] += 1;
             });
         }
     }
 }
 
-/// Writes each intersection (as [`Isect::pack`]) to its place in its tile's list. Consumes `cursors`, which comes from
-/// [`super::isect_offsets`]; `isects` is resized to `total`.
+/// Writes each intersection with a tile of `range` (as [`Isect::pack`]) to its place in its tile's list. Consumes `cursors`,
+/// which comes from [`super::isect_offsets`]; `isects` is resized to `total`.
 pub fn emit(
     order: &[u32],
     packed: &Packed,
     grid: Grid,
+    range: TileRange,
     simd: SimdPath,
     total: u64,
     cursors: &mut [u64],
@@ -130,19 +154,24 @@ pub fn emit(
     }
     let isects = &*isects;
     order.par_chunks(len).zip(cursors.par_chunks_mut(tiles)).for_each(|(order, cursors)| {
-        dispatch(simd, EmitChunk { order, packed, grid, cursors, isects });
+        if range.is_all(grid) {
+            dispatch(simd, EmitChunk::<false> { order, packed, grid, range, cursors, isects });
+        } else {
+            dispatch(simd, EmitChunk::<true> { order, packed, grid, range, cursors, isects });
+        }
     });
 }
 
-struct EmitChunk<'a> {
+struct EmitChunk<'a, const CUT: bool> {
     order: &'a [u32],
     packed: &'a Packed,
     grid: Grid,
+    range: TileRange,
     cursors: &'a mut [u64],
     isects: &'a [AtomicU64],
 }
 
-impl Kernel for EmitChunk<'_> {
+impl<const CUT: bool> Kernel for EmitChunk<'_, CUT> {
     type Out = ();
 
     #[inline(always)]
@@ -151,13 +180,63 @@ impl Kernel for EmitChunk<'_> {
         for (i, &row) in self.order.iter().enumerate() {
             prefetch_ahead(spans, self.order, i);
             let mut k = 0;
-            for_each_tile(&splats[row as usize], &spans[row as usize], self.grid, |tile, pixel_rows| {
+            let (splat, span) = (&splats[row as usize], &spans[row as usize]);
+            for_each_tile::<CUT>(splat, span, self.grid, &self.range, |tile, pixel_rows| {
                 let place = &mut self.cursors[tile];
                 self.isects[*place as usize].store(Isect { row, pixel_rows, k }.pack(), Relaxed);
                 *place += 1;
                 k += 1;
             });
         }
+    }
+}
+
+/// Numbers the intersections of a range in emit order, as [`super::splats::pack`] does for all tiles: sets
+/// [`Splat::emit`], writes the number of intersections of each row to `counts`, and their sums by chunk to `chunk_counts`.
+pub fn number(
+    packed: &mut Packed,
+    grid: Grid,
+    range: TileRange,
+    simd: SimdPath,
+    counts: &mut Vec<u32>,
+    chunk_counts: &mut Vec<u64>,
+) {
+    let Packed { splats, spans, counts: of_all, .. } = packed;
+    room::resize(counts, of_all.len(), 0);
+    room::resize(chunk_counts, of_all.len().div_ceil(ROWS_PER_EMIT_CHUNK), 0);
+    let rows = (splats.par_chunks_mut(ROWS_PER_EMIT_CHUNK), spans.par_chunks(ROWS_PER_EMIT_CHUNK)).into_par_iter();
+    let out = (counts.par_chunks_mut(ROWS_PER_EMIT_CHUNK), chunk_counts.par_iter_mut()).into_par_iter();
+    rows.zip(of_all.par_chunks(ROWS_PER_EMIT_CHUNK)).zip(out).for_each(|(((splats, spans), of_all), (counts, sum))| {
+        *sum = dispatch(simd, NumberChunk { splats, spans, of_all, grid, range, counts });
+    });
+}
+
+struct NumberChunk<'a> {
+    splats: &'a mut [Splat],
+    spans: &'a [Span],
+    /// Intersections of each row with all tiles; 0 for rows that are not drawn.
+    of_all: &'a [u32],
+    grid: Grid,
+    range: TileRange,
+    counts: &'a mut [u32],
+}
+
+impl Kernel for NumberChunk<'_> {
+    /// Sum of the counts.
+    type Out = u64;
+
+    #[inline(always)]
+    fn run<const FMA: bool>(self) -> u64 {
+        let mut emit = 0;
+        for (i, splat) in self.splats.iter_mut().enumerate() {
+            let mut count = 0;
+            if self.of_all[i] > 0 {
+                for_each_tile::<true>(splat, &self.spans[i], self.grid, &self.range, |_, _| count += 1);
+            }
+            (splat.emit, self.counts[i]) = (emit, count);
+            emit += u64::from(count);
+        }
+        emit
     }
 }
 
@@ -242,11 +321,11 @@ mod tests {
         order.iter().enumerate().for_each(|(i, &row)| rank[row as usize] = i);
         let (mut tile_counts, mut offsets) = (Vec::new(), Vec::new());
         let (mut tile_offsets, mut cursors, mut isects) = (Vec::new(), Vec::new(), Vec::new());
-        count(&order, &packed, grid, SimdPath::best(), &mut tile_counts);
+        count(&order, &packed, grid, TileRange::all(grid), SimdPath::best(), &mut tile_counts);
         let total = scan(&packed.chunk_counts, &mut offsets);
         isect_offsets(&tile_counts, grid.tiles(), &mut tile_offsets, &mut cursors);
         assert_eq!(tile_offsets[grid.tiles()], total);
-        emit(&order, &packed, grid, SimdPath::best(), total, &mut cursors, &mut isects);
+        emit(&order, &packed, grid, TileRange::all(grid), SimdPath::best(), total, &mut cursors, &mut isects);
         let mut tiles_of = vec![Vec::new(); 5000];
         for tile in 0..grid.tiles() {
             let list = &isects[tile_offsets[tile] as usize..tile_offsets[tile + 1] as usize];

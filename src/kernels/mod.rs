@@ -17,5 +17,6 @@ pub mod splats;
 mod ssim_band;
 pub mod stages;
 mod tile_block;
+pub mod tile_range;
 pub mod uniforms;
 pub mod uniforms_tiles;

@@ -291,7 +291,8 @@ pub fn rasterize_bwd(
         partials.iter_mut().flatten().for_each(|sum| *sum.get_mut() = 0);
     });
     let partials = &partials[..];
-    (0..lists.grid.tiles()).into_par_iter().for_each(|tile| {
+    let tiles = (0..lists.grid.tiles()).into_par_iter().filter(|tile| lists.range.contains(lists.grid, *tile));
+    tiles.for_each(|tile| {
         SCRATCH.with_borrow_mut(|state| {
             state.load(lists, raster, upstream, tile);
             dispatch(lists.simd, BackTile { lists, chunk_offsets, tile, cap, state, partials });
@@ -299,10 +300,26 @@ pub fn rasterize_bwd(
     });
 }
 
-/// Folds the sums of each row over its intersections and converts them to gradients. `counts` holds the number of
-/// intersections of each row.
+/// Which of the ranges of a picture is folded: the sums of a row are carried from the first to the last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FoldPart {
+    /// Sums begin at zero.
+    pub is_first: bool,
+    /// Sums become gradients.
+    pub is_last: bool,
+}
+
+impl FoldPart {
+    /// A picture that is one range.
+    pub const WHOLE: FoldPart = FoldPart { is_first: true, is_last: true };
+}
+
+/// Folds the sums of each row over its intersections with the tiles of a range, and converts them to gradients after the last
+/// range; before that `out` holds the sums as they are. `counts` holds the number of intersections of each row in the range,
+/// and `counts_of_all` that in all tiles.
 pub fn fold_rows(
-    counts: &[u32],
+    part: FoldPart,
+    [counts, counts_of_all]: [&[u32]; 2],
     chunk_offsets: &[u64],
     partials: &[Partial],
     projected: &Projected,
@@ -322,24 +339,31 @@ pub fn fold_rows(
             let row = chunk * ROWS_PER_CHUNK + i;
             let last = first + counts[row] as usize;
             let mut sums = [0.0f32; SUMS];
+            if !part.is_first {
+                let ([hx, hy], [hxx, hxy, hyy]) = (v_means2d[i], v_conics[i]);
+                let [red, green, blue] = v_colors[i];
+                sums = [v_opacities[i], hx, hy, hxx, hxy, hyy, red, green, blue];
+            }
             for partial in &partials[first..last] {
                 for (sum, part) in sums.iter_mut().zip(partial) {
                     *sum += f32::from_bits(part.load(Relaxed));
                 }
             }
+            first = last;
             let [h, hx, hy, hxx, hxy, hyy, red, green, blue] = sums;
             v_colors[i] = [red, green, blue];
-            if first == last {
+            if !part.is_last {
+                (v_means2d[i], v_conics[i], v_opacities[i]) = ([hx, hy], [hxx, hxy, hyy], h);
+            } else if counts_of_all[row] == 0 {
                 // The footprint of a culled row is not valid.
                 (v_means2d[i], v_conics[i], v_opacities[i]) = ([0.0; 2], [0.0; 3], 0.0);
-                continue;
+            } else {
+                // dL/dsigma = -h; sigma = (A dx^2 + C dy^2) / 2 + B dx dy with dx = pixel - mean.
+                let [a, b, c] = projected.conics[row];
+                v_means2d[i] = [a * hx + b * hy, b * hx + c * hy];
+                v_conics[i] = [-0.5 * hxx, -hxy, -0.5 * hyy];
+                v_opacities[i] = h / projected.opacities[row];
             }
-            // dL/dsigma = -h; sigma = (A dx^2 + C dy^2) / 2 + B dx dy with dx = pixel - mean.
-            let [a, b, c] = projected.conics[row];
-            v_means2d[i] = [a * hx + b * hy, b * hx + c * hy];
-            v_conics[i] = [-0.5 * hxx, -hxy, -0.5 * hyy];
-            v_opacities[i] = h / projected.opacities[row];
-            first = last;
         }
     });
 }
@@ -374,7 +398,7 @@ mod tests {
         projected.resize(2);
         projected.opacities.fill(1.0);
         let mut out = FootprintGradients::default();
-        fold_rows(&[1, 3], &[0], &partials, &projected, &mut out);
+        fold_rows(FoldPart::WHOLE, [&[1, 3]; 2], &[0], &partials, &projected, &mut out);
         assert_eq!(out.v_colors, [[5.0; 3], [1.0; 3]]);
         assert_eq!(out.v_opacities, [5.0, 1.0]);
     }

@@ -15,6 +15,7 @@
 use super::constants::{TILE, TRANSMITTANCE_MIN};
 use super::splats::{Grid, LOG2_ALPHA_MIN, Splat};
 use super::tile_block::{Block, ROWS, prefetch_splats};
+use super::tile_range::TileRange;
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch, fma};
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -30,8 +31,10 @@ pub const NEVER: u32 = u32::MAX;
 /// Input of both directions of the rasterizer.
 #[derive(Debug, Clone, Copy)]
 pub struct Lists<'a> {
-    /// The tiles.
+    /// The tiles of the picture.
     pub grid: Grid,
+    /// The tiles whose lists these are.
+    pub range: TileRange,
     /// Splats by row.
     pub splats: &'a [Splat],
     /// Packed [`super::isect_emit::Isect`]s, tile by tile.
@@ -282,7 +285,7 @@ fn blend_row<const FMA: bool>(row: &mut Row, y: usize, first: u32, block: &Block
     count
 }
 
-/// Blends every tile into `out`.
+/// Blends the tiles of the range into `out`, and leaves the other tiles as they are.
 pub fn rasterize_fwd(lists: &Lists<'_>, out: &mut Raster) {
     let tiles = lists.grid.tiles();
     out.resize(tiles);
@@ -293,6 +296,7 @@ pub fn rasterize_fwd(lists: &Lists<'_>, out: &mut Raster) {
         .zip(out.stop.par_chunks_mut(TILE_PIXELS))
         .zip(out.evaluated.par_iter_mut())
         .enumerate()
+        .filter(|(tile, _)| lists.range.contains(lists.grid, *tile))
         .for_each(|(tile, (((rgb, t_final), stop), evaluated))| {
             SCRATCH.with_borrow_mut(|state| {
                 state.reset(lists.grid, tile);
@@ -385,10 +389,10 @@ pub(in crate::kernels) mod tests {
         let (mut chunk_offsets, mut tile_offsets, mut isects) = (vec![], vec![], vec![]);
         let (mut tile_counts, mut cursors) = (vec![], vec![]);
         pack(&p, &colors, grid, simd, &mut packed);
-        count(&order, &packed, grid, simd, &mut tile_counts);
+        count(&order, &packed, grid, TileRange::all(grid), simd, &mut tile_counts);
         let total = scan(&packed.chunk_counts, &mut chunk_offsets);
         isect_offsets(&tile_counts, grid.tiles(), &mut tile_offsets, &mut cursors);
-        emit(&order, &packed, grid, simd, total, &mut cursors, &mut isects);
+        emit(&order, &packed, grid, TileRange::all(grid), simd, total, &mut cursors, &mut isects);
         Scene { grid, radii: p.radii, packed, chunk_offsets, tile_offsets, isects }
     }
 
@@ -396,6 +400,7 @@ pub(in crate::kernels) mod tests {
         pub(in crate::kernels) fn lists(&self, simd: SimdPath) -> Lists<'_> {
             Lists {
                 grid: self.grid,
+                range: TileRange::all(self.grid),
                 splats: &self.packed.splats,
                 isects: &self.isects,
                 tile_offsets: &self.tile_offsets,

@@ -27,6 +27,14 @@ pub enum PagingError {
         /// Bytes of one frame.
         frame_bytes: usize,
     },
+    /// No room on the drive for pages that a step will write back.
+    #[error("making room for {pages} pages failed: {source}")]
+    Room {
+        /// Pages.
+        pages: u64,
+        /// What the store said.
+        source: PageError,
+    },
     /// The store failed.
     #[error("{doing} page {page} failed: {source}")]
     Store {
@@ -42,6 +50,9 @@ pub enum PagingError {
 impl PagingError {
     /// Whether it is only space on the drive that is missing: the same call may work later.
     pub fn is_out_of_space(&self) -> bool {
-        matches!(self, PagingError::Store { source, .. } if source.is_out_of_space())
+        match self {
+            PagingError::Store { source, .. } | PagingError::Room { source, .. } => source.is_out_of_space(),
+            PagingError::WorkingSet { .. } => false,
+        }
     }
 }

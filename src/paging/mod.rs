@@ -11,8 +11,9 @@
 //! | `cut` | which pages the last commit names, and the pages of a commit beside training |
 //! | [`pager`] | the parts together: hands out the pages of a view and takes them back |
 //!
-//! The pager's calls that need several parts stand in `fetch`, `prefetch`, `transfers` and `commit`.
+//! The pager's calls that need several parts stand in `fetch`, [`batches`], `prefetch`, `transfers` and `commit`.
 
+pub mod batches;
 mod commit;
 mod cut;
 pub mod error;

@@ -2,7 +2,7 @@
 //!
 //! The pager composes parts that know nothing of each other: `index` (entries and slots of the pages), `frames` (which pages are
 //! in memory), `plan` (what the coming steps need), `mover` (transfers), `cut` (commits). Calls that need several parts stand in
-//! files of their own: `fetch` brings what is needed now, `prefetch` what will be needed, `transfers` begins and ends reads and
+//! files of their own: `fetch` brings what is needed now, `batches` walks a view that is larger than the frames, `prefetch` what will be needed, `transfers` begins and ends reads and
 //! write-backs, `commit` makes what the pages hold durable.
 //!
 //! Invariants: 1. `acquire` gives every page that the view may see by the bounds as they are now, whatever was planned;
@@ -29,6 +29,7 @@ use crate::scene::camera::Camera;
 use crate::scene::page_layout::capacity_bytes;
 use crate::scene::page_meta::PageMeta;
 use crate::schedule::visibility::visible_pages;
+use std::collections::BTreeMap;
 
 /// Sizes of a pager. None of them changes a bit of the rows.
 #[derive(Debug, Clone, Copy)]
@@ -71,6 +72,8 @@ pub struct Pager {
     pub(super) cuts: Cuts,
     pub(super) counters: Counters,
     pub(super) transfers: Transfers,
+    /// Next uses of the pages that the present step still needs, where it walks its view in batches.
+    pub(super) uses_in_step: BTreeMap<PageNo, u32>,
 }
 
 impl Pager {
@@ -91,6 +94,7 @@ impl Pager {
             cuts: Cuts::default(),
             counters: Counters::default(),
             transfers: Transfers::default(),
+            uses_in_step: BTreeMap::new(),
             config,
         }
     }
@@ -202,13 +206,23 @@ impl Pager {
         }
     }
 
-    /// Pins every page with rows that `camera` may see by the bounds as they are now, ascending by id. `step` is the
-    /// 0-based step that uses them. Blocks only for pages that are not in memory.
+    /// Pins every page with rows that `camera` may see by the bounds as they are now, ascending by id: a view of one batch.
+    /// `step` is the 0-based step that uses them. Blocks only for pages that are not in memory.
     ///
     /// # Errors
     /// The working set is larger than the frames; a page cannot be read; a page could not be written, now or since the
     /// last call. Nothing is pinned then, and every page keeps what it holds.
     pub fn acquire(&mut self, step: u32, camera: &Camera) -> Result<Vec<PinnedPage>, PagingError> {
+        let pages = self.begin_view(step, camera)?;
+        self.pin_batch(step, &pages)
+    }
+
+    /// Begins 0-based `step` on the view of `camera`; returns every page with rows that the camera may see by the bounds as
+    /// they are now, ascending by id. [`Pager::pin_batch`] pins them.
+    ///
+    /// # Errors
+    /// A page could not be written since the last call.
+    pub fn begin_view(&mut self, step: u32, camera: &Camera) -> Result<Vec<PageNo>, PagingError> {
         self.mover.resume_writes();
         if let Some(error) = self.mover.take_failure() {
             return Err(error);
@@ -223,13 +237,11 @@ impl Pager {
             let missed = |p: &&PageNo| planned.binary_search(p).is_err() && self.frames.state(**p).is_none();
             self.counters.stats.late_misses += pages.iter().filter(missed).count() as u64;
         }
-        let pinned = self.fetch(&format!("the view of step {step}"), &pages, Asker::Step)?;
-        self.count_bound(&pages);
-        Ok(pinned)
+        Ok(pages)
     }
 
-    /// Adds a step to the bound on reads.
-    fn count_bound(&mut self, pages: &[PageNo]) {
+    /// Adds a batch of a step to the bound on reads.
+    pub(super) fn count_bound(&mut self, pages: &[PageNo]) {
         if !self.mover.has_store() {
             return;
         }
@@ -343,10 +355,15 @@ impl Pager {
         self.counters.stats.pinned_max = self.counters.stats.pinned_max.max(self.frames.count(FrameState::Pinned));
     }
 
+    /// The next use of a page: in the present step if it walks its view in batches, else the first planned step.
+    pub(super) fn next_use(&self, page: PageNo) -> u32 {
+        self.uses_in_step.get(&page).copied().unwrap_or_else(|| self.look_ahead.views.next_use(page))
+    }
+
     /// Tells the frame table of next uses that changed.
     pub(super) fn apply_changed_uses(&mut self) {
         for page in self.look_ahead.views.take_changed() {
-            self.frames.set_next_use(page, self.look_ahead.views.next_use(page));
+            self.frames.set_next_use(page, self.next_use(page));
         }
     }
 }

@@ -96,7 +96,7 @@ impl Pager {
         }
     }
 
-    fn clean_early(&mut self, victim: Victim) {
+    pub(super) fn clean_early(&mut self, victim: Victim) {
         if let Err(Failure { error, .. }) = self.begin_write(victim.page, true) {
             // The next step gets the error.
             let _ = self.mover.stop_writes(error, false);

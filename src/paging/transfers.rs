@@ -26,7 +26,7 @@ impl Pager {
     /// Begins to read a page that is not in memory, if a frame is free for it.
     pub(super) fn begin_read(&mut self, page: PageNo, is_ahead: bool) -> bool {
         let Some(slot) = self.index.slot(page).filter(|_| self.mover.has_store()) else { return false };
-        let (frame_bytes, next_use) = (self.frame_bytes(), self.look_ahead.views.next_use(page));
+        let (frame_bytes, next_use) = (self.frame_bytes(), self.next_use(page));
         let make = || PageBuffer::mapped(frame_bytes);
         let Some(buffer) = self.frames.begin_load(page, next_use, make) else { return false };
         self.mover.read(page, self.index.meta(page), &slot, buffer, is_ahead);

@@ -1,28 +1,42 @@
-//! One training step, top to bottom. Nothing here opens a file.
+//! One training step, top to bottom: the pass in, the picture, the pass out. Nothing here opens a file.
+//!
+//! A step needs all rows of its view twice and the picture once. So it walks the pages of the view in batches: the pass in
+//! turns the rows of each batch into splats, the pass out turns the gradients of the splats into an update of each batch.
+//! A view whose pages fit into the frames is one batch, which stays pinned between the two passes. A larger view is several
+//! batches; its pass out walks them backwards, since the last batches are still in memory then.
 //!
 //! Invariants: 1. every pinned page is released, whatever happens; 2. a step whose rendering fails, or whose loss is not
-//! finite, changes no row, except that events which were due on the pinned pages are applied; 3. the result is the same
-//! for any number of threads and frames.
+//! finite, changes no row, except that events which were due on the pages are applied; 3. the result is the same for any
+//! number of threads and frames, and for any cut into batches; 4. an error after the first update of several batches is
+//! [`TrainError::Torn`]: the pages in memory belong to no step then.
 
-use super::batch::{gather, update};
+use super::batch::{gather, gather_listed, update};
 use super::error::TrainError;
 use super::pages::PagedScene;
 use super::working_set::WorkingSet;
-use crate::render::{LossOptions, LossValue, RenderError, RenderOptions, Renderer};
+use crate::base::ids::PageNo;
+use crate::optim::deferred::StepCounts;
+use crate::paging::batches::UseInStep;
+use crate::paging::error::PagingError;
+use crate::paging::pinned::PinnedPage;
+use crate::render::{LossOptions, LossValue, RenderOptions, Renderer, RowBatches};
 use crate::scene::camera::Camera;
 use crate::scene::image::Target;
+use std::collections::VecDeque;
 
 /// What a step did.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct StepOutcome {
     /// Loss of the view.
     pub loss: LossValue,
-    /// Rows in the working set.
+    /// Rows of the view.
     pub rows: usize,
-    /// Rows in the pinned pages.
+    /// Rows in the pages of the view.
     pub rows_pinned: usize,
-    /// Pages pinned.
+    /// Pages of the view.
     pub pages: usize,
+    /// Batches of the view.
+    pub batches: usize,
     /// Rows that the optimizer rewrote.
     pub updated: u64,
     /// Rows left as they were because a gradient or a result was not finite.
@@ -31,11 +45,12 @@ pub struct StepOutcome {
     pub skipped: bool,
 }
 
-/// Trains on one view at 0-based `step`, whose pages are one batch: pins them, applies the events that are due, gathers
-/// the rows, renders them forward and backward, updates the rows, and releases the pages.
+/// Trains on one view at 0-based `step`: pins its pages batch by batch, applies the events that are due, gathers the rows,
+/// renders them forward and backward, updates the rows, and releases the pages. A batch has at most `pages_most` pages.
 ///
 /// # Errors
-/// Pages could not be had, or the renderer failed; the rows are as they were before the step.
+/// Pages could not be had, or the renderer failed; the rows are as they were before the step, except under
+/// [`TrainError::Torn`].
 pub fn train_step(
     scene: &mut PagedScene,
     working: &mut WorkingSet,
@@ -43,54 +58,180 @@ pub fn train_step(
     (step, camera, target): (u32, &Camera, &Target),
     (render, loss): (&RenderOptions, &LossOptions),
     collects: bool,
+    pages_most: usize,
 ) -> Result<StepOutcome, TrainError> {
-    let mut pages = scene.pager.acquire(step, camera)?;
-    scene.pager.prefetch(step);
-    if let Err(error) = scene.apply_pending(&mut pages) {
-        scene.pager.release(pages);
-        return Err(error);
-    }
-    // Again and again, since what was read and written since may let more be read.
-    scene.pager.prefetch(step);
-    gather(&scene.rules, &pages, step, camera, working);
-    let rendered = differentiate(working, renderer, (camera, target), (render, loss), || scene.pager.prefetch(step));
-    scene.pager.prefetch(step);
-    let rows_pinned = pages.iter().map(|page| page.meta.rows as usize).sum();
-    let rows = working.row_from_working.len();
-    let mut outcome = StepOutcome { rows, rows_pinned, pages: pages.len(), ..StepOutcome::default() };
-    if let Ok(value) = rendered {
-        outcome.loss = value;
-        outcome.skipped = !value.loss.is_finite();
-    }
-    if rendered.is_ok() && !outcome.skipped {
-        let counts = update(scene, &mut pages, step, camera, working, collects);
-        outcome.updated = counts.updated as u64;
-        outcome.rows_skipped = counts.skipped_non_finite as u64;
-    }
-    scene.pager.release(pages);
-    rendered?;
-    Ok(outcome)
+    let pages = scene.pager.begin_view(step, camera)?;
+    let (batches, pinned, outcome) = (Vec::new(), Vec::new(), StepOutcome::default());
+    let mut passes = Passes { scene, working, renderer, step, camera, batches, pinned, outcome };
+    let done = passes
+        .rows_in(pages, pages_most, render)
+        .and_then(|()| passes.picture(target, loss))
+        .and_then(|()| passes.rows_out(collects));
+    passes.release();
+    let outcome = passes.outcome;
+    scene.pager.end_batches();
+    done.map(|()| outcome)
 }
 
-/// Renders the rows of the working set, compares the picture with the photo, and takes the loss back to the gradients of
-/// the rows. `meanwhile` runs while a device may be at work on the picture.
-///
-/// # Errors
-/// Those of the renderer.
-pub(super) fn differentiate(
-    working: &mut WorkingSet,
-    renderer: &mut dyn Renderer,
-    (camera, target): (&Camera, &Target),
-    (render, loss): (&RenderOptions, &LossOptions),
-    meanwhile: impl FnOnce(),
-) -> Result<LossValue, RenderError> {
-    let WorkingSet { columns, gradients, .. } = working;
-    renderer.begin_view(camera, render, 1)?;
-    renderer.rows_in(columns)?;
-    renderer.picture()?;
-    meanwhile();
-    renderer.loss(target, loss)?;
-    renderer.picture_back()?;
-    renderer.rows_out(0, columns, gradients)?;
-    renderer.loss_value()
+/// A batch whose rows are in.
+struct Batch {
+    /// Pages with rows, ascending by id, with the parts of pages that split.
+    pages: Vec<PageNo>,
+    /// As [`WorkingSet::row_from_working`]; empty for the batch that is pinned.
+    row_from_working: Vec<u32>,
+}
+
+/// A step under way.
+struct Passes<'a> {
+    scene: &'a mut PagedScene,
+    working: &'a mut WorkingSet,
+    renderer: &'a mut dyn Renderer,
+    step: u32,
+    camera: &'a Camera,
+    /// Batches that are in and not out yet.
+    batches: Vec<Batch>,
+    /// The pages of the last of them, where they are pinned.
+    pinned: Vec<PinnedPage>,
+    outcome: StepOutcome,
+}
+
+impl Passes<'_> {
+    /// The pass in: brings the pages up to date with all events, batch by batch, and hands their rows to the renderer. The last
+    /// batch stays pinned.
+    fn rows_in(&mut self, pages: Vec<PageNo>, pages_most: usize, render: &RenderOptions) -> Result<(), TrainError> {
+        let mut per_batch = self.scene.pager.pages_per_batch(pages.len()).min(pages_most).max(1);
+        let mut coming = VecDeque::from(pages);
+        if per_batch < coming.len() {
+            self.scene.pager.set_use_in_step(self.step, coming.iter().copied(), UseInStep::Coming);
+        }
+        loop {
+            let batch: Vec<PageNo> = coming.drain(..per_batch.min(coming.len())).collect();
+            self.pinned = self.scene.pager.pin_batch(self.step, &batch)?;
+            self.prefetch(&coming, per_batch);
+            if let Err(error) = self.scene.apply_pending(&mut self.pinned) {
+                // Parts of pages that split found no frame: a smaller batch leaves more of them.
+                let pages: Vec<PageNo> = self.pinned.iter().map(|pinned| pinned.page).collect();
+                if !matches!(error, TrainError::Paging(PagingError::WorkingSet { .. })) || pages.len() < 2 {
+                    return Err(error);
+                }
+                self.release();
+                per_batch = per_batch.min(pages.len()) / 2;
+                pages.into_iter().rev().for_each(|page| coming.push_front(page));
+                self.scene.pager.set_use_in_step(self.step, coming.iter().copied(), UseInStep::Coming);
+                continue;
+            }
+            // Again and again, since what was read and written since may let more be read.
+            self.prefetch(&coming, per_batch);
+            if self.batches.is_empty() {
+                let batches = if coming.is_empty() { RowBatches::One } else { RowBatches::Several };
+                self.renderer.begin_view(self.camera, render, batches)?;
+            }
+            self.batch_in(&coming)?;
+            if coming.is_empty() {
+                return Ok(());
+            }
+        }
+    }
+
+    /// Hands the rows of the pinned batch to the renderer, and unpins the batch unless it is the last one.
+    fn batch_in(&mut self, coming: &VecDeque<PageNo>) -> Result<(), TrainError> {
+        gather(&self.scene.rules, &self.pinned, self.step, self.camera, self.working);
+        self.renderer.rows_in(&self.working.columns)?;
+        let with_rows = self.pinned.iter().filter(|pinned| pinned.meta.rows > 0);
+        let pages: Vec<PageNo> = with_rows.map(|pinned| pinned.page).collect();
+        self.outcome.rows += self.working.row_from_working.len();
+        self.outcome.rows_pinned += self.pinned.iter().map(|pinned| pinned.meta.rows as usize).sum::<usize>();
+        self.outcome.pages += self.pinned.len();
+        self.outcome.batches += 1;
+        let mut row_from_working = Vec::new();
+        if !coming.is_empty() {
+            row_from_working = self.working.row_from_working.clone();
+            self.scene.pager.set_use_in_step(self.step, pages.iter().copied(), UseInStep::Returning);
+            self.release();
+        }
+        self.batches.push(Batch { pages, row_from_working });
+        Ok(())
+    }
+
+    /// Renders the picture of all splats, compares the picture with the photo, and takes the loss back to the splats.
+    fn picture(&mut self, target: &Target, loss: &LossOptions) -> Result<(), TrainError> {
+        self.renderer.picture()?;
+        // A device may be at work on the picture.
+        self.prefetch_before_last();
+        self.renderer.loss(target, loss)?;
+        self.renderer.picture_back()?;
+        if self.batches.len() > 1 {
+            // A drive that is full is found while the step can still be given up.
+            self.scene.pager.reserve_slots(self.batches.iter().map(|batch| batch.pages.len()).sum())?;
+        }
+        Ok(())
+    }
+
+    /// The pass out: takes the gradients back to the rows, and updates the rows, from the last batch to the first.
+    fn rows_out(&mut self, collects: bool) -> Result<(), TrainError> {
+        let several = self.batches.len() > 1;
+        let mut is_changed = false;
+        while let Some(batch) = self.batches.pop() {
+            let out = self.batch_out(batch, collects);
+            self.release();
+            match out {
+                Ok(is_done) if is_done => return Ok(()),
+                Ok(_) => is_changed = several,
+                Err(error) if is_changed => return Err(TrainError::Torn { source: Box::new(error) }),
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(())
+    }
+
+    /// One batch of the pass out, which is the first of them where its pages are still pinned. Whether the step ends here because
+    /// its loss is not finite.
+    fn batch_out(&mut self, batch: Batch, collects: bool) -> Result<bool, TrainError> {
+        let is_first = self.batches.len() + 1 == self.outcome.batches;
+        if !is_first {
+            self.pinned = self.scene.pager.pin_batch(self.step, &batch.pages)?;
+            self.working.row_from_working = batch.row_from_working;
+            gather_listed(&self.scene.rules, &self.pinned, self.step, self.working);
+        }
+        self.scene.pager.set_use_in_step(self.step, batch.pages, UseInStep::Done);
+        self.prefetch_before_last();
+        let WorkingSet { columns, gradients, .. } = &mut *self.working;
+        self.renderer.rows_out(self.batches.len(), columns, gradients)?;
+        if is_first {
+            self.outcome.loss = self.renderer.loss_value()?;
+            self.outcome.skipped = !self.outcome.loss.loss.is_finite();
+        }
+        self.prefetch_before_last();
+        if self.outcome.skipped {
+            return Ok(true);
+        }
+        let StepCounts { updated, skipped_non_finite } =
+            update(self.scene, &mut self.pinned, self.step, self.camera, self.working, collects);
+        self.outcome.updated += updated as u64;
+        self.outcome.rows_skipped += skipped_non_finite as u64;
+        Ok(false)
+    }
+
+    /// Begins reads during the pass in: of the next batch, or of the next steps where there is none.
+    fn prefetch(&mut self, coming: &VecDeque<PageNo>, per_batch: usize) {
+        if coming.is_empty() && self.batches.is_empty() {
+            return self.scene.pager.prefetch(self.step);
+        }
+        let next: Vec<PageNo> = coming.iter().copied().take(per_batch).collect();
+        self.scene.pager.prefetch_batch(&next);
+    }
+
+    /// Begins reads during the pass out: of the batch before, or of the next steps where there is none.
+    fn prefetch_before_last(&mut self) {
+        // While the last batch is being taken out it is not in the list any more, before that it is.
+        let is_out = usize::from(self.outcome.batches != self.batches.len());
+        match (self.batches.len() + is_out).checked_sub(2) {
+            Some(before) => self.scene.pager.prefetch_batch(&self.batches[before].pages),
+            None => self.scene.pager.prefetch(self.step),
+        }
+    }
+
+    fn release(&mut self) {
+        self.scene.pager.release(std::mem::take(&mut self.pinned));
+    }
 }

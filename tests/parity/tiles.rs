@@ -8,10 +8,11 @@ use gsscale::kernels::isect_emit::{Isect, count, emit};
 use gsscale::kernels::isect_offsets::isect_offsets;
 use gsscale::kernels::project_fwd::Projected;
 use gsscale::kernels::radix_sort::DepthSort;
-use gsscale::kernels::rasterize_bwd::{FootprintGradients, Upstream, fold_rows, rasterize_bwd};
+use gsscale::kernels::rasterize_bwd::{FoldPart, FootprintGradients, Upstream, fold_rows, rasterize_bwd};
 use gsscale::kernels::rasterize_fwd::{Lists, Raster, rasterize_fwd, untile};
 use gsscale::kernels::scan::scan;
 use gsscale::kernels::splats::{Grid, Packed, pack};
+use gsscale::kernels::tile_range::TileRange;
 use gsscale::render::gpu_tiles::{Blend, Pairs, TileStages, splat_bytes};
 use gsscale::render::gpu_tiles_bwd::PictureGradientBuffers;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -202,11 +203,12 @@ fn on_cpu(scene: &Scene, v_rgb: &[f32], v_alpha: Option<&[f32]>) -> Outcome {
     DepthSort::default().sort(&p.depths, &p.radii, &mut order);
     pack(p, &scene.colors, grid, simd, &mut packed);
     let total = scan(&packed.chunk_counts, &mut chunk_offsets);
-    count(&order, &packed, grid, simd, &mut tile_counts);
+    count(&order, &packed, grid, TileRange::all(grid), simd, &mut tile_counts);
     isect_offsets(&tile_counts, grid.tiles(), &mut tile_offsets, &mut cursors);
-    emit(&order, &packed, grid, simd, total, &mut cursors, &mut isects);
+    emit(&order, &packed, grid, TileRange::all(grid), simd, total, &mut cursors, &mut isects);
     let lists = Lists {
         grid,
+        range: TileRange::all(grid),
         splats: &packed.splats,
         isects: &isects,
         tile_offsets: &tile_offsets,
@@ -218,7 +220,7 @@ fn on_cpu(scene: &Scene, v_rgb: &[f32], v_alpha: Option<&[f32]>) -> Outcome {
     rasterize_fwd(&lists, &mut raster);
     rasterize_bwd(&lists, &chunk_offsets, &raster, &Upstream { v_rgb, v_alpha }, &mut partials);
     let mut out = FootprintGradients::default();
-    fold_rows(&packed.counts, &chunk_offsets, &partials, p, &mut out);
+    fold_rows(FoldPart::WHOLE, [&packed.counts; 2], &chunk_offsets, &partials, p, &mut out);
     let pixels = (grid.width * grid.height) as usize;
     let (mut rgb, mut alpha) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
     untile(grid, &raster, &mut rgb, &mut alpha);

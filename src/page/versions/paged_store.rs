@@ -304,11 +304,27 @@ impl PagedStore {
     }
 
     fn grow(&mut self) -> Result<Place, PageError> {
+        self.add_segment()?;
+        // A new segment has at least one slot.
+        self.slots.allocate().ok_or(PageError::Poisoned { cause: "a segment without slots".to_string() })
+    }
+
+    fn add_segment(&mut self) -> Result<(), PageError> {
         let (segment, bytes) = (self.slots.segments(), self.config.layout.segment_bytes());
         self.engine.create_segment(segment, bytes).map_err(|source| PageError::Grow { segment, bytes, source })?;
         self.slots.add_segment();
-        // A new segment has at least one slot.
-        self.slots.allocate().ok_or(PageError::Poisoned { cause: "a segment without slots".to_string() })
+        Ok(())
+    }
+
+    /// Makes sure that `slots` slots are free, in new segments if need be: as many writes will find space on the drive.
+    ///
+    /// # Errors
+    /// The drive has no space for another segment.
+    pub fn reserve(&mut self, slots: u64) -> Result<(), PageError> {
+        while self.slots.free() < slots {
+            self.add_segment()?;
+        }
+        Ok(())
     }
 
     fn take_staging(&mut self) -> PageBuffer {

@@ -5,6 +5,7 @@
 //!
 //! Invariants: 1. the steps are played once for each step of the run; 2. nothing here moves a page.
 
+use super::batches::pages_per_batch;
 use super::cache_model::{CacheModel, STEPS_AHEAD, StepChange};
 use super::views::ViewPlan;
 use crate::base::ids::PageNo;
@@ -73,12 +74,21 @@ impl LookAhead {
             let Some(planned) = self.views.pages(coming) else { break };
             pages.clear();
             pages.extend(planned.iter().copied().filter(|page| index[page.index()].rows > 0));
+            // A step that walks its view in batches ends the look-ahead, with its first batch.
+            let per_batch = pages_per_batch(pages.len(), self.model.frames());
+            let is_cut = per_batch < pages.len();
+            if is_cut {
+                pages.sort_unstable_by_key(|page| index[page.index()].id);
+                pages.truncate(per_batch);
+            }
             let next_use = |page| self.views.next_use_after(page, coming);
-            // A step that does not fit ends the look-ahead; the step itself will say so.
             if self.model.step(coming, &pages, next_use, &mut change).is_err() {
                 break;
             }
             self.admits.extend(change.pairs().map(|(page, leaves)| Admit { page, step: coming, leaves }));
+            if is_cut {
+                break;
+            }
         }
     }
 

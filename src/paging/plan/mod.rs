@@ -1,6 +1,7 @@
 //! What the coming steps need, and what a cache makes of it. Runs and simulations use the same plan, the same model of a cache
 //! and the same order of eviction. No I/O.
 
+pub mod batches;
 pub mod bound;
 pub mod cache_model;
 pub(super) mod look_ahead;

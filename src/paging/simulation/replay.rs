@@ -15,10 +15,12 @@
 
 use crate::base::ids::PageNo;
 use crate::paging::frames::evict::EvictPolicy;
+use crate::paging::plan::batches::walk;
 use crate::paging::plan::cache_model::{CacheModel, STEPS_AHEAD, StepChange, TooFewFrames};
 use crate::paging::plan::steps::Plan;
 use crate::schedule::order::ViewOrder;
 use crate::schedule::visibility::ViewPages;
+use std::collections::VecDeque;
 use std::ops::Range;
 
 /// Steps of the window whose heaviest place is reported.
@@ -42,7 +44,9 @@ pub struct ReplayOptions {
 /// One step.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct StepTraffic {
-    /// Pages needed.
+    /// Batches in which the step walks its view, forwards and back; 1 for a view that fits, 0 for a view without pages.
+    pub batches: u32,
+    /// Pages needed, by each batch.
     pub pages: u32,
     /// Of these, pages that were read for it.
     pub pages_read: u32,
@@ -71,59 +75,105 @@ pub struct Replay {
     pub is_exact: bool,
 }
 
-/// Goes through the steps. `page_bytes` are bytes on disk by page; pages that are needed but not listed count nothing.
+/// Goes through the steps, each in the batches of [`walk`]. `page_bytes` are bytes on disk by page; pages that are needed but
+/// not listed count nothing.
 ///
 /// # Errors
-/// A view needs more pages than there are frames.
+/// There are no frames.
 pub fn replay(
     views: &ViewPages,
     page_bytes: &[u32],
     order: &ViewOrder,
     options: &ReplayOptions,
 ) -> Result<Replay, TooFewFrames> {
-    let mut coming = order.clone();
+    let mut coming = Coming::new(views, order, options);
+    // The unit of the plan and of the model is a batch: a step of one batch is one of them.
     let mut plan = Plan::new(0, options.plan_bytes);
     let cache = CacheModel::new(options.frames, options.policy);
     let mut cache = if options.reads_ahead { cache.reading_ahead() } else { cache };
     let mut change = StepChange::default();
-    // Each page is needed in every epoch, so its next use lies less than two epochs ahead.
-    let reach = 2 * views.views() as u32;
-    let mut is_exact = true;
     let bytes = |pages: &[PageNo]| -> u64 {
         pages.iter().map(|p| page_bytes.get(p.index()).map_or(0, |&b| u64::from(b))).sum()
     };
-    let mut steps = Vec::with_capacity(options.steps as usize);
+    let mut steps = vec![StepTraffic::default(); options.steps as usize];
     let mut frames_left = options.frames;
     let mut frames_freed = vec![0; options.steps as usize];
-    for step in 0..options.steps {
-        // The run ends; what would come after it is not needed by anyone.
-        while plan.steps().end < options.steps.min(step.saturating_add(reach)) {
-            if !plan.push(views.of(coming.view_at(plan.steps().end))) {
-                is_exact = false;
-                break;
-            }
-        }
-        let pages = plan.pages(step);
-        cache.step(step, pages, |page| plan.next_use(page, step + 1), &mut change)?;
+    let mut batch = 0;
+    while coming.extend(&mut plan, batch) {
+        let step = coming.step_of(batch);
+        let pages = plan.pages(batch);
+        cache.step(batch, pages, |page| plan.next_use(page, batch + 1), &mut change)?;
         // As long as there are frames without a page nothing leaves, so that each of these is read for the first time.
         let first = change.admit.len().min(frames_left);
         frames_left -= first;
         for last_use in &change.last_uses {
-            frames_freed[(last_use + 1).max(step.saturating_sub(STEPS_AHEAD)) as usize] += 1;
+            let last_use = coming.step_of(*last_use);
+            let free_from = (last_use + 1).max(step.saturating_sub(STEPS_AHEAD)).min(step);
+            frames_freed[free_from as usize] += 1;
         }
-        steps.push(StepTraffic {
-            pages: pages.len() as u32,
-            pages_read: change.admit.len() as u32,
-            bytes_read: bytes(&change.admit),
-            bytes_first: bytes(&change.admit[..first]),
-            pages_first: first as u32,
-            bytes_written: bytes(&change.evict),
-            frames_freed: 0,
-        });
+        let traffic = &mut steps[step as usize];
+        traffic.batches += 1;
+        traffic.pages += pages.len() as u32;
+        traffic.pages_read += change.admit.len() as u32;
+        traffic.bytes_read += bytes(&change.admit);
+        traffic.bytes_first += bytes(&change.admit[..first]);
+        traffic.pages_first += first as u32;
+        traffic.bytes_written += bytes(&change.evict);
         plan.pop();
+        batch += 1;
     }
     steps.iter_mut().zip(frames_freed).for_each(|(traffic, frames)| traffic.frames_freed = frames);
-    Ok(Replay { steps, views: views.views(), is_exact })
+    Ok(Replay { steps, views: views.views(), is_exact: coming.is_exact })
+}
+
+/// The batches that are still to be planned, in order.
+struct Coming<'a> {
+    views: &'a ViewPages,
+    order: ViewOrder,
+    options: &'a ReplayOptions,
+    /// The step of each batch that is planned, from the batch `first` on.
+    step_from_batch: Vec<u32>,
+    /// Batches of the step that is planned now and are not planned yet.
+    waiting: VecDeque<Vec<PageNo>>,
+    next_step: u32,
+    /// Whether every next use was known whenever a page left.
+    is_exact: bool,
+}
+
+impl<'a> Coming<'a> {
+    fn new(views: &'a ViewPages, order: &ViewOrder, options: &'a ReplayOptions) -> Coming<'a> {
+        let (step_from_batch, waiting) = (Vec::new(), VecDeque::new());
+        Coming { views, order: order.clone(), options, step_from_batch, waiting, next_step: 0, is_exact: true }
+    }
+
+    fn step_of(&self, batch: u32) -> u32 {
+        self.step_from_batch[batch as usize]
+    }
+
+    /// Plans what fits of the next two epochs after `batch`: each page is needed in every epoch, so its next use lies less than two
+    /// epochs ahead. `false` when no batch is left.
+    fn extend(&mut self, plan: &mut Plan, batch: u32) -> bool {
+        let now = self.step_from_batch.get(batch as usize).copied().unwrap_or(self.next_step);
+        // The run ends; what would come after it is not needed by anyone.
+        let reach = self.options.steps.min(now.saturating_add(2 * self.views.views() as u32));
+        loop {
+            if let Some(pages) = self.waiting.front() {
+                if !plan.push(pages) {
+                    self.is_exact = false;
+                    break;
+                }
+                self.waiting.pop_front();
+                self.step_from_batch.push(self.next_step - 1);
+            } else if self.next_step < reach {
+                let pages = self.views.of(self.order.view_at(self.next_step));
+                self.waiting.extend(walk(pages, self.options.frames).map(<[PageNo]>::to_vec));
+                self.next_step += 1;
+            } else {
+                break;
+            }
+        }
+        !plan.steps().is_empty()
+    }
 }
 
 /// What a drive does and how long a step takes without it.

@@ -1,0 +1,112 @@
+//! Ranges of tiles: the parts in which a picture is blended whose lists of intersections are too long to be made at once.
+//!
+//! Invariants: 1. a range is a number of whole tile columns, or a part of one column, so the intersections of a Gaussian with
+//! the tiles of a range follow each other in emit order (tiles column by column); 2. the ranges of a picture are disjoint,
+//! cover it, and come in that order, so sums over the intersections of a Gaussian can be carried from range to range; 3. a range
+//! of several tiles has no more intersections than asked for; a range of one tile may have more.
+
+use super::splats::Grid;
+
+/// Tiles that are blended together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TileRange {
+    /// First tile column, and one past the last.
+    pub columns: [u16; 2],
+    /// First tile row, and one past the last; all rows unless the range is a part of one column.
+    pub rows: [u16; 2],
+}
+
+impl TileRange {
+    /// All tiles.
+    pub fn all(grid: Grid) -> TileRange {
+        TileRange { columns: [0, grid.tiles_x as u16], rows: [0, grid.tiles_y as u16] }
+    }
+
+    /// Whether these are all tiles.
+    pub fn is_all(&self, grid: Grid) -> bool {
+        *self == TileRange::all(grid)
+    }
+
+    /// Whether a tile, by its number in the picture, belongs to the range.
+    #[inline(always)]
+    pub fn contains(&self, grid: Grid, tile: usize) -> bool {
+        let (x, y) = grid.position(tile);
+        let within = |at: u32, [first, end]: [u16; 2]| (u32::from(first)..u32::from(end)).contains(&at);
+        within(x, self.columns) && within(y, self.rows)
+    }
+
+    /// Cuts a picture into ranges of at most `isects_most` intersections. `tile_offsets` has one entry more than tiles: the
+    /// intersections of a tile are the difference of two.
+    pub fn cut(grid: Grid, tile_offsets: &[u64], isects_most: u64) -> Vec<TileRange> {
+        let of_tile = |x: u32, y: u32| {
+            let tile = y as usize * grid.tiles_x as usize + x as usize;
+            tile_offsets[tile + 1] - tile_offsets[tile]
+        };
+        let all_rows = [0, grid.tiles_y as u16];
+        let (mut ranges, mut begun, mut held) = (Vec::new(), 0u32, 0u64);
+        for x in 0..grid.tiles_x {
+            let of_column: u64 = (0..grid.tiles_y).map(|y| of_tile(x, y)).sum();
+            if held + of_column <= isects_most {
+                held += of_column;
+                continue;
+            }
+            if begun < x {
+                ranges.push(TileRange { columns: [begun as u16, x as u16], rows: all_rows });
+            }
+            if of_column <= isects_most {
+                (begun, held) = (x, of_column);
+                continue;
+            }
+            let (mut first, mut held_here) = (0u32, 0u64);
+            for y in 0..grid.tiles_y {
+                let isects = of_tile(x, y);
+                if y > first && held_here + isects > isects_most {
+                    ranges.push(TileRange { columns: [x as u16, x as u16 + 1], rows: [first as u16, y as u16] });
+                    (first, held_here) = (y, 0);
+                }
+                held_here += isects;
+            }
+            ranges.push(TileRange { columns: [x as u16, x as u16 + 1], rows: [first as u16, grid.tiles_y as u16] });
+            (begun, held) = (x + 1, 0);
+        }
+        if begun < grid.tiles_x {
+            ranges.push(TileRange { columns: [begun as u16, grid.tiles_x as u16], rows: all_rows });
+        }
+        ranges
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::rng::{Purpose, Stream};
+
+    #[test]
+    fn ranges_cover_every_tile_once_in_column_order_and_keep_their_limit() {
+        let mut draws = Stream::new(23, Purpose::Test, 0, 0);
+        for (width, height) in [(1, 1), (16, 200), (200, 16), (147, 93), (0, 0)] {
+            let grid = Grid::new(width, height);
+            let mut tile_offsets = vec![0];
+            for _ in 0..grid.tiles() {
+                tile_offsets.push(tile_offsets[tile_offsets.len() - 1] + draws.below(100));
+            }
+            let isects = |tile: usize| tile_offsets[tile + 1] - tile_offsets[tile];
+            for most in [0, 1, 50, 120, 700, u64::MAX] {
+                let ranges = TileRange::cut(grid, &tile_offsets, most);
+                let mut seen = Vec::new();
+                for range in &ranges {
+                    assert!(range.rows == [0, grid.tiles_y as u16] || range.columns[1] == range.columns[0] + 1);
+                    let tiles: Vec<usize> = (0..grid.tiles()).filter(|&tile| range.contains(grid, tile)).collect();
+                    let held: u64 = tiles.iter().map(|&tile| isects(tile)).sum();
+                    assert!(!tiles.is_empty() && (held <= most || tiles.len() == 1), "{held} of {most}");
+                    let mut in_order: Vec<(u32, u32)> = tiles.iter().map(|&tile| grid.position(tile)).collect();
+                    in_order.sort_unstable();
+                    seen.extend(in_order);
+                }
+                assert!(seen.is_sorted() && seen.len() == grid.tiles(), "{width}x{height} in ranges of {most}");
+                assert_eq!(ranges.len() <= 1, most == u64::MAX || grid.tiles() <= 1 || ranges.len() == 1);
+            }
+            assert!(TileRange::cut(grid, &tile_offsets, u64::MAX).iter().all(|range| range.is_all(grid)));
+        }
+    }
+}
