@@ -238,7 +238,7 @@ fn bits_of_steps(scene: &Path, options: &GpuOptions, capacity: u32) -> Option<(V
         bits.extend(working.gradients.radii.as_flattened());
         bits.extend([done.loss.loss.to_bits() as u32, (done.loss.loss.to_bits() >> 32) as u32]);
     }
-    Some((bits, isects, renderer.frames_again()))
+    Some((bits, isects, renderer.frames_rerecorded()))
 }
 
 /// Cuts and waits are how a step is carried out, not what it computes: the same bits on whole steps.

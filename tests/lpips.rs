@@ -128,7 +128,7 @@ fn wrong_files_of_weights_are_named() {
     let refused = |path: &Path| read_lpips(path, SimdPath::best()).err().expect("refused").to_string();
     assert!(refused(&path).contains("check the path"));
     std::fs::write(&path, b"PK\x03\x04 a pickle").unwrap();
-    assert!(refused(&path).contains("no safetensors file"));
+    assert!(refused(&path).contains("not a safetensors file"));
     let whole = tensors(ALEX);
     write(&path, &whole[..whole.len() - 1]);
     assert!(refused(&path).contains("lin4.model.1.weight: is missing"));
@@ -145,5 +145,5 @@ fn wrong_files_of_weights_are_named() {
     let mut bytes = std::fs::read(&path).unwrap();
     bytes.truncate(bytes.len() / 2);
     std::fs::write(&path, bytes).unwrap();
-    assert!(refused(&path).contains("no safetensors file"));
+    assert!(refused(&path).contains("not a safetensors file"));
 }

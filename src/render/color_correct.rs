@@ -1,17 +1,17 @@
-//! PSNR after the render's colours were fitted to the photo's: roughly what a model of exposure and white balance would
-//! reach. It is another measure than PSNR, by a decibel or more on drone photos, so whoever reports it names it; several
-//! papers on city scenes report nothing else.
+//! Colour-corrected PSNR: PSNR after the colours of the render were fitted to the photo. The figure is roughly what a
+//! model of exposure and white balance would reach. It differs from PSNR by a decibel or more on drone photos, so every
+//! report names the fit. Several papers on city scenes report this figure only.
 //!
-//! Two fits are in use, both from MultiNeRF (github.com/google-research/multinerf), both of one photo at a time:
-//! - [`ColorCorrect::Affine`], of RawNeRF and gsplat's `color_correct_affine`: per channel, (a, b) of least
-//!   sum (a photo + b - render)^2, undone as (render - b) / a. A render that has little to do with its photo has a small
-//!   slope, whose undoing magnifies its errors: there the figure is below PSNR;
-//! - [`ColorCorrect::Quadratic`], of Mip-NeRF 360 and Zip-NeRF, nerfstudio's and gsplat's `color_correct`: each channel of
-//!   the photo as a quadratic polynomial of the render's three (10 terms), by least squares over pixels that are not
-//!   saturated, five times, each on the result of the last.
+//! The field uses two fits, both from MultiNeRF (github.com/google-research/multinerf), both of one photo at a time:
+//! - [`ColorCorrect::Affine`] (RawNeRF; `color_correct_affine` of gsplat): per channel, the (a, b) that minimise
+//!   sum (a photo + b - render)^2, inverted as (render - b) / a. A render that hardly resembles its photo has a small
+//!   slope a, and the inversion magnifies the errors: such a figure is below PSNR;
+//! - [`ColorCorrect::Quadratic`] (Mip-NeRF 360, Zip-NeRF; `color_correct` of nerfstudio and gsplat): each channel of
+//!   the photo as a quadratic polynomial of the three channels of the render (10 terms), by least squares over
+//!   unsaturated pixels, in five rounds that each start from the result of the last.
 //!
-//! Invariants: 1. renders are cut to 0..1 before and after; 2. pixels with mask byte 0 take no part; 3. sums are f64, in
-//! the order of the rows: the same bits for any number of threads; 4. NaN at a pixel that counts gives NaN.
+//! Invariants: 1. renders are clamped to 0..1 before and after; 2. pixels with mask byte 0 are ignored; 3. sums are f64
+//! in row order, so the bits are the same for any number of threads; 4. NaN at an unmasked pixel gives NaN.
 
 use crate::scene::image::{Image, Target};
 use rayon::prelude::*;
@@ -19,22 +19,22 @@ use serde::{Deserialize, Serialize};
 
 /// Terms of a quadratic polynomial of three variables.
 const TERMS: usize = 10;
-/// Least variance and slope that are divided by.
-const LEAST: f64 = 1e-8;
-/// Values nearer to 0 or 1 than this are saturated: half a step of 8 bits.
-const SATURATED: f64 = 0.5 / 255.0;
-/// How often the quadratic is fitted.
+/// Smallest variance or slope to divide by.
+const DIVISOR_MIN: f64 = 1e-8;
+/// A value is saturated when it is nearer to 0 or 1 than this: half a step of 8 bits.
+const SATURATION_MARGIN: f64 = 0.5 / 255.0;
+/// Rounds of the quadratic fit.
 const ROUNDS: usize = 5;
-/// Share of a term's own square below which what is left of it after the other terms is rounding.
-const RANK: f64 = 1e-12;
+/// Relative size of a Cholesky pivot below which the pivot is rounding error: the term depends on earlier terms.
+const PIVOT_MIN: f64 = 1e-12;
 
-/// How colours are fitted.
+/// The colour fit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ColorCorrect {
-    /// Per channel, slope and offset.
+    /// Slope and offset per channel.
     Affine,
-    /// All channels, a quadratic polynomial.
+    /// A quadratic polynomial of all three channels.
     Quadratic,
 }
 
@@ -55,18 +55,18 @@ impl ColorCorrect {
 
 type Rgb = [f64; 3];
 
-/// PSNR of the render after its colours were fitted to the photo's, dB; infinity without any difference, NaN when no
-/// pixel counts.
+/// PSNR of the render after the colours were fitted to the photo, dB. Infinity when the fitted render equals the photo,
+/// NaN when every pixel is masked.
 ///
 /// # Panics
 /// When picture and target differ in size.
-pub fn color_corrected_psnr(image: &Image, target: &Target, how: ColorCorrect) -> f64 {
+pub fn color_corrected_psnr(image: &Image, target: &Target, fit: ColorCorrect) -> f64 {
     assert_eq!((image.width, image.height), (target.width, target.height), "picture and photo differ in size");
     let rows = pairs(image, target);
     if rows.iter().any(|row| row.iter().any(|(render, _)| render.iter().any(|x| x.is_nan()))) {
         return f64::NAN;
     }
-    let corrected = match how {
+    let corrected = match fit {
         ColorCorrect::Affine => affine(&rows),
         ColorCorrect::Quadratic => quadratic(&rows),
     };
@@ -78,7 +78,7 @@ pub fn color_corrected_psnr(image: &Image, target: &Target, how: ColorCorrect) -
     if mse == 0.0 { f64::INFINITY } else { -10.0 * libm::log10(mse) }
 }
 
-/// Pixels that count, row by row: render (cut to 0..1) and photo.
+/// Unmasked pixels by picture row: (render clamped to 0..1, photo).
 fn pairs(image: &Image, target: &Target) -> Vec<Vec<(Rgb, Rgb)>> {
     let (width, pixels) = (image.width as usize, image.pixels());
     let counts = |i: usize| target.mask.as_ref().is_none_or(|mask| mask[i] != 0);
@@ -90,7 +90,7 @@ fn pairs(image: &Image, target: &Target) -> Vec<Vec<(Rgb, Rgb)>> {
     rows.map(|row| (row * width..(row + 1) * width).filter(|&i| counts(i)).map(pair).collect()).collect()
 }
 
-/// Sums over pixels in parallel, the rows' sums in their order; `renders` stand in for those of `rows`.
+/// Sums `of` over all pixels: rows in parallel, then the row sums in order. `renders` replaces the renders in `rows`.
 fn sum<const N: usize>(
     renders: &[Vec<Rgb>],
     rows: &[Vec<(Rgb, Rgb)>],
@@ -120,29 +120,29 @@ fn affine(rows: &[Vec<(Rgb, Rgb)>]) -> Vec<Vec<Rgb>> {
     let of = |c: usize| {
         let [n, photo, render] = sum(&renders, rows, |r, (_, p)| [1.0, p[c], r[c]]);
         let (photo, render) = (photo / n, render / n);
-        // About the means, so that nothing cancels.
+        // Centred on the means, which avoids cancellation.
         let [square, product] = sum(&renders, rows, |r, (_, p)| {
             let p = p[c] - photo;
             [p * p, p * (r[c] - render)]
         });
-        let slope = product / n / (square / n).max(LEAST);
+        let slope = product / n / (square / n).max(DIVISOR_MIN);
         (slope, render - slope * photo)
     };
     let fits = [of(0), of(1), of(2)];
     map(&renders, |render| {
         std::array::from_fn(|c| {
             let (slope, offset) = fits[c];
-            ((render[c] - offset) / if slope.abs() < LEAST { 1.0 } else { slope }).clamp(0.0, 1.0)
+            ((render[c] - offset) / if slope.abs() < DIVISOR_MIN { 1.0 } else { slope }).clamp(0.0, 1.0)
         })
     })
 }
 
 fn quadratic(rows: &[Vec<(Rgb, Rgb)>]) -> Vec<Vec<Rgb>> {
-    let is_unsaturated = |x: f64| (SATURATED..=1.0 - SATURATED).contains(&x);
+    let is_unsaturated = |x: f64| (SATURATION_MARGIN..=1.0 - SATURATION_MARGIN).contains(&x);
     let mut fitted = renders(rows);
     for _ in 0..ROUNDS {
         let of = |c: usize| {
-            // The upper triangle of the normal equations, row after row, and their right-hand side at its end.
+            // The upper triangle of the normal equations, row by row, then the right-hand side.
             const SUMS: usize = TERMS * (TERMS + 1) / 2 + TERMS;
             let sums: [f64; SUMS] = sum(&fitted, rows, |render, (first, photo)| {
                 if ![first[c], render[c], photo[c]].into_iter().all(is_unsaturated) {
@@ -172,14 +172,14 @@ fn quadratic(rows: &[Vec<(Rgb, Rgb)>]) -> Vec<Vec<Rgb>> {
     fitted
 }
 
-/// rr, rg, rb, gg, gb, bb, r, g, b, 1.
+/// Terms of the polynomial: rr, rg, rb, gg, gb, bb, r, g, b, 1.
 fn terms([r, g, b]: &Rgb) -> [f64; TERMS] {
     [r * r, r * g, r * b, g * g, g * b, b * b, *r, *g, *b, 1.0]
 }
 
-/// Weights of least squares from the normal equations, by Cholesky's decomposition. The constant comes first and then the
-/// linear terms; a term that the ones before it explain (a gray picture has such) gets no weight, which changes no
-/// fitted value.
+/// Least-squares weights from the normal equations, by Cholesky decomposition. The order of elimination is the
+/// constant, the linear terms, the quadratic terms. A term that depends linearly on earlier terms (as in a gray
+/// picture) gets weight 0, which changes no fitted value.
 fn solve(upper: &[f64], right: &[f64]) -> [f64; TERMS] {
     let at = |i: usize, j: usize| {
         let (i, j) = (TERMS - 1 - i.max(j), TERMS - 1 - i.min(j));
@@ -191,7 +191,7 @@ fn solve(upper: &[f64], right: &[f64]) -> [f64; TERMS] {
         for j in 0..=i {
             let rest = at(i, j) - (0..j).map(|k| lower[i][k] * lower[j][k]).sum::<f64>();
             lower[i][j] = match i == j {
-                true if rest > RANK * at(i, i) => rest.sqrt(),
+                true if rest > PIVOT_MIN * at(i, i) => rest.sqrt(),
                 false if lower[j][j] > 0.0 => rest / lower[j][j],
                 _ => 0.0,
             };

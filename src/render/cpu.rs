@@ -1,7 +1,9 @@
-//! The stages in order on the CPU, forward and backward, with the memory that they share.
+//! [`CpuRenderer`]: the stages of a view on the CPU, forward and backward, and the memory that the stages share.
 //!
-//! Invariants: 1. the columns of a view are allocated only when a view is larger than all before; 2. the result has the
-//! same bits for any number of threads, for any cut of the rows into batches, and on the AVX2 and AVX-512 paths.
+//! Not here: the computation of each stage (`crate::kernels`), and the order of calls (`super::sequence`).
+//!
+//! Invariants: 1. buffers grow only when a view is larger than all views before; 2. the result has the same bits for
+//! any number of threads, for any split of the rows into batches, and on the AVX2 and AVX-512 paths.
 
 use super::sequence::{Sequence, ViewOptions};
 use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer};
@@ -28,7 +30,7 @@ use std::time::Instant;
 /// Counters of the last view.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RenderStats {
-    /// Rows that were drawn.
+    /// Visible rows.
     pub visible: u64,
     /// Intersections of rows and tiles.
     pub isects: u64,
@@ -43,7 +45,7 @@ struct StageClock {
 }
 
 impl StageClock {
-    /// Runs the stage of this name and adds its time.
+    /// Runs `work` and adds the elapsed time to `stage`.
     fn time<T>(&mut self, stage: &str, work: impl FnOnce() -> T) -> T {
         let start = Instant::now();
         let out = work();
@@ -53,8 +55,8 @@ impl StageClock {
         out
     }
 
-    /// Forgets the times of the stages of these names, which run again.
-    fn restart(&mut self, stages: &[&str]) {
+    /// Sets the times of `stages` to zero, before the stages run again.
+    fn reset(&mut self, stages: &[&str]) {
         let stages = STAGES.iter().zip(&mut self.seconds).filter(|(s, _)| stages.contains(&s.name));
         stages.for_each(|(_, seconds)| *seconds = 0.0);
     }
@@ -88,7 +90,7 @@ pub struct CpuRenderer {
 }
 
 impl CpuRenderer {
-    /// A renderer without memory yet.
+    /// A renderer that holds no memory yet.
     pub fn new() -> Self {
         CpuRenderer::default()
     }
@@ -121,12 +123,12 @@ impl CpuRenderer {
         &self.alpha
     }
 
-    /// What the last picture left of each tile.
+    /// Per-tile results of the last picture.
     pub fn raster(&self) -> &Raster {
         &self.raster
     }
 
-    /// Footprints of the last view, one entry per row of all its batches.
+    /// Footprints of the last view, one entry per row over all batches.
     pub fn projected(&self) -> &Projected {
         &self.projected
     }
@@ -139,7 +141,7 @@ impl CpuRenderer {
         fold_rows(&self.packed.counts, &self.chunk_offsets, &self.partials, &self.projected, &mut self.footprints);
     }
 
-    /// Seconds that each stage took in the last view, in the order of [`STAGES`] (0 for those that did not run).
+    /// Seconds of each stage in the last view, in the order of [`STAGES`]; 0 for a stage that did not run.
     pub fn stage_seconds(&self) -> impl Iterator<Item = (&'static str, f64)> + '_ {
         STAGES.iter().zip(self.clock.seconds).map(|(stage, seconds)| (stage.name, seconds))
     }
@@ -149,7 +151,7 @@ impl CpuRenderer {
         self.stats
     }
 
-    /// Bytes that this renderer holds now.
+    /// Host memory that this renderer holds, bytes.
     pub fn scratch_bytes(&self) -> u64 {
         let p = &self.projected;
         let f = &self.footprints;
@@ -241,15 +243,15 @@ impl Renderer for CpuRenderer {
         self.sequence.loss(target)?;
         let Self { clock, image_loss, image, gradient: PictureGradient { v_rgb, v_alpha }, .. } = self;
         *v_alpha = None;
-        clock.restart(&["image_loss"]);
+        clock.reset(&["image_loss"]);
         let value = clock.time("image_loss", || image_loss.value_and_gradient(image, target, options, v_rgb));
         self.loss_value = Some(value);
         Ok(())
     }
 
     fn picture_gradient(&mut self) -> Result<&mut PictureGradient, RenderError> {
-        let (view, was_there) = self.sequence.picture_gradient()?;
-        if !was_there {
+        let (view, had_gradient) = self.sequence.picture_gradient()?;
+        if !had_gradient {
             self.gradient.reset(view.camera.pixels());
         }
         Ok(&mut self.gradient)
@@ -259,7 +261,7 @@ impl Renderer for CpuRenderer {
         let ViewOptions { camera, options } = self.sequence.picture_back(Some(&self.gradient))?;
         let grid = Grid::new(camera.width, camera.height);
         let mut clock = std::mem::take(&mut self.clock);
-        clock.restart(&["rasterize_bwd", "sh_bwd", "project_bwd"]);
+        clock.reset(&["rasterize_bwd", "sh_bwd", "project_bwd"]);
         clock.time("rasterize_bwd", || self.rasterize_back(grid, &options));
         self.clock = clock;
         Ok(())
@@ -302,7 +304,7 @@ mod tests {
     use crate::kernels::image_loss::SsimPadding;
     use crate::scene::columns::Column;
 
-    /// `rows` Gaussians in front of a camera, some of them large, opaque, behind it or off the picture.
+    /// `rows` Gaussians in front of a camera; some are large, opaque, behind the camera or off the picture.
     fn scene(rows: usize, width: u32, height: u32) -> (Columns, Camera) {
         let mut draws = Stream::new(11, Purpose::Test, rows as u64, 0);
         let mut c = Columns::zeros(rows, 2);
@@ -326,7 +328,7 @@ mod tests {
         PictureGradient { v_rgb, v_alpha: Some((0..camera.pixels()).map(|_| draws.normal() as f32).collect()) }
     }
 
-    /// Bits of image, alpha and all gradients on a path with a number of threads.
+    /// Bits of image, alpha and all gradients for an instruction path and a number of threads.
     fn render_bits(rows: &Columns, camera: &Camera, simd: SimdPath, threads: usize) -> Vec<Vec<u32>> {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
@@ -363,7 +365,8 @@ mod tests {
         part
     }
 
-    /// As [`render_bits`] from a loss, with the rows in batches that end at `ends`, which come out backwards.
+    /// As [`render_bits`] from a loss, with the rows in batches that end at `ends`; `rows_out` takes the last batch
+    /// first.
     fn bits_of_batches(renderer: &mut CpuRenderer, rows: &Columns, camera: &Camera, ends: &[usize]) -> Vec<Vec<u32>> {
         let options = RenderOptions { sh_degree: 2, background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
         let firsts = std::iter::once(&0).chain(ends);
@@ -394,7 +397,7 @@ mod tests {
 
     #[test]
     fn batches_do_not_change_a_bit() {
-        // Batches that are no multiples of blocks or chunks, one row, and nothing; larger and smaller views in turn.
+        // Batch sizes: no multiple of a block or chunk, one row, and zero rows. A larger view, then a smaller one.
         let mut renderer = CpuRenderer::new();
         for (n, cuts) in
             [(20_000, vec![vec![9_001], vec![1, 1, 4_096, 13_313], vec![0, 20_000]]), (900, vec![vec![450]])]
@@ -419,7 +422,7 @@ mod tests {
         let is_order = |result: Result<(), RenderError>| matches!(result, Err(RenderError::OutOfOrder { .. }));
         let mut renderer = CpuRenderer::new();
         assert!(is_order(renderer.rows_in(&rows)) && is_order(renderer.picture()));
-        let none = RenderError::Batches { asked: 0, most: usize::MAX };
+        let none = RenderError::Batches { asked: 0, max: usize::MAX };
         assert_eq!(renderer.begin_view(&camera, &options, 0), Err(none));
         renderer.begin_view(&camera, &options, 2).unwrap();
         renderer.rows_in(&rows).unwrap();
@@ -433,14 +436,14 @@ mod tests {
         renderer.picture_back().unwrap();
         renderer.rows_out(1, &rows, &mut grads).unwrap();
         let want = grads.clone();
-        assert!(is_order(renderer.rows_out(1, &rows, &mut grads)), "this batch is out");
-        assert!(is_order(renderer.picture_gradient().map(|_| ())), "the other one is not");
+        assert!(is_order(renderer.rows_out(1, &rows, &mut grads)), "this batch was processed already");
+        assert!(is_order(renderer.picture_gradient().map(|_| ())), "the other batch is still due");
         let other = RenderError::BatchRows { batch: 0, given: 1 };
         assert_eq!(renderer.rows_out(0, &part(&rows, 0..1), &mut grads), Err(other));
         let beyond = RenderError::BatchRows { batch: 2, given: 600 };
         assert_eq!(renderer.rows_out(2, &rows, &mut grads), Err(beyond));
         renderer.rows_out(0, &rows, &mut grads).unwrap();
-        // The way back may be gone again, from the same gradient.
+        // The backward pass may run again, from the same gradient.
         renderer.picture_back().unwrap();
         renderer.rows_out(1, &rows, &mut grads).unwrap();
         assert!(grads.columns == want.columns && grads.radii == want.radii);
@@ -467,7 +470,7 @@ mod tests {
         let mut grads = Gradients::default();
         for (n, width, height) in [(0, 33, 17), (50, 1, 1), (50, 16, 16), (0, 0, 0)] {
             let (mut rows, camera) = scene(n, width, height);
-            // All behind the camera.
+            // All rows behind the camera.
             rows.means.iter_mut().for_each(|x| *x -= 10.0);
             renderer.draw(&rows, &camera, &options).unwrap();
             let pixels = camera.pixels();

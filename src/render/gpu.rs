@@ -1,37 +1,38 @@
-//! The stages in order on a GPU, forward and backward, on the rows of one view at a time.
+//! [`GpuRenderer`]: the stages of a view on a GPU, forward and backward, one view at a time.
 //!
-//! Not here: the stages themselves (`gpu_rows`, `gpu_tiles`, `gpu_loss`), the device and its memory (`crate::gpu`).
+//! Not here: the recording of each stage (`gpu_rows`, `gpu_tiles`, `gpu_tiles_bwd`, `gpu_loss`), the device and its
+//! memory (`crate::gpu`).
 //!
-//! What crosses the bus in a step, with n rows in view, p pixels and all colour bands: 236 n bytes of values and 4 p of
-//! the photo up, 236 n of gradients and 16 n for densification down, and some KiB of counts and uniforms. Less is not
-//! possible while the truth of every value is on the host (the photo's mask could be left out where there is none).
-//! What waits for what:
+//! # Bus traffic
+//! A step with n rows in view, p pixels and all colour bands uploads 236 n bytes of values and 4 p bytes of photo. The
+//! step downloads 236 n bytes of gradients and 16 n bytes for densification. Counts and uniforms add some KiB. While
+//! the host holds the master copy of every value, only the mask byte of photos without a mask could be saved.
 //!
-//! | stage | crosses | while |
+//! | stage | transfer | device work at the same time |
 //! | --- | --- | --- |
-//! | `rows_in` | geometry up (44 n) | nothing: it is the first thing that the device needs |
-//! | `rows_in` | colours up (192 n) | the device projects and sorts |
-//! | `loss` | photo up (4 p), commands of the loss | the device finishes the colours, makes the lists and blends |
-//! | `picture_back` | two counts down, commands of the backward stages | the device computes the loss |
-//! | `rows_out` | gradients of colours down (192 n) | the device goes from splats to geometry |
-//! | `rows_out` | gradients of geometry down (60 n) | nothing: they are the last thing that the device makes |
+//! | `rows_in` | geometry up (44 n) | none: the first stage needs the geometry |
+//! | `rows_in` | colours up (192 n) | projection and depth sort |
+//! | `loss` | photo up (4 p), commands of the loss | colours, tile lists, blending |
+//! | `picture_back` | two counts down, commands of the backward stages | loss |
+//! | `rows_out` | gradients of colours down (192 n) | gradients of splats to gradients of geometry |
+//! | `rows_out` | gradients of geometry down (60 n) | none: the last stage writes these gradients |
 //!
-//! Five submissions carry this: two of `rows_in` and `picture`, which share the second; one of `loss`; two of
-//! `picture_back` and `rows_out`, which share the first. `picture_back` waits for the two counts, `rows_out` for the
-//! gradients. [`Renderer::picture_mut`] and [`Renderer::picture_gradient`] cost their callers 12 p down and 12 p up, each
-//! with a submission and a wait of its own.
-//! The stages hold one batch: sorting needs the geometry of all rows, so it is recorded with that of the only batch.
+//! A step has five submissions: two in `rows_in` and `picture`, which share the second; one in `loss`; two in
+//! `picture_back` and `rows_out`, which share the first. `picture_back` waits for the two counts, `rows_out` waits for
+//! the gradients. [`Renderer::picture_mut`] and [`Renderer::picture_gradient`] each add 12 p bytes down, 12 p bytes up,
+//! one submission and one wait.
 //!
-//! So the device waits for the host between two steps only. There the next step's values are not known yet: each row in
-//! view was just rewritten by the optimizer, and the cull of the next view reads the means that it wrote. The rows of the
-//! next view that this one does not see are known (their values are a function of the stored state and the step), but
-//! which these are follows from a cull too; that, and keeping rows on the device, is for the device tier. The next photo
-//! is known, but has its place above, where it delays nothing.
+//! A view has one batch, because the depth sort needs the geometry of all rows and is recorded in `rows_in`.
 //!
-//! Invariants: 1. only the rows of the last view, its lists and its picture are on the device; 2. the same input gives
-//! the same bits on the same device; 3. nothing is returned that was made of buffers that were too small: such a frame
-//! and its loss are recorded again with larger ones; 4. after an error of the device there is no view until the next
-//! `begin_view`.
+//! The device is therefore idle only between two steps. The optimizer has just rewritten every row in view, and the
+//! cull of the next view reads the new means, so the next upload cannot start earlier. Rows of the next view that the
+//! current view does not see have known values (a function of the stored state and the step), but their list also needs
+//! the cull. Early upload of those rows belongs to a future device tier that keeps rows on the device. The next photo
+//! is known, but its upload in `loss` already costs no time.
+//!
+//! Invariants: 1. the device holds the rows, lists and picture of the last view only; 2. the same input gives the same
+//! bits on the same device; 3. no result comes from buffers that were too small: the frame and its loss are recorded
+//! again with larger buffers; 4. after a device error there is no view until the next `begin_view`.
 
 use super::gpu_loss::{LossStage, value};
 use super::gpu_rows::{DeviceColumns, FOOTPRINT_BYTES, RowStages, band_into_sh_n};
@@ -48,32 +49,32 @@ use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
 
-/// Batches of a view that the device takes.
+/// Row batches per view that this backend supports.
 const BATCHES_MAX: usize = 1;
 
-/// A row of what densification needs: the gradient by the mean on the screen, and the radii.
+/// Densification input of one row: gradient with respect to the projected mean (2), radii (2).
 type Footprint = [f32; 4];
 
-/// What the frame of a view needs, which tells whether its picture is right.
+/// The buffer sizes that a frame needs. The picture is valid only if the frame had this room.
 #[derive(Debug)]
-enum Need {
-    /// On its way to the host.
-    UnderWay(DemandReadback),
-    /// The frame had room for it.
-    Met(Demand),
+enum DemandState {
+    /// The readback is pending.
+    Pending(DemandReadback),
+    /// The host has read the demand.
+    Known(Demand),
 }
 
-/// What the device holds of a view whose rows are in.
+/// Device state between `rows_in` and `picture`.
 #[derive(Debug)]
 struct RowsIn {
     columns: DeviceColumns,
     splats: Buffer,
     ranks: Ranks,
-    /// Upload and evaluation of the colours, which the lists and the picture are to follow in one submission.
+    /// Upload and evaluation of the colours, not submitted yet: `picture` appends lists and blending.
     colors: Recording,
 }
 
-/// What the device holds of a view that has a picture.
+/// Device state of a view with a picture.
 #[derive(Debug)]
 struct View {
     of: ViewOptions,
@@ -81,45 +82,45 @@ struct View {
     splats: Buffer,
     ranks: Ranks,
     frame: Frame,
-    need: Need,
-    /// Whether `image` holds its picture.
+    demand: DemandState,
+    /// Whether `GpuRenderer::image` holds the picture of this view.
     image_is_read: bool,
-    /// Whether the caller may have changed `image`: then that is what the loss compares.
+    /// Whether the caller may have changed `GpuRenderer::image`; the loss then compares that image.
     image_is_corrected: bool,
     loss: Option<Loss>,
-    back: Option<Back>,
+    splat_gradients: Option<SplatGradients>,
 }
 
-/// A loss that is under way or done.
+/// A loss that was submitted.
 #[derive(Debug)]
 struct Loss {
     plan: LossPlan,
-    /// The photo, kept until the picture is known to be right.
+    /// The photo, kept until the picture is known to be valid.
     target: Buffer,
     v_rgb: Buffer,
-    sums: Sums,
+    sums: LossSums,
 }
 
-/// The four numbers that the value of a loss is made of.
+/// The four sums from which the value of a loss follows.
 #[derive(Debug)]
-enum Sums {
-    /// A picture without pixels has none.
-    Nothing,
-    /// On their way to the host.
-    UnderWay(Readback),
-    /// On the host.
-    Here([f32; 4]),
+enum LossSums {
+    /// The picture has no pixels.
+    Empty,
+    /// The readback is pending.
+    Pending(Readback),
+    /// The host has read the sums.
+    Known([f32; 4]),
 }
 
 /// Gradients of the splats.
 #[derive(Debug)]
-struct Back {
+struct SplatGradients {
     v_splats: Buffer,
-    /// The tile stages that write them, which the stages on rows are to follow in one submission.
+    /// The tile stages that write `v_splats`, not submitted yet: `rows_out` appends the stages on rows.
     tiles: Recording,
 }
 
-/// Host memory that is kept between views.
+/// Host memory that is reused between views.
 #[derive(Debug, Default)]
 struct Scratch {
     band: Vec<f32>,
@@ -138,18 +139,19 @@ pub struct GpuRenderer {
     rows_in: Option<RowsIn>,
     view: Option<View>,
     image: Image,
-    /// The gradient of the picture, where the caller has had it on the host.
+    /// The gradient of the picture, valid if `gradient_on_host`.
     gradient: PictureGradient,
-    gradient_is_here: bool,
+    /// Whether the caller requested the gradient of the picture, and the host copy therefore replaces the device's.
+    gradient_on_host: bool,
     scratch: Scratch,
-    frames_again: u64,
+    frames_rerecorded: u64,
 }
 
-/// Gradients on their way to the host.
+/// Pending readbacks of the gradients of the rows.
 struct GradientReadbacks {
-    /// sh0 and the bands in use.
+    /// sh0, then the bands in use.
     colors: Vec<Readback>,
-    /// Means, quats, scales, opacities.
+    /// means, quats, scales, opacities.
     geometry: Vec<Readback>,
     footprints: Readback,
 }
@@ -158,7 +160,7 @@ impl GpuRenderer {
     /// Compiles the stages for `gpu`.
     ///
     /// # Errors
-    /// The device refuses a shader.
+    /// The device rejects a shader.
     pub fn new(gpu: Gpu) -> GpuResult<Self> {
         Ok(GpuRenderer {
             rows: RowStages::new(&gpu)?,
@@ -170,9 +172,9 @@ impl GpuRenderer {
             view: None,
             image: Image::default(),
             gradient: PictureGradient::default(),
-            gradient_is_here: false,
+            gradient_on_host: false,
             scratch: Scratch::default(),
-            frames_again: 0,
+            frames_rerecorded: 0,
         })
     }
 
@@ -181,20 +183,20 @@ impl GpuRenderer {
         &self.gpu
     }
 
-    /// Sets how many intersections the next view has room for; it grows again on demand.
+    /// Sets the capacity of the next view in intersections. The capacity grows on demand.
     pub fn set_capacity(&mut self, isects: u32) {
         self.tiles.set_capacity(isects);
     }
 
-    /// Frames so far that were recorded again because their buffers were too small.
-    pub fn frames_again(&self) -> u64 {
-        self.frames_again
+    /// Frames so far that were recorded again because a buffer was too small.
+    pub fn frames_rerecorded(&self) -> u64 {
+        self.frames_rerecorded
     }
 
-    /// Intersections of the last view; 0 before its loss or picture was taken.
+    /// Intersections of the last view; 0 until a call has read the picture, the loss or a gradient.
     pub fn isects(&self) -> u32 {
-        match self.view.as_ref().map(|view| &view.need) {
-            Some(Need::Met(demand)) => demand.isects,
+        match self.view.as_ref().map(|view| &view.demand) {
+            Some(DemandState::Known(demand)) => demand.isects,
             _ => 0,
         }
     }
@@ -206,7 +208,7 @@ impl GpuRenderer {
     pub fn alpha(&mut self) -> Result<Vec<f32>, RenderError> {
         self.sequence.image()?;
         self.with_view("coverage", |renderer, view| {
-            let (view, _) = renderer.settle(view)?;
+            let (view, _) = renderer.wait_for_valid_frame(view)?;
             let gpu = &renderer.gpu;
             let mut alpha = vec![0.0; view.of.camera.pixels()];
             let mut recorder = gpu.begin("coverage");
@@ -218,13 +220,13 @@ impl GpuRenderer {
         })
     }
 
-    /// Gives up the view, and what the device holds of it.
-    fn give_up(&mut self) {
-        self.sequence.give_up();
+    /// Drops the view and its device memory.
+    fn drop_view(&mut self) {
+        self.sequence.drop_view();
         (self.rows_in, self.view) = (None, None);
     }
 
-    /// Runs a stage on the view that has a picture. When the device fails there is no view any more.
+    /// Runs a stage on a view with a picture. A failed stage drops the view.
     fn with_view<T>(
         &mut self,
         call: &'static str,
@@ -237,16 +239,16 @@ impl GpuRenderer {
                 Ok(value)
             }
             Err(error) => {
-                self.give_up();
+                self.drop_view();
                 Err(error)
             }
         }
     }
 
-    /// Submits geometry, projection and order of the rows; records their colours. Does not wait.
+    /// Submits upload, projection and depth sort of the rows; records upload and evaluation of colours. Does not wait.
     fn submit_rows(&mut self, rows: &Columns, view: &ViewOptions) -> GpuResult<RowsIn> {
         let (gpu, ViewOptions { camera, options }) = (&self.gpu, view);
-        // The sequence of stages has checked that the count fits.
+        // `Sequence::rows_in` has checked that the count fits.
         let count = rows.rows() as u32;
         let columns = DeviceColumns::new(gpu, count, options.sh_degree)?;
         let splats = gpu.buffer("splats", splat_bytes(count))?;
@@ -256,14 +258,14 @@ impl GpuRenderer {
         let grid = Grid::new(camera.width, camera.height);
         let ranks = self.tiles.order(gpu, &mut recorder, &splats.view(), count, grid)?;
         gpu.submit(recorder)?;
-        // The device projects and sorts while colours, four fifths of a row, are on their way.
+        // The device projects and sorts during the upload of the colours, four fifths of a row.
         let mut recorder = gpu.begin("forward");
         columns.upload_colors(&mut recorder, rows, &mut self.scratch.band)?;
         self.rows.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, &splats)?;
         Ok(RowsIn { columns, splats, ranks, colors: recorder.set_aside() })
     }
 
-    /// Submits the colours that were recorded, the lists of the tiles and the picture; does not wait.
+    /// Submits the recorded colours, the tile lists and the blending. Does not wait.
     fn submit_picture(&mut self, of: ViewOptions, rows: RowsIn) -> GpuResult<View> {
         let (gpu, ViewOptions { camera, options }) = (&self.gpu, &of);
         let RowsIn { columns, splats, ranks, colors } = rows;
@@ -278,38 +280,38 @@ impl GpuRenderer {
             splats,
             ranks,
             frame,
-            need: Need::UnderWay(demand),
+            demand: DemandState::Pending(demand),
             image_is_read: false,
             image_is_corrected: false,
             loss: None,
-            back: None,
+            splat_gradients: None,
         })
     }
 
-    /// Waits for what the view's frame needs. A frame with too little room is recorded again, with more, and so is the
-    /// loss of its picture.
-    fn settle(&mut self, mut view: View) -> GpuResult<(View, Demand)> {
+    /// Waits until the frame of the view is known to have had enough room. A frame with too little room is recorded
+    /// again with larger buffers, and so is the loss of its picture.
+    fn wait_for_valid_frame(&mut self, mut view: View) -> GpuResult<(View, Demand)> {
         let (gpu, mut again) = (&self.gpu, false);
         let demand = loop {
-            let demand = match view.need {
-                Need::Met(demand) => demand,
-                Need::UnderWay(readback) => readback.wait(gpu)?,
+            let demand = match view.demand {
+                DemandState::Known(demand) => demand,
+                DemandState::Pending(readback) => readback.wait(gpu)?,
             };
-            view.need = Need::Met(demand);
+            view.demand = DemandState::Known(demand);
             if self.tiles.fits(&view.frame, demand)? {
                 break demand;
             }
             again = true;
-            self.frames_again += 1;
+            self.frames_rerecorded += 1;
             let blend = view.frame.blend;
-            drop(view.frame); // its memory is free for the next
+            drop(view.frame); // frees memory for the larger frame
             let mut recorder = gpu.begin("forward again");
             let (frame, demand) = self.tiles.frame(gpu, &mut recorder, &view.splats.view(), &view.ranks, blend)?;
             gpu.submit(recorder)?;
-            (view.frame, view.need) = (frame, Need::UnderWay(demand));
+            (view.frame, view.demand) = (frame, DemandState::Pending(demand));
         };
         if again && let Some(Loss { plan, target, v_rgb, sums }) = view.loss.take() {
-            drop((v_rgb, sums)); // of a picture that was not right
+            drop((v_rgb, sums)); // computed from the invalid picture
             view.loss = Some(self.submit_loss(gpu.begin("image_loss"), &view, &view.frame.rgb, plan, target)?);
         }
         Ok((view, demand))
@@ -325,7 +327,7 @@ impl GpuRenderer {
         bytes.copy_to(&self.gpu, &mut self.image.rgb)
     }
 
-    /// Submits the loss of `rgb`, the view's picture, whether or not it is right yet, or what the caller made of it.
+    /// Submits the loss of `rgb`: the picture of the view, which may still turn out invalid, or the corrected picture.
     fn submit_loss(
         &self,
         mut recorder: Recorder<'_>,
@@ -340,20 +342,20 @@ impl GpuRenderer {
         let (rgb, photo) = (rgb.view(), target.view());
         let sums = self.loss.run(gpu, &mut recorder, size, &plan, &rgb, &photo, &v_rgb.view())?;
         let sums = match sums {
-            Some(sums) => Sums::UnderWay(recorder.read_back("image_loss", &sums.slice(0, 16))?),
-            None => Sums::Nothing,
+            Some(sums) => LossSums::Pending(recorder.read_back("image_loss", &sums.slice(0, 16))?),
+            None => LossSums::Empty,
         };
         gpu.submit(recorder)?;
         Ok(Loss { plan, target, v_rgb, sums })
     }
 
-    /// Reads the gradient that the loss left, of a picture that is right, into `gradient`; zeros where there was no loss.
+    /// Reads the gradient of the loss into `self.gradient`; zeros if no loss ran.
     fn read_gradient(&mut self, view: View) -> GpuResult<View> {
         self.gradient.reset(view.of.camera.pixels());
         if view.loss.is_none() {
             return Ok(view);
         }
-        let (view, _) = self.settle(view)?;
+        let (view, _) = self.wait_for_valid_frame(view)?;
         if let Some(loss) = &view.loss {
             let mut recorder = self.gpu.begin("picture gradient");
             let bytes = recorder.read_back("image_loss", &loss.v_rgb.view())?;
@@ -363,17 +365,17 @@ impl GpuRenderer {
         Ok(view)
     }
 
-    /// Records the way back to the splats, once the picture is right.
-    fn record_back(&mut self, view: View) -> Result<View, RenderError> {
-        let (mut view, demand) = self.settle(view)?;
+    /// Records the backward pass from the picture to the splats, once the picture is valid.
+    fn record_picture_back(&mut self, view: View) -> Result<View, RenderError> {
+        let (mut view, demand) = self.wait_for_valid_frame(view)?;
         let gpu = &self.gpu;
         let mut recorder = gpu.begin("backward");
-        let (mut here, mut v_alpha) = (None, None);
-        if self.gradient_is_here {
-            here = Some(recorder.buffer_with("v_rgb", &self.gradient.v_rgb)?);
+        let (mut uploaded, mut v_alpha) = (None, None);
+        if self.gradient_on_host {
+            uploaded = Some(recorder.buffer_with("v_rgb", &self.gradient.v_rgb)?);
             v_alpha = self.gradient.v_alpha.as_ref().map(|v| recorder.buffer_with("v_alpha", v)).transpose()?;
         }
-        let v_rgb = here.as_ref().or(view.loss.as_ref().map(|loss| &loss.v_rgb));
+        let v_rgb = uploaded.as_ref().or(view.loss.as_ref().map(|loss| &loss.v_rgb));
         let v_rgb = v_rgb.ok_or(RenderError::OutOfOrder { call: "picture_back", needs: "loss or picture_gradient" })?;
         let v_splats = gpu.buffer("v_splats", splat_bytes(view.ranks.rows))?;
         let (v_rgb, v_alpha) = (v_rgb.view(), v_alpha.as_ref().map(Buffer::view));
@@ -387,12 +389,16 @@ impl GpuRenderer {
             PictureGradientBuffers { v_rgb: &v_rgb, v_alpha: v_alpha.as_ref() },
             &v_splats.view(),
         )?;
-        view.back = Some(Back { v_splats, tiles: recorder.set_aside() });
+        view.splat_gradients = Some(SplatGradients { v_splats, tiles: recorder.set_aside() });
         Ok(view)
     }
 
-    /// Submits the way back from the picture to the rows, and what is read back of it; does not wait.
-    fn submit_back(&self, view: &View, Back { v_splats, tiles }: Back) -> GpuResult<GradientReadbacks> {
+    /// Submits the backward pass from the picture to the rows and the readbacks of the gradients. Does not wait.
+    fn submit_rows_out(
+        &self,
+        view: &View,
+        SplatGradients { v_splats, tiles }: SplatGradients,
+    ) -> GpuResult<GradientReadbacks> {
         let (gpu, camera, splats, columns) = (&self.gpu, &view.of.camera, &view.splats, &view.columns);
         let RenderOptions { eps2d, sh_degree, .. } = view.of.options;
         let mut recorder = gpu.resume(tiles);
@@ -403,32 +409,38 @@ impl GpuRenderer {
             .map(|buffer| recorder.read_back("sh_bwd", &buffer.view()))
             .collect::<GpuResult<_>>()?;
         gpu.submit(recorder)?;
-        // Colours, four fifths of a row, are copied on the host while the device does the rest.
+        // The host copies the gradients of colours, four fifths of a row, while the device runs `project_bwd`.
         let mut recorder = gpu.begin("backward");
         let footprints = gpu.buffer("footprints", FOOTPRINT_BYTES * u64::from(view.ranks.rows))?;
         let into = &mut recorder;
         self.rows.project_bwd(gpu, into, camera, eps2d, columns, splats, &v_splats, &grads, &footprints)?;
         let geometry = [&grads.means, &grads.quats, &grads.scales, &grads.opacities]
             .map(|buffer| recorder.read_back("project_bwd", &buffer.view()));
-        let back = GradientReadbacks {
+        let readbacks = GradientReadbacks {
             colors,
             geometry: geometry.into_iter().collect::<GpuResult<_>>()?,
             footprints: recorder.read_back("project_bwd", &footprints.view())?,
         };
         gpu.submit(recorder)?;
-        Ok(back)
+        Ok(readbacks)
     }
 
-    /// Waits for the gradients and puts them where the caller wants them.
-    fn finish(&mut self, view: &View, back: GradientReadbacks, sh_degree: u8, grads: &mut Gradients) -> GpuResult<()> {
+    /// Waits for the gradients of the rows and copies them to `grads`.
+    fn read_row_gradients(
+        &mut self,
+        view: &View,
+        readbacks: GradientReadbacks,
+        sh_degree: u8,
+        grads: &mut Gradients,
+    ) -> GpuResult<()> {
         let rows = view.ranks.rows as usize;
         let out = &mut grads.columns;
         out.sh_degree = sh_degree;
         out.resize(rows);
         if view.of.options.sh_degree < sh_degree {
-            out.sh_n.fill(0.0); // bands that are not in use
+            out.sh_n.fill(0.0); // the unused bands stay zero
         }
-        let mut colors = back.colors.into_iter();
+        let mut colors = readbacks.colors.into_iter();
         for bytes in colors.by_ref().take(1) {
             bytes.copy_to(&self.gpu, &mut out.sh0)?;
         }
@@ -440,12 +452,12 @@ impl GpuRenderer {
             band_into_sh_n(values, band, out);
         }
         let geometry = [&mut out.means, &mut out.quats, &mut out.scales, &mut out.opacities];
-        for (to, bytes) in geometry.into_iter().zip(back.geometry) {
+        for (to, bytes) in geometry.into_iter().zip(readbacks.geometry) {
             bytes.copy_to(&self.gpu, to)?;
         }
         let footprints = &mut self.scratch.footprints;
         room::resize(footprints, rows, [0.0; 4]);
-        back.footprints.copy_to(&self.gpu, footprints)?;
+        readbacks.footprints.copy_to(&self.gpu, footprints)?;
         grads.radii.clear();
         grads.radii.extend(footprints.iter().map(|f| [f[2] as u32, f[3] as u32]));
         grads.means2d.clear();
@@ -453,22 +465,22 @@ impl GpuRenderer {
         Ok(())
     }
 
-    /// The value of the view's loss, once its picture is right and its sums have arrived.
-    fn read_value(&mut self, view: View) -> Result<(View, LossValue), RenderError> {
-        let (mut view, _) = self.settle(view)?;
+    /// Waits for the sums of the loss of a valid picture and returns the value of the loss.
+    fn read_loss_value(&mut self, view: View) -> Result<(View, LossValue), RenderError> {
+        let (mut view, _) = self.wait_for_valid_frame(view)?;
         let Some(loss) = &mut view.loss else {
             return Err(RenderError::OutOfOrder { call: "loss_value", needs: "loss" });
         };
-        let sums = match std::mem::replace(&mut loss.sums, Sums::Nothing) {
-            Sums::Nothing => [0.0; 4],
-            Sums::UnderWay(readback) => {
+        let sums = match std::mem::replace(&mut loss.sums, LossSums::Empty) {
+            LossSums::Empty => [0.0; 4],
+            LossSums::Pending(readback) => {
                 let mut sums = [0.0f32; 4];
                 readback.copy_to(&self.gpu, &mut sums)?;
                 sums
             }
-            Sums::Here(sums) => sums,
+            LossSums::Known(sums) => sums,
         };
-        loss.sums = Sums::Here(sums);
+        loss.sums = LossSums::Known(sums);
         let value = value(&loss.plan, sums);
         Ok((view, value))
     }
@@ -493,7 +505,7 @@ impl Renderer for GpuRenderer {
         let floats = s.band.capacity() + s.target.capacity() + self.image.rgb.capacity();
         let gradient = self.gradient.bytes();
         let traffic = self.gpu.traffic();
-        // Such adapters have no memory of their own.
+        // Integrated and software adapters allocate device memory from host memory.
         let is_shared = matches!(self.gpu.summary().kind, DeviceKind::Integrated | DeviceKind::Software);
         let device = if is_shared { traffic.device_bytes_peak } else { 0 };
         (4 * floats + size_of::<Footprint>() * s.footprints.capacity()) as u64
@@ -503,15 +515,15 @@ impl Renderer for GpuRenderer {
     }
 
     fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: usize) -> Result<(), RenderError> {
-        // What the last view held is free for this one.
-        self.give_up();
-        self.gradient_is_here = false;
+        // Frees the memory of the last view before this view allocates.
+        self.drop_view();
+        self.gradient_on_host = false;
         self.sequence.begin(camera, options, batches, BATCHES_MAX)
     }
 
     fn rows_in(&mut self, rows: &Columns) -> Result<(), RenderError> {
         let (view, _) = self.sequence.rows_in(rows)?;
-        let submitted = self.submit_rows(rows, &view).inspect_err(|_| self.give_up())?;
+        let submitted = self.submit_rows(rows, &view).inspect_err(|_| self.drop_view())?;
         self.rows_in = Some(submitted);
         Ok(())
     }
@@ -519,7 +531,7 @@ impl Renderer for GpuRenderer {
     fn picture(&mut self) -> Result<(), RenderError> {
         let of = self.sequence.picture()?;
         let rows = self.rows_in.take().ok_or(RenderError::OutOfOrder { call: "picture", needs: "rows_in" })?;
-        let view = self.submit_picture(of, rows).inspect_err(|_| self.give_up())?;
+        let view = self.submit_picture(of, rows).inspect_err(|_| self.drop_view())?;
         self.view = Some(view);
         Ok(())
     }
@@ -527,7 +539,7 @@ impl Renderer for GpuRenderer {
     fn image(&mut self) -> Result<&Image, RenderError> {
         self.sequence.image()?;
         self.with_view("image", |renderer, view| {
-            let (mut view, _) = renderer.settle(view)?;
+            let (mut view, _) = renderer.wait_for_valid_frame(view)?;
             if !view.image_is_read {
                 renderer.read_image(&view)?;
                 view.image_is_read = true;
@@ -547,11 +559,11 @@ impl Renderer for GpuRenderer {
 
     fn loss(&mut self, target: &Target, options: &LossOptions) -> Result<(), RenderError> {
         self.sequence.loss(target)?;
-        self.gradient_is_here = false;
+        self.gradient_on_host = false;
         let plan = LossPlan::new(target.width as usize, target.height as usize, target.mask.as_deref(), options);
         self.with_view("loss", |renderer, mut view| {
             view.loss = None;
-            // The device blends while the photo is packed, crosses the bus, and the loss is recorded behind it.
+            // The device blends while the host packs and uploads the photo and records the loss.
             pack_target(target, &mut renderer.scratch.target);
             let mut recorder = renderer.gpu.begin("image_loss");
             let pixels = recorder.buffer_with("target", &renderer.scratch.target)?;
@@ -567,24 +579,26 @@ impl Renderer for GpuRenderer {
 
     fn picture_gradient(&mut self) -> Result<&mut PictureGradient, RenderError> {
         self.sequence.picture_gradient()?;
-        if !self.gradient_is_here {
+        if !self.gradient_on_host {
             self.with_view("picture_gradient", |renderer, view| Ok((renderer.read_gradient(view)?, ())))?;
-            self.gradient_is_here = true;
+            self.gradient_on_host = true;
         }
         Ok(&mut self.gradient)
     }
 
     fn picture_back(&mut self) -> Result<(), RenderError> {
-        self.sequence.picture_back(self.gradient_is_here.then_some(&self.gradient))?;
-        self.with_view("picture_back", |renderer, view| Ok((renderer.record_back(view)?, ())))
+        self.sequence.picture_back(self.gradient_on_host.then_some(&self.gradient))?;
+        self.with_view("picture_back", |renderer, view| Ok((renderer.record_picture_back(view)?, ())))
     }
 
     fn rows_out(&mut self, batch: usize, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError> {
         self.sequence.rows_out(batch, rows)?;
         self.with_view("rows_out", |renderer, mut view| {
-            let back = view.back.take().ok_or(RenderError::OutOfOrder { call: "rows_out", needs: "picture_back" })?;
-            let back = renderer.submit_back(&view, back)?;
-            renderer.finish(&view, back, rows.sh_degree, grads)?;
+            let splat_gradients = view.splat_gradients.take();
+            let splat_gradients =
+                splat_gradients.ok_or(RenderError::OutOfOrder { call: "rows_out", needs: "picture_back" })?;
+            let readbacks = renderer.submit_rows_out(&view, splat_gradients)?;
+            renderer.read_row_gradients(&view, readbacks, rows.sh_degree, grads)?;
             Ok((view, ()))
         })
     }
@@ -593,6 +607,6 @@ impl Renderer for GpuRenderer {
         if self.view.as_ref().is_none_or(|view| view.loss.is_none()) {
             return Err(RenderError::OutOfOrder { call: "loss_value", needs: "loss" });
         }
-        self.with_view("loss_value", |renderer, view| renderer.read_value(view))
+        self.with_view("loss_value", |renderer, view| renderer.read_loss_value(view))
     }
 }

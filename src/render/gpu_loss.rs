@@ -1,8 +1,8 @@
-//! The image loss on the device: value and gradient of a picture against an 8-bit photo, all on the device but the
-//! four numbers of the value.
+//! Records the image loss on a device: value and gradient of a picture against an 8-bit photo. The host reads only the
+//! four sums from which the value follows.
 //!
-//! Invariants: 1. sums are trees in a fixed order: the same bits on every run of one device; 2. the derivative maps are
-//! kept for one channel at a time.
+//! Invariants: 1. sums are trees in a fixed order: the same bits on every run of one device; 2. one channel's
+//! derivative maps exist at a time.
 
 use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
 use crate::kernels::image_loss::{LossPlan, LossValue};
@@ -21,7 +21,7 @@ impl LossStage {
     /// Compiles the stage.
     ///
     /// # Errors
-    /// The device refuses a shader.
+    /// The device rejects a shader.
     pub fn new(gpu: &Gpu) -> GpuResult<Self> {
         let entry = |name: &str| gpu.pipeline("image_loss.wgsl", name, &[]);
         Ok(LossStage {
@@ -31,12 +31,12 @@ impl LossStage {
         })
     }
 
-    /// Writes the gradient of the picture `rgb` (planar) against `target_pixels` (see
-    /// [`crate::kernels::uniforms::pack_target`]) to `v_rgb`, and returns the sums that [`value`] makes a loss of: read
-    /// back four floats. A picture without pixels has no sums.
+    /// Records the gradient of the picture `rgb` (planar) against `target_pixels` (layout:
+    /// [`crate::kernels::uniforms::pack_target`]) into `v_rgb`. Returns the buffer whose first four floats [`value`]
+    /// turns into the loss, or `None` for a picture without pixels.
     ///
     /// # Errors
-    /// The device failed, or its budget cannot hold 12 bytes per pixel more.
+    /// The device failed, or its budget has less than 12 bytes per pixel left.
     pub fn run(
         &self,
         gpu: &Gpu,
@@ -80,7 +80,7 @@ impl LossStage {
     }
 }
 
-/// The loss from the four floats that [`LossStage::run`] left.
+/// The loss from the four sums of [`LossStage::run`].
 pub fn value(plan: &LossPlan, sums: [f32; 4]) -> LossValue {
     let [l1, squares, ssim, _] = sums.map(f64::from);
     plan.value(l1, squares, ssim)

@@ -1,9 +1,9 @@
-//! The stages on rows, on the device: project_fwd, sh_fwd, sh_bwd, project_bwd, with the columns that they work on.
+//! Records the stages on rows on a device: project_fwd, sh_fwd, sh_bwd, project_bwd. Owns the device columns.
 //!
-//! Not here: which rows, tiles, the order of a step.
+//! Not here: the choice of rows, the tile stages, the order of a step.
 //!
-//! Invariants: 1. no binding is larger than the device allows: longer columns are bound in windows of rows, and since
-//! rows do not depend on each other the result has the same bits; 2. higher bands of the colour are a buffer each.
+//! Invariants: 1. no binding exceeds the device's limit: longer columns are bound in windows of rows, and because rows
+//! are independent the result has the same bits; 2. each SH band above 0 is a buffer of its own.
 
 use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
 use crate::kernels::uniforms::RowsUniforms;
@@ -11,19 +11,19 @@ use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use std::sync::Arc;
 
-/// Bytes of a row in `splats` and `v_splats`: see `shaders/shared/splat.wgsl`.
+/// Bytes per row of `splats` and `v_splats`: see `shaders/shared/splat.wgsl`.
 pub const SPLAT_BYTES: u64 = 48;
-/// Bytes of a row of what `project_bwd` leaves for densification: the gradient by the mean on the screen, and the radii.
+/// Bytes per row of the densification input from `project_bwd`: gradient with respect to the projected mean, and radii.
 pub const FOOTPRINT_BYTES: u64 = 16;
-/// Floats of a row of each higher band.
+/// Floats per row of the SH bands 1, 2 and 3.
 pub const BAND_WIDTHS: [usize; 3] = [9, 15, 21];
-/// Windows begin at multiples of this many rows: then every column's offset is a multiple of 256 bytes, the largest
-/// alignment that a device may ask for.
+/// Windows begin at multiples of this many rows. Every column's offset is then a multiple of 256 bytes, the largest
+/// alignment that a device may require.
 const WINDOW_STEP: u64 = 64;
-/// Invocations of a workgroup.
+/// Invocations per workgroup.
 const WORKGROUP: u32 = 256;
 
-/// Columns of rows on the device, or their gradients.
+/// Columns of rows on the device, or the gradients of the columns.
 #[derive(Debug)]
 pub struct DeviceColumns {
     /// Rows.
@@ -38,15 +38,15 @@ pub struct DeviceColumns {
     pub opacities: Buffer,
     /// `[rows][3]`.
     pub sh0: Buffer,
-    /// `[rows][2 l + 1][3]` for each band l in use, from 1 on.
+    /// `[rows][2 l + 1][3]` for each band l in use, from l = 1.
     pub bands: Vec<Buffer>,
 }
 
 impl DeviceColumns {
-    /// Memory for `rows` rows with the bands 1 to `sh_degree`; its contents are arbitrary.
+    /// Allocates `rows` rows with the bands 1 to `sh_degree`, uninitialised.
     ///
     /// # Errors
-    /// The device or its budget cannot hold them.
+    /// Device memory or its budget is exhausted.
     pub fn new(gpu: &Gpu, rows: u32, sh_degree: u8) -> GpuResult<Self> {
         let column = |label, width: usize| gpu.buffer(label, 4 * width as u64 * u64::from(rows));
         let band_labels = ["sh1", "sh2", "sh3"];
@@ -63,18 +63,18 @@ impl DeviceColumns {
         })
     }
 
-    /// Bytes of one row over all columns, for columns with the bands 1 to `sh_degree`.
+    /// Bytes per row over all columns, with the bands 1 to `sh_degree`.
     pub fn row_bytes(sh_degree: u8) -> u64 {
         4 * (14 + BAND_WIDTHS[..usize::from(sh_degree.min(3))].iter().sum::<usize>()) as u64
     }
 
-    /// The columns with their floats per row, bands last.
+    /// Each column with its floats per row; bands last.
     pub fn columns(&self) -> impl Iterator<Item = (&Buffer, usize)> {
         let narrow = [(&self.means, 3), (&self.quats, 4), (&self.scales, 3), (&self.opacities, 1), (&self.sh0, 3)];
         narrow.into_iter().chain(self.bands.iter().zip(BAND_WIDTHS))
     }
 
-    /// Uploads what `project_fwd` reads of `rows`, which hold as many rows.
+    /// Uploads means, quats, scales and opacities. `rows` must have `self.rows` rows.
     ///
     /// # Errors
     /// The device failed.
@@ -85,7 +85,7 @@ impl DeviceColumns {
         recorder.upload(&self.opacities.view(), &rows.opacities)
     }
 
-    /// Uploads the colours of `rows`, which hold as many rows and at least the bands in use. `scratch` takes one band
+    /// Uploads the colours. `rows` must have `self.rows` rows and at least the bands in use. `scratch` holds one band
     /// at a time.
     ///
     /// # Errors
@@ -99,7 +99,7 @@ impl DeviceColumns {
         Ok(())
     }
 
-    /// The window of each column.
+    /// The part of each column inside `window`.
     fn window(&self, window: Window) -> WindowViews {
         let view = |buffer: &Buffer, width: usize| window.of(buffer, 4 * width as u64);
         WindowViews {
@@ -113,7 +113,7 @@ impl DeviceColumns {
     }
 }
 
-/// Copies one band (0: l = 1) out of `sh_n` into `[rows][2 l + 1][3]`.
+/// Copies one band (index 0 is l = 1) from `sh_n` to `out`, `[rows][2 l + 1][3]`.
 pub fn band_from_sh_n(rows: &Columns, band: usize, out: &mut Vec<f32>) {
     out.clear();
     let row_width = rows.sh_n.len() / rows.rows().max(1);
@@ -123,7 +123,7 @@ pub fn band_from_sh_n(rows: &Columns, band: usize, out: &mut Vec<f32>) {
     }
 }
 
-/// Copies one band back into its place in `sh_n`.
+/// Copies one band from `values` back into `sh_n`.
 pub fn band_into_sh_n(values: &[f32], band: usize, rows: &mut Columns) {
     let row_width = rows.sh_n.len() / rows.rows().max(1);
     let first: usize = BAND_WIDTHS[..band].iter().sum();
@@ -133,6 +133,7 @@ pub fn band_into_sh_n(values: &[f32], band: usize, rows: &mut Columns) {
     }
 }
 
+/// A range of rows that one binding covers.
 #[derive(Debug, Clone, Copy)]
 struct Window {
     first: u64,
@@ -154,7 +155,7 @@ struct WindowViews {
     bands: Vec<BufferView>,
 }
 
-/// Windows that cover `rows` rows so that no binding of `row_bytes` per row exceeds the device's limit.
+/// Splits `rows` rows into windows so that no binding of `row_bytes` per row exceeds the device's limit.
 fn windows(gpu: &Gpu, rows: u32, row_bytes: u64) -> impl Iterator<Item = Window> {
     let rows = u64::from(rows);
     let most = (gpu.max_binding_bytes() / row_bytes).min(gpu.window_rows());
@@ -162,12 +163,12 @@ fn windows(gpu: &Gpu, rows: u32, row_bytes: u64) -> impl Iterator<Item = Window>
     (0..rows.div_ceil(step)).map(move |i| Window { first: i * step, rows: (rows - i * step).min(step) as u32 })
 }
 
-/// The compiled stages.
+/// The compiled stages on rows.
 #[derive(Debug)]
 pub struct RowStages {
     project_fwd: Arc<Pipeline>,
     project_bwd: Arc<Pipeline>,
-    /// By degree.
+    /// Indexed by SH degree.
     sh_fwd: [Arc<Pipeline>; 4],
     sh_bwd: [Arc<Pipeline>; 4],
 }
@@ -176,7 +177,7 @@ impl RowStages {
     /// Compiles the stages.
     ///
     /// # Errors
-    /// The device refuses a shader.
+    /// The device rejects a shader.
     pub fn new(gpu: &Gpu) -> GpuResult<Self> {
         let defines = [("SH_DEGREE_1", ""), ("SH_DEGREE_2", ""), ("SH_DEGREE_3", "")];
         let sh = |shader: &str, entry: &str, degree: usize| gpu.pipeline(shader, entry, &defines[..degree]);
@@ -191,7 +192,7 @@ impl RowStages {
         })
     }
 
-    /// Writes the footprints of all rows to `splats`, colours still 0.
+    /// Records the footprints of all rows into `splats`, with colours 0.
     ///
     /// # Errors
     /// The device failed.
@@ -213,7 +214,7 @@ impl RowStages {
         Ok(())
     }
 
-    /// Fills in the colours of the rows that are drawn, from the bands up to `sh_degree`.
+    /// Records the colours of the visible rows into `splats`, from the bands up to `sh_degree`.
     ///
     /// # Errors
     /// The device failed.
@@ -231,7 +232,7 @@ impl RowStages {
             let uniform = recorder.uniform(&RowsUniforms::new(camera, 0.0, window.rows))?;
             let w = rows.window(window);
             let mut views = vec![uniform, window.of(splats, SPLAT_BYTES), w.sh0];
-            // Band 0 has no direction.
+            // Band 0 does not depend on the view direction, so degree 0 needs no means.
             views.extend((degree > 0).then_some(w.means));
             views.extend(w.bands.into_iter().take(degree));
             recorder.dispatch("sh_fwd", &self.sh_fwd[degree], &views, groups_1d(window.rows, WORKGROUP))?;
@@ -239,7 +240,7 @@ impl RowStages {
         Ok(())
     }
 
-    /// Writes the gradients of means (the colour's part), sh0 and the bands up to `sh_degree`.
+    /// Records the gradients of sh0, of the bands up to `sh_degree`, and the colour's part of the gradients of means.
     ///
     /// # Errors
     /// The device failed.
@@ -268,8 +269,8 @@ impl RowStages {
         Ok(())
     }
 
-    /// Adds to the gradients of means and writes those of quats, scales and opacities, and `footprints`
-    /// ([`FOOTPRINT_BYTES`] a row).
+    /// Records the gradients of quats, scales and opacities, adds the projection's part to the gradients of means, and
+    /// records `footprints` ([`FOOTPRINT_BYTES`] per row).
     ///
     /// # Errors
     /// The device failed.
@@ -308,7 +309,7 @@ impl RowStages {
     }
 }
 
-/// Bytes of a row in the widest binding of the colour stages.
+/// Bytes per row of the widest binding of the colour stages.
 fn widest_row(degree: usize) -> u64 {
     BAND_WIDTHS[..degree].iter().map(|w| 4 * *w as u64).fold(SPLAT_BYTES, u64::max)
 }

@@ -1,14 +1,13 @@
-//! Records the tile stages on a device: order by depth, intersections, lists by tile, and the rasterizer in both
-//! directions. Twin of the second half of [`super::cpu`].
+//! Records the tile stages of the forward pass on a device: depth sort, intersections, tile lists, blending.
 //!
-//! Not here: projection, colours and loss, whose splats come in and whose gradients go out as buffers
-//! (`shaders/shared/splat.wgsl`).
+//! Not here: the backward half (`gpu_tiles_bwd`); projection, colours and loss (`gpu_rows`, `gpu_loss`). Splats come in
+//! as a buffer (`shaders/shared/splat.wgsl`). The CPU twin is the second half of [`super::cpu`].
 //!
-//! Invariants: 1. nothing is written beyond a buffer: stages clamp the number of intersections to what the buffers
-//! hold, and [`Demand`] tells the true one; a frame that fell short is recorded again with more room; 2. an invocation
-//! stays below 65,535 loop iterations: long lists are blended in segments, whose number follows from the longest list
-//! that was seen, and a frame with a longer one is recorded again; 3. the order of every sum is fixed, so a device
-//! gives the same bits whenever it runs the same input again.
+//! Invariants: 1. no stage writes beyond a buffer: stages clamp the number of intersections to the capacity of the
+//! buffers, [`Demand`] reports the true number, and a frame that exceeded its capacity is recorded again with more; 2.
+//! an invocation runs fewer than 65,535 loop iterations: long lists are blended in segments, whose number follows from
+//! the longest list so far, and a frame with a longer list is recorded again; 3. the order of every sum is fixed, so
+//! the same input gives the same bits on one device.
 
 use crate::gpu::{Buffer, BufferView, Gpu, GpuError, GpuResult, Pipeline, Readback, Recorder, groups_1d};
 use crate::kernels::splats::Grid;
@@ -18,14 +17,14 @@ use crate::kernels::uniforms_tiles::{
 };
 use std::sync::Arc;
 
-/// Invocations of a workgroup of the stages on rows and intersections.
+/// Invocations per workgroup of the stages on rows and intersections.
 const WORKGROUP: u32 = crate::gpu::WORKGROUP;
-/// Fewest intersections that buffers are made for.
+/// Capacity of the first frame, intersections.
 const CAPACITY_MIN: u32 = 1 << 16;
-/// Most intersections of a view: sums saturate at 2^32 - 1, and indices of folded dispatches need some room.
+/// Most intersections of a view: sums saturate at 2^32 - 1, and the index of a folded dispatch may exceed the count.
 const CAPACITY_MAX: u64 = (1 << 32) - (1 << 25);
 
-/// Compiled stages.
+/// The compiled tile stages, forward and backward.
 #[derive(Debug)]
 pub(super) struct Pipelines {
     scan_reduce: Arc<Pipeline>,
@@ -41,73 +40,73 @@ pub(super) struct Pipelines {
     pub(super) fold_rows: Arc<Pipeline>,
 }
 
-/// What blending depends on besides splats.
+/// The parameters of blending besides splats.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Blend {
     /// Tiles of the picture.
     pub grid: Grid,
-    /// Added behind everything.
+    /// Background colour, weighted by the transmittance that is left.
     pub background: [f32; 3],
     /// Upper clamp of alpha.
     pub max_alpha: f32,
 }
 
-/// Two arrays of 32-bit words that a sort goes to and fro between.
+/// Keys and values of a sort, 32-bit words.
 #[derive(Debug)]
 pub struct Pairs {
-    /// Keys and values.
+    /// `[capacity]` u32.
     pub keys: Buffer,
-    /// As long as the keys.
+    /// `[capacity]` u32.
     pub values: Buffer,
 }
 
-/// Rows of a view in depth order, with the offsets of their intersections.
+/// The rows of a view in depth order, with the offsets of their intersections.
 #[derive(Debug)]
 pub struct Ranks {
     /// Rows of the view.
     pub rows: u32,
-    /// `[rows]` u32: rows by rank; rows that are not drawn come last.
+    /// `[rows]` u32: row of each rank; rows that are not drawn come last.
     pub order: Buffer,
-    /// `[rows + 1]` u32: where each rank's intersections begin; the last is their number.
+    /// `[rows + 1]` u32: first intersection of each rank; the last entry is the number of intersections.
     pub offsets: Buffer,
 }
 
-/// Lists and picture of a view.
+/// Tile lists and picture of a view.
 #[derive(Debug)]
 pub struct Frame {
     /// Tiles, background and clamp.
     pub blend: Blend,
-    /// Intersections that the buffers hold.
+    /// Capacity of the buffers, intersections.
     pub capacity: u32,
-    /// Longest list that the dispatches reached to the end of.
+    /// Longest list that the recorded segments cover.
     pub list_max: u32,
-    /// u32 by emit index: the row.
+    /// `[capacity]` u32: row of each intersection, by emit index.
     pub row_from_isect: Buffer,
-    /// u32, tile by tile: emit indices.
+    /// `[capacity]` u32: emit indices, tile by tile.
     pub isects: Buffer,
-    /// `[tiles + 1]` u32.
+    /// `[tiles + 1]` u32: first list entry of each tile.
     pub tile_offsets: Buffer,
     /// `[3][height][width]` f32.
     pub rgb: Buffer,
-    /// `[height][width]` f32: transmittance behind everything; the coverage is 1 less this.
+    /// `[height][width]` f32: final transmittance T; the coverage is 1 - T.
     pub t_final: Buffer,
     /// `[height][width]` u32: list index at which the pixel stopped, or 2^32 - 1.
     pub stops: Buffer,
 }
 
-/// What a recorded frame will turn out to have needed: two words on their way to the host.
+/// Pending readback of a frame's [`Demand`].
 #[derive(Debug)]
 pub struct DemandReadback {
     total: Readback,
     longest: Readback,
 }
 
-/// What a frame needs.
+/// The buffer sizes that a frame needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Demand {
-    /// Intersections; 2^32 - 1 stands for this many or more.
+    /// Intersections, saturated: 2^32 - 1 means 2^32 - 1 or more.
     pub isects: u32,
-    /// Longest list of a tile, of those intersections that the buffers held.
+    /// Longest tile list among the intersections within the capacity.
     pub list_max: u32,
 }
 
@@ -124,16 +123,19 @@ impl DemandReadback {
     }
 }
 
-/// The tile stages of one device, and how much room the views so far needed.
+/// The tile stages of one device, and the buffer sizes for the next frame.
 #[derive(Debug)]
 pub struct TileStages {
     pub(super) pipelines: Pipelines,
+    /// Capacity of the next frame, intersections.
     capacity: u32,
-    /// Words of the largest binding.
+    /// Size of the largest binding, 32-bit words.
     binding_words: u32,
+    /// Longest list that the segments of the next frame cover.
     list_max: u32,
 }
 
+/// Bytes of `count` 32-bit words.
 pub(super) fn words(count: u32) -> u64 {
     4 * u64::from(count)
 }
@@ -142,7 +144,7 @@ impl TileStages {
     /// Compiles the stages.
     ///
     /// # Errors
-    /// A shader does not compile on this device.
+    /// The device rejects a shader.
     pub fn new(gpu: &Gpu) -> GpuResult<TileStages> {
         let get = |stage: &str, entry: &str| gpu.pipeline(&format!("{stage}.wgsl"), entry, &[]);
         let pipelines = Pipelines {
@@ -162,21 +164,21 @@ impl TileStages {
         Ok(TileStages { pipelines, capacity: CAPACITY_MIN, binding_words, list_max: SEGMENT_FWD })
     }
 
-    /// Intersections that the next frame has room for.
+    /// Capacity of the next frame, intersections.
     pub fn capacity(&self) -> u32 {
         self.capacity
     }
 
-    /// Sets how many intersections the next frame has room for; it grows again on demand.
+    /// Sets the capacity of the next frame. The capacity grows on demand.
     pub fn set_capacity(&mut self, isects: u32) {
         self.capacity = isects.max(1);
     }
 
-    /// Records the exclusive prefix sum of `count` words into `offsets` (`count` + 1 words, the last is the total).
-    /// Sums saturate: a total of 2^32 - 1 means this much or more.
+    /// Records the exclusive prefix sum of `count` words into `offsets` (`count` + 1 words; the last is the total).
+    /// Sums saturate: a total of 2^32 - 1 means 2^32 - 1 or more.
     ///
     /// # Errors
-    /// The device has no room for the sums of blocks.
+    /// Device memory is exhausted.
     pub fn scan(
         &self,
         gpu: &Gpu,
@@ -202,11 +204,11 @@ impl TileStages {
         recorder.dispatch("scan", &self.pipelines.scan, &views, groups)
     }
 
-    /// Records the stable sort of pairs by the `bits` low bits of their keys. The number of pairs is the word
-    /// `live_at` of `live`, at most `capacity`. Returns the sorted pairs.
+    /// Records a stable radix sort of `pairs` by the low `bits` bits of the keys. Word `live_at` of the buffer `live`
+    /// holds the number of pairs, at most `capacity`. Returns the sorted pairs.
     ///
     /// # Errors
-    /// The device has no room.
+    /// Device memory is exhausted.
     pub fn sort(
         &self,
         gpu: &Gpu,
@@ -247,10 +249,10 @@ impl TileStages {
         Ok(from)
     }
 
-    /// Records the order of the rows by depth and the offsets of their intersections. `splats` holds `rows` records.
+    /// Records the depth sort of the rows and the offsets of their intersections. `splats` holds `rows` records.
     ///
     /// # Errors
-    /// The device has no room.
+    /// Device memory is exhausted.
     pub fn order(
         &self,
         gpu: &Gpu,
@@ -281,11 +283,11 @@ impl TileStages {
         Ok(Ranks { rows, order: sorted.values, offsets })
     }
 
-    /// Records the lists of the tiles and the picture, with room as the frames before needed it. The picture is right
-    /// if [`TileStages::fits`] says so once the demand has arrived.
+    /// Records the tile lists and the blending, with buffers as large as earlier frames needed. The picture is valid if
+    /// [`TileStages::fits`] is true for the demand that the readback returns.
     ///
     /// # Errors
-    /// The device has no room.
+    /// Device memory is exhausted.
     pub fn frame(
         &self,
         gpu: &Gpu,
@@ -317,7 +319,7 @@ impl TileStages {
             row_from_isect.view(),
         ];
         recorder.dispatch("isect_emit", &self.pipelines.isect_emit, &views, groups_1d(capacity, WORKGROUP))?;
-        // One value beyond the last tile is for intersections that were not found.
+        // The key `tiles`, one beyond the last tile, marks entries without an intersection.
         let bits = 32 - tiles.leading_zeros();
         let live = ranks.offsets.view();
         let sorted = self.sort(gpu, recorder, &live, ranks.rows, capacity, bits, pairs)?;
@@ -371,10 +373,11 @@ impl TileStages {
         Ok(())
     }
 
-    /// Whether a frame had room for what it needed. If not, the next one will: record [`TileStages::frame`] again.
+    /// Whether the buffers of a frame were large enough. If not, the sizes for the next frame grow to `demand`, and the
+    /// caller records [`TileStages::frame`] again.
     ///
     /// # Errors
-    /// No device could hold this view.
+    /// The view has more intersections than any device can hold.
     pub fn fits(&mut self, frame: &Frame, demand: Demand) -> GpuResult<bool> {
         if u64::from(demand.isects) >= CAPACITY_MAX {
             let need = words(demand.isects);
@@ -386,8 +389,8 @@ impl TileStages {
         }
         let room = demand.isects <= frame.capacity;
         if !room {
-            // A quarter more, so that views that need a little more do not come here again; but not more than a binding
-            // holds, unless this view alone is beyond it, which the dispatch then reports.
+            // A quarter more than needed, so that slightly larger views need no second recording. The limit is the
+            // largest binding; if this view alone exceeds it, the dispatch reports the error.
             let more = (demand.isects.saturating_add(demand.isects / 4)).min(self.binding_words);
             self.capacity = self.capacity.max(more).max(demand.isects);
         }
@@ -398,10 +401,10 @@ impl TileStages {
         Ok(room && reached)
     }
 
-    /// Orders, lists and blends, as often as the demand takes, and waits for it. `splats` holds `rows` records.
+    /// Runs sort, lists and blending, again with larger buffers if needed, and waits. `splats` holds `rows` records.
     ///
     /// # Errors
-    /// The device has no room, or failed.
+    /// Device memory is exhausted, or the device failed.
     pub fn forward(
         &mut self,
         gpu: &Gpu,
@@ -424,12 +427,12 @@ impl TileStages {
     }
 }
 
-/// Bytes of the splats, or of their gradients, of `rows` rows.
+/// Bytes of the splats of `rows` rows, or of their gradients.
 pub fn splat_bytes(rows: u32) -> u64 {
     u64::from(SPLAT_WORDS) * words(rows)
 }
 
-/// Uniforms of one dispatch of a rasterizer: list entries from `length` times `segment` on.
+/// Uniforms of one rasterizer dispatch over the list entries [`length` * `segment`, `length` * (`segment` + 1)).
 pub(super) fn raster_uniforms(blend: &Blend, segment: u32, length: u32, flags: u32) -> RasterUniforms {
     RasterUniforms {
         grid: grid_words(blend.grid),

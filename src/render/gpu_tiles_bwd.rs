@@ -1,8 +1,9 @@
-//! Records the backward half of the tile stages: sums of every intersection, then gradients of every row's splat.
+//! Records the backward half of the tile stages: the gradient sums of each intersection, then the gradients of each
+//! row's splat.
 //!
-//! Invariants: 1. the sums of all intersections need not fit one binding: they are made window by window, each from a
-//! pass of its own over the lists, and a row that a window cuts carries its sums on, so the result has the same bits for
-//! any window; 2. the order of every sum is fixed.
+//! Invariants: 1. the sums of all intersections may exceed one binding: each window of intersections has its own pass
+//! over the lists, and a row that spans two windows continues its sums, so the result has the same bits for any window
+//! size; 2. the order of every sum is fixed.
 
 use super::gpu_tiles::{Demand, Frame, Ranks, TileStages, raster_uniforms, words};
 use crate::gpu::{BufferView, Gpu, GpuResult, Recorder, groups_1d};
@@ -11,27 +12,27 @@ use crate::kernels::uniforms_tiles::{
 };
 use std::ops::Range;
 
-/// Gradient of the picture on the device: what the backward pass starts from.
+/// Gradient of the picture on the device: the input of the backward pass.
 #[derive(Debug, Clone, Copy)]
 pub struct PictureGradientBuffers<'a> {
     /// `[3][height][width]` f32.
     pub v_rgb: &'a BufferView,
-    /// `[height][width]` f32; none: zeros.
+    /// `[height][width]` f32; `None` stands for zeros.
     pub v_alpha: Option<&'a BufferView>,
 }
 
-/// Intersections whose sums one binding holds, at least 1.
+/// Intersections whose sums fit one binding, at least 1.
 fn window_isects(gpu: &Gpu) -> u32 {
     let bytes = 4 * u64::from(SUMS);
     u32::try_from(gpu.max_binding_bytes() / bytes).unwrap_or(u32::MAX).max(1)
 }
 
 impl TileStages {
-    /// Records the gradients of the splats (`v_splats`, a record for each row). The frame must have fitted, with this
-    /// demand.
+    /// Records the gradients of the splats into `v_splats`, one record per row. [`TileStages::fits`] must be true for
+    /// `frame` and `demand`.
     ///
     /// # Errors
-    /// The device has no room.
+    /// Device memory is exhausted.
     pub fn backward(
         &self,
         gpu: &Gpu,
@@ -75,7 +76,8 @@ impl TileStages {
         }
     }
 
-    /// Records one pass over all lists, back to front, that keeps the sums of the intersections of a window.
+    /// Records one pass over all lists, back to front, that stores the sums of the intersections in the window
+    /// `isects`.
     fn sums(
         &self,
         recorder: &mut Recorder<'_>,

@@ -1,8 +1,9 @@
 //! Image metrics for reports: PSNR and SSIM of a rendered picture against its photo.
-//! What the loss needs is in `kernels::image_loss`; here values are cut to 0..1 first, and no gradient is made.
 //!
-//! Invariants: 1. pictures are clamped but not rounded to 8 bits; 2. pixels with mask byte 0 are left out; 3. the bits are
-//! the same for any number of threads; 4. a picture with NaN at a pixel that counts gives NaN, never a number.
+//! Not here: the training loss with its gradient (`kernels::image_loss`). Metrics clamp values to 0..1 first.
+//!
+//! Invariants: 1. pictures are clamped but not rounded to 8 bits; 2. pixels with mask byte 0 are ignored; 3. the bits
+//! are the same for any number of threads; 4. NaN at an unmasked pixel makes the metric NaN.
 
 use crate::base::simd::SimdPath;
 pub use crate::kernels::image_loss::SsimVariant;
@@ -10,7 +11,7 @@ use crate::kernels::image_loss::{ImagePair, mean_ssim};
 use crate::scene::image::{Image, Target};
 use rayon::prelude::*;
 
-/// Mean squared difference over pixels that count and channels, values cut to 0..1; NaN when no pixel counts.
+/// Mean squared difference over unmasked pixels and channels, values clamped to 0..1; NaN when every pixel is masked.
 ///
 /// # Panics
 /// When picture and target differ in size.
@@ -37,8 +38,8 @@ pub fn mse(image: &Image, target: &Target) -> f64 {
     rows.iter().sum::<f64>() / (3.0 * counted as f64)
 }
 
-/// Peak signal-to-noise ratio, dB: -10 log10 of [`mse`], the peak being 1. A picture without any difference gives
-/// `f64::INFINITY`, which JSON cannot write, so whoever reports it decides what to print; NaN when no pixel counts.
+/// Peak signal-to-noise ratio, dB: -10 log10 of [`mse`] for a peak of 1. A picture equal to its photo has PSNR
+/// `f64::INFINITY`; JSON has no infinity, so the caller decides what to print. NaN when every pixel is masked.
 ///
 /// # Panics
 /// When picture and target differ in size.
@@ -47,9 +48,9 @@ pub fn psnr(image: &Image, target: &Target) -> f64 {
     if mse == 0.0 { f64::INFINITY } else { -10.0 * libm::log10(mse) }
 }
 
-/// Mean structural similarity over pixels and channels (11x11 Gaussian window, sigma 1.5), values cut to 0..1.
-/// Masked pixels take the photo's value before filtering and are left out of the mean; NaN when no pixel counts.
-/// [`SsimVariant::Valid`] falls back to `Same` when a side is under 11 pixels.
+/// Mean structural similarity over pixels and channels (11x11 Gaussian window, sigma 1.5), values clamped to 0..1.
+/// Masked pixels take the photo's value before filtering and are excluded from the mean; NaN when every pixel is
+/// masked. [`SsimVariant::Valid`] falls back to `Same` when a side is under 11 pixels.
 ///
 /// # Panics
 /// When picture and target differ in size.
@@ -58,8 +59,8 @@ pub fn ssim(image: &Image, target: &Target, variant: SsimVariant, simd: SimdPath
     mean_ssim(&pair, variant, simd)
 }
 
-/// Mean over views: every view weighs the same, whatever its size (the field's convention, also for PSNR, which is
-/// averaged in dB). NaN for no views; NaN or infinity in a view stays visible in the mean.
+/// Mean over views. Every view has the same weight, whatever its size; PSNR is averaged in dB (both are the field's
+/// convention). NaN for no views; NaN or infinity in a view stays visible in the mean.
 pub fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
@@ -84,7 +85,7 @@ mod tests {
     #[test]
     fn a_perfect_picture_is_infinitely_good() {
         let (image, target) = gradient_pair(23, 14);
-        // One f32 rounding of byte / 255 per value is all that differs: at most 2^-25 each, so above 144 dB.
+        // The only difference is one f32 rounding of byte / 255 per value, at most 2^-25 each: above 144 dB.
         assert!(psnr(&image, &target) > 144.0);
         for variant in SsimVariant::ALL {
             // f32 rounding of windowed sums, relative to C2 = 9e-4.
@@ -101,7 +102,7 @@ mod tests {
         let target = Target { width: 12, height: 11, rgb: vec![51; 3 * 132], mask: None };
         let mut image = Image::new(12, 11);
         image.rgb.fill(0.3);
-        // 0.3 is rounded to f32 (3e-8 relative to the difference 0.1, 3e-6 dB).
+        // 0.3 is rounded to f32: 3e-8 relative to the difference 0.1, which is 3e-6 dB.
         assert!((psnr(&image, &target) - 20.0).abs() < 1e-5);
     }
 

@@ -1,6 +1,9 @@
-//! From rows to a picture, from the picture to a loss, and from the loss to gradients of the rows; and image metrics.
+//! Rendering forward and backward: rows to a picture, picture to a loss, loss to gradients of the rows. Also the image
+//! metrics of reports.
 //!
-//! [`Renderer`] is the interface of every backend: the stages of one view, in order, on batches of rows.
+//! [`Renderer`] is the interface of every backend: the stages of one view, in order, on batches of rows. The CPU
+//! backend is [`cpu`]. The device backend is [`gpu`], with its stages in `gpu_rows`, `gpu_tiles`, `gpu_tiles_bwd` and
+//! `gpu_loss`. The kernels themselves are in [`crate::kernels`] and `shaders/`.
 
 pub mod color_correct;
 pub mod cpu;
@@ -22,16 +25,16 @@ use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
 
-/// What a rendering depends on besides rows and camera.
+/// The parameters of a rendering besides rows and camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RenderOptions {
-    /// Bands in use now, 0 to 3; at most the degree the rows are stored with.
+    /// SH degree to evaluate, 0 to 3; at most the degree that the rows are stored with.
     pub sh_degree: u8,
     /// Upper clamp of alpha.
     pub max_alpha: f32,
     /// Blur of the projected covariance, px^2.
     pub eps2d: f32,
-    /// RGB added behind everything.
+    /// Background colour, RGB, weighted by the transmittance that is left.
     pub background: [f32; 3],
     /// Instruction path of the CPU kernels.
     pub simd: SimdPath,
@@ -46,25 +49,25 @@ impl Default for RenderOptions {
 /// Gradients of one batch of a view, one entry per row.
 #[derive(Debug, Clone, Default)]
 pub struct Gradients {
-    /// With respect to the stored (pre-activation) columns.
+    /// Gradient with respect to the stored (pre-activation) columns.
     pub columns: Columns,
-    /// With respect to the pixel position of the mean, signed, pixel units.
+    /// Gradient with respect to the projected mean, signed, in pixel units.
     pub means2d: Vec<[f32; 2]>,
-    /// Half extents of the footprint, pixels; [0, 0]: the row was not drawn.
+    /// Half extents of the footprint, pixels; [0, 0] for a row that was not drawn.
     pub radii: Vec<[u32; 2]>,
 }
 
-/// Gradient of a loss with respect to a picture, on the host: what the way back starts from.
+/// Gradient of a loss with respect to a picture, in host memory: the input of the backward pass.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PictureGradient {
     /// `[3][height][width]`.
     pub v_rgb: Vec<f32>,
-    /// `[height][width]`, for the coverage 1 - T; none: zeros.
+    /// `[height][width]`, with respect to the coverage 1 - T; `None` stands for zeros.
     pub v_alpha: Option<Vec<f32>>,
 }
 
 impl PictureGradient {
-    /// Becomes a gradient of zeros for so many pixels; keeps the allocation.
+    /// Sets the gradient to zeros for a picture of `pixels` pixels; reuses the allocation.
     fn reset(&mut self, pixels: usize) {
         self.v_rgb.clear();
         self.v_rgb.resize(3 * pixels, 0.0);
@@ -81,26 +84,26 @@ impl PictureGradient {
 /// Why a view could not be rendered.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RenderError {
-    /// Tiles are numbered in 24 bits.
-    #[error("an image of {width}x{height} is too large: a side holds at most {} pixels", Grid::SIDE_MAX)]
+    /// A side of the picture is longer than [`Grid::SIDE_MAX`]: tile numbers have 24 bits.
+    #[error("an image of {width}x{height} is too large: each side may have at most {} pixels", Grid::SIDE_MAX)]
     ImageTooLarge {
         /// Pixels.
         width: u32,
         /// Pixels.
         height: u32,
     },
-    /// Rows are numbered in 32 bits within a view.
-    #[error("{0} Gaussians are too many for one view")]
+    /// A view has more rows than 32-bit row numbers can count.
+    #[error("{0} Gaussians are too many for one view: the limit is {max}", max = u32::MAX - 1)]
     TooManyRows(usize),
-    /// More bands were asked for than the rows hold.
-    #[error("SH degree {asked} was asked for, but the rows are stored with degree {stored}")]
+    /// The options ask for a higher SH degree than the rows hold.
+    #[error("SH degree {asked} was requested, but the rows are stored with degree {stored}")]
     ShDegree {
-        /// Of the options.
+        /// Degree of the options.
         asked: u8,
-        /// Of the rows.
+        /// Degree of the rows.
         stored: u8,
     },
-    /// The photo does not have the size of the picture.
+    /// The photo and the picture differ in size.
     #[error("the target is {}x{}, the picture {}x{}", .target.0, .target.1, .image.0, .image.1)]
     TargetSize {
         /// Width and height of the target.
@@ -108,43 +111,43 @@ pub enum RenderError {
         /// Width and height of the picture.
         image: (u32, u32),
     },
-    /// A stage was called before one that it needs.
-    #[error("{call} was called, but it needs {needs} first")]
+    /// A stage was called before a stage that it depends on.
+    #[error("the stage {call} must follow {needs}")]
     OutOfOrder {
-        /// The stage.
+        /// The stage that was called.
         call: &'static str,
-        /// What must come before it.
+        /// The stage or state that must come before.
         needs: &'static str,
     },
-    /// The rows of a view were to come in a number of batches that this backend does not take.
-    #[error("a view in {asked} batches of rows was asked for; it may have 1 to {most}")]
+    /// This backend does not support the requested number of row batches.
+    #[error("a view in {asked} batches of rows was requested; this backend supports 1 to {max}")]
     Batches {
-        /// Of the caller.
+        /// Batches that the caller requested.
         asked: usize,
-        /// Of the backend.
-        most: usize,
+        /// Most batches that the backend supports.
+        max: usize,
     },
-    /// The rows that went in as this batch were others.
-    #[error("batch {batch} of this view is not one of {given} rows")]
+    /// The view has no such batch, or the batch had another number of rows on the way in.
+    #[error("this view has no batch {batch} with {given} rows")]
     BatchRows {
-        /// Counted from 0.
+        /// Number of the batch, from 0.
         batch: usize,
         /// Rows that the caller gave.
         given: usize,
     },
-    /// The gradient of the picture does not have the size of the picture.
-    #[error("the gradient of the picture does not belong to a picture of {pixels} pixels")]
+    /// The gradient of the picture and the picture differ in size.
+    #[error("the gradient of the picture must have the size of the picture, {pixels} pixels")]
     GradientSize {
-        /// Of the picture.
+        /// Pixels of the picture.
         pixels: usize,
     },
-    /// The device could not do its part, or the view does not fit it; the stage or buffer is named.
+    /// The device failed, or the view exceeds a limit of the device. The error names the stage or buffer.
     #[error(transparent)]
     Device(#[from] GpuError),
 }
 
 impl RenderError {
-    /// What the user can do about it; `None` when the text says so itself.
+    /// What the user can do about the error; `None` when the message itself contains the remedy.
     pub fn remedy(&self) -> Option<&'static str> {
         match self {
             RenderError::Device(GpuError::OutOfBudget { .. } | GpuError::OutOfMemory { .. }) => None,
@@ -167,113 +170,118 @@ impl RenderError {
 /// ```text
 /// begin_view ──> rows_in (each batch) ──> picture ──> loss ──> picture_back ──> rows_out (each batch) ──> loss_value
 ///                                            │          │
-///                                            │          └> picture_gradient: read it, add to it, take it through a correction
-///                                            └> image; picture_mut: correct it
+///                                            │          └> picture_gradient: read or change the gradient
+///                                            └> image: read the picture; picture_mut: correct the picture
 /// ```
 ///
-/// A batch is a part of the view's rows; the batches together are the view's rows in their order, and their number
-/// changes no bit. One batch is the ordinary case. The rows of a batch are needed while it goes in and while it comes
-/// out, not between. A device may still be at work on a stage when its call returns: what it fails at later is an error
-/// of the call that needs the result. A stage out of order is [`RenderError::OutOfOrder`] and changes nothing. After a
-/// [`RenderError::Device`] there is no view until the next `begin_view`.
+/// A batch is a consecutive part of the view's rows. All batches in order make up the view. The number of batches
+/// changes no bit of the result; one batch is the ordinary case. The caller provides the rows of a batch to `rows_in`
+/// and again to `rows_out`, and may drop the rows between the two calls.
+///
+/// A device may still execute a stage when the call returns. A later failure is then reported by the call that needs
+/// the result. A stage that is called out of order returns [`RenderError::OutOfOrder`] and changes nothing. A
+/// [`RenderError::Device`] drops the view; the next call must be `begin_view`.
 pub trait Renderer: Send {
-    /// Name for reports.
+    /// Name of the backend, for reports.
     fn name(&self) -> &'static str;
 
-    /// The device, for reports.
+    /// Name of the device, for reports.
     fn device(&self) -> String {
         self.name().to_string()
     }
 
-    /// What crossed the bus to the device so far, and its memory; zeros where there is no device.
+    /// Bytes transferred to and from the device so far, and device memory; zeros for a backend without a device.
     fn traffic(&self) -> Traffic {
         Traffic::default()
     }
 
-    /// Host memory held for views, bytes.
+    /// Host memory that the renderer holds, bytes.
     fn host_bytes(&self) -> u64;
 
-    /// Begins a view whose rows come in `batches` batches. The view before is given up.
+    /// Begins a view whose rows come in `batches` batches. Drops the previous view.
     ///
     /// # Errors
-    /// The picture is too large, or this backend does not take as many batches.
+    /// The picture is too large, or this backend does not support this number of batches.
     fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: usize) -> Result<(), RenderError>;
 
-    /// Projects and colours the rows of the next batch: its splats are appended to the view's.
+    /// Projects and colours the rows of the next batch and appends the splats to those of the view.
     ///
     /// # Errors
-    /// All batches are in, there are too many rows, they hold fewer bands than the options ask for, or a device has no
-    /// room for them.
+    /// All batches were given already, the view has too many rows, the rows hold a lower SH degree than the options
+    /// request, or device memory is exhausted.
     fn rows_in(&mut self, rows: &Columns) -> Result<(), RenderError>;
 
-    /// Sorts the splats by depth, lists them by tile and blends them.
+    /// Sorts the splats by depth, lists the splats of each tile and blends the lists.
     ///
     /// # Errors
-    /// Not all batches are in, or a device has no room for the lists.
+    /// A batch of rows is missing, or device memory is exhausted.
     fn picture(&mut self) -> Result<(), RenderError>;
 
     /// The picture.
     ///
     /// # Errors
-    /// Without a picture, or while its gradient is on the way back to the rows.
+    /// The view has no picture yet, or `picture_back` ran and `rows_out` of a batch is still due.
     fn image(&mut self) -> Result<&Image, RenderError>;
 
-    /// The values of the picture on the host, `[3][height][width]`, to be corrected: [`Renderer::loss`] compares what
-    /// the caller makes of them. The gradient is then that of the corrected picture, and the caller takes it back
-    /// through the correction, by [`Renderer::picture_gradient`]. On a device the picture crosses the bus twice.
+    /// The values of the picture in host memory, `[3][height][width]`, for the caller to correct. [`Renderer::loss`]
+    /// then compares the corrected picture, and the gradient is that of the corrected picture. The caller must
+    /// propagate the gradient through the correction, in [`Renderer::picture_gradient`]. On a device the picture
+    /// crosses the bus twice.
     ///
     /// # Errors
     /// As [`Renderer::image`].
     fn picture_mut(&mut self) -> Result<&mut [f32], RenderError>;
 
-    /// Computes the loss of the picture against `target`, and the gradient of the picture, which replaces any other.
+    /// Computes the loss of the picture against `target` and the gradient of the picture. Replaces an earlier gradient.
     ///
     /// # Errors
-    /// As [`Renderer::image`], or when the target's size differs.
+    /// As [`Renderer::image`], or target and picture differ in size.
     fn loss(&mut self, target: &Target, options: &LossOptions) -> Result<(), RenderError>;
 
-    /// The gradient of the picture on the host, as the loss left it, or zeros where there was no loss. What the caller
-    /// makes of it is what [`Renderer::picture_back`] starts from: here a second term of the loss adds its gradient, and
-    /// a correction of the picture takes the gradient back through itself. On a device the gradient crosses the bus
-    /// twice.
+    /// The gradient of the picture in host memory: the gradient of the loss, or zeros if no loss ran.
+    /// [`Renderer::picture_back`] starts from the values that the caller leaves here. A second loss term adds its
+    /// gradient here, and a correction of the picture propagates the gradient here. On a device the gradient crosses
+    /// the bus twice.
     ///
     /// # Errors
     /// As [`Renderer::image`].
     fn picture_gradient(&mut self) -> Result<&mut PictureGradient, RenderError>;
 
-    /// Takes the gradient of the picture back to the view's splats.
+    /// Propagates the gradient of the picture back to the splats of the view.
     ///
     /// # Errors
-    /// Without a gradient, or when the caller changed its size.
+    /// The picture has no gradient, or the caller changed the size of the gradient.
     fn picture_back(&mut self) -> Result<(), RenderError>;
 
-    /// Takes the gradients of the splats back to the rows of a batch (counted from 0), which are given again. Batches
-    /// come out in any order, each once. Every entry of `grads` is written, zeros for rows that were not drawn.
+    /// Propagates the gradients of the splats back to the rows of one batch (counted from 0). The caller provides the
+    /// same rows as to [`Renderer::rows_in`]. Batches may come in any order, each once. Every entry of `grads` is
+    /// written; rows that were not drawn get zeros.
     ///
     /// # Errors
-    /// Before [`Renderer::picture_back`], when the batch is out already, or when it had another number of rows.
+    /// [`Renderer::picture_back`] has not run, the batch was processed already, or the batch had another number of
+    /// rows.
     fn rows_out(&mut self, batch: usize, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError>;
 
-    /// The value of the last [`Renderer::loss`]. On a device it is there without waiting once rows are out.
+    /// The value of the last [`Renderer::loss`]. On a device, a call after `rows_out` does not wait.
     ///
     /// # Errors
-    /// Without a loss.
+    /// The view has no loss.
     fn loss_value(&mut self) -> Result<LossValue, RenderError>;
 
-    /// The stages of a view of one batch up to its picture.
+    /// Runs the stages of a one-batch view up to the picture.
     ///
     /// # Errors
-    /// Those of the stages.
+    /// The errors of the stages.
     fn draw(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
         self.begin_view(camera, options, 1)?;
         self.rows_in(rows)?;
         self.picture()
     }
 
-    /// The stages of a view of one batch from the gradient of its picture back to its rows.
+    /// Runs the stages of a one-batch view from the gradient of the picture back to the rows.
     ///
     /// # Errors
-    /// Those of the stages.
+    /// The errors of the stages.
     fn backpropagate(&mut self, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError> {
         self.picture_back()?;
         self.rows_out(0, rows, grads)

@@ -1,9 +1,10 @@
-//! Where a view stands among its stages, and which stage may follow: the same rules for every backend.
+//! The order of the stages of a view: tracks the progress of the view and checks each call. Shared by every backend.
 //!
 //! Not here: what the stages compute.
 //!
-//! Invariants: 1. a stage that is called out of order, or with a batch, photo or gradient that does not fit the view, is
-//! an error and changes nothing; 2. after [`Sequence::begin`] has failed, or after [`Sequence::give_up`], there is no view.
+//! Invariants: 1. a stage that is called out of order, or with a batch, photo or gradient that does not fit the view,
+//! returns an error and changes nothing; 2. after a failed [`Sequence::begin`] or after [`Sequence::drop_view`] there
+//! is no view.
 
 use super::{PictureGradient, RenderError, RenderOptions};
 use crate::kernels::splats::Grid;
@@ -12,81 +13,81 @@ use crate::scene::columns::Columns;
 use crate::scene::image::Target;
 use std::ops::Range;
 
-/// A view that was begun.
+/// Camera and options of a view.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ViewOptions {
     pub camera: Camera,
     pub options: RenderOptions,
 }
 
-/// What the view has reached.
+/// Progress of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Reached {
-    /// Some of the batches are in.
+enum Progress {
+    /// Batches of rows are being added.
     Rows,
-    /// The picture is made.
+    /// The picture exists.
     Picture,
-    /// The gradient of the picture is there, from a loss or from the caller.
-    Gradient,
-    /// The gradients of the splats are there, and some batches are not out yet.
-    Splats,
+    /// The gradient of the picture exists, from a loss or from the caller.
+    PictureGradient,
+    /// The gradients of the splats exist, and `rows_out` of at least one batch is still due.
+    SplatGradients,
 }
 
-/// The view that is rendered now.
+/// The current view.
 #[derive(Debug)]
 struct Current {
     view: ViewOptions,
-    reached: Reached,
+    progress: Progress,
     batches: usize,
-    /// Where each batch that is in ends, in rows of the view.
+    /// End of each batch that `rows_in` has taken, in rows of the view.
     ends: Vec<usize>,
-    /// Whether each batch is out, on the way back that is going on.
+    /// Whether `rows_out` of each batch has run in the current backward pass.
     is_out: Vec<bool>,
 }
 
-/// The stages of one view after another.
+/// The stage order of a renderer, one view at a time.
 #[derive(Debug, Default)]
 pub(super) struct Sequence {
     current: Option<Current>,
 }
 
-fn order<T>(call: &'static str, needs: &'static str) -> Result<T, RenderError> {
+fn out_of_order<T>(call: &'static str, needs: &'static str) -> Result<T, RenderError> {
     Err(RenderError::OutOfOrder { call, needs })
 }
 
 impl Sequence {
-    /// `begin_view` of a backend that takes at most `most` batches.
+    /// Checks `begin_view` of a backend that supports at most `max` batches.
     pub fn begin(
         &mut self,
         camera: &Camera,
         options: &RenderOptions,
         batches: usize,
-        most: usize,
+        max: usize,
     ) -> Result<(), RenderError> {
         self.current = None;
         let Camera { width, height, .. } = *camera;
         if width.max(height) > Grid::SIDE_MAX {
             return Err(RenderError::ImageTooLarge { width, height });
         }
-        if batches == 0 || batches > most {
-            return Err(RenderError::Batches { asked: batches, most });
+        if batches == 0 || batches > max {
+            return Err(RenderError::Batches { asked: batches, max });
         }
         let view = ViewOptions { camera: *camera, options: *options };
         let (ends, is_out) = (Vec::with_capacity(batches), Vec::with_capacity(batches));
-        self.current = Some(Current { view, reached: Reached::Rows, batches, ends, is_out });
+        self.current = Some(Current { view, progress: Progress::Rows, batches, ends, is_out });
         Ok(())
     }
 
-    /// There is no view any more.
-    pub fn give_up(&mut self) {
+    /// Drops the view.
+    pub fn drop_view(&mut self) {
         self.current = None;
     }
 
-    /// `rows_in`: the view, and the batch's place among the view's rows.
+    /// Checks `rows_in`. Returns the view and the range of the batch in the view's rows.
     pub fn rows_in(&mut self, rows: &Columns) -> Result<(ViewOptions, Range<usize>), RenderError> {
-        let Some(current) = &mut self.current else { return order("rows_in", "begin_view") };
-        if current.reached != Reached::Rows || current.ends.len() == current.batches {
-            return order("rows_in", "a view whose batches are not all in");
+        let Some(current) = &mut self.current else { return out_of_order("rows_in", "begin_view") };
+        if current.progress != Progress::Rows || current.ends.len() == current.batches {
+            return out_of_order("rows_in", "begin_view: all batches of this view were given already");
         }
         let asked = current.view.options.sh_degree;
         if asked > rows.sh_degree {
@@ -101,56 +102,56 @@ impl Sequence {
         Ok((current.view, first..end))
     }
 
-    /// `picture`: the view.
+    /// Checks `picture`. Returns the view.
     pub fn picture(&mut self) -> Result<ViewOptions, RenderError> {
         match &mut self.current {
-            Some(current) if current.reached == Reached::Rows && current.ends.len() == current.batches => {
-                current.reached = Reached::Picture;
+            Some(current) if current.progress == Progress::Rows && current.ends.len() == current.batches => {
+                current.progress = Progress::Picture;
                 Ok(current.view)
             }
-            _ => order("picture", "rows_in of every batch"),
+            _ => out_of_order("picture", "rows_in of every batch"),
         }
     }
 
-    /// What `call` needs: a picture that is not on its way back.
+    /// Checks that the view has a picture and that no backward pass is unfinished.
     fn with_picture(&mut self, call: &'static str) -> Result<&mut Current, RenderError> {
-        let Some(current) = &mut self.current else { return order(call, "picture") };
-        match current.reached {
-            Reached::Rows => order(call, "picture"),
-            Reached::Picture | Reached::Gradient => Ok(current),
-            Reached::Splats => order(call, "rows_out of every batch"),
+        let Some(current) = &mut self.current else { return out_of_order(call, "picture") };
+        match current.progress {
+            Progress::Rows => out_of_order(call, "picture"),
+            Progress::Picture | Progress::PictureGradient => Ok(current),
+            Progress::SplatGradients => out_of_order(call, "rows_out of every batch"),
         }
     }
 
-    /// `image`: the view.
+    /// Checks `image`. Returns the view.
     pub fn image(&mut self) -> Result<ViewOptions, RenderError> {
         Ok(self.with_picture("image")?.view)
     }
 
-    /// `loss`.
+    /// Checks `loss`.
     pub fn loss(&mut self, target: &Target) -> Result<(), RenderError> {
         let current = self.with_picture("loss")?;
         let image = (current.view.camera.width, current.view.camera.height);
         if (target.width, target.height) != image {
             return Err(RenderError::TargetSize { target: (target.width, target.height), image });
         }
-        current.reached = Reached::Gradient;
+        current.progress = Progress::PictureGradient;
         Ok(())
     }
 
-    /// `picture_gradient`: the view, and whether there was a gradient already.
+    /// Checks `picture_gradient`. Returns the view, and whether the picture had a gradient already.
     pub fn picture_gradient(&mut self) -> Result<(ViewOptions, bool), RenderError> {
         let current = self.with_picture("picture_gradient")?;
-        let was_there = current.reached == Reached::Gradient;
-        current.reached = Reached::Gradient;
-        Ok((current.view, was_there))
+        let had_gradient = current.progress == Progress::PictureGradient;
+        current.progress = Progress::PictureGradient;
+        Ok((current.view, had_gradient))
     }
 
-    /// `picture_back`: the view. `gradient` is what it starts from, where that is on the host.
+    /// Checks `picture_back`. Returns the view. `gradient` is the gradient of the picture if the host holds it.
     pub fn picture_back(&mut self, gradient: Option<&PictureGradient>) -> Result<ViewOptions, RenderError> {
         let current = match &mut self.current {
-            Some(current) if current.reached == Reached::Gradient => current,
-            _ => return order("picture_back", "loss or picture_gradient"),
+            Some(current) if current.progress == Progress::PictureGradient => current,
+            _ => return out_of_order("picture_back", "loss or picture_gradient"),
         };
         let pixels = current.view.camera.pixels();
         if let Some(PictureGradient { v_rgb, v_alpha }) = gradient
@@ -158,17 +159,17 @@ impl Sequence {
         {
             return Err(RenderError::GradientSize { pixels });
         }
-        current.reached = Reached::Splats;
+        current.progress = Progress::SplatGradients;
         current.is_out.clear();
         current.is_out.resize(current.batches, false);
         Ok(current.view)
     }
 
-    /// `rows_out`: the view, and the batch's place among the view's rows.
+    /// Checks `rows_out`. Returns the view and the range of the batch in the view's rows.
     pub fn rows_out(&mut self, batch: usize, rows: &Columns) -> Result<(ViewOptions, Range<usize>), RenderError> {
         let current = match &mut self.current {
-            Some(current) if current.reached == Reached::Splats => current,
-            _ => return order("rows_out", "picture_back"),
+            Some(current) if current.progress == Progress::SplatGradients => current,
+            _ => return out_of_order("rows_out", "picture_back"),
         };
         let Some(&end) = current.ends.get(batch) else {
             return Err(RenderError::BatchRows { batch, given: rows.rows() });
@@ -178,11 +179,11 @@ impl Sequence {
             return Err(RenderError::BatchRows { batch, given: rows.rows() });
         }
         if std::mem::replace(&mut current.is_out[batch], true) {
-            return order("rows_out", "a batch that is not out yet");
+            return out_of_order("rows_out", "picture_back: this batch was processed already");
         }
         if current.is_out.iter().all(|out| *out) {
-            // The way back may be gone again, with another gradient.
-            current.reached = Reached::Gradient;
+            // The backward pass may run again, with another gradient.
+            current.progress = Progress::PictureGradient;
         }
         Ok((current.view, first..end))
     }

@@ -172,12 +172,12 @@ fn buffers_that_are_too_small_are_made_larger() {
     let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
     let (view, options, target) = (scene(4000, 160, 112), RenderOptions::default(), photo(160, 112, false));
     let want = bits(&results(&mut gpu, &view, &options, &target));
-    assert_eq!(gpu.frames_again(), 0);
+    assert_eq!(gpu.frames_rerecorded(), 0);
     gpu.set_capacity(100);
     assert!(bits(&results(&mut gpu, &view, &options, &target)) == want);
-    assert_eq!(gpu.frames_again(), 1);
+    assert_eq!(gpu.frames_rerecorded(), 1);
     results(&mut gpu, &view, &options, &target);
-    assert_eq!(gpu.frames_again(), 1, "the room is kept");
+    assert_eq!(gpu.frames_rerecorded(), 1, "the room is kept");
 }
 
 #[test]
@@ -248,7 +248,7 @@ fn a_view_beyond_one_binding_of_sums_is_that_of_the_cpu() {
     let options = RenderOptions { background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
     let got = results(&mut gpu, &view, &options, &target);
     let isects = u64::from(gpu.isects());
-    println!("{isects} intersections, {} frames again, {:?}", gpu.frames_again(), gpu.traffic());
+    println!("{isects} intersections, {} frames again, {:?}", gpu.frames_rerecorded(), gpu.traffic());
     assert!(36 * isects > limit, "{isects} intersections need one window");
     assert_same("a large view", &got, &results(&mut CpuRenderer::new(), &view, &options, &target));
 }
@@ -370,7 +370,7 @@ fn misuse_is_an_error() {
     gpu.begin_view(&camera, &options, 1).unwrap();
     gpu.rows_in(&rows).unwrap();
     gpu.draw(&small, &camera, &options).unwrap();
-    assert_eq!(gpu.begin_view(&camera, &options, 2), Err(RenderError::Batches { asked: 2, most: 1 }));
+    assert_eq!(gpu.begin_view(&camera, &options, 2), Err(RenderError::Batches { asked: 2, max: 1 }));
     let high = RenderOptions { sh_degree: 3, ..RenderOptions::default() };
     assert!(matches!(gpu.draw(&Columns::zeros(1, 1), &camera, &high), Err(RenderError::ShDegree { .. })));
 }
@@ -421,7 +421,7 @@ fn gradients_that_the_caller_adds_to_reach_the_rows() {
     // A frame that was too small is found out by whoever asks first: here the caller who wants the gradient.
     gpu.set_capacity(100);
     assert!(bits(&with_term(&mut gpu, Some(1.0))) == bits(&got));
-    assert_eq!(gpu.frames_again(), 1);
+    assert_eq!(gpu.frames_rerecorded(), 1);
 }
 
 /// The reference files: see `tests/oracle/raster.rs`, whose limits are those of the files' README.

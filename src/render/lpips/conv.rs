@@ -1,17 +1,17 @@
-//! Convolutions and pooling of pictures on the processor, for metrics.
+//! Convolution and max pooling of pictures on the CPU, for metrics.
 //!
-//! Planes lie row by row, the channels of one picture row behind each other, so that a row of results is one piece of
-//! memory and rows can be made in parallel. A convolution gathers the pixels under the kernel for 32 neighbouring
-//! results and multiplies them with the weights of eight channels at a time: the sums stay in registers.
+//! The layout is `[y][channel][x]`, so that a row of results is contiguous and rows can be computed in parallel. A
+//! convolution gathers the pixels under the kernel for 32 neighbouring results and multiplies them with the weights of
+//! eight output channels at a time; the sums stay in registers.
 //!
-//! Invariant: sums run over (input channel, kernel row, kernel column) in that order, whatever the number of threads.
+//! Invariant: sums run over (input channel, kernel row, kernel column) in that order, for any number of threads.
 
 use crate::base::simd::{Kernel, SimdPath, dispatch, fma};
 use rayon::prelude::*;
 
-/// Results of one block, in x.
+/// Neighbouring results in x that are computed together.
 const BLOCK: usize = 32;
-/// Output channels that are summed together.
+/// Output channels that are computed together.
 const GROUP: usize = 8;
 
 /// Channels of a picture: value (c, y, x) at `(y * channels + c) * width + x`.
@@ -33,12 +33,13 @@ impl Planes {
     }
 }
 
-/// A convolution with bias and rectifier.
+/// A convolution with bias and ReLU.
 pub(super) struct Conv {
-    /// `[out / 8][in * kernel * kernel][8]`, the last group filled with zeros.
+    /// `[out / 8][in * kernel * kernel][8]`, the last group padded with zeros.
     weights: Vec<f32>,
-    /// `[out]`, filled to whole groups.
+    /// `[out]`, padded to whole groups.
     bias: Vec<f32>,
+    /// Input and output channels.
     channels: [usize; 2],
     kernel: usize,
     stride: usize,
@@ -46,7 +47,7 @@ pub(super) struct Conv {
 }
 
 impl Conv {
-    /// From weights `[out][in][kernel][kernel]` and a bias `[out]`; `channels`: in, out.
+    /// Packs weights `[out][in][kernel][kernel]` and a bias `[out]`; `channels` is [in, out].
     pub fn new(weights: &[f32], bias: &[f32], channels: [usize; 2], [kernel, stride, padding]: [usize; 3]) -> Conv {
         let [inputs, outputs] = channels;
         let terms = inputs * kernel * kernel;
@@ -76,7 +77,8 @@ impl Conv {
         out
     }
 
-    /// The inputs of results (y, x..x + BLOCK): `[in * kernel * kernel][BLOCK]`, zeros outside the picture.
+    /// Gathers the inputs of the results (y, x..x + BLOCK) into `patch`, `[in * kernel * kernel][BLOCK]`, with zeros
+    /// outside the picture.
     fn gather(&self, input: &Planes, y: usize, x: usize, patch: &mut Vec<f32>) {
         patch.clear();
         for channel in 0..self.channels[0] {
@@ -101,7 +103,7 @@ impl Conv {
     }
 }
 
-/// All channels of one block of results.
+/// Computes all output channels of one block of results.
 struct BlockSums<'a> {
     conv: &'a Conv,
     patch: &'a [f32],
@@ -140,7 +142,7 @@ impl Kernel for BlockSums<'_> {
     }
 }
 
-/// Maximum over `size` x `size` pixels at every second one; windows that do not fit are left out.
+/// Maximum over windows of `size` x `size` pixels with stride 2; incomplete windows are dropped.
 pub(super) fn max_pool(input: &Planes, size: usize) -> Planes {
     let shrunk = |n: usize| n.saturating_sub(size) / 2 + usize::from(n >= size);
     let mut out = Planes::zeros(input.channels, shrunk(input.height), shrunk(input.width));

@@ -1,12 +1,13 @@
-//! LPIPS: how different two pictures look to a network that was trained on something else (Zhang et al., CVPR 2018).
+//! LPIPS: a perceptual distance between two pictures in the feature space of an image network (Zhang et al., CVPR
+//! 2018).
 //!
-//! The features of AlexNet or VGG-16 after five of their layers are scaled to unit length over channels; their squared
-//! differences are weighed per channel, averaged over the picture and added up. Version 0.1 of the authors' package is
-//! followed to the letter; the weights come from a file (see [`weights`]), nothing is downloaded.
+//! Features of AlexNet or VGG-16 at five layers are scaled to unit length over channels. The squared differences are
+//! weighted per channel, averaged over pixels and summed over layers. The computation follows version 0.1 of the
+//! authors' package exactly. The weights come from a file (see [`weights`]); the program downloads nothing.
 //!
-//! Invariants: 1. the result is the same for any number of threads; 2. memory is that of one picture's features at one
-//! layer, twice; 3. numbers of different networks or of different input ranges are never comparable, so every report
-//! names both.
+//! Invariants: 1. the result is the same for any number of threads; 2. memory holds the features of one layer at a
+//! time, for both pictures; 3. values of different networks or input ranges are not comparable, so every report names
+//! both.
 
 mod conv;
 pub mod weights;
@@ -16,12 +17,12 @@ use crate::scene::image::{Image, Target};
 use conv::{Conv, Planes, max_pool};
 use rayon::prelude::*;
 
-/// Which network looks.
+/// The feature network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Network {
-    /// AlexNet: what gsplat, GS-Scale and nerfstudio report.
+    /// AlexNet, as reported by gsplat, GS-Scale and nerfstudio.
     Alex,
-    /// VGG-16: what the code of the 3DGS paper and the CityGaussian line report.
+    /// VGG-16, as reported by the code of the 3DGS paper and by the CityGaussian line.
     Vgg,
 }
 
@@ -41,7 +42,7 @@ impl Network {
         }
     }
 
-    /// Shortest side of a picture that leaves something for every layer, pixels.
+    /// Shortest side of a picture that gives every layer at least one pixel, pixels.
     fn shortest_side(self) -> usize {
         match self {
             Network::Alex => 31,
@@ -50,12 +51,12 @@ impl Network {
     }
 }
 
-/// What the values of a picture are mapped to before the network sees them.
+/// The range to which pixel values are mapped before the network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InputRange {
-    /// -1..1, what the weights were trained for (`normalize=True` of the authors' package).
+    /// -1..1, the range of the training data (`normalize=True` of the authors' package).
     Signed,
-    /// 0..1 as they are (`normalize=False`): a slip of the 3DGS code that many tables repeat.
+    /// 0..1, unchanged (`normalize=False`): a mistake of the 3DGS code that many tables repeat.
     Unit,
 }
 
@@ -74,16 +75,20 @@ impl std::str::FromStr for InputRange {
 
     fn from_str(text: &str) -> Result<InputRange, String> {
         let ranges = [InputRange::Signed, InputRange::Unit];
-        ranges.into_iter().find(|r| r.name() == text).ok_or_else(|| format!("'{text}' is neither signed nor unit"))
+        ranges
+            .into_iter()
+            .find(|r| r.name() == text)
+            .ok_or_else(|| format!("unknown input range '{text}': use signed or unit"))
     }
 }
 
-/// One step of a network. Every convolution is followed by a rectifier.
+/// One layer of a network. A ReLU follows every convolution.
 #[derive(Debug, Clone, Copy)]
 enum Layer {
-    /// Convolution: name in the file, channels in and out, kernel, stride, padding; whether the distance looks here.
+    /// Convolution. `name`: tensor name in the file; `shape`: input and output channels; `tap`: whether the distance
+    /// compares the features after this layer.
     Conv { name: &'static str, shape: [usize; 2], kernel: usize, stride: usize, padding: usize, tap: bool },
-    /// Maximum over `size` x `size` pixels, every second one.
+    /// Maximum over windows of `size` x `size` pixels, stride 2.
     Pool { size: usize },
 }
 
@@ -121,28 +126,28 @@ const VGG: [Layer; 17] = [
     conv("slice5.28", [512, 512], [3, 1, 1], true),
 ];
 
-/// Mean of the training pictures, in the range -1..1, and their deviation.
+/// Mean and standard deviation of the training pictures per channel, in the range -1..1.
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 
 /// A network with its weights.
 pub struct Lpips {
     network: Network,
-    /// One per convolution, in order.
+    /// The convolutions, in layer order.
     convs: Vec<Conv>,
-    /// Weights of the channels at each tap.
+    /// Channel weights of each tap.
     channel_weights: Vec<Vec<f32>>,
     simd: SimdPath,
 }
 
 impl Lpips {
-    /// Which network it is.
+    /// The feature network.
     pub fn network(&self) -> Network {
         self.network
     }
 
-    /// Distance of a picture from its photo, 0 for equal ones. Values are cut to 0..1; masked pixels take the photo's
-    /// value. NaN when a value is not finite or when the picture is too small for the network.
+    /// Distance of a picture from its photo, 0 if they are equal. Values are clamped to 0..1; masked pixels take the
+    /// photo's value. NaN when a value is NaN or the picture is too small for the network.
     ///
     /// # Panics
     /// When picture and target differ in size.
@@ -172,7 +177,7 @@ impl Lpips {
     }
 }
 
-/// The two pictures as the network wants them.
+/// Picture and photo as inputs of the network.
 fn input_planes(image: &Image, target: &Target, range: InputRange) -> (Planes, Planes) {
     let (width, height, pixels) = (image.width as usize, image.height as usize, image.pixels());
     let (mut a, mut b) = (Planes::zeros(3, height, width), Planes::zeros(3, height, width));
@@ -192,7 +197,7 @@ fn input_planes(image: &Image, target: &Target, range: InputRange) -> (Planes, P
     (a, b)
 }
 
-/// Mean over pixels of the weighed squared differences of features of unit length.
+/// Mean over pixels of the weighted squared differences of unit-length features.
 fn mean_difference(a: &Planes, b: &Planes, channel_weights: &[f32]) -> f64 {
     let rows: Vec<f64> = (0..a.height)
         .into_par_iter()

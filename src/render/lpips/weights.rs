@@ -1,11 +1,11 @@
-//! Weights of LPIPS from a safetensors file that the user made once, where Python and the `lpips` package are:
+//! Reads LPIPS weights from a safetensors file. The user makes the file once, with Python and the `lpips` package:
 //!
 //! ```text
 //! python -c "import lpips, safetensors.torch as s; s.save_file({k: v.clone().contiguous() for k, v in lpips.LPIPS(net='alex').state_dict().items()}, 'lpips_alex.safetensors')"
 //! ```
 //!
-//! (`net='vgg'` for VGG.) The network is recognised by its first layer. A safetensors file holds numbers only; nothing
-//! in it is executed.
+//! (`net='vgg'` for VGG.) The shape of the first layer tells the network. A safetensors file holds numbers only and
+//! contains no executable code.
 
 use super::conv::Conv;
 use super::{Layer, Lpips, Network};
@@ -14,22 +14,22 @@ use crate::base::simd::SimdPath;
 use safetensors::{Dtype, SafeTensors};
 use std::path::Path;
 
-/// The largest file that is read: VGG has 59 MB, and a file may hold the tensors of its classifier or copies.
+/// Size limit of the file: VGG has 59 MB, and a file may also hold the classifier's tensors or copies.
 const FILE_BYTES_MAX: u64 = 1 << 30;
 const REMEDY: &str = "make it with the one-line export in tools/README.md, section LPIPS";
 
 /// Reads a network with its weights.
 ///
 /// # Errors
-/// The file cannot be read, is no safetensors file, or a tensor is missing, has another shape or is not finite.
+/// The file cannot be read or is not a safetensors file; a tensor is missing, has another shape or is not finite.
 pub fn read_lpips(path: &Path, simd: SimdPath) -> InputResult<Lpips> {
     let io = |e: std::io::Error| InputError::io(path, "reading the LPIPS weights", &e);
     if std::fs::metadata(path).map_err(io)?.len() > FILE_BYTES_MAX {
-        return Err(InputError::new(path, "is larger than any file of LPIPS weights (1 GiB)", REMEDY));
+        return Err(InputError::new(path, "exceeds 1 GiB, the size limit for LPIPS weights", REMEDY));
     }
     let bytes = std::fs::read(path).map_err(io)?;
     let tensors = SafeTensors::deserialize(&bytes)
-        .map_err(|e| InputError::new(path, format!("is no safetensors file: {e}"), REMEDY))?;
+        .map_err(|e| InputError::new(path, format!("is not a safetensors file: {e}"), REMEDY))?;
     let file = File { path, tensors };
     let network = file.network()?;
     let (mut convs, mut channel_weights) = (Vec::new(), Vec::new());
@@ -58,7 +58,8 @@ impl File<'_> {
             [64, 3, 11, 11] => Ok(Network::Alex),
             [64, 3, 3, 3] => Ok(Network::Vgg),
             _ => {
-                let problem = "holds neither AlexNet nor VGG-16 of the lpips package (tensor net.slice1.0.weight)";
+                let problem =
+                    "holds neither AlexNet nor VGG-16 of the lpips package: unknown shape of net.slice1.0.weight";
                 Err(InputError::new(self.path, problem, REMEDY))
             }
         }
@@ -69,13 +70,13 @@ impl File<'_> {
         let tensor = self.tensors.tensor(name).map_err(|_| wrong("is missing".into()))?;
         if tensor.dtype() != Dtype::F32 || tensor.shape() != shape {
             let (dtype, got) = (tensor.dtype(), tensor.shape());
-            return Err(wrong(format!("is {dtype:?} {got:?} where F32 {shape:?} is needed")));
+            return Err(wrong(format!("is {dtype:?} {got:?}, expected F32 {shape:?}")));
         }
         let values: Vec<f32> =
             tensor.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
         match values.iter().all(|x| x.is_finite()) {
             true => Ok(values),
-            false => Err(wrong("holds a value that is not finite".into())),
+            false => Err(wrong("contains a value that is not finite".into())),
         }
     }
 }
