@@ -128,7 +128,7 @@ fn steps<R: Renderer>(
     let mut round = |counted: bool| {
         for (camera, target) in &views {
             let how = (&options.render, &options.loss);
-            let done = train_step(&mut scene, &mut working, renderer, (step, camera, target), how, false);
+            let done = train_step(&mut scene, &mut working, renderer, (step, camera, target), how, false, usize::MAX);
             let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
             hash.add(outcome.loss.loss.to_bits());
             step += 1;

@@ -25,7 +25,9 @@ use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::cpu::CpuRenderer;
-use gsscale::render::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer};
+use gsscale::render::{
+    Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches,
+};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Columns, row_width};
 use gsscale::scene::image::{Image, Target};
@@ -165,7 +167,7 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
                 renderer.begin = Some(Instant::now());
                 let at = (step, camera, target);
                 let how = (&options.render, &options.loss);
-                let done = train_step(&mut scene, &mut working, &mut renderer, at, how, true);
+                let done = train_step(&mut scene, &mut working, &mut renderer, at, how, true, usize::MAX);
                 let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
                 renderer.note_end();
                 let stats = renderer.inner.stats();
@@ -337,7 +339,7 @@ impl Renderer for Watched {
         self.inner.host_bytes()
     }
 
-    fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: usize) -> Result<(), RenderError> {
+    fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError> {
         let before = self.begin.map_or(0.0, |t| t.elapsed().as_secs_f64());
         self.add("acquire+cull+gather", before);
         self.inner.begin_view(camera, options, batches)

@@ -174,7 +174,7 @@ fn no_row_outside_of_the_selected_pages_changes_a_picture() {
         let camera = small(camera(&mut draws));
         let rgb = (0..3 * camera.pixels()).map(|_| draws.below(256) as u8).collect();
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-        train_step(&mut pages, &mut working, &mut renderer, (step, &camera, &target), how, false).unwrap();
+        train_step(&mut pages, &mut working, &mut renderer, (step, &camera, &target), how, false, usize::MAX).unwrap();
     }
     let mut all = Columns::zeros(0, 0);
     let mut append = |rows: &Columns| {
@@ -186,7 +186,8 @@ fn no_row_outside_of_the_selected_pages_changes_a_picture() {
     for view in 0..150 {
         let camera = small(camera(&mut draws));
         selected += pages.pager.pages_of_view(&camera).len();
-        pages.gather_view(&camera, STEPS, &mut working).unwrap();
+        let seen = pages.pager.pages_of_view(&camera);
+        pages.gather_pages(&seen, &camera, STEPS, &mut working).unwrap();
         left_out += all.rows() - working.columns.rows();
         let [of_view, of_all] = [&working.columns, &all].map(|rows| {
             renderer.draw(rows, &camera, &options.render).unwrap();

@@ -229,7 +229,7 @@ fn bits_of_steps(scene: &Path, options: &GpuOptions, capacity: u32) -> Option<(V
         let view = &dataset.views[view];
         let (target, how) = (decode(&view.photo).unwrap(), (&options.render, &options.loss));
         let at = (step as u32, &view.camera, &target);
-        let done = train_step(&mut scene, &mut working, &mut renderer, at, how, true).unwrap();
+        let done = train_step(&mut scene, &mut working, &mut renderer, at, how, true, usize::MAX).unwrap();
         assert!(done.rows > 900 && done.updated > 300 && !done.skipped, "{done:?}");
         isects = isects.min(renderer.isects());
         let columns = [&working.columns, &working.gradients.columns];

@@ -281,7 +281,7 @@ mod tests {
                 let (splat, [rx, ry]) = (packed.splats[row], projected.radii[row].map(|r| r as f32));
                 let mut reached = vec![[16u8, 0]; grid.tiles()];
                 let mut last = None;
-                for_each_tile(&splat, &packed.spans[row], grid, |tile, rows| {
+                for_each_tile::<false>(&splat, &packed.spans[row], grid, &TileRange::all(grid), |tile, rows| {
                     // Sums over a row's tiles are folded in this order, so that a view may be cut at tile columns.
                     let place = Some(grid.position(tile));
                     assert!(last < place, "tiles come once, column by column: {place:?} after {last:?}");

@@ -6,21 +6,23 @@
 //! any number of threads, for any split of the rows into batches, and on the AVX2 and AVX-512 paths.
 
 use super::sequence::{Sequence, ViewOptions};
-use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer};
+use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches};
 use crate::base::room;
+use crate::base::simd::SimdPath;
 use crate::kernels::image_loss::ImageLoss;
-use crate::kernels::isect_emit::{count, emit};
+use crate::kernels::isect_emit::{count, emit, number};
 use crate::kernels::isect_offsets::isect_offsets;
 use crate::kernels::project_bwd::project_bwd;
 use crate::kernels::project_fwd::{Projected, project_fwd};
 use crate::kernels::radix_sort::DepthSort;
-use crate::kernels::rasterize_bwd::{FootprintGradients, Partial, Upstream, fold_rows, rasterize_bwd};
+use crate::kernels::rasterize_bwd::{FoldPart, FootprintGradients, Partial, Upstream, fold_rows, rasterize_bwd};
 use crate::kernels::rasterize_fwd::{Lists, Raster, rasterize_fwd, untile};
 use crate::kernels::scan::scan;
 use crate::kernels::sh_bwd::sh_bwd;
 use crate::kernels::sh_fwd::sh_fwd;
 use crate::kernels::splats::{Grid, Packed, pack};
 use crate::kernels::stages::STAGES;
+use crate::kernels::tile_range::TileRange;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
@@ -81,6 +83,14 @@ pub struct CpuRenderer {
     isects: Vec<AtomicU64>,
     raster: Raster,
     partials: Vec<Partial>,
+    /// The ranges of tiles of the picture, in order.
+    ranges: Vec<TileRange>,
+    /// Intersections of each row in the range that is taken back now, and their sums by chunk of rows; unused by a picture of one
+    /// range.
+    range_counts: Vec<u32>,
+    range_chunk_counts: Vec<u64>,
+    /// Most intersections that are listed at once; `None`: all of them.
+    isects_most: Option<u64>,
     footprints: FootprintGradients,
     image_loss: ImageLoss,
     loss_value: Option<LossValue>,
@@ -95,10 +105,37 @@ impl CpuRenderer {
         CpuRenderer::default()
     }
 
-    fn rasterize(&mut self, grid: Grid, options: &RenderOptions) {
+    /// Limits the lists of the next views to this many intersections; `None` stands for no limit. A picture with more is blended
+    /// in ranges of tiles. A range has at least one tile, however long its list is.
+    pub fn set_isects_most(&mut self, isects_most: Option<u64>) {
+        self.isects_most = isects_most;
+    }
+
+    /// Ranges of tiles of the last picture.
+    pub fn ranges(&self) -> &[TileRange] {
+        &self.ranges
+    }
+
+    /// Counts the intersections with the tiles of a range. Returns their number.
+    fn count_range(&mut self, grid: Grid, range: TileRange, simd: SimdPath) -> u64 {
+        count(&self.order, &self.packed, grid, range, simd, &mut self.tile_counts);
+        isect_offsets(&self.tile_counts, grid.tiles(), &mut self.tile_offsets, &mut self.cursors);
+        self.tile_offsets.last().copied().unwrap_or(0)
+    }
+
+    /// Lists the intersections with the tiles of a range that was counted last.
+    fn list_range(&mut self, grid: Grid, range: TileRange, simd: SimdPath, isects: u64) {
+        emit(&self.order, &self.packed, grid, range, simd, isects, &mut self.cursors, &mut self.isects);
+    }
+
+    fn rasterize(&mut self, grid: Grid, range: TileRange, options: &RenderOptions) {
         let mut raster = std::mem::take(&mut self.raster);
-        rasterize_fwd(&self.lists(grid, options), &mut raster);
+        rasterize_fwd(&self.lists(grid, range, options), &mut raster);
         self.raster = raster;
+    }
+
+    /// Copies the tiles into the picture.
+    fn finish_picture(&mut self, grid: Grid) {
         let pixels = grid.width as usize * grid.height as usize;
         (self.image.width, self.image.height) = (grid.width, grid.height);
         self.image.rgb.resize(3 * pixels, 0.0);
@@ -106,9 +143,10 @@ impl CpuRenderer {
         untile(grid, &self.raster, &mut self.image.rgb, &mut self.alpha);
     }
 
-    fn lists(&self, grid: Grid, options: &RenderOptions) -> Lists<'_> {
+    fn lists(&self, grid: Grid, range: TileRange, options: &RenderOptions) -> Lists<'_> {
         Lists {
             grid,
+            range,
             splats: &self.packed.splats,
             isects: &self.isects,
             tile_offsets: &self.tile_offsets,
@@ -133,12 +171,29 @@ impl CpuRenderer {
         &self.projected
     }
 
+    /// Takes the gradient of the picture back to the splats, range by range. The lists of a picture of one range are still
+    /// there; others are made again.
     fn rasterize_back(&mut self, grid: Grid, options: &RenderOptions) {
-        let mut partials = std::mem::take(&mut self.partials);
-        let upstream = Upstream { v_rgb: &self.gradient.v_rgb, v_alpha: self.gradient.v_alpha.as_deref() };
-        rasterize_bwd(&self.lists(grid, options), &self.chunk_offsets, &self.raster, &upstream, &mut partials);
-        self.partials = partials;
-        fold_rows(&self.packed.counts, &self.chunk_offsets, &self.partials, &self.projected, &mut self.footprints);
+        let ranges = std::mem::take(&mut self.ranges);
+        for (i, &range) in ranges.iter().enumerate() {
+            let part = FoldPart { is_first: i == 0, is_last: i + 1 == ranges.len() };
+            if ranges.len() > 1 {
+                let (counts, sums) = (&mut self.range_counts, &mut self.range_chunk_counts);
+                number(&mut self.packed, grid, range, options.simd, counts, sums);
+                scan(&self.range_chunk_counts, &mut self.chunk_offsets);
+                let isects = self.count_range(grid, range, options.simd);
+                self.list_range(grid, range, options.simd, isects);
+            }
+            let mut partials = std::mem::take(&mut self.partials);
+            let upstream = Upstream { v_rgb: &self.gradient.v_rgb, v_alpha: self.gradient.v_alpha.as_deref() };
+            let lists = self.lists(grid, range, options);
+            rasterize_bwd(&lists, &self.chunk_offsets, &self.raster, &upstream, &mut partials);
+            self.partials = partials;
+            let counts = if ranges.len() > 1 { &self.range_counts } else { &self.packed.counts };
+            let counts = [counts, &self.packed.counts].map(Vec::as_slice);
+            fold_rows(part, counts, &self.chunk_offsets, &self.partials, &self.projected, &mut self.footprints);
+        }
+        self.ranges = ranges;
     }
 
     /// Seconds of each stage in the last view, in the order of [`STAGES`]; 0 for a stage that did not run.
@@ -167,7 +222,9 @@ impl CpuRenderer {
                 + bytes(&self.tile_counts)
                 + bytes(&self.chunk_offsets)
                 + bytes(&self.packed.chunk_counts)
-                + bytes(&self.tile_offsets))
+                + bytes(&self.tile_offsets)
+                + bytes(&self.range_counts)
+                + bytes(&self.range_chunk_counts))
             + (bytes(&self.cursors) + bytes(&self.isects) + bytes(&self.partials))
             + (bytes(&f.v_means2d) + bytes(&f.v_conics) + bytes(&f.v_colors) + bytes(&f.v_opacities))
     }
@@ -182,8 +239,8 @@ impl Renderer for CpuRenderer {
         self.scratch_bytes()
     }
 
-    fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: usize) -> Result<(), RenderError> {
-        self.sequence.begin(camera, options, batches, usize::MAX)?;
+    fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError> {
+        self.sequence.begin(camera, options, batches)?;
         (self.clock, self.stats, self.loss_value) = (StageClock::default(), RenderStats::default(), None);
         Ok(())
     }
@@ -212,14 +269,22 @@ impl Renderer for CpuRenderer {
             pack(&self.projected, &self.colors, grid, simd, &mut self.packed);
             scan(&self.packed.chunk_counts, &mut self.chunk_offsets)
         });
-        clock.time("isect_offsets", || {
-            count(&self.order, &self.packed, grid, simd, &mut self.tile_counts);
-            isect_offsets(&self.tile_counts, grid.tiles(), &mut self.tile_offsets, &mut self.cursors);
-        });
-        clock.time("isect_emit", || {
-            emit(&self.order, &self.packed, grid, simd, total, &mut self.cursors, &mut self.isects)
-        });
-        clock.time("rasterize_fwd", || self.rasterize(grid, &options));
+        let all = TileRange::all(grid);
+        clock.time("isect_offsets", || self.count_range(grid, all, simd));
+        let ranges = match self.isects_most.filter(|most| total > *most) {
+            Some(most) => TileRange::cut(grid, &self.tile_offsets, most),
+            None => vec![all],
+        };
+        for &range in &ranges {
+            let isects = match ranges.len() {
+                1 => total,
+                _ => clock.time("isect_offsets", || self.count_range(grid, range, simd)),
+            };
+            clock.time("isect_emit", || self.list_range(grid, range, simd, isects));
+            clock.time("rasterize_fwd", || self.rasterize(grid, range, &options));
+        }
+        clock.time("rasterize_fwd", || self.finish_picture(grid));
+        self.ranges = ranges;
         self.clock = clock;
         self.stats = RenderStats {
             visible: self.order.len() as u64,
@@ -300,7 +365,6 @@ fn bytes<T>(v: &Vec<T>) -> u64 {
 mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};
-    use crate::base::simd::SimdPath;
     use crate::kernels::image_loss::SsimPadding;
     use crate::scene::columns::Column;
 
@@ -371,7 +435,8 @@ mod tests {
         let options = RenderOptions { sh_degree: 2, background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
         let firsts = std::iter::once(&0).chain(ends);
         let batches: Vec<Columns> = firsts.zip(ends).map(|(&first, &end)| part(rows, first..end)).collect();
-        renderer.begin_view(camera, &options, batches.len()).unwrap();
+        let how = if batches.len() == 1 { RowBatches::One } else { RowBatches::Several };
+        renderer.begin_view(camera, &options, how).unwrap();
         batches.iter().for_each(|batch| renderer.rows_in(batch).unwrap());
         renderer.picture().unwrap();
         let rgb = (0..3 * camera.pixels()).map(|i| (i % 251) as u8).collect();
@@ -416,20 +481,41 @@ mod tests {
     }
 
     #[test]
+    fn ranges_of_tiles_do_not_change_a_bit() {
+        let mut renderer = CpuRenderer::new();
+        let (rows, camera) = scene(20_000, 123, 77);
+        let one = bits_of_batches(&mut renderer, &rows, &camera, &[20_000]);
+        let isects = renderer.stats().isects;
+        assert_eq!(renderer.ranges().len(), 1);
+        // A few ranges, some fifty with parts of columns, and one for each of the 8 x 5 tiles.
+        for (most, least_ranges) in [(isects / 3, 3), (isects / 30, 30), (0, 40)] {
+            renderer.set_isects_most(Some(most));
+            assert!(one == bits_of_batches(&mut renderer, &rows, &camera, &[9_001, 20_000]), "lists of {most}");
+            assert!(renderer.ranges().len() >= least_ranges, "{} ranges of {most}", renderer.ranges().len());
+            let many = one == bits_of_batches(&mut renderer, &rows, &camera, &[20_000]);
+            assert!(many, "lists of {most}, the same memory again");
+        }
+        renderer.set_isects_most(None);
+        assert!(one == bits_of_batches(&mut renderer, &rows, &camera, &[20_000]));
+    }
+
+    #[test]
     fn stages_out_of_order_are_errors_and_change_nothing() {
         let (rows, camera) = scene(600, 40, 30);
         let (options, mut grads) = (RenderOptions { sh_degree: 2, ..RenderOptions::default() }, Gradients::default());
         let is_order = |result: Result<(), RenderError>| matches!(result, Err(RenderError::OutOfOrder { .. }));
         let mut renderer = CpuRenderer::new();
         assert!(is_order(renderer.rows_in(&rows)) && is_order(renderer.picture()));
-        let none = RenderError::Batches { asked: 0, max: usize::MAX };
-        assert_eq!(renderer.begin_view(&camera, &options, 0), Err(none));
-        renderer.begin_view(&camera, &options, 2).unwrap();
+        renderer.begin_view(&camera, &options, RowBatches::One).unwrap();
+        assert!(is_order(renderer.picture()), "the rows are missing");
         renderer.rows_in(&rows).unwrap();
-        assert!(is_order(renderer.picture()), "a batch is missing");
+        assert!(is_order(renderer.rows_in(&rows)), "the view has one batch");
+        renderer.begin_view(&camera, &options, RowBatches::Several).unwrap();
         renderer.rows_in(&rows).unwrap();
-        assert!(is_order(renderer.rows_in(&rows)) && is_order(renderer.image().map(|_| ())));
+        renderer.rows_in(&rows).unwrap();
+        assert!(is_order(renderer.image().map(|_| ())));
         renderer.picture().unwrap();
+        assert!(is_order(renderer.rows_in(&rows)), "the picture has no more rows");
         assert!(is_order(renderer.picture_back()) && is_order(renderer.loss_value().map(|_| ())));
         *renderer.picture_gradient().unwrap() = random_gradient(&camera);
         assert!(is_order(renderer.rows_out(0, &rows, &mut grads)));

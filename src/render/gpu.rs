@@ -22,7 +22,8 @@
 //! the gradients. [`Renderer::picture_mut`] and [`Renderer::picture_gradient`] each add 12 p bytes down, 12 p bytes up,
 //! one submission and one wait.
 //!
-//! A view has one batch, because the depth sort needs the geometry of all rows and is recorded in `rows_in`.
+//! A view of one batch keeps its rows on the device, and its depth sort is recorded in `rows_in`. A view of several batches
+//! (`gpu_batches`) uploads the rows of each batch twice, one submission each way, and sorts in `picture`.
 //!
 //! The device is therefore idle only between two steps. The optimizer has just rewritten every row in view, and the
 //! cull of the next view reads the new means, so the next upload cannot start earlier. Rows of the next view that the
@@ -34,12 +35,13 @@
 //! bits on the same device; 3. no result comes from buffers that were too small: the frame and its loss are recorded
 //! again with larger buffers; 4. after a device error there is no view until the next `begin_view`.
 
+use super::gpu_batches::{self, SplatBatch};
 use super::gpu_loss::{LossStage, value};
 use super::gpu_rows::{DeviceColumns, FOOTPRINT_BYTES, RowStages, band_into_sh_n};
 use super::gpu_tiles::{Blend, Demand, DemandReadback, Frame, Ranks, TileStages, splat_bytes};
 use super::gpu_tiles_bwd::PictureGradientBuffers;
 use super::sequence::{Sequence, ViewOptions};
-use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer};
+use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches};
 use crate::base::room;
 use crate::gpu::{Buffer, DeviceKind, Gpu, GpuResult, Readback, Recorder, Recording, Traffic};
 use crate::kernels::image_loss::LossPlan;
@@ -48,9 +50,7 @@ use crate::kernels::uniforms::pack_target;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
-
-/// Row batches per view that this backend supports.
-const BATCHES_MAX: usize = 1;
+use std::ops::Range;
 
 /// Densification input of one row: gradient with respect to the projected mean (2), radii (2).
 type Footprint = [f32; 4];
@@ -66,7 +66,16 @@ enum DemandState {
 
 /// Device state between `rows_in` and `picture`.
 #[derive(Debug)]
-struct RowsIn {
+enum RowsIn {
+    /// Of a view of one batch.
+    Whole(WholeRows),
+    /// Of a view of several batches.
+    Batches(Vec<SplatBatch>),
+}
+
+/// The rows of a view of one batch.
+#[derive(Debug)]
+struct WholeRows {
     columns: DeviceColumns,
     splats: Buffer,
     ranks: Ranks,
@@ -78,7 +87,8 @@ struct RowsIn {
 #[derive(Debug)]
 struct View {
     of: ViewOptions,
-    columns: DeviceColumns,
+    /// The rows of a view of one batch; `None` for several batches, whose rows come again.
+    columns: Option<DeviceColumns>,
     splats: Buffer,
     ranks: Ranks,
     frame: Frame,
@@ -116,8 +126,8 @@ enum LossSums {
 #[derive(Debug)]
 struct SplatGradients {
     v_splats: Buffer,
-    /// The tile stages that write `v_splats`, not submitted yet: `rows_out` appends the stages on rows.
-    tiles: Recording,
+    /// The tile stages that write `v_splats`, not submitted yet: the first `rows_out` appends the stages on rows.
+    tiles: Option<Recording>,
 }
 
 /// Host memory that is reused between views.
@@ -246,7 +256,7 @@ impl GpuRenderer {
     }
 
     /// Submits upload, projection and depth sort of the rows; records upload and evaluation of colours. Does not wait.
-    fn submit_rows(&mut self, rows: &Columns, view: &ViewOptions) -> GpuResult<RowsIn> {
+    fn submit_rows(&mut self, rows: &Columns, view: &ViewOptions) -> GpuResult<WholeRows> {
         let (gpu, ViewOptions { camera, options }) = (&self.gpu, view);
         // `Sequence::rows_in` has checked that the count fits.
         let count = rows.rows() as u32;
@@ -262,16 +272,25 @@ impl GpuRenderer {
         let mut recorder = gpu.begin("forward");
         columns.upload_colors(&mut recorder, rows, &mut self.scratch.band)?;
         self.rows.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, &splats)?;
-        Ok(RowsIn { columns, splats, ranks, colors: recorder.set_aside() })
+        Ok(WholeRows { columns, splats, ranks, colors: recorder.set_aside() })
     }
 
-    /// Submits the recorded colours, the tile lists and the blending. Does not wait.
+    /// Submits what is recorded of the rows, the tile lists and the blending. Does not wait.
     fn submit_picture(&mut self, of: ViewOptions, rows: RowsIn) -> GpuResult<View> {
         let (gpu, ViewOptions { camera, options }) = (&self.gpu, &of);
-        let RowsIn { columns, splats, ranks, colors } = rows;
         let grid = Grid::new(camera.width, camera.height);
         let blend = Blend { grid, background: options.background, max_alpha: options.max_alpha };
-        let mut recorder = gpu.resume(colors);
+        let (mut recorder, columns, splats, ranks) = match rows {
+            RowsIn::Whole(WholeRows { columns, splats, ranks, colors }) => {
+                (gpu.resume(colors), Some(columns), splats, ranks)
+            }
+            RowsIn::Batches(batches) => {
+                let mut recorder = gpu.begin("forward");
+                let (splats, rows) = gpu_batches::join(gpu, &mut recorder, &batches)?;
+                let ranks = self.tiles.order(gpu, &mut recorder, &splats.view(), rows, grid)?;
+                (recorder, None, splats, ranks)
+            }
+        };
         let (frame, demand) = self.tiles.frame(gpu, &mut recorder, &splats.view(), &ranks, blend)?;
         gpu.submit(recorder)?;
         Ok(View {
@@ -389,21 +408,43 @@ impl GpuRenderer {
             PictureGradientBuffers { v_rgb: &v_rgb, v_alpha: v_alpha.as_ref() },
             &v_splats.view(),
         )?;
-        view.splat_gradients = Some(SplatGradients { v_splats, tiles: recorder.set_aside() });
+        view.splat_gradients = Some(SplatGradients { v_splats, tiles: Some(recorder.set_aside()) });
         Ok(view)
     }
 
-    /// Submits the backward pass from the picture to the rows and the readbacks of the gradients. Does not wait.
+    /// Submits the backward pass to the rows of the batch at `place`, behind the tile stages if they are not submitted yet, and
+    /// the readbacks of the gradients. Does not wait.
     fn submit_rows_out(
+        &mut self,
+        view: &mut View,
+        rows: &Columns,
+        place: &Range<usize>,
+    ) -> Result<GradientReadbacks, RenderError> {
+        let gradients = view.splat_gradients.as_mut();
+        let gradients = gradients.ok_or(RenderError::OutOfOrder { call: "rows_out", needs: "picture_back" })?;
+        let (gpu, sh_degree) = (&self.gpu, view.of.options.sh_degree);
+        let mut recorder = gradients.tiles.take().map_or_else(|| gpu.begin("backward"), |tiles| gpu.resume(tiles));
+        let (splats, v_splats) = (&view.splats, &gradients.v_splats);
+        if let Some(columns) = &view.columns {
+            return Ok(self.submit_gradients(recorder, &view.of, columns, [splats, v_splats])?);
+        }
+        let columns = gpu_batches::upload(gpu, &mut recorder, rows, sh_degree, &mut self.scratch.band)?;
+        let splats = gpu_batches::part(gpu, &mut recorder, "splats", splats, place)?;
+        let v_splats = gpu_batches::part(gpu, &mut recorder, "v_splats", v_splats, place)?;
+        Ok(self.submit_gradients(recorder, &view.of, &columns, [&splats, &v_splats])?)
+    }
+
+    /// Submits the stages on rows of the backward pass and the readbacks of their gradients.
+    fn submit_gradients(
         &self,
-        view: &View,
-        SplatGradients { v_splats, tiles }: SplatGradients,
+        mut recorder: Recorder<'_>,
+        ViewOptions { camera, options }: &ViewOptions,
+        columns: &DeviceColumns,
+        [splats, v_splats]: [&Buffer; 2],
     ) -> GpuResult<GradientReadbacks> {
-        let (gpu, camera, splats, columns) = (&self.gpu, &view.of.camera, &view.splats, &view.columns);
-        let RenderOptions { eps2d, sh_degree, .. } = view.of.options;
-        let mut recorder = gpu.resume(tiles);
-        let grads = DeviceColumns::new(gpu, view.ranks.rows, sh_degree)?;
-        self.rows.sh_bwd(gpu, &mut recorder, camera, sh_degree, columns, splats, &v_splats, &grads)?;
+        let (gpu, RenderOptions { eps2d, sh_degree, .. }) = (&self.gpu, *options);
+        let grads = DeviceColumns::new(gpu, columns.rows, sh_degree)?;
+        self.rows.sh_bwd(gpu, &mut recorder, camera, sh_degree, columns, splats, v_splats, &grads)?;
         let colors: Vec<Readback> = std::iter::once(&grads.sh0)
             .chain(&grads.bands)
             .map(|buffer| recorder.read_back("sh_bwd", &buffer.view()))
@@ -411,9 +452,9 @@ impl GpuRenderer {
         gpu.submit(recorder)?;
         // The host copies the gradients of colours, four fifths of a row, while the device runs `project_bwd`.
         let mut recorder = gpu.begin("backward");
-        let footprints = gpu.buffer("footprints", FOOTPRINT_BYTES * u64::from(view.ranks.rows))?;
+        let footprints = gpu.buffer("footprints", FOOTPRINT_BYTES * u64::from(columns.rows))?;
         let into = &mut recorder;
-        self.rows.project_bwd(gpu, into, camera, eps2d, columns, splats, &v_splats, &grads, &footprints)?;
+        self.rows.project_bwd(gpu, into, camera, eps2d, columns, splats, v_splats, &grads, &footprints)?;
         let geometry = [&grads.means, &grads.quats, &grads.scales, &grads.opacities]
             .map(|buffer| recorder.read_back("project_bwd", &buffer.view()));
         let readbacks = GradientReadbacks {
@@ -430,10 +471,9 @@ impl GpuRenderer {
         &mut self,
         view: &View,
         readbacks: GradientReadbacks,
-        sh_degree: u8,
+        (rows, sh_degree): (usize, u8),
         grads: &mut Gradients,
     ) -> GpuResult<()> {
-        let rows = view.ranks.rows as usize;
         let out = &mut grads.columns;
         out.sh_degree = sh_degree;
         out.resize(rows);
@@ -514,17 +554,27 @@ impl Renderer for GpuRenderer {
             + device
     }
 
-    fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: usize) -> Result<(), RenderError> {
+    fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError> {
         // Frees the memory of the last view before this view allocates.
         self.drop_view();
         self.gradient_on_host = false;
-        self.sequence.begin(camera, options, batches, BATCHES_MAX)
+        self.sequence.begin(camera, options, batches)
     }
 
     fn rows_in(&mut self, rows: &Columns) -> Result<(), RenderError> {
         let (view, _) = self.sequence.rows_in(rows)?;
-        let submitted = self.submit_rows(rows, &view).inspect_err(|_| self.drop_view())?;
-        self.rows_in = Some(submitted);
+        if self.sequence.batches() == Some(RowBatches::One) {
+            let submitted = self.submit_rows(rows, &view).inspect_err(|_| self.drop_view())?;
+            self.rows_in = Some(RowsIn::Whole(submitted));
+            return Ok(());
+        }
+        let band = &mut self.scratch.band;
+        let batch = gpu_batches::submit_batch(&self.gpu, &self.rows, rows, &view, band);
+        let batch = batch.inspect_err(|_| self.drop_view())?;
+        match &mut self.rows_in {
+            Some(RowsIn::Batches(batches)) => batches.push(batch),
+            _ => self.rows_in = Some(RowsIn::Batches(vec![batch])),
+        }
         Ok(())
     }
 
@@ -592,13 +642,10 @@ impl Renderer for GpuRenderer {
     }
 
     fn rows_out(&mut self, batch: usize, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError> {
-        self.sequence.rows_out(batch, rows)?;
+        let (_, place) = self.sequence.rows_out(batch, rows)?;
         self.with_view("rows_out", |renderer, mut view| {
-            let splat_gradients = view.splat_gradients.take();
-            let splat_gradients =
-                splat_gradients.ok_or(RenderError::OutOfOrder { call: "rows_out", needs: "picture_back" })?;
-            let readbacks = renderer.submit_rows_out(&view, splat_gradients)?;
-            renderer.read_row_gradients(&view, readbacks, rows.sh_degree, grads)?;
+            let readbacks = renderer.submit_rows_out(&mut view, rows, &place)?;
+            renderer.read_row_gradients(&view, readbacks, (place.len(), rows.sh_degree), grads)?;
             Ok((view, ()))
         })
     }

@@ -8,6 +8,7 @@
 pub mod color_correct;
 pub mod cpu;
 pub mod gpu;
+mod gpu_batches;
 pub mod gpu_loss;
 pub mod gpu_rows;
 pub mod gpu_tiles;
@@ -81,6 +82,15 @@ impl PictureGradient {
     }
 }
 
+/// How the rows of a view come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RowBatches {
+    /// In one batch: the ordinary case. A device keeps the rows until the gradients are computed.
+    One,
+    /// In any number of batches, at least one. A device keeps the splats and drops the rows.
+    Several,
+}
+
 /// Why a view could not be rendered.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RenderError {
@@ -118,14 +128,6 @@ pub enum RenderError {
         call: &'static str,
         /// The stage or state that must come before.
         needs: &'static str,
-    },
-    /// This backend does not support the requested number of row batches.
-    #[error("a view in {asked} batches of rows was requested; this backend supports 1 to {max}")]
-    Batches {
-        /// Batches that the caller requested.
-        asked: usize,
-        /// Most batches that the backend supports.
-        max: usize,
     },
     /// The view has no such batch, or the batch had another number of rows on the way in.
     #[error("this view has no batch {batch} with {given} rows")]
@@ -198,23 +200,23 @@ pub trait Renderer: Send {
     /// Host memory that the renderer holds, bytes.
     fn host_bytes(&self) -> u64;
 
-    /// Begins a view whose rows come in `batches` batches. Drops the previous view.
+    /// Begins a view. Drops the previous view.
     ///
     /// # Errors
-    /// The picture is too large, or this backend does not support this number of batches.
-    fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: usize) -> Result<(), RenderError>;
+    /// The picture is too large.
+    fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError>;
 
     /// Projects and colours the rows of the next batch and appends the splats to those of the view.
     ///
     /// # Errors
-    /// All batches were given already, the view has too many rows, the rows hold a lower SH degree than the options
+    /// The view has one batch, which was given already, the view has too many rows, the rows hold a lower SH degree than the options
     /// request, or device memory is exhausted.
     fn rows_in(&mut self, rows: &Columns) -> Result<(), RenderError>;
 
     /// Sorts the splats by depth, lists the splats of each tile and blends the lists.
     ///
     /// # Errors
-    /// A batch of rows is missing, or device memory is exhausted.
+    /// The view has no batch of rows yet, or device memory is exhausted.
     fn picture(&mut self) -> Result<(), RenderError>;
 
     /// The picture.
@@ -273,7 +275,7 @@ pub trait Renderer: Send {
     /// # Errors
     /// The errors of the stages.
     fn draw(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
-        self.begin_view(camera, options, 1)?;
+        self.begin_view(camera, options, RowBatches::One)?;
         self.rows_in(rows)?;
         self.picture()
     }

@@ -6,7 +6,7 @@
 //! returns an error and changes nothing; 2. after a failed [`Sequence::begin`] or after [`Sequence::drop_view`] there
 //! is no view.
 
-use super::{PictureGradient, RenderError, RenderOptions};
+use super::{PictureGradient, RenderError, RenderOptions, RowBatches};
 use crate::kernels::splats::Grid;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
@@ -38,7 +38,7 @@ enum Progress {
 struct Current {
     view: ViewOptions,
     progress: Progress,
-    batches: usize,
+    batches: RowBatches,
     /// End of each batch that `rows_in` has taken, in rows of the view.
     ends: Vec<usize>,
     /// Whether `rows_out` of each batch has run in the current backward pass.
@@ -56,26 +56,21 @@ fn out_of_order<T>(call: &'static str, needs: &'static str) -> Result<T, RenderE
 }
 
 impl Sequence {
-    /// Checks `begin_view` of a backend that supports at most `max` batches.
-    pub fn begin(
-        &mut self,
-        camera: &Camera,
-        options: &RenderOptions,
-        batches: usize,
-        max: usize,
-    ) -> Result<(), RenderError> {
+    /// Checks `begin_view`.
+    pub fn begin(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError> {
         self.current = None;
         let Camera { width, height, .. } = *camera;
         if width.max(height) > Grid::SIDE_MAX {
             return Err(RenderError::ImageTooLarge { width, height });
         }
-        if batches == 0 || batches > max {
-            return Err(RenderError::Batches { asked: batches, max });
-        }
         let view = ViewOptions { camera: *camera, options: *options };
-        let (ends, is_out) = (Vec::with_capacity(batches), Vec::with_capacity(batches));
-        self.current = Some(Current { view, progress: Progress::Rows, batches, ends, is_out });
+        self.current = Some(Current { view, progress: Progress::Rows, batches, ends: Vec::new(), is_out: Vec::new() });
         Ok(())
+    }
+
+    /// How the rows of the view come; `None` without a view.
+    pub fn batches(&self) -> Option<RowBatches> {
+        self.current.as_ref().map(|current| current.batches)
     }
 
     /// Drops the view.
@@ -86,7 +81,8 @@ impl Sequence {
     /// Checks `rows_in`. Returns the view and the range of the batch in the view's rows.
     pub fn rows_in(&mut self, rows: &Columns) -> Result<(ViewOptions, Range<usize>), RenderError> {
         let Some(current) = &mut self.current else { return out_of_order("rows_in", "begin_view") };
-        if current.progress != Progress::Rows || current.ends.len() == current.batches {
+        let is_full = current.batches == RowBatches::One && !current.ends.is_empty();
+        if current.progress != Progress::Rows || is_full {
             return out_of_order("rows_in", "begin_view: all batches of this view were given already");
         }
         let asked = current.view.options.sh_degree;
@@ -105,11 +101,11 @@ impl Sequence {
     /// Checks `picture`. Returns the view.
     pub fn picture(&mut self) -> Result<ViewOptions, RenderError> {
         match &mut self.current {
-            Some(current) if current.progress == Progress::Rows && current.ends.len() == current.batches => {
+            Some(current) if current.progress == Progress::Rows && !current.ends.is_empty() => {
                 current.progress = Progress::Picture;
                 Ok(current.view)
             }
-            _ => out_of_order("picture", "rows_in of every batch"),
+            _ => out_of_order("picture", "rows_in"),
         }
     }
 
@@ -161,7 +157,7 @@ impl Sequence {
         }
         current.progress = Progress::SplatGradients;
         current.is_out.clear();
-        current.is_out.resize(current.batches, false);
+        current.is_out.resize(current.ends.len(), false);
         Ok(current.view)
     }
 

@@ -23,6 +23,12 @@ pub fn gather(rules: &PageRules, pages: &[PinnedPage], step: u32, camera: &Camer
     catch_up::gather(&tables, rules.sh_degree(), &rules.adam, step, row_from_working, columns);
 }
 
+/// As [`gather`], of the rows that `working` lists: they were culled at the same step before.
+pub(super) fn gather_listed(rules: &PageRules, pages: &[PinnedPage], step: u32, working: &mut WorkingSet) {
+    let WorkingSet { row_from_working, columns, .. } = working;
+    catch_up::gather(&numbered(pages), rules.sh_degree(), &rules.adam, step, row_from_working, columns);
+}
+
 /// Applies the gradients of the working set to the pages that its rows were gathered from at `step`: optimizer, bounds,
 /// and the statistics of densification if `collects`.
 pub(super) fn update(

@@ -48,6 +48,15 @@ pub enum TrainError {
         /// Memory with which the step could have been done, where frames follow from it.
         least: Option<u64>,
     },
+    /// A step failed after it had updated some of the batches of its view.
+    #[error(
+        "{source}\n  the step had updated a part of its view, so what is in memory is not committed: go on from the last commit with \
+         gsscale-train --resume and the output folder, once the cause is mended"
+    )]
+    Torn {
+        /// What failed.
+        source: Box<TrainError>,
+    },
     /// The loss was not finite several times in a row.
     #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
     NonFinite {

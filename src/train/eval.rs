@@ -6,6 +6,7 @@ use super::memory::{check_photos_fit, host_budget};
 use super::pages::PagedScene;
 use super::prepare::ply_warnings;
 use super::report::{ColorCorrected, TestMetrics, json_psnr};
+use super::view::draw;
 use super::working_set::WorkingSet;
 use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
@@ -57,8 +58,7 @@ pub fn evaluate(
         targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
         let target = targets.get(view)?;
         let camera = &dataset.views[view].camera;
-        scene.gather_view(camera, now, working)?;
-        renderer.draw(&working.columns, camera, options)?;
+        draw((&mut *scene, now, &mut *working), renderer, camera, options)?;
         let image = renderer.image()?;
         if target.counts() {
             psnrs.push(json_psnr(psnr(image, &target)));

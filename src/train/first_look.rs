@@ -159,7 +159,7 @@ impl World<'_> {
         let mut step = |number| {
             let (what, how) = ((number, &camera, &target), (&render, &options.loss));
             let began = Instant::now();
-            train_step(&mut scene, &mut working, &mut *renderer, what, how, false)?;
+            train_step(&mut scene, &mut working, &mut *renderer, what, how, false, usize::MAX)?;
             Ok::<_, TrainError>(began.elapsed().as_secs_f64())
         };
         // The first takes memory from the system.

@@ -49,5 +49,6 @@ pub mod tiers;
 pub mod trainer;
 pub mod training_loop;
 mod update;
+pub mod view;
 pub mod whole_file;
 pub mod working_set;

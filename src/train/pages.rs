@@ -345,20 +345,25 @@ impl PagedScene {
         Ok(is_other)
     }
 
-    /// Collects into `working` the rows that `camera` may draw after `now` steps, as though their pages had been touched
-    /// then; stores nothing.
+    /// Collects into `working` the rows of these pages that `camera` may draw after `now` steps, as though the pages had been
+    /// touched then; stores nothing.
     ///
     /// # Errors
     /// Pages could not be had.
-    pub fn gather_view(&mut self, camera: &Camera, now: u32, working: &mut WorkingSet) -> Result<(), PagingError> {
-        let pages = self.pager.pages_of_view(camera);
+    pub fn gather_pages(
+        &mut self,
+        pages: &[PageNo],
+        camera: &Camera,
+        now: u32,
+        working: &mut WorkingSet,
+    ) -> Result<(), PagingError> {
         let WorkingSet { row_from_working, columns, .. } = working;
         if columns.sh_degree != self.rules.sh_degree {
             *columns = Columns::zeros(0, self.rules.sh_degree);
         }
         columns.resize(0);
         let mut part = Columns::zeros(0, self.rules.sh_degree);
-        self.visit(&pages, &mut |rules, tables| {
+        self.visit(pages, &mut |rules, tables| {
             visible_rows(tables, &rules.adam, now, camera, row_from_working);
             gather(tables, rules.sh_degree, &rules.adam, now, row_from_working, &mut part);
             append(columns, &part);

@@ -122,11 +122,7 @@ impl Passes<'_> {
             }
             // Again and again, since what was read and written since may let more be read.
             self.prefetch(&coming, per_batch);
-            if self.batches.is_empty() {
-                let batches = if coming.is_empty() { RowBatches::One } else { RowBatches::Several };
-                self.renderer.begin_view(self.camera, render, batches)?;
-            }
-            self.batch_in(&coming)?;
+            self.batch_in(&coming, render)?;
             if coming.is_empty() {
                 return Ok(());
             }
@@ -134,8 +130,12 @@ impl Passes<'_> {
     }
 
     /// Hands the rows of the pinned batch to the renderer, and unpins the batch unless it is the last one.
-    fn batch_in(&mut self, coming: &VecDeque<PageNo>) -> Result<(), TrainError> {
+    fn batch_in(&mut self, coming: &VecDeque<PageNo>, render: &RenderOptions) -> Result<(), TrainError> {
         gather(&self.scene.rules, &self.pinned, self.step, self.camera, self.working);
+        if self.batches.is_empty() {
+            let batches = if coming.is_empty() { RowBatches::One } else { RowBatches::Several };
+            self.renderer.begin_view(self.camera, render, batches)?;
+        }
         self.renderer.rows_in(&self.working.columns)?;
         let with_rows = self.pinned.iter().filter(|pinned| pinned.meta.rows > 0);
         let pages: Vec<PageNo> = with_rows.map(|pinned| pinned.page).collect();

@@ -12,7 +12,8 @@ use super::error::TrainError;
 use super::eval::{EvalRequest, evaluate};
 use super::pages::PagedScene;
 use super::report::{TestMetrics, TierTraffic};
-use super::step::{StepOutcome, differentiate, train_step};
+use super::step::{StepOutcome, train_step};
+use super::view::rehearse;
 use super::working_set::WorkingSet;
 use crate::checkpoint::run_state::LastTest;
 use crate::config::limits::RunOptions;
@@ -61,6 +62,10 @@ pub struct Trainer {
     pub(super) is_torn: bool,
     /// What the frames share with all else, where their number follows from it.
     pub(super) budget: Option<HostBudget>,
+    /// The most pages of a batch of a step.
+    pub(super) pages_most: usize,
+    /// The most rows of a view so far.
+    pub(super) rows_of_view: usize,
 }
 
 fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
@@ -116,6 +121,8 @@ impl Trainer {
             last_test: None,
             is_torn: false,
             budget: None,
+            pages_most: usize::MAX,
+            rows_of_view: 0,
         }
     }
 
@@ -129,11 +136,12 @@ impl Trainer {
         let mut pixels = 0;
         for &view in views {
             let camera = &dataset.views[view].camera;
-            self.scene.gather_view(camera, self.step, &mut self.working)?;
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
             let how = (&render, &self.options.loss);
-            differentiate(&mut self.working, &mut *self.renderer, (camera, &target), how, || ())?;
+            let now = (&mut self.scene, self.step, &mut self.working);
+            let rows = rehearse(now, &mut *self.renderer, (camera, &target), how, self.pages_most)?;
+            self.rows_of_view = self.rows_of_view.max(rows);
             pixels = pixels.max(camera.pixels());
         }
         Ok(pixels)
@@ -219,7 +227,9 @@ impl Trainer {
                 (self.step, &dataset.views[view].camera, &target),
                 (&render, &self.options.loss),
                 self.options.strategy.collects(self.step),
+                self.pages_most,
             );
+            self.is_torn = matches!(stepped, Err(TrainError::Torn { .. }));
             // A step without its frames changed nothing that doing it again does not.
             match stepped {
                 Err(TrainError::Paging(error)) if self.find_frames(&error) => {}
@@ -227,6 +237,7 @@ impl Trainer {
             }
         };
         let outcome = stepped.map_err(|error| error.of_view(&dataset.views[view].name))?;
+        self.rows_of_view = self.rows_of_view.max(outcome.rows);
         self.count(&outcome, &dataset.views[view].name)?;
         if self.options.optimizer == Method::Dense {
             // The step has changed rows: if this fails, what is there now belongs to no step.

@@ -12,11 +12,12 @@ use gsscale::gpu::{FaultKind, GpuError, GpuOptions, InjectedFault};
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::gpu::GpuRenderer;
 use gsscale::render::{
-    Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, SsimPadding,
+    Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches, SsimPadding,
 };
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::{Image, Target};
+use std::ops::Range;
 
 fn renderer(options: &GpuOptions) -> Option<GpuRenderer> {
     open(options).map(|gpu| GpuRenderer::new(gpu).unwrap())
@@ -323,7 +324,7 @@ fn stages_share_five_submissions() {
         let mut grads = Gradients::default();
         let mut view = || -> Result<(), (&str, RenderError)> {
             let of = |stage| move |error| (stage, error);
-            gpu.begin_view(&camera, &options, 1).map_err(of("begin_view"))?;
+            gpu.begin_view(&camera, &options, RowBatches::One).map_err(of("begin_view"))?;
             gpu.rows_in(&rows).map_err(of("rows_in"))?;
             gpu.picture().map_err(of("picture"))?;
             gpu.loss(&target, &loss).map_err(of("loss"))?;
@@ -338,6 +339,52 @@ fn stages_share_five_submissions() {
     }
 }
 
+/// The rows of a view in one batch and in several, which come out backwards: the same bits of picture, loss and gradients.
+#[test]
+fn batches_of_rows_change_no_bit() {
+    let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
+    let (rows, camera) = scene(3000, 100, 70);
+    let (target, options) = (photo(100, 70, true), RenderOptions::default());
+    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
+    let part = |place: Range<usize>| {
+        let mut part = Columns { sh_degree: rows.sh_degree, ..Columns::default() };
+        for column in Column::ALL {
+            let width = column.width(rows.sh_degree);
+            *part.column_mut(column) = rows.column(column)[place.start * width..place.end * width].to_vec();
+        }
+        part
+    };
+    let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+    let mut run = |ends: &[usize], how: RowBatches| {
+        let batches: Vec<Columns> = ends.windows(2).map(|ends| part(ends[0]..ends[1])).collect();
+        gpu.begin_view(&camera, &options, how).unwrap();
+        batches.iter().for_each(|batch| gpu.rows_in(batch).unwrap());
+        gpu.picture().unwrap();
+        gpu.loss(&target, &loss).unwrap();
+        gpu.picture_back().unwrap();
+        let mut all = vec![Vec::new(); 1 + Column::ALL.len()];
+        for (i, batch) in batches.iter().enumerate().rev() {
+            let mut grads = Gradients::default();
+            gpu.rows_out(i, batch, &mut grads).unwrap();
+            let mut of_batch = vec![bits(grads.means2d.as_flattened())];
+            of_batch.extend(Column::ALL.map(|c| bits(grads.columns.column(c))));
+            for (all, mut of_batch) in all.iter_mut().zip(of_batch) {
+                of_batch.append(all);
+                *all = of_batch;
+            }
+        }
+        let value = gpu.loss_value().unwrap().loss.to_bits();
+        all.extend([bits(&gpu.image().unwrap().rgb), vec![value as u32, (value >> 32) as u32]]);
+        all
+    };
+    let one = run(&[0, 3000], RowBatches::One);
+    assert!(one.iter().all(|values| values.iter().any(|bits| *bits != 0)));
+    // Starts that are not aligned, a batch of one row, and one without rows.
+    for ends in [&[0, 3000][..], &[0, 1501, 3000], &[0, 1, 1, 777, 3000], &[0, 0, 3000, 3000]] {
+        assert!(run(ends, RowBatches::Several) == one, "batches end at {ends:?}");
+    }
+}
+
 #[test]
 fn misuse_is_an_error() {
     let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
@@ -349,7 +396,7 @@ fn misuse_is_an_error() {
     assert!(
         is_order(gpu.rows_in(&rows)) && is_order(gpu.picture()) && is_order(gpu.loss(&photo(32, 32, false), &loss))
     );
-    gpu.begin_view(&camera, &options, 1).unwrap();
+    gpu.begin_view(&camera, &options, RowBatches::One).unwrap();
     assert!(is_order(gpu.picture()));
     gpu.rows_in(&rows).unwrap();
     assert!(is_order(gpu.rows_in(&rows)) && is_order(gpu.picture_back()));
@@ -367,10 +414,12 @@ fn misuse_is_an_error() {
     gpu.picture_gradient().unwrap().v_rgb.pop();
     assert_eq!(gpu.picture_back(), Err(RenderError::GradientSize { pixels: 32 * 32 }));
     // Begun, and begun anew before the recorded colours were submitted.
-    gpu.begin_view(&camera, &options, 1).unwrap();
+    gpu.begin_view(&camera, &options, RowBatches::One).unwrap();
     gpu.rows_in(&rows).unwrap();
     gpu.draw(&small, &camera, &options).unwrap();
-    assert_eq!(gpu.begin_view(&camera, &options, 2), Err(RenderError::Batches { asked: 2, max: 1 }));
+    gpu.begin_view(&camera, &options, RowBatches::One).unwrap();
+    gpu.rows_in(&rows).unwrap();
+    assert!(is_order(gpu.rows_in(&rows)), "the view has one batch");
     let high = RenderOptions { sh_degree: 3, ..RenderOptions::default() };
     assert!(matches!(gpu.draw(&Columns::zeros(1, 1), &camera, &high), Err(RenderError::ShDegree { .. })));
 }
