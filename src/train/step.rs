@@ -1,8 +1,8 @@
 //! One training step, top to bottom. Nothing here opens a file.
 //!
-//! Invariants: 1. every pinned page is released, whatever happens; 2. a step whose rendering fails, or whose loss is not
-//! finite, changes no row, except that events which were due on the pinned pages are applied; 3. the result is the same
-//! for any number of threads and frames.
+//! Invariants: 1. every pinned page is released, on errors too; 2. a step whose rendering fails or whose loss is not
+//! finite changes no row, but pending events of the pinned pages stay applied; 3. the result is the same for any number
+//! of threads and frames.
 
 use super::batch::{gather, update};
 use super::error::TrainError;
@@ -12,7 +12,7 @@ use crate::render::{LossOptions, LossValue, RenderError, RenderOptions, Renderer
 use crate::scene::camera::Camera;
 use crate::scene::image::Target;
 
-/// What a step did.
+/// Result of a step.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct StepOutcome {
     /// Loss of the view.
@@ -25,17 +25,17 @@ pub struct StepOutcome {
     pub pages: usize,
     /// Rows that the optimizer rewrote.
     pub updated: u64,
-    /// Rows left as they were because a gradient or a result was not finite.
+    /// Rows left unchanged because a gradient or a result was not finite.
     pub rows_skipped: u64,
-    /// The loss was not finite: nothing was changed.
+    /// The loss was not finite, so the step changed no row.
     pub skipped: bool,
 }
 
-/// Trains on one view at 0-based `step`, whose pages are one batch: pins them, applies the events that are due, gathers
-/// the rows, renders them forward and backward, updates the rows, and releases the pages.
+/// Trains on one view at 0-based `step`; all pages of the view form one batch. The step pins the pages, applies pending
+/// events, gathers the rows, renders forward and backward, updates the rows and releases the pages.
 ///
 /// # Errors
-/// Pages could not be had, or the renderer failed; the rows are as they were before the step.
+/// Pages could not be pinned, or the renderer failed; no row has changed then.
 pub fn train_step(
     scene: &mut PagedScene,
     working: &mut WorkingSet,
@@ -50,7 +50,7 @@ pub fn train_step(
         scene.pager.release(pages);
         return Err(error);
     }
-    // Again and again, since what was read and written since may let more be read.
+    // Prefetch several times per step: completed reads and writes free staging for more.
     scene.pager.prefetch(step);
     gather(&scene.rules, &pages, step, camera, working);
     let rendered = differentiate(working, renderer, (camera, target), (render, loss), || scene.pager.prefetch(step));
@@ -72,8 +72,8 @@ pub fn train_step(
     Ok(outcome)
 }
 
-/// Renders the rows of the working set, compares the picture with the photo, and takes the loss back to the gradients of
-/// the rows. `meanwhile` runs while a device may be at work on the picture.
+/// Renders the working set, computes the loss against the photo, and propagates gradients back to the rows.
+/// `meanwhile` runs while a device may still render the picture.
 ///
 /// # Errors
 /// Those of the renderer.
