@@ -32,7 +32,7 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Columns, row_width};
 use gsscale::scene::image::{Image, Target};
 use gsscale::train::catch_up::{gather, visible_rows};
-use gsscale::train::pages::{PagedScene, numbered};
+use gsscale::train::pages::{PagedScene, row_tables};
 use gsscale::train::step::train_step;
 use gsscale::train::working_set::WorkingSet;
 use serde_json::json;
@@ -219,7 +219,7 @@ fn split_cull(
         let start = Instant::now();
         let acquired = scene.pager.acquire(now, camera);
         let Ok(pages) = acquired else { panic!("no pages: {:?}", acquired.err()) };
-        let tables = numbered(&pages);
+        let tables = row_tables(&pages);
         let acquired = start.elapsed().as_secs_f64();
         visible_rows(&tables, &scene.rules.adam, now, camera, &mut rows);
         let culled = start.elapsed().as_secs_f64();

@@ -17,7 +17,7 @@ use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::pinned::PinnedPage;
 use gsscale::scene::columns::{Column, Columns, row_width};
 use gsscale::train::catch_up::gather;
-use gsscale::train::pages::{PagedScene, numbered};
+use gsscale::train::pages::{PagedScene, row_tables};
 use serde_json::{Value, json};
 use std::hint::black_box;
 
@@ -83,7 +83,7 @@ pub fn touched(rows: usize, percent: u32, rounds: usize, simd: SimdPath) -> Touc
     for _ in 0..=rounds {
         let now = fall_asleep(&mut pages);
         let gathered = time(|| {
-            gather(&numbered(&pages), options.sh_degree, &scene.rules.adam, now, &list, &mut values);
+            gather(&row_tables(&pages), options.sh_degree, &scene.rules.adam, now, &list, &mut values);
             black_box(&values);
         });
         let optimized = time(|| optimize(&mut pages, &scene, now, &list, &values, &gradients));

@@ -1,23 +1,23 @@
-//! The two ends of a step, where it reads and writes the rows of a batch of pinned pages: gather and update.
+//! Gather and update: the two functions through which a step reads and writes the rows of a batch of pinned pages.
 //!
-//! Between them the step works on the [`WorkingSet`] alone. A backend that keeps rows on a device replaces these two
-//! functions together with the renderer.
+//! Between gather and update, a step uses the [`WorkingSet`] alone. A backend that keeps rows on a device replaces
+//! these two functions and the renderer.
 //!
-//! Invariants: from [`gather`] to `update` nobody changes the pinned rows or the values of the working set, since the
-//! update starts from these values.
+//! Invariants: between [`gather`] and `update`, the pinned rows and the values of the working set stay unchanged,
+//! because the update starts from the gathered values.
 
 use super::catch_up;
-use super::pages::{PageRules, PagedScene, numbered};
+use super::pages::{PageRules, PagedScene, row_tables};
 use super::update::{StepGradients, update_pages};
 use super::working_set::WorkingSet;
 use crate::optim::deferred::StepCounts;
 use crate::paging::pinned::PinnedPage;
 use crate::scene::camera::Camera;
 
-/// Culls the rows of the pages, which are up to date with all events, and evaluates at 0-based `step` those that
-/// `camera` may draw.
+/// Culls the rows of the pages for `camera` and evaluates the visible rows at 0-based `step`. The pages must have
+/// applied all events.
 pub fn gather(rules: &PageRules, pages: &[PinnedPage], step: u32, camera: &Camera, working: &mut WorkingSet) {
-    let tables = numbered(pages);
+    let tables = row_tables(pages);
     let WorkingSet { row_from_working, columns, .. } = working;
     catch_up::visible_rows(&tables, &rules.adam, step, camera, row_from_working);
     catch_up::gather(&tables, rules.sh_degree(), &rules.adam, step, row_from_working, columns);
@@ -26,11 +26,11 @@ pub fn gather(rules: &PageRules, pages: &[PinnedPage], step: u32, camera: &Camer
 /// As [`gather`], of the rows that `working` lists: they were culled at the same step before.
 pub(super) fn gather_listed(rules: &PageRules, pages: &[PinnedPage], step: u32, working: &mut WorkingSet) {
     let WorkingSet { row_from_working, columns, .. } = working;
-    catch_up::gather(&numbered(pages), rules.sh_degree(), &rules.adam, step, row_from_working, columns);
+    catch_up::gather(&row_tables(pages), rules.sh_degree(), &rules.adam, step, row_from_working, columns);
 }
 
-/// Applies the gradients of the working set to the pages that its rows were gathered from at `step`: optimizer, bounds,
-/// and the statistics of densification if `collects`.
+/// Applies the gradients of the working set to the pages that [`gather`] read at `step`: optimizer, bounds and, if
+/// `collects`, densification statistics.
 pub(super) fn update(
     scene: &mut PagedScene,
     pages: &mut [PinnedPage],

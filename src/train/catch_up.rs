@@ -1,11 +1,10 @@
-//! From stored rows to the rows of one view: which of them it may draw, and what they are at this step.
+//! Culls stored rows for one view and evaluates them at a step.
 //!
-//! Rows come as a list of tables numbered through: the pinned pages of a step, or one table in memory.
+//! Input rows are a list of tables with consecutive row numbers: the pinned pages of a step, or one table in memory.
 //!
-//! Invariants: 1. rows are only read here; 2. the cull is conservative: no row that the projection would draw is left
-//! out, whatever its rotation and opacity; 3. listed rows ascend; 4. results are the same for any number of threads and
-//! for any cut of the rows into tables; 5. once `out` has grown to its size, nothing that grows with the scene is
-//! allocated.
+//! Invariants: 1. this file only reads rows; 2. the cull is conservative: it keeps every row that the projection would
+//! draw, for any rotation and opacity; 3. listed rows ascend; 4. results are the same for any number of threads and any
+//! division of the rows into tables; 5. once `out` has its full size, no allocation grows with the scene.
 
 use crate::base::math::exp32;
 use crate::base::room;
@@ -17,8 +16,8 @@ use crate::scene::columns::{Column, Columns};
 use crate::scene::frustum::Frustum;
 use crate::scene::rows::{ColumnsMut, Rows, RowsNow};
 
-/// The rows of `tables` that `camera` may draw after `now` optimizer steps, ascending. Tables are numbered through:
-/// each starts where the one before it ends.
+/// Lists the rows of `tables` that `camera` may draw after `now` optimizer steps, ascending. The row numbers of each
+/// table start where those of the previous table end.
 pub fn visible_rows(tables: &[Rows<'_>], adam: &DeferredAdam, now: u32, camera: &Camera, out: &mut Vec<u32>) {
     let at = adam.at(now);
     let frustum = Frustum::new(camera);
@@ -27,8 +26,8 @@ pub fn visible_rows(tables: &[Rows<'_>], adam: &DeferredAdam, now: u32, camera: 
     out.truncate(found);
 }
 
-/// The listed rows as they are after `now` optimizer steps: row i of `out` is row `rows[i]` of the tables, which are
-/// numbered through and all stored with `sh_degree`.
+/// Evaluates the listed rows after `now` optimizer steps: row i of `out` is row `rows[i]` of the tables. All tables are
+/// stored with `sh_degree`.
 pub fn gather(tables: &[Rows<'_>], sh_degree: u8, adam: &DeferredAdam, now: u32, rows: &[u32], out: &mut Columns) {
     if out.sh_degree != sh_degree {
         *out = Columns::zeros(0, sh_degree);
@@ -37,7 +36,7 @@ pub fn gather(tables: &[Rows<'_>], sh_degree: u8, adam: &DeferredAdam, now: u32,
     evaluate_into(&adam.at(now), tables, rows, out.view_mut());
 }
 
-/// All rows of the tables as they are after `now` optimizer steps, in their order.
+/// Evaluates all rows of the tables after `now` optimizer steps, in order.
 pub fn evaluate_all(tables: &[Rows<'_>], sh_degree: u8, adam: &DeferredAdam, now: u32) -> Columns {
     let first = tables.first().map_or(0, |t| t.first_row) as u32;
     let rows: Vec<u32> = (first..first + rows_of(tables) as u32).collect();
@@ -50,7 +49,7 @@ fn rows_of(tables: &[Rows<'_>]) -> usize {
     tables.iter().map(Rows::rows).sum()
 }
 
-/// Evaluates the listed rows, cut into tasks by tables and within them.
+/// Evaluates the listed rows in parallel tasks, split between tables and within them.
 fn evaluate_into(at: &AdamNow<'_>, tables: &[Rows<'_>], rows: &[u32], out: ColumnsMut<'_>) {
     if rows.is_empty() {
         return;
@@ -76,12 +75,13 @@ fn evaluate_into(at: &AdamNow<'_>, tables: &[Rows<'_>], rows: &[u32], out: Colum
     join_if(rows.len() > ROWS_PER_TASK, both.0, both.1);
 }
 
-/// Runs both, on two threads where that is worth it.
-fn join_if<A: Send, B: Send>(worth: bool, a: impl FnOnce() -> A + Send, b: impl FnOnce() -> B + Send) -> (A, B) {
-    if worth { rayon::join(a, b) } else { (a(), b()) }
+/// Runs `a` and `b`, on two threads if `parallel`.
+fn join_if<A: Send, B: Send>(parallel: bool, a: impl FnOnce() -> A + Send, b: impl FnOnce() -> B + Send) -> (A, B) {
+    if parallel { rayon::join(a, b) } else { (a(), b()) }
 }
 
-/// Lists the rows of the tables that may be drawn in the front of `out`, which has room for all; returns how many.
+/// Writes the visible rows to the front of `out` and returns their number. `out` has as many entries as the tables have
+/// rows.
 fn cull(at: &AdamNow<'_>, frustum: &Frustum, tables: &[Rows<'_>], out: &mut [u32]) -> usize {
     let rows = out.len();
     match tables {
@@ -92,7 +92,7 @@ fn cull(at: &AdamNow<'_>, frustum: &Frustum, tables: &[Rows<'_>], out: &mut [u32
     let halves;
     let (head, tail) = match tables {
         [view] => {
-            // Halved at whole tasks.
+            // Split at a multiple of the task size.
             let (a, b) = view.split_at(rows.div_ceil(ROWS_PER_TASK) / 2 * ROWS_PER_TASK);
             halves = [a, b];
             halves.split_at(1)
@@ -124,7 +124,7 @@ impl Kernel for CullRows<'_, '_> {
         for first in (0..whole).step_by(LANES) {
             let drawn = cull_lanes(at, frustum, &view, first);
             for (lane, &drawn) in drawn.iter().enumerate() {
-                // Written always, kept when counted: no branch to mispredict.
+                // Write always, advance only if drawn: this avoids a mispredicted branch.
                 out[found] = (view.first_row + first + lane) as u32;
                 found += usize::from(drawn);
             }
@@ -137,7 +137,7 @@ impl Kernel for CullRows<'_, '_> {
     }
 }
 
-/// [`LANES`] rows from `first` on: one vector per coordinate.
+/// Culls [`LANES`] rows from `first` on, one vector per coordinate.
 #[inline(always)]
 fn cull_lanes(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, first: usize) -> [bool; LANES] {
     let drifts = LaneDrifts::gather(&view.stamp[first..], |stamp| at.drift(stamp));
@@ -160,7 +160,7 @@ fn cull_row_by_row(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, first: 
     std::array::from_fn(|l| cull_row(at, frustum, view, first + l))
 }
 
-/// One row, by the exact evaluation.
+/// Culls one row by exact evaluation.
 fn cull_row(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, row: usize) -> bool {
     let of = |column: Column| std::array::from_fn::<f32, 3, _>(|c| at.evaluate_element(view, column, row, c));
     let s = of(Column::Scales);

@@ -1,4 +1,4 @@
-//! Looking at held-out views: PSNR, SSIM, and pictures of render beside photo. Changes no state.
+//! Evaluation of held-out views: PSNR, SSIM, LPIPS, and pictures of render beside photo. Leaves the scene unchanged.
 
 use super::error::TrainError;
 use super::machine;
@@ -24,25 +24,25 @@ use crate::render::{RenderOptions, Renderer};
 use crate::scene::image::{Image, Target};
 use std::path::{Path, PathBuf};
 
-/// Where pictures go and which views are looked at.
+/// Views and metrics of an evaluation.
 pub struct EvalRequest<'a> {
-    /// Positions in `dataset.views`.
+    /// Indices in `dataset.views`.
     pub views: &'a [usize],
-    /// The SSIM to report.
+    /// Variant of SSIM.
     pub ssim: SsimVariant,
-    /// Folder for pictures (render beside photo), created when missing; `None` for none.
+    /// Folder for pictures (render beside photo), created if missing; `None` for no pictures.
     pub pictures: Option<&'a Path>,
-    /// The network of LPIPS and what it is fed, where LPIPS is wanted.
+    /// LPIPS network and its input range; `None` for no LPIPS.
     pub lpips: Option<(&'a Lpips, InputRange)>,
-    /// The fit of colours, where PSNR after one is wanted too.
+    /// Method of colour correction; `None` for no colour-corrected PSNR.
     pub color_correct: Option<ColorCorrect>,
 }
 
-/// Evaluates the rows as they are after `now` steps on the requested views, collected in `working`. Views that are masked as a whole have no metrics and
-/// are left out of the means; `None` when no view is left.
+/// Evaluates the scene after `now` steps on the requested views; `working` is scratch. Fully masked views have no
+/// metrics and do not count in the means. `None` if no view has metrics.
 ///
 /// # Errors
-/// A photo cannot be decoded, pages could not be had, the renderer failed, or a picture cannot be written.
+/// A photo cannot be decoded, pages could not be pinned, the renderer failed, or a picture cannot be written.
 pub fn evaluate(
     (scene, now, working): (&mut PagedScene, u32, &mut WorkingSet),
     renderer: &mut dyn Renderer,
@@ -64,9 +64,9 @@ pub fn evaluate(
             psnrs.push(json_psnr(psnr(image, &target)));
             let fit = request.color_correct;
             corrected.extend(fit.map(|how| json_psnr(color_corrected_psnr(image, &target, how))));
-            // No window of the map may count although some pixels at the border do.
+            // NaN: every SSIM window is masked although some border pixels are not.
             ssims.extend(Some(ssim(image, &target, request.ssim, options.simd)).filter(|x| !x.is_nan()));
-            // A picture too small for the network has no distance.
+            // NaN: the picture is too small for the network.
             let distance = request.lpips.map(|(lpips, range)| lpips.distance(image, &target, range));
             distances.extend(distance.filter(|x| !x.is_nan()));
         }
@@ -83,8 +83,8 @@ pub fn evaluate(
     Ok(Some(TestMetrics { views: psnrs.len() as u32, psnr: mean(&psnrs), ssim, lpips, color_corrected }))
 }
 
-/// File of the picture of a view: its name, folders folded in, without the extension; with its number in front where
-/// two views would share a file.
+/// File of a view's picture: the view's name without extension, with `/` replaced by `_`, and prefixed with the view's
+/// index if two views would share a file.
 fn picture_path(folder: &Path, dataset: &Dataset, view: usize) -> PathBuf {
     let flat = |name: &str| {
         let flat = name.replace(['/', '\\'], "_");
@@ -110,30 +110,30 @@ fn write_pair(path: &Path, image: &Image, target: &Target) -> InputResult<()> {
         .map_err(|e| InputError::new(path, format!("writing the picture failed: {e}"), "check the disk and its space"))
 }
 
-/// What `gsscale-eval` prints.
+/// Report of `gsscale-eval`.
 #[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
 pub struct EvalReport {
     /// The PLY.
     pub ply: PathBuf,
-    /// The scene.
+    /// Folder of the scene.
     pub scene: PathBuf,
     /// Gaussians in the PLY.
     pub gaussians: u64,
-    /// Which SSIM is reported.
+    /// Variant of SSIM.
     pub ssim_variant: String,
-    /// Network and input range of LPIPS, where it was measured: `alex, signed`.
+    /// Network and input range of LPIPS (`alex, signed`), if measured.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub lpips_variant: Option<String>,
-    /// Means over the held-out views; absent when there are none.
+    /// Means over the held-out views; `None` without held-out views.
     pub test: Option<TestMetrics>,
 }
 
-/// What an evaluation of a PLY gives besides PSNR and SSIM.
+/// Optional outputs of the evaluation of a PLY.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct EvalExtras<'a> {
     /// Folder for pictures.
     pub pictures: Option<&'a Path>,
-    /// Weights of LPIPS, and what range of values its network is fed.
+    /// LPIPS weights and the input range of the network.
     pub lpips: Option<(&'a Path, InputRange)>,
 }
 
@@ -163,13 +163,13 @@ pub fn evaluate_ply(
         eprintln!("warning: {warning}");
     }
     if columns.rows() == 0 {
-        let problem = "no Gaussian lies within reach of this scene";
+        let problem = "no Gaussian lies within the coordinate range of this scene";
         return Err(InputError::new(ply, problem, "give a PLY that was trained on this scene").into());
     }
     let run = RunOptions::new(config, dataset.scene_scale);
     let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
     let gaussians = columns.rows() as u64;
-    // All bands of the file, whatever the config has for training.
+    // Evaluate with the file's SH degree; the config's is for training.
     let bands = RunOptions { sh_degree: columns.sh_degree, sh_degree_start: columns.sh_degree, ..run.clone() };
     let pager = Pager::in_memory(PagerConfig::in_memory(run.page_rows, columns.sh_degree));
     let mut pages = PagedScene::new(&columns, pager, &bands)?;

@@ -1,4 +1,4 @@
-//! The steps of a trainer within its memory: frames are taken and given back as the scene grows ([`super::budget`] says how many).
+//! Adjusts the number of frames between steps and raises the budget, as [`super::budget`] computes them.
 
 use super::budget::{HostBudget, SPARE_SHARE, ViewMemory};
 use super::staging::PLAN_BYTES_LEAST;
@@ -8,16 +8,16 @@ use crate::paging::error::PagingError;
 use crate::scene::camera::Camera;
 use crate::scene::columns::row_width;
 
-/// Frames are given back when there are more than one in so many.
-const WORTH_GIVING: usize = 16;
+/// The number of frames rises only by more than 1/16, to avoid small changes at every step.
+const FRAME_RISE_SHARE: usize = 16;
 
 impl Trainer {
-    /// Stays within this memory from now on, as far as frames that give way can do it.
+    /// Keeps the run within this budget from now on by adjusting its number of frames.
     pub fn set_budget(&mut self, budget: HostBudget) {
         self.budget = Some(budget);
     }
 
-    /// What the largest view took so far.
+    /// Memory of the largest view so far.
     pub(super) fn view_memory(&self) -> ViewMemory {
         let [working, rendering] = self.view_bytes();
         let width = row_width(self.working.columns.sh_degree) as u64;
@@ -26,8 +26,7 @@ impl Trainer {
         ViewMemory { now, at_last }
     }
 
-    /// Takes away the frames that the scene, as it has grown, leaves no memory for, and gives back what was taken for growth
-    /// that did not come. Between steps; the next one has this camera.
+    /// Adjusts the number of frames to the grown scene, in both directions, before a step with this camera.
     pub(super) fn fit_frames(&mut self, camera: &Camera) {
         let Some(budget) = self.budget.filter(|_| !self.is_in_memory()) else { return };
         let needed = self.scene.pager.pages_of_view(camera).len();
@@ -37,21 +36,21 @@ impl Trainer {
         }
         let pager = &mut self.scene.pager;
         let now = pager.frames_max();
-        if frames > now + now / WORTH_GIVING || (frames > now && needed >= now) {
+        if frames > now + now / FRAME_RISE_SHARE || (frames > now && needed >= now) {
             pager.allow_frames(frames);
         } else {
             pager.limit_frames(frames);
         }
     }
 
-    /// Gives a step the frames that `error` says it lacked, if memory is left for them; then the step can be tried again.
-    /// Each time there are more frames than before.
-    pub(super) fn find_frames(&mut self, error: &PagingError) -> bool {
+    /// Adds the frames that a step lacked, as `error` reports, if memory is left for them. On true the step can be
+    /// repeated, with more frames than before.
+    pub(super) fn add_missing_frames(&mut self, error: &PagingError) -> bool {
         let PagingError::WorkingSet { pages: needed, frames: now, .. } = *error else { return false };
         let Some(budget) = self.budget.filter(|_| !self.is_in_memory() && needed > now) else { return false };
         let mut most = budget.frames_at_most(&self.scene, self.view_memory());
         if most < needed && !self.raise_for_frames(budget, needed) {
-            // The plan is advice: with a small one the run reads more, and goes on.
+            // The plan is optional: with a small plan the run reads more pages and continues.
             let Some(smaller) = budget.with_small_plan() else { return false };
             most = smaller.frames_at_most(&self.scene, self.view_memory());
             if most < needed {
@@ -65,15 +64,15 @@ impl Trainer {
         true
     }
 
-    /// Takes more memory for a step that needs so many frames, if nobody named the run's memory and the machine has it.
+    /// Raises the budget for a step that needs `needed` frames; see [`HostBudget::raised`].
     fn raise_for_frames(&mut self, budget: HostBudget, needed: usize) -> bool {
         let frames = (needed * self.scene.pager.frame_bytes()) as u64;
-        let bytes = budget.taken(&self.scene, self.view_memory().now, 1.0) + budget.staging + frames;
+        let bytes = budget.bytes_beside_frames(&self.scene, self.view_memory().now, 1.0) + budget.staging + frames;
         self.raise_budget(budget, bytes)
     }
 
-    /// Takes more memory to go on with all pages in it, if nobody named the run's memory and the machine has it.
-    pub(super) fn raise_for_all(&mut self, budget: HostBudget) -> bool {
+    /// Raises the budget to keep all pages in memory; see [`HostBudget::raised`].
+    pub(super) fn raise_for_all_pages(&mut self, budget: HostBudget) -> bool {
         let bytes = budget.bytes_of_all(&self.scene, self.view_memory().at_last, true);
         self.raise_budget(budget, bytes)
     }
@@ -82,8 +81,8 @@ impl Trainer {
         let Some(raised) = budget.raised(bytes) else { return false };
         if !budget.is_raised {
             eprintln!(
-                "warning: from step {} on the scene needs more than {}, the share of the free memory that a run takes by itself: \
-                 it takes more as long as the machine has it; --host-mem sets a limit",
+                "warning: from step {} on the scene needs more than {}, the default share of the free memory: the run \
+                 takes more as long as the machine has it; --host-mem sets a limit",
                 self.step,
                 format_bytes(budget.bytes)
             );
@@ -92,7 +91,7 @@ impl Trainer {
         true
     }
 
-    /// Whether no page ever leaves memory.
+    /// Whether all pages stay in memory.
     pub(super) fn is_in_memory(&self) -> bool {
         self.scene.pager.frames_max() == usize::MAX
     }

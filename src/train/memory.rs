@@ -1,7 +1,7 @@
-//! How much memory a run will take, and how much it took.
+//! Memory of a run: the expected peak by part, and the measured size of the process.
 //!
-//! What depends on the views (rows, intersections, images) is measured by rendering a few of them with the first
-//! Gaussians; what is simple arithmetic is computed. The promise is 10 % of the peak that a run without growth has.
+//! The parts that depend on views (rows, intersections, images) are measured by rendering a few views with the first
+//! Gaussians; the other parts are computed. The estimate is within 10 % of the peak of a run without growth.
 
 use super::pages::PAGES_PER_BATCH;
 use crate::base::error::{InputError, InputResult};
@@ -11,36 +11,35 @@ use crate::config::file::TrainConfig;
 use crate::dataset::loader::{Dataset, View};
 use crate::scene::state::row_bytes;
 
-/// What is kept of a page that is not in memory: its entry, its place on the drive, its uses in the plan.
+/// Bytes per page of index, slot address and uses in the plan, for pages in memory or not.
 pub(super) const INDEX_BYTES: u64 = 256;
-/// Pages that split have been full, and half of their rows left for another page: memory of the frames of a scene that has
-/// grown over that of its rows. Measured: 1.18 with 64 rows to a page, 1.25 with 1024.
+/// Memory of frames over memory of rows in a grown scene, since a split leaves pages partly empty. Measured: 1.18 with
+/// 64 rows per page, 1.25 with 1024.
 const GROWN_SPARE: f64 = 1.25;
 /// Program, libraries and thread stacks, measured on an empty run: 16 MiB with the tables of a short one.
 pub(super) const BASE_BYTES: u64 = 12 << 20;
 
-/// Share of the memory that is available which a run takes when it is not told how much, percent.
+/// Share of the available memory that a run without --host-mem takes, percent.
 const BUDGET_PERCENT: u64 = 70;
-/// Share of the available memory that a run without a named budget may take beyond its first share, percent: what a run
-/// holds is known to a tenth.
+/// Share of the available memory up to which a run without --host-mem may rise, percent: estimates err by up to a tenth.
 const REACH_PERCENT: u64 = 90;
 
-/// What a run is expected to hold in memory at its peak, by part, bytes.
+/// Expected peak memory of a run by part, bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct MemoryEstimate {
     /// Pages in frames: values, moments, stamps, identities and statistics.
     pub frames: u64,
-    /// Pages on their way to or from a drive, and the plan.
+    /// Pages in transfer, and the plan.
     pub staging: u64,
     /// Rows of one view, their gradients, the stages' intermediates, images and loss.
     pub view: u64,
-    /// Of these, what its pixels take, however many rows it has.
+    /// The part of `view` that depends on pixels alone.
     pub view_pixels: u64,
     /// Decoded photos.
     pub targets: u64,
-    /// The index of the pages, in memory or not.
+    /// Index of all pages, in memory or not.
     pub index: u64,
-    /// Copies of pages that take part in a round of densification.
+    /// Copies of pages during a densification round.
     pub copies: u64,
     /// Everything else, with the optimizer's tables.
     pub base: u64,
@@ -58,8 +57,7 @@ impl MemoryEstimate {
     }
 }
 
-/// Bytes that a run may take: what it was told, or a share of what this process could have; `None` where the system does
-/// not tell.
+/// The budget of a run: --host-mem, or a share of the available memory; `None` if the system does not report it.
 pub fn host_budget(config: &TrainConfig) -> Option<u64> {
     match config.host_mem.0 {
         0 => memory_available().map(|bytes| bytes / 100 * BUDGET_PERCENT),
@@ -67,36 +65,36 @@ pub fn host_budget(config: &TrainConfig) -> Option<u64> {
     }
 }
 
-/// Bytes that this process could come to hold on this machine: what it holds, and most of what it could still get; `None`
-/// where the system does not tell. For runs that were not told how much they may take and need more than they set out with.
-pub fn within_reach() -> Option<u64> {
-    // Not what it holds of files: that memory can go, and counts as available already.
+/// Bytes that this process holds plus most of the available memory: the limit for raising the budget of a run without
+/// --host-mem. `None` if the system does not report it.
+pub fn obtainable_bytes() -> Option<u64> {
+    // Anonymous memory only: cached files count as available already.
     let held = status_field("RssAnon:").or_else(host_bytes_now)?;
     Some(held + memory_available()? / 100 * REACH_PERCENT)
 }
 
-/// Rows that a run may come to, as far as it is known: those there are, or the cap.
+/// Known upper bound of a run's rows: the current rows, or the cap if that is more.
 pub fn rows_at_most(config: &TrainConfig, rows: u64) -> u64 {
     if config.strategy.grows() { rows.max(config.max_gaussians) } else { rows }
 }
 
-/// The most that decoding a photo with its mask takes, bytes, and the view whose it is.
+/// The most bytes that decoding one photo with its mask takes, and the view of that photo.
 pub(super) fn largest_decode(dataset: &Dataset) -> (u64, Option<&View>) {
     let largest = dataset.views.iter().max_by_key(|view| view.photo.decode_bytes());
     (largest.map_or(0, |view| view.photo.decode_bytes()), largest)
 }
 
-/// Refuses a photo that cannot be decoded within the memory of the run, before it is decoded. What a photo takes follows from
-/// its header ([`crate::dataset::photo_header`]).
+/// Refuses photos that cannot be decoded within `host_mem`, judging by their headers
+/// ([`crate::dataset::photo_header`]).
 ///
 /// # Errors
-/// The photo that takes most takes more than `host_mem`.
+/// Decoding the largest photo takes more than `host_mem`.
 pub(super) fn check_photos_fit(dataset: &Dataset, host_mem: Option<u64>) -> InputResult<()> {
     let (bytes, Some(view)) = largest_decode(dataset) else { return Ok(()) };
     let Some(budget) = host_mem.filter(|budget| bytes > *budget) else { return Ok(()) };
     let header = &view.photo.header;
     let problem = format!(
-        "decoding it takes up to {}, more than the memory that there is for everything ({})",
+        "decoding it takes up to {}, more than the whole memory of the run ({})",
         format_bytes(bytes),
         format_bytes(budget)
     );
@@ -105,23 +103,23 @@ pub(super) fn check_photos_fit(dataset: &Dataset, host_mem: Option<u64>) -> Inpu
     Err(InputError::new(&view.photo.image_path, problem, remedy).at(place))
 }
 
-/// Memory of the copies that a round of densification makes of the pages of a scene, a batch at a time.
+/// Bytes of the page copies that a densification round makes, one batch at a time.
 pub(super) fn bytes_of_copies(pages: usize, frame_bytes: usize) -> u64 {
     (pages.min(PAGES_PER_BATCH) * frame_bytes) as u64
 }
 
-/// Memory of the pages of so many rows at a degree when all are in it; `has_grown` once pages were full and split.
+/// Bytes of all pages in memory for `rows` rows at `sh_degree`; `has_grown` if pages have split.
 pub(super) fn frames_in_memory(rows: u64, sh_degree: u8, has_grown: bool) -> u64 {
     let spare = if has_grown { GROWN_SPARE } else { 1.0 };
     (rows as f64 * row_bytes(sh_degree) as f64 * spare) as u64
 }
 
-/// The largest resident size of this process so far, bytes; `None` where the system does not tell.
+/// Peak resident size of this process, bytes; `None` if the system does not report it.
 pub fn host_bytes_peak() -> Option<u64> {
     status_field("VmHWM:")
 }
 
-/// The resident size of this process now, bytes; `None` where the system does not tell.
+/// Current resident size of this process, bytes; `None` if the system does not report it.
 pub fn host_bytes_now() -> Option<u64> {
     status_field("VmRSS:")
 }

@@ -1,13 +1,14 @@
-//! The glue, in one direction: [`run`] sets a run up and sees it through ([`tiers`] says where pages live, [`memory`] and
-//! [`preflight`] whether that fits), [`budget`] keeps it fitting as the scene grows, and `outgrown` says when it cannot,
-//! [`trainer`] loops over steps, [`step`] is one step from top to bottom,
-//! [`checkpoint`] commits it (`first_commit` that of a run in memory), [`full_drive`] finds it space, [`resume`] goes on from a
-//! commit if nothing changed (`changes`, [`dataset_print`]), [`pages`] has the rows of a run in pages and brings them to now with [`catch_up`],
-//! `update` changes them, `dense` all of them at every step, [`costs`] counts what steps took, [`eval`] looks at
-//! held-out views, [`report`] writes what happened, [`progress`] shows it, [`machine`] starts its threads, [`signals`]
-//! hears Ctrl-C, [`start`] gives the first Gaussians
-//! (`gaussian_pages` those of a file of any size), [`first_look`] looks at them for a plan, [`out_folder`] is where results go, `ownership` says which store belongs to which run and who may delete what, [`page_map`] draws where pages lie,
-//! [`stores`] is what tools do with checkpoints.
+//! Training: the module where all others meet. Dependencies between its files have no cycle.
+//!
+//! | task | files |
+//! | --- | --- |
+//! | set up and run | [`run`], [`prepare`], [`start`] (first Gaussians; `gaussian_pages` from a file of any size), [`tiers`] (where pages live), [`machine`] (threads, renderer), [`signals`] (Ctrl-C) |
+//! | memory | [`memory`], [`probe`] and [`preflight`] (does the run fit), [`budget`] and `fitting` (frames of a growing scene), `outgrown` (a scene that no longer fits), [`staging`] |
+//! | one step | [`step`], [`batch`] (gather, update), [`working_set`], [`catch_up`] (cull, evaluate), `update`, `dense` (dense Adam) |
+//! | state and loop | [`pages`], [`trainer`], [`training_loop`], [`eval`], [`costs`] |
+//! | commits | [`checkpoint`], `first_commit` (of a run in memory), [`full_drive`], [`resume`] with `changes` and [`dataset_print`] (may the run resume) |
+//! | results | [`out_folder`], [`report`], [`progress`], [`page_map`], [`facts`] |
+//! | stores | `ownership` (which run owns a store, who may delete it), `places`, [`first_look`] (for a plan), [`stores`] (what tools do with checkpoints) |
 
 pub mod batch;
 pub mod budget;

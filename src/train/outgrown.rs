@@ -1,8 +1,7 @@
-//! Scenes that outgrow their memory. One that was all in memory goes on with pages on the drive of its checkpoint. A view
-//! that needs more pages than memory has frames for ends the run: which photo it is of, what is kept, and what would do.
+//! Scenes that outgrow their memory. A scene in memory starts paging to the drive of its checkpoint. A view that needs
+//! more pages than there are frames ends the run with a commit and an error that names the photo and enough memory.
 //!
-//! Invariant: nothing is lost, and no bit is another. The step that could not be done changed nothing that doing it again
-//! does not.
+//! Invariant: no step is lost and no bit of the result changes. A step that lacked frames can be repeated.
 
 use super::budget::ViewNeed;
 use super::catch_up::visible_rows;
@@ -18,17 +17,17 @@ use crate::scene::camera::Camera;
 use crate::scene::page_split::parts_of;
 
 impl TrainError {
-    /// The same of a step on the photo `name`.
-    pub(super) fn of_view(mut self, name: &str) -> TrainError {
+    /// Adds the name of the view to an error about missing frames.
+    pub(super) fn with_view_name(mut self, name: &str) -> TrainError {
         if let TrainError::Paging(PagingError::WorkingSet { what, .. }) = &mut self {
             *what = format!("{what} ({name})");
         }
         self
     }
 
-    /// Flags with which a run that stopped for want of frames may go on; empty for other errors. It may have been the first
-    /// view of many to outgrow them, so that there is some room to grow.
-    pub(super) fn more_memory(&self) -> String {
+    /// Flags with which a run that lacked frames can resume; empty for other errors. They include room for more growth,
+    /// since other views may outgrow the frames next.
+    pub(super) fn memory_flags(&self) -> String {
         match self {
             TrainError::Outgrown { least: Some(least), .. } => {
                 format!(" --host-mem {}MiB (at least {}MiB)", (least + least / 2) / MIB, least.div_ceil(MIB))
@@ -42,13 +41,13 @@ impl TrainError {
 }
 
 impl Trainer {
-    /// Lets the pages of a run in memory leave it from now on, if they do not fit any more: all of them are committed, and
-    /// what is committed can be read again. Between steps. A run whose memory nobody named, and which would have
-    /// too few frames for its views then, keeps all pages in memory as long as the machine has it.
+    /// Starts paging in a run in memory whose pages no longer fit, between steps: commits all pages, so that they can be
+    /// evicted and read again. If paging left too few frames for a view and the user set no budget, all pages stay in
+    /// memory while the machine has it.
     ///
     /// # Errors
-    /// They could not be committed, for another reason than space.
-    pub(super) fn move_out_if_outgrown(&mut self, outputs: &mut LoopOutputs<'_>) -> Result<(), TrainError> {
+    /// The commit failed for a reason other than space.
+    pub(super) fn start_paging_if_outgrown(&mut self, outputs: &mut LoopOutputs<'_>) -> Result<(), TrainError> {
         let Some(budget) = self.budget.filter(|_| self.is_in_memory()) else { return Ok(()) };
         let view = self.view_memory();
         if budget.holds_all(&self.scene, view.at_last) {
@@ -57,19 +56,19 @@ impl Trainer {
         let needed = self.scene.pager.stats().pinned_max;
         let frames = budget.frames(&self.scene, view, needed);
         let is_tight = budget.frames_at_most(&self.scene, view) < needed;
-        if is_tight && self.raise_for_all(budget) {
+        if is_tight && self.raise_for_all_pages(budget) {
             return Ok(());
         }
         let outgrown =
             format!("from step {} on the scene does not fit into {}", self.step, format_bytes(budget.bytes()));
-        // Once: what cannot be helped now is not tried at every step.
+        // Warn once: without the budget, later steps do not try again.
         self.budget = None;
         let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else {
-            eprintln!("warning: {outgrown} (--host-mem), and there is no drive to move its pages to (--spill-dir)");
+            eprintln!("warning: {outgrown} (--host-mem), and no drive is set for its pages (--spill-dir)");
             return Ok(());
         };
         let commits = Some(checkpoint.commits_done());
-        if budget.tried_after == commits {
+        if budget.failed_after == commits {
             self.budget = Some(budget);
             return Ok(());
         }
@@ -81,16 +80,16 @@ impl Trainer {
             }
             Err(error) if error.is_out_of_space() => {
                 eprintln!("warning: {outgrown} (--host-mem), and its pages cannot be moved to a drive: {error}");
-                // After the next commit that finds space.
-                self.budget = Some(budget.tried(commits));
+                // Try again after the next successful commit.
+                self.budget = Some(budget.with_failure_after(commits));
                 return Ok(());
             }
             Err(error) => return Err(error),
         }
         checkpoint.set_optional(false);
         eprintln!(
-            "warning: {outgrown} (--host-mem): its pages move between memory and {}; with --spill-dir from its start a \
-             run may choose an order of views that moves fewer",
+            "warning: {outgrown} (--host-mem): its pages move between memory and {}; a new run with --spill-dir can \
+             choose a view order that moves fewer pages",
             checkpoint.folder().display()
         );
         self.budget = Some(budget);
@@ -98,9 +97,9 @@ impl Trainer {
         Ok(())
     }
 
-    /// Commits the run as it is when it has outgrown its frames, so that it can go on with more memory, and finds out how
-    /// much that must be.
-    pub(super) fn keep_outgrown(
+    /// Commits a run that has outgrown its frames, so that it can resume with more memory, and adds the least memory to
+    /// the error.
+    pub(super) fn commit_outgrown(
         &mut self,
         error: TrainError,
         dataset: &Dataset,
@@ -116,15 +115,15 @@ impl Trainer {
         let largest = largest_view(dataset, self.scene.pager.index()).view.filter(|view| Some(*view) != next);
         let mut needs = Vec::new();
         for view in next.into_iter().chain(largest) {
-            match self.need_of(&dataset.views[view].camera) {
+            match self.measure_need(&dataset.views[view].camera) {
                 Ok(need) => needs.push(need),
                 Err(second) => {
-                    eprintln!("warning: what the view {} needs is not known: {second}", dataset.views[view].name);
+                    eprintln!("warning: the memory of the view {} is unknown: {second}", dataset.views[view].name);
                 }
             }
         }
         if let PagingError::WorkingSet { pages, .. } = &mut source {
-            // A page that splits asked for one frame more; there may be many behind it.
+            // The error counts one frame for one split; further pages may split too.
             *pages = needs.iter().map(|need| need.pages).fold(*pages, usize::max);
             needs.push(ViewNeed { pages: *pages, growth: 1.0 });
         }
@@ -133,8 +132,8 @@ impl Trainer {
         TrainError::Outgrown { source, least }
     }
 
-    /// What a step on a view needs, with the events that its pages miss applied to copies of them.
-    fn need_of(&mut self, camera: &Camera) -> Result<ViewNeed, PagingError> {
+    /// Measures what a step on a view needs, with pending events applied to copies of its pages.
+    fn measure_need(&mut self, camera: &Camera) -> Result<ViewNeed, PagingError> {
         let (mut pages, mut rows, mut visible) = (0, 0, Vec::new());
         let (now, of_view) = (self.step, self.scene.pager.pages_of_view(camera));
         self.scene.visit(&of_view, &mut |rules, tables| {

@@ -1,10 +1,10 @@
-//! The rows of a run as pages: first pages, what all of them share (optimizer, event log, statistics, counts), and
-//! bringing pages to now.
+//! The pages of a run and their shared state (optimizer, event log, statistics, counts): creates the first pages,
+//! applies events, and evaluates pages at a step.
 //!
-//! Invariants: 1. events reach a page when a training step pins it, and only then; everything else applies them to a
-//! copy. So what is applied when does not depend on frames, cadences of evaluation or saves; 2. after
-//! [`PagedScene::apply_pending`] every pinned page is stored with the degree in use; 3. `rows_bound` is at least the
-//! number of rows that there would be if every page had applied every event.
+//! Invariants: 1. a stored page applies events only when a training step pins it; evaluation and export apply events to
+//! copies. The step at which a page applies an event therefore does not depend on frames, evaluation or saves; 2. after
+//! [`PagedScene::apply_pending`] every pinned page is stored with the current SH degree; 3. `rows_bound` is at least
+//! the number of rows that the scene would have if every page had applied every event.
 
 use super::catch_up::{evaluate_all, gather, visible_rows};
 use super::error::TrainError;
@@ -36,33 +36,33 @@ use crate::scene::state::SceneState;
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// Pages that are brought to now together: their copies are in memory at once.
+/// Pages evaluated together; copies of all of them are in memory at once.
 pub(super) const PAGES_PER_BATCH: usize = 32;
 
-/// What all pages share.
+/// State shared by all pages.
 pub struct PageRules {
     /// The optimizer.
     pub adam: DeferredAdam,
     events: EventLog,
     seed: u64,
     page_rows: usize,
-    /// What steps collect, and when rounds follow.
+    /// The densification strategy.
     pub(super) strategy: Arc<dyn Strategy>,
-    /// When rows may split before they are seen again.
+    /// Limits within which an unseen row may split; used by page bounds.
     splits: SplitLimits,
     sh_degree: u8,
 }
 
-/// Gets the rows of some pages, numbered through.
+/// Receives the rows of some pages as tables with consecutive row numbers.
 pub(super) type Visitor<'v, E> = dyn FnMut(&PageRules, &[Rows<'_>]) -> Result<(), E> + 'v;
 
-/// The pages of a run and what they share.
+/// The pages of a run and their shared state.
 pub struct PagedScene {
-    /// Where the pages are.
+    /// Cache and storage of the pages.
     pub pager: Pager,
-    /// What they share.
+    /// State shared by all pages.
     pub rules: PageRules,
-    /// Statistics of rows since the last round.
+    /// Gradient statistics of rows since the last densification round.
     pub histogram: GradHistogram,
     rows: u64,
     rows_bound: u64,
@@ -82,17 +82,17 @@ impl PageRules {
         }
     }
 
-    /// Degree in use, as the events raised it.
+    /// Current SH degree, as raised by events.
     pub fn sh_degree(&self) -> u8 {
         self.sh_degree
     }
 
-    /// Rows that a page holds at most.
+    /// Capacity of a page, rows.
     pub(super) fn page_rows(&self) -> usize {
         self.page_rows
     }
 
-    /// Bounds of rows that were changed, for the index.
+    /// Bounds of a page with these rows, for the index.
     pub(super) fn bounds(&self, rows: &Rows<'_>) -> PageBounds {
         self.adam.page_bounds(rows, &self.splits)
     }
@@ -105,7 +105,7 @@ impl PageRules {
         (meta.events_applied as usize) < self.events.len()
     }
 
-    /// The entry of a page that was rewritten with these rows.
+    /// The index entry of a page that holds `state` with all events applied.
     pub(super) fn meta(&self, id: PageId, state: &SceneState) -> PageMeta {
         PageMeta {
             id,
@@ -118,7 +118,7 @@ impl PageRules {
 }
 
 impl PagedScene {
-    /// Pages of first Gaussians. Each row keeps its number in `columns` as its identity.
+    /// Creates the pages of the first Gaussians. The uid of a row is its row number in `columns`.
     ///
     /// # Errors
     /// A page could not be stored.
@@ -129,8 +129,8 @@ impl PagedScene {
         Ok(scene)
     }
 
-    /// Pages of the first Gaussians of points that need not fit in memory: those of [`PagedScene::new`] for the same
-    /// points.
+    /// Creates the pages of the first Gaussians from points that may exceed memory; the result equals
+    /// [`PagedScene::new`] for the same points.
     ///
     /// # Errors
     /// The points cannot be read, or a page could not be stored.
@@ -154,13 +154,13 @@ impl PagedScene {
         }
     }
 
-    /// No pages yet.
+    /// A scene without pages.
     pub(super) fn empty(pager: Pager, options: &RunOptions) -> PagedScene {
         let (rules, histogram) = (PageRules::new(options), GradHistogram::default());
         PagedScene { pager, rules, histogram, rows: 0, rows_bound: 0 }
     }
 
-    /// Pages that a checkpoint brought back, with what all of them share.
+    /// A scene from the pages and the shared state of a checkpoint.
     pub(super) fn restore(
         pager: Pager,
         options: &RunOptions,
@@ -169,7 +169,7 @@ impl PagedScene {
         [rows, rows_bound]: [u64; 2],
     ) -> PagedScene {
         let mut rules = PageRules::new(options);
-        // Not what keys would begin with now, which may have changed since.
+        // Replay the logged raises: the configured schedule may have changed since.
         rules.sh_degree = options.sh_degree_start.min(options.sh_degree);
         for event in events.events() {
             if let EventKind::RaiseShDegree { degree } = event.kind {
@@ -191,23 +191,23 @@ impl PagedScene {
         Ok(())
     }
 
-    /// Rows in the pages as they are stored: late events are not counted.
+    /// Rows of the stored pages, without the effect of pending events.
     pub fn rows(&self) -> u64 {
         self.rows
     }
 
-    /// No fewer than the rows that there would be if every page had applied every event.
+    /// Upper bound of the rows after every page has applied every event.
     pub fn rows_bound(&self) -> u64 {
         self.rows_bound
     }
 
-    /// The events so far.
+    /// The event log.
     pub fn events(&self) -> &EventLog {
         &self.rules.events
     }
 
-    /// Logs an event: pages apply it when they are next pinned by a step. A round is promised the growth of all rows
-    /// that may grow in it, and clears the statistics.
+    /// Logs an event; each page applies it when a step next pins the page. A densification round adds the growth of all
+    /// rows that may grow to `rows_bound` and clears the statistics.
     pub fn log_event(&mut self, event: Event) {
         self.rules.events.push(event);
         match effect_of(&event.kind) {
@@ -220,11 +220,11 @@ impl PagedScene {
         }
     }
 
-    /// Applies the events that the pinned pages miss. Pages that outgrow their capacity split, which takes frames; the
-    /// list stays ascending by id.
+    /// Applies pending events to the pinned pages. A page that outgrows its capacity splits and takes a frame per new
+    /// page; the list stays ascending by id.
     ///
     /// # Errors
-    /// No frame could be had for a split, or a page cannot be split; it keeps its rows then.
+    /// No frame is free for a split, or a page cannot be split; the page keeps its rows then.
     pub fn apply_pending(&mut self, pages: &mut Vec<PinnedPage>) -> Result<(), TrainError> {
         if pages.iter().all(|p| !self.rules.is_behind(&p.meta)) {
             return Ok(());
@@ -252,7 +252,7 @@ impl PagedScene {
         done
     }
 
-    /// Takes over what became of a page; the parts that it split into but the first go to `added`.
+    /// Stores the result of a replay in `page`; if the page split, all parts but the first go to `added`.
     fn store_replay(
         &mut self,
         page: &mut PinnedPage,
@@ -271,7 +271,7 @@ impl PagedScene {
         page.dirty = true;
         for round in rounds {
             self.rows = self.rows.saturating_add_signed(round.rows_change);
-            // Pages whose statistics are not those of the round take back more than was promised for them.
+            // The max matters for pages whose statistics differ from the round's: they return more than was promised.
             let promised = self.rows_bound.saturating_sub(round.promised).saturating_add_signed(round.rows_change);
             self.rows_bound = promised.max(self.rows);
         }
@@ -308,13 +308,12 @@ impl PagedScene {
         Ok(())
     }
 
-    /// Brings every page to `now`, the number of steps done, by the rules that it was trained by, and goes on by those of
-    /// `options`: rows take the steps that they missed at the old rates, and bounds are renewed. Reads and rewrites every
-    /// page, once, and counts the histogram anew on the way; says whether it was another than the one that came with the
-    /// pages, as it is after a salvage that had to leave statistics out.
+    /// Switches to the rules of `options` after `now` steps. Every page applies its pending events and missed steps at
+    /// the old rates and gets new bounds, so every page is read and rewritten once. The histogram is recounted; returns
+    /// whether the recount differs, as it does after a salvage that left statistics out.
     ///
     /// # Errors
-    /// Pages could not be had.
+    /// Pages could not be pinned.
     pub(super) fn change_rules(&mut self, options: &RunOptions, now: u32) -> Result<bool, TrainError> {
         let mut rules = PageRules::new(options);
         rules.events = self.rules.events.clone();
@@ -326,7 +325,7 @@ impl PagedScene {
             let mut pinned = self.pager.acquire_pages(pages)?;
             let applied = self.apply_pending(&mut pinned);
             if applied.is_ok() {
-                // Parts of pages that split are pinned too, so that every row is counted.
+                // New pages from splits are pinned too, so every row is counted.
                 pinned.iter().for_each(|page| histogram.add_rows(&page.rows(0)));
                 let at = self.rules.adam.at(now);
                 pinned.par_iter_mut().for_each(|page| {
@@ -340,16 +339,16 @@ impl PagedScene {
             applied?;
         }
         self.rules = rules;
-        let is_other = histogram != self.histogram;
+        let is_changed = histogram != self.histogram;
         self.histogram = histogram;
-        Ok(is_other)
+        Ok(is_changed)
     }
 
-    /// Collects into `working` the rows of these pages that `camera` may draw after `now` steps, as though the pages had been
-    /// touched then; stores nothing.
+    /// Gathers into `working` the rows of these pages that `camera` may draw after `now` steps, with pending events applied to
+    /// copies. Stored pages stay unchanged.
     ///
     /// # Errors
-    /// Pages could not be had.
+    /// Pages could not be pinned.
     pub fn gather_pages(
         &mut self,
         pages: &[PageNo],
@@ -371,10 +370,11 @@ impl PagedScene {
         })
     }
 
-    /// Hands all rows as they are after `now` steps to `each`, part by part in the order of page ids; stores nothing.
+    /// Passes all rows, evaluated after `now` steps, to `each` in batches, in the order of page ids. Stored pages stay
+    /// unchanged.
     ///
     /// # Errors
-    /// Pages could not be had, or `each` failed.
+    /// Pages could not be pinned, or `each` failed.
     pub fn for_all_rows<E: From<PagingError>>(
         &mut self,
         now: u32,
@@ -387,10 +387,10 @@ impl PagedScene {
         self.for_rows_of(&pages, now, each)
     }
 
-    /// As [`PagedScene::for_all_rows`], of these pages alone.
+    /// As [`PagedScene::for_all_rows`], for `pages` only.
     ///
     /// # Errors
-    /// Pages could not be had, or `each` failed.
+    /// Pages could not be pinned, or `each` failed.
     pub fn for_rows_of<E: From<PagingError>>(
         &mut self,
         pages: &[PageNo],
@@ -400,7 +400,7 @@ impl PagedScene {
         self.visit(pages, &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
     }
 
-    /// Pins the pages batch by batch and hands their rows to `each`, with pending events applied to copies.
+    /// Pins the pages in batches and passes their rows to `each`, with pending events applied to copies.
     pub(super) fn visit<E: From<PagingError>>(&mut self, pages: &[PageNo], each: &mut Visitor<'_, E>) -> Result<(), E> {
         let batch = PAGES_PER_BATCH.min(self.pager.frames_max()).max(1);
         for pages in pages.chunks(batch) {
@@ -432,8 +432,8 @@ impl PagedScene {
     }
 }
 
-/// The rows of the pages, numbered through.
-pub fn numbered(pages: &[PinnedPage]) -> Vec<Rows<'_>> {
+/// The rows of the pages as tables with consecutive row numbers.
+pub fn row_tables(pages: &[PinnedPage]) -> Vec<Rows<'_>> {
     let mut first_row = 0;
     let mut tables = Vec::with_capacity(pages.len());
     for page in pages {
@@ -443,8 +443,8 @@ pub fn numbered(pages: &[PinnedPage]) -> Vec<Rows<'_>> {
     tables
 }
 
-/// Hands out the first pages of Gaussians that are in memory, at most `fill` rows each, with the bands up to `sh_degree`.
-/// Each row keeps its number in `columns` as its identity.
+/// Partitions Gaussians in memory into first pages of at most `fill` rows, stored with `sh_degree`, and passes each to
+/// `take`. The uid of a row is its row number in `columns`.
 ///
 /// # Errors
 /// Those of `take`.
@@ -460,8 +460,8 @@ pub(super) fn first_pages<E>(
         .try_for_each(|(page, rows)| take(PageId::initial(page), first_rows(columns, rows, sh_degree)))
 }
 
-/// The listed rows of `columns` as fresh rows with their numbers as identities, stored with `sh_degree`: bands above it
-/// are left out.
+/// The listed rows of `columns` as untrained rows whose uids are their row numbers. SH bands above `sh_degree` are
+/// dropped.
 fn first_rows(columns: &Columns, rows: &[u32], sh_degree: u8) -> SceneState {
     let mut out = Columns::zeros(rows.len(), sh_degree);
     for column in Column::ALL {

@@ -1,11 +1,10 @@
-//! Before the first step: what each tier will hold, whether that fits, and how many frames there are.
+//! Plans the tiers before the first step: what each tier will hold, whether it fits, and the number of frames.
 //!
-//! Invariant: a run that cannot fit is refused here, with the numbers and the alternatives; what only might not fit,
-//! because the scene grows, is a warning.
+//! Invariant: a run that cannot fit is refused here, with numbers and alternatives. Growth that may not fit is a warning.
 
 use super::budget::HostBudget;
 use super::error::TrainError;
-use super::memory::{MemoryEstimate, rows_at_most, within_reach};
+use super::memory::{MemoryEstimate, obtainable_bytes, rows_at_most};
 use super::places::drive_of;
 use super::probe::{Probe, estimate};
 use super::staging::{PLAN_BYTES, staging_bytes, with_staging};
@@ -26,39 +25,39 @@ use crate::scene::partition::first_fill;
 use crate::schedule::order::Order;
 use crate::schedule::visibility::{ViewPages, visible_pages};
 
-/// Bytes that a common drive of 500 GB is rated to take in its life.
+/// Rated endurance of a common drive of 500 GB, bytes written.
 const ENDURANCE_BYTES: f64 = 300e12;
-/// Epochs that are played through to see what a run will write.
+/// Epochs that are simulated to estimate the bytes a run writes.
 const PLAYED_EPOCHS: u32 = 3;
 /// Pages are numbered in 32 bits.
 const PAGES_MOST: u64 = u32::MAX as u64;
-/// Scenes hardly ever grow to this many times their points, so that nothing is said of it.
+/// Growth factor that scenes hardly ever reach; growth beyond it causes no warning.
 const GROWTH_UNLIKELY: f64 = 20.0;
-/// Versions of a page that may lie on the drive: two commits', and the one that is written for the next.
+/// Versions of a page on the drive: one per commit kept (two), and one being written.
 const VERSIONS: u64 = 3;
-/// Slots that writes in flight take beside those of the pages.
+/// Additional slots of writes in flight.
 const SLOTS_IN_FLIGHT: u64 = 64;
 
-/// What a run needs and has of pages.
+/// Pages, frames and drive space of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TierPlan {
-    /// Pages now, and as far as is known at most.
+    /// Pages now, and their known upper bound.
     pub pages: [u64; 2],
     /// Bytes of a frame and of a slot on the drive.
     pub frame_bytes: u64,
-    /// Frames, which may be more than there are pages; `None` for a run in memory, which has one for every page.
+    /// Frames, possibly more than pages; `None` for a run in memory, which has one frame per page.
     pub frames: Option<u64>,
-    /// The user named their number.
+    /// The user set the number of frames.
     frames_are_named: bool,
     /// The view that needs most pages.
     pub(super) largest_view: LargestView,
-    /// Bytes that the run is expected to write to the drive, commits apart.
+    /// Bytes that the run is expected to write to the drive, without commits.
     pub bytes_written: f64,
-    /// Free bytes of the drive, where one is used and the system tells.
+    /// Free bytes of the drive; `None` without a drive or if the system does not report them.
     pub free_bytes: Option<u64>,
 }
 
-/// Settles the frames and completes the estimates with them: [`super::probe::estimate`]'s, at the start and at most.
+/// Chooses the number of frames and completes the two estimates of [`super::probe::estimate`] with it.
 ///
 /// # Errors
 /// The budget or the drive is too small.
@@ -73,7 +72,7 @@ pub fn settle(
     let index = trainer.scene.pager.index().len() as u64;
     let rows_max = rows_at_most(config, trainer.scene.rows());
     let fill = first_fill(config.page_rows as usize, config.strategy.grows()) as u64;
-    // Pages are not all full (giants have their own), and what grows is filled like what is there.
+    // Not all pages are full (giants have pages of their own); assume that new pages are as full as the present ones.
     let grown = (index as f64 * rows_max as f64 / trainer.scene.rows().max(1) as f64).ceil() as u64;
     let pages_max = grown.max(rows_max.div_ceil(fill));
     let frame_bytes = trainer.scene.pager.frame_bytes() as u64;
@@ -89,9 +88,9 @@ pub fn settle(
     };
     if trainer.scene.pager.frames_max() == usize::MAX {
         let asked = host_mem;
-        let host_mem = enough_memory(config, asked, memory[0].total());
+        let host_mem = raise_to_least(config, asked, memory[0].total());
         if trainer.scene.pager.slot_space().is_none() {
-            // A run that goes on has a drive already, to which its pages move if they do not fit.
+            // A resumed run has a drive already and can start paging.
             check_in_memory(memory, host_mem)?;
         }
         if let Some(budget) = host_mem {
@@ -121,8 +120,8 @@ pub fn settle(
     Ok(plan)
 }
 
-/// What is known of a scene whose pages a dry run cannot look at, since they do not fit in memory and it writes none;
-/// `None` where they do fit. A dry run keeps what would lie on the drive in memory, in half of the budget at most.
+/// Describes a scene that a dry run cannot plan because its pages exceed half of the budget; `None` if they fit. A dry
+/// run writes no pages: it keeps the pages of the drive in memory, in at most half of the budget.
 pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Option<u64>) -> Option<String> {
     let (spill_dir, budget) = (config.residence().spill_dir()?, host_mem?);
     let frame = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes() as u64;
@@ -135,9 +134,9 @@ pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Op
         "scene   {} views to train on, {} held out\n\
          start   {} Gaussians\n\
          pages   about {pages} of up to {}, {} in all; the drive has {} free\n\
-         memory  {} for everything, less than {} pages at once. What a view needs is not known before the pages are \
-         on the drive, and a dry run writes none: the run itself finds it before its first step, and refuses what is \
-         too little",
+         memory  {} in all, fewer than {} pages at once\n\
+         views   unknown: their needs follow from pages on the drive, and a dry run writes none.\n        \
+         The run itself checks them before its first step.",
         start.dataset.train_views().len(),
         start.dataset.test_views().len(),
         start.rows,
@@ -149,12 +148,12 @@ pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Op
     ))
 }
 
-/// Gives a pager whose frames follow from the budget as many as the largest training view of `dataset` needs, so that views can
-/// be looked at; [`settle`] gives it the rest once it is known what a view takes. Returns which view that is.
+/// Allows the frames that the largest training view of `dataset` needs, so that views can be measured; [`settle`]
+/// allows the rest afterwards. Returns the index of that view. Runs in memory or with --frames are left unchanged.
 ///
 /// # Errors
-/// The budget does not even hold the pages of that view.
-pub fn hold_a_view(
+/// The budget does not hold the pages of that view.
+pub fn allow_largest_view(
     config: &TrainConfig,
     dataset: &Dataset,
     trainer: &mut Trainer,
@@ -166,8 +165,8 @@ pub fn hold_a_view(
         return Ok(number);
     }
     let bytes = needed * trainer.scene.pager.frame_bytes() as u64;
-    // What nobody named may become more once it is known what a view takes.
-    let most = if config.host_mem.0 == 0 { host_mem.and(within_reach()).max(host_mem) } else { host_mem };
+    // A default budget may rise once the memory of a view is known.
+    let most = if config.host_mem.0 == 0 { host_mem.and(obtainable_bytes()).max(host_mem) } else { host_mem };
     if let Some(budget) = most.filter(|budget| bytes > *budget) {
         let problem = format!(
             "{} are too little: the view {view} needs {needed} pages of {} at once, which is {}",
@@ -175,16 +174,15 @@ pub fn hold_a_view(
             format_bytes(trainer.scene.pager.frame_bytes() as u64),
             format_bytes(bytes)
         );
-        let remedy = "give more than these pages and what a view, photos and tables take beside them, or lower --page-rows or \
-                      --sh-degree";
+        let remedy = "give memory for these pages, one view, photos and tables, or lower --page-rows or --sh-degree";
         return Err(InputError::new("--host-mem", problem, remedy));
     }
     trainer.scene.pager.allow_frames(needed as usize);
     Ok(number)
 }
 
-/// What `--view-order auto` stands for. Of a scene that grows, the pages as they are now stand for what it may come to, and
-/// as many fewer frames for what there will be.
+/// Resolves `--view-order auto`. For a scene that grows, the current pages stand for the grown scene, with the number of
+/// frames reduced in proportion.
 fn auto_order(
     config: &TrainConfig,
     dataset: &Dataset,
@@ -205,11 +203,11 @@ fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
     dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect()
 }
 
-/// Frames that `host_mem` bytes leave for the pages of a scene, as [`settle`] gives them to a run. For planning without one:
-/// the trainer has the pages of the largest view.
+/// Number of frames within `host_mem`, as [`settle`] chooses it. For planning without a run: `trainer` holds the pages
+/// of the largest view.
 ///
 /// # Errors
-/// The budget does not hold that view, or it cannot be rendered.
+/// The budget does not hold that view, or the view cannot be rendered.
 pub(super) fn frames_within(
     config: &TrainConfig,
     dataset: &Dataset,
@@ -232,8 +230,8 @@ pub(super) fn frames_within(
     Ok(frames_of_budget(&plan, Some(host_mem), &memory)?)
 }
 
-/// Says when the scene may outgrow its memory: the largest view needs about as many times more pages as there are more
-/// Gaussians, and leaves fewer frames for them.
+/// Warns if the scene may outgrow its memory: the pages of the largest view grow in proportion to the Gaussians, while
+/// the frames shrink.
 fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, memory: &[MemoryEstimate; 2]) {
     let ([now, most], Some(frames)) = (plan.pages, plan.frames) else { return };
     if !config.strategy.grows() {
@@ -248,26 +246,26 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
     let times = times_to_outgrow(plan, frames, memory[0].view - memory[0].view_pixels, config.frames > 0);
     let until = match config.max_gaussians {
         0 if times >= GROWTH_UNLIKELY => return,
-        0 => "there is no cap on it (--max-gaussians)".to_string(),
+        0 => "growth has no cap (--max-gaussians)".to_string(),
         _ if then <= left => return,
-        cap => format!("with --max-gaussians {cap} it may come to need {then}, with {left} left for them"),
+        cap => format!("with --max-gaussians {cap} the view may need {then} pages with {left} frames"),
     };
     eprintln!(
-        "warning: the view {view} needs {needed} pages, there are {frames} frames, and {until}: when the scene has grown to about \
-         {times:.1} times what it is, the run may stop; it can then go on with --resume and more --frames or --host-mem"
+        "warning: the view {view} needs {needed} pages, there are {frames} frames, and {until}: the run may stop when \
+         the scene has grown about {times:.1} times; --resume with more --frames or --host-mem then continues it"
     );
 }
 
-/// How many times as many Gaussians as now leave the largest view just the frames that it needs.
+/// Growth factor of the scene at which the largest view needs all frames.
 fn times_to_outgrow(plan: &TierPlan, frames: u64, of_rows: u64, are_fixed: bool) -> f64 {
-    // Frames that were named do not give way to the rows of a view.
+    // With --frames the number of frames does not shrink as the rows of a view grow.
     let of_rows = if are_fixed { 0 } else { of_rows };
     let needed = plan.largest_view.pages * plan.frame_bytes;
     (frames * plan.frame_bytes + of_rows) as f64 / (needed + of_rows).max(1) as f64
 }
 
-/// Bytes that the run will write to the drive, commits apart: the import, and some epochs played through with the pages as
-/// they are now.
+/// Bytes that the run will write to the drive, without commits: the import, and the steps by simulation of a few epochs
+/// with the current pages.
 fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, frames: usize) -> f64 {
     let cameras = train_cameras(dataset);
     let index = trainer.scene.pager.index();
@@ -282,20 +280,20 @@ fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, fra
     import + written as f64 * f64::from(config.steps - done) / f64::from(steps.max(1))
 }
 
-/// The training view that needs most pages by the bounds of `index`.
+/// The training view that needs most pages, by page bounds. Held-out views do not count: evaluation visits their pages
+/// in batches.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct LargestView {
-    /// Its number among the dataset's views; `None` where no view sees anything.
+    /// Its index in `dataset.views`; `None` if no view sees a page.
     pub view: Option<usize>,
     /// Its name.
     pub name: String,
     /// Pages that it needs.
     pub pages: u64,
-    /// Mean over the training views.
+    /// Mean number of pages over the training views.
     pub mean: f64,
 }
 
-/// Evaluation takes its views page by page, so held-out views do not count.
 pub(super) fn largest_view(dataset: &Dataset, index: &[PageMeta]) -> LargestView {
     let (mut largest, mut sum, mut list) = (LargestView::default(), 0, Vec::new());
     let views = dataset.train_views();
@@ -314,7 +312,7 @@ fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -
     let Some(budget) = host_mem else { return Ok(()) };
     if start.total() > budget {
         let problem = format!(
-            "{} are too little: the scene takes about {} in memory ({} of Gaussians)",
+            "{} are too little: the scene needs about {} of memory ({} for Gaussians)",
             format_bytes(budget),
             format_bytes(start.total()),
             format_bytes(start.frames)
@@ -325,7 +323,7 @@ fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -
     }
     if most.total() > budget {
         eprintln!(
-            "warning: the run may need {}, but has {}: once it needs more its pages move between memory and its checkpoint; name \
+            "warning: the run may need {} but has {}: beyond that, its pages move between memory and its checkpoint; name \
              a folder on a fast drive with --spill-dir, or lower --max-gaussians, --image-cache, --sh-degree or the size \
              of the photos",
             format_bytes(most.total()),
@@ -335,7 +333,7 @@ fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -
     Ok(())
 }
 
-/// Frames that a run starts with, and the memory that they follow from.
+/// Number of frames at the start, and the budget from which it follows.
 fn first_frames(
     config: &TrainConfig,
     plan: &TierPlan,
@@ -346,41 +344,41 @@ fn first_frames(
         check_view(plan, u64::from(config.frames))?;
         return Ok((u64::from(config.frames), host_mem));
     }
-    // By what is known for certain: the cap may never be reached. What grows takes from the frames in its time.
+    // By the estimate without growth: the cap may never be reached, and growth takes frames when it happens.
     if let Ok(frames) = frames_of_budget(plan, host_mem, memory) {
         return Ok((frames, host_mem));
     }
-    let host_mem = enough_memory(config, host_mem, least_memory(plan, memory, host_mem));
+    let host_mem = raise_to_least(config, host_mem, least_memory(plan, memory, host_mem));
     Ok((frames_of_budget(plan, host_mem, memory)?, host_mem))
 }
 
-/// `host_mem`, or `least` bytes where it is less, nobody named it, and the machine has them.
-fn enough_memory(config: &TrainConfig, host_mem: Option<u64>, least: u64) -> Option<u64> {
+/// `host_mem`, raised to `least` with a warning if the user set no budget and the machine has the memory.
+fn raise_to_least(config: &TrainConfig, host_mem: Option<u64>, least: u64) -> Option<u64> {
     let budget = host_mem.filter(|&budget| config.host_mem.0 == 0 && least > budget);
-    let Some(short) = budget.filter(|_| within_reach().is_some_and(|most| least <= most)) else { return host_mem };
+    let Some(short) = budget.filter(|_| obtainable_bytes().is_some_and(|most| least <= most)) else { return host_mem };
     eprintln!(
-        "warning: the run needs {} from its start, more than {}, the share of the free memory that it takes by itself: it \
-         takes more as long as the machine has it; --host-mem sets a limit",
+        "warning: the run needs {} from its start, more than {}, the default share of the free memory: it takes more as \
+         long as the machine has it; --host-mem sets a limit",
         format_bytes(least),
         format_bytes(short)
     );
     Some(least)
 }
 
-/// Memory with which the largest view has its frames.
+/// Least budget with which the largest view has its frames.
 fn least_memory(plan: &TierPlan, memory: &MemoryEstimate, host_mem: Option<u64>) -> u64 {
     let rest = memory.fixed() - memory.staging + view_spare(memory) + plan.largest_view.pages * plan.frame_bytes;
     let least = with_staging(rest, memory.staging, host_mem.unwrap_or(u64::MAX));
     least + least / 50
 }
 
-/// Vectors of a view that is a little larger than those that were rendered grow by an eighth.
+/// Margin for a view slightly larger than the rendered ones: its vectors grow by an eighth.
 fn view_spare(memory: &MemoryEstimate) -> u64 {
     (memory.view - memory.view_pixels) / 8
 }
 
 fn frames_of_budget(plan: &TierPlan, host_mem: Option<u64>, memory: &MemoryEstimate) -> InputResult<u64> {
-    // Where the system tells nothing, everything fits until it does not.
+    // Without a budget, the system reports no available memory: set no limit.
     let Some(budget) = host_mem else { return Ok(PAGES_MOST) };
     let frames = budget.saturating_sub(memory.fixed() + view_spare(memory)) / plan.frame_bytes;
     let LargestView { pages: needed, name: view, .. } = &plan.largest_view;
@@ -388,7 +386,7 @@ fn frames_of_budget(plan: &TierPlan, host_mem: Option<u64>, memory: &MemoryEstim
         return Ok(frames.min(PAGES_MOST));
     }
     let problem = format!(
-        "{} are too little: {} go to one view, photos, staging and tables, which leaves {frames} pages of {}, but the \
+        "{} are too little: one view, photos, staging and tables take {}, which leaves {frames} pages of {}, but the \
          view {view} needs {needed}",
         format_bytes(budget),
         format_bytes(memory.fixed()),
@@ -407,13 +405,14 @@ fn check_view(plan: &TierPlan, frames: u64) -> InputResult<()> {
         return Ok(());
     }
     let problem = format!("{frames} are too few: the view {view} needs {needed} pages at once");
-    Err(InputError::new("--frames", problem, format!("give at least {needed}; views may come to need more")))
+    Err(InputError::new("--frames", problem, format!("give at least {needed}; views of a growing scene need more")))
 }
 
-/// Refuses a drive that cannot hold the `rows` first Gaussians, before anything is read or written for it.
+/// Refuses a drive that cannot hold the `rows` first Gaussians, before the import. A drive that does not report its free
+/// space passes.
 ///
 /// # Errors
-/// It is too small; a drive that does not tell what is free is large enough.
+/// The drive has too little free space.
 pub fn check_first_drive(config: &TrainConfig, rows: u64) -> InputResult<()> {
     let Some(spill_dir) = config.residence().spill_dir() else { return Ok(()) };
     let free = free_bytes(&drive_of(spill_dir)).ok().flatten();
@@ -422,7 +421,7 @@ pub fn check_first_drive(config: &TrainConfig, rows: u64) -> InputResult<()> {
     free.map_or(Ok(()), |free| refuse_small_drive(free, pages, frame_bytes))
 }
 
-/// Bytes of so many pages on the drive, and of those that are on their way there.
+/// Bytes of `pages` pages on the drive, with slots of writes in flight.
 fn drive_bytes(pages: u64, frame_bytes: u64) -> u64 {
     pages.saturating_add(SLOTS_IN_FLIGHT).saturating_mul(frame_bytes)
 }
@@ -433,7 +432,7 @@ fn refuse_small_drive(free: u64, pages: u64, frame_bytes: u64) -> InputResult<()
         return Ok(());
     }
     let problem = format!(
-        "the drive has {} free for pages, but {pages} of {} may have to lie there, {} with those on their way",
+        "the drive has {} free for pages, but may have to hold {pages} of {}, {} with writes in flight",
         format_bytes(free),
         format_bytes(frame_bytes),
         format_bytes(needed)
@@ -442,7 +441,7 @@ fn refuse_small_drive(free: u64, pages: u64, frame_bytes: u64) -> InputResult<()
     Err(InputError::new("--spill-dir", problem, remedy))
 }
 
-/// Checkpoints that `--save-every` keeps by name: each may come to hold a version of every page.
+/// Number of named checkpoints from `--save-every`; each may hold a version of every page.
 fn checkpoints_kept(config: &TrainConfig) -> u64 {
     u64::from(config.steps.saturating_sub(1).checked_div(config.save_every).unwrap_or(0))
 }
@@ -458,7 +457,7 @@ fn check_drive(plan: &TierPlan, tiers: &Tiers, kept: u64) -> InputResult<()> {
             kept => (format!(" and {kept} named checkpoints"), ", keep fewer checkpoints with --save-every"),
         };
         eprintln!(
-            "warning: the scene with its last two commits{named} may grow to {} on the drive, which has {} free: lower \
+            "warning: the scene with its last two commits{named} may take {} on the drive, which has {} free: lower \
              --max-gaussians{fewer}, or commit less often with --commit-every",
             format_bytes(with_past),
             format_bytes(free)
@@ -467,7 +466,7 @@ fn check_drive(plan: &TierPlan, tiers: &Tiers, kept: u64) -> InputResult<()> {
     Ok(())
 }
 
-/// The tiers' part of what is said at the start.
+/// The description of the tiers that a run prints at its start.
 pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> String {
     let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
     let LargestView { pages: largest, mean, .. } = &plan.largest_view;
@@ -479,7 +478,7 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
     let frames = match plan.frames {
         None => String::from("Gaussians with their optimizer state"),
         Some(frames) if !plan.frames_are_named && frames >= plan.pages[1] => {
-            String::from("frames of pages, for all that there are")
+            String::from("frames of pages, one for every page")
         }
         Some(frames) => format!("{frames} frames of pages"),
     };
@@ -488,7 +487,7 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
     text.push_str(&part("one view: rows, gradients, images", memory.view));
     text.push_str(&part("decoded photos (--image-cache)", memory.targets));
     if memory.staging > 0 {
-        text.push_str(&part("pages on their way that are encoded, and the plan", memory.staging));
+        text.push_str(&part("encoded pages in transfer, and the plan", memory.staging));
     }
     text.push_str(&part("index of the pages", memory.index));
     text.push_str(&part("program and tables", memory.base + memory.copies));

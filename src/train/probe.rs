@@ -1,4 +1,4 @@
-//! What a run will take, measured before its first step by rendering a few views with the first Gaussians.
+//! Estimates the memory of a run before its first step by rendering a few views with the first Gaussians.
 
 use super::error::TrainError;
 use super::memory::{
@@ -11,25 +11,25 @@ use crate::dataset::target_cache::TargetCache;
 use crate::scene::columns::row_width;
 use crate::scene::partition::first_fill;
 
-/// Views, spread over all, rendered to see what a view takes.
+/// Views to render, spread evenly over the dataset.
 const PROBE_VIEWS: usize = 6;
 
-/// What an estimate is made of.
+/// Input of an estimate.
 #[derive(Debug, Clone)]
 pub struct Probe {
-    /// Views that are rendered to see what a view takes.
+    /// Views to render.
     pub views: Vec<usize>,
     /// Gaussians of the scene.
     pub rows: u64,
-    /// Its pages.
+    /// Pages of the scene.
     pub pages: usize,
-    /// Bytes that the graphics driver took when it was looked for a device.
+    /// Bytes that the graphics driver allocated during the search for a device.
     pub driver: u64,
 }
 
 impl Probe {
-    /// Of a run: `largest`, the view that needs most pages, and a few spread over the dataset. The largest comes first, so that
-    /// what it takes is taken at once, with nothing to spare for growing.
+    /// The probe of a run: `largest` (the view that needs most pages) and a few views spread over the dataset. The
+    /// largest comes first, so that buffers get their final size at once instead of growing with spare capacity.
     pub fn of_run(dataset: &Dataset, trainer: &Trainer, largest: Option<usize>, driver: u64) -> Probe {
         let every = dataset.views.len().div_ceil(PROBE_VIEWS).max(1);
         let spread = (0..dataset.views.len()).step_by(every).filter(|view| largest != Some(*view));
@@ -38,9 +38,9 @@ impl Probe {
     }
 }
 
-/// Estimates a run before its first step, with all pages in memory: if nothing grows, and if it grows to its cap. The trainer
-/// renders the views of the probe for it and keeps the memory for its own steps: allocating it twice would break the heap
-/// into pieces and the promise with it.
+/// Estimates the memory of a run with all pages in memory: without growth, and grown to its cap. The trainer renders the
+/// views of the probe and keeps the allocations for its steps; allocating twice would fragment the heap and exceed the
+/// estimate.
 ///
 /// # Errors
 /// A view cannot be rendered.
@@ -53,15 +53,14 @@ pub fn estimate(
     let rows = probe.rows;
     let pixels = trainer.probe_views(dataset, &probe.views)? as u64;
     let [working, rendering] = trainer.view_bytes();
-    // Image, coverage, gradient, and the tiles' copies of them.
+    // Image, coverage, gradient, and per-tile copies of them.
     let of_pixels = (pixels * 4 * (3 + 1 + 3 + 6)).min(rendering);
-    // More Gaussians make a view's part grow in proportion, and bands that come into use its rows; the part of its
-    // pixels stays.
+    // The part of the rows grows with the number of Gaussians and with the SH degree; the part of the pixels is constant.
     let (first, last) = trainer.sh_degrees();
     let wider = row_width(last) as f64 / row_width(first) as f64;
     let of_rows = working as f64 * wider + (rendering - of_pixels) as f64;
     let decoders = rayon::current_num_threads();
-    // A view that a step waits for is decoded even where the cache is smaller.
+    // A photo that a step waits for is decoded even if it exceeds the cache.
     let keep_all = TargetCache::bytes_to_keep_all(&dataset.views, decoders);
     let targets = config.image_cache.0.min(keep_all).max(largest_decode(dataset).0);
     let pages = probe.pages as f64;

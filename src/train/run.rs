@@ -169,7 +169,7 @@ pub(super) fn see_through(
     begun: Begun,
 ) -> Result<RunOutcome, TrainError> {
     let (config, host_mem) = (&request.config, begun.host_mem);
-    let largest = preflight::hold_a_view(config, dataset, &mut trainer, host_mem)?;
+    let largest = preflight::allow_largest_view(config, dataset, &mut trainer, host_mem)?;
     let probe = Probe::of_run(dataset, &trainer, largest, begun.driver);
     let mut memory = estimate(config, dataset, &mut trainer, &probe)?;
     let plan = preflight::settle(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
@@ -189,7 +189,7 @@ pub(super) fn see_through(
     }
     let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun);
     if tiers.can_resume() {
-        let more = outcome.as_ref().err().map_or(String::new(), TrainError::more_memory);
+        let more = outcome.as_ref().err().map_or(String::new(), TrainError::memory_flags);
         let elsewhere = spill_dir_flag(request);
         eprintln!("to go on from the last commit: gsscale-train --resume {}{elsewhere}{more}", request.out.display());
     }

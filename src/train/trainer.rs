@@ -1,10 +1,9 @@
-//! The loop over steps: views in order, events where they are due, metrics, evaluation and saves.
-//! Longer than other files: all of it is the loop's own state and the order in which things happen to it; what is done at each
-//! point lies elsewhere.
+//! The trainer: the state of a run and one step of it, with the order of views and the events after a step. The loop
+//! lies in [`super::training_loop`].
 //!
-//! Invariants: 1. the state after step s is a function of dataset, config and s alone, not of threads, budgets or
-//! cadences of logging and evaluation; 2. a step whose loss is not finite changes nothing, and three in a row end
-//! the run with what the last good step left.
+//! Invariants: 1. the state after step s is a function of dataset, config and s alone; threads, budgets, logging and
+//! evaluation do not change it; 2. a step with a non-finite loss changes no row, and three such steps in a row end the
+//! run with the result of the last good step.
 
 use super::budget::HostBudget;
 use super::dense::settle_all;
@@ -31,19 +30,19 @@ use crate::schedule::order::{Order, ViewOrder};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// Steps in a row with a loss that is not finite after which a run ends.
+/// Consecutive steps with a non-finite loss that end a run.
 const NON_FINITE_STEPS_MAX: u32 = 3;
-/// Views whose photos are asked for ahead of their steps.
+/// Views whose photos are prefetched.
 const PREFETCH_VIEWS: u32 = 8;
 
-/// Steps from one look at the coming views to the next, and how many views are looked at.
+/// Steps between two updates of the pager's plan, and the least and most views that a plan covers.
 const LOOK_AHEAD_EVERY: u32 = 8;
 const LOOK_AHEAD_LEAST: u32 = 64;
 const LOOK_AHEAD_MOST: u32 = 8192;
 
-/// A run. In memory is the same code with as many frames as there are pages.
+/// The state of a run. A run in memory uses the same code with one frame per page.
 pub struct Trainer {
-    /// The rows, in pages, with the optimizer and the events.
+    /// The pages, the optimizer and the event log.
     pub scene: PagedScene,
     /// The renderer.
     pub renderer: Box<dyn Renderer>,
@@ -56,11 +55,11 @@ pub struct Trainer {
     pub(super) steps_skipped: u32,
     pub(super) steps_skipped_in_a_row: u32,
     pub(super) train_seconds: f64,
-    /// The last evaluation on the held-out views.
+    /// Result of the last evaluation on the held-out views.
     pub(super) last_test: Option<LastTest>,
-    /// A step failed after it had changed rows: there is nothing to commit.
+    /// A step failed after it had changed rows, so the state must not be committed.
     pub(super) is_torn: bool,
-    /// What the frames share with all else, where their number follows from it.
+    /// Memory budget from which the number of frames follows; `None` without a budget.
     pub(super) budget: Option<HostBudget>,
     /// The most pages of a batch of a step.
     pub(super) pages_most: usize,
@@ -74,7 +73,8 @@ fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
 }
 
 impl Trainer {
-    /// A trainer of first Gaussians `columns` on the training views of `dataset` (at least one), all pages in memory.
+    /// A trainer for the first Gaussians `columns` and the training views of `dataset` (at least one), with all pages in
+    /// memory.
     ///
     /// # Errors
     /// As [`Trainer::with_pager`].
@@ -88,7 +88,7 @@ impl Trainer {
         Trainer::with_pager(columns, pager, dataset, renderer, options)
     }
 
-    /// A trainer whose pages are where `pager` (without pages yet) puts them.
+    /// A trainer whose pages are stored in `pager`, which must be empty.
     ///
     /// # Errors
     /// A page could not be stored.
@@ -103,7 +103,7 @@ impl Trainer {
         Ok(Trainer::of_scene(scene, dataset, renderer, options))
     }
 
-    /// A trainer of pages that were made with the same options.
+    /// A trainer for a scene that was created with the same options.
     pub fn of_scene(scene: PagedScene, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Trainer {
         let train_views = dataset.train_views();
         Trainer {
@@ -126,8 +126,8 @@ impl Trainer {
         }
     }
 
-    /// Renders views of the dataset, forward and backward, so that the memory of a view is allocated; changes no state.
-    /// Returns the most pixels of a view.
+    /// Renders views forward and backward so that the memory of a view is allocated; the scene stays unchanged. Returns
+    /// the pixels of the largest view.
     ///
     /// # Errors
     /// A view cannot be rendered.
@@ -147,22 +147,22 @@ impl Trainer {
         Ok(pixels)
     }
 
-    /// Trains in this order of views from the first step on; for orders that are settled after the pages are known.
+    /// Sets the view order before the first step, for orders that depend on the pages.
     pub fn set_view_order(&mut self, order: Order, dataset: &Dataset) {
         self.order = view_order(order, self.options.seed, dataset);
     }
 
-    /// The order of views.
+    /// The view order.
     pub fn view_order(&self) -> &ViewOrder {
         &self.order
     }
 
-    /// Bytes held for one view: its rows with their gradients, and what the renderer has.
+    /// Bytes held for one view: working set, renderer.
     pub fn view_bytes(&self) -> [u64; 2] {
         [self.working.bytes() as u64, self.renderer.host_bytes()]
     }
 
-    /// Degrees in use now and at the last step.
+    /// SH degree now and at the last step.
     pub fn sh_degrees(&self) -> (u8, u8) {
         (self.scene.rules.sh_degree(), self.options.sh_degree_at(self.options.steps.saturating_sub(1)))
     }
@@ -172,7 +172,7 @@ impl Trainer {
         self.step
     }
 
-    /// Index into the dataset's views of the view that the next step trains on.
+    /// Index in `dataset.views` of the next step's view.
     pub fn next_view(&mut self) -> usize {
         self.train_views[self.order.view_at(self.step)]
     }
@@ -182,30 +182,31 @@ impl Trainer {
         self.train_seconds
     }
 
-    /// Gaussians whose update was skipped, and steps that were, because something was not finite.
+    /// Row updates and steps skipped because a value was not finite.
     pub fn skipped(&self) -> (u64, u32) {
         (self.rows_skipped, self.steps_skipped)
     }
 
-    /// What moved between the tiers since the run began, over all its lives.
+    /// Traffic between the tiers since the run began, including the time before a resume.
     pub fn tier_traffic(&self) -> TierTraffic {
         TierTraffic::of(&self.scene.pager)
     }
 
-    /// Options of a rendering now: with the bands that are in use.
+    /// Render options with the current SH degree.
     pub fn render_options(&self) -> RenderOptions {
         RenderOptions { sh_degree: self.scene.rules.sh_degree(), ..self.options.render }
     }
 
-    /// The events so far.
+    /// The event log.
     pub fn events(&self) -> &EventLog {
         self.scene.events()
     }
 
-    /// Runs one step and the events that are due after it.
+    /// Runs one step and logs the events that follow it.
     ///
     /// # Errors
-    /// A photo cannot be decoded, the renderer failed, or the loss was not finite too often.
+    /// A photo cannot be decoded, pages could not be pinned, the renderer failed, or the loss was not finite
+    /// [`NON_FINITE_STEPS_MAX`] times in a row.
     pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
         let view = self.next_view();
         let mut ahead = Vec::new();
@@ -230,17 +231,17 @@ impl Trainer {
                 self.pages_most,
             );
             self.is_torn = matches!(stepped, Err(TrainError::Torn { .. }));
-            // A step without its frames changed nothing that doing it again does not.
+            // A step that lacked frames can be repeated: it only applied pending events.
             match stepped {
-                Err(TrainError::Paging(error)) if self.find_frames(&error) => {}
+                Err(TrainError::Paging(error)) if self.add_missing_frames(&error) => {}
                 stepped => break stepped,
             }
         };
-        let outcome = stepped.map_err(|error| error.of_view(&dataset.views[view].name))?;
+        let outcome = stepped.map_err(|error| error.with_view_name(&dataset.views[view].name))?;
         self.rows_of_view = self.rows_of_view.max(outcome.rows);
-        self.count(&outcome, &dataset.views[view].name)?;
+        self.count_skipped(&outcome, &dataset.views[view].name)?;
         if self.options.optimizer == Method::Dense {
-            // The step has changed rows: if this fails, what is there now belongs to no step.
+            // The step has changed rows; an error here leaves a state between two steps.
             self.is_torn = true;
             settle_all(&mut self.scene, self.step + 1)?;
             self.is_torn = false;
@@ -251,12 +252,12 @@ impl Trainer {
         Ok(outcome)
     }
 
-    /// Tells the pager which views come next, now and then: it plans by pages, which costs more than a step should.
+    /// Updates the pager's plan every [`LOOK_AHEAD_EVERY`] steps; doing it at every step would cost too much.
     fn look_ahead(&mut self, dataset: &Dataset) {
         if self.is_in_memory() || !self.step.is_multiple_of(LOOK_AHEAD_EVERY) {
             return;
         }
-        // Every page of the scene is needed within the next two epochs, if it ever is.
+        // Two epochs contain a use of every page that any view needs.
         let count = (2 * self.train_views.len() as u32).clamp(LOOK_AHEAD_LEAST, LOOK_AHEAD_MOST);
         let mut coming = Vec::new();
         self.order.upcoming(self.step, count.min(self.options.steps - self.step), &mut coming);
@@ -265,7 +266,7 @@ impl Trainer {
         self.scene.pager.look_ahead(self.step, &cameras);
     }
 
-    fn count(&mut self, outcome: &StepOutcome, view: &str) -> Result<(), TrainError> {
+    fn count_skipped(&mut self, outcome: &StepOutcome, view: &str) -> Result<(), TrainError> {
         self.rows_skipped += outcome.rows_skipped;
         if !outcome.skipped {
             self.steps_skipped_in_a_row = 0;
@@ -280,11 +281,11 @@ impl Trainer {
             step: self.step,
             view: view.to_string(),
             count: self.steps_skipped_in_a_row,
-            remedy: "lower the learning rates; if the defaults were used, report this as a bug with the scene",
+            remedy: "lower the learning rates; with the default rates, report this as a bug and attach the scene",
         })
     }
 
-    /// Events fire after the update of their step, on values that contain it; here they are decided and logged.
+    /// Decides and logs the events of this step. They act on values after the step's update.
     fn log_events(&mut self) {
         let (step, scale) = (self.step, self.options.scene_scale);
         let rows = self.scene.rows_bound();
@@ -296,7 +297,7 @@ impl Trainer {
         }
     }
 
-    /// Evaluates on the held-out views as of now.
+    /// Evaluates the held-out views at the current step.
     ///
     /// # Errors
     /// As [`evaluate`].
@@ -322,10 +323,10 @@ impl Trainer {
         Ok(test)
     }
 
-    /// Writes the rows as of now as a PLY; returns what was written, in which coordinates.
+    /// Writes the rows at the current step as a PLY; returns what was written and in which coordinates.
     ///
     /// # Errors
-    /// The folder cannot be written, or pages could not be had.
+    /// The folder cannot be written, or pages could not be pinned.
     pub fn save(&mut self, dataset: &Dataset, path: &Path) -> Result<ply::PlyWritten, TrainError> {
         let meta = PlyMeta {
             step: Some(u64::from(self.step)),
@@ -341,7 +342,7 @@ impl Trainer {
         Ok(writer.finish()?)
     }
 
-    /// The path of the final PLY in an output folder.
+    /// Path of the final PLY in an output folder.
     pub fn ply_path(out: &Path) -> PathBuf {
         out.join("point_cloud.ply")
     }

@@ -1,7 +1,7 @@
-//! The loop over steps: evaluation, saves, metrics, progress and commits where they are due, until the last step or a stop.
+//! The loop over steps, with evaluation, saves, metrics, progress and commits between them.
 //!
-//! Invariants: 1. when the loop logs, evaluates, saves or commits changes no bit of the run; 2. a step that fails for want of
-//! space or frames is done again once there is some, or the run ends with its last good step committed.
+//! Invariants: 1. logging, evaluation, saves and commits change no bit of the result; 2. a step that lacks drive space or
+//! frames is repeated once they are available, or the run ends with its last good step committed.
 
 use super::checkpoint::Checkpoint;
 use super::error::TrainError;
@@ -16,22 +16,22 @@ use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use std::path::Path;
 
-/// Where a loop writes, and how it is watched.
+/// Outputs and controls of a loop.
 pub struct LoopOutputs<'a> {
     /// Output folder.
     pub out: &'a Path,
-    /// metrics.jsonl.
+    /// Writer of metrics.jsonl.
     pub metrics: &'a mut MetricsLog,
-    /// Bar or lines.
+    /// Progress bar or lines.
     pub progress: &'a mut Progress,
-    /// Ctrl-C.
+    /// Stop request (Ctrl-C).
     pub stop: &'a StopFlag,
-    /// Where the run is committed to, if anywhere.
+    /// The run's checkpoint, if it has one.
     pub checkpoint: Option<&'a mut Checkpoint>,
 }
 
 impl Trainer {
-    /// Runs to the last step or until asked to stop.
+    /// Runs until the last step or a stop request.
     ///
     /// # Errors
     /// As [`Trainer::step`], or an output cannot be written.
@@ -42,7 +42,7 @@ impl Trainer {
         outputs: &mut LoopOutputs<'_>,
     ) -> Result<(), TrainError> {
         while self.step < self.options.steps && outputs.stop.exit_code().is_none() {
-            self.move_out_if_outgrown(outputs)?;
+            self.start_paging_if_outgrown(outputs)?;
             let step = self.step;
             let before = self.renderer.traffic();
             let Some(outcome) = self.step_with_space(dataset, targets, outputs)? else { break };
@@ -96,7 +96,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// A step; where its drive is full, another try once there is space. `None`: asked to stop while waiting for it.
+    /// Runs a step and repeats it after waiting for space if the drive is full. `None` if a stop was requested meanwhile.
     fn step_with_space(
         &mut self,
         dataset: &Dataset,
@@ -107,7 +107,7 @@ impl Trainer {
             match self.step(dataset, targets) {
                 Ok(outcome) => return Ok(Some(outcome)),
                 Err(error) if error.is_out_of_space() => self.make_space(outputs, error)?,
-                Err(error) => return Err(self.keep_outgrown(error, dataset, outputs)),
+                Err(error) => return Err(self.commit_outgrown(error, dataset, outputs)),
             }
             if outputs.stop.exit_code().is_some() {
                 return Ok(None);
@@ -115,20 +115,20 @@ impl Trainer {
         }
     }
 
-    /// Stops where rows have statistics that the run never counted: growth would go by numbers that are not so.
+    /// Fails if pages hold gradient statistics that the histogram lacks: densification would use wrong numbers.
     fn check_statistics(&self, outputs: &LoopOutputs<'_>) -> InputResult<()> {
         let rows = self.scene.histogram.uncounted();
         if rows == 0 {
             return Ok(());
         }
         let store = outputs.checkpoint.as_deref().map_or(outputs.out, Checkpoint::folder);
-        let problem = format!("the pages have statistics of {rows} rows that the state of the run has not counted");
-        let remedy = "nothing was committed since: make a store that agrees with itself with gsscale-ckpt salvage, and go on \
-                      with gsscale-train --resume and --spill-dir";
+        let problem = format!("the pages hold statistics of {rows} rows that the run's histogram lacks");
+        let remedy = "the last commit is intact: make a consistent store with gsscale-ckpt salvage, then continue with \
+                      gsscale-train --resume and --spill-dir";
         Err(InputError::new(store, problem, remedy).at(format!("step {}", self.step)))
     }
 
-    /// Space after `error`, by the checkpoint where there is one.
+    /// Frees or awaits drive space after `error`; without a checkpoint, returns the error.
     fn make_space(&mut self, outputs: &mut LoopOutputs<'_>, error: TrainError) -> Result<(), TrainError> {
         match outputs.checkpoint.as_deref_mut() {
             Some(checkpoint) => checkpoint.make_space(self, outputs.metrics, outputs.stop, error),
@@ -136,8 +136,8 @@ impl Trainer {
         }
     }
 
-    /// The commit after the last step. Without space for it a run that is done needs none, and one that was asked to stop
-    /// stops.
+    /// Commits after the last step. A lack of space is only a warning: a finished run has its results, and a stopped run
+    /// keeps its previous commit.
     fn commit_last(&mut self, outputs: &mut LoopOutputs<'_>) -> Result<(), TrainError> {
         let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else { return Ok(()) };
         match self.step < self.options.steps || checkpoint.wants_last() {
@@ -146,7 +146,7 @@ impl Trainer {
         }
     }
 
-    /// As [`Trainer::save`], of a file that the run does not need: on a full drive it is left out, and said.
+    /// As [`Trainer::save`], but a full drive is only a warning, because the run does not need the file.
     fn save_if_space(&mut self, dataset: &Dataset, path: &Path) -> Result<(), TrainError> {
         match self.save(dataset, path) {
             Err(error) if error.is_out_of_space() => {

@@ -1,7 +1,7 @@
-//! What a step changes on its pinned pages: rows, statistics, bounds.
+//! Updates the pinned pages of a step: rows, statistics, bounds.
 //!
-//! Invariants: 1. rows are changed in place, page by page, in parallel; the result does not depend on the number of
-//! threads; 2. a page of which nothing was changed stays clean; 3. the bounds of every page that was changed are renewed.
+//! Invariants: 1. rows are updated in place, pages in parallel, with the same result for any number of threads; 2. an
+//! unchanged page stays clean; 3. every changed page gets new bounds.
 
 use super::pages::PagedScene;
 use crate::densify::strategy::DrawnRows;
@@ -12,13 +12,13 @@ use crate::scene::columns::Columns;
 use crate::scene::rows::ColumnsRef;
 use rayon::prelude::*;
 
-/// What a step hands to the update.
+/// Input of the update.
 pub(super) struct StepGradients<'a> {
     /// 0-based step.
     pub step: u32,
-    /// Rows of the pinned pages, numbered through, ascending.
+    /// Row numbers in the pinned pages, consecutive across pages, ascending.
     pub rows: &'a [u32],
-    /// The listed rows as they were gathered at this step.
+    /// Values of the listed rows, as gathered at this step.
     pub columns: &'a Columns,
     /// One entry per listed row.
     pub gradients: &'a Gradients,
@@ -26,11 +26,11 @@ pub(super) struct StepGradients<'a> {
     pub size: [u32; 2],
 }
 
-/// The part of a step that belongs to one page.
+/// The part of a step's rows that lies in one page.
 struct PageShare<'a> {
     page: &'a mut PinnedPage,
     first_row: usize,
-    /// Where its rows lie in the list.
+    /// Positions of the page's rows in [`StepGradients::rows`].
     listed: std::ops::Range<usize>,
     rows: &'a [u32],
     values: ColumnsRef<'a>,
@@ -38,15 +38,15 @@ struct PageShare<'a> {
     touched: bool,
 }
 
-/// Optimizer step, statistics (when they are collected) and bounds of the pages that had a gradient.
+/// Runs the optimizer step, collects statistics if `collects`, and renews the bounds of changed pages.
 pub(super) fn update_pages(
     scene: &mut PagedScene,
     pages: &mut [PinnedPage],
-    of_step: &StepGradients<'_>,
+    input: &StepGradients<'_>,
     collects: bool,
 ) -> StepCounts {
-    let at = scene.rules.adam.at(of_step.step);
-    let mut shares = shares(pages, of_step);
+    let at = scene.rules.adam.at(input.step);
+    let mut shares = shares(pages, input);
     let counts: Vec<StepCounts> = shares
         .par_iter_mut()
         .map(|share| {
@@ -56,14 +56,14 @@ pub(super) fn update_pages(
         })
         .collect();
     if collects {
-        let Gradients { means2d, radii, .. } = of_step.gradients;
+        let Gradients { means2d, radii, .. } = input.gradients;
         let strategy = &scene.rules.strategy;
         for share in &mut shares {
             let drawn = DrawnRows {
                 rows: share.rows,
                 v_means2d: &means2d[share.listed.clone()],
                 radii: &radii[share.listed.clone()],
-                image_size: of_step.size,
+                image_size: input.size,
             };
             let mut view = share.page.rows_mut(share.first_row);
             share.touched |= strategy.collect(&mut view, &drawn, &mut scene.histogram) > 0;
@@ -80,9 +80,9 @@ pub(super) fn update_pages(
     })
 }
 
-/// Cuts listed rows, their values and gradients at the borders of the pages.
-fn shares<'a>(pages: &'a mut [PinnedPage], of_step: &StepGradients<'a>) -> Vec<PageShare<'a>> {
-    let (mut rest, mut values, mut grads) = (of_step.rows, of_step.columns.view(), of_step.gradients.columns.view());
+/// Splits the listed rows, their values and their gradients by page.
+fn shares<'a>(pages: &'a mut [PinnedPage], input: &StepGradients<'a>) -> Vec<PageShare<'a>> {
+    let (mut rest, mut values, mut grads) = (input.rows, input.columns.view(), input.gradients.columns.view());
     let (mut first_row, mut first_listed) = (0, 0);
     let mut shares = Vec::with_capacity(pages.len());
     for page in pages {

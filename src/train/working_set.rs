@@ -1,14 +1,14 @@
-//! The rows that a view needs, on their way through a step.
+//! The working set: the rows of one view and their gradients during a step.
 
 use crate::render::Gradients;
 use crate::scene::columns::Columns;
 
-/// The rows that a view needs, evaluated at its step, and their gradients; kept between steps for its allocations.
+/// The rows of a view, evaluated at one step, and their gradients. Steps reuse one working set and its allocations.
 #[derive(Default)]
 pub struct WorkingSet {
-    /// Row of the pinned pages, numbered through, for each row of the working set, ascending.
+    /// For each row of the working set, its row number in the pinned pages (consecutive across pages); ascending.
     pub row_from_working: Vec<u32>,
-    /// Values now; the renderer reads them, and the update goes on from them.
+    /// Values at this step; input of the renderer and of the update.
     pub columns: Columns,
     /// Gradients of the step.
     pub gradients: Gradients,
