@@ -339,6 +339,10 @@ impl Renderer for Watched {
         self.inner.host_bytes()
     }
 
+    fn set_list_bytes(&mut self, bytes: Option<u64>) {
+        self.inner.set_list_bytes(bytes);
+    }
+
     fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError> {
         let before = self.begin.map_or(0.0, |t| t.elapsed().as_secs_f64());
         self.add("acquire+cull+gather", before);

@@ -29,6 +29,9 @@ use crate::scene::image::{Image, Target};
 use std::sync::atomic::AtomicU64;
 use std::time::Instant;
 
+/// Bytes of one intersection: its entry in a list, and its sums in the backward pass.
+const LIST_BYTES: u64 = (size_of::<AtomicU64>() + size_of::<Partial>()) as u64;
+
 /// Counters of the last view.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RenderStats {
@@ -103,12 +106,6 @@ impl CpuRenderer {
     /// A renderer that holds no memory yet.
     pub fn new() -> Self {
         CpuRenderer::default()
-    }
-
-    /// Limits the lists of the next views to this many intersections; `None` stands for no limit. A picture with more is blended
-    /// in ranges of tiles. A range has at least one tile, however long its list is.
-    pub fn set_isects_most(&mut self, isects_most: Option<u64>) {
-        self.isects_most = isects_most;
     }
 
     /// Ranges of tiles of the last picture.
@@ -237,6 +234,10 @@ impl Renderer for CpuRenderer {
 
     fn host_bytes(&self) -> u64 {
         self.scratch_bytes()
+    }
+
+    fn set_list_bytes(&mut self, bytes: Option<u64>) {
+        self.isects_most = bytes.map(|bytes| bytes / LIST_BYTES);
     }
 
     fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError> {
@@ -489,13 +490,13 @@ mod tests {
         assert_eq!(renderer.ranges().len(), 1);
         // A few ranges, some fifty with parts of columns, and one for each of the 8 x 5 tiles.
         for (most, least_ranges) in [(isects / 3, 3), (isects / 30, 30), (0, 40)] {
-            renderer.set_isects_most(Some(most));
+            renderer.set_list_bytes(Some(most * LIST_BYTES));
             assert!(one == bits_of_batches(&mut renderer, &rows, &camera, &[9_001, 20_000]), "lists of {most}");
             assert!(renderer.ranges().len() >= least_ranges, "{} ranges of {most}", renderer.ranges().len());
             let many = one == bits_of_batches(&mut renderer, &rows, &camera, &[20_000]);
             assert!(many, "lists of {most}, the same memory again");
         }
-        renderer.set_isects_most(None);
+        renderer.set_list_bytes(None);
         assert!(one == bits_of_batches(&mut renderer, &rows, &camera, &[20_000]));
     }
 

@@ -554,6 +554,10 @@ impl Renderer for GpuRenderer {
             + device
     }
 
+    fn set_list_bytes(&mut self, _bytes: Option<u64>) {
+        // The lists of a device lie in its own memory, which `--device-mem` bounds.
+    }
+
     fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError> {
         // Frees the memory of the last view before this view allocates.
         self.drop_view();

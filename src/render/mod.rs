@@ -200,6 +200,11 @@ pub trait Renderer: Send {
     /// Host memory that the renderer holds, bytes.
     fn host_bytes(&self) -> u64;
 
+    /// Limits the memory for intersection lists and per-intersection sums of the next views, bytes; `None` stands for no limit.
+    /// A picture whose lists need more is blended in ranges of tiles, at least one tile at a time. The limit changes no bit of
+    /// the result.
+    fn set_list_bytes(&mut self, bytes: Option<u64>);
+
     /// Begins a view. Drops the previous view.
     ///
     /// # Errors

@@ -9,7 +9,7 @@
 //! up to the available memory of the machine; 4. no bit of the result depends on the budget.
 
 use super::memory::{INDEX_BYTES, MemoryEstimate, bytes_of_copies, frames_in_memory, obtainable_bytes};
-use super::pages::PagedScene;
+use super::pages::{PAGES_PER_BATCH, PagedScene};
 use super::staging::{PLAN_BYTES, PLAN_BYTES_LEAST, with_staging};
 use crate::page::format::slot_header::HEADER_BYTES;
 
@@ -17,7 +17,7 @@ use crate::page::format::slot_header::HEADER_BYTES;
 const UNEVEN: f64 = 2.0;
 
 /// Fewest frames of a run: write back needs some.
-const FRAMES_LEAST: usize = 2;
+pub(super) const FRAMES_LEAST: usize = 2;
 /// An extension of frames or memory adds 1/8 on top, so that the next steps of a growing scene need no extension.
 pub(super) const SPARE_SHARE: usize = 8;
 /// Vectors grow by an eighth for a view that is slightly larger than earlier views.
@@ -116,6 +116,22 @@ impl HostBudget {
         self.frames_left(scene, view.at_last, growth_due(scene)).max(with_splits).max(bare).max(FRAMES_LEAST)
     }
 
+    /// How a step walks a view that does not fit in one batch: the frames, and the most pages of a batch. The renderer holds
+    /// `rendering` bytes, and the working set `working_row` bytes for each row of a batch. A batch takes as many frames again for the
+    /// next batch and for pages that split, its share of the working set, and copies of its pages in a densification round.
+    pub(super) fn batches(&self, scene: &PagedScene, rendering: u64, working_row: usize) -> (usize, usize) {
+        let taken = self.bytes_beside_frames(scene, rendering, growth_due(scene)) - self.copies(scene) + self.staging;
+        let left = self.bytes.saturating_sub(taken);
+        let frame = scene.pager.frame_bytes() as u64;
+        let working = (scene.rules.page_rows() * working_row) as u64;
+        cut(left, frame, working, self.copies_pages)
+    }
+
+    fn copies(&self, scene: &PagedScene) -> u64 {
+        let pages = scene.pager.index().len();
+        if self.copies_pages { bytes_of_copies(pages, scene.pager.frame_bytes()) } else { 0 }
+    }
+
     /// Frames that fit beside the run's current memory, without growth.
     pub(super) fn frames_at_most(&self, scene: &PagedScene, view: ViewMemory) -> usize {
         self.frames_left(scene, view.now, 1.0)
@@ -176,9 +192,20 @@ impl HostBudget {
         let of_rows = view.saturating_sub(self.view_pixels) as f64 * growth;
         let pages = scene.pager.index().len();
         let index = pages as f64 * growth * INDEX_BYTES as f64;
-        let copies = if self.copies_pages { bytes_of_copies(pages, scene.pager.frame_bytes()) } else { 0 };
-        self.constant + copies + self.view_pixels + (of_rows + index) as u64
+        self.constant + self.copies(scene) + self.view_pixels + (of_rows + index) as u64
     }
+}
+
+/// Frames and pages of a batch within `left` bytes: twice the frames of a batch, and for each page of a batch `working` bytes of
+/// the working set and, if densification `copies` pages, a copy. At least one page and [`FRAMES_LEAST`] frames, though they may not fit.
+pub(super) fn cut(left: u64, frame: u64, working: u64, copies: bool) -> (usize, usize) {
+    let copied = if copies { PAGES_PER_BATCH as u64 } else { 0 };
+    let few = left / (2 * frame + working + if copies { frame } else { 0 });
+    let many = left.saturating_sub(copied * frame) / (2 * frame + working);
+    let pages = if few > copied { many } else { few }.max(1);
+    let beside = pages * working + pages.min(copied) * frame;
+    let frames = (left.saturating_sub(beside) / frame).max(2 * pages).max(FRAMES_LEAST as u64);
+    (frames as usize, pages as usize)
 }
 
 /// Largest growth factor of a view's rows since they were last counted.

@@ -3,6 +3,7 @@
 use super::budget::{HostBudget, SPARE_SHARE, ViewMemory};
 use super::staging::PLAN_BYTES_LEAST;
 use super::trainer::Trainer;
+use super::working_set::WorkingSet;
 use crate::base::units::format_bytes;
 use crate::paging::error::PagingError;
 use crate::scene::camera::Camera;
@@ -26,13 +27,32 @@ impl Trainer {
         ViewMemory { now, at_last }
     }
 
-    /// Adjusts the number of frames to the grown scene, in both directions, before a step with this camera.
+    /// Memory of a view whose pages hold `rows` rows, in one batch.
+    fn view_memory_of(&self, rows: u64) -> ViewMemory {
+        let (held, [_, rendering]) = (self.view_memory(), self.view_bytes());
+        let visible = (rows as f64 * self.visible_share) as u64;
+        let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degrees().1]
+            .map(|degree| visible * WorkingSet::row_bytes(degree) as u64 + rendering);
+        ViewMemory { now: held.now.max(now), at_last: held.at_last.max(at_last) }
+    }
+
+    /// Adjusts the number of frames to the grown scene, in both directions, before a step with this camera. A view that does not
+    /// fit in one batch is cut into batches that do.
     pub(super) fn fit_frames(&mut self, camera: &Camera) {
         let Some(budget) = self.budget.filter(|_| !self.is_in_memory()) else { return };
-        let needed = self.scene.pager.pages_of_view(camera).len();
-        let mut frames = budget.frames(&self.scene, self.view_memory(), needed);
+        let pages = self.scene.pager.pages_of_view(camera);
+        let index = self.scene.pager.index();
+        let rows = pages.iter().map(|page| u64::from(index[page.index()].rows)).sum();
+        let needed = pages.len();
+        let view = self.view_memory_of(rows);
+        let mut frames = budget.frames(&self.scene, view, needed);
+        self.pages_most = usize::MAX;
         if frames < needed && self.raise_for_frames(budget, needed) {
             frames = needed;
+        } else if frames < needed {
+            let row_bytes = WorkingSet::row_bytes(self.sh_degrees().1);
+            (frames, self.pages_most) = budget.batches(&self.scene, self.view_bytes()[1], row_bytes);
+            self.working.shrink_to(self.pages_most.saturating_mul(self.options.page_rows));
         }
         let pager = &mut self.scene.pager;
         let now = pager.frames_max();

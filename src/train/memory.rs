@@ -19,6 +19,9 @@ const GROWN_SPARE: f64 = 1.25;
 /// Program, libraries and thread stacks, measured on an empty run: 16 MiB with the tables of a short one.
 pub(super) const BASE_BYTES: u64 = 12 << 20;
 
+/// The least memory for the intersection lists of a view, bytes.
+const LIST_BYTES_LEAST: u64 = 16 << 20;
+
 /// Share of the available memory that a run without --host-mem takes, percent.
 const BUDGET_PERCENT: u64 = 70;
 /// Share of the available memory up to which a run without --host-mem may rise, percent: estimates err by up to a tenth.
@@ -35,6 +38,8 @@ pub struct MemoryEstimate {
     pub view: u64,
     /// The part of `view` that depends on pixels alone.
     pub view_pixels: u64,
+    /// Part of `view` for the rows and gradients of the largest view, in one batch: the part that batches make smaller.
+    pub working: u64,
     /// Decoded photos.
     pub targets: u64,
     /// Index of all pages, in memory or not.
@@ -82,6 +87,12 @@ pub fn rows_at_most(config: &TrainConfig, rows: u64) -> u64 {
 pub(super) fn largest_decode(dataset: &Dataset) -> (u64, Option<&View>) {
     let largest = dataset.views.iter().max_by_key(|view| view.photo.decode_bytes());
     (largest.map_or(0, |view| view.photo.decode_bytes()), largest)
+}
+
+/// Memory for the intersection lists of a view in a run that may take `host_mem` bytes: the lists of a few views of drone photos
+/// fit into an eighth, and longer lists are made in parts.
+pub(super) fn list_bytes(host_mem: u64) -> u64 {
+    (host_mem / 8).max(LIST_BYTES_LEAST)
 }
 
 /// Refuses photos that cannot be decoded within `host_mem`, judging by their headers

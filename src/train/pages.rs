@@ -402,7 +402,8 @@ impl PagedScene {
 
     /// Pins the pages in batches and passes their rows to `each`, with pending events applied to copies.
     pub(super) fn visit<E: From<PagingError>>(&mut self, pages: &[PageNo], each: &mut Visitor<'_, E>) -> Result<(), E> {
-        let batch = PAGES_PER_BATCH.min(self.pager.frames_max()).max(1);
+        // The copies of a batch take as much memory as its frames.
+        let batch = PAGES_PER_BATCH.min(self.pager.frames_max() / 2).max(1);
         for pages in pages.chunks(batch) {
             let pinned = self.pager.acquire_pages(pages)?;
             let rules = &self.rules;

@@ -2,7 +2,7 @@
 //!
 //! Invariant: a run that cannot fit is refused here, with numbers and alternatives. Growth that may not fit is a warning.
 
-use super::budget::HostBudget;
+use super::budget::{FRAMES_LEAST, HostBudget, cut};
 use super::error::TrainError;
 use super::memory::{MemoryEstimate, obtainable_bytes, rows_at_most};
 use super::places::drive_of;
@@ -11,12 +11,14 @@ use super::staging::{PLAN_BYTES, staging_bytes, with_staging};
 use super::start::Start;
 use super::tiers::{Tiers, budget_in_memory, first_staging_bytes};
 use super::trainer::Trainer;
+use super::working_set::WorkingSet;
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::page::folder::file_system::free_bytes;
 use crate::paging::pager::PagerConfig;
+use crate::paging::plan::batches::pages_per_batch;
 use crate::paging::simulation::auto::automatic_order;
 use crate::paging::simulation::replay::{ReplayOptions, replay};
 use crate::scene::camera::Camera;
@@ -51,6 +53,8 @@ pub struct TierPlan {
     frames_are_named: bool,
     /// The view that needs most pages.
     pub(super) largest_view: LargestView,
+    /// Training views that need several batches, and the most batches of one of them.
+    cut_views: (usize, usize),
     /// Bytes that the run is expected to write to the drive, without commits.
     pub bytes_written: f64,
     /// Free bytes of the drive; `None` without a drive or if the system does not report them.
@@ -85,6 +89,7 @@ pub fn settle(
         bytes_written: 0.0,
         free_bytes: tiers.free_bytes()?,
         largest_view,
+        cut_views: (0, 1),
     };
     if trainer.scene.pager.frames_max() == usize::MAX {
         let asked = host_mem;
@@ -102,7 +107,8 @@ pub fn settle(
     let staging = staging_bytes(trainer.scene.pager.prefetch_bytes(), tiers.codec);
     memory.iter_mut().for_each(|m| m.staging = staging);
     let asked = host_mem;
-    let (frames, host_mem) = first_frames(config, &plan, asked, &memory[0])?;
+    let (FirstFrames { frames, pages_most }, host_mem) = first_frames(config, &plan, asked, &memory[0])?;
+    trainer.pages_most = pages_most;
     trainer.scene.pager.allow_frames(frames as usize);
     trainer.scene.pager.limit_frames(frames as usize);
     if let Some(budget) = host_mem.filter(|_| config.frames == 0) {
@@ -110,7 +116,15 @@ pub fn settle(
         trainer.set_budget(if host_mem == asked { first } else { first.raised_at_start() });
     }
     plan.frames = Some(frames);
-    memory.iter_mut().for_each(|m| m.frames = m.frames.min(frames * frame_bytes));
+    plan.cut_views = cut_views(dataset, trainer.scene.pager.index(), frames, pages_most);
+    for memory in &mut *memory {
+        memory.frames = memory.frames.min(frames * frame_bytes);
+        if pages_most < usize::MAX {
+            let of_batch = (pages_most as u64).saturating_mul(page_working(config)).min(memory.working);
+            memory.view -= memory.working - of_batch;
+            memory.copies = memory.copies.min(pages_most as u64 * frame_bytes);
+        }
+    }
     if config.view_order.0.is_none() {
         trainer.set_view_order(auto_order(config, dataset, trainer, frames, &plan)?, dataset);
     }
@@ -149,36 +163,35 @@ pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Op
 }
 
 /// Allows the frames that the largest training view of `dataset` needs, so that views can be measured; [`settle`]
-/// allows the rest afterwards. Returns the index of that view. Runs in memory or with --frames are left unchanged.
-///
-/// # Errors
-/// The budget does not hold the pages of that view.
+/// allows the rest afterwards. Where the budget may not hold them beside the rows of the view, the view is measured in batches.
+/// Returns the index of that view. Runs in memory or with --frames are left unchanged.
 pub fn allow_largest_view(
     config: &TrainConfig,
     dataset: &Dataset,
     trainer: &mut Trainer,
     host_mem: Option<u64>,
-) -> InputResult<Option<usize>> {
-    let LargestView { view: number, name: view, pages: needed, .. } =
-        largest_view(dataset, trainer.scene.pager.index());
+) -> Option<usize> {
+    let LargestView { view, pages: needed, .. } = largest_view(dataset, trainer.scene.pager.index());
     if config.frames > 0 || trainer.scene.pager.frames_max() == usize::MAX {
-        return Ok(number);
+        return view;
     }
-    let bytes = needed * trainer.scene.pager.frame_bytes() as u64;
+    let frame_bytes = trainer.scene.pager.frame_bytes() as u64;
     // A default budget may rise once the memory of a view is known.
     let most = if config.host_mem.0 == 0 { host_mem.and(obtainable_bytes()).max(host_mem) } else { host_mem };
-    if let Some(budget) = most.filter(|budget| bytes > *budget) {
-        let problem = format!(
-            "{} are too little: the view {view} needs {needed} pages of {} at once, which is {}",
-            format_bytes(budget),
-            format_bytes(trainer.scene.pager.frame_bytes() as u64),
-            format_bytes(bytes)
-        );
-        let remedy = "give memory for these pages, one view, photos and tables, or lower --page-rows or --sh-degree";
-        return Err(InputError::new("--host-mem", problem, remedy));
+    let mut frames = needed;
+    if let Some(budget) = most.filter(|budget| needed * (frame_bytes + page_working(config)) > *budget) {
+        let (fewer, pages) = cut(budget / 2, frame_bytes, page_working(config), true);
+        if (fewer as u64) < needed {
+            (frames, trainer.pages_most) = (fewer as u64, pages);
+        }
     }
-    trainer.scene.pager.allow_frames(needed as usize);
-    Ok(number)
+    trainer.scene.pager.allow_frames(frames as usize);
+    view
+}
+
+/// Bytes of the working set for the rows of one full page.
+fn page_working(config: &TrainConfig) -> u64 {
+    u64::from(config.page_rows) * WorkingSet::row_bytes(config.sh_degree) as u64
 }
 
 /// Resolves `--view-order auto`. For a scene that grows, the current pages stand for the grown scene, with the number of
@@ -194,7 +207,9 @@ fn auto_order(
     let cameras = train_cameras(dataset);
     let views = ViewPages::new(trainer.scene.pager.index(), &cameras);
     let frames = if frames >= most { now } else { frames * now / most };
-    let frames = (frames as usize).max(views.most());
+    // A run whose views fit now is planned as one whose views fit.
+    let least = if plan.frames.is_some_and(|frames| frames as usize >= views.most()) { views.most() } else { 1 };
+    let frames = (frames as usize).max(least);
     automatic_order(&views, &cameras, now as usize, frames, config.seed, PLAN_BYTES as u64)
         .map_err(|e| InputError::new("--view-order", e.to_string(), "name one: shuffle, groups:N or tour"))
 }
@@ -226,11 +241,12 @@ pub(super) fn frames_within(
         bytes_written: 0.0,
         free_bytes: None,
         largest_view,
+        cut_views: (0, 1),
     };
-    Ok(frames_of_budget(&plan, Some(host_mem), &memory)?)
+    Ok(frames_of_budget(config, &plan, Some(host_mem), &memory)?.frames)
 }
 
-/// Warns if the scene may outgrow its memory: the pages of the largest view grow in proportion to the Gaussians, while
+/// Warns if views may outgrow the frames: the pages of the largest view grow in proportion to the Gaussians, while
 /// the frames shrink.
 fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, memory: &[MemoryEstimate; 2]) {
     let ([now, most], Some(frames)) = (plan.pages, plan.frames) else { return };
@@ -251,8 +267,9 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
         cap => format!("with --max-gaussians {cap} the view may need {then} pages with {left} frames"),
     };
     eprintln!(
-        "warning: the view {view} needs {needed} pages, there are {frames} frames, and {until}: the run may stop when \
-         the scene has grown about {times:.1} times; --resume with more --frames or --host-mem then continues it"
+        "warning: the view {view} needs {needed} pages, there are {frames} frames, and {until}: when the scene has \
+         grown about {times:.1} times, steps on such views take several batches and read more; more --frames or --host-mem \
+         avoid it"
     );
 }
 
@@ -333,23 +350,38 @@ fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -
     Ok(())
 }
 
-/// Number of frames at the start, and the budget from which it follows.
+/// Frames at the start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct FirstFrames {
+    frames: u64,
+    /// The most pages of a batch of a view.
+    pages_most: usize,
+}
+
+impl FirstFrames {
+    /// Enough for every view in one batch.
+    fn of_whole_views(frames: u64) -> FirstFrames {
+        FirstFrames { frames, pages_most: usize::MAX }
+    }
+}
+
+/// Frames at the start, and the budget from which they follow.
 fn first_frames(
     config: &TrainConfig,
     plan: &TierPlan,
     host_mem: Option<u64>,
     memory: &MemoryEstimate,
-) -> InputResult<(u64, Option<u64>)> {
+) -> InputResult<(FirstFrames, Option<u64>)> {
     if config.frames > 0 {
-        check_view(plan, u64::from(config.frames))?;
-        return Ok((u64::from(config.frames), host_mem));
+        check_frames(u64::from(config.frames))?;
+        return Ok((FirstFrames::of_whole_views(u64::from(config.frames)), host_mem));
     }
     // By the estimate without growth: the cap may never be reached, and growth takes frames when it happens.
-    if let Ok(frames) = frames_of_budget(plan, host_mem, memory) {
+    if let Some(frames) = whole_views(plan, host_mem, memory) {
         return Ok((frames, host_mem));
     }
     let host_mem = raise_to_least(config, host_mem, least_memory(plan, memory, host_mem));
-    Ok((frames_of_budget(plan, host_mem, memory)?, host_mem))
+    Ok((frames_of_budget(config, plan, host_mem, memory)?, host_mem))
 }
 
 /// `host_mem`, raised to `least` with a warning if the user set no budget and the machine has the memory.
@@ -377,35 +409,67 @@ fn view_spare(memory: &MemoryEstimate) -> u64 {
     (memory.view - memory.view_pixels) / 8
 }
 
-fn frames_of_budget(plan: &TierPlan, host_mem: Option<u64>, memory: &MemoryEstimate) -> InputResult<u64> {
+/// Frames with which every view is one batch; `None` where the budget leaves too few.
+fn whole_views(plan: &TierPlan, host_mem: Option<u64>, memory: &MemoryEstimate) -> Option<FirstFrames> {
     // Without a budget, the system reports no available memory: set no limit.
-    let Some(budget) = host_mem else { return Ok(PAGES_MOST) };
+    let Some(budget) = host_mem else { return Some(FirstFrames::of_whole_views(PAGES_MOST)) };
     let frames = budget.saturating_sub(memory.fixed() + view_spare(memory)) / plan.frame_bytes;
-    let LargestView { pages: needed, name: view, .. } = &plan.largest_view;
-    if frames >= *needed {
-        return Ok(frames.min(PAGES_MOST));
-    }
-    let problem = format!(
-        "{} are too little: one view, photos, staging and tables take {}, which leaves {frames} pages of {}, but the \
-         view {view} needs {needed}",
-        format_bytes(budget),
-        format_bytes(memory.fixed()),
-        format_bytes(plan.frame_bytes)
-    );
-    let remedy = format!(
-        "give at least {}, or lower --image-cache, --prefetch-bytes, --page-rows, --sh-degree or the size of the photos",
-        format_bytes(least_memory(plan, memory, host_mem))
-    );
-    Err(InputError::new("--host-mem", problem, remedy))
+    (frames >= plan.largest_view.pages).then(|| FirstFrames::of_whole_views(frames.min(PAGES_MOST)))
 }
 
-fn check_view(plan: &TierPlan, frames: u64) -> InputResult<()> {
-    let LargestView { pages: needed, name: view, .. } = &plan.largest_view;
-    if frames >= *needed {
+/// Frames within the budget: for whole views, or for views in batches.
+fn frames_of_budget(
+    config: &TrainConfig,
+    plan: &TierPlan,
+    host_mem: Option<u64>,
+    memory: &MemoryEstimate,
+) -> InputResult<FirstFrames> {
+    let (whole, budget) = (whole_views(plan, host_mem, memory), host_mem.unwrap_or(u64::MAX));
+    if let Some(whole) = whole {
+        return Ok(whole);
+    }
+    let rendering = memory.view - memory.working;
+    let beside = memory.fixed() - memory.working - memory.copies + (rendering - memory.view_pixels.min(rendering)) / 8;
+    let of_a_page = 2 * plan.frame_bytes + page_working(config) + memory.copies.min(plan.frame_bytes);
+    let Some(left) = budget.checked_sub(beside).filter(|left| *left >= of_a_page) else {
+        let problem = format!(
+            "{} are too little: pixels and splats of one view, photos, staging and tables take {}, and the smallest batch of a              view {}",
+            format_bytes(budget),
+            format_bytes(beside),
+            format_bytes(of_a_page)
+        );
+        let floor = with_staging(beside - memory.staging + of_a_page, memory.staging, budget);
+        let remedy = format!(
+            "give at least {} ({} keeps each view in one batch), or lower --image-cache, --prefetch-bytes, --page-rows, \
+             --sh-degree or the size of the photos",
+            format_bytes(floor + floor / 50),
+            format_bytes(least_memory(plan, memory, host_mem))
+        );
+        return Err(InputError::new("--host-mem", problem, remedy));
+    };
+    let (frames, pages_most) = cut(left, plan.frame_bytes, page_working(config), memory.copies > 0);
+    Ok(FirstFrames { frames: (frames as u64).min(PAGES_MOST), pages_most })
+}
+
+/// The training views that need more than one batch, and the most batches of one of them.
+fn cut_views(dataset: &Dataset, index: &[PageMeta], frames: u64, pages_most: usize) -> (usize, usize) {
+    let (mut views, mut most, mut list) = (0, 1, Vec::new());
+    for view in dataset.train_views() {
+        visible_pages(index, &dataset.views[view].camera, &mut list);
+        let per_batch = pages_per_batch(list.len(), frames as usize).min(pages_most);
+        let batches = list.len().div_ceil(per_batch);
+        views += usize::from(batches > 1);
+        most = most.max(batches);
+    }
+    (views, most)
+}
+
+fn check_frames(frames: u64) -> InputResult<()> {
+    if frames >= FRAMES_LEAST as u64 {
         return Ok(());
     }
-    let problem = format!("{frames} are too few: the view {view} needs {needed} pages at once");
-    Err(InputError::new("--frames", problem, format!("give at least {needed}; views of a growing scene need more")))
+    let problem = format!("{frames} is too few: a step writes one page back while it reads another");
+    Err(InputError::new("--frames", problem, format!("give at least {FRAMES_LEAST}")))
 }
 
 /// Refuses a drive that cannot hold the `rows` first Gaussians, before the import. A drive that does not report its free
@@ -475,6 +539,11 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
         plan.pages[0],
         format_bytes(plan.frame_bytes)
     );
+    if let (views @ 1.., most) = plan.cut_views {
+        text.push_str(&format!(
+            "        {views} views are larger than the frames: steps on them take up to {most} batches\n"
+        ));
+    }
     let frames = match plan.frames {
         None => String::from("Gaussians with their optimizer state"),
         Some(frames) if !plan.frames_are_named && frames >= plan.pages[1] => {

@@ -5,6 +5,7 @@ use super::memory::{
     BASE_BYTES, INDEX_BYTES, MemoryEstimate, bytes_of_copies, frames_in_memory, largest_decode, rows_at_most,
 };
 use super::trainer::Trainer;
+use super::working_set::WorkingSet;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
@@ -51,14 +52,17 @@ pub fn estimate(
     probe: &Probe,
 ) -> Result<[MemoryEstimate; 2], TrainError> {
     let rows = probe.rows;
-    let pixels = trainer.probe_views(dataset, &probe.views)? as u64;
+    let (pixels, visible) = trainer.probe_views(dataset, &probe.views)?;
+    let pixels = pixels as u64;
     let [working, rendering] = trainer.view_bytes();
     // Image, coverage, gradient, and per-tile copies of them.
     let of_pixels = (pixels * 4 * (3 + 1 + 3 + 6)).min(rendering);
     // The part of the rows grows with the number of Gaussians and with the SH degree; the part of the pixels is constant.
     let (first, last) = trainer.sh_degrees();
     let wider = row_width(last) as f64 / row_width(first) as f64;
-    let of_rows = working as f64 * wider + (rendering - of_pixels) as f64;
+    // A view that was probed in batches had the working set of one of them.
+    let working = (working as f64 * wider).max((visible * WorkingSet::row_bytes(last)) as f64);
+    let of_rows = working + (rendering - of_pixels) as f64;
     let decoders = rayon::current_num_threads();
     // A photo that a step waits for is decoded even if it exceeds the cache.
     let keep_all = TargetCache::bytes_to_keep_all(&dataset.views, decoders);
@@ -76,6 +80,7 @@ pub fn estimate(
             staging: 0,
             view: of_pixels + (of_rows * growth) as u64,
             view_pixels: of_pixels,
+            working: (working * growth) as u64,
             targets,
             index: (pages * growth) as u64 * INDEX_BYTES,
             copies,

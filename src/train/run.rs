@@ -9,6 +9,7 @@ use super::costs::Meter;
 use super::error::TrainError;
 use super::facts::{Resolved, write_config};
 use super::machine;
+use super::memory::list_bytes;
 use super::memory::{host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
 use super::out_folder::{self, Existing};
 use super::page_map::write_page_map;
@@ -169,7 +170,8 @@ pub(super) fn see_through(
     begun: Begun,
 ) -> Result<RunOutcome, TrainError> {
     let (config, host_mem) = (&request.config, begun.host_mem);
-    let largest = preflight::allow_largest_view(config, dataset, &mut trainer, host_mem)?;
+    trainer.renderer.set_list_bytes(host_mem.map(list_bytes));
+    let largest = preflight::allow_largest_view(config, dataset, &mut trainer, host_mem);
     let probe = Probe::of_run(dataset, &trainer, largest, begun.driver);
     let mut memory = estimate(config, dataset, &mut trainer, &probe)?;
     let plan = preflight::settle(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;

@@ -63,8 +63,8 @@ pub struct Trainer {
     pub(super) budget: Option<HostBudget>,
     /// The most pages of a batch of a step.
     pub(super) pages_most: usize,
-    /// The most rows of a view so far.
-    pub(super) rows_of_view: usize,
+    /// The largest share of the rows in its pages that a view has drawn so far.
+    pub(super) visible_share: f64,
 }
 
 fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
@@ -122,18 +122,18 @@ impl Trainer {
             is_torn: false,
             budget: None,
             pages_most: usize::MAX,
-            rows_of_view: 0,
+            visible_share: 0.0,
         }
     }
 
     /// Renders views forward and backward so that the memory of a view is allocated; the scene stays unchanged. Returns
-    /// the pixels of the largest view.
+    /// the pixels of the largest view, and the most rows that a view draws.
     ///
     /// # Errors
     /// A view cannot be rendered.
-    pub fn probe_views(&mut self, dataset: &Dataset, views: &[usize]) -> Result<usize, TrainError> {
+    pub fn probe_views(&mut self, dataset: &Dataset, views: &[usize]) -> Result<(usize, usize), TrainError> {
         let render = self.render_options();
-        let mut pixels = 0;
+        let (mut pixels, mut visible) = (0, 0);
         for &view in views {
             let camera = &dataset.views[view].camera;
             let rgb = vec![0; 3 * camera.pixels()];
@@ -141,10 +141,12 @@ impl Trainer {
             let how = (&render, &self.options.loss);
             let now = (&mut self.scene, self.step, &mut self.working);
             let rows = rehearse(now, &mut *self.renderer, (camera, &target), how, self.pages_most)?;
-            self.rows_of_view = self.rows_of_view.max(rows);
-            pixels = pixels.max(camera.pixels());
+            let index = self.scene.pager.index();
+            let pages = self.scene.pager.pages_of_view(camera);
+            self.note_share(rows, pages.iter().map(|page| index[page.index()].rows as usize).sum());
+            (pixels, visible) = (pixels.max(camera.pixels()), visible.max(rows));
         }
-        Ok(pixels)
+        Ok((pixels, visible))
     }
 
     /// Sets the view order before the first step, for orders that depend on the pages.
@@ -238,7 +240,7 @@ impl Trainer {
             }
         };
         let outcome = stepped.map_err(|error| error.with_view_name(&dataset.views[view].name))?;
-        self.rows_of_view = self.rows_of_view.max(outcome.rows);
+        self.note_share(outcome.rows, outcome.rows_pinned);
         self.count_skipped(&outcome, &dataset.views[view].name)?;
         if self.options.optimizer == Method::Dense {
             // The step has changed rows; an error here leaves a state between two steps.
@@ -264,6 +266,10 @@ impl Trainer {
         let camera = |&position: &usize| &dataset.views[self.train_views[position]].camera;
         let cameras: Vec<&Camera> = coming.iter().map(camera).collect();
         self.scene.pager.look_ahead(self.step, &cameras);
+    }
+
+    fn note_share(&mut self, visible: usize, in_pages: usize) {
+        self.visible_share = self.visible_share.max(visible as f64 / in_pages.max(1) as f64);
     }
 
     fn count_skipped(&mut self, outcome: &StepOutcome, view: &str) -> Result<(), TrainError> {

@@ -1,9 +1,9 @@
-//! The working set: the rows of one view and their gradients during a step.
+//! The working set: the rows of one batch of a view and their gradients during a step.
 
 use crate::render::Gradients;
-use crate::scene::columns::Columns;
+use crate::scene::columns::{Columns, row_width};
 
-/// The rows of a view, evaluated at one step, and their gradients. Steps reuse one working set and its allocations.
+/// The rows of a batch, evaluated at one step, and their gradients. Steps reuse one working set and its allocations.
 #[derive(Default)]
 pub struct WorkingSet {
     /// For each row of the working set, its row number in the pinned pages (consecutive across pages); ascending.
@@ -19,5 +19,17 @@ impl WorkingSet {
     pub fn bytes(&self) -> usize {
         let columns = self.columns.bytes() + self.gradients.columns.bytes();
         self.row_from_working.capacity() * 4 + columns + self.gradients.means2d.capacity() * 16
+    }
+
+    /// Bytes of one row that is stored with `sh_degree`: its number, values, gradients, and the footprint's gradient and radii.
+    pub fn row_bytes(sh_degree: u8) -> usize {
+        4 + 2 * 4 * row_width(sh_degree) + 16
+    }
+
+    /// Frees the memory of a working set that has room for many more than `rows` rows.
+    pub fn shrink_to(&mut self, rows: usize) {
+        if self.row_from_working.capacity() > rows + rows / 4 {
+            *self = WorkingSet::default();
+        }
     }
 }
