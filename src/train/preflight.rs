@@ -1,6 +1,7 @@
 //! Plans the tiers before the first step: what each tier will hold, whether it fits, and the number of frames.
 //!
-//! Invariant: a run that cannot fit is refused here, with numbers and alternatives. Growth that may not fit is a warning.
+//! Invariant: a run that cannot fit is refused here, with numbers and alternatives. Growth that may not fit is a
+//! warning.
 
 use super::budget::HostBudget;
 use super::error::TrainError;
@@ -181,8 +182,8 @@ pub fn allow_largest_view(
     Ok(number)
 }
 
-/// Resolves `--view-order auto`. For a scene that grows, the current pages stand for the grown scene, with the number of
-/// frames reduced in proportion.
+/// Resolves `--view-order auto`. For a scene that grows, the current pages stand for the grown scene, with the number
+/// of frames reduced in proportion.
 fn auto_order(
     config: &TrainConfig,
     dataset: &Dataset,
@@ -408,8 +409,8 @@ fn check_view(plan: &TierPlan, frames: u64) -> InputResult<()> {
     Err(InputError::new("--frames", problem, format!("give at least {needed}; views of a growing scene need more")))
 }
 
-/// Refuses a drive that cannot hold the `rows` first Gaussians, before the import. A drive that does not report its free
-/// space passes.
+/// Refuses a drive that cannot hold the `rows` first Gaussians, before the import. A drive that does not report its
+/// free space passes.
 ///
 /// # Errors
 /// The drive has too little free space.

@@ -68,8 +68,8 @@ fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
 }
 
 impl Trainer {
-    /// A trainer for the first Gaussians `columns` and the training views of `dataset` (at least one), with all pages in
-    /// memory.
+    /// A trainer for the first Gaussians `columns` and the training views of `dataset` (at least one), with all pages
+    /// in memory.
     ///
     /// # Errors
     /// As [`Trainer::with_pager`].
