@@ -420,8 +420,8 @@ impl TrainConfig {
             return Ok(());
         }
         let problem = format!(
-            "{:e} is out of range: below 1e-16, second moments that f32 rounds to zero let Gaussians leave the bounds of \
-             their pages; above 1, training stands still",
+            "{:e} is out of range: below 1e-16, second moments that f32 rounds to zero let Gaussians leave the bounds \
+             of their pages; above 1, training stands still",
             self.adam_eps
         );
         Err(InputError::new("--adam-eps", problem, "use 1e-16 to 1; 1e-15 is usual"))

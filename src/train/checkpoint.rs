@@ -46,7 +46,7 @@ pub struct Checkpoint {
     /// The run can continue without commits: all pages are in memory.
     pub(super) is_optional: bool,
     /// A commit found no space, and the warning was printed.
-    said_full: bool,
+    warned_full: bool,
     /// How long to wait for space.
     pub(super) full_wait: Duration,
     /// Step at which space was last made, whether on the store's drive, and when. A second attempt at the same step
@@ -112,7 +112,7 @@ impl Checkpoint {
             name: None,
             folder: folder.to_path_buf(),
             is_optional: false,
-            said_full: false,
+            warned_full: false,
             full_wait: Duration::try_from_secs_f64(config.disk_full_wait).unwrap_or_default(),
             space_made: None,
             interval: CommitInterval::new(config.commit_every),
@@ -201,7 +201,7 @@ impl Checkpoint {
             Some(beside) if trainer.scene.pager.is_frozen_written() || is_late(beside) => self.finish(trainer),
             _ => Ok(()),
         };
-        self.excused(result)
+        self.tolerate_full_drive(result)
     }
 
     /// Whether an early commit for free slots is allowed. The time limit prevents a commit at every step, since slots
@@ -215,10 +215,10 @@ impl Checkpoint {
     }
 
     /// For a run in memory, turns a lack of space into a warning; the next attempt follows one interval later.
-    fn excused(&mut self, result: Result<(), TrainError>) -> Result<(), TrainError> {
+    fn tolerate_full_drive(&mut self, result: Result<(), TrainError>) -> Result<(), TrainError> {
         match result {
             Err(error) if self.is_optional && error.is_out_of_space() => {
-                if !std::mem::replace(&mut self.said_full, true) {
+                if !std::mem::replace(&mut self.warned_full, true) {
                     eprintln!("warning: nothing can be committed: {error}");
                 }
                 // The next commit would hold another step, so drop the name.
@@ -236,7 +236,7 @@ impl Checkpoint {
     pub(super) fn give_up(&mut self, trainer: &mut Trainer, why: TrainError) -> Result<(), TrainError> {
         self.beside = None;
         trainer.scene.pager.thaw();
-        self.excused(Err(why))
+        self.tolerate_full_drive(Err(why))
     }
 
     /// Creates the checkpoint of a run in memory at its first commit. On failure the run continues without commits;

@@ -121,8 +121,8 @@ impl Checkpoint {
         let (needed_text, folder) = (format_bytes(needed), full.display().to_string());
         if !is_told {
             eprintln!(
-                "paused: {lacks}\n  {folder} needs {needed_text} more and has {free_then} free. Training waits up to {until:.0} s \
-                 (--disk-full-wait) for space, then continues; Ctrl-C stops it"
+                "paused: {lacks}\n  {folder} needs {needed_text} more and has {free_then} free. Training waits up to \
+                 {until:.0} s (--disk-full-wait) for space, then continues; Ctrl-C stops it"
             );
         }
         while began.elapsed() < self.full_wait && stop.exit_code().is_none() {

@@ -6,7 +6,7 @@
 //! Invariants: 1. memory stays within the given bound; 2. pages have the rows of [`crate::scene::partition::partition`]
 //! in its order; the uid of a row is its number in the file.
 
-use super::prepare::cut_sh;
+use super::prepare::truncate_sh;
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::dataset::import::{Grown, PageSpace, Spool, SpoolSpace, SpoolWriter, paginate};
@@ -85,7 +85,7 @@ impl GaussianFile {
         let (mut some, mut far) = (none(), 0);
         let mut hand_on = |mut columns: Columns| {
             far += to_local(&mut columns, &self.meta, self.origin, self.scale);
-            take(&cut_sh(columns, self.sh_degree_most))
+            take(&truncate_sh(columns, self.sh_degree_most))
         };
         let meta = stream_gaussians(&self.path, &mut |values| {
             push_row(&mut some, values);

@@ -62,7 +62,7 @@ pub struct TierPlan {
 ///
 /// # Errors
 /// The budget or the drive is too small.
-pub fn settle(
+pub fn plan_tiers(
     config: &TrainConfig,
     dataset: &Dataset,
     trainer: &mut Trainer,
@@ -149,7 +149,7 @@ pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Op
     ))
 }
 
-/// Allows the frames that the largest training view of `dataset` needs, so that views can be measured; [`settle`]
+/// Allows the frames that the largest training view of `dataset` needs, so that views can be measured; [`plan_tiers`]
 /// allows the rest afterwards. Returns the index of that view. Runs in memory or with --frames are left unchanged.
 ///
 /// # Errors
@@ -204,7 +204,7 @@ fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
     dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect()
 }
 
-/// Number of frames within `host_mem`, as [`settle`] chooses it. For planning without a run: `trainer` holds the pages
+/// Number of frames within `host_mem`, as [`plan_tiers`] chooses it. For planning without a run: `trainer` holds the pages
 /// of the largest view.
 ///
 /// # Errors
@@ -324,9 +324,9 @@ fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -
     }
     if most.total() > budget {
         eprintln!(
-            "warning: the run may need {} but has {}: beyond that, its pages move between memory and its checkpoint; name \
-             a folder on a fast drive with --spill-dir, or lower --max-gaussians, --image-cache, --sh-degree or the size \
-             of the photos",
+            "warning: the run may need {} but has {}: beyond that, its pages move between memory and its checkpoint; \
+             name a folder on a fast drive with --spill-dir, or lower --max-gaussians, --image-cache, --sh-degree or \
+             the size of the photos",
             format_bytes(most.total()),
             format_bytes(budget)
         );
@@ -358,8 +358,8 @@ fn raise_to_least(config: &TrainConfig, host_mem: Option<u64>, least: u64) -> Op
     let budget = host_mem.filter(|&budget| config.host_mem.0 == 0 && least > budget);
     let Some(short) = budget.filter(|_| obtainable_bytes().is_some_and(|most| least <= most)) else { return host_mem };
     eprintln!(
-        "warning: the run needs {} from its start, more than {}, the default share of the free memory: it takes more as \
-         long as the machine has it; --host-mem sets a limit",
+        "warning: the run needs {} from its start, more than {}, the default share of the free memory: it takes more \
+         as long as the machine has it; --host-mem sets a limit",
         format_bytes(least),
         format_bytes(short)
     );
@@ -494,7 +494,8 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
     text.push_str(&part("program and tables", memory.base + memory.copies));
     if tiers.spills() {
         text.push_str(&format!(
-            "drive   {} of pages by {} ({}), {} free; about {} to be written, commits apart, {:.2} % of what a common drive is rated for\n",
+            "drive   {} of pages by {} ({}), {} free\n        \
+             about {} to write without commits, {:.2} % of the rated life of a common drive\n",
             format_bytes(plan.pages[0] * plan.frame_bytes),
             tiers.engine,
             tiers.codec,

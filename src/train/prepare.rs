@@ -56,7 +56,7 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
             let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
             dataset.warnings.extend(ply_warnings(&ply, &meta, far));
             let in_use = columns.sh_degree.max(limits::first_sh_degree(config));
-            (cut_sh(columns, config.sh_degree), in_use)
+            (truncate_sh(columns, config.sh_degree), in_use)
         }
         None => (first_gaussians(scene, &mut dataset, config)?, limits::first_sh_degree(config)),
     };
@@ -112,7 +112,7 @@ fn first_gaussians(scene: &Path, dataset: &mut Dataset, config: &TrainConfig) ->
 }
 
 /// Drops the SH bands above `sh_degree`.
-pub(super) fn cut_sh(columns: Columns, sh_degree: u8) -> Columns {
+pub(super) fn truncate_sh(columns: Columns, sh_degree: u8) -> Columns {
     if columns.sh_degree <= sh_degree {
         return columns;
     }

@@ -108,7 +108,7 @@ pub struct ColorCorrected {
 
 impl TestMetrics {
     /// Text of the colour-corrected PSNR with its name; empty if not measured.
-    pub fn words_of_color_corrected(&self) -> String {
+    pub fn color_corrected_text(&self) -> String {
         self.color_corrected
             .map_or(String::new(), |c| format!(", colour-corrected PSNR ({}) {:.2} dB", c.method.name(), c.cc_psnr))
     }

@@ -16,7 +16,7 @@ use super::ownership::{Claim, last_state, open_own};
 use super::pages::PagedScene;
 use super::places::absolute;
 use super::report::{StepLine, Summary};
-use super::run::{Begun, Past, RunOutcome, RunRequest, begin, run, see_through};
+use super::run::{Begun, Past, RunOutcome, RunRequest, begin, plan_and_train, run};
 use super::start::Start;
 use super::start::dataset_print;
 use super::tiers::Stored;
@@ -68,7 +68,7 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     let mut config = earlier.config.clone();
     request.keys.clone().apply(&mut config);
     config.check()?;
-    if let Some(outcome) = already_done(request, &config, &earlier)? {
+    if let Some(outcome) = finished_outcome(request, &config, &earlier)? {
         return Ok(outcome);
     }
     let folder = stored_folder(&request.out, &config);
@@ -77,11 +77,11 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     // The resumed run takes the lock again.
     drop(lock);
     match found {
-        Ok(Some(stored)) => go_on(request, &earlier, config, stored),
-        Ok(None) => begin_again(request, &earlier, config),
+        Ok(Some(stored)) => resume_from(request, &earlier, config, stored),
+        Ok(None) => restart(request, &earlier, config),
         // A run in memory creates its checkpoint at its first commit.
-        Err(_) if is_in_output && !SpillDir::exists_in(&folder) && !has_past(&request.out) => {
-            begin_again(request, &earlier, config)
+        Err(_) if is_in_output && !SpillDir::exists_in(&folder) && !has_results(&request.out) => {
+            restart(request, &earlier, config)
         }
         Err(error) => Err(error),
     }
@@ -124,7 +124,7 @@ impl Earlier {
         }
         let state = last_state(&folder, Access::Map)?;
         let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
-        if Path::new(&state.run.out) != absolute(&request.out) && has_past(&request.out) {
+        if Path::new(&state.run.out) != absolute(&request.out) && has_results(&request.out) {
             let problem =
                 format!("it holds results, and the checkpoint in {} is that of {}", folder.display(), state.run.out);
             let remedy = "name that output folder, or one that does not exist yet";
@@ -146,7 +146,7 @@ impl Earlier {
 
 /// Whether a new start would destroy something of the run in `out`: a result, or a logged commit whose checkpoint may
 /// lie elsewhere.
-fn has_past(out: &Path) -> bool {
+fn has_results(out: &Path) -> bool {
     let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap_or_default();
     let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
     let has = |name: &str| out.join(name).exists();
@@ -161,8 +161,8 @@ fn has_past(out: &Path) -> bool {
 ///
 /// # Errors
 /// The run left results that would be replaced; else as [`run`].
-fn begin_again(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
-    if has_past(&request.out) {
+fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
+    if has_results(&request.out) {
         let problem = "the run left results but no commit to resume from: a run that ends without --keep-checkpoint \
                        removes its checkpoint";
         let remedy = "start a new run from its Gaussians with another --out and --init-ply point_cloud.ply, or start over \
@@ -176,7 +176,7 @@ fn begin_again(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) 
 }
 
 /// Resumes from a checkpoint.
-fn go_on(
+fn resume_from(
     request: &ResumeRequest,
     earlier: &Earlier,
     mut config: TrainConfig,
@@ -197,17 +197,17 @@ fn go_on(
     let start = Start::look(&scene, &config, &request.out, host_mem)?;
     let print = dataset_print(&start)?;
     changes.add_dataset(&start.dataset, &state.dataset, &print);
-    changes.numbers.extend(start_change(&start, &state, &print));
+    changes.numbers.extend(first_degree_change(&start, &state, &print));
     changes.check(&start.dataset.image_folder, request.accept_changes)?;
     let (renderer, options, driver) = begin(request.quiet, &config, &start)?;
-    say(request, &state, &config, &changes, &*renderer);
+    print_resume(request, &state, &config, &changes, &*renderer);
     let dataset = start.into_dataset();
     let (pager, tiers) = stored.into_tiers(&config, host_mem.unwrap_or(u64::MAX))?;
     tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
     let has_changed = !changes.numbers.is_empty();
     let pages = match has_changed {
-        false => restore_pages(pager, &of_state(&options, &state), &state)?,
-        true => changed_pages(pager, &options, &state)?,
+        false => restore_pages(pager, &restore_options(&options, &state), &state)?,
+        true => pages_with_new_rules(pager, &options, &state)?,
     };
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
     trainer.restore_counts(&state);
@@ -223,7 +223,7 @@ fn go_on(
     let begun = Begun { print, sh_degree_start: state.sh_degree_start, past: Some(past), host_mem, driver, run };
     let (out, quiet) = (request.out.clone(), request.quiet);
     let request = RunRequest { scene, out, config, dry_run: false, existing: Existing::BeginAgain, quiet };
-    see_through(&request, &dataset, tiers, trainer, begun)
+    plan_and_train(&request, &dataset, tiers, trainer, begun)
 }
 
 /// The identity of a resumed run: its own, that of its checkpoint, or a new one.
@@ -255,7 +255,13 @@ fn check_steps(config: &TrainConfig, state: &RunState) -> InputResult<()> {
 }
 
 /// Prints the resume and its differences.
-fn say(request: &ResumeRequest, state: &RunState, config: &TrainConfig, changes: &Changes, renderer: &dyn Renderer) {
+fn print_resume(
+    request: &ResumeRequest,
+    state: &RunState,
+    config: &TrainConfig,
+    changes: &Changes,
+    renderer: &dyn Renderer,
+) {
     if renderer.device() != state.device {
         let (there, here) = (&state.device, renderer.device());
         eprintln!("warning: the renderer was {there} and is {here}: its rounding differs");
@@ -277,7 +283,7 @@ fn say(request: &ResumeRequest, state: &RunState, config: &TrainConfig, changes:
 /// Handles a run that did all steps and wrote its results: trains nothing. Removes a checkpoint that a kill left
 /// behind, unless it is to be kept, the user named another folder, it belongs to another run, or it cannot be opened. A
 /// run that was rolled back since is not finished.
-fn already_done(
+fn finished_outcome(
     request: &ResumeRequest,
     config: &TrainConfig,
     earlier: &Earlier,
@@ -322,11 +328,11 @@ fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result
 }
 
 /// The pages of a run that resumes with changed rules, updated to its last step by the old rules.
-fn changed_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
+fn pages_with_new_rules(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
     let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
-    let then = rules_then(&then, &state.simd, SimdPath::is_supported)
+    let then = config_before(&then, &state.simd, SimdPath::is_supported)
         .ok_or_else(|| CommitError::Contradiction("no instruction path of this machine is known".to_string()))?;
-    let old = of_state(&RunOptions::new(&then, state.dataset.scene_scale), state);
+    let old = restore_options(&RunOptions::new(&then, state.dataset.scene_scale), state);
     let mut pages = restore_pages(pager, &old, state)?;
     if pages.change_rules(options, state.step)? {
         eprintln!("warning: the statistics of the rows differed from the run's histogram, which is counted anew");
@@ -336,7 +342,7 @@ fn changed_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result
 
 /// The config by which the pages were trained, on an instruction path with the same bits if this machine has one, else
 /// on the path of the config or the best available: another path changes only the rounding.
-fn rules_then(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath) -> bool) -> Option<TrainConfig> {
+fn config_before(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath) -> bool) -> Option<TrainConfig> {
     let on = |simd: Option<SimdPath>| TrainConfig { simd: Chosen(simd), ..then.clone() };
     let path = SimdPath::from_name(simd);
     let class = path.map(SimdPath::bits_class);
@@ -348,13 +354,13 @@ fn rules_then(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath) ->
 
 /// The options for restoring pages: with the SH degree of the run's first step, from which its events raised the
 /// degree. Accepted changes of keys may give another first degree now.
-fn of_state(options: &RunOptions, state: &RunState) -> RunOptions {
+fn restore_options(options: &RunOptions, state: &RunState) -> RunOptions {
     RunOptions { sh_degree_start: state.sh_degree_start, ..options.clone() }
 }
 
 /// The difference if the run would start with another SH degree now: a sign of changed input. For the same points or
 /// Gaussians only the config can differ, and its keys are compared elsewhere.
-fn start_change(start: &Start, state: &RunState, here: &DatasetPrint) -> Option<String> {
+fn first_degree_change(start: &Start, state: &RunState, here: &DatasetPrint) -> Option<String> {
     if state.dataset.points == here.points {
         return None;
     }
@@ -370,7 +376,7 @@ mod tests {
     fn pages_go_on_by_their_own_config_on_a_machine_without_its_path() {
         let then =
             TrainConfig { means_lr: 0.5, seed: 9, simd: Chosen(Some(SimdPath::Avx512)), ..TrainConfig::default() };
-        let here = |paths: &[SimdPath]| rules_then(&then, "avx512", |path| paths.contains(&path));
+        let here = |paths: &[SimdPath]| config_before(&then, "avx512", |path| paths.contains(&path));
         let with = |simd: Option<SimdPath>| Some(TrainConfig { simd: Chosen(simd), ..then.clone() });
         assert_eq!(here(&SimdPath::ALL), with(Some(SimdPath::Avx512)));
         assert_eq!(
@@ -382,9 +388,9 @@ mod tests {
         // and that of the config.
         let asked = std::cell::Cell::new(0);
         let last = |_| asked.replace(asked.get() + 1) == 4;
-        assert_eq!(rules_then(&then, "avx512", last), with(None));
+        assert_eq!(config_before(&then, "avx512", last), with(None));
         let baseline = TrainConfig { simd: Chosen(Some(SimdPath::Baseline)), ..then.clone() };
-        let found = rules_then(&baseline, "avx512", |path| path == SimdPath::Baseline);
+        let found = config_before(&baseline, "avx512", |path| path == SimdPath::Baseline);
         assert_eq!(found, Some(baseline), "that of the config comes next");
         // Never by another config.
         assert_eq!(here(&[]), None);

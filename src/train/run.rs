@@ -137,7 +137,8 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
     let trainer = Trainer::of_scene(scene, &dataset, renderer, options);
     let run = RunId::draw();
-    see_through(request, &dataset, tiers, trainer, Begun { print, sh_degree_start, past: None, host_mem, driver, run })
+    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run };
+    plan_and_train(request, &dataset, tiers, trainer, begun)
 }
 
 /// Common start of all runs after reading the scene: warnings, options, the renderer and its memory.
@@ -161,7 +162,7 @@ pub(super) fn begin(
 }
 
 /// Plans a run, prints the plan, and trains to the end.
-pub(super) fn see_through(
+pub(super) fn plan_and_train(
     request: &RunRequest,
     dataset: &Dataset,
     mut tiers: Tiers,
@@ -172,7 +173,7 @@ pub(super) fn see_through(
     let largest = preflight::allow_largest_view(config, dataset, &mut trainer, host_mem)?;
     let probe = Probe::of_run(dataset, &trainer, largest, begun.driver);
     let mut memory = estimate(config, dataset, &mut trainer, &probe)?;
-    let plan = preflight::settle(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
+    let plan = preflight::plan_tiers(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
     if !request.quiet {
         let of_tiers = preflight::describe(&plan, &memory[1], &tiers);
         eprintln!("{}", describe(request, dataset, &trainer, &of_tiers));
@@ -208,7 +209,7 @@ fn spill_dir_flag(request: &RunRequest) -> String {
 }
 
 /// The config to keep: with choices resolved and absolute paths.
-fn settled(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
+fn resolved_config(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
     let view_order = Chosen(Some(trainer.view_order().order()));
     with_absolute_paths(TrainConfig { view_order, ..config.clone() })
 }
@@ -231,9 +232,9 @@ fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun
             kept.0
         }
         None => {
-            let settled = settled(&request.config, trainer);
-            write_config(&path, &settled, &resolved(request, dataset, trainer, begun.run))?;
-            settled
+            let kept = resolved_config(&request.config, trainer);
+            write_config(&path, &kept, &resolved(request, dataset, trainer, begun.run))?;
+            kept
         }
     };
     let fail = |e: toml::ser::Error| InputError::new(&path, e.to_string(), "report this as a bug");

@@ -56,7 +56,7 @@ pub struct Tiers {
     /// The checkpoint is in the output folder.
     is_in_output: bool,
     /// The run resumed from this store.
-    has_past: bool,
+    has_resumed: bool,
     /// For a dry run: a folder on the drive of the spill directory.
     planned_on: Option<PathBuf>,
     /// I/O engine, for reports; empty if all pages stay in memory.
@@ -250,7 +250,7 @@ impl Stored {
             return Err(CommitError::Contradiction("slots have another size than pages".to_string()).into());
         }
         let mut tiers = Tiers::default();
-        (tiers.has_past, tiers.is_in_memory, tiers.keeps) = (true, is_in_memory, config.keep_checkpoint);
+        (tiers.has_resumed, tiers.is_in_memory, tiers.keeps) = (true, is_in_memory, config.keep_checkpoint);
         tiers.is_in_output = config.residence().spill_dir().is_none();
         let folder = spill.folder().to_path_buf();
         let (engine, codec) = tiers.take_spill(spill, config)?;
@@ -305,7 +305,7 @@ impl Tiers {
     }
 
     fn has_checkpoint(&self) -> bool {
-        self.has_past || self.checkpoint.as_ref().is_some_and(Checkpoint::has_commit)
+        self.has_resumed || self.checkpoint.as_ref().is_some_and(Checkpoint::has_commit)
     }
 
     /// Whether pages may be evicted to a drive.

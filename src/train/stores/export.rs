@@ -23,7 +23,7 @@ use crate::scene::select::RankSearch;
 use crate::train::error::TrainError;
 use crate::train::memory::host_bytes_peak;
 use crate::train::pages::PagedScene;
-use crate::train::prepare::cut_sh;
+use crate::train::prepare::truncate_sh;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -252,7 +252,7 @@ impl Choice {
                 }
             }
         }
-        cut_sh(chosen, sh_degree)
+        truncate_sh(chosen, sh_degree)
     }
 
     fn is_inside(&self, rows: &Columns, row: usize) -> bool {

@@ -15,7 +15,7 @@ use crate::scene::state::SceneState;
 use crate::train::catch_up::evaluate_all;
 use crate::train::error::TrainError;
 use crate::train::pages::PagedScene;
-use crate::train::prepare::cut_sh;
+use crate::train::prepare::truncate_sh;
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_64;
 
@@ -93,7 +93,7 @@ impl StoredStart {
                 let problem = "its Gaussians are too far from the cameras for f32";
                 return Err(InputError::new(&self.folder, problem, "check that it is a scene of this dataset").into());
             }
-            let mut state = SceneState::from_columns(cut_sh(columns, sh_degree));
+            let mut state = SceneState::from_columns(truncate_sh(columns, sh_degree));
             state.raise_sh_degree(sh_degree);
             state.uid = uid;
             let rows: Vec<u32> = (0..state.rows() as u32).collect();
