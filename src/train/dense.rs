@@ -6,13 +6,10 @@
 //! pinned at once.
 
 use super::error::TrainError;
-use super::pages::PagedScene;
+use super::pages::{PAGES_PER_BATCH, PagedScene};
 use crate::base::ids::PageNo;
 use crate::scene::rows::RowsNow;
 use rayon::prelude::*;
-
-/// Pages updated together.
-const PAGES_PER_BATCH: usize = 32;
 
 /// Stores every row as evaluated after `now` steps, and renews the bounds of every page.
 ///

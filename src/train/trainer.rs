@@ -198,7 +198,7 @@ impl Trainer {
     ///
     /// # Errors
     /// A photo cannot be decoded, pages could not be pinned, the renderer failed, or the loss was not finite
-    /// [`NON_FINITE_STEPS_MAX`] times in a row.
+    /// `NON_FINITE_STEPS_MAX` times in a row.
     pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
         let view = self.next_view();
         let mut ahead = Vec::new();

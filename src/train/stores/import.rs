@@ -25,8 +25,9 @@ use crate::train::error::TrainError;
 use crate::train::gaussian_pages::{GaussianSpace, GaussianWriter};
 use crate::train::memory::host_bytes_peak;
 use crate::train::pages::PageRules;
+use crate::train::whole_file::folder_of;
 use serde::Serialize;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Memory besides the rows: threads, the store's buffers and its map, bytes.
 const FIXED_BYTES: u64 = 48 * MIB;
@@ -75,7 +76,7 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
         return Err(InputError::new(&request.file, "it holds points, not Gaussians", remedy).into());
     }
     let (memory, beside) = (memory_for_rows(request)?, folder_of(&request.out));
-    let space = GaussianSpace { folder: &beside, memory };
+    let space = GaussianSpace { folder: beside, memory };
     let mut rows = GaussianWriter::new(&request.file, space);
     let meta = stream_gaussians(&request.file, &mut |values| rows.push(values))?;
     let rows = rows.finish()?;
@@ -144,11 +145,6 @@ fn memory_for_rows(request: &ImportRequest) -> InputResult<usize> {
         return Err(InputError::new("--host-mem", problem, format!("give at least {}", format_bytes(least))));
     }
     Ok((request.host_mem - FIXED_BYTES - pages) as usize)
-}
-
-/// Folder for temporary files: on the drive of the new store.
-fn folder_of(out: &Path) -> PathBuf {
-    out.parent().filter(|p| !p.as_os_str().is_empty()).map_or_else(|| PathBuf::from("."), Path::to_path_buf)
 }
 
 /// Default config and options for Gaussians at their full SH degree.
