@@ -155,8 +155,8 @@ fn a_run_does_what_was_planned() {
 
 /// Bytes that a run says it will write.
 fn told_to_be_written(said: &str) -> f64 {
-    let line = said.lines().find(|line| line.starts_with("drive")).unwrap();
-    let text = line.split("; about ").nth(1).and_then(|rest| rest.split(" to be written, commits apart").next());
+    let line = said.lines().find(|line| line.contains(" to write without commits")).unwrap();
+    let text = line.split("about ").nth(1).and_then(|rest| rest.split(" to write without commits").next());
     let (number, unit) = text.and_then(|text| text.split_once(' ')).expect(line);
     let power = ["B", "KiB", "MiB", "GiB", "TiB"].iter().position(|u| *u == unit).expect(line);
     number.parse::<f64>().expect(line) * 1024f64.powi(power as i32)
@@ -174,7 +174,8 @@ fn a_run_says_what_it_takes_of_the_life_of_a_drive() {
     let output = train(&[&[text(&scene)][..], &flags, &more].concat());
     let said = stderr(&output);
     assert!(output.status.success(), "{said}");
-    let told = said.split("commits apart, ").nth(1).and_then(|rest| rest.split(" % of what").next()).expect(&said);
+    let told =
+        said.split("without commits, ").nth(1).and_then(|rest| rest.split(" % of the rated").next()).expect(&said);
     let share = told.parse::<f64>().expect(&said) / 100.0;
     let expected = told_to_be_written(&said) / 300e12;
     // Both are rounded to be read: the share to a hundredth of a percent, the bytes to three digits.

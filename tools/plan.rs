@@ -386,7 +386,8 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
     let size = |bytes: f64| format_bytes(bytes as u64);
     let pages = scene.index.len();
     let mut text = format!(
-        "{} Gaussians in {pages} pages of at most {} rows, {} on disk; {} views need {:.1} % of the pages on average, {:.1} % at most",
+        "{} Gaussians in {pages} pages of at most {} rows, {} on disk\n\
+         {} views need {:.1} % of the pages on average, {:.1} % at most",
         scene.gaussians,
         scene.config.page_rows,
         format_bytes(state_bytes(scene)),
@@ -431,18 +432,22 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
         );
     }
     text += &format!(
-        "\nwritten: by all {} steps and the import, as a share of {}, commits not counted; worst 20: read and written; * chosen by auto\
-         \nwait: for a drive that reads {}/s and writes {}/s, and steps of {:.4} s{}; time: of all steps, with these Gaussians",
-        scene.config.steps,
-        format_bytes(args.endurance.0),
+        "\n*        chosen by auto\
+         \nworst 20 bytes read and written\
+         \nwait     for a drive that reads {}/s and writes {}/s,\
+         \n         and steps of {:.4} s{}\
+         \ntime     of all {} steps, without growth\
+         \nwritten  by import and all steps, without commits; life: share of {}",
         size(scene.drive.read_rate),
         size(scene.drive.write_rate),
         scene.drive.step_seconds,
         match (args.step_seconds, &scene.timed_on) {
             (Some(_), _) => String::new(),
-            (None, Some(device)) => format!(" ({device}, a view of middling size)"),
+            (None, Some(device)) => format!("\n         ({device}, median view)"),
             (None, None) => " (assumed: no view fits)".to_string(),
         },
+        scene.config.steps,
+        format_bytes(args.endurance.0),
     );
     if rows.iter().any(|row| !row.planned.is_exact) {
         text += "\nThe plan reached less than two epochs ahead: a larger --plan-mem may reduce reads.";

@@ -182,7 +182,7 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
     if let (Some(summary), false) = (&outcome.summary, quiet) {
         let test = match &summary.test {
             Some(t) => {
-                let corrected = t.words_of_color_corrected();
+                let corrected = t.color_corrected_text();
                 format!("test PSNR {:.2} dB, SSIM {:.4}{corrected} on {} held-out views", t.psnr, t.ssim, t.views)
             }
             None if summary.finished => String::from("no photos held out"),

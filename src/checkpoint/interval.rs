@@ -1,12 +1,12 @@
-//! How often a run is committed, and what that cost it: numbers in, numbers out.
+//! The commit interval, computed from the measured costs of commits.
 //!
-//! `--commit-every auto` wants that a kill costs at most [`LOSS_SECONDS`]; commits come more often while they hold training
-//! up for less than `CHEAP_OVERHEAD`, which keeps their whole cost below [`OVERHEAD`] on any drive that can have both. On
-//! one that cannot the loss wins, and the overhead is reported. What a drive may be made to take has the last word
-//! ([`BYTES_PER_HOUR`]).
+//! `--commit-every auto` limits the loss of a kill to [`LOSS_SECONDS`]. Commits are more frequent while they delay
+//! training by less than `CHEAP_OVERHEAD`, which keeps their total cost below [`OVERHEAD`] on drives fast enough for
+//! both. On a slower drive the loss limit has priority, and the overhead is reported. [`BYTES_PER_HOUR`] has priority
+//! over both.
 //!
-//! Invariants: 1. no clock is read here: whoever asks says how long ago things were; 2. the interval is a function of the
-//! costs that were told, in their order; 3. nothing here can change what a run computes.
+//! Invariants: 1. this file reads no clock; callers pass elapsed times; 2. the interval is a function of the sequence
+//! of costs; 3. no result of a run depends on it.
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
@@ -14,13 +14,13 @@ use std::str::FromStr;
 
 /// Most seconds of work that a kill may cost.
 pub const LOSS_SECONDS: f64 = 60.0;
-/// Most of the run's time that commits may hold it up.
+/// Largest share of the run's time that commits may delay it.
 pub const OVERHEAD: f64 = 0.03;
-/// Commits come more often than [`LOSS_SECONDS`] asks for while they hold the run up for less than this.
+/// Commits are more frequent than [`LOSS_SECONDS`] requires while they delay the run by less than this share.
 const CHEAP_OVERHEAD: f64 = 0.01;
-/// But not more often than this: nobody misses the work of so few seconds.
+/// Shortest automatic interval: losing fewer seconds of work does not matter.
 const SHORTEST_SECONDS: f64 = 10.0;
-/// Most bytes that commits write in an hour: a drive rated for 300 TB takes them for 1,100 hours.
+/// Most bytes that commits write per hour: a drive rated for 300 TB lasts 1,100 hours.
 pub const BYTES_PER_HOUR: f64 = 256.0 * (1u64 << 30) as f64;
 /// Weight of the last commit in the expected cost of the next.
 const LAST_WEIGHT: f64 = 0.5;
@@ -28,9 +28,9 @@ const LAST_WEIGHT: f64 = 0.5;
 /// The value of `--commit-every`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CommitEvery {
-    /// By what commits cost: see the head of this file.
+    /// By the cost of commits; see the module page.
     Auto,
-    /// So many seconds from one commit to the next; 0: none that only time asks for.
+    /// Seconds between commits; 0 for no periodic commits.
     Seconds(f64),
 }
 
@@ -80,16 +80,16 @@ impl<'de> Deserialize<'de> for CommitEvery {
     }
 }
 
-/// What one commit took.
+/// Cost of one commit.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CommitCost {
-    /// Seconds that training waited for it.
+    /// Seconds that training waited for the commit.
     pub waited: f64,
-    /// Seconds from its cut to its being durable.
+    /// Seconds from its cut until it was durable.
     pub until_durable: f64,
-    /// Bytes of pages that were written for it and would not have been written then without it.
+    /// Bytes of pages written only because of the commit.
     pub bytes: u64,
-    /// Seconds of work, since the cut of the commit before, that a kill just before this one was durable would have cost.
+    /// Seconds of work since the previous cut that a kill just before durability would have lost.
     pub at_risk: f64,
 }
 
@@ -102,25 +102,25 @@ pub struct CommitReport {
     pub commit_bytes: u64,
     /// Seconds that training waited for them.
     pub commit_seconds: f64,
-    /// The same in percent of the time that the run has taken.
+    /// `commit_seconds` in percent of the run's time.
     pub commit_overhead_percent: f64,
-    /// Seconds from the end of one commit to the cut of the next, as things are; 0 where time asks for none.
+    /// Current seconds from the end of a commit to the next cut; 0 without periodic commits.
     pub commit_interval: f64,
-    /// The most seconds of work that a kill could have cost so far.
+    /// Most seconds of work that a kill could have lost so far.
     pub commit_loss_seconds: f64,
 }
 
-/// When the next commit is due.
+/// Decides when the next commit is due.
 #[derive(Debug, Clone)]
 pub struct CommitInterval {
     every: CommitEvery,
-    /// What the next commit is expected to take.
+    /// Expected cost of the next commit.
     expected: Option<CommitCost>,
     total: CommitReport,
 }
 
 impl CommitReport {
-    /// For the progress line; empty before the first commit.
+    /// Text for the progress line; empty before the first commit.
     pub fn words(&self) -> String {
         if self.commits == 0 {
             return String::new();
@@ -131,12 +131,12 @@ impl CommitReport {
 }
 
 impl CommitInterval {
-    /// Before the first commit.
+    /// The interval before the first commit.
     pub fn new(every: CommitEvery) -> CommitInterval {
         CommitInterval { every, expected: None, total: CommitReport::default() }
     }
 
-    /// Seconds from the end of one commit to the cut of the next; `None` where time alone asks for none.
+    /// Seconds from the end of a commit to the next cut; `None` without periodic commits.
     pub fn seconds(&self) -> Option<f64> {
         match self.every {
             CommitEvery::Seconds(seconds) => (seconds > 0.0).then_some(seconds),
@@ -149,7 +149,7 @@ impl CommitInterval {
         self.seconds().is_some_and(|seconds| since >= seconds)
     }
 
-    /// Takes in what a commit took.
+    /// Adds the cost of a commit.
     pub fn add(&mut self, cost: CommitCost) {
         let before = self.expected.unwrap_or(cost);
         let mean = |before: f64, last: f64| before + LAST_WEIGHT * (last - before);
@@ -165,7 +165,7 @@ impl CommitInterval {
         self.total.commit_loss_seconds = self.total.commit_loss_seconds.max(cost.at_risk);
     }
 
-    /// Totals, `run_seconds` after the start of this process's part of the run.
+    /// Totals after `run_seconds` of this process.
     pub fn report(&self, run_seconds: f64) -> CommitReport {
         CommitReport {
             commit_overhead_percent: 100.0 * self.total.commit_seconds
@@ -176,9 +176,9 @@ impl CommitInterval {
     }
 }
 
-/// The interval for commits of an expected cost.
+/// The automatic interval for an expected cost.
 fn automatic(cost: CommitCost) -> f64 {
-    // A kill costs the interval and the time until the next commit is durable.
+    // A kill loses the interval plus the time until the next commit is durable.
     let longest = (LOSS_SECONDS - cost.until_durable).max(LOSS_SECONDS / 2.0);
     let cheap = cost.waited * (1.0 / CHEAP_OVERHEAD - 1.0);
     let wear = 3600.0 * cost.bytes as f64 / BYTES_PER_HOUR - cost.until_durable;

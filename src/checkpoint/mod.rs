@@ -1,4 +1,4 @@
-//! What a run is beside its pages, as it stands in a checkpoint, and how often one is made.
+//! The run state in a checkpoint (everything except pages), and the commit interval.
 
 pub mod interval;
 pub mod run_state;

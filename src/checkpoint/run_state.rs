@@ -1,11 +1,11 @@
-//! Everything that a run needs beside its pages to go on as though it had never stopped, as bytes.
+//! The run state as bytes: everything besides pages that a run needs to resume exactly.
 //!
-//! Invariants: 1. what the bytes give back is what went in, bit for bit; 2. the version comes first, so that another
-//! program's state is told from damage; 3. bytes that nobody vouches for give a state within its limits or an error,
+//! Invariants: 1. decoding returns the encoded state, bit for bit; 2. the version comes first, so that the state of
+//! another program version is distinguished from damage; 3. decoding untrusted bytes gives a valid state or an error,
 //! never a panic.
 //!
-//! Layout: [`VERSION`] as u32, then the fields of [`RunState`] in their order, as [`crate::page::format::encoding`] writes them.
-//! Only version 4 is read; no program was released with versions 1 to 3.
+//! Layout: [`VERSION`] as u32, then the fields of [`RunState`] in their order, as [`crate::page::format::encoding`]
+//! writes them. Only version 4 is read; no program was released with versions 1 to 3.
 
 use crate::base::identity::RunId;
 use crate::page::format::encoding::{self, EncodingError};
@@ -15,10 +15,10 @@ use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
 pub const VERSION: u32 = 4;
-/// Bins of the statistics.
+/// Bins of the histogram.
 const BINS: u16 = 1 << 15;
 
-/// A view, as far as training depends on it.
+/// Digests of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ViewPrint {
     /// Digest of name, set, size and pose.
@@ -27,14 +27,14 @@ pub struct ViewPrint {
     pub photo: u64,
 }
 
-/// The dataset that a run was started on, as far as training depends on it.
+/// Digests and numbers of the dataset properties on which training depends.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DatasetPrint {
-    /// In the dataset's order.
+    /// Views in the dataset's order.
     pub views: Vec<ViewPrint>,
-    /// Gaussians that a run starts from.
+    /// Number of first Gaussians.
     pub first_rows: u64,
-    /// Digest of the points or Gaussians that they are made from.
+    /// Digest of the points or Gaussians from which they are made.
     pub points: u64,
     /// Scene scale, local units.
     pub scene_scale: f32,
@@ -47,7 +47,7 @@ pub struct DatasetPrint {
 /// The last evaluation on the held-out views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct LastTest {
-    /// Steps that were done by then.
+    /// Steps done at the evaluation.
     pub step: u32,
     /// Views in the means.
     pub views: u32,
@@ -57,45 +57,45 @@ pub struct LastTest {
     pub ssim: f64,
 }
 
-/// Which run a state belongs to, and where the run was.
+/// Identity and paths of a run.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunIdentity {
     /// Its identity.
     pub id: RunId,
-    /// Its output folder, absolute; empty where unknown.
+    /// Its output folder, absolute; empty if unknown.
     pub out: String,
-    /// Its scene, absolute; empty where unknown.
+    /// Its scene, absolute; empty if unknown.
     pub scene: String,
 }
 
-/// A run between two steps.
+/// The state of a run between two steps, without its pages.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunState {
     /// Steps done.
     pub step: u32,
     /// The config, every key, as TOML.
     pub config: String,
-    /// Instruction path that was resolved.
+    /// Resolved instruction path.
     pub simd: String,
-    /// What rendered.
+    /// Name of the renderer.
     pub device: String,
-    /// Degree in use from the first step.
+    /// SH degree of the first step.
     pub sh_degree_start: u8,
     /// The dataset.
     pub dataset: DatasetPrint,
-    /// The events so far.
+    /// The event log.
     pub events: Vec<Event>,
-    /// Statistics of rows since the last round: bins that are not empty, with their rows.
+    /// Histogram since the last round: non-empty bins with their numbers of rows.
     pub histogram: Vec<(u16, u32)>,
-    /// Rows in the pages as they are stored.
+    /// Rows of the stored pages.
     pub rows: u64,
-    /// No fewer than the rows after all events.
+    /// Upper bound of the rows after all events.
     pub rows_bound: u64,
-    /// Gaussians whose update was skipped because something was not finite.
+    /// Row updates skipped because a value was not finite.
     pub rows_skipped: u64,
-    /// Steps that were skipped for the same reason.
+    /// Steps skipped because the loss was not finite.
     pub steps_skipped: u32,
-    /// Of these, the last ones in a row.
+    /// Number of the last skipped steps in a row.
     pub steps_skipped_in_a_row: u32,
     /// Seconds spent in steps.
     pub train_seconds: f64,
@@ -103,28 +103,28 @@ pub struct RunState {
     pub metrics_bytes: u64,
     /// The last evaluation, if there was one.
     pub test: Option<LastTest>,
-    /// What moved between the tiers so far.
+    /// Traffic between the tiers so far.
     pub traffic: PagerStats,
-    /// Whose state it is.
+    /// Identity and paths of the run.
     pub run: RunIdentity,
 }
 
 /// Why bytes are not the state of a run.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RunStateError {
-    /// Written by another program.
+    /// Written by another version of the program.
     #[error("the run state has version {0}; this program knows version {VERSION}")]
     Version(u32),
-    /// Not a value.
+    /// The encoding is invalid.
     #[error("the run state is {0}")]
     Encoding(#[from] EncodingError),
-    /// A value that no run has.
-    #[error("the run state contradicts itself: {0}")]
+    /// A value is impossible.
+    #[error("the run state is inconsistent: {0}")]
     Impossible(&'static str),
 }
 
 impl RunState {
-    /// The state of a run of `rows` Gaussians without a past: not trained yet, or its past is unknown.
+    /// The state of a run of `rows` Gaussians without history: not trained yet, or history unknown.
     pub fn without_past(config: String, simd: String, dataset: DatasetPrint, rows: u64) -> RunState {
         RunState {
             step: 0,
@@ -148,20 +148,20 @@ impl RunState {
         }
     }
 
-    /// As bytes.
+    /// Encodes the state.
     ///
     /// # Errors
-    /// None that a state of a run can cause.
+    /// None for a valid state.
     pub fn to_bytes(&self) -> Result<Vec<u8>, RunStateError> {
         let mut bytes = VERSION.to_le_bytes().to_vec();
         bytes.extend(encoding::to_bytes(self)?);
         Ok(bytes)
     }
 
-    /// From bytes.
+    /// Decodes a state.
     ///
     /// # Errors
-    /// They are not the state of a run, or of another version.
+    /// The bytes are not a run state, or have another version.
     pub fn from_bytes(bytes: &[u8]) -> Result<RunState, RunStateError> {
         let (version, body) = bytes.split_first_chunk().ok_or(RunStateError::Impossible("it is empty"))?;
         let version = u32::from_le_bytes(*version);
@@ -176,9 +176,9 @@ impl RunState {
     /// The events as a log.
     ///
     /// # Errors
-    /// They are not in the order of time.
+    /// The events are out of order.
     pub fn event_log(&self) -> Result<EventLog, RunStateError> {
-        EventLog::from_events(self.events.clone()).ok_or(RunStateError::Impossible("its events go back in time"))
+        EventLog::from_events(self.events.clone()).ok_or(RunStateError::Impossible("its events are out of order"))
     }
 
     fn check(&self) -> Result<(), RunStateError> {
@@ -191,12 +191,12 @@ impl RunState {
         if self.sh_degree_start > 3 || log.events().iter().any(is_too_high) {
             return refuse("a degree is above 3");
         }
-        // Logits of others would be infinite, or no numbers.
+        // The logit of any other value is infinite or NaN.
         let is_opacity = |x: f32| x > 0.0 && x < 1.0;
         let is_wrong =
             |e: &Event| matches!(e.kind, EventKind::ResetOpacity { max_opacity } if !is_opacity(max_opacity));
         if log.events().iter().any(is_wrong) {
-            return refuse("an event resets opacities to what is none");
+            return refuse("an event resets opacities to an invalid value");
         }
         let ascends = self.histogram.windows(2).all(|pair| pair[0].0 < pair[1].0);
         if !ascends || self.histogram.last().is_some_and(|last| last.0 >= BINS) {
@@ -204,17 +204,17 @@ impl RunState {
         }
         let DatasetPrint { origin, scale, .. } = &self.dataset;
         if !(origin.iter().all(|x| x.is_finite()) && scale.is_normal() && *scale > 0.0) {
-            return refuse("its local frame is none");
+            return refuse("its local frame is invalid");
         }
         let is_time = |seconds: f64| seconds >= 0.0 && seconds.is_finite();
         if !is_time(self.train_seconds)
             || !is_time(self.traffic.stall_seconds)
             || !is_time(self.traffic.other_stall_seconds)
         {
-            return refuse("it has trained or waited for no length of time");
+            return refuse("its training or waiting time is invalid");
         }
         if self.test.is_some_and(|test| test.step > self.step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
-            return refuse("its last evaluation cannot be");
+            return refuse("its last evaluation is invalid");
         }
         Ok(())
     }

@@ -1,8 +1,8 @@
-//! Keys whose value is one of a few words: the words of every key, how a word becomes a value, and how a value is
-//! written. A value is parsed once, by the config file or by the command line; nothing later compares text.
+//! Keys whose value is one of a few words: parses words to values and writes values as words. The config file or the
+//! command line parses a value once; later code never compares text.
 //!
-//! Invariants: 1. a value is written as the word that it is read from; 2. a file and a flag refuse a word with the same
-//! sentence; 3. this file knows no default and no meaning of a value.
+//! Invariants: 1. a value is written as the word from which it is read; 2. file and flag refuse an unknown word with
+//! the same message; 3. this file holds no defaults and no meanings.
 
 use crate::base::simd::SimdPath;
 use crate::densify::strategy::StrategyName;
@@ -23,11 +23,11 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::borrow::Cow;
 use std::marker::PhantomData;
 
-/// The value of a key that is written as a word.
+/// A key's value that is written as a word.
 pub trait Choice: Clone + Send + Sync + 'static {
     /// The key, in kebab-case.
     const KEY: &'static str;
-    /// The words that a user may write, as help and errors list them; `groups:N` stands for all of its kind.
+    /// The words that a user may write, for help and errors; `groups:N` stands for any N.
     const WORDS: &'static [&'static str];
 
     /// The value of a word; `None` for a word that a user may not write.
@@ -40,7 +40,7 @@ pub trait Choice: Clone + Send + Sync + 'static {
 /// The value of a word.
 ///
 /// # Errors
-/// The word is unknown; the error is a sentence that names the key and the words.
+/// The word is unknown; the error names the key and its words.
 pub fn parse_choice<T: Choice>(word: &str) -> Result<T, String> {
     T::from_word(word).ok_or_else(|| unknown::<T>(T::KEY, word))
 }
@@ -58,21 +58,21 @@ fn listed(words: &[&str]) -> String {
     }
 }
 
-/// A choice that a run may leave open: the key's word for none is `auto`, or `off` for what a run can do without.
+/// An optional choice; the key's word for `None` is `auto`, or `off` for an optional feature.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Chosen<T>(pub Option<T>);
 
-/// Where training logs its numbers.
+/// Format of the metrics log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LogFormat {
     /// metrics.jsonl alone.
     Json,
-    /// Event files of TensorBoard beside it.
+    /// TensorBoard event files as well.
     Tensorboard,
 }
 
-/// Implements [`Choice`], reading and writing for enums whose values have one word each. Values after `hidden` are written
-/// but never read.
+/// Implements [`Choice`], reading and writing for enums whose values have one word each. Values after `hidden` are
+/// written but never read.
 macro_rules! choices {
     ($($key:literal: $type:ident { $($value:ident = $word:literal),+ } $(hidden { $($other:ident = $other_word:literal),+ })?)+) => { $(
         impl Choice for $type {
@@ -145,7 +145,7 @@ impl Choice for StrategyName {
 
 reading_and_writing!(StrategyName);
 
-/// Implements [`Choice`] for choices that may be left open, with the word that leaves them open.
+/// Implements [`Choice`] for optional choices, with their word for `None`.
 macro_rules! open_choices {
     ($($key:literal: $type:ident, $none:literal in [$($word:literal),+], $from:expr, $to:expr;)+) => { $(
         impl Choice for Chosen<$type> {
@@ -232,12 +232,12 @@ impl<T: Choice> TypedValueParser for ChoiceParser<T> {
     }
 }
 
-/// What renders: the value of `--device`.
+/// The renderer: the value of `--device`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Device {
     /// The CPU.
     Cpu,
-    /// The GPU that this chooses; the CPU where [`DeviceChoice::Auto`] finds none.
+    /// The chosen GPU; the CPU if [`DeviceChoice::Auto`] finds none.
     Gpu(DeviceChoice),
 }
 
@@ -248,9 +248,9 @@ impl std::str::FromStr for Device {
             "cpu" => Ok(Device::Cpu),
             "auto" => Ok(Device::Gpu(DeviceChoice::Auto)),
             "gpu" => Ok(Device::Gpu(DeviceChoice::Gpu)),
-            name if name.trim().is_empty() => Err(format!(
-                "unknown --device '{name}': use auto, gpu, cpu, or a part of the name of one of --list-devices"
-            )),
+            name if name.trim().is_empty() => {
+                Err(format!("unknown --device '{name}': use auto, gpu, cpu, or a part of a name from --list-devices"))
+            }
             name => Ok(Device::Gpu(DeviceChoice::Named(name.to_string()))),
         }
     }

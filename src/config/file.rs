@@ -1,10 +1,8 @@
-//! Every key of a run, once: the TOML file, the command line, the defaults and the class of each key come from the one
-//! list below.
+//! The keys of a run: one list defines the TOML file, the command line, the defaults and the class of each key.
 //!
 //! Invariants: 1. a key has the same kebab-case spelling in the file and as a flag; 2. flags override the file, the
-//! file overrides the defaults; 3. unknown keys are refused; 4. what a run resolved is written to its config.toml,
-//! which is itself a valid config file (its `[resolved]` table states facts and is ignored when read, as are the tables
-//! of [`super::published`]).
+//! file overrides the defaults; 3. unknown keys are refused; 4. the config.toml of a run is a valid config file; its
+//! `[resolved]` table and the tables of [`super::published`] hold facts and are ignored when read.
 
 use super::choice::{Chosen, Device, LogFormat};
 use super::key::{Class, Key};
@@ -31,16 +29,16 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
-/// Tables of a config file that state something and set nothing.
+/// Tables of a config file that hold facts instead of settings.
 pub(super) const TABLES: [&str; 3] = ["resolved", "published", "tier"];
 
-/// Longest config file, bytes; one with every key has some 8 KB.
+/// Longest config file, bytes; a file with every key has some 8 KB.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 /// Most steps of a run: the optimizer keeps 88 bytes for each.
 const STEPS_MAX: u32 = 10_000_000;
 /// Most random points to start from.
 const INIT_POINTS_MAX: u32 = 100_000_000;
-/// Most worker threads: each has a stack, and a slip of the finger must not fill the machine with them.
+/// Most worker threads: a typing error must not fill memory with stacks.
 const THREADS_MAX: u32 = 1024;
 
 /// Fewest and most rows of a page: below, the index and the headers outweigh the rows; above, a page is 48 MB.
@@ -58,14 +56,14 @@ macro_rules! config_keys {
             fn default() -> Self { TrainConfig { $($( $name: $default, )+)+ } }
         }
 
-        /// The keys as flags; only those typed are set.
+        /// The keys as flags; `None` for flags that were not given.
         #[derive(Debug, Clone, Default, clap::Args)]
         pub struct TrainOverrides {
             $($( $(#[doc = $doc])+ #[arg(long, help_heading = $heading $(, $($arg)+)?)] pub $name: Option<$ty>, )+)+
         }
 
         impl TrainOverrides {
-            /// Puts the typed flags over `config`.
+            /// Overrides `config` with the given flags.
             pub fn apply(self, config: &mut TrainConfig) { $($( if let Some(v) = self.$name { config.$name = v; } )+)+ }
         }
 
@@ -86,11 +84,11 @@ config_keys! {
         max_resolution: u32 = 0 => Numbers;
         /// Hold out every N-th photo, names in sorted order (index % N == 0); 0 = none
         test_every: u32 = 8 => Numbers;
-        /// Hold out every photo whose index is greater than N; -1 = off. Takes the place of --test-every
+        /// Hold out every photo whose index is greater than N, instead of --test-every; -1 = off
         [allow_negative_numbers = true] test_after: i64 = -1 => Numbers;
         /// Use masks found in masks/ (white = keep)
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] masks: bool = true => Numbers;
-        /// Masks mark what to leave out instead of what to keep
+        /// White in masks means leave out
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] invert_masks: bool = false => Numbers;
         /// Train without the photos that are registered but missing
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] allow_missing: bool = false => Place;
@@ -98,59 +96,59 @@ config_keys! {
         image_cache: ByteSize = ByteSize(1 << 30) => Free;
         /// Near plane, relative to the size of the scene
         near_plane: f64 = 0.01 => Numbers;
-        /// Start from this PLY: Gaussians if it has f_dc_0, else coloured points; or from the last generation of this store,
-        /// a folder (see gsscale-ckpt import): it may be larger than memory. Empty = the dataset's points
+        /// Start from this PLY (Gaussians if it has f_dc_0, else coloured points), or from the last generation of this
+        /// store folder (see gsscale-ckpt import), which may exceed memory. Empty = the dataset's points
         init_ply: String = String::new() => Derived;
         /// Random points in the views' frusta when the dataset has none; 0 = refuse such a dataset
         init_points: u32 = 100_000 => Numbers;
     }
     "Training" {
-        /// Total number of steps. A run that ended or stopped may go on to more: see --resume and --keep-checkpoint
+        /// Total number of steps; --resume can raise it (see --keep-checkpoint)
         steps: u32 = 30_000 => Length;
-        /// Steps over which the rate of positions decays; it stays there afterwards. 0 = --steps. A run that goes on to
-        /// more steps keeps the one it began with
+        /// Steps over which the learning rate of positions decays; it is constant afterwards. 0 = --steps. A resumed
+        /// run keeps its first value
         schedule_steps: u32 = 0 => Derived;
         /// Seed of every random draw
         seed: u64 = 42 => Numbers;
-        /// Highest band of spherical harmonics, 0 to 3
+        /// Highest degree of spherical harmonics (SH), 0 to 3
         sh_degree: u8 = 3 => Layout;
-        /// Raise the band in use every N steps; 0 = all from the start
+        /// Raise the SH degree every N steps; 0 = full degree from the start
         sh_every: u32 = 1000 => Numbers;
-        /// Band in use from the first step
+        /// SH degree of the first step
         sh_start: u8 = 0 => Numbers;
-        /// Order of the photos: auto, shuffle, groups:N (n spatial groups, shuffled within) or tour (along the way).
-        /// auto is shuffle where the scene fits in memory or little has to be read, else groups
+        /// Order of the photos: auto, shuffle, groups:N (N spatial groups, shuffled within) or tour (a path through
+        /// all). auto is shuffle if the scene fits in memory or reads are few, else groups
         view_order: Chosen<Order> = Chosen(None) => Numbers;
-        /// Gaussians that a page holds. Part of a run: other pages give other roundings
+        /// Capacity of a page, Gaussians. Fixed for a run, because it changes the rounding
         page_rows: u32 = 1024 => Layout;
-        /// Weight of 1 - SSIM in the loss; L1 has the rest
+        /// Weight of 1 - SSIM in the loss; the rest is L1
         ssim_lambda: f64 = 0.2 => Numbers;
-        /// Pixels that the loss's SSIM covers: valid (windows inside the image) or same (zero padded)
+        /// Pixels of the SSIM in the loss: valid (windows inside the image) or same (zero padded)
         ssim_padding: SsimPadding = SsimPadding::Valid => Numbers;
-        /// Rate of positions, times the scene scale
+        /// Learning rate of positions, times the scene scale
         means_lr: f64 = 1.6e-4 => Numbers;
-        /// Factor that the rate of positions has decayed to at the last step
+        /// Learning rate of positions at the last step, as a fraction of --means-lr
         means_lr_final: f64 = 0.01 => Numbers;
-        /// Rate of log-scales
+        /// Learning rate of log-scales
         scales_lr: f64 = 5e-3 => Numbers;
-        /// Rate of quaternions
+        /// Learning rate of quaternions
         quats_lr: f64 = 1e-3 => Numbers;
-        /// Rate of logit opacities
+        /// Learning rate of logit opacities
         opacities_lr: f64 = 5e-2 => Numbers;
-        /// Rate of the constant colour band
+        /// Learning rate of the constant SH band
         sh0_lr: f64 = 2.5e-3 => Numbers;
-        /// Rate of the higher colour bands
+        /// Learning rate of the higher SH bands
         shn_lr: f64 = 2.5e-3 / 20.0 => Numbers;
-        /// Adam's epsilon: 1e-16 to 1, because below 1e-16 it vanishes beside what f32 rounds off second moments
+        /// Adam's epsilon, 1e-16 to 1: below 1e-16 it is lost in the f32 rounding of second moments
         adam_eps: f64 = 1e-15 => Numbers;
-        /// Which Gaussians take an optimizer step: deferred (all; those without a gradient when they are next looked at),
-        /// dense (all, at once: slow, for comparison), or sparse (only those with a gradient, which is not exact)
+        /// Which Gaussians Adam updates: deferred (all; those without a gradient when next visible), dense (all at
+        /// every step: slow, for comparison), or sparse (only those with a gradient: not exact)
         optimizer: Method = Method::Deferred => Numbers;
-        /// What is kept of Adam's moments between steps: f32, or bf16, which is not exact and halves what they take on disk
+        /// Format of Adam's moments: f32, or bf16 (not exact; halves their size on disk)
         moments: Moments = Moments::F32 => Numbers;
-        /// Opacity of first Gaussians
+        /// Initial opacity
         init_opacity: f64 = 0.1 => Numbers;
-        /// Size of first Gaussians, times the distance to their three nearest neighbours
+        /// Initial size, times the distance to the three nearest neighbours
         init_scale: f64 = 1.0 => Numbers;
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
         max_alpha: f64 = 0.99 => Numbers;
@@ -160,13 +158,13 @@ config_keys! {
     "Densification" {
         /// default (clone, split, prune, reset) or none
         strategy: StrategyName = StrategyName::Default => Numbers;
-        /// Never more Gaussians than this; 0 = no cap
+        /// Most Gaussians; 0 = no cap
         max_gaussians: u64 = 0 => Numbers;
-        /// First step after which rounds may run
+        /// Step after which densification rounds begin
         refine_start: u32 = 500 => Numbers;
-        /// Step at which rounds and resets end
+        /// Step at which densification rounds and opacity resets end
         refine_stop: u32 = 15_000 => Numbers;
-        /// Steps between rounds
+        /// Steps between densification rounds
         refine_every: u32 = 100 => Numbers;
         /// Steps between opacity resets, to twice --prune-opa; 0 = never
         reset_every: u32 = 3000 => Numbers;
@@ -182,62 +180,61 @@ config_keys! {
     "Output" {
         /// Evaluate on the held-out photos every N steps; 0 = only at the end
         eval_every: u32 = 0 => Free;
-        /// Write a PLY every N steps and keep the run as it is then as a named checkpoint, step-N; 0 = only at the end
+        /// Write a PLY and keep a named checkpoint (step-N) every N steps; 0 = only a PLY at the end
         save_every: u32 = 0 => Free;
         /// Write a line of metrics every N steps
         log_every: u32 = 100 => Free;
-        /// Where numbers go while training: json (metrics.jsonl), or tensorboard for event files beside it
+        /// Log of metrics: json (metrics.jsonl), or tensorboard (event files as well)
         log: LogFormat = LogFormat::Json => Free;
-        /// SSIM that is reported: same (zero padded, as the 3DGS code), valid or reflect
+        /// SSIM to report: same (zero padded, as the 3DGS code), valid or reflect
         ssim_variant: SsimVariant = SsimVariant::Same => Reported;
-        /// Report colour-corrected PSNR beside PSNR: affine (per channel, gsplat's), quadratic (Zip-NeRF's, nerfstudio's)
-        /// or off. It is another measure than PSNR, never comparable with it, and always named
+        /// Also report colour-corrected PSNR: affine (per channel, as gsplat), quadratic (as Zip-NeRF and nerfstudio)
+        /// or off. It is not comparable with PSNR
         [alias = "colour-correct"] color_correct: Chosen<ColorCorrect> = Chosen(None) => Free;
         /// Coordinates of the PLY: dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;
     }
     "Memory and disk" {
-        /// Memory that the run may take; 0 = 70 % of what this machine, or its control group, has available
+        /// Memory limit of the run; 0 = 70 % of the memory available on this machine or in its control group
         host_mem: ByteSize = ByteSize(0) => Free;
-        /// Folder for pages that do not fit in memory, on a fast drive; empty = all pages stay in memory. It is the
-        /// checkpoint of the run as well; that of a run in memory is the folder `checkpoint` inside --out
+        /// Folder on a fast drive for pages that do not fit in memory; it is also the checkpoint of the run. Empty =
+        /// all pages stay in memory, and the checkpoint is the folder `checkpoint` inside --out
         spill_dir: String = String::new() => Lasting;
-        /// Keep the checkpoint (the spill directory, or `checkpoint` inside --out) at the end of the run too, to go on to
-        /// more steps later or to look at it with gsscale-ckpt. Without it, it is kept only when the run stops early
+        /// Keep the checkpoint at the end of the run, for more steps later or for gsscale-ckpt. Otherwise it is kept
+        /// only if the run stops early
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] keep_checkpoint: bool = false => Lasting;
-        /// Pages held in memory at once; 0 = as many as --host-mem allows
+        /// Most pages in memory; 0 = as many as --host-mem allows
         frames: u32 = 0 => Free;
-        /// How pages are read and written: auto, uring, mmap or pread. Never changes results
+        /// I/O engine for pages: auto, uring, mmap or pread. Never changes results
         io: IoEngine = IoEngine::Auto => Free;
-        /// How pages are stored: raw, halves (for --moments bf16), zstd:LEVEL, or auto (what the drive's speed and the
-        /// moments favour). Never changes results
+        /// Codec of stored pages: raw, halves (for --moments bf16), zstd:LEVEL, or auto (by the speed of the drive and
+        /// --moments). Never changes results
         spill_codec: Chosen<Codec> = Chosen(None) => Free;
-        /// Seconds from one commit to the next: a run that is killed loses no more. 0 = only when it is asked to stop, and
-        /// after the last step. auto = 10 to 60: as often as commits hold training up for less than 1 % of the time, and
-        /// later only where they would write more than 256 GiB an hour. Never changes results
+        /// Seconds between commits, which is the most that a killed run loses. 0 = only on a stop request and after the
+        /// last step. auto = 10 to 60, so that commits delay training by less than 1 %; longer if commits would write
+        /// more than 256 GiB an hour. Never changes results
         commit_every: CommitEvery = CommitEvery::Auto => Free;
-        /// Seconds that a run waits for space when the drive of --spill-dir is full, before it stops with its last commit
+        /// Seconds to wait for space on a full drive before the run stops with its last commit
         disk_full_wait: f64 = 600.0 => Free;
-        /// Which page leaves memory first: belady (next used last) or lru. Never changes results
+        /// Which page to evict: belady (farthest next use) or lru. Never changes results
         evict: EvictPolicy = EvictPolicy::FarthestNextUse => Free;
-        /// When pages move: overlap (while steps compute), ahead (before they are needed, but the step waits for it) or
-        /// demand (when a step needs them). The last two are for comparison. Never changes results
+        /// When pages move: overlap (during steps), ahead (prefetched between steps, which wait) or demand (when a step
+        /// needs them). The last two are for comparison. Never changes results
         transfers: Transfers = Transfers::Overlap => Free;
-        /// Bytes of pages that may be read ahead of their step; 0 = an eighth of the frames
+        /// Most bytes of prefetched pages; 0 = an eighth of the frames
         prefetch_bytes: ByteSize = ByteSize(0) => Free;
     }
     "Machine" {
         /// Worker threads; 0 = one per core. Never changes results
         threads: u32 = 0 => Free;
-        /// Instruction path: auto, avx512, avx2 or baseline. Results are the same bits per path
+        /// Instruction path: auto, avx512, avx2 or baseline. Each path always gives the same bits
         simd: Chosen<SimdPath> = Chosen(None) => Instructions;
-        /// What renders: auto (a hardware GPU if there is one, else the CPU), gpu (a software adapter counts too), cpu,
-        /// or a part of the name of one of --list-devices
+        /// Renderer: auto (a hardware GPU if there is one, else the CPU), gpu (a software adapter as well), cpu, or a
+        /// part of a name from --list-devices
         device: Device = Device::Gpu(DeviceChoice::Auto) => Free;
-        /// The same command gives the same bits again on the same device. Every run does so, at no cost: there is no
-        /// faster way that does not
+        /// Repeated runs give the same bits on the same device. Always on; there is no faster mode
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] deterministic: bool = true => Free;
-        /// Memory that may be taken on the device; 0 = what the device has
+        /// Memory limit on the device; 0 = all of its memory
         device_mem: ByteSize = ByteSize(0) => Free;
     }
 }
@@ -293,13 +290,13 @@ impl TrainConfig {
         let read = File::open(path).and_then(|file| file.take(FILE_BYTES_MAX + 1).read_to_string(&mut text));
         read.map_err(|e| InputError::io(path, "reading the config", &e))?;
         if text.len() as u64 > FILE_BYTES_MAX {
-            return Err(InputError::new(path, "the file is far larger than any config", "give a TOML file of keys"));
+            return Err(InputError::new(path, "the file is too large for a config", "give a TOML file of keys"));
         }
         TrainConfig::parse(&text)
             .map_err(|problem| InputError::new(path, problem, "see configs/default.toml for every key and its meaning"))
     }
 
-    /// Parses a config text over the defaults; the error is a sentence.
+    /// Parses a config text over the defaults.
     pub fn parse(text: &str) -> Result<TrainConfig, String> {
         let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| e.to_string())?;
         for name in TABLES {
@@ -387,7 +384,7 @@ impl TrainConfig {
                 return refuse(key, "a number from 0 on");
             }
         }
-        // As the events of a run have it.
+        // Compare in f32, as events store the value.
         if self.prune_opa as f32 >= 0.5 {
             return refuse("prune-opa", "less than 0.5");
         }
@@ -414,17 +411,17 @@ impl TrainConfig {
         self.check_adam_eps()
     }
 
-    /// Checks Adam's epsilon: alone, where it is that of a checkpoint.
+    /// Checks Adam's epsilon; separate for the config of a checkpoint.
     ///
     /// # Errors
-    /// It is out of range.
+    /// The epsilon is out of range.
     pub fn check_adam_eps(&self) -> InputResult<()> {
         if (EPS_MIN..=1.0).contains(&self.adam_eps) {
             return Ok(());
         }
         let problem = format!(
-            "{:e} is out of range: below 1e-16 it does not cover the second moments that f32 rounds to zero, so Gaussians \
-             would leave the bounds of their pages, and above 1 nothing moves",
+            "{:e} is out of range: below 1e-16, second moments that f32 rounds to zero let Gaussians leave the bounds \
+             of their pages; above 1, training stands still",
             self.adam_eps
         );
         Err(InputError::new("--adam-eps", problem, "use 1e-16 to 1; 1e-15 is usual"))
@@ -436,19 +433,19 @@ fn refuse(key: &str, allowed: &str) -> InputResult<()> {
     Err(InputError::new(format!("--{key}"), "the value is out of range", format!("use {allowed}")))
 }
 
-/// Parses the command line of a program whose flags hold [`TrainOverrides`]; prints help and usage errors itself.
+/// Parses the command line of a program with [`TrainOverrides`]; prints help and usage errors and exits.
 pub fn parse_command_line<T: clap::CommandFactory + clap::FromArgMatches>() -> T {
     parse_arguments(&std::env::args_os().collect::<Vec<_>>())
 }
 
-/// As [`parse_command_line`], of these arguments, the program's name first.
+/// As [`parse_command_line`], for given arguments, starting with the program's name.
 pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[std::ffi::OsString]) -> T {
     let matches = help_with_defaults(T::command()).get_matches_from(arguments);
     T::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
 }
 
-/// The command with the default of each key in its help. (The flags have no clap defaults: an absent flag must leave
-/// the config file's value alone.)
+/// Adds the default of each key to its help. Flags have no clap defaults, because an absent flag must keep the config
+/// file's value.
 fn help_with_defaults(mut command: clap::Command) -> clap::Command {
     let defaults = toml::Table::try_from(TrainConfig::default()).unwrap_or_default();
     for key in KEYS {

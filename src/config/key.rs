@@ -1,79 +1,78 @@
-//! What is known of a key beside its value: where it stands in help, what it means, and what a change of it means.
+//! A key's heading in help, its meaning, and its class: the effect of a change.
 
 /// A key of the config.
 #[derive(Debug, Clone, Copy)]
 pub struct Key {
-    /// The group of keys that it is listed in.
+    /// Its heading in help.
     pub heading: &'static str,
-    /// The field of [`super::file::TrainConfig`], which is the id of the flag as well.
+    /// Its field in [`super::file::TrainConfig`], also the id of the flag.
     pub field: &'static str,
     /// Its meaning, for help and for configs/default.toml.
     pub meaning: &'static str,
-    /// What a change of it means.
+    /// The effect of a change.
     pub class: Class,
 }
 
 impl Key {
-    /// The name in files and on the command line: kebab-case.
+    /// Its name in files and on the command line, in kebab-case.
     pub fn name(&self) -> String {
         self.field.replace('_', "-")
     }
 }
 
-/// What a change of a key means: for a run that goes on with other settings, and for a run that is compared with a
-/// published one.
+/// The effect of a changed key on a resumed run, and on the comparison with a published run.
 ///
-/// | class | on `--resume` | beside a published run |
+/// | class | on `--resume` | compared with a published run |
 /// | --- | --- | --- |
 /// | `Numbers` | refused without `--accept-changes` | another run |
 /// | `Layout` | refused | another run |
-/// | `Derived` | what follows from it is compared, not the key | another run |
-/// | `Instructions` | what follows from it is compared, not the key | the same run |
+/// | `Derived` | its derived value is compared | another run |
+/// | `Instructions` | its derived value is compared | the same run |
 /// | `Place` | refused without `--accept-changes` | the same run |
-/// | `Free` | said; holds for this life of the run alone | the same run |
-/// | `Lasting` | said; holds for all later lives | the same run |
-/// | `Reported` | said; holds for this life of the run alone | another figure |
-/// | `Length` | said; holds for all later lives | another run |
+/// | `Free` | reported; valid until the next resume | the same run |
+/// | `Lasting` | reported; kept for later resumes | the same run |
+/// | `Reported` | reported; valid until the next resume | another figure |
+/// | `Length` | reported; kept for later resumes | another run |
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Class {
     /// Changes the numbers of the steps.
     Numbers,
-    /// The stored pages are laid out by it.
+    /// Determines the layout of stored pages.
     Layout,
-    /// Another value may mean the same: of `schedule-steps` the steps that it stands for are compared, of `init-ply` the
-    /// digest of first Gaussians, wherever the file lies now.
+    /// Different values can have the same effect: for `schedule-steps` the resolved steps are compared, for `init-ply`
+    /// the digest of the first Gaussians.
     Derived,
-    /// The instruction path: as [`Class::Derived`], and at most the last bits differ, as they do with another seed.
+    /// The instruction path: as [`Class::Derived`]; results differ at most in rounding.
     Instructions,
-    /// Where the dataset is found, and whether it may be incomplete.
+    /// Location of the dataset, and whether it may be incomplete.
     Place,
-    /// Where and how fast a run computes, or what it writes.
+    /// Resources, speed and outputs of a run.
     Free,
-    /// As [`Class::Free`], for what a run keeps.
+    /// As [`Class::Free`], for the place and the keeping of the checkpoint.
     Lasting,
-    /// Changes no Gaussian, but a figure that is reported.
+    /// Changes a reported figure but no Gaussian.
     Reported,
-    /// How far a run goes; what its rates follow is `schedule-steps`.
+    /// Number of steps. The learning rates follow `schedule-steps` instead.
     Length,
 }
 
 impl Class {
-    /// Whether a run may go on with another value without being asked: no step computes other numbers.
+    /// Whether a run may resume with another value without --accept-changes, because no step computes other numbers.
     pub fn is_free(self) -> bool {
         matches!(self, Class::Free | Class::Lasting | Class::Reported | Class::Length)
     }
 
-    /// Whether another value holds for all later lives of a run, not for this life alone. Free keys may not.
+    /// Whether another value is kept for later resumes.
     pub fn lasts(self) -> bool {
         !matches!(self, Class::Free | Class::Reported)
     }
 
-    /// Whether what follows from the value is compared instead of the value.
+    /// Whether the derived value is compared instead of the key.
     pub fn is_derived(self) -> bool {
         matches!(self, Class::Derived | Class::Instructions)
     }
 
-    /// Whether another value makes a run another one than a published run, or its figures other figures.
+    /// Whether another value makes a run or its figures differ from a published run.
     pub fn makes_another_run(self) -> bool {
         !matches!(self, Class::Free | Class::Lasting | Class::Place | Class::Instructions)
     }

@@ -1,6 +1,5 @@
-//! What follows from a config: the options of each layer, and what the run will take of memory.
-//!
-//! The libraries below never see the file; they get their own option structs from here.
+//! Derives the options of each module from a config. Other modules receive their own option structs and never see the
+//! config.
 
 use super::file::TrainConfig;
 use crate::base::simd::SimdPath;
@@ -20,26 +19,26 @@ use crate::scene::init::InitOptions;
 use crate::schedule::order::Order;
 use std::sync::Arc;
 
-/// Everything that the training loop needs, resolved.
+/// Resolved options of the training loop.
 #[derive(Debug, Clone)]
 pub struct RunOptions {
     /// Total steps.
     pub steps: u32,
     /// Seed of every draw.
     pub seed: u64,
-    /// Degree that rows are stored with.
+    /// Highest SH degree.
     pub sh_degree: u8,
-    /// Steps between raises of the degree in use; 0 = all from the start.
+    /// Steps between raises of the SH degree; 0 = full degree from the start.
     pub sh_every: u32,
-    /// Degree in use at step 0: what was asked for, or what the Gaussians that a run starts from were trained with.
+    /// SH degree at step 0: that of the config or of the Gaussians from which the run starts.
     pub sh_degree_start: u8,
     /// Cap on Gaussians; 0 = none.
     pub max_gaussians: usize,
-    /// Rows that a page holds at most.
+    /// Capacity of a page, rows.
     pub page_rows: usize,
-    /// Order of the views; a shuffle where that is still to be settled.
+    /// View order; a shuffle while `auto` is unresolved.
     pub view_order: Order,
-    /// Rendering, but for the degree in use.
+    /// Render options, except for the current SH degree.
     pub render: RenderOptions,
     /// Loss.
     pub loss: LossOptions,
@@ -47,21 +46,21 @@ pub struct RunOptions {
     pub rates: Rates,
     /// Adam's constants.
     pub adam: AdamConfig,
-    /// When rows without a gradient take their steps.
+    /// Which rows the optimizer updates.
     pub optimizer: Method,
-    /// What is kept of its moments.
+    /// Format of stored moments.
     pub moments: Moments,
-    /// When the scene densifies, and how.
+    /// Densification strategy.
     pub strategy: Arc<dyn Strategy>,
     /// Scene scale, local units.
     pub scene_scale: f32,
-    /// SSIM that is reported.
+    /// SSIM to report.
     pub ssim_variant: SsimVariant,
-    /// How colours are fitted for the PSNR that is reported beside PSNR, where it was asked for.
+    /// Method of the colour-corrected PSNR; `None` for none.
     pub color_correct: Option<ColorCorrect>,
     /// Coordinates of PLY files.
     pub export_frame: ExportFrame,
-    /// Cadences in steps; 0 = only at the end.
+    /// Steps between evaluations; 0 = only at the end.
     pub eval_every: u32,
     /// Steps between PLY files; 0 = only at the end.
     pub save_every: u32,
@@ -114,14 +113,14 @@ impl RunOptions {
         }
     }
 
-    /// Bands in use at 0-based `step`.
+    /// SH degree at 0-based `step`.
     pub fn sh_degree_at(&self, step: u32) -> u8 {
         let raised = step.checked_div(self.sh_every).unwrap_or(u32::MAX);
         raised.max(u32::from(self.sh_degree_start)).min(u32::from(self.sh_degree)) as u8
     }
 }
 
-/// The strategy that a config names, with its keys.
+/// The strategy of a config.
 fn strategy(config: &TrainConfig) -> Arc<dyn Strategy> {
     match config.strategy {
         StrategyName::None => Arc::new(NoStrategy),
@@ -144,17 +143,17 @@ fn default_strategy(config: &TrainConfig) -> DefaultStrategy {
     }
 }
 
-/// Steps over which the rates decay.
+/// Steps over which the learning rate decays.
 pub fn schedule_steps(config: &TrainConfig) -> u32 {
     if config.schedule_steps == 0 { config.steps } else { config.schedule_steps }
 }
 
-/// The instruction path that a config asks for on this machine.
+/// The instruction path of a config on this machine.
 pub fn simd_path(config: &TrainConfig) -> SimdPath {
     config.simd.0.unwrap_or_else(SimdPath::best)
 }
 
-/// How the scene is to be read.
+/// Options for reading the scene.
 pub fn read_options(config: &TrainConfig) -> ReadOptions {
     ReadOptions {
         images: (!config.images.is_empty()).then(|| config.images.clone()),
@@ -163,7 +162,7 @@ pub fn read_options(config: &TrainConfig) -> ReadOptions {
     }
 }
 
-/// How the dataset is to be loaded.
+/// Options for loading the dataset.
 pub fn load_options(config: &TrainConfig) -> LoadOptions {
     LoadOptions {
         data_factor: config.data_factor,
@@ -178,12 +177,12 @@ pub fn load_options(config: &TrainConfig) -> LoadOptions {
     }
 }
 
-/// Degree in use from the first step, where the Gaussians themselves do not ask for more.
+/// SH degree of the first step, unless the given Gaussians have more.
 pub fn first_sh_degree(config: &TrainConfig) -> u8 {
     if config.sh_every == 0 { config.sh_degree } else { config.sh_start.min(config.sh_degree) }
 }
 
-/// How first Gaussians are made: without bands that are not in use yet.
+/// Options for creating first Gaussians, without SH bands above the first degree.
 pub fn init_options(config: &TrainConfig) -> InitOptions {
     InitOptions {
         sh_degree: first_sh_degree(config),

@@ -1,5 +1,5 @@
-//! What the user wrote ([`mod@file`]; its words: [`choice`]; what a change of a key means: [`key`]), what follows from it
-//! ([`limits`], [`residence`]), and runs that were published ([`published`]).
+//! The config of a run: its keys ([`mod@file`], [`key`]) and their words ([`choice`]), options derived from them
+//! ([`limits`], [`residence`]), and published runs ([`published`]).
 
 pub mod choice;
 pub mod file;

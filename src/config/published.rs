@@ -1,11 +1,11 @@
-//! Published runs: what a config file says beside its settings, for whoever wants to set our figures beside a paper's.
+//! Configs of published runs, for comparison with the figures of papers.
 //!
-//! Such a file is an ordinary config with two kinds of tables more: `[published]` (what the scene is, where it is to be
-//! had, what was reached) and `[tier.NAME]` (densification settings that make more or fewer Gaussians). Training ignores
-//! both ([`TrainConfig::parse`]); here they are read as strictly as the settings.
+//! Such a file is a config with two further kinds of tables: `[published]` (the scene, its sources, published results)
+//! and `[tier.NAME]` (densification settings for more or fewer Gaussians). Training ignores both
+//! ([`TrainConfig::parse`]); here they are read strictly.
 //!
-//! The files' values are GS-Scale's: the dictionary `configs` at the end of its trainers, its paper (arXiv 2509.15645)
-//! and what its code does; each file names the traps.
+//! The values are GS-Scale's: from the dictionary `configs` at the end of its trainers, from its paper (arXiv
+//! 2509.15645) and from the behaviour of its code; comments in each file name the pitfalls.
 
 use super::file::{KEYS, TABLES, TrainConfig};
 use super::key::Key;
@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// The runs that come with the program, by name.
+/// The built-in runs, by name.
 pub const BUILT_IN: [(&str, &str); 8] = [
     ("rubble", include_str!("../../configs/rubble.toml")),
     ("building", include_str!("../../configs/building.toml")),
@@ -31,11 +31,11 @@ pub const BUILT_IN: [(&str, &str); 8] = [
 /// A published run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PublishedRun {
-    /// Its name: that of the file, without the ending.
+    /// Its name: the file name without extension.
     pub name: String,
-    /// Settings, those of the active tier.
+    /// Settings of the active tier.
     pub config: TrainConfig,
-    /// What was published about it.
+    /// Published facts.
     pub facts: Published,
     /// Densification tiers by name.
     pub tiers: BTreeMap<String, Tier>,
@@ -45,67 +45,67 @@ pub struct PublishedRun {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct Published {
-    /// Dataset and scene, for people.
+    /// Dataset and scene, as text.
     pub title: String,
-    /// Names of the folder layouts in which the scene is to be had, the best first.
+    /// Names of the folder layouts in which the scene is available, the best first.
     pub layouts: Vec<String>,
-    /// Where photos, poses and points are to be had.
+    /// Sources of photos, poses and points.
     pub fetch: Vec<String>,
-    /// Files of points inside the scene's folder, of which the first that exists replaces the model's own.
+    /// Files of points inside the scene's folder; the first existing one replaces the model's points.
     #[serde(default)]
     pub clouds: Vec<String>,
     /// Photos of the published set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub views: Option<u32>,
-    /// Of these, held out.
+    /// Held-out photos among them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub held_out: Option<u32>,
-    /// Width and height that training used, pixels.
+    /// Width and height used in training, pixels.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub size: Option<[u32; 2]>,
-    /// What else is to be known.
+    /// Further notes.
     #[serde(default)]
     pub notes: Vec<String>,
-    /// Quality that was reached, where it was published.
+    /// Published quality, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub expected: Option<Expected>,
-    /// Memory that was saved, where it was published.
+    /// Published memory saving, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory: Option<MemorySaving>,
 }
 
-/// Means over the held-out photos: GS-Scale's, and those of the trainer that it changed.
+/// Means over the held-out photos: of GS-Scale, and of the original trainer that it modifies.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct Expected {
-    /// dB.
+    /// PSNR, dB.
     pub psnr: f64,
-    /// Structural similarity.
+    /// SSIM.
     pub ssim: f64,
-    /// Which one.
+    /// Variant of SSIM.
     pub ssim_variant: SsimVariant,
     /// LPIPS.
     pub lpips: f64,
-    /// Network and input range of it: `alex, signed`.
+    /// Network and input range of LPIPS: `alex, signed`.
     pub lpips_variant: String,
-    /// The unchanged trainer's.
+    /// PSNR of the original trainer, dB.
     pub original_psnr: f64,
-    /// The unchanged trainer's.
+    /// SSIM of the original trainer.
     pub original_ssim: f64,
-    /// The unchanged trainer's.
+    /// LPIPS of the original trainer.
     pub original_lpips: f64,
 }
 
-/// GPU memory of the unchanged trainer over GS-Scale's, as PyTorch counts what it allocated.
+/// GPU memory of the original trainer over GS-Scale's, as allocated by PyTorch.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct MemorySaving {
-    /// On this scene, where the text states it.
+    /// On this scene, if the paper states it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub saving: Option<f64>,
-    /// Least and most of its six scenes.
+    /// Least and most over the paper's six scenes.
     pub saving_range: [f64; 2],
-    /// Their geometric mean.
+    /// Geometric mean over these scenes.
     pub saving_mean: f64,
 }
 
@@ -121,7 +121,7 @@ pub struct Tier {
     pub refine_stop: u32,
 }
 
-/// The tables beside the settings.
+/// The tables besides the settings.
 #[derive(Deserialize)]
 struct Tables {
     published: Published,
@@ -130,10 +130,10 @@ struct Tables {
 }
 
 impl PublishedRun {
-    /// The run of this name, or in this file.
+    /// Finds a run by its name or its file.
     ///
     /// # Errors
-    /// No such name or file, a file without `[published]`, or settings that are refused.
+    /// The name or file does not exist, the file has no `[published]`, or its settings are invalid.
     pub fn find(name_or_file: &Path) -> InputResult<PublishedRun> {
         let built_in = BUILT_IN.iter().find(|(name, _)| Path::new(name) == name_or_file);
         if let Some((name, text)) = built_in {
@@ -141,7 +141,7 @@ impl PublishedRun {
         }
         let names = BUILT_IN.map(|(name, _)| name).join(", ");
         let text = std::fs::read_to_string(name_or_file).map_err(|e| {
-            let problem = format!("neither a published run nor a file that can be read: {e}");
+            let problem = format!("neither a published run nor a readable file: {e}");
             InputError::new(name_or_file, problem, format!("name one of {names}, or a config file with [published]"))
         })?;
         let stem = name_or_file.file_stem().unwrap_or_default().to_string_lossy();
@@ -163,14 +163,14 @@ impl PublishedRun {
         Ok(PublishedRun { name: name.to_string(), config, facts: published, tiers: tier })
     }
 
-    /// Puts the settings of a tier over the config.
+    /// Applies the settings of a tier to the config.
     ///
     /// # Errors
-    /// There is no such tier.
+    /// The tier does not exist.
     pub fn use_tier(&mut self, name: &str) -> InputResult<()> {
         let Some(tier) = self.tiers.get(name) else {
             let names: Vec<&str> = self.tiers.keys().map(String::as_str).collect();
-            let problem = format!("'{name}' is no tier of {}", self.name);
+            let problem = format!("{} has no tier '{name}'", self.name);
             return Err(InputError::new("--tier", problem, format!("use one of: {}", names.join(", "))));
         };
         self.config.grow_grad2d = tier.grow_grad2d;
@@ -179,7 +179,7 @@ impl PublishedRun {
         Ok(())
     }
 
-    /// Name of the tier whose settings the config has.
+    /// Name of the tier with the config's settings.
     pub fn tier_of(&self, config: &TrainConfig) -> Option<&str> {
         let of = |t: &Tier| (t.grow_grad2d, t.grow_scale3d, t.refine_stop);
         let used = (config.grow_grad2d, config.grow_scale3d, config.refine_stop);
@@ -187,10 +187,10 @@ impl PublishedRun {
     }
 }
 
-/// Settings of `used` that make it another run than `published`: `steps = 200 instead of 200000`.
+/// Settings of `used` that differ from `published` and matter: `steps = 200 instead of 200000`.
 pub fn differences(published: &TrainConfig, used: &TrainConfig) -> Vec<String> {
     let [before, after] = [published, used].map(|c| toml::Table::try_from(c).unwrap_or_default());
-    // A run that went on to more steps has the number written that 0 stood for.
+    // An extended run has the resolved number written instead of 0.
     let is_same_schedule = schedule_steps(published) == schedule_steps(used);
     let is_free = |name: &str| {
         let same_run = |key: &Key| key.name() == name && !key.class.makes_another_run();

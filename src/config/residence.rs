@@ -1,4 +1,4 @@
-//! Where the pages of a run live while it trains, as `--spill-dir` and `--frames` say together.
+//! Where the pages of a run live, by `--spill-dir` and `--frames`.
 
 use super::file::TrainConfig;
 use std::path::{Path, PathBuf};
@@ -8,14 +8,14 @@ use std::path::{Path, PathBuf};
 pub enum Residence<'a> {
     /// All pages in memory; the run commits to its output folder.
     Memory,
-    /// In `--frames` frames over a store in memory, without a drive and without commits: for comparisons.
+    /// In `--frames` frames over a store in memory, without commits; for comparisons.
     Frames,
-    /// In frames over this folder on a drive, which is the checkpoint of the run as well.
+    /// In frames over this spill directory, which is also the checkpoint of the run.
     SpillDir(&'a Path),
 }
 
 impl<'a> Residence<'a> {
-    /// The folder that `--spill-dir` names.
+    /// The spill directory, if any.
     pub fn spill_dir(self) -> Option<&'a Path> {
         match self {
             Residence::SpillDir(folder) => Some(folder),

@@ -3,10 +3,10 @@
 //!
 //! Invariants: 1. the number of frames follows from bytes: the budget minus what the run holds beside its frames. It
 //! never follows from a page count guessed at the start. A frame takes memory once a page fills it; 2. frames shrink
-//! before the step that needs their memory, by the largest growth that its view may have had since the last step; frames
-//! removed for growth that did not come return; 3. possible growth never stops a run: a step gets the frames that it
-//! needs while the run's current memory leaves room for them. A run without --host-mem exceeds its first share for them,
-//! up to the available memory of the machine; 4. no bit of the result depends on the budget.
+//! before the step that needs their memory, by the largest growth that its view may have had since the last step;
+//! frames removed for growth that did not come return; 3. possible growth never stops a run: a step gets the frames
+//! that it needs while the run's current memory leaves room for them. A run without --host-mem exceeds its first share
+//! for them, up to the available memory of the machine; 4. no bit of the result depends on the budget.
 
 use super::memory::{INDEX_BYTES, MemoryEstimate, bytes_of_copies, frames_in_memory, obtainable_bytes};
 use super::pages::{PAGES_PER_BATCH, PagedScene};

@@ -1,7 +1,7 @@
-//! What is other than it was when a run goes on: its config, key by key, and its dataset.
+//! Differences between a run and its resume: the config, key by key, and the dataset.
 //!
-//! A key's class ([`Class`]) stands beside the key. Keys that change no number of the result may be given anew, which is only
-//! said; keys that do are refused unless the user accepts it; keys that the stored pages are laid out by cannot change.
+//! The class of a key ([`Class`]) decides: a key that changes no number of the result may change, with a message; a key
+//! that changes numbers is refused unless the user accepts it; a key of the page layout cannot change.
 
 use super::dataset_print::{DatasetChanges, dataset_changes};
 use crate::base::error::{InputError, InputResult};
@@ -14,11 +14,11 @@ use crate::dataset::loader::Dataset;
 use serde::Deserialize;
 use std::path::Path;
 
-/// The config that a run keeps when it goes on with `config`: that of its file, with what changes numbers and how far it
-/// goes and where its checkpoint is as they are now.
+/// The config that a run keeps when it resumes with `config`: that of its file, with the lasting keys of `config`
+/// (numbers, length, place of the checkpoint).
 ///
 /// # Errors
-/// None that a config can cause.
+/// None for a valid config.
 pub(super) fn kept_config(file: &Path, of_file: &TrainConfig, config: &TrainConfig) -> InputResult<TrainConfig> {
     let broken = |e: String| InputError::new(file, e, "report this as a bug");
     let table = |config: &TrainConfig| toml::Table::try_from(config).map_err(|e| broken(e.to_string()));
@@ -30,7 +30,7 @@ pub(super) fn kept_config(file: &Path, of_file: &TrainConfig, config: &TrainConf
     Ok(with_absolute_paths(kept))
 }
 
-/// The config with paths that do not depend on where the program was started.
+/// The config with absolute paths.
 pub(super) fn with_absolute_paths(config: TrainConfig) -> TrainConfig {
     let absolute = |path: &String| match path.as_str() {
         "" => String::new(),
@@ -39,28 +39,28 @@ pub(super) fn with_absolute_paths(config: TrainConfig) -> TrainConfig {
     TrainConfig { spill_dir: absolute(&config.spill_dir), init_ply: absolute(&config.init_ply), ..config }
 }
 
-/// Refuses to go on from pages that were trained with too small an epsilon: their bounds do not hold, and another epsilon
-/// from now on does not bring them back. No earlier check can: the config in the run's folder may be another by now.
+/// Refuses to resume from pages trained with too small an epsilon: their bounds do not hold, and a new epsilon does not
+/// repair them. Checks the config of the commit, since the config in the run's folder may have changed.
 fn check_eps_of_commit(file: &Path, then: &TrainConfig) -> InputResult<()> {
     let Err(error) = then.check_adam_eps() else { return Ok(()) };
-    let problem = format!("the last commit was trained with an --adam-eps that is refused by now: {}", error.problem);
+    let problem = format!("the last commit was trained with an invalid --adam-eps: {}", error.problem);
     let remedy = "start a new run from its Gaussians: gsscale-ckpt export, then --init-ply with that file";
     Err(InputError::new(file, problem, remedy))
 }
 
-/// What is other than it was, a line each.
+/// Differences, one line each.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Changes {
-    /// What changes no number.
+    /// Differences that change no number.
     pub free: Vec<String>,
-    /// What changes numbers.
+    /// Differences that change numbers.
     pub numbers: Vec<String>,
-    /// What cannot change.
+    /// Differences with which the run cannot resume.
     pub fixed: Vec<String>,
 }
 
 impl Changes {
-    /// The keys of `config` beside those of the last commit.
+    /// Compares the keys of `config` with those of the last commit.
     ///
     /// # Errors
     /// The config of the commit cannot be read.
@@ -75,7 +75,7 @@ impl Changes {
         let mut changes = Changes::default();
         for (name, now) in &here {
             let Some(class) = KEYS.iter().find(|key| key.name() == *name).map(|key| key.class) else { continue };
-            // A key that an older commit did not know has the default since, and the user hears of it.
+            // A key unknown to the older commit counts as a difference, so that the user sees its default.
             let then = there.get(name).filter(|_| written.contains_key(name));
             if class.is_derived() || then == Some(now) {
                 continue;
@@ -85,7 +85,7 @@ impl Changes {
                 class if class.is_free() => &mut changes.free,
                 _ => &mut changes.numbers,
             };
-            let then = then.map_or_else(|| "not there".to_string(), toml::Value::to_string);
+            let then = then.map_or_else(|| "absent".to_string(), toml::Value::to_string);
             lines.push(format!("{name} was {then} and is {now}"));
         }
         check_eps_of_commit(file, &then)?;
@@ -97,7 +97,7 @@ impl Changes {
         Ok(changes)
     }
 
-    /// Adds another instruction path than that of the last commit: one of the same bits changes no number.
+    /// Adds a difference of instruction path. Two paths of the same bits class change no number.
     fn add_path(&mut self, there: &str, here: SimdPath) {
         if there == here.name() {
             return;
@@ -111,31 +111,30 @@ impl Changes {
         }
     }
 
-    /// Adds what is other in the dataset.
+    /// Adds the differences of the dataset.
     pub fn add_dataset(&mut self, dataset: &Dataset, there: &DatasetPrint, here: &DatasetPrint) {
         let DatasetChanges { lines, fixed } = dataset_changes(dataset, there, here);
         self.numbers.extend(lines);
         self.fixed.extend(fixed);
     }
 
-    /// Refuses what a run cannot go on with, or not without `accept`.
+    /// Refuses differences that exclude a resume, and differences in numbers without `accept`.
     ///
     /// # Errors
-    /// There is such a change.
+    /// There is such a difference.
     pub fn check(&self, place: &Path, accept: bool) -> InputResult<()> {
         let list = |lines: &[String]| lines.iter().map(|line| format!("\n    {line}")).collect::<String>();
         if !self.fixed.is_empty() {
             let all = [self.fixed.as_slice(), &self.numbers].concat();
-            let problem = format!("the Gaussians of this run cannot follow what changed:{}", list(&all));
-            let remedy = "bring it back as it was, or start a new run from them: --init-ply with its point_cloud.ply";
+            let problem = format!("the Gaussians of this run do not fit these changes:{}", list(&all));
+            let remedy = "undo the changes, or start a new run from the Gaussians: --init-ply with its point_cloud.ply";
             return Err(InputError::new(place, problem, remedy));
         }
         if accept || self.numbers.is_empty() {
             return Ok(());
         }
-        let problem = format!("the run would go on with other numbers than it began with:{}", list(&self.numbers));
-        let remedy = "bring it back as it was, go on all the same with --accept-changes, or start a new run with another \
-                      --out";
+        let problem = format!("these changes would change the numbers of the run:{}", list(&self.numbers));
+        let remedy = "undo the changes, accept them with --accept-changes, or start a new run with another --out";
         Err(InputError::new(place, problem, remedy))
     }
 }

@@ -1,13 +1,13 @@
-//! The commits of a run: when they are made, and what they hold of it.
+//! The commits of a run: when to commit, and the state that a commit holds.
 //!
-//! A commit that time asks for is made beside training: a cut between two steps, its pages written during the steps that
-//! follow ([`crate::paging`]), then the transaction. One that must be there before anything else happens (a stop, the
-//! end, a drive without space) is made at once.
+//! A periodic commit runs beside training: a cut between two steps, its pages written during the following steps
+//! ([`crate::paging`]), then the transaction. A commit that must complete first (before a stop, at the end, on a full
+//! drive) is written at once.
 //!
-//! Invariants: 1. commits happen between steps and change nothing of the run; 2. what is committed is all that later
-//! steps depend on: a run that goes on from it ends with the same bytes; 3. clocks decide when a commit is made, and
-//! nothing else; 4. a run in memory makes its checkpoint when it first commits, so a short one writes none; a full drive
-//! costs such a run its commits, and nothing else.
+//! Invariants: 1. commits happen between steps and do not change the run; 2. a commit holds all state on which later
+//! steps depend: a run resumed from it ends with the same bytes; 3. clocks decide only when to commit; 4. a run in
+//! memory creates its checkpoint at its first commit, so a short run writes none; on a full drive such a run loses its
+//! commits and continues.
 
 use super::error::TrainError;
 use super::first_commit::FirstCommit;
@@ -22,13 +22,13 @@ use crate::paging::stats::SlotSpace;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// A commit is made at once where its pages are not written after this time beside training.
+/// A commit beside training that is not written after this time is completed at once.
 const BESIDE_SECONDS: f64 = 20.0;
-/// Least time from a commit to one before its time.
+/// Least time between a commit and an early commit for space.
 const EARLY_SECONDS: f64 = 10.0;
-/// Fewer free slots than one in so many are few.
+/// Fewer than 1/10 of the slots free counts as few.
 const FEW_FREE: u64 = 10;
-/// A commit before its time must make at least one slot in so many free.
+/// An early commit must free at least 1/20 of the slots.
 const WORTH_FREEING: u64 = 20;
 
 /// The commits of a run.
@@ -36,67 +36,68 @@ const WORTH_FREEING: u64 = 20;
 pub struct Checkpoint {
     /// `None` before the first commit of a run in memory.
     pub(super) commits: Option<Commits>,
-    /// How that one makes them.
+    /// Creates the store at the first commit of a run in memory.
     first: Option<FirstCommit>,
-    /// What it made them in.
+    /// The folder created by that first commit.
     spill: Option<SpillDir>,
-    /// The next commit is kept under this name.
+    /// Name under which the next commit is kept.
     name: Option<String>,
     pub(super) folder: PathBuf,
-    /// The run can go on without: all of it is in memory.
+    /// The run can continue without commits: all pages are in memory.
     pub(super) is_optional: bool,
-    /// A commit found no space, and the user knows.
-    said_full: bool,
+    /// A commit found no space, and the warning was printed.
+    warned_full: bool,
     /// How long to wait for space.
     pub(super) full_wait: Duration,
-    /// Step at which space was last made, and when; a second time at the same step it must come from elsewhere.
+    /// Step at which space was last made, whether on the store's drive, and when. A second attempt at the same step
+    /// waits for space instead.
     pub(super) space_made: Option<(u32, bool, Instant)>,
     interval: CommitInterval,
     started: Instant,
-    /// When the last commit was durable, and its cut.
+    /// When the last commit became durable.
     last: Instant,
     last_cut: Instant,
     beside: Option<Beside>,
-    /// What does not change: see [`Checkpoint::set_origin`].
+    /// The constant part of the run state; see [`Checkpoint::set_origin`].
     origin: Option<Origin>,
     done: u64,
     /// Step of the last commit.
     last_step: Option<u32>,
 }
 
-/// A commit that is made beside training.
+/// A commit in progress beside training.
 #[derive(Debug)]
 struct Beside {
     run_state: Vec<u8>,
     step: u32,
     cut: Instant,
     waited: Duration,
-    /// The pager's seconds for it, before it.
+    /// The pager's commit seconds before this commit.
     pager_seconds: f64,
 }
 
-/// What a run was started with, as its run state has it.
+/// The constant part of a run state: how the run was started.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Origin {
     /// The config, every key, as TOML.
     pub config: String,
-    /// Instruction path that was resolved.
+    /// Resolved instruction path.
     pub simd: String,
-    /// Degree in use from the first step.
+    /// SH degree of the first step.
     pub sh_degree_start: u8,
     /// The dataset.
     pub dataset: DatasetPrint,
-    /// The run that commits.
+    /// Identity of the run.
     pub run: RunIdentity,
 }
 
 impl Checkpoint {
-    /// Commits to the store in `folder` as often as the config says, the first one after that time.
+    /// Commits to the store in `folder` at the interval of the config; the first commit follows one interval from now.
     pub fn new(commits: Commits, folder: &Path, config: &TrainConfig) -> Checkpoint {
         Checkpoint { commits: Some(commits), ..Checkpoint::without(folder, config) }
     }
 
-    /// Of a run in memory: the first commit makes a checkpoint as `first` says.
+    /// Commits of a run in memory: the first commit creates the store with `first`.
     pub(super) fn later(first: FirstCommit, config: &TrainConfig) -> Checkpoint {
         let folder = first.folder().to_path_buf();
         Checkpoint { first: Some(first), is_optional: true, ..Checkpoint::without(&folder, config) }
@@ -111,7 +112,7 @@ impl Checkpoint {
             name: None,
             folder: folder.to_path_buf(),
             is_optional: false,
-            said_full: false,
+            warned_full: false,
             full_wait: Duration::try_from_secs_f64(config.disk_full_wait).unwrap_or_default(),
             space_made: None,
             interval: CommitInterval::new(config.commit_every),
@@ -125,39 +126,39 @@ impl Checkpoint {
         }
     }
 
-    /// What the run was started with; before the first commit.
+    /// Sets how the run was started. Must precede the first commit.
     pub fn set_origin(&mut self, origin: Origin) {
         self.origin = Some(origin);
         (self.started, self.last, self.last_cut) = (Instant::now(), Instant::now(), Instant::now());
     }
 
-    /// A full drive costs the run its commits and nothing else: all of it is in memory.
+    /// Sets whether the run continues without commits on a full drive.
     pub fn set_optional(&mut self, is_optional: bool) {
         self.is_optional = is_optional;
     }
 
-    /// Where it is, or will be.
+    /// Folder of the store, which may not exist yet.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// The next commit is kept under `name`, whatever is committed later.
+    /// Keeps the next commit under `name`; later commits do not replace it.
     pub fn keep_next_as(&mut self, name: String) {
         self.name = Some(name);
     }
 
-    /// Whether a commit after the last step is worth its writes: one of a run in memory that never committed would write
-    /// everything for a checkpoint that is removed at once.
-    pub fn wants_last(&self) -> bool {
+    /// Whether to commit after the last step. A run in memory without commits should not: it would write all pages to a
+    /// checkpoint that is removed at once.
+    pub fn needs_last_commit(&self) -> bool {
         self.commits.is_some()
     }
 
-    /// Gives up the folder that the first commit of a run in memory made, if it did; nothing is committed any more.
+    /// Ends committing and returns the folder that the first commit of a run in memory created, if any.
     pub fn into_folder(self) -> Option<SpillDir> {
         self.spill
     }
 
-    /// Whether something was committed since the store was opened.
+    /// Whether the store has a commit since it was opened.
     pub fn has_commit(&self) -> bool {
         self.done > 0
     }
@@ -167,7 +168,7 @@ impl Checkpoint {
         self.done
     }
 
-    /// The folder that the first commit of a run in memory made.
+    /// The folder that the first commit of a run in memory created.
     pub(super) fn spill(&self) -> Option<&SpillDir> {
         self.spill.as_ref()
     }
@@ -177,22 +178,22 @@ impl Checkpoint {
         self.last_step
     }
 
-    /// What commits have cost so far.
+    /// Costs of the commits so far.
     pub fn report(&self) -> CommitReport {
         self.interval.report(self.started.elapsed().as_secs_f64())
     }
 
-    /// Between two steps: begins a commit if one is due, and ends one whose pages are written.
+    /// Called between two steps: begins a commit if one is due, and completes one whose pages are written.
     ///
     /// # Errors
     /// As [`Checkpoint::commit`].
     pub fn between_steps(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         if !trainer.scene.pager.is_frozen() {
-            // A failed write gave it up; the next step gets the error.
+            // A failed write abandoned it; the next step returns the error.
             self.beside = None;
         }
         let result = match &self.beside {
-            // What is named after a step holds that step.
+            // A commit named after a step must hold that step.
             _ if self.name.is_some() => self.commit(trainer, metrics),
             None if self.is_time() && self.first.is_some() => self.commit(trainer, metrics),
             None if self.is_time() && self.commits.is_some() => self.begin(trainer, metrics),
@@ -200,11 +201,11 @@ impl Checkpoint {
             Some(beside) if trainer.scene.pager.is_frozen_written() || is_late(beside) => self.finish(trainer),
             _ => Ok(()),
         };
-        self.excused(result)
+        self.tolerate_full_drive(result)
     }
 
-    /// Whether a commit may be made for the slots that it makes free. What only names keep stays taken, so that it is not
-    /// asked at every step.
+    /// Whether an early commit for free slots is allowed. The time limit prevents a commit at every step, since slots
+    /// kept by names stay taken.
     fn may_be_early(&self) -> bool {
         !self.is_optional && self.last.elapsed().as_secs_f64() >= EARLY_SECONDS
     }
@@ -213,14 +214,14 @@ impl Checkpoint {
         self.interval.is_due(self.last.elapsed().as_secs_f64())
     }
 
-    /// A run in memory goes on where only space is missing, and tries again after as long as from commit to commit.
-    fn excused(&mut self, result: Result<(), TrainError>) -> Result<(), TrainError> {
+    /// For a run in memory, turns a lack of space into a warning; the next attempt follows one interval later.
+    fn tolerate_full_drive(&mut self, result: Result<(), TrainError>) -> Result<(), TrainError> {
         match result {
             Err(error) if self.is_optional && error.is_out_of_space() => {
-                if !std::mem::replace(&mut self.said_full, true) {
+                if !std::mem::replace(&mut self.warned_full, true) {
                     eprintln!("warning: nothing can be committed: {error}");
                 }
-                // The next one would hold another step.
+                // The next commit would hold another step, so drop the name.
                 if let Some(name) = self.name.take() {
                     eprintln!("warning: {name} is not kept");
                 }
@@ -231,15 +232,15 @@ impl Checkpoint {
         }
     }
 
-    /// Gives up the commit that `why`, a lack of space, stands in the way of; the run goes on without.
+    /// Abandons the commit in progress after `why`, a lack of space; the run continues without it.
     pub(super) fn give_up(&mut self, trainer: &mut Trainer, why: TrainError) -> Result<(), TrainError> {
         self.beside = None;
         trainer.scene.pager.thaw();
-        self.excused(Err(why))
+        self.tolerate_full_drive(Err(why))
     }
 
-    /// The checkpoint of a run in memory, at its first commit. The run itself is none the worse without one.
-    /// Where only space is missing it is tried again at the next commit.
+    /// Creates the checkpoint of a run in memory at its first commit. On failure the run continues without commits;
+    /// after a lack of space the next commit tries again.
     fn make_first(&mut self, trainer: &mut Trainer) -> Result<(), TrainError> {
         let Some(first) = &self.first else { return Ok(()) };
         match first.make(&mut trainer.scene.pager) {
@@ -259,7 +260,7 @@ impl Checkpoint {
         let run_state = bytes_of(&state)?;
         trainer.scene.pager.freeze()?;
         self.beside = Some(Beside { run_state, step: state.step, cut, waited: cut.elapsed(), pager_seconds });
-        // In memory, or with nothing to write, there is nothing to wait for.
+        // Without pages to write, complete the commit now.
         if trainer.scene.pager.is_frozen_written() { self.finish(trainer) } else { Ok(()) }
     }
 
@@ -279,10 +280,10 @@ impl Checkpoint {
         Ok(())
     }
 
-    /// Commits the run as it is now, at once. A commit beside training that has not ended is given up for it.
+    /// Commits the current state at once and abandons a commit in progress.
     ///
     /// # Errors
-    /// Nothing was committed; what was committed before still is.
+    /// The commit failed; earlier commits are intact.
     pub fn commit(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         if self.origin.is_none() {
             return Ok(());
@@ -304,10 +305,10 @@ impl Checkpoint {
         Ok(())
     }
 
-    /// As [`Checkpoint::commit`]; where only space is missing, says so.
+    /// As [`Checkpoint::commit`], but a lack of space is only a warning.
     ///
     /// # Errors
-    /// As [`Checkpoint::commit`], but for space.
+    /// As [`Checkpoint::commit`], except for space.
     pub fn commit_or_warn(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         match self.commit(trainer, metrics) {
             Err(error) if error.is_out_of_space() => {
@@ -327,7 +328,7 @@ impl Checkpoint {
         (self.last, self.last_cut) = (Instant::now(), cut);
     }
 
-    /// Whether a commit is needed for its space alone.
+    /// Whether an early commit is needed to free slots.
     fn space_is_short(&self, trainer: &Trainer) -> bool {
         let Some(space) = trainer.scene.pager.slot_space().filter(is_worth_a_commit) else { return false };
         let left = crate::page::folder::file_system::free_bytes(&self.folder).ok().flatten();
@@ -335,7 +336,7 @@ impl Checkpoint {
     }
 }
 
-/// Whether few slots are free, and a commit would make some free.
+/// Whether few slots are free and a commit would free enough.
 fn is_worth_a_commit(space: &SlotSpace) -> bool {
     let SlotSpace { total, free, retired, .. } = *space;
     free * FEW_FREE < total && retired * WORTH_FREEING >= total
@@ -350,7 +351,7 @@ fn bytes_of(state: &RunState) -> Result<Vec<u8>, CommitError> {
 }
 
 impl Trainer {
-    /// The run between two steps, beside its pages.
+    /// The run state between two steps, without the pages.
     pub fn run_state(&self, origin: &Origin, metrics_bytes: u64) -> RunState {
         let Origin { config, simd, sh_degree_start, dataset, run } = origin.clone();
         RunState {
@@ -375,7 +376,7 @@ impl Trainer {
         }
     }
 
-    /// Goes on where a run stopped; the pages are those of the same commit.
+    /// Restores step and counters from a run state; the pages must come from the same commit.
     pub fn restore_counts(&mut self, state: &RunState) {
         self.step = state.step;
         self.rows_skipped = state.rows_skipped;

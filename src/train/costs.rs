@@ -1,11 +1,11 @@
-//! What the steps of a run took: CPU, bytes and memory, loading, the last evaluation and export left out.
+//! Costs of the steps of a run (CPU, bytes, memory), without loading, the last evaluation and export.
 
 use super::report::StepCosts;
 use super::tiers::Tiers;
 use super::trainer::Trainer;
 use crate::base::machine::process_cpu_seconds;
 
-/// Costs that are being counted.
+/// Counters at the start of a measurement.
 pub(super) struct Meter {
     cpu: Option<f64>,
     read: u64,
@@ -14,14 +14,14 @@ pub(super) struct Meter {
 }
 
 impl Meter {
-    /// Counts from now on.
+    /// Starts a measurement.
     pub fn start(trainer: &Trainer) -> Meter {
         let stats = trainer.scene.pager.stats();
         let (read, written, stall) = (stats.bytes_read, stats.bytes_written, stats.stall_seconds);
         Meter { cpu: process_cpu_seconds(), read, written, stall }
     }
 
-    /// What was counted.
+    /// Costs since the start.
     pub fn stop(&self, trainer: &Trainer, tiers: &Tiers) -> StepCosts {
         let stats = trainer.scene.pager.stats();
         StepCosts {

@@ -1,10 +1,10 @@
-//! What training depends on of a dataset, as digests: taken when a run begins, compared when it goes on.
+//! Digests of the dataset properties on which training depends: taken when a run begins, compared when it resumes.
 //!
-//! Photos are told by their files: length and content up to 256 KiB, of longer ones length, head, middle and tail of 64
-//! KiB each. That costs three small reads a photo instead of a pass over a dataset that may be larger than memory, and
-//! finds what happens to photos: another photo under the same name, another size or quality, edited pixels (every encoder
-//! that compresses moves what follows them, and the length). It is no guard against single flipped bits; those end in
-//! decoding, or in one photo of thousands. Points are read whole at the start of a run anyway, so all of them count.
+//! The digest of a photo covers its file: the length, and the whole content up to 256 KiB, or head, middle and tail of
+//! 64 KiB each. That costs three small reads per photo instead of a pass over a dataset that may exceed memory. It
+//! detects a replaced photo, another size or quality, and edited pixels, because a compressing encoder then changes the
+//! length and all later bytes. It does not detect single flipped bits; those fail to decode or affect one photo of
+//! thousands. The digest of the points covers all of them, since a run reads all points at its start.
 
 use crate::base::error::{InputError, InputResult};
 use crate::checkpoint::run_state::{DatasetPrint, ViewPrint};
@@ -19,9 +19,9 @@ use xxhash_rust::xxh3::Xxh3;
 
 /// Files up to this length are read whole.
 const WHOLE_BYTES: u64 = 256 << 10;
-/// What is read of longer ones at each place.
+/// Length of one sample of a longer file.
 const SAMPLE_BYTES: u64 = 64 << 10;
-/// Differences that are listed before they are only counted.
+/// Differences to list; further ones are only counted.
 const LISTED: usize = 10;
 
 pub(super) fn view_print(view: &View) -> InputResult<ViewPrint> {
@@ -43,7 +43,7 @@ pub(super) fn view_print(view: &View) -> InputResult<ViewPrint> {
     Ok(ViewPrint { pose: pose.digest(), photo: photo.digest() })
 }
 
-/// Length and content of a file, or samples of it.
+/// Adds the length of a file and its content or samples of it to the digest.
 fn add_file(digest: &mut Xxh3, path: &Path) -> InputResult<()> {
     let io = |e: std::io::Error| InputError::io(path, "reading the file for its digest", &e);
     let mut file = File::open(path).map_err(io)?;
@@ -63,7 +63,7 @@ fn add_file(digest: &mut Xxh3, path: &Path) -> InputResult<()> {
     Ok(())
 }
 
-/// Digest and number of points that first Gaussians are made from.
+/// Digest and number of the points from which the first Gaussians are made.
 ///
 /// # Errors
 /// The points cannot be read.
@@ -79,34 +79,34 @@ pub(super) fn points_print(points: &dyn PointSource) -> InputResult<(u64, u64)> 
     Ok((digest.digest(), count))
 }
 
-/// Digest of Gaussians that a run starts from, one after the other: streamed or not, it is the same.
+/// Digest of the Gaussians from which a run starts; the same for streamed and whole input.
 #[derive(Default)]
 pub(super) struct GaussiansPrint(Xxh3);
 
 impl GaussiansPrint {
-    /// Takes the next ones.
+    /// Adds the next Gaussians.
     pub fn add(&mut self, columns: &Columns) {
         for row in 0..columns.rows() {
             Column::ALL.into_iter().for_each(|column| self.0.update(bytemuck::cast_slice(columns.row(column, row))));
         }
     }
 
-    /// Of all that were taken.
+    /// Digest of all Gaussians added.
     pub fn digest(&self) -> u64 {
         self.0.digest()
     }
 }
 
-/// Where a dataset differs from the one that a run began with, a line each.
+/// Differences from the dataset with which a run began, one line each.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct DatasetChanges {
-    /// What training may go on with when the user accepts it.
+    /// Differences with which training can resume if the user accepts them.
     pub lines: Vec<String>,
-    /// What the Gaussians cannot follow.
+    /// Differences with which training cannot resume.
     pub fixed: Vec<String>,
 }
 
-/// Compares `dataset`, whose print is `here`, with the print that a run began with.
+/// Compares `dataset`, whose print is `here`, with `there`, the print with which a run began.
 pub(super) fn dataset_changes(dataset: &Dataset, there: &DatasetPrint, here: &DatasetPrint) -> DatasetChanges {
     let mut changes = DatasetChanges::default();
     let lines = &mut changes.lines;
@@ -122,7 +122,7 @@ pub(super) fn dataset_changes(dataset: &Dataset, there: &DatasetPrint, here: &Da
             }
         }
     } else if there.views.is_empty() {
-        lines.push("which photos it was trained on is not known: its state was lost and salvaged".to_string());
+        lines.push("the photos of the run are unknown: its state was lost, and its pages were salvaged".to_string());
     } else {
         lines.push(format!("the dataset had {} views and has {}", there.views.len(), here.views.len()));
     }

@@ -1,25 +1,20 @@
-//! The dense optimizer: after every step every row is brought to now and stored, seen or not.
+//! The dense optimizer: updates and stores every row after every step. For comparison with deferred Adam, since each
+//! step costs the whole scene in memory and on the drive.
 //!
-//! The slow way round that deferred Adam spares: each step costs the whole scene, in memory and on the drive. It is here
-//! to be compared with.
-//!
-//! Invariants: 1. events reach pages at the next step, and each row at the values of the event's own step, so rows and
-//! decisions are those of the deferred run up to roundings; 2. no more than [`PAGES_PER_BATCH`] pages, and half of the
-//! frames, are pinned at once.
+//! Invariants: 1. a page applies an event at the next step, on values of the event's own step, so rows and decisions
+//! equal those of the deferred run up to roundings; 2. at most [`PAGES_PER_BATCH`] pages and half of the frames are
+//! pinned at once.
 
 use super::error::TrainError;
-use super::pages::PagedScene;
+use super::pages::{PAGES_PER_BATCH, PagedScene};
 use crate::base::ids::PageNo;
 use crate::scene::rows::RowsNow;
 use rayon::prelude::*;
 
-/// Pages that are settled together.
-const PAGES_PER_BATCH: usize = 32;
-
-/// Stores every row as it is after `now` steps, and renews the bounds of its page.
+/// Stores every row as evaluated after `now` steps, and renews the bounds of every page.
 ///
 /// # Errors
-/// Pages could not be had, or no frame for the half of one that splits.
+/// Pages could not be pinned, or no frame was free for a split.
 pub(super) fn settle_all(scene: &mut PagedScene, now: u32) -> Result<(), TrainError> {
     let index = scene.pager.index();
     let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();

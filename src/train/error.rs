@@ -1,6 +1,6 @@
-//! What can end a run early: every way in which training, commits, resume and the tools on checkpoints fail.
+//! Errors of training, commits, resume and checkpoint tools.
 //!
-//! Knows no state of a run, so that every file of the room may name it.
+//! This file uses no other file of the module, so that all others can use it.
 
 use crate::base::error::InputError;
 use crate::page::map::commit::CommitError;
@@ -8,16 +8,16 @@ use crate::paging::error::PagingError;
 use crate::render::RenderError;
 use crate::scene::page_split::SplitTooDeep;
 
-/// What can end a run early.
+/// Error that ends a run.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
-    /// Something that the user gave.
+    /// Invalid input.
     #[error(transparent)]
     Input(#[from] InputError),
-    /// The renderer.
+    /// The renderer failed.
     #[error("rendering failed: {0}{remedy}", remedy = .0.remedy().map_or(String::new(), |r| format!("\n  remedy: {r}")))]
     Render(#[from] RenderError),
-    /// Pages could not be had.
+    /// Pages could not be pinned or stored.
     #[error(transparent)]
     Paging(#[from] PagingError),
     /// A page cannot be split.
@@ -26,16 +26,17 @@ pub enum TrainError {
     /// A commit failed, or a checkpoint cannot be opened.
     #[error(transparent)]
     Commit(#[from] CommitError),
-    /// The drive is full, and nobody freed space in time.
+    /// The drive is full, and no space was freed in time.
     #[error(
-        "the drive of {folder} is full: it needs {needed} more{stands}\n  remedy: free space on it, then go on from the last \
-         commit with gsscale-train --resume and the output folder; a run that committed nothing starts again with --overwrite",
-        stands = .last_step.map_or(String::new(), |step| format!("; the commit after step {step} stands"))
+        "the drive of {folder} is full: it needs {needed} more{kept}\n  remedy: free space on it, then continue from \
+         the last commit with gsscale-train --resume and the output folder; a run without commits starts again with \
+         --overwrite",
+        kept = .last_step.map_or(String::new(), |step| format!("; the commit after step {step} is intact"))
     )]
     DriveFull {
-        /// The spill directory, or that of the file that found no space.
+        /// The spill directory, or the folder of the file that found no space.
         folder: String,
-        /// Bytes, for people.
+        /// Bytes needed, as text.
         needed: String,
         /// Step of the last commit of this process.
         last_step: Option<u32>,
@@ -43,9 +44,9 @@ pub enum TrainError {
     /// The scene has outgrown its frames.
     #[error("{source}")]
     Outgrown {
-        /// Who needed how many.
+        /// The error of the pager.
         source: PagingError,
-        /// Memory with which the step could have been done, where frames follow from it.
+        /// Least budget with which the step fits, bytes; `None` if frames do not follow from a budget.
         least: Option<u64>,
     },
     /// A step failed after it had updated some of the batches of its view.
@@ -60,18 +61,18 @@ pub enum TrainError {
     /// The loss was not finite several times in a row.
     #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
     NonFinite {
-        /// Last of the steps.
+        /// The last of these steps.
         step: u32,
         /// View of that step.
         view: String,
-        /// How many in a row.
+        /// Consecutive steps.
         count: u32,
-        /// What to do.
+        /// Remedy.
         remedy: &'static str,
     },
 }
 
-/// The error of a page that could not be stored, on its way through an import.
+/// Wraps an error of storing a page, so that an import can return it.
 pub(super) fn not_stored(error: &impl std::fmt::Display) -> InputError {
     InputError::new("--spill-dir", format!("a page could not be stored: {error}"), "see the cause")
 }

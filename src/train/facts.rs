@@ -1,6 +1,6 @@
-//! config.toml of a run: every setting, and the facts that followed from it (`[resolved]`).
+//! The config.toml of a run: every setting, and facts resolved at its start (`[resolved]`).
 //!
-//! Invariant: the file is a valid `--config`; its facts are read by what goes on with the run or evaluates it.
+//! Invariant: the file is a valid `--config`. Resume and evaluation read its facts.
 
 use super::whole_file::write_whole;
 use crate::base::error::{InputError, InputResult};
@@ -9,7 +9,7 @@ use crate::config::file::TrainConfig;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// Facts of a run that follow from its config and machine.
+/// Facts of a run that follow from its config, scene and machine.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Resolved {
     /// Version of the program.
@@ -23,7 +23,7 @@ pub struct Resolved {
     pub simd: String,
     /// Worker threads in use.
     pub threads: usize,
-    /// What renders: "cpu", or the name of the GPU with its driver.
+    /// The renderer: "cpu", or the name of the GPU with its driver.
     pub device: String,
     /// Training views.
     pub train_views: usize,
@@ -54,7 +54,7 @@ pub fn write_config(path: &Path, config: &TrainConfig, resolved: &Resolved) -> I
 /// Reads the facts back from a run's config.toml.
 ///
 /// # Errors
-/// It is not a run's.
+/// The file has no `[resolved]` table of a run.
 pub fn read_resolved(path: &Path) -> InputResult<Resolved> {
     let text = std::fs::read_to_string(path).map_err(|e| InputError::io(path, "reading the config", &e))?;
     let refuse = |problem: String| InputError::new(path, problem, "name the output folder of a run");

@@ -1,8 +1,7 @@
-//! The checkpoint of a run whose pages all stay in memory: made in its output folder by its first commit.
+//! The checkpoint of a run in memory: its first commit creates the store in the output folder.
 //!
-//! From then on the run is one with a spill directory in which nothing is evicted: a commit writes the pages that changed
-//! since the last one, from the memory that they lie in. Invariant: a checkpoint that could not be made leaves nothing
-//! behind, and the pager as it was.
+//! From then on the run has a spill directory without eviction: a commit writes the pages that changed since the last
+//! commit. Invariant: a failed creation leaves no files and does not change the pager.
 
 use super::error::TrainError;
 use crate::config::file::TrainConfig;
@@ -24,7 +23,7 @@ use std::path::{Path, PathBuf};
 /// Memory for the cache of the page map, bytes.
 pub(super) const MAP_CACHE_BYTES: usize = 8 << 20;
 
-/// What making a checkpoint takes.
+/// Settings of the checkpoint to create.
 #[derive(Debug, Clone)]
 pub(super) struct FirstCommit {
     folder: PathBuf,
@@ -34,7 +33,7 @@ pub(super) struct FirstCommit {
 }
 
 impl FirstCommit {
-    /// In the output folder of a run.
+    /// The checkpoint in the output folder of a run.
     pub fn of(out: &Path, config: &TrainConfig) -> FirstCommit {
         FirstCommit {
             folder: checkpoint_folder(out),
@@ -44,17 +43,17 @@ impl FirstCommit {
         }
     }
 
-    /// Where it will be.
+    /// Folder of the checkpoint.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Makes it, and gives it to the pager.
+    /// Creates the store and attaches it to the pager.
     pub fn make(&self, pager: &mut Pager) -> Result<(SpillDir, Commits), TrainError> {
         let layout = SlotLayout::new(self.capacity_bytes, pager.index().len() as u64);
-        // A kill in the middle of an earlier life's first commit leaves a store without commits.
+        // An earlier process killed during its first commit leaves a store without commits.
         remove_uncommitted(&self.folder, true)?;
-        // On a network file system too: it is where the user wants the results.
+        // Allow a network file system: the user chose it for the results.
         let spill = SpillDir::create(&self.folder, Purpose::Checkpoint, layout, true)?;
         match self.make_in(&spill, layout) {
             Ok((commits, store)) => {
@@ -77,7 +76,7 @@ impl FirstCommit {
     }
 }
 
-/// As `--spill-codec` says; `auto` does not measure the drive, of which little is asked.
+/// Codec of `--spill-codec`. `auto` does not measure the drive here, since commits alone load it little.
 pub(super) fn codec(config: &TrainConfig) -> Codec {
     config.spill_codec.0.unwrap_or(match config.moments {
         Moments::F32 => Codec::Raw,

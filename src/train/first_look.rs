@@ -1,7 +1,8 @@
-//! The pages of a run's first Gaussians without the run: what planning looks at, and how long a step on them takes.
+//! The pages of a run's first Gaussians, for planning without a run, and the time of a step on them.
 //!
-//! Invariants: 1. nothing is stored; 2. of the Gaussians no more is in memory at once than an import takes, and then the
-//! pages of one view: the largest, if that is asked about, and one to time that is small enough; 3. pages and bounds are those that the run begins with.
+//! Invariants: 1. no page is stored; 2. memory holds at most the Gaussians of an import, then the pages of one view:
+//! the largest view for the frames of a budget, a small enough view for timing; 3. pages and bounds equal those at the
+//! start of a run.
 
 use super::error::TrainError;
 use super::machine;
@@ -27,52 +28,52 @@ use crate::schedule::visibility::visible_pages;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Steps are timed until this much time has passed ...
+/// Duration after which no further step is timed.
 const TIMED: Duration = Duration::from_secs(1);
-/// ... and no more than so many are.
+/// Most steps that are timed.
 const TIMED_STEPS: u32 = 8;
-/// Pages of the view that is timed take at most this share of the memory.
+/// Pages of the timed view take at most 1/4 of the memory.
 const TIMED_SHARE: u64 = 4;
 
-/// What a run would begin with.
+/// The scene with which a run would begin.
 pub struct FirstLook {
     /// Views and frame.
     pub dataset: Dataset,
     /// The pages.
     pub index: Vec<PageMeta>,
-    /// Bytes of each on disk with all bands in use, without header and padding.
+    /// Bytes of each page on disk at the full SH degree, without header and padding.
     pub page_bytes: Vec<u32>,
     /// Gaussians.
     pub gaussians: u64,
-    /// Frames that the memory asked about leaves for pages, about as a run on the CPU gets them.
+    /// Approximate frames of a CPU run within the requested memory.
     pub frames: Option<u64>,
-    /// How long a step takes here, where that was asked for and a view that sees anything fits into memory.
+    /// Time of a step on this machine, if requested and if a view that sees pages fits in memory.
     pub step: Option<StepTime>,
 }
 
-/// How long a step takes.
+/// Time of a step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepTime {
-    /// With the bands of the last step, on a view that needs as many pages as half of those that see anything do at most.
+    /// Seconds at the SH degree of the last step, on the view of median page count among those that see pages.
     pub seconds: f64,
-    /// What rendered it.
+    /// Name of the renderer.
     pub device: String,
 }
 
-/// What else to look for: reads the Gaussians once more and renders a view, each.
+/// Optional results; each reads the Gaussians again and renders a view.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct LookFor {
-    /// For how many frames so many bytes of memory are good.
+    /// Compute the frames within this budget, bytes.
     pub frames_within: Option<u64>,
-    /// How long a step takes.
+    /// Time a step.
     pub step: bool,
 }
 
-/// Looks at what a run of `scene` would begin with. `folder` is for what does not fit in memory; what is written there has
-/// no name.
+/// Reads the scene with which a run of `scene` would begin. `folder` holds unnamed temporary files for data that
+/// exceeds memory.
 ///
 /// # Errors
-/// As [`Start::look`]; the memory asked about does not hold a view, one cannot be rendered, or there is no such device.
+/// As [`Start::look`]; the budget does not hold a view, a view cannot be rendered, or the device does not exist.
 pub fn first_look(
     scene: &Path,
     config: &TrainConfig,
@@ -104,7 +105,7 @@ pub fn first_look(
     })
 }
 
-/// What a run begins with.
+/// The start of a run, with its pages' index.
 struct World<'a> {
     config: &'a TrainConfig,
     start: Start,
@@ -113,7 +114,7 @@ struct World<'a> {
 }
 
 impl World<'_> {
-    /// Frames that `host_mem` leaves beside what the largest view takes, which is rendered for it.
+    /// Frames within `host_mem`; renders the largest view to measure its memory.
     fn frames_within(&mut self, options: &RunOptions, host_mem: u64) -> Result<u64, TrainError> {
         let largest = preflight::largest_view(&self.start.dataset, &self.index);
         let Some(view) = largest.view else { return Ok(0) };
@@ -125,7 +126,7 @@ impl World<'_> {
         preflight::frames_within(self.config, dataset, &mut trainer, &probe, largest, host_mem)
     }
 
-    /// The pages that a view needs, in memory.
+    /// Loads the pages of a view into memory.
     fn pages_of(&mut self, view: usize, options: &RunOptions, host_mem: Option<u64>) -> Result<PagedScene, TrainError> {
         let mut pages = Vec::new();
         visible_pages(&self.index, &self.start.dataset.views[view].camera, &mut pages);
@@ -142,13 +143,13 @@ impl World<'_> {
         Ok(scene)
     }
 
-    /// Times steps with a black photo: their median. Those of a run are up to a third longer, since their rows were not in a
-    /// cache a step before.
+    /// Median time of steps with a black photo. Steps of a run take up to a third longer, because their rows are not in
+    /// the processor's cache from the step before.
     fn step_time(&mut self, options: RunOptions, host_mem: Option<u64>) -> Result<Option<StepTime>, TrainError> {
         let options = RunOptions { sh_degree_start: options.sh_degree_at(options.steps.saturating_sub(1)), ..options };
         let frame_bytes = PagerConfig::in_memory(options.page_rows, options.sh_degree).frame_bytes() as u64;
         let pages_most = host_mem.map_or(u64::MAX, |bytes| bytes / TIMED_SHARE / frame_bytes);
-        let Some(view) = self.middling_view(pages_most) else { return Ok(None) };
+        let Some(view) = self.median_view(pages_most) else { return Ok(None) };
         let mut scene = self.pages_of(view, &options, host_mem)?;
         let camera = self.start.dataset.views[view].camera;
         let render = RenderOptions { sh_degree: scene.rules.sh_degree(), ..options.render };
@@ -162,7 +163,7 @@ impl World<'_> {
             train_step(&mut scene, &mut working, &mut *renderer, what, how, false, usize::MAX)?;
             Ok::<_, TrainError>(began.elapsed().as_secs_f64())
         };
-        // The first takes memory from the system.
+        // The first step allocates memory, so do not time it.
         step(0)?;
         let (mut seconds, began) = (Vec::new(), Instant::now());
         for number in 1..=TIMED_STEPS {
@@ -175,8 +176,9 @@ impl World<'_> {
         Ok(Some(StepTime { seconds: seconds[seconds.len() / 2], device: renderer.device() }))
     }
 
-    /// Of the training views that see anything, the one in the middle by pages, or else the largest with no more than so many.
-    fn middling_view(&self, pages_most: u64) -> Option<usize> {
+    /// The training view of median page count among those that see pages, or the largest with at most `pages_most`
+    /// pages.
+    fn median_view(&self, pages_most: u64) -> Option<usize> {
         let dataset = &self.start.dataset;
         let mut pages = Vec::new();
         let mut views = Vec::new();

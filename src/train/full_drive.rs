@@ -1,10 +1,10 @@
-//! A run whose drive is full: space is made of what it holds back, or waited for, and else the run stops.
+//! A run on a full drive: frees its own space, waits for space, or stops.
 //!
-//! First two commits: they make the slots of versions free that nothing needs any more. What they lack they get from the
-//! reserve, which is given up for it. Where that is not enough training waits, with everything in memory as it is, until
-//! somebody has freed space, and then goes on as though nothing had happened. After `--disk-full-wait` it stops.
+//! First it makes two commits, which free the slots of old versions; the reserve is released to make room for them. If
+//! that is not enough, training waits, with its state in memory, until the user frees space, and then continues. After
+//! `--disk-full-wait` the run stops.
 //!
-//! Invariants: 1. nothing of the run is changed or lost while it waits; 2. whatever happens, the last commit stands.
+//! Invariants: 1. waiting does not change the run; 2. the last commit always stays intact.
 
 use super::checkpoint::Checkpoint;
 use super::error::TrainError;
@@ -17,15 +17,15 @@ use crate::page::map::commit::Commits;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// From one look at the drive to the next.
+/// Interval between checks of the drive.
 const POLL: Duration = Duration::from_secs(1);
-/// The reserve is filled only where it takes less than one in so many of the free bytes.
+/// The reserve is filled only if it takes less than 1/4 of the free bytes.
 const RESERVE_SHARE: u64 = 4;
-/// What is asked for on the drive of the results while a run goes on: metrics are a few hundred bytes a line.
+/// Bytes required on the drive of the results during a run: metrics take a few hundred bytes per line.
 const OTHER_BYTES: u64 = 1 << 20;
 
 impl TrainError {
-    /// Whether it is only space on a drive that is missing: the same may work later.
+    /// Whether the cause is a lack of drive space, so that a later attempt may succeed.
     pub fn is_out_of_space(&self) -> bool {
         match self {
             TrainError::Commit(error) => error.is_out_of_space(),
@@ -37,7 +37,7 @@ impl TrainError {
 }
 
 impl Checkpoint {
-    /// Sets the reserve aside where the drive has much more than that.
+    /// Fills the reserve if the drive has much more free space.
     ///
     /// # Errors
     /// The folder cannot be written.
@@ -51,10 +51,10 @@ impl Checkpoint {
         Ok(())
     }
 
-    /// Makes space after `why`, or waits for it. Training may go on after this, unless it was asked to stop meanwhile.
+    /// Frees space after `why`, or waits for space. Training can continue afterwards, unless a stop was requested.
     ///
     /// # Errors
-    /// Nobody freed any in time; or another error than for want of space.
+    /// No space was freed in time, or an error other than a lack of space.
     pub fn make_space(
         &mut self,
         trainer: &mut Trainer,
@@ -66,18 +66,18 @@ impl Checkpoint {
             return Err(why);
         }
         if self.is_optional {
-            // All of the run is in memory: what was being committed is given up, and the step works without a write.
+            // All pages are in memory: abandon the commit; the step needs no write.
             return self.give_up(trainer, why);
         }
         let is_own = self.other_drive(&why).is_none();
         let now = (trainer.steps_done(), is_own, Instant::now());
-        // Then the drive is too small for the scene, as far as commits can tell.
+        // A second failure at the same step: commits cannot free enough.
         let is_stuck = self.space_made.is_some_and(|(step, own, _)| (step, own) == (now.0, is_own));
         let mut lacks = why;
         if !is_stuck {
             self.space_made = Some(now);
         }
-        // Neither commits nor the reserve make space on another drive than their own.
+        // Commits and reserve free space only on the store's drive.
         if !is_stuck && is_own {
             match self.commit_with_reserve(trainer, metrics) {
                 Ok(()) => return Ok(()),
@@ -89,7 +89,7 @@ impl Checkpoint {
         self.wait_for_space(trainer, (metrics, stop), lacks, (began, is_stuck))
     }
 
-    /// Commits twice, since one commit keeps what the one before it names; with the reserve's space if need be.
+    /// Commits twice, because a commit keeps the slots of the previous one; releases the reserve if needed.
     fn commit_with_reserve(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         let mut result = self.commit(trainer, metrics);
         let is_full = result.as_ref().is_err_and(|e| e.is_out_of_space() && self.other_drive(e).is_none());
@@ -121,14 +121,14 @@ impl Checkpoint {
         let (needed_text, folder) = (format_bytes(needed), full.display().to_string());
         if !is_told {
             eprintln!(
-                "paused: {lacks}\n  {folder} needs {needed_text} more and has {free_then} free. Training waits up to {until:.0} s \
-                 (--disk-full-wait) for space and then goes on; Ctrl-C stops it"
+                "paused: {lacks}\n  {folder} needs {needed_text} more and has {free_then} free. Training waits up to \
+                 {until:.0} s (--disk-full-wait) for space, then continues; Ctrl-C stops it"
             );
         }
         while began.elapsed() < self.full_wait && stop.exit_code().is_none() {
             std::thread::sleep(POLL.min(self.full_wait / 20));
             let free_now = free_bytes(&full).ok().flatten();
-            // Less than a segment does not help a scene that the drive is too small for.
+            // More free space below the size of a segment does not help.
             if free_now.zip(free).is_some_and(|(now, then)| now < needed && now <= then) {
                 continue;
             }
@@ -153,20 +153,20 @@ impl Checkpoint {
         }
     }
 
-    /// The folder of the file that found no space, where that is on another drive than the store.
+    /// The folder of the file that found no space, if it lies on another drive than the store.
     fn other_drive(&self, error: &TrainError) -> Option<PathBuf> {
         let TrainError::Input(error) = error else { return None };
         let folder = error.file.parent().filter(|folder| folder.is_dir())?;
         (!is_same_drive(folder, &self.folder)).then(|| folder.to_path_buf())
     }
 
-    /// What the page map may grow by for one commit, bytes: it doubles at most.
+    /// Most bytes by which one commit can grow the page map: at most it doubles.
     fn map_growth(&self) -> u64 {
         std::fs::metadata(self.folder.join(crate::page::map::commit::MAP_NAME)).map_or(0, |map| map.len())
     }
 }
 
-/// Whether two folders lie on one drive; so they do where the system does not tell.
+/// Whether two folders lie on one drive; true if the system does not report it.
 fn is_same_drive(a: &Path, b: &Path) -> bool {
     #[cfg(unix)]
     {

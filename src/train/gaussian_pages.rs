@@ -1,12 +1,12 @@
-//! Gaussians as first pages, however many there are.
+//! First pages from any number of Gaussians.
 //!
-//! Rows go through files into pages as points do ([`crate::dataset::import`]): the largest 0.5 % apart, the others by median
-//! splits.
+//! Rows pass through files into pages as points do ([`crate::dataset::import`]): the largest 0.5 % in pages of their
+//! own, the others by median splits.
 //!
-//! Invariants: 1. memory is bounded by what is given; 2. pages have the rows of [`crate::scene::partition::partition`], in
-//! its order, and each row the number that it was read with.
+//! Invariants: 1. memory stays within the given bound; 2. pages have the rows of [`crate::scene::partition::partition`]
+//! in its order; the uid of a row is its number in the file.
 
-use super::prepare::cut_sh;
+use super::prepare::truncate_sh;
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::dataset::import::{Grown, PageSpace, Spool, SpoolSpace, SpoolWriter, paginate};
@@ -16,10 +16,10 @@ use crate::scene::partition::Placed;
 use crate::scene::state::SceneState;
 use std::path::{Path, PathBuf};
 
-/// Gaussians that are moved into another frame together.
+/// Gaussians transformed into the local frame together.
 const ROWS_AT_ONCE: usize = 1024;
 
-/// A Gaussian with its number, on its way into a page.
+/// A Gaussian with its number in the file.
 #[derive(Debug, Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C)]
 struct Row {
@@ -43,12 +43,12 @@ impl Grown for Row {
     }
 }
 
-/// Gaussians of a file as a run starts from them: in its local frame, with no more bands than it has.
+/// A file of Gaussians, read into a run's local frame with at most the run's SH degree.
 #[derive(Debug, Clone)]
 pub(super) struct GaussianFile {
     path: PathBuf,
     meta: PlyMeta,
-    /// Degree of the file.
+    /// SH degree of the file.
     sh_degree: u8,
     sh_degree_most: u8,
     origin: [f64; 3],
@@ -56,10 +56,10 @@ pub(super) struct GaussianFile {
 }
 
 impl GaussianFile {
-    /// The file, for a run with bands up to `sh_degree_most` in the local frame of `origin` and `scale`.
+    /// Opens the file for a run of at most `sh_degree_most` in the local frame of `origin` and `scale`.
     ///
     /// # Errors
-    /// Its header cannot be understood.
+    /// The header is invalid.
     pub fn open(path: &Path, sh_degree_most: u8, (origin, scale): ([f64; 3], f64)) -> InputResult<GaussianFile> {
         let (meta, sh_degree) = gaussians_header(path)?;
         Ok(GaussianFile { path: path.to_path_buf(), meta, sh_degree, sh_degree_most, origin, scale })
@@ -75,8 +75,8 @@ impl GaussianFile {
         &self.path
     }
 
-    /// Hands on the Gaussians in the file's order, some at a time. Returns what the file said, and how many were too far away
-    /// for the local frame and are left out.
+    /// Passes the Gaussians to `take` in batches, in the file's order. Returns the file's metadata, and the number of
+    /// Gaussians dropped because they are too far away for the local frame.
     ///
     /// # Errors
     /// The file cannot be read, or `take` failed.
@@ -85,7 +85,7 @@ impl GaussianFile {
         let (mut some, mut far) = (none(), 0);
         let mut hand_on = |mut columns: Columns| {
             far += to_local(&mut columns, &self.meta, self.origin, self.scale);
-            take(&cut_sh(columns, self.sh_degree_most))
+            take(&truncate_sh(columns, self.sh_degree_most))
         };
         let meta = stream_gaussians(&self.path, &mut |values| {
             push_row(&mut some, values);
@@ -99,10 +99,10 @@ impl GaussianFile {
     }
 }
 
-/// What the way of Gaussians into pages may take.
+/// Resources for the import of Gaussians.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct GaussianSpace<'a> {
-    /// An existing folder for what does not fit in memory.
+    /// An existing folder for temporary files.
     pub folder: &'a Path,
     /// Bytes of memory.
     pub memory: usize,
@@ -114,9 +114,9 @@ impl<'a> GaussianSpace<'a> {
     }
 }
 
-/// Gaussians being read, as [`push_row`] takes them.
+/// Collects Gaussians while they are read.
 pub(super) struct GaussianWriter<'a> {
-    /// What they are read from, for messages.
+    /// The source file, for messages.
     file: &'a Path,
     space: GaussianSpace<'a>,
     rows: SpoolWriter<Row>,
@@ -125,12 +125,12 @@ pub(super) struct GaussianWriter<'a> {
 }
 
 impl<'a> GaussianWriter<'a> {
-    /// None yet.
+    /// An empty writer.
     pub fn new(file: &'a Path, space: GaussianSpace<'a>) -> Self {
         GaussianWriter { file, space, rows: SpoolWriter::new(space.of_list()), next: 0, width: ROW_HEAD }
     }
 
-    /// Takes the next ones.
+    /// Adds the rows of `columns`.
     ///
     /// # Errors
     /// As [`GaussianWriter::push`].
@@ -142,7 +142,7 @@ impl<'a> GaussianWriter<'a> {
         })
     }
 
-    /// Takes the next one; all of them have the same bands.
+    /// Adds one Gaussian; all must have the same SH degree.
     ///
     /// # Errors
     /// The folder cannot be written, or there are 2^32 rows.
@@ -157,7 +157,7 @@ impl<'a> GaussianWriter<'a> {
         Ok(())
     }
 
-    /// All were read.
+    /// Ends the input.
     ///
     /// # Errors
     /// The folder cannot be written.
@@ -167,7 +167,7 @@ impl<'a> GaussianWriter<'a> {
     }
 }
 
-/// Gaussians that were read.
+/// Gaussians after reading, in memory and temporary files.
 pub(super) struct GaussianSpool<'a> {
     space: GaussianSpace<'a>,
     rows: Spool<Row>,
@@ -175,17 +175,18 @@ pub(super) struct GaussianSpool<'a> {
 }
 
 impl GaussianSpool<'_> {
-    /// How many.
+    /// Number of Gaussians.
     pub fn rows(&self) -> usize {
         self.rows.len()
     }
 
-    /// The degree of their bands.
+    /// SH degree of the Gaussians.
     pub fn sh_degree(&self) -> u8 {
         self.sh_degree
     }
 
-    /// Divides them into pages of at most `fill` rows and hands these out in the order of their names.
+    /// Partitions the Gaussians into pages of at most `fill` rows and passes the pages to `take` in the order of their
+    /// ids.
     ///
     /// # Errors
     /// The folder cannot be written, or `take` failed.

@@ -1,5 +1,4 @@
-//! What a config asks of the machine: worker threads, the instruction path, and what renders. Done once, before any
-//! work.
+//! Sets up worker threads, instruction path and renderer from the config, once, before other work.
 
 use crate::base::error::{InputError, InputResult};
 use crate::config::choice::Device;
@@ -10,15 +9,14 @@ use crate::render::Renderer;
 use crate::render::cpu::CpuRenderer;
 use crate::render::gpu::GpuRenderer;
 
-/// Starts the worker threads that `config` asks for, checks its instruction path, and sees to it that a limit on the
-/// size of files is an error like others.
+/// Starts the worker threads of `config`, checks its instruction path, and makes a file size limit an ordinary error.
 ///
 /// # Errors
 /// This machine lacks the instructions.
 pub fn set_up(config: &TrainConfig) -> InputResult<()> {
     super::signals::survive_file_size_limit();
     if config.threads > 0 {
-        // A pool that exists already (a library user's) is kept: results do not depend on it.
+        // An existing pool (of a library user) stays in use: results do not depend on it.
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
     }
     let path = simd_path(config);
@@ -29,11 +27,11 @@ pub fn set_up(config: &TrainConfig) -> InputResult<()> {
     Err(InputError::new("--simd", problem, "use --simd auto"))
 }
 
-/// The renderer that `--device` asks for, and what is to be said about the choice. `auto` takes a hardware GPU if there
-/// is one that works, else the CPU, never a software adapter: the CPU renderer is the faster one then.
+/// The renderer of `--device`, and a message about the choice. `auto` uses a working hardware GPU, else the CPU; it
+/// never uses a software adapter, since the CPU renderer is faster.
 ///
 /// # Errors
-/// The device that was asked for does not exist or cannot be used.
+/// The named device does not exist or cannot be used.
 pub fn renderer(config: &TrainConfig) -> InputResult<(Box<dyn Renderer>, Option<String>)> {
     let choice = match &config.device {
         Device::Cpu => return Ok((Box::new(CpuRenderer::new()), None)),

@@ -24,7 +24,8 @@ const LIST_BYTES_LEAST: u64 = 16 << 20;
 
 /// Share of the available memory that a run without --host-mem takes, percent.
 const BUDGET_PERCENT: u64 = 70;
-/// Share of the available memory up to which a run without --host-mem may rise, percent: estimates err by up to a tenth.
+/// Share of the available memory up to which a run without --host-mem may rise, percent: estimates err by up to a
+/// tenth.
 const REACH_PERCENT: u64 = 90;
 
 /// Expected peak memory of a run by part, bytes.

@@ -1,8 +1,7 @@
-//! The output folder of a run that begins: refused where a run is in it already, made, and cleared of an earlier run when
-//! the user says so.
+//! The output folder of a new run: checks it, creates it, locks it, and clears it of an earlier run on --overwrite.
 //!
-//! Invariants: 1. nothing is removed but files under this program's names beside a run's config, and that run's own
-//! checkpoint (`ownership`); 2. a run that could go on is named with the command that does so.
+//! Invariants: 1. only files with this program's names beside a run's config, and that run's own checkpoint
+//! (`ownership`), are removed; 2. the refusal of a folder with a resumable run names the command that resumes it.
 
 use super::error::TrainError;
 use super::facts::read_resolved;
@@ -19,25 +18,25 @@ use crate::report::run_report::{PAGES_FILE, REPORT_FILE};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 
-/// What a run does with an output folder that is there already.
+/// Treatment of an existing output folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Existing {
-    /// Refuses it, unless it is empty.
+    /// Refuse the folder unless it is empty.
     Refuse,
-    /// Removes the earlier run's results and its checkpoint in the folder.
+    /// Remove the earlier run's results and its checkpoint in the folder.
     Overwrite,
-    /// Takes it as its own: this run was cut off before its first commit.
+    /// Use the folder: this run was cut off there before its first commit.
     BeginAgain,
 }
 
-/// The file that the process which trains into an output folder locks; it stays there, empty.
+/// Lock file of an output folder; it stays there, empty.
 const LOCK: &str = ".gsscale-lock";
 
-/// The right to train into an output folder, as long as it lives.
+/// The lock on an output folder, held until dropped.
 #[derive(Debug)]
 pub(super) struct OutLock(#[allow(dead_code)] Option<File>); // the lock is held by the open file
 
-/// Locks an output folder that exists. Where the file system knows no locks, nothing is locked.
+/// Locks an existing output folder. On file systems without locks this does nothing.
 ///
 /// # Errors
 /// Another process trains into the folder.
@@ -53,15 +52,15 @@ pub(super) fn lock(out: &Path) -> InputResult<OutLock> {
     }
 }
 
-/// Whether a folder has nothing in it but the file of the lock.
+/// Whether a folder is empty except for the lock file.
 pub fn is_empty(out: &Path) -> bool {
     std::fs::read_dir(out).is_ok_and(|mut entries| entries.all(|e| e.is_ok_and(|e| e.file_name() == LOCK)))
 }
 
-/// Refuses an output folder that a run may not begin in, and says what to do about it.
+/// Refuses an output folder in which a run may not begin.
 ///
 /// # Errors
-/// The folder has something in it and is not to be overwritten, or its checkpoint is not the earlier run's.
+/// The folder is not empty and `existing` refuses it, or its checkpoint belongs to another run.
 pub(super) fn check(out: &Path, existing: Existing) -> Result<(), TrainError> {
     match existing {
         Existing::Refuse => Ok(check_new(out)?),
@@ -85,7 +84,7 @@ fn check_new(out: &Path) -> InputResult<()> {
     Err(InputError::new(out, "exists already", remedy_of_existing(out)))
 }
 
-/// What to do about an output folder that is there already: go on with the run in it, or start over.
+/// The remedy for an existing output folder: resume its run, or start over.
 pub fn remedy_of_existing(out: &Path) -> String {
     let start_over = "choose another --out, or replace it with --overwrite";
     let Ok(config) = TrainConfig::read(&out.join("config.toml")) else { return start_over.to_string() };
@@ -98,45 +97,45 @@ pub fn remedy_of_existing(out: &Path) -> String {
         Some(spill_dir) => format!("--overwrite after removing {}", spill_dir.display()),
     };
     format!(
-        "it holds a run that can go on: gsscale-train --resume {}; or choose another --out, or start over with {over}",
+        "resume its run with gsscale-train --resume {}; or choose another --out, or start over with {over}",
         out.display()
     )
 }
 
-/// Makes the folder, durably.
+/// Creates the folder durably.
 ///
 /// # Errors
-/// It cannot be made.
+/// The folder cannot be created.
 pub(super) fn make_folder(out: &Path) -> InputResult<()> {
     let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
     let is_new = !out.exists();
     std::fs::create_dir_all(out).map_err(io)?;
-    // Other folders on the way to it that were made just now are left to the file system.
+    // The names of new parent folders are not synced.
     if is_new { sync_folder(folder_of(out)).map_err(io) } else { Ok(()) }
 }
 
-/// Makes the folder, proves that it can be written, and removes what an earlier run left there under our names.
+/// Creates the folder, checks that it is writable, and removes an earlier run's files.
 ///
 /// # Errors
-/// The folder cannot be written, or its checkpoint is not the earlier run's.
+/// The folder cannot be written, or its checkpoint belongs to another run.
 pub(super) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
     let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
     make_folder(out)?;
     let probe = out.join(".gsscale-probe");
     std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(io)?;
-    // Without a run's config the files under our names are somebody else's (the points of a scene, say).
+    // Without a run's config, files with our names may be somebody else's (such as the points of a scene).
     if existing == Existing::Refuse || !out.join("config.toml").is_file() {
         return Ok(());
     }
     if existing == Existing::Overwrite {
-        // First, because a run that is still at work in it ends this one here.
+        // First, because an active run in the folder makes this fail.
         remove_checkpoint_in(&checkpoint_folder(out), run_in(out))?;
         remove_file(&out.join("config.toml"))?;
     }
     remove_file(&out.join("metrics.jsonl"))?;
     remove_events(&out.join("tensorboard"))?;
     if existing == Existing::BeginAgain {
-        // A run that was cut off before its first commit left nothing else, and results are nobody's to remove here.
+        // A run that was cut off before its first commit left nothing else; results must stay.
         return Ok(());
     }
     for name in ["summary.json", "point_cloud.ply", REPORT_FILE, PAGES_FILE] {
@@ -154,7 +153,7 @@ fn remove_file(path: &Path) -> InputResult<()> {
     std::fs::remove_file(path).map_err(|e| InputError::io(path, "removing the earlier run's file", &e))
 }
 
-/// Removes the pictures of an earlier evaluation, which lie in folders where the photos do, and folders that are empty then.
+/// Removes the pictures of an earlier evaluation from `folder` and its subfolders, and folders that become empty.
 fn remove_pictures(folder: &Path) -> InputResult<()> {
     if !folder.is_dir() {
         return Ok(());
@@ -172,8 +171,8 @@ fn remove_pictures(folder: &Path) -> InputResult<()> {
     Ok(())
 }
 
-/// Removes the event files of an earlier run, which TensorBoard would draw into the new one's curves, and their folder if
-/// nothing else is in it.
+/// Removes the event files of an earlier run, since TensorBoard would draw them into the new curves, and their folder
+/// if it becomes empty.
 fn remove_events(folder: &Path) -> InputResult<()> {
     if !folder.is_dir() {
         return Ok(());
@@ -186,7 +185,7 @@ fn remove_events(folder: &Path) -> InputResult<()> {
     Ok(())
 }
 
-/// Removes what a later evaluation of an earlier state said, which comparisons would take for this run's.
+/// Removes the evaluation of an earlier state, since comparisons would use it for this run.
 pub(super) fn remove_evaluation(out: &Path) -> InputResult<()> {
     for path in ["evaluated.json", "evaluated-as.toml"].map(|name| out.join(name)) {
         match std::fs::remove_file(&path) {
@@ -199,12 +198,12 @@ pub(super) fn remove_evaluation(out: &Path) -> InputResult<()> {
     Ok(())
 }
 
-/// Removes what `--save-every` of an earlier run left.
+/// Removes the PLY files that `--save-every` of an earlier run wrote.
 fn remove_saved(out: &Path) -> InputResult<()> {
     saved(out)?.iter().try_for_each(|path| remove_file(path))
 }
 
-/// What `--save-every` left in the folder: point_cloud_<step>.ply.
+/// The PLY files that `--save-every` wrote: point_cloud_<step>.ply.
 pub(super) fn saved(out: &Path) -> InputResult<Vec<PathBuf>> {
     let entries = std::fs::read_dir(out).map_err(|e| InputError::io(out, "listing the folder", &e))?;
     let is_saved = |path: &PathBuf| {

@@ -41,9 +41,9 @@ impl TrainError {
 }
 
 impl Trainer {
-    /// Starts paging in a run in memory whose pages no longer fit, between steps: commits all pages, so that they can be
-    /// evicted and read again. If paging left too few frames for a view and the user set no budget, all pages stay in
-    /// memory while the machine has it.
+    /// Starts paging in a run in memory whose pages no longer fit, between steps: commits all pages, so that they can
+    /// be evicted and read again. If paging left too few frames for a view and the user set no budget, all pages stay
+    /// in memory while the machine has it.
     ///
     /// # Errors
     /// The commit failed for a reason other than space.

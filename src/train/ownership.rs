@@ -1,15 +1,15 @@
-//! Which store belongs to which run, and who may delete what.
+//! Ownership of stores: which run a store belongs to, and who may delete what.
 //!
-//! A run draws an identity when it begins ([`RunId`]) and writes it to its config.toml and into every commit. A path is no
-//! identity: a spill directory can be removed and made again by another run under the same name.
+//! A run draws an identity when it begins ([`RunId`]) and writes it to its config.toml and into every commit. A path is
+//! not an identity: another run can create a new spill directory under the same name.
 //!
 //! | who | may delete | only if |
 //! | --- | --- | --- |
 //! | a run that begins with `--spill-dir P` | the store in `P` | the store holds no commit ([`crate::page::folder::uncommitted`]) |
 //! | a run in memory, at its first commit | the store in `OUT/checkpoint` | the store holds no commit |
-//! | a run that ends, `--keep-checkpoint` absent | the store that it made or went on from | this process holds the store's lock, and FORMAT has the store's identity |
+//! | a run that ends, `--keep-checkpoint` absent | the store that it made or resumed from | this process holds the store's lock, and FORMAT has the store's identity |
 //! | a run that is refused or fails before its first commit | the store that it made | as above |
-//! | `--resume OUT` of a run that is done | the checkpoint that a kill left at the run's own place | the last commit has the identity of the run in `OUT`, and `--keep-checkpoint` is absent |
+//! | `--resume OUT` of a finished run | the checkpoint that a kill left in the run's own folder | the last commit has the identity of the run in `OUT`, and `--keep-checkpoint` is absent |
 //! | `--overwrite` | the store in `OUT/checkpoint` | the store holds no commit, or its last commit has the identity of the run in `OUT` |
 //! | any run | anything in `OUT` | it holds the lock of `OUT` |
 //! | `--resume OUT` of a run that was cut off before its first commit | metrics and event files in `OUT` | there is neither a result nor a saved PLY nor a logged commit |
@@ -18,8 +18,8 @@
 //! | `gsscale-ckpt clone`, `salvage`, `import` | their own unfinished store | the folder was made by this process |
 //! | a sweep of `gsscale-bench` | its own unfinished runs and their pages | the folder has the sweep's mark in its name, or its record in it |
 //!
-//! Whatever the row: files inside a spill directory go by the store's identity ([`SpillDir::remove`]), other files stay, and a
-//! store that cannot be opened stays.
+//! In all cases, files inside a spill directory are deleted by the store's identity ([`SpillDir::remove`]); other files
+//! stay, and so does a store that cannot be opened.
 
 use super::error::TrainError;
 use super::places::absolute;
@@ -48,7 +48,8 @@ pub(super) fn check_owner(folder: &Path, of_store: &RunIdentity, run: RunId) -> 
         out => (
             format!("it holds the checkpoint of another run, that of {out}"),
             format!(
-                "name the folder that holds the pages of this run with --spill-dir; the other one goes on with gsscale-train --resume {out}"
+                "name the folder that holds the pages of this run with --spill-dir; the other run continues with \
+                 gsscale-train --resume {out}"
             ),
         ),
     };
@@ -58,16 +59,17 @@ pub(super) fn check_owner(folder: &Path, of_store: &RunIdentity, run: RunId) -> 
 /// The run that a checkpoint must belong to.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Claim<'a> {
-    /// Its identity; unknown where its config.toml has none.
+    /// Its identity; unknown if its config.toml has none.
     pub run: RunId,
     /// Its output folder.
     pub out: &'a Path,
-    /// The user named the folder of the checkpoint for this very call.
+    /// The user named the folder of the checkpoint on this command line.
     pub is_named: bool,
 }
 
 impl Claim<'_> {
-    /// Refuses the checkpoint of another run. A run without an identity owns a checkpoint that says so, or that was named.
+    /// Refuses the checkpoint of another run. A run without an identity owns a checkpoint that names its output folder
+    /// or that the user named.
     fn check(&self, folder: &Path, of_store: &RunIdentity) -> InputResult<()> {
         let out = absolute(self.out);
         let is_here = Path::new(&of_store.out) == out;
@@ -76,20 +78,20 @@ impl Claim<'_> {
         }
         if is_here && of_store.id.is_other_than(self.run) {
             let problem = "it holds the checkpoint of an earlier run in the same output folder";
-            let remedy = "name the folder that holds the pages of this run with --spill-dir; to go on with the earlier run, \
-                          name an output folder that does not exist yet and this folder with --spill-dir";
+            let remedy = "name the folder that holds the pages of this run with --spill-dir; to resume the earlier run, \
+                          name a new output folder and this folder with --spill-dir";
             return Err(InputError::new(folder, problem, remedy));
         }
         check_owner(folder, of_store, self.run)
     }
 }
 
-/// The checkpoint in `folder`, if it belongs to the run; `None` where nothing was committed in it.
+/// Opens the checkpoint in `folder`; `None` if it has no commit.
 ///
 /// # Errors
-/// It belongs to another run, cannot be opened, or is in use.
+/// The checkpoint belongs to another run, cannot be opened, or is in use.
 pub(super) fn open_own(folder: &Path, claim: Claim<'_>, allow_remote: bool) -> Result<Option<Stored>, TrainError> {
-    // Opening a map for writing changes its file, so its owner is asked for by reading. What cannot be read is refused below.
+    // Opening a map for writing changes its file, so check the owner by reading. An unreadable map is refused below.
     if let Ok(state) = last_state(folder, Access::Map) {
         claim.check(folder, &state.run)?;
     }
@@ -98,10 +100,10 @@ pub(super) fn open_own(folder: &Path, claim: Claim<'_>, allow_remote: bool) -> R
     Ok(Some(stored))
 }
 
-/// The run state of the last commit, read without writing anything.
+/// Reads the run state of the last commit without writing.
 ///
 /// # Errors
-/// Nothing was committed, or the store cannot be opened.
+/// The store has no commit or cannot be opened.
 pub(super) fn last_state(folder: &Path, access: Access) -> Result<RunState, TrainError> {
     let store = StoreReader::open(folder, access, WitnessRule::Obeyed)?;
     let bytes = store.run_state(store.find(None)?)?;
@@ -109,21 +111,21 @@ pub(super) fn last_state(folder: &Path, access: Access) -> Result<RunState, Trai
     Ok(RunState::from_bytes(&bytes).map_err(|e| wrong(e.to_string()))?)
 }
 
-/// Removes the checkpoint that the run of `out` left in its output folder, for a run that starts over there.
+/// Removes the checkpoint that `run` left in its output folder, for a run that starts over there.
 ///
 /// # Errors
-/// It belongs to another run, cannot be opened, or is in use: it stays, and the new run must not begin.
+/// The checkpoint belongs to another run, cannot be opened, or is in use; it stays, and the new run must not begin.
 pub(super) fn remove_checkpoint_in(folder: &Path, run: RunId) -> Result<(), TrainError> {
     check_removable(folder, run)?;
     if SpillDir::exists_in(folder) && !remove_uncommitted(folder, true)? {
         SpillDir::open(folder, true)?.remove()?;
     }
-    // Only if nothing else is in it.
+    // Succeeds only if the folder is empty.
     let _ = std::fs::remove_dir(folder);
     Ok(())
 }
 
-/// As [`remove_checkpoint_in`], without removing anything.
+/// Checks whether [`remove_checkpoint_in`] may remove the checkpoint.
 ///
 /// # Errors
 /// As [`remove_checkpoint_in`].
@@ -131,8 +133,7 @@ pub(super) fn check_removable(folder: &Path, run: RunId) -> Result<(), TrainErro
     if !SpillDir::exists_in(folder) || SpillDir::open(folder, true)?.holds_no_commit()? {
         return Ok(());
     }
-    let by_hand =
-        format!("if it is of no use any more, remove it (rm -r {}), or choose another --out", folder.display());
+    let by_hand = format!("if you do not need it, remove it (rm -r {}), or choose another --out", folder.display());
     let refuse = |problem: String| InputError::new(folder, problem, by_hand.clone());
     let state = last_state(folder, Access::Pages)
         .map_err(|e| refuse(format!("the checkpoint in it cannot be opened, so it is not removed: {e}")))?;

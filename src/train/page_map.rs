@@ -30,7 +30,7 @@ fn page_tiles(dataset: &Dataset, trainer: &Trainer) -> Vec<PageTile> {
         }
     }
     let seen: Vec<usize> = (0..index.len()).filter(|&i| is_finite(&index[i].bounds)).collect();
-    // From above is along the axis in which the pages' centres differ least.
+    // The view from above is along the axis in which page centres differ least.
     let centre = |i: usize, axis: usize| f64::from(index[i].bounds.lo[axis]) + f64::from(index[i].bounds.hi[axis]);
     let spread = |axis: usize| {
         let mean = seen.iter().map(|&i| centre(i, axis)).sum::<f64>() / seen.len() as f64;

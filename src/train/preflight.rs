@@ -1,6 +1,7 @@
 //! Plans the tiers before the first step: what each tier will hold, whether it fits, and the number of frames.
 //!
-//! Invariant: a run that cannot fit is refused here, with numbers and alternatives. Growth that may not fit is a warning.
+//! Invariant: a run that cannot fit is refused here, with numbers and alternatives. Growth that may not fit is a
+//! warning.
 
 use super::budget::{FRAMES_LEAST, HostBudget, cut};
 use super::error::TrainError;
@@ -65,7 +66,7 @@ pub struct TierPlan {
 ///
 /// # Errors
 /// The budget or the drive is too small.
-pub fn settle(
+pub fn plan_tiers(
     config: &TrainConfig,
     dataset: &Dataset,
     trainer: &mut Trainer,
@@ -162,7 +163,7 @@ pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Op
     ))
 }
 
-/// Allows the frames that the largest training view of `dataset` needs, so that views can be measured; [`settle`]
+/// Allows the frames that the largest training view of `dataset` needs, so that views can be measured; [`plan_tiers`]
 /// allows the rest afterwards. Where the budget may not hold them beside the rows of the view, the view is measured in batches.
 /// Returns the index of that view. Runs in memory or with --frames are left unchanged.
 pub fn allow_largest_view(
@@ -194,8 +195,8 @@ fn page_working(config: &TrainConfig) -> u64 {
     u64::from(config.page_rows) * WorkingSet::row_bytes(config.sh_degree) as u64
 }
 
-/// Resolves `--view-order auto`. For a scene that grows, the current pages stand for the grown scene, with the number of
-/// frames reduced in proportion.
+/// Resolves `--view-order auto`. For a scene that grows, the current pages stand for the grown scene, with the number
+/// of frames reduced in proportion.
 fn auto_order(
     config: &TrainConfig,
     dataset: &Dataset,
@@ -218,7 +219,7 @@ fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
     dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect()
 }
 
-/// Number of frames within `host_mem`, as [`settle`] chooses it. For planning without a run: `trainer` holds the pages
+/// Number of frames within `host_mem`, as [`plan_tiers`] chooses it. For planning without a run: `trainer` holds the pages
 /// of the largest view.
 ///
 /// # Errors
@@ -340,9 +341,9 @@ fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -
     }
     if most.total() > budget {
         eprintln!(
-            "warning: the run may need {} but has {}: beyond that, its pages move between memory and its checkpoint; name \
-             a folder on a fast drive with --spill-dir, or lower --max-gaussians, --image-cache, --sh-degree or the size \
-             of the photos",
+            "warning: the run may need {} but has {}: beyond that, its pages move between memory and its checkpoint; \
+             name a folder on a fast drive with --spill-dir, or lower --max-gaussians, --image-cache, --sh-degree or \
+             the size of the photos",
             format_bytes(most.total()),
             format_bytes(budget)
         );
@@ -389,8 +390,8 @@ fn raise_to_least(config: &TrainConfig, host_mem: Option<u64>, least: u64) -> Op
     let budget = host_mem.filter(|&budget| config.host_mem.0 == 0 && least > budget);
     let Some(short) = budget.filter(|_| obtainable_bytes().is_some_and(|most| least <= most)) else { return host_mem };
     eprintln!(
-        "warning: the run needs {} from its start, more than {}, the default share of the free memory: it takes more as \
-         long as the machine has it; --host-mem sets a limit",
+        "warning: the run needs {} from its start, more than {}, the default share of the free memory: it takes more \
+         as long as the machine has it; --host-mem sets a limit",
         format_bytes(least),
         format_bytes(short)
     );
@@ -472,8 +473,8 @@ fn check_frames(frames: u64) -> InputResult<()> {
     Err(InputError::new("--frames", problem, format!("give at least {FRAMES_LEAST}")))
 }
 
-/// Refuses a drive that cannot hold the `rows` first Gaussians, before the import. A drive that does not report its free
-/// space passes.
+/// Refuses a drive that cannot hold the `rows` first Gaussians, before the import. A drive that does not report its
+/// free space passes.
 ///
 /// # Errors
 /// The drive has too little free space.
@@ -562,7 +563,8 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
     text.push_str(&part("program and tables", memory.base + memory.copies));
     if tiers.spills() {
         text.push_str(&format!(
-            "drive   {} of pages by {} ({}), {} free; about {} to be written, commits apart, {:.2} % of what a common drive is rated for\n",
+            "drive   {} of pages by {} ({}), {} free\n        \
+             about {} to write without commits, {:.2} % of the rated life of a common drive\n",
             format_bytes(plan.pages[0] * plan.frame_bytes),
             tiers.engine,
             tiers.codec,

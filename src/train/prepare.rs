@@ -1,6 +1,7 @@
-//! The dataset and the first Gaussians of a scene that is read into memory whole, and what both ways of starting a run check.
+//! Reads the dataset and the first Gaussians of a scene into memory, and checks them. Streamed scenes
+//! ([`super::start`]) use the same checks.
 //!
-//! Invariant: bad input is an error here, before anything is written.
+//! Invariant: bad input is an error here, before any file is written.
 
 use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
@@ -17,16 +18,16 @@ use std::path::{Path, PathBuf};
 pub struct Prepared {
     /// Views and frame.
     pub dataset: Dataset,
-    /// First Gaussians, local frame. Bands that are not in use yet may be missing.
+    /// First Gaussians in the local frame. SH bands above the current degree may be missing.
     pub columns: Columns,
-    /// Degree in use from the first step: what they were trained with, or what was asked for.
+    /// SH degree of the first step: that of the given Gaussians or of the config, whichever is higher.
     pub sh_degree_start: u8,
 }
 
-/// Reads the scene and makes first Gaussians.
+/// Reads the scene and creates the first Gaussians.
 ///
 /// # Errors
-/// Whatever is wrong with the scene or the PLY, by file, place and remedy.
+/// The scene or the PLY is invalid.
 pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
     let mut raw = read_scene(scene, &limits::read_options(config))?;
     let mut gaussians = None;
@@ -55,7 +56,7 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
             let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
             dataset.warnings.extend(ply_warnings(&ply, &meta, far));
             let in_use = columns.sh_degree.max(limits::first_sh_degree(config));
-            (cut_sh(columns, config.sh_degree), in_use)
+            (truncate_sh(columns, config.sh_degree), in_use)
         }
         None => (first_gaussians(scene, &mut dataset, config)?, limits::first_sh_degree(config)),
     };
@@ -63,7 +64,7 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
     Ok(Prepared { dataset, columns, sh_degree_start })
 }
 
-/// There must be views to train on.
+/// Refuses a dataset without training views.
 pub(super) fn check_train_views(scene: &Path, dataset: &Dataset) -> InputResult<()> {
     if !dataset.train_views().is_empty() {
         return Ok(());
@@ -72,10 +73,10 @@ pub(super) fn check_train_views(scene: &Path, dataset: &Dataset) -> InputResult<
     Err(InputError::new(scene, problem, "hold out fewer photos: see --test-every and --test-after"))
 }
 
-/// There must be Gaussians to start from, and no more than may be.
+/// Refuses a start without Gaussians, or with more than --max-gaussians.
 pub(super) fn check_first_rows(from: &Path, config: &TrainConfig, rows: u64) -> InputResult<()> {
     if rows == 0 {
-        let problem = "no Gaussian is left to start from: all are too far from the cameras";
+        let problem = "all first Gaussians are too far from the cameras";
         return Err(InputError::new(from, problem, "give a PLY of this scene with --init-ply"));
     }
     if config.max_gaussians > 0 && rows > config.max_gaussians {
@@ -99,19 +100,19 @@ fn first_gaussians(scene: &Path, dataset: &mut Dataset, config: &TrainConfig) ->
         ));
     }
     dataset.warnings.push(format!(
-        "there are no points to start from: {} random ones are drawn in what the cameras see",
+        "the dataset has no points: starting from {} random points in the views' frusta",
         config.init_points
     ));
     let cameras: Vec<_> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
     let count = config.init_points as usize;
-    // Aerial and object captures both have their subject within a few camera-spreads of the cameras.
+    // In aerial and object captures the subject lies within a few camera spreads of the cameras.
     let (near, far) = (0.1 * dataset.scene_scale, 3.0 * dataset.scene_scale);
     let (points, colors) = random_points_in_frusta(&cameras, count, near, far, config.seed);
     Ok(gaussians_from_points(&points, &colors, &options))
 }
 
-/// The same rows without the bands above a degree.
-pub(super) fn cut_sh(columns: Columns, sh_degree: u8) -> Columns {
+/// Drops the SH bands above `sh_degree`.
+pub(super) fn truncate_sh(columns: Columns, sh_degree: u8) -> Columns {
     if columns.sh_degree <= sh_degree {
         return columns;
     }
@@ -120,7 +121,7 @@ pub(super) fn cut_sh(columns: Columns, sh_degree: u8) -> Columns {
     Columns { sh_degree, sh_n, ..columns }
 }
 
-/// What to say about Gaussians that were read from `ply`, of which `far` did not survive the change of frame.
+/// Warnings about Gaussians read from `ply`, of which `far` were dropped by the change of frame.
 pub fn ply_warnings(ply: &Path, meta: &PlyMeta, far: u64) -> Vec<String> {
     let mut warnings = Vec::new();
     if meta.dropped > 0 {

@@ -39,9 +39,9 @@ impl Probe {
     }
 }
 
-/// Estimates the memory of a run with all pages in memory: without growth, and grown to its cap. The trainer renders the
-/// views of the probe and keeps the allocations for its steps; allocating twice would fragment the heap and exceed the
-/// estimate.
+/// Estimates the memory of a run with all pages in memory: without growth, and grown to its cap. The trainer renders
+/// the views of the probe and keeps the allocations for its steps; allocating twice would fragment the heap and exceed
+/// the estimate.
 ///
 /// # Errors
 /// A view cannot be rendered.
@@ -57,7 +57,8 @@ pub fn estimate(
     let [working, rendering] = trainer.view_bytes();
     // Image, coverage, gradient, and per-tile copies of them.
     let of_pixels = (pixels * 4 * (3 + 1 + 3 + 6)).min(rendering);
-    // The part of the rows grows with the number of Gaussians and with the SH degree; the part of the pixels is constant.
+    // The part of the rows grows with the number of Gaussians and with the SH degree; the part of the pixels is
+    // constant.
     let (first, last) = trainer.sh_degrees();
     let wider = row_width(last) as f64 / row_width(first) as f64;
     // A view that was probed in batches had the working set of one of them.

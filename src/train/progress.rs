@@ -1,4 +1,4 @@
-//! What a person sees while a run goes on: a bar on a terminal, plain lines elsewhere, nothing with `--quiet`.
+//! Progress display: a bar on a terminal, lines elsewhere, nothing with `--quiet`.
 
 use indicatif::{ProgressBar, ProgressStyle};
 use std::io::IsTerminal;
@@ -8,7 +8,7 @@ use std::time::Instant;
 pub struct Progress {
     bar: Option<ProgressBar>,
     quiet: bool,
-    /// Steps that were done before.
+    /// Steps done before this process.
     first: u32,
     total: u32,
     started: Instant,
@@ -28,7 +28,7 @@ impl Progress {
         Progress { bar, quiet, first: 0, total, started: now, last_line: now }
     }
 
-    /// The display of a run that goes on after `first` steps, which count for no rate.
+    /// The display of a run resumed after `first` steps; these do not count in the rate.
     pub fn after(self, first: u32) -> Self {
         if let Some(bar) = &self.bar {
             bar.set_position(u64::from(first));
@@ -37,7 +37,7 @@ impl Progress {
         Progress { first, ..self }
     }
 
-    /// One step is done. `message` is asked for only when it will be shown.
+    /// Shows that `done` steps are done. `message` is called only if it is shown.
     pub fn step(&mut self, done: u32, message: impl FnOnce() -> String) {
         if let Some(bar) = &self.bar {
             bar.set_position(u64::from(done));
@@ -47,7 +47,7 @@ impl Progress {
             }
             return;
         }
-        // Off a terminal a line every ten seconds tells that the run lives without filling a log.
+        // Without a terminal, one line every ten seconds keeps logs small.
         if !self.quiet && (self.last_line.elapsed().as_secs() >= 10 || done == self.total) {
             self.last_line = Instant::now();
             let [rate, left] = rate(self.first, done, self.total, self.started.elapsed().as_secs_f64());
@@ -55,7 +55,7 @@ impl Progress {
         }
     }
 
-    /// The loop has ended.
+    /// Removes the bar.
     pub fn finish(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
@@ -63,7 +63,7 @@ impl Progress {
     }
 }
 
-/// Steps a second since the first one of this process, and seconds that are left.
+/// Steps per second of this process, and estimated seconds left.
 fn rate(first: u32, done: u32, total: u32, seconds: f64) -> [f64; 2] {
     let rate = f64::from(done.saturating_sub(first)) / seconds.max(1e-9);
     [rate, f64::from(total.saturating_sub(done)) / rate.max(1e-9)]

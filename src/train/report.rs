@@ -1,7 +1,7 @@
-//! What a run leaves behind for programs: metrics.jsonl line by line, summary.json at the end, config.toml at the start.
+//! Machine-readable output of a run: metrics.jsonl line by line, and summary.json at the end.
 //!
-//! Invariants: 1. every number written is finite (JSON knows neither infinity nor NaN: see [`json_psnr`]); 2. whole
-//! files appear by rename, so a reader never sees half of one.
+//! Invariants: 1. every number written is finite, because JSON has neither infinity nor NaN (see [`json_psnr`]); 2.
+//! whole files appear by rename, so a reader never sees a partial file.
 
 use super::whole_file::write_whole;
 use crate::base::error::{InputError, InputResult};
@@ -16,10 +16,10 @@ use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-/// PSNR that stands for a perfect image.
+/// PSNR of a perfect image.
 pub const PSNR_PERFECT: f64 = 100.0;
 
-/// The counters of the pager with the sizes that they belong to.
+/// The counters of the pager, with frames and pages.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct TierTraffic {
     /// The counters.
@@ -32,12 +32,12 @@ pub struct TierTraffic {
 }
 
 impl TierTraffic {
-    /// Of a pager.
+    /// The traffic of a pager.
     pub fn of(pager: &Pager) -> TierTraffic {
         TierTraffic { stats: pager.stats(), frames: pager.frames() as u64, pages: pager.index().len() as u64 }
     }
 
-    /// For the progress line; empty while nothing was read or written.
+    /// Text for the progress line; empty before the first read or write.
     pub fn words(&self) -> String {
         let PagerStats { bytes_read, bytes_written, stall_seconds, .. } = self.stats;
         if bytes_read + bytes_written == 0 {
@@ -69,13 +69,13 @@ pub struct StepLine {
     pub bytes_read_back: u64,
     /// Most device memory allocated so far, bytes.
     pub device_bytes_peak: u64,
-    /// Between the tiers, since the start.
+    /// Traffic between the tiers since the start.
     #[serde(flatten)]
     pub tiers: TierTraffic,
-    /// What commits cost so far, where there are any.
+    /// Costs of the commits so far, if any.
     #[serde(flatten, skip_serializing_if = "Option::is_none", default)]
     pub commits: Option<CommitReport>,
-    /// Evaluation on the held-out views, where one was due.
+    /// Evaluation on the held-out views, if one was due.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub test: Option<TestMetrics>,
 }
@@ -83,74 +83,74 @@ pub struct StepLine {
 /// Means over the held-out views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TestMetrics {
-    /// Views in the means: those with a pixel that is not masked.
+    /// Views in the means: those with an unmasked pixel.
     pub views: u32,
     /// Mean PSNR, dB.
     pub psnr: f64,
     /// Mean SSIM.
     pub ssim: f64,
-    /// Mean LPIPS, where weights were given: see the report for network and input range.
+    /// Mean LPIPS, if weights were given; the report names network and input range.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub lpips: Option<f64>,
-    /// PSNR after a fit of colours, where it was asked for: another measure than `psnr`.
+    /// Colour-corrected PSNR, if requested; not comparable with `psnr`.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub color_corrected: Option<ColorCorrected>,
 }
 
-/// Mean PSNR after each render's colours were fitted to its photo's.
+/// Mean PSNR after fitting the colours of each render to its photo.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ColorCorrected {
-    /// How.
+    /// Method of the fit.
     pub method: ColorCorrect,
     /// Mean over the views, dB.
     pub cc_psnr: f64,
 }
 
 impl TestMetrics {
-    /// The colour-corrected PSNR with its name, for people; empty where it was not measured.
-    pub fn words_of_color_corrected(&self) -> String {
+    /// Text of the colour-corrected PSNR with its name; empty if not measured.
+    pub fn color_corrected_text(&self) -> String {
         self.color_corrected
             .map_or(String::new(), |c| format!(", colour-corrected PSNR ({}) {:.2} dB", c.method.name(), c.cc_psnr))
     }
 }
 
-/// Costs of the steps that this process did (a run that was resumed: since then).
+/// Costs of the steps of this process (after a resume, of the steps since then).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct StepCosts {
-    /// CPU seconds of all threads during the steps; absent where the system does not tell.
+    /// CPU seconds of all threads during the steps; absent if the system does not report them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub train_cpu_seconds: Option<f64>,
     /// Bytes read from the drive by the steps.
     pub train_bytes_read: u64,
-    /// Bytes written to it by the steps and their commits' pages.
+    /// Bytes written to the drive by steps and by commits of pages.
     pub train_bytes_written: u64,
     /// Seconds that the steps waited for the drive.
     pub train_stall_seconds: f64,
-    /// Most bytes allocated on the device; 0 on the CPU.
+    /// Peak bytes allocated on the device; 0 on the CPU.
     pub device_bytes_peak: u64,
     /// Bytes of the segment files on the drive, which never shrink; 0 without a spill directory.
     pub drive_bytes_peak: u64,
 }
 
-/// What summary.json holds.
+/// Content of summary.json.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Summary {
     /// Steps done.
     pub steps: u32,
     /// Gaussians in the result.
     pub gaussians: u64,
-    /// Seconds spent in training steps, evaluation left out.
+    /// Seconds spent in training steps, without evaluation.
     pub train_seconds: f64,
     /// Largest resident size of the process, bytes.
     pub host_bytes_peak: u64,
-    /// Held-out metrics; absent when no view is held out.
+    /// Held-out metrics; absent without held-out views.
     pub test: Option<TestMetrics>,
     /// The scene that was trained.
     pub scene: PathBuf,
     /// Version of the program.
     pub version: String,
-    /// Which SSIM `test.ssim` is: same, valid or reflect.
+    /// Variant of `test.ssim`: same, valid or reflect.
     pub ssim_variant: String,
     /// Whether the run did all of its steps and the evaluation after them.
     pub finished: bool,
@@ -158,19 +158,18 @@ pub struct Summary {
     pub rows_skipped_non_finite: u64,
     /// Steps skipped because the loss was not finite.
     pub steps_skipped_non_finite: u32,
-    /// What the steps alone took.
+    /// Costs of the steps alone.
     #[serde(flatten)]
     pub costs: StepCosts,
-    /// Between the tiers, first pages, evaluation and export included.
+    /// Traffic between the tiers, including import, evaluation and export.
     #[serde(flatten)]
     pub tiers: TierTraffic,
-    /// What commits cost, where there were any. Of a run that was resumed, since then.
+    /// Costs of the commits, if any; after a resume, of the commits since then.
     #[serde(flatten, skip_serializing_if = "Option::is_none", default)]
     pub commits: Option<CommitReport>,
 }
 
-/// A PSNR for JSON: at most 100, which also stands for no difference at all; what is not a number (a broken picture)
-/// counts as the worst, 0.
+/// A PSNR for JSON: at most [`PSNR_PERFECT`]; NaN (a broken picture) becomes the worst value, 0.
 pub fn json_psnr(psnr: f64) -> f64 {
     if psnr.is_nan() || psnr == f64::NEG_INFINITY { 0.0 } else { psnr.min(PSNR_PERFECT) }
 }
@@ -179,7 +178,7 @@ pub fn json_psnr(psnr: f64) -> f64 {
 pub struct MetricsLog {
     path: PathBuf,
     file: BufWriter<File>,
-    /// The same numbers for TensorBoard, where they were asked for.
+    /// The TensorBoard file, if requested.
     events: Option<EventFile>,
 }
 
@@ -201,7 +200,7 @@ impl MetricsLog {
         Ok(MetricsLog { events: Some(EventFile::create(folder, first_step)?), ..self })
     }
 
-    /// The file of a run that begins, or that goes on after the first `bytes` bytes.
+    /// Opens the file of a new run, or of a run that resumes after the first `bytes` bytes.
     ///
     /// # Errors
     /// As [`MetricsLog::create`] and [`MetricsLog::resume`].
@@ -209,20 +208,20 @@ impl MetricsLog {
         bytes.map_or_else(|| MetricsLog::create(path), |bytes| MetricsLog::resume(path, bytes))
     }
 
-    /// Appends after the first `bytes` bytes of the file; what follows them belongs to steps that are done again. Where some
-    /// of these bytes are missing the log goes on after the last whole line, with a warning: no step depends on it.
+    /// Appends after the first `bytes` bytes of the file; later bytes belong to steps that are repeated. If bytes are
+    /// missing, appends after the last whole line and warns: no step depends on the log.
     ///
     /// # Errors
     /// The file cannot be read or written.
     pub fn resume(path: &Path, bytes: u64) -> InputResult<Self> {
-        let io = |e: std::io::Error| InputError::io(path, "going on with the metrics file", &e);
+        let io = |e: std::io::Error| InputError::io(path, "continuing the metrics file", &e);
         let mut options = OpenOptions::new();
         let file = options.read(true).append(true).create(true).open(path).map_err(io)?;
         let there = file.metadata().map_err(io)?.len();
         let kept = if there < bytes { end_of_whole_lines(&file).map_err(io)? } else { bytes };
         if there < bytes {
             eprintln!(
-                "warning: {} has {there} of the {bytes} bytes that the run had written: the curves of the report have a gap",
+                "warning: {} has only {there} of {bytes} bytes: the curves of the report have a gap",
                 path.display()
             );
         }
@@ -230,7 +229,7 @@ impl MetricsLog {
         Ok(MetricsLog { path: path.to_path_buf(), file: BufWriter::new(file), events: None })
     }
 
-    /// Makes what was written durable; returns its length in bytes.
+    /// Makes the file durable; returns its length in bytes.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -241,7 +240,7 @@ impl MetricsLog {
         Ok(self.file.get_ref().metadata().map_err(io)?.len())
     }
 
-    /// Writes one line and hands it to the system, so that a crash loses none that was written.
+    /// Writes one line unbuffered, so that a crash of the process loses no written line.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -257,7 +256,7 @@ impl MetricsLog {
     }
 }
 
-/// Bytes up to the end of the last line that ends.
+/// Length of the file up to the end of its last complete line, bytes.
 fn end_of_whole_lines(file: &File) -> std::io::Result<u64> {
     let (mut reader, mut line, mut end) = (BufReader::new(file), Vec::new(), 0);
     while reader.read_until(b'\n', &mut line)? > 0 && line.ends_with(b"\n") {

@@ -1,11 +1,10 @@
-//! Resuming a run that stopped, or that ended and kept its checkpoint: from its output folder to the end.
+//! Resumes a run that stopped, or that ended and kept its checkpoint, from its output folder.
 //!
-//! Invariants: 1. a resumed run ends with the bytes that it would have had without the stop; 2. keys that change
-//! numbers, and the dataset, are those of the run, or the resume is refused with the difference, unless the user accepts it:
-//! then every page is brought to the step of the change as it was trained, once, and goes on from there by the new rules; 3. a
-//! refused resume leaves everything as it was; 4. the checkpoint alone is enough: of the output folder nothing is needed but
-//! what says which checkpoint is meant, and files that are missing there are made again; 5. a checkpoint of another run is
-//! neither used nor removed (`ownership`).
+//! Invariants: 1. a resumed run ends with the same bytes as an uninterrupted one; 2. a resume with changed numbers or
+//! another dataset is refused with the differences. If the user accepts them, every page is evaluated once at the step
+//! of the change by the old rules and continues by the new; 3. a refused resume changes nothing; 4. the checkpoint is
+//! sufficient: the output folder only names it, and missing files there are written again; 5. a checkpoint of another
+//! run is neither used nor removed (`ownership`).
 
 use super::changes::{Changes, kept_config};
 use super::error::TrainError;
@@ -17,7 +16,7 @@ use super::ownership::{Claim, last_state, open_own};
 use super::pages::PagedScene;
 use super::places::absolute;
 use super::report::{StepLine, Summary};
-use super::run::{Begun, Past, RunOutcome, RunRequest, begin, run, see_through};
+use super::run::{Begun, Past, RunOutcome, RunRequest, begin, plan_and_train, run};
 use super::start::Start;
 use super::start::dataset_print;
 use super::tiers::Stored;
@@ -39,73 +38,71 @@ use crate::render::Renderer;
 use crate::report::run_report::write_run_report;
 use std::path::{Path, PathBuf};
 
-/// What to do about a config.toml that cannot be used.
-const REMEDY_DAMAGED: &str = "remove the file: gsscale-train --resume makes it again from the checkpoint; where the pages lie in \
-                              a spill directory, name it with --spill-dir";
+/// Remedy for an unusable config.toml.
+const REMEDY_DAMAGED: &str = "remove the file: gsscale-train --resume restores it from the checkpoint; if the pages \
+                              lie in a spill directory, name it with --spill-dir";
 
-/// Which run, and what it is given now.
+/// The run to resume, and the settings given now.
 #[derive(Debug, Clone)]
 pub struct ResumeRequest {
     /// Its output folder.
     pub out: PathBuf,
     /// Flags.
     pub keys: TrainOverrides,
-    /// Its scene, where that is not where it was.
+    /// Its scene, if it moved.
     pub scene: Option<PathBuf>,
-    /// Other numbers and another dataset are accepted.
+    /// Accept changed numbers and another dataset.
     pub accept_changes: bool,
-    /// Nothing but errors on the terminal.
+    /// Print only warnings and errors.
     pub quiet: bool,
 }
 
-/// Goes on with a run, to its end.
+/// Resumes a run and trains to its end.
 ///
 /// # Errors
-/// There is no run that could go on, or it is not the same any more (nothing is changed then); else as
-/// [`super::run::run`].
+/// No run can be resumed, or it has changed (the folder stays unchanged then); else as [`super::run::run`].
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
-    // Of a run that is at work nothing is read that it may be writing, and nothing is removed.
+    // Do not read or remove files of an active run.
     let lock = if request.out.is_dir() { Some(out_folder::lock(&request.out)?) } else { None };
     let earlier = Earlier::find(request)?;
     let mut config = earlier.config.clone();
     request.keys.clone().apply(&mut config);
     config.check()?;
-    if let Some(outcome) = already_done(request, &config, &earlier)? {
+    if let Some(outcome) = finished_outcome(request, &config, &earlier)? {
         return Ok(outcome);
     }
     let folder = stored_folder(&request.out, &config);
     let is_in_output = config.residence().spill_dir().is_none();
     let found = open_own(&folder, earlier.claim(request), is_in_output);
-    // The run takes it again.
+    // The resumed run takes the lock again.
     drop(lock);
     match found {
-        Ok(Some(stored)) => go_on(request, &earlier, config, stored),
-        Ok(None) => begin_again(request, &earlier, config),
-        // A run in memory makes its checkpoint with its first commit.
-        Err(_) if is_in_output && !SpillDir::exists_in(&folder) && !has_past(&request.out) => {
-            begin_again(request, &earlier, config)
+        Ok(Some(stored)) => resume_from(request, &earlier, config, stored),
+        Ok(None) => restart(request, &earlier, config),
+        // A run in memory creates its checkpoint at its first commit.
+        Err(_) if is_in_output && !SpillDir::exists_in(&folder) && !has_results(&request.out) => {
+            restart(request, &earlier, config)
         }
         Err(error) => Err(error),
     }
 }
 
-/// What is known of a run before its checkpoint is opened.
+/// Facts of a run before its checkpoint is opened.
 struct Earlier {
-    /// config.toml, whether it is there or not.
+    /// Path of config.toml, which may not exist.
     path: PathBuf,
-    /// What it says; `None` where it is missing.
+    /// Its content; `None` if it is missing.
     file: Option<(TrainConfig, Resolved)>,
     /// Its config, from the file or from the checkpoint.
     config: TrainConfig,
     /// Its scene.
     scene: PathBuf,
-    /// Its identity; unknown where config.toml is missing, and the checkpoint was named by the user.
+    /// Its identity; unknown if config.toml is missing and the user named the checkpoint.
     run: RunId,
 }
 
 impl Earlier {
-    /// From config.toml, or where it is missing from the checkpoint in the output folder or in the spill directory that
-    /// the user named.
+    /// Reads config.toml or, if it is missing, the checkpoint in the output folder or in the given spill directory.
     fn find(request: &ResumeRequest) -> Result<Earlier, TrainError> {
         let path = request.out.join("config.toml");
         if path.exists() {
@@ -127,29 +124,29 @@ impl Earlier {
         }
         let state = last_state(&folder, Access::Map)?;
         let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
-        if Path::new(&state.run.out) != absolute(&request.out) && has_past(&request.out) {
+        if Path::new(&state.run.out) != absolute(&request.out) && has_results(&request.out) {
             let problem =
                 format!("it holds results, and the checkpoint in {} is that of {}", folder.display(), state.run.out);
             let remedy = "name that output folder, or one that does not exist yet";
             return Err(InputError::new(&request.out, problem, remedy).into());
         }
-        eprintln!("warning: {} is missing: it is made again from the checkpoint", path.display());
-        // A checkpoint may have been moved, and a run that committed to its output folder names no spill directory.
+        eprintln!("warning: {} is missing: restoring it from the checkpoint", path.display());
+        // The checkpoint may have moved, and a run that committed to its output folder has no spill directory.
         let config = TrainConfig { spill_dir: named.unwrap_or("").to_string(), ..then };
         let scene = request.scene.clone().unwrap_or_else(|| PathBuf::from(&state.run.scene));
         Ok(Earlier { run: state.run.id, file: None, config, scene, path })
     }
 
-    /// The checkpoint that the run may go on from.
+    /// The claim that the run's checkpoint must satisfy.
     fn claim<'a>(&self, request: &'a ResumeRequest) -> Claim<'a> {
         let is_named = request.keys.spill_dir.as_ref().is_some_and(|folder| !folder.is_empty());
         Claim { run: self.run, out: &request.out, is_named }
     }
 }
 
-/// Whether the run in `out` left something that beginning again would destroy: a result, or a logged commit whose
-/// checkpoint may lie elsewhere.
-fn has_past(out: &Path) -> bool {
+/// Whether a new start would destroy something of the run in `out`: a result, or a logged commit whose checkpoint may
+/// lie elsewhere.
+fn has_results(out: &Path) -> bool {
     let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap_or_default();
     let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
     let has = |name: &str| out.join(name).exists();
@@ -160,14 +157,14 @@ fn has_past(out: &Path) -> bool {
         || metrics.lines().filter_map(commits).any(|commits| commits > 0)
 }
 
-/// Begins a run again that was cut off before its first commit: its config says all that the run needs.
+/// Restarts a run that was cut off before its first commit, from its config.
 ///
 /// # Errors
-/// The run left results, which would be replaced; else as [`run`].
-fn begin_again(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
-    if has_past(&request.out) {
-        let problem = "the run left results, but no commit to go on from: a run that ends without --keep-checkpoint removes \
-                       its checkpoint";
+/// The run left results that would be replaced; else as [`run`].
+fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
+    if has_results(&request.out) {
+        let problem = "the run left results but no commit to resume from: a run that ends without --keep-checkpoint \
+                       removes its checkpoint";
         let remedy = "start a new run from its Gaussians with another --out and --init-ply point_cloud.ply, or start over \
                       with --overwrite";
         return Err(InputError::new(&request.out, problem, remedy).into());
@@ -178,8 +175,8 @@ fn begin_again(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) 
     run(&RunRequest { scene, out, config, dry_run: false, existing, quiet })
 }
 
-/// Goes on from a checkpoint.
-fn go_on(
+/// Resumes from a checkpoint.
+fn resume_from(
     request: &ResumeRequest,
     earlier: &Earlier,
     mut config: TrainConfig,
@@ -200,17 +197,17 @@ fn go_on(
     let start = Start::look(&scene, &config, &request.out, host_mem)?;
     let print = dataset_print(&start)?;
     changes.add_dataset(&start.dataset, &state.dataset, &print);
-    changes.numbers.extend(start_change(&start, &state, &print));
+    changes.numbers.extend(first_degree_change(&start, &state, &print));
     changes.check(&start.dataset.image_folder, request.accept_changes)?;
     let (renderer, options, driver) = begin(request.quiet, &config, &start)?;
-    say(request, &state, &config, &changes, &*renderer);
+    print_resume(request, &state, &config, &changes, &*renderer);
     let dataset = start.into_dataset();
     let (pager, tiers) = stored.into_tiers(&config, host_mem.unwrap_or(u64::MAX))?;
     tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
     let has_changed = !changes.numbers.is_empty();
     let pages = match has_changed {
-        false => restore_pages(pager, &of_state(&options, &state), &state)?,
-        true => changed_pages(pager, &options, &state)?,
+        false => restore_pages(pager, &restore_options(&options, &state), &state)?,
+        true => pages_with_new_rules(pager, &options, &state)?,
     };
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
     trainer.restore_counts(&state);
@@ -226,20 +223,20 @@ fn go_on(
     let begun = Begun { print, sh_degree_start: state.sh_degree_start, past: Some(past), host_mem, driver, run };
     let (out, quiet) = (request.out.clone(), request.quiet);
     let request = RunRequest { scene, out, config, dry_run: false, existing: Existing::BeginAgain, quiet };
-    see_through(&request, &dataset, tiers, trainer, begun)
+    plan_and_train(&request, &dataset, tiers, trainer, begun)
 }
 
-/// The identity of a run that goes on: its own, that of its checkpoint, or a new one where neither is known.
+/// The identity of a resumed run: its own, that of its checkpoint, or a new one.
 fn identity_of(run: RunId, state: &RunState) -> RunId {
     [run, state.run.id].into_iter().find(|id| id.is_known()).unwrap_or_else(RunId::draw)
 }
 
-/// Where the checkpoint of a run is.
+/// Folder of a run's checkpoint.
 fn stored_folder(out: &Path, config: &TrainConfig) -> PathBuf {
     config.residence().checkpoint_folder(out)
 }
 
-/// More steps do not stretch the rates of a run.
+/// Keeps the rate schedule of a run that is extended to more steps.
 fn keep_schedule(config: &mut TrainConfig, keys: &TrainOverrides, state: &RunState) {
     if let Ok(then) = TrainConfig::parse(&state.config)
         && keys.schedule_steps.is_none()
@@ -257,15 +254,21 @@ fn check_steps(config: &TrainConfig, state: &RunState) -> InputResult<()> {
     Err(InputError::new("--steps", problem, "give more, or roll the run back with gsscale-ckpt"))
 }
 
-/// Says that a run goes on, and what is other than it was.
-fn say(request: &ResumeRequest, state: &RunState, config: &TrainConfig, changes: &Changes, renderer: &dyn Renderer) {
+/// Prints the resume and its differences.
+fn print_resume(
+    request: &ResumeRequest,
+    state: &RunState,
+    config: &TrainConfig,
+    changes: &Changes,
+    renderer: &dyn Renderer,
+) {
     if renderer.device() != state.device {
         let (there, here) = (&state.device, renderer.device());
-        eprintln!("warning: the run was rendered by {there}, and is by {here} from here on: other roundings");
+        eprintln!("warning: the renderer was {there} and is {here}: its rounding differs");
     }
     changes.numbers.iter().for_each(|line| eprintln!("warning: accepted from step {} on: {line}", state.step));
     if !changes.numbers.is_empty() {
-        eprintln!("warning: every page is brought to that step as it was trained, and rewritten, once");
+        eprintln!("warning: every page is updated to that step by the old rules and rewritten once");
     }
     if request.quiet {
         return;
@@ -277,10 +280,10 @@ fn say(request: &ResumeRequest, state: &RunState, config: &TrainConfig, changes:
     eprintln!("resume  {} after {} of {} steps{other}", request.out.display(), state.step, config.steps);
 }
 
-/// A run that did all of its steps and wrote its results: nothing is trained. If it was killed before its checkpoint was
-/// gone, what is left of the checkpoint is removed, unless it is to be kept or the user named another folder than the run's.
-/// A checkpoint of another run, or one that cannot be opened, stays. A run that was rolled back since is not done.
-fn already_done(
+/// Handles a run that did all steps and wrote its results: trains nothing. Removes a checkpoint that a kill left
+/// behind, unless it is to be kept, the user named another folder, it belongs to another run, or it cannot be opened. A
+/// run that was rolled back since is not finished.
+fn finished_outcome(
     request: &ResumeRequest,
     config: &TrainConfig,
     earlier: &Earlier,
@@ -305,13 +308,13 @@ fn already_done(
     let is_its_own = |stored: &Stored| earlier.run.is_known() && stored.run_state.run.id == earlier.run;
     if let Some(stored) = stored.filter(|stored| is_its_place && !config.keep_checkpoint && is_its_own(stored)) {
         stored.remove()?;
-        // Empty where an earlier life of the run made the folder in its results.
+        // An earlier process of the run may have created the folder in its results; it is empty now.
         let _ = std::fs::remove_dir(checkpoint_folder(&request.out));
     }
     write_run_report(&request.out)?;
     if !request.quiet {
-        let more = if is_kept { "; --steps N goes on to more" } else { "" };
-        eprintln!("{} is done: all {} steps, results are there{more}", request.out.display(), summary.steps);
+        let more = if is_kept { "; --steps N extends it" } else { "" };
+        eprintln!("{} is finished: all {} steps, with results{more}", request.out.display(), summary.steps);
     }
     Ok(Some(RunOutcome { summary: Some(summary), exit_code: 0 }))
 }
@@ -324,22 +327,22 @@ fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result
     Ok(PagedScene::restore(pager, options, events, histogram, [state.rows, state.rows_bound]))
 }
 
-/// The pages of a run that goes on by other rules: brought to its last step by those that it had.
-fn changed_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
+/// The pages of a run that resumes with changed rules, updated to its last step by the old rules.
+fn pages_with_new_rules(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
     let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
-    let then = rules_then(&then, &state.simd, SimdPath::is_supported)
+    let then = config_before(&then, &state.simd, SimdPath::is_supported)
         .ok_or_else(|| CommitError::Contradiction("no instruction path of this machine is known".to_string()))?;
-    let old = of_state(&RunOptions::new(&then, state.dataset.scene_scale), state);
+    let old = restore_options(&RunOptions::new(&then, state.dataset.scene_scale), state);
     let mut pages = restore_pages(pager, &old, state)?;
     if pages.change_rules(options, state.step)? {
-        eprintln!("warning: the statistics of the rows were not those that the run had counted, and are counted anew");
+        eprintln!("warning: the statistics of the rows differed from the run's histogram, which is counted anew");
     }
     Ok(pages)
 }
 
-/// The config that the pages were trained by, on a path that gives the bits that they have if this machine has one, else
-/// on the path of the config or on the best that there is: a path changes roundings, other rates the scene.
-fn rules_then(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath) -> bool) -> Option<TrainConfig> {
+/// The config by which the pages were trained, on an instruction path with the same bits if this machine has one, else
+/// on the path of the config or the best available: another path changes only the rounding.
+fn config_before(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath) -> bool) -> Option<TrainConfig> {
     let on = |simd: Option<SimdPath>| TrainConfig { simd: Chosen(simd), ..then.clone() };
     let path = SimdPath::from_name(simd);
     let class = path.map(SimdPath::bits_class);
@@ -349,20 +352,20 @@ fn rules_then(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath) ->
     all.find(|c| is_supported(limits::simd_path(c)))
 }
 
-/// The options by which pages come back: with the band that was in use from their first step, from which the events of
-/// the run raised it. Which band the run would begin with now may be another, by keys that were accepted.
-fn of_state(options: &RunOptions, state: &RunState) -> RunOptions {
+/// The options for restoring pages: with the SH degree of the run's first step, from which its events raised the
+/// degree. Accepted changes of keys may give another first degree now.
+fn restore_options(options: &RunOptions, state: &RunState) -> RunOptions {
     RunOptions { sh_degree_start: state.sh_degree_start, ..options.clone() }
 }
 
-/// A start that would be another one now: of no use to a run that is past it, but a sign that something changed. Of the
-/// same points or Gaussians it is another by the config alone, whose keys are compared one by one, and once.
-fn start_change(start: &Start, state: &RunState, here: &DatasetPrint) -> Option<String> {
+/// The difference if the run would start with another SH degree now: a sign of changed input. For the same points or
+/// Gaussians only the config can differ, and its keys are compared elsewhere.
+fn first_degree_change(start: &Start, state: &RunState, here: &DatasetPrint) -> Option<String> {
     if state.dataset.points == here.points {
         return None;
     }
     let (there, here) = (state.sh_degree_start, start.sh_degree_start);
-    (there != here).then(|| format!("the first Gaussians had {there} bands in use and have {here}"))
+    (there != here).then(|| format!("the SH degree of the first Gaussians was {there} and is {here}"))
 }
 
 #[cfg(test)]
@@ -373,7 +376,7 @@ mod tests {
     fn pages_go_on_by_their_own_config_on_a_machine_without_its_path() {
         let then =
             TrainConfig { means_lr: 0.5, seed: 9, simd: Chosen(Some(SimdPath::Avx512)), ..TrainConfig::default() };
-        let here = |paths: &[SimdPath]| rules_then(&then, "avx512", |path| paths.contains(&path));
+        let here = |paths: &[SimdPath]| config_before(&then, "avx512", |path| paths.contains(&path));
         let with = |simd: Option<SimdPath>| Some(TrainConfig { simd: Chosen(simd), ..then.clone() });
         assert_eq!(here(&SimdPath::ALL), with(Some(SimdPath::Avx512)));
         assert_eq!(
@@ -381,13 +384,13 @@ mod tests {
             with(Some(SimdPath::Avx2)),
             "the same bits on another path"
         );
-        // What `auto` stands for depends on the machine: it is asked for after the path itself, the two of its class, and
-        // that of the config.
+        // What `auto` stands for depends on the machine: it is asked for after the path itself, the two of its class,
+        // and that of the config.
         let asked = std::cell::Cell::new(0);
         let last = |_| asked.replace(asked.get() + 1) == 4;
-        assert_eq!(rules_then(&then, "avx512", last), with(None));
+        assert_eq!(config_before(&then, "avx512", last), with(None));
         let baseline = TrainConfig { simd: Chosen(Some(SimdPath::Baseline)), ..then.clone() };
-        let found = rules_then(&baseline, "avx512", |path| path == SimdPath::Baseline);
+        let found = config_before(&baseline, "avx512", |path| path == SimdPath::Baseline);
         assert_eq!(found, Some(baseline), "that of the config comes next");
         // Never by another config.
         assert_eq!(here(&[]), None);

@@ -1,7 +1,7 @@
-//! A run from command line to result: load, check, say what it will take, train, evaluate, write.
+//! A run from command line to result: load, check, print the plan, train, evaluate, write.
 //!
-//! Invariants: 1. the output folder is made only after the dataset was understood, so bad input leaves nothing
-//! behind; 2. a run that is stopped or fails after its first step still writes the PLY of its last good step.
+//! Invariants: 1. the output folder is created after the dataset was read, so bad input leaves no files; 2. a run that
+//! is stopped or fails after its first step still writes the PLY of its last good step.
 
 use super::changes::with_absolute_paths;
 use super::checkpoint::{Checkpoint, Origin};
@@ -41,7 +41,7 @@ use crate::report::run_report::{PAGES_FILE, write_run_report};
 use crate::scene::partition::first_fill;
 use std::path::{Path, PathBuf};
 
-/// What to run.
+/// The run to start.
 #[derive(Debug, Clone)]
 pub struct RunRequest {
     /// Scene folder (or transforms.json).
@@ -50,50 +50,50 @@ pub struct RunRequest {
     pub out: PathBuf,
     /// Checked config.
     pub config: TrainConfig,
-    /// Print what was understood and stop.
+    /// Print the plan and stop.
     pub dry_run: bool,
-    /// What becomes of an output folder that is there already.
+    /// Treatment of an existing output folder.
     pub existing: Existing,
-    /// Nothing but errors on the terminal.
+    /// Print only warnings and errors.
     pub quiet: bool,
 }
 
 /// How a run ended.
 #[derive(Debug, Clone)]
 pub struct RunOutcome {
-    /// What summary.json holds; `None` for a dry run.
+    /// Content of summary.json; `None` for a dry run.
     pub summary: Option<Summary>,
-    /// Exit code of the process: 0, or 130/143 when asked to stop.
+    /// Exit code of the process: 0, or 130/143 after a stop request.
     pub exit_code: i32,
 }
 
-/// What a run that goes on has behind it.
+/// The past of a resumed run.
 pub(super) struct Past {
-    /// Its config, as it is kept from now on.
+    /// The config to keep from now on.
     pub config: TrainConfig,
     /// Length of its metrics.
     pub metrics_bytes: u64,
     /// Steps done.
     pub step: u32,
-    /// It goes on with other numbers: that is committed at once.
+    /// Numbers have changed, which is committed at once.
     pub has_changed: bool,
-    /// What its config.toml says; `None` where the file is missing and is made again.
+    /// Content of its config.toml; `None` if the file is missing and must be restored.
     pub file: Option<(TrainConfig, Resolved)>,
-    /// Gaussians that it began with.
+    /// Number of its first Gaussians.
     pub first_rows: u64,
 }
 
-/// What a run begins or goes on with.
+/// Facts with which a run begins or resumes.
 pub(super) struct Begun {
-    /// The dataset.
+    /// Digest of the dataset.
     pub print: DatasetPrint,
-    /// Degree in use from the first step.
+    /// SH degree of the first step.
     pub sh_degree_start: u8,
-    /// A run that goes on.
+    /// The past of a resumed run.
     pub past: Option<Past>,
     /// Budget, bytes.
     pub host_mem: Option<u64>,
-    /// Bytes that the graphics driver took.
+    /// Bytes allocated by the graphics driver.
     pub driver: u64,
     /// Identity of the run.
     pub run: RunId,
@@ -102,7 +102,7 @@ pub(super) struct Begun {
 /// Runs a request from beginning to end.
 ///
 /// # Errors
-/// Bad input (nothing is left behind), or a failure while training (the last good step is written).
+/// Bad input (leaves no files), or a failure while training (the last good step is written).
 pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
     config.check()?;
@@ -122,13 +122,13 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     if let Some(spill_dir) = config.residence().spill_dir().filter(|_| !request.dry_run)
         && remove_uncommitted(spill_dir, false)?
     {
-        eprintln!("{} held a run that was cut off before its first commit: its pages are removed", spill_dir.display());
+        eprintln!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
     }
     preflight::check_first_drive(config, start.rows)?;
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
     let fill = first_fill(config.page_rows as usize, options.strategy.grows());
     let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
-    // Dropped after the trainer, whose pages may lie there.
+    // Drop the tiers after the trainer, whose pages may lie there.
     let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
     tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
     if !request.dry_run {
@@ -138,10 +138,11 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
     let trainer = Trainer::of_scene(scene, &dataset, renderer, options);
     let run = RunId::draw();
-    see_through(request, &dataset, tiers, trainer, Begun { print, sh_degree_start, past: None, host_mem, driver, run })
+    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run };
+    plan_and_train(request, &dataset, tiers, trainer, begun)
 }
 
-/// What begins alike for all runs once the scene was read: warnings, options, the renderer and the bytes it took.
+/// Common start of all runs after reading the scene: warnings, options, the renderer and its memory.
 pub(super) fn begin(
     quiet: bool,
     config: &TrainConfig,
@@ -161,8 +162,8 @@ pub(super) fn begin(
     Ok((renderer, options, driver))
 }
 
-/// Checks what a run will take, says it, and trains to the end.
-pub(super) fn see_through(
+/// Plans a run, prints the plan, and trains to the end.
+pub(super) fn plan_and_train(
     request: &RunRequest,
     dataset: &Dataset,
     mut tiers: Tiers,
@@ -174,7 +175,7 @@ pub(super) fn see_through(
     let largest = preflight::allow_largest_view(config, dataset, &mut trainer, host_mem);
     let probe = Probe::of_run(dataset, &trainer, largest, begun.driver);
     let mut memory = estimate(config, dataset, &mut trainer, &probe)?;
-    let plan = preflight::settle(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
+    let plan = preflight::plan_tiers(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
     if !request.quiet {
         let of_tiers = preflight::describe(&plan, &memory[1], &tiers);
         eprintln!("{}", describe(request, dataset, &trainer, &of_tiers));
@@ -184,7 +185,7 @@ pub(super) fn see_through(
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     out_folder::make_folder(&request.out)?;
-    // Held to the end, and taken before anything is removed.
+    // Take the lock before removing files; hold it to the end.
     let _lock = out_folder::lock(&request.out)?;
     if begun.past.is_none() {
         out_folder::make(&request.out, request.existing)?;
@@ -199,7 +200,7 @@ pub(super) fn see_through(
     outcome
 }
 
-/// ` --spill-dir FOLDER` where the run's config does not lead to its checkpoint, because it could not be written anew.
+/// ` --spill-dir FOLDER` if the config.toml could not be rewritten and so does not name the run's checkpoint.
 fn spill_dir_flag(request: &RunRequest) -> String {
     let [kept, now] = [TrainConfig::read(&request.out.join("config.toml")), Ok(request.config.clone())]
         .map(|config| config.map(|config| with_absolute_paths(config).spill_dir));
@@ -209,19 +210,19 @@ fn spill_dir_flag(request: &RunRequest) -> String {
     }
 }
 
-/// The config as it is kept: settled, and with paths that do not depend on where the program was started.
-fn settled(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
+/// The config to keep: with choices resolved and absolute paths.
+fn resolved_config(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
     let view_order = Chosen(Some(trainer.view_order().order()));
     with_absolute_paths(TrainConfig { view_order, ..config.clone() })
 }
 
-/// Writes config.toml, of a run that goes on where it changed; returns what every commit says of how the run began.
+/// Writes config.toml (on resume only if it changed); returns the origin for all commits.
 fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun: &Begun) -> InputResult<Origin> {
     let simd = limits::simd_path(&request.config).name().to_string();
     let path = request.out.join("config.toml");
     let config = match &begun.past {
         Some(past) => {
-            // Of the Gaussians that were here before.
+            // It belongs to the Gaussians before the change.
             out_folder::remove_evaluation(&request.out)?;
             let made_again = Resolved { gaussians: past.first_rows, ..resolved(request, dataset, trainer, begun.run) };
             let before = past.file.as_ref().map_or(&made_again, |(_, facts)| facts);
@@ -233,9 +234,9 @@ fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun
             kept.0
         }
         None => {
-            let settled = settled(&request.config, trainer);
-            write_config(&path, &settled, &resolved(request, dataset, trainer, begun.run))?;
-            settled
+            let kept = resolved_config(&request.config, trainer);
+            write_config(&path, &kept, &resolved(request, dataset, trainer, begun.run))?;
+            kept
         }
     };
     let fail = |e: toml::ser::Error| InputError::new(&path, e.to_string(), "report this as a bug");
@@ -275,7 +276,7 @@ fn train_into(
     let costs = meter.stop(&trainer, &*tiers);
     let ply = Trainer::ply_path(out);
     let saved = trainer.save(dataset, &ply);
-    // What ended the run is the error to be told; that its last rows cannot be written either comes beside it.
+    // Return the error that ended the run; a failure to write its last rows is an additional warning.
     let (looped, written) = match (looped, saved) {
         (Err(error), Err(other)) => {
             eprintln!("warning: {} cannot be written: {other}", ply.display());
@@ -284,20 +285,20 @@ fn train_into(
         (looped, saved) => (looped, saved?),
     };
     warn_of_ply(config, &written, &ply);
-    // A stopped run owes the user its files at once; the held-out views can be looked at later with gsscale-eval.
+    // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
     let asked = stop.exit_code();
     let tested = looped.and_then(|()| match asked {
         None => trainer.evaluate(dataset, &targets, Some(&out.join("renders/test"))),
         Some(_) => Ok(None),
     });
     if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, tiers.checkpoint.as_mut()) {
-        // Once more, with what the evaluation said.
+        // Commit again, with the result of the evaluation.
         checkpoint.commit_or_warn(&mut trainer, &mut metrics)?;
     }
     let summary = Summary {
         gaussians: written.rows + written.skipped,
         test: tested.as_ref().ok().copied().flatten(),
-        // Without its evaluation a run is not done: it goes on to that.
+        // A run without its evaluation is not finished: a resume evaluates it.
         finished: trainer.steps_done() == config.steps && tested.is_ok() && asked.is_none(),
         costs,
         commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
@@ -311,11 +312,11 @@ fn train_into(
     Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
 }
 
-/// Says where the final PLY is not what was asked for.
+/// Warns if the final PLY differs from the request.
 fn warn_of_ply(config: &TrainConfig, written: &PlyWritten, ply: &Path) {
     if written.frame == ExportFrame::Local && config.export_frame == ExportFrame::Dataset {
         eprintln!(
-            "warning: the scene lies too far from its origin for f32, so {} holds local positions; \
+            "warning: dataset coordinates exceed the precision of f32, so {} holds local positions; \
              its comments give origin and scale",
             ply.display()
         );
@@ -325,7 +326,7 @@ fn warn_of_ply(config: &TrainConfig, written: &PlyWritten, ply: &Path) {
     }
 }
 
-/// What the trainer alone knows of a run that ended: not done, not evaluated.
+/// The part of the summary that the trainer knows: not finished, not evaluated.
 fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
     let (rows_skipped, steps_skipped) = trainer.skipped();
     Summary {
@@ -363,7 +364,7 @@ fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, run: Run
     }
 }
 
-/// What was understood and what it will take, for people.
+/// Text of the plan: dataset, start and tiers.
 fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, tiers: &str) -> String {
     let (config, rows) = (&request.config, trainer.scene.rows());
     let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());

@@ -1,9 +1,9 @@
-//! What a run starts from: first Gaussians in memory, or points or Gaussians that go into pages one page at a time.
+//! The start of a run: first Gaussians in memory, or points or Gaussians that are streamed into pages.
 //!
-//! What is in files is streamed when there is a spill directory: then the scene may be larger than memory; the Gaussians of
-//! a store always are. Points drawn at random are made in memory.
+//! With a spill directory, points and Gaussians in files are streamed, so the scene may exceed memory. The Gaussians of
+//! a store are always streamed. Random points are made in memory.
 //!
-//! Invariant: both ways give the same pages, bit for bit ([`crate::dataset::import`]).
+//! Invariant: streamed and whole input give the same pages, bit for bit ([`crate::dataset::import`]).
 
 use super::dataset_print::view_print;
 use super::dataset_print::{GaussiansPrint, points_print};
@@ -37,20 +37,20 @@ use crate::scene::state::SceneState;
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 
-/// Memory of an import where no budget is known, bytes.
+/// Memory of an import without a budget, bytes.
 const BUDGET_DEFAULT: u64 = 1 << 30;
-/// What first Gaussians are made from gets one part in so many of the budget.
+/// The input of the first Gaussians gets 1/3 of the budget.
 const BUDGET_SHARE: u64 = 3;
 
-/// A dataset and what its Gaussians are made from.
+/// A dataset and the source of its first Gaussians.
 pub struct Start {
     /// Views and frame.
     pub dataset: Dataset,
-    /// Degree in use from the first step.
+    /// SH degree of the first step.
     pub sh_degree_start: u8,
-    /// Gaussians that there will be; of a cloud no fewer.
+    /// Number of first Gaussians; an upper bound for point clouds.
     pub rows: u64,
-    /// Digest of what they are made from: the same whether it was streamed or not.
+    /// Digest of their source; the same for streamed and whole input.
     pub points: u64,
     from: FirstRows,
 }
@@ -63,7 +63,7 @@ enum FirstRows {
 }
 
 impl Start {
-    /// Reads the scene; of its points no more is kept in memory than `host_mem` allows, where they can be streamed.
+    /// Reads the scene. Points that can be streamed take no more memory than `host_mem` allows.
     ///
     /// # Errors
     /// As [`prepare`].
@@ -74,8 +74,8 @@ impl Start {
         Start::look(scene, config, &folder_beside(Path::new(&config.spill_dir)), host_mem)
     }
 
-    /// As [`Start::read`], for a look at what a run began with: Gaussians are not made where that can be avoided. `folder`
-    /// is for what does not fit in memory; what is written there has no name.
+    /// As [`Start::read`], for inspection of a run's start: avoids creating Gaussians. `folder` holds unnamed temporary
+    /// files for data that exceeds memory.
     ///
     /// # Errors
     /// As [`prepare`].
@@ -178,16 +178,16 @@ impl Start {
         Ok(Some(Start { dataset, sh_degree_start: limits::first_sh_degree(config), rows, points, from }))
     }
 
-    /// The dataset alone, for a run that has its Gaussians already: what they were made from, columns, a spool or a store
-    /// with its lock, is given up here.
+    /// The dataset alone, for a run that has its Gaussians already. Drops their source: columns, a spool, or a store
+    /// with its lock.
     pub(super) fn into_dataset(self) -> Dataset {
         self.dataset
     }
 
-    /// The dataset, and the Gaussians in the pages of `pager`.
+    /// The dataset, and the first Gaussians as pages in `pager`.
     ///
     /// # Errors
-    /// What they are made from cannot be read again, or a page could not be stored.
+    /// The source cannot be read again, or a page could not be stored.
     pub fn into_pages(
         mut self,
         pager: Pager,
@@ -201,11 +201,11 @@ impl Start {
         Ok((self.dataset, scene))
     }
 
-    /// Hands out the first pages in the order of their names, with the bands that are in use from the first step. `folder` is
-    /// for what does not fit in memory. May be asked again.
+    /// Passes the first pages to `take` in the order of their ids, with the SH degree of the first step. `folder` holds
+    /// temporary files for data that exceeds memory. May be called repeatedly.
     ///
     /// # Errors
-    /// What they are made from cannot be read again, or `take` failed.
+    /// The source cannot be read again, or `take` failed.
     pub(super) fn for_each_page(
         &mut self,
         options: &RunOptions,
@@ -217,7 +217,7 @@ impl Start {
         let fill = first_fill(options.page_rows, options.strategy.grows());
         let frame = self.dataset.frame;
         let mut failed = None;
-        // Not what the import says of its taker's errors, but these themselves.
+        // Keep the error of `take` itself: the import would wrap it.
         let mut take_state = |id, mut state: SceneState| {
             state.raise_sh_degree(sh_degree);
             take(id, state).map_err(|error| not_stored(failed.insert(error)))
@@ -252,13 +252,12 @@ impl Start {
     }
 }
 
-/// A third of the memory: the frames have a share already, and the system keeps what was just written.
+/// A third of the memory: frames take a share, and the system caches the files just written.
 fn budget(folder: &Path, host_mem: Option<u64>) -> Budget<'_> {
     Budget { folder, bytes: (host_mem.unwrap_or(BUDGET_DEFAULT) / BUDGET_SHARE) as usize }
 }
 
-/// Without a spill directory a PLY of Gaussians is read whole: one that cannot fit is refused by its header, before memory
-/// runs out.
+/// Refuses a PLY of Gaussians that exceeds memory, by its header: without a spill directory the file is read whole.
 fn check_gaussians_fit(config: &TrainConfig, host_mem: Option<u64>) -> InputResult<()> {
     let file = Path::new(&config.init_ply);
     let is_read = !config.init_ply.is_empty() && is_ply(file);
@@ -273,7 +272,7 @@ fn check_gaussians_fit(config: &TrainConfig, host_mem: Option<u64>) -> InputResu
         format_bytes(bytes),
         format_bytes(budget)
     );
-    let remedy = "name a folder on a fast drive with --spill-dir: then they go into pages, a few at a time";
+    let remedy = "name a folder on a fast drive with --spill-dir: the Gaussians are then streamed into pages";
     Err(InputError::new(file, problem, remedy))
 }
 
@@ -292,7 +291,7 @@ fn read_points(file: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>
     Ok(())
 }
 
-/// The print of what a run starts from.
+/// The dataset print of a run's start.
 ///
 /// # Errors
 /// A photo or a mask cannot be read.

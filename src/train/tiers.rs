@@ -1,7 +1,7 @@
-//! Where a run's pages live, as its config says: all in memory, or in frames over files in a spill directory.
+//! Where the pages of a run live, by its config: all in memory, or in frames over a spill directory.
 //!
-//! Invariants: 1. nothing here changes a bit of the result, only what is kept where; 2. [`Tiers::close`] removes the
-//! checkpoint (the spill directory, or that of a run in memory), unless a run can go on from it: see [`Tiers::is_done`].
+//! Invariants: 1. nothing here changes a bit of the result; 2. [`Tiers::close`] removes the checkpoint (the spill
+//! directory, or that of a run in memory) unless a run can resume from it; see [`Tiers::is_done`].
 
 use super::budget::HostBudget;
 use super::checkpoint::Checkpoint;
@@ -32,12 +32,12 @@ use crate::paging::pager::{Pager, PagerConfig};
 use crate::scene::page_layout::capacity_bytes;
 use std::path::{Path, PathBuf};
 
-/// Fewest frames that a run gets before its views were looked at: enough for importing and probing.
+/// Fewest frames of a run before its views are measured: enough for import and probe.
 const FIRST_FRAMES: usize = 64;
-/// One frame in so many may be filled ahead of its step.
+/// 1/8 of the frames may be prefetched.
 const PREFETCH_SHARE: usize = 8;
 
-/// Space set aside for a last commit on a full drive: room for a segment, at least for the map to grow, bytes.
+/// Least reserve for a last commit on a full drive, bytes: room for the map to grow.
 const RESERVE_BYTES_LEAST: u64 = 2 << 20;
 const RESERVE_BYTES_MOST: u64 = 256 << 20;
 
@@ -47,28 +47,28 @@ pub struct Tiers {
     spill: Option<SpillDir>,
     /// Commits to the spill directory, or to the output folder of a run in memory.
     pub checkpoint: Option<Checkpoint>,
-    /// The run did all that it had to: its checkpoint is of no use any more, unless it is to be kept.
+    /// The run is finished, so its checkpoint is not needed.
     pub is_done: bool,
     /// `--keep-checkpoint`.
     keeps: bool,
-    /// All pages are in memory, and in a folder only as far as they were committed.
+    /// All pages are in memory; the store holds committed versions only.
     is_in_memory: bool,
     /// The checkpoint is in the output folder.
     is_in_output: bool,
-    /// The directory had a run in it when it was opened.
-    has_past: bool,
-    /// Of a dry run: a folder on the drive where the spill directory would be.
+    /// The run resumed from this store.
+    has_resumed: bool,
+    /// For a dry run: a folder on the drive of the spill directory.
     planned_on: Option<PathBuf>,
-    /// What moves pages, for reports; empty when all stay in memory.
+    /// I/O engine, for reports; empty if all pages stay in memory.
     pub engine: String,
-    /// How pages are stored.
+    /// Codec of stored pages.
     pub codec: Codec,
-    /// What the user should know of how they were chosen.
+    /// Messages about the choice of engine and codec.
     pub notes: Vec<String>,
 }
 
-/// How pages are stored, as `--spill-codec` says; `auto` measures the drive of `folder`, and is raw without one or where
-/// it cannot be measured.
+/// Codec of `--spill-codec`. `auto` measures the drive of `folder`, and is raw without a folder or if the measurement
+/// fails.
 fn chosen_codec(config: &TrainConfig, folder: Option<&Path>, notes: &mut Vec<String>) -> Codec {
     if let Some(codec) = config.spill_codec.0 {
         return codec;
@@ -76,7 +76,7 @@ fn chosen_codec(config: &TrainConfig, folder: Option<&Path>, notes: &mut Vec<Str
     match folder.map(DriveRate::of) {
         None => Codec::Raw,
         Some(Ok(rate)) => match rate.codec() {
-            // Costs one pass and saves a third of the bytes, on any drive.
+            // Halves cost one pass and save a third of the bytes on any drive.
             Codec::Raw if config.moments == Moments::Bf16 => Codec::Halves,
             codec => codec,
         },
@@ -87,7 +87,7 @@ fn chosen_codec(config: &TrainConfig, folder: Option<&Path>, notes: &mut Vec<Str
     }
 }
 
-/// Sizes of the pager of a run within `host_mem` bytes.
+/// Pager sizes of a run within `host_mem` bytes.
 fn pager_config(config: &TrainConfig, host_mem: u64) -> PagerConfig {
     let mut pager = PagerConfig {
         frames: config.frames as usize,
@@ -104,17 +104,17 @@ fn pager_config(config: &TrainConfig, host_mem: u64) -> PagerConfig {
     pager
 }
 
-/// Bytes of pages in flight ahead of their step, each way, with so many frames.
+/// Bytes of prefetched pages in flight, each way, for `frames` frames.
 fn prefetch_bytes(config: &TrainConfig, frames: usize, frame_bytes: usize) -> usize {
     let bytes = match config.prefetch_bytes.0 as usize {
         0 => (frames / PREFETCH_SHARE).saturating_mul(frame_bytes).min(PREFETCH_BYTES_MAX),
         bytes => bytes,
     };
-    // At least one page each way, or nothing would ever be ahead.
+    // At least one page each way, or prefetch would never happen.
     bytes.max(frame_bytes)
 }
 
-/// The memory of a run whose pages are all in it as long as they fit.
+/// The budget of a run that keeps all pages in memory while they fit.
 pub(super) fn budget_in_memory(config: &TrainConfig, host_mem: u64, memory: &MemoryEstimate) -> HostBudget {
     let frame_bytes = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes();
     let ahead = prefetch_bytes(config, (host_mem / frame_bytes as u64) as usize, frame_bytes);
@@ -122,22 +122,21 @@ pub(super) fn budget_in_memory(config: &TrainConfig, host_mem: u64, memory: &Mem
     HostBudget::new(host_mem, memory, config.host_mem.0 > 0).in_memory(ahead, staging)
 }
 
-/// The pager with its pages moving when `--transfers` says.
+/// Sets the time of transfers by `--transfers`.
 fn with_transfers(mut pager: Pager, config: &TrainConfig) -> Pager {
     pager.set_transfers(config.transfers);
     pager
 }
 
-/// The same of a run that was not begun, with this budget and a drive that is fast enough for raw pages where the codec is
-/// chosen by its speed.
+/// Staging of a run that has not begun, with this budget; `auto` counts as a drive fast enough for raw pages.
 pub fn first_staging_bytes(config: &TrainConfig, host_mem: u64) -> u64 {
     let codec = chosen_codec(config, None, &mut Vec::new());
     staging_bytes(2 * pager_config(config, host_mem).prefetch_bytes, codec)
 }
 
-/// Opens the tiers for a scene of about `pages` pages, within `host_mem` bytes. The pager has few frames at first where
-/// their number follows from the budget: see [`Pager::allow_frames`]. With `dry`, nothing is written: what would lie on the
-/// drive is in memory, where it must fit ([`super::preflight::too_large_for_a_dry_run`]).
+/// Opens the tiers for a scene of about `pages` pages, within `host_mem` bytes. If the number of frames follows from
+/// the budget, the pager has few frames at first ([`Pager::allow_frames`]). With `dry`, pages of the drive are kept in
+/// memory and must fit there ([`super::preflight::too_large_for_a_dry_run`]).
 ///
 /// # Errors
 /// The spill directory cannot be used, or the I/O engine does not work here.
@@ -162,7 +161,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     };
     let spill = SpillDir::create(spill_dir, Purpose::Checkpoint, layout, false)?;
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
-    // From here on an error removes the directory.
+    // From here on, an error removes the directory.
     let (engine, codec) = tiers.take_spill(spill, config)?;
     let opened = Commits::create(Box::new(folder), of_commits)?;
     let store = opened.paged_store(engine, layout, codec)?;
@@ -172,20 +171,20 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     Ok((with_transfers(Pager::new(pager, store), config), tiers))
 }
 
-/// A spill directory with a run that can go on.
+/// An opened checkpoint.
 pub struct Stored {
     spill: SpillDir,
     opened: Opened,
-    /// What the run is beside its pages.
+    /// State of the run without its pages.
     pub run_state: RunState,
 }
 
 impl Stored {
-    /// Opens the checkpoint in `folder` at its last commit; `None` where a store is there in which nothing was committed. An
-    /// empty folder is no such store: it may be the mount point of a drive that is not mounted. `allow_remote`: also on a network file system.
+    /// Opens the checkpoint in `folder` at its last commit; `None` for a store without commits. An empty folder is an
+    /// error, since it may be the mount point of an unmounted drive. `allow_remote` allows network file systems.
     ///
     /// # Errors
-    /// There is none, it is damaged, or in use.
+    /// There is no store, or it is damaged or in use.
     pub fn open(folder: &Path, allow_remote: bool) -> Result<Option<Stored>, TrainError> {
         if !SpillDir::exists_in(folder) {
             let problem = "the checkpoint of this run is not there: it is removed when a run ends without \
@@ -206,12 +205,16 @@ impl Stored {
             opened => opened?,
         };
         let run_state = RunState::from_bytes(&opened.run_state).map_err(|e| {
-            InputError::new(folder, e.to_string(), "go on with the program that made it, or start the run again")
+            InputError::new(
+                folder,
+                e.to_string(),
+                "resume with the program version that made it, or start the run again",
+            )
         })?;
         Ok(Some(Stored { spill, opened, run_state }))
     }
 
-    /// Removes the checkpoint. Gives the names of files that stay because they are not the store's.
+    /// Removes the checkpoint. Returns the names of files that stay because they do not belong to the store.
     ///
     /// # Errors
     /// A file cannot be removed.
@@ -220,22 +223,23 @@ impl Stored {
         self.spill.remove()
     }
 
-    /// Whether every segment that it names is there. A kill while a checkpoint is removed leaves a map without them.
+    /// Whether all segments exist. A kill during removal leaves a map without segments.
     pub fn is_whole(&self) -> bool {
         let engine = open_engine(IoEngine::Pread, self.spill.folder(), DEPTH);
         let layout = self.spill.format().layout;
         engine.is_ok_and(|engine| self.opened.paged_store(engine.store, layout, Codec::Raw).is_ok())
     }
 
-    /// The tiers of the run that goes on, its pages in them.
+    /// The pager and tiers of the resumed run.
     ///
     /// # Errors
-    /// The I/O engine does not work here, or what is stored contradicts itself. The directory stays as it is.
+    /// The I/O engine does not work here, or the store is inconsistent. The directory stays unchanged.
     pub fn into_tiers(self, config: &TrainConfig, host_mem: u64) -> Result<(Pager, Tiers), TrainError> {
         let Stored { spill, opened, run_state } = self;
         let mut pager = pager_config(config, host_mem);
         let bytes = (opened.pages.len() * pager.frame_bytes()) as u64;
-        // A run in memory stays there while that is no question; otherwise its checkpoint serves as a spill directory.
+        // A run in memory stays there if half of the budget holds it; otherwise its checkpoint becomes a spill
+        // directory.
         let is_in_memory = config.residence() == Residence::Memory && bytes <= host_mem / 2;
         if is_in_memory {
             let in_memory = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree);
@@ -246,7 +250,7 @@ impl Stored {
             return Err(CommitError::Contradiction("slots have another size than pages".to_string()).into());
         }
         let mut tiers = Tiers::default();
-        (tiers.has_past, tiers.is_in_memory, tiers.keeps) = (true, is_in_memory, config.keep_checkpoint);
+        (tiers.has_resumed, tiers.is_in_memory, tiers.keeps) = (true, is_in_memory, config.keep_checkpoint);
         tiers.is_in_output = config.residence().spill_dir().is_none();
         let folder = spill.folder().to_path_buf();
         let (engine, codec) = tiers.take_spill(spill, config)?;
@@ -266,7 +270,7 @@ fn commit_config(spill: &SpillDir) -> CommitConfig {
 }
 
 impl Tiers {
-    /// Takes over a spill directory and starts what moves its pages.
+    /// Takes over a spill directory and starts its I/O engine.
     fn take_spill(&mut self, spill: SpillDir, config: &TrainConfig) -> InputResult<(Box<dyn PageEngine>, Codec)> {
         self.notes.extend(spill.warnings().iter().filter(|_| !self.is_in_memory).cloned());
         let folder = spill.folder().to_path_buf();
@@ -281,8 +285,8 @@ impl Tiers {
         Ok((opened.store, codec))
     }
 
-    /// A run whose pages stay in memory commits to its output folder `out`, from its first commit on. Nothing for other
-    /// runs: those with a spill directory commit there, and `--frames` alone, which is for comparisons, has no drive.
+    /// Sets up commits to the output folder `out` for a run in memory. Other runs stay unchanged: a run with a spill
+    /// directory commits there, and `--frames` alone, which is for comparisons, does not commit.
     pub fn commit_in(&mut self, out: &Path, config: &TrainConfig) {
         if config.residence() == Residence::Memory {
             self.checkpoint = Some(Checkpoint::later(FirstCommit::of(out, config), config));
@@ -290,7 +294,7 @@ impl Tiers {
         }
     }
 
-    /// Whether a run that stops now can go on from its checkpoint.
+    /// Whether a run that stops now can resume from its checkpoint.
     pub fn can_resume(&self) -> bool {
         !self.is_done && self.has_checkpoint()
     }
@@ -301,15 +305,15 @@ impl Tiers {
     }
 
     fn has_checkpoint(&self) -> bool {
-        self.has_past || self.checkpoint.as_ref().is_some_and(Checkpoint::has_commit)
+        self.has_resumed || self.checkpoint.as_ref().is_some_and(Checkpoint::has_commit)
     }
 
-    /// Whether pages may leave memory for a drive.
+    /// Whether pages may be evicted to a drive.
     pub fn spills(&self) -> bool {
         (self.spill.is_some() || self.planned_on.is_some()) && !self.is_in_memory
     }
 
-    /// Bytes of the files that hold pages on the drive; 0 without one, or where they cannot be listed.
+    /// Bytes of the segment files; 0 without a drive or if they cannot be listed.
     pub fn drive_bytes(&self) -> u64 {
         let of =
             |spill: &SpillDir| spill.segments().map_or(0, |s| s.len() as u64 * spill.format().layout.segment_bytes());
@@ -317,11 +321,11 @@ impl Tiers {
         self.spill.as_ref().or(made).map_or(0, of)
     }
 
-    /// Bytes that pages may take on the drive: what is free, and what they have already, of a run that goes on or of the
-    /// import; `None` without a drive, or where the system does not tell.
+    /// Bytes that pages may take on the drive: free bytes plus bytes of existing segments (of the import or a resumed
+    /// run); `None` without a drive or if the system does not report them.
     ///
     /// # Errors
-    /// The folder is gone.
+    /// The folder does not exist.
     pub fn free_bytes(&self) -> InputResult<Option<u64>> {
         if let Some(folder) = &self.planned_on {
             return Ok(free_bytes(folder).ok().flatten());
@@ -331,8 +335,8 @@ impl Tiers {
         Ok(spill.free_bytes()?.map(|free| free.saturating_add(taken)))
     }
 
-    /// Closes the checkpoint, and removes it unless a run can go on from it or it is to be kept; the pager is gone by now.
-    /// Gives what should be said about it.
+    /// Closes the checkpoint and removes it, unless a run can resume from it or it is to be kept. The pager must be
+    /// dropped before. Returns messages for the user.
     pub fn close(&mut self) -> Vec<String> {
         let is_kept = self.has_checkpoint() && (self.keeps || !self.is_done);
         let made = self.checkpoint.take().and_then(Checkpoint::into_folder);
@@ -341,7 +345,7 @@ impl Tiers {
         match spill.remove() {
             Ok(foreign) if foreign.is_empty() => {
                 if self.is_in_output {
-                    // An earlier life of the run made it. Only if it is empty.
+                    // An earlier process of the run created the folder. This succeeds only if it is empty.
                     let _ = std::fs::remove_dir(&folder);
                 }
                 Vec::new()

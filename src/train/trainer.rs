@@ -73,8 +73,8 @@ fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
 }
 
 impl Trainer {
-    /// A trainer for the first Gaussians `columns` and the training views of `dataset` (at least one), with all pages in
-    /// memory.
+    /// A trainer for the first Gaussians `columns` and the training views of `dataset` (at least one), with all pages
+    /// in memory.
     ///
     /// # Errors
     /// As [`Trainer::with_pager`].
@@ -208,7 +208,7 @@ impl Trainer {
     ///
     /// # Errors
     /// A photo cannot be decoded, pages could not be pinned, the renderer failed, or the loss was not finite
-    /// [`NON_FINITE_STEPS_MAX`] times in a row.
+    /// `NON_FINITE_STEPS_MAX` times in a row.
     pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
         let view = self.next_view();
         let mut ahead = Vec::new();

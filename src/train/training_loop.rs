@@ -1,7 +1,7 @@
 //! The loop over steps, with evaluation, saves, metrics, progress and commits between them.
 //!
-//! Invariants: 1. logging, evaluation, saves and commits change no bit of the result; 2. a step that lacks drive space or
-//! frames is repeated once they are available, or the run ends with its last good step committed.
+//! Invariants: 1. logging, evaluation, saves and commits change no bit of the result; 2. a step that lacks drive space
+//! or frames is repeated once they are available, or the run ends with its last good step committed.
 
 use super::checkpoint::Checkpoint;
 use super::error::TrainError;
@@ -96,7 +96,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// Runs a step and repeats it after waiting for space if the drive is full. `None` if a stop was requested meanwhile.
+    /// Runs a step and repeats it after waiting for space if the drive is full. `None` if a stop was requested
+    /// meanwhile.
     fn step_with_space(
         &mut self,
         dataset: &Dataset,
@@ -136,11 +137,11 @@ impl Trainer {
         }
     }
 
-    /// Commits after the last step. A lack of space is only a warning: a finished run has its results, and a stopped run
-    /// keeps its previous commit.
+    /// Commits after the last step. A lack of space is only a warning: a finished run has its results, and a stopped
+    /// run keeps its previous commit.
     fn commit_last(&mut self, outputs: &mut LoopOutputs<'_>) -> Result<(), TrainError> {
         let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else { return Ok(()) };
-        match self.step < self.options.steps || checkpoint.wants_last() {
+        match self.step < self.options.steps || checkpoint.needs_last_commit() {
             true => checkpoint.commit_or_warn(self, outputs.metrics),
             false => Ok(()),
         }

@@ -1,4 +1,4 @@
-//! Files that appear whole or not at all: written beside their place, synced, renamed, and the folder synced.
+//! Atomic writes of whole files: write a temporary file, sync it, rename it, sync the folder.
 
 use crate::base::error::{InputError, InputResult};
 use crate::page::engine::segment_files::sync_folder;
@@ -11,7 +11,7 @@ pub(super) fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// Writes a whole file by way of a temporary one beside it; file and name are durable when this returns.
+/// Writes a file through a temporary file beside it; content and name are durable when this returns.
 ///
 /// # Errors
 /// The folder cannot be written.
@@ -23,6 +23,6 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> InputResult<()> {
     let mut file = File::create(&part).map_err(io)?;
     file.write_all(bytes).and_then(|()| file.sync_all()).map_err(io)?;
     std::fs::rename(&part, path).map_err(io)?;
-    // Without it a power cut can leave the folder without the new name.
+    // Without this sync a power cut can lose the new name.
     sync_folder(folder_of(path)).map_err(io)
 }

@@ -55,8 +55,9 @@ pub enum FormatError {
     Damaged,
     /// Written by a program of another version.
     #[error(
-        "it has format version {found} (features {features:#x}), which is {}; this program knows version {FORMAT_VERSION} (features {KNOWN_FEATURES:#x})",
-        if *.found > FORMAT_VERSION { "newer" } else { "older" }
+        "it has a{} format version {found} (features {features:#x});\n  \
+         this program knows version {FORMAT_VERSION} (features {KNOWN_FEATURES:#x})",
+        if *.found > FORMAT_VERSION { " newer" } else { "n older" }
     )]
     Version {
         /// Its version.
@@ -66,7 +67,7 @@ pub enum FormatError {
     },
     /// This version, but with features that this program does not know.
     #[error(
-        "it has format version {FORMAT_VERSION} with features that this program does not know (bits {:#x})",
+        "it has features that this program does not know (bits {:#x})",
         .features & !KNOWN_FEATURES
     )]
     Features {

@@ -31,9 +31,7 @@ impl std::fmt::Display for SlotName {
 #[derive(Debug, thiserror::Error)]
 pub enum PageError {
     /// Reading failed twice.
-    #[error(
-        "{at} cannot be read: {source}\n  remedy: check the drive and its cable; roll back to an earlier checkpoint"
-    )]
+    #[error("{at} cannot be read: {source}\n  remedy: check the drive and cable; roll back to an earlier checkpoint")]
     Read {
         /// The version.
         at: SlotName,
@@ -90,7 +88,8 @@ pub enum PageError {
     },
     /// The payload or its label is too long.
     #[error(
-        "page {page} has {payload_bytes} bytes and a label of {label_bytes}; the limits are {capacity_bytes} and {LABEL_BYTES_MAX}\n  remedy: report this as a bug"
+        "page {page} has {payload_bytes} bytes (limit {capacity_bytes}) and a label of {label_bytes} (limit \
+         {LABEL_BYTES_MAX})\n  remedy: report this as a bug"
     )]
     TooLong {
         /// The page.

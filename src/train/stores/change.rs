@@ -1,7 +1,7 @@
-//! The two commands that change a store that exists: going back to an earlier generation, and taking names away.
+//! Rollback and prune: the two commands that change an existing store.
 //!
-//! Invariants: 1. both hold the lock of the store; 2. both are one transaction of the map: done or not done; 3. no byte
-//! of a page is written.
+//! Invariants: 1. both hold the lock of the store; 2. each is one transaction of the map; 3. no byte of a page is
+//! written.
 
 use super::{StorePlace, run_state_of};
 use crate::base::error::InputError;
@@ -14,23 +14,22 @@ use crate::page::tool::reading::{Access, StoreReader, commit_config};
 use crate::train::error::TrainError;
 use serde::Serialize;
 
-/// What going back did, or would do.
+/// Result of a rollback, done or planned.
 #[derive(Debug, Clone, Serialize)]
 pub struct RolledBack {
-    /// The generation that the store is at now.
+    /// The latest generation after the rollback.
     pub generation: u64,
     /// Its step.
     pub step: u32,
-    /// Later generations that are gone.
+    /// Dropped later generations.
     pub dropped: Vec<u64>,
-    /// Their names.
+    /// Names of the dropped generations.
     pub dropped_names: Vec<String>,
-    /// Whether it was done.
+    /// Whether the rollback was done.
     pub is_done: bool,
 }
 
-/// Makes a kept generation the latest again; later ones are dropped with their names. Without `yes` only says what would
-/// go.
+/// Makes a kept generation the latest again; drops later generations with their names. Without `yes` nothing changes.
 ///
 /// # Errors
 /// The store is in use or cannot be opened, or the generation is not kept.
@@ -52,7 +51,7 @@ pub fn rollback(place: &StorePlace, generation: &str, yes: bool) -> Result<Rolle
     Ok(RolledBack { generation, step, dropped, dropped_names, is_done })
 }
 
-/// Opens the store for writing that was looked at before.
+/// Opens for writing the store that was read before.
 fn open_same(place: &StorePlace, store: u128) -> Result<SpillDir, InputError> {
     let spill = SpillDir::open(&place.folder, true)?;
     if spill.format().store == store {
@@ -60,41 +59,41 @@ fn open_same(place: &StorePlace, store: u128) -> Result<SpillDir, InputError> {
     }
     Err(InputError::new(
         &place.folder,
-        "another store took the place of this one meanwhile",
-        "look at it again: gsscale-ckpt ls",
+        "another store has replaced this one meanwhile",
+        "list its generations with gsscale-ckpt ls",
     ))
 }
 
-/// Which names go.
+/// Names to remove.
 #[derive(Debug, Clone, Default)]
 pub struct PruneRequest {
-    /// These.
+    /// These names.
     pub names: Vec<String>,
-    /// All but this many of the newest named generations.
+    /// All names except those of this many newest named generations.
     pub keep: Option<usize>,
-    /// Only say what would go.
+    /// Only report, change nothing.
     pub dry_run: bool,
 }
 
-/// What was taken away, or would be.
+/// Result of a prune, done or planned.
 #[derive(Debug, Clone, Serialize)]
 pub struct Pruned {
-    /// Names that went.
+    /// Removed names.
     pub dropped_names: Vec<String>,
     /// Generations that are no longer kept.
     pub dropped: Vec<u64>,
     /// Generations that are kept.
     pub kept: Vec<u64>,
-    /// Bytes of slots that became free for the run to write again; the segment files keep their length.
+    /// Bytes of freed slots, which the run can reuse; the segment files keep their length.
     pub bytes_freed: u64,
-    /// Whether it was done.
+    /// Whether the prune was done.
     pub is_done: bool,
 }
 
-/// Takes names away; what only they kept becomes free. The last two generations stay in any case.
+/// Removes names and frees the generations that only these names kept. The last two generations always stay.
 ///
 /// # Errors
-/// The store is in use or cannot be opened, or a name is not there.
+/// The store is in use or cannot be opened, or a name does not exist.
 pub fn prune(place: &StorePlace, request: &PruneRequest) -> Result<Pruned, TrainError> {
     let before = place.open(Access::Pages)?;
     let pins = before.generations().pins();
@@ -102,7 +101,7 @@ pub fn prune(place: &StorePlace, request: &PruneRequest) -> Result<Pruned, Train
         let names: Vec<&str> = pins.keys().map(String::as_str).collect();
         let names = if names.is_empty() { "none".to_string() } else { names.join(", ") };
         let problem = format!("no checkpoint is named '{unknown}'");
-        return Err(InputError::new(&place.folder, problem, format!("names that there are: {names}")).into());
+        return Err(InputError::new(&place.folder, problem, format!("use one of: {names}")).into());
     }
     let mut dropped_names = request.names.clone();
     if let Some(keep) = request.keep {
@@ -123,7 +122,7 @@ pub fn prune(place: &StorePlace, request: &PruneRequest) -> Result<Pruned, Train
     let is_done = !request.dry_run && !dropped_names.is_empty();
     let mut bytes_freed = 0;
     if is_done {
-        // A reader's lock keeps writers out, this process's own too.
+        // The reader's lock excludes every writer, also this process's own, so drop it first.
         let store = before.format().store;
         drop(before);
         write_pins(place, store, &dropped_names)?;

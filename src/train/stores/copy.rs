@@ -1,7 +1,7 @@
-//! A store on another drive: all kept generations, their names and states, and only the slots that they need.
+//! Copies a store: all kept generations with their names and states, and only the slots that they need.
 //!
-//! Every page is verified while it is read. The copy has an identity of its own, so that slots of the two can never be
-//! taken for each other; generations keep their numbers.
+//! Every page is verified while it is read. The copy has a new identity, so slots of the two stores cannot be confused;
+//! generations keep their numbers.
 
 use super::StorePlace;
 use crate::base::error::InputError;
@@ -17,23 +17,23 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// What was copied.
+/// Result of a copy.
 #[derive(Debug, Clone, Serialize)]
 pub struct Copied {
     /// The new folder.
     pub to: PathBuf,
-    /// Generations, with their numbers.
+    /// Numbers of the generations.
     pub generations: Vec<u64>,
     /// Versions of pages.
     pub versions: u64,
-    /// Bytes of slots that were read.
+    /// Bytes of slots read.
     pub bytes_read: u64,
 }
 
 /// Copies a store to the folder `to`, which does not exist.
 ///
 /// # Errors
-/// The store is in use or damaged (the page is named), or the drive of `to` refuses. There is no store at `to` then.
+/// The store is in use or damaged (the error names the page), or `to` cannot be written. No store is left at `to` then.
 pub fn clone_store(place: &StorePlace, to: &Path) -> Result<Copied, TrainError> {
     refuse_existing(to)?;
     let store = place.open(Access::Pages)?;
@@ -69,7 +69,7 @@ pub fn clone_store(place: &StorePlace, to: &Path) -> Result<Copied, TrainError> 
     Ok(Copied { to: to.to_path_buf(), generations, versions, bytes_read })
 }
 
-/// How most pages are stored, as a codec for new ones.
+/// The codec of most pages, for new pages.
 pub(super) fn usual_codec<'a>(slots: impl Iterator<Item = &'a SlotRef>) -> Codec {
     let mut counts = [0u64; 3];
     slots.for_each(|slot| {
@@ -93,7 +93,7 @@ fn damaged(place: &StorePlace, page: PageId, slot: &SlotRef, what: &str) -> Inpu
         .at(format!("offset {}", slot.place.offset))
 }
 
-/// The same slots, in segments fit for so many of them.
+/// The layout with segments sized for `slots` slots.
 pub(super) fn layout_for(layout: SlotLayout, slots: u64) -> SlotLayout {
     let most = u64::from(layout.slots_per_segment);
     SlotLayout { slots_per_segment: slots.clamp(1, most) as u32, ..layout }

@@ -1,8 +1,8 @@
-//! The Gaussians of a generation as a PLY, page by page, through the code that the trainer writes its own with.
+//! Exports the Gaussians of a generation as a PLY, page by page, with the trainer's writer.
 //!
-//! Invariants: 1. without a choice of rows the file is, byte for byte, the one that the trainer would have written after
-//! the step of the generation; 2. memory is bounded by the budget, whatever the scene's size; 3. the file is there whole
-//! or not at all; 4. which rows are chosen depends on the rows alone.
+//! Invariants: 1. without selection the file equals, byte for byte, the trainer's PLY after the generation's step; 2.
+//! memory is bounded by the budget for any size of scene; 3. the file is written whole or not at all; 4. the selection
+//! depends on the rows alone.
 
 use super::{StorePlace, options_of, run_state_of};
 use crate::base::error::InputError;
@@ -23,39 +23,39 @@ use crate::scene::select::RankSearch;
 use crate::train::error::TrainError;
 use crate::train::memory::host_bytes_peak;
 use crate::train::pages::PagedScene;
-use crate::train::prepare::cut_sh;
+use crate::train::prepare::truncate_sh;
 use serde::Serialize;
 use std::path::PathBuf;
 
-/// Pages in memory at most: one pass needs no more.
+/// Most pages in memory; one pass needs no more.
 const FRAMES_MAX: usize = 64;
-/// Frames that a page takes on its way: its own, a copy with its pending events, its rows evaluated, the engine's buffer.
+/// Copies of a page in memory: the frame, the copy with pending events, the evaluated rows, the engine's buffer.
 const COPIES: u64 = 4;
 /// Threads that read.
 const READERS: usize = 4;
 /// Bytes of an entry of the map in memory: version, page, index.
 const ENTRY_BYTES: u64 = 512;
-/// What the program takes besides, bytes.
+/// Other memory of the program, bytes.
 const FIXED_BYTES: u64 = 32 << 20;
 
 /// What to export.
 #[derive(Debug, Clone)]
 pub struct ExportRequest {
-    /// Number or name of the generation; the latest without.
+    /// Number or name of the generation; `None` for the latest.
     pub generation: Option<String>,
     /// The PLY.
     pub out: PathBuf,
     /// Memory, bytes.
     pub host_mem: u64,
-    /// Only the most visible Gaussians, this many.
+    /// Number of Gaussians to keep, most visible first.
     pub max_gaussians: Option<u64>,
-    /// Only those whose means lie in this box, lower then upper corner, dataset coordinates.
+    /// Keep Gaussians with means in this box: lower, then upper corner, dataset coordinates.
     pub crop: Option<[f64; 6]>,
-    /// Only bands up to this degree.
+    /// Highest SH degree to keep.
     pub sh_degree: Option<u8>,
 }
 
-/// What was exported.
+/// Result of an export.
 #[derive(Debug, Clone, Serialize)]
 pub struct Exported {
     /// The file.
@@ -66,22 +66,23 @@ pub struct Exported {
     pub step: u32,
     /// Gaussians in the file.
     pub gaussians: u64,
-    /// Gaussians that are not finite and were left out.
+    /// Dropped Gaussians with non-finite values.
     pub skipped: u64,
     /// Bytes of the file.
     pub bytes: u64,
-    /// Whether the file holds local coordinates, since f32 cannot hold the dataset's.
+    /// Whether the file holds local coordinates because f32 cannot hold the dataset's.
     pub is_local: bool,
-    /// Bytes of pages that were read.
+    /// Bytes of pages read.
     pub bytes_read: u64,
-    /// Most memory of the process, bytes.
+    /// Peak memory of the process, bytes.
     pub host_bytes_peak: u64,
 }
 
 /// Exports a generation.
 ///
 /// # Errors
-/// The store cannot be opened or is damaged, the budget is too small, no Gaussian is left, or the file cannot be written.
+/// The store cannot be opened or is damaged, the budget is too small, no Gaussian is left, or the file cannot be
+/// written.
 pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, TrainError> {
     let store = place.open(Access::Pages)?;
     let generation = store.find(request.generation.as_deref())?;
@@ -120,7 +121,7 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
     })
 }
 
-/// What the trainer writes in the comments.
+/// The PLY comments, as the trainer writes them.
 fn meta_of(state: &RunState, options: &RunOptions) -> PlyMeta {
     let print = &state.dataset;
     PlyMeta {
@@ -133,7 +134,7 @@ fn meta_of(state: &RunState, options: &RunOptions) -> PlyMeta {
     }
 }
 
-/// The pages of a generation behind as many frames as one part in `share` of the budget allows.
+/// The scene of a generation, with the frames that 1/`share` of the budget allows.
 pub(super) fn scene_at(
     store: &StoreReader,
     generation: u64,
@@ -168,14 +169,14 @@ pub(super) fn scene_at(
     Ok(PagedScene::restore(pager, options, events, histogram, [state.rows, state.rows_bound]))
 }
 
-/// Which rows go into the file.
+/// Selection of the rows for the file.
 struct Choice {
-    /// In the local frame, rounded outwards for pages; rows are compared in dataset coordinates.
+    /// Box in the local frame, rounded outwards for pages; rows are compared in dataset coordinates.
     crop: Option<[f64; 6]>,
     origin: [f64; 3],
     scale: f64,
     most: Option<u64>,
-    /// The least visible row that stays.
+    /// The least visible row to keep.
     cut: Option<GiantCut>,
     /// Number of the next row among those inside the box.
     next: u32,
@@ -187,7 +188,7 @@ impl Choice {
         Choice { crop: request.crop, origin, scale, most: request.max_gaussians, cut: None, next: 0 }
     }
 
-    /// Pages that may hold a row inside the box, in the order of their names.
+    /// Pages that may hold a row inside the box, in the order of their ids.
     fn pages(&self, scene: &PagedScene) -> Vec<PageNo> {
         let index = scene.pager.index();
         let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
@@ -195,7 +196,7 @@ impl Choice {
             let bounds = &index[p.index()].bounds;
             index[p.index()].rows > 0
                 && self.crop.is_none_or(|crop| {
-                    // A little wider than the box: the way back into dataset coordinates rounds.
+                    // Slightly wider than the box, because the conversion to dataset coordinates rounds.
                     let slack = |x: f64| x.abs() * 1e-6 + 1e-9;
                     (0..3).all(|i| {
                         let at = |x: f32| f64::from(x) * self.scale + self.origin[i];
@@ -208,7 +209,7 @@ impl Choice {
         pages
     }
 
-    /// Finds the least visible row that stays, in passes over the pages.
+    /// Finds the least visible row to keep, in passes over the pages.
     fn find_cut(&mut self, scene: &mut PagedScene, pages: &[PageNo], step: u32) -> Result<(), TrainError> {
         let Some(most) = self.most else { return Ok(()) };
         let mut count = 0u64;
@@ -235,7 +236,7 @@ impl Choice {
         Ok(())
     }
 
-    /// The rows that stay, without the bands above a degree.
+    /// The selected rows, with at most `sh_degree`.
     fn chosen(&mut self, rows: &Columns, sh_degree: u8) -> Columns {
         let mut chosen = Columns::zeros(0, rows.sh_degree);
         if self.crop.is_none() && self.cut.is_none() {
@@ -251,7 +252,7 @@ impl Choice {
                 }
             }
         }
-        cut_sh(chosen, sh_degree)
+        truncate_sh(chosen, sh_degree)
     }
 
     fn is_inside(&self, rows: &Columns, row: usize) -> bool {
@@ -264,7 +265,7 @@ impl Choice {
     }
 }
 
-/// How much of a picture a row can cover: its opacity times the area of its two longest axes.
+/// Visibility of a row: its opacity times the area of its two longest axes.
 fn visibility(rows: &Columns, row: usize) -> f32 {
     let scales = rows.row(Column::Scales, row);
     let shortest = scales[0].min(scales[1]).min(scales[2]);

@@ -1,9 +1,10 @@
-//! Gaussians of a PLY as a fresh store, however many there are.
+//! Imports the Gaussians of a PLY of any size as a new store.
 //!
-//! Rows go through files beside the store into pages, as a run's first Gaussians do. Values are those of the file, bit for bit, in the file's own frame; moments are zero; no step is done.
+//! Rows pass through files beside the store into pages, as a run's first Gaussians do. Values equal those of the file,
+//! bit for bit, in the file's own frame; moments are zero; no step is done.
 //!
-//! Invariants: 1. memory is bounded by the budget; 2. pages are a function of the file, `page_rows` and nothing else; 3. the
-//! store is there whole or not at all.
+//! Invariants: 1. memory is bounded by the budget; 2. pages are a function of the file and `page_rows` alone; 3. the
+//! store is written whole or not at all.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
@@ -24,13 +25,14 @@ use crate::train::error::TrainError;
 use crate::train::gaussian_pages::{GaussianSpace, GaussianWriter};
 use crate::train::memory::host_bytes_peak;
 use crate::train::pages::PageRules;
+use crate::train::whole_file::folder_of;
 use serde::Serialize;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-/// What the program takes besides the budget's parts: threads, the store's buffers and its map.
+/// Memory besides the rows: threads, the store's buffers and its map, bytes.
 const FIXED_BYTES: u64 = 48 * MIB;
 
-/// What to import, and where to.
+/// Options of an import.
 #[derive(Debug, Clone)]
 pub struct ImportRequest {
     /// The PLY of Gaussians.
@@ -39,33 +41,34 @@ pub struct ImportRequest {
     pub out: PathBuf,
     /// Memory, bytes.
     pub host_mem: u64,
-    /// Gaussians that a page holds.
+    /// Capacity of a page, rows.
     pub page_rows: u32,
-    /// How pages are stored.
+    /// Codec of the pages.
     pub codec: Codec,
 }
 
-/// What was imported.
+/// Result of an import.
 #[derive(Debug, Clone, Serialize)]
 pub struct Imported {
     /// The new folder.
     pub store: PathBuf,
     /// Gaussians.
     pub gaussians: u64,
-    /// Gaussians that are not finite and were left out.
+    /// Dropped Gaussians with non-finite values.
     pub dropped: u64,
     /// Pages.
     pub pages: u64,
-    /// Degree of the file.
+    /// SH degree of the file.
     pub sh_degree: u8,
-    /// Most memory of the process, bytes.
+    /// Peak memory of the process, bytes.
     pub host_bytes_peak: u64,
 }
 
 /// Imports a PLY.
 ///
 /// # Errors
-/// The file cannot be read or holds no Gaussians, the budget is too small, or the drive refuses. There is no store then.
+/// The file cannot be read or holds no Gaussians, the budget is too small, or the folder cannot be written. No store is
+/// left then.
 pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
     refuse_existing(&request.out)?;
     if !holds_gaussians(&request.file)? {
@@ -73,7 +76,7 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
         return Err(InputError::new(&request.file, "it holds points, not Gaussians", remedy).into());
     }
     let (memory, beside) = (memory_for_rows(request)?, folder_of(&request.out));
-    let space = GaussianSpace { folder: &beside, memory };
+    let space = GaussianSpace { folder: beside, memory };
     let mut rows = GaussianWriter::new(&request.file, space);
     let meta = stream_gaussians(&request.file, &mut |values| rows.push(values))?;
     let rows = rows.finish()?;
@@ -108,11 +111,11 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
     })
 }
 
-/// Makes pages of rows and stores them.
+/// Encodes rows as pages and stores them.
 struct PageWriter {
     store: NewStore,
     rules: PageRules,
-    /// Words, so that tables are aligned.
+    /// As u64, so that tables are aligned.
     payload: Vec<u64>,
     pages: u32,
     failed: Option<TrainError>,
@@ -132,9 +135,9 @@ impl PageWriter {
     }
 }
 
-/// Memory for rows on their way, bytes.
+/// Memory for rows in transfer, bytes.
 fn memory_for_rows(request: &ImportRequest) -> InputResult<usize> {
-    // Pages in flight, and one being made.
+    // Pages in flight, and one being encoded.
     let pages = 20 * capacity_bytes(request.page_rows as usize, 3) as u64;
     let least = FIXED_BYTES + pages + 16 * MIB;
     if request.host_mem < least {
@@ -144,12 +147,7 @@ fn memory_for_rows(request: &ImportRequest) -> InputResult<usize> {
     Ok((request.host_mem - FIXED_BYTES - pages) as usize)
 }
 
-/// Where lists go that outgrow memory: the drive of the new store.
-fn folder_of(out: &Path) -> PathBuf {
-    out.parent().filter(|p| !p.as_os_str().is_empty()).map_or_else(|| PathBuf::from("."), Path::to_path_buf)
-}
-
-/// The defaults, for Gaussians that have all their bands in use.
+/// Default config and options for Gaussians at their full SH degree.
 fn options_for(request: &ImportRequest, sh_degree: u8, meta: &PlyMeta) -> InputResult<(TrainConfig, RunOptions)> {
     let config = TrainConfig {
         page_rows: request.page_rows,
@@ -164,7 +162,7 @@ fn options_for(request: &ImportRequest, sh_degree: u8, meta: &PlyMeta) -> InputR
     Ok((config, options))
 }
 
-/// The state of a run that has not begun.
+/// The run state before the first step.
 fn first_state(config: &TrainConfig, meta: &PlyMeta, rows: u64, sh_degree: u8) -> Result<Vec<u8>, TrainError> {
     let (origin, scale) = match meta.frame {
         ExportFrame::Local => (meta.origin, meta.scale),

@@ -1,4 +1,4 @@
-//! What a store is, its trainer's state in words, and one page.
+//! Inspection of a store: format, run state as text, and single pages.
 
 use super::{StorePlace, options_of, run_state_of};
 use crate::base::error::InputError;
@@ -18,7 +18,7 @@ use crate::scene::rows::Rows;
 use crate::train::error::TrainError;
 use serde::Serialize;
 
-/// A store as a whole, and one of its generations.
+/// Facts of a store and of one generation.
 #[derive(Debug, Clone, Serialize)]
 pub struct Inspected {
     /// The store's folder.
@@ -31,35 +31,35 @@ pub struct Inspected {
     pub format_version: u32,
     /// Feature bits that a reader must know.
     pub features_incompatible: u32,
-    /// Feature bits that a reader may pass over.
+    /// Feature bits that a reader may ignore.
     pub features_compatible: u32,
     /// Bytes of a slot.
     pub slot_bytes: u64,
     /// Slots in a segment.
     pub slots_per_segment: u32,
-    /// Segment files that are there.
+    /// Segment files.
     pub segments: u64,
-    /// Their bytes.
+    /// Bytes of the segment files.
     pub segment_bytes: u64,
     /// Transactions of the map.
     pub transactions: u64,
-    /// The generation that the rest is about.
+    /// The generation to which the following fields belong.
     pub generation: u64,
-    /// Its pages.
+    /// Pages of the generation.
     pub pages: u64,
-    /// Pages stored as they are, shuffled with zstd, as halves.
+    /// Pages stored raw, shuffled with zstd, as halves.
     pub pages_by_codec: [u64; 3],
-    /// Bytes of payloads as used and as stored.
+    /// Bytes of payloads, decoded and stored.
     pub payload_bytes: [u64; 2],
     /// Pages stored with each SH degree.
     pub pages_by_degree: [u64; 4],
-    /// Pages that have not applied all events yet.
+    /// Pages with pending events.
     pub pages_behind: u64,
-    /// The trainer's state, a fact a line.
+    /// The run state as text, one fact per line.
     pub state: Vec<String>,
 }
 
-/// Looks at a generation.
+/// Inspects a generation.
 ///
 /// # Errors
 /// The store cannot be opened, or the generation is not kept.
@@ -103,7 +103,7 @@ pub fn inspect(place: &StorePlace, generation: Option<&str>) -> Result<Inspected
     })
 }
 
-/// Number of a codec in lists.
+/// Index of a codec in lists.
 fn codec_number(codec: StoredAs) -> usize {
     match codec {
         StoredAs::Raw => 0,
@@ -112,7 +112,7 @@ fn codec_number(codec: StoredAs) -> usize {
     }
 }
 
-/// The trainer's state in words.
+/// The run state as text.
 fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
     let count = |is: fn(Effect<'_>) -> bool| state.events.iter().filter(|e| is(effect_of(&e.kind))).count();
     let rounds = count(|effect| matches!(effect, Effect::Round(_)));
@@ -128,8 +128,8 @@ fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
     let [x, y, z] = print.origin;
     vec![
         format!("step {} of {}, {:.1} s of training", state.step, config.steps, state.train_seconds),
-        format!("{} Gaussians in pages, {} with all promised growth", state.rows, state.rows_bound),
-        format!("SH degree {degree} in use, up to {}; {} Gaussians a page at most", config.sh_degree, config.page_rows),
+        format!("{} Gaussians in pages, at most {} after pending events", state.rows, state.rows_bound),
+        format!("SH degree {degree}, up to {}; {} Gaussians per page at most", config.sh_degree, config.page_rows),
         format!("{} events: {rounds} rounds, {resets} opacity resets, {raises} SH raises{last}", state.events.len()),
         format!(
             "strategy {}, view order {}, seed {}, moments {}",
@@ -145,19 +145,19 @@ fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
             print.first_rows,
             print.scale
         ),
-        format!("{} steps and {} updates skipped as not finite", state.steps_skipped, state.rows_skipped),
-        format!("{} bytes of metrics.jsonl belong to it", state.metrics_bytes),
+        format!("{} steps and {} updates skipped: not finite", state.steps_skipped, state.rows_skipped),
+        format!("{} bytes of metrics.jsonl", state.metrics_bytes),
     ]
 }
 
-/// Least, mean and most of a value.
+/// Minimum, mean and maximum of a value.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Spread {
-    /// Least.
+    /// Minimum.
     pub least: f64,
     /// Mean.
     pub mean: f64,
-    /// Most.
+    /// Maximum.
     pub most: f64,
 }
 
@@ -166,27 +166,27 @@ pub struct Spread {
 pub struct PageInspected {
     /// Its name.
     pub page: String,
-    /// The generation that brought this version.
+    /// The first generation with this version.
     pub since: u64,
     /// Segment file.
     pub file: String,
     /// Offset in it, bytes.
     pub offset: u64,
-    /// Number of the write in the life of the store.
+    /// Serial number of the write in this store.
     pub serial: u64,
-    /// How it is stored.
+    /// Codec.
     pub codec: String,
-    /// Bytes as used and as stored.
+    /// Bytes of the payload, decoded and stored.
     pub payload_bytes: [u32; 2],
     /// xxh3-128 of the stored payload, hexadecimal.
     pub checksum: String,
     /// Rows.
     pub rows: u32,
-    /// Degree that it is stored with.
+    /// SH degree of the page.
     pub sh_degree: u8,
-    /// Events that it has applied, of all so far.
+    /// Events applied, and all events.
     pub events: [u32; 2],
-    /// Box of the means now and until it is next touched, local coordinates.
+    /// Box of the means now and until the page is next touched, local coordinates.
     pub bounds: [[f32; 3]; 2],
     /// Largest standard deviation, local units.
     pub sigma_max: f32,
@@ -200,14 +200,14 @@ pub struct PageInspected {
     pub sigma: Spread,
     /// Views that drew a row since the last round.
     pub views: Spread,
-    /// First value that training could not have left, if any.
+    /// First invalid value, if any.
     pub fault: Option<String>,
 }
 
-/// Looks at a page: its header and its rows as they are stored.
+/// Inspects a page: its header and its rows as stored.
 ///
 /// # Errors
-/// The store is in use or cannot be opened, or the page is not there or damaged.
+/// The store is in use or cannot be opened, or the page is missing or damaged.
 pub fn inspect_page(place: &StorePlace, generation: Option<&str>, id: PageId) -> Result<PageInspected, TrainError> {
     let store = place.open(Access::Pages)?;
     let generation = store.find(generation)?;
@@ -221,12 +221,12 @@ pub fn inspect_page(place: &StorePlace, generation: Option<&str>, id: PageId) ->
         refuse(problem, "a page that was split is replaced by its halves, page 7 by 7.0 and 7.1")
     })?;
     let broken = |what: String| refuse(format!("page {id}: {what}"), "gsscale-ckpt verify --deep lists all damage");
-    let meta = meta_from_label(id, &page.label).ok_or_else(|| broken("its label is none".to_string()))?;
+    let meta = meta_from_label(id, &page.label).ok_or_else(|| broken("its label is invalid".to_string()))?;
     let mut reader = store.slot_reader();
     let header = reader.check_header(id, &page.slot).map_err(broken)?;
     let payload = reader.payload(id, &page.slot).map_err(broken)?;
     if layout_of(&meta).bytes() != payload.len() {
-        return Err(broken("its slot has another length".to_string()).into());
+        return Err(broken("the length of its slot is wrong".to_string()).into());
     }
     let rows = layout_of(&meta).rows(payload, 0);
     let slot = page.slot;

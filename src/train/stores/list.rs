@@ -1,4 +1,4 @@
-//! The kept generations of a store.
+//! Lists the kept generations of a store.
 
 use super::{StorePlace, run_state_of};
 use crate::page::tool::reading::Access;
@@ -13,11 +13,11 @@ pub struct GenerationLine {
     pub generation: u64,
     /// Its names.
     pub names: Vec<String>,
-    /// Whether `--resume` goes on from it.
+    /// Whether `--resume` continues from it.
     pub is_latest: bool,
     /// Steps done.
     pub step: u32,
-    /// Held-out PSNR at the last evaluation before, dB; `None` where it is not known.
+    /// Held-out PSNR of the last evaluation before it, dB; `None` if unknown.
     pub psnr: Option<f64>,
     /// Gaussians in its pages.
     pub gaussians: u64,
@@ -29,7 +29,7 @@ pub struct GenerationLine {
     pub bytes: u64,
 }
 
-/// All of them.
+/// All kept generations of a store.
 #[derive(Debug, Clone, Serialize)]
 pub struct Listed {
     /// The store's folder.
@@ -38,14 +38,14 @@ pub struct Listed {
     pub used_by: Option<String>,
     /// Bytes of its segment files.
     pub segment_bytes: u64,
-    /// Ascending.
+    /// Generations, ascending.
     pub generations: Vec<GenerationLine>,
 }
 
 /// Lists the kept generations.
 ///
 /// # Errors
-/// The store cannot be opened, or a run state is of another program.
+/// The store cannot be opened, or another version of the program wrote a run state.
 pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
     let store = place.open(Access::Map)?;
     let tests = place.run.as_deref().map(tests_of).unwrap_or_default();
@@ -71,8 +71,8 @@ pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
     Ok(Listed { store: place.folder.clone(), used_by, segment_bytes, generations })
 }
 
-/// Steps and PSNRs of the evaluations in a run's metrics.jsonl, in order. Lines that are none are passed over: the file is
-/// cut short after a crash.
+/// Steps and PSNRs of the evaluations in a run's metrics.jsonl, in order. Invalid lines are skipped, since a crash cuts
+/// the file short.
 fn tests_of(run: &Path) -> Vec<(u32, f64)> {
     let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
     let test = |line: &str| {

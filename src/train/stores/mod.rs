@@ -1,9 +1,10 @@
-//! What tools do with checkpoints: list, look, verify, export, import, copy, rebuild, go back, forget.
+//! The commands of gsscale-ckpt: list, inspect, verify, export, import, clone, salvage, rollback, prune.
 //!
-//! Each file is one of these. They give plain structs, which the tool prints as text or JSON.
+//! One file per command (rollback and prune share one). Each returns plain structs, which the tool prints as text or
+//! JSON.
 //!
-//! Invariants: 1. what only looks writes nothing ([`crate::page::tool::reading`]); 2. what makes a store or a file makes it whole
-//! or not at all; 3. values of rows come from the code that the trainer uses.
+//! Invariants: 1. read-only commands write nothing ([`crate::page::tool::reading`]); 2. a command creates its store or
+//! file whole or not at all; 3. values of rows come from the trainer's code.
 
 mod change;
 mod copy;
@@ -45,32 +46,32 @@ impl From<ReadError> for TrainError {
     }
 }
 
-/// Where the store is that a user means.
+/// The store that the user named.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StorePlace {
     /// The spill directory.
     pub folder: PathBuf,
-    /// The output folder of its run, if that was named.
+    /// The output folder of its run, if the user named that.
     pub run: Option<PathBuf>,
-    /// Identity of that run; unknown where the store itself was named.
+    /// Identity of that run; unknown if the user named the store itself.
     pub id: RunId,
 }
 
 impl StorePlace {
-    /// Opens the store, which must be that of the run that was named.
+    /// Opens the store, which must belong to the named run.
     ///
     /// # Errors
-    /// It cannot be opened, is in use (where pages are asked for), or holds the checkpoint of another run.
+    /// The store cannot be opened, is in use (for access to pages), or holds the checkpoint of another run.
     fn open(&self, access: Access) -> Result<StoreReader, TrainError> {
         let store = StoreReader::open(&self.folder, access, WitnessRule::Obeyed)?;
         self.check_owner(&store)?;
         Ok(store)
     }
 
-    /// Refuses the checkpoint of another run than the one that was named: the path in a run's config may lead to it by now.
+    /// Refuses the checkpoint of another run: the path in a run's config may lead to one by now.
     ///
     /// # Errors
-    /// It is another run's.
+    /// The store belongs to another run.
     fn check_owner(&self, store: &StoreReader) -> Result<(), TrainError> {
         let latest = store.generations().latest();
         if latest == 0 || !self.id.is_known() {
@@ -80,10 +81,10 @@ impl StorePlace {
     }
 }
 
-/// The store of a run's output folder, or the spill directory itself.
+/// Finds the store of a run's output folder; `dir` may also be the spill directory itself.
 ///
 /// # Errors
-/// There is none.
+/// There is no store.
 pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
     if !dir.is_dir() {
         return Err(InputError::new(
@@ -92,7 +93,7 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
             "name a run's output folder or its spill directory",
         ));
     }
-    // A FORMAT file that was lost leaves the segments.
+    // If FORMAT is lost, the segments identify a store.
     if dir.join("FORMAT").exists() || segments_in(dir).is_ok_and(|segments| !segments.is_empty()) {
         return Ok(StorePlace { folder: dir.to_path_buf(), run: None, id: RunId::UNKNOWN });
     }
@@ -115,14 +116,14 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
 /// The run state of a generation.
 ///
 /// # Errors
-/// It cannot be read, or is of another program.
+/// The state cannot be read, or another version of the program wrote it.
 pub fn run_state_of(store: &StoreReader, generation: u64) -> Result<RunState, TrainError> {
     let bytes = store.run_state(generation)?;
     let wrong = |problem: String| InputError::new(store.folder(), problem, "use the program that made it");
     Ok(RunState::from_bytes(&bytes).map_err(|e| wrong(e.to_string()).at(format!("generation {generation}")))?)
 }
 
-/// The config of a run, and what follows from it.
+/// The config of a run, and its options.
 fn options_of(store: &Path, state: &RunState) -> InputResult<(TrainConfig, RunOptions)> {
     let config = TrainConfig::parse(&state.config)
         .map_err(|problem| InputError::new(store, problem, "use the program that made it").at("config of the run"))?;

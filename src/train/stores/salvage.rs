@@ -1,19 +1,18 @@
-//! A store whose map or pages are damaged, rebuilt elsewhere from what is whole.
+//! Rebuilds a damaged store in a new folder from its undamaged parts.
 //!
-//! Where the map can still be verified (only its witness or some pages are damaged), the pages are those of the last
-//! generation; in place of a damaged version comes the newest older one that is whole. A run can go on from that.
+//! If the map can be verified (only its witness or some pages are damaged), the result is the last generation, with the
+//! newest undamaged older version in place of each damaged one. A run can resume from it.
 //!
-//! Where the map is lost, the newest whole version of every page is taken by number of write, whether it was committed or
-//! not; numbers of a process that ended before its first commit are used again, so it may be an earlier one. A page that
-//! was split counts as replaced by its parts. The trainer's state was in the map: what is left is a scene at the step of
-//! its newest row, to be exported, started from or gone on with, with its moments, and without the events that were still
-//! pending.
+//! If the map is lost, the result takes the newest undamaged version of every page by serial number, committed or not.
+//! A process that ended before its first commit leaves serial numbers that are used again, so a version may be an
+//! earlier one. A page that was split is replaced by its parts. The run state was in the map, so the result is a scene
+//! at the step of its newest row, with moments and without pending events; it can be exported, started from or resumed.
 //!
-//! Invariants: 1. the damaged store is not written; 2. everything that is missing is said; 3. the histogram of a state that
-//! is written here counts exactly the statistics of the rows in the pages, those apart that belong to a round which their
-//! page has yet to apply. Where the map is lost, so are the events, and a page that had applied fewer of them than others
-//! has statistics of a round that will never be applied: they are cleared. Where no page at all had applied the last
-//! round, all pages keep theirs, and the next round looks further back.
+//! Invariants: 1. the damaged store is not written; 2. everything missing is reported; 3. the histogram of a written
+//! state counts exactly the statistics of the rows in the pages, except statistics of a round that their page has yet
+//! to apply. If the map is lost, the events are lost too: a page that had applied fewer events than others then holds
+//! statistics of a round that will never be applied, and these are cleared. If no page had applied the last round, all
+//! pages keep their statistics, and the next round covers more steps.
 
 use super::copy::{layout_for, usual_codec};
 use super::{StorePlace, options_of, run_state_of};
@@ -44,34 +43,34 @@ use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// What to salvage, and where to.
+/// Options of a salvage.
 #[derive(Debug, Clone)]
 pub struct SalvageRequest {
     /// The new store, a folder that does not exist.
     pub to: PathBuf,
-    /// The run's config.toml, where the map is lost and the store was named rather than its run.
+    /// The run's config.toml, for a lost map if the user named the store instead of the run.
     pub config: Option<PathBuf>,
 }
 
-/// A page that is missing or older than it should be.
+/// A page that is missing or an older version.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct LostPage {
     /// The page.
     pub page: String,
-    /// Its rows, where its label is known.
+    /// Its rows, if its label is known.
     pub rows: Option<u32>,
-    /// Generation of the version that was taken instead; `None`: there is no whole one.
+    /// Generation of the version taken instead; `None` if no version is undamaged.
     pub taken: Option<u64>,
-    /// What is wrong.
+    /// Description.
     pub what: String,
 }
 
-/// What was salvaged.
+/// Result of a salvage.
 #[derive(Debug, Clone, Serialize)]
 pub struct Salvaged {
     /// The new folder.
     pub to: PathBuf,
-    /// Whether the map could be used, so that a run can go on from the new store.
+    /// Whether the map was usable, so that a run can resume from the new store.
     pub has_state: bool,
     /// Step of the run, or of the newest row.
     pub step: u32,
@@ -81,19 +80,19 @@ pub struct Salvaged {
     pub pages: u64,
     /// Pages that are missing, incomplete or older.
     pub lost: Vec<LostPage>,
-    /// What else the user should know.
+    /// Messages for the user.
     pub notes: Vec<String>,
 }
 
-/// A version that is to be kept.
+/// A version to keep.
 struct Kept {
     slot: SlotRef,
     label: Vec<u8>,
-    /// In place of a newer version.
+    /// It replaces a damaged newer version.
     is_older: bool,
 }
 
-/// What is known before pages are copied.
+/// Facts before pages are copied.
 struct Source {
     folder: PathBuf,
     store: u128,
@@ -105,11 +104,11 @@ struct Source {
 /// Rebuilds a store.
 ///
 /// # Errors
-/// The store is in use or of another version, nothing in it is whole, or the drive of the new one refuses. There is no
-/// new store then.
+/// The store is in use or of another version, all of it is damaged, or the new folder cannot be written. No new store
+/// is left then.
 pub fn salvage(place: &StorePlace, request: &SalvageRequest) -> Result<Salvaged, TrainError> {
     refuse_existing(&request.to)?;
-    // Held until the end: no trainer may write meanwhile.
+    // Hold the lock until the end, so that no trainer writes meanwhile.
     let _lock = refuse_if_in_use(&place.folder)?;
     let mut notes = Vec::new();
     let map = match StoreReader::open(&place.folder, Access::Pages, WitnessRule::Ignored) {
@@ -126,7 +125,7 @@ pub fn salvage(place: &StorePlace, request: &SalvageRequest) -> Result<Salvaged,
             None
         }
         Err(ReadError::Input(error)) => {
-            notes.push(format!("the map is of no use without FORMAT: {}", error.problem));
+            notes.push(format!("the map is unusable without FORMAT: {}", error.problem));
             None
         }
     };
@@ -168,7 +167,7 @@ fn source_of(
     }
     let layout = format.map_or_else(
         || {
-            // Every payload lies in its slot, so the longest gives the least that a slot can be.
+            // Every payload fits its slot, so the longest payload is a lower bound of the slot size.
             let bytes = found.iter().map(|h| h.slot.payload_bytes as usize).max().unwrap_or(0);
             SlotLayout::new(bytes, found.len() as u64)
         },
@@ -193,7 +192,7 @@ impl Source {
     }
 }
 
-/// The last generation, damaged versions replaced by older ones.
+/// Rebuilds the last generation, with older versions in place of damaged ones.
 fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest) -> Result<Salvaged, TrainError> {
     let latest = store.find(None)?;
     let mut state = run_state_of(store, latest)?;
@@ -246,22 +245,22 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
     copy.skip_to(latest);
     commit(copy, &state, &source)?;
     if !lost.is_empty() {
-        source.notes.push("the run can go on from it, but no longer ends with the bytes that it would have had".into());
+        source.notes.push("the run can resume from it, but will not end with the same bytes".into());
     }
     let (step, pages, to) = (state.step, kept.len() as u64, request.to.clone());
     Ok(Salvaged { to, has_state: true, step, gaussians: rows, pages, lost, notes: source.notes })
 }
 
-/// Whether the statistics of a page belong to a round that the page has yet to apply, so that the histogram of the next one
+/// Whether the statistics of a page belong to a round that the page has yet to apply, so the next round's histogram
 /// does not count them.
 fn misses_a_round(meta: &PageMeta, state: &RunState) -> bool {
     let missed = state.events.get(meta.events_applied as usize..).unwrap_or_default();
     missed.iter().any(|event| matches!(effect_of(&event.kind), Effect::Round(_)))
 }
 
-/// A page without the statistics of its rows. The statistics of an older version are not those that the run has counted: the
-/// run's histogram holds the newer ones, and nothing is promised any more for rounds that only the newer version had gone
-/// through. Rows without statistics neither grow in such a round nor are taken out of the histogram.
+/// A page with cleared statistics. The run's histogram counts the statistics of the newer, damaged version, and growth
+/// is no longer promised for rounds that only the newer version had applied. Rows without statistics neither grow in
+/// such a round nor leave the histogram.
 fn without_statistics(meta: &PageMeta, payload: &[u8]) -> Vec<u8> {
     let mut page = read_page(&layout_of(meta).rows(payload, 0));
     clear_statistics(&mut page);
@@ -286,7 +285,7 @@ fn changed(folder: &Path, page: PageId, what: &str) -> InputError {
     InputError::new(folder, format!("page {page} changed while it was read: {what}"), "check the drive, then try again")
 }
 
-/// The newest whole version of every page.
+/// Rebuilds a store without its map from the newest undamaged version of every page.
 fn without_state(place: &StorePlace, mut source: Source, request: &SalvageRequest) -> Result<Salvaged, TrainError> {
     let mut reader = source.reader();
     let found = source.by_page();
@@ -340,7 +339,7 @@ fn without_state(place: &StorePlace, mut source: Source, request: &SalvageReques
         histogram.add_rows(&page.view());
         let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
         let written = write_page(&page, bytes).bytes();
-        // Events are gone with the map: none is pending any more.
+        // The events are lost with the map, so none is pending.
         let meta = PageMeta { events_applied: 0, ..rules.meta(*id, &page) };
         copy.put(*id, &label(&meta), &bytes[..written])?;
     }
@@ -355,18 +354,18 @@ fn without_state(place: &StorePlace, mut source: Source, request: &SalvageReques
     Ok(Salvaged { to, has_state: false, step, gaussians: rows, pages, lost, notes: source.notes })
 }
 
-/// The version can be used: label, checksum and values.
+/// Checks label, checksum and values of a version.
 fn whole(reader: &mut SlotReader, header: &SlotHeader) -> Result<(), String> {
-    let meta = meta_from_label(header.page, &header.label).ok_or("its label is none")?;
+    let meta = meta_from_label(header.page, &header.label).ok_or("its label is invalid")?;
     let payload = reader.payload(header.page, &header.slot)?;
     if meta.rows == 0 || layout_of(&meta).bytes() != payload.len() {
-        return Err("its slot has another length than its label says".to_string());
+        return Err("the length of its slot differs from its label".to_string());
     }
     check_values(&layout_of(&meta).rows(payload, 0), u32::MAX)
 }
 
-/// Takes out pages that were split later, and says where their parts are not all there. Parts that are older than the
-/// whole page come from a time that was rolled back: they go.
+/// Drops pages that were split later, and reports missing parts. Parts older than the whole page come from before a
+/// rollback and are dropped too.
 fn drop_split_pages(
     kept: &mut BTreeMap<PageId, SlotHeader>,
     found: &BTreeMap<PageId, Vec<SlotHeader>>,
@@ -391,17 +390,17 @@ fn drop_split_pages(
     for id in &split {
         for child in id.children().into_iter().flatten() {
             if !known.contains(&child) && descendants(child, &known).is_empty() {
-                let what = format!("page {id} was split, and this part is nowhere or has lost all its Gaussians");
+                let what = format!("page {id} was split, and this part is missing or has lost all its Gaussians");
                 lost.push(LostPage { page: child.to_string(), rows: None, taken: None, what });
             }
         }
     }
 }
 
-/// Pages that a page was split into, however often: its subtree without itself.
+/// All pages that a page was split into, over any number of splits: its subtree without itself.
 fn descendants(id: PageId, known: &BTreeSet<PageId>) -> Vec<PageId> {
     let Some([low, high]) = id.children() else { return Vec::new() };
-    // A subtree is a range of ids: it ends where the lowest bit of its root would carry.
+    // A subtree is a range of ids; it ends where the lowest bit of its root would carry.
     let half = high.to_bits() - id.to_bits();
     let (from, to) = (low.to_bits() - (half - 1), high.to_bits() + (half - 1));
     let bounds = PageId::from_bits(from).zip(PageId::from_bits(to));
@@ -438,7 +437,7 @@ fn config_for(
         DatasetPrint { views: Vec::new(), first_rows: 0, points: 0, scene_scale: 1.0, origin: [0.0; 3], scale: 1.0 };
     let Some(file) = file else {
         source.notes.push(
-            "the run's config is not known (name the run's output folder, or --config): default rates, local coordinates"
+            "the run's config is not known (name its output folder or --config): using default rates, local coordinates"
                 .to_string(),
         );
         let config = TrainConfig { page_rows: rows.max(16), sh_degree: degree, ..TrainConfig::default() };
@@ -447,7 +446,7 @@ fn config_for(
     let config = TrainConfig::read(&file)?;
     if config.page_rows < rows || config.sh_degree < degree {
         let problem = format!(
-            "it has page-rows {} and sh-degree {}, its pages have {rows} and {degree}",
+            "it has page-rows {} and sh-degree {}, but the pages have {rows} and {degree}",
             config.page_rows, config.sh_degree
         );
         return Err(InputError::new(file, problem, "give the config.toml of the run that made these pages"));
@@ -458,7 +457,7 @@ fn config_for(
     Ok((config, print))
 }
 
-/// A state at `step` without a past.
+/// A run state at `step` without history.
 fn state_for(
     (config, print): &(TrainConfig, DatasetPrint),
     rows: u64,

@@ -1,7 +1,7 @@
-//! A store as what a new run starts from: the Gaussians of its last generation, page by page, in the frame of the new
-//! run's dataset. Moments, statistics and events stay behind.
+//! A store as the start of a new run: the Gaussians of its last generation, page by page, in the local frame of the new
+//! run. Moments, statistics and events are dropped.
 //!
-//! Invariant: memory is bounded by the budget, whatever the scene's size.
+//! Invariant: memory is bounded by the budget for any size of scene.
 
 use super::export::scene_at;
 use super::{find_store, options_of, run_state_of};
@@ -15,24 +15,24 @@ use crate::scene::state::SceneState;
 use crate::train::catch_up::evaluate_all;
 use crate::train::error::TrainError;
 use crate::train::pages::PagedScene;
-use crate::train::prepare::cut_sh;
+use crate::train::prepare::truncate_sh;
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_64;
 
-/// A stored scene, open.
+/// An opened store.
 pub struct StoredStart {
     folder: PathBuf,
     scene: PagedScene,
     state: RunState,
-    /// Keeps the store from being written.
+    /// Holds the lock that excludes writers.
     _store: StoreReader,
 }
 
 impl StoredStart {
-    /// The last generation of the store in `dir`, or of the run whose output folder that is.
+    /// Opens the last generation of the store in `dir`, which may be the output folder of a run.
     ///
     /// # Errors
-    /// It cannot be opened, is in use, or the budget, of which it gets one part in `share`, is too small for it.
+    /// The store cannot be opened or is in use, or 1/`share` of the budget is too small for it.
     pub fn open(dir: &Path, host_mem: u64, share: u64) -> Result<StoredStart, TrainError> {
         let place = find_store(dir)?;
         let store = place.open(Access::Pages)?;
@@ -44,12 +44,12 @@ impl StoredStart {
         Ok(StoredStart { folder, scene, state, _store: store })
     }
 
-    /// No fewer than its Gaussians.
+    /// Upper bound of its Gaussians.
     pub fn rows_at_most(&self) -> u64 {
         self.state.rows_bound
     }
 
-    /// Tells one start from another: the state of the run that made it, which its pages follow from.
+    /// Digest of the start: of the run state, from which the pages follow.
     ///
     /// # Errors
     /// The state cannot be encoded.
@@ -59,16 +59,16 @@ impl StoredStart {
         Ok(xxh3_64(&bytes))
     }
 
-    /// Bands that its Gaussians have.
+    /// SH degree of its Gaussians.
     pub fn sh_degree(&self) -> u8 {
         self.scene.rules.sh_degree()
     }
 
-    /// Hands out first pages: at most `page_rows` rows each, in the local frame of `origin` and `scale`, with the bands up
-    /// to `sh_degree` and their identities. May be asked again.
+    /// Passes first pages to `take`: at most `page_rows` rows each, in the local frame of `origin` and `scale`, with at
+    /// most `sh_degree` and with their uids. May be called repeatedly.
     ///
     /// # Errors
-    /// A page cannot be read or leaves f32 in the new frame, or `take` failed.
+    /// A page cannot be read or overflows f32 in the new frame, or `take` failed.
     pub fn for_each_page(
         &mut self,
         (origin, scale): ([f64; 3], f64),
@@ -93,7 +93,7 @@ impl StoredStart {
                 let problem = "its Gaussians are too far from the cameras for f32";
                 return Err(InputError::new(&self.folder, problem, "check that it is a scene of this dataset").into());
             }
-            let mut state = SceneState::from_columns(cut_sh(columns, sh_degree));
+            let mut state = SceneState::from_columns(truncate_sh(columns, sh_degree));
             state.raise_sh_degree(sh_degree);
             state.uid = uid;
             let rows: Vec<u32> = (0..state.rows() as u32).collect();

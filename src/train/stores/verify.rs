@@ -1,8 +1,8 @@
-//! Whether a store is whole: every fault with its page and place.
+//! Verifies a store and lists every fault with its page and place.
 //!
-//! Always: the map (checksum of every value, the sums over all of them, the witness), the state of every kept generation,
-//! every entry against its run, the length of every segment, the header of every slot. Deep: every payload's checksum, its
-//! decoding and its values.
+//! Always checked: the map (checksum of every value, sums over all values, the witness), the state of every kept
+//! generation, every entry against its run, the length of every segment, the header of every slot. Deep: checksum,
+//! decoding and values of every payload.
 
 use super::{StorePlace, options_of};
 use crate::checkpoint::run_state::RunState;
@@ -14,10 +14,10 @@ use crate::paging::stored::{PageLimits, check_values, layout_of};
 use crate::train::error::TrainError;
 use serde::Serialize;
 
-/// Something that is not as it should be.
+/// One fault of a store.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Fault {
-    /// What is at fault: map, state, segment, entry, header, payload, values.
+    /// The faulty part: map, state, segment, entry, header, payload, values.
     pub kind: &'static str,
     /// The page.
     pub page: Option<String>,
@@ -27,22 +27,22 @@ pub struct Fault {
     pub file: Option<String>,
     /// Offset of the slot in it, bytes.
     pub offset: Option<u64>,
-    /// What is wrong.
+    /// Description.
     pub what: String,
 }
 
-/// What a verification found.
+/// Result of a verification.
 #[derive(Debug, Clone, Serialize)]
 pub struct Verdict {
     /// The store's folder.
     pub store: std::path::PathBuf,
     /// Whether payloads were read.
     pub deep: bool,
-    /// Kept generations that were checked.
+    /// Kept generations checked.
     pub generations: u64,
-    /// Versions of pages that were checked.
+    /// Versions of pages checked.
     pub versions: u64,
-    /// Bytes of slots that were read.
+    /// Bytes of slots read.
     pub bytes_read: u64,
     /// All faults, in the order map, states, segments, slots by place.
     pub faults: Vec<Fault>,
@@ -51,7 +51,7 @@ pub struct Verdict {
 /// Verifies a store.
 ///
 /// # Errors
-/// It is none, of another version, in use, or its folder cannot be read. Damage is no error here.
+/// The folder is not a store, has another format version, is in use, or cannot be read. Damage is not an error here.
 pub fn verify(place: &StorePlace, deep: bool) -> Result<Verdict, TrainError> {
     let store = place.folder.clone();
     let mut verdict = Verdict { store, deep, generations: 0, versions: 0, bytes_read: 0, faults: Vec::new() };
@@ -105,7 +105,7 @@ pub fn verify(place: &StorePlace, deep: bool) -> Result<Verdict, TrainError> {
     Ok(verdict)
 }
 
-/// Reads every run state; gives the limits and the step of the last one.
+/// Checks every run state; returns the limits and the step of the last one.
 fn check_states(store: &StoreReader, verdict: &mut Verdict) -> Option<(PageLimits, u32)> {
     let mut last = None;
     for generation in store.generations().kept() {
@@ -132,7 +132,7 @@ fn check_states(store: &StoreReader, verdict: &mut Verdict) -> Option<(PageLimit
     last
 }
 
-/// Every segment that a slot lies in is there with its full length.
+/// Checks that every segment with slots exists with its full length.
 fn check_segments(store: &StoreReader, slots: &[SlotRef], verdict: &mut Verdict) -> Result<(), TrainError> {
     let there = store.segments()?;
     let full = store.format().layout.segment_bytes();
@@ -157,7 +157,7 @@ fn fault_of_map(error: &CommitError) -> Fault {
         CommitError::File { name, .. } => name,
         _ => crate::page::map::commit::MAP_NAME,
     };
-    // The remedy has its place in messages for people.
+    // Drop the remedy, which follows the first line.
     let what = error.to_string().lines().next().unwrap_or_default().to_string();
     Fault { kind: "map", page: None, generation: None, file: Some(file.to_string()), offset: None, what }
 }
