@@ -1,9 +1,8 @@
-//! A city far larger than the memory of the run, imported and trained by `gsscale-train` under a hard limit: `--host-mem` and
-//! a tenth of it.
+//! `gsscale-train` imports and trains a city far larger than memory, under a hard limit of `--host-mem` plus a tenth.
 //!
-//! `cargo bench --bench bounded -- --dir DIR` draws a small city and repeats it side by side (`gsscale-synth --tile`), which
-//! takes no memory here. The benchmark prints one line of JSON. It writes only below one new folder, and removes the folder
-//! at the end.
+//! `cargo bench --bench bounded -- --dir DIR` generates a small city and repeats it side by side (`gsscale-synth
+//! --tile`), which needs little memory. The benchmark prints one line of JSON. It writes only to one new folder, and
+//! removes the folder at the end.
 
 #[path = "support/memory_group.rs"]
 mod memory_group;
@@ -31,26 +30,25 @@ Examples:
   cargo bench --bench bounded -- --dir /mnt/nvme/bounded --gaussians max      as many as leave a fifth of the free drive free
   cargo bench --bench bounded -- --dir /mnt/nvme/bounded --gaussians 5000000 --host-mem 512MiB
 
-The limit is a memory control group of Linux (it takes a user who may make one, such as root); where there is none the
-line says so, and the peak that the run measured of itself is all there is. 20 million Gaussians take some 17 GB of the
-drive while it runs.";
+The limit is a memory control group of Linux, which a user such as root may create. Without a group, the line gives the
+reason, and only the peak that the run measured itself is known. 20 million Gaussians need some 17 GB of the drive.";
 
-/// On the drive beside the pages, for each Gaussian: its point in the scene, and what an import sorts.
+/// Bytes per Gaussian on the drive beside the pages: the point in the scene, and the data that the import sorts.
 const SCENE_BYTES: u64 = 51 + 120;
 /// Share of the free drive that `--gaussians max` uses.
 const DRIVE_SHARE: f64 = 0.8;
 
-/// Trains a city far larger than memory under a hard limit, and prints a line of JSON about what it took.
+/// Trains a city far larger than memory under a hard limit, and prints time and memory as a line of JSON.
 #[derive(Parser)]
 #[command(name = "bounded", bin_name = "cargo bench --bench bounded --", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// Folder to make on the drive; it must not exist, and is removed at the end
+    /// New folder on the drive; the benchmark removes it at the end
     #[arg(long, value_name = "DIR")]
     dir: PathBuf,
-    /// Gaussians, rounded down to whole copies of the city; or max: as many as leave a fifth of the free drive free
+    /// Gaussians, rounded down to whole copies of the city; max uses four fifths of the free drive
     #[arg(long, default_value = "20000000", value_name = "N|max")]
     gaussians: String,
-    /// Gaussians of the city that is repeated
+    /// Gaussians of one copy of the city
     #[arg(long, default_value_t = 1_000_000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     city: u32,
     /// Photos
@@ -62,7 +60,7 @@ pub struct Args {
     /// Steps
     #[arg(long, default_value_t = 200, value_name = "N")]
     steps: u32,
-    /// Gaussians that a page holds
+    /// Gaussians per page
     #[arg(long, default_value_t = 1024, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     page_rows: u32,
 }
@@ -71,13 +69,13 @@ fn main() -> ExitCode {
     run_with_arguments("bounded", |arguments, print| start(&Args::parse_from(arguments), print))
 }
 
-/// Measures.
+/// Runs the benchmark.
 ///
 /// # Errors
-/// The folder cannot be made, or `gsscale-train` cannot be started. A run that fails is a result.
+/// The folder cannot be created, or `gsscale-train` cannot be started. A failed run is a result.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     if args.dir.symlink_metadata().is_ok() {
-        return Err(InputError::new(&args.dir, "exists already", "name a folder that does not").into());
+        return Err(InputError::new(&args.dir, "already exists", "use a new folder").into());
     }
     std::fs::create_dir_all(&args.dir).map_err(|e| InputError::io(&args.dir, "making the folder", &e))?;
     let scratch = Scratch(args.dir.clone());
@@ -115,7 +113,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     Ok(())
 }
 
-/// A tenth above what the run was promised.
+/// The limit: a tenth above `--host-mem`.
 fn limit(args: &Args) -> u64 {
     args.host_mem.0 + args.host_mem.0 / 10
 }
@@ -126,32 +124,32 @@ fn state_bytes(args: &Args, gaussians: u64) -> u64 {
     gaussians.div_ceil(u64::from(args.page_rows)) * page
 }
 
-/// How often the city is repeated along each side, as nearly square as it goes.
+/// Copies of the city along each side, as square as possible.
 fn tiles(args: &Args) -> InputResult<[u32; 2]> {
     let wanted = match args.gaussians.as_str() {
         "max" => {
             let io = |e: std::io::Error| InputError::io(&args.dir, "asking for the free space", &e);
-            let unknown = || InputError::new(&args.dir, "the system does not tell what is free", "give --gaussians");
+            let unknown = || InputError::new(&args.dir, "the system does not report free space", "give --gaussians");
             let free = free_bytes(&args.dir).map_err(io)?.ok_or_else(unknown)?;
             let each = state_bytes(args, 1_000_000) as f64 / 1e6 + SCENE_BYTES as f64;
             (free as f64 * DRIVE_SHARE / each) as u64
         }
         text => text.parse().map_err(|_| {
-            InputError::new("--gaussians", format!("'{text}' is no number"), "write for example 20000000, or max")
+            InputError::new("--gaussians", format!("unknown number '{text}'"), "use a number such as 20000000, or max")
         })?,
     };
     let copies = (wanted / u64::from(args.city)).min(10_000) as u32;
     if copies == 0 {
-        let problem = format!("{wanted} Gaussians are fewer than the {} of one copy", args.city);
-        return Err(InputError::new("--gaussians", problem, "give more, or a smaller --city"));
+        let problem = format!("{wanted} Gaussians are fewer than one copy of the city ({})", args.city);
+        return Err(InputError::new("--gaussians", problem, "use more Gaussians, or a smaller --city"));
     }
-    // Nearly as many as wanted, of nearly square shape: the best of the widths up to the root.
+    // Nearly the wanted number in a nearly square shape: the best of the widths up to the square root.
     let most = (f64::from(copies).sqrt() as u32).max(1);
     let across = (most.div_ceil(2)..=most).max_by_key(|across| (copies / across * across, *across)).unwrap_or(1);
     Ok([across, copies / across])
 }
 
-/// How the program ended.
+/// The outcome of the run.
 struct Run {
     status: ExitStatus,
     limited_by: Option<&'static str>,
@@ -173,7 +171,7 @@ fn train(args: &Args) -> InputResult<Run> {
         ("--sh-start", "3".into()),
         ("--strategy", "none".into()),
         ("--device", "cpu".into()),
-        // The state is on the drive once, not once for each commit.
+        // Without commits the drive holds the state once.
         ("--commit-every", "0".into()),
     ];
     let mut arguments: Vec<OsString> = vec![path("scene"), "--quiet".into()];
@@ -216,7 +214,7 @@ fn killed_by(_status: &ExitStatus) -> Option<i32> {
     None
 }
 
-/// The folder that was made, removed however this ends.
+/// The new folder, removed at the end and on errors.
 struct Scratch(PathBuf);
 
 impl Drop for Scratch {

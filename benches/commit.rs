@@ -1,12 +1,11 @@
 //! Time to commit to a store and to open a store, on a real drive. (What commits cost a run is in the run's
 //! `summary.json`: `commit_overhead_percent`, `commit_bytes`, `commit_interval`.)
 //!
-//! `cargo bench --bench commit` commits 64 and 1,000 dirty pages of 728 KiB (numbers choose other counts), and opens a store
-//! of 100,000 pages. Files lie in the folder of temporary files (`TMPDIR`). Inside a test run it does the same with a few
-//! small pages.
+//! `cargo bench --bench commit` commits 64 and 1,000 dirty pages of 728 KiB (numbers choose other counts), and opens a
+//! store of 100,000 pages. Files are in the folder of temporary files (`TMPDIR`). A test run uses a few small pages.
 //!
-//! A commit is its writes, the sync of the segments, the map's transaction and the witness. The opened store has segments
-//! of holes, because opening reads the map and no page.
+//! A commit writes the pages, syncs the segments, commits the map's transaction and writes the witness. The opened
+//! store has empty sparse segments, because opening reads the map but no page.
 
 #![allow(clippy::expect_used)] // a benchmark that cannot run ends
 
@@ -29,15 +28,15 @@ use support::Args;
 /// Bytes of a page of 1,024 rows at SH degree 3.
 const PAGE_BYTES: usize = 745_472;
 const CONFIG: CommitConfig = CommitConfig { store: 0xbe, cache_bytes: 16 << 20, reserve_bytes: 0 };
-/// Like bounds and counts of a page.
+/// Stands for the bounds and counts of a page.
 const LABEL: [u8; 64] = [7; 64];
 
 /// Seconds of one measurement.
 #[derive(Debug, Clone, Copy)]
 pub struct CommitTime {
-    /// Writing the pages.
+    /// Seconds to write the pages.
     pub write: f64,
-    /// Sync, transaction, witness.
+    /// Seconds for sync, transaction and witness.
     pub commit: f64,
 }
 
@@ -97,7 +96,7 @@ pub fn commit_seconds(pages: u32, bytes: usize, times: usize) -> Result<CommitTi
     Ok(CommitTime { write, commit: support::median(measured.iter().map(|m| m.1)) })
 }
 
-/// Seconds to open a store whose map names `pages` pages that were just written.
+/// Seconds to open a store whose map has `pages` pages.
 pub fn open_seconds(pages: u32) -> Result<f64, CommitError> {
     let (at, layout) = (folder("open"), layout(PAGE_BYTES));
     let opened = Commits::create(Box::new(DriveFolder::new(&at)), CONFIG)?;
@@ -126,7 +125,7 @@ pub fn open_seconds(pages: u32) -> Result<f64, CommitError> {
     Ok(seconds)
 }
 
-/// Small sizes: commits, opens, and says whether times are times.
+/// Commits and opens with small sizes; returns whether all times are positive.
 pub fn tiny() -> bool {
     let commit = commit_seconds(5, 5000, 3).expect("a store takes commits");
     let open = open_seconds(300).expect("a store opens");

@@ -1,15 +1,15 @@
-//! Time of a whole training step on a device, and of each of its stages beside what moving its bytes would take.
+//! Time of a whole training step on a device, and of each stage against its memory floor.
 //!
-//! `cargo bench --bench gpu` measures the best adapter (a software one if there is nothing else) on real scenes (where
-//! `GSSCALE_DATA`, or `../shared/data`, has them) and a made-up terrain, with the CPU renderer on the same steps. Words
-//! choose cases, numbers the terrain's sizes, `--json` the form. Inside a test run it does two steps of a tiny terrain.
+//! `cargo bench --bench gpu` measures the best adapter (a software adapter if there is no other) on real scenes (in
+//! `GSSCALE_DATA` or `../shared/data`) and on a generated terrain, and the CPU renderer on the same steps. Words select
+//! cases, numbers set the sizes of the terrain, `--json` prints JSON. A test run does two steps of a tiny terrain.
 //!
-//! Whole steps are timed without stage timestamps, the stages in a second run with them: a pass of its own for every
-//! stage, timed by the device. The floor of a stage is the bytes that it must read and write once, gathers included,
-//! over the rate at which the device copies a large buffer. Stages that compute more than they move (both directions of
-//! the rasterizer, the loss) cannot reach it; it says how far they are from being bound by memory.
+//! Whole steps are timed without stage timestamps. The stages are timed by the device in a second run, with a pass for
+//! each stage. The floor of a stage is its bytes (one read of every input including gathers, one write of every output)
+//! divided by the rate of a large buffer copy. Compute-bound stages (both directions of the rasterizer, the loss)
+//! cannot reach the floor; the ratio shows how far they are from being memory-bound.
 //!
-//! CPU seconds of a step count all threads, so on a software adapter the device's work too.
+//! CPU seconds of a step count all threads, which includes the device's work on a software adapter.
 
 pub mod support;
 
@@ -35,11 +35,11 @@ use support::{Args, Hash, Seconds, checked, machine, time};
 
 /// Views of a round.
 const VIEWS: usize = 8;
-/// Rounds before the first that counts, and rounds that count.
+/// Warm-up rounds and measured rounds.
 const ROUNDS: [usize; 2] = [1, 2];
-/// Terrains where no size is given.
+/// Default sizes of the terrain.
 const TERRAINS: [usize; 2] = [100_000, 1_000_000];
-/// Bytes of the copy that gives the device's rate.
+/// Bytes of the copy that measures the device's rate.
 const COPY_BYTES: u64 = 64 << 20;
 
 fn main() {
@@ -72,7 +72,7 @@ fn main() {
     }
 }
 
-/// Two steps of a tiny terrain; the hash of its losses, or nothing without a device.
+/// Two steps of a tiny terrain; returns the hash of the losses, or `None` without a device.
 pub fn tiny() -> Option<u64> {
     let gpu = Gpu::open_with(&DeviceChoice::Gpu, &GpuOptions { profile: true, ..GpuOptions::default() }).ok()?;
     assert!(checked(copy_rate(&gpu, 4096, 1)) > 0.0);
@@ -85,7 +85,7 @@ pub fn tiny() -> Option<u64> {
     Some(run.hash)
 }
 
-/// Bytes read and written a second by copies from buffer to buffer: the best of some runs.
+/// Bytes read and written per second by buffer copies: the best of `runs` runs.
 fn copy_rate(gpu: &Gpu, bytes: u64, runs: usize) -> GpuResult<f64> {
     let (from, to) = (gpu.buffer("copied", bytes)?, gpu.buffer("copy", bytes)?);
     let mut best = f64::INFINITY;
@@ -100,7 +100,7 @@ fn copy_rate(gpu: &Gpu, bytes: u64, runs: usize) -> GpuResult<f64> {
     Ok(2.0 * bytes as f64 / best)
 }
 
-/// What some steps took, means of a step.
+/// Mean figures of a step.
 struct Run {
     time: Seconds,
     counts: Counts,
@@ -108,7 +108,7 @@ struct Run {
     hash: u64,
 }
 
-/// Trains from the case's start: `warm` rounds, then `rounds` that count.
+/// Trains from the start of the case: `warm` warm-up rounds, then `rounds` measured rounds.
 fn steps<R: Renderer>(
     case: &Case,
     simd: SimdPath,
@@ -145,7 +145,7 @@ fn steps<R: Renderer>(
     Run { time: Seconds { wall: whole.wall / steps, cpu: whole.cpu / steps }, counts, steps, hash: hash.0 }
 }
 
-/// A stage's mean time and floor in a step, seconds.
+/// Mean time and floor of a stage in a step, seconds.
 struct StageResult {
     name: &'static str,
     seconds: f64,

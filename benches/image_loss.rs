@@ -1,6 +1,7 @@
-//! Time of the image loss with its gradient, per instruction path, on one thread and on all.
-//! `cargo bench --bench image_loss` prints medians in milliseconds and per megapixel, beside a plain copy
-//! of what must be read and written; inside a test run it does one small picture, so that it cannot rot.
+//! Time of the image loss and its gradient, per instruction path, on one thread and on all.
+//!
+//! `cargo bench --bench image_loss` prints medians in milliseconds and per megapixel, and the ratio to a plain copy of
+//! the same bytes. A test run measures one small picture.
 
 mod support;
 

@@ -1,15 +1,15 @@
-//! Speed of the CPU renderer beside its floor.
+//! Speed of the CPU renderer against its floor.
 //!
 //! `cargo bench --bench render` measures the inner loop on each instruction path, then whole views of 10k, 100k and 1M
-//! Gaussians (other numbers choose other sizes, `--path avx2` the instruction path, `RAYON_NUM_THREADS` the threads).
-//! Inside a test run it renders one tiny view.
+//! Gaussians. Numbers set other sizes, `--path avx2` the instruction path, `RAYON_NUM_THREADS` the threads. A test run
+//! renders one tiny view.
 //!
-//! Rates are per second of CPU time and thread where the system tells it, so that other programs on the
-//! machine disturb them little; else per second of wall time.
+//! Rates are per CPU second and thread, so that other load on the machine changes them little; on a system without CPU
+//! times, per wall second.
 //!
-//! The floor of blending is a bare loop over splats that stay in the first cache level: no lists, no early stops, no
-//! edges, all pixels of a tile. A ratio of 1 means that only blending takes time. `nominal` counts every pixel of the
-//! tiles that a row can reach, `evaluated` only the pixel rows that are blended.
+//! The floor of blending is a bare loop over splats in the first cache level: no lists, no early stops, no edges, all
+//! pixels of a tile. A ratio of 1 means that only blending takes time. `nominal` counts every pixel of the tiles that a
+//! row can reach, `evaluated` counts only the pixel rows that are blended.
 //!
 //! The inner loop is measured on tiles with 2,048 splats that reach every pixel and never saturate it.
 
@@ -60,16 +60,16 @@ pub fn tiny() -> u64 {
     hash.0
 }
 
-/// Splats in the list of a tile of the inner loop's scene.
+/// Splats per tile in the scene of the inner loop.
 const INNER_SPLATS: usize = 2048;
 
-/// Prints the rate of the rasterizer's inner loop beside the bare loop's, both on `threads` threads; returns the
-/// picture of one tile.
+/// Prints the rates of the rasterizer's inner loop and of the bare loop, both on `threads` threads; returns the picture
+/// of one tile.
 fn inner_loop(simd: SimdPath, threads: usize, least: Duration) -> Vec<f32> {
     let Ok(pool) = rayon::ThreadPoolBuilder::new().num_threads(threads).build() else { return Vec::new() };
     pool.install(|| {
         let bare = bare_blend_rate(simd, least);
-        // Eight tiles a thread, so that threads get the same share.
+        // Eight tiles per thread give every thread the same share.
         let grid = Grid::new(16 * 8 * threads as u32, 16);
         let splats: Vec<Splat> = (0..INNER_SPLATS).map(|i| wide_splat(i, grid.width as f32)).collect();
         let isect = |i: usize| Isect { row: (i % INNER_SPLATS) as u32, pixel_rows: [0, 15], k: 0 };
@@ -104,11 +104,11 @@ fn inner_loop(simd: SimdPath, threads: usize, least: Duration) -> Vec<f32> {
     })
 }
 
-/// A splat with an alpha of 1/240 to 1/230 at every pixel of a picture this wide: above 1/255, and 2,048 of them leave
-/// a transmittance of more than 1e-4.
+/// A splat with an alpha of 1/240 to 1/230 at every pixel of a picture of this width: above 1/255, and 2,048 such
+/// splats leave a transmittance above 1e-4.
 fn wide_splat(i: usize, width: f32) -> Splat {
     let color = [0.25, 0.5, 0.1 + 0.8 * i as f32 / INNER_SPLATS as f32];
-    // Over the picture the exponent to base 2 falls by less than 0.05.
+    // The exponent to base 2 falls by less than 0.05 over the picture.
     let fall = 0.01 / (width * width);
     Splat {
         mean: [0.5 * width + (i % 16) as f32, (i / 128) as f32],
@@ -176,7 +176,7 @@ fn measure(n: usize, width: u32, height: u32, simd: SimdPath, floor: f64, least:
     println!();
 }
 
-/// Keeps the least time of every stage that ran.
+/// Keeps the shortest time of each stage that ran.
 fn note_stages(renderer: &CpuRenderer, least: &mut [(&'static str, f64)]) {
     for (least, (stage, seconds)) in least.iter_mut().zip(renderer.stage_seconds()) {
         least.0 = stage;

@@ -2,9 +2,10 @@
 //!
 //! `cargo bench --bench sizes -- SCENE --spill-dir DIR` trains scenes of several sizes.
 //!
-//! The benchmark repeats the points of one scene behind its cameras, where no view sees the copies: the work of a step stays
-//! the same, and the pages on the drive grow in number. All sizes train in one process with the same number of frames, in
-//! turns of a few steps, on the same views step by step. The benchmark prints one line of JSON for each size.
+//! The benchmark repeats the points of a scene behind its cameras, where no view sees the copies. The work of a step
+//! stays the same, and the number of pages on the drive grows. All sizes train in one process with the same number of
+//! frames, in turns of a few steps, on the same views step by step. The benchmark prints one line of JSON for each
+//! size.
 
 pub mod support;
 
@@ -38,11 +39,11 @@ Examples:
   cargo bench --bench sizes -- scans/city --spill-dir /mnt/nvme/bench --steps 400 --strategy none --view-order groups:25
   cargo bench --bench sizes -- scans/city --spill-dir /mnt/nvme/bench --copies 1,20 --frames 400
 
-With a city of a million points the sizes are 1, 4 and 20 million Gaussians, which takes 19 GB of the drive.";
+With a city of a million points the sizes are 1, 4 and 20 million Gaussians, which need 19 GB of the drive.";
 
 /// Memory of an import, bytes.
 const IMPORT_BYTES: usize = 512 << 20;
-/// Frames when they are not given: this many times what the largest view needs.
+/// Default frames, as a multiple of the pages of the largest view.
 const VIEWS_IN_FRAMES: usize = 3;
 
 /// Trains scenes of several sizes on the same visible Gaussians, in turns, and prints a line of JSON for each.
@@ -51,13 +52,13 @@ const VIEWS_IN_FRAMES: usize = 3;
 pub struct Args {
     /// Scene with points: a COLMAP folder (images/, sparse/), or a folder with transforms.json
     scene: PathBuf,
-    /// Sizes in copies of the scene's points; the first is what the others are compared with
+    /// Sizes in copies of the scene's points; all sizes are compared with the first
     #[arg(long, value_delimiter = ',', default_value = "1,4,20", value_name = "N")]
     copies: Vec<u32>,
     /// Steps of a turn
     #[arg(long, default_value_t = 10, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     turn: u32,
-    /// Steps that are not measured, while memory fills [default: a quarter of the steps]
+    /// Steps before the measurement, while the frames fill [default: a quarter of the steps]
     #[arg(long, value_name = "N")]
     warm_up: Option<u32>,
     #[command(flatten)]
@@ -68,7 +69,7 @@ pub struct Args {
 struct Copies<'a> {
     dataset: &'a Dataset,
     count: u32,
-    /// From one copy to the next, local units.
+    /// Offset between copies, local units.
     shift: [f32; 3],
 }
 
@@ -86,7 +87,7 @@ impl PointSource for Copies<'_> {
 struct Size {
     copies: u32,
     trainer: Trainer,
-    /// After the trainer, whose pages lie there.
+    /// Dropped after the trainer, whose pages are in this folder.
     tiers: Tiers,
     before: PagerStats,
     seconds: Vec<f64>,
@@ -98,14 +99,14 @@ fn main() -> ExitCode {
     run_with_arguments("sizes", |arguments, print| start(&parse_arguments(arguments), print))
 }
 
-/// Measures.
+/// Runs the benchmark.
 ///
 /// # Errors
-/// Bad input, or a step that fails.
+/// The input is invalid, or a step fails.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let config = config_with_drive(&args.keys)?;
     if args.copies.is_empty() || args.copies.contains(&0) {
-        return Err(InputError::new("--copies", "a scene of nothing", "write for example 1,4,20").into());
+        return Err(InputError::new("--copies", "each size needs at least one copy", "use for example 1,4,20").into());
     }
     let dataset =
         load_dataset(read_scene(&args.scene, &limits::read_options(&config))?, &limits::load_options(&config))?;
@@ -133,7 +134,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     Ok(())
 }
 
-/// Frames for all sizes: as asked, or enough for the largest view of the scene itself three times.
+/// Frames for all sizes: `--frames`, or three times the pages of the largest view of the original scene.
 fn frames(config: &TrainConfig, dataset: &Dataset) -> Result<usize, TrainError> {
     if config.frames > 0 {
         return Ok(config.frames as usize);
@@ -144,8 +145,8 @@ fn frames(config: &TrainConfig, dataset: &Dataset) -> Result<usize, TrainError> 
     Ok(VIEWS_IN_FRAMES * dataset.train_views().into_iter().map(of).max().unwrap_or(1))
 }
 
-/// A vector that leads so far back from all cameras that no copy of the points comes before any of them: against the mean
-/// of their directions, by more than the scene is wide.
+/// The offset between copies. It points against the mean viewing direction and is longer than the scene is wide, so
+/// that all copies are behind all cameras.
 fn behind_the_cameras(dataset: &Dataset) -> [f32; 3] {
     let mut ahead = [0.0f64; 3];
     for view in &dataset.views {

@@ -1,8 +1,9 @@
-//! Time of a whole training step (acquire, cull, gather, forward, loss, backward, Adam, statistics, bounds) beside its floor.
+//! Time of a whole training step (acquire, cull, gather, forward, loss, backward, Adam, statistics, bounds) against its
+//! floor.
 //!
-//! `cargo bench --bench step` measures real scenes (where `GSSCALE_DATA`, or `../shared/data`, has them) and a made-up
-//! terrain. Numbers choose sizes, words choose cases, `--path avx2` the instruction path, `--json` the form,
-//! `RAYON_NUM_THREADS` the threads. Inside a test run it does a few steps of a tiny terrain. The cases `touched_100_percent`
+//! `cargo bench --bench step` measures real scenes (in `GSSCALE_DATA` or `../shared/data`) and a generated terrain.
+//! Numbers set sizes, words select cases, `--path avx2` sets the instruction path, `--json` prints JSON,
+//! `RAYON_NUM_THREADS` sets the threads. A test run does a few steps of a tiny terrain. The cases `touched_100_percent`
 //! and `touched_65_percent` measure the gather and the optimizer alone (`support::touched`).
 //!
 //! Real scenes start from their points with the program's own defaults and all colour bands in use; densification is
@@ -10,12 +11,12 @@
 //! repetition, by CPU seconds of all threads. Photos are decoded beforehand. The hash is over the bits of all losses:
 //! the same on each machine and for any number of threads, per instruction path.
 //!
-//! The floor is what the machine could do at best, each part measured here: blending the pixel-Gaussian pairs of the
-//! view once forward and once backward at the rate of a bare forward loop that stays in registers, and moving 11
-//! floats for each parameter (gather reads three and writes one for every row in view; Adam reads four and writes
-//! three for every row with a gradient) at the rate of a plain copy. The backward pass has about three times the
-//! arithmetic of the forward pass, so a ratio of 1 is out of reach. Beside each part stands what moving its bytes once
-//! would take on all threads; parts that compute more than they move (the rasterizer, the loss) cannot reach that.
+//! The floor of a step is the sum of two measured parts: blending the pixel-Gaussian pairs of the view once forward and
+//! once backward at the rate of a bare forward loop in registers; and moving 11 floats per parameter at the rate of a
+//! plain copy (the gather reads three and writes one for every row in view, Adam reads four and writes three for every
+//! row with a gradient). The backward pass has about three times the arithmetic of the forward pass, so a ratio of 1 is
+//! out of reach. The floor of each part of a step is the time to move the part's bytes once on all threads;
+//! compute-bound parts (the rasterizer, the loss) cannot reach it.
 
 pub mod support;
 
@@ -43,14 +44,14 @@ use support::floor::{bare_blend_rate, copy_rate};
 use support::touched::touched;
 use support::{Args, Hash, Seconds, machine, median, time};
 
-/// How much is measured.
+/// Size of a measurement.
 #[derive(Clone, Copy)]
 struct Effort {
-    /// Rounds over the views before the first that counts.
+    /// Warm-up rounds over the views.
     warm_up: usize,
-    /// Rounds that count.
+    /// Measured rounds.
     rounds: usize,
-    /// Views of a round, at most.
+    /// Most views of a round.
     views: usize,
 }
 
@@ -95,7 +96,7 @@ pub fn tiny() -> u64 {
     let case = terrain_case(300, 48, 40, 2);
     let result = run(&case, SimdPath::best(), TINY, floor);
     assert!(result.cpu.wall > 0.0 && result.floor_seconds > 0.0 && result.rows > 0.0);
-    // All but these move rows, lists or pictures.
+    // All other parts move rows, lists or pictures.
     assert!(result.parts.iter().all(|p| p.name == "acquire" || p.floor > 0.0));
     result.hash
 }
@@ -124,7 +125,7 @@ struct Floor {
     bytes: f64,
 }
 
-/// A part of a step: what it took, and what moving its bytes would take on all threads.
+/// A part of a step: its time, and the time to move its bytes on all threads.
 struct Part {
     name: &'static str,
     wall: f64,
@@ -132,10 +133,10 @@ struct Part {
     floor: f64,
 }
 
-/// What a case took, per step.
+/// Figures of a case, per step.
 struct StepResult {
     cpu: Seconds,
-    /// Least and largest round, CPU seconds a step.
+    /// Fastest and slowest round, CPU seconds per step.
     spread: [f64; 2],
     floor_seconds: f64,
     rows: f64,
@@ -206,7 +207,7 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
     }
 }
 
-/// Acquire, cull and gather are one span of the step; their shares are taken from doing each alone on the final state.
+/// Splits the span of acquire, cull and gather in proportion to the times of each part alone on the final state.
 fn split_cull(
     parts: &[(&'static str, f64)],
     scene: &mut PagedScene,
@@ -300,7 +301,7 @@ impl StepResult {
     }
 }
 
-/// The CPU renderer with a note of when its stages begin and end.
+/// The CPU renderer with timestamps of its stages.
 #[derive(Default)]
 struct Watched {
     inner: CpuRenderer,
@@ -317,7 +318,7 @@ impl Watched {
         }
     }
 
-    /// The step has ended: what came after the renderer is the optimizer's.
+    /// Notes the end of the step: the time since the renderer belongs to the optimizer.
     fn note_end(&mut self) {
         let optimizer = self.rows_out.map_or(0.0, |t| t.elapsed().as_secs_f64());
         let stages: Vec<(&'static str, f64)> = self.inner.stage_seconds().collect();

@@ -1,8 +1,8 @@
-//! What the benchmarks share: arguments, time by wall clock and by CPU, medians, a hash of results, and made-up scenes.
-//! Measures nothing itself.
+//! Shared by the benchmarks: arguments, wall and CPU time, medians, a hash of results, generated scenes. Measures
+//! nothing itself.
 //!
-//! CPU seconds are those of all threads of this program. They are the figure to compare on a machine that does other
-//! work too; where the system does not tell them they are wall seconds times threads.
+//! CPU seconds count all threads of this program, so other load on the machine changes them little. On a system that
+//! does not report CPU time they are wall seconds times threads.
 #![allow(dead_code)] // each benchmark uses a part of it
 
 pub mod cases;
@@ -19,28 +19,28 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::Columns;
 use std::time::{Duration, Instant};
 
-/// A result without which there is nothing to measure.
+/// Unwraps a result that the measurement needs.
 pub fn checked<T, E: std::fmt::Display>(result: Result<T, E>) -> T {
     result.unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// What was asked for on the command line.
+/// The arguments of a benchmark.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Args {
-    /// The real size (`cargo bench` says so by `--bench`); otherwise the tiny one.
+    /// Whether to measure the real sizes (`cargo bench` passes `--bench`) instead of a tiny case.
     pub real: bool,
-    /// One JSON object a line instead of text.
+    /// Print one JSON object per line instead of text.
     pub json: bool,
-    /// Instruction path, if one was named with `--path`.
+    /// Instruction path of `--path`.
     pub path: Option<SimdPath>,
-    /// Numbers given: sizes.
+    /// Sizes.
     pub sizes: Vec<usize>,
-    /// Words given: only cases whose name holds one of them.
+    /// Parts of names of cases; if not empty, only matching cases run.
     pub only: Vec<String>,
 }
 
 impl Args {
-    /// Reads the program's arguments; ends it when an option is unknown.
+    /// Reads the program's arguments; ends the program if an option is unknown.
     pub fn read() -> Args {
         Args::parse(std::env::args().skip(1)).unwrap_or_else(|problem| {
             eprintln!("error: {problem}");
@@ -48,7 +48,7 @@ impl Args {
         })
     }
 
-    /// Reads arguments; the error is a sentence.
+    /// Parses arguments; the error is a message.
     pub fn parse(args: impl Iterator<Item = String>) -> Result<Args, String> {
         let mut out = Args { real: false, json: false, path: None, sizes: Vec::new(), only: Vec::new() };
         let mut args = args;
@@ -73,40 +73,40 @@ impl Args {
         Ok(out)
     }
 
-    /// The path to measure.
+    /// The instruction path to measure.
     pub fn simd(&self) -> SimdPath {
         self.path.unwrap_or_else(SimdPath::best)
     }
 
-    /// Whether the case of this name was asked for.
+    /// Whether the arguments select the case with this name.
     pub fn wants(&self, case: &str) -> bool {
         self.only.is_empty() || self.only.iter().any(|word| case.contains(word.as_str()))
     }
 }
 
-/// Wall and CPU seconds of some work.
+/// Wall and CPU seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Seconds {
-    /// By the clock.
+    /// Wall seconds.
     pub wall: f64,
-    /// Of all threads.
+    /// CPU seconds of all threads.
     pub cpu: f64,
 }
 
-/// CPU seconds of all threads that this program has had, by the nanosecond.
+/// CPU seconds of all threads of this program so far, in nanosecond resolution.
 #[cfg(unix)]
 pub fn cpu_seconds() -> Option<f64> {
     let t = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
     Some(t.tv_sec as f64 + 1e-9 * t.tv_nsec as f64)
 }
 
-/// CPU seconds of all threads that this program has had.
+/// CPU seconds of all threads of this program so far.
 #[cfg(not(unix))]
 pub fn cpu_seconds() -> Option<f64> {
     None
 }
 
-/// The time that `work` takes.
+/// The time of `work`.
 pub fn time(mut work: impl FnMut()) -> Seconds {
     let (begin, before) = (Instant::now(), cpu_seconds());
     work();
@@ -116,10 +116,10 @@ pub fn time(mut work: impl FnMut()) -> Seconds {
     Seconds { wall, cpu }
 }
 
-/// Least length of what is timed at once: the system books the time of other running threads at its ticks only.
+/// Shortest timed batch: the system updates the CPU time of other running threads only at its ticks.
 const BATCH: Duration = Duration::from_millis(100);
 
-/// Time of one run of `work`: the medians over batches of runs, for at least as long as `least`.
+/// Time of one run of `work`: the medians over batches of runs, measured for at least `least`.
 pub fn steady_time(least: Duration, mut work: impl FnMut()) -> Seconds {
     let (start, batch) = (Instant::now(), least.min(BATCH));
     let mut batches = Vec::new();
@@ -140,7 +140,7 @@ pub fn steady_time(least: Duration, mut work: impl FnMut()) -> Seconds {
     Seconds { wall: median(batches.iter().map(|s| s.wall)), cpu: median(batches.iter().map(|s| s.cpu)) }
 }
 
-/// The middle value; of an even number, the mean of the middle two. 0 of none.
+/// The median; for an even count, the mean of the middle two; 0 without values.
 pub fn median(values: impl Iterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.collect();
     values.sort_by(f64::total_cmp);
@@ -151,7 +151,7 @@ pub fn median(values: impl Iterator<Item = f64>) -> f64 {
     }
 }
 
-/// FNV-1a over 64-bit words: the same bits of a result give the same number.
+/// FNV-1a over 64-bit words, to compare the bits of results.
 #[derive(Debug, Clone, Copy)]
 pub struct Hash(pub u64);
 
@@ -170,15 +170,15 @@ impl Hash {
     }
 }
 
-/// One line about the machine and how busy it is: figures mean little without it.
+/// One line about the machine and its load, which the figures depend on.
 pub fn machine(simd: SimdPath) -> String {
     let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
     let load = load.split_whitespace().next().unwrap_or("unknown").to_string();
     format!("{}, {} threads, path {}, load {load}", cpu_model(), rayon::current_num_threads(), simd.name())
 }
 
-/// A rough terrain seen obliquely, covered by flat Gaussians whose size follows their spacing; most are half opaque.
-/// Rows and a camera that sees nearly all of them.
+/// A rough terrain seen obliquely: rows, and a camera that sees nearly all of them. The Gaussians are flat, sized by
+/// their spacing, and mostly half opaque.
 pub fn terrain(n: usize, width: u32, height: u32) -> (Columns, Camera) {
     let mut draws = Stream::new(1, Purpose::Test, n as u64, 0);
     let mut c = Columns::zeros(n, 3);
@@ -196,7 +196,7 @@ pub fn terrain(n: usize, width: u32, height: u32) -> (Columns, Camera) {
         c.opacities[row] = draws.range(-2.0, 3.0) as f32;
     }
     c.sh0.iter_mut().chain(&mut c.sh_n).for_each(|x| *x = 0.2 * draws.normal() as f32);
-    // Looks down at 45 degrees from the side of negative y.
+    // The camera looks down at 45 degrees from negative y.
     let h = std::f32::consts::FRAC_1_SQRT_2;
     let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, -h, -h, 0.0], [0.0, h, -h, 3.0]];
     let f = width as f32 * 0.9;

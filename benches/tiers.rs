@@ -1,8 +1,8 @@
 //! The same training in memory and through the drive, with frames for shares of the pages.
 //!
-//! `cargo bench --bench tiers -- SCENE --spill-dir DIR` trains all contenders in one process, in turns of a few steps, so
-//! that other load on the machine slows all alike. All contenders train on the same views, step by step. Prints one line of
-//! JSON for each contender.
+//! `cargo bench --bench tiers -- SCENE --spill-dir DIR` trains all contenders in one process, in turns of a few steps,
+//! so that other load on the machine slows all alike. All contenders train on the same views, step by step. Prints one
+//! line of JSON for each contender.
 
 #[path = "support/demand.rs"]
 mod demand;
@@ -44,44 +44,45 @@ Examples:
   cargo bench --bench tiers -- scans/city --spill-dir /mnt/nvme/bench --steps 600 --strategy none --view-order groups:25
   cargo bench --bench tiers -- scans/city --spill-dir /mnt/nvme/bench --steps 600 --shares 10,5 --page-rows 256
 
-share_misses of the pages were not in memory when a step asked, of these share_absent not even on their way; where the
-pages of two steps in a row do not fit into the frames together, share_absent_least cannot be helped.
+share_misses: share of the needed pages that were not in memory when a step asked for them. share_absent: the part of
+these whose read had not started. share_absent_least: the least share_absent of any prefetcher, above 0 when the pages
+of two consecutive steps exceed the frames.
 
-Memory must hold the scene once for the run in memory and once for the sum of the shares. With --view-order auto all
-take the order that is chosen for the smallest share.";
+Memory must hold the scene once for the run in memory and once for the sum of the shares. With --view-order auto, all
+contenders use the order that is chosen for the smallest share.";
 
-/// Memory that choosing the order of views may take, bytes.
+/// Memory limit for choosing the order of views, bytes.
 const ORDER_BYTES: u64 = 256 << 20;
 
-/// Trains a scene in memory and with frames for shares of it, in turns, and prints a line of JSON for each.
+/// Trains a scene in memory and with frames for shares of its pages, in turns, and prints a line of JSON for each.
 #[derive(Parser)]
 #[command(name = "tiers", bin_name = "cargo bench --bench tiers --", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     scene: PathBuf,
-    /// Frames, in percent of the pages of the start
+    /// Frames, in percent of the pages at the start
     #[arg(long, value_delimiter = ',', default_value = "50,25,10", value_name = "P")]
     shares: Vec<f64>,
     /// Steps of a turn
     #[arg(long, default_value_t = 25, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     turn: u32,
-    /// Steps that are not measured, while memory fills [default: one epoch, at most half of the steps]
+    /// Steps before the measurement, while the frames fill [default: one epoch, at most half of the steps]
     #[arg(long, value_name = "N")]
     warm_up: Option<u32>,
     #[command(flatten)]
     keys: TrainOverrides,
 }
 
-/// One of those that are compared.
+/// One of the compared trainings.
 struct Contender {
     share: Option<f64>,
     trainer: Trainer,
-    /// After the trainer, whose pages lie there.
+    /// Dropped after the trainer, whose pages are in this folder.
     tiers: Tiers,
     before: PagerStats,
     demand: Demand,
     seconds: Vec<f64>,
-    /// User and system.
+    /// User time and system time.
     cpu_seconds: [f64; 2],
     rows: u64,
     rows_pinned: u64,
@@ -92,10 +93,10 @@ fn main() -> ExitCode {
     run_with_arguments("tiers", |arguments, print| start(&parse_arguments(arguments), print))
 }
 
-/// Measures.
+/// Runs the benchmark.
 ///
 /// # Errors
-/// Bad input, or a step that fails.
+/// The input is invalid, or a step fails.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let mut config = config_with_drive(&args.keys)?;
     if let Some(share) = args.shares.iter().find(|s| !(**s > 0.0 && **s <= 100.0)) {
@@ -119,7 +120,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     }
     let warm_up = args.warm_up.unwrap_or(dataset.train_views().len() as u32).min(config.steps / 2);
     decode_all(dataset, &targets, &config)?;
-    // Without it nothing is predicted; what is measured stands.
+    // If this fails, the line has no prediction; the measurements are complete.
     let rate = DriveRate::of_without_caching(Path::new(&config.spill_dir)).ok();
     in_turns(&mut contenders, 0..warm_up, args.turn, |c| c.step(dataset, &targets, false))?;
     contenders.iter_mut().for_each(Contender::begin);
@@ -145,7 +146,7 @@ fn views(dataset: &Dataset, trainer: &Trainer) -> ViewPages {
     ViewPages::new(trainer.scene.pager.index(), &cameras(dataset))
 }
 
-/// One order for all, so that all train on the same views: for the smallest number of frames where it is automatic.
+/// One order for all contenders, so that all train on the same views. An automatic order is that of the fewest frames.
 fn settle_order(
     config: &mut TrainConfig,
     dataset: &Dataset,
@@ -164,7 +165,7 @@ fn settle_order(
     Ok(())
 }
 
-/// In memory, or with this many frames over a folder of its own in the spill directory.
+/// A contender in memory, or with this many frames and its own folder in the spill directory.
 fn contender(
     prepared: &Prepared,
     config: &TrainConfig,
@@ -177,7 +178,7 @@ fn contender(
     }
     let spill_dir = folder.map_or_else(String::new, |f| f.display().to_string());
     let frames_key = if share.is_some() { u32::try_from(frames).unwrap_or(u32::MAX) } else { 0 };
-    // The share says how much memory there is.
+    // --shares sets the memory.
     let own = TrainConfig { spill_dir, frames: frames_key, host_mem: ByteSize(0), ..config.clone() };
     let scale = prepared.dataset.scene_scale;
     let options = RunOptions { sh_degree_start: prepared.sh_degree_start, ..RunOptions::new(&own, scale) };
@@ -223,7 +224,7 @@ impl Contender {
         Ok(())
     }
 
-    /// What was measured, beside the run in memory and what holds for all.
+    /// The line of JSON: the measurements, the ratios to the run in memory, and the common facts.
     fn line(&self, in_memory: &Contender, predicted: Option<&Prediction>, facts: &Value) -> Value {
         let steps = self.seconds.len().max(1) as f64;
         let sum = |of: &Contender| of.seconds.iter().sum::<f64>();
@@ -274,7 +275,7 @@ impl Contender {
     }
 }
 
-/// What the model of planning says of the same steps.
+/// The prediction of `gsscale-plan`'s model for the same steps.
 struct Prediction {
     views: ViewPages,
     page_bytes: Vec<u32>,
@@ -285,7 +286,7 @@ struct Prediction {
 }
 
 impl Prediction {
-    /// For a drive of this rate, and steps as long as those in memory were.
+    /// The model for a drive with this rate, and for steps as long as those in memory.
     fn new(
         config: &TrainConfig,
         (dataset, warm_up): (&Dataset, u32),
@@ -304,7 +305,7 @@ impl Prediction {
         }
     }
 
-    /// Seconds that the measured steps wait for the drive, with so many frames.
+    /// Seconds that the measured steps wait for the drive, with this many frames.
     fn stall_seconds(&self, frames: usize) -> Option<f64> {
         let (policy, steps) = (self.policy, self.steps.end);
         let options = ReplayOptions { frames, policy, reads_ahead: true, steps, plan_bytes: ORDER_BYTES };

@@ -339,10 +339,10 @@ fn the_depth_cloud_is_found_and_its_absence_said() {
     assert!(dry(&matrix_city).contains("laid out as matrixcity"));
     // 24 views are fewer than 5,620: none is held out by index.
     let said = dry(&data);
-    assert!(said.contains("the published cloud is not there (sparse/0/points.ply)"), "{said}");
+    assert!(said.contains("the published point cloud is missing (sparse/0/points.ply)"), "{said}");
     assert!(said.contains("0 held-out photos instead of 741"), "{said}");
     fs::copy(matrix_city.join("points.ply"), data.join("sparse/0/points.ply")).unwrap();
-    assert!(!dry(&data).contains("the published cloud is not there"));
+    assert!(!dry(&data).contains("the published point cloud is missing"));
 }
 
 #[test]

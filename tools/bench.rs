@@ -1,5 +1,5 @@
-//! `gsscale-bench`: measures training and prints lines of JSON. The first argument names the measurement; without a name it
-//! is `run`. Parses, calls, prints. (Measurements of the program's own parts are benchmarks: `benches/`.)
+//! `gsscale-bench`: measures training and prints lines of JSON. The first argument names the measurement; without a
+//! name it is `run`. Parses, calls, prints. (Measurements of the program's own parts are benchmarks: `benches/`.)
 
 #[path = "bench/compare.rs"]
 mod compare;
@@ -32,15 +32,15 @@ use std::ffi::OsString;
 use std::path::Path;
 use std::process::ExitCode;
 
-/// Measurements, in the order in which one comes to use them.
+/// The measurements, the most used first.
 const HELP: &str = "\
 Measures training, and prints one line of JSON a run.
 
   gsscale-bench SCENE                  trains a scene (the same as run SCENE)
   gsscale-bench run NAME --data DIR    trains a published scene; prints our figures beside the published figures
   gsscale-bench compare A B --out F    shows finished runs side by side on one page
-  gsscale-bench pareto SCENE --out DIR what each setting costs and saves
-  gsscale-bench ladder SCENE --out DIR what each idea of out-of-core training brings
+  gsscale-bench pareto SCENE --out DIR shows the cost and savings of each setting
+  gsscale-bench ladder SCENE --out DIR shows the gain of each idea of out-of-core training
 
 Each command has --help with examples: gsscale-bench run --help, gsscale-bench run rubble --help.
 Published scenes:";
@@ -84,7 +84,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// The checked config of a measurement; starts its worker threads.
+/// The checked config of a measurement; starts the worker threads.
 fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, TrainError> {
     let mut config = file.map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
     keys.clone().apply(&mut config);
@@ -94,7 +94,7 @@ fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, Tra
         return Err(InputError::new("--simd", problem, "use --simd auto").into());
     }
     if config.threads > 0 {
-        // Fails only if the pool exists already, which it does not at the start of main.
+        // Fails only if the pool already exists; main has not started one.
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
     }
     Ok(config)

@@ -58,7 +58,7 @@ enum Command {
     Verify(verify::Args),
     /// Makes an earlier generation the latest one
     Rollback(rollback::Args),
-    /// Removes names of checkpoints, and frees what only they kept
+    /// Removes names of checkpoints, and frees pages that only they kept
     Prune(prune::Args),
     /// Writes the Gaussians of a generation as a PLY
     Export(export::Args),

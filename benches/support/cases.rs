@@ -1,4 +1,4 @@
-//! The scenes that whole steps are measured on: photos beside which peers were measured, and a made-up terrain.
+//! The scenes for measuring whole steps: photo scenes with known times of other programs, and a generated terrain.
 //! Measures nothing itself.
 
 use super::{checked, terrain};
@@ -14,7 +14,7 @@ use gsscale::scene::init::gaussians_from_points;
 use gsscale::scene::neighbours::nearest_dist2;
 use std::path::PathBuf;
 
-/// What peers take for a step of the same input, CPU seconds, on another machine: two vCPUs of an AMD EPYC (Zen 5), SH
+/// CPU seconds of other programs for a step with the same input, measured on two vCPUs of an AMD EPYC (Zen 5), SH
 /// degree 3, no densification.
 #[derive(Debug, Clone, Copy)]
 pub struct Peer {
@@ -22,11 +22,11 @@ pub struct Peer {
     pub opensplat: f64,
     /// Brush 1.0.0 on lavapipe.
     pub brush: f64,
-    /// The CPU renderer is to take a this-th part of OpenSplat's.
+    /// Target: OpenSplat's time divided by that of the CPU renderer.
     pub target: Option<f64>,
 }
 
-/// A real scene beside which peers were measured.
+/// A real scene with known times of other programs.
 #[derive(Debug, Clone, Copy)]
 pub struct PhotoCase {
     /// Name in reports.
@@ -45,7 +45,7 @@ const fn photos(
     PhotoCase { name, folder, data_factor, count, peer: Peer { opensplat, brush, target } }
 }
 
-/// The peers' inputs.
+/// The inputs of the other programs.
 pub const PHOTO_CASES: [PhotoCase; 4] = [
     photos("brighton_480x269_10k", ("brighton", 2.5, Some(10_000)), (0.098, 0.68, Some(3.0))),
     photos("brighton_480x269_50k", ("brighton", 2.5, Some(50_000)), (0.130, 1.00, None)),
@@ -63,11 +63,11 @@ pub struct Case {
     pub views: Vec<(Camera, Target)>,
     /// Unit of the rates for means.
     pub scene_scale: f32,
-    /// What others take.
+    /// Times of other programs.
     pub peer: Option<Peer>,
 }
 
-/// A real scene with at most `views` of its photos, its points brought to the case's count; none where it is not there.
+/// A real scene with at most `views` photos and the case's number of points; `None` if the scene is missing.
 pub fn photo_case(case: &PhotoCase, views: usize) -> Option<Case> {
     let data = std::env::var_os("GSSCALE_DATA")
         .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
@@ -99,8 +99,8 @@ pub fn photo_case(case: &PhotoCase, views: usize) -> Option<Case> {
     Some(Case { name, columns, views: views.collect(), scene_scale: dataset.scene_scale, peer: Some(case.peer) })
 }
 
-/// `count` points: those there are, taken in turn, from the second turn on moved by a draw of half the distance to their
-/// neighbours; or the first `count` of an order that hashes their index.
+/// Changes the number of points to `count`. More points: repeats the points, displaced by random draws of half the
+/// distance to the neighbours. Fewer points: the first `count` in the order of hashed indices.
 fn resampled(points: &[[f32; 3]], colors: &[[u8; 3]], count: usize) -> (Vec<[f32; 3]>, Vec<[u8; 3]>) {
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.sort_by_cached_key(|&i| gsscale::base::rng::hash64(&[1, i as u64]));
@@ -120,7 +120,7 @@ fn resampled(points: &[[f32; 3]], colors: &[[u8; 3]], count: usize) -> (Vec<[f32
     out
 }
 
-/// Rows of a terrain, disturbed, and pictures of the terrain as it was, from places around the first camera.
+/// Perturbed rows of a terrain, and pictures of the original terrain from cameras around the first.
 pub fn terrain_case(n: usize, width: u32, height: u32, views: usize) -> Case {
     let (mut columns, camera) = terrain(n, width, height);
     let mut renderer = CpuRenderer::new();

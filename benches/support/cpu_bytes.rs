@@ -1,8 +1,8 @@
-//! Bytes that the parts of a step on the CPU must move: every input read once and every output written once, where a part
-//! gathers through an index once per gather. Colours use all bands. What stays in a cache between two parts is counted
-//! all the same, so a small view can be below its floor.
+//! Bytes that the parts of a step on the CPU must move: one read of every input and one write of every output; a gather
+//! counts every gathered element. Colours use all bands. Data that stays in a cache between two parts counts too, so a
+//! small view can be faster than its floor.
 
-/// What a step's bytes follow from, means over steps.
+/// Mean counts of a step, which determine its bytes.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CpuCounts {
     /// Rows in the pinned pages.
@@ -23,15 +23,15 @@ const SH0: f64 = 12.0;
 const BANDS: f64 = 180.0;
 /// Bytes of all values of a row.
 const ROW: f64 = GEOMETRY + SH0 + BANDS;
-/// A row as projection leaves it: position, conic, depth, extent, opacity.
+/// Bytes per row of the projection's output: position, conic, depth, extent, opacity.
 const FOOTPRINT: f64 = 36.0;
-/// A row as the tile loops read it, with what it reaches and its count.
+/// Bytes per row of the input of the tile loops: splat, span and count.
 const SPLAT: f64 = 64.0;
 const SPAN: f64 = 20.0;
-/// Nine sums.
+/// Bytes of the nine gradient sums.
 const PARTIAL: f64 = 36.0;
 
-/// Bytes of a part of a step of these counts; 0 for one that moves none by this account.
+/// Bytes of a part of a step; 0 for a part without an entry.
 pub fn part_bytes(part: &str, counts: &CpuCounts) -> f64 {
     let CpuCounts { pinned, rows, updated, isects, pixels } = *counts;
     match part {
@@ -49,7 +49,7 @@ pub fn part_bytes(part: &str, counts: &CpuCounts) -> f64 {
         "rasterize_fwd" => isects * (8.0 + SPLAT) + pixels * 20.0,
         // Picture and photo in, gradient out.
         "image_loss" => pixels * (12.0 + 3.0 + 12.0),
-        // The list again and the sums of each; then sums and splats in, gradients of footprints and colours out.
+        // The list again and the sums of each entry; then sums and splats in, gradients of footprints and colours out.
         "rasterize_bwd" => isects * (8.0 + SPLAT + 2.0 * PARTIAL) + pixels * 20.0 + rows * (SPLAT + PARTIAL),
         "sh_bwd" => rows * (8.0 + 12.0 + 12.0 + 12.0 + BANDS + 12.0 + SH0 + BANDS),
         "project_bwd" => rows * (GEOMETRY + FOOTPRINT + 24.0 + 12.0 + GEOMETRY),

@@ -1,7 +1,7 @@
-//! The pages that steps needed, as they were needed, and the fewest reads that any cache could have served them with.
+//! The pages that each step needed, and a lower bound on the reads of any cache for these steps.
 //!
-//! Invariant: the bound starts from the pages that were in memory when the measurement began and ends with its last
-//! step, as the measured cache did, so the two differ by decisions alone.
+//! Invariant: the bound covers the same interval as the measured cache: from the pages in memory at the start of the
+//! measurement to the last step. Bound and measurement differ by eviction decisions only.
 
 use gsscale::base::ids::PageNo;
 use gsscale::page::format::slot_header::transfer_bytes;
@@ -12,31 +12,31 @@ use gsscale::scene::page_layout::PageLayout;
 use gsscale::scene::page_meta::PageMeta;
 use std::collections::BTreeSet;
 
-/// What a measurement asked of its cache.
+/// The page requests of a measurement.
 #[derive(Debug, Default)]
 pub struct Demand {
-    /// Pages in memory, or on their way, before the first step.
+    /// Pages in memory, or being read, before the first step.
     pub resident: Vec<PageNo>,
-    /// By step.
+    /// Pages of each step.
     pub steps: Vec<Vec<PageNo>>,
 }
 
 impl Demand {
-    /// A measurement that begins now.
+    /// Starts a measurement.
     pub fn begin(pager: &Pager) -> Demand {
         let all = (0..pager.index().len() as u32).map(PageNo);
         Demand { resident: all.filter(|p| pager.is_in_memory(*p)).collect(), steps: Vec::new() }
     }
 
-    /// Pages and bytes that the optimal cache of `frames` frames reads; `bytes` is the size of each page on the drive.
-    /// `None` when a step needs more frames than that.
+    /// Pages and bytes that the optimal cache with `frames` frames reads; `bytes` is the size of each page on the
+    /// drive. `None` if a step needs more frames.
     pub fn fewest_reads(&self, frames: usize, bytes: &[u64]) -> Option<(u64, u64)> {
         self.fewest_reads_of(&self.steps, frames, bytes)
     }
 
-    /// As [`Demand::fewest_reads`], of the caches that let no step wait: the pages of the next step are in memory, beside
-    /// those of the present one, when this one ends. Where the two do not fit together, the first of the next, whatever is
-    /// there already: then it is an estimate, and may be too high.
+    /// As [`Demand::fewest_reads`], over caches that never let a step wait: at the end of a step, the pages of that
+    /// step and of the next are in memory. If the two exceed the frames, only the first pages of the next step count,
+    /// regardless of what is in memory; the result is then an estimate and may be too high.
     pub fn fewest_reads_in_time(&self, frames: usize, bytes: &[u64]) -> Option<(u64, u64)> {
         let both = |(i, pages): (usize, &Vec<PageNo>)| {
             let coming = self.steps.get(i + 1).into_iter().flatten().filter(|p| !pages.contains(p));
@@ -55,7 +55,7 @@ impl Demand {
         let mut cache = CacheModel::new(frames, EvictPolicy::FarthestNextUse);
         let mut change = StepChange::default();
         let mut total = (0, 0);
-        // What is there at the beginning enters as a step of its own, which is not counted.
+        // The initial pages enter as an extra step, which is not counted.
         for (step, pages) in std::iter::once(&self.resident).chain(steps).enumerate() {
             let next_use = |page: PageNo| {
                 let of_page = &uses[page.index()];
@@ -70,8 +70,8 @@ impl Demand {
         Some(total)
     }
 
-    /// Pages that no reading ahead could have brought in time: where the pages of two steps in a row do not fit into the
-    /// frames together, the second's wait until the first's may leave.
+    /// Pages that no prefetch could have read in time: if the pages of two consecutive steps exceed the frames, some
+    /// reads must wait for evictions after the first step.
     pub fn fewest_absent(&self, frames: usize) -> u64 {
         let mut both: BTreeSet<PageNo> = BTreeSet::new();
         let mut absent = 0;

@@ -1,9 +1,9 @@
-//! Bytes that the stages of a step on a device must move: every input read once and every output written once, where a
-//! stage gathers through an index once per gather. Colours use all bands.
+//! Bytes that the stages of a step on a device must move: one read of every input and one write of every output; a
+//! gather counts every gathered element. Colours use all bands.
 
 use gsscale::scene::camera::Camera;
 
-/// What a step's bytes follow from, means over steps.
+/// Mean counts of a step, which determine its bytes.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Counts {
     /// Rows in view.
@@ -25,7 +25,7 @@ impl Counts {
         self.tiles += f64::from(camera.width.div_ceil(16) * camera.height.div_ceil(16));
     }
 
-    /// Makes means of sums.
+    /// Divides the sums by the number of steps.
     pub fn divide(&mut self, steps: f64) {
         for sum in [&mut self.rows, &mut self.isects, &mut self.pixels, &mut self.tiles] {
             *sum /= steps;
@@ -39,10 +39,10 @@ const SPLAT: f64 = 48.0;
 const GEOMETRY: f64 = 44.0;
 const SH0: f64 = 12.0;
 const BANDS: f64 = 180.0;
-/// Bits of a pass of the sort.
+/// Key bits per pass of the sort.
 const DIGIT_BITS: f64 = 4.0;
 
-/// Bytes of a stage in a step of these counts; 0 for one that is not of the table.
+/// Bytes of a stage in a step; 0 for a stage without an entry.
 pub fn stage_bytes(stage: &str, counts: &Counts) -> f64 {
     let Counts { rows, isects, pixels, tiles } = *counts;
     // A pass reads the keys for the histogram, then reads and writes keys and values.
@@ -50,7 +50,7 @@ pub fn stage_bytes(stage: &str, counts: &Counts) -> f64 {
     let tile_bits = (tiles + 1.0).log2().ceil();
     match stage {
         "project_fwd" => rows * (GEOMETRY + SPLAT),
-        // The radius is read, means give the direction, the colour is written.
+        // Reads the radius, the mean for the direction, and the coefficients; writes the colour.
         "sh_fwd" => rows * (16.0 + 12.0 + SH0 + BANDS + 16.0),
         // Depth keys: 32 bits from the splats; then the sort by tile.
         "radix_sort" => rows * (SPLAT + 8.0) + sort(rows, 32.0) + sort(isects, tile_bits),
@@ -60,7 +60,7 @@ pub fn stage_bytes(stage: &str, counts: &Counts) -> f64 {
         "rasterize_fwd" => isects * (8.0 + SPLAT) + pixels * 20.0,
         // Three channels: picture and photo in, three maps out; the same in and the gradient out.
         "image_loss" => 3.0 * pixels * (8.0 + 12.0 + 12.0 + 8.0 + 4.0),
-        // The list again and nine sums for each; then sums and splats in, gradients of splats out.
+        // The list again and nine sums per entry; then sums and splats in, gradients of splats out.
         "rasterize_bwd" => isects * (8.0 + SPLAT + 36.0) + pixels * 20.0 + isects * 40.0 + rows * (2.0 * SPLAT + 12.0),
         "sh_bwd" => rows * (32.0 + 16.0 + 12.0 + BANDS + 12.0 + SH0 + BANDS),
         "project_bwd" => rows * (GEOMETRY + 16.0 + 32.0 + 16.0 + 12.0 + GEOMETRY + 16.0),

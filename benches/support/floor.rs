@@ -1,4 +1,4 @@
-//! What this machine could do at best, as bare loops: blending in registers, copying memory.
+//! The best rates of this machine, measured with bare loops: blending in registers, copying memory.
 
 use super::steady_time;
 use gsscale::base::simd::{Kernel, LANES, SimdPath, dispatch, fma};
@@ -7,11 +7,11 @@ use gsscale::kernels::splats::LOG2_ALPHA_MIN;
 use rayon::prelude::*;
 use std::time::Duration;
 
-/// Times that the bare loop goes through its splats in one run.
+/// Passes of the bare loop over its splats per run.
 const REPEATS: usize = 50;
 
-/// Pixel-Gaussians per CPU second and thread of a bare loop over splats that stay in the first cache level, timed for
-/// as long as `least`: no lists, no early stops, no edges, all pixels of a 16x16 tile, their state in registers.
+/// Pixel-Gaussians per CPU second and thread of a bare loop, timed for at least `least`. The splats stay in the first
+/// cache level and the state of all pixels of a 16x16 tile in registers; there are no lists, early stops or edges.
 pub fn bare_blend_rate(simd: SimdPath, least: Duration) -> f64 {
     let threads = rayon::current_num_threads();
     let splats: Vec<[f32; 8]> = (0..512)

@@ -1,8 +1,8 @@
-//! A hard limit on the memory of another program: a memory control group of Linux, version 2 or 1, where this user may
-//! make one.
+//! A hard limit on the memory of another program: a memory control group of Linux (version 2 or 1), if the user may
+//! create one.
 //!
-//! Invariants: 1. only a group that was made here is ever changed or removed; 2. the program is in the group from its
-//! first instruction on, so all of its memory counts.
+//! Invariants: 1. this module changes and removes only groups that it created; 2. the program is in the group from its
+//! first instruction, so all of its memory counts.
 
 use std::ffi::OsString;
 use std::fs;
@@ -10,16 +10,16 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Where the groups are, and the names of their files.
+/// The location of the groups and the names of their files.
 struct Version {
     name: &'static str,
     root: &'static str,
     /// A file that every group has.
     mark: &'static str,
-    /// As /proc/self/cgroup names it.
+    /// Name in /proc/self/cgroup.
     controller: &'static str,
     limit: &'static str,
-    /// Limit of what may go to swap space, and whether memory counts in it.
+    /// File of the limit of swap space, and whether the limit includes memory.
     swap: (&'static str, bool),
     peak: &'static str,
 }
@@ -52,10 +52,10 @@ pub struct MemoryGroup {
 }
 
 impl MemoryGroup {
-    /// A new group below the one that this process is in, or below one above it.
+    /// Creates a group below the group of this process, or below an ancestor of that group.
     ///
     /// # Errors
-    /// Why none can be made here, for people.
+    /// A message why this system allows no group.
     pub fn new(bytes: u64) -> Result<MemoryGroup, String> {
         let mut why = Vec::new();
         for version in &VERSIONS {
@@ -67,12 +67,12 @@ impl MemoryGroup {
         Err(why.join("; "))
     }
 
-    /// What limits.
+    /// The version of the control groups.
     pub fn name(&self) -> &'static str {
         self.version.name
     }
 
-    /// The command as a program of the group.
+    /// A command that runs the program inside the group.
     pub fn command(&self, program: &Path, arguments: &[OsString]) -> Command {
         let mut command = Command::new("sh");
         command.arg("-c").arg("echo $$ > \"$0\" && exec \"$@\"").arg(self.folder.join("cgroup.procs"));
@@ -80,7 +80,7 @@ impl MemoryGroup {
         command
     }
 
-    /// The most that the group held so far, page cache included.
+    /// Peak memory of the group, including the page cache.
     pub fn peak_bytes(&self) -> Option<u64> {
         fs::read_to_string(self.folder.join(self.version.peak)).ok()?.trim().parse().ok()
     }
@@ -88,15 +88,15 @@ impl MemoryGroup {
 
 impl Drop for MemoryGroup {
     fn drop(&mut self) {
-        // Nothing is in it any more; a folder that stays is empty and harmless.
+        // The group has no process any more. If removing fails, the empty group stays, which is harmless.
         let _ = fs::remove_dir(&self.folder);
     }
 }
 
-/// The folder of the group that this process is in.
+/// The folder of this process's group.
 fn group_of(version: &Version) -> Result<PathBuf, String> {
     if !Path::new(version.root).join(version.mark).is_file() {
-        return Err("not there".to_string());
+        return Err("not available".to_string());
     }
     let text = fs::read_to_string("/proc/self/cgroup").map_err(|e| e.to_string())?;
     let is_ours = |controllers: &str| controllers.split(',').any(|c| c == version.controller);
@@ -108,7 +108,7 @@ fn group_of(version: &Version) -> Result<PathBuf, String> {
     Ok(Path::new(version.root).join(path.trim_start_matches('/')))
 }
 
-/// Makes a group in the nearest folder from `inside` upwards that allows it.
+/// Creates a group in the nearest folder from `inside` upwards that allows it.
 fn make(version: &Version, inside: &Path, bytes: u64) -> Result<PathBuf, String> {
     let mut last = String::from("no folder");
     for above in inside.ancestors().take_while(|folder| folder.starts_with(version.root)) {
@@ -125,18 +125,18 @@ fn make(version: &Version, inside: &Path, bytes: u64) -> Result<PathBuf, String>
 }
 
 fn try_make(version: &Version, above: &Path, folder: &Path, bytes: u64) -> io::Result<()> {
-    // In version 2 only; refused where programs are in that group themselves; it may be on already.
+    // Version 2 only. Fails if the parent group has processes; the controller may already be on.
     let _ = fs::OpenOptions::new()
         .write(true)
         .open(above.join("cgroup.subtree_control"))
         .and_then(|mut file| file.write_all(b"+memory"));
     fs::create_dir(folder)?;
     fs::write(folder.join(version.limit), bytes.to_string())?;
-    // Without this what does not fit would go to swap space; where there is none the file is missing.
+    // Without this limit, excess memory would go to swap space. A system without swap space has no such file.
     let (swap, counts_memory) = version.swap;
     if folder.join(swap).is_file() {
         fs::write(folder.join(swap), if counts_memory { bytes } else { 0 }.to_string())?;
     }
-    // The program must be able to enter.
+    // The program must be able to enter the group.
     fs::OpenOptions::new().write(true).open(folder.join("cgroup.procs")).map(|_| ())
 }

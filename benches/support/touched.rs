@@ -1,10 +1,10 @@
-//! The gather and the optimizer on rows drawn at random, beside the bandwidth of a plain copy.
+//! The gather and the optimizer on randomly chosen rows, against the bandwidth of a plain copy.
 //!
-//! The gather reads the value and both moments of every listed row, brings the value up to date (deferred Adam) and writes
-//! it to the working set: 4 floats a parameter. The optimizer reads that value, both moments and a gradient, and writes the
-//! value and the moments: 7 floats. Before each round every row gets a stamp of an earlier step at random, so that the
-//! gather finds updates to catch up with. (Views of a scene list neighbouring rows: the parts `gather` and
-//! `adam+statistics+bounds` of a whole step show those.)
+//! Per parameter, the gather moves 4 floats: it reads value and both moments, applies deferred Adam, and writes the
+//! value to the working set. The optimizer moves 7 floats: it reads value, both moments and gradient, and writes value
+//! and moments. Before each round every row gets the stamp of a random earlier step, so that the gather has deferred
+//! updates to apply. (Views of a scene list neighbouring rows; the parts `gather` and `adam+statistics+bounds` of a
+//! whole step measure that case.)
 
 use super::{median, terrain, time};
 use gsscale::base::ids::PageNo;
@@ -21,10 +21,10 @@ use gsscale::train::pages::{PagedScene, row_tables};
 use serde_json::{Value, json};
 use std::hint::black_box;
 
-/// Stamps lie at most this many steps back.
+/// Largest age of a stamp, steps.
 const SLEEP_STEPS: u32 = 500;
 
-/// CPU seconds for one list of rows, and the bytes that they move.
+/// CPU seconds and bytes for one list of rows.
 #[derive(Debug, Clone, Copy)]
 pub struct Touched {
     listed: usize,
@@ -34,12 +34,12 @@ pub struct Touched {
 }
 
 impl Touched {
-    /// Bytes per CPU second and thread, as a share of those of a copy.
+    /// Bytes per CPU second and thread, divided by the rate of a copy.
     pub fn share_of_copy(&self, copy_rate: f64) -> f64 {
         self.bytes / (self.gather_seconds + self.optimizer_seconds) / copy_rate
     }
 
-    /// For people.
+    /// A line of text.
     pub fn text(&self, name: &str, copy_rate: f64) -> String {
         format!(
             "{name}: {} rows, gather {:.2} ms CPU, optimizer {:.2} ms CPU, {:.0} % of copy bandwidth",
@@ -50,7 +50,7 @@ impl Touched {
         )
     }
 
-    /// For programs.
+    /// A line of JSON.
     pub fn json(&self, name: &str, copy_rate: f64) -> Value {
         json!({
             "case": name, "rows": self.listed, "gather_cpu_seconds": self.gather_seconds,
@@ -62,7 +62,7 @@ impl Touched {
 
 /// Medians of `rounds` rounds over `percent` of `rows` rows in pages.
 pub fn touched(rows: usize, percent: u32, rounds: usize, simd: SimdPath) -> Touched {
-    // All colour bands are in use from the first step.
+    // All SH bands are in use from the first step.
     let config = TrainConfig { simd: Chosen(Some(simd)), sh_every: 0, ..TrainConfig::default() };
     let options = RunOptions::new(&config, 1.0);
     let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
@@ -79,7 +79,7 @@ pub fn touched(rows: usize, percent: u32, rounds: usize, simd: SimdPath) -> Touc
     }
     let mut values = Columns::zeros(0, options.sh_degree);
     let mut measured = Vec::new();
-    // The first round gives rows their moments and takes memory from the system, and does not count.
+    // The first round creates the moments and allocates memory; it does not count.
     for _ in 0..=rounds {
         let now = fall_asleep(&mut pages);
         let gathered = time(|| {
@@ -107,7 +107,7 @@ fn fall_asleep(pages: &mut [PinnedPage]) -> u32 {
     SLEEP_STEPS + 1
 }
 
-/// The optimizer's step on the gathered rows, page by page in parallel, as a training step does it.
+/// The optimizer step on the gathered rows, pages in parallel, as in training.
 fn optimize(
     pages: &mut [PinnedPage],
     scene: &PagedScene,

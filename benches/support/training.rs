@@ -1,5 +1,4 @@
-//! What benchmarks that train a scene share: their command lines, the config, turns, and lines of JSON.
-//! Measures nothing itself.
+//! Shared by the benchmarks that train a scene: command lines, config, turns, lines of JSON. Measures nothing itself.
 
 use gsscale::base::error::InputError;
 use gsscale::config::choice::Device;
@@ -14,8 +13,8 @@ use std::ffi::OsString;
 use std::ops::Range;
 use std::process::ExitCode;
 
-/// Runs the benchmark `name` with the arguments after `cargo bench --bench NAME --`, and prints its lines of JSON. Without
-/// arguments the benchmark is skipped, so that a plain `cargo bench` reaches the others.
+/// Runs the benchmark `name` with the arguments after `cargo bench --bench NAME --`, and prints its lines of JSON.
+/// Without arguments the benchmark is skipped, so that a plain `cargo bench` reaches the others.
 pub fn run_with_arguments(
     name: &str,
     start: impl FnOnce(&[OsString], &mut dyn FnMut(&Value)) -> Result<(), TrainError>,
@@ -35,17 +34,17 @@ pub fn run_with_arguments(
     }
 }
 
-/// The checked config of a benchmark that needs a drive, its worker threads started.
+/// The checked config of a benchmark that needs a drive; starts the worker threads.
 ///
 /// # Errors
-/// A key is refused, there is no spill directory, or a device other than the CPU is named.
+/// A key is invalid, the spill directory is missing, or the device is not the CPU.
 pub fn config_with_drive(keys: &TrainOverrides) -> Result<TrainConfig, TrainError> {
     let mut config = TrainConfig::default();
     keys.clone().apply(&mut config);
     config.check()?;
     if !matches!(config.device, Device::Cpu | Device::Gpu(DeviceChoice::Auto)) {
         let problem = format!("this benchmark measures the CPU path, not '{}'", config.device);
-        return Err(InputError::new("--device", problem, "leave it out").into());
+        return Err(InputError::new("--device", problem, "remove the flag").into());
     }
     if !simd_path(&config).is_supported() {
         let problem = format!("this machine cannot run {}", simd_path(&config).name());
@@ -56,14 +55,14 @@ pub fn config_with_drive(keys: &TrainOverrides) -> Result<TrainConfig, TrainErro
         return Err(InputError::new("--spill-dir", "there is no drive to measure", remedy).into());
     }
     if config.threads > 0 {
-        // Fails only where the pool exists already; at the start of main it does not.
+        // Fails only if the pool already exists; main has not started one.
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
     }
     Ok(config)
 }
 
-/// Decodes every photo, so that no contender does it for the others. Where the cache cannot hold all photos, all contenders
-/// decode alike during the steps.
+/// Decodes every photo, so that no contender decodes for the others. If the cache cannot hold all photos, all
+/// contenders decode equally during the steps.
 ///
 /// # Errors
 /// A photo cannot be decoded.
@@ -75,7 +74,7 @@ pub fn decode_all(dataset: &Dataset, targets: &TargetCache, config: &TrainConfig
     Ok(())
 }
 
-/// Lets all contenders do `steps`, in turns of `turn` steps, so that other load on the machine slows all alike.
+/// Runs `steps` for all contenders, in turns of `turn` steps, so that other load on the machine slows all equally.
 ///
 /// # Errors
 /// A step fails.

@@ -1,7 +1,7 @@
-//! gsplat's `DefaultStrategy`: rows whose position in the picture has a large gradient are cloned or split, faint and large
-//! ones are pruned, and opacities are reset now and then.
+//! gsplat's `DefaultStrategy`: rows with a large gradient of their projected mean are duplicated or split, faint rows
+//! and large rows are pruned, and opacities are reset at intervals.
 //!
-//! Invariants: 1. a round never leaves more than `max_gaussians` rows; 2. a cadence of 0 means never.
+//! Invariants: 1. a round never leaves more than `max_gaussians` rows; 2. an interval of 0 means never.
 
 use super::ops::{child_log_scale, sigma};
 use super::stats::{GradHistogram, promised_growth};
@@ -14,23 +14,23 @@ use crate::scene::rows::{Rows, mean_grad2d};
 /// The strategy with its keys.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DefaultStrategy {
-    /// Rows grow whose mean gradient norm (NDC units) is greater.
+    /// A row grows if its mean gradient norm is above this value, NDC units.
     pub grow_grad2d: f32,
-    /// Growing rows up to this size are duplicated, larger ones split; share of the scene scale.
+    /// A growing row up to this size is duplicated, a larger one is split; in units of the scene scale.
     pub grow_scale3d: f32,
-    /// Rows are pruned whose opacity is smaller.
+    /// A row is pruned if its opacity is below this value.
     pub prune_opa: f32,
-    /// Rows are pruned that are larger than this, after the first `reset_every` steps; share of the scene scale.
+    /// A row is pruned if it is larger than this size, after step `reset_every`; in units of the scene scale.
     pub prune_scale3d: f32,
-    /// No round at or before this step.
+    /// Rounds happen only after this step.
     pub refine_start: u32,
-    /// No round, reset or statistics at or after this step.
+    /// Rounds, resets and statistics end before this step.
     pub refine_stop: u32,
-    /// Steps from round to round.
+    /// Steps between rounds.
     pub refine_every: u32,
-    /// Steps from opacity reset to opacity reset.
+    /// Steps between opacity resets.
     pub reset_every: u32,
-    /// The scene never has more rows.
+    /// Most rows of the scene.
     pub max_gaussians: u64,
 }
 
@@ -56,15 +56,15 @@ impl DefaultStrategy {
         step > self.refine_start && step < self.refine_stop && step.is_multiple_of(self.refine_every)
     }
 
-    /// Whether an opacity reset follows this step (after its round). Without pruning by opacity there is none: it would
-    /// reset to nothing, whose logit is no number.
+    /// Whether an opacity reset follows this step (after its round). Resets need pruning by opacity: with `prune_opa` 0
+    /// the cap would be 0, which has no finite logit.
     pub fn is_reset(&self, step: u32) -> bool {
         self.prune_opa > 0.0 && step > 0 && step < self.refine_stop && step.is_multiple_of(self.reset_every)
     }
 
-    /// Thresholds of the round after this step. Every growing row adds one, so the cap leaves room for as many as rows
-    /// are missing to it; where more would grow, the strongest bins of the histogram that fit do. Prunes of the same
-    /// round are not counted on.
+    /// Thresholds of the round after this step. Every growing row adds one row, so at most `max_gaussians - rows` rows
+    /// may grow. If more rows exceed `grow_grad2d`, the threshold rises to the highest bins of the histogram that fit.
+    /// The limit ignores the prunes of the same round.
     pub fn thresholds(&self, step: u32, scene_scale: f32, rows: u64, histogram: &GradHistogram) -> RoundThresholds {
         let room = self.max_gaussians.saturating_sub(rows);
         let was_reset = self.reset_every > 0 && step > self.reset_every;
@@ -98,14 +98,14 @@ impl Strategy for DefaultStrategy {
         events
     }
 
-    /// No round's thresholds are lower than the keys.
+    /// The thresholds of a round are never below the keys.
     fn split_limits(&self, scene_scale: f32) -> SplitLimits {
         SplitLimits { grow_grad2d: self.grow_grad2d, split_scale: self.grow_scale3d * scene_scale }
     }
 }
 
 impl Round for RoundThresholds {
-    /// Growth first, then pruning of everything that is there afterwards.
+    /// Growth first, then pruning of old and new rows.
     fn fate(&self, row: &RowFacts) -> Fate {
         let is_faint = sigmoid(row.opacity) < self.prune_opacity;
         let is_pruned = |log_scale: f32| is_faint || sigma(log_scale) > self.prune_scale;
@@ -125,8 +125,8 @@ impl Round for RoundThresholds {
         means.fold(false, |any, mean| any | (mean > self.grow_grad2d))
     }
 
-    /// The slack is for the roundings of the sigmoid, some 4e-7.
-    fn spares(&self, extremes: &Extremes) -> bool {
+    /// The slack of 1e-5 covers the rounding of the sigmoid, some 4e-7.
+    fn keeps_all(&self, extremes: &Extremes) -> bool {
         sigmoid(extremes.lowest_opacity) >= self.prune_opacity * (1.0 + 1e-5) && extremes.sigma_max <= self.prune_scale
     }
 
@@ -175,7 +175,7 @@ mod tests {
         assert_eq!(of(0.05, 1.1, solid), Fate::Duplicate { pruned: false });
         assert_eq!(of(0.05, 1.1, faint), Fate::Duplicate { pruned: true });
         assert_eq!(of(0.2, 1.1, solid), Fate::Split { children_pruned: false });
-        // 0.7 is too large to stay, 0.7 / 1.6 is not.
+        // 0.7 exceeds the prune limit of 0.5; a child of 0.7 / 1.6 does not.
         assert_eq!(of(0.7, 1.1, solid), Fate::Split { children_pruned: false });
         assert_eq!(of(0.7, 0.0, solid), Fate::Prune);
         assert_eq!(of(0.9, 1.1, solid), Fate::Split { children_pruned: true });

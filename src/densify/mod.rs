@@ -1,6 +1,5 @@
-//! What changes the number of Gaussians: strategies ([`strategy`]; gsplat's: [`mod@default`]), the statistics that they decide
-//! by ([`stats`]), the edits that their rounds make to rows ([`ops`]), and applying logged events, late or on time
-//! ([`replay`]).
+//! Densification: strategies ([`strategy`]; gsplat's strategy: [`mod@default`]), the statistics for their decisions
+//! ([`stats`]), the edits of a round ([`ops`]), and the application of logged events, late or on time ([`replay`]).
 
 pub mod default;
 pub mod ops;

@@ -1,13 +1,13 @@
-//! Edits that rounds and resets make to rows: growing, pruning, resetting, on values, moments, stamps, identities and
-//! statistics together. What becomes of a row is decided by the [`Round`].
+//! The edits of rounds and resets: growing, pruning and resetting of values, moments, stamps, uids and statistics.
 //!
-//! Rows are judged as they are at the event's time. A row that is neither grown, pruned nor reset is not rewritten:
-//! it goes on from its stored state. So applying an event late gives what applying it on time would have given, as a
-//! set of (uid, bits).
+//! Not here: the decision about each row ([`Round`]).
 //!
-//! Invariants: 1. new rows have zero moments and contain the steps of the event; 2. identities of new rows and their
-//! random draws depend on (seed, parent's uid, event, child) only; 3. rows that stay keep their order, new rows follow
-//! in the order of their parents.
+//! An event acts on the values of the event's own step. A row that is neither grown, pruned nor reset keeps its stored
+//! state. Applying an event late therefore gives the same result as on time, as a set of (uid, bits).
+//!
+//! Invariants: 1. new rows have zero moments and the stamp of the event; 2. uids and random draws of new rows depend on
+//! (seed, parent's uid, event, child) only; 3. surviving rows keep their order, and new rows follow in the order of
+//! their parents.
 
 use super::strategy::{Fate, Round, RowFacts};
 use crate::base::math::{exp32, logit};
@@ -18,37 +18,37 @@ use crate::scene::rows::{BLOCK_LANES, RowBlock, Rows, RowsMut, RowsNow, first_la
 use crate::scene::state::SceneState;
 use rayon::prelude::*;
 
-/// Rows of one unit of parallel work.
+/// Rows per unit of parallel work.
 const ROWS_PER_TASK: usize = 4096;
 /// Children of a split are smaller than their parent by this factor.
 const SPLIT_SHRINK: f64 = 1.6;
 
-/// What a round did.
+/// The effect of a round in rows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RoundCounts {
-    /// Rows that got a copy.
+    /// Duplicated rows.
     pub duplicated: usize,
-    /// Rows replaced by two children.
+    /// Rows that were replaced by two children.
     pub split: usize,
-    /// Rows pruned, new ones included.
+    /// Pruned rows, including new rows.
     pub pruned: usize,
 }
 
-/// Edits that a round makes to some rows.
+/// The edits of a round to the rows of a view.
 #[derive(Debug, Clone)]
 pub struct RoundEdits {
     /// Rows to remove, numbered in the view, ascending.
     pub removed: Vec<u32>,
     /// Rows to append.
     pub added: SceneState,
-    /// What they amount to.
+    /// The sums of both.
     pub counts: RoundCounts,
 }
 
-/// Decides a round for the rows of a view, reading only.
+/// Computes the edits of a round to the rows of a view; changes no row.
 pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, seed: u64, event: u64) -> RoundEdits {
     let mut removed = Vec::new();
-    let mut born = NewRows { columns: Columns::zeros(0, rows.columns.sh_degree), uid: Vec::new() };
+    let mut new_rows = NewRows { columns: Columns::zeros(0, rows.columns.sh_degree), uid: Vec::new() };
     let mut counts = RoundCounts::default();
     let mut block = [0.0; BLOCK_LANES];
     let (mut log_scales, mut opacities) = (vec![0.0; rows.rows()], vec![0.0; rows.rows()]);
@@ -70,10 +70,10 @@ pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, se
             }
             Fate::Duplicate { pruned: false } => {
                 counts.duplicated += 1;
-                born.push(child_uid(rows.uid[row], event, 0), &block);
+                new_rows.push(child_uid(rows.uid[row], event, 0), &block);
             }
             Fate::Duplicate { pruned: true } => {
-                // Both copies go at once.
+                // Row and copy are both pruned.
                 counts.duplicated += 1;
                 counts.pruned += 2;
                 removed.push(row as u32);
@@ -87,15 +87,15 @@ pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, se
                 }
                 for child in 0..2 {
                     let uid = child_uid(rows.uid[row], event, child);
-                    born.push(uid, &split_child(&block, seed, uid, event));
+                    new_rows.push(uid, &split_child(&block, seed, uid, event));
                 }
             }
         }
     }
-    RoundEdits { removed, added: born.into_state(values.now()), counts }
+    RoundEdits { removed, added: new_rows.into_state(values.now()), counts }
 }
 
-/// Applies a round to a whole table and clears its statistics.
+/// Applies a round to a table and clears the statistics.
 pub fn apply_round<V: RowsNow>(
     values: &V,
     state: &mut SceneState,
@@ -109,7 +109,7 @@ pub fn apply_round<V: RowsNow>(
     apply_edits(state, &edits)
 }
 
-/// Makes the edits of views that cover a whole table, given with the first row of each, and clears its statistics.
+/// Applies edits, each with the first row of its view, to a table that the views cover. Clears the statistics.
 pub fn apply_edits(state: &mut SceneState, edits: &[(usize, RoundEdits)]) -> RoundCounts {
     let mut removed = Vec::new();
     let mut counts = RoundCounts::default();
@@ -120,7 +120,7 @@ pub fn apply_edits(state: &mut SceneState, edits: &[(usize, RoundEdits)]) -> Rou
         counts.pruned += edit.counts.pruned;
     }
     state.remove(&removed);
-    // Where this fails, appending fails too, with the allocator's own message.
+    // If the reservation fails, `append` fails too, with the allocator's own message.
     let _ = state.try_reserve_exact(edits.iter().map(|(_, edit)| edit.added.rows()).sum());
     edits.iter().for_each(|(_, edit)| state.append(&edit.added));
     state.grad2d.fill(0.0);
@@ -128,14 +128,14 @@ pub fn apply_edits(state: &mut SceneState, edits: &[(usize, RoundEdits)]) -> Rou
     counts
 }
 
-/// Applies an opacity reset to a whole table; returns the number of rows rewritten.
+/// Applies an opacity reset to a table; returns the number of rewritten rows.
 pub fn reset_opacities<V: RowsNow>(values: &V, state: &mut SceneState, max_opacity: f32) -> usize {
     let mut chunks = state.chunks_mut(ROWS_PER_TASK);
     chunks.par_iter_mut().map(|rows| reset_opacity_rows(values, rows, max_opacity)).sum()
 }
 
-/// Caps the opacities of the rows of a view and clears the moments of their opacities. A row is left alone when that
-/// changes nothing: opacity at or below the cap, no moments (never drawn, just made, or reset before).
+/// Caps the opacities of the rows of a view and clears the moments of the opacities. A row whose opacity is at most the
+/// cap and has no moments (never drawn, new, or reset before) is not rewritten.
 pub fn reset_opacity_rows<V: RowsNow>(values: &V, rows: &mut RowsMut<'_>, max_opacity: f32) -> usize {
     let cap = logit(max_opacity);
     let mut rewritten = 0;
@@ -153,12 +153,12 @@ pub fn reset_opacity_rows<V: RowsNow>(values: &V, rows: &mut RowsMut<'_>, max_op
     rewritten
 }
 
-/// Identity of a new row.
+/// The uid of a new row.
 pub fn child_uid(parent: u64, event: u64, child: u64) -> u64 {
     hash64(&[parent, event, child])
 }
 
-/// A child of a split: drawn from the parent as a Gaussian, smaller, otherwise the same.
+/// A child of a split: the mean is drawn from the parent's Gaussian, the scales shrink, other values are copied.
 fn split_child(parent: &RowBlock, seed: u64, uid: u64, event: u64) -> RowBlock {
     let mut child = *parent;
     let (scales, quats) = (first_lane(Column::Scales), first_lane(Column::Quats));
@@ -179,12 +179,12 @@ fn split_child(parent: &RowBlock, seed: u64, uid: u64, event: u64) -> RowBlock {
     child
 }
 
-/// Largest log-scale of a split's child, rounded as the child's own scales are.
+/// Log-scale of a split's child, with the rounding of [`split_child`].
 pub(super) fn child_log_scale(parent: f32) -> f32 {
     (f64::from(parent) - libm::log(SPLIT_SHRINK)) as f32
 }
 
-/// Rotation matrix of a quaternion w x y z of any length; a zero quaternion counts as no rotation.
+/// Rotation matrix of a quaternion (w, x, y, z) of any length; a zero quaternion gives the identity.
 fn rotation(q: [f64; 4]) -> [[f64; 3]; 3] {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     let [w, x, y, z] = if length > 0.0 { q.map(|c| c / length) } else { [1.0, 0.0, 0.0, 0.0] };
@@ -195,7 +195,7 @@ fn rotation(q: [f64; 4]) -> [[f64; 3]; 3] {
     ]
 }
 
-/// Rows being made.
+/// New rows of a round.
 struct NewRows {
     columns: Columns,
     uid: Vec<u64>,
@@ -217,7 +217,7 @@ impl NewRows {
     }
 }
 
-/// Largest standard deviation from the largest log-scale, as the decisions compare it.
+/// Standard deviation of a log-scale, with the rounding that the decisions use.
 pub(super) fn sigma(log_scale: f32) -> f32 {
     exp32(log_scale)
 }
@@ -239,13 +239,13 @@ mod tests {
             let child = split_child(&parent, 1, uid, 3);
             let z = [f64::from(child[1]), f64::from(child[0]) / 0.1, f64::from(child[2]) / 0.01];
             let norm2 = z.iter().map(|x| x * x).sum::<f64>();
-            // The bounds of pages count on 3.33; the slack is for f32 positions and the rounded log-scales above.
+            // The bounds of pages assume 3.33; the slack covers f32 positions and the rounded log-scales above.
             assert!(norm2 <= 3.33 * 3.33 * (1.0 + 1e-5));
             (0..3).for_each(|i| sums[i] += z[i] * z[i]);
             assert_eq!(child[scales + 1], child_log_scale(parent[scales + 1]));
         }
         for sum in sums {
-            // The cut takes 3.3 % of the variance; five standard errors of sqrt(2 / n) are 5 %.
+            // Cutting the draws removes 3.3 % of the variance; five standard errors of sqrt(2 / n) are 5 %.
             assert!((sum / n as f64 - 0.967).abs() < 0.05, "{sum}");
         }
     }

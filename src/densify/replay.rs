@@ -1,12 +1,13 @@
-//! Events on rows: one at a time on a table, or all that a page missed since it was last touched.
+//! Applies logged events to rows: one event to a table, or all pending events to a page.
 //!
-//! Each event acts on the rows' values of its own step, so replaying late gives what applying on time would have
-//! given, as a set of (uid, bits). A page is copied only when its rows change in number or in width; everything else is
-//! edited in place. When pages are acquired, and where their parts are stored, is not decided here.
+//! Not here: when pages are pinned, and where the parts of a split page are stored.
+//!
+//! Each event acts on the values of its own step, so a late replay gives the same result as on time, as a set of (uid,
+//! bits). A page is copied only if the number of its rows or their width changes; other edits are in place.
 //!
 //! Invariants: 1. the outcome is a function of the page's rows, the log, the seed and the page capacity; 2. a page that
-//! outgrew its capacity is cut once, after the last event, by its rows' positions at that event's time: rows grow in
-//! at most one of the rounds that a page missed, so it has at most doubled by then.
+//! outgrew its capacity is split once, after the last event, by the positions of its rows at that event. A row grows in
+//! at most one of the rounds that a page missed, so a page has at most doubled by then.
 
 use super::ops::{self, RoundCounts, RoundEdits};
 use super::strategy::{Effect, Extremes, Round, effect_of};
@@ -21,17 +22,17 @@ use crate::scene::rows::{Rows, RowsMut, RowsNow};
 use crate::scene::state::SceneState;
 use std::sync::OnceLock;
 
-/// What an event changed.
+/// The effect of an event.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct EventOutcome {
-    /// What a densification round did.
+    /// The effect of a densification round.
     pub round: RoundCounts,
     /// Rows that an opacity reset rewrote.
     pub reset_rows: usize,
 }
 
-/// Applies event number `index` of the log to all rows of a table, the whole scene or one page of it, when it happens and
-/// without shortcuts: what [`PendingEvents`] must amount to.
+/// Applies event number `index` of the log to all rows of a table (the scene or one page) on time and without
+/// shortcuts. [`PendingEvents`] must give the same result.
 pub fn apply_event(
     state: &mut SceneState,
     adam: &DeferredAdam,
@@ -52,35 +53,35 @@ pub fn apply_event(
     outcome
 }
 
-/// What one round did to a page.
+/// The effect of one round on a page.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PageRound {
     /// Index of the event.
     pub event: usize,
-    /// Rows after it, less rows before.
+    /// Rows after the round minus rows before.
     pub rows_change: i64,
-    /// Rows that the round's threshold had promised to this page ([`super::stats::GradHistogram::promised`]).
+    /// Growth of this page that [`super::stats::GradHistogram::promised`] counted when the round was logged.
     pub promised: u64,
-    /// What it did.
+    /// Numbers of edited rows.
     pub counts: RoundCounts,
 }
 
-/// What became of a page.
+/// The effect of a replay on a page.
 #[derive(Debug, Clone, PartialEq)]
 pub enum PageEdit {
-    /// No byte changed: the page stays clean.
+    /// No byte changed; the page stays clean.
     Unchanged,
-    /// The rows given were edited where they are.
+    /// The rows were edited in place.
     InPlace,
-    /// The page is to be rewritten as these, ordered by name: the page itself, possibly without rows, or its parts. The
-    /// rows given are not to be used any more.
+    /// These pages replace the page, ordered by name: the page itself, possibly without rows, or its parts. The rows in
+    /// the frame are obsolete.
     Replaced(Vec<(PageId, SceneState)>),
 }
 
 /// Outcome of a replay.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Replay {
-    /// What became of the page.
+    /// The effect on the page.
     pub edit: PageEdit,
     /// The rounds among the events, in order.
     pub rounds: Vec<PageRound>,
@@ -88,29 +89,29 @@ pub struct Replay {
     pub reset_rows: usize,
 }
 
-/// The log of a run with what replaying it needs. Cheap to make for every step; shared by the pages of one.
+/// The event log of a run with the inputs of a replay. Cheap to create for every step; the pages of a step share one.
 pub struct PendingEvents<'a> {
     adam: &'a DeferredAdam,
     seed: u64,
     page_rows: usize,
     events: &'a [Event],
-    /// The optimizer at the time of each event, once somebody asked for it.
+    /// The optimizer at the step of each event, created on first use.
     at: Vec<OnceLock<Box<AdamNow<'a>>>>,
 }
 
 impl<'a> PendingEvents<'a> {
-    /// The events so far, for pages of a capacity.
+    /// The events so far, for pages with a capacity of `page_rows` rows.
     pub fn new(adam: &'a DeferredAdam, seed: u64, page_rows: usize, log: &'a EventLog) -> Self {
         let events = log.events();
         PendingEvents { adam, seed, page_rows, events, at: events.iter().map(|_| OnceLock::new()).collect() }
     }
 
-    /// Number of events: what a page has applied after a replay.
+    /// Number of events, which is the number that a page has applied after a replay.
     pub fn len(&self) -> usize {
         self.events.len()
     }
 
-    /// Whether nothing has happened yet.
+    /// Whether the log has no event yet.
     pub fn is_empty(&self) -> bool {
         self.events.is_empty()
     }
@@ -119,10 +120,10 @@ impl<'a> PendingEvents<'a> {
         self.at[index].get_or_init(|| Box::new(self.adam.at(self.events[index].now())))
     }
 
-    /// Applies what page `id` missed to its rows, `applied` being the number of events that they contain.
+    /// Applies the pending events of page `id` to its rows, which have applied the first `applied` events.
     ///
     /// # Errors
-    /// The page must be split and cannot be.
+    /// The page outgrew its capacity and cannot be split.
     pub fn apply(&self, id: PageId, applied: usize, rows: &mut RowsMut<'_>) -> Result<Replay, SplitTooDeep> {
         let mut replay = Replay::default();
         let mut edited = EditedRows { page: rows, table: None };
@@ -133,8 +134,8 @@ impl<'a> PendingEvents<'a> {
         Ok(replay)
     }
 
-    /// Applies the events from number `applied` on to a table that nobody splits or stores: rows as evaluation and
-    /// export see them.
+    /// Applies the events from number `applied` on to a table that is neither split nor stored, for evaluation and
+    /// export.
     pub fn apply_to_table(&self, applied: usize, state: &mut SceneState) {
         let mut no_page = SceneState::default();
         let mut edited = EditedRows { page: &mut no_page.view_mut(), table: Some(std::mem::take(state)) };
@@ -144,7 +145,7 @@ impl<'a> PendingEvents<'a> {
 
     /// Applies the events from number `from` on.
     fn replay(&self, from: usize, rows: &mut EditedRows<'_, '_>, replay: &mut Replay) {
-        // Of rows that were not rewritten since.
+        // Valid until rows are rewritten.
         let mut extremes = None;
         for index in from..self.events.len() {
             match effect_of(&self.events[index].kind) {
@@ -152,7 +153,7 @@ impl<'a> PendingEvents<'a> {
                 Effect::ResetOpacity { max_opacity } => {
                     let reset_rows = rows.reset_opacities(self.at(index), max_opacity);
                     replay.reset_rows += reset_rows;
-                    replay.touch(reset_rows > 0);
+                    replay.mark_edited(reset_rows > 0);
                     extremes = None;
                 }
                 Effect::Round(round) => {
@@ -162,14 +163,14 @@ impl<'a> PendingEvents<'a> {
                         ops::apply_edits(rows.table(), &[(0, edits)]);
                         extremes = None;
                     } else {
-                        replay.touch(rows.clear_statistics());
+                        replay.mark_edited(rows.clear_statistics());
                     }
                 }
             }
         }
     }
 
-    /// What a round does to rows; no edits when that is nothing, statistics aside.
+    /// The effect of a round on rows; no edits if the round changes statistics only.
     fn plan(
         &self,
         index: usize,
@@ -180,7 +181,7 @@ impl<'a> PendingEvents<'a> {
         let promised = round.promised_rows(rows);
         let mut done = PageRound { event: index, rows_change: 0, promised, counts: RoundCounts::default() };
         let nothing_grows = promised == 0 && !round.may_grow(rows);
-        if nothing_grows && round.spares(extremes.get_or_insert_with(|| self.extremes(rows))) {
+        if nothing_grows && round.keeps_all(extremes.get_or_insert_with(|| self.extremes(rows))) {
             return (done, None);
         }
         let edits = ops::plan_round(self.at(index), rows, round, self.seed, index as u64);
@@ -197,7 +198,7 @@ impl<'a> PendingEvents<'a> {
         }
     }
 
-    /// The table as pages within the capacity, cut by the positions after the last event.
+    /// Splits the table into pages within the capacity, by the positions after the last event.
     fn split(&self, id: PageId, state: SceneState) -> Result<Vec<(PageId, SceneState)>, SplitTooDeep> {
         if state.rows() <= self.page_rows {
             return Ok(vec![(id, state)]);
@@ -211,7 +212,7 @@ impl<'a> PendingEvents<'a> {
 }
 
 impl Replay {
-    fn touch(&mut self, is_changed: bool) {
+    fn mark_edited(&mut self, is_changed: bool) {
         if is_changed {
             self.edit = PageEdit::InPlace;
         }
@@ -224,11 +225,11 @@ impl Default for Replay {
     }
 }
 
-/// Rows that events are applied to.
+/// The rows of a replay.
 struct EditedRows<'a, 'r> {
-    /// The rows of a page, edited where they are while there is no table.
+    /// The rows of a page, edited in place until `table` exists.
     page: &'a mut RowsMut<'r>,
-    /// The rows from when their number or their width changes.
+    /// A copy of the rows, from the first event that changes their number or width.
     table: Option<SceneState>,
 }
 
@@ -237,7 +238,7 @@ impl EditedRows<'_, '_> {
         self.table.as_ref().map_or_else(|| self.page.as_ref(), SceneState::view)
     }
 
-    /// The rows as a table.
+    /// The rows as a table, copied on first use.
     fn table(&mut self) -> &mut SceneState {
         self.table.get_or_insert_with(|| read_page(&self.page.as_ref()))
     }
@@ -248,7 +249,7 @@ impl EditedRows<'_, '_> {
         }
     }
 
-    /// Returns the number of rows that were rewritten.
+    /// Returns the number of rewritten rows.
     fn reset_opacities(&mut self, values: &AdamNow<'_>, max_opacity: f32) -> usize {
         match &mut self.table {
             Some(state) => ops::reset_opacities(values, state, max_opacity),
@@ -256,7 +257,7 @@ impl EditedRows<'_, '_> {
         }
     }
 
-    /// Returns whether there were any.
+    /// Returns whether a row had statistics.
     fn clear_statistics(&mut self) -> bool {
         match &mut self.table {
             Some(state) => clear_statistics(&mut state.view_mut()),
@@ -265,10 +266,10 @@ impl EditedRows<'_, '_> {
     }
 }
 
-/// Forgets the statistics of rows; returns whether there were any.
+/// Clears the statistics of rows; returns whether a row had statistics.
 fn clear_statistics(rows: &mut RowsMut<'_>) -> bool {
-    let had = rows.count.iter().any(|&n| n != 0) || rows.grad2d.iter().any(|&g| g.to_bits() != 0);
+    let had_statistics = rows.count.iter().any(|&n| n != 0) || rows.grad2d.iter().any(|&g| g.to_bits() != 0);
     rows.grad2d.fill(0.0);
     rows.count.fill(0);
-    had
+    had_statistics
 }

@@ -1,17 +1,17 @@
-//! What is known of rows since the last round: how strongly the loss pulls their position on the screen.
+//! Statistics of rows since the last round: sums of the gradient norms of projected means, and their histogram.
 //!
-//! Invariants: 1. only drawn rows change; 2. sums are in NDC units, so thresholds do not depend on the image size;
-//! 3. the histogram counts every row that has statistics, exactly once, in the bin of its mean: integers only, so the
-//! order in which rows were touched leaves no trace in it; 4. no counter wraps: a row that is taken out of an empty bin, as
-//! only statistics that do not belong to the histogram can be, is counted as uncounted ([`GradHistogram::uncounted`]).
+//! Invariants: 1. only drawn rows change; 2. sums are in NDC units, so thresholds do not depend on the image size; 3.
+//! the histogram counts every row with statistics exactly once, in the bin of its mean, with integer counters, so the
+//! order of updates does not matter; 4. no counter wraps: removing a row from an empty bin, which happens only for
+//! statistics of another histogram, adds to [`GradHistogram::uncounted`].
 
 pub use crate::scene::rows::mean_grad2d;
 use crate::scene::rows::{Rows, RowsMut};
 
-/// Bins: one per value of the upper 16 bits of a non-negative f32, so 128 to every doubling.
+/// Bins: one per value of the upper 16 bits of a non-negative f32, so 128 per doubling.
 const BINS: usize = 1 << 15;
 
-/// Number of rows with statistics by their mean gradient norm. 128 KiB.
+/// Number of rows by mean gradient norm. 128 KiB.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GradHistogram {
     bins: Vec<u32>,
@@ -25,12 +25,12 @@ impl Default for GradHistogram {
 }
 
 impl GradHistogram {
-    /// The bins that are not empty, ascending, with their rows: for a checkpoint.
+    /// The non-empty bins with their row counts, ascending, for a checkpoint.
     pub fn filled(&self) -> Vec<(u16, u32)> {
         self.bins.iter().zip(0..).filter(|(rows, _)| **rows > 0).map(|(&rows, bin)| (bin, rows)).collect()
     }
 
-    /// From what [`GradHistogram::filled`] gave; `None` for a bin that does not exist.
+    /// The histogram with these bins of [`GradHistogram::filled`]; `None` if a bin number is out of range.
     pub fn from_filled(filled: &[(u16, u32)]) -> Option<GradHistogram> {
         let mut histogram = GradHistogram::default();
         for &(bin, rows) in filled {
@@ -44,14 +44,14 @@ impl GradHistogram {
         self.bins[bin(mean)] += 1;
     }
 
-    /// Counts the rows of a view that have statistics.
+    /// Adds the rows of a view that have statistics.
     pub fn add_rows(&mut self, rows: &Rows<'_>) {
         for (&grad2d, &count) in rows.grad2d.iter().zip(rows.count).filter(|(_, count)| **count > 0) {
             self.add(mean_grad2d(grad2d, count));
         }
     }
 
-    /// Takes a row with this mean out again.
+    /// Removes a row with this mean.
     pub fn remove(&mut self, mean: f32) {
         let rows = &mut self.bins[bin(mean)];
         match rows.checked_sub(1) {
@@ -60,31 +60,30 @@ impl GradHistogram {
         }
     }
 
-    /// Rows that were taken out without having been counted: 0, unless rows have statistics that this histogram was not
-    /// made of.
+    /// Removals from empty bins: 0, unless the rows have statistics that were never added to this histogram.
     pub fn uncounted(&self) -> u64 {
         self.uncounted
     }
 
-    /// Forgets all rows; after a round.
+    /// Removes all rows, after a round.
     pub fn clear(&mut self) {
         self.bins.fill(0);
     }
 
-    /// Rows counted.
+    /// Number of rows.
     pub fn rows(&self) -> u64 {
         self.bins.iter().map(|&n| u64::from(n)).sum()
     }
 
-    /// The smallest threshold, not below `least`, that at most `room` rows exceed, in whole bins: either `least`
-    /// itself, or just below the edge of a bin, or infinity.
+    /// The smallest threshold of at least `least` that at most `room` rows exceed, in whole bins: `least` itself, just
+    /// below the edge of a bin, or infinity.
     pub fn threshold(&self, least: f32, room: u64) -> f32 {
         let first = bin(least);
         let mut above = 0u64;
         for b in (first..BINS).rev() {
             above += u64::from(self.bins[b]);
             if above > room {
-                // Bin b does not fit any more: growth starts with the bin after it.
+                // Bin b exceeds the room, so growth starts with bin b + 1.
                 let edge = f32::from_bits((b as u32 + 1) << 16);
                 return if edge.is_finite() { edge.next_down() } else { f32::INFINITY };
             }
@@ -92,14 +91,14 @@ impl GradHistogram {
         least
     }
 
-    /// Rows that may grow at this threshold, one of [`GradHistogram::threshold`]'s: whole bins, so at least those that
-    /// exceed it. Adds up to the [`promised_growth`] of all pages.
+    /// Upper bound of the rows above a threshold from [`GradHistogram::threshold`]: whole bins. Equals the sum of
+    /// [`promised_growth`] over all pages.
     pub fn promised(&self, threshold: f32) -> u64 {
         self.bins[bin(threshold.next_up())..].iter().map(|&n| u64::from(n)).sum()
     }
 }
 
-/// Rows of a view that [`GradHistogram::promised`] counted, when their statistics are still those of the round.
+/// The rows of a view that [`GradHistogram::promised`] counted, if their statistics are unchanged since the round.
 pub fn promised_growth(rows: &Rows<'_>, threshold: f32) -> u64 {
     let first = bin(threshold.next_up());
     let is_counted = |&(&grad2d, &count): &(&f32, &u32)| count > 0 && bin(mean_grad2d(grad2d, count)) >= first;
@@ -107,13 +106,13 @@ pub fn promised_growth(rows: &Rows<'_>, threshold: f32) -> u64 {
 }
 
 fn bin(mean: f32) -> usize {
-    // Negative zero, negative numbers and NaN do not occur in sums of norms; they would count as 0.
+    // Sums of norms are never -0, negative or NaN; such values would count as 0.
     if mean > 0.0 { (mean.to_bits() >> 16) as usize } else { 0 }
 }
 
-/// Adds the gradients of one view. `rows` ascends and is numbered in the table that the view was cut from; `v_means2d`
-/// (loss with respect to the pixel position, pixel units) and `radii` have one entry per listed row; rows with a zero
-/// radius were not drawn. Gradients that are not finite are left out. Returns the number of rows that changed.
+/// Adds the gradients of one view. `rows` lists rows of the table that contains `view`, ascending. `v_means2d`
+/// (gradient of the loss with respect to the projected mean, pixel units) and `radii` have one entry per listed row.
+/// Rows with a zero radius and gradients that are not finite are ignored. Returns the number of rows that changed.
 pub fn accumulate(
     view: &mut RowsMut<'_>,
     rows: &[u32],
@@ -194,7 +193,7 @@ mod tests {
             let threshold = histogram.threshold(2e-4, room);
             let above = means.iter().filter(|&&m| m > threshold).count() as u64;
             assert!(above <= room);
-            // Bins are under 1 % wide: up to 10 of these means share one.
+            // A bin is less than 1 % wide: up to 10 of these means share one bin.
             assert!(above + 10 >= room.min(979), "{above} of {room}");
             assert!(threshold <= last);
             last = threshold;

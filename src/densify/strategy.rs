@@ -1,15 +1,18 @@
-//! What a densification strategy is: a [`Strategy`] says what steps collect and which events follow them; a [`Round`], which
-//! the log keeps, says what becomes of a row.
+//! The interface of densification strategies. A [`Strategy`] decides what steps collect and which events follow a step.
+//! A [`Round`] is a logged event that decides the [`Fate`] of each row.
 //!
-//! A round is not asked through the strategy of the run: pages apply a round late, by then perhaps under other keys, and must
-//! do what it would have done on time. So everything that a round decides by stands in its event.
+//! A round does not depend on the strategy of the run: a page may apply a round late, when the config has changed, and
+//! must get the result of applying the round on time. The event therefore holds every value that the decision needs.
 //!
-//! To add a strategy: a file beside [`super::default`] with its keys as a struct that implements [`Strategy`]; a name in
-//! [`StrategyName`]; its keys in `config/file.rs`, and their way into the struct in `config/limits.rs`. If it decides by other things than [`crate::scene::events::RoundThresholds`] holds, its round is a
-//! kind of event in `scene/events.rs` that implements [`Round`] and that [`effect_of`] names.
+//! To add a strategy:
+//! 1. add a file beside [`super::default`] with a struct that holds the keys and implements [`Strategy`];
+//! 2. add a name to [`StrategyName`];
+//! 3. add the keys to `config/file.rs` and pass them to the struct in `config/limits.rs`;
+//! 4. if a round needs values beyond [`crate::scene::events::RoundThresholds`], add an event kind to `scene/events.rs`,
+//!    implement [`Round`] for it and name it in [`effect_of`].
 //!
-//! Invariants: 1. strategies and rounds are functions of their arguments, without side effects; 2. the same event decides the
-//! same for a row whenever it is applied.
+//! Invariants: 1. strategies and rounds are functions of their arguments, without side effects; 2. an event gives a row
+//! the same fate whenever it is applied.
 
 use super::stats::{GradHistogram, accumulate};
 use crate::optim::bounds::SplitLimits;
@@ -43,48 +46,49 @@ impl StrategyName {
         [StrategyName::Default, StrategyName::None].into_iter().find(|strategy| strategy.name() == name)
     }
 
-    /// Whether a scene may come to have more Gaussians than it begins with.
+    /// Whether the number of Gaussians may grow.
     pub fn grows(self) -> bool {
         self != StrategyName::None
     }
 }
 
-/// Rows of a view that a step drew, with what the renderer knows of them.
+/// The rows of a step's working set, with their gradients and radii.
 #[derive(Debug, Clone, Copy)]
 pub struct DrawnRows<'a> {
-    /// The rows, ascending, numbered as the view's.
+    /// Row numbers in the table of the view, ascending.
     pub rows: &'a [u32],
-    /// For each, the gradient of the loss with respect to its position in the picture, pixel units.
+    /// Gradient of the loss with respect to each row's projected mean, pixel units.
     pub v_means2d: &'a [[f32; 2]],
-    /// For each, its radii in the picture, pixels; a row with a zero radius was not drawn.
+    /// Radii of each row's footprint, pixels; a row with a zero radius was not drawn.
     pub radii: &'a [[u32; 2]],
     /// Width and height of the picture, pixels.
     pub image_size: [u32; 2],
 }
 
-/// When a scene densifies, and what steps collect for it.
+/// A densification strategy: when rounds happen, and which statistics steps collect.
 pub trait Strategy: fmt::Debug + Send + Sync {
-    /// Whether the scene may come to have more Gaussians than it begins with.
+    /// Whether the number of Gaussians may grow.
     fn grows(&self) -> bool;
 
     /// Whether this step collects statistics.
     fn collects(&self, step: u32) -> bool;
 
-    /// Adds what a step drew to the statistics of rows; returns the number of rows that changed. Every row with statistics
-    /// counts in the histogram.
+    /// Adds the gradients of a step to the statistics of the rows and updates the histogram, which counts every row
+    /// that has statistics. Returns the number of rows that changed.
     fn collect(&self, view: &mut RowsMut<'_>, drawn: &DrawnRows<'_>, histogram: &mut GradHistogram) -> usize {
         accumulate(view, drawn.rows, drawn.v_means2d, drawn.radii, drawn.image_size, histogram)
     }
 
-    /// The events that follow this step, in order. `scene_scale` is in local units, `rows` is an upper bound of the rows
-    /// before the first of these events, `histogram` holds their statistics. The caller clears the histogram after a round.
+    /// The events that follow this step, in order. `scene_scale` is in local units. `rows` is an upper bound of the
+    /// number of rows before the first event. `histogram` counts the rows by statistics; the caller clears it after a
+    /// round.
     fn events_after(&self, step: u32, scene_scale: f32, rows: u64, histogram: &GradHistogram) -> Vec<EventKind>;
 
-    /// What bounds of pages must count on: no round splits a row that these leave out.
+    /// Limits for the bounds of pages: a round splits only rows within these limits.
     fn split_limits(&self, scene_scale: f32) -> SplitLimits;
 }
 
-/// Densifies never.
+/// The strategy that never densifies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NoStrategy;
 
@@ -106,10 +110,10 @@ impl Strategy for NoStrategy {
     }
 }
 
-/// What a round knows of a row at the event's time.
+/// The values of a row at the time of the event, as input of [`Round::fate`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RowFacts {
-    /// Mean of the gradient norms collected since the last round, NDC units.
+    /// Mean of the gradient norms since the last round, NDC units.
     pub mean_grad2d: f32,
     /// Largest log-scale.
     pub log_scale: f32,
@@ -117,72 +121,72 @@ pub struct RowFacts {
     pub opacity: f32,
 }
 
-/// Bounds of the rows of a page at any later step, if nobody touches them.
+/// Bounds over the rows of a page, for any later step until a step touches the page.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Extremes {
-    /// Lowest logit of an opacity.
+    /// Lower bound of the opacity logits.
     pub lowest_opacity: f32,
-    /// Largest standard deviation.
+    /// Upper bound of the standard deviations.
     pub sigma_max: f32,
 }
 
-/// What a round does with a row.
+/// The decision of a round about a row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fate {
-    /// Nothing.
+    /// The row stays unchanged.
     Keep,
-    /// Removed.
+    /// The row is removed.
     Prune,
-    /// Gets a copy of itself; or, when what it is would be pruned, both go.
+    /// The row is duplicated.
     Duplicate {
-        /// Whether the row and its copy are pruned at once.
+        /// Whether the same round prunes both copies.
         pruned: bool,
     },
-    /// Replaced by two smaller children; or by nothing, when those would be pruned.
+    /// Two smaller children replace the row.
     Split {
-        /// Whether the children are pruned at once.
+        /// Whether the same round prunes both children.
         children_pruned: bool,
     },
 }
 
-/// A logged round: what becomes of each row.
+/// A logged round.
 pub trait Round: Sync {
-    /// What becomes of a row.
+    /// The fate of a row.
     fn fate(&self, row: &RowFacts) -> Fate;
 
-    /// Whether some row may grow. False only where [`Round::fate`] makes no row out of any of these.
+    /// Whether a row may be duplicated or split. False only if [`Round::fate`] duplicates and splits no row of `rows`.
     fn may_grow(&self, rows: &Rows<'_>) -> bool;
 
-    /// Whether rows within these bounds stay as long as they do not grow: a page that missed many rounds is looked at once
-    /// then, not once a round.
-    fn spares(&self, extremes: &Extremes) -> bool;
+    /// Whether the round keeps every row within these bounds that does not grow. A page that missed many rounds then
+    /// computes its bounds once instead of deciding every row in every round.
+    fn keeps_all(&self, extremes: &Extremes) -> bool;
 
-    /// Rows that may grow when the round is logged: at least those that do. There are at most `rows`, and the histogram
-    /// holds their statistics.
+    /// Upper bound of the number of rows that grow, when the round is logged. The scene has at most `rows` rows, and
+    /// the histogram holds their statistics.
     fn promised(&self, rows: u64, histogram: &GradHistogram) -> u64;
 
-    /// Rows of a view that [`Round::promised`] counted, when their statistics are still those of the round.
+    /// The rows of a view that [`Round::promised`] counted, if their statistics are unchanged since the round.
     fn promised_rows(&self, rows: &Rows<'_>) -> u64;
 }
 
-/// What an event does to rows.
+/// The effect of an event on rows.
 #[derive(Clone, Copy)]
 pub enum Effect<'a> {
     /// A round of a strategy.
     Round(&'a dyn Round),
-    /// Opacities above the given one are set to it.
+    /// Opacities are capped.
     ResetOpacity {
-        /// Largest opacity (after activation) that remains.
+        /// The cap, after activation.
         max_opacity: f32,
     },
-    /// Rows that are stored without the bands up to this degree get zeros.
+    /// Rows that are stored with a lower SH degree get zeros for the missing bands.
     RaiseShDegree {
         /// The degree.
         degree: u8,
     },
 }
 
-/// What an event of this kind does to rows. The only place that names the rounds of all strategies.
+/// The effect of an event kind on rows. The only place that names the rounds of all strategies.
 pub fn effect_of(kind: &EventKind) -> Effect<'_> {
     match *kind {
         EventKind::Densify(ref thresholds) => Effect::Round(thresholds),

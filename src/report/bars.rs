@@ -1,19 +1,19 @@
-//! Horizontal bars with their values beside them, as SVG text, drawn by `plotters`.
+//! A horizontal bar chart as SVG text, drawn by `plotters`.
 //!
-//! Invariant: a bar without a value, or with one that is not finite, is an empty line, not an error.
+//! Invariant: a missing or non-finite value gives an empty bar, not an error.
 
-use super::chart::{AXIS, COLORS};
-use super::html::escape;
-use plotters::coord::Shift;
+use super::chart::{AXIS, COLORS, Canvas, draw_svg, text};
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 const WIDTH: u32 = 560;
-/// Height of a bar with the gap below it, of the title, and width of the names: about twelve characters.
+/// Height of a bar with the gap below it.
 const BAR: i32 = 30;
+/// Height of the title.
 const TITLE: i32 = 34;
+/// Width of the names, about twelve characters.
 const NAMES: i32 = 90;
-/// Room for the value behind the longest bar.
+/// Width of the value beside the longest bar.
 const VALUES: i32 = 80;
 
 /// Named values, one bar each.
@@ -21,30 +21,17 @@ const VALUES: i32 = 80;
 pub struct Bars {
     /// Title with the unit.
     pub title: String,
-    /// Name, value, and the value as it is written.
+    /// Name, value, and text of the value.
     pub bars: Vec<(String, Option<f64>, String)>,
 }
 
 impl Bars {
-    /// The bars as SVG, the first on top.
+    /// The chart as SVG, the first bar on top.
     pub fn svg(&self) -> String {
-        let mut text = String::new();
-        let size = (WIDTH, (TITLE + BAR * self.bars.len() as i32 + 6) as u32);
-        let drawn = {
-            let root = SVGBackend::with_string(&mut text, size).into_drawing_area();
-            self.draw(&root).and_then(|()| root.present().map_err(|e| e.to_string()))
-        };
-        match drawn {
-            Ok(()) => text,
-            Err(problem) => format!("<p class=\"dim\">This chart could not be drawn: {}</p>", escape(&problem)),
-        }
+        draw_svg((WIDTH, (TITLE + BAR * self.bars.len() as i32 + 6) as u32), |root| self.draw(root))
     }
 
-    fn draw(&self, root: &DrawingArea<SVGBackend<'_>, Shift>) -> Result<(), String> {
-        fn text<E: std::fmt::Display>(e: E) -> String {
-            e.to_string()
-        }
-        root.fill(&WHITE).map_err(text)?;
+    fn draw(&self, root: &Canvas<'_>) -> Result<(), String> {
         let anchor = |h| Pos::new(h, VPos::Center);
         let title = TextStyle::from(("sans-serif", 16)).pos(anchor(HPos::Center));
         root.draw(&Text::new(self.title.clone(), (WIDTH as i32 / 2, TITLE / 2), title)).map_err(text)?;

@@ -1,7 +1,7 @@
 //! Line and point charts as SVG text, drawn by `plotters`.
 //!
-//! Invariants: 1. points that are not finite are left out; a chart without any point says so instead of failing; 2. the
-//! same data give the same text.
+//! Invariants: 1. points that are not finite are dropped, and a chart without points shows "no data"; 2. the same data
+//! give the same text.
 
 use super::html::escape;
 use plotters::coord::Shift;
@@ -9,18 +9,18 @@ use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-/// Width and height of a chart, in the units of its SVG.
+/// Width and height of a chart, SVG units.
 const SIZE: (u32, u32) = (560, 320);
-/// Those of a chart over the whole width of a page, and the part of it that its legend takes. Where the legend has more
-/// rows than the plot is high, the chart is higher.
+/// Width and height of a wide chart, with the legend at the right. A legend with more rows makes the chart higher.
 const WIDE: (u32, u32) = (1040, 480);
 const LEGEND_WIDTH: u32 = 190;
-/// Middle of a legend's first row, and from one row to the next.
+/// Middle of the first row of the legend.
 const LEGEND_TOP: u32 = 40;
+/// Distance of the rows of the legend.
 const LEGEND_ROW: u32 = 20;
-/// Characters of a name that have room in a legend.
+/// Longest name in the legend, characters.
 const NAME_MAX: usize = 24;
-/// Colours of series, in their order: as many as a sweep needs, for the base, its eleven knobs and the front.
+/// Colours of series, as many as a sweep needs for the base, eleven knobs and the front.
 pub(super) const COLORS: [RGBColor; 13] = [
     RGBColor(36, 99, 180),
     RGBColor(205, 92, 32),
@@ -36,13 +36,13 @@ pub(super) const COLORS: [RGBColor; 13] = [
     RGBColor(230, 120, 170),
     RGBColor(0, 70, 60),
 ];
-/// What becomes of the colours when they begin again: below 1 they are darker, above lighter.
+/// Brightness of the colours in each round through [`COLORS`]: darker below 1, lighter above 1.
 const SHADES: [f64; 4] = [1.0, 0.6, 1.5, 0.3];
 
-/// Axes and frames.
+/// Colour of axes and frames.
 pub(super) const AXIS: RGBColor = RGBColor(97, 97, 97);
 
-/// How a series is drawn.
+/// The mark of a series.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mark {
     /// A line through the points.
@@ -51,25 +51,25 @@ pub enum Mark {
     Dots,
     /// A ring at every point.
     Rings,
-    /// Both.
+    /// A line with dots.
     LineAndDots,
 }
 
-/// One named sequence of points.
+/// A named sequence of points.
 #[derive(Debug, Clone)]
 pub struct Series {
-    /// Name in the legend; empty for none.
+    /// Name in the legend; an empty name has no entry.
     pub name: String,
     /// (x, y).
     pub points: Vec<(f64, f64)>,
-    /// How it is drawn.
+    /// The mark.
     pub mark: Mark,
-    /// Index of its colour; those beyond the last begin again in other shades.
+    /// Number of the colour; numbers beyond the palette repeat it in other shades.
     pub color: usize,
 }
 
 /// A chart.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Chart {
     /// Title.
     pub title: String,
@@ -77,17 +77,17 @@ pub struct Chart {
     pub x: String,
     /// Name and unit of the y axis.
     pub y: String,
-    /// What is drawn, in the order of colours.
+    /// The series, in drawing order.
     pub series: Vec<Series>,
-    /// Labels of single points: (x, y, text). One that would lie over points or other labels is left out.
+    /// Labels of points: (x, y, text). A label that would cover a point or another label is dropped.
     pub labels: Vec<(f64, f64, String)>,
     /// Vertical ranges: (x, lowest y, highest y).
     pub ranges: Vec<(f64, f64, f64)>,
     /// Horizontal ranges: (y, lowest x, highest x).
     pub ranges_x: Vec<(f64, f64, f64)>,
-    /// A dashed horizontal line with what it means.
+    /// A dashed horizontal line and its text.
     pub rule: Option<(f64, String)>,
-    /// Over the whole width of the page, the legend beside it.
+    /// Whether the chart takes the whole width of the page, with the legend at the right.
     pub is_wide: bool,
     /// Whether the y axis starts at zero.
     pub from_zero: bool,
@@ -97,8 +97,7 @@ impl Chart {
     /// A chart without series.
     pub fn new(title: &str, x: &str, y: &str) -> Chart {
         let [title, x, y] = [title, x, y].map(str::to_string);
-        let (series, labels, ranges, ranges_x, rule) = Default::default();
-        Chart { title, x, y, series, labels, ranges, ranges_x, rule, is_wide: false, from_zero: false }
+        Chart { title, x, y, ..Chart::default() }
     }
 
     /// Adds a series.
@@ -108,7 +107,7 @@ impl Chart {
         self.with_color(name, points, mark, color)
     }
 
-    /// Adds a series in a colour.
+    /// Adds a series with a colour number.
     #[must_use]
     pub fn with_color(mut self, name: &str, points: Vec<(f64, f64)>, mark: Mark, color: usize) -> Chart {
         let points = points.into_iter().filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
@@ -116,41 +115,28 @@ impl Chart {
         self
     }
 
-    /// Lets the y axis start at zero.
+    /// Starts the y axis at zero.
     #[must_use]
     pub fn zero_based(mut self) -> Chart {
         self.from_zero = true;
         self
     }
 
-    /// Lets the chart take the whole width of the page.
+    /// Makes the chart as wide as the page.
     #[must_use]
     pub fn wide(mut self) -> Chart {
         self.is_wide = true;
         self
     }
 
-    /// Whether there is nothing to draw.
+    /// Whether the chart has no points.
     pub fn is_empty(&self) -> bool {
         self.series.iter().all(|s| s.points.is_empty())
     }
 
     /// The chart as SVG.
     pub fn svg(&self) -> String {
-        let mut text = String::new();
-        let drawn = {
-            let root = SVGBackend::with_string(&mut text, self.size()).into_drawing_area();
-            self.draw(&root).and_then(|()| root.present().map_err(|e| e.to_string()))
-        };
-        match drawn {
-            Ok(()) if self.is_wide => {
-                let end = text.rfind("</svg>").unwrap_or(text.len());
-                text.insert_str(end, &self.legend());
-                text
-            }
-            Ok(()) => text,
-            Err(problem) => format!("<p class=\"dim\">This chart could not be drawn: {}</p>", escape(&problem)),
-        }
+        draw_svg(self.size(), |root| self.draw(root))
     }
 
     fn size(&self) -> (u32, u32) {
@@ -158,50 +144,39 @@ impl Chart {
         if self.is_wide { (WIDE.0, WIDE.1.max(legend)) } else { SIZE }
     }
 
-    /// What the legend lists.
+    /// The series in the legend.
     fn named(&self) -> impl Iterator<Item = &Series> {
         self.series.iter().filter(|s| !s.name.is_empty())
     }
 
-    /// The legend beside a wide plot, as SVG. It is written here because `plotters` knows no `<title>`, in which a name
-    /// that had to be shortened is whole.
-    fn legend(&self) -> String {
-        let left = WIDE.0 - LEGEND_WIDTH;
-        let (middle, words) = (left + 6, left + 20);
-        let mut svg = String::new();
+    /// Draws the legend of a wide chart.
+    fn draw_legend(&self, root: &Canvas<'_>) -> Result<(), String> {
+        let style = TextStyle::from(("sans-serif", 13)).pos(Pos::new(HPos::Left, VPos::Center));
         for (row, series) in self.named().enumerate() {
-            let y = LEGEND_TOP + LEGEND_ROW * row as u32;
-            let RGBColor(r, g, b) = color(series.color);
-            let color = format!("#{r:02X}{g:02X}{b:02X}");
-            let ring = format!("fill=\"none\" stroke=\"{color}\" stroke-width=\"2\"");
-            let mark = match series.mark {
-                Mark::Line => format!("<path d=\"M{left} {y}h12\" {ring}/>"),
-                Mark::Rings => format!("<circle cx=\"{middle}\" cy=\"{y}\" r=\"4\" {ring}/>"),
-                Mark::Dots | Mark::LineAndDots => {
-                    format!("<circle cx=\"{middle}\" cy=\"{y}\" r=\"4\" fill=\"{color}\"/>")
-                }
-            };
-            let (whole, name) = (escape(&series.name), escape(&shortened(&series.name)));
-            let title = if whole == name { String::new() } else { format!("<title>{whole}</title>") };
-            svg.push_str(&format!(
-                "<g>{title}{mark}<text x=\"{words}\" y=\"{y}\" dy=\"0.35em\" font-family=\"sans-serif\" \
-                 font-size=\"10.5\">\n{name}\n</text></g>\n"
-            ));
+            let (y, color) = ((LEGEND_TOP + LEGEND_ROW * row as u32) as i32, color(series.color));
+            match series.mark {
+                Mark::Line => root.draw(&PathElement::new([(0, y), (12, y)], color.stroke_width(2))),
+                Mark::Rings => root.draw(&Circle::new((6, y), 4, color.stroke_width(2))),
+                Mark::Dots | Mark::LineAndDots => root.draw(&Circle::new((6, y), 4, color.filled())),
+            }
+            .map_err(text)?;
+            root.draw(&Text::new(shortened(&series.name), (20, y), style.clone())).map_err(text)?;
         }
-        svg
+        Ok(())
     }
 
-    fn draw(&self, root: &DrawingArea<SVGBackend<'_>, Shift>) -> Result<(), String> {
+    fn draw(&self, root: &Canvas<'_>) -> Result<(), String> {
         root.fill(&WHITE).map_err(text)?;
         if !self.is_wide {
             return self.draw_plot(root);
         }
-        let (plot, _) = root.split_horizontally(WIDE.0 - LEGEND_WIDTH);
+        let (plot, legend) = root.split_horizontally(WIDE.0 - LEGEND_WIDTH);
+        self.draw_legend(&legend)?;
         let (plot, _) = plot.split_vertically(WIDE.1);
         self.draw_plot(&plot)
     }
 
-    fn draw_plot(&self, root: &DrawingArea<SVGBackend<'_>, Shift>) -> Result<(), String> {
+    fn draw_plot(&self, root: &Canvas<'_>) -> Result<(), String> {
         let ([x0, x1], [y0, y1]) = self.ranges();
         let mut builder = ChartBuilder::on(root);
         builder.margin(8).margin_right(18).x_label_area_size(38).y_label_area_size(58);
@@ -241,9 +216,8 @@ impl Chart {
         Ok(())
     }
 
-    /// Writes the labels beside their points, each at the first of some places where it covers no point and no other
-    /// label.
-    fn draw_labels(&self, root: &DrawingArea<SVGBackend<'_>, Shift>, chart: &Plot<'_, '_>) -> Result<(), String> {
+    /// Draws each label beside its point, at the first of six places where it covers no point and no other label.
+    fn draw_labels(&self, root: &Canvas<'_>, chart: &Plot<'_, '_>) -> Result<(), String> {
         let pixel = |x: f64, y: f64| chart.backend_coord(&(x, y));
         let ([x0, x1], [y0, y1]) = self.ranges();
         let ((left, bottom), (right, top)) = (pixel(x0, y0), pixel(x1, y1));
@@ -275,11 +249,11 @@ impl Chart {
         Ok(())
     }
 
-    /// Both ends of each range, upright or level; one that is not finite is left out.
+    /// Both ends of each vertical and horizontal range; ranges that are not finite are dropped.
     fn bars(&self) -> impl Iterator<Item = [(f64, f64); 2]> {
-        let upright = self.ranges.iter().map(|&(x, low, high)| [(x, low), (x, high)]);
-        let level = self.ranges_x.iter().map(|&(y, low, high)| [(low, y), (high, y)]);
-        upright.chain(level).filter(|ends| ends.iter().all(|(x, y)| x.is_finite() && y.is_finite()))
+        let vertical = self.ranges.iter().map(|&(x, low, high)| [(x, low), (x, high)]);
+        let horizontal = self.ranges_x.iter().map(|&(y, low, high)| [(low, y), (high, y)]);
+        vertical.chain(horizontal).filter(|ends| ends.iter().all(|(x, y)| x.is_finite() && y.is_finite()))
     }
 
     /// Ranges of the axes, with a margin; never empty.
@@ -305,12 +279,27 @@ impl Chart {
 }
 
 type Plot<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+pub(super) type Canvas<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
-fn text<E: std::fmt::Display>(e: E) -> String {
+/// The SVG of a drawing, or a paragraph with the error.
+pub(super) fn draw_svg(size: (u32, u32), draw: impl FnOnce(&Canvas<'_>) -> Result<(), String>) -> String {
+    let mut svg = String::new();
+    let drawn = {
+        let root = SVGBackend::with_string(&mut svg, size).into_drawing_area();
+        draw(&root).and_then(|()| root.present().map_err(text))
+    };
+    match drawn {
+        Ok(()) => svg,
+        Err(problem) => format!("<p class=\"dim\">This chart could not be drawn: {}</p>", escape(&problem)),
+    }
+}
+
+/// The text of an error of `plotters`, whose type depends on the backend.
+pub(super) fn text<E: std::fmt::Display>(e: E) -> String {
     e.to_string()
 }
 
-/// The colour of an index.
+/// The colour with this number.
 fn color(index: usize) -> RGBColor {
     let RGBColor(r, g, b) = COLORS[index % COLORS.len()];
     let shade = SHADES[index / COLORS.len() % SHADES.len()];
@@ -322,7 +311,7 @@ fn color(index: usize) -> RGBColor {
     RGBColor(of(r), of(g), of(b))
 }
 
-/// A name with its middle left out where it is too long for a legend: names of runs differ in how they begin and end.
+/// A name that fits the legend. A longer name loses its middle, because names of runs differ at both ends.
 fn shortened(name: &str) -> String {
     let length = name.chars().count();
     if length <= NAME_MAX {
@@ -355,17 +344,17 @@ fn draw_series(chart: &mut Plot<'_, '_>, series: &Series, in_legend: bool) -> Re
     Ok(())
 }
 
-/// A tick of an axis that covers `span`: with so many digits that neighbours differ.
+/// The label of a tick on an axis that covers `span`, with enough digits to tell neighbours apart.
 fn tick(value: f64, span: f64) -> String {
     let (scale, unit) = unit(value);
-    // Some eight ticks, a digit finer than their distance.
+    // About eight ticks; one digit more than their distance needs.
     let digits = (1.0 - (span / scale / 8.0).log10()).floor().clamp(0.0, 12.0) as usize;
     let text = format!("{:.digits$}", value / scale);
     let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
     if text == "-0" { "0".to_string() } else { format!("{text}{unit}") }
 }
 
-/// What a number is divided by to be short, and the letter for it.
+/// Scale and letter that shorten a number.
 fn unit(value: f64) -> (f64, &'static str) {
     match value.abs() {
         m if m >= 1e9 => (1e9, "G"),
@@ -375,7 +364,7 @@ fn unit(value: f64) -> (f64, &'static str) {
     }
 }
 
-/// A number in few characters: 1.2M, 350k, 0.25.
+/// A number in few characters, such as 1.2M, 350k, 0.25.
 pub fn short(value: f64) -> String {
     let (scale, unit) = unit(value);
     let scaled = value / scale;
@@ -418,7 +407,7 @@ mod tests {
 
     #[test]
     fn colours_differ_also_when_they_begin_again() {
-        // The base, its knobs and the front of a sweep.
+        // A sweep needs colours for the base, eleven knobs and the front.
         assert!(COLORS.len() > 12);
         let all: Vec<RGBColor> = (0..COLORS.len() * SHADES.len()).map(color).collect();
         assert_eq!(all[..COLORS.len()], COLORS);
@@ -438,9 +427,8 @@ mod tests {
         let svg = chart.with("short", vec![(1.0, 1.0)], Mark::Dots).svg();
         let height = LEGEND_TOP + 61 * LEGEND_ROW;
         assert!(svg.contains(&format!("viewBox=\"0 0 1040 {height}\"")) && svg.trim_end().ends_with("</svg>"), "{svg}");
-        assert!(svg.contains(&format!("y=\"{}\" dy=\"0.35em\"", height - LEGEND_ROW)), "the last row is inside");
-        assert!(svg.contains("<title>resolution-1-2-seed7-0123&amp;0007</title>") && svg.contains(">\nresolution-1…"));
-        assert_eq!(svg.matches("<title>").count(), 60, "names that are whole need none");
+        assert!(svg.contains(&format!("cy=\"{}\"", height - LEGEND_ROW)), "the last row is inside");
+        assert!(svg.contains(">\nresolution-1…7-0123&amp;0007\n") && svg.contains(">\nshort\n"));
         assert_eq!(shortened(&name(7)), "resolution-1…7-0123&0007");
         assert_eq!(shortened("ä".repeat(30).as_str()).chars().count(), NAME_MAX);
         assert_eq!(shortened(&"b".repeat(NAME_MAX)), "b".repeat(NAME_MAX));

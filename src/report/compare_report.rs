@@ -1,27 +1,27 @@
-//! A page that sets finished runs side by side: figures, curves, and renders of the same held-out view.
+//! A page that compares finished runs: figures, curves, and renders of the same held-out views.
 //!
-//! Invariants: 1. what a run lacks is left out for it; only a folder without metrics is refused; 2. the number of
-//! pictures is bounded; 3. figures of a run that was evaluated again, as a sweep does on the photos of its base, are
-//! those of that evaluation; what else makes figures another measure than those of the first run is said beside them.
+//! Invariants: 1. missing files of a run make its part shorter; only a folder without metrics is an error; 2. the
+//! number of pictures is bounded; 3. PSNR and SSIM of a run with `evaluated.json` are from that file (a sweep evaluates
+//! runs on the photos of its base); other settings that make figures incomparable with the first run appear as remarks.
 
 use super::chart::{Chart, Mark};
-use super::html::{Cell, Page};
+use super::html::{Cell, Page, slider};
 use super::picture::view_pictures;
 use super::run_report::{curve, read_json, read_metrics, read_text};
 use crate::base::error::InputResult;
-use crate::base::units::format_bytes;
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Sliders shown; more make a file that is slow to open.
+/// Most sliders: a file with more opens slowly.
 const SLIDERS_MAX: usize = 12;
-/// What `gsscale-eval --json` wrote of a run, and the config that it was told, where there is one.
+/// Output of `gsscale-eval --json` in a run's folder.
 const EVALUATED: &str = "evaluated.json";
+/// Config of that evaluation.
 const EVALUATED_AS: &str = "evaluated-as.toml";
-/// Keys that make photos smaller, and so easier.
+/// Keys that make photos smaller, and so raise PSNR.
 const PHOTO_KEYS: [&str; 2] = ["data-factor", "max-resolution"];
-/// Stands behind the names of runs that have remarks.
+/// Follows the names of runs that have remarks.
 const STAR: &str = " *";
 
 /// A run of the comparison.
@@ -30,14 +30,14 @@ struct Compared {
     folder: PathBuf,
     metrics: Vec<Value>,
     summary: Value,
-    /// What the held-out figures are from: the summary, or a later evaluation.
+    /// Source of the held-out figures: the summary or a later evaluation.
     judged: Value,
     is_evaluated_again: bool,
-    /// Values of [`PHOTO_KEYS`] while training.
+    /// Values of [`PHOTO_KEYS`] in training.
     trained_on: [Option<f64>; 2],
-    /// The same for the held-out figures.
+    /// Values of [`PHOTO_KEYS`] for the held-out figures.
     judged_on: [Option<f64>; 2],
-    /// What sets it apart from the first run.
+    /// Differences to the first run that matter for the comparison.
     remarks: Vec<String>,
 }
 
@@ -60,12 +60,12 @@ impl Compared {
         self.judged["test"]["psnr"].as_f64()
     }
 
-    /// Its name in charts.
+    /// Name in tables and charts.
     fn label(&self) -> String {
         format!("{}{}", self.name, if self.remarks.is_empty() { "" } else { STAR })
     }
 
-    /// What sets it apart from the first run.
+    /// Differences to the first run that matter for the comparison.
     fn remarks(&self, first: &Compared) -> Vec<String> {
         let mut remarks = Vec::new();
         for (what, own, first) in
@@ -74,7 +74,7 @@ impl Compared {
             let pairs = PHOTO_KEYS.iter().zip(own.into_iter().zip(first));
             let both = pairs.filter_map(|(key, (own, first))| Some((key, own?, first?)));
             let others = both.filter(|(_, own, first)| own != first);
-            // 1.2 * 1.5 is not quite 1.8.
+            // In f64, 1.2 * 1.5 differs from 1.8.
             let round = |x: f64| (x * 1e4).round() / 1e4;
             remarks.extend(
                 others.map(|(key, own, first)| format!("{what} with {key} {} instead of {}", round(own), round(first))),
@@ -90,24 +90,24 @@ impl Compared {
         remarks
     }
 
-    /// Whether both were judged on photos of the same size, as far as is known.
+    /// Whether the held-out photos of both runs have the same size, as far as known.
     fn is_judged_as(&self, other: &Compared) -> bool {
         let mut pairs = self.judged_on.into_iter().zip(other.judged_on);
         pairs.all(|(own, other)| own.zip(other).is_none_or(|(own, other)| own == other))
     }
 }
 
-/// Values of [`PHOTO_KEYS`] in a config file; none where it or the key is missing.
+/// Values of [`PHOTO_KEYS`] in a config file; `None` for a missing file or key.
 fn photos(config: &Path) -> [Option<f64>; 2] {
     let table: Option<toml::Table> = read_text(config).and_then(|text| text.parse().ok());
     let number = |value: &toml::Value| value.as_float().or_else(|| value.as_integer().map(|i| i as f64));
     PHOTO_KEYS.map(|key| table.as_ref().and_then(|table| table.get(key)).and_then(number))
 }
 
-/// A report that sets several runs side by side: what they reached, over steps and over seconds, and what they look like.
+/// The page that compares the runs in `folders`.
 ///
 /// # Errors
-/// A folder holds no metrics, or a picture in it is none.
+/// A folder holds no metrics, or a picture cannot be decoded.
 pub fn compare_report(folders: &[PathBuf]) -> InputResult<String> {
     let mut runs = Vec::new();
     for (folder, name) in folders.iter().zip(names(folders)) {
@@ -118,7 +118,7 @@ pub fn compare_report(folders: &[PathBuf]) -> InputResult<String> {
     let scenes: BTreeSet<&str> = runs.iter().filter_map(|r| r.summary["scene"].as_str()).collect();
     let scenes = scenes.into_iter().collect::<Vec<_>>().join(", ");
     let mut page = Page::new("gsscale: comparison", &format!("{} runs; {scenes}", folders.len()));
-    page.table(&HEAD, &runs.iter().map(|run| row(run, &runs[0])).collect::<Vec<_>>());
+    add_table(&mut page, &runs);
     page.heading("Over steps and seconds");
     let caption = if runs.iter().all(|run| run.remarks.is_empty()) { "" } else { CAPTION };
     for chart in charts(&runs) {
@@ -128,7 +128,7 @@ pub fn compare_report(folders: &[PathBuf]) -> InputResult<String> {
     Ok(page.finish())
 }
 
-/// The folders' own names where those are all different, else their paths.
+/// The folder names if they are distinct, else the paths.
 fn names(folders: &[PathBuf]) -> Vec<String> {
     let short = |folder: &PathBuf| folder.file_name().map(|n| n.to_string_lossy().into_owned());
     let distinct: BTreeSet<Option<String>> = folders.iter().map(short).collect();
@@ -137,7 +137,7 @@ fn names(folders: &[PathBuf]) -> Vec<String> {
     folders.iter().map(|f| short(f).filter(|_| is_clear).unwrap_or_else(|| long(f))).collect()
 }
 
-/// A curve of the comparison: its title, its axis, what it shows of a line of metrics.
+/// A curve of the comparison: title, unit, and value of a line of metrics.
 type Curve = (&'static str, &'static str, fn(&Value) -> Option<f64>);
 
 const CURVES: [Curve; 4] = [
@@ -147,9 +147,9 @@ const CURVES: [Curve; 4] = [
     ("Read from the drive", "GB", |m| m["bytes_read"].as_f64().filter(|b| *b > 0.0).map(|b| b / 1e9)),
 ];
 
-/// What the star means.
-const CAPTION: &str = "* trained or judged otherwise than the first run, see the remarks. Curves are of each run's own \
-                       photos; the held-out views of a run that was evaluated again on other ones are one dot at its end.";
+/// Explains the star.
+const CAPTION: &str = "* trained or judged differently from the first run, see the remarks. Curves are from each run's own \
+                       photos. A run that was evaluated again on other photos has a single dot at its end.";
 
 fn charts(runs: &[Compared]) -> Vec<Chart> {
     let mut charts = Vec::new();
@@ -161,11 +161,11 @@ fn charts(runs: &[Compared]) -> Vec<Chart> {
             let mut chart = Chart::new(&format!("{title} over {axis}"), axis, unit).wide();
             for run in runs {
                 let is_test = title == CURVES[0].0;
-                // What was measured on other photos than the figure at the end makes no line with it.
+                // Values from other photos than the final value must not join its line.
                 let is_other = is_test && run.is_evaluated_again && run.judged_on != run.trained_on;
                 let mut points = if is_other { Vec::new() } else { curve(&run.metrics, x, of) };
                 if is_test {
-                    // The last evaluation is not in the metrics.
+                    // The metrics do not contain the final evaluation.
                     let end = if x == "step" { &run.summary["steps"] } else { &run.summary["train_seconds"] };
                     points.extend(end.as_f64().zip(run.psnr()));
                 }
@@ -179,7 +179,7 @@ fn charts(runs: &[Compared]) -> Vec<Chart> {
     charts
 }
 
-/// Renders of views that all runs have: each run against the first one.
+/// Renders of the views that all runs have: each run against the first run.
 fn add_views(page: &mut Page, runs: &[Compared]) -> InputResult<()> {
     let Some((first, others)) = runs.split_first().filter(|(_, others)| !others.is_empty()) else { return Ok(()) };
     let pictures = |folder: &Path| -> BTreeSet<String> {
@@ -195,73 +195,63 @@ fn add_views(page: &mut Page, runs: &[Compared]) -> InputResult<()> {
     if common.is_empty() {
         return Ok(());
     }
-    page.heading("Held-out views that all have");
+    page.heading("Held-out views of all runs");
     let shown = others.len().min(SLIDERS_MAX);
     let (runs, views) = (evenly(others.len(), shown), evenly(common.len(), SLIDERS_MAX / shown));
     let (sliders, all) = (runs.len() * views.len(), others.len() * common.len());
     if sliders < all {
         page.paragraph(&format!(
-            "{sliders} of {all} pairs of a run and a view are shown, {} are left out; all pictures are in renders/test \
-             of the runs.",
+            "{sliders} of {all} pairs of a run and a view are shown, {} are left out. The runs have all pictures in \
+             renders/test.",
             all - sliders
         ));
     }
     let common: Vec<&String> = common.iter().collect();
-    page.begin_views();
+    let mut sliders = Vec::new();
     for name in views.iter().map(|&view| common[view]) {
         let left = view_pictures(&first.folder.join("renders/test").join(name))?;
         for run in runs.iter().map(|&run| &others[run]) {
             let right = view_pictures(&run.folder.join("renders/test").join(name))?;
             let sides = [(first.name.as_str(), left.render.as_str()), (run.name.as_str(), right.render.as_str())];
-            page.slider(name.trim_end_matches(".png"), sides, ("photo", &left.photo), "");
+            sliders.push(slider(name.trim_end_matches(".png"), sides, ("photo", &left.photo)));
         }
     }
-    page.end_views();
+    page.views(&sliders);
     Ok(())
 }
 
-/// At most `most` of the numbers below `count`, evenly.
-fn evenly(count: usize, most: usize) -> Vec<usize> {
-    let chosen = most.min(count);
+/// At most `max` of the numbers below `count`, evenly spaced.
+fn evenly(count: usize, max: usize) -> Vec<usize> {
+    let chosen = max.min(count);
     (0..chosen).map(|i| i * count / chosen).collect()
 }
 
-const HEAD: [&str; 12] = [
-    "run",
-    "PSNR, dB",
-    "against the first",
-    "SSIM",
-    "Gaussians",
-    "steps",
-    "seconds",
-    "CPU s",
-    "peak memory",
-    "read",
-    "written",
-    "remarks",
-];
-
-fn row(run: &Compared, first: &Compared) -> Vec<Cell> {
-    let summary = &run.summary;
-    let number =
-        |value: &Value, digits: usize| Cell::Number(value.as_f64().map_or(String::new(), |v| format!("{v:.digits$}")));
-    let bytes = |value: &Value| Cell::Number(value.as_u64().map_or(String::new(), format_bytes));
-    // On other photos it is another measure.
-    let against = run.psnr().zip(first.psnr()).filter(|_| run.folder != first.folder && run.is_judged_as(first));
-    vec![
-        Cell::Text(run.label()),
-        number(&run.judged["test"]["psnr"], 3),
-        Cell::Number(against.map_or(String::new(), |(own, first)| format!("{:+.3}", own - first))),
-        number(&run.judged["test"]["ssim"], 4),
-        number(&summary["gaussians"], 0),
-        number(&summary["steps"], 0),
-        number(&summary["train_seconds"], 1),
-        number(&summary["train_cpu_seconds"], 1),
-        bytes(&summary["host_bytes_peak"]),
-        bytes(&summary["bytes_read"]),
-        bytes(&summary["bytes_written"]),
-        Cell::Text(run.remarks.join("; ")),
-    ]
+fn add_table(page: &mut Page, runs: &[Compared]) {
+    let first = &runs[0];
+    // PSNR on other photos is a different measure.
+    let against = |run: &Compared| {
+        let both = run.psnr().zip(first.psnr()).filter(|_| run.folder != first.folder && run.is_judged_as(first));
+        both.map(|(own, first)| own - first)
+    };
+    let number = |run: &Compared, key: &str, digits: usize| Cell::number(run.summary[key].as_f64(), digits);
+    let bytes = |run: &Compared, key: &str| Cell::bytes(run.summary[key].as_f64());
+    page.table(
+        runs,
+        &[
+            ("run", &|r| Cell::text(r.label())),
+            ("PSNR, dB", &|r| Cell::number(r.psnr(), 3)),
+            ("against the first", &|r| Cell::difference(against(r), 3)),
+            ("SSIM", &|r| Cell::number(r.judged["test"]["ssim"].as_f64(), 4)),
+            ("Gaussians", &|r| number(r, "gaussians", 0)),
+            ("steps", &|r| number(r, "steps", 0)),
+            ("seconds", &|r| number(r, "train_seconds", 1)),
+            ("CPU s", &|r| number(r, "train_cpu_seconds", 1)),
+            ("peak memory", &|r| bytes(r, "host_bytes_peak")),
+            ("read", &|r| bytes(r, "bytes_read")),
+            ("written", &|r| bytes(r, "bytes_written")),
+            ("remarks", &|r| Cell::text(r.remarks.join("; "))),
+        ],
+    );
 }
 
 #[cfg(test)]
@@ -298,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_on_smaller_photos_are_judged_by_their_evaluation_or_marked() {
+    fn runs_on_smaller_photos_use_their_evaluation_or_have_a_remark() {
         let parent = TempDir::new().unwrap();
         let base = run(parent.path(), "base", (26.0, 1.0, "same"), 0);
         let half = run(parent.path(), "half", (28.5, 2.0, "same"), 0);
@@ -310,7 +300,7 @@ mod tests {
         assert!(page.contains("<td>SSIM is valid instead of same</td>") && page.contains("+0.500"));
         assert!(page.contains("<td>base</td>") && page.contains(&CAPTION[..40]));
 
-        // As a sweep does it.
+        // The files that a sweep writes.
         evaluate(&half, 25.25, "same");
         std::fs::write(half.join(EVALUATED_AS), config(1.0)).unwrap();
         let page = compare_report(&[base.clone(), half.clone()]).unwrap();
@@ -319,11 +309,11 @@ mod tests {
         let marks = "<td>trained with data-factor 2 instead of 1; PSNR and SSIM are of evaluated.json</td>";
         assert!(page.contains(marks), "{page}");
 
-        // Without the config that it was evaluated with, nobody knows on which photos.
+        // Without the config of the evaluation, the photos are unknown.
         std::fs::remove_file(half.join(EVALUATED_AS)).unwrap();
         assert!(compare_report(&[base.clone(), half]).unwrap().contains("-0.750"));
         let alike = compare_report(&[base.clone(), base]).unwrap();
-        assert!(!alike.contains(" *<") && !alike.contains("trained or judged otherwise"));
+        assert!(!alike.contains(" *<") && !alike.contains("trained or judged differently"));
     }
 
     #[test]
@@ -342,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn pages_of_many_runs_are_bounded_and_say_what_they_leave_out() {
+    fn pages_of_many_runs_are_bounded_and_report_omitted_pairs() {
         let parent = TempDir::new().unwrap();
         let folder = |i: usize, views: usize| {
             let name = format!("resolution-1-2-seed1-{i:08}-of-{views}");

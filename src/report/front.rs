@@ -1,11 +1,11 @@
-//! Which settings are worth having: means and spreads over seeds, the Pareto front, and what costs no accuracy.
+//! Judges the settings of a sweep: mean and spread over seeds, Pareto front, loss of accuracy against the base.
 //!
-//! Invariants: 1. a point is on the front unless another one is at least as good in both and better in one; 2. nothing
-//! is called free while the seeds of the base say nothing about their spread.
+//! Invariants: 1. a point is on the front unless another point is at least as good in both values and better in one;
+//! 2. without a known spread of the base, only settings with the same bits as the base count as free.
 
 use super::record::RunRecord;
 
-/// Mean and range of a figure over seeds.
+/// Mean and range of a value over seeds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Spread {
     /// Mean.
@@ -17,7 +17,7 @@ pub struct Spread {
 }
 
 impl Spread {
-    /// Of the finite values; `None` of none.
+    /// Over the finite values; `None` if there are none.
     pub fn of(values: impl Iterator<Item = f64>) -> Option<Spread> {
         let values: Vec<f64> = values.filter(|v| v.is_finite()).collect();
         let low = values.iter().copied().fold(f64::INFINITY, f64::min);
@@ -25,59 +25,59 @@ impl Spread {
         (!values.is_empty()).then(|| Spread { mean: values.iter().sum::<f64>() / values.len() as f64, low, high })
     }
 
-    /// From the lowest to the highest.
+    /// Highest value minus lowest value.
     pub fn width(&self) -> f64 {
         self.high - self.low
     }
 }
 
-/// What a setting costs in accuracy, against the base.
+/// Accuracy of a setting against the base.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
-    /// It is the base.
+    /// The setting is the base.
     Base,
-    /// The same bits as the base for every seed that both have.
+    /// The same bits as the base for every common seed.
     SameBits,
-    /// PSNR and SSIM no lower than the base's means over the same seeds, less its spread over all of its seeds.
+    /// PSNR and SSIM are at least the base's means over the common seeds, minus the base's spread over all its seeds.
     WithinSpread,
-    /// Lower than that.
+    /// PSNR or SSIM is lower than that.
     Costs,
-    /// Nothing can be said: the base has one seed, or no seed that the setting has.
+    /// The base has only one seed, or base and setting have no common seed.
     Unknown,
 }
 
 impl Verdict {
-    /// Whether no accuracy is lost as far as can be seen.
+    /// Whether the setting loses no accuracy beyond the spread.
     pub fn is_free(self) -> bool {
         matches!(self, Verdict::Base | Verdict::SameBits | Verdict::WithinSpread)
     }
 }
 
-/// A setting with all its seeds.
+/// A setting with the runs of all its seeds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Setting {
-    /// What was turned.
+    /// The changed knob.
     pub knob: String,
-    /// To what.
+    /// Name of the setting.
     pub label: String,
-    /// Its runs.
+    /// The successful runs.
     pub runs: Vec<RunRecord>,
     /// PSNR, dB.
     pub psnr: Option<Spread>,
     /// SSIM.
     pub ssim: Option<Spread>,
-    /// What it costs in accuracy.
+    /// Accuracy against the base.
     pub verdict: Verdict,
 }
 
 impl Setting {
-    /// Mean of a figure over the seeds that have it.
+    /// Mean of a value over the seeds that have it.
     pub fn mean(&self, of: impl Fn(&RunRecord) -> Option<f64>) -> Option<f64> {
         Spread::of(self.runs.iter().filter_map(of)).map(|s| s.mean)
     }
 }
 
-/// The runs that were done, by setting, the base first, judged against it.
+/// Groups the successful runs by setting, base first, and judges each setting against the base.
 pub fn settings(records: &[RunRecord]) -> Vec<Setting> {
     let mut settings: Vec<Setting> = Vec::new();
     for record in records.iter().filter(|r| r.problem.is_none()) {
@@ -127,15 +127,15 @@ fn judge(setting: &Setting, base: &Setting) -> Verdict {
     }
 }
 
-/// Mean difference of a figure to the base, seed by seed: what a seed is lucky in, its base is lucky in too. `None` where
-/// no seed has both.
+/// Mean difference to the base over common seeds. Pairing by seed cancels the luck of a seed. `None` without a common
+/// seed.
 pub fn against(setting: &Setting, base: &Setting, of: impl Fn(&RunRecord) -> Option<f64>) -> Option<f64> {
     let of_base = |seed: u64| base.runs.iter().find(|b| b.seed == seed).and_then(&of);
     Spread::of(setting.runs.iter().filter_map(|run| Some(of(run)? - of_base(run.seed)?))).map(|s| s.mean)
 }
 
-/// Indices of the points (cost, value) that no other point beats, by ascending cost; lower cost and higher value are
-/// better. Of equal points all are on it.
+/// The Pareto front: indices of the points (cost, value) that no other point beats, by ascending cost. Lower cost and
+/// higher value are better. Equal points are all on the front.
 pub fn pareto_front(points: &[(f64, f64)]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.retain(|&i| points[i].0.is_finite() && points[i].1.is_finite());
@@ -144,8 +144,7 @@ pub fn pareto_front(points: &[(f64, f64)]) -> Vec<usize> {
     });
     let mut front: Vec<usize> = Vec::new();
     for i in order {
-        let is_on_it = front.last().is_none_or(|&best| points[i].1 > points[best].1 || points[i] == points[best]);
-        if is_on_it {
+        if front.last().is_none_or(|&best| points[i].1 > points[best].1 || points[i] == points[best]) {
             front.push(i);
         }
     }
@@ -161,7 +160,7 @@ mod tests {
     fn the_front_is_what_brute_force_finds() {
         let mut draws = Stream::new(3, Purpose::Test, 0, 0);
         for round in 0..300 {
-            // Few distinct values, so that ties in one or both happen; sometimes a value that is no number.
+            // Few distinct values give ties in one or both coordinates; some values are NaN.
             let draw = |draws: &mut Stream| if draws.below(30) == 0 { f64::NAN } else { draws.below(6) as f64 };
             let points: Vec<(f64, f64)> = (0..round % 17).map(|_| (draw(&mut draws), draw(&mut draws))).collect();
             let is_finite = |p: &(f64, f64)| p.0.is_finite() && p.1.is_finite();
@@ -203,7 +202,7 @@ mod tests {
         use Verdict::{Base, Costs, SameBits, Unknown, WithinSpread};
         let want = [Base, Costs, Costs, WithinSpread, Costs, SameBits, Costs];
         assert_eq!(verdicts(&runs), names.clone().into_iter().zip(want).collect::<Vec<_>>());
-        // With one seed of the base only equal bits say anything.
+        // With one seed of the base, only equal bits give a verdict.
         runs.remove(3);
         let want = [Base, Unknown, Unknown, Unknown, Unknown, SameBits, SameBits];
         assert_eq!(verdicts(&runs), names.into_iter().zip(want).collect::<Vec<_>>());

@@ -1,9 +1,9 @@
-//! A page: headings, paragraphs, tables, charts, pictures, put together as one HTML text.
+//! An HTML page of headings, paragraphs, tables, charts and pictures.
 //!
-//! Invariants: 1. nothing is fetched: styles, scripts and pictures are inside the file; 2. every text from outside is
-//! escaped here, so callers pass plain text.
+//! Invariants: 1. the page fetches nothing: styles, scripts and pictures are inside the file; 2. this module escapes
+//! every text, so callers pass plain text.
 
-use std::fmt::Write as _;
+use crate::base::units::format_bytes;
 
 const STYLE: &str = "\
 :root{--ink:#1d2228;--dim:#66707c;--line:#dfe3e8;--paper:#fff;--back:#f5f6f8;--accent:#2463b4}
@@ -38,7 +38,7 @@ th{vertical-align:bottom}
 details summary{cursor:pointer;color:var(--accent)}
 ";
 
-/// Moves the edge between the two pictures of a slider; arrow keys work too.
+/// Moves the edge between the two pictures of a slider with the pointer or the arrow keys.
 const SCRIPT: &str = "\
 document.querySelectorAll('.slider').forEach(function(s){var o=s.querySelector('.over');
 function fit(){o.querySelector('img').style.width=s.clientWidth+'px';}
@@ -49,7 +49,7 @@ if(e.key==='ArrowLeft')to(f-.05);if(e.key==='ArrowRight')to(f+.05);});
 window.addEventListener('resize',fit);fit();to(.5);});
 ";
 
-/// A page in the making.
+/// A page under construction.
 pub struct Page {
     title: String,
     body: String,
@@ -64,110 +64,98 @@ pub enum Cell {
     Number(String),
 }
 
+impl Cell {
+    /// Left-aligned text.
+    pub fn text(text: impl Into<String>) -> Cell {
+        Cell::Text(text.into())
+    }
+
+    /// A number; an empty cell for `None`.
+    pub fn number(value: Option<f64>, digits: usize) -> Cell {
+        Cell::Number(value.map_or(String::new(), |v| format!("{v:.digits$}")))
+    }
+
+    /// A number with its sign; an empty cell for `None`.
+    pub fn difference(value: Option<f64>, digits: usize) -> Cell {
+        Cell::Number(value.map_or(String::new(), |v| format!("{v:+.digits$}")))
+    }
+
+    /// A number of bytes; a dash for 0 and `None`.
+    pub fn bytes(value: Option<f64>) -> Cell {
+        Cell::Number(value.filter(|b| *b > 0.0).map_or("–".to_string(), |b| format_bytes(b as u64)))
+    }
+}
+
+/// A column of a table: its heading, and its cell for a row.
+pub type Column<'a, T> = (&'a str, &'a dyn Fn(&T) -> Cell);
+
 impl Page {
     /// A page with a title and a line under it.
     pub fn new(title: &str, subtitle: &str) -> Page {
-        let mut page = Page { title: title.to_string(), body: String::new() };
-        page.push(format_args!("<h1>{}</h1>\n<p class=\"dim\">{}</p>\n", escape(title), escape(subtitle)));
-        page
-    }
-
-    fn push(&mut self, text: std::fmt::Arguments) {
-        // Writing to a String cannot fail.
-        let _ = self.body.write_fmt(text);
+        let body = format!("<h1>{}</h1>\n<p class=\"dim\">{}</p>\n", escape(title), escape(subtitle));
+        Page { title: title.to_string(), body }
     }
 
     /// A heading.
     pub fn heading(&mut self, text: &str) {
-        self.push(format_args!("<h2>{}</h2>\n", escape(text)));
+        self.body += &format!("<h2>{}</h2>\n", escape(text));
     }
 
     /// A paragraph.
     pub fn paragraph(&mut self, text: &str) {
-        self.push(format_args!("<p>{}</p>\n", escape(text)));
+        self.body += &format!("<p>{}</p>\n", escape(text));
     }
 
-    /// Key figures side by side: (value, what it is).
+    /// Key figures side by side: (value, label).
     pub fn tiles(&mut self, tiles: &[(String, &str)]) {
-        self.push(format_args!("<section class=\"tiles\">\n"));
+        self.body += "<section class=\"tiles\">\n";
         for (value, label) in tiles {
             let (value, label) = (escape(value), escape(label));
-            self.push(format_args!("<div class=\"tile\"><b>{value}</b><span>{label}</span></div>\n"));
+            self.body += &format!("<div class=\"tile\"><b>{value}</b><span>{label}</span></div>\n");
         }
-        self.push(format_args!("</section>\n"));
+        self.body += "</section>\n";
     }
 
-    /// Charts in a grid: SVG made by [`super::chart`], which escapes its own texts, and a caption.
+    /// Charts in a grid: (SVG, caption). [`super::chart`] escapes the texts of the SVG.
     pub fn charts(&mut self, charts: &[(String, String)]) {
-        self.push(format_args!("<div class=\"charts\">\n"));
-        for (svg, caption) in charts {
-            self.push(format_args!("<figure>{svg}<figcaption>{}</figcaption></figure>\n", escape(caption)));
-        }
-        self.push(format_args!("</div>\n"));
+        self.body += "<div class=\"charts\">\n";
+        charts.iter().for_each(|(svg, caption)| self.figure("", svg, caption));
+        self.body += "</div>\n";
     }
 
     /// A chart over the whole width.
     pub fn wide_chart(&mut self, svg: &str, caption: &str) {
-        self.push(format_args!("<figure class=\"wide\">{svg}<figcaption>{}</figcaption></figure>\n", escape(caption)));
+        self.figure("wide", svg, caption);
+    }
+
+    fn figure(&mut self, class: &str, svg: &str, caption: &str) {
+        let caption = escape(caption);
+        self.body += &format!("<figure class=\"{class}\">{svg}<figcaption>{caption}</figcaption></figure>\n");
     }
 
     /// A table.
-    pub fn table(&mut self, head: &[&str], rows: &[Vec<Cell>]) {
-        self.push(format_args!("<div class=\"table\"><table><thead><tr>"));
-        for name in head {
-            self.push(format_args!("<th>{}</th>", escape(name)));
-        }
-        self.push(format_args!("</tr></thead><tbody>\n"));
+    pub fn table<T>(&mut self, rows: &[T], columns: &[Column<'_, T>]) {
+        let headings: String = columns.iter().map(|(heading, _)| format!("<th>{}</th>", escape(heading))).collect();
+        self.body += &format!("<div class=\"table\"><table><thead><tr>{headings}</tr></thead><tbody>\n");
         for row in rows {
-            self.push(format_args!("<tr>"));
-            for cell in row {
-                match cell {
-                    Cell::Text(text) => self.push(format_args!("<td>{}</td>", escape(text))),
-                    Cell::Number(text) => self.push(format_args!("<td class=\"number\">{}</td>", escape(text))),
-                }
-            }
-            self.push(format_args!("</tr>\n"));
+            let cells = columns.iter().map(|(_, cell)| match cell(row) {
+                Cell::Text(text) => format!("<td>{}</td>", escape(&text)),
+                Cell::Number(text) => format!("<td class=\"number\">{}</td>", escape(&text)),
+            });
+            self.body += &format!("<tr>{}</tr>\n", cells.collect::<String>());
         }
-        self.push(format_args!("</tbody></table></div>\n"));
+        self.body += "</tbody></table></div>\n";
     }
 
-    /// Opens a grid of views; close it with [`Page::end_views`].
-    pub fn begin_views(&mut self) {
-        self.push(format_args!("<div class=\"views\">\n"));
+    /// Views in a grid, each made by [`slider`].
+    pub fn views(&mut self, sliders: &[String]) {
+        self.body += &format!("<div class=\"views\">\n{}</div>\n", sliders.concat());
     }
 
-    /// Ends the grid of views.
-    pub fn end_views(&mut self) {
-        self.push(format_args!("</div>\n"));
-    }
-
-    /// A render over its photo with a movable edge, and the map of differences behind a fold. Pictures as data URIs.
-    pub fn view(&mut self, name: &str, render: &str, photo: &str, difference: &str, caption: &str) {
-        self.slider(name, [("render", render), ("photo", photo)], ("difference", difference), caption);
-    }
-
-    /// Two pictures of the same view, (what it is, data URI), one over the other with a movable edge, and a third one
-    /// behind a fold.
-    pub fn slider(&mut self, name: &str, [left, right]: [(&str, &str); 2], folded: (&str, &str), caption: &str) {
-        let (name, caption) = (escape(name), escape(caption));
-        let [(left, left_uri), (right, right_uri), (fold, fold_uri)] =
-            [left, right, folded].map(|(what, uri)| (escape(what), uri));
-        self.push(format_args!(
-            "<figure><div class=\"slider\" tabindex=\"0\" role=\"slider\" aria-label=\"{left} against {right} of {name}\" \
-             aria-valuenow=\"50\"><img src=\"{right_uri}\" alt=\"{right}\"><div class=\"over\"><img src=\"{left_uri}\" \
-             alt=\"{left}\"></div><i class=\"l\">{left}</i><i class=\"r\">{right}</i></div>\n<figcaption>{name} {caption}\
-             <details><summary>{fold}</summary><img src=\"{fold_uri}\" alt=\"{fold}\" style=\"width:100%\"></details>\
-             </figcaption></figure>\n"
-        ));
-    }
-
-    /// Text as it is, behind a fold.
+    /// Preformatted text behind a fold.
     pub fn folded(&mut self, summary: &str, text: &str) {
-        self.push(format_args!(
-            "<details><summary>{}</summary><pre>{}</pre></details>\n",
-            escape(summary),
-            escape(text)
-        ));
+        let (summary, text) = (escape(summary), escape(text));
+        self.body += &format!("<details><summary>{summary}</summary><pre>{text}</pre></details>\n");
     }
 
     /// The whole file.
@@ -182,20 +170,25 @@ impl Page {
     }
 }
 
-/// Text as HTML shows it literally.
+/// HTML of two pictures of a view, one over the other with a movable edge, and a third picture behind a fold. A picture
+/// is (label, data URI).
+pub fn slider(name: &str, [left, right]: [(&str, &str); 2], folded: (&str, &str)) -> String {
+    let name = escape(name);
+    let [(left, left_uri), (right, right_uri), (fold, fold_uri)] =
+        [left, right, folded].map(|(label, uri)| (escape(label), uri));
+    format!(
+        "<figure><div class=\"slider\" tabindex=\"0\" role=\"slider\" aria-label=\"{left} against {right} of {name}\" \
+         aria-valuenow=\"50\"><img src=\"{right_uri}\" alt=\"{right}\"><div class=\"over\"><img src=\"{left_uri}\" \
+         alt=\"{left}\"></div><i class=\"l\">{left}</i><i class=\"r\">{right}</i></div>\n<figcaption>{name} \
+         <details><summary>{fold}</summary><img src=\"{fold_uri}\" alt=\"{fold}\" style=\"width:100%\"></details>\
+         </figcaption></figure>\n"
+    )
+}
+
+/// Escapes text for HTML and SVG.
 pub fn escape(text: &str) -> String {
-    let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '&' => out.push_str("&amp;"),
-            '<' => out.push_str("&lt;"),
-            '>' => out.push_str("&gt;"),
-            '"' => out.push_str("&quot;"),
-            '\'' => out.push_str("&#39;"),
-            c => out.push(c),
-        }
-    }
-    out
+    let text = text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
+    text.replace('"', "&quot;").replace('\'', "&#39;")
 }
 
 #[cfg(test)]
@@ -203,14 +196,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_comes_from_outside_stays_text() {
+    fn hostile_text_stays_text() {
         let hostile = "<script>alert('x')</script>\" onload=\"y";
         let mut page = Page::new(hostile, hostile);
         page.heading(hostile);
-        page.table(&[hostile], &[vec![Cell::Text(hostile.into()), Cell::Number(hostile.into())]]);
+        page.table(&[hostile], &[(hostile, &|t| Cell::text(*t)), (hostile, &|t| Cell::Number(t.to_string()))]);
         page.folded(hostile, hostile);
         page.tiles(&[(hostile.into(), hostile)]);
-        page.view(hostile, "data:,", "data:,", "data:,", hostile);
+        page.views(&[slider(hostile, [(hostile, "data:,"); 2], (hostile, "data:,"))]);
         let text = page.finish();
         assert_eq!(text.matches("<script>").count(), 1, "only the page's own");
         assert!(!text.contains("\" onload"));

@@ -1,75 +1,77 @@
-//! The page of a ladder: what each rung took, as bars and as a table, and whether all ended with the same bits.
+//! The page of a ladder: the costs of each rung as bars and as a table, and whether the rungs ended with the same bits.
 
 use super::bars::Bars;
 use super::html::{Cell, Page};
 use super::record::RunRecord;
 use crate::base::units::format_bytes;
 
-/// A rung that was run.
+/// A rung that has run.
 #[derive(Debug, Clone)]
 pub struct LadderRung {
     /// Short name.
     pub name: String,
-    /// What it adds to the one before.
+    /// The idea that this rung adds.
     pub what: String,
-    /// What it took.
+    /// The figures.
     pub record: RunRecord,
 }
 
-/// The page for the rungs so far; those of `not_built` are listed without figures.
-pub fn ladder_page(facts: &str, rungs: &[LadderRung], not_built: &[&str]) -> String {
+/// The page for the rungs so far.
+pub fn ladder_page(facts: &str, rungs: &[LadderRung]) -> String {
     let mut page = Page::new("gsscale: the ladder of out-of-core training", facts);
     if let Some(r) = rungs.first().map(|r| &r.record) {
         page.paragraph(&format!("{} threads of {}. Every rung was a process of its own.", r.threads, r.cpu));
     }
-    page.paragraph(&sameness(rungs));
+    page.paragraph(&equal_bits(rungs));
     let seconds = |of: fn(&RunRecord) -> Option<f64>, title: &str| {
         bars(rungs, title, of, &|v| if v >= 100.0 { format!("{v:.0} s") } else { format!("{v:.1} s") })
     };
     let bytes = |of: fn(&RunRecord) -> Option<f64>, title: &str| bars(rungs, title, of, &|v| format_bytes(v as u64));
     page.charts(&[
-        (seconds(|r| Some(r.seconds), "Seconds of training"), "Steps alone, without loading and evaluation.".into()),
+        (
+            seconds(|r| Some(r.seconds), "Seconds of training"),
+            "Training steps only, without loading and evaluation.".into(),
+        ),
         (
             seconds(|r| r.cpu_seconds, "CPU seconds of training"),
-            "All threads during the steps, those of the drive's engine included.".into(),
+            "All threads during the steps, including the threads of the I/O engine.".into(),
         ),
         (bytes(|r| Some(r.bytes_read as f64), "Bytes read from the drive"), "By the steps.".into()),
         (
             bytes(|r| Some(r.bytes_written as f64), "Bytes written to the drive"),
-            "Pages, written by the steps and by the commit after the last one, which a run in memory does not make; by \
-             other commits only where --commit-every asks for them."
+            "Pages, written by the steps and by the commit after the last step. A run in memory makes no such commit. \
+             Other commits happen only with --commit-every."
                 .into(),
         ),
         (
             bytes(|r| Some(r.host_bytes_peak as f64), "Peak of host memory"),
-            "Largest resident size of the process, photos, buffers and evaluation included.".into(),
+            "Largest resident size of the process, including photos, buffers and evaluation.".into(),
         ),
-        (seconds(|r| Some(r.stall_seconds), "Seconds waiting for the drive"), "In which a step stood still.".into()),
+        (
+            seconds(|r| Some(r.stall_seconds), "Seconds waiting for the drive"),
+            "Time in which a step waited for pages.".into(),
+        ),
     ]);
     page.heading("All figures");
     let in_memory = rungs.iter().find(|r| r.name == "memory").and_then(|r| r.record.psnr);
-    page.table(&HEAD, &rungs.iter().map(|r| row(r, in_memory)).collect::<Vec<_>>());
-    page.heading("Rungs that are not built yet");
-    let not_built =
-        not_built.iter().map(|name| vec![Cell::Text(format!("+ {name}")), Cell::Text("not built yet".into())]);
-    page.table(&["rung", ""], &not_built.collect::<Vec<_>>());
+    add_table(&mut page, rungs, in_memory);
     page.finish()
 }
 
 fn bars(rungs: &[LadderRung], title: &str, of: fn(&RunRecord) -> Option<f64>, write: &dyn Fn(f64) -> String) -> String {
     let bar = |rung: &LadderRung| {
-        let (value, lack) = match rung.record.problem {
+        let (value, placeholder) = match rung.record.problem {
             Some(_) => (None, "failed"),
-            // Not every system tells every figure.
+            // Some systems do not report every value.
             None => (of(&rung.record), "–"),
         };
-        (rung.name.clone(), value, value.map_or(lack.to_string(), write))
+        (rung.name.clone(), value, value.map_or(placeholder.to_string(), write))
     };
     Bars { title: title.to_string(), bars: rungs.iter().map(bar).collect() }.svg()
 }
 
-/// Which rungs ended with the same bits.
-fn sameness(rungs: &[LadderRung]) -> String {
+/// Says which rungs ended with the same bits.
+fn equal_bits(rungs: &[LadderRung]) -> String {
     let done: Vec<&LadderRung> = rungs.iter().filter(|r| r.record.problem.is_none()).collect();
     let exact: Vec<&&LadderRung> = done.iter().filter(|r| r.name != "naive").collect();
     let names = |of: &[&&LadderRung]| of.iter().map(|r| r.name.clone()).collect::<Vec<_>>().join(", ");
@@ -77,60 +79,51 @@ fn sameness(rungs: &[LadderRung]) -> String {
         Some(first) if exact.len() > 1 && exact.iter().all(|r| r.record.ply == first.record.ply) => {
             format!("The results of {} are the same, byte for byte.", names(&exact))
         }
-        Some(_) if exact.len() > 1 => format!("The results of {} DIFFER, which they must not.", names(&exact)),
-        _ => String::from("Too few rungs were run to compare their results."),
+        Some(_) if exact.len() > 1 => format!("The results of {} DIFFER, which is a fault.", names(&exact)),
+        _ => String::from("Too few rungs have run to compare their results."),
     };
     let naive = done.iter().find(|r| r.name == "naive").and_then(|r| r.record.psnr);
     if let Some((naive, exact)) = naive.zip(exact.first().and_then(|r| r.record.psnr)) {
         text.push_str(&format!(
-            " Dense updates differ by roundings, which training carries on: {:+.4} dB.",
+            " Dense updates round differently, and training amplifies the difference: {:+.4} dB.",
             naive - exact
         ));
     }
     text
 }
 
-const HEAD: [&str; 13] = [
-    "rung",
-    "seconds",
-    "ms a step",
-    "CPU s",
-    "waited, s",
-    "read",
-    "written",
-    "host peak",
-    "device peak",
-    "drive peak",
-    "PSNR, dB",
-    "against memory",
-    "SSIM",
-];
-
-fn row(rung: &LadderRung, in_memory: Option<f64>) -> Vec<Cell> {
-    let record = &rung.record;
-    if let Some(problem) = &record.problem {
-        let mut row = vec![Cell::Text(format!("{}; failed: {problem}", rung.what))];
-        row.resize_with(HEAD.len(), || Cell::Text(String::new()));
-        return row;
-    }
-    let number =
-        |value: Option<f64>, digits: usize| Cell::Number(value.map_or(String::new(), |v| format!("{v:.digits$}")));
-    let bytes = |b: u64| Cell::Number(if b == 0 { String::from("–") } else { format_bytes(b) });
-    vec![
-        Cell::Text(rung.what.clone()),
-        number(Some(record.seconds), 1),
-        number(Some(1e3 * record.seconds / f64::from(record.steps.max(1))), 1),
-        number(record.cpu_seconds, 1),
-        number(Some(record.stall_seconds), 1),
-        bytes(record.bytes_read),
-        bytes(record.bytes_written),
-        bytes(record.host_bytes_peak),
-        bytes(record.device_bytes_peak),
-        bytes(record.drive_bytes_peak),
-        number(record.psnr, 3),
-        Cell::Number(record.psnr.zip(in_memory).map_or(String::new(), |(own, m)| format!("{:+.4}", own - m))),
-        number(record.ssim, 4),
-    ]
+fn add_table(page: &mut Page, rungs: &[LadderRung], in_memory: Option<f64>) {
+    let name = |rung: &LadderRung| match &rung.record.problem {
+        Some(problem) => format!("{}; failed: {problem}", rung.what),
+        None => rung.what.clone(),
+    };
+    let number = |rung: &LadderRung, value: Option<f64>, digits: usize| match rung.record.problem {
+        Some(_) => Cell::text(""),
+        None => Cell::number(value, digits),
+    };
+    let bytes = |rung: &LadderRung, value: u64| match rung.record.problem {
+        Some(_) => Cell::text(""),
+        None => Cell::bytes(Some(value as f64)),
+    };
+    let step_ms = |r: &RunRecord| 1e3 * r.seconds / f64::from(r.steps.max(1));
+    page.table(
+        rungs,
+        &[
+            ("rung", &|r| Cell::text(name(r))),
+            ("seconds", &|r| number(r, Some(r.record.seconds), 1)),
+            ("ms a step", &|r| number(r, Some(step_ms(&r.record)), 1)),
+            ("CPU s", &|r| number(r, r.record.cpu_seconds, 1)),
+            ("waited, s", &|r| number(r, Some(r.record.stall_seconds), 1)),
+            ("read", &|r| bytes(r, r.record.bytes_read)),
+            ("written", &|r| bytes(r, r.record.bytes_written)),
+            ("host peak", &|r| bytes(r, r.record.host_bytes_peak)),
+            ("device peak", &|r| bytes(r, r.record.device_bytes_peak)),
+            ("drive peak", &|r| bytes(r, r.record.drive_bytes_peak)),
+            ("PSNR, dB", &|r| number(r, r.record.psnr, 3)),
+            ("against memory", &|r| Cell::difference(r.record.psnr.zip(in_memory).map(|(own, m)| own - m), 4)),
+            ("SSIM", &|r| number(r, r.record.ssim, 4)),
+        ],
+    );
 }
 
 #[cfg(test)]
@@ -143,19 +136,20 @@ mod tests {
     }
 
     #[test]
-    fn a_rung_that_ends_with_other_bits_is_not_passed_over() {
+    fn a_rung_with_other_bits_is_reported() {
         let mut rungs = vec![rung("naive", "x", 26.5), rung("overlap", "a", 26.25), rung("memory", "a", 26.25)];
-        assert!(sameness(&rungs).contains("overlap, memory are the same") && sameness(&rungs).contains("+0.2500 dB"));
+        assert!(
+            equal_bits(&rungs).contains("overlap, memory are the same") && equal_bits(&rungs).contains("+0.2500 dB")
+        );
         rungs[1].record.ply = "b".into();
-        assert!(sameness(&rungs).contains("DIFFER"));
+        assert!(equal_bits(&rungs).contains("DIFFER"));
         rungs[1].record.problem = Some("no <memory>".into());
-        let page = ladder_page("facts", &rungs, &["image splitting"]);
-        assert!(page.contains("failed: no &lt;memory&gt;") && page.contains("not built yet"));
+        assert!(ladder_page("facts", &rungs).contains("failed: no &lt;memory&gt;"));
     }
 
     #[test]
-    fn a_figure_that_is_missing_is_not_a_rung_that_failed() {
-        // No CPU seconds, as where the system does not tell them.
+    fn a_missing_value_is_not_a_failed_rung() {
+        // Some systems report no CPU seconds.
         let mut rungs = vec![rung("naive", "x", 26.5), rung("memory", "a", 26.25)];
         let svg = |rungs: &[LadderRung]| bars(rungs, "CPU seconds", |r| r.cpu_seconds, &|v| format!("{v:.1} s"));
         rungs[1].record.cpu_seconds = Some(7.5);

@@ -1,7 +1,7 @@
-//! Pages for people: one self-contained HTML file with charts and pictures, that opens offline in any browser.
+//! Reports: self-contained HTML pages with charts and pictures, which open offline in any browser.
 //!
-//! Reads what a run left behind (metrics.jsonl, summary.json, config.toml, pictures), never the run itself; so a report
-//! can be made again at any time, also of a run that was stopped.
+//! A report reads only the files of a run (metrics.jsonl, summary.json, config.toml, pictures). It can be made again at
+//! any time, also for a run that was stopped.
 
 pub mod bars;
 pub mod chart;

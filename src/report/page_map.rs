@@ -1,34 +1,34 @@
-//! The pages of a scene seen from above: where they lie, how many views need them, which are in memory.
+//! A map of the pages of a scene, seen along its shortest axis: position, number of views, residency.
 //!
-//! Invariant: the picture has one rectangle a page, up to a bound; beyond it pages are drawn as cells of a grid.
+//! Invariant: the map has one rectangle per page up to 20,000; a larger scene draws every n-th page.
 
 use serde::{Deserialize, Serialize};
 use std::fmt::Write as _;
 
-/// Longest side of the picture.
+/// Longest side of the map, SVG units.
 const SIDE: f64 = 720.0;
-/// More rectangles than this make a file that browsers labour at.
+/// Most rectangles: browsers show larger files slowly.
 const RECTANGLES_MAX: usize = 20_000;
 
-/// One page, seen along the shortest axis of the scene.
+/// One page, projected along the shortest axis of the scene.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PageTile {
-    /// Lower corner of its box.
+    /// Lower corner of the page's box.
     pub lo: [f32; 2],
-    /// Upper corner.
+    /// Upper corner of the page's box.
     pub hi: [f32; 2],
-    /// Gaussians in it.
+    /// Gaussians of the page.
     pub rows: u32,
-    /// Training views that see it.
+    /// Training views that need the page.
     pub views: u32,
-    /// Whether it was in memory at the end.
+    /// Whether the page was in memory at the end.
     pub resident: bool,
 }
 
-/// The map as SVG: colour by the number of views that see a page, outline by residency. Empty without pages.
+/// The map as SVG: the fill shows the number of views, the outline shows residency. Empty without pages.
 pub fn page_map_svg(tiles: &[PageTile]) -> String {
     let corners = || tiles.iter().flat_map(|t| [t.lo, t.hi]).filter(|c| c.iter().all(|x| x.is_finite()));
-    // A few far pages (sky, giants) would shrink the rest to a dot: the map shows what 98 % of the corners span.
+    // A few distant pages (sky, giants) would shrink the rest to a dot, so the map spans 98 % of the corners.
     let Some((lo, hi)) = span(corners().map(|c| c[0])).zip(span(corners().map(|c| c[1]))) else {
         return String::new();
     };
@@ -44,7 +44,7 @@ pub fn page_map_svg(tiles: &[PageTile]) -> String {
     );
     let stride = tiles.len().div_ceil(RECTANGLES_MAX).max(1);
     let mut drawn: Vec<&PageTile> = tiles.iter().step_by(stride).filter(|t| t.rows > 0).collect();
-    // Small pages over large ones, so that none is hidden.
+    // Large pages first, so that small pages stay visible.
     drawn.sort_by(|a, b| area(b).total_cmp(&area(a)));
     for tile in drawn {
         let at = [0, 1].map(|i| (f64::from(tile.lo[i] - lo[i]) * scale).clamp(-1e4, 1e4));
@@ -71,7 +71,7 @@ fn area(tile: &PageTile) -> f32 {
     (tile.hi[0] - tile.lo[0]) * (tile.hi[1] - tile.lo[1])
 }
 
-/// From the first to the 99th percentile of some values.
+/// The 1st and 99th percentiles.
 fn span(values: impl Iterator<Item = f32>) -> Option<(f32, f32)> {
     let mut values: Vec<f32> = values.collect();
     if values.is_empty() {

@@ -1,7 +1,7 @@
-//! Pictures for pages: the render-beside-photo files of an evaluation, cut in two, shrunk, with a map of differences,
-//! as data URIs.
+//! Pictures of a report as data URIs. An evaluation writes render and photo side by side into one file; this module
+//! cuts the file in two, shrinks the halves and computes a difference map.
 //!
-//! Invariant: sizes are bounded before anything is decoded, and the decoder gets pixels alone.
+//! Invariant: sizes are checked before decoding, and the decoder receives the pixel chunks only.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::png_pixels::{PNG_BUFFERS, PixelChunks};
@@ -18,27 +18,27 @@ use std::path::Path;
 /// Widest picture in a page, pixels.
 const WIDTH_MAX: u32 = 800;
 const JPEG_QUALITY: u8 = 88;
-/// The most that a decoded file may take, bytes.
+/// Limit of a decoded file, bytes.
 const DECODED_MAX: u64 = 1 << 30;
-/// A difference of this many levels (of 255) is shown at full strength.
+/// Differences of this many levels (of 255) and more are white.
 const FULL_DIFFERENCE: f32 = 64.0;
 
-/// A view for a page, each picture a data URI.
+/// The pictures of a view as data URIs.
 pub struct ViewPictures {
     /// The render.
     pub render: String,
     /// The photo.
     pub photo: String,
-    /// Their difference: black for none over red and yellow to white for a quarter of the range and more.
+    /// The difference map: black for no difference, then red, yellow, and white from a quarter of the range.
     pub difference: String,
 }
 
 /// Reads a PNG whose left half is the render and whose right half is the photo.
 ///
 /// # Errors
-/// The file cannot be read or decoded, or is larger than any view.
+/// The file cannot be read or decoded, or exceeds the size limit.
 pub fn view_pictures(path: &Path) -> InputResult<ViewPictures> {
-    let bad = |e: image::ImageError| InputError::new(path, format!("is no picture: {e}"), "evaluate the run again");
+    let bad = |e: image::ImageError| InputError::new(path, format!("is not a picture: {e}"), "evaluate the run again");
     let io = |e: std::io::Error| InputError::io(path, "reading the picture", &e);
     let file = File::open(path).map_err(io)?;
     let mut limits = Limits::default();
@@ -47,7 +47,11 @@ pub fn view_pictures(path: &Path) -> InputResult<ViewPictures> {
     let pixels = PixelChunks::new(BufReader::new(file)).map_err(io)?;
     let decoder = PngDecoder::with_limits(pixels, limits).map_err(bad)?;
     if decoder.total_bytes() > DECODED_MAX {
-        return Err(InputError::new(path, "is larger than any view", "evaluate the run again"));
+        return Err(InputError::new(
+            path,
+            "exceeds the size limit of a view (1 GiB decoded)",
+            "evaluate the run again",
+        ));
     }
     let both = DynamicImage::from_decoder(decoder).map_err(bad)?.into_rgb8();
     let (width, height) = (both.width() / 2, both.height());

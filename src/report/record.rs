@@ -1,7 +1,6 @@
-//! One finished run as a line of JSON: what was set, what it reached, what it took.
+//! The result of one run as a line of JSON: settings, quality and costs.
 //!
-//! Invariant: every figure is what the run's own process measured, but for `wall_seconds`, which is how long that process
-//! lived.
+//! Invariant: the run's own process measured every figure except `wall_seconds`, the lifetime of that process.
 
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -10,30 +9,30 @@ use std::collections::BTreeMap;
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct RunRecord {
-    /// Digest of all that the figures depend on: scene, settings, seed, program, machine and drive.
+    /// Digest of everything that the figures depend on: scene, settings, seed, program, machine and drive.
     pub key: String,
     /// The scene.
     pub scene: String,
-    /// What was turned: `base`, a knob, or `together`.
+    /// The changed knob: `base`, the name of a knob, or `together`.
     pub knob: String,
-    /// The setting, for people: `groups:9`.
+    /// Name of the setting, such as `groups:9`.
     pub label: String,
-    /// Keys that differ from the base, as written in a config file.
+    /// Config keys that differ from the base, with their values.
     pub settings: BTreeMap<String, String>,
     /// Seed.
     pub seed: u64,
     /// Steps.
     pub steps: u32,
-    /// Why there are no figures, for a run that failed.
+    /// Message of a failed run, which has no figures.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub problem: Option<String>,
     /// PSNR of the held-out views, dB.
     pub psnr: Option<f64>,
     /// SSIM of the held-out views.
     pub ssim: Option<f64>,
-    /// Seconds of the steps.
+    /// Seconds of the training steps.
     pub seconds: f64,
-    /// CPU seconds of the steps, all threads.
+    /// CPU seconds of the training steps, all threads.
     pub cpu_seconds: Option<f64>,
     /// Seconds from the start of the process to its end.
     pub wall_seconds: f64,
@@ -51,13 +50,13 @@ pub struct RunRecord {
     pub pages: u64,
     /// Largest resident size of the process, bytes.
     pub host_bytes_peak: u64,
-    /// Most bytes on the device.
+    /// Peak device memory, bytes.
     pub device_bytes_peak: u64,
     /// Bytes of the segment files.
     pub drive_bytes_peak: u64,
-    /// Digest of the PLY: runs with the same one ended with the same bits.
+    /// Digest of the PLY: equal digests mean equal bits.
     pub ply: String,
-    /// Order of the views as it was resolved.
+    /// The order of views that the run used, after `auto` was resolved.
     pub view_order: String,
     /// Version of the program.
     pub version: String,

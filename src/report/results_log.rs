@@ -1,19 +1,19 @@
-//! A file of finished runs, one JSON line each, that grows run by run and survives being cut off.
+//! A log of finished runs, one JSON line per run, which survives a crash.
 //!
-//! Invariants: 1. a line is whole or it is the last one: what a crash left of a last line is cut away when the file is
-//! opened to be written; 2. a line is on the drive before [`ResultsLog::append`] returns; 3. one process writes at a
-//! time.
+//! Invariants: 1. every line but the last is complete; opening the log for writing removes an incomplete last line; 2.
+//! a line is durable before [`ResultsLog::append`] returns. The caller guarantees that one process writes at a time: a
+//! sweep locks its output folder.
 
 use super::record::RunRecord;
 use crate::base::error::{InputError, InputResult};
-use std::fs::{File, OpenOptions, TryLockError};
+use std::fs::{File, OpenOptions};
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-/// Largest file that is read, bytes: some hundred thousand runs.
+/// Size limit of the log, bytes: about a hundred thousand runs.
 const BYTES_MAX: u64 = 256 << 20;
 
-/// The runs so far, open for more.
+/// A log that is open for writing, with the runs so far.
 #[derive(Debug)]
 pub struct ResultsLog {
     path: PathBuf,
@@ -22,29 +22,20 @@ pub struct ResultsLog {
 }
 
 impl ResultsLog {
-    /// Opens or creates the file, cuts off a torn last line, and locks it.
+    /// Opens or creates the log and removes an incomplete last line.
     ///
     /// # Errors
-    /// Another process writes to it, it cannot be read or written, or a line before the last is no result.
+    /// The log cannot be read or written, or a complete line does not hold a result.
     pub fn open(path: &Path) -> InputResult<ResultsLog> {
         let io = |e: std::io::Error| InputError::io(path, "opening the results", &e);
         let mut file = OpenOptions::new().read(true).append(true).create(true).open(path).map_err(io)?;
-        match file.try_lock() {
-            Ok(()) => {}
-            Err(TryLockError::WouldBlock) => {
-                let remedy = "wait for the other one to end, or choose another --out";
-                return Err(InputError::new(path, "another process is writing to it", remedy));
-            }
-            // Where a file system knows no locks there is one writer all the same.
-            Err(TryLockError::Error(_)) => {}
-        }
-        let (records, whole) = read(path, &mut file)?;
-        file.set_len(whole).map_err(io)?;
+        let (records, complete_bytes) = read(path, &mut file)?;
+        file.set_len(complete_bytes).map_err(io)?;
         file.seek(SeekFrom::End(0)).map_err(io)?;
         Ok(ResultsLog { path: path.to_path_buf(), file, records })
     }
 
-    /// The records of a file, read without locking or changing it; none where there is no file.
+    /// Reads the records of a log without changing it; none if the file does not exist.
     ///
     /// # Errors
     /// As [`ResultsLog::open`].
@@ -61,15 +52,10 @@ impl ResultsLog {
         &self.records
     }
 
-    /// The run with this key, if it was done. A run that failed counts as not done.
-    pub fn done(&self, key: &str) -> Option<&RunRecord> {
-        self.records.iter().rev().find(|r| r.key == key && r.problem.is_none())
-    }
-
-    /// Adds a run.
+    /// Appends a run.
     ///
     /// # Errors
-    /// The file cannot be written.
+    /// The log cannot be written.
     pub fn append(&mut self, record: RunRecord) -> InputResult<()> {
         let io = |e: std::io::Error| InputError::io(&self.path, "writing the results", &e);
         let text = serde_json::to_string(&record).map_err(|e| io(e.into()))? + "\n";
@@ -79,13 +65,18 @@ impl ResultsLog {
     }
 }
 
-/// The records of the whole lines, and how many bytes those take.
+/// The last successful run with this key.
+pub fn successful_run<'a>(records: &'a [RunRecord], key: &str) -> Option<&'a RunRecord> {
+    records.iter().rev().find(|r| r.key == key && r.problem.is_none())
+}
+
+/// The records of the complete lines, and the bytes of these lines.
 fn read(path: &Path, file: &mut File) -> InputResult<(Vec<RunRecord>, u64)> {
     let io = |e: std::io::Error| InputError::io(path, "reading the results", &e);
     let mut bytes = Vec::new();
     file.take(BYTES_MAX + 1).read_to_end(&mut bytes).map_err(io)?;
     if bytes.len() as u64 > BYTES_MAX {
-        let problem = format!("is larger than {} MiB, which no sweep writes", BYTES_MAX >> 20);
+        let problem = format!("exceeds {} MiB, the size limit of results", BYTES_MAX >> 20);
         return Err(InputError::new(path, problem, "choose another --out"));
     }
     let whole = bytes.iter().rposition(|&b| b == b'\n').map_or(0, |at| at + 1);
@@ -93,7 +84,7 @@ fn read(path: &Path, file: &mut File) -> InputResult<(Vec<RunRecord>, u64)> {
     let mut records = Vec::new();
     for (number, line) in lines {
         let record = serde_json::from_slice(line).map_err(|e| {
-            let problem = format!("line {} is no result: {e}", number + 1);
+            let problem = format!("line {} is not a result: {e}", number + 1);
             InputError::new(path, problem, "remove the line, or choose another --out")
         })?;
         records.push(record);
@@ -111,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_cut_at_any_byte_keeps_its_whole_lines_and_takes_more() {
+    fn a_log_cut_at_any_byte_keeps_its_complete_lines_and_accepts_more() {
         let folder = tempfile::TempDir::new().unwrap();
         let path = folder.path().join("cut.jsonl");
         let mut log = ResultsLog::open(&path).unwrap();
@@ -133,15 +124,14 @@ mod tests {
     }
 
     #[test]
-    fn failed_runs_are_not_done_and_broken_lines_are_named() {
+    fn failed_runs_are_not_successful_and_broken_lines_are_named() {
         let folder = tempfile::TempDir::new().unwrap();
         let path = folder.path().join("failed.jsonl");
         let mut log = ResultsLog::open(&path).unwrap();
         log.append(record("a", Some("no memory"))).unwrap();
-        assert!(log.done("a").is_none());
+        assert!(successful_run(log.records(), "a").is_none());
         log.append(record("a", None)).unwrap();
-        assert!(log.done("a").is_some() && log.done("b").is_none());
-        assert!(ResultsLog::open(&path).unwrap_err().to_string().contains("another process"));
+        assert!(successful_run(log.records(), "a").is_some() && successful_run(log.records(), "b").is_none());
         drop(log);
         std::fs::write(&path, "{\"key\":\"a\"}\nnonsense\n{}\n").unwrap();
         assert!(ResultsLog::open(&path).unwrap_err().to_string().contains("line 2"));

@@ -1,10 +1,10 @@
-//! report.html of a run, made from the files that the run left in its folder.
+//! `report.html` of a run, made from the files in the run's folder.
 //!
-//! Invariants: 1. files that are missing or cut short (a run that was stopped) make the report shorter, not fail; only a
-//! folder without metrics is refused; 2. the number of pictures and of points in a chart is bounded.
+//! Invariants: 1. missing or incomplete files (of a run that was stopped) make the report shorter; only a folder
+//! without metrics is an error; 2. the number of pictures and of points in a chart is bounded.
 
 use super::chart::{Chart, Mark, short};
-use super::html::Page;
+use super::html::{Page, slider};
 use super::page_map::{PageTile, page_map_svg};
 use super::picture::view_pictures;
 use crate::base::error::{InputError, InputResult};
@@ -14,20 +14,20 @@ use std::path::{Path, PathBuf};
 
 /// Name of the report in a run's folder.
 pub const REPORT_FILE: &str = "report.html";
-/// Name of the page map's data in a run's folder: a JSON list of [`PageTile`].
+/// Name of the data of the page map in a run's folder: a JSON list of [`PageTile`].
 pub const PAGES_FILE: &str = "pages.json";
-/// Views shown; more make a file that is slow to open.
+/// Most views: a file with more opens slowly.
 const VIEWS_MAX: usize = 12;
-/// Points of a curve.
+/// Most points of a curve.
 const POINTS_MAX: usize = 600;
-/// Largest text file that is read whole, bytes.
+/// Size limit of a text file, bytes.
 const TEXT_BYTES_MAX: u64 = 256 << 20;
 const MIB: f64 = (1 << 20) as f64;
 
-/// Makes the report of the run in `folder` as HTML text.
+/// The report of the run in `folder` as HTML.
 ///
 /// # Errors
-/// The folder holds no metrics, or a picture in it is none.
+/// The folder holds no metrics, or a picture cannot be decoded.
 pub fn run_report(folder: &Path) -> InputResult<String> {
     let metrics = read_metrics(folder)?;
     let summary = read_json(&folder.join("summary.json")).unwrap_or(Value::Null);
@@ -55,7 +55,7 @@ pub fn run_report(folder: &Path) -> InputResult<String> {
     Ok(page.finish())
 }
 
-/// Makes the report and writes it into the folder; returns its path.
+/// Writes the report of the run in `folder` into the folder; returns its path.
 ///
 /// # Errors
 /// As [`run_report`], or the folder cannot be written.
@@ -78,7 +78,7 @@ pub(super) fn read_json(path: &Path) -> Option<Value> {
     serde_json::from_str(&read_text(path)?).ok()
 }
 
-/// The lines of metrics.jsonl that are whole.
+/// The complete lines of metrics.jsonl.
 pub(super) fn read_metrics(folder: &Path) -> InputResult<Vec<Value>> {
     let path = folder.join("metrics.jsonl");
     let text = read_text(&path)
@@ -86,7 +86,7 @@ pub(super) fn read_metrics(folder: &Path) -> InputResult<Vec<Value>> {
     Ok(text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect())
 }
 
-/// Points (x, y) of the lines that have both, thinned evenly.
+/// Points (x, y) of the lines that have both values, evenly thinned to at most about [`POINTS_MAX`].
 pub(super) fn curve(metrics: &[Value], x: &str, y: impl Fn(&Value) -> Option<f64>) -> Vec<(f64, f64)> {
     let all: Vec<(f64, f64)> = metrics.iter().filter_map(|m| Some((m[x].as_f64()?, y(m)?))).collect();
     let stride = all.len().div_ceil(POINTS_MAX).max(1);
@@ -135,7 +135,7 @@ fn tiles(summary: &Value, metrics: &[Value]) -> Vec<(String, &'static str)> {
 fn training_charts(metrics: &[Value]) -> Vec<(String, String)> {
     let train = |m: &Value| m["psnr"].as_f64();
     let test = |m: &Value| m["test"]["psnr"].as_f64();
-    // Skipped steps carry the largest number there is.
+    // A skipped step has the loss f64::MAX.
     let loss = |m: &Value| m["loss"].as_f64().filter(|l| *l < 1e30);
     let mut charts = Vec::new();
     for (x, unit) in [("step", "step"), ("seconds", "seconds of training")] {
@@ -155,7 +155,7 @@ fn training_charts(metrics: &[Value]) -> Vec<(String, String)> {
     charts
 }
 
-/// Charts of memory and of the traffic between the tiers, as far as the run logged them.
+/// Charts of memory and of the traffic between the tiers, if the run logged them.
 fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
     let mib = |name: &'static str| move |m: &Value| m[name].as_f64().map(|b| b / MIB);
     let mut charts = Vec::new();
@@ -170,7 +170,7 @@ fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
     if !budget.is_empty() {
         memory = memory.with("budget", budget, Mark::Line);
     }
-    add(memory, "Largest resident size so far, beside what --host-mem allows where it was given.");
+    add(memory, "Largest resident size so far, and the limit of --host-mem if given.");
     if metrics.iter().any(|m| m["bytes_read"].as_f64().is_some_and(|b| b > 0.0)) {
         let chart = Chart::new("Disk traffic", "step", "MiB since the start").zero_based();
         let chart = chart.with("read", curve(metrics, "step", mib("bytes_read")), Mark::Line);
@@ -181,7 +181,7 @@ fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
         let chart = Chart::new("Waiting for pages", "step", "seconds since the start").zero_based();
         add(
             chart.with("", curve(metrics, "step", |m| m["stall_seconds"].as_f64()), Mark::Line),
-            "Time in which a step could not start because a page was not there yet.",
+            "Time in which a step waited for a page.",
         );
         let chart = Chart::new("Page hits", "step", "share").zero_based();
         let share = |m: &Value| {
@@ -190,12 +190,12 @@ fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
         };
         add(
             chart.with("", curve(metrics, "step", share), Mark::Line),
-            "Share of needed pages that were in memory already, since the start.",
+            "Share of needed pages that were already in memory, since the start.",
         );
     }
     if metrics.iter().any(|m| m["device_bytes_peak"].as_f64().is_some_and(|b| b > 0.0)) {
         let chart = Chart::new("Device memory", "step", "MiB").zero_based();
-        add(chart.with("", curve(metrics, "step", mib("device_bytes_peak")), Mark::Line), "Most device memory so far.");
+        add(chart.with("", curve(metrics, "step", mib("device_bytes_peak")), Mark::Line), "Peak device memory so far.");
     }
     charts
 }
@@ -207,8 +207,8 @@ fn add_page_map(page: &mut Page, path: &Path) {
         return;
     }
     page.heading("Pages");
-    let caption = "The pages of the scene along its shortest axis: the warmer, the more training views see the page; light \
-                   outlines were in memory at the end.";
+    let caption = "The pages of the scene, seen along its shortest axis. Warmer colours: more training views need the page. \
+                   Light outlines: the page was in memory at the end.";
     page.charts(&[(svg, caption.to_string())]);
 }
 
@@ -223,14 +223,15 @@ fn add_views(page: &mut Page, folder: &Path) -> InputResult<()> {
     page.heading("Held-out views");
     let stride = files.len().div_ceil(VIEWS_MAX);
     if stride > 1 {
-        page.paragraph(&format!("One in {stride} of {} views; all are in renders/test.", files.len()));
+        page.paragraph(&format!("One in {stride} of {} views; renders/test has all.", files.len()));
     }
-    page.begin_views();
+    let mut sliders = Vec::new();
     for file in files.iter().step_by(stride) {
         let pictures = view_pictures(file)?;
         let name = file.file_stem().unwrap_or_default().to_string_lossy();
-        page.view(&name, &pictures.render, &pictures.photo, &pictures.difference, "");
+        let sides = [("render", pictures.render.as_str()), ("photo", &pictures.photo)];
+        sliders.push(slider(&name, sides, ("difference", &pictures.difference)));
     }
-    page.end_views();
+    page.views(&sliders);
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! `gsscale-bench compare`: finished runs side by side on one page.
+//! `gsscale-bench compare`: compares finished runs on one page.
 
 use clap::Parser;
 use gsscale::report::compare_report::compare_report;
@@ -11,10 +11,10 @@ Examples:
   gsscale-bench compare runs/village runs/village_sh1 --out compare.html
   gsscale-bench compare sweeps/village/runs/* --out compare.html
 
-The first run is the one that the others are set against. What a run's folder has in evaluated.json (written by
-gsscale-eval --json, as a sweep does for runs on smaller photos) takes the place of the run's own PSNR and SSIM.";
+All runs are compared with the first. If a run's folder has evaluated.json, PSNR and SSIM come from that file.
+gsscale-eval --json writes the file, and a sweep does so for runs on smaller photos.";
 
-/// Sets finished runs side by side: figures, curves over steps and seconds, renders of the same view under a slider.
+/// Compares finished runs: figures, curves over steps and seconds, renders of the same view under a slider.
 #[derive(Parser)]
 #[command(name = "gsscale-bench compare", bin_name = "gsscale-bench compare", version, after_help = EXAMPLES)]
 pub struct Args {
@@ -26,7 +26,7 @@ pub struct Args {
     out: PathBuf,
 }
 
-/// Compares.
+/// Writes the page.
 ///
 /// # Errors
 /// A folder holds no run, or the page cannot be written.

@@ -1,9 +1,8 @@
-//! What has to be known of a scene before its runs are planned: how many pages there are and how many a view needs.
+//! The facts of a scene that planning a sweep needs: number of pages, and pages of the largest view.
 
 use gsscale::base::error::InputResult;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
-use gsscale::dataset::loader::Dataset;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::simulation::auto::automatic_order;
 use gsscale::scene::camera::Camera;
@@ -14,36 +13,36 @@ use gsscale::train::pages::PagedScene;
 use gsscale::train::prepare::prepare;
 use std::path::Path;
 
-/// Memory that choosing an order of views may take, bytes.
+/// Memory limit for choosing an order of views, bytes.
 const ORDER_BYTES: u64 = 256 << 20;
-/// Frames beyond those of the largest view: Gaussians grow in size and reach into more views while they train
-/// (sheffield_cross_395, 3,000 steps without densification: from 227 pages to 270, 1.19).
+/// Frames per page of the largest view: Gaussians become larger in training and reach into more views
+/// (sheffield_cross_395, 3,000 steps without densification: from 227 pages to 270, factor 1.19).
 const SPARE: f64 = 1.25;
-/// How often the Gaussians are expected to multiply where they do without a cap.
+/// Expected growth of the number of Gaussians without a cap.
 const UNCAPPED_GROWTH: f64 = 1.5;
-/// Pages grow in number faster than Gaussians, since a page that splits leaves two that are half full (the same scene up
-/// to 64,000 Gaussians: 776 pages, where 720 would do).
+/// Growth of the number of pages over that of Gaussians: a split leaves two half-full pages (the same scene up to
+/// 64,000 Gaussians: 776 pages, where full pages would be 720).
 const SPLIT_GROWTH: f64 = 1.1;
 
-/// A scene at its start.
+/// A scene before training.
 pub struct Facts {
     /// Gaussians.
     pub gaussians: u64,
     /// Pages at the start.
     pub pages: u64,
-    /// Pages of the view that needs most, at the start.
+    /// Pages of the largest view, at the start.
     pub largest_view: u64,
-    /// Pages at the end over those at the start, as far as the config tells.
+    /// Expected pages at the end divided by pages at the start.
     growth: f64,
     views: ViewPages,
     cameras: Vec<Camera>,
 }
 
 impl Facts {
-    /// Reads the scene and cuts its first Gaussians into pages, in memory.
+    /// Reads the scene and partitions its initial Gaussians into pages, in memory.
     ///
     /// # Errors
-    /// As a run.
+    /// The errors of a run.
     pub fn of(scene: &Path, config: &TrainConfig) -> Result<Facts, TrainError> {
         let prepared = prepare(scene, config)?;
         let (dataset, columns) = (&prepared.dataset, &prepared.columns);
@@ -51,7 +50,7 @@ impl Facts {
             RunOptions { sh_degree_start: prepared.sh_degree_start, ..RunOptions::new(config, dataset.scene_scale) };
         let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
         let scene = PagedScene::new(columns, pager, &options)?;
-        let cameras = cameras(dataset);
+        let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
         let views = ViewPages::new(scene.pager.index(), &cameras);
         let gaussians = columns.rows() as u64;
         Ok(Facts {
@@ -64,31 +63,31 @@ impl Facts {
         })
     }
 
-    /// Pages at the end of training: what shares are of.
+    /// Expected pages at the end of training, the base of all shares.
     pub fn pages_at_end(&self) -> u64 {
         (self.pages as f64 * self.growth).ceil() as u64
     }
 
-    /// Frames for a share of the pages, in percent, or `None` where they do not hold the largest view with some to spare.
+    /// Frames for a share of the pages, in percent; `None` if fewer than [`Facts::fewest_frames`].
     pub fn frames(&self, percent: f64) -> Option<u64> {
         let frames = (percent / 100.0 * self.pages_at_end() as f64).ceil() as u64;
         (frames >= self.fewest_frames()).then_some(frames)
     }
 
-    /// Frames that hold the largest view with some to spare.
+    /// Frames for the largest view, with a reserve.
     pub fn fewest_frames(&self) -> u64 {
         (self.largest_view as f64 * self.growth * SPARE).ceil() as u64 + 2
     }
 
-    /// Percent of the pages that these frames hold.
+    /// Share of the pages that these frames hold, in percent.
     pub fn percent(&self, frames: u64) -> f64 {
         100.0 * frames as f64 / self.pages_at_end() as f64
     }
 
-    /// The order that `--view-order auto` stands for with this many frames.
+    /// The order that `--view-order auto` chooses for this many frames.
     ///
     /// # Errors
-    /// The frames do not hold a view.
+    /// The largest view needs more frames.
     pub fn order(&self, frames: u64, seed: u64) -> InputResult<Order> {
         let (pages, frames) = (self.pages as usize, frames.max(self.largest_view) as usize);
         automatic_order(&self.views, &self.cameras, pages, frames, seed, ORDER_BYTES)
@@ -103,8 +102,4 @@ fn growth(gaussians: u64, config: &TrainConfig) -> f64 {
         (_, 0) => UNCAPPED_GROWTH * SPLIT_GROWTH,
         (_, cap) => (cap as f64 / gaussians.max(1) as f64).max(1.0) * SPLIT_GROWTH,
     }
-}
-
-fn cameras(dataset: &Dataset) -> Vec<Camera> {
-    dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect()
 }

@@ -1,21 +1,20 @@
-//! `gsscale-bench pareto`: what each knob costs in accuracy and saves in time, bytes and Gaussians.
+//! `gsscale-bench pareto`: the cost of each knob in accuracy, and its savings in time, bytes and Gaussians.
 
 use super::facts::Facts;
-use super::knobs::{self, KNOBS, Knobs};
-use super::sweep::{Planned, Surroundings, Sweep};
+use super::knobs::{KNOBS, Knobs};
+use super::sweep::{Planned, Surroundings, Sweep, SweepArgs, use_drive};
 use clap::Parser;
+use clap::builder::PossibleValuesParser;
 use gsscale::base::error::InputError;
-use gsscale::checkpoint::interval::CommitEvery;
 use gsscale::config::choice::Choice;
-use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::config::file::TrainConfig;
 use gsscale::page::format::codec::Codec;
 use gsscale::report::record::RunRecord;
-use gsscale::report::results_log::ResultsLog;
+use gsscale::report::results_log::{ResultsLog, successful_run};
 use gsscale::report::sweep_page::sweep_page;
 use gsscale::train::error::TrainError;
 use gsscale::train::whole_file::write_whole;
 use serde_json::Value;
-use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -24,128 +23,88 @@ Examples:
   gsscale-bench pareto scans/village --out sweeps/village --knobs sh,moments --max-runs 5
   gsscale-bench pareto scans/city --out sweeps/city --steps 300 --share 25 --knobs budget,order,codec --strategy none
 
-Results are added to results.jsonl in --out run by run, and a sweep that is started again goes on where it stopped; the
-page is pareto.html. Each run is a process of its own. Budget, page and codec need a drive: see --spill.";
+Each run is a process of its own and adds a line to results.jsonl in --out; the page is pareto.html. A sweep that stopped
+continues when started again. The knobs budget, page and codec need a drive: see --spill.";
 
 /// File of results in the output folder.
 const RESULTS: &str = "results.jsonl";
-/// Steps of a run where none are given.
-pub const STEPS_DEFAULT: u32 = 3000;
-/// The SH degree rises after so many parts of a run where nothing else is said: band 3 is in use after three tenths.
-const SH_RAISES: u32 = 10;
 
-/// Sweeps the knobs of training one at a time and a few together, and draws PSNR and SSIM against what they take.
+/// Changes one knob of training at a time, and a few together, and charts PSNR and SSIM against the costs.
 #[derive(Parser)]
 #[command(name = "gsscale-bench pareto", bin_name = "gsscale-bench pareto", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
-    scene: PathBuf,
-    /// Config file of the base; flags override it. Without one, steps are 3000 and --sh-every a tenth of the steps. Commits
-    /// by the clock are made only with --commit-every
-    #[arg(long)]
-    config: Option<PathBuf>,
-    /// Folder for the results and the page
-    #[arg(long, short)]
-    out: PathBuf,
-    /// Knobs: optimizer, order, budget, page, codec, moments, sh, cap, resolution, steps, together [default: all]
-    #[arg(long, value_delimiter = ',', value_name = "KNOB")]
+    #[command(flatten)]
+    common: SweepArgs,
+    /// Knobs to change [default: all]
+    #[arg(long, value_delimiter = ',', value_name = "KNOB", hide_default_value = true)]
+    #[arg(default_values = KNOBS, value_parser = PossibleValuesParser::new(KNOBS))]
     knobs: Vec<String>,
-    /// Seeds. First the base runs with all of them, then every setting with the first, then with the second, and so on
+    /// Seeds. The base runs first, with all seeds; then all settings run with the first seed, then with the second
     #[arg(long, value_delimiter = ',', default_value = "1,2,3", value_name = "N")]
     seeds: Vec<u64>,
-    /// Settings are tried with this many of the seeds; the base with all
+    /// Seeds for each setting; the base uses all
     #[arg(long, default_value_t = 1, value_name = "N")]
     setting_seeds: usize,
-    /// Stop after so many runs; the next call goes on
+    /// Stop after this many runs; the next call continues
     #[arg(long, value_name = "N")]
     max_runs: Option<usize>,
-    /// Print the runs with an estimate of their time, and stop
+    /// Print the runs with an estimate of their time, then stop
     #[arg(long)]
     list: bool,
     /// Frames of the base, in percent of the pages; 0 = all pages in memory
     #[arg(long, default_value_t = 0.0, value_name = "P")]
     share: f64,
-    /// Folder for pages that leave memory, on the drive to measure [default: spill in --out]
-    #[arg(long, value_name = "DIR")]
-    spill: Option<PathBuf>,
-    #[command(flatten)]
-    keys: TrainOverrides,
 }
 
-/// Sweeps.
+/// Runs the sweep.
 ///
 /// # Errors
-/// Bad input, or the results cannot be written.
+/// The input is invalid, or the results cannot be written.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
-    let names = match args.knobs.is_empty() {
-        true => KNOBS.map(str::to_string).to_vec(),
-        false => args.knobs.clone(),
-    };
-    knobs::check(&names)?;
     check_numbers(args)?;
-    let config = bench_config(args.config.as_deref(), &args.keys)?;
-    let (base, settings) = plan(args, &names, config)?;
+    let (base, settings) = plan(args, args.common.base_config()?)?;
     let runs = in_order(&base, &settings, &args.seeds, args.setting_seeds);
     if args.list {
-        list(args, &runs, &Surroundings::of(&args.scene, &args.out, args.spill.as_deref())?)?;
-        return Ok(());
+        return list(args, &runs, &Surroundings::of(&args.common)?);
     }
-    let mut sweep = Sweep::open(&args.scene, &args.out, args.spill.as_deref(), &base.config, RESULTS)?;
-    let open: Vec<&Planned> = runs.iter().filter(|r| sweep.log.done(&r.key(sweep.surroundings())).is_none()).collect();
+    let mut sweep = Sweep::open(&args.common, &base.config, RESULTS)?;
+    let is_open = |r: &&Planned| successful_run(sweep.records(), &r.key(sweep.surroundings())).is_none();
+    let open: Vec<&Planned> = runs.iter().filter(is_open).collect();
     let done = runs.len() - open.len();
     let count = open.len().min(args.max_runs.unwrap_or(usize::MAX));
     eprintln!("{done} of {} runs are done; {count} to do now", runs.len());
     for (i, run) in open.iter().take(count).enumerate() {
         eprintln!("run {} of {count}: {} {}, seed {}", i + 1, run.knob, run.label, run.config.seed);
-        let record = sweep.run(run)?;
-        if let Some(problem) = &record.problem {
-            eprintln!("warning: it failed: {problem}");
-        }
-        print(&serde_json::to_value(&record).unwrap_or_default());
+        sweep.run(run, print)?;
         write_page(args, &base, &runs, &sweep)?;
     }
     write_page(args, &base, &runs, &sweep)?;
-    eprintln!("{}", args.out.join("pareto.html").display());
+    eprintln!("{}", args.common.out.join("pareto.html").display());
     Ok(())
 }
 
 fn check_numbers(args: &Args) -> Result<(), TrainError> {
     if args.seeds.is_empty() || args.setting_seeds == 0 {
-        return Err(InputError::new("--seeds", "there is no seed", "use --seeds 1,2,3 --setting-seeds 1").into());
+        return Err(InputError::new("--seeds", "no seed is given", "use --seeds 1,2,3 --setting-seeds 1").into());
     }
     if !(0.0..=100.0).contains(&args.share) {
-        return Err(InputError::new("--share", "it must be 0 to 100", "use --share 25, or 0 for memory").into());
+        let remedy = "use --share 25, or 0 for all pages in memory";
+        return Err(InputError::new("--share", "the value must be 0 to 100", remedy).into());
     }
     Ok(())
 }
 
-/// The config of a measurement whose runs are short by default.
-///
-/// # Errors
-/// As for a run.
-pub fn bench_config(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, TrainError> {
-    let mut keys = keys.clone();
-    if file.is_none() {
-        let steps = *keys.steps.get_or_insert(STEPS_DEFAULT);
-        // All bands are in use for most of a short run, as they are for nearly all of a long one.
-        keys.sh_every.get_or_insert((steps / SH_RAISES).max(1));
-    }
-    // Commits go by the clock, and their bytes would count as the setting's.
-    keys.commit_every.get_or_insert(CommitEvery::Seconds(0.0));
-    super::settle(file, &keys)
-}
-
-/// The base with its order settled, and the settings beside it.
-fn plan(args: &Args, names: &[String], mut config: TrainConfig) -> Result<(Planned, Vec<Planned>), TrainError> {
+/// The base with a resolved order of views, and the settings.
+fn plan(args: &Args, mut config: TrainConfig) -> Result<(Planned, Vec<Planned>), TrainError> {
     (config.spill_dir, config.frames) = (String::new(), 0);
-    // What is chosen by itself may change with the drive's mood.
+    // An automatic choice may differ from run to run, because it measures the drive.
     config.spill_codec.0.get_or_insert(Codec::Raw);
-    let facts = Facts::of(&args.scene, &config)?;
+    let facts = Facts::of(&args.common.scene, &config)?;
     let frames = match args.share {
         0.0 => None,
         share => Some(facts.frames(share).ok_or_else(|| {
             let problem = format!(
-                "{share} % of {} pages are too few: the largest view needs {} of the first {}, and views grow",
+                "{share} % of {} pages is too small: the largest view needs {} of the first {} pages, and views grow",
                 facts.pages_at_end(),
                 facts.largest_view,
                 facts.pages
@@ -157,14 +116,12 @@ fn plan(args: &Args, names: &[String], mut config: TrainConfig) -> Result<(Plann
     if config.view_order.0.is_none() {
         config.view_order.0 = Some(facts.order(frames.unwrap_or(facts.pages), config.seed)?);
     }
-    let base = Planned::base(&config);
-    let base = match frames {
-        Some(frames) => base.on_drive(frames),
-        None => base,
-    };
-    let knobs = Knobs { scene: &args.scene, base: &base, facts: &facts, share: args.share };
-    let settings = knobs.settings(names)?;
-    Ok((base, settings))
+    if let Some(frames) = frames {
+        use_drive(&mut config, frames);
+    }
+    let knobs = Knobs { scene: &args.common.scene, base: &config, facts: &facts, share: args.share };
+    let settings = knobs.settings(&args.knobs)?;
+    Ok((Planned { knob: "base".into(), label: "base".into(), config }, settings))
 }
 
 /// The base with all seeds, then the settings seed by seed.
@@ -180,20 +137,16 @@ fn in_order(base: &Planned, settings: &[Planned], seeds: &[u64], setting_seeds: 
     of_base.chain(of_settings).collect()
 }
 
-/// Prints the runs, which of them are done, and how long the rest will take by those that are.
+/// Prints the runs and which of them are done, and estimates the time of the others from those that are done.
 fn list(args: &Args, runs: &[Planned], surroundings: &Surroundings) -> Result<(), TrainError> {
-    let records = ResultsLog::peek(&args.out.join(RESULTS))?;
-    let done = |run: &Planned| {
-        let key = run.key(surroundings);
-        records.iter().rev().find(|r| r.key == key && r.problem.is_none())
-    };
+    let records = ResultsLog::peek(&args.common.out.join(RESULTS))?;
     let per_step: Vec<f64> =
         records.iter().filter(|r| r.problem.is_none()).map(|r| r.wall_seconds / f64::from(r.steps.max(1))).collect();
     let mean = (!per_step.is_empty()).then(|| per_step.iter().sum::<f64>() / per_step.len() as f64);
     let mut left = 0.0;
     for run in runs {
         let (name, steps) = (format!("{} {}", run.knob, run.label), f64::from(run.config.steps));
-        let state = match (done(run), mean) {
+        let state = match (successful_run(&records, &run.key(surroundings)), mean) {
             (Some(record), _) => format!("done in {:.0} s", record.wall_seconds),
             (None, Some(mean)) => {
                 left += mean * steps;
@@ -204,20 +157,20 @@ fn list(args: &Args, runs: &[Planned], surroundings: &Surroundings) -> Result<()
         gsscale::say!("{name:<52} seed {:<4} {:>6} steps  {state}", run.config.seed, run.config.steps);
     }
     match mean {
-        Some(_) => gsscale::say!("{} runs; about {:.0} min for those to do", runs.len(), left / 60.0),
-        None => gsscale::say!("{} runs; no run is done yet, so there is no estimate: try --max-runs 1", runs.len()),
+        Some(_) => gsscale::say!("{} runs; about {:.0} min for the runs to do", runs.len(), left / 60.0),
+        None => gsscale::say!("{} runs; an estimate needs one finished run: use --max-runs 1", runs.len()),
     }
     Ok(())
 }
 
-/// Draws the runs of this plan that are done.
+/// Writes the page of the runs of this plan that are done.
 fn write_page(args: &Args, base: &Planned, runs: &[Planned], sweep: &Sweep) -> Result<(), TrainError> {
-    let (records, surroundings) = (sweep.log.records(), sweep.surroundings());
+    let (records, surroundings) = (sweep.records(), sweep.surroundings());
     let mut of_plan: Vec<RunRecord> = Vec::new();
     for run in runs {
         let key = run.key(surroundings);
         if let Some(record) = records.iter().rev().find(|r| r.key == key) {
-            // One run may stand for two settings: it is named as the plan names it.
+            // Two settings may share a run; the page uses the name of the planned setting.
             of_plan.push(RunRecord { knob: run.knob.clone(), label: run.label.clone(), ..record.clone() });
         }
     }
@@ -236,7 +189,7 @@ fn write_page(args: &Args, base: &Planned, runs: &[Planned], sweep: &Sweep) -> R
             (_, cap) => format!("at most {cap} Gaussians"),
         },
     );
-    let scene = args.scene.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
+    let scene = args.common.scene.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
     let page = sweep_page(&scene, &facts, &of_plan);
-    Ok(write_whole(&args.out.join("pareto.html"), page.as_bytes())?)
+    Ok(write_whole(&args.common.out.join("pareto.html"), page.as_bytes())?)
 }

@@ -1,8 +1,7 @@
-//! `gsscale-bench run NAME --data DIR`: a published run, from the dataset's folder to a table of ours beside the paper's.
+//! `gsscale-bench run NAME --data DIR`: trains a published scene and prints our figures beside the published figures.
 //!
-//! Checks the folder, trains through `train::run` (the same as `gsscale-train`), evaluates, and sets the figures side by
-//! side (`published_table`). Photos are read where they are; nothing is written outside the output folder but pages in
-//! `--spill-dir`.
+//! Checks the dataset's folder, trains through `train::run` (as `gsscale-train` does), evaluates, and compares the
+//! figures (`published_table`). Writes only the output folder and the pages in `--spill-dir`.
 
 use super::published_table::{Comparison, Ours};
 use clap::Parser;
@@ -33,14 +32,14 @@ Examples:
   gsscale-bench run building --data /data/building-pixsfm --tier S3 --spill-dir /nvme/pages --host-mem 12GiB
   gsscale-train --resume runs/rubble && gsscale-bench run rubble --data /data/rubble-pixsfm --out runs/rubble --no-train
 
-Runs: rubble, building, residence, sciart, lfls, sziit, sztu, aerial. The figures go to the terminal, as one line of JSON to
-the standard output, and into OUT/published.json and OUT/published.html.";
+Runs: rubble, building, residence, sciart, lfls, sziit, sztu, aerial. Standard output gets the figures as a line of JSON;
+OUT/published.json and OUT/published.html keep them.";
 
 /// Trains a published run and prints our figures beside the published ones.
 #[derive(Parser)]
 #[command(name = "gsscale-bench run", bin_name = "gsscale-bench run", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// Name of a published run, or a config file with a table published
+    /// Name of a published run, or a config file with a table [published]
     run: PathBuf,
     /// Folder of the dataset
     #[arg(long, value_name = "DIR")]
@@ -51,30 +50,30 @@ pub struct Args {
     /// Densification tier of the config, S0 (fewest Gaussians) to S5 (most)
     #[arg(long)]
     tier: Option<String>,
-    /// Measure LPIPS too, with these weights (safetensors; tools/README.md says how to make them)
+    /// Also measure LPIPS, with these weights (safetensors; see tools/README.md)
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
-    /// What LPIPS's network is fed: signed (-1..1) or unit (0..1)
+    /// Input range of the LPIPS network: signed (-1..1) or unit (0..1)
     #[arg(long, default_value = "signed", value_name = "RANGE")]
     lpips_range: InputRange,
-    /// Check the folder, print what was understood and the memory it will take, then stop
+    /// Check the folder, print the setup and the memory of the run, then stop
     #[arg(long)]
     dry_run: bool,
-    /// Evaluate what is in the output folder instead of training
+    /// Evaluate the result in the output folder instead of training
     #[arg(long, conflicts_with_all = ["dry_run", "overwrite", "tier"])]
     no_train: bool,
     /// Replace the results of an earlier run in the output folder
     #[arg(long)]
     overwrite: bool,
-    /// Print nothing but warnings, errors and the line of JSON
+    /// Print only warnings, errors and the line of JSON
     #[arg(long, short)]
     quiet: bool,
     #[command(flatten)]
     keys: TrainOverrides,
 }
 
-/// Whether these arguments (the program's name first) ask for a published run: they give a dataset, or begin with the
-/// name of one.
+/// Whether these arguments (the program's name first) request a published run: they contain `--data`, or start with the
+/// name of a published run or a config file.
 pub fn is_meant(arguments: &[OsString]) -> bool {
     let is_run =
         |a: &OsString| BUILT_IN.iter().any(|(name, _)| a == name) || Path::new(a).extension() == Some("toml".as_ref());
@@ -82,26 +81,26 @@ pub fn is_meant(arguments: &[OsString]) -> bool {
     arguments.get(1).is_some_and(is_run) || arguments.iter().any(is_data)
 }
 
-/// What is known before any training.
+/// The setup of a run, before training.
 struct Setting {
     run: PublishedRun,
     layout: Layout,
-    /// As published, with the cloud that was found.
+    /// The published config, with the point cloud that was found.
     published: TrainConfig,
     out: PathBuf,
-    /// Why the figures will not be comparable.
+    /// Differences to the published run, which make the figures incomparable.
     caveats: Vec<String>,
 }
 
-/// Runs.
+/// Runs the command.
 ///
 /// # Errors
-/// The folder is not complete, or as a run.
+/// The folder is incomplete, or the run fails.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, TrainError> {
     let mut run = PublishedRun::find(&args.run)?;
     let out = args.out.clone().unwrap_or_else(|| Path::new("runs").join(&run.name));
     let finished = if args.no_train { Some(TrainConfig::read(&out.join("config.toml"))?) } else { None };
-    // A run of another tier is compared with that tier afterwards too, as it was when it ended.
+    // With --no-train, the tier is that of the finished run.
     let of_finished = finished.as_ref().and_then(|config| run.tier_of(config)).map(str::to_string);
     if let Some(tier) = args.tier.clone().or(of_finished) {
         run.use_tier(&tier)?;
@@ -128,7 +127,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, Tra
     Ok(ExitCode::SUCCESS)
 }
 
-/// The layout of the folder and the config with what lies in it.
+/// Finds the layout of the folder and its point cloud.
 fn settle(run: PublishedRun, args: &Args, out: PathBuf) -> InputResult<Setting> {
     let parse = |name: &String| {
         let refuse = |problem| InputError::new(&args.run, problem, "correct the config").at("layouts");
@@ -136,7 +135,7 @@ fn settle(run: PublishedRun, args: &Args, out: PathBuf) -> InputResult<Setting> 
     };
     let layouts: Vec<Layout> = run.facts.layouts.iter().map(parse).collect::<InputResult<_>>()?;
     if layouts.is_empty() {
-        return Err(InputError::new(&args.run, "no layout is named", "name one, such as \"colmap\"").at("layouts"));
+        return Err(InputError::new(&args.run, "no layout is given", "add one, such as \"colmap\"").at("layouts"));
     }
     let layout = find_layout(&args.data, &layouts, &run.facts.fetch)?;
     let mut published = run.config.clone();
@@ -147,12 +146,12 @@ fn settle(run: PublishedRun, args: &Args, out: PathBuf) -> InputResult<Setting> 
         published.init_ply = cloud.to_string_lossy().into_owned();
     } else if layout == Layout::Colmap && !run.facts.clouds.is_empty() {
         let places = run.facts.clouds.join(", ");
-        caveats.push(format!("starts from the model's own points: the published cloud is not there ({places})"));
+        caveats.push(format!("starts from the model's own points: the published point cloud is missing ({places})"));
     }
     Ok(Setting { run, layout, published, out, caveats })
 }
 
-/// Sets what the folder holds beside what was published: photos, held-out photos, their size, points.
+/// Compares the folder with the published run: photos, held-out photos, size of photos, points.
 fn check_photos(args: &Args, config: &TrainConfig, setting: &mut Setting) -> InputResult<()> {
     let raw = read_scene(&args.data, &ReadOptions { points_later: true, ..read_options(config) })?;
     let (facts, caveats) = (&setting.run.facts, &mut setting.caveats);
@@ -164,13 +163,13 @@ fn check_photos(args: &Args, config: &TrainConfig, setting: &mut Setting) -> Inp
     }
     let k = raw.views[0].intrinsics;
     let used = [k.width, k.height].map(|side| f64::from(side) / config.data_factor);
-    // Undistortion and rounding cost a pixel or a few; another set of photos has another size altogether.
+    // Undistortion and rounding change the size by a few pixels; another set of photos differs by more.
     let is_off = |size: &[u32; 2]| (0..2).any(|i| (used[i] / f64::from(size[i]) - 1.0).abs() > 0.01);
     if let Some([w, h]) = facts.size.filter(is_off) {
         caveats.push(format!("photos of {:.0}x{:.0} instead of {w}x{h}", used[0], used[1]));
     }
     if raw.points_path.is_none() && raw.points.positions.is_empty() && config.init_ply.is_empty() {
-        caveats.push("starts from random points: the folder has none".to_string());
+        caveats.push("starts from random points: the folder has no points".to_string());
     }
     Ok(())
 }
@@ -199,7 +198,7 @@ fn describe(args: &Args, setting: &Setting, config: &TrainConfig) {
     }
 }
 
-/// Trains to the end; only an exit code for a dry run and for one that was stopped.
+/// Trains to the end. A dry run and a stopped run return only an exit code.
 fn train(args: &Args, setting: &Setting, config: &TrainConfig) -> Result<Result<Summary, ExitCode>, TrainError> {
     let outcome = run(&RunRequest {
         scene: args.data.clone(),
@@ -220,11 +219,12 @@ fn train(args: &Args, setting: &Setting, config: &TrainConfig) -> Result<Result<
 fn read_summary(out: &Path) -> InputResult<Summary> {
     let path = out.join("summary.json");
     let text = std::fs::read_to_string(&path).map_err(|e| InputError::io(&path, "reading the run's summary", &e))?;
-    serde_json::from_str(&text)
-        .map_err(|e| InputError::new(&path, format!("no summary of a run: {e}"), "name the output folder of a run"))
+    serde_json::from_str(&text).map_err(|e| {
+        InputError::new(&path, format!("is not the summary of a run: {e}"), "use the output folder of a run")
+    })
 }
 
-/// Our figures: those of the run, or of its PLY where that has to be looked at again.
+/// Our figures, from the run's summary or, for LPIPS and --no-train, from an evaluation of the PLY.
 fn measure(args: &Args, setting: &Setting, config: &TrainConfig, summary: Summary) -> Result<Ours, TrainError> {
     let mut ours = Ours::new(summary, config);
     if args.lpips.is_some() || args.no_train {

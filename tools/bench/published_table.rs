@@ -1,7 +1,7 @@
-//! Our figures beside published ones: as text, as JSON and as a page.
+//! Our figures beside the published figures, as text, as JSON and as a page.
 //!
-//! Invariant: a difference is given only between figures of the same measure (same SSIM padding, same network and input
-//! range of LPIPS); what makes a run another one than the published is listed wherever the figures are.
+//! Invariant: a difference appears only between figures of the same measure (same SSIM padding, same LPIPS network and
+//! input range). Every output lists the differences between this run and the published run.
 
 use gsscale::base::units::format_bytes;
 use gsscale::config::file::TrainConfig;
@@ -13,13 +13,13 @@ use gsscale::train::report::{Summary, TestMetrics};
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// What we reached.
+/// Figures of our run.
 pub struct Ours {
     /// Means over the held-out views.
     pub test: Option<TestMetrics>,
-    /// Which SSIM they hold.
+    /// Variant of SSIM.
     pub ssim_variant: SsimVariant,
-    /// Which LPIPS they hold.
+    /// Variant of LPIPS.
     pub lpips_variant: Option<String>,
     summary: Summary,
     /// Bytes of all Gaussians with their moments and statistics.
@@ -27,7 +27,7 @@ pub struct Ours {
 }
 
 impl Ours {
-    /// Of a run that ended.
+    /// The figures of a finished run.
     pub fn new(summary: Summary, config: &TrainConfig) -> Ours {
         let floats = 11 + 3 * (u64::from(config.sh_degree) + 1).pow(2);
         let moment_bytes = match config.moments {
@@ -44,11 +44,12 @@ impl Ours {
     }
 }
 
-/// A row of the table: measure, ours, theirs, the unchanged trainer's, digits.
+/// A row of the table.
 struct Row {
     measure: String,
     ours: Option<f64>,
     published: Option<f64>,
+    /// Figure of the unchanged trainer.
     original: Option<f64>,
     is_same_measure: bool,
     digits: usize,
@@ -66,19 +67,19 @@ impl Row {
     }
 }
 
-/// Everything that is reported.
+/// The input of the report.
 pub struct Comparison<'a> {
     /// The published run.
     pub run: &'a PublishedRun,
-    /// Densification tier, where the settings are one's.
+    /// Densification tier, if the settings are those of a tier.
     pub tier: Option<&'a str>,
-    /// Layout of the folder.
+    /// Layout of the dataset.
     pub layout: &'a str,
-    /// The folder.
+    /// Folder of the dataset.
     pub data: &'a Path,
     /// Output folder.
     pub out: &'a Path,
-    /// What makes it another run than the published.
+    /// Differences to the published run.
     pub caveats: &'a [String],
     /// Our figures.
     pub ours: &'a Ours,
@@ -90,51 +91,33 @@ impl Comparison<'_> {
     fn rows(&self) -> Vec<Row> {
         let (test, expected) = (self.ours.test, self.run.facts.expected.as_ref());
         let lpips_variant = self.ours.lpips_variant.as_deref();
+        let row = |measure, digits, ours, theirs: Option<[f64; 2]>, is_same_measure| {
+            let (published, original) = (theirs.map(|t| t[0]), theirs.map(|t| t[1]));
+            Row { measure, ours, published, original, is_same_measure, digits }
+        };
+        let psnr = expected.map(|e| [e.psnr, e.original_psnr]);
+        let ssim = expected.map(|e| [e.ssim, e.original_ssim]);
+        let lpips = expected.map(|e| [e.lpips, e.original_lpips]);
+        let is_same_ssim = expected.is_some_and(|e| e.ssim_variant == self.ours.ssim_variant);
+        let is_same_lpips = expected.is_some_and(|e| Some(e.lpips_variant.as_str()) == lpips_variant);
+        let (ssim_name, lpips_name) = (self.ours.ssim_variant, lpips_variant.unwrap_or("alex, signed"));
         let mut rows = vec![
-            Row {
-                measure: "PSNR, dB".into(),
-                ours: test.map(|t| t.psnr),
-                published: expected.map(|e| e.psnr),
-                original: expected.map(|e| e.original_psnr),
-                is_same_measure: true,
-                digits: 2,
-            },
-            Row {
-                measure: format!("SSIM ({})", self.ours.ssim_variant),
-                ours: test.map(|t| t.ssim),
-                published: expected.map(|e| e.ssim),
-                original: expected.map(|e| e.original_ssim),
-                is_same_measure: expected.is_some_and(|e| e.ssim_variant == self.ours.ssim_variant),
-                digits: 3,
-            },
-            Row {
-                measure: format!("LPIPS ({})", lpips_variant.unwrap_or("alex, signed")),
-                ours: test.and_then(|t| t.lpips),
-                published: expected.map(|e| e.lpips),
-                original: expected.map(|e| e.original_lpips),
-                is_same_measure: expected.is_some_and(|e| Some(e.lpips_variant.as_str()) == lpips_variant),
-                digits: 3,
-            },
+            row("PSNR, dB".into(), 2, test.map(|t| t.psnr), psnr, true),
+            row(format!("SSIM ({ssim_name})"), 3, test.map(|t| t.ssim), ssim, is_same_ssim),
+            row(format!("LPIPS ({lpips_name})"), 3, test.and_then(|t| t.lpips), lpips, is_same_lpips),
         ];
         if let Some(corrected) = test.and_then(|t| t.color_corrected) {
-            rows.push(Row {
-                measure: format!("colour-corrected PSNR ({}), dB", corrected.method.name()),
-                ours: Some(corrected.cc_psnr),
-                published: None,
-                original: None,
-                is_same_measure: false,
-                digits: 2,
-            });
+            let name = format!("colour-corrected PSNR ({}), dB", corrected.method.name());
+            rows.push(row(name, 2, Some(corrected.cc_psnr), None, false));
         }
         rows
     }
 
-    /// Facts beside the quality, one line each.
+    /// Further facts, one line each.
     fn facts(&self) -> Vec<String> {
         let summary = &self.ours.summary;
         let mut facts = vec![format!(
-            "{} Gaussians after {} steps, {:.1} s of training; {} at the peak of host memory, the Gaussians with their \
-             moments take {}",
+            "{} Gaussians after {} steps, {:.1} s of training; peak host memory {}; Gaussians with their moments {}",
             summary.gaussians,
             summary.steps,
             summary.train_seconds,
@@ -145,8 +128,8 @@ impl Comparison<'_> {
             let here = memory.saving.map_or(String::new(), |s| format!("{s} on this scene; "));
             let ([least, most], mean) = (memory.saving_range, memory.saving_mean);
             facts.push(format!(
-                "published: GPU memory of the unchanged trainer over GS-Scale's: {here}{least} to {most} on its scenes, \
-                 geometric mean {mean}"
+                "published: GPU memory of the unchanged trainer divided by that of GS-Scale: {here}{least} to {most} on \
+                 its scenes, geometric mean {mean}"
             ));
         }
         if self.run.facts.expected.is_none() {
@@ -156,7 +139,7 @@ impl Comparison<'_> {
         facts
     }
 
-    /// One line of JSON's worth.
+    /// The comparison as JSON.
     pub fn json(&self) -> Value {
         let summary = &self.ours.summary;
         let rows = self.rows();
@@ -212,12 +195,17 @@ impl Comparison<'_> {
         let tier = self.tier.unwrap_or("none");
         let title = format!("gsscale: {} beside the published figures", self.run.facts.title);
         let mut page = Page::new(&title, &format!("{}, tier {tier}", self.data.display()));
-        let cells = |row: &Row| {
-            let [measure, numbers @ ..] = row.cells();
-            std::iter::once(Cell::Text(measure)).chain(numbers.map(Cell::Number)).collect()
-        };
-        let rows: Vec<Vec<Cell>> = self.rows().iter().map(cells).collect();
-        page.table(&HEAD, &rows);
+        let number = |row: &Row, i: usize| Cell::Number(row.cells()[i].clone());
+        page.table(
+            &self.rows(),
+            &[
+                (HEAD[0], &|row| Cell::text(&row.measure)),
+                (HEAD[1], &|row| number(row, 1)),
+                (HEAD[2], &|row| number(row, 2)),
+                (HEAD[3], &|row| number(row, 3)),
+                (HEAD[4], &|row| number(row, 4)),
+            ],
+        );
         self.facts().iter().for_each(|fact| page.paragraph(fact));
         if !self.caveats.is_empty() {
             page.heading("Not the published run");

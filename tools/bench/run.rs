@@ -1,4 +1,5 @@
-//! `gsscale-bench run`: trains a scene for some steps and prints one line of JSON about what it took. Writes no file.
+//! `gsscale-bench run`: trains a scene for some steps and prints time, memory and quality as a line of JSON. Writes no
+//! file.
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
@@ -24,8 +25,8 @@ Examples:
 
 gsscale-bench help lists the other measurements.
 
-cpu_seconds_per_step counts all threads during the steps, decoding of photos included; loading and evaluation are not
-in it. host_bytes_peak is without the copy that writing a PLY takes.";
+cpu_seconds_per_step counts all threads during the steps, including the decoding of photos and without loading and
+evaluation. host_bytes_peak excludes the copy that writing a PLY needs.";
 
 /// Trains a scene and prints one line of JSON: steps, seconds, CPU seconds, peak memory, PSNR, SSIM, machine.
 #[derive(Parser)]
@@ -36,15 +37,15 @@ pub struct Args {
     /// Config file; flags override it
     #[arg(long)]
     config: Option<PathBuf>,
-    /// Leave out the evaluation on held-out photos
+    /// Skip the evaluation on held-out photos
     #[arg(long)]
     no_eval: bool,
     #[command(flatten)]
     keys: TrainOverrides,
 }
 
-/// This measurement runs the CPU path with all pages in memory.
-fn refuse_what_is_not_measured(config: &TrainConfig) -> InputResult<()> {
+/// Rejects the flags of devices and drives: this measurement runs on the CPU with all pages in memory.
+fn check_flags(config: &TrainConfig) -> InputResult<()> {
     let given = [
         ("--device", !matches!(config.device, Device::Cpu | Device::Gpu(DeviceChoice::Auto))),
         ("--spill-dir", config.residence().spill_dir().is_some()),
@@ -55,18 +56,18 @@ fn refuse_what_is_not_measured(config: &TrainConfig) -> InputResult<()> {
         None => Ok(()),
         Some((flag, _)) => {
             let problem = "this measurement runs on the CPU with all pages in memory";
-            Err(InputError::new(flag, problem, "leave it out, or use gsscale-bench pareto or ladder"))
+            Err(InputError::new(flag, problem, "remove the flag, or use gsscale-bench pareto or ladder"))
         }
     }
 }
 
-/// Measures.
+/// Runs the measurement.
 ///
 /// # Errors
-/// As a run.
+/// The errors of a run.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let config = super::settle(args.config.as_deref(), &args.keys)?;
-    refuse_what_is_not_measured(&config)?;
+    check_flags(&config)?;
     let began = Instant::now();
     let prepared = prepare(&args.scene, &config)?;
     let dataset = prepared.dataset;

@@ -1,17 +1,19 @@
-//! Runs that are compared: each one trains in a process of its own, and its figures go to a file of results.
+//! Runs the trainings of a sweep or ladder, each in its own process, and logs the results.
 //!
-//! Invariants: 1. a run that is in the file is not done again; what keys it is all that its figures depend on: the scene,
-//! every setting, the seed, the program's bytes, the machine and the drive; 2. a run's folder appears under its name only
-//! when the run has ended well; 3. a run that fails is written down and the others go on, but a run that is interrupted
-//! ends everything; 4. what is being written is never removed: a run holds the sweep's lock as long as it lives, also when
-//! the sweep itself was killed.
+//! Invariants: 1. a logged run does not run again; its key is a digest of everything that the figures depend on: scene,
+//! settings, seed, bytes of the program, machine and drive; 2. a run's folder gets its final name only after success;
+//! 3. a failed run is logged and the sweep continues; an interrupted run ends the sweep; 4. a file in use is never
+//! removed: each run holds the lock of the sweep while the run lives, even if the sweep itself was killed.
 
+use clap::Args;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::cpu_model;
+use gsscale::checkpoint::interval::CommitEvery;
 use gsscale::config::choice::Choice;
-use gsscale::config::file::{ByteSize, TrainConfig};
+use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides};
 use gsscale::report::record::RunRecord;
-use gsscale::report::results_log::ResultsLog;
+use gsscale::report::results_log::{ResultsLog, successful_run};
+use gsscale::train::error::TrainError;
 use gsscale::train::report::Summary;
 use gsscale::train::whole_file::write_whole;
 use serde_json::Value;
@@ -23,50 +25,90 @@ use std::process::{Command, Output, Stdio};
 use std::time::Instant;
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
-/// Where pages of a run go when they leave memory; the run's own folder takes its place.
-const SPILL_PLACE: &str = "spill";
-/// Characters of a failed run's message that are kept.
+/// Stands for a run's own spill directory in the config of a planned run.
+const SPILL_PLACEHOLDER: &str = "spill";
+/// Longest message of a failed run, characters.
 const PROBLEM_MAX: usize = 600;
-
-/// Held by the sweep and by the run that it started, in the output folder.
+/// File in the output folder that the sweep and its current run lock.
 const LOCK: &str = "sweep.lock";
+/// Default steps of a run.
+pub const STEPS_DEFAULT: u32 = 3000;
+/// Default number of `--sh-every` intervals in a run: the last of three raises comes after three tenths.
+const SH_INTERVALS: u32 = 10;
 
-/// All that the figures of a run depend on beside its settings.
+/// The arguments of every sweep and ladder.
+#[derive(Args)]
+pub struct SweepArgs {
+    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
+    pub scene: PathBuf,
+    /// Config file of the base; flags override it. Without a file, --steps is 3000 and --sh-every a tenth of the steps.
+    /// Commits by time need an explicit --commit-every
+    #[arg(long)]
+    pub config: Option<PathBuf>,
+    /// Folder for the results and the page
+    #[arg(long, short)]
+    pub out: PathBuf,
+    /// Spill directory, on the drive to measure [default: spill in --out]
+    #[arg(long, value_name = "DIR")]
+    pub spill: Option<PathBuf>,
+    #[command(flatten)]
+    pub keys: TrainOverrides,
+}
+
+impl SweepArgs {
+    /// The config of the base. Runs are short by default.
+    ///
+    /// # Errors
+    /// The errors of a run.
+    pub fn base_config(&self) -> Result<TrainConfig, TrainError> {
+        let mut keys = self.keys.clone();
+        if self.config.is_none() {
+            let steps = *keys.steps.get_or_insert(STEPS_DEFAULT);
+            // A short run then uses all bands for most of its steps, like a long run.
+            keys.sh_every.get_or_insert((steps / SH_INTERVALS).max(1));
+        }
+        // Commits by time would add their bytes to the cost of a setting.
+        keys.commit_every.get_or_insert(CommitEvery::Seconds(0.0));
+        super::settle(self.config.as_deref(), &keys)
+    }
+}
+
+/// Everything except the settings that the figures of a run depend on.
 pub struct Surroundings {
     /// Scene, drive, program, processor and threads, as one text.
     text: String,
-    /// Ends the names of this sweep's folders on the drive, which other sweeps may use as well.
+    /// Suffix of this sweep's folders on the drive, which other sweeps may also use.
     mark: String,
 }
 
 impl Surroundings {
-    /// Looks at scene, drive, program and machine. `spill` is the folder for pages, as the sweep was given it.
+    /// Reads scene, drive, program and machine.
     ///
     /// # Errors
     /// `gsscale-train` is missing.
-    pub fn of(scene: &Path, out: &Path, spill: Option<&Path>) -> InputResult<Surroundings> {
+    pub fn of(args: &SweepArgs) -> InputResult<Surroundings> {
         let program = digest(&beside("gsscale-train")?)?;
-        // The folder in --out needs no mention: an output folder may move with its results.
-        let drive = spill.map_or_else(String::new, |path| whole(path).display().to_string());
+        // The default folder in --out is not part of the key: an output folder may move with its results.
+        let drive = args.spill.as_ref().map_or_else(String::new, |path| resolved(path).display().to_string());
         let (threads, cpu) = (rayon::current_num_threads(), cpu_model());
-        let text = format!("{}\n{drive}\n{program}\n{threads}\n{cpu}", whole(scene).display());
-        let mark = format!("{:08x}", xxh3_64(whole(out).as_os_str().as_encoded_bytes()) as u32);
+        let text = format!("{}\n{drive}\n{program}\n{threads}\n{cpu}", resolved(&args.scene).display());
+        let mark = format!("{:08x}", xxh3_64(resolved(&args.out).as_os_str().as_encoded_bytes()) as u32);
         Ok(Surroundings { text, mark })
     }
 }
 
-/// A run to be done.
+/// A planned run.
 #[derive(Debug, Clone)]
 pub struct Planned {
-    /// What is turned.
+    /// The changed knob.
     pub knob: String,
-    /// To what, for people.
+    /// Name of the setting.
     pub label: String,
-    /// All settings. A spill directory that is not empty stands for one that the sweep chooses.
+    /// All settings. The sweep replaces a spill directory that is not empty by one of its own.
     pub config: TrainConfig,
 }
 
-/// A folder of runs with their results.
+/// An output folder of runs with their results.
 pub struct Sweep {
     scene: PathBuf,
     out: PathBuf,
@@ -74,28 +116,21 @@ pub struct Sweep {
     base: TrainConfig,
     surroundings: Surroundings,
     lock: File,
-    /// The results so far.
-    pub log: ResultsLog,
+    log: ResultsLog,
+}
+
+/// Makes a config keep `frames` pages in memory and the others on the drive.
+pub fn use_drive(config: &mut TrainConfig, frames: u64) {
+    config.spill_dir = SPILL_PLACEHOLDER.into();
+    config.frames = u32::try_from(frames).unwrap_or(u32::MAX);
+    config.host_mem = ByteSize(0);
 }
 
 impl Planned {
-    /// A run with the settings of the base.
-    pub fn base(config: &TrainConfig) -> Planned {
-        Planned { knob: "base".into(), label: "base".into(), config: config.clone() }
-    }
-
-    /// Digest of all settings, the seed, and what surrounds the run.
+    /// Digest of all settings, the seed, and the surroundings.
     pub fn key(&self, surroundings: &Surroundings) -> String {
         let settings = toml::to_string(&self.config).unwrap_or_default();
         format!("{:016x}", xxh3_64(format!("{}\n{settings}", surroundings.text).as_bytes()))
-    }
-
-    /// The same run, its pages going through a drive.
-    pub fn on_drive(mut self, frames: u64) -> Planned {
-        self.config.spill_dir = SPILL_PLACE.into();
-        self.config.frames = u32::try_from(frames).unwrap_or(u32::MAX);
-        self.config.host_mem = ByteSize(0);
-        self
     }
 
     /// Name of the run's folder.
@@ -109,40 +144,51 @@ impl Planned {
 }
 
 impl Sweep {
-    /// Opens or makes the folder; removes what runs that were cut off left in it.
+    /// Opens or creates the output folder, with results in `file`; removes the leftovers of interrupted runs.
     ///
     /// # Errors
-    /// The folder cannot be written, another sweep uses it, or its results cannot be read.
-    pub fn open(scene: &Path, out: &Path, spill: Option<&Path>, base: &TrainConfig, file: &str) -> InputResult<Sweep> {
-        let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
-        std::fs::create_dir_all(out.join("runs")).map_err(io)?;
-        let lock = lock(out)?;
+    /// The folder cannot be written, another sweep uses it, or the results cannot be read.
+    pub fn open(args: &SweepArgs, base: &TrainConfig, file: &str) -> InputResult<Sweep> {
+        let (scene, out, base) = (args.scene.clone(), args.out.clone(), base.clone());
+        make_folder(&out.join("runs"))?;
+        let lock = lock(&out)?;
         let log = ResultsLog::open(&out.join(file))?;
-        let surroundings = Surroundings::of(scene, out, spill)?;
-        let spill = spill.map_or_else(|| out.join("spill"), Path::to_path_buf);
-        let (scene, out, base) = (scene.to_path_buf(), out.to_path_buf(), base.clone());
-        // Only the one who holds the lock comes here, so nothing that is being written is removed.
+        let surroundings = Surroundings::of(args)?;
+        let spill = args.spill.clone().unwrap_or_else(|| out.join("spill"));
+        // This process holds the lock, so no run uses these files.
         remove_parts(&out.join("runs"), &[".part", ".part.toml"])?;
         remove_parts(&spill, &[&format!("{}.part", surroundings.mark)])?;
         Ok(Sweep { scene, out, spill, base, surroundings, lock, log })
     }
 
-    /// What keys the results beside the settings.
+    /// The results so far.
+    pub fn records(&self) -> &[RunRecord] {
+        self.log.records()
+    }
+
+    /// The part of a run's key beside the settings.
     pub fn surroundings(&self) -> &Surroundings {
         &self.surroundings
     }
 
-    /// The result of a run: from the file, or of a process that trains now.
+    /// The result of a run, from the log or from a training now. Prints the result as JSON; warns if the run failed.
     ///
     /// # Errors
-    /// The program is missing or was interrupted, or results cannot be written. A run that fails is a result.
-    pub fn run(&mut self, planned: &Planned) -> InputResult<RunRecord> {
+    /// The program is missing or was interrupted, or results cannot be written. A failed run is a result.
+    pub fn run(&mut self, planned: &Planned, print: &mut dyn FnMut(&Value)) -> InputResult<RunRecord> {
         let key = planned.key(&self.surroundings);
-        if let Some(done) = self.log.done(&key) {
-            return Ok(done.clone());
+        let record = match successful_run(self.log.records(), &key) {
+            Some(done) => done.clone(),
+            None => {
+                let record = self.train(planned, &key)?;
+                self.log.append(record.clone())?;
+                record
+            }
+        };
+        if let Some(problem) = &record.problem {
+            eprintln!("warning: the run failed: {problem}");
         }
-        let record = self.train(planned, &key)?;
-        self.log.append(record.clone())?;
+        print(&serde_json::to_value(&record).unwrap_or_default());
         Ok(record)
     }
 
@@ -163,7 +209,7 @@ impl Sweep {
         let output = self.spawn("gsscale-train", &arguments)?;
         record.wall_seconds = began.elapsed().as_secs_f64();
         if !output.status.success() {
-            // Said before the folders go: a run that stops early would keep its checkpoint.
+            // Before the folders are removed: an interrupted run keeps its checkpoint.
             refuse_interrupted(&output)?;
             record.problem = Some(problem(&output));
         } else {
@@ -196,7 +242,7 @@ impl Sweep {
         }
     }
 
-    /// Takes the figures from what the run left in `folder`, and removes its PLY, which is large.
+    /// Reads the figures from the run's folder and removes the PLY, which is large.
     fn read_figures(&self, record: &mut RunRecord, config: &TrainConfig, folder: &Path) -> InputResult<()> {
         let summary: Summary = read_json(&folder.join("summary.json"))?;
         let ply = folder.join("point_cloud.ply");
@@ -215,7 +261,7 @@ impl Sweep {
         record.view_order = TrainConfig::read(&folder.join("config.toml"))?.view_order.word().into_owned();
         let photos = |c: &TrainConfig| (c.data_factor, c.max_resolution);
         if photos(config) != photos(&self.base) {
-            // Smaller photos are easier: all are judged on the photos of the base.
+            // Smaller photos raise PSNR, so every run is evaluated on the photos of the base.
             let file = folder.join("evaluated-as.toml");
             write_config(&file, &self.base)?;
             let json = folder.join("evaluated.json");
@@ -232,7 +278,8 @@ impl Sweep {
         remove(&ply)
     }
 
-    /// Runs a program that lies beside this one to its end. Its input is the lock, which stays held as long as it lives.
+    /// Runs a program from the folder of this program to its end. The program's standard input is the lock file, so the
+    /// lock stays held while the program lives.
     fn spawn(&self, program: &str, arguments: &[&Path]) -> InputResult<Output> {
         let path = beside(program)?;
         let held = self.lock.try_clone().map_err(|e| InputError::io(&self.out, "handing on the lock", &e))?;
@@ -245,7 +292,7 @@ impl Sweep {
     }
 }
 
-/// Keys of `config` that are not as in `base`, the seed left out.
+/// Keys of `config` that differ from `base`, except the seed.
 fn changes(base: &TrainConfig, config: &TrainConfig) -> BTreeMap<String, String> {
     let table = |c: &TrainConfig| toml::Table::try_from(c).unwrap_or_default();
     let base = table(base);
@@ -262,17 +309,17 @@ fn write_config(path: &Path, config: &TrainConfig) -> InputResult<()> {
 fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> InputResult<T> {
     let text = std::fs::read(path).map_err(|e| InputError::io(path, "reading", &e))?;
     serde_json::from_slice(&text)
-        .map_err(|e| InputError::new(path, format!("is not what a run writes: {e}"), "run it again"))
+        .map_err(|e| InputError::new(path, format!("cannot be parsed: {e}"), "start the sweep again"))
 }
 
-/// The same path whether the folder is there yet or not: links of what is there are followed.
-fn whole(path: &Path) -> PathBuf {
+/// The absolute path with links resolved, as far as the path exists: creating the folder does not change the result.
+fn resolved(path: &Path) -> PathBuf {
     let path = std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
     let of = |up: &Path| Some(std::fs::canonicalize(up).ok()?.join(path.strip_prefix(up).ok()?));
     path.ancestors().find_map(of).unwrap_or_else(|| path.clone())
 }
 
-/// A program that lies beside this one.
+/// Path of a program in the folder of this program.
 fn beside(program: &str) -> InputResult<PathBuf> {
     let own = std::env::current_exe().map_err(|e| InputError::io(program, "finding this program", &e))?;
     let path = own.with_file_name(format!("{program}{}", std::env::consts::EXE_SUFFIX));
@@ -289,25 +336,23 @@ fn lock(out: &Path) -> InputResult<File> {
     let file = OpenOptions::new().write(true).create(true).truncate(false).open(&path).map_err(io)?;
     match file.try_lock() {
         Err(TryLockError::WouldBlock) => {
-            let problem = "another sweep, or a run that a killed one left behind, is at work here";
-            Err(InputError::new(out, problem, "wait until it has ended, or choose another --out"))
+            let problem = "in use by another sweep, or by a run that a killed sweep left behind";
+            Err(InputError::new(out, problem, "wait for its end, or choose another --out"))
         }
-        // Where a file system knows no locks there is one sweep all the same.
+        // Without lock support of the file system, the user keeps to one sweep.
         Ok(()) | Err(TryLockError::Error(_)) => Ok(file),
     }
 }
 
-/// A run that somebody stopped is no result: the sweep stops too, and goes on with this run next time.
+/// An interrupted run is not a result: the sweep ends too, and the next call repeats this run.
 fn refuse_interrupted(output: &Output) -> InputResult<()> {
     match output.status.code() {
-        Some(130 | 143) => {
-            Err(InputError::new("the sweep", "was interrupted", "the same command goes on where it stopped"))
-        }
+        Some(130 | 143) => Err(InputError::new("the sweep", "was interrupted", "start it again to continue")),
         _ => Ok(()),
     }
 }
 
-/// What a failed program said last, or how it ended.
+/// The last error message of a failed program, or its exit status.
 fn problem(output: &Output) -> String {
     let said = String::from_utf8_lossy(&output.stderr);
     let errors = said.rfind("error: ").map_or(said.trim(), |at| said[at..].trim());
@@ -331,7 +376,7 @@ fn make_folder(path: &Path) -> InputResult<()> {
     std::fs::create_dir_all(path).map_err(|e| InputError::io(path, "making the folder", &e))
 }
 
-/// Removes a file or folder of a run, if it is there.
+/// Removes a file or folder of a run, if it exists.
 fn remove(path: &Path) -> InputResult<()> {
     let removed = if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
     match removed {
@@ -340,7 +385,7 @@ fn remove(path: &Path) -> InputResult<()> {
     }
 }
 
-/// Removes what runs that were cut off left in a folder, by how the names end.
+/// Removes the leftovers of interrupted runs from a folder: names with one of these endings.
 fn remove_parts(folder: &Path, ends: &[&str]) -> InputResult<()> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
     let is_part = |path: &PathBuf| {

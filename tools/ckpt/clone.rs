@@ -30,7 +30,7 @@ pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
     super::print(args.json, &done, || {
         format!(
             "{}: {} generations, {} page versions, {} read and verified\n\
-             go on with it: gsscale-train --resume OUT --spill-dir {}",
+             continue from the copy: gsscale-train --resume OUT --spill-dir {}",
             done.to.display(),
             done.generations.len(),
             done.versions,

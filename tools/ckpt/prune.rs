@@ -49,15 +49,15 @@ fn text_of(pruned: &Pruned) -> String {
     if pruned.dropped_names.is_empty() {
         return format!("no name to remove; kept generations: {}", list(&pruned.kept));
     }
-    let (names, gone) = (pruned.dropped_names.join(", "), list(&pruned.dropped));
+    let (names, removed) = (pruned.dropped_names.join(", "), list(&pruned.dropped));
     match pruned.is_done {
         true => format!(
-            "removed names: {names}; removed generations: {gone}; kept: {}; {} free for the run",
+            "removed names: {names}; removed generations: {removed}; kept: {}; {} free for the run",
             list(&pruned.kept),
             format_bytes(pruned.bytes_freed)
         ),
         false => {
-            format!("would remove names: {names}; would remove generations: {gone}; kept: {}", list(&pruned.kept))
+            format!("would remove names: {names}; would remove generations: {removed}; kept: {}", list(&pruned.kept))
         }
     }
 }

@@ -46,9 +46,9 @@ fn text_of(done: &RolledBack) -> String {
         [] => String::new(),
         names => format!(" with the names {}", names.join(", ")),
     };
-    let (was, list) = (if *is_done { "gone" } else { "would be gone" }, list.join(", "));
+    let list = list.join(", ");
     match is_done {
-        true => format!("the store is at generation {generation} (step {step}); {was}: {list}{names}"),
-        false => format!("the store would be at generation {generation} (step {step}); {was}: {list}{names}"),
+        true => format!("the store is at generation {generation} (step {step}); removed: {list}{names}"),
+        false => format!("would go back to generation {generation} (step {step}) and remove: {list}{names}"),
     }
 }
