@@ -22,9 +22,11 @@
 //! 5. Contents of a new buffer are arbitrary (it may be reused): use [`Recorder::clear`] where zeros are needed.
 //! 6. One recorder at a time, set aside or not, because only then do its commands and its reused buffers share one order.
 
+mod adapter;
 mod belt;
 mod buffers;
 mod device;
+mod driver;
 mod error;
 mod injected;
 mod layout;
@@ -33,19 +35,16 @@ mod readback;
 mod record;
 mod shader;
 mod sources;
+mod uniforms;
 
+pub use adapter::{AdapterSummary, DeviceChoice, DeviceKind, WORKGROUP, list_adapters};
 pub use buffers::{Buffer, BufferView};
-pub use device::{AdapterSummary, DeviceChoice, DeviceKind, Gpu, GpuOptions, Traffic, list_adapters};
+pub use device::{Gpu, GpuOptions, Traffic};
 pub use error::{GpuError, GpuResult};
 pub use injected::{FaultKind, InjectedFault};
 pub use layout::StructLayout;
 pub use profile::StageTime;
 pub use readback::Readback;
 pub use record::{Recorder, Recording, Submission, groups_1d};
-pub use shader::{
-    Binding, BindingKind, Defines, Pipeline, Reflection, Source, preprocess, reflect, validate, variants,
-};
-pub use sources::SOURCES;
-
-/// Invocations of a workgroup, unless a shader needs another number.
-pub const WORKGROUP: u32 = 256;
+pub use shader::{Binding, BindingKind, Pipeline, Reflection, reflect, validate};
+pub use sources::{Defines, SOURCES, Source, preprocess, variants};

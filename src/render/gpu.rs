@@ -212,7 +212,7 @@ impl GpuRenderer {
             let mut recorder = gpu.begin("coverage");
             let bytes = recorder.read_back("rasterize_fwd", &view.frame.t_final.view())?;
             gpu.submit(recorder)?;
-            bytes.copy_to(gpu, &mut alpha)?;
+            bytes.copy_to(&mut alpha)?;
             alpha.iter_mut().for_each(|t| *t = 1.0 - *t);
             Ok((view, alpha))
         })
@@ -293,7 +293,7 @@ impl GpuRenderer {
         let demand = loop {
             let demand = match view.need {
                 Need::Met(demand) => demand,
-                Need::UnderWay(readback) => readback.wait(gpu)?,
+                Need::UnderWay(readback) => readback.wait()?,
             };
             view.need = Need::Met(demand);
             if self.tiles.fits(&view.frame, demand)? {
@@ -322,7 +322,7 @@ impl GpuRenderer {
         self.gpu.submit(recorder)?;
         (self.image.width, self.image.height) = (width, height);
         self.image.rgb.resize(3 * view.of.camera.pixels(), 0.0);
-        bytes.copy_to(&self.gpu, &mut self.image.rgb)
+        bytes.copy_to(&mut self.image.rgb)
     }
 
     /// Submits the loss of `rgb`, the view's picture, whether or not it is right yet, or what the caller made of it.
@@ -358,7 +358,7 @@ impl GpuRenderer {
             let mut recorder = self.gpu.begin("picture gradient");
             let bytes = recorder.read_back("image_loss", &loss.v_rgb.view())?;
             self.gpu.submit(recorder)?;
-            bytes.copy_to(&self.gpu, &mut self.gradient.v_rgb)?;
+            bytes.copy_to(&mut self.gradient.v_rgb)?;
         }
         Ok(view)
     }
@@ -430,22 +430,22 @@ impl GpuRenderer {
         }
         let mut colors = back.colors.into_iter();
         for bytes in colors.by_ref().take(1) {
-            bytes.copy_to(&self.gpu, &mut out.sh0)?;
+            bytes.copy_to(&mut out.sh0)?;
         }
         for (band, bytes) in colors.enumerate() {
             let values = &mut self.scratch.band;
             values.clear();
             values.resize(rows * super::gpu_rows::BAND_WIDTHS[band], 0.0);
-            bytes.copy_to(&self.gpu, values)?;
+            bytes.copy_to(values)?;
             band_into_sh_n(values, band, out);
         }
         let geometry = [&mut out.means, &mut out.quats, &mut out.scales, &mut out.opacities];
         for (to, bytes) in geometry.into_iter().zip(back.geometry) {
-            bytes.copy_to(&self.gpu, to)?;
+            bytes.copy_to(to)?;
         }
         let footprints = &mut self.scratch.footprints;
         room::resize(footprints, rows, [0.0; 4]);
-        back.footprints.copy_to(&self.gpu, footprints)?;
+        back.footprints.copy_to(footprints)?;
         grads.radii.clear();
         grads.radii.extend(footprints.iter().map(|f| [f[2] as u32, f[3] as u32]));
         grads.means2d.clear();
@@ -463,7 +463,7 @@ impl GpuRenderer {
             Sums::Nothing => [0.0; 4],
             Sums::UnderWay(readback) => {
                 let mut sums = [0.0f32; 4];
-                readback.copy_to(&self.gpu, &mut sums)?;
+                readback.copy_to(&mut sums)?;
                 sums
             }
             Sums::Here(sums) => sums,
