@@ -13,6 +13,7 @@
 //! inner loop needs no other test.
 
 use super::constants::{TILE, TRANSMITTANCE_MIN};
+use super::lanes::Lane;
 use super::splats::{Grid, LOG2_ALPHA_MIN, Splat};
 use super::tile_block::{Block, ROWS, prefetch_splats};
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch, fma};
@@ -20,8 +21,6 @@ use rayon::prelude::*;
 use std::cell::RefCell;
 use std::sync::atomic::AtomicU64;
 
-/// One value per pixel of a row of a tile.
-pub type Lanes = [f32; LANES];
 /// Pixels of a tile.
 pub const TILE_PIXELS: usize = (TILE * TILE) as usize;
 /// Stop position of a pixel that processed its whole list.
@@ -126,11 +125,11 @@ const BLOCK: usize = 64;
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 struct Row {
-    t: Lanes,
+    t: Lane,
     /// A lane stops when its T would fall to this or below; -1 for dead lanes.
-    floor: Lanes,
-    rgb: [Lanes; 3],
-    t_final: Lanes,
+    floor: Lane,
+    rgb: [Lane; 3],
+    t_final: Lane,
     stop: [u32; LANES],
     /// Whether any lane is alive.
     alive: bool,
@@ -149,7 +148,7 @@ impl Row {
     /// Stops the lanes whose next transmittance is at or below their floor, at list index `at`.
     #[cold]
     #[inline(never)]
-    fn stop_lanes(&mut self, at: u32, t: &Lanes, next: &mut Lanes, weight: &mut Lanes) {
+    fn stop_lanes(&mut self, at: u32, t: &Lane, next: &mut Lane, weight: &mut Lane) {
         for lane in 0..LANES {
             if next[lane] <= self.floor[lane] {
                 self.t_final[lane] = t[lane];
@@ -247,7 +246,7 @@ fn blend_row<const FMA: bool>(row: &mut Row, y: usize, first: u32, block: &Block
     let mut reach = block.reach[y];
     let count = u64::from(reach.count_ones());
     let (mut t, mut rgb) = (row.t, row.rgb);
-    let x: Lanes = std::array::from_fn(|lane| x0 + lane as f32);
+    let x: Lane = std::array::from_fn(|lane| x0 + lane as f32);
     while reach != 0 {
         let i = reach.trailing_zeros() as usize % BLOCK;
         reach &= reach - 1;
@@ -307,7 +306,7 @@ pub fn rasterize_fwd(lists: &Lists<'_>, out: &mut Raster) {
 #[inline(always)]
 pub(super) fn copy_lanes(out: &mut [f32], from: &[f32]) {
     let n = out.len();
-    match (<&mut Lanes>::try_from(&mut *out), from.first_chunk::<LANES>()) {
+    match (<&mut Lane>::try_from(&mut *out), from.first_chunk::<LANES>()) {
         (Ok(out), Some(from)) => *out = *from,
         _ => out.copy_from_slice(&from[..n]),
     }
