@@ -96,20 +96,6 @@ fn dispatches_fold_beyond_65535_workgroups() {
 }
 
 #[test]
-fn the_device_can_choose_the_number_of_workgroups() {
-    let Some(gpu) = open(&GpuOptions::default()) else { return };
-    let mut pass = gpu.begin("test");
-    let marks = pass.buffer_zeroed("marks", 40).unwrap();
-    let groups = pass.buffer_with("groups", &[7u32, 1, 1]).unwrap();
-    let pipeline = gpu.pipeline_from(&MARK, "main", &[]).unwrap();
-    let uniform = pass.uniform(&TestUniforms { count: 10, add: 5 }).unwrap();
-    pass.dispatch_indirect("mark", &pipeline, &[uniform, marks.view()], &groups.view()).unwrap();
-    let readback = pass.read_back("mark", &marks.view()).unwrap();
-    gpu.submit(pass).unwrap();
-    assert_eq!(readback.to_vec::<u32>().unwrap(), [5, 6, 7, 8, 9, 10, 11, 0, 0, 0]);
-}
-
-#[test]
 fn every_dispatch_has_its_own_uniforms() {
     let Some(gpu) = open(&GpuOptions::default()) else { return };
     let pipeline = gpu.pipeline_from(&MARK, "main", &[]).unwrap();
@@ -224,8 +210,8 @@ fn a_binding_beyond_the_limit_is_refused_and_windows_are_not() {
     let mut pass = gpu.begin("test");
     let from = pass.buffer_with("values_in", &values).unwrap();
     let to = gpu.buffer("values_out", from.size()).unwrap();
-    let rows = gpu.rows_per_window(4);
-    assert!(rows * 4 <= limit && rows * 4 % gpu.offset_alignment() == 0);
+    let rows = limit / 4;
+    assert_eq!(limit % gpu.offset_alignment(), 0);
     let mut row = 0;
     while row < values.len() as u64 {
         let count = rows.min(values.len() as u64 - row);

@@ -13,11 +13,9 @@ use super::error::{GpuError, GpuResult, lock};
 /// Smallest buffer, bytes; also the size of a view of an empty buffer.
 const CLASS_MIN: u64 = 256;
 
-/// Every buffer of the pool serves shaders, copies and counts of workgroups.
-const USAGES: wgpu::BufferUsages = wgpu::BufferUsages::STORAGE
-    .union(wgpu::BufferUsages::COPY_SRC)
-    .union(wgpu::BufferUsages::COPY_DST)
-    .union(wgpu::BufferUsages::INDIRECT);
+/// Every buffer of the pool serves shaders and copies.
+const USAGES: wgpu::BufferUsages =
+    wgpu::BufferUsages::STORAGE.union(wgpu::BufferUsages::COPY_SRC).union(wgpu::BufferUsages::COPY_DST);
 
 /// A buffer on the device; returns to the pool when dropped.
 #[derive(Debug)]

@@ -3,7 +3,7 @@
 //! Invariants: (1) every limit that the shaders need is requested; (2) no call here panics.
 
 use std::fmt;
-use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use super::adapter::{AdapterSummary, DeviceChoice, DeviceKind, choose, limits_to_request};
@@ -76,7 +76,8 @@ pub struct Gpu {
     pub(super) profiler: Mutex<Profiler>,
     pub(super) injector: Injector,
     pub(super) uploaded: AtomicU64,
-    pub(super) recorders: Arc<AtomicU32>,
+    /// Every open recording holds a reference.
+    pub(super) recordings: Arc<()>,
     pub(super) serial: bool,
     pipelines: Pipelines,
     pool: Arc<Pool>,
@@ -133,7 +134,7 @@ impl Gpu {
             profiler: Mutex::new(profiler),
             injector: Injector::new(options.fault.or_else(InjectedFault::from_environment)),
             uploaded: AtomicU64::new(0),
-            recorders: Arc::default(),
+            recordings: Arc::default(),
             serial: options.serial,
             pipelines: Pipelines::new(Arc::clone(&driver), subgroup_defines, uniform_blocks),
             pool: Pool::new(Arc::clone(&driver), options.budget.unwrap_or(u64::MAX), limits.max_buffer_size),
@@ -168,14 +169,6 @@ impl Gpu {
     /// Alignment of the offsets of bound windows, bytes.
     pub fn offset_alignment(&self) -> u64 {
         self.offset_alignment
-    }
-
-    /// Most rows of `row_bytes` in one binding, such that every window starts at an offset that can be bound.
-    pub fn rows_per_window(&self, row_bytes: u64) -> u64 {
-        let row_bytes = row_bytes.max(1);
-        let alignment = self.offset_alignment;
-        let step = alignment / (1 << row_bytes.trailing_zeros().min(alignment.trailing_zeros()));
-        (self.max_binding_bytes / row_bytes / step * step).max(step)
     }
 
     /// The pipeline of an entry point of a shader in [`SOURCES`]; compiled on first use.

@@ -20,7 +20,10 @@
 //! 3. Counts come from uniforms or buffers, never from `arrayLength`: a view of an empty buffer still spans some bytes.
 //! 4. No workgroup waits for another; no invocation loops more than 65,535 times in total.
 //! 5. Contents of a new buffer are arbitrary (it may be reused): use [`Recorder::clear`] where zeros are needed.
-//! 6. One recorder at a time, set aside or not, because only then do its commands and its reused buffers share one order.
+//! 6. Only one recorder may be open, set aside or not: reused buffers rely on commands that run in the order recorded.
+//!
+//! Files import each other in one direction: `error` <- `driver` (the wgpu device that the others share) <- `buffers`,
+//! `belt`, `shader` <- `readback`, `uniforms` <- `profile` <- `device` <- `record`.
 
 mod adapter;
 mod belt;
@@ -46,5 +49,5 @@ pub use layout::StructLayout;
 pub use profile::StageTime;
 pub use readback::Readback;
 pub use record::{Recorder, Recording, Submission, groups_1d};
-pub use shader::{Binding, BindingKind, Pipeline, Reflection, reflect, validate};
+pub use shader::{Pipeline, validate};
 pub use sources::{Defines, SOURCES, Source, preprocess, variants};

@@ -5,7 +5,7 @@
 //! uploads fill a staging set, the commands recorded so far are submitted and recording continues.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::Ordering;
 
 use super::adapter::GROUPS_MAX;
 use super::belt::SET_BYTES;
@@ -37,25 +37,8 @@ pub struct Submission {
     name: &'static str,
 }
 
-/// Counts a recording as open while it exists.
-#[derive(Debug)]
-struct Open(Arc<AtomicU32>);
-
-impl Open {
-    fn new(recorders: &Arc<AtomicU32>) -> Open {
-        recorders.fetch_add(1, Ordering::Relaxed);
-        Open(Arc::clone(recorders))
-    }
-}
-
-impl Drop for Open {
-    fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::Relaxed);
-    }
-}
-
-/// The unsubmitted work of a recorder, set aside between two calls of its owner; [`Gpu::resume`] continues it. Until then
-/// it counts as an open recorder: no other one can be submitted.
+/// The unsubmitted work of a recorder, set aside between two calls of its owner; [`Gpu::resume`] continues it. Until
+/// then it counts as an open recorder, and no other recorder can be submitted.
 #[derive(Debug)]
 #[must_use]
 pub struct Recording {
@@ -64,7 +47,7 @@ pub struct Recording {
     pass: Option<(wgpu::ComputePass<'static>, &'static str)>,
     uniforms: Vec<Vec<u8>>,
     readbacks: Vec<PendingMap>,
-    _open: Open,
+    _open: Arc<()>,
 }
 
 /// A recording of work.
@@ -78,7 +61,7 @@ impl Gpu {
     pub fn begin(&self, name: &'static str) -> Recorder<'_> {
         let encoder = self.driver.encoder(name);
         let (uniforms, readbacks) = (Vec::new(), Vec::new());
-        let work = Recording { name, encoder, pass: None, uniforms, readbacks, _open: Open::new(&self.recorders) };
+        let work = Recording { name, encoder, pass: None, uniforms, readbacks, _open: Arc::clone(&self.recordings) };
         Recorder { gpu: self, work }
     }
 
@@ -92,7 +75,8 @@ impl Gpu {
     /// # Errors
     /// The API refused the commands, the device was lost or ran out of memory, or two recorders were open at once.
     pub fn submit(&self, mut recorder: Recorder<'_>) -> GpuResult<Submission> {
-        if self.recorders.load(Ordering::Relaxed) > 1 {
+        // One reference is the device's own, one that of `recorder`.
+        if Arc::strong_count(&self.recordings) > 2 {
             return Err(GpuError::bindings(recorder.work.name, "two recorders are open at once"));
         }
         let submission = recorder.flush()?;
@@ -244,22 +228,6 @@ impl Recorder<'_> {
             return Err(GpuError::bindings(stage, problem));
         }
         self.bind(stage, pipeline, views)?.dispatch_workgroups(groups[0], groups[1], groups[2]);
-        self.gpu.driver.faults.check()
-    }
-
-    /// Dispatches a stage; `groups` holds the three workgroup counts on the device.
-    ///
-    /// # Errors
-    /// As [`Recorder::dispatch`].
-    pub fn dispatch_indirect(
-        &mut self,
-        stage: &'static str,
-        pipeline: &Pipeline,
-        views: &[BufferView],
-        groups: &BufferView,
-    ) -> GpuResult<()> {
-        self.check_copy(stage, groups, 12)?;
-        self.bind(stage, pipeline, views)?.dispatch_workgroups_indirect(&groups.raw, groups.offset);
         self.gpu.driver.faults.check()
     }
 

@@ -15,7 +15,7 @@ use super::sources::{Defines, Source, preprocess, switches};
 
 /// Kind of a binding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum BindingKind {
+pub(super) enum BindingKind {
     /// `var<uniform>`
     Uniform,
     /// `var<storage, read>`
@@ -26,26 +26,24 @@ pub enum BindingKind {
 
 /// One binding that an entry point uses.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Binding {
+pub(super) struct Binding {
     /// Number in group 0.
-    pub number: u32,
+    pub(super) number: u32,
     /// Name of the variable.
-    pub name: String,
+    pub(super) name: String,
     /// Kind of the binding.
-    pub kind: BindingKind,
+    pub(super) kind: BindingKind,
     /// Least bytes that a view must span; for a runtime-sized array, one element.
-    pub min_size: u64,
+    pub(super) min_size: u64,
 }
 
 /// The compiler's reflection of an entry point.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Reflection {
+pub(super) struct Reflection {
     /// Bindings used, by number.
-    pub bindings: Vec<Binding>,
-    /// Invocations of a workgroup, per dimension.
-    pub workgroup_size: [u32; 3],
+    pub(super) bindings: Vec<Binding>,
     /// Workgroup memory, bytes.
-    pub workgroup_storage: u64,
+    pub(super) workgroup_storage: u64,
 }
 
 /// A compiled entry point.
@@ -54,7 +52,7 @@ pub struct Pipeline {
     pub(super) raw: wgpu::ComputePipeline,
     pub(super) layout: wgpu::BindGroupLayout,
     /// The compiler's reflection.
-    pub reflection: Reflection,
+    pub(super) reflection: Reflection,
 }
 
 /// Shader, entry point and defines of a pipeline.
@@ -171,7 +169,7 @@ pub fn validate(name: &str, text: &str, subgroups: bool) -> GpuResult<(naga::Mod
 ///
 /// # Errors
 /// The text does not validate, the entry point does not exist, or a binding is outside group 0.
-pub fn reflect(name: &str, text: &str, entry: &str, subgroups: bool) -> GpuResult<Reflection> {
+fn reflect(name: &str, text: &str, entry: &str, subgroups: bool) -> GpuResult<Reflection> {
     let (module, info) = validate(name, text, subgroups)?;
     let index = module
         .entry_points
@@ -205,6 +203,5 @@ pub fn reflect(name: &str, text: &str, entry: &str, subgroups: bool) -> GpuResul
         bindings.push(Binding { number, name: variable_name, kind, min_size });
     }
     bindings.sort_by_key(|b| b.number);
-    let workgroup_size = module.entry_points[index].workgroup_size;
-    Ok(Reflection { bindings, workgroup_size, workgroup_storage })
+    Ok(Reflection { bindings, workgroup_storage })
 }

@@ -145,17 +145,14 @@ fn params(source: &Source) -> GpuResult<BTreeMap<String, Vec<String>>> {
 /// An import is missing or a directive is malformed.
 pub fn variants(source: &Source) -> GpuResult<Vec<Vec<(String, String)>>> {
     let mut all = vec![Vec::new()];
-    for switch in switches(source)? {
-        let with = all.iter().map(|v| [v.clone(), vec![(switch.clone(), String::new())]].concat());
-        all = all.iter().cloned().chain(with.collect::<Vec<_>>()).collect();
+    for switch in &switches(source)? {
+        let with: Vec<_> =
+            all.iter().map(|v| [v.as_slice(), &[(switch.clone(), String::new())][..]].concat()).collect();
+        all.extend(with);
     }
-    for (name, values) in params(source)? {
-        let with = |v: &Vec<(String, String)>| {
-            let v = v.clone();
-            let name = name.clone();
-            values.clone().into_iter().map(move |value| [v.clone(), vec![(name.clone(), value)]].concat())
-        };
-        all = all.iter().flat_map(with).collect();
+    for (name, values) in &params(source)? {
+        let with = |v: &Vec<_>, value: &String| [v.as_slice(), &[(name.clone(), value.clone())][..]].concat();
+        all = all.iter().flat_map(|v| values.iter().map(move |value| with(v, value))).collect();
     }
     Ok(all)
 }
@@ -166,21 +163,16 @@ pub fn variants(source: &Source) -> GpuResult<Vec<Vec<(String, String)>>> {
 /// A define is unknown, a value is not in its list, an import is missing, or a condition is not closed.
 pub fn preprocess(source: &Source, defines: Defines<'_>) -> GpuResult<String> {
     let switches = switches(source)?;
-    let mut values: BTreeMap<String, String> = BTreeMap::new();
-    for (name, list) in params(source)? {
-        values.insert(name, list.into_iter().next().unwrap_or_default());
-    }
     let lists = params(source)?;
+    let mut values: BTreeMap<_, _> = lists.iter().map(|(name, list)| (name.clone(), list[0].clone())).collect();
     for (name, value) in defines {
         match lists.get(*name) {
             Some(list) if list.iter().any(|v| v == value) => {
                 values.insert(name.to_string(), value.to_string());
             }
             Some(list) => {
-                return Err(GpuError::shader(
-                    source.name,
-                    format!("{name} = {value:?} is none of {}", list.join(", ")),
-                ));
+                let problem = format!("{name} = {value:?} is none of {}", list.join(", "));
+                return Err(GpuError::shader(source.name, problem));
             }
             None if switches.contains(*name) => {}
             None => return Err(GpuError::shader(source.name, format!("does not know the define {name}"))),

@@ -79,7 +79,7 @@ struct Tile {
 }
 
 thread_local! {
-    /// One per thread: making it anew for every tile would cost as much as some hundred splats.
+    /// Each thread reuses its own: initialising one for every tile would cost as much as about a hundred splats.
     static SCRATCH: RefCell<Box<Tile>> = RefCell::new(Box::new(Tile {
         rows: [Row::EMPTY; ROWS],
         row_stop: [0; ROWS],

@@ -169,7 +169,7 @@ struct Tile {
 }
 
 thread_local! {
-    /// One per thread: making it anew for every tile would cost as much as blending a few hundred splats.
+    /// Each thread reuses its own: initialising one for every tile would cost as much as blending a few hundred splats.
     static SCRATCH: RefCell<Box<Tile>> = RefCell::new(Box::new(Tile { rows: [Row::DEAD; ROWS], block: Block::new() }));
 }
 
@@ -343,12 +343,10 @@ pub fn untile(grid: Grid, raster: &Raster, rgb: &mut [f32], alpha: &mut [f32]) {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 pub(in crate::kernels) mod tests {
     use super::*;
-    use crate::base::rng::{Purpose, Stream};
-    use crate::kernels::isect_emit::{count, emit};
+    use crate::kernels::isect_emit::{count, emit, tests::random_rows};
     use crate::kernels::isect_offsets::isect_offsets;
-    use crate::kernels::project_fwd::Projected;
     use crate::kernels::scan::scan;
-    use crate::kernels::splats::{Packed, pack};
+    use crate::kernels::splats::Packed;
 
     /// Footprints of all kinds, depths in row order, with their intersections.
     pub(in crate::kernels) struct Scene {
@@ -362,33 +360,16 @@ pub(in crate::kernels) mod tests {
 
     pub(in crate::kernels) fn scene(n: usize, needles: bool) -> Scene {
         let grid = Grid::new(70, 43);
-        let mut draws = Stream::new(21, Purpose::Test, n as u64, u64::from(needles));
-        let mut p = Projected::default();
-        let mut colors = Vec::new();
-        for _ in 0..n {
-            let major = draws.range(-1.0, if needles { 9.0 } else { 4.0 }).exp2();
-            let minor = if needles { 0.6 } else { draws.range(-1.0, 3.0).exp2() };
-            let (sin, cos) = draws.range(0.0, 3.2).sin_cos();
-            let (u, v) = (1.0 / (major * major), 1.0 / (minor * minor));
-            let conic = [u * cos * cos + v * sin * sin, (u - v) * sin * cos, u * sin * sin + v * cos * cos];
-            p.means2d.push([draws.range(-20.0, 90.0) as f32, draws.range(-20.0, 60.0) as f32]);
-            p.conics.push(conic.map(|x| x as f32));
-            p.radii.push([conic[2], conic[0]].map(|x| (3.33 * (x / (u * v)).sqrt()).ceil() as u32));
-            // A third of the opacities can reach the clamp.
-            p.opacities.push((draws.range(0.0, 1.5) as f32).min(1.0));
-            p.depths.push(1.0);
-            colors.push([0; 3].map(|_| draws.range(0.0, 1.5) as f32));
-        }
+        let (packed, projected) = random_rows(n, needles, n as u64, grid);
         let order: Vec<u32> = (0..n as u32).collect();
-        let (mut packed, simd) = (Packed::default(), SimdPath::best());
+        let simd = SimdPath::best();
         let (mut chunk_offsets, mut tile_offsets, mut isects) = (vec![], vec![], vec![]);
         let (mut tile_counts, mut cursors) = (vec![], vec![]);
-        pack(&p, &colors, grid, simd, &mut packed);
         count(&order, &packed, grid, simd, &mut tile_counts);
         let total = scan(&packed.chunk_counts, &mut chunk_offsets);
         isect_offsets(&tile_counts, grid.tiles(), &mut tile_offsets, &mut cursors);
         emit(&order, &packed, grid, simd, total, &mut cursors, &mut isects);
-        Scene { grid, radii: p.radii, packed, chunk_offsets, tile_offsets, isects }
+        Scene { grid, radii: projected.radii, packed, chunk_offsets, tile_offsets, isects }
     }
 
     impl Scene {

@@ -191,7 +191,7 @@ impl Ellipse {
 
 /// Pixel rows of a tile column, clipped to the box and the image; last < first if there is none.
 #[inline(always)]
-pub(super) fn rows_in_column(ellipse: &Ellipse, grid: Grid, tiles: [u16; 4], column: u16) -> [u16; 2] {
+fn rows_in_column(ellipse: &Ellipse, grid: Grid, tiles: [u16; 4], column: u16) -> [u16; 2] {
     let x0 = (u32::from(column) * TILE) as f32 + 0.5;
     let [first, last] = ellipse.rows_in(x0, x0 + (TILE - 1) as f32);
     let first = first.max(i32::from(tiles[1]) * TILE as i32);
@@ -369,21 +369,26 @@ impl PackedLanes {
     }
 }
 
-/// Number of tiles that a row reaches.
+/// Calls `each(tile column, pixel rows)` for every tile column of a row's span, from left to right.
 #[inline(always)]
-fn tiles_reached(splat: &Splat, span: &Span, grid: Grid) -> u32 {
+pub(super) fn for_each_column(splat: &Splat, span: &Span, grid: Grid, mut each: impl FnMut(u16, [u16; 2])) {
     let [x0, _, x1, _] = span.tiles;
-    let mut count = 0;
     for (column, rows) in (x0..x1).zip(span.rows) {
-        let _ = column;
-        count += tile_rows(rows).len() as u32;
+        each(column, rows);
     }
     if x1.saturating_sub(x0) > 2 {
         let ellipse = splat.ellipse();
         for column in x0 + 2..x1 {
-            count += tile_rows(rows_in_column(&ellipse, grid, span.tiles, column)).len() as u32;
+            each(column, rows_in_column(&ellipse, grid, span.tiles, column));
         }
     }
+}
+
+/// Number of tiles that a row reaches.
+#[inline(always)]
+fn tiles_reached(splat: &Splat, span: &Span, grid: Grid) -> u32 {
+    let mut count = 0;
+    for_each_column(splat, span, grid, |_, rows| count += tile_rows(rows).len() as u32);
     count
 }
 
