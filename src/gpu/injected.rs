@@ -80,7 +80,7 @@ impl Injector {
 pub(super) fn fill_device(driver: &Driver) {
     let mut taken = Vec::new();
     while !driver.faults.is_reported() && taken.len() < FILL_BUFFERS {
-        taken.push(driver.buffer("injected fault", FILL_BYTES, wgpu::BufferUsages::STORAGE));
+        taken.push(driver.buffer("filling the device", FILL_BYTES, wgpu::BufferUsages::STORAGE));
     }
 }
 
