@@ -8,9 +8,9 @@
 //!
 //! `SsimVariant::Valid` has no window on a picture with a side under 11 pixels: it falls back to `Same`.
 //!
-//! Invariants: 1. bands depend on the height alone and their f64 sums are added in order, so the bits are the same for any
-//! number of threads; 2. a call allocates nothing if its picture is no larger than earlier ones; 3. a picture with NaN
-//! or infinity at a used pixel gives a non-finite loss, never a panic.
+//! Invariants: 1. bands depend on the height alone and their f64 sums are added in order, so the bits are the same for
+//! any number of threads; 2. a call allocates nothing if its picture is no larger than earlier ones; 3. a picture with
+//! NaN or infinity at a used pixel gives a non-finite loss, never a panic.
 
 pub use super::image_pair::{ImagePair, Reference, SsimVariant};
 use super::image_pair::{WINDOW, counted};

@@ -50,8 +50,8 @@ fn unit_direction_vjp(unit: [f32; 3], inv_len: f32, v_unit: [f32; 3]) -> [f32; 3
 
 /// Backward of `sh_fwd`: writes `grads.means`, `grads.sh0` and `grads.sh_n`.
 ///
-/// `colors` is the output of `sh_fwd` and `v_colors` its gradient; `radii` are those given to `sh_fwd`: one entry per row
-/// each. `grads` is resized to the rows.
+/// `colors` is the output of `sh_fwd` and `v_colors` its gradient; `radii` are those given to `sh_fwd`: one entry per
+/// row each. `grads` is resized to the rows.
 pub fn sh_bwd(
     rows: &Columns,
     camera: &Camera,
