@@ -62,7 +62,7 @@ fn run_add(gpu: &Gpu, values: &[u32], add: u32, defines: &[(&str, &str)]) -> Res
     pass.dispatch("add", &pipeline, &[uniform, from.view(), to.view()], groups_1d(count, 256))?;
     let readback = pass.read_back("add", &to.view())?;
     gpu.submit(pass)?;
-    let mut out: Vec<u32> = readback.to_vec(gpu)?;
+    let mut out: Vec<u32> = readback.to_vec()?;
     out.truncate(values.len());
     Ok(out)
 }
@@ -91,22 +91,8 @@ fn dispatches_fold_beyond_65535_workgroups() {
     pass.dispatch("mark", &pipeline, &[uniform, marks.view()], groups).unwrap();
     let readback = pass.read_back("mark", &marks.view()).unwrap();
     gpu.submit(pass).unwrap();
-    let out: Vec<u32> = readback.to_vec(&gpu).unwrap();
+    let out: Vec<u32> = readback.to_vec().unwrap();
     assert!(out.iter().zip(1..).all(|(mark, once)| *mark == once), "each place exactly once");
-}
-
-#[test]
-fn the_device_can_choose_the_number_of_workgroups() {
-    let Some(gpu) = open(&GpuOptions::default()) else { return };
-    let mut pass = gpu.begin("test");
-    let marks = pass.buffer_zeroed("marks", 40).unwrap();
-    let groups = pass.buffer_with("groups", &[7u32, 1, 1]).unwrap();
-    let pipeline = gpu.pipeline_from(&MARK, "main", &[]).unwrap();
-    let uniform = pass.uniform(&TestUniforms { count: 10, add: 5 }).unwrap();
-    pass.dispatch_indirect("mark", &pipeline, &[uniform, marks.view()], &groups.view()).unwrap();
-    let readback = pass.read_back("mark", &marks.view()).unwrap();
-    gpu.submit(pass).unwrap();
-    assert_eq!(readback.to_vec::<u32>(&gpu).unwrap(), [5, 6, 7, 8, 9, 10, 11, 0, 0, 0]);
 }
 
 #[test]
@@ -122,7 +108,7 @@ fn every_dispatch_has_its_own_uniforms() {
     }
     let readback = pass.read_back("mark", &marks.view()).unwrap();
     gpu.submit(pass).unwrap();
-    assert_eq!(readback.to_vec::<u32>(&gpu).unwrap(), [rounds * (rounds + 1) / 2]);
+    assert_eq!(readback.to_vec::<u32>().unwrap(), [rounds * (rounds + 1) / 2]);
 }
 
 #[test]
@@ -135,7 +121,7 @@ fn uploads_larger_than_the_staging_arrive_whole() {
         let buffer = pass.buffer_with("values", &values).unwrap();
         let readback = pass.read_back("values", &buffer.view()).unwrap();
         gpu.submit(pass).unwrap();
-        assert!(readback.to_vec::<u32>(&gpu).unwrap() == values, "round {round}");
+        assert!(readback.to_vec::<u32>().unwrap() == values, "round {round}");
         let traffic = gpu.traffic();
         assert_eq!(traffic.bytes_uploaded, u64::from(round + 1) * (80 << 20));
         assert_eq!(traffic.bytes_read_back, u64::from(round + 1) * (80 << 20));
@@ -158,7 +144,7 @@ fn uploads_of_partial_words_arrive() {
         let buffer = pass.buffer_with("bytes", &bytes).unwrap();
         let readback = pass.read_back("bytes", &buffer.view()).unwrap();
         gpu.submit(pass).unwrap();
-        let out: Vec<u8> = readback.to_vec(&gpu).unwrap();
+        let out: Vec<u8> = readback.to_vec().unwrap();
         assert_eq!(out[..len], bytes);
         assert!(out[len..].iter().all(|b| *b == 0));
     }
@@ -175,7 +161,7 @@ fn results_of_several_submissions_can_be_under_way() {
         gpu.submit(pass).unwrap();
     }
     for (k, readback) in (0..5u32).zip(waiting) {
-        assert_eq!(readback.to_vec::<u32>(&gpu).unwrap(), [k, k + 1]);
+        assert_eq!(readback.to_vec::<u32>().unwrap(), [k, k + 1]);
     }
 }
 
@@ -224,8 +210,8 @@ fn a_binding_beyond_the_limit_is_refused_and_windows_are_not() {
     let mut pass = gpu.begin("test");
     let from = pass.buffer_with("values_in", &values).unwrap();
     let to = gpu.buffer("values_out", from.size()).unwrap();
-    let rows = gpu.rows_per_window(4);
-    assert!(rows * 4 <= limit && rows * 4 % gpu.offset_alignment() == 0);
+    let rows = limit / 4;
+    assert_eq!(limit % gpu.offset_alignment(), 0);
     let mut row = 0;
     while row < values.len() as u64 {
         let count = rows.min(values.len() as u64 - row);
@@ -236,7 +222,7 @@ fn a_binding_beyond_the_limit_is_refused_and_windows_are_not() {
     }
     let readback = pass.read_back("add", &to.view()).unwrap();
     gpu.submit(pass).unwrap();
-    assert!(readback.to_vec::<u32>(&gpu).unwrap().iter().zip(1..).all(|(a, b)| *a == b));
+    assert!(readback.to_vec::<u32>().unwrap().iter().zip(1..).all(|(a, b)| *a == b));
 }
 
 #[test]
@@ -264,7 +250,7 @@ fn wrong_bindings_and_copies_are_errors_that_name_them() {
     assert!(pass.copy(&a.view(), &a.slice(512, 512)).is_err());
     assert!(pass.clear(&a.slice(2, 4)).is_err());
     let early = pass.read_back("early", &a.view()).unwrap();
-    assert!(early.to_vec::<u32>(&gpu).unwrap_err().to_string().contains("before its commands were submitted"));
+    assert!(early.to_vec::<u32>().unwrap_err().to_string().contains("before its commands were submitted"));
     drop(pass);
     let (one, two) = (gpu.begin("one"), gpu.begin("two"));
     assert!(gpu.submit(one).unwrap_err().to_string().contains("two recorders"));
@@ -277,7 +263,7 @@ fn wrong_bindings_and_copies_are_errors_that_name_them() {
     let mut recorder = gpu.resume(recording);
     let sevens = recorder.read_back("three", &a.slice(0, 16)).unwrap();
     gpu.submit(recorder).unwrap();
-    assert_eq!(sevens.to_vec::<u32>(&gpu).unwrap(), [7; 4]);
+    assert_eq!(sevens.to_vec::<u32>().unwrap(), [7; 4]);
     drop(gpu.begin("five").set_aside());
     assert_eq!(run_add(&gpu, &[1, 2], 1, &[]).unwrap(), [2, 3], "the device is as good as before");
 }
@@ -323,7 +309,7 @@ fn shaders_take_the_plain_path_without_subgroups() {
         pass.dispatch("path", &pipeline, &[out.view()], [1, 1, 1]).unwrap();
         let readback = pass.read_back("path", &out.view()).unwrap();
         gpu.submit(pass).unwrap();
-        let sum = readback.to_vec::<u32>(&gpu).unwrap()[0];
+        let sum = readback.to_vec::<u32>().unwrap()[0];
         match gpu.summary().subgroup_sizes {
             Some((low, high)) if forced.is_none() => assert!((low..=high).contains(&sum), "{sum}"),
             _ => assert_eq!(sum, 0),

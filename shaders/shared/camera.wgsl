@@ -27,7 +27,4 @@ struct RowsUniforms {
     slope_high: vec2<f32>,
     /// Number of rows of this window.
     row_count: u32,
-    pad0: u32,
-    pad1: u32,
-    pad2: u32,
 }

@@ -35,7 +35,7 @@ impl RunId {
         self != RunId::UNKNOWN
     }
 
-    /// Whether both are known and differ: then one run must not change what the other made.
+    /// Whether both are known and differ: then neither run may change the other's files.
     pub fn is_other_than(self, other: RunId) -> bool {
         self.is_known() && other.is_known() && self != other
     }

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-/// CPU seconds, user and system, of all threads of this process so far; `None` if the system does not tell.
+/// CPU seconds, user and system, of all threads of this process so far; `None` if the system does not report them.
 ///
 /// From /proc/self/stat, whose ticks are hundredths of a second on every Linux (USER_HZ).
 pub fn process_cpu_seconds() -> Option<f64> {
@@ -31,8 +31,8 @@ pub fn cpu_model() -> String {
     name.unwrap_or(std::env::consts::ARCH).to_string()
 }
 
-/// Memory that this process may still take, bytes: what the machine has available, or what a control group's limit
-/// leaves, whichever is less. `None` if the system does not tell.
+/// Memory that this process can still allocate, bytes: the smaller of the machine's available memory and the rest of
+/// its control groups' limits. `None` if the system does not report it.
 pub fn memory_available() -> Option<u64> {
     let machine = meminfo_available(&std::fs::read_to_string("/proc/meminfo").ok()?)?;
     let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();

@@ -24,7 +24,8 @@ pub enum Purpose {
     Test = 7,
 }
 
-/// Mixes one 64-bit word (the finaliser of SplitMix64: Steele, Lea, Flood 2014, "Fast splittable pseudorandom number generators").
+/// Mixes one 64-bit word (the finaliser of SplitMix64: Steele, Lea, Flood 2014, "Fast splittable pseudorandom number
+/// generators").
 pub fn mix64(mut z: u64) -> u64 {
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);

@@ -7,7 +7,8 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 
-use super::error::{Faults, GpuError, GpuResult};
+use super::driver::Driver;
+use super::error::{GpuError, GpuResult};
 
 /// Bytes of one staging buffer: in the range where copies run fastest.
 const CHUNK_BYTES: u64 = 4 << 20;
@@ -35,12 +36,17 @@ struct Set {
 }
 
 /// Both sets; the first one is being filled.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Belt {
+    driver: Arc<Driver>,
     sets: [Set; 2],
 }
 
 impl Belt {
+    pub(super) fn new(driver: Arc<Driver>) -> Belt {
+        Belt { driver, sets: Default::default() }
+    }
+
     /// Host memory of the staging buffers, bytes.
     pub(super) fn bytes(&self) -> u64 {
         self.sets.iter().map(|s| s.chunks.len() as u64 * CHUNK_BYTES).sum()
@@ -50,23 +56,21 @@ impl Belt {
     /// staged. Fewer than all means that the set is full. `bytes.len()` is a multiple of 4.
     pub(super) fn write(
         &mut self,
-        device: &wgpu::Device,
-        faults: &Faults,
         encoder: &mut wgpu::CommandEncoder,
         target: &wgpu::Buffer,
         offset: u64,
         bytes: &[u8],
     ) -> GpuResult<usize> {
-        self.sets[0].wait(device, faults)?;
+        self.sets[0].wait(&self.driver)?;
         let mut done = 0;
         while done < bytes.len() {
-            let Some(chunk) = self.sets[0].chunk_with_room(device) else { break };
-            faults.check()?;
+            let Some(chunk) = self.sets[0].chunk_with_room(&self.driver) else { break };
+            self.driver.faults.check()?;
             let room = usize::try_from(CHUNK_BYTES - chunk.used).unwrap_or(0);
             let n = room.min(bytes.len() - done);
             let end = chunk.used + n as u64;
-            let mut view =
-                chunk.raw.get_mapped_range_mut(chunk.used..end).map_err(|e| mapping_failed(&e.to_string()))?;
+            let view = chunk.raw.get_mapped_range_mut(chunk.used..end);
+            let mut view = view.map_err(|e| GpuError::validation("upload", e))?;
             view.copy_from_slice(&bytes[done..done + n]);
             drop(view);
             encoder.copy_buffer_to_buffer(&chunk.raw, chunk.used, target, offset + done as u64, n as u64);
@@ -104,36 +108,27 @@ impl Belt {
 
 impl Set {
     /// Waits until the device has read the last content of this set.
-    fn wait(&mut self, device: &wgpu::Device, faults: &Faults) -> GpuResult<()> {
+    fn wait(&mut self, driver: &Driver) -> GpuResult<()> {
         let Some(submission) = self.submission.take() else { return Ok(()) };
-        let waited = device.poll(wgpu::PollType::Wait { submission_index: Some(submission), timeout: None });
-        faults.check()?;
-        waited.map_err(|e| mapping_failed(&e.to_string()))?;
+        driver.wait("upload", Some(submission))?;
         if self.chunks.iter().any(|c| c.state.load(Ordering::Acquire) != MAPPED) {
-            return Err(mapping_failed("staging memory could not be mapped again"));
+            return Err(GpuError::validation("upload", "staging memory could not be mapped again"));
         }
         Ok(())
     }
 
-    fn chunk_with_room(&mut self, device: &wgpu::Device) -> Option<&mut Chunk> {
+    /// A chunk that is not full; `None` if the set is full.
+    fn chunk_with_room(&mut self, driver: &Driver) -> Option<&mut Chunk> {
         let at = match self.chunks.iter().position(|c| c.used < CHUNK_BYTES) {
             Some(at) => at,
             None if self.chunks.len() as u64 * CHUNK_BYTES >= SET_BYTES => return None,
             None => {
-                let raw = device.create_buffer(&wgpu::BufferDescriptor {
-                    label: Some("upload staging"),
-                    size: CHUNK_BYTES,
-                    usage: wgpu::BufferUsages::MAP_WRITE | wgpu::BufferUsages::COPY_SRC,
-                    mapped_at_creation: true,
-                });
+                let usage = wgpu::BufferUsages::MAP_WRITE | wgpu::BufferUsages::COPY_SRC;
+                let raw = driver.buffer("upload staging", CHUNK_BYTES, usage);
                 self.chunks.push(Chunk { raw, state: Arc::new(AtomicU8::new(MAPPED)), used: 0 });
                 self.chunks.len() - 1
             }
         };
         self.chunks.get_mut(at)
     }
-}
-
-fn mapping_failed(message: &str) -> GpuError {
-    GpuError::Validation { stage: "upload".into(), message: message.into() }
 }

@@ -7,10 +7,15 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
-use super::error::{Faults, GpuError, GpuResult, lock};
+use super::driver::Driver;
+use super::error::{GpuError, GpuResult, lock};
 
 /// Smallest buffer, bytes; also the size of a view of an empty buffer.
 const CLASS_MIN: u64 = 256;
+
+/// Every buffer of the pool serves shaders and copies.
+const USAGES: wgpu::BufferUsages =
+    wgpu::BufferUsages::STORAGE.union(wgpu::BufferUsages::COPY_SRC).union(wgpu::BufferUsages::COPY_DST);
 
 /// A buffer on the device; returns to the pool when dropped.
 #[derive(Debug)]
@@ -66,7 +71,7 @@ impl Buffer {
 impl Drop for Buffer {
     fn drop(&mut self) {
         let mut state = lock(&self.pool.state);
-        state.in_use -= self.class;
+        state.usage.in_use -= self.class;
         state.free.entry(self.class).or_default().push(self.raw.clone());
     }
 }
@@ -74,6 +79,7 @@ impl Drop for Buffer {
 /// The pool with its accounting.
 #[derive(Debug)]
 pub(super) struct Pool {
+    driver: Arc<Driver>,
     state: Mutex<PoolState>,
     budget: u64,
     buffer_max: u64,
@@ -82,34 +88,25 @@ pub(super) struct Pool {
 #[derive(Debug, Default)]
 struct PoolState {
     free: BTreeMap<u64, Vec<wgpu::Buffer>>,
-    in_use: u64,
-    allocated: u64,
-    peak: u64,
-    allocations: u64,
+    usage: PoolUse,
 }
 
-/// The pool's accounting, bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// The pool's accounting: bytes of live buffers, of all buffers now and at most, and the number of buffers allocated.
+#[derive(Debug, Clone, Copy, Default)]
 pub(super) struct PoolUse {
     pub(super) in_use: u64,
-    pub(super) allocated: u64,
+    allocated: u64,
     pub(super) peak: u64,
     pub(super) allocations: u64,
 }
 
 impl Pool {
-    pub(super) fn new(budget: u64, buffer_max: u64) -> Arc<Pool> {
-        Arc::new(Pool { state: Mutex::default(), budget, buffer_max })
+    pub(super) fn new(driver: Arc<Driver>, budget: u64, buffer_max: u64) -> Arc<Pool> {
+        Arc::new(Pool { driver, state: Mutex::default(), budget, buffer_max })
     }
 
     /// A buffer of `size` bytes with arbitrary contents.
-    pub(super) fn take(
-        self: &Arc<Self>,
-        device: &wgpu::Device,
-        faults: &Faults,
-        label: &'static str,
-        size: u64,
-    ) -> GpuResult<Buffer> {
+    pub(super) fn take(self: &Arc<Self>, label: &'static str, size: u64) -> GpuResult<Buffer> {
         let limit = self.buffer_max / 4 * 4;
         if size > limit {
             return Err(GpuError::BufferTooLarge { what: label.into(), need: size, limit });
@@ -121,42 +118,34 @@ impl Pool {
             Some(raw) => raw,
             None => {
                 self.make_room(&mut state, label, class)?;
-                faults.set_stage(label);
-                let raw = device.create_buffer(&wgpu::BufferDescriptor {
-                    label: Some(label),
-                    size: class,
-                    usage: wgpu::BufferUsages::STORAGE
-                        | wgpu::BufferUsages::COPY_SRC
-                        | wgpu::BufferUsages::COPY_DST
-                        | wgpu::BufferUsages::INDIRECT,
-                    mapped_at_creation: false,
-                });
-                faults.check()?;
-                state.allocated += class;
-                state.allocations += 1;
-                state.peak = state.peak.max(state.allocated);
+                self.driver.faults.set_stage(label);
+                let raw = self.driver.buffer(label, class, USAGES);
+                self.driver.faults.check()?;
+                state.usage.allocated += class;
+                state.usage.allocations += 1;
+                state.usage.peak = state.usage.peak.max(state.usage.allocated);
                 raw
             }
         };
-        state.in_use += class;
+        state.usage.in_use += class;
         Ok(Buffer { raw, label, size, class, pool: Arc::clone(self) })
     }
 
     /// Returns free buffers to the device, largest first, until `class` bytes fit the budget.
     fn make_room(&self, state: &mut PoolState, label: &str, class: u64) -> GpuResult<()> {
-        if state.in_use.saturating_add(class) > self.budget {
+        if state.usage.in_use.saturating_add(class) > self.budget {
             return Err(GpuError::OutOfBudget {
                 what: label.into(),
                 need: class,
-                in_use: state.in_use,
+                in_use: state.usage.in_use,
                 budget: self.budget,
             });
         }
-        while state.allocated + class > self.budget {
+        while state.usage.allocated + class > self.budget {
             let Some(mut largest) = state.free.last_entry() else { break };
             let size = *largest.key();
             if largest.get_mut().pop().is_some() {
-                state.allocated -= size;
+                state.usage.allocated -= size;
             }
             if largest.get().is_empty() {
                 largest.remove();
@@ -168,13 +157,12 @@ impl Pool {
     /// Returns all free buffers to the device.
     pub(super) fn trim(&self) {
         let mut state = lock(&self.state);
-        state.allocated = state.in_use;
+        state.usage.allocated = state.usage.in_use;
         state.free.clear();
     }
 
     pub(super) fn usage(&self) -> PoolUse {
-        let state = lock(&self.state);
-        PoolUse { in_use: state.in_use, allocated: state.allocated, peak: state.peak, allocations: state.allocations }
+        lock(&self.state).usage
     }
 }
 

@@ -116,6 +116,23 @@ pub enum GpuError {
     },
 }
 
+impl GpuError {
+    /// The API refused the work of `stage`.
+    pub(super) fn validation(stage: &str, message: impl ToString) -> GpuError {
+        GpuError::Validation { stage: stage.into(), message: message.to_string() }
+    }
+
+    /// A fault of a shader.
+    pub(super) fn shader(shader: &str, problem: impl Into<String>) -> GpuError {
+        GpuError::Shader { shader: shader.into(), problem: problem.into() }
+    }
+
+    /// A mismatch in the work of `stage`.
+    pub(super) fn bindings(stage: &str, problem: impl Into<String>) -> GpuError {
+        GpuError::Bindings { stage: stage.into(), problem: problem.into() }
+    }
+}
+
 /// Result of calls that use a device.
 pub type GpuResult<T> = Result<T, GpuError>;
 

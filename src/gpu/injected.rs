@@ -4,6 +4,12 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use super::driver::Driver;
+
+/// Bytes of a buffer that fills the device, and most such buffers: a tebibyte in total.
+const FILL_BYTES: u64 = 128 << 20;
+const FILL_BUFFERS: usize = 8192;
+
 /// Kind of a fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FaultKind {
@@ -67,6 +73,14 @@ impl Injector {
     pub(super) fn next(&self) -> Option<FaultKind> {
         let number = self.submissions.fetch_add(1, Ordering::Relaxed) + 1;
         self.plan.filter(|plan| plan.submission == number).map(|plan| plan.kind)
+    }
+}
+
+/// Allocates memory until the driver refuses, then frees it; the refusal stays reported.
+pub(super) fn fill_device(driver: &Driver) {
+    let mut taken = Vec::new();
+    while !driver.faults.is_reported() && taken.len() < FILL_BUFFERS {
+        taken.push(driver.buffer("filling the device", FILL_BYTES, wgpu::BufferUsages::STORAGE));
     }
 }
 

@@ -12,7 +12,7 @@ pub struct StructLayout {
     pub fields: &'static [(&'static str, usize)],
 }
 
-/// Declares an uploadable `#[repr(C)]` struct with its `LAYOUT`.
+/// Declares uploadable `#[repr(C)]` structs, each with its `LAYOUT`.
 ///
 /// ```
 /// gsscale::wgsl_struct! {
@@ -28,12 +28,12 @@ pub struct StructLayout {
 /// ```
 #[macro_export]
 macro_rules! wgsl_struct {
-    (
+    ($(
         $(#[$meta:meta])*
         $vis:vis struct $name:ident {
             $( $(#[$field_meta:meta])* $field_vis:vis $field:ident : $ty:ty ),* $(,)?
         }
-    ) => {
+    )+) => {$(
         $(#[$meta])*
         #[repr(C)]
         #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
@@ -49,5 +49,5 @@ macro_rules! wgsl_struct {
                 fields: &[ $( (stringify!($field), std::mem::offset_of!($name, $field)) ),* ],
             };
         }
-    };
+    )+};
 }

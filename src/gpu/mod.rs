@@ -20,11 +20,16 @@
 //! 3. Counts come from uniforms or buffers, never from `arrayLength`: a view of an empty buffer still spans some bytes.
 //! 4. No workgroup waits for another; no invocation loops more than 65,535 times in total.
 //! 5. Contents of a new buffer are arbitrary (it may be reused): use [`Recorder::clear`] where zeros are needed.
-//! 6. One recorder at a time, set aside or not, because only then do its commands and its reused buffers share one order.
+//! 6. Only one recorder may be open, set aside or not: reused buffers rely on commands that run in the order recorded.
+//!
+//! Files import each other in one direction: `error` <- `driver` (the wgpu device that the others share) <- `buffers`,
+//! `belt`, `shader` <- `readback`, `uniforms` <- `profile` <- `device` <- `record`.
 
+mod adapter;
 mod belt;
 mod buffers;
 mod device;
+mod driver;
 mod error;
 mod injected;
 mod layout;
@@ -33,19 +38,16 @@ mod readback;
 mod record;
 mod shader;
 mod sources;
+mod uniforms;
 
+pub use adapter::{AdapterSummary, DeviceChoice, DeviceKind, WORKGROUP, list_adapters};
 pub use buffers::{Buffer, BufferView};
-pub use device::{AdapterSummary, DeviceChoice, DeviceKind, Gpu, GpuOptions, Traffic, list_adapters};
+pub use device::{Gpu, GpuOptions, Traffic};
 pub use error::{GpuError, GpuResult};
 pub use injected::{FaultKind, InjectedFault};
 pub use layout::StructLayout;
 pub use profile::StageTime;
 pub use readback::Readback;
 pub use record::{Recorder, Recording, Submission, groups_1d};
-pub use shader::{
-    Binding, BindingKind, Defines, Pipeline, Reflection, Source, preprocess, reflect, validate, variants,
-};
-pub use sources::SOURCES;
-
-/// Invocations of a workgroup, unless a shader needs another number.
-pub const WORKGROUP: u32 = 256;
+pub use shader::{Pipeline, validate};
+pub use sources::{Defines, SOURCES, Source, preprocess, variants};

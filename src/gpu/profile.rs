@@ -3,9 +3,12 @@
 //! Invariants: (1) without timestamps on the adapter, or with profiling off, nothing is recorded and the list is empty:
 //! no figure is estimated; (2) a pass is limited to dispatches of one stage only while profiling.
 
-use super::device::Gpu;
-use super::error::{GpuResult, lock};
-use super::readback::{PendingMap, Readback};
+use std::sync::Arc;
+
+use super::buffers::BufferView;
+use super::driver::Driver;
+use super::error::GpuResult;
+use super::readback::{PendingMap, Readback, Staging};
 
 /// Most passes of one recorder that are timed; further ones are not.
 const PASSES_MAX: u32 = 1024;
@@ -24,6 +27,7 @@ pub struct StageTime {
 /// Timestamps in flight, and the sums of those read back.
 #[derive(Debug)]
 pub(super) struct Profiler {
+    staging: Arc<Staging>,
     queries: Option<(wgpu::QuerySet, wgpu::Buffer)>,
     seconds_per_tick: f64,
     recorded: Vec<&'static str>,
@@ -32,24 +36,20 @@ pub(super) struct Profiler {
 }
 
 impl Profiler {
-    pub(super) fn new(device: &wgpu::Device, queue: &wgpu::Queue, on: bool) -> Profiler {
+    pub(super) fn new(driver: &Driver, staging: Arc<Staging>, on: bool) -> Profiler {
         let queries = on.then(|| {
-            let set = device.create_query_set(&wgpu::QuerySetDescriptor {
+            let set = driver.device.create_query_set(&wgpu::QuerySetDescriptor {
                 label: Some("stage times"),
                 ty: wgpu::QueryType::Timestamp,
                 count: 2 * PASSES_MAX,
             });
-            let resolved = device.create_buffer(&wgpu::BufferDescriptor {
-                label: Some("stage times"),
-                size: u64::from(2 * PASSES_MAX) * 8,
-                usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
-                mapped_at_creation: false,
-            });
-            (set, resolved)
+            let usage = wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC;
+            (set, driver.buffer("stage times", u64::from(2 * PASSES_MAX) * 8, usage))
         });
         Profiler {
+            staging,
             queries,
-            seconds_per_tick: if on { f64::from(queue.get_timestamp_period()) * 1e-9 } else { 0.0 },
+            seconds_per_tick: if on { f64::from(driver.queue.get_timestamp_period()) * 1e-9 } else { 0.0 },
             recorded: Vec::new(),
             under_way: Vec::new(),
             sums: Vec::new(),
@@ -84,7 +84,7 @@ impl Profiler {
     }
 
     /// Records the read-back of this submission's timestamps.
-    pub(super) fn resolve(&mut self, gpu: &Gpu, encoder: &mut wgpu::CommandEncoder) -> GpuResult<Option<PendingMap>> {
+    pub(super) fn resolve(&mut self, encoder: &mut wgpu::CommandEncoder) -> GpuResult<Option<PendingMap>> {
         let Some((set, resolved)) = &self.queries else { return Ok(None) };
         if self.recorded.is_empty() {
             return Ok(None);
@@ -92,18 +92,17 @@ impl Profiler {
         let stages = std::mem::take(&mut self.recorded);
         let count = 2 * u32::try_from(stages.len()).unwrap_or(PASSES_MAX);
         encoder.resolve_query_set(set, 0..count, resolved, 0);
-        let view =
-            super::BufferView { raw: resolved.clone(), label: "stage times", offset: 0, size: u64::from(count) * 8 };
-        let (readback, pending) = Readback::record(gpu, encoder, "stage times", &view)?;
+        let view = BufferView { raw: resolved.clone(), label: "stage times", offset: 0, size: u64::from(count) * 8 };
+        let (readback, pending) = self.staging.record(encoder, "stage times", &view)?;
         self.under_way.push((readback, stages));
         Ok(Some(pending))
     }
 
     /// Adds timestamps in flight to the sums, waiting for all but the last `leave` submissions.
-    pub(super) fn collect(&mut self, gpu: &Gpu, leave: usize) -> GpuResult<()> {
+    pub(super) fn collect(&mut self, leave: usize) -> GpuResult<()> {
         while self.under_way.len() > leave {
             let (readback, stages) = self.under_way.remove(0);
-            let ticks: Vec<u64> = readback.to_vec(gpu)?;
+            let ticks: Vec<u64> = readback.to_vec()?;
             for (stage, pair) in stages.into_iter().zip(ticks.chunks_exact(2)) {
                 let seconds = pair[1].saturating_sub(pair[0]) as f64 * self.seconds_per_tick;
                 match self.sums.iter_mut().find(|s| s.stage == stage) {
@@ -117,16 +116,10 @@ impl Profiler {
         }
         Ok(())
     }
-}
 
-impl Gpu {
-    /// Time of every stage so far, in order of first use; empty without profiling. Waits for the device.
-    ///
-    /// # Errors
-    /// The device was lost.
-    pub fn stage_times(&self) -> GpuResult<Vec<StageTime>> {
-        let mut profiler = lock(&self.profiler);
-        profiler.collect(self, 0)?;
-        Ok(profiler.sums.clone())
+    /// Time of every stage so far, in order of first use. Waits for the device.
+    pub(super) fn times(&mut self) -> GpuResult<Vec<StageTime>> {
+        self.collect(0)?;
+        Ok(self.sums.clone())
     }
 }

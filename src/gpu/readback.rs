@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
 use super::buffers::{BufferView, size_class};
-use super::device::Gpu;
+use super::driver::Driver;
 use super::error::{GpuError, GpuResult, lock};
 
 const RECORDED: u8 = 0;
@@ -18,13 +18,38 @@ const MAPPED: u8 = 2;
 const FAILED: u8 = 3;
 
 /// Free staging buffers by class, and the number of bytes read.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Staging {
+    driver: Arc<Driver>,
     free: Mutex<BTreeMap<u64, Vec<wgpu::Buffer>>>,
     read: AtomicU64,
 }
 
 impl Staging {
+    pub(super) fn new(driver: Arc<Driver>) -> Arc<Staging> {
+        Arc::new(Staging { driver, free: Mutex::default(), read: AtomicU64::new(0) })
+    }
+
+    /// Records the copy of `view` for `stage`.
+    pub(super) fn record(
+        self: &Arc<Self>,
+        encoder: &mut wgpu::CommandEncoder,
+        stage: &'static str,
+        view: &BufferView,
+    ) -> GpuResult<(Readback, PendingMap)> {
+        let (size, class) = (view.size, size_class(view.size));
+        let reused = lock(&self.free).get_mut(&class).and_then(Vec::pop);
+        let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
+        let raw = reused.unwrap_or_else(|| self.driver.buffer("read-back staging", class, usage));
+        self.driver.faults.check()?;
+        encoder.copy_buffer_to_buffer(&view.raw, view.offset, &raw, 0, size);
+        self.read.fetch_add(size, Ordering::Relaxed);
+        let (state, submission) = (Arc::new(AtomicU8::new(RECORDED)), Arc::new(OnceLock::new()));
+        let pending =
+            PendingMap { raw: raw.clone(), size, state: Arc::clone(&state), submission: Arc::clone(&submission) };
+        Ok((Readback { raw, stage, size, class, state, submission, staging: Arc::clone(self) }, pending))
+    }
+
     pub(super) fn bytes_read(&self) -> u64 {
         self.read.load(Ordering::Relaxed)
     }
@@ -70,34 +95,6 @@ impl PendingMap {
 }
 
 impl Readback {
-    /// Records the copy of `view`.
-    pub(super) fn record(
-        gpu: &Gpu,
-        encoder: &mut wgpu::CommandEncoder,
-        stage: &'static str,
-        view: &BufferView,
-    ) -> GpuResult<(Readback, PendingMap)> {
-        let class = size_class(view.size);
-        let reused = lock(&gpu.staging.free).get_mut(&class).and_then(Vec::pop);
-        let raw = reused.unwrap_or_else(|| {
-            gpu.device.create_buffer(&wgpu::BufferDescriptor {
-                label: Some("read-back staging"),
-                size: class,
-                usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
-                mapped_at_creation: false,
-            })
-        });
-        gpu.faults.check()?;
-        encoder.copy_buffer_to_buffer(&view.raw, view.offset, &raw, 0, view.size);
-        gpu.staging.read.fetch_add(view.size, Ordering::Relaxed);
-        let state = Arc::new(AtomicU8::new(RECORDED));
-        let submission = Arc::new(OnceLock::new());
-        let (size, shared) = (view.size, Arc::clone(&submission));
-        let pending = PendingMap { raw: raw.clone(), size, state: Arc::clone(&state), submission: shared };
-        let staging = Arc::clone(&gpu.staging);
-        Ok((Readback { raw, stage, size, class, state, submission, staging }, pending))
-    }
-
     /// Size, bytes.
     pub fn size(&self) -> u64 {
         self.size
@@ -107,9 +104,9 @@ impl Readback {
     ///
     /// # Errors
     /// The recorder was not submitted, the device was lost, or its work failed.
-    pub fn to_vec<T: bytemuck::Pod>(self, gpu: &Gpu) -> GpuResult<Vec<T>> {
+    pub fn to_vec<T: bytemuck::Pod>(self) -> GpuResult<Vec<T>> {
         let mut out = vec![T::zeroed(); usize::try_from(self.size).unwrap_or(0) / size_of::<T>().max(1)];
-        self.copy_to(gpu, &mut out)?;
+        self.copy_to(&mut out)?;
         Ok(out)
     }
 
@@ -117,10 +114,10 @@ impl Readback {
     ///
     /// # Errors
     /// The recorder was not submitted, the device was lost, or its work failed.
-    pub fn copy_to<T: bytemuck::Pod>(self, gpu: &Gpu, out: &mut [T]) -> GpuResult<()> {
-        self.wait(gpu)?;
+    pub fn copy_to<T: bytemuck::Pod>(self, out: &mut [T]) -> GpuResult<()> {
+        self.wait()?;
         let out = bytemuck::cast_slice_mut::<T, u8>(out);
-        let view = self.raw.get_mapped_range(..self.size).map_err(|e| self.failed(&e.to_string()))?;
+        let view = self.raw.get_mapped_range(..self.size).map_err(|e| GpuError::validation(self.stage, e))?;
         let n = out.len().min(view.len());
         out[..n].copy_from_slice(&view[..n]);
         drop(view);
@@ -133,26 +130,20 @@ impl Readback {
         Ok(())
     }
 
-    fn wait(&self, gpu: &Gpu) -> GpuResult<()> {
+    fn wait(&self) -> GpuResult<()> {
         if self.state.load(Ordering::Acquire) == RECORDED {
-            return Err(self.failed("read before its commands were submitted"));
+            return Err(GpuError::validation(self.stage, "read before its commands were submitted"));
         }
-        gpu.faults.set_stage(self.stage);
+        let driver = &self.staging.driver;
+        driver.faults.set_stage(self.stage);
         while self.state.load(Ordering::Acquire) == MAPPING {
             // Waits for this read-back's own submission only: the device may work on later ones meanwhile.
-            let submission_index = self.submission.get().cloned();
-            let waited = gpu.device.poll(wgpu::PollType::Wait { submission_index, timeout: None });
-            gpu.faults.check()?;
-            waited.map_err(|e| self.failed(&e.to_string()))?;
+            driver.wait(self.stage, self.submission.get().cloned())?;
         }
-        gpu.faults.check()?;
+        driver.faults.check()?;
         match self.state.load(Ordering::Acquire) {
             MAPPED => Ok(()),
-            _ => Err(self.failed("the results could not be mapped")),
+            _ => Err(GpuError::validation(self.stage, "the results could not be mapped")),
         }
-    }
-
-    fn failed(&self, message: &str) -> GpuError {
-        GpuError::Validation { stage: self.stage.into(), message: message.into() }
     }
 }

@@ -5,15 +5,17 @@
 //! uploads fill a staging set, the commands recorded so far are submitted and recording continues.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::Ordering;
 
+use super::adapter::GROUPS_MAX;
 use super::belt::SET_BYTES;
 use super::buffers::{Buffer, BufferView};
-use super::device::{GROUPS_MAX, Gpu};
+use super::device::Gpu;
 use super::error::{GpuError, GpuResult, lock};
-use super::injected::FaultKind;
+use super::injected::{FaultKind, fill_device};
 use super::readback::{PendingMap, Readback};
 use super::shader::{BindingKind, Pipeline};
+use super::uniforms::UNIFORM_CHUNK;
 
 /// Workgroups for `count` invocations in workgroups of `workgroup`, folded into two dimensions beyond 65,535.
 ///
@@ -28,38 +30,6 @@ pub fn groups_1d(count: u32, workgroup: u32) -> [u32; 3] {
     [groups.div_ceil(rows), rows, 1]
 }
 
-/// Bytes of one uniform buffer of the ring.
-const UNIFORM_CHUNK: u64 = 64 << 10;
-
-/// Bytes of a buffer for an injected memory fault, and most such buffers: a tebibyte in total.
-const FILL_BYTES: u64 = 128 << 20;
-const FILL_BUFFERS: usize = 8192;
-
-/// Uniform buffers, refilled by every submission.
-#[derive(Debug)]
-pub(super) struct UniformRing {
-    chunks: Vec<wgpu::Buffer>,
-    alignment: u64,
-}
-
-impl UniformRing {
-    pub(super) fn new(alignment: u64) -> UniformRing {
-        UniformRing { chunks: Vec::new(), alignment: alignment.max(16) }
-    }
-
-    fn chunk(&mut self, device: &wgpu::Device, index: usize) -> wgpu::Buffer {
-        while self.chunks.len() <= index {
-            self.chunks.push(device.create_buffer(&wgpu::BufferDescriptor {
-                label: Some("uniforms"),
-                size: UNIFORM_CHUNK,
-                usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST,
-                mapped_at_creation: false,
-            }));
-        }
-        self.chunks[index].clone()
-    }
-}
-
 /// A submission that can be waited for.
 #[derive(Debug, Clone)]
 pub struct Submission {
@@ -67,25 +37,8 @@ pub struct Submission {
     name: &'static str,
 }
 
-/// Counts a recording as open while it exists.
-#[derive(Debug)]
-struct Open(Arc<AtomicU32>);
-
-impl Open {
-    fn new(recorders: &Arc<AtomicU32>) -> Open {
-        recorders.fetch_add(1, Ordering::Relaxed);
-        Open(Arc::clone(recorders))
-    }
-}
-
-impl Drop for Open {
-    fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::Relaxed);
-    }
-}
-
-/// The unsubmitted work of a recorder, set aside between two calls of its owner; [`Gpu::resume`] continues it. Until then
-/// it counts as an open recorder: no other one can be submitted.
+/// The unsubmitted work of a recorder, set aside between two calls of its owner; [`Gpu::resume`] continues it. Until
+/// then it counts as an open recorder, and no other recorder can be submitted.
 #[derive(Debug)]
 #[must_use]
 pub struct Recording {
@@ -94,7 +47,7 @@ pub struct Recording {
     pass: Option<(wgpu::ComputePass<'static>, &'static str)>,
     uniforms: Vec<Vec<u8>>,
     readbacks: Vec<PendingMap>,
-    _open: Open,
+    _open: Arc<()>,
 }
 
 /// A recording of work.
@@ -106,9 +59,9 @@ pub struct Recorder<'g> {
 impl Gpu {
     /// Starts a recording; `name` appears in errors that belong to no stage.
     pub fn begin(&self, name: &'static str) -> Recorder<'_> {
-        let encoder = new_encoder(&self.device, name);
+        let encoder = self.driver.encoder(name);
         let (uniforms, readbacks) = (Vec::new(), Vec::new());
-        let work = Recording { name, encoder, pass: None, uniforms, readbacks, _open: Open::new(&self.recorders) };
+        let work = Recording { name, encoder, pass: None, uniforms, readbacks, _open: Arc::clone(&self.recordings) };
         Recorder { gpu: self, work }
     }
 
@@ -122,9 +75,9 @@ impl Gpu {
     /// # Errors
     /// The API refused the commands, the device was lost or ran out of memory, or two recorders were open at once.
     pub fn submit(&self, mut recorder: Recorder<'_>) -> GpuResult<Submission> {
-        if self.recorders.load(Ordering::Relaxed) > 1 {
-            let problem = "two recorders are open at once".into();
-            return Err(GpuError::Bindings { stage: recorder.work.name.into(), problem });
+        // One reference is the device's own, one that of `recorder`.
+        if Arc::strong_count(&self.recordings) > 2 {
+            return Err(GpuError::bindings(recorder.work.name, "two recorders are open at once"));
         }
         let submission = recorder.flush()?;
         if self.serial {
@@ -138,17 +91,9 @@ impl Gpu {
     /// # Errors
     /// The device was lost or ran out of memory.
     pub fn wait(&self, submission: &Submission) -> GpuResult<()> {
-        self.faults.set_stage(submission.name);
-        let index = Some(submission.index.clone());
-        let waited = self.device.poll(wgpu::PollType::Wait { submission_index: index, timeout: None });
-        self.faults.check()?;
-        let stage = submission.name.into();
-        waited.map(|_| ()).map_err(|e| GpuError::Validation { stage, message: e.to_string() })
+        self.driver.faults.set_stage(submission.name);
+        self.driver.wait(submission.name, Some(submission.index.clone()))
     }
-}
-
-fn new_encoder(device: &wgpu::Device, name: &'static str) -> wgpu::CommandEncoder {
-    device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some(name) })
 }
 
 impl Recorder<'_> {
@@ -162,26 +107,7 @@ impl Recorder<'_> {
     /// # Errors
     /// The device has no memory left.
     pub fn uniform<T: bytemuck::NoUninit>(&mut self, value: &T) -> GpuResult<BufferView> {
-        let bytes = bytemuck::bytes_of(value);
-        let mut ring = lock(&self.gpu.uniforms);
-        let alignment = ring.alignment;
-        let fits =
-            |chunk: &Vec<u8>| (chunk.len() as u64).next_multiple_of(alignment) + bytes.len() as u64 <= UNIFORM_CHUNK;
-        if !self.work.uniforms.last().is_some_and(fits) {
-            self.work.uniforms.push(Vec::new());
-        }
-        let index = self.work.uniforms.len() - 1;
-        let raw = ring.chunk(&self.gpu.device, index);
-        drop(ring);
-        self.gpu.faults.check()?;
-        let chunk = &mut self.work.uniforms[index];
-        let offset = (chunk.len() as u64).next_multiple_of(alignment);
-        chunk.resize(usize::try_from(offset).unwrap_or(chunk.len()), 0);
-        chunk.extend_from_slice(bytes);
-        let size = bytes.len() as u64;
-        let tail = chunk.len().next_multiple_of(4);
-        chunk.resize(tail, 0); // writes are multiples of 4 bytes
-        Ok(BufferView { raw, label: "uniforms", offset, size })
+        lock(&self.gpu.uniforms).pack(&mut self.work.uniforms, bytemuck::bytes_of(value))
     }
 
     /// A new buffer containing `data`.
@@ -226,12 +152,11 @@ impl Recorder<'_> {
 
     fn upload_words(&mut self, view: &BufferView, mut at: u64, mut bytes: &[u8]) -> GpuResult<()> {
         self.work.pass = None;
-        self.gpu.faults.set_stage(view.label);
+        self.gpu.driver.faults.set_stage(view.label);
         self.gpu.uploaded.fetch_add(bytes.len() as u64, Ordering::Relaxed);
         while !bytes.is_empty() {
             let mut belt = lock(&self.gpu.belt);
-            let (device, faults) = (&self.gpu.device, &self.gpu.faults);
-            let done = belt.write(device, faults, &mut self.work.encoder, &view.raw, view.offset + at, bytes)?;
+            let done = belt.write(&mut self.work.encoder, &view.raw, view.offset + at, bytes)?;
             drop(belt);
             bytes = &bytes[done..];
             at += done as u64;
@@ -249,7 +174,7 @@ impl Recorder<'_> {
     pub fn clear(&mut self, view: &BufferView) -> GpuResult<()> {
         self.check_copy("clear", view, view.size)?;
         self.work.pass = None;
-        self.gpu.faults.set_stage(view.label);
+        self.gpu.driver.faults.set_stage(view.label);
         self.work.encoder.clear_buffer(&view.raw, view.offset, Some(view.size));
         Ok(())
     }
@@ -262,11 +187,10 @@ impl Recorder<'_> {
         self.check_copy("copy", from, from.size)?;
         self.check_copy("copy", to, from.size)?;
         if from.raw == to.raw {
-            let problem = format!("a copy of {} within one buffer", from.label);
-            return Err(GpuError::Bindings { stage: self.work.name.into(), problem });
+            return Err(GpuError::bindings(self.work.name, format!("a copy of {} within one buffer", from.label)));
         }
         self.work.pass = None;
-        self.gpu.faults.set_stage(to.label);
+        self.gpu.driver.faults.set_stage(to.label);
         self.work.encoder.copy_buffer_to_buffer(&from.raw, from.offset, &to.raw, to.offset, from.size);
         Ok(())
     }
@@ -278,8 +202,8 @@ impl Recorder<'_> {
     pub fn read_back(&mut self, stage: &'static str, view: &BufferView) -> GpuResult<Readback> {
         self.check_copy("read_back", view, view.size)?;
         self.work.pass = None;
-        self.gpu.faults.set_stage(stage);
-        let (readback, pending) = Readback::record(self.gpu, &mut self.work.encoder, stage, view)?;
+        self.gpu.driver.faults.set_stage(stage);
+        let (readback, pending) = self.gpu.staging.record(&mut self.work.encoder, stage, view)?;
         self.work.readbacks.push(pending);
         Ok(readback)
     }
@@ -301,26 +225,10 @@ impl Recorder<'_> {
         }
         if groups.iter().any(|&n| n > GROUPS_MAX) {
             let problem = format!("{groups:?} workgroups; a dimension holds at most {GROUPS_MAX}");
-            return Err(GpuError::Bindings { stage: stage.into(), problem });
+            return Err(GpuError::bindings(stage, problem));
         }
         self.bind(stage, pipeline, views)?.dispatch_workgroups(groups[0], groups[1], groups[2]);
-        self.gpu.faults.check()
-    }
-
-    /// Dispatches a stage; `groups` holds the three workgroup counts on the device.
-    ///
-    /// # Errors
-    /// As [`Recorder::dispatch`].
-    pub fn dispatch_indirect(
-        &mut self,
-        stage: &'static str,
-        pipeline: &Pipeline,
-        views: &[BufferView],
-        groups: &BufferView,
-    ) -> GpuResult<()> {
-        self.check_copy(stage, groups, 12)?;
-        self.bind(stage, pipeline, views)?.dispatch_workgroups_indirect(&groups.raw, groups.offset);
-        self.gpu.faults.check()
+        self.gpu.driver.faults.check()
     }
 
     /// A pass with pipeline and bind group set.
@@ -331,7 +239,7 @@ impl Recorder<'_> {
         views: &[BufferView],
     ) -> GpuResult<&mut wgpu::ComputePass<'static>> {
         self.check_bindings(stage, pipeline, views)?;
-        self.gpu.faults.set_stage(stage);
+        self.gpu.driver.faults.set_stage(stage);
         let entries: Vec<wgpu::BindGroupEntry<'_>> = pipeline
             .reflection
             .bindings
@@ -346,12 +254,12 @@ impl Recorder<'_> {
                 }),
             })
             .collect();
-        let group = self.gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
+        let group = self.gpu.driver.device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some(stage),
             layout: &pipeline.layout,
             entries: &entries,
         });
-        self.gpu.faults.check()?;
+        self.gpu.driver.faults.check()?;
         let mut profiler = lock(&self.gpu.profiler);
         let reusable = self.work.pass.take_if(|(_, of)| !profiler.is_on() || *of == stage);
         let pass = match reusable {
@@ -368,7 +276,7 @@ impl Recorder<'_> {
     }
 
     fn check_bindings(&self, stage: &'static str, pipeline: &Pipeline, views: &[BufferView]) -> GpuResult<()> {
-        let problem = |problem: String| Err(GpuError::Bindings { stage: stage.into(), problem });
+        let problem = |problem: String| Err(GpuError::bindings(stage, problem));
         let bindings = &pipeline.reflection.bindings;
         if bindings.len() != views.len() {
             let names: Vec<&str> = bindings.iter().map(|b| b.name.as_str()).collect();
@@ -417,35 +325,22 @@ impl Recorder<'_> {
         } else {
             return Ok(());
         };
-        Err(GpuError::Bindings { stage: self.work.name.into(), problem })
+        Err(GpuError::bindings(self.work.name, problem))
     }
 
     /// Injects the fault planned for this submission, if any.
     fn inject_fault(&mut self) {
         match self.gpu.injector.next() {
             None => {}
-            Some(FaultKind::Lost) => self.gpu.device.destroy(),
+            Some(FaultKind::Lost) => self.gpu.driver.device.destroy(),
             Some(FaultKind::Validation) => {
-                let raw = lock(&self.gpu.uniforms).chunk(&self.gpu.device, 0);
+                let raw = lock(&self.gpu.uniforms).chunk(0);
                 self.work.encoder.clear_buffer(&raw, 0, Some(2 * UNIFORM_CHUNK)); // beyond its end
             }
             Some(FaultKind::OutOfMemory) => {
-                self.gpu.faults.report(&wgpu::Error::OutOfMemory { source: "injected fault".into() });
+                self.gpu.driver.faults.report(&wgpu::Error::OutOfMemory { source: "injected fault".into() });
             }
-            Some(FaultKind::Full) => self.fill_device(),
-        }
-    }
-
-    /// Allocates memory until the driver refuses, then frees it; the refusal stays reported.
-    fn fill_device(&self) {
-        let mut taken = Vec::new();
-        while !self.gpu.faults.is_reported() && taken.len() < FILL_BUFFERS {
-            taken.push(self.gpu.device.create_buffer(&wgpu::BufferDescriptor {
-                label: Some("all there is"),
-                size: FILL_BYTES,
-                usage: wgpu::BufferUsages::STORAGE,
-                mapped_at_creation: false,
-            }));
+            Some(FaultKind::Full) => fill_device(&self.gpu.driver),
         }
     }
 
@@ -454,33 +349,29 @@ impl Recorder<'_> {
         let gpu = self.gpu;
         self.work.pass = None;
         let mut profiler = lock(&gpu.profiler);
-        let stamps = profiler.resolve(gpu, &mut self.work.encoder)?;
+        let stamps = profiler.resolve(&mut self.work.encoder)?;
         drop(profiler);
         self.work.readbacks.extend(stamps);
-        gpu.faults.set_stage(self.work.name);
+        gpu.driver.faults.set_stage(self.work.name);
         self.inject_fault();
-        let encoder = std::mem::replace(&mut self.work.encoder, new_encoder(&gpu.device, self.work.name));
+        let encoder = std::mem::replace(&mut self.work.encoder, gpu.driver.encoder(self.work.name));
         let commands = encoder.finish();
-        gpu.faults.check()?;
-        let mut ring = lock(&gpu.uniforms);
-        for (index, bytes) in self.work.uniforms.drain(..).enumerate() {
-            gpu.uploaded.fetch_add(bytes.len() as u64, Ordering::Relaxed);
-            gpu.queue.write_buffer(&ring.chunk(&gpu.device, index), 0, &bytes);
-        }
-        drop(ring);
+        gpu.driver.faults.check()?;
+        let written = lock(&gpu.uniforms).write(&mut self.work.uniforms);
+        gpu.uploaded.fetch_add(written, Ordering::Relaxed);
         let mut belt = lock(&gpu.belt);
         belt.finish();
-        let index = gpu.queue.submit([commands]);
+        let index = gpu.driver.queue.submit([commands]);
         belt.submitted(&index);
         drop(belt);
         for pending in self.work.readbacks.drain(..) {
             pending.start(&index);
         }
         // Without a poll a lost device would go unnoticed, because submissions to it are silently dropped.
-        let polled = gpu.device.poll(wgpu::PollType::Poll);
-        gpu.faults.check()?;
-        polled.map_err(|e| GpuError::Validation { stage: self.work.name.into(), message: e.to_string() })?;
-        lock(&gpu.profiler).collect(gpu, 4)?;
+        let polled = gpu.driver.device.poll(wgpu::PollType::Poll);
+        gpu.driver.faults.check()?;
+        polled.map_err(|e| GpuError::validation(self.work.name, e))?;
+        lock(&gpu.profiler).collect(4)?;
         Ok(Submission { index, name: self.work.name })
     }
 }

@@ -8,15 +8,16 @@
 //!
 //! `SsimVariant::Valid` has no window on a picture with a side under 11 pixels: it falls back to `Same`.
 //!
-//! Invariants: 1. bands depend on the height alone and their f64 sums are added in order, so the bits are the same for any
-//! number of threads; 2. a call allocates nothing if its picture is no larger than earlier ones; 3. a picture with NaN
-//! or infinity at a used pixel gives a non-finite loss, never a panic.
+//! Invariants: 1. bands depend on the height alone and their f64 sums are added in order, so the bits are the same for
+//! any number of threads; 2. a call allocates nothing if its picture is no larger than earlier ones; 3. a picture with
+//! NaN or infinity at a used pixel gives a non-finite loss, never a panic.
 
-use super::ssim_band::{BandKernel, BandSums, GradientBand, WINDOW, domain};
+pub use super::image_pair::{ImagePair, Reference, SsimVariant};
+use super::image_pair::{WINDOW, counted};
+use super::ssim_band::{BandKernel, BandSums, GradientBand};
 use crate::base::simd::{SimdPath, dispatch};
 use crate::scene::image::{Image, Target};
 use rayon::prelude::*;
-use std::fmt;
 use std::ops::Range;
 
 /// Most rows of a band: few enough to give every core one, enough that the ten rows read twice cost little.
@@ -29,38 +30,6 @@ pub enum SsimPadding {
     Valid,
     /// Every pixel, with zeros outside (the 3DGS code).
     Same,
-}
-
-/// Variants of SSIM; published figures use all three, and they differ in the third digit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum SsimVariant {
-    /// Mean over every pixel, with zeros outside the picture: the 3DGS code.
-    #[default]
-    Same,
-    /// Mean over the windows inside the picture: scikit-image, pytorch-msssim.
-    Valid,
-    /// Mean over every pixel, with the picture mirrored at its borders: torchmetrics.
-    Reflect,
-}
-
-impl SsimVariant {
-    /// All variants, the default first.
-    pub const ALL: [SsimVariant; 3] = [SsimVariant::Same, SsimVariant::Valid, SsimVariant::Reflect];
-
-    /// The name on the command line, in config files and in reports.
-    pub fn name(self) -> &'static str {
-        match self {
-            SsimVariant::Same => "same",
-            SsimVariant::Valid => "valid",
-            SsimVariant::Reflect => "reflect",
-        }
-    }
-}
-
-impl fmt::Display for SsimVariant {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
 }
 
 impl From<SsimPadding> for SsimVariant {
@@ -96,96 +65,6 @@ pub struct LossValue {
     pub mse: f64,
 }
 
-/// The reference picture.
-#[derive(Debug, Clone, Copy)]
-pub enum Reference<'a> {
-    /// Interleaved `[height][width][3]`; a byte stands for byte / 255.
-    Bytes(&'a [u8]),
-    /// Planar `[3][height][width]`.
-    Planar(&'a [f32]),
-}
-
-/// A picture and its reference, of one size, on plain slices.
-#[derive(Debug, Clone, Copy)]
-pub struct ImagePair<'a> {
-    /// Width, pixels.
-    pub width: usize,
-    /// Height, pixels.
-    pub height: usize,
-    /// The picture to judge, planar `[3][height][width]`.
-    pub rgb: &'a [f32],
-    /// The reference.
-    pub reference: Reference<'a>,
-    /// One byte per pixel, 0 = excluded; `None`: every pixel is used.
-    pub mask: Option<&'a [u8]>,
-    /// Clamp the values to 0..1 first, as metrics do. The gradient ignores the clamp: keep it `false` for the loss.
-    pub clamp: bool,
-}
-
-impl<'a> ImagePair<'a> {
-    /// A picture and its photo.
-    pub fn new(image: &'a Image, target: &'a Target) -> Self {
-        assert_eq!((image.width, image.height), (target.width, target.height), "picture and target differ in size");
-        ImagePair {
-            width: image.width as usize,
-            height: image.height as usize,
-            rgb: &image.rgb,
-            reference: Reference::Bytes(&target.rgb),
-            mask: target.mask.as_deref(),
-            clamp: false,
-        }
-    }
-
-    /// Number of pixels.
-    pub fn pixels(&self) -> usize {
-        self.width * self.height
-    }
-
-    /// Number of used pixels.
-    pub fn counted_pixels(&self) -> usize {
-        counted(self.mask, self.width, 0..self.height, 0..self.width)
-    }
-
-    /// Number of used pixels in the SSIM map.
-    fn counted_windows(&self, variant: SsimVariant) -> usize {
-        counted_windows(self.mask, self.width, self.height, variant)
-    }
-
-    /// The variant that is possible at this size.
-    fn possible(&self, variant: SsimVariant) -> SsimVariant {
-        possible(self.width, self.height, variant)
-    }
-
-    fn check(&self) {
-        let n = self.pixels();
-        let reference = match self.reference {
-            Reference::Bytes(bytes) => bytes.len(),
-            Reference::Planar(values) => values.len(),
-        };
-        assert!(self.rgb.len() == 3 * n && reference == 3 * n, "a picture's length does not fit its size");
-        assert!(self.mask.is_none_or(|mask| mask.len() == n), "the mask's length does not fit the picture");
-    }
-}
-
-/// Number of used pixels in a part of a picture.
-fn counted(mask: Option<&[u8]>, width: usize, rows: Range<usize>, columns: Range<usize>) -> usize {
-    let Some(mask) = mask else { return rows.len() * columns.len() };
-    rows.map(|row| {
-        let line = &mask[row * width..][columns.clone()];
-        line.iter().filter(|&&byte| byte != 0).count()
-    })
-    .sum()
-}
-
-fn counted_windows(mask: Option<&[u8]>, width: usize, height: usize, variant: SsimVariant) -> usize {
-    counted(mask, width, domain(variant, height), domain(variant, width))
-}
-
-fn possible(width: usize, height: usize, variant: SsimVariant) -> SsimVariant {
-    let small = width.min(height) < WINDOW;
-    if small && variant == SsimVariant::Valid { SsimVariant::Same } else { variant }
-}
-
 /// Weights that turn the sums over a picture into the loss; computed by the same code for every backend.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LossPlan {
@@ -205,10 +84,10 @@ pub struct LossPlan {
 impl LossPlan {
     /// The plan for a picture of this size; `mask` as in [`ImagePair::mask`].
     pub fn new(width: usize, height: usize, mask: Option<&[u8]>, options: &LossOptions) -> Self {
-        let variant = possible(width, height, options.padding.into());
+        let variant = SsimVariant::from(options.padding).possible(width, height);
         let lambda = f64::from(options.ssim_lambda);
         let samples = 3.0 * counted(mask, width, 0..height, 0..width) as f64;
-        let windows = 3.0 * counted_windows(mask, width, height, variant) as f64;
+        let windows = 3.0 * counted(mask, width, variant.domain(height), variant.domain(width)) as f64;
         LossPlan {
             variant,
             samples,
@@ -223,7 +102,7 @@ impl LossPlan {
 
     /// Pixels at each border that the SSIM map does not cover.
     pub fn margin(&self) -> usize {
-        domain(self.variant, WINDOW).start
+        self.variant.domain(WINDOW).start
     }
 
     /// The loss from the sums of absolute differences, of squared differences and of the SSIM map.
@@ -305,8 +184,8 @@ impl ImageLoss {
 /// A length does not match the size.
 pub fn mean_ssim(pair: &ImagePair, variant: SsimVariant, simd: SimdPath) -> f64 {
     pair.check();
-    let variant = pair.possible(variant);
-    let windows = 3.0 * pair.counted_windows(variant) as f64;
+    let variant = variant.possible(pair.width, pair.height);
+    let windows = 3.0 * counted(pair.mask, pair.width, variant.domain(pair.height), variant.domain(pair.width)) as f64;
     if windows == 0.0 {
         return f64::NAN;
     }

@@ -8,7 +8,7 @@
 
 use super::constants::TILE;
 use super::radix_sort::chunk_len;
-use super::splats::{Grid, Packed, ROWS_PER_CHUNK as ROWS_PER_EMIT_CHUNK, Span, Splat, rows_in_column, tile_rows};
+use super::splats::{Grid, Packed, ROWS_PER_CHUNK as ROWS_PER_EMIT_CHUNK, Span, Splat, for_each_column, tile_rows};
 use super::tile_range::TileRange;
 use crate::base::room;
 use crate::base::simd::{Kernel, SimdPath, dispatch, prefetch};
@@ -55,7 +55,7 @@ fn for_each_tile<const CUT: bool>(
     range: &TileRange,
     mut each: impl FnMut(usize, [u8; 2]),
 ) {
-    let mut column = |x: u16, rows: [u16; 2]| {
+    for_each_column::<CUT>(splat, span, grid, range.columns, |x, rows| {
         for y in tile_rows(rows) {
             if CUT && !(u32::from(range.rows[0])..u32::from(range.rows[1])).contains(&y) {
                 continue;
@@ -64,30 +64,63 @@ fn for_each_tile<const CUT: bool>(
             let [first, last] = rows.map(|row| (i32::from(row) - top).clamp(0, TILE as i32 - 1) as u8);
             each(y as usize * grid.tiles_x as usize + usize::from(x), [first, last]);
         }
-    };
-    let [x0, _, x1, _] = span.tiles;
-    let within = |x: u16| !CUT || (range.columns[0]..range.columns[1]).contains(&x);
-    for (x, rows) in (x0..x1).zip(span.rows) {
-        if within(x) {
-            column(x, rows);
-        }
+    });
+}
+
+/// Calls `each(row, tile, pixel rows, k)` for every intersection of a chunk of the drawn rows with the tiles of a range, front to
+/// back.
+struct EachIsect<'a, F> {
+    order: &'a [u32],
+    packed: &'a Packed,
+    grid: Grid,
+    range: TileRange,
+    each: F,
+}
+
+/// The same for a range that is a part of the picture, whose tests all tiles need not pay for.
+struct EachIsectOfPart<'a, F>(EachIsect<'a, F>);
+
+fn each_isect<F: FnMut(u32, usize, [u8; 2], u32)>(simd: SimdPath, isects: EachIsect<'_, F>) {
+    match isects.range.is_all(isects.grid) {
+        true => dispatch(simd, isects),
+        false => dispatch(simd, EachIsectOfPart(isects)),
     }
-    if x1.saturating_sub(x0) > 2 {
-        let (from, to) = if CUT { ((x0 + 2).max(range.columns[0]), x1.min(range.columns[1])) } else { (x0 + 2, x1) };
-        if from < to {
-            let ellipse = splat.ellipse();
-            for x in from..to {
-                column(x, rows_in_column(&ellipse, grid, span.tiles, x));
+}
+
+impl<F: FnMut(u32, usize, [u8; 2], u32)> EachIsect<'_, F> {
+    #[inline(always)]
+    fn call<const CUT: bool>(mut self) {
+        let Packed { splats, spans, .. } = self.packed;
+        for (i, &row) in self.order.iter().enumerate() {
+            // Depth order is random order in memory.
+            if let Some(&ahead) = self.order.get(i + 24) {
+                prefetch(spans, ahead as usize);
             }
+            let mut k = 0;
+            let (splat, span) = (&splats[row as usize], &spans[row as usize]);
+            for_each_tile::<CUT>(splat, span, self.grid, &self.range, |tile, pixel_rows| {
+                (self.each)(row, tile, pixel_rows, k);
+                k += 1;
+            });
         }
     }
 }
 
-/// Prefetches a span some rows ahead, because depth order is random order in memory.
-#[inline(always)]
-fn prefetch_ahead(spans: &[Span], order: &[u32], i: usize) {
-    if let Some(&row) = order.get(i + 24) {
-        prefetch(spans, row as usize);
+impl<F: FnMut(u32, usize, [u8; 2], u32)> Kernel for EachIsect<'_, F> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        self.call::<false>();
+    }
+}
+
+impl<F: FnMut(u32, usize, [u8; 2], u32)> Kernel for EachIsectOfPart<'_, F> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        self.0.call::<true>();
     }
 }
 
@@ -102,36 +135,9 @@ pub fn count(order: &[u32], packed: &Packed, grid: Grid, range: TileRange, simd:
         return;
     }
     order.par_chunks(len).zip(tile_counts.par_chunks_mut(tiles)).for_each(|(order, tile_counts)| {
-        if range.is_all(grid) {
-            dispatch(simd, CountChunk::<false> { order, packed, grid, range, tile_counts });
-        } else {
-            dispatch(simd, CountChunk::<true> { order, packed, grid, range, tile_counts });
-        }
+        let each = |_, tile: usize, _, _| tile_counts[tile] += 1;
+        each_isect(simd, EachIsect { order, packed, grid, range, each });
     });
-}
-
-struct CountChunk<'a, const CUT: bool> {
-    order: &'a [u32],
-    packed: &'a Packed,
-    grid: Grid,
-    range: TileRange,
-    tile_counts: &'a mut [u32],
-}
-
-impl<const CUT: bool> Kernel for CountChunk<'_, CUT> {
-    type Out = ();
-
-    #[inline(always)]
-    fn run<const FMA: bool>(self) {
-        let Packed { splats, spans, .. } = self.packed;
-        for (i, &row) in self.order.iter().enumerate() {
-            prefetch_ahead(spans, self.order, i);
-            let (splat, span) = (&splats[row as usize], &spans[row as usize]);
-            for_each_tile::<CUT>(splat, span, self.grid, &self.range, |tile, _| {
-                self.tile_counts[tile] += 1;
-            });
-        }
-    }
 }
 
 /// Writes each intersection with a tile of `range` (as [`Isect::pack`]) to its place in its tile's list. Consumes `cursors`,
@@ -154,41 +160,13 @@ pub fn emit(
     }
     let isects = &*isects;
     order.par_chunks(len).zip(cursors.par_chunks_mut(tiles)).for_each(|(order, cursors)| {
-        if range.is_all(grid) {
-            dispatch(simd, EmitChunk::<false> { order, packed, grid, range, cursors, isects });
-        } else {
-            dispatch(simd, EmitChunk::<true> { order, packed, grid, range, cursors, isects });
-        }
+        let each = |row, tile: usize, pixel_rows, k| {
+            let place = &mut cursors[tile];
+            isects[*place as usize].store(Isect { row, pixel_rows, k }.pack(), Relaxed);
+            *place += 1;
+        };
+        each_isect(simd, EachIsect { order, packed, grid, range, each });
     });
-}
-
-struct EmitChunk<'a, const CUT: bool> {
-    order: &'a [u32],
-    packed: &'a Packed,
-    grid: Grid,
-    range: TileRange,
-    cursors: &'a mut [u64],
-    isects: &'a [AtomicU64],
-}
-
-impl<const CUT: bool> Kernel for EmitChunk<'_, CUT> {
-    type Out = ();
-
-    #[inline(always)]
-    fn run<const FMA: bool>(self) {
-        let Packed { splats, spans, .. } = self.packed;
-        for (i, &row) in self.order.iter().enumerate() {
-            prefetch_ahead(spans, self.order, i);
-            let mut k = 0;
-            let (splat, span) = (&splats[row as usize], &spans[row as usize]);
-            for_each_tile::<CUT>(splat, span, self.grid, &self.range, |tile, pixel_rows| {
-                let place = &mut self.cursors[tile];
-                self.isects[*place as usize].store(Isect { row, pixel_rows, k }.pack(), Relaxed);
-                *place += 1;
-                k += 1;
-            });
-        }
-    }
 }
 
 /// Numbers the intersections of a range in emit order, as [`super::splats::pack`] does for all tiles: sets
@@ -241,32 +219,36 @@ impl Kernel for NumberChunk<'_> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(in crate::kernels) mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};
     use crate::kernels::isect_offsets::isect_offsets;
     use crate::kernels::project_fwd::Projected;
     use crate::kernels::scan::scan;
-    use crate::kernels::splats::LOG2_ALPHA_MIN;
+    use crate::kernels::splats::{LOG2_ALPHA_MIN, pack};
 
-    /// Footprints of all kinds, unsorted by depth.
-    fn random_rows(n: usize, needles: bool, seed: u64, grid: Grid) -> (Packed, Projected) {
-        let mut draws = Stream::new(5, Purpose::Test, seed, u64::from(needles));
+    /// Footprints of all kinds on and around a picture, all at depth 1, packed; and the footprints themselves.
+    pub(in crate::kernels) fn random_rows(n: usize, needles: bool, seed: u64, grid: Grid) -> (Packed, Projected) {
+        let mut draws = Stream::new(21, Purpose::Test, seed, u64::from(needles));
         let mut p = Projected::default();
+        let mut colors = Vec::new();
         for _ in 0..n {
-            let major = draws.range(0.0, if needles { 9.0 } else { 4.0 }).exp2();
-            let minor = if needles { 0.55 } else { draws.range(0.55, major.max(0.6)) };
-            let (s, c) = draws.range(0.0, std::f64::consts::PI).sin_cos();
+            let major = draws.range(-1.0, if needles { 9.0 } else { 4.0 }).exp2();
+            let minor = if needles { 0.6 } else { draws.range(-1.0, 3.0).exp2() };
+            let (sin, cos) = draws.range(0.0, 3.2).sin_cos();
             let (u, v) = (1.0 / (major * major), 1.0 / (minor * minor));
-            let conic = [u * c * c + v * s * s, (u - v) * s * c, u * s * s + v * c * c];
-            p.means2d.push([draws.range(-40.0, 140.0) as f32, draws.range(-40.0, 110.0) as f32]);
+            let conic = [u * cos * cos + v * sin * sin, (u - v) * sin * cos, u * sin * sin + v * cos * cos];
+            let [width, height] = [grid.width, grid.height].map(f64::from);
+            p.means2d.push([draws.range(-20.0, width + 20.0) as f32, draws.range(-20.0, height + 17.0) as f32]);
             p.conics.push(conic.map(|x| x as f32));
             p.radii.push([conic[2], conic[0]].map(|x| (3.33 * (x / (u * v)).sqrt()).ceil() as u32));
-            p.opacities.push(draws.range(0.001, 1.0) as f32);
+            // A third of the opacities can reach the clamp.
+            p.opacities.push((draws.range(0.0, 1.5) as f32).min(1.0));
             p.depths.push(1.0);
+            colors.push([0; 3].map(|_| draws.range(0.0, 1.5) as f32));
         }
         let mut packed = Packed::default();
-        crate::kernels::splats::pack(&p, &vec![[0.5; 3]; n], grid, SimdPath::best(), &mut packed);
+        pack(&p, &colors, grid, SimdPath::best(), &mut packed);
         (packed, p)
     }
 

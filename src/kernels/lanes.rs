@@ -8,8 +8,11 @@ use crate::base::simd::LANES;
 /// Rows per parallel task: a multiple of [`LANES`], some 100 KiB of columns.
 pub const ROWS_PER_CHUNK: usize = 2048;
 
+/// One value for each lane: a row of a block, or a pixel of a tile's row.
+pub type Lane = [f32; LANES];
+
 /// `W` components of a block of rows, one array per component.
-pub type Lanes<const W: usize> = [[f32; LANES]; W];
+pub type Lanes<const W: usize> = [Lane; W];
 
 /// Gathers a block from row-major values: `src` holds up to [`LANES`] rows of `W` floats.
 #[inline(always)]

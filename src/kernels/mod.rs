@@ -2,6 +2,7 @@
 
 pub mod constants;
 pub mod image_loss;
+mod image_pair;
 pub mod isect_emit;
 pub mod isect_offsets;
 pub mod lanes;

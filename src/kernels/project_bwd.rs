@@ -100,7 +100,7 @@ pub fn geometry_vjp(view: &View, g: &Geometry, v_mean2d: [f32; 2], v_conic: [f32
 
 /// Derivative of the sigmoid at a logit: o (1 - o), without cancellation near o = 1.
 #[inline(always)]
-pub fn sigmoid_slope(logit: f32) -> f32 {
+fn sigmoid_slope(logit: f32) -> f32 {
     let e = exp32(-logit.abs());
     let d = 1.0 + e;
     e / (d * d)

@@ -363,11 +363,11 @@ impl Kernel for ProjectChunk<'_> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(in crate::kernels) mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};
 
-    fn camera() -> Camera {
+    pub(in crate::kernels) fn camera() -> Camera {
         Camera {
             viewmat: [[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, -0.6, 0.2], [0.0, 0.6, 0.8, 3.0]],
             fx: 70.0,

@@ -10,8 +10,9 @@
 //! so that a view may be cut at tile columns without changing a bit; 4. threads cannot change a bit.
 
 use super::constants::TILE;
+use super::lanes::Lane;
 use super::project_fwd::Projected;
-use super::rasterize_fwd::{Lanes, Lists, Raster, TILE_PIXELS, copy_lanes, exp2_bounded, log2_max_alpha};
+use super::rasterize_fwd::{Lists, Raster, TILE_PIXELS, copy_lanes, exp2_bounded, log2_max_alpha};
 use super::splats::{LOG2_ALPHA_MIN, ROWS_PER_CHUNK};
 use super::tile_block::{Block, ROWS, prefetch_splats};
 use crate::base::room;
@@ -55,11 +56,11 @@ pub struct FootprintGradients {
 #[repr(C, align(64))]
 struct Row {
     /// Transmittance in front of the splats processed so far (initially: behind everything).
-    t: Lanes,
+    t: Lane,
     /// Colour seen behind the splats processed so far, dotted with v_rgb, as if nothing were in front; initially that
     /// of the background, minus v_alpha.
-    behind: Lanes,
-    v_rgb: [Lanes; 3],
+    behind: Lane,
+    v_rgb: [Lane; 3],
     /// List index at which the lane stopped: entries from there on do not affect it.
     stop: [u32; LANES],
 }
@@ -78,7 +79,7 @@ struct Tile {
 }
 
 thread_local! {
-    /// One per thread: making it anew for every tile would cost as much as some hundred splats.
+    /// Each thread reuses its own: initialising one for every tile would cost as much as about a hundred splats.
     static SCRATCH: RefCell<Box<Tile>> = RefCell::new(Box::new(Tile {
         rows: [Row::EMPTY; ROWS],
         row_stop: [0; ROWS],
@@ -141,7 +142,7 @@ impl Kernel for BackTile<'_> {
         let Tile { rows, row_stop, block, sums, halves } = state;
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
-        let x: Lanes = std::array::from_fn(|lane| x0 + lane as f32);
+        let x: Lane = std::array::from_fn(|lane| x0 + lane as f32);
         let last_stop = row_stop.iter().fold(0, |m, s| m.max(*s));
         let all = lists.tile(tile);
         for (number, list) in all.chunks(BLOCK).enumerate().rev() {
@@ -196,10 +197,10 @@ fn bits(mut set: u64) -> impl Iterator<Item = usize> {
 #[derive(Clone, Copy, Default)]
 #[repr(C, align(64))]
 struct Sums {
-    h: Lanes,
-    hy: Lanes,
-    hyy: Lanes,
-    rgb: [Lanes; 3],
+    h: Lane,
+    hy: Lane,
+    hyy: Lane,
+    rgb: [Lane; 3],
 }
 
 /// The nine sums with lanes i and i + 8 added.
@@ -211,7 +212,7 @@ impl Sums {
     /// First step of the sum over lanes (pairwise halving, in the same order on every path). dx is constant in a lane,
     /// so its moments are formed here.
     #[inline(always)]
-    fn halves(&self, x: &Lanes, mean_x: f32) -> Halves {
+    fn halves(&self, x: &Lane, mean_x: f32) -> Halves {
         let mut out = Halves::default();
         for i in 0..8 {
             let [left, right] = [i, i + 8].map(|lane| {
@@ -235,7 +236,7 @@ fn back_row<const FMA: bool>(
     y: usize,
     first: u32,
     block: &Block<BLOCK>,
-    x: &Lanes,
+    x: &Lane,
     cap: f32,
     sums: &mut [Sums; BLOCK],
 ) {

@@ -13,6 +13,7 @@
 //! inner loop needs no other test.
 
 use super::constants::{TILE, TRANSMITTANCE_MIN};
+use super::lanes::Lane;
 use super::splats::{Grid, LOG2_ALPHA_MIN, Splat};
 use super::tile_block::{Block, ROWS, prefetch_splats};
 use super::tile_range::TileRange;
@@ -21,8 +22,6 @@ use rayon::prelude::*;
 use std::cell::RefCell;
 use std::sync::atomic::AtomicU64;
 
-/// One value per pixel of a row of a tile.
-pub type Lanes = [f32; LANES];
 /// Pixels of a tile.
 pub const TILE_PIXELS: usize = (TILE * TILE) as usize;
 /// Stop position of a pixel that processed its whole list.
@@ -129,11 +128,11 @@ const BLOCK: usize = 64;
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 struct Row {
-    t: Lanes,
+    t: Lane,
     /// A lane stops when its T would fall to this or below; -1 for dead lanes.
-    floor: Lanes,
-    rgb: [Lanes; 3],
-    t_final: Lanes,
+    floor: Lane,
+    rgb: [Lane; 3],
+    t_final: Lane,
     stop: [u32; LANES],
     /// Whether any lane is alive.
     alive: bool,
@@ -152,7 +151,7 @@ impl Row {
     /// Stops the lanes whose next transmittance is at or below their floor, at list index `at`.
     #[cold]
     #[inline(never)]
-    fn stop_lanes(&mut self, at: u32, t: &Lanes, next: &mut Lanes, weight: &mut Lanes) {
+    fn stop_lanes(&mut self, at: u32, t: &Lane, next: &mut Lane, weight: &mut Lane) {
         for lane in 0..LANES {
             if next[lane] <= self.floor[lane] {
                 self.t_final[lane] = t[lane];
@@ -173,7 +172,7 @@ struct Tile {
 }
 
 thread_local! {
-    /// One per thread: making it anew for every tile would cost as much as blending a few hundred splats.
+    /// Each thread reuses its own: initialising one for every tile would cost as much as blending a few hundred splats.
     static SCRATCH: RefCell<Box<Tile>> = RefCell::new(Box::new(Tile { rows: [Row::DEAD; ROWS], block: Block::new() }));
 }
 
@@ -250,7 +249,7 @@ fn blend_row<const FMA: bool>(row: &mut Row, y: usize, first: u32, block: &Block
     let mut reach = block.reach[y];
     let count = u64::from(reach.count_ones());
     let (mut t, mut rgb) = (row.t, row.rgb);
-    let x: Lanes = std::array::from_fn(|lane| x0 + lane as f32);
+    let x: Lane = std::array::from_fn(|lane| x0 + lane as f32);
     while reach != 0 {
         let i = reach.trailing_zeros() as usize % BLOCK;
         reach &= reach - 1;
@@ -311,7 +310,7 @@ pub fn rasterize_fwd(lists: &Lists<'_>, out: &mut Raster) {
 #[inline(always)]
 pub(super) fn copy_lanes(out: &mut [f32], from: &[f32]) {
     let n = out.len();
-    match (<&mut Lanes>::try_from(&mut *out), from.first_chunk::<LANES>()) {
+    match (<&mut Lane>::try_from(&mut *out), from.first_chunk::<LANES>()) {
         (Ok(out), Some(from)) => *out = *from,
         _ => out.copy_from_slice(&from[..n]),
     }
@@ -348,12 +347,10 @@ pub fn untile(grid: Grid, raster: &Raster, rgb: &mut [f32], alpha: &mut [f32]) {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 pub(in crate::kernels) mod tests {
     use super::*;
-    use crate::base::rng::{Purpose, Stream};
-    use crate::kernels::isect_emit::{count, emit};
+    use crate::kernels::isect_emit::{count, emit, tests::random_rows};
     use crate::kernels::isect_offsets::isect_offsets;
-    use crate::kernels::project_fwd::Projected;
     use crate::kernels::scan::scan;
-    use crate::kernels::splats::{Packed, pack};
+    use crate::kernels::splats::Packed;
 
     /// Footprints of all kinds, depths in row order, with their intersections.
     pub(in crate::kernels) struct Scene {
@@ -367,33 +364,16 @@ pub(in crate::kernels) mod tests {
 
     pub(in crate::kernels) fn scene(n: usize, needles: bool) -> Scene {
         let grid = Grid::new(70, 43);
-        let mut draws = Stream::new(21, Purpose::Test, n as u64, u64::from(needles));
-        let mut p = Projected::default();
-        let mut colors = Vec::new();
-        for _ in 0..n {
-            let major = draws.range(-1.0, if needles { 9.0 } else { 4.0 }).exp2();
-            let minor = if needles { 0.6 } else { draws.range(-1.0, 3.0).exp2() };
-            let (sin, cos) = draws.range(0.0, 3.2).sin_cos();
-            let (u, v) = (1.0 / (major * major), 1.0 / (minor * minor));
-            let conic = [u * cos * cos + v * sin * sin, (u - v) * sin * cos, u * sin * sin + v * cos * cos];
-            p.means2d.push([draws.range(-20.0, 90.0) as f32, draws.range(-20.0, 60.0) as f32]);
-            p.conics.push(conic.map(|x| x as f32));
-            p.radii.push([conic[2], conic[0]].map(|x| (3.33 * (x / (u * v)).sqrt()).ceil() as u32));
-            // A third of the opacities can reach the clamp.
-            p.opacities.push((draws.range(0.0, 1.5) as f32).min(1.0));
-            p.depths.push(1.0);
-            colors.push([0; 3].map(|_| draws.range(0.0, 1.5) as f32));
-        }
+        let (packed, projected) = random_rows(n, needles, n as u64, grid);
         let order: Vec<u32> = (0..n as u32).collect();
-        let (mut packed, simd) = (Packed::default(), SimdPath::best());
+        let simd = SimdPath::best();
         let (mut chunk_offsets, mut tile_offsets, mut isects) = (vec![], vec![], vec![]);
         let (mut tile_counts, mut cursors) = (vec![], vec![]);
-        pack(&p, &colors, grid, simd, &mut packed);
         count(&order, &packed, grid, TileRange::all(grid), simd, &mut tile_counts);
         let total = scan(&packed.chunk_counts, &mut chunk_offsets);
         isect_offsets(&tile_counts, grid.tiles(), &mut tile_offsets, &mut cursors);
         emit(&order, &packed, grid, TileRange::all(grid), simd, total, &mut cursors, &mut isects);
-        Scene { grid, radii: p.radii, packed, chunk_offsets, tile_offsets, isects }
+        Scene { grid, radii: projected.radii, packed, chunk_offsets, tile_offsets, isects }
     }
 
     impl Scene {

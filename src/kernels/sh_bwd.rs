@@ -15,7 +15,7 @@ use rayon::prelude::*;
 
 /// Gradient of sum_k `v_basis[k]` basis_k with respect to the unit direction, taken as if x, y, z were free.
 #[inline(always)]
-pub fn sh_basis_vjp(degree: u8, dir: [f32; 3], v_basis: &[f32; BASIS]) -> [f32; 3] {
+fn sh_basis_vjp(degree: u8, dir: [f32; 3], v_basis: &[f32; BASIS]) -> [f32; 3] {
     let [x, y, z] = dir;
     let v = v_basis;
     let mut g = [0.0; 3];
@@ -43,15 +43,15 @@ pub fn sh_basis_vjp(degree: u8, dir: [f32; 3], v_basis: &[f32; BASIS]) -> [f32; 
 /// Converts a gradient at the unit direction to one at the unnormalised direction: its tangential part, divided by the
 /// length.
 #[inline(always)]
-pub fn unit_direction_vjp(unit: [f32; 3], inv_len: f32, v_unit: [f32; 3]) -> [f32; 3] {
+fn unit_direction_vjp(unit: [f32; 3], inv_len: f32, v_unit: [f32; 3]) -> [f32; 3] {
     let along = dot(unit, v_unit);
     std::array::from_fn(|i| (v_unit[i] - along * unit[i]) * inv_len)
 }
 
 /// Backward of `sh_fwd`: writes `grads.means`, `grads.sh0` and `grads.sh_n`.
 ///
-/// `colors` is the output of `sh_fwd` and `v_colors` its gradient; `radii` are those given to `sh_fwd`: one entry per row
-/// each. `grads` is resized to the rows.
+/// `colors` is the output of `sh_fwd` and `v_colors` its gradient; `radii` are those given to `sh_fwd`: one entry per
+/// row each. `grads` is resized to the rows.
 pub fn sh_bwd(
     rows: &Columns,
     camera: &Camera,
@@ -166,49 +166,8 @@ impl<const DEGREE: u8> Kernel for ShBwdChunk<'_, DEGREE> {
 mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};
-    use crate::kernels::sh_fwd::{sh_basis, sh_fwd, unit_direction};
-
-    fn camera() -> Camera {
-        Camera {
-            viewmat: [[1.0, 0.0, 0.0, 0.5], [0.0, 1.0, 0.0, -0.25], [0.0, 0.0, 1.0, 2.0]],
-            fx: 60.0,
-            fy: 60.0,
-            cx: 32.0,
-            cy: 32.0,
-            width: 64,
-            height: 64,
-            near_plane: 0.01,
-            far_plane: 1e10,
-        }
-    }
-
-    #[test]
-    fn the_gradient_of_each_basis_function_is_its_derivative() {
-        let mut rng = Stream::new(11, Purpose::Test, 0, 0);
-        for _ in 0..20 {
-            let dir: [f32; 3] = std::array::from_fn(|_| rng.range(-1.0, 1.0) as f32);
-            let (unit, inv_len) = unit_direction(dir);
-            for k in 0..BASIS {
-                let mut one = [0.0; BASIS];
-                one[k] = 1.0;
-                let got = unit_direction_vjp(unit, inv_len, sh_basis_vjp(3, unit, &one));
-                for c in 0..3 {
-                    let at = |step: f32| {
-                        let mut moved = dir;
-                        moved[c] += step;
-                        let (d, _) = unit_direction(moved);
-                        (f64::from(moved[c]), f64::from(sh_basis(3, d)[k]))
-                    };
-                    let ((x1, y1), (x0, y0)) = (at(5e-3), at(-5e-3));
-                    let want = (y1 - y0) / (x1 - x0);
-                    // Rounding contributes 1e-7 / 1e-2 = 1e-5; the third derivative (at most some 60 / length^3 in band
-                    // 3) times h^2 / 6 = 4e-6 the rest.
-                    let limit = 3e-5 + 3e-4 * f64::from(inv_len).powi(3);
-                    assert!((f64::from(got[c]) - want).abs() < limit, "basis {k}, axis {c}: {} {want}", got[c]);
-                }
-            }
-        }
-    }
+    use crate::kernels::project_fwd::tests::camera;
+    use crate::kernels::sh_fwd::sh_fwd;
 
     #[test]
     fn culled_rows_get_zero_and_every_path_the_same_bits() {

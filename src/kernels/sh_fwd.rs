@@ -75,7 +75,7 @@ pub fn basis_len(degree: u8) -> usize {
 /// Colour of one row: basis times coefficients, plus 0.5, not below 0. `sh_n` is `[K - 1][3]`; only the
 /// coefficients of the first `basis.len()` functions are used.
 #[inline(always)]
-pub fn sh_color(basis: &[f32], sh0: [f32; 3], sh_n: &[f32]) -> [f32; 3] {
+fn sh_color(basis: &[f32], sh0: [f32; 3], sh_n: &[f32]) -> [f32; 3] {
     let mut c: [f32; 3] = std::array::from_fn(|i| 0.5 + basis[0] * sh0[i]);
     for (b, coefficient) in basis[1..].iter().zip(sh_n.as_chunks::<3>().0) {
         for i in 0..3 {

@@ -8,13 +8,11 @@
 //! bits.
 
 use super::constants::TILE;
-use super::lanes::{block_of, gather};
+use super::lanes::{Lane, block_of, gather};
 use super::project_fwd::Projected;
 use crate::base::room;
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use rayon::prelude::*;
-
-type Lanes = [f32; LANES];
 
 /// log2 of [`super::constants::ALPHA_MIN`], the threshold that the tile loops compare the exponent with.
 pub const LOG2_ALPHA_MIN: f32 = -7.994_353_4;
@@ -193,7 +191,7 @@ impl Ellipse {
 
 /// Pixel rows of a tile column, clipped to the box and the image; last < first if there is none.
 #[inline(always)]
-pub(super) fn rows_in_column(ellipse: &Ellipse, grid: Grid, tiles: [u16; 4], column: u16) -> [u16; 2] {
+fn rows_in_column(ellipse: &Ellipse, grid: Grid, tiles: [u16; 4], column: u16) -> [u16; 2] {
     let x0 = (u32::from(column) * TILE) as f32 + 0.5;
     let [first, last] = ellipse.rows_in(x0, x0 + (TILE - 1) as f32);
     let first = first.max(i32::from(tiles[1]) * TILE as i32);
@@ -290,7 +288,7 @@ impl Kernel for PackChunk<'_> {
 /// log2 of positive normal numbers, within 1.2e-7 (absolute, or relative for larger results): scales the mantissa to
 /// [1/sqrt 2, sqrt 2), then sums the series of 2 log2(e) atanh((m - 1) / (m + 1)) to the ninth power.
 #[inline(always)]
-fn log2_lanes(x: &Lanes) -> Lanes {
+fn log2_lanes(x: &Lane) -> Lane {
     const SQRT_HALF_BITS: u32 = 0x3f35_04f3;
     let mut out = [0.0; LANES];
     for lane in 0..LANES {
@@ -308,7 +306,7 @@ fn log2_lanes(x: &Lanes) -> Lanes {
 /// Splats and spans of a block of rows, by lane: plain arrays and one loop, which the compiler vectorises.
 struct PackedLanes {
     /// mean x, mean y, a, b, c, log2_opacity, reach.
-    splat: [Lanes; 7],
+    splat: [Lane; 7],
     /// First tile column, first tile row, one past the last column, one past the last row.
     tiles: [[i32; LANES]; 4],
     /// First and last pixel row in the first, then in the second tile column.
@@ -317,7 +315,7 @@ struct PackedLanes {
 
 impl PackedLanes {
     #[inline(always)]
-    fn new(means: &[Lanes; 2], conics: &[Lanes; 3], radii: &[Lanes; 2], logs: &Lanes, grid: Grid) -> Self {
+    fn new(means: &[Lane; 2], conics: &[Lane; 3], radii: &[Lane; 2], logs: &Lane, grid: Grid) -> Self {
         const LOG2E: f32 = std::f32::consts::LOG2_E;
         const SHIFT: u32 = TILE.ilog2();
         let (tiles_x, tiles_y, height) = (grid.tiles_x as i32, grid.tiles_y as i32, grid.height as i32);
@@ -371,21 +369,38 @@ impl PackedLanes {
     }
 }
 
+/// Calls `each(tile column, pixel rows)` for every tile column of a row's span, from left to right; with `CUT`, for those from
+/// `columns[0]` to below `columns[1]`.
+#[inline(always)]
+pub(super) fn for_each_column<const CUT: bool>(
+    splat: &Splat,
+    span: &Span,
+    grid: Grid,
+    columns: [u16; 2],
+    mut each: impl FnMut(u16, [u16; 2]),
+) {
+    let [x0, _, x1, _] = span.tiles;
+    for (column, rows) in (x0..x1).zip(span.rows) {
+        if !CUT || (columns[0]..columns[1]).contains(&column) {
+            each(column, rows);
+        }
+    }
+    if x1.saturating_sub(x0) > 2 {
+        let [first, end] = if CUT { [(x0 + 2).max(columns[0]), x1.min(columns[1])] } else { [x0 + 2, x1] };
+        if first < end {
+            let ellipse = splat.ellipse();
+            for column in first..end {
+                each(column, rows_in_column(&ellipse, grid, span.tiles, column));
+            }
+        }
+    }
+}
+
 /// Number of tiles that a row reaches.
 #[inline(always)]
 fn tiles_reached(splat: &Splat, span: &Span, grid: Grid) -> u32 {
-    let [x0, _, x1, _] = span.tiles;
     let mut count = 0;
-    for (column, rows) in (x0..x1).zip(span.rows) {
-        let _ = column;
-        count += tile_rows(rows).len() as u32;
-    }
-    if x1.saturating_sub(x0) > 2 {
-        let ellipse = splat.ellipse();
-        for column in x0 + 2..x1 {
-            count += tile_rows(rows_in_column(&ellipse, grid, span.tiles, column)).len() as u32;
-        }
-    }
+    for_each_column::<false>(splat, span, grid, [0; 2], |_, rows| count += tile_rows(rows).len() as u32);
     count
 }
 

@@ -7,23 +7,20 @@
 //! cache.
 //!
 //! SSIM (Wang, Bovik, Sheikh and Simoncelli 2004) with means m, over an 11x11 Gaussian window of sigma 1.5:
-//! S = (2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sxx + syy + C2)). Only the sum sxx + syy occurs, so four windowed
-//! maps are enough: x, y, x^2 + y^2, x y. The derivative goes back through the same symmetric window, with three maps:
-//! dS/dx = W * dS/dmx + 2 x (W * dS/dE[xx]) + y (W * dS/dE[xy]).
+//! S = (2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sxx + syy + C2)). Only the sum sxx + syy occurs, so four
+//! windowed maps are enough: x, y, x^2 + y^2, x y. The derivative goes back through the same symmetric window, with
+//! three maps: dS/dx = W * dS/dmx + 2 x (W * dS/dE[xx]) + y (W * dS/dE[xy]).
 //!
 //! Invariants: 1. each value of a pixel comes from the same operations in the same order wherever the band or tile
 //! borders are; 2. each pixel is counted once in the sums, by the band and tile that own it; 3. where the mask is 0 the
 //! picture is replaced by the reference, the map has weight 0 and the gradient is exactly 0.
 
-use super::image_loss::{ImagePair, Reference, SsimVariant};
+use super::image_pair::{ImagePair, RADIUS, Reference, SsimVariant, WINDOW};
+use super::lanes::Lane;
 use crate::base::simd::{Kernel, LANES, fma};
 use std::array::from_fn;
 use std::ops::Range;
 
-/// Side of the SSIM window, pixels.
-pub(super) const WINDOW: usize = 11;
-/// Pixels on each side of the window's centre.
-pub(super) const RADIUS: usize = 5;
 /// Columns of one tile: with the map's margin of 5 on both sides, 16 vectors.
 const TILE: usize = 16 * LANES - 2 * RADIUS;
 /// Columns (and rows) of input that a gradient needs on each side.
@@ -50,7 +47,6 @@ const TAPS: [f32; WINDOW] = [
     1.028_380_1e-3,
 ];
 
-type Lane = [f32; LANES];
 type Row = [f32; STRIDE];
 
 /// Sums over the used pixels of one band.
@@ -165,7 +161,7 @@ impl BandKernel<'_> {
 
     /// Marks the columns of the map that have weight, and those that this tile sums.
     fn mark_columns(&self, tile: &Tile, scratch: &mut Scratch) {
-        let inside = domain(self.variant, self.pair.width);
+        let inside = self.variant.domain(self.pair.width);
         for j in 0..STRIDE {
             let column = (tile.own.start + j).wrapping_sub(RADIUS);
             let counts = inside.contains(&column) && j < tile.own.len() + 2 * RADIUS;
@@ -256,7 +252,7 @@ impl BandKernel<'_> {
     fn map_row<const FMA: bool>(&self, tile: &Tile, row: isize, i: usize, scratch: &mut Scratch, sums: &mut LaneSums) {
         let Scratch { input, derivatives, columns, domain: in_domain, owned } = scratch;
         let derivatives = &mut derivatives[(i - 2 * RADIUS) % WINDOW];
-        let rows_with_weight = domain(self.variant, self.pair.height);
+        let rows_with_weight = self.variant.domain(self.pair.height);
         if row < 0 || !rows_with_weight.contains(&(row as usize)) {
             *derivatives = [[0.0; STRIDE]; 3];
             return;
@@ -403,14 +399,6 @@ fn multiply(mut a: Lane, b: Lane) -> Lane {
         a[l] *= b[l];
     }
     a
-}
-
-/// Positions along one side that the map covers.
-pub(super) fn domain(variant: SsimVariant, side: usize) -> Range<usize> {
-    match variant {
-        SsimVariant::Valid => RADIUS..side.saturating_sub(RADIUS),
-        SsimVariant::Same | SsimVariant::Reflect => 0..side,
-    }
 }
 
 /// Index of the mirror image of `i` in `0..side`; the border element is not repeated.

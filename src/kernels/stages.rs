@@ -12,8 +12,8 @@ pub struct Stage {
 
 /// The stages in order.
 ///
-/// On a device a sort by tile stands between `isect_emit` and `isect_offsets`. On the CPU it is a counting sort:
-/// `isect_offsets` counts tiles and converts the counts to places, and `isect_emit` writes directly to them.
+/// A device sorts intersections by tile between `isect_emit` and `isect_offsets`. The CPU uses a counting sort instead:
+/// `isect_offsets` converts the tiles' counts to places, and `isect_emit` writes each intersection to its place.
 pub const STAGES: [Stage; 11] = [
     Stage { name: "project_fwd", doc: "rows to footprints on the screen; culls" },
     Stage { name: "sh_fwd", doc: "colours of the visible rows from their view directions" },

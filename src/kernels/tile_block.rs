@@ -6,7 +6,7 @@
 
 use super::constants::TILE;
 use super::isect_emit::Isect;
-use super::rasterize_fwd::Lanes;
+use super::lanes::Lane;
 use super::splats::Splat;
 use crate::base::simd::{LANES, fma, prefetch};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -18,11 +18,11 @@ pub(super) const ROWS: usize = TILE as usize;
 #[repr(C, align(64))]
 pub(super) struct Local {
     /// dy by row.
-    pub dy: Lanes,
+    pub dy: Lane,
     /// b dy by row.
-    pub bdy: Lanes,
+    pub bdy: Lane,
     /// c dy^2 + log2_opacity by row.
-    pub cdy: Lanes,
+    pub cdy: Lane,
     /// x of the mean.
     pub mean_x: f32,
     /// Coefficient of dx^2.

@@ -35,12 +35,7 @@ crate::wgsl_struct! {
         pub slope_high: [f32; 2],
         /// Rows of the window.
         pub row_count: u32,
-        /// 0.
-        pub pad0: u32,
-        /// 0.
-        pub pad1: u32,
-        /// 0.
-        pub pad2: u32,
+        _pad: [u32; 3],
     }
 }
 
@@ -61,9 +56,7 @@ impl RowsUniforms {
             slope_low: view.slope_low,
             slope_high: view.slope_high,
             row_count,
-            pad0: 0,
-            pad1: 0,
-            pad2: 0,
+            _pad: [0; 3],
         }
     }
 }

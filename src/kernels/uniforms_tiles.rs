@@ -39,9 +39,7 @@ crate::wgsl_struct! {
         /// Unused.
         pub pad: [u32; 2],
     }
-}
 
-crate::wgsl_struct! {
     /// Uniform of `radix_sort.wgsl`.
     pub struct SortUniforms {
         /// Most keys; for `depth_keys`, most rows.
@@ -53,9 +51,7 @@ crate::wgsl_struct! {
         /// Lowest bit of the digit.
         pub shift: u32,
     }
-}
 
-crate::wgsl_struct! {
     /// Uniform of `isect_emit.wgsl`.
     pub struct IsectUniforms {
         /// Width, height, tile columns, tile rows.
@@ -67,9 +63,7 @@ crate::wgsl_struct! {
         /// Unused.
         pub pad: [u32; 2],
     }
-}
 
-crate::wgsl_struct! {
     /// Uniform of `isect_offsets.wgsl`.
     pub struct OffsetsUniforms {
         /// Number of tiles.
@@ -81,9 +75,7 @@ crate::wgsl_struct! {
         /// Unused.
         pub pad: u32,
     }
-}
 
-crate::wgsl_struct! {
     /// Uniform of `rasterize_fwd.wgsl` and `rasterize_bwd.wgsl`.
     pub struct RasterUniforms {
         /// Width, height, tile columns, tile rows.

@@ -224,7 +224,7 @@ impl GpuRenderer {
             let mut recorder = gpu.begin("coverage");
             let bytes = recorder.read_back("rasterize_fwd", &view.frame.t_final.view())?;
             gpu.submit(recorder)?;
-            bytes.copy_to(gpu, &mut alpha)?;
+            bytes.copy_to(&mut alpha)?;
             alpha.iter_mut().for_each(|t| *t = 1.0 - *t);
             Ok((view, alpha))
         })
@@ -314,7 +314,7 @@ impl GpuRenderer {
         let demand = loop {
             let demand = match view.demand {
                 DemandState::Known(demand) => demand,
-                DemandState::Pending(readback) => readback.wait(gpu)?,
+                DemandState::Pending(readback) => readback.wait()?,
             };
             view.demand = DemandState::Known(demand);
             if self.tiles.fits(&view.frame, demand)? {
@@ -343,7 +343,7 @@ impl GpuRenderer {
         self.gpu.submit(recorder)?;
         (self.image.width, self.image.height) = (width, height);
         self.image.rgb.resize(3 * view.of.camera.pixels(), 0.0);
-        bytes.copy_to(&self.gpu, &mut self.image.rgb)
+        bytes.copy_to(&mut self.image.rgb)
     }
 
     /// Submits the loss of `rgb`: the picture of the view, which may still turn out invalid, or the corrected picture.
@@ -379,7 +379,7 @@ impl GpuRenderer {
             let mut recorder = self.gpu.begin("picture gradient");
             let bytes = recorder.read_back("image_loss", &loss.v_rgb.view())?;
             self.gpu.submit(recorder)?;
-            bytes.copy_to(&self.gpu, &mut self.gradient.v_rgb)?;
+            bytes.copy_to(&mut self.gradient.v_rgb)?;
         }
         Ok(view)
     }
@@ -482,22 +482,22 @@ impl GpuRenderer {
         }
         let mut colors = readbacks.colors.into_iter();
         for bytes in colors.by_ref().take(1) {
-            bytes.copy_to(&self.gpu, &mut out.sh0)?;
+            bytes.copy_to(&mut out.sh0)?;
         }
         for (band, bytes) in colors.enumerate() {
             let values = &mut self.scratch.band;
             values.clear();
             values.resize(rows * super::gpu_rows::BAND_WIDTHS[band], 0.0);
-            bytes.copy_to(&self.gpu, values)?;
+            bytes.copy_to(values)?;
             band_into_sh_n(values, band, out);
         }
         let geometry = [&mut out.means, &mut out.quats, &mut out.scales, &mut out.opacities];
         for (to, bytes) in geometry.into_iter().zip(readbacks.geometry) {
-            bytes.copy_to(&self.gpu, to)?;
+            bytes.copy_to(to)?;
         }
         let footprints = &mut self.scratch.footprints;
         room::resize(footprints, rows, [0.0; 4]);
-        readbacks.footprints.copy_to(&self.gpu, footprints)?;
+        readbacks.footprints.copy_to(footprints)?;
         grads.radii.clear();
         grads.radii.extend(footprints.iter().map(|f| [f[2] as u32, f[3] as u32]));
         grads.means2d.clear();
@@ -515,7 +515,7 @@ impl GpuRenderer {
             LossSums::Empty => [0.0; 4],
             LossSums::Pending(readback) => {
                 let mut sums = [0.0f32; 4];
-                readback.copy_to(&self.gpu, &mut sums)?;
+                readback.copy_to(&mut sums)?;
                 sums
             }
             LossSums::Known(sums) => sums,

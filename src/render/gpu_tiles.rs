@@ -115,10 +115,10 @@ impl DemandReadback {
     ///
     /// # Errors
     /// The device failed.
-    pub fn wait(self, gpu: &Gpu) -> GpuResult<Demand> {
+    pub fn wait(self) -> GpuResult<Demand> {
         let (mut isects, mut list_max) = ([0u32], [0u32]);
-        self.total.copy_to(gpu, &mut isects)?;
-        self.longest.copy_to(gpu, &mut list_max)?;
+        self.total.copy_to(&mut isects)?;
+        self.longest.copy_to(&mut list_max)?;
         Ok(Demand { isects: isects[0], list_max: list_max[0] })
     }
 }
@@ -417,7 +417,7 @@ impl TileStages {
         loop {
             let (frame, demand) = self.frame(gpu, &mut recorder, splats, &ranks, blend)?;
             gpu.submit(recorder)?;
-            let demand = demand.wait(gpu)?;
+            let demand = demand.wait()?;
             if self.fits(&frame, demand)? {
                 return Ok((ranks, frame, demand));
             }

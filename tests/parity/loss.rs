@@ -61,8 +61,8 @@ fn on_gpu(gpu: &Gpu, image: &Image, target: &Target, options: &LossOptions) -> (
         .map(|sums| recorder.read_back("image_loss", &sums.view()).unwrap());
     let v_rgb = recorder.read_back("image_loss", &v_rgb.view()).unwrap();
     gpu.submit(recorder).unwrap();
-    let sums = sums.map_or([0.0; 4], |bytes| bytes.to_vec::<[f32; 4]>(gpu).unwrap()[0]);
-    let mut v_rgb: Vec<f32> = v_rgb.to_vec(gpu).unwrap();
+    let sums = sums.map_or([0.0; 4], |bytes| bytes.to_vec::<[f32; 4]>().unwrap()[0]);
+    let mut v_rgb: Vec<f32> = v_rgb.to_vec().unwrap();
     v_rgb.truncate(image.rgb.len());
     (value(&plan, sums), v_rgb)
 }

@@ -88,7 +88,7 @@ fn read<'g>(gpu: &'g Gpu, buffer: &Buffer, stage: impl FnOnce(&mut Recorder<'g>)
     stage(&mut recorder);
     let bytes = recorder.read_back("parity", &buffer.view()).unwrap();
     gpu.submit(recorder).unwrap();
-    let mut values: Vec<f32> = bytes.to_vec(gpu).unwrap();
+    let mut values: Vec<f32> = bytes.to_vec().unwrap();
     values.truncate((buffer.size() / 4) as usize);
     values
 }

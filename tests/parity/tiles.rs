@@ -60,7 +60,7 @@ fn gpu_scan(gpu: &Gpu, stages: &TileStages, values: &[u32]) -> Vec<u32> {
     stages.scan(gpu, &mut recorder, &from.view(), values.len() as u32, &to.view()).unwrap();
     let back = recorder.read_back("sums", &to.view()).unwrap();
     gpu.submit(recorder).unwrap();
-    back.to_vec(gpu).unwrap()
+    back.to_vec().unwrap()
 }
 
 #[test]
@@ -105,7 +105,7 @@ fn gpu_sort(gpu: &Gpu, stages: &TileStages, keys: &[u32], live: u32, bits: u32) 
     let keys = recorder.read_back("keys", &sorted.keys.view()).unwrap();
     let values = recorder.read_back("values", &sorted.values.view()).unwrap();
     gpu.submit(recorder).unwrap();
-    (keys.to_vec(gpu).unwrap(), values.to_vec(gpu).unwrap())
+    (keys.to_vec().unwrap(), values.to_vec().unwrap())
 }
 
 /// Footprints of a view, with culled rows among them.
@@ -266,8 +266,8 @@ fn on_gpu(gpu: &Gpu, stages: &mut TileStages, scene: &Scene, v_rgb: &[f32], v_al
     .map(|b| recorder.read_back("results", &b.view()).unwrap());
     gpu.submit(recorder).unwrap();
     let [order, row_from_isect, isects, tile_offsets, rgb, t_final, v_splats] = read;
-    let (order, rows_of) = (order.to_vec::<u32>(gpu).unwrap(), row_from_isect.to_vec::<u32>(gpu).unwrap());
-    let (isects, starts) = (isects.to_vec::<u32>(gpu).unwrap(), tile_offsets.to_vec::<u32>(gpu).unwrap());
+    let (order, rows_of) = (order.to_vec::<u32>().unwrap(), row_from_isect.to_vec::<u32>().unwrap());
+    let (isects, starts) = (isects.to_vec::<u32>().unwrap(), tile_offsets.to_vec::<u32>().unwrap());
     let visible = scene.projected.radii.iter().filter(|r| **r != [0, 0]).count();
     let pixels = (grid.width * grid.height) as usize;
     let tile =
@@ -275,9 +275,9 @@ fn on_gpu(gpu: &Gpu, stages: &mut TileStages, scene: &Scene, v_rgb: &[f32], v_al
     Outcome {
         order: order[..visible].to_vec(),
         lists: (0..grid.tiles()).map(tile).collect(),
-        rgb: rgb.to_vec::<f32>(gpu).unwrap()[..3 * pixels].to_vec(),
-        t_final: t_final.to_vec::<f32>(gpu).unwrap()[..pixels].to_vec(),
-        gradients: v_splats.to_vec::<[f32; 12]>(gpu).unwrap()[..rows as usize]
+        rgb: rgb.to_vec::<f32>().unwrap()[..3 * pixels].to_vec(),
+        t_final: t_final.to_vec::<f32>().unwrap()[..pixels].to_vec(),
+        gradients: v_splats.to_vec::<[f32; 12]>().unwrap()[..rows as usize]
             .iter()
             .map(|v| [v[0], v[1], v[4], v[5], v[6], v[8], v[9], v[10], v[3]])
             .collect(),
@@ -443,8 +443,8 @@ fn dispatches_beyond_65_535_workgroups_fold() {
             .map(|b| recorder.read_back("results", &b.view()).unwrap());
         gpu.submit(recorder).unwrap();
         let [rows_of, isects, starts, rgb] = read;
-        let (rows_of, isects) = (rows_of.to_vec::<u32>(&gpu).unwrap(), isects.to_vec::<u32>(&gpu).unwrap());
-        let starts = starts.to_vec::<u32>(&gpu).unwrap();
+        let (rows_of, isects) = (rows_of.to_vec::<u32>().unwrap(), isects.to_vec::<u32>().unwrap());
+        let starts = starts.to_vec::<u32>().unwrap();
         for tile in 0..4095u32 {
             assert_eq!(starts[tile as usize], tile * rows);
             for (row, isect) in (0..rows).zip(&isects[(tile * rows) as usize..]) {
@@ -452,7 +452,7 @@ fn dispatches_beyond_65_535_workgroups_fold() {
             }
         }
         // alpha is 0.9 at every pixel: three of them, then the fourth would bring T to 1e-4 or, by rounding, not.
-        let rgb: Vec<f32> = rgb.to_vec(&gpu).unwrap();
+        let rgb: Vec<f32> = rgb.to_vec().unwrap();
         assert!(rgb[..16 * 65_520].iter().all(|red| (red - 0.5).abs() < 1e-3));
     }
 }

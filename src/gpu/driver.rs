@@ -1,0 +1,54 @@
+//! The opened wgpu device with its queue and error reports: what the other files of this room share.
+//!
+//! Invariant: calls return before the driver reports their errors; the caller asks [`Faults::check`] afterwards.
+
+use std::sync::Arc;
+
+use super::error::{Faults, GpuError, GpuResult};
+
+/// An opened wgpu device.
+#[derive(Debug)]
+pub(super) struct Driver {
+    pub(super) device: wgpu::Device,
+    pub(super) queue: wgpu::Queue,
+    pub(super) faults: Arc<Faults>,
+}
+
+impl Driver {
+    /// Opens the device of `adapter`, called `name` in errors.
+    pub(super) fn open(
+        adapter: &wgpu::Adapter,
+        name: &str,
+        required_features: wgpu::Features,
+        required_limits: wgpu::Limits,
+    ) -> GpuResult<Driver> {
+        let descriptor =
+            wgpu::DeviceDescriptor { label: Some("gsscale"), required_features, required_limits, ..Default::default() };
+        let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
+            .map_err(|e| GpuError::Open { device: name.into(), message: e.to_string() })?;
+        let faults = Arc::new(Faults::default());
+        let reports = Arc::clone(&faults);
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| reports.report(&error)));
+        let losses = Arc::clone(&faults);
+        device.set_device_lost_callback(move |_, message| losses.lost(message));
+        Ok(Driver { device, queue, faults })
+    }
+
+    /// A new buffer; one with `MAP_WRITE` is mapped.
+    pub(super) fn buffer(&self, label: &str, size: u64, usage: wgpu::BufferUsages) -> wgpu::Buffer {
+        let mapped_at_creation = usage.contains(wgpu::BufferUsages::MAP_WRITE);
+        self.device.create_buffer(&wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation })
+    }
+
+    /// A new command encoder.
+    pub(super) fn encoder(&self, label: &str) -> wgpu::CommandEncoder {
+        self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some(label) })
+    }
+
+    /// Waits until the device has finished `submission`; errors that no report explains name `stage`.
+    pub(super) fn wait(&self, stage: &str, submission: Option<wgpu::SubmissionIndex>) -> GpuResult<()> {
+        let waited = self.device.poll(wgpu::PollType::Wait { submission_index: submission, timeout: None });
+        self.faults.check()?;
+        waited.map(|_| ()).map_err(|e| GpuError::validation(stage, e))
+    }
+}
