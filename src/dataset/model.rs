@@ -1,8 +1,22 @@
-//! The result of a reader, before any photo is opened: plain data in the dataset's own coordinates, all f64.
+//! What a reader is asked for and what it returns before any photo is opened: plain data in the dataset's own
+//! coordinates, all f64.
 
 use crate::base::error::InputResult;
 use glam::{DMat3, DVec3};
 use std::path::PathBuf;
+
+/// The user's options for reading a scene.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct ReadOptions {
+    /// Image folder, relative to the scene; `None` is `images`. Photo names in transforms.json include their folder:
+    /// for these, `images` is only a second place to look, and any other folder replaces the one in the name.
+    pub images: Option<String>,
+    /// Drop a view with a warning, instead of failing, if its missing photo is needed now (the JSON does not state its
+    /// size). The loader reports missing photos whose size is known.
+    pub allow_missing: bool,
+    /// Leave points in their file and return its path: they may exceed memory.
+    pub points_later: bool,
+}
 
 /// Supported lens models, with COLMAP's parameter order in the comments.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -100,7 +114,7 @@ pub struct RawScene {
     /// Points; may be empty.
     pub points: PointCloud,
     /// An existing file of points that the caller must read: a PLY that the dataset names, because this module does not
-    /// read PLY; or, with [`super::read::ReadOptions::points_later`], the model's own points3D file
+    /// read PLY; or, with [`ReadOptions::points_later`], the model's own points3D file
     /// ([`super::colmap::stream_points`]).
     pub points_path: Option<PathBuf>,
     /// Everything dropped or repaired, one sentence each, for the user.

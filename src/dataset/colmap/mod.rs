@@ -14,9 +14,9 @@ mod text;
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::checks::{MAX_COORDINATE, listed, sort_views};
+pub use crate::dataset::model::ReadOptions;
 use crate::dataset::model::{Intrinsics, PointCloud, Pose, RawScene, RawView, TakePoint};
 use crate::dataset::paths::safe_join;
-pub use crate::dataset::read::ReadOptions;
 use glam::{DMat3, DQuat, DVec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -20,8 +20,7 @@ pub mod write;
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::checks::{checked_intrinsics, listed, sort_views};
-use crate::dataset::model::{Lens, RawScene, RawView, Split};
-use crate::dataset::read::ReadOptions;
+use crate::dataset::model::{Lens, RawScene, RawView, ReadOptions, Split};
 use crate::dataset::transforms::pose::make_pose;
 use std::path::{Path, PathBuf};
 use torch_file::TorchFile;

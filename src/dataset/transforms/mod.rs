@@ -25,9 +25,8 @@ pub(in crate::dataset) mod pose;
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::checks::{listed, sort_views};
-use crate::dataset::model::{PointCloud, RawScene, RawView, Split};
+use crate::dataset::model::{PointCloud, RawScene, RawView, ReadOptions, Split};
 use crate::dataset::paths::{clean_name, safe_join};
-use crate::dataset::read::ReadOptions;
 use intrinsics::Levels;
 use json::{FIX_KEY, JsonFile, LISTS, Names, Node, STAY_INSIDE};
 pub use matrix_city::{looks_like_matrix_city, read_matrix_city};
@@ -123,7 +122,7 @@ impl<'a> Reading<'a> {
     ) -> InputResult<()> {
         let top = json.top();
         let folder = file.parent().unwrap_or(Path::new(""));
-        if json.frame_count()? == 0 && split != Some(Split::Test) {
+        if !json.has_frames()? && split != Some(Split::Test) {
             return Err(top.error("frames", "no frames", "write the file again with its frames"));
         }
         let prescribed = Prescribed::of(json)?;
