@@ -69,15 +69,8 @@ impl Division<'_> {
         axis: usize,
         count: usize,
     ) -> InputResult<((Spool<E>, PointBox), (Spool<E>, PointBox))> {
-        let mut search = RankSearch::new(count as u64, records.len() as u64);
-        while !search.is_done() {
-            records.for_each(|e| {
-                search.count(axis_key(e, axis));
-                Ok(())
-            })?;
-            search.next_pass();
-        }
-        let first_high = search.key().unwrap_or(u64::MAX);
+        let search = RankSearch::new(count as u64, records.len() as u64);
+        let first_high = records.search(search, |e| Some(axis_key(e, axis)))?.key().unwrap_or(u64::MAX);
         let (mut low, mut high) = (SpoolWriter::new(self.space), SpoolWriter::new(self.space));
         let (mut low_box, mut high_box) = (PointBox::EMPTY, PointBox::EMPTY);
         records.for_each(|e| {

@@ -80,21 +80,12 @@ impl<'a, R: BufRead> Body<'a, R> {
             return Ok(());
         }
         self.check_room(element)?;
-        if self.format == Format::Ascii {
-            for _ in 0..element.count {
-                self.next_line()?;
-            }
-            return Ok(());
-        }
-        let (row_bytes, exact) = element.row_bytes();
-        if exact {
+        match (self.format, element.row_bytes()) {
+            (Format::Ascii, _) => (0..element.count).try_for_each(|_| self.next_line()),
             // No overflow: the product was compared with the bytes left above.
-            return self.skip_bytes(element.count * row_bytes);
+            (_, (row_bytes, true)) => self.skip_bytes(element.count * row_bytes),
+            _ => (0..element.count).try_for_each(|_| self.walk_row(element, |_, _| {})),
         }
-        for _ in 0..element.count {
-            self.walk_row(element, |_, _| {})?;
-        }
-        Ok(())
     }
 
     fn fill(&mut self, bytes: &mut [u8]) -> InputResult<()> {
@@ -212,7 +203,7 @@ pub fn read_rows<R: BufRead>(
     body: &mut Body<'_, R>,
     element: &Element,
     slots: &[usize],
-    mut each: impl FnMut(u64, &[f64]),
+    mut each: impl FnMut(u64, &[f64]) -> InputResult<()>,
 ) -> InputResult<()> {
     let (row_bytes, exact) = element.row_bytes();
     if body.format != Format::Ascii && exact {
@@ -235,7 +226,7 @@ pub fn read_rows<R: BufRead>(
         } else {
             body.walk_row(element, store)?;
         }
-        each(row, &values);
+        each(row, &values)?;
     }
     Ok(())
 }
@@ -246,7 +237,7 @@ fn read_packed<R: BufRead>(
     element: &Element,
     row_bytes: usize,
     slots: &[usize],
-    mut each: impl FnMut(u64, &[f64]),
+    mut each: impl FnMut(u64, &[f64]) -> InputResult<()>,
 ) -> InputResult<()> {
     let mut offsets = Vec::with_capacity(element.properties.len());
     let mut offset = 0;
@@ -268,7 +259,7 @@ fn read_packed<R: BufRead>(
             for (value, &(offset, scalar)) in values.iter_mut().zip(&fields) {
                 *value = scalar.decode(&bytes[offset..], big_endian);
             }
-            each(row, &values);
+            each(row, &values)?;
             row += 1;
         }
     }
