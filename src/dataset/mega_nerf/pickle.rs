@@ -329,16 +329,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn plain_values_are_read() {
-        let value =
-            read(b"\x80\x02}q\x00(X\x01\x00\x00\x00WK\x60X\x01\x00\x00\x00xG\x3f\xf8\x00\x00\x00\x00\x00\x00u.");
-        let value = value.unwrap_or(Value::Nothing);
-        assert_eq!(value.get("W"), Some(&Value::Int(96)));
-        assert_eq!(value.get("x"), Some(&Value::Float(1.5)));
-        assert_eq!(read(b"\x80\x02\x8a\x02\xff\xff."), Ok(Value::Int(-1)));
-    }
-
-    #[test]
     fn attacks_give_an_error_message() {
         for (text, word) in [
             (&b"cos\nsystem\n."[..], "os system"),
