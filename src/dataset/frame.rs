@@ -10,7 +10,6 @@
 
 use super::model::Pose;
 use glam::DVec3;
-use std::convert::Infallible;
 
 /// Larger coordinates are treated as non-finite: their squares would overflow.
 pub const LARGEST_COORDINATE: f64 = 1e100;
@@ -74,14 +73,9 @@ pub struct Extent {
 impl Extent {
     /// Measures cameras and points. Positions that are not [`usable`] are ignored.
     pub fn measure(centres: &[DVec3], points: &[[f64; 3]]) -> Self {
-        let distances = |centre: DVec3| {
-            let points = points.iter().map(|&p| DVec3::from_array(p)).filter(|&p| usable(p));
-            Ok::<f64, Infallible>(median(points.map(|p| p.distance(centre)).collect()))
-        };
-        match Extent::measure_by(centres, distances) {
-            Ok(extent) => extent,
-            Err(never) => match never {},
-        }
+        let points = points.iter().map(|&p| DVec3::from_array(p)).filter(|&p| usable(p));
+        let centre = median_position(centres);
+        Extent::of(centres, centre, median(points.map(|p| p.distance(centre)).collect()))
     }
 
     /// As [`Extent::measure`], with `point_distance` giving the median distance of the usable points from a position.
@@ -89,14 +83,14 @@ impl Extent {
     /// # Errors
     /// Those of `point_distance`.
     pub fn measure_by<E>(centres: &[DVec3], point_distance: impl FnOnce(DVec3) -> Result<f64, E>) -> Result<Self, E> {
-        let centres: Vec<DVec3> = centres.iter().copied().filter(|&c| usable(c)).collect();
-        let centre = DVec3::from_array(std::array::from_fn(|axis| median(centres.iter().map(|c| c[axis]).collect())));
-        let mut camera_radius = median(centres.iter().map(|c| c.distance(centre)).collect());
-        let point_distance = point_distance(centre)?;
-        if camera_radius <= negligible(point_distance, centre) {
-            camera_radius = 0.0;
-        }
-        Ok(Extent { centre, camera_radius, point_distance })
+        let centre = median_position(centres);
+        Ok(Extent::of(centres, centre, point_distance(centre)?))
+    }
+
+    fn of(centres: &[DVec3], centre: DVec3, point_distance: f64) -> Self {
+        let radius = median(centres.iter().filter(|&&c| usable(c)).map(|c| c.distance(centre)).collect());
+        let camera_radius = if radius <= negligible(point_distance, centre) { 0.0 } else { radius };
+        Extent { centre, camera_radius, point_distance }
     }
 
     /// The local frame: the origin is the median camera; one unit is the median distance of the cameras from it, so
@@ -145,6 +139,12 @@ impl Extent {
 /// Whether every coordinate is finite and its square does not overflow.
 pub fn usable(position: DVec3) -> bool {
     position.to_array().iter().all(|x| x.abs() <= LARGEST_COORDINATE)
+}
+
+/// Coordinate-wise median of the usable positions.
+fn median_position(positions: &[DVec3]) -> DVec3 {
+    let of_axis = |axis: usize| median(positions.iter().filter(|&&c| usable(c)).map(|c| c[axis]).collect());
+    DVec3::from_array(std::array::from_fn(of_axis))
 }
 
 fn negligible(point_distance: f64, centre: DVec3) -> f64 {

@@ -31,6 +31,22 @@ pub enum Lens {
     Fisheye([f64; 4]),
 }
 
+impl Lens {
+    /// The parameters.
+    pub fn coefficients(&self) -> &[f64] {
+        match self {
+            Lens::Pinhole => &[],
+            Lens::Radial(k) => k,
+            Lens::Fisheye(k) => k,
+        }
+    }
+
+    /// The same mapping without needless parameters: a radial lens of zeros is a pinhole.
+    pub fn simplified(self) -> Lens {
+        if self == Lens::Radial([0.0; 8]) { Lens::Pinhole } else { self }
+    }
+}
+
 /// Intrinsics of a photo as the dataset states them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Intrinsics {

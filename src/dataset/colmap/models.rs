@@ -70,18 +70,13 @@ pub(super) fn intrinsics(m: &CameraModel, size: (u64, u64), p: &[f64]) -> Result
     if p.len() != m.params {
         return Err(format!("{} takes {} parameters, not {}", m.name, m.params, p.len()));
     }
-    let radial = |k: [f64; 4]| Lens::Radial([k[0], k[1], k[2], k[3], 0.0, 0.0, 0.0, 0.0]);
     let one_focal = matches!(m.id, 0 | 2 | 3 | 8 | 9);
     let (focal, centre, k) =
         if one_focal { ([p[0], p[0]], [p[1], p[2]], &p[3..]) } else { ([p[0], p[1]], [p[2], p[3]], &p[4..]) };
+    let coefficient = |i: usize| k.get(i).copied().unwrap_or(0.0);
     let lens = match m.id {
-        2 => radial([k[0], 0.0, 0.0, 0.0]),
-        3 => radial([k[0], k[1], 0.0, 0.0]),
-        4 => radial([k[0], k[1], k[2], k[3]]),
-        5 => Lens::Fisheye([k[0], k[1], k[2], k[3]]),
-        6 => Lens::Radial([k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7]]),
-        8 => Lens::Fisheye([k[0], 0.0, 0.0, 0.0]),
-        9 => Lens::Fisheye([k[0], k[1], 0.0, 0.0]),
+        2 | 3 | 4 | 6 => Lens::Radial(std::array::from_fn(coefficient)),
+        5 | 8 | 9 => Lens::Fisheye(std::array::from_fn(coefficient)),
         _ => Lens::Pinhole,
     };
     checked_intrinsics(size, focal, centre, lens)

@@ -35,19 +35,14 @@ pub(super) struct TensorRef {
 pub(super) enum Value {
     /// None, or an object without content of interest, such as an empty ordered dictionary.
     Nothing,
-    /// True or false.
-    Bool(bool),
-    /// A whole number.
+    Bool,
     Int(i64),
-    /// A number.
     Float(f64),
-    /// Text.
     Text(Rc<str>),
     /// A tuple or a list.
     List(Rc<Vec<Value>>),
     /// A dictionary, in order.
     Dict(Rc<Vec<(Value, Value)>>),
-    /// A tensor.
     Tensor(Rc<TensorRef>),
     /// The name of a function or class, `module name`.
     Name(Rc<str>),
@@ -115,7 +110,7 @@ impl<'a> Machine<'a> {
             b'}' => self.push(Value::Dict(Rc::default()))?,
             b']' | b')' => self.push(Value::List(Rc::default()))?,
             b'N' => self.push(Value::Nothing)?,
-            0x88 | 0x89 => self.push(Value::Bool(code == 0x88))?,
+            0x88 | 0x89 => self.push(Value::Bool)?,
             b'K' | b'M' | b'J' | 0x8a => self.integer(code)?,
             b'G' => {
                 let bytes = self.take(8)?;

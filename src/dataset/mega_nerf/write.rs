@@ -5,6 +5,7 @@
 //! tensors.
 
 use crate::base::error::{InputError, InputResult};
+use crate::dataset::colmap_write::make_folder;
 use crate::dataset::model::{RawScene, RawView, Split};
 use glam::DMat3;
 use std::fs::File;
@@ -46,8 +47,7 @@ pub fn write_mega_nerf(folder: &Path, scene: &RawScene, test_every: usize) -> In
         let part = folder.join(if split == Split::Test { "val" } else { "train" });
         let stem = format!("{i:06}");
         for sub in ["metadata", "rgbs"] {
-            let sub = part.join(sub);
-            std::fs::create_dir_all(&sub).map_err(|e| InputError::io(&sub, "creating the folder", &e))?;
+            make_folder(&part.join(sub))?;
         }
         write_metadata(&part.join("metadata").join(format!("{stem}.pt")), view, drb_from_world, origin, scale)?;
         let extension = view.image_path.extension().and_then(|e| e.to_str()).unwrap_or("jpg");

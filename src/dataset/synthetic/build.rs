@@ -13,7 +13,6 @@ use glam::DVec3;
 const HALF_PLOT: f64 = 0.5 * PITCH - HALF_STREET;
 
 impl World {
-    /// Builds the city of this seed.
     pub(super) fn build(seed: u64, blocks: u32) -> World {
         let noise = Noise::new(seed);
         let mut world = World { seed, blocks, noise, solids: Vec::new(), plots: Vec::new() };

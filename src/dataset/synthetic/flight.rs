@@ -68,7 +68,6 @@ fn tilt_of(half_height: f64) -> f64 {
     (40.0f64).min(66.0 - half_height.to_degrees()).max(0.0).to_radians()
 }
 
-/// Plans the flight.
 pub(super) fn plan(options: &CityOptions) -> Flight {
     let (width, height) = (f64::from(options.width), f64::from(options.height));
     let focal = FOCAL * width;

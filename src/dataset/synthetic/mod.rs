@@ -20,7 +20,7 @@ mod trace;
 mod world;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::colmap_write::{Model, ModelImage, write_file, write_model};
+use crate::dataset::colmap_write::{Model, ModelImage, make_folder, write_file, write_model};
 use flight::Flight;
 use glam::DVec3;
 use image::{ExtendedColorType, codecs::jpeg::JpegEncoder};
@@ -183,14 +183,14 @@ fn prepare(folder: &Path, overwrite: bool) -> InputResult<()> {
         if let Some(foreign) = photos.iter().find(|name| !is_photo_name(name)) {
             return Err(InputError::new(
                 &images,
-                format!("'{foreign}' is no photo of a generated city, so nothing is overwritten"),
+                format!("'{foreign}' is not a photo of a generated city; nothing was overwritten"),
                 "choose another folder",
             ));
         }
         // A generated model always has photos beside it: photos are written before it, and removed after it.
         let model = folder.join("sparse");
         if photos.is_empty() && model.symlink_metadata().is_ok() {
-            let problem = "there is a model without photos of a generated city, so nothing is overwritten";
+            let problem = "this is a model without photos of a generated city; nothing was overwritten";
             return Err(InputError::new(&model, problem, "choose another folder"));
         }
         // The model is removed first: without it the folder cannot be read as a scene.
@@ -202,10 +202,6 @@ fn prepare(folder: &Path, overwrite: bool) -> InputResult<()> {
         }
     }
     make_folder(&images)
-}
-
-fn make_folder(path: &Path) -> InputResult<()> {
-    std::fs::create_dir_all(path).map_err(|e| InputError::io(path, "making the folder", &e))
 }
 
 /// The names in a folder.

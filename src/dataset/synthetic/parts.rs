@@ -105,13 +105,12 @@ impl Parts {
         skin(self, Kind::Leaves, color, accent)
     }
 
-    /// A hedge of these half sides.
     pub(super) fn hedge(&mut self, at: DVec3, half_x: f64, half_y: f64, leaves: Skin) {
         let height = self.draws.range(1.2, 1.7);
         self.block(at, (half_x, half_y), height, AXIS, leaves, leaves);
     }
 
-    /// A house with a gabled or hipped roof, a chimney, sometimes a garage.
+    /// A house with a gabled or hipped roof, a chimney, sometimes a dormer.
     pub(super) fn house(&mut self, at: DVec3, half_x: f64, half_y: f64, turn: f64) {
         let turn = turn_by(turn);
         let height = if self.draws.uniform() < 0.6 { 5.6 } else { 3.4 } + self.draws.range(-0.2, 0.3);
@@ -140,7 +139,6 @@ impl Parts {
         }
     }
 
-    /// A garden shed or pavilion.
     pub(super) fn shed(&mut self, at: DVec3) {
         let wood = skin(self, Kind::Wood, paint(0.52, 0.4, 0.3), paint(0.5, 0.4, 0.3));
         let roof_color = self.pick(&TILES);

@@ -27,7 +27,6 @@ pub(super) fn tone(light: Vec3) -> Vec3 {
     Vec3::new(shoulder(light.x), shoulder(light.y), shoulder(light.z))
 }
 
-/// 8-bit value, clamped and rounded.
 pub(super) fn to_byte(x: f32) -> u8 {
     (x.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
 }
@@ -38,7 +37,6 @@ pub(super) fn gain(options: &CityOptions, view: u32) -> f32 {
     (1.0 + options.exposure * draws.normal_within(3.0)).max(0.2) as f32
 }
 
-/// Takes photo number `view`.
 pub(super) fn take(scene: &Scene, k: &Intrinsics, shot: &Shot, view: u32, options: &CityOptions) -> Photo {
     let (width, height) = (k.width as usize, k.height as usize);
     let spread = 1.0 / k.fx;

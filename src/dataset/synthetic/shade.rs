@@ -56,7 +56,6 @@ pub(super) struct Hit {
 /// Light along one ray.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sample {
-    /// Linear light.
     pub(super) light: Vec3,
     /// A number that changes at every border of a surface or a shadow.
     pub(super) surface: u32,

@@ -23,7 +23,6 @@ fn floor_i(x: f64) -> i64 {
 }
 
 impl Noise {
-    /// The fields of this seed.
     pub(super) fn new(seed: u64) -> Noise {
         let mut draws = Stream::new(seed, Purpose::City, u64::MAX, 0);
         Noise { lattice: (0..LATTICE * LATTICE).map(|_| draws.range(-1.0, 1.0) as f32).collect() }
@@ -176,7 +175,6 @@ fn matt(albedo: Vec3) -> Look {
 }
 
 impl Skin {
-    /// The surface at `place`.
     pub(super) fn look(&self, noise: &Noise, place: Place) -> Look {
         // Each surface shifts the noise, so that walls have different stains.
         let shift = f64::from(self.seed & 0xffff) * 0.37;

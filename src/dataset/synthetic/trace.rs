@@ -10,7 +10,6 @@ use glam::DVec3;
 /// Side of a cell, metres.
 const CELL: f64 = 4.0;
 
-/// The grid.
 pub(super) struct Grid {
     low: [f64; 2],
     cells: [usize; 2],
@@ -71,7 +70,6 @@ struct Walk {
 }
 
 impl Grid {
-    /// The grid of these solids.
     pub(super) fn new(solids: &[Solid]) -> Grid {
         let mut low = [0.0f64; 2];
         let mut high = [0.0f64; 2];
@@ -184,7 +182,7 @@ impl Grid {
                     best = Some((item.solid, entry));
                 }
             }
-            // A hit beyond this cell may have a nearer rival in a cell yet to come.
+            // A hit beyond this cell is final only if no later cell has a nearer one.
             reach <= out
         });
         best

@@ -33,7 +33,6 @@ pub(super) struct Plot {
     pub(super) patches: Vec<Patch>,
 }
 
-/// The whole city.
 pub(super) struct World {
     pub(super) seed: u64,
     pub(super) blocks: u32,
@@ -53,7 +52,6 @@ const VERGE: Skin = Skin { kind: Kind::Grass, color: paint(0.4, 0.47, 0.24), acc
 const FIELD: f64 = 74.0;
 
 impl World {
-    /// Half the side of the city, metres.
     pub(super) fn half(&self) -> f64 {
         0.5 * PITCH * f64::from(self.blocks)
     }

@@ -2,15 +2,14 @@
 //!
 //! Not here: the meaning of the values.
 //!
-//! Invariants: 1. buffers are bounded by a constant ([`BLOCK_BYTES`], [`MAX_LINE_BYTES`]) or by the longest header;
-//! 2. no loop runs longer than the file has bytes; 3. errors name the byte offset (binary) or the line (ascii).
+//! Invariants: 1. buffers are bounded by a constant ([`MAX_LINE_BYTES`]) or by the longest header; 2. no
+//! loop runs longer than the file has bytes; 3. errors name the byte offset (binary) or the line (ascii).
 
 use super::header::{Element, Format, Header, Kind, Scalar, shorten};
 use crate::base::error::{InputError, InputResult};
 use std::io::{BufRead, ErrorKind, Read};
 use std::path::Path;
 
-const BLOCK_BYTES: usize = 1 << 18;
 const MAX_LINE_BYTES: u64 = 1 << 20;
 const CUT_SHORT: &str = "the file is cut short or its header is wrong: copy or export it again";
 
@@ -231,7 +230,7 @@ pub fn read_rows<R: BufRead>(
     Ok(())
 }
 
-/// Reads binary rows of fixed length, in blocks.
+/// Reads binary rows of fixed length.
 fn read_packed<R: BufRead>(
     body: &mut Body<'_, R>,
     element: &Element,
@@ -248,20 +247,13 @@ fn read_packed<R: BufRead>(
     }
     let fields: Vec<(usize, Scalar)> = slots.iter().map(|&property| offsets[property]).collect();
     let big_endian = body.format == Format::BigEndian;
-    let block_rows = (BLOCK_BYTES / row_bytes).max(1) as u64;
-    let mut block = vec![0u8; block_rows.min(element.count) as usize * row_bytes];
-    let mut values = vec![0.0; slots.len()];
-    let mut row = 0;
-    while row < element.count {
-        let rows = block_rows.min(element.count - row) as usize;
-        body.fill(&mut block[..rows * row_bytes])?;
-        for bytes in block[..rows * row_bytes].chunks_exact(row_bytes) {
-            for (value, &(offset, scalar)) in values.iter_mut().zip(&fields) {
-                *value = scalar.decode(&bytes[offset..], big_endian);
-            }
-            each(row, &values)?;
-            row += 1;
+    let (mut bytes, mut values) = (vec![0u8; row_bytes], vec![0.0; slots.len()]);
+    for row in 0..element.count {
+        body.fill(&mut bytes)?;
+        for (value, &(offset, scalar)) in values.iter_mut().zip(&fields) {
+            *value = scalar.decode(&bytes[offset..], big_endian);
         }
+        each(row, &values)?;
     }
     Ok(())
 }
