@@ -58,6 +58,11 @@ pub(super) fn sort_views(file: &Path, views: &mut [RawView]) -> InputResult<()> 
     }
 }
 
+/// The warning about views that a reader leaves out.
+pub(super) fn left_out(file: &Path, names: &[String], why: &str) -> String {
+    format!("{}: {} view(s) left out, {why}: {}", file.display(), names.len(), listed(names))
+}
+
 /// The first names of a list, and the number of further ones.
 pub(super) fn listed(names: &[String]) -> String {
     let shown = names.iter().take(LISTED).map(|n| format!("'{n}'")).collect::<Vec<_>>().join(", ");
