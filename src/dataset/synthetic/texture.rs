@@ -179,16 +179,14 @@ impl Skin {
         // Each surface shifts the noise, so that walls have different stains.
         let shift = f64::from(self.seed & 0xffff) * 0.37;
         let (u, v, w) = (place.u + shift, place.v, place.w);
+        let speckled = |layers: &[(f64, f32)]| matt(self.color * (1.0 + noise.layers(u, v, w, layers)));
         match self.kind {
             Kind::Facade | Kind::ShopFacade => self.facade(noise, place, shift),
             Kind::Curtain => self.curtain(noise, place, shift),
             Kind::Plain => matt(self.color * (1.0 + wall_stains(noise, u, v, w))),
             Kind::Tiles => self.tiles(noise, place, shift),
             Kind::Bitumen => self.bitumen(noise, u, v, w),
-            Kind::Gravel => {
-                let n = noise.layers(u, v, w, &[(0.3, 0.22), (0.8, 0.12), (4.0, 0.14), (0.12, 0.2)]);
-                matt(self.color * (1.0 + n))
-            }
+            Kind::Gravel => speckled(&[(0.3, 0.22), (0.8, 0.12), (4.0, 0.14), (0.12, 0.2)]),
             Kind::Metal => self.metal(noise, u, v, w),
             Kind::Solar => solar(u, v, w),
             Kind::Leaves => {
@@ -201,10 +199,7 @@ impl Skin {
             Kind::Asphalt => matt(asphalt(noise, self, u, v, w)),
             Kind::Paving => matt(self.paving(noise, place.u, v, w)),
             Kind::Grass => matt(self.grass(noise, u, v, w)),
-            Kind::Earth => {
-                let n = noise.layers(u, v, w, &[(5.0, 0.12), (1.3, 0.12), (0.4, 0.14), (0.15, 0.14)]);
-                matt(self.color * (1.0 + n))
-            }
+            Kind::Earth => speckled(&[(5.0, 0.12), (1.3, 0.12), (0.4, 0.14), (0.15, 0.14)]),
             Kind::Crop => matt(self.crop(noise, u, v, w)),
             Kind::Court => matt(self.court(noise, place)),
             Kind::Pool => {

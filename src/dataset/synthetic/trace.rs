@@ -85,11 +85,11 @@ impl Grid {
         let mut grid = Grid { low, cells, top, starts, items: Vec::new(), highest };
         let mut listed = Vec::new();
         for (k, s) in solids.iter().enumerate() {
-            grid.for_cells_of(s, |c| listed.push((c, k as u32)));
+            grid.for_cells_of(s, |c| listed.push((c as u32, k as u32)));
         }
         listed.sort_unstable();
         for &(c, k) in &listed {
-            let s = &solids[k as usize];
+            let (c, s) = (c as usize, &solids[k as usize]);
             grid.starts[c + 1] += 1;
             grid.top[c] = grid.top[c].max(s.high.z);
             grid.items.push(Item::new(k, s));
