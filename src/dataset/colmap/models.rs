@@ -9,12 +9,9 @@ use crate::dataset::model::{Intrinsics, Lens};
 pub(super) const UNDISTORT: &str =
     "undistort the photos first, which writes PINHOLE cameras: colmap image_undistorter --output_type COLMAP";
 
-/// A camera model known to COLMAP.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct CameraModel {
-    /// COLMAP's number.
     pub id: i32,
-    /// COLMAP's name.
     pub name: &'static str,
     /// Number of parameters of a supported model, 0 for an unsupported one.
     pub params: usize,

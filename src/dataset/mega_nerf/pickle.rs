@@ -22,15 +22,11 @@ pub(super) struct TensorRef {
     pub storage: Rc<str>,
     /// Name of the file with the numbers.
     pub key: Rc<str>,
-    /// First element.
     pub offset: usize,
-    /// Number of elements along each axis.
     pub sizes: Vec<usize>,
-    /// Distance between elements along each axis.
     pub strides: Vec<usize>,
 }
 
-/// A value of a pickle.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Value {
     /// None, or an object without content of interest, such as an empty ordered dictionary.
@@ -74,7 +70,6 @@ pub(super) fn read(text: &[u8]) -> Result<Value, String> {
     }
 }
 
-/// An entry of the memo.
 #[derive(Clone)]
 enum Memo {
     Unused,

@@ -14,7 +14,6 @@ use std::path::Path;
 use zip::CompressionMethod;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
-/// A value of a dictionary.
 pub(super) enum Entry {
     Int(i32),
     Float(f64),
@@ -79,7 +78,6 @@ fn write_metadata(path: &Path, view: &RawView, drb: DMat3, origin: glam::DVec3, 
     )
 }
 
-/// Writes a dictionary as torch.save does.
 pub(super) fn write_torch(path: &Path, entries: &[(&str, Entry)]) -> InputResult<()> {
     let io = |e: std::io::Error| InputError::io(path, "writing", &e);
     let zipped = |e: zip::result::ZipError| io(std::io::Error::other(e));

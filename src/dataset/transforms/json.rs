@@ -40,7 +40,6 @@ fn is_known(key: &str) -> bool {
 /// nerfstudio's lists of file names.
 pub(super) const LISTS: [&str; 3] = ["train_filenames", "val_filenames", "test_filenames"];
 
-/// A list of file names.
 #[derive(Debug, Default)]
 pub(super) enum Names {
     #[default]
@@ -102,20 +101,15 @@ fn invalid(path: &Path, e: &serde_json::Error) -> InputError {
 }
 
 impl JsonFile {
-    /// The top-level object.
     pub fn top(&self) -> Node<'_> {
         Node { file: &self.path, map: &self.top, frame: None }
     }
 
-    /// The names under [`LISTS`]`[list]`.
     pub fn names(&self, list: usize) -> &Names {
         &self.lists.names[list]
     }
 
     /// Whether the list of frames has any.
-    ///
-    /// # Errors
-    /// The list of frames is missing.
     pub fn has_frames(&self) -> InputResult<bool> {
         match &self.lists.frames {
             Value::Array(first) => Ok(!first.is_empty()),
@@ -125,9 +119,6 @@ impl JsonFile {
     }
 
     /// Passes the frames to `take` one by one, each with its index.
-    ///
-    /// # Errors
-    /// A frame is not an object, or `take` refused it.
     pub fn for_each_frame(&self, take: &mut dyn FnMut(Node<'_>) -> InputResult<()>) -> InputResult<()> {
         let mut refused = None;
         let mut index = 0;
@@ -265,7 +256,6 @@ fn read_names<'de, A: SeqAccess<'de>>(of: &mut A) -> Result<Names, A::Error> {
 #[derive(Clone, Copy)]
 pub(super) struct Node<'a> {
     pub file: &'a Path,
-    /// Known keys.
     pub map: &'a Map<String, Value>,
     /// Index of the frame; `None` for the top level.
     pub frame: Option<usize>,
@@ -287,12 +277,10 @@ impl<'a> Node<'a> {
         self.map.get(key).filter(|v| !v.is_null())
     }
 
-    /// A number, if the key exists.
     pub fn number(&self, key: &str) -> InputResult<Option<f64>> {
         self.typed(key, "a number", Value::as_f64)
     }
 
-    /// A string, if the key exists.
     pub fn text(&self, key: &str) -> InputResult<Option<&'a str>> {
         self.typed(key, "a string", Value::as_str)
     }

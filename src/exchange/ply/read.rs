@@ -219,7 +219,6 @@ pub fn take_row(columns: &Columns, row: usize, values: &mut Vec<f32>) {
     }
 }
 
-/// Streams the Gaussians of a body.
 fn stream_gaussian_rows<R: BufRead>(
     body: &mut Body<'_, R>,
     header: &Header,

@@ -15,7 +15,6 @@ const CUT_SHORT: &str = "the file is cut short or its header is wrong: copy or e
 
 /// The body of a file, with the read position.
 pub struct Body<'a, R> {
-    /// For errors.
     pub path: &'a Path,
     reader: R,
     format: Format,
@@ -73,7 +72,6 @@ impl<'a, R: BufRead> Body<'a, R> {
         Err(self.error(problem, CUT_SHORT))
     }
 
-    /// Skips all rows of an element.
     pub fn skip(&mut self, element: &Element) -> InputResult<()> {
         if element.count == 0 {
             return Ok(());
