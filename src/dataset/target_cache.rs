@@ -59,7 +59,6 @@ struct State {
     slots: Vec<Slot>,
     /// Coming views: (position, view), positions ascending.
     plan: VecDeque<(u64, usize)>,
-    next_position: u64,
     /// Views that callers wait for and whose decode has not started, oldest first.
     wanted: VecDeque<usize>,
     in_flight: usize,
@@ -122,9 +121,7 @@ impl TargetCache {
             slot.uses.clear();
         }
         state.plan.clear();
-        for &view in coming {
-            let position = state.next_position;
-            state.next_position += 1;
+        for (position, &view) in (0..).zip(coming) {
             state.plan.push_back((position, view));
             state.slots[view].uses.push_back(position);
         }
