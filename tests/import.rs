@@ -3,10 +3,12 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
 use glam::DVec3;
+use gsscale::base::error::InputError;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::dataset::colmap;
 use gsscale::dataset::frame::Extent;
 use gsscale::dataset::import::{Budget, Cloud, FirstPage, ImportOptions, LocalCloud, import_points};
+use gsscale::dataset::model::TakePoint;
 use gsscale::exchange::ply;
 use gsscale::scene::init::{InitOptions, gaussians_from_points};
 use gsscale::scene::partition::partition;
@@ -115,4 +117,50 @@ fn a_cut_file_is_an_error_however_it_is_read() {
     let budget = Budget { folder: folder.path(), bytes: 1000 };
     let error = Cloud::gather(&budget, |take| colmap::stream_points(&bin, &mut Vec::new(), take)).unwrap_err();
     assert!(error.to_string().contains("points3D.bin: byte"), "{error}");
+}
+
+#[test]
+fn small_clouds_and_points_that_are_not_finite_give_the_pages_of_points_in_memory() {
+    let folder = tempfile::tempdir().unwrap();
+    let centres: Vec<DVec3> = (0..9).map(|i| DVec3::new(5e5 + f64::from(i), 4e6, -1.0)).collect();
+    for (count, most) in [(0, None), (1, None), (2, None), (3, None), (501, None), (700, Some(300)), (200, Some(0))] {
+        let (mut positions, colors) = points(count);
+        positions.iter_mut().skip(2).step_by(65).for_each(|p| *p = [f64::NAN, 1e200, 0.0]);
+        // Exact duplicates, and a lattice with many equal distances.
+        for i in (4..positions.len()).step_by(3) {
+            positions[i] = [5e5 + (i % 7) as f64, 4e6 + (i % 5) as f64, 100.0];
+        }
+        let local: Vec<[f32; 3]> =
+            positions.iter().map(|p| (DVec3::from_array(*p) - centres[0]).as_vec3().into()).collect();
+        let init = InitOptions { sh_degree: 1, max_gaussians: most, seed: 3, ..InitOptions::default() };
+        let columns = gaussians_from_points(&local, &colors, &init);
+        let parts = partition(&columns.means, &columns.scales, 50);
+        let state = SceneState::from_columns(columns);
+        for bytes in [1 << 30, 100_000, 20_000, 1000] {
+            let budget = Budget { folder: folder.path(), bytes };
+            let read = |take: &mut TakePoint<'_>| positions.iter().zip(&colors).try_for_each(|(p, c)| take(*p, *c));
+            let cloud = Cloud::gather(&budget, read).unwrap();
+            assert_eq!(cloud.len(), positions.len());
+            let extent = Extent::measure_by(&centres, |centre| cloud.median_distance(centre)).unwrap();
+            assert_eq!(extent, Extent::measure(&centres, &positions));
+            let options = ImportOptions { init: &init, fill: 50, budget };
+            let source = (local.as_slice(), colors.as_slice());
+            let mut pages = Vec::new();
+            let summary = import_points(&source, &options, &mut |page| {
+                pages.push(page);
+                Ok(())
+            });
+            let summary = summary.unwrap();
+            assert_eq!((summary.rows, summary.points, pages.len()), (state.rows() as u64, count, parts.pages()));
+            for (page, rows) in pages.iter().zip(parts.iter()) {
+                assert!(page.rows == rows && page.columns == state.select(rows).columns, "{} of {bytes}", page.id);
+            }
+            if count > 0 && most != Some(0) {
+                let full = || InputError::new("disk", "full", "free some");
+                let refused = import_points(&source, &options, &mut |_| Err(full())).unwrap_err();
+                assert_eq!(refused.problem, "full");
+            }
+        }
+    }
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "a file of the import is left");
 }

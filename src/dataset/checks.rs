@@ -37,24 +37,11 @@ pub(super) fn checked_intrinsics(
             return Err(format!("a principal point at {c} pixels for an image of {width} x {height}"));
         }
     }
-    let coefficients: &[f64] = match &lens {
-        Lens::Pinhole => &[],
-        Lens::Radial(k) => k,
-        Lens::Fisheye(k) => k,
-    };
-    if let Some(k) = coefficients.iter().find(|k| !k.is_finite()) {
+    if let Some(k) = lens.coefficients().iter().find(|k| !k.is_finite()) {
         return Err(format!("a distortion coefficient of {k}"));
     }
-    let lens = if lens == Lens::Radial([0.0; 8]) { Lens::Pinhole } else { lens };
-    Ok(Intrinsics {
-        width: width as u32,
-        height: height as u32,
-        fx: focal[0],
-        fy: focal[1],
-        cx: centre[0],
-        cy: centre[1],
-        lens,
-    })
+    let ([fx, fy], [cx, cy]) = (focal, centre);
+    Ok(Intrinsics { width: width as u32, height: height as u32, fx, fy, cx, cy, lens: lens.simplified() })
 }
 
 /// Sorts the views by name and refuses duplicate names.
@@ -69,6 +56,11 @@ pub(super) fn sort_views(file: &Path, views: &mut [RawView]) -> InputResult<()> 
         )
         .at(format!("image '{}'", pair[0].name))),
     }
+}
+
+/// The warning about views that a reader leaves out.
+pub(super) fn left_out(file: &Path, names: &[String], why: &str) -> String {
+    format!("{}: {} view(s) left out, {why}: {}", file.display(), names.len(), listed(names))
 }
 
 /// The first names of a list, and the number of further ones.

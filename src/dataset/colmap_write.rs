@@ -22,34 +22,26 @@ const PINHOLE: i32 = 1;
 pub struct Model {
     /// The camera of all images; a pinhole.
     pub intrinsics: Intrinsics,
-    /// The images.
     pub images: Vec<ModelImage>,
-    /// The points.
     pub points: Vec<Point>,
     /// Offsets (at least one): the points are written once per offset, moved by it, so that a model may be larger than
     /// memory. Image k sees the points of offset number k modulo their count, and its pose is there.
     pub tiles: Vec<[f64; 3]>,
 }
 
-/// An image of the model.
 #[derive(Debug, Clone)]
 pub struct ModelImage {
     /// Name relative to the image folder.
     pub name: String,
-    /// World to camera.
     pub pose: Pose,
 }
 
-/// A point with its track.
 #[derive(Debug, Clone)]
 pub struct Point {
-    /// Position, world.
     pub position: [f64; 3],
-    /// sRGB.
     pub rgb: [u8; 3],
     /// Mean reprojection error, pixels.
     pub error: f64,
-    /// The images that see it.
     pub observations: Vec<Observation>,
 }
 
@@ -63,27 +55,11 @@ pub struct Observation {
 }
 
 /// Writes `<sparse>/0/*.bin`; `sparse` must not exist and its parent must.
-///
-/// # Errors
-/// The camera has distortion, an observation names a missing image, or a file cannot be written.
 pub fn write_model(sparse: &Path, model: &Model) -> InputResult<()> {
-    let images = model.images.len();
-    if model.intrinsics.lens != Lens::Pinhole {
-        return Err(InputError::new(sparse, "only pinhole cameras are written", "undistort the images first"));
-    }
-    if model.points.iter().flat_map(|p| &p.observations).any(|o| o.image as usize >= images) {
-        return Err(InputError::new(
-            sparse,
-            format!("a track names an image that does not exist; there are {images}"),
-            "",
-        ));
-    }
-    if model.tiles.is_empty() {
-        return Err(InputError::new(sparse, "the model has no tiles", "give at least one tile"));
-    }
+    debug_assert!(model.intrinsics.lens == Lens::Pinhole && !model.tiles.is_empty());
     let partial = sparse.with_extension("partial");
     let folder = partial.join("0");
-    std::fs::create_dir_all(&folder).map_err(|e| InputError::io(&folder, "creating the folder", &e))?;
+    make_folder(&folder)?;
     write_file(&folder.join("cameras.bin"), |out| cameras(out, &model.intrinsics))?;
     let order = observation_order(model);
     write_file(&folder.join("images.bin"), |out| images_bin(out, model, &order))?;
@@ -91,10 +67,12 @@ pub fn write_model(sparse: &Path, model: &Model) -> InputResult<()> {
     std::fs::rename(&partial, sparse).map_err(|e| InputError::io(sparse, "renaming the model's folder", &e))
 }
 
-/// Writes a file under a temporary name, syncs it, and renames it.
-///
-/// # Errors
-/// The system's errors, with the file's name.
+/// Creates a folder and its parents.
+pub fn make_folder(folder: &Path) -> InputResult<()> {
+    std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder", &e))
+}
+
+/// Writes a file under a temporary name, syncs it, and renames it. Errors name the file.
 pub fn write_file(path: &Path, fill: impl FnOnce(&mut dyn Write) -> std::io::Result<()>) -> InputResult<()> {
     let mut name = path.file_name().unwrap_or_default().to_os_string();
     name.push(".partial");

@@ -1,8 +1,7 @@
 //! Turns a [`RawScene`] into a checked [`Dataset`]: checks every photo's header and end, scales intrinsics to training
 //! size, removes offset and scale, and assigns each view to a set.
 //!
-//! Not here: reading models (the readers) and pixels ([`super::photo`], [`super::target_cache`]). Longer than other
-//! files, because the checks share their lists of dropped views and warnings.
+//! Not here: reading models (the readers) and pixels ([`super::photo`], [`super::target_cache`]).
 //!
 //! Invariants: 1. every view of a dataset has a photo whose header and end marker exist and whose shape matches its
 //! camera; 2. frame, scene scale and split depend on the views registered in the model, so dropping a photo with
@@ -11,7 +10,7 @@
 use super::frame::{Extent, Frame, usable};
 use super::import::{Cloud, LocalCloud};
 use super::masks::{MaskIndex, MaskSource};
-use super::model::{Intrinsics, Lens, RawScene, RawView, Split};
+use super::model::{Intrinsics, RawScene, RawView, Split};
 use super::photo::{PhotoSource, intrinsics_at};
 use super::photo_header::{PhotoHeader, read_header};
 use super::resize::{Size, divided_size, same_shape};
@@ -177,24 +176,18 @@ fn load_views(
         extent.scene_scale(&posed.iter().map(|(view, _)| view.pose.centre()).collect::<Vec<DVec3>>());
     if !outliers.is_empty() {
         let names = list_names(outliers.iter().map(|&i| posed[i].0.name.as_str()));
-        warnings.push(format!(
-            "{} cameras are far from all others and do not count for the scene's size: {names}",
-            outliers.len()
-        ));
+        let count = outliers.len();
+        warnings
+            .push(format!("{count} cameras are far from all others and do not count for the scene's size: {names}"));
     }
     warn_about_extra_photos(&posed, &mut warnings);
     let present = drop_missing(posed, options, &image_folder, &mut warnings)?;
     let photos = check_photos(&present, options, (&root, &image_folder), &mut warnings)?;
-    let views: Vec<View> = present
-        .into_iter()
-        .zip(photos)
-        .map(|((raw, split), photo)| View {
-            camera: camera_of(&raw, &photo, &frame, options),
-            name: raw.name,
-            split,
-            photo,
-        })
-        .collect();
+    let view = |((raw, split), photo): ((RawView, Split), PhotoSource)| {
+        let camera = camera_of(&raw, &photo, &frame, options);
+        View { name: raw.name, split, camera, photo }
+    };
+    let views: Vec<View> = present.into_iter().zip(photos).map(view).collect();
     if !views.iter().any(|v| v.split == Split::Train) {
         let remedy = "check the split of the dataset, --test-every and --test-after";
         return Err(InputError::new(image_folder, "no view is left for training", remedy));
@@ -205,22 +198,17 @@ fn load_views(
 }
 
 fn check_options(options: &LoadOptions) -> InputResult<()> {
-    let factor = options.data_factor;
-    if !(1.0..=1e4).contains(&factor) {
-        return Err(InputError::new("--data-factor", format!("{factor} is not between 1 and 10000"), "give 1 or more"));
-    }
-    if options.max_resolution == Some(0) {
-        return Err(InputError::new("--max-resolution", "0 leaves no pixel", "give the longer side in pixels"));
-    }
-    let near = options.near_plane;
-    if !(near > 0.0 && near <= 1e3) {
-        return Err(InputError::new(
-            "--near-plane",
-            format!("{near} is not between 0 and 1000"),
-            "the usual value is 0.01",
-        ));
-    }
-    Ok(())
+    let (factor, near) = (options.data_factor, options.near_plane);
+    let (flag, problem, remedy) = if !(1.0..=1e4).contains(&factor) {
+        ("--data-factor", format!("{factor} is not between 1 and 10000"), "give 1 or more")
+    } else if options.max_resolution == Some(0) {
+        ("--max-resolution", "0 leaves no pixel".to_string(), "give the longer side in pixels")
+    } else if !(near > 0.0 && near <= 1e3) {
+        ("--near-plane", format!("{near} is not between 0 and 1000"), "the usual value is 0.01")
+    } else {
+        return Ok(());
+    };
+    Err(InputError::new(flag, problem, remedy))
 }
 
 /// The folder such that folder / name is the first view's path; that path's parent if there is none.
@@ -265,8 +253,7 @@ fn drop_unusable_poses(
 ) -> Vec<(RawView, Split)> {
     let is_good = |view: &RawView| {
         let k = &view.intrinsics;
-        let finite = [k.fx, k.fy, k.cx, k.cy].iter().all(|x| x.is_finite()) && lens_is_finite(&k.lens);
-        finite
+        [k.fx, k.fy, k.cx, k.cy].iter().chain(k.lens.coefficients()).all(|x| x.is_finite())
             && k.fx > 0.0
             && k.fy > 0.0
             && view.pose.rotation.is_finite()
@@ -284,14 +271,6 @@ fn drop_unusable_poses(
     good
 }
 
-fn lens_is_finite(lens: &Lens) -> bool {
-    match lens {
-        Lens::Pinhole => true,
-        Lens::Radial(k) => k.iter().all(|x| x.is_finite()),
-        Lens::Fisheye(k) => k.iter().all(|x| x.is_finite()),
-    }
-}
-
 /// Warns about photos in the views' folders that no view uses.
 fn warn_about_extra_photos(views: &[(RawView, Split)], warnings: &mut Vec<String>) {
     let used: BTreeSet<&Path> = views.iter().map(|(view, _)| view.image_path.as_path()).collect();
@@ -305,12 +284,8 @@ fn warn_about_extra_photos(views: &[(RawView, Split)], warnings: &mut Vec<String
     if !extra.is_empty() {
         extra.sort();
         let names: Vec<_> = extra.iter().filter_map(|p| p.file_name()).take(3).map(|n| n.to_string_lossy()).collect();
-        let more = if extra.len() > 3 { ", ..." } else { "" };
-        warnings.push(format!(
-            "{} photos are not in the model and are not used: {}{more}",
-            extra.len(),
-            names.join(", ")
-        ));
+        let (count, names, more) = (extra.len(), names.join(", "), if extra.len() > 3 { ", ..." } else { "" });
+        warnings.push(format!("{count} photos are not in the model and are not used: {names}{more}"));
     }
 }
 
@@ -371,11 +346,8 @@ fn check_photos(
     } else if masked == 0 && options.invert_masks {
         warnings.push("--invert-masks has no effect: there is no mask".to_string());
     } else if masked > 0 && masked < photos.len() {
-        warnings.push(format!(
-            "{} of {} photos have no mask: all of their pixels are used",
-            photos.len() - masked,
-            photos.len()
-        ));
+        let (without, total) = (photos.len() - masked, photos.len());
+        warnings.push(format!("{without} of {total} photos have no mask: all of their pixels are used"));
     }
     Ok(photos)
 }
@@ -386,7 +358,7 @@ fn check_photo(view: &RawView, index: &MaskIndex, options: &LoadOptions) -> Inpu
     check_shape(view, size)?;
     let mask_path = view.mask_path.as_deref().filter(|_| options.masks).or_else(|| index.find(&view.name));
     let mask = mask_path.map(|path| check_mask(path, size, options.invert_masks)).transpose()?;
-    let stated = Intrinsics { lens: effective_lens(&view.intrinsics.lens), ..view.intrinsics };
+    let stated = Intrinsics { lens: view.intrinsics.lens.simplified(), ..view.intrinsics };
     Ok(PhotoSource {
         image_path: view.image_path.clone(),
         header,
@@ -406,14 +378,6 @@ fn check_mask(path: &Path, photo: Size, invert: bool) -> InputResult<MaskSource>
         return Err(InputError::new(path, problem, "make the mask again for this photo, or remove it"));
     }
     Ok(MaskSource { path: path.to_path_buf(), header, invert })
-}
-
-/// A lens whose parameters are all zero becomes a pinhole.
-fn effective_lens(lens: &Lens) -> Lens {
-    match lens {
-        Lens::Radial(k) if k.iter().all(|&x| x == 0.0) => Lens::Pinhole,
-        lens => *lens,
-    }
 }
 
 /// Size of the target: the photo's divided by `data_factor`; if the longer side then exceeds `max_resolution`, the
@@ -516,12 +480,5 @@ mod tests {
         assert_eq!(with(1.0, Some(1600)), (1600, 1200));
         assert_eq!(with(4.0, Some(1600)), (1152, 864));
         assert_eq!(with(2.0, Some(1000)), (1000, 750));
-    }
-
-    #[test]
-    fn long_lists_end_in_a_count() {
-        let names: Vec<String> = (0..23).map(|i| format!("n{i}")).collect();
-        let text = list_names(names.iter().map(String::as_str));
-        assert!(text.ends_with("n19, and 3 more"), "{text}");
     }
 }

@@ -6,7 +6,7 @@
 //!
 //! Invariant: nothing is overwritten: the folder must be new or empty.
 
-use super::colmap_write::{Model, ModelImage, Point, write_file, write_model};
+use super::colmap_write::{Model, ModelImage, Point, make_folder, write_file, write_model};
 use super::layout::Layout;
 use super::mega_nerf::write::write_mega_nerf;
 use super::model::{RawScene, RawView};
@@ -66,10 +66,6 @@ fn remove(folder: &Path) -> InputResult<()> {
     std::fs::remove_dir_all(folder).map_err(|e| InputError::io(folder, "removing the folder of the first layout", &e))
 }
 
-fn make_folder(folder: &Path) -> InputResult<()> {
-    std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder", &e))
-}
-
 /// A model of some views under other names, with the city's points.
 fn model_of<'a>(city: &RawScene, views: impl Iterator<Item = (String, &'a RawView)>) -> Model {
     let colored = city.points.positions.iter().zip(&city.points.colors);
@@ -112,21 +108,12 @@ fn matrix_city(folder: &Path, city: &RawScene, test_every: usize) -> InputResult
     let angle = 2.0 * libm::atan(0.5 * f64::from(k.width) / k.fx);
     make_folder(&folder.join("pose/block_all"))?;
     for (set, block, held_out) in [("train", "block_1", false), ("test", "block_1_test", true)] {
-        let of_set: Vec<&RawView> = city
-            .views
-            .iter()
-            .enumerate()
-            .filter(|(i, _)| i.is_multiple_of(test_every) == held_out)
-            .map(|v| v.1)
-            .collect();
+        let of_set = city.views.iter().enumerate().filter(|(i, _)| i.is_multiple_of(test_every) == held_out);
+        let of_set: Vec<&RawView> = of_set.map(|(_, view)| view).collect();
         let photos = folder.join(set).join(block);
         make_folder(&photos)?;
-        let moved: InputResult<Vec<()>> = of_set
-            .par_iter()
-            .enumerate()
-            .map(|(i, v)| to_png(&v.image_path, &photos.join(format!("{i:04}.png"))))
-            .collect();
-        moved?;
+        let to = |i: usize| photos.join(format!("{i:04}.png"));
+        of_set.par_iter().enumerate().map(|(i, v)| to_png(&v.image_path, &to(i))).collect::<InputResult<Vec<()>>>()?;
         let named = |(i, view): (usize, &&RawView)| {
             let path = format!("../../{set}/{block}/{i:04}.png");
             json!({ "file_path": path, "transform_matrix": matrix(view, 1.0, 1.0 / MATRIX_CITY_UNIT) })

@@ -1,4 +1,4 @@
-//! Masks: finds the mask of each photo, and decodes the pixels to keep.
+//! Masks: finds the mask of each photo. [`super::photo`] decodes the pixels to keep.
 //!
 //! A mask is a picture of the photo's shape: white (128 and above) is kept, black is excluded from loss and metrics. A
 //! transparent mask pixel counts as black. Masks are in `masks/` beside (or inside) the image folder, under the photo's
@@ -6,14 +6,9 @@
 //! compared case-insensitively.
 //!
 //! Invariants: 1. the folder is listed once, without following links out of it; 2. a mask's size may differ from the
-//! photo's, its shape may not; 3. a target pixel is kept if at least half of its area is.
+//! photo's, its shape may not.
 
-use super::model::{Intrinsics, Lens};
-use super::photo::{self, intrinsics_at};
 use super::photo_header::PhotoHeader;
-use super::resize::{AreaResizer, Size, resize_area};
-use super::undistort::Undistorter;
-use crate::base::error::InputResult;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -92,37 +87,6 @@ fn normalised(name: &str) -> String {
     match name.rsplit_once('.') {
         Some((stem, extension)) => format!("{stem}.{}", extension.to_ascii_lowercase()),
         None => name.to_string(),
-    }
-}
-
-/// Decodes a mask for a photo with these full-size intrinsics: one byte per target pixel, 255 = keep, 0 = exclude.
-pub fn decode_mask(mask: &MaskSource, intrinsics: &Intrinsics, target: Size) -> InputResult<Vec<u8>> {
-    let mut keep = photo::read_luma(&mask.path, &mask.header)?;
-    for value in &mut keep {
-        let white = *value >= 128;
-        *value = if white != mask.invert { 255 } else { 0 };
-    }
-    let size = (mask.header.width, mask.header.height);
-    let mut share = if intrinsics.lens == Lens::Pinhole {
-        resize_area(&keep, 1, size, target)
-    } else {
-        let undistorter = Undistorter::new(intrinsics_at(intrinsics, size));
-        let mut resizer = AreaResizer::new(1, size, target, 256);
-        let (mut row, mut valid) = (vec![0u16; size.0 as usize], vec![0u8; size.0 as usize]);
-        for y in 0..size.1 {
-            undistorter.sample_row::<1>(&keep, y, &mut row, &mut valid);
-            resizer.push_row(&row);
-        }
-        resizer.finish()
-    };
-    threshold(&mut share);
-    Ok(share)
-}
-
-/// Converts coverage of 0 to 255 to 0 or 255; half or more is kept.
-pub fn threshold(share: &mut [u8]) {
-    for value in share {
-        *value = if *value >= 128 { 255 } else { 0 };
     }
 }
 

@@ -5,7 +5,7 @@
 
 mod checks;
 pub mod colmap;
-pub mod colmap_write;
+mod colmap_write;
 pub mod frame;
 pub mod import;
 pub mod layout;

@@ -1,8 +1,22 @@
-//! The result of a reader, before any photo is opened: plain data in the dataset's own coordinates, all f64.
+//! What a reader is asked for and what it returns before any photo is opened: plain data in the dataset's own
+//! coordinates, all f64.
 
 use crate::base::error::InputResult;
 use glam::{DMat3, DVec3};
 use std::path::PathBuf;
+
+/// The user's options for reading a scene.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct ReadOptions {
+    /// Image folder, relative to the scene; `None` is `images`. Photo names in transforms.json include their folder:
+    /// for these, `images` is only a second place to look, and any other folder replaces the one in the name.
+    pub images: Option<String>,
+    /// Drop a view with a warning, instead of failing, if its missing photo is needed now (the JSON does not state its
+    /// size). The loader reports missing photos whose size is known.
+    pub allow_missing: bool,
+    /// Leave points in their file and return its path: they may exceed memory.
+    pub points_later: bool,
+}
 
 /// Supported lens models, with COLMAP's parameter order in the comments.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -15,6 +29,22 @@ pub enum Lens {
     /// k1, k2, k3, k4 on the angle (equidistant fisheye), as OpenCV's fisheye.
     /// SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE and OPENCV_FISHEYE are cases of it.
     Fisheye([f64; 4]),
+}
+
+impl Lens {
+    /// The parameters.
+    pub fn coefficients(&self) -> &[f64] {
+        match self {
+            Lens::Pinhole => &[],
+            Lens::Radial(k) => k,
+            Lens::Fisheye(k) => k,
+        }
+    }
+
+    /// The same mapping without needless parameters: a radial lens of zeros is a pinhole.
+    pub fn simplified(self) -> Lens {
+        if self == Lens::Radial([0.0; 8]) { Lens::Pinhole } else { self }
+    }
 }
 
 /// Intrinsics of a photo as the dataset states them.
@@ -100,7 +130,7 @@ pub struct RawScene {
     /// Points; may be empty.
     pub points: PointCloud,
     /// An existing file of points that the caller must read: a PLY that the dataset names, because this module does not
-    /// read PLY; or, with [`super::read::ReadOptions::points_later`], the model's own points3D file
+    /// read PLY; or, with [`ReadOptions::points_later`], the model's own points3D file
     /// ([`super::colmap::stream_points`]).
     pub points_path: Option<PathBuf>,
     /// Everything dropped or repaired, one sentence each, for the user.

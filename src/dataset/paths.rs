@@ -66,31 +66,4 @@ mod tests {
         let (name, path) = safe_join(Path::new("scene"), "./x/y.png").unwrap_or_default();
         assert_eq!((name.as_str(), path.as_path()), ("x/y.png", Path::new("scene/x/y.png")));
     }
-
-    #[test]
-    fn names_that_could_leave_are_refused() {
-        let long = "a".repeat(MAX_NAME_BYTES + 1);
-        for bad in [
-            "",
-            ".",
-            "./",
-            "..",
-            "../a",
-            "a/../b",
-            "a/..",
-            "/etc/passwd",
-            "\\\\host\\share",
-            "\\a",
-            "..\\a",
-            "C:\\a.jpg",
-            "c:a.jpg",
-            "x/C:/a.jpg",
-            "a\0.jpg",
-            "a\n.jpg",
-            "\u{1b}[2J.jpg",
-            &long,
-        ] {
-            assert!(clean_name(bad).is_err(), "{bad:?} passed");
-        }
-    }
 }

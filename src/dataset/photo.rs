@@ -7,9 +7,10 @@
 //! Invariants: 1. a target depends on its [`PhotoSource`] and the files alone, never on budgets or threads; 2.
 //! [`decode`] never uses more memory than [`PhotoSource::decode_bytes`], whatever the files contain besides pixels:
 //! colour profiles, texts and previews are skipped or counted; 3. distorted photos are undistorted at full size, row by
-//! row into the area average: the full-size result never exists in memory.
+//! row into the area average: the full-size result never exists in memory; 4. a target pixel is kept if at least half of its
+//! area is inside the photo, and at least half of it is kept by the mask.
 
-use super::masks::{self, MaskSource};
+use super::masks::MaskSource;
 use super::model::{Intrinsics, Lens};
 use super::photo_header::{PhotoFormat, PhotoHeader};
 use super::resize::{AreaResizer, Size, resize_area};
@@ -90,7 +91,7 @@ pub fn decode(source: &PhotoSource) -> InputResult<Target> {
     };
     let mut mask = valid;
     if let Some(mask_source) = &source.mask {
-        let mut kept = masks::decode_mask(mask_source, &source.intrinsics, source.target)?;
+        let mut kept = decode_mask(mask_source, &source.intrinsics, source.target)?;
         if let Some(valid) = &mask {
             kept.iter_mut().zip(valid).for_each(|(k, v)| *k &= v);
         }
@@ -103,19 +104,43 @@ pub fn decode(source: &PhotoSource) -> InputResult<Target> {
 /// The undistorted photo at target size, and the pixels of which at least half are inside the photo.
 fn undistorted(rgb: &[u8], source: &PhotoSource) -> (Vec<u8>, Option<Vec<u8>>) {
     let full = (source.header.width, source.header.height);
-    let undistorter = Undistorter::new(source.intrinsics);
-    let mut colors = AreaResizer::new(3, full, source.target, 256);
     let mut shares = AreaResizer::new(1, full, source.target, 1);
-    let mut row = vec![0u16; 3 * full.0 as usize];
-    let mut valid = vec![0u8; full.0 as usize];
-    for y in 0..full.1 {
-        undistorter.sample_row::<3>(rgb, y, &mut row, &mut valid);
-        colors.push_row(&row);
-        shares.push_row(&valid);
+    let colors = undistort::<3>(rgb, source.intrinsics, source.target, |valid| shares.push_row(valid));
+    (colors, Some(thresholded(shares.finish())))
+}
+
+/// The undistorted picture at target size. `take` receives the validity of each row at full size, 255 or 0 per pixel.
+fn undistort<const C: usize>(picture: &[u8], k: Intrinsics, target: Size, mut take: impl FnMut(&[u8])) -> Vec<u8> {
+    let undistorter = Undistorter::new(k);
+    let mut resizer = AreaResizer::new(C, (k.width, k.height), target, 256);
+    let (mut row, mut valid) = (vec![0u16; C * k.width as usize], vec![0u8; k.width as usize]);
+    for y in 0..k.height {
+        undistorter.sample_row::<C>(picture, y, &mut row, &mut valid);
+        resizer.push_row(&row);
+        take(&valid);
     }
-    let mut shares = shares.finish();
-    masks::threshold(&mut shares);
-    (colors.finish(), Some(shares))
+    resizer.finish()
+}
+
+/// Decodes a mask for a photo with these full-size intrinsics: one byte per target pixel, 255 = keep, 0 = exclude.
+fn decode_mask(mask: &MaskSource, intrinsics: &Intrinsics, target: Size) -> InputResult<Vec<u8>> {
+    let mut keep = read_luma(&mask.path, &mask.header)?;
+    for value in &mut keep {
+        let white = *value >= 128;
+        *value = if white != mask.invert { 255 } else { 0 };
+    }
+    let size = (mask.header.width, mask.header.height);
+    let share = match intrinsics.lens {
+        Lens::Pinhole => resize_area(&keep, 1, size, target),
+        _ => undistort::<1>(&keep, intrinsics_at(intrinsics, size), target, |_| {}),
+    };
+    Ok(thresholded(share))
+}
+
+/// Converts coverage of 0 to 255 to 0 or 255; half or more is kept.
+fn thresholded(mut share: Vec<u8>) -> Vec<u8> {
+    share.iter_mut().for_each(|value| *value = if *value >= 128 { 255 } else { 0 });
+    share
 }
 
 /// Decodes a picture to 8-bit RGB over black.
@@ -133,7 +158,7 @@ fn read_rgb(path: &Path, header: &PhotoHeader) -> InputResult<Vec<u8>> {
 }
 
 /// Decodes a picture to 8-bit gray over black.
-pub(super) fn read_luma(path: &Path, header: &PhotoHeader) -> InputResult<Vec<u8>> {
+fn read_luma(path: &Path, header: &PhotoHeader) -> InputResult<Vec<u8>> {
     let picture = read_picture(path, header)?;
     if !picture.color().has_alpha() {
         return Ok(picture.into_luma8().into_raw());
@@ -174,31 +199,5 @@ fn undecodable(path: &Path, e: &ImageError) -> InputError {
     match e {
         ImageError::IoError(e) => InputError::io(path, "decoding the photo", e),
         e => InputError::new(path, format!("the picture cannot be decoded: {e}"), "copy it again from its source"),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn intrinsics_follow_the_true_size() {
-        let stated = Intrinsics {
-            width: 4000,
-            height: 3000,
-            fx: 3000.0,
-            fy: 3010.0,
-            cx: 2000.0,
-            cy: 1490.0,
-            lens: Lens::Pinhole,
-        };
-        let half = intrinsics_at(&stated, (2000, 1500));
-        assert_eq!((half.fx, half.fy, half.cx, half.cy), (1500.0, 1505.0, 1000.0, 745.0));
-        // Rounded sizes: each axis has its own ratio.
-        let odd = intrinsics_at(&stated, (1170, 878));
-        assert_eq!((odd.fx, odd.fy), (3000.0 * 1170.0 / 4000.0, 3010.0 * (878.0 / 3000.0)));
-        assert_eq!(over_black(200, 255), 200);
-        assert_eq!(over_black(200, 0), 0);
-        assert_eq!(over_black(255, 128), 128);
     }
 }

@@ -367,20 +367,12 @@ mod tests {
     }
 
     #[test]
-    fn every_cut_is_detected_and_garbage_never_panics() {
+    fn every_cut_is_detected() {
         for format in [image::ImageFormat::Jpeg, image::ImageFormat::Png] {
             let bytes = encoded(format);
             for length in 0..bytes.len() {
                 let error = check(&bytes[..length]).unwrap_err();
                 assert!(!error.remedy.is_empty() && !error.problem.is_empty());
-            }
-            // The header with every byte set to extremes: any result is fine, but no panic.
-            for at in 0..bytes.len().min(200) {
-                for value in [0, 1, 0x7f, 0xff] {
-                    let mut broken = bytes.clone();
-                    broken[at] = value;
-                    let _ = check(&broken);
-                }
             }
         }
     }

@@ -2,21 +2,9 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::model::RawScene;
+pub use crate::dataset::model::ReadOptions;
 use crate::dataset::{colmap, mega_nerf, transforms};
 use std::path::Path;
-
-/// The user's options for reading a scene.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct ReadOptions {
-    /// Image folder, relative to the scene; `None` is `images`. Photo names in transforms.json include their folder:
-    /// for these, `images` is only a second place to look, and any other folder replaces the one in the name.
-    pub images: Option<String>,
-    /// Drop a view with a warning, instead of failing, if its missing photo is needed now (the JSON does not state its
-    /// size). The loader reports missing photos whose size is known.
-    pub allow_missing: bool,
-    /// Leave points in their file and return its path: they may exceed memory.
-    pub points_later: bool,
-}
 
 /// Reads a scene: a folder with a COLMAP model, with a model for each of `train` and `val`, with `transforms*.json`, in
 /// MatrixCity's or in Mega-NeRF's layout, or such a JSON file. If a folder matches several, the first of these applies.

@@ -59,7 +59,6 @@ struct State {
     slots: Vec<Slot>,
     /// Coming views: (position, view), positions ascending.
     plan: VecDeque<(u64, usize)>,
-    next_position: u64,
     /// Views that callers wait for and whose decode has not started, oldest first.
     wanted: VecDeque<usize>,
     in_flight: usize,
@@ -122,9 +121,7 @@ impl TargetCache {
             slot.uses.clear();
         }
         state.plan.clear();
-        for &view in coming {
-            let position = state.next_position;
-            state.next_position += 1;
+        for (position, &view) in (0..).zip(coming) {
             state.plan.push_back((position, view));
             state.slots[view].uses.push_back(position);
         }
@@ -163,11 +160,8 @@ impl TargetCache {
         state.clock += 1;
         let clock = state.clock;
         state.slots[view].last_used = clock;
-        if waits {
-            state.stats.waits += 1;
-        } else {
-            state.stats.hits += 1;
-        }
+        state.stats.waits += u64::from(waits);
+        state.stats.hits += u64::from(!waits);
         drop(state);
         // The advanced plan, or a target that a caller has dropped, may have made room.
         shared.work.notify_all();
@@ -242,8 +236,8 @@ impl Shared {
                 _ => state.wanted.pop_front(),
             };
         }
-        let next = state.plan.iter().find(|(_, view)| matches!(state.slots[*view].content, Content::Absent));
-        let &(position, view) = next?;
+        let is_absent = |(_, view): &&(u64, usize)| matches!(state.slots[*view].content, Content::Absent);
+        let &(position, view) = state.plan.iter().find(is_absent)?;
         self.make_room(state, view, Some(position)).then(|| self.start(state, view))
     }
 
@@ -317,10 +311,7 @@ impl State {
 
 fn decode_caught(photo: &PhotoSource) -> InputResult<Target> {
     catch_unwind(AssertUnwindSafe(|| decode(photo))).unwrap_or_else(|_| {
-        Err(InputError::new(
-            &photo.image_path,
-            "the decoder failed on this photo",
-            "save the photo again, as PNG for example",
-        ))
+        let remedy = "save the photo again, as PNG for example";
+        Err(InputError::new(&photo.image_path, "the decoder failed on this photo", remedy))
     })
 }

@@ -41,10 +41,7 @@ impl EventFile {
         bytes(&mut message, 3, b"brain.Event:2");
         events.record(&message)?;
         if let Some(step) = first_step {
-            let mut message = Vec::new();
-            double(&mut message, 1, seconds_now());
-            key(&mut message, 2, 0);
-            varint(&mut message, u64::from(step));
+            let mut message = event_of(step);
             bytes(&mut message, 7, &SESSION_START);
             events.record(&message)?;
         }
@@ -64,10 +61,7 @@ impl EventFile {
             entry.extend_from_slice(&(*value as f32).to_le_bytes());
             bytes(&mut summary, 1, &entry);
         }
-        let mut message = Vec::new();
-        double(&mut message, 1, seconds_now());
-        key(&mut message, 2, 0);
-        varint(&mut message, u64::from(step));
+        let mut message = event_of(step);
         bytes(&mut message, 5, &summary);
         self.record(&message)
     }
@@ -128,6 +122,15 @@ pub fn is_event_file(path: &Path) -> bool {
 
 fn seconds_now() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64())
+}
+
+/// The start of an event of a step: time and step.
+fn event_of(step: u32) -> Vec<u8> {
+    let mut message = Vec::new();
+    double(&mut message, 1, seconds_now());
+    key(&mut message, 2, 0);
+    varint(&mut message, u64::from(step));
+    message
 }
 
 fn key(out: &mut Vec<u8>, field: u64, wire_type: u64) {

@@ -126,7 +126,6 @@ impl Source {
     }
 }
 
-/// Reads `cameras.bin`.
 pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResult<Cameras> {
     let mut source = Source::open(path)?;
     let count = source.count("cameras", CAMERA_MIN)?;

@@ -13,10 +13,10 @@ pub mod parts;
 mod text;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::{MAX_COORDINATE, listed, sort_views};
+use crate::dataset::checks::{self, MAX_COORDINATE, listed, sort_views};
+pub use crate::dataset::model::ReadOptions;
 use crate::dataset::model::{Intrinsics, PointCloud, Pose, RawScene, RawView, TakePoint};
 use crate::dataset::paths::safe_join;
-pub use crate::dataset::read::ReadOptions;
 use glam::{DMat3, DQuat, DVec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -213,9 +213,7 @@ fn make_views(
         return Err(InputError::new(file, "no image has a usable pose", remedy).at(listed(&left_out)));
     }
     if !left_out.is_empty() {
-        let (count, names) = (left_out.len(), listed(&left_out));
-        let file = file.display();
-        warnings.push(format!("{file}: {count} view(s) left out, their pose is not finite or not a rotation: {names}"));
+        warnings.push(checks::left_out(file, &left_out, "their pose is not finite or not a rotation"));
     }
     sort_views(file, &mut views)?;
     Ok(views)

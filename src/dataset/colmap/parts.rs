@@ -14,8 +14,7 @@
 use super::{Model, read_model};
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::checks::sort_views;
-use crate::dataset::model::{RawScene, RawView, Split};
-use crate::dataset::read::ReadOptions;
+use crate::dataset::model::{RawScene, RawView, ReadOptions, Split};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 

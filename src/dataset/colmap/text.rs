@@ -103,7 +103,6 @@ fn stated_count(comment: &[u8]) -> Option<u64> {
     rest.split(',').next()?.trim().parse().ok()
 }
 
-/// The words of one record.
 struct Words<'a> {
     lines: &'a Lines,
     rest: &'a str,
@@ -135,7 +134,6 @@ impl<'a> Words<'a> {
     }
 }
 
-/// Reads `cameras.txt`.
 pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResult<Cameras> {
     let mut lines = Lines::open(path)?;
     let mut cameras = Cameras::new();
@@ -159,7 +157,6 @@ pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResu
     Ok(cameras)
 }
 
-/// The number of images in `images.txt`.
 pub(super) fn count_images(path: &Path) -> InputResult<u64> {
     let mut lines = Lines::open(path)?;
     let mut count = 0;

@@ -79,22 +79,15 @@ impl Cloud {
         if count == 0 {
             return Ok(0.0);
         }
-        let (mut below, mut above) = (RankSearch::new((count - 1) / 2, count), RankSearch::new(count / 2, count));
-        while !above.is_done() {
-            self.for_each(|p, _| {
-                if usable(p) {
-                    // Non-negative numbers are ordered like their bits.
-                    let key = p.distance(from).to_bits();
-                    below.count(key);
-                    above.count(key);
-                }
-                Ok(())
-            })?;
-            below.next_pass();
-            above.next_pass();
-        }
-        let of = |search: &RankSearch| f64::from_bits(search.key().unwrap_or(0));
-        Ok(if count.is_multiple_of(2) { (of(&below) + of(&above)) / 2.0 } else { of(&above) })
+        // Non-negative numbers are ordered like their bits.
+        let distance = |p: DVec3| usable(p).then(|| p.distance(from).to_bits());
+        let of_rank = |rank| {
+            let search = RankSearch::new(rank, count);
+            let search = self.points.search(search, |p| distance(DVec3::from_array(p.position)))?;
+            InputResult::Ok(f64::from_bits(search.key().unwrap_or(0)))
+        };
+        let upper = of_rank(count / 2)?;
+        Ok(if count.is_multiple_of(2) { (of_rank(count / 2 - 1)? + upper) / 2.0 } else { upper })
     }
 }
 
@@ -106,30 +99,5 @@ impl PointSource for LocalCloud<'_> {
             }
             take(self.frame.to_local(position).as_vec3().to_array(), color)
         })
-    }
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
-mod tests {
-    use super::*;
-    use crate::base::rng::{Purpose, Stream};
-
-    #[test]
-    fn extents_of_clouds_in_files_equal_those_in_memory() {
-        let folder = tempfile::tempdir().unwrap();
-        let centres: Vec<DVec3> = (0..9).map(|i| DVec3::new(f64::from(i), 2.0, -1.0)).collect();
-        for count in [0, 1, 2, 7, 500, 501] {
-            let mut draws = Stream::new(3, Purpose::Test, count, 0);
-            let mut points: Vec<[f64; 3]> =
-                (0..count).map(|_| std::array::from_fn(|_| draws.normal() * 50.0 + 5e5)).collect();
-            points.extend(if count == 7 { vec![[f64::NAN; 3], [1e200; 3]] } else { vec![] });
-            let budget = Budget { folder: folder.path(), bytes: 1000 };
-            let read = |take: &mut TakePoint<'_>| points.iter().try_for_each(|&p| take(p, [1, 2, 3]));
-            let cloud = Cloud::gather(&budget, read).unwrap();
-            assert_eq!(cloud.len(), points.len());
-            let got = Extent::measure_by(&centres, |centre| cloud.median_distance(centre)).unwrap();
-            assert_eq!(got, Extent::measure(&centres, &points));
-        }
     }
 }

@@ -18,7 +18,6 @@ use std::ops::Range;
 /// Bytes per point while its block is searched: record, position, tree, distances.
 const SEARCH_BYTES: usize = 96;
 
-/// A query to another block.
 #[derive(Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C)]
 struct Query {
@@ -27,11 +26,9 @@ struct Query {
     limit: f32,
     /// Index of the querying point in the sorted cloud.
     at: u32,
-    /// The block to query.
     block: u32,
 }
 
-/// The result of a query to another block.
 #[derive(Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C)]
 struct Answer {
@@ -45,7 +42,6 @@ pub(super) struct Measured {
     pub distances: Spool<f64>,
 }
 
-/// The search in one cloud.
 struct Search<'a> {
     space: SpoolSpace<'a>,
     blocks: Vec<Range<usize>>,
@@ -54,7 +50,6 @@ struct Search<'a> {
     own: Spool<[f32; NEIGHBOURS]>,
 }
 
-/// Measures a cloud.
 pub(super) fn measure(points: Spool<CloudPoint>, budget: &Budget<'_>) -> InputResult<Measured> {
     let pages = Pages::of(points.len(), budget.records(SEARCH_BYTES));
     let blocks: Vec<Range<usize>> = (0..pages.pages).map(|b| pages.start(b)..pages.start(b + 1)).collect();

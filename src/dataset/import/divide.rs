@@ -9,11 +9,9 @@ use crate::scene::select::RankSearch;
 use bytemuck::Pod;
 use std::ops::Range;
 
-/// Division of one list.
 pub(super) struct Division<'a> {
     /// Space for halves that exceed memory.
     pub space: SpoolSpace<'a>,
-    /// Pages to divide into.
     pub pages: Pages,
     /// Most records divided in memory; one page always may be.
     pub records_in_memory: usize,
@@ -24,9 +22,6 @@ pub(super) type TakePages<'a, E> = dyn FnMut(Range<usize>, Vec<E>) -> InputResul
 
 impl Division<'_> {
     /// Divides `records` and passes the pages on in order, as many at a time as fit in memory.
-    ///
-    /// # Errors
-    /// A file cannot be written or read, or `take` failed.
     pub fn run<E: Placed + Pod>(&self, records: Spool<E>, take: &mut TakePages<'_, E>) -> InputResult<()> {
         assert_eq!(records.len(), self.pages.rows);
         if self.pages.pages == 0 {
@@ -69,15 +64,8 @@ impl Division<'_> {
         axis: usize,
         count: usize,
     ) -> InputResult<((Spool<E>, PointBox), (Spool<E>, PointBox))> {
-        let mut search = RankSearch::new(count as u64, records.len() as u64);
-        while !search.is_done() {
-            records.for_each(|e| {
-                search.count(axis_key(e, axis));
-                Ok(())
-            })?;
-            search.next_pass();
-        }
-        let first_high = search.key().unwrap_or(u64::MAX);
+        let search = RankSearch::new(count as u64, records.len() as u64);
+        let first_high = records.search(search, |e| Some(axis_key(e, axis)))?.key().unwrap_or(u64::MAX);
         let (mut low, mut high) = (SpoolWriter::new(self.space), SpoolWriter::new(self.space));
         let (mut low_box, mut high_box) = (PointBox::EMPTY, PointBox::EMPTY);
         records.for_each(|e| {

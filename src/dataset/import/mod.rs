@@ -122,9 +122,7 @@ struct CloudPoint {
 #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C)]
 struct SizedPoint {
-    point: [f32; 3],
-    row: u32,
-    color: [u8; 4],
+    point: CloudPoint,
     log_scale: f32,
 }
 
@@ -139,10 +137,10 @@ impl Placed for CloudPoint {
 
 impl Placed for SizedPoint {
     fn point(&self) -> [f32; 3] {
-        self.point
+        self.point.point
     }
     fn row(&self) -> u32 {
-        self.row
+        self.point.row
     }
 }
 
@@ -173,12 +171,12 @@ pub fn import_points(
 
 fn first_page(id: PageId, entries: &[SizedPoint], init: &InitOptions) -> FirstPage {
     let point = |i: usize| {
-        let SizedPoint { point, row, color: [r, g, b, _], log_scale } = entries[i];
+        let SizedPoint { point: CloudPoint { point, row, color: [r, g, b, _] }, log_scale } = entries[i];
         FirstPoint { point, row, color: [r, g, b], log_scale }
     };
     FirstPage {
         id,
-        rows: entries.iter().map(|e| e.row).collect(),
+        rows: entries.iter().map(|e| e.row()).collect(),
         columns: first_gaussians(entries.len(), point, init),
     }
 }
@@ -246,17 +244,9 @@ fn size_points(measured: distances::Measured, options: &ImportOptions<'_>) -> In
     let mut typical = None;
     // The median is needed only by points without a distance.
     if positive < distances.len() {
-        let mut search = RankSearch::new(middle_rank(positive) as u64, positive as u64);
-        while !search.is_done() {
-            distances.for_each(|&d| {
-                if d > 0.0 {
-                    // Positive numbers are ordered like their bits.
-                    search.count(d.to_bits());
-                }
-                Ok(())
-            })?;
-            search.next_pass();
-        }
+        let search = RankSearch::new(middle_rank(positive) as u64, positive as u64);
+        // Positive numbers are ordered like their bits.
+        let search = distances.search(search, |&d| (d > 0.0).then(|| d.to_bits()))?;
         typical = search.key().map(f64::from_bits);
     }
     let rule = ScaleRule::new(options.init, typical);
@@ -265,85 +255,8 @@ fn size_points(measured: distances::Measured, options: &ImportOptions<'_>) -> In
     for first in (0..points.len()).step_by(step) {
         let range = first..points.len().min(first + step);
         for (p, distance) in points.range(range.clone())?.iter().zip(distances.range(range)?) {
-            let log_scale = rule.log_scale(distance);
-            sized.push(SizedPoint { point: p.point, row: p.row, color: p.color, log_scale })?;
+            sized.push(SizedPoint { point: *p, log_scale: rule.log_scale(distance) })?;
         }
     }
     sized.finish()
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
-mod tests {
-    use super::*;
-    use crate::base::rng::{Purpose, Stream};
-    use crate::scene::init::gaussians_from_points;
-    use crate::scene::partition::partition;
-    use crate::scene::state::SceneState;
-
-    /// Clusters far apart, duplicates, a lattice, lone points, non-finite points.
-    fn cloud(count: u64) -> (Vec<[f32; 3]>, Vec<[u8; 3]>) {
-        let point = |i: u64| {
-            let mut s = Stream::new(6, Purpose::Test, i, count);
-            let position: [f32; 3] = match i % 13 {
-                0 => std::array::from_fn(|_| s.below(7) as f32),
-                1 => std::array::from_fn(|_| (s.normal() * 300.0) as f32),
-                2 if i.is_multiple_of(5) => [f32::NAN, 0.0, 1.0],
-                k => std::array::from_fn(|axis| (((k * (axis as u64 + 2)) % 5) as f64 * 40.0 + s.normal()) as f32),
-            };
-            (position, std::array::from_fn(|_| s.below(256) as u8))
-        };
-        (0..count).map(point).unzip()
-    }
-
-    #[test]
-    fn pages_equal_those_made_in_memory_for_any_budget() {
-        let folder = tempfile::tempdir().unwrap();
-        for (count, most) in [(0, None), (1, None), (3, None), (7000, None), (7000, Some(5000)), (2000, Some(0))] {
-            let (points, colors) = cloud(count);
-            let init = InitOptions { max_gaussians: most, sh_degree: 1, seed: 3, ..InitOptions::default() };
-            let columns = gaussians_from_points(&points, &colors, &init);
-            let fill = 50;
-            let parts = partition(&columns.means, &columns.scales, fill);
-            let state = SceneState::from_columns(columns);
-            for bytes in [1 << 30, 1 << 20, 300_000, 100_000, 20_000] {
-                let mut pages = Vec::new();
-                let budget = Budget { folder: folder.path(), bytes };
-                let options = ImportOptions { init: &init, fill, budget };
-                let source = (points.as_slice(), colors.as_slice());
-                let summary = import_points(&source, &options, &mut |page| {
-                    pages.push(page);
-                    Ok(())
-                })
-                .unwrap();
-                assert_eq!((summary.rows, summary.points), (state.rows() as u64, count));
-                assert_eq!(pages.len(), parts.pages());
-                for (number, (page, rows)) in pages.iter().zip(parts.iter()).enumerate() {
-                    assert_eq!(page.id, PageId::initial(number as u32));
-                    assert_eq!(page.rows, rows);
-                    assert!(page.columns == state.select(rows).columns, "{count} points, {bytes} bytes, page {number}");
-                }
-            }
-            assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
-        }
-    }
-
-    #[test]
-    fn errors_of_the_source_and_of_the_receiver_are_returned() {
-        struct Broken;
-        impl PointSource for Broken {
-            fn read(&self, take: &mut dyn FnMut([f32; 3], [u8; 3]) -> InputResult<()>) -> InputResult<()> {
-                take([0.0; 3], [0; 3])?;
-                Err(InputError::new("points", "cut short", "copy it again"))
-            }
-        }
-        let folder = tempfile::tempdir().unwrap();
-        let init = InitOptions::default();
-        let options = ImportOptions { init: &init, fill: 8, budget: Budget { folder: folder.path(), bytes: 10_000 } };
-        assert!(import_points(&Broken, &options, &mut |_| Ok(())).is_err());
-        let (points, colors) = cloud(100);
-        let source = (points.as_slice(), colors.as_slice());
-        let full = || InputError::new("disk", "full", "free some");
-        assert!(import_points(&source, &options, &mut |_| Err(full())).is_err());
-    }
 }

@@ -58,15 +58,8 @@ pub fn paginate<E: Grown>(
 
 /// Separates the ordinary records from the giants.
 fn split_giants<E: Grown>(records: Spool<E>, space: SpoolSpace<'_>) -> InputResult<(Spool<E>, Spool<E>)> {
-    let mut search = GiantCut::search(records.len());
-    while !search.is_done() {
-        records.for_each(|e| {
-            search.count(GiantCut::key(e.log_size(), e.row()));
-            Ok(())
-        })?;
-        search.next_pass();
-    }
-    let cut = GiantCut::found(&search);
+    let search = GiantCut::search(records.len());
+    let cut = GiantCut::found(&records.search(search, |e| Some(GiantCut::key(e.log_size(), e.row())))?);
     let (mut small, mut large) = (SpoolWriter::new(space), SpoolWriter::new(space));
     records.for_each(|e| if cut.is_giant(e.log_size(), e.row()) { large.push(*e) } else { small.push(*e) })?;
     debug_assert_eq!(large.len(), giants(records.len()));

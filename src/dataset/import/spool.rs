@@ -5,7 +5,8 @@
 //! is killed.
 
 use crate::base::error::{InputError, InputResult};
-use bytemuck::{NoUninit, Pod};
+use crate::scene::select::RankSearch;
+use bytemuck::Pod;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::ops::Range;
@@ -111,7 +112,7 @@ impl<T: Pod> SpoolWriter<T> {
             self.file = Some(SpoolFile::create(&self.folder)?);
         }
         let Some(file) = &mut self.file else { return Ok(()) };
-        let written = file.file.write_all(bytes_of(&self.waiting));
+        let written = file.file.write_all(bytemuck::cast_slice(&self.waiting));
         written.map_err(|e| file.error("writing points", &e))?;
         self.in_file += self.waiting.len();
         self.waiting.clear();
@@ -177,8 +178,7 @@ impl<T: Pod> Spool<T> {
     /// The file cannot be read.
     pub fn range(&self, range: Range<usize>) -> InputResult<Vec<T>> {
         let mut records = Vec::new();
-        self.read_into(range, &mut records)?;
-        Ok(records)
+        self.read_into(range, &mut records).map(|()| records)
     }
 
     /// Reads all records.
@@ -187,6 +187,21 @@ impl<T: Pod> Spool<T> {
     /// The file cannot be read.
     pub fn into_vec(self) -> InputResult<Vec<T>> {
         if self.file.is_some() { self.range(0..self.len) } else { Ok(self.records) }
+    }
+
+    /// Completes a search among the records' keys; records without a key do not count.
+    ///
+    /// # Errors
+    /// The file cannot be read.
+    pub fn search(&self, mut search: RankSearch, key: impl Fn(&T) -> Option<u64>) -> InputResult<RankSearch> {
+        while !search.is_done() {
+            self.for_each(|record| {
+                key(record).into_iter().for_each(|key| search.count(key));
+                Ok(())
+            })?;
+            search.next_pass();
+        }
+        Ok(search)
     }
 
     fn read_into(&self, range: Range<usize>, out: &mut Vec<T>) -> InputResult<()> {
@@ -202,10 +217,6 @@ impl<T: Pod> Spool<T> {
         let read = reader.seek(at).and_then(|_| reader.read_exact(bytemuck::cast_slice_mut(out)));
         read.map_err(|e| file.error("reading points", &e))
     }
-}
-
-fn bytes_of<T: NoUninit>(records: &[T]) -> &[u8] {
-    bytemuck::cast_slice(records)
 }
 
 #[cfg(test)]

@@ -19,9 +19,8 @@ mod torch_file;
 pub mod write;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::{checked_intrinsics, listed, sort_views};
-use crate::dataset::model::{Lens, RawScene, RawView, Split};
-use crate::dataset::read::ReadOptions;
+use crate::dataset::checks::{checked_intrinsics, left_out, listed, sort_views};
+use crate::dataset::model::{Lens, RawScene, RawView, ReadOptions, Split};
 use crate::dataset::transforms::pose::make_pose;
 use std::path::{Path, PathBuf};
 use torch_file::TorchFile;
@@ -136,9 +135,7 @@ impl Reading<'_> {
             warnings.push(format!("{}: {problem}; their views are left out", folder.display()));
         }
         if !self.bad_poses.is_empty() {
-            let (count, names) = (self.bad_poses.len(), listed(&self.bad_poses));
-            warnings
-                .push(format!("{}: {count} view(s) left out, their pose is not a rotation: {names}", folder.display()));
+            warnings.push(left_out(folder, &self.bad_poses, "their pose is not a rotation"));
         }
         if self.views.is_empty() {
             return Err(InputError::new(folder, "no view is left in train/metadata and val/metadata", REMEDY));

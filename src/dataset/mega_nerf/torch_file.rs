@@ -27,9 +27,6 @@ pub(super) struct TorchFile {
 
 impl TorchFile {
     /// Opens a file and reads its structure.
-    ///
-    /// # Errors
-    /// The file cannot be read, is too large, is not a PyTorch zip archive, or holds more than numbers and tensors.
     pub fn open(path: &Path) -> InputResult<TorchFile> {
         let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
         let bytes = file.metadata().map_err(|e| InputError::io(path, "opening", &e))?.len();
@@ -48,9 +45,6 @@ impl TorchFile {
     }
 
     /// The numbers under a key: a number, or a tensor of one of the `shapes`, row-major.
-    ///
-    /// # Errors
-    /// The key is missing, or its value is of another kind.
     pub fn numbers(&self, key: &str, shapes: &[&[usize]]) -> InputResult<Vec<f64>> {
         let wrong = |problem: String| InputError::new(&self.path, problem, REMEDY).at(format!("key '{key}'"));
         let value = self.top.get(key).ok_or_else(|| wrong("is missing".into()))?;
@@ -64,9 +58,6 @@ impl TorchFile {
     }
 
     /// One number under a key: a number or a tensor of one element.
-    ///
-    /// # Errors
-    /// As [`TorchFile::numbers`].
     pub fn number(&self, key: &str) -> InputResult<f64> {
         self.numbers(key, &[&[], &[1]]).map(|n| n[0])
     }

@@ -5,6 +5,7 @@
 //! tensors.
 
 use crate::base::error::{InputError, InputResult};
+use crate::dataset::colmap_write::make_folder;
 use crate::dataset::model::{RawScene, RawView, Split};
 use glam::DMat3;
 use std::fs::File;
@@ -13,7 +14,6 @@ use std::path::Path;
 use zip::CompressionMethod;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
-/// A value of a dictionary.
 pub(super) enum Entry {
     Int(i32),
     Float(f64),
@@ -46,8 +46,7 @@ pub fn write_mega_nerf(folder: &Path, scene: &RawScene, test_every: usize) -> In
         let part = folder.join(if split == Split::Test { "val" } else { "train" });
         let stem = format!("{i:06}");
         for sub in ["metadata", "rgbs"] {
-            let sub = part.join(sub);
-            std::fs::create_dir_all(&sub).map_err(|e| InputError::io(&sub, "creating the folder", &e))?;
+            make_folder(&part.join(sub))?;
         }
         write_metadata(&part.join("metadata").join(format!("{stem}.pt")), view, drb_from_world, origin, scale)?;
         let extension = view.image_path.extension().and_then(|e| e.to_str()).unwrap_or("jpg");
@@ -79,7 +78,6 @@ fn write_metadata(path: &Path, view: &RawView, drb: DMat3, origin: glam::DVec3, 
     )
 }
 
-/// Writes a dictionary as torch.save does.
 pub(super) fn write_torch(path: &Path, entries: &[(&str, Entry)]) -> InputResult<()> {
     let io = |e: std::io::Error| InputError::io(path, "writing", &e);
     let zipped = |e: zip::result::ZipError| io(std::io::Error::other(e));

@@ -1,7 +1,7 @@
-//! Fills the plots of the city: which plot is what, and what stands on it.
+//! Builds the city: chooses the kind of each plot, and places its parts.
 //!
-//! Invariant: the draws of a plot, a street or a field come from streams keyed by its own number, so the city
-//! grows at its rim when `blocks` does without its pieces depending on the order in which they are built.
+//! Invariant: a plot, street or field takes its random draws from a stream keyed by its own number, so that it does not
+//! depend on the order of construction.
 
 use super::parts::{Parts, grass, skin};
 use super::texture::{Kind, Noise, Skin, paint};
@@ -13,7 +13,6 @@ use glam::DVec3;
 const HALF_PLOT: f64 = 0.5 * PITCH - HALF_STREET;
 
 impl World {
-    /// Builds the city of this seed.
     pub(super) fn build(seed: u64, blocks: u32) -> World {
         let noise = Noise::new(seed);
         let mut world = World { seed, blocks, noise, solids: Vec::new(), plots: Vec::new() };
@@ -43,7 +42,7 @@ impl World {
     }
 }
 
-/// Decides what a plot is and builds it. `slot` spreads the kinds evenly over neighbours.
+/// Chooses the kind of a plot and builds it. `slot` gives neighbours different kinds.
 fn fill_plot(parts: &mut Parts, centre: [f64; 2], from_middle: f64, slot: u32) -> Plot {
     let tall = parts.draws.uniform() > 0.25 + 0.8 * from_middle;
     match slot {
@@ -79,7 +78,7 @@ fn houses(parts: &mut Parts, centre: [f64; 2]) -> Plot {
     plot
 }
 
-/// One house: `row` is -1 where the street lies to the south, 1 where it lies to the north.
+/// One house with its garden. `row` is -1 if the street is south of the house, 1 if it is north.
 fn house_lot(parts: &mut Parts, plot: &mut Plot, x: f64, y: f64, row: f64, lot: f64) {
     let d = &mut parts.draws;
     let (half_x, half_y) = (d.range(3.6, 4.8), d.range(4.0, 5.2));
@@ -118,7 +117,7 @@ fn house_lot(parts: &mut Parts, plot: &mut Plot, x: f64, y: f64, row: f64, lot: 
     }
 }
 
-/// Rows of flats around a court.
+/// Rows of flats around a courtyard.
 fn terraces(parts: &mut Parts, centre: [f64; 2]) -> Plot {
     let court = skin(parts, Kind::Paving, paint(0.6, 0.56, 0.5), paint(0.54, 0.5, 0.45));
     let lawn = grass(parts);
@@ -150,7 +149,7 @@ fn terraces(parts: &mut Parts, centre: [f64; 2]) -> Plot {
     plot
 }
 
-/// Office buildings, one quarter of the plot is a car park.
+/// Office buildings; one quarter of the plot is a car park.
 fn offices(parts: &mut Parts, centre: [f64; 2]) -> Plot {
     let base = skin(parts, Kind::Paving, paint(0.66, 0.64, 0.6), paint(0.58, 0.55, 0.52));
     let mut plot = Plot { base, patches: Vec::new() };
@@ -205,7 +204,7 @@ fn green_corner(parts: &mut Parts, plot: &mut Plot, at: DVec3, half: f64) {
     }
 }
 
-/// Lawn, paths, a court, trees, a pavilion.
+/// A park: lawn, paths, flower beds, a sports court, trees, a pavilion.
 fn park(parts: &mut Parts, centre: [f64; 2]) -> Plot {
     let mut plot = Plot { base: grass(parts), patches: Vec::new() };
     let path = skin(parts, Kind::Earth, paint(0.72, 0.66, 0.54), paint(0.6, 0.55, 0.45));
@@ -234,7 +233,7 @@ fn park(parts: &mut Parts, centre: [f64; 2]) -> Plot {
         let size = d.range(0.75, 1.4);
         let on_path = x.abs() < 4.0 || (y - 3.0).abs() < 4.0 || (x.abs() < 9.0 && (y - 3.0).abs() < 9.0);
         let on_court = (centre[0] + x - court_x).abs() < 9.5 && (centre[1] + y - court_y).abs() < 11.5;
-        // Clearings stay open.
+        // One clearing stays without trees.
         let clearing = (x + side * 13.0).abs() < 8.0 && (y + 12.0).abs() < 8.0;
         if !on_path && !on_court && !clearing && planted < 24 {
             parts.tree(DVec3::new(centre[0] + x, centre[1] + y, 0.0), size);
@@ -244,7 +243,7 @@ fn park(parts: &mut Parts, centre: [f64; 2]) -> Plot {
     plot
 }
 
-/// Trees, parked and driving cars, lamps along one street.
+/// Adds trees, lamps, and parked and driving cars to one street.
 fn furnish_street(parts: &mut Parts, line: f64, half: f64, along_y: bool) {
     let place = |across: f64, along: f64| {
         if along_y { DVec3::new(line + across, along, 0.0) } else { DVec3::new(along, line + across, 0.0) }
@@ -276,7 +275,7 @@ fn furnish_street(parts: &mut Parts, line: f64, half: f64, along_y: bool) {
     }
 }
 
-/// Trees alone, in copses and along field edges, and a few barns.
+/// Adds trees and a few barns to the land around the city.
 fn plant_countryside(world: &mut World) {
     let reach = world.half() + MARGIN;
     let cell = 30.0;

@@ -1,11 +1,11 @@
-//! The flight: where the camera was for every photo.
+//! Plans the flight: the camera's pose for every photo.
 //!
-//! Two passes of parallel strips, the second across the first, at one altitude; on every strip the camera looks
-//! forward and down, and neighbouring strips are flown in opposite directions, so that every wall is seen. Strips
-//! are laid over the places looked at, not over the camera's track: the camera starts behind the city's edge.
+//! The flight has two passes of parallel strips at one altitude; the second pass crosses the first. The camera looks
+//! forward and down, and neighbouring strips have opposite directions, so that every wall is seen. Strips cover the
+//! places that the camera aims at: the camera itself starts outside the city.
 //!
-//! Invariants: 1. the poses are a function of the options alone; 2. overlap holds per pass in the middle of the
-//! pictures: 75 % along a strip and 60 % across, unless the caller chose another number of blocks.
+//! Invariants: 1. poses depend on the options alone; 2. within a pass, photos overlap by 75 % along a strip and by 60 %
+//! across (in the middle of the pictures), unless the user chose the number of blocks.
 
 use super::CityOptions;
 use super::solid::Ray;
@@ -16,9 +16,9 @@ use glam::{DMat3, DVec2, DVec3};
 
 /// Camera height above the ground, metres.
 const ALTITUDE: f64 = 82.0;
-/// Focal length as a share of the picture's width.
+/// Focal length as a fraction of the picture's width.
 const FOCAL: f64 = 0.9;
-/// Overlaps of neighbouring photos of a strip and of neighbouring strips.
+/// Overlap of neighbouring photos in a strip, and of neighbouring strips.
 const FORWARD_OVERLAP: f64 = 0.75;
 const SIDE_OVERLAP: f64 = 0.60;
 
@@ -32,7 +32,7 @@ pub(super) struct Shot {
     pub(super) aim: DVec2,
 }
 
-/// The whole flight: one camera, many poses.
+/// The flight: one camera, one pose per photo.
 pub(super) struct Flight {
     pub(super) intrinsics: Intrinsics,
     pub(super) shots: Vec<Shot>,
@@ -51,7 +51,7 @@ impl Shot {
         Ray::new(self.centre, self.rotation.transpose() * (d / d.length()))
     }
 
-    /// Picture position of a point, when it lies before the camera and inside the picture.
+    /// Picture position of a point, if it is in front of the camera and inside the picture.
     pub(super) fn project(&self, k: &Intrinsics, point: DVec3) -> Option<DVec2> {
         let p = self.rotation * (point - self.centre);
         if p.z <= 0.1 {
@@ -63,12 +63,11 @@ impl Shot {
     }
 }
 
-/// Tilt off the vertical, radians; tall pictures look down more steeply, so that the horizon stays outside.
+/// Angle to the vertical, radians; smaller for tall pictures, so that the horizon stays outside.
 fn tilt_of(half_height: f64) -> f64 {
     (40.0f64).min(66.0 - half_height.to_degrees()).max(0.0).to_radians()
 }
 
-/// Plans the flight.
 pub(super) fn plan(options: &CityOptions) -> Flight {
     let (width, height) = (f64::from(options.width), f64::from(options.height));
     let focal = FOCAL * width;
@@ -88,7 +87,7 @@ pub(super) fn plan(options: &CityOptions) -> Flight {
     let (step, spacing) = ((1.0 - FORWARD_OVERLAP) * length, (1.0 - SIDE_OVERLAP) * breadth);
     let per_pass = 0.5 * f64::from(options.views);
     let side = (per_pass * step * spacing).sqrt();
-    // Rounded down: whole blocks, and no less overlap than promised.
+    // Rounded down to whole blocks, which only increases the overlap.
     let blocks = options.blocks.unwrap_or(((side / PITCH) as u32).max(1));
     let side = f64::from(blocks) * PITCH;
     let mut shots = Vec::with_capacity(options.views as usize);
@@ -127,8 +126,8 @@ fn fly_pass(options: &CityOptions, pass: u32, views: u32, side: f64, tilt: f64, 
     }
 }
 
-/// World-to-camera rotation (x right, y down, z forward) of a camera that looks along `heading`, turned by `yaw`,
-/// `tilt` off the vertical, turned by `roll` about its axis.
+/// World-to-camera rotation (x right, y down, z forward) of a camera that looks along `heading` rotated by `yaw`, at the
+/// angle `tilt` to the vertical, rotated by `roll` about its axis.
 fn attitude(heading: DVec2, yaw: f64, tilt: f64, roll: f64) -> DMat3 {
     let (c, s) = (libm::cos(yaw), libm::sin(yaw));
     let ahead = DVec2::new(c * heading.x - s * heading.y, s * heading.x + c * heading.y);

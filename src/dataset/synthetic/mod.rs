@@ -1,12 +1,12 @@
-//! A city that does not exist, photographed: the demo, the data of scaling runs, and a test scene.
+//! Generates photos of a random city: for the demo, scaling runs and tests.
 //!
 //! [`write_city`] builds a world from a seed (`world`, `build`, `parts`, `solid`, `texture`), plans a flight over it
-//! (`flight`), casts rays (`trace`, `shade`, `photo`), picks points (`points`) and writes an ordinary COLMAP scene:
-//! `images/view_0000.jpg ...` and `sparse/0/{cameras,images,points3D}.bin`. It knows nothing about training.
+//! (`flight`), casts rays (`trace`, `shade`, `photo`), samples points (`points`) and writes a COLMAP scene:
+//! `images/view_0000.jpg ...` and `sparse/0/{cameras,images,points3D}.bin`.
 //!
-//! Invariants: 1. the same options give the same bytes for any number of threads and on every platform: all draws
-//! are keyed, all arithmetic is + - * / sqrt and `libm`; 2. `sparse/` appears last and whole, under its final name
-//! in one rename, so that an interrupted run leaves no folder that reads as a scene.
+//! Invariants: 1. the same options give the same bytes for any number of threads and on every platform: all random draws
+//! are keyed, all arithmetic is + - * / sqrt and `libm`; 2. `sparse/` appears last, complete, in one rename: the folder
+//! of an interrupted run cannot be read as a scene.
 
 mod build;
 mod flight;
@@ -20,7 +20,7 @@ mod trace;
 mod world;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::colmap_write::{Model, ModelImage, write_file, write_model};
+use crate::dataset::colmap_write::{Model, ModelImage, make_folder, write_file, write_model};
 use flight::Flight;
 use glam::DVec3;
 use image::{ExtendedColorType, codecs::jpeg::JpegEncoder};
@@ -32,10 +32,10 @@ use world::World;
 /// Quality of the JPEGs.
 const JPEG_QUALITY: u8 = 95;
 
-/// What city to make and how to photograph it.
+/// Options of the city and of its photos.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CityOptions {
-    /// Seed of everything.
+    /// Seed of the city, the flight, the points and the sensor noise.
     pub seed: u64,
     /// Photos, 1 to 100,000.
     pub views: u32,
@@ -43,23 +43,23 @@ pub struct CityOptions {
     pub width: u32,
     /// Height of a photo, pixels, 16 to 16,384.
     pub height: u32,
-    /// Points to sample, up to 50 million.
+    /// Number of points, up to 50 million.
     pub points: u32,
-    /// Side of the city in blocks of 60 m, 1 to 150 (each takes about 0.15 MB of memory); `None` takes what
-    /// the views cover at full overlap.
+    /// Side of the city in blocks of 60 m, 1 to 150 (a block takes about 0.15 MB of memory); `None`: the largest city
+    /// that the views cover at full overlap.
     pub blocks: Option<u32>,
-    /// Standard deviation of the gain of the photos (0.03 is 3 %), 0 to 0.3.
+    /// Standard deviation of the photos' brightness (0.03 is 3 %), 0 to 0.3.
     pub exposure: f64,
-    /// Standard deviation of the sensor noise as a share of white, 0 to 0.3.
+    /// Standard deviation of the sensor noise as a fraction of white, 0 to 0.3.
     pub noise: f64,
-    /// Rays per pixel and direction where surfaces meet: 3 casts 3x3. 1 to 8.
+    /// Where surfaces meet, NxN rays are cast through a pixel; 1 to 8.
     pub supersample: u32,
-    /// The city is repeated so many times along x and y, 1 to 100 each, and every photo is put into one of the copies in
-    /// turn (it shows no neighbour of its copy, which the points have): as many points as wanted, in bounded memory.
+    /// Copies of the city along x and y, 1 to 100 each, for any number of points in bounded memory. The photos are
+    /// divided among the copies in turn; they do not show neighbouring copies.
     pub tiles: [u32; 2],
     /// Added to all coordinates, metres: (500000, 4600000, 0) makes them look like UTM.
     pub offset: [f64; 3],
-    /// Replace a scene that is already in the folder.
+    /// Replace the generated scene in the folder.
     pub overwrite: bool,
 }
 
@@ -82,7 +82,7 @@ impl Default for CityOptions {
     }
 }
 
-/// What was written.
+/// Summary of a written scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CitySummary {
     /// The scene's folder.
@@ -91,19 +91,19 @@ pub struct CitySummary {
     pub views: u32,
     /// Points written.
     pub points: u64,
-    /// Entries of all tracks.
+    /// Total length of all tracks.
     pub observations: u64,
     /// Side of the city in blocks.
     pub blocks: u32,
     /// Side of the city, metres.
     pub side: f64,
-    /// Solids that the city is made of.
+    /// Number of solids of the city.
     pub solids: u32,
-    /// Rays cast through pixels (shadow rays are not counted).
+    /// Number of rays cast through pixels, without shadow rays.
     pub rays: u64,
 }
 
-/// Refuses options out of range, naming the flag of `gsscale-synth`.
+/// Refuses options out of range; the error names the flag of `gsscale-synth`.
 fn check(options: &CityOptions) -> InputResult<()> {
     let in_range = |flag: &str, value: f64, low: f64, high: f64| {
         if value >= low && value <= high {
@@ -123,10 +123,10 @@ fn check(options: &CityOptions) -> InputResult<()> {
     options.offset.iter().try_for_each(|&v| in_range("--offset", v, -1e9, 1e9))
 }
 
-/// Makes the city and writes it to `folder` as a COLMAP scene. `progress(done, views)` is called after each photo.
+/// Generates a city and writes it to `folder` as a COLMAP scene. `progress(done, views)` is called after each photo.
 ///
 /// # Errors
-/// Options out of range; a folder that holds something while `overwrite` is off; anything that cannot be written.
+/// An option is out of range, the folder is not empty and `overwrite` is off, or a file cannot be written.
 pub fn write_city(
     folder: &Path,
     options: &CityOptions,
@@ -156,18 +156,18 @@ pub fn write_city(
     })
 }
 
-/// Where the copies of the city are.
+/// Offsets of the copies of the city.
 fn tiles([across, along]: [u32; 2], side: f64) -> Vec<[f64; 3]> {
     (0..across * along).map(|k| [f64::from(k % across) * side, f64::from(k / across) * side, 0.0]).collect()
 }
 
-/// Name of a photo; names sort in the order of the flight.
+/// Name of photo `k`; names sort in the order of the flight.
 fn photo_name(k: usize, views: u32) -> String {
     let digits = views.saturating_sub(1).to_string().len().max(4);
     format!("view_{k:0digits$}.jpg")
 }
 
-/// Makes the folders; with `overwrite` takes away the scene that is there, but never photos that are not ours.
+/// Creates the folders. With `overwrite`, removes the generated scene in them, but never other photos or models.
 fn prepare(folder: &Path, overwrite: bool) -> InputResult<()> {
     make_folder(folder)?;
     let images = folder.join("images");
@@ -183,17 +183,17 @@ fn prepare(folder: &Path, overwrite: bool) -> InputResult<()> {
         if let Some(foreign) = photos.iter().find(|name| !is_photo_name(name)) {
             return Err(InputError::new(
                 &images,
-                format!("'{foreign}' is no photo of a generated city, so nothing is overwritten"),
+                format!("'{foreign}' is not a photo of a generated city; nothing was overwritten"),
                 "choose another folder",
             ));
         }
-        // A model without photos of ours is somebody's own: photos are written before it, and removed after it.
+        // A generated model always has photos beside it: photos are written before it, and removed after it.
         let model = folder.join("sparse");
         if photos.is_empty() && model.symlink_metadata().is_ok() {
-            let problem = "there is a model without photos of a generated city, so nothing is overwritten";
+            let problem = "this is a model without photos of a generated city; nothing was overwritten";
             return Err(InputError::new(&model, problem, "choose another folder"));
         }
-        // The model goes first: without it the rest is no scene.
+        // The model is removed first: without it the folder cannot be read as a scene.
         for name in ["sparse", "sparse.partial", "images"] {
             let path = folder.join(name);
             if path.symlink_metadata().is_ok_and(|m| m.is_dir()) {
@@ -204,25 +204,21 @@ fn prepare(folder: &Path, overwrite: bool) -> InputResult<()> {
     make_folder(&images)
 }
 
-fn make_folder(path: &Path) -> InputResult<()> {
-    std::fs::create_dir_all(path).map_err(|e| InputError::io(path, "making the folder", &e))
-}
-
-/// Names of what is in a folder.
+/// The names in a folder.
 fn list(folder: &Path) -> InputResult<Vec<String>> {
     let names = std::fs::read_dir(folder)
         .and_then(|entries| entries.map(|e| Ok(e?.file_name().to_string_lossy().into_owned())).collect());
     names.map_err(|e: std::io::Error| InputError::io(folder, "listing the folder", &e))
 }
 
-/// Whether [`photo_name`] makes such names (what a broken run leaves counts too).
+/// Whether [`photo_name`] makes this name, or an interrupted run left it.
 fn is_photo_name(name: &str) -> bool {
     let name = name.strip_suffix(".partial").unwrap_or(name);
     let number = name.strip_prefix("view_").and_then(|n| n.strip_suffix(".jpg"));
     number.is_some_and(|n| n.len() >= 4 && n.bytes().all(|b| b.is_ascii_digit()))
 }
 
-/// Takes and writes all photos; returns the rays cast.
+/// Takes and writes all photos; returns the number of rays.
 fn write_photos(
     folder: &Path,
     options: &CityOptions,
@@ -232,7 +228,7 @@ fn write_photos(
 ) -> InputResult<u64> {
     let mut rays = 0;
     let mut waiting: Option<(usize, Photo)> = None;
-    // While one photo is taken, the one before it is compressed and written.
+    // A photo is compressed and written while the next one is taken.
     for k in 0..=flight.shots.len() {
         let done = waiting.take();
         let (taken, written) = rayon::join(
@@ -282,12 +278,5 @@ mod tests {
             assert!(error.starts_with(flag), "{error}");
         }
         assert!(check(&CityOptions::default()).is_ok());
-    }
-
-    #[test]
-    fn names_sort_in_flight_order() {
-        assert_eq!(photo_name(7, 60), "view_0007.jpg");
-        assert_eq!(photo_name(7, 10_000), "view_0007.jpg");
-        assert_eq!(photo_name(7, 10_001), "view_00007.jpg");
     }
 }

@@ -1,31 +1,47 @@
-//! Things made of solids: houses, flats, offices, trees, cars, lamps.
+//! Parts of the city, made of solids: houses, flats, offices, trees, cars, lamps.
 //!
-//! Invariant: a part takes its draws from the stream of the plot or street that it stands on, in the order built.
+//! Invariant: a part takes its random draws from the stream of its plot or street, in the order of construction.
 
 use super::solid::{Shape, Solid};
 use super::texture::{Kind, Skin, paint};
 use crate::base::rng::Stream;
 use glam::{DVec3, Vec3};
 
-/// Solids under construction and the draws they come from.
+/// The solids of one plot or street, and its stream of random draws.
 pub(super) struct Parts {
     pub(super) draws: Stream,
     pub(super) solids: Vec<Solid>,
 }
 
-/// A surface with its own draws.
+/// A surface with a seed of its own.
 pub(super) fn skin(parts: &mut Parts, kind: Kind, color: Vec3, accent: Vec3) -> Skin {
     Skin { kind, color, accent, seed: parts.draws.next_u64() as u32 }
 }
 
-/// One of several lawns.
+/// A lawn of a random green.
 pub(super) fn grass(parts: &mut Parts) -> Skin {
     let green = parts.draws.range(0.0, 0.06) as f32;
     skin(parts, Kind::Grass, paint(0.38 + green, 0.48, 0.25), paint(0.5 + green, 0.53, 0.3))
 }
 
-const AXIS: (f64, f64) = (1.0, 0.0);
-const QUARTER: (f64, f64) = (0.0, 1.0);
+/// Cosine and sine of an angle.
+type Turn = (f64, f64);
+
+const AXIS: Turn = (1.0, 0.0);
+const QUARTER: Turn = (0.0, 1.0);
+
+fn turn_by(angle: f64) -> Turn {
+    (libm::cos(angle), libm::sin(angle))
+}
+
+/// The place at these distances from `at`, in directions turned by `turn`.
+fn beside(at: DVec3, turn: Turn, along: f64, across: f64, up: f64) -> DVec3 {
+    at + DVec3::new(turn.0 * along - turn.1 * across, turn.1 * along + turn.0 * across, up)
+}
+
+fn above(at: DVec3, up: f64) -> DVec3 {
+    at + DVec3::new(0.0, 0.0, up)
+}
 
 const WALLS: [Vec3; 9] = [
     paint(0.88, 0.85, 0.78),
@@ -72,26 +88,31 @@ impl Parts {
         items[self.draws.below(items.len() as u64) as usize]
     }
 
-    fn block(&mut self, at: DVec3, half: (f64, f64), height: f64, turn: (f64, f64), side: Skin, top: Skin) {
+    fn block(&mut self, at: DVec3, half: (f64, f64), height: f64, turn: Turn, side: Skin, top: Skin) {
         let shape = Shape::Block { half_x: half.0, half_y: half.1, height };
         self.solids.push(Solid::new(shape, at, turn, side, top));
     }
 
-    /// Leaves of one of several kinds of tree.
+    /// A roof with its ridge along x, hipped if `run` > 0.
+    fn roof(&mut self, at: DVec3, half: (f64, f64), (height, run): (f64, f64), turn: Turn, side: Skin, top: Skin) {
+        let shape = Shape::Roof { half_x: half.0, half_y: half.1, height, run, cap: 100.0 };
+        self.solids.push(Solid::new(shape, at, turn, side, top));
+    }
+
+    /// Leaves in the colours of a random kind of tree.
     pub(super) fn leaf_skin(&mut self) -> Skin {
         let (color, accent) = self.pick(&CROWNS[..3]);
         skin(self, Kind::Leaves, color, accent)
     }
 
-    /// A hedge of these half sides.
     pub(super) fn hedge(&mut self, at: DVec3, half_x: f64, half_y: f64, leaves: Skin) {
         let height = self.draws.range(1.2, 1.7);
         self.block(at, (half_x, half_y), height, AXIS, leaves, leaves);
     }
 
-    /// A house with a gabled or hipped roof, a chimney, sometimes a garage.
+    /// A house with a gabled or hipped roof, a chimney, sometimes a dormer.
     pub(super) fn house(&mut self, at: DVec3, half_x: f64, half_y: f64, turn: f64) {
-        let turn = (libm::cos(turn), libm::sin(turn));
+        let turn = turn_by(turn);
         let height = if self.draws.uniform() < 0.6 { 5.6 } else { 3.4 } + self.draws.range(-0.2, 0.3);
         let wall_color = self.pick(&WALLS);
         let trim = self.pick(&[paint(0.9, 0.88, 0.84), paint(0.5, 0.4, 0.32), paint(0.8, 0.78, 0.72)]);
@@ -105,41 +126,35 @@ impl Parts {
         let rise = wide * self.draws.range(0.62, 0.85);
         let run = if self.draws.uniform() < 0.35 { wide } else { 0.0 };
         let gable = Skin { kind: Kind::Plain, ..wall };
-        let shape = Shape::Roof { half_x: long + 0.45, half_y: wide + 0.45, height: rise, run, cap: 100.0 };
-        self.solids.push(Solid::new(shape, at + DVec3::new(0.0, 0.0, height), roof_turn, gable, tiles));
+        self.roof(above(at, height), (long + 0.45, wide + 0.45), (rise, run), roof_turn, gable, tiles);
         let brick = skin(self, Kind::Plain, paint(0.56, 0.36, 0.3), paint(0.5, 0.5, 0.5));
         let (cx, cy) = (self.draws.range(-0.5, 0.5) * long, self.draws.range(0.15, 0.35) * wide);
-        let chimney = at + DVec3::new(roof_turn.0 * cx - roof_turn.1 * cy, roof_turn.1 * cx + roof_turn.0 * cy, height);
-        self.block(chimney, (0.4, 0.4), rise + 0.7, turn, brick, brick);
+        self.block(beside(at, roof_turn, cx, cy, height), (0.4, 0.4), rise + 0.7, turn, brick, brick);
         if run == 0.0 && self.draws.uniform() < 0.45 {
             // A dormer: a small house across the ridge.
-            let shape = Shape::Roof { half_x: wide * 0.8, half_y: 1.3, height: 0.9, run: 0.0, cap: 100.0 };
-            let place = at + DVec3::new(0.0, 0.0, height + 0.35 * rise);
+            let place = above(at, height + 0.35 * rise);
             let across = (-roof_turn.1, roof_turn.0);
             self.block(place - DVec3::Z, (wide * 0.74, 1.1), 1.0, across, wall, tiles);
-            self.solids.push(Solid::new(shape, place, across, gable, tiles));
+            self.roof(place, (wide * 0.8, 1.3), (0.9, 0.0), across, gable, tiles);
         }
     }
 
-    /// A garden shed or pavilion.
     pub(super) fn shed(&mut self, at: DVec3) {
         let wood = skin(self, Kind::Wood, paint(0.52, 0.4, 0.3), paint(0.5, 0.4, 0.3));
         let roof_color = self.pick(&TILES);
         let roof = skin(self, Kind::Metal, roof_color, roof_color);
         self.block(at, (1.5, 1.3), 2.1, AXIS, wood, roof);
-        let shape = Shape::Roof { half_x: 1.7, half_y: 1.5, height: 0.8, run: 0.0, cap: 100.0 };
-        self.solids.push(Solid::new(shape, at + DVec3::new(0.0, 0.0, 2.1), AXIS, wood, roof));
+        self.roof(above(at, 2.1), (1.7, 1.5), (0.8, 0.0), AXIS, wood, roof);
     }
 
     /// A barn with a metal roof.
     pub(super) fn barn(&mut self, at: DVec3, turn: f64) {
-        let turn = (libm::cos(turn), libm::sin(turn));
+        let turn = turn_by(turn);
         let wall = skin(self, Kind::Wood, paint(0.55, 0.36, 0.28), paint(0.5, 0.4, 0.3));
         let roof = skin(self, Kind::Metal, paint(0.6, 0.58, 0.56), paint(0.5, 0.5, 0.5));
         let (long, wide) = (self.draws.range(8.0, 10.5), self.draws.range(4.5, 6.0));
         self.block(at, (long, wide), 4.2, turn, wall, roof);
-        let shape = Shape::Roof { half_x: long + 0.5, half_y: wide + 0.5, height: 2.6, run: 0.0, cap: 100.0 };
-        self.solids.push(Solid::new(shape, at + DVec3::new(0.0, 0.0, 4.2), turn, wall, roof));
+        self.roof(above(at, 4.2), (long + 0.5, wide + 0.5), (2.6, 0.0), turn, wall, roof);
     }
 
     /// A row of flats of half length `half_long`; `along_y` turns it.
@@ -152,7 +167,7 @@ impl Parts {
         let pitched = self.draws.uniform() < 0.6;
         for k in 0..houses {
             let along = (f64::from(2 * k + 1) - f64::from(houses)) * part;
-            let place = at + DVec3::new(turn.0 * along, turn.1 * along, 0.0);
+            let place = beside(at, turn, along, 0.0, 0.0);
             let height = (floors + self.draws.range(-0.6, 0.9)).floor() * 3.1 + 0.5;
             let wall_color = self.pick(&WALLS);
             let trim = self.pick(&[paint(0.86, 0.84, 0.8), paint(0.66, 0.62, 0.56), paint(0.56, 0.46, 0.4)]);
@@ -163,13 +178,11 @@ impl Parts {
                 let tiles = skin(self, Kind::Tiles, tile_color, tile_color * 0.8);
                 self.block(place, (part, half_deep), height, turn, wall, tiles);
                 let rise = half_deep * 0.62;
-                let shape = Shape::Roof { half_x: part, half_y: half_deep + 0.5, height: rise, run: 0.0, cap: 100.0 };
                 let gable = Skin { kind: Kind::Plain, ..wall };
-                self.solids.push(Solid::new(shape, place + DVec3::new(0.0, 0.0, height), turn, gable, tiles));
+                self.roof(above(place, height), (part, half_deep + 0.5), (rise, 0.0), turn, gable, tiles);
                 let brick = skin(self, Kind::Plain, paint(0.56, 0.38, 0.32), paint(0.5, 0.5, 0.5));
                 let side = self.draws.range(0.3, 0.6) * part;
-                let chimney = place + DVec3::new(turn.0 * side, turn.1 * side, height);
-                self.block(chimney, (0.5, 0.8), rise + 0.9, turn, brick, brick);
+                self.block(beside(place, turn, side, 0.0, height), (0.5, 0.8), rise + 0.9, turn, brick, brick);
             } else {
                 self.flat_roofed(place, (part, half_deep), height, turn, wall);
             }
@@ -178,7 +191,7 @@ impl Parts {
     }
 
     /// Balconies on the two long sides of a part of a row.
-    fn balconies(&mut self, at: DVec3, half: (f64, f64), height: f64, turn: (f64, f64)) {
+    fn balconies(&mut self, at: DVec3, half: (f64, f64), height: f64, turn: Turn) {
         if self.draws.uniform() < 0.5 {
             return;
         }
@@ -186,23 +199,17 @@ impl Parts {
         let floors = (height / 3.1) as u32;
         for side in [-1.0, 1.0] {
             for floor in 1..floors {
-                let across = side * (half.1 + 0.6);
                 let along = 0.45 * half.0;
                 for along in [-along, along] {
-                    let place = at
-                        + DVec3::new(
-                            turn.0 * along - turn.1 * across,
-                            turn.1 * along + turn.0 * across,
-                            f64::from(floor) * 3.1 - 0.1,
-                        );
+                    let place = beside(at, turn, along, side * (half.1 + 0.6), f64::from(floor) * 3.1 - 0.1);
                     self.block(place, (1.5, 0.6), 1.1, turn, slab, slab);
                 }
             }
         }
     }
 
-    /// A building with a parapet and things on its flat roof.
-    fn flat_roofed(&mut self, at: DVec3, half: (f64, f64), height: f64, turn: (f64, f64), wall: Skin) {
+    /// A building with a parapet, and with stairs, machines and solar panels on its flat roof.
+    fn flat_roofed(&mut self, at: DVec3, half: (f64, f64), height: f64, turn: Turn, wall: Skin) {
         let kind = self.pick(&[Kind::Bitumen, Kind::Gravel, Kind::Bitumen, Kind::Grass]);
         let color = match kind {
             Kind::Gravel => self.pick(&[paint(0.64, 0.61, 0.56), paint(0.56, 0.54, 0.52)]),
@@ -212,9 +219,7 @@ impl Parts {
         let roof = skin(self, kind, color, paint(0.55, 0.5, 0.36));
         self.block(at, half, height, turn, wall, roof);
         let rim = skin(self, Kind::Plain, wall.accent.lerp(Vec3::splat(0.4), 0.5), wall.accent);
-        let put = |along: f64, across: f64, up: f64| {
-            at + DVec3::new(turn.0 * along - turn.1 * across, turn.1 * along + turn.0 * across, up)
-        };
+        let put = |along: f64, across: f64, up: f64| beside(at, turn, along, across, up);
         for side in [-1.0, 1.0] {
             self.block(put(0.0, side * (half.1 - 0.2), height), (half.0, 0.2), 0.6, turn, rim, rim);
             let end = (0.2, half.1 - 0.4);
@@ -235,13 +240,8 @@ impl Parts {
             for k in 0..3 {
                 let across = -0.1 * half.1 - f64::from(k) * 2.2;
                 let shape = Shape::Roof { half_x: 0.5 * half.0, half_y: 0.85, height: 1.0, run: 0.0, cap: 0.8 };
-                self.solids.push(Solid::new(
-                    shape,
-                    put(-stair.signum() * 0.3 * half.0, across, height),
-                    turn,
-                    grey,
-                    panel,
-                ));
+                let place = put(-stair.signum() * 0.3 * half.0, across, height);
+                self.solids.push(Solid::new(shape, place, turn, grey, panel));
             }
         }
     }
@@ -268,7 +268,7 @@ impl Parts {
             let raised = at + DVec3::new(0.2 * half_x, -0.2 * half_y, height);
             self.block(raised, upper, more, AXIS, Skin { seed: wall.seed ^ 1, ..wall }, wall);
             let roof = skin(self, Kind::Gravel, paint(0.58, 0.56, 0.54), paint(0.5, 0.5, 0.5));
-            self.block(raised + DVec3::new(0.0, 0.0, more), upper, 0.3, AXIS, roof, roof);
+            self.block(above(raised, more), upper, 0.3, AXIS, roof, roof);
         }
     }
 
@@ -280,18 +280,17 @@ impl Parts {
             let needles = skin(self, Kind::Leaves, paint(0.18, 0.29, 0.2), paint(0.28, 0.38, 0.26));
             for k in 0..4 {
                 let share = 1.0 - 0.22 * f64::from(k);
-                let turn = self.draws.range(0.0, 1.5);
+                let turn = turn_by(self.draws.range(0.0, 1.5));
                 let (half, height) = (2.1 * size * share, 3.2 * size * share.max(0.5));
-                let shape = Shape::Roof { half_x: half, half_y: half, height, run: half, cap: 100.0 };
-                let place = at + DVec3::new(0.0, 0.0, size * (1.2 + 1.7 * f64::from(k)));
-                self.solids.push(Solid::new(shape, place, (libm::cos(turn), libm::sin(turn)), needles, needles));
+                let place = above(at, size * (1.2 + 1.7 * f64::from(k)));
+                self.roof(place, (half, half), (height, half), turn, needles, needles);
             }
             return;
         }
         let (color, accent) = self.pick(&CROWNS);
         let clumps = 8 + self.draws.below(5);
         for k in 0..clumps {
-            // Every clump has its own tone, which is what makes a crown look leafy from far away.
+            // Every clump has its own tone, so that a crown looks leafy from far away.
             let tone = self.draws.range(0.75, 1.25) as f32;
             let leaves = skin(self, Kind::Leaves, color * tone, accent * tone);
             let d = &mut self.draws;
@@ -302,8 +301,7 @@ impl Parts {
             let radius = size * (1.35 - 0.35 * level) * d.range(0.85, 1.15);
             let radii = DVec3::new(radius, radius * d.range(0.85, 1.1), radius * d.range(0.75, 0.95));
             let place = at + DVec3::new(out * libm::cos(turn), out * libm::sin(turn), up);
-            let frame = (libm::cos(turn), libm::sin(turn));
-            self.solids.push(Solid::new(Shape::Ellipsoid { radii }, place, frame, leaves, leaves));
+            self.solids.push(Solid::new(Shape::Ellipsoid { radii }, place, turn_by(turn), leaves, leaves));
         }
     }
 
@@ -316,7 +314,7 @@ impl Parts {
         let van = self.draws.uniform() < 0.14;
         let long = self.draws.range(1.95, 2.3);
         let body_height = if van { 1.75 } else { 0.62 };
-        self.block(at + DVec3::new(0.0, 0.0, 0.3), (long, 0.9), body_height, turn, paint_skin, paint_skin);
+        self.block(above(at, 0.3), (long, 0.9), body_height, turn, paint_skin, paint_skin);
         let tyre = skin(self, Kind::Plain, paint(0.12, 0.12, 0.12), paint(0.1, 0.1, 0.1));
         self.block(at, (long * 0.82, 0.86), 0.35, turn, tyre, tyre);
         if van {
@@ -324,17 +322,15 @@ impl Parts {
         }
         let back = if self.draws.uniform() < 0.5 { 0.25 } else { -0.25 };
         let shape = Shape::Roof { half_x: long * 0.66, half_y: 0.86, height: 2.6, run: 2.2, cap: 0.58 };
-        let place = at + DVec3::new(turn.0 * back, turn.1 * back, 0.92);
-        // The slopes of the cabin are its windows; its cut top is the roof.
-        self.solids.push(Solid::new(shape, place, turn, glass, glass));
-        let lid = at + DVec3::new(turn.0 * back, turn.1 * back, 1.48);
-        self.block(lid, (long * 0.66 - 0.46, 0.68), 0.06, turn, paint_skin, paint_skin);
+        // The slopes of the cabin are its windows; a block on its cut top is the roof.
+        self.solids.push(Solid::new(shape, beside(at, turn, back, 0.0, 0.92), turn, glass, glass));
+        let lid = (long * 0.66 - 0.46, 0.68);
+        self.block(beside(at, turn, back, 0.0, 1.48), lid, 0.06, turn, paint_skin, paint_skin);
     }
 
-    /// A street lamp.
     pub(super) fn lamp(&mut self, at: DVec3) {
         let metal = skin(self, Kind::Plain, paint(0.5, 0.51, 0.52), paint(0.5, 0.5, 0.5));
         self.block(at, (0.09, 0.09), 6.0, AXIS, metal, metal);
-        self.block(at + DVec3::new(0.0, 0.0, 6.0), (0.45, 0.45), 0.15, AXIS, metal, metal);
+        self.block(above(at, 6.0), (0.45, 0.45), 0.15, AXIS, metal, metal);
     }
 }

@@ -1,8 +1,8 @@
-//! Takes one photo: rays through every pixel, more of them where surfaces meet, then the camera's tone curve.
+//! Takes one photo: casts a ray through every pixel, and more where surfaces meet; then applies the camera's tone curve.
 //!
-//! Invariants: 1. a pixel depends on (scene, shot, options, view, pixel) alone, so photos have the same bytes for
-//! any number of threads; 2. a pixel gets either one ray, with textures averaged over the whole pixel, or
-//! up to `supersample`^2 more; the choice looks only at rays of the pixel and the first rays of its neighbours.
+//! Invariants: 1. a pixel depends on (scene, shot, options, view, pixel) alone, so photos have the same bytes for any
+//! number of threads; 2. a pixel gets either one ray, with textures averaged over the whole pixel, or up to
+//! `supersample`^2 more; the choice depends only on rays of the pixel and the first rays of its neighbours.
 
 use super::CityOptions;
 use super::flight::Shot;
@@ -12,33 +12,31 @@ use crate::dataset::model::Intrinsics;
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Relative spread of brightness among a pixel and its neighbours from which on more rays are cast.
+/// Relative spread of brightness among a pixel and its neighbours above which more rays are cast.
 const CONTRAST: f32 = 0.35;
 
-/// A photo: interleaved 8-bit RGB, and the rays that were cast through pixels.
+/// A photo: interleaved 8-bit RGB, and the number of rays.
 pub(super) struct Photo {
     pub(super) rgb: Vec<u8>,
     pub(super) rays: u64,
 }
 
-/// Brightness of light on the camera's scale: a soft shoulder, then a square root.
+/// The camera's tone curve: a soft shoulder, then a square root.
 pub(super) fn tone(light: Vec3) -> Vec3 {
     let shoulder = |x: f32| ((1.18 * x) / (1.0 + 0.18 * x)).max(0.0).sqrt();
     Vec3::new(shoulder(light.x), shoulder(light.y), shoulder(light.z))
 }
 
-/// 8-bit value, clamped and rounded.
 pub(super) fn to_byte(x: f32) -> u8 {
     (x.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
 }
 
-/// Gain of one photo, 1 without exposure change; never below 0.2.
+/// Gain of one photo, at least 0.2; 1 without exposure changes.
 pub(super) fn gain(options: &CityOptions, view: u32) -> f32 {
     let mut draws = Stream::new(options.seed, Purpose::Sensor, u64::from(view), u64::MAX);
     (1.0 + options.exposure * draws.normal_within(3.0)).max(0.2) as f32
 }
 
-/// Takes the photo number `view`.
 pub(super) fn take(scene: &Scene, k: &Intrinsics, shot: &Shot, view: u32, options: &CityOptions) -> Photo {
     let (width, height) = (k.width as usize, k.height as usize);
     let spread = 1.0 / k.fx;
@@ -93,8 +91,8 @@ fn is_mixed(first: &[Sample], width: usize, height: usize, x: usize, y: usize) -
     high - low > CONTRAST * (high + low)
 }
 
-/// Mean light of n x n rays through one pixel, and the rays cast. The four outermost are cast first: when they and
-/// the pixel's first ray agree, the border that called for more rays runs through a neighbour, and they suffice.
+/// Mean light of n x n rays through one pixel, and their number. The four corners are cast first: if they agree with the
+/// pixel's first ray, the border between surfaces is in a neighbour, and the corners suffice.
 fn many_rays(
     scene: &Scene,
     k: &Intrinsics,
@@ -108,7 +106,7 @@ fn many_rays(
     let cast = |i: u32, j: u32| {
         let (px, py) = (x as f64 + (f64::from(i) + 0.5) * cell, y as f64 + (f64::from(j) + 0.5) * cell);
         let sample = scene.sample(&shot.ray(k, px, py), spread);
-        // Bright spots are held at twice white, as a sensor's pixel would.
+        // A sample is at most twice white, as in a sensor that saturates.
         Sample { light: sample.light.min(Vec3::splat(2.0)), ..sample }
     };
     let corners = [(0, 0), (n - 1, 0), (0, n - 1), (n - 1, n - 1)].map(|(i, j)| cast(i, j));

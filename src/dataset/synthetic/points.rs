@@ -1,9 +1,8 @@
-//! Points as structure from motion would find them: places that photos show, with the noise of matching and a track
-//! of photos that really see them.
+//! Samples points as structure from motion finds them: visible places with matching noise, and tracks of the photos that
+//! see them.
 //!
-//! Invariants: 1. point k depends on (scene, flight, options, k) alone; 2. a track names each photo once, in
-//! ascending order, starting photo included; 3. every observation is the projection of the true place plus noise,
-//! and lies inside its photo.
+//! Invariants: 1. point k depends on (scene, flight, options, k) alone; 2. a track contains each photo at most once, in
+//! ascending order; 3. every observation is the projection of the true place plus noise, and inside its photo.
 
 use super::CityOptions;
 use super::flight::{Flight, Shot};
@@ -14,20 +13,20 @@ use crate::dataset::colmap_write::{Observation, Point};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-/// Photos around a photo that are searched for further observations.
+/// Number of neighbouring photos that are searched for further observations.
 const NEIGHBOURS: usize = 16;
 /// Noise of one observation, pixels per coordinate.
 const MATCH_NOISE: f64 = 0.5;
-/// Draws until a place is found that two photos see; the last draw is taken as it is.
+/// Most draws for a place that two photos see; the last draw is used in any case.
 const TRIES: u32 = 6;
 
-/// Makes the points; a flight that sees only sky makes none.
+/// Samples the points. A point whose draws all see the sky is left out.
 pub(super) fn sample(scene: &Scene, flight: &Flight, options: &CityOptions) -> Vec<Point> {
     let neighbours = neighbours(&flight.shots);
     (0..options.points).into_par_iter().filter_map(|k| one_point(scene, flight, options, &neighbours, k)).collect()
 }
 
-/// For every photo the photos that aim nearest to where it aims, itself left out.
+/// For each photo, the other photos with the nearest aims.
 fn neighbours(shots: &[Shot]) -> Vec<Vec<u32>> {
     shots
         .par_iter()
@@ -97,7 +96,7 @@ fn one_point(
     Some(Point { position: (position + DVec3::from(options.offset)).into(), rgb, error, observations })
 }
 
-/// The place moved by the error of matching: half a pixel across the line of sight, twice that along it.
+/// Moves the place by the matching error: half a pixel across the line of sight, one pixel along it.
 fn disturbed(hit: &Hit, shot: &Shot, spread: f64, draws: &mut Stream) -> DVec3 {
     let pixel = hit.t * spread * MATCH_NOISE;
     let noise = DVec3::new(draws.normal_within(3.0), draws.normal_within(3.0), 2.0 * draws.normal_within(3.0)) * pixel;

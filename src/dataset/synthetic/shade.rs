@@ -1,7 +1,7 @@
-//! Light: the sun with sharp shadows, a blue sky with the share of it that each place sees, a little light from the
-//! ground, and a mild gloss that depends on the direction of view.
+//! Lighting: the sun with sharp shadows, the visible part of a blue sky, some light from the ground, and a weak gloss
+//! that depends on the viewing direction.
 //!
-//! Invariant: the light of a place is a function of (world, place, direction of view, footprint) alone.
+//! Invariant: light depends on (world, place, viewing direction, footprint) alone.
 
 use super::solid::{Entry, Face, Ray, Shape, Solid};
 use super::texture::{Look, Place};
@@ -12,9 +12,9 @@ use rayon::prelude::*;
 
 /// Side of a cell of the sky map, metres.
 const SKY_CELL: f64 = 1.0;
-/// Directions that sample the sky.
+/// Number of directions that sample the sky.
 const SKY_RAYS: usize = 32;
-/// How far a sky ray looks for obstacles, metres.
+/// Length of the rays that sample the sky, metres.
 const SKY_REACH: f64 = 45.0;
 
 const SUN_LIGHT: Vec3 = Vec3::new(1.42, 1.30, 1.10);
@@ -27,7 +27,7 @@ fn sun() -> DVec3 {
     v / v.length()
 }
 
-/// A world ready for rays.
+/// A world with its grid and its sky map.
 pub(super) struct Scene {
     pub(super) world: World,
     grid: Grid,
@@ -35,7 +35,7 @@ pub(super) struct Scene {
     sky: SkyMap,
 }
 
-/// How much of the sky the top of each square metre sees, and how high that top is.
+/// For each square metre: the height of its top, and the share of the sky that the top sees.
 struct SkyMap {
     low: f64,
     cells: usize,
@@ -43,7 +43,7 @@ struct SkyMap {
     open: Vec<f32>,
 }
 
-/// What a ray met.
+/// The first place on a ray.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Hit {
     pub(super) t: f64,
@@ -56,9 +56,8 @@ pub(super) struct Hit {
 /// Light along one ray.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sample {
-    /// Linear light.
     pub(super) light: Vec3,
-    /// Changes at every border of a surface or a shadow.
+    /// A number that changes at every border of a surface or a shadow.
     pub(super) surface: u32,
 }
 
@@ -66,14 +65,14 @@ pub(super) struct Sample {
 const SKY: Sample = Sample { light: Vec3::new(0.55, 0.68, 0.85), surface: u32::MAX };
 
 impl Scene {
-    /// Prepares the world: grid, sky map.
+    /// Builds the grid and the sky map.
     pub(super) fn new(world: World) -> Scene {
         let grid = Grid::new(&world.solids);
         let sky = SkyMap::new(&world, &grid);
         Scene { world, grid, sun: sun(), sky }
     }
 
-    /// What the ray meets; `None` is the sky.
+    /// The first place on a ray; `None` is the sky.
     pub(super) fn hit(&self, ray: &Ray) -> Option<Hit> {
         let ground = if ray.along.z < 0.0 { -ray.from.z * ray.inverse.z } else { f64::INFINITY };
         if let Some((k, Entry { t, normal, face })) = self.grid.nearest(&self.world.solids, ray, ground.min(1e5)) {
@@ -87,7 +86,7 @@ impl Scene {
         Some(Hit { t: ground, point: DVec3::new(p.x, p.y, 0.0), normal: DVec3::Z, solid: None })
     }
 
-    /// Whether the straight line between a place (just off its surface) and a camera is free.
+    /// Whether nothing is between a place and a camera.
     pub(super) fn sees(&self, camera: DVec3, hit: &Hit) -> bool {
         let from = hit.point + hit.normal * 0.02;
         let way = camera - from;
@@ -95,7 +94,7 @@ impl Scene {
         !self.grid.blocked(&self.world.solids, &Ray::new(from, way / length), length)
     }
 
-    /// Light along a ray; `spread` is the side of a sample's footprint at distance 1.
+    /// Light along a ray; `spread` is the side of the sample's footprint at distance 1.
     pub(super) fn sample(&self, ray: &Ray, spread: f64) -> Sample {
         match self.hit(ray) {
             Some(hit) => self.shade(ray, &hit, spread),
@@ -106,7 +105,7 @@ impl Scene {
     /// Light from a place towards the ray's origin.
     pub(super) fn shade(&self, ray: &Ray, hit: &Hit, spread: f64) -> Sample {
         let facing = -hit.normal.dot(ray.along);
-        // The footprint is longer the flatter the view; its side is taken between both extents.
+        // At a flat angle the footprint is longer in one direction: its side is the geometric mean.
         let w = hit.t * spread / facing.max(0.08).sqrt();
         let (look, surface) = match hit.solid {
             Some((k, face)) => {
@@ -146,7 +145,7 @@ impl Scene {
         (light, in_sun)
     }
 
-    /// Mirror-like part: sky or street in the mirrored direction, and a broad highlight of the sun.
+    /// The reflected light: sky or street in the mirrored direction, and a broad highlight of the sun.
     fn gloss(&self, ray: &Ray, n: DVec3, gloss: f32, in_sun: bool, open: f32) -> Vec3 {
         let facing = (-n.dot(ray.along)).clamp(0.0, 1.0);
         let mirrored = ray.along + n * (2.0 * facing);
@@ -157,7 +156,7 @@ impl Scene {
         let around = if up > 0.0 {
             Vec3::new(0.75, 0.85, 1.0).lerp(Vec3::new(0.4, 0.6, 0.9), up) * (0.3 + 0.7 * open)
         } else {
-            // What stands opposite: bright towards the side that the sun lights.
+            // The reflected street is brighter on the side that the sun lights.
             let lit = (mirrored.x * self.sun.x + mirrored.y * self.sun.y) as f32;
             Vec3::new(0.42, 0.38, 0.33).lerp(Vec3::new(0.16, 0.16, 0.17), -up) * (1.0 - 0.45 * lit)
         };
@@ -171,7 +170,7 @@ impl Scene {
     }
 }
 
-/// Surface of a solid at a world point.
+/// The surface of a solid at a world point.
 fn solid_look(world: &World, solid: &Solid, face: Face, point: DVec3, w: f64) -> Look {
     let p = solid.turn_in(point - solid.origin);
     let (half_x, half_y, height) = match solid.shape {
@@ -227,7 +226,7 @@ impl SkyMap {
         SkyMap { low: -half, cells, height: height.concat(), open: open.concat() }
     }
 
-    /// Share of the sky that a point sees, weighted by the cosine to the vertical.
+    /// The share of the sky that a point sees, weighted by the cosine to the vertical.
     fn open_at(&self, p: DVec3) -> f32 {
         let (x, y) = ((p.x - self.low) / SKY_CELL, (p.y - self.low) / SKY_CELL);
         let last = (self.cells - 1) as f64;
@@ -242,20 +241,20 @@ impl SkyMap {
             for (di, wx) in [(0, 1.0 - fx), (1, fx)] {
                 let c = (j + dj) * self.cells + i + di;
                 let above = z - self.height[c];
-                // A corner whose top lies above the point is inside or over it and says nothing about it.
+                // A corner whose top is above the point does not count.
                 let usable = (1.5 + above).clamp(0.0, 1.0) * wx * wy;
                 let rise = (above / 16.0).clamp(0.0, 1.0);
                 sum += usable * (self.open[c] + (1.0 - self.open[c]) * rise);
                 weight += usable;
             }
         }
-        // Under a crown or an eave.
+        // The value below a crown or an eave, where no corner counts.
         let covered = 0.45;
         (sum + covered * 0.05) / (weight + 0.05)
     }
 }
 
-/// Directions over the upper half, dense towards the zenith as the cosine is (a spiral on the disk, lifted).
+/// Directions to the sky with a density proportional to the cosine to the vertical: a spiral on the disk, projected up.
 fn sky_directions() -> [DVec3; SKY_RAYS] {
     std::array::from_fn(|k| {
         let area = (k as f64 + 0.5) / SKY_RAYS as f64;

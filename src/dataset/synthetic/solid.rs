@@ -1,7 +1,7 @@
-//! Solids that stand on the ground, and where a ray enters one.
+//! Solids, and the place where a ray enters one.
 //!
-//! Invariants: 1. every solid is convex and lies inside its box `low..high`; 2. a ray that starts inside a solid
-//! does not hit it (so shadow rays may start on a face).
+//! Invariants: 1. every solid is convex and inside its box `low..high`; 2. a ray that starts inside a solid does not hit
+//! it, so that shadow rays may start on a face.
 
 use super::texture::Skin;
 use glam::DVec3;
@@ -30,33 +30,30 @@ impl Ray {
 pub(super) enum Shape {
     /// Box with half sides and a height.
     Block { half_x: f64, half_y: f64, height: f64 },
-    /// Roof over a rectangle with its ridge along x: slopes along y, and along x too when `run > 0` (hipped); cut
-    /// off at `cap`.
+    /// Roof over a rectangle with its ridge along x: slopes along y, and also along x if `run > 0` (hipped); cut off at
+    /// the height `cap`.
     Roof { half_x: f64, half_y: f64, height: f64, run: f64, cap: f64 },
     /// Ellipsoid around the origin.
     Ellipsoid { radii: DVec3 },
 }
 
-/// Which part of a solid a ray met.
+/// A part of a solid's surface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Face {
-    /// Vertical wall across x (gable ends too).
+    /// Vertical wall across x, or gable end.
     SideX,
     /// Vertical wall across y.
     SideY,
-    /// Horizontal top.
     Top,
-    /// Underside.
     Bottom,
     /// Roof slope that falls along y.
     SlopeY,
     /// Roof slope that falls along x.
     SlopeX,
-    /// Curved.
     Round,
 }
 
-/// Where a ray enters a solid: distance, normal in the solid's frame, part.
+/// The place where a ray enters a solid; the normal is in the solid's frame.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Entry {
     pub(super) t: f64,
@@ -64,7 +61,7 @@ pub(super) struct Entry {
     pub(super) face: Face,
 }
 
-/// A shape placed in the world, with its surfaces.
+/// A shape at a place in the world, with its surfaces.
 #[derive(Debug, Clone)]
 pub(super) struct Solid {
     pub(super) shape: Shape,
@@ -80,7 +77,7 @@ pub(super) struct Solid {
 }
 
 impl Solid {
-    /// Places `shape` at `origin`, turned by the angle with this cosine and sine.
+    /// Places `shape` at `origin`, rotated by the angle with this cosine and sine.
     pub(super) fn new(shape: Shape, origin: DVec3, (cos, sin): (f64, f64), side: Skin, top: Skin) -> Solid {
         let (hx, hy, z0, z1) = match shape {
             Shape::Block { half_x, half_y, height } => (half_x, half_y, 0.0, height),
@@ -88,25 +85,25 @@ impl Solid {
             Shape::Ellipsoid { radii } => (radii.x, radii.y, -radii.z, radii.z),
         };
         let (ex, ey) = (hx * cos.abs() + hy * sin.abs(), hx * sin.abs() + hy * cos.abs());
-        // A millimetre of slack keeps hits on faces inside the box whatever the rounding.
+        // A millimetre of slack keeps hits on faces inside the box despite rounding.
         let low = origin + DVec3::new(-ex, -ey, z0) - DVec3::splat(1e-3);
         let high = origin + DVec3::new(ex, ey, z1) + DVec3::splat(1e-3);
         Solid { shape, origin, cos, sin, low, high, side, top }
     }
 
-    /// World point or direction in the solid's frame (directions: pass them without the origin).
+    /// Rotates a direction, or the difference of two points, from the world to the solid's frame.
     #[inline(always)]
     pub(super) fn turn_in(&self, p: DVec3) -> DVec3 {
         DVec3::new(self.cos * p.x + self.sin * p.y, self.cos * p.y - self.sin * p.x, p.z)
     }
 
-    /// Direction of the solid's frame in the world.
+    /// Rotates a direction from the solid's frame to the world.
     #[inline(always)]
     pub(super) fn turn_out(&self, p: DVec3) -> DVec3 {
         DVec3::new(self.cos * p.x - self.sin * p.y, self.sin * p.x + self.cos * p.y, p.z)
     }
 
-    /// Where `ray` enters, if it does so in (0, limit).
+    /// The place where `ray` enters, if its distance is in (0, limit).
     #[inline]
     pub(super) fn enter(&self, ray: &Ray, limit: f64) -> Option<Entry> {
         let from = self.turn_in(ray.from - self.origin);
@@ -122,7 +119,7 @@ impl Solid {
     }
 }
 
-/// The part of a ray inside all half-spaces seen so far, and the face through which it enters.
+/// The part of a ray inside all half-spaces so far, and the face through which it enters.
 struct Clip {
     t0: f64,
     t1: f64,
@@ -131,7 +128,7 @@ struct Clip {
 }
 
 impl Clip {
-    /// Keeps the part with `normal . p <= distance` (the normal need not have length 1).
+    /// Keeps the part with `normal . p <= distance`; the normal may have any length.
     #[inline(always)]
     fn half_space(&mut self, from: DVec3, along: DVec3, normal: DVec3, distance: f64, face: Face) {
         let (speed, room) = (normal.dot(along), distance - normal.dot(from));

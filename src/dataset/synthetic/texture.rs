@@ -1,8 +1,8 @@
-//! Procedural textures: what colour a surface has at a place, averaged over the footprint of a sample.
+//! Procedural textures: the colour of a surface at a place, averaged over the footprint of a sample. Colours are linear
+//! reflectance; [`super::shade`] adds light.
 //!
-//! Invariants: 1. a texture is a function of the surface and the place alone, never of the view; `w`, the side of
-//! the sample's footprint in metres, only removes detail that the sample cannot hold; 2. only + - * / sqrt.
-//! Colours are linear reflectance. Light is the matter of `shade`.
+//! Invariants: 1. a texture depends on the surface and the place alone, never on the view; `w`, the side of the sample's
+//! footprint in metres, only removes detail that is too small for the sample; 2. all arithmetic is + - * / sqrt.
 
 use crate::base::rng::{Purpose, Stream, mix64};
 use glam::Vec3;
@@ -15,7 +15,7 @@ pub(super) struct Noise {
     lattice: Vec<f32>,
 }
 
-/// floor, also where the instruction set has no rounding instruction.
+/// The floor, computed without a rounding instruction.
 #[inline(always)]
 fn floor_i(x: f64) -> i64 {
     let i = x as i64;
@@ -23,7 +23,6 @@ fn floor_i(x: f64) -> i64 {
 }
 
 impl Noise {
-    /// The fields of this seed.
     pub(super) fn new(seed: u64) -> Noise {
         let mut draws = Stream::new(seed, Purpose::City, u64::MAX, 0);
         Noise { lattice: (0..LATTICE * LATTICE).map(|_| draws.range(-1.0, 1.0) as f32).collect() }
@@ -44,14 +43,15 @@ impl Noise {
         low + (high - low) * sy
     }
 
-    /// Sum of (wavelength in metres, amplitude) layers; layers shorter than the footprint fade out as [`fade`] says.
+    /// Sum of noise layers (wavelength in metres, amplitude). Layers that are short against the footprint fade out as in
+    /// [`fade`].
     #[inline(always)]
     pub(super) fn layers(&self, x: f64, y: f64, w: f64, layers: &[(f64, f32)]) -> f32 {
         let mut sum = 0.0;
         let (mut a, mut b) = (x, y);
         let per_footprint = 1.0 / w;
         for &(length, amplitude) in layers {
-            // Every layer is turned by 37 degrees against the one before, so that the lattices do not line up.
+            // Each layer is rotated by 37 degrees against the previous one, so that the lattices do not align.
             (a, b) = (0.8 * a - 0.6 * b + 17.3, 0.6 * a + 0.8 * b - 5.1);
             let keep = ((length * per_footprint - 1.0) * 0.5).clamp(0.0, 1.0) as f32;
             if keep > 0.0 {
@@ -63,19 +63,19 @@ impl Noise {
     }
 }
 
-/// How much of a detail of this size a footprint `w` still shows: 1 from three footprints on, 0 below one.
+/// Visibility of a detail of this size in a footprint `w`: 1 from three footprints upwards, 0 below one.
 #[inline(always)]
 pub(super) fn fade(size: f64, w: f64) -> f32 {
     (((size / w) - 1.0) * 0.5).clamp(0.0, 1.0) as f32
 }
 
-/// Share of the footprint [x - w/2, x + w/2] that lies in [low, high].
+/// Share of the footprint [x - w/2, x + w/2] that is in [low, high].
 #[inline(always)]
 pub(super) fn cover(x: f64, low: f64, high: f64, w: f64) -> f32 {
     (((x + 0.5 * w).min(high) - (x - 0.5 * w).max(low)) / w).clamp(0.0, 1.0) as f32
 }
 
-/// Share of the footprint that lies on lines of this width around the multiples of `period`.
+/// Share of the footprint that is on lines of this width around the multiples of `period`.
 #[inline(always)]
 pub(super) fn lines(x: f64, period: f64, width: f64, w: f64) -> f32 {
     if w >= period {
@@ -85,14 +85,14 @@ pub(super) fn lines(x: f64, period: f64, width: f64, w: f64) -> f32 {
     cover(d, -0.5 * width, 0.5 * width, w)
 }
 
-/// A number in [0, 1) for a lattice cell.
+/// A random number in [0, 1) for a lattice cell.
 #[inline(always)]
 pub(super) fn cell_draw(i: i64, j: i64, seed: u32) -> f32 {
     let key = (i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (j as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
     (mix64(key ^ (u64::from(seed) << 17)) >> 40) as f32 * (1.0 / 16_777_216.0)
 }
 
-/// Linear reflectance from the display value that a painter would name (the tone curve is a square root).
+/// Linear reflectance of a display colour (the tone curve is a square root).
 pub(super) const fn paint(r: f32, g: f32, b: f32) -> Vec3 {
     Vec3::new(r * r, g * g, b * b)
 }
@@ -102,12 +102,12 @@ fn mix(a: Vec3, b: Vec3, t: f32) -> Vec3 {
     a + (b - a) * t
 }
 
-/// What a surface is made of.
+/// The material of a surface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     /// Wall with a grid of windows.
     Facade,
-    /// The same with shops on the ground floor.
+    /// A facade with shops on the ground floor.
     ShopFacade,
     /// Glass front with mullions.
     Curtain,
@@ -119,23 +119,17 @@ pub(super) enum Kind {
     Bitumen,
     /// Flat roof of gravel.
     Gravel,
-    /// Standing-seam metal.
+    /// Sheets with standing seams.
     Metal,
-    /// Solar panel.
     Solar,
-    /// Leaves of trees and hedges.
     Leaves,
-    /// Bark, wood.
+    /// Wood or bark.
     Wood,
-    /// Car paint.
     CarPaint,
-    /// Car window.
     CarGlass,
     /// Road and car-park surface.
     Asphalt,
-    /// Slabs.
     Paving,
-    /// Lawn.
     Grass,
     /// Gravel path or bare earth.
     Earth,
@@ -143,11 +137,10 @@ pub(super) enum Kind {
     Crop,
     /// Sports court: accent lines on colour.
     Court,
-    /// Swimming pool.
     Pool,
 }
 
-/// A surface: what it is made of, its colours, and its own draws.
+/// A surface: its material, its colours, and the seed of its random details.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Skin {
     pub(super) kind: Kind,
@@ -156,7 +149,7 @@ pub(super) struct Skin {
     pub(super) seed: u32,
 }
 
-/// A surface at one place.
+/// The optical properties of a surface at one place.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Look {
     /// Linear reflectance.
@@ -167,7 +160,7 @@ pub(super) struct Look {
     pub(super) rough: f32,
 }
 
-/// Where on a face: metres along it, metres up it, its size, and the footprint.
+/// A place on a face: metres along it, metres up it, the size of the face, and the footprint.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {
     pub(super) u: f64,
@@ -182,21 +175,18 @@ fn matt(albedo: Vec3) -> Look {
 }
 
 impl Skin {
-    /// The surface at `place`.
     pub(super) fn look(&self, noise: &Noise, place: Place) -> Look {
-        // The fields are shifted per surface, or all walls would carry the same stains.
+        // Each surface shifts the noise, so that walls have different stains.
         let shift = f64::from(self.seed & 0xffff) * 0.37;
         let (u, v, w) = (place.u + shift, place.v, place.w);
+        let speckled = |layers: &[(f64, f32)]| matt(self.color * (1.0 + noise.layers(u, v, w, layers)));
         match self.kind {
             Kind::Facade | Kind::ShopFacade => self.facade(noise, place, shift),
             Kind::Curtain => self.curtain(noise, place, shift),
             Kind::Plain => matt(self.color * (1.0 + wall_stains(noise, u, v, w))),
             Kind::Tiles => self.tiles(noise, place, shift),
             Kind::Bitumen => self.bitumen(noise, u, v, w),
-            Kind::Gravel => {
-                let n = noise.layers(u, v, w, &[(0.3, 0.22), (0.8, 0.12), (4.0, 0.14), (0.12, 0.2)]);
-                matt(self.color * (1.0 + n))
-            }
+            Kind::Gravel => speckled(&[(0.3, 0.22), (0.8, 0.12), (4.0, 0.14), (0.12, 0.2)]),
             Kind::Metal => self.metal(noise, u, v, w),
             Kind::Solar => solar(u, v, w),
             Kind::Leaves => {
@@ -209,10 +199,7 @@ impl Skin {
             Kind::Asphalt => matt(asphalt(noise, self, u, v, w)),
             Kind::Paving => matt(self.paving(noise, place.u, v, w)),
             Kind::Grass => matt(self.grass(noise, u, v, w)),
-            Kind::Earth => {
-                let n = noise.layers(u, v, w, &[(5.0, 0.12), (1.3, 0.12), (0.4, 0.14), (0.15, 0.14)]);
-                matt(self.color * (1.0 + n))
-            }
+            Kind::Earth => speckled(&[(5.0, 0.12), (1.3, 0.12), (0.4, 0.14), (0.15, 0.14)]),
             Kind::Crop => matt(self.crop(noise, u, v, w)),
             Kind::Court => matt(self.court(noise, place)),
             Kind::Pool => {
@@ -231,7 +218,7 @@ impl Skin {
         let w = p.w;
         let mut albedo = self.color * (1.0 + wall_stains(noise, p.u + shift, p.v, w));
         if self.seed & 3 == 0 {
-            // Brick courses: a row of bricks is drawn 0.3 m high, as much as aerial photos can hold.
+            // Rows of bricks are 0.3 m high: aerial photos cannot resolve real ones.
             albedo *= 1.0 - 0.25 * lines(p.v, 0.3, 0.06, w);
             let row = floor_i(p.v / 0.3);
             let brick = floor_i((p.u + 0.3 * (row & 1) as f64) / 0.6);
@@ -264,7 +251,7 @@ impl Skin {
         let glass = glass * (1.0 - lines(cu, half, 0.1, w) * 0.7);
         let lit = cell_draw(i, j, self.seed ^ 0x55);
         let pane = if lit > 0.72 { paint(0.62, 0.6, 0.54) } else { paint(0.16, 0.19, 0.24) * (0.6 + lit) };
-        // A blind or curtain hides a part of the pane from above.
+        // A blind covers the upper part of a dark pane.
         let blind = cover(cv, head - f64::from(cell_draw(j, i, self.seed)) * (head - sill) * 0.8, head, w);
         let pane = mix(pane, paint(0.66, 0.64, 0.6), if lit < 0.35 { blind } else { 0.0 });
         Look { albedo: mix(albedo, pane, glass), gloss: 0.55 * glass, rough: 0.0 }
@@ -298,7 +285,7 @@ impl Skin {
         albedo *= 1.0 - 0.35 * lines(v, 0.42, 0.1, w);
         let n = noise.layers(u, v * 0.35, w, &[(5.0, 0.14), (1.5, 0.16), (0.5, 0.12), (0.2, 0.1)]);
         albedo *= 1.0 + n;
-        // Moss near the eaves and where the large field is high.
+        // Moss grows near the eaves, in places chosen by the coarse noise.
         let moss = (noise.layers(u, v, w, &[(3.0, 0.7), (0.8, 0.4)]) - 0.35 - 0.06 * v as f32).clamp(0.0, 0.6);
         albedo = mix(albedo, paint(0.36, 0.38, 0.26), moss);
         albedo = mix(albedo, self.accent, cover(v, p.height - 0.25, p.height + 1.0, w));
@@ -396,11 +383,11 @@ fn solar(u: f64, v: f64, w: f64) -> Look {
     Look { albedo, gloss: 0.5, rough: 0.0 }
 }
 
-/// Asphalt with mended patches, seams and stains; markings are laid on it by the ground plan.
+/// Asphalt with patches, cracks and stains. The ground plan adds road markings.
 pub(super) fn asphalt(noise: &Noise, skin: &Skin, x: f64, y: f64, w: f64) -> Vec3 {
     let mut albedo = skin.color;
     albedo *= 1.0 + noise.layers(x, y, w, &[(21.0, 0.16), (4.0, 0.12), (1.1, 0.1), (0.4, 0.12), (0.15, 0.16)]);
-    // Mended rectangles: one cell in five carries one.
+    // One cell in five has a rectangular patch.
     let (i, j) = (floor_i(x / 9.0), floor_i(y / 9.0));
     let own = cell_draw(i, j, skin.seed ^ 0x31);
     if own < 0.2 {
@@ -409,7 +396,7 @@ pub(super) fn asphalt(noise: &Noise, skin: &Skin, x: f64, y: f64, w: f64) -> Vec
         let on = cover(dx, 1.5, 1.5 + size, w) * cover(dy, 2.5, 2.5 + size * 0.6, w);
         albedo *= 1.0 - on * (0.34 - 2.4 * (own - 0.1).abs());
     }
-    // Cracks follow the zero crossings of a smooth field.
+    // Cracks follow the zero crossings of smooth noise.
     let n = noise.value(x / 3.7 + 3.1, y / 3.7) + 0.35 * noise.value(x / 0.9, y / 0.9);
     let crack = (1.0 - n.abs() * 22.0).max(0.0) * fade(0.28, w);
     albedo * (1.0 - 0.45 * crack)

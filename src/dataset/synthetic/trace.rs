@@ -1,8 +1,8 @@
-//! Finds what a ray meets: a grid over the ground whose cells list the solids above them, walked cell by cell.
+//! Finds the first solid on a ray: each cell of a grid over the ground lists its solids, and a ray visits cell by cell.
 //!
-//! Invariants: 1. every solid is listed in every cell that its box touches; 2. a walk visits cells in the order in
-//! which the ray crosses them and ends at the first cell that holds its nearest hit, so the answer does not depend
-//! on the cell size; 3. `top` of a cell is no lower than any solid in it.
+//! Invariants: 1. a solid is in the list of every cell that its box touches; 2. cells are visited in the order in which
+//! the ray crosses them, up to the cell of the nearest hit, so that the result does not depend on the cell size; 3. the
+//! `top` of a cell is at least as high as every solid in it.
 
 use super::solid::{Entry, Ray, Solid};
 use glam::DVec3;
@@ -10,7 +10,6 @@ use glam::DVec3;
 /// Side of a cell, metres.
 const CELL: f64 = 4.0;
 
-/// The grid.
 pub(super) struct Grid {
     low: [f64; 2],
     cells: [usize; 2],
@@ -22,16 +21,15 @@ pub(super) struct Grid {
     highest: f64,
 }
 
-/// A solid in a cell's list, with its box beside it: most solids of a cell are rejected by the box alone, without
-/// touching their own memory.
-#[derive(Debug, Clone, Copy, Default)]
+/// A solid in a cell's list, with its box: most solids of a cell are rejected by the box, without a look at the solid.
+#[derive(Debug, Clone, Copy)]
 struct Item {
     low: [f32; 3],
     high: [f32; 3],
     solid: u32,
 }
 
-/// Slack of the boxes, metres: more than single precision loses on coordinates of up to 24 km.
+/// Slack of the boxes, metres: more than the rounding of f32 for coordinates of up to 24 km.
 const SLACK: f64 = 0.02;
 
 impl Item {
@@ -46,7 +44,7 @@ impl Item {
         let (mut t0, mut t1) = (0.0f32, limit);
         for k in 0..3 {
             let (a, b) = ((self.low[k] - from[k]) * inverse[k], (self.high[k] - from[k]) * inverse[k]);
-            // A NaN (0 times infinity, a ray along a face) is dropped and the box kept.
+            // A NaN (0 times infinity, from a ray along a face) fails both comparisons: the box counts as near.
             let (near, far) = if a < b { (a, b) } else { (b, a) };
             t0 = if near > t0 { near } else { t0 };
             t1 = if far < t1 { far } else { t1 };
@@ -72,7 +70,6 @@ struct Walk {
 }
 
 impl Grid {
-    /// The grid of these solids.
     pub(super) fn new(solids: &[Solid]) -> Grid {
         let mut low = [0.0f64; 2];
         let mut high = [0.0f64; 2];
@@ -83,26 +80,23 @@ impl Grid {
             highest = highest.max(s.high.z);
         }
         let cells = [0, 1].map(|k| ((high[k] - low[k]) / CELL) as usize + 1);
-        let mut grid = Grid { low, cells, top: vec![0.0; cells[0] * cells[1]], starts: vec![], items: vec![], highest };
-        let mut counts = vec![0u32; grid.top.len() + 1];
-        for s in solids {
-            grid.for_cells_of(s, |c| counts[c + 1] += 1);
-        }
-        for c in 1..counts.len() {
-            counts[c] += counts[c - 1];
-        }
-        grid.items = vec![Item::default(); counts[counts.len() - 1] as usize];
-        let mut fill = counts.clone();
+        let count = cells[0] * cells[1];
+        let (top, starts) = (vec![0.0; count], vec![0; count + 1]);
+        let mut grid = Grid { low, cells, top, starts, items: Vec::new(), highest };
+        let mut listed = Vec::new();
         for (k, s) in solids.iter().enumerate() {
-            let (mut top, mut items) = (std::mem::take(&mut grid.top), std::mem::take(&mut grid.items));
-            grid.for_cells_of(s, |c| {
-                items[fill[c] as usize] = Item::new(k as u32, s);
-                fill[c] += 1;
-                top[c] = top[c].max(s.high.z);
-            });
-            (grid.top, grid.items) = (top, items);
+            grid.for_cells_of(s, |c| listed.push((c as u32, k as u32)));
         }
-        grid.starts = counts;
+        listed.sort_unstable();
+        for &(c, k) in &listed {
+            let (c, s) = (c as usize, &solids[k as usize]);
+            grid.starts[c + 1] += 1;
+            grid.top[c] = grid.top[c].max(s.high.z);
+            grid.items.push(Item::new(k, s));
+        }
+        for c in 0..count {
+            grid.starts[c + 1] += grid.starts[c];
+        }
         grid
     }
 
@@ -188,7 +182,7 @@ impl Grid {
                     best = Some((item.solid, entry));
                 }
             }
-            // A hit beyond this cell may have a nearer rival in a cell yet to come.
+            // A hit beyond this cell is final only if no later cell has a nearer one.
             reach <= out
         });
         best

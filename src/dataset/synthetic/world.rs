@@ -1,8 +1,8 @@
-//! The city as data: solids, and the plan of the ground between them.
+//! The city as data: its solids, and the ground plan.
 //!
-//! Invariants: 1. the world is a function of (seed, blocks) alone; 2. the ground is the plane z = 0, the city is
-//! the square [-half, half]^2 with a road around it, fields lie beyond; 3. coordinates are metres, z up, without
-//! the offset that the dataset may carry.
+//! Invariants: 1. the world depends on (seed, blocks) alone; 2. the ground is the plane z = 0, the city is the square
+//! [-half, half]^2 with a road around it, surrounded by fields; 3. coordinates are metres, z up, without the dataset's
+//! offset.
 
 use super::solid::Solid;
 use super::texture::{Kind, Look, Noise, Place, Skin, asphalt, cell_draw, cover, lines, paint};
@@ -14,7 +14,7 @@ pub(super) const PITCH: f64 = 60.0;
 pub(super) const HALF_ROAD: f64 = 4.0;
 /// Distance from the centre line to the outer edge of the pavement, metres.
 pub(super) const HALF_STREET: f64 = 6.6;
-/// How far beyond the outer road trees and farms stand, metres.
+/// Width of the strip around the city that has trees and farms, metres.
 pub(super) const MARGIN: f64 = 150.0;
 
 /// A rectangle of ground inside a plot.
@@ -29,11 +29,10 @@ pub(super) struct Patch {
 #[derive(Debug, Clone)]
 pub(super) struct Plot {
     pub(super) base: Skin,
-    /// Later patches lie over earlier ones.
+    /// Later patches cover earlier ones.
     pub(super) patches: Vec<Patch>,
 }
 
-/// The whole city.
 pub(super) struct World {
     pub(super) seed: u64,
     pub(super) blocks: u32,
@@ -53,12 +52,11 @@ const VERGE: Skin = Skin { kind: Kind::Grass, color: paint(0.4, 0.47, 0.24), acc
 const FIELD: f64 = 74.0;
 
 impl World {
-    /// Half the side of the city, metres.
     pub(super) fn half(&self) -> f64 {
         0.5 * PITCH * f64::from(self.blocks)
     }
 
-    /// The ground at (x, y) and a number that changes where its plan does.
+    /// The ground at (x, y), and a number that changes at the borders of the plan.
     pub(super) fn ground(&self, x: f64, y: f64, w: f64) -> (Look, u32) {
         let half = self.half();
         let last = f64::from(self.blocks);
@@ -68,7 +66,7 @@ impl World {
         let (dx, dy) = ((gx - kx) * PITCH, (gy - ky) * PITCH);
         let inside_x = x.abs() <= half + HALF_STREET;
         let inside_y = y.abs() <= half + HALF_STREET;
-        // The two middle roads lead out of the city.
+        // The two middle roads leave the city.
         let middle = (self.blocks / 2) as f64;
         let street_x = dx.abs() < HALF_STREET && (inside_y || kx == middle);
         let street_y = dy.abs() < HALF_STREET && (inside_x || ky == middle);
@@ -90,7 +88,7 @@ impl World {
         if !on_road {
             if in_town {
                 let mut look = PAVEMENT.look(&self.noise, place);
-                // The kerb is a row of light stone.
+                // The kerb is light stone.
                 let nearest = (dx.abs() - HALF_ROAD).min(dy.abs() - HALF_ROAD);
                 look.albedo += (Vec3::splat(0.45) - look.albedo) * (0.7 * cover(nearest, -0.1, 0.28, w));
                 return (look, 1);
@@ -106,7 +104,7 @@ impl World {
             let mark = markings(across, along, to_crossing, in_town, w);
             let worn = 0.75 + self.noise.layers(x, y, w, &[(1.3, 0.25), (0.4, 0.25)]);
             albedo += (ROAD.accent - albedo) * (mark * worn.clamp(0.2, 1.0));
-            // Tyres darken two tracks per lane.
+            // Tyres darken the asphalt.
             let lane = across.abs() - 2.0;
             let track = cover(lane.abs(), 0.55, 1.05, w.max(0.4));
             albedo *= 1.0 - 0.16 * track;
@@ -121,7 +119,7 @@ impl World {
         let place = Place { u: x, v: y, width: 0.0, height: 0.0, w };
         for (k, patch) in plot.patches.iter().enumerate().rev() {
             if x >= patch.low[0] && x < patch.high[0] && y >= patch.low[1] && y < patch.high[1] {
-                // Courts and car parks draw lines from their own corner.
+                // The patterns of courts and car parks start at the patch's corner.
                 let own = Place {
                     u: x - patch.low[0],
                     v: y - patch.low[1],
@@ -140,7 +138,7 @@ impl World {
     }
 
     fn countryside(&self, x: f64, y: f64, w: f64) -> (Look, u32) {
-        // Every row of fields is shifted, so that their corners do not line up.
+        // Every row of fields is shifted, so that their corners do not align.
         let j = (y / FIELD).floor();
         let shift = f64::from(cell_draw(j as i64, 9, self.seed as u32)) * FIELD;
         let i = ((x + shift) / FIELD).floor();
@@ -154,7 +152,7 @@ impl World {
         (look, 5 + ((i as i64 + j as i64) & 1) as u32)
     }
 
-    /// Whether a tree may stand at (x, y) outside the city: not on a road or its verge.
+    /// Whether `p` is outside the city and not on a road or its verge.
     pub(super) fn is_open_land(&self, p: DVec3) -> bool {
         let half = self.half();
         let middle = (self.blocks / 2) as f64 * PITCH - half;
@@ -163,7 +161,7 @@ impl World {
     }
 }
 
-/// Share of the footprint on road markings.
+/// Share of the footprint that is on road markings.
 fn markings(across: f64, along: f64, to_crossing: f64, in_town: bool, w: f64) -> f32 {
     let edge = cover(across.abs(), HALF_ROAD - 0.45, HALF_ROAD - 0.28, w);
     let d = along - 6.0 * (along / 6.0).floor();
@@ -171,14 +169,14 @@ fn markings(across: f64, along: f64, to_crossing: f64, in_town: bool, w: f64) ->
     if !in_town || to_crossing > HALF_ROAD + 6.5 {
         return edge.max(dash);
     }
-    // Zebra crossing and stop line before a junction.
+    // Before a junction: a zebra crossing and a stop line.
     let from_edge = to_crossing - HALF_ROAD;
     let zebra = cover(from_edge, 0.9, 3.9, w) * lines(across + 0.5, 1.0, 0.5, w);
     let stop = cover(from_edge, 5.0, 5.45, w);
     zebra.max(stop)
 }
 
-/// Lines of parking bays: two rows of bays on each side of an aisle, from the patch's own corner.
+/// Lines of parking bays on both sides of aisles, which repeat every 16 m.
 fn parking_lines(p: Place) -> f32 {
     let v = p.v - 16.0 * (p.v / 16.0).floor();
     let row = cover(v, 0.3, 5.3, p.w).max(cover(v, 11.3, 16.0, p.w));

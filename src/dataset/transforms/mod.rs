@@ -24,10 +24,9 @@ mod photos;
 pub(in crate::dataset) mod pose;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::{listed, sort_views};
-use crate::dataset::model::{PointCloud, RawScene, RawView, Split};
+use crate::dataset::checks::{left_out, listed, sort_views};
+use crate::dataset::model::{PointCloud, RawScene, RawView, ReadOptions, Split};
 use crate::dataset::paths::{clean_name, safe_join};
-use crate::dataset::read::ReadOptions;
 use intrinsics::Levels;
 use json::{FIX_KEY, JsonFile, LISTS, Names, Node, STAY_INSIDE};
 pub use matrix_city::{looks_like_matrix_city, read_matrix_city};
@@ -69,31 +68,18 @@ fn choose_files(path: &Path, warnings: &mut Vec<String>) -> InputResult<Vec<(Pat
         ["transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json"]
             .map(|n| Some(path.join(n)).filter(|p| p.is_file()));
     let Some(train) = train else {
-        return match single {
-            Some(single) => Ok(vec![(single, None)]),
-            None => Err(InputError::new(
-                path,
-                "neither transforms_train.json nor transforms.json is here",
-                "give the folder that holds one of them, or the JSON itself",
-            )),
-        };
+        let none = "neither transforms_train.json nor transforms.json is here";
+        let remedy = "give the folder that holds one of them, or the JSON itself";
+        return single.map(|file| vec![(file, None)]).ok_or_else(|| InputError::new(path, none, remedy));
     };
     if let Some(single) = single {
         warnings.push(format!("{}: not read, because transforms_train.json exists beside it", single.display()));
     }
-    let mut files = vec![(train, Some(Split::Train))];
-    match (test, val) {
-        (Some(test), val) => {
-            files.push((test, Some(Split::Test)));
-            if let Some(val) = val {
-                let val = val.display();
-                warnings.push(format!("{val}: not read; transforms_test.json is the test set"));
-            }
-        }
-        (None, Some(val)) => files.push((val, Some(Split::Test))),
-        (None, None) => {}
+    if let (Some(_), Some(val)) = (&test, &val) {
+        warnings.push(format!("{}: not read; transforms_test.json is the test set", val.display()));
     }
-    Ok(files)
+    let held_out = test.or(val).map(|file| (file, Some(Split::Test)));
+    Ok([Some((train, Some(Split::Train))), held_out].into_iter().flatten().collect())
 }
 
 /// State of the reader.
@@ -123,7 +109,7 @@ impl<'a> Reading<'a> {
     ) -> InputResult<()> {
         let top = json.top();
         let folder = file.parent().unwrap_or(Path::new(""));
-        if json.frame_count()? == 0 && split != Some(Split::Test) {
+        if !json.has_frames()? && split != Some(Split::Test) {
             return Err(top.error("frames", "no frames", "write the file again with its frames"));
         }
         let prescribed = Prescribed::of(json)?;
@@ -187,30 +173,17 @@ impl<'a> Reading<'a> {
 
     /// Warns about dropped views; fails if a photo's size was needed or no view remains.
     fn report(&self, file: &Path, warnings: &mut Vec<String>) -> InputResult<()> {
-        let shown = file.display();
-        if !self.missing.is_empty() {
-            let (count, names) = (self.missing.len(), listed(&self.missing));
-            if !self.options.allow_missing {
-                return Err(InputError::new(
-                    file,
-                    format!("{count} photo(s) are missing: {names}"),
-                    "put them there, name their folder with --images, or leave them out with --allow-missing",
-                )
-                .at("file_path"));
-            }
-            warnings.push(format!("{shown}: {count} view(s) left out, their photo is missing: {names}"));
+        if !self.missing.is_empty() && !self.options.allow_missing {
+            let problem = format!("{} photo(s) are missing: {}", self.missing.len(), listed(&self.missing));
+            let remedy = "put them there, name their folder with --images, or leave them out with --allow-missing";
+            return Err(InputError::new(file, problem, remedy).at("file_path"));
         }
-        if !self.bad_poses.is_empty() {
-            let (count, names) = (self.bad_poses.len(), listed(&self.bad_poses));
-            warnings.push(format!(
-                "{shown}: {count} view(s) left out, their pose is not finite or not a rotation: {names}"
-            ));
-        }
-        if !self.unlisted.is_empty() {
-            let (count, names) = (self.unlisted.len(), listed(&self.unlisted));
-            warnings.push(format!(
-                "{shown}: {count} view(s) left out, neither train_filenames nor the held-out list has them: {names}"
-            ));
+        for (names, why) in [
+            (&self.missing, "their photo is missing"),
+            (&self.bad_poses, "their pose is not finite or not a rotation"),
+            (&self.unlisted, "neither train_filenames nor the held-out list has them"),
+        ] {
+            warnings.extend((!names.is_empty()).then(|| left_out(file, names, why)));
         }
         if self.views.is_empty() {
             let problem = match self.bad_poses.len() {

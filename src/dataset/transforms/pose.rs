@@ -82,20 +82,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn axes_are_flipped_and_a_common_scale_is_removed() {
-        // At (1, 2, 3), looking down the world's -z with y up: OpenGL's identity.
-        for scale in [1.0, 0.01] {
-            let s = scale;
-            let pose = make_pose(&[[s, 0., 0., 1.], [0., s, 0., 2.], [0., 0., s, 3.], [0., 0., 0., 1.]]).unwrap();
-            // 1e-12: a few roundings of numbers of size 3.
-            assert!((pose.centre() - DVec3::new(1., 2., 3.)).length() < 1e-12);
-            // A point 5 ahead, 1 to the right, 1 up: in OpenCV axes x = 1, y = -1, z = 5.
-            let seen = pose.rotation * DVec3::new(2., 3., -2.) + pose.translation;
-            assert!((seen - DVec3::new(1., -1., 5.)).length() < 1e-12, "{seen}");
-        }
-    }
-
-    #[test]
     fn a_rounded_rotation_is_made_exact() {
         let (c, s) = (0.866, 0.5);
         let pose = make_pose(&[[c, -s, 0., 0.], [s, c, 0., 0.], [0., 0., 1., 0.], [0., 0., 0., 1.]]).unwrap();

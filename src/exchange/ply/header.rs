@@ -14,10 +14,8 @@ pub const MAX_HEADER_BYTES: u64 = 64 * 1024;
 
 const REMEDY: &str = "check that this is a complete PLY file";
 
-/// Encoding of the values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
-    /// Decimal numbers, one element per line.
     Ascii,
     /// Packed, least significant byte first.
     LittleEndian,
@@ -25,24 +23,15 @@ pub enum Format {
     BigEndian,
 }
 
-/// Type of a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scalar {
-    /// `char`, `int8`
     I8,
-    /// `uchar`, `uint8`
     U8,
-    /// `short`, `int16`
     I16,
-    /// `ushort`, `uint16`
     U16,
-    /// `int`, `int32`
     I32,
-    /// `uint`, `uint32`
     U32,
-    /// `float`, `float32`
     F32,
-    /// `double`, `float64`
     F64,
 }
 
@@ -61,7 +50,6 @@ impl Scalar {
         })
     }
 
-    /// Bytes of one value.
     pub fn size(self) -> usize {
         match self {
             Scalar::I8 | Scalar::U8 => 1,
@@ -71,7 +59,6 @@ impl Scalar {
         }
     }
 
-    /// Whether the type is a floating-point type.
     pub fn is_float(self) -> bool {
         matches!(self, Scalar::F32 | Scalar::F64)
     }
@@ -102,39 +89,30 @@ impl Scalar {
 /// Kind of a property: a number or a list of numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// One value.
     Scalar(Scalar),
     /// A count, then that many values.
     List {
-        /// Type of the count.
         count: Scalar,
-        /// Type of the values.
         item: Scalar,
     },
 }
 
-/// A property of an element.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Property {
-    /// Name.
     pub name: String,
-    /// Type.
     pub kind: Kind,
 }
 
 /// An element: a table of the file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Element {
-    /// Name: `vertex`, `face` ...
     pub name: String,
     /// Number of rows that the header states.
     pub count: u64,
-    /// Properties of a row, in order.
     pub properties: Vec<Property>,
 }
 
 impl Element {
-    /// Index of the property with this name.
     pub fn find(&self, name: &str) -> Option<usize> {
         self.properties.iter().position(|p| p.name == name)
     }
@@ -156,18 +134,13 @@ impl Element {
     }
 }
 
-/// A parsed header.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Header {
-    /// Encoding of the values.
     pub format: Format,
-    /// Elements, in file order.
     pub elements: Vec<Element>,
     /// Comments without the word `comment`, trimmed.
     pub comments: Vec<String>,
-    /// Length of the header, bytes.
     pub bytes: u64,
-    /// Lines of the header.
     pub lines: u64,
 }
 

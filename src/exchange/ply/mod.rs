@@ -194,13 +194,4 @@ mod tests {
             assert_eq!(once, unit_quat(once));
         }
     }
-
-    #[test]
-    fn far_offsets_stay_local() {
-        let utm = [500_000.0, 5_000_000.0, 100.0];
-        assert_eq!(ExportFrame::Dataset.fitting_f32(utm, 200.0), ExportFrame::Local);
-        assert_eq!(ExportFrame::Dataset.fitting_f32(utm, 20_000.0), ExportFrame::Dataset);
-        assert_eq!(ExportFrame::Local.fitting_f32([0.0; 3], 1.0), ExportFrame::Local);
-        assert_eq!(ExportFrame::Dataset.fitting_f32([0.0; 3], 0.0), ExportFrame::Dataset);
-    }
 }

@@ -219,7 +219,6 @@ pub fn take_row(columns: &Columns, row: usize, values: &mut Vec<f32>) {
     }
 }
 
-/// Streams the Gaussians of a body.
 fn stream_gaussian_rows<R: BufRead>(
     body: &mut Body<'_, R>,
     header: &Header,
@@ -236,17 +235,13 @@ fn stream_gaussian_rows<R: BufRead>(
     let mut meta = meta_from_comments(path, &header.comments)?;
     let mut dropped = Dropped::default();
     let (mut values, mut out) = (vec![0.0f32; slots.len()], vec![0.0f32; slots.len()]);
-    let mut outcome = Ok(());
     read_rows(body, vertex, &slots, |row, raw| {
-        if outcome.is_err() {
-            return;
-        }
         for (value, &r) in values.iter_mut().zip(raw) {
             *value = r as f32;
         }
         if !values.iter().all(|v| v.is_finite()) {
             dropped.add(row);
-            return;
+            return Ok(());
         }
         out[..10].copy_from_slice(&values[..10]);
         out[10..ROW_HEAD].copy_from_slice(&unit_quat([values[10], values[11], values[12], values[13]]));
@@ -255,9 +250,8 @@ fn stream_gaussian_rows<R: BufRead>(
         for k in 0..rest / 3 {
             (0..3).for_each(|channel| out[ROW_HEAD + 3 * k + channel] = f_rest[channel * (rest / 3) + k]);
         }
-        outcome = take(&out);
+        take(&out)
     })?;
-    outcome?;
     dropped.check(path, vertex.count)?;
     meta.dropped = dropped.count;
     Ok(meta)
@@ -340,19 +334,14 @@ fn stream_rows<R: BufRead>(
         }
     }
     let mut dropped = Dropped::default();
-    let mut outcome = Ok(());
     read_rows(body, vertex, &slots, |row, raw| {
-        if outcome.is_err() {
-            return;
-        }
         if !raw.iter().all(|v| v.is_finite()) {
             dropped.add(row);
-            return;
+            return Ok(());
         }
         let color = |c: usize| raw.get(3 + c).map_or(128, |&v| color_byte(v, color_types[c]));
-        outcome = take([raw[0], raw[1], raw[2]], [color(0), color(1), color(2)]);
+        take([raw[0], raw[1], raw[2]], [color(0), color(1), color(2)])
     })?;
-    outcome?;
     dropped.check(path, vertex.count)?;
     Ok(dropped.count)
 }

@@ -2,21 +2,19 @@
 //!
 //! Not here: the meaning of the values.
 //!
-//! Invariants: 1. buffers are bounded by a constant ([`BLOCK_BYTES`], [`MAX_LINE_BYTES`]) or by the longest header;
-//! 2. no loop runs longer than the file has bytes; 3. errors name the byte offset (binary) or the line (ascii).
+//! Invariants: 1. buffers are bounded by a constant ([`MAX_LINE_BYTES`]) or by the longest header; 2. no
+//! loop runs longer than the file has bytes; 3. errors name the byte offset (binary) or the line (ascii).
 
 use super::header::{Element, Format, Header, Kind, Scalar, shorten};
 use crate::base::error::{InputError, InputResult};
 use std::io::{BufRead, ErrorKind, Read};
 use std::path::Path;
 
-const BLOCK_BYTES: usize = 1 << 18;
 const MAX_LINE_BYTES: u64 = 1 << 20;
 const CUT_SHORT: &str = "the file is cut short or its header is wrong: copy or export it again";
 
 /// The body of a file, with the read position.
 pub struct Body<'a, R> {
-    /// For errors.
     pub path: &'a Path,
     reader: R,
     format: Format,
@@ -74,27 +72,17 @@ impl<'a, R: BufRead> Body<'a, R> {
         Err(self.error(problem, CUT_SHORT))
     }
 
-    /// Skips all rows of an element.
     pub fn skip(&mut self, element: &Element) -> InputResult<()> {
         if element.count == 0 {
             return Ok(());
         }
         self.check_room(element)?;
-        if self.format == Format::Ascii {
-            for _ in 0..element.count {
-                self.next_line()?;
-            }
-            return Ok(());
-        }
-        let (row_bytes, exact) = element.row_bytes();
-        if exact {
+        match (self.format, element.row_bytes()) {
+            (Format::Ascii, _) => (0..element.count).try_for_each(|_| self.next_line()),
             // No overflow: the product was compared with the bytes left above.
-            return self.skip_bytes(element.count * row_bytes);
+            (_, (row_bytes, true)) => self.skip_bytes(element.count * row_bytes),
+            _ => (0..element.count).try_for_each(|_| self.walk_row(element, |_, _| {})),
         }
-        for _ in 0..element.count {
-            self.walk_row(element, |_, _| {})?;
-        }
-        Ok(())
     }
 
     fn fill(&mut self, bytes: &mut [u8]) -> InputResult<()> {
@@ -212,7 +200,7 @@ pub fn read_rows<R: BufRead>(
     body: &mut Body<'_, R>,
     element: &Element,
     slots: &[usize],
-    mut each: impl FnMut(u64, &[f64]),
+    mut each: impl FnMut(u64, &[f64]) -> InputResult<()>,
 ) -> InputResult<()> {
     let (row_bytes, exact) = element.row_bytes();
     if body.format != Format::Ascii && exact {
@@ -235,18 +223,18 @@ pub fn read_rows<R: BufRead>(
         } else {
             body.walk_row(element, store)?;
         }
-        each(row, &values);
+        each(row, &values)?;
     }
     Ok(())
 }
 
-/// Reads binary rows of fixed length, in blocks.
+/// Reads binary rows of fixed length.
 fn read_packed<R: BufRead>(
     body: &mut Body<'_, R>,
     element: &Element,
     row_bytes: usize,
     slots: &[usize],
-    mut each: impl FnMut(u64, &[f64]),
+    mut each: impl FnMut(u64, &[f64]) -> InputResult<()>,
 ) -> InputResult<()> {
     let mut offsets = Vec::with_capacity(element.properties.len());
     let mut offset = 0;
@@ -257,20 +245,13 @@ fn read_packed<R: BufRead>(
     }
     let fields: Vec<(usize, Scalar)> = slots.iter().map(|&property| offsets[property]).collect();
     let big_endian = body.format == Format::BigEndian;
-    let block_rows = (BLOCK_BYTES / row_bytes).max(1) as u64;
-    let mut block = vec![0u8; block_rows.min(element.count) as usize * row_bytes];
-    let mut values = vec![0.0; slots.len()];
-    let mut row = 0;
-    while row < element.count {
-        let rows = block_rows.min(element.count - row) as usize;
-        body.fill(&mut block[..rows * row_bytes])?;
-        for bytes in block[..rows * row_bytes].chunks_exact(row_bytes) {
-            for (value, &(offset, scalar)) in values.iter_mut().zip(&fields) {
-                *value = scalar.decode(&bytes[offset..], big_endian);
-            }
-            each(row, &values);
-            row += 1;
+    let (mut bytes, mut values) = (vec![0u8; row_bytes], vec![0.0; slots.len()]);
+    for row in 0..element.count {
+        body.fill(&mut bytes)?;
+        for (value, &(offset, scalar)) in values.iter_mut().zip(&fields) {
+            *value = scalar.decode(&bytes[offset..], big_endian);
         }
+        each(row, &values)?;
     }
     Ok(())
 }

@@ -2,7 +2,7 @@
 //!
 //! Not here: when and where to write. The parent module documents the file's layout.
 //!
-//! Invariants: 1. memory beyond the given rows is one block of [`BLOCK_ROWS`] rows; 2. the bytes depend on the
+//! Invariants: 1. memory beyond the given rows is a buffer of 1 MiB; 2. the bytes depend on the
 //! arguments alone; 3. the target is replaced as a whole, after the new bytes have reached the disk, or not at all; 4.
 //! a row with a non-finite value, before or after the change of frame, is left out and counted.
 //!
@@ -16,8 +16,6 @@ use std::fmt::Write as _;
 use std::fs::File;
 use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
-
-const BLOCK_ROWS: usize = 4096;
 
 /// Summary of a written file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -55,14 +53,14 @@ pub struct PlyWriter {
     path: PathBuf,
     part: PartFile,
     out: BufWriter<File>,
-    file_rows: FileRows,
+    sh_degree: u8,
+    log_scale: f64,
     meta: PlyMeta,
     frame: ExportFrame,
     rows_at_most: u64,
     given: u64,
     rows: u64,
     bytes: u64,
-    block: Vec<u8>,
 }
 
 impl PlyWriter {
@@ -86,14 +84,14 @@ impl PlyWriter {
             path: path.to_path_buf(),
             part,
             out,
-            file_rows: FileRows::new(sh_degree, meta, frame),
+            sh_degree,
+            log_scale: libm::log(meta.scale),
             meta: meta.clone(),
             frame,
             rows_at_most,
             given: 0,
             rows: 0,
             bytes: header.len() as u64,
-            block: Vec::new(),
         })
     }
 
@@ -104,17 +102,47 @@ impl PlyWriter {
     pub fn write(&mut self, columns: &Columns) -> InputResult<()> {
         let rows = columns.rows();
         self.given += rows as u64;
-        if self.given > self.rows_at_most || columns.sh_degree > self.file_rows.sh_degree {
+        if self.given > self.rows_at_most || columns.sh_degree > self.sh_degree {
             let problem = format!("{} rows were given, but at most {} were announced", self.given, self.rows_at_most);
             return Err(InputError::new(&self.path, problem, "report this as a bug"));
         }
-        for first in (0..rows).step_by(BLOCK_ROWS) {
-            self.block.clear();
-            self.rows += self.file_rows.encode(columns, first..(first + BLOCK_ROWS).min(rows), &mut self.block);
-            self.out.write_all(&self.block).map_err(|e| InputError::io(&self.path, "writing", &e))?;
-            self.bytes += self.block.len() as u64;
+        let (mut values, mut bytes) = (vec![0.0; 17 + sh_n_width(self.sh_degree)], Vec::new());
+        for row in 0..rows {
+            if self.fill(columns, row, &mut values) {
+                bytes.clear();
+                bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+                self.out.write_all(&bytes).map_err(|e| InputError::io(&self.path, "writing", &e))?;
+                self.bytes += bytes.len() as u64;
+                self.rows += 1;
+            }
         }
         Ok(())
+    }
+
+    /// Writes the values of one row in file order; false if one is not finite. Bands that the row lacks stay unchanged.
+    fn fill(&self, c: &Columns, row: usize, out: &mut [f32]) -> bool {
+        let (geometry, rest) = out.split_at_mut(9);
+        let coefficients = sh_n_width(self.sh_degree) / 3;
+        let (f_rest, tail) = rest.split_at_mut(3 * coefficients);
+        let (local, scale, origin) = (self.frame == ExportFrame::Local, self.meta.scale, self.meta.origin);
+        let mean = c.row(Column::Means, row);
+        let scales = c.row(Column::Scales, row);
+        for i in 0..3 {
+            geometry[i] = if local { mean[i] } else { (f64::from(mean[i]) * scale + origin[i]) as f32 };
+            geometry[3 + i] = 0.0;
+            tail[1 + i] = if local { scales[i] } else { (f64::from(scales[i]) + self.log_scale) as f32 };
+        }
+        geometry[6..9].copy_from_slice(c.row(Column::Sh0, row));
+        for (k, coefficient) in c.row(Column::ShN, row).chunks_exact(3).enumerate() {
+            for channel in 0..3 {
+                f_rest[channel * coefficients + k] = coefficient[channel];
+            }
+        }
+        tail[0] = c.opacities[row];
+        let q = c.row(Column::Quats, row);
+        let finite = q.iter().all(|v| v.is_finite());
+        tail[4..8].copy_from_slice(&unit_quat([q[0], q[1], q[2], q[3]]));
+        finite && out.iter().all(|v| v.is_finite())
     }
 
     /// Syncs the file to the disk, then renames it to its target.
@@ -131,7 +159,7 @@ impl PlyWriter {
         let failed = |doing: &str, e: &std::io::Error| InputError::io(&path, doing, e);
         let mut file = out.into_inner().map_err(|e| failed("writing", e.error()))?;
         if rows < rows_at_most {
-            let header = header_text(self.file_rows.sh_degree, rows, rows_at_most, &meta, frame);
+            let header = header_text(self.sh_degree, rows, rows_at_most, &meta, frame);
             let written = file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(header.as_bytes()));
             written.map_err(|e| failed("writing", &e))?;
         }
@@ -202,63 +230,4 @@ fn property_names(sh_degree: u8) -> Vec<String> {
     numbered("scale", 3);
     numbered("rot", 4);
     names
-}
-
-/// Layout of rows in the file.
-struct FileRows {
-    sh_degree: u8,
-    origin: [f64; 3],
-    scale: f64,
-    log_scale: f64,
-    local: bool,
-}
-
-impl FileRows {
-    fn new(sh_degree: u8, meta: &PlyMeta, frame: ExportFrame) -> Self {
-        FileRows {
-            sh_degree,
-            origin: meta.origin,
-            scale: meta.scale,
-            log_scale: libm::log(meta.scale),
-            local: frame == ExportFrame::Local,
-        }
-    }
-
-    /// Appends the bytes of the finite rows among `rows`; returns their number.
-    fn encode(&self, columns: &Columns, rows: std::ops::Range<usize>, out: &mut Vec<u8>) -> u64 {
-        let mut values = vec![0.0; 17 + sh_n_width(self.sh_degree)];
-        let mut finite = 0;
-        for row in rows {
-            if self.fill(columns, row, &mut values) {
-                out.extend(values.iter().flat_map(|v| v.to_le_bytes()));
-                finite += 1;
-            }
-        }
-        finite
-    }
-
-    /// Writes the values of one row in file order; false if one is not finite. Bands that the row lacks stay unchanged.
-    fn fill(&self, c: &Columns, row: usize, out: &mut [f32]) -> bool {
-        let (geometry, rest) = out.split_at_mut(9);
-        let coefficients = sh_n_width(self.sh_degree) / 3;
-        let (f_rest, tail) = rest.split_at_mut(3 * coefficients);
-        let mean = c.row(Column::Means, row);
-        let scales = c.row(Column::Scales, row);
-        for i in 0..3 {
-            geometry[i] = if self.local { mean[i] } else { (f64::from(mean[i]) * self.scale + self.origin[i]) as f32 };
-            geometry[3 + i] = 0.0;
-            tail[1 + i] = if self.local { scales[i] } else { (f64::from(scales[i]) + self.log_scale) as f32 };
-        }
-        geometry[6..9].copy_from_slice(c.row(Column::Sh0, row));
-        for (k, coefficient) in c.row(Column::ShN, row).chunks_exact(3).enumerate() {
-            for channel in 0..3 {
-                f_rest[channel * coefficients + k] = coefficient[channel];
-            }
-        }
-        tail[0] = c.opacities[row];
-        let q = c.row(Column::Quats, row);
-        let finite = q.iter().all(|v| v.is_finite());
-        tail[4..8].copy_from_slice(&unit_quat([q[0], q[1], q[2], q[3]]));
-        finite && out.iter().all(|v| v.is_finite())
-    }
 }
