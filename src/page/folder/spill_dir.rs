@@ -7,13 +7,12 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
-use crate::page::engine::drive_rate;
 use crate::page::engine::segment_files::{segment_from_file_name, sync_folder, with_safe_flags};
+use crate::page::folder::drive_rate;
 use crate::page::folder::file_system::{FileSystem, free_bytes};
+use crate::page::folder::protocol_files::{MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME};
 use crate::page::format::slot_header::{HEADER_BYTES, SlotHeader};
-use crate::page::format::spill_format::{FORMAT_BYTES, FormatError, Purpose, SpillFormat};
-use crate::page::map::commit::{MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME};
-use crate::page::versions::slots::SlotLayout;
+use crate::page::format::spill_format::{FORMAT_BYTES, FormatError, Purpose, SlotLayout, SpillFormat};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};

@@ -8,7 +8,7 @@
 //! least one is valid, and it is at most one transaction behind. A witness behind its map is an ordinary crash.
 
 use crate::page::format::seal::{SEAL_BYTES, SealScope};
-use crate::page::map::mutants::{Mutant, active};
+use crate::page::mutants::{Mutant, active};
 use redb::StorageBackend;
 use std::io;
 use std::sync::Arc;

@@ -10,15 +10,16 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::page::engine::page_engine::Place;
-use crate::page::engine::pread::PreadEngine;
 use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name};
+use crate::page::engine::threaded::ThreadedEngine;
+use crate::page::folder::protocol_files::DriveFile;
 use crate::page::folder::spill_dir::{LOCK, LOCK_MAGIC, bad_format, format_bytes_of, read_format};
 use crate::page::format::slot_header::SlotRef;
 use crate::page::format::spill_format::{FormatFeatures, SpillFormat, features_of};
 use crate::page::map::commit::{CommitConfig, CommitError, MAP_NAME, WITNESS_NAME};
+use crate::page::map::entries::{MapContent, MapError};
 use crate::page::map::generations::Generations;
-use crate::page::map::manifest::{Manifest, MapContent, MapError};
-use crate::page::map::map_file::DriveFile;
+use crate::page::map::manifest::Manifest;
 use crate::page::map::opening::{StoredPage, check_segments, pages_at, slot_and_label};
 use crate::page::map::witness::Witness;
 use crate::page::tool::slot_reader::SlotReader;
@@ -268,7 +269,7 @@ impl StoreReader {
     /// The map names an impossible slot; a segment up to the last one that `pages` use is missing or has another
     /// length; or the engine cannot be started.
     pub fn paged_store(&self, pages: &[StoredPage], threads: usize) -> Result<PagedStore, ReadError> {
-        let engine = PreadEngine::open_read_only(&self.folder, threads)
+        let engine = ThreadedEngine::pread_read_only(&self.folder, threads)
             .map_err(|e| InputError::io(&self.folder, "opening the pages", &e))?;
         let SpillFormat { store, layout, .. } = self.format;
         let config = PagedStoreConfig {

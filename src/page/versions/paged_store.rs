@@ -16,7 +16,7 @@ use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Place,
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, transfer_bytes};
 use crate::page::format::verify::verify;
-use crate::page::map::mutants::{Mutant, active};
+use crate::page::mutants::{Mutant, active};
 pub use crate::page::versions::page_done::{PageDone, PageMoved, PageTraffic};
 use crate::page::versions::page_error::{PageError, SlotName, is_out_of_space};
 use crate::page::versions::slots::{SlotError, SlotLayout, Slots};

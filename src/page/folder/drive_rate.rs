@@ -5,10 +5,10 @@
 //! measured on; an unreadable cache file means a new measurement; 2. a drive that cannot be measured stores pages raw.
 
 use crate::base::error::InputResult;
-use crate::page::engine::measure::{Case, Scratch};
 use crate::page::engine::open::{DEPTH, IoEngine};
 use crate::page::engine::page_engine::Direction;
 use crate::page::engine::segment_files::with_safe_flags;
+use crate::page::folder::measure::{Case, Scratch};
 use crate::page::format::codec::Codec;
 use serde::{Deserialize, Serialize};
 use std::fs::{File, OpenOptions};
