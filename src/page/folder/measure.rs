@@ -347,28 +347,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_small_sweep_measures_every_case_and_leaves_nothing() {
-        let folder = tempfile::tempdir().unwrap();
-        let engines = [IoEngine::Pread, IoEngine::Mmap];
-        let sizes = [(65_536, 1), (753_664, 4), (3 << 20, 2)];
-        let cases: Vec<Case> =
-            engines.iter().flat_map(|&engine| sizes.map(|(bytes, depth)| Case { engine, bytes, depth })).collect();
-        let limits = Limits { file_bytes: 16 << 20, seconds: 30.0, written_bytes: 1 << 20 };
-        let mut last = 0.0;
-        let mut sweep =
-            |seconds| sweep(folder.path(), &cases, Limits { seconds, ..limits }, &mut |share| last = share).unwrap();
-        let short = sweep(0.5);
-        assert!(short.measured.len() == cases.len() && short.written_bytes >= FILL_BYTES as u64);
-        // Cases share the buffers; each round needs at least its depth of them, twice.
-        for measured in &short.measured {
-            assert!(measured.read.is_none_or(|r| r > 0.0) && measured.write.is_none_or(|w| w > 0.0));
-        }
-        assert!(short.measured[0].both().is_some(), "the first case of the first round is always measured");
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "nothing is left");
-        assert!(last > 0.0);
-    }
-
-    #[test]
     fn too_little_space_is_refused_before_anything_is_made() {
         let folder = tempfile::tempdir().unwrap();
         let case = Case { engine: IoEngine::Pread, bytes: 65_536, depth: 1 };
@@ -376,18 +354,5 @@ mod tests {
         let refused = sweep(folder.path(), &[case], limits, &mut |_| ()).unwrap_err().to_string();
         assert!(refused.contains("free") && refused.contains("smaller"), "{refused}");
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
-    }
-
-    #[test]
-    fn medians() {
-        assert_eq!(median(&mut []), None);
-        assert_eq!(median(&mut [3.0]), Some(3.0));
-        assert_eq!(median(&mut [3.0, 9.0, 1.0]), Some(3.0));
-        let both = |read, write| {
-            let case = Case { engine: IoEngine::Pread, bytes: 1, depth: 1 };
-            Measured { case, read, write }.both()
-        };
-        assert_eq!(both(Some(2.0), Some(2.0)), Some(2.0));
-        assert_eq!(both(Some(1.0), None), None);
     }
 }

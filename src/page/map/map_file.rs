@@ -189,39 +189,3 @@ impl StorageBackend for MapFile {
         Err(BackendError::Unsupported)
     }
 }
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
-mod tests {
-    use super::*;
-    use redb::backends::InMemoryBackend;
-
-    #[test]
-    fn held_back_writes_are_readable_but_not_on_the_drive() {
-        let inner: Arc<dyn StorageBackend> = Arc::new(InMemoryBackend::new());
-        inner.set_len(16).unwrap();
-        inner.write(0, &[1; 16]).unwrap();
-        let map = MapFile::holding_back(Arc::clone(&inner)).unwrap();
-        map.write(4, &[2; 4]).unwrap();
-        map.set_len(24).unwrap();
-        map.write(20, &[3; 4]).unwrap();
-        map.sync_data().unwrap();
-        let mut seen = [9; 24];
-        map.read(0, &mut seen).unwrap();
-        assert_eq!(seen, [1, 1, 1, 1, 2, 2, 2, 2, 1, 1, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 3, 3, 3, 3]);
-        map.set_len(18).unwrap();
-        map.set_len(24).unwrap();
-        map.read(0, &mut seen).unwrap();
-        assert_eq!(seen[16..], [0; 8], "bytes cut off come back as zeros");
-        assert!(map.read(20, &mut [0; 5]).is_err(), "beyond the end");
-        let mut stored = [0; 16];
-        inner.read(0, &mut stored).unwrap();
-        assert_eq!((inner.len().unwrap(), stored), (16, [1; 16]), "nothing may reach the drive");
-        map.release_held().unwrap();
-        let mut after = [9; 24];
-        inner.read(0, &mut after).unwrap();
-        assert_eq!(after, seen);
-        map.shut();
-        assert!(map.read(0, &mut after).is_err() && map.write(0, &[1]).is_err() && map.len().is_err());
-    }
-}

@@ -156,7 +156,7 @@ impl Opened {
         let mut paged = PagedStore::open(engine, config, segments, used)
             .map_err(|error| CommitError::Contradiction(error.to_string()))?;
         for past in past {
-            paged.retire_past(&past.slot, past.until);
+            paged.free_from(&past.slot, past.until);
         }
         Ok(paged)
     }

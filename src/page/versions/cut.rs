@@ -15,7 +15,8 @@ impl PagedStore {
         self.free_from(slot, self.config.generation);
     }
 
-    /// As [`PagedStore::free`], but superseded from generation `from` on, which is cut and not committed yet.
+    /// As [`PagedStore::free`], but superseded from generation `from` on: one that is cut and not committed yet, or, at
+    /// opening, one of the past.
     pub fn free_from(&mut self, slot: &SlotRef, from: u64) {
         let was_in_use = self.slots.retire(slot.place, slot.generation, from);
         debug_assert!(was_in_use, "a slot was freed twice: {slot:?}");
@@ -33,11 +34,5 @@ impl PagedStore {
     /// none of these names; returns how many.
     pub fn commit_done(&mut self, durable: u64, pinned: &[u64]) -> usize {
         self.slots.release_retired(durable, pinned)
-    }
-
-    /// At opening: only generations before `until` name version `slot`, which was marked in use.
-    pub fn retire_past(&mut self, slot: &SlotRef, until: u64) {
-        let was_in_use = self.slots.retire(slot.place, slot.generation, until);
-        debug_assert!(was_in_use, "a slot was retired twice: {slot:?}");
     }
 }

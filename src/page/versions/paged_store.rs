@@ -120,11 +120,6 @@ impl PagedStore {
         PageBuffer::mapped(self.config.layout.slot_bytes as usize)
     }
 
-    /// The engine's name, for messages.
-    pub fn engine_name(&self) -> &'static str {
-        self.engine.name()
-    }
-
     /// Bytes moved so far.
     pub fn traffic(&self) -> PageTraffic {
         self.traffic
@@ -255,7 +250,7 @@ impl PagedStore {
         }
         synced.map_err(|source| {
             self.poison = Some(format!("making pages durable failed: {source}"));
-            PageError::Sync { source }
+            PageError::Sync(source)
         })
     }
 
@@ -266,7 +261,7 @@ impl PagedStore {
 
     fn refuse_if_poisoned(&self) -> Result<(), PageError> {
         match &self.poison {
-            Some(cause) if !active(Mutant::PoisonIgnored) => Err(PageError::Poisoned { cause: cause.clone() }),
+            Some(cause) if !active(Mutant::PoisonIgnored) => Err(PageError::Poisoned(cause.clone())),
             _ => Ok(()),
         }
     }
@@ -308,7 +303,7 @@ impl PagedStore {
         self.engine.create_segment(segment, bytes).map_err(|source| PageError::Grow { segment, bytes, source })?;
         self.slots.add_segment();
         // A new segment has at least one slot.
-        self.slots.allocate().ok_or(PageError::Poisoned { cause: "a segment without slots".to_string() })
+        self.slots.allocate().ok_or(PageError::Poisoned("a segment without slots".to_string()))
     }
 
     fn take_staging(&mut self) -> PageBuffer {
@@ -382,7 +377,7 @@ impl PagedStore {
         // A reference from a damaged index may ask for more than a slot holds.
         if needed > buffer.len().min(self.config.layout.slot_bytes as usize) {
             let what = format!("the map states {needed} bytes, more than a slot holds");
-            let error = PageError::Damaged { at: pending.name(), what };
+            let error = PageError::Damaged(pending.name(), what);
             return self.ended.push(pending.end(buffer, Err(error)));
         }
         self.traffic.bytes_read += bytes as u64;
@@ -451,8 +446,8 @@ impl PagedStore {
                 let payload_bytes = pending.slot.payload_bytes as usize;
                 return self.ended.push(pending.end(buffer, Ok(PageMoved::Read { payload_bytes })));
             }
-            (Err(source), _) => PageError::Read { at, source },
-            (Ok(()), Err(what)) => PageError::Damaged { at, what },
+            (Err(source), _) => PageError::Read(at, source),
+            (Ok(()), Err(what)) => PageError::Damaged(at, what),
         };
         if pending.is_repeated {
             self.ended.push(pending.end(buffer, Err(error)));
@@ -469,10 +464,10 @@ impl PagedStore {
         let end = result.map(|()| PageMoved::Written(pending.slot)).map_err(|source| {
             self.slots.release(pending.slot.place);
             if is_out_of_space(&source) {
-                return PageError::NoSpace { at, source };
+                return PageError::NoSpace(at, source);
             }
             self.poison.get_or_insert_with(|| format!("writing {at} failed: {source}"));
-            PageError::Write { at, source }
+            PageError::Write(at, source)
         });
         self.ended.push(pending.end(buffer, end));
     }
