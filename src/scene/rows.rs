@@ -188,44 +188,46 @@ pub struct RowsMut<'a> {
     pub count: &'a mut [u32],
 }
 
-impl<'a> Rows<'a> {
-    /// Number of rows.
-    pub fn rows(&self) -> usize {
-        self.stamp.len()
-    }
+/// Shared and exclusive views are split alike: only the method that splits their slices differs.
+macro_rules! impl_rows {
+    ($View:ident, $split:ident) => {
+        impl<'a> $View<'a> {
+            /// Number of rows.
+            pub fn rows(&self) -> usize {
+                self.stamp.len()
+            }
 
-    /// The rows before `row`, and the rest.
-    pub fn split_at(self, row: usize) -> (Rows<'a>, Rows<'a>) {
-        let (columns, columns_b) = self.columns.split_at(row);
-        let (exp_avg, exp_avg_b) = self.exp_avg.split_at(row);
-        let (exp_avg_sq, exp_avg_sq_b) = self.exp_avg_sq.split_at(row);
-        let (stamp, stamp_b) = self.stamp.split_at(row);
-        let (uid, uid_b) = self.uid.split_at(row);
-        let (grad2d, grad2d_b) = self.grad2d.split_at(row);
-        let (count, count_b) = self.count.split_at(row);
-        let first_row = self.first_row;
-        (
-            Rows { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count },
-            Rows {
-                first_row: first_row + row,
-                columns: columns_b,
-                exp_avg: exp_avg_b,
-                exp_avg_sq: exp_avg_sq_b,
-                stamp: stamp_b,
-                uid: uid_b,
-                grad2d: grad2d_b,
-                count: count_b,
-            },
-        )
-    }
+            /// The rows before `row`, and the rest.
+            pub fn split_at(self, row: usize) -> ($View<'a>, $View<'a>) {
+                let (columns, columns_b) = self.columns.split_at(row);
+                let (exp_avg, exp_avg_b) = self.exp_avg.split_at(row);
+                let (exp_avg_sq, exp_avg_sq_b) = self.exp_avg_sq.split_at(row);
+                let (stamp, stamp_b) = self.stamp.$split(row);
+                let (uid, uid_b) = self.uid.$split(row);
+                let (grad2d, grad2d_b) = self.grad2d.$split(row);
+                let (count, count_b) = self.count.$split(row);
+                let front =
+                    $View { first_row: self.first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count };
+                let back = $View {
+                    first_row: self.first_row + row,
+                    columns: columns_b,
+                    exp_avg: exp_avg_b,
+                    exp_avg_sq: exp_avg_sq_b,
+                    stamp: stamp_b,
+                    uid: uid_b,
+                    grad2d: grad2d_b,
+                    count: count_b,
+                };
+                (front, back)
+            }
+        }
+    };
 }
 
-impl<'a> RowsMut<'a> {
-    /// Number of rows.
-    pub fn rows(&self) -> usize {
-        self.stamp.len()
-    }
+impl_rows!(Rows, split_at);
+impl_rows!(RowsMut, split_at_mut);
 
+impl RowsMut<'_> {
     /// A shared view of the same rows.
     pub fn as_ref(&self) -> Rows<'_> {
         Rows {
@@ -238,31 +240,6 @@ impl<'a> RowsMut<'a> {
             grad2d: self.grad2d,
             count: self.count,
         }
-    }
-
-    /// The rows before `row`, and the rest.
-    pub fn split_at(self, row: usize) -> (RowsMut<'a>, RowsMut<'a>) {
-        let (columns, columns_b) = self.columns.split_at(row);
-        let (exp_avg, exp_avg_b) = self.exp_avg.split_at(row);
-        let (exp_avg_sq, exp_avg_sq_b) = self.exp_avg_sq.split_at(row);
-        let (stamp, stamp_b) = self.stamp.split_at_mut(row);
-        let (uid, uid_b) = self.uid.split_at_mut(row);
-        let (grad2d, grad2d_b) = self.grad2d.split_at_mut(row);
-        let (count, count_b) = self.count.split_at_mut(row);
-        let first_row = self.first_row;
-        (
-            RowsMut { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count },
-            RowsMut {
-                first_row: first_row + row,
-                columns: columns_b,
-                exp_avg: exp_avg_b,
-                exp_avg_sq: exp_avg_sq_b,
-                stamp: stamp_b,
-                uid: uid_b,
-                grad2d: grad2d_b,
-                count: count_b,
-            },
-        )
     }
 }
 

@@ -89,15 +89,17 @@ impl Folder for DriveFolder {
     }
 
     fn remove(&self, name: &str) -> io::Result<()> {
-        match std::fs::remove_file(self.0.join(name)) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
-            _ => Ok(()),
-        }
+        std::fs::remove_file(self.0.join(name)).or_else(unless_missing)
     }
 
     fn sync(&self) -> io::Result<()> {
         sync_folder(&self.0)
     }
+}
+
+/// The error, unless the file did not exist.
+pub(in crate::page) fn unless_missing(error: io::Error) -> io::Result<()> {
+    if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) }
 }
 
 /// A file on a drive. Growing allocates space, so that a full drive is detected before anything is overwritten.

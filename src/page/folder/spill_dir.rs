@@ -7,10 +7,12 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
-use crate::page::engine::segment_files::{segment_from_file_name, sync_folder, with_safe_flags};
+use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, sync_folder, with_safe_flags};
 use crate::page::folder::drive_rate;
 use crate::page::folder::file_system::{FileSystem, free_bytes};
-use crate::page::folder::protocol_files::{MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME};
+use crate::page::folder::protocol_files::{
+    MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME, unless_missing,
+};
 use crate::page::format::slot_header::{HEADER_BYTES, SlotHeader};
 use crate::page::format::spill_format::{FORMAT_BYTES, FormatError, Purpose, SlotLayout, SpillFormat};
 use std::fs::{File, OpenOptions, TryLockError};
@@ -141,14 +143,12 @@ impl SpillDir {
         free_bytes(&self.folder).map_err(|e| InputError::io(&self.folder, "reading the free space", &e))
     }
 
-    /// Numbers of the existing segments, ascending.
+    /// Numbers of the existing segment files, ascending.
     ///
     /// # Errors
     /// The folder cannot be read.
     pub fn segments(&self) -> InputResult<Vec<u32>> {
-        let mut segments: Vec<u32> = names(&self.folder)?.iter().filter_map(|n| segment_from_file_name(n)).collect();
-        segments.sort_unstable();
-        Ok(segments)
+        Ok(segments_in(&self.folder)?.into_iter().map(|(segment, _)| segment).collect())
     }
 
     /// Refuses a folder whose lock or FORMAT file is no longer the one that this process holds: somebody removed the
@@ -172,19 +172,10 @@ impl SpillDir {
     pub fn remove(self) -> InputResult<Vec<String>> {
         self.check_identity()?;
         let mut foreign = Vec::new();
-        let mut ours = [
-            MAP_NAME,
-            MAP_NEW_NAME,
-            WITNESS_NAME,
-            RESERVE_NAME,
-            RESERVE_NEW_NAME,
-            FORMAT_NEW,
-            FORMAT,
-            LOCK,
-            drive_rate::FILE_NAME,
-        ]
-        .map(str::to_string)
-        .to_vec();
+        let mut ours = [MAP_NAME, MAP_NEW_NAME, WITNESS_NAME, RESERVE_NAME, RESERVE_NEW_NAME, FORMAT_NEW, FORMAT, LOCK]
+            .map(str::to_string)
+            .to_vec();
+        ours.push(drive_rate::FILE_NAME.to_string());
         for name in names(&self.folder)? {
             if segment_from_file_name(&name).is_some() && self.is_our_segment(&self.folder.join(&name)) {
                 ours.insert(0, name);
@@ -192,13 +183,9 @@ impl SpillDir {
                 foreign.push(name);
             }
         }
-        for name in ours {
-            let path = self.folder.join(name);
-            match std::fs::remove_file(&path) {
-                Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                    return Err(InputError::io(path, "removing", &error));
-                }
-                _ => {}
+        for path in ours.iter().map(|name| self.folder.join(name)) {
+            if let Err(error) = std::fs::remove_file(&path).or_else(unless_missing) {
+                return Err(InputError::io(path, "removing", &error));
             }
         }
         if self.made_folder && foreign.is_empty() {
@@ -211,7 +198,7 @@ impl SpillDir {
     /// segment's creation).
     fn is_our_segment(&self, path: &Path) -> bool {
         let mut header = Vec::new();
-        let file = with_safe_flags(OpenOptions::new().read(true)).open(path);
+        let file = open_for_reading(path);
         let bytes = file.and_then(|file| {
             let metadata = file.metadata()?;
             file.take(HEADER_BYTES as u64).read_to_end(&mut header)?;
@@ -327,6 +314,23 @@ fn refuse_foreign_files(folder: &Path) -> InputResult<()> {
     }
 }
 
+/// Numbers and lengths of the segment files in `folder`, ascending.
+///
+/// # Errors
+/// The folder cannot be read.
+pub fn segments_in(folder: &Path) -> InputResult<Vec<(u32, u64)>> {
+    let failed = |e: io::Error| InputError::io(folder, "reading the folder", &e);
+    let mut segments = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(failed)? {
+        let entry = entry.map_err(failed)?;
+        let about = entry.metadata().map_err(failed)?;
+        let number = entry.file_name().to_str().and_then(segment_from_file_name);
+        segments.extend(number.filter(|_| about.is_file()).map(|segment| (segment, about.len())));
+    }
+    segments.sort_unstable();
+    Ok(segments)
+}
+
 /// Names in the folder, sorted. Names that are not UTF-8 are made printable; no file of this program has one.
 fn names(folder: &Path) -> InputResult<Vec<String>> {
     let failed = |e: io::Error| InputError::io(folder, "reading the folder", &e);
@@ -410,7 +414,7 @@ pub(in crate::page) fn read_format(folder: &Path) -> InputResult<Option<Result<S
 pub(in crate::page) fn format_bytes_of(folder: &Path) -> InputResult<Option<Vec<u8>>> {
     let path = folder.join(FORMAT);
     let failed = |e: io::Error| InputError::io(&path, "reading", &e);
-    let file = match with_safe_flags(OpenOptions::new().read(true)).open(&path) {
+    let file = match open_for_reading(&path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         file => file.map_err(failed)?,
     };

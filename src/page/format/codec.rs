@@ -113,7 +113,7 @@ pub fn decode(stored: &[u8], codec: StoredAs, payload: &mut [u8]) -> io::Result<
     match codec {
         StoredAs::Raw if stored.len() == payload.len() => payload.copy_from_slice(stored),
         StoredAs::Raw => return Err(wrong("the stored length differs from the payload's")),
-        StoredAs::Halves => halves::decode(stored, payload).map_err(|e| wrong(&e.to_string()))?,
+        StoredAs::Halves => halves::decode(stored, payload)?,
         StoredAs::ShuffledZstd => SCRATCH.with_borrow_mut(|scratch| {
             let decompressor = match &mut scratch.decompressor {
                 Some(decompressor) => decompressor,

@@ -4,5 +4,5 @@ pub(in crate::page) mod cut;
 pub(in crate::page) mod page_done;
 pub mod page_error;
 pub mod paged_store;
+pub(in crate::page) mod pending;
 pub mod slots;
-pub(in crate::page) mod waiting;

@@ -18,9 +18,9 @@ use crate::page::format::slot_header::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader
 use crate::page::format::verify::verify;
 use crate::page::mutants::{Mutant, active};
 pub use crate::page::versions::page_done::{PageDone, PageMoved, PageTraffic};
-use crate::page::versions::page_error::{PageError, SlotName, is_out_of_space};
+use crate::page::versions::page_error::{PageError, is_out_of_space};
+use crate::page::versions::pending::{Pending, Waiting};
 use crate::page::versions::slots::{SlotError, SlotLayout, Slots};
-use crate::page::versions::waiting::Waiting;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::io;
@@ -41,19 +41,6 @@ pub struct PagedStoreConfig {
     pub generation: u64,
     /// Serial number of the next write; higher than that of any valid slot.
     pub serial: u64,
-}
-
-/// A transfer in flight.
-#[derive(Debug)]
-struct Pending {
-    token: u64,
-    page: PageId,
-    slot: SlotRef,
-    direction: Direction,
-    /// Whether this is the second and last attempt of a read.
-    is_repeated: bool,
-    /// The caller's buffer, while a staging buffer carries the encoded form.
-    payload: Option<PageBuffer>,
 }
 
 /// Pages in slots. Has one owner.
@@ -211,8 +198,10 @@ impl PagedStore {
             Ok(slot) => SlotRef { generation, ..slot },
             Err(error) => return Err((error, buffer)),
         };
-        let staging = (self.config.codec != Codec::Raw).then(|| self.take_staging());
-        self.waiting.push(Waiting { token, page, slot, label: label.to_vec(), payload: buffer, staging });
+        let is_staged = self.config.codec != Codec::Raw;
+        let (payload, buffer) = if is_staged { (Some(buffer), self.take_staging()) } else { (None, buffer) };
+        let pending = Pending { token, page, slot, direction: Direction::Write, is_repeated: false, payload };
+        self.waiting.push(Waiting { pending, label: label.to_vec(), buffer });
         if self.waiting.len() >= WRITE_BATCH {
             self.begin_writes();
         }
@@ -311,9 +300,12 @@ impl PagedStore {
         self.staging.pop().unwrap_or_else(|| self.new_buffer())
     }
 
-    fn give_staging(&mut self, buffer: PageBuffer) {
+    /// The caller's buffer of a transfer that `buffer` carried; a staging buffer becomes free.
+    fn callers(&mut self, pending: &mut Pending, buffer: PageBuffer) -> PageBuffer {
+        let Some(payload) = pending.payload.take() else { return buffer };
         self.staged -= 1;
         self.staging.push(buffer);
+        payload
     }
 
     /// Submits the accepted writes to the engine. This happens by itself when a batch is full and in
@@ -325,45 +317,31 @@ impl PagedStore {
             [one] => one.seal(codec),
             many => many.par_iter_mut().for_each(|write| write.seal(codec)),
         }
-        for Waiting { token, page, slot, label, payload, staging } in batch {
-            let (buffer, payload) = match (slot.codec, staging) {
-                (StoredAs::Raw, staging) => {
-                    staging.into_iter().for_each(|staging| self.give_staging(staging));
-                    (payload, None)
-                }
-                (_, Some(staging)) => (staging, Some(payload)),
-                (_, None) => (payload, None),
-            };
-            let pending = Pending { token, page, slot, direction: Direction::Write, is_repeated: false, payload };
-            self.submit_write(pending, &label, buffer);
+        for Waiting { mut pending, label, mut buffer } in batch {
+            if pending.slot.codec == StoredAs::Raw
+                && let Some(staging) = pending.payload.take()
+            {
+                // Sealing has put the caller's buffer first.
+                self.staged -= 1;
+                self.staging.push(staging);
+            }
+            if let Err(error) = self.refuse_if_poisoned() {
+                self.slots.release(pending.slot.place);
+                buffer = self.callers(&mut pending, buffer);
+                self.ended.push(pending.end(buffer, Err(error)));
+            } else {
+                self.submit_write(pending, label, buffer);
+            }
         }
     }
 
     /// Writes the header before the payload and submits.
-    fn submit_write(&mut self, mut pending: Pending, label: &[u8], mut buffer: PageBuffer) {
-        if let Err(error) = self.refuse_if_poisoned() {
-            self.slots.release(pending.slot.place);
-            let payload = match pending.payload.take() {
-                Some(payload) => {
-                    self.give_staging(buffer);
-                    payload
-                }
-                None => buffer,
-            };
-            return self.ended.push(pending.end(payload, Err(error)));
-        }
-        let slot = &pending.slot;
-        let bytes = slot.transfer_bytes();
-        let described = SlotHeader {
-            store: self.config.store,
-            page: pending.page,
-            serial: self.config.serial,
-            slot: *slot,
-            label: label.to_vec(),
-        };
+    fn submit_write(&mut self, pending: Pending, label: Vec<u8>, mut buffer: PageBuffer) {
+        let (slot, bytes) = (pending.slot, pending.slot.transfer_bytes());
+        let (store, serial) = (self.config.store, self.config.serial);
         self.config.serial += 1;
         if let Some(header) = buffer.as_mut_slice().first_chunk_mut() {
-            described.encode(header);
+            SlotHeader { store, page: pending.page, serial, slot, label }.encode(header);
         }
         self.traffic.bytes_written += bytes as u64;
         self.traffic.payload_bytes_written += u64::from(slot.payload_bytes);
@@ -419,13 +397,7 @@ impl PagedStore {
             many => many.par_iter_mut().for_each(check),
         }
         for (mut pending, Completion { transfer, result }, verdict) in checked {
-            let buffer = match pending.payload.take() {
-                Some(payload) => {
-                    self.give_staging(transfer.buffer);
-                    payload
-                }
-                None => transfer.buffer,
-            };
+            let buffer = self.callers(&mut pending, transfer.buffer);
             match pending.direction {
                 Direction::Read => self.finish_read(pending, buffer, result, verdict),
                 Direction::Write => self.finish_write(pending, buffer, result),
@@ -470,16 +442,6 @@ impl PagedStore {
             PageError::Write(at, source)
         });
         self.ended.push(pending.end(buffer, end));
-    }
-}
-
-impl Pending {
-    fn name(&self) -> SlotName {
-        SlotName { page: self.page, place: self.slot.place, generation: self.slot.generation }
-    }
-
-    fn end(self, buffer: PageBuffer, result: Result<PageMoved, PageError>) -> PageDone {
-        PageDone { token: self.token, page: self.page, buffer, result }
     }
 }
 

@@ -68,23 +68,13 @@ impl Slots {
         let mut slots = Slots::new(layout);
         (0..segments).for_each(|_| slots.add_segment());
         for place in used {
-            slots.mark_used(place)?;
+            let slot = slots.number(place).ok_or(SlotError::NoSlot(place))?;
+            if !slots.free.remove(&slot) {
+                return Err(SlotError::Twice(place));
+            }
+            slots.states[slot as usize] = SlotState::InUse;
         }
         Ok(slots)
-    }
-
-    /// At opening, marks a free slot as in use because the index of the current or of a pinned generation names it.
-    /// [`Slots::retire`] then retires past versions.
-    ///
-    /// # Errors
-    /// The place is not a slot, or is named twice.
-    pub fn mark_used(&mut self, place: Place) -> Result<(), SlotError> {
-        let slot = self.number(place).ok_or(SlotError::NoSlot(place))?;
-        if !self.free.remove(&slot) {
-            return Err(SlotError::Twice(place));
-        }
-        self.states[slot as usize] = SlotState::InUse;
-        Ok(())
     }
 
     /// The sizes of slots and segments.
