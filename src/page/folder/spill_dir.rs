@@ -68,23 +68,19 @@ impl SpillDir {
         refuse_foreign_files(folder)?;
         let lock = take_lock(folder)?;
         // Checked again under the lock: another process may have created a store just now.
-        match read_format(folder)? {
-            None => {}
-            Some(Ok(SpillFormat { purpose: Purpose::Scratch, .. })) => {
-                let problem =
-                    "it holds the pages of an interrupted run without a checkpoint, which no other run can use";
-                let remedy = format!("remove the folder (rm -r {}) or {OTHER_FOLDER}", folder.display());
-                return Err(InputError::new(folder, problem, remedy));
-            }
-            Some(Ok(_)) => {
-                let remedy = format!(
-                    "continue that run (gsscale-train --resume with its output folder), remove the folder (rm -r {}) or \
-                     {OTHER_FOLDER}",
-                    folder.display()
-                );
-                return Err(InputError::new(folder, "it holds the checkpoint of another run", remedy));
-            }
-            Some(Err(error)) => return Err(bad_format(folder, &error)),
+        if let Some(SpillFormat { purpose, .. }) = read_format(folder)? {
+            let remove = format!("remove the folder (rm -r {}) or {OTHER_FOLDER}", folder.display());
+            let (problem, remedy) = match purpose {
+                Purpose::Scratch => (
+                    "it holds the pages of an interrupted run without a checkpoint, which no other run can use",
+                    remove,
+                ),
+                Purpose::Checkpoint => (
+                    "it holds the checkpoint of another run",
+                    format!("continue that run (gsscale-train --resume with its output folder), {remove}"),
+                ),
+            };
+            return Err(InputError::new(folder, problem, remedy));
         }
         make_private(folder)?;
         sign_lock(folder, &lock)?;
@@ -100,12 +96,10 @@ impl SpillDir {
     pub fn open(folder: &Path, allow_remote: bool) -> InputResult<SpillDir> {
         check_folder(folder)?;
         let warnings = check_file_system(folder, allow_remote)?;
-        let read = || match read_format(folder)? {
-            Some(format) => format.map_err(|error| bad_format(folder, &error)),
-            None => {
-                let remedy = "give the folder that was named by --spill-dir";
-                Err(InputError::new(folder, "it is not a spill directory: it has no FORMAT file", remedy))
-            }
+        let read = || {
+            let remedy = "give the folder that was named by --spill-dir";
+            let missing = || InputError::new(folder, "it is not a spill directory: it has no FORMAT file", remedy);
+            read_format(folder)?.ok_or_else(missing)
         };
         // The first read comes before the lock file is created, so that a foreign folder stays unchanged.
         read()?;
@@ -155,7 +149,7 @@ impl SpillDir {
     /// store and created another one under the same path.
     fn check_identity(&self) -> InputResult<()> {
         let is_same_lock = is_same_file(&self.folder.join(LOCK), &self.lock);
-        let is_same_store = matches!(read_format(&self.folder)?, Some(Ok(format)) if format.store == self.format.store);
+        let is_same_store = matches!(read_format(&self.folder)?, Some(format) if format.store == self.format.store);
         if is_same_lock && is_same_store {
             return Ok(());
         }
@@ -298,10 +292,8 @@ fn warnings_for(folder: &Path, kind: FileSystem, allow_remote: bool) -> InputRes
 
 /// Refuses a folder that contains files foreign to a spill directory.
 fn refuse_foreign_files(folder: &Path) -> InputResult<()> {
-    match read_format(folder)? {
-        Some(Ok(_)) => return Ok(()),
-        Some(Err(error)) => return Err(bad_format(folder, &error)),
-        None => {}
+    if read_format(folder)?.is_some() {
+        return Ok(());
     }
     let names = names(folder)?;
     // A run that was interrupted before it wrote its FORMAT file leaves these.
@@ -406,8 +398,9 @@ fn host_name() -> String {
 }
 
 /// Content of the FORMAT file; `None` if there is none.
-pub(in crate::page) fn read_format(folder: &Path) -> InputResult<Option<Result<SpillFormat, FormatError>>> {
-    Ok(format_bytes_of(folder)?.map(|bytes| SpillFormat::from_bytes(&bytes)))
+fn read_format(folder: &Path) -> InputResult<Option<SpillFormat>> {
+    let read = |bytes: Vec<u8>| SpillFormat::from_bytes(&bytes).map_err(|error| bad_format(folder, &error));
+    format_bytes_of(folder)?.map(read).transpose()
 }
 
 /// Bytes of the FORMAT file, empty if it is not a regular file; `None` if there is none.

@@ -375,16 +375,15 @@ fn open_map(folder: &Path, store: u128, rule: WitnessRule, copied: bool) -> Resu
     Ok(Manifest::open_read_only(backend, store, acknowledged, CACHE_BYTES)?)
 }
 
-/// As [`open_map`], while a process commits to it.
+/// As [`open_map`], while a process commits to it: copies the file until a copy verifies.
 fn open_copy(folder: &Path, store: u128, rule: WitnessRule) -> Result<(Manifest, MapContent), ReadError> {
-    let mut copies = 1;
-    loop {
+    for copies in 1..COPIES_MAX {
         match open_map(folder, store, rule, true) {
-            Err(ReadError::Commit(CommitError::Map(_))) if copies < COPIES_MAX => {
+            Err(ReadError::Commit(CommitError::Map(_))) => {
                 std::thread::sleep(Duration::from_millis(10 * u64::from(copies)));
-                copies += 1;
             }
             opened => return opened,
         }
     }
+    open_map(folder, store, rule, true)
 }
