@@ -8,7 +8,10 @@
 //! page, generation, place, lengths, checksum); a mismatch is read once more and then reported; 2. a new version never
 //! overwrites a slot that a durable or pinned generation names; 3. after a failed write or sync the store accepts no
 //! more writes, except after a lack of space: then nothing was written, and space may be freed later; 4. every accepted
-//! transfer ends in exactly one [`PageDone`].
+//! transfer ends in exactly one [`PageDone`]; 5. a retired slot keeps the whole range of generations that may name it.
+//!
+//! A cut ends a generation. Versions of the ended generation may still be written after the cut, by its number, beside
+//! versions of the next one.
 
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::PageBuffer;
@@ -17,8 +20,8 @@ use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, transfer_bytes};
 use crate::page::format::verify::verify;
 use crate::page::mutants::{Mutant, active};
-pub use crate::page::versions::page_done::{PageDone, PageMoved, PageTraffic};
 use crate::page::versions::page_error::{PageError, is_out_of_space};
+pub use crate::page::versions::pending::{PageDone, PageMoved, PageTraffic};
 use crate::page::versions::pending::{Pending, Waiting};
 use crate::page::versions::slots::{SlotError, SlotLayout, Slots};
 use rayon::prelude::*;
@@ -46,8 +49,8 @@ pub struct PagedStoreConfig {
 /// Pages in slots. Has one owner.
 pub struct PagedStore {
     engine: Box<dyn PageEngine>,
-    pub(in crate::page) config: PagedStoreConfig,
-    pub(in crate::page) slots: Slots,
+    config: PagedStoreConfig,
+    slots: Slots,
     pending: BTreeMap<u64, Pending>,
     next_transfer: u64,
     waiting: Vec<Waiting>,
@@ -241,6 +244,33 @@ impl PagedStore {
             self.poison = Some(format!("making pages durable failed: {source}"));
             PageError::Sync(source)
         })
+    }
+
+    /// Version `slot` is superseded. If no committed generation can name it, its slot is free at once, otherwise after
+    /// [`PagedStore::commit_done`]. A run without commits thus frees every slot at once.
+    pub fn free(&mut self, slot: &SlotRef) {
+        self.free_from(slot, self.config.generation);
+    }
+
+    /// As [`PagedStore::free`], but superseded from generation `from` on: one that is cut and not committed yet, or, at
+    /// opening, one of the past.
+    pub fn free_from(&mut self, slot: &SlotRef, from: u64) {
+        let was_in_use = self.slots.retire(slot.place, slot.generation, from);
+        debug_assert!(was_in_use, "a slot was freed twice: {slot:?}");
+    }
+
+    /// Ends generation [`PagedStore::generation`], which is about to be committed from the present index: later writes
+    /// belong to the next generation, unless [`PagedStore::write_for`] names the ended one. [`PagedStore::sync`] must
+    /// follow the last write of the generation and precede the commit.
+    pub fn cut(&mut self) -> u64 {
+        self.config.generation += 1;
+        self.config.generation - 1
+    }
+
+    /// Acknowledges the commit of generation `durable`; of the earlier ones `pinned` are kept. Frees the slots that
+    /// none of these names; returns how many.
+    pub fn commit_done(&mut self, durable: u64, pinned: &[u64]) -> usize {
+        self.slots.release_retired(durable, pinned)
     }
 
     /// Poisons the store, because another part of it failed: no more writes are accepted.
