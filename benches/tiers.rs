@@ -17,7 +17,7 @@ use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides, parse_argumen
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
-use gsscale::page::engine::drive_rate::DriveRate;
+use gsscale::page::folder::drive_rate::DriveRate;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::simulation::auto::automatic_order;
 use gsscale::paging::simulation::replay::{DriveModel, ReplayOptions, replay};

@@ -12,7 +12,8 @@ use gsscale::page::format::spill_format::Purpose;
 use gsscale::page::map::commit::{
     CommitConfig, CommitError, Commits, Cut, MAP_NAME, PageChange, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME,
 };
-use gsscale::page::map::manifest::{Manifest, MapBatch, MapError};
+use gsscale::page::map::entries::{MapBatch, MapError};
+use gsscale::page::map::manifest::Manifest;
 use gsscale::page::map::opening::Opened;
 use gsscale::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule, commit_config};
 use gsscale::page::versions::paged_store::{PageMoved, PagedStore};

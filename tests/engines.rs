@@ -6,11 +6,10 @@
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::page::engine::buffer::{ALIGNMENT, PageBuffer};
 use gsscale::page::engine::memory::MemoryEngine;
-use gsscale::page::engine::mmap::MmapEngine;
 use gsscale::page::engine::open::{DEPTH, IoEngine, open_engine};
 use gsscale::page::engine::page_engine::{Completion, Direction, PageEngine, Place, Transfer};
-use gsscale::page::engine::pread::PreadEngine;
 use gsscale::page::engine::segment_files::segment_file_name;
+use gsscale::page::engine::threaded::ThreadedEngine;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::io::ErrorKind;
 use std::path::Path;
@@ -22,9 +21,9 @@ type Open = fn(&Path) -> Box<dyn PageEngine>;
 /// The engines that work on files, with and without the page cache, by name.
 fn file_engines() -> Vec<(&'static str, Open)> {
     let mut engines: Vec<(&str, Open)> = vec![
-        ("pread", |folder| Box::new(PreadEngine::open(folder, 6, true).unwrap())),
-        ("pread, buffered", |folder| Box::new(PreadEngine::open(folder, 6, false).unwrap())),
-        ("mmap", |folder| Box::new(MmapEngine::open(folder, 6).unwrap())),
+        ("pread", |folder| Box::new(ThreadedEngine::pread(folder, 6, true).unwrap())),
+        ("pread, buffered", |folder| Box::new(ThreadedEngine::pread(folder, 6, false).unwrap())),
+        ("mmap", |folder| Box::new(ThreadedEngine::mmap(folder, 6).unwrap())),
     ];
     #[cfg(target_os = "linux")]
     {

@@ -23,7 +23,7 @@ mod verify;
 use clap::{Parser, Subcommand};
 use gsscale::base::error::InputError;
 use gsscale::page::map::commit::CommitError;
-use gsscale::page::map::manifest::MapError;
+use gsscale::page::map::entries::MapError;
 use gsscale::train::error::TrainError;
 use serde::Serialize;
 use std::process::ExitCode;

@@ -4,10 +4,10 @@
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::units::{format_bytes, parse_bytes};
-use gsscale::page::engine::drive_rate::codec_for;
-use gsscale::page::engine::measure::{Case, Limits, Measured, Sweep, sweep};
 use gsscale::page::engine::open::IoEngine;
+use gsscale::page::folder::drive_rate::codec_for;
 use gsscale::page::folder::file_system::FileSystem;
+use gsscale::page::folder::measure::{Case, Limits, Measured, Sweep, sweep};
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::scene::page_layout::capacity_bytes;

@@ -7,7 +7,7 @@ use gsscale::base::units::{format_bytes, format_seconds};
 use gsscale::config::choice::Chosen;
 use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::optim::method::Method;
-use gsscale::page::engine::drive_rate::DriveRate;
+use gsscale::page::folder::drive_rate::DriveRate;
 use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::plan::cache_model::{CacheModel, StepChange, TooFewFrames};

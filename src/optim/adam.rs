@@ -102,18 +102,3 @@ impl<F: Real> DenseAdam<F> {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_first_step_has_the_length_of_the_rate_for_any_gradient() {
-        let mut adam = DenseAdam::new(AdamConfig::default(), vec![1.0f64, 1.0, 1.0]);
-        adam.step(&[3.0, -2e-5, 0.0], 0.25);
-        // eps shifts it by at most 1e-15 / |g|.
-        assert!((adam.values[0] - 0.75).abs() < 1e-14);
-        assert!((adam.values[1] - 1.25).abs() < 1e-9);
-        assert_eq!(adam.values[2], 1.0);
-    }
-}

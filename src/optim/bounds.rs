@@ -11,7 +11,7 @@
 //! they are computed; 2. they hold for every later step, whatever events are pending, in the f32 arithmetic of the
 //! evaluation; 3. the same bits on every instruction path.
 
-use super::deferred::DeferredAdam;
+use super::adam_now::DeferredAdam;
 use super::lanes::{Coordinates, LANES, LaneDrifts, by_coordinate, drifted_lanes, drifted_opacities, tables_of};
 use super::moments::Moments;
 use crate::base::math::exp32;

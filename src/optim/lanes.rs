@@ -5,7 +5,7 @@
 //!
 //! Invariant: the bits are those of [`RowsNow`](crate::scene::rows::RowsNow) on every instruction path.
 
-use super::deferred::{AdamNow, DeferredAdam};
+use super::adam_now::{AdamNow, DeferredAdam};
 use super::drift::{Drift, EpsFloor, drifted, needs_direct_sum};
 use crate::base::simd::Kernel;
 use crate::scene::columns::Column;

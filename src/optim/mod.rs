@@ -1,6 +1,7 @@
 //! Learning rates and Adam: the dense form as reference, the deferred form for training.
 
 pub mod adam;
+mod adam_now;
 pub mod bounds;
 mod decay;
 pub mod deferred;

@@ -13,16 +13,14 @@
 //! Invariant: the bits are those of [`RowsNow`] on every instruction path.
 
 use super::adam::AdamConfig;
+use super::adam_now::{AdamNow, OfLanes, StepCounts};
 use super::decay::Decay;
-use super::deferred::{AdamNow, StepCounts};
 use super::drift::{EpsFloor, drifted, flush, needs_direct_sum};
 use super::moments::{Moments, round_block};
 use super::row_vectors::{RowVectors, Table, TableMut, is_of_row_behind};
 use crate::base::simd::{Kernel, LANES};
 use crate::scene::columns::Column;
-use crate::scene::rows::{
-    BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, RowsNow, SH_N_LANE, first_lane,
-};
+use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, RowsNow, SH_N_LANE};
 
 /// Larger gradients are treated as non-finite: their square must not overflow the second moment. Below this limit every
 /// number that an update computes from finite state is finite.
@@ -127,30 +125,6 @@ pub(super) fn evaluate_alone<const W: usize>(at: &AdamNow<'_>, view: &Rows<'_>, 
     let mut now = [0.0; BLOCK_LANES];
     at.evaluate_row(view, row, &mut now);
     RowVectors::of_block(&now)
-}
-
-/// A value per lane of a row; all lanes of `sh_n` share one.
-#[derive(Debug, Clone)]
-pub(super) struct OfLanes {
-    pub narrow: [f32; LANES],
-    pub sh_n: f32,
-}
-
-impl OfLanes {
-    /// From a value per column.
-    pub fn new(of: impl Fn(Column) -> f32) -> Self {
-        let mut narrow = [0.0; LANES];
-        for column in Column::ALL.into_iter().filter(|&c| c != Column::ShN) {
-            narrow[first_lane(column)..][..column.width(0)].fill(of(column));
-        }
-        OfLanes { narrow, sh_n: of(Column::ShN) }
-    }
-
-    /// The value of a column.
-    #[inline(always)]
-    pub fn of(&self, column: Column) -> f32 {
-        if column == Column::ShN { self.sh_n } else { self.narrow[first_lane(column)] }
-    }
 }
 
 /// Moves the values of one row of any width to now.

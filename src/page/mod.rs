@@ -7,12 +7,16 @@
 //! | [`mod@format`] | the bytes of a slot: headers, codecs, checksums, the FORMAT file |
 //! | [`versions`] | which slot holds which version of a page |
 //! | [`map`] | the page map, generations, commits, the witness |
-//! | [`folder`] | the spill directory: lock, identity, clean-up |
+//! | [`folder`] | the spill directory: lock, identity, clean-up; what its drive is and how fast |
 //! | [`tool`] | inspecting a store, building one, finding pages without a map |
+//!
+//! Dependencies point one way: `engine` <- `format` <- `versions`, `folder` <- `map` <- `tool`.
 
 pub mod engine;
 pub mod folder;
 pub mod format;
 pub mod map;
+#[doc(hidden)]
+pub mod mutants;
 pub mod tool;
 pub mod versions;

@@ -62,23 +62,81 @@ pub fn row_width(sh_degree: u8) -> usize {
     14 + sh_n_width(sh_degree)
 }
 
-/// Rows of Gaussians by column; also gradients (`v_*`), `exp_avg` and `exp_avg_sq`, which have the same shape.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Columns {
+/// Something for each column: vectors, shared slices or exclusive slices of `[rows][width]` floats.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct ColumnSet<T> {
     /// Degree that `sh_n` is stored with, 0 to 3.
     pub sh_degree: u8,
     /// `[rows][3]`.
-    pub means: Vec<f32>,
+    pub means: T,
     /// `[rows][4]`, w x y z.
-    pub quats: Vec<f32>,
+    pub quats: T,
     /// `[rows][3]`, log.
-    pub scales: Vec<f32>,
+    pub scales: T,
     /// `[rows]`, logit.
-    pub opacities: Vec<f32>,
+    pub opacities: T,
     /// `[rows][3]`.
-    pub sh0: Vec<f32>,
+    pub sh0: T,
     /// `[rows][(degree + 1)^2 - 1][3]`.
-    pub sh_n: Vec<f32>,
+    pub sh_n: T,
+}
+
+/// Rows of Gaussians by column; also gradients (`v_*`), `exp_avg` and `exp_avg_sq`, which have the same shape.
+pub type Columns = ColumnSet<Vec<f32>>;
+
+impl<T> ColumnSet<T> {
+    /// What belongs to one column.
+    #[inline(always)]
+    pub fn get(&self, column: Column) -> &T {
+        match column {
+            Column::Means => &self.means,
+            Column::Quats => &self.quats,
+            Column::Scales => &self.scales,
+            Column::Opacities => &self.opacities,
+            Column::Sh0 => &self.sh0,
+            Column::ShN => &self.sh_n,
+        }
+    }
+
+    /// As [`ColumnSet::get`], mutable.
+    #[inline(always)]
+    pub fn get_mut(&mut self, column: Column) -> &mut T {
+        match column {
+            Column::Means => &mut self.means,
+            Column::Quats => &mut self.quats,
+            Column::Scales => &mut self.scales,
+            Column::Opacities => &mut self.opacities,
+            Column::Sh0 => &mut self.sh0,
+            Column::ShN => &mut self.sh_n,
+        }
+    }
+
+    /// Mutable references to what belongs to each column.
+    pub fn each_mut(&mut self) -> ColumnSet<&mut T> {
+        ColumnSet {
+            sh_degree: self.sh_degree,
+            means: &mut self.means,
+            quats: &mut self.quats,
+            scales: &mut self.scales,
+            opacities: &mut self.opacities,
+            sh0: &mut self.sh0,
+            sh_n: &mut self.sh_n,
+        }
+    }
+
+    /// Something else for each column, in storage order.
+    #[inline(always)]
+    pub fn map<U>(self, mut of: impl FnMut(Column, T) -> U) -> ColumnSet<U> {
+        ColumnSet {
+            sh_degree: self.sh_degree,
+            means: of(Column::Means, self.means),
+            quats: of(Column::Quats, self.quats),
+            scales: of(Column::Scales, self.scales),
+            opacities: of(Column::Opacities, self.opacities),
+            sh0: of(Column::Sh0, self.sh0),
+            sh_n: of(Column::ShN, self.sh_n),
+        }
+    }
 }
 
 impl Columns {
@@ -120,32 +178,17 @@ impl Columns {
 
     /// Bytes allocated.
     pub fn bytes(&self) -> usize {
-        let floats = self.means.capacity() + self.quats.capacity() + self.scales.capacity();
-        4 * (floats + self.opacities.capacity() + self.sh0.capacity() + self.sh_n.capacity())
+        Column::ALL.iter().map(|&column| 4 * self.get(column).capacity()).sum()
     }
 
     /// The floats of one column.
     pub fn column(&self, column: Column) -> &[f32] {
-        match column {
-            Column::Means => &self.means,
-            Column::Quats => &self.quats,
-            Column::Scales => &self.scales,
-            Column::Opacities => &self.opacities,
-            Column::Sh0 => &self.sh0,
-            Column::ShN => &self.sh_n,
-        }
+        self.get(column)
     }
 
     /// The floats of one column.
     pub fn column_mut(&mut self, column: Column) -> &mut Vec<f32> {
-        match column {
-            Column::Means => &mut self.means,
-            Column::Quats => &mut self.quats,
-            Column::Scales => &mut self.scales,
-            Column::Opacities => &mut self.opacities,
-            Column::Sh0 => &mut self.sh0,
-            Column::ShN => &mut self.sh_n,
-        }
+        self.get_mut(column)
     }
 
     /// The floats of one row of one column.

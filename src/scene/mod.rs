@@ -11,6 +11,7 @@ pub mod page_layout;
 pub mod page_meta;
 pub mod page_split;
 pub mod partition;
+pub mod point_box;
 pub mod rows;
 pub mod select;
 pub mod state;

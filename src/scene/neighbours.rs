@@ -9,6 +9,7 @@
 //! point in it; 2. the result does not depend on threads; 3. O(n log n) for any clustering: the tree halves the points,
 //! not the space, and equal points may be on both sides.
 
+use super::point_box::{PointBox, norm2};
 use rayon::prelude::*;
 
 /// Neighbours per point.
@@ -25,20 +26,11 @@ struct Entry {
     index: u32,
 }
 
-/// The bounding box of some points.
-#[derive(Debug, Clone, Copy)]
-pub struct Bounds {
-    /// Lower corner.
-    pub low: [f32; 3],
-    /// Upper corner.
-    pub high: [f32; 3],
-}
-
 /// A balanced tree: every node halves its range of `entries`, and all leaves are at depth `levels`. `boxes` is in
 /// preorder: a node's left child is next to it, the right child of a node with `l` levels below is 2^l further.
 pub struct NeighbourTree {
     entries: Vec<Entry>,
-    boxes: Vec<Bounds>,
+    boxes: Vec<PointBox>,
     levels: u32,
 }
 
@@ -64,7 +56,7 @@ impl NeighbourTree {
         while points.len().div_ceil(1 << levels) > LEAF {
             levels += 1;
         }
-        let mut boxes = vec![Bounds { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3] }; (2 << levels) - 1];
+        let mut boxes = vec![PointBox::EMPTY; (2 << levels) - 1];
         build(&mut entries, &mut boxes, levels);
         NeighbourTree { entries, boxes, levels }
     }
@@ -99,14 +91,14 @@ impl NeighbourTree {
     }
 
     /// The bounding box of all points.
-    pub fn bounds(&self) -> Bounds {
+    pub fn bounds(&self) -> PointBox {
         self.boxes[0]
     }
 
     fn search(&self, node: usize, levels: u32, low: usize, high: usize, q: [f32; 3], best: &mut [f32; 4]) {
         if levels == 0 {
             for entry in &self.entries[low..high] {
-                insert(best, dist2(std::array::from_fn(|i| entry.point[i] - q[i])));
+                insert(best, norm2(std::array::from_fn(|i| entry.point[i] - q[i])));
             }
             return;
         }
@@ -124,30 +116,6 @@ impl NeighbourTree {
         visit(left_first);
         visit(!left_first);
     }
-}
-
-impl Bounds {
-    fn of(entries: &[Entry]) -> Bounds {
-        let mut b = Bounds { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3] };
-        for entry in entries {
-            for i in 0..3 {
-                b.low[i] = b.low[i].min(entry.point[i]);
-                b.high[i] = b.high[i].max(entry.point[i]);
-            }
-        }
-        b
-    }
-
-    /// Squared distance of the box from a point; never greater than that of a point in the box.
-    #[inline]
-    pub fn dist2(&self, q: [f32; 3]) -> f32 {
-        dist2(std::array::from_fn(|i| (self.low[i] - q[i]).max(q[i] - self.high[i]).max(0.0)))
-    }
-}
-
-#[inline]
-fn dist2(d: [f32; 3]) -> f32 {
-    d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
 }
 
 /// The smallest values of two lists, ascending.
@@ -171,13 +139,12 @@ fn insert(best: &mut [f32; 4], value: f32) {
 }
 
 /// Sorts `entries` into the tree with `levels` levels below this node, and fills its boxes.
-fn build(entries: &mut [Entry], boxes: &mut [Bounds], levels: u32) {
-    boxes[0] = Bounds::of(entries);
+fn build(entries: &mut [Entry], boxes: &mut [PointBox], levels: u32) {
+    boxes[0] = PointBox::of(entries.iter().map(|e| e.point));
     if levels == 0 {
         return;
     }
-    let extent = |i: usize| boxes[0].high[i] - boxes[0].low[i];
-    let axis = (1..3).fold(0, |widest, i| if extent(i) > extent(widest) { i } else { widest });
+    let axis = boxes[0].longest_axis();
     let middle = entries.len() / 2;
     // Ties are ordered by index, so that the two halves are a function of the points alone.
     entries.select_nth_unstable_by(middle, |a, b| a.point[axis].total_cmp(&b.point[axis]).then(a.index.cmp(&b.index)));
@@ -202,7 +169,7 @@ mod tests {
         let of = |i: usize| {
             let mut all: Vec<f32> = (0..points.len())
                 .filter(|&j| j != i)
-                .map(|j| dist2(std::array::from_fn(|k| points[j][k] - points[i][k])))
+                .map(|j| norm2(std::array::from_fn(|k| points[j][k] - points[i][k])))
                 .filter(|d| !d.is_nan())
                 .collect();
             all.sort_by(f32::total_cmp);

@@ -8,7 +8,7 @@
 //! 3. more rows or a higher degree never shorten the payload. Only for little-endian machines, which is checked at
 //! compile time.
 
-use super::columns::{Column, Columns};
+use super::columns::Column;
 use super::rows::{ColumnsMut, ColumnsRef, Rows, RowsMut};
 use super::state::SceneState;
 use bytemuck::{AnyBitPattern, NoUninit};
@@ -43,10 +43,11 @@ impl PageLayout {
         let stamp = take(&mut rest, self.rows);
         let grad2d = take(&mut rest, self.rows);
         let count = take(&mut rest, self.rows);
-        let [mut columns, mut exp_avg, mut exp_avg_sq] = [empty_ref(self.sh_degree); 3];
+        let [mut columns, mut exp_avg, mut exp_avg_sq] =
+            [ColumnsRef { sh_degree: self.sh_degree, ..ColumnsRef::default() }; 3];
         for column in Column::ALL {
             for table in [&mut columns, &mut exp_avg, &mut exp_avg_sq] {
-                *slice_of(table, column) = take(&mut rest, self.rows * column.width(self.sh_degree));
+                *table.get_mut(column) = take(&mut rest, self.rows * column.width(self.sh_degree));
             }
         }
         Rows { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count }
@@ -59,10 +60,10 @@ impl PageLayout {
         let stamp = take_mut(&mut rest, self.rows);
         let grad2d = take_mut(&mut rest, self.rows);
         let count = take_mut(&mut rest, self.rows);
-        let mut tables = [0; 3].map(|_| empty_mut(self.sh_degree));
+        let mut tables = [0; 3].map(|_| ColumnsMut { sh_degree: self.sh_degree, ..ColumnsMut::default() });
         for column in Column::ALL {
             for table in &mut tables {
-                *slice_of_mut(table, column) = take_mut(&mut rest, self.rows * column.width(self.sh_degree));
+                *table.get_mut(column) = take_mut(&mut rest, self.rows * column.width(self.sh_degree));
             }
         }
         let [columns, exp_avg, exp_avg_sq] = tables;
@@ -85,26 +86,17 @@ pub fn write_page(state: &SceneState, payload: &mut [u8]) -> PageLayout {
     rows.uid.copy_from_slice(&state.uid);
     rows.grad2d.copy_from_slice(&state.grad2d);
     rows.count.copy_from_slice(&state.count);
-    for (mut to, from) in
+    for (to, from) in
         [(rows.columns, &state.columns), (rows.exp_avg, &state.exp_avg), (rows.exp_avg_sq, &state.exp_avg_sq)]
     {
-        for column in Column::ALL {
-            slice_of_mut(&mut to, column).copy_from_slice(from.column(column));
-        }
+        to.map(|column, values| values.copy_from_slice(from.column(column)));
     }
     layout
 }
 
 /// Copies the rows of a page into a table of their own.
 pub fn read_page(rows: &Rows<'_>) -> SceneState {
-    let table = |from: ColumnsRef<'_>| {
-        let mut from = from;
-        let mut columns = Columns { sh_degree: from.sh_degree, ..Columns::default() };
-        for column in Column::ALL {
-            columns.column_mut(column).extend_from_slice(slice_of(&mut from, column));
-        }
-        columns
-    };
+    let table = |from: ColumnsRef<'_>| from.map(|_, values| values.to_vec());
     SceneState {
         columns: table(rows.columns),
         exp_avg: table(rows.exp_avg),
@@ -134,47 +126,10 @@ fn take_mut<'a, T: AnyBitPattern + NoUninit>(rest: &mut &'a mut [u8], count: usi
     bytemuck::cast_slice_mut(&mut table[..bytes])
 }
 
-fn empty_ref<'a>(sh_degree: u8) -> ColumnsRef<'a> {
-    ColumnsRef { sh_degree, means: &[], quats: &[], scales: &[], opacities: &[], sh0: &[], sh_n: &[] }
-}
-
-fn empty_mut<'a>(sh_degree: u8) -> ColumnsMut<'a> {
-    ColumnsMut {
-        sh_degree,
-        means: &mut [],
-        quats: &mut [],
-        scales: &mut [],
-        opacities: &mut [],
-        sh0: &mut [],
-        sh_n: &mut [],
-    }
-}
-
-fn slice_of<'t, 'a>(table: &'t mut ColumnsRef<'a>, column: Column) -> &'t mut &'a [f32] {
-    match column {
-        Column::Means => &mut table.means,
-        Column::Quats => &mut table.quats,
-        Column::Scales => &mut table.scales,
-        Column::Opacities => &mut table.opacities,
-        Column::Sh0 => &mut table.sh0,
-        Column::ShN => &mut table.sh_n,
-    }
-}
-
-fn slice_of_mut<'t, 'a>(table: &'t mut ColumnsMut<'a>, column: Column) -> &'t mut &'a mut [f32] {
-    match column {
-        Column::Means => &mut table.means,
-        Column::Quats => &mut table.quats,
-        Column::Scales => &mut table.scales,
-        Column::Opacities => &mut table.opacities,
-        Column::Sh0 => &mut table.sh0,
-        Column::ShN => &mut table.sh_n,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::columns::Columns;
     use crate::scene::state::row_bytes;
 
     #[test]

@@ -4,7 +4,7 @@
 //! Invariants: 1. the parts are a function of the rows in their order and of the given positions; 2. rows keep their
 //! relative order; 3. the ids of the parts follow lineage, and the parts are ordered by id.
 
-use super::partition::{PointBox, PointRow, axis_key};
+use super::partition::{PointRow, axis_key, box_of};
 use super::state::SceneState;
 use crate::base::ids::PageId;
 
@@ -60,7 +60,7 @@ fn cut(
         return Ok(());
     }
     let [low_id, high_id] = id.children().ok_or(SplitTooDeep { page: id })?;
-    let axis = PointBox::of(&entries).longest_axis();
+    let axis = box_of(&entries).longest_axis();
     let middle = entries.len() / 2;
     entries.select_nth_unstable_by_key(middle, |e| axis_key(e, axis));
     let high = entries.split_off(middle);

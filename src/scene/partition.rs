@@ -11,6 +11,7 @@
 //! themselves); 3. the result is a function of positions and sizes, not of threads: equal coordinates are ordered by
 //! row; 4. the rows of a page ascend.
 
+use super::point_box::PointBox;
 use super::select::{RankSearch, float_key};
 use rayon::prelude::*;
 use std::ops::Range;
@@ -194,7 +195,7 @@ impl Pages {
         }
         let middle = Pages::middle(&range);
         let at = self.start(middle) - self.start(range.start);
-        let axis = PointBox::of(entries).longest_axis();
+        let axis = box_of(entries).longest_axis();
         entries.select_nth_unstable_by_key(at, |e| axis_key(e, axis));
         let serial = entries.len() < SERIAL_BELOW;
         let (low, high) = entries.split_at_mut(at);
@@ -208,58 +209,17 @@ impl Pages {
     }
 }
 
+/// The box of all entries.
+pub fn box_of<E: Placed>(entries: &[E]) -> PointBox {
+    if entries.len() >= 8 * SERIAL_BELOW {
+        return entries.par_chunks(SERIAL_BELOW).map(box_of).reduce(|| PointBox::EMPTY, PointBox::union);
+    }
+    PointBox::of(entries.iter().map(E::point))
+}
+
 /// Key that orders rows along an axis, equal coordinates by row.
 pub fn axis_key<E: Placed>(entry: &E, axis: usize) -> u64 {
     u64::from(float_key(entry.point()[axis])) << 32 | u64::from(entry.row())
-}
-
-/// The bounding box of some points.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PointBox {
-    /// Lower corner; greater than `hi` without points.
-    pub lo: [f32; 3],
-    /// Upper corner.
-    pub hi: [f32; 3],
-}
-
-impl PointBox {
-    /// The box of no points.
-    pub const EMPTY: PointBox = PointBox { lo: [f32::INFINITY; 3], hi: [f32::NEG_INFINITY; 3] };
-
-    /// The box of all entries.
-    pub fn of<E: Placed>(entries: &[E]) -> PointBox {
-        if entries.len() >= 8 * SERIAL_BELOW {
-            let parts = entries.par_chunks(SERIAL_BELOW).map(PointBox::of);
-            return parts.reduce(|| PointBox::EMPTY, PointBox::union);
-        }
-        let mut all = PointBox::EMPTY;
-        entries.iter().for_each(|e| all.add(e.point()));
-        all
-    }
-
-    /// Extends the box to include a point.
-    pub fn add(&mut self, point: [f32; 3]) {
-        for i in 0..3 {
-            self.lo[i] = self.lo[i].min(point[i]);
-            self.hi[i] = self.hi[i].max(point[i]);
-        }
-    }
-
-    /// The smallest box that contains both.
-    #[must_use]
-    pub fn union(mut self, other: PointBox) -> PointBox {
-        for i in 0..3 {
-            self.lo[i] = self.lo[i].min(other.lo[i]);
-            self.hi[i] = self.hi[i].max(other.hi[i]);
-        }
-        self
-    }
-
-    /// The longest axis of the box; the first of equal ones.
-    pub fn longest_axis(&self) -> usize {
-        let extent = |i: usize| self.hi[i] - self.lo[i];
-        (1..3).fold(0, |widest, i| if extent(i) > extent(widest) { i } else { widest })
-    }
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@
 //! first row; 3. splitting a view gives disjoint views, so rows can be processed in parallel without locks; 4. a
 //! [`RowBlock`] holds one whole row in a fixed order of lanes, whatever the degree; unused lanes are zero.
 
-use super::columns::{Column, sh_n_width};
+use super::columns::{Column, ColumnSet, Columns};
 
 /// Floats of a [`RowBlock`]: 16 for the narrow columns, those of fixed width (14 used), 48 for `sh_n` (45 used at
 /// degree 3).
@@ -30,41 +30,22 @@ pub const fn first_lane(column: Column) -> usize {
 }
 
 /// Shared view of the columns of some rows; each slice is `[rows][width]`.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct ColumnsRef<'a> {
-    /// Degree that `sh_n` is stored with.
-    pub sh_degree: u8,
-    /// `[rows][3]`.
-    pub means: &'a [f32],
-    /// `[rows][4]`, w x y z.
-    pub quats: &'a [f32],
-    /// `[rows][3]`, log.
-    pub scales: &'a [f32],
-    /// `[rows]`, logit.
-    pub opacities: &'a [f32],
-    /// `[rows][3]`.
-    pub sh0: &'a [f32],
-    /// `[rows][(degree + 1)^2 - 1][3]`.
-    pub sh_n: &'a [f32],
-}
+pub type ColumnsRef<'a> = ColumnSet<&'a [f32]>;
 
 /// Exclusive view of the columns of some rows; each slice is `[rows][width]`.
-#[derive(Debug)]
-pub struct ColumnsMut<'a> {
-    /// Degree that `sh_n` is stored with.
-    pub sh_degree: u8,
-    /// `[rows][3]`.
-    pub means: &'a mut [f32],
-    /// `[rows][4]`, w x y z.
-    pub quats: &'a mut [f32],
-    /// `[rows][3]`, log.
-    pub scales: &'a mut [f32],
-    /// `[rows]`, logit.
-    pub opacities: &'a mut [f32],
-    /// `[rows][3]`.
-    pub sh0: &'a mut [f32],
-    /// `[rows][(degree + 1)^2 - 1][3]`.
-    pub sh_n: &'a mut [f32],
+pub type ColumnsMut<'a> = ColumnSet<&'a mut [f32]>;
+
+impl Columns {
+    /// A shared view of all rows.
+    pub fn view(&self) -> ColumnsRef<'_> {
+        let Columns { sh_degree, means, quats, scales, opacities, sh0, sh_n } = self;
+        ColumnSet { sh_degree: *sh_degree, means, quats, scales, opacities, sh0, sh_n }
+    }
+
+    /// A mutable view of all rows.
+    pub fn view_mut(&mut self) -> ColumnsMut<'_> {
+        self.each_mut().map(|_, values| values.as_mut_slice())
+    }
 }
 
 impl<'a> ColumnsRef<'a> {
@@ -75,37 +56,13 @@ impl<'a> ColumnsRef<'a> {
 
     /// The values of one column, `[rows][width]`.
     pub fn column(&self, column: Column) -> &'a [f32] {
-        match column {
-            Column::Means => self.means,
-            Column::Quats => self.quats,
-            Column::Scales => self.scales,
-            Column::Opacities => self.opacities,
-            Column::Sh0 => self.sh0,
-            Column::ShN => self.sh_n,
-        }
+        self.get(column)
     }
 
     /// The rows before `row`, and the rest.
     pub fn split_at(self, row: usize) -> (ColumnsRef<'a>, ColumnsRef<'a>) {
-        let sh_degree = self.sh_degree;
-        let (means, means_b) = self.means.split_at(row * 3);
-        let (quats, quats_b) = self.quats.split_at(row * 4);
-        let (scales, scales_b) = self.scales.split_at(row * 3);
-        let (opacities, opacities_b) = self.opacities.split_at(row);
-        let (sh0, sh0_b) = self.sh0.split_at(row * 3);
-        let (sh_n, sh_n_b) = self.sh_n.split_at(row * sh_n_width(sh_degree));
-        (
-            ColumnsRef { sh_degree, means, quats, scales, opacities, sh0, sh_n },
-            ColumnsRef {
-                sh_degree,
-                means: means_b,
-                quats: quats_b,
-                scales: scales_b,
-                opacities: opacities_b,
-                sh0: sh0_b,
-                sh_n: sh_n_b,
-            },
-        )
+        let at = |column: Column| row * column.width(self.sh_degree);
+        (self.map(|column, values| &values[..at(column)]), self.map(|column, values| &values[at(column)..]))
     }
 
     /// Copies one row into the lanes of a block. `W` is the width of `sh_n`: constant, so that the copy takes a few
@@ -145,38 +102,20 @@ impl<'a> ColumnsMut<'a> {
     /// A shared view of the same rows.
     #[inline(always)]
     pub fn as_ref(&self) -> ColumnsRef<'_> {
-        ColumnsRef {
-            sh_degree: self.sh_degree,
-            means: self.means,
-            quats: self.quats,
-            scales: self.scales,
-            opacities: self.opacities,
-            sh0: self.sh0,
-            sh_n: self.sh_n,
-        }
+        let ColumnSet { sh_degree, means, quats, scales, opacities, sh0, sh_n } = self;
+        ColumnSet { sh_degree: *sh_degree, means, quats, scales, opacities, sh0, sh_n }
     }
 
     /// The rows before `row`, and the rest.
     pub fn split_at(self, row: usize) -> (ColumnsMut<'a>, ColumnsMut<'a>) {
         let sh_degree = self.sh_degree;
-        let (means, means_b) = self.means.split_at_mut(row * 3);
-        let (quats, quats_b) = self.quats.split_at_mut(row * 4);
-        let (scales, scales_b) = self.scales.split_at_mut(row * 3);
-        let (opacities, opacities_b) = self.opacities.split_at_mut(row);
-        let (sh0, sh0_b) = self.sh0.split_at_mut(row * 3);
-        let (sh_n, sh_n_b) = self.sh_n.split_at_mut(row * sh_n_width(sh_degree));
-        (
-            ColumnsMut { sh_degree, means, quats, scales, opacities, sh0, sh_n },
-            ColumnsMut {
-                sh_degree,
-                means: means_b,
-                quats: quats_b,
-                scales: scales_b,
-                opacities: opacities_b,
-                sh0: sh0_b,
-                sh_n: sh_n_b,
-            },
-        )
+        let mut rest = ColumnsMut { sh_degree, ..ColumnsMut::default() };
+        let front = self.map(|column, values| {
+            let (front, back) = values.split_at_mut(row * column.width(sh_degree));
+            *rest.get_mut(column) = back;
+            front
+        });
+        (front, rest)
     }
 
     /// Copies the lanes of a block into one row; `W` is the width of `sh_n`.
@@ -249,44 +188,46 @@ pub struct RowsMut<'a> {
     pub count: &'a mut [u32],
 }
 
-impl<'a> Rows<'a> {
-    /// Number of rows.
-    pub fn rows(&self) -> usize {
-        self.stamp.len()
-    }
+/// Shared and exclusive views are split alike: only the method that splits their slices differs.
+macro_rules! impl_rows {
+    ($View:ident, $split:ident) => {
+        impl<'a> $View<'a> {
+            /// Number of rows.
+            pub fn rows(&self) -> usize {
+                self.stamp.len()
+            }
 
-    /// The rows before `row`, and the rest.
-    pub fn split_at(self, row: usize) -> (Rows<'a>, Rows<'a>) {
-        let (columns, columns_b) = self.columns.split_at(row);
-        let (exp_avg, exp_avg_b) = self.exp_avg.split_at(row);
-        let (exp_avg_sq, exp_avg_sq_b) = self.exp_avg_sq.split_at(row);
-        let (stamp, stamp_b) = self.stamp.split_at(row);
-        let (uid, uid_b) = self.uid.split_at(row);
-        let (grad2d, grad2d_b) = self.grad2d.split_at(row);
-        let (count, count_b) = self.count.split_at(row);
-        let first_row = self.first_row;
-        (
-            Rows { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count },
-            Rows {
-                first_row: first_row + row,
-                columns: columns_b,
-                exp_avg: exp_avg_b,
-                exp_avg_sq: exp_avg_sq_b,
-                stamp: stamp_b,
-                uid: uid_b,
-                grad2d: grad2d_b,
-                count: count_b,
-            },
-        )
-    }
+            /// The rows before `row`, and the rest.
+            pub fn split_at(self, row: usize) -> ($View<'a>, $View<'a>) {
+                let (columns, columns_b) = self.columns.split_at(row);
+                let (exp_avg, exp_avg_b) = self.exp_avg.split_at(row);
+                let (exp_avg_sq, exp_avg_sq_b) = self.exp_avg_sq.split_at(row);
+                let (stamp, stamp_b) = self.stamp.$split(row);
+                let (uid, uid_b) = self.uid.$split(row);
+                let (grad2d, grad2d_b) = self.grad2d.$split(row);
+                let (count, count_b) = self.count.$split(row);
+                let front =
+                    $View { first_row: self.first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count };
+                let back = $View {
+                    first_row: self.first_row + row,
+                    columns: columns_b,
+                    exp_avg: exp_avg_b,
+                    exp_avg_sq: exp_avg_sq_b,
+                    stamp: stamp_b,
+                    uid: uid_b,
+                    grad2d: grad2d_b,
+                    count: count_b,
+                };
+                (front, back)
+            }
+        }
+    };
 }
 
-impl<'a> RowsMut<'a> {
-    /// Number of rows.
-    pub fn rows(&self) -> usize {
-        self.stamp.len()
-    }
+impl_rows!(Rows, split_at);
+impl_rows!(RowsMut, split_at_mut);
 
+impl RowsMut<'_> {
     /// A shared view of the same rows.
     pub fn as_ref(&self) -> Rows<'_> {
         Rows {
@@ -299,31 +240,6 @@ impl<'a> RowsMut<'a> {
             grad2d: self.grad2d,
             count: self.count,
         }
-    }
-
-    /// The rows before `row`, and the rest.
-    pub fn split_at(self, row: usize) -> (RowsMut<'a>, RowsMut<'a>) {
-        let (columns, columns_b) = self.columns.split_at(row);
-        let (exp_avg, exp_avg_b) = self.exp_avg.split_at(row);
-        let (exp_avg_sq, exp_avg_sq_b) = self.exp_avg_sq.split_at(row);
-        let (stamp, stamp_b) = self.stamp.split_at_mut(row);
-        let (uid, uid_b) = self.uid.split_at_mut(row);
-        let (grad2d, grad2d_b) = self.grad2d.split_at_mut(row);
-        let (count, count_b) = self.count.split_at_mut(row);
-        let first_row = self.first_row;
-        (
-            RowsMut { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count },
-            RowsMut {
-                first_row: first_row + row,
-                columns: columns_b,
-                exp_avg: exp_avg_b,
-                exp_avg_sq: exp_avg_sq_b,
-                stamp: stamp_b,
-                uid: uid_b,
-                grad2d: grad2d_b,
-                count: count_b,
-            },
-        )
     }
 }
 

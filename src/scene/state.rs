@@ -5,7 +5,7 @@
 //! rows are removed and appended in all vectors at once, and remaining rows keep their order.
 
 use super::columns::{Column, Columns, row_width};
-use super::rows::{ColumnsMut, ColumnsRef, Rows, RowsMut};
+use super::rows::{Rows, RowsMut};
 use rayon::prelude::*;
 use std::collections::TryReserveError;
 
@@ -67,9 +67,7 @@ impl SceneState {
     /// Bytes allocated by all vectors.
     pub fn bytes(&self) -> usize {
         let tables = [&self.columns, &self.exp_avg, &self.exp_avg_sq];
-        let floats: usize =
-            tables.iter().flat_map(|t| Column::ALL.map(|c| column_vec(t, c).capacity())).sum::<usize>() * 4;
-        floats
+        tables.map(Columns::bytes).iter().sum::<usize>()
             + self.stamp.capacity() * 4
             + self.uid.capacity() * 8
             + self.grad2d.capacity() * 4
@@ -144,8 +142,10 @@ impl SceneState {
         }
         let sh_degree = self.sh_degree();
         let SceneState { columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count } = self;
-        let floats = [columns, exp_avg, exp_avg_sq].into_iter().flat_map(column_vecs);
-        let mut floats: Vec<(usize, &mut Vec<f32>)> = floats.map(|(c, v)| (c.width(sh_degree), v)).collect();
+        let mut floats: Vec<(usize, &mut Vec<f32>)> = Vec::new();
+        for table in [columns, exp_avg, exp_avg_sq] {
+            table.each_mut().map(|column, values| floats.push((column.width(sh_degree), values)));
+        }
         floats.push((1, grad2d));
         floats.par_iter_mut().for_each(|(width, values)| remove_runs(values, *width, removed));
         remove_runs(stamp, 1, removed);
@@ -161,8 +161,8 @@ impl SceneState {
     pub fn try_reserve_exact(&mut self, more: usize) -> Result<(), TryReserveError> {
         let sh_degree = self.sh_degree();
         for table in [&mut self.columns, &mut self.exp_avg, &mut self.exp_avg_sq] {
-            for (column, values) in column_vecs(table) {
-                values.try_reserve_exact(more.saturating_mul(column.width(sh_degree)))?;
+            for column in Column::ALL {
+                table.get_mut(column).try_reserve_exact(more.saturating_mul(column.width(sh_degree)))?;
             }
         }
         self.stamp.try_reserve_exact(more)?;
@@ -218,56 +218,6 @@ impl SceneState {
         self.grad2d.extend_from_slice(&other.grad2d);
         self.count.extend_from_slice(&other.count);
     }
-}
-
-impl Columns {
-    /// A shared view of all rows.
-    pub fn view(&self) -> ColumnsRef<'_> {
-        ColumnsRef {
-            sh_degree: self.sh_degree,
-            means: &self.means,
-            quats: &self.quats,
-            scales: &self.scales,
-            opacities: &self.opacities,
-            sh0: &self.sh0,
-            sh_n: &self.sh_n,
-        }
-    }
-
-    /// A mutable view of all rows.
-    pub fn view_mut(&mut self) -> ColumnsMut<'_> {
-        ColumnsMut {
-            sh_degree: self.sh_degree,
-            means: &mut self.means,
-            quats: &mut self.quats,
-            scales: &mut self.scales,
-            opacities: &mut self.opacities,
-            sh0: &mut self.sh0,
-            sh_n: &mut self.sh_n,
-        }
-    }
-}
-
-fn column_vec(columns: &Columns, column: Column) -> &Vec<f32> {
-    match column {
-        Column::Means => &columns.means,
-        Column::Quats => &columns.quats,
-        Column::Scales => &columns.scales,
-        Column::Opacities => &columns.opacities,
-        Column::Sh0 => &columns.sh0,
-        Column::ShN => &columns.sh_n,
-    }
-}
-
-fn column_vecs(columns: &mut Columns) -> [(Column, &mut Vec<f32>); 6] {
-    [
-        (Column::Means, &mut columns.means),
-        (Column::Quats, &mut columns.quats),
-        (Column::Scales, &mut columns.scales),
-        (Column::Opacities, &mut columns.opacities),
-        (Column::Sh0, &mut columns.sh0),
-        (Column::ShN, &mut columns.sh_n),
-    ]
 }
 
 /// Closes the gaps of removed rows, with one move per run of remaining rows.

@@ -5,7 +5,7 @@
 //!
 //! | who | may delete | only if |
 //! | --- | --- | --- |
-//! | a run that begins with `--spill-dir P` | the store in `P` | the store holds no commit ([`crate::page::folder::uncommitted`]) |
+//! | a run that begins with `--spill-dir P` | the store in `P` | the store holds no commit ([`crate::page::tool::uncommitted`]) |
 //! | a run in memory, at its first commit | the store in `OUT/checkpoint` | the store holds no commit |
 //! | a run that ends, `--keep-checkpoint` absent | the store that it made or resumed from | this process holds the store's lock, and FORMAT has the store's identity |
 //! | a run that is refused or fails before its first commit | the store that it made | as above |
@@ -28,8 +28,8 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{RunIdentity, RunState};
 use crate::page::folder::spill_dir::SpillDir;
-use crate::page::folder::uncommitted::remove_uncommitted;
 use crate::page::tool::reading::{Access, StoreReader, WitnessRule};
+use crate::page::tool::uncommitted::remove_uncommitted;
 use std::path::Path;
 
 /// Refuses the checkpoint of another run.

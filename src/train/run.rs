@@ -35,7 +35,7 @@ use crate::config::residence::Residence;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyWritten};
-use crate::page::folder::uncommitted::remove_uncommitted;
+use crate::page::tool::uncommitted::remove_uncommitted;
 use crate::render::Renderer;
 use crate::report::run_report::{PAGES_FILE, write_run_report};
 use crate::scene::partition::first_fill;

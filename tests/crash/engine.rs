@@ -5,7 +5,7 @@
 use crate::disk::{Disk, DiskFile, Rng};
 use gsscale::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use gsscale::page::engine::segment_files::segment_file_name;
-use gsscale::page::map::mutants::{Mutant, active};
+use gsscale::page::mutants::{Mutant, active};
 use redb::StorageBackend;
 use std::collections::BTreeMap;
 use std::io;

@@ -1,7 +1,7 @@
 //! Deliberate mistakes in the protocol: the simulator must notice every one.
 
 use crate::random::{Counts, run_seed};
-use gsscale::page::map::mutants::{Mutant, choose};
+use gsscale::page::mutants::{Mutant, choose};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// All of them.

@@ -10,8 +10,9 @@ use super::spool::{Spool, SpoolSpace, SpoolWriter};
 use super::{Budget, CloudPoint};
 use crate::base::error::InputResult;
 use crate::scene::init::rms_distance;
-use crate::scene::neighbours::{Bounds, NEIGHBOURS, NeighbourTree, merged};
+use crate::scene::neighbours::{NEIGHBOURS, NeighbourTree, merged};
 use crate::scene::partition::Pages;
+use crate::scene::point_box::PointBox;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -70,7 +71,7 @@ impl Search<'_> {
         Ok(self.points.range(block.clone())?.iter().map(|p| p.point).collect())
     }
 
-    fn search_own_blocks(&mut self) -> InputResult<Vec<Bounds>> {
+    fn search_own_blocks(&mut self) -> InputResult<Vec<PointBox>> {
         let mut own = SpoolWriter::new(self.space);
         let mut bounds = Vec::with_capacity(self.blocks.len());
         for block in &self.blocks {
@@ -83,7 +84,7 @@ impl Search<'_> {
     }
 
     /// The queries of all points whose third neighbour is farther than another block's box.
-    fn query_other_blocks(&self, bounds: &[Bounds]) -> InputResult<Spool<Query>> {
+    fn query_other_blocks(&self, bounds: &[PointBox]) -> InputResult<Spool<Query>> {
         let mut queries = SpoolWriter::new(self.space);
         for (from, block) in self.blocks.iter().enumerate() {
             let (points, own) = (self.positions(block)?, self.own.range(block.clone())?);

@@ -4,7 +4,8 @@
 
 use super::spool::{Spool, SpoolSpace, SpoolWriter};
 use crate::base::error::InputResult;
-use crate::scene::partition::{Pages, Placed, PointBox, axis_key};
+use crate::scene::partition::{Pages, Placed, axis_key};
+use crate::scene::point_box::PointBox;
 use crate::scene::select::RankSearch;
 use bytemuck::Pod;
 use std::ops::Range;

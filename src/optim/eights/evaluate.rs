@@ -3,7 +3,7 @@
 //! Not here: rows whose values eps affects, and the last row of a table; the code shared by all paths evaluates them
 //! one by one. Invariant: the bits are those of [`EvaluateRows`] as a plain loop.
 
-use super::super::deferred::AdamNow;
+use super::super::adam_now::AdamNow;
 use super::super::drift::EpsFloor;
 use super::super::row_kernels::{AHEAD, EvaluateRows, evaluate_alone};
 use super::super::row_vectors::{Table, TableMut, start_of_eight};

@@ -5,8 +5,8 @@
 //! Not here: the last listed row, and the rounding of 16-bit moments, which use the code shared by all paths.
 //! Invariant: bits and counts are those of [`StepRows`] as a plain loop.
 
+use super::super::adam_now::StepCounts;
 use super::super::decay::Decay;
-use super::super::deferred::StepCounts;
 use super::super::row_kernels::{AHEAD, GradKind, LARGEST_GRAD, StepConstants, StepRows, finish_step};
 use super::super::row_vectors::{Table, TableMut, start_of_eight};
 use super::{BLOCK, Eights, Numbers, eight_mut, load, of_lanes};

@@ -5,9 +5,9 @@
 //! it is written, never uses huge pages, and returns all its memory when dropped; a buffer registered with a ring
 //! returns it when that ring is next used.
 
-#[cfg(target_os = "linux")]
-use crate::page::engine::registered::Registration;
 use memmap2::MmapMut;
+#[cfg(target_os = "linux")]
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// Alignment of memory, offsets and lengths that every drive accepts for direct I/O, bytes.
 pub const ALIGNMENT: usize = 4096;
@@ -23,6 +23,24 @@ pub struct PageBuffer {
     /// Its entry in the buffer table of the ring that transfers it.
     #[cfg(target_os = "linux")]
     pub(in crate::page) registration: Option<Registration>,
+}
+
+/// A buffer's entry in the buffer table of one ring; given up on drop.
+#[cfg(target_os = "linux")]
+#[derive(Debug)]
+pub(in crate::page) struct Registration {
+    pub number: u16,
+    /// Bytes that the kernel has pinned, from the start of the buffer.
+    pub bytes: usize,
+    /// Indices of the table whose buffers were dropped, on any thread.
+    pub ended: Arc<Mutex<Vec<u16>>>,
+}
+
+#[cfg(target_os = "linux")]
+impl Drop for Registration {
+    fn drop(&mut self) {
+        self.ended.lock().unwrap_or_else(PoisonError::into_inner).push(self.number);
+    }
 }
 
 enum Memory {
@@ -73,13 +91,9 @@ impl PageBuffer {
     }
 
     /// Bytes of the buffer.
+    #[allow(clippy::len_without_is_empty)] // nobody asks
     pub fn len(&self) -> usize {
         self.len
-    }
-
-    /// Whether the buffer has no bytes.
-    pub fn is_empty(&self) -> bool {
-        self.len == 0
     }
 
     /// All bytes.
@@ -115,6 +129,7 @@ mod tests {
             let buffers: Vec<PageBuffer> = [0, 1, 4096, 749_568].map(make).into();
             for (buffer, len) in buffers.iter().zip([0, 4096, 4096, 749_568]) {
                 assert_eq!(buffer.len(), len);
+                assert!(!buffer.is_mapped() || len >= MAPPED_LEAST);
                 assert_eq!(buffer.as_slice().as_ptr().align_offset(ALIGNMENT), 0);
                 assert!(buffer.as_slice().iter().all(|&b| b == 0));
             }
@@ -123,11 +138,5 @@ mod tests {
             assert_eq!(boxed[3].as_slice().as_ptr().align_offset(ALIGNMENT), 0);
             assert_eq!(boxed[3].as_slice()[749_567], 7);
         }
-    }
-
-    #[test]
-    fn small_buffers_and_empty_ones_are_not_mapped() {
-        let is_mapped = |bytes| PageBuffer::mapped(bytes).is_mapped();
-        assert_eq!([0, 4096, 32 << 10, 749_568].map(is_mapped), [false, false, true, true]);
     }
 }

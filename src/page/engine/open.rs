@@ -5,9 +5,8 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::page::engine::memory::MemoryEngine;
-use crate::page::engine::mmap::MmapEngine;
 use crate::page::engine::page_engine::PageEngine;
-use crate::page::engine::pread::PreadEngine;
+use crate::page::engine::threaded::ThreadedEngine;
 use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
@@ -91,7 +90,7 @@ pub fn open_engine(engine: IoEngine, folder: &Path, depth: usize) -> InputResult
     // An unusable folder is reported here, so that later failures are the engine's own.
     std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "opening the folder of pages", &e))?;
     let store: Box<dyn PageEngine> = match engine {
-        IoEngine::Mmap => Box::new(MmapEngine::open(folder, depth).map_err(|e| not_opened(engine, &e))?),
+        IoEngine::Mmap => Box::new(ThreadedEngine::mmap(folder, depth).map_err(|e| not_opened(engine, &e))?),
         IoEngine::Pread => open_pread(folder, depth, &mut notes)?,
         IoEngine::Uring => open_uring(folder, depth, &mut notes).map_err(|e| not_opened(engine, &e))?,
         _ => match open_uring(folder, depth, &mut notes) {
@@ -135,7 +134,7 @@ fn open_uring(_folder: &Path, _depth: usize, _notes: &mut Vec<String>) -> std::i
 }
 
 fn open_pread(folder: &Path, depth: usize, notes: &mut Vec<String>) -> InputResult<Box<dyn PageEngine>> {
-    let store = PreadEngine::open(folder, depth, true).map_err(|e| not_opened(IoEngine::Pread, &e))?;
+    let store = ThreadedEngine::pread(folder, depth, true).map_err(|e| not_opened(IoEngine::Pread, &e))?;
     note_buffered(store.is_direct(), notes);
     Ok(Box::new(store))
 }

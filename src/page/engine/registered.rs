@@ -15,7 +15,7 @@
 //! to nobody else. Requests name addresses within the entry's buffer, which their flight owns.
 #![allow(unsafe_code)] // the table takes addresses of buffers
 
-use crate::page::engine::buffer::PageBuffer;
+use crate::page::engine::buffer::{PageBuffer, Registration};
 use io_uring::Submitter;
 use std::io;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -28,24 +28,6 @@ const BYTES_MAX: usize = 1 << 30;
 /// Refusals by the kernel before registration pauses.
 const REFUSALS_MAX: u32 = 8;
 
-/// Indices whose buffers were dropped, on any thread.
-type Ended = Arc<Mutex<Vec<u16>>>;
-
-/// A buffer's entry in the table of one ring; given up on drop.
-#[derive(Debug)]
-pub struct Registration {
-    number: u16,
-    /// Bytes that the kernel has pinned, from the start of the buffer.
-    bytes: usize,
-    ended: Ended,
-}
-
-impl Drop for Registration {
-    fn drop(&mut self) {
-        self.ended.lock().unwrap_or_else(PoisonError::into_inner).push(self.number);
-    }
-}
-
 /// The table of registered buffers of one ring.
 #[derive(Debug, Default)]
 pub struct RegisteredBuffers {
@@ -57,7 +39,8 @@ pub struct RegisteredBuffers {
     used: u16,
     /// Handed-out indices that are free again.
     clear: Vec<u16>,
-    ended: Ended,
+    /// Indices whose buffers were dropped, on any thread.
+    ended: Arc<Mutex<Vec<u16>>>,
 }
 
 impl RegisteredBuffers {

@@ -1,4 +1,4 @@
-//! Resumes transfers of which the system moved only a part.
+//! Completes transfers of which the system moved only a part.
 //!
 //! Every engine drives its requests with a [`Resume`]: a short transfer continues where it ended, an interrupted one is
 //! tried again, and one that makes no progress ends with an error instead of looping forever.
@@ -8,14 +8,20 @@
 //! progress are tolerated.
 
 use crate::page::engine::buffer::ALIGNMENT;
-use crate::page::engine::page_engine::Direction;
+use crate::page::engine::page_engine::{Direction, Transfer};
+use std::fs::File;
 use std::io;
+#[cfg(unix)]
+use std::os::unix::fs::FileExt;
+#[cfg(windows)]
+use std::os::windows::fs::FileExt;
+use std::time::Duration;
 
 /// Most outcomes in a row without progress.
-pub const TRIES_MAX: u8 = 32;
-/// `ECANCELED` and `EFAULT` on Linux: the ring returns them for requests whose thread ended. Such a request is cancelled, or the
-/// kernel continues it where the process's memory is not mapped. Buffers stay mapped until their transfer ends, so the
-/// request may be sent again.
+const TRIES_MAX: u8 = 32;
+/// `ECANCELED` and `EFAULT` on Linux: the ring returns them for requests whose thread ended. Such a request is
+/// cancelled, or the kernel continues it where the process's memory is not mapped. Buffers stay mapped until their
+/// transfer ends, so the request may be sent again.
 const THREAD_ENDED: [i32; 2] = [125, 14];
 
 /// Progress of one request.
@@ -34,37 +40,34 @@ impl Resume {
     /// # Errors
     /// The outcome's error if a retry cannot help; `UnexpectedEof` or `WriteZero` at the end of the file.
     pub fn advance(&mut self, direction: Direction, outcome: io::Result<usize>, total: usize) -> io::Result<bool> {
-        match outcome {
-            Ok(0) if self.done < total => Err(match direction {
-                Direction::Read => io::Error::new(io::ErrorKind::UnexpectedEof, "the file ends before the page does"),
-                Direction::Write => io::Error::new(io::ErrorKind::WriteZero, "the drive accepts no more bytes"),
-            }),
+        let error = match outcome {
+            Ok(0) if self.done < total => {
+                return Err(match direction {
+                    Direction::Read => {
+                        io::Error::new(io::ErrorKind::UnexpectedEof, "the file ends before the page does")
+                    }
+                    Direction::Write => io::Error::new(io::ErrorKind::WriteZero, "the drive accepts no more bytes"),
+                });
+            }
+            Ok(moved) if self.done + moved >= total => {
+                self.done = total;
+                return Ok(true);
+            }
             Ok(moved) => {
                 let reached = self.done + moved;
-                if reached >= total {
-                    self.done = total;
-                    return Ok(true);
-                }
                 let whole = reached - reached % ALIGNMENT;
                 if whole > self.done {
                     *self = Resume { done: whole, tries: 0 };
                     return Ok(false);
                 }
-                self.try_again(|| {
-                    io::Error::new(
-                        io::ErrorKind::TimedOut,
-                        "the drive makes no progress: it moves only parts of a block",
-                    )
-                })
+                let problem = "the drive makes no progress: it moves only parts of a block";
+                io::Error::new(io::ErrorKind::TimedOut, problem)
             }
-            Err(error) if may_pass(&error) => self.try_again(|| error),
-            Err(error) => Err(error),
-        }
-    }
-
-    fn try_again(&mut self, error: impl FnOnce() -> io::Error) -> io::Result<bool> {
+            Err(error) if may_pass(&error) => error,
+            Err(error) => return Err(error),
+        };
         self.tries += 1;
-        if self.tries > TRIES_MAX { Err(error()) } else { Ok(false) }
+        if self.tries > TRIES_MAX { Err(error) } else { Ok(false) }
     }
 }
 
@@ -74,33 +77,60 @@ fn may_pass(error: &io::Error) -> bool {
         || (cfg!(target_os = "linux") && error.raw_os_error().is_some_and(|raw| THREAD_ENDED.contains(&raw)))
 }
 
+/// Carries out a whole transfer with blocking calls.
+///
+/// # Errors
+/// The drive's I/O errors; `UnexpectedEof` if the file ends too early.
+pub fn move_bytes(file: &File, transfer: &mut Transfer) -> io::Result<()> {
+    move_parts(transfer, |direction, bytes, at| match direction {
+        #[cfg(unix)]
+        Direction::Read => file.read_at(bytes, at),
+        #[cfg(unix)]
+        Direction::Write => file.write_at(bytes, at),
+        #[cfg(windows)]
+        Direction::Read => file.seek_read(bytes, at),
+        #[cfg(windows)]
+        Direction::Write => file.seek_write(bytes, at),
+    })
+}
+
+/// Calls `move_part` with the rest of a transfer, as (direction, bytes, their place in the file), until all bytes have
+/// moved.
+fn move_parts(
+    transfer: &mut Transfer,
+    mut move_part: impl FnMut(Direction, &mut [u8], u64) -> io::Result<usize>,
+) -> io::Result<()> {
+    let (direction, total, start) = (transfer.direction, transfer.bytes, transfer.place.offset);
+    let mut resume = Resume::default();
+    while resume.done < total {
+        let rest = &mut transfer.buffer.as_mut_slice()[resume.done..total];
+        let outcome = move_part(direction, rest, start + resume.done as u64);
+        resume.advance(direction, outcome, total)?;
+        if resume.tries > 1 {
+            std::thread::sleep(Duration::from_micros(50 * u64::from(resume.tries)));
+        }
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use crate::base::rng::{Purpose, Stream};
+    use crate::page::engine::buffer::PageBuffer;
+    use crate::page::engine::page_engine::Place;
 
-    #[test]
-    fn a_short_transfer_resumes_at_the_last_whole_block() {
-        let mut resume = Resume::default();
-        let total = 6 * ALIGNMENT;
-        assert!(!resume.advance(Direction::Write, Ok(ALIGNMENT + 512), total).unwrap());
-        assert_eq!(resume.done, ALIGNMENT);
-        assert!(!resume.advance(Direction::Write, Ok(2 * ALIGNMENT), total).unwrap());
-        assert_eq!(resume.done, 3 * ALIGNMENT);
-        assert!(resume.advance(Direction::Write, Ok(3 * ALIGNMENT), total).unwrap());
-        assert_eq!(resume.done, total);
-    }
+    const BYTES: usize = 37 * ALIGNMENT;
+    const OFFSET: usize = 3 * ALIGNMENT;
 
     #[test]
     fn a_transfer_without_progress_ends_with_an_error() {
         for raw in [4, 11, 125, 14] {
             let mut resume = Resume::default();
-            let again = || Err(io::Error::from_raw_os_error(raw));
-            for _ in 0..TRIES_MAX {
-                assert!(!resume.advance(Direction::Read, again(), ALIGNMENT).unwrap());
-            }
-            let end = resume.advance(Direction::Read, again(), ALIGNMENT).unwrap_err();
-            assert_eq!(end.raw_os_error(), Some(raw));
+            let mut again = || resume.advance(Direction::Read, Err(io::Error::from_raw_os_error(raw)), ALIGNMENT);
+            assert!((0..TRIES_MAX).all(|_| !again().unwrap()));
+            assert_eq!(again().unwrap_err().raw_os_error(), Some(raw));
         }
         let mut resume = Resume::default();
         let end = (0..=TRIES_MAX).map(|_| resume.advance(Direction::Read, Ok(100), ALIGNMENT)).find_map(Result::err);
@@ -109,13 +139,59 @@ mod tests {
 
     #[test]
     fn end_of_file_and_lasting_errors_are_reported_at_once() {
-        let mut resume = Resume::default();
-        let end = resume.advance(Direction::Read, Ok(0), ALIGNMENT).unwrap_err();
-        assert_eq!(end.kind(), io::ErrorKind::UnexpectedEof);
-        let end = resume.advance(Direction::Write, Ok(0), ALIGNMENT).unwrap_err();
-        assert_eq!(end.kind(), io::ErrorKind::WriteZero);
-        let end = resume.advance(Direction::Read, Err(io::Error::from_raw_os_error(5)), ALIGNMENT).unwrap_err();
-        assert_eq!(end.raw_os_error(), Some(5));
-        assert_eq!(resume.tries, 0);
+        let end = |direction, outcome| Resume::default().advance(direction, outcome, ALIGNMENT).unwrap_err();
+        assert_eq!(end(Direction::Read, Ok(0)).kind(), io::ErrorKind::UnexpectedEof);
+        assert_eq!(end(Direction::Write, Ok(0)).kind(), io::ErrorKind::WriteZero);
+        assert_eq!(end(Direction::Read, Err(io::Error::from_raw_os_error(5))).raw_os_error(), Some(5));
+    }
+
+    /// Carries out a transfer against `drive`, which moves few bytes at a time and interrupts often. Returns the number
+    /// of calls.
+    fn move_in_parts(transfer: &mut Transfer, drive: &mut [u8], draws: &mut Stream) -> usize {
+        let mut asked = 0;
+        let moved = move_parts(transfer, |direction, bytes, at| {
+            asked += 1;
+            match asked % 4 {
+                1 => return Err(io::Error::from(io::ErrorKind::Interrupted)),
+                2 => return Err(io::Error::from(io::ErrorKind::WouldBlock)),
+                _ => {}
+            }
+            // Sometimes less than a block: the rest of a partial block moves again, and progress comes before the limit
+            // on tries.
+            let count =
+                (draws.below(4) as usize * ALIGNMENT + 1 + draws.below(ALIGNMENT as u64) as usize).min(bytes.len());
+            let there = &mut drive[at as usize..][..count];
+            match direction {
+                Direction::Read => bytes[..count].copy_from_slice(there),
+                Direction::Write => there.copy_from_slice(&bytes[..count]),
+            }
+            Ok(count)
+        });
+        moved.unwrap();
+        asked
+    }
+
+    #[test]
+    fn a_transfer_in_interrupted_parts_arrives_whole() {
+        for seed in 0..50 {
+            let mut draws = Stream::new(seed, Purpose::Test, 0, 0);
+            let mut drive: Vec<u8> = (0..OFFSET + BYTES + ALIGNMENT).map(|_| draws.next_u64() as u8).collect();
+            let before = drive.clone();
+            let place = Place { segment: 0, offset: OFFSET as u64 };
+            // The buffer is longer than the transfer.
+            let buffer = PageBuffer::zeroed(BYTES + ALIGNMENT);
+            let mut transfer = Transfer { token: 1, direction: Direction::Read, place, bytes: BYTES, buffer };
+            let asked = move_in_parts(&mut transfer, &mut drive, &mut draws);
+            assert!(asked > 30, "asked {asked} times: too easy");
+            let (moved, rest) = transfer.buffer.as_slice().split_at(BYTES);
+            assert!(drive == before && *moved == before[OFFSET..OFFSET + BYTES], "seed {seed}: other bytes were read");
+            assert!(rest.iter().all(|&b| b == 0));
+            transfer.buffer.as_mut_slice().iter_mut().for_each(|b| *b = !*b);
+            transfer.direction = Direction::Write;
+            move_in_parts(&mut transfer, &mut drive, &mut draws);
+            let is_right =
+                |(i, b): (usize, &u8)| *b == if (OFFSET..OFFSET + BYTES).contains(&i) { !before[i] } else { before[i] };
+            assert!(drive.iter().enumerate().all(is_right), "seed {seed}: other bytes were written");
+        }
     }
 }

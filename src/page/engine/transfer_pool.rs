@@ -6,57 +6,47 @@
 //! 2. dropping the pool carries out all submitted transfers and then ends the threads.
 
 use crate::page::engine::page_engine::{Completion, Transfer};
-use std::collections::VecDeque;
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
 /// A pool of threads that carry out transfers.
 pub struct TransferPool {
-    shared: Arc<Shared>,
+    /// `None` once the pool ends.
+    queue: Option<Sender<Transfer>>,
+    done: Receiver<Completion>,
     workers: Vec<JoinHandle<()>>,
     in_flight: usize,
 }
 
-type Work = dyn Fn(&mut Transfer) -> io::Result<()> + Send + Sync;
-
-struct Shared {
-    work: Box<Work>,
-    queue: Mutex<Queue>,
-    /// Notified when a transfer is queued and when the pool ends.
-    waiting: Condvar,
-    /// Notified when a transfer has finished.
-    done: Condvar,
-}
-
-#[derive(Default)]
-struct Queue {
-    waiting: VecDeque<Transfer>,
-    done: Vec<Completion>,
-    ended: bool,
-}
-
 impl TransferPool {
-    /// Starts `threads` threads (at least one) named `name` that do `work`.
-    ///
-    /// # Errors
-    /// The system refuses the first thread. Fewer threads than requested only make the pool slower.
+    /// Starts `threads` threads (at least one) named `name` that do `work`. Fails if the system refuses the first
+    /// thread; fewer threads than requested only make the pool slower.
     pub fn new(
         name: &str,
         threads: usize,
         work: impl Fn(&mut Transfer) -> io::Result<()> + Send + Sync + 'static,
     ) -> io::Result<TransferPool> {
-        let shared = Arc::new(Shared {
-            work: Box::new(work),
-            queue: Mutex::default(),
-            waiting: Condvar::new(),
-            done: Condvar::new(),
-        });
-        let mut pool = TransferPool { shared, workers: Vec::new(), in_flight: 0 };
+        let (queue, waiting) = channel::<Transfer>();
+        let (finished, done) = channel();
+        let (waiting, work) = (Arc::new(Mutex::new(waiting)), Arc::new(work));
+        let mut pool = TransferPool { queue: Some(queue), done, workers: Vec::new(), in_flight: 0 };
         for i in 0..threads.max(1) {
-            let shared = Arc::clone(&pool.shared);
-            match std::thread::Builder::new().name(format!("{name}-{i}")).spawn(move || shared.run_worker()) {
+            let (waiting, work, finished) = (Arc::clone(&waiting), Arc::clone(&work), finished.clone());
+            let run = move || {
+                loop {
+                    // One idle worker waits in `recv`, the others wait for its lock.
+                    let next = waiting.lock().unwrap_or_else(PoisonError::into_inner).recv();
+                    let Ok(mut transfer) = next else { return };
+                    let result = catch_unwind(AssertUnwindSafe(|| work(&mut transfer)))
+                        .unwrap_or_else(|_| Err(io::Error::other("an I/O thread panicked")));
+                    // The pool outlives its workers, and so does the receiver.
+                    let _ = finished.send(Completion { transfer, result });
+                }
+            };
+            match std::thread::Builder::new().name(format!("{name}-{i}")).spawn(run) {
                 Ok(worker) => pool.workers.push(worker),
                 Err(error) if pool.workers.is_empty() => return Err(error),
                 Err(_) => break,
@@ -67,19 +57,20 @@ impl TransferPool {
 
     /// Queues a transfer; transfers start in order of submission.
     pub fn submit(&mut self, transfer: Transfer) {
-        self.in_flight += 1;
-        self.shared.lock().waiting.push_back(transfer);
-        self.shared.waiting.notify_one();
+        // Workers end only after the queue, so that it accepts every transfer.
+        if self.queue.as_ref().is_some_and(|queue| queue.send(transfer).is_ok()) {
+            self.in_flight += 1;
+        }
     }
 
     /// Moves finished transfers to `done`. With `wait`, blocks until at least one has finished, if any is in flight.
     pub fn complete(&mut self, wait: bool, done: &mut Vec<Completion>) {
-        let mut queue = self.shared.lock();
-        while wait && self.in_flight > 0 && queue.done.is_empty() {
-            queue = self.shared.done.wait(queue).unwrap_or_else(PoisonError::into_inner);
+        let before = done.len();
+        done.extend(self.done.try_iter());
+        if wait && done.len() == before && self.in_flight > 0 {
+            done.extend(self.done.recv());
         }
-        self.in_flight -= queue.done.len();
-        done.append(&mut queue.done);
+        self.in_flight -= done.len() - before;
     }
 
     /// Submitted transfers whose completion has not been collected.
@@ -90,35 +81,10 @@ impl TransferPool {
 
 impl Drop for TransferPool {
     fn drop(&mut self) {
-        self.shared.lock().ended = true;
-        self.shared.waiting.notify_all();
+        self.queue = None;
         for worker in self.workers.drain(..) {
             // Workers catch the panics of their work, so there is no error to report.
             let _ = worker.join();
-        }
-    }
-}
-
-impl Shared {
-    fn lock(&self) -> MutexGuard<'_, Queue> {
-        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn run_worker(&self) {
-        let mut queue = self.lock();
-        loop {
-            if let Some(mut transfer) = queue.waiting.pop_front() {
-                drop(queue);
-                let result = catch_unwind(AssertUnwindSafe(|| (self.work)(&mut transfer)))
-                    .unwrap_or_else(|_| Err(io::Error::other("an I/O thread panicked")));
-                queue = self.lock();
-                queue.done.push(Completion { transfer, result });
-                self.done.notify_one();
-            } else if queue.ended {
-                return;
-            } else {
-                queue = self.waiting.wait(queue).unwrap_or_else(PoisonError::into_inner);
-            }
         }
     }
 }

@@ -20,7 +20,7 @@ use crate::page::engine::buffer::PageBuffer;
 use crate::page::engine::page_cache::{WriteBehind, drop_cached};
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use crate::page::engine::registered::RegisteredBuffers;
-use crate::page::engine::segment_io::{SegmentIo, too_many_files};
+use crate::page::engine::segment_files::{SegmentFiles, is_too_many_files};
 use crate::page::engine::short_transfers::Resume;
 use io_uring::{IoUring, opcode, squeue, types};
 use slab::Slab;
@@ -43,7 +43,7 @@ const SHORTAGES: [i32; 3] = [11, 16, 12];
 pub struct UringEngine {
     ring: IoUring,
     registered: RegisteredBuffers,
-    segments: SegmentIo,
+    segments: SegmentFiles,
     behind: WriteBehind,
     flights: Slab<Flight>,
     requests: Slab<Request>,
@@ -90,7 +90,7 @@ impl UringEngine {
         Ok(UringEngine {
             registered: RegisteredBuffers::of(&ring.submitter()),
             ring,
-            segments: SegmentIo::new(folder, direct)?,
+            segments: SegmentFiles::new(folder, direct)?,
             behind: WriteBehind::default(),
             flights: Slab::new(),
             requests: Slab::new(),
@@ -124,7 +124,7 @@ impl UringEngine {
             let Some(&id) = self.waiting.front() else { return };
             let flight_id = self.requests[id].flight;
             if let Err(error) = self.prepare(flight_id) {
-                if too_many_files(&error) && self.with_kernel > 0 {
+                if is_too_many_files(&error) && self.with_kernel > 0 {
                     return; // a completion will free a file descriptor
                 }
                 self.flights[flight_id].error.get_or_insert(error);

@@ -90,29 +90,6 @@ pub fn free_bytes(folder: &Path) -> io::Result<Option<u64>> {
 mod tests {
     use super::*;
 
-    #[test]
-    fn kinds_follow_from_their_number() {
-        let numbers = [
-            (0xef53, FileSystem::Local),      // ext4
-            (0x5846_5342, FileSystem::Local), // XFS
-            (0x9123_683e, FileSystem::Local), // Btrfs
-            (0x2fc1_2fc1, FileSystem::Local), // ZFS
-            (0x0102_1994, FileSystem::Memory),
-            (0x794c_7630, FileSystem::Overlay),
-            (0x6969, FileSystem::Remote("NFS")),
-            (0xff53_4d42, FileSystem::Remote("CIFS")),
-            (0x0102_1997, FileSystem::Remote("9p")),
-            (0x6573_5546, FileSystem::Remote("FUSE")),
-        ];
-        for (magic, kind) in numbers {
-            assert_eq!(FileSystem::from_magic(magic), kind, "{magic:#x}");
-        }
-        let mut all: Vec<u32> = KINDS.iter().map(|(number, _)| *number).collect();
-        all.sort_unstable();
-        all.dedup();
-        assert_eq!(all.len(), KINDS.len(), "a number stands twice");
-    }
-
     #[cfg(target_os = "linux")]
     #[test]
     fn memory_is_distinguished_from_drives() {

@@ -1,16 +1,27 @@
-//! The folder of a store as the commit protocol uses it: a few files by name, and syncs of folder entries.
+//! The folder of a store as the commit protocol uses it: a few files by name, the bytes of one file, and syncs of folder
+//! entries.
 //!
 //! Invariants: 1. an entry is durable only after [`Folder::sync`]; 2. names are the protocol's own constants, so
 //! nothing outside the folder is accessed; a symbolic link in place of a file is an error; 3. only the owner can access
 //! new files.
 
-use crate::page::engine::segment_files::{sync_folder, with_safe_flags};
-use crate::page::map::map_file::DriveFile;
+use crate::page::engine::segment_files::{allocate, sync_folder, with_safe_flags};
 use redb::StorageBackend;
-use std::fs::OpenOptions;
+use std::fs::{File, OpenOptions};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+
+/// File of the page map.
+pub const MAP_NAME: &str = "map.redb";
+/// File of the page map while it is created.
+pub const MAP_NEW_NAME: &str = "map.redb.new";
+/// File of the witness.
+pub const WITNESS_NAME: &str = "witness";
+/// File that reserves space for a last commit on a full drive.
+pub const RESERVE_NAME: &str = "reserve";
+/// The reserve while it is filled.
+pub const RESERVE_NEW_NAME: &str = "reserve.new";
 
 /// Files of one folder.
 pub trait Folder: Send {
@@ -78,13 +89,91 @@ impl Folder for DriveFolder {
     }
 
     fn remove(&self, name: &str) -> io::Result<()> {
-        match std::fs::remove_file(self.0.join(name)) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
-            _ => Ok(()),
-        }
+        std::fs::remove_file(self.0.join(name)).or_else(unless_missing)
     }
 
     fn sync(&self) -> io::Result<()> {
         sync_folder(&self.0)
+    }
+}
+
+/// The error, unless the file did not exist.
+pub(in crate::page) fn unless_missing(error: io::Error) -> io::Result<()> {
+    if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) }
+}
+
+/// A file on a drive. Growing allocates space, so that a full drive is detected before anything is overwritten.
+#[derive(Debug)]
+pub struct DriveFile(File);
+
+impl DriveFile {
+    /// `file` must be open for reading and writing.
+    pub fn new(file: File) -> DriveFile {
+        DriveFile(file)
+    }
+}
+
+impl StorageBackend for DriveFile {
+    fn len(&self) -> io::Result<u64> {
+        Ok(self.0.metadata()?.len())
+    }
+
+    #[cfg(unix)]
+    fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
+        std::os::unix::fs::FileExt::read_exact_at(&self.0, out, offset)
+    }
+
+    #[cfg(not(unix))]
+    fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
+        use std::io::{Read, Seek};
+        (&self.0).seek(io::SeekFrom::Start(offset))?;
+        (&self.0).read_exact(out)
+    }
+
+    fn set_len(&self, len: u64) -> io::Result<()> {
+        let now = self.0.metadata()?.len();
+        if len <= now {
+            return self.0.set_len(len);
+        }
+        allocate(&self.0, now, len).inspect_err(|_| {
+            // Space that was allocated before the drive was full is freed, as far as possible.
+            let _ = self.0.set_len(now);
+        })
+    }
+
+    fn sync_data(&self) -> io::Result<()> {
+        self.0.sync_data()
+    }
+
+    #[cfg(unix)]
+    fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
+        std::os::unix::fs::FileExt::write_all_at(&self.0, data, offset)
+    }
+
+    #[cfg(not(unix))]
+    fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
+        use std::io::{Seek, Write};
+        (&self.0).seek(io::SeekFrom::Start(offset))?;
+        (&self.0).write_all(data)
+    }
+}
+
+#[cfg(all(test, unix))]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_that_grows_takes_its_space() {
+        use std::os::unix::fs::MetadataExt;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map");
+        let open = File::options().read(true).write(true).create_new(true).open(&path).unwrap();
+        let file = DriveFile::new(open);
+        for (len, taken) in [(1 << 20, 1 << 20), (3 << 20, 3 << 20), (1 << 20, 1 << 20)] {
+            file.set_len(len).unwrap();
+            let there = std::fs::metadata(&path).unwrap();
+            assert!(there.len() == len && there.blocks() * 512 >= taken, "{} blocks", there.blocks());
+        }
     }
 }

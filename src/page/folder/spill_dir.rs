@@ -7,13 +7,14 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
-use crate::page::engine::drive_rate;
-use crate::page::engine::segment_files::{segment_from_file_name, sync_folder, with_safe_flags};
+use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, sync_folder, with_safe_flags};
+use crate::page::folder::drive_rate;
 use crate::page::folder::file_system::{FileSystem, free_bytes};
+use crate::page::folder::protocol_files::{
+    MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME, unless_missing,
+};
 use crate::page::format::slot_header::{HEADER_BYTES, SlotHeader};
-use crate::page::format::spill_format::{FORMAT_BYTES, FormatError, Purpose, SpillFormat};
-use crate::page::map::commit::{MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME};
-use crate::page::versions::slots::SlotLayout;
+use crate::page::format::spill_format::{FORMAT_BYTES, FormatError, Purpose, SlotLayout, SpillFormat};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
@@ -67,23 +68,19 @@ impl SpillDir {
         refuse_foreign_files(folder)?;
         let lock = take_lock(folder)?;
         // Checked again under the lock: another process may have created a store just now.
-        match read_format(folder)? {
-            None => {}
-            Some(Ok(SpillFormat { purpose: Purpose::Scratch, .. })) => {
-                let problem =
-                    "it holds the pages of an interrupted run without a checkpoint, which no other run can use";
-                let remedy = format!("remove the folder (rm -r {}) or {OTHER_FOLDER}", folder.display());
-                return Err(InputError::new(folder, problem, remedy));
-            }
-            Some(Ok(_)) => {
-                let remedy = format!(
-                    "continue that run (gsscale-train --resume with its output folder), remove the folder (rm -r {}) or \
-                     {OTHER_FOLDER}",
-                    folder.display()
-                );
-                return Err(InputError::new(folder, "it holds the checkpoint of another run", remedy));
-            }
-            Some(Err(error)) => return Err(bad_format(folder, &error)),
+        if let Some(SpillFormat { purpose, .. }) = read_format(folder)? {
+            let remove = format!("remove the folder (rm -r {}) or {OTHER_FOLDER}", folder.display());
+            let (problem, remedy) = match purpose {
+                Purpose::Scratch => (
+                    "it holds the pages of an interrupted run without a checkpoint, which no other run can use",
+                    remove,
+                ),
+                Purpose::Checkpoint => (
+                    "it holds the checkpoint of another run",
+                    format!("continue that run (gsscale-train --resume with its output folder), {remove}"),
+                ),
+            };
+            return Err(InputError::new(folder, problem, remedy));
         }
         make_private(folder)?;
         sign_lock(folder, &lock)?;
@@ -99,12 +96,10 @@ impl SpillDir {
     pub fn open(folder: &Path, allow_remote: bool) -> InputResult<SpillDir> {
         check_folder(folder)?;
         let warnings = check_file_system(folder, allow_remote)?;
-        let read = || match read_format(folder)? {
-            Some(format) => format.map_err(|error| bad_format(folder, &error)),
-            None => {
-                let remedy = "give the folder that was named by --spill-dir";
-                Err(InputError::new(folder, "it is not a spill directory: it has no FORMAT file", remedy))
-            }
+        let read = || {
+            let remedy = "give the folder that was named by --spill-dir";
+            let missing = || InputError::new(folder, "it is not a spill directory: it has no FORMAT file", remedy);
+            read_format(folder)?.ok_or_else(missing)
         };
         // The first read comes before the lock file is created, so that a foreign folder stays unchanged.
         read()?;
@@ -142,21 +137,19 @@ impl SpillDir {
         free_bytes(&self.folder).map_err(|e| InputError::io(&self.folder, "reading the free space", &e))
     }
 
-    /// Numbers of the existing segments, ascending.
+    /// Numbers of the existing segment files, ascending.
     ///
     /// # Errors
     /// The folder cannot be read.
     pub fn segments(&self) -> InputResult<Vec<u32>> {
-        let mut segments: Vec<u32> = names(&self.folder)?.iter().filter_map(|n| segment_from_file_name(n)).collect();
-        segments.sort_unstable();
-        Ok(segments)
+        Ok(segments_in(&self.folder)?.into_iter().map(|(segment, _)| segment).collect())
     }
 
     /// Refuses a folder whose lock or FORMAT file is no longer the one that this process holds: somebody removed the
     /// store and created another one under the same path.
     fn check_identity(&self) -> InputResult<()> {
         let is_same_lock = is_same_file(&self.folder.join(LOCK), &self.lock);
-        let is_same_store = matches!(read_format(&self.folder)?, Some(Ok(format)) if format.store == self.format.store);
+        let is_same_store = matches!(read_format(&self.folder)?, Some(format) if format.store == self.format.store);
         if is_same_lock && is_same_store {
             return Ok(());
         }
@@ -173,19 +166,10 @@ impl SpillDir {
     pub fn remove(self) -> InputResult<Vec<String>> {
         self.check_identity()?;
         let mut foreign = Vec::new();
-        let mut ours = [
-            MAP_NAME,
-            MAP_NEW_NAME,
-            WITNESS_NAME,
-            RESERVE_NAME,
-            RESERVE_NEW_NAME,
-            FORMAT_NEW,
-            FORMAT,
-            LOCK,
-            drive_rate::FILE_NAME,
-        ]
-        .map(str::to_string)
-        .to_vec();
+        let mut ours = [MAP_NAME, MAP_NEW_NAME, WITNESS_NAME, RESERVE_NAME, RESERVE_NEW_NAME, FORMAT_NEW, FORMAT, LOCK]
+            .map(str::to_string)
+            .to_vec();
+        ours.push(drive_rate::FILE_NAME.to_string());
         for name in names(&self.folder)? {
             if segment_from_file_name(&name).is_some() && self.is_our_segment(&self.folder.join(&name)) {
                 ours.insert(0, name);
@@ -193,13 +177,9 @@ impl SpillDir {
                 foreign.push(name);
             }
         }
-        for name in ours {
-            let path = self.folder.join(name);
-            match std::fs::remove_file(&path) {
-                Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                    return Err(InputError::io(path, "removing", &error));
-                }
-                _ => {}
+        for path in ours.iter().map(|name| self.folder.join(name)) {
+            if let Err(error) = std::fs::remove_file(&path).or_else(unless_missing) {
+                return Err(InputError::io(path, "removing", &error));
             }
         }
         if self.made_folder && foreign.is_empty() {
@@ -212,7 +192,7 @@ impl SpillDir {
     /// segment's creation).
     fn is_our_segment(&self, path: &Path) -> bool {
         let mut header = Vec::new();
-        let file = with_safe_flags(OpenOptions::new().read(true)).open(path);
+        let file = open_for_reading(path);
         let bytes = file.and_then(|file| {
             let metadata = file.metadata()?;
             file.take(HEADER_BYTES as u64).read_to_end(&mut header)?;
@@ -312,10 +292,8 @@ fn warnings_for(folder: &Path, kind: FileSystem, allow_remote: bool) -> InputRes
 
 /// Refuses a folder that contains files foreign to a spill directory.
 fn refuse_foreign_files(folder: &Path) -> InputResult<()> {
-    match read_format(folder)? {
-        Some(Ok(_)) => return Ok(()),
-        Some(Err(error)) => return Err(bad_format(folder, &error)),
-        None => {}
+    if read_format(folder)?.is_some() {
+        return Ok(());
     }
     let names = names(folder)?;
     // A run that was interrupted before it wrote its FORMAT file leaves these.
@@ -326,6 +304,23 @@ fn refuse_foreign_files(folder: &Path) -> InputResult<()> {
             Err(InputError::new(folder, problem, "name an empty folder, or one that does not exist"))
         }
     }
+}
+
+/// Numbers and lengths of the segment files in `folder`, ascending.
+///
+/// # Errors
+/// The folder cannot be read.
+pub fn segments_in(folder: &Path) -> InputResult<Vec<(u32, u64)>> {
+    let failed = |e: io::Error| InputError::io(folder, "reading the folder", &e);
+    let mut segments = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(failed)? {
+        let entry = entry.map_err(failed)?;
+        let about = entry.metadata().map_err(failed)?;
+        let number = entry.file_name().to_str().and_then(segment_from_file_name);
+        segments.extend(number.filter(|_| about.is_file()).map(|segment| (segment, about.len())));
+    }
+    segments.sort_unstable();
+    Ok(segments)
 }
 
 /// Names in the folder, sorted. Names that are not UTF-8 are made printable; no file of this program has one.
@@ -403,15 +398,16 @@ fn host_name() -> String {
 }
 
 /// Content of the FORMAT file; `None` if there is none.
-pub(in crate::page) fn read_format(folder: &Path) -> InputResult<Option<Result<SpillFormat, FormatError>>> {
-    Ok(format_bytes_of(folder)?.map(|bytes| SpillFormat::from_bytes(&bytes)))
+fn read_format(folder: &Path) -> InputResult<Option<SpillFormat>> {
+    let read = |bytes: Vec<u8>| SpillFormat::from_bytes(&bytes).map_err(|error| bad_format(folder, &error));
+    format_bytes_of(folder)?.map(read).transpose()
 }
 
 /// Bytes of the FORMAT file, empty if it is not a regular file; `None` if there is none.
 pub(in crate::page) fn format_bytes_of(folder: &Path) -> InputResult<Option<Vec<u8>>> {
     let path = folder.join(FORMAT);
     let failed = |e: io::Error| InputError::io(&path, "reading", &e);
-    let file = match with_safe_flags(OpenOptions::new().read(true)).open(&path) {
+    let file = match open_for_reading(&path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         file => file.map_err(failed)?,
     };

@@ -54,7 +54,6 @@ fn from_limited<T: DeserializeOwned, const LIMIT: usize>(bytes: &[u8]) -> Result
 #[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
-    use crate::base::rng::mix64;
 
     #[derive(Debug, PartialEq, Serialize, serde::Deserialize)]
     struct Sample {
@@ -75,27 +74,13 @@ mod tests {
         // Fixed lengths: 4, then 8 + 2 x 4, then 8 + 6, then 1 + 8.
         assert_eq!(bytes.len(), 4 + 16 + 14 + 9);
         assert_eq!(bytes[..12], [7, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0]);
-    }
-
-    #[test]
-    fn hostile_bytes_end_in_an_error() {
-        let bytes = to_bytes(&sample()).unwrap();
-        assert!((0..bytes.len()).all(|cut| from_bytes::<Sample>(&bytes[..cut]).is_err()));
+        // Left-over bytes, and lengths of a list and of a string that exceed the bytes.
         let longer = [bytes.as_slice(), &[0]].concat();
         assert!(from_bytes::<Sample>(&longer).unwrap_err().to_string().contains("1 bytes are left over"));
-        // Lengths of lists and strings that exceed the bytes.
         for at in [4, 20] {
             let mut huge = bytes.clone();
             huge[at..at + 8].fill(0x7f);
             assert!(from_bytes::<Sample>(&huge).is_err());
-        }
-        for seed in 0..5000 {
-            let mut random = bytes.clone();
-            for i in 0..4 {
-                let at = mix64(seed * 4 + i) as usize % random.len();
-                random[at] = mix64(seed * 4 + i + (1 << 40)) as u8;
-            }
-            let _ = from_bytes::<Sample>(&random);
         }
     }
 }

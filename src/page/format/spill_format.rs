@@ -4,14 +4,86 @@
 //! distinct from a newer version; 2. impossible sizes are refused; 3. another version and an unknown incompatible
 //! feature are refused by name; unknown compatible features are ignored.
 
-use crate::page::format::slot_header::{FORMAT_VERSION, KNOWN_COMPATIBLE, KNOWN_FEATURES, checksum};
-use crate::page::versions::slots::SlotLayout;
+use crate::page::engine::buffer::ALIGNMENT;
+use crate::page::engine::page_engine::Place;
+use crate::page::format::slot_header::{
+    FORMAT_VERSION, HEADER_BYTES, KNOWN_COMPATIBLE, KNOWN_FEATURES, checksum, transfer_bytes,
+};
+use bytemuck::{Pod, Zeroable};
 
 /// Length of the file.
 pub const FORMAT_BYTES: usize = 256;
 const CHECKSUM_AT: usize = FORMAT_BYTES - 16;
 const MAGIC: [u8; 8] = *b"gsscdir\n";
-const COMPATIBLE_AT: usize = 48;
+
+/// Target size of a segment, bytes; segments of small scenes are smaller.
+const SEGMENT_BYTES: u64 = 256 << 20;
+/// Largest slot, bytes: the length of a payload is a 32-bit number.
+const SLOT_BYTES_MAX: u64 = HEADER_BYTES as u64 + (1 << 32);
+/// Target number of segments of a scene: each costs a file descriptor.
+const SEGMENTS: u64 = 64;
+
+/// The front of the file, zeros up to the checksum.
+#[derive(Clone, Copy, Zeroable, Pod)]
+#[repr(C, packed)]
+struct Front {
+    magic: [u8; 8],
+    version: u32,
+    incompatible: u32,
+    store: u128,
+    slot_bytes: u64,
+    slots_per_segment: u32,
+    is_checkpoint: u8,
+    unused: [u8; 3],
+    compatible: u32,
+}
+
+/// Sizes that are fixed for the life of a store.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SlotLayout {
+    /// Bytes of a slot; a multiple of [`ALIGNMENT`].
+    pub slot_bytes: u64,
+    /// Slots in a segment, at least 1.
+    pub slots_per_segment: u32,
+}
+
+impl SlotLayout {
+    /// Slots for payloads of at most `capacity_bytes`, in segments that suit a scene of about `pages` pages: about 256
+    /// MiB, less for a smaller scene, more where a scene would need too many files.
+    pub fn new(capacity_bytes: usize, pages: u64) -> SlotLayout {
+        let slot_bytes = transfer_bytes(capacity_bytes) as u64;
+        let usual = (SEGMENT_BYTES / slot_bytes).min(pages);
+        let slots = usual.max(pages / SEGMENTS).clamp(1, u64::from(u32::MAX));
+        SlotLayout { slot_bytes, slots_per_segment: slots as u32 }
+    }
+
+    /// Bytes of a segment.
+    pub fn segment_bytes(&self) -> u64 {
+        self.slot_bytes * u64::from(self.slots_per_segment)
+    }
+
+    /// Place of slot number `slot`.
+    pub fn place(&self, slot: u64) -> Place {
+        let per = u64::from(self.slots_per_segment);
+        Place { segment: (slot / per) as u32, offset: slot % per * self.slot_bytes }
+    }
+
+    /// Number of the slot at `place`; `None` if no slot starts there.
+    pub fn slot(&self, place: Place) -> Option<u64> {
+        let begins = place.offset.is_multiple_of(self.slot_bytes) && place.offset < self.segment_bytes();
+        begins.then(|| u64::from(place.segment) * u64::from(self.slots_per_segment) + place.offset / self.slot_bytes)
+    }
+
+    /// Whether a store can have these sizes: aligned, not empty, no larger than the longest payload, segments
+    /// addressable.
+    pub fn is_possible(&self) -> bool {
+        self.slot_bytes > ALIGNMENT as u64
+            && self.slot_bytes <= SLOT_BYTES_MAX
+            && self.slot_bytes.is_multiple_of(ALIGNMENT as u64)
+            && self.slots_per_segment > 0
+            && self.slot_bytes.checked_mul(u64::from(self.slots_per_segment)).is_some_and(|b| b <= i64::MAX as u64)
+    }
+}
 
 /// What happens to the pages after the run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -82,15 +154,19 @@ pub enum FormatError {
 impl SpillFormat {
     /// Encodes the file.
     pub fn to_bytes(&self) -> [u8; FORMAT_BYTES] {
+        let front = Front {
+            magic: MAGIC,
+            version: FORMAT_VERSION,
+            incompatible: KNOWN_FEATURES,
+            store: self.store,
+            slot_bytes: self.layout.slot_bytes,
+            slots_per_segment: self.layout.slots_per_segment,
+            is_checkpoint: u8::from(self.purpose == Purpose::Checkpoint),
+            unused: [0; 3],
+            compatible: KNOWN_COMPATIBLE,
+        };
         let mut bytes = [0; FORMAT_BYTES];
-        bytes[..8].copy_from_slice(&MAGIC);
-        bytes[8..12].copy_from_slice(&FORMAT_VERSION.to_le_bytes());
-        bytes[12..16].copy_from_slice(&KNOWN_FEATURES.to_le_bytes());
-        bytes[16..32].copy_from_slice(&self.store.to_le_bytes());
-        bytes[32..40].copy_from_slice(&self.layout.slot_bytes.to_le_bytes());
-        bytes[40..44].copy_from_slice(&self.layout.slots_per_segment.to_le_bytes());
-        bytes[44] = u8::from(self.purpose == Purpose::Checkpoint);
-        bytes[COMPATIBLE_AT..][..4].copy_from_slice(&KNOWN_COMPATIBLE.to_le_bytes());
+        bytes[..size_of::<Front>()].copy_from_slice(bytemuck::bytes_of(&front));
         seal(&mut bytes);
         bytes
     }
@@ -100,19 +176,16 @@ impl SpillFormat {
     /// # Errors
     /// The bytes are not a FORMAT file of this version.
     pub fn from_bytes(bytes: &[u8]) -> Result<SpillFormat, FormatError> {
-        let bytes = whole(bytes)?;
-        let FormatFeatures { version, incompatible, .. } = features_in(bytes);
-        if version != FORMAT_VERSION {
-            return Err(FormatError::Version { found: version, features: incompatible });
+        let front = front_of(bytes)?;
+        let (found, features) = (front.version, front.incompatible);
+        if found != FORMAT_VERSION {
+            return Err(FormatError::Version { found, features });
         }
-        if incompatible & !KNOWN_FEATURES != 0 {
-            return Err(FormatError::Features { features: incompatible });
+        if features & !KNOWN_FEATURES != 0 {
+            return Err(FormatError::Features { features });
         }
-        let layout = SlotLayout {
-            slot_bytes: u64::from_le_bytes(field(bytes, 32)),
-            slots_per_segment: u32::from_le_bytes(field(bytes, 40)),
-        };
-        let purpose = match bytes[44] {
+        let layout = SlotLayout { slot_bytes: front.slot_bytes, slots_per_segment: front.slots_per_segment };
+        let purpose = match front.is_checkpoint {
             0 => Purpose::Scratch,
             1 => Purpose::Checkpoint,
             _ => return Err(FormatError::Sizes),
@@ -120,7 +193,7 @@ impl SpillFormat {
         if !layout.is_possible() {
             return Err(FormatError::Sizes);
         }
-        Ok(SpillFormat { store: u128::from_le_bytes(field(bytes, 16)), purpose, layout })
+        Ok(SpillFormat { store: front.store, purpose, layout })
     }
 }
 
@@ -129,22 +202,17 @@ impl SpillFormat {
 /// # Errors
 /// The bytes are not a FORMAT file, or damaged.
 pub fn features_of(bytes: &[u8]) -> Result<FormatFeatures, FormatError> {
-    Ok(features_in(whole(bytes)?))
+    let front = front_of(bytes)?;
+    Ok(FormatFeatures { version: front.version, incompatible: front.incompatible, compatible: front.compatible })
 }
 
-fn features_in(bytes: &[u8; FORMAT_BYTES]) -> FormatFeatures {
-    let word = |at: usize| u32::from_le_bytes(field(bytes, at));
-    FormatFeatures { version: word(8), incompatible: word(12), compatible: word(COMPATIBLE_AT) }
-}
-
-/// The bytes, if their length, magic and checksum are right.
-fn whole(bytes: &[u8]) -> Result<&[u8; FORMAT_BYTES], FormatError> {
+/// The front of the file, if its length, magic and checksum are right.
+fn front_of(bytes: &[u8]) -> Result<Front, FormatError> {
     if !bytes.starts_with(&MAGIC) {
         return Err(FormatError::Foreign);
     }
-    let bytes: &[u8; FORMAT_BYTES] = bytes.try_into().map_err(|_| FormatError::Damaged)?;
-    let is_whole = bytes[CHECKSUM_AT..] == checksum(&bytes[..CHECKSUM_AT]).to_le_bytes();
-    if is_whole { Ok(bytes) } else { Err(FormatError::Damaged) }
+    let is_whole = bytes.len() == FORMAT_BYTES && bytes[CHECKSUM_AT..] == checksum(&bytes[..CHECKSUM_AT]).to_le_bytes();
+    if is_whole { Ok(bytemuck::pod_read_unaligned(&bytes[..size_of::<Front>()])) } else { Err(FormatError::Damaged) }
 }
 
 fn seal(bytes: &mut [u8; FORMAT_BYTES]) {
@@ -152,16 +220,34 @@ fn seal(bytes: &mut [u8; FORMAT_BYTES]) {
     bytes[CHECKSUM_AT..].copy_from_slice(&sum.to_le_bytes());
 }
 
-fn field<const N: usize>(bytes: &[u8; FORMAT_BYTES], at: usize) -> [u8; N] {
-    let mut field = [0; N];
-    field.copy_from_slice(&bytes[at..at + N]);
-    field
-}
-
 #[cfg(test)]
 #[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
+
+    #[test]
+    fn segments_fit_the_scene() {
+        let capacity = 745_472;
+        let small = SlotLayout::new(capacity, 10);
+        assert_eq!((small.slots_per_segment, small.slot_bytes), (10, 4096 + 745_472));
+        let usual = SlotLayout::new(capacity, 20_000);
+        assert!(usual.segment_bytes() <= 256 << 20 && usual.segment_bytes() > 255 << 20);
+        let huge = SlotLayout::new(capacity, 1_000_000);
+        assert!(1_000_000_u64.div_ceil(u64::from(huge.slots_per_segment)) <= SEGMENTS + 1);
+        assert_eq!(SlotLayout::new(1, 0).slots_per_segment, 1);
+        for layout in [small, usual, huge] {
+            assert!(layout.is_possible());
+            for slot in [0, 1, 349, 350, 999_999] {
+                assert_eq!(layout.slot(layout.place(slot)), Some(slot));
+            }
+        }
+        assert_eq!(usual.slot(Place { segment: 0, offset: 4096 }), None);
+        assert_eq!(usual.slot(Place { segment: 0, offset: usual.segment_bytes() }), None);
+        let largest = SlotLayout { slot_bytes: SLOT_BYTES_MAX, slots_per_segment: 1 };
+        assert!(largest.is_possible() && largest.slot_bytes == transfer_bytes(u32::MAX as usize) as u64);
+        let wrong = [(0, 1), (4096, 1), (8193, 1), (8192, 0), (1 << 62, 4), (1 << 62, 1), (SLOT_BYTES_MAX + 4096, 1)];
+        assert!(wrong.iter().all(|&(slot_bytes, n)| !SlotLayout { slot_bytes, slots_per_segment: n }.is_possible()));
+    }
 
     fn sample() -> SpillFormat {
         SpillFormat { store: 1 << 100, purpose: Purpose::Checkpoint, layout: SlotLayout::new(745_472, 1000) }
@@ -189,7 +275,7 @@ mod tests {
 
     #[test]
     fn unknown_compatible_features_are_ignored() {
-        let bytes = with(COMPATIBLE_AT + 1, 0x80);
+        let bytes = with(49, 0x80);
         assert_eq!(SpillFormat::from_bytes(&bytes), Ok(sample()));
         let features = FormatFeatures { version: FORMAT_VERSION, incompatible: 0, compatible: 0x8000 };
         assert_eq!(features_of(&bytes), Ok(features));
@@ -205,9 +291,6 @@ mod tests {
         assert_eq!(changed(12, 1), FormatError::Features { features: 1 });
         assert!(changed(8, 2).to_string().contains("newer") && changed(8, 0).to_string().contains("older"));
         assert!(changed(12, 5).to_string().contains("bits 0x5"));
-        assert!(
-            changed(8, 2).to_string().contains("version 2") && changed(8, 2).to_string().contains("knows version 1")
-        );
         assert_eq!(changed(32, 1), FormatError::Sizes);
         assert_eq!(changed(39, 0x7f), FormatError::Sizes);
         assert_eq!(changed(44, 2), FormatError::Sizes);

@@ -5,7 +5,7 @@
 use crate::base::ids::PageId;
 use crate::page::format::codec;
 use crate::page::format::slot_header::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs, checksum};
-use crate::page::map::mutants::{Mutant, active};
+use crate::page::mutants::{Mutant, active};
 
 /// Verifies that the bytes of a slot are version `slot` of `page` in `store`, unchanged. Decodes an encoded payload to
 /// `payload`, a buffer with header room; a raw payload stays where it is.

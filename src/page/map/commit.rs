@@ -14,26 +14,18 @@
 
 use crate::base::ids::PageId;
 use crate::page::folder::protocol_files::Folder;
+pub use crate::page::folder::protocol_files::{MAP_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME};
 use crate::page::format::slot_header::SlotRef;
+pub use crate::page::map::commit_error::CommitError;
+use crate::page::map::entries::{MapBatch, MapError};
 use crate::page::map::generations::Generations;
-use crate::page::map::manifest::{Manifest, MapBatch, MapError};
-use crate::page::map::mutants::{Mutant, active};
-use crate::page::map::opening::Opened;
+use crate::page::map::manifest::Manifest;
 use crate::page::map::witness::Witness;
-use crate::page::versions::page_error::PageError;
+use crate::page::mutants::{Mutant, active};
+use crate::page::versions::page_error::is_out_of_space;
 use crate::page::versions::paged_store::{PageDone, PagedStore};
 use std::io;
 
-/// File of the page map.
-pub const MAP_NAME: &str = "map.redb";
-/// File of the page map while it is created.
-pub const MAP_NEW_NAME: &str = "map.redb.new";
-/// File of the witness.
-pub const WITNESS_NAME: &str = "witness";
-/// File that reserves space for a last commit on a full drive.
-pub const RESERVE_NAME: &str = "reserve";
-/// The reserve while it is filled.
-pub const RESERVE_NEW_NAME: &str = "reserve.new";
 /// Bytes per write while the reserve is filled.
 const RESERVE_PIECE_BYTES: usize = 1 << 20;
 
@@ -70,118 +62,18 @@ pub struct Cut<'a> {
     pub pin: Option<&'a str>,
 }
 
-/// Why a store cannot be created, opened, or committed to.
-#[derive(Debug, thiserror::Error)]
-pub enum CommitError {
-    /// Pages could not be made durable.
-    #[error(transparent)]
-    Pages(#[from] PageError),
-    /// The map failed.
-    #[error("{0}\n  remedy: acknowledged commits are intact; check the drive, then start again")]
-    Map(#[from] MapError),
-    /// No space. Nothing is lost; the commit may be repeated once there is space.
-    #[error("there is no space for a commit: {0}\n  remedy: free space on the drive of the spill directory")]
-    Full(io::Error),
-    /// A file beside the map cannot be used.
-    #[error("{name} cannot be used: {source}\n  remedy: check the drive; `gsscale-ckpt salvage` can rebuild the map")]
-    File {
-        /// Name of the file in the store's folder.
-        name: &'static str,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// An earlier error ended all commits of this process.
-    #[error("commits stopped after a drive error ({0})\n  remedy: check the drive, then start again")]
-    Poisoned(String),
-    /// The folder contains no store.
-    #[error("there is no page map in this folder")]
-    NoStore,
-    /// The map is undamaged, but its content is impossible.
-    #[error("the page map contradicts itself: {0}\n  remedy: `gsscale-ckpt salvage` can rebuild it from the pages")]
-    Contradiction(String),
-    /// Segments are missing or have another length.
-    #[error(
-        "pages are missing: {0}\n  remedy: restore the segment files; `gsscale-ckpt salvage` recovers the remaining pages"
-    )]
-    Segments(String),
-    /// The requested generation is not kept.
-    #[error("generation {0} is not kept\n  remedy: `gsscale-ckpt ls` lists the kept generations")]
-    NotKept(u64),
-}
-
-impl CommitError {
-    /// Whether the error is only a lack of space: a later attempt may succeed.
-    pub fn is_out_of_space(&self) -> bool {
-        match self {
-            CommitError::Full(_) | CommitError::Map(MapError::Full(_)) => true,
-            CommitError::Pages(error) => error.is_out_of_space(),
-            _ => false,
-        }
-    }
-}
-
 /// The commits of one open store.
 pub struct Commits {
-    folder: Box<dyn Folder>,
-    config: CommitConfig,
+    pub(super) folder: Box<dyn Folder>,
+    pub(super) config: CommitConfig,
     /// `None` after the drive was full: the map must be reopened.
-    manifest: Option<Manifest>,
-    witness: Witness,
-    generations: Generations,
-    poison: Option<String>,
+    pub(super) manifest: Option<Manifest>,
+    pub(super) witness: Witness,
+    pub(super) generations: Generations,
+    pub(super) poison: Option<String>,
 }
 
 impl Commits {
-    /// Creates an empty store in `folder`, durable when this returns. Overwrites the remains of an interrupted
-    /// creation.
-    ///
-    /// # Errors
-    /// The folder cannot be written, or contains a store already.
-    pub fn create(folder: Box<dyn Folder>, config: CommitConfig) -> Result<Opened, CommitError> {
-        if folder.open(MAP_NAME).map_err(|source| CommitError::File { name: MAP_NAME, source })?.is_some() {
-            let source = io::Error::new(io::ErrorKind::AlreadyExists, "this folder already contains a store");
-            return Err(CommitError::File { name: MAP_NAME, source });
-        }
-        let witness = folder.create(WITNESS_NAME).and_then(|file| Witness::create(file, config.store));
-        witness.map_err(|source| CommitError::File { name: WITNESS_NAME, source })?;
-        let file = folder.create(MAP_NEW_NAME).map_err(|source| CommitError::File { name: MAP_NAME, source })?;
-        drop(Manifest::create(file, config.store, config.cache_bytes)?);
-        // Entries may become durable in any order: first sync all files, then give the map the name that makes them a
-        // store.
-        let named = sync_entries(folder.as_ref()).and_then(|()| folder.rename(MAP_NEW_NAME, MAP_NAME));
-        let named = named.and_then(|()| sync_entries(folder.as_ref()));
-        named.map_err(|source| CommitError::File { name: MAP_NAME, source })?;
-        Commits::open(folder, config)
-    }
-
-    /// Opens the store in `folder`: verifies the whole map and finds the last generation. Reads no page data.
-    ///
-    /// # Errors
-    /// There is no store, it is damaged or older than the last acknowledged commit, or it cannot be read or written.
-    /// The files of a refused store stay unchanged.
-    pub fn open(folder: Box<dyn Folder>, config: CommitConfig) -> Result<Opened, CommitError> {
-        let file = folder.open(MAP_NAME).map_err(|source| CommitError::File { name: MAP_NAME, source })?;
-        let file = file.ok_or(CommitError::NoStore)?;
-        let witness_error = |source| CommitError::File { name: WITNESS_NAME, source };
-        let witness = folder.open(WITNESS_NAME).map_err(witness_error)?;
-        let witness = witness.ok_or_else(|| witness_error(io::ErrorKind::NotFound.into()))?;
-        let mut witness = Witness::open(witness, config.store).map_err(witness_error)?;
-        // A killed process may have left folder entries that are not durable; this sync makes them so.
-        sync_entries(folder.as_ref()).map_err(|source| CommitError::File { name: "the folder", source })?;
-        let (manifest, content) = Manifest::open(file, config.store, witness.sequence(), config.cache_bytes)?;
-        // A commit that was durable but not yet acknowledged is acknowledged now.
-        if witness.sequence() < content.counters.sequence {
-            witness.record(content.counters.sequence).map_err(witness_error)?;
-        }
-        let generations = Generations::of(&content);
-        let run_state = match content.counters.latest {
-            0 => Vec::new(),
-            latest => manifest.run_state(latest)?,
-        };
-        let commits = Commits { folder, config, manifest: Some(manifest), witness, generations, poison: None };
-        Opened::new(commits, content, run_state)
-    }
-
     /// The fixed settings.
     pub fn config(&self) -> CommitConfig {
         self.config
@@ -209,7 +101,7 @@ impl Commits {
         done: &mut Vec<PageDone>,
         cut: &Cut<'_>,
     ) -> Result<u64, CommitError> {
-        self.commit_generation(store, done, None, cut)
+        self.poisoning(store, |commits, store| commits.commit_steps(store, done, None, cut))
     }
 
     /// As [`Commits::commit`], for a generation that was [cut](PagedStore::cut) earlier and whose pages have been
@@ -224,20 +116,21 @@ impl Commits {
         generation: u64,
         cut: &Cut<'_>,
     ) -> Result<u64, CommitError> {
-        self.commit_generation(store, done, Some(generation), cut)
+        self.poisoning(store, |commits, store| commits.commit_steps(store, done, Some(generation), cut))
     }
 
-    fn commit_generation(
+    /// Runs a step of a commit unless commits have stopped; an error other than a lack of space stops them.
+    fn poisoning<T>(
         &mut self,
         store: &mut PagedStore,
-        done: &mut Vec<PageDone>,
-        generation: Option<u64>,
-        cut: &Cut<'_>,
-    ) -> Result<u64, CommitError> {
+        step: impl FnOnce(&mut Commits, &mut PagedStore) -> Result<T, CommitError>,
+    ) -> Result<T, CommitError> {
         self.refuse_if_poisoned()?;
-        let result = self.commit_steps(store, done, generation, cut);
-        if let Err(error) = &result {
-            self.poison_unless_full(store, error);
+        let result = step(self, store);
+        if let Some(error) = result.as_ref().err().filter(|error| !error.is_out_of_space()) {
+            let cause = error.to_string();
+            store.poison_with(cause.clone());
+            self.poison.get_or_insert(cause);
         }
         result
     }
@@ -279,20 +172,15 @@ impl Commits {
     /// # Errors
     /// A generation is not kept; otherwise as [`Commits::commit`].
     pub fn pin(&mut self, store: &mut PagedStore, put: &[(String, u64)], drop: &[String]) -> Result<(), CommitError> {
-        self.refuse_if_poisoned()?;
         if let Some((_, generation)) = put.iter().find(|(_, generation)| !self.generations.is_kept(*generation)) {
             return Err(CommitError::NotKept(*generation));
         }
-        let result = self.ensure_open().and_then(|()| {
-            let batch = self.generations.plan_pins(put, drop);
-            self.acknowledge(&batch)
-        });
-        if let Err(error) = &result {
-            self.poison_unless_full(store, error);
-        }
-        result?;
-        self.free_slots(store);
-        Ok(())
+        self.poisoning(store, |commits, store| {
+            commits.ensure_open()?;
+            commits.acknowledge(&commits.generations.plan_pins(put, drop))?;
+            commits.free_slots(store);
+            Ok(())
+        })
     }
 
     /// Makes a kept generation the latest again, drops the later ones with their pins, and closes the store.
@@ -301,9 +189,7 @@ impl Commits {
     /// The generation is not kept; otherwise as [`Commits::commit`].
     pub fn rollback(mut self, generation: u64) -> Result<(), CommitError> {
         self.refuse_if_poisoned()?;
-        if !self.generations.is_kept(generation) {
-            return Err(CommitError::NotKept(generation));
-        }
+        self.check_kept(generation)?;
         let batch = self.generations.plan_rollback(generation);
         self.acknowledge(&batch)
     }
@@ -313,11 +199,13 @@ impl Commits {
     /// # Errors
     /// The generation is not kept, or cannot be read.
     pub fn run_state(&self, generation: u64) -> Result<Vec<u8>, CommitError> {
-        if !self.generations.is_kept(generation) {
-            return Err(CommitError::NotKept(generation));
-        }
+        self.check_kept(generation)?;
         let manifest = self.manifest.as_ref().ok_or(MapError::Poisoned)?;
         Ok(manifest.run_state(generation)?)
+    }
+
+    pub(super) fn check_kept(&self, generation: u64) -> Result<(), CommitError> {
+        if self.generations.is_kept(generation) { Ok(()) } else { Err(CommitError::NotKept(generation)) }
     }
 
     /// Creates the reserve, if missing; returns whether it exists now.
@@ -328,11 +216,11 @@ impl Commits {
         let bytes = self.config.reserve_bytes;
         match fill_reserve(self.folder.as_ref(), bytes) {
             Ok(()) => Ok(true),
-            Err(error) if crate::page::versions::page_error::is_out_of_space(&error) => {
+            Err(error) if is_out_of_space(&error) => {
                 self.give_up_reserve()?;
                 Ok(false)
             }
-            Err(source) => Err(CommitError::File { name: RESERVE_NAME, source }),
+            Err(error) => Err(CommitError::file(RESERVE_NAME)(error)),
         }
     }
 
@@ -341,11 +229,11 @@ impl Commits {
     /// # Errors
     /// The folder cannot be written.
     pub fn give_up_reserve(&mut self) -> Result<bool, CommitError> {
-        let error = |source| CommitError::File { name: RESERVE_NAME, source };
+        let error = CommitError::file(RESERVE_NAME);
         let mut was_there = false;
         for name in [RESERVE_NAME, RESERVE_NEW_NAME] {
-            was_there |= self.folder.open(name).map_err(error)?.is_some();
-            self.folder.remove(name).map_err(error)?;
+            was_there |= self.folder.open(name).map_err(&error)?.is_some();
+            self.folder.remove(name).map_err(&error)?;
         }
         Ok(was_there)
     }
@@ -355,7 +243,7 @@ impl Commits {
     fn acknowledge(&mut self, batch: &MapBatch) -> Result<(), CommitError> {
         if active(Mutant::WitnessBeforeMap) {
             let next = self.witness.sequence() + 1;
-            self.witness.record(next).map_err(|source| CommitError::File { name: WITNESS_NAME, source })?;
+            self.witness.record(next).map_err(CommitError::file(WITNESS_NAME))?;
         }
         let mut applied = self.apply(batch);
         if applied.is_err() && active(Mutant::MapCommitRetried) {
@@ -376,7 +264,7 @@ impl Commits {
             other => other?,
         }
         let sequence = self.manifest.as_ref().map_or(0, |m| m.counters().sequence);
-        self.witness.record(sequence).map_err(|source| CommitError::File { name: WITNESS_NAME, source })?;
+        self.witness.record(sequence).map_err(CommitError::file(WITNESS_NAME))?;
         self.generations.adopt(batch);
         Ok(())
     }
@@ -435,24 +323,12 @@ impl Commits {
             _ => Ok(()),
         }
     }
-
-    fn poison_unless_full(&mut self, store: &mut PagedStore, error: &CommitError) {
-        if !error.is_out_of_space() {
-            let cause = error.to_string();
-            store.poison_with(cause.clone());
-            self.poison.get_or_insert(cause);
-        }
-    }
 }
 
 impl std::fmt::Debug for Commits {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "Commits({:?}, {:?}, poison: {:?})", self.manifest, self.witness, self.poison)
     }
-}
-
-fn sync_entries(folder: &dyn Folder) -> io::Result<()> {
-    if active(Mutant::FolderNotSyncedForMap) { Ok(()) } else { folder.sync() }
 }
 
 /// The map's value for a version of a page: the slot reference, then the label.

@@ -8,8 +8,8 @@
 //! cannot pass for one of a later generation.
 
 use crate::base::ids::PageId;
-use crate::page::map::manifest::{MapBatch, MapContent, MapVersion};
-use crate::page::map::mutants::{Mutant, active};
+use crate::page::map::entries::{MapBatch, MapContent, MapVersion};
+use crate::page::mutants::{Mutant, active};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 /// An entry, seen by generations `from..until`.

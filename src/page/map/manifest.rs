@@ -12,80 +12,20 @@
 
 use crate::base::ids::PageId;
 use crate::page::format::encoding;
-use crate::page::format::seal::{SealBroken, SealScope};
-use crate::page::map::manifest_write::Writer;
+use crate::page::map::entries::{
+    COUNTERS, Counters, Fault, GENERATIONS, HEADER, MapBatch, MapContent, MapError, MapVersion, PAGES, PINS,
+    RUN_STATES, Reader, Writer, damaged,
+};
 use crate::page::map::map_file::MapFile;
-use crate::page::map::mutants::{Mutant, active};
-use crate::page::versions::page_error::is_out_of_space;
-use redb::{Builder, Database, ReadableDatabase, ReadableTable, StorageBackend, TableDefinition};
-use std::collections::BTreeMap;
-use std::io;
+use crate::page::mutants::{Mutant, active};
+use redb::{Builder, Database, ReadableDatabase, StorageBackend};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-
-pub(in crate::page) const PAGES: TableDefinition<'_, (u64, u64), &[u8]> = TableDefinition::new("pages");
-pub(in crate::page) const GENERATIONS: TableDefinition<'_, u64, &[u8]> = TableDefinition::new("generations");
-pub(in crate::page) const RUN_STATES: TableDefinition<'_, u64, &[u8]> = TableDefinition::new("run_states");
-pub(in crate::page) const PINS: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("pins");
-pub(in crate::page) const HEADER: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("header");
-
-/// Table numbers in seals.
-pub(in crate::page) const PAGES_SEAL: u8 = 1;
-pub(in crate::page) const GENERATIONS_SEAL: u8 = 2;
-pub(in crate::page) const RUN_STATES_SEAL: u8 = 3;
-pub(in crate::page) const PINS_SEAL: u8 = 4;
-pub(in crate::page) const HEADER_SEAL: u8 = 5;
-/// Key of the counters in the header table.
-pub(in crate::page) const COUNTERS: &str = "counters";
 
 /// Most transactions and generations: one a second for 68 years. Serial numbers of writes are derived from generations
 /// and would overflow beyond this limit.
 const SEQUENCE_MAX: u64 = 1 << 31;
 const GENERATION_MAX: u64 = 1 << 31;
-
-/// Why the map cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum MapError {
-    /// The bytes of the map are not those written.
-    #[error("the page map is damaged: {0}")]
-    Damaged(String),
-    /// The map is undamaged, but older than the last acknowledged commit: a bit flipped, or an old copy was restored.
-    #[error("the page map is at transaction {found}, but transaction {acknowledged} was acknowledged")]
-    Stale {
-        /// Number of the map's last transaction.
-        found: u64,
-        /// Number of the last transaction in the witness.
-        acknowledged: u64,
-    },
-    /// redb panicked.
-    #[error("the page map's library panicked: {0}")]
-    Panicked(String),
-    /// The drive is full. Nothing was lost; the map must be reopened.
-    #[error("no space for the page map: {0}")]
-    Full(io::Error),
-    /// The drive failed.
-    #[error("the page map cannot be read or written: {0}")]
-    Io(io::Error),
-    /// An earlier call failed.
-    #[error("the page map stopped after an earlier error")]
-    Poisoned,
-}
-
-impl From<io::Error> for MapError {
-    fn from(error: io::Error) -> MapError {
-        if is_out_of_space(&error) { MapError::Full(error) } else { MapError::Io(error) }
-    }
-}
-
-impl From<redb::Error> for MapError {
-    fn from(error: redb::Error) -> MapError {
-        match error {
-            redb::Error::Io(e) => e.into(),
-            redb::Error::PreviousIo => MapError::Poisoned,
-            other => MapError::Damaged(other.to_string()),
-        }
-    }
-}
 
 /// Runs calls of redb; a panic becomes an error.
 fn guarded<T>(calls: impl FnOnce() -> Result<T, Fault>) -> Result<T, MapError> {
@@ -99,82 +39,6 @@ fn guarded<T>(calls: impl FnOnce() -> Result<T, Fault>) -> Result<T, MapError> {
             Err(MapError::Panicked(text.unwrap_or_else(|| "without a message".to_string())))
         }
     }
-}
-
-/// An error inside [`guarded`].
-pub(in crate::page) enum Fault {
-    Library(Box<redb::Error>),
-    Map(MapError),
-}
-
-impl<E: Into<redb::Error>> From<E> for Fault {
-    fn from(error: E) -> Fault {
-        Fault::Library(Box::new(error.into()))
-    }
-}
-
-pub(in crate::page) fn damaged(place: impl std::fmt::Display, problem: impl std::fmt::Display) -> Fault {
-    Fault::Map(MapError::Damaged(format!("{place}: {problem}")))
-}
-
-/// Counters of the whole map, written with every transaction.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-pub struct Counters {
-    /// Number of transactions.
-    pub sequence: u64,
-    /// The latest generation; 0 before the first commit.
-    pub latest: u64,
-    /// Number of the next generation; never used twice.
-    pub next: u64,
-    /// Number of entries of all tables except the header's.
-    pub(in crate::page) entries: u64,
-    /// Sum of the checksums of these entries.
-    pub(in crate::page) tally: u64,
-}
-
-/// One version of a page.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct MapVersion {
-    /// The page.
-    pub page: PageId,
-    /// First generation that sees it.
-    pub generation: u64,
-    /// The store's value; `None`: the page is removed from this generation on.
-    pub value: Option<Vec<u8>>,
-}
-
-/// Content of a map, except the run states.
-#[derive(Debug, Default)]
-pub struct MapContent {
-    /// The counters.
-    pub counters: Counters,
-    /// All versions, ordered by page, then generation.
-    pub versions: Vec<MapVersion>,
-    /// The kept generations with their notes.
-    pub generations: BTreeMap<u64, Vec<u8>>,
-    /// Pinned generations by name.
-    pub pins: BTreeMap<String, u64>,
-}
-
-/// One transaction.
-#[derive(Debug, Default)]
-pub struct MapBatch {
-    /// New versions, which start with a generation of this transaction.
-    pub put_versions: Vec<MapVersion>,
-    /// Versions that no kept generation sees.
-    pub drop_versions: Vec<(PageId, u64)>,
-    /// The new generation: number, note, run state.
-    pub put_generation: Option<(u64, Vec<u8>, Vec<u8>)>,
-    /// Generations that are no longer kept.
-    pub drop_generations: Vec<u64>,
-    /// Pins to add.
-    pub put_pins: Vec<(String, u64)>,
-    /// Pins to remove.
-    pub drop_pins: Vec<String>,
-    /// The latest generation after this transaction.
-    pub latest: u64,
-    /// Number of the next generation after this transaction.
-    pub next: u64,
 }
 
 /// The open map.
@@ -283,16 +147,11 @@ impl Manifest {
     /// The run state is missing, damaged or cannot be read.
     pub fn run_state(&self, generation: u64) -> Result<Vec<u8>, MapError> {
         let database = self.database.as_ref().ok_or(MapError::Poisoned)?;
-        let scope = self.scope(RUN_STATES_SEAL);
         guarded(|| {
-            let table = database.begin_read()?.open_table(RUN_STATES)?;
+            let table = database.begin_read()?.open_table(RUN_STATES.table)?;
             let value = table.get(generation)?.ok_or_else(|| damaged("run state", format!("none of {generation}")))?;
-            Ok(unseal(scope, &generation.to_le_bytes(), value.value(), "run state")?.0.to_vec())
+            Ok(RUN_STATES.unseal(self.store, &generation, value.value())?.0.to_vec())
         })
-    }
-
-    fn scope(&self, table: u8) -> SealScope {
-        SealScope { store: self.store, table }
     }
 
     fn read_all(&self) -> Result<MapContent, MapError> {
@@ -300,59 +159,38 @@ impl Manifest {
         guarded(|| {
             let transaction = database.begin_read()?;
             let mut content = MapContent::default();
-            let header = transaction.open_table(HEADER)?;
+            let header = transaction.open_table(HEADER.table)?;
             let value = header.get(COUNTERS)?.ok_or_else(|| damaged("header", "no counters"))?;
-            let (body, _) = unseal(self.scope(HEADER_SEAL), COUNTERS.as_bytes(), value.value(), "counters")?;
+            let (body, _) = HEADER.unseal(self.store, &COUNTERS, value.value())?;
             content.counters = encoding::from_bytes(body).map_err(|e| damaged("counters", e))?;
-            let mut sum = Sum::default();
-            self.read_versions(&transaction.open_table(PAGES)?, &mut content, &mut sum)?;
-            for entry in transaction.open_table(GENERATIONS)?.iter()? {
-                let (key, value) = entry?;
-                let key = key.value();
-                let scope = self.scope(GENERATIONS_SEAL);
-                let note = sum.add(unseal(scope, &key.to_le_bytes(), value.value(), "generation")?);
-                content.generations.insert(key, note.to_vec());
-            }
-            for entry in transaction.open_table(RUN_STATES)?.iter()? {
-                let (key, value) = entry?;
-                let scope = self.scope(RUN_STATES_SEAL);
-                sum.add(unseal(scope, &key.value().to_le_bytes(), value.value(), "run state")?);
-            }
-            for entry in transaction.open_table(PINS)?.iter()? {
-                let (key, value) = entry?;
-                let body = sum.add(unseal(self.scope(PINS_SEAL), key.value().as_bytes(), value.value(), "pin")?);
+            let mut reader = Reader { store: self.store, transaction: &transaction, entries: 0, tally: 0 };
+            reader.read(&PAGES, |(page, generation), body| {
+                let page = PageId::from_bits(page).ok_or_else(|| damaged("page", "impossible id"))?;
+                let value = match body.split_first() {
+                    Some((0, [])) => None,
+                    Some((1, rest)) => Some(rest.to_vec()),
+                    _ => return Err(damaged(format!("page {page}"), "impossible value")),
+                };
+                content.versions.push(MapVersion { page, generation, value });
+                Ok(())
+            })?;
+            reader.read(&GENERATIONS, |generation, note| {
+                content.generations.insert(generation, note.to_vec());
+                Ok(())
+            })?;
+            reader.read(&RUN_STATES, |_, _| Ok(()))?;
+            reader.read(&PINS, |name, body| {
                 let generation = encoding::from_bytes(body).map_err(|e| damaged("pin", e))?;
-                content.pins.insert(key.value().to_string(), generation);
-            }
-            let fits = (sum.entries, sum.tally) == (content.counters.entries, content.counters.tally);
+                content.pins.insert(name.to_string(), generation);
+                Ok(())
+            })?;
+            let fits = (reader.entries, reader.tally) == (content.counters.entries, content.counters.tally);
             if !fits && !active(Mutant::TallyNotVerified) {
                 return Err(damaged("entries", "some are missing, doubled or outdated"));
             }
             check_generations(&content)?;
             Ok(content)
         })
-    }
-
-    fn read_versions(
-        &self,
-        table: &impl ReadableTable<(u64, u64), &'static [u8]>,
-        content: &mut MapContent,
-        sum: &mut Sum,
-    ) -> Result<(), Fault> {
-        let scope = self.scope(PAGES_SEAL);
-        for entry in table.iter()? {
-            let (key, value) = entry?;
-            let (page, generation) = key.value();
-            let body = sum.add(unseal(scope, &version_key(page, generation), value.value(), "page")?);
-            let page = PageId::from_bits(page).ok_or_else(|| damaged("page", "impossible id"))?;
-            let value = match body.split_first() {
-                Some((0, [])) => None,
-                Some((1, rest)) => Some(rest.to_vec()),
-                _ => return Err(damaged(format!("page {page}"), "impossible value")),
-            };
-            content.versions.push(MapVersion { page, generation, value });
-        }
-        Ok(())
     }
 }
 
@@ -376,47 +214,6 @@ fn builder(cache_bytes: usize) -> Builder {
     let mut builder = Builder::new();
     builder.set_cache_size(cache_bytes).set_check_integrity_on_open(true);
     builder
-}
-
-pub(in crate::page) fn version_key(page: u64, generation: u64) -> [u8; 16] {
-    let mut key = [0; 16];
-    key[..8].copy_from_slice(&page.to_le_bytes());
-    key[8..].copy_from_slice(&generation.to_le_bytes());
-    key
-}
-
-pub(in crate::page) fn bound(key: &[u8]) -> &[u8] {
-    if active(Mutant::ValuesNotBoundToKeys) { &[] } else { key }
-}
-
-pub(in crate::page) fn unseal<'a>(
-    scope: SealScope,
-    key: &[u8],
-    sealed: &'a [u8],
-    what: &str,
-) -> Result<(&'a [u8], u64), Fault> {
-    match scope.unseal(bound(key), sealed) {
-        Err(SealBroken) if active(Mutant::ValuesNotVerified) => {
-            let (checksum, body) = sealed.split_first_chunk().ok_or_else(|| damaged(what, "too short"))?;
-            Ok((body, u64::from_le_bytes(*checksum)))
-        }
-        result => result.map_err(|e| damaged(what, e)),
-    }
-}
-
-/// Number of entries and sum of their checksums.
-#[derive(Default)]
-struct Sum {
-    entries: u64,
-    tally: u64,
-}
-
-impl Sum {
-    fn add<'a>(&mut self, (body, checksum): (&'a [u8], u64)) -> &'a [u8] {
-        self.entries += 1;
-        self.tally = self.tally.wrapping_add(checksum);
-        body
-    }
 }
 
 /// Checks that the generations in a map are consistent.

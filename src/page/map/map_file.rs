@@ -8,9 +8,8 @@
 //! Invariants: 1. held-back operations are carried out in order, syncs included; 2. once shut, the file is neither read
 //! nor written.
 
-use crate::page::engine::segment_files::allocate;
+use crate::page::mutants::{Mutant, active};
 use redb::{BackendError, StorageBackend};
-use std::fs::File;
 use std::io;
 use std::ops::Bound;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -170,7 +169,7 @@ impl StorageBackend for MapFile {
             held.operations.push(Held::Sync);
             return Ok(());
         }
-        if crate::page::map::mutants::active(crate::page::map::mutants::Mutant::MapNotDurable) {
+        if active(Mutant::MapNotDurable) {
             return Ok(());
         }
         self.noted(self.0.file.sync_data())
@@ -188,112 +187,5 @@ impl StorageBackend for MapFile {
     // The store's folder is locked as a whole, so the file needs no lock of its own.
     fn try_lock_range(&self, _start: Bound<u64>, _end: Bound<u64>) -> Result<bool, BackendError> {
         Err(BackendError::Unsupported)
-    }
-}
-
-/// A file on a drive. Growing allocates space, so that a full drive is detected before anything is overwritten.
-#[derive(Debug)]
-pub struct DriveFile(File);
-
-impl DriveFile {
-    /// `file` must be open for reading and writing.
-    pub fn new(file: File) -> DriveFile {
-        DriveFile(file)
-    }
-}
-
-impl StorageBackend for DriveFile {
-    fn len(&self) -> io::Result<u64> {
-        Ok(self.0.metadata()?.len())
-    }
-
-    #[cfg(unix)]
-    fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
-        std::os::unix::fs::FileExt::read_exact_at(&self.0, out, offset)
-    }
-
-    #[cfg(not(unix))]
-    fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
-        use std::io::{Read, Seek};
-        (&self.0).seek(io::SeekFrom::Start(offset))?;
-        (&self.0).read_exact(out)
-    }
-
-    fn set_len(&self, len: u64) -> io::Result<()> {
-        let now = self.0.metadata()?.len();
-        if len <= now {
-            return self.0.set_len(len);
-        }
-        allocate(&self.0, now, len).inspect_err(|_| {
-            // Space that was allocated before the drive was full is freed, as far as possible.
-            let _ = self.0.set_len(now);
-        })
-    }
-
-    fn sync_data(&self) -> io::Result<()> {
-        self.0.sync_data()
-    }
-
-    #[cfg(unix)]
-    fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
-        std::os::unix::fs::FileExt::write_all_at(&self.0, data, offset)
-    }
-
-    #[cfg(not(unix))]
-    fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
-        use std::io::{Seek, Write};
-        (&self.0).seek(io::SeekFrom::Start(offset))?;
-        (&self.0).write_all(data)
-    }
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
-mod tests {
-    use super::*;
-    use redb::backends::InMemoryBackend;
-
-    #[cfg(unix)]
-    #[test]
-    fn a_file_that_grows_takes_its_space() {
-        use std::os::unix::fs::MetadataExt;
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("map");
-        let open = File::options().read(true).write(true).create_new(true).open(&path).unwrap();
-        let file = DriveFile::new(open);
-        for (len, taken) in [(1 << 20, 1 << 20), (3 << 20, 3 << 20), (1 << 20, 1 << 20)] {
-            file.set_len(len).unwrap();
-            let there = std::fs::metadata(&path).unwrap();
-            assert!(there.len() == len && there.blocks() * 512 >= taken, "{} blocks", there.blocks());
-        }
-    }
-
-    #[test]
-    fn held_back_writes_are_readable_but_not_on_the_drive() {
-        let inner: Arc<dyn StorageBackend> = Arc::new(InMemoryBackend::new());
-        inner.set_len(16).unwrap();
-        inner.write(0, &[1; 16]).unwrap();
-        let map = MapFile::holding_back(Arc::clone(&inner)).unwrap();
-        map.write(4, &[2; 4]).unwrap();
-        map.set_len(24).unwrap();
-        map.write(20, &[3; 4]).unwrap();
-        map.sync_data().unwrap();
-        let mut seen = [9; 24];
-        map.read(0, &mut seen).unwrap();
-        assert_eq!(seen, [1, 1, 1, 1, 2, 2, 2, 2, 1, 1, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 3, 3, 3, 3]);
-        map.set_len(18).unwrap();
-        map.set_len(24).unwrap();
-        map.read(0, &mut seen).unwrap();
-        assert_eq!(seen[16..], [0; 8], "bytes cut off come back as zeros");
-        assert!(map.read(20, &mut [0; 5]).is_err(), "beyond the end");
-        let mut stored = [0; 16];
-        inner.read(0, &mut stored).unwrap();
-        assert_eq!((inner.len().unwrap(), stored), (16, [1; 16]), "nothing may reach the drive");
-        map.release_held().unwrap();
-        let mut after = [9; 24];
-        inner.read(0, &mut after).unwrap();
-        assert_eq!(after, seen);
-        map.shut();
-        assert!(map.read(0, &mut after).is_err() && map.write(0, &[1]).is_err() && map.len().is_err());
     }
 }

@@ -2,11 +2,10 @@
 //! generation.
 
 pub mod commit;
+pub mod commit_error;
+pub mod entries;
 pub mod generations;
 pub mod manifest;
-pub(in crate::page) mod manifest_write;
 pub mod map_file;
-#[doc(hidden)]
-pub mod mutants;
 pub mod opening;
 pub mod witness;

@@ -1,4 +1,4 @@
-//! The content of a store at opening: the pages of its last generation, and the free slots.
+//! Creating and opening a store; its content at opening: the pages of its last generation, and the free slots.
 //!
 //! The drive holds no list of free slots. A slot is in use if the last generation names it, retired if only another
 //! kept generation does, and free otherwise; so no crash can leave a list that disagrees with the map.
@@ -6,14 +6,20 @@
 use crate::base::ids::PageId;
 use crate::page::engine::page_engine::{PageEngine, Place};
 use crate::page::engine::segment_files::segment_file_name;
+use crate::page::folder::protocol_files::{Folder, MAP_NAME, MAP_NEW_NAME, WITNESS_NAME};
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::SlotRef;
-use crate::page::map::commit::{CommitError, Commits};
-use crate::page::map::manifest::{MapContent, MapVersion};
-use crate::page::map::mutants::{Mutant, active};
+use crate::page::map::commit::{CommitConfig, Commits};
+use crate::page::map::commit_error::CommitError;
+use crate::page::map::entries::{MapContent, MapVersion};
+use crate::page::map::generations::Generations;
+use crate::page::map::manifest::Manifest;
+use crate::page::map::witness::Witness;
+use crate::page::mutants::{Mutant, active};
 use crate::page::versions::paged_store::{PagedStore, PagedStoreConfig};
 use crate::page::versions::slots::SlotLayout;
 use std::collections::BTreeMap;
+use std::io;
 
 /// Serial numbers that one opening of the store may use between two commits: opening a later generation starts beyond
 /// them. Openings of the same generation, because the earlier ones ended without a commit, start at the same number. So
@@ -58,29 +64,70 @@ pub struct Opened {
     past: Vec<Past>,
 }
 
-impl Opened {
-    /// Decodes the values of `content`.
+impl Commits {
+    /// Creates an empty store in `folder`, durable when this returns. Overwrites the remains of an interrupted
+    /// creation.
     ///
     /// # Errors
-    /// A value cannot be decoded, or two pages name one slot.
-    pub(in crate::page) fn new(
-        commits: Commits,
-        content: MapContent,
-        run_state: Vec<u8>,
-    ) -> Result<Opened, CommitError> {
+    /// The folder cannot be written, or contains a store already.
+    pub fn create(folder: Box<dyn Folder>, config: CommitConfig) -> Result<Opened, CommitError> {
+        let (map_error, witness_error) = (CommitError::file(MAP_NAME), CommitError::file(WITNESS_NAME));
+        if folder.open(MAP_NAME).map_err(&map_error)?.is_some() {
+            let taken = io::Error::new(io::ErrorKind::AlreadyExists, "this folder already contains a store");
+            return Err(map_error(taken));
+        }
+        let witness = folder.create(WITNESS_NAME).and_then(|file| Witness::create(file, config.store));
+        witness.map_err(witness_error)?;
+        let file = folder.create(MAP_NEW_NAME).map_err(&map_error)?;
+        drop(Manifest::create(file, config.store, config.cache_bytes)?);
+        // Entries may become durable in any order: first sync all files, then give the map the name that makes them a
+        // store.
+        let named = sync_entries(folder.as_ref()).and_then(|()| folder.rename(MAP_NEW_NAME, MAP_NAME));
+        named.and_then(|()| sync_entries(folder.as_ref())).map_err(map_error)?;
+        Commits::open(folder, config)
+    }
+
+    /// Opens the store in `folder`: verifies the whole map and finds the last generation. Reads no page data.
+    ///
+    /// # Errors
+    /// There is no store, it is damaged or older than the last acknowledged commit, or it cannot be read or written.
+    /// The files of a refused store stay unchanged.
+    pub fn open(folder: Box<dyn Folder>, config: CommitConfig) -> Result<Opened, CommitError> {
+        let file = folder.open(MAP_NAME).map_err(CommitError::file(MAP_NAME))?.ok_or(CommitError::NoStore)?;
+        let witness_error = CommitError::file(WITNESS_NAME);
+        let witness = folder.open(WITNESS_NAME).map_err(&witness_error)?;
+        let witness = witness.ok_or_else(|| witness_error(io::ErrorKind::NotFound.into()))?;
+        let mut witness = Witness::open(witness, config.store).map_err(&witness_error)?;
+        // A killed process may have left folder entries that are not durable; this sync makes them so.
+        sync_entries(folder.as_ref()).map_err(CommitError::file("the folder"))?;
+        let (manifest, content) = Manifest::open(file, config.store, witness.sequence(), config.cache_bytes)?;
+        // A commit that was durable but not yet acknowledged is acknowledged now.
+        if witness.sequence() < content.counters.sequence {
+            witness.record(content.counters.sequence).map_err(witness_error)?;
+        }
+        let generations = Generations::of(&content);
+        let run_state = match content.counters.latest {
+            0 => Vec::new(),
+            latest => manifest.run_state(latest)?,
+        };
+        let commits = Commits { folder, config, manifest: Some(manifest), witness, generations, poison: None };
         let pages = pages_at(&content.versions, content.counters.latest)?;
         let past = past_slots(&content.versions, &pages)?;
         Ok(Opened { commits, pages, run_state, content, past })
     }
+}
 
+fn sync_entries(folder: &dyn Folder) -> io::Result<()> {
+    if active(Mutant::FolderNotSyncedForMap) { Ok(()) } else { folder.sync() }
+}
+
+impl Opened {
     /// Pages of a kept generation, ascending by id.
     ///
     /// # Errors
     /// The generation is not kept.
     pub fn pages_at(&self, generation: u64) -> Result<Vec<StoredPage>, CommitError> {
-        if !self.commits.generations().is_kept(generation) {
-            return Err(CommitError::NotKept(generation));
-        }
+        self.commits.check_kept(generation)?;
         pages_at(&self.content.versions, generation)
     }
 
@@ -109,7 +156,7 @@ impl Opened {
         let mut paged = PagedStore::open(engine, config, segments, used)
             .map_err(|error| CommitError::Contradiction(error.to_string()))?;
         for past in past {
-            paged.retire_past(&past.slot, past.until);
+            paged.free_from(&past.slot, past.until);
         }
         Ok(paged)
     }

@@ -8,7 +8,7 @@
 //! least one is valid, and it is at most one transaction behind. A witness behind its map is an ordinary crash.
 
 use crate::page::format::seal::{SEAL_BYTES, SealScope};
-use crate::page::map::mutants::{Mutant, active};
+use crate::page::mutants::{Mutant, active};
 use redb::StorageBackend;
 use std::io;
 use std::sync::Arc;
@@ -92,33 +92,4 @@ fn read_slot(store: u128, slot: u64, bytes: &[u8]) -> Option<u64> {
     let (body, _) = scope(store).unseal(&slot.to_le_bytes(), sealed).ok()?;
     let (magic, sequence) = body.split_first_chunk::<8>()?;
     (*magic == MAGIC).then_some(u64::from_le_bytes(sequence.try_into().ok()?))
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
-mod tests {
-    use super::*;
-    use redb::backends::InMemoryBackend;
-
-    #[test]
-    fn one_damaged_slot_falls_back_one_transaction_and_two_are_refused() {
-        let file: Arc<dyn StorageBackend> = Arc::new(InMemoryBackend::new());
-        let mut witness = Witness::create(Arc::clone(&file), 9).unwrap();
-        for sequence in 1..6 {
-            witness.record(sequence).unwrap();
-        }
-        assert_eq!(Witness::open(Arc::clone(&file), 9).unwrap().sequence(), 5);
-        assert!(Witness::open(Arc::clone(&file), 8).is_err(), "another store's witness");
-        let mut newest = [0u8; SLOT_BYTES];
-        file.read(SLOT_BYTES as u64, &mut newest).unwrap();
-        newest[17] ^= 4;
-        file.write(SLOT_BYTES as u64, &newest).unwrap();
-        assert_eq!(Witness::open(Arc::clone(&file), 9).unwrap().sequence(), 4);
-        // A valid slot copied to the wrong place is ignored.
-        let mut older = [0u8; SLOT_BYTES];
-        file.read(0, &mut older).unwrap();
-        file.write(SLOT_BYTES as u64, &older).unwrap();
-        file.write(0, &newest).unwrap();
-        assert_eq!(Witness::open(file, 9).unwrap_err().kind(), io::ErrorKind::InvalidData);
-    }
 }

@@ -1,6 +1,7 @@
-//! What tools need beyond a run: reading a store without writing, building a new store, finding pages without a map.
+//! What tools do with stores: read one, build one, find pages without a map, tell which hold no commit.
 
 pub mod new_store;
 pub mod reading;
 pub mod scan;
 pub mod slot_reader;
+pub mod uncommitted;

@@ -10,15 +10,17 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::page::engine::page_engine::Place;
-use crate::page::engine::pread::PreadEngine;
-use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name};
-use crate::page::folder::spill_dir::{LOCK, LOCK_MAGIC, bad_format, format_bytes_of, read_format};
+use crate::page::engine::segment_files::open_for_reading;
+use crate::page::engine::threaded::ThreadedEngine;
+use crate::page::folder::protocol_files::DriveFile;
+use crate::page::folder::spill_dir::{LOCK, LOCK_MAGIC, bad_format, format_bytes_of, segments_in};
+use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::SlotRef;
 use crate::page::format::spill_format::{FormatFeatures, SpillFormat, features_of};
 use crate::page::map::commit::{CommitConfig, CommitError, MAP_NAME, WITNESS_NAME};
+use crate::page::map::entries::{MapContent, MapError};
 use crate::page::map::generations::Generations;
-use crate::page::map::manifest::{Manifest, MapContent, MapError};
-use crate::page::map::map_file::DriveFile;
+use crate::page::map::manifest::Manifest;
 use crate::page::map::opening::{StoredPage, check_segments, pages_at, slot_and_label};
 use crate::page::map::witness::Witness;
 use crate::page::tool::slot_reader::SlotReader;
@@ -109,9 +111,8 @@ impl StoreReader {
     pub fn open(folder: &Path, access: Access, rule: WitnessRule) -> Result<StoreReader, ReadError> {
         let (format, features) = format_at(folder)?;
         let (lock, used_by) = match lock_for_reading(folder)? {
-            ReadLock::Taken(file) => (Some(file), None),
-            ReadLock::Nobody => (None, None),
-            ReadLock::InUse(who) => (None, Some(who)),
+            Ok(lock) => (lock, None),
+            Err(who) => (None, Some(who)),
         };
         if let Some(who) = used_by.as_ref().filter(|_| access == Access::Pages) {
             return Err(in_use(folder, who).into());
@@ -186,9 +187,7 @@ impl StoreReader {
     /// # Errors
     /// The generation is not kept, or the map contradicts itself.
     pub fn pages_at(&self, generation: u64) -> Result<Vec<StoredPage>, CommitError> {
-        if !self.generations.is_kept(generation) {
-            return Err(CommitError::NotKept(generation));
-        }
+        self.check_kept(generation)?;
         pages_at(&self.content.versions, generation)
     }
 
@@ -197,10 +196,12 @@ impl StoreReader {
     /// # Errors
     /// The run state is not kept, or cannot be read.
     pub fn run_state(&self, generation: u64) -> Result<Vec<u8>, CommitError> {
-        if !self.generations.is_kept(generation) {
-            return Err(CommitError::NotKept(generation));
-        }
+        self.check_kept(generation)?;
         Ok(self.manifest.run_state(generation)?)
+    }
+
+    fn check_kept(&self, generation: u64) -> Result<(), CommitError> {
+        if self.generations.is_kept(generation) { Ok(()) } else { Err(CommitError::NotKept(generation)) }
     }
 
     /// The note of a kept generation.
@@ -268,16 +269,11 @@ impl StoreReader {
     /// The map names an impossible slot; a segment up to the last one that `pages` use is missing or has another
     /// length; or the engine cannot be started.
     pub fn paged_store(&self, pages: &[StoredPage], threads: usize) -> Result<PagedStore, ReadError> {
-        let engine = PreadEngine::open_read_only(&self.folder, threads)
+        let engine = ThreadedEngine::pread_read_only(&self.folder, threads)
             .map_err(|e| InputError::io(&self.folder, "opening the pages", &e))?;
         let SpillFormat { store, layout, .. } = self.format;
-        let config = PagedStoreConfig {
-            store,
-            layout,
-            codec: crate::page::format::codec::Codec::Raw,
-            generation: self.generations.next(),
-            serial: 0,
-        };
+        let config =
+            PagedStoreConfig { store, layout, codec: Codec::Raw, generation: self.generations.next(), serial: 0 };
         let last = pages.iter().map(|p| p.slot.place.segment).max();
         let segments = check_segments(&engine, layout, last)?;
         let used = pages.iter().map(|p| &p.slot);
@@ -310,26 +306,9 @@ pub fn format_at(folder: &Path) -> InputResult<(SpillFormat, FormatFeatures)> {
                       salvage can still find its pages";
         InputError::new(folder, "it is not a store: it has no FORMAT file", remedy)
     };
-    let format = read_format(folder)?.ok_or_else(no_store)?.map_err(|error| bad_format(folder, &error))?;
     let bytes = format_bytes_of(folder)?.ok_or_else(no_store)?;
-    Ok((format, features_of(&bytes).map_err(|error| bad_format(folder, &error))?))
-}
-
-/// Numbers and lengths of the segment files in `folder`, ascending.
-///
-/// # Errors
-/// The folder cannot be read.
-pub fn segments_in(folder: &Path) -> InputResult<Vec<(u32, u64)>> {
-    let failed = |e: io::Error| InputError::io(folder, "reading the folder", &e);
-    let mut segments = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(failed)? {
-        let entry = entry.map_err(failed)?;
-        let about = entry.metadata().map_err(failed)?;
-        let number = entry.file_name().to_str().and_then(segment_from_file_name);
-        segments.extend(number.filter(|_| about.is_file()).map(|segment| (segment, about.len())));
-    }
-    segments.sort_unstable();
-    Ok(segments)
+    let read = SpillFormat::from_bytes(&bytes).and_then(|format| Ok((format, features_of(&bytes)?)));
+    read.map_err(|error| bad_format(folder, &error))
 }
 
 /// Refuses a folder that a process is using.
@@ -337,11 +316,7 @@ pub fn segments_in(folder: &Path) -> InputResult<Vec<(u32, u64)>> {
 /// # Errors
 /// The store is in use, or its lock cannot be read.
 pub fn refuse_if_in_use(folder: &Path) -> InputResult<Option<File>> {
-    match lock_for_reading(folder)? {
-        ReadLock::Taken(file) => Ok(Some(file)),
-        ReadLock::Nobody => Ok(None),
-        ReadLock::InUse(who) => Err(in_use(folder, &who)),
-    }
+    lock_for_reading(folder)?.map_err(|who| in_use(folder, &who))
 }
 
 fn in_use(folder: &Path, who: &str) -> InputError {
@@ -353,30 +328,23 @@ fn in_use(folder: &Path, who: &str) -> InputError {
     )
 }
 
-enum ReadLock {
-    Taken(File),
-    /// The store was never locked.
-    Nobody,
-    InUse(String),
-}
-
-/// Takes a lock that readers share and that excludes writers.
-fn lock_for_reading(folder: &Path) -> InputResult<ReadLock> {
+/// Takes a lock that readers share and that excludes writers: `None` if the store was never locked, or the process that
+/// uses the store.
+fn lock_for_reading(folder: &Path) -> InputResult<Result<Option<File>, String>> {
     let path = folder.join(LOCK);
     let failed = |e: io::Error| InputError::io(&path, "finding out which process uses the store", &e);
     let file = match open_for_reading(&path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(ReadLock::Nobody),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Ok(None)),
         file => file.map_err(failed)?,
     };
     match file.try_lock_shared() {
-        Ok(()) => Ok(ReadLock::Taken(file)),
+        Ok(()) => Ok(Ok(Some(file))),
         Err(TryLockError::Error(error)) => Err(failed(error)),
         Err(TryLockError::WouldBlock) => {
             let mut text = String::new();
             // A foreign lock file may contain anything; the holder then stays unknown.
             let _ = (&file).take(512).read_to_string(&mut text);
-            let who = text.strip_prefix(LOCK_MAGIC).unwrap_or("unknown").trim().replace('\n', ", ");
-            Ok(ReadLock::InUse(who))
+            Ok(Err(text.strip_prefix(LOCK_MAGIC).unwrap_or("unknown").trim().replace('\n', ", ")))
         }
     }
 }
@@ -385,21 +353,21 @@ fn lock_for_reading(folder: &Path) -> InputResult<ReadLock> {
 fn open_map(folder: &Path, store: u128, rule: WitnessRule, copied: bool) -> Result<(Manifest, MapContent), ReadError> {
     let acknowledged = match rule {
         WitnessRule::Obeyed => {
-            let failed = |source| CommitError::File { name: WITNESS_NAME, source };
-            let file = open_for_reading(&folder.join(WITNESS_NAME)).map_err(failed)?;
-            Witness::open(Arc::new(DriveFile::new(file)), store).map_err(failed)?.sequence()
+            let failed = CommitError::file(WITNESS_NAME);
+            let file = open_for_reading(&folder.join(WITNESS_NAME)).map_err(&failed)?;
+            Witness::open(Arc::new(DriveFile::new(file)), store).map_err(&failed)?.sequence()
         }
         WitnessRule::Ignored => 0,
     };
     let mut file = match open_for_reading(&folder.join(MAP_NAME)) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Err(CommitError::NoStore.into()),
-        file => file.map_err(|source| CommitError::File { name: MAP_NAME, source })?,
+        file => file.map_err(CommitError::file(MAP_NAME))?,
     };
     let backend: Arc<dyn StorageBackend> = if copied {
         let mut bytes = Vec::new();
         let memory = InMemoryBackend::new();
         let read = file.read_to_end(&mut bytes).and_then(|_| memory.set_len(bytes.len() as u64));
-        read.and_then(|()| memory.write(0, &bytes)).map_err(|source| CommitError::File { name: MAP_NAME, source })?;
+        read.and_then(|()| memory.write(0, &bytes)).map_err(CommitError::file(MAP_NAME))?;
         Arc::new(memory)
     } else {
         Arc::new(DriveFile::new(file))
@@ -407,16 +375,15 @@ fn open_map(folder: &Path, store: u128, rule: WitnessRule, copied: bool) -> Resu
     Ok(Manifest::open_read_only(backend, store, acknowledged, CACHE_BYTES)?)
 }
 
-/// As [`open_map`], while a process commits to it.
+/// As [`open_map`], while a process commits to it: copies the file until a copy verifies.
 fn open_copy(folder: &Path, store: u128, rule: WitnessRule) -> Result<(Manifest, MapContent), ReadError> {
-    let mut copies = 1;
-    loop {
+    for copies in 1..COPIES_MAX {
         match open_map(folder, store, rule, true) {
-            Err(ReadError::Commit(CommitError::Map(_))) if copies < COPIES_MAX => {
+            Err(ReadError::Commit(CommitError::Map(_))) => {
                 std::thread::sleep(Duration::from_millis(10 * u64::from(copies)));
-                copies += 1;
             }
             opened => return opened,
         }
     }
+    open_map(folder, store, rule, true)
 }

@@ -7,9 +7,9 @@ use crate::base::ids::PageId;
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::engine::page_engine::Place;
 use crate::page::engine::segment_files::{open_for_reading, segment_file_name};
+use crate::page::folder::protocol_files::DriveFile;
 use crate::page::format::slot_header::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs, transfer_bytes};
 use crate::page::format::verify::{verify, verify_identity};
-use crate::page::map::map_file::DriveFile;
 use redb::StorageBackend;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -52,9 +52,8 @@ impl SlotReader {
     /// # Errors
     /// The problem, as text for users.
     pub fn header_at(&mut self, place: Place) -> Result<SlotHeader, String> {
-        let mut bytes = [0; HEADER_BYTES];
-        self.read(place, HEADER_BYTES, |from| bytes.copy_from_slice(from))?;
-        SlotHeader::decode(&bytes).map_err(|e| e.to_string())
+        let bytes = self.read(place, HEADER_BYTES)?.first_chunk().ok_or("the slot is shorter than its header")?;
+        SlotHeader::decode(bytes).map_err(|e| e.to_string())
     }
 
     /// The payload of version `slot` of `page`, verified and decoded; aligned for its tables.
@@ -67,7 +66,7 @@ impl SlotReader {
         if needed as u64 > self.slot_bytes {
             return Err(format!("the map states {bytes} bytes, more than a slot holds"));
         }
-        self.read(slot.place, bytes, |_| ())?;
+        self.read(slot.place, bytes)?;
         if slot.codec != StoredAs::Raw {
             make_longer(&mut self.decoded, needed);
         }
@@ -77,30 +76,30 @@ impl SlotReader {
         Ok(&whole.as_slice()[HEADER_BYTES..][..slot.payload_bytes as usize])
     }
 
-    /// Reads bytes into the buffer and passes them to `take`.
-    fn read(&mut self, place: Place, bytes: usize, take: impl FnOnce(&[u8])) -> Result<(), String> {
+    /// Reads bytes into the buffer.
+    fn read(&mut self, place: Place, bytes: usize) -> Result<&[u8], String> {
         let failed = |e: io::Error| match e.kind() {
             io::ErrorKind::NotFound => format!("{} is missing", segment_file_name(place.segment)),
             io::ErrorKind::UnexpectedEof => "the segment ends inside the slot".to_string(),
             _ => format!("it cannot be read: {e}"),
         };
         if self.file.as_ref().is_none_or(|(segment, ..)| *segment != place.segment) {
-            let file = open_for_reading(&self.folder.join(segment_file_name(place.segment))).map_err(failed)?;
-            let length = file.metadata().map_err(failed)?;
-            if !length.is_file() {
-                return Err(format!("{} is not a file", segment_file_name(place.segment)));
+            let name = segment_file_name(place.segment);
+            let file = open_for_reading(&self.folder.join(&name)).map_err(failed)?;
+            let metadata = file.metadata().map_err(failed)?;
+            if !metadata.is_file() {
+                return Err(format!("{name} is not a file"));
             }
-            self.file = Some((place.segment, DriveFile::new(file), length.len()));
+            self.file = Some((place.segment, DriveFile::new(file), metadata.len()));
         }
-        let Some((_, file, length)) = &self.file else { return Ok(()) };
+        let Some((_, file, length)) = &self.file else { return Ok(&[]) };
         if place.offset.saturating_add(bytes as u64) > *length {
             return Err(failed(io::ErrorKind::UnexpectedEof.into()));
         }
         make_longer(&mut self.stored, bytes);
         let buffer = &mut self.stored.as_mut_slice()[..bytes];
         file.read(place.offset, buffer).map_err(failed)?;
-        take(buffer);
-        Ok(())
+        Ok(buffer)
     }
 }
 

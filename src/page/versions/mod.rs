@@ -1,8 +1,6 @@
 //! Versions of pages on an engine: which slot holds which version, and when a slot becomes free.
 
-pub(in crate::page) mod cut;
-pub(in crate::page) mod page_done;
 pub mod page_error;
 pub mod paged_store;
+pub(in crate::page) mod pending;
 pub mod slots;
-pub(in crate::page) mod waiting;

@@ -31,37 +31,17 @@ impl std::fmt::Display for SlotName {
 #[derive(Debug, thiserror::Error)]
 pub enum PageError {
     /// Reading failed twice.
-    #[error("{at} cannot be read: {source}\n  remedy: check the drive and cable; roll back to an earlier checkpoint")]
-    Read {
-        /// The version.
-        at: SlotName,
-        /// The system's error.
-        source: io::Error,
-    },
+    #[error("{0} cannot be read: {1}\n  remedy: check the drive and cable; roll back to an earlier checkpoint")]
+    Read(SlotName, #[source] io::Error),
     /// The bytes read differ from those written, in two attempts.
-    #[error("{at} is damaged: {what}\n  remedy: check the drive; roll back to an earlier checkpoint")]
-    Damaged {
-        /// The version.
-        at: SlotName,
-        /// The mismatch.
-        what: String,
-    },
+    #[error("{0} is damaged: {1}\n  remedy: check the drive; roll back to an earlier checkpoint")]
+    Damaged(SlotName, String),
     /// Writing failed. The store accepts no more writes.
-    #[error("{at} cannot be written: {source}\n  remedy: check the drive; committed generations are intact")]
-    Write {
-        /// The version being written.
-        at: SlotName,
-        /// The system's error.
-        source: io::Error,
-    },
+    #[error("{0} cannot be written: {1}\n  remedy: check the drive; committed generations are intact")]
+    Write(SlotName, #[source] io::Error),
     /// No space for the bytes. Nothing is lost, and the write may be repeated.
-    #[error("there is no space to write {at}: {source}\n  remedy: free space on the drive of the spill directory")]
-    NoSpace {
-        /// The version being written.
-        at: SlotName,
-        /// The system's error.
-        source: io::Error,
-    },
+    #[error("there is no space to write {0}: {1}\n  remedy: free space on the drive of the spill directory")]
+    NoSpace(SlotName, #[source] io::Error),
     /// No space for another segment, or it cannot be created. Nothing is lost, and the attempt may be repeated.
     #[error("{} ({bytes} bytes) cannot be created: {source}\n  remedy: {}", segment_file_name(*.segment), grow_remedy(.source))]
     Grow {
@@ -74,18 +54,12 @@ pub enum PageError {
     },
     /// The drive failed to make writes durable. The store accepts no more writes.
     #[error(
-        "the drive could not make writes durable: {source}\n  remedy: check the drive; committed generations are intact"
+        "the drive could not make writes durable: {0}\n  remedy: check the drive; committed generations are intact"
     )]
-    Sync {
-        /// The system's error.
-        source: io::Error,
-    },
+    Sync(#[source] io::Error),
     /// A write or sync failed earlier, so the store accepts no writes.
-    #[error("writing stopped after a drive error ({cause})\n  remedy: check the drive, then start again")]
-    Poisoned {
-        /// The first error.
-        cause: String,
-    },
+    #[error("writing stopped after a drive error ({0})\n  remedy: check the drive, then start again")]
+    Poisoned(String),
     /// The payload or its label is too long.
     #[error(
         "page {page} has {payload_bytes} bytes (limit {capacity_bytes}) and a label of {label_bytes} (limit \
@@ -107,7 +81,7 @@ impl PageError {
     /// Whether the error is only a lack of space: a later attempt may succeed.
     pub fn is_out_of_space(&self) -> bool {
         match self {
-            PageError::NoSpace { .. } => true,
+            PageError::NoSpace(..) => true,
             PageError::Grow { source, .. } => is_out_of_space(source),
             _ => false,
         }

@@ -8,7 +8,10 @@
 //! page, generation, place, lengths, checksum); a mismatch is read once more and then reported; 2. a new version never
 //! overwrites a slot that a durable or pinned generation names; 3. after a failed write or sync the store accepts no
 //! more writes, except after a lack of space: then nothing was written, and space may be freed later; 4. every accepted
-//! transfer ends in exactly one [`PageDone`].
+//! transfer ends in exactly one [`PageDone`]; 5. a retired slot keeps the whole range of generations that may name it.
+//!
+//! A cut ends a generation. Versions of the ended generation may still be written after the cut, by its number, beside
+//! versions of the next one.
 
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::PageBuffer;
@@ -16,11 +19,11 @@ use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Place,
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, transfer_bytes};
 use crate::page::format::verify::verify;
-use crate::page::map::mutants::{Mutant, active};
-pub use crate::page::versions::page_done::{PageDone, PageMoved, PageTraffic};
-use crate::page::versions::page_error::{PageError, SlotName, is_out_of_space};
+use crate::page::mutants::{Mutant, active};
+use crate::page::versions::page_error::{PageError, is_out_of_space};
+pub use crate::page::versions::pending::{PageDone, PageMoved, PageTraffic};
+use crate::page::versions::pending::{Pending, Waiting};
 use crate::page::versions::slots::{SlotError, SlotLayout, Slots};
-use crate::page::versions::waiting::Waiting;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::io;
@@ -43,24 +46,11 @@ pub struct PagedStoreConfig {
     pub serial: u64,
 }
 
-/// A transfer in flight.
-#[derive(Debug)]
-struct Pending {
-    token: u64,
-    page: PageId,
-    slot: SlotRef,
-    direction: Direction,
-    /// Whether this is the second and last attempt of a read.
-    is_repeated: bool,
-    /// The caller's buffer, while a staging buffer carries the encoded form.
-    payload: Option<PageBuffer>,
-}
-
 /// Pages in slots. Has one owner.
 pub struct PagedStore {
     engine: Box<dyn PageEngine>,
-    pub(in crate::page) config: PagedStoreConfig,
-    pub(in crate::page) slots: Slots,
+    config: PagedStoreConfig,
+    slots: Slots,
     pending: BTreeMap<u64, Pending>,
     next_transfer: u64,
     waiting: Vec<Waiting>,
@@ -118,11 +108,6 @@ impl PagedStore {
     /// A zeroed buffer for one page of this store: header room and the longest payload.
     pub fn new_buffer(&self) -> PageBuffer {
         PageBuffer::mapped(self.config.layout.slot_bytes as usize)
-    }
-
-    /// The engine's name, for messages.
-    pub fn engine_name(&self) -> &'static str {
-        self.engine.name()
     }
 
     /// Bytes moved so far.
@@ -216,8 +201,10 @@ impl PagedStore {
             Ok(slot) => SlotRef { generation, ..slot },
             Err(error) => return Err((error, buffer)),
         };
-        let staging = (self.config.codec != Codec::Raw).then(|| self.take_staging());
-        self.waiting.push(Waiting { token, page, slot, label: label.to_vec(), payload: buffer, staging });
+        let is_staged = self.config.codec != Codec::Raw;
+        let (payload, buffer) = if is_staged { (Some(buffer), self.take_staging()) } else { (None, buffer) };
+        let pending = Pending { token, page, slot, direction: Direction::Write, is_repeated: false, payload };
+        self.waiting.push(Waiting { pending, label: label.to_vec(), buffer });
         if self.waiting.len() >= WRITE_BATCH {
             self.begin_writes();
         }
@@ -255,8 +242,35 @@ impl PagedStore {
         }
         synced.map_err(|source| {
             self.poison = Some(format!("making pages durable failed: {source}"));
-            PageError::Sync { source }
+            PageError::Sync(source)
         })
+    }
+
+    /// Version `slot` is superseded. If no committed generation can name it, its slot is free at once, otherwise after
+    /// [`PagedStore::commit_done`]. A run without commits thus frees every slot at once.
+    pub fn free(&mut self, slot: &SlotRef) {
+        self.free_from(slot, self.config.generation);
+    }
+
+    /// As [`PagedStore::free`], but superseded from generation `from` on: one that is cut and not committed yet, or, at
+    /// opening, one of the past.
+    pub fn free_from(&mut self, slot: &SlotRef, from: u64) {
+        let was_in_use = self.slots.retire(slot.place, slot.generation, from);
+        debug_assert!(was_in_use, "a slot was freed twice: {slot:?}");
+    }
+
+    /// Ends generation [`PagedStore::generation`], which is about to be committed from the present index: later writes
+    /// belong to the next generation, unless [`PagedStore::write_for`] names the ended one. [`PagedStore::sync`] must
+    /// follow the last write of the generation and precede the commit.
+    pub fn cut(&mut self) -> u64 {
+        self.config.generation += 1;
+        self.config.generation - 1
+    }
+
+    /// Acknowledges the commit of generation `durable`; of the earlier ones `pinned` are kept. Frees the slots that
+    /// none of these names; returns how many.
+    pub fn commit_done(&mut self, durable: u64, pinned: &[u64]) -> usize {
+        self.slots.release_retired(durable, pinned)
     }
 
     /// Poisons the store, because another part of it failed: no more writes are accepted.
@@ -266,7 +280,7 @@ impl PagedStore {
 
     fn refuse_if_poisoned(&self) -> Result<(), PageError> {
         match &self.poison {
-            Some(cause) if !active(Mutant::PoisonIgnored) => Err(PageError::Poisoned { cause: cause.clone() }),
+            Some(cause) if !active(Mutant::PoisonIgnored) => Err(PageError::Poisoned(cause.clone())),
             _ => Ok(()),
         }
     }
@@ -306,7 +320,7 @@ impl PagedStore {
     fn grow(&mut self) -> Result<Place, PageError> {
         self.add_segment()?;
         // A new segment has at least one slot.
-        self.slots.allocate().ok_or(PageError::Poisoned { cause: "a segment without slots".to_string() })
+        self.slots.allocate().ok_or(PageError::Poisoned("a segment without slots".to_string()))
     }
 
     fn add_segment(&mut self) -> Result<(), PageError> {
@@ -332,9 +346,12 @@ impl PagedStore {
         self.staging.pop().unwrap_or_else(|| self.new_buffer())
     }
 
-    fn give_staging(&mut self, buffer: PageBuffer) {
+    /// The caller's buffer of a transfer that `buffer` carried; a staging buffer becomes free.
+    fn callers(&mut self, pending: &mut Pending, buffer: PageBuffer) -> PageBuffer {
+        let Some(payload) = pending.payload.take() else { return buffer };
         self.staged -= 1;
         self.staging.push(buffer);
+        payload
     }
 
     /// Submits the accepted writes to the engine. This happens by itself when a batch is full and in
@@ -346,45 +363,31 @@ impl PagedStore {
             [one] => one.seal(codec),
             many => many.par_iter_mut().for_each(|write| write.seal(codec)),
         }
-        for Waiting { token, page, slot, label, payload, staging } in batch {
-            let (buffer, payload) = match (slot.codec, staging) {
-                (StoredAs::Raw, staging) => {
-                    staging.into_iter().for_each(|staging| self.give_staging(staging));
-                    (payload, None)
-                }
-                (_, Some(staging)) => (staging, Some(payload)),
-                (_, None) => (payload, None),
-            };
-            let pending = Pending { token, page, slot, direction: Direction::Write, is_repeated: false, payload };
-            self.submit_write(pending, &label, buffer);
+        for Waiting { mut pending, label, mut buffer } in batch {
+            if pending.slot.codec == StoredAs::Raw
+                && let Some(staging) = pending.payload.take()
+            {
+                // Sealing has put the caller's buffer first.
+                self.staged -= 1;
+                self.staging.push(staging);
+            }
+            if let Err(error) = self.refuse_if_poisoned() {
+                self.slots.release(pending.slot.place);
+                buffer = self.callers(&mut pending, buffer);
+                self.ended.push(pending.end(buffer, Err(error)));
+            } else {
+                self.submit_write(pending, label, buffer);
+            }
         }
     }
 
     /// Writes the header before the payload and submits.
-    fn submit_write(&mut self, mut pending: Pending, label: &[u8], mut buffer: PageBuffer) {
-        if let Err(error) = self.refuse_if_poisoned() {
-            self.slots.release(pending.slot.place);
-            let payload = match pending.payload.take() {
-                Some(payload) => {
-                    self.give_staging(buffer);
-                    payload
-                }
-                None => buffer,
-            };
-            return self.ended.push(pending.end(payload, Err(error)));
-        }
-        let slot = &pending.slot;
-        let bytes = slot.transfer_bytes();
-        let described = SlotHeader {
-            store: self.config.store,
-            page: pending.page,
-            serial: self.config.serial,
-            slot: *slot,
-            label: label.to_vec(),
-        };
+    fn submit_write(&mut self, pending: Pending, label: Vec<u8>, mut buffer: PageBuffer) {
+        let (slot, bytes) = (pending.slot, pending.slot.transfer_bytes());
+        let (store, serial) = (self.config.store, self.config.serial);
         self.config.serial += 1;
         if let Some(header) = buffer.as_mut_slice().first_chunk_mut() {
-            described.encode(header);
+            SlotHeader { store, page: pending.page, serial, slot, label }.encode(header);
         }
         self.traffic.bytes_written += bytes as u64;
         self.traffic.payload_bytes_written += u64::from(slot.payload_bytes);
@@ -398,7 +401,7 @@ impl PagedStore {
         // A reference from a damaged index may ask for more than a slot holds.
         if needed > buffer.len().min(self.config.layout.slot_bytes as usize) {
             let what = format!("the map states {needed} bytes, more than a slot holds");
-            let error = PageError::Damaged { at: pending.name(), what };
+            let error = PageError::Damaged(pending.name(), what);
             return self.ended.push(pending.end(buffer, Err(error)));
         }
         self.traffic.bytes_read += bytes as u64;
@@ -440,13 +443,7 @@ impl PagedStore {
             many => many.par_iter_mut().for_each(check),
         }
         for (mut pending, Completion { transfer, result }, verdict) in checked {
-            let buffer = match pending.payload.take() {
-                Some(payload) => {
-                    self.give_staging(transfer.buffer);
-                    payload
-                }
-                None => transfer.buffer,
-            };
+            let buffer = self.callers(&mut pending, transfer.buffer);
             match pending.direction {
                 Direction::Read => self.finish_read(pending, buffer, result, verdict),
                 Direction::Write => self.finish_write(pending, buffer, result),
@@ -467,8 +464,8 @@ impl PagedStore {
                 let payload_bytes = pending.slot.payload_bytes as usize;
                 return self.ended.push(pending.end(buffer, Ok(PageMoved::Read { payload_bytes })));
             }
-            (Err(source), _) => PageError::Read { at, source },
-            (Ok(()), Err(what)) => PageError::Damaged { at, what },
+            (Err(source), _) => PageError::Read(at, source),
+            (Ok(()), Err(what)) => PageError::Damaged(at, what),
         };
         if pending.is_repeated {
             self.ended.push(pending.end(buffer, Err(error)));
@@ -485,22 +482,12 @@ impl PagedStore {
         let end = result.map(|()| PageMoved::Written(pending.slot)).map_err(|source| {
             self.slots.release(pending.slot.place);
             if is_out_of_space(&source) {
-                return PageError::NoSpace { at, source };
+                return PageError::NoSpace(at, source);
             }
             self.poison.get_or_insert_with(|| format!("writing {at} failed: {source}"));
-            PageError::Write { at, source }
+            PageError::Write(at, source)
         });
         self.ended.push(pending.end(buffer, end));
-    }
-}
-
-impl Pending {
-    fn name(&self) -> SlotName {
-        SlotName { page: self.page, place: self.slot.place, generation: self.slot.generation }
-    }
-
-    fn end(self, buffer: PageBuffer, result: Result<PageMoved, PageError>) -> PageDone {
-        PageDone { token: self.token, page: self.page, buffer, result }
     }
 }
 

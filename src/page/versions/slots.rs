@@ -7,64 +7,9 @@
 //! out first, so that an import fills the segments front to back; 3. every slot is exactly one of free, in use and
 //! retired.
 
-use crate::page::engine::buffer::ALIGNMENT;
 use crate::page::engine::page_engine::Place;
-use crate::page::format::slot_header::{HEADER_BYTES, transfer_bytes};
+pub use crate::page::format::spill_format::SlotLayout;
 use std::collections::BTreeSet;
-
-/// Target size of a segment, bytes; segments of small scenes are smaller.
-const SEGMENT_BYTES: u64 = 256 << 20;
-/// Largest slot, bytes: the length of a payload is a 32-bit number.
-const SLOT_BYTES_MAX: u64 = HEADER_BYTES as u64 + (1 << 32);
-/// Target number of segments of a scene: each costs a file descriptor.
-const SEGMENTS: u64 = 64;
-
-/// Sizes that are fixed for the life of a store.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct SlotLayout {
-    /// Bytes of a slot; a multiple of [`ALIGNMENT`].
-    pub slot_bytes: u64,
-    /// Slots in a segment, at least 1.
-    pub slots_per_segment: u32,
-}
-
-impl SlotLayout {
-    /// Slots for payloads of at most `capacity_bytes`, in segments that suit a scene of about `pages` pages: about 256
-    /// MiB, less for a smaller scene, more where a scene would need too many files.
-    pub fn new(capacity_bytes: usize, pages: u64) -> SlotLayout {
-        let slot_bytes = transfer_bytes(capacity_bytes) as u64;
-        let usual = (SEGMENT_BYTES / slot_bytes).min(pages);
-        let slots = usual.max(pages / SEGMENTS).clamp(1, u64::from(u32::MAX));
-        SlotLayout { slot_bytes, slots_per_segment: slots as u32 }
-    }
-
-    /// Bytes of a segment.
-    pub fn segment_bytes(&self) -> u64 {
-        self.slot_bytes * u64::from(self.slots_per_segment)
-    }
-
-    /// Place of slot number `slot`.
-    pub fn place(&self, slot: u64) -> Place {
-        let per = u64::from(self.slots_per_segment);
-        Place { segment: (slot / per) as u32, offset: slot % per * self.slot_bytes }
-    }
-
-    /// Number of the slot at `place`; `None` if no slot starts there.
-    pub fn slot(&self, place: Place) -> Option<u64> {
-        let begins = place.offset.is_multiple_of(self.slot_bytes) && place.offset < self.segment_bytes();
-        begins.then(|| u64::from(place.segment) * u64::from(self.slots_per_segment) + place.offset / self.slot_bytes)
-    }
-
-    /// Whether a store can have these sizes: aligned, not empty, no larger than the longest payload, segments
-    /// addressable.
-    pub fn is_possible(&self) -> bool {
-        self.slot_bytes > ALIGNMENT as u64
-            && self.slot_bytes <= SLOT_BYTES_MAX
-            && self.slot_bytes.is_multiple_of(ALIGNMENT as u64)
-            && self.slots_per_segment > 0
-            && self.slot_bytes.checked_mul(u64::from(self.slots_per_segment)).is_some_and(|b| b <= i64::MAX as u64)
-    }
-}
 
 /// State of a slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -123,23 +68,13 @@ impl Slots {
         let mut slots = Slots::new(layout);
         (0..segments).for_each(|_| slots.add_segment());
         for place in used {
-            slots.mark_used(place)?;
+            let slot = slots.number(place).ok_or(SlotError::NoSlot(place))?;
+            if !slots.free.remove(&slot) {
+                return Err(SlotError::Twice(place));
+            }
+            slots.states[slot as usize] = SlotState::InUse;
         }
         Ok(slots)
-    }
-
-    /// At opening, marks a free slot as in use because the index of the current or of a pinned generation names it.
-    /// [`Slots::retire`] then retires past versions.
-    ///
-    /// # Errors
-    /// The place is not a slot, or is named twice.
-    pub fn mark_used(&mut self, place: Place) -> Result<(), SlotError> {
-        let slot = self.number(place).ok_or(SlotError::NoSlot(place))?;
-        if !self.free.remove(&slot) {
-            return Err(SlotError::Twice(place));
-        }
-        self.states[slot as usize] = SlotState::InUse;
-        Ok(())
     }
 
     /// The sizes of slots and segments.
@@ -236,34 +171,9 @@ impl Slots {
 #[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
-    use std::collections::BTreeMap;
 
     fn layout(slots_per_segment: u32) -> SlotLayout {
         SlotLayout { slot_bytes: 8192, slots_per_segment }
-    }
-
-    #[test]
-    fn segments_fit_the_scene() {
-        let capacity = 745_472;
-        let small = SlotLayout::new(capacity, 10);
-        assert_eq!((small.slots_per_segment, small.slot_bytes), (10, 4096 + 745_472));
-        let usual = SlotLayout::new(capacity, 20_000);
-        assert!(usual.segment_bytes() <= 256 << 20 && usual.segment_bytes() > 255 << 20);
-        let huge = SlotLayout::new(capacity, 1_000_000);
-        assert!(1_000_000_u64.div_ceil(u64::from(huge.slots_per_segment)) <= SEGMENTS + 1);
-        assert_eq!(SlotLayout::new(1, 0).slots_per_segment, 1);
-        for layout in [small, usual, huge] {
-            assert!(layout.is_possible());
-            for slot in [0, 1, 349, 350, 999_999] {
-                assert_eq!(layout.slot(layout.place(slot)), Some(slot));
-            }
-        }
-        assert_eq!(usual.slot(Place { segment: 0, offset: 4096 }), None);
-        assert_eq!(usual.slot(Place { segment: 0, offset: usual.segment_bytes() }), None);
-        let largest = SlotLayout { slot_bytes: SLOT_BYTES_MAX, slots_per_segment: 1 };
-        assert!(largest.is_possible() && largest.slot_bytes == transfer_bytes(u32::MAX as usize) as u64);
-        let wrong = [(0, 1), (4096, 1), (8193, 1), (8192, 0), (1 << 62, 4), (1 << 62, 1), (SLOT_BYTES_MAX + 4096, 1)];
-        assert!(wrong.iter().all(|&(slot_bytes, n)| !SlotLayout { slot_bytes, slots_per_segment: n }.is_possible()));
     }
 
     #[test]
@@ -290,86 +200,5 @@ mod tests {
         for wrong in [place(2, 0), place(0, 4096), place(0, 16384), place(u32::MAX, u64::MAX - 4095)] {
             assert_eq!(error(&[wrong]), SlotError::NoSlot(wrong));
         }
-    }
-
-    /// A simple model: for every kept generation, the places it names.
-    #[derive(Default)]
-    struct Model {
-        /// Place, and generation of the write.
-        present: BTreeMap<u8, (Place, u64)>,
-        /// Committed generations that are kept, with their places.
-        kept: BTreeMap<u64, Vec<Place>>,
-        pinned: Vec<u64>,
-        generation: u64,
-        durable: u64,
-    }
-
-    /// All sequences of seven operations on two pages: rewrite a page, cut and acknowledge a commit (with and without a
-    /// pin, with a write between cut and acknowledgement), drop the pins. After each operation, no place that a kept
-    /// generation names was handed out, and the three states add up.
-    #[test]
-    fn no_sequence_of_operations_hands_out_a_named_slot() {
-        const OPERATIONS: u32 = 6;
-        const LENGTH: u32 = 7;
-        for code in 0..OPERATIONS.pow(LENGTH) {
-            let mut slots = Slots::new(layout(1));
-            let mut model = Model { generation: 1, ..Model::default() };
-            let mut rest = code;
-            for _ in 0..LENGTH {
-                match rest % OPERATIONS {
-                    0 => write(&mut slots, &mut model, 0),
-                    1 => write(&mut slots, &mut model, 1),
-                    2 => commit(&mut slots, &mut model, false, None),
-                    3 => commit(&mut slots, &mut model, true, None),
-                    4 => commit(&mut slots, &mut model, false, Some(0)),
-                    _ => drop_pins(&mut slots, &mut model),
-                }
-                rest /= OPERATIONS;
-                let used = slots.total() - slots.free() - slots.retired();
-                assert_eq!(used, model.present.len() as u64, "sequence {code}");
-                for place in model.kept.values().flatten() {
-                    assert_ne!(slots.state(*place), Some(SlotState::Free), "sequence {code}");
-                }
-            }
-            drop_pins(&mut slots, &mut model);
-            commit(&mut slots, &mut model, false, None);
-            assert_eq!(slots.retired(), 0, "sequence {code}: slots have leaked");
-        }
-    }
-
-    fn write(slots: &mut Slots, model: &mut Model, page: u8) {
-        let place = slots.allocate().unwrap_or_else(|| {
-            slots.add_segment();
-            slots.allocate().unwrap()
-        });
-        assert!(model.kept.values().flatten().all(|p| *p != place), "a named slot was handed out");
-        if let Some((old, written)) = model.present.insert(page, (place, model.generation)) {
-            assert!(slots.retire(old, written, model.generation));
-        }
-    }
-
-    fn commit(slots: &mut Slots, model: &mut Model, pin: bool, write_meanwhile: Option<u8>) {
-        let cut = model.generation;
-        // From the cut on, the generation being committed counts as naming its places.
-        model.kept.insert(cut, model.present.values().map(|p| p.0).collect());
-        model.generation += 1;
-        if let Some(page) = write_meanwhile {
-            write(slots, model, page);
-        }
-        let last = std::mem::replace(&mut model.durable, cut);
-        if !model.pinned.contains(&last) {
-            model.kept.remove(&last);
-        }
-        if pin {
-            model.pinned.push(cut);
-        }
-        slots.release_retired(cut, &model.pinned);
-    }
-
-    fn drop_pins(slots: &mut Slots, model: &mut Model) {
-        model.pinned.clear();
-        let durable = model.durable;
-        model.kept.retain(|generation, _| *generation == durable);
-        slots.release_retired(durable, &[]);
     }
 }

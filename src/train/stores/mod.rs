@@ -34,7 +34,8 @@ use crate::base::identity::RunId;
 use crate::checkpoint::run_state::RunState;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
-use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule, segments_in};
+use crate::page::folder::spill_dir::segments_in;
+use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule};
 use std::path::{Path, PathBuf};
 
 impl From<ReadError> for TrainError {

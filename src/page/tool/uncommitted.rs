@@ -7,10 +7,11 @@
 //! first check to the removal of the last file.
 
 use crate::base::error::InputResult;
+use crate::page::folder::protocol_files::MAP_NAME;
 use crate::page::folder::spill_dir::SpillDir;
+use crate::page::folder::spill_dir::segments_in;
 use crate::page::format::spill_format::Purpose;
-use crate::page::map::commit::MAP_NAME;
-use crate::page::tool::reading::{latest_generation, segments_in};
+use crate::page::tool::reading::latest_generation;
 use std::path::Path;
 
 impl SpillDir {

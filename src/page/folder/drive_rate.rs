@@ -5,10 +5,10 @@
 //! measured on; an unreadable cache file means a new measurement; 2. a drive that cannot be measured stores pages raw.
 
 use crate::base::error::InputResult;
-use crate::page::engine::measure::{Case, Scratch};
 use crate::page::engine::open::{DEPTH, IoEngine};
 use crate::page::engine::page_engine::Direction;
-use crate::page::engine::segment_files::with_safe_flags;
+use crate::page::engine::segment_files::{open_for_reading, with_safe_flags};
+use crate::page::folder::measure::{Case, Scratch};
 use crate::page::format::codec::Codec;
 use serde::{Deserialize, Serialize};
 use std::fs::{File, OpenOptions};
@@ -99,7 +99,7 @@ fn measure(folder: &Path) -> InputResult<DriveRate> {
 }
 
 fn remembered(folder: &Path) -> Option<DriveRate> {
-    let file = with_safe_flags(OpenOptions::new().read(true)).open(folder.join(FILE_NAME)).ok()?;
+    let file = open_for_reading(&folder.join(FILE_NAME)).ok()?;
     let mut text = String::new();
     file.take(FILE_BYTES_MAX).read_to_string(&mut text).ok()?;
     let rate: DriveRate = serde_json::from_str(&text).ok()?;

@@ -1,0 +1,256 @@
+//! The deferred optimizer of a run and its state at one step: tables, rates, single values. [`super::deferred`] applies it
+//! to rows.
+//!
+//! Invariants: 1. one function evaluates a value, for every caller; 2. nothing here depends on rows.
+
+use super::adam::AdamConfig;
+use super::decay::Decay;
+use super::drift::{Drift, DriftTables, EpsFloor, RECENT, drifted, flush, needs_direct_sum};
+use super::moments::Moments;
+use super::rates::Rates;
+use crate::base::simd::{LANES, SimdPath};
+use crate::scene::columns::Column;
+use crate::scene::rows::{RowBlock, first_lane};
+
+/// A value per lane of a row; all lanes of `sh_n` share one.
+#[derive(Debug, Clone)]
+pub(super) struct OfLanes {
+    pub narrow: [f32; LANES],
+    pub sh_n: f32,
+}
+
+impl OfLanes {
+    /// From a value per column.
+    pub fn new(of: impl Fn(Column) -> f32) -> Self {
+        let mut narrow = [0.0; LANES];
+        for column in Column::ALL.into_iter().filter(|&c| c != Column::ShN) {
+            narrow[first_lane(column)..][..column.width(0)].fill(of(column));
+        }
+        OfLanes { narrow, sh_n: of(Column::ShN) }
+    }
+
+    /// The value of a column.
+    #[inline(always)]
+    pub fn of(&self, column: Column) -> f32 {
+        if column == Column::ShN { self.sh_n } else { self.narrow[first_lane(column)] }
+    }
+}
+
+/// Gaps whose decay is tabulated; longer ones are computed.
+const TABLED_GAPS: usize = 4096;
+
+/// The optimizer of a run: rates, tables, instruction path. Holds no row state.
+#[derive(Debug, Clone)]
+pub struct DeferredAdam {
+    tables: DriftTables,
+    /// Base rates.
+    lane_rates: OfLanes,
+    eps: EpsFloor,
+    /// `[k]`: decay of the moments over k steps.
+    decays: Vec<Decay>,
+    simd: SimdPath,
+    moments: Moments,
+}
+
+/// Counts of one step.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct StepCounts {
+    /// Rows that were rewritten.
+    pub updated: usize,
+    /// Rows left unchanged because their gradient was not finite (or beyond 1e18).
+    pub skipped_non_finite: usize,
+}
+
+/// The optimizer at one step: everything that evaluation at this step needs, so that the work per row is a look-up.
+#[derive(Debug, Clone)]
+pub struct AdamNow<'a> {
+    adam: &'a DeferredAdam,
+    now: u32,
+    /// `[k]`: drift of a row that missed k steps.
+    recent: [Drift; RECENT],
+}
+
+impl DeferredAdam {
+    /// Builds the tables for these rates; panics as [`DriftTables::new`] does.
+    pub fn new(rates: Rates, config: AdamConfig, simd: SimdPath) -> Self {
+        let lane_rates = OfLanes::new(|column| rates.base(column) as f32);
+        DeferredAdam {
+            tables: DriftTables::new(rates, config),
+            lane_rates,
+            eps: EpsFloor::new(config.eps),
+            decays: (0..TABLED_GAPS as u32).map(|k| Decay::new(config, k)).collect(),
+            simd,
+            moments: Moments::F32,
+        }
+    }
+
+    /// The same optimizer with another storage format of moments.
+    #[must_use]
+    pub fn with_moments(self, moments: Moments) -> Self {
+        DeferredAdam { moments, ..self }
+    }
+
+    /// The same optimizer without catching up: rows without a gradient keep their values and moments
+    /// ([`super::method::Method::Sparse`]).
+    #[must_use]
+    pub fn without_catch_up(self) -> Self {
+        DeferredAdam { tables: self.tables.still(), ..self }
+    }
+
+    /// Storage format of moments.
+    pub fn moments(&self) -> Moments {
+        self.moments
+    }
+
+    /// The rates of the run.
+    pub fn rates(&self) -> &Rates {
+        self.tables.rates()
+    }
+
+    /// Bytes of the tables.
+    pub fn bytes(&self) -> usize {
+        self.tables.bytes() + self.decays.len() * size_of::<Decay>()
+    }
+
+    /// The optimizer after `now` steps. Costs about a microsecond.
+    pub fn at(&self, now: u32) -> AdamNow<'_> {
+        let recent = std::array::from_fn(|k| self.tables.drift(now.saturating_sub(k as u32), now));
+        AdamNow { adam: self, now, recent }
+    }
+
+    /// One value after `now` steps, from its state after `stamp` steps. This defines a single value; [`AdamNow`] gives
+    /// the same bits for rows.
+    pub fn evaluate(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32, now: u32) -> f32 {
+        self.evaluate_with(&self.tables.drift(stamp, now), column, value, m, v, stamp, now)
+    }
+
+    /// Series sums of the movement to the limit, for a row of this stamp.
+    #[inline(always)]
+    pub(crate) fn limit_drift(&self, stamp: u32) -> &Drift {
+        self.tables.limit(stamp)
+    }
+
+    /// The limit of a value that gets no more gradients; it moves there from `value` monotonically.
+    pub(crate) fn limit(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32) -> f32 {
+        self.evaluate_with(self.tables.limit(stamp), column, value, m, v, stamp, u32::MAX)
+    }
+
+    /// The run's instruction path.
+    pub(crate) fn simd(&self) -> SimdPath {
+        self.simd
+    }
+
+    /// Base rates of the lanes of a row.
+    #[inline(always)]
+    pub(super) fn lane_rates(&self) -> &OfLanes {
+        &self.lane_rates
+    }
+
+    pub(super) fn tables(&self) -> &DriftTables {
+        &self.tables
+    }
+
+    /// eps, and the second moment above which the series is valid.
+    #[inline(always)]
+    pub(crate) fn eps_floor(&self) -> EpsFloor {
+        self.eps
+    }
+
+    /// Base rate of a column, as the evaluation uses it.
+    #[inline(always)]
+    pub(crate) fn base_rate(&self, column: Column) -> f32 {
+        self.lane_rates.of(column)
+    }
+
+    fn evaluate_with(&self, drift: &Drift, column: Column, value: f32, m: f32, v: f32, stamp: u32, now: u32) -> f32 {
+        if stamp >= now {
+            return value;
+        }
+        let of_means = column == Column::Means;
+        let rate = self.lane_rates.of(column);
+        if needs_direct_sum(m, v, self.eps.floor) {
+            return flush(value - self.tables.direct_sum(m, v, stamp, now, of_means) * rate);
+        }
+        let sums = if of_means { [drift[0], drift[1], drift[2]] } else { [drift[4], drift[5], drift[6]] };
+        drifted(value, m, v, sums, rate, self.eps.eps)
+    }
+
+    /// The decay of the moments over `k` steps.
+    #[inline(always)]
+    fn decay(&self, k: u32) -> Decay {
+        match self.decays.get(k as usize) {
+            Some(&decay) => decay,
+            None => self.far_decay(k),
+        }
+    }
+
+    /// The decay over `k` steps beyond the table.
+    #[cold]
+    #[inline(never)]
+    fn far_decay(&self, k: u32) -> Decay {
+        Decay::new(self.tables.config(), k)
+    }
+}
+
+impl<'a> AdamNow<'a> {
+    /// The optimizer.
+    #[inline(always)]
+    pub fn adam(&self) -> &'a DeferredAdam {
+        self.adam
+    }
+
+    /// The run's instruction path.
+    pub fn simd(&self) -> SimdPath {
+        self.adam.simd
+    }
+
+    /// Number of steps without a gradient over which the moments of a row of this stamp decay.
+    #[inline(always)]
+    fn missed(&self, stamp: u32) -> u32 {
+        if self.adam.tables.is_still() { 0 } else { self.now.saturating_sub(stamp) }
+    }
+
+    /// The decay that the current step applies to the moments of a row of this stamp: for the first moment over the
+    /// missed steps, for the second moment over the missed steps and this one.
+    #[inline(always)]
+    pub(super) fn step_decay(&self, stamp: u32) -> Decay {
+        let missed = self.missed(stamp);
+        Decay { first: self.adam.decay(missed).first, ..self.adam.decay(missed.saturating_add(1)) }
+    }
+
+    /// Number of steps taken.
+    #[inline(always)]
+    pub(super) fn steps(&self) -> u32 {
+        self.now
+    }
+
+    /// The decay of the moments of a row of this stamp over the steps that it missed.
+    #[inline(always)]
+    pub(super) fn settled_decay(&self, stamp: u32) -> Decay {
+        self.adam.decay(self.missed(stamp))
+    }
+
+    /// A value of a row of this stamp, as of now.
+    #[inline(always)]
+    pub(super) fn evaluate_value(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32) -> f32 {
+        self.adam.evaluate_with(self.drift(stamp), column, value, m, v, stamp, self.now)
+    }
+
+    /// Series sums for a row of this stamp.
+    #[inline(always)]
+    pub(crate) fn drift(&self, stamp: u32) -> &Drift {
+        let gap = self.now.saturating_sub(stamp) as usize;
+        if gap < RECENT { &self.recent[gap] } else { self.adam.tables.limit(stamp) }
+    }
+
+    /// Moves the values of one loaded row to now, lane by lane, if eps affects one of them.
+    pub(super) fn evaluate_block_directly(&self, value: &mut RowBlock, m: &RowBlock, v: &RowBlock, stamp: u32) {
+        let drift = self.drift(stamp);
+        for column in Column::ALL {
+            let first = first_lane(column);
+            for l in first..first + column.width(3) {
+                value[l] = self.adam.evaluate_with(drift, column, value[l], m[l], v[l], stamp, self.now);
+            }
+        }
+    }
+}
