@@ -85,8 +85,8 @@ fn explanation(settings: &[Setting]) -> String {
             .to_string(),
         n => format!(
             "A setting costs no accuracy if its PSNR and SSIM are at least those of the base with the same seeds, minus \
-             the spread of the base (highest minus lowest) over {n} seeds. The dashed line is this limit for a setting \
-             with all of these seeds."
+             the spread of the base (highest minus lowest) over {n} seeds. The dashed line is this limit for a \
+             setting with all of these seeds."
         ),
     };
     format!(

@@ -23,8 +23,8 @@ Examples:
   gsscale-bench pareto scans/village --out sweeps/village --knobs sh,moments --max-runs 5
   gsscale-bench pareto scans/city --out sweeps/city --steps 300 --share 25 --knobs budget,order,codec --strategy none
 
-Each run is a process of its own and adds a line to results.jsonl in --out; the page is pareto.html. A sweep that stopped
-continues when started again. The knobs budget, page and codec need a drive: see --spill.";
+Each run is a process of its own and adds a line to results.jsonl in --out; the page is pareto.html. A sweep that
+stopped continues when started again. The knobs budget, page and codec need a drive: see --spill.";
 
 /// File of results in the output folder.
 const RESULTS: &str = "results.jsonl";

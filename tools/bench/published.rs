@@ -32,8 +32,8 @@ Examples:
   gsscale-bench run building --data /data/building-pixsfm --tier S3 --spill-dir /nvme/pages --host-mem 12GiB
   gsscale-train --resume runs/rubble && gsscale-bench run rubble --data /data/rubble-pixsfm --out runs/rubble --no-train
 
-Runs: rubble, building, residence, sciart, lfls, sziit, sztu, aerial. Standard output gets the figures as a line of JSON;
-OUT/published.json and OUT/published.html keep them.";
+Runs: rubble, building, residence, sciart, lfls, sziit, sztu, aerial. Standard output gets the figures as a line of
+JSON; OUT/published.json and OUT/published.html keep them.";
 
 /// Trains a published run and prints our figures beside the published ones.
 #[derive(Parser)]
