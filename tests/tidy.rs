@@ -1,5 +1,5 @@
-//! House rules that the compiler does not hold: which layer may name which, how long functions are, where `unsafe`
-//! may stand, and that no marker of unfinished work is left.
+//! House rules that the compiler does not check: which layer may import which, the length of functions, where `unsafe`
+//! may stand, and markers of unfinished work.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
 use std::collections::BTreeMap;

@@ -1,5 +1,4 @@
-//! `gsscale-bench` as a process, and what it prints.
-#![allow(dead_code, clippy::unwrap_used)] // test code: each test file uses a part of it
+//! Runs `gsscale-bench` and parses its output.
 
 use super::scenes::{city, stderr};
 use serde_json::Value;

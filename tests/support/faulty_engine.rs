@@ -1,10 +1,8 @@
-//! A store that fails on purpose, around one that works.
+//! An I/O engine that fails on purpose, around a working one.
 //!
-//! Every operation is counted by kind; rules say which one fails, how, and whether all later ones of the kind fail
-//! too. The rules can be changed while the store is in use. It keeps the first of [`PageEngine`]'s invariants (every
-//! buffer comes back, as it was handed over) and breaks the others as it is told.
-
-#![allow(dead_code)] // each test binary uses a part of it
+//! Every operation is counted by kind. Rules say which operation fails, how, and whether all later operations of that
+//! kind fail too. Rules may change while the engine is in use. Invariant: every buffer comes back as it was handed
+//! over, the first invariant of [`PageEngine`]; a rule may break the others.
 
 use gsscale::base::rng::mix64;
 use gsscale::page::engine::buffer::ALIGNMENT;

@@ -1,6 +1,5 @@
-//! Small scenes for tests through the real binaries: a generated city, rewritten as a COLMAP text model that a test
-//! can bend in any way.
-#![allow(dead_code, clippy::unwrap_used, clippy::expect_used)] // test code: each test file uses a part of it
+//! Small scenes for tests through the real binaries: a generated city, rewritten as a COLMAP text model that a test can
+//! edit.
 
 use glam::{DMat3, DQuat, DVec3};
 use gsscale::dataset::read::{ReadOptions, read_scene};

@@ -1,4 +1,4 @@
-//! The page map with right seals around wrong values, as a store that somebody made on purpose; and states of runs.
+//! Page maps with valid seals around wrong values, as an attacker could write them; and run states.
 
 use super::pages::{PAGE_ROWS, label_of_a_page, payload_bytes_of_a_page};
 use super::with_mode;

@@ -1,4 +1,4 @@
-//! JPEG and PNG: what their headers say, and decoding within what was announced.
+//! JPEG and PNG: headers, and decoding within the announced size.
 
 use crate::Target;
 use crate::allocation::peak_of;

@@ -1,5 +1,5 @@
-//! A whole spill directory, damaged by what the input says: opened, it is refused, or it is one that was committed, page by
-//! page to the bit, or pages are reported as damaged.
+//! A whole spill directory, damaged as the input says. The open refuses the directory, or finds a committed state page
+//! by page to the bit, or reports pages as damaged.
 
 use crate::Target;
 use crate::scene_folder::scratch;
