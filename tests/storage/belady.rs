@@ -6,7 +6,7 @@ use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::plan::bound::FewestReads;
 use gsscale::paging::plan::cache_model::{CacheModel, StepChange};
 
-/// What the cache that knows the future reads, from empty or with pages of a choice of its own at the start.
+/// Reads of the cache that evicts by farthest next use: from an empty cache, or with first pages of its own choice.
 fn model(steps: &[Vec<PageNo>], frames: usize, pages: u32, is_warm: bool) -> u64 {
     let next = |page: PageNo, from: usize| (from..steps.len()).find(|&s| steps[s].contains(&page)).map(|s| s as u32);
     let mut cache = CacheModel::new(frames, EvictPolicy::FarthestNextUse);
@@ -55,12 +55,13 @@ fn pages_made_in_memory_are_not_read() {
     bound.add(PageNo(1));
     bound.step(2, [(PageNo(0), 1), (PageNo(1), 1)].into_iter());
     assert_eq!(bound.pages(), 0);
-    // Two frames are full, so nothing else was kept: the page is read.
+    // The two frames hold other pages, so the page is read.
     bound.step(2, [(PageNo(2), 7)].into_iter());
     assert_eq!((bound.pages(), bound.bytes()), (1, 7));
 }
 
-/// The fewest pages that any cache reads whose frames differ from step to step: every content that it could have.
+/// The fewest pages that any cache reads when the number of frames differs from step to step: a search over all
+/// contents.
 fn fewest(steps: &[(usize, u32)], pages: u32) -> u64 {
     let mut reads: Vec<Option<u64>> = vec![None; 1 << pages];
     reads[0] = Some(0);

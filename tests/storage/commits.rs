@@ -97,7 +97,7 @@ fn generations_reopen_and_a_rollback_restores_an_older_one() {
     assert_eq!(read(&mut store, 0, &opened.pages_at(4).unwrap()[0].slot), 22);
     assert_eq!(read(&mut store, 0, &opened.pages_at(1).unwrap()[0].slot), 10);
     assert!(matches!(opened.pages_at(3), Err(CommitError::NotKept(3))));
-    // Generations 1, 4 and 5 name four slots; what rounds wrote between them is free again.
+    // Generations 1, 4 and 5 name four slots; the slots of the rounds between them are free again.
     assert_eq!(store.slots().total() - store.slots().free(), 4);
     opened.commits.rollback(1).unwrap();
     let opened = open(at).unwrap();
@@ -112,7 +112,7 @@ fn generations_reopen_and_a_rollback_restores_an_older_one() {
     assert_eq!(opened.pages.iter().map(|p| p.page).collect::<Vec<_>>(), [PageId::initial(0)]);
 }
 
-/// Two pages in two segments, committed. The segments' files are as long as they were made.
+/// Two pages in two segments, committed. The segment files have the length they were created with.
 fn two_segments(at: &Path) {
     let opened = create(at).unwrap();
     let mut store = pages_of(&opened, at);
@@ -122,7 +122,8 @@ fn two_segments(at: &Path) {
     commit(&mut commits, &mut store, &changed, None);
 }
 
-/// Whatever engine: a segment that is missing, cut at any block, longer, or something else is named, and nothing is changed.
+/// With any engine: a segment that is missing, truncated at any block, too long, or not a file is reported by name, and
+/// nothing changes.
 #[test]
 fn missing_cut_and_longer_segments_are_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
@@ -158,7 +159,7 @@ fn missing_cut_and_longer_segments_are_refused_by_name() {
     for (path, bytes) in paths.iter().zip(&bytes) {
         std::fs::write(path, bytes).unwrap();
     }
-    // A file more is nobody's business: it stays as it is.
+    // A file outside the store stays untouched.
     std::fs::write(at.join(segment_file_name(7)), b"mine").unwrap();
     let opened = open(at).unwrap();
     let mut store = pages_of(&opened, at);
@@ -166,7 +167,7 @@ fn missing_cut_and_longer_segments_are_refused_by_name() {
     assert_eq!(std::fs::read(at.join(segment_file_name(7))).unwrap(), b"mine");
 }
 
-/// A map that somebody made on purpose: right seals, and numbers that would take all memory or run over.
+/// A map made by an attacker: valid seals, and numbers that would exhaust memory or overflow.
 #[test]
 fn hostile_maps_are_refused() {
     let folder = tempfile::tempdir().unwrap();
@@ -199,7 +200,7 @@ fn hostile_maps_are_refused() {
     }
 }
 
-/// The same for those who only look.
+/// The same for read-only access.
 #[test]
 fn hostile_maps_cost_readers_nothing() {
     let parent = tempfile::tempdir().unwrap();
@@ -223,7 +224,7 @@ fn hostile_maps_cost_readers_nothing() {
     let slot = pages[0].slot;
     let mut reading = reader.slot_reader();
     assert_eq!(reading.payload(PageId::initial(0), &slot).unwrap(), [7; 100]);
-    // More than the file holds, and more than a slot does.
+    // Longer than the file, and longer than a slot.
     let longer = |payload_bytes| SlotRef { stored_bytes: payload_bytes, payload_bytes, ..slot };
     let error = reading.payload(PageId::initial(0), &longer(4000)).unwrap_err();
     assert!(error.contains("another version"), "{error}");
@@ -236,7 +237,7 @@ fn hostile_maps_cost_readers_nothing() {
     }
 }
 
-/// A folder in which the second piece of the reserve cannot be written: the process is as good as killed there.
+/// A folder in which the second piece of the reserve cannot be written, as if the process were killed there.
 struct Interrupted(DriveFolder);
 
 impl Folder for Interrupted {
@@ -258,7 +259,7 @@ impl Folder for Interrupted {
     }
 }
 
-/// A reserve whose filling was interrupted is not taken for one: every byte of it was written when it has its name.
+/// A partly filled reserve is not taken for a reserve: the file gets its name only after every byte was written.
 #[test]
 fn a_reserve_that_was_not_filled_is_filled_again() {
     let folder = tempfile::tempdir().unwrap();
@@ -318,7 +319,7 @@ fn another_stores_map_and_a_missing_witness_are_refused() {
 }
 
 const TABLE: TableDefinition<'_, u32, u32> = TableDefinition::new("t");
-/// Where redb keeps the bit that says which of its two roots counts; it is in no checksum.
+/// Where redb keeps the bit that selects its valid root. No checksum covers this bit.
 const PRIMARY_BYTE: u64 = 9;
 
 fn flip_primary(file: &dyn StorageBackend) {
@@ -327,11 +328,11 @@ fn flip_primary(file: &dyn StorageBackend) {
     file.write(PRIMARY_BYTE, &[byte[0] ^ 1]).unwrap();
 }
 
-/// A file that is somebody else's: one memory of several openings, or one that a process stops writing in the middle of.
+/// A file shared by several openings, whose writes stop in the middle as if a process had ended.
 #[derive(Debug, Clone)]
 struct Passed {
     to: Arc<dyn StorageBackend>,
-    /// Nothing but a first piece can be written.
+    /// Only the first piece of a write succeeds.
     stops: bool,
 }
 
@@ -357,8 +358,8 @@ impl StorageBackend for Passed {
     }
 }
 
-/// A counterexample inside the library, kept: one flipped bit takes the last two-phase commit back without a word, also
-/// with its integrity check at opening.
+/// A counterexample inside redb, kept as a test: one flipped bit silently undoes the last two-phase commit, even with
+/// the integrity check at opening.
 #[test]
 fn one_flipped_bit_makes_redb_forget_a_durable_commit() {
     let shared = memory();
@@ -374,7 +375,7 @@ fn one_flipped_bit_makes_redb_forget_a_durable_commit() {
         transaction.open_table(TABLE).unwrap().insert(0, value).unwrap();
         transaction.commit().unwrap();
     }
-    // As a crash leaves it: nothing is written at closing.
+    // Like a crash: closing writes nothing.
     let crashed = memory();
     let mut bytes = vec![0; shared.len().unwrap() as usize];
     shared.read(0, &mut bytes).unwrap();

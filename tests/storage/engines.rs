@@ -30,7 +30,7 @@ fn file_engines() -> Vec<(&'static str, Open)> {
         use gsscale::page::engine::uring::UringEngine;
         match UringEngine::open(&std::env::temp_dir(), 1, true) {
             Ok(_) => {
-                // A ring of 4 is always full here.
+                // A ring of 4 entries is always full in this test.
                 engines.push(("uring", |folder| Box::new(UringEngine::open(folder, 32, true).unwrap())));
                 engines.push(("uring of 4", |folder| Box::new(UringEngine::open(folder, 4, true).unwrap())));
                 engines.push(("uring, buffered", |folder| Box::new(UringEngine::open(folder, 32, false).unwrap())));
@@ -51,7 +51,7 @@ fn transfer(token: u64, direction: Direction, segment: u32, offset: u64, buffer:
     Transfer { token, direction, place: Place { segment, offset }, bytes: buffer.len(), buffer }
 }
 
-/// Carries out one transfer alone.
+/// Performs one transfer alone.
 fn move_one(store: &mut dyn PageEngine, transfer: Transfer) -> Completion {
     let mut done = Vec::new();
     store.submit(transfer);
@@ -74,14 +74,14 @@ fn filled(draws: &mut Stream, mut buffer: PageBuffer) -> PageBuffer {
     buffer
 }
 
-/// What the segments should hold, and which bytes are on the way.
+/// The expected contents of the segments, and the bytes in flight.
 struct Model {
     segments: Vec<Vec<u8>>,
     busy: Vec<(u64, Place, usize)>,
 }
 
 impl Model {
-    /// A place for `bytes` bytes that nothing in flight touches.
+    /// A place for `bytes` bytes that no transfer in flight touches.
     fn free_place(&self, draws: &mut Stream, bytes: usize) -> Option<Place> {
         let segment = draws.below(self.segments.len() as u64) as u32;
         let blocks = (SEGMENT - bytes as u64) / ALIGNMENT as u64 + 1;
@@ -117,11 +117,11 @@ fn pages_round_trip_with_many_in_flight() {
         }
         let mut done = Vec::new();
         for token in 0..400 {
-            // One block to 3 MiB, most of them odd numbers of blocks; some transfers end before their buffer does.
+            // One block to 3 MiB, mostly odd numbers of blocks; some transfers are shorter than their buffer.
             let blocks = if token % 7 == 0 { 257 + draws.below(512) } else { 1 + draws.below(120) };
             let bytes = blocks as usize * ALIGNMENT;
             let Some(place) = model.free_place(&mut draws, bytes) else { continue };
-            // Every second one is in memory of its own, as frames are: the ring registers those.
+            // Every second buffer is mapped memory, as frames are: the ring registers mapped buffers.
             let make = if token % 2 == 0 { PageBuffer::zeroed } else { PageBuffer::mapped };
             let mut buffer = filled(&mut draws, make(bytes + ALIGNMENT * (token % 3) as usize));
             let direction = if draws.below(2) == 0 { Direction::Read } else { Direction::Write };
@@ -152,7 +152,7 @@ fn pages_round_trip_with_many_in_flight() {
     }
 }
 
-/// A folder written with one engine is opened with all.
+/// A folder written by one engine is read by every engine.
 fn every_engine_reads(folder: &Path, model: &Model, writer: &str) {
     for (name, open) in file_engines() {
         let mut store = open(folder);
@@ -198,7 +198,7 @@ fn impossible_transfers_end_as_errors_with_their_buffers() {
             let length = std::fs::metadata(folder.path().join(segment_file_name(3))).unwrap().len();
             assert_eq!(length, SEGMENT, "{name}: a write beyond the end made the file longer");
         }
-        // After all that the store works.
+        // The store still works.
         let fresh = move_one(&mut *store, transfer(9, Direction::Read, 3, 4096, PageBuffer::zeroed(bytes)));
         fresh.result.unwrap();
         assert!(fresh.transfer.buffer.as_slice().iter().all(|&b| b == 0), "{name}: fresh space is zeros");
@@ -206,7 +206,7 @@ fn impossible_transfers_end_as_errors_with_their_buffers() {
     }
 }
 
-/// Someone cuts or removes a file that is in use: an error or the bytes, never a signal.
+/// Another process truncates or removes a file in use: the result is an error or the bytes, never a signal.
 #[test]
 fn files_cut_short_or_removed_in_use_are_errors() {
     for (name, open) in file_engines() {
@@ -256,7 +256,8 @@ fn dropping_a_store_carries_out_what_was_submitted() {
     }
 }
 
-/// A thread submits and ends; another takes the completions. (The kernel cancels what a ring's thread left behind.)
+/// A thread submits and ends; another thread takes the completions. (The kernel cancels requests of a ring whose thread
+/// has ended.)
 #[test]
 fn transfers_outlive_the_thread_that_submitted_them() {
     for (name, open) in all_engines() {
@@ -324,20 +325,20 @@ fn more_segments_than_open_files() {
     }
 }
 
-/// So that a write behind the limit on file sizes is an error: without a handler the signal that comes with it ends the
+/// Handles SIGXFSZ, so that a write beyond the limit on file sizes is an error. Without a handler the signal ends the
 /// process.
 fn outlive_the_signal_of_large_files() {
     let told = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
     signal_hook::flag::register(signal_hook::consts::SIGXFSZ, told).unwrap();
 }
 
-/// From now on the system writes nothing behind so many bytes of any file; `None`: as it would without that.
+/// Limits the size of files: writes beyond `bytes` fail. `None` lifts the limit.
 fn limit_files(bytes: Option<u64>) {
     let maximum = getrlimit(Resource::Fsize).maximum;
     setrlimit(Resource::Fsize, Rlimit { current: bytes.or(maximum), maximum }).unwrap();
 }
 
-/// The system refuses to write behind the first 2.5 MiB of any file, in the middle of a request.
+/// The system refuses writes beyond the first 2.5 MiB of any file, in the middle of a request.
 #[test]
 fn refused_writes_are_errors_with_their_buffers() {
     if !in_child(module_path!(), "refused_writes_are_errors_with_their_buffers") {
@@ -362,7 +363,7 @@ fn refused_writes_are_errors_with_their_buffers() {
         assert_eq!(end.result.unwrap_err().kind(), ErrorKind::FileTooLarge, "{name}");
         assert_eq!(end.transfer.buffer.len(), 3 << 20);
         let file = std::fs::read(folder.path().join(segment_file_name(0))).unwrap();
-        // The request that met the limit was short, and only what was left of it refused.
+        // The request at the limit was short; only its rest was refused.
         let wrote = |from: usize, to: usize| file[from..to].iter().all(|&b| b == 7);
         assert!(wrote(2 << 20, 5 << 19), "{name}: nothing of the last request came through");
         let end = move_one(&mut *store, transfer(2, Direction::Write, 0, 0, PageBuffer::zeroed(2 << 20)));
@@ -370,7 +371,7 @@ fn refused_writes_are_errors_with_their_buffers() {
     }
 }
 
-/// A ring's request that the system ends in the middle goes on from there. The limit is gone when the answer is taken.
+/// A request of the ring that the system cuts short is resumed. The limit is lifted before the completion is taken.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_short_answer_of_the_ring_is_resumed() {
@@ -397,7 +398,7 @@ fn a_short_answer_of_the_ring_is_resumed() {
             assert!(began.elapsed().as_secs() < 20, "nothing was written");
             std::thread::sleep(std::time::Duration::from_millis(20));
         }
-        // What the kernel tries by itself, it has tried by now.
+        // The kernel has finished its own retries by now.
         std::thread::sleep(std::time::Duration::from_millis(200));
         let file = std::fs::read(&path).unwrap();
         assert!(file[cut..].iter().all(|&b| b == 0), "the request was not cut short");
@@ -425,8 +426,8 @@ fn auto_takes_what_works_and_says_what_does_not() {
     }
 }
 
-/// Submits writes of random bytes, each of `bytes`, to places `from..to` of segment 0, asks for no answer, and waits until
-/// all are in the file.
+/// Submits writes of random bytes, each of `bytes`, to places `from..to` of segment 0, takes no completion, and waits
+/// until all bytes are in the file.
 fn write_unasked(store: &mut dyn PageEngine, folder: &Path, places: std::ops::Range<usize>, bytes: usize) {
     const PIECE: usize = 64 << 10;
     let mut draws = Stream::new(1, Purpose::Test, 48, 0);
@@ -447,8 +448,8 @@ fn write_unasked(store: &mut dyn PageEngine, folder: &Path, places: std::ops::Ra
     }
 }
 
-/// While a step computes nobody takes answers; the drive must have something to do all the same. The ring's requests come
-/// from one transfer, since each further one makes room by taking answers.
+/// While a step computes, nobody takes completions, and the drive must stay busy. All requests of the ring belong to
+/// one transfer, because each further transfer takes completions to make room.
 #[test]
 fn three_times_the_usual_depth_completes_without_polling() {
     const MIB: usize = 1 << 20;
@@ -474,7 +475,7 @@ fn three_times_the_usual_depth_completes_without_polling() {
     }
 }
 
-/// Requests that have ended make room for others, although nobody has taken their answers.
+/// Completed requests make room for others before their completions are taken.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_ring_of_ended_requests_is_not_full() {
@@ -486,7 +487,7 @@ fn a_ring_of_ended_requests_is_not_full() {
     store.create_segment(0, SEGMENT).unwrap();
     for first in (0..16).step_by(4) {
         write_unasked(&mut store, folder.path(), first..first + 4, 64 << 10);
-        // What is in the file is answered soon, but not at once.
+        // The completion follows soon after the bytes are in the file, but not at once.
         std::thread::sleep(std::time::Duration::from_millis(100));
     }
     let mut done = Vec::new();
@@ -496,7 +497,7 @@ fn a_ring_of_ended_requests_is_not_full() {
     assert!(done.len() == 16 && done.iter().all(|end| end.result.is_ok()));
 }
 
-/// Bytes of this process that the kernel holds in place.
+/// Bytes of this process that the kernel has pinned.
 #[cfg(target_os = "linux")]
 fn pinned_bytes() -> usize {
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
@@ -504,7 +505,7 @@ fn pinned_bytes() -> usize {
     kib.unwrap().trim().parse::<usize>().unwrap() << 10
 }
 
-/// Waits until the kernel holds so many bytes: before Linux 6.4 it lets go a second late.
+/// Waits until the kernel has pinned exactly `bytes` bytes. Before Linux 6.4 the kernel unpins a second late.
 #[cfg(target_os = "linux")]
 fn expect_pinned(bytes: usize) {
     let began = std::time::Instant::now();
@@ -514,7 +515,7 @@ fn expect_pinned(bytes: usize) {
     }
 }
 
-/// A ring, unless this system has none, or none that knows buffers.
+/// A ring with a table of registered buffers, if this system has one.
 #[cfg(target_os = "linux")]
 fn ring_with_table(folder: &Path) -> Option<gsscale::page::engine::uring::UringEngine> {
     let store = gsscale::page::engine::uring::UringEngine::open(folder, 8, true);
@@ -549,7 +550,7 @@ fn write_and_read(store: &mut dyn PageEngine, draws: &mut Stream, buffers: Vec<P
 #[test]
 fn the_ring_registers_long_lived_buffers_and_releases_them() {
     use rustix::thread::{CapabilitySet, capabilities};
-    // Two of them are within the smallest common limit on locked memory, which others of this user use as well.
+    // Two buffers fit the smallest common limit on locked memory, which other processes of this user share.
     let all = capabilities(None).unwrap().effective.contains(CapabilitySet::IPC_LOCK);
     let bytes = if all { 256 << 10 } else { 32 << 10 };
     if !in_child(module_path!(), "the_ring_registers_long_lived_buffers_and_releases_them") {
@@ -559,11 +560,11 @@ fn the_ring_registers_long_lived_buffers_and_releases_them() {
     let Some(mut store) = ring_with_table(folder.path()) else { return };
     store.create_segment(0, SEGMENT).unwrap();
     let mut draws = Stream::new(5, Purpose::Test, 0, 0);
-    // Memory of the heap's is not registered.
+    // Heap memory is not registered.
     write_and_read(&mut store, &mut draws, (0..4).map(|_| PageBuffer::zeroed(bytes)).collect());
     assert_eq!(store.registered(), 0);
     let before = pinned_bytes();
-    // Of a buffer as much is held as has moved.
+    // Only the part of a buffer that has moved is pinned.
     let mut buffer = PageBuffer::mapped(bytes);
     for (moved, held) in [(bytes / 4, bytes / 4), (4096, bytes / 4), (bytes, bytes), (bytes / 2, bytes)] {
         let part = Transfer { bytes: moved, ..transfer(3, Direction::Read, 0, 0, buffer) };
@@ -590,7 +591,7 @@ fn the_ring_registers_long_lived_buffers_and_releases_them() {
         assert_eq!(store.registered(), 8, "once each");
         expect_pinned(before + 8 * bytes);
     }
-    // Frames that go give their memory back, and others take their places in the table.
+    // Freed frames are unregistered, and new frames take their places in the table.
     buffers.truncate(3);
     store.complete(false, &mut Vec::new());
     assert_eq!(store.registered(), 3);
@@ -599,7 +600,7 @@ fn the_ring_registers_long_lived_buffers_and_releases_them() {
     buffers = write_and_read(&mut store, &mut draws, buffers);
     assert!(store.registered() == 7 || !all);
     expect_pinned(before + store.registered() * bytes);
-    // A buffer outlives its ring and is another one's then.
+    // A buffer outlives its ring and is then registered with another.
     drop(store);
     let Some(mut store) = ring_with_table(folder.path()) else { panic!("the second ring is refused") };
     buffers = write_and_read(&mut store, &mut draws, buffers);
@@ -609,7 +610,7 @@ fn the_ring_registers_long_lived_buffers_and_releases_them() {
     assert_eq!(store.registered(), 0);
 }
 
-/// Who may lock any amount of memory gives that right up first; both hold for this child only.
+/// The child gives up the right to lock any amount of memory, and sets the limit.
 #[cfg(target_os = "linux")]
 #[test]
 fn beyond_the_limit_on_locked_memory_buffers_move_unregistered() {
@@ -633,13 +634,13 @@ fn beyond_the_limit_on_locked_memory_buffers_move_unregistered() {
     let buffers = write_and_read(&mut store, &mut draws, buffers);
     let registered = store.registered();
     assert!(registered <= limit as usize / BYTES, "{registered}");
-    // Of a user who is not bound nothing else counts against the limit but the ring itself, which is smaller than a buffer:
-    // the refusals came after these.
+    // For a user without a limit, only the ring itself counts against the new limit, and the ring is smaller than a
+    // buffer: the refusals began after the expected buffers.
     let least = if was_free { (limit as usize / BYTES).saturating_sub(1) } else { 0 };
     assert!(registered >= least, "{registered} of {least}");
     let mut buffers = write_and_read(&mut store, &mut draws, buffers);
     assert_eq!(store.registered(), registered);
-    // Where some have ended, others take their places.
+    // After some buffers are freed, others take their places.
     buffers.drain(..registered.min(2));
     store.complete(false, &mut Vec::new());
     assert_eq!(store.registered(), registered - registered.min(2));
@@ -647,7 +648,7 @@ fn beyond_the_limit_on_locked_memory_buffers_move_unregistered() {
     assert!(store.registered() <= registered && (store.registered() == registered || !was_free));
 }
 
-/// Containers forbid io_uring with a seccomp filter; so does this thread to itself, and only to itself.
+/// Containers forbid io_uring with a seccomp filter; the filter of this test covers one thread.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_refused_ring_falls_back_with_the_reason() {

@@ -94,7 +94,7 @@ impl Store {
         Ok(())
     }
 
-    /// Commits every page that there is.
+    /// Commits every page.
     fn commit(&mut self) -> Result<u64, CommitError> {
         let version = |slot: &Option<SlotRef>| slot.map(|slot| (slot, vec![9]));
         let pages = self.slots.iter().zip(0..).filter(|(slot, _)| slot.is_some());
@@ -142,8 +142,8 @@ fn every_test_of_the_matrix_exists() {
     assert!(named > 30, "{named}");
 }
 
-/// Every used byte of a small map and its witness, one flipped bit: by every push some of them, with `GSSCALE_FLIPS` all.
-/// A map that opens all the same is the last one, entry for entry.
+/// Flips one bit of every used byte of a small map and its witness: of every seventh byte in a plain run, of all with
+/// `GSSCALE_FLIPS`. A map that still opens equals the last one, entry for entry.
 #[test]
 fn a_flipped_bit_anywhere_in_the_map_is_noticed_or_harmless() {
     let folder = tempfile::tempdir().unwrap();
@@ -162,7 +162,7 @@ fn a_flipped_bit_anywhere_in_the_map_is_noticed_or_harmless() {
         Manifest::open(file, CONFIG.store, sequence, CONFIG.cache_bytes).map(|(_, content)| content)
     };
     std::panic::set_hook(Box::new(|info| {
-        // The library's panics become errors.
+        // Panics of redb become errors.
         if !info.location().is_some_and(|l| l.file().contains("redb")) {
             eprintln!("{info}");
         }
@@ -185,7 +185,7 @@ fn a_flipped_bit_anywhere_in_the_map_is_noticed_or_harmless() {
         }
     }
     println!("{tried} flips of {} used bytes, {noticed} noticed, the others in bytes that are not read", used.len());
-    // Most used bytes are of freed pages and of bitmaps of the library's: what counts is compared above.
+    // Most used bytes belong to freed pages and to redb's bitmaps; everything that counts is compared above.
     assert!(noticed > 50, "{noticed} of {tried}");
 }
 
@@ -197,7 +197,7 @@ fn an_older_map_with_its_witness_is_that_generation_or_names_pages() {
     (0..3).for_each(|page| store.write(page, 1).unwrap());
     store.commit().unwrap();
     let old = [MAP_NAME, WITNESS_NAME].map(|name| (name, std::fs::read(at.join(name)).unwrap()));
-    // Page 2 stays; slots of page 0's first version are written again by the fourth round.
+    // Page 2 stays; the fourth round overwrites slots of page 0's first version.
     for round in 2..6 {
         store.write(0, round).unwrap();
         store.commit().unwrap();
@@ -223,7 +223,7 @@ fn a_folder_that_is_moved_away_keeps_its_commits() {
     (0..3).for_each(|page| store.write(page, 1).unwrap());
     let mut latest = store.commit().unwrap();
     std::fs::rename(&at, &moved).unwrap();
-    // What is open goes on working; a new segment cannot be made, and nothing is lost by that.
+    // Open files keep working. A new segment cannot be created, and that loses nothing.
     store.write(3, 1).unwrap();
     let error = store.write(4, 1).unwrap_err();
     assert!(matches!(error, PageError::Grow { segment: 1, .. }) && error.to_string().contains("remedy"), "{error}");
@@ -237,7 +237,7 @@ fn a_folder_that_is_moved_away_keeps_its_commits() {
     assert!(!at.exists(), "nothing is made where the folder was");
 }
 
-/// What the second process does: `GSSCALE_TEST_FOLDER` says where. In a plain run, nothing.
+/// The second process, in the folder `GSSCALE_TEST_FOLDER`. Without that variable the test does nothing.
 #[test]
 #[cfg(unix)]
 fn process_with_a_limit() {
@@ -250,7 +250,7 @@ fn process_with_a_limit() {
     let mut store = Store::create(&folder);
     (0..4).for_each(|page| store.write(page, 1).unwrap());
     store.commit().unwrap();
-    // Neither a segment of 32 KiB nor the map may grow or be written beyond the first 16 KiB.
+    // Neither a segment of 32 KiB nor the map may be written beyond the first 16 KiB.
     limit(Some(16 << 10));
     let error = store.write(4, 1).unwrap_err();
     assert!(error.is_out_of_space(), "{error}");
@@ -272,7 +272,7 @@ fn a_limit_on_the_length_of_files_is_a_full_drive() {
     run_one(one_test(module_path!(), "process_with_a_limit").env("GSSCALE_TEST_FOLDER", folder.path()));
 }
 
-/// The wall clock may jump. It is asked for identities and for the times in event files, and for nothing else.
+/// The wall clock may jump. Only identities and the times in event files are read from it.
 #[test]
 fn no_decision_reads_the_wall_clock() {
     let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));

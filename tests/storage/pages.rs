@@ -64,7 +64,7 @@ fn touch(
     accumulate(&mut state.view_mut(), &rows, &v_means2d, &radii, [20, 30], histogram);
 }
 
-/// Every row as (values, moments, stamp, statistics) by uid: what must agree, bit for bit.
+/// Every row as (values, moments, stamp, statistics) by uid: these must agree bit for bit.
 fn by_uid<'s>(states: impl IntoIterator<Item = &'s SceneState>) -> BTreeMap<u64, Vec<u32>> {
     let mut rows = BTreeMap::new();
     for state in states {
@@ -79,21 +79,21 @@ fn by_uid<'s>(states: impl IntoIterator<Item = &'s SceneState>) -> BTreeMap<u64,
     rows
 }
 
-/// Whether the rows that descend from the first rows of this group are drawn in a step.
+/// Whether the rows that descend from the first rows of this group are drawn at a step.
 fn is_drawn(root: u64, uid: u64, step: u32) -> bool {
     hash64(&[root % 16, u64::from(step), 1]).is_multiple_of(19) && !hash64(&[uid, u64::from(step), 2]).is_multiple_of(3)
 }
 
-/// A scene trained in one table, every event applied at once, and what that was.
+/// A scene trained in one table with every event applied at once, and its history.
 struct OnTime<'a> {
     adam: &'a DeferredAdam,
     state: SceneState,
     log: EventLog,
-    /// Of the rows since the last round.
+    /// Gradients of the rows since the last round.
     histogram: GradHistogram,
     /// Histogram before each event.
     histograms: Vec<GradHistogram>,
-    /// First row that a row descends from.
+    /// The first ancestor of each row.
     root_from_uid: HashMap<u64, u64>,
 }
 
@@ -175,15 +175,15 @@ impl Page {
     }
 }
 
-/// The same training in pages that apply events when they are acquired: those that are drawn, and others by chance.
+/// The same training in pages that apply events when they are acquired: drawn pages, and random others.
 struct InPages<'a> {
     adam: &'a DeferredAdam,
     page_rows: usize,
     pages: BTreeMap<PageId, Page>,
     histogram: GradHistogram,
-    /// Rows that there may be when all pages have applied all events.
+    /// Upper bound on the rows after all pages have applied all events.
     rows_bound: i64,
-    /// Pages that were split, pages that events left alone.
+    /// Number of pages that were split, and of pages that events left unchanged.
     splits: usize,
     unchanged: usize,
 }
@@ -235,7 +235,7 @@ impl InPages<'_> {
         }
     }
 
-    /// What becomes of the statistics and of the bound on the rows when an event enters the log.
+    /// Updates the statistics and the bound on the rows when an event enters the log.
     fn log_event(&mut self, event: Event) {
         if let EventKind::Densify(thresholds) = event.kind {
             self.rows_bound += self.histogram.promised(thresholds.grow_grad2d) as i64;
@@ -283,7 +283,8 @@ fn so_they_do_with_moments_in_sixteen_bits() {
     }
 }
 
-/// For each case: rows of a page, of a first page, acquisitions without need in 1,000 pages and steps. Returns the rows.
+/// Each case gives the rows of a page, the rows of a first page, and unneeded acquisitions per 1,000 pages and steps.
+/// Returns the rows.
 fn late_equals_at_once(adam: &DeferredAdam, cases: &[(usize, usize, u64)]) -> SceneState {
     let start = scene(2000);
     let whole = on_time(&start, adam);
@@ -303,7 +304,7 @@ fn late_equals_at_once(adam: &DeferredAdam, cases: &[(usize, usize, u64)]) -> Sc
             }
         }
         let case = format!("{page_rows} rows a page, chance {chance}");
-        // As export sees them, before and after the last events are applied.
+        // As an export sees the rows, before and after the last events are applied.
         let pending = PendingEvents::new(adam, SEED, page_rows, &log);
         let export = |page: &Page| {
             let mut state = page.state();
@@ -324,9 +325,8 @@ fn late_equals_at_once(adam: &DeferredAdam, cases: &[(usize, usize, u64)]) -> Sc
     whole.state
 }
 
-/// As a run decides its rounds, in which no row is looked at for them: by the histogram and the rows that there may be,
-/// where rows that a page has yet to prune still count. The cap is kept at every step, and what comes of it is what the
-/// same events applied at once give.
+/// Decides rounds as a run does, without looking at rows: by the histogram and the bound on the rows, which counts rows
+/// that a page has yet to prune. The cap holds at every step, and the result equals the same events applied at once.
 #[test]
 fn a_cap_by_which_pages_decide_is_never_exceeded_and_gives_the_rows_of_events_applied_at_once() {
     let adam = adam(1.0);
@@ -374,7 +374,7 @@ fn a_cap_by_which_pages_decide_is_never_exceeded_and_gives_the_rows_of_events_ap
     assert!(decided_otherwise > 0, "no prune was ever waiting, so it does not matter how they count");
 }
 
-/// Rows with moments from a few steps, down to sizes where eps shows, and statistics.
+/// Rows with moments of a few steps, down to sizes where eps matters, and statistics.
 fn moving_page(rows: usize, adam: &DeferredAdam, key: u64) -> SceneState {
     let mut draws = Stream::new(9, Purpose::Test, key, 0);
     let mut state = scene(rows);
@@ -395,7 +395,7 @@ fn moving_page(rows: usize, adam: &DeferredAdam, key: u64) -> SceneState {
     state
 }
 
-/// Rounds, resets and raises at random later steps, the first round as soon as possible in half of the cases.
+/// Rounds, resets and raises at random later steps; in half of the cases the first round is as early as possible.
 fn random_log(key: u64, from: u32, limits: &SplitLimits) -> EventLog {
     let mut draws = Stream::new(10, Purpose::Test, key, 0);
     let mut log = EventLog::default();
@@ -419,9 +419,9 @@ fn random_log(key: u64, from: u32, limits: &SplitLimits) -> EventLog {
 
 #[test]
 fn bounds_hold_at_every_later_step_whatever_happens_meanwhile() {
-    // A large rate of the means, so that rows move as far as their neighbours are.
+    // A large learning rate of the means, so that rows move as far as the distance to their neighbours.
     let tightest = tightest_bounds(&adam(1000.0));
-    // Some page without growth has a box as large as the range its rows run through, but for the 1e-3 of slack.
+    // In some page without growth, the box equals the range of its rows up to the slack of 1e-3.
     assert!(tightest < 1.01, "{tightest}");
     // With moments in 16 bits the slack is 2 %.
     let tightest = tightest_bounds(&adam(1000.0).with_moments(Moments::Bf16));

@@ -40,13 +40,13 @@ fn camera(centre: [f64; 3], heading: f64, tilt: f64) -> Camera {
     }
 }
 
-/// Square city of side 1 in `side` x `side` pages of ground; strips of views across it.
+/// A square city of side 1 in `side` x `side` pages of ground, with strips of views across it.
 struct Survey {
     index: Vec<PageMeta>,
     cameras: Vec<Camera>,
 }
 
-/// `views` views, each of which sees about `share` of the city, from two crossing passes when tilted.
+/// `views` views, each of which sees about `share` of the city; two crossing passes when tilted.
 fn survey(views: usize, side: usize, share: f64, tilt: f64) -> Survey {
     let mut draws = Stream::new(1, Purpose::Test, 60, 0);
     let cell = 1.0 / side as f64;
@@ -137,12 +137,12 @@ fn orders_and_policies_read_in_the_order_of_the_design() {
             assert!(known <= lru, "{order}: knowing the future never reads more");
             known
         });
-        // Each refinement of the order saves a good deal, until what is left is the way through the city itself.
+        // Each refinement of the order saves a good deal. The tour through the city itself remains.
         assert!(table[1] < 0.75 * table[0] && table[2] < 0.75 * table[1] + 0.01, "{table:?}");
         assert!(table[3] < 0.75 * table[2] + 0.01, "{table:?}");
         assert!(of("tour", EvictPolicy::FarthestNextUse) < 0.15 * table[0] + 0.02);
     }
-    // A shuffle that knows the future is about as good as least recent use with half as many pages missing.
+    // In a shuffled order, farthest next use misses clearly fewer pages than least recent use.
     let shuffle = |policy| miss(&run(&survey, &pages, Order::Shuffle, policy, 0.25, 3));
     let (lru, known) = (shuffle(EvictPolicy::LeastRecentlyUsed), shuffle(EvictPolicy::FarthestNextUse));
     assert!((0.6..0.85).contains(&lru) && (0.35..0.6).contains(&known), "{lru} {known}");
@@ -162,7 +162,7 @@ fn bytes_follow_pages_and_everything_that_leaves_is_written() {
     let all = run(&survey, &pages, Order::Shuffle, EvictPolicy::FarthestNextUse, 1.0, 3);
     assert_eq!(all.totals(), ((needed.len() as u64) << 20, 0));
     assert_eq!(all.figures(all.steady()).hit_rate, 1.0);
-    // A plan that looks less far reads no less, and says that it is no bound.
+    // A plan with a shorter look-ahead reads no less, and reports that its figure is no bound.
     let order = ViewOrder::new(Order::Shuffle, 5, &survey.cameras);
     let options = ReplayOptions {
         frames: 102,
@@ -193,31 +193,32 @@ fn traffic(read: &[u64]) -> Replay {
 fn stalls_are_what_the_drive_cannot_do_in_time() {
     // A page of 10 bytes takes a second to read and a second to write; a step takes 2 s.
     let drive = DriveModel { read_rate: 10.0, write_rate: 10.0, step_seconds: 2.0 };
-    // Frames become free at the begin of the steps that are listed.
+    // Frames become free at the start of the listed steps.
     let with = |read: &[u64], freed: &[usize], drive: &DriveModel| {
         let mut run = traffic(read);
         freed.iter().for_each(|&step| run.steps[step].frames_freed += 1);
         run.stall(0..read.len(), drive)
     };
     assert_eq!(with(&[10, 10, 10, 10], &[0, 0, 1, 2], &drive), Stall::default(), "the drive keeps up");
-    // 30 bytes are 6 s of reading and writing, begun with the step before, which takes 2 s.
+    // 30 bytes are 6 s of reading and writing, started with the previous step, which takes 2 s.
     let late = Stall { seconds: 4.0, worst_seconds: 4.0, steps: 1 };
     assert_eq!(with(&[0, 0, 0, 30], &[2, 2, 2], &drive), late);
-    // Begun two steps earlier they cost nothing, also where the last frame is free one step later only.
+    // Started two steps earlier the transfers cost nothing, even if the last frame is free one step later.
     assert_eq!(with(&[0, 0, 0, 30], &[0, 0, 0], &drive), Stall::default());
     assert_eq!(with(&[0, 0, 0, 30], &[0, 0, 2], &drive), Stall::default());
-    // But reading ahead does not make the drive faster: 4 s for each step of 2 s, the first two begun with step 0.
+    // Prefetching does not make the drive faster: 4 s for each step of 2 s; the first two steps' reads start with step
+    // 0.
     assert_eq!(with(&[0, 20, 20, 20], &[0; 6], &drive).seconds, 3.0 * 4.0 - 3.0 * 2.0);
-    // One of the frames is free when the step before has ended: 2 s, after the other 4 s, which end 2 s late as well.
+    // One frame is free when the previous step has ended: its 2 s follow the other 4 s, which also end 2 s late.
     assert_eq!(with(&[0, 0, 0, 30], &[2, 2, 3], &drive).seconds, 4.0);
     assert_eq!(with(&[0, 0, 0, 20], &[2, 3], &drive).seconds, 2.0);
-    // Whichever frame is free serves the next read: the second step waits for what the first has taken.
+    // Any free frame serves the next read: the second step waits for the frame that the first has taken.
     assert_eq!(with(&[0, 0, 10, 10], &[0, 3], &drive).seconds, 2.0);
-    // What the import has left in memory is not waited for.
+    // Pages that the import left in memory cause no wait.
     let mut begun = traffic(&[0, 0, 0, 30]);
     begun.steps[3] = StepTraffic { bytes_first: 30, pages_first: 3, bytes_written: 0, ..begun.steps[3] };
     assert_eq!((begun.stall(0..4, &drive), begun.read_by_run()), (Stall::default(), 0));
-    // What happened before the range has used its frames, and is not waited for.
+    // Steps before the range have used their frames and cause no wait.
     let mut run = traffic(&[20, 0, 20, 20]);
     [0, 0, 1, 1, 3, 3].into_iter().for_each(|step| run.steps[step].frames_freed += 1);
     assert_eq!(run.stall(1..4, &drive), Stall { seconds: 6.0, worst_seconds: 4.0, steps: 2 });
@@ -225,7 +226,7 @@ fn stalls_are_what_the_drive_cannot_do_in_time() {
     assert_eq!(with(&[0, 20, 20], &[0, 0, 1, 1], &slow).seconds, 8.0);
 }
 
-/// A cache that reads ahead, by going through all pages at every step: the frames that each step frees.
+/// A prefetching cache by a scan of all pages at every step: the frames that each step frees.
 fn frames_freed(needed: &[BTreeSet<PageNo>], frames: usize) -> (Vec<u32>, u64, usize) {
     let next_use = |page: PageNo, step: usize| needed[step..].iter().position(|n| n.contains(&page)).map(|d| step + d);
     let mut held: BTreeMap<PageNo, usize> = BTreeMap::new();
@@ -237,7 +238,7 @@ fn frames_freed(needed: &[BTreeSet<PageNo>], frames: usize) -> (Vec<u32>, u64, u
             held.insert(p, step);
         });
         for _ in 0..(held.len() + absent).saturating_sub(frames) {
-            // (next use, older, lower number), the greatest leaves.
+            // (next use, older, lower number): the greatest is evicted.
             let key = |(&page, &last): (&PageNo, &usize)| {
                 (next_use(page, step + 1).unwrap_or(usize::MAX), Reverse(last), Reverse(page))
             };
@@ -282,7 +283,7 @@ fn frames_are_free_when_no_step_needs_them_and_pages_just_used_are_spared() {
         let reads = |run: &Replay| run.steps.iter().map(|s| u64::from(s.pages_read)).sum::<u64>();
         assert_eq!(reads(&run), read);
         let least = reads(&best.unwrap());
-        // One read in FAR_STEPS for each frame, at most.
+        // At most one read in FAR_STEPS for each frame.
         assert!((least..=least + 360 / u64::from(FAR_STEPS) * frames as u64).contains(&read), "{read} {least}");
         (spared, busy) = (spared + others, busy + freed.iter().filter(|&&f| f > 0).count());
     }

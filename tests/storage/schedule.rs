@@ -9,7 +9,7 @@ use gsscale::paging::plan::steps::{Plan, USE_BYTES};
 
 type Steps = Vec<Vec<PageNo>>;
 
-/// Steps that need `low..=high` of `pages` pages, in no order.
+/// Steps that need `low..=high` of `pages` pages, in random order.
 fn steps(draws: &mut Stream, count: usize, pages: u32, low: u64, high: u64) -> Steps {
     let step = |draws: &mut Stream| {
         let mut all: Vec<PageNo> = (0..pages).map(PageNo).collect();
@@ -25,7 +25,7 @@ fn next_use(steps: &Steps, page: PageNo, from: usize) -> Option<u32> {
     (from..steps.len()).find(|&s| steps[s].contains(&page)).map(|s| s as u32)
 }
 
-/// The least pages that any cache can read: over all sets that may be in the cache after each step.
+/// The fewest pages that any cache can read: a search over all sets that may be cached after each step.
 fn least_reads(steps: &Steps, pages: u32, frames: u32) -> u32 {
     let mut cost = vec![u32::MAX; 1 << pages];
     cost[0] = 0;
@@ -34,7 +34,7 @@ fn least_reads(steps: &Steps, pages: u32, frames: u32) -> u32 {
         let mut after = vec![u32::MAX; 1 << pages];
         for (held, &reads) in cost.iter().enumerate().filter(|(_, c)| **c < u32::MAX) {
             let kept_at_most = held & !needed;
-            // All subsets of what is held and not needed.
+            // All subsets of the held pages that the step does not need.
             let mut kept = kept_at_most;
             loop {
                 let now = kept | needed;
@@ -52,7 +52,7 @@ fn least_reads(steps: &Steps, pages: u32, frames: u32) -> u32 {
     cost.into_iter().min().unwrap()
 }
 
-/// Runs the model over all steps; checks what holds of every change; returns the reads.
+/// Runs the model over all steps, checks the invariants of every change, and returns the reads.
 fn reads(steps: &Steps, frames: usize, policy: EvictPolicy, next: impl Fn(PageNo, usize) -> Option<u32>) -> u32 {
     let mut cache = CacheModel::new(frames, policy);
     let mut held: Vec<PageNo> = Vec::new();
@@ -103,7 +103,7 @@ fn least_recent_use_is_what_a_queue_does() {
             queue.drain(..queue.len().saturating_sub(12));
         }
         assert_eq!(reads(&steps, 12, EvictPolicy::LeastRecentlyUsed, |_, _| None), want);
-        // Without any knowledge of the future the planned cache does the same.
+        // Without knowledge of the future the planned cache does the same.
         assert_eq!(reads(&steps, 12, EvictPolicy::FarthestNextUse, |_, _| None), want);
     }
 }
@@ -140,7 +140,7 @@ fn a_window_that_moves_knows_what_lies_in_it_and_stays_within_its_bytes() {
         plan.push(&(0..60).chain(0..60).map(PageNo).collect::<Vec<_>>()[..60])
             && plan.next_use(PageNo(3), 7) == Some(7)
     );
-    // One step fits whatever the bytes.
+    // One step fits regardless of its bytes.
     assert!(Plan::new(0, 0).push(&all[1]));
 }
 
@@ -158,7 +158,8 @@ fn planned_changes_are_those_that_happen_and_print_exactly() {
         [
             "step 10: 2 pages, admit 2, evict 0\n  + 0 1",
             "step 11: 2 pages, admit 1, evict 0\n  + 2",
-            // 1 and 2 are needed next in the same step; both were used last in the same step: the lower number leaves.
+            // Pages 1 and 2 are next needed in the same step and were last used in the same step: the lower number is
+            // evicted.
             "step 12: 2 pages, admit 1, evict 1\n  + 3\n  - 1",
             "step 13: 2 pages, admit 1, evict 1\n  + 1\n  - 0",
         ]

@@ -30,7 +30,7 @@ fn is_root() -> bool {
     rustix::process::geteuid().is_root()
 }
 
-/// Every file below a folder with its bytes, to see that nothing changed.
+/// Every file below a folder with its bytes, to compare before and after.
 fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut files = BTreeMap::new();
     for entry in std::fs::read_dir(folder).unwrap() {
@@ -41,7 +41,7 @@ fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     files
 }
 
-/// Refused with these words and a remedy, and nothing in the folder changed.
+/// Asserts that the folder is refused with `words` and a remedy, and that nothing in it changed.
 fn assert_refused(folder: &Path, words: &str) {
     let before = contents(folder);
     let error = create(folder).expect_err("taken");
@@ -50,7 +50,7 @@ fn assert_refused(folder: &Path, words: &str) {
     assert!(contents(folder) == before, "something in the folder changed");
 }
 
-/// A segment whose first slot is of `store`.
+/// Writes a segment whose first slot belongs to `store`.
 fn write_segment(folder: &Path, segment: u32, store: u128) {
     let place = Place { segment, offset: 0 };
     let slot = SlotRef { place, stored_bytes: 1, payload_bytes: 1, generation: 1, checksum: 0, codec: StoredAs::Raw };
@@ -101,7 +101,7 @@ fn removal_keeps_foreign_files() {
     assert_eq!(std::fs::read(&outside).unwrap(), b"mine");
 }
 
-/// Somebody removed the folder while it was in use, and another run made its own there.
+/// Somebody removes the folder in use, and another run creates its own in the same place.
 #[test]
 fn a_store_that_replaced_ours_is_not_removed() {
     let parent = tempfile::tempdir().unwrap();
@@ -145,7 +145,7 @@ fn folders_of_something_else_are_refused_and_untouched() {
     symlink(full.join("photo.jpg"), links.join("LOCK")).unwrap();
     assert_refused(&links, "locking the spill directory failed");
     assert_eq!(std::fs::read(full.join("photo.jpg")).unwrap(), b"mine");
-    // Open never makes anything.
+    // Open creates nothing.
     let empty = folder("empty");
     assert!(SpillDir::open(&empty, false).unwrap_err().to_string().contains("it has no FORMAT file"));
     assert!(contents(&empty).is_empty());
@@ -163,7 +163,7 @@ fn links_and_files_and_missing_parents_are_refused() {
     symlink(parent.path().join("nowhere"), parent.path().join("dangling")).unwrap();
     assert!(error(&parent.path().join("dangling")).contains("is a symbolic link"));
     assert!(error(&file).contains("is not a folder"));
-    // A drive that is not mounted must not become a folder of the drive below.
+    // A missing mount must not become a folder on the drive below.
     assert!(error(&parent.path().join("nowhere/spill")).contains("creating the spill directory failed"));
     assert!(contents(&real).is_empty() && !parent.path().join("nowhere").exists());
 }
@@ -181,7 +181,7 @@ fn left_over_directories_are_refused_with_the_remedy() {
     let opened = SpillDir::open(&kept, false).unwrap();
     assert_eq!((opened.format().store, opened.format().layout), (store, LAYOUT));
     drop(opened);
-    // Damage of any byte is told; so is a file cut short.
+    // Damage of any byte is reported, and so is a truncated file.
     let path = kept.join("FORMAT");
     let bytes = std::fs::read(&path).unwrap();
     for at in 0..bytes.len() {
@@ -194,7 +194,7 @@ fn left_over_directories_are_refused_with_the_remedy() {
     }
     std::fs::write(&path, &bytes).unwrap();
     assert!(SpillDir::open(&kept, false).is_ok());
-    // A process that ended between its first two files leaves a folder that can be used.
+    // A process that ended between its first two files leaves a usable folder.
     let begun = parent.path().join("begun");
     drop(create(&begun).unwrap());
     std::fs::rename(begun.join("FORMAT"), begun.join("FORMAT.new")).unwrap();
@@ -234,7 +234,7 @@ fn a_spill_directory_in_memory_is_warned_about() {
     let parent = tempfile::tempdir_in(memory).unwrap();
     let spill = create(&parent.path().join("spill")).unwrap();
     assert!(spill.warnings()[0].contains("take memory"), "{:?}", spill.warnings());
-    // Direct files or not, whatever tmpfs of this kernel takes: segments work.
+    // With or without direct I/O (tmpfs of this kernel may refuse it), segments work.
     let mut files = SegmentFiles::new(spill.folder(), true).unwrap();
     files.create(0, LAYOUT.segment_bytes()).unwrap();
     let page = PageBuffer::zeroed(8192);
@@ -243,7 +243,8 @@ fn a_spill_directory_in_memory_is_warned_about() {
     assert_eq!(spill.remove().unwrap(), [""; 0]);
 }
 
-/// What the second process does: `GSSCALE_TEST_ROLE` says what, `GSSCALE_TEST_FOLDER` where. In a plain run, nothing.
+/// The second process: `GSSCALE_TEST_ROLE` names its task, `GSSCALE_TEST_FOLDER` its folder. Without these variables
+/// the test does nothing.
 #[test]
 fn second_process() {
     let Ok(role) = std::env::var("GSSCALE_TEST_ROLE") else { return };
@@ -272,7 +273,7 @@ fn second_process() {
     }
 }
 
-/// A line for the first process, apart from what the test runner prints.
+/// Prints a line for the first process, distinct from the output of the test runner.
 fn say(line: &str) {
     println!("\nsays {line}");
     std::io::stdout().flush().unwrap();
@@ -280,7 +281,7 @@ fn say(line: &str) {
 
 fn fill_many_segments(folder: &Path, segments: u32) -> std::io::Result<()> {
     let mut files = SegmentFiles::new(folder, false)?;
-    // Others of the process hold files as well, more than was reckoned with: all but four.
+    // The rest of the process holds files as well, more than expected: all but four.
     let mut others: Vec<std::fs::File> = std::iter::from_fn(|| std::fs::File::open("/dev/null").ok()).collect();
     others.truncate(others.len() - 4);
     for segment in 0..segments {
@@ -302,7 +303,7 @@ fn start(role: &str, folder: &Path, change: impl FnOnce(&mut Command) -> &mut Co
     change(command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null())).spawn()
 }
 
-/// The line that the second process says.
+/// Reads the line of the second process.
 fn heard(child: &mut Child) -> String {
     let lines = BufReader::new(child.stdout.as_mut().unwrap()).lines();
     let said = lines.map_while(Result::ok).find_map(|line| line.strip_prefix("says ").map(str::to_string));
@@ -329,7 +330,7 @@ fn two_processes_never_share_a_directory() {
         assert!(told.contains(&process) && told.contains("remedy"), "{told}");
     }
     assert!(contents(&folder) == before);
-    // Killed, not ended: the lock goes with the process, what it left is told for what it is.
+    // The holder is killed: its lock is released, and the folder is recognized as that of an interrupted run.
     holder.kill().unwrap();
     holder.wait().unwrap();
     assert_refused(&folder, "an interrupted run");
@@ -361,7 +362,7 @@ fn read_only_folders_are_refused() {
     std::fs::create_dir(&folder).unwrap();
     std::fs::set_permissions(&folder, std::fs::Permissions::from_mode(0o500)).unwrap();
     let said = if is_root() {
-        // Root may write everywhere, so somebody else is asked.
+        // Root may write everywhere, so a process of another user tries.
         std::fs::set_permissions(parent.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
         chown(&folder, Some(NOBODY), None).unwrap();
         match start("create", &folder, |command| command.uid(NOBODY).gid(NOBODY)) {

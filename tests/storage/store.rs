@@ -20,7 +20,7 @@ const STORE: u128 = 0xabc;
 const CAPACITY: usize = 20_000;
 const CODECS: [Codec; 2] = [Codec::Raw, Codec::Zstd { level: 1 }];
 
-/// A memory store that the test can reach into, and open a second time.
+/// An engine in memory that the test can change from outside and open a second time.
 #[derive(Clone, Default)]
 struct Shared(Arc<Mutex<MemoryEngine>>);
 
@@ -66,7 +66,7 @@ fn faulty(codec: Codec) -> (PagedStore, Faults, Shared) {
     (PagedStore::new(Box::new(engine), config(codec)), faults, shared)
 }
 
-/// A payload that compresses for even pages and does not for odd ones.
+/// A payload that compresses for even pages and does not compress for odd pages.
 fn payload(page: u64, version: u64, bytes: usize) -> Vec<u8> {
     let noise = |i: usize| mix64((page << 40) ^ (version << 20) ^ i as u64) as u8;
     (0..bytes).map(|i| if page.is_multiple_of(2) && i % 4 > 0 { (page + version) as u8 } else { noise(i) }).collect()
@@ -162,7 +162,7 @@ fn pages_round_trip_bit_for_bit() {
     }
 }
 
-/// A header tells everything that the index would need to be made again.
+/// A header holds everything needed to rebuild the index.
 #[test]
 fn slots_describe_themselves() {
     let (mut store, _, shared) = faulty(Codec::Raw);
@@ -181,7 +181,7 @@ fn slots_describe_themselves() {
     assert!(header(&first).serial < header(&second).serial, "which is the later version?");
 }
 
-/// Every bit of every version in a small store, flipped on the drive, one at a time.
+/// Flips every bit of every version in a small store, one at a time, on the drive.
 #[test]
 fn every_flipped_bit_is_found_and_named() {
     for codec in CODECS {
@@ -195,7 +195,7 @@ fn every_flipped_bit_is_found_and_named() {
                 assert_damaged(&mut store, page, &slot, "remedy");
                 shared.at(slot.place, flip);
             }
-            // Behind the version there is nothing of it.
+            // Bytes after the version do not belong to it.
             shared.at(slot.place, |there| there[slot.transfer_bytes()] ^= 1);
             assert!(read(&mut store, page, &slot) == payload);
         }
@@ -208,12 +208,13 @@ fn a_fault_that_a_second_read_mends_is_not_an_error() {
     for (fault, codec) in faults.iter().flat_map(|fault| CODECS.map(|codec| (*fault, codec))) {
         let (mut store, faults, _) = faulty(codec);
         let slot = write(&mut store, 2, &payload(2, 0, 9000));
-        // The store's own buffers hold another page then, so what is not read is not there by chance.
+        // The store's staging buffers now hold another page, so that bytes which are not read cannot be right by
+        // chance.
         write(&mut store, 4, &payload(4, 0, 9000));
         faults.add(Operation::Read, 0, false, fault);
         assert!(read(&mut store, 2, &slot) == payload(2, 0, 9000), "{fault:?}");
         assert_eq!(store.traffic().reads_repeated, 1);
-        // Twice is.
+        // Two failing reads are an error.
         write(&mut store, 4, &payload(4, 1, 9000));
         faults.add(Operation::Read, 2, true, fault);
         assert!(try_read(&mut store, 2, &slot).is_err(), "{fault:?}");
@@ -221,7 +222,7 @@ fn a_fault_that_a_second_read_mends_is_not_an_error() {
     }
 }
 
-/// The reasons by which a slot that holds something else is told.
+/// The error of a slot that holds something else gives the reason.
 #[test]
 fn misdirected_and_lost_transfers_are_found() {
     for codec in CODECS {
@@ -231,12 +232,12 @@ fn misdirected_and_lost_transfers_are_found() {
         faults.add(Operation::Read, 0, true, Fault::Misdirected(b.place));
         assert_damaged(&mut store, 1, &a, "it holds page 2 instead");
         faults.clear();
-        // A write that went to the slot of another page: both are found out.
+        // A write that went to the slot of another page: both pages are reported.
         faults.add(Operation::Write, 2, false, Fault::Misdirected(b.place));
         let c = write(&mut store, 4, &payload(4, 0, bytes));
         assert_damaged(&mut store, 4, &c, "there is no slot header here");
         assert_damaged(&mut store, 2, &b, "it holds page 4 instead");
-        // A write that went nowhere, over nothing, over an older version of the same page, and a torn one.
+        // Lost writes: over nothing, over an older version of the same page; and a torn write.
         store.free(&c);
         faults.add(Operation::Write, 3, true, Fault::Lost);
         let d = write(&mut store, 4, &payload(4, 1, bytes));
@@ -262,7 +263,8 @@ fn misdirected_and_lost_transfers_are_found() {
     }
 }
 
-/// References that no store gave, as from a damaged index: an error, not a panic, not a byte beyond the slot.
+/// References that no store returned, as from a damaged index: an error, not a panic, and no byte beyond the slot is
+/// read.
 #[test]
 fn hostile_references_end_in_an_error() {
     for codec in CODECS {
@@ -307,7 +309,7 @@ fn what_does_not_fit_is_refused_at_once() {
     assert_eq!((store.in_flight(), store.slots().total()), (0, 0), "a refusal takes no slot");
 }
 
-/// Errors of the drive end all writing; what was read before can be read still.
+/// Drive errors end all writing; earlier pages remain readable.
 #[test]
 fn a_failed_write_or_sync_ends_all_writing() {
     for (codec, on) in CODECS.iter().flat_map(|codec| [(codec, Operation::Write), (codec, Operation::Sync)]) {
@@ -320,7 +322,7 @@ fn a_failed_write_or_sync_ends_all_writing() {
         };
         let told = error.to_string();
         assert!(matches!(error, PageError::Write { .. } | PageError::Sync { .. }) && told.contains("remedy"), "{told}");
-        // The second attempt would succeed, as Linux has it; it must not be made.
+        // A second attempt would succeed, as on Linux; it must not be made.
         let [writes, syncs] = [Operation::Write, Operation::Sync].map(|on| faults.count(on));
         let again = try_write(&mut store, 4, &payload(4, 0, 9000)).unwrap_err();
         assert!(matches!(again, PageError::Poisoned { .. }), "{again}");
@@ -330,7 +332,7 @@ fn a_failed_write_or_sync_ends_all_writing() {
     }
 }
 
-/// A full drive is not an error of the drive: nothing is lost, and with space it goes on.
+/// A full drive is not a drive error: nothing is lost, and writing works again once there is space.
 #[test]
 fn a_full_drive_is_survived() {
     for codec in CODECS {
@@ -347,7 +349,7 @@ fn a_full_drive_is_survived() {
     }
 }
 
-/// Many transfers in flight that end in any order: each comes back once, with its own buffer and page.
+/// Many transfers in flight complete in any order: each comes back once, with its own buffer and page.
 #[test]
 fn transfers_may_end_in_any_order() {
     for codec in CODECS {
@@ -384,7 +386,7 @@ fn transfers_may_end_in_any_order() {
     }
 }
 
-/// What a run over the store believes: the payload of every version that some index names.
+/// The expected state of the store: the payload of every version that an index names.
 #[derive(Default)]
 struct Run {
     /// Page to version number, reference.
@@ -399,7 +401,7 @@ const RUN_PAGES: u64 = 5;
 const RUN_BYTES: usize = 5000;
 
 impl Run {
-    /// One write, with reading, committing and pinning now and then, all decided by `step`.
+    /// One write, with occasional reads, commits and pins; `step` decides them all.
     fn step(&mut self, store: &mut PagedStore, step: u64) {
         let page = mix64(step) % RUN_PAGES;
         if let Some((version, slot)) = self.present.get(&page).copied() {
@@ -431,7 +433,7 @@ impl Run {
         }
     }
 
-    /// A version is read back as it was written, or there is an error: never other bytes.
+    /// Reads a version: the bytes as written, or an error, never other bytes.
     fn check(&mut self, store: &mut PagedStore, page: u64, version: u64, slot: &SlotRef) {
         match try_read(store, page, slot) {
             Ok(bytes) => assert!(bytes == payload(page, version, RUN_BYTES), "other bytes were returned as good"),
@@ -439,7 +441,7 @@ impl Run {
         }
     }
 
-    /// Every version that an index names; gives how many could not be read.
+    /// Checks every version that an index names; returns how many could not be read.
     fn check_all(&mut self, store: &mut PagedStore) -> usize {
         let before = self.errors;
         for index in self.kept.clone().values().chain([&self.present.clone()]) {
@@ -468,7 +470,7 @@ fn kept_generations_are_never_overwritten() {
             assert_eq!(run.check_all(&mut store), 0);
         }
         assert!(run.kept.len() > 10 && store.slots().retired() > 10);
-        // Another process opens the last generation and an older one that is pinned.
+        // Another process opens the last generation and an older, pinned one.
         let (segments, generation) = (store.slots().segments(), store.generation());
         let used: std::collections::BTreeSet<[u8; SlotRef::ENCODED_BYTES]> =
             run.kept.values().flat_map(|index| index.values().map(|(_, slot)| slot.to_bytes())).collect();
@@ -483,8 +485,8 @@ fn kept_generations_are_never_overwritten() {
     }
 }
 
-/// Every operation of a run made to fail, once and for ever, in every way: no panic, no lost buffer, no wrong bytes;
-/// and where the drive tells the truth about what it did, every version that was reported as written is there.
+/// Makes every operation of a run fail, once and permanently, in every way: no panic, no lost buffer, no wrong bytes.
+/// Where the drive reports its results truthfully, every version reported as written is there.
 #[test]
 fn any_operation_may_fail_in_any_way() {
     use io::ErrorKind as K;

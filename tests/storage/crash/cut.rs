@@ -9,20 +9,20 @@ use gsscale::page::map::commit::{Cut, PageChange};
 use gsscale::page::versions::paged_store::PageMoved;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// A generation that was cut and is not committed yet.
+/// A generation that is cut and not yet committed.
 #[derive(Debug)]
 pub struct Frozen {
     generation: u64,
     /// Pages of the generation with their versions.
     pages: BTreeMap<PageId, u64>,
-    /// Of these, where versions that are written lie.
+    /// Slots of the versions that are already written.
     slots: BTreeMap<PageId, SlotRef>,
     /// Pages that differ from the last commit.
     changed: BTreeSet<PageId>,
 }
 
 impl Life<'_> {
-    /// Cuts: from here on pages change for the next generation.
+    /// Cuts: later changes belong to the next generation.
     pub fn freeze(&mut self) {
         if self.frozen.is_some() {
             return;
@@ -34,14 +34,14 @@ impl Life<'_> {
         self.frozen = Some(Frozen { generation, pages, slots, changed });
     }
 
-    /// Gives the cut up: what it has written are versions like others.
+    /// Abandons the cut: the versions that it wrote become ordinary versions.
     pub fn thaw(&mut self) {
         if let Some(frozen) = self.frozen.take() {
             self.changed.extend(frozen.changed);
         }
     }
 
-    /// Whether the version of a page in memory is one that the cut needs and that is not written yet.
+    /// Whether the cut still needs the version in memory, which is not yet written.
     pub fn is_frozen(&self, page: PageId) -> bool {
         let Some(frozen) = &self.frozen else { return false };
         !frozen.slots.contains_key(&page)
@@ -54,7 +54,7 @@ impl Life<'_> {
         frozen.pages.keys().copied().filter(|page| !frozen.slots.contains_key(page)).collect()
     }
 
-    /// Writes the cut's version of a page, which may have a newer one by now. Without space nothing happens.
+    /// Writes the cut's version of a page, which may have a newer version by now. Does nothing without space.
     pub fn write_frozen(&mut self, page: PageId) -> Result<(), End> {
         let Some(frozen) = &mut self.frozen else { return Ok(()) };
         let (generation, version) = (frozen.generation, frozen.pages[&page]);
@@ -95,7 +95,7 @@ impl Life<'_> {
         Ok(())
     }
 
-    /// Commits the cut; where there is no space, it is given up.
+    /// Commits the cut; without space, abandons it.
     pub fn commit_frozen(&mut self, pin: Option<&str>) -> Result<(), End> {
         for page in self.unwritten() {
             self.write_frozen(page)?;

@@ -26,7 +26,7 @@ pub fn spoil_and_open(disk: &Disk, past: &Disk, oracle: &Oracle, rng: &mut Rng) 
         5 if name == MAP_NAME => tamper::with(&disk, name, rng),
         1 => flip_used(&disk, name, rng),
         2 if name == MAP_NAME => {
-            // The first sector is written with every commit and decides which tree counts.
+            // The first sector is written with every commit and selects the valid tree.
             let bit = rng.below(320 * 8);
             disk.flip(name, bit);
             format!("bit {bit} of {name} flipped")
@@ -40,7 +40,7 @@ pub fn spoil_and_open(disk: &Disk, past: &Disk, oracle: &Oracle, rng: &mut Rng) 
     open_spoilt(&disk, oracle).map_err(|error| format!("{what}: {error}"))
 }
 
-/// Flips a bit where there is something: most of a map's file is empty.
+/// Flips a bit in a used part: most of a map's file is empty.
 fn flip_used(disk: &Disk, name: &str, rng: &mut Rng) -> String {
     let bytes = disk.contents(name);
     let used: Vec<usize> = bytes.iter().enumerate().filter(|(_, b)| **b != 0).map(|(i, _)| i).collect();
@@ -50,7 +50,7 @@ fn flip_used(disk: &Disk, name: &str, rng: &mut Rng) -> String {
     format!("used bit {bit} of {name} flipped")
 }
 
-/// A slot's bytes stand in another slot.
+/// Copies a slot's bytes to another slot.
 fn astray(disk: &Disk, name: &str, rng: &mut Rng) -> String {
     let slots = disk.file_len(name) / 8192;
     let (from, to) = (rng.below(slots), rng.below(slots));
@@ -58,7 +58,7 @@ fn astray(disk: &Disk, name: &str, rng: &mut Rng) -> String {
     format!("slot {from} of {name} written to {to}")
 }
 
-/// A slot holds what it held before: the drive had dropped a write without a word.
+/// Puts an earlier version back into a slot: the drive has silently dropped a write.
 fn lost_write(disk: &Disk, past: &Disk, name: &str, rng: &mut Rng) -> String {
     let (mut bytes, old) = (disk.contents(name), past.contents(name));
     let slot = rng.below(disk.file_len(name) / 8192) as usize * 8192;
@@ -69,13 +69,13 @@ fn lost_write(disk: &Disk, past: &Disk, name: &str, rng: &mut Rng) -> String {
     format!("a write to slot {slot} of {name} was lost")
 }
 
-/// Opens a damaged disk: an error with a name, or exactly what was acknowledged.
+/// Opens a damaged disk: the result is an error that names the damage, or exactly the acknowledged state.
 pub fn open_spoilt(disk: &Disk, oracle: &Oracle) -> Result<bool, String> {
     let before: Vec<(String, Vec<u8>)> = disk.names().into_iter().map(|n| (n.clone(), disk.contents(&n))).collect();
     match Commits::open(Box::new(disk.clone()), CONFIG) {
         Err(_) => {
             let changed = before.iter().find(|(name, bytes)| disk.contents(name) != *bytes);
-            // Only the witness may be brought up to date before a store is refused.
+            // Before a store is refused, only the witness may be updated.
             match changed.filter(|(name, _)| name != gsscale::page::map::commit::WITNESS_NAME) {
                 Some((name, _)) => Err(format!("a refused store was changed: {name}")),
                 None => Ok(true),

@@ -16,7 +16,7 @@ const BLOCK: usize = 4096;
 /// Length of the writes to the header of the map's file.
 const MAP_HEADER_BYTES: usize = 320;
 
-/// Numbers from a seed.
+/// Random numbers from a seed.
 #[derive(Debug, Clone)]
 pub struct Rng(pub u64);
 
@@ -35,7 +35,7 @@ impl Rng {
     }
 }
 
-/// Bytes in shared blocks; a block that is not there is zero.
+/// Bytes in shared blocks; a missing block is zero.
 #[derive(Debug, Clone, Default)]
 struct Image {
     len: u64,
@@ -87,7 +87,7 @@ impl Image {
     }
 }
 
-/// A change that is not synced.
+/// An unsynced change.
 #[derive(Debug, Clone)]
 enum Unsynced {
     Write(u64, Arc<[u8]>),
@@ -96,14 +96,14 @@ enum Unsynced {
 
 #[derive(Debug, Clone, Default)]
 struct File {
-    /// What is read.
+    /// Contents as read.
     now: Image,
-    /// What is on the drive for certain.
+    /// Contents that are on the drive for certain.
     durable: Image,
     unsynced: Vec<Unsynced>,
 }
 
-/// A change of the folder that is not synced.
+/// An unsynced change of the folder.
 #[derive(Debug, Clone)]
 enum Entry {
     Create(String, usize),
@@ -111,18 +111,18 @@ enum Entry {
     Remove(String),
 }
 
-/// What the power failure leaves of un-synced changes.
+/// The unsynced changes that survive a power failure.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Survival {
     Nothing,
     Everything,
-    /// The first so many, whole.
+    /// The first changes, this many of them, whole.
     First(usize),
-    /// Whole changes by the bits of this number.
+    /// Whole changes selected by the bits of this number.
     Mask(u64),
-    /// As the mask; of the change at this index only the first so many sectors of 512 bytes.
+    /// Like the mask; of the change at this index only the first sectors of 512 bytes, this many of them.
     Torn(u64, usize, usize),
-    /// Sectors of this many bytes each by chance; with flips, a surviving sector in 64 has a flipped bit.
+    /// Random sectors of this many bytes each; with flips, a surviving sector in 64 has a flipped bit.
     Sectors(u64, usize, bool),
 }
 
@@ -135,9 +135,9 @@ pub enum Fault {
     Full,
     /// EMFILE.
     TooManyFiles,
-    /// Writes say that they wrote less, reads that the file ends.
+    /// Writes report fewer bytes, reads report the end of the file.
     Short,
-    /// EINTR, as though nobody had tried again.
+    /// EINTR, passed on without a retry.
     Interrupted,
 }
 
@@ -158,7 +158,7 @@ impl Fault {
 pub struct FaultPlan {
     /// Number of the first call that fails, reads included.
     pub at_call: u64,
-    /// How many calls from there on fail. Of those, [`Fault::Full`] fails only such as need space.
+    /// Number of calls that fail from there on. [`Fault::Full`] fails only the calls that need space.
     pub calls: u64,
     pub fault: Fault,
 }
@@ -174,14 +174,14 @@ struct State {
     crash_at: u64,
     crashed: bool,
     fault: Option<FaultPlan>,
-    /// Number of the sync, from now, that fails.
+    /// Number of the failing sync, counted from now.
     failing_sync: Option<u64>,
     faults_given: u64,
     rng: Rng,
     short_write: Option<u64>,
 }
 
-/// The disk; clones are the same disk.
+/// The simulated disk. Clones share one disk.
 #[derive(Debug, Clone)]
 pub struct Disk(Arc<Mutex<State>>);
 
@@ -204,7 +204,7 @@ impl Disk {
         })))
     }
 
-    /// A copy that goes its own way.
+    /// An independent copy.
     pub fn fork(&self) -> Disk {
         Disk(Arc::new(Mutex::new(self.state().clone())))
     }
@@ -235,12 +235,12 @@ impl Disk {
         self.state().fault = plan;
     }
 
-    /// Errors given so far.
+    /// Errors returned so far.
     pub fn faults_given(&self) -> u64 {
         self.state().faults_given
     }
 
-    /// A drive that was full has space again.
+    /// Ends the shortage: the drive has space again.
     pub fn end_shortage(&self) {
         let mut state = self.state();
         if state.fault.is_some_and(|plan| plan.fault == Fault::Full) {
@@ -248,7 +248,7 @@ impl Disk {
         }
     }
 
-    /// No injected error waits any more, and none counts as given.
+    /// Drops pending injected errors and resets their count.
     pub fn forget_faults(&self) {
         let mut state = self.state();
         (state.crash_at, state.fault, state.failing_sync) = (u64::MAX, None, None);
@@ -259,7 +259,7 @@ impl Disk {
         self.state().failing_sync = after;
     }
 
-    /// The write so many from now is short: all but its last sectors arrive.
+    /// Makes a later write short: all but its last sectors arrive. `after` counts writes from now.
     pub fn short_write(&self, after: Option<u64>) {
         self.state().short_write = after;
     }
@@ -270,7 +270,7 @@ impl Disk {
         state.files.iter().map(|f| f.unsynced.len()).sum::<usize>() + state.unsynced_entries.len()
     }
 
-    /// Of every file, the last un-synced change if it is a write: its index among all changes, and its sectors.
+    /// For every file whose last unsynced change is a write: its index among all changes, and its number of sectors.
     pub fn last_writes(&self) -> Vec<(usize, usize)> {
         let state = self.state();
         let mut index = 0;
@@ -317,7 +317,7 @@ impl Disk {
         state.short_write = None;
     }
 
-    /// The process ends, the machine goes on: nothing is lost.
+    /// The process ends and the machine keeps running: nothing is lost.
     pub fn process_killed(&self) {
         let mut state = self.state();
         (state.crashed, state.crash_at, state.fault, state.failing_sync) = (false, u64::MAX, None, None);
@@ -333,7 +333,7 @@ impl Disk {
         state.entries.get(name).map_or(0, |&i| state.files[i].now.len)
     }
 
-    /// Flips a bit of what is on the drive.
+    /// Flips a bit on the drive.
     pub fn flip(&self, name: &str, bit: u64) {
         let mut state = self.state();
         let index = state.entries[name];
@@ -346,7 +346,7 @@ impl Disk {
         file.unsynced.clear();
     }
 
-    /// Copies bytes of a file elsewhere in it: a write that went astray.
+    /// Copies bytes of a file to another place in it: a misdirected write.
     pub fn copy_within(&self, name: &str, from: u64, to: u64, bytes: usize) {
         let mut state = self.state();
         let index = state.entries[name];
@@ -367,7 +367,7 @@ impl Disk {
         bytes
     }
 
-    /// Puts other bytes in place of a file's.
+    /// Replaces the bytes of a file.
     pub fn replace(&self, name: &str, bytes: &[u8]) {
         let mut state = self.state();
         let index = state.entries[name];
@@ -395,7 +395,8 @@ fn survive(image: &mut Image, change: &Unsynced, survival: Survival, index: usiz
             image.write(*offset, &bytes[..bytes.len().min(sectors * 512)]);
         }
         (Unsynced::Write(offset, bytes), Survival::Sectors(_, sector, flips)) => {
-            // The map's first sector stands alone: nothing could survive a drive that damages what it overwrites there.
+            // The map's first sector is excepted: no store survives a drive that damages this sector while overwriting
+            // it.
             let flips = flips && bytes.len() != MAP_HEADER_BYTES;
             // Most changes are whole or lost; some are torn in pieces.
             let torn = rng.one_in(3);
@@ -442,7 +443,7 @@ fn apply_entry(entries: &mut BTreeMap<String, usize>, entry: &Entry) {
 }
 
 impl State {
-    /// Counts a call; tells whether it fails.
+    /// Counts a call, and fails if the plan says so.
     fn call(&mut self, needs_space: bool) -> io::Result<()> {
         if self.crashed {
             return Err(io::Error::other("the power is off"));
@@ -458,7 +459,7 @@ impl State {
         Ok(())
     }
 
-    /// Counts a change; the power may fail with it, after it began.
+    /// Counts a change. The power may fail after the change began.
     fn tick(&mut self) -> io::Result<()> {
         self.clock += 1;
         if self.clock >= self.crash_at {
@@ -472,7 +473,7 @@ impl State {
         let mut failed = self.call(true);
         let mut count = data.len();
         if failed.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::UnexpectedEof) {
-            // A short write is no error: it says how much it wrote, of less than two sectors nothing.
+            // A short write is no error: it reports the bytes written, and writes nothing below two sectors.
             failed = Ok(());
             count = data.len() / 1024 * 512;
         } else if failed.is_err() && !self.crashed {
@@ -509,13 +510,13 @@ impl State {
             self.failing_sync = left.checked_sub(1);
             if left == 0 {
                 self.faults_given += 1;
-                // What was dirty counts as clean; some of it reached the drive.
+                // Dirty data counts as clean; some of it reached the drive.
                 let target = &mut self.files[file];
                 for change in std::mem::take(&mut target.unsynced) {
                     let seed = self.rng.next();
                     let mut rng = Rng(seed);
                     survive(&mut target.durable, &change, Survival::Sectors(seed, 512, false), 0, &mut rng);
-                    // The length is metadata: journaled with the next sync, whatever became of the data.
+                    // The length is metadata: journaled with the next sync, independent of the data.
                 }
                 let len = target.now.len;
                 target.durable.set_len(len);
@@ -553,7 +554,8 @@ pub struct DiskFile {
 }
 
 impl DiskFile {
-    /// One write as the system does it: may be short. One that writes nothing is an error, as in the standard library.
+    /// One write as the system performs it, possibly short. A write of zero bytes is an error, as in the standard
+    /// library.
     pub fn write_some(&self, offset: u64, data: &[u8]) -> io::Result<usize> {
         match self.disk.state().write(self.file, offset, data) {
             Ok(0) if !data.is_empty() => Err(io::ErrorKind::WriteZero.into()),

@@ -25,7 +25,7 @@ const PAGES_MAX: usize = 7;
 pub enum End {
     /// Power failure, or an error that ends the process.
     Stopped,
-    /// The store did something that must not be.
+    /// The store broke a promise.
     Violation(String),
 }
 
@@ -41,30 +41,30 @@ impl From<PageError> for End {
     }
 }
 
-/// A page as this process has it.
+/// A page as this process sees it.
 #[derive(Debug, Clone, Copy)]
 pub struct Held {
     pub version: u64,
-    /// `None`: dirty, in memory alone.
+    /// `None`: dirty, only in memory.
     pub slot: Option<SlotRef>,
-    /// Slot of the version before, until the page is written.
+    /// Slot of the previous version, until the page is written.
     pub before: Option<SlotRef>,
 }
 
-/// An open store and what this process knows of it.
+/// An open store and the process's knowledge of it.
 pub struct Life<'a> {
     pub commits: Commits,
     pub store: PagedStore,
     pub oracle: &'a mut Oracle,
     pub pages: BTreeMap<PageId, Held>,
     pub changed: BTreeSet<PageId>,
-    /// A commit that is under way beside the rest.
+    /// A cut whose commit is pending.
     pub frozen: Option<Frozen>,
     next_version: u64,
     next_page: u32,
 }
 
-/// Opens the store, or makes it if it was never there; judges and compares what it holds.
+/// Opens or creates the store; judges its state and compares its pages.
 pub fn open<'a>(disk: &Disk, oracle: &'a mut Oracle, seed: u64) -> Result<Life<'a>, End> {
     let opened = match Commits::open(Box::new(disk.clone()), CONFIG) {
         Err(CommitError::NoStore) if !oracle.is_created => {
@@ -99,7 +99,7 @@ pub fn paged_store(disk: &Disk, opened: &Opened, seed: u64) -> Result<PagedStore
     opened.paged_store(Box::new(SimStore::new(disk.clone(), seed)), LAYOUT, Codec::Raw)
 }
 
-/// An error without a cause on the disk must not be.
+/// An error without a cause on the disk is a violation.
 fn stopped_by(disk: &Disk, error: &dyn std::fmt::Display) -> End {
     if disk.has_crashed() || disk.faults_given() > 0 {
         End::Stopped
@@ -109,7 +109,7 @@ fn stopped_by(disk: &Disk, error: &dyn std::fmt::Display) -> End {
 }
 
 impl Life<'_> {
-    /// A page of this number, new or not, gets a new version in memory.
+    /// Gives a page, new or existing, a new version in memory.
     pub fn edit(&mut self, page: PageId) {
         self.next_version += 1;
         let version = self.next_version;
@@ -120,7 +120,7 @@ impl Life<'_> {
         self.changed.insert(page);
     }
 
-    /// A page makes room for its two halves.
+    /// Replaces a page by its two halves.
     pub fn split(&mut self, page: PageId) {
         let Some(children) = page.children() else { return };
         if let Some(slot) = self.pages.remove(&page).and_then(|held| held.before.or(held.slot)) {
@@ -130,7 +130,7 @@ impl Life<'_> {
         children.into_iter().for_each(|child| self.edit(child));
     }
 
-    /// Writes a dirty page, as an eviction does. Where there is no space it stays dirty.
+    /// Writes a dirty page, as an eviction does. Without space the page stays dirty.
     pub fn write(&mut self, page: PageId) -> Result<(), End> {
         let Some(held) = self.pages.get(&page).copied().filter(|held| held.slot.is_none()) else { return Ok(()) };
         if self.is_frozen(page) {
@@ -167,7 +167,7 @@ impl Life<'_> {
         Ok(())
     }
 
-    /// Commits; where there is no space, everything stays as it is.
+    /// Commits; without space nothing changes.
     pub fn commit(&mut self, pin: Option<&str>) -> Result<(), End> {
         self.thaw();
         let dirty: Vec<PageId> = self.pages.iter().filter(|(_, h)| h.slot.is_none()).map(|(p, _)| *p).collect();
@@ -187,7 +187,7 @@ impl Life<'_> {
         let mut done = Vec::new();
         self.begin(&cut)?;
         let mut result = self.commits.commit(&mut self.store, &mut done, &cut);
-        // An honest process stops after an error; a confused one may try again and must be refused.
+        // A correct process stops after an error; a confused process may retry and must be refused.
         if result.as_ref().is_err_and(|error| !error.is_out_of_space()) {
             self.begin(&cut)?;
             result = result.or_else(|error| self.commits.commit(&mut self.store, &mut done, &cut).map_err(|_| error));
@@ -244,14 +244,14 @@ impl Life<'_> {
         match read_and_compare(&mut self.store, page, &slot, version) {
             Ok(true) => Ok(()),
             Ok(false) if disk.has_crashed() || disk.faults_given() > given => Err(End::Stopped),
-            // A sync that failed may have dropped what had been written.
+            // A failed sync may have dropped written data.
             Ok(false) if self.store.poison().is_some() => Err(End::Stopped),
             Ok(false) => Err(End::Violation(format!("page {page} cannot be read back"))),
             Err(what) => Err(End::Violation(what)),
         }
     }
 
-    /// One random thing.
+    /// Performs one random operation.
     pub fn step(&mut self, disk: &Disk, rng: &mut Rng) -> Result<(), End> {
         let ids: Vec<PageId> = self.pages.keys().copied().collect();
         let some = |rng: &mut Rng| ids.get(rng.below(ids.len() as u64) as usize).copied();
@@ -308,7 +308,7 @@ impl Life<'_> {
     }
 }
 
-/// The maker's mistakes aside, an error must have a cause.
+/// Without a mutant, an error must have a cause.
 pub fn end_of(disk: &Disk, end: End) -> End {
     match end {
         End::Stopped if !disk.has_crashed() && disk.faults_given() == 0 => {

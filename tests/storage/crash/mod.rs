@@ -20,14 +20,14 @@ use disk::Fault;
 use random::run_many;
 use std::time::Instant;
 
-/// Crashes of every push.
+/// Crashes of a plain run.
 const CRASHES: u64 = 50_000;
 
 /// Crashes within which every mutant must be noticed.
 #[cfg(debug_assertions)]
 const MUTANT_CRASHES: u64 = 20_000;
 
-/// Panics inside the map's library become errors of the store; their messages would only hide those of the tests.
+/// Panics inside redb become errors of the store; their messages would hide those of the tests.
 fn hush_library_panics() {
     static ONCE: std::sync::Once = std::sync::Once::new();
     ONCE.call_once(|| {
@@ -91,7 +91,7 @@ fn every_call_of_a_small_run_may_fail() {
     for (way, fault) in script::FAULTS.into_iter().enumerate() {
         let [once, for_ever] = failing.met[way];
         if fault == Fault::Full {
-            // Met once by the calls that need space, and by all calls before the last of them.
+            // Once: only calls that need space meet it. For ever: all calls before the last such call meet it.
             assert!(once > 80 && for_ever > once, "{failing:?}");
         } else {
             assert_eq!([once, for_ever], [failing.calls; 2], "{fault:?}");

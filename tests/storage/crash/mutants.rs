@@ -4,7 +4,7 @@ use super::random::{Counts, run_seed};
 use gsscale::page::map::mutants::{Mutant, choose};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-/// All of them.
+/// All mutants.
 pub const MUTANTS: &[Mutant] = &[
     Mutant::SegmentsNotSynced,
     Mutant::SegmentsSyncedAfterMap,
@@ -38,13 +38,13 @@ pub const MUTANTS: &[Mutant] = &[
     Mutant::GenerationsReused,
 ];
 
-/// Runs seeds with the mistake until it is noticed: how many crashes that took, and what was seen.
+/// Runs seeds with the mutant until it is noticed; returns the number of crashes and the violation.
 pub fn hunt(mutant: Mutant, crashes_max: u64) -> Option<(u64, String)> {
     choose(Some(mutant));
     let mut counts = Counts::default();
     let mut found = None;
     for seed in 1 << 40.. {
-        // Assertions of the store count as noticing, too.
+        // Assertions of the store count as noticing.
         let ran = catch_unwind(AssertUnwindSafe(|| run_seed(seed, &mut counts)));
         let what = match ran {
             Ok(Ok(())) if counts.crashes < crashes_max => continue,

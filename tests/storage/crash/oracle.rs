@@ -16,7 +16,7 @@ pub struct Snapshot {
     pub run_state: Vec<u8>,
 }
 
-/// What a transaction leaves.
+/// The state after a transaction.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Acknowledged {
     pub latest: u64,
@@ -25,23 +25,24 @@ pub struct Acknowledged {
 
 #[derive(Debug, Clone, Default)]
 pub struct Oracle {
-    /// Whether the making of the store returned.
+    /// Whether the creation of the store returned.
     pub is_created: bool,
     pub acknowledged: Acknowledged,
-    /// What the transactions under way would leave: several after one that found no space, since it may have been durable.
+    /// The states that pending transactions may leave: several after a transaction without space, which may be durable
+    /// all the same.
     pub in_flight: Vec<Candidate>,
     /// The kept generations.
     pub snapshots: BTreeMap<u64, Snapshot>,
-    /// Largest number that a generation ever had.
+    /// Largest generation number so far.
     pub highest: u64,
     pub commits: u64,
 }
 
-/// A state that a transaction under way would leave.
+/// The state that a pending transaction would leave.
 #[derive(Debug, Clone)]
 pub struct Candidate {
     pub after: Acknowledged,
-    /// Generations that it and those before it bring.
+    /// Generations created by this transaction and the pending ones before it.
     pub snapshots: Vec<(u64, Snapshot)>,
 }
 
@@ -57,7 +58,7 @@ pub fn fill(page: PageId, version: u64, payload: &mut [u8]) {
     }
 }
 
-/// Reads a version and compares it. `Ok(false)`: the store says that it cannot be read.
+/// Reads a version and compares it. `Ok(false)`: the store reports it as unreadable.
 pub fn read_and_compare(store: &mut PagedStore, page: PageId, slot: &SlotRef, version: u64) -> Result<bool, String> {
     match read(store, page, slot) {
         Err(PageError::Read { .. } | PageError::Damaged { .. }) => Ok(false),
@@ -86,7 +87,8 @@ fn read(store: &mut PagedStore, page: PageId, slot: &SlotRef) -> Result<Vec<u8>,
 }
 
 impl Oracle {
-    /// A transaction begins: `change` says what it makes of a state; `snapshot` is the generation that it brings.
+    /// A transaction begins. `change` maps a state to the next; `snapshot` is the generation that the transaction
+    /// creates.
     pub fn begin(&mut self, change: impl Fn(&mut Acknowledged), snapshot: Option<(u64, Snapshot)>) {
         let now = Candidate { after: self.acknowledged.clone(), snapshots: Vec::new() };
         let bases = std::iter::once(now).chain(self.in_flight.iter().cloned());
@@ -100,13 +102,13 @@ impl Oracle {
         self.in_flight.extend(begun);
     }
 
-    /// It was acknowledged, and the store says that it is at `found` and keeps `kept`.
+    /// The transaction was acknowledged; the store reports the state `found` and the kept generations `kept`.
     pub fn acknowledge(&mut self, found: &Acknowledged, kept: &[u64]) -> Result<(), String> {
         let candidates = std::mem::take(&mut self.in_flight);
         if candidates.iter().all(|c| c.after != *found) {
             return Err(format!("acknowledged {found:?}, under way was {candidates:?}"));
         }
-        // Which of the transactions before it had been durable, the kept generations tell.
+        // The kept generations show which earlier transactions are durable.
         let brought = candidates.into_iter().filter(|c| c.after == *found).flat_map(|c| c.snapshots);
         self.snapshots.extend(brought.filter(|(generation, _)| kept.contains(generation)));
         self.acknowledged = found.clone();
@@ -117,7 +119,7 @@ impl Oracle {
         Ok(())
     }
 
-    /// The state of a store that was just opened is one of those that may be; takes it over.
+    /// Checks that the state of a newly opened store is one of the possible states, and adopts it.
     pub fn judge(&mut self, opened: &Opened) -> Result<(), String> {
         let generations = opened.commits.generations();
         let found = state_of(&opened.commits);
@@ -140,7 +142,8 @@ impl Oracle {
         Ok(())
     }
 
-    /// Pages and run state of all kept generations are what was committed. Returns how many pages were unreadable.
+    /// Compares pages and run state of all kept generations with the committed ones. Returns the number of unreadable
+    /// pages.
     pub fn compare(&self, opened: &Opened, store: &mut PagedStore) -> Result<u64, String> {
         let mut unreadable = 0;
         let mut compared: Vec<(PageId, u64)> = Vec::new();
@@ -170,18 +173,18 @@ impl Oracle {
     }
 }
 
-/// The version that a page's label names.
+/// The version in a page's label.
 pub fn version_of(page: &StoredPage) -> u64 {
     page.label.first_chunk().map_or(u64::MAX, |bytes| u64::from_le_bytes(*bytes))
 }
 
-/// Where a store says that it is.
+/// The state that a store reports.
 fn state_of(commits: &Commits) -> Acknowledged {
     Acknowledged { latest: commits.generations().latest(), pins: commits.generations().pins().clone() }
 }
 
 impl Oracle {
-    /// [`Oracle::acknowledge`] by what the store says.
+    /// [`Oracle::acknowledge`] with the state that the store reports.
     pub fn acknowledge_by(&mut self, commits: &Commits) -> Result<(), String> {
         let kept: Vec<u64> = commits.generations().kept().collect();
         self.acknowledge(&state_of(commits), &kept)

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// What happened so far.
+/// Counts of events.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Counts {
     pub seeds: u64,
@@ -24,7 +24,7 @@ pub struct Counts {
 
 const LIVES: u64 = 6;
 const STEPS: u64 = 40;
-/// A long run says so often how far it is.
+/// Interval of progress messages.
 const PROGRESS: Duration = Duration::from_secs(30);
 
 impl Counts {
@@ -39,14 +39,14 @@ impl Counts {
     }
 }
 
-/// What has been run by all threads together.
+/// Progress of all threads together.
 struct Progress {
     counts: Counts,
     said: Instant,
 }
 
-/// Runs seeds from `first` on, on every core, until there were `wanted` crashes. An error is the first violation; there
-/// was no commit lost and no wrong byte returned otherwise.
+/// Runs seeds from `first` on, on every core, until `wanted` crashes have happened. `Err` is the first violation; `Ok`
+/// means no lost commit and no wrong byte.
 pub fn run_many(first: u64, wanted: u64) -> Result<Counts, String> {
     let (next, start) = (AtomicU64::new(first), Instant::now());
     let progress = Mutex::new(Progress { counts: Counts::default(), said: start });
@@ -113,7 +113,7 @@ pub fn run_seed(seed: u64, counts: &mut Counts) -> Result<(), String> {
         }
     }
     counts.commits += oracle.commits;
-    // A last, quiet opening.
+    // A last opening without faults.
     disk.process_killed();
     match open(&disk, &mut oracle, rng.next()) {
         Err(End::Violation(what)) => Err(format!("seed {seed} at the end: {what}")),
@@ -158,7 +158,7 @@ fn live(disk: &Disk, oracle: &mut Oracle, rng: &mut Rng) -> Result<(), End> {
     }
     for _ in 0..rng.below(STEPS) + 4 {
         life.step(disk, rng)?;
-        // Space comes back some time.
+        // Space returns at some time.
         if rng.one_in(16) {
             disk.end_shortage();
         }
@@ -166,7 +166,7 @@ fn live(disk: &Disk, oracle: &mut Oracle, rng: &mut Rng) -> Result<(), End> {
     Ok(())
 }
 
-/// A tool rolls the store back; the power may fail meanwhile.
+/// A tool rolls the store back; the power may fail during the rollback.
 fn roll_back(disk: &Disk, oracle: &mut Oracle, rng: &mut Rng, counts: &mut Counts) -> Result<(), String> {
     disk.forget_faults();
     let opened = match Commits::open(Box::new(disk.clone()), CONFIG) {

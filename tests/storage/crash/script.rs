@@ -6,7 +6,7 @@ use super::life::{End, Life, end_of, open};
 use super::oracle::Oracle;
 use gsscale::base::ids::PageId;
 
-/// Up to so many un-synced changes, all subsets of them are tried.
+/// With up to this many unsynced changes, all subsets are tried.
 const SUBSETS_MAX: usize = 8;
 
 /// Three pages, a split, spills, a pin and its end; two lives.
@@ -31,7 +31,7 @@ fn run(disk: &Disk, oracle: &mut Oracle) -> Result<(), End> {
     life.commit(None)
 }
 
-/// A commit beside work: a page of it gets a newer version before the cut's is written, and one after.
+/// A commit beside changes: one page gets a newer version before the cut's version is written, another afterwards.
 fn beside(life: &mut Life<'_>) -> Result<(), End> {
     let ids = life.ids();
     let [a, b, ..] = ids[..] else { return Ok(()) };
@@ -46,14 +46,14 @@ fn beside(life: &mut Life<'_>) -> Result<(), End> {
     life.write(b)
 }
 
-/// A page is changed and spilled.
+/// Changes and spills a page.
 fn first(life: &mut Life<'_>, index: usize) -> Result<(), End> {
     let Some(page) = life.ids().get(index).copied() else { return Ok(()) };
     life.edit(page);
     life.write(page)
 }
 
-/// Runs the workload; whether it went to its end.
+/// Runs the workload; returns whether it finished.
 fn checked(disk: &Disk, oracle: &mut Oracle) -> Result<bool, String> {
     match run(disk, oracle).map_err(|end| end_of(disk, end)) {
         Err(End::Violation(what)) => Err(what),
@@ -62,7 +62,7 @@ fn checked(disk: &Disk, oracle: &mut Oracle) -> Result<bool, String> {
     }
 }
 
-/// Opens what is left and compares it; then the store must still be usable.
+/// Opens the remaining store and compares it; the store must then accept work.
 fn reopen(disk: &Disk, oracle: &Oracle) -> Result<(), String> {
     disk.forget_faults();
     let mut oracle = oracle.clone();
@@ -77,7 +77,7 @@ fn reopen(disk: &Disk, oracle: &Oracle) -> Result<(), String> {
     }
 }
 
-/// All ways in which `unsynced` changes survive: whole ones in all subsets (or nearly), and the last one torn.
+/// All ways in which unsynced changes survive: whole changes in (nearly) all subsets, and the last change torn.
 fn survivals(disk: &Disk) -> Vec<Survival> {
     let unsynced = disk.unsynced();
     let mut all = vec![Survival::Nothing, Survival::Everything];
@@ -94,7 +94,7 @@ fn survivals(disk: &Disk) -> Vec<Survival> {
     all
 }
 
-/// Every crash point: returns how many states were opened.
+/// Tries every crash point; returns the number of opened states.
 pub fn every_crash_point() -> Result<u64, String> {
     let whole = Disk::new(1);
     checked(&whole, &mut Oracle::default())?;
@@ -117,20 +117,20 @@ pub fn every_crash_point() -> Result<u64, String> {
 /// All ways in which a call fails.
 pub const FAULTS: [Fault; 5] = [Fault::Io, Fault::Full, Fault::TooManyFiles, Fault::Short, Fault::Interrupted];
 
-/// What was tried.
+/// Results of the failing calls.
 #[derive(Debug, Default)]
 pub struct Failing {
     /// Calls of the workload.
     pub calls: u64,
-    /// Cases by the ways of [`FAULTS`]: those that fail once, and those that fail for ever, in which an error was met.
+    /// Cases in which an error was met, for each fault of [`FAULTS`]: failing once, failing permanently.
     pub met: [[u64; 2]; 5],
-    /// Of these, the cases in which the workload went to its end all the same.
+    /// Those of the cases in which the workload finished.
     pub survived: [[u64; 2]; 5],
 }
 
-/// Every call fails, once and for ever, in every way. Afterwards the store opens at the last acknowledged generation or at
-/// the one under way, with all bytes of all kept generations as they were committed, and takes another commit: after the
-/// process was killed, and after the power failed.
+/// Makes every call fail, once and permanently, with every fault. Then the store opens at the last acknowledged
+/// generation or at the pending one, with all bytes of all kept generations, and takes another commit: both after a
+/// killed process and after a power failure.
 pub fn every_call_fails() -> Result<Failing, String> {
     let whole = Disk::new(1);
     checked(&whole, &mut Oracle::default())?;

@@ -27,7 +27,7 @@ pub fn paged_store(opened: &Opened, folder: &Path, codec: Codec, faults: &Faults
     opened.paged_store(Box::new(FaultyEngine::new(engine, faults.clone())), layout, codec).unwrap()
 }
 
-/// The store holds exactly the pages of `model` that have rows.
+/// Asserts that the store holds exactly the pages of `model` that have rows.
 pub fn opens_with(folder: &Path, model: &Model) {
     let opened = Commits::open(Box::new(DriveFolder::new(folder)), COMMITS).unwrap();
     let store = paged_store(&opened, folder, Codec::Raw, &Faults::new());
@@ -41,7 +41,7 @@ pub fn opens_with(folder: &Path, model: &Model) {
     }
 }
 
-/// What a run did with its commits.
+/// Counts of a run's commits.
 #[derive(Default)]
 struct Done {
     committed: u32,
@@ -50,7 +50,7 @@ struct Done {
     had_to_write: u32,
 }
 
-/// Steps with a cut now and then, which is committed when its pages are written, or earlier, or given up.
+/// Steps with occasional cuts. A cut is committed once its pages are written, or earlier, or abandoned.
 fn run_with_commits(seed: u64, frames: usize, codec: Codec, faults: &Faults) -> Result<Done, PagingError> {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
@@ -91,7 +91,7 @@ fn run_with_commits(seed: u64, frames: usize, codec: Codec, faults: &Faults) -> 
             }
             Some(_) => {}
         }
-        // Opened beside the run that goes on, as after a crash: nothing is written by that.
+        // A copy opened as after a crash, while the run continues. Opening writes nothing.
         if done.committed % 4 == 3 && draws.below(6) == 0 {
             drop(commits);
             opens_with(at, last.as_ref().unwrap());
@@ -127,8 +127,8 @@ fn a_cut_is_committed_as_it_was_whatever_the_steps_after_it_do() {
     assert!(committed > 100 && had_to_write > 100, "{committed} of {had_to_write}");
 }
 
-/// A step that has changed rows must not be done twice: where one of the pages that it still needs cannot be written for the
-/// cut, it gets the page all the same, and the next step gets the error.
+/// A step that has changed rows must not be repeated. If a page of the step cannot be written for the cut, the step
+/// gets the page all the same, and the next step gets the error.
 #[test]
 fn a_failed_write_is_left_to_the_next_step_once_rows_have_changed() {
     let folder = tempfile::tempdir().unwrap();
@@ -146,8 +146,7 @@ fn a_failed_write_is_left_to_the_next_step_once_rows_have_changed() {
     assert!(!run.pager.is_frozen() && run.step().unwrap_err().is_out_of_space());
 }
 
-/// A write that fails while a cut is written gives the cut up; the commit before it stands, and the steps go on where
-/// only space is missing.
+/// A failing write abandons the cut; the previous commit stands, and steps continue if only space is missing.
 #[test]
 fn a_failed_write_gives_the_cut_up_and_nothing_else() {
     let folder = tempfile::tempdir().unwrap();
@@ -171,7 +170,7 @@ fn a_failed_write_gives_the_cut_up_and_nothing_else() {
     opens_with(at, &first);
     let mut commits = Commits::open(Box::new(DriveFolder::new(at)), COMMITS).unwrap().commits;
     while (run.step as usize) < STEPS {
-        // The failure was told already, or is told once more.
+        // The failure was reported already, or is reported once more.
         if let Err(error) = run.step() {
             assert!(error.is_out_of_space(), "{error}");
         }

@@ -19,7 +19,7 @@ fn frames_of(seed: u64) -> usize {
     memory.pager.stats().pinned_max + 3
 }
 
-/// Reads and room on the drive that fail once in a while are passed on with the page's name; the step tried again works.
+/// Occasional failures of reads and of space are passed on with the page's name; the repeated step works.
 #[test]
 fn a_step_that_failed_can_be_tried_again() {
     let frames = frames_of(1);
@@ -29,7 +29,7 @@ fn a_step_that_failed_can_be_tried_again() {
         let (mut failed, mut tried) = (0, u32::MAX);
         while (run.step as usize) < STEPS {
             let is_first_try = std::mem::replace(&mut tried, run.step) != run.step;
-            // A read fails twice in a row before it is given up.
+            // A read is retried once before it counts as failed.
             if run.step.is_multiple_of(3) && is_first_try {
                 let n = faults.count(Operation::Read) + u64::from(run.step % 2);
                 (n..n + 2).for_each(|n| faults.add(Operation::Read, n, false, fault));
@@ -67,8 +67,8 @@ fn a_full_drive_can_be_waited_for() {
     assert!(failed > 3, "{failed}");
 }
 
-/// After an error of the drive nothing is written any more, the run ends, and everything can still be written out,
-/// though every frame may be dirty.
+/// After a drive error nothing more is written, the run ends, and everything can still be exported, even if every frame
+/// is dirty.
 #[test]
 fn a_drive_that_fails_for_ever_loses_nothing_that_is_in_memory() {
     for (seed, nth) in [(3, 0), (3, 40), (4, 7), (5, 20), (6, 33)] {
@@ -96,7 +96,7 @@ fn an_import_that_fails_names_the_page() {
     assert!(error.to_string().contains("free space"), "{error}");
 }
 
-/// More space is no remedy where it is not space that is missing.
+/// The remedy names more space only if space is missing.
 #[test]
 fn a_segment_that_cannot_be_made_says_why_and_what_helps() {
     for (kind, remedy) in [

@@ -17,13 +17,13 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
-/// Says when the page map finds no space.
+/// Decides when the page map finds no space.
 #[derive(Debug, Default)]
 struct Shortage {
     syncs: AtomicU64,
-    /// Number of the sync of the map that finds no space, though everything before it reached the drive.
+    /// Number of the map's sync that reports no space after all earlier data reached the drive.
     at_sync: Mutex<Option<u64>>,
-    /// From then on nothing that needs space works.
+    /// Every later call that needs space fails.
     lasts: AtomicBool,
     began: AtomicBool,
 }
@@ -104,7 +104,7 @@ impl Folder for FolderOnDrive {
     }
 }
 
-/// A run over a store in `at`, with one commit after twenty steps. Gives also what it held then.
+/// A run over a store in `at`, with one commit after twenty steps, and the model at that commit.
 fn begun(at: &Path, seed: u64, shortage: &Arc<Shortage>) -> (Run, Commits, Model) {
     let mut memory = in_memory(seed);
     (0..STEPS).for_each(|_| memory.step().unwrap());
@@ -127,16 +127,17 @@ fn steps_to(run: &mut Run, step: u32) {
     }
 }
 
-/// What a commit that found no space left behind.
+/// Effects of a commit that found no space.
 #[derive(Default)]
 struct Left {
-    /// It was durable.
+    /// Number of durable commits.
     durable: u32,
-    /// Pages of it that the commit before it had not, and that were gone at the one after it.
+    /// Pages that only this commit held: neither the previous nor the next commit had them.
     short_lived: usize,
 }
 
-/// A commit that finds no space at its sync number `nth`, then steps, then a commit; `None` where it has no so many.
+/// A commit that finds no space at its sync number `nth`, then steps, then a commit; `None` if the commit has fewer
+/// syncs.
 fn full_once(seed: u64, nth: u64, beside: bool) -> Option<Left> {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
@@ -164,7 +165,7 @@ fn full_once(seed: u64, nth: u64, beside: bool) -> Option<Left> {
     let has_rows = |model: &Model, id: &PageId| model.get(id).is_some_and(|(meta, _)| meta.rows > 0);
     let lived = |id: &PageId| has_rows(&middle, id) && !has_rows(&first, id) && !has_rows(&run.model, id);
     let short_lived = middle.keys().filter(|id| lived(id)).count();
-    // The generation before the last one is kept: that which found no space, if it was durable.
+    // The generation before the last is kept: the one that found no space, if it was durable.
     let kept: Vec<u64> = commits.generations().kept().collect();
     let is_durable = kept == [2, 3];
     assert!(is_durable || kept == [1, 3], "{kept:?}");
@@ -173,8 +174,9 @@ fn full_once(seed: u64, nth: u64, beside: bool) -> Option<Left> {
     Some(Left { durable: u32::from(is_durable), short_lived: if is_durable { short_lived } else { 0 } })
 }
 
-/// Pages that were born in a generation which was durable without anybody knowing, and gone before the next one, are not in
-/// that one: otherwise they were in the map for ever, their rows doubled.
+/// A generation may be durable although its commit reported an error. Pages that were created in it and deleted before
+/// the next generation must be absent from the next generation; otherwise they would stay in the map with duplicate
+/// rows.
 #[test]
 fn pages_of_a_commit_that_was_durable_after_all_go_with_the_next_one() {
     for beside in [false, true] {
@@ -190,7 +192,7 @@ fn pages_of_a_commit_that_was_durable_after_all_go_with_the_next_one() {
     }
 }
 
-/// A page that was never written is an error of the commit, which would take it away otherwise.
+/// Committing a page that was never written is an error; otherwise the commit would drop the page.
 #[test]
 fn a_commit_without_its_writes_is_refused() {
     let folder = tempfile::tempdir().unwrap();
@@ -204,7 +206,7 @@ fn a_commit_without_its_writes_is_refused() {
     opens_with(at, &first);
 }
 
-/// A drive that is still full when the map is opened again costs another commit, not the run.
+/// A drive that is still full when the map is reopened costs another commit, not the run.
 #[test]
 fn a_drive_that_stays_full_costs_commits_and_not_the_run() {
     for nth in 0..2 {

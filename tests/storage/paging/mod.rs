@@ -37,7 +37,7 @@ fn pages_hold_what_was_put_into_them_whatever_the_frames() {
                 (EvictPolicy::LeastRecentlyUsed, 3, Codec::Raw),
             ] {
                 let faults = Faults::new();
-                // With and without transfers that take long and end out of order.
+                // With and without slow transfers that complete out of order.
                 if (i as u64 + seed).is_multiple_of(2) {
                     faults.reorder(seed + 100);
                 }
@@ -75,7 +75,7 @@ fn frames_that_are_taken_away_and_given_back_cost_no_page() {
                 if step < 3 * STEPS / 4 {
                     run.pager.limit_frames(frames);
                 } else {
-                    // And given back.
+                    // The frames are given back.
                     run.pager.allow_frames(2 * fewest);
                 }
                 let (now, most) = (run.pager.frames(), run.pager.frames_max());

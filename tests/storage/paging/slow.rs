@@ -15,10 +15,10 @@ use std::sync::{Arc, Mutex};
 const PAGES: u32 = 100;
 const FRAMES: usize = 40;
 
-/// Bytes on their way: reads, writes.
+/// Bytes in flight: reads, writes.
 type OnTheWay = Arc<Mutex<[usize; 2]>>;
 
-/// A store in memory whose transfers end one by one, oldest first, and only while somebody waits.
+/// A store in memory whose transfers complete one by one, oldest first, and only while somebody waits.
 struct SlowStore {
     inner: MemoryEngine,
     queue: VecDeque<Transfer>,
@@ -74,7 +74,7 @@ fn slow_pager(config: PagerConfig) -> (Pager, OnTheWay) {
 
 #[test]
 fn what_moves_ahead_at_a_slow_drive_is_bounded_in_bytes() {
-    // Every view is elsewhere than the last. Where every page changes, pages leave no faster than they are written.
+    // No view overlaps the last. If every page changes, evictions are as fast as writes.
     let cameras: Vec<Camera> = (0..120).map(|i| camera(f64::from(i * 37 % 97))).collect();
     let coming: Vec<&Camera> = cameras.iter().collect();
     for (pages_ahead, touches) in [1, 3, 10].into_iter().flat_map(|pages| [(pages, true), (pages, false)]) {
@@ -100,8 +100,8 @@ fn what_moves_ahead_at_a_slow_drive_is_bounded_in_bytes() {
     }
 }
 
-/// A page that moves into a later view after that view was planned, and has left memory by then, is a late miss. Where
-/// pages are planned anew there is none.
+/// A page that moves into a later view after that view was planned, and was evicted by then, is a late miss. Replanning
+/// avoids late misses.
 #[test]
 fn a_page_that_comes_as_a_surprise_is_counted() {
     const LATER: usize = 12;

@@ -10,15 +10,15 @@ use gsscale::paging::pager::{Pager, PagerConfig};
 const FRAMES: usize = 70;
 const PAGES: u32 = 2 * FRAMES as u32;
 
-/// What a page that compresses well holds.
+/// Fills a page with compressible contents.
 fn mark(payload: &mut [u8], page: u32, round: u8) {
     payload.fill(0);
     payload[3] = page as u8;
     payload[7] = round;
 }
 
-/// Views of many pages that are all on the drive, then as many dirty ones to write: with few buffers for encoded pages,
-/// every page comes and nothing waits for ever. They never become fewer, so the last count is the largest.
+/// Views of many pages on the drive, then writes of as many dirty pages: with few staging buffers every page arrives
+/// and nothing waits forever. The number of buffers never decreases, so the last count is the maximum.
 #[test]
 fn a_view_of_many_encoded_pages_takes_no_more_buffers_than_were_reckoned_with() {
     for (codec, prefetch_pages) in [
@@ -63,7 +63,7 @@ fn a_view_of_many_encoded_pages_takes_no_more_buffers_than_were_reckoned_with() 
                     _ => {}
                 }
             }
-            // A few buffers in any case; some more where nobody said how many.
+            // A few buffers are the minimum; the default is larger.
             let least = if prefetch_pages == 0 { 32 } else { 4 };
             let reckoned = pager.prefetch_bytes().max(least * pager.frame_bytes()) as u64;
             let staging = pager.staging_bytes();

@@ -16,13 +16,14 @@ use std::collections::{BTreeMap, BTreeSet};
 
 const PAGES: u32 = 100;
 
-/// Views in groups of neighbours, as aerial flights have them.
+/// Views in groups of neighbours, as in aerial flights.
 fn cameras() -> Vec<Camera> {
     let mut draws = Stream::new(9, Purpose::Test, 1, 1);
     (0..400).map(|i| camera(f64::from(i / 12 * 29 % 97) + draws.range(0.0, 8.0))).collect()
 }
 
-/// Steps that touch every page, or that only read; the whole future is known. Also the pages in memory at the start.
+/// Runs steps that write every page or only read, with the whole future known. Also returns the pages in memory at the
+/// start.
 fn drive(config: PagerConfig, cameras: &[Camera], touches: bool, calls: usize) -> (PagerStats, Vec<u32>) {
     let mut pager = Pager::new(config, store(Codec::Raw, &Faults::new()));
     world::insert_pages(&mut pager, PAGES);
@@ -40,8 +41,8 @@ fn drive(config: PagerConfig, cameras: &[Camera], touches: bool, calls: usize) -
     (PagerStats { pages_read: after.pages_read - before.pages_read, ..after }, start)
 }
 
-/// Pages that the best cache of `frames` frames reads: on a miss the page leaves whose next use is farthest. `start`
-/// are in memory at first.
+/// Page reads of the optimal cache of `frames` frames: a miss evicts the page with the farthest next use. `start` are
+/// in memory at first.
 fn belady(views: &[Vec<u32>], frames: usize, start: &[u32]) -> u64 {
     let mut uses: BTreeMap<u32, Vec<usize>> = BTreeMap::new();
     views.iter().enumerate().for_each(|(s, v)| v.iter().for_each(|&p| uses.entry(p).or_default().push(s)));
@@ -88,8 +89,8 @@ fn reads_are_the_least_that_the_frames_allow() {
         let (asked, start) = read(0, 0, EvictPolicy::FarthestNextUse);
         let least = belady(&views, frames, &start);
         assert_eq!(asked.pages_read, least, "{frames} frames");
-        // Looking ahead costs a read now and then: a page is evicted early so that no step waits. Over 12 other seeds that is 4.7 %
-        // with 60 frames on average, and 8.5 % at most.
+        // Prefetching costs an occasional read: a page is evicted early so that no step waits. Over 12 other seeds the
+        // cost is 4.7 % with 60 frames on average, and 8.5 % at most.
         let (ahead, _) = read(3, 16, EvictPolicy::FarthestNextUse);
         println!(
             "{frames} frames: least {least}, read {}, missed {} of {}",
@@ -99,13 +100,14 @@ fn reads_are_the_least_that_the_frames_allow() {
         assert!(ahead.misses * 4 < asked.misses, "{frames}: {asked:?} {ahead:?}");
         let (recent, _) = read(0, 0, EvictPolicy::LeastRecentlyUsed);
         assert!(recent.pages_read > least, "{frames}: {recent:?}");
-        // The import wrote most pages once; what is only read is not written again.
+        // The import wrote most pages once; pages that are only read are not written again.
         assert!(touches || ahead.pages_written <= u64::from(PAGES), "{frames}: {ahead:?}");
     }
 }
 
-/// `gsscale-plan` prints what a [`Plan`] and a [`CacheModel`] say. The run has the same plan and the same order of eviction, with
-/// frames in place of the model: as long as no page moves and nothing is read ahead, the same pages enter at every step.
+/// `gsscale-plan` prints figures of a [`Plan`] and a [`CacheModel`]. The run has the same plan and the same eviction
+/// order, with frames in place of the model: as long as no page moves and nothing is prefetched, the same pages enter
+/// at every step.
 #[test]
 fn the_run_reads_what_the_printed_plan_lists() {
     let cameras = cameras();
@@ -115,7 +117,7 @@ fn the_run_reads_what_the_printed_plan_lists() {
         let mut pager =
             Pager::new(PagerConfig { prefetch_bytes: 0, ..config(frames) }, store(Codec::Raw, &Faults::new()));
         world::insert_pages(&mut pager, PAGES);
-        // What the import left in memory enters the model as a step of its own, before the first.
+        // Pages that the import left in memory enter the model as a step before the first.
         let mut plan = Plan::new(0, 1 << 24);
         let start: Vec<PageNo> = (0..PAGES).map(PageNo).filter(|&p| pager.is_in_memory(p)).collect();
         assert!(plan.push(&start));
@@ -136,7 +138,7 @@ fn the_run_reads_what_the_printed_plan_lists() {
     }
 }
 
-/// What was planned long ago is planned anew before it is acted upon: a page that moves into a later view is kept for it.
+/// Old plans are renewed before use: a page that moves into a later view is kept for it.
 #[test]
 fn a_page_that_moves_into_a_later_view_is_kept_for_it() {
     const LATER: usize = 17;

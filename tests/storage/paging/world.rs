@@ -33,7 +33,7 @@ pub fn config(frames: usize) -> PagerConfig {
     }
 }
 
-/// A store in memory that fails by `faults`.
+/// A store in memory that fails as `faults` says.
 pub fn store(codec: Codec, faults: &Faults) -> PagedStore {
     store_over(Box::new(FaultyEngine::new(Box::new(MemoryEngine::new()), faults.clone())), codec)
 }
@@ -43,7 +43,7 @@ pub fn store_over(engine: Box<dyn PageEngine>, codec: Codec) -> PagedStore {
     PagedStore::new(engine, PagedStoreConfig { store: 5, layout, codec, generation: 1, serial: 0 })
 }
 
-/// Puts `pages` pages of three rows in a row.
+/// Inserts `pages` pages of three rows each, in a row along x.
 pub fn insert_pages(pager: &mut Pager, pages: u32) {
     for i in 0..pages {
         let meta = meta(PageId::initial(i), f64::from(i), 3, 1);
@@ -68,7 +68,7 @@ pub fn payload_bytes(meta: &PageMeta) -> usize {
     PageLayout { rows: meta.rows as usize, sh_degree: meta.sh_degree }.bytes()
 }
 
-/// Bytes that no other version of any page has.
+/// Fills a payload with bytes that no other version of any page has.
 pub fn fill(payload: &mut [u8], meta: &PageMeta, version: u64) {
     let key = mix64(meta.id.to_bits() ^ mix64(version));
     for (i, b) in payload[..payload_bytes(meta)].iter_mut().enumerate() {
@@ -76,10 +76,10 @@ pub fn fill(payload: &mut [u8], meta: &PageMeta, version: u64) {
     }
 }
 
-/// What every page is and the version of its bytes, by id.
+/// Metadata and version of every page, by id.
 pub type Model = BTreeMap<PageId, (PageMeta, u64)>;
 
-/// Whether a pinned page is what the model says.
+/// Asserts that a pinned page equals the model.
 pub fn check(page: &PinnedPage, model: &Model) {
     let (meta, version) = model[&page.meta.id];
     assert_eq!(page.meta, meta);
@@ -89,7 +89,7 @@ pub fn check(page: &PinnedPage, model: &Model) {
     assert!(got == want, "page {} does not hold its version {version}", meta.id);
 }
 
-/// Ids of the pages that a view needs, by the model.
+/// Ids of the pages that a view needs according to the model.
 pub fn needed(model: &Model, camera: &Camera) -> Vec<PageId> {
     let metas: Vec<PageMeta> = model.values().map(|(meta, _)| *meta).collect();
     let mut pages = Vec::new();
@@ -97,7 +97,7 @@ pub fn needed(model: &Model, camera: &Camera) -> Vec<PageId> {
     pages.iter().map(|p| metas[p.index()]).filter(|m| m.rows > 0).map(|m| m.id).collect()
 }
 
-/// A run of random steps. The same seed makes the same steps, whatever the pager is.
+/// A run of random steps. The same seed gives the same steps for any pager.
 pub struct Run {
     pub pager: Pager,
     pub model: Model,
@@ -118,7 +118,7 @@ impl Run {
             pager.insert(meta, |payload| fill(payload, &meta, 0))?;
             model.insert(meta.id, (meta, 0));
         }
-        // Views wander, so that steps share pages, and jump from time to time.
+        // Views wander, so that steps share pages, and jump occasionally.
         let mut x = 0.0;
         let mut cameras = Vec::new();
         for _ in 0..steps {
@@ -129,7 +129,7 @@ impl Run {
         Ok(Run { pager, model, step: 0, seed, version: 0, cameras })
     }
 
-    /// One step: pages come, are compared, change, split, lose their rows, and go back.
+    /// One step: pages are acquired, compared, changed, split or emptied, and released.
     pub fn step(&mut self) -> Result<(), PagingError> {
         let mut draws = Stream::new(self.seed, Purpose::Test, 2, u64::from(self.step));
         let first = self.step as usize;
@@ -194,7 +194,7 @@ impl Run {
         Ok(self.pager.add_split(upper, buffer))
     }
 
-    /// Every page as it is now, a few at a time, as an export would read them.
+    /// Checks every page, a few at a time, as an export reads them.
     pub fn check_all(&mut self, at_once: usize) -> Result<(), PagingError> {
         let pages: Vec<PageNo> = (0..self.pager.index().len() as u32).map(PageNo).collect();
         assert_eq!(pages.len(), self.model.len());
