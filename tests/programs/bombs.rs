@@ -11,10 +11,10 @@ use std::process::{Command, Output, Stdio};
 use tempfile::TempDir;
 
 const BUDGET: u64 = 200 << 20;
-/// What the bombs hold: three times the budget.
+/// Decompressed size of the bombs: three times the budget.
 const HELD: usize = 600 << 20;
 
-/// Runs the trainer; its output, and the most memory that it had, bytes.
+/// Runs the trainer; returns its output and its peak memory, bytes.
 fn measured(args: &[&str]) -> (Output, u64) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
     command.args(args).args(["--device", "cpu", "--quiet"]).stdout(Stdio::null()).stderr(Stdio::piped());
@@ -70,7 +70,8 @@ fn profile_bomb() -> Vec<u8> {
     chunk(b"iCCP", &[b"all zeros\0\0", &deflated_zeros(HELD)[..]].concat())
 }
 
-/// What cameras and programs write beside pixels: a profile that is no run of zeros, texts of all kinds, EXIF.
+/// Chunks that cameras and programs write beside pixels: a colour profile that is not all zeros, texts of all kinds,
+/// EXIF.
 fn ordinary_chunks() -> Vec<u8> {
     let profile: Vec<u8> = (0..560_000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 13) as u8).collect();
     let text = "exposure 1/250 f/8 ".repeat(2000);
@@ -92,7 +93,8 @@ fn photos(scene: &Path) -> Vec<PathBuf> {
     photos
 }
 
-/// Makes all photos PNGs of the same pixels with these chunks; the format is told by the bytes, not by the name.
+/// Rewrites all photos as PNGs of the same pixels with these chunks; readers detect the format by the bytes, not by the
+/// name.
 fn make_png(scene: &Path, chunks: &[u8]) {
     for path in photos(scene) {
         let picture = image::load_from_memory(&std::fs::read(&path).unwrap()).unwrap();
@@ -100,7 +102,7 @@ fn make_png(scene: &Path, chunks: &[u8]) {
     }
 }
 
-/// A short run within the budget; its Gaussians.
+/// A short run within the budget; returns its Gaussians.
 fn trained(scene: &Path, out: &Path) -> Vec<u8> {
     let args = [text(scene), "--out", text(out), "--steps", "8", "--threads", "2", "--host-mem", "200MiB"];
     let (output, peak) = measured(&args);
@@ -139,7 +141,7 @@ fn masks_with_huge_profiles_stay_within_the_budget() {
     assert!(trained(&scene, &folder.path().join("bomb")) == plain);
 }
 
-/// transforms.json that does not state the size: it is read from the photos.
+/// transforms.json without the image size: the size is read from the photos.
 #[test]
 fn reading_the_size_of_a_photo_inflates_nothing() {
     let folder = TempDir::new().unwrap();
@@ -156,7 +158,7 @@ fn reading_the_size_of_a_photo_inflates_nothing() {
     assert!(peak <= BUDGET, "{} MiB were taken", peak >> 20);
 }
 
-/// A baseline JPEG of this size with a scan for each component, of which hardly anything is there.
+/// A baseline JPEG of this size with one scan for each component, almost without data.
 fn jpeg_in_scans(width: u16, height: u16) -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
     let picture = image::RgbImage::from_pixel(16, 16, image::Rgb([90, 120, 40]));
@@ -170,7 +172,7 @@ fn jpeg_in_scans(width: u16, height: u16) -> Vec<u8> {
     [&header[..], &[0xff, 0xda, 0, 8, 1, first, 0, 0, 63, 0], &[0; 4000], &[0xff, 0xd9]].concat()
 }
 
-/// Puts `bytes` in the place of a photo: the run must refuse it by name, with the memory that it would take.
+/// Replaces a photo by `bytes`: the run must refuse it by name, with the memory that it needs.
 fn refused(bytes: &[u8], more: &[&str]) {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 4, 64, 48, 500);
@@ -200,7 +202,7 @@ fn a_photo_that_fits_no_cache_counts_all_the_same() {
     refused(&png_with(&picture.into(), &[]), &["--image-cache", "1MiB"]);
 }
 
-/// Writes a transforms.json; the peak of reading it as a multiple of its size, and what was said.
+/// Writes and reads a transforms.json; returns the peak memory as a multiple of the file size, and stderr.
 fn read_json(text_of_file: &str) -> (f64, String) {
     let folder = TempDir::new().unwrap();
     std::fs::write(folder.path().join("transforms.json"), text_of_file).unwrap();
@@ -210,7 +212,8 @@ fn read_json(text_of_file: &str) -> (f64, String) {
     (peak as f64 / text_of_file.len() as f64, said)
 }
 
-/// The promise of `dataset::transforms`, and what the program takes without any scene, some 20 MiB, over 24 MiB of a file.
+/// The bound of `dataset::transforms`, plus the memory of the program without a scene, some 20 MiB, over a file of 24
+/// MiB.
 const JSON_MULTIPLE: f64 = 16.0 + 1.0;
 
 #[test]

@@ -14,7 +14,7 @@ fn small() -> (TempDir, PathBuf, TextModel) {
     (folder, scene, model)
 }
 
-/// Must train to the end; returns what it said.
+/// Asserts that the run trains to the end; returns stderr.
 fn trains(folder: &TempDir, scene: &Path, more: &[&str]) -> String {
     let out = folder.path().join("out");
     let mut args = vec![text(scene), "--out", text(&out), "--steps", "12", "--quiet", "--overwrite"];
@@ -29,7 +29,7 @@ fn trains(folder: &TempDir, scene: &Path, more: &[&str]) -> String {
     said
 }
 
-/// Must refuse: exit code 1, all `words` in the message, a remedy, and nothing left behind.
+/// Asserts a refusal: exit code 1, all `words` in the message, a remedy, and no files left behind.
 fn refuses(folder: &TempDir, scene: &Path, more: &[&str], words: &[&str]) {
     let out = folder.path().join("refused");
     let mut args = vec![text(scene), "--out", text(&out), "--steps", "12"];
@@ -79,7 +79,7 @@ fn points_very_far_away_are_dropped_and_counted() {
 #[test]
 fn a_camera_inside_a_gaussian_trains() {
     let (folder, scene, mut model) = small();
-    // A wide cloud of few points around a camera makes first Gaussians that contain it.
+    // Few points spread widely around a camera make first Gaussians that contain it.
     let v = &model.views[3];
     let q = glam::DQuat::from_xyzw(v.qvec[1], v.qvec[2], v.qvec[3], v.qvec[0]);
     let centre = -(q.inverse() * glam::DVec3::from_array(v.tvec));
@@ -93,7 +93,7 @@ fn a_camera_inside_a_gaussian_trains() {
 #[test]
 fn a_view_that_sees_nothing_trains() {
     let (folder, scene, mut model) = small();
-    // Turned by half a turn about its own y axis, the camera looks away from the city.
+    // Rotated by half a turn about its own y axis, the camera looks away from the city.
     let q = model.views[5].qvec;
     let turned = glam::DQuat::from_rotation_y(std::f64::consts::PI) * glam::DQuat::from_xyzw(q[1], q[2], q[3], q[0]);
     model.views[5].qvec = [turned.w, turned.x, turned.y, turned.z];
@@ -103,7 +103,7 @@ fn a_view_that_sees_nothing_trains() {
     trains(&folder, &scene, &[]);
 }
 
-// Must warn and go on.
+// Must warn and continue.
 
 #[test]
 fn extra_images_are_a_warning() {
@@ -349,7 +349,7 @@ fn unknown_words_are_refused_with_the_words_that_are_known() {
     assert!(stderr(&output).contains("unknown --device ' ': use auto, gpu, cpu"), "{}", stderr(&output));
 }
 
-/// The words of a config.toml are those that the user wrote: an older program reads them, and `--resume` compares them.
+/// config.toml keeps the user's words: older programs read them, and `--resume` compares them.
 #[test]
 fn a_run_keeps_the_words_that_were_written() {
     let (folder, scene, _) = small();
@@ -397,7 +397,7 @@ fn numbers_that_no_machine_can_hold_are_refused() {
     ] {
         refuses(&folder, &scene, &[flag, value], &[flag, "out of range"]);
     }
-    // From a file as from the command line; and the limit is told and allowed.
+    // A file and the command line behave alike; the message names the limit, and the limit itself is allowed.
     let file = folder.path().join("eps.toml");
     std::fs::write(&file, "adam-eps = 1e-30\n").unwrap();
     refuses(&folder, &scene, &["--config", text(&file)], &["--adam-eps", "1e-30", "f32 rounds to zero", "1e-16 to 1"]);
@@ -409,7 +409,7 @@ fn numbers_that_no_machine_can_hold_are_refused() {
 #[test]
 fn a_cap_beyond_memory_is_a_warning() {
     let (folder, scene, _) = small();
-    // 3 TB with the optimizer's state; the city has 400 points and never gets there.
+    // 3 TB with the optimizer's state; the city has 400 points and never reaches this cap.
     let said = trains(&folder, &scene, &["--max-gaussians", "4000000000"]);
     let knows_memory = cfg!(target_os = "linux");
     assert!(said.contains("--max-gaussians") || !knows_memory, "{said}");
@@ -432,7 +432,7 @@ fn a_view_masked_as_a_whole_counts_for_nothing() {
 #[test]
 fn a_held_out_photo_that_cannot_be_decoded_loses_no_run() {
     let (folder, scene, model) = small();
-    // Header and end are whole, so it passes at load; the pixels between are not.
+    // Header and end are intact, so the photo passes at load; the pixels between are damaged.
     let path = scene.join("images").join(&model.views[0].name);
     image::RgbImage::new(96, 64).save_with_format(&path, image::ImageFormat::Png).unwrap();
     let mut bytes = std::fs::read(&path).unwrap();
@@ -482,7 +482,7 @@ fn help_is_grouped_and_has_examples() {
     }
 }
 
-/// `gsscale-plan ... | head` ends well, whatever is left to print.
+/// `gsscale-plan ... | head` exits with success, whatever remains unprinted.
 #[test]
 fn a_reader_that_has_gone_is_no_error() {
     let folder = tempfile::tempdir().unwrap();
@@ -506,7 +506,7 @@ fn a_reader_that_has_gone_is_no_error() {
     }
 }
 
-/// What was asked for and cannot be written is an error that says so.
+/// Output that cannot be written is an error with a message.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_full_standard_output_is_an_error() {

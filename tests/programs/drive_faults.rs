@@ -83,18 +83,18 @@ fn make_scene(folder: &Path) -> PathBuf {
     scene
 }
 
-/// One scene, the bytes that a healthy run of it ends with, and the most pages of a step.
+/// One scene, the result of a healthy run of it, and the most pages of a step.
 struct World {
     folder: TempDir,
     scene: PathBuf,
     want: Vec<u8>,
     fewest: usize,
-    /// The run can go on without its commits.
+    /// The run can continue without its commits.
     is_optional: bool,
     optimizer: Method,
 }
 
-/// How a life on a misbehaving drive ended.
+/// The end of a run on a faulty drive.
 struct Life {
     result: Result<(), TrainError>,
     out: PathBuf,
@@ -200,7 +200,7 @@ impl World {
         Ok(())
     }
 
-    /// The run in `out` goes on with the real program, on a healthy drive, and ends with the right bytes.
+    /// Resumes the run in `out` with the real program on a healthy drive, and compares its bytes.
     fn goes_on(&self, out: &Path, what: &str) {
         let output = train(&["--resume", text(out), "--frames", &(self.fewest + 30).to_string(), "--quiet"]);
         assert!(output.status.success(), "{what}: {}", stderr(&output));
@@ -271,7 +271,7 @@ fn what_passes_by_itself_changes_no_bit() {
     let life = world.live("once", &Faults::new(), |faults| {
         let reads = faults.count(Operation::Read);
         let ways = [Fault::Error(ErrorKind::Other), Fault::Short, Fault::FlipBit(70_001), Fault::Torn];
-        // Further apart than transfers can be in flight together, so that the second try of a read is a good one.
+        // The faults lie further apart than transfers in flight, so that the second try of a read succeeds.
         (0..16).for_each(|i| faults.add(Operation::Read, reads + 5 + 150 * i, false, ways[i as usize % 4]));
         faults.reorder(3);
     });
@@ -279,7 +279,7 @@ fn what_passes_by_itself_changes_no_bit() {
     assert!(std::fs::read(Trainer::ply_path(&life.out)).unwrap() == world.want);
 }
 
-/// A drive that flips a bit on its way to a page, or writes half of it, and says that all is well.
+/// A drive that silently flips a bit of a page or writes half of it.
 #[test]
 fn a_page_that_is_not_what_was_written_is_named_and_never_used() {
     let world = World::new();
@@ -301,7 +301,7 @@ fn args<'a>(scene: &'a Path, out: &'a Path, spill: &'a Path) -> Vec<&'a str> {
     args
 }
 
-/// A drive that has room for the pages once, and not for the versions of two commits.
+/// A drive with room for the pages once, but not for the versions of two commits.
 fn small_drive(folder: &Path) -> Option<Small> {
     let capacity = capacity_bytes(32, 3);
     // Pages of up to 7,000 rows, filled to 70 percent.
@@ -309,14 +309,14 @@ fn small_drive(folder: &Path) -> Option<Small> {
     Small::mount(folder, segment + segment / 2 + (4 << 20))
 }
 
-/// What it takes is known before anything is written; what the import has written is not counted twice.
+/// The space needed is known before the first write; pages written by the import count once.
 #[test]
 fn a_drive_is_refused_only_if_it_is_too_small_and_at_once() {
     let folder = TempDir::new().unwrap();
     let scene = make_scene(folder.path());
     let Some(drive) = small_drive(&folder.path().join("drive")) else { return };
     let (out, spill) = (folder.path().join("out"), drive.0.join("spill"));
-    // Pages beyond the frames are written by the import: more than the drive has free afterwards.
+    // The import writes the pages beyond the frames: more than the drive has free afterwards.
     let mut few = args(&scene, &out, &spill);
     let steps = few.iter().position(|arg| *arg == "60").unwrap();
     few[steps] = "2";
@@ -376,13 +376,13 @@ fn a_really_full_drive_pauses_the_run_until_there_is_space() {
     assert!(summary(&out)["commits"].as_u64().unwrap() > 1 && summary(&out)["commit_interval"] == 0.02);
 }
 
-/// All of such a run is in memory: it loses its commits on a full drive, and nothing else.
+/// The whole run is in memory: a full drive costs its commits and nothing else.
 #[test]
 fn a_run_in_memory_goes_on_when_the_drive_of_its_commits_is_full() {
     loses_commits_alone(World::new());
 }
 
-/// Its steps go on changing rows after they have changed those of their view.
+/// Its steps change more rows after those of their view.
 #[test]
 fn so_does_a_run_in_memory_that_updates_every_row() {
     loses_commits_alone(World::of(Method::Dense));
@@ -448,8 +448,8 @@ fn few_open_files_are_enough_and_when_commits_happen_changes_no_bit() {
     assert!(plys.windows(2).all(|pair| pair[0] == pair[1]));
 }
 
-/// The system sends a signal with its refusal, which must not end the process without a word. What it refuses counts as
-/// space that is missing.
+/// The system sends a signal with its refusal; the process must not end without a message. The refusal counts as
+/// missing space.
 #[test]
 fn a_limit_on_the_size_of_files_is_an_error_that_names_the_file() {
     let folder = TempDir::new().unwrap();
@@ -466,7 +466,7 @@ fn a_limit_on_the_size_of_files_is_an_error_that_names_the_file() {
     assert!(Trainer::ply_path(&out).exists() && !spill.exists(), "what was trained is there, nothing was committed");
 }
 
-/// What `--save-every` writes is not needed to go on.
+/// Files of `--save-every` are not needed to continue.
 #[test]
 fn a_drive_without_room_for_a_saved_ply_costs_that_file_alone() {
     let folder = TempDir::new().unwrap();
@@ -487,7 +487,8 @@ fn a_drive_without_room_for_a_saved_ply_costs_that_file_alone() {
     assert!(metrics.lines().last().unwrap().starts_with("{\"step\":29,"), "all steps were done: {metrics}");
 }
 
-/// The drive of the results is full, not that of the pages: it is that one that is named and waited for.
+/// The drive of the results is full and the drive of the pages is not: the run names and waits for the drive of the
+/// results.
 #[test]
 fn a_full_drive_of_results_is_named_and_costs_no_reserve() {
     let folder = TempDir::new().unwrap();
@@ -496,7 +497,7 @@ fn a_full_drive_of_results_is_named_and_costs_no_reserve() {
     let (out, spill) = (drive.0.join("out"), folder.path().join("spill"));
     let more = ["--commit-every", "0.02", "--disk-full-wait", "0.2", "--log-every", "1", "--quiet"];
     let all = [&args(&scene, &out, &spill)[..], &more].concat();
-    // A flag that is given twice is refused.
+    // A repeated flag is refused.
     let at = all.iter().position(|arg| *arg == "--log-every").unwrap();
     let output = train(&[&all[..at], &all[at + 2..]].concat());
     let said = stderr(&output);
@@ -509,7 +510,7 @@ fn a_full_drive_of_results_is_named_and_costs_no_reserve() {
     assert!(output.status.success(), "{}", stderr(&output));
 }
 
-/// Containers forbid io_uring with a seccomp filter; a child has the filter of the thread that starts it.
+/// Containers forbid io_uring with a seccomp filter; a child process inherits the filter of the thread that starts it.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_run_without_io_uring_says_so_and_trains() {

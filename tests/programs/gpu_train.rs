@@ -49,7 +49,8 @@ fn a_gpu_trains_as_the_cpu_does() {
     assert!(said.contains(&device.summary().name), "{said}");
     let resolved = std::fs::read_to_string(on_gpu.join("config.toml")).unwrap();
     assert!(resolved.contains(&device.summary().name), "{resolved}");
-    // Roundings grow with every step, in both directions; a thousand steps are to stay within 0.1 dB.
+    // Rounding differences grow with every step, in both directions; after a thousand steps PSNR must agree within 0.1
+    // dB.
     let (want, got) = (psnr(&on_cpu), psnr(&on_gpu));
     println!("test PSNR after 60 steps: {want:.3} dB on the CPU, {got:.3} dB on the GPU");
     assert!((want - got).abs() < 0.1, "{got} dB, on the CPU {want} dB");
@@ -59,14 +60,15 @@ fn a_gpu_trains_as_the_cpu_does() {
         for key in ["bytes_uploaded", "bytes_read_back", "device_bytes_peak"] {
             assert!(line[key].as_u64().unwrap() > 0, "{key}: {line}");
         }
-        // At most all rows of 59 floats with 16 bytes for densification, a photo of 4 bytes a pixel, and 64 KiB of counts and uniforms.
+        // Upper bound: all rows of 59 floats with 16 bytes for densification, a photo of 4 bytes a pixel, and 64 KiB of
+        // counts and uniforms.
         let most = 1200 * (59 * 4 + 16) + 128 * 96 * 4 + (64 << 10);
         assert!(line["bytes_uploaded"].as_u64().unwrap() < most && line["bytes_read_back"].as_u64().unwrap() < most);
     }
     for line in metrics(&on_cpu) {
         assert_eq!((&line["bytes_uploaded"], &line["device_bytes_peak"]), (&0.into(), &0.into()));
     }
-    // The same command gives the same file: with --deterministic, which is the default, and without.
+    // The same command gives the same file, with --deterministic (the default) and without.
     let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
     for (name, device, first) in [("again", "gpu", &on_gpu), ("again on the CPU", "cpu", &on_cpu)] {
         for switch in ["--deterministic", "--deterministic=false"] {
@@ -75,7 +77,7 @@ fn a_gpu_trains_as_the_cpu_does() {
             assert!(ply(first) == ply(&again), "two runs of the same command differ: {name} {switch}");
         }
     }
-    // The PLY alone gives the run's numbers, on the device that its config names.
+    // The PLY alone gives the run's metrics, on the device that its config names.
     let report = eval(&[text(&on_gpu), text(&scene)]);
     assert!(report.status.success(), "{}", stderr(&report));
 }
@@ -149,8 +151,9 @@ fn a_run_that_outgrows_the_budget_leaves_its_last_good_step() {
     assert!(header.contains(&format!("element vertex {rows}\n")), "{header}");
 }
 
-/// Runs the real binary with a fault of the device in mid-run (see `GSSCALE_GPU_FAULT`), under a limit of the address space
-/// if one is given, KiB: the stage is named, the exit code is not 0, the last good step is there. Returns the error's line.
+/// Runs the real binary with a device fault in mid-run (see `GSSCALE_GPU_FAULT`), under a limit of the address space if
+/// one is given, KiB. Asserts that the error names the stage, that the exit code is not 0, and that the last good step
+/// is written. Returns the error's line.
 fn assert_ends_with_last_good_step(scene: &Path, out: &Path, fault: &str, address_space: Option<u64>) -> String {
     let limit = address_space.map_or(String::new(), |kib| format!("ulimit -v {kib} && "));
     let output = Command::new("sh")
@@ -162,7 +165,7 @@ fn assert_ends_with_last_good_step(scene: &Path, out: &Path, fault: &str, addres
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{fault}: {said}");
     let line = said.lines().rev().find(|l| l.starts_with("error: ")).unwrap_or_else(|| panic!("{fault}: {said}"));
-    // The stage whose results were waited for, or the part of the step that was submitted.
+    // The stage whose results the run waited for, or the submitted part of the step.
     let stage = line.split(": ").nth(2).unwrap_or_default();
     let is_stage = STAGES.iter().any(|s| s.name == stage) || ["forward", "backward"].contains(&stage);
     assert!(is_stage, "{fault}: {line}");
@@ -236,7 +239,7 @@ fn bits_of_steps(scene: &Path, options: &GpuOptions, capacity: u32) -> Option<(V
     Some((bits, isects, renderer.frames_again()))
 }
 
-/// Cuts and waits are how a step is carried out, not what it computes: the same bits on whole steps.
+/// Cuts and waits affect the execution of a step, not its result: whole steps give the same bits.
 #[test]
 fn windows_waits_and_second_tries_change_no_bit_of_whole_steps() {
     let folder = TempDir::new().unwrap();
@@ -244,8 +247,8 @@ fn windows_waits_and_second_tries_change_no_bit_of_whole_steps() {
     let plain = GpuOptions::default();
     let Some((want, isects, again)) = bits_of_steps(&scene, &plain, 1 << 16) else { return };
     assert_eq!(again, 0);
-    // What must fit one binding: the splats, 48 bytes a row. Columns are cut in three at least (more than 900 rows are in
-    // view), the sums of the intersections too.
+    // One binding must hold the splats, 48 bytes a row. Columns are cut into three parts or more (over 900 rows are in
+    // view), and so are the sums of the intersections.
     let limit = 48 * 1500;
     let windows = (36 * u64::from(isects)).div_ceil(limit);
     println!("{isects} intersections in {windows} windows");
@@ -266,13 +269,13 @@ fn windows_waits_and_second_tries_change_no_bit_of_whole_steps() {
     }
 }
 
-/// What the third and fourth step upload and allocate, of a scene `times` as large whose other rows no camera sees.
+/// Uploads and allocations of the third and fourth step, on a scene `times` as large whose other rows no camera sees.
 fn steps_of_a_scene(scene: &Path, times: usize) -> Option<(Vec<usize>, Traffic, Traffic)> {
     let renderer = GpuRenderer::new(gpu::open(&GpuOptions::default())?).unwrap();
     let config = TrainConfig { steps: 10, strategy: StrategyName::None, ..TrainConfig::default() };
     let Prepared { dataset, mut columns, .. } = prepare(scene, &config).unwrap();
     let rows = columns.rows();
-    // Against the direction in which the cameras look, all of them: they look down on the city.
+    // Opposite to the viewing directions: all cameras look down on the city.
     let away: Vec<f32> = (0..3).map(|i| dataset.views.iter().map(|v| -v.camera.viewmat[2][i]).sum::<f32>()).collect();
     let small = columns.clone();
     columns.resize(times * rows);

@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 use std::process::Output;
 use tempfile::TempDir;
 
-/// Every kind of event happens several times: rounds, which also prune, resets of opacity and raises of the SH degree.
-/// Small pages split often. Pruning by size would begin with the first reset.
+/// Every kind of event happens several times: rounds (which also prune), opacity resets and raises of the SH degree.
+/// Small pages split often. Pruning by size would start with the first reset.
 const EVENTS: &str = "--page-rows 32 --refine-start 10 --refine-every 10 --reset-every 45 --sh-every 30 --prune-opa 0.05 \
     --prune-scale3d 1000 --view-order groups:4 --test-every 8 --threads 2 --device cpu";
 
@@ -19,7 +19,7 @@ fn words(text: &str) -> Vec<&str> {
     text.split_whitespace().collect()
 }
 
-/// A city of 2 by 2 blocks: almost every page is in almost every one of its views of 64x48.
+/// A city of 2 by 2 blocks: almost every view of 64x48 sees almost every page.
 fn compact_city(folder: &Path) -> PathBuf {
     let scene = folder.join("scene");
     let size = CityOptions { seed: 5, views: 16, width: 64, height: 48, points: 3_000, ..CityOptions::default() };
@@ -34,12 +34,12 @@ fn train_in(scene: &Path, out: &Path, flags: &[&str]) -> Output {
     train(&[&fixed[..], &words(EVENTS), flags].concat())
 }
 
-/// The Gaussians that a run ended with.
+/// The final Gaussians of a run.
 fn ply(out: &Path) -> Vec<u8> {
     std::fs::read(out.join("point_cloud.ply")).unwrap()
 }
 
-/// The number after `words` in what a program said, with its unit as a flag takes it.
+/// The number after `words` in a program's message, with its unit as a flag takes it.
 fn named(said: &str, words: &str) -> String {
     let rest = said.split(words).nth(1).unwrap_or_else(|| panic!("{words} is not in: {said}"));
     let number: String = rest.chars().take_while(|c| c.is_ascii_alphanumeric() || *c == '.' || *c == ' ').collect();
@@ -51,19 +51,19 @@ fn mebibytes(text: &str) -> f64 {
     text.strip_suffix("MiB").unwrap_or_else(|| panic!("'{text}' is no number of MiB")).parse().unwrap()
 }
 
-/// The least memory, MiB, with which a run of `scene` is not refused at its start.
+/// The smallest memory, MiB, with which a run of `scene` starts.
 fn floor(scene: &Path, out: &Path, flags: &[&str]) -> f64 {
-    // Enough for the pages of a view, and not for the rest.
+    // Enough for the pages of a view, but not for everything else.
     let output = train_in(scene, out, &[flags, &["--host-mem", "20MiB"]].concat());
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     mebibytes(&named(&stderr(&output), "give at least "))
 }
 
-/// Runs with a cap and without one, each without a named memory, with much, and with little more than the least: all write
-/// the bytes of the run in memory.
+/// Runs with a cap and without one, each with default memory, with much, and with little more than the minimum: all
+/// write the bytes of the run in memory.
 fn finishes_in_every_memory(folder: &Path, scene: &Path, first: u32, moves: bool) {
     let (alone, out) = (folder.join("alone"), folder.join("out"));
-    // Caps that are reached in the first rounds and later: pages are full, half empty, and both.
+    // Caps that are reached in the first rounds and later: pages are full, half empty, or both.
     for cap in [first + first / 10, first + first / 2, 0] {
         let growth = format!("--grow-grad2d 0.001 --steps 100 --quiet --max-gaussians {cap}");
         let flags = words(&growth);
@@ -72,7 +72,7 @@ fn finishes_in_every_memory(folder: &Path, scene: &Path, first: u32, moves: bool
         assert!(output.status.success(), "{growth}: {}", stderr(&output));
         let whole = summary(&alone);
         assert!(whole["gaussians"].as_u64() > Some(u64::from(first) * 105 / 100), "it hardly grew: {whole}");
-        // Room for the pages, of 28 KiB, that a view needs at the end, and half as much for its rows.
+        // Room for the pages, 28 KiB each, that a view needs at the end, and half as much again for its rows.
         let pages = whole["pages_pinned_max"].as_f64().unwrap() * 28.0 / 1024.0;
         let close = format!("{}MiB", (floor(scene, &out, &flags) + 1.5 * pages).ceil());
         for host_mem in [None, Some("2GiB"), Some(close.as_str())] {
@@ -100,7 +100,7 @@ fn a_run_whose_views_see_a_part_finishes_in_every_memory_that_holds_it() {
     let folder = TempDir::new().unwrap();
     let scene = scenes::wide_city(folder.path(), 8_000);
     finishes_in_every_memory(folder.path(), &scene, 8_000, true);
-    // None of these events happened in vain.
+    // Each of these events had an effect.
     let out = folder.path().join("out");
     let with = |flag: &str, value: &str| {
         let mut flags = words(EVENTS);
@@ -119,15 +119,15 @@ fn a_run_whose_views_see_a_part_finishes_in_every_memory_that_holds_it() {
     }
 }
 
-/// What follows `flag` in the line with which a stopped run says how it can go on.
+/// The value after `flag` in the remedy of a stopped run.
 fn remedy(said: &str, flag: &str) -> String {
     let line =
         said.lines().find(|l| l.starts_with("to go on from the last commit")).unwrap_or_else(|| panic!("{said}"));
     line.split(flag).nth(1).unwrap().split([' ', ')']).next().unwrap().to_string()
 }
 
-/// Follows what a stopped run names until it is done: each time it is more than the run had, and the step that stopped it
-/// is done with it. Returns how often it stopped.
+/// Follows the remedies of stopped runs until a run finishes: each names more memory than the run had, and the step
+/// that stopped then succeeds. Returns the number of stops.
 fn follow(out: &Path, first: Output, mut had: f64, is_least: bool) -> u32 {
     let (mut output, mut stops) = (first, 0);
     while !output.status.success() {
@@ -155,7 +155,7 @@ fn the_memory_that_a_stopped_run_names_is_more_than_it_had_and_enough() {
             compact_city(folder.path()),
             "--grow-grad2d 0.0005 --steps 60 --quiet --spill-codec zstd:1 --image-cache 64KiB",
         ),
-        // Enough growth that a small plan does not help.
+        // Grows enough that a small plan is too small.
         ("large", scenes::wide_city(&wide, 8_000), "--grow-grad2d 0.00002 --steps 110 --quiet"),
     ] {
         let (out, flags) = (folder.path().join(name), words(more));
@@ -169,7 +169,7 @@ fn the_memory_that_a_stopped_run_names_is_more_than_it_had_and_enough() {
             assert!(follow(&out, output, least, is_least) > 0, "{memory} were enough from the start");
             assert!(ply(&out) == ply(&alone), "another scene than in memory");
         }
-        // A number of frames that was named: no fewer than the pages that the step splits into.
+        // A given number of frames, fewer than the pages that the step splits into.
         let frames = summary(&alone)["pages_pinned_max"].as_u64().unwrap() / 2;
         let output = train_in(&scene, &out, &[&flags[..], &["--frames", &frames.to_string()]].concat());
         let said = stderr(&output);
@@ -196,7 +196,7 @@ fn a_run_goes_on_in_less_memory_and_in_more() {
     let spill = folder.path().join("spill");
     let to_spill = ["--spill-dir", text(&spill)];
     let (much, little) = (["--host-mem", "2GiB"], ["--host-mem", "54MiB"]);
-    // In memory, in more than it needs, in less than all of it; then in less, in more, and unnamed.
+    // In memory with more than needed, then with less than all; then with less, with more, and with the default.
     for (is_paged, then, now) in [
         (false, &[][..], &[&little[..], &["--image-cache", "64KiB"]].concat()[..]),
         (true, &much[..], &little[..]),
@@ -212,8 +212,8 @@ fn a_run_goes_on_in_less_memory_and_in_more() {
     }
 }
 
-/// In a memory control group, which is a machine with that much memory: a run takes more than its first share of it before
-/// it stops, whether its pages have a drive from the start or not.
+/// In a memory control group, which acts as a machine with that much memory: a run takes more than its first share
+/// before it stops, whether its pages have a drive from the start or not.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_run_whose_memory_nobody_named_takes_what_the_machine_has() {
@@ -223,7 +223,7 @@ fn a_run_whose_memory_nobody_named_takes_what_the_machine_has() {
     let all = [&words(EVENTS)[..], &words("--grow-grad2d 0.0001 --max-gaussians 40000 --steps 80")].concat();
     let output = train(&[&[text(&scene), "--out", text(&alone), "--quiet"], &all[..]].concat());
     assert!(output.status.success(), "{}", stderr(&output));
-    // 70 % hold the first view, and not the largest that comes.
+    // 70 % hold the first view, but not the largest.
     let group = match MemoryGroup::new(60 << 20) {
         Ok(group) => group,
         Err(why) => return println!("skipped: no memory control group can be made here ({why})"),

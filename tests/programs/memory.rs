@@ -4,8 +4,8 @@ use crate::support::scenes::{city, stderr, summary, text, train};
 use std::path::Path;
 use tempfile::TempDir;
 
-/// The promise is a tenth. On scenes as small as a test's, what the program takes before it has a scene (code,
-/// libraries, stacks) differs by up to this much between systems and build profiles; on real scenes it is nothing.
+/// The documented error is a tenth. On a small test scene, the memory of the bare program (code, libraries, stacks)
+/// differs between systems and build profiles by up to this much; on real scenes that difference is negligible.
 const SLACK: f64 = 4e6;
 
 /// The announced peak of a run, bytes.
@@ -45,7 +45,7 @@ fn the_announced_memory_is_what_a_run_takes() {
     let growing = ["--max-gaussians", "66000", "--refine-start", "9", "--refine-every", "10", "--grow-grad2d", "0"];
     let gaussians = check(folder.path(), &scene, "growing", &[&two[..], &growing].concat());
     assert!(gaussians > 64_000, "the scene hardly grew ({gaussians}), so the last case shows little");
-    // Large pages, many of which split, with all bands.
+    // Large pages, many of which split, with all colour bands.
     let growing =
         ["--max-gaussians", "150000", "--refine-start", "9", "--refine-every", "5", "--grow-grad2d", "0.00002"];
     let gaussians = check(folder.path(), &scene, "grown", &[&two[..], &growing, &["--sh-start", "3"]].concat());

@@ -37,13 +37,14 @@ fn dense_is_deferred_up_to_roundings_and_sparse_is_not() {
     let (deferred, dense, sparse) = (optimizer("deferred"), optimizer("dense"), optimizer("sparse"));
     let start = of("start", &["--steps", "1", "--strategy", "none", "--means-lr", "0"]);
     let moved = distance(&start, &deferred);
-    // Roundings of 6e-8 grow where gradients are small against their noise; momentum is a tenth of a movement and more.
+    // Roundings of 6e-8 grow where gradients are small against their noise; momentum amounts to a tenth of a movement
+    // and more.
     let (by_dense, by_sparse) = (distance(&dense, &deferred) / moved, distance(&sparse, &deferred) / moved);
     assert!(by_dense > 0.0 && by_dense < 0.01, "dense is {by_dense} of the movement away");
     assert!(by_sparse > 0.03, "sparse is {by_sparse} of the movement away");
 }
 
-/// Rounds, resets and raises reach pages that nobody looks at, and pages split while frames are short.
+/// Rounds, resets and raises reach unseen pages, and pages split while frames are scarce.
 #[test]
 fn dense_updates_take_events_as_deferred_ones_do() {
     let folder = TempDir::new().unwrap();
@@ -55,10 +56,10 @@ fn dense_updates_take_events_as_deferred_ones_do() {
     let deferred = of("deferred", &[]);
     let dense = of("dense", &["--optimizer", "dense"]);
     assert!(deferred.rows() > 8100, "the scene grew to {}", deferred.rows());
-    // A threshold decides on values that differ by roundings: a few rows of thousands may fall on its other side.
+    // A threshold on values that differ by roundings flips for a few rows of thousands.
     let off = deferred.rows().abs_diff(dense.rows()) as f64 / deferred.rows() as f64;
     assert!(off < 0.01, "{} against {} Gaussians", dense.rows(), deferred.rows());
-    // Through few frames the same bits.
+    // Few frames give the same bits.
     let (spill, pages) =
         (folder.path().join("spill"), summary(&folder.path().join("dense"))["pages"].as_u64().unwrap());
     let frames = (pages * 9 / 10).to_string();

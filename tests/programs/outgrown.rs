@@ -8,7 +8,7 @@ use gsscale::dataset::synthetic::{CityOptions, write_city};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
-/// Grows by half within the steps; no commit before the end but that of a run that stops.
+/// Grows by half within the steps; commits only at the end or when the run stops.
 const GROWING: &[&str] = &[
     "--steps",
     "150",
@@ -49,7 +49,7 @@ fn a_run_that_outgrows_its_frames_says_so_keeps_what_it_has_and_goes_on_with_mor
     let output = train(&[&[text(&scene), "--out", text(&alone), "--quiet"], GROWING].concat());
     assert!(output.status.success(), "{}", stderr(&output));
     let most = summary(&alone)["pages_pinned_max"].as_u64().unwrap();
-    // The view that needs most takes 65 pages at the start.
+    // The largest view takes 65 pages at the start.
     let too_few = (most * 85 / 100).to_string();
     let begin = ["--out", text(&out), "--spill-dir", text(&spill), "--frames", &too_few];
     let output = train(&[&[text(&scene)], &begin[..], GROWING].concat());
@@ -65,8 +65,8 @@ fn a_run_that_outgrows_its_frames_says_so_keeps_what_it_has_and_goes_on_with_mor
     assert!(stopped["finished"] == false && steps > 30, "{stopped}");
     let kept = std::fs::read(out.join("point_cloud.ply")).unwrap();
     assert!(kept.len() > 62 * 4 * 6000, "the last good state is written");
-    // With as few as before it stops where it did, with the same Gaussians; more pages may have been cut meanwhile, whose
-    // rows come in another order.
+    // With the same number of frames the run stops at the same step with the same Gaussians; further pages may have
+    // been split meanwhile, which changes the order of rows.
     let output = train(&["--resume", text(&out), "--quiet"]);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     let again = std::fs::read(out.join("point_cloud.ply")).unwrap();
@@ -95,7 +95,7 @@ fn a_cap_that_the_frames_hold_is_no_reason_to_warn() {
     assert!(warned.contains("--max-gaussians 600000") && warned.contains("200 frames"), "{warned}");
 }
 
-/// What the drive tier is for: a scene that outgrows the memory it was given.
+/// The purpose of the drive: a scene that outgrows its memory.
 fn large_scene(folder: &Path) -> PathBuf {
     let scene = folder.join("scene");
     let (views, width, height, points, blocks) = (33, 160, 120, 60_000, Some(12));
@@ -104,7 +104,7 @@ fn large_scene(folder: &Path) -> PathBuf {
     scene
 }
 
-/// Grows sixfold, a round every 20 steps, all bands in use.
+/// Grows sixfold; a round every 20 steps, all colour bands in use.
 const GROWING_MUCH: &str = "--steps 120 --page-rows 64 --grow-grad2d 0.00005 --refine-start 20 --refine-every 20 --view-order \
     groups:4 --test-every 11 --commit-every 0 --device cpu --threads 2 --image-cache 4MiB --prefetch-bytes 1MiB \
     --log-every 5 --sh-start 3";
@@ -130,7 +130,8 @@ fn a_scene_that_grows_stays_within_its_memory() {
     let said = stderr(&output);
     assert!(output.status.success(), "{said}");
     assert!(said.contains("there is no cap on it") && said.contains("for all that there are"), "{said}");
-    // Without a folder for its pages it begins in memory, and finds the drive of its results when it does not fit.
+    // Without a folder for its pages the run starts in memory, and moves to the drive of its results when it no longer
+    // fits.
     let moved = path("moved");
     let other = ["--out", text(&moved), "--host-mem", "160MiB", "--spill-codec", "zstd:1", "--evict", "lru"];
     let output = train(&[&[text(&scene)], &other[..], &flags[..]].concat());
@@ -138,7 +139,7 @@ fn a_scene_that_grows_stays_within_its_memory() {
     assert!(output.status.success(), "{said}");
     assert!(said.contains(&format!("its pages move between memory and {}/checkpoint", text(&moved))), "{said}");
     assert!(!moved.join("checkpoint").exists(), "removed at a clean end");
-    // Stopped after it moved, it goes on in the same memory.
+    // Stopped after the move, the run continues in the same memory.
     let cut = path("cut");
     let begin = ["--out", text(&cut), "--host-mem", "160MiB", "--quiet", "--keep-checkpoint"];
     let steps = GROWING_MUCH.replace("--steps 120", "--steps 90 --schedule-steps 120");
@@ -153,7 +154,7 @@ fn a_scene_that_grows_stays_within_its_memory() {
     assert!(peak(&in_memory) > 1.8 * BUDGET, "{:.1} MB in memory: it hardly grew", peak(&in_memory) / 1e6);
     assert_eq!(in_memory["bytes_read"], 0);
     for out in [&out, &moved, &cut] {
-        // The promise is a tenth.
+        // The documented error is a tenth.
         let done = summary(out);
         assert!(peak(&done) <= 1.1 * BUDGET, "{:.1} MB at the peak", peak(&done) / 1e6);
         let frames = frames_logged(out);
@@ -183,13 +184,13 @@ fn a_scene_that_grows_beyond_its_memory_stops_with_the_need_and_goes_on_with_it(
     let peak = stopped["host_bytes_peak"].as_f64().unwrap();
     assert!(peak <= 1.1 * 92.0 * 1048576.0, "{:.1} MB at the peak", peak / 1e6);
     assert!(stopped["gaussians"].as_u64() > Some(70_000), "it stopped before it grew: {stopped}");
-    // Once more with what it names, which is more than it had.
+    // Again with the named memory, which is more than before.
     let line = said.lines().find(|l| l.starts_with("to go on from the last commit")).unwrap();
     let named = line.split("--host-mem ").nth(1).and_then(|rest| rest.split_whitespace().next()).unwrap();
     let output = train(&["--resume", text(&out), "--host-mem", named, "--quiet"]);
     let steps = summary(&out)["steps"].as_u64().unwrap();
     assert!(steps > stopped["steps"].as_u64().unwrap(), "{named} did not help: {}", stderr(&output));
-    // In less than its views take, from the start in memory: what there is is written all the same.
+    // With less memory than its views take, in memory from the start: the finished part is written all the same.
     let tight = folder.path().join("tight");
     let output = train(&[&[text(&scene), "--out", text(&tight), "--host-mem", "92MiB"], &flags[..]].concat());
     let said = stderr(&output);
@@ -199,14 +200,14 @@ fn a_scene_that_grows_beyond_its_memory_stops_with_the_need_and_goes_on_with_it(
     assert!(output.status.success() && summary(&out)["finished"] == true, "{}", stderr(&output));
 }
 
-/// Only as many steps as the scene needs to grow beyond 160 MiB.
+/// Just enough steps for the scene to grow beyond 160 MiB.
 fn growing_less() -> String {
     let all = "--steps 120";
     assert!(GROWING_MUCH.contains(all));
     GROWING_MUCH.replace(all, "--steps 66")
 }
 
-/// Every row is updated at every step: pages that are in memory beside those that a step has just read.
+/// Dense Adam updates every row at every step: also pages in memory beside those just read.
 #[test]
 fn a_run_that_updates_every_row_moves_out_as_well() {
     let folder = TempDir::new().unwrap();
@@ -225,7 +226,7 @@ fn a_run_that_updates_every_row_moves_out_as_well() {
     assert!(got == want, "another scene than in memory");
 }
 
-/// The drive of the results is full when the pages should move there: the run says so and goes on in memory.
+/// The drive of the results is full when the pages should move there: the run reports it and continues in memory.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_run_with_no_drive_to_move_to_goes_on_in_memory() {

@@ -10,7 +10,7 @@ use gsscale::dataset::synthetic::{CityOptions, write_city};
 use std::path::Path;
 use tempfile::TempDir;
 
-/// Of all runs.
+/// Flags of all runs.
 const COMMON: &[&str] = &["--view-order", "groups:4", "--test-every", "24", "--quiet"];
 
 /// Events of the runs of 600 steps.
@@ -20,12 +20,12 @@ const EVENTS: &[&str] = &["--refine-start", "100", "--refine-every", "50", "--re
 const MORE_EVENTS: &[&str] =
     &["--refine-start", "20", "--refine-every", "25", "--reset-every", "45", "--sh-every", "30"];
 
-/// Where pages are and how they get there.
+/// Where pages are kept, and how they get there.
 #[derive(Debug, Clone)]
 struct How {
     /// 0: all pages in memory.
     frames: u64,
-    /// Empty: no files, a store in memory.
+    /// Empty: a store in memory, without files.
     io: &'static str,
     threads: &'static str,
     more: &'static [&'static str],
@@ -85,7 +85,7 @@ fn frames_engines_and_threads_change_no_bit() {
         let io = |i: usize| engines[i % engines.len()];
         grid.push(how(pages, io(1), "1", &[]));
         grid.push(how(pages / 2, io(0), "2", &[]));
-        // Or the fewest, where a view needs more than a quarter.
+        // Or the fewest frames, if a view needs more than a quarter of the pages.
         grid.push(how(pages / 4, io(1), "2", &["--evict", "lru", "--prefetch-bytes", "1MiB"]));
         grid.push(how(pages / 4, "", "1", &[]));
         grid.push(how(fewest, io(0), "1", &["--spill-codec", "zstd:1"]));
@@ -97,16 +97,16 @@ fn frames_engines_and_threads_change_no_bit() {
         assert!(number(&summary, "frames") <= how.frames, "{how:?}: {summary}");
         let spills = how.frames < pages;
         assert_eq!(number(&summary, "pages_read") > 0, spills, "{how:?}: {summary}");
-        // What fits in memory is written once to the drive, by the commit after the last step.
+        // Pages that fit in memory are written to the drive once, by the commit after the last step.
         let commits = !how.io.is_empty();
         assert_eq!(number(&summary, "bytes_written") > 0, spills || commits, "{how:?}: {summary}");
     }
 }
 
-/// Without it the time of the first reset is that from which large Gaussians are pruned as well.
+/// Without this flag, the first reset also starts the pruning of large Gaussians.
 const NO_SIZE_LIMIT: &[&str] = &["--prune-scale3d", "1000"];
 
-/// Of runs on cities.
+/// Flags of runs on cities.
 const CITY: &[&str] = &["--page-rows", "32", "--steps", "120", "--grow-grad2d", "0.001"];
 
 #[test]
@@ -140,27 +140,28 @@ fn a_tenth_of_a_city_in_memory_gives_the_same_city() {
     let frames = number(&whole, "pages") / 10;
     let (got, summary) = run(folder.path(), &scene, &base, &How { frames, io: "auto", threads: "2", more: &[] });
     assert!(got == want);
-    // Of the pages of a city that did not grow.
+    // As a share of the pages of a city that did not grow.
     let seen = number(&summary, "pages_pinned_max") as f64 / fewest_pages as f64;
     assert!(seen < 0.03, "a view sees {seen} of the pages: {summary}");
     assert!(number(&summary, "evictions") > 0 && number(&summary, "pages_read") > 0, "{summary}");
-    // Export and evaluation looked at every page, which is not counted as the steps' need.
+    // Export and evaluation read every page; the steps' counters exclude these reads.
     assert!(number(&summary, "other_pages_needed") >= number(&summary, "pages"), "{summary}");
-    // The bound may keep other pages over the import than were there; what was read ahead when the run ended is in neither.
+    // The bound may keep other pages after the import than the run; pages prefetched at the end of the run are in
+    // neither count.
     let (bound, steps) = (number(&summary, "belady_bytes_read"), number(&summary, "bytes_read"));
     let read = steps - number(&summary, "other_bytes_read");
     assert!(bound > 0 && bound <= read && read < bound + bound / 2, "{read} read by steps, {bound} at least");
 }
 
-/// Pages that no view has looked at since a round have promised growth that counts: the cap on the Gaussians holds at every
-/// step, whatever is in memory, and is reached.
+/// The predicted growth of pages that no view has seen since a round counts: the cap on the Gaussians holds at every
+/// step, for any memory, and is reached.
 #[test]
 fn a_cap_on_the_gaussians_holds_at_every_step_and_pages_to_the_same_bits() {
     let folder = TempDir::new().unwrap();
     let scene = scenes::wide_city(folder.path(), 8_000);
     let cap = 8_400;
-    // Rounds are close to each other, so that most pages with growth were not looked at between two of them; and nothing
-    // is pruned, which would make room again, nor reset to opacities that do not exist.
+    // Rounds follow each other closely, so that most growing pages are unseen between two rounds; nothing is pruned,
+    // which would make room again, nor reset to impossible opacities.
     let rounds = ["--refine-start", "20", "--refine-every", "4", "--reset-every", "45"];
     let capped = ["--max-gaussians", "8400", "--log-every", "1", "--prune-opa", "0"];
     let base = [CITY, COMMON, NO_SIZE_LIMIT, &rounds, &capped].concat();
@@ -174,12 +175,12 @@ fn a_cap_on_the_gaussians_holds_at_every_step_and_pages_to_the_same_bits() {
     let rows: Vec<u64> = metrics.lines().map(|l| number(&serde_json::from_str(l).unwrap(), "gaussians")).collect();
     assert_eq!(rows.len(), 119, "a line after each step but the first");
     assert!(rows.iter().all(|&rows| rows <= cap), "{rows:?}");
-    // A bin of the histogram that does not fit as a whole is left out.
+    // A histogram bin that does not fit as a whole is left out.
     let end = number(&summary, "gaussians");
     assert!(end <= cap && end + 40 > cap, "{end} of {cap}");
 }
 
-/// 16-bit moments are another training, but paged they are the same one.
+/// 16-bit moments change training, but paging changes nothing further.
 #[test]
 fn moments_in_16_bits_page_to_the_same_bits() {
     let folder = TempDir::new().unwrap();

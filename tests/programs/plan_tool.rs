@@ -29,15 +29,15 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
     let number = |plan: &Value, key: &str| plan[key].as_f64().unwrap();
     for plan in &plans[..4] {
         assert!(number(plan, "hit_rate") >= number(plan, "lru_hit_rate") && plan["is_belady_bound"] == true);
-        // Each page is written by the import; beyond it everything that is read pushes something out.
+        // The import writes each page; beyond that, every read evicts a page.
         assert!(number(plan, "bytes_written") >= number(&value, "state_bytes"));
         assert!(number(plan, "bytes_read") > 0.0);
-        // Of a common drive, 300 TB.
+        // The endurance of a common drive: 300 TB.
         let share = number(plan, "bytes_written") / 300e12;
         assert!((number(plan, "share_of_endurance") / share - 1.0).abs() < 1e-9, "{plan}");
     }
     assert!(number(&plans[1], "hit_rate") < number(&plans[3], "hit_rate"), "a tour reads less than a shuffle");
-    // When everything fits nothing is read again, and auto is a shuffle.
+    // If everything fits, nothing is read again, and auto chooses a shuffle.
     assert!(
         plans[4..].iter().all(|plan| number(plan, "hit_rate") == 1.0 && number(plan, "stall_seconds_worst") == 0.0)
     );
@@ -49,14 +49,14 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
         let shown = format!(" {:.3} {:9.3} ", number(plan, "hit_rate"), number(plan, "lru_hit_rate"));
         assert!(line.contains(&shown), "{shown} is not in: {table}");
     }
-    // Shares that nobody named hold the largest view.
+    // Default shares hold the largest view.
     let open: Value = serde_json::from_str(&with(&["--view-order", "shuffle", "--json"])).unwrap();
     let frames = |value: &Value| -> Vec<u64> {
         value["plans"].as_array().unwrap().iter().map(|plan| plan["frames"].as_u64().unwrap()).collect()
     };
     let (most, pages) = (open["pages_of_largest_view"].as_u64().unwrap(), open["pages"].as_u64().unwrap());
     assert!(most > pages / 2 && frames(&open) == [most, pages], "{open}");
-    // The exact lists of two steps: what leaves makes room for what enters.
+    // The exact lists of two steps: evicted pages make room for admitted pages.
     let lists = with(&["--compare-frames", "70%", "--view-order", "shuffle", "--lists", "700..740"]);
     let lines: Vec<&str> = lists.lines().collect();
     assert!(lines[0].starts_with("step 700: ") && lines.iter().any(|line| line.starts_with("step 701: ")), "{lists}");
@@ -73,7 +73,7 @@ fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
     std::fs::write(run.join("config.toml"), format!("steps = 77\n[resolved]\nscene = {:?}\n", text(&scene))).unwrap();
     let told = stdout(&plan(&run, &["--page-rows", "16", "--compare-frames", "100%"]));
     assert!(told.contains("by all 77 steps"), "{told}");
-    // Frames that are named need no memory that was.
+    // Given frames need no given memory.
     for named in [["--frames", "80"], ["--compare-frames", "100%"]] {
         stdout(&plan(&run, &[&["--page-rows", "16", "--host-mem", "1MiB"], &named[..]].concat()));
     }
@@ -92,7 +92,7 @@ fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
     }
 }
 
-/// What the plan says beforehand is what the run does: frames for a budget, bytes read, bytes written.
+/// The plan equals the run: frames for a budget, bytes read, bytes written.
 #[test]
 fn a_run_does_what_was_planned() {
     let folder = TempDir::new().unwrap();
@@ -131,25 +131,26 @@ fn a_run_does_what_was_planned() {
         let off = (number(planned) / real - 1.0).abs();
         assert!(off <= tolerance, "{what}: {planned} planned, {real} in the run, {:.1} % off", 100.0 * off);
     };
-    // The plan renders the view with the most pages alone, the run some others as well, which may take a little more.
+    // The plan renders only the view with the most pages; the run renders some others too, which may take a little
+    // more.
     near("frames", &within["plans"][0]["frames"], number(&done["frames"]), 0.1);
     assert!(number(&done["frames"]) < 0.9 * number(&done["pages"]), "everything fits: {done}");
     let plan = planned(&["--frames", &done["frames"].to_string()]);
-    // The plan knows all views and pages that do not move, and that is what these Gaussians hardly do.
+    // The plan knows all views and assumes that pages stay in place, which nearly holds for these Gaussians.
     let plan = &plan["plans"][0];
     near("the bound", &plan["bytes_read"], number(&done["belady_bytes_read"]), 0.01);
     let read = number(&done["bytes_read"]) - number(&done["other_bytes_read"]);
     near("bytes read", &plan["bytes_read"], read, 0.05);
-    // It counts pages as changed that a view sees; those in which no row has a gradient need not be written.
+    // The plan counts every seen page as changed; pages whose rows have no gradient need not be written.
     let (most, written) =
         (number(&plan["bytes_written"]), number(&done["bytes_written"]) - number(&done["commit_bytes"]));
     assert!(written <= most && most <= 1.6 * written, "{most} bytes to be written at most, {written} were");
-    // The run itself says the same before its first step.
+    // The run prints the same before its first step.
     let told = told_to_be_written(&said);
     assert!((told / most - 1.0).abs() < 0.1, "{told} told by the run, {most} by the plan");
 }
 
-/// Bytes that a run says it will write.
+/// Bytes that a run announces to write.
 fn told_to_be_written(said: &str) -> f64 {
     let line = said.lines().find(|line| line.starts_with("drive")).unwrap();
     let text = line.split("; about ").nth(1).and_then(|rest| rest.split(" to be written, commits apart").next());
@@ -158,14 +159,14 @@ fn told_to_be_written(said: &str) -> f64 {
     number.parse::<f64>().expect(line) * 1024f64.powi(power as i32)
 }
 
-/// What a run says of the life of a drive is the bytes it will write over those that a common drive is rated for.
+/// The drive wear that a run announces is its bytes to be written over the endurance of a common drive.
 #[test]
 fn a_run_says_what_it_takes_of_the_life_of_a_drive() {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 150, 96, 64, 8000);
     let spill = folder.path().join("spill");
     let flags = ["--page-rows", "16", "--frames", "330", "--view-order", "shuffle", "--strategy", "none"];
-    // As many as make some 900 GiB.
+    // Enough steps for some 900 GiB.
     let more = ["--steps", "2000000", "--dry-run", "--spill-dir", text(&spill)];
     let output = train(&[&[text(&scene)][..], &flags, &more].concat());
     let said = stderr(&output);
@@ -173,7 +174,7 @@ fn a_run_says_what_it_takes_of_the_life_of_a_drive() {
     let told = said.split("commits apart, ").nth(1).and_then(|rest| rest.split(" % of what").next()).expect(&said);
     let share = told.parse::<f64>().expect(&said) / 100.0;
     let expected = told_to_be_written(&said) / 300e12;
-    // Both are rounded to be read: the share to a hundredth of a percent, the bytes to three digits.
+    // Both are rounded for people: the share to a hundredth of a percent, the bytes to three digits.
     assert!(expected > 0.002 && (share - expected).abs() < 0.00005 + 0.005 * expected, "{share}, {expected}: {said}");
 }
 
@@ -212,8 +213,7 @@ fn a_scene_larger_than_memory_is_planned_within_it() {
     assert!(plan["frames"].as_u64() < pages && plan["frames"].as_u64() > value["pages_of_largest_view"].as_u64());
 }
 
-/// Steps are timed on the device of the run unless somebody says how long they take; all of them and what they wait make the
-/// time of the run.
+/// Step times are measured on the device of the run unless given; steps plus stalls make the time of the run.
 #[test]
 fn the_time_of_a_run_is_that_of_its_steps_and_what_they_wait() {
     let folder = TempDir::new().unwrap();
@@ -226,19 +226,19 @@ fn the_time_of_a_run_is_that_of_its_steps_and_what_they_wait() {
     let number = |value: &Value| value.as_f64().unwrap();
     let timed = planned(&["--steps", "1000"]);
     assert!(number(&timed["step_seconds"]) > 1e-6 && timed["step_timed_on"] == "cpu", "{timed}");
-    // As many steps as are gone through one by one, and many more, which are like the later ones of these.
+    // As many steps as the simulation plays one by one, and many more, which repeat the later ones.
     for steps in [1200.0, 24_000.0] {
         let of = |rate| planned(&["--steps", &steps.to_string(), "--step-seconds", "0.002", "--drive-read", rate]);
         let (slow, fast) = (of("1MB"), of("1000GB"));
         assert!(slow["step_seconds"] == 0.002 && slow["step_timed_on"].is_null(), "{slow}");
         let [slow, fast] = [&slow, &fast].map(|value| &value["plans"][0]);
-        // Reading takes far longer than the steps: the run takes as long as its reads and writes.
+        // Reading takes far longer than computing: the run takes as long as its reads and writes.
         let moved = number(&slow["bytes_read"]) / 1e6 + (number(&slow["bytes_written"])) / 100e6;
         let seconds = number(&slow["seconds"]);
         assert!((seconds / moved - 1.0).abs() < 0.05, "{seconds} s to move {slow} in {moved} s");
         assert!(number(&fast["seconds"]) >= 0.002 * steps && number(&fast["seconds"]) < 0.1 * seconds, "{fast}");
     }
-    // With all pages in memory nothing is waited for, not even the first time.
+    // With all pages in memory no step waits, not even the first.
     let all = planned(&["--steps", "30", "--step-seconds", "0.5", "--compare-frames", "100%"]);
     assert_eq!(number(&all["plans"][1]["seconds"]), 15.0, "{all}");
     let table = stdout(&plan(&scene, &[&common[..], &["--steps", "100", "--step-seconds", "72"]].concat()));

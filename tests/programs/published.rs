@@ -18,8 +18,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use tempfile::TempDir;
 
-/// GS-Scale's per-scene dictionary, typed from the table and not from the files: name, data_factor, test_every, test_after,
-/// position_lr, scaling_lr, smallest tier's refine_stop_iter, training size.
+/// GS-Scale's per-scene dictionary, typed from the paper's table rather than from the config files: name, data_factor,
+/// test_every, test_after, position_lr, scaling_lr, smallest tier's refine_stop_iter, training size.
 #[rustfmt::skip]
 type SceneRow = (&'static str, f64, u32, i64, f64, f64, u32, Option<[u32; 2]>);
 #[rustfmt::skip]
@@ -34,7 +34,7 @@ const SCENES: [SceneRow; 8] = [
     ("sciart",    4.0,    0,  2998, 0.000016, 0.005,  5000, None),
 ];
 
-/// Its table of quality: unchanged trainer's PSNR, SSIM, LPIPS, then its own.
+/// GS-Scale's quality table: PSNR, SSIM, LPIPS of the unchanged trainer, then its own.
 #[rustfmt::skip]
 const QUALITY: [(&str, [f64; 6]); 6] = [
     ("rubble",   [26.63, 0.808, 0.194, 26.62, 0.808, 0.194]),
@@ -58,7 +58,7 @@ fn find(name: &str) -> PublishedRun {
     PublishedRun::find(Path::new(name)).unwrap_or_else(|e| panic!("{e}"))
 }
 
-/// The values that all of its scenes share.
+/// The values shared by all scenes.
 fn shared() -> TrainConfig {
     TrainConfig {
         steps: 200_000,
@@ -166,7 +166,7 @@ fn bench(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_gsscale-bench")).args(args).output().unwrap()
 }
 
-/// AlexNet of drawn weights as a file for --lpips.
+/// Writes AlexNet with random weights as a file for --lpips.
 fn lpips_weights(folder: &Path) -> PathBuf {
     let shapes: [(&str, [usize; 4]); 5] = [
         ("slice1.0", [64, 3, 11, 11]),
@@ -233,13 +233,13 @@ fn look_alikes_train_as_the_plain_layout_does() {
     let (merged, of_merged) = trained(&lookalike(folder.path(), Layout::ColmapMerged));
     let (one_folder, _) = trained(&lookalike(folder.path(), Layout::Gauu));
     assert!(merged == one_folder, "two folders read as one give the bytes of one folder");
-    // Their poses went through a quaternion once more than the plain scene's, which moves last bits.
+    // These poses went through one more quaternion than the plain scene's, which changes last bits.
     assert!((of_merged - psnr).abs() < 0.5, "{of_merged} dB, {psnr} dB");
     let mega_nerf = lookalike(folder.path(), Layout::MegaNerf);
     cloud_in_drb(&plain, &mega_nerf.join("points.ply"));
     for scene in [mega_nerf, lookalike(folder.path(), Layout::MatrixCity)] {
         let (_, other) = trained(&scene);
-        // Other axes or units round otherwise (Mega-NeRF's poses are f32), and densification decides on roundings.
+        // Other axes or units round differently (Mega-NeRF's poses are f32), and densification amplifies roundings.
         assert!((other - psnr).abs() < 0.5, "{}: {other} dB, {psnr} dB", scene.display());
     }
 }
@@ -279,7 +279,7 @@ fn a_run_is_set_beside_the_published_one() {
     assert!(page.contains("26.62") && page.contains("colour-corrected PSNR (affine)"));
     assert!(out.join("report.html").is_file() && out.join("published.json").is_file());
     assert_eq!(before, files_of(&data), "nothing is written into the dataset");
-    // The same figures again without training. Another SSIM or LPIPS has no difference to the published one.
+    // The same figures again without training. Another SSIM or LPIPS gives no difference to the published one.
     let weights = lpips_weights(folder.path());
     let again = |more: &[&str]| -> Value {
         let output = bench(&[&common[..], &["--no-train", "--quiet", "--lpips", text(&weights)], more].concat());
@@ -295,10 +295,10 @@ fn a_run_is_set_beside_the_published_one() {
     // The PLY holds unit quaternions.
     assert!((again["ours"]["test"]["psnr"].as_f64().unwrap() - ours).abs() < 0.01);
     assert!(again["difference"]["ssim"].is_null() && again["tier"] == "S2");
-    // Nor are the tier's settings a difference that the run did not have when it was trained.
+    // Settings of the tier that the run had at training are no difference either.
     assert_eq!(signed["not_the_published_run"], line["not_the_published_run"]);
     assert!(!why.contains("grow-") && !why.contains("refine-stop"), "{why}");
-    // gsscale-eval, as others spell it, from the same PLY; the run's config asked for the affine fit.
+    // gsscale-eval with colour correction, from the same PLY; the run's config asked for the affine fit.
     for (more, method) in [(&[][..], "affine"), (&["--colour-correct", "quadratic"], "quadratic")] {
         let output = eval(&[&[text(&out), text(&data)], more].concat());
         let report: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -333,7 +333,7 @@ fn the_depth_cloud_is_found_and_its_absence_said() {
         stderr(&output)
     };
     assert!(dry(&matrix_city).contains("laid out as matrixcity"));
-    // 24 views are fewer than 5,620: none is held out by index.
+    // 24 views are fewer than 5,620: no view is held out by index.
     let said = dry(&data);
     assert!(said.contains("the published cloud is not there (sparse/0/points.ply)"), "{said}");
     assert!(said.contains("0 held-out photos instead of 741"), "{said}");

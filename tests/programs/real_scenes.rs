@@ -11,7 +11,7 @@ fn a_real_scene_trains_to_a_known_quality() {
     let out = folder.path().join("run");
     let output = train(&[text(&scene), "--out", text(&out), "--steps", "500", "--strategy", "none", "--quiet"]);
     assert!(output.status.success(), "{}", stderr(&output));
-    // The best peer had 24.06 dB after 500 of its 2,000 steps. A fault in any gradient costs more than a decibel.
+    // The best other system reached 24.06 dB after 500 of its 2,000 steps. A faulty gradient costs more than a decibel.
     assert!(psnr(&out) > 24.0, "{} dB", psnr(&out));
     let summary = summary(&out);
     assert_eq!(summary["test"]["views"], 22);

@@ -33,7 +33,7 @@ fn every_run_ends_with_a_report_that_stands_alone() {
     ] {
         assert!(html.contains(part), "{part} is missing");
     }
-    // The namespace of SVG is a name, not an address that is fetched.
+    // The SVG namespace is a name, not a fetched address.
     let addresses = html.replace("http://www.w3.org/2000/svg", "");
     assert!(!addresses.contains("http://") && !addresses.contains("https://") && !addresses.contains("src=\"/"));
     assert!(in_a_browser(&out.join("report.html"), folder.path()).is_none_or(|sliders| sliders > 0));
@@ -41,7 +41,7 @@ fn every_run_ends_with_a_report_that_stands_alone() {
     assert!(both.contains("PSNR of held-out views") && both.matches("<tr>").count() == 3);
     assert_eq!(both.matches("class=\"slider\"").count(), html.matches("class=\"slider\"").count());
 
-    // A run that was cut short: the last line of the metrics is half, everything else is missing.
+    // An interrupted run: the last line of the metrics is incomplete, all other files are missing.
     let cut = folder.path().join("cut <b>");
     std::fs::create_dir(&cut).unwrap();
     let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();

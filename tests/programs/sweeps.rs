@@ -16,7 +16,7 @@ fn names(folder: &Path) -> Vec<String> {
     names
 }
 
-/// A page of ours: whole, self-contained, and it opens in a browser where there is one.
+/// Asserts that a report page is complete and self-contained, and that it opens in a browser if one is installed.
 fn check_page(page: &Path, parts: &[&str], scratch: &Path) {
     let html = std::fs::read_to_string(page).unwrap();
     for part in parts.iter().chain(&["<svg", "</html>"]) {
@@ -42,9 +42,9 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
         assert_eq!(rung["ply"], memory["ply"], "{} is not exact", rung["label"]);
     }
     assert_ne!(naive["ply"], memory["ply"], "dense updates round more often");
-    // 60 steps carry roundings of 1e-7 to a few thousandths of a decibel at most.
+    // 60 steps amplify roundings of 1e-7 to a few thousandths of a decibel at most.
     assert!((number(naive, "psnr") - number(memory, "psnr")).abs() < 0.05);
-    // A cache smaller than the scene that is gone through at every step in the same order keeps nothing.
+    // A cache smaller than the scene keeps nothing if every step visits all pages in the same order.
     let pages = number(naive, "pages");
     let frames = number(naive, "frames");
     assert!(frames < pages && number(deferred, "frames") == frames);
@@ -55,7 +55,7 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     assert!(rungs.iter().all(|r| number(r, "cpu_seconds") > 0.0 && number(r, "host_bytes_peak") > 1e6));
     check_page(&out.join("ladder.html"), &["the same, byte for byte", "not built yet"], folder.path());
     assert!(names(&out.join("spill")).is_empty(), "scratch is removed");
-    // What is done is not done again.
+    // Finished runs are not repeated.
     assert_eq!(lines(&args), rungs);
     assert_eq!(parse(&std::fs::read_to_string(out.join("ladder.jsonl")).unwrap()), rungs);
 }
@@ -76,7 +76,7 @@ fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
     let planned = String::from_utf8_lossy(&listed.stdout).lines().filter(|l| l.contains("to do")).count();
     assert!(planned >= 16 && !out.exists(), "listing runs nothing");
 
-    // Killed in the middle of some run.
+    // Killed in the middle of a run.
     let program = env!("CARGO_BIN_EXE_gsscale-bench");
     let mut killed = Command::new(program).args(&args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let results = out.join("results.jsonl");
@@ -89,11 +89,11 @@ fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
     killed.wait().unwrap();
     let kept = std::fs::read_to_string(&results).unwrap();
     let done = kept.lines().count();
-    // And a machine that went down while a line was being written.
+    // And as after a crash of the machine in the middle of a line.
     std::fs::write(&results, format!("{kept}{{\"key\":\"0123")).unwrap();
     std::fs::create_dir_all(out.join("runs/base-base-seed9-00000000.part/renders")).unwrap();
 
-    // Whoever holds the lock is at work, be it only a run that outlived its sweep.
+    // The holder of the lock is at work, even if only a run that outlived its sweep.
     let lock = std::fs::File::open(out.join("sweep.lock")).unwrap();
     lock.lock().unwrap();
     let refused = bench(&args);
@@ -118,7 +118,7 @@ fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
     assert!(lines(&args).is_empty(), "all are done");
 }
 
-/// The figures that follow from what the knobs do, and the page.
+/// Checks the figures that follow from the knobs, and the page.
 fn check_sweep(records: &[Value], out: &Path, scratch: &Path) {
     let of = |knob: &str, label: &str, seed: u64| -> &Value {
         let found = records.iter().find(|r| r["knob"] == knob && r["label"] == label && r["seed"] == seed);
@@ -132,13 +132,14 @@ fn check_sweep(records: &[Value], out: &Path, scratch: &Path) {
     let sparse = of("optimizer", "sparse", 1);
     assert_ne!(sparse["ply"], base["ply"]);
     assert_eq!(sparse["settings"]["optimizer"], "sparse");
-    // Judged on the photos of the base: half of the resolution is worse there, on its own photos it would be better.
+    // Quality is measured on the photos of the base: half of the resolution is worse there, and would be better on its
+    // own photos.
     let small = of("resolution", "1/2", 1);
     assert!(number(small, "psnr") < number(base, "psnr"), "{small} {base}");
     let parts = ["Pareto front", "the same bits", "mean of the base less its spread", "CPU seconds"];
     check_page(&out.join("pareto.html"), &parts, scratch);
     let names = names(&out.join("runs"));
-    // As the help says it: all runs of the sweep, of which the base is the first.
+    // As the help says: all runs of the sweep, the base first.
     let folders: Vec<_> = names.iter().map(|name| out.join("runs").join(name)).collect();
     let folders: Vec<&str> = folders.iter().map(|folder| text(folder)).collect();
     let page = out.join("compare.html");
@@ -173,7 +174,7 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     refuses(&[scene, "--steps", "1", "--device", "gpu"], "--device");
     assert!(!Path::new(out).exists(), "nor does a flag that means nothing here");
 
-    // The drive cannot be used: the rungs that need it fail and say why, the one in memory is run.
+    // The drive is unusable: the rungs that need it fail with a reason, the one in memory runs.
     let file = folder.path().join("file");
     std::fs::write(&file, "").unwrap();
     let output = bench(&["ladder", scene, "--out", out, "--steps", "4", "--page-rows", "16", "--spill", text(&file)]);
@@ -183,7 +184,7 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     let records = lines(&args);
     assert!(records[0]["problem"].as_str().is_some_and(|p| p.contains("--host-mem")), "{records:?}");
     assert!(records[1..].iter().all(|r| r["problem"].is_null()) && records.len() > 1, "{records:?}");
-    // Only what failed is tried again.
+    // Only failed runs are repeated.
     assert_eq!(lines(&args).len(), 1);
     let page = std::fs::read_to_string(Path::new(out).join("pareto.html")).unwrap();
     assert!(page.contains("Runs that failed") && page.contains("--host-mem"));

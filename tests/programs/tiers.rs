@@ -16,7 +16,7 @@ fn run(folder: &Path, scene: &Path, more: &[&str]) -> std::process::Output {
     train(&[&[text(scene), "--out", text(&out), "--steps", "12", "--overwrite"], more].concat())
 }
 
-/// The run ends with code 1, says all of `words`, and leaves no output.
+/// Asserts that the run ends with code 1, prints all of `words`, and leaves no output.
 fn refuses(folder: &Path, scene: &Path, more: &[&str], words: &[&str]) {
     let output = run(folder, scene, more);
     let said = stderr(&output);
@@ -36,7 +36,7 @@ fn budgets_that_are_too_small_are_refused_with_numbers_and_alternatives() {
     refuses(folder.path(), &scene, &with_drive, &["8.0 MiB", "needs", "at least"]);
     assert!(!spill.exists(), "a refused run leaves no spill directory");
     refuses(folder.path(), &scene, &["--frames", "2", "--page-rows", "64"], &["--frames: 2", "pages at once"]);
-    // A word that a flag does not know is an error of usage.
+    // An unknown word of a flag is a usage error.
     for (flag, word, known) in
         [("--io", "floppy", "uring"), ("--spill-codec", "zip", "zstd:"), ("--view-order", "groups:0", "groups:")]
     {
@@ -58,7 +58,7 @@ fn the_spill_directory_goes_with_its_run_and_others_files_are_safe() {
     assert!(stderr(&output).contains("60 frames of pages") && stderr(&output).contains("drive "));
     assert!(!spill.exists(), "removed at a clean end");
     let done = summary(&folder.path().join("out"));
-    // All 48 pages fit, so nothing has to come back.
+    // All 48 pages fit, so no page is read back.
     assert!(done["pages_read"] == 0 && done["frames"] == done["pages"], "{done}");
     let config = std::fs::read_to_string(folder.path().join("out/config.toml")).unwrap();
     assert!(config.contains("view-order = \"shuffle\""), "resolved once, and recorded: {config}");
@@ -77,13 +77,13 @@ fn a_dry_run_touches_no_spill_directory() {
     assert!(output.status.success(), "{}", stderr(&output));
     assert!(!spill.exists());
     assert!(!stderr(&output).contains("warning"), "{}", stderr(&output));
-    // Checkpoints that are kept may each come to hold every page.
+    // Each kept checkpoint may come to hold every page.
     let kept = ["--spill-dir", text(&spill), "--save-every", "1", "--steps", "3000000"];
     let output = train(&[&[text(&scene), "--dry-run"], &kept[..]].concat());
     let said = stderr(&output);
     assert!(output.status.success() && said.contains("2999999 named checkpoints may grow to"), "{said}");
     assert!(said.contains("--save-every"), "{said}");
-    // Frames count in a dry run as they do in a run.
+    // A dry run counts frames as a run does.
     let output = train(&[text(&scene), "--dry-run", "--frames", "2", "--page-rows", "64"]);
     assert!(output.status.code() == Some(1) && stderr(&output).contains("--frames: 2"), "{}", stderr(&output));
 }
@@ -96,7 +96,7 @@ fn bands_are_in_use_from_the_first_step_when_asked() {
     let ply = std::fs::read(folder.path().join("out/point_cloud.ply")).unwrap();
     let header_end = ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
     let rows: Vec<f32> = ply[header_end..].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
-    // 62 floats a row, the higher bands from the tenth on.
+    // 62 floats a row; the higher bands start at the tenth.
     let trained = rows.chunks_exact(62).filter(|row| row[9..54].iter().any(|&x| x != 0.0)).count();
     assert!(trained > 1000, "{trained} rows have trained bands");
 }
@@ -106,7 +106,7 @@ fn a_budget_that_was_refused_trains_with_what_the_remedy_names() {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 150, 48, 32, 8000);
     let spill = folder.path().join("spill");
-    // An eighth of this budget, which is what first frames get, does not hold the pages of the largest view.
+    // First frames get an eighth of this budget, which does not hold the pages of the largest view.
     let more = ["--prefetch-bytes", "1MiB", "--page-rows", "16", "--strategy", "none", "--spill-dir", text(&spill)];
     let refused = run(folder.path(), &scene, &[&["--host-mem", "32MiB"][..], &more].concat());
     let said = stderr(&refused);
@@ -115,7 +115,7 @@ fn a_budget_that_was_refused_trains_with_what_the_remedy_names() {
     let enough = format!("{:.1}MiB", least.parse::<f64>().unwrap() + 0.1);
     let trained = run(folder.path(), &scene, &[&["--host-mem", enough.as_str()][..], &more].concat());
     assert!(trained.status.success(), "{enough}: {}", stderr(&trained));
-    // A dry run says the same, of frames over a drive, and asks for no folder that it was given.
+    // A dry run prints the same for frames over a drive, and needs no folder.
     let dry = |budget: &str| {
         let flags = [&["--steps", "12", "--dry-run", "--host-mem", budget][..], &more].concat();
         train(&[&[text(&scene)], &flags[..]].concat())
@@ -128,7 +128,7 @@ fn a_budget_that_was_refused_trains_with_what_the_remedy_names() {
         too_little.status.code() == Some(1) && said.contains("the view") && !said.contains("name a folder"),
         "{said}"
     );
-    // What does not fit in memory is not brought there.
+    // A plan that does not fit in memory is refused.
     let said = stderr(&dry("8MiB"));
     assert!(said.contains("a dry run writes none") && said.contains("8000 Gaussians"), "{said}");
     assert!(!spill.exists());
@@ -137,7 +137,7 @@ fn a_budget_that_was_refused_trains_with_what_the_remedy_names() {
     assert!(done["frames"].as_u64().unwrap() < done["pages"].as_u64().unwrap(), "not all pages fit");
 }
 
-/// What `auto` stood for when a run began is its order for good, also where another budget would have chosen another.
+/// `auto` is resolved once, at the start of a run: the order stays even if another budget would choose another order.
 #[test]
 fn an_order_that_was_chosen_is_kept_under_another_budget() {
     let folder = TempDir::new().unwrap();
@@ -173,7 +173,7 @@ fn an_order_that_was_chosen_is_kept_under_another_budget() {
     assert!(got != with_order("auto"), "in memory auto is a shuffle, so this shows nothing");
 }
 
-/// How pages are stored by default follows from the drive, which is measured once: what its folder remembers decides.
+/// The default codec follows from the drive, which is measured once and remembered in its folder.
 #[test]
 fn the_codec_follows_from_what_the_spill_directory_remembers_of_its_drive() {
     let (folder, scene) = small();
@@ -200,7 +200,7 @@ fn the_codec_follows_from_what_the_spill_directory_remembers_of_its_drive() {
     }
 }
 
-/// How pages are stored, as a run says at its start.
+/// The codec that a run announces at its start.
 fn codec_of(output: &std::process::Output) -> String {
     let said = stderr(output);
     let line = said.lines().find(|line| line.starts_with("drive ")).expect(&said);
@@ -236,7 +236,7 @@ fn metrics_and_progress_tell_what_moves() {
     let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
     let lines: Vec<serde_json::Value> = metrics.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert_eq!(lines.len(), 12);
-    // Totals since the start, which the summary has at the end.
+    // Totals since the start, equal to the final summary.
     let done = summary(&out);
     for key in
         ["pages_needed", "pages_read", "late_misses", "bytes_read", "bytes_written", "stall_seconds", "host_bytes_peak"]
@@ -245,7 +245,7 @@ fn metrics_and_progress_tell_what_moves() {
         assert!(values.windows(2).all(|pair| pair[0] <= pair[1]), "{key}: {values:?}");
         let total = done[key].as_f64().expect(key);
         assert!(total >= values[11], "{key}: {total} in the summary, {values:?}");
-        // Nothing moves that was not planned, and what is planned need not be waited for.
+        // Every transfer was planned, and planned transfers need not be waited for.
         assert!(values[11] > 0.0 || ["late_misses", "stall_seconds"].contains(&key), "{key}: {values:?}");
     }
     assert!(done["belady_bytes_read"].as_u64() > Some(0), "{done}");

@@ -65,7 +65,7 @@ fn every_global_change_is_an_event_in_order() {
         degrees.push(trainer.render_options().sh_degree);
         trainer.step(&dataset, &targets).unwrap();
     }
-    // Bands as gsplat has them: step / 20, at most 2.
+    // The SH degree follows gsplat: step / 20, at most 2.
     assert!(degrees.iter().enumerate().all(|(step, &d)| usize::from(d) == (step / 20).min(2)), "{degrees:?}");
     let events: Vec<(u32, char)> = trainer.events().events().iter().map(|e| (e.step, letter(e.kind))).collect();
     let want = [(10, 'd'), (19, 's'), (20, 'd'), (30, 'd'), (30, 'r'), (39, 's'), (40, 'd')];
@@ -105,15 +105,16 @@ fn utm_offsets_cost_no_quality() {
     model.write(&scene);
     let far = folder.path().join("far");
     run(&scene, &far, &steps);
-    // The bound of the promise: 0.05 dB; f64 subtraction leaves differences of some 1e-9 of the scene.
+    // The documented bound is 0.05 dB; f64 subtraction leaves differences of some 1e-9 of the scene.
     let (here_db, far_db) = (psnr(&here), psnr(&far));
     assert!((here_db - far_db).abs() < 0.05, "{here_db} dB at the origin, {far_db} dB at UTM coordinates");
-    // The offset is far more than 1,000 radii of this small scene: the PLY stays local, and evaluation knows.
+    // The offset is far more than 1,000 radii of this small scene: the PLY stays in local coordinates, and evaluation
+    // knows the offset.
     let output = eval(&[text(&far), text(&scene)]);
     assert!(output.status.success(), "{}", stderr(&output));
     let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let again = report["test"]["psnr"].as_f64().unwrap();
-    // Rounding of positions and scales to f32 on the way through the PLY.
+    // Positions and scales are rounded to f32 in the PLY.
     assert!((again - far_db).abs() < 1e-2, "{again} dB from the PLY, {far_db} dB in the run");
 }
 
@@ -144,7 +145,7 @@ fn training_can_start_from_a_trained_ply() {
     let second = folder.path().join("second");
     let ply = first.join("point_cloud.ply");
     run(&scene, &second, &["--steps", "10", "--strategy", "none", "--init-ply", text(&ply)]);
-    // Ten steps with fresh moments cannot undo 400: a start from points is some 10 dB lower.
+    // Ten steps with fresh moments cannot undo 400; a start from points would be some 10 dB lower.
     assert!(psnr(&second) > psnr(&first) - 1.5, "{} after {}", psnr(&second), psnr(&first));
 }
 
@@ -157,12 +158,13 @@ fn the_bands_of_a_trained_ply_stay_in_use() {
     let second = folder.path().join("second");
     let ply = first.join("point_cloud.ply");
     run(&scene, &second, &["--steps", "1", "--strategy", "none", "--init-ply", text(&ply)]);
-    // One step of Adam without history moves every value by its rate; without the bands it would be decibels less.
+    // One step of Adam without history moves every value by its learning rate; without the bands the loss would be
+    // several decibels.
     assert!(psnr(&second) > psnr(&first) - 0.7, "{} after {}", psnr(&second), psnr(&first));
     let output = eval(&[text(&second), text(&scene)]);
     let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let again = report["test"]["psnr"].as_f64().unwrap();
-    // Rounding on the way through the PLY.
+    // Rounding in the PLY.
     assert!((again - psnr(&second)).abs() < 2e-3, "{again} from the PLY, {} in the run", psnr(&second));
 }
 
@@ -211,7 +213,7 @@ fn an_interrupt_finishes_the_step_and_writes_the_scene() {
     let summary = summary(&out);
     assert_eq!(summary["finished"], false);
     assert!(summary["steps"].as_u64().unwrap() > 0);
-    // There are held-out photos, but nobody looked at them: neither the words nor the report say otherwise.
+    // There are held-out photos, but none was evaluated: neither stderr nor the report claims otherwise.
     assert!(stderr(&output).contains("of training; not evaluated"), "{}", stderr(&output));
     assert!(!std::fs::read_to_string(out.join("report.html")).unwrap().contains("held-out"));
 }

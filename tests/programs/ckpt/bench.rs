@@ -50,7 +50,7 @@ const BUSY: &[&str] = &[
     "--quiet",
 ];
 
-/// Names of the pages that two generations of a store have in different versions.
+/// Names of the pages that differ between two generations of a store.
 pub fn changed_pages(store: &Path, from: u64, to: u64) -> Vec<String> {
     let store = StoreReader::open(store, Access::Map, WitnessRule::Obeyed).unwrap();
     let before = store.pages_at(from).unwrap();
@@ -58,16 +58,16 @@ pub fn changed_pages(store: &Path, from: u64, to: u64) -> Vec<String> {
     store.pages_at(to).unwrap().iter().filter(|page| is_changed(page)).map(|page| page.page.to_string()).collect()
 }
 
-/// A run whose scene is its rows alone.
+/// Flags of a run without events.
 pub const EVENTLESS: &[&str] = &["--strategy", "none", "--sh-every", "0"];
 
-/// What every run is told; a key of `more` takes the place of the usual one.
+/// The usual flags; a key in `more` replaces the usual one.
 pub fn with<'a>(more: &[&'a str]) -> Vec<&'a str> {
     let pairs = BUSY.chunks(2).filter(|pair| !more.contains(&pair[0]));
     pairs.flatten().chain(more).copied().collect()
 }
 
-/// A scene, and one run of it at a time.
+/// A scene, and one run on it at a time.
 pub struct Bench {
     folder: TempDir,
     scene: PathBuf,
@@ -98,7 +98,7 @@ impl Bench {
         std::fs::read(self.path("out/point_cloud.ply")).unwrap()
     }
 
-    /// The PLY of the run that is left alone.
+    /// The PLY of the uninterrupted run.
     pub fn alone(&self) -> Vec<u8> {
         let out = self.path("alone");
         let output = train(&[&[text(&self.scene), "--out", text(&out)], BUSY].concat());
@@ -106,7 +106,7 @@ impl Bench {
         std::fs::read(out.join("point_cloud.ply")).unwrap()
     }
 
-    /// A run that goes on.
+    /// A run in progress.
     pub fn running(&self, more: &[&str]) -> (PathBuf, Child) {
         let (out, spill) = (self.path("out"), self.spill());
         let mut args = vec![text(&self.scene), "--out", text(&out), "--spill-dir", text(&spill)];
@@ -116,7 +116,7 @@ impl Bench {
         (out, child)
     }
 
-    /// A run that was asked to stop twice, some steps apart, long before its end: two generations.
+    /// A run stopped twice, some steps apart, long before its end: two generations.
     pub fn stopped(&self, more: &[&str]) -> PathBuf {
         let (out, child) = self.running(more);
         stop(child);
@@ -124,18 +124,18 @@ impl Bench {
         out
     }
 
-    /// Goes on to the end.
+    /// Resumes the run to its end.
     pub fn go_on(&self, more: &[&str]) {
         let output = train(&[&["--resume", text(&self.path("out")), "--quiet"], more].concat());
         assert!(output.status.success(), "{}", stderr(&output));
     }
 
-    /// Goes on for a few steps.
+    /// Resumes the run for a few steps.
     pub fn go_on_until_stopped(&self, more: &[&str]) {
         stop(self.going_on(more));
     }
 
-    /// A run that went on some steps ago.
+    /// A resumed run, some steps later.
     pub fn going_on(&self, more: &[&str]) -> Child {
         let lines = self.lines();
         let mut child = spawn(&[&["--resume", text(&self.path("out")), "--quiet"], more].concat());
@@ -156,21 +156,21 @@ impl Bench {
         }
     }
 
-    /// Exports to a file that is new each time.
+    /// Exports to a new file each time.
     pub fn export(&self, dir: &Path, more: &[&str]) -> PathBuf {
         let file = (0..).map(|i| self.path(&format!("export{i}.ply"))).find(|path| !path.exists()).unwrap();
         ckpt(&[&["export", text(dir), "--out", text(&file)], more].concat());
         file
     }
 
-    /// Clones to a folder that is new each time.
+    /// Clones to a new folder each time.
     pub fn copy(&self, command: &str, dir: &Path) -> PathBuf {
         let to = (0..).map(|i| self.path(&format!("copy{i}"))).find(|path| !path.exists()).unwrap();
         ckpt(&[command, text(dir), text(&to)]);
         to
     }
 
-    /// Every file of the spill directory: its bytes and when it was written last.
+    /// Every file of the spill directory with its bytes and modification time.
     pub fn store_files(&self) -> BTreeMap<PathBuf, (Vec<u8>, std::time::SystemTime)> {
         let entries = std::fs::read_dir(self.spill()).unwrap().map(|entry| entry.unwrap().path());
         entries
@@ -188,7 +188,7 @@ fn spawn(args: &[&str]) -> Child {
     command.args(args).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
 }
 
-/// SIGTERM, and the end that follows.
+/// Sends SIGTERM and waits.
 pub fn stop(child: Child) {
     assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap().success());
     let output = child.wait_with_output().unwrap();
@@ -199,26 +199,26 @@ pub fn run(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_gsscale-ckpt")).args(args).output().unwrap()
 }
 
-/// What the tool prints when it succeeds.
+/// The output of a successful call.
 pub fn ckpt(args: &[&str]) -> String {
     let output = run(args);
     assert!(output.status.success(), "{args:?}: {}", stderr(&output));
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// What it prints with `--json`.
+/// The output with `--json`.
 pub fn json(args: &[&str]) -> serde_json::Value {
     serde_json::from_str(&ckpt(&[args, &["--json"]].concat())).unwrap()
 }
 
-/// What it says when it does not succeed; nothing but that.
+/// The message of a failing call, which prints nothing else.
 pub fn failed(args: &[&str]) -> String {
     let output = run(args);
     assert!(matches!(output.status.code(), Some(1 | 2)), "{args:?}: {output:?}");
     stderr(&output)
 }
 
-/// Gives generations names, as the trainer does.
+/// Names generations, as the trainer does.
 pub fn pin(spill: &Path, names: &[(&str, u64)]) {
     let dir = SpillDir::open(spill, true).unwrap();
     let mut opened = Commits::open(Box::new(DriveFolder::new(spill)), commit_config(dir.format().store)).unwrap();
@@ -228,7 +228,7 @@ pub fn pin(spill: &Path, names: &[(&str, u64)]) {
     opened.commits.pin(&mut store, &names, &[]).unwrap();
 }
 
-/// A PLY of floats, read without the library.
+/// A PLY of floats, read without gsscale's reader.
 pub struct Ply {
     pub names: Vec<String>,
     pub rows: Vec<Vec<f32>>,
@@ -249,7 +249,7 @@ impl Ply {
         Ply { names, rows }
     }
 
-    /// Of each coordinate.
+    /// The median of each coordinate.
     pub fn median(&self) -> [f64; 3] {
         std::array::from_fn(|i| {
             let mut values: Vec<f32> = self.rows.iter().map(|row| row[i]).collect();
@@ -267,7 +267,7 @@ impl Ply {
     }
 }
 
-/// A run from Gaussians that are somewhere else, of a few steps.
+/// A run of a few steps from the Gaussians of `init`.
 pub fn train_from(bench: &Bench, init: &Path, out: &str) -> Vec<u8> {
     let out = bench.path(out);
     let more =

@@ -23,7 +23,7 @@ fn pack(folder: &Path) -> Vec<u8> {
     let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
     let options = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
     let mut paths: Vec<PathBuf> = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path()).collect();
-    // Who used it last is nobody's business.
+    // The lock names its last holder and is not compared.
     paths.retain(|path| path.file_name().is_some_and(|name| name != "LOCK"));
     paths.sort();
     for path in paths {
@@ -45,7 +45,7 @@ fn unpack(bytes: &[u8], folder: &Path) {
     }
 }
 
-/// What a store holds, in a form that does not depend on where it is.
+/// The contents of a store, independent of its place.
 fn content_of(folder: &Path) -> Value {
     let mut content = serde_json::Map::new();
     let mut put = |key: &str, value: Value| content.insert(key.to_string(), value);
@@ -67,7 +67,7 @@ fn content_of(folder: &Path) -> Value {
     put("pages_digest", format!("{:032x}", checksum(&bytes)).into());
     let file = folder.with_extension("ply");
     ckpt(&["export", text(folder), "--out", text(&file)]);
-    // The comments name the version of the program.
+    // The PLY comments name the version of the program.
     let ply = std::fs::read(&file).unwrap();
     let rows = ply.windows(11).position(|w| w == b"end_header\n").unwrap();
     put("ply_digest", format!("{:032x}", checksum(&ply[rows..])).into());
@@ -76,7 +76,7 @@ fn content_of(folder: &Path) -> Value {
 
 fn write_present_version() {
     let bench = Bench::new();
-    // Few and small pages, with moments, statistics and events that some of them have not applied.
+    // Few small pages, with moments, statistics and pending events.
     bench.stopped(&["--page-rows", "16", "--sh-degree", "1", "--max-gaussians", "220", "--spill-codec", "zstd:19"]);
     let version = *VERSIONS.last().unwrap();
     let packed = pack(&bench.spill());

@@ -24,7 +24,7 @@ fn inspecting_a_store_reports_what_the_run_left_and_changes_nothing() {
     let bench = Bench::new();
     let out = bench.stopped(&[]);
     let before = bench.store_files();
-    // The run's folder and the spill directory are the same store.
+    // The output folder and the spill directory name the same store.
     let listed = json(&["ls", text(&out)]);
     let there = json(&["ls", text(&bench.spill())]);
     assert_eq!(generations(&listed), generations(&there));
@@ -77,7 +77,7 @@ fn an_export_is_the_trainers_file_byte_for_byte_and_can_be_a_part_of_it() {
     let want = std::fs::read(out.join("point_cloud.ply")).unwrap();
     let file = bench.export(&out, &[]);
     assert!(std::fs::read(&file).unwrap() == want, "the export is not what the trainer wrote");
-    // The least budget that it takes, by its own word.
+    // The minimum budget, from the tool's own message.
     let said = failed(&["export", text(&out), "--out", text(&file), "--host-mem", "1MiB"]);
     let least = said.split("give at least ").nth(1).unwrap().trim().replace(' ', "");
     let file = bench
@@ -91,7 +91,7 @@ fn an_export_is_the_trainers_file_byte_for_byte_and_can_be_a_part_of_it() {
     let part = Ply::read(&bench.export(&out, &["--crop", &crop]));
     let expected: Vec<&Vec<f32>> = all.rows.iter().filter(|row| inside(row)).collect();
     assert!(expected.len() > 100 && expected.len() < all.rows.len());
-    // Coordinates of the file are rounded once more than those that were compared: a row on the border may differ.
+    // The file's coordinates are rounded once more than the compared ones: a row on the border may differ.
     assert!(part.rows.len().abs_diff(expected.len()) <= 2, "{} of {}", part.rows.len(), expected.len());
     assert!(part.rows.iter().filter(|row| inside(row)).count() + 2 >= part.rows.len());
 
@@ -129,7 +129,7 @@ fn a_run_that_was_rolled_back_or_cloned_ends_with_the_same_bytes() {
     assert!(ckpt(&["rollback", text(&out), &a.to_string()]).contains("already the latest"));
     assert!(json(&["verify", text(&out), "--deep"])["faults"].as_array().unwrap().is_empty());
 
-    // The copy has both generations, under their numbers, in slots that are its own.
+    // The copy has both generations with their numbers, in its own slots.
     let copied = json(&["ls", text(&copy)]);
     let of = |listed: &Value| -> Vec<String> {
         let keys = ["generation", "step", "gaussians", "pages", "bytes", "bytes_alone", "names"];
@@ -142,7 +142,7 @@ fn a_run_that_was_rolled_back_or_cloned_ends_with_the_same_bytes() {
     let said = failed(&["clone", text(&out), text(&copy)]);
     assert!(said.contains("exists already"), "{said}");
 
-    // The run goes with its copy from then on, and not back to a store that lacks what it did since.
+    // The run then uses its copy, and does not return to a store that lacks the newer steps.
     bench.go_on_until_stopped(&["--spill-dir", text(&copy)]);
     let config = std::fs::read_to_string(out.join("config.toml")).unwrap();
     assert!(config.contains(&format!("spill-dir = \"{}\"", text(&copy))), "{config}");
@@ -152,7 +152,7 @@ fn a_run_that_was_rolled_back_or_cloned_ends_with_the_same_bytes() {
     bench.go_on(&[]);
     assert!(bench.ply() == want, "the run went on with the copy and ended otherwise");
     assert!(!copy.join("map.redb").exists() && bench.spill().join("map.redb").exists());
-    // The files of the run are those of the end; the older generation still leads there.
+    // The output files are those of the end; the store's older generation is still the latest there.
     std::fs::remove_file(out.join("summary.json")).unwrap();
     bench.go_on(&["--spill-dir", text(&bench.spill())]);
     assert!(bench.ply() == want, "the run went back and ended otherwise");
@@ -219,7 +219,7 @@ fn a_store_in_use_is_never_written_and_readers_report_the_use() {
     assert!(json(&["verify", text(&out), "--deep"])["faults"].as_array().unwrap().is_empty());
 }
 
-/// What a run that goes on was started from is of no use to it any more.
+/// A resumed run no longer needs its starting Gaussians.
 #[test]
 fn a_store_that_a_run_was_started_from_is_free_once_the_run_goes_on() {
     let bench = Bench::new();
@@ -227,11 +227,11 @@ fn a_store_that_a_run_was_started_from_is_free_once_the_run_goes_on() {
     let seed = bench.copy("clone", &out);
     let first = generations(&json(&["ls", text(&seed)]))[0].to_string();
     [out, bench.spill()].iter().for_each(|folder| std::fs::remove_dir_all(folder).unwrap());
-    // It gets a part of the budget; what is named is the budget that was given, and the one that would do.
+    // The import gets a part of the budget; messages name the given budget and a sufficient one.
     let with_budget = |budget: &str| {
         let out = bench.path("none");
         let flags = ["--init-ply", text(&seed), "--host-mem", budget, "--out", text(&out), "--steps", "1"];
-        // Looking for a GPU loads its driver, which may take more of this budget than is left.
+        // Detecting a GPU loads its driver, which may take more than the rest of this budget.
         train(&[&[text(&bench.path("scene")), "--device", "cpu"], &flags[..]].concat())
     };
     let said = stderr(&with_budget("48MiB"));
@@ -292,7 +292,7 @@ fn flipped_bits_in_pages_are_named_and_older_versions_take_their_place() {
     assert_eq!(faults, want);
     let words = String::from_utf8(bench::run(&["verify", text(&out), "--deep"]).stdout).unwrap();
     assert!(words.contains("2 faults") && words.contains(&format!("{} offset {offset}", file.display())), "{words}");
-    // What needs the pages names one; no half-made copy is left.
+    // Commands that need the pages name a damaged one; no partial copy is left.
     let to = bench.path("copy");
     let said = failed(&["clone", text(&out), text(&to)]);
     assert!(said.contains("page ") && said.contains("remedy"), "{said}");
@@ -311,13 +311,13 @@ fn flipped_bits_in_pages_are_named_and_older_versions_take_their_place() {
     assert!(lost.iter().all(|page| page["taken"].as_u64().is_some_and(|taken| taken <= a)), "{done}");
     assert!(json(&["verify", text(&rescued), "--deep"])["faults"].as_array().unwrap().is_empty());
     bench.export(&rescued, &[]);
-    // Going back leads around the damage as well, and the run can go on from either.
+    // A rollback avoids the damage as well, and the run resumes from either.
     json(&["rollback", text(&out), &a.to_string(), "--yes"]);
     assert!(json(&["verify", text(&out), "--deep"])["faults"].as_array().unwrap().is_empty());
     bench.go_on(&["--spill-dir", text(&rescued)]);
 }
 
-/// Older versions have other statistics than the run has counted, and rounds ahead that its newer ones had behind them.
+/// Older versions have other statistics than the run has counted, and pending rounds that newer versions have applied.
 #[test]
 fn a_run_resumes_from_many_older_pages() {
     // With rounds between the generations that grow much, and with statistics that no round cleared.
@@ -367,16 +367,16 @@ fn a_lost_map_is_rebuilt_from_the_slots() {
         done["lost"].as_array().unwrap().is_empty() && done["notes"].to_string().contains("state is lost"),
         "{done}"
     );
-    // Without events that were pending nothing of the scene was in the map alone.
+    // Without pending events, no part of the scene is in the map alone.
     let file = bench.export(&bench.path("rescued"), &[]);
     assert!(std::fs::read(&file).unwrap() == want, "the rescued scene is another");
 
-    // Without FORMAT as well, and without the run's config: local coordinates, the same Gaussians.
+    // Without FORMAT and without the run's config: local coordinates, the same Gaussians.
     std::fs::remove_file(bench.spill().join("FORMAT")).unwrap();
     let done = json(&["salvage", text(&bench.spill()), "--out", text(&bench.path("bare"))]);
     assert_eq!(&done["gaussians"], &listed["generations"][1]["gaussians"]);
     assert!(done["notes"].to_string().contains("config is not known"), "{done}");
-    // A damaged page is said, and its older version taken or its rows missing.
+    // A damaged page is reported, and its older version is used or its rows are missing.
     let first = json(&["inspect", text(&bench.path("rescued"))])["pages"].as_u64().unwrap();
     let segment = bench.spill().join("seg-00000000.dat");
     flip(&segment, 4096 + 100);
@@ -396,12 +396,11 @@ fn a_lost_map_is_rebuilt_from_the_slots() {
     assert!(said.contains("no slot header") && !bench.path("fourth").exists(), "{said}");
 }
 
-/// What the histogram of the run's state counts is lost with the map; the statistics in the pages are not, and growth goes
-/// by both.
+/// The histogram in the run state is lost with the map; the statistics in the pages remain. Growth uses both.
 #[test]
 fn growth_goes_on_after_a_salvage_without_a_map() {
     let bench = Bench::new();
-    // The rounds lie behind the stop, with room for half of the growth that there would be without a cap.
+    // The rounds come after the stop; the cap allows half of the uncapped growth.
     let more = ["--refine-every", "150", "--refine-stop", "400", "--grow-grad2d", "0.0001", "--max-gaussians", "4000"];
     let (scene, alone) = (bench.path("scene"), bench.path("alone"));
     let args = [&[text(&scene), "--out", text(&alone)], &bench::with(&more)[..]].concat();
@@ -424,12 +423,12 @@ fn growth_goes_on_after_a_salvage_without_a_map() {
     ]);
     let said = stderr(&output);
     assert!(output.status.success(), "{said}");
-    // The statistics in the pages and those in the state agree: nothing had to be counted anew.
+    // The statistics in the pages and in the run state agree: nothing was recounted.
     assert!(!said.contains("counted anew"), "{said}");
     let of = |out: &Path| summary(out)["gaussians"].as_u64().unwrap();
     let (first, grown, want) = (done["gaussians"].as_u64().unwrap(), of(&out), of(&alone));
     println!("{first} Gaussians grew to {grown}; without the damage to {want}");
-    // A few opacity resets that were pending are lost, and with them the statistics of their pages: 3 % of the growth.
+    // A few pending opacity resets are lost together with the statistics of their pages: 3 % of the growth.
     let off = grown.abs_diff(want) as f64 / (want - first) as f64;
     assert!(want > first + 500 && off < 0.03, "{first} grew to {grown}; without the damage to {want}");
 }
@@ -442,7 +441,7 @@ fn split_pages_are_not_rescued_twice() {
     let last = &listed["generations"][1];
     std::fs::write(bench.spill().join("map.redb"), vec![7; 100_000]).unwrap();
     let done = json(&["salvage", text(&out), "--out", text(&bench.path("rescued"))]);
-    // Pages that lost all their rows leave slots that nothing tells from pages that are there.
+    // Slots of emptied pages look like slots of existing pages.
     let (pages, rows) = (done["pages"].as_u64().unwrap(), done["gaussians"].as_u64().unwrap());
     let (want, want_rows) = (last["pages"].as_u64().unwrap(), last["gaussians"].as_u64().unwrap());
     assert!(pages >= want && pages <= want + 2, "{pages} pages instead of {want}: {done}");
@@ -532,7 +531,7 @@ fn other_folders_and_other_versions_are_refused_by_name() {
     refused(&["format version 2", "newer", "knows version 1"]);
     with(13, 0x40);
     refused(&["features that this program does not know", "0x4000"]);
-    // A compatible bit is passed over, and shown.
+    // A compatible feature bit is accepted and shown.
     with(49, 0x01);
     assert_eq!(json(&["inspect", text(&out)])["features_compatible"], 256);
     std::fs::write(&path, &good[..200]).unwrap();
@@ -541,7 +540,7 @@ fn other_folders_and_other_versions_are_refused_by_name() {
     bench.go_on(&[]);
 }
 
-/// Gaussians on a wavy plane, all columns different.
+/// Gaussians on a wavy plane; all columns differ.
 fn wave(rows: usize) -> Columns {
     let mut columns = Columns::zeros(rows, 3);
     for row in 0..rows {
@@ -560,7 +559,7 @@ fn gaussians_that_do_not_fit_are_refused_by_the_header_or_go_into_pages() {
     let folder = tempfile::tempdir().unwrap();
     let ply = folder.path().join("in.ply");
     let path = |name: &str| folder.path().join(name);
-    // No view sees more than one of ten parts.
+    // Each view sees at most one of ten parts.
     let mut gaussians = wave(150_000);
     gaussians.means.chunks_exact_mut(3).enumerate().for_each(|(row, mean)| mean[1] += 2000.0 * (row / 15_000) as f32);
     write_gaussians(&ply, &gaussians, &PlyMeta::default()).unwrap();
@@ -576,7 +575,7 @@ fn gaussians_that_do_not_fit_are_refused_by_the_header_or_go_into_pages() {
         said.contains("in.ply") && said.contains("150000 Gaussians take") && said.contains("--spill-dir"),
         "{said}"
     );
-    // Their values alone take 35 MB, with moments 109 MB; on the drive they train to what they train to in memory.
+    // The values alone take 35 MB, 109 MB with moments; paged training equals training in memory.
     let in_memory = train(&[&common, &["--out", text(&alone)][..]].concat());
     assert!(in_memory.status.success(), "{}", stderr(&in_memory));
     let within = ["--out", text(&out), "--spill-dir", text(&spill), "--host-mem", "64MiB"];
@@ -594,7 +593,7 @@ fn gaussians_round_trip_through_a_store_within_the_budget() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
     write_gaussians(&path("in.ply"), &wave(rows), &PlyMeta::default()).unwrap();
-    // The rows alone take 29 MB as 40,000, and more than the budget from 150,000 on.
+    // The rows alone take 29 MB at 40,000 rows, and exceed the budget from 150,000 rows on.
     let (budget, bytes) = ("112MiB", 112u64 << 20);
     let done = json(&["import", text(&path("in.ply")), "--out", text(&path("store")), "--host-mem", budget]);
     assert_eq!((done["gaussians"].as_u64(), done["sh_degree"].as_u64()), (Some(rows as u64), Some(3)));
@@ -615,7 +614,7 @@ fn gaussians_round_trip_through_a_store_within_the_budget() {
         };
         assert!(sorted(&out) == sorted(&path("in.ply")), "a value changed on its way");
     }
-    // Pages are places: a small box reads few of them.
+    // Pages are local in space: a small box reads few of them.
     let part = json(&["export", text(&path("store")), "--out", text(&out), "--crop", "0,0,-9,12,12,9"]);
     assert!(part["bytes_read"].as_u64().unwrap() * 4 < done["bytes_read"].as_u64().unwrap(), "{part}");
 
@@ -637,7 +636,7 @@ fn a_run_starts_from_a_store_as_from_the_file_that_it_was_made_of() {
     json(&["import", text(&file), "--out", text(&store), "--page-rows", "32"]);
     let want = train_from(&bench, &file, "from-file");
     assert!(train_from(&bench, &store, "from-store") == want, "the store is another start than its file");
-    // The checkpoint of a run is a start as well; its pages are others than the file's, so its roundings are.
+    // A run's checkpoint also serves as a start; its pages differ from the file's, and so do the roundings.
     let rows = Ply::read(&file).rows.len();
     train_from(&bench, &out, "from-run");
     let started = summary(&bench.path("from-run"));

@@ -11,7 +11,7 @@ use tempfile::TempDir;
 /// Steps of a run.
 pub const STEPS: u32 = 200;
 
-/// What every run here is told.
+/// Flags of every run.
 pub const BUSY: &[&str] = &[
     "--page-rows",
     "32",
@@ -36,7 +36,7 @@ pub const BUSY: &[&str] = &[
     "--quiet",
 ];
 
-/// Commits only when a run is asked to stop, and at its end.
+/// Commits only when a run is asked to stop, and at the end.
 pub const SELDOM: [&str; 2] = ["--commit-every", "0"];
 
 /// Where a run keeps its pages.
@@ -44,7 +44,7 @@ pub const SELDOM: [&str; 2] = ["--commit-every", "0"];
 pub enum Place {
     /// In memory.
     Memory,
-    /// In a spill directory, with so many frames.
+    /// In a spill directory, with this many frames.
     Spill(u64),
 }
 
@@ -53,7 +53,7 @@ pub struct Bench {
     pub scene: PathBuf,
 }
 
-/// What a run left that nobody disturbed.
+/// The result of an uninterrupted run.
 pub struct Alone {
     pub ply: Vec<u8>,
     /// Steps in metrics.jsonl.
@@ -80,7 +80,7 @@ impl Bench {
         self.folder.path().join(name)
     }
 
-    /// The run that is left alone, in memory.
+    /// The uninterrupted run, in memory.
     pub fn alone(&self, more: &[&str]) -> Alone {
         let out = self.path("alone");
         let steps = STEPS.to_string();
@@ -94,35 +94,35 @@ impl Bench {
         alone
     }
 
-    /// Begins a run in `out`.
+    /// Starts a run in `out`.
     pub fn begin(&self, place: Place, more: &[&str]) -> Child {
         let (out, spill, steps) = (self.path("out"), self.path("spill"), STEPS.to_string());
         let mut args = vec![text(&self.scene), "--out", text(&out), "--steps", &steps];
         let frames;
         if let Place::Spill(count) = place {
             frames = count.to_string();
-            // A codec that is named saves the second that measuring the drive takes.
+            // A given codec saves the second of measuring the drive.
             args.extend(["--spill-dir", text(&spill), "--frames", &frames, "--spill-codec", "raw"]);
         }
         spawn(&[&args, BUSY, more].concat())
     }
 
-    /// Goes on with the run in `out`.
+    /// Resumes the run in `out`.
     pub fn go_on(&self, more: &[&str]) -> Child {
         self.go_on_in("out", more)
     }
 
-    /// Goes on with the run in the folder of this name.
+    /// Resumes the run in the folder of this name.
     pub fn go_on_in(&self, out: &str, more: &[&str]) -> Child {
         spawn(&[&["--resume", text(&self.path(out)), "--quiet"], more].concat())
     }
 
-    /// Begins a run in `out` and asks it to stop after some lines of metrics.
+    /// Starts a run in `out` and asks it to stop after some lines of metrics.
     pub fn stopped(&self, place: Place, lines: usize) {
         self.stopped_with(place, lines, &[]);
     }
 
-    /// As [`Bench::stopped`], of a run that is told `more`.
+    /// Like [`Bench::stopped`], with the flags `more`.
     pub fn stopped_with(&self, place: Place, lines: usize, more: &[&str]) {
         let mut child = self.begin(place, &[&SELDOM, more].concat());
         self.wait_for_lines(&mut child, lines);
@@ -131,17 +131,17 @@ impl Bench {
         assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
     }
 
-    /// Where the checkpoint of the run in `out` is.
+    /// The checkpoint of the run in `out`.
     pub fn checkpoint(&self, place: Place) -> PathBuf {
         self.path(if place == Place::Memory { "out/checkpoint" } else { "spill" })
     }
 
-    /// Waits until the run in `out` has logged something after its first `lines` lines, or ended.
+    /// Waits until the run in `out` has logged more than `lines` lines, or has ended.
     pub fn wait_for_lines(&self, child: &mut Child, lines: usize) {
         self.wait_for_lines_in("out", child, lines);
     }
 
-    /// As [`Bench::wait_for_lines`], of the run in the folder of this name.
+    /// Like [`Bench::wait_for_lines`], for the run in the folder of this name.
     pub fn wait_for_lines_in(&self, out: &str, child: &mut Child, lines: usize) {
         let started = Instant::now();
         let file = self.path(out).join("metrics.jsonl");
@@ -182,14 +182,14 @@ pub fn ended(child: Child) -> Output {
     child.wait_with_output().unwrap()
 }
 
-/// Waits for a run that ends well.
+/// Waits for a run that must succeed.
 pub fn succeeded(child: Child) -> String {
     let output = ended(child);
     assert!(output.status.success(), "{}", stderr(&output));
     stderr(&output)
 }
 
-/// Waits for a run that refuses, with a remedy; what it said.
+/// Waits for a run that must refuse with a remedy; returns stderr.
 pub fn refused(child: Child) -> String {
     let output = ended(child);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
@@ -197,7 +197,7 @@ pub fn refused(child: Child) -> String {
     stderr(&output)
 }
 
-/// Copies a folder with all that is in it.
+/// Copies a folder recursively.
 pub fn copy_folder(from: &Path, to: &Path) {
     std::fs::create_dir(to).unwrap();
     for entry in std::fs::read_dir(from).unwrap().map(Result::unwrap) {

@@ -4,7 +4,7 @@ use super::bench::{Bench, Place, SELDOM, copy_folder, ended, logged, ply, refuse
 use crate::support::scenes::{TextModel, stderr, summary, text};
 use std::path::PathBuf;
 
-/// The rows of a binary PLY as bytes, in the order of their bytes.
+/// The rows of a binary PLY as bytes, sorted.
 fn rows(ply: &[u8]) -> Vec<&[u8]> {
     let end = b"end_header\n";
     let first = ply.windows(end.len()).position(|w| w == end).unwrap() + end.len();
@@ -30,17 +30,17 @@ fn what_changed_is_said_and_left_as_it_was() {
     let out = bench.path("out");
     let mut child = bench.begin(Place::Spill(alone.fewest), &SELDOM);
     bench.wait_for_lines(&mut child, 2);
-    // In use: a second process is kept out.
+    // The folder is in use: a second process is refused.
     let said = refused(bench.go_on(&[]));
     assert!(said.contains("another process"), "{said}");
     signal(&child, "INT");
     assert_eq!(ended(child).status.code(), Some(130));
-    // Every key that differs, and what it was.
+    // The message lists every changed key and its earlier value.
     let said = refused(bench.go_on(&["--means-lr", "0.001", "--seed", "3", "--threads", "1"]));
     assert!(said.contains("\n    means-lr was 0.00016 and is 0.001"), "{said}");
     assert!(said.contains("seed was 42 and is 3") && said.contains("--accept-changes"), "{said}");
     assert!(!said.contains("threads"), "threads change nothing: {said}");
-    // What stored pages are laid out by cannot be accepted, nor fewer steps than were done.
+    // The layout of stored pages cannot change, and steps cannot be fewer than were done.
     let said = refused(bench.go_on(&["--page-rows", "64", "--accept-changes"]));
     assert!(said.contains("page-rows was 32 and is 64") && said.contains("--init-ply"), "{said}");
     let said = refused(bench.go_on(&["--steps", "3"]));
@@ -61,7 +61,7 @@ fn what_changed_is_said_and_left_as_it_was() {
     std::fs::remove_dir_all(bench.scene.join("sparse/0")).unwrap();
     std::fs::create_dir(bench.scene.join("sparse/0")).unwrap();
     model.iter().for_each(|(path, bytes)| std::fs::write(path, bytes).unwrap());
-    // After all of that it still goes on, and says what it is given anew.
+    // The run still resumes, and reports the new settings.
     let child = crate::support::scenes::train(&["--resume", text(&out), "--threads", "1", "--evict", "lru"]);
     let said = stderr(&child);
     assert!(child.status.success(), "{said}");
@@ -70,7 +70,8 @@ fn what_changed_is_said_and_left_as_it_was() {
     assert!(ply(&out) == alone.ply, "the scene is another");
 }
 
-/// Accepted changes hold from the step on at which the run stopped, whatever is in memory then, and for later lives.
+/// Accepted changes apply from the step at which the run stopped, independent of the pages in memory, and to all later
+/// restarts.
 #[test]
 fn accepted_changes_are_the_same_in_any_memory() {
     let bench = Bench::new();
@@ -78,8 +79,8 @@ fn accepted_changes_are_the_same_in_any_memory() {
     bench.stopped(Place::Memory, 12);
     copy_folder(&bench.path("out"), &bench.path("twin"));
     copy_folder(&bench.path("out"), &bench.path("still"));
-    // Nothing moves by the change itself: without another step the rows are, bit for bit, those of the stopped run. Their
-    // order may be another: pages that had outgrown themselves are split by now.
+    // The change itself moves no row: without another step the rows equal those of the stopped run bit for bit. Their
+    // order may differ, because oversized pages are split by now.
     let (stopped, steps) = (ply(&bench.path("still")), summary(&bench.path("still"))["steps"].to_string());
     let much = ["--means-lr", "0.1", "--scales-lr", "0.5", "--accept-changes", "--steps", &steps];
     succeeded(bench.go_on_in("still", &much));
@@ -96,7 +97,7 @@ fn accepted_changes_are_the_same_in_any_memory() {
     bench.wait_for_lines_in("twin", &mut child, logged(&bench.path("out")).len() - 8);
     signal(&child, "INT");
     let output = ended(child);
-    // It may have been done before it heard.
+    // The run may have finished before the signal arrived.
     assert!(output.status.code() == Some(130) || output.status.success(), "{}", stderr(&output));
     succeeded(bench.go_on_in("twin", &["--frames", &frames]));
     let (first, second) = (ply(&bench.path("out")), ply(&bench.path("twin")));
@@ -104,7 +105,7 @@ fn accepted_changes_are_the_same_in_any_memory() {
     assert!(first != alone.ply, "the change changed nothing");
 }
 
-/// What was accepted is part of the run: later lives need not be told again, and end alike.
+/// Accepted changes belong to the run: later restarts need no flag, and end with the same bytes.
 #[test]
 fn other_bands_are_accepted_once() {
     let bench = Bench::new();
@@ -124,7 +125,7 @@ fn other_bands_are_accepted_once() {
     }
 }
 
-/// The same dataset and the same first Gaussians are told by what they hold, not by where they lie.
+/// A dataset and first Gaussians are recognized by their contents, not by their path.
 #[test]
 fn a_scene_and_a_start_that_were_moved_are_named_and_the_run_goes_on() {
     let bench = Bench::new();
@@ -146,7 +147,7 @@ fn a_scene_and_a_start_that_were_moved_are_named_and_the_run_goes_on() {
     bench.wait_for_lines(&mut child, logged(&bench.path("out")).len() + 3);
     signal(&child, "INT");
     assert_eq!(ended(child).status.code(), Some(130));
-    // From then on it is there.
+    // Afterwards the file exists.
     succeeded(bench.go_on(&[]));
     assert!(ply(&bench.path("out")) == want, "the scene is another");
 }

@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-/// Steps that are left of all files in order of their names: the start of a session makes what was said before of its
-/// first step and of later ones void.
+/// Valid steps of all files in order of their names: the start of a session voids earlier records of its first step and
+/// later ones.
 pub fn steps(folder: &Path) -> Vec<u64> {
     let mut files: Vec<PathBuf> = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path()).collect();
     files.sort();
@@ -11,7 +11,7 @@ pub fn steps(folder: &Path) -> Vec<u64> {
     for file in files {
         let data = std::fs::read(file).unwrap();
         let mut rest = data.as_slice();
-        // A record is length, checksum, message, checksum; what a kill cut off is no record.
+        // A record is length, checksum, message, checksum; a record cut short by a kill does not count.
         while rest.len() >= 16 {
             let length = u64::from_le_bytes(rest[..8].try_into().unwrap()) as usize;
             if rest.len() < length + 16 {

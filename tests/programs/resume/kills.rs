@@ -9,13 +9,13 @@ use gsscale::base::rng::{Purpose, Stream};
 use std::os::unix::process::ExitStatusExt;
 use std::time::Duration;
 
-/// Commits as often as can be, names some, evaluates, and tells TensorBoard.
+/// Commits as often as possible, names some commits, evaluates, and writes TensorBoard files.
 const OFTEN: &[&str] = &["--commit-every", "0.02", "--save-every", "45", "--eval-every", "70", "--log", "tensorboard"];
-/// Milliseconds until a kill, at most, from the first line of metrics of a life on; one in four lives is killed within
-/// that of its begin.
+/// Maximum milliseconds from a run's first line of metrics to its kill. One in four runs is killed within this time of
+/// its start.
 const KILL_WITHIN: u64 = 200;
 
-/// A share of the kills falls to runs of each kind: in memory, and with 100 %, 50 % and the fewest of the frames.
+/// Each kind of run gets a share of the kills: in memory, and with 100 %, 50 % and the fewest of the frames.
 #[test]
 fn a_run_that_is_killed_at_any_time_ends_with_the_same_bytes() {
     let kills: u32 = std::env::var("GSSCALE_KILLS").ok().map_or(20, |n| n.parse().unwrap());
@@ -40,7 +40,7 @@ fn a_run_that_is_killed_at_any_time_ends_with_the_same_bytes() {
     }
 }
 
-/// One run from its begin to its end, killed now and then while kills are left. Returns its lives.
+/// One run from start to finish, killed while kills are left. Returns its number of processes.
 fn live(bench: &Bench, place: Place, fewest: u64, left: &mut u32, draws: &mut Stream) -> u32 {
     let mut child = bench.begin(place, OFTEN);
     bench.wait_for_lines(&mut child, 4);
@@ -60,7 +60,7 @@ fn live(bench: &Bench, place: Place, fewest: u64, left: &mut u32, draws: &mut St
             return lives;
         }
         (*left, lives) = (left.saturating_sub(1), lives + 1);
-        // Whatever changes no number changes from life to life; a run in memory may lack the memory for it.
+        // Settings that change no result vary from process to process; a run in memory may lack memory for them.
         let mut more = vec!["--threads", ["1", "2"][lives as usize % 2], "--spill-codec"];
         more.push(["raw", "zstd:1"][lives as usize / 2 % 2]);
         let frames = match place {
@@ -74,7 +74,7 @@ fn live(bench: &Bench, place: Place, fewest: u64, left: &mut u32, draws: &mut St
     }
 }
 
-/// What is counted since the start of a run does not start anew with a life.
+/// Counters since the start of a run continue across restarts.
 fn counters_go_on(bench: &Bench) {
     let lines = lines(&bench.path("out"));
     for key in ["seconds", "bytes_written", "pages_needed"] {
@@ -85,7 +85,7 @@ fn counters_go_on(bench: &Bench) {
     }
 }
 
-/// A kill while the checkpoint of a finished run is being removed leaves a map whose segments are gone.
+/// A kill during the removal of a finished run's checkpoint leaves a map without its segments.
 #[test]
 fn a_run_that_was_done_is_not_trained_again() {
     let bench = Bench::new();
@@ -96,7 +96,7 @@ fn a_run_that_was_done_is_not_trained_again() {
         super::bench::copy_folder(&checkpoint, &kept);
         succeeded(bench.go_on(&[]));
         assert!(ply(&out) == alone.ply && !checkpoint.join("FORMAT").exists());
-        // Empty, or this fails.
+        // Succeeds only if the folder is empty.
         let _ = std::fs::remove_dir(&checkpoint);
         std::fs::rename(&kept, &checkpoint).unwrap();
         for segment in std::fs::read_dir(&checkpoint).unwrap().map(|e| e.unwrap().path()) {

@@ -15,7 +15,7 @@ fn open(folder: &Path) -> (SpillDir, Commits) {
     (spill, commits)
 }
 
-/// Names, with the steps and the evaluation of then; and back to one of them.
+/// Named checkpoints keep their steps and evaluations; a run returns to one of them.
 #[test]
 fn saves_are_named_checkpoints() {
     let bench = Bench::new();
@@ -33,20 +33,20 @@ fn saves_are_named_checkpoints() {
             .map(|(name, &g)| (name.clone(), RunState::from_bytes(&commits.run_state(g).unwrap()).unwrap()))
             .collect();
         let steps: Vec<(&str, u32)> = states.iter().map(|(name, s)| (name.as_str(), s.step)).collect();
-        // Step 120 is done when 121 are, as in the names of the PLYs.
+        // Step 120 is done after 121 steps, as in the names of the PLYs.
         assert_eq!(steps, [("step-120", 121), ("step-180", 181), ("step-60", 61)]);
         let tests: Vec<u32> = states.iter().map(|(_, s)| s.test.unwrap().step).collect();
         assert_eq!(tests, [101, 151, 51]);
         assert!(states.iter().all(|(_, s)| s.test.unwrap().psnr > 5.0 && s.test.unwrap().views == 1));
-        // The last two are kept, whatever has a name.
+        // The last two generations are kept, named or not.
         let kept: Vec<u64> = generations.kept().collect();
         assert_eq!(kept.len(), 5, "{kept:?}");
         let last = RunState::from_bytes(&commits.run_state(generations.latest()).unwrap()).unwrap();
         let psnr = summary(&out)["test"]["psnr"].as_f64().unwrap();
         assert_eq!(last.step, STEPS);
-        // JSON may move the last digit.
+        // JSON may change the last digit.
         assert!((last.test.unwrap().psnr - psnr).abs() < 1e-9);
-        // Back to a name, and on from there.
+        // Returns to a name and continues from there.
         let back = generations.pins()["step-120"];
         commits.rollback(back).unwrap();
         drop(spill);
@@ -59,18 +59,19 @@ fn saves_are_named_checkpoints() {
     }
 }
 
-/// More steps than planned: the schedule of the rates is kept, whenever the run is told, and however it is cut.
+/// More steps than planned: the learning-rate schedule stays the same, whenever the change is given and however the run
+/// is interrupted.
 #[test]
 fn more_steps_keep_the_schedule() {
     let bench = Bench::new();
     let (want, out) = (bench.path("want"), bench.path("out"));
     let alone = bench.alone(&[]);
-    // The same from the start: a schedule that ends before the run does.
+    // The same schedule from the start: it ends before the run does.
     let planned = bench.longer(&want, 260);
     assert!(planned != alone.ply);
     // More steps make more rows, so the largest view needs more frames than it did.
     for place in [Place::Memory, Place::Spill(alone.fewest + 20)] {
-        // Ended and kept; done when asked again; on to more.
+        // Finished and kept; finished when asked again; then continued to more steps.
         succeeded(bench.begin(place, &["--keep-checkpoint"]));
         assert!(ply(&out) == alone.ply);
         succeeded(bench.go_on(&[]));
@@ -79,18 +80,18 @@ fn more_steps_keep_the_schedule() {
         bench.wait_for_lines(&mut child, alone.logged.len() + 4);
         signal(&child, "INT");
         assert_eq!(ended(child).status.code(), Some(130));
-        // It knows by now how far it goes.
+        // The run remembers its number of steps.
         succeeded(bench.go_on(&["--keep-checkpoint=false"]));
         assert!(ply(&out) == planned, "{place:?}: the scene is another");
         assert_eq!(summary(&out)["steps"], 260);
         let steps = logged(&out);
         assert!(steps.windows(2).all(|pair| pair[0] < pair[1]) && steps.last() == Some(&259), "{steps:?}");
         std::fs::remove_dir_all(&out).unwrap();
-        // Told in the middle.
+        // The change comes in mid-run.
         bench.stopped(place, 9);
         succeeded(bench.go_on(&["--steps", "260"]));
         assert!(ply(&out) == planned, "{place:?}: the scene is another when told before the end");
-        // Gone is gone.
+        // The removed checkpoint stays removed.
         let said = super::bench::refused(bench.go_on(&["--steps", "300"]));
         assert!(said.contains("--keep-checkpoint"), "{said}");
         std::fs::remove_dir_all(&out).unwrap();
@@ -99,7 +100,7 @@ fn more_steps_keep_the_schedule() {
 }
 
 impl Bench {
-    /// The bytes of a run of more steps with the schedule of the usual one, made in one go.
+    /// The bytes of an uninterrupted run of more steps with the usual schedule.
     fn longer(&self, out: &Path, steps: u32) -> Vec<u8> {
         let (steps, schedule) = (steps.to_string(), STEPS.to_string());
         let args = ["--out", text(out), "--steps", &steps, "--schedule-steps", &schedule];

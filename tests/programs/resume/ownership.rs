@@ -14,7 +14,7 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     entries.map(|path| (path.clone(), std::fs::read(&path).unwrap())).collect()
 }
 
-/// A run in `out` with this spill directory, to its end.
+/// A complete run in `out` with this spill directory.
 fn whole_run(bench: &Bench, out: &Path, spill: &Path, steps: &str) {
     let spill = ["--spill-dir", text(spill), "--frames", "4000", "--spill-codec", "raw"];
     let output = train(&[&[text(&bench.scene), "--out", text(out), "--steps", steps], BUSY, &spill].concat());
@@ -56,7 +56,7 @@ fn a_run_does_not_go_on_from_the_checkpoint_of_another() {
     let (out, spill) = (bench.path("out"), bench.path("spill"));
     let place = Place::Spill(4000);
     bench.stopped(place, 4);
-    // Somebody gives the folder to another run of the very same settings.
+    // The folder is given to another run with identical settings.
     std::fs::rename(&out, bench.path("first")).unwrap();
     std::fs::remove_dir_all(&spill).unwrap();
     bench.stopped(place, 8);
@@ -77,7 +77,7 @@ fn a_run_does_not_go_on_from_the_checkpoint_of_another() {
 fn starting_over_leaves_a_checkpoint_that_is_another_runs() {
     let bench = Bench::new();
     let (out, checkpoint) = (bench.path("out"), bench.path("out/checkpoint"));
-    // Another run's pages lie where those of the run in `out` would.
+    // Another run's pages lie in the place of those of the run in `out`.
     bench.stopped(Place::Memory, 4);
     std::fs::remove_dir_all(&checkpoint).unwrap();
     let (other, steps) = (bench.path("other"), "60");
@@ -93,7 +93,7 @@ fn starting_over_leaves_a_checkpoint_that_is_another_runs() {
     assert!(said.contains("cannot be opened"), "{said}");
     std::fs::write(checkpoint.join("map.redb"), &before[&checkpoint.join("map.redb")]).unwrap();
     assert!(files(&checkpoint) == before, "another run's checkpoint was touched");
-    // Pictures of ours go, whatever else lies beside them stays.
+    // The run's own pictures are removed; other files stay.
     std::fs::remove_file(out.join("metrics.jsonl")).unwrap();
     std::fs::remove_dir_all(&checkpoint).unwrap();
     std::fs::create_dir_all(out.join("renders/test/more")).unwrap();
@@ -114,7 +114,7 @@ fn the_checkpoint_alone_is_enough_to_go_on() {
     let alone = bench.alone(&[]);
     let out = bench.path("out");
     for place in [Place::Spill(alone.fewest), Place::Memory] {
-        // Of the metrics a part is missing, then all.
+        // A part of the metrics is missing, then all of them.
         bench.stopped(place, 6);
         let metrics = std::fs::read(out.join("metrics.jsonl")).unwrap();
         std::fs::write(out.join("metrics.jsonl"), &metrics[..metrics.len() / 2]).unwrap();
@@ -129,7 +129,7 @@ fn the_checkpoint_alone_is_enough_to_go_on() {
         let spill = bench.path("spill");
         let mut named = vec![];
         if place != Place::Memory {
-            // Where the pages lie is in the config: without it they have to be named.
+            // config.toml names the folder of the pages; without it, the user has to.
             assert!(refused(bench.go_on(&[])).contains("--spill-dir"));
             std::fs::remove_dir_all(&out).unwrap();
             named.extend(["--spill-dir", text(&spill)]);
@@ -160,7 +160,7 @@ fn a_run_that_was_cut_off_before_its_first_commit_begins_again() {
         assert_eq!(super::bench::logged(&out), alone.logged, "{place:?}");
         std::fs::remove_dir_all(&out).unwrap();
     }
-    // Pages on a drive that is not mounted are no reason to begin again.
+    // An unmounted drive of pages is no reason to start over.
     let mut child = bench.begin(Place::Spill(4000), &SELDOM);
     bench.wait_for_lines(&mut child, 1);
     child.kill().unwrap();
@@ -169,7 +169,7 @@ fn a_run_that_was_cut_off_before_its_first_commit_begins_again() {
     assert!(refused(bench.go_on(&[])).contains("not mounted"));
     std::fs::remove_dir_all(bench.path("unmounted")).unwrap();
     std::fs::remove_dir_all(&out).unwrap();
-    // A result is worth more than a second start.
+    // A result is never overwritten by a second start.
     let mut child = bench.begin(Place::Memory, &["--frames", "4000"]);
     bench.wait_for_lines(&mut child, 1);
     signal(&child, "INT");
@@ -180,7 +180,7 @@ fn a_run_that_was_cut_off_before_its_first_commit_begins_again() {
     assert!(files(&out) == before);
 }
 
-/// Wherever in its first moments a run is killed: the same command, or `--resume` once there is a config, trains it.
+/// A run killed at any early moment: the same command, or `--resume` once a config exists, trains it.
 #[test]
 fn a_kill_in_the_first_second_is_in_nobodys_way() {
     let bench = Bench::new();
@@ -191,7 +191,7 @@ fn a_kill_in_the_first_second_is_in_nobodys_way() {
         std::thread::sleep(std::time::Duration::from_millis(milliseconds));
         child.kill().unwrap();
         ended(child);
-        // The lines to wait for are those of the second process.
+        // Wait for lines of the second process.
         let _ = std::fs::remove_file(out.join("metrics.jsonl"));
         let mut again = match out.join("config.toml").exists() {
             true => bench.go_on(&SELDOM),
@@ -207,7 +207,7 @@ fn a_kill_in_the_first_second_is_in_nobodys_way() {
     }
 }
 
-/// After a power cut the folder has the names of the files that a run made: the folder and its parent are synced.
+/// After a power failure the folder still has the names of the run's files: the folder and its parent are synced.
 #[test]
 fn the_output_folder_is_synced_after_its_config_was_renamed() {
     if Command::new("strace").args(["-o", "/dev/null", "true"]).status().is_err() {
@@ -233,7 +233,7 @@ fn the_output_folder_is_synced_after_its_config_was_renamed() {
     assert!(lines[renamed..].iter().any(|l| is_sync(l, &out)), "the folder is not synced\n{said}");
 }
 
-/// Two folders with the same run: the one that is left behind neither trains nor removes anything.
+/// Two folders with the same run: the stale folder neither trains nor removes anything.
 #[test]
 fn a_copy_of_an_output_folder_is_the_same_run() {
     let bench = Bench::new();
@@ -246,7 +246,7 @@ fn a_copy_of_an_output_folder_is_the_same_run() {
     assert!(said.contains("not there"), "{said}");
 }
 
-/// A run that is at work is not begun again, gone on with or overwritten by another process.
+/// A running run cannot be started, resumed or overwritten by another process.
 #[test]
 fn one_process_at_a_time_trains_into_a_folder() {
     let bench = Bench::new();
@@ -264,7 +264,7 @@ fn one_process_at_a_time_trains_into_a_folder() {
     succeeded(bench.go_on(&[]));
 }
 
-/// Saved scenes and the mount point of a drive that is not mounted are no reasons to begin again.
+/// Saved scenes and the mount point of an unmounted drive are no reasons to start over.
 #[test]
 fn a_run_with_a_past_is_not_begun_again() {
     let bench = Bench::new();
@@ -288,7 +288,7 @@ fn a_run_with_a_past_is_not_begun_again() {
     assert_eq!(std::fs::read_dir(&spill).unwrap().count(), 0, "something was written to a mount point");
 }
 
-/// An output folder whose config.toml tells no run, or is missing or damaged, does not get another run's checkpoint.
+/// An output folder whose config.toml names no run, is missing or is damaged does not get another run's checkpoint.
 #[test]
 fn a_folder_that_does_not_know_its_run_takes_no_other() {
     let bench = Bench::new();
@@ -310,7 +310,7 @@ fn a_folder_that_does_not_know_its_run_takes_no_other() {
     let said = refused(bench.go_on_in("first", &["--spill-dir", text(&spill)]));
     assert!(said.contains("it holds results") && said.contains(text(&out)), "{said}");
     assert!(files(&spill) == before.0);
-    // The remedy for a damaged config.toml, followed to the letter.
+    // The remedy for a damaged config.toml, followed literally.
     std::fs::write(out.join("config.toml"), "").unwrap();
     assert!(refused(bench.go_on(&[])).contains("remove the file"));
     std::fs::remove_file(out.join("config.toml")).unwrap();

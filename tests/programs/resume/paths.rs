@@ -26,7 +26,7 @@ fn edit_run_state(folder: &Path, edit: impl FnOnce(&mut RunState)) {
     commits.commit(&mut store, &mut Vec::new(), &cut).unwrap();
 }
 
-/// A machine that lacks the path of the last commit, but has one of the same bits, goes on as though nothing were other.
+/// A machine without the path of the last commit, but with a path of the same bits, resumes without a message.
 #[test]
 fn a_run_goes_on_on_another_path_of_the_same_bits() {
     if !SimdPath::Avx2.is_supported() {
@@ -36,7 +36,7 @@ fn a_run_goes_on_on_another_path_of_the_same_bits() {
     let bench = Bench::new();
     let alone = bench.alone(&["--simd", "avx2"]);
     for place in [Place::Memory, Place::Spill(alone.fewest)] {
-        // As though the first life had been on a machine with AVX-512.
+        // As if the first process had run on a machine with AVX-512.
         bench.stopped_with(place, 9, &["--simd", "avx2"]);
         edit_run_state(&bench.checkpoint(place), |state| {
             assert_eq!(state.simd, "avx2");
@@ -50,7 +50,7 @@ fn a_run_goes_on_on_another_path_of_the_same_bits() {
         std::fs::remove_dir_all(bench.path("out")).unwrap();
         let _ = std::fs::remove_dir(bench.checkpoint(place));
     }
-    // Where there is AVX-512: really there and back.
+    // With AVX-512, the test really switches forth and back.
     if !SimdPath::Avx512.is_supported() {
         println!("SKIPPED: this machine lacks AVX-512");
         return;
@@ -76,13 +76,13 @@ fn the_baseline_has_bits_of_its_own() {
     edit_run_state(&bench.checkpoint(Place::Memory), |state| state.simd = "baseline".into());
     let said = refused(bench.go_on(&[]));
     assert!(said.contains("simd was baseline and is avx2"), "{said}");
-    // A path that this program does not know is none of its own class.
+    // An unknown path belongs to no known class.
     edit_run_state(&bench.checkpoint(Place::Memory), |state| state.simd = "neon".into());
     assert!(refused(bench.go_on(&[])).contains("simd was neon and is avx2"));
     succeeded(bench.go_on(&["--accept-changes"]));
 }
 
-/// An epsilon that an older program allowed: refused as the run's, and as that of its last commit.
+/// An epsilon that an older program allowed: refused as the run's, and as the last commit's.
 #[test]
 fn a_run_with_too_small_an_epsilon_does_not_go_on() {
     let bench = Bench::new();

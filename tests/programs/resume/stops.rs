@@ -9,7 +9,7 @@ fn a_run_that_is_asked_to_stop_says_how_to_go_on_and_does() {
     let alone = bench.alone(&[]);
     let out = bench.path("out");
     for place in [Place::Spill(alone.fewest), Place::Memory] {
-        // No commit but those at the stops.
+        // Commits only at the stops.
         let mut child = bench.begin(place, &SELDOM);
         for (lines, (name, code)) in [(3, ("INT", 130)), (12, ("TERM", 143))] {
             bench.wait_for_lines(&mut child, lines);
@@ -33,7 +33,7 @@ fn a_run_that_is_asked_to_stop_says_how_to_go_on_and_does() {
     }
 }
 
-/// Nothing is overwritten silently: neither results nor checkpoints.
+/// Neither results nor checkpoints are overwritten silently.
 #[test]
 fn the_same_command_again_says_that_there_is_a_run() {
     let bench = Bench::new();
@@ -41,7 +41,7 @@ fn the_same_command_again_says_that_there_is_a_run() {
     bench.stopped(Place::Spill(4000), 2);
     let said = refused(bench.begin(Place::Spill(4000), &[]));
     assert!(said.contains("--resume") && said.contains("after removing"), "{said}");
-    // Over the output, but not over a spill directory.
+    // `--overwrite` covers the output, but not a spill directory.
     let said = refused(bench.begin(Place::Spill(4000), &["--overwrite"]));
     assert!(said.contains("checkpoint of another run"), "{said}");
     std::fs::remove_dir_all(bench.path("out")).unwrap();
@@ -50,33 +50,33 @@ fn the_same_command_again_says_that_there_is_a_run() {
     let said = refused(bench.begin(Place::Memory, &[]));
     assert!(said.contains("--resume") && said.contains("start over with --overwrite"), "{said}");
     assert!(bench.path("out/checkpoint/FORMAT").exists());
-    // Starting over takes the checkpoint away, but not what somebody put beside it.
+    // Starting over removes the checkpoint, but not foreign files beside it.
     std::fs::write(bench.path("out/checkpoint/notes.txt"), "mine").unwrap();
     std::fs::remove_file(bench.path("out/metrics.jsonl")).unwrap();
     let mut child = bench.begin(Place::Memory, &[&SELDOM[..], &["--overwrite"]].concat());
     bench.wait_for_lines(&mut child, 2);
     assert!(!bench.path("out/checkpoint/FORMAT").exists() && bench.path("out/checkpoint/notes.txt").exists());
-    // In it, nothing can be committed; the run is none the worse for it.
+    // Nothing can be committed there; the run is unaffected.
     signal(&child, "INT");
     let output = ended(child);
     assert_eq!(output.status.code(), Some(130));
     assert!(stderr(&output).contains("not committed") && !stderr(&output).contains("--resume"), "{}", stderr(&output));
 }
 
-/// A run whose last evaluation failed is not done: its checkpoint stays, and the same command makes up for it.
+/// A run whose last evaluation failed is unfinished: its checkpoint stays, and the same command completes it.
 #[test]
 fn a_run_without_its_last_evaluation_goes_on_to_it() {
     let bench = Bench::new();
     let alone = bench.alone(&[]);
     bench.stopped(Place::Spill(alone.fewest), 2);
     let out = bench.path("out");
-    // In the way of the pictures.
+    // A file blocks the folder of the pictures.
     std::fs::write(out.join("renders"), "mine").unwrap();
     assert!(refused(bench.go_on(&[])).contains("renders"));
     assert!(ply(&out) == alone.ply, "all steps were done");
     assert!(summary(&out)["finished"] == false && bench.path("spill/map.redb").exists());
     std::fs::remove_file(out.join("renders")).unwrap();
-    // As gsscale-eval may have written it of the Gaussians as they were then.
+    // An older result of gsscale-eval.
     std::fs::write(out.join("evaluated.json"), "{}").unwrap();
     succeeded(bench.go_on(&[]));
     assert!(!out.join("evaluated.json").exists(), "comparisons would take it for this run's");

@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::process::Command;
 
-/// Opens the page in headless Chromium: scripts run without an error, and every slider was set up. How many there are;
-/// `None` where there is no Chromium.
+/// Opens the page in headless Chromium and asserts that its scripts ran without an error and set up every slider.
+/// Returns the number of sliders; `None` without Chromium.
 pub fn in_a_browser(page: &Path, scratch: &Path) -> Option<usize> {
     let names = ["chromium", "chromium-browser", "google-chrome"];
     let Some(browser) = names.into_iter().find(|n| Command::new(n).arg("--version").output().is_ok()) else {
@@ -19,7 +19,7 @@ pub fn in_a_browser(page: &Path, scratch: &Path) -> Option<usize> {
         .unwrap();
     let dom = String::from_utf8_lossy(&output.stdout);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    // The script sets the width of the upper picture: it ran to its end for every slider.
+    // The script sets the width of the upper picture last, for every slider.
     let sliders = dom.matches("class=\"slider\"").count();
     assert!(dom.contains("</main>"), "the page is whole");
     assert_eq!(dom.matches("style=\"width: 50%;\"").count(), sliders, "the sliders were not set up");

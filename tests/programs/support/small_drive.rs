@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// A tmpfs of `bytes`, unmounted at the end; `None` where this user may not mount.
+/// A tmpfs of `bytes`, unmounted on drop; `None` if this user may not mount.
 pub struct Small(pub PathBuf);
 
 impl Small {
-    /// Mounts it on a folder that does not exist yet.
+    /// Mounts it on a new folder.
     pub fn mount(folder: &Path, bytes: u64) -> Option<Small> {
         std::fs::create_dir(folder).unwrap();
         let options = format!("size={bytes}");
@@ -22,7 +22,7 @@ impl Small {
         }
     }
 
-    /// Makes it larger, or smaller where what it holds allows it.
+    /// Resizes it; its contents must fit.
     pub fn resize(&self, bytes: u64) {
         let options = format!("remount,size={bytes}");
         assert!(Command::new("mount").args(["-o", &options]).arg(&self.0).status().unwrap().success());
