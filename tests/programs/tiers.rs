@@ -128,7 +128,7 @@ fn a_budget_that_was_refused_trains_with_what_the_remedy_names() {
         too_little.status.code() == Some(1) && said.contains("the view") && !said.contains("name a folder"),
         "{said}"
     );
-    // A plan that does not fit in memory is refused.
+    // A dry run does not load Gaussians beyond the memory.
     let said = stderr(&dry("8MiB"));
     assert!(said.contains("a dry run writes none") && said.contains("8000 Gaussians"), "{said}");
     assert!(!spill.exists());
