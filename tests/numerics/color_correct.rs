@@ -7,7 +7,7 @@ use gsscale::scene::image::{Image, Target};
 const W: u32 = 23;
 const H: u32 = 17;
 
-/// Numbers in 0..1 that repeat for no reason: a multiplicative hash of the index.
+/// Pseudo-random numbers in 0..1: a multiplicative hash of the index.
 fn noise(i: usize, key: u64) -> f64 {
     let x = (i as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15 ^ key.wrapping_mul(0xd134_2543_de82_ef95));
     ((x ^ (x >> 29)).wrapping_mul(0xbf58_476d_1ce4_e5b9) >> 11) as f64 / (1u64 << 53) as f64
@@ -146,11 +146,11 @@ fn edges_have_an_answer() {
     let (image, mut target) = pair();
     let n = image.pixels();
     for how in [ColorCorrect::Affine, ColorCorrect::Quadratic] {
-        // A flat photo and a flat render: nothing to fit, nothing that is not a number.
+        // A flat photo and a flat render: there is nothing to fit, and the result is a number.
         let flat = Target { rgb: vec![128; 3 * n], mask: None, ..target.clone() };
         assert!(color_corrected_psnr(&image, &flat, how).is_finite());
         assert!(color_corrected_psnr(&Image::new(W, H), &target, how).is_finite());
-        // A gray picture, whose terms depend on each other.
+        // A gray picture, whose terms are linearly dependent.
         let mut gray = image.clone();
         let red = gray.rgb[..n].to_vec();
         gray.rgb[n..2 * n].copy_from_slice(&red);

@@ -67,7 +67,7 @@ fn camera(draws: &mut Stream) -> Camera {
     let viewmat =
         std::array::from_fn(|i| [r[i][0] as f32, r[i][1] as f32, r[i][2] as f32, (draws.normal() * 4.0) as f32]);
     let (width, height) = (200 + draws.below(400) as u32, 100 + draws.below(400) as u32);
-    // Wide to narrow, and principal points as far as outside of the image.
+    // Wide to narrow views; principal points up to far outside the image.
     let f = f64::from(width) * draws.range(0.3, 2.5);
     Camera {
         viewmat,
@@ -108,7 +108,7 @@ fn scene(rows: usize, adam: &DeferredAdam) -> SceneState {
 
 #[test]
 fn no_row_that_would_be_drawn_is_left_out() {
-    // A large rate, so that rows move a good deal between their last update and now.
+    // A large learning rate, so that rows move far between their last update and now.
     let adam = DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), SimdPath::best());
     let rows = 3000 + 7;
     let state = scene(rows, &adam);
@@ -127,8 +127,8 @@ fn no_row_that_would_be_drawn_is_left_out() {
             }
         }
     }
-    // The cull takes the largest sigma for every direction, which costs a third here, with needles up to the size of
-    // the scene and views whose principal point lies outside of the picture.
+    // Culling uses the largest sigma for every direction. That lists a third more rows here, with needles up to the
+    // size of the scene and principal points outside the picture.
     assert!(drawn > 4000 && listed * 2 < drawn * 3, "{listed} listed for {drawn} drawn");
 }
 
@@ -151,7 +151,7 @@ fn no_row_that_the_projection_kernel_draws_is_left_out() {
     assert!(drawn > 50_000, "{drawn}");
 }
 
-/// From the pages to the picture: what was not selected would not have changed a bit of it.
+/// From pages to picture: rows that were not selected would not have changed one bit of the picture.
 #[test]
 fn no_row_outside_of_the_selected_pages_changes_a_picture() {
     const STEPS: u32 = 60;
@@ -194,7 +194,7 @@ fn no_row_outside_of_the_selected_pages_changes_a_picture() {
         drawn += usize::from(of_all.iter().any(|&x| x != 0.0));
         assert!(of_view.iter().zip(&of_all).all(|(a, b)| a.to_bits() == b.to_bits()), "view {view}: {camera:?}");
     }
-    // Views look everywhere, many of them past the scene; boxes of pages meet more of them than rows do.
+    // Views look in all directions, many past the scene; more page boxes than rows meet a view.
     let share = selected as f64 / (150 * pages.pager.index().len()) as f64;
     assert!(
         drawn > 100 && left_out > 150 * 1000 && share < 0.9,

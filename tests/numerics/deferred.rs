@@ -94,8 +94,8 @@ fn values_follow_dense_adam_in_f64() {
                 let (width, rate) = (column.width(0), rates.base(column));
                 for (j, (&got, &want)) in now.column(column).iter().zip(&dense[i].values).enumerate() {
                     let error = (f64::from(got) - want).abs();
-                    // Half an ulp of the value for every write and for this reading, and 1e-6 of the rate for
-                    // every write (moments in f32) and reading.
+                    // Half an ulp of the value for every write and for this read, and 1e-6 of the learning rate for
+                    // every write (moments in f32) and read.
                     let half_ulp = want.abs() * f64::from(f32::EPSILON) / 2.0;
                     let slack = (1.0 + writes[j / width]) * (half_ulp + 1e-6 * rate);
                     assert!(error <= slack, "{column:?} value {j} after step {step}: {error:e} > {slack:e}");
@@ -108,8 +108,8 @@ fn values_follow_dense_adam_in_f64() {
     }
 }
 
-/// A long run in which rows are seen at random, a row in fifty at a step, and opacities are reset every 3,000 steps.
-/// Two values a row have gradients: a position, whose rate falls, and the opacity.
+/// A long run: each step sees a random fiftieth of the rows, and opacities are reset every 3,000 steps. Two values of a
+/// row have gradients: a position, whose learning rate decays, and the opacity.
 #[test]
 fn ten_thousand_rows_follow_dense_adam_over_a_long_run_with_resets() {
     const RUN: u32 = 50_000;
@@ -149,7 +149,7 @@ fn ten_thousand_rows_follow_dense_adam_over_a_long_run_with_resets() {
             opacities.values.iter_mut().for_each(|x| *x = x.min(f64::from(cap)));
             opacities.exp_avg.fill(0.0);
             opacities.exp_avg_sq.fill(0.0);
-            // It settles rows: one more rounding of a value.
+            // The reset settles all rows: one more rounding of each value.
             writes.iter_mut().for_each(|w| *w += 1.0);
         }
         if (step + 1) % 5_000 != 0 {
@@ -164,9 +164,9 @@ fn ten_thousand_rows_follow_dense_adam_over_a_long_run_with_resets() {
                 (now.opacities[row], opacities.values[row], base(Column::Opacities)),
             ];
             for ((got, want, rate), mean_square) in values.into_iter().zip(&mut mean_squares) {
-                // Roundings of the value, one for every write and this reading, go to either side: six standard
-                // deviations of as many even draws within half an ulp. Those of the moments may all go to one side: a
-                // millionth of the rate for each.
+                // Roundings of the value, one for every write and this read, go to either side: six standard deviations
+                // of as many uniform draws within half an ulp. Roundings of the moments may all go to one side: a
+                // millionth of the learning rate each.
                 let half_ulp = want.abs().max(1.0) * f64::from(f32::EPSILON) / 2.0;
                 let count = 1.0 + writes[row];
                 let slack = 6.0 * (count / 3.0).sqrt() * half_ulp + 1e-6 * count * rate;
@@ -175,7 +175,7 @@ fn ten_thousand_rows_follow_dense_adam_over_a_long_run_with_resets() {
                 *mean_square += error * error / rows as f64;
             }
         }
-        // Values are of the order of one; a thousand even draws within half an ulp of it come to 1.1e-6.
+        // Values are of the order of one; a thousand uniform draws within half an ulp of one sum to 1.1e-6.
         assert!(mean_squares.iter().all(|x| x.sqrt() < 4e-6), "after step {step}: {mean_squares:?}");
     }
 }
@@ -210,7 +210,7 @@ fn bits_of(state: &SceneState) -> Vec<u32> {
     floats.map(|x| x.to_bits()).chain(state.stamp.iter().copied()).collect()
 }
 
-/// Rows some of whose values are too small for a normal float, or are log-scales beyond their limits.
+/// Rows with denormal values or with log-scales beyond their limits.
 fn eventful_start(degree: u8) -> SceneState {
     let mut state = SceneState::from_columns(random_columns(2100, degree, 1.0, 3));
     for column in Column::ALL {
@@ -220,8 +220,8 @@ fn eventful_start(degree: u8) -> SceneState {
     state
 }
 
-/// Gradients that decide what is done with their row: what all values are set to, if anything, then a column, a place in
-/// its row (0 the first, 1 the last value) and the value there.
+/// Gradients that decide whether a row is updated: the value for all entries, if any, then a column, a place in its row
+/// (0 the first, 1 the last value) and the value there.
 const ODD_GRADS: [(Option<f32>, Column, f64, f32); 16] = [
     (Some(0.0), Column::Means, 0.0, 0.0),
     (Some(-0.0), Column::Means, 0.0, 0.0),
@@ -241,13 +241,13 @@ const ODD_GRADS: [(Option<f32>, Column, f64, f32); 16] = [
     (None, Column::Means, 1.0, -1.0000001e18),
 ];
 
-/// With an eps at which some rows (gradients down to 1e-7) take the direct sum.
+/// An eps at which some rows (gradients down to 1e-7) take the direct sum.
 fn eventful_config() -> AdamConfig {
     AdamConfig { eps: 1e-8, ..AdamConfig::default() }
 }
 
-/// 60 steps with what each loop has a branch for: rows without a gradient and with one that is skipped, first moments of
-/// zero, seconds that eps touches.
+/// 60 steps that reach every branch of each loop: rows without a gradient, rows with a skipped gradient, first moments
+/// of zero, second moments near eps.
 fn eventful_steps(simd: SimdPath, degree: u8, moments: Moments) -> (DeferredAdam, SceneState, [usize; 2]) {
     let adam = DeferredAdam::new(Rates::new(1.0, 100), eventful_config(), simd).with_moments(moments);
     let mut state = eventful_start(degree);
@@ -273,7 +273,7 @@ fn eventful_steps(simd: SimdPath, degree: u8, moments: Moments) -> (DeferredAdam
     (adam, state, counts)
 }
 
-/// Rows of a list of any order, with rows that are listed twice, after `now` steps.
+/// Evaluates a list of rows in any order, with duplicates, after `now` steps.
 fn evaluate_listed(state: &SceneState, adam: &DeferredAdam, now: u32) -> Columns {
     let rows = state.rows();
     let mut out = Columns::zeros(rows + 130, state.sh_degree());
@@ -303,7 +303,7 @@ fn the_same_bits_on_every_instruction_path_whatever_happens_to_rows() {
     }
 }
 
-/// Which values are no numbers is the same on every path, and the others keep their bits: nothing hides that a state broke.
+/// Every path gives NaN and infinity for the same values and equal bits for all others: no path hides a broken state.
 #[test]
 fn nan_stays_nan_on_every_instruction_path() {
     let (plain, mut state, _) = eventful_steps(SimdPath::Baseline, 3, Moments::F32);
@@ -366,7 +366,7 @@ fn settling_a_row_keeps_its_later_values() {
     let got = evaluate_all(&state, &adam, 300);
     for column in Column::ALL {
         for (a, b) in got.column(column).iter().zip(want.column(column)) {
-            // One more rounding of the value, and of moments that still move it by a few rates.
+            // One more rounding of the value, and of moments that still move the value by a few learning rates.
             let slack = b.abs() * f32::EPSILON + 1e-6 * adam.rates().base(column) as f32;
             assert!((a - b).abs() <= slack, "{column:?} {a} {b}");
         }
@@ -400,12 +400,12 @@ fn bad_gradients_leave_their_row_alone(simd: SimdPath) {
             assert_eq!(state.exp_avg_sq.row(column, row), before.exp_avg_sq.row(column, row));
         }
     }
-    // A runaway log-scale is brought back to the limit when its row is updated.
+    // A runaway log-scale is clamped to the limit when its row is updated.
     assert_eq!(state.columns.scales[15], 30.0);
     assert!(Column::ALL.into_iter().all(|c| state.columns.column(c).iter().all(|x| x.is_finite())));
 }
 
-/// A row is loaded together with a little of the one behind it, and the last row of a table is worked on by other code.
+/// A load of a row also reads a little of the next row, and the last row of a table takes a different code path.
 #[test]
 fn a_rows_result_does_not_depend_on_its_neighbours() {
     SimdPath::ALL.into_iter().filter(|p| p.is_supported()).for_each(rows_beside_it_change_no_bit);
@@ -425,7 +425,7 @@ fn rows_beside_it_change_no_bit(simd: SimdPath) {
             let listed: Vec<u32> = (0..rows as u32).filter(|row| !(row + step as u32).is_multiple_of(4)).collect();
             let mut grads = grads_at(&listed, degree, now);
             for i in 0..listed.len() {
-                // Rows without a gradient and rows that are skipped lie before and behind others.
+                // Rows without a gradient and skipped rows lie before and after others.
                 let of = [None, Some(0.0), None, Some(f32::NAN), Some(0.0), None, None][(i + step) % 7];
                 if let Some(value) = of {
                     Column::ALL.into_iter().for_each(|column| grads.row_mut(column, i).fill(value));
@@ -457,7 +457,7 @@ fn rows_beside_it_change_no_bit(simd: SimdPath) {
     }
 }
 
-/// Every case on every instruction path that this machine has.
+/// Every case on every SIMD path of this machine.
 fn each_path<T: Clone, const N: usize>(cases: [T; N]) -> impl Iterator<Item = (SimdPath, T)> {
     let paths = SimdPath::ALL.into_iter().filter(|p| p.is_supported());
     paths.flat_map(move |simd| cases.clone().map(|case| (simd, case)))
@@ -475,7 +475,7 @@ fn a_list_that_does_not_ascend_is_refused_before_any_row_is_changed() {
     }
 }
 
-/// A view of rows 3000 to 5200 of a table, which is worked on in pieces.
+/// Rows 3000 to 5200 of a table, processed in pieces.
 #[test]
 fn a_list_that_does_not_fit_the_view_is_refused_before_any_row_is_changed() {
     for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
@@ -483,7 +483,7 @@ fn a_list_that_does_not_fit_the_view_is_refused_before_any_row_is_changed() {
         let all: Vec<u32> = (3000..5200).collect();
         let (grads, values) = (grads_at(&all, 3, 0), random_columns(all.len(), 3, 1.0, 5));
         let start = SceneState::from_columns(values.clone());
-        // All rows but the odd one are right, so that what is worked on beside it would be changed.
+        // All rows but the odd one have valid gradients, so that an error beside the odd row would show.
         let last = all.len() - 1;
         for (at, row) in [(0, 3000), (0, 2999), (last, 5200), (last, 5198), (10, 3011)] {
             let (mut list, is_right) = (all.clone(), all[at] == row);
@@ -514,7 +514,7 @@ fn without_catch_up_rows_keep_their_values_without_a_gradient() {
         adam.step(&mut exact, &all, &grads, step);
     }
     assert!(still == exact, "with a gradient at every step there is nothing to catch up with");
-    // Years later.
+    // Many steps later.
     assert!(evaluate_all(&still, &sparse, 1500) == still.columns);
     assert!(evaluate_all(&exact, &adam, 1500) != exact.columns);
     let before = still.clone();
@@ -523,7 +523,7 @@ fn without_catch_up_rows_keep_their_values_without_a_gradient() {
     assert!(
         still.columns == before.columns && still.exp_avg == before.exp_avg && still.exp_avg_sq == before.exp_avg_sq
     );
-    // The next gradient meets the moments as the last one left them.
+    // The next gradient finds the moments as the last gradient left them.
     let grads = grads_at(&all, degree, 1500);
     sparse.step(&mut still, &all, &grads, 1500);
     let (m, g) = (before.exp_avg.means[0], grads.means[0]);

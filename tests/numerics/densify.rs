@@ -64,7 +64,7 @@ fn touch(
     accumulate(&mut state.view_mut(), &rows, &v_means2d, &radii, [20, 30], histogram);
 }
 
-/// Every row as (values, moments, stamp, statistics) by uid: what must agree, bit for bit.
+/// Every row as (values, moments, stamp, statistics) by uid: these must agree bit for bit.
 fn by_uid(state: &SceneState) -> BTreeMap<u64, Vec<u32>> {
     let mut rows = BTreeMap::new();
     for row in 0..state.rows() {
@@ -120,7 +120,7 @@ fn a_round_does_what_a_plain_implementation_does() {
             assert_eq!(state.stamp[at], 81);
         }
         if kept == 1 {
-            // Not rewritten: the stored row is the one before, statistics aside.
+            // A row that was not rewritten: the stored row equals the one before, except for statistics.
             let at = row_after[&uid];
             assert_eq!(state.stamp[at], before.stamp[row]);
             assert_eq!(state.columns.row(Column::Means, at), before.columns.row(Column::Means, row));
@@ -134,7 +134,7 @@ fn a_round_does_what_a_plain_implementation_does() {
     assert!(state.grad2d.iter().all(|&g| g == 0.0) && state.count.iter().all(|&n| n == 0));
 }
 
-/// Whether a part of the scene is looked at in a step.
+/// Whether a part of the scene is drawn at a step.
 fn part_is_drawn(part: usize, step: u32) -> bool {
     hash64(&[part as u64, u64::from(step), 1]).is_multiple_of(23)
 }
@@ -180,7 +180,7 @@ fn events_applied_late_to_parts_give_the_rows_of_events_applied_on_time() {
     }
     assert_eq!(log.len(), 10);
     assert!(whole.uid.iter().filter(|&&uid| uid >= 1200).count() > 100, "hardly anything grew");
-    // Late: each part applies what it missed when it is next looked at, and at the end.
+    // Late: each part applies the missed events when it is next drawn, and at the end.
     let mut late = BTreeMap::new();
     for part in 0..parts {
         let mut state = start.clone();
@@ -203,7 +203,7 @@ fn events_applied_late_to_parts_give_the_rows_of_events_applied_on_time() {
     assert!(by_uid(&whole) == late);
 }
 
-/// The histogram of the rows of a table, counted afresh.
+/// Recounts the histogram of the rows of a table.
 fn histogram_of(state: &SceneState) -> GradHistogram {
     let mut histogram = GradHistogram::default();
     for (&grad2d, &count) in state.grad2d.iter().zip(&state.count).filter(|(_, n)| **n > 0) {
@@ -229,8 +229,8 @@ fn the_cap_is_reached_and_never_exceeded() {
             histogram.clear();
             assert!(state.rows() as u64 <= max_gaussians.max(2000), "{} of {max_gaussians}", state.rows());
         }
-        // A bin is under 1 % wide: with some 1500 rows with statistics a few dozen may share the first that does
-        // not fit; three rounds close most of the gap.
+        // A bin is under 1 % wide: of some 1500 rows with statistics, a few dozen may share the first bin that does not
+        // fit. Three rounds close most of the gap.
         assert!(state.rows() as u64 + 10 >= max_gaussians, "{} of {max_gaussians}", state.rows());
     }
 }

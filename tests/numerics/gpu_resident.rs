@@ -14,16 +14,16 @@ use gsscale::scene::image::Target;
 
 /// Most rows of a view.
 const ROWS: usize = 1500;
-/// Views before the first that counts: all size classes of buffers, their free lists and the driver's pools.
+/// Views before the measurement: they fill all size classes of buffers, their free lists and the driver's pools.
 const WARM: usize = 40;
-/// Views that count.
+/// Measured views.
 const VIEWS: usize = 60;
-/// What resident memory may grow by over [`VIEWS`] views, bytes. Measured: under 1.5 MB, which is heap that worker
-/// threads come to share out differently. A driver that keeps a copy of each shader for every new count of rows (see
-/// [`GpuOptions::uniform_blocks`]) takes 118 MB for them, and one kept buffer of 64 KiB a view takes 4 MB.
+/// Allowed growth of resident memory over [`VIEWS`] views, bytes. Measured: under 1.5 MB, which is heap that worker
+/// threads distribute differently. A driver that keeps a copy of each shader for every new count of rows (see
+/// [`GpuOptions::uniform_blocks`]) takes 118 MB; one leaked buffer of 64 KiB a view takes 4 MB.
 const GROWTH: u64 = 3_000_000;
 
-/// Bytes, where the system tells.
+/// Resident memory of this process, bytes, if the system reports it.
 fn resident() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/self/statm").ok()?;
     let pages: u64 = text.split_whitespace().nth(1)?.parse().ok()?;

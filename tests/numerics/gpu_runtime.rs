@@ -33,7 +33,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 "#,
 };
 
-/// Adds to the place of every workgroup.
+/// Adds 1 to the element of every workgroup.
 const MARK: Source = Source {
     name: "test/mark.wgsl",
     text: r#"
@@ -195,7 +195,7 @@ fn the_budget_is_kept_and_an_excess_names_need_and_budget() {
     let reused = gpu.buffer("reused", (1 << 20) - 5).unwrap();
     assert_eq!(gpu.traffic().device_allocations, 2);
     drop((reused, second));
-    // Neither of the free buffers fits: both are given back to make room.
+    // Neither free buffer fits: both are released to make room.
     let whole = gpu.buffer("whole", 3 << 20).unwrap();
     let traffic = gpu.traffic();
     assert_eq!((traffic.device_bytes, traffic.device_bytes_peak, traffic.device_allocations), (budget, budget, 3));
@@ -267,7 +267,7 @@ fn wrong_bindings_and_copies_are_errors_that_name_them() {
     let (one, two) = (gpu.begin("one"), gpu.begin("two"));
     assert!(gpu.submit(one).unwrap_err().to_string().contains("two recorders"));
     gpu.submit(two).unwrap();
-    // What is set aside counts as open, until it is submitted or given up.
+    // A recording that is set aside counts as open until it is submitted or dropped.
     let mut recorder = gpu.begin("three");
     recorder.upload(&a.view(), &[7u32; 4]).unwrap();
     let recording = recorder.set_aside();

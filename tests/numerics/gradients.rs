@@ -26,10 +26,10 @@ const STEP: f64 = 2e-7;
 /// A step of a mean moves it by up to 1e-5 px, which changes an alpha at the rim of the smallest footprint by 1e-5;
 /// f32 changes it by less.
 const MARGIN_MIN: f64 = 5e-5;
-/// Relative L2 error of a column: some ten times what f32 leaves of it (2e-6 at most here).
+/// Relative L2 error of a column: about ten times the error of f32 (2e-6 at most here).
 const COLUMN_L2: f64 = 2e-5;
-/// Error of a row relative to itself plus a thousandth of the root mean square. f32 leaves 1e-5; opacities near 1
-/// hardly move anything, and the rounding of the differences leaves 3e-4 of them.
+/// Error of a row relative to itself plus a thousandth of the root mean square. f32 leaves 1e-5; opacities near 1 have
+/// tiny gradients, and the rounding of the differences leaves 3e-4 of these.
 const ROW_MAX: f64 = 1e-3;
 
 fn camera() -> Camera {
@@ -47,7 +47,7 @@ fn camera() -> Camera {
     }
 }
 
-/// What a scene is drawn from.
+/// Parameters of a random scene.
 struct Recipe {
     rows: usize,
     stored_degree: u8,
@@ -101,7 +101,7 @@ impl Recipe {
         rows
     }
 
-    /// The first seed's scene that is far from every discontinuity.
+    /// The scene of the first seed that is far from every discontinuity.
     fn scene(&self) -> (Columns, Render64) {
         let candidates = (0..200).map(|seed| {
             let rows = self.draw(seed);

@@ -74,10 +74,10 @@ fn degenerate_clouds_get_sane_scales() {
     for points in [vec![[0.0; 3]], vec![[7.0, -1.0, 3.0]; 200]] {
         let columns = init(&points, &options);
         assert_eq!(columns.rows(), points.len());
-        // Nothing to measure: 0.01 scene scales.
+        // One point has no neighbours: 0.01 scene scales.
         assert!(columns.scales.iter().all(|s| (s - 0.02f32.ln()).abs() < 1e-6));
     }
-    // Two and three points: the mean over the neighbours there are.
+    // Two and three points: the mean over the existing neighbours.
     let pair = init(&[[0.0; 3], [0.0, 0.5, 0.0]], &options);
     assert!(pair.scales.iter().all(|s| (s - 0.5f32.ln()).abs() < 1e-6));
     // Five coincident points in an ordinary cloud get its median distance.
@@ -89,7 +89,7 @@ fn degenerate_clouds_get_sane_scales() {
     let mut all: Vec<f32> = (0..204).map(|row| columns.row(Column::Scales, row)[0]).collect();
     all.sort_by(f32::total_cmp);
     assert!(all[60] < lone && lone < all[140], "{lone}");
-    // The guards, in scene scales.
+    // The limits of scales, in scene scales.
     let spread = init(&[[0.0; 3], [1e-9, 0.0, 0.0], [1e6, 0.0, 0.0]], &options);
     let near_ln = |scale: f32, x: f32| (scale - x.ln()).abs() < 1e-6;
     assert!(near_ln(spread.row(Column::Scales, 2)[0], 20.0), "{:?}", spread.scales);

@@ -33,7 +33,7 @@ const VGG: Layers = &[
     ("slice5.28", [512, 512, 3, 3], true),
 ];
 
-/// As `uniform` of the script.
+/// Like `uniform` of the script.
 fn uniform(stream: u64, count: usize) -> impl Iterator<Item = f64> {
     (1..=count as u64).map(move |i| (mix64((stream << 32) + i) >> 40) as f64 / f64::from(1 << 24))
 }

@@ -28,14 +28,14 @@ const OTHER_WORKGROUPS: &[(&str, &str, [u32; 3], &str)] = &[
     ("rasterize_bwd.wgsl", "rasterize_bwd", [64, 1, 1], "four pixels of a tile to an invocation"),
 ];
 
-/// Variants of one shader that are still tested one by one.
+/// Number of variants of one shader up to which every variant is tested.
 const VARIANTS_MAX: usize = 64;
 
 fn all_layouts() -> Vec<StructLayout> {
     LAYOUTS.iter().flat_map(|table| table.iter().copied()).collect()
 }
 
-/// Everything that is wrong with a shader.
+/// All faults of a shader.
 fn problems(source: &Source, layouts: &[StructLayout]) -> Vec<String> {
     let all = match variants(source) {
         Ok(all) if all.len() > VARIANTS_MAX => return vec![format!("{}: {} variants", source.name, all.len())],
@@ -124,7 +124,7 @@ fn layout_problems(module: &naga::Module, layouts: &[StructLayout]) -> Vec<Strin
             }
             continue;
         };
-        // Names with an underscore in front are padding: only the others must stand at equal places.
+        // Names with a leading underscore are padding: only the others must have equal offsets.
         let shader: Vec<_> = members.iter().map(|m| (m.name.clone().unwrap_or_default(), m.offset as usize)).collect();
         let shader: Vec<_> =
             shader.iter().map(|(n, o)| (n.as_str(), *o)).filter(|(n, _)| !n.starts_with('_')).collect();
@@ -218,7 +218,7 @@ fn constants_are_the_same_in_both_languages() {
     }
 }
 
-/// The checks above see what they should: each fault in a shader that is otherwise fine is found.
+/// The checks above find each fault in an otherwise correct shader.
 #[test]
 fn the_checks_find_faults() {
     const GOOD: &str = "struct U { count: u32, scale: f32 }

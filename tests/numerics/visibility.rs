@@ -36,7 +36,8 @@ fn rotation(draws: &mut Stream) -> [[f64; 3]; 3] {
     ]
 }
 
-/// Any direction; wide to narrow; principal points as far as outside of the image; small and large worlds.
+/// A random camera: any direction, wide to narrow, principal points up to far outside the image, small and large
+/// worlds.
 fn camera(draws: &mut Stream) -> Camera {
     let r = rotation(draws);
     let far_out = libm::pow(10.0, draws.range(-1.0, 4.0));
@@ -85,7 +86,7 @@ fn no_row_that_may_be_drawn_lies_in_a_page_that_is_not_listed() {
         assert!(list.windows(2).all(|pair| pair[0] < pair[1]));
         for (page, rows) in pages.iter().enumerate() {
             let is_listed = list.binary_search(&PageNo(page as u32)).is_ok();
-            // The scalar and the wide form are the same test.
+            // The scalar and the SIMD form are the same test.
             assert_eq!(frustum.planes().may_meet(&index[page].bounds), is_listed);
             let drawn = rows.iter().any(|row| frustum.may_draw(row.mean, row.sigma_max));
             assert!(is_listed || !drawn, "page {page} of {camera:?}");
@@ -94,13 +95,13 @@ fn no_row_that_may_be_drawn_lies_in_a_page_that_is_not_listed() {
         listed_pages += list.len();
         all_pages += pages.len();
     }
-    // Boxes around rows are wider than the rows, but the test is one: it leaves out most of what is not drawn.
+    // Boxes are wider than their rows, and one test covers a page: it still leaves out most pages that are not drawn.
     assert!(drawn_pages > 10_000 && drawn_pages * 3 < all_pages * 2, "{drawn_pages} of {all_pages}");
     assert!(listed_pages - drawn_pages < (all_pages - drawn_pages) / 6, "{listed_pages} listed for {drawn_pages}");
 }
 
-/// Walks a row from inside to outside until the row test flips between two neighbours, which is where roundings
-/// decide, and asks for its page there: alone, and as the innermost of rows that reach outwards.
+/// Moves a row from inside to outside until the row test flips between two neighbouring values, where roundings decide.
+/// Asks for its page there: with the row alone, and with the row as the innermost of rows that reach outwards.
 #[test]
 fn the_last_row_that_is_drawn_is_in_a_listed_page() {
     let mut draws = Stream::new(2, Purpose::Test, 40, 0);

@@ -105,8 +105,8 @@ fn adam_dense_f32_equals_torch() {
     }
 }
 
-/// The rival of `adam_seeds` is torch in f32: nearly every value has torch's own bits. (Which operations torch's compiler
-/// fused is a guess, and wrong for some tails of its loops; with no fused operation, or others, more than 8 % differ in
+/// [`Torch32`] imitates torch in f32: nearly every value has torch's own bits. (Which operations torch's compiler fused
+/// is a guess, and wrong for some tails of its loops; with no fused operation, or other ones, more than 8 % differ in
 /// every file.)
 #[test]
 fn torch_in_f32_is_imitated() {
@@ -128,8 +128,8 @@ fn torch_in_f32_is_imitated() {
     }
 }
 
-/// The fixture's values as means, one to a row, so that each is touched by its own schedule alone and both rate schedules
-/// go through the trainer's own path.
+/// The fixture's values as means, one to a row, so that each follows its own touch schedule and both rate schedules
+/// take the trainer's own path.
 fn state_of(case: &Case) -> SceneState {
     let mut columns = Columns::zeros(case.values, 0);
     for (row, x) in case.file.f32("param0").into_iter().enumerate() {
@@ -149,7 +149,7 @@ fn rates_of(case: &Case) -> Rates {
     rates
 }
 
-/// Deferred Adam with its state in f64: what remains is the error of the formula.
+/// Deferred Adam with its state in f64: the remaining error is that of the formula.
 #[test]
 fn adam_deferred_in_f64_is_within_a_millionth_of_a_rate() {
     for name in FILES {
@@ -159,7 +159,7 @@ fn adam_deferred_in_f64_is_within_a_millionth_of_a_rate() {
         let rate = case.lrs[0];
         let mut values = case.file.f64("param0").to_vec();
         let mut moments = vec![[0.0f64; 2]; case.values];
-        // By rows: a row takes a step when one of its columns has a gradient.
+        // A row takes a step when one of its columns has a gradient.
         let mut stamps = vec![0u32; case.values / case.columns];
         let value_at = |values: &[f64], moments: &[[f64; 2]], stamps: &[u32], i: usize, now: u32| {
             values[i] - rate * tables.movement(moments[i], stamps[i / case.columns], now, true)
@@ -181,7 +181,7 @@ fn adam_deferred_in_f64_is_within_a_millionth_of_a_rate() {
             let Some(snap) = case.snaps.iter().position(|&s| s == step) else { continue };
             let now = (0..case.values).map(|i| value_at(&values, &moments, &stamps, i, step as u32));
             let error = max_abs(now, case.snapshot("param_f64", snap)) / rate;
-            // What the series leaves out near its floor; each later step adds its own.
+            // The truncation error of the series near its floor; each later step adds its own.
             assert!(error < 1e-6, "{name} after step {step}: {error:e} of a rate");
         }
     }
@@ -225,7 +225,7 @@ fn adam_deferred_equals_torch_at_every_snapshot() {
         unlucky += compare_with_torch_in_f32(&case, name, &largest);
         values += case.values;
     }
-    // Of the values of other seeds (`adam_seeds`) less than one in a hundred, too.
+    // Likewise less than one in a hundred of the values of other seeds (`adam_seeds`).
     assert!(unlucky * 67 <= values, "{unlucky} of {values} values");
 }
 

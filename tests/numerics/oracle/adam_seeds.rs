@@ -23,7 +23,7 @@ const SIZES: usize = 8;
 /// Values of a schedule.
 const VALUES: usize = COPIES * SIZES;
 
-/// One run: its length, its rates, eps, and where it draws from.
+/// One run: its length, learning rate, eps, and random stream.
 struct Run {
     seed: u64,
     steps: u32,
@@ -69,16 +69,16 @@ impl Errors {
     }
 }
 
-/// What a run came to.
+/// The result of a run.
 struct Outcome {
-    /// By value, of which each schedule has [`VALUES`]; their gradient sizes alternate.
+    /// By value; each schedule has [`VALUES`], with alternating gradient sizes.
     errors: Vec<Errors>,
     /// By schedule: error of each second moment after the last step, relative to that in f64.
     second_moments: Vec<Vec<f64>>,
 }
 
 impl Outcome {
-    /// Errors of the values that are chosen by their number.
+    /// Errors of the values whose numbers satisfy `of`.
     fn over(&self, of: impl Fn(usize) -> bool) -> Errors {
         let chosen = self.errors.iter().enumerate().filter(|&(i, _)| of(i));
         chosen.fold(Errors::default(), |a, (_, b)| a.join(b))
@@ -107,7 +107,7 @@ fn is_touched(schedule: usize, step: u32, due: &mut u32, draws: &mut Stream) -> 
     touched
 }
 
-/// Runs all schedules of a run; the values are positions of rows of their own.
+/// Runs all schedules of a run; each value is the position of its own row.
 fn outcome_of(run: &Run, simd: SimdPath) -> Outcome {
     let count = SCHEDULES * VALUES;
     let config = AdamConfig { eps: run.eps, ..AdamConfig::default() };
@@ -147,7 +147,7 @@ fn outcome_of(run: &Run, simd: SimdPath) -> Outcome {
     }
     for i in 0..count {
         let v = f64::from(state.exp_avg_sq.means[3 * i]);
-        // Ours is as its last gradient left it, dense Adam's has decayed since.
+        // The deferred moment dates from its last gradient; dense Adam's has decayed since.
         let since = f64::from(run.steps - state.stamp[i]);
         let want = dense.exp_avg_sq[i] / libm::pow(config.beta2, since);
         // Below, f32 has fewer digits.
@@ -179,7 +179,7 @@ fn adam_deferred_errs_no_more_than_torch_in_f32_on_any_seed() {
         unlucky += outcome.errors.iter().filter(|e| e.largest[0] > 2.0 * e.largest[1]).count();
         values += outcome.errors.len();
     }
-    // Where torch's own roundings of one value happened to cancel, twice its error is less than it is expected to be.
+    // For a value whose roundings cancel in torch by chance, twice torch's error is below the expected error.
     assert!(unlucky * 67 <= values, "{unlucky} of {values} values");
     if std::env::var_os("GSSCALE_PRINT").is_some() {
         println!("{unlucky} of {values} values err by more than twice torch's error");

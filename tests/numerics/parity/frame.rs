@@ -44,7 +44,7 @@ fn photo(width: u32, height: u32, masked: bool) -> Target {
     Target { width, height, rgb, mask }
 }
 
-/// What a view gives.
+/// The results of a view.
 struct Results {
     image: Image,
     value: LossValue,
@@ -76,7 +76,7 @@ fn l2(got: &[f32], want: &[f32]) -> f64 {
 
 /// Relative L2 of a gradient column: a thousand times the rounding of one stage, for sums whose terms cancel.
 const GRADIENT_L2: f64 = 2e-4;
-/// Of a pixel, where no decision moved.
+/// Error of a pixel without a flipped decision.
 const PIXEL: f32 = 5e-5;
 
 fn assert_same(what: &str, got: &Results, want: &Results) {
@@ -117,7 +117,7 @@ fn bits(results: &Results) -> Vec<u32> {
 fn views_are_those_of_the_cpu() {
     let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
     let mut cpu = CpuRenderer::new();
-    // One renderer for all: what an earlier view left behind must not show.
+    // One renderer for all views: leftovers of an earlier view must not show.
     for (rows, width, height, sh_degree) in [(4000, 160, 112, 3), (3, 65, 47, 2), (20_000, 123, 77, 1), (900, 40, 9, 0)]
     {
         let view = scene(rows, width, height);
@@ -237,7 +237,7 @@ fn sums_of_intersections_in_windows_give_the_same_bits() {
 /// More intersections than sums fit one binding of 128 MiB, at its real size: some 10 s of CPU time on a software adapter.
 #[test]
 fn a_view_beyond_one_binding_of_sums_is_that_of_the_cpu() {
-    // Of every adapter as much as the least that is accepted.
+    // Every adapter is limited to the smallest accepted binding.
     let limit = 128 << 20;
     let Some(mut gpu) = renderer(&GpuOptions { max_binding_bytes: Some(limit), ..GpuOptions::default() }) else {
         return;
@@ -418,7 +418,8 @@ fn gradients_that_the_caller_adds_to_reach_the_rows() {
     let (corrected, want) = (with_exposure(&mut gpu, 1.25), with_exposure(&mut CpuRenderer::new(), 1.25));
     assert_same("an exposure", &corrected, &want);
     assert!((corrected.value.loss - plain.value.loss).abs() > 1e-3, "the loss compares the corrected picture");
-    // A frame that was too small is found out by whoever asks first: here the caller who wants the gradient.
+    // A capacity that was too small is detected by the first reader of a result: here the caller that wants the
+    // gradient.
     gpu.set_capacity(100);
     assert!(bits(&with_term(&mut gpu, Some(1.0))) == bits(&got));
     assert_eq!(gpu.frames_again(), 1);

@@ -13,7 +13,7 @@ use gsscale::scene::image::{Image, Target};
 const SIZES: [[u32; 2]; 10] =
     [[96, 64], [65, 47], [1, 1], [1, 40], [50, 1], [16, 16], [11, 11], [10, 33], [0, 7], [0, 0]];
 
-/// The device as it is, with subgroup operations where it has them, and on the plain path.
+/// The device as it is, with subgroup operations if supported, and on the plain path.
 fn devices() -> impl Iterator<Item = Gpu> {
     [None, Some(false)].into_iter().filter_map(|subgroups| open(&GpuOptions { subgroups, ..GpuOptions::default() }))
 }
@@ -88,7 +88,7 @@ fn assert_same(what: &str, gpu: &Gpu, image: &Image, target: &Target, options: &
     }
 }
 
-/// Of the largest gradient: five times what lavapipe shows.
+/// Error relative to the largest gradient: five times lavapipe's.
 const LIMIT: f32 = 1e-4;
 
 #[test]
@@ -147,7 +147,7 @@ fn non_finite_pixels_show_unless_masked() {
         let mut image = clean.clone();
         image.rgb[place] = poison;
         assert!(!on_gpu(&gpu, &image, &target, &options).0.loss.is_finite(), "{poison}");
-        // Behind the mask nothing of it is seen.
+        // Masked pixels have no effect.
         let mut mask = vec![255; image.pixels()];
         mask[place] = 0;
         target.mask = Some(mask);

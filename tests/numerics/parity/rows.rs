@@ -45,7 +45,7 @@ fn random_rows(n: usize) -> Columns {
     rows
 }
 
-/// What the tile stages hand back: twelve floats for each row, as in `shaders/shared/splat.wgsl`.
+/// Random output of the tile stages: twelve floats for each row, as in `shaders/shared/splat.wgsl`.
 fn random_gradients(n: usize) -> Vec<[f32; 12]> {
     let mut rng = Stream::new(4, Purpose::Test, n as u64, 1);
     let mut draw = || rng.normal() as f32;
@@ -59,7 +59,7 @@ fn record_of(p: &Projected, row: usize, [r, g, b]: [f32; 3]) -> [f32; 12] {
     [mx, my, p.depths[row], p.opacities[row], xx, xy, yy, rx, r, g, b, ry]
 }
 
-/// Everything that the stages say about some rows.
+/// Results of all stages for some rows.
 struct Results {
     projected: Vec<[f32; 12]>,
     colors: Vec<[f32; 3]>,
@@ -93,7 +93,7 @@ fn read<'g>(gpu: &'g Gpu, buffer: &Buffer, stage: impl FnOnce(&mut Recorder<'g>)
     values
 }
 
-/// The same on the device; sh_fwd and the backward stages are given the CPU's splats.
+/// The same on the device; sh_fwd and the backward stages get the CPU's splats.
 fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]], cpu: &Results) -> Results {
     let n = rows.rows();
     let stages = RowStages::new(gpu).unwrap();
@@ -104,7 +104,7 @@ fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]
     let projected = read(gpu, &splats, |r| {
         columns.upload_geometry(r, rows).unwrap();
         columns.upload_colors(r, rows, &mut Vec::new()).unwrap();
-        // Every entry must be written: what was there before must not show.
+        // Every entry must be overwritten: earlier contents must not show.
         for (buffer, width) in grads.columns() {
             r.upload(&buffer.view(), &vec![f32::NAN; width * n]).unwrap();
         }
@@ -243,7 +243,7 @@ fn logit_of_alpha_min(by: f32) -> f32 {
     -5.537_334_3 * (1.0 - by)
 }
 
-/// What is done to a row, and to what number of it.
+/// A change of a row that makes it odd, with the row's number.
 type Poison = (&'static str, fn(&mut Columns, usize));
 
 const POISON: [Poison; 30] = [
@@ -302,7 +302,7 @@ fn non_finite_rows_are_culled_as_on_the_cpu_and_do_not_spread() {
     }
     let mut v = random_gradients(n);
     let first = on_cpu(&rows, &camera(), 3, &v);
-    // Gradients of rows that are not drawn must not be read into anything.
+    // Gradients of rows that are not drawn must have no effect.
     for (v, splat) in v.iter_mut().zip(&first.projected) {
         if splat[7] == 0.0 {
             *v = [f32::NAN; 12];

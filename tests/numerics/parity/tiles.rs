@@ -16,7 +16,7 @@ use gsscale::render::gpu_tiles::{Blend, Pairs, TileStages, splat_bytes};
 use gsscale::render::gpu_tiles_bwd::PictureGradientBuffers;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-/// The device on each path that it has: subgroups of 8, subgroups of any size, none.
+/// The device on each supported path: subgroups of 8, subgroups of any size, none.
 fn devices() -> Vec<Gpu> {
     let open = |subgroups, subgroups_of_8| {
         let options = GpuOptions { subgroups, subgroups_of_8, ..GpuOptions::default() };
@@ -39,7 +39,7 @@ fn sums_are_those_of_the_cpu() {
             scan(&values.iter().map(|&x| u64::from(x)).collect::<Vec<_>>(), &mut want);
             assert!(gpu_scan(&gpu, &stages, &values).iter().map(|&x| u64::from(x)).eq(want), "{n} values");
         }
-        // Sums that do not fit 32 bits saturate, wherever it happens.
+        // Sums beyond 32 bits saturate, at any position.
         for big in [0, 2048, 99_999] {
             let mut values = vec![1u32; 100_000];
             values[big] = u32::MAX - 3;
@@ -81,7 +81,7 @@ fn sorted_pairs_are_those_of_a_stable_sort() {
             let keys: Vec<u32> = (0..n).map(|_| draws.below(distinct) as u32).collect();
             let mut want: Vec<(u32, u32)> = keys.iter().copied().zip(0..).collect();
             want.sort_by_key(|pair| pair.0);
-            // Buffers hold more than there is to sort.
+            // Buffers are larger than the sorted part.
             let capacity = n as u32 + n as u32 / 3;
             let mut padded = keys.clone();
             padded.resize(capacity as usize, 3);
@@ -182,7 +182,7 @@ impl Scene {
     }
 }
 
-/// All that the tile stages make of a scene, in the CPU's terms.
+/// Results of the tile stages for a scene, in the CPU's terms.
 #[derive(Default)]
 struct Outcome {
     order: Vec<u32>,
@@ -289,8 +289,9 @@ fn upstream(scene: &Scene) -> (Vec<f32>, Vec<f32>) {
     (normals(3 * pixels), normals(pixels))
 }
 
-/// The order must be equal, lists up to tiles where a footprint's border meets a rounding, pictures and gradients up to
-/// roundings and pixels where one decides whether a contribution is above 1/255.
+/// The order must be equal. Lists must agree except for tiles at which a footprint's border meets a rounding. Pictures
+/// and gradients must agree up to roundings and up to pixels in which a rounding decides whether a contribution is
+/// above 1/255.
 fn compare(want: &Outcome, got: &Outcome, what: &str) {
     assert!(want.order == got.order, "{what}: depth order");
     let total: usize = want.lists.iter().map(Vec::len).sum();
