@@ -33,7 +33,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 "#,
 };
 
-/// Adds 1 to the element of every workgroup.
+/// Each workgroup adds its number to its own element.
 const MARK: Source = Source {
     name: "test/mark.wgsl",
     text: r#"

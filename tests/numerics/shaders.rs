@@ -28,7 +28,7 @@ const OTHER_WORKGROUPS: &[(&str, &str, [u32; 3], &str)] = &[
     ("rasterize_bwd.wgsl", "rasterize_bwd", [64, 1, 1], "four pixels of a tile to an invocation"),
 ];
 
-/// Number of variants of one shader up to which every variant is tested.
+/// The most variants that a shader may have: every variant is tested.
 const VARIANTS_MAX: usize = 64;
 
 fn all_layouts() -> Vec<StructLayout> {
