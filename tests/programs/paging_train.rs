@@ -135,7 +135,7 @@ fn a_tenth_of_a_city_in_memory_gives_the_same_city() {
         without[at + 1] = never;
         let (other, summary) = run(folder.path(), &scene, &without, &in_memory);
         fewest_pages = fewest_pages.min(number(&summary, "pages"));
-        assert!(other != want, "{flag} {never} changes nothing, so such events happened in vain");
+        assert!(other != want, "{flag} {never} changes nothing, so these events had no effect");
     }
     let frames = number(&whole, "pages") / 10;
     let (got, summary) = run(folder.path(), &scene, &base, &How { frames, io: "auto", threads: "2", more: &[] });

@@ -407,7 +407,7 @@ fn the_witness_detects_a_stale_map_that_redb_accepts() {
     }
     let mut after = vec![0; before.len()];
     shared.read(0, &mut after).unwrap();
-    assert!(before == after, "a refused map stays as it was");
+    assert!(before == after, "a refused map changed");
     flip_primary(&shared);
     let (map, content) = Manifest::open(Arc::new(shared), 5, acknowledged, 1 << 20).unwrap();
     assert_eq!((content.counters.latest, map.run_state(2).unwrap()), (2, vec![2]));

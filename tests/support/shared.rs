@@ -12,10 +12,10 @@ pub fn shared_folder(env: &str, name: &str) -> Option<PathBuf> {
     }
     assert!(
         std::env::var_os("CI").is_none(),
-        "the shared fixtures are missing: {} is not a folder; set {env} to where they are",
+        "the shared fixtures are missing: {} is not a folder; set {env} to their path",
         path.display()
     );
-    println!("SKIPPED: {} is not there (set {env} to where it is)", path.display());
+    println!("SKIPPED: {} does not exist (set {env} to its path)", path.display());
     None
 }
 

@@ -62,7 +62,7 @@ impl Folder for MemoryFolder {
     }
 }
 
-/// Takes values from the input; zeros when it has ended.
+/// Reads values from the input; zeros after its end.
 struct Reader<'a>(&'a [u8]);
 
 impl<'a> Reader<'a> {
@@ -88,8 +88,8 @@ fn slot_bytes() -> u64 {
     PAGES.frame_bytes() as u64
 }
 
-/// Latest and next number; a run state of so many bytes; then versions: page, generation, kind, value of so many
-/// bytes; at last pins.
+/// Input: latest and next generation number; a run state with its length; versions (page, generation, kind, value with
+/// its length); pins.
 pub fn map_values() -> Target {
     let slot = |offset: u64| {
         let place = Place { segment: 0, offset };
@@ -118,7 +118,7 @@ pub fn map_values() -> Target {
     Target { name: "map_values", run: run_map, seeds, words: &[], cases: 1_000, memory: [48 << 20, 64] }
 }
 
-/// The map that the input describes, sealed as the program seals it.
+/// Builds the map that the input describes, sealed as the program seals it.
 fn folder_of(input: &[u8]) -> Option<MemoryFolder> {
     let mut input = Reader(input);
     let (latest, next) = (input.u64(), input.u64());
@@ -182,7 +182,7 @@ fn store_of(opened: &Opened) -> Option<PagedStore> {
     opened.paged_store(Box::new(MemoryEngine::new()), layout, Codec::Raw).ok()
 }
 
-/// Opens the pages, if the map allows it, and commits once more: as they are, or without any.
+/// Opens the pages, if the map allows it, and commits once more: with the pages, or without any.
 fn use_pages(mut opened: Opened, without: bool) {
     let Some(mut store) = store_of(&opened) else { return };
     if without {
@@ -245,7 +245,7 @@ fn check_state(state: &RunState) {
     assert_eq!(RunState::from_bytes(&bytes).unwrap().to_bytes().unwrap(), bytes);
 }
 
-/// Mode 0: a state. Others: small values of the map, as the library that encodes them reads them.
+/// Mode 0: a run state. Other modes: small values of the map, as the decoding library reads them.
 pub fn run_state() -> Target {
     let state = sample().to_bytes().unwrap();
     let mut long = sample();

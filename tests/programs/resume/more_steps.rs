@@ -75,7 +75,7 @@ fn more_steps_keep_the_schedule() {
         succeeded(bench.begin(place, &["--keep-checkpoint"]));
         assert!(ply(&out) == alone.ply);
         succeeded(bench.go_on(&[]));
-        assert!(bench.checkpoint(place).join("FORMAT").exists(), "what is to be kept stays");
+        assert!(bench.checkpoint(place).join("FORMAT").exists(), "the kept checkpoint is gone");
         let mut child = bench.go_on(&[&SELDOM[..], &["--steps", "260", "--log-every", "1"]].concat());
         bench.wait_for_lines(&mut child, alone.logged.len() + 4);
         signal(&child, "INT");
