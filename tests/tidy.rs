@@ -1,11 +1,11 @@
-//! House rules that the compiler does not check: which layer may import which, the length of functions, where `unsafe`
-//! may stand, and markers of unfinished work.
+//! House rules that the compiler does not hold: which layer may name which, how long functions are, where `unsafe`
+//! may stand, and that no marker of unfinished work is left.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// For each layer, the layers that it may import (itself always).
+/// For each layer, the layers that it may name (itself always).
 const LAYERS: &[(&str, &[&str])] = &[
     ("base", &[]),
     ("scene", &["base"]),
@@ -61,7 +61,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ),
 ];
 
-/// Files that may contain `unsafe`; each block needs its argument.
+/// Files that may hold `unsafe`, each block with its argument.
 const UNSAFE_FILES: &[&str] = &[
     "src/base/eight.rs",
     "src/base/simd.rs",
@@ -89,7 +89,7 @@ fn rust_files(folders: &[&str]) -> Vec<(String, String)> {
     files
 }
 
-/// Layers that a source text imports through `crate::<layer>` (also inside `crate::{a, b}`), tests included.
+/// Layers that a source text names through `crate::<layer>` (also inside `crate::{a, b}`), tests included.
 fn named_layers(text: &str) -> Vec<String> {
     let code: String = text.lines().filter(|l| !l.trim_start().starts_with("//")).collect::<Vec<_>>().join("\n");
     let mut names = Vec::new();
@@ -123,7 +123,7 @@ fn dependencies_point_one_way() {
             }
         }
     }
-    assert!(wrong.is_empty(), "imports against the order of layers:\n{}", wrong.join("\n"));
+    assert!(wrong.is_empty(), "these point the wrong way:\n{}", wrong.join("\n"));
 }
 
 #[test]
@@ -132,13 +132,13 @@ fn the_layer_reader_sees_what_it_should() {
     assert_eq!(named_layers(text), ["scene", "optim", "base"]);
 }
 
-/// Layers whose files must not import each other in a circle.
+/// Rooms whose files form no circle.
 const ROOMS_WITHOUT_CIRCLES: &[&str] = &["config", "train"];
 
-/// Files of a layer (a folder counts as one) that a file of the layer imports, tests excluded.
+/// Files of a room (a folder in it counts as one) that a file of the room imports, tests left out.
 fn imported_files(room: &str, name: &str, text: &str) -> Vec<String> {
     let depth = Path::new(name).components().count() - if name.ends_with("/mod.rs") { 1 } else { 0 };
-    // The layer is one step up from src/LAYER/file.rs, two steps from src/LAYER/folder/file.rs.
+    // From src/ROOM/file.rs the room is one step up, from src/ROOM/folder/file.rs two.
     let prefixes = ["super::".repeat(depth.saturating_sub(2)), format!("crate::{room}::")];
     let code = text.split("#[cfg(test)]").next().unwrap_or("");
     let mut found = Vec::new();
@@ -154,7 +154,7 @@ fn imported_files(room: &str, name: &str, text: &str) -> Vec<String> {
     found
 }
 
-/// A path of imports from `at` back to `at`, if there is one.
+/// The files from `at` back to `at`, if there is such a way.
 fn circle_from(at: &str, edges: &BTreeMap<String, Vec<String>>) -> Option<Vec<String>> {
     let mut ways = vec![vec![at.to_string()]];
     let mut seen: Vec<String> = Vec::new();
@@ -239,7 +239,7 @@ fn files_say_what_they_are_and_leave_no_markers() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
-/// A function ends at the closing brace with the indentation of its `fn`, which rustfmt guarantees.
+/// Functions are found by their closing brace at the indentation of their `fn`, which rustfmt guarantees.
 #[test]
 fn functions_stay_readable() {
     let mut wrong = Vec::new();

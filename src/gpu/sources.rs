@@ -1,4 +1,4 @@
-//! The table of shaders built into the program. `tests/numerics/shaders.rs` fails if a shader file is missing from it.
+//! The table of shaders built into the program. `tests/shaders.rs` fails if a shader file is missing from it.
 
 use super::shader::Source;
 

@@ -130,8 +130,7 @@ fn a_scene_that_grows_stays_within_its_memory() {
     let said = stderr(&output);
     assert!(output.status.success(), "{said}");
     assert!(said.contains("there is no cap on it") && said.contains("for all that there are"), "{said}");
-    // Without a folder for its pages the run starts in memory, and moves to the drive of its results when it no longer
-    // fits.
+    // Without a folder for its pages it begins in memory, and finds the drive of its results when it does not fit.
     let moved = path("moved");
     let other = ["--out", text(&moved), "--host-mem", "160MiB", "--spill-codec", "zstd:1", "--evict", "lru"];
     let output = train(&[&[text(&scene)], &other[..], &flags[..]].concat());
