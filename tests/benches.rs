@@ -1,4 +1,4 @@
-//! The benchmarks at their tiny sizes, so that they cannot rot, and that what they hash is the same bits twice.
+//! Every benchmark at its smallest size, so that benchmarks keep working. Two calls hash the same bits.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 #![allow(clippy::duplicate_mod)] // each benchmark is a program of its own, with its own support
 
@@ -17,8 +17,10 @@ mod image_loss;
 #[allow(dead_code)] // its `main`
 #[path = "../benches/render.rs"]
 mod render;
+#[allow(dead_code)] // the tests of programs use all of it
 #[path = "support/bench.rs"]
 mod scene_of_a_bench;
+#[allow(dead_code)] // the tests of programs use all of it
 #[path = "support/scenes.rs"]
 mod scenes;
 #[allow(dead_code)] // its `main`
@@ -44,7 +46,7 @@ use tempfile::TempDir;
 
 type Lines = Result<Vec<Value>, TrainError>;
 
-/// The arguments of a benchmark behind its name.
+/// The command line of a benchmark.
 fn arguments(args: &[&str]) -> Vec<OsString> {
     std::iter::once("bench").chain(args.iter().copied()).map(OsString::from).collect()
 }
@@ -125,8 +127,8 @@ fn shares_of_the_state_train_to_the_bits_of_the_run_in_memory() {
     }
     assert!(number(share, "overfetch") >= 1.0 && number(share, "seconds_per_step_median") > 0.0);
     assert!((0.0..1e6).contains(&number(share, "stall_seconds_predicted")), "{share}");
-    // The bound starts and ends where the measurement does; only what was read ahead at either end may differ, which an
-    // eighth of the frames bounds.
+    // The bound covers the measured steps; only prefetched pages at either end may differ, at most an eighth of the
+    // frames.
     let reads = number(share, "pages_read_per_step") * 40.0;
     let bound = number(share, "belady_pages_per_step") * 40.0;
     assert!(bound > 0.0 && reads + number(share, "frames") / 8.0 >= bound, "{reads} pages read, {bound} at least");
@@ -143,14 +145,14 @@ fn sizes_see_the_same_rows_whatever_lies_behind_them() {
     let [one, three] = &lines[..] else { panic!("{lines:?}") };
     assert_eq!(number(three, "gaussians"), 3.0 * number(one, "gaussians"));
     assert_eq!((&one["frames"], number(one, "ratio_of_medians")), (&three["frames"], 1.0));
-    // Neighbours at the ends of a copy may differ, and with them a few first scales.
+    // Neighbours at the ends of a copy may differ, and so may a few initial scales.
     assert!((number(three, "rows_ratio") - 1.0).abs() < 0.01, "{three}");
     assert!((number(three, "pages_per_step") / number(one, "pages_per_step") - 1.0).abs() < 0.2, "{one} {three}");
     assert!(number(three, "pages") > 2.5 * number(one, "pages") && number(three, "seconds_per_step_median") > 0.0);
     assert!(spill.read_dir().unwrap().next().is_none(), "scratch is removed");
 }
 
-/// A control group is made where this user may make one; else the line says why not.
+/// A control group is created if this user may create one; otherwise the line gives the reason.
 #[test]
 #[cfg(unix)]
 fn a_city_larger_than_memory_trains_under_a_hard_limit() {

@@ -17,9 +17,9 @@ pub const LANES: usize = 16;
 /// A class of instruction paths that give the same bits.
 ///
 /// Tests compare the paths available on their machine: the picture, its gradients and the loss
-/// (`the_paths_of_a_class_give_the_same_bits` of the oracle tests), the optimizer (`tests/deferred.rs`, where the
-/// baseline gives the same bits too, because nothing is fused there), culling (`tests/cull.rs`), bounds of pages (their
-/// unit test), and a whole run (`tests/resume/paths.rs`).
+/// (`the_paths_of_a_class_give_the_same_bits` of the oracle tests), the optimizer (`tests/numerics/deferred.rs`, where
+/// the baseline gives the same bits too, because nothing is fused there), culling (`tests/numerics/cull.rs`), bounds of
+/// pages (their unit test), and a whole run (`tests/programs/resume/paths.rs`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum BitsClass {
     /// AVX2 and AVX-512: multiply-add is one instruction that rounds once. Inner loops are 16 wide on both, so sums are

@@ -1,5 +1,5 @@
-//! Rust twins of WGSL structs: one macro declares the struct and its layout, which `tests/shaders.rs` compares with the
-//! layout computed by the shader compiler.
+//! Rust twins of WGSL structs: one macro declares the struct and its layout, which `tests/numerics/shaders.rs` compares
+//! with the layout computed by the shader compiler.
 
 /// Layout of the Rust twin of a WGSL struct.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

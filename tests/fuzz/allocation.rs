@@ -9,12 +9,12 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::io::Write;
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 
-/// No target has a reason to ask for so much at once.
+/// Larger allocations are refused: no target needs one.
 const REFUSED_BYTES: usize = 1 << 30;
 
 static LIVE: AtomicI64 = AtomicI64::new(0);
 static PEAK: AtomicI64 = AtomicI64::new(0);
-/// What runs, for the message of a refusal.
+/// The running case, for the message of a refusal.
 pub static CASE: AtomicU64 = AtomicU64::new(0);
 
 struct Counting;
@@ -68,7 +68,7 @@ unsafe impl GlobalAlloc for Counting {
         if is_refused(bytes) {
             return std::ptr::null_mut();
         }
-        // Both are there for a moment.
+        // Old and new block exist together for a moment.
         add(bytes);
         LIVE.fetch_sub(layout.size() as i64, Ordering::Relaxed);
         // SAFETY: as the caller promised.
@@ -79,7 +79,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// Runs `work`; gives the most bytes that it held at once.
+/// Runs `work`; returns its peak of allocated bytes.
 pub fn peak_of(work: impl FnOnce()) -> u64 {
     let before = LIVE.load(Ordering::Relaxed);
     PEAK.store(before, Ordering::Relaxed);

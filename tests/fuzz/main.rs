@@ -1,23 +1,23 @@
-//! Everything that reads bytes from outside, fed with damaged ones: an answer or an error with a remedy, never a panic, an
-//! endless loop, a huge allocation, or a path that leaves its folder.
+//! Everything that reads untrusted bytes, fed with damaged ones: the result is a value or an error with a remedy, never a
+//! panic, an endless loop, a huge allocation, or a path outside its folder.
 //!
-//! Each target is a function of bytes; every push runs it on a fixed number of inputs of a fixed seed. On demand:
-//! `GSSCALE_FUZZ_SECONDS=60 cargo test --release --test fuzz -- --nocapture` runs each target so long from a seed of the
-//! clock (`GSSCALE_FUZZ_SEED=7` from that one), on as many threads as the machine has when the runner starts one process a
-//! test (cargo-nextest does). An input that fails is saved; `GSSCALE_FUZZ_INPUT=FILE cargo test --test fuzz NAME` runs it
-//! again. Inputs under `tests/fuzz/corpus/NAME/` are run every time.
+//! Each target is a function of bytes. A plain run tries a fixed number of inputs from a fixed seed. On demand,
+//! `GSSCALE_FUZZ_SECONDS=60 cargo test --release --test fuzz -- --nocapture` runs each target for that time from a seed of
+//! the clock (`GSSCALE_FUZZ_SEED=7`: from that seed). Runners with a process for each test (cargo-nextest) use every core.
+//! A failing input is saved; `GSSCALE_FUZZ_INPUT=FILE cargo test --test fuzz NAME` runs it again. Inputs under
+//! `tests/fuzz/corpus/NAME/` run every time. This test binary has an allocator of its own, which counts bytes.
 //!
 //! | target | what it reads |
 //! | --- | --- |
-//! | `slot_header` | slot headers (also under a right checksum), slot references, labels, the FORMAT file |
+//! | `slot_header` | slot headers (also with a valid checksum), slot references, labels, the FORMAT file |
 //! | `page_payload` | stored payloads of all codecs; a whole slot through the store |
-//! | `map_values` | a page map whose seals are all right and whose values are not |
-//! | `run_state` | the state of a run |
-//! | `store_dir` | a spill directory with bytes flipped, files cut, removed, swapped, grown or put back from an earlier time |
+//! | `map_values` | a page map with valid seals and wrong values |
+//! | `run_state` | run states |
+//! | `store_dir` | a spill directory with flipped bytes and truncated, removed, swapped, grown or outdated files |
 //! | `ply` | PLY, text and binary |
 //! | `colmap_binary`, `colmap_text` | the three files of a model |
 //! | `transforms` | transforms.json |
-//! | `image_names` | names of files in all of these: no path leaves its folder |
+//! | `image_names` | file names in all of the formats: no path leaves its folder |
 //! | `config` | config.toml, sizes, orders, codecs |
 //! | `torch` | files of PyTorch in Mega-NeRF's layout, and the pickles in them |
 //! | `photo` | JPEG and PNG, header and decoding |
@@ -34,31 +34,31 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Seed of every push.
+/// Seed of a plain run.
 const SEED: u64 = 2026;
-/// A case that takes longer is taken for an endless loop, however busy the machine is.
+/// A case that takes longer counts as an endless loop, however busy the machine is.
 const ENDLESS: Duration = Duration::from_secs(100);
 
-/// Something that reads bytes.
+/// A function that reads untrusted bytes.
 pub struct Target {
-    /// For people and file names.
+    /// Name in messages and file names.
     pub name: &'static str,
-    /// Panics on what must not be.
+    /// Panics on a violation.
     pub run: fn(&[u8]),
-    /// Good inputs.
+    /// Valid inputs.
     pub seeds: Vec<Vec<u8>>,
     /// Words of its format.
     pub words: &'static [&'static str],
-    /// Inputs of every push.
+    /// Inputs of a plain run.
     pub cases: u64,
-    /// Most bytes that it may hold at once: so many, and so many for each byte of input.
+    /// Most bytes that a case may hold at once: a constant, and a number for each byte of input.
     pub memory: [u64; 2],
 }
 
-/// The counts of allocations are those of the process: one target at a time.
+/// Allocations are counted for the whole process, so one target runs at a time.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
-/// Panics inside the map's library become errors of the store; their messages would only hide the others.
+/// Panics inside redb become errors of the store; their messages would hide others.
 fn hush_library_panics() {
     static ONCE: std::sync::Once = std::sync::Once::new();
     ONCE.call_once(|| {
@@ -71,7 +71,7 @@ fn hush_library_panics() {
     });
 }
 
-/// Ends the process when one case does not end.
+/// Ends the process if a case does not end.
 fn watch(name: &'static str, is_over: &AtomicBool) {
     let mut last = (u64::MAX, Instant::now());
     while !is_over.load(Ordering::Relaxed) {
@@ -94,7 +94,7 @@ fn clock() -> u64 {
     std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(1, |d| d.as_nanos() as u64)
 }
 
-/// Runs one input; what it held at most, or why it is wrong.
+/// Runs one input. Returns its peak memory, or the violation.
 fn check(target: &Target, input: &[u8]) -> Result<u64, String> {
     let mut ended = Ok(());
     let peak = allocation::peak_of(|| ended = catch_unwind(AssertUnwindSafe(|| (target.run)(input))));
@@ -194,14 +194,15 @@ tests!(
     photo,
 );
 
-/// What [`gsscale::dataset::photo_header`] announces, held against what decoding holds, for every kind of pixels.
+/// The memory that [`gsscale::dataset::photo_header`] announces against the memory that decoding holds, for every pixel
+/// format.
 #[test]
 fn photos_are_decoded_within_what_their_headers_announce() {
     let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
     for (name, bytes) in targets::pictures() {
         for (what, peak, announced) in targets::decoded(&bytes) {
-            // Windows of the decompressor and rows: less than half a byte for each of 3 million pixels, so that a byte too
-            // few is found out.
+            // Decompressor windows and rows: less than half a byte for each of 3 million pixels, so that an
+            // announcement one byte too small shows.
             assert!(peak <= announced + (1 << 20), "{name} as {what}: {peak} bytes were held, {announced} announced");
         }
     }

@@ -23,11 +23,11 @@ const NUMBERS: &[&str] = &[
     "+",
 ];
 
-/// Draws of one case.
+/// Random numbers of one case.
 pub struct Draws(Stream);
 
 impl Draws {
-    /// The draws of case `case` of `target` under `seed`.
+    /// Random numbers of case `case` of `target` under `seed`.
     pub fn of(target: &str, seed: u64, case: u64) -> Draws {
         let name = target.bytes().fold(0u64, |hash, byte| hash.wrapping_mul(31).wrapping_add(u64::from(byte)));
         Draws(Stream::new(seed, Purpose::Test, name, case))
@@ -41,14 +41,14 @@ impl Draws {
         self.0.next_u64() as u8
     }
 
-    /// Start and end of a piece of so many bytes.
+    /// Start and end of a random piece of an input of `len` bytes.
     fn piece(&mut self, len: usize) -> (usize, usize) {
         let start = self.below(len + 1);
         let longest = if self.below(2) == 0 { 16 } else { len };
         (start, start + self.below((len - start).min(longest) + 1))
     }
 
-    /// One of `seeds`, damaged at one to eight places; seldom random bytes.
+    /// One of `seeds`, damaged at one to eight places; occasionally random bytes.
     pub fn input(&mut self, seeds: &[Vec<u8>], words: &[&str]) -> Vec<u8> {
         let mut input = seeds[self.below(seeds.len())].clone();
         if self.below(50) == 0 {
@@ -116,7 +116,7 @@ impl Draws {
         }
     }
 
-    /// A number of 1 to 8 bytes that is at some border.
+    /// Writes a boundary value of 1 to 8 bytes.
     fn number(&mut self, input: &mut [u8]) {
         let len = input.len() as u64;
         let integers = [0, 1, u64::MAX, u64::MAX >> 1, 1 << 31, u64::from(u32::MAX), len, len + 1, 1 << 40, 1 << 63];
@@ -133,7 +133,7 @@ impl Draws {
         }
     }
 
-    /// A number of a text becomes another one.
+    /// Replaces a number of a text.
     fn text_number(&mut self, input: &mut Vec<u8>) {
         let is_digit = |byte: u8| byte.is_ascii_digit() || byte == b'.' || byte == b'-';
         let at = self.below(input.len());

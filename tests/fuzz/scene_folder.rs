@@ -6,7 +6,7 @@ use gsscale::dataset::read::{ReadOptions, read_scene};
 use std::path::{Component, Path};
 use tempfile::TempDir;
 
-/// A new folder, removed at its end.
+/// A new folder, removed on drop.
 pub fn scratch() -> TempDir {
     let memory = Path::new("/dev/shm");
     let folder = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
@@ -19,7 +19,7 @@ pub fn stays_in(folder: &Path, path: &Path) -> bool {
     rest.components().all(|part| matches!(part, Component::Normal(_)))
 }
 
-/// Reads the scene in `folder`; what it says must hold together.
+/// Reads the scene in `folder` and checks its consistency.
 pub fn read_and_check(folder: &Path) -> Option<RawScene> {
     check(folder, read_scene(folder, &ReadOptions { allow_missing: true, ..ReadOptions::default() }))
 }

@@ -1,5 +1,4 @@
-//! `gsscale-bench` as a process, and what it prints.
-#![allow(dead_code, clippy::unwrap_used)] // test code: each test file uses a part of it
+//! Runs `gsscale-bench` and parses its output.
 
 use super::scenes::{city, stderr};
 use serde_json::Value;
@@ -10,7 +9,7 @@ pub fn bench(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_gsscale-bench")).args(args).output().unwrap()
 }
 
-/// The lines of JSON of a call that succeeds.
+/// The JSON lines of a successful call.
 pub fn lines(args: &[&str]) -> Vec<Value> {
     let output = bench(args);
     assert!(output.status.success(), "{}", stderr(&output));
@@ -25,7 +24,7 @@ pub fn number(line: &Value, key: &str) -> f64 {
     line[key].as_f64().unwrap_or_else(|| panic!("{key} in {line}"))
 }
 
-/// A city of which no view sees more than two thirds.
+/// A city whose views each see at most two thirds of it.
 pub fn large_city(folder: &Path) -> PathBuf {
     city(folder, 150, 48, 32, 8000)
 }

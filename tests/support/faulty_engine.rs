@@ -1,10 +1,8 @@
-//! A store that fails on purpose, around one that works.
+//! An I/O engine that fails on purpose, around a working one.
 //!
-//! Every operation is counted by kind; rules say which one fails, how, and whether all later ones of the kind fail
-//! too. The rules can be changed while the store is in use. It keeps the first of [`PageEngine`]'s invariants (every
-//! buffer comes back, as it was handed over) and breaks the others as it is told.
-
-#![allow(dead_code)] // each test binary uses a part of it
+//! Every operation is counted by kind. Rules say which operation fails, how, and whether all later operations of that
+//! kind fail too. Rules may change while the engine is in use. Invariant: every buffer comes back as it was handed
+//! over, the first invariant of [`PageEngine`]; a rule may break the others.
 
 use gsscale::base::rng::mix64;
 use gsscale::page::engine::buffer::ALIGNMENT;
@@ -13,7 +11,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Kinds of operations, counted apart.
+/// Kinds of operations, each with its own count.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Operation {
     /// A transfer from the store.
@@ -31,28 +29,28 @@ pub enum Operation {
 pub enum Fault {
     /// An error is reported and nothing is done. `Other` stands for EIO.
     Error(io::ErrorKind),
-    /// Only the first half is moved, and reported as an error.
+    /// Only the first half is moved, with an error.
     Short,
-    /// Only the first half is moved, and reported as all of it: a torn page.
+    /// Only the first half is moved, and reported as complete: a torn page.
     Torn,
-    /// One bit on the way is flipped: this bit of the transfer.
+    /// This bit of the transfer is flipped.
     FlipBit(u64),
-    /// Nothing is done, and reported as done.
+    /// Nothing is done, and reported as complete.
     Lost,
     /// The transfer goes to or comes from another place.
     Misdirected(Place),
 }
 
-/// Which operation fails how.
+/// A rule: which operation fails, and how.
 #[derive(Debug, Clone, Copy)]
 pub struct Rule {
     /// Kind of operation.
     pub on: Operation,
     /// Number of the operation of this kind, from 0.
     pub nth: u64,
-    /// Whether all later ones fail as well.
+    /// Whether all later operations of the kind fail as well.
     pub for_ever: bool,
-    /// How.
+    /// The fault.
     pub fault: Fault,
 }
 
@@ -60,11 +58,11 @@ pub struct Rule {
 struct Plan {
     rules: Vec<Rule>,
     counts: BTreeMap<Operation, u64>,
-    /// Seed of the order of completions, when they are to be out of order.
+    /// Seed of the completion order; `None` keeps the order.
     reorder: Option<u64>,
 }
 
-/// The rules of a store, shared with whoever tests it.
+/// The rules of an engine, shared with its test.
 #[derive(Debug, Clone, Default)]
 pub struct Faults(Arc<Mutex<Plan>>);
 
@@ -74,17 +72,17 @@ impl Faults {
         Faults::default()
     }
 
-    /// Adds a rule; the first one that fits an operation counts.
+    /// Adds a rule. The first rule that fits an operation applies.
     pub fn add(&self, on: Operation, nth: u64, for_ever: bool, fault: Fault) {
         self.plan().rules.push(Rule { on, nth, for_ever, fault });
     }
 
-    /// Forgets the rules; counts go on.
+    /// Removes the rules; counts continue.
     pub fn clear(&self) {
         self.plan().rules.clear();
     }
 
-    /// From now on transfers complete one by one, in an order that follows from the seed.
+    /// From now on transfers complete one by one, in an order given by the seed.
     pub fn reorder(&self, seed: u64) {
         self.plan().reorder = Some(seed);
     }
@@ -98,7 +96,7 @@ impl Faults {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Counts an operation and says how it is to fail.
+    /// Counts an operation and returns its fault.
     fn next(&self, on: Operation) -> Option<Fault> {
         let mut plan = self.plan();
         let count = plan.counts.entry(on).or_default();
@@ -108,7 +106,7 @@ impl Faults {
         plan.rules.iter().find(hit).map(|r| r.fault)
     }
 
-    /// A number below `n` if completions are out of order.
+    /// A random number below `n` if completions are reordered.
     fn pick(&self, n: usize) -> Option<usize> {
         let mut plan = self.plan();
         let seed = plan.reorder.as_mut()?;
@@ -117,7 +115,7 @@ impl Faults {
     }
 }
 
-/// A transfer that was changed on its way in, as it was.
+/// The original of a transfer that was changed on its way in.
 #[derive(Debug)]
 struct Changed {
     fault: Fault,
@@ -125,7 +123,7 @@ struct Changed {
     bytes: usize,
 }
 
-/// The failing store.
+/// The failing engine.
 pub struct FaultyEngine {
     inner: Box<dyn PageEngine>,
     faults: Faults,
@@ -134,12 +132,12 @@ pub struct FaultyEngine {
 }
 
 impl FaultyEngine {
-    /// Around `inner`, after the rules of `faults`.
+    /// Wraps `inner`, with the rules of `faults`.
     pub fn new(inner: Box<dyn PageEngine>, faults: Faults) -> FaultyEngine {
         FaultyEngine { inner, faults, changed: BTreeMap::new(), ended: Vec::new() }
     }
 
-    /// Puts a transfer back as it was handed over and reports its end as the fault wants it.
+    /// Restores a transfer to what was handed over, and reports the result that the fault asks for.
     fn restore(&mut self, mut completion: Completion) -> Completion {
         let Some(Changed { fault, place, bytes }) = self.changed.remove(&completion.transfer.token) else {
             return completion;
@@ -148,7 +146,7 @@ impl FaultyEngine {
         (transfer.place, transfer.bytes) = (place, bytes);
         match fault {
             Fault::Short => completion.result = Err(io::ErrorKind::UnexpectedEof.into()),
-            // On a read, what arrives; on a write, the caller's memory is as it was.
+            // On a read, the arriving bytes; on a write, the caller's memory is unchanged.
             Fault::FlipBit(bit) => flip(transfer, bit),
             _ => {}
         }

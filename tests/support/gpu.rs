@@ -1,5 +1,4 @@
-//! A device for tests: the best adapter, a software one if there is nothing else.
-#![allow(dead_code)] // each test file uses a part
+//! Opens a device for tests: the best adapter, or a software adapter.
 
 use gsscale::gpu::{DeviceChoice, Gpu, GpuError, GpuOptions};
 

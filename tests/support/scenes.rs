@@ -1,6 +1,5 @@
-//! Small scenes for tests through the real binaries: a generated city, rewritten as a COLMAP text model that a test
-//! can bend in any way.
-#![allow(dead_code, clippy::unwrap_used, clippy::expect_used)] // test code: each test file uses a part of it
+//! Small scenes for tests through the real binaries: a generated city, rewritten as a COLMAP text model that a test can
+//! edit.
 
 use glam::{DMat3, DQuat, DVec3};
 use gsscale::dataset::read::{ReadOptions, read_scene};
@@ -43,7 +42,7 @@ pub fn city(folder: &Path, views: u32, width: u32, height: u32, points: u32) -> 
     scene
 }
 
-/// A city of 12 by 12 blocks: none of its 30 views of 48x36 sees half of it.
+/// A city of 12 by 12 blocks: each of its 30 views of 48x36 sees less than half of it.
 pub fn wide_city(folder: &Path, points: u32) -> PathBuf {
     let scene = folder.join("scene");
     let size = CityOptions { seed: 5, views: 30, width: 48, height: 36, points, ..CityOptions::default() };
@@ -52,7 +51,7 @@ pub fn wide_city(folder: &Path, points: u32) -> PathBuf {
 }
 
 impl TextModel {
-    /// What a scene holds.
+    /// Reads the model of a scene.
     pub fn of(scene: &Path) -> TextModel {
         let raw = read_scene(scene, &ReadOptions::default()).unwrap();
         let i = raw.views[0].intrinsics;
@@ -97,7 +96,7 @@ impl TextModel {
         let [fx, fy, cx, cy] = self.pinhole;
         let frames = self.views.iter().map(|v| {
             let rotation = DMat3::from_quat(DQuat::from_xyzw(v.qvec[1], v.qvec[2], v.qvec[3], v.qvec[0]).normalize());
-            // Camera to world; y and z of the camera point the other way in OpenGL.
+            // Camera to world; y and z of the camera are reversed in OpenGL.
             let (x, y, z) = (rotation.row(0), -rotation.row(1), -rotation.row(2));
             let t = -(rotation.transpose() * DVec3::from_array(v.tvec));
             let row = |i: usize| [x[i], y[i], z[i], t[i]];
@@ -145,7 +144,7 @@ pub fn eval(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_gsscale-eval")).args(args).output().unwrap()
 }
 
-/// What a program said on stderr.
+/// The stderr of a program.
 pub fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }

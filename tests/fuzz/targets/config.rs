@@ -42,7 +42,7 @@ fn run(input: &[u8]) {
                 assert!(error.to_string().contains("--") && !error.remedy.is_empty(), "{error}");
                 return;
             }
-            // A config that passes is written and read without a change.
+            // A valid config is written and read back unchanged.
             let text = toml::to_string(&config).unwrap();
             assert_eq!(TrainConfig::parse(&text), Ok(config));
         }

@@ -1,4 +1,4 @@
-//! The page map with right seals around wrong values, as a store that somebody made on purpose; and states of runs.
+//! Page maps with valid seals around wrong values, as an attacker could write them; and run states.
 
 use super::pages::{PAGE_ROWS, label_of_a_page, payload_bytes_of_a_page};
 use super::with_mode;
@@ -63,7 +63,7 @@ impl Folder for MemoryFolder {
     }
 }
 
-/// Takes values from the input; zeros when it has ended.
+/// Reads values from the input; zeros after its end.
 struct Reader<'a>(&'a [u8]);
 
 impl<'a> Reader<'a> {
@@ -89,8 +89,8 @@ fn slot_bytes() -> u64 {
     PAGES.frame_bytes() as u64
 }
 
-/// Latest and next number; a run state of so many bytes; then versions: page, generation, kind, value of so many
-/// bytes; at last pins.
+/// Input: latest and next generation number; a run state with its length; versions (page, generation, kind, value with
+/// its length); pins.
 pub fn map_values() -> Target {
     let slot = |offset: u64| {
         let place = Place { segment: 0, offset };
@@ -119,7 +119,7 @@ pub fn map_values() -> Target {
     Target { name: "map_values", run: run_map, seeds, words: &[], cases: 1_000, memory: [48 << 20, 64] }
 }
 
-/// The map that the input describes, sealed as the program seals it.
+/// Builds the map that the input describes, sealed as the program seals it.
 fn folder_of(input: &[u8]) -> Option<MemoryFolder> {
     let mut input = Reader(input);
     let (latest, next) = (input.u64(), input.u64());
@@ -183,7 +183,7 @@ fn store_of(opened: &Opened) -> Option<PagedStore> {
     opened.paged_store(Box::new(MemoryEngine::new()), layout, Codec::Raw).ok()
 }
 
-/// Opens the pages, if the map allows it, and commits once more: as they are, or without any.
+/// Opens the pages, if the map allows it, and commits once more: with the pages, or without any.
 fn use_pages(mut opened: Opened, without: bool) {
     let Some(mut store) = store_of(&opened) else { return };
     if without {
@@ -246,7 +246,7 @@ fn check_state(state: &RunState) {
     assert_eq!(RunState::from_bytes(&bytes).unwrap().to_bytes().unwrap(), bytes);
 }
 
-/// Mode 0: a state. Others: small values of the map, as the library that encodes them reads them.
+/// Mode 0: a run state. Other modes: small values of the map, as the decoding library reads them.
 pub fn run_state() -> Target {
     let state = sample().to_bytes().unwrap();
     let mut long = sample();

@@ -18,7 +18,7 @@ pub use scenes::{colmap_binary, colmap_text, image_names, transforms};
 pub use store_dir::store_dir;
 pub use torch::torch;
 
-/// The first byte of an input says how the rest is used.
+/// The first byte of an input selects the mode for the rest.
 fn split_mode(input: &[u8]) -> (u8, &[u8]) {
     input.split_first().map_or((0, input), |(mode, rest)| (*mode, rest))
 }

@@ -41,7 +41,7 @@ fn header(slot: SlotRef) -> [u8; HEADER_BYTES] {
     bytes
 }
 
-/// The input in an array, zeros behind it; under a right checksum if so wished.
+/// The input as an array, padded with zeros; with a valid checksum if `sealed`.
 fn array<const N: usize>(input: &[u8], sealed: bool) -> [u8; N] {
     let mut bytes = [0; N];
     let len = input.len().min(N);
@@ -113,7 +113,7 @@ fn run_header(input: &[u8]) {
     }
 }
 
-/// Numbers as pages hold them: smooth, with words of 16 bits in between.
+/// Values as in pages: smooth, interleaved with 16-bit words.
 fn payload(len: usize) -> Vec<u8> {
     let word = |i: usize| if i % 64 < 32 { (i as u32 & 0xff) << 20 } else { (i as f32 * 0.37).sin().to_bits() };
     (0..len.div_ceil(4)).flat_map(|i| word(i).to_le_bytes()).take(len).collect()
@@ -164,7 +164,7 @@ fn run_payload(input: &[u8]) {
     }
 }
 
-/// A slot as the reference says that it is, with a right checksum or a wrong one: read through the store.
+/// Reads a slot that matches the reference through the store, with a valid or a wrong checksum.
 fn run_slot(input: &[u8]) {
     let Some((reference, bytes)) = input.split_first_chunk() else { return };
     let Some(mut wanted) = SlotRef::from_bytes(reference) else { return };

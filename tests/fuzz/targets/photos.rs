@@ -1,4 +1,4 @@
-//! JPEG and PNG: what their headers say, and decoding within what was announced.
+//! JPEG and PNG: headers, and decoding within the announced size.
 
 use crate::Target;
 use crate::allocation::peak_of;
@@ -10,7 +10,7 @@ use gsscale::dataset::photo_header::{PhotoHeader, read_header};
 use image::{ExtendedColorType, ImageEncoder, ImageFormat};
 use std::io::Cursor;
 
-/// Photos that would take more are not decoded here.
+/// Larger photos are not decoded here.
 const DECODE_BYTES_MAX: u64 = 4 << 20;
 
 fn encoded(picture: &image::DynamicImage, format: ImageFormat) -> Vec<u8> {
@@ -57,7 +57,7 @@ fn run(input: &[u8]) {
     }
 }
 
-/// A file of every kind of pixels that decoders make, 2000 x 1500.
+/// A file of every pixel format that decoders return, 2000 x 1500.
 pub fn pictures() -> Vec<(String, Vec<u8>)> {
     let rgb = image::RgbImage::from_fn(2000, 1500, |x, y| image::Rgb([x as u8, y as u8, (x / 100 * y) as u8]));
     let rgb = image::DynamicImage::from(rgb);
@@ -94,7 +94,7 @@ fn with_transparency(png: &[u8], colour: &[u8]) -> Vec<u8> {
     [&png[..33], &length, b"tRNS", colour, &crc.sum().to_be_bytes(), &png[33..]].concat()
 }
 
-/// Decodes a file as a photo and as the mask of a small photo: the most bytes held, and those announced.
+/// Decodes a file as a photo and as the mask of a small photo: peak bytes, and announced bytes.
 pub fn decoded(bytes: &[u8]) -> [(&'static str, u64, u64); 2] {
     let folder = scratch();
     let (path, small) = (folder.path().join("a"), folder.path().join("b"));

@@ -57,7 +57,7 @@ fn text_files(name: &[u8]) -> [Vec<u8>; 3] {
     [cameras.to_vec(), images, points]
 }
 
-/// A scene with a model of these files.
+/// A scene with these model files.
 fn scene_of(files: &[Vec<u8>; 3], extension: &str) -> TempDir {
     let scene = scratch();
     let model = scene.path().join("sparse/0");
@@ -69,7 +69,7 @@ fn scene_of(files: &[Vec<u8>; 3], extension: &str) -> TempDir {
     scene
 }
 
-/// The first byte says which file of the model is the rest.
+/// The first byte selects the model file that the rest replaces.
 fn run_model(input: &[u8], mut files: [Vec<u8>; 3], extension: &str) {
     let (mode, rest) = split_mode(input);
     files[usize::from(mode % 3)] = rest.to_vec();
@@ -125,7 +125,7 @@ fn run_transforms(input: &[u8]) {
     read_and_check(scene.path());
 }
 
-/// A name, in every place where a file can give one.
+/// A name in every place where a file may contain one.
 pub fn image_names() -> Target {
     let names =
         ["images/0001.png", "cam1/x/a b.jpg", "..\\..\\a", "C:\\a.jpg", "./x//y", "~/.ssh/id", "\\\\host\\share\\a"];

@@ -1,5 +1,5 @@
-//! A whole spill directory, damaged by what the input says: opened, it is refused, or it is one that was committed, page by
-//! page to the bit, or pages are reported as damaged.
+//! A whole spill directory, damaged as the input says. The open refuses the directory, or finds a committed state page
+//! by page to the bit, or reports pages as damaged.
 
 use crate::Target;
 use crate::scene_folder::scratch;
@@ -38,7 +38,7 @@ fn payload(page: PageId, version: u64) -> Vec<u8> {
 }
 
 fn version_at(page: u32, generation: u64) -> u64 {
-    // Round g writes pages with (page + g) even, and all in the first.
+    // Round g writes the pages with even (page + g); round 1 writes all.
     (1..=generation).rev().find(|g| *g == 1 || (u64::from(page) + g).is_multiple_of(2)).unwrap_or(0)
 }
 
@@ -95,7 +95,7 @@ fn template() -> &'static Template {
     })
 }
 
-/// Pieces of eight bytes: what, which file, another file, four bytes of offset, a value.
+/// Input in pieces of eight bytes: operation, file, other file, four bytes of offset, value.
 pub fn store_dir() -> Target {
     let op = |what: u8, file: u8, other: u8, at: u32, value: u8| {
         [&[what, file, other], at.to_le_bytes().as_slice(), &[value]].concat()
@@ -111,7 +111,7 @@ pub fn store_dir() -> Target {
     Target { name: "store_dir", run, seeds, words: &[], cases: 600, memory: [96 << 20, 1000] }
 }
 
-/// The damaged directory's files.
+/// Files of the damaged directory.
 fn damaged(input: &[u8]) -> Files {
     let Template { now, past } = template();
     let mut files = now.clone();
@@ -163,7 +163,7 @@ fn run(input: &[u8]) {
     make_private(folder);
     let Ok(spill) = SpillDir::open(folder, true) else { return };
     let Ok(opened) = Commits::open(Box::new(DriveFolder::new(folder)), config(&spill)) else {
-        // A refused store is left as it was, but for the lock and the witness.
+        // A refused store is unchanged except for the lock and the witness.
         let after = contents(folder);
         for (name, bytes) in files.iter().filter(|(name, _)| !["LOCK", "witness"].contains(&name.as_str())) {
             assert_eq!(after.get(name), Some(bytes), "{name} was changed");

@@ -1,4 +1,4 @@
-//! Files of PyTorch in Mega-NeRF's layout, and the pickles in them under right checksums.
+//! Files of PyTorch in Mega-NeRF's layout, and the pickles inside them under valid checksums.
 
 use super::{split_mode, with_mode};
 use crate::Target;

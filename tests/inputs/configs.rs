@@ -1,0 +1,42 @@
+//! Every config file parses and passes its checks; default.toml equals the built-in defaults.
+
+use gsscale::config::file::{KEYS, TrainConfig, default_file};
+use gsscale::config::key::Key;
+use std::path::PathBuf;
+
+fn configs() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("configs")
+}
+
+#[test]
+fn default_file_is_the_default() {
+    let path = configs().join("default.toml");
+    let written = std::fs::read_to_string(&path).unwrap_or_default();
+    if std::env::var_os("GSSCALE_WRITE_DEFAULT_CONFIG").is_some() {
+        std::fs::write(&path, default_file()).unwrap();
+        return;
+    }
+    assert_eq!(
+        written,
+        default_file(),
+        "configs/default.toml is out of date: run the test once with GSSCALE_WRITE_DEFAULT_CONFIG=1"
+    );
+    assert_eq!(TrainConfig::read(&path).unwrap(), TrainConfig::default());
+    for name in KEYS.iter().map(Key::name) {
+        assert!(written.contains(&format!("\n{name} = ")), "{name} is not in default.toml");
+    }
+}
+
+#[test]
+fn every_config_file_is_valid() {
+    let mut seen = 0;
+    for entry in std::fs::read_dir(configs()).unwrap() {
+        let path = entry.unwrap().path();
+        if path.extension().is_none_or(|extension| extension != "toml") {
+            continue;
+        }
+        TrainConfig::read(&path).unwrap().check().unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+        seen += 1;
+    }
+    assert!(seen >= 3, "only {seen} config files");
+}

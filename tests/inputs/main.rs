@@ -1,0 +1,11 @@
+//! Files that users bring: datasets, photos, PLY files, config files; and the generated scene.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+
+mod support;
+
+mod configs;
+mod import;
+mod photos;
+mod ply;
+mod readers;
+mod synthetic;

@@ -1,0 +1,4 @@
+//! Where the photo scenes are.
+
+#[path = "../../support/shared.rs"]
+pub mod shared;

@@ -1,0 +1,11 @@
+//! Reference fixtures, a second renderer, and a device.
+
+#[path = "../../support/child.rs"]
+pub mod child;
+pub mod fixture;
+#[path = "../../support/gpu.rs"]
+pub mod gpu;
+pub mod reference64;
+#[allow(dead_code)] // no photo scenes are read here
+#[path = "../../support/shared.rs"]
+mod shared;

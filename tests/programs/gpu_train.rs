@@ -1,0 +1,344 @@
+//! Whole runs on a GPU through the real binary: quality equal to the CPU renderer, bytes that cross the bus, and the
+//! choice of device with its reason.
+
+use crate::support::gpu;
+use crate::support::scenes::{city, eval, psnr, stderr, summary, text, train, wide_city};
+use gsscale::config::file::TrainConfig;
+use gsscale::config::limits::RunOptions;
+use gsscale::dataset::photo::decode;
+use gsscale::dataset::target_cache::TargetCache;
+use gsscale::densify::strategy::StrategyName;
+use gsscale::gpu::GpuOptions;
+use gsscale::kernels::stages::STAGES;
+use gsscale::paging::pager::{Pager, PagerConfig};
+use gsscale::render::Traffic;
+use gsscale::render::gpu::GpuRenderer;
+use gsscale::scene::columns::Column;
+use gsscale::train::pages::PagedScene;
+use gsscale::train::prepare::{Prepared, prepare};
+use gsscale::train::step::train_step;
+use gsscale::train::trainer::Trainer;
+use gsscale::train::working_set::WorkingSet;
+use std::path::Path;
+use std::process::Command;
+use tempfile::TempDir;
+
+const SHORT: &[&str] = &["--steps", "60", "--strategy", "none", "--sh-every", "20", "--log-every", "1"];
+
+fn run(scene: &Path, out: &Path, more: &[&str]) -> String {
+    let args = [&[text(scene), "--out", text(out)], SHORT, more].concat();
+    let output = train(&args);
+    assert!(output.status.success(), "{}", stderr(&output));
+    stderr(&output)
+}
+
+/// metrics.jsonl of a run.
+fn metrics(out: &Path) -> Vec<serde_json::Value> {
+    let lines = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
+    lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+#[test]
+fn a_gpu_trains_as_the_cpu_does() {
+    let Some(device) = gpu::open(&GpuOptions::default()) else { return };
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 16, 128, 96, 1200);
+    let [on_cpu, on_gpu] = ["cpu", "gpu"].map(|name| folder.path().join(name));
+    run(&scene, &on_cpu, &["--device", "cpu"]);
+    let said = run(&scene, &on_gpu, &["--device", "gpu"]);
+    assert!(said.contains(&device.summary().name), "{said}");
+    let resolved = std::fs::read_to_string(on_gpu.join("config.toml")).unwrap();
+    assert!(resolved.contains(&device.summary().name), "{resolved}");
+    // Rounding differences grow with every step, in both directions; after a thousand steps PSNR must agree within 0.1
+    // dB.
+    let (want, got) = (psnr(&on_cpu), psnr(&on_gpu));
+    println!("test PSNR after 60 steps: {want:.3} dB on the CPU, {got:.3} dB on the GPU");
+    assert!((want - got).abs() < 0.1, "{got} dB, on the CPU {want} dB");
+    let lines = metrics(&on_gpu);
+    assert!(want > metrics(&on_cpu)[0]["psnr"].as_f64().unwrap() + 1.0, "60 steps are training");
+    for line in &lines {
+        for key in ["bytes_uploaded", "bytes_read_back", "device_bytes_peak"] {
+            assert!(line[key].as_u64().unwrap() > 0, "{key}: {line}");
+        }
+        // Upper bound: all rows of 59 floats with 16 bytes for densification, a photo of 4 bytes a pixel, and 64 KiB of
+        // counts and uniforms.
+        let most = 1200 * (59 * 4 + 16) + 128 * 96 * 4 + (64 << 10);
+        assert!(line["bytes_uploaded"].as_u64().unwrap() < most && line["bytes_read_back"].as_u64().unwrap() < most);
+    }
+    for line in metrics(&on_cpu) {
+        assert_eq!((&line["bytes_uploaded"], &line["device_bytes_peak"]), (&0.into(), &0.into()));
+    }
+    // The same command gives the same file, with --deterministic (the default) and without.
+    let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
+    for (name, device, first) in [("again", "gpu", &on_gpu), ("again on the CPU", "cpu", &on_cpu)] {
+        for switch in ["--deterministic", "--deterministic=false"] {
+            let again = folder.path().join(format!("{name} {switch}"));
+            run(&scene, &again, &["--device", device, switch]);
+            assert!(ply(first) == ply(&again), "two runs of the same command differ: {name} {switch}");
+        }
+    }
+    // The PLY alone gives the run's metrics, on the device that its config names.
+    let report = eval(&[text(&on_gpu), text(&scene)]);
+    assert!(report.status.success(), "{}", stderr(&report));
+}
+
+#[test]
+fn pages_from_a_drive_train_the_same_scene_on_a_gpu() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = wide_city(folder.path(), 6_000);
+    let [in_memory, paged, spill] = ["memory", "paged", "spill"].map(|name| folder.path().join(name));
+    let grow = |out: &Path, more: &[&str]| {
+        let growing = ["--steps", "60", "--refine-start", "20", "--refine-every", "15", "--grow-grad2d", "0.001"];
+        let paths = [text(&scene), "--out", text(out), "--device", "gpu", "--page-rows", "32"];
+        let output = train(&[&paths[..], &growing, more].concat());
+        assert!(output.status.success(), "{}", stderr(&output));
+    };
+    grow(&in_memory, &[]);
+    let whole = summary(&in_memory);
+    let frames = whole["pages_pinned_max"].as_u64().unwrap();
+    assert!(frames < whole["pages"].as_u64().unwrap() / 2, "a view sees too much");
+    let frames = frames.to_string();
+    grow(&paged, &["--frames", &frames, "--spill-dir", text(&spill)]);
+    let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
+    assert!(ply(&in_memory) == ply(&paged), "pages from the drive give another scene");
+    let traffic = summary(&paged);
+    assert!(traffic["pages_read"].as_u64().unwrap() > 0 && traffic["evictions"].as_u64().unwrap() > 0, "{traffic}");
+    assert_ne!(traffic["gaussians"], 6_000, "no round changed anything");
+}
+
+#[test]
+fn a_view_beyond_the_budget_ends_the_run_with_need_and_remedy() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 128, 96, 400);
+    let out = folder.path().join("run");
+    let args = [&[text(&scene), "--out", text(&out), "--device", "gpu", "--device-mem", "1MiB"], SHORT].concat();
+    let output = train(&args);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("bytes of device memory") && said.contains("remedy: raise --device-mem"), "{said}");
+    assert!(!out.join("point_cloud.ply").exists(), "nothing was trained");
+}
+
+#[test]
+fn a_run_that_outgrows_the_budget_leaves_its_last_good_step() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 128, 96, 1200);
+    let short = folder.path().join("short");
+    run(&scene, &short, &["--device", "gpu"]);
+    let enough = metrics(&short).last().unwrap()["device_bytes_peak"].as_u64().unwrap();
+    let out = folder.path().join("run");
+    let budget = (enough + enough / 8).to_string();
+    let growing = ["--steps", "200", "--refine-start", "9", "--refine-every", "10", "--grow-grad2d", "0"];
+    let args = ["--device", "gpu", "--device-mem", &budget, "--max-gaussians", "60000"];
+    let output = train(&[&[text(&scene), "--out", text(&out)], &growing[..], &args].concat());
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("bytes of device memory") && said.contains("remedy: raise --device-mem"), "{said}");
+    let summary = summary(&out);
+    let (steps, rows) = (summary["steps"].as_u64().unwrap(), summary["gaussians"].as_u64().unwrap());
+    assert!(summary["finished"] == false && steps > 0 && steps < 200 && rows > 1200, "{summary}");
+    let ply = std::fs::read(out.join("point_cloud.ply")).unwrap();
+    let header = String::from_utf8_lossy(&ply[..ply.len().min(4096)]).into_owned();
+    assert!(header.contains(&format!("element vertex {rows}\n")), "{header}");
+}
+
+/// Runs the real binary with a device fault in mid-run (see `GSSCALE_GPU_FAULT`), under a limit of the address space if
+/// one is given, KiB. Asserts that the error names the stage, that the exit code is not 0, and that the last good step
+/// is written. Returns the error's line.
+fn assert_ends_with_last_good_step(scene: &Path, out: &Path, fault: &str, address_space: Option<u64>) -> String {
+    let limit = address_space.map_or(String::new(), |kib| format!("ulimit -v {kib} && "));
+    let output = Command::new("sh")
+        .args(["-c", &format!("{limit}exec \"$@\""), "sh", env!("CARGO_BIN_EXE_gsscale-train")])
+        .args([text(scene), "--out", text(out), "--device", "gpu", "--steps", "200", "--strategy", "none"])
+        .env("GSSCALE_GPU_FAULT", fault)
+        .output()
+        .unwrap();
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{fault}: {said}");
+    let line = said.lines().rev().find(|l| l.starts_with("error: ")).unwrap_or_else(|| panic!("{fault}: {said}"));
+    // The stage whose results the run waited for, or the submitted part of the step.
+    let stage = line.split(": ").nth(2).unwrap_or_default();
+    let is_stage = STAGES.iter().any(|s| s.name == stage) || ["forward", "backward"].contains(&stage);
+    assert!(is_stage, "{fault}: {line}");
+    let summary = summary(out);
+    let steps = summary["steps"].as_u64().unwrap();
+    assert!(summary["finished"] == false && steps > 10 && steps < 100, "{fault}: {summary}");
+    let ply = std::fs::read(out.join("point_cloud.ply")).unwrap();
+    assert!(ply.starts_with(b"ply") && ply.len() > 300 * 59 * 4, "{fault}: {} bytes", ply.len());
+    line.to_string()
+}
+
+#[test]
+fn a_device_that_fails_in_mid_run_leaves_the_last_good_step() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 64, 48, 300);
+    let cases = [("lost", "the device was lost"), ("validation", "refused the work"), ("memory", "out of memory")];
+    for (kind, expected) in cases {
+        // Five submissions a step; the memory estimate renders some views before the first.
+        let line = assert_ends_with_last_good_step(&scene, &folder.path().join(kind), &format!("{kind}@150"), None);
+        assert!(line.contains(expected), "{kind}: {line}");
+    }
+}
+
+/// The real thing: the driver is asked for memory until it refuses. A software adapter takes the program's own memory, so
+/// there the address space is limited to 6 GiB (the program needs about one): it refuses the driver, whose requests are
+/// large, long before the program's own small ones. Without filling on purpose this cannot be had there: in a run that
+/// grows into such a limit the program's own requests, which cannot be refused, come first as often as the driver's.
+#[test]
+#[cfg(target_os = "linux")]
+fn a_device_without_memory_left_leaves_the_last_good_step() {
+    let Some(device) = gpu::open(&GpuOptions::default()) else { return };
+    let is_software = device.summary().kind == gsscale::gpu::DeviceKind::Software;
+    drop(device);
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 64, 48, 300);
+    let limit = is_software.then_some(6 << 20);
+    let line = assert_ends_with_last_good_step(&scene, &folder.path().join("run"), "full@150", limit);
+    assert!(line.contains("the device is out of memory") && !line.contains("injected"), "{line}");
+}
+
+/// All bits that some steps with all colour bands on a small city give: values of the rows in view before each step,
+/// losses, gradients, radii. With the least of the steps' intersections, and the frames that were recorded again.
+fn bits_of_steps(scene: &Path, options: &GpuOptions, capacity: u32) -> Option<(Vec<u32>, u32, u64)> {
+    let mut renderer = GpuRenderer::new(gpu::open(options)?).unwrap();
+    renderer.set_capacity(capacity);
+    let config = TrainConfig { steps: 10, strategy: StrategyName::None, sh_every: 0, ..TrainConfig::default() };
+    let Prepared { dataset, mut columns, .. } = prepare(scene, &config).unwrap();
+    // Large enough for several tiles each.
+    columns.scales.iter_mut().for_each(|s| *s += 0.7);
+    let options = RunOptions::new(&config, dataset.scene_scale);
+    let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
+    let mut scene = PagedScene::new(&columns, pager, &options).unwrap();
+    let mut working = WorkingSet::default();
+    let (mut bits, mut isects) = (Vec::new(), u32::MAX);
+    for (step, &view) in dataset.train_views().iter().cycle().take(10).enumerate() {
+        let view = &dataset.views[view];
+        let (target, how) = (decode(&view.photo).unwrap(), (&options.render, &options.loss));
+        let at = (step as u32, &view.camera, &target);
+        let done = train_step(&mut scene, &mut working, &mut renderer, at, how, true, usize::MAX).unwrap();
+        assert!(done.rows > 900 && done.updated > 300 && !done.skipped, "{done:?}");
+        isects = isects.min(renderer.isects());
+        let columns = [&working.columns, &working.gradients.columns];
+        let values = columns.into_iter().flat_map(|c| Column::ALL.into_iter().flat_map(|of| c.column(of)));
+        bits.extend(values.chain(working.gradients.means2d.as_flattened()).map(|x| x.to_bits()));
+        bits.extend(working.gradients.radii.as_flattened());
+        bits.extend([done.loss.loss.to_bits() as u32, (done.loss.loss.to_bits() >> 32) as u32]);
+    }
+    Some((bits, isects, renderer.frames_rerecorded()))
+}
+
+/// Cuts and waits affect the execution of a step, not its result: whole steps give the same bits.
+#[test]
+fn windows_waits_and_second_tries_change_no_bit_of_whole_steps() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 64, 48, 1500);
+    let plain = GpuOptions::default();
+    let Some((want, isects, again)) = bits_of_steps(&scene, &plain, 1 << 16) else { return };
+    assert_eq!(again, 0);
+    // One binding must hold the splats, 48 bytes a row. Columns are cut into three parts or more (over 900 rows are in
+    // view), and so are the sums of the intersections.
+    let limit = 48 * 1500;
+    let windows = (36 * u64::from(isects)).div_ceil(limit);
+    println!("{isects} intersections in {windows} windows");
+    assert!(windows >= 3);
+    let cut = GpuOptions { max_binding_bytes: Some(limit), window_rows: Some(384), ..plain };
+    let serial = GpuOptions { serial: true, ..plain };
+    for (what, options, capacity) in [
+        ("windows", cut, limit as u32 / 4),
+        ("a wait for each submission", serial, 1 << 16),
+        ("lists that were too short at first", plain, 100),
+        ("all of it", GpuOptions { serial: true, ..cut }, 100),
+        ("windows, and uniforms in blocks", GpuOptions { uniform_blocks: Some(true), ..cut }, limit as u32 / 4),
+    ] {
+        let (got, _, again) = bits_of_steps(&scene, &options, capacity).unwrap();
+        assert_eq!(capacity == 100, again > 0, "{what}: {again} frames again");
+        let moved = got.iter().zip(&want).filter(|(g, w)| g != w).count();
+        assert!(got == want, "{what}: {moved} of {} words differ", want.len());
+    }
+}
+
+/// Uploads and allocations of the third and fourth step, on a scene `times` as large whose other rows no camera sees.
+fn steps_of_a_scene(scene: &Path, times: usize) -> Option<(Vec<usize>, Traffic, Traffic)> {
+    let renderer = GpuRenderer::new(gpu::open(&GpuOptions::default())?).unwrap();
+    let config = TrainConfig { steps: 10, strategy: StrategyName::None, ..TrainConfig::default() };
+    let Prepared { dataset, mut columns, .. } = prepare(scene, &config).unwrap();
+    let rows = columns.rows();
+    // Opposite to the viewing directions: all cameras look down on the city.
+    let away: Vec<f32> = (0..3).map(|i| dataset.views.iter().map(|v| -v.camera.viewmat[2][i]).sum::<f32>()).collect();
+    let small = columns.clone();
+    columns.resize(times * rows);
+    for column in Column::ALL {
+        let copies = small.column(column).repeat(times);
+        columns.column_mut(column).copy_from_slice(&copies);
+    }
+    for (i, x) in columns.means.iter_mut().enumerate().skip(3 * rows) {
+        *x += 100.0 * dataset.scene_scale * away[i % 3];
+    }
+    let mut trainer =
+        Trainer::new(columns, &dataset, Box::new(renderer), RunOptions::new(&config, dataset.scene_scale)).unwrap();
+    let targets = TargetCache::new(&dataset.views, 1 << 30, 1).unwrap();
+    let step = |trainer: &mut Trainer| trainer.step(&dataset, &targets).unwrap().rows;
+    let mut seen = vec![step(&mut trainer), step(&mut trainer)];
+    let before = trainer.renderer.traffic();
+    seen.extend([step(&mut trainer), step(&mut trainer)]);
+    Some((seen, before, trainer.renderer.traffic()))
+}
+
+#[test]
+fn what_no_camera_sees_costs_the_device_nothing() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 128, 96, 1500);
+    let (Some(small), Some(large)) = (steps_of_a_scene(&scene, 1), steps_of_a_scene(&scene, 10)) else { return };
+    assert!(small.0.iter().all(|&rows| rows > 100), "{:?}", small.0);
+    assert_eq!(small.0, large.0, "both see the same rows");
+    assert_eq!(small.1, large.1, "before the steps");
+    assert_eq!(small.2, large.2, "after the steps");
+    assert!(small.2.bytes_uploaded > small.1.bytes_uploaded);
+}
+
+#[test]
+fn devices_are_listed_and_an_unknown_one_is_refused() {
+    let output = train(&["--list-devices"]);
+    let listed = String::from_utf8(output.stdout).unwrap();
+    assert!(output.status.success() && listed.ends_with("cpu: the CPU renderer\n"), "{listed}");
+    if let Some(device) = gpu::open(&GpuOptions::default()) {
+        assert!(listed.contains(&device.summary().to_string()), "{listed}");
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 64, 48, 200);
+    let out = folder.path().join("run");
+    let output = train(&[text(&scene), "--out", text(&out), "--device", "no such device"]);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(
+        said.contains("--device") && said.contains("'no such device'") && said.contains("--list-devices"),
+        "{said}"
+    );
+    assert!(!out.exists(), "bad input leaves nothing behind");
+}
+
+#[test]
+fn auto_never_takes_a_software_adapter() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 64, 48, 200);
+    let output = train(&[text(&scene), "--dry-run"]);
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    let has_hardware = gsscale::gpu::list_adapters()
+        .iter()
+        .any(|a| a.kind != gsscale::gpu::DeviceKind::Software && a.refusal.is_none());
+    assert_eq!(said.contains("there is no hardware GPU: the CPU renders"), !has_hardware, "{said}");
+    assert_eq!(said.contains("rendered by cpu"), !has_hardware, "{said}");
+}

@@ -1,0 +1,28 @@
+//! Whole runs through the programs that users start. A few tests drive the training loop itself.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
+
+mod support;
+
+mod bench_tool;
+#[cfg(target_os = "linux")] // /proc shows the peak memory of a process
+mod bombs;
+#[cfg(unix)]
+mod ckpt;
+mod cli;
+#[cfg(unix)]
+mod drive_faults;
+mod gpu_train;
+mod growing;
+mod memory;
+mod optimizers;
+mod outgrown;
+mod paging_train;
+mod plan_tool;
+mod published;
+mod real_scenes;
+mod report;
+#[cfg(unix)]
+mod resume;
+mod sweeps;
+mod tiers;
+mod train;

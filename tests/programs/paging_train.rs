@@ -1,0 +1,202 @@
+//! Paging changes no byte of a run: any number of frames, any I/O engine and any number of threads give the same files.
+//! Through the real binary.
+//!
+//! `GSSCALE_PAGING_FULL=1 cargo test --test programs paging_train` runs the whole grid at 600 steps: about 15 minutes
+//! on two cores, longer than nextest allows a test.
+
+use crate::support::scenes::{self, stderr, summary, text, train};
+use crate::support::shared::real_scene;
+use gsscale::dataset::synthetic::{CityOptions, write_city};
+use std::path::Path;
+use tempfile::TempDir;
+
+/// Flags of all runs.
+const COMMON: &[&str] = &["--view-order", "groups:4", "--test-every", "24", "--quiet"];
+
+/// Events of the runs of 600 steps.
+const EVENTS: &[&str] = &["--refine-start", "100", "--refine-every", "50", "--reset-every", "200", "--sh-every", "100"];
+
+/// Every event at least twice within 120 steps.
+const MORE_EVENTS: &[&str] =
+    &["--refine-start", "20", "--refine-every", "25", "--reset-every", "45", "--sh-every", "30"];
+
+/// Where pages are kept, and how they get there.
+#[derive(Debug, Clone)]
+struct How {
+    /// 0: all pages in memory.
+    frames: u64,
+    /// Empty: a store in memory, without files.
+    io: &'static str,
+    threads: &'static str,
+    more: &'static [&'static str],
+}
+
+/// Runs the scene; returns the PLY and the summary.
+fn run(folder: &Path, scene: &Path, base: &[&str], how: &How) -> (Vec<u8>, serde_json::Value) {
+    let (out, spill) = (folder.join("out"), folder.join("spill"));
+    let frames = how.frames.to_string();
+    let mut args = vec![text(scene), "--out", text(&out), "--overwrite", "--frames", &frames];
+    args.extend(["--threads", how.threads]);
+    args.extend(base);
+    args.extend(how.more);
+    if !how.io.is_empty() {
+        args.extend(["--io", how.io, "--spill-dir", text(&spill)]);
+    }
+    let output = train(&args);
+    assert!(output.status.success(), "{how:?}: {}", stderr(&output));
+    assert!(!spill.exists(), "{how:?}: the spill directory is left over");
+    (std::fs::read(out.join("point_cloud.ply")).unwrap(), summary(&out))
+}
+
+fn number(summary: &serde_json::Value, key: &str) -> u64 {
+    summary[key].as_u64().unwrap()
+}
+
+/// Engines that work here: containers often forbid io_uring.
+fn engines() -> Vec<&'static str> {
+    let folder = TempDir::new().unwrap();
+    let works = |io: &&str| gsscale::page::engine::open::open_engine(io.parse().unwrap(), folder.path(), 4).is_ok();
+    ["uring", "mmap", "pread"].into_iter().filter(works).collect()
+}
+
+#[test]
+fn frames_engines_and_threads_change_no_bit() {
+    let Some(scene) = real_scene("seneca") else { return };
+    let folder = TempDir::new().unwrap();
+    let is_full = std::env::var_os("GSSCALE_PAGING_FULL").is_some();
+    let steps = if is_full { "600" } else { "200" };
+    let events = if is_full { EVENTS } else { MORE_EVENTS };
+    let base = [&["--data-factor", "4", "--page-rows", "128", "--steps", steps], COMMON, events].concat();
+    let in_memory = How { frames: 0, io: "", threads: "2", more: &[] };
+    let (want, whole) = run(folder.path(), &scene, &base, &in_memory);
+    let (pages, fewest) = (number(&whole, "frames"), number(&whole, "pages_pinned_max"));
+    assert_ne!(number(&whole, "gaussians"), 59_927, "no round changed anything, so the test shows little");
+    assert_eq!((number(&whole, "bytes_read"), number(&whole, "evictions")), (0, 0));
+    let engines = engines();
+    let how = |frames, io, threads, more| How { frames, io, threads, more };
+    let mut grid = Vec::new();
+    if is_full {
+        for frames in [pages, pages / 2, pages / 4, fewest] {
+            for &io in engines.iter().chain(&[""]) {
+                grid.extend(["1", "2"].map(|threads| how(frames, io, threads, &[] as &[&str])));
+            }
+        }
+    } else {
+        let io = |i: usize| engines[i % engines.len()];
+        grid.push(how(pages, io(1), "1", &[]));
+        grid.push(how(pages / 2, io(0), "2", &[]));
+        // Or the fewest frames, if a view needs more than a quarter of the pages.
+        grid.push(how(pages / 4, io(1), "2", &["--evict", "lru", "--prefetch-bytes", "1MiB"]));
+        grid.push(how(pages / 4, "", "1", &[]));
+        grid.push(how(fewest, io(0), "1", &["--spill-codec", "zstd:1"]));
+        grid.push(how(fewest, io(2), "2", &[]));
+    }
+    for how in grid.into_iter().map(|h| How { frames: h.frames.max(fewest), ..h }) {
+        let (got, summary) = run(folder.path(), &scene, &base, &how);
+        assert!(got == want, "{how:?} gives another scene");
+        assert!(number(&summary, "frames") <= how.frames, "{how:?}: {summary}");
+        let spills = how.frames < pages;
+        assert_eq!(number(&summary, "pages_read") > 0, spills, "{how:?}: {summary}");
+        // Pages that fit in memory are written to the drive once, by the commit after the last step.
+        let commits = !how.io.is_empty();
+        assert_eq!(number(&summary, "bytes_written") > 0, spills || commits, "{how:?}: {summary}");
+    }
+}
+
+/// Without this flag, the first reset also starts the pruning of large Gaussians.
+const NO_SIZE_LIMIT: &[&str] = &["--prune-scale3d", "1000"];
+
+/// Flags of runs on cities.
+const CITY: &[&str] = &["--page-rows", "32", "--steps", "120", "--grow-grad2d", "0.001"];
+
+#[test]
+fn a_tenth_of_a_city_in_memory_gives_the_same_city() {
+    let folder = TempDir::new().unwrap();
+    let scene = folder.path().join("scene");
+    let options = CityOptions {
+        seed: 5,
+        views: 96,
+        width: 48,
+        height: 36,
+        points: 1_500,
+        tiles: [8, 6],
+        blocks: Some(12),
+        supersample: 1,
+        ..CityOptions::default()
+    };
+    write_city(&scene, &options, &|_, _| {}).unwrap();
+    let base = [CITY, COMMON, NO_SIZE_LIMIT, MORE_EVENTS].concat();
+    let in_memory = How { frames: 0, io: "", threads: "2", more: &[] };
+    let (want, whole) = run(folder.path(), &scene, &base, &in_memory);
+    let mut fewest_pages = u64::MAX;
+    for (flag, never) in [("--refine-every", "1000"), ("--reset-every", "0"), ("--sh-every", "1000")] {
+        let mut without = base.clone();
+        let at = without.iter().position(|word| *word == flag).unwrap();
+        without[at + 1] = never;
+        let (other, summary) = run(folder.path(), &scene, &without, &in_memory);
+        fewest_pages = fewest_pages.min(number(&summary, "pages"));
+        assert!(other != want, "{flag} {never} changes nothing, so these events had no effect");
+    }
+    let frames = number(&whole, "pages") / 10;
+    let (got, summary) = run(folder.path(), &scene, &base, &How { frames, io: "auto", threads: "2", more: &[] });
+    assert!(got == want);
+    // As a share of the pages of a city that did not grow.
+    let seen = number(&summary, "pages_pinned_max") as f64 / fewest_pages as f64;
+    assert!(seen < 0.03, "a view sees {seen} of the pages: {summary}");
+    assert!(number(&summary, "evictions") > 0 && number(&summary, "pages_read") > 0, "{summary}");
+    // Export and evaluation read every page; the steps' counters exclude these reads.
+    assert!(number(&summary, "other_pages_needed") >= number(&summary, "pages"), "{summary}");
+    // The bound may keep other pages after the import than the run; pages prefetched at the end of the run are in
+    // neither count.
+    let (bound, steps) = (number(&summary, "belady_bytes_read"), number(&summary, "bytes_read"));
+    let read = steps - number(&summary, "other_bytes_read");
+    assert!(bound > 0 && bound <= read && read < bound + bound / 2, "{read} read by steps, {bound} at least");
+}
+
+/// The predicted growth of pages that no view has seen since a round counts: the cap on the Gaussians holds at every
+/// step, for any memory, and is reached.
+#[test]
+fn a_cap_on_the_gaussians_holds_at_every_step_and_pages_to_the_same_bits() {
+    let folder = TempDir::new().unwrap();
+    let scene = scenes::wide_city(folder.path(), 8_000);
+    let cap = 8_400;
+    // Rounds follow each other closely, so that most growing pages are unseen between two rounds; nothing is pruned,
+    // which would make room again, nor reset to impossible opacities.
+    let rounds = ["--refine-start", "20", "--refine-every", "4", "--reset-every", "45"];
+    let capped = ["--max-gaussians", "8400", "--log-every", "1", "--prune-opa", "0"];
+    let base = [CITY, COMMON, NO_SIZE_LIMIT, &rounds, &capped].concat();
+    let (want, whole) = run(folder.path(), &scene, &base, &How { frames: 0, io: "", threads: "2", more: &[] });
+    let frames = number(&whole, "pages_pinned_max");
+    assert!(frames < number(&whole, "pages") / 2, "a view sees too much");
+    let (got, summary) = run(folder.path(), &scene, &base, &How { frames, io: "auto", threads: "2", more: &[] });
+    assert!(got == want);
+    assert_eq!(number(&summary, "gaussians"), number(&whole, "gaussians"));
+    let metrics = std::fs::read_to_string(folder.path().join("out/metrics.jsonl")).unwrap();
+    let rows: Vec<u64> = metrics.lines().map(|l| number(&serde_json::from_str(l).unwrap(), "gaussians")).collect();
+    assert_eq!(rows.len(), 119, "a line after each step but the first");
+    assert!(rows.iter().all(|&rows| rows <= cap), "{rows:?}");
+    // A histogram bin that does not fit as a whole is left out.
+    let end = number(&summary, "gaussians");
+    assert!(end <= cap && end + 40 > cap, "{end} of {cap}");
+}
+
+/// 16-bit moments change training, but paging changes nothing further.
+#[test]
+fn moments_in_16_bits_page_to_the_same_bits() {
+    let folder = TempDir::new().unwrap();
+    let scene = scenes::wide_city(folder.path(), 8_000);
+    let base = [CITY, COMMON, MORE_EVENTS].concat();
+    let halves = [&base[..], &["--moments", "bf16"]].concat();
+    let in_memory = How { frames: 0, io: "", threads: "2", more: &[] };
+    let (want, whole) = run(folder.path(), &scene, &halves, &in_memory);
+    let frames = number(&whole, "pages_pinned_max");
+    assert!(frames < number(&whole, "pages") / 2, "a view sees too much");
+    for (threads, more) in [("2", &[][..]), ("1", &["--spill-codec", "zstd:1"])] {
+        let how = How { frames, io: "auto", threads, more };
+        let (got, summary) = run(folder.path(), &scene, &halves, &how);
+        assert!(got == want, "{how:?} gives another scene");
+        assert!(number(&summary, "pages_read") > 0 && number(&summary, "evictions") > 0, "{summary}");
+    }
+    let (exact, _) = run(folder.path(), &scene, &base, &in_memory);
+    assert!(exact != want, "the moments were not rounded");
+}

@@ -1,0 +1,247 @@
+//! `gsscale-plan` through its binary: sums that agree, exact lists, and refusals with a remedy.
+
+use crate::support::scenes::{city, stderr, summary, text, train, wide_city};
+use serde_json::Value;
+use std::path::Path;
+use std::process::{Command, Output};
+use tempfile::TempDir;
+
+fn plan(scene: &Path, args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_gsscale-plan")).arg(text(scene)).args(args).output().unwrap()
+}
+
+fn stdout(output: &Output) -> String {
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+#[test]
+fn a_scene_is_planned_for_several_memories_and_orders() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 300, 32, 24, 8000);
+    let common = ["--page-rows", "32", "--steps", "1000", "--test-every", "0"];
+    let with = |more: &[&str]| stdout(&plan(&scene, &[&common[..], more].concat()));
+    let orders = "auto,shuffle,groups:4,tour";
+    let value: Value =
+        serde_json::from_str(&with(&["--compare-frames", "70%,100%", "--compare-orders", orders, "--json"])).unwrap();
+    let plans = value["plans"].as_array().unwrap();
+    assert_eq!((plans.len(), value["views"].as_u64().unwrap()), (8, 300));
+    let number = |plan: &Value, key: &str| plan[key].as_f64().unwrap();
+    for plan in &plans[..4] {
+        assert!(number(plan, "hit_rate") >= number(plan, "lru_hit_rate") && plan["is_belady_bound"] == true);
+        // The import writes each page; beyond that, every read evicts a page.
+        assert!(number(plan, "bytes_written") >= number(&value, "state_bytes"));
+        assert!(number(plan, "bytes_read") > 0.0);
+        // The endurance of a common drive: 300 TB.
+        let share = number(plan, "bytes_written") / 300e12;
+        assert!((number(plan, "share_of_endurance") / share - 1.0).abs() < 1e-9, "{plan}");
+    }
+    assert!(number(&plans[1], "hit_rate") < number(&plans[3], "hit_rate"), "a tour reads less than a shuffle");
+    // If everything fits, nothing is read again, and auto chooses a shuffle.
+    assert!(
+        plans[4..].iter().all(|plan| number(plan, "hit_rate") == 1.0 && number(plan, "stall_seconds_worst") == 0.0)
+    );
+    assert_eq!(plans[4]["view_order"], "shuffle");
+    let table = with(&["--compare-frames", "70%", "--compare-orders", orders]);
+    assert_eq!(table.lines().count(), 4 + 4, "{table}");
+    assert!(table.lines().nth(1).unwrap().contains("hit rate    of lru"), "{table}");
+    for (plan, line) in plans[..4].iter().zip(table.lines().skip(2)) {
+        let shown = format!(" {:.3} {:9.3} ", number(plan, "hit_rate"), number(plan, "lru_hit_rate"));
+        assert!(line.contains(&shown), "{shown} is not in: {table}");
+    }
+    // Default shares hold the largest view.
+    let open: Value = serde_json::from_str(&with(&["--view-order", "shuffle", "--json"])).unwrap();
+    let frames = |value: &Value| -> Vec<u64> {
+        value["plans"].as_array().unwrap().iter().map(|plan| plan["frames"].as_u64().unwrap()).collect()
+    };
+    let (most, pages) = (open["pages_of_largest_view"].as_u64().unwrap(), open["pages"].as_u64().unwrap());
+    assert!(most > pages / 2 && frames(&open) == [most, pages], "{open}");
+    // The exact lists of two steps: evicted pages make room for admitted pages.
+    let lists = with(&["--compare-frames", "70%", "--view-order", "shuffle", "--lists", "700..740"]);
+    let lines: Vec<&str> = lists.lines().collect();
+    assert!(lines[0].starts_with("step 700: ") && lines.iter().any(|line| line.starts_with("step 701: ")), "{lists}");
+    let count = |sign: &str| lines.iter().filter_map(|l| l.strip_prefix(sign)).flat_map(str::split_whitespace).count();
+    assert!(count("  + ") > 0 && count("  + ") == count("  - "), "{lists}");
+}
+
+#[test]
+fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 12, 64, 48, 800);
+    let run = folder.path().join("run");
+    std::fs::create_dir(&run).unwrap();
+    std::fs::write(run.join("config.toml"), format!("steps = 77\n[resolved]\nscene = {:?}\n", text(&scene))).unwrap();
+    let told = stdout(&plan(&run, &["--page-rows", "16", "--compare-frames", "100%"]));
+    assert!(told.contains("by all 77 steps"), "{told}");
+    // Given frames need no given memory.
+    for named in [["--frames", "80"], ["--compare-frames", "100%"]] {
+        stdout(&plan(&run, &[&["--page-rows", "16", "--host-mem", "1MiB"], &named[..]].concat()));
+    }
+    for (args, words) in [
+        (&["--page-rows", "16", "--frames", "2"][..], ["2 frames", "--host-mem"]),
+        (&["--compare-frames", "many"], ["'many'", "25%"]),
+        (&["--compare-orders", "random"], ["'random'", "groups:N"]),
+        (&["--drive-read", "0"], ["--drive-read", "bytes per second"]),
+        (&["--lists", "5..5"], ["5..5", "100..110"]),
+        (&["--step-seconds", "nan"], ["--step-seconds", "leave them out"]),
+        (&["--optimizer", "dense"], ["every page at every step", "deferred"]),
+    ] {
+        let output = plan(&run, args);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success() && words.iter().all(|word| said.contains(word)), "{said}");
+    }
+}
+
+/// The plan equals the run: frames for a budget, bytes read, bytes written.
+#[test]
+fn a_run_does_what_was_planned() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 150, 96, 64, 8000);
+    let (out, spill) = (folder.path().join("out"), folder.path().join("spill"));
+    let common = [
+        "--page-rows",
+        "16",
+        "--test-every",
+        "0",
+        "--strategy",
+        "none",
+        "--steps",
+        "450",
+        "--sh-start",
+        "3",
+        "--means-lr",
+        "1e-9",
+        "--scales-lr",
+        "1e-9",
+    ];
+    let common = [&common[..], &["--view-order", "groups:9", "--prefetch-bytes", "1MiB"]].concat();
+    let planned = |more: &[&str]| -> Value {
+        serde_json::from_str(&stdout(&plan(&scene, &[&common[..], &["--json"], more].concat()))).unwrap()
+    };
+    let flags = ["--out", text(&out), "--spill-dir", text(&spill), "--commit-every", "0", "--device", "cpu"];
+    let common = [&common[..], &["--host-mem", "42MiB"]].concat();
+    let trained = train(&[&[text(&scene)][..], &common, &flags].concat());
+    let said = stderr(&trained);
+    assert!(trained.status.success(), "{said}");
+    let done = summary(&out);
+    let within = planned(&["--host-mem", "42MiB"]);
+    assert!(within["pages"] == done["pages"] && within["gaussians"] == done["gaussians"], "{within} {done}");
+    let number = |value: &Value| value.as_f64().unwrap();
+    let near = |what: &str, planned: &Value, real: f64, tolerance: f64| {
+        let off = (number(planned) / real - 1.0).abs();
+        assert!(off <= tolerance, "{what}: {planned} planned, {real} in the run, {:.1} % off", 100.0 * off);
+    };
+    // The plan renders only the view with the most pages; the run renders some others too, which may take a little
+    // more.
+    near("frames", &within["plans"][0]["frames"], number(&done["frames"]), 0.1);
+    assert!(number(&done["frames"]) < 0.9 * number(&done["pages"]), "everything fits: {done}");
+    let plan = planned(&["--frames", &done["frames"].to_string()]);
+    // The plan knows all views and assumes that pages stay in place, which nearly holds for these Gaussians.
+    let plan = &plan["plans"][0];
+    near("the bound", &plan["bytes_read"], number(&done["belady_bytes_read"]), 0.01);
+    let read = number(&done["bytes_read"]) - number(&done["other_bytes_read"]);
+    near("bytes read", &plan["bytes_read"], read, 0.05);
+    // The plan counts every seen page as changed; pages whose rows have no gradient need not be written.
+    let (most, written) =
+        (number(&plan["bytes_written"]), number(&done["bytes_written"]) - number(&done["commit_bytes"]));
+    assert!(written <= most && most <= 1.6 * written, "{most} bytes to be written at most, {written} were");
+    // The run prints the same before its first step.
+    let told = told_to_be_written(&said);
+    assert!((told / most - 1.0).abs() < 0.1, "{told} told by the run, {most} by the plan");
+}
+
+/// Bytes that a run announces to write.
+fn told_to_be_written(said: &str) -> f64 {
+    let line = said.lines().find(|line| line.contains(" to write without commits")).unwrap();
+    let text = line.split("about ").nth(1).and_then(|rest| rest.split(" to write without commits").next());
+    let (number, unit) = text.and_then(|text| text.split_once(' ')).expect(line);
+    let power = ["B", "KiB", "MiB", "GiB", "TiB"].iter().position(|u| *u == unit).expect(line);
+    number.parse::<f64>().expect(line) * 1024f64.powi(power as i32)
+}
+
+/// The drive wear that a run announces is its bytes to be written over the endurance of a common drive.
+#[test]
+fn a_run_says_what_it_takes_of_the_life_of_a_drive() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 150, 96, 64, 8000);
+    let spill = folder.path().join("spill");
+    let flags = ["--page-rows", "16", "--frames", "330", "--view-order", "shuffle", "--strategy", "none"];
+    // Enough steps for some 900 GiB.
+    let more = ["--steps", "2000000", "--dry-run", "--spill-dir", text(&spill)];
+    let output = train(&[&[text(&scene)][..], &flags, &more].concat());
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    let told =
+        said.split("without commits, ").nth(1).and_then(|rest| rest.split(" % of the rated").next()).expect(&said);
+    let share = told.parse::<f64>().expect(&said) / 100.0;
+    let expected = told_to_be_written(&said) / 300e12;
+    // Both are rounded for people: the share to a hundredth of a percent, the bytes to three digits.
+    assert!(expected > 0.002 && (share - expected).abs() < 0.00005 + 0.005 * expected, "{share}, {expected}: {said}");
+}
+
+#[test]
+fn the_drive_of_the_pages_is_measured_unless_its_rates_are_named() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 12, 64, 48, 800);
+    let spill = folder.path().join("spill");
+    let rates = |more: &[&str]| {
+        let args = [&["--page-rows", "16", "--compare-frames", "100%", "--json"], more].concat();
+        let value: Value = serde_json::from_str(&stdout(&plan(&scene, &args))).unwrap();
+        ["drive_read_bytes_per_second", "drive_write_bytes_per_second"].map(|key| value[key].as_f64().unwrap())
+    };
+    assert_eq!(rates(&[]), [3e9, 2e9]);
+    assert_eq!(rates(&["--drive-read", "5GB", "--drive-write", "4GB", "--spill-dir", text(&spill)]), [5e9, 4e9]);
+    let [read, write] = rates(&["--drive-read", "5GB", "--spill-dir", text(&spill)]);
+    assert!(read == 5e9 && write > 1e6 && write != 2e9, "{write} bytes a second");
+    let left: Vec<_> = folder.path().read_dir().unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(left, ["scene"], "a plan leaves no file");
+}
+
+#[test]
+fn a_scene_larger_than_memory_is_planned_within_it() {
+    let folder = TempDir::new().unwrap();
+    let scene = wide_city(folder.path(), 200_000);
+    let (budget, bytes) = ("100MiB", 100 << 20);
+    let args = ["--host-mem", budget, "--page-rows", "128", "--image-cache", "4MiB", "--prefetch-bytes", "1MiB"];
+    let args = [&args[..], &["--device", "cpu"]].concat();
+    let value: Value =
+        serde_json::from_str(&stdout(&plan(&scene, &[&args[..], &["--json", "--plan-mem", "16MiB"]].concat())))
+            .unwrap();
+    assert!(value["gaussians"].as_u64() > Some(190_000) && value["state_bytes"].as_u64() > Some(bytes), "{value}");
+    assert!(value["host_bytes_peak"].as_u64() <= Some(bytes), "{value}");
+    assert!(value["step_timed_on"].is_string(), "a view of middling size fits: {value}");
+    let (plan, pages) = (&value["plans"][0], value["pages"].as_u64());
+    assert!(plan["frames"].as_u64() < pages && plan["frames"].as_u64() > value["pages_of_largest_view"].as_u64());
+}
+
+/// Step times are measured on the device of the run unless given; steps plus stalls make the time of the run.
+#[test]
+fn the_time_of_a_run_is_that_of_its_steps_and_what_they_wait() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 300, 32, 24, 8000);
+    let common = ["--page-rows", "32", "--test-every", "0", "--compare-frames", "70%", "--view-order", "shuffle"];
+    let common = [&common[..], &["--device", "cpu", "--drive-write", "100MB"]].concat();
+    let planned = |more: &[&str]| -> Value {
+        serde_json::from_str(&stdout(&plan(&scene, &[&common[..], &["--json"], more].concat()))).unwrap()
+    };
+    let number = |value: &Value| value.as_f64().unwrap();
+    let timed = planned(&["--steps", "1000"]);
+    assert!(number(&timed["step_seconds"]) > 1e-6 && timed["step_timed_on"] == "cpu", "{timed}");
+    // As many steps as the simulation plays one by one, and many more, which repeat the later ones.
+    for steps in [1200.0, 24_000.0] {
+        let of = |rate| planned(&["--steps", &steps.to_string(), "--step-seconds", "0.002", "--drive-read", rate]);
+        let (slow, fast) = (of("1MB"), of("1000GB"));
+        assert!(slow["step_seconds"] == 0.002 && slow["step_timed_on"].is_null(), "{slow}");
+        let [slow, fast] = [&slow, &fast].map(|value| &value["plans"][0]);
+        // Reading takes far longer than computing: the run takes as long as its reads and writes.
+        let moved = number(&slow["bytes_read"]) / 1e6 + (number(&slow["bytes_written"])) / 100e6;
+        let seconds = number(&slow["seconds"]);
+        assert!((seconds / moved - 1.0).abs() < 0.05, "{seconds} s to move {slow} in {moved} s");
+        assert!(number(&fast["seconds"]) >= 0.002 * steps && number(&fast["seconds"]) < 0.1 * seconds, "{fast}");
+    }
+    // With all pages in memory no step waits, not even the first.
+    let all = planned(&["--steps", "30", "--step-seconds", "0.5", "--compare-frames", "100%"]);
+    assert_eq!(number(&all["plans"][1]["seconds"]), 15.0, "{all}");
+    let table = stdout(&plan(&scene, &[&common[..], &["--steps", "100", "--step-seconds", "72"]].concat()));
+    assert!(table.contains("2.0 h") && table.contains("72.0000 s;"), "{table}");
+}

@@ -1,0 +1,404 @@
+//! Published runs: config files against the papers' tables, and the way from a dataset folder to a table beside the
+//! paper's, as configs/README.md describes it. On look-alike datasets through the real binaries.
+
+use crate::support::scenes::{self, eval, stderr, text, train};
+use gsscale::config::choice::Chosen;
+use gsscale::config::file::TrainConfig;
+use gsscale::config::published::{BUILT_IN, PublishedRun};
+use gsscale::dataset::layout::Layout;
+use gsscale::dataset::lookalike::write_lookalike;
+use gsscale::dataset::synthetic::CityOptions;
+use gsscale::densify::strategy::StrategyName;
+use gsscale::render::SsimPadding;
+use gsscale::render::metrics::SsimVariant;
+use gsscale::schedule::order::Order;
+use serde_json::Value;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use tempfile::TempDir;
+
+/// GS-Scale's per-scene dictionary, typed from the paper's table rather than from the config files: name, data_factor,
+/// test_every, test_after, position_lr, scaling_lr, smallest tier's refine_stop_iter, training size.
+#[rustfmt::skip]
+type SceneRow = (&'static str, f64, u32, i64, f64, f64, u32, Option<[u32; 2]>);
+#[rustfmt::skip]
+const SCENES: [SceneRow; 8] = [
+    ("rubble",    4.0,    83, -1,   0.000016, 0.005,  5000, Some([1152, 864])),
+    ("building",  4.0,    97, -1,   0.000008, 0.0025, 5000, Some([1152, 864])),
+    ("lfls",      3.4175, 10, -1,   0.000016, 0.005,  4000, Some([1600, 1064])),
+    ("sziit",     3.4175, 10, -1,   0.000016, 0.005,  5000, Some([1600, 1064])),
+    ("sztu",      3.4175, 10, -1,   0.000016, 0.005,  4000, Some([1600, 1064])),
+    ("aerial",    1.2,    0,  5620, 0.000008, 0.0025, 5000, Some([1600, 900])),
+    ("residence", 4.0,    0,  2561, 0.000016, 0.005,  5000, None),
+    ("sciart",    4.0,    0,  2998, 0.000016, 0.005,  5000, None),
+];
+
+/// GS-Scale's quality table: PSNR, SSIM, LPIPS of the unchanged trainer, then its own.
+#[rustfmt::skip]
+const QUALITY: [(&str, [f64; 6]); 6] = [
+    ("rubble",   [26.63, 0.808, 0.194, 26.62, 0.808, 0.194]),
+    ("building", [22.74, 0.777, 0.211, 22.78, 0.777, 0.211]),
+    ("lfls",     [24.04, 0.752, 0.234, 24.08, 0.752, 0.233]),
+    ("sziit",    [26.28, 0.797, 0.213, 26.29, 0.797, 0.213]),
+    ("sztu",     [24.90, 0.835, 0.155, 24.95, 0.836, 0.155]),
+    ("aerial",   [27.69, 0.873, 0.127, 27.66, 0.873, 0.128]),
+];
+
+/// The tiers above the smallest: grow_grad2d, grow_scale3d, refine_stop_iter.
+const TIERS: [(&str, f64, f64, u32); 5] = [
+    ("S1", 0.0002, 0.01, 15_000),
+    ("S2", 0.00015, 0.005, 15_000),
+    ("S3", 0.00013, 0.003, 15_000),
+    ("S4", 0.0001, 0.002, 15_000),
+    ("S5", 0.00008, 0.0016, 15_000),
+];
+
+fn find(name: &str) -> PublishedRun {
+    PublishedRun::find(Path::new(name)).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// The values shared by all scenes.
+fn shared() -> TrainConfig {
+    TrainConfig {
+        steps: 200_000,
+        seed: 42,
+        sh_degree: 3,
+        sh_start: 0,
+        sh_every: 1000,
+        init_opacity: 0.1,
+        init_scale: 1.0,
+        ssim_lambda: 0.2,
+        ssim_padding: SsimPadding::Valid,
+        near_plane: 0.01,
+        max_alpha: 0.999,
+        background: "0,0,0".parse().unwrap(),
+        means_lr_final: 0.01,
+        quats_lr: 0.001,
+        opacities_lr: 0.05,
+        sh0_lr: 0.0025,
+        shn_lr: 0.0025 / 20.0,
+        adam_eps: 1e-15,
+        strategy: StrategyName::Default,
+        max_gaussians: 0,
+        refine_start: 500,
+        refine_every: 100,
+        reset_every: 3000,
+        prune_opa: 0.005,
+        prune_scale3d: 0.1,
+        ssim_variant: SsimVariant::Reflect,
+        view_order: Chosen(Some(Order::Shuffle)),
+        ..TrainConfig::default()
+    }
+}
+
+#[test]
+fn the_files_hold_the_tables() {
+    assert_eq!(BUILT_IN.len(), SCENES.len());
+    for (name, data_factor, test_every, test_after, means_lr, scales_lr, smallest, size) in SCENES {
+        let mut run = find(name);
+        let expected = TrainConfig {
+            data_factor,
+            test_every,
+            test_after,
+            means_lr,
+            scales_lr,
+            grow_grad2d: 0.0002,
+            grow_scale3d: 0.01,
+            refine_stop: 15_000,
+            ..shared()
+        };
+        assert_eq!(run.config, expected, "{name}");
+        assert_eq!((run.facts.size, run.tier_of(&run.config)), (size, Some("S1")), "{name}");
+        assert_eq!(run.tiers.len(), 6);
+        for (tier, grow_grad2d, grow_scale3d, refine_stop) in TIERS.into_iter().chain([("S0", 0.0002, 0.01, smallest)])
+        {
+            run.use_tier(tier).unwrap();
+            assert_eq!(run.config, TrainConfig { grow_grad2d, grow_scale3d, refine_stop, ..expected.clone() });
+        }
+        let said = run.use_tier("S6").unwrap_err().to_string();
+        assert!(said.contains("S0, S1, S2, S3, S4, S5"), "{said}");
+        for layout in &run.facts.layouts {
+            layout.parse::<Layout>().unwrap();
+        }
+        assert!(run.facts.fetch.iter().all(|f| f.starts_with("https://")) && !run.facts.fetch.is_empty());
+    }
+    assert_eq!((find("rubble").facts.views, find("rubble").facts.held_out), (Some(1657 + 21), Some(21)));
+}
+
+#[test]
+fn the_files_hold_the_published_figures() {
+    for (name, _) in BUILT_IN {
+        let facts = find(name).facts;
+        let Some((_, figures)) = QUALITY.iter().find(|(scene, _)| *scene == name) else {
+            assert!(facts.expected.is_none() && facts.memory.is_none(), "{name} is not in the paper's tables");
+            continue;
+        };
+        let e = facts.expected.unwrap();
+        assert_eq!([e.original_psnr, e.original_ssim, e.original_lpips, e.psnr, e.ssim, e.lpips], *figures, "{name}");
+        assert_eq!((e.ssim_variant, e.lpips_variant.as_str()), (SsimVariant::Reflect, "alex, signed"));
+        let memory = facts.memory.unwrap();
+        assert_eq!((memory.saving_range, memory.saving_mean), ([3.3, 5.6], 3.98));
+        assert_eq!(memory.saving, (name == "aerial").then_some(5.5));
+    }
+}
+
+#[test]
+fn a_file_of_ones_own_is_read_as_strictly() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("mine.toml");
+    let with = |from: &str, to: &str| {
+        fs::write(&path, BUILT_IN[0].1.replacen(from, to, 1)).unwrap();
+        PublishedRun::find(&path).map_err(|e| e.to_string())
+    };
+    let mine = with("steps = 200000", "steps = 7").unwrap();
+    assert_eq!((mine.name.as_str(), mine.config.steps), ("mine", 7));
+    assert!(with("original-psnr", "orginal-psnr").unwrap_err().contains("orginal-psnr"));
+    assert!(with("[tier.S0]\ngrow-grad2d", "[tier.S0]\ngrow-grad").unwrap_err().contains("grow-grad"));
+    assert!(with("[published]", "[publishd]").unwrap_err().contains("publishd"));
+    fs::write(&path, "steps = 7\n").unwrap();
+    assert!(PublishedRun::find(&path).unwrap_err().to_string().contains("no table [published]"));
+    let said = PublishedRun::find(Path::new("rubbel")).unwrap_err().to_string();
+    assert!(said.contains("rubble, building"), "{said}");
+}
+
+fn bench(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_gsscale-bench")).args(args).output().unwrap()
+}
+
+/// Writes AlexNet with random weights as a file for --lpips.
+fn lpips_weights(folder: &Path) -> PathBuf {
+    let shapes: [(&str, [usize; 4]); 5] = [
+        ("slice1.0", [64, 3, 11, 11]),
+        ("slice2.3", [192, 64, 5, 5]),
+        ("slice3.6", [384, 192, 3, 3]),
+        ("slice4.8", [256, 384, 3, 3]),
+        ("slice5.10", [256, 256, 3, 3]),
+    ];
+    let floats = |count: usize, scale: f32| -> Vec<u8> {
+        (0..count as u32)
+            .flat_map(|i| (((i.wrapping_mul(2_654_435_761) >> 16) as f32 / 32768.0 - 1.0) * scale).to_le_bytes())
+            .collect()
+    };
+    let mut tensors = Vec::new();
+    for (i, (name, shape)) in shapes.into_iter().enumerate() {
+        let scale = (6.0 / (shape[1] * shape[2] * shape[3]) as f32).sqrt();
+        tensors.push((format!("net.{name}.weight"), shape.to_vec(), floats(shape.iter().product(), scale)));
+        tensors.push((format!("net.{name}.bias"), vec![shape[0]], floats(shape[0], 0.1)));
+        let ones: Vec<u8> = (0..shape[0]).flat_map(|_| 0.5f32.to_le_bytes()).collect();
+        tensors.push((format!("lin{i}.model.1.weight"), vec![1, shape[0], 1, 1], ones));
+    }
+    let views = tensors.iter().map(|(name, shape, bytes)| {
+        (name.clone(), safetensors::tensor::TensorView::new(safetensors::Dtype::F32, shape.clone(), bytes).unwrap())
+    });
+    let path = folder.join("lpips_alex.safetensors");
+    fs::write(&path, safetensors::serialize(views, None).unwrap()).unwrap();
+    path
+}
+
+fn lookalike(folder: &Path, layout: Layout) -> PathBuf {
+    let scene = folder.join(layout.name());
+    let options = CityOptions { seed: 5, views: 24, width: 96, height: 64, points: 1500, ..CityOptions::default() };
+    write_lookalike(&scene, &options, (layout, 6), &|_, _| {}).unwrap();
+    scene
+}
+
+/// Points of a COLMAP look-alike as a text PLY in the axes of Mega-NeRF's world: down, right, back.
+fn cloud_in_drb(city: &Path, to: &Path) {
+    let raw = gsscale::dataset::read::read_scene(city, &Default::default()).unwrap();
+    let mut ply = format!("ply\nformat ascii 1.0\nelement vertex {}\n", raw.points.positions.len());
+    for property in ["double x", "double y", "double z", "uchar red", "uchar green", "uchar blue"] {
+        ply += &format!("property {property}\n");
+    }
+    ply += "end_header\n";
+    for ([x, y, z], [r, g, b]) in raw.points.positions.iter().zip(&raw.points.colors) {
+        ply += &format!("{} {x} {} {r} {g} {b}\n", -z, -y);
+    }
+    fs::write(to, ply).unwrap();
+}
+
+#[test]
+fn look_alikes_train_as_the_plain_layout_does() {
+    let folder = TempDir::new().unwrap();
+    let trained = |scene: &Path| {
+        let out = folder.path().join("out").join(scene.file_name().unwrap());
+        let sizes = ["--steps", "120", "--test-every", "6", "--sh-every", "40", "--quiet", "--device", "cpu"];
+        let densify = ["--refine-start", "20", "--refine-every", "20", "--refine-stop", "90", "--reset-every", "60"];
+        let output = train(&[&[text(scene), "--out", text(&out)], &sizes[..], &densify[..]].concat());
+        assert!(output.status.success(), "{}", stderr(&output));
+        (fs::read(out.join("point_cloud.ply")).unwrap(), scenes::psnr(&out))
+    };
+    let plain = lookalike(folder.path(), Layout::Colmap);
+    let (_, psnr) = trained(&plain);
+    let (merged, of_merged) = trained(&lookalike(folder.path(), Layout::ColmapMerged));
+    let (one_folder, _) = trained(&lookalike(folder.path(), Layout::Gauu));
+    assert!(merged == one_folder, "two folders read as one give the bytes of one folder");
+    // These poses went through one more quaternion than the plain scene's, which changes last bits.
+    assert!((of_merged - psnr).abs() < 0.5, "{of_merged} dB, {psnr} dB");
+    let mega_nerf = lookalike(folder.path(), Layout::MegaNerf);
+    cloud_in_drb(&plain, &mega_nerf.join("points.ply"));
+    for scene in [mega_nerf, lookalike(folder.path(), Layout::MatrixCity)] {
+        let (_, other) = trained(&scene);
+        // Other axes or units round differently (Mega-NeRF's poses are f32), and densification amplifies roundings.
+        assert!((other - psnr).abs() < 0.5, "{}: {other} dB, {psnr} dB", scene.display());
+    }
+}
+
+#[test]
+fn a_run_is_set_beside_the_published_one() {
+    let folder = TempDir::new().unwrap();
+    let data = lookalike(folder.path(), Layout::ColmapMerged);
+    let before: Vec<PathBuf> = files_of(&data);
+    let out = folder.path().join("out");
+    let common = ["run", "rubble", "--data", text(&data), "--out", text(&out)];
+    let sizes = ["--steps", "30", "--data-factor", "1", "--device", "cpu", "--tier", "S2", "--color-correct", "affine"];
+    let output = bench(&[&common[..], &sizes].concat());
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    let line: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(
+        (&line["tier"], &line["layout"], &line["comparable"]),
+        (&"S2".into(), &"colmap-merged".into(), &false.into())
+    );
+    assert_eq!(line["published"]["psnr"], 26.62);
+    let ours = line["ours"]["test"]["psnr"].as_f64().unwrap();
+    assert!((line["difference"]["psnr"].as_f64().unwrap() - (ours - 26.62)).abs() < 1e-9);
+    assert!(line["difference"]["ssim"].is_number() && line["difference"]["lpips"].is_null(), "{line}");
+    let corrected = line["ours"]["test"]["color_corrected"]["cc_psnr"].as_f64().unwrap();
+    assert!(corrected.is_finite() && line["ours"]["test"]["color_corrected"]["method"] == "affine");
+    let why = line["not_the_published_run"].to_string();
+    for words in ["24 photos instead of 1678", "4 held-out photos instead of 21", "steps = 30 instead of 200000"] {
+        assert!(why.contains(words), "{why}");
+    }
+    for words in
+        ["GS-Scale", "26.62", "colour-corrected PSNR (affine), dB", "not the published run: ", "SSIM (reflect)"]
+    {
+        assert!(said.contains(words), "{words}: {said}");
+    }
+    let page = fs::read_to_string(out.join("published.html")).unwrap();
+    assert!(page.contains("26.62") && page.contains("colour-corrected PSNR (affine)"));
+    assert!(out.join("report.html").is_file() && out.join("published.json").is_file());
+    assert_eq!(before, files_of(&data), "nothing is written into the dataset");
+    // The same figures again without training. Another SSIM or LPIPS gives no difference to the published one.
+    let weights = lpips_weights(folder.path());
+    let again = |more: &[&str]| -> Value {
+        let output = bench(&[&common[..], &["--no-train", "--quiet", "--lpips", text(&weights)], more].concat());
+        assert!(output.status.success(), "{}", stderr(&output));
+        serde_json::from_slice(&output.stdout).unwrap()
+    };
+    let signed = again(&[]);
+    assert_eq!(signed["ours"]["lpips_variant"], "alex, signed");
+    let distance = signed["ours"]["test"]["lpips"].as_f64().unwrap();
+    assert!((signed["difference"]["lpips"].as_f64().unwrap() - (distance - 0.194)).abs() < 1e-9);
+    let again = again(&["--ssim-variant", "same", "--lpips-range", "unit"]);
+    assert!(again["difference"]["lpips"].is_null() && again["ours"]["test"]["lpips"].is_number());
+    // The PLY holds unit quaternions.
+    assert!((again["ours"]["test"]["psnr"].as_f64().unwrap() - ours).abs() < 0.01);
+    assert!(again["difference"]["ssim"].is_null() && again["tier"] == "S2");
+    // Settings of the tier that the run had at training are no difference either.
+    assert_eq!(signed["not_the_published_run"], line["not_the_published_run"]);
+    assert!(!why.contains("grow-") && !why.contains("refine-stop"), "{why}");
+    // gsscale-eval with colour correction, from the same PLY; the run's config asked for the affine fit.
+    for (more, method) in [(&[][..], "affine"), (&["--colour-correct", "quadratic"], "quadratic")] {
+        let output = eval(&[&[text(&out), text(&data)], more].concat());
+        let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let test = &report["test"];
+        assert_eq!(test["color_corrected"]["method"], method);
+        assert!(test["color_corrected"]["cc_psnr"].is_number() && test["psnr"] == again["ours"]["test"]["psnr"]);
+    }
+}
+
+fn files_of(folder: &Path) -> Vec<PathBuf> {
+    let mut files = Vec::new();
+    let mut stack = vec![folder.to_path_buf()];
+    while let Some(path) = stack.pop() {
+        if path.is_dir() {
+            stack.extend(fs::read_dir(&path).unwrap().map(|e| e.unwrap().path()));
+        } else {
+            files.push(path);
+        }
+    }
+    files.sort();
+    files
+}
+
+#[test]
+fn the_depth_cloud_is_found_and_its_absence_said() {
+    let folder = TempDir::new().unwrap();
+    let matrix_city = lookalike(folder.path(), Layout::MatrixCity);
+    let data = lookalike(folder.path(), Layout::Colmap);
+    let dry = |data: &Path| {
+        let output = bench(&["run", "aerial", "--data", text(data), "--dry-run", "--device", "cpu"]);
+        assert!(output.status.success() && output.stdout.is_empty(), "{}", stderr(&output));
+        stderr(&output)
+    };
+    assert!(dry(&matrix_city).contains("laid out as matrixcity"));
+    // 24 views are fewer than 5,620: no view is held out by index.
+    let said = dry(&data);
+    assert!(said.contains("the published point cloud is missing (sparse/0/points.ply)"), "{said}");
+    assert!(said.contains("0 held-out photos instead of 741"), "{said}");
+    fs::copy(matrix_city.join("points.ply"), data.join("sparse/0/points.ply")).unwrap();
+    assert!(!dry(&data).contains("the published point cloud is missing"));
+}
+
+#[test]
+fn an_incomplete_folder_is_told_from_a_complete_one() {
+    let folder = TempDir::new().unwrap();
+    let data = lookalike(folder.path(), Layout::ColmapMerged);
+    let out = folder.path().join("out");
+    let refuses = |words: &[&str]| {
+        let output = bench(&["run", "rubble", "--data", text(&data), "--out", text(&out), "--steps", "2"]);
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        for word in words {
+            assert!(said.contains(word), "{word}: {said}");
+        }
+        assert!(!out.exists(), "nothing is left behind");
+    };
+    fs::remove_file(data.join("val/rgbs/000006.jpg")).unwrap();
+    refuses(&["1 of 24 photos are missing: 000006.jpg", "remedy"]);
+    fs::remove_dir_all(data.join("val/sparse")).unwrap();
+    fs::remove_file(data.join("coordinates.pt")).unwrap();
+    refuses(&[
+        "as colmap-merged: a model (cameras and images) in val/sparse/0 missing",
+        "as mega-nerf: coordinates.pt missing",
+        "train/sparse/0/ ",
+        "https://github.com/cmusatyalab/mega-nerf",
+    ]);
+    let output = bench(&["run", "rubble"]);
+    assert!(stderr(&output).contains("--data"));
+}
+
+/// The commands of configs/README.md that train a look-alike, each on one line.
+fn commands_of_look_alike() -> Vec<String> {
+    let readme = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/README.md")).unwrap();
+    let section = readme.split("## Published runs").nth(1).expect("configs/README.md has the section");
+    let section = section.split("\n## ").next().unwrap();
+    let block = section.split("```sh\n").skip(1).map(|b| b.split("```").next().unwrap());
+    let block = block.into_iter().find(|b| b.contains("gsscale-synth")).expect("a block that makes a look-alike");
+    block.lines().map(|l| l.split(" #").next().unwrap().trim().to_string()).filter(|l| !l.is_empty()).collect()
+}
+
+#[test]
+fn the_commands_for_a_look_alike_end_at_the_table() {
+    let folder = TempDir::new().unwrap();
+    let mut said = String::new();
+    for line in commands_of_look_alike() {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let ["cargo", "run", "--release", "--bin", program, "--", args @ ..] = &words[..] else { panic!("{line}") };
+        let program = match *program {
+            "gsscale-synth" => env!("CARGO_BIN_EXE_gsscale-synth"),
+            "gsscale-bench" => env!("CARGO_BIN_EXE_gsscale-bench"),
+            other => panic!("{other} in {line}"),
+        };
+        let output = Command::new(program).args(args).current_dir(folder.path()).output().unwrap();
+        assert!(output.status.success(), "{line}\n{}", stderr(&output));
+        said = stderr(&output);
+    }
+    for words in ["Mill-19 Rubble, tier S1", "GS-Scale", "26.62", "PSNR, dB", "not the published run: "] {
+        assert!(said.contains(words), "{words}: {said}");
+    }
+    let json: Value =
+        serde_json::from_slice(&fs::read(folder.path().join("runs/rubble/published.json")).unwrap()).unwrap();
+    assert!(json["ours"]["test"]["psnr"].as_f64().unwrap() > 10.0);
+}

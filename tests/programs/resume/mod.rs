@@ -1,0 +1,10 @@
+//! A killed or stopped run, resumed, ends with the bytes of an uninterrupted run. Through the real binary.
+
+mod bench;
+mod changes;
+mod events;
+mod kills;
+mod more_steps;
+mod ownership;
+mod paths;
+mod stops;

@@ -1,0 +1,21 @@
+//! Small scenes, the programs as processes, a browser, small drives, limits on memory, a device.
+
+#[path = "../../support/bench.rs"]
+pub mod bench;
+pub mod browser;
+#[cfg(unix)]
+#[allow(dead_code)] // the storage tests use all of it
+#[path = "../../support/faulty_engine.rs"]
+pub mod faulty_engine;
+#[path = "../../support/gpu.rs"]
+pub mod gpu;
+#[cfg(target_os = "linux")]
+#[allow(dead_code)] // the benchmarks use all of it
+#[path = "../../../benches/support/memory_group.rs"]
+pub mod memory_group;
+#[path = "../../support/scenes.rs"]
+pub mod scenes;
+#[path = "../../support/shared.rs"]
+pub mod shared;
+#[cfg(unix)]
+pub mod small_drive;

@@ -1,0 +1,232 @@
+//! Commits on a full drive: a transaction that found no space may be durable all the same, and the drive may still be
+//! full when the map is reopened. Neither case loses a page, and no deleted page comes back.
+
+use super::beside::{COMMITS, opens_with, paged_store};
+use super::in_memory;
+use super::world::{Model, Run, config, fill, meta};
+use super::{PAGES, STEPS};
+use crate::support::faulty_engine::Faults;
+use gsscale::base::ids::PageId;
+use gsscale::page::folder::protocol_files::{DriveFolder, Folder};
+use gsscale::page::format::codec::Codec;
+use gsscale::page::map::commit::{CommitError, Commits, MAP_NAME};
+use gsscale::paging::pager::Pager;
+use redb::StorageBackend;
+use std::io::{self, ErrorKind};
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+
+/// Decides when the page map finds no space.
+#[derive(Debug, Default)]
+struct Shortage {
+    syncs: AtomicU64,
+    /// Number of the map's sync that reports no space after all earlier data reached the drive.
+    at_sync: Mutex<Option<u64>>,
+    /// Every later call that needs space fails.
+    lasts: AtomicBool,
+    began: AtomicBool,
+}
+
+impl Shortage {
+    fn begin_after(&self, syncs: u64, lasts: bool) {
+        *self.at_sync.lock().unwrap() = Some(self.syncs.load(Ordering::Relaxed) + syncs);
+        self.lasts.store(lasts, Ordering::Relaxed);
+        self.began.store(false, Ordering::Relaxed);
+    }
+
+    fn end(&self) {
+        *self.at_sync.lock().unwrap() = None;
+        self.began.store(false, Ordering::Relaxed);
+    }
+
+    fn check(&self) -> io::Result<()> {
+        match self.began.load(Ordering::Relaxed) && self.lasts.load(Ordering::Relaxed) {
+            true => Err(ErrorKind::StorageFull.into()),
+            false => Ok(()),
+        }
+    }
+}
+
+#[derive(Debug)]
+struct MapOnDrive(Arc<dyn StorageBackend>, Arc<Shortage>);
+
+impl StorageBackend for MapOnDrive {
+    fn len(&self) -> io::Result<u64> {
+        self.0.len()
+    }
+    fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
+        self.0.read(offset, out)
+    }
+    fn set_len(&self, len: u64) -> io::Result<()> {
+        self.1.check()?;
+        self.0.set_len(len)
+    }
+    fn sync_data(&self) -> io::Result<()> {
+        self.1.check()?;
+        self.0.sync_data()?;
+        let number = self.1.syncs.fetch_add(1, Ordering::Relaxed);
+        if *self.1.at_sync.lock().unwrap() == Some(number) {
+            self.1.began.store(true, Ordering::Relaxed);
+            return Err(ErrorKind::StorageFull.into());
+        }
+        Ok(())
+    }
+    fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
+        self.1.check()?;
+        self.0.write(offset, data)
+    }
+}
+
+struct FolderOnDrive(DriveFolder, Arc<Shortage>);
+
+impl FolderOnDrive {
+    fn noted(&self, name: &str, file: Arc<dyn StorageBackend>) -> Arc<dyn StorageBackend> {
+        if name == MAP_NAME { Arc::new(MapOnDrive(file, Arc::clone(&self.1))) } else { file }
+    }
+}
+
+impl Folder for FolderOnDrive {
+    fn open(&self, name: &str) -> io::Result<Option<Arc<dyn StorageBackend>>> {
+        Ok(self.0.open(name)?.map(|file| self.noted(name, file)))
+    }
+    fn create(&self, name: &str) -> io::Result<Arc<dyn StorageBackend>> {
+        Ok(self.noted(name, self.0.create(name)?))
+    }
+    fn rename(&self, from: &str, to: &str) -> io::Result<()> {
+        self.0.rename(from, to)
+    }
+    fn remove(&self, name: &str) -> io::Result<()> {
+        self.0.remove(name)
+    }
+    fn sync(&self) -> io::Result<()> {
+        self.0.sync()
+    }
+}
+
+/// A run over a store in `at`, with one commit after twenty steps, and the model at that commit.
+fn begun(at: &Path, seed: u64, shortage: &Arc<Shortage>) -> (Run, Commits, Model) {
+    let mut memory = in_memory(seed);
+    (0..STEPS).for_each(|_| memory.step().unwrap());
+    let frames = memory.pager.stats().pinned_max + 5;
+    let folder = || Box::new(FolderOnDrive(DriveFolder::new(at), Arc::clone(shortage)));
+    let opened = Commits::create(folder(), COMMITS).unwrap();
+    let pager = Pager::new(config(frames), paged_store(&opened, at, Codec::Raw, &Faults::new()));
+    let mut commits = opened.commits;
+    let mut run = Run::new(pager, seed, PAGES, STEPS).unwrap();
+    steps_to(&mut run, 20);
+    run.pager.flush().unwrap();
+    run.pager.commit(&mut commits, b"first", b"", None).unwrap();
+    let first = run.model.clone();
+    (run, commits, first)
+}
+
+fn steps_to(run: &mut Run, step: u32) {
+    while run.step < step {
+        run.step().unwrap();
+    }
+}
+
+/// Effects of a commit that found no space.
+#[derive(Default)]
+struct Left {
+    /// Number of durable commits.
+    durable: u32,
+    /// Pages that only this commit held: neither the previous nor the next commit had them.
+    short_lived: usize,
+}
+
+/// A commit that finds no space at its sync number `nth`, then steps, then a commit; `None` if the commit has fewer
+/// syncs.
+fn full_once(seed: u64, nth: u64, beside: bool) -> Option<Left> {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let shortage = Arc::new(Shortage::default());
+    let (mut run, mut commits, first) = begun(at, seed, &shortage);
+    let mut commit = |run: &mut Run| match beside {
+        true => {
+            run.pager.freeze().unwrap();
+            run.pager.finish_frozen().unwrap();
+            run.pager.commit_frozen(&mut commits, b"state", b"").map(|done| done.map(|(generation, _)| generation))
+        }
+        false => {
+            run.pager.flush().unwrap();
+            run.pager.commit(&mut commits, b"state", b"", None)
+        }
+    };
+    steps_to(&mut run, 50);
+    shortage.begin_after(nth, false);
+    let error = commit(&mut run).err()?;
+    assert!(error.is_out_of_space(), "{error}");
+    let middle = run.model.clone();
+    steps_to(&mut run, STEPS as u32 - 10);
+    shortage.end();
+    commit(&mut run).unwrap().unwrap();
+    let has_rows = |model: &Model, id: &PageId| model.get(id).is_some_and(|(meta, _)| meta.rows > 0);
+    let lived = |id: &PageId| has_rows(&middle, id) && !has_rows(&first, id) && !has_rows(&run.model, id);
+    let short_lived = middle.keys().filter(|id| lived(id)).count();
+    // The generation before the last is kept: the one that found no space, if it was durable.
+    let kept: Vec<u64> = commits.generations().kept().collect();
+    let is_durable = kept == [2, 3];
+    assert!(is_durable || kept == [1, 3], "{kept:?}");
+    drop(commits);
+    opens_with(at, &run.model);
+    Some(Left { durable: u32::from(is_durable), short_lived: if is_durable { short_lived } else { 0 } })
+}
+
+/// A generation may be durable although its commit reported an error. Pages that were created in it and deleted before
+/// the next generation must be absent from the next generation; otherwise they would stay in the map with duplicate
+/// rows.
+#[test]
+fn pages_of_a_commit_that_was_durable_after_all_go_with_the_next_one() {
+    for beside in [false, true] {
+        let (mut failed, mut all) = (0, Left::default());
+        for seed in 0..4 {
+            for left in (0..).map_while(|nth| full_once(seed, nth, beside)) {
+                failed += 1;
+                all.durable += left.durable;
+                all.short_lived += left.short_lived;
+            }
+        }
+        assert!(all.durable > 0 && failed > all.durable && all.short_lived > 3, "{failed}, {}", all.durable);
+    }
+}
+
+/// Committing a page that was never written is an error; otherwise the commit would drop the page.
+#[test]
+fn a_commit_without_its_writes_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let (mut run, mut commits, first) = begun(at, 1, &Arc::new(Shortage::default()));
+    let new = meta(PageId::initial(PAGES), 3.0, 2, 1);
+    run.pager.insert(new, |payload| fill(payload, &new, 77)).unwrap();
+    let error = run.pager.commit(&mut commits, b"state", b"", None).unwrap_err();
+    assert!(matches!(&error, CommitError::Contradiction(what) if what.contains(&new.id.to_string())), "{error}");
+    drop(commits);
+    opens_with(at, &first);
+}
+
+/// A drive that is still full when the map is reopened costs another commit, not the run.
+#[test]
+fn a_drive_that_stays_full_costs_commits_and_not_the_run() {
+    for nth in 0..2 {
+        let folder = tempfile::tempdir().unwrap();
+        let at = folder.path();
+        let shortage = Arc::new(Shortage::default());
+        let (mut run, mut commits, _) = begun(at, 2, &shortage);
+        steps_to(&mut run, 40);
+        shortage.begin_after(nth, true);
+        for round in 0..3 {
+            run.pager.flush().unwrap();
+            let error = run.pager.commit(&mut commits, b"state", b"", None).unwrap_err();
+            assert!(error.is_out_of_space(), "attempt {round}: {error}");
+            assert!(commits.poison().is_none());
+            steps_to(&mut run, 60 + 20 * round);
+        }
+        shortage.end();
+        run.pager.flush().unwrap();
+        run.pager.commit(&mut commits, b"state", b"", None).unwrap().unwrap();
+        drop(commits);
+        opens_with(at, &run.model);
+    }
+}

@@ -1,0 +1,170 @@
+//! The schedule and the cache model against slow versions: next uses by scanning all steps, fewest reads by trying
+//! every choice.
+
+use gsscale::base::ids::PageNo;
+use gsscale::base::rng::{Purpose, Stream};
+use gsscale::paging::frames::evict::EvictPolicy;
+use gsscale::paging::plan::cache_model::{CacheModel, StepChange, TooFewFrames};
+use gsscale::paging::plan::steps::{Plan, USE_BYTES};
+
+type Steps = Vec<Vec<PageNo>>;
+
+/// Steps that need `low..=high` of `pages` pages, in random order.
+fn steps(draws: &mut Stream, count: usize, pages: u32, low: u64, high: u64) -> Steps {
+    let step = |draws: &mut Stream| {
+        let mut all: Vec<PageNo> = (0..pages).map(PageNo).collect();
+        draws.shuffle(&mut all);
+        all.truncate((low + draws.below(high - low + 1)) as usize);
+        all
+    };
+    (0..count).map(|_| step(draws)).collect()
+}
+
+/// The first step at or after `from` that needs the page.
+fn next_use(steps: &Steps, page: PageNo, from: usize) -> Option<u32> {
+    (from..steps.len()).find(|&s| steps[s].contains(&page)).map(|s| s as u32)
+}
+
+/// The fewest pages that any cache can read: a search over all sets that may be cached after each step.
+fn least_reads(steps: &Steps, pages: u32, frames: u32) -> u32 {
+    let mut cost = vec![u32::MAX; 1 << pages];
+    cost[0] = 0;
+    for needed in steps {
+        let needed = needed.iter().fold(0usize, |set, p| set | 1 << p.0);
+        let mut after = vec![u32::MAX; 1 << pages];
+        for (held, &reads) in cost.iter().enumerate().filter(|(_, c)| **c < u32::MAX) {
+            let kept_at_most = held & !needed;
+            // All subsets of the held pages that the step does not need.
+            let mut kept = kept_at_most;
+            loop {
+                let now = kept | needed;
+                if now.count_ones() <= frames {
+                    after[now] = after[now].min(reads + (needed & !held).count_ones());
+                }
+                if kept == 0 {
+                    break;
+                }
+                kept = (kept - 1) & kept_at_most;
+            }
+        }
+        cost = after;
+    }
+    cost.into_iter().min().unwrap()
+}
+
+/// Runs the model over all steps, checks the invariants of every change, and returns the reads.
+fn reads(steps: &Steps, frames: usize, policy: EvictPolicy, next: impl Fn(PageNo, usize) -> Option<u32>) -> u32 {
+    let mut cache = CacheModel::new(frames, policy);
+    let mut held: Vec<PageNo> = Vec::new();
+    let mut change = StepChange::default();
+    let mut reads = 0;
+    for (step, needed) in steps.iter().enumerate() {
+        cache.step(step as u32, needed, |page| next(page, step + 1), &mut change).unwrap();
+        assert!(change.evict.iter().all(|p| !needed.contains(p) && held.contains(p)));
+        assert!(change.admit.iter().all(|p| needed.contains(p) && !held.contains(p)));
+        held.retain(|p| !change.evict.contains(p));
+        held.extend(&change.admit);
+        assert!(held.len() <= frames && needed.iter().all(|p| held.contains(p) && cache.holds(*p)));
+        assert!(change.evict.is_empty() || held.len() == frames, "no page leaves before its frame is needed");
+        reads += change.admit.len() as u32;
+    }
+    reads
+}
+
+#[test]
+fn farthest_next_use_reads_the_least_that_is_possible() {
+    let mut draws = Stream::new(1, Purpose::Test, 50, 0);
+    let (mut lru_total, mut least_total) = (0, 0);
+    for _ in 0..150 {
+        let frames = 3 + draws.below(4) as u32;
+        let steps = steps(&mut draws, 14, 9, 1, u64::from(frames));
+        let least = least_reads(&steps, 9, frames);
+        let known = |page, from| next_use(&steps, page, from);
+        assert_eq!(reads(&steps, frames as usize, EvictPolicy::FarthestNextUse, known), least);
+        lru_total += reads(&steps, frames as usize, EvictPolicy::LeastRecentlyUsed, known);
+        least_total += least;
+    }
+    assert!(lru_total * 10 > least_total * 11, "these cases do not tell the policies apart");
+}
+
+#[test]
+fn least_recent_use_is_what_a_queue_does() {
+    let mut draws = Stream::new(2, Purpose::Test, 50, 0);
+    for _ in 0..40 {
+        let steps = steps(&mut draws, 80, 40, 1, 8);
+        let mut queue: Vec<PageNo> = Vec::new();
+        let mut want = 0;
+        for needed in &steps {
+            want += needed.iter().filter(|p| !queue.contains(p)).count() as u32;
+            queue.retain(|p| !needed.contains(p));
+            let mut sorted = needed.clone();
+            sorted.sort_unstable();
+            queue.extend(sorted);
+            queue.drain(..queue.len().saturating_sub(12));
+        }
+        assert_eq!(reads(&steps, 12, EvictPolicy::LeastRecentlyUsed, |_, _| None), want);
+        // Without knowledge of the future the planned cache does the same.
+        assert_eq!(reads(&steps, 12, EvictPolicy::FarthestNextUse, |_, _| None), want);
+    }
+}
+
+#[test]
+fn a_window_that_moves_knows_what_lies_in_it_and_stays_within_its_bytes() {
+    let mut draws = Stream::new(3, Purpose::Test, 50, 0);
+    let all = steps(&mut draws, 400, 60, 0, 12);
+    let mut plan = Plan::new(0, 1500);
+    let (mut first, mut end) = (0, 0);
+    while first < all.len() {
+        while end < all.len() && plan.push(&all[end]) {
+            end += 1;
+        }
+        assert!(end > first && plan.steps() == (first as u32..end as u32));
+        for step in first..end {
+            assert_eq!(plan.pages(step as u32), all[step]);
+        }
+        let window = all[..end].to_vec();
+        for page in (0..60).map(PageNo) {
+            for from in [first, first + 1, (first + end) / 2] {
+                assert_eq!(plan.next_use(page, from as u32), next_use(&window, page, from));
+            }
+        }
+        assert_eq!(plan.uses(), all[first..end].iter().map(Vec::len).sum::<usize>());
+        assert!(plan.uses() * USE_BYTES <= 1500, "{} uses", plan.uses());
+        let steps = 1 + draws.below(3) as usize;
+        (0..steps.min(end - first)).for_each(|i| assert_eq!(plan.pop().as_ref(), Some(&all[first + i])));
+        first += steps.min(end - first);
+    }
+    assert!(plan.steps().is_empty() && plan.pages(400).is_empty());
+    plan.restart(7);
+    assert!(
+        plan.push(&(0..60).chain(0..60).map(PageNo).collect::<Vec<_>>()[..60])
+            && plan.next_use(PageNo(3), 7) == Some(7)
+    );
+    // One step fits regardless of its bytes.
+    assert!(Plan::new(0, 0).push(&all[1]));
+}
+
+#[test]
+fn planned_changes_are_those_that_happen_and_print_exactly() {
+    let all: Steps =
+        [vec![0, 1], vec![1, 2], vec![0, 3], vec![1, 2]].map(|s| s.into_iter().map(PageNo).collect()).into();
+    let mut plan = Plan::new(10, 1 << 20);
+    assert!(all.iter().all(|step| plan.push(step)));
+    let cache = CacheModel::new(3, EvictPolicy::FarthestNextUse);
+    let planned = cache.changes(&plan, 10..99).unwrap();
+    let text: Vec<String> = planned.iter().map(ToString::to_string).collect();
+    assert_eq!(
+        text,
+        [
+            "step 10: 2 pages, admit 2, evict 0\n  + 0 1",
+            "step 11: 2 pages, admit 1, evict 0\n  + 2",
+            // Pages 1 and 2 are next needed in the same step and were last used in the same step: the lower number is
+            // evicted.
+            "step 12: 2 pages, admit 1, evict 1\n  + 3\n  - 1",
+            "step 13: 2 pages, admit 1, evict 1\n  + 1\n  - 0",
+        ]
+    );
+    assert_eq!(plan.to_string().lines().nth(3), Some("step 12: 0 3"));
+    let small = CacheModel::new(1, EvictPolicy::FarthestNextUse);
+    assert_eq!(small.changes(&plan, 10..11), Err(TooFewFrames { step: 10, needed: 2, frames: 1 }));
+}
