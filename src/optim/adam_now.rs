@@ -1,5 +1,5 @@
-//! The deferred optimizer of a run and its state at one step: tables, rates, single values. [`super::deferred`] applies it
-//! to rows.
+//! The deferred optimizer of a run and its state at one step: tables, rates, single values. [`super::deferred`] applies
+//! it to rows.
 //!
 //! Invariants: 1. one function evaluates a value, for every caller; 2. nothing here depends on rows.
 

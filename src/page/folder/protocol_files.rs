@@ -1,5 +1,4 @@
-//! The folder of a store as the commit protocol uses it: a few files by name, the bytes of one file, and syncs of folder
-//! entries.
+//! The folder of a store as the commit protocol uses it: a few files by name, their bytes, and syncs of folder entries.
 //!
 //! Invariants: 1. an entry is durable only after [`Folder::sync`]; 2. names are the protocol's own constants, so
 //! nothing outside the folder is accessed; a symbolic link in place of a file is an error; 3. only the owner can access
