@@ -76,7 +76,7 @@ fn frames_engines_and_threads_change_no_bit() {
     let how = |frames, io, threads, more| How { frames, io, threads, more };
     let mut grid = Vec::new();
     if is_full {
-        for frames in [pages, pages / 2, pages / 4, fewest] {
+        for frames in [pages, pages / 2, pages / 4, fewest, fewest / 2, fewest / 10, 2] {
             for &io in engines.iter().chain(&[""]) {
                 grid.extend(["1", "2"].map(|threads| how(frames, io, threads, &[] as &[&str])));
             }
@@ -90,8 +90,12 @@ fn frames_engines_and_threads_change_no_bit() {
         grid.push(how(pages / 4, "", "1", &[]));
         grid.push(how(fewest, io(0), "1", &["--spill-codec", "zstd:1"]));
         grid.push(how(fewest, io(2), "2", &[]));
+        // Fewer frames than the largest view has pages: its steps go in batches.
+        grid.push(how(fewest / 2, io(1), "1", &[]));
+        grid.push(how(fewest / 10, io(0), "2", &["--spill-codec", "zstd:1"]));
+        grid.push(how(2, "", "2", &[]));
     }
-    for how in grid.into_iter().map(|h| How { frames: h.frames.max(fewest), ..h }) {
+    for how in grid {
         let (got, summary) = run(folder.path(), &scene, &base, &how);
         assert!(got == want, "{how:?} gives another scene");
         assert!(number(&summary, "frames") <= how.frames, "{how:?}: {summary}");

@@ -3,6 +3,7 @@
 
 mod support;
 
+mod batches;
 mod belady;
 mod commits;
 mod crash;

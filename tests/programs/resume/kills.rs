@@ -15,16 +15,19 @@ const OFTEN: &[&str] = &["--commit-every", "0.02", "--save-every", "45", "--eval
 /// its start.
 const KILL_WITHIN: u64 = 200;
 
-/// Each kind of run gets a share of the kills: in memory, and with 100 %, 50 % and the fewest of the frames.
+/// Each kind of run gets a share of the kills: in memory, with 100 % and 50 % of the frames, and with 100 %, 50 % and 10 % of the
+/// pages of the largest view.
 #[test]
 fn a_run_that_is_killed_at_any_time_ends_with_the_same_bytes() {
     let kills: u32 = std::env::var("GSSCALE_KILLS").ok().map_or(20, |n| n.parse().unwrap());
     let bench = Bench::new();
     let alone = bench.alone(OFTEN);
     let (all, fewest) = (alone.pages, alone.fewest);
-    let places = [Place::Memory, Place::Spill(all), Place::Spill(fewest.max(all / 2)), Place::Spill(fewest)];
+    // With fewer frames than the largest view has pages, kills come within and between the passes of a step.
+    let frames = [all, fewest.max(all / 2), fewest, fewest / 2, (fewest / 10).max(2)];
+    let places: Vec<Place> = [Place::Memory].into_iter().chain(frames.map(Place::Spill)).collect();
     let mut draws = Stream::new(7, Purpose::Test, 0, 0);
-    for place in places {
+    for &place in &places {
         let mut left = kills.div_ceil(places.len() as u32);
         while left > 0 {
             let lives = live(&bench, place, fewest, &mut left, &mut draws);
