@@ -183,7 +183,7 @@ fn benchmarks_that_train_refuse_wrong_input() {
     refused(tiers(&[scene, "--spill-dir", spill, "--device", "gpu"]), "--device");
     refused(sizes(&[scene]), "--spill-dir");
     refused(sizes(&[scene, "--spill-dir", spill, "--copies", "1,0"]), "--copies");
-    refused(bounded(&["--dir", spill]), "exists already");
+    refused(bounded(&["--dir", spill]), "already exists");
     let new = folder.path().join("new");
     refused(bounded(&["--dir", text(&new), "--gaussians", "lots"]), "--gaussians");
     refused(bounded(&["--dir", text(&new), "--gaussians", "999"]), "fewer than");

@@ -402,7 +402,7 @@ fn numbers_that_no_machine_can_hold_are_refused() {
     std::fs::write(&file, "adam-eps = 1e-30\n").unwrap();
     refuses(&folder, &scene, &["--config", text(&file)], &["--adam-eps", "1e-30", "f32 rounds to zero", "1e-16 to 1"]);
     let help = train(&["--help"]);
-    assert!(String::from_utf8_lossy(&help.stdout).contains("epsilon: 1e-16 to 1"));
+    assert!(String::from_utf8_lossy(&help.stdout).contains("epsilon, 1e-16 to 1"));
     trains(&folder, &scene, &["--adam-eps", "1e-16"]);
 }
 

@@ -119,32 +119,10 @@ fn a_run_whose_views_see_a_part_finishes_in_every_memory_that_holds_it() {
     }
 }
 
-/// The value after `flag` in the remedy of a stopped run.
-fn remedy(said: &str, flag: &str) -> String {
-    let line =
-        said.lines().find(|l| l.starts_with("to go on from the last commit")).unwrap_or_else(|| panic!("{said}"));
-    line.split(flag).nth(1).unwrap().split([' ', ')']).next().unwrap().to_string()
-}
-
-/// Follows the remedies of stopped runs until a run finishes: each names more memory than the run had, and the step
-/// that stopped then succeeds. Returns the number of stops.
-fn follow(out: &Path, first: Output, mut had: f64, is_least: bool) -> u32 {
-    let (mut output, mut stops) = (first, 0);
-    while !output.status.success() {
-        let said = stderr(&output);
-        assert!(output.status.code() == Some(1) && said.contains("pages in memory at once"), "{said}");
-        let steps = summary(out)["steps"].as_u64().unwrap();
-        let more = remedy(&said, if is_least { "(at least " } else { "--host-mem " });
-        assert!(mebibytes(&more) > had, "{more} is named to a run that had {had} MiB: {said}");
-        output = train(&["--resume", text(out), "--host-mem", &more, "--quiet"]);
-        (had, stops) = (mebibytes(&more), stops + 1);
-        assert!(summary(out)["steps"].as_u64() > Some(steps), "{more} was not enough: {}", stderr(&output));
-    }
-    stops
-}
-
+/// A run whose views outgrow its frames finishes with the bytes of the run in memory: in the smallest memory with which it
+/// starts, in that with a quarter more, and with a given number of frames. The smallest memory is refused by a MiB less.
 #[test]
-fn the_memory_that_a_stopped_run_names_is_more_than_it_had_and_enough() {
+fn a_run_whose_views_outgrow_its_memory_goes_in_batches() {
     let folder = TempDir::new().unwrap();
     let wide = folder.path().join("wide");
     std::fs::create_dir(&wide).unwrap();
@@ -155,30 +133,36 @@ fn the_memory_that_a_stopped_run_names_is_more_than_it_had_and_enough() {
             compact_city(folder.path()),
             "--grow-grad2d 0.0005 --steps 60 --quiet --spill-codec zstd:1 --image-cache 64KiB",
         ),
-        // Grows enough that a small plan is too small.
         ("large", scenes::wide_city(&wide, 8_000), "--grow-grad2d 0.00002 --steps 110 --quiet"),
     ] {
         let (out, flags) = (folder.path().join(name), words(more));
         let output =
             train(&[&[text(&scene), "--out", text(&alone), "--overwrite"], &words(EVENTS)[..], &flags].concat());
         assert!(output.status.success(), "{}", stderr(&output));
+        let pages = summary(&alone)["pages_pinned_max"].as_u64().unwrap();
         let least = floor(&scene, &out, &flags).ceil();
-        for is_least in [true, false] {
-            let memory = format!("{least}MiB");
-            let output = train_in(&scene, &out, &[&flags[..], &["--host-mem", &memory]].concat());
-            assert!(follow(&out, output, least, is_least) > 0, "{memory} were enough from the start");
-            assert!(ply(&out) == ply(&alone), "another scene than in memory");
+        let memories = [least, (1.25 * least).ceil()].map(|least| format!("{least}MiB"));
+        let frames = [pages / 2, pages / 10, 2].map(|frames| frames.to_string());
+        let flagged = |flag| move |value| [flag, value];
+        let budgets = memories.iter().map(String::as_str).map(flagged("--host-mem"));
+        for within in budgets.chain(frames.iter().map(String::as_str).map(flagged("--frames"))) {
+            let output = train_in(&scene, &out, &[&flags[..], &within].concat());
+            assert!(output.status.success(), "{name} {within:?}: {}", stderr(&output));
+            let done = summary(&out);
+            assert!(done["finished"] == true && ply(&out) == ply(&alone), "{name} {within:?}: another scene");
+            if within[0] == "--frames" {
+                let pinned = done["pages_pinned_max"].as_u64().unwrap();
+                assert!(pinned <= within[1].parse().unwrap() && pinned < pages, "{name} {within:?}: {done}");
+            } else {
+                // A tenth on top, as everywhere.
+                let peak = done["host_bytes_peak"].as_f64().unwrap() / 1048576.0;
+                assert!(peak <= 1.1 * mebibytes(within[1]), "{name} {within:?}: {peak} MiB at the peak");
+            }
         }
-        // A given number of frames, fewer than the pages that the step splits into.
-        let frames = summary(&alone)["pages_pinned_max"].as_u64().unwrap() / 2;
-        let output = train_in(&scene, &out, &[&flags[..], &["--frames", &frames.to_string()]].concat());
+        let less = format!("{}MiB", least - 1.0);
+        let output = train_in(&scene, &out, &[&flags[..], &["--host-mem", &less]].concat());
         let said = stderr(&output);
-        assert_eq!(output.status.code(), Some(1), "{said}");
-        let steps = summary(&out)["steps"].as_u64();
-        let named = remedy(&said, "--frames ");
-        assert!(named.parse::<u64>().unwrap() > frames, "{said}");
-        let output = train(&["--resume", text(&out), "--frames", &named, "--quiet"]);
-        assert!(summary(&out)["steps"].as_u64() > steps, "{named} frames were not enough: {}", stderr(&output));
+        assert!(output.status.code() == Some(1) && said.contains("smallest batch of a view"), "{less}: {said}");
     }
 }
 

@@ -1,5 +1,5 @@
-//! A scene that outgrows its frames: the start warns, the run keeps its work, and the run continued with more frames
-//! ends with the bytes of a run that had these frames from the start. Through the real binary.
+//! A scene that outgrows its frames or its memory: the start warns, the run goes on with views in batches or with pages that
+//! move to a drive, and ends with the bytes of a run that had memory for everything. Through the real binary.
 
 use crate::support::scenes::{stderr, summary, text, train};
 #[cfg(target_os = "linux")]
@@ -41,7 +41,7 @@ fn scene(folder: &Path) -> PathBuf {
 }
 
 #[test]
-fn a_run_that_outgrows_its_frames_says_so_keeps_what_it_has_and_goes_on_with_more() {
+fn a_run_that_outgrows_its_frames_goes_in_batches_to_the_same_bytes() {
     let folder = TempDir::new().unwrap();
     let scene = scene(folder.path());
     let path = |name: &str| folder.path().join(name);
@@ -54,26 +54,12 @@ fn a_run_that_outgrows_its_frames_says_so_keeps_what_it_has_and_goes_on_with_mor
     let begin = ["--out", text(&out), "--spill-dir", text(&spill), "--frames", &too_few];
     let output = train(&[&[text(&scene)], &begin[..], GROWING].concat());
     let said = stderr(&output);
-    assert_eq!(output.status.code(), Some(1), "the scene never outgrew {too_few} frames: {said}");
-    for words in
-        ["warning: the view", "no cap", "pages in memory at once", &format!("--resume {} --frames ", text(&out))]
-    {
+    assert!(output.status.success(), "{said}");
+    for words in ["warning: the view", "no cap", "steps on such views take several batches"] {
         assert!(said.contains(words), "{words} is not in: {said}");
     }
-    let stopped = summary(&out);
-    let steps = stopped["steps"].as_u64().unwrap();
-    assert!(stopped["finished"] == false && steps > 30, "{stopped}");
-    let kept = std::fs::read(out.join("point_cloud.ply")).unwrap();
-    assert!(kept.len() > 62 * 4 * 6000, "the last good state is written");
-    // With the same number of frames the run stops at the same step with the same Gaussians; further pages may have
-    // been split meanwhile, which changes the order of rows.
-    let output = train(&["--resume", text(&out), "--quiet"]);
-    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
-    let again = std::fs::read(out.join("point_cloud.ply")).unwrap();
-    assert!(again.len() == kept.len() && again[..300] == kept[..300], "step and number of Gaussians are in the header");
-    let output = train(&["--resume", text(&out), "--frames", &most.to_string(), "--quiet"]);
-    assert!(output.status.success(), "{}", stderr(&output));
-    assert_eq!(summary(&out)["finished"], true);
+    let done = summary(&out);
+    assert!(done["finished"] == true && done["pages_pinned_max"].as_u64() < Some(most), "{done}");
     assert!(spill.read_dir().map_or(true, |mut left| left.next().is_none()), "nothing is left of its pages");
     let [got, want] = [&out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
     assert!(got == want, "another scene than that of a run with enough frames");
@@ -166,37 +152,29 @@ fn a_scene_that_grows_stays_within_its_memory() {
     }
 }
 
+/// 92 MiB do not hold the largest view of the grown scene. The run finishes in them, whether its pages have a drive from the
+/// start or move to the drive of its checkpoint.
 #[test]
-fn a_scene_that_grows_beyond_its_memory_stops_with_the_need_and_goes_on_with_it() {
+fn a_scene_whose_views_grow_beyond_its_memory_finishes_in_it() {
     let folder = TempDir::new().unwrap();
     let scene = large_scene(folder.path());
-    let (out, spill) = (folder.path().join("out"), folder.path().join("spill"));
+    let (alone, out, spill) = (folder.path().join("alone"), folder.path().join("out"), folder.path().join("spill"));
     let flags: Vec<&str> = GROWING_MUCH.split_whitespace().collect();
-    let within = ["--out", text(&out), "--spill-dir", text(&spill), "--host-mem", "92MiB"];
-    let output = train(&[&[text(&scene)], &within[..], &flags[..]].concat());
-    let said = stderr(&output);
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    for words in ["(view_00", ".jpg) needs", "pages in memory at once", "--host-mem"] {
-        assert!(said.contains(words), "{words} is not in: {said}");
+    let output = train(&[&[text(&scene), "--out", text(&alone), "--quiet"], &flags[..]].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let pages = summary(&alone)["pages_pinned_max"].as_u64();
+    for to_spill in [&["--spill-dir", text(&spill)][..], &[]] {
+        let within = ["--out", text(&out), "--overwrite", "--host-mem", "92MiB"];
+        let output = train(&[&[text(&scene)], &within[..], to_spill, &flags].concat());
+        let said = stderr(&output);
+        assert!(output.status.success(), "{said}");
+        let done = summary(&out);
+        assert!(done["finished"] == true && done["pages_pinned_max"].as_u64() < pages, "no view was cut: {done}");
+        let peak = done["host_bytes_peak"].as_f64().unwrap();
+        assert!(peak <= 1.1 * 92.0 * 1048576.0, "{:.1} MB at the peak", peak / 1e6);
+        let [got, want] = [&out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
+        assert!(got == want, "another scene than in memory");
     }
-    let stopped = summary(&out);
-    let peak = stopped["host_bytes_peak"].as_f64().unwrap();
-    assert!(peak <= 1.1 * 92.0 * 1048576.0, "{:.1} MB at the peak", peak / 1e6);
-    assert!(stopped["gaussians"].as_u64() > Some(70_000), "it stopped before it grew: {stopped}");
-    // Again with the named memory, which is more than before.
-    let line = said.lines().find(|l| l.starts_with("to go on from the last commit")).unwrap();
-    let named = line.split("--host-mem ").nth(1).and_then(|rest| rest.split_whitespace().next()).unwrap();
-    let output = train(&["--resume", text(&out), "--host-mem", named, "--quiet"]);
-    let steps = summary(&out)["steps"].as_u64().unwrap();
-    assert!(steps > stopped["steps"].as_u64().unwrap(), "{named} did not help: {}", stderr(&output));
-    // With less memory than its views take, in memory from the start: the finished part is written all the same.
-    let tight = folder.path().join("tight");
-    let output = train(&[&[text(&scene), "--out", text(&tight), "--host-mem", "92MiB"], &flags[..]].concat());
-    let said = stderr(&output);
-    assert!(output.status.code() == Some(1) && said.contains("pages in memory at once"), "{said}");
-    assert!(tight.join("point_cloud.ply").is_file() && tight.join("summary.json").is_file(), "{said}");
-    let output = train(&["--resume", text(&out), "--host-mem", "200MiB", "--quiet"]);
-    assert!(output.status.success() && summary(&out)["finished"] == true, "{}", stderr(&output));
 }
 
 /// Just enough steps for the scene to grow beyond 160 MiB.

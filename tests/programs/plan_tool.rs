@@ -43,9 +43,9 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
     );
     assert_eq!(plans[4]["view_order"], "shuffle");
     let table = with(&["--compare-frames", "70%", "--compare-orders", orders]);
-    assert_eq!(table.lines().count(), 4 + 4, "{table}");
-    assert!(table.lines().nth(1).unwrap().contains("hit rate    of lru"), "{table}");
-    for (plan, line) in plans[..4].iter().zip(table.lines().skip(2)) {
+    assert!(table.lines().nth(2).unwrap().contains("hit rate    of lru"), "{table}");
+    assert!(table.lines().nth(3 + 4).unwrap().starts_with("*  "), "{table}");
+    for (plan, line) in plans[..4].iter().zip(table.lines().skip(3)) {
         let shown = format!(" {:.3} {:9.3} ", number(plan, "hit_rate"), number(plan, "lru_hit_rate"));
         assert!(line.contains(&shown), "{shown} is not in: {table}");
     }
@@ -72,14 +72,13 @@ fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
     std::fs::create_dir(&run).unwrap();
     std::fs::write(run.join("config.toml"), format!("steps = 77\n[resolved]\nscene = {:?}\n", text(&scene))).unwrap();
     let told = stdout(&plan(&run, &["--page-rows", "16", "--compare-frames", "100%"]));
-    assert!(told.contains("by all 77 steps"), "{told}");
+    assert!(told.contains("of all 77 steps"), "{told}");
     // Given frames need no given memory.
     for named in [["--frames", "80"], ["--compare-frames", "100%"]] {
         stdout(&plan(&run, &[&["--page-rows", "16", "--host-mem", "1MiB"], &named[..]].concat()));
     }
     for (args, words) in [
-        (&["--page-rows", "16", "--frames", "2"][..], ["2 frames", "--host-mem"]),
-        (&["--compare-frames", "many"], ["'many'", "25%"]),
+        (&["--compare-frames", "many"][..], ["'many'", "25%"]),
         (&["--compare-orders", "random"], ["'random'", "groups:N"]),
         (&["--drive-read", "0"], ["--drive-read", "bytes per second"]),
         (&["--lists", "5..5"], ["5..5", "100..110"]),
@@ -243,5 +242,5 @@ fn the_time_of_a_run_is_that_of_its_steps_and_what_they_wait() {
     let all = planned(&["--steps", "30", "--step-seconds", "0.5", "--compare-frames", "100%"]);
     assert_eq!(number(&all["plans"][1]["seconds"]), 15.0, "{all}");
     let table = stdout(&plan(&scene, &[&common[..], &["--steps", "100", "--step-seconds", "72"]].concat()));
-    assert!(table.contains("2.0 h") && table.contains("72.0000 s;"), "{table}");
+    assert!(table.contains("2.0 h") && table.contains("steps of 72.0000 s"), "{table}");
 }

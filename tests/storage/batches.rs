@@ -14,6 +14,7 @@ use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::error::PagingError;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
+use gsscale::render::RenderOptions;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
@@ -79,7 +80,8 @@ fn step(scene: &mut PagedScene, step: u32) -> Result<StepOutcome, TrainError> {
     let rgb = (0..3 * camera.pixels()).map(|i| ((i * 7 + step as usize) % 256) as u8).collect();
     let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
     let (mut working, mut renderer) = (WorkingSet::default(), CpuRenderer::new());
-    let how = (&options.render, &options.loss);
+    let render = RenderOptions { sh_degree: scene.rules.sh_degree(), ..options.render };
+    let how = (&render, &options.loss);
     train_step(scene, &mut working, &mut renderer, (step, &camera, &target), how, false, usize::MAX)
 }
 
