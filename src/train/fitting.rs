@@ -27,9 +27,13 @@ impl Trainer {
         ViewMemory { now, at_last }
     }
 
-    /// Memory of a view whose pages hold `rows` rows, in one batch.
+    /// Memory of a view whose pages hold `rows` rows, in one batch: what is held already, unless no view with as many rows was
+    /// one batch so far.
     fn view_memory_of(&self, rows: u64) -> ViewMemory {
         let (held, [_, rendering]) = (self.view_memory(), self.view_bytes());
+        if rows <= self.whole_rows {
+            return held;
+        }
         let visible = (rows as f64 * self.visible_share) as u64;
         let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degrees().1]
             .map(|degree| visible * WorkingSet::row_bytes(degree) as u64 + rendering);
@@ -52,7 +56,9 @@ impl Trainer {
         } else if frames < needed {
             let row_bytes = WorkingSet::row_bytes(self.sh_degrees().1);
             (frames, self.pages_most) = budget.batches(&self.scene, self.view_bytes()[1], row_bytes);
-            self.working.shrink_to(self.pages_most.saturating_mul(self.options.page_rows));
+            if self.working.shrink_to(self.pages_most.saturating_mul(self.options.page_rows)) {
+                self.whole_rows = 0;
+            }
         }
         let pager = &mut self.scene.pager;
         let now = pager.frames_max();

@@ -434,7 +434,7 @@ fn frames_of_budget(
     let of_a_page = 2 * plan.frame_bytes + page_working(config) + memory.copies.min(plan.frame_bytes);
     let Some(left) = budget.checked_sub(beside).filter(|left| *left >= of_a_page) else {
         let problem = format!(
-            "{} are too little: pixels and splats of one view, photos, staging and tables take {}, and the smallest batch of a              view {}",
+            "{} are too little: pixels and splats of one view, photos, staging and tables take {}, and the smallest batch of a view {}",
             format_bytes(budget),
             format_bytes(beside),
             format_bytes(of_a_page)

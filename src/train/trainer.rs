@@ -63,6 +63,8 @@ pub struct Trainer {
     pub(super) budget: Option<HostBudget>,
     /// The most pages of a batch of a step.
     pub(super) pages_most: usize,
+    /// The most rows in the pages of a view that was one batch, since the working set was allocated.
+    pub(super) whole_rows: u64,
     /// The largest share of the rows in its pages that a view has drawn so far.
     pub(super) visible_share: f64,
 }
@@ -122,6 +124,7 @@ impl Trainer {
             is_torn: false,
             budget: None,
             pages_most: usize::MAX,
+            whole_rows: 0,
             visible_share: 0.0,
         }
     }
@@ -143,7 +146,8 @@ impl Trainer {
             let rows = rehearse(now, &mut *self.renderer, (camera, &target), how, self.pages_most)?;
             let index = self.scene.pager.index();
             let pages = self.scene.pager.pages_of_view(camera);
-            self.note_share(rows, pages.iter().map(|page| index[page.index()].rows as usize).sum());
+            let is_whole = self.scene.pager.pages_per_batch(pages.len()).min(self.pages_most) >= pages.len();
+            self.note_view(rows, pages.iter().map(|page| index[page.index()].rows as usize).sum(), is_whole);
             (pixels, visible) = (pixels.max(camera.pixels()), visible.max(rows));
         }
         Ok((pixels, visible))
@@ -240,7 +244,7 @@ impl Trainer {
             }
         };
         let outcome = stepped.map_err(|error| error.with_view_name(&dataset.views[view].name))?;
-        self.note_share(outcome.rows, outcome.rows_pinned);
+        self.note_view(outcome.rows, outcome.rows_pinned, outcome.batches == 1);
         self.count_skipped(&outcome, &dataset.views[view].name)?;
         if self.options.optimizer == Method::Dense {
             // The step has changed rows; an error here leaves a state between two steps.
@@ -268,7 +272,9 @@ impl Trainer {
         self.scene.pager.look_ahead(self.step, &cameras);
     }
 
-    fn note_share(&mut self, visible: usize, in_pages: usize) {
+    /// Notes how many of the rows in the pages of a view were drawn, and whether the view was one batch.
+    fn note_view(&mut self, visible: usize, in_pages: usize, is_whole: bool) {
+        self.whole_rows = self.whole_rows.max(if is_whole { in_pages as u64 } else { 0 });
         self.visible_share = self.visible_share.max(visible as f64 / in_pages.max(1) as f64);
     }
 

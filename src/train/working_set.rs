@@ -26,10 +26,12 @@ impl WorkingSet {
         4 + 2 * 4 * row_width(sh_degree) + 16
     }
 
-    /// Frees the memory of a working set that has room for many more than `rows` rows.
-    pub fn shrink_to(&mut self, rows: usize) {
-        if self.row_from_working.capacity() > rows + rows / 4 {
+    /// Frees the memory of a working set that has room for many more than `rows` rows. Returns whether it did.
+    pub fn shrink_to(&mut self, rows: usize) -> bool {
+        let is_large = self.row_from_working.capacity() > rows + rows / 4;
+        if is_large {
             *self = WorkingSet::default();
         }
+        is_large
     }
 }

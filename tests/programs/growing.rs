@@ -120,7 +120,7 @@ fn a_run_whose_views_see_a_part_finishes_in_every_memory_that_holds_it() {
 }
 
 /// A run whose views outgrow its frames finishes with the bytes of the run in memory: in the smallest memory with which it
-/// starts, in that with a quarter more, and with a given number of frames. The smallest memory is refused by a MiB less.
+/// starts, in that with a quarter more, and with a given number of frames. A tenth less is refused.
 #[test]
 fn a_run_whose_views_outgrow_its_memory_goes_in_batches() {
     let folder = TempDir::new().unwrap();
@@ -159,7 +159,8 @@ fn a_run_whose_views_outgrow_its_memory_goes_in_batches() {
                 assert!(peak <= 1.1 * mebibytes(within[1]), "{name} {within:?}: {peak} MiB at the peak");
             }
         }
-        let less = format!("{}MiB", least - 1.0);
+        // The floor has some margin for what a run measures anew.
+        let less = format!("{}MiB", (0.9 * least).floor());
         let output = train_in(&scene, &out, &[&flags[..], &["--host-mem", &less]].concat());
         let said = stderr(&output);
         assert!(output.status.code() == Some(1) && said.contains("smallest batch of a view"), "{less}: {said}");

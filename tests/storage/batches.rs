@@ -85,17 +85,20 @@ fn step(scene: &mut PagedScene, step: u32) -> Result<StepOutcome, TrainError> {
     train_step(scene, &mut working, &mut renderer, (step, &camera, &target), how, false, usize::MAX)
 }
 
-fn rows(scene: &mut PagedScene) -> Vec<u32> {
-    let mut all = Vec::new();
+/// The bits of every row, column by column.
+fn rows(scene: &mut PagedScene) -> Vec<Vec<u32>> {
+    let mut all = vec![Vec::new(); Column::ALL.len()];
     let mut append = |rows: &Columns| {
-        Column::ALL.iter().for_each(|&column| all.extend(rows.column(column).iter().map(|x| x.to_bits())));
+        for (all, column) in all.iter_mut().zip(Column::ALL) {
+            all.extend(rows.column(column).iter().map(|x| x.to_bits()));
+        }
         Ok::<(), PagingError>(())
     };
     scene.for_all_rows(STEPS, &mut append).unwrap();
     all
 }
 
-fn trained_in_memory() -> Vec<u32> {
+fn trained_in_memory() -> Vec<Vec<u32>> {
     let mut scene = scene(None);
     (0..STEPS).for_each(|s| assert_eq!(step(&mut scene, s).unwrap().batches, 1));
     rows(&mut scene)

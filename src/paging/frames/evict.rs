@@ -30,6 +30,14 @@ pub enum EvictPolicy {
 impl EvictPolicy {
     /// All policies, the default first.
     pub const ALL: [EvictPolicy; 2] = [EvictPolicy::FarthestNextUse, EvictPolicy::LeastRecentlyUsed];
+
+    /// Whether the order of eviction is the same whatever is planned.
+    pub fn ignores_plan(self) -> bool {
+        match self {
+            EvictPolicy::FarthestNextUse => false,
+            EvictPolicy::LeastRecentlyUsed => true,
+        }
+    }
 }
 
 /// A page that could be evicted.

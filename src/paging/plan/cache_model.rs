@@ -189,7 +189,7 @@ impl CacheModel {
 
     /// Whether a page may be evicted while the step before `step` still computes, or `is_last` as nothing else is left.
     fn may_go(&self, victim: &Candidate, step: u32, is_last: bool) -> bool {
-        let ignores_plan = self.idle.policy() == EvictPolicy::LeastRecentlyUsed;
+        let ignores_plan = self.idle.policy().ignores_plan();
         is_last || ignores_plan || victim.next_use > step.saturating_add(FAR_STEPS)
     }
 
@@ -199,7 +199,7 @@ impl CacheModel {
         loop {
             let first = self.idle.first()?;
             let exact = next_use(first.page).unwrap_or(NEVER);
-            if self.idle.policy() == EvictPolicy::LeastRecentlyUsed || exact >= first.next_use {
+            if self.idle.policy().ignores_plan() || exact >= first.next_use {
                 return Some(first);
             }
             self.idle.insert(Candidate { next_use: exact, ..first });
