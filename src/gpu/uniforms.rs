@@ -37,7 +37,7 @@ impl UniformRing {
     pub(super) fn pack(&mut self, packed: &mut Vec<Vec<u8>>, bytes: &[u8]) -> GpuResult<BufferView> {
         let size = bytes.len() as u64;
         let offset_in = |chunk: &Vec<u8>| (chunk.len() as u64).next_multiple_of(self.alignment);
-        if !packed.last().is_some_and(|chunk| offset_in(chunk) + size <= UNIFORM_CHUNK) {
+        if packed.last().is_none_or(|chunk| offset_in(chunk) + size > UNIFORM_CHUNK) {
             packed.push(Vec::new());
         }
         let index = packed.len() - 1;

@@ -68,7 +68,7 @@ enum DemandState {
 #[derive(Debug)]
 enum RowsIn {
     /// Of a view of one batch.
-    Whole(WholeRows),
+    Whole(Box<WholeRows>),
     /// Of a view of several batches.
     Batches(Vec<SplatBatch>),
 }
@@ -281,7 +281,8 @@ impl GpuRenderer {
         let grid = Grid::new(camera.width, camera.height);
         let blend = Blend { grid, background: options.background, max_alpha: options.max_alpha };
         let (mut recorder, columns, splats, ranks) = match rows {
-            RowsIn::Whole(WholeRows { columns, splats, ranks, colors }) => {
+            RowsIn::Whole(whole) => {
+                let WholeRows { columns, splats, ranks, colors } = *whole;
                 (gpu.resume(colors), Some(columns), splats, ranks)
             }
             RowsIn::Batches(batches) => {
@@ -569,7 +570,7 @@ impl Renderer for GpuRenderer {
         let (view, _) = self.sequence.rows_in(rows)?;
         if self.sequence.batches() == Some(RowBatches::One) {
             let submitted = self.submit_rows(rows, &view).inspect_err(|_| self.drop_view())?;
-            self.rows_in = Some(RowsIn::Whole(submitted));
+            self.rows_in = Some(RowsIn::Whole(Box::new(submitted)));
             return Ok(());
         }
         let band = &mut self.scratch.band;
