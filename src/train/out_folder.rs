@@ -203,7 +203,7 @@ fn remove_saved(out: &Path) -> InputResult<()> {
     saved(out)?.iter().try_for_each(|path| remove_file(path))
 }
 
-/// The PLY files that `--save-every` wrote: point_cloud_<step>.ply.
+/// The PLY files that `--save-every` wrote: `point_cloud_<step>.ply`.
 pub(super) fn saved(out: &Path) -> InputResult<Vec<PathBuf>> {
     let entries = std::fs::read_dir(out).map_err(|e| InputError::io(out, "listing the folder", &e))?;
     let is_saved = |path: &PathBuf| {
