@@ -9,7 +9,7 @@
 //! SSIM (Wang, Bovik, Sheikh and Simoncelli 2004) with means m, over an 11x11 Gaussian window of sigma 1.5:
 //! S = (2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sxx + syy + C2)). Only the sum sxx + syy occurs, so four
 //! windowed maps are enough: x, y, x^2 + y^2, x y. The derivative goes back through the same symmetric window, with
-//! three maps: dS/dx = W * dS/dmx + 2 x (W * dS/dE[xx]) + y (W * dS/dE[xy]).
+//! three maps: dS/dx = W * dS/dmx + 2 x (W * `dS/dE[xx]`) + y (W * `dS/dE[xy]`).
 //!
 //! Invariants: 1. each value of a pixel comes from the same operations in the same order wherever the band or tile
 //! borders are; 2. each pixel is counted once in the sums, by the band and tile that own it; 3. where the mask is 0 the
@@ -346,7 +346,7 @@ impl BandKernel<'_> {
     }
 }
 
-/// [S, dS/dmx, dS/dE[xx], dS/dE[xy]] from the windowed means of x, y, x^2 + y^2 and x y.
+/// `[S, dS/dmx, dS/dE[xx], dS/dE[xy]]` from the windowed means of x, y, x^2 + y^2 and x y.
 #[inline(always)]
 fn ssim_point<const FMA: bool>(mx: f32, my: f32, squares: f32, products: f32) -> [f32; 4] {
     let mean_product = mx * my;

@@ -3,7 +3,7 @@
 //! Every value is preceded by a checksum bound to its key; the counters hold the number of entries and the sum of their
 //! checksums, which reveals a missing or doubled entry.
 //!
-//! Invariant: every entry added or removed by [`Writer`] changes the counters of the same transaction.
+//! Invariant: every entry added or removed by `Writer` changes the counters of the same transaction.
 
 use crate::base::ids::PageId;
 use crate::page::format::encoding;
