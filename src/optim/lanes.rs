@@ -3,7 +3,7 @@
 //! Not here: rows with second moments so small that eps matters; they are reported, and the caller evaluates them one
 //! by one.
 //!
-//! Invariant: the bits are those of `RowsNow`(crate::scene::rows::RowsNow) on every instruction path.
+//! Invariant: the bits are those of `RowsNow` on every instruction path.
 
 use super::adam_now::{AdamNow, DeferredAdam};
 use super::drift::{Drift, EpsFloor, drifted, needs_direct_sum};

@@ -1,7 +1,7 @@
 //! The dataset's points in its own coordinates; they may exceed memory.
 //!
 //! Invariants: 1. points keep the order of their file; 2. measurements equal those of points in memory
-//! (`Extent`(crate::dataset::frame::Extent)), bit for bit.
+//! (`Extent`), bit for bit.
 
 use super::spool::{Spool, SpoolWriter};
 use super::{Budget, PointSource};
