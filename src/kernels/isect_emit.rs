@@ -171,7 +171,7 @@ pub fn emit(
 
 /// Numbers the intersections of a range in emit order, as [`super::splats::pack`] does for all tiles: sets
 /// [`Splat::emit`], writes the number of intersections of each row to `counts`, and their sums by chunk to `chunk_counts`.
-pub fn number(
+pub fn number_isects(
     packed: &mut Packed,
     grid: Grid,
     range: TileRange,

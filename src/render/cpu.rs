@@ -10,7 +10,7 @@ use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, Ren
 use crate::base::room;
 use crate::base::simd::SimdPath;
 use crate::kernels::image_loss::ImageLoss;
-use crate::kernels::isect_emit::{count, emit, number};
+use crate::kernels::isect_emit::{count, emit, number_isects};
 use crate::kernels::isect_offsets::isect_offsets;
 use crate::kernels::project_bwd::project_bwd;
 use crate::kernels::project_fwd::{Projected, project_fwd};
@@ -176,7 +176,7 @@ impl CpuRenderer {
             let part = FoldPart { is_first: i == 0, is_last: i + 1 == ranges.len() };
             if ranges.len() > 1 {
                 let (counts, sums) = (&mut self.range_counts, &mut self.range_chunk_counts);
-                number(&mut self.packed, grid, range, options.simd, counts, sums);
+                number_isects(&mut self.packed, grid, range, options.simd, counts, sums);
                 scan(&self.range_chunk_counts, &mut self.chunk_offsets);
                 let isects = self.count_range(grid, range, options.simd);
                 self.list_range(grid, range, options.simd, isects);

@@ -287,7 +287,7 @@ impl GpuRenderer {
             }
             RowsIn::Batches(batches) => {
                 let mut recorder = gpu.begin("forward");
-                let (splats, rows) = gpu_batches::join(gpu, &mut recorder, &batches)?;
+                let (splats, rows) = gpu_batches::concatenate(gpu, &mut recorder, &batches)?;
                 let ranks = self.tiles.order(gpu, &mut recorder, &splats.view(), rows, grid)?;
                 (recorder, None, splats, ranks)
             }
@@ -430,8 +430,8 @@ impl GpuRenderer {
             return Ok(self.submit_gradients(recorder, &view.of, columns, [splats, v_splats])?);
         }
         let columns = gpu_batches::upload(gpu, &mut recorder, rows, sh_degree, &mut self.scratch.band)?;
-        let splats = gpu_batches::part(gpu, &mut recorder, "splats", splats, place)?;
-        let v_splats = gpu_batches::part(gpu, &mut recorder, "v_splats", v_splats, place)?;
+        let splats = gpu_batches::copy_rows(gpu, &mut recorder, "splats", splats, place)?;
+        let v_splats = gpu_batches::copy_rows(gpu, &mut recorder, "v_splats", v_splats, place)?;
         Ok(self.submit_gradients(recorder, &view.of, &columns, [&splats, &v_splats])?)
     }
 

@@ -66,7 +66,7 @@ pub(super) fn submit_batch(
 ///
 /// # Errors
 /// The device has no memory for the buffer.
-pub(super) fn join(gpu: &Gpu, recorder: &mut Recorder<'_>, batches: &[SplatBatch]) -> GpuResult<(Buffer, u32)> {
+pub(super) fn concatenate(gpu: &Gpu, recorder: &mut Recorder<'_>, batches: &[SplatBatch]) -> GpuResult<(Buffer, u32)> {
     let rows = batches.iter().map(|batch| batch.rows).sum();
     let splats = gpu.buffer("splats", splat_bytes(rows))?;
     let mut first = 0;
@@ -82,7 +82,7 @@ pub(super) fn join(gpu: &Gpu, recorder: &mut Recorder<'_>, batches: &[SplatBatch
 ///
 /// # Errors
 /// The device has no memory for the buffer.
-pub(super) fn part(
+pub(super) fn copy_rows(
     gpu: &Gpu,
     recorder: &mut Recorder<'_>,
     label: &'static str,

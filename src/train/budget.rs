@@ -124,7 +124,7 @@ impl HostBudget {
         let left = self.bytes.saturating_sub(taken);
         let frame = scene.pager.frame_bytes() as u64;
         let working = (scene.rules.page_rows() * working_row) as u64;
-        cut(left, frame, working, self.copies_pages)
+        frames_and_batch(left, frame, working, self.copies_pages)
     }
 
     fn copies(&self, scene: &PagedScene) -> u64 {
@@ -198,7 +198,7 @@ impl HostBudget {
 
 /// Frames and pages of a batch within `left` bytes: twice the frames of a batch, and for each page of a batch `working` bytes of
 /// the working set and, if densification `copies` pages, a copy. At least one page and [`FRAMES_LEAST`] frames, though they may not fit.
-pub(super) fn cut(left: u64, frame: u64, working: u64, copies: bool) -> (usize, usize) {
+pub(super) fn frames_and_batch(left: u64, frame: u64, working: u64, copies: bool) -> (usize, usize) {
     let copied = if copies { PAGES_PER_BATCH as u64 } else { 0 };
     let few = left / (2 * frame + working + if copies { frame } else { 0 });
     let many = left.saturating_sub(copied * frame) / (2 * frame + working);

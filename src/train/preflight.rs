@@ -3,7 +3,7 @@
 //! Invariant: a run that cannot fit is refused here, with numbers and alternatives. Growth that may not fit is a
 //! warning.
 
-use super::budget::{FRAMES_LEAST, HostBudget, cut};
+use super::budget::{FRAMES_LEAST, HostBudget, frames_and_batch};
 use super::error::TrainError;
 use super::memory::{MemoryEstimate, obtainable_bytes, rows_at_most};
 use super::places::drive_of;
@@ -181,7 +181,7 @@ pub fn allow_largest_view(
     let most = if config.host_mem.0 == 0 { host_mem.and(obtainable_bytes()).max(host_mem) } else { host_mem };
     let mut frames = needed;
     if let Some(budget) = most.filter(|budget| needed * (frame_bytes + page_working(config)) > *budget) {
-        let (fewer, pages) = cut(budget / 2, frame_bytes, page_working(config), true);
+        let (fewer, pages) = frames_and_batch(budget / 2, frame_bytes, page_working(config), true);
         if (fewer as u64) < needed {
             (frames, trainer.pages_most) = (fewer as u64, pages);
         }
@@ -255,6 +255,10 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
         return;
     }
     let LargestView { pages: needed, name: view, .. } = &plan.largest_view;
+    if *needed > frames {
+        // The description of the pages says so.
+        return;
+    }
     let then = (*needed as f64 * most as f64 / now.max(1) as f64).ceil() as u64;
     let left = match host_mem.filter(|_| config.frames == 0) {
         None => frames,
@@ -448,7 +452,7 @@ fn frames_of_budget(
         );
         return Err(InputError::new("--host-mem", problem, remedy));
     };
-    let (frames, pages_most) = cut(left, plan.frame_bytes, page_working(config), memory.copies > 0);
+    let (frames, pages_most) = frames_and_batch(left, plan.frame_bytes, page_working(config), memory.copies > 0);
     Ok(FirstFrames { frames: (frames as u64).min(PAGES_MOST), pages_most })
 }
 

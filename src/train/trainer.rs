@@ -14,6 +14,7 @@ use super::report::{TestMetrics, TierTraffic};
 use super::step::{StepOutcome, train_step};
 use super::view::rehearse;
 use super::working_set::WorkingSet;
+use crate::base::error::InputError;
 use crate::checkpoint::run_state::LastTest;
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
@@ -338,8 +339,13 @@ impl Trainer {
     /// Writes the rows at the current step as a PLY; returns what was written and in which coordinates.
     ///
     /// # Errors
-    /// The folder cannot be written, or pages could not be pinned.
+    /// The folder cannot be written, pages could not be pinned, or a failed step left pages of two steps.
     pub fn save(&mut self, dataset: &Dataset, path: &Path) -> Result<ply::PlyWritten, TrainError> {
+        if self.is_torn {
+            let problem = "the last step failed half-way, so some Gaussians belong to the step before";
+            let remedy = "resume the run from its last commit with gsscale-train --resume and the output folder";
+            return Err(InputError::new(path, problem, remedy).into());
+        }
         let meta = PlyMeta {
             step: Some(u64::from(self.step)),
             origin: dataset.frame.origin.to_array(),

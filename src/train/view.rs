@@ -13,7 +13,7 @@ use crate::render::{LossOptions, RenderOptions, Renderer, RowBatches};
 use crate::scene::camera::Camera;
 use crate::scene::image::Target;
 
-/// Pages of a batch of an evaluation.
+/// Pages of a batch of an evaluation, at most.
 const PAGES_PER_BATCH: usize = 64;
 
 /// Renders the picture that `camera` has after `now` steps; [`Renderer::image`] gives it.
@@ -27,7 +27,7 @@ pub fn draw(
     options: &RenderOptions,
 ) -> Result<(), TrainError> {
     let pages = scene.pager.pages_of_view(camera);
-    let batches = batches(&pages, PAGES_PER_BATCH);
+    let batches = batches(&pages, PAGES_PER_BATCH.min(scene.pager.pages_per_batch(pages.len())));
     begin(renderer, camera, options, &batches)?;
     for batch in batches {
         scene.gather_pages(batch, camera, now, working)?;

@@ -39,7 +39,7 @@ JSON; OUT/published.json and OUT/published.html keep them.";
 #[derive(Parser)]
 #[command(name = "gsscale-bench run", bin_name = "gsscale-bench run", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// Name of a published run, or a config file with a table [published]
+    /// Name of a published run, or a config file with a table `published`
     run: PathBuf,
     /// Folder of the dataset
     #[arg(long, value_name = "DIR")]
