@@ -135,7 +135,7 @@ fn the_checkpoint_alone_is_enough_to_go_on() {
             named.extend(["--spill-dir", text(&spill)]);
         }
         let said = succeeded(bench.go_on(&named));
-        assert!(said.contains("config.toml is missing") && said.contains("metrics.jsonl has 0"), "{said}");
+        assert!(said.contains("config.toml is missing") && said.contains("metrics.jsonl has only 0"), "{said}");
         assert!(ply(&out) == alone.ply, "{place:?}: the scene is another");
         let config = std::fs::read_to_string(out.join("config.toml")).unwrap();
         assert!(config.contains("[resolved]") && config.contains(text(&bench.scene)), "{config}");
