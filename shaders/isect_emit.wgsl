@@ -1,5 +1,5 @@
-// Emits one intersection for each row and tile that the row can reach, the twin of src/kernels/isect_emit.rs: rows in
-// depth order, the tiles of a row column by column. One invocation finds one intersection, so a row that covers the
+// Emits one intersection for each row and tile of a range that the row can reach, the twin of src/kernels/isect_emit.rs:
+// rows in depth order, the tiles of a row column by column. One invocation finds one intersection, so a row that covers the
 // picture costs only its share.
 //
 // Nothing is written beyond the capacity: the scan's total gives the demand, and the caller runs again with larger
@@ -14,6 +14,8 @@ struct IsectUniforms {
     /// Capacity of the buffers, in intersections.
     capacity: u32,
     pad: vec2<u32>,
+    /// The range of tiles that is listed: first column, end of the columns, first row, end of the rows.
+    range: vec4<u32>,
 }
 
 @group(0) @binding(0) var<uniform> view: IsectUniforms;
@@ -27,10 +29,22 @@ struct IsectUniforms {
 @group(0) @binding(5) var<storage, read_write> isects: array<u32>;
 /// NO_ROW if the intersection was counted but not found.
 @group(0) @binding(6) var<storage, read_write> row_from_isect: array<u32>;
-/// By rank: number of tiles that the row can reach, from which the scan computes the offsets.
+/// By rank: number of tiles of the range that the row can reach, from which the scan computes the offsets.
 @group(0) @binding(7) var<storage, read_write> counts: array<u32>;
 
 const NO_ROW: u32 = 0xffffffffu;
+
+/// First column and end of the columns of the range that a splat can reach.
+fn columns_in_range(reach: Reach) -> vec2<u32> {
+    return vec2<u32>(max(reach.box.x, view.range.x), min(reach.box.z, view.range.y));
+}
+
+/// First row and end of the rows of the range that a splat can reach in a column; equal if there are none.
+fn rows_in_range(reach: Reach, tile_x: u32) -> vec2<u32> {
+    let rows = tile_rows_in(reach, view.grid, tile_x);
+    let first = max(rows.x, view.range.z);
+    return vec2<u32>(first, max(first, min(rows.y, view.range.w)));
+}
 
 /// Counts intersections before any is emitted.
 @compute @workgroup_size(256)
@@ -46,8 +60,9 @@ fn isect_count(
     let at = SPLAT_STRIDE * order[rank];
     let reach = reach_of(splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]), view.grid);
     var count = 0u;
-    for (var tile_x = reach.box.x; tile_x < reach.box.z; tile_x++) {
-        let rows = tile_rows_in(reach, view.grid, tile_x);
+    let columns = columns_in_range(reach);
+    for (var tile_x = columns.x; tile_x < columns.y; tile_x++) {
+        let rows = rows_in_range(reach, tile_x);
         count += rows.y - rows.x;
     }
     counts[rank] = count;
@@ -87,8 +102,9 @@ fn isect_emit(
     // tiles.
     var tile = view.grid.tiles_x * view.grid.tiles_y;
     var found = NO_ROW;
-    for (var tile_x = reach.box.x; tile_x < reach.box.z; tile_x++) {
-        let rows = tile_rows_in(reach, view.grid, tile_x);
+    let columns = columns_in_range(reach);
+    for (var tile_x = columns.x; tile_x < columns.y; tile_x++) {
+        let rows = rows_in_range(reach, tile_x);
         if left < rows.y - rows.x {
             tile = (rows.x + left) * view.grid.tiles_x + tile_x;
             found = row;

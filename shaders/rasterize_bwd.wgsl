@@ -196,12 +196,13 @@ fn rasterize_bwd(
     let parts = TILE_LANES;
 #endif
 #endif
-    let tile = linear_group(workgroup, workgroups);
+    let n = linear_group(workgroup, workgroups);
     let grid = view.grid;
     // Uniform across the workgroup.
-    if tile >= grid.tiles_x * grid.tiles_y {
+    if n >= tiles_in_range(view.range) {
         return;
     }
+    let tile = tile_of_range(n, view.range, grid);
     let pixel = pixel_of(tile, lane, grid);
     let plane = grid.width * grid.height;
     let at = pixel.y * grid.width + pixel.x;
@@ -302,9 +303,27 @@ fn partial(isect: u32, row: u32, which: u32) -> f32 {
     return select(0.0, partials[(isect - view.window_first) * SUMS + which], row_from_isect[isect] == row);
 }
 
+/// The row at a rank.
+fn row_at(rank: u32) -> u32 {
+    if (view.flags & FOLD_WITHOUT_LISTS) != 0u {
+        return rank;
+    }
+    return order[rank];
+}
+
+/// First intersection of a rank, and one past the last.
+fn isects_at(rank: u32) -> vec2<u32> {
+    if (view.flags & FOLD_WITHOUT_LISTS) != 0u {
+        return vec2<u32>();
+    }
+    let end = min(offsets[rank + 1u], view.isect_count);
+    return vec2<u32>(min(offsets[rank], end), end);
+}
+
 /// Folds the sums of each row over its intersections, in emit order (tiles column by column), and converts them to
-/// gradients. Nine invocations process a row, one per sum. A row that ends beyond the window stores its sums in place
-/// of its gradients, in the order of the sums, and the next window continues from there.
+/// gradients. Nine invocations process a row, one per sum. A row that ends beyond the window, or may have intersections
+/// in a later range of tiles, stores its sums in place of its gradients, in the order of the sums, and the next window
+/// or range continues from there.
 @compute @workgroup_size(256)
 fn fold_rows(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -316,12 +335,14 @@ fn fold_rows(
     let which = lane % SUMS;
     var sum = 0.0;
     if lane < GROUP_ROWS * SUMS && rank < view.row_count {
-        let row = order[rank];
-        let row_end = min(offsets[rank + 1u], view.isect_count);
-        let row_first = min(offsets[rank], row_end);
+        let row = row_at(rank);
+        let isects_of_row = isects_at(rank);
+        let row_first = isects_of_row.x;
+        let row_end = isects_of_row.y;
         let end = min(row_end, view.window_end);
         var isect = max(row_first, view.window_first);
-        if row_first < view.window_first && row_end > view.window_first {
+        let spans_windows = row_first < view.window_first && row_end > view.window_first;
+        if spans_windows || (view.flags & FOLD_CARRIED) != 0u {
             let carried = v_splats[SPLAT_STRIDE * row + which / 4u];
             sum = carried[which % 4u];
         }
@@ -345,11 +366,12 @@ fn fold_rows(
     if lane >= GROUP_ROWS || own_rank >= view.row_count {
         return;
     }
-    let row = order[own_rank];
+    let row = row_at(own_rank);
     let at = SPLAT_STRIDE * row;
     let s = lane * SUMS;
-    let row_end = min(offsets[own_rank + 1u], view.isect_count);
-    let row_first = min(offsets[own_rank], row_end);
+    let isects_of_row = isects_at(own_rank);
+    let row_first = isects_of_row.x;
+    let row_end = isects_of_row.y;
     // A row without intersections belongs to the first window, any other row to each window that has some of its
     // intersections.
     let is_here = select(view.window_first == 0u, row_first < view.window_end && row_end > view.window_first, row_end > row_first);
@@ -357,7 +379,8 @@ fn fold_rows(
         return;
     }
     // More windows follow. (A row without intersections is complete, wherever its place would be.)
-    if row_end > view.window_end && row_end > row_first {
+    let continues = row_end > view.window_end && row_end > row_first;
+    if continues || (view.flags & FOLD_UNFINISHED) != 0u {
         v_splats[at] = vec4<f32>(row_sums[s], row_sums[s + 1u], row_sums[s + 2u], row_sums[s + 3u]);
         v_splats[at + 1u] = vec4<f32>(row_sums[s + 4u], row_sums[s + 5u], row_sums[s + 6u], row_sums[s + 7u]);
         v_splats[at + 2u] = vec4<f32>(row_sums[s + 8u], 0.0, 0.0, 0.0);

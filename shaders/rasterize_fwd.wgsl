@@ -118,12 +118,13 @@ fn rasterize_fwd(
     @builtin(subgroup_invocation_id) subgroup_lane: u32,
 #endif
 ) {
-    let tile = linear_group(workgroup, workgroups);
+    let n = linear_group(workgroup, workgroups);
     let grid = view.grid;
     // Uniform across the workgroup.
-    if tile >= grid.tiles_x * grid.tiles_y {
+    if n >= tiles_in_range(view.range) {
         return;
     }
+    let tile = tile_of_range(n, view.range, grid);
     let pixel = pixel_of(tile, lane, grid);
     let plane = grid.width * grid.height;
     let at = pixel.y * grid.width + pixel.x;

@@ -15,7 +15,7 @@ struct RasterUniforms {
     /// First list index of the segment, and one past the last.
     first: u32,
     end: u32,
-    /// Sum of SEGMENT_FIRST, SEGMENT_LAST (in this direction's order) and HAS_V_ALPHA.
+    /// Sum of SEGMENT_FIRST, SEGMENT_LAST (in this direction's order), HAS_V_ALPHA and the flags of fold_rows.
     flags: u32,
     /// Numbers of rows of the view and of their intersections, for fold_rows.
     row_count: u32,
@@ -23,11 +23,19 @@ struct RasterUniforms {
     /// The intersections, by emit index, whose sums the backward rasterizer stores in this dispatch.
     window_first: u32,
     window_end: u32,
+    /// The range of tiles that is blended: first column, end of the columns, first row, end of the rows.
+    range: vec4<u32>,
 }
 
 const SEGMENT_FIRST: u32 = 1u;
 const SEGMENT_LAST: u32 = 2u;
 const HAS_V_ALPHA: u32 = 4u;
+/// The rows continue the sums that v_splats holds.
+const FOLD_CARRIED: u32 = 8u;
+/// The rows store their sums: another range of tiles follows.
+const FOLD_UNFINISHED: u32 = 16u;
+/// No lists: every row stands at its own rank and has no intersections.
+const FOLD_WITHOUT_LISTS: u32 = 32u;
 
 /// Invocations per tile.
 const TILE_LANES: u32 = 64u;
@@ -56,6 +64,17 @@ fn exponents(splat: TileSplat, dx: vec4<f32>, dy: f32) -> vec4<f32> {
 /// Alpha before the threshold is applied. A sigma below 0 is a rounding error and counts as 0.
 fn alphas(e: vec4<f32>, log2_opacity: f32, max_alpha: f32) -> vec4<f32> {
     return min(exp2(min(e, vec4<f32>(log2_opacity))), vec4<f32>(max_alpha));
+}
+
+/// Number of tiles of the range.
+fn tiles_in_range(range: vec4<u32>) -> u32 {
+    return (range.y - range.x) * (range.w - range.z);
+}
+
+/// The number, in the picture, of the n-th tile of the range.
+fn tile_of_range(n: u32, range: vec4<u32>, grid: Grid) -> u32 {
+    let columns = max(range.y - range.x, 1u);
+    return (range.z + n / columns) * grid.tiles_x + range.x + n % columns;
 }
 
 /// The first of an invocation's four pixels.

@@ -7,13 +7,23 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 
+use super::buffers::Pool;
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
 
-/// Bytes of one staging buffer: in the range where copies run fastest.
-const CHUNK_BYTES: u64 = 4 << 20;
-/// Most bytes staged in one set.
-pub(super) const SET_BYTES: u64 = 32 << 20;
+/// Bytes of one staging buffer, at most: in the range where copies run fastest.
+const CHUNK_BYTES_MAX: u64 = 4 << 20;
+/// Bytes of one staging buffer, at least.
+const CHUNK_BYTES_MIN: u64 = 16 << 10;
+/// A staging buffer takes at most this part of the budget.
+const CHUNK_SHARE: u64 = 64;
+/// Most staging buffers in one set.
+const SET_CHUNKS: usize = 8;
+
+/// Staging that uploads of `bytes` bytes a step take without a budget: two sets.
+pub fn staging_bytes(bytes: u64) -> u64 {
+    2 * bytes.next_multiple_of(CHUNK_BYTES_MAX).clamp(CHUNK_BYTES_MAX, SET_CHUNKS as u64 * CHUNK_BYTES_MAX)
+}
 
 /// Alignment of mapped ranges.
 const MAP_ALIGNMENT: u64 = wgpu::MAP_ALIGNMENT;
@@ -39,17 +49,16 @@ struct Set {
 #[derive(Debug)]
 pub(super) struct Belt {
     driver: Arc<Driver>,
+    pool: Arc<Pool>,
+    chunk_bytes: u64,
     sets: [Set; 2],
 }
 
 impl Belt {
-    pub(super) fn new(driver: Arc<Driver>) -> Belt {
-        Belt { driver, sets: Default::default() }
-    }
-
-    /// Host memory of the staging buffers, bytes.
-    pub(super) fn bytes(&self) -> u64 {
-        self.sets.iter().map(|s| s.chunks.len() as u64 * CHUNK_BYTES).sum()
+    /// Staging for a device whose pool may allocate `budget` bytes.
+    pub(super) fn new(driver: Arc<Driver>, pool: Arc<Pool>, budget: u64) -> Belt {
+        let share = (budget / CHUNK_SHARE).clamp(CHUNK_BYTES_MIN, CHUNK_BYTES_MAX);
+        Belt { driver, pool, chunk_bytes: share / MAP_ALIGNMENT * MAP_ALIGNMENT, sets: Default::default() }
     }
 
     /// Stages as much of `bytes` as fits and records its copy to `target` at `offset`; returns the number of bytes
@@ -64,9 +73,8 @@ impl Belt {
         self.sets[0].wait(&self.driver)?;
         let mut done = 0;
         while done < bytes.len() {
-            let Some(chunk) = self.sets[0].chunk_with_room(&self.driver) else { break };
-            self.driver.faults.check()?;
-            let room = usize::try_from(CHUNK_BYTES - chunk.used).unwrap_or(0);
+            let Some(chunk) = self.sets[0].chunk_with_room(&self.pool, self.chunk_bytes)? else { break };
+            let room = usize::try_from(self.chunk_bytes - chunk.used).unwrap_or(0);
             let n = room.min(bytes.len() - done);
             let end = chunk.used + n as u64;
             let view = chunk.raw.get_mapped_range_mut(chunk.used..end);
@@ -74,7 +82,7 @@ impl Belt {
             view.copy_from_slice(&bytes[done..done + n]);
             drop(view);
             encoder.copy_buffer_to_buffer(&chunk.raw, chunk.used, target, offset + done as u64, n as u64);
-            chunk.used = end.next_multiple_of(MAP_ALIGNMENT).min(CHUNK_BYTES);
+            chunk.used = end.next_multiple_of(MAP_ALIGNMENT).min(self.chunk_bytes);
             done += n;
         }
         Ok(done)
@@ -118,17 +126,21 @@ impl Set {
     }
 
     /// A chunk that is not full; `None` if the set is full.
-    fn chunk_with_room(&mut self, driver: &Driver) -> Option<&mut Chunk> {
-        let at = match self.chunks.iter().position(|c| c.used < CHUNK_BYTES) {
+    fn chunk_with_room(&mut self, pool: &Pool, chunk_bytes: u64) -> GpuResult<Option<&mut Chunk>> {
+        let at = match self.chunks.iter().position(|c| c.used < chunk_bytes) {
             Some(at) => at,
-            None if self.chunks.len() as u64 * CHUNK_BYTES >= SET_BYTES => return None,
+            None if self.chunks.len() >= SET_CHUNKS => return Ok(None),
             None => {
                 let usage = wgpu::BufferUsages::MAP_WRITE | wgpu::BufferUsages::COPY_SRC;
-                let raw = driver.buffer("upload staging", CHUNK_BYTES, usage);
-                self.chunks.push(Chunk { raw, state: Arc::new(AtomicU8::new(MAPPED)), used: 0 });
+                match pool.keep("upload staging", chunk_bytes, usage) {
+                    Ok(raw) => self.chunks.push(Chunk { raw, state: Arc::new(AtomicU8::new(MAPPED)), used: 0 }),
+                    // A smaller set is submitted more often.
+                    Err(error) if error.lacks_room() && !self.chunks.is_empty() => return Ok(None),
+                    Err(error) => return Err(error),
+                }
                 self.chunks.len() - 1
             }
         };
-        self.chunks.get_mut(at)
+        Ok(self.chunks.get_mut(at))
     }
 }

@@ -1,8 +1,10 @@
-//! Device memory: buffers from a pool of size classes, charged to one budget.
+//! Device memory: buffers from a pool of size classes, charged to one budget. Staging and uniforms are charged to it as well.
 //!
-//! Invariants: (1) allocated bytes, in use or free in the pool, never exceed the budget; (2) a buffer is reused only
+//! Invariants: (1) allocated bytes, in use or free in the pool, never exceed the budget; once the device refused a buffer,
+//! the budget is what it had granted until then; (2) a buffer is reused only
 //! within its class, which is at most a quarter larger than the requested size; (3) a dropped buffer returns to the
-//! pool, and commands recorded later may use it; this is safe because commands run in the order recorded.
+//! pool, and commands recorded later may use it; this is safe because commands run in the order recorded, and a buffer for
+//! read-backs returns only after the host has unmapped it.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -17,6 +19,24 @@ const CLASS_MIN: u64 = 256;
 const USAGES: wgpu::BufferUsages =
     wgpu::BufferUsages::STORAGE.union(wgpu::BufferUsages::COPY_SRC).union(wgpu::BufferUsages::COPY_DST);
 
+/// What a buffer of the pool serves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Purpose {
+    /// Shaders and copies.
+    Work,
+    /// Copies to the host, which maps the buffer.
+    ReadBack,
+}
+
+impl Purpose {
+    fn usages(self) -> wgpu::BufferUsages {
+        match self {
+            Purpose::Work => USAGES,
+            Purpose::ReadBack => wgpu::BufferUsages::MAP_READ.union(wgpu::BufferUsages::COPY_DST),
+        }
+    }
+}
+
 /// A buffer on the device; returns to the pool when dropped.
 #[derive(Debug)]
 pub struct Buffer {
@@ -24,6 +44,9 @@ pub struct Buffer {
     label: &'static str,
     size: u64,
     class: u64,
+    purpose: Purpose,
+    /// Whether the pool may hand the buffer out again.
+    is_reusable: bool,
     pool: Arc<Pool>,
 }
 
@@ -50,6 +73,16 @@ impl BufferView {
 }
 
 impl Buffer {
+    /// The driver's buffer.
+    pub(super) fn raw(&self) -> &wgpu::Buffer {
+        &self.raw
+    }
+
+    /// Lets the pool hand the buffer out again, or not, once it is dropped.
+    pub(super) fn set_reusable(&mut self, is_reusable: bool) {
+        self.is_reusable = is_reusable;
+    }
+
     /// The requested size, bytes.
     pub fn size(&self) -> u64 {
         self.size
@@ -72,7 +105,12 @@ impl Drop for Buffer {
     fn drop(&mut self) {
         let mut state = lock(&self.pool.state);
         state.usage.in_use -= self.class;
-        state.free.entry(self.class).or_default().push(self.raw.clone());
+        let free = state.free.entry((self.class, self.purpose)).or_default();
+        if self.is_reusable {
+            free.push(self.raw.clone());
+        } else {
+            state.usage.allocated -= self.class;
+        }
     }
 }
 
@@ -81,13 +119,15 @@ impl Drop for Buffer {
 pub(super) struct Pool {
     driver: Arc<Driver>,
     state: Mutex<PoolState>,
-    budget: u64,
     buffer_max: u64,
+    /// Most bytes of the API's memory blocks; `None`: no limit.
+    block_limit: Option<u64>,
 }
 
 #[derive(Debug, Default)]
 struct PoolState {
-    free: BTreeMap<u64, Vec<wgpu::Buffer>>,
+    budget: u64,
+    free: BTreeMap<(u64, Purpose), Vec<wgpu::Buffer>>,
     usage: PoolUse,
 }
 
@@ -95,55 +135,108 @@ struct PoolState {
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct PoolUse {
     pub(super) in_use: u64,
-    allocated: u64,
+    pub(super) allocated: u64,
+    /// Bytes of staging and uniforms that stay for good.
+    pub(super) kept: u64,
     pub(super) peak: u64,
     pub(super) allocations: u64,
 }
 
 impl Pool {
-    pub(super) fn new(driver: Arc<Driver>, budget: u64, buffer_max: u64) -> Arc<Pool> {
-        Arc::new(Pool { driver, state: Mutex::default(), budget, buffer_max })
+    pub(super) fn new(driver: Arc<Driver>, budget: u64, block_limit: Option<u64>, buffer_max: u64) -> Arc<Pool> {
+        let state = PoolState { budget, ..PoolState::default() };
+        Arc::new(Pool { driver, state: Mutex::new(state), buffer_max, block_limit })
     }
 
     /// A buffer of `size` bytes with arbitrary contents.
-    pub(super) fn take(self: &Arc<Self>, label: &'static str, size: u64) -> GpuResult<Buffer> {
+    pub(super) fn take(self: &Arc<Self>, label: &'static str, size: u64, purpose: Purpose) -> GpuResult<Buffer> {
         let limit = self.buffer_max / 4 * 4;
         if size > limit {
             return Err(GpuError::BufferTooLarge { what: label.into(), need: size, limit });
         }
         let class = size_class(size).min(limit);
         let mut state = lock(&self.state);
-        let reused = state.free.get_mut(&class).and_then(Vec::pop);
+        let reused = state.free.get_mut(&(class, purpose)).and_then(Vec::pop);
         let raw = match reused {
             Some(raw) => raw,
             None => {
                 self.make_room(&mut state, label, class)?;
-                self.driver.faults.set_stage(label);
-                let raw = self.driver.buffer(label, class, USAGES);
-                self.driver.faults.check()?;
-                state.usage.allocated += class;
+                let raw = self.allocate(&mut state, label, class, purpose.usages())?;
                 state.usage.allocations += 1;
-                state.usage.peak = state.usage.peak.max(state.usage.allocated);
                 raw
             }
         };
         state.usage.in_use += class;
-        Ok(Buffer { raw, label, size, class, pool: Arc::clone(self) })
+        Ok(Buffer { raw, label, size, class, purpose, is_reusable: true, pool: Arc::clone(self) })
+    }
+
+    /// A buffer of `size` bytes that stays charged for as long as the pool lives.
+    pub(super) fn keep(&self, label: &'static str, size: u64, usages: wgpu::BufferUsages) -> GpuResult<wgpu::Buffer> {
+        let mut state = lock(&self.state);
+        self.make_room(&mut state, label, size)?;
+        let raw = self.allocate(&mut state, label, size, usages)?;
+        state.usage.in_use += size;
+        state.usage.kept += size;
+        Ok(raw)
+    }
+
+    /// Asks the driver for a buffer and counts it. A refusal lowers the budget to what is allocated.
+    fn allocate(
+        &self,
+        state: &mut PoolState,
+        label: &'static str,
+        size: u64,
+        usages: wgpu::BufferUsages,
+    ) -> GpuResult<wgpu::Buffer> {
+        self.driver.faults.set_stage(label);
+        let raw = self.driver.buffer(label, size, usages);
+        self.driver.faults.check().map_err(|error| match error {
+            GpuError::OutOfMemory { .. } => {
+                state.budget = state.usage.allocated;
+                GpuError::DeviceFull { what: label.into(), need: size, in_use: state.usage.in_use }
+            }
+            other => other,
+        })?;
+        if let Some(error) = self.over_block_limit(state, label, size)? {
+            return Err(error); // drops the buffer
+        }
+        state.usage.allocated += size;
+        state.usage.peak = state.usage.peak.max(state.usage.allocated);
+        Ok(raw)
+    }
+
+    /// The error for a buffer with which the API's memory blocks exceed the limit even after all free buffers are gone.
+    fn over_block_limit(&self, state: &mut PoolState, label: &str, size: u64) -> GpuResult<Option<GpuError>> {
+        let Some(limit) = self.block_limit else { return Ok(None) };
+        let reserved =
+            || self.driver.device.generate_allocator_report().map_or(0, |report| report.total_reserved_bytes);
+        if reserved() <= limit {
+            return Ok(None);
+        }
+        state.usage.allocated = state.usage.in_use;
+        state.free.clear();
+        self.driver.wait(label, None)?; // the API frees what the device has finished with
+        Ok((reserved() > limit).then(|| GpuError::OutOfBudget {
+            what: label.into(),
+            need: size,
+            in_use: state.usage.in_use,
+            budget: limit,
+        }))
     }
 
     /// Returns free buffers to the device, largest first, until `class` bytes fit the budget.
     fn make_room(&self, state: &mut PoolState, label: &str, class: u64) -> GpuResult<()> {
-        if state.usage.in_use.saturating_add(class) > self.budget {
+        if state.usage.in_use.saturating_add(class) > state.budget {
             return Err(GpuError::OutOfBudget {
                 what: label.into(),
                 need: class,
                 in_use: state.usage.in_use,
-                budget: self.budget,
+                budget: state.budget,
             });
         }
-        while state.usage.allocated + class > self.budget {
+        while state.usage.allocated + class > state.budget {
             let Some(mut largest) = state.free.last_entry() else { break };
-            let size = *largest.key();
+            let (size, _) = *largest.key();
             if largest.get_mut().pop().is_some() {
                 state.usage.allocated -= size;
             }
@@ -154,11 +247,24 @@ impl Pool {
         Ok(())
     }
 
+    /// Bytes that buffers can still take.
+    pub(super) fn room(&self) -> u64 {
+        let state = lock(&self.state);
+        state.budget.saturating_sub(state.usage.in_use)
+    }
+
     /// Returns all free buffers to the device.
     pub(super) fn trim(&self) {
         let mut state = lock(&self.state);
         state.usage.allocated = state.usage.in_use;
         state.free.clear();
+    }
+
+    /// Bytes of the free buffers for read-backs.
+    pub(super) fn read_back_bytes(&self) -> u64 {
+        let state = lock(&self.state);
+        let free = state.free.iter().filter(|((_, purpose), _)| *purpose == Purpose::ReadBack);
+        free.map(|((class, _), free)| class * free.len() as u64).sum()
     }
 
     pub(super) fn usage(&self) -> PoolUse {

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 
 use super::adapter::{AdapterSummary, DeviceChoice, DeviceKind, choose, limits_to_request};
 use super::belt::Belt;
-use super::buffers::{Buffer, Pool};
+use super::buffers::{Buffer, Pool, Purpose};
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult, lock};
 use super::injected::{InjectedFault, Injector};
@@ -18,8 +18,24 @@ use super::shader::{Pipeline, Pipelines};
 use super::sources::{Defines, SOURCES, Source};
 use super::uniforms::UniformRing;
 
+/// Smallest and largest memory block under a budget, bytes: the API raises smaller ones to 4 MiB.
+const BLOCK_MIN: u64 = 4 << 20;
+const BLOCK_MAX: u64 = 64 << 20;
+/// The budget from which on it holds for memory blocks, bytes: blocks are a large part of smaller ones.
+const BLOCKS_COUNT_FROM: u64 = 128 << 20;
 /// Largest binding used, bytes: the API's cap is 2^31-1, and windows must start at aligned offsets.
 const BINDING_MAX: u64 = (1 << 31) - 256;
+
+/// Bytes of a memory block of the API under a budget.
+fn block_bytes(budget: u64) -> u64 {
+    (budget / 64).clamp(BLOCK_MIN, BLOCK_MAX)
+}
+
+/// The part of a budget for buffers. The API holds blocks of three kinds of memory (device, uploads, read-backs), which are
+/// partly empty: measured 4 to 6 blocks in all.
+fn bytes_for_buffers(budget: u64) -> u64 {
+    if budget < BLOCKS_COUNT_FROM { budget } else { budget - 6 * block_bytes(budget) }
+}
 
 /// Options that a test or the user's budget sets.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -35,7 +51,8 @@ pub struct GpuOptions {
     /// `Some(false)` disables the path for adapters whose subgroups all have 8 invocations, in favour of the general
     /// one.
     pub subgroups_of_8: Option<bool>,
-    /// Most device memory to allocate, bytes (`--device-mem`); `None`: no limit.
+    /// Most device memory to allocate, bytes (`--device-mem`); `None`: no limit. From 128 MiB on the limit holds for the memory
+    /// blocks of the API, below for the buffers in them.
     pub budget: Option<u64>,
     /// Measures the time of every stage, if the adapter can.
     pub profile: bool,
@@ -57,13 +74,13 @@ pub struct Traffic {
     pub bytes_uploaded: u64,
     /// Bytes from the device to the host.
     pub bytes_read_back: u64,
-    /// Device memory of live buffers, bytes.
+    /// Device memory of live buffers, staging and uniforms, bytes.
     pub device_bytes: u64,
     /// Most device memory ever allocated, bytes, including free buffers in the pool.
     pub device_bytes_peak: u64,
     /// Buffers allocated so far: constant once warmed up.
     pub device_allocations: u64,
-    /// Host memory of the staging buffers, bytes.
+    /// The part of this memory that stages uploads, uniforms and read-backs, bytes. It may lie in host memory.
     pub staging_bytes: u64,
 }
 
@@ -114,8 +131,12 @@ impl Gpu {
         features.set(wgpu::Features::SUBGROUP, subgroups);
         features.set(wgpu::Features::TIMESTAMP_QUERY, profile);
         let limits = limits_to_request(&adapter.limits());
-        let driver = Arc::new(Driver::open(&adapter, &summary.name, features, limits.clone())?);
-        let staging = Staging::new(Arc::clone(&driver));
+        let driver =
+            Arc::new(Driver::open(&adapter, &summary.name, features, limits.clone(), options.budget.map(block_bytes))?);
+        let budget = options.budget.map_or(u64::MAX, bytes_for_buffers);
+        let block_limit = options.budget.filter(|budget| *budget >= BLOCKS_COUNT_FROM);
+        let pool = Pool::new(Arc::clone(&driver), budget, block_limit, limits.max_buffer_size);
+        let staging = Staging::new(Arc::clone(&driver), Arc::clone(&pool));
         let profiler = Profiler::new(&driver, Arc::clone(&staging), profile);
         driver.faults.check()?;
         let of_8 = summary.subgroup_sizes == Some((8, 8)) && options.subgroups_of_8 != Some(false);
@@ -129,15 +150,15 @@ impl Gpu {
         let own_max = limits.max_storage_buffer_binding_size.min(BINDING_MAX);
         Ok(Gpu {
             staging,
-            belt: Mutex::new(Belt::new(Arc::clone(&driver))),
-            uniforms: Mutex::new(UniformRing::new(Arc::clone(&driver), u64::from(alignment))),
+            belt: Mutex::new(Belt::new(Arc::clone(&driver), Arc::clone(&pool), budget)),
+            uniforms: Mutex::new(UniformRing::new(Arc::clone(&driver), Arc::clone(&pool), u64::from(alignment))),
             profiler: Mutex::new(profiler),
             injector: Injector::new(options.fault.or_else(InjectedFault::from_environment)),
             uploaded: AtomicU64::new(0),
             recordings: Arc::default(),
             serial: options.serial,
             pipelines: Pipelines::new(Arc::clone(&driver), subgroup_defines, uniform_blocks),
-            pool: Pool::new(Arc::clone(&driver), options.budget.unwrap_or(u64::MAX), limits.max_buffer_size),
+            pool,
             summary,
             offset_alignment: u64::from(limits.min_storage_buffer_offset_alignment),
             max_binding_bytes: options.max_binding_bytes.map_or(own_max, |lowered| lowered.min(own_max)),
@@ -193,7 +214,12 @@ impl Gpu {
     /// # Errors
     /// The buffer exceeds the budget or the device's memory.
     pub fn buffer(&self, label: &'static str, size: u64) -> GpuResult<Buffer> {
-        self.pool.take(label, size)
+        self.pool.take(label, size, Purpose::Work)
+    }
+
+    /// Device memory that buffers can still take, bytes; 2^64 - 1 less what is in use without a budget.
+    pub fn room(&self) -> u64 {
+        self.pool.room()
     }
 
     /// Returns free buffers to the device.
@@ -210,8 +236,15 @@ impl Gpu {
             device_bytes: pool.in_use,
             device_bytes_peak: pool.peak,
             device_allocations: pool.allocations,
-            staging_bytes: lock(&self.belt).bytes() + self.staging.bytes(),
+            staging_bytes: pool.kept + self.pool.read_back_bytes(),
         }
+    }
+
+    /// Bytes that the driver has allocated for buffers, and bytes of the memory blocks that hold them; `None` if the backend
+    /// reports neither.
+    pub fn allocator_bytes(&self) -> Option<[u64; 2]> {
+        let report = self.driver.device.generate_allocator_report()?;
+        Some([report.total_allocated_bytes, report.total_reserved_bytes])
     }
 
     /// Time of every stage so far, in order of first use; empty without profiling. Waits for the device.

@@ -15,15 +15,25 @@ pub(super) struct Driver {
 }
 
 impl Driver {
-    /// Opens the device of `adapter`, called `name` in errors.
+    /// Opens the device of `adapter`, called `name` in errors. Buffers lie in memory blocks of `block_bytes`, or larger ones of
+    /// their own; `None` leaves the sizes to the API.
     pub(super) fn open(
         adapter: &wgpu::Adapter,
         name: &str,
         required_features: wgpu::Features,
         required_limits: wgpu::Limits,
+        block_bytes: Option<u64>,
     ) -> GpuResult<Driver> {
-        let descriptor =
-            wgpu::DeviceDescriptor { label: Some("gsscale"), required_features, required_limits, ..Default::default() };
+        let memory_hints = block_bytes.map_or(wgpu::MemoryHints::Performance, |bytes| wgpu::MemoryHints::Manual {
+            suballocated_device_memory_block_size: bytes..bytes,
+        });
+        let descriptor = wgpu::DeviceDescriptor {
+            label: Some("gsscale"),
+            required_features,
+            required_limits,
+            memory_hints,
+            ..Default::default()
+        };
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
             .map_err(|e| GpuError::Open { device: name.into(), message: e.to_string() })?;
         let faults = Arc::new(Faults::default());

@@ -60,6 +60,19 @@ pub enum GpuError {
         /// The driver's message.
         message: String,
     },
+    /// The device has no memory for a buffer.
+    #[error(
+        "the device has no memory for {what}: {need} bytes beside the {in_use} in use\n  remedy: close other programs that \
+         use the device"
+    )]
+    DeviceFull {
+        /// Label of the buffer.
+        what: String,
+        /// Bytes that the buffer needs.
+        need: u64,
+        /// Bytes in use by other buffers.
+        in_use: u64,
+    },
     /// One buffer is larger than the device allows.
     #[error("{what} needs one buffer of {need} bytes; the device allows {limit}")]
     BufferTooLarge {
@@ -130,6 +143,20 @@ impl GpuError {
     /// A mismatch in the work of `stage`.
     pub(super) fn bindings(stage: &str, problem: impl Into<String>) -> GpuError {
         GpuError::Bindings { stage: stage.into(), problem: problem.into() }
+    }
+}
+
+impl GpuError {
+    /// Whether a buffer or binding was refused for its size before any command that needs it was recorded. The same work in
+    /// smaller parts may succeed.
+    pub fn lacks_room(&self) -> bool {
+        matches!(
+            self,
+            GpuError::OutOfBudget { .. }
+                | GpuError::DeviceFull { .. }
+                | GpuError::BufferTooLarge { .. }
+                | GpuError::BindingTooLarge { .. }
+        )
     }
 }
 

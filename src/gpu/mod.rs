@@ -41,6 +41,7 @@ mod sources;
 mod uniforms;
 
 pub use adapter::{AdapterSummary, DeviceChoice, DeviceKind, WORKGROUP, list_adapters};
+pub use belt::staging_bytes;
 pub use buffers::{Buffer, BufferView};
 pub use device::{Gpu, GpuOptions, Traffic};
 pub use error::{GpuError, GpuResult};

@@ -1,33 +1,32 @@
-//! Read-back of results: copies into staging memory that is mapped when the device has finished. Staging buffers are
-//! reused, at most two per size class, so that one is read while the other is filled.
+//! Read-back of results: copies into staging memory that is mapped when the device has finished. Staging buffers come from the
+//! pool and are charged to its budget.
 //!
 //! Invariants: (1) a read-back returns the bytes as of its place in the recording; (2) reading before the recorder was
 //! submitted is an error, never an endless wait.
 
-use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::{Arc, OnceLock};
 
-use super::buffers::{BufferView, size_class};
+use super::buffers::{Buffer, BufferView, Pool, Purpose};
 use super::driver::Driver;
-use super::error::{GpuError, GpuResult, lock};
+use super::error::{GpuError, GpuResult};
 
 const RECORDED: u8 = 0;
 const MAPPING: u8 = 1;
 const MAPPED: u8 = 2;
 const FAILED: u8 = 3;
 
-/// Free staging buffers by class, and the number of bytes read.
+/// The source of staging buffers, and the number of bytes read.
 #[derive(Debug)]
 pub(super) struct Staging {
     driver: Arc<Driver>,
-    free: Mutex<BTreeMap<u64, Vec<wgpu::Buffer>>>,
+    pool: Arc<Pool>,
     read: AtomicU64,
 }
 
 impl Staging {
-    pub(super) fn new(driver: Arc<Driver>) -> Arc<Staging> {
-        Arc::new(Staging { driver, free: Mutex::default(), read: AtomicU64::new(0) })
+    pub(super) fn new(driver: Arc<Driver>, pool: Arc<Pool>) -> Arc<Staging> {
+        Arc::new(Staging { driver, pool, read: AtomicU64::new(0) })
     }
 
     /// Records the copy of `view` for `stage`.
@@ -37,26 +36,19 @@ impl Staging {
         stage: &'static str,
         view: &BufferView,
     ) -> GpuResult<(Readback, PendingMap)> {
-        let (size, class) = (view.size, size_class(view.size));
-        let reused = lock(&self.free).get_mut(&class).and_then(Vec::pop);
-        let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
-        let raw = reused.unwrap_or_else(|| self.driver.buffer("read-back staging", class, usage));
-        self.driver.faults.check()?;
+        let size = view.size;
+        let mut to = self.pool.take("read-back staging", size, Purpose::ReadBack)?;
+        to.set_reusable(false); // until the host has read and unmapped it
+        let raw = to.raw().clone();
         encoder.copy_buffer_to_buffer(&view.raw, view.offset, &raw, 0, size);
         self.read.fetch_add(size, Ordering::Relaxed);
         let (state, submission) = (Arc::new(AtomicU8::new(RECORDED)), Arc::new(OnceLock::new()));
-        let pending =
-            PendingMap { raw: raw.clone(), size, state: Arc::clone(&state), submission: Arc::clone(&submission) };
-        Ok((Readback { raw, stage, size, class, state, submission, staging: Arc::clone(self) }, pending))
+        let pending = PendingMap { raw, size, state: Arc::clone(&state), submission: Arc::clone(&submission) };
+        Ok((Readback { buffer: to, stage, size, state, submission, staging: Arc::clone(self) }, pending))
     }
 
     pub(super) fn bytes_read(&self) -> u64 {
         self.read.load(Ordering::Relaxed)
-    }
-
-    /// Host memory of the free staging buffers, bytes.
-    pub(super) fn bytes(&self) -> u64 {
-        lock(&self.free).iter().map(|(class, free)| class * free.len() as u64).sum()
     }
 }
 
@@ -64,10 +56,9 @@ impl Staging {
 #[derive(Debug)]
 #[must_use]
 pub struct Readback {
-    raw: wgpu::Buffer,
+    buffer: Buffer,
     stage: &'static str,
     size: u64,
-    class: u64,
     state: Arc<AtomicU8>,
     submission: Arc<OnceLock<wgpu::SubmissionIndex>>,
     staging: Arc<Staging>,
@@ -114,19 +105,15 @@ impl Readback {
     ///
     /// # Errors
     /// The recorder was not submitted, the device was lost, or its work failed.
-    pub fn copy_to<T: bytemuck::Pod>(self, out: &mut [T]) -> GpuResult<()> {
+    pub fn copy_to<T: bytemuck::Pod>(mut self, out: &mut [T]) -> GpuResult<()> {
         self.wait()?;
         let out = bytemuck::cast_slice_mut::<T, u8>(out);
-        let view = self.raw.get_mapped_range(..self.size).map_err(|e| GpuError::validation(self.stage, e))?;
+        let view = self.buffer.raw().get_mapped_range(..self.size).map_err(|e| GpuError::validation(self.stage, e))?;
         let n = out.len().min(view.len());
         out[..n].copy_from_slice(&view[..n]);
         drop(view);
-        self.raw.unmap();
-        let mut free = lock(&self.staging.free);
-        let class = free.entry(self.class).or_default();
-        if class.len() < 2 {
-            class.push(self.raw.clone());
-        }
+        self.buffer.raw().unmap();
+        self.buffer.set_reusable(true);
         Ok(())
     }
 

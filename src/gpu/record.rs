@@ -8,7 +8,6 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use super::adapter::GROUPS_MAX;
-use super::belt::SET_BYTES;
 use super::buffers::{Buffer, BufferView};
 use super::device::Gpu;
 use super::error::{GpuError, GpuResult, lock};
@@ -161,7 +160,7 @@ impl Recorder<'_> {
             bytes = &bytes[done..];
             at += done as u64;
             if !bytes.is_empty() {
-                self.flush()?; // the set of SET_BYTES is full
+                self.flush()?; // the staging set is full
             }
         }
         Ok(())
@@ -334,8 +333,9 @@ impl Recorder<'_> {
             None => {}
             Some(FaultKind::Lost) => self.gpu.driver.device.destroy(),
             Some(FaultKind::Validation) => {
-                let raw = lock(&self.gpu.uniforms).chunk(0);
-                self.work.encoder.clear_buffer(&raw, 0, Some(2 * UNIFORM_CHUNK)); // beyond its end
+                if let Ok(raw) = lock(&self.gpu.uniforms).chunk(0) {
+                    self.work.encoder.clear_buffer(&raw, 0, Some(2 * UNIFORM_CHUNK)); // beyond its end
+                }
             }
             Some(FaultKind::OutOfMemory) => {
                 self.gpu.driver.faults.report(&wgpu::Error::OutOfMemory { source: "injected fault".into() });
@@ -375,8 +375,6 @@ impl Recorder<'_> {
         Ok(Submission { index, name: self.work.name })
     }
 }
-
-const _: () = assert!(SET_BYTES.is_multiple_of(4));
 
 #[cfg(test)]
 mod tests {

@@ -48,6 +48,7 @@ sources![
     "scan.wgsl",
     "sh_bwd.wgsl",
     "sh_fwd.wgsl",
+    "tile_range.wgsl",
     "shared/camera.wgsl",
     "shared/constants.wgsl",
     "shared/covariance.wgsl",

@@ -4,7 +4,7 @@
 
 use std::sync::Arc;
 
-use super::buffers::BufferView;
+use super::buffers::{BufferView, Pool};
 use super::driver::Driver;
 use super::error::GpuResult;
 
@@ -15,22 +15,23 @@ pub(super) const UNIFORM_CHUNK: u64 = 64 << 10;
 #[derive(Debug)]
 pub(super) struct UniformRing {
     driver: Arc<Driver>,
+    pool: Arc<Pool>,
     chunks: Vec<wgpu::Buffer>,
     alignment: u64,
 }
 
 impl UniformRing {
-    pub(super) fn new(driver: Arc<Driver>, alignment: u64) -> UniformRing {
-        UniformRing { driver, chunks: Vec::new(), alignment: alignment.max(16) }
+    pub(super) fn new(driver: Arc<Driver>, pool: Arc<Pool>, alignment: u64) -> UniformRing {
+        UniformRing { driver, pool, chunks: Vec::new(), alignment: alignment.max(16) }
     }
 
     /// The buffer at `index`; allocated on first use.
-    pub(super) fn chunk(&mut self, index: usize) -> wgpu::Buffer {
+    pub(super) fn chunk(&mut self, index: usize) -> GpuResult<wgpu::Buffer> {
         while self.chunks.len() <= index {
             let usage = wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
-            self.chunks.push(self.driver.buffer("uniforms", UNIFORM_CHUNK, usage));
+            self.chunks.push(self.pool.keep("uniforms", UNIFORM_CHUNK, usage)?);
         }
-        self.chunks[index].clone()
+        Ok(self.chunks[index].clone())
     }
 
     /// Appends a uniform to `packed`, the contents of the buffers at the next submission; returns its place.
@@ -42,8 +43,7 @@ impl UniformRing {
         }
         let index = packed.len() - 1;
         let offset = offset_in(&packed[index]);
-        let raw = self.chunk(index);
-        self.driver.faults.check()?;
+        let raw = self.chunk(index)?;
         let chunk = &mut packed[index];
         chunk.resize(usize::try_from(offset).unwrap_or(chunk.len()), 0);
         chunk.extend_from_slice(bytes);
@@ -54,9 +54,8 @@ impl UniformRing {
     /// Writes the packed uniforms to their buffers, before the next submission; returns the number of bytes.
     pub(super) fn write(&mut self, packed: &mut Vec<Vec<u8>>) -> u64 {
         let mut written = 0;
-        for (index, bytes) in packed.drain(..).enumerate() {
-            let raw = self.chunk(index);
-            self.driver.queue.write_buffer(&raw, 0, &bytes);
+        for (raw, bytes) in self.chunks.iter().zip(packed.drain(..)) {
+            self.driver.queue.write_buffer(raw, 0, &bytes);
             written += bytes.len() as u64;
         }
         written

@@ -27,6 +27,12 @@ impl TileRange {
         *self == TileRange::all(grid)
     }
 
+    /// Number of tiles.
+    pub fn tiles(&self) -> u32 {
+        let [columns, rows] = [self.columns, self.rows].map(|[first, end]| u32::from(end - first));
+        columns * rows
+    }
+
     /// Whether a tile, by its number in the picture, belongs to the range.
     #[inline(always)]
     pub fn contains(&self, grid: Grid, tile: usize) -> bool {
@@ -35,45 +41,58 @@ impl TileRange {
         within(x, self.columns) && within(y, self.rows)
     }
 
-    /// Cuts a picture into ranges of at most `isects_most` intersections. `tile_offsets` has one entry more than tiles: the
-    /// intersections of a tile are the difference of two.
-    pub fn cut(grid: Grid, tile_offsets: &[u64], isects_most: u64) -> Vec<TileRange> {
-        let of_tile = |x: u32, y: u32| {
-            let tile = y as usize * grid.tiles_x as usize + x as usize;
-            tile_offsets[tile + 1] - tile_offsets[tile]
-        };
+    /// Cuts a picture into ranges for which `fits(range, intersections)` is true, or of one tile. `isects_of_tile(column, row)`
+    /// counts the intersections of a tile. A part of a range that fits must fit.
+    pub fn cut(
+        grid: Grid,
+        isects_of_tile: impl Fn(u32, u32) -> u64,
+        fits: impl Fn(&TileRange, u64) -> bool,
+    ) -> Vec<TileRange> {
         let all_rows = [0, grid.tiles_y as u16];
+        let columns = |first: u32, end: u32| TileRange { columns: [first as u16, end as u16], rows: all_rows };
         let (mut ranges, mut begun, mut held) = (Vec::new(), 0u32, 0u64);
         for x in 0..grid.tiles_x {
-            let of_column: u64 = (0..grid.tiles_y).map(|y| of_tile(x, y)).sum();
-            if held + of_column <= isects_most {
+            let of_column: u64 = (0..grid.tiles_y).map(|y| isects_of_tile(x, y)).sum();
+            if fits(&columns(begun, x + 1), held + of_column) {
                 held += of_column;
                 continue;
             }
             if begun < x {
-                ranges.push(TileRange { columns: [begun as u16, x as u16], rows: all_rows });
+                ranges.push(columns(begun, x));
             }
-            if of_column <= isects_most {
-                (begun, held) = (x, of_column);
+            (begun, held) = (x, of_column);
+            if fits(&columns(x, x + 1), of_column) {
                 continue;
             }
-            let (mut first, mut held_here) = (0u32, 0u64);
-            for y in 0..grid.tiles_y {
-                let isects = of_tile(x, y);
-                if y > first && held_here + isects > isects_most {
-                    ranges.push(TileRange { columns: [x as u16, x as u16 + 1], rows: [first as u16, y as u16] });
-                    (first, held_here) = (y, 0);
-                }
-                held_here += isects;
-            }
-            ranges.push(TileRange { columns: [x as u16, x as u16 + 1], rows: [first as u16, grid.tiles_y as u16] });
+            cut_column(x, grid, &isects_of_tile, &fits, &mut ranges);
             (begun, held) = (x + 1, 0);
         }
         if begun < grid.tiles_x {
-            ranges.push(TileRange { columns: [begun as u16, grid.tiles_x as u16], rows: all_rows });
+            ranges.push(columns(begun, grid.tiles_x));
         }
         ranges
     }
+}
+
+/// Cuts one tile column.
+fn cut_column(
+    x: u32,
+    grid: Grid,
+    isects_of_tile: &impl Fn(u32, u32) -> u64,
+    fits: &impl Fn(&TileRange, u64) -> bool,
+    ranges: &mut Vec<TileRange>,
+) {
+    let rows = |first: u32, end: u32| TileRange { columns: [x as u16, x as u16 + 1], rows: [first as u16, end as u16] };
+    let (mut first, mut held) = (0u32, 0u64);
+    for y in 0..grid.tiles_y {
+        let isects = isects_of_tile(x, y);
+        if y > first && !fits(&rows(first, y + 1), held + isects) {
+            ranges.push(rows(first, y));
+            (first, held) = (y, 0);
+        }
+        held += isects;
+    }
+    ranges.push(rows(first, grid.tiles_y));
 }
 
 #[cfg(test)]
@@ -91,8 +110,12 @@ mod tests {
                 tile_offsets.push(tile_offsets[tile_offsets.len() - 1] + draws.below(100));
             }
             let isects = |tile: usize| tile_offsets[tile + 1] - tile_offsets[tile];
+            let cut = |most: u64| {
+                let of_tile = |x: u32, y: u32| isects(y as usize * grid.tiles_x as usize + x as usize);
+                TileRange::cut(grid, of_tile, |_, isects| isects <= most)
+            };
             for most in [0, 1, 50, 120, 700, u64::MAX] {
-                let ranges = TileRange::cut(grid, &tile_offsets, most);
+                let ranges = cut(most);
                 let mut seen = Vec::new();
                 for range in &ranges {
                     assert!(range.rows == [0, grid.tiles_y as u16] || range.columns[1] == range.columns[0] + 1);
@@ -106,7 +129,7 @@ mod tests {
                 assert!(seen.is_sorted() && seen.len() == grid.tiles(), "{width}x{height} in ranges of {most}");
                 assert_eq!(ranges.len() <= 1, most == u64::MAX || grid.tiles() <= 1 || ranges.len() == 1);
             }
-            assert!(TileRange::cut(grid, &tile_offsets, u64::MAX).iter().all(|range| range.is_all(grid)));
+            assert!(cut(u64::MAX).iter().all(|range| range.is_all(grid)));
         }
     }
 }

@@ -1,6 +1,7 @@
 //! Rust twins of the uniform structs of the tile stages' shaders; the shaders document the fields.
 
 use super::splats::Grid;
+use super::tile_range::TileRange;
 
 /// Sums that the backward rasterizer writes for each intersection.
 pub const SUMS: u32 = 9;
@@ -28,6 +29,12 @@ pub const SEGMENT_FIRST: u32 = 1;
 pub const SEGMENT_LAST: u32 = 2;
 /// Flag of [`RasterUniforms`]: a gradient of the coverage is given.
 pub const HAS_V_ALPHA: u32 = 4;
+/// Flag of [`RasterUniforms`] for `fold_rows`: the rows continue the sums that the gradients' buffer holds.
+pub const FOLD_CARRIED: u32 = 8;
+/// Flag of [`RasterUniforms`] for `fold_rows`: the rows store their sums, because another range of tiles follows.
+pub const FOLD_UNFINISHED: u32 = 16;
+/// Flag of [`RasterUniforms`] for `fold_rows`: there are no lists; a row's rank is its number.
+pub const FOLD_WITHOUT_LISTS: u32 = 32;
 
 crate::wgsl_struct! {
     /// Uniform of `scan.wgsl`.
@@ -62,6 +69,24 @@ crate::wgsl_struct! {
         pub capacity: u32,
         /// Unused.
         pub pad: [u32; 2],
+        /// First column, end of the columns, first row, end of the rows of the tiles that are listed.
+        pub range: [u32; 4],
+    }
+
+    /// Uniform of `tile_range.wgsl`.
+    pub struct RangeUniforms {
+        /// Width, height, tile columns, tile rows.
+        pub grid: [u32; 4],
+        /// First column, end of the columns, first row, end of the rows.
+        pub range: [u32; 4],
+        /// The number, in the view, of the segment's first row.
+        pub first_row: u32,
+        /// Rows of the segment.
+        pub row_count: u32,
+        /// Room of the copy, rows.
+        pub capacity: u32,
+        /// Unused.
+        pub pad: u32,
     }
 
     /// Uniform of `isect_offsets.wgsl`.
@@ -100,7 +125,14 @@ crate::wgsl_struct! {
         pub window_first: u32,
         /// One past the last.
         pub window_end: u32,
+        /// First column, end of the columns, first row, end of the rows of the tiles that are blended.
+        pub range: [u32; 4],
     }
+}
+
+/// A range of tiles as the shaders store it.
+pub fn range_words(TileRange { columns, rows }: TileRange) -> [u32; 4] {
+    [columns[0], columns[1], rows[0], rows[1]].map(u32::from)
 }
 
 /// A grid as the shaders store it.

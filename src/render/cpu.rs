@@ -273,7 +273,13 @@ impl Renderer for CpuRenderer {
         let all = TileRange::all(grid);
         clock.time("isect_offsets", || self.count_range(grid, all, simd));
         let ranges = match self.isects_most.filter(|most| total > *most) {
-            Some(most) => TileRange::cut(grid, &self.tile_offsets, most),
+            Some(most) => {
+                let of_tile = |x: u32, y: u32| {
+                    let tile = y as usize * grid.tiles_x as usize + x as usize;
+                    self.tile_offsets[tile + 1] - self.tile_offsets[tile]
+                };
+                TileRange::cut(grid, of_tile, |_, isects| isects <= most)
+            }
             None => vec![all],
         };
         for &range in &ranges {

@@ -1,7 +1,13 @@
 //! [`GpuRenderer`]: the stages of a view on a GPU, forward and backward, one view at a time.
 //!
-//! Not here: the recording of each stage (`gpu_rows`, `gpu_tiles`, `gpu_tiles_bwd`, `gpu_loss`), the device and its
-//! memory (`crate::gpu`).
+//! Not here: the recording of each stage (`gpu_rows`, `gpu_tiles`, `gpu_tiles_bwd`, `gpu_loss`), rows in chunks
+//! (`gpu_segments`, `gpu_gradients`), the picture in ranges of tiles (`gpu_ranges`), the device and its memory (`crate::gpu`).
+//!
+//! # Memory
+//! The ordinary view keeps its rows and tile lists on the device. A buffer that the budget or the device refuses costs first
+//! the rows, which then come and go in chunks, and then the lists, which are then made for one range of tiles at a time. What
+//! must stay is 96 bytes a row in view (splats and gradients), 8 bytes a row for the places in a range, some 60 bytes a pixel,
+//! and the splats and lists of one tile. The result has the same bits on every path.
 //!
 //! # Bus traffic
 //! A step with n rows in view, p pixels and all colour bands uploads 236 n bytes of values and 4 p bytes of photo. The
@@ -23,7 +29,7 @@
 //! one submission and one wait.
 //!
 //! A view of one batch keeps its rows on the device, and its depth sort is recorded in `rows_in`. A view of several batches
-//! (`gpu_batches`) uploads the rows of each batch twice, one submission each way, and sorts in `picture`.
+//! uploads the rows of each batch twice, and sorts the splats of each range of tiles.
 //!
 //! The device is therefore idle only between two steps. The optimizer has just rewritten every row in view, and the
 //! cull of the next view reads the new means, so the next upload cannot start earlier. Rows of the next view that the
@@ -35,108 +41,26 @@
 //! bits on the same device; 3. no result comes from buffers that were too small: the frame and its loss are recorded
 //! again with larger buffers; 4. after a device error there is no view until the next `begin_view`.
 
-use super::gpu_batches::{self, SplatBatch};
+use super::device_needs::ViewSizes;
+use super::gpu_gradients::{RowGradients, RowsOut, Scratch, check_room};
 use super::gpu_loss::{LossStage, value};
-use super::gpu_rows::{DeviceColumns, FOOTPRINT_BYTES, RowStages, band_into_sh_n};
-use super::gpu_tiles::{Blend, Demand, DemandReadback, Frame, Ranks, TileStages, splat_bytes};
-use super::gpu_tiles_bwd::PictureGradientBuffers;
+use super::gpu_ranges::{RangeStages, Ranges};
+use super::gpu_rows::{DeviceColumns, RowStages, SplatRows};
+use super::gpu_segments::{self, Segment};
+use super::gpu_tiles::{Blend, Demand, Pixels, TileStages, splat_bytes};
+use super::gpu_tiles_bwd::{Fold, PictureGradientBuffers};
+use super::gpu_view::{DemandState, Lists, Loss, LossSums, RowsIn, View, WholeLists, WholeRows, blend_of};
 use super::sequence::{Sequence, ViewOptions};
 use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches};
-use crate::base::room;
-use crate::gpu::{Buffer, DeviceKind, Gpu, GpuResult, Readback, Recorder, Recording, Traffic};
+use crate::gpu::{Buffer, DeviceKind, Gpu, GpuResult, Recorder, Traffic};
 use crate::kernels::image_loss::LossPlan;
 use crate::kernels::splats::Grid;
+use crate::kernels::tile_range::TileRange;
 use crate::kernels::uniforms::pack_target;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
 use std::ops::Range;
-
-/// Densification input of one row: gradient with respect to the projected mean (2), radii (2).
-type Footprint = [f32; 4];
-
-/// The buffer sizes that a frame needs. The picture is valid only if the frame had this room.
-#[derive(Debug)]
-enum DemandState {
-    /// The readback is pending.
-    Pending(DemandReadback),
-    /// The host has read the demand.
-    Known(Demand),
-}
-
-/// Device state between `rows_in` and `picture`.
-#[derive(Debug)]
-enum RowsIn {
-    /// Of a view of one batch.
-    Whole(Box<WholeRows>),
-    /// Of a view of several batches.
-    Batches(Vec<SplatBatch>),
-}
-
-/// The rows of a view of one batch.
-#[derive(Debug)]
-struct WholeRows {
-    columns: DeviceColumns,
-    splats: Buffer,
-    ranks: Ranks,
-    /// Upload and evaluation of the colours, not submitted yet: `picture` appends lists and blending.
-    colors: Recording,
-}
-
-/// Device state of a view with a picture.
-#[derive(Debug)]
-struct View {
-    of: ViewOptions,
-    /// The rows of a view of one batch; `None` for several batches, whose rows come again.
-    columns: Option<DeviceColumns>,
-    splats: Buffer,
-    ranks: Ranks,
-    frame: Frame,
-    demand: DemandState,
-    /// Whether `GpuRenderer::image` holds the picture of this view.
-    image_is_read: bool,
-    /// Whether the caller may have changed `GpuRenderer::image`; the loss then compares that image.
-    image_is_corrected: bool,
-    loss: Option<Loss>,
-    splat_gradients: Option<SplatGradients>,
-}
-
-/// A loss that was submitted.
-#[derive(Debug)]
-struct Loss {
-    plan: LossPlan,
-    /// The photo, kept until the picture is known to be valid.
-    target: Buffer,
-    v_rgb: Buffer,
-    sums: LossSums,
-}
-
-/// The four sums from which the value of a loss follows.
-#[derive(Debug)]
-enum LossSums {
-    /// The picture has no pixels.
-    Empty,
-    /// The readback is pending.
-    Pending(Readback),
-    /// The host has read the sums.
-    Known([f32; 4]),
-}
-
-/// Gradients of the splats.
-#[derive(Debug)]
-struct SplatGradients {
-    v_splats: Buffer,
-    /// The tile stages that write `v_splats`, not submitted yet: the first `rows_out` appends the stages on rows.
-    tiles: Option<Recording>,
-}
-
-/// Host memory that is reused between views.
-#[derive(Debug, Default)]
-struct Scratch {
-    band: Vec<f32>,
-    target: Vec<u32>,
-    footprints: Vec<Footprint>,
-}
 
 /// Renders views on a GPU.
 #[derive(Debug)]
@@ -144,6 +68,7 @@ pub struct GpuRenderer {
     gpu: Gpu,
     rows: RowStages,
     tiles: TileStages,
+    ranges: RangeStages,
     loss: LossStage,
     sequence: Sequence,
     rows_in: Option<RowsIn>,
@@ -154,16 +79,8 @@ pub struct GpuRenderer {
     /// Whether the caller requested the gradient of the picture, and the host copy therefore replaces the device's.
     gradient_on_host: bool,
     scratch: Scratch,
+    packed_target: Vec<u32>,
     frames_rerecorded: u64,
-}
-
-/// Pending readbacks of the gradients of the rows.
-struct GradientReadbacks {
-    /// sh0, then the bands in use.
-    colors: Vec<Readback>,
-    /// means, quats, scales, opacities.
-    geometry: Vec<Readback>,
-    footprints: Readback,
 }
 
 impl GpuRenderer {
@@ -175,6 +92,7 @@ impl GpuRenderer {
         Ok(GpuRenderer {
             rows: RowStages::new(&gpu)?,
             tiles: TileStages::new(&gpu)?,
+            ranges: RangeStages::new(&gpu)?,
             loss: LossStage::new(&gpu)?,
             gpu,
             sequence: Sequence::default(),
@@ -184,6 +102,7 @@ impl GpuRenderer {
             gradient: PictureGradient::default(),
             gradient_on_host: false,
             scratch: Scratch::default(),
+            packed_target: Vec::new(),
             frames_rerecorded: 0,
         })
     }
@@ -205,9 +124,15 @@ impl GpuRenderer {
 
     /// Intersections of the last view; 0 until a call has read the picture, the loss or a gradient.
     pub fn isects(&self) -> u32 {
-        match self.view.as_ref().map(|view| &view.demand) {
-            Some(DemandState::Known(demand)) => demand.isects,
-            _ => 0,
+        self.view.as_ref().map_or(0, |view| u32::try_from(view.sizes().isects).unwrap_or(u32::MAX))
+    }
+
+    /// Ranges of tiles in which the last picture was blended.
+    pub fn ranges(&self) -> usize {
+        match self.view.as_ref().map(|view| &view.lists) {
+            None => 0,
+            Some(Lists::Whole(_)) => 1,
+            Some(Lists::Ranges(ranges)) => ranges.len(),
         }
     }
 
@@ -218,15 +143,15 @@ impl GpuRenderer {
     pub fn alpha(&mut self) -> Result<Vec<f32>, RenderError> {
         self.sequence.image()?;
         self.with_view("coverage", |renderer, view| {
-            let (view, _) = renderer.wait_for_valid_frame(view)?;
+            renderer.wait_for_valid_picture(view)?;
             let gpu = &renderer.gpu;
             let mut alpha = vec![0.0; view.of.camera.pixels()];
             let mut recorder = gpu.begin("coverage");
-            let bytes = recorder.read_back("rasterize_fwd", &view.frame.t_final.view())?;
+            let bytes = recorder.read_back("rasterize_fwd", &view.pixels.t_final.view())?;
             gpu.submit(recorder)?;
             bytes.copy_to(&mut alpha)?;
             alpha.iter_mut().for_each(|t| *t = 1.0 - *t);
-            Ok((view, alpha))
+            Ok(alpha)
         })
     }
 
@@ -236,15 +161,26 @@ impl GpuRenderer {
         (self.rows_in, self.view) = (None, None);
     }
 
-    /// Runs a stage on a view with a picture. A failed stage drops the view.
+    /// Runs a stage on a view with a picture. A stage that lacks device memory runs again while the view can give some back. A
+    /// failed stage drops the view.
     fn with_view<T>(
         &mut self,
         call: &'static str,
-        stage: impl FnOnce(&mut Self, View) -> Result<(View, T), RenderError>,
+        mut stage: impl FnMut(&mut Self, &mut View) -> Result<T, RenderError>,
     ) -> Result<T, RenderError> {
-        let view = self.view.take().ok_or(RenderError::OutOfOrder { call, needs: "picture" })?;
-        match stage(self, view) {
-            Ok((view, value)) => {
+        let mut view = self.view.take().ok_or(RenderError::OutOfOrder { call, needs: "picture" })?;
+        let result = loop {
+            match stage(self, &mut view) {
+                Err(RenderError::Device(error)) if error.lacks_room() => match self.give_back(&mut view) {
+                    Ok(true) => {}
+                    Ok(false) => break Err(error.into()),
+                    Err(other) => break Err(other.into()),
+                },
+                result => break result,
+            }
+        };
+        match result {
+            Ok(value) => {
                 self.view = Some(view);
                 Ok(value)
             }
@@ -255,92 +191,151 @@ impl GpuRenderer {
         }
     }
 
+    /// Frees device memory that a view can do without: the columns of its rows, then its lists. Returns whether it did.
+    fn give_back(&mut self, view: &mut View) -> GpuResult<bool> {
+        if view.columns.take().is_some() {
+            return Ok(true);
+        }
+        if matches!(view.lists, Lists::Ranges(_)) {
+            return Ok(false);
+        }
+        self.wait_for_valid_picture(view)?;
+        if matches!(view.lists, Lists::Whole(_)) {
+            self.draw_in_ranges(view)?;
+        }
+        Ok(true)
+    }
+
+    /// The stages on ranges of tiles.
+    fn in_ranges<'a>(&'a self, of: &ViewOptions, pixels: &'a Pixels) -> Ranges<'a> {
+        Ranges { gpu: &self.gpu, tiles: &self.tiles, stages: &self.ranges, blend: blend_of(of), pixels }
+    }
+
+    /// Replaces the lists of a view by ranges of tiles and draws the picture again. Waits.
+    fn draw_in_ranges(&self, view: &mut View) -> GpuResult<()> {
+        view.lists = Lists::Ranges(Vec::new()); // frees the lists
+        let bytes = self.bytes_for_lists(&view.of, &view.segments);
+        view.lists = Lists::Ranges(self.in_ranges(&view.of, &view.pixels).draw(&view.segments, bytes)?);
+        Ok(())
+    }
+
+    /// Device memory for the lists of a range, beside what the view still needs: gradients of the splats, and the photo, the
+    /// gradient and the derivatives of the loss.
+    fn bytes_for_lists(&self, of: &ViewOptions, segments: &[Segment]) -> u64 {
+        let rows: u64 = segments.iter().map(|segment| splat_bytes(segment.rows)).sum();
+        let reserved = (rows + (12 + 12 + 4) * of.camera.pixels() as u64) / 4 * 5;
+        // The reserve is an estimate: without room beside it, lists may still fit.
+        let room = self.gpu.room();
+        room.saturating_sub(reserved).max(room / 8)
+    }
+
     /// Submits upload, projection and depth sort of the rows; records upload and evaluation of colours. Does not wait.
-    fn submit_rows(&mut self, rows: &Columns, view: &ViewOptions) -> GpuResult<WholeRows> {
+    fn submit_whole(&mut self, rows: &Columns, view: &ViewOptions) -> GpuResult<RowsIn> {
         let (gpu, ViewOptions { camera, options }) = (&self.gpu, view);
         // `Sequence::rows_in` has checked that the count fits.
-        let count = rows.rows() as u32;
+        let (count, all) = (rows.rows() as u32, 0..rows.rows());
         let columns = DeviceColumns::new(gpu, count, options.sh_degree)?;
         let splats = gpu.buffer("splats", splat_bytes(count))?;
         let mut recorder = gpu.begin("forward");
-        columns.upload_geometry(&mut recorder, rows)?;
-        self.rows.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, &splats)?;
+        columns.upload_geometry(&mut recorder, rows, &all)?;
+        let into = SplatRows::from(&splats);
+        self.rows.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, into)?;
         let grid = Grid::new(camera.width, camera.height);
-        let ranks = self.tiles.order(gpu, &mut recorder, &splats.view(), count, grid)?;
+        let ranks = self.tiles.order(gpu, &mut recorder, &splats.view(), count, grid, TileRange::all(grid))?;
         gpu.submit(recorder)?;
         // The device projects and sorts during the upload of the colours, four fifths of a row.
         let mut recorder = gpu.begin("forward");
-        columns.upload_colors(&mut recorder, rows, &mut self.scratch.band)?;
-        self.rows.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, &splats)?;
-        Ok(WholeRows { columns, splats, ranks, colors: recorder.set_aside() })
+        columns.upload_colors(&mut recorder, rows, &all, &mut self.scratch.band)?;
+        self.rows.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, into)?;
+        let whole = Box::new(WholeRows { columns, ranks, colors: recorder.set_aside() });
+        let segment = Segment { first: 0, rows: count, splats, v_splats: None };
+        Ok(RowsIn { segments: vec![segment], whole: Some(whole) })
     }
 
-    /// Submits what is recorded of the rows, the tile lists and the blending. Does not wait.
+    /// Submits what is recorded of the rows, the tile lists and the blending. Waits only if the lists do not fit at once.
     fn submit_picture(&mut self, of: ViewOptions, rows: RowsIn) -> GpuResult<View> {
-        let (gpu, ViewOptions { camera, options }) = (&self.gpu, &of);
-        let grid = Grid::new(camera.width, camera.height);
-        let blend = Blend { grid, background: options.background, max_alpha: options.max_alpha };
-        let (mut recorder, columns, splats, ranks) = match rows {
-            RowsIn::Whole(whole) => {
-                let WholeRows { columns, splats, ranks, colors } = *whole;
-                (gpu.resume(colors), Some(columns), splats, ranks)
+        let (gpu, blend) = (&self.gpu, blend_of(&of));
+        let RowsIn { segments, whole } = rows;
+        if let (Some(whole), Some(segment)) = (whole, segments.first()) {
+            let WholeRows { columns, ranks, colors } = *whole;
+            let mut recorder = gpu.resume(colors);
+            let recorded = Pixels::new(gpu, blend.grid).and_then(|pixels| {
+                let splats = segment.splats.view();
+                let frame = self.tiles.frame(gpu, &mut recorder, &splats, &ranks, blend, &pixels)?;
+                Ok((pixels, frame))
+            });
+            // Without a frame, the colours at least.
+            gpu.submit(recorder)?;
+            match recorded {
+                Ok((pixels, (frame, demand))) => {
+                    let lists = WholeLists { ranks, frame, demand: DemandState::Pending(demand) };
+                    return Ok(View::new(of, segments, Some(columns), pixels, Lists::Whole(Box::new(lists))));
+                }
+                // Smaller views may need less than the largest so far.
+                Err(error) if error.lacks_room() => self.tiles.halve_capacity(),
+                Err(error) => return Err(error),
             }
-            RowsIn::Batches(batches) => {
-                let mut recorder = gpu.begin("forward");
-                let (splats, rows) = gpu_batches::concatenate(gpu, &mut recorder, &batches)?;
-                let ranks = self.tiles.order(gpu, &mut recorder, &splats.view(), rows, grid)?;
-                (recorder, None, splats, ranks)
-            }
-        };
-        let (frame, demand) = self.tiles.frame(gpu, &mut recorder, &splats.view(), &ranks, blend)?;
-        gpu.submit(recorder)?;
-        Ok(View {
-            of,
-            columns,
-            splats,
-            ranks,
-            frame,
-            demand: DemandState::Pending(demand),
-            image_is_read: false,
-            image_is_corrected: false,
-            loss: None,
-            splat_gradients: None,
-        })
+        }
+        let gpu = &self.gpu;
+        let pixels = Pixels::new(gpu, blend.grid)?;
+        let mut view = View::new(of, segments, None, pixels, Lists::Ranges(Vec::new()));
+        self.draw_in_ranges(&mut view)?;
+        Ok(view)
     }
 
-    /// Waits until the frame of the view is known to have had enough room. A frame with too little room is recorded
-    /// again with larger buffers, and so is the loss of its picture.
-    fn wait_for_valid_frame(&mut self, mut view: View) -> GpuResult<(View, Demand)> {
-        let (gpu, mut again) = (&self.gpu, false);
-        let demand = loop {
-            let demand = match view.demand {
+    /// Waits until the picture of the view is known to be valid. A frame with too little room is recorded again with larger
+    /// buffers, or drawn in ranges where these do not fit, and so is the loss of its picture.
+    fn wait_for_valid_picture(&mut self, view: &mut View) -> GpuResult<()> {
+        let (mut again, blend) = (false, view.blend());
+        while let Lists::Whole(lists) = &mut view.lists {
+            let unread = DemandState::Known(Demand { isects: 0, list_max: 0 });
+            let demand = match std::mem::replace(&mut lists.demand, unread) {
                 DemandState::Known(demand) => demand,
                 DemandState::Pending(readback) => readback.wait()?,
             };
-            view.demand = DemandState::Known(demand);
-            if self.tiles.fits(&view.frame, demand)? {
-                break demand;
+            lists.demand = DemandState::Known(demand);
+            let fits = self.tiles.fits(&lists.frame, demand);
+            if let Ok(true) = fits {
+                break;
             }
             again = true;
             self.frames_rerecorded += 1;
-            let blend = view.frame.blend;
-            drop(view.frame); // frees memory for the larger frame
-            let mut recorder = gpu.begin("forward again");
-            let (frame, demand) = self.tiles.frame(gpu, &mut recorder, &view.splats.view(), &view.ranks, blend)?;
-            gpu.submit(recorder)?;
-            (view.frame, view.demand) = (frame, DemandState::Pending(demand));
-        };
+            let recorded = fits.and_then(|_| self.frame_again(view, blend));
+            match recorded {
+                Ok(()) => {}
+                Err(error) if error.lacks_room() => {
+                    self.tiles.halve_capacity();
+                    view.columns = None;
+                    self.draw_in_ranges(view)?;
+                }
+                Err(error) => return Err(error),
+            }
+        }
         if again && let Some(Loss { plan, target, v_rgb, sums }) = view.loss.take() {
             drop((v_rgb, sums)); // computed from the invalid picture
-            view.loss = Some(self.submit_loss(gpu.begin("image_loss"), &view, &view.frame.rgb, plan, target)?);
+            view.loss = Some(self.submit_loss(self.gpu.begin("image_loss"), view, &view.pixels.rgb, plan, target)?);
         }
-        Ok((view, demand))
+        Ok(())
+    }
+
+    /// Records lists and blending again, with buffers of the sizes that are known now.
+    fn frame_again(&self, view: &mut View, blend: Blend) -> GpuResult<()> {
+        let Lists::Whole(lists) = std::mem::replace(&mut view.lists, Lists::Ranges(Vec::new())) else { return Ok(()) };
+        let WholeLists { ranks, frame, .. } = *lists;
+        drop(frame); // frees memory for the larger frame
+        let Some(segment) = view.segments.first() else { return Ok(()) };
+        let mut recorder = self.gpu.begin("forward again");
+        let splats = segment.splats.view();
+        let (frame, demand) = self.tiles.frame(&self.gpu, &mut recorder, &splats, &ranks, blend, &view.pixels)?;
+        self.gpu.submit(recorder)?;
+        view.lists = Lists::Whole(Box::new(WholeLists { ranks, frame, demand: DemandState::Pending(demand) }));
+        Ok(())
     }
 
     fn read_image(&mut self, view: &View) -> GpuResult<()> {
         let Camera { width, height, .. } = view.of.camera;
         let mut recorder = self.gpu.begin("picture");
-        let bytes = recorder.read_back("rasterize_fwd", &view.frame.rgb.view())?;
+        let bytes = recorder.read_back("rasterize_fwd", &view.pixels.rgb.view())?;
         self.gpu.submit(recorder)?;
         (self.image.width, self.image.height) = (width, height);
         self.image.rgb.resize(3 * view.of.camera.pixels(), 0.0);
@@ -357,7 +352,7 @@ impl GpuRenderer {
         target: Buffer,
     ) -> GpuResult<Loss> {
         let gpu = &self.gpu;
-        let v_rgb = gpu.buffer("v_rgb", view.frame.rgb.size())?;
+        let v_rgb = gpu.buffer("v_rgb", view.pixels.rgb.size())?;
         let size = [view.of.camera.width, view.of.camera.height];
         let (rgb, photo) = (rgb.view(), target.view());
         let sums = self.loss.run(gpu, &mut recorder, size, &plan, &rgb, &photo, &v_rgb.view())?;
@@ -370,25 +365,25 @@ impl GpuRenderer {
     }
 
     /// Reads the gradient of the loss into `self.gradient`; zeros if no loss ran.
-    fn read_gradient(&mut self, view: View) -> GpuResult<View> {
+    fn read_gradient(&mut self, view: &mut View) -> GpuResult<()> {
         self.gradient.reset(view.of.camera.pixels());
         if view.loss.is_none() {
-            return Ok(view);
+            return Ok(());
         }
-        let (view, _) = self.wait_for_valid_frame(view)?;
+        self.wait_for_valid_picture(view)?;
         if let Some(loss) = &view.loss {
             let mut recorder = self.gpu.begin("picture gradient");
             let bytes = recorder.read_back("image_loss", &loss.v_rgb.view())?;
             self.gpu.submit(recorder)?;
             bytes.copy_to(&mut self.gradient.v_rgb)?;
         }
-        Ok(view)
+        Ok(())
     }
 
     /// Records the backward pass from the picture to the splats, once the picture is valid.
-    fn record_picture_back(&mut self, view: View) -> Result<View, RenderError> {
-        let (mut view, demand) = self.wait_for_valid_frame(view)?;
-        let gpu = &self.gpu;
+    fn record_picture_back(&mut self, view: &mut View) -> Result<(), RenderError> {
+        self.wait_for_valid_picture(view)?;
+        let (gpu, blend) = (&self.gpu, view.blend());
         let mut recorder = gpu.begin("backward");
         let (mut uploaded, mut v_alpha) = (None, None);
         if self.gradient_on_host {
@@ -397,118 +392,77 @@ impl GpuRenderer {
         }
         let v_rgb = uploaded.as_ref().or(view.loss.as_ref().map(|loss| &loss.v_rgb));
         let v_rgb = v_rgb.ok_or(RenderError::OutOfOrder { call: "picture_back", needs: "loss or picture_gradient" })?;
-        let v_splats = gpu.buffer("v_splats", splat_bytes(view.ranks.rows))?;
         let (v_rgb, v_alpha) = (v_rgb.view(), v_alpha.as_ref().map(Buffer::view));
-        self.tiles.backward(
-            gpu,
-            &mut recorder,
-            &view.splats.view(),
-            &view.ranks,
-            &view.frame,
-            demand,
-            PictureGradientBuffers { v_rgb: &v_rgb, v_alpha: v_alpha.as_ref() },
-            &v_splats.view(),
-        )?;
-        view.splat_gradients = Some(SplatGradients { v_splats, tiles: Some(recorder.set_aside()) });
-        Ok(view)
+        let gradient = PictureGradientBuffers { v_rgb: &v_rgb, v_alpha: v_alpha.as_ref() };
+        view.tiles_back = None;
+        match &mut view.lists {
+            Lists::Whole(lists) => {
+                let (WholeLists { ranks, frame, .. }, DemandState::Known(demand)) = (&**lists, &lists.demand) else {
+                    return Err(RenderError::OutOfOrder { call: "picture_back", needs: "picture" });
+                };
+                for segment in &mut view.segments {
+                    segment.v_splats = None;
+                    let v_splats = gpu.buffer("v_splats", splat_bytes(ranks.rows))?;
+                    let (splats, out) = (segment.splats.view(), v_splats.view());
+                    let (into, pixels) = (&mut recorder, &view.pixels);
+                    self.tiles.backward(
+                        gpu,
+                        into,
+                        &splats,
+                        ranks,
+                        frame,
+                        pixels,
+                        *demand,
+                        gradient,
+                        &out,
+                        Fold::Whole,
+                    )?;
+                    segment.v_splats = Some(v_splats);
+                }
+                view.tiles_back = Some(recorder.set_aside());
+            }
+            Lists::Ranges(planned) => {
+                gpu.submit(recorder)?; // the uploads
+                let ranges = Ranges { gpu, tiles: &self.tiles, stages: &self.ranges, blend, pixels: &view.pixels };
+                ranges.back(&mut view.segments, planned, gradient)?;
+            }
+        }
+        if view.columns.is_none() {
+            // The caller changes rows as soon as the first batch is out, so the pass out must not fail for want of memory.
+            if let Some(tiles) = view.tiles_back.take() {
+                gpu.submit(gpu.resume(tiles))?;
+            }
+            check_room(gpu, view.of.options.sh_degree)?;
+        }
+        Ok(())
     }
 
-    /// Submits the backward pass to the rows of the batch at `place`, behind the tile stages if they are not submitted yet, and
-    /// the readbacks of the gradients. Does not wait.
-    fn submit_rows_out(
+    /// Propagates the gradients of the splats of the batch at `place` to its rows.
+    fn rows_out_of(
         &mut self,
         view: &mut View,
         rows: &Columns,
         place: &Range<usize>,
-    ) -> Result<GradientReadbacks, RenderError> {
-        let gradients = view.splat_gradients.as_mut();
-        let gradients = gradients.ok_or(RenderError::OutOfOrder { call: "rows_out", needs: "picture_back" })?;
-        let (gpu, sh_degree) = (&self.gpu, view.of.options.sh_degree);
-        let mut recorder = gradients.tiles.take().map_or_else(|| gpu.begin("backward"), |tiles| gpu.resume(tiles));
-        let (splats, v_splats) = (&view.splats, &gradients.v_splats);
-        if let Some(columns) = &view.columns {
-            return Ok(self.submit_gradients(recorder, &view.of, columns, [splats, v_splats])?);
-        }
-        let columns = gpu_batches::upload(gpu, &mut recorder, rows, sh_degree, &mut self.scratch.band)?;
-        let splats = gpu_batches::copy_rows(gpu, &mut recorder, "splats", splats, place)?;
-        let v_splats = gpu_batches::copy_rows(gpu, &mut recorder, "v_splats", v_splats, place)?;
-        Ok(self.submit_gradients(recorder, &view.of, &columns, [&splats, &v_splats])?)
-    }
-
-    /// Submits the stages on rows of the backward pass and the readbacks of their gradients.
-    fn submit_gradients(
-        &self,
-        mut recorder: Recorder<'_>,
-        ViewOptions { camera, options }: &ViewOptions,
-        columns: &DeviceColumns,
-        [splats, v_splats]: [&Buffer; 2],
-    ) -> GpuResult<GradientReadbacks> {
-        let (gpu, RenderOptions { eps2d, sh_degree, .. }) = (&self.gpu, *options);
-        let grads = DeviceColumns::new(gpu, columns.rows, sh_degree)?;
-        self.rows.sh_bwd(gpu, &mut recorder, camera, sh_degree, columns, splats, v_splats, &grads)?;
-        let colors: Vec<Readback> = std::iter::once(&grads.sh0)
-            .chain(&grads.bands)
-            .map(|buffer| recorder.read_back("sh_bwd", &buffer.view()))
-            .collect::<GpuResult<_>>()?;
-        gpu.submit(recorder)?;
-        // The host copies the gradients of colours, four fifths of a row, while the device runs `project_bwd`.
-        let mut recorder = gpu.begin("backward");
-        let footprints = gpu.buffer("footprints", FOOTPRINT_BYTES * u64::from(columns.rows))?;
-        let into = &mut recorder;
-        self.rows.project_bwd(gpu, into, camera, eps2d, columns, splats, v_splats, &grads, &footprints)?;
-        let geometry = [&grads.means, &grads.quats, &grads.scales, &grads.opacities]
-            .map(|buffer| recorder.read_back("project_bwd", &buffer.view()));
-        let readbacks = GradientReadbacks {
-            colors,
-            geometry: geometry.into_iter().collect::<GpuResult<_>>()?,
-            footprints: recorder.read_back("project_bwd", &footprints.view())?,
-        };
-        gpu.submit(recorder)?;
-        Ok(readbacks)
-    }
-
-    /// Waits for the gradients of the rows and copies them to `grads`.
-    fn read_row_gradients(
-        &mut self,
-        view: &View,
-        readbacks: GradientReadbacks,
-        (rows, sh_degree): (usize, u8),
         grads: &mut Gradients,
-    ) -> GpuResult<()> {
-        let out = &mut grads.columns;
-        out.sh_degree = sh_degree;
-        out.resize(rows);
-        if view.of.options.sh_degree < sh_degree {
-            out.sh_n.fill(0.0); // the unused bands stay zero
+    ) -> Result<(), RenderError> {
+        let (gpu, sh_degree) = (&self.gpu, view.of.options.sh_degree);
+        let out = RowsOut { gpu, stages: &self.rows, view: &view.of };
+        out.prepare(place.len(), rows.sh_degree, grads);
+        if let (Some(columns), Some(segment)) = (&view.columns, view.segments.first()) {
+            let room = RowGradients::new(gpu, columns.rows, sh_degree)?;
+            let recorder = view.tiles_back.take().map_or_else(|| gpu.begin("backward"), |tiles| gpu.resume(tiles));
+            return Ok(out.whole(recorder, columns, &room, segment, grads, &mut self.scratch)?);
         }
-        let mut colors = readbacks.colors.into_iter();
-        for bytes in colors.by_ref().take(1) {
-            bytes.copy_to(&mut out.sh0)?;
+        if let Some(tiles) = view.tiles_back.take() {
+            gpu.submit(gpu.resume(tiles))?;
         }
-        for (band, bytes) in colors.enumerate() {
-            let values = &mut self.scratch.band;
-            values.clear();
-            values.resize(rows * super::gpu_rows::BAND_WIDTHS[band], 0.0);
-            bytes.copy_to(values)?;
-            band_into_sh_n(values, band, out);
-        }
-        let geometry = [&mut out.means, &mut out.quats, &mut out.scales, &mut out.opacities];
-        for (to, bytes) in geometry.into_iter().zip(readbacks.geometry) {
-            bytes.copy_to(to)?;
-        }
-        let footprints = &mut self.scratch.footprints;
-        room::resize(footprints, rows, [0.0; 4]);
-        readbacks.footprints.copy_to(footprints)?;
-        grads.radii.clear();
-        grads.radii.extend(footprints.iter().map(|f| [f[2] as u32, f[3] as u32]));
-        grads.means2d.clear();
-        grads.means2d.extend(footprints.iter().map(|f| [f[0], f[1]]));
-        Ok(())
+        let of_batch = view.segments.iter().filter(|segment| place.contains(&segment.first));
+        Ok(out.in_chunks(rows, place.start, of_batch, grads, &mut self.scratch)?)
     }
 
     /// Waits for the sums of the loss of a valid picture and returns the value of the loss.
-    fn read_loss_value(&mut self, view: View) -> Result<(View, LossValue), RenderError> {
-        let (mut view, _) = self.wait_for_valid_frame(view)?;
+    fn read_loss_value(&mut self, view: &mut View) -> Result<LossValue, RenderError> {
+        self.wait_for_valid_picture(view)?;
         let Some(loss) = &mut view.loss else {
             return Err(RenderError::OutOfOrder { call: "loss_value", needs: "loss" });
         };
@@ -522,8 +476,7 @@ impl GpuRenderer {
             LossSums::Known(sums) => sums,
         };
         loss.sums = LossSums::Known(sums);
-        let value = value(&loss.plan, sums);
-        Ok((view, value))
+        Ok(value(&loss.plan, sums))
     }
 }
 
@@ -542,17 +495,16 @@ impl Renderer for GpuRenderer {
     }
 
     fn host_bytes(&self) -> u64 {
-        let s = &self.scratch;
-        let floats = s.band.capacity() + s.target.capacity() + self.image.rgb.capacity();
-        let gradient = self.gradient.bytes();
+        let floats = self.packed_target.capacity() + self.image.rgb.capacity();
         let traffic = self.gpu.traffic();
         // Integrated and software adapters allocate device memory from host memory.
         let is_shared = matches!(self.gpu.summary().kind, DeviceKind::Integrated | DeviceKind::Software);
-        let device = if is_shared { traffic.device_bytes_peak } else { 0 };
-        (4 * floats + size_of::<Footprint>() * s.footprints.capacity()) as u64
-            + gradient
-            + traffic.staging_bytes
-            + device
+        let device = if is_shared { traffic.device_bytes_peak } else { traffic.staging_bytes };
+        4 * floats as u64 + self.scratch.bytes() + self.gradient.bytes() + device
+    }
+
+    fn device_sizes(&self) -> Option<ViewSizes> {
+        Some(self.view.as_ref().map_or(ViewSizes::default(), View::sizes))
     }
 
     fn set_list_bytes(&mut self, _bytes: Option<u64>) {
@@ -567,19 +519,24 @@ impl Renderer for GpuRenderer {
     }
 
     fn rows_in(&mut self, rows: &Columns) -> Result<(), RenderError> {
-        let (view, _) = self.sequence.rows_in(rows)?;
+        let (view, place) = self.sequence.rows_in(rows)?;
         if self.sequence.batches() == Some(RowBatches::One) {
-            let submitted = self.submit_rows(rows, &view).inspect_err(|_| self.drop_view())?;
-            self.rows_in = Some(RowsIn::Whole(Box::new(submitted)));
-            return Ok(());
+            match self.submit_whole(rows, &view) {
+                Ok(submitted) => {
+                    self.rows_in = Some(submitted);
+                    return Ok(());
+                }
+                Err(error) if error.lacks_room() => {}
+                Err(error) => {
+                    self.drop_view();
+                    return Err(error.into());
+                }
+            }
         }
         let band = &mut self.scratch.band;
-        let batch = gpu_batches::submit_batch(&self.gpu, &self.rows, rows, &view, band);
-        let batch = batch.inspect_err(|_| self.drop_view())?;
-        match &mut self.rows_in {
-            Some(RowsIn::Batches(batches)) => batches.push(batch),
-            _ => self.rows_in = Some(RowsIn::Batches(vec![batch])),
-        }
+        let segments = gpu_segments::submit_rows(&self.gpu, &self.rows, rows, place.start, &view, band);
+        let segments = segments.inspect_err(|_| self.drop_view())?;
+        self.rows_in.get_or_insert_default().segments.extend(segments);
         Ok(())
     }
 
@@ -594,12 +551,12 @@ impl Renderer for GpuRenderer {
     fn image(&mut self) -> Result<&Image, RenderError> {
         self.sequence.image()?;
         self.with_view("image", |renderer, view| {
-            let (mut view, _) = renderer.wait_for_valid_frame(view)?;
+            renderer.wait_for_valid_picture(view)?;
             if !view.image_is_read {
-                renderer.read_image(&view)?;
+                renderer.read_image(view)?;
                 view.image_is_read = true;
             }
-            Ok((view, ()))
+            Ok(())
         })?;
         Ok(&self.image)
     }
@@ -615,27 +572,28 @@ impl Renderer for GpuRenderer {
     fn loss(&mut self, target: &Target, options: &LossOptions) -> Result<(), RenderError> {
         self.sequence.loss(target)?;
         self.gradient_on_host = false;
-        let plan = LossPlan::new(target.width as usize, target.height as usize, target.mask.as_deref(), options);
-        self.with_view("loss", |renderer, mut view| {
+        let (width, height) = (target.width as usize, target.height as usize);
+        self.with_view("loss", |renderer, view| {
             view.loss = None;
+            let plan = LossPlan::new(width, height, target.mask.as_deref(), options);
             // The device blends while the host packs and uploads the photo and records the loss.
-            pack_target(target, &mut renderer.scratch.target);
+            pack_target(target, &mut renderer.packed_target);
             let mut recorder = renderer.gpu.begin("image_loss");
-            let pixels = recorder.buffer_with("target", &renderer.scratch.target)?;
+            let pixels = recorder.buffer_with("target", &renderer.packed_target)?;
             let corrected = match view.image_is_corrected {
                 true => Some(recorder.buffer_with("corrected picture", &renderer.image.rgb)?),
                 false => None,
             };
-            let rgb = corrected.as_ref().unwrap_or(&view.frame.rgb);
-            view.loss = Some(renderer.submit_loss(recorder, &view, rgb, plan, pixels)?);
-            Ok((view, ()))
+            let rgb = corrected.as_ref().unwrap_or(&view.pixels.rgb);
+            view.loss = Some(renderer.submit_loss(recorder, view, rgb, plan, pixels)?);
+            Ok(())
         })
     }
 
     fn picture_gradient(&mut self) -> Result<&mut PictureGradient, RenderError> {
         self.sequence.picture_gradient()?;
         if !self.gradient_on_host {
-            self.with_view("picture_gradient", |renderer, view| Ok((renderer.read_gradient(view)?, ())))?;
+            self.with_view("picture_gradient", |renderer, view| Ok(renderer.read_gradient(view)?))?;
             self.gradient_on_host = true;
         }
         Ok(&mut self.gradient)
@@ -643,16 +601,12 @@ impl Renderer for GpuRenderer {
 
     fn picture_back(&mut self) -> Result<(), RenderError> {
         self.sequence.picture_back(self.gradient_on_host.then_some(&self.gradient))?;
-        self.with_view("picture_back", |renderer, view| Ok((renderer.record_picture_back(view)?, ())))
+        self.with_view("picture_back", |renderer, view| renderer.record_picture_back(view))
     }
 
     fn rows_out(&mut self, batch: usize, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError> {
         let (_, place) = self.sequence.rows_out(batch, rows)?;
-        self.with_view("rows_out", |renderer, mut view| {
-            let readbacks = renderer.submit_rows_out(&mut view, rows, &place)?;
-            renderer.read_row_gradients(&view, readbacks, (place.len(), rows.sh_degree), grads)?;
-            Ok((view, ()))
-        })
+        self.with_view("rows_out", |renderer, view| renderer.rows_out_of(view, rows, &place, grads))
     }
 
     fn loss_value(&mut self) -> Result<LossValue, RenderError> {

@@ -9,6 +9,7 @@ use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_
 use crate::kernels::uniforms::RowsUniforms;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
+use std::ops::Range;
 use std::sync::Arc;
 
 /// Bytes per row of `splats` and `v_splats`: see `shaders/shared/splat.wgsl`.
@@ -19,7 +20,7 @@ pub const FOOTPRINT_BYTES: u64 = 16;
 pub const BAND_WIDTHS: [usize; 3] = [9, 15, 21];
 /// Windows begin at multiples of this many rows. Every column's offset is then a multiple of 256 bytes, the largest
 /// alignment that a device may require.
-const WINDOW_STEP: u64 = 64;
+pub const WINDOW_STEP: u64 = 64;
 /// Invocations per workgroup.
 const WORKGROUP: u32 = 256;
 
@@ -74,26 +75,32 @@ impl DeviceColumns {
         narrow.into_iter().chain(self.bands.iter().zip(BAND_WIDTHS))
     }
 
-    /// Uploads means, quats, scales and opacities. `rows` must have `self.rows` rows.
+    /// Uploads means, quats, scales and opacities of the rows `part`, which are `self.rows` rows.
     ///
     /// # Errors
     /// The device failed.
-    pub fn upload_geometry(&self, recorder: &mut Recorder<'_>, rows: &Columns) -> GpuResult<()> {
-        recorder.upload(&self.means.view(), &rows.means)?;
-        recorder.upload(&self.quats.view(), &rows.quats)?;
-        recorder.upload(&self.scales.view(), &rows.scales)?;
-        recorder.upload(&self.opacities.view(), &rows.opacities)
+    pub fn upload_geometry(&self, recorder: &mut Recorder<'_>, rows: &Columns, part: &Range<usize>) -> GpuResult<()> {
+        recorder.upload(&self.means.view(), &rows.means[3 * part.start..3 * part.end])?;
+        recorder.upload(&self.quats.view(), &rows.quats[4 * part.start..4 * part.end])?;
+        recorder.upload(&self.scales.view(), &rows.scales[3 * part.start..3 * part.end])?;
+        recorder.upload(&self.opacities.view(), &rows.opacities[part.clone()])
     }
 
-    /// Uploads the colours. `rows` must have `self.rows` rows and at least the bands in use. `scratch` holds one band
-    /// at a time.
+    /// Uploads the colours of the rows `part`, which are `self.rows` rows with at least the bands in use. `scratch` holds one
+    /// band at a time.
     ///
     /// # Errors
     /// The device failed.
-    pub fn upload_colors(&self, recorder: &mut Recorder<'_>, rows: &Columns, scratch: &mut Vec<f32>) -> GpuResult<()> {
-        recorder.upload(&self.sh0.view(), &rows.sh0)?;
+    pub fn upload_colors(
+        &self,
+        recorder: &mut Recorder<'_>,
+        rows: &Columns,
+        part: &Range<usize>,
+        scratch: &mut Vec<f32>,
+    ) -> GpuResult<()> {
+        recorder.upload(&self.sh0.view(), &rows.sh0[3 * part.start..3 * part.end])?;
         for (band, buffer) in self.bands.iter().enumerate() {
-            band_from_sh_n(rows, band, scratch);
+            band_from_sh_n(rows, part, band, scratch);
             recorder.upload(&buffer.view(), scratch)?;
         }
         Ok(())
@@ -113,23 +120,48 @@ impl DeviceColumns {
     }
 }
 
-/// Copies one band (index 0 is l = 1) from `sh_n` to `out`, `[rows][2 l + 1][3]`.
-pub fn band_from_sh_n(rows: &Columns, band: usize, out: &mut Vec<f32>) {
+/// Copies one band (index 0 is l = 1) of the rows `part` from `sh_n` to `out`, `[rows][2 l + 1][3]`.
+pub fn band_from_sh_n(rows: &Columns, part: &Range<usize>, band: usize, out: &mut Vec<f32>) {
     out.clear();
     let row_width = rows.sh_n.len() / rows.rows().max(1);
     let first: usize = BAND_WIDTHS[..band].iter().sum();
-    for row in rows.sh_n.chunks_exact(row_width.max(1)) {
+    for row in rows.sh_n[row_width * part.start..row_width * part.end].chunks_exact(row_width.max(1)) {
         out.extend_from_slice(&row[first..first + BAND_WIDTHS[band]]);
     }
 }
 
-/// Copies one band from `values` back into `sh_n`.
-pub fn band_into_sh_n(values: &[f32], band: usize, rows: &mut Columns) {
+/// Copies one band of the rows `part` from `values` back into `sh_n`.
+pub fn band_into_sh_n(values: &[f32], part: &Range<usize>, band: usize, rows: &mut Columns) {
     let row_width = rows.sh_n.len() / rows.rows().max(1);
     let first: usize = BAND_WIDTHS[..band].iter().sum();
     let width = BAND_WIDTHS[band];
-    for (row, values) in rows.sh_n.chunks_exact_mut(row_width.max(1)).zip(values.chunks_exact(width)) {
+    let rows = rows.sh_n[row_width * part.start..row_width * part.end].chunks_exact_mut(row_width.max(1));
+    for (row, values) in rows.zip(values.chunks_exact(width)) {
         row[first..first + width].copy_from_slice(values);
+    }
+}
+
+/// Splat records, or their gradients, of consecutive rows from a row of a buffer on.
+#[derive(Debug, Clone, Copy)]
+pub struct SplatRows<'a> {
+    buffer: &'a Buffer,
+    first: u64,
+}
+
+impl<'a> SplatRows<'a> {
+    /// The records from row `first` on, a multiple of [`WINDOW_STEP`].
+    pub fn from_row(buffer: &'a Buffer, first: u64) -> Self {
+        SplatRows { buffer, first }
+    }
+
+    fn window(&self, window: Window) -> BufferView {
+        Window { first: self.first + window.first, ..window }.of(self.buffer, SPLAT_BYTES)
+    }
+}
+
+impl<'a> From<&'a Buffer> for SplatRows<'a> {
+    fn from(buffer: &'a Buffer) -> Self {
+        SplatRows::from_row(buffer, 0)
     }
 }
 
@@ -203,12 +235,12 @@ impl RowStages {
         camera: &Camera,
         eps2d: f32,
         rows: &DeviceColumns,
-        splats: &Buffer,
+        splats: SplatRows<'_>,
     ) -> GpuResult<()> {
         for window in windows(gpu, rows.rows, SPLAT_BYTES) {
             let uniform = recorder.uniform(&RowsUniforms::new(camera, eps2d, window.rows))?;
             let w = rows.window(window);
-            let views = [uniform, w.means, w.quats, w.scales, w.opacities, window.of(splats, SPLAT_BYTES)];
+            let views = [uniform, w.means, w.quats, w.scales, w.opacities, splats.window(window)];
             recorder.dispatch("project_fwd", &self.project_fwd, &views, groups_1d(window.rows, WORKGROUP))?;
         }
         Ok(())
@@ -225,13 +257,13 @@ impl RowStages {
         camera: &Camera,
         sh_degree: u8,
         rows: &DeviceColumns,
-        splats: &Buffer,
+        splats: SplatRows<'_>,
     ) -> GpuResult<()> {
         let degree = usize::from(sh_degree);
         for window in windows(gpu, rows.rows, widest_row(degree)) {
             let uniform = recorder.uniform(&RowsUniforms::new(camera, 0.0, window.rows))?;
             let w = rows.window(window);
-            let mut views = vec![uniform, window.of(splats, SPLAT_BYTES), w.sh0];
+            let mut views = vec![uniform, splats.window(window), w.sh0];
             // Band 0 does not depend on the view direction, so degree 0 needs no means.
             views.extend((degree > 0).then_some(w.means));
             views.extend(w.bands.into_iter().take(degree));
@@ -251,15 +283,15 @@ impl RowStages {
         camera: &Camera,
         sh_degree: u8,
         rows: &DeviceColumns,
-        splats: &Buffer,
-        v_splats: &Buffer,
+        splats: SplatRows<'_>,
+        v_splats: SplatRows<'_>,
         grads: &DeviceColumns,
     ) -> GpuResult<()> {
         let degree = usize::from(sh_degree);
         for window in windows(gpu, rows.rows, widest_row(degree)) {
             let uniform = recorder.uniform(&RowsUniforms::new(camera, 0.0, window.rows))?;
             let (w, v) = (rows.window(window), grads.window(window));
-            let splats = [window.of(splats, SPLAT_BYTES), window.of(v_splats, SPLAT_BYTES)];
+            let splats = [splats.window(window), v_splats.window(window)];
             let mut views = vec![uniform];
             views.extend(splats.into_iter().chain([v.means, v.sh0]));
             views.extend((degree > 0).then_some(w.means));
@@ -281,8 +313,8 @@ impl RowStages {
         camera: &Camera,
         eps2d: f32,
         rows: &DeviceColumns,
-        splats: &Buffer,
-        v_splats: &Buffer,
+        splats: SplatRows<'_>,
+        v_splats: SplatRows<'_>,
         grads: &DeviceColumns,
         footprints: &Buffer,
     ) -> GpuResult<()> {
@@ -295,8 +327,8 @@ impl RowStages {
                 w.quats,
                 w.scales,
                 w.opacities,
-                window.of(splats, SPLAT_BYTES),
-                window.of(v_splats, SPLAT_BYTES),
+                splats.window(window),
+                v_splats.window(window),
                 v.means,
                 v.quats,
                 v.scales,

@@ -11,9 +11,10 @@
 
 use crate::gpu::{Buffer, BufferView, Gpu, GpuError, GpuResult, Pipeline, Readback, Recorder, groups_1d};
 use crate::kernels::splats::Grid;
+use crate::kernels::tile_range::TileRange;
 use crate::kernels::uniforms_tiles::{
     DIGIT_BITS, DIGITS, IsectUniforms, OffsetsUniforms, RasterUniforms, SCAN_BLOCK, SEGMENT_FIRST, SEGMENT_FWD,
-    SEGMENT_LAST, SORT_BLOCK, SPLAT_WORDS, ScanUniforms, SortUniforms, grid_words,
+    SEGMENT_LAST, SORT_BLOCK, SPLAT_WORDS, ScanUniforms, SortUniforms, grid_words, range_words,
 };
 use std::sync::Arc;
 
@@ -71,27 +72,58 @@ pub struct Ranks {
     pub offsets: Buffer,
 }
 
-/// Tile lists and picture of a view.
+/// The picture of a view.
 #[derive(Debug)]
-pub struct Frame {
-    /// Tiles, background and clamp.
-    pub blend: Blend,
-    /// Capacity of the buffers, intersections.
-    pub capacity: u32,
-    /// Longest list that the recorded segments cover.
-    pub list_max: u32,
-    /// `[capacity]` u32: row of each intersection, by emit index.
-    pub row_from_isect: Buffer,
-    /// `[capacity]` u32: emit indices, tile by tile.
-    pub isects: Buffer,
-    /// `[tiles + 1]` u32: first list entry of each tile.
-    pub tile_offsets: Buffer,
+pub struct Pixels {
     /// `[3][height][width]` f32.
     pub rgb: Buffer,
     /// `[height][width]` f32: final transmittance T; the coverage is 1 - T.
     pub t_final: Buffer,
     /// `[height][width]` u32: list index at which the pixel stopped, or 2^32 - 1.
     pub stops: Buffer,
+}
+
+impl Pixels {
+    /// The buffers of a picture, with arbitrary contents.
+    ///
+    /// # Errors
+    /// Device memory is exhausted.
+    pub fn new(gpu: &Gpu, grid: Grid) -> GpuResult<Pixels> {
+        let pixels = u64::from(grid.width) * u64::from(grid.height);
+        Ok(Pixels {
+            rgb: gpu.buffer("picture", 12 * pixels)?,
+            t_final: gpu.buffer("transmittance", 4 * pixels)?,
+            stops: gpu.buffer("stops of pixels", 4 * pixels)?,
+        })
+    }
+}
+
+/// The sizes of the buffers of a [`Frame`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FrameRoom {
+    /// Intersections.
+    pub capacity: u32,
+    /// Longest list that the segments of the blending cover.
+    pub list_max: u32,
+}
+
+/// Tile lists of a view, or of a range of its tiles.
+#[derive(Debug)]
+pub struct Frame {
+    /// Tiles, background and clamp.
+    pub blend: Blend,
+    /// The tiles with lists.
+    pub range: TileRange,
+    /// Capacity of the buffers, and longest list that the recorded segments cover.
+    pub room: FrameRoom,
+    /// `[capacity]` u32: row of each intersection, by emit index.
+    pub row_from_isect: Buffer,
+    /// `[capacity]` u32: emit indices, tile by tile.
+    pub isects: Buffer,
+    /// `[tiles + 1]` u32: first list entry of each tile of the picture.
+    pub tile_offsets: Buffer,
+    /// One u32: the length of the longest list.
+    pub longest: Buffer,
 }
 
 /// Pending readback of a frame's [`Demand`].
@@ -127,12 +159,10 @@ impl DemandReadback {
 #[derive(Debug)]
 pub struct TileStages {
     pub(super) pipelines: Pipelines,
-    /// Capacity of the next frame, intersections.
-    capacity: u32,
+    /// Sizes of the next frame.
+    room: FrameRoom,
     /// Size of the largest binding, 32-bit words.
     binding_words: u32,
-    /// Longest list that the segments of the next frame cover.
-    list_max: u32,
 }
 
 /// Bytes of `count` 32-bit words.
@@ -161,17 +191,22 @@ impl TileStages {
             fold_rows: get("rasterize_bwd", "fold_rows")?,
         };
         let binding_words = u32::try_from(gpu.max_binding_bytes() / 4).unwrap_or(u32::MAX);
-        Ok(TileStages { pipelines, capacity: CAPACITY_MIN, binding_words, list_max: SEGMENT_FWD })
+        Ok(TileStages { pipelines, room: FrameRoom { capacity: CAPACITY_MIN, list_max: SEGMENT_FWD }, binding_words })
     }
 
-    /// Capacity of the next frame, intersections.
-    pub fn capacity(&self) -> u32 {
-        self.capacity
+    /// Sizes of the next frame of a whole view, as earlier frames needed them.
+    pub fn room(&self) -> FrameRoom {
+        self.room
     }
 
     /// Sets the capacity of the next frame. The capacity grows on demand.
     pub fn set_capacity(&mut self, isects: u32) {
-        self.capacity = isects.max(1);
+        self.room.capacity = isects.max(1);
+    }
+
+    /// Halves the capacity of the next frame, after a frame that device memory could not hold.
+    pub(super) fn halve_capacity(&mut self) {
+        self.room.capacity = (self.room.capacity / 2).max(1);
     }
 
     /// Records the exclusive prefix sum of `count` words into `offsets` (`count` + 1 words; the last is the total).
@@ -249,7 +284,8 @@ impl TileStages {
         Ok(from)
     }
 
-    /// Records the depth sort of the rows and the offsets of their intersections. `splats` holds `rows` records.
+    /// Records the depth sort of the rows and the offsets of their intersections with the tiles of `range`. `splats` holds
+    /// `rows` records.
     ///
     /// # Errors
     /// Device memory is exhausted.
@@ -260,6 +296,7 @@ impl TileStages {
         splats: &BufferView,
         rows: u32,
         grid: Grid,
+        range: TileRange,
     ) -> GpuResult<Ranks> {
         let groups = groups_1d(rows, WORKGROUP);
         let pairs =
@@ -273,8 +310,9 @@ impl TileStages {
         let view = recorder.uniform(&IsectUniforms {
             grid: grid_words(grid),
             row_count: rows,
-            capacity: self.capacity,
+            capacity: 0,
             pad: [0; 2],
+            range: range_words(range),
         })?;
         let views = [view, splats.clone(), sorted.values.view(), counts.view()];
         recorder.dispatch("isect_emit", &self.pipelines.isect_count, &views, groups)?;
@@ -283,20 +321,22 @@ impl TileStages {
         Ok(Ranks { rows, order: sorted.values, offsets })
     }
 
-    /// Records the tile lists and the blending, with buffers as large as earlier frames needed. The picture is valid if
-    /// [`TileStages::fits`] is true for the demand that the readback returns.
+    /// Records the lists of the tiles of `range`, with buffers of the sizes `room`. The lists are complete if the demand of
+    /// the frame is within `room`.
     ///
     /// # Errors
     /// Device memory is exhausted.
-    pub fn frame(
+    pub fn lists(
         &self,
         gpu: &Gpu,
         recorder: &mut Recorder<'_>,
         splats: &BufferView,
         ranks: &Ranks,
         blend: Blend,
-    ) -> GpuResult<(Frame, DemandReadback)> {
-        let (grid, capacity) = (blend.grid, self.capacity);
+        range: TileRange,
+        room: FrameRoom,
+    ) -> GpuResult<Frame> {
+        let (grid, capacity) = (blend.grid, room.capacity);
         let tiles = grid.tiles_x * grid.tiles_y;
         let pairs = Pairs {
             keys: gpu.buffer("tiles of intersections", words(capacity))?,
@@ -308,6 +348,7 @@ impl TileStages {
             row_count: ranks.rows,
             capacity,
             pad: [0; 2],
+            range: range_words(range),
         })?;
         let views = [
             view,
@@ -330,45 +371,60 @@ impl TileStages {
         let views = [lists, live, sorted.keys.view(), tile_offsets.view(), longest.view()];
         let groups = groups_1d(tiles + 1, WORKGROUP);
         recorder.dispatch("isect_offsets", &self.pipelines.isect_offsets, &views, groups)?;
+        Ok(Frame { blend, range, room, row_from_isect, isects: sorted.values, tile_offsets, longest })
+    }
 
-        let pixels = u64::from(grid.width) * u64::from(grid.height);
-        let frame = Frame {
-            blend,
-            capacity,
-            list_max: self.list_max,
-            row_from_isect,
-            isects: sorted.values,
-            tile_offsets,
-            rgb: gpu.buffer("picture", 12 * pixels)?,
-            t_final: gpu.buffer("transmittance", 4 * pixels)?,
-            stops: gpu.buffer("stops of pixels", 4 * pixels)?,
-        };
-        self.blend(recorder, splats, &frame)?;
+    /// Records the tile lists and the blending of a whole view, with buffers as large as earlier frames needed. The picture
+    /// is valid if [`TileStages::fits`] is true for the demand that the readback returns.
+    ///
+    /// # Errors
+    /// Device memory is exhausted.
+    pub fn frame(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        splats: &BufferView,
+        ranks: &Ranks,
+        blend: Blend,
+        pixels: &Pixels,
+    ) -> GpuResult<(Frame, DemandReadback)> {
+        let frame = self.lists(gpu, recorder, splats, ranks, blend, TileRange::all(blend.grid), self.room)?;
+        self.blend(recorder, splats, &frame, pixels)?;
         let last = words(ranks.rows);
         let total = recorder.read_back("scan", &ranks.offsets.slice(last, 4))?;
-        let longest = recorder.read_back("isect_offsets", &longest.slice(0, 4))?;
+        let longest = recorder.read_back("isect_offsets", &frame.longest.slice(0, 4))?;
         Ok((frame, DemandReadback { total, longest }))
     }
 
-    fn blend(&self, recorder: &mut Recorder<'_>, splats: &BufferView, frame: &Frame) -> GpuResult<()> {
-        let tiles = frame.blend.grid.tiles_x * frame.blend.grid.tiles_y;
-        let segments = frame.list_max.div_ceil(SEGMENT_FWD).max(1);
+    /// Records the blending of the tiles of a frame.
+    ///
+    /// # Errors
+    /// The device failed.
+    pub fn blend(
+        &self,
+        recorder: &mut Recorder<'_>,
+        splats: &BufferView,
+        frame: &Frame,
+        pixels: &Pixels,
+    ) -> GpuResult<()> {
+        let segments = frame.room.list_max.div_ceil(SEGMENT_FWD).max(1);
         for segment in 0..segments {
             let mut flags = 0;
             flags |= if segment == 0 { SEGMENT_FIRST } else { 0 };
             flags |= if segment + 1 == segments { SEGMENT_LAST } else { 0 };
-            let view = recorder.uniform(&raster_uniforms(&frame.blend, segment, SEGMENT_FWD, flags))?;
+            let view = recorder.uniform(&raster_uniforms(&frame.blend, frame.range, segment, SEGMENT_FWD, flags))?;
             let views = [
                 view,
                 splats.clone(),
                 frame.row_from_isect.view(),
                 frame.isects.view(),
                 frame.tile_offsets.view(),
-                frame.rgb.view(),
-                frame.t_final.view(),
-                frame.stops.view(),
+                pixels.rgb.view(),
+                pixels.t_final.view(),
+                pixels.stops.view(),
             ];
-            recorder.dispatch("rasterize_fwd", &self.pipelines.rasterize_fwd, &views, groups_1d(tiles, 1))?;
+            let groups = groups_1d(frame.range.tiles(), 1);
+            recorder.dispatch("rasterize_fwd", &self.pipelines.rasterize_fwd, &views, groups)?;
         }
         Ok(())
     }
@@ -387,16 +443,16 @@ impl TileStages {
                 limit: words(CAPACITY_MAX as u32),
             });
         }
-        let room = demand.isects <= frame.capacity;
+        let room = demand.isects <= frame.room.capacity;
         if !room {
             // A quarter more than needed, so that slightly larger views need no second recording. The limit is the
             // largest binding; if this view alone exceeds it, the dispatch reports the error.
             let more = (demand.isects.saturating_add(demand.isects / 4)).min(self.binding_words);
-            self.capacity = self.capacity.max(more).max(demand.isects);
+            self.room.capacity = self.room.capacity.max(more).max(demand.isects);
         }
-        let reached = demand.list_max <= frame.list_max;
+        let reached = demand.list_max <= frame.room.list_max;
         if !reached {
-            self.list_max = self.list_max.max(demand.list_max.next_multiple_of(SEGMENT_FWD));
+            self.room.list_max = self.room.list_max.max(demand.list_max.next_multiple_of(SEGMENT_FWD));
         }
         Ok(room && reached)
     }
@@ -411,15 +467,16 @@ impl TileStages {
         splats: &BufferView,
         rows: u32,
         blend: Blend,
-    ) -> GpuResult<(Ranks, Frame, Demand)> {
+    ) -> GpuResult<(Ranks, Frame, Pixels, Demand)> {
         let mut recorder = gpu.begin("tiles");
-        let ranks = self.order(gpu, &mut recorder, splats, rows, blend.grid)?;
+        let pixels = Pixels::new(gpu, blend.grid)?;
+        let ranks = self.order(gpu, &mut recorder, splats, rows, blend.grid, TileRange::all(blend.grid))?;
         loop {
-            let (frame, demand) = self.frame(gpu, &mut recorder, splats, &ranks, blend)?;
+            let (frame, demand) = self.frame(gpu, &mut recorder, splats, &ranks, blend, &pixels)?;
             gpu.submit(recorder)?;
             let demand = demand.wait()?;
             if self.fits(&frame, demand)? {
-                return Ok((ranks, frame, demand));
+                return Ok((ranks, frame, pixels, demand));
             }
             drop(frame);
             recorder = gpu.begin("tiles again");
@@ -433,7 +490,13 @@ pub fn splat_bytes(rows: u32) -> u64 {
 }
 
 /// Uniforms of one rasterizer dispatch over the list entries [`length` * `segment`, `length` * (`segment` + 1)).
-pub(super) fn raster_uniforms(blend: &Blend, segment: u32, length: u32, flags: u32) -> RasterUniforms {
+pub(super) fn raster_uniforms(
+    blend: &Blend,
+    range: TileRange,
+    segment: u32,
+    length: u32,
+    flags: u32,
+) -> RasterUniforms {
     RasterUniforms {
         grid: grid_words(blend.grid),
         background: blend.background,
@@ -446,5 +509,6 @@ pub(super) fn raster_uniforms(blend: &Blend, segment: u32, length: u32, flags: u
         isect_count: 0,
         window_first: 0,
         window_end: 0,
+        range: range_words(range),
     }
 }

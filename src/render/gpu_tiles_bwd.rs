@@ -3,12 +3,15 @@
 //!
 //! Invariants: 1. the sums of all intersections may exceed one binding: each window of intersections has its own pass
 //! over the lists, and a row that spans two windows continues its sums, so the result has the same bits for any window
-//! size; 2. the order of every sum is fixed.
+//! size; 2. the same holds for ranges of tiles ([`Fold::Range`]), whose rows continue the sums of the ranges before; 3. the
+//! order of every sum is fixed.
 
-use super::gpu_tiles::{Demand, Frame, Ranks, TileStages, raster_uniforms, words};
-use crate::gpu::{BufferView, Gpu, GpuResult, Recorder, groups_1d};
+use super::gpu_tiles::{Blend, Demand, Frame, Pixels, Ranks, TileStages, raster_uniforms};
+use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Recorder, groups_1d};
+use crate::kernels::tile_range::TileRange;
 use crate::kernels::uniforms_tiles::{
-    FOLD_ROWS, HAS_V_ALPHA, RasterUniforms, SEGMENT_BWD, SEGMENT_FIRST, SEGMENT_LAST, SUMS,
+    FOLD_CARRIED, FOLD_ROWS, FOLD_UNFINISHED, FOLD_WITHOUT_LISTS, HAS_V_ALPHA, RasterUniforms, SEGMENT_BWD,
+    SEGMENT_FIRST, SEGMENT_LAST, SUMS,
 };
 use std::ops::Range;
 
@@ -21,10 +24,29 @@ pub struct PictureGradientBuffers<'a> {
     pub v_alpha: Option<&'a BufferView>,
 }
 
-/// Intersections whose sums fit one binding, at least 1.
-fn window_isects(gpu: &Gpu) -> u32 {
+/// What becomes of the sums of the rows of a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fold {
+    /// The frame is the whole view: sums begin at zero and become gradients.
+    Whole,
+    /// The frame is a range of tiles: the rows continue the sums that their records hold, and store sums.
+    Range,
+}
+
+/// Windows of fewer intersections are not tried: each window is a pass over all lists.
+const WINDOW_MIN: u32 = 1 << 10;
+
+/// A buffer for the sums of a window of at most `isects` intersections: as many as fit one binding and device memory.
+fn window_of_sums(gpu: &Gpu, isects: u32) -> GpuResult<(Buffer, u32)> {
     let bytes = 4 * u64::from(SUMS);
-    u32::try_from(gpu.max_binding_bytes() / bytes).unwrap_or(u32::MAX).max(1)
+    let most = u32::try_from(gpu.max_binding_bytes() / bytes).unwrap_or(u32::MAX).max(1);
+    let mut window = most.min(isects.max(1));
+    loop {
+        match gpu.buffer("sums of intersections", bytes * u64::from(window)) {
+            Err(error) if error.lacks_room() && window > WINDOW_MIN => window = window.div_ceil(2),
+            buffer => return Ok((buffer?, window)),
+        }
+    }
 }
 
 impl TileStages {
@@ -40,23 +62,24 @@ impl TileStages {
         splats: &BufferView,
         ranks: &Ranks,
         frame: &Frame,
+        pixels: &Pixels,
         demand: Demand,
         picture: PictureGradientBuffers<'_>,
         v_splats: &BufferView,
+        fold: Fold,
     ) -> GpuResult<()> {
-        let grid = frame.blend.grid;
         let segments = demand.list_max.div_ceil(SEGMENT_BWD).max(1);
-        let pixels = u64::from(grid.width) * u64::from(grid.height);
-        let window = window_isects(gpu).min(demand.isects.max(1));
-        let partials = gpu.buffer("sums of intersections", u64::from(SUMS) * words(window))?;
-        let carry = gpu.buffer("pixels between segments", if segments > 1 { 8 * pixels } else { 8 })?;
+        // Two words a pixel; the transmittance has one.
+        let carry = gpu.buffer("pixels between segments", if segments > 1 { 2 * pixels.t_final.size() } else { 8 })?;
+        let (partials, window) = window_of_sums(gpu, demand.isects)?;
+        let fold_flags = if fold == Fold::Range { FOLD_CARRIED | FOLD_UNFINISHED } else { 0 };
         let mut first = 0u32;
         loop {
             let isects = first..demand.isects.min(first.saturating_add(window));
             let (carry, partials) = (carry.view(), partials.view());
-            let buffers = (splats, &carry, &partials);
+            let buffers = (splats, pixels, &carry, &partials);
             self.sums(recorder, frame, segments, isects.clone(), picture, buffers)?;
-            let mut fold = window_uniforms(frame, 0, 0, isects.clone());
+            let mut fold = window_uniforms(frame, 0, fold_flags, isects.clone());
             (fold.row_count, fold.isect_count) = (ranks.rows, demand.isects);
             let views = [
                 recorder.uniform(&fold)?,
@@ -85,9 +108,8 @@ impl TileStages {
         segments: u32,
         isects: Range<u32>,
         PictureGradientBuffers { v_rgb, v_alpha }: PictureGradientBuffers<'_>,
-        (splats, carry, partials): (&BufferView, &BufferView, &BufferView),
+        (splats, pixels, carry, partials): (&BufferView, &Pixels, &BufferView, &BufferView),
     ) -> GpuResult<()> {
-        let tiles = frame.blend.grid.tiles_x * frame.blend.grid.tiles_y;
         for segment in (0..segments).rev() {
             let mut flags = if v_alpha.is_some() { HAS_V_ALPHA } else { 0 };
             flags |= if segment + 1 == segments { SEGMENT_FIRST } else { 0 };
@@ -98,20 +120,48 @@ impl TileStages {
                 frame.row_from_isect.view(),
                 frame.isects.view(),
                 frame.tile_offsets.view(),
-                frame.t_final.view(),
-                frame.stops.view(),
+                pixels.t_final.view(),
+                pixels.stops.view(),
                 v_rgb.clone(),
                 v_alpha.unwrap_or(v_rgb).clone(),
                 partials.clone(),
                 carry.clone(),
             ];
-            recorder.dispatch("rasterize_bwd", &self.pipelines.rasterize_bwd, &views, groups_1d(tiles, 1))?;
+            let groups = groups_1d(frame.range.tiles(), 1);
+            recorder.dispatch("rasterize_bwd", &self.pipelines.rasterize_bwd, &views, groups)?;
         }
         Ok(())
+    }
+
+    /// Records the conversion of the sums of `rows` rows to gradients, after the last range of tiles.
+    ///
+    /// # Errors
+    /// Device memory is exhausted.
+    pub fn finish_sums(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        splats: &BufferView,
+        v_splats: &BufferView,
+        rows: u32,
+        blend: Blend,
+    ) -> GpuResult<()> {
+        // Bound in place of the lists that the stage does not read.
+        let (no_list, no_sums) = (gpu.buffer("no list", 4)?.view(), gpu.buffer("no sums", 4)?.view());
+        let flags = FOLD_CARRIED | FOLD_WITHOUT_LISTS;
+        let mut fold = raster_uniforms(&blend, TileRange::all(blend.grid), 0, SEGMENT_BWD, flags);
+        fold.row_count = rows;
+        let uniform = recorder.uniform(&fold)?;
+        let views = [uniform, splats.clone(), no_list.clone(), no_sums, no_list.clone(), no_list, v_splats.clone()];
+        recorder.dispatch("rasterize_bwd", &self.pipelines.fold_rows, &views, groups_1d(rows, FOLD_ROWS))
     }
 }
 
 fn window_uniforms(frame: &Frame, segment: u32, flags: u32, isects: Range<u32>) -> RasterUniforms {
     let (window_first, window_end) = (isects.start, isects.end);
-    RasterUniforms { window_first, window_end, ..raster_uniforms(&frame.blend, segment, SEGMENT_BWD, flags) }
+    RasterUniforms {
+        window_first,
+        window_end,
+        ..raster_uniforms(&frame.blend, frame.range, segment, SEGMENT_BWD, flags)
+    }
 }

@@ -7,12 +7,16 @@
 
 pub mod color_correct;
 pub mod cpu;
+pub mod device_needs;
 pub mod gpu;
-mod gpu_batches;
+mod gpu_gradients;
 pub mod gpu_loss;
+mod gpu_ranges;
 pub mod gpu_rows;
+mod gpu_segments;
 pub mod gpu_tiles;
 pub mod gpu_tiles_bwd;
+mod gpu_view;
 pub mod lpips;
 pub mod metrics;
 mod sequence;
@@ -25,6 +29,7 @@ use crate::kernels::splats::Grid;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
+use device_needs::ViewSizes;
 
 /// The parameters of a rendering besides rows and camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -152,7 +157,9 @@ impl RenderError {
     /// What the user can do about the error; `None` when the message itself contains the remedy.
     pub fn remedy(&self) -> Option<&'static str> {
         match self {
-            RenderError::Device(GpuError::OutOfBudget { .. } | GpuError::OutOfMemory { .. }) => None,
+            RenderError::Device(
+                GpuError::OutOfBudget { .. } | GpuError::OutOfMemory { .. } | GpuError::DeviceFull { .. },
+            ) => None,
             RenderError::Device(GpuError::BufferTooLarge { .. } | GpuError::BindingTooLarge { .. }) => {
                 Some("make the photos smaller with --max-resolution or --data-factor, or render with --device cpu")
             }
@@ -199,6 +206,11 @@ pub trait Renderer: Send {
 
     /// Host memory that the renderer holds, bytes.
     fn host_bytes(&self) -> u64;
+
+    /// The sizes of the last view, from which its device memory follows; `None` for a backend without a device.
+    fn device_sizes(&self) -> Option<ViewSizes> {
+        None
+    }
 
     /// Limits the memory for intersection lists and per-intersection sums of the next views, bytes; `None` stands for no limit.
     /// A picture whose lists need more is blended in ranges of tiles, at least one tile at a time. The limit changes no bit of

@@ -9,6 +9,7 @@ use crate::base::machine::memory_available;
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::{Dataset, View};
+use crate::render::device_needs::ViewSizes;
 use crate::scene::state::row_bytes;
 
 /// Bytes per page of index, slot address and uses in the plan, for pages in memory or not.
@@ -49,6 +50,8 @@ pub struct MemoryEstimate {
     pub copies: u64,
     /// Everything else, with the optimizer's tables.
     pub base: u64,
+    /// The largest sizes of the probed views on a device; `None` without a device.
+    pub device: Option<ViewSizes>,
 }
 
 impl MemoryEstimate {

@@ -18,6 +18,7 @@ pub mod checkpoint;
 pub mod costs;
 pub mod dataset_print;
 mod dense;
+mod device_memory;
 pub mod error;
 pub mod eval;
 pub mod facts;

@@ -4,7 +4,7 @@ use super::error::TrainError;
 use super::memory::{
     BASE_BYTES, INDEX_BYTES, MemoryEstimate, bytes_of_copies, frames_in_memory, largest_decode, rows_at_most,
 };
-use super::trainer::Trainer;
+use super::trainer::{Probed, Trainer};
 use super::working_set::WorkingSet;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
@@ -52,7 +52,7 @@ pub fn estimate(
     probe: &Probe,
 ) -> Result<[MemoryEstimate; 2], TrainError> {
     let rows = probe.rows;
-    let (pixels, visible) = trainer.probe_views(dataset, &probe.views)?;
+    let Probed { pixels, visible, device } = trainer.probe_views(dataset, &probe.views)?;
     let pixels = pixels as u64;
     let [working, rendering] = trainer.view_bytes();
     // Image, coverage, gradient, and per-tile copies of them.
@@ -86,6 +86,7 @@ pub fn estimate(
             index: (pages * growth) as u64 * INDEX_BYTES,
             copies,
             base,
+            device: device.map(|view| view.grown(growth)),
         }
     }))
 }

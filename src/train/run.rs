@@ -6,6 +6,7 @@
 use super::changes::with_absolute_paths;
 use super::checkpoint::{Checkpoint, Origin};
 use super::costs::Meter;
+use super::device_memory;
 use super::error::TrainError;
 use super::facts::{Resolved, write_config};
 use super::machine;
@@ -175,9 +176,11 @@ pub(super) fn plan_and_train(
     let largest = preflight::allow_largest_view(config, dataset, &mut trainer, host_mem);
     let probe = Probe::of_run(dataset, &trainer, largest, begun.driver);
     let mut memory = estimate(config, dataset, &mut trainer, &probe)?;
+    device_memory::check(config, &memory)?;
     let plan = preflight::plan_tiers(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
     if !request.quiet {
-        let of_tiers = preflight::describe(&plan, &memory[1], &tiers);
+        let of_device = device_memory::describe(config, &memory[1]);
+        let of_tiers = preflight::describe(&plan, &memory[1], &tiers) + &of_device;
         eprintln!("{}", describe(request, dataset, &trainer, &of_tiers));
     }
     if request.dry_run {

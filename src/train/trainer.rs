@@ -22,6 +22,7 @@ use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{self, PlyMeta};
 use crate::optim::method::Method;
 use crate::paging::pager::{Pager, PagerConfig};
+use crate::render::device_needs::ViewSizes;
 use crate::render::{RenderOptions, Renderer};
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
@@ -73,6 +74,17 @@ pub struct Trainer {
 fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
     let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
     ViewOrder::new(order, seed, &cameras)
+}
+
+/// The largest sizes of the views of [`Trainer::probe_views`].
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Probed {
+    /// Pixels.
+    pub pixels: usize,
+    /// Rows in view.
+    pub visible: usize,
+    /// Sizes on a device; `None` without a device.
+    pub device: Option<ViewSizes>,
 }
 
 impl Trainer {
@@ -135,9 +147,9 @@ impl Trainer {
     ///
     /// # Errors
     /// A view cannot be rendered.
-    pub fn probe_views(&mut self, dataset: &Dataset, views: &[usize]) -> Result<(usize, usize), TrainError> {
+    pub fn probe_views(&mut self, dataset: &Dataset, views: &[usize]) -> Result<Probed, TrainError> {
         let render = self.render_options();
-        let (mut pixels, mut visible) = (0, 0);
+        let mut probed = Probed::default();
         for &view in views {
             let camera = &dataset.views[view].camera;
             let rgb = vec![0; 3 * camera.pixels()];
@@ -149,9 +161,11 @@ impl Trainer {
             let pages = self.scene.pager.pages_of_view(camera);
             let is_whole = self.scene.pager.pages_per_batch(pages.len()).min(self.pages_most) >= pages.len();
             self.note_view(rows, pages.iter().map(|page| index[page.index()].rows as usize).sum(), is_whole);
-            (pixels, visible) = (pixels.max(camera.pixels()), visible.max(rows));
+            (probed.pixels, probed.visible) = (probed.pixels.max(camera.pixels()), probed.visible.max(rows));
+            let sizes = self.renderer.device_sizes();
+            probed.device = sizes.map(|sizes| probed.device.map_or(sizes, |most| most.max(sizes)));
         }
-        Ok((pixels, visible))
+        Ok(probed)
     }
 
     /// Sets the view order before the first step, for orders that depend on the pages.

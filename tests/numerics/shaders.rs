@@ -17,6 +17,7 @@ const LAYOUTS: &[&[StructLayout]] = &[
         uniforms_tiles::IsectUniforms::LAYOUT,
         uniforms_tiles::OffsetsUniforms::LAYOUT,
         uniforms_tiles::RasterUniforms::LAYOUT,
+        uniforms_tiles::RangeUniforms::LAYOUT,
     ],
 ];
 

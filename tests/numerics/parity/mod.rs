@@ -3,5 +3,6 @@
 
 mod frame;
 mod loss;
+mod ranges;
 mod rows;
 mod tiles;

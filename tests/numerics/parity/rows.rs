@@ -11,7 +11,9 @@ use gsscale::kernels::project_bwd::project_bwd;
 use gsscale::kernels::project_fwd::{Projected, project_fwd};
 use gsscale::kernels::sh_bwd::sh_bwd;
 use gsscale::kernels::sh_fwd::sh_fwd;
-use gsscale::render::gpu_rows::{BAND_WIDTHS, DeviceColumns, FOOTPRINT_BYTES, RowStages, SPLAT_BYTES, band_into_sh_n};
+use gsscale::render::gpu_rows::{
+    BAND_WIDTHS, DeviceColumns, FOOTPRINT_BYTES, RowStages, SPLAT_BYTES, SplatRows, band_into_sh_n,
+};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::Columns;
 
@@ -102,27 +104,28 @@ fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]
     let splats = gpu.buffer("splats", SPLAT_BYTES * n as u64).unwrap();
     let v_splats = gpu.buffer("v_splats", SPLAT_BYTES * n as u64).unwrap();
     let projected = read(gpu, &splats, |r| {
-        columns.upload_geometry(r, rows).unwrap();
-        columns.upload_colors(r, rows, &mut Vec::new()).unwrap();
+        columns.upload_geometry(r, rows, &(0..n)).unwrap();
+        columns.upload_colors(r, rows, &(0..n), &mut Vec::new()).unwrap();
         // Every entry must be overwritten: earlier contents must not show.
         for (buffer, width) in grads.columns() {
             r.upload(&buffer.view(), &vec![f32::NAN; width * n]).unwrap();
         }
         r.upload(&splats.view(), &vec![f32::NAN; 12 * n]).unwrap();
         r.upload(&v_splats.view(), v).unwrap();
-        stages.project_fwd(gpu, r, camera, EPS2D, &columns, &splats).unwrap();
+        stages.project_fwd(gpu, r, camera, EPS2D, &columns, (&splats).into()).unwrap();
     });
     let colored = read(gpu, &splats, |r| {
         r.upload(&splats.view(), &cpu.projected).unwrap();
-        stages.sh_fwd(gpu, r, camera, degree, &columns, &splats).unwrap();
+        stages.sh_fwd(gpu, r, camera, degree, &columns, (&splats).into()).unwrap();
     });
     let with_colors: Vec<_> = cpu.projected.iter().zip(&cpu.colors).map(|(p, c)| with_color(*p, *c)).collect();
     let mut out = Columns::zeros(n, 3);
     let footprints = gpu.buffer("footprints", FOOTPRINT_BYTES * n as u64).unwrap();
     out.opacities = read(gpu, &grads.opacities, |r| {
         r.upload(&splats.view(), &with_colors).unwrap();
-        stages.sh_bwd(gpu, r, camera, degree, &columns, &splats, &v_splats, &grads).unwrap();
-        stages.project_bwd(gpu, r, camera, EPS2D, &columns, &splats, &v_splats, &grads, &footprints).unwrap();
+        let [s, v_s] = [&splats, &v_splats].map(SplatRows::from);
+        stages.sh_bwd(gpu, r, camera, degree, &columns, s, v_s, &grads).unwrap();
+        stages.project_bwd(gpu, r, camera, EPS2D, &columns, s, v_s, &grads, &footprints).unwrap();
     });
     let packed = read(gpu, &footprints, |_| {});
     for (i, (got, record)) in packed.as_chunks::<4>().0.iter().zip(&with_colors).enumerate() {
@@ -134,7 +137,7 @@ fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]
     out.scales = read(gpu, &grads.scales, |_| {});
     out.sh0 = read(gpu, &grads.sh0, |_| {});
     for (band, buffer) in grads.bands.iter().enumerate() {
-        band_into_sh_n(&read(gpu, buffer, |_| {}), band, &mut out);
+        band_into_sh_n(&read(gpu, buffer, |_| {}), &(0..n), band, &mut out);
     }
     let (projected, _) = projected.as_chunks::<12>();
     let (colored, _) = colored.as_chunks::<12>();
@@ -360,9 +363,12 @@ fn bands_are_cut_out_and_put_back() {
     let mut back = Columns::zeros(7, 3);
     for band in 0..BAND_WIDTHS.len() {
         let mut values = Vec::new();
-        gsscale::render::gpu_rows::band_from_sh_n(&rows, band, &mut values);
+        gsscale::render::gpu_rows::band_from_sh_n(&rows, &(0..7), band, &mut values);
         assert_eq!(values.len(), 7 * BAND_WIDTHS[band]);
-        band_into_sh_n(&values, band, &mut back);
+        let mut part = Vec::new();
+        gsscale::render::gpu_rows::band_from_sh_n(&rows, &(2..5), band, &mut part);
+        assert_eq!(part, values[2 * BAND_WIDTHS[band]..5 * BAND_WIDTHS[band]]);
+        band_into_sh_n(&values, &(0..7), band, &mut back);
     }
     assert_eq!(back.sh_n, rows.sh_n);
 }

@@ -1,0 +1,139 @@
+// Ranges of tiles: how many splats reach each tile, and the splats that reach a range, copied into one buffer.
+//
+// The splats of a view lie in segments, and one dispatch processes one segment. The twin of the tally is the count of
+// src/kernels/isect_emit.rs; the CPU reads all splats for every range and needs no copy.
+#import "shared/constants.wgsl"
+#import "shared/dispatch.wgsl"
+#import "shared/footprint.wgsl"
+
+struct RangeUniforms {
+    grid: Grid,
+    /// First column, end of the columns, first row, end of the rows.
+    range: vec4<u32>,
+    /// The number, in the view, of the segment's first row.
+    first_row: u32,
+    /// Rows of the segment.
+    row_count: u32,
+    /// Room of the copy, in rows.
+    capacity: u32,
+    pad: u32,
+}
+
+@group(0) @binding(0) var<uniform> segment: RangeUniforms;
+@group(0) @binding(1) var<storage, read> splats: array<vec4<f32>>;
+/// For each tile column, tiles_y + 1 entries: the splats that begin in a tile less those that ended in the tile before.
+@group(0) @binding(2) var<storage, read_write> changes: array<atomic<i32>>;
+/// For each tile column the splats that begin there, tiles_x + 1 entries; then those that ended in the column before.
+@group(0) @binding(3) var<storage, read_write> columns: array<atomic<u32>>;
+/// By row of the view: 1 if the splat reaches the range.
+@group(0) @binding(4) var<storage, read_write> flags: array<u32>;
+/// Prefix sums of the flags: the place of each row in the copy.
+@group(0) @binding(5) var<storage, read> places: array<u32>;
+/// Records of the segment: splats or their gradients.
+@group(0) @binding(6) var<storage, read> records: array<vec4<f32>>;
+/// Records of the copy.
+@group(0) @binding(7) var<storage, read_write> compact: array<vec4<f32>>;
+/// Records of the segment.
+@group(0) @binding(8) var<storage, read_write> records_out: array<vec4<f32>>;
+/// Records of the copy.
+@group(0) @binding(9) var<storage, read> compact_in: array<vec4<f32>>;
+
+fn reach_of_row(row: u32) -> Reach {
+    let at = SPLAT_STRIDE * row;
+    return reach_of(splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]), segment.grid);
+}
+
+/// Adds each splat to the counts of the tiles that it can reach.
+@compute @workgroup_size(256)
+fn range_tally(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = linear_index(workgroup, workgroups, lane, 256u);
+    if row >= segment.row_count {
+        return;
+    }
+    let reach = reach_of_row(row);
+    if reach.box.x >= reach.box.z {
+        return;
+    }
+    atomicAdd(&columns[reach.box.x], 1u);
+    atomicAdd(&columns[segment.grid.tiles_x + 1u + reach.box.z], 1u);
+    for (var tile_x = reach.box.x; tile_x < reach.box.z; tile_x++) {
+        let rows = tile_rows_in(reach, segment.grid, tile_x);
+        if rows.x < rows.y {
+            let column = tile_x * (segment.grid.tiles_y + 1u);
+            atomicAdd(&changes[column + rows.x], 1);
+            atomicAdd(&changes[column + rows.y], -1);
+        }
+    }
+}
+
+/// Flags the splats that reach the range.
+@compute @workgroup_size(256)
+fn range_select(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = linear_index(workgroup, workgroups, lane, 256u);
+    if row >= segment.row_count {
+        return;
+    }
+    let reach = reach_of_row(row);
+    var flag = 0u;
+    let end = min(reach.box.z, segment.range.y);
+    for (var tile_x = max(reach.box.x, segment.range.x); tile_x < end; tile_x++) {
+        let rows = tile_rows_in(reach, segment.grid, tile_x);
+        if max(rows.x, segment.range.z) < min(rows.y, segment.range.w) {
+            flag = 1u;
+            break;
+        }
+    }
+    flags[segment.first_row + row] = flag;
+}
+
+/// The place of a row in the copy, or the capacity if it has none.
+fn place_of(row: u32) -> u32 {
+    let place = places[segment.first_row + row];
+    return select(segment.capacity, place, places[segment.first_row + row + 1u] > place);
+}
+
+/// Copies the records of the flagged rows to their places.
+@compute @workgroup_size(256)
+fn range_gather(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = linear_index(workgroup, workgroups, lane, 256u);
+    if row >= segment.row_count {
+        return;
+    }
+    let place = place_of(row);
+    if place < segment.capacity {
+        for (var i = 0u; i < SPLAT_STRIDE; i++) {
+            compact[SPLAT_STRIDE * place + i] = records[SPLAT_STRIDE * row + i];
+        }
+    }
+}
+
+/// Copies the records of the flagged rows back from their places.
+@compute @workgroup_size(256)
+fn range_scatter(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = linear_index(workgroup, workgroups, lane, 256u);
+    if row >= segment.row_count {
+        return;
+    }
+    let place = place_of(row);
+    if place < segment.capacity {
+        for (var i = 0u; i < SPLAT_STRIDE; i++) {
+            records_out[SPLAT_STRIDE * row + i] = compact_in[SPLAT_STRIDE * place + i];
+        }
+    }
+}

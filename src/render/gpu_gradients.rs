@@ -1,0 +1,230 @@
+//! The way out on a device: gradients of splats to gradients of rows, and their copy to the host.
+//!
+//! Rows whose columns stayed on the device leave at once. Other rows are uploaded again and leave in chunks, as many rows at a
+//! time as device memory holds.
+//!
+//! Not here: the stages (`gpu_rows`), the way in (`gpu_segments`).
+//!
+//! Invariant: gradients have the same bits for any cut of the rows into batches, segments and chunks.
+
+use super::Gradients;
+use super::gpu_rows::{BAND_WIDTHS, DeviceColumns, FOOTPRINT_BYTES, RowStages, SplatRows, band_into_sh_n};
+use super::gpu_segments::{CHUNK_STEP, Segment, gradients_of, in_chunks};
+use super::sequence::ViewOptions;
+use crate::base::room;
+use crate::gpu::{Buffer, Gpu, GpuResult, Readback, Recorder};
+use crate::scene::columns::Columns;
+use std::ops::Range;
+
+/// Densification input of one row: gradient with respect to the projected mean (2), radii (2).
+type Footprint = [f32; 4];
+
+/// Host memory that is reused between views.
+#[derive(Debug, Default)]
+pub(super) struct Scratch {
+    /// One SH band of the rows.
+    pub band: Vec<f32>,
+    footprints: Vec<Footprint>,
+}
+
+impl Scratch {
+    /// Host memory, bytes.
+    pub fn bytes(&self) -> u64 {
+        (4 * self.band.capacity() + size_of::<Footprint>() * self.footprints.capacity()) as u64
+    }
+}
+
+/// Device memory of the gradients of rows.
+pub(super) struct RowGradients {
+    columns: DeviceColumns,
+    footprints: Buffer,
+}
+
+impl RowGradients {
+    /// Allocates the gradients of `rows` rows.
+    ///
+    /// # Errors
+    /// Device memory is exhausted.
+    pub fn new(gpu: &Gpu, rows: u32, sh_degree: u8) -> GpuResult<Self> {
+        let columns = DeviceColumns::new(gpu, rows, sh_degree)?;
+        let footprints = gpu.buffer("footprints", FOOTPRINT_BYTES * u64::from(rows))?;
+        Ok(RowGradients { columns, footprints })
+    }
+}
+
+/// Device memory of a row of a chunk, bytes: its columns, their gradients and footprint, and the read-back of both.
+pub(super) fn chunk_row_bytes(sh_degree: u8) -> u64 {
+    3 * DeviceColumns::row_bytes(sh_degree) + 2 * FOOTPRINT_BYTES
+}
+
+/// Checks that the smallest chunk has room, so that a pass out that has begun does not end for want of it.
+///
+/// # Errors
+/// Device memory is exhausted.
+pub(super) fn check_room(gpu: &Gpu, sh_degree: u8) -> GpuResult<()> {
+    let columns = DeviceColumns::new(gpu, CHUNK_STEP as u32, sh_degree)?;
+    RowGradients::new(gpu, columns.rows, sh_degree).map(|_| ())
+}
+
+/// The stages and options of a way out.
+pub(super) struct RowsOut<'a> {
+    pub gpu: &'a Gpu,
+    pub stages: &'a RowStages,
+    pub view: &'a ViewOptions,
+}
+
+/// Pending readbacks of the gradients of rows.
+struct Readbacks {
+    /// sh0, then the bands in use.
+    colors: Vec<Readback>,
+    /// means, quats, scales, opacities.
+    geometry: Vec<Readback>,
+    footprints: Readback,
+}
+
+impl RowsOut<'_> {
+    /// Prepares `grads` for a batch of `rows` rows of the stored degree `sh_degree`.
+    pub fn prepare(&self, rows: usize, sh_degree: u8, grads: &mut Gradients) {
+        grads.columns.sh_degree = sh_degree;
+        grads.columns.resize(rows);
+        if self.view.options.sh_degree < sh_degree {
+            grads.columns.sh_n.fill(0.0); // the unused bands stay zero
+        }
+        room::resize(&mut grads.radii, rows, [0; 2]);
+        room::resize(&mut grads.means2d, rows, [0.0; 2]);
+    }
+
+    /// Submits the stages on rows whose columns are on the device, behind the work of `recorder`, and copies the gradients to
+    /// `grads`, which is prepared.
+    ///
+    /// # Errors
+    /// The device failed.
+    pub fn whole(
+        &self,
+        recorder: Recorder<'_>,
+        columns: &DeviceColumns,
+        room: &RowGradients,
+        segment: &Segment,
+        grads: &mut Gradients,
+        scratch: &mut Scratch,
+    ) -> GpuResult<()> {
+        let splats = [SplatRows::from(&segment.splats), SplatRows::from(gradients_of(segment)?)];
+        let readbacks = self.submit(recorder, columns, splats, room)?;
+        self.read(readbacks, &(0..columns.rows as usize), grads, scratch)
+    }
+
+    /// Uploads the rows of a batch again, which begins at row `first` of the view, runs the stages on them in chunks, and copies
+    /// the gradients to `grads`, which is prepared. `segments` are those of the batch.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory for the smallest chunk.
+    pub fn in_chunks<'s>(
+        &self,
+        rows: &Columns,
+        first: usize,
+        segments: impl Iterator<Item = &'s Segment>,
+        grads: &mut Gradients,
+        scratch: &mut Scratch,
+    ) -> GpuResult<()> {
+        for segment in segments {
+            let begin = segment.first - first;
+            in_chunks(segment.rows as usize, |part| self.chunk(rows, segment, begin, part, grads, scratch))?;
+        }
+        Ok(())
+    }
+
+    /// The rows `part` of a segment, which begins at row `begin` of the batch.
+    fn chunk(
+        &self,
+        rows: &Columns,
+        segment: &Segment,
+        begin: usize,
+        part: Range<usize>,
+        grads: &mut Gradients,
+        scratch: &mut Scratch,
+    ) -> GpuResult<()> {
+        let sh_degree = self.view.options.sh_degree;
+        let columns = DeviceColumns::new(self.gpu, part.len() as u32, sh_degree)?;
+        let room = RowGradients::new(self.gpu, columns.rows, sh_degree)?;
+        let of_batch = begin + part.start..begin + part.end;
+        let mut recorder = self.gpu.begin("backward");
+        columns.upload_geometry(&mut recorder, rows, &of_batch)?;
+        columns.upload_colors(&mut recorder, rows, &of_batch, &mut scratch.band)?;
+        let splats =
+            [&segment.splats, gradients_of(segment)?].map(|buffer| SplatRows::from_row(buffer, part.start as u64));
+        let readbacks = self.submit(recorder, &columns, splats, &room)?;
+        self.read(readbacks, &of_batch, grads, scratch)
+    }
+
+    /// Submits the stages on rows and the readbacks of the gradients. Does not wait. The work that `recorder` brings along is
+    /// submitted even if the readbacks lack memory.
+    fn submit(
+        &self,
+        mut recorder: Recorder<'_>,
+        columns: &DeviceColumns,
+        [splats, v_splats]: [SplatRows<'_>; 2],
+        RowGradients { columns: grads, footprints }: &RowGradients,
+    ) -> GpuResult<Readbacks> {
+        let (gpu, ViewOptions { camera, options }) = (self.gpu, self.view);
+        let into = &mut recorder;
+        let recorded = self
+            .stages
+            .sh_bwd(gpu, into, camera, options.sh_degree, columns, splats, v_splats, grads)
+            .and_then(|()| read_back(&mut recorder, "sh_bwd", std::iter::once(&grads.sh0).chain(&grads.bands)));
+        gpu.submit(recorder)?;
+        let colors = recorded?;
+        // The host copies the gradients of colours, four fifths of a row, while the device runs `project_bwd`.
+        let mut recorder = gpu.begin("backward");
+        let into = &mut recorder;
+        self.stages.project_bwd(gpu, into, camera, options.eps2d, columns, splats, v_splats, grads, footprints)?;
+        let geometry = [&grads.means, &grads.quats, &grads.scales, &grads.opacities];
+        let readbacks = Readbacks {
+            colors,
+            geometry: read_back(&mut recorder, "project_bwd", geometry.into_iter())?,
+            footprints: recorder.read_back("project_bwd", &footprints.view())?,
+        };
+        gpu.submit(recorder)?;
+        Ok(readbacks)
+    }
+
+    /// Waits for the gradients and copies them to the rows `part` of `grads`.
+    fn read(
+        &self,
+        readbacks: Readbacks,
+        part: &Range<usize>,
+        grads: &mut Gradients,
+        Scratch { band: values, footprints }: &mut Scratch,
+    ) -> GpuResult<()> {
+        let out = &mut grads.columns;
+        let mut colors = readbacks.colors.into_iter();
+        for bytes in colors.by_ref().take(1) {
+            bytes.copy_to(&mut out.sh0[3 * part.start..3 * part.end])?;
+        }
+        for (band, bytes) in colors.enumerate() {
+            values.clear();
+            values.resize(part.len() * BAND_WIDTHS[band], 0.0);
+            bytes.copy_to(values)?;
+            band_into_sh_n(values, part, band, out);
+        }
+        let geometry = [(&mut out.means, 3), (&mut out.quats, 4), (&mut out.scales, 3), (&mut out.opacities, 1)];
+        for ((to, width), bytes) in geometry.into_iter().zip(readbacks.geometry) {
+            bytes.copy_to(&mut to[width * part.start..width * part.end])?;
+        }
+        room::resize(footprints, part.len(), [0.0; 4]);
+        readbacks.footprints.copy_to(footprints)?;
+        let rows = grads.means2d[part.clone()].iter_mut().zip(&mut grads.radii[part.clone()]);
+        for ((mean2d, radii), f) in rows.zip(footprints.iter()) {
+            (*mean2d, *radii) = ([f[0], f[1]], [f[2] as u32, f[3] as u32]);
+        }
+        Ok(())
+    }
+}
+
+/// Records the readbacks of some buffers.
+fn read_back<'a>(
+    recorder: &mut Recorder<'_>,
+    stage: &'static str,
+    buffers: impl Iterator<Item = &'a Buffer>,
+) -> GpuResult<Vec<Readback>> {
+    buffers.map(|buffer| recorder.read_back(stage, &buffer.view())).collect()
+}

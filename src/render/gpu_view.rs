@@ -1,0 +1,138 @@
+//! What a device holds of the current view, between the stages.
+//!
+//! Not here: the stages.
+
+use super::device_needs::ViewSizes;
+use super::gpu_ranges::PlannedRange;
+use super::gpu_rows::DeviceColumns;
+use super::gpu_segments::Segment;
+use super::gpu_tiles::{Blend, Demand, DemandReadback, Frame, Pixels, Ranks};
+use super::sequence::ViewOptions;
+use crate::gpu::{Buffer, Readback, Recording};
+use crate::kernels::image_loss::LossPlan;
+use crate::kernels::splats::Grid;
+
+/// Device state between `rows_in` and `picture`.
+#[derive(Debug, Default)]
+pub(super) struct RowsIn {
+    /// The splats of the batches so far.
+    pub segments: Vec<Segment>,
+    /// The rows of a view of one batch that fits; its splats are the one segment.
+    pub whole: Option<Box<WholeRows>>,
+}
+
+/// The rows of a view of one batch, on the device until their gradients are computed.
+#[derive(Debug)]
+pub(super) struct WholeRows {
+    pub columns: DeviceColumns,
+    pub ranks: Ranks,
+    /// Upload and evaluation of the colours, not submitted yet: `picture` appends lists and blending.
+    pub colors: Recording,
+}
+
+/// The buffer sizes that a frame needs. The picture is valid only if the frame had this room.
+#[derive(Debug)]
+pub(super) enum DemandState {
+    /// The readback is pending.
+    Pending(DemandReadback),
+    /// The host has read the demand.
+    Known(Demand),
+}
+
+/// The tile lists of a view of which all lists fit at once.
+#[derive(Debug)]
+pub(super) struct WholeLists {
+    pub ranks: Ranks,
+    pub frame: Frame,
+    pub demand: DemandState,
+}
+
+/// The tile lists of a view.
+#[derive(Debug)]
+pub(super) enum Lists {
+    /// All of them are on the device.
+    Whole(Box<WholeLists>),
+    /// They are made for one range at a time.
+    Ranges(Vec<PlannedRange>),
+}
+
+/// Device state of a view with a picture.
+#[derive(Debug)]
+pub(super) struct View {
+    pub of: ViewOptions,
+    pub segments: Vec<Segment>,
+    /// The rows of a view of one batch; `None` if they must come again.
+    pub columns: Option<DeviceColumns>,
+    pub pixels: Pixels,
+    pub lists: Lists,
+    /// Whether `GpuRenderer::image` holds the picture of this view.
+    pub image_is_read: bool,
+    /// Whether the caller may have changed `GpuRenderer::image`; the loss then compares that image.
+    pub image_is_corrected: bool,
+    pub loss: Option<Loss>,
+    /// The tile stages of the backward pass, not submitted yet: the first `rows_out` appends the stages on rows.
+    pub tiles_back: Option<Recording>,
+}
+
+impl View {
+    /// A view whose picture was submitted.
+    pub fn new(
+        of: ViewOptions,
+        segments: Vec<Segment>,
+        columns: Option<DeviceColumns>,
+        pixels: Pixels,
+        lists: Lists,
+    ) -> View {
+        let (image_is_read, image_is_corrected) = (false, false);
+        View { of, segments, columns, pixels, lists, image_is_read, image_is_corrected, loss: None, tiles_back: None }
+    }
+
+    /// Tiles, background and clamp.
+    pub fn blend(&self) -> Blend {
+        blend_of(&self.of)
+    }
+
+    /// Rows, intersections, longest list and pixels. Lists are empty until a call has read the picture, the loss or a gradient.
+    pub fn sizes(&self) -> ViewSizes {
+        let demands = match &self.lists {
+            Lists::Whole(lists) => match lists.demand {
+                DemandState::Known(demand) => vec![demand],
+                DemandState::Pending(_) => Vec::new(),
+            },
+            Lists::Ranges(ranges) => ranges.iter().map(|range| range.demand).collect(),
+        };
+        ViewSizes {
+            rows: self.segments.iter().map(|segment| u64::from(segment.rows)).sum(),
+            isects: demands.iter().map(|demand| u64::from(demand.isects)).sum(),
+            longest_list: demands.iter().map(|demand| u64::from(demand.list_max)).max().unwrap_or(0),
+            pixels: self.of.camera.pixels() as u64,
+        }
+    }
+}
+
+/// Tiles, background and clamp of a view.
+pub(super) fn blend_of(ViewOptions { camera, options }: &ViewOptions) -> Blend {
+    let grid = Grid::new(camera.width, camera.height);
+    Blend { grid, background: options.background, max_alpha: options.max_alpha }
+}
+
+/// A loss that was submitted.
+#[derive(Debug)]
+pub(super) struct Loss {
+    pub plan: LossPlan,
+    /// The photo, kept until the picture is known to be valid.
+    pub target: Buffer,
+    pub v_rgb: Buffer,
+    pub sums: LossSums,
+}
+
+/// The four sums from which the value of a loss follows.
+#[derive(Debug)]
+pub(super) enum LossSums {
+    /// The picture has no pixels.
+    Empty,
+    /// The readback is pending.
+    Pending(Readback),
+    /// The host has read the sums.
+    Known([f32; 4]),
+}
