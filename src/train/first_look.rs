@@ -4,6 +4,7 @@
 //! the largest view for the frames of a budget, a small enough view for timing; 3. pages and bounds equal those at the
 //! start of a run.
 
+use super::comparison::Comparison;
 use super::error::TrainError;
 use super::machine;
 use super::memory::host_budget;
@@ -157,8 +158,9 @@ impl World<'_> {
         let mut working = WorkingSet::default();
         let rgb = vec![0; 3 * camera.pixels()];
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
+        let comparison = Comparison { target: &target, loss: options.loss };
         let mut step = |number| {
-            let (what, how) = ((number, &camera, &target), (&render, &options.loss));
+            let (what, how) = ((number, &camera), (&render, &comparison));
             let began = Instant::now();
             train_step(&mut scene, &mut working, &mut *renderer, what, how, false, usize::MAX)?;
             Ok::<_, TrainError>(began.elapsed().as_secs_f64())

@@ -4,7 +4,7 @@
 //! | --- | --- |
 //! | set up and run | [`run`], [`prepare`], [`start`] (first Gaussians; `gaussian_pages` from a file of any size), [`tiers`] (where pages live), [`machine`] (threads, renderer), [`signals`] (Ctrl-C) |
 //! | memory | [`memory`], [`probe`] and [`preflight`] (does the run fit), [`budget`] and `fitting` (frames of a growing scene), `outgrown` (a scene that no longer fits), [`staging`] |
-//! | one step | [`step`], [`batch`] (gather, update), [`working_set`], [`catch_up`] (cull, evaluate), `update`, `dense` (dense Adam) |
+//! | one step | [`step`], [`comparison`] (from picture to loss and back; also for `view`, which renders without a step), [`batch`] (gather, update), [`working_set`], [`catch_up`] (cull, evaluate), `update`, `dense` (dense Adam) |
 //! | state and loop | [`pages`], [`trainer`], [`training_loop`], [`eval`], [`costs`] |
 //! | commits | [`checkpoint`], `first_commit` (of a run in memory), [`full_drive`], [`resume`] with `changes` and [`dataset_print`] (may the run resume) |
 //! | results | [`out_folder`], [`report`], [`progress`], [`page_map`], [`facts`] |
@@ -15,6 +15,7 @@ pub mod budget;
 pub mod catch_up;
 mod changes;
 pub mod checkpoint;
+pub mod comparison;
 pub mod costs;
 pub mod dataset_print;
 mod dense;

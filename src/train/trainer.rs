@@ -6,6 +6,7 @@
 //! run with the result of the last good step.
 
 use super::budget::HostBudget;
+use super::comparison::Comparison;
 use super::dense::settle_all;
 use super::error::TrainError;
 use super::eval::{EvalRequest, evaluate};
@@ -142,9 +143,9 @@ impl Trainer {
             let camera = &dataset.views[view].camera;
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-            let how = (&render, &self.options.loss);
+            let comparison = Comparison { target: &target, loss: self.options.loss };
             let now = (&mut self.scene, self.step, &mut self.working);
-            let rows = rehearse(now, &mut *self.renderer, (camera, &target), how, self.pages_most)?;
+            let rows = rehearse(now, &mut *self.renderer, camera, (&render, &comparison), self.pages_most)?;
             let index = self.scene.pager.index();
             let pages = self.scene.pager.pages_of_view(camera);
             let is_whole = self.scene.pager.pages_per_batch(pages.len()).min(self.pages_most) >= pages.len();
@@ -227,13 +228,14 @@ impl Trainer {
         let target = targets.get(view)?;
         let started = Instant::now();
         let render = self.render_options();
+        let comparison = Comparison { target: &target, loss: self.options.loss };
         let stepped = loop {
             let stepped = train_step(
                 &mut self.scene,
                 &mut self.working,
                 &mut *self.renderer,
-                (self.step, &dataset.views[view].camera, &target),
-                (&render, &self.options.loss),
+                (self.step, &dataset.views[view].camera),
+                (&render, &comparison),
                 self.options.strategy.collects(self.step),
                 self.pages_most,
             );
