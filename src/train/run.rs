@@ -4,7 +4,7 @@
 //! is stopped or fails after its first step still writes the PLY of its last good step.
 
 use super::changes::with_absolute_paths;
-use super::checkpoint::{Checkpoint, Origin};
+use super::checkpoint::Checkpoint;
 use super::costs::Meter;
 use super::error::TrainError;
 use super::facts::{Resolved, write_config};
@@ -27,7 +27,7 @@ use super::trainer::Trainer;
 use super::training_loop::LoopOutputs;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
-use crate::checkpoint::run_state::{DatasetPrint, RunIdentity};
+use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity};
 use crate::config::choice::{Chosen, LogFormat};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};

@@ -16,7 +16,7 @@ use super::step::{StepOutcome, train_step};
 use super::view::rehearse;
 use super::working_set::WorkingSet;
 use crate::base::error::InputError;
-use crate::checkpoint::run_state::LastTest;
+use crate::checkpoint::run_state::{LastTest, TrainerState};
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
@@ -52,13 +52,8 @@ pub struct Trainer {
     order: ViewOrder,
     train_views: Vec<usize>,
     pub(super) working: WorkingSet,
-    pub(super) step: u32,
-    pub(super) rows_skipped: u64,
-    pub(super) steps_skipped: u32,
-    pub(super) steps_skipped_in_a_row: u32,
-    pub(super) train_seconds: f64,
-    /// Result of the last evaluation on the held-out views.
-    pub(super) last_test: Option<LastTest>,
+    /// Everything that a commit saves and a resume restores, besides the pages.
+    pub(super) state: TrainerState,
     /// A step failed after it had changed rows, so the state must not be committed.
     pub(super) is_torn: bool,
     /// Memory budget from which the number of frames follows; `None` without a budget.
@@ -117,12 +112,7 @@ impl Trainer {
             working: WorkingSet::default(),
             renderer,
             options,
-            step: 0,
-            rows_skipped: 0,
-            steps_skipped: 0,
-            steps_skipped_in_a_row: 0,
-            train_seconds: 0.0,
-            last_test: None,
+            state: TrainerState::default(),
             is_torn: false,
             budget: None,
             pages_most: usize::MAX,
@@ -144,7 +134,7 @@ impl Trainer {
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
             let comparison = Comparison { target: &target, loss: self.options.loss };
-            let now = (&mut self.scene, self.step, &mut self.working);
+            let now = (&mut self.scene, self.state.step, &mut self.working);
             let rows = rehearse(now, &mut *self.renderer, camera, (&render, &comparison), self.pages_most)?;
             let index = self.scene.pager.index();
             let pages = self.scene.pager.pages_of_view(camera);
@@ -177,22 +167,22 @@ impl Trainer {
 
     /// Steps done.
     pub fn steps_done(&self) -> u32 {
-        self.step
+        self.state.step
     }
 
     /// Index in `dataset.views` of the next step's view.
     pub fn next_view(&mut self) -> usize {
-        self.train_views[self.order.view_at(self.step)]
+        self.train_views[self.order.view_at(self.state.step)]
     }
 
     /// Seconds spent in steps.
     pub fn train_seconds(&self) -> f64 {
-        self.train_seconds
+        self.state.train_seconds
     }
 
     /// Row updates and steps skipped because a value was not finite.
     pub fn skipped(&self) -> (u64, u32) {
-        (self.rows_skipped, self.steps_skipped)
+        (self.state.rows_skipped, self.state.steps_skipped)
     }
 
     /// Traffic between the tiers since the run began, including the time before a resume.
@@ -218,7 +208,7 @@ impl Trainer {
     pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
         let view = self.next_view();
         let mut ahead = Vec::new();
-        self.order.upcoming(self.step, PREFETCH_VIEWS.min(self.options.steps - self.step), &mut ahead);
+        self.order.upcoming(self.state.step, PREFETCH_VIEWS.min(self.options.steps - self.state.step), &mut ahead);
         for position in &mut ahead {
             *position = self.train_views[*position];
         }
@@ -234,9 +224,9 @@ impl Trainer {
                 &mut self.scene,
                 &mut self.working,
                 &mut *self.renderer,
-                (self.step, &dataset.views[view].camera),
+                (self.state.step, &dataset.views[view].camera),
                 (&render, &comparison),
-                self.options.strategy.collects(self.step),
+                self.options.strategy.collects(self.state.step),
                 self.pages_most,
             );
             self.is_torn = matches!(stepped, Err(TrainError::Torn { .. }));
@@ -252,27 +242,27 @@ impl Trainer {
         if self.options.optimizer == Method::Dense {
             // The step has changed rows; an error here leaves a state between two steps.
             self.is_torn = true;
-            settle_all(&mut self.scene, self.step + 1)?;
+            settle_all(&mut self.scene, self.state.step + 1)?;
             self.is_torn = false;
         }
         self.log_events();
-        self.step += 1;
-        self.train_seconds += started.elapsed().as_secs_f64();
+        self.state.step += 1;
+        self.state.train_seconds += started.elapsed().as_secs_f64();
         Ok(outcome)
     }
 
     /// Updates the pager's plan every [`LOOK_AHEAD_EVERY`] steps; doing it at every step would cost too much.
     fn look_ahead(&mut self, dataset: &Dataset) {
-        if self.is_in_memory() || !self.step.is_multiple_of(LOOK_AHEAD_EVERY) {
+        if self.is_in_memory() || !self.state.step.is_multiple_of(LOOK_AHEAD_EVERY) {
             return;
         }
         // Two epochs contain a use of every page that any view needs.
         let count = (2 * self.train_views.len() as u32).clamp(LOOK_AHEAD_LEAST, LOOK_AHEAD_MOST);
         let mut coming = Vec::new();
-        self.order.upcoming(self.step, count.min(self.options.steps - self.step), &mut coming);
+        self.order.upcoming(self.state.step, count.min(self.options.steps - self.state.step), &mut coming);
         let camera = |&position: &usize| &dataset.views[self.train_views[position]].camera;
         let cameras: Vec<&Camera> = coming.iter().map(camera).collect();
-        self.scene.pager.look_ahead(self.step, &cameras);
+        self.scene.pager.look_ahead(self.state.step, &cameras);
     }
 
     /// Notes how many of the rows in the pages of a view were drawn, and whether the view was one batch.
@@ -282,27 +272,27 @@ impl Trainer {
     }
 
     fn count_skipped(&mut self, outcome: &StepOutcome, view: &str) -> Result<(), TrainError> {
-        self.rows_skipped += outcome.rows_skipped;
+        self.state.rows_skipped += outcome.rows_skipped;
         if !outcome.skipped {
-            self.steps_skipped_in_a_row = 0;
+            self.state.steps_skipped_in_a_row = 0;
             return Ok(());
         }
-        self.steps_skipped += 1;
-        self.steps_skipped_in_a_row += 1;
-        if self.steps_skipped_in_a_row < NON_FINITE_STEPS_MAX {
+        self.state.steps_skipped += 1;
+        self.state.steps_skipped_in_a_row += 1;
+        if self.state.steps_skipped_in_a_row < NON_FINITE_STEPS_MAX {
             return Ok(());
         }
         Err(TrainError::NonFinite {
-            step: self.step,
+            step: self.state.step,
             view: view.to_string(),
-            count: self.steps_skipped_in_a_row,
+            count: self.state.steps_skipped_in_a_row,
             remedy: "lower the learning rates; with the default rates, report this as a bug and attach the scene",
         })
     }
 
     /// Decides and logs the events of this step. They act on values after the step's update.
     fn log_events(&mut self) {
-        let (step, scale) = (self.step, self.options.scene_scale);
+        let (step, scale) = (self.state.step, self.options.scene_scale);
         let rows = self.scene.rows_bound();
         let kinds = self.options.strategy.events_after(step, scale, rows, &self.scene.histogram);
         kinds.into_iter().for_each(|kind| self.scene.log_event(Event { step, kind }));
@@ -331,10 +321,10 @@ impl Trainer {
             lpips: None,
             color_correct: self.options.color_correct,
         };
-        let now = (&mut self.scene, self.step, &mut self.working);
+        let now = (&mut self.scene, self.state.step, &mut self.working);
         let test = evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)?;
-        let of = |t: TestMetrics| LastTest { step: self.step, views: t.views, psnr: t.psnr, ssim: t.ssim };
-        self.last_test = test.map(of).or(self.last_test);
+        let of = |t: TestMetrics| LastTest { step: self.state.step, views: t.views, psnr: t.psnr, ssim: t.ssim };
+        self.state.test = test.map(of).or(self.state.test);
         Ok(test)
     }
 
@@ -349,7 +339,7 @@ impl Trainer {
             return Err(InputError::new(path, problem, remedy).into());
         }
         let meta = PlyMeta {
-            step: Some(u64::from(self.step)),
+            step: Some(u64::from(self.state.step)),
             origin: dataset.frame.origin.to_array(),
             scale: dataset.frame.scale,
             scene_radius: f64::from(dataset.scene_scale) * dataset.frame.scale,
@@ -358,7 +348,7 @@ impl Trainer {
         };
         let rows_at_most = self.scene.rows_bound();
         let mut writer = ply::PlyWriter::create(path, self.options.sh_degree, rows_at_most, &meta)?;
-        self.scene.for_all_rows(self.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
+        self.scene.for_all_rows(self.state.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
         Ok(writer.finish()?)
     }
 

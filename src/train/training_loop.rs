@@ -41,14 +41,14 @@ impl Trainer {
         targets: &TargetCache,
         outputs: &mut LoopOutputs<'_>,
     ) -> Result<(), TrainError> {
-        while self.step < self.options.steps && outputs.stop.exit_code().is_none() {
+        while self.state.step < self.options.steps && outputs.stop.exit_code().is_none() {
             self.start_paging_if_outgrown(outputs)?;
-            let step = self.step;
+            let step = self.state.step;
             let before = self.renderer.traffic();
             let Some(outcome) = self.step_with_space(dataset, targets, outputs)? else { break };
             self.check_statistics(outputs)?;
             let traffic = self.renderer.traffic();
-            let is_last = self.step == self.options.steps;
+            let is_last = self.state.step == self.options.steps;
             let due = |every: u32| step > 0 && step.is_multiple_of(every);
             let psnr = json_psnr(-10.0 * outcome.loss.mse.log10());
             let mut test: Option<TestMetrics> = None;
@@ -67,7 +67,7 @@ impl Trainer {
                     loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },
                     psnr,
                     gaussians: self.scene.rows(),
-                    seconds: self.train_seconds,
+                    seconds: self.state.train_seconds,
                     host_bytes_peak: host_bytes_peak().unwrap_or(0),
                     bytes_uploaded: traffic.bytes_uploaded - before.bytes_uploaded,
                     bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
@@ -79,8 +79,8 @@ impl Trainer {
                 let written = outputs.metrics.write(&line).map_err(TrainError::from);
                 written.or_else(|error| self.make_space(outputs, error))?;
             }
-            let (gaussians, last_test) = (self.scene.rows(), self.last_test);
-            outputs.progress.step(self.step, || {
+            let (gaussians, last_test) = (self.scene.rows(), self.state.test);
+            outputs.progress.step(self.state.step, || {
                 let test = last_test.map_or(String::new(), |t| format!(" test {:.2}", t.psnr));
                 let tiers = TierTraffic::of(&self.scene.pager).words();
                 let commits = outputs.checkpoint.as_deref().map_or(String::new(), |c| c.report().words());
@@ -126,7 +126,7 @@ impl Trainer {
         let problem = format!("the pages hold statistics of {rows} rows that the run's histogram lacks");
         let remedy = "the last commit is intact: make a consistent store with gsscale-ckpt salvage, then continue with \
                       gsscale-train --resume and --spill-dir";
-        Err(InputError::new(store, problem, remedy).at(format!("step {}", self.step)))
+        Err(InputError::new(store, problem, remedy).at(format!("step {}", self.state.step)))
     }
 
     /// Frees or awaits drive space after `error`; without a checkpoint, returns the error.
@@ -141,7 +141,7 @@ impl Trainer {
     /// run keeps its previous commit.
     fn commit_last(&mut self, outputs: &mut LoopOutputs<'_>) -> Result<(), TrainError> {
         let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else { return Ok(()) };
-        match self.step < self.options.steps || checkpoint.needs_last_commit() {
+        match self.state.step < self.options.steps || checkpoint.needs_last_commit() {
             true => checkpoint.commit_or_warn(self, outputs.metrics),
             false => Ok(()),
         }

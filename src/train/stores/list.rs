@@ -52,13 +52,13 @@ pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
     let mut generations = Vec::new();
     for used in store.disk_use()? {
         let state = run_state_of(&store, used.generation)?;
-        let in_metrics = || tests.iter().rfind(|(step, _)| *step < state.step).map(|(_, psnr)| *psnr);
-        let psnr = state.test.map(|test| test.psnr).or_else(in_metrics);
+        let in_metrics = || tests.iter().rfind(|(step, _)| *step < state.trainer.step).map(|(_, psnr)| *psnr);
+        let psnr = state.trainer.test.map(|test| test.psnr).or_else(in_metrics);
         generations.push(GenerationLine {
             generation: used.generation,
             names: used.names,
             is_latest: used.generation == store.generations().latest(),
-            step: state.step,
+            step: state.trainer.step,
             psnr,
             gaussians: state.rows,
             pages: used.pages,

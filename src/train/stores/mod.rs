@@ -78,7 +78,7 @@ impl StorePlace {
         if latest == 0 || !self.id.is_known() {
             return Ok(());
         }
-        Ok(check_owner(&self.folder, &run_state_of(store, latest)?.run, self.id)?)
+        Ok(check_owner(&self.folder, &run_state_of(store, latest)?.origin.run, self.id)?)
     }
 }
 
@@ -126,9 +126,9 @@ pub fn run_state_of(store: &StoreReader, generation: u64) -> Result<RunState, Tr
 
 /// The config of a run, and its options.
 fn options_of(store: &Path, state: &RunState) -> InputResult<(TrainConfig, RunOptions)> {
-    let config = TrainConfig::parse(&state.config)
+    let config = TrainConfig::parse(&state.origin.config)
         .map_err(|problem| InputError::new(store, problem, "use the program that made it").at("config of the run"))?;
-    let options = RunOptions::new(&config, state.dataset.scene_scale);
-    let options = RunOptions { sh_degree_start: state.sh_degree_start, ..options };
+    let options = RunOptions::new(&config, state.origin.dataset.scene_scale);
+    let options = RunOptions { sh_degree_start: state.origin.sh_degree_start, ..options };
     Ok((config, options))
 }
