@@ -14,6 +14,7 @@ use gsscale::paging::plan::cache_model::{CacheModel, StepChange, TooFewFrames};
 use gsscale::paging::plan::steps::Plan;
 use gsscale::paging::simulation::auto::automatic_order;
 use gsscale::paging::simulation::replay::{DriveModel, Figures, Replay, ReplayOptions, Stall, WINDOW_STEPS, replay};
+use gsscale::report::run_files::CONFIG_FILE;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::scene::page_meta::PageMeta;
@@ -180,7 +181,7 @@ fn start(args: &Args) -> InputResult<String> {
 }
 
 fn load(args: &Args) -> InputResult<Scene> {
-    let run_config = args.scene.join("config.toml");
+    let run_config = args.scene.join(CONFIG_FILE);
     let is_run = run_config.is_file();
     let config_path = args.config.clone().or_else(|| is_run.then(|| run_config.clone()));
     let mut config = config_path.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;

@@ -52,5 +52,4 @@ pub mod trainer;
 pub mod training_loop;
 mod update;
 pub mod view;
-pub mod whole_file;
 pub mod working_set;

@@ -35,6 +35,7 @@ use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::Access;
 use crate::paging::pager::Pager;
 use crate::render::Renderer;
+use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
 use std::path::{Path, PathBuf};
 
@@ -104,7 +105,7 @@ struct Earlier {
 impl Earlier {
     /// Reads config.toml or, if it is missing, the checkpoint in the output folder or in the given spill directory.
     fn find(request: &ResumeRequest) -> Result<Earlier, TrainError> {
-        let path = request.out.join("config.toml");
+        let path = request.out.join(CONFIG_FILE);
         if path.exists() {
             let facts = read_resolved(&path).map_err(|e| InputError { remedy: REMEDY_DAMAGED.to_string(), ..e })?;
             let config = TrainConfig::read(&path)?;
@@ -150,14 +151,11 @@ impl Earlier {
 /// Whether a new start would destroy something of the run in `out`: a result, or a logged commit whose checkpoint may
 /// lie elsewhere.
 fn has_results(out: &Path) -> bool {
-    let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap_or_default();
+    let metrics = std::fs::read_to_string(out.join(METRICS_FILE)).unwrap_or_default();
     let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
     let has = |name: &str| out.join(name).exists();
     let has_saved = || out_folder::saved(out).is_ok_and(|saved| !saved.is_empty());
-    has("point_cloud.ply")
-        || has("summary.json")
-        || has_saved()
-        || metrics.lines().filter_map(commits).any(|commits| commits > 0)
+    has(PLY_FILE) || has(SUMMARY_FILE) || has_saved() || metrics.lines().filter_map(commits).any(|commits| commits > 0)
 }
 
 /// Restarts a run that was cut off before its first commit, from its config.
@@ -291,7 +289,7 @@ fn finished_outcome(
     config: &TrainConfig,
     earlier: &Earlier,
 ) -> Result<Option<RunOutcome>, TrainError> {
-    let text = std::fs::read_to_string(request.out.join("summary.json")).unwrap_or_default();
+    let text = std::fs::read_to_string(request.out.join(SUMMARY_FILE)).unwrap_or_default();
     let summary: Option<Summary> = serde_json::from_str(&text).ok();
     let Some(summary) = summary.filter(|s| s.finished && s.steps >= config.steps) else { return Ok(None) };
     let folder = stored_folder(&request.out, config);

@@ -37,7 +37,8 @@ use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyWritten};
 use crate::page::tool::uncommitted::remove_uncommitted;
 use crate::render::Renderer;
-use crate::report::run_report::{PAGES_FILE, write_run_report};
+use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE};
+use crate::report::run_report::write_run_report;
 use crate::scene::partition::first_fill;
 use std::path::{Path, PathBuf};
 
@@ -202,7 +203,7 @@ pub(super) fn plan_and_train(
 
 /// ` --spill-dir FOLDER` if the config.toml could not be rewritten and so does not name the run's checkpoint.
 fn spill_dir_flag(request: &RunRequest) -> String {
-    let [kept, now] = [TrainConfig::read(&request.out.join("config.toml")), Ok(request.config.clone())]
+    let [kept, now] = [TrainConfig::read(&request.out.join(CONFIG_FILE)), Ok(request.config.clone())]
         .map(|config| config.map(|config| with_absolute_paths(config).spill_dir));
     match now {
         Ok(now) if !now.is_empty() && !kept.is_ok_and(|kept| kept == now) => format!(" --spill-dir {now}"),
@@ -219,7 +220,7 @@ fn resolved_config(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
 /// Writes config.toml (on resume only if it changed); returns the origin for all commits.
 fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun: &Begun) -> InputResult<Origin> {
     let simd = limits::simd_path(&request.config).name().to_string();
-    let path = request.out.join("config.toml");
+    let path = request.out.join(CONFIG_FILE);
     let config = match &begun.past {
         Some(past) => {
             // It belongs to the Gaussians before the change.
@@ -255,9 +256,9 @@ fn train_into(
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
     let origin = begin_files(request, dataset, &trainer, &begun)?;
-    let mut metrics = MetricsLog::open(&out.join("metrics.jsonl"), begun.past.as_ref().map(|p| p.metrics_bytes))?;
+    let mut metrics = MetricsLog::open(&out.join(METRICS_FILE), begun.past.as_ref().map(|p| p.metrics_bytes))?;
     if config.log == LogFormat::Tensorboard {
-        metrics = metrics.with_events(&out.join("tensorboard"), begun.past.as_ref().map(|p| p.step))?;
+        metrics = metrics.with_events(&out.join(EVENTS_FOLDER), begun.past.as_ref().map(|p| p.step))?;
     }
     let keeps = tiers.keeps_checkpoint();
     let mut checkpoint = tiers.checkpoint.as_mut();
@@ -288,7 +289,7 @@ fn train_into(
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
     let asked = stop.exit_code();
     let tested = looped.and_then(|()| match asked {
-        None => trainer.evaluate(dataset, &targets, Some(&out.join("renders/test"))),
+        None => trainer.evaluate(dataset, &targets, Some(&out.join(PICTURES_FOLDER))),
         Some(_) => Ok(None),
     });
     if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, tiers.checkpoint.as_mut()) {
@@ -304,7 +305,7 @@ fn train_into(
         commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
         ..summary_of(request, &trainer)
     };
-    write_summary(&out.join("summary.json"), &summary)?;
+    write_summary(&out.join(SUMMARY_FILE), &summary)?;
     write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
     write_run_report(out)?;
     tested?;

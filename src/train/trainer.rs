@@ -24,6 +24,7 @@ use crate::exchange::ply::{self, PlyMeta};
 use crate::optim::method::Method;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::{RenderOptions, Renderer};
+use crate::report::run_files::PLY_FILE;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
@@ -354,6 +355,6 @@ impl Trainer {
 
     /// Path of the final PLY in an output folder.
     pub fn ply_path(out: &Path) -> PathBuf {
-        out.join("point_cloud.ply")
+        out.join(PLY_FILE)
     }
 }

@@ -14,6 +14,7 @@ use super::trainer::Trainer;
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::report::run_files::saved_ply_name;
 use std::path::Path;
 
 /// Outputs and controls of a loop.
@@ -56,7 +57,7 @@ impl Trainer {
                 test = self.evaluate(dataset, targets, None)?;
             }
             if due(self.options.save_every) && !is_last {
-                self.save_if_space(dataset, &outputs.out.join(format!("point_cloud_{step:06}.ply")))?;
+                self.save_if_space(dataset, &outputs.out.join(saved_ply_name(step)))?;
                 if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
                     checkpoint.keep_next_as(format!("step-{step}"));
                 }

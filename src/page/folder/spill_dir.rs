@@ -7,7 +7,8 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
-use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, sync_folder, with_safe_flags};
+use crate::base::whole_file::sync_folder;
+use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, with_safe_flags};
 use crate::page::folder::drive_rate;
 use crate::page::folder::file_system::{FileSystem, free_bytes};
 use crate::page::folder::protocol_files::{

@@ -8,9 +8,9 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
+use crate::base::whole_file::{folder_of, sync_folder};
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::engine::open::{IoEngine, open_engine};
-use crate::page::engine::segment_files::sync_folder;
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
@@ -150,8 +150,7 @@ impl NewStore {
         }
         std::fs::rename(&self.part, &self.target).map_err(failed)?;
         self.spill = None;
-        let parent = self.target.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        sync_folder(parent).map_err(failed)?;
+        sync_folder(folder_of(&self.target)).map_err(failed)?;
         Ok(())
     }
 

@@ -9,6 +9,7 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::base::units::{MIB, format_bytes};
+use crate::base::whole_file::folder_of;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
@@ -25,7 +26,6 @@ use crate::train::error::TrainError;
 use crate::train::gaussian_pages::{GaussianSpace, GaussianWriter};
 use crate::train::memory::host_bytes_peak;
 use crate::train::pages::PageRules;
-use crate::train::whole_file::folder_of;
 use serde::Serialize;
 use std::path::PathBuf;
 

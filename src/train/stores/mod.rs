@@ -36,6 +36,7 @@ use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
 use crate::page::folder::spill_dir::segments_in;
 use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule};
+use crate::report::run_files::CONFIG_FILE;
 use std::path::{Path, PathBuf};
 
 impl From<ReadError> for TrainError {
@@ -98,7 +99,7 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
     if dir.join("FORMAT").exists() || segments_in(dir).is_ok_and(|segments| !segments.is_empty()) {
         return Ok(StorePlace { folder: dir.to_path_buf(), run: None, id: RunId::UNKNOWN });
     }
-    let file = dir.join("config.toml");
+    let file = dir.join(CONFIG_FILE);
     if !file.is_file() {
         let remedy = "name a run's output folder or its spill directory";
         return Err(InputError::new(dir, "it is neither a store nor a run's output folder", remedy));

@@ -33,6 +33,7 @@ use crate::page::tool::slot_reader::SlotReader;
 use crate::page::versions::slots::SlotLayout;
 use crate::paging::label::{label, meta_from_label};
 use crate::paging::stored::{check_values, layout_of};
+use crate::report::run_files::CONFIG_FILE;
 use crate::scene::page_layout::{capacity_bytes, read_page, write_page};
 use crate::scene::page_meta::PageMeta;
 use crate::scene::state::SceneState;
@@ -430,7 +431,7 @@ fn config_for(
     kept: &BTreeMap<PageId, SlotHeader>,
     source: &mut Source,
 ) -> Result<(TrainConfig, DatasetPrint), InputError> {
-    let file = request.config.clone().or_else(|| place.run.as_ref().map(|run| run.join("config.toml")));
+    let file = request.config.clone().or_else(|| place.run.as_ref().map(|run| run.join(CONFIG_FILE)));
     let metas = kept.iter().filter_map(|(id, h)| meta_from_label(*id, &h.label));
     let (rows, degree) = metas.fold((0, 0), |(rows, degree), m| (m.rows.max(rows), m.sh_degree.max(degree)));
     let mut print =
