@@ -3,7 +3,8 @@
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::whole_file::write_whole;
-use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
+use gsscale::config::command_line::parse_command_line;
+use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::render::lpips::InputRange;
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE};
 use gsscale::train::error::TrainError;

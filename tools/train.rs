@@ -2,7 +2,8 @@
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
+use gsscale::config::command_line::parse_command_line;
+use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::report::run_files::CONFIG_FILE;
 use gsscale::train::error::TrainError;

@@ -6,6 +6,7 @@
 
 use super::comparison::Comparison;
 use super::error::TrainError;
+use super::largest_view::largest_view;
 use super::machine;
 use super::memory::host_budget;
 use super::pages::{PageRules, PagedScene};
@@ -117,14 +118,14 @@ struct World<'a> {
 impl World<'_> {
     /// Frames within `host_mem`; renders the largest view to measure its memory.
     fn frames_within(&mut self, options: &RunOptions, host_mem: u64) -> Result<u64, TrainError> {
-        let largest = preflight::largest_view(&self.start.dataset, &self.index);
+        let largest = largest_view(&self.start.dataset, &self.index);
         let Some(view) = largest.view else { return Ok(0) };
         let scene = self.pages_of(view, options, Some(host_mem))?;
         let dataset = &self.start.dataset;
         let mut trainer = Trainer::of_scene(scene, dataset, Box::new(CpuRenderer::new()), options.clone());
         let rows = self.index.iter().map(|page| u64::from(page.rows)).sum();
         let probe = Probe { views: vec![view], rows, pages: self.index.len(), driver: 0 };
-        preflight::frames_within(self.config, dataset, &mut trainer, &probe, largest, host_mem)
+        preflight::frames_within(self.config, dataset, &mut trainer, &probe, largest.pages, host_mem)
     }
 
     /// Loads the pages of a view into memory.

@@ -3,7 +3,7 @@
 //! | task | files |
 //! | --- | --- |
 //! | set up and run | [`run`], [`prepare`], [`start`] (first Gaussians; `gaussian_pages` from a file of any size), [`tiers`] (where pages live), [`machine`] (threads, renderer), [`signals`] (Ctrl-C) |
-//! | memory | [`memory`], [`probe`] and [`preflight`] (does the run fit), [`budget`] and `fitting` (frames of a growing scene), `outgrown` (a scene that no longer fits), [`staging`] |
+//! | memory | [`memory`], [`probe`] and [`preflight`] (does the run fit: `largest_view`, `first_frames`, `drive_space`, `plan_text`), [`budget`] and `fitting` (frames of a growing scene), `outgrown` (a scene that no longer fits), [`staging`] |
 //! | one step | [`step`], [`comparison`] (from picture to loss and back; also for `view`, which renders without a step), [`batch`] (gather, update), [`working_set`], [`catch_up`] (cull, evaluate), `update`, `dense` (dense Adam) |
 //! | state and loop | [`pages`], [`trainer`], [`training_loop`], [`eval`], [`costs`] |
 //! | commits | [`checkpoint`], `first_commit` (of a run in memory), [`full_drive`], [`resume`] with `changes` and [`dataset_print`] (may the run resume) |
@@ -19,14 +19,17 @@ pub mod comparison;
 pub mod costs;
 pub mod dataset_print;
 mod dense;
+mod drive_space;
 pub mod error;
 pub mod eval;
 pub mod facts;
 mod first_commit;
+mod first_frames;
 pub mod first_look;
 mod fitting;
 pub mod full_drive;
 mod gaussian_pages;
+mod largest_view;
 pub mod machine;
 pub mod memory;
 pub mod out_folder;
@@ -35,6 +38,7 @@ mod ownership;
 pub mod page_map;
 pub mod pages;
 mod places;
+mod plan_text;
 pub mod preflight;
 pub mod prepare;
 pub mod probe;

@@ -6,7 +6,7 @@
 use super::budget::ViewNeed;
 use super::catch_up::visible_rows;
 use super::error::TrainError;
-use super::preflight::largest_view;
+use super::largest_view::largest_view;
 use super::staging::PLAN_BYTES;
 use super::trainer::Trainer;
 use super::training_loop::LoopOutputs;

@@ -6,6 +6,7 @@
 use super::changes::with_absolute_paths;
 use super::checkpoint::Checkpoint;
 use super::costs::Meter;
+use super::drive_space::check_first_drive;
 use super::error::TrainError;
 use super::facts::{Resolved, write_config};
 use super::machine;
@@ -14,6 +15,7 @@ use super::memory::{host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
 use super::out_folder::{self, Existing};
 use super::page_map::write_page_map;
 use super::places::absolute;
+use super::plan_text;
 use super::preflight;
 use super::probe::{Probe, estimate};
 use super::progress::Progress;
@@ -114,7 +116,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let host_mem = host_budget(config);
     let start = Start::read(&request.scene, config, host_mem)?;
     let sh_degree_start = start.sh_degree_start;
-    if let Some(known) = preflight::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
+    if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
         if !request.quiet {
             eprintln!("{known}");
         }
@@ -125,7 +127,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     {
         eprintln!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
     }
-    preflight::check_first_drive(config, start.rows)?;
+    check_first_drive(config, start.rows)?;
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
     let fill = first_fill(config.page_rows as usize, options.strategy.grows());
     let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
@@ -178,7 +180,7 @@ pub(super) fn plan_and_train(
     let mut memory = estimate(config, dataset, &mut trainer, &probe)?;
     let plan = preflight::plan_tiers(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
     if !request.quiet {
-        let of_tiers = preflight::describe(&plan, &memory[1], &tiers);
+        let of_tiers = plan_text::describe(&plan, &memory[1], &tiers);
         eprintln!("{}", describe(request, dataset, &trainer, &of_tiers));
     }
     if request.dry_run {

@@ -136,7 +136,7 @@ pub fn first_staging_bytes(config: &TrainConfig, host_mem: u64) -> u64 {
 
 /// Opens the tiers for a scene of about `pages` pages, within `host_mem` bytes. If the number of frames follows from
 /// the budget, the pager has few frames at first ([`Pager::allow_frames`]). With `dry`, pages of the drive are kept in
-/// memory and must fit there ([`super::preflight::too_large_for_a_dry_run`]).
+/// memory and must fit there ([`super::plan_text::too_large_for_a_dry_run`]).
 ///
 /// # Errors
 /// The spill directory cannot be used, or the I/O engine does not work here.
