@@ -262,6 +262,30 @@ fn files_say_what_they_are_and_leave_no_markers() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
+/// Files that the comments of a text name.
+fn named_files(text: &str) -> Vec<&str> {
+    let is_path = |c: char| c.is_alphanumeric() || "_/.".contains(c);
+    let comments = text.lines().filter_map(|line| Some(line.split_once("//")?.1));
+    let words = comments.flat_map(|comment| comment.split(move |c| !is_path(c)));
+    words.map(|word| word.trim_end_matches('.')).filter(|w| w.ends_with(".rs") || w.ends_with(".wgsl")).collect()
+}
+
+#[test]
+fn files_that_comments_name_exist() {
+    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
+    let mut wrong = Vec::new();
+    for (name, text) in rust_files(&["src", "tools", "benches"]) {
+        let folders = Path::new(&name).ancestors().skip(1).map(Path::to_path_buf);
+        let folders: Vec<PathBuf> = folders.chain(["src".into(), "shaders".into()]).collect();
+        let exists = |file: &str| folders.iter().any(|folder| root.join(folder).join(file).is_file());
+        // A file x stands for any.
+        let missing = named_files(&text).into_iter().filter(|file| !exists(file) && !file.ends_with("/x.wgsl"));
+        wrong.extend(missing.map(|file| format!("{name} names {file}")));
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    assert_eq!(named_files("let a; // see `b/c.rs`, d.wgsl.\nlet e = \"f.rs\";"), ["b/c.rs", "d.wgsl"]);
+}
+
 /// Functions are found by their closing brace at the indentation of their `fn`, which rustfmt guarantees.
 #[test]
 fn functions_stay_readable() {

@@ -2,7 +2,7 @@
 
 use super::file::{KEYS, TrainConfig};
 
-/// Parses the command line of a program with [`TrainOverrides`]; prints help and usage errors and exits.
+/// Parses the command line of a program with [`super::file::TrainOverrides`]; prints help and usage errors and exits.
 pub fn parse_command_line<T: clap::CommandFactory + clap::FromArgMatches>() -> T {
     parse_arguments(&std::env::args_os().collect::<Vec<_>>())
 }

@@ -1,7 +1,7 @@
 //! What happens between the picture of a view and the gradient of its splats: the one place for the training step and
 //! the rehearsal.
 //!
-//! A correction of the picture (an exposure per photo) or a second loss term is added in [`Comparison::loss_and_back`];
+//! A correction of the picture (an exposure per photo) or a second loss term is added in `Comparison::loss_and_back`;
 //! what it needs is a field of [`Comparison`], so that step and rehearsal pass it on unchanged.
 //!
 //! Invariants: 1. the rehearsal allocates what a step allocates, because both run this code; 2. without a correction the
