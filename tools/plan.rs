@@ -252,7 +252,7 @@ fn drive_rates(args: &Args, config: &TrainConfig) -> InputResult<[f64; 2]> {
     let measured = match named {
         [Some(_), Some(_)] => COMMON_DRIVE,
         _ if config.residence().spill_dir().is_none() => COMMON_DRIVE,
-        _ => DriveRate::of_without_caching(&folder_for(config)).map(|rate| [rate.read, rate.write])?,
+        _ => DriveRate::measure(&folder_for(config)).map(|rate| [rate.read, rate.write])?,
     };
     Ok([0, 1].map(|way| named[way].unwrap_or(measured[way])))
 }

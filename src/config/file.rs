@@ -1,6 +1,6 @@
 //! The keys of a run: one list defines the TOML file, the command line, the defaults and the class of each key.
 //!
-//! Not here: ranges ([`super::check`]), help and configs/default.toml ([`super::command_line`]), words of enumerations
+//! Not here: ranges (`check`), help and configs/default.toml ([`super::command_line`]), words of enumerations
 //! ([`super::choice`]).
 //!
 //! Invariants: 1. a key has the same kebab-case spelling in the file and as a flag; 2. flags override the file, the
@@ -198,8 +198,8 @@ config_keys! {
         frames: u32 = 0 => Free;
         /// I/O engine for pages: auto, uring, mmap or pread. Never changes results
         io: IoEngine = IoEngine::Auto => Free;
-        /// Codec of stored pages: raw, halves (for --moments bf16), zstd:LEVEL, or auto (by the speed of the drive and
-        /// --moments). Never changes results
+        /// Codec of stored pages: raw, halves (for --moments bf16), zstd:LEVEL, or auto (halves for --moments bf16, else
+        /// raw; gsscale-iotune advises zstd for slow drives). Never changes results
         spill_codec: Chosen<Codec> = Chosen(None) => Free;
         /// Seconds between commits, which is the most that a killed run loses. 0 = only on a stop request and after the
         /// last step. auto = 10 to 60, so that commits delay training by less than 1 %; longer if commits would write

@@ -9,7 +9,6 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
 use crate::base::whole_file::sync_folder;
 use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, with_safe_flags};
-use crate::page::folder::drive_rate;
 use crate::page::folder::file_system::{FileSystem, free_bytes};
 use crate::page::folder::protocol_files::{
     MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME, unless_missing,
@@ -170,7 +169,6 @@ impl SpillDir {
         let mut ours = [MAP_NAME, MAP_NEW_NAME, WITNESS_NAME, RESERVE_NAME, RESERVE_NEW_NAME, FORMAT_NEW, FORMAT, LOCK]
             .map(str::to_string)
             .to_vec();
-        ours.push(drive_rate::FILE_NAME.to_string());
         for name in names(&self.folder)? {
             if segment_from_file_name(&name).is_some() && self.is_our_segment(&self.folder.join(&name)) {
                 ours.insert(0, name);
