@@ -17,7 +17,7 @@ const PAGES_MOST: u64 = u32::MAX as u64;
 
 /// What the largest view needs.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct ViewNeed {
+pub(super) struct LargestNeed {
     /// Bytes of a frame.
     pub frame_bytes: u64,
     /// Pages of the view.
@@ -43,7 +43,7 @@ impl FirstFrames {
 /// Frames at the start, and the budget from which they follow.
 pub(super) fn first_frames(
     config: &TrainConfig,
-    need: &ViewNeed,
+    need: &LargestNeed,
     host_mem: Option<u64>,
     memory: &MemoryEstimate,
 ) -> InputResult<(FirstFrames, Option<u64>)> {
@@ -60,7 +60,7 @@ pub(super) fn first_frames(
 }
 
 /// Least budget with which the largest view has its frames.
-fn least_memory(need: &ViewNeed, memory: &MemoryEstimate, host_mem: Option<u64>) -> u64 {
+fn least_memory(need: &LargestNeed, memory: &MemoryEstimate, host_mem: Option<u64>) -> u64 {
     let rest = memory.fixed() - memory.staging + view_spare(memory) + need.pages * need.frame_bytes;
     let least = with_staging(rest, memory.staging, host_mem.unwrap_or(u64::MAX));
     least + least / 50
@@ -72,7 +72,7 @@ fn view_spare(memory: &MemoryEstimate) -> u64 {
 }
 
 /// Frames with which every view is one batch; `None` where the budget leaves too few.
-fn whole_views(need: &ViewNeed, host_mem: Option<u64>, memory: &MemoryEstimate) -> Option<FirstFrames> {
+fn whole_views(need: &LargestNeed, host_mem: Option<u64>, memory: &MemoryEstimate) -> Option<FirstFrames> {
     // Without a budget, the system reports no available memory: set no limit.
     let Some(budget) = host_mem else { return Some(FirstFrames::of_whole_views(PAGES_MOST)) };
     let frames = budget.saturating_sub(memory.fixed() + view_spare(memory)) / need.frame_bytes;
@@ -82,7 +82,7 @@ fn whole_views(need: &ViewNeed, host_mem: Option<u64>, memory: &MemoryEstimate) 
 /// Frames within the budget: for whole views, or for views in batches.
 pub(super) fn frames_of_budget(
     config: &TrainConfig,
-    need: &ViewNeed,
+    need: &LargestNeed,
     host_mem: Option<u64>,
     memory: &MemoryEstimate,
 ) -> InputResult<FirstFrames> {

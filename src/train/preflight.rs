@@ -6,7 +6,7 @@
 use super::budget::{HostBudget, frames_and_batch};
 use super::drive_space::{bytes_written, check_drive};
 use super::error::TrainError;
-use super::first_frames::{FirstFrames, ViewNeed, first_frames, frames_of_budget, page_working, raise_to_least};
+use super::first_frames::{FirstFrames, LargestNeed, first_frames, frames_of_budget, page_working, raise_to_least};
 use super::largest_view::{LargestView, cut_views, largest_view, train_cameras};
 use super::memory::{MemoryEstimate, obtainable_bytes, rows_at_most};
 use super::probe::{Probe, estimate};
@@ -58,41 +58,74 @@ pub fn plan_tiers(
     host_mem: Option<u64>,
     memory: &mut [MemoryEstimate; 2],
 ) -> InputResult<TierPlan> {
-    let index = trainer.scene.pager.index().len() as u64;
-    let rows_max = rows_at_most(config, trainer.scene.rows());
-    let fill = first_fill(config.page_rows as usize, config.strategy.grows()) as u64;
-    // Not all pages are full (giants have pages of their own); assume that new pages are as full as the present ones.
-    let grown = (index as f64 * rows_max as f64 / trainer.scene.rows().max(1) as f64).ceil() as u64;
-    let pages_max = grown.max(rows_max.div_ceil(fill));
-    let frame_bytes = trainer.scene.pager.frame_bytes() as u64;
-    let largest_view = largest_view(dataset, trainer.scene.pager.index());
     let mut plan = TierPlan {
-        pages: [index, pages_max],
-        frame_bytes,
+        pages: pages_now_and_most(config, trainer),
+        frame_bytes: trainer.scene.pager.frame_bytes() as u64,
         frames: None,
         frames_are_named: config.frames > 0,
         bytes_written: 0.0,
         free_bytes: tiers.free_bytes()?,
-        largest_view,
+        largest_view: largest_view(dataset, trainer.scene.pager.index()),
         cut_views: (0, 1),
     };
     if trainer.scene.pager.frames_max() == usize::MAX {
-        let asked = host_mem;
-        let host_mem = raise_to_least(config, asked, memory[0].total());
-        if trainer.scene.pager.slot_space().is_none() {
-            // A resumed run has a drive already and can start paging.
-            check_in_memory(memory, host_mem)?;
-        }
-        if let Some(budget) = host_mem {
-            let first = budget_in_memory(config, budget, &memory[0]);
-            trainer.set_budget(if host_mem == asked { first } else { first.raised_at_start() });
-        }
+        plan_in_memory(config, trainer, host_mem, memory)?;
         return Ok(plan);
     }
     let staging = staging_bytes(trainer.scene.pager.prefetch_bytes(), tiers.codec);
     memory.iter_mut().for_each(|m| m.staging = staging);
-    let asked = host_mem;
-    let need = ViewNeed { frame_bytes, pages: plan.largest_view.pages };
+    let (frames, host_mem) = plan_frames(config, trainer, &plan, host_mem, memory)?;
+    plan.frames = Some(frames);
+    plan.cut_views = cut_views(dataset, trainer.scene.pager.index(), frames, trainer.pages_most);
+    if config.view_order.0.is_none() {
+        trainer.set_view_order(auto_order(config, dataset, trainer, frames, &plan)?, dataset);
+    }
+    warn_of_growth(config, &plan, host_mem, memory);
+    plan.bytes_written = bytes_written(config, dataset, trainer, frames.min(plan.pages[0].max(1)) as usize);
+    if let Some(free) = plan.free_bytes.filter(|_| tiers.spills()) {
+        check_drive(config, free, plan.pages, plan.frame_bytes)?;
+    }
+    Ok(plan)
+}
+
+/// Pages now, and their known upper bound. Not all pages are full (giants have pages of their own); new pages are taken
+/// to be as full as the present ones.
+fn pages_now_and_most(config: &TrainConfig, trainer: &Trainer) -> [u64; 2] {
+    let (pages, rows) = (trainer.scene.pager.index().len() as u64, trainer.scene.rows());
+    let rows_max = rows_at_most(config, rows);
+    let fill = first_fill(config.page_rows as usize, config.strategy.grows()) as u64;
+    let grown = (pages as f64 * rows_max as f64 / rows.max(1) as f64).ceil() as u64;
+    [pages, grown.max(rows_max.div_ceil(fill))]
+}
+
+/// The budget of a run that keeps all pages in memory.
+fn plan_in_memory(
+    config: &TrainConfig,
+    trainer: &mut Trainer,
+    asked: Option<u64>,
+    memory: &[MemoryEstimate; 2],
+) -> InputResult<()> {
+    let host_mem = raise_to_least(config, asked, memory[0].total());
+    if trainer.scene.pager.slot_space().is_none() {
+        // A resumed run has a drive already and can start paging.
+        check_in_memory(memory, host_mem)?;
+    }
+    if let Some(budget) = host_mem {
+        let first = budget_in_memory(config, budget, &memory[0]);
+        trainer.set_budget(if host_mem == asked { first } else { first.raised_at_start() });
+    }
+    Ok(())
+}
+
+/// The frames and the batches of a run with a drive, and the budget from which they follow; completes the estimates.
+fn plan_frames(
+    config: &TrainConfig,
+    trainer: &mut Trainer,
+    plan: &TierPlan,
+    asked: Option<u64>,
+    memory: &mut [MemoryEstimate; 2],
+) -> InputResult<(u64, Option<u64>)> {
+    let need = LargestNeed { frame_bytes: plan.frame_bytes, pages: plan.largest_view.pages };
     let (FirstFrames { frames, pages_most }, host_mem) = first_frames(config, &need, asked, &memory[0])?;
     trainer.pages_most = pages_most;
     trainer.scene.pager.allow_frames(frames as usize);
@@ -101,25 +134,15 @@ pub fn plan_tiers(
         let first = HostBudget::new(budget, &memory[0], config.host_mem.0 > 0);
         trainer.set_budget(if host_mem == asked { first } else { first.raised_at_start() });
     }
-    plan.frames = Some(frames);
-    plan.cut_views = cut_views(dataset, trainer.scene.pager.index(), frames, pages_most);
-    for memory in &mut *memory {
-        memory.frames = memory.frames.min(frames * frame_bytes);
+    for memory in memory {
+        memory.frames = memory.frames.min(frames * plan.frame_bytes);
         if pages_most < usize::MAX {
             let of_batch = (pages_most as u64).saturating_mul(page_working(config)).min(memory.working);
             memory.view -= memory.working - of_batch;
-            memory.copies = memory.copies.min(pages_most as u64 * frame_bytes);
+            memory.copies = memory.copies.min(pages_most as u64 * plan.frame_bytes);
         }
     }
-    if config.view_order.0.is_none() {
-        trainer.set_view_order(auto_order(config, dataset, trainer, frames, &plan)?, dataset);
-    }
-    warn_of_growth(config, &plan, host_mem, memory);
-    plan.bytes_written = bytes_written(config, dataset, trainer, frames.min(plan.pages[0].max(1)) as usize);
-    if let Some(free) = plan.free_bytes.filter(|_| tiers.spills()) {
-        check_drive(config, free, plan.pages, frame_bytes)?;
-    }
-    Ok(plan)
+    Ok((frames, host_mem))
 }
 
 /// Allows the frames that the largest training view of `dataset` needs, so that views can be measured; [`plan_tiers`]
@@ -184,7 +207,7 @@ pub(super) fn frames_within(
 ) -> Result<u64, TrainError> {
     let [mut memory, _] = estimate(config, dataset, trainer, probe)?;
     memory.staging = first_staging_bytes(config, host_mem);
-    let need = ViewNeed { frame_bytes: trainer.scene.pager.frame_bytes() as u64, pages: view_pages };
+    let need = LargestNeed { frame_bytes: trainer.scene.pager.frame_bytes() as u64, pages: view_pages };
     Ok(frames_of_budget(config, &need, Some(host_mem), &memory)?.frames)
 }
 
