@@ -86,7 +86,7 @@ pub struct Origin {
 
 /// The part of a run's state that the trainer itself holds and changes. A commit saves it whole, and a resume restores
 /// it whole.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct TrainerState {
     /// Steps done.
     pub step: u32,

@@ -341,7 +341,7 @@ impl Trainer {
         RunState {
             origin: origin.clone(),
             device: self.renderer.device(),
-            trainer: self.state,
+            trainer: self.state.clone(),
             events: self.events().events().to_vec(),
             histogram: self.scene.histogram.filled(),
             rows: self.scene.rows(),
@@ -354,7 +354,7 @@ impl Trainer {
     /// Restores the trainer's own state and the traffic counters from a run state; the pages must come from the same
     /// commit.
     pub fn restore(&mut self, state: &RunState) {
-        self.state = state.trainer;
+        self.state = state.trainer.clone();
         self.scene.pager.restore_stats(state.traffic);
     }
 }
