@@ -11,7 +11,6 @@ use crate::page::engine::open::{DEPTH, IoEngine, open_engine};
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
-use crate::page::format::spill_format::Purpose;
 use crate::page::map::commit::{CommitConfig, Commits};
 use crate::page::tool::uncommitted::remove_uncommitted;
 use crate::page::versions::paged_store::PagedStore;
@@ -54,7 +53,7 @@ impl FirstCommit {
         // An earlier process killed during its first commit leaves a store without commits.
         remove_uncommitted(&self.folder, true)?;
         // Allow a network file system: the user chose it for the results.
-        let spill = SpillDir::create(&self.folder, Purpose::Checkpoint, layout, true)?;
+        let spill = SpillDir::create(&self.folder, layout, true)?;
         match self.make_in(&spill, layout) {
             Ok((commits, store)) => {
                 pager.attach(store);

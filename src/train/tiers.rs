@@ -21,7 +21,6 @@ use crate::page::folder::file_system::free_bytes;
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
-use crate::page::format::spill_format::Purpose;
 use crate::page::map::commit::{CommitConfig, CommitError, Commits};
 use crate::page::map::opening::Opened;
 use crate::page::versions::paged_store::{PagedStore, PagedStoreConfig};
@@ -136,7 +135,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
         let of_store = PagedStoreConfig { store: 0, layout, codec, generation: 1, serial: 1 };
         return Ok((with_transfers(Pager::new(pager, PagedStore::new(engine, of_store)), config), tiers));
     };
-    let spill = SpillDir::create(spill_dir, Purpose::Checkpoint, layout, false)?;
+    let spill = SpillDir::create(spill_dir, layout, false)?;
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
     // From here on, an error removes the directory.
     let (engine, codec) = tiers.take_spill(spill, config)?;

@@ -17,7 +17,6 @@ use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
 use gsscale::page::format::codec::Codec;
-use gsscale::page::format::spill_format::Purpose;
 use gsscale::page::map::commit::{CommitConfig, Commits, RESERVE_NAME};
 use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::pager::{Pager, PagerConfig};
@@ -133,7 +132,7 @@ impl World {
         let sh_degree_start = start.sh_degree_start;
         let options = RunOptions { sh_degree_start, ..RunOptions::new(&config, start.dataset.scene_scale) };
         let layout = SlotLayout::new(capacity_bytes(PAGE_ROWS as usize, config.sh_degree), 100);
-        let spill = SpillDir::create(&spill_dir, Purpose::Checkpoint, layout, false)?;
+        let spill = SpillDir::create(&spill_dir, layout, false)?;
         let of_commits = CommitConfig { store: spill.format().store, cache_bytes: 1 << 20, reserve_bytes: 1 << 20 };
         let opened = Commits::create(Box::new(DriveFolder::new(&spill_dir)), of_commits)?;
         let engine = open_engine(IoEngine::Pread, &spill_dir, 4)?.store;

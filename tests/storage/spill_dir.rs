@@ -10,7 +10,6 @@ use gsscale::page::engine::page_engine::Place;
 use gsscale::page::engine::segment_files::{SegmentFiles, segment_file_name};
 use gsscale::page::folder::spill_dir::SpillDir;
 use gsscale::page::format::slot_header::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs};
-use gsscale::page::format::spill_format::Purpose;
 use gsscale::page::versions::slots::SlotLayout;
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Write};
@@ -23,7 +22,7 @@ const LAYOUT: SlotLayout = SlotLayout { slot_bytes: 8192, slots_per_segment: 4 }
 const NOBODY: u32 = 65534;
 
 fn create(folder: &Path) -> Result<SpillDir, InputError> {
-    SpillDir::create(folder, Purpose::Scratch, LAYOUT, false)
+    SpillDir::create(folder, LAYOUT, false)
 }
 
 fn is_root() -> bool {
@@ -176,7 +175,7 @@ fn left_over_directories_are_refused_with_the_remedy() {
     assert_refused(&folder, "an interrupted run");
     assert!(create(&folder).unwrap_err().remedy.contains("rm -r"));
     let kept = parent.path().join("kept");
-    let store = SpillDir::create(&kept, Purpose::Checkpoint, LAYOUT, false).unwrap().format().store;
+    let store = SpillDir::create(&kept, LAYOUT, false).unwrap().format().store;
     assert_refused(&kept, "it holds the checkpoint of another run");
     let opened = SpillDir::open(&kept, false).unwrap();
     assert_eq!((opened.format().store, opened.format().layout), (store, LAYOUT));

@@ -15,7 +15,6 @@ use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::{HEADER_BYTES, SlotRef};
-use crate::page::format::spill_format::Purpose;
 use crate::page::map::commit::{Commits, Cut, PageChange};
 use crate::page::map::opening::Opened;
 use crate::page::tool::reading::{ReadError, commit_config};
@@ -67,7 +66,7 @@ impl NewStore {
     /// `target` exists, or the drive fails.
     pub fn create(target: &Path, layout: SlotLayout, codec: Codec) -> Result<NewStore, ReadError> {
         let part = refuse_existing(target)?;
-        let spill = SpillDir::create(&part, Purpose::Checkpoint, layout, false)?;
+        let spill = SpillDir::create(&part, layout, false)?;
         let begin = || -> Result<(Commits, PagedStore), ReadError> {
             let opened: Opened =
                 Commits::create(Box::new(DriveFolder::new(&part)), commit_config(spill.format().store))?;
