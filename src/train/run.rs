@@ -258,10 +258,7 @@ fn train_into(
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
     let origin = begin_files(request, dataset, &trainer, &begun)?;
-    let mut metrics = MetricsLog::open(&out.join(METRICS_FILE), begun.past.as_ref().map(|p| p.metrics_bytes))?;
-    if config.log == LogFormat::Tensorboard {
-        metrics = metrics.with_events(&out.join(EVENTS_FOLDER), begun.past.as_ref().map(|p| p.step))?;
-    }
+    let mut metrics = open_metrics(config.log, out, begun.past.as_ref())?;
     let keeps = tiers.keeps_checkpoint();
     let mut checkpoint = tiers.checkpoint.as_mut();
     if let Some(checkpoint) = &mut checkpoint {
@@ -313,6 +310,15 @@ fn train_into(
     tested?;
     tiers.is_done = summary.finished;
     Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
+}
+
+/// The log of metrics of a new run, or of a run that resumes after `past`.
+fn open_metrics(log: LogFormat, out: &Path, past: Option<&Past>) -> InputResult<MetricsLog> {
+    let metrics = MetricsLog::open(&out.join(METRICS_FILE), past.map(|past| past.metrics_bytes))?;
+    match log {
+        LogFormat::Json => Ok(metrics),
+        LogFormat::Tensorboard => metrics.with_events(&out.join(EVENTS_FOLDER), past.map(|past| past.step)),
+    }
 }
 
 /// Warns if the final PLY differs from the request.
