@@ -172,7 +172,7 @@ fn left_over_directories_are_refused_with_the_remedy() {
     let parent = tempfile::tempdir().unwrap();
     let folder = parent.path().join("spill");
     drop(create(&folder).unwrap());
-    assert_refused(&folder, "an interrupted run");
+    assert_refused(&folder, "it holds the checkpoint of another run");
     assert!(create(&folder).unwrap_err().remedy.contains("rm -r"));
     let kept = parent.path().join("kept");
     let store = SpillDir::create(&kept, LAYOUT, false).unwrap().format().store;
@@ -329,10 +329,10 @@ fn two_processes_never_share_a_directory() {
         assert!(told.contains(&process) && told.contains("remedy"), "{told}");
     }
     assert!(contents(&folder) == before);
-    // The holder is killed: its lock is released, and the folder is recognized as that of an interrupted run.
+    // The holder is killed: its lock is released, and the folder is recognized as another run's.
     holder.kill().unwrap();
     holder.wait().unwrap();
-    assert_refused(&folder, "an interrupted run");
+    assert_refused(&folder, "it holds the checkpoint of another run");
     let in_use = SpillDir::open(&folder, false).unwrap();
     assert!(ask("create", &folder).contains(&format!("process {}", std::process::id())));
     assert_eq!(in_use.remove().unwrap(), [""; 0]);
