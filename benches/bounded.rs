@@ -10,7 +10,8 @@ pub mod support;
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::config::file::{ByteSize, TrainConfig};
+use gsscale::config::file::TrainConfig;
+use gsscale::config::values::ByteSize;
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::page::folder::file_system::free_bytes;
 use gsscale::page::format::slot_header::transfer_bytes;

@@ -24,6 +24,7 @@ use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::gpu::GpuRenderer;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::image::Target;
+use gsscale::train::comparison::Comparison;
 use gsscale::train::pages::PagedScene;
 use gsscale::train::step::train_step;
 use gsscale::train::working_set::WorkingSet;
@@ -127,8 +128,8 @@ fn steps<R: Renderer>(
     let (mut step, mut hash, mut counts, mut counted) = (0, Hash::default(), Counts::default(), false);
     let mut round = |counted: bool| {
         for (camera, target) in &views {
-            let how = (&options.render, &options.loss);
-            let done = train_step(&mut scene, &mut working, renderer, (step, camera, target), how, false, usize::MAX);
+            let how = (&options.render, &Comparison { target, loss: options.loss });
+            let done = train_step(&mut scene, &mut working, renderer, (step, camera), how, false, usize::MAX);
             let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
             hash.add(outcome.loss.loss.to_bits());
             step += 1;

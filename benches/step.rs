@@ -33,6 +33,7 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Columns, row_width};
 use gsscale::scene::image::{Image, Target};
 use gsscale::train::catch_up::{gather, visible_rows};
+use gsscale::train::comparison::Comparison;
 use gsscale::train::pages::{PagedScene, row_tables};
 use gsscale::train::step::train_step;
 use gsscale::train::working_set::WorkingSet;
@@ -166,8 +167,8 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
         rounds.push(time(|| {
             for (camera, target) in &views {
                 renderer.begin = Some(Instant::now());
-                let at = (step, camera, target);
-                let how = (&options.render, &options.loss);
+                let at = (step, camera);
+                let how = (&options.render, &Comparison { target, loss: options.loss });
                 let done = train_step(&mut scene, &mut working, &mut renderer, at, how, true, usize::MAX);
                 let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
                 renderer.note_end();

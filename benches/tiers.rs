@@ -13,8 +13,10 @@ use demand::{Demand, page_bytes};
 use gsscale::base::error::InputError;
 use gsscale::base::machine::process_cpu_split;
 use gsscale::config::choice::Chosen;
-use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides, parse_arguments};
+use gsscale::config::command_line::parse_arguments;
+use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::RunOptions;
+use gsscale::config::values::ByteSize;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::page::folder::drive_rate::DriveRate;
@@ -121,7 +123,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let warm_up = args.warm_up.unwrap_or(dataset.train_views().len() as u32).min(config.steps / 2);
     decode_all(dataset, &targets, &config)?;
     // If this fails, the line has no prediction; the measurements are complete.
-    let rate = DriveRate::of_without_caching(Path::new(&config.spill_dir)).ok();
+    let rate = DriveRate::measure(Path::new(&config.spill_dir)).ok();
     in_turns(&mut contenders, 0..warm_up, args.turn, |c| c.step(dataset, &targets, false))?;
     contenders.iter_mut().for_each(Contender::begin);
     in_turns(&mut contenders, warm_up..config.steps, args.turn, |c| c.step(dataset, &targets, true))?;

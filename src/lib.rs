@@ -1,4 +1,5 @@
 //! gsscale trains 3D Gaussian Splatting scenes. This page is the tour, in the order in which data flows.
+//! At its end: [how to add](#how-to-add) a key, a strategy, a loss term, a format, a resumable value, an eviction order.
 //!
 //! ```text
 //!  photos, poses, points ──> dataset ──> scene (rows in pages, events)      drive
@@ -40,6 +41,52 @@
 //! *view* a photo with its pose, a *target* its pixels, a *tile* 16x16 pixels, a *stage* one kernel of the pipeline,
 //! a *batch* the part of a view's rows that a renderer takes in at once, a *step* one optimizer iteration, an *event* one global change that every row applies. A *page* is a group of rows that
 //! travel together, a *slot* its place on disk, a *frame* its place in memory, a *plan* which pages coming steps need.
+//!
+//! # How to add
+//!
+//! Each list names the files in the order in which they change; paths are below `src` unless they say so. `cargo nextest run`
+//! names what is forgotten: an undocumented key, a word that is not read, a state that does not come back, an
+//! import that points the wrong way.
+//!
+//! **A config key**
+//! 1. `config/file.rs`: one line in the list gives field, flag, help, default and the effect of a change
+//!    ([`config::key::Class`]).
+//! 2. `config/check.rs`: its range. An enumeration needs its words instead: one line in `config/choice.rs`.
+//! 3. `config/limits.rs`: the options of the room that obeys the key. The room itself never sees the config.
+//! 4. `configs/default.toml`: `GSSCALE_WRITE_DEFAULT_CONFIG=1 cargo test --test inputs default_file` writes the
+//!    file again.
+//!
+//! **A densification strategy**
+//! 1. `densify/strategy.rs` states the steps: a file with the [`densify::strategy::Strategy`], its name, and an
+//!    event kind in `scene/events.rs` if a round needs other values than today's.
+//! 2. `config/choice.rs`: the word of `--strategy`. `config/file.rs`: the keys. `config/limits.rs`: keys to
+//!    strategy.
+//!
+//! **A loss term, or a correction of the picture such as an exposure per photo**
+//! 1. `train/comparison.rs`: the one place between picture and gradient, for steps and rehearsals. It works on the
+//!    CPU and on devices through [`render::Renderer::picture_mut`] and [`render::Renderer::picture_gradient`]. What
+//!    it needs is a field of [`train::comparison::Comparison`].
+//! 2. `train/trainer.rs`: fills that field, in `step` and in `probe_views`.
+//! 3. `train/step.rs`, after `loss_value`: adds the term to the loss that is logged.
+//! 4. The weight is a config key; parameters that are trained are a resumable value.
+//! 5. Only if its time matters: the stage itself, `kernels/image_loss.rs` and `image_loss.wgsl` among the shaders.
+//!
+//! **An output format**
+//! 1. `exchange/` gets a file beside `exchange/ply/write.rs`, with the same three calls: create, write rows,
+//!    finish. [`base::whole_file::PartFile`] makes the file appear as a whole. `exchange/mod.rs` names the file.
+//! 2. `train/trainer.rs`, `save`: what a run writes. `train/stores/export.rs`: what `gsscale-ckpt export` writes.
+//! 3. `report/run_files.rs`: the name in a run's folder, so that `--overwrite` removes the file.
+//!
+//! **A resumable value**
+//! 1. `checkpoint/run_state.rs`: a field of [`checkpoint::run_state::TrainerState`], a place in `encode` and
+//!    `decode`, a new `VERSION`, and in `check` which values are impossible.
+//! 2. `train/trainer.rs`: uses `self.state`. Commits and resumes need no change.
+//! 3. `tests/programs/ckpt/fixture.rs` says how the store that later versions must open is written again.
+//!
+//! **An eviction order**
+//! 1. `paging/frames/evict.rs`: a value of [`paging::frames::evict::EvictPolicy`], its key of the order, and
+//!    whether the order ignores the plan. Runs, look-ahead and simulations share it.
+//! 2. `config/choice.rs`: the word of `--evict`. `config/file.rs`: the help of the key.
 
 pub mod base;
 pub mod checkpoint;

@@ -34,7 +34,7 @@ mod step;
 mod tiers;
 
 use clap::Parser;
-use gsscale::config::file::parse_arguments;
+use gsscale::config::command_line::parse_arguments;
 use gsscale::train::error::TrainError;
 use scene_of_a_bench::{large_city, number};
 use scenes::{city, text};

@@ -132,28 +132,14 @@ fn the_layer_reader_sees_what_it_should() {
     assert_eq!(named_layers(text), ["scene", "optim", "base"]);
 }
 
-/// Rooms, and folders of rooms, whose files form no circle.
-const ROOMS_WITHOUT_CIRCLES: &[&str] = &[
-    "base",
-    "config",
-    "dataset",
-    "exchange",
-    "gpu",
-    "kernels",
-    "train",
-    "page",
-    "page/engine",
-    "page/folder",
-    "page/format",
-    "page/map",
-    "page/tool",
-    "page/versions",
-    "paging",
-    "densify",
-    "optim",
-    "scene",
-    "schedule",
-];
+/// Rooms, and folders of rooms.
+fn rooms() -> Vec<String> {
+    let names = rust_files(&["src"]).into_iter().map(|(name, _)| name);
+    let folder = |name: String| Some(Path::new(name.strip_prefix("src/")?).parent()?.to_str()?.to_string());
+    let mut rooms: Vec<String> = names.filter_map(folder).filter(|room| !room.is_empty()).collect();
+    rooms.dedup();
+    rooms
+}
 
 /// Files of a room (a folder in it counts as one) that a file of the room imports, tests left out.
 fn imported_files(room: &str, name: &str, text: &str) -> Vec<String> {
@@ -196,7 +182,9 @@ fn circle_from(at: &str, edges: &BTreeMap<String, Vec<String>>) -> Option<Vec<St
 
 #[test]
 fn files_of_a_room_form_no_circle() {
-    for room in ROOMS_WITHOUT_CIRCLES {
+    let rooms = rooms();
+    assert!(rooms.len() > 30, "{rooms:?}");
+    for room in &rooms {
         let mut edges: BTreeMap<String, Vec<String>> = BTreeMap::new();
         for (name, text) in rust_files(&[&format!("src/{room}")]) {
             let inside = name.strip_prefix(&format!("src/{room}/")).unwrap();
@@ -260,6 +248,30 @@ fn files_say_what_they_are_and_leave_no_markers() {
         }
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// Files that the comments of a text name.
+fn named_files(text: &str) -> Vec<&str> {
+    let is_path = |c: char| c.is_alphanumeric() || "_/.".contains(c);
+    let comments = text.lines().filter_map(|line| Some(line.split_once("//")?.1));
+    let words = comments.flat_map(|comment| comment.split(move |c| !is_path(c)));
+    words.map(|word| word.trim_end_matches('.')).filter(|w| w.ends_with(".rs") || w.ends_with(".wgsl")).collect()
+}
+
+#[test]
+fn files_that_comments_name_exist() {
+    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
+    let mut wrong = Vec::new();
+    for (name, text) in rust_files(&["src", "tools", "benches"]) {
+        let folders = Path::new(&name).ancestors().skip(1).map(Path::to_path_buf);
+        let folders: Vec<PathBuf> = folders.chain(["src".into(), "shaders".into()]).collect();
+        let exists = |file: &str| folders.iter().any(|folder| root.join(folder).join(file).is_file());
+        // A file x stands for any.
+        let missing = named_files(&text).into_iter().filter(|file| !exists(file) && !file.ends_with("/x.wgsl"));
+        wrong.extend(missing.map(|file| format!("{name} names {file}")));
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    assert_eq!(named_files("let a; // see `b/c.rs`, d.wgsl.\nlet e = \"f.rs\";"), ["b/c.rs", "d.wgsl"]);
 }
 
 /// Functions are found by their closing brace at the indentation of their `fn`, which rustfmt guarantees.

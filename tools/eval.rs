@@ -2,11 +2,13 @@
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
+use gsscale::base::whole_file::write_whole;
+use gsscale::config::command_line::parse_command_line;
+use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::render::lpips::InputRange;
+use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::eval::{EvalExtras, evaluate_ply};
-use gsscale::train::whole_file::write_whole;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -56,7 +58,7 @@ fn main() -> ExitCode {
 
 fn start(args: Args) -> Result<(), TrainError> {
     let (ply, run_config) = if args.model.is_dir() {
-        (args.model.join("point_cloud.ply"), Some(args.model.join("config.toml")))
+        (args.model.join(PLY_FILE), Some(args.model.join(CONFIG_FILE)))
     } else {
         (args.model.clone(), None)
     };

@@ -5,7 +5,9 @@ use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::units::{format_bytes, format_seconds};
 use gsscale::config::choice::Chosen;
-use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides, parse_command_line};
+use gsscale::config::command_line::parse_command_line;
+use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::config::values::ByteSize;
 use gsscale::optim::method::Method;
 use gsscale::page::folder::drive_rate::DriveRate;
 use gsscale::page::format::slot_header::transfer_bytes;
@@ -14,6 +16,7 @@ use gsscale::paging::plan::cache_model::{CacheModel, StepChange, TooFewFrames};
 use gsscale::paging::plan::steps::Plan;
 use gsscale::paging::simulation::auto::automatic_order;
 use gsscale::paging::simulation::replay::{DriveModel, Figures, Replay, ReplayOptions, Stall, WINDOW_STEPS, replay};
+use gsscale::report::run_files::CONFIG_FILE;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::scene::page_meta::PageMeta;
@@ -180,7 +183,7 @@ fn start(args: &Args) -> InputResult<String> {
 }
 
 fn load(args: &Args) -> InputResult<Scene> {
-    let run_config = args.scene.join("config.toml");
+    let run_config = args.scene.join(CONFIG_FILE);
     let is_run = run_config.is_file();
     let config_path = args.config.clone().or_else(|| is_run.then(|| run_config.clone()));
     let mut config = config_path.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
@@ -249,7 +252,7 @@ fn drive_rates(args: &Args, config: &TrainConfig) -> InputResult<[f64; 2]> {
     let measured = match named {
         [Some(_), Some(_)] => COMMON_DRIVE,
         _ if config.residence().spill_dir().is_none() => COMMON_DRIVE,
-        _ => DriveRate::of_without_caching(&folder_for(config)).map(|rate| [rate.read, rate.write])?,
+        _ => DriveRate::measure(&folder_for(config)).map(|rate| [rate.read, rate.write])?,
     };
     Ok([0, 1].map(|way| named[way].unwrap_or(measured[way])))
 }

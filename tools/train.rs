@@ -2,8 +2,10 @@
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
+use gsscale::config::command_line::parse_command_line;
+use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
+use gsscale::report::run_files::CONFIG_FILE;
 use gsscale::train::error::TrainError;
 use gsscale::train::out_folder::{Existing, remedy_of_existing};
 use gsscale::train::resume::{ResumeRequest, resume};
@@ -141,7 +143,7 @@ fn demo_scene(out: &Path, config: &TrainConfig, overwrite: bool, quiet: bool) ->
     if !overwrite && (is_taken || out.is_file()) {
         return Err(InputError::new(out, "exists already", remedy_of_existing(out)).into());
     }
-    let same_seed = TrainConfig::read(&out.join("config.toml")).is_ok_and(|earlier| earlier.seed == config.seed);
+    let same_seed = TrainConfig::read(&out.join(CONFIG_FILE)).is_ok_and(|earlier| earlier.seed == config.seed);
     if same_seed && scene.join("sparse/0/points3D.bin").is_file() {
         return Ok(scene);
     }

@@ -38,8 +38,7 @@ impl InputError {
 
     /// Whether the error is only a lack of disk space.
     pub fn is_out_of_space(&self) -> bool {
-        use std::io::ErrorKind as K;
-        matches!(self.kind, Some(K::StorageFull | K::QuotaExceeded | K::FileTooLarge))
+        self.kind.is_some_and(is_out_of_space)
     }
 
     /// The same error with its place inside the file.
@@ -63,6 +62,13 @@ impl InputError {
         };
         InputError { kind: Some(source.kind()), ..InputError::new(file, format!("{doing} failed: {source}"), remedy) }
     }
+}
+
+/// Whether the system refused bytes for lack of space; then nothing was written. A limit on the length of files counts,
+/// too.
+pub fn is_out_of_space(kind: std::io::ErrorKind) -> bool {
+    use std::io::ErrorKind as K;
+    matches!(kind, K::StorageFull | K::QuotaExceeded | K::FileTooLarge)
 }
 
 impl fmt::Display for InputError {

@@ -1,4 +1,5 @@
-//! Shared by every layer: errors, identities, random draws, deterministic math, instruction paths, sizes. Knows neither
+//! Shared by every layer: errors, identities, random draws, deterministic math, instruction paths, sizes, files that
+//! are written whole. Knows neither
 //! Gaussians, pictures nor disk formats.
 
 #[cfg(target_arch = "x86_64")]
@@ -14,3 +15,4 @@ pub mod room;
 pub mod say;
 pub mod simd;
 pub mod units;
+pub mod whole_file;

@@ -189,8 +189,7 @@ fn automatic(cost: CommitCost) -> f64 {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
-
-    const GIB: u64 = 1 << 30;
+    use crate::base::units::GIB;
 
     fn cost(waited: f64, until_durable: f64, bytes: u64) -> CommitCost {
         CommitCost { waited, until_durable, bytes, at_risk: 0.0 }

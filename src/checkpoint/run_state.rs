@@ -4,8 +4,9 @@
 //! another program version is distinguished from damage; 3. decoding untrusted bytes gives a valid state or an error,
 //! never a panic.
 //!
-//! Layout: [`VERSION`] as u32, then the fields of [`RunState`] in their order, as [`crate::page::format::encoding`]
-//! writes them. Only version 4 is read; no program was released with versions 1 to 3.
+//! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
+//! [`crate::page::format::encoding`] writes them. Only version 4 is read; no program was released with versions 1 to 3.
+//! A new value is a field of [`TrainerState`], a place at the end of `encode` and `decode`, and a new version.
 
 use crate::base::identity::RunId;
 use crate::page::format::encoding::{self, EncodingError};
@@ -68,29 +69,27 @@ pub struct RunIdentity {
     pub scene: String,
 }
 
-/// The state of a run between two steps, without its pages.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct RunState {
-    /// Steps done.
-    pub step: u32,
+/// How a run was started. Constant while it runs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Origin {
     /// The config, every key, as TOML.
     pub config: String,
     /// Resolved instruction path.
     pub simd: String,
-    /// Name of the renderer.
-    pub device: String,
     /// SH degree of the first step.
     pub sh_degree_start: u8,
     /// The dataset.
     pub dataset: DatasetPrint,
-    /// The event log.
-    pub events: Vec<Event>,
-    /// Histogram since the last round: non-empty bins with their numbers of rows.
-    pub histogram: Vec<(u16, u32)>,
-    /// Rows of the stored pages.
-    pub rows: u64,
-    /// Upper bound of the rows after all events.
-    pub rows_bound: u64,
+    /// Identity and paths of the run.
+    pub run: RunIdentity,
+}
+
+/// The part of a run's state that the trainer itself holds and changes. A commit saves it whole, and a resume restores
+/// it whole.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct TrainerState {
+    /// Steps done.
+    pub step: u32,
     /// Row updates skipped because a value was not finite.
     pub rows_skipped: u64,
     /// Steps skipped because the loss was not finite.
@@ -99,14 +98,31 @@ pub struct RunState {
     pub steps_skipped_in_a_row: u32,
     /// Seconds spent in steps.
     pub train_seconds: f64,
+    /// The last evaluation on the held-out views, if there was one.
+    pub test: Option<LastTest>,
+}
+
+/// The state of a run between two steps, without its pages.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RunState {
+    /// How the run was started.
+    pub origin: Origin,
+    /// Name of the renderer.
+    pub device: String,
+    /// The state of the trainer.
+    pub trainer: TrainerState,
+    /// The event log.
+    pub events: Vec<Event>,
+    /// Histogram since the last round: non-empty bins with their numbers of rows.
+    pub histogram: Vec<(u16, u32)>,
+    /// Rows of the stored pages.
+    pub rows: u64,
+    /// Upper bound of the rows after all events.
+    pub rows_bound: u64,
     /// Length of metrics.jsonl.
     pub metrics_bytes: u64,
-    /// The last evaluation, if there was one.
-    pub test: Option<LastTest>,
     /// Traffic between the tiers so far.
     pub traffic: PagerStats,
-    /// Identity and paths of the run.
-    pub run: RunIdentity,
 }
 
 /// Why bytes are not the state of a run.
@@ -125,26 +141,18 @@ pub enum RunStateError {
 
 impl RunState {
     /// The state of a run of `rows` Gaussians without history: not trained yet, or history unknown.
-    pub fn without_past(config: String, simd: String, dataset: DatasetPrint, rows: u64) -> RunState {
+    pub fn without_past(origin: Origin, device: String, rows: u64) -> RunState {
+        let dataset = DatasetPrint { first_rows: rows, ..origin.dataset };
         RunState {
-            step: 0,
-            config,
-            simd,
-            device: String::new(),
-            sh_degree_start: 0,
-            dataset: DatasetPrint { first_rows: rows, ..dataset },
+            origin: Origin { dataset, ..origin },
+            device,
+            trainer: TrainerState::default(),
             events: Vec::new(),
             histogram: Vec::new(),
             rows,
             rows_bound: rows,
-            rows_skipped: 0,
-            steps_skipped: 0,
-            steps_skipped_in_a_row: 0,
-            train_seconds: 0.0,
             metrics_bytes: 0,
-            test: None,
             traffic: PagerStats::default(),
-            run: RunIdentity::default(),
         }
     }
 
@@ -154,7 +162,7 @@ impl RunState {
     /// None for a valid state.
     pub fn to_bytes(&self) -> Result<Vec<u8>, RunStateError> {
         let mut bytes = VERSION.to_le_bytes().to_vec();
-        bytes.extend(encoding::to_bytes(self)?);
+        bytes.extend(self.encode()?);
         Ok(bytes)
     }
 
@@ -168,9 +176,35 @@ impl RunState {
         if version != VERSION {
             return Err(RunStateError::Version(version));
         }
-        let state: RunState = encoding::from_bytes(body)?;
+        let state = RunState::decode(body)?;
         state.check()?;
         Ok(state)
+    }
+
+    /// The values in the order of the layout. Tuples add no byte; serde implements tuples of at most 16 values.
+    fn encode(&self) -> Result<Vec<u8>, EncodingError> {
+        let RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic } = self;
+        let Origin { config, simd, sh_degree_start, dataset, run } = origin;
+        let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, test } = trainer;
+        encoding::to_bytes(&(
+            (step, config, simd, device, sh_degree_start, dataset),
+            (events, histogram, rows, rows_bound),
+            (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
+            (metrics_bytes, test, traffic, run),
+        ))
+    }
+
+    /// The counterpart of [`RunState::encode`].
+    fn decode(bytes: &[u8]) -> Result<RunState, EncodingError> {
+        let (
+            (step, config, simd, device, sh_degree_start, dataset),
+            (events, histogram, rows, rows_bound),
+            (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
+            (metrics_bytes, test, traffic, run),
+        ) = encoding::from_bytes(bytes)?;
+        let origin = Origin { config, simd, sh_degree_start, dataset, run };
+        let trainer = TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, test };
+        Ok(RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic })
     }
 
     /// The events as a log.
@@ -184,11 +218,11 @@ impl RunState {
     fn check(&self) -> Result<(), RunStateError> {
         let log = self.event_log()?;
         let refuse = |what| Err(RunStateError::Impossible(what));
-        if log.events().last().is_some_and(|last| last.step >= self.step) {
+        if log.events().last().is_some_and(|last| last.step >= self.trainer.step) {
             return refuse("an event lies in its future");
         }
         let is_too_high = |e: &Event| matches!(e.kind, EventKind::RaiseShDegree { degree } if degree > 3);
-        if self.sh_degree_start > 3 || log.events().iter().any(is_too_high) {
+        if self.origin.sh_degree_start > 3 || log.events().iter().any(is_too_high) {
             return refuse("a degree is above 3");
         }
         // The logit of any other value is infinite or NaN.
@@ -202,18 +236,17 @@ impl RunState {
         if !ascends || self.histogram.last().is_some_and(|last| last.0 >= BINS) {
             return refuse("its statistics have bins that do not exist");
         }
-        let DatasetPrint { origin, scale, .. } = &self.dataset;
+        let DatasetPrint { origin, scale, .. } = &self.origin.dataset;
         if !(origin.iter().all(|x| x.is_finite()) && scale.is_normal() && *scale > 0.0) {
             return refuse("its local frame is invalid");
         }
         let is_time = |seconds: f64| seconds >= 0.0 && seconds.is_finite();
-        if !is_time(self.train_seconds)
-            || !is_time(self.traffic.stall_seconds)
-            || !is_time(self.traffic.other_stall_seconds)
+        let TrainerState { step, train_seconds, test, .. } = self.trainer;
+        if !is_time(train_seconds) || !is_time(self.traffic.stall_seconds) || !is_time(self.traffic.other_stall_seconds)
         {
             return refuse("its training or waiting time is invalid");
         }
-        if self.test.is_some_and(|test| test.step > self.step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
+        if test.is_some_and(|test| test.step > step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
             return refuse("its last evaluation is invalid");
         }
         Ok(())
@@ -236,40 +269,44 @@ mod tests {
             Event { step: 8, kind: EventKind::ResetOpacity { max_opacity: 0.01 } },
         ];
         RunState {
-            step: 9,
-            config: "steps = 20\n".to_string(),
-            simd: "avx2".to_string(),
+            origin: Origin {
+                config: "steps = 20\n".to_string(),
+                simd: "avx2".to_string(),
+                sh_degree_start: 0,
+                dataset: DatasetPrint {
+                    views: vec![ViewPrint { pose: 5, photo: u64::MAX }, ViewPrint { pose: 0, photo: 1 }],
+                    first_rows: 7,
+                    points: 3,
+                    scene_scale: 1.25,
+                    origin: [5e5, -0.0, 1.0],
+                    scale: 2.5,
+                },
+                run: RunIdentity {
+                    id: "00112233445566778899aabbccddeeff".parse().unwrap(),
+                    out: "/runs/a".to_string(),
+                    scene: "/scans/a".to_string(),
+                },
+            },
             device: "cpu".to_string(),
-            sh_degree_start: 0,
-            dataset: DatasetPrint {
-                views: vec![ViewPrint { pose: 5, photo: u64::MAX }, ViewPrint { pose: 0, photo: 1 }],
-                first_rows: 7,
-                points: 3,
-                scene_scale: 1.25,
-                origin: [5e5, -0.0, 1.0],
-                scale: 2.5,
+            trainer: TrainerState {
+                step: 9,
+                rows_skipped: 1,
+                steps_skipped: 2,
+                steps_skipped_in_a_row: 1,
+                train_seconds: 0.1,
+                test: Some(LastTest { step: 8, views: 3, psnr: 21.5, ssim: 0.75 }),
             },
             events: events.to_vec(),
             histogram: vec![(3, 1), (32767, 9)],
             rows: 10,
             rows_bound: 12,
-            rows_skipped: 1,
-            steps_skipped: 2,
-            steps_skipped_in_a_row: 1,
-            train_seconds: 0.1,
             metrics_bytes: 1234,
-            test: Some(LastTest { step: 8, views: 3, psnr: 21.5, ssim: 0.75 }),
             traffic: PagerStats {
                 bytes_read: 9,
                 stall_seconds: 0.25,
                 other_bytes_read: 4,
                 belady_bytes_read: 3,
                 ..PagerStats::default()
-            },
-            run: RunIdentity {
-                id: "00112233445566778899aabbccddeeff".parse().unwrap(),
-                out: "/runs/a".to_string(),
-                scene: "/scans/a".to_string(),
             },
         }
     }
@@ -292,21 +329,21 @@ mod tests {
             let bytes = state.to_bytes().unwrap();
             assert!(matches!(RunState::from_bytes(&bytes), Err(RunStateError::Impossible(_))));
         };
-        refused(|s| s.step = 8);
+        refused(|s| s.trainer.step = 8);
         refused(|s| s.events.reverse());
         refused(|s| s.events[0].kind = EventKind::ResetOpacity { max_opacity: 0.0 });
         refused(|s| s.events[0].kind = EventKind::ResetOpacity { max_opacity: 1.0 });
         refused(|s| s.events[0].kind = EventKind::ResetOpacity { max_opacity: f32::NAN });
-        refused(|s| s.sh_degree_start = 4);
+        refused(|s| s.origin.sh_degree_start = 4);
         refused(|s| s.histogram = vec![(32768, 1)]);
         refused(|s| s.histogram.reverse());
-        refused(|s| s.train_seconds = f64::NAN);
+        refused(|s| s.trainer.train_seconds = f64::NAN);
         refused(|s| s.traffic.stall_seconds = -1.0);
         refused(|s| s.traffic.other_stall_seconds = f64::INFINITY);
-        refused(|s| s.test = s.test.map(|t| LastTest { step: 10, ..t }));
-        refused(|s| s.test = s.test.map(|t| LastTest { psnr: f64::NAN, ..t }));
-        refused(|s| s.dataset.scale = 0.0);
-        refused(|s| s.dataset.origin[1] = f64::INFINITY);
+        refused(|s| s.trainer.test = s.trainer.test.map(|t| LastTest { step: 10, ..t }));
+        refused(|s| s.trainer.test = s.trainer.test.map(|t| LastTest { psnr: f64::NAN, ..t }));
+        refused(|s| s.origin.dataset.scale = 0.0);
+        refused(|s| s.origin.dataset.origin[1] = f64::INFINITY);
     }
 
     #[test]

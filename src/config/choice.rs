@@ -125,25 +125,11 @@ choices! {
     "ssim-padding": SsimPadding { Valid = "valid", Same = "same" }
     "optimizer": Method { Deferred = "deferred", Dense = "dense", Sparse = "sparse" }
     "moments": Moments { F32 = "f32", Bf16 = "bf16" }
+    "strategy": StrategyName { Default = "default", None = "none" }
     "log": LogFormat { Json = "json", Tensorboard = "tensorboard" }
     "ssim-variant": SsimVariant { Same = "same", Valid = "valid", Reflect = "reflect" }
     "export-frame": ExportFrame { Dataset = "dataset", Local = "local" }
 }
-
-impl Choice for StrategyName {
-    const KEY: &'static str = "strategy";
-    const WORDS: &'static [&'static str] = &StrategyName::NAMES;
-
-    fn from_word(word: &str) -> Option<StrategyName> {
-        StrategyName::from_name(word)
-    }
-
-    fn word(&self) -> Cow<'static, str> {
-        Cow::Borrowed(self.name())
-    }
-}
-
-reading_and_writing!(StrategyName);
 
 /// Implements [`Choice`] for optional choices, with their word for `None`.
 macro_rules! open_choices {

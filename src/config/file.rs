@@ -1,19 +1,21 @@
 //! The keys of a run: one list defines the TOML file, the command line, the defaults and the class of each key.
 //!
+//! Not here: ranges (`check`), help and configs/default.toml ([`super::command_line`]), words of enumerations
+//! ([`super::choice`]).
+//!
 //! Invariants: 1. a key has the same kebab-case spelling in the file and as a flag; 2. flags override the file, the
 //! file overrides the defaults; 3. unknown keys are refused; 4. the config.toml of a run is a valid config file; its
 //! `[resolved]` table and the tables of [`super::published`] hold facts and are ignored when read.
 
 use super::choice::{Chosen, Device, LogFormat};
 use super::key::{Class, Key};
+use super::values::{ByteSize, Rgb};
 use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
-use crate::base::units::parse_bytes;
 use crate::checkpoint::interval::CommitEvery;
 use crate::densify::strategy::StrategyName;
 use crate::exchange::ply::ExportFrame;
 use crate::gpu::DeviceChoice;
-use crate::optim::adam::EPS_MIN;
 use crate::optim::method::Method;
 use crate::optim::moments::Moments;
 use crate::page::engine::open::IoEngine;
@@ -34,17 +36,6 @@ pub(super) const TABLES: [&str; 3] = ["resolved", "published", "tier"];
 
 /// Longest config file, bytes; a file with every key has some 8 KB.
 const FILE_BYTES_MAX: u64 = 1 << 20;
-/// Most steps of a run: the optimizer keeps 88 bytes for each.
-const STEPS_MAX: u32 = 10_000_000;
-/// Most random points to start from.
-const INIT_POINTS_MAX: u32 = 100_000_000;
-/// Most worker threads: a typing error must not fill memory with stacks.
-const THREADS_MAX: u32 = 1024;
-
-/// Fewest and most rows of a page: below, the index and the headers outweigh the rows; above, a page is 48 MB.
-const PAGE_ROWS_MIN: u32 = 16;
-const PAGE_ROWS_MAX: u32 = 65_536;
-
 macro_rules! config_keys {
     ($($heading:literal { $( $(#[doc = $doc:literal])+ $([$($arg:tt)+])? $name:ident: $ty:ty = $default:expr => $class:ident; )+ })+) => {
         /// All keys of a run with their values.
@@ -207,8 +198,8 @@ config_keys! {
         frames: u32 = 0 => Free;
         /// I/O engine for pages: auto, uring, mmap or pread. Never changes results
         io: IoEngine = IoEngine::Auto => Free;
-        /// Codec of stored pages: raw, halves (for --moments bf16), zstd:LEVEL, or auto (by the speed of the drive and
-        /// --moments). Never changes results
+        /// Codec of stored pages: raw, halves (for --moments bf16), zstd:LEVEL, or auto (halves for --moments bf16, else
+        /// raw; gsscale-iotune advises zstd for slow drives). Never changes results
         spill_codec: Chosen<Codec> = Chosen(None) => Free;
         /// Seconds between commits, which is the most that a killed run loses. 0 = only on a stop request and after the
         /// last step. auto = 10 to 60, so that commits delay training by less than 1 %; longer if commits would write
@@ -239,50 +230,6 @@ config_keys! {
     }
 }
 
-/// A number of bytes, written as `4GiB`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ByteSize(pub u64);
-
-impl std::str::FromStr for ByteSize {
-    type Err = String;
-    fn from_str(text: &str) -> Result<Self, String> {
-        parse_bytes(text).map(ByteSize)
-    }
-}
-
-impl Serialize for ByteSize {
-    fn serialize<S: serde::Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
-        let units = [(1u64 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")];
-        let text = units
-            .iter()
-            .find(|(unit, _)| self.0 > 0 && self.0.is_multiple_of(*unit))
-            .map_or_else(|| self.0.to_string(), |(unit, name)| format!("{}{name}", self.0 / unit));
-        s.serialize_str(&text)
-    }
-}
-
-impl<'de> Deserialize<'de> for ByteSize {
-    fn deserialize<D: serde::Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
-        let text = String::deserialize(d)?;
-        text.parse().map_err(serde::de::Error::custom)
-    }
-}
-
-/// A colour: three numbers in 0..1, in the file `[0.0, 0.0, 0.0]`, on the command line `0,0,0`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Rgb(pub [f64; 3]);
-
-impl std::str::FromStr for Rgb {
-    type Err = String;
-    fn from_str(text: &str) -> Result<Self, String> {
-        let values: Result<Vec<f64>, _> = text.split(',').map(|v| v.trim().parse::<f64>()).collect();
-        match values.as_deref() {
-            Ok(&[r, g, b]) => Ok(Rgb([r, g, b])),
-            _ => Err(format!("'{text}' is not a colour; write R,G,B with numbers in 0..1")),
-        }
-    }
-}
-
 impl TrainConfig {
     /// Reads a config file over the defaults.
     pub fn read(path: &Path) -> InputResult<TrainConfig> {
@@ -304,185 +251,6 @@ impl TrainConfig {
         }
         TrainConfig::deserialize(table).map_err(|e| e.to_string())
     }
-
-    /// Checks ranges and relations between keys.
-    ///
-    /// # Errors
-    /// Names the first key that is out of range, with what is allowed.
-    pub fn check(&self) -> InputResult<()> {
-        let positive = |x: f64| x.is_finite() && x > 0.0;
-        if !positive(self.data_factor) || self.data_factor < 1.0 {
-            return refuse("data-factor", "1 or more");
-        }
-        if !positive(self.near_plane) {
-            return refuse("near-plane", "a positive number");
-        }
-        if self.sh_degree > 3 {
-            return refuse("sh-degree", "0, 1, 2 or 3");
-        }
-        if self.sh_start > self.sh_degree {
-            return refuse("sh-start", "0 to --sh-degree");
-        }
-        if !(PAGE_ROWS_MIN..=PAGE_ROWS_MAX).contains(&self.page_rows) {
-            return refuse("page-rows", "16 to 65536");
-        }
-        if self.steps == 0 || self.steps > STEPS_MAX {
-            return refuse("steps", "1 to 10,000,000");
-        }
-        if self.schedule_steps > STEPS_MAX {
-            return refuse("schedule-steps", "0 to 10,000,000");
-        }
-        if self.max_gaussians >= u64::from(u32::MAX) {
-            return refuse("max-gaussians", "less than 4,294,967,295, or 0 for no cap");
-        }
-        if self.init_points > INIT_POINTS_MAX {
-            return refuse("init-points", "0 to 100,000,000");
-        }
-        if self.threads > THREADS_MAX {
-            return refuse("threads", "0 to 1024");
-        }
-        if !(0.0..=1.0).contains(&self.ssim_lambda) {
-            return refuse("ssim-lambda", "0 to 1");
-        }
-        if !(self.init_opacity > 0.0 && self.init_opacity < 1.0) {
-            return refuse("init-opacity", "a number between 0 and 1");
-        }
-        if !positive(self.init_scale) {
-            return refuse("init-scale", "a positive number");
-        }
-        if !(self.max_alpha > 0.5 && self.max_alpha < 1.0) {
-            return refuse("max-alpha", "a number between 0.5 and 1, such as 0.99 or 0.999");
-        }
-        if self.background.0.iter().any(|c| !(0.0..=1.0).contains(c)) {
-            return refuse("background", "three numbers in 0..1");
-        }
-        if self.refine_every == 0 {
-            return refuse("refine-every", "1 or more");
-        }
-        if matches!(self.commit_every, CommitEvery::Seconds(s) if !(s >= 0.0 && s.is_finite())) {
-            return refuse("commit-every", "auto, or a number of seconds from 0 on");
-        }
-        if !(0.0..=1e9).contains(&self.disk_full_wait) {
-            return refuse("disk-full-wait", "a number of seconds from 0 on");
-        }
-        if self.log_every == 0 {
-            return refuse("log-every", "1 or more");
-        }
-        self.check_thresholds()?;
-        self.check_rates()
-    }
-
-    fn check_thresholds(&self) -> InputResult<()> {
-        let thresholds = [
-            ("grow-grad2d", self.grow_grad2d),
-            ("grow-scale3d", self.grow_scale3d),
-            ("prune-opa", self.prune_opa),
-            ("prune-scale3d", self.prune_scale3d),
-        ];
-        for (key, value) in thresholds {
-            if !(value >= 0.0 && value.is_finite()) {
-                return refuse(key, "a number from 0 on");
-            }
-        }
-        // Compare in f32, as events store the value.
-        if self.prune_opa as f32 >= 0.5 {
-            return refuse("prune-opa", "less than 0.5");
-        }
-        Ok(())
-    }
-
-    fn check_rates(&self) -> InputResult<()> {
-        let rates = [
-            ("means-lr", self.means_lr),
-            ("scales-lr", self.scales_lr),
-            ("quats-lr", self.quats_lr),
-            ("opacities-lr", self.opacities_lr),
-            ("sh0-lr", self.sh0_lr),
-            ("shn-lr", self.shn_lr),
-        ];
-        for (key, value) in rates {
-            if !(0.0..=1e6).contains(&value) {
-                return refuse(key, "a number from 0 to 1e6");
-            }
-        }
-        if !(self.means_lr_final > 0.0 && self.means_lr_final <= 1.0) {
-            return refuse("means-lr-final", "a number above 0 and up to 1");
-        }
-        self.check_adam_eps()
-    }
-
-    /// Checks Adam's epsilon; separate for the config of a checkpoint.
-    ///
-    /// # Errors
-    /// The epsilon is out of range.
-    pub fn check_adam_eps(&self) -> InputResult<()> {
-        if (EPS_MIN..=1.0).contains(&self.adam_eps) {
-            return Ok(());
-        }
-        let problem = format!(
-            "{:e} is out of range: below 1e-16, second moments that f32 rounds to zero let Gaussians leave the bounds \
-             of their pages; above 1, training stands still",
-            self.adam_eps
-        );
-        Err(InputError::new("--adam-eps", problem, "use 1e-16 to 1; 1e-15 is usual"))
-    }
-}
-
-/// The error about a key whose value is out of range.
-fn refuse(key: &str, allowed: &str) -> InputResult<()> {
-    Err(InputError::new(format!("--{key}"), "the value is out of range", format!("use {allowed}")))
-}
-
-/// Parses the command line of a program with [`TrainOverrides`]; prints help and usage errors and exits.
-pub fn parse_command_line<T: clap::CommandFactory + clap::FromArgMatches>() -> T {
-    parse_arguments(&std::env::args_os().collect::<Vec<_>>())
-}
-
-/// As [`parse_command_line`], for given arguments, starting with the program's name.
-pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[std::ffi::OsString]) -> T {
-    let matches = help_with_defaults(T::command()).get_matches_from(arguments);
-    T::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
-}
-
-/// Adds the default of each key to its help. Flags have no clap defaults, because an absent flag must keep the config
-/// file's value.
-fn help_with_defaults(mut command: clap::Command) -> clap::Command {
-    let defaults = toml::Table::try_from(TrainConfig::default()).unwrap_or_default();
-    for key in KEYS {
-        let Some(value) = defaults.get(&key.name()) else { continue };
-        let value = value.as_str().map_or_else(|| value.to_string(), str::to_string);
-        if value.is_empty() {
-            continue;
-        }
-        command = command.mut_arg(key.field, |arg| {
-            let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
-            arg.help(format!("{help} [default: {value}]"))
-        });
-    }
-    command
-}
-
-/// The text of configs/default.toml: every key with its meaning and default.
-pub fn default_file() -> String {
-    let defaults = toml::Table::try_from(TrainConfig::default()).unwrap_or_default();
-    let mut text = String::from(
-        "# Every key with its meaning and default. A config file needs only the keys that it changes;\n\
-         # flags of the same name override it.\n",
-    );
-    let mut last_heading = "";
-    for key in KEYS {
-        if key.heading != last_heading {
-            text.push_str(&format!("\n## {}\n", key.heading));
-            last_heading = key.heading;
-        }
-        for line in key.meaning.lines() {
-            text.push_str(&format!("\n#{line}"));
-        }
-        let name = key.name();
-        let value = defaults.get(&name).map(ToString::to_string).unwrap_or_default();
-        text.push_str(&format!("\n{name} = {value}\n"));
-    }
-    text
 }
 
 #[cfg(test)]
@@ -504,15 +272,5 @@ mod tests {
         config.background = Rgb([0.5, 0.25, 1.0]);
         let text = toml::to_string(&config).unwrap_or_default();
         assert_eq!(TrainConfig::parse(&text), Ok(config));
-    }
-
-    #[test]
-    fn values_out_of_range_are_refused_by_name() {
-        let bad = TrainConfig { sh_degree: 4, ..TrainConfig::default() };
-        assert!(bad.check().is_err_and(|e| e.to_string().contains("--sh-degree")));
-        // As a 32-bit number this is half.
-        let bad = TrainConfig { prune_opa: 0.499_999_999, ..TrainConfig::default() };
-        assert!(bad.check().is_err_and(|e| e.to_string().contains("--prune-opa")));
-        assert!(TrainConfig::default().check().is_ok());
     }
 }

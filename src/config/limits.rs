@@ -88,7 +88,7 @@ impl RunOptions {
                 simd,
                 ..RenderOptions::default()
             },
-            loss: LossOptions { ssim_lambda: config.ssim_lambda as f32, padding: config.ssim_padding, simd },
+            loss: loss_options(config),
             rates: Rates {
                 means: config.means_lr * f64::from(scene_scale),
                 means_final_factor: config.means_lr_final,
@@ -140,6 +140,18 @@ fn default_strategy(config: &TrainConfig) -> DefaultStrategy {
         refine_every: config.refine_every,
         reset_every: never_if_zero(config.reset_every),
         max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
+    }
+}
+
+/// The loss of a config.
+fn loss_options(config: &TrainConfig) -> LossOptions {
+    LossOptions { ssim_lambda: config.ssim_lambda as f32, padding: config.ssim_padding, simd: simd_path(config) }
+}
+
+/// The loss of the default config.
+impl Default for LossOptions {
+    fn default() -> LossOptions {
+        loss_options(&TrainConfig::default())
     }
 }
 

@@ -1,9 +1,13 @@
-//! The config of a run: its keys ([`mod@file`], [`key`]) and their words ([`choice`]), options derived from them
+//! The config of a run: its keys ([`mod@file`], [`key`]) with their words ([`choice`]), other values
+//! ([`values`]) and ranges (`check`), the command line ([`command_line`]), options derived from them
 //! ([`limits`], [`residence`]), and published runs ([`published`]).
 
+mod check;
 pub mod choice;
+pub mod command_line;
 pub mod file;
 pub mod key;
 pub mod limits;
 pub mod published;
 pub mod residence;
+pub mod values;

@@ -206,7 +206,7 @@ pub fn differences(published: &TrainConfig, used: &TrainConfig) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::file::ByteSize;
+    use super::super::values::ByteSize;
     use super::*;
     use crate::checkpoint::interval::CommitEvery;
     use crate::paging::timing::Transfers;

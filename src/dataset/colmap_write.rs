@@ -8,10 +8,10 @@
 //! all its files are.
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::whole_file::write_whole_with;
 use crate::dataset::model::{Intrinsics, Lens, Pose};
 use glam::{DMat3, DQuat};
-use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::Write;
 use std::path::Path;
 
 /// Id of the PINHOLE camera model (fx, fy, cx, cy).
@@ -60,36 +60,16 @@ pub fn write_model(sparse: &Path, model: &Model) -> InputResult<()> {
     let partial = sparse.with_extension("partial");
     let folder = partial.join("0");
     make_folder(&folder)?;
-    write_file(&folder.join("cameras.bin"), |out| cameras(out, &model.intrinsics))?;
+    write_whole_with(&folder.join("cameras.bin"), |out| cameras(out, &model.intrinsics))?;
     let order = observation_order(model);
-    write_file(&folder.join("images.bin"), |out| images_bin(out, model, &order))?;
-    write_file(&folder.join("points3D.bin"), |out| points_bin(out, model))?;
+    write_whole_with(&folder.join("images.bin"), |out| images_bin(out, model, &order))?;
+    write_whole_with(&folder.join("points3D.bin"), |out| points_bin(out, model))?;
     std::fs::rename(&partial, sparse).map_err(|e| InputError::io(sparse, "renaming the model's folder", &e))
 }
 
 /// Creates a folder and its parents.
 pub fn make_folder(folder: &Path) -> InputResult<()> {
     std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder", &e))
-}
-
-/// Writes a file under a temporary name, syncs it, and renames it. Errors name the file.
-pub fn write_file(path: &Path, fill: impl FnOnce(&mut dyn Write) -> std::io::Result<()>) -> InputResult<()> {
-    let mut name = path.file_name().unwrap_or_default().to_os_string();
-    name.push(".partial");
-    let partial = path.with_file_name(name);
-    let write = || {
-        let mut out = BufWriter::with_capacity(1 << 20, File::create(&partial)?);
-        fill(&mut out)?;
-        out.flush()?;
-        out.get_ref().sync_data()?;
-        drop(out);
-        std::fs::rename(&partial, path)
-    };
-    write().map_err(|e| {
-        // The remains of the attempt are useless, and may not exist.
-        let _ = std::fs::remove_file(&partial);
-        InputError::io(path, "writing", &e)
-    })
 }
 
 fn cameras(out: &mut dyn Write, k: &Intrinsics) -> std::io::Result<()> {

@@ -6,13 +6,14 @@
 //!
 //! Invariant: nothing is overwritten: the folder must be new or empty.
 
-use super::colmap_write::{Model, ModelImage, Point, make_folder, write_file, write_model};
+use super::colmap_write::{Model, ModelImage, Point, make_folder, write_model};
 use super::layout::Layout;
 use super::mega_nerf::write::write_mega_nerf;
 use super::model::{RawScene, RawView};
 use super::read::{ReadOptions, read_scene};
 use super::synthetic::{CityOptions, CitySummary, write_city};
 use crate::base::error::{InputError, InputResult};
+use crate::base::whole_file::{write_whole, write_whole_with};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -141,7 +142,7 @@ fn matrix(view: &RawView, rotation: f64, position: f64) -> [[f64; 4]; 4] {
 }
 
 fn write_json(path: &Path, value: &Value) -> InputResult<()> {
-    write_file(path, |out| out.write_all(value.to_string().as_bytes()))
+    write_whole(path, value.to_string().as_bytes())
 }
 
 /// Rewrites a photo as PNG with the same pixels, and removes the original.
@@ -156,7 +157,7 @@ fn to_png(from: &Path, to: &Path) -> InputResult<()> {
 /// The city's points in MatrixCity's unit, as its published clouds are: doubles and bytes.
 fn write_cloud(path: &Path, city: &RawScene) -> InputResult<()> {
     let points = &city.points;
-    write_file(path, |out| {
+    write_whole_with(path, |out| {
         write!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {}\n", points.positions.len())?;
         for property in ["double x", "double y", "double z", "uchar red", "uchar green", "uchar blue"] {
             writeln!(out, "property {property}")?;

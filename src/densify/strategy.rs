@@ -30,22 +30,6 @@ pub enum StrategyName {
 }
 
 impl StrategyName {
-    /// The names in config files and on the command line.
-    pub const NAMES: [&str; 2] = ["default", "none"];
-
-    /// The name in config files and on the command line: one of [`StrategyName::NAMES`].
-    pub fn name(self) -> &'static str {
-        match self {
-            StrategyName::Default => "default",
-            StrategyName::None => "none",
-        }
-    }
-
-    /// The strategy with this name.
-    pub fn from_name(name: &str) -> Option<StrategyName> {
-        [StrategyName::Default, StrategyName::None].into_iter().find(|strategy| strategy.name() == name)
-    }
-
     /// Whether the number of Gaussians may grow.
     pub fn grows(self) -> bool {
         self != StrategyName::None

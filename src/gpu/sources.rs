@@ -1,5 +1,5 @@
 //! Shader sources: the table of those built into the program, and a small preprocessor.
-//! `tests/shaders.rs` fails if a shader file is missing from the table.
+//! `tests/numerics/shaders.rs` fails if a shader file is missing from the table.
 //!
 //! The preprocessor knows these directives, at the start of a line:
 //!

@@ -7,6 +7,7 @@
 use super::chart::{Chart, Mark};
 use super::html::{Cell, Page, slider};
 use super::picture::view_pictures;
+use super::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PICTURES_FOLDER, SUMMARY_FILE};
 use super::run_report::{curve, read_json, read_metrics, read_text};
 use crate::base::error::InputResult;
 use serde_json::Value;
@@ -15,10 +16,6 @@ use std::path::{Path, PathBuf};
 
 /// Most sliders: a file with more opens slowly.
 const SLIDERS_MAX: usize = 12;
-/// Output of `gsscale-eval --json` in a run's folder.
-const EVALUATED: &str = "evaluated.json";
-/// Config of that evaluation.
-const EVALUATED_AS: &str = "evaluated-as.toml";
 /// Keys that make photos smaller, and so raise PSNR.
 const PHOTO_KEYS: [&str; 2] = ["data-factor", "max-resolution"];
 /// Follows the names of runs that have remarks.
@@ -45,11 +42,11 @@ impl Compared {
     fn read(folder: &Path, name: String) -> InputResult<Compared> {
         let metrics = read_metrics(folder)?;
         let json = |name: &str| read_json(&folder.join(name)).unwrap_or(Value::Null);
-        let (summary, evaluated) = (json("summary.json"), json(EVALUATED));
+        let (summary, evaluated) = (json(SUMMARY_FILE), json(EVALUATED_FILE));
         let is_evaluated_again = evaluated["test"]["psnr"].is_number();
-        let trained_on = photos(&folder.join("config.toml"));
+        let trained_on = photos(&folder.join(CONFIG_FILE));
         let (judged, judged_on) = match is_evaluated_again {
-            true => (evaluated, photos(&folder.join(EVALUATED_AS))),
+            true => (evaluated, photos(&folder.join(EVALUATED_AS_FILE))),
             false => (summary.clone(), trained_on),
         };
         let (folder, remarks) = (folder.to_path_buf(), Vec::new());
@@ -85,7 +82,7 @@ impl Compared {
             remarks.push(format!("SSIM is {own} instead of {first}"));
         }
         if self.is_evaluated_again {
-            remarks.push(format!("PSNR and SSIM are of {EVALUATED}"));
+            remarks.push(format!("PSNR and SSIM are of {EVALUATED_FILE}"));
         }
         remarks
     }
@@ -183,7 +180,7 @@ fn charts(runs: &[Compared]) -> Vec<Chart> {
 fn add_views(page: &mut Page, runs: &[Compared]) -> InputResult<()> {
     let Some((first, others)) = runs.split_first().filter(|(_, others)| !others.is_empty()) else { return Ok(()) };
     let pictures = |folder: &Path| -> BTreeSet<String> {
-        let entries = std::fs::read_dir(folder.join("renders/test")).into_iter().flatten().flatten();
+        let entries = std::fs::read_dir(folder.join(PICTURES_FOLDER)).into_iter().flatten().flatten();
         let names = entries.map(|e| e.file_name().to_string_lossy().into_owned());
         names.filter(|name| name.ends_with(".png")).collect()
     };
@@ -209,9 +206,9 @@ fn add_views(page: &mut Page, runs: &[Compared]) -> InputResult<()> {
     let common: Vec<&String> = common.iter().collect();
     let mut sliders = Vec::new();
     for name in views.iter().map(|&view| common[view]) {
-        let left = view_pictures(&first.folder.join("renders/test").join(name))?;
+        let left = view_pictures(&first.folder.join(PICTURES_FOLDER).join(name))?;
         for run in runs.iter().map(|&run| &others[run]) {
-            let right = view_pictures(&run.folder.join("renders/test").join(name))?;
+            let right = view_pictures(&run.folder.join(PICTURES_FOLDER).join(name))?;
             let sides = [(first.name.as_str(), left.render.as_str()), (run.name.as_str(), right.render.as_str())];
             sliders.push(slider(name.trim_end_matches(".png"), sides, ("photo", &left.photo)));
         }
@@ -264,7 +261,7 @@ mod tests {
     /// A finished run with these held-out figures and `views` pictures.
     fn run(parent: &Path, name: &str, (psnr, factor, ssim): (f64, f64, &str), views: usize) -> PathBuf {
         let folder = parent.join(name);
-        std::fs::create_dir_all(folder.join("renders/test")).unwrap();
+        std::fs::create_dir_all(folder.join(PICTURES_FOLDER)).unwrap();
         let line = json!({"step": 4, "psnr": 20.0, "gaussians": 9, "seconds": 1.0, "test": {"psnr": 77.0}});
         std::fs::write(folder.join("metrics.jsonl"), format!("{line}\n")).unwrap();
         let test = json!({"views": views, "psnr": psnr, "ssim": 0.5});
@@ -284,7 +281,7 @@ mod tests {
 
     fn evaluate(folder: &Path, psnr: f64, ssim: &str) {
         let report = json!({"ssim_variant": ssim, "test": {"views": 1, "psnr": psnr, "ssim": 0.25}});
-        std::fs::write(folder.join(EVALUATED), report.to_string()).unwrap();
+        std::fs::write(folder.join(EVALUATED_FILE), report.to_string()).unwrap();
     }
 
     #[test]
@@ -302,7 +299,7 @@ mod tests {
 
         // The files that a sweep writes.
         evaluate(&half, 25.25, "same");
-        std::fs::write(half.join(EVALUATED_AS), config(1.0)).unwrap();
+        std::fs::write(half.join(EVALUATED_AS_FILE), config(1.0)).unwrap();
         let page = compare_report(&[base.clone(), half.clone()]).unwrap();
         assert!(page.contains("25.250") && page.contains("-0.750") && page.contains("0.2500"), "{page}");
         assert!(!page.contains("28.500") && !page.contains("judged with"));
@@ -310,7 +307,7 @@ mod tests {
         assert!(page.contains(marks), "{page}");
 
         // Without the config of the evaluation, the photos are unknown.
-        std::fs::remove_file(half.join(EVALUATED_AS)).unwrap();
+        std::fs::remove_file(half.join(EVALUATED_AS_FILE)).unwrap();
         assert!(compare_report(&[base.clone(), half]).unwrap().contains("-0.750"));
         let alike = compare_report(&[base.clone(), base]).unwrap();
         assert!(!alike.contains(" *<") && !alike.contains("trained or judged differently"));
@@ -327,7 +324,7 @@ mod tests {
         assert_eq!(points(&half), [(4.0, 77.0), (10.0, 28.5)]);
         evaluate(&half, 25.25, "same");
         assert_eq!(points(&half), [(10.0, 25.25)]);
-        std::fs::write(half.join(EVALUATED_AS), config(2.0)).unwrap();
+        std::fs::write(half.join(EVALUATED_AS_FILE), config(2.0)).unwrap();
         assert_eq!(points(&half), [(4.0, 77.0), (10.0, 25.25)]);
     }
 

@@ -13,5 +13,6 @@ pub mod page_map;
 pub mod picture;
 pub mod record;
 pub mod results_log;
+pub mod run_files;
 pub mod run_report;
 pub mod sweep_page;

@@ -7,15 +7,13 @@ use super::chart::{Chart, Mark, short};
 use super::html::{Page, slider};
 use super::page_map::{PageTile, page_map_svg};
 use super::picture::view_pictures;
+use super::run_files::{CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
+use crate::base::whole_file::write_whole;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
-/// Name of the report in a run's folder.
-pub const REPORT_FILE: &str = "report.html";
-/// Name of the data of the page map in a run's folder: a JSON list of [`PageTile`].
-pub const PAGES_FILE: &str = "pages.json";
 /// Most views: a file with more opens slowly.
 const VIEWS_MAX: usize = 12;
 /// Most points of a curve.
@@ -30,7 +28,7 @@ const MIB: f64 = (1 << 20) as f64;
 /// The folder holds no metrics, or a picture cannot be decoded.
 pub fn run_report(folder: &Path) -> InputResult<String> {
     let metrics = read_metrics(folder)?;
-    let summary = read_json(&folder.join("summary.json")).unwrap_or(Value::Null);
+    let summary = read_json(&folder.join(SUMMARY_FILE)).unwrap_or(Value::Null);
     let scene = summary["scene"].as_str().unwrap_or("").to_string();
     let name = folder.file_name().map_or("run".into(), |n| n.to_string_lossy().into_owned());
     let mut page = Page::new(&format!("gsscale: {name}"), &scene);
@@ -43,9 +41,9 @@ pub fn run_report(folder: &Path) -> InputResult<String> {
         page.charts(&tiers);
     }
     add_page_map(&mut page, &folder.join(PAGES_FILE));
-    add_views(&mut page, &folder.join("renders/test"))?;
+    add_views(&mut page, &folder.join(PICTURES_FOLDER))?;
     page.heading("Config");
-    if let Some(text) = read_text(&folder.join("config.toml")) {
+    if let Some(text) = read_text(&folder.join(CONFIG_FILE)) {
         page.folded("config.toml, every key as it was used", &text);
     }
     if !summary.is_null() {
@@ -62,10 +60,7 @@ pub fn run_report(folder: &Path) -> InputResult<String> {
 pub fn write_run_report(folder: &Path) -> InputResult<PathBuf> {
     let html = run_report(folder)?;
     let path = folder.join(REPORT_FILE);
-    let part = folder.join(format!(".{REPORT_FILE}.part"));
-    std::fs::write(&part, html)
-        .and_then(|()| std::fs::rename(&part, &path))
-        .map_err(|e| InputError::io(&path, "writing the report", &e))?;
+    write_whole(&path, html.as_bytes())?;
     Ok(path)
 }
 
@@ -80,7 +75,7 @@ pub(super) fn read_json(path: &Path) -> Option<Value> {
 
 /// The complete lines of metrics.jsonl.
 pub(super) fn read_metrics(folder: &Path) -> InputResult<Vec<Value>> {
-    let path = folder.join("metrics.jsonl");
+    let path = folder.join(METRICS_FILE);
     let text = read_text(&path)
         .ok_or_else(|| InputError::new(&path, "cannot be read", "name the output folder of a training run"))?;
     Ok(text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect())

@@ -66,8 +66,8 @@ impl Changes {
     /// The config of the commit cannot be read.
     pub fn of_config(file: &Path, state: &RunState, config: &TrainConfig) -> InputResult<Changes> {
         let broken = |e: String| InputError::new(file, e, "start the run again");
-        let written: toml::Table = state.config.parse().map_err(|e: toml::de::Error| broken(e.to_string()))?;
-        let then = TrainConfig::parse(&state.config).map_err(broken)?;
+        let written: toml::Table = state.origin.config.parse().map_err(|e: toml::de::Error| broken(e.to_string()))?;
+        let then = TrainConfig::parse(&state.origin.config).map_err(broken)?;
         let table = |config: &TrainConfig| {
             toml::Table::try_from(config).map_err(|e| InputError::new(file, e.to_string(), "report this as a bug"))
         };
@@ -93,7 +93,7 @@ impl Changes {
         if was != is {
             changes.numbers.push(format!("schedule-steps was {was} and is {is}"));
         }
-        changes.add_path(&state.simd, limits::simd_path(config));
+        changes.add_path(&state.origin.simd, limits::simd_path(config));
         Ok(changes)
     }
 

@@ -14,7 +14,7 @@ use super::first_commit::FirstCommit;
 use super::report::MetricsLog;
 use super::trainer::Trainer;
 use crate::checkpoint::interval::{CommitCost, CommitInterval, CommitReport};
-use crate::checkpoint::run_state::{DatasetPrint, RunIdentity, RunState};
+use crate::checkpoint::run_state::{Origin, RunState};
 use crate::config::file::TrainConfig;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::{CommitError, Commits};
@@ -58,7 +58,7 @@ pub struct Checkpoint {
     last: Instant,
     last_cut: Instant,
     beside: Option<Beside>,
-    /// The constant part of the run state; see [`Checkpoint::set_origin`].
+    /// How the run was started; see [`Checkpoint::set_origin`].
     origin: Option<Origin>,
     done: u64,
     /// Step of the last commit.
@@ -74,21 +74,6 @@ struct Beside {
     waited: Duration,
     /// The pager's commit seconds before this commit.
     pager_seconds: f64,
-}
-
-/// The constant part of a run state: how the run was started.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Origin {
-    /// The config, every key, as TOML.
-    pub config: String,
-    /// Resolved instruction path.
-    pub simd: String,
-    /// SH degree of the first step.
-    pub sh_degree_start: u8,
-    /// The dataset.
-    pub dataset: DatasetPrint,
-    /// Identity of the run.
-    pub run: RunIdentity,
 }
 
 impl Checkpoint {
@@ -259,7 +244,7 @@ impl Checkpoint {
         let state = trainer.run_state(origin, metrics.sync()?);
         let run_state = bytes_of(&state)?;
         trainer.scene.pager.freeze()?;
-        self.beside = Some(Beside { run_state, step: state.step, cut, waited: cut.elapsed(), pager_seconds });
+        self.beside = Some(Beside { run_state, step: state.trainer.step, cut, waited: cut.elapsed(), pager_seconds });
         // Without pages to write, complete the commit now.
         if trainer.scene.pager.is_frozen_written() { self.finish(trainer) } else { Ok(()) }
     }
@@ -297,11 +282,11 @@ impl Checkpoint {
         let written = trainer.scene.pager.stats().bytes_written;
         trainer.scene.pager.flush()?;
         let state = trainer.run_state(origin, metrics.sync()?);
-        let note = format!("step {}", state.step);
+        let note = format!("step {}", state.trainer.step);
         trainer.scene.pager.commit(commits, &bytes_of(&state)?, note.as_bytes(), name.as_deref())?;
         self.name = None;
         let bytes = trainer.scene.pager.stats().bytes_written - written;
-        self.acknowledged(state.step, cut, cut.elapsed().as_secs_f64(), bytes);
+        self.acknowledged(state.trainer.step, cut, cut.elapsed().as_secs_f64(), bytes);
         Ok(())
     }
 
@@ -353,37 +338,23 @@ fn bytes_of(state: &RunState) -> Result<Vec<u8>, CommitError> {
 impl Trainer {
     /// The run state between two steps, without the pages.
     pub fn run_state(&self, origin: &Origin, metrics_bytes: u64) -> RunState {
-        let Origin { config, simd, sh_degree_start, dataset, run } = origin.clone();
         RunState {
-            step: self.step,
-            config,
-            simd,
+            origin: origin.clone(),
             device: self.renderer.device(),
-            sh_degree_start,
-            dataset,
+            trainer: self.state.clone(),
             events: self.events().events().to_vec(),
             histogram: self.scene.histogram.filled(),
             rows: self.scene.rows(),
             rows_bound: self.scene.rows_bound(),
-            rows_skipped: self.rows_skipped,
-            steps_skipped: self.steps_skipped,
-            steps_skipped_in_a_row: self.steps_skipped_in_a_row,
-            train_seconds: self.train_seconds,
             metrics_bytes,
-            test: self.last_test,
             traffic: self.scene.pager.stats(),
-            run,
         }
     }
 
-    /// Restores step and counters from a run state; the pages must come from the same commit.
-    pub fn restore_counts(&mut self, state: &RunState) {
-        self.step = state.step;
-        self.rows_skipped = state.rows_skipped;
-        self.steps_skipped = state.steps_skipped;
-        self.steps_skipped_in_a_row = state.steps_skipped_in_a_row;
-        self.train_seconds = state.train_seconds;
-        self.last_test = state.test;
+    /// Restores the trainer's own state and the traffic counters from a run state; the pages must come from the same
+    /// commit.
+    pub fn restore(&mut self, state: &RunState) {
+        self.state = state.trainer.clone();
         self.scene.pager.restore_stats(state.traffic);
     }
 }

@@ -2,9 +2,9 @@
 //!
 //! Invariant: the file is a valid `--config`. Resume and evaluation read its facts.
 
-use super::whole_file::write_whole;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
+use crate::base::whole_file::write_whole;
 use crate::config::file::TrainConfig;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};

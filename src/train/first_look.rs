@@ -4,7 +4,9 @@
 //! the largest view for the frames of a budget, a small enough view for timing; 3. pages and bounds equal those at the
 //! start of a run.
 
+use super::comparison::Comparison;
 use super::error::TrainError;
+use super::largest_view::largest_view;
 use super::machine;
 use super::memory::host_budget;
 use super::pages::{PageRules, PagedScene};
@@ -116,14 +118,14 @@ struct World<'a> {
 impl World<'_> {
     /// Frames within `host_mem`; renders the largest view to measure its memory.
     fn frames_within(&mut self, options: &RunOptions, host_mem: u64) -> Result<u64, TrainError> {
-        let largest = preflight::largest_view(&self.start.dataset, &self.index);
+        let largest = largest_view(&self.start.dataset, &self.index);
         let Some(view) = largest.view else { return Ok(0) };
         let scene = self.pages_of(view, options, Some(host_mem))?;
         let dataset = &self.start.dataset;
         let mut trainer = Trainer::of_scene(scene, dataset, Box::new(CpuRenderer::new()), options.clone());
         let rows = self.index.iter().map(|page| u64::from(page.rows)).sum();
         let probe = Probe { views: vec![view], rows, pages: self.index.len(), driver: 0 };
-        preflight::frames_within(self.config, dataset, &mut trainer, &probe, largest, host_mem)
+        preflight::frames_within(self.config, dataset, &mut trainer, &probe, largest.pages, host_mem)
     }
 
     /// Loads the pages of a view into memory.
@@ -157,8 +159,9 @@ impl World<'_> {
         let mut working = WorkingSet::default();
         let rgb = vec![0; 3 * camera.pixels()];
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
+        let comparison = Comparison { target: &target, loss: options.loss };
         let mut step = |number| {
-            let (what, how) = ((number, &camera, &target), (&render, &options.loss));
+            let (what, how) = ((number, &camera), (&render, &comparison));
             let began = Instant::now();
             train_step(&mut scene, &mut working, &mut *renderer, what, how, false, usize::MAX)?;
             Ok::<_, TrainError>(began.elapsed().as_secs_f64())

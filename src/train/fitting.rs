@@ -109,7 +109,7 @@ impl Trainer {
             eprintln!(
                 "warning: from step {} on the scene needs more than {}, the default share of the free memory: the run \
                  takes more as long as the machine has it; --host-mem sets a limit",
-                self.step,
+                self.state.step,
                 format_bytes(budget.bytes)
             );
         }

@@ -3,8 +3,8 @@
 //! | task | files |
 //! | --- | --- |
 //! | set up and run | [`run`], [`prepare`], [`start`] (first Gaussians; `gaussian_pages` from a file of any size), [`tiers`] (where pages live), [`machine`] (threads, renderer), [`signals`] (Ctrl-C) |
-//! | memory | [`memory`], [`probe`] and [`preflight`] (does the run fit), [`budget`] and `fitting` (frames of a growing scene), `outgrown` (a scene that no longer fits), [`staging`] |
-//! | one step | [`step`], [`batch`] (gather, update), [`working_set`], [`catch_up`] (cull, evaluate), `update`, `dense` (dense Adam) |
+//! | memory | [`memory`], [`probe`] and [`preflight`] (does the run fit: `largest_view`, `first_frames`, `drive_space`, `plan_text`), [`budget`] and `fitting` (frames of a growing scene), `outgrown` (a scene that no longer fits), [`staging`] |
+//! | one step | [`step`], [`comparison`] (from picture to loss and back; also for `view`, which renders without a step), [`batch`] (gather, update), [`working_set`], [`catch_up`] (cull, evaluate), `update`, `dense` (dense Adam) |
 //! | state and loop | [`pages`], [`trainer`], [`training_loop`], [`eval`], [`costs`] |
 //! | commits | [`checkpoint`], `first_commit` (of a run in memory), [`full_drive`], [`resume`] with `changes` and [`dataset_print`] (may the run resume) |
 //! | results | [`out_folder`], [`report`], [`progress`], [`page_map`], [`facts`] |
@@ -15,18 +15,22 @@ pub mod budget;
 pub mod catch_up;
 mod changes;
 pub mod checkpoint;
+pub mod comparison;
 pub mod costs;
 pub mod dataset_print;
 mod dense;
 mod device_memory;
+mod drive_space;
 pub mod error;
 pub mod eval;
 pub mod facts;
 mod first_commit;
+mod first_frames;
 pub mod first_look;
 mod fitting;
 pub mod full_drive;
 mod gaussian_pages;
+mod largest_view;
 pub mod machine;
 pub mod memory;
 pub mod out_folder;
@@ -35,6 +39,7 @@ mod ownership;
 pub mod page_map;
 pub mod pages;
 mod places;
+mod plan_text;
 pub mod preflight;
 pub mod prepare;
 pub mod probe;
@@ -52,5 +57,4 @@ pub mod trainer;
 pub mod training_loop;
 mod update;
 pub mod view;
-pub mod whole_file;
 pub mod working_set;

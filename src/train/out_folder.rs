@@ -6,15 +6,14 @@
 use super::error::TrainError;
 use super::facts::read_resolved;
 use super::ownership::{check_removable, remove_checkpoint_in};
-use super::whole_file::folder_of;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
+use crate::base::whole_file::{folder_of, sync_folder};
 use crate::config::file::TrainConfig;
 use crate::config::residence::checkpoint_folder;
 use crate::exchange::tensorboard::is_event_file;
-use crate::page::engine::segment_files::sync_folder;
 use crate::page::folder::spill_dir::SpillDir;
-use crate::report::run_report::{PAGES_FILE, REPORT_FILE};
+use crate::report::run_files::{CONFIG_FILE, RUN_FILES, RunFile, Tells, is_saved_ply};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 
@@ -71,7 +70,7 @@ pub(super) fn check(out: &Path, existing: Existing) -> Result<(), TrainError> {
 
 /// Identity of the run whose config lies in `out`.
 fn run_in(out: &Path) -> RunId {
-    read_resolved(&out.join("config.toml")).map_or(RunId::UNKNOWN, |resolved| resolved.run)
+    read_resolved(&out.join(CONFIG_FILE)).map_or(RunId::UNKNOWN, |resolved| resolved.run)
 }
 
 fn check_new(out: &Path) -> InputResult<()> {
@@ -87,7 +86,7 @@ fn check_new(out: &Path) -> InputResult<()> {
 /// The remedy for an existing output folder: resume its run, or start over.
 pub fn remedy_of_existing(out: &Path) -> String {
     let start_over = "choose another --out, or replace it with --overwrite";
-    let Ok(config) = TrainConfig::read(&out.join("config.toml")) else { return start_over.to_string() };
+    let Ok(config) = TrainConfig::read(&out.join(CONFIG_FILE)) else { return start_over.to_string() };
     let residence = config.residence();
     if !SpillDir::exists_in(&residence.checkpoint_folder(out)) {
         return start_over.to_string();
@@ -124,37 +123,46 @@ pub(super) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
     let probe = out.join(".gsscale-probe");
     std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(io)?;
     // Without a run's config, files with our names may be somebody else's (such as the points of a scene).
-    if existing == Existing::Refuse || !out.join("config.toml").is_file() {
+    if existing == Existing::Refuse || !out.join(CONFIG_FILE).is_file() {
         return Ok(());
     }
-    if existing == Existing::Overwrite {
-        // First, because an active run in the folder makes this fail.
-        remove_checkpoint_in(&checkpoint_folder(out), run_in(out))?;
-        remove_file(&out.join("config.toml"))?;
-    }
-    remove_file(&out.join("metrics.jsonl"))?;
-    remove_events(&out.join("tensorboard"))?;
     if existing == Existing::BeginAgain {
         // A run that was cut off before its first commit left nothing else; results must stay.
-        return Ok(());
+        return Ok(remove_files(out, |tells| tells == Tells::Steps)?);
     }
-    for name in ["summary.json", "point_cloud.ply", REPORT_FILE, PAGES_FILE] {
-        remove_file(&out.join(name))?;
-    }
-    remove_saved(out)?;
-    remove_evaluation(out)?;
-    Ok(remove_pictures(&out.join("renders/test"))?)
+    // First, because an active run in the folder makes this fail.
+    remove_checkpoint_in(&checkpoint_folder(out), run_in(out))?;
+    Ok(remove_files(out, |_| true)?)
+}
+
+/// Removes the evaluation of an earlier state, since comparisons would use it for this run.
+pub(super) fn remove_evaluation(out: &Path) -> InputResult<()> {
+    remove_files(out, |tells| tells == Tells::Evaluation)
+}
+
+/// Removes the files of [`RUN_FILES`] that tell about `which` parts of an earlier run.
+fn remove_files(out: &Path, which: impl Fn(Tells) -> bool) -> InputResult<()> {
+    let files = RUN_FILES.iter().filter(|(_, tells)| which(*tells));
+    files.map(|(file, _)| file).try_for_each(|file| match file {
+        RunFile::File(name) => remove_file(&out.join(name)),
+        RunFile::SavedPlys => saved(out)?.iter().try_for_each(|path| remove_file(path)),
+        RunFile::Events(folder) => remove_in(&out.join(folder), is_event_file, false),
+        RunFile::Pictures(folder) => {
+            remove_in(&out.join(folder), |path| path.extension().is_some_and(|e| e == "png"), true)
+        }
+    })
 }
 
 fn remove_file(path: &Path) -> InputResult<()> {
-    if !path.is_file() {
-        return Ok(());
+    match std::fs::remove_file(path) {
+        Err(e) if path.is_file() => Err(InputError::io(path, "removing the earlier run's file", &e)),
+        _ => Ok(()),
     }
-    std::fs::remove_file(path).map_err(|e| InputError::io(path, "removing the earlier run's file", &e))
 }
 
-/// Removes the pictures of an earlier evaluation from `folder` and its subfolders, and folders that become empty.
-fn remove_pictures(folder: &Path) -> InputResult<()> {
+/// Removes the files that are ours from `folder`, and from its subfolders if `is_deep`; then folders that are empty.
+/// TensorBoard would draw curves that stay into those of the new run.
+fn remove_in(folder: &Path, is_ours: fn(&Path) -> bool, is_deep: bool) -> InputResult<()> {
     if !folder.is_dir() {
         return Ok(());
     }
@@ -162,8 +170,8 @@ fn remove_pictures(folder: &Path) -> InputResult<()> {
     for entry in entries.flatten() {
         let path = entry.path();
         match entry.file_type() {
-            Ok(kind) if kind.is_dir() => remove_pictures(&path)?,
-            Ok(kind) if kind.is_file() && path.extension().is_some_and(|e| e == "png") => remove_file(&path)?,
+            Ok(kind) if kind.is_dir() && is_deep => remove_in(&path, is_ours, is_deep)?,
+            Ok(kind) if kind.is_file() && is_ours(&path) => remove_file(&path)?,
             _ => {}
         }
     }
@@ -171,46 +179,10 @@ fn remove_pictures(folder: &Path) -> InputResult<()> {
     Ok(())
 }
 
-/// Removes the event files of an earlier run, since TensorBoard would draw them into the new curves, and their folder
-/// if it becomes empty.
-fn remove_events(folder: &Path) -> InputResult<()> {
-    if !folder.is_dir() {
-        return Ok(());
-    }
-    let entries = std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "listing the folder", &e))?;
-    for path in entries.flatten().map(|entry| entry.path()).filter(|path| is_event_file(path)) {
-        std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "removing the earlier run's file", &e))?;
-    }
-    let _ = std::fs::remove_dir(folder);
-    Ok(())
-}
-
-/// Removes the evaluation of an earlier state, since comparisons would use it for this run.
-pub(super) fn remove_evaluation(out: &Path) -> InputResult<()> {
-    for path in ["evaluated.json", "evaluated-as.toml"].map(|name| out.join(name)) {
-        match std::fs::remove_file(&path) {
-            Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
-                return Err(InputError::io(&path, "removing the earlier evaluation", &e));
-            }
-            _ => {}
-        }
-    }
-    Ok(())
-}
-
-/// Removes the PLY files that `--save-every` of an earlier run wrote.
-fn remove_saved(out: &Path) -> InputResult<()> {
-    saved(out)?.iter().try_for_each(|path| remove_file(path))
-}
-
-/// The PLY files that `--save-every` wrote: `point_cloud_<step>.ply`.
+/// The PLY files that `--save-every` wrote.
 pub(super) fn saved(out: &Path) -> InputResult<Vec<PathBuf>> {
     let entries = std::fs::read_dir(out).map_err(|e| InputError::io(out, "listing the folder", &e))?;
-    let is_saved = |path: &PathBuf| {
-        let name = path.file_name().and_then(|n| n.to_str()).unwrap_or("");
-        let step = name.strip_prefix("point_cloud_").and_then(|rest| rest.strip_suffix(".ply"));
-        step.is_some_and(|s| s.len() >= 6 && s.bytes().all(|b| b.is_ascii_digit()))
-    };
+    let is_saved = |path: &PathBuf| path.file_name().and_then(|name| name.to_str()).is_some_and(is_saved_ply);
     Ok(entries.flatten().map(|entry| entry.path()).filter(is_saved).collect())
 }
 

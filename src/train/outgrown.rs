@@ -6,7 +6,7 @@
 use super::budget::ViewNeed;
 use super::catch_up::visible_rows;
 use super::error::TrainError;
-use super::preflight::largest_view;
+use super::largest_view::largest_view;
 use super::staging::PLAN_BYTES;
 use super::trainer::Trainer;
 use super::training_loop::LoopOutputs;
@@ -60,7 +60,7 @@ impl Trainer {
             return Ok(());
         }
         let outgrown =
-            format!("from step {} on the scene does not fit into {}", self.step, format_bytes(budget.bytes()));
+            format!("from step {} on the scene does not fit into {}", self.state.step, format_bytes(budget.bytes()));
         // Warn once: without the budget, later steps do not try again.
         self.budget = None;
         let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else {
@@ -135,7 +135,7 @@ impl Trainer {
     /// Measures what a step on a view needs, with pending events applied to copies of its pages.
     fn measure_need(&mut self, camera: &Camera) -> Result<ViewNeed, PagingError> {
         let (mut pages, mut rows, mut visible) = (0, 0, Vec::new());
-        let (now, of_view) = (self.step, self.scene.pager.pages_of_view(camera));
+        let (now, of_view) = (self.state.step, self.scene.pager.pages_of_view(camera));
         self.scene.visit(&of_view, &mut |rules, tables| {
             pages += tables.iter().map(|table| parts_of(table.rows(), rules.page_rows())).sum::<usize>();
             visible_rows(tables, &rules.adam, now, camera, &mut visible);

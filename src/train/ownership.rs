@@ -93,10 +93,10 @@ impl Claim<'_> {
 pub(super) fn open_own(folder: &Path, claim: Claim<'_>, allow_remote: bool) -> Result<Option<Stored>, TrainError> {
     // Opening a map for writing changes its file, so check the owner by reading. An unreadable map is refused below.
     if let Ok(state) = last_state(folder, Access::Map) {
-        claim.check(folder, &state.run)?;
+        claim.check(folder, &state.origin.run)?;
     }
     let Some(stored) = Stored::open(folder, allow_remote)? else { return Ok(None) };
-    claim.check(folder, &stored.run_state.run)?;
+    claim.check(folder, &stored.run_state.origin.run)?;
     Ok(Some(stored))
 }
 
@@ -137,9 +137,10 @@ pub(super) fn check_removable(folder: &Path, run: RunId) -> Result<(), TrainErro
     let refuse = |problem: String| InputError::new(folder, problem, by_hand.clone());
     let state = last_state(folder, Access::Pages)
         .map_err(|e| refuse(format!("the checkpoint in it cannot be opened, so it is not removed: {e}")))?;
-    if state.run.id.is_known() && state.run.id == run {
+    if state.origin.run.id.is_known() && state.origin.run.id == run {
         return Ok(());
     }
-    let whose = if state.run.out.is_empty() { String::new() } else { format!(", that of {}", state.run.out) };
+    let whose =
+        if state.origin.run.out.is_empty() { String::new() } else { format!(", that of {}", state.origin.run.out) };
     Err(refuse(format!("it holds the checkpoint of another run{whose}, so it is not removed")).into())
 }

@@ -1,9 +1,9 @@
 //! pages.json: the pages of a scene along its shortest axis, for the map in the report.
 
 use super::trainer::Trainer;
-use super::whole_file::write_whole;
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageNo;
+use crate::base::whole_file::write_whole;
 use crate::dataset::loader::Dataset;
 use crate::report::page_map::PageTile;
 use crate::scene::page_meta::PageBounds;

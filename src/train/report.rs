@@ -3,9 +3,9 @@
 //! Invariants: 1. every number written is finite, because JSON has neither infinity nor NaN (see [`json_psnr`]); 2.
 //! whole files appear by rename, so a reader never sees a partial file.
 
-use super::whole_file::write_whole;
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
+use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitReport;
 use crate::exchange::tensorboard::EventFile;
 use crate::paging::pager::Pager;

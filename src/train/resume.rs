@@ -35,6 +35,7 @@ use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::Access;
 use crate::paging::pager::Pager;
 use crate::render::Renderer;
+use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
 use std::path::{Path, PathBuf};
 
@@ -104,7 +105,7 @@ struct Earlier {
 impl Earlier {
     /// Reads config.toml or, if it is missing, the checkpoint in the output folder or in the given spill directory.
     fn find(request: &ResumeRequest) -> Result<Earlier, TrainError> {
-        let path = request.out.join("config.toml");
+        let path = request.out.join(CONFIG_FILE);
         if path.exists() {
             let facts = read_resolved(&path).map_err(|e| InputError { remedy: REMEDY_DAMAGED.to_string(), ..e })?;
             let config = TrainConfig::read(&path)?;
@@ -123,18 +124,21 @@ impl Earlier {
             return Err(nothing().into());
         }
         let state = last_state(&folder, Access::Map)?;
-        let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
-        if Path::new(&state.run.out) != absolute(&request.out) && has_results(&request.out) {
-            let problem =
-                format!("it holds results, and the checkpoint in {} is that of {}", folder.display(), state.run.out);
+        let then = TrainConfig::parse(&state.origin.config).map_err(CommitError::Contradiction)?;
+        if Path::new(&state.origin.run.out) != absolute(&request.out) && has_results(&request.out) {
+            let problem = format!(
+                "it holds results, and the checkpoint in {} is that of {}",
+                folder.display(),
+                state.origin.run.out
+            );
             let remedy = "name that output folder, or one that does not exist yet";
             return Err(InputError::new(&request.out, problem, remedy).into());
         }
         eprintln!("warning: {} is missing: restoring it from the checkpoint", path.display());
         // The checkpoint may have moved, and a run that committed to its output folder has no spill directory.
         let config = TrainConfig { spill_dir: named.unwrap_or("").to_string(), ..then };
-        let scene = request.scene.clone().unwrap_or_else(|| PathBuf::from(&state.run.scene));
-        Ok(Earlier { run: state.run.id, file: None, config, scene, path })
+        let scene = request.scene.clone().unwrap_or_else(|| PathBuf::from(&state.origin.run.scene));
+        Ok(Earlier { run: state.origin.run.id, file: None, config, scene, path })
     }
 
     /// The claim that the run's checkpoint must satisfy.
@@ -147,14 +151,11 @@ impl Earlier {
 /// Whether a new start would destroy something of the run in `out`: a result, or a logged commit whose checkpoint may
 /// lie elsewhere.
 fn has_results(out: &Path) -> bool {
-    let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap_or_default();
+    let metrics = std::fs::read_to_string(out.join(METRICS_FILE)).unwrap_or_default();
     let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
     let has = |name: &str| out.join(name).exists();
     let has_saved = || out_folder::saved(out).is_ok_and(|saved| !saved.is_empty());
-    has("point_cloud.ply")
-        || has("summary.json")
-        || has_saved()
-        || metrics.lines().filter_map(commits).any(|commits| commits > 0)
+    has(PLY_FILE) || has(SUMMARY_FILE) || has_saved() || metrics.lines().filter_map(commits).any(|commits| commits > 0)
 }
 
 /// Restarts a run that was cut off before its first commit, from its config.
@@ -196,7 +197,7 @@ fn resume_from(
     }
     let start = Start::look(&scene, &config, &request.out, host_mem)?;
     let print = dataset_print(&start)?;
-    changes.add_dataset(&start.dataset, &state.dataset, &print);
+    changes.add_dataset(&start.dataset, &state.origin.dataset, &print);
     changes.numbers.extend(first_degree_change(&start, &state, &print));
     changes.check(&start.dataset.image_folder, request.accept_changes)?;
     let (renderer, options, driver) = begin(request.quiet, &config, &start)?;
@@ -210,17 +211,17 @@ fn resume_from(
         true => pages_with_new_rules(pager, &options, &state)?,
     };
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
-    trainer.restore_counts(&state);
+    trainer.restore(&state);
     let past = Past {
         config: kept_config(file, &earlier.config, &config)?,
         metrics_bytes: state.metrics_bytes,
-        step: state.step,
+        step: state.trainer.step,
         has_changed,
         file: earlier.file.clone(),
-        first_rows: state.dataset.first_rows,
+        first_rows: state.origin.dataset.first_rows,
     };
     let run = identity_of(earlier.run, &state);
-    let begun = Begun { print, sh_degree_start: state.sh_degree_start, past: Some(past), host_mem, driver, run };
+    let begun = Begun { print, sh_degree_start: state.origin.sh_degree_start, past: Some(past), host_mem, driver, run };
     let (out, quiet) = (request.out.clone(), request.quiet);
     let request = RunRequest { scene, out, config, dry_run: false, existing: Existing::BeginAgain, quiet };
     plan_and_train(&request, &dataset, tiers, trainer, begun)
@@ -228,7 +229,7 @@ fn resume_from(
 
 /// The identity of a resumed run: its own, that of its checkpoint, or a new one.
 fn identity_of(run: RunId, state: &RunState) -> RunId {
-    [run, state.run.id].into_iter().find(|id| id.is_known()).unwrap_or_else(RunId::draw)
+    [run, state.origin.run.id].into_iter().find(|id| id.is_known()).unwrap_or_else(RunId::draw)
 }
 
 /// Folder of a run's checkpoint.
@@ -238,7 +239,7 @@ fn stored_folder(out: &Path, config: &TrainConfig) -> PathBuf {
 
 /// Keeps the rate schedule of a run that is extended to more steps.
 fn keep_schedule(config: &mut TrainConfig, keys: &TrainOverrides, state: &RunState) {
-    if let Ok(then) = TrainConfig::parse(&state.config)
+    if let Ok(then) = TrainConfig::parse(&state.origin.config)
         && keys.schedule_steps.is_none()
         && config.steps != then.steps
     {
@@ -247,10 +248,10 @@ fn keep_schedule(config: &mut TrainConfig, keys: &TrainOverrides, state: &RunSta
 }
 
 fn check_steps(config: &TrainConfig, state: &RunState) -> InputResult<()> {
-    if config.steps >= state.step {
+    if config.steps >= state.trainer.step {
         return Ok(());
     }
-    let problem = format!("{} are fewer than the {} steps that the run has done", config.steps, state.step);
+    let problem = format!("{} are fewer than the {} steps that the run has done", config.steps, state.trainer.step);
     Err(InputError::new("--steps", problem, "give more, or roll the run back with gsscale-ckpt"))
 }
 
@@ -266,7 +267,7 @@ fn print_resume(
         let (there, here) = (&state.device, renderer.device());
         eprintln!("warning: the renderer was {there} and is {here}: its rounding differs");
     }
-    changes.numbers.iter().for_each(|line| eprintln!("warning: accepted from step {} on: {line}", state.step));
+    changes.numbers.iter().for_each(|line| eprintln!("warning: accepted from step {} on: {line}", state.trainer.step));
     if !changes.numbers.is_empty() {
         eprintln!("warning: every page is updated to that step by the old rules and rewritten once");
     }
@@ -277,7 +278,7 @@ fn print_resume(
         [] => String::new(),
         free => format!("; {}", free.join(", ")),
     };
-    eprintln!("resume  {} after {} of {} steps{other}", request.out.display(), state.step, config.steps);
+    eprintln!("resume  {} after {} of {} steps{other}", request.out.display(), state.trainer.step, config.steps);
 }
 
 /// Handles a run that did all steps and wrote its results: trains nothing. Removes a checkpoint that a kill left
@@ -288,7 +289,7 @@ fn finished_outcome(
     config: &TrainConfig,
     earlier: &Earlier,
 ) -> Result<Option<RunOutcome>, TrainError> {
-    let text = std::fs::read_to_string(request.out.join("summary.json")).unwrap_or_default();
+    let text = std::fs::read_to_string(request.out.join(SUMMARY_FILE)).unwrap_or_default();
     let summary: Option<Summary> = serde_json::from_str(&text).ok();
     let Some(summary) = summary.filter(|s| s.finished && s.steps >= config.steps) else { return Ok(None) };
     let folder = stored_folder(&request.out, config);
@@ -301,11 +302,11 @@ fn finished_outcome(
     } else {
         None
     };
-    if stored.as_ref().is_some_and(|stored| stored.run_state.step < config.steps && stored.is_whole()) {
+    if stored.as_ref().is_some_and(|stored| stored.run_state.trainer.step < config.steps && stored.is_whole()) {
         return Ok(None);
     }
     let is_kept = config.keep_checkpoint && stored.is_some();
-    let is_its_own = |stored: &Stored| earlier.run.is_known() && stored.run_state.run.id == earlier.run;
+    let is_its_own = |stored: &Stored| earlier.run.is_known() && stored.run_state.origin.run.id == earlier.run;
     if let Some(stored) = stored.filter(|stored| is_its_place && !config.keep_checkpoint && is_its_own(stored)) {
         stored.remove()?;
         // An earlier process of the run may have created the folder in its results; it is empty now.
@@ -329,12 +330,12 @@ fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result
 
 /// The pages of a run that resumes with changed rules, updated to its last step by the old rules.
 fn pages_with_new_rules(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
-    let then = TrainConfig::parse(&state.config).map_err(CommitError::Contradiction)?;
-    let then = config_before(&then, &state.simd, SimdPath::is_supported)
+    let then = TrainConfig::parse(&state.origin.config).map_err(CommitError::Contradiction)?;
+    let then = config_before(&then, &state.origin.simd, SimdPath::is_supported)
         .ok_or_else(|| CommitError::Contradiction("no instruction path of this machine is known".to_string()))?;
-    let old = restore_options(&RunOptions::new(&then, state.dataset.scene_scale), state);
+    let old = restore_options(&RunOptions::new(&then, state.origin.dataset.scene_scale), state);
     let mut pages = restore_pages(pager, &old, state)?;
-    if pages.change_rules(options, state.step)? {
+    if pages.change_rules(options, state.trainer.step)? {
         eprintln!("warning: the statistics of the rows differed from the run's histogram, which is counted anew");
     }
     Ok(pages)
@@ -355,16 +356,16 @@ fn config_before(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath)
 /// The options for restoring pages: with the SH degree of the run's first step, from which its events raised the
 /// degree. Accepted changes of keys may give another first degree now.
 fn restore_options(options: &RunOptions, state: &RunState) -> RunOptions {
-    RunOptions { sh_degree_start: state.sh_degree_start, ..options.clone() }
+    RunOptions { sh_degree_start: state.origin.sh_degree_start, ..options.clone() }
 }
 
 /// The difference if the run would start with another SH degree now: a sign of changed input. For the same points or
 /// Gaussians only the config can differ, and its keys are compared elsewhere.
 fn first_degree_change(start: &Start, state: &RunState, here: &DatasetPrint) -> Option<String> {
-    if state.dataset.points == here.points {
+    if state.origin.dataset.points == here.points {
         return None;
     }
-    let (there, here) = (state.sh_degree_start, start.sh_degree_start);
+    let (there, here) = (state.origin.sh_degree_start, start.sh_degree_start);
     (there != here).then(|| format!("the SH degree of the first Gaussians was {there} and is {here}"))
 }
 

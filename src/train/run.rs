@@ -4,9 +4,10 @@
 //! is stopped or fails after its first step still writes the PLY of its last good step.
 
 use super::changes::with_absolute_paths;
-use super::checkpoint::{Checkpoint, Origin};
+use super::checkpoint::Checkpoint;
 use super::costs::Meter;
 use super::device_memory;
+use super::drive_space::check_first_drive;
 use super::error::TrainError;
 use super::facts::{Resolved, write_config};
 use super::machine;
@@ -15,6 +16,7 @@ use super::memory::{host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
 use super::out_folder::{self, Existing};
 use super::page_map::write_page_map;
 use super::places::absolute;
+use super::plan_text;
 use super::preflight;
 use super::probe::{Probe, estimate};
 use super::progress::Progress;
@@ -28,7 +30,7 @@ use super::trainer::Trainer;
 use super::training_loop::LoopOutputs;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
-use crate::checkpoint::run_state::{DatasetPrint, RunIdentity};
+use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity};
 use crate::config::choice::{Chosen, LogFormat};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
@@ -38,7 +40,8 @@ use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyWritten};
 use crate::page::tool::uncommitted::remove_uncommitted;
 use crate::render::Renderer;
-use crate::report::run_report::{PAGES_FILE, write_run_report};
+use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE};
+use crate::report::run_report::write_run_report;
 use crate::scene::partition::first_fill;
 use std::path::{Path, PathBuf};
 
@@ -114,7 +117,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let host_mem = host_budget(config);
     let start = Start::read(&request.scene, config, host_mem)?;
     let sh_degree_start = start.sh_degree_start;
-    if let Some(known) = preflight::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
+    if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
         if !request.quiet {
             eprintln!("{known}");
         }
@@ -125,7 +128,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     {
         eprintln!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
     }
-    preflight::check_first_drive(config, start.rows)?;
+    check_first_drive(config, start.rows)?;
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
     let fill = first_fill(config.page_rows as usize, options.strategy.grows());
     let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
@@ -180,7 +183,7 @@ pub(super) fn plan_and_train(
     let plan = preflight::plan_tiers(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
     if !request.quiet {
         let of_device = device_memory::describe(config, &memory[1]);
-        let of_tiers = preflight::describe(&plan, &memory[1], &tiers) + &of_device;
+        let of_tiers = plan_text::describe(&plan, &memory[1], &tiers) + &of_device;
         eprintln!("{}", describe(request, dataset, &trainer, &of_tiers));
     }
     if request.dry_run {
@@ -205,7 +208,7 @@ pub(super) fn plan_and_train(
 
 /// ` --spill-dir FOLDER` if the config.toml could not be rewritten and so does not name the run's checkpoint.
 fn spill_dir_flag(request: &RunRequest) -> String {
-    let [kept, now] = [TrainConfig::read(&request.out.join("config.toml")), Ok(request.config.clone())]
+    let [kept, now] = [TrainConfig::read(&request.out.join(CONFIG_FILE)), Ok(request.config.clone())]
         .map(|config| config.map(|config| with_absolute_paths(config).spill_dir));
     match now {
         Ok(now) if !now.is_empty() && !kept.is_ok_and(|kept| kept == now) => format!(" --spill-dir {now}"),
@@ -222,7 +225,7 @@ fn resolved_config(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
 /// Writes config.toml (on resume only if it changed); returns the origin for all commits.
 fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun: &Begun) -> InputResult<Origin> {
     let simd = limits::simd_path(&request.config).name().to_string();
-    let path = request.out.join("config.toml");
+    let path = request.out.join(CONFIG_FILE);
     let config = match &begun.past {
         Some(past) => {
             // It belongs to the Gaussians before the change.
@@ -258,10 +261,7 @@ fn train_into(
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
     let origin = begin_files(request, dataset, &trainer, &begun)?;
-    let mut metrics = MetricsLog::open(&out.join("metrics.jsonl"), begun.past.as_ref().map(|p| p.metrics_bytes))?;
-    if config.log == LogFormat::Tensorboard {
-        metrics = metrics.with_events(&out.join("tensorboard"), begun.past.as_ref().map(|p| p.step))?;
-    }
+    let mut metrics = open_metrics(config.log, out, begun.past.as_ref())?;
     let keeps = tiers.keeps_checkpoint();
     let mut checkpoint = tiers.checkpoint.as_mut();
     if let Some(checkpoint) = &mut checkpoint {
@@ -291,7 +291,7 @@ fn train_into(
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
     let asked = stop.exit_code();
     let tested = looped.and_then(|()| match asked {
-        None => trainer.evaluate(dataset, &targets, Some(&out.join("renders/test"))),
+        None => trainer.evaluate(dataset, &targets, Some(&out.join(PICTURES_FOLDER))),
         Some(_) => Ok(None),
     });
     if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, tiers.checkpoint.as_mut()) {
@@ -307,12 +307,21 @@ fn train_into(
         commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
         ..summary_of(request, &trainer)
     };
-    write_summary(&out.join("summary.json"), &summary)?;
+    write_summary(&out.join(SUMMARY_FILE), &summary)?;
     write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
     write_run_report(out)?;
     tested?;
     tiers.is_done = summary.finished;
     Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
+}
+
+/// The log of metrics of a new run, or of a run that resumes after `past`.
+fn open_metrics(log: LogFormat, out: &Path, past: Option<&Past>) -> InputResult<MetricsLog> {
+    let metrics = MetricsLog::open(&out.join(METRICS_FILE), past.map(|past| past.metrics_bytes))?;
+    match log {
+        LogFormat::Json => Ok(metrics),
+        LogFormat::Tensorboard => metrics.with_events(&out.join(EVENTS_FOLDER), past.map(|past| past.step)),
+    }
 }
 
 /// Warns if the final PLY differs from the request.

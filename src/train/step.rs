@@ -11,6 +11,7 @@
 //! [`TrainError::Torn`]: the pages in memory belong to no step then.
 
 use super::batch::{gather, gather_listed, update};
+use super::comparison::Comparison;
 use super::error::TrainError;
 use super::pages::PagedScene;
 use super::working_set::WorkingSet;
@@ -19,9 +20,8 @@ use crate::optim::deferred::StepCounts;
 use crate::paging::batches::UseInStep;
 use crate::paging::error::PagingError;
 use crate::paging::pinned::PinnedPage;
-use crate::render::{LossOptions, LossValue, RenderOptions, Renderer, RowBatches};
+use crate::render::{LossValue, RenderOptions, Renderer, RowBatches};
 use crate::scene::camera::Camera;
-use crate::scene::image::Target;
 use std::collections::VecDeque;
 
 /// What a step did.
@@ -55,8 +55,8 @@ pub fn train_step(
     scene: &mut PagedScene,
     working: &mut WorkingSet,
     renderer: &mut dyn Renderer,
-    (step, camera, target): (u32, &Camera, &Target),
-    (render, loss): (&RenderOptions, &LossOptions),
+    (step, camera): (u32, &Camera),
+    (render, comparison): (&RenderOptions, &Comparison<'_>),
     collects: bool,
     pages_most: usize,
 ) -> Result<StepOutcome, TrainError> {
@@ -65,7 +65,7 @@ pub fn train_step(
     let mut passes = Passes { scene, working, renderer, step, camera, batches, pinned, outcome };
     let done = passes
         .rows_in(pages, pages_most, render)
-        .and_then(|()| passes.picture(target, loss))
+        .and_then(|()| passes.picture(comparison))
         .and_then(|()| passes.rows_out(collects));
     passes.release();
     let outcome = passes.outcome;
@@ -153,13 +153,12 @@ impl Passes<'_> {
         Ok(())
     }
 
-    /// Renders the picture of all splats, compares the picture with the photo, and takes the loss back to the splats.
-    fn picture(&mut self, target: &Target, loss: &LossOptions) -> Result<(), TrainError> {
+    /// Renders the picture of all splats, and takes its loss back to the splats.
+    fn picture(&mut self, comparison: &Comparison<'_>) -> Result<(), TrainError> {
         self.renderer.picture()?;
         // A device may be at work on the picture.
         self.prefetch_before_last();
-        self.renderer.loss(target, loss)?;
-        self.renderer.picture_back()?;
+        comparison.loss_and_back(self.renderer)?;
         if self.batches.len() > 1 {
             // A drive that is full is found while the step can still be given up.
             self.scene.pager.reserve_slots(self.batches.iter().map(|batch| batch.pages.len()).sum())?;

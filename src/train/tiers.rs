@@ -14,16 +14,13 @@ use crate::base::error::{InputError, InputResult};
 use crate::checkpoint::run_state::RunState;
 use crate::config::file::TrainConfig;
 use crate::config::residence::Residence;
-use crate::optim::moments::Moments;
 use crate::page::engine::memory::MemoryEngine;
 use crate::page::engine::open::{DEPTH, IoEngine, open_engine};
 use crate::page::engine::page_engine::PageEngine;
-use crate::page::folder::drive_rate::DriveRate;
 use crate::page::folder::file_system::free_bytes;
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
-use crate::page::format::spill_format::Purpose;
 use crate::page::map::commit::{CommitConfig, CommitError, Commits};
 use crate::page::map::opening::Opened;
 use crate::page::versions::paged_store::{PagedStore, PagedStoreConfig};
@@ -63,28 +60,8 @@ pub struct Tiers {
     pub engine: String,
     /// Codec of stored pages.
     pub codec: Codec,
-    /// Messages about the choice of engine and codec.
+    /// Messages about the drive and the choice of the engine.
     pub notes: Vec<String>,
-}
-
-/// Codec of `--spill-codec`. `auto` measures the drive of `folder`, and is raw without a folder or if the measurement
-/// fails.
-fn chosen_codec(config: &TrainConfig, folder: Option<&Path>, notes: &mut Vec<String>) -> Codec {
-    if let Some(codec) = config.spill_codec.0 {
-        return codec;
-    }
-    match folder.map(DriveRate::of) {
-        None => Codec::Raw,
-        Some(Ok(rate)) => match rate.codec() {
-            // Halves cost one pass and save a third of the bytes on any drive.
-            Codec::Raw if config.moments == Moments::Bf16 => Codec::Halves,
-            codec => codec,
-        },
-        Some(Err(error)) => {
-            notes.push(format!("the drive was not measured, pages are stored raw: {error}"));
-            Codec::Raw
-        }
-    }
 }
 
 /// Pager sizes of a run within `host_mem` bytes.
@@ -128,15 +105,14 @@ fn with_transfers(mut pager: Pager, config: &TrainConfig) -> Pager {
     pager
 }
 
-/// Staging of a run that has not begun, with this budget; `auto` counts as a drive fast enough for raw pages.
+/// Staging of a run that has not begun, with this budget.
 pub fn first_staging_bytes(config: &TrainConfig, host_mem: u64) -> u64 {
-    let codec = chosen_codec(config, None, &mut Vec::new());
-    staging_bytes(2 * pager_config(config, host_mem).prefetch_bytes, codec)
+    staging_bytes(2 * pager_config(config, host_mem).prefetch_bytes, codec(config))
 }
 
 /// Opens the tiers for a scene of about `pages` pages, within `host_mem` bytes. If the number of frames follows from
 /// the budget, the pager has few frames at first ([`Pager::allow_frames`]). With `dry`, pages of the drive are kept in
-/// memory and must fit there ([`super::preflight::too_large_for_a_dry_run`]).
+/// memory and must fit there (`plan_text::too_large_for_a_dry_run`).
 ///
 /// # Errors
 /// The spill directory cannot be used, or the I/O engine does not work here.
@@ -154,12 +130,12 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let Some(spill_dir) = residence.spill_dir().filter(|_| !dry) else {
         tiers.planned_on = residence.spill_dir().map(drive_of);
         let engine = Box::new(MemoryEngine::new());
-        let codec = chosen_codec(config, None, &mut tiers.notes);
+        let codec = codec(config);
         (tiers.engine, tiers.codec) = (engine.name().to_string(), codec);
         let of_store = PagedStoreConfig { store: 0, layout, codec, generation: 1, serial: 1 };
         return Ok((with_transfers(Pager::new(pager, PagedStore::new(engine, of_store)), config), tiers));
     };
-    let spill = SpillDir::create(spill_dir, Purpose::Checkpoint, layout, false)?;
+    let spill = SpillDir::create(spill_dir, layout, false)?;
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
     // From here on, an error removes the directory.
     let (engine, codec) = tiers.take_spill(spill, config)?;
@@ -275,10 +251,7 @@ impl Tiers {
         self.notes.extend(spill.warnings().iter().filter(|_| !self.is_in_memory).cloned());
         let folder = spill.folder().to_path_buf();
         self.spill = Some(spill);
-        let codec = match self.is_in_memory {
-            true => codec(config),
-            false => chosen_codec(config, Some(&folder), &mut self.notes),
-        };
+        let codec = codec(config);
         let opened = open_engine(config.io, &folder, DEPTH)?;
         self.notes.extend(opened.notes);
         (self.engine, self.codec) = (opened.store.name().to_string(), codec);

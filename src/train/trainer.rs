@@ -6,6 +6,7 @@
 //! run with the result of the last good step.
 
 use super::budget::HostBudget;
+use super::comparison::Comparison;
 use super::dense::settle_all;
 use super::error::TrainError;
 use super::eval::{EvalRequest, evaluate};
@@ -15,7 +16,7 @@ use super::step::{StepOutcome, train_step};
 use super::view::rehearse;
 use super::working_set::WorkingSet;
 use crate::base::error::InputError;
-use crate::checkpoint::run_state::LastTest;
+use crate::checkpoint::run_state::{LastTest, TrainerState};
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
@@ -24,6 +25,7 @@ use crate::optim::method::Method;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::device_needs::ViewSizes;
 use crate::render::{RenderOptions, Renderer};
+use crate::report::run_files::PLY_FILE;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
@@ -52,13 +54,8 @@ pub struct Trainer {
     order: ViewOrder,
     train_views: Vec<usize>,
     pub(super) working: WorkingSet,
-    pub(super) step: u32,
-    pub(super) rows_skipped: u64,
-    pub(super) steps_skipped: u32,
-    pub(super) steps_skipped_in_a_row: u32,
-    pub(super) train_seconds: f64,
-    /// Result of the last evaluation on the held-out views.
-    pub(super) last_test: Option<LastTest>,
+    /// Everything that a commit saves and a resume restores, besides the pages.
+    pub(super) state: TrainerState,
     /// A step failed after it had changed rows, so the state must not be committed.
     pub(super) is_torn: bool,
     /// Memory budget from which the number of frames follows; `None` without a budget.
@@ -128,12 +125,7 @@ impl Trainer {
             working: WorkingSet::default(),
             renderer,
             options,
-            step: 0,
-            rows_skipped: 0,
-            steps_skipped: 0,
-            steps_skipped_in_a_row: 0,
-            train_seconds: 0.0,
-            last_test: None,
+            state: TrainerState::default(),
             is_torn: false,
             budget: None,
             pages_most: usize::MAX,
@@ -154,9 +146,9 @@ impl Trainer {
             let camera = &dataset.views[view].camera;
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-            let how = (&render, &self.options.loss);
-            let now = (&mut self.scene, self.step, &mut self.working);
-            let rows = rehearse(now, &mut *self.renderer, (camera, &target), how, self.pages_most)?;
+            let comparison = Comparison { target: &target, loss: self.options.loss };
+            let now = (&mut self.scene, self.state.step, &mut self.working);
+            let rows = rehearse(now, &mut *self.renderer, camera, (&render, &comparison), self.pages_most)?;
             let index = self.scene.pager.index();
             let pages = self.scene.pager.pages_of_view(camera);
             let is_whole = self.scene.pager.pages_per_batch(pages.len()).min(self.pages_most) >= pages.len();
@@ -190,22 +182,22 @@ impl Trainer {
 
     /// Steps done.
     pub fn steps_done(&self) -> u32 {
-        self.step
+        self.state.step
     }
 
     /// Index in `dataset.views` of the next step's view.
     pub fn next_view(&mut self) -> usize {
-        self.train_views[self.order.view_at(self.step)]
+        self.train_views[self.order.view_at(self.state.step)]
     }
 
     /// Seconds spent in steps.
     pub fn train_seconds(&self) -> f64 {
-        self.train_seconds
+        self.state.train_seconds
     }
 
     /// Row updates and steps skipped because a value was not finite.
     pub fn skipped(&self) -> (u64, u32) {
-        (self.rows_skipped, self.steps_skipped)
+        (self.state.rows_skipped, self.state.steps_skipped)
     }
 
     /// Traffic between the tiers since the run began, including the time before a resume.
@@ -231,7 +223,7 @@ impl Trainer {
     pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
         let view = self.next_view();
         let mut ahead = Vec::new();
-        self.order.upcoming(self.step, PREFETCH_VIEWS.min(self.options.steps - self.step), &mut ahead);
+        self.order.upcoming(self.state.step, PREFETCH_VIEWS.min(self.options.steps - self.state.step), &mut ahead);
         for position in &mut ahead {
             *position = self.train_views[*position];
         }
@@ -241,14 +233,15 @@ impl Trainer {
         let target = targets.get(view)?;
         let started = Instant::now();
         let render = self.render_options();
+        let comparison = Comparison { target: &target, loss: self.options.loss };
         let stepped = loop {
             let stepped = train_step(
                 &mut self.scene,
                 &mut self.working,
                 &mut *self.renderer,
-                (self.step, &dataset.views[view].camera, &target),
-                (&render, &self.options.loss),
-                self.options.strategy.collects(self.step),
+                (self.state.step, &dataset.views[view].camera),
+                (&render, &comparison),
+                self.options.strategy.collects(self.state.step),
                 self.pages_most,
             );
             self.is_torn = matches!(stepped, Err(TrainError::Torn { .. }));
@@ -264,27 +257,27 @@ impl Trainer {
         if self.options.optimizer == Method::Dense {
             // The step has changed rows; an error here leaves a state between two steps.
             self.is_torn = true;
-            settle_all(&mut self.scene, self.step + 1)?;
+            settle_all(&mut self.scene, self.state.step + 1)?;
             self.is_torn = false;
         }
         self.log_events();
-        self.step += 1;
-        self.train_seconds += started.elapsed().as_secs_f64();
+        self.state.step += 1;
+        self.state.train_seconds += started.elapsed().as_secs_f64();
         Ok(outcome)
     }
 
     /// Updates the pager's plan every [`LOOK_AHEAD_EVERY`] steps; doing it at every step would cost too much.
     fn look_ahead(&mut self, dataset: &Dataset) {
-        if self.is_in_memory() || !self.step.is_multiple_of(LOOK_AHEAD_EVERY) {
+        if self.is_in_memory() || !self.state.step.is_multiple_of(LOOK_AHEAD_EVERY) {
             return;
         }
         // Two epochs contain a use of every page that any view needs.
         let count = (2 * self.train_views.len() as u32).clamp(LOOK_AHEAD_LEAST, LOOK_AHEAD_MOST);
         let mut coming = Vec::new();
-        self.order.upcoming(self.step, count.min(self.options.steps - self.step), &mut coming);
+        self.order.upcoming(self.state.step, count.min(self.options.steps - self.state.step), &mut coming);
         let camera = |&position: &usize| &dataset.views[self.train_views[position]].camera;
         let cameras: Vec<&Camera> = coming.iter().map(camera).collect();
-        self.scene.pager.look_ahead(self.step, &cameras);
+        self.scene.pager.look_ahead(self.state.step, &cameras);
     }
 
     /// Notes how many of the rows in the pages of a view were drawn, and whether the view was one batch.
@@ -294,27 +287,27 @@ impl Trainer {
     }
 
     fn count_skipped(&mut self, outcome: &StepOutcome, view: &str) -> Result<(), TrainError> {
-        self.rows_skipped += outcome.rows_skipped;
+        self.state.rows_skipped += outcome.rows_skipped;
         if !outcome.skipped {
-            self.steps_skipped_in_a_row = 0;
+            self.state.steps_skipped_in_a_row = 0;
             return Ok(());
         }
-        self.steps_skipped += 1;
-        self.steps_skipped_in_a_row += 1;
-        if self.steps_skipped_in_a_row < NON_FINITE_STEPS_MAX {
+        self.state.steps_skipped += 1;
+        self.state.steps_skipped_in_a_row += 1;
+        if self.state.steps_skipped_in_a_row < NON_FINITE_STEPS_MAX {
             return Ok(());
         }
         Err(TrainError::NonFinite {
-            step: self.step,
+            step: self.state.step,
             view: view.to_string(),
-            count: self.steps_skipped_in_a_row,
+            count: self.state.steps_skipped_in_a_row,
             remedy: "lower the learning rates; with the default rates, report this as a bug and attach the scene",
         })
     }
 
     /// Decides and logs the events of this step. They act on values after the step's update.
     fn log_events(&mut self) {
-        let (step, scale) = (self.step, self.options.scene_scale);
+        let (step, scale) = (self.state.step, self.options.scene_scale);
         let rows = self.scene.rows_bound();
         let kinds = self.options.strategy.events_after(step, scale, rows, &self.scene.histogram);
         kinds.into_iter().for_each(|kind| self.scene.log_event(Event { step, kind }));
@@ -343,10 +336,10 @@ impl Trainer {
             lpips: None,
             color_correct: self.options.color_correct,
         };
-        let now = (&mut self.scene, self.step, &mut self.working);
+        let now = (&mut self.scene, self.state.step, &mut self.working);
         let test = evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)?;
-        let of = |t: TestMetrics| LastTest { step: self.step, views: t.views, psnr: t.psnr, ssim: t.ssim };
-        self.last_test = test.map(of).or(self.last_test);
+        let of = |t: TestMetrics| LastTest { step: self.state.step, views: t.views, psnr: t.psnr, ssim: t.ssim };
+        self.state.test = test.map(of).or(self.state.test);
         Ok(test)
     }
 
@@ -361,7 +354,7 @@ impl Trainer {
             return Err(InputError::new(path, problem, remedy).into());
         }
         let meta = PlyMeta {
-            step: Some(u64::from(self.step)),
+            step: Some(u64::from(self.state.step)),
             origin: dataset.frame.origin.to_array(),
             scale: dataset.frame.scale,
             scene_radius: f64::from(dataset.scene_scale) * dataset.frame.scale,
@@ -370,12 +363,12 @@ impl Trainer {
         };
         let rows_at_most = self.scene.rows_bound();
         let mut writer = ply::PlyWriter::create(path, self.options.sh_degree, rows_at_most, &meta)?;
-        self.scene.for_all_rows(self.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
+        self.scene.for_all_rows(self.state.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
         Ok(writer.finish()?)
     }
 
     /// Path of the final PLY in an output folder.
     pub fn ply_path(out: &Path) -> PathBuf {
-        out.join("point_cloud.ply")
+        out.join(PLY_FILE)
     }
 }

@@ -14,6 +14,7 @@ use super::trainer::Trainer;
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::report::run_files::saved_ply_name;
 use std::path::Path;
 
 /// Outputs and controls of a loop.
@@ -41,14 +42,14 @@ impl Trainer {
         targets: &TargetCache,
         outputs: &mut LoopOutputs<'_>,
     ) -> Result<(), TrainError> {
-        while self.step < self.options.steps && outputs.stop.exit_code().is_none() {
+        while self.state.step < self.options.steps && outputs.stop.exit_code().is_none() {
             self.start_paging_if_outgrown(outputs)?;
-            let step = self.step;
+            let step = self.state.step;
             let before = self.renderer.traffic();
             let Some(outcome) = self.step_with_space(dataset, targets, outputs)? else { break };
             self.check_statistics(outputs)?;
             let traffic = self.renderer.traffic();
-            let is_last = self.step == self.options.steps;
+            let is_last = self.state.step == self.options.steps;
             let due = |every: u32| step > 0 && step.is_multiple_of(every);
             let psnr = json_psnr(-10.0 * outcome.loss.mse.log10());
             let mut test: Option<TestMetrics> = None;
@@ -56,7 +57,7 @@ impl Trainer {
                 test = self.evaluate(dataset, targets, None)?;
             }
             if due(self.options.save_every) && !is_last {
-                self.save_if_space(dataset, &outputs.out.join(format!("point_cloud_{step:06}.ply")))?;
+                self.save_if_space(dataset, &outputs.out.join(saved_ply_name(step)))?;
                 if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
                     checkpoint.keep_next_as(format!("step-{step}"));
                 }
@@ -67,7 +68,7 @@ impl Trainer {
                     loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },
                     psnr,
                     gaussians: self.scene.rows(),
-                    seconds: self.train_seconds,
+                    seconds: self.state.train_seconds,
                     host_bytes_peak: host_bytes_peak().unwrap_or(0),
                     bytes_uploaded: traffic.bytes_uploaded - before.bytes_uploaded,
                     bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
@@ -79,8 +80,8 @@ impl Trainer {
                 let written = outputs.metrics.write(&line).map_err(TrainError::from);
                 written.or_else(|error| self.make_space(outputs, error))?;
             }
-            let (gaussians, last_test) = (self.scene.rows(), self.last_test);
-            outputs.progress.step(self.step, || {
+            let (gaussians, last_test) = (self.scene.rows(), self.state.test);
+            outputs.progress.step(self.state.step, || {
                 let test = last_test.map_or(String::new(), |t| format!(" test {:.2}", t.psnr));
                 let tiers = TierTraffic::of(&self.scene.pager).words();
                 let commits = outputs.checkpoint.as_deref().map_or(String::new(), |c| c.report().words());
@@ -126,7 +127,7 @@ impl Trainer {
         let problem = format!("the pages hold statistics of {rows} rows that the run's histogram lacks");
         let remedy = "the last commit is intact: make a consistent store with gsscale-ckpt salvage, then continue with \
                       gsscale-train --resume and --spill-dir";
-        Err(InputError::new(store, problem, remedy).at(format!("step {}", self.step)))
+        Err(InputError::new(store, problem, remedy).at(format!("step {}", self.state.step)))
     }
 
     /// Frees or awaits drive space after `error`; without a checkpoint, returns the error.
@@ -141,7 +142,7 @@ impl Trainer {
     /// run keeps its previous commit.
     fn commit_last(&mut self, outputs: &mut LoopOutputs<'_>) -> Result<(), TrainError> {
         let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else { return Ok(()) };
-        match self.step < self.options.steps || checkpoint.needs_last_commit() {
+        match self.state.step < self.options.steps || checkpoint.needs_last_commit() {
             true => checkpoint.commit_or_warn(self, outputs.metrics),
             false => Ok(()),
         }

@@ -5,13 +5,13 @@
 //! Invariants: 1. nothing is stored; 2. memory beside the renderer's is bounded by the rows of one batch, however many rows
 //! the view has.
 
+use super::comparison::Comparison;
 use super::error::TrainError;
 use super::pages::PagedScene;
 use super::working_set::WorkingSet;
 use crate::base::ids::PageNo;
-use crate::render::{LossOptions, RenderOptions, Renderer, RowBatches};
+use crate::render::{RenderOptions, Renderer, RowBatches};
 use crate::scene::camera::Camera;
-use crate::scene::image::Target;
 
 /// Pages of a batch of an evaluation, at most.
 const PAGES_PER_BATCH: usize = 64;
@@ -44,8 +44,8 @@ pub fn draw(
 pub fn rehearse(
     (scene, now, working): (&mut PagedScene, u32, &mut WorkingSet),
     renderer: &mut dyn Renderer,
-    (camera, target): (&Camera, &Target),
-    (options, loss): (&RenderOptions, &LossOptions),
+    camera: &Camera,
+    (options, comparison): (&RenderOptions, &Comparison<'_>),
     pages_most: usize,
 ) -> Result<usize, TrainError> {
     let pages = scene.pager.pages_of_view(camera);
@@ -58,8 +58,7 @@ pub fn rehearse(
         rows += working.row_from_working.len();
     }
     renderer.picture()?;
-    renderer.loss(target, loss)?;
-    renderer.picture_back()?;
+    comparison.loss_and_back(renderer)?;
     for (i, batch) in batches.iter().enumerate().rev() {
         if i + 1 < batches.len() {
             scene.gather_pages(batch, camera, now, working)?;

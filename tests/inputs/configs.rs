@@ -1,6 +1,7 @@
 //! Every config file parses and passes its checks; default.toml equals the built-in defaults.
 
-use gsscale::config::file::{KEYS, TrainConfig, default_file};
+use gsscale::config::command_line::default_file;
+use gsscale::config::file::{KEYS, TrainConfig};
 use gsscale::config::key::Key;
 use std::path::PathBuf;
 

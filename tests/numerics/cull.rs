@@ -19,6 +19,7 @@ use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::Target;
 use gsscale::scene::state::SceneState;
 use gsscale::train::catch_up::{evaluate_all, gather, visible_rows};
+use gsscale::train::comparison::Comparison;
 use gsscale::train::pages::PagedScene;
 use gsscale::train::step::train_step;
 use gsscale::train::working_set::WorkingSet;
@@ -168,12 +169,12 @@ fn no_row_outside_of_the_selected_pages_changes_a_picture() {
         let [fx, fy, cx, cy] = [camera.fx, camera.fy, camera.cx, camera.cy].map(|x| x / 4.0);
         Camera { width, height, fx, fy, cx, cy, ..camera }
     };
-    let how = (&options.render, &options.loss);
     for step in 0..STEPS {
         let camera = small(camera(&mut draws));
         let rgb = (0..3 * camera.pixels()).map(|_| draws.below(256) as u8).collect();
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-        train_step(&mut pages, &mut working, &mut renderer, (step, &camera, &target), how, false, usize::MAX).unwrap();
+        let how = (&options.render, &Comparison { target: &target, loss: options.loss });
+        train_step(&mut pages, &mut working, &mut renderer, (step, &camera), how, false, usize::MAX).unwrap();
     }
     let mut all = Columns::zeros(0, 0);
     let mut append = |rows: &Columns| {

@@ -4,10 +4,9 @@
 use crate::support::child::in_child;
 use crate::support::gpu;
 use gsscale::base::rng::{Purpose, Stream};
-use gsscale::base::simd::SimdPath;
 use gsscale::gpu::GpuOptions;
 use gsscale::render::gpu::GpuRenderer;
-use gsscale::render::{Gradients, LossOptions, RenderOptions, Renderer, SsimPadding};
+use gsscale::render::{Gradients, LossOptions, RenderOptions, Renderer};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::Columns;
 use gsscale::scene::image::Target;
@@ -52,7 +51,7 @@ fn views_whose_counts_are_all_new_leave_no_memory_behind() {
     let camera =
         Camera { viewmat, fx: 70.0, fy: 70.0, cx: 40.0, cy: 32.0, width, height, near_plane: 0.01, far_plane: 1e10 };
     let target = Target { width, height, rgb: vec![128; 3 * 80 * 64], mask: None };
-    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
+    let loss = LossOptions::default();
     let mut renderer = GpuRenderer::new(device).unwrap();
     let mut grads = Gradients::default();
     let mut before = None;

@@ -14,6 +14,7 @@ use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::Traffic;
 use gsscale::render::gpu::GpuRenderer;
 use gsscale::scene::columns::Column;
+use gsscale::train::comparison::Comparison;
 use gsscale::train::pages::PagedScene;
 use gsscale::train::prepare::{Prepared, prepare};
 use gsscale::train::step::train_step;
@@ -231,8 +232,9 @@ fn bits_of_steps(scene: &Path, options: &GpuOptions, capacity: u32) -> Option<(V
     let (mut bits, mut isects) = (Vec::new(), u32::MAX);
     for (step, &view) in dataset.train_views().iter().cycle().take(10).enumerate() {
         let view = &dataset.views[view];
-        let (target, how) = (decode(&view.photo).unwrap(), (&options.render, &options.loss));
-        let at = (step as u32, &view.camera, &target);
+        let target = decode(&view.photo).unwrap();
+        let how = (&options.render, &Comparison { target: &target, loss: options.loss });
+        let at = (step as u32, &view.camera);
         let done = train_step(&mut scene, &mut working, &mut renderer, at, how, true, usize::MAX).unwrap();
         assert!(done.rows > 900 && done.updated > 300 && !done.skipped, "{done:?}");
         isects = isects.min(renderer.isects());

@@ -4,7 +4,8 @@
 use crate::support::browser::in_a_browser;
 use crate::support::scenes::{city, stderr, text, train};
 use gsscale::report::compare_report::compare_report;
-use gsscale::report::run_report::{PAGES_FILE, run_report};
+use gsscale::report::run_files::PAGES_FILE;
+use gsscale::report::run_report::run_report;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 

@@ -20,6 +20,7 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::Target;
 use gsscale::scene::page_layout::capacity_bytes;
+use gsscale::train::comparison::Comparison;
 use gsscale::train::error::TrainError;
 use gsscale::train::pages::PagedScene;
 use gsscale::train::step::{StepOutcome, train_step};
@@ -81,8 +82,8 @@ fn step(scene: &mut PagedScene, step: u32) -> Result<StepOutcome, TrainError> {
     let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
     let (mut working, mut renderer) = (WorkingSet::default(), CpuRenderer::new());
     let render = RenderOptions { sh_degree: scene.rules.sh_degree(), ..options.render };
-    let how = (&render, &options.loss);
-    train_step(scene, &mut working, &mut renderer, (step, &camera, &target), how, false, usize::MAX)
+    let how = (&render, &Comparison { target: &target, loss: options.loss });
+    train_step(scene, &mut working, &mut renderer, (step, &camera), how, false, usize::MAX)
 }
 
 /// The bits of every row, column by column.

@@ -8,7 +8,6 @@ use gsscale::page::folder::protocol_files::{DriveFolder, Folder};
 use gsscale::page::folder::spill_dir::SpillDir;
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::{HEADER_BYTES, SlotRef};
-use gsscale::page::format::spill_format::Purpose;
 use gsscale::page::map::commit::{
     CommitConfig, CommitError, Commits, Cut, MAP_NAME, PageChange, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME,
 };
@@ -206,7 +205,7 @@ fn hostile_maps_are_refused() {
 fn hostile_maps_cost_readers_nothing() {
     let parent = tempfile::tempdir().unwrap();
     let at = parent.path().join("store");
-    let spill = SpillDir::create(&at, Purpose::Checkpoint, LAYOUT, false).unwrap();
+    let spill = SpillDir::create(&at, LAYOUT, false).unwrap();
     let config = commit_config(spill.format().store);
     let opened = Commits::create(Box::new(DriveFolder::new(&at)), config).unwrap();
     let mut store = pages_of(&opened, &at);

@@ -10,7 +10,6 @@ use gsscale::page::engine::page_engine::Place;
 use gsscale::page::engine::segment_files::{SegmentFiles, segment_file_name};
 use gsscale::page::folder::spill_dir::SpillDir;
 use gsscale::page::format::slot_header::{HEADER_BYTES, SlotHeader, SlotRef, StoredAs};
-use gsscale::page::format::spill_format::Purpose;
 use gsscale::page::versions::slots::SlotLayout;
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Write};
@@ -23,7 +22,7 @@ const LAYOUT: SlotLayout = SlotLayout { slot_bytes: 8192, slots_per_segment: 4 }
 const NOBODY: u32 = 65534;
 
 fn create(folder: &Path) -> Result<SpillDir, InputError> {
-    SpillDir::create(folder, Purpose::Scratch, LAYOUT, false)
+    SpillDir::create(folder, LAYOUT, false)
 }
 
 fn is_root() -> bool {
@@ -173,10 +172,10 @@ fn left_over_directories_are_refused_with_the_remedy() {
     let parent = tempfile::tempdir().unwrap();
     let folder = parent.path().join("spill");
     drop(create(&folder).unwrap());
-    assert_refused(&folder, "an interrupted run");
+    assert_refused(&folder, "it holds the checkpoint of another run");
     assert!(create(&folder).unwrap_err().remedy.contains("rm -r"));
     let kept = parent.path().join("kept");
-    let store = SpillDir::create(&kept, Purpose::Checkpoint, LAYOUT, false).unwrap().format().store;
+    let store = SpillDir::create(&kept, LAYOUT, false).unwrap().format().store;
     assert_refused(&kept, "it holds the checkpoint of another run");
     let opened = SpillDir::open(&kept, false).unwrap();
     assert_eq!((opened.format().store, opened.format().layout), (store, LAYOUT));
@@ -330,10 +329,10 @@ fn two_processes_never_share_a_directory() {
         assert!(told.contains(&process) && told.contains("remedy"), "{told}");
     }
     assert!(contents(&folder) == before);
-    // The holder is killed: its lock is released, and the folder is recognized as that of an interrupted run.
+    // The holder is killed: its lock is released, and the folder is recognized as another run's.
     holder.kill().unwrap();
     holder.wait().unwrap();
-    assert_refused(&folder, "an interrupted run");
+    assert_refused(&folder, "it holds the checkpoint of another run");
     let in_use = SpillDir::open(&folder, false).unwrap();
     assert!(ask("create", &folder).contains(&format!("process {}", std::process::id())));
     assert_eq!(in_use.remove().unwrap(), [""; 0]);

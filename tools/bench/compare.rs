@@ -1,9 +1,9 @@
 //! `gsscale-bench compare`: compares finished runs on one page.
 
 use clap::Parser;
+use gsscale::base::whole_file::write_whole;
 use gsscale::report::compare_report::compare_report;
 use gsscale::train::error::TrainError;
-use gsscale::train::whole_file::write_whole;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\

@@ -8,6 +8,7 @@ use super::sweep::{Planned, Sweep, SweepArgs, use_drive};
 use clap::Parser;
 use clap::builder::PossibleValuesParser;
 use gsscale::base::error::InputError;
+use gsscale::base::whole_file::write_whole;
 use gsscale::config::choice::Choice;
 use gsscale::config::file::TrainConfig;
 use gsscale::optim::method::Method;
@@ -17,7 +18,6 @@ use gsscale::paging::timing::Transfers;
 use gsscale::report::ladder_page::{LadderRung, ladder_page};
 use gsscale::schedule::order::Order;
 use gsscale::train::error::TrainError;
-use gsscale::train::whole_file::write_whole;
 use serde_json::Value;
 
 const EXAMPLES: &str = "\

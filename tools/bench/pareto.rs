@@ -6,6 +6,7 @@ use super::sweep::{Planned, Surroundings, Sweep, SweepArgs, use_drive};
 use clap::Parser;
 use clap::builder::PossibleValuesParser;
 use gsscale::base::error::InputError;
+use gsscale::base::whole_file::write_whole;
 use gsscale::config::choice::Choice;
 use gsscale::config::file::TrainConfig;
 use gsscale::page::format::codec::Codec;
@@ -13,7 +14,6 @@ use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::{ResultsLog, successful_run};
 use gsscale::report::sweep_page::sweep_page;
 use gsscale::train::error::TrainError;
-use gsscale::train::whole_file::write_whole;
 use serde_json::Value;
 
 const EXAMPLES: &str = "\

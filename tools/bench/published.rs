@@ -6,6 +6,7 @@
 use super::published_table::{Comparison, Ours};
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
+use gsscale::base::whole_file::write_whole;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::read_options;
 use gsscale::config::published::{BUILT_IN, PublishedRun, differences};
@@ -13,13 +14,13 @@ use gsscale::dataset::layout::{Layout, find_layout};
 use gsscale::dataset::model::{RawScene, Split};
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use gsscale::render::lpips::InputRange;
+use gsscale::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::eval::{EvalExtras, evaluate_ply};
 use gsscale::train::out_folder::Existing;
 use gsscale::train::report::Summary;
 use gsscale::train::run::{RunRequest, run};
 use gsscale::train::trainer::Trainer;
-use gsscale::train::whole_file::write_whole;
 use serde_json::Value;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -99,7 +100,7 @@ struct Setting {
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, TrainError> {
     let mut run = PublishedRun::find(&args.run)?;
     let out = args.out.clone().unwrap_or_else(|| Path::new("runs").join(&run.name));
-    let finished = if args.no_train { Some(TrainConfig::read(&out.join("config.toml"))?) } else { None };
+    let finished = if args.no_train { Some(TrainConfig::read(&out.join(CONFIG_FILE))?) } else { None };
     // With --no-train, the tier is that of the finished run.
     let of_finished = finished.as_ref().and_then(|config| run.tier_of(config)).map(str::to_string);
     if let Some(tier) = args.tier.clone().or(of_finished) {
@@ -217,7 +218,7 @@ fn train(args: &Args, setting: &Setting, config: &TrainConfig) -> Result<Result<
 }
 
 fn read_summary(out: &Path) -> InputResult<Summary> {
-    let path = out.join("summary.json");
+    let path = out.join(SUMMARY_FILE);
     let text = std::fs::read_to_string(&path).map_err(|e| InputError::io(&path, "reading the run's summary", &e))?;
     serde_json::from_str(&text).map_err(|e| {
         InputError::new(&path, format!("is not the summary of a run: {e}"), "use the output folder of a run")

@@ -8,14 +8,16 @@
 use clap::Args;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::cpu_model;
+use gsscale::base::whole_file::write_whole;
 use gsscale::checkpoint::interval::CommitEvery;
 use gsscale::config::choice::Choice;
-use gsscale::config::file::{ByteSize, TrainConfig, TrainOverrides};
+use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::config::values::ByteSize;
 use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::{ResultsLog, successful_run};
+use gsscale::report::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PLY_FILE, SUMMARY_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::report::Summary;
-use gsscale::train::whole_file::write_whole;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -244,8 +246,8 @@ impl Sweep {
 
     /// Reads the figures from the run's folder and removes the PLY, which is large.
     fn read_figures(&self, record: &mut RunRecord, config: &TrainConfig, folder: &Path) -> InputResult<()> {
-        let summary: Summary = read_json(&folder.join("summary.json"))?;
-        let ply = folder.join("point_cloud.ply");
+        let summary: Summary = read_json(&folder.join(SUMMARY_FILE))?;
+        let ply = folder.join(PLY_FILE);
         record.ply = digest(&ply)?;
         (record.psnr, record.ssim) = (summary.test.map(|t| t.psnr), summary.test.map(|t| t.ssim));
         record.seconds = summary.train_seconds;
@@ -258,13 +260,13 @@ impl Sweep {
         record.host_bytes_peak = summary.host_bytes_peak;
         record.device_bytes_peak = summary.costs.device_bytes_peak;
         record.drive_bytes_peak = summary.costs.drive_bytes_peak;
-        record.view_order = TrainConfig::read(&folder.join("config.toml"))?.view_order.word().into_owned();
+        record.view_order = TrainConfig::read(&folder.join(CONFIG_FILE))?.view_order.word().into_owned();
         let photos = |c: &TrainConfig| (c.data_factor, c.max_resolution);
         if photos(config) != photos(&self.base) {
             // Smaller photos raise PSNR, so every run is evaluated on the photos of the base.
-            let file = folder.join("evaluated-as.toml");
+            let file = folder.join(EVALUATED_AS_FILE);
             write_config(&file, &self.base)?;
-            let json = folder.join("evaluated.json");
+            let json = folder.join(EVALUATED_FILE);
             let arguments = [&ply, self.scene.as_path(), Path::new("--config"), &file, Path::new("--json"), &json];
             let output = self.spawn("gsscale-eval", &arguments)?;
             if !output.status.success() {

@@ -1,7 +1,7 @@
 //! `gsscale-ckpt export`: writes a generation as a PLY.
 
 use gsscale::base::units::format_bytes;
-use gsscale::config::file::ByteSize;
+use gsscale::config::values::ByteSize;
 use gsscale::train::error::TrainError;
 use gsscale::train::stores::{ExportRequest, export, find_store};
 use std::path::PathBuf;

@@ -1,7 +1,7 @@
 //! `gsscale-ckpt import`: makes a store from the Gaussians of a PLY.
 
 use gsscale::base::units::format_bytes;
-use gsscale::config::file::ByteSize;
+use gsscale::config::values::ByteSize;
 use gsscale::page::format::codec::Codec;
 use gsscale::train::error::TrainError;
 use gsscale::train::stores::{ImportRequest, import};

@@ -20,7 +20,8 @@ mod trace;
 mod world;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::colmap_write::{Model, ModelImage, make_folder, write_file, write_model};
+use crate::base::whole_file::write_whole;
+use crate::dataset::colmap_write::{Model, ModelImage, make_folder, write_model};
 use flight::Flight;
 use glam::DVec3;
 use image::{ExtendedColorType, codecs::jpeg::JpegEncoder};
@@ -213,7 +214,7 @@ fn list(folder: &Path) -> InputResult<Vec<String>> {
 
 /// Whether [`photo_name`] makes this name, or an interrupted run left it.
 fn is_photo_name(name: &str) -> bool {
-    let name = name.strip_suffix(".partial").unwrap_or(name);
+    let name = name.strip_prefix('.').and_then(|name| name.strip_suffix(".part")).unwrap_or(name);
     let number = name.strip_prefix("view_").and_then(|n| n.strip_suffix(".jpg"));
     number.is_some_and(|n| n.len() >= 4 && n.bytes().all(|b| b.is_ascii_digit()))
 }
@@ -257,7 +258,7 @@ fn write_photo(folder: &Path, options: &CityOptions, k: usize, photo: &Photo) ->
     JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY)
         .encode(&photo.rgb, options.width, options.height, ExtendedColorType::Rgb8)
         .map_err(|e| InputError::new(&path, format!("compressing failed: {e}"), "choose another --resolution"))?;
-    write_file(&path, |out| out.write_all(&bytes))
+    write_whole(&path, &bytes)
 }
 
 #[cfg(test)]

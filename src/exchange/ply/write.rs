@@ -11,6 +11,7 @@
 
 use super::{ExportFrame, PlyMeta, unit_quat};
 use crate::base::error::{InputError, InputResult};
+use crate::base::whole_file::PartFile;
 use crate::scene::columns::{Column, Columns, sh_n_width};
 use std::fmt::Write as _;
 use std::fs::File;
@@ -69,14 +70,8 @@ impl PlyWriter {
     /// # Errors
     /// The disk fails, or `path` names no file.
     pub fn create(path: &Path, sh_degree: u8, rows_at_most: u64, meta: &PlyMeta) -> InputResult<PlyWriter> {
-        let name =
-            path.file_name().ok_or_else(|| InputError::new(path, "this path has no file name", "give a file name"))?;
         let frame = meta.frame.fitting_f32(meta.origin, meta.scene_radius);
-        let mut part_name = std::ffi::OsString::from(".");
-        part_name.push(name);
-        part_name.push(".part");
-        let part = PartFile { path: path.with_file_name(part_name) };
-        let file = File::create(&part.path).map_err(|e| InputError::io(path, "creating the file", &e))?;
+        let (part, file) = PartFile::create(path)?;
         let mut out = BufWriter::with_capacity(1 << 20, file);
         let header = header_text(sh_degree, rows_at_most, rows_at_most, meta, frame);
         out.write_all(header.as_bytes()).map_err(|e| InputError::io(path, "writing", &e))?;
@@ -163,31 +158,8 @@ impl PlyWriter {
             let written = file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(header.as_bytes()));
             written.map_err(|e| failed("writing", &e))?;
         }
-        file.sync_all().map_err(|e| failed("flushing to the disk", &e))?;
-        drop(file);
-        std::fs::rename(&part.path, &path).map_err(|e| failed("replacing the file", &e))?;
-        sync_folder(&path);
+        part.finish(file)?;
         Ok(PlyWritten { frame, rows, skipped: given - rows, bytes })
-    }
-}
-
-/// The unfinished file; removed on drop unless it was renamed.
-struct PartFile {
-    path: PathBuf,
-}
-
-impl Drop for PartFile {
-    fn drop(&mut self) {
-        // After the rename the file no longer exists, and this call fails as expected.
-        let _ = std::fs::remove_file(&self.path);
-    }
-}
-
-/// Makes the rename durable. Some file systems cannot; the data is on the disk either way.
-fn sync_folder(path: &Path) {
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    if let Ok(folder) = File::open(folder) {
-        let _ = folder.sync_all();
     }
 }
 

@@ -246,14 +246,6 @@ pub fn open_for_reading(path: &Path) -> io::Result<File> {
     with_safe_flags(OpenOptions::new().read(true)).open(path)
 }
 
-/// Makes the entries of a folder durable.
-///
-/// # Errors
-/// The drive reported an error.
-pub fn sync_folder(folder: &Path) -> io::Result<()> {
-    if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
-}
-
 /// Adds the flags: private to its owner, follow no link, do not block on a pipe in place of the file. (The standard
 /// library already keeps descriptors from being inherited.)
 pub fn with_safe_flags(options: &mut OpenOptions) -> &mut OpenOptions {

@@ -4,7 +4,8 @@
 //! nothing outside the folder is accessed; a symbolic link in place of a file is an error; 3. only the owner can access
 //! new files.
 
-use crate::page::engine::segment_files::{allocate, sync_folder, with_safe_flags};
+use crate::base::whole_file::sync_folder;
+use crate::page::engine::segment_files::{allocate, with_safe_flags};
 use redb::StorageBackend;
 use std::fs::{File, OpenOptions};
 use std::io;

@@ -7,14 +7,14 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
-use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, sync_folder, with_safe_flags};
-use crate::page::folder::drive_rate;
+use crate::base::whole_file::sync_folder;
+use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, with_safe_flags};
 use crate::page::folder::file_system::{FileSystem, free_bytes};
 use crate::page::folder::protocol_files::{
     MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME, unless_missing,
 };
 use crate::page::format::slot_header::{HEADER_BYTES, SlotHeader};
-use crate::page::format::spill_format::{FORMAT_BYTES, FormatError, Purpose, SlotLayout, SpillFormat};
+use crate::page::format::spill_format::{FORMAT_BYTES, FormatError, SlotLayout, SpillFormat};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
@@ -46,9 +46,9 @@ impl SpillDir {
     /// # Errors
     /// The folder is a link, not empty, another user's, in use, left over from another run, read-only, or on a network
     /// file system.
-    pub fn create(folder: &Path, purpose: Purpose, layout: SlotLayout, allow_remote: bool) -> InputResult<SpillDir> {
+    pub fn create(folder: &Path, layout: SlotLayout, allow_remote: bool) -> InputResult<SpillDir> {
         let made_folder = make_folder(folder)?;
-        let result = SpillDir::create_in(folder, purpose, layout, allow_remote, made_folder);
+        let result = SpillDir::create_in(folder, layout, allow_remote, made_folder);
         if result.is_err() && made_folder {
             // Removes the folder only if it is still empty; any content belongs to somebody else.
             let _ = std::fs::remove_dir(folder);
@@ -56,35 +56,23 @@ impl SpillDir {
         result
     }
 
-    fn create_in(
-        folder: &Path,
-        purpose: Purpose,
-        layout: SlotLayout,
-        allow_remote: bool,
-        made_folder: bool,
-    ) -> InputResult<SpillDir> {
+    fn create_in(folder: &Path, layout: SlotLayout, allow_remote: bool, made_folder: bool) -> InputResult<SpillDir> {
         check_folder(folder)?;
         let warnings = check_file_system(folder, allow_remote)?;
         refuse_foreign_files(folder)?;
         let lock = take_lock(folder)?;
         // Checked again under the lock: another process may have created a store just now.
-        if let Some(SpillFormat { purpose, .. }) = read_format(folder)? {
-            let remove = format!("remove the folder (rm -r {}) or {OTHER_FOLDER}", folder.display());
-            let (problem, remedy) = match purpose {
-                Purpose::Scratch => (
-                    "it holds the pages of an interrupted run without a checkpoint, which no other run can use",
-                    remove,
-                ),
-                Purpose::Checkpoint => (
-                    "it holds the checkpoint of another run",
-                    format!("continue that run (gsscale-train --resume with its output folder), {remove}"),
-                ),
-            };
-            return Err(InputError::new(folder, problem, remedy));
+        if read_format(folder)?.is_some() {
+            let remedy = format!(
+                "continue that run (gsscale-train --resume with its output folder), remove the folder (rm -r {}) or \
+                 {OTHER_FOLDER}",
+                folder.display()
+            );
+            return Err(InputError::new(folder, "it holds the checkpoint of another run", remedy));
         }
         make_private(folder)?;
         sign_lock(folder, &lock)?;
-        let format = SpillFormat { store: draw_identity(), purpose, layout };
+        let format = SpillFormat { store: draw_identity(), layout };
         write_format(folder, &format)?;
         Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder, lock })
     }
@@ -169,7 +157,6 @@ impl SpillDir {
         let mut ours = [MAP_NAME, MAP_NEW_NAME, WITNESS_NAME, RESERVE_NAME, RESERVE_NEW_NAME, FORMAT_NEW, FORMAT, LOCK]
             .map(str::to_string)
             .to_vec();
-        ours.push(drive_rate::FILE_NAME.to_string());
         for name in names(&self.folder)? {
             if segment_from_file_name(&name).is_some() && self.is_our_segment(&self.folder.join(&name)) {
                 ours.insert(0, name);

@@ -12,6 +12,7 @@
 //!
 //! One process at a time owns the store; the caller holds the lock on its folder.
 
+use crate::base::error::is_out_of_space;
 use crate::base::ids::PageId;
 use crate::page::folder::protocol_files::Folder;
 pub use crate::page::folder::protocol_files::{MAP_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME};
@@ -22,7 +23,6 @@ use crate::page::map::generations::Generations;
 use crate::page::map::manifest::Manifest;
 use crate::page::map::witness::Witness;
 use crate::page::mutants::{Mutant, active};
-use crate::page::versions::page_error::is_out_of_space;
 use crate::page::versions::paged_store::{PageDone, PagedStore};
 use std::io;
 
@@ -216,7 +216,7 @@ impl Commits {
         let bytes = self.config.reserve_bytes;
         match fill_reserve(self.folder.as_ref(), bytes) {
             Ok(()) => Ok(true),
-            Err(error) if is_out_of_space(&error) => {
+            Err(error) if is_out_of_space(error.kind()) => {
                 self.give_up_reserve()?;
                 Ok(false)
             }

@@ -5,11 +5,11 @@
 //!
 //! Invariant: every entry added or removed by `Writer` changes the counters of the same transaction.
 
+use crate::base::error::is_out_of_space;
 use crate::base::ids::PageId;
 use crate::page::format::encoding;
 use crate::page::format::seal::{SealBroken, SealScope};
 use crate::page::mutants::{Mutant, active};
-use crate::page::versions::page_error::is_out_of_space;
 use redb::{Key, ReadTransaction, Table, TableDefinition, WriteTransaction};
 use std::collections::BTreeMap;
 use std::io;
@@ -65,7 +65,7 @@ pub enum MapError {
 
 impl From<io::Error> for MapError {
     fn from(error: io::Error) -> MapError {
-        if is_out_of_space(&error) { MapError::Full(error) } else { MapError::Io(error) }
+        if is_out_of_space(error.kind()) { MapError::Full(error) } else { MapError::Io(error) }
     }
 }
 

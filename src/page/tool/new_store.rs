@@ -8,14 +8,13 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
+use crate::base::whole_file::{folder_of, sync_folder};
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::engine::open::{IoEngine, open_engine};
-use crate::page::engine::segment_files::sync_folder;
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::{HEADER_BYTES, SlotRef};
-use crate::page::format::spill_format::Purpose;
 use crate::page::map::commit::{Commits, Cut, PageChange};
 use crate::page::map::opening::Opened;
 use crate::page::tool::reading::{ReadError, commit_config};
@@ -67,7 +66,7 @@ impl NewStore {
     /// `target` exists, or the drive fails.
     pub fn create(target: &Path, layout: SlotLayout, codec: Codec) -> Result<NewStore, ReadError> {
         let part = refuse_existing(target)?;
-        let spill = SpillDir::create(&part, Purpose::Checkpoint, layout, false)?;
+        let spill = SpillDir::create(&part, layout, false)?;
         let begin = || -> Result<(Commits, PagedStore), ReadError> {
             let opened: Opened =
                 Commits::create(Box::new(DriveFolder::new(&part)), commit_config(spill.format().store))?;
@@ -150,8 +149,7 @@ impl NewStore {
         }
         std::fs::rename(&self.part, &self.target).map_err(failed)?;
         self.spill = None;
-        let parent = self.target.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        sync_folder(parent).map_err(failed)?;
+        sync_folder(folder_of(&self.target)).map_err(failed)?;
         Ok(())
     }
 

@@ -10,7 +10,6 @@ use crate::base::error::InputResult;
 use crate::page::folder::protocol_files::MAP_NAME;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::folder::spill_dir::segments_in;
-use crate::page::format::spill_format::Purpose;
 use crate::page::tool::reading::latest_generation;
 use std::path::Path;
 
@@ -36,7 +35,7 @@ impl SpillDir {
 pub fn remove_uncommitted(folder: &Path, allow_remote: bool) -> InputResult<bool> {
     // Creating a store in this folder will report why it cannot be used.
     let Ok(spill) = SpillDir::open(folder, allow_remote) else { return Ok(false) };
-    if spill.format().purpose != Purpose::Checkpoint || !spill.holds_no_commit()? {
+    if !spill.holds_no_commit()? {
         return Ok(false);
     }
     spill.remove()?;

@@ -2,6 +2,7 @@
 //!
 //! Invariant: an error about stored bytes names the segment file, the offset, the page and its generation.
 
+use crate::base::error::is_out_of_space;
 use crate::base::ids::PageId;
 use crate::page::engine::page_engine::Place;
 use crate::page::engine::segment_files::segment_file_name;
@@ -82,7 +83,7 @@ impl PageError {
     pub fn is_out_of_space(&self) -> bool {
         match self {
             PageError::NoSpace(..) => true,
-            PageError::Grow { source, .. } => is_out_of_space(source),
+            PageError::Grow { source, .. } => is_out_of_space(source.kind()),
             _ => false,
         }
     }
@@ -91,17 +92,11 @@ impl PageError {
 /// The remedy when a segment cannot be created.
 fn grow_remedy(source: &io::Error) -> &'static str {
     match source.kind() {
-        // A limit on file length counts as a lack of space, too; the message above names the cause.
-        _ if is_out_of_space(source) => "free space on the drive of the spill directory",
+        _ if is_out_of_space(source.kind()) => "free space on the drive of the spill directory",
         io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => {
             "make the spill directory writable, or name another one"
         }
         io::ErrorKind::AlreadyExists => "remove the file from the spill directory if it does not belong to this run",
         _ => "check the drive and the spill directory; committed generations are intact",
     }
-}
-
-/// Whether the system refused bytes for lack of space; then nothing was written.
-pub fn is_out_of_space(error: &io::Error) -> bool {
-    matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded | io::ErrorKind::FileTooLarge)
 }

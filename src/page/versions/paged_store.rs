@@ -13,6 +13,7 @@
 //! A cut ends a generation. Versions of the ended generation may still be written after the cut, by its number, beside
 //! versions of the next one.
 
+use crate::base::error::is_out_of_space;
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Place, Transfer};
@@ -20,7 +21,7 @@ use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, transfer_bytes};
 use crate::page::format::verify::verify;
 use crate::page::mutants::{Mutant, active};
-use crate::page::versions::page_error::{PageError, is_out_of_space};
+use crate::page::versions::page_error::PageError;
 pub use crate::page::versions::pending::{PageDone, PageMoved, PageTraffic};
 use crate::page::versions::pending::{Pending, Waiting};
 use crate::page::versions::slots::{SlotError, SlotLayout, Slots};
@@ -481,7 +482,7 @@ impl PagedStore {
         let result = if active(Mutant::WriteErrorIgnored) { Ok(()) } else { result };
         let end = result.map(|()| PageMoved::Written(pending.slot)).map_err(|source| {
             self.slots.release(pending.slot.place);
-            if is_out_of_space(&source) {
+            if is_out_of_space(source.kind()) {
                 return PageError::NoSpace(at, source);
             }
             self.poison.get_or_insert_with(|| format!("writing {at} failed: {source}"));

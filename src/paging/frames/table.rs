@@ -113,11 +113,6 @@ impl<M> FrameTable<M> {
         self.find(page).map(|frame| self.frames[frame].state)
     }
 
-    /// Whether a page is being read.
-    pub fn is_loading(&self, page: PageNo) -> bool {
-        self.state(page) == Some(FrameState::Loading)
-    }
-
     /// Frames that can be used without evicting.
     pub fn free_frames(&self) -> usize {
         self.free.len() + self.frames_max.saturating_sub(self.frames())

@@ -40,7 +40,7 @@ pub fn rollback(place: &StorePlace, generation: &str, yes: bool) -> Result<Rolle
         let pins = store.generations().pins().iter();
         let names: Vec<String> = pins.filter(|(_, g)| **g > generation).map(|(name, _)| name.clone()).collect();
         let dropped: Vec<u64> = store.generations().kept().filter(|g| *g > generation).collect();
-        (generation, run_state_of(&store, generation)?.step, dropped, names, store.format().store)
+        (generation, run_state_of(&store, generation)?.trainer.step, dropped, names, store.format().store)
     };
     let is_done = yes && !dropped.is_empty();
     if is_done {

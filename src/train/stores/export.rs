@@ -91,12 +91,12 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
     let mut scene = scene_at(&store, generation, &state, &options, (request.host_mem, 1))?;
     let mut choice = Choice::new(&state, request);
     let pages = choice.pages(&scene);
-    choice.find_cut(&mut scene, &pages, state.step)?;
+    choice.find_cut(&mut scene, &pages, state.trainer.step)?;
     let sh_degree = request.sh_degree.map_or(options.sh_degree, |degree| degree.min(options.sh_degree));
     let meta = meta_of(&state, &options);
     let mut writer = PlyWriter::create(&request.out, sh_degree, state.rows_bound, &meta)?;
     let mut given = 0;
-    scene.for_rows_of(&pages, state.step, &mut |rows| {
+    scene.for_rows_of(&pages, state.trainer.step, &mut |rows| {
         let chosen = choice.chosen(rows, sh_degree);
         given += chosen.rows() as u64;
         Ok::<(), TrainError>(writer.write(&chosen)?)
@@ -111,7 +111,7 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
     Ok(Exported {
         file: request.out.clone(),
         generation,
-        step: state.step,
+        step: state.trainer.step,
         gaussians: written.rows,
         skipped: written.skipped,
         bytes: written.bytes,
@@ -123,9 +123,9 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
 
 /// The PLY comments, as the trainer writes them.
 fn meta_of(state: &RunState, options: &RunOptions) -> PlyMeta {
-    let print = &state.dataset;
+    let print = &state.origin.dataset;
     PlyMeta {
-        step: Some(u64::from(state.step)),
+        step: Some(u64::from(state.trainer.step)),
         origin: print.origin,
         scale: print.scale,
         scene_radius: f64::from(print.scene_scale) * print.scale,
@@ -184,7 +184,7 @@ struct Choice {
 
 impl Choice {
     fn new(state: &RunState, request: &ExportRequest) -> Choice {
-        let (origin, scale) = (state.dataset.origin, state.dataset.scale);
+        let (origin, scale) = (state.origin.dataset.origin, state.origin.dataset.scale);
         Choice { crop: request.crop, origin, scale, most: request.max_gaussians, cut: None, next: 0 }
     }
 

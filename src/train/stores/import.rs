@@ -9,7 +9,8 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::base::units::{MIB, format_bytes};
-use crate::checkpoint::run_state::{DatasetPrint, RunState};
+use crate::base::whole_file::folder_of;
+use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::exchange::ply::{ExportFrame, PlyMeta, holds_gaussians, stream_gaussians};
@@ -25,7 +26,6 @@ use crate::train::error::TrainError;
 use crate::train::gaussian_pages::{GaussianSpace, GaussianWriter};
 use crate::train::memory::host_bytes_peak;
 use crate::train::pages::PageRules;
-use crate::train::whole_file::folder_of;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -172,10 +172,7 @@ fn first_state(config: &TrainConfig, meta: &PlyMeta, rows: u64, sh_degree: u8) -
     let text = toml::to_string(config).map_err(|e| fail(e.to_string()))?;
     let dataset = DatasetPrint { views: Vec::new(), first_rows: rows, points: 0, scene_scale: 1.0, origin, scale };
     let simd = limits::simd_path(config).name().to_string();
-    let state = RunState {
-        device: "none".to_string(),
-        sh_degree_start: sh_degree,
-        ..RunState::without_past(text, simd, dataset, rows)
-    };
+    let origin = Origin { config: text, simd, sh_degree_start: sh_degree, dataset, run: RunIdentity::default() };
+    let state = RunState::without_past(origin, "none".to_string(), rows);
     Ok(state.to_bytes().map_err(|e| fail(e.to_string()))?)
 }

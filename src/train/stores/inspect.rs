@@ -122,12 +122,12 @@ fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
         EventKind::RaiseShDegree { degree } => Some(degree),
         _ => None,
     });
-    let degree = raised.unwrap_or(state.sh_degree_start);
+    let degree = raised.unwrap_or(state.origin.sh_degree_start);
     let last = state.events.last().map_or(String::new(), |e| format!(", the last after step {}", e.step));
-    let print = &state.dataset;
+    let print = &state.origin.dataset;
     let [x, y, z] = print.origin;
     vec![
-        format!("step {} of {}, {:.1} s of training", state.step, config.steps, state.train_seconds),
+        format!("step {} of {}, {:.1} s of training", state.trainer.step, config.steps, state.trainer.train_seconds),
         format!("{} Gaussians in pages, at most {} after pending events", state.rows, state.rows_bound),
         format!("SH degree {degree}, up to {}; {} Gaussians per page at most", config.sh_degree, config.page_rows),
         format!("{} events: {rounds} rounds, {resets} opacity resets, {raises} SH raises{last}", state.events.len()),
@@ -138,14 +138,14 @@ fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
             config.seed,
             config.moments.word()
         ),
-        format!("rendered by {}, instruction path {}", state.device, state.simd),
+        format!("rendered by {}, instruction path {}", state.device, state.origin.simd),
         format!(
             "dataset of {} views, {} first Gaussians, origin {x} {y} {z}, scale {}",
             print.views.len(),
             print.first_rows,
             print.scale
         ),
-        format!("{} steps and {} updates skipped: not finite", state.steps_skipped, state.rows_skipped),
+        format!("{} steps and {} updates skipped: not finite", state.trainer.steps_skipped, state.trainer.rows_skipped),
         format!("{} bytes of metrics.jsonl", state.metrics_bytes),
     ]
 }
@@ -250,7 +250,7 @@ pub fn inspect_page(place: &StorePlace, generation: Option<&str>, id: PageId) ->
         opacity: spread(rows.columns.opacities.iter().map(|&o| 1.0 / (1.0 + f64::from(exp32(-o))))),
         sigma: spread(rows.columns.scales.chunks_exact(3).map(sigma)),
         views: spread(rows.count.iter().map(|&c| f64::from(c))),
-        fault: check_values(&rows, state.step).err(),
+        fault: check_values(&rows, state.trainer.step).err(),
     })
 }
 

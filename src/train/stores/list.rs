@@ -2,6 +2,7 @@
 
 use super::{StorePlace, run_state_of};
 use crate::page::tool::reading::Access;
+use crate::report::run_files::METRICS_FILE;
 use crate::train::error::TrainError;
 use serde::Serialize;
 use std::path::Path;
@@ -52,13 +53,13 @@ pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
     let mut generations = Vec::new();
     for used in store.disk_use()? {
         let state = run_state_of(&store, used.generation)?;
-        let in_metrics = || tests.iter().rfind(|(step, _)| *step < state.step).map(|(_, psnr)| *psnr);
-        let psnr = state.test.map(|test| test.psnr).or_else(in_metrics);
+        let in_metrics = || tests.iter().rfind(|(step, _)| *step < state.trainer.step).map(|(_, psnr)| *psnr);
+        let psnr = state.trainer.test.map(|test| test.psnr).or_else(in_metrics);
         generations.push(GenerationLine {
             generation: used.generation,
             names: used.names,
             is_latest: used.generation == store.generations().latest(),
-            step: state.step,
+            step: state.trainer.step,
             psnr,
             gaussians: state.rows,
             pages: used.pages,
@@ -74,7 +75,7 @@ pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
 /// Steps and PSNRs of the evaluations in a run's metrics.jsonl, in order. Invalid lines are skipped, since a crash cuts
 /// the file short.
 fn tests_of(run: &Path) -> Vec<(u32, f64)> {
-    let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
+    let text = std::fs::read_to_string(run.join(METRICS_FILE)).unwrap_or_default();
     let test = |line: &str| {
         let line: serde_json::Value = serde_json::from_str(line).ok()?;
         Some((u32::try_from(line["step"].as_u64()?).ok()?, line["test"]["psnr"].as_f64()?))

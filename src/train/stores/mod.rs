@@ -36,6 +36,7 @@ use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
 use crate::page::folder::spill_dir::segments_in;
 use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule};
+use crate::report::run_files::CONFIG_FILE;
 use std::path::{Path, PathBuf};
 
 impl From<ReadError> for TrainError {
@@ -78,7 +79,7 @@ impl StorePlace {
         if latest == 0 || !self.id.is_known() {
             return Ok(());
         }
-        Ok(check_owner(&self.folder, &run_state_of(store, latest)?.run, self.id)?)
+        Ok(check_owner(&self.folder, &run_state_of(store, latest)?.origin.run, self.id)?)
     }
 }
 
@@ -98,7 +99,7 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
     if dir.join("FORMAT").exists() || segments_in(dir).is_ok_and(|segments| !segments.is_empty()) {
         return Ok(StorePlace { folder: dir.to_path_buf(), run: None, id: RunId::UNKNOWN });
     }
-    let file = dir.join("config.toml");
+    let file = dir.join(CONFIG_FILE);
     if !file.is_file() {
         let remedy = "name a run's output folder or its spill directory";
         return Err(InputError::new(dir, "it is neither a store nor a run's output folder", remedy));
@@ -126,9 +127,9 @@ pub fn run_state_of(store: &StoreReader, generation: u64) -> Result<RunState, Tr
 
 /// The config of a run, and its options.
 fn options_of(store: &Path, state: &RunState) -> InputResult<(TrainConfig, RunOptions)> {
-    let config = TrainConfig::parse(&state.config)
+    let config = TrainConfig::parse(&state.origin.config)
         .map_err(|problem| InputError::new(store, problem, "use the program that made it").at("config of the run"))?;
-    let options = RunOptions::new(&config, state.dataset.scene_scale);
-    let options = RunOptions { sh_degree_start: state.sh_degree_start, ..options };
+    let options = RunOptions::new(&config, state.origin.dataset.scene_scale);
+    let options = RunOptions { sh_degree_start: state.origin.sh_degree_start, ..options };
     Ok((config, options))
 }

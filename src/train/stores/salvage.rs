@@ -18,7 +18,7 @@ use super::copy::{layout_for, usual_codec};
 use super::{StorePlace, options_of, run_state_of};
 use crate::base::error::InputError;
 use crate::base::ids::PageId;
-use crate::checkpoint::run_state::{DatasetPrint, RunIdentity, RunState};
+use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState, TrainerState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::densify::stats::GradHistogram;
@@ -33,6 +33,7 @@ use crate::page::tool::slot_reader::SlotReader;
 use crate::page::versions::slots::SlotLayout;
 use crate::paging::label::{label, meta_from_label};
 use crate::paging::stored::{check_values, layout_of};
+use crate::report::run_files::CONFIG_FILE;
 use crate::scene::page_layout::{capacity_bytes, read_page, write_page};
 use crate::scene::page_meta::PageMeta;
 use crate::scene::state::SceneState;
@@ -247,7 +248,7 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
     if !lost.is_empty() {
         source.notes.push("the run can resume from it, but will not end with the same bytes".into());
     }
-    let (step, pages, to) = (state.step, kept.len() as u64, request.to.clone());
+    let (step, pages, to) = (state.trainer.step, kept.len() as u64, request.to.clone());
     Ok(Salvaged { to, has_state: true, step, gaussians: rows, pages, lost, notes: source.notes })
 }
 
@@ -319,7 +320,7 @@ fn without_state(place: &StorePlace, mut source: Source, request: &SalvageReques
         kept.iter().filter_map(|(id, h)| meta_from_label(*id, &h.label)).map(|m| m.sh_degree).max().unwrap_or(0);
     let (rows, step) = measure(&mut reader, &kept, &source)?;
     config.0.steps = config.0.steps.max(step);
-    let mut state = RunState { run, ..state_for(&config, rows, step, degree)? };
+    let mut state = state_for(&config, run, (rows, step), degree)?;
     let (_, options) = options_of(&source.folder, &state)?;
     let layout = SlotLayout::new(capacity_bytes(options.page_rows, options.sh_degree), kept.len() as u64);
     let mut copy = NewStore::create(&request.to, layout, usual_codec(kept.values().map(|h| &h.slot)))?;
@@ -430,7 +431,7 @@ fn config_for(
     kept: &BTreeMap<PageId, SlotHeader>,
     source: &mut Source,
 ) -> Result<(TrainConfig, DatasetPrint), InputError> {
-    let file = request.config.clone().or_else(|| place.run.as_ref().map(|run| run.join("config.toml")));
+    let file = request.config.clone().or_else(|| place.run.as_ref().map(|run| run.join(CONFIG_FILE)));
     let metas = kept.iter().filter_map(|(id, h)| meta_from_label(*id, &h.label));
     let (rows, degree) = metas.fold((0, 0), |(rows, degree), m| (m.rows.max(rows), m.sh_degree.max(degree)));
     let mut print =
@@ -460,17 +461,15 @@ fn config_for(
 /// A run state at `step` without history.
 fn state_for(
     (config, print): &(TrainConfig, DatasetPrint),
-    rows: u64,
-    step: u32,
+    run: RunIdentity,
+    (rows, step): (u64, u32),
     sh_degree_start: u8,
 ) -> Result<RunState, TrainError> {
     let options = RunOptions::new(config, print.scene_scale);
     let text = toml::to_string(config).map_err(|e| CommitError::Contradiction(e.to_string()))?;
     let simd = limits::simd_path(config).name().to_string();
-    Ok(RunState {
-        step,
-        device: "unknown".to_string(),
-        sh_degree_start: sh_degree_start.min(options.sh_degree),
-        ..RunState::without_past(text, simd, print.clone(), rows)
-    })
+    let sh_degree_start = sh_degree_start.min(options.sh_degree);
+    let origin = Origin { config: text, simd, sh_degree_start, dataset: print.clone(), run };
+    let state = RunState::without_past(origin, "unknown".to_string(), rows);
+    Ok(RunState { trainer: TrainerState { step, ..TrainerState::default() }, ..state })
 }

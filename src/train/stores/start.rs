@@ -75,13 +75,13 @@ impl StoredStart {
         (page_rows, sh_degree): (usize, u8),
         take: &mut dyn FnMut(SceneState) -> Result<(), TrainError>,
     ) -> Result<(), TrainError> {
-        let print = &self.state.dataset;
+        let print = &self.state.origin.dataset;
         let meta =
             PlyMeta { origin: print.origin, scale: print.scale, frame: ExportFrame::Local, ..PlyMeta::default() };
         let index = self.scene.pager.index();
         let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
         pages.sort_unstable_by_key(|p| index[p.index()].id);
-        let now = self.state.step;
+        let now = self.state.trainer.step;
         for page in pages {
             let (mut uid, mut columns) = (Vec::new(), Columns::default());
             self.scene.visit(&[page], &mut |rules, tables| {

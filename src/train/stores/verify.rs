@@ -115,7 +115,7 @@ fn check_states(store: &StoreReader, verdict: &mut Verdict) -> Option<(PageLimit
             let state = RunState::from_bytes(&bytes).map_err(|e| e.to_string())?;
             let (config, _) = options_of(store.folder(), &state).map_err(|e| e.problem)?;
             let (page_rows, events) = (config.page_rows as usize, state.events.len());
-            Ok((PageLimits { page_rows, sh_degree: config.sh_degree, events }, state.step))
+            Ok((PageLimits { page_rows, sh_degree: config.sh_degree, events }, state.trainer.step))
         };
         match read() {
             Ok(limits) => last = Some(limits),

@@ -4,7 +4,7 @@ use super::pages::{PAGE_ROWS, label_of_a_page, payload_bytes_of_a_page};
 use super::with_mode;
 use crate::Target;
 use gsscale::base::ids::PageId;
-use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, RunIdentity, RunState, ViewPrint};
+use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, Origin, RunIdentity, RunState, TrainerState, ViewPrint};
 use gsscale::densify::stats::GradHistogram;
 use gsscale::page::engine::memory::MemoryEngine;
 use gsscale::page::engine::page_engine::Place;
@@ -207,35 +207,39 @@ fn sample() -> RunState {
         Event { step: 8, kind: EventKind::ResetOpacity { max_opacity: 0.01 } },
     ];
     RunState {
-        step: 9,
-        config: "steps = 20\n".to_string(),
-        simd: "avx2".to_string(),
+        origin: Origin {
+            config: "steps = 20\n".to_string(),
+            simd: "avx2".to_string(),
+            sh_degree_start: 0,
+            dataset: DatasetPrint {
+                views: vec![ViewPrint { pose: 5, photo: u64::MAX }],
+                first_rows: 7,
+                points: 3,
+                scene_scale: 1.25,
+                origin: [5e5, -1.0, 0.0],
+                scale: 2.5,
+            },
+            run: RunIdentity {
+                id: "00112233445566778899aabbccddeeff".parse().unwrap(),
+                out: "/a".into(),
+                scene: "/b".into(),
+            },
+        },
         device: "cpu".to_string(),
-        sh_degree_start: 0,
-        dataset: DatasetPrint {
-            views: vec![ViewPrint { pose: 5, photo: u64::MAX }],
-            first_rows: 7,
-            points: 3,
-            scene_scale: 1.25,
-            origin: [5e5, -1.0, 0.0],
-            scale: 2.5,
+        trainer: TrainerState {
+            step: 9,
+            rows_skipped: 1,
+            steps_skipped: 2,
+            steps_skipped_in_a_row: 1,
+            train_seconds: 0.1,
+            test: Some(LastTest { step: 8, views: 2, psnr: 20.5, ssim: 0.75 }),
         },
         events,
         histogram: vec![(3, 1), (32767, 9)],
         rows: 10,
         rows_bound: 12,
-        rows_skipped: 1,
-        steps_skipped: 2,
-        steps_skipped_in_a_row: 1,
-        train_seconds: 0.1,
         metrics_bytes: 1234,
-        test: Some(LastTest { step: 8, views: 2, psnr: 20.5, ssim: 0.75 }),
         traffic: PagerStats { bytes_read: 9, ..PagerStats::default() },
-        run: RunIdentity {
-            id: "00112233445566778899aabbccddeeff".parse().unwrap(),
-            out: "/a".into(),
-            scene: "/b".into(),
-        },
     }
 }
 
@@ -250,8 +254,8 @@ fn check_state(state: &RunState) {
 pub fn run_state() -> Target {
     let state = sample().to_bytes().unwrap();
     let mut long = sample();
-    long.dataset.views = (0..300).map(|pose| ViewPrint { pose, photo: 1 }).collect();
-    long.config = "a = 1\n".repeat(100);
+    long.origin.dataset.views = (0..300).map(|pose| ViewPrint { pose, photo: 1 }).collect();
+    long.origin.config = "a = 1\n".repeat(100);
     let texts = (7u64, vec!["abc".to_string(), "d".to_string()], Some(vec![1u8, 2]));
     let seeds = vec![
         with_mode(0, &state),

@@ -10,7 +10,7 @@ use gsscale::page::format::codec::{Codec, decode, encode_as};
 use gsscale::page::format::slot_header::{
     HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, checksum, transfer_bytes,
 };
-use gsscale::page::format::spill_format::{FORMAT_BYTES, Purpose, SpillFormat};
+use gsscale::page::format::spill_format::{FORMAT_BYTES, SpillFormat};
 use gsscale::page::versions::paged_store::{PageMoved, PagedStore, PagedStoreConfig};
 use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::label::{label, meta_from_label};
@@ -71,7 +71,7 @@ pub fn label_of_a_page() -> Vec<u8> {
 pub fn slot_header() -> Target {
     let raw = slot(StoredAs::Raw, 700, 700);
     let layout = SlotLayout { slot_bytes: 8192, slots_per_segment: 4 };
-    let format = SpillFormat { store: STORE, purpose: Purpose::Checkpoint, layout };
+    let format = SpillFormat { store: STORE, layout };
     let parts: [&[u8]; 4] = [&header(raw)[..200], &raw.to_bytes(), &label_of_a_page(), &format.to_bytes()];
     let seeds = (0..8).map(|mode| with_mode(mode, parts[usize::from(mode) / 2])).collect();
     Target { name: "slot_header", run: run_header, seeds, words: &[], cases: 60_000, memory: [16 << 10, 1] }

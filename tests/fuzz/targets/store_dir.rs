@@ -9,7 +9,6 @@ use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::HEADER_BYTES;
-use gsscale::page::format::spill_format::Purpose;
 use gsscale::page::map::commit::{CommitConfig, Commits, Cut, PageChange};
 use gsscale::page::map::opening::Opened;
 use gsscale::page::versions::paged_store::{PageMoved, PagedStore};
@@ -61,7 +60,7 @@ fn template() -> &'static Template {
     TEMPLATE.get_or_init(|| {
         let parent = scratch();
         let folder = parent.path().join("store");
-        let spill = SpillDir::create(&folder, Purpose::Checkpoint, LAYOUT, true).unwrap();
+        let spill = SpillDir::create(&folder, LAYOUT, true).unwrap();
         let opened = Commits::create(Box::new(DriveFolder::new(&folder)), config(&spill)).unwrap();
         let mut store = paged(&opened, &folder, LAYOUT).unwrap();
         let mut commits = opened.commits;

@@ -7,12 +7,11 @@
 use crate::support::fixture::Fixture;
 use crate::support::gpu::open;
 use gsscale::base::rng::{Purpose, Stream};
-use gsscale::base::simd::SimdPath;
 use gsscale::gpu::{FaultKind, GpuError, GpuOptions, InjectedFault};
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::gpu::GpuRenderer;
 use gsscale::render::{
-    Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches, SsimPadding,
+    Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches,
 };
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
@@ -52,13 +51,8 @@ pub struct Results {
     pub grads: Gradients,
 }
 
-/// The weights of the default loss.
-pub fn loss_options(padding: SsimPadding) -> LossOptions {
-    LossOptions { ssim_lambda: 0.2, padding, simd: SimdPath::best() }
-}
-
 fn results(renderer: &mut dyn Renderer, view: &(Columns, Camera), options: &RenderOptions, target: &Target) -> Results {
-    results_with(renderer, view, options, target, &loss_options(SsimPadding::Valid)).unwrap()
+    results_with(renderer, view, options, target, &LossOptions::default()).unwrap()
 }
 
 pub fn results_with(
@@ -312,7 +306,7 @@ fn a_view_allocates_nothing_once_warm_and_uploads_its_rows_only() {
 fn stages_share_five_submissions() {
     let (rows, camera) = scene(300, 40, 30);
     let (target, options) = (photo(40, 30, false), RenderOptions::default());
-    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
+    let loss = LossOptions::default();
     let submitted = ["rows_in", "picture", "loss", "rows_out", "rows_out"];
     for (submission, want) in (1..).zip(submitted.into_iter().chain(submitted)) {
         let fault = Some(InjectedFault { kind: FaultKind::OutOfMemory, submission });
@@ -341,7 +335,7 @@ fn batches_of_rows_change_no_bit() {
     let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
     let (rows, camera) = scene(3000, 100, 70);
     let (target, options) = (photo(100, 70, true), RenderOptions::default());
-    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
+    let loss = LossOptions::default();
     let part = |place: Range<usize>| {
         let mut part = Columns { sh_degree: rows.sh_degree, ..Columns::default() };
         for column in Column::ALL {
@@ -385,7 +379,7 @@ fn batches_of_rows_change_no_bit() {
 fn misuse_is_an_error() {
     let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
     let (rows, camera) = scene(10, 32, 32);
-    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
+    let loss = LossOptions::default();
     let mut grads = Gradients::default();
     let is_order = |result: Result<(), RenderError>| matches!(result, Err(RenderError::OutOfOrder { .. }));
     let (options, small) = (RenderOptions::default(), scene(9, 32, 32).0);
@@ -426,7 +420,7 @@ fn gradients_that_the_caller_adds_to_reach_the_rows() {
     let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
     let (rows, camera) = scene(900, 65, 47);
     let (target, options) = (photo(65, 47, true), RenderOptions::default());
-    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
+    let loss = LossOptions::default();
     let mut draws = Stream::new(5, Purpose::Test, 0, 0);
     let scale = 1.0 / camera.pixels() as f32;
     let term: Vec<f32> = (0..3 * camera.pixels()).map(|_| scale * draws.normal() as f32).collect();

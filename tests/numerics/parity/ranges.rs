@@ -1,7 +1,7 @@
 //! Views that device memory cannot hold at once: rows in chunks, pictures in ranges of tiles. The results have the bits of the
 //! view that fits, for any budget and any binding, down to the least that is stated.
 
-use super::frame::{bits, loss_options, photo, renderer, results_with, scene};
+use super::frame::{bits, photo, renderer, results_with, scene};
 use gsscale::gpu::{GpuError, GpuOptions};
 use gsscale::render::device_needs::DeviceNeeds;
 use gsscale::render::gpu::GpuRenderer;
@@ -26,7 +26,7 @@ fn least(gpu: &GpuRenderer) -> u64 {
 fn budgets_down_to_the_least_change_no_bit() {
     for (rows, masked, padding) in [(6000, true, SsimPadding::Valid), (3000, false, SsimPadding::Same)] {
         let (view, target) = (wide_scene(rows), photo(208, 144, masked));
-        let loss = loss_options(padding);
+        let loss = LossOptions { padding, ..LossOptions::default() };
         let options = RenderOptions { background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
         let Some(mut whole) = renderer(&GpuOptions::default()) else { return };
         let want = bits(&results_with(&mut whole, &view, &options, &target, &loss).unwrap());
@@ -68,7 +68,7 @@ fn a_budget_covers_what_the_driver_allocates() {
     let (mut view, target) = (scene(85_000, 640, 480), photo(640, 480, false));
     (view.1.fx, view.1.fy) = (300.0, 300.0);
     view.0.scales.iter_mut().for_each(|s| *s = 0.1 * *s - 1.7);
-    let (options, loss) = (RenderOptions::default(), loss_options(SsimPadding::Valid));
+    let (options, loss) = (RenderOptions::default(), LossOptions::default());
     for _ in 0..3 {
         results_with(&mut gpu, &view, &options, &target, &loss).unwrap();
         let traffic = gpu.gpu().traffic();
@@ -89,7 +89,7 @@ fn a_budget_covers_what_the_driver_allocates() {
 fn bindings_smaller_than_the_splats_change_no_bit() {
     let rows = 12_000;
     let (view, target) = (wide_scene(rows), photo(208, 144, true));
-    let (options, loss) = (RenderOptions::default(), loss_options(SsimPadding::Valid));
+    let (options, loss) = (RenderOptions::default(), LossOptions::default());
     let Some(mut whole) = renderer(&GpuOptions::default()) else { return };
     let want = bits(&results_with(&mut whole, &view, &options, &target, &loss).unwrap());
     // The picture alone needs 12 bytes a pixel.
@@ -107,7 +107,7 @@ fn bindings_smaller_than_the_splats_change_no_bit() {
 fn batches_in_little_memory_change_no_bit() {
     let rows = 3000;
     let (view, target) = (wide_scene(rows), photo(208, 144, true));
-    let (options, loss) = (RenderOptions::default(), loss_options(SsimPadding::Valid));
+    let (options, loss) = (RenderOptions::default(), LossOptions::default());
     let Some(mut whole) = renderer(&GpuOptions::default()) else { return };
     let want = bits(&results_with(&mut whole, &view, &options, &target, &loss).unwrap());
     let budget = Some(least(&whole));
@@ -168,7 +168,7 @@ fn below_the_least_the_error_names_need_budget_and_remedy_and_smaller_views_stil
     assert!(need + in_use > budget);
     let error = gpu.image().unwrap_err();
     assert!(matches!(error, RenderError::OutOfOrder { .. }), "no picture after an error: {error}");
-    let (view, target, loss) = (scene(60, 64, 48), photo(64, 48, false), loss_options(SsimPadding::Valid));
+    let (view, target, loss) = (scene(60, 64, 48), photo(64, 48, false), LossOptions::default());
     let options = RenderOptions::default();
     let got = bits(&results_with(&mut gpu, &view, &options, &target, &loss).unwrap());
     let Some(mut whole) = renderer(&GpuOptions::default()) else { return };

@@ -32,20 +32,20 @@ fn saves_are_named_checkpoints() {
             .iter()
             .map(|(name, &g)| (name.clone(), RunState::from_bytes(&commits.run_state(g).unwrap()).unwrap()))
             .collect();
-        let steps: Vec<(&str, u32)> = states.iter().map(|(name, s)| (name.as_str(), s.step)).collect();
+        let steps: Vec<(&str, u32)> = states.iter().map(|(name, s)| (name.as_str(), s.trainer.step)).collect();
         // Step 120 is done after 121 steps, as in the names of the PLYs.
         assert_eq!(steps, [("step-120", 121), ("step-180", 181), ("step-60", 61)]);
-        let tests: Vec<u32> = states.iter().map(|(_, s)| s.test.unwrap().step).collect();
+        let tests: Vec<u32> = states.iter().map(|(_, s)| s.trainer.test.unwrap().step).collect();
         assert_eq!(tests, [101, 151, 51]);
-        assert!(states.iter().all(|(_, s)| s.test.unwrap().psnr > 5.0 && s.test.unwrap().views == 1));
+        assert!(states.iter().all(|(_, s)| s.trainer.test.unwrap().psnr > 5.0 && s.trainer.test.unwrap().views == 1));
         // The last two generations are kept, named or not.
         let kept: Vec<u64> = generations.kept().collect();
         assert_eq!(kept.len(), 5, "{kept:?}");
         let last = RunState::from_bytes(&commits.run_state(generations.latest()).unwrap()).unwrap();
         let psnr = summary(&out)["test"]["psnr"].as_f64().unwrap();
-        assert_eq!(last.step, STEPS);
+        assert_eq!(last.trainer.step, STEPS);
         // JSON may change the last digit.
-        assert!((last.test.unwrap().psnr - psnr).abs() < 1e-9);
+        assert!((last.trainer.test.unwrap().psnr - psnr).abs() < 1e-9);
         // Returns to a name and continues from there.
         let back = generations.pins()["step-120"];
         commits.rollback(back).unwrap();

@@ -39,8 +39,8 @@ fn a_run_goes_on_on_another_path_of_the_same_bits() {
         // As if the first process had run on a machine with AVX-512.
         bench.stopped_with(place, 9, &["--simd", "avx2"]);
         edit_run_state(&bench.checkpoint(place), |state| {
-            assert_eq!(state.simd, "avx2");
-            state.simd = "avx512".into();
+            assert_eq!(state.origin.simd, "avx2");
+            state.origin.simd = "avx512".into();
         });
         let output = train(&["--resume", text(&bench.path("out"))]);
         let said = stderr(&output);
@@ -73,11 +73,11 @@ fn the_baseline_has_bits_of_its_own() {
     bench.stopped_with(Place::Memory, 9, &["--simd", "avx2"]);
     let said = refused(bench.go_on(&["--simd", "baseline"]));
     assert!(said.contains("simd was avx2 and is baseline") && said.contains("--accept-changes"), "{said}");
-    edit_run_state(&bench.checkpoint(Place::Memory), |state| state.simd = "baseline".into());
+    edit_run_state(&bench.checkpoint(Place::Memory), |state| state.origin.simd = "baseline".into());
     let said = refused(bench.go_on(&[]));
     assert!(said.contains("simd was baseline and is avx2"), "{said}");
     // An unknown path belongs to no known class.
-    edit_run_state(&bench.checkpoint(Place::Memory), |state| state.simd = "neon".into());
+    edit_run_state(&bench.checkpoint(Place::Memory), |state| state.origin.simd = "neon".into());
     assert!(refused(bench.go_on(&[])).contains("simd was neon and is avx2"));
     succeeded(bench.go_on(&["--accept-changes"]));
 }
@@ -92,8 +92,8 @@ fn a_run_with_too_small_an_epsilon_does_not_go_on() {
         assert!(said.contains("--adam-eps") && said.contains("1e-16 to 1"), "{value}: {said}");
     }
     edit_run_state(&bench.checkpoint(Place::Memory), |state| {
-        let old = state.config.lines().find(|line| line.starts_with("adam-eps")).unwrap().to_string();
-        state.config = state.config.replace(&old, "adam-eps = 1e-30");
+        let old = state.origin.config.lines().find(|line| line.starts_with("adam-eps")).unwrap().to_string();
+        state.origin.config = state.origin.config.replace(&old, "adam-eps = 1e-30");
     });
     for more in [&[][..], &["--accept-changes"]] {
         let said = refused(bench.go_on(more));

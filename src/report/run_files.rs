@@ -1,0 +1,92 @@
+//! The files in the output folder of a run: names, kinds, and which of them belong to what part of a run.
+//!
+//! Not here: their content, and the checkpoint, whose folder `config` names. [`RUN_FILES`] is the one list: whoever writes
+//! another file into the folder adds it, and so it is removed with the rest when a run replaces an earlier one.
+
+/// Every setting of the run, with the facts resolved at its start. A folder without it is not a run's.
+pub const CONFIG_FILE: &str = "config.toml";
+/// One line of JSON per logged step.
+pub const METRICS_FILE: &str = "metrics.jsonl";
+/// Folder of the curves for TensorBoard.
+pub const EVENTS_FOLDER: &str = "tensorboard";
+/// Figures of the whole run, written at its end.
+pub const SUMMARY_FILE: &str = "summary.json";
+/// The Gaussians at the end.
+pub const PLY_FILE: &str = "point_cloud.ply";
+/// The page for people.
+pub const REPORT_FILE: &str = "report.html";
+/// The pages seen from above, for the report: a JSON list of [`super::page_map::PageTile`].
+pub const PAGES_FILE: &str = "pages.json";
+/// Folder of the pictures of the held-out views.
+pub const PICTURES_FOLDER: &str = "renders/test";
+/// Output of `gsscale-eval --json`, in place of the figures of the summary.
+pub const EVALUATED_FILE: &str = "evaluated.json";
+/// Config of that evaluation.
+pub const EVALUATED_AS_FILE: &str = "evaluated-as.toml";
+
+/// What stands under a name in the output folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RunFile {
+    /// A file of this name.
+    File(&'static str),
+    /// The files of `--save-every`, as [`saved_ply_name`] names them.
+    SavedPlys,
+    /// A folder of event files; other files in it are not ours.
+    Events(&'static str),
+    /// A folder tree of PNG files; other files in it are not ours.
+    Pictures(&'static str),
+}
+
+/// The part of a run that a file tells about, which decides when a later run in the folder removes it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Tells {
+    /// How the run began.
+    Start,
+    /// Its steps.
+    Steps,
+    /// Its result.
+    Result,
+    /// A later evaluation of its result.
+    Evaluation,
+}
+
+/// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
+pub const RUN_FILES: [(RunFile, Tells); 11] = [
+    (RunFile::File(CONFIG_FILE), Tells::Start),
+    (RunFile::File(METRICS_FILE), Tells::Steps),
+    (RunFile::Events(EVENTS_FOLDER), Tells::Steps),
+    (RunFile::File(SUMMARY_FILE), Tells::Result),
+    (RunFile::File(PLY_FILE), Tells::Result),
+    (RunFile::File(REPORT_FILE), Tells::Result),
+    (RunFile::File(PAGES_FILE), Tells::Result),
+    (RunFile::SavedPlys, Tells::Result),
+    (RunFile::File(EVALUATED_FILE), Tells::Evaluation),
+    (RunFile::File(EVALUATED_AS_FILE), Tells::Evaluation),
+    (RunFile::Pictures(PICTURES_FOLDER), Tells::Result),
+];
+
+/// Name of the Gaussians that `--save-every` writes after `step`.
+pub fn saved_ply_name(step: u32) -> String {
+    format!("point_cloud_{step:06}.ply")
+}
+
+/// Whether [`saved_ply_name`] makes this name.
+pub fn is_saved_ply(name: &str) -> bool {
+    let step = name.strip_prefix("point_cloud_").and_then(|rest| rest.strip_suffix(".ply"));
+    step.is_some_and(|step| step.len() >= 6 && step.bytes().all(|b| b.is_ascii_digit()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_saved_gaussians_are_recognised() {
+        for step in [0, 7, 1_234_567] {
+            assert!(is_saved_ply(&saved_ply_name(step)));
+        }
+        for other in [PLY_FILE, "point_cloud_1.ply", "point_cloud_00000a.ply", "point_cloud_000001.txt"] {
+            assert!(!is_saved_ply(other));
+        }
+    }
+}

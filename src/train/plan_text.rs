@@ -1,0 +1,89 @@
+//! The plan of a run's tiers as text, as a run prints it at its start.
+
+use super::largest_view::LargestView;
+use super::memory::MemoryEstimate;
+use super::places::drive_of;
+use super::preflight::TierPlan;
+use super::start::Start;
+use super::tiers::Tiers;
+use crate::base::units::format_bytes;
+use crate::config::file::TrainConfig;
+use crate::page::folder::file_system::free_bytes;
+use crate::paging::pager::PagerConfig;
+use crate::scene::partition::first_fill;
+
+/// Rated endurance of a common drive of 500 GB, bytes written.
+const ENDURANCE_BYTES: f64 = 300e12;
+
+/// The description of the tiers that a run prints at its start.
+pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> String {
+    let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
+    let LargestView { pages: largest, mean, .. } = &plan.largest_view;
+    let mut text = format!(
+        "pages   {} of up to {}; a view needs {mean:.0} on average, {largest} at most\n",
+        plan.pages[0],
+        format_bytes(plan.frame_bytes)
+    );
+    if let (views @ 1.., most) = plan.cut_views {
+        text.push_str(&format!(
+            "        {views} views are larger than the frames: steps on them take up to {most} batches\n"
+        ));
+    }
+    let frames = match plan.frames {
+        None => String::from("Gaussians with their optimizer state"),
+        Some(frames) if !plan.frames_are_named && frames >= plan.pages[1] => {
+            String::from("frames of pages, one for every page")
+        }
+        Some(frames) => format!("{frames} frames of pages"),
+    };
+    text.push_str(&format!("memory  about {} at the peak\n", format_bytes(memory.total())));
+    text.push_str(&part(&frames, memory.frames));
+    text.push_str(&part("one view: rows, gradients, images", memory.view));
+    text.push_str(&part("decoded photos (--image-cache)", memory.targets));
+    if memory.staging > 0 {
+        text.push_str(&part("encoded pages in transfer, and the plan", memory.staging));
+    }
+    text.push_str(&part("index of the pages", memory.index));
+    text.push_str(&part("program and tables", memory.base + memory.copies));
+    if tiers.spills() {
+        text.push_str(&format!(
+            "drive   {} of pages by {} ({}), {} free\n        \
+             about {} to write without commits, {:.2} % of the rated life of a common drive\n",
+            format_bytes(plan.pages[0] * plan.frame_bytes),
+            tiers.engine,
+            tiers.codec,
+            plan.free_bytes.map_or(String::from("unknown"), format_bytes),
+            format_bytes(plan.bytes_written as u64),
+            100.0 * plan.bytes_written / ENDURANCE_BYTES
+        ));
+    }
+    text
+}
+
+/// Describes a scene that a dry run cannot plan because its pages exceed half of the budget; `None` if they fit. A dry
+/// run writes no pages: it keeps the pages of the drive in memory, in at most half of the budget.
+pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Option<u64>) -> Option<String> {
+    let (spill_dir, budget) = (config.residence().spill_dir()?, host_mem?);
+    let frame = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes() as u64;
+    let pages = start.rows.div_ceil(first_fill(config.page_rows as usize, config.strategy.grows()) as u64);
+    if pages.saturating_mul(frame) <= budget / 2 {
+        return None;
+    }
+    let free = free_bytes(&drive_of(spill_dir)).ok().flatten();
+    Some(format!(
+        "scene   {} views to train on, {} held out\n\
+         start   {} Gaussians\n\
+         pages   about {pages} of up to {}, {} in all; the drive has {} free\n\
+         memory  {} in all, fewer than {} pages at once\n\
+         views   unknown: their needs follow from pages on the drive, and a dry run writes none.\n        \
+         The run itself checks them before its first step.",
+        start.dataset.train_views().len(),
+        start.dataset.test_views().len(),
+        start.rows,
+        format_bytes(frame),
+        format_bytes(pages.saturating_mul(frame)),
+        free.map_or(String::from("unknown"), format_bytes),
+        format_bytes(budget),
+        (budget / frame).max(1),
+    ))
+}
