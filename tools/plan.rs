@@ -12,6 +12,7 @@ use gsscale::optim::method::Method;
 use gsscale::page::folder::drive_rate::DriveRate;
 use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::paging::frames::evict::EvictPolicy;
+use gsscale::paging::plan::batches::cut_views;
 use gsscale::paging::plan::cache_model::{CacheModel, StepChange, TooFewFrames};
 use gsscale::paging::plan::steps::Plan;
 use gsscale::paging::simulation::auto::automatic_order;
@@ -175,7 +176,7 @@ fn start(args: &Args) -> InputResult<String> {
             "state_bytes": state_bytes(&scene), "host_bytes_peak": host_bytes_peak(), "pages_of_largest_view": scene.views.most(),
             "drive_read_bytes_per_second": scene.drive.read_rate, "drive_write_bytes_per_second": scene.drive.write_rate,
             "step_seconds": scene.drive.step_seconds, "step_timed_on": scene.timed_on,
-            "plans": rows.iter().map(|row| json_of(args, row)).collect::<Vec<_>>(),
+            "plans": rows.iter().map(|row| json_of(args, &scene, row)).collect::<Vec<_>>(),
         });
         return Ok(format!("{value:#}"));
     }
@@ -369,12 +370,13 @@ fn row(args: &Args, scene: &Scene, frames: usize, asked: Chosen<Order>) -> Input
     })
 }
 
-fn json_of(args: &Args, row: &Row) -> Value {
+fn json_of(args: &Args, scene: &Scene, row: &Row) -> Value {
     let (f, steps) = (&row.figures, f64::from(row.figures.steps));
+    let (views, batches) = views_in_batches(scene, row.frames);
     json!({
         "view_order": row.order.to_string(), "automatic": row.is_automatic, "frames": row.frames,
         "steps_simulated": row.planned.steps.len(), "is_belady_bound": row.planned.is_exact,
-        "pages_per_step": f.pages_per_step, "hit_rate": f.hit_rate, "lru_hit_rate": row.lru.hit_rate,
+        "views_in_batches": views, "batches_most": batches, "pages_per_step": f.pages_per_step, "hit_rate": f.hit_rate, "lru_hit_rate": row.lru.hit_rate,
         "bytes_read_per_step": f.read_per_step, "bytes_written_per_step": f.written_per_step,
         "heaviest_5_percent_share": f.heaviest_share,
         "worst_window": { "first_step": f.worst_window, "steps": WINDOW_STEPS, "bytes_per_step": f.worst_per_step },
@@ -452,10 +454,32 @@ fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
         scene.config.steps,
         format_bytes(args.endurance.0),
     );
+    for (frames, views, batches) in in_batches(scene, rows) {
+        text += &format!(
+            "\nWith {frames} frames, steps on {views} views take up to {batches} batches, which read pages twice."
+        );
+    }
     if rows.iter().any(|row| !row.planned.is_exact) {
         text += "\nThe plan reached less than two epochs ahead: a larger --plan-mem may reduce reads.";
     }
     text
+}
+
+/// Each number of frames with which views need several batches, with the number of these views and the most batches.
+fn in_batches(scene: &Scene, rows: &[Row]) -> Vec<(usize, usize, usize)> {
+    let mut frames: Vec<usize> = rows.iter().map(|row| row.frames).collect();
+    frames.dedup();
+    let cut = |frames| {
+        let (views, batches) = views_in_batches(scene, frames);
+        (frames, views, batches)
+    };
+    frames.into_iter().map(cut).filter(|(_, views, _)| *views > 0).collect()
+}
+
+/// The number of views that need several batches, and the most batches of one of them.
+fn views_in_batches(scene: &Scene, frames: usize) -> (usize, usize) {
+    let pages = (0..scene.views.views()).map(|view| scene.views.of(view).len());
+    cut_views(pages, frames, usize::MAX)
 }
 
 /// The pages read and evicted in some steps.

@@ -3,7 +3,7 @@
 //! Invariant: needs follow from the bounds of the pages alone; no page is read.
 
 use crate::dataset::loader::Dataset;
-use crate::paging::plan::batches::pages_per_batch;
+use crate::paging::plan::batches;
 use crate::scene::camera::Camera;
 use crate::scene::page_meta::PageMeta;
 use crate::schedule::visibility::visible_pages;
@@ -39,15 +39,12 @@ pub(super) fn largest_view(dataset: &Dataset, index: &[PageMeta]) -> LargestView
 
 /// The training views that need more than one batch, and the most batches of one of them.
 pub(super) fn cut_views(dataset: &Dataset, index: &[PageMeta], frames: u64, pages_most: usize) -> (usize, usize) {
-    let (mut views, mut most, mut list) = (0, 1, Vec::new());
-    for view in dataset.train_views() {
+    let mut list = Vec::new();
+    let pages = dataset.train_views().into_iter().map(|view| {
         visible_pages(index, &dataset.views[view].camera, &mut list);
-        let per_batch = pages_per_batch(list.len(), frames as usize).min(pages_most);
-        let batches = list.len().div_ceil(per_batch);
-        views += usize::from(batches > 1);
-        most = most.max(batches);
-    }
-    (views, most)
+        list.len()
+    });
+    batches::cut_views(pages, frames as usize, pages_most)
 }
 
 /// Cameras of the training views.

@@ -27,6 +27,14 @@ pub fn accesses(pages: usize, frames: usize) -> usize {
     (2 * pages.div_ceil(pages_per_batch(pages, frames))).saturating_sub(1)
 }
 
+/// Of views with these numbers of pages: how many need several batches, and the most batches of one of them, 1 at least.
+pub fn cut_views(pages: impl Iterator<Item = usize>, frames: usize, pages_most: usize) -> (usize, usize) {
+    pages.fold((0, 1), |(views, most), pages| {
+        let batches = pages.div_ceil(pages_per_batch(pages, frames).min(pages_most).max(1));
+        (views + usize::from(batches > 1), most.max(batches))
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
