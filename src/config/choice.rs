@@ -4,6 +4,7 @@
 //! Invariants: 1. a value is written as the word from which it is read; 2. file and flag refuse an unknown word with
 //! the same message; 3. this file holds no defaults and no meanings.
 
+use super::schedule::Schedule;
 use crate::base::simd::SimdPath;
 use crate::densify::strategy::StrategyName;
 use crate::exchange::ply::ExportFrame;
@@ -125,6 +126,7 @@ choices! {
     "ssim-padding": SsimPadding { Valid = "valid", Same = "same" }
     "optimizer": Method { Deferred = "deferred", Dense = "dense", Sparse = "sparse" }
     "moments": Moments { F32 = "f32", Bf16 = "bf16" }
+    "schedule": Schedule { RunLength = "run-length", Classic = "classic" }
     "log": LogFormat { Json = "json", Tensorboard = "tensorboard" }
     "ssim-variant": SsimVariant { Same = "same", Valid = "valid", Reflect = "reflect" }
     "export-frame": ExportFrame { Dataset = "dataset", Local = "local" }
@@ -308,6 +310,7 @@ mod tests {
         check::<Method>();
         check::<Moments>();
         check::<StrategyName>();
+        check::<Schedule>();
         check::<LogFormat>();
         check::<SsimVariant>();
         check::<ExportFrame>();

@@ -1,5 +1,5 @@
 //! The config of a run: its keys ([`mod@file`], [`key`]) and their words ([`choice`]), options derived from them
-//! ([`limits`], [`residence`]), and published runs ([`published`]).
+//! ([`limits`], [`residence`]), values that follow from a run's length ([`schedule`]), and published runs ([`published`]).
 
 pub mod choice;
 pub mod file;
@@ -7,3 +7,4 @@ pub mod key;
 pub mod limits;
 pub mod published;
 pub mod residence;
+pub mod schedule;
