@@ -134,9 +134,13 @@ impl TextModel {
     }
 }
 
-/// Runs `gsscale-train` with these arguments.
+/// Keeps lengths and rates as the flags of a test and the defaults say, whatever its number of steps.
+pub const CLASSIC: [&str; 2] = ["--schedule", "classic"];
+
+/// Runs `gsscale-train` with these arguments, and with [`CLASSIC`] unless they give a schedule.
 pub fn train(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_gsscale-train")).args(args).output().unwrap()
+    let schedule: &[&str] = if args.contains(&CLASSIC[0]) { &[] } else { &CLASSIC };
+    Command::new(env!("CARGO_BIN_EXE_gsscale-train")).args(args).args(schedule).output().unwrap()
 }
 
 /// Runs `gsscale-eval` with these arguments.
