@@ -6,6 +6,7 @@
 
 use super::schedule::Schedule;
 use crate::base::simd::SimdPath;
+use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
 use crate::exchange::ply::ExportFrame;
 use crate::gpu::DeviceChoice;
@@ -127,6 +128,7 @@ choices! {
     "optimizer": Method { Deferred = "deferred", Dense = "dense", Sparse = "sparse" }
     "moments": Moments { F32 = "f32", Bf16 = "bf16" }
     "schedule": Schedule { RunLength = "run-length", Classic = "classic" }
+    "growth-score": GrowthScore { Gradient = "gradient", Error = "error", Mixed = "mixed" }
     "log": LogFormat { Json = "json", Tensorboard = "tensorboard" }
     "ssim-variant": SsimVariant { Same = "same", Valid = "valid", Reflect = "reflect" }
     "export-frame": ExportFrame { Dataset = "dataset", Local = "local" }
@@ -311,6 +313,7 @@ mod tests {
         check::<Moments>();
         check::<StrategyName>();
         check::<Schedule>();
+        check::<GrowthScore>();
         check::<LogFormat>();
         check::<SsimVariant>();
         check::<ExportFrame>();

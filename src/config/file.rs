@@ -11,6 +11,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
 use crate::base::units::parse_bytes;
 use crate::checkpoint::interval::CommitEvery;
+use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
 use crate::exchange::ply::ExportFrame;
 use crate::gpu::DeviceChoice;
@@ -169,8 +170,14 @@ config_keys! {
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }
     "Densification" {
-        /// default (clone, split, prune, reset) or none
+        /// default (gsplat's: clone, split, prune, reset), long-axis (split along the longest axis; at --max-gaussians,
+        /// which it needs, remove what weighs least), or none
         strategy: StrategyName = StrategyName::Default => Numbers;
+        /// Of --strategy long-axis: grow first what has the largest screen-space gradient (gradient), what covers the
+        /// most squared error (error), or the largest geometric mean of both (mixed)
+        growth_score: GrowthScore = GrowthScore::Mixed => Numbers;
+        /// Of --strategy long-axis: share of the Gaussians seen that a round at the cap removes; 0 = none
+        recycle: f64 = 0.02 => Numbers;
         /// Most Gaussians; 0 = no cap
         max_gaussians: u64 = 0 => Numbers;
         /// Step after which densification rounds begin
@@ -419,6 +426,13 @@ impl TrainConfig {
             if !(value >= 0.0 && value.is_finite()) {
                 return refuse(key, "a number from 0 on");
             }
+        }
+        if !(0.0..=0.5).contains(&self.recycle) {
+            return refuse("recycle", "a share from 0 to 0.5");
+        }
+        if self.strategy == StrategyName::LongAxis && self.max_gaussians == 0 {
+            let problem = "--strategy long-axis grows until the cap, and there is none";
+            return Err(InputError::new("--max-gaussians", problem, "give the most Gaussians that the scene may have"));
         }
         // Compare in f32, as events store the value.
         if self.prune_opa as f32 >= 0.5 {

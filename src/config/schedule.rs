@@ -18,13 +18,9 @@
 //! factor that was measured at 3,000 steps. `reset-every` stays as it is, because opacities take a number of steps to
 //! recover, not a share; `refine-stop` ends resets too.
 //!
-//! Invariants: 1. a given key is never changed; 2. at 30,000 steps and more every key keeps its classic value; 3. the
-//! result is written to the config of the run, so a resumed run keeps its values whatever its new length.
-
-use super::file::{TrainConfig, TrainOverrides};
-use crate::base::error::InputResult;
-use std::collections::BTreeSet;
-use std::path::Path;
+//! Not here: which keys are given ([`super::new_run`]).
+//!
+//! Invariants: 1. at 30,000 steps and more every value is the classic one; 2. no value jumps between lengths.
 
 /// Steps for which the classic values were made.
 const CLASSIC_STEPS: u32 = 30_000;
@@ -42,81 +38,65 @@ pub enum Schedule {
     Classic,
 }
 
-impl TrainConfig {
-    /// The config of a new run: flags over the config file over the defaults, and the keys that neither gives by
-    /// `--schedule`. Not checked yet.
-    ///
-    /// # Errors
-    /// The file cannot be read.
-    pub fn of_new_run(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<TrainConfig> {
-        let (mut config, mut given) = match file {
-            Some(path) => TrainConfig::read_with_keys(path)?,
-            None => (TrainConfig::default(), BTreeSet::new()),
-        };
-        given.extend(keys.given().into_iter().map(str::to_string));
-        keys.clone().apply(&mut config);
-        config.follow_length(&given);
-        Ok(config)
-    }
-
-    /// Sets the keys of the schedule that are not in `given` (names of fields) by `--schedule` and `--steps`.
-    fn follow_length(&mut self, given: &BTreeSet<String>) {
-        if self.schedule == Schedule::Classic {
-            return;
-        }
-        let (steps, classic) = (self.steps, TrainConfig::default());
-        let is_open = |field: &str| !given.contains(field);
-        if is_open("sh_every") {
-            self.sh_every = (steps / 10).clamp(1, classic.sh_every);
-        }
-        if is_open("refine_start") {
-            self.refine_start = (steps / 6).min(classic.refine_start);
-        }
-        if is_open("refine_every") {
-            self.refine_every = (steps / 30).clamp(REFINE_EVERY_LEAST, classic.refine_every);
-        }
-        if is_open("refine_stop") {
-            self.refine_stop = (u64::from(steps) * 4 / 5).min(u64::from(classic.refine_stop)) as u32;
-        }
-        if is_open("means_lr") {
-            self.means_lr = classic.means_lr * rate_factor(steps);
-        }
-    }
+/// The values of the keys that follow the length of a run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Lengths {
+    /// Steps between raises of the SH degree.
+    pub sh_every: u32,
+    /// Step after which rounds begin.
+    pub refine_start: u32,
+    /// Steps between rounds.
+    pub refine_every: u32,
+    /// Step at which rounds end.
+    pub refine_stop: u32,
+    /// Learning rate of positions, times the scene scale.
+    pub means_lr: f64,
 }
 
-/// Factor of the learning rate of positions in a run of this many steps.
-fn rate_factor(steps: u32) -> f64 {
-    (f64::from(CLASSIC_STEPS) / f64::from(steps.max(1))).sqrt().clamp(1.0, RATE_FACTOR_MOST)
+impl Lengths {
+    /// The values for 30,000 steps.
+    pub const CLASSIC: Lengths =
+        Lengths { sh_every: 1000, refine_start: 500, refine_every: 100, refine_stop: 15_000, means_lr: 1.6e-4 };
+
+    /// The values of a run of this many steps.
+    pub fn of_steps(steps: u32) -> Lengths {
+        let classic = Lengths::CLASSIC;
+        let factor = (f64::from(CLASSIC_STEPS) / f64::from(steps.max(1))).sqrt().clamp(1.0, RATE_FACTOR_MOST);
+        Lengths {
+            sh_every: (steps / 10).clamp(1, classic.sh_every),
+            refine_start: (steps / 6).min(classic.refine_start),
+            refine_every: (steps / 30).clamp(REFINE_EVERY_LEAST, classic.refine_every),
+            refine_stop: (u64::from(steps) * 4 / 5).min(u64::from(classic.refine_stop)) as u32,
+            means_lr: classic.means_lr * factor,
+        }
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn of_steps(steps: u32) -> TrainConfig {
-        let mut config = TrainConfig { steps, ..TrainConfig::default() };
-        config.follow_length(&BTreeSet::new());
-        config
-    }
-
     #[test]
     fn long_runs_keep_the_classic_values_and_short_runs_follow_their_length() {
-        for steps in [30_000, 30_001, 200_000] {
-            assert_eq!(of_steps(steps), TrainConfig { steps, ..TrainConfig::default() });
+        for steps in [30_000, 30_001, 200_000, u32::MAX] {
+            assert_eq!(Lengths::of_steps(steps), Lengths::CLASSIC);
         }
-        let lengths = |c: &TrainConfig| (c.sh_every, c.refine_start, c.refine_every, c.refine_stop);
-        let short = of_steps(3000);
-        assert_eq!(lengths(&short), (300, 500, 100, 2400));
-        assert_eq!((short.means_lr, short.reset_every), (3.0 * 1.6e-4, 3000));
-        assert_eq!(lengths(&of_steps(300)), (30, 50, 10, 240));
-        assert!(of_steps(1).check().is_ok());
+        let of = |sh_every, refine_start, refine_every, refine_stop| Lengths {
+            sh_every,
+            refine_start,
+            refine_every,
+            refine_stop,
+            means_lr: 3.0 * 1.6e-4,
+        };
+        assert_eq!(Lengths::of_steps(3000), of(300, 500, 100, 2400));
+        assert_eq!(Lengths::of_steps(300), of(30, 50, 10, 240));
     }
 
     #[test]
     fn nothing_jumps_between_lengths() {
-        let mut last = of_steps(1);
+        let mut last = Lengths::of_steps(1);
         for steps in (2..32_000).step_by(37) {
-            let now = of_steps(steps);
+            let now = Lengths::of_steps(steps);
             // 37 steps more move no length by more than that, and no rate by more than 1 %.
             assert!(now.means_lr <= last.means_lr && now.means_lr > 0.99 * last.means_lr, "{steps}");
             for (now, last) in [
@@ -129,24 +109,5 @@ mod tests {
             }
             last = now;
         }
-    }
-
-    #[test]
-    fn given_keys_and_the_classic_schedule_are_left_alone() {
-        let keys = TrainOverrides { steps: Some(3000), sh_every: Some(1000), ..TrainOverrides::default() };
-        let config = TrainConfig::of_new_run(None, &keys).unwrap_or_default();
-        assert_eq!((config.sh_every, config.refine_stop), (1000, 2400));
-        let keys = TrainOverrides { schedule: Some(Schedule::Classic), ..keys };
-        let config = TrainConfig::of_new_run(None, &keys).unwrap_or_default();
-        let want = TrainConfig { steps: 3000, schedule: Schedule::Classic, ..TrainConfig::default() };
-        assert_eq!(config, want);
-    }
-
-    #[test]
-    fn keys_of_a_file_are_given() {
-        let parsed = TrainConfig::parse_with_keys("steps = 3000\nmeans-lr = 1.6e-4\n[resolved]\nrefine-stop = 1\n");
-        let (mut config, given) = parsed.unwrap_or_default();
-        config.follow_length(&given);
-        assert_eq!((config.means_lr, config.sh_every, config.refine_stop), (1.6e-4, 300, 2400));
     }
 }

@@ -154,7 +154,12 @@ pub(super) fn begin(
     let options =
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
     let before = host_bytes_now().unwrap_or(0);
-    let (renderer, word) = machine::renderer(config)?;
+    let (mut renderer, word) = machine::renderer(config)?;
+    // On from here, so that probing allocates what the steps need.
+    renderer.weigh_rows(options.strategy.needs_weights()).map_err(|error| {
+        let problem = format!("strategy {} needs statistics that are missing: {error}", config.strategy.name());
+        InputError::new("--strategy", problem, "use --device cpu, or --growth-score gradient with --recycle 0")
+    })?;
     let driver = host_bytes_now().unwrap_or(0).saturating_sub(before);
     if let Some(word) = word.filter(|_| !quiet) {
         eprintln!("{word}");
