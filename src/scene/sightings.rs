@@ -2,10 +2,9 @@
 //! the row had in these views together.
 //!
 //! The blending weight of a row in a view is the sum of alpha times transmittance over the pixels of the view, so its
-//! unit is the pixel. The word holds the number of views in its low [`VIEWS_BITS`] bits and the sum of weights in the
-//! other 20 bits: the exponent and the upper 12 bits of the mantissa of a positive f32, rounded to nearest. Adding the
-//! n-th view rounds the sum by at most 2^-13 of it, so even after [`VIEWS_MOST`] views a rounding is at most half of a
-//! mean addition.
+//! unit is the pixel. The word holds the number of views in its low 12 bits and the sum of weights in the other 20
+//! bits: the exponent and the upper 12 bits of the mantissa of a positive f32, rounded to nearest. Adding a view rounds
+//! the sum by at most 2^-13 of it, so even after [`VIEWS_MOST`] views a rounding is at most half of a mean addition.
 //!
 //! Invariants: 1. a word without weights is the plain number of views; 2. a row with [`VIEWS_MOST`] views takes no more
 //! statistics until the next round; 3. weights only add up, in the order of the steps, so the word is a function of
