@@ -345,6 +345,10 @@ impl Renderer for Watched {
         self.inner.set_list_bytes(bytes);
     }
 
+    fn weigh_rows(&mut self, is_wanted: bool) -> Result<(), RenderError> {
+        self.inner.weigh_rows(is_wanted)
+    }
+
     fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError> {
         let before = self.begin.map_or(0.0, |t| t.elapsed().as_secs_f64());
         self.add("acquire+cull+gather", before);

@@ -87,8 +87,7 @@ fn main() -> ExitCode {
 
 /// The checked config of a measurement; starts the worker threads.
 fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, TrainError> {
-    let mut config = file.map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
-    keys.clone().apply(&mut config);
+    let config = TrainConfig::of_new_run(file, keys)?;
     config.check()?;
     if !simd_path(&config).is_supported() {
         let problem = format!("this machine cannot run {}", config.simd.word());

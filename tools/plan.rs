@@ -187,8 +187,7 @@ fn load(args: &Args) -> InputResult<Scene> {
     let run_config = args.scene.join(CONFIG_FILE);
     let is_run = run_config.is_file();
     let config_path = args.config.clone().or_else(|| is_run.then(|| run_config.clone()));
-    let mut config = config_path.as_deref().map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
-    args.keys.clone().apply(&mut config);
+    let config = TrainConfig::of_new_run(config_path.as_deref(), &args.keys)?;
     config.check()?;
     set_up(&config)?;
     if config.optimizer == Method::Dense {

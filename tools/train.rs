@@ -96,12 +96,14 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
         let (accept_changes, quiet) = (args.accept_changes, args.quiet);
         return resume(&ResumeRequest { out, keys: args.keys, scene: args.scene, accept_changes, quiet });
     }
-    let mut config = match (&args.config, args.demo) {
-        (Some(path), _) => TrainConfig::read(path)?,
-        (None, true) => demo_config(),
-        (None, false) => TrainConfig::default(),
+    let config = match (&args.config, args.demo) {
+        (None, true) => {
+            let mut config = demo_config();
+            args.keys.apply(&mut config);
+            config
+        }
+        (file, _) => TrainConfig::of_new_run(file.as_deref(), &args.keys)?,
     };
-    args.keys.apply(&mut config);
     config.check()?;
     let out = args.out.unwrap_or_default();
     let mut scratch = None;

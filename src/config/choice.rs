@@ -4,7 +4,9 @@
 //! Invariants: 1. a value is written as the word from which it is read; 2. file and flag refuse an unknown word with
 //! the same message; 3. this file holds no defaults and no meanings.
 
+use super::schedule::Schedule;
 use crate::base::simd::SimdPath;
+use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
 use crate::exchange::ply::ExportFrame;
 use crate::gpu::DeviceChoice;
@@ -125,7 +127,9 @@ choices! {
     "ssim-padding": SsimPadding { Valid = "valid", Same = "same" }
     "optimizer": Method { Deferred = "deferred", Dense = "dense", Sparse = "sparse" }
     "moments": Moments { F32 = "f32", Bf16 = "bf16" }
-    "strategy": StrategyName { Default = "default", None = "none" }
+    "strategy": StrategyName { Default = "default", LongAxis = "long-axis", None = "none" }
+    "schedule": Schedule { RunLength = "run-length", Classic = "classic" }
+    "growth-score": GrowthScore { Gradient = "gradient", Error = "error", Mixed = "mixed" }
     "log": LogFormat { Json = "json", Tensorboard = "tensorboard" }
     "ssim-variant": SsimVariant { Same = "same", Valid = "valid", Reflect = "reflect" }
     "export-frame": ExportFrame { Dataset = "dataset", Local = "local" }
@@ -294,6 +298,8 @@ mod tests {
         check::<Method>();
         check::<Moments>();
         check::<StrategyName>();
+        check::<Schedule>();
+        check::<GrowthScore>();
         check::<LogFormat>();
         check::<SsimVariant>();
         check::<ExportFrame>();

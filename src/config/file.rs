@@ -9,10 +9,12 @@
 
 use super::choice::{Chosen, Device, LogFormat};
 use super::key::{Class, Key};
+use super::schedule::Schedule;
 use super::values::{ByteSize, Rgb};
 use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
 use crate::checkpoint::interval::CommitEvery;
+use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
 use crate::exchange::ply::ExportFrame;
 use crate::gpu::DeviceChoice;
@@ -27,6 +29,7 @@ use crate::render::color_correct::ColorCorrect;
 use crate::render::metrics::SsimVariant;
 use crate::schedule::order::Order;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
@@ -56,6 +59,13 @@ macro_rules! config_keys {
         impl TrainOverrides {
             /// Overrides `config` with the given flags.
             pub fn apply(self, config: &mut TrainConfig) { $($( if let Some(v) = self.$name { config.$name = v; } )+)+ }
+
+            /// The fields of the given flags.
+            pub fn given(&self) -> Vec<&'static str> {
+                let mut fields = Vec::new();
+                $($( if self.$name.is_some() { fields.push(stringify!($name)); } )+)+
+                fields
+            }
         }
 
         /// Every key, in order.
@@ -99,6 +109,10 @@ config_keys! {
         /// Steps over which the learning rate of positions decays; it is constant afterwards. 0 = --steps. A resumed
         /// run keeps its first value
         schedule_steps: u32 = 0 => Derived;
+        /// Values of --sh-every, --refine-start, --refine-every, --refine-stop and --means-lr where they are not given:
+        /// run-length (by --steps; the classic values from 30,000 steps on) or classic (their defaults below). A
+        /// resumed run keeps its values
+        schedule: Schedule = Schedule::RunLength => Free;
         /// Seed of every random draw
         seed: u64 = 42 => Numbers;
         /// Highest degree of spherical harmonics (SH), 0 to 3
@@ -147,8 +161,14 @@ config_keys! {
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }
     "Densification" {
-        /// default (clone, split, prune, reset) or none
+        /// default (gsplat's: clone, split, prune, reset), long-axis (split along the longest axis; at --max-gaussians,
+        /// which it needs, remove what weighs least), or none
         strategy: StrategyName = StrategyName::Default => Numbers;
+        /// Of --strategy long-axis: grow first what has the largest screen-space gradient (gradient), what covers the
+        /// most squared error (error), or the largest geometric mean of both (mixed)
+        growth_score: GrowthScore = GrowthScore::Mixed => Numbers;
+        /// Of --strategy long-axis: share of the Gaussians seen that a round at the cap removes; 0 = none
+        recycle: f64 = 0.02 => Numbers;
         /// Most Gaussians; 0 = no cap
         max_gaussians: u64 = 0 => Numbers;
         /// Step after which densification rounds begin
@@ -232,24 +252,47 @@ config_keys! {
 
 impl TrainConfig {
     /// Reads a config file over the defaults.
+    ///
+    /// # Errors
+    /// The file cannot be read, is no config, or has an unknown key or word.
     pub fn read(path: &Path) -> InputResult<TrainConfig> {
+        Ok(TrainConfig::read_with_keys(path)?.0)
+    }
+
+    /// As [`TrainConfig::read`], with the fields of the keys that the file gives.
+    ///
+    /// # Errors
+    /// As [`TrainConfig::read`].
+    pub fn read_with_keys(path: &Path) -> InputResult<(TrainConfig, BTreeSet<String>)> {
         let mut text = String::new();
         let read = File::open(path).and_then(|file| file.take(FILE_BYTES_MAX + 1).read_to_string(&mut text));
         read.map_err(|e| InputError::io(path, "reading the config", &e))?;
         if text.len() as u64 > FILE_BYTES_MAX {
             return Err(InputError::new(path, "the file is too large for a config", "give a TOML file of keys"));
         }
-        TrainConfig::parse(&text)
+        TrainConfig::parse_with_keys(&text)
             .map_err(|problem| InputError::new(path, problem, "see configs/default.toml for every key and its meaning"))
     }
 
     /// Parses a config text over the defaults.
+    ///
+    /// # Errors
+    /// The text is no TOML, or has an unknown key or word.
     pub fn parse(text: &str) -> Result<TrainConfig, String> {
+        Ok(TrainConfig::parse_with_keys(text)?.0)
+    }
+
+    /// As [`TrainConfig::parse`], with the fields of the keys that the text gives.
+    ///
+    /// # Errors
+    /// As [`TrainConfig::parse`].
+    pub fn parse_with_keys(text: &str) -> Result<(TrainConfig, BTreeSet<String>), String> {
         let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| e.to_string())?;
         for name in TABLES {
             table.remove(name);
         }
-        TrainConfig::deserialize(table).map_err(|e| e.to_string())
+        let given = table.keys().map(|key| key.replace('-', "_")).collect();
+        Ok((TrainConfig::deserialize(table).map_err(|e| e.to_string())?, given))
     }
 }
 

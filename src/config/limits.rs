@@ -6,6 +6,7 @@ use crate::base::simd::SimdPath;
 use crate::dataset::loader::LoadOptions;
 use crate::dataset::read::ReadOptions;
 use crate::densify::default::DefaultStrategy;
+use crate::densify::long_axis::LongAxisStrategy;
 use crate::densify::strategy::{NoStrategy, Strategy, StrategyName};
 use crate::exchange::ply::ExportFrame;
 use crate::optim::adam::AdamConfig;
@@ -125,6 +126,7 @@ fn strategy(config: &TrainConfig) -> Arc<dyn Strategy> {
     match config.strategy {
         StrategyName::None => Arc::new(NoStrategy),
         StrategyName::Default => Arc::new(default_strategy(config)),
+        StrategyName::LongAxis => Arc::new(long_axis_strategy(config)),
     }
 }
 
@@ -152,6 +154,18 @@ fn loss_options(config: &TrainConfig) -> LossOptions {
 impl Default for LossOptions {
     fn default() -> LossOptions {
         loss_options(&TrainConfig::default())
+    }
+}
+
+fn long_axis_strategy(config: &TrainConfig) -> LongAxisStrategy {
+    LongAxisStrategy {
+        score: config.growth_score,
+        recycle: config.recycle,
+        prune_opa: config.prune_opa as f32,
+        refine_start: config.refine_start,
+        refine_stop: config.refine_stop,
+        refine_every: config.refine_every,
+        max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
     }
 }
 

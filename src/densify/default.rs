@@ -8,7 +8,7 @@ use super::stats::{GradHistogram, promised_growth};
 use super::strategy::{Extremes, Fate, Round, RowFacts, Strategy};
 use crate::base::math::sigmoid;
 use crate::optim::bounds::SplitLimits;
-use crate::scene::events::{EventKind, RoundThresholds};
+use crate::scene::events::{EventKind, RoundThresholds, SPLIT_SIGMAS};
 use crate::scene::rows::{Rows, mean_grad2d};
 
 /// The strategy with its keys.
@@ -100,7 +100,8 @@ impl Strategy for DefaultStrategy {
 
     /// The thresholds of a round are never below the keys.
     fn split_limits(&self, scene_scale: f32) -> SplitLimits {
-        SplitLimits { grow_grad2d: self.grow_grad2d, split_scale: self.grow_scale3d * scene_scale }
+        let (grow_grad2d, split_scale) = (self.grow_grad2d, self.grow_scale3d * scene_scale);
+        SplitLimits { grow_grad2d, split_scale, reach: SPLIT_SIGMAS as f32 }
     }
 }
 
@@ -109,7 +110,7 @@ impl Round for RoundThresholds {
     fn fate(&self, row: &RowFacts) -> Fate {
         let is_faint = sigmoid(row.opacity) < self.prune_opacity;
         let is_pruned = |log_scale: f32| is_faint || sigma(log_scale) > self.prune_scale;
-        let grows = row.mean_grad2d > self.grow_grad2d;
+        let grows = mean_grad2d(row.grad2d, row.count) > self.grow_grad2d;
         if !grows {
             return if is_pruned(row.log_scale) { Fate::Prune } else { Fate::Keep };
         }
@@ -120,7 +121,7 @@ impl Round for RoundThresholds {
         }
     }
 
-    fn may_grow(&self, rows: &Rows<'_>) -> bool {
+    fn may_edit(&self, rows: &Rows<'_>) -> bool {
         let means = rows.grad2d.iter().zip(rows.count).map(|(&grad2d, &count)| mean_grad2d(grad2d, count));
         means.fold(false, |any, mean| any | (mean > self.grow_grad2d))
     }
@@ -169,7 +170,7 @@ mod tests {
         let t = RoundThresholds { grow_grad2d: 1.0, split_scale: 0.1, prune_opacity: 0.005, prune_scale: 0.5 };
         let (solid, faint) = (logit(0.5), logit(0.004));
         let of = |sigma: f32, mean_grad2d: f32, opacity: f32| {
-            t.fate(&RowFacts { mean_grad2d, log_scale: sigma.ln(), opacity })
+            t.fate(&RowFacts { grad2d: 2.0 * mean_grad2d, count: 2, log_scale: sigma.ln(), opacity })
         };
         assert_eq!(of(0.05, 1.0, solid), Fate::Keep);
         assert_eq!(of(0.05, 1.1, solid), Fate::Duplicate { pruned: false });

@@ -180,8 +180,8 @@ impl<'a> PendingEvents<'a> {
     ) -> (PageRound, Option<RoundEdits>) {
         let promised = round.promised_rows(rows);
         let mut done = PageRound { event: index, rows_change: 0, promised, counts: RoundCounts::default() };
-        let nothing_grows = promised == 0 && !round.may_grow(rows);
-        if nothing_grows && round.keeps_all(extremes.get_or_insert_with(|| self.extremes(rows))) {
+        let by_bounds = promised == 0 && !round.may_edit(rows);
+        if by_bounds && round.keeps_all(extremes.get_or_insert_with(|| self.extremes(rows))) {
             return (done, None);
         }
         let edits = ops::plan_round(self.at(index), rows, round, self.seed, index as u64);

@@ -1,33 +1,40 @@
-//! Statistics of rows since the last round: sums of the gradient norms of projected means, and their histogram.
+//! Statistics of rows since the last round, and their histogram: sums of growth scores (for the default strategy, of the
+//! gradient norms of projected means) and, for strategies that remove rows by it, mean blending weights.
 //!
-//! Invariants: 1. only drawn rows change; 2. sums are in NDC units, so thresholds do not depend on the image size; 3.
-//! the histogram counts every row with statistics exactly once, in the bin of its mean, with integer counters, so the
-//! order of updates does not matter; 4. no counter wraps: removing a row from an empty bin, which happens only for
-//! statistics of another histogram, adds to [`GradHistogram::uncounted`].
+//! Invariants: 1. only drawn rows change; 2. gradients are in NDC units, so thresholds do not depend on the image size;
+//! 3. the histogram counts every row with statistics exactly once in the bin of its mean score, and every row that
+//! enough views weighed exactly once in the bin of its mean weight, with integer counters, so the order of updates does
+//! not matter; 4. no counter wraps: removing a row from an empty bin, which happens only for statistics of another
+//! histogram, adds to [`GradHistogram::uncounted`].
 
 pub use crate::scene::rows::mean_grad2d;
 use crate::scene::rows::{Rows, RowsMut};
+use crate::scene::sightings::{is_full, mean_weight, views, with_view};
 
 /// Bins: one per value of the upper 16 bits of a non-negative f32, so 128 per doubling.
 const BINS: usize = 1 << 15;
+/// A row is removed by its weight only if at least this many views drew it since the last round: a weight in one view
+/// says little about the others.
+pub const WEIGHED_VIEWS: u32 = 3;
 
-/// Number of rows by mean gradient norm. 128 KiB.
+/// Number of rows by mean growth score, and by mean blending weight. 256 KiB.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GradHistogram {
+    /// The bins of scores, then those of weights.
     bins: Vec<u32>,
     uncounted: u64,
 }
 
 impl Default for GradHistogram {
     fn default() -> Self {
-        GradHistogram { bins: vec![0; BINS], uncounted: 0 }
+        GradHistogram { bins: vec![0; 2 * BINS], uncounted: 0 }
     }
 }
 
 impl GradHistogram {
-    /// The non-empty bins with their row counts, ascending, for a checkpoint.
+    /// The non-empty bins with their row counts, ascending, for a checkpoint. The bins of weights follow those of scores.
     pub fn filled(&self) -> Vec<(u16, u32)> {
-        self.bins.iter().zip(0..).filter(|(rows, _)| **rows > 0).map(|(&rows, bin)| (bin, rows)).collect()
+        self.bins.iter().zip(0..=u16::MAX).filter(|(rows, _)| **rows > 0).map(|(&rows, bin)| (bin, rows)).collect()
     }
 
     /// The histogram with these bins of [`GradHistogram::filled`]; `None` if a bin number is out of range.
@@ -46,16 +53,32 @@ impl GradHistogram {
 
     /// Adds the rows of a view that have statistics.
     pub fn add_rows(&mut self, rows: &Rows<'_>) {
-        for (&grad2d, &count) in rows.grad2d.iter().zip(rows.count).filter(|(_, count)| **count > 0) {
+        rows.grad2d.iter().zip(rows.count).for_each(|(&grad2d, &count)| self.add_row(grad2d, count));
+    }
+
+    /// Counts a row with these statistics.
+    fn add_row(&mut self, grad2d: f32, count: u32) {
+        if count > 0 {
             self.add(mean_grad2d(grad2d, count));
+        }
+        if let Some(bin) = weight_bin(count) {
+            self.bins[BINS + bin as usize] += 1;
         }
     }
 
-    /// Removes a row with this mean.
-    pub fn remove(&mut self, mean: f32) {
-        let rows = &mut self.bins[bin(mean)];
-        match rows.checked_sub(1) {
-            Some(left) => *rows = left,
+    /// Removes a row with these statistics.
+    fn remove_row(&mut self, grad2d: f32, count: u32) {
+        if count > 0 {
+            self.take_from(bin(mean_grad2d(grad2d, count)));
+        }
+        if let Some(bin) = weight_bin(count) {
+            self.take_from(BINS + bin as usize);
+        }
+    }
+
+    fn take_from(&mut self, bin: usize) {
+        match self.bins[bin].checked_sub(1) {
+            Some(left) => self.bins[bin] = left,
             None => self.uncounted += 1,
         }
     }
@@ -70,9 +93,43 @@ impl GradHistogram {
         self.bins.fill(0);
     }
 
-    /// Number of rows.
+    /// Number of rows with statistics.
     pub fn rows(&self) -> u64 {
-        self.bins.iter().map(|&n| u64::from(n)).sum()
+        self.bins[..BINS].iter().map(|&n| u64::from(n)).sum()
+    }
+
+    /// Number of rows that at least [`WEIGHED_VIEWS`] views weighed.
+    pub fn weighed_rows(&self) -> u64 {
+        self.bins[BINS..].iter().map(|&n| u64::from(n)).sum()
+    }
+
+    /// The lowest bin of scores, at least 1, from which on there are at most `room` rows; the number of bins if the last
+    /// bin has more. Bin 0 holds scores of zero.
+    pub fn split_bin(&self, room: u64) -> u32 {
+        let (mut first, mut above) = (BINS, 0u64);
+        while first > 1 {
+            above += u64::from(self.bins[first - 1]);
+            if above > room {
+                break;
+            }
+            first -= 1;
+        }
+        first as u32
+    }
+
+    /// Number of rows in this bin of scores and above. Equals the sum of [`rows_from_bin`] over all pages.
+    pub fn rows_from_bin(&self, bin: u32) -> u64 {
+        self.bins[(bin as usize).min(BINS)..BINS].iter().map(|&n| u64::from(n)).sum()
+    }
+
+    /// The highest bin of weights below which there are at most `most` rows.
+    pub fn remove_bin(&self, most: u64) -> u32 {
+        let mut below = 0u64;
+        let fits = |rows: &&u32| {
+            below += u64::from(**rows);
+            below <= most
+        };
+        self.bins[BINS..].iter().take_while(fits).count() as u32
     }
 
     /// The smallest threshold of at least `least` that at most `room` rows exceed, in whole bins: `least` itself, just
@@ -94,7 +151,7 @@ impl GradHistogram {
     /// Upper bound of the rows above a threshold from [`GradHistogram::threshold`]: whole bins. Equals the sum of
     /// [`promised_growth`] over all pages.
     pub fn promised(&self, threshold: f32) -> u64 {
-        self.bins[bin(threshold.next_up())..].iter().map(|&n| u64::from(n)).sum()
+        self.bins[bin(threshold.next_up())..BINS].iter().map(|&n| u64::from(n)).sum()
     }
 }
 
@@ -105,6 +162,26 @@ pub fn promised_growth(rows: &Rows<'_>, threshold: f32) -> u64 {
     rows.grad2d.iter().zip(rows.count).filter(is_counted).count() as u64
 }
 
+/// The rows of a view that [`GradHistogram::rows_from_bin`] counted, if their statistics are unchanged since the round.
+pub fn rows_from_bin(rows: &Rows<'_>, bin: u32) -> u64 {
+    let is_counted = |&(&grad2d, &count): &(&f32, &u32)| count > 0 && score_bin(grad2d, count) >= bin;
+    rows.grad2d.iter().zip(rows.count).filter(is_counted).count() as u64
+}
+
+/// Bin of the mean score of a row with these statistics.
+#[inline(always)]
+pub fn score_bin(grad2d: f32, count: u32) -> u32 {
+    bin(mean_grad2d(grad2d, count)) as u32
+}
+
+/// Bin of the mean weight of a row; `None` if fewer than [`WEIGHED_VIEWS`] views drew it or none weighed it.
+#[inline(always)]
+pub fn weight_bin(count: u32) -> Option<u32> {
+    let mean = mean_weight(count).filter(|_| views(count) >= WEIGHED_VIEWS)?;
+    Some(bin(mean) as u32)
+}
+
+#[inline(always)]
 fn bin(mean: f32) -> usize {
     // Sums of norms are never -0, negative or NaN; such values would count as 0.
     if mean > 0.0 { (mean.to_bits() >> 16) as usize } else { 0 }
@@ -121,26 +198,44 @@ pub fn accumulate(
     image_size: [u32; 2],
     histogram: &mut GradHistogram,
 ) -> usize {
-    let mut changed = 0;
     assert!(rows.len() == v_means2d.len() && rows.len() == radii.len(), "one gradient and radius per listed row");
     let half = image_size.map(|n| n as f32 * 0.5);
-    for ((&row, v), radius) in rows.iter().zip(v_means2d).zip(radii) {
+    accumulate_scores(view, rows, radii, histogram, |listed| (grad_norm(v_means2d[listed], half), None))
+}
+
+/// Norm of a gradient of the projected mean, NDC units; `half` is half of the image size, pixels.
+#[inline(always)]
+pub fn grad_norm(v: [f32; 2], half: [f32; 2]) -> f32 {
+    let (x, y) = (v[0] * half[0], v[1] * half[1]);
+    (x * x + y * y).sqrt()
+}
+
+/// Adds a growth score and, where a strategy weighs rows, a blending weight (pixels) of one view to the statistics of
+/// the listed rows. `of_row` gives both for a position in `rows`; `radii` is as in [`accumulate`]. Rows with a zero
+/// radius, with a score that is not finite, or with as many views as a row can count are ignored. Returns the number of
+/// rows that changed.
+pub fn accumulate_scores(
+    view: &mut RowsMut<'_>,
+    rows: &[u32],
+    radii: &[[u32; 2]],
+    histogram: &mut GradHistogram,
+    of_row: impl Fn(usize) -> (f32, Option<f32>),
+) -> usize {
+    let mut changed = 0;
+    for (listed, (&row, radius)) in rows.iter().zip(radii).enumerate() {
         if radius[0] == 0 || radius[1] == 0 {
             continue;
         }
-        let (x, y) = (v[0] * half[0], v[1] * half[1]);
-        let norm = (x * x + y * y).sqrt();
-        if !norm.is_finite() {
-            continue;
-        }
+        let (score, weight) = of_row(listed);
         let row = row as usize - view.first_row;
         let (grad2d, count) = (&mut view.grad2d[row], &mut view.count[row]);
-        if *count > 0 {
-            histogram.remove(mean_grad2d(*grad2d, *count));
+        if !score.is_finite() || is_full(*count) {
+            continue;
         }
-        *grad2d = (*grad2d + norm).min(f32::MAX);
-        *count += 1;
-        histogram.add(mean_grad2d(*grad2d, *count));
+        histogram.remove_row(*grad2d, *count);
+        *grad2d = (*grad2d + score).min(f32::MAX);
+        *count = with_view(*count, weight);
+        histogram.add_row(*grad2d, *count);
         changed += 1;
     }
     changed
@@ -168,6 +263,32 @@ mod tests {
         assert_eq!(histogram.threshold(2e-4, 1), 2e-4);
         let threshold = histogram.threshold(2e-4, 0);
         assert!(threshold >= mean_grad2d(state.grad2d[0], 2));
+    }
+
+    #[test]
+    fn weights_have_bins_of_their_own_that_a_checkpoint_holds() {
+        let mut state = SceneState::from_columns(Columns::zeros(100, 0));
+        let mut histogram = GradHistogram::default();
+        let rows: Vec<u32> = (0..100).collect();
+        for view in 1..=WEIGHED_VIEWS {
+            let of_row = |row: usize| (row as f32, Some(row as f32 + 1.0));
+            accumulate_scores(&mut state.view_mut(), &rows, &[[1, 1]; 100], &mut histogram, of_row);
+            assert_eq!(histogram.weighed_rows(), if view < WEIGHED_VIEWS { 0 } else { 100 });
+        }
+        assert_eq!((histogram.rows(), histogram.uncounted()), (100, 0));
+        // Means are whole numbers, and the bins below 128 tell whole numbers apart.
+        let removed = |most: u64| {
+            let below = histogram.remove_bin(most);
+            state.count.iter().filter(|&&count| weight_bin(count).is_some_and(|bin| bin < below)).count()
+        };
+        assert_eq!([0, 1, 7, 99].map(removed), [0, 1, 7, 99]);
+        let grown = |room: u64| rows_from_bin(&state.view(), histogram.split_bin(room));
+        // Row 0 has score 0, which never grows.
+        assert_eq!([0, 1, 7, 99, 100].map(grown), [0, 1, 7, 99, 99]);
+        assert_eq!(GradHistogram::from_filled(&histogram.filled()), Some(histogram.clone()));
+        let mut recounted = GradHistogram::default();
+        recounted.add_rows(&state.view());
+        assert_eq!(recounted, histogram);
     }
 
     #[test]

@@ -8,8 +8,8 @@
 //! 1. add a file beside [`super::default`] with a struct that holds the keys and implements [`Strategy`];
 //! 2. add a name to [`StrategyName`];
 //! 3. add the keys to `config/file.rs` and pass them to the struct in `config/limits.rs`;
-//! 4. if a round needs values beyond [`crate::scene::events::RoundThresholds`], add an event kind to `scene/events.rs`,
-//!    implement [`Round`] for it and name it in [`effect_of`].
+//! 4. if a round needs values beyond those of the events in `scene/events.rs`, add an event kind there, implement
+//!    [`Round`] for it and name it in [`effect_of`].
 //!
 //! Invariants: 1. strategies and rounds are functions of their arguments, without side effects; 2. an event gives a row
 //! the same fate whenever it is applied.
@@ -25,6 +25,8 @@ use std::fmt;
 pub enum StrategyName {
     /// [`super::default::DefaultStrategy`].
     Default,
+    /// [`super::long_axis::LongAxisStrategy`].
+    LongAxis,
     /// [`NoStrategy`].
     None,
 }
@@ -45,6 +47,9 @@ pub struct DrawnRows<'a> {
     pub v_means2d: &'a [[f32; 2]],
     /// Radii of each row's footprint, pixels; a row with a zero radius was not drawn.
     pub radii: &'a [[u32; 2]],
+    /// Blending weight, and blending weight times squared error, of each row, summed over the pixels of the view; empty
+    /// unless [`Strategy::needs_weights`].
+    pub weights: &'a [[f32; 2]],
     /// Width and height of the picture, pixels.
     pub image_size: [u32; 2],
 }
@@ -56,6 +61,11 @@ pub trait Strategy: fmt::Debug + Send + Sync {
 
     /// Whether this step collects statistics.
     fn collects(&self, step: u32) -> bool;
+
+    /// Whether [`Strategy::collect`] reads [`DrawnRows::weights`], which the renderer collects on demand only.
+    fn needs_weights(&self) -> bool {
+        false
+    }
 
     /// Adds the gradients of a step to the statistics of the rows and updates the histogram, which counts every row
     /// that has statistics. Returns the number of rows that changed.
@@ -97,8 +107,10 @@ impl Strategy for NoStrategy {
 /// The values of a row at the time of the event, as input of [`Round::fate`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RowFacts {
-    /// Mean of the gradient norms since the last round, NDC units.
-    pub mean_grad2d: f32,
+    /// Sum of the growth scores since the last round; for the default strategy, of gradient norms, NDC units.
+    pub grad2d: f32,
+    /// Views that drew the row since the last round, and its weight in them ([`crate::scene::sightings`]).
+    pub count: u32,
     /// Largest log-scale.
     pub log_scale: f32,
     /// Logit of the opacity.
@@ -131,6 +143,8 @@ pub enum Fate {
         /// Whether the same round prunes both children.
         children_pruned: bool,
     },
+    /// Two children replace the row, side by side along its longest axis.
+    SplitLongAxis,
 }
 
 /// A logged round.
@@ -138,11 +152,12 @@ pub trait Round: Sync {
     /// The fate of a row.
     fn fate(&self, row: &RowFacts) -> Fate;
 
-    /// Whether a row may be duplicated or split. False only if [`Round::fate`] duplicates and splits no row of `rows`.
-    fn may_grow(&self, rows: &Rows<'_>) -> bool;
+    /// Whether the statistics of a row may decide its fate. False only if [`Round::fate`] would duplicate, split and
+    /// prune the same rows of `rows` if they had no statistics.
+    fn may_edit(&self, rows: &Rows<'_>) -> bool;
 
-    /// Whether the round keeps every row within these bounds that does not grow. A page that missed many rounds then
-    /// computes its bounds once instead of deciding every row in every round.
+    /// Whether the round keeps every row within these bounds that has no statistics. A page that missed many rounds
+    /// then computes its bounds once instead of deciding every row in every round.
     fn keeps_all(&self, extremes: &Extremes) -> bool;
 
     /// Upper bound of the number of rows that grow, when the round is logged. The scene has at most `rows` rows, and
@@ -174,6 +189,7 @@ pub enum Effect<'a> {
 pub fn effect_of(kind: &EventKind) -> Effect<'_> {
     match *kind {
         EventKind::Densify(ref thresholds) => Effect::Round(thresholds),
+        EventKind::LongAxis(ref thresholds) => Effect::Round(thresholds),
         EventKind::ResetOpacity { max_opacity } => Effect::ResetOpacity { max_opacity },
         EventKind::RaiseShDegree { degree } => Effect::RaiseShDegree { degree },
     }

@@ -15,6 +15,7 @@ pub mod scan;
 pub mod sh_bwd;
 pub mod sh_fwd;
 pub mod splats;
+pub mod squared_error;
 mod ssim_band;
 pub mod stages;
 mod tile_block;

@@ -2,12 +2,14 @@
 //!
 //! With h = alpha dL/dalpha (zero where alpha is clamped), a splat needs only nine sums over a tile's pixels: h, h dx,
 //! h dy, h dx^2, h dx dy, h dy^2 and weight v_rgb. The gradients are linear in these sums and are computed once per
-//! row.
+//! row. On demand two more sums are collected, statistics for densification: weight = alpha T, and weight times a value
+//! of the pixel, its error.
 //!
 //! Invariants: 1. where opacity exp(-sigma) > max_alpha, no gradient passes through alpha, only through the colour; 2.
 //! a splat that contributes to no pixel gets exact zeros; 3. the nine sums of a row are folded over its tiles from left
 //! to right in emit order (tiles column by column), starting from zero: this order is part of the result's definition,
-//! so that a view may be cut at tile columns without changing a bit; 4. threads cannot change a bit.
+//! so that a view may be cut at tile columns without changing a bit; 4. threads cannot change a bit; 5. collecting
+//! weights changes no bit of the nine sums.
 
 use super::constants::TILE;
 use super::lanes::Lane;
@@ -27,6 +29,18 @@ pub const SUMS: usize = 9;
 /// The sums of one intersection as f32 bits. Every place is written by one tile only; relaxed stores express this in
 /// safe Rust.
 pub type Partial = [AtomicU32; SUMS];
+
+/// Weight, and weight times error, of one intersection, as [`Partial`].
+pub type WeightPartial = [AtomicU32; 2];
+
+/// The statistics that [`rasterize_bwd`] collects besides gradients.
+#[derive(Debug)]
+pub struct Weighing<'a> {
+    /// Error of each pixel, `[height][width]`.
+    pub errors: &'a [f32],
+    /// The sums of every intersection at its emit index; resized.
+    pub partials: &'a mut Vec<WeightPartial>,
+}
 
 /// Gradient of the loss with respect to the image.
 #[derive(Debug, Clone, Copy)]
@@ -61,6 +75,8 @@ struct Row {
     /// of the background, minus v_alpha.
     behind: Lane,
     v_rgb: [Lane; 3],
+    /// Error of the pixels; zeros unless weights are collected.
+    error: Lane,
     /// List index at which the lane stopped: entries from there on do not affect it.
     stop: [u32; LANES],
 }
@@ -75,6 +91,7 @@ struct Tile {
     row_stop: [u32; ROWS],
     block: Block<BLOCK>,
     sums: [Sums; BLOCK],
+    weights: [[Lane; 2]; BLOCK],
     halves: [Halves; BLOCK],
 }
 
@@ -85,16 +102,18 @@ thread_local! {
         row_stop: [0; ROWS],
         block: Block::new(),
         sums: [Sums::default(); BLOCK],
+        weights: [[[0.0; LANES]; 2]; BLOCK],
         halves: [Halves::default(); BLOCK],
     }));
 }
 
 impl Row {
-    const EMPTY: Row = Row { t: [0.0; LANES], behind: [0.0; LANES], v_rgb: [[0.0; LANES]; 3], stop: [0; LANES] };
+    const EMPTY: Row =
+        Row { t: [0.0; LANES], behind: [0.0; LANES], v_rgb: [[0.0; LANES]; 3], error: [0.0; LANES], stop: [0; LANES] };
 }
 
 impl Tile {
-    fn load(&mut self, lists: &Lists<'_>, raster: &Raster, upstream: &Upstream<'_>, tile: usize) {
+    fn load(&mut self, lists: &Lists<'_>, raster: &Raster, upstream: &Upstream<'_>, errors: &[f32], tile: usize) {
         let grid = lists.grid;
         let (tx, ty) = grid.position(tile);
         let columns = (grid.width - tx * TILE).min(TILE) as usize;
@@ -106,6 +125,9 @@ impl Tile {
             let from = (ty as usize * ROWS + row) * grid.width as usize + tx as usize * LANES;
             for c in 0..3 {
                 copy_lanes(&mut out.v_rgb[c][..columns], &upstream.v_rgb[c * pixels + from..]);
+            }
+            if !errors.is_empty() {
+                copy_lanes(&mut out.error[..columns], &errors[from..]);
             }
             let within = tile * TILE_PIXELS + row * LANES;
             let v_alpha = upstream.v_alpha.map(|v| &v[from..from + columns]);
@@ -124,22 +146,25 @@ impl Tile {
     }
 }
 
-struct BackTile<'a> {
+/// The way back through one tile; `WEIGHS` collects weights.
+struct BackTile<'a, const WEIGHS: bool> {
     lists: &'a Lists<'a>,
     chunk_offsets: &'a [u64],
     tile: usize,
     cap: f32,
     state: &'a mut Tile,
     partials: &'a [Partial],
+    /// Empty unless weights are collected.
+    weight_partials: &'a [WeightPartial],
 }
 
-impl Kernel for BackTile<'_> {
+impl<const WEIGHS: bool> Kernel for BackTile<'_, WEIGHS> {
     type Out = ();
 
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        let BackTile { lists, chunk_offsets, tile, cap, state, partials } = self;
-        let Tile { rows, row_stop, block, sums, halves } = state;
+        let BackTile { lists, chunk_offsets, tile, cap, state, partials, weight_partials } = self;
+        let Tile { rows, row_stop, block, sums, weights, halves } = state;
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
         let x: Lane = std::array::from_fn(|lane| x0 + lane as f32);
@@ -161,9 +186,12 @@ impl Kernel for BackTile<'_> {
             }
             for i in bits(touched) {
                 sums[i] = Sums::default();
+                if WEIGHS {
+                    weights[i] = [[0.0; LANES]; 2];
+                }
             }
             for (y, row) in rows.iter_mut().enumerate() {
-                back_row::<FMA>(row, y, first, block, &x, cap, sums);
+                back_row::<FMA, WEIGHS>(row, y, first, block, &x, cap, (sums, weights));
             }
             for i in bits(touched) {
                 halves[i] = sums[i].halves(&x, block.locals[i].mean_x);
@@ -171,15 +199,26 @@ impl Kernel for BackTile<'_> {
             for i in bits(touched) {
                 let local = &block.locals[i];
                 let chunk = local.row as usize / ROWS_PER_CHUNK;
-                let out = &partials[(chunk_offsets[chunk] + local.emit) as usize];
-                for (out, half) in out.iter().zip(&halves[i].0) {
-                    let four: [f32; 4] = std::array::from_fn(|lane| half[lane] + half[lane + 4]);
-                    let sum = (four[0] + four[2]) + (four[1] + four[3]);
-                    out.store(sum.to_bits(), Relaxed);
+                let at = (chunk_offsets[chunk] + local.emit) as usize;
+                for (out, half) in partials[at].iter().zip(&halves[i].0) {
+                    out.store(sum_of_half(half).to_bits(), Relaxed);
+                }
+                if WEIGHS {
+                    for (out, lanes) in weight_partials[at].iter().zip(&weights[i]) {
+                        let half: [f32; 8] = std::array::from_fn(|lane| lanes[lane] + lanes[lane + 8]);
+                        out.store(sum_of_half(&half).to_bits(), Relaxed);
+                    }
                 }
             }
         }
     }
+}
+
+/// The last steps of the sum over lanes, pairwise.
+#[inline(always)]
+fn sum_of_half(half: &[f32; 8]) -> f32 {
+    let four: [f32; 4] = std::array::from_fn(|lane| half[lane] + half[lane + 4]);
+    (four[0] + four[2]) + (four[1] + four[3])
 }
 
 /// Indices of the set bits, ascending.
@@ -231,21 +270,21 @@ impl Sums {
 
 /// Processes one row of a tile, whose pixel centres are at `x`, through a block that begins at list index `first`.
 #[inline(always)]
-fn back_row<const FMA: bool>(
+fn back_row<const FMA: bool, const WEIGHS: bool>(
     row: &mut Row,
     y: usize,
     first: u32,
     block: &Block<BLOCK>,
     x: &Lane,
     cap: f32,
-    sums: &mut [Sums; BLOCK],
+    (sums, weights): (&mut [Sums; BLOCK], &mut [[Lane; 2]; BLOCK]),
 ) {
     let mut reach = block.reach[y];
-    let Row { mut t, mut behind, v_rgb: [v_red, v_green, v_blue], stop } = *row;
+    let Row { mut t, mut behind, v_rgb: [v_red, v_green, v_blue], error, stop } = *row;
     while reach != 0 {
         let i = reach.ilog2() as usize % BLOCK;
         reach ^= 1 << i;
-        let (local, acc) = (&block.locals[i], &mut sums[i]);
+        let (local, acc, weighed) = (&block.locals[i], &mut sums[i], &mut weights[i]);
         let at = first + i as u32;
         // Loaded once: a load under the loop's conditions would become a gather.
         let (dy, bdy, cdy, top, color) = (local.dy[y], local.bdy[y], local.cdy[y], local.top, local.color);
@@ -271,33 +310,81 @@ fn back_row<const FMA: bool>(
             acc.rgb[0][lane] = fma::<FMA>(weight, v_red[lane], acc.rgb[0][lane]);
             acc.rgb[1][lane] = fma::<FMA>(weight, v_green[lane], acc.rgb[1][lane]);
             acc.rgb[2][lane] = fma::<FMA>(weight, v_blue[lane], acc.rgb[2][lane]);
+            if WEIGHS {
+                weighed[0][lane] += weight;
+                weighed[1][lane] = fma::<FMA>(weight, error[lane], weighed[1][lane]);
+            }
         }
     }
     (row.t, row.behind) = (t, behind);
 }
 
-/// Writes the sums of every intersection to its emit index in `partials`, which is resized. `chunk_offsets` are the
-/// first emit indices of the chunks of [`ROWS_PER_CHUNK`] rows.
+/// Writes the sums of every intersection to its emit index in `partials`, which is resized, and the weights likewise if
+/// `weighing` asks for them. `chunk_offsets` are the first emit indices of the chunks of [`ROWS_PER_CHUNK`] rows.
 pub fn rasterize_bwd(
     lists: &Lists<'_>,
     chunk_offsets: &[u64],
     raster: &Raster,
     upstream: &Upstream<'_>,
     partials: &mut Vec<Partial>,
+    weighing: Option<Weighing<'_>>,
 ) {
     let cap = log2_max_alpha(lists.max_alpha, lists.simd);
-    room::resize_with(partials, lists.isects.len(), Partial::default);
-    // Zeroes everything in memory order: cheaper than writing single zeros for splats without effect.
+    reset(partials, lists.isects.len());
+    let partials = &partials[..];
+    let tiles = (0..lists.grid.tiles()).into_par_iter().filter(|tile| lists.range.contains(lists.grid, *tile));
+    let Some(Weighing { errors, partials: weights }) = weighing else {
+        return tiles.for_each(|tile| {
+            SCRATCH.with_borrow_mut(|state| {
+                state.load(lists, raster, upstream, &[], tile);
+                let weight_partials = &[];
+                let work = BackTile::<false> { lists, chunk_offsets, tile, cap, state, partials, weight_partials };
+                dispatch(lists.simd, work);
+            });
+        });
+    };
+    reset(weights, lists.isects.len());
+    let weight_partials = &weights[..];
+    tiles.for_each(|tile| {
+        SCRATCH.with_borrow_mut(|state| {
+            state.load(lists, raster, upstream, errors, tile);
+            let work = BackTile::<true> { lists, chunk_offsets, tile, cap, state, partials, weight_partials };
+            dispatch(lists.simd, work);
+        });
+    });
+}
+
+/// Resizes sums to this number of intersections and zeroes everything in memory order: cheaper than writing single zeros
+/// for splats without effect.
+fn reset<const N: usize>(partials: &mut Vec<[AtomicU32; N]>, isects: usize) {
+    room::resize_with(partials, isects, || std::array::from_fn(|_| AtomicU32::new(0)));
     partials.par_chunks_mut(16_384).for_each(|partials| {
         partials.iter_mut().flatten().for_each(|sum| *sum.get_mut() = 0);
     });
-    let partials = &partials[..];
-    let tiles = (0..lists.grid.tiles()).into_par_iter().filter(|tile| lists.range.contains(lists.grid, *tile));
-    tiles.for_each(|tile| {
-        SCRATCH.with_borrow_mut(|state| {
-            state.load(lists, raster, upstream, tile);
-            dispatch(lists.simd, BackTile { lists, chunk_offsets, tile, cap, state, partials });
-        });
+}
+
+/// Folds the weights of each row as [`fold_rows`] folds the nine sums, into `[weight, weight times error]` for each of
+/// `rows` rows; zeros for rows that are not drawn.
+pub fn fold_weights(
+    is_first: bool,
+    (rows, counts): (usize, &[u32]),
+    chunk_offsets: &[u64],
+    partials: &[WeightPartial],
+    out: &mut Vec<[f32; 2]>,
+) {
+    room::resize(out, rows, [0.0; 2]);
+    out.par_chunks_mut(ROWS_PER_CHUNK).enumerate().for_each(|(chunk, out)| {
+        let mut first = chunk_offsets[chunk] as usize;
+        for (out, &count) in out.iter_mut().zip(&counts[chunk * ROWS_PER_CHUNK..]) {
+            let last = first + count as usize;
+            let mut sums = if is_first { [0.0f32; 2] } else { *out };
+            for partial in &partials[first..last] {
+                for (sum, part) in sums.iter_mut().zip(partial) {
+                    *sum += f32::from_bits(part.load(Relaxed));
+                }
+            }
+            (first, *out) = (last, sums);
+        }
     });
 }
 
@@ -386,7 +473,7 @@ mod tests {
         rasterize_fwd(lists, &mut raster);
         let mut partials = Vec::new();
         let upstream = Upstream { v_rgb: &v_rgb, v_alpha: Some(&v_alpha) };
-        rasterize_bwd(lists, chunk_offsets, &raster, &upstream, &mut partials);
+        rasterize_bwd(lists, chunk_offsets, &raster, &upstream, &mut partials, None);
         partials.iter().flatten().map(|x| f32::from_bits(x.load(Relaxed))).collect()
     }
 

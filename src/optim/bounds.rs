@@ -3,9 +3,11 @@
 //! An untouched value moves by its momentum, monotonically, towards a limit ([`super::drift`]): value and limit bound
 //! it for all later steps. An opacity reset may rewrite a row in between, which changes only roundings. A densification
 //! round may split it, at most once, because the round clears the statistics that made it grow; its children then lie
-//! around it. The children are included in the box, rather than in a larger sigma (1.63 times: 3.33 + 3.33 / 1.6 of
-//! 3.33), for two reasons: a row must not be missed if its parent is before the near plane, and the margin is then that
-//! of the row instead of the page's largest.
+//! around it. The children are included in the box, rather than in a larger sigma (1.63 times for random splits: 3.33 +
+//! 3.33 / 1.6 of 3.33), for two reasons: a row must not be missed if its parent is before the near plane, and the margin
+//! is then that of the row instead of the page's largest. Children are never larger than their parent along any axis of
+//! it, so sigma_max needs no factor: means of children lie within [`SplitLimits::reach`] of their parent (3.33 sigma for
+//! random splits, 0.75 for long-axis splits, where no point of a child's 3.33 sigma is farther than 2.98 sigma).
 //!
 //! Invariants: 1. bounds are a function of the stored rows and the run's configuration alone, not of the step at which
 //! they are computed; 2. they hold for every later step, whatever events are pending, in the f32 arithmetic of the
@@ -17,7 +19,6 @@ use super::moments::Moments;
 use crate::base::math::exp32;
 use crate::base::simd::{Kernel, dispatch};
 use crate::scene::columns::Column;
-use crate::scene::events::SPLIT_SIGMAS;
 use crate::scene::page_meta::PageBounds;
 use crate::scene::rows::{Rows, mean_grad2d};
 
@@ -33,9 +34,8 @@ const VALUE_SLACK: f32 = 8.0 * 0.5 * f32::EPSILON;
 const FLUSH_SLACK: f32 = 2.0 * f32::MIN_POSITIVE;
 /// Relative slack of a standard deviation: [`exp32`] is within two ulp, both here and in the test of a row.
 const SIGMA_SLACK: f32 = 1e-6;
-/// Reach of a split, in standard deviations of the parent. The factor allows for the roundings of its rotation and
-/// scales.
-const SPLIT_REACH: f32 = SPLIT_SIGMAS as f32 * (1.0 + 1e-4);
+/// Factor of a split's reach for the roundings of its rotation and scales.
+const REACH_SLACK: f32 = 1.0 + 1e-4;
 
 /// The lowest thresholds for splitting that any round of the run can have.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -44,11 +44,13 @@ pub struct SplitLimits {
     pub grow_grad2d: f32,
     /// Growing rows split only above this largest standard deviation.
     pub split_scale: f32,
+    /// Largest distance of a child's mean from its parent's, in the parent's largest standard deviation.
+    pub reach: f32,
 }
 
 impl SplitLimits {
     /// For a run without rounds.
-    pub const NEVER: SplitLimits = SplitLimits { grow_grad2d: f32::INFINITY, split_scale: f32::INFINITY };
+    pub const NEVER: SplitLimits = SplitLimits { grow_grad2d: f32::INFINITY, split_scale: f32::INFINITY, reach: 0.0 };
 }
 
 impl DeferredAdam {
@@ -229,9 +231,9 @@ fn sigma(log_scale: f32) -> f32 {
 
 /// Largest distance of a row's children from it.
 #[inline(always)]
-fn split_reach(splits: &SplitLimits, grad2d: f32, count: u32, sigma: f32) -> f32 {
-    let splits = (mean_grad2d(grad2d, count) > splits.grow_grad2d) & (sigma > splits.split_scale);
-    if splits { SPLIT_REACH * sigma } else { 0.0 }
+fn split_reach(limits: &SplitLimits, grad2d: f32, count: u32, sigma: f32) -> f32 {
+    let is_split = (mean_grad2d(grad2d, count) > limits.grow_grad2d) & (sigma > limits.split_scale);
+    if is_split { limits.reach * REACH_SLACK * sigma } else { 0.0 }
 }
 
 #[cfg(test)]
@@ -266,7 +268,7 @@ mod tests {
             state.stamp[row] = draws.below(600) as u32;
             (state.grad2d[row], state.count[row]) = (draws.uniform() as f32, draws.below(3) as u32);
         }
-        let splits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01 };
+        let splits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
         let of = |simd: SimdPath, rows: &Rows<'_>| {
             DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), simd).page_bounds(rows, &splits)
         };

@@ -9,18 +9,21 @@ use super::sequence::{Sequence, ViewOptions};
 use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches};
 use crate::base::room;
 use crate::base::simd::SimdPath;
-use crate::kernels::image_loss::ImageLoss;
+use crate::kernels::image_loss::{ImageLoss, ImagePair};
 use crate::kernels::isect_emit::{count, emit, number_isects};
 use crate::kernels::isect_offsets::isect_offsets;
 use crate::kernels::project_bwd::project_bwd;
 use crate::kernels::project_fwd::{Projected, project_fwd};
 use crate::kernels::radix_sort::DepthSort;
-use crate::kernels::rasterize_bwd::{FoldPart, FootprintGradients, Partial, Upstream, fold_rows, rasterize_bwd};
+use crate::kernels::rasterize_bwd::{
+    FoldPart, FootprintGradients, Partial, Upstream, Weighing, WeightPartial, fold_rows, fold_weights, rasterize_bwd,
+};
 use crate::kernels::rasterize_fwd::{Lists, Raster, rasterize_fwd, untile};
 use crate::kernels::scan::scan;
 use crate::kernels::sh_bwd::sh_bwd;
 use crate::kernels::sh_fwd::sh_fwd;
 use crate::kernels::splats::{Grid, Packed, pack};
+use crate::kernels::squared_error::squared_errors;
 use crate::kernels::stages::STAGES;
 use crate::kernels::tile_range::TileRange;
 use crate::scene::camera::Camera;
@@ -86,14 +89,21 @@ pub struct CpuRenderer {
     isects: Vec<AtomicU64>,
     raster: Raster,
     partials: Vec<Partial>,
+    /// Whether the next views collect weights of rows, and whether this view does; the sums by intersection and by row,
+    /// and the error of each pixel.
+    weighs_next: bool,
+    weighs: bool,
+    weight_partials: Vec<WeightPartial>,
+    weights: Vec<[f32; 2]>,
+    errors: Vec<f32>,
     /// The ranges of tiles of the picture, in order.
     ranges: Vec<TileRange>,
     /// Intersections of each row in the range that is taken back now, and their sums by chunk of rows; unused by a picture of one
     /// range.
     range_counts: Vec<u32>,
     range_chunk_counts: Vec<u64>,
-    /// Most intersections that are listed at once; `None`: all of them.
-    isects_most: Option<u64>,
+    /// Most bytes of intersections that are listed at once; `None`: all of them.
+    list_bytes: Option<u64>,
     footprints: FootprintGradients,
     image_loss: ImageLoss,
     loss_value: Option<LossValue>,
@@ -182,11 +192,18 @@ impl CpuRenderer {
                 self.list_range(grid, range, options.simd, isects);
             }
             let mut partials = std::mem::take(&mut self.partials);
+            let mut weight_partials = std::mem::take(&mut self.weight_partials);
             let upstream = Upstream { v_rgb: &self.gradient.v_rgb, v_alpha: self.gradient.v_alpha.as_deref() };
             let lists = self.lists(grid, range, options);
-            rasterize_bwd(&lists, &self.chunk_offsets, &self.raster, &upstream, &mut partials);
-            self.partials = partials;
+            let weighing = Weighing { errors: &self.errors, partials: &mut weight_partials };
+            let weighing = self.weighs.then_some(weighing);
+            rasterize_bwd(&lists, &self.chunk_offsets, &self.raster, &upstream, &mut partials, weighing);
+            (self.partials, self.weight_partials) = (partials, weight_partials);
             let counts = if ranges.len() > 1 { &self.range_counts } else { &self.packed.counts };
+            if self.weighs {
+                let rows = (self.projected.rows(), counts.as_slice());
+                fold_weights(part.is_first, rows, &self.chunk_offsets, &self.weight_partials, &mut self.weights);
+            }
             let counts = [counts, &self.packed.counts].map(Vec::as_slice);
             fold_rows(part, counts, &self.chunk_offsets, &self.partials, &self.projected, &mut self.footprints);
         }
@@ -223,6 +240,7 @@ impl CpuRenderer {
                 + bytes(&self.range_counts)
                 + bytes(&self.range_chunk_counts))
             + (bytes(&self.cursors) + bytes(&self.isects) + bytes(&self.partials))
+            + (bytes(&self.weight_partials) + bytes(&self.weights) + bytes(&self.errors))
             + (bytes(&f.v_means2d) + bytes(&f.v_conics) + bytes(&f.v_colors) + bytes(&f.v_opacities))
     }
 }
@@ -237,12 +255,18 @@ impl Renderer for CpuRenderer {
     }
 
     fn set_list_bytes(&mut self, bytes: Option<u64>) {
-        self.isects_most = bytes.map(|bytes| bytes / LIST_BYTES);
+        self.list_bytes = bytes;
+    }
+
+    fn weigh_rows(&mut self, is_wanted: bool) -> Result<(), RenderError> {
+        self.weighs_next = is_wanted;
+        Ok(())
     }
 
     fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError> {
         self.sequence.begin(camera, options, batches)?;
         (self.clock, self.stats, self.loss_value) = (StageClock::default(), RenderStats::default(), None);
+        self.weighs = self.weighs_next;
         Ok(())
     }
 
@@ -272,7 +296,9 @@ impl Renderer for CpuRenderer {
         });
         let all = TileRange::all(grid);
         clock.time("isect_offsets", || self.count_range(grid, all, simd));
-        let ranges = match self.isects_most.filter(|most| total > *most) {
+        let isect_bytes = LIST_BYTES + if self.weighs { size_of::<WeightPartial>() as u64 } else { 0 };
+        let isects_most = self.list_bytes.map(|bytes| bytes / isect_bytes);
+        let ranges = match isects_most.filter(|most| total > *most) {
             Some(most) => {
                 let of_tile = |x: u32, y: u32| {
                     let tile = y as usize * grid.tiles_x as usize + x as usize;
@@ -318,6 +344,9 @@ impl Renderer for CpuRenderer {
         clock.reset(&["image_loss"]);
         let value = clock.time("image_loss", || image_loss.value_and_gradient(image, target, options, v_rgb));
         self.loss_value = Some(value);
+        if self.weighs {
+            squared_errors(&ImagePair::new(&self.image, target), &mut self.errors);
+        }
         Ok(())
     }
 
@@ -325,6 +354,9 @@ impl Renderer for CpuRenderer {
         let (view, had_gradient) = self.sequence.picture_gradient()?;
         if !had_gradient {
             self.gradient.reset(view.camera.pixels());
+            // No photo was compared.
+            self.errors.clear();
+            self.errors.resize(if self.weighs { view.camera.pixels() } else { 0 }, 0.0);
         }
         Ok(&mut self.gradient)
     }
@@ -345,7 +377,7 @@ impl Renderer for CpuRenderer {
         let Self { clock, projected, colors, footprints: v, .. } = self;
         let (radii, colors) = (&projected.radii[place.clone()], &colors[place.clone()]);
         let (v_means2d, v_conics) = (&v.v_means2d[place.clone()], &v.v_conics[place.clone()]);
-        let (v_colors, v_opacities) = (&v.v_colors[place.clone()], &v.v_opacities[place]);
+        let (v_colors, v_opacities) = (&v.v_colors[place.clone()], &v.v_opacities[place.clone()]);
         let columns = &mut grads.columns;
         clock.time("sh_bwd", || sh_bwd(rows, &camera, sh_degree, radii, colors, v_colors, simd, columns));
         clock.time("project_bwd", || {
@@ -355,6 +387,10 @@ impl Renderer for CpuRenderer {
         grads.means2d.extend_from_slice(v_means2d);
         grads.radii.clear();
         grads.radii.extend_from_slice(radii);
+        grads.weights.clear();
+        if self.weighs {
+            grads.weights.extend_from_slice(&self.weights[place]);
+        }
         Ok(())
     }
 
@@ -442,6 +478,7 @@ mod tests {
         let options = RenderOptions { sh_degree: 2, background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
         let firsts = std::iter::once(&0).chain(ends);
         let batches: Vec<Columns> = firsts.zip(ends).map(|(&first, &end)| part(rows, first..end)).collect();
+        renderer.weigh_rows(true).unwrap();
         let how = if batches.len() == 1 { RowBatches::One } else { RowBatches::Several };
         renderer.begin_view(camera, &options, how).unwrap();
         batches.iter().for_each(|batch| renderer.rows_in(batch).unwrap());
@@ -451,11 +488,12 @@ mod tests {
         let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
         renderer.loss(&target, &loss).unwrap();
         renderer.picture_back().unwrap();
-        let mut all = vec![Vec::new(); 8];
+        let mut all = vec![Vec::new(); 9];
         for (i, batch) in batches.iter().enumerate().rev() {
             let mut grads = Gradients::default();
             renderer.rows_out(i, batch, &mut grads).unwrap();
             let mut of_batch = vec![bits(grads.means2d.as_flattened()), grads.radii.as_flattened().to_vec()];
+            of_batch.push(bits(grads.weights.as_flattened()));
             of_batch.extend(Column::ALL.map(|c| bits(grads.columns.column(c))));
             for (all, mut of_batch) in all.iter_mut().zip(of_batch) {
                 of_batch.append(all);

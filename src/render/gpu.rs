@@ -268,7 +268,7 @@ impl GpuRenderer {
             gpu.submit(recorder)?;
             match recorded {
                 Ok((pixels, (frame, demand))) => {
-                    let lists = WholeLists { ranks, frame, demand: DemandState::Pending(demand) };
+                    let lists = WholeLists { ranks, frame, demand: DemandState::Pending(Box::new(demand)) };
                     return Ok(View::new(of, segments, Some(columns), pixels, Lists::Whole(Box::new(lists))));
                 }
                 // Smaller views may need less than the largest so far.
@@ -328,7 +328,8 @@ impl GpuRenderer {
         let splats = segment.splats.view();
         let (frame, demand) = self.tiles.frame(&self.gpu, &mut recorder, &splats, &ranks, blend, &view.pixels)?;
         self.gpu.submit(recorder)?;
-        view.lists = Lists::Whole(Box::new(WholeLists { ranks, frame, demand: DemandState::Pending(demand) }));
+        view.lists =
+            Lists::Whole(Box::new(WholeLists { ranks, frame, demand: DemandState::Pending(Box::new(demand)) }));
         Ok(())
     }
 

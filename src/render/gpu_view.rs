@@ -34,7 +34,7 @@ pub(super) struct WholeRows {
 #[derive(Debug)]
 pub(super) enum DemandState {
     /// The readback is pending.
-    Pending(DemandReadback),
+    Pending(Box<DemandReadback>),
     /// The host has read the demand.
     Known(Demand),
 }

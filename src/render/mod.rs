@@ -61,6 +61,10 @@ pub struct Gradients {
     pub means2d: Vec<[f32; 2]>,
     /// Half extents of the footprint, pixels; [0, 0] for a row that was not drawn.
     pub radii: Vec<[u32; 2]>,
+    /// If [`Renderer::weigh_rows`] asked for it: the blending weight alpha T of each row, and the weight times the
+    /// squared error of the picture (mean over channels), summed over the pixels; zeros for rows that were not drawn.
+    /// Empty otherwise.
+    pub weights: Vec<[f32; 2]>,
 }
 
 /// Gradient of a loss with respect to a picture, in host memory: the input of the backward pass.
@@ -148,6 +152,12 @@ pub enum RenderError {
         /// Pixels of the picture.
         pixels: usize,
     },
+    /// Weights of rows were asked of a backend that does not collect them.
+    #[error("the {backend} backend does not collect the blending weights of Gaussians")]
+    NoWeights {
+        /// Name of the backend.
+        backend: &'static str,
+    },
     /// The device failed, or the view exceeds a limit of the device. The error names the stage or buffer.
     #[error(transparent)]
     Device(#[from] GpuError),
@@ -167,6 +177,7 @@ impl RenderError {
                 Some("update the graphics driver if this happens again, or render with --device cpu")
             }
             RenderError::Device(_) => Some("render with --device cpu, and report a bug"),
+            RenderError::NoWeights { .. } => Some("render with --device cpu"),
             _ => Some(
                 "make the photos smaller with --max-resolution or --data-factor; if they are not large, report a bug",
             ),
@@ -216,6 +227,16 @@ pub trait Renderer: Send {
     /// A picture whose lists need more is blended in ranges of tiles, at least one tile at a time. The limit changes no bit of
     /// the result.
     fn set_list_bytes(&mut self, bytes: Option<u64>);
+
+    /// Whether the backward passes of the next views also collect [`Gradients::weights`]. The error that they weigh is
+    /// that of the picture which [`Renderer::loss`] compared, zero where the photo is masked. Changes no bit of picture,
+    /// loss and gradients.
+    ///
+    /// # Errors
+    /// The backend does not collect weights.
+    fn weigh_rows(&mut self, is_wanted: bool) -> Result<(), RenderError> {
+        if is_wanted { Err(RenderError::NoWeights { backend: self.name() }) } else { Ok(()) }
+    }
 
     /// Begins a view. Drops the previous view.
     ///

@@ -13,6 +13,10 @@ use serde::{Deserialize, Serialize};
 /// pages rely on it. 1.1 % of draws are repeated.
 pub const SPLIT_SIGMAS: f64 = 3.33;
 
+/// Distance of the children of a long-axis split from their parent, in its largest standard deviation: bounds of pages
+/// rely on it.
+pub const LONG_AXIS_OFFSET: f64 = 0.75;
+
 /// Thresholds of a densification round. All are absolute, so that a late application decides the same.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RoundThresholds {
@@ -24,6 +28,20 @@ pub struct RoundThresholds {
     pub prune_opacity: f32,
     /// Rows with a greater largest standard deviation are pruned. Infinity: none.
     pub prune_scale: f32,
+}
+
+/// Thresholds of a round that splits rows along their longest axis and removes rows of little weight. Bins are those of
+/// the histograms in [`crate::densify::stats`]: nobody computes a quotient twice.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct LongAxisRound {
+    /// Rows split whose mean growth score lies in this bin or above; at least 1.
+    pub split_from_bin: u32,
+    /// Rows are removed whose mean blending weight lies below this bin; 0: none.
+    pub remove_below_bin: u32,
+    /// Only rows that at least this many views drew since the last round are removed by their weight.
+    pub remove_views: u32,
+    /// Rows with a smaller opacity are removed.
+    pub prune_opacity: f32,
 }
 
 /// A kind of global change.
@@ -41,6 +59,8 @@ pub enum EventKind {
     },
     /// A densification round.
     Densify(RoundThresholds),
+    /// A round of long-axis splits and removals.
+    LongAxis(LongAxisRound),
 }
 
 /// A global change and its step.

@@ -14,4 +14,5 @@ pub mod partition;
 pub mod point_box;
 pub mod rows;
 pub mod select;
+pub mod sightings;
 pub mod state;

@@ -5,6 +5,7 @@
 //! [`RowBlock`] holds one whole row in a fixed order of lanes, whatever the degree; unused lanes are zero.
 
 use super::columns::{Column, ColumnSet, Columns};
+use super::sightings::views;
 
 /// Floats of a [`RowBlock`]: 16 for the narrow columns, those of fixed width (14 used), 48 for `sh_n` (45 used at
 /// degree 3).
@@ -161,9 +162,9 @@ pub struct Rows<'a> {
     pub stamp: &'a [u32],
     /// Identities.
     pub uid: &'a [u64],
-    /// Sums of gradient norms since the last round.
+    /// Sums of growth scores since the last round; for the default strategy, of gradient norms.
     pub grad2d: &'a [f32],
-    /// Views that drew the row since the last round.
+    /// Views that drew the row since the last round, and its blending weight in them ([`super::sightings`]).
     pub count: &'a [u32],
 }
 
@@ -182,9 +183,9 @@ pub struct RowsMut<'a> {
     pub stamp: &'a mut [u32],
     /// Identities.
     pub uid: &'a mut [u64],
-    /// Sums of gradient norms since the last round.
+    /// Sums of growth scores since the last round; for the default strategy, of gradient norms.
     pub grad2d: &'a mut [f32],
-    /// Views that drew the row since the last round.
+    /// Views that drew the row since the last round, and its blending weight in them ([`super::sightings`]).
     pub count: &'a mut [u32],
 }
 
@@ -243,10 +244,10 @@ impl RowsMut<'_> {
     }
 }
 
-/// Mean gradient norm per view that drew the row; 0 without views.
+/// Mean growth score (gradient norm) per view that drew the row; 0 without views.
 #[inline(always)]
 pub fn mean_grad2d(grad2d: f32, count: u32) -> f32 {
-    grad2d / count.max(1) as f32
+    grad2d / views(count).max(1) as f32
 }
 
 /// Current values of rows at one step of training. The optimizer implements it; events act on rows through it, because

@@ -31,7 +31,7 @@ use super::training_loop::LoopOutputs;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity};
-use crate::config::choice::{Chosen, LogFormat};
+use crate::config::choice::{Choice, Chosen, LogFormat};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::config::residence::Residence;
@@ -158,7 +158,12 @@ pub(super) fn begin(
     let options =
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
     let before = host_bytes_now().unwrap_or(0);
-    let (renderer, word) = machine::renderer(config)?;
+    let (mut renderer, word) = machine::renderer(config)?;
+    // On from here, so that probing allocates what the steps need.
+    renderer.weigh_rows(options.strategy.needs_weights()).map_err(|error| {
+        let problem = format!("strategy {} needs statistics that are missing: {error}", config.strategy.word());
+        InputError::new("--strategy", problem, "use --device cpu, or --growth-score gradient with --recycle 0")
+    })?;
     let driver = host_bytes_now().unwrap_or(0).saturating_sub(before);
     if let Some(word) = word.filter(|_| !quiet) {
         eprintln!("{word}");

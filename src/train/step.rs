@@ -60,6 +60,7 @@ pub fn train_step(
     collects: bool,
     pages_most: usize,
 ) -> Result<StepOutcome, TrainError> {
+    renderer.weigh_rows(collects && scene.rules.strategy.needs_weights())?;
     let pages = scene.pager.begin_view(step, camera)?;
     let (batches, pinned, outcome) = (Vec::new(), Vec::new(), StepOutcome::default());
     let mut passes = Passes { scene, working, renderer, step, camera, batches, pinned, outcome };

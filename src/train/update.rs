@@ -56,13 +56,14 @@ pub(super) fn update_pages(
         })
         .collect();
     if collects {
-        let Gradients { means2d, radii, .. } = input.gradients;
+        let Gradients { means2d, radii, weights, .. } = input.gradients;
         let strategy = &scene.rules.strategy;
         for share in &mut shares {
             let drawn = DrawnRows {
                 rows: share.rows,
                 v_means2d: &means2d[share.listed.clone()],
                 radii: &radii[share.listed.clone()],
+                weights: weights.get(share.listed.clone()).unwrap_or_default(),
                 image_size: input.size,
             };
             let mut view = share.page.rows_mut(share.first_row);

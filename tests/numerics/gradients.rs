@@ -32,7 +32,7 @@ const COLUMN_L2: f64 = 2e-5;
 /// tiny gradients, and the rounding of the differences leaves 3e-4 of these.
 const ROW_MAX: f64 = 1e-3;
 
-fn camera() -> Camera {
+pub(super) fn camera() -> Camera {
     // A product of two rotations by 3-4-5 angles: orthonormal up to the rounding of its entries.
     Camera {
         viewmat: [[0.8, 0.0, -0.6, 0.25], [0.36, 0.8, 0.48, -0.125], [0.48, -0.6, 0.64, 4.0]],
@@ -48,7 +48,7 @@ fn camera() -> Camera {
 }
 
 /// Parameters of a random scene.
-struct Recipe {
+pub(super) struct Recipe {
     rows: usize,
     stored_degree: u8,
     sh_degree: u8,
@@ -58,15 +58,15 @@ struct Recipe {
 }
 
 /// Faint, small, all bands.
-const FAINT: Recipe =
+pub(super) const FAINT: Recipe =
     Recipe { rows: 14, stored_degree: 3, sh_degree: 3, log_scales: [-2.0, -0.4], logits: [-1.5, 1.5], max_alpha: 0.99 };
 /// Alphas at their clamp, pixels that end early, bands stored but not in use. The clamp is such that no power of
 /// 1 - clamp is near the end of a pixel, 1e-4.
-const OPAQUE: Recipe =
+pub(super) const OPAQUE: Recipe =
     Recipe { rows: 20, stored_degree: 2, sh_degree: 1, log_scales: [-1.2, -0.2], logits: [1.0, 5.0], max_alpha: 0.92 };
 
 impl Recipe {
-    fn options(&self) -> RenderOptions {
+    pub(super) fn options(&self) -> RenderOptions {
         RenderOptions {
             sh_degree: self.sh_degree,
             max_alpha: self.max_alpha,
@@ -102,7 +102,7 @@ impl Recipe {
     }
 
     /// The scene of the first seed that is far from every discontinuity.
-    fn scene(&self) -> (Columns, Render64) {
+    pub(super) fn scene(&self) -> (Columns, Render64) {
         let candidates = (0..200).map(|seed| {
             let rows = self.draw(seed);
             let picture = render(&Rows64::new(&rows), &camera(), &self.settings());

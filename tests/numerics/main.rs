@@ -16,3 +16,4 @@ mod oracle;
 mod parity;
 mod shaders;
 mod visibility;
+mod weights;

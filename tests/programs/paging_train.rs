@@ -184,6 +184,36 @@ fn a_cap_on_the_gaussians_holds_at_every_step_and_pages_to_the_same_bits() {
     assert!(end <= cap && end + 40 > cap, "{end} of {cap}");
 }
 
+/// The rounds of the strategy that splits along the longest axis, with recycling at the cap: for any memory and number
+/// of threads the same bits, and the cap holds at every step.
+#[test]
+fn long_axis_rounds_page_to_the_same_bits_and_keep_the_cap() {
+    let folder = TempDir::new().unwrap();
+    let scene = scenes::wide_city(folder.path(), 8_000);
+    // A round after every eighth step: most pages are unseen in between, and some rows are weighed often enough.
+    let rounds = ["--refine-start", "20", "--refine-every", "8", "--strategy", "long-axis", "--recycle", "0.2"];
+    let capped =
+        ["--page-rows", "32", "--steps", "120", "--max-gaussians", "8800", "--log-every", "1", "--device", "cpu"];
+    let base = [COMMON, &rounds, &capped].concat();
+    let (want, whole) = run(folder.path(), &scene, &base, &How { frames: 0, io: "", threads: "2", more: &[] });
+    let most = number(&whole, "pages_pinned_max");
+    assert!(most < number(&whole, "pages") / 2, "a view sees too much");
+    for (frames, io, threads) in [(most, "auto", "1"), (most / 3, "", "2")] {
+        let (got, summary) = run(folder.path(), &scene, &base, &How { frames, io, threads, more: &[] });
+        assert!(got == want, "{frames} frames");
+        assert_eq!(number(&summary, "gaussians"), number(&whole, "gaussians"));
+        assert!(number(&summary, "pages_read") > 0, "{summary}");
+        let metrics = std::fs::read_to_string(folder.path().join("out/metrics.jsonl")).unwrap();
+        let rows: Vec<u64> = metrics.lines().map(|l| number(&serde_json::from_str(l).unwrap(), "gaussians")).collect();
+        assert!(rows.iter().all(|&rows| rows <= 8_800), "{rows:?}");
+        assert!(rows.windows(2).any(|pair| pair[1] < pair[0]), "nothing was recycled: {rows:?}");
+        assert!(rows.iter().max() > Some(&8_600), "the cap is not reached: {rows:?}");
+    }
+    let gradient = How { frames: 0, io: "", threads: "1", more: &["--growth-score", "gradient"] };
+    let (without, _) = run(folder.path(), &scene, &base, &gradient);
+    assert!(without != want, "the score changes nothing");
+}
+
 /// 16-bit moments change training, but paging changes nothing further.
 #[test]
 fn moments_in_16_bits_page_to_the_same_bits() {

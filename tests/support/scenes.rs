@@ -134,9 +134,15 @@ impl TextModel {
     }
 }
 
-/// Runs `gsscale-train` with these arguments.
+/// Keeps lengths and rates as the flags of a test and the defaults say, whatever its number of steps.
+pub const CLASSIC: [&str; 2] = ["--schedule", "classic"];
+
+/// Runs `gsscale-train` with these arguments, and with [`CLASSIC`] unless they name a schedule or resume a run, which
+/// keeps its own.
 pub fn train(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_gsscale-train")).args(args).output().unwrap()
+    let is_set = args.contains(&CLASSIC[0]) || args.contains(&"--resume");
+    let schedule: &[&str] = if is_set { &[] } else { &CLASSIC };
+    Command::new(env!("CARGO_BIN_EXE_gsscale-train")).args(args).args(schedule).output().unwrap()
 }
 
 /// Runs `gsscale-eval` with these arguments.

@@ -12,7 +12,7 @@ use gsscale::scene::columns::{Column, Columns};
 /// A view whose Gaussians cross many tile columns.
 fn wide_scene(rows: usize) -> (Columns, Camera) {
     let (mut columns, camera) = scene(rows, 208, 144);
-    columns.scales.iter_mut().for_each(|s| *s = 0.3 * *s);
+    columns.scales.iter_mut().for_each(|s| *s *= 0.3);
     columns.opacities.iter_mut().for_each(|o| *o -= 3.0);
     (columns, camera)
 }

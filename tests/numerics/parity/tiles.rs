@@ -218,7 +218,7 @@ fn on_cpu(scene: &Scene, v_rgb: &[f32], v_alpha: Option<&[f32]>) -> Outcome {
     };
     let (mut raster, mut partials) = (Raster::default(), Vec::new());
     rasterize_fwd(&lists, &mut raster);
-    rasterize_bwd(&lists, &chunk_offsets, &raster, &Upstream { v_rgb, v_alpha }, &mut partials);
+    rasterize_bwd(&lists, &chunk_offsets, &raster, &Upstream { v_rgb, v_alpha }, &mut partials, None);
     let mut out = FootprintGradients::default();
     fold_rows(FoldPart::WHOLE, [&packed.counts; 2], &chunk_offsets, &partials, p, &mut out);
     let pixels = (grid.width * grid.height) as usize;

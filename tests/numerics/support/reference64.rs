@@ -49,6 +49,8 @@ impl Rows64 {
 /// One row on the screen.
 #[derive(Debug, Clone, Copy)]
 pub struct Splat64 {
+    /// Number of the row.
+    pub row: usize,
     pub mean2d: [f64; 2],
     /// xx, yy of the covariance with its blur, px^2.
     pub variances: [f64; 2],
@@ -68,6 +70,8 @@ pub struct Render64 {
     pub rgb: Vec<[f64; 3]>,
     /// 1 - transmittance.
     pub alpha: Vec<f64>,
+    /// Row, pixel and blending weight of every contribution.
+    pub weights: Vec<(usize, usize, f64)>,
     /// Smallest relative distance of an alpha from 1/255 or from the clamp, of a transmittance from its end, of two
     /// depths from each other, and the rows' margins.
     pub margin: f64,
@@ -183,6 +187,7 @@ pub fn project(rows: &Rows64, camera: &Camera, settings: &Settings, row: usize) 
     let centre = std::array::from_fn(|i| -(0..3).map(|j| m[j][i] * m[j][3]).sum::<f64>());
     let (color, color_margin) = color(rows, row, centre, settings.sh_degree);
     Some(Splat64 {
+        row,
         mean2d: std::array::from_fn(|i| focal[i] * p[i] / p[2] + principal[i]),
         variances: [xx, yy],
         conic: [yy / det, -xy / det, xx / det],
@@ -200,7 +205,8 @@ pub fn render(rows: &Rows64, camera: &Camera, settings: &Settings) -> Render64 {
     splats.sort_by(|a, b| a.depth.total_cmp(&b.depth));
     let gaps = splats.windows(2).map(|w| w[1].depth / w[0].depth - 1.0);
     let margin = splats.iter().map(|s| s.margin).chain(gaps).fold(f64::INFINITY, f64::min);
-    let mut out = Render64 { rgb: Vec::new(), alpha: Vec::new(), margin, blended: 0, clamped: 0, ended: 0 };
+    let (rgb, alpha, weights) = (Vec::new(), Vec::new(), Vec::new());
+    let mut out = Render64 { rgb, alpha, weights, margin, blended: 0, clamped: 0, ended: 0 };
     for y in 0..camera.height {
         for x in 0..camera.width {
             blend_pixel(&splats, settings, [f64::from(x) + 0.5, f64::from(y) + 0.5], &mut out);
@@ -230,6 +236,7 @@ fn blend_pixel(splats: &[Splat64], settings: &Settings, pixel: [f64; 2], out: &m
         for c in 0..3 {
             rgb[c] += s.color[c] * alpha * transmittance;
         }
+        out.weights.push((s.row, out.rgb.len(), alpha * transmittance));
         transmittance = next;
         out.blended += 1;
         out.clamped += usize::from(raw > settings.max_alpha);

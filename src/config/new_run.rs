@@ -1,0 +1,87 @@
+//! The config of a new run: flags over the config file over the defaults, and what neither gives by the run's length.
+//!
+//! Invariants: 1. a given key is never changed; 2. the result is written to the config of the run as if every key had
+//! been given, so a resumed run keeps its values whatever its new length.
+
+use super::file::{TrainConfig, TrainOverrides};
+use super::schedule::{Lengths, Schedule};
+use crate::base::error::InputResult;
+use std::collections::BTreeSet;
+use std::path::Path;
+
+impl TrainConfig {
+    /// The config of a new run, not checked yet.
+    ///
+    /// # Errors
+    /// The file cannot be read.
+    pub fn of_new_run(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<TrainConfig> {
+        let (mut config, mut given) = match file {
+            Some(path) => TrainConfig::read_with_keys(path)?,
+            None => (TrainConfig::default(), BTreeSet::new()),
+        };
+        given.extend(keys.given().into_iter().map(str::to_string));
+        keys.clone().apply(&mut config);
+        config.follow_length(&given);
+        Ok(config)
+    }
+
+    /// Sets the keys of the schedule that are not in `given` (names of fields) by `--schedule` and `--steps`.
+    fn follow_length(&mut self, given: &BTreeSet<String>) {
+        let lengths = match self.schedule {
+            Schedule::RunLength => Lengths::of_steps(self.steps),
+            Schedule::Classic => Lengths::CLASSIC,
+        };
+        let is_open = |field: &str| !given.contains(field);
+        if is_open("sh_every") {
+            self.sh_every = lengths.sh_every;
+        }
+        if is_open("refine_start") {
+            self.refine_start = lengths.refine_start;
+        }
+        if is_open("refine_every") {
+            self.refine_every = lengths.refine_every;
+        }
+        if is_open("refine_stop") {
+            self.refine_stop = lengths.refine_stop;
+        }
+        if is_open("means_lr") {
+            self.means_lr = lengths.means_lr;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn of_flags(keys: &TrainOverrides) -> TrainConfig {
+        TrainConfig::of_new_run(None, keys).unwrap_or_default()
+    }
+
+    #[test]
+    fn the_classic_values_are_the_defaults() {
+        let classic = TrainOverrides { schedule: Some(Schedule::Classic), ..TrainOverrides::default() };
+        let want = TrainConfig { schedule: Schedule::Classic, ..TrainConfig::default() };
+        assert_eq!(of_flags(&classic), want);
+        let short = TrainOverrides { steps: Some(3000), ..classic };
+        assert_eq!(of_flags(&short), TrainConfig { steps: 3000, ..want });
+        assert_eq!(of_flags(&TrainOverrides::default()), TrainConfig::default(), "30,000 steps are the default");
+    }
+
+    #[test]
+    fn flags_are_left_alone() {
+        let keys = TrainOverrides { steps: Some(3000), sh_every: Some(1000), ..TrainOverrides::default() };
+        let config = of_flags(&keys);
+        assert_eq!((config.sh_every, config.refine_stop, config.reset_every), (1000, 2400, 3000));
+        let shortest = TrainOverrides { steps: Some(1), ..TrainOverrides::default() };
+        assert!(of_flags(&shortest).check().is_ok());
+    }
+
+    #[test]
+    fn keys_of_a_file_are_given() {
+        let parsed = TrainConfig::parse_with_keys("steps = 3000\nmeans-lr = 1.6e-4\n[resolved]\nrefine-stop = 1\n");
+        let (mut config, given) = parsed.unwrap_or_default();
+        config.follow_length(&given);
+        assert_eq!((config.means_lr, config.sh_every, config.refine_stop), (1.6e-4, 300, 2400));
+    }
+}

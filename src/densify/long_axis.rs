@@ -1,0 +1,275 @@
+//! The strategy `long-axis`: rows with the highest growth scores are split along their longest axis as far as the cap
+//! allows, and once the cap is reached, rows of little weight are removed so that better rows can take their places.
+//!
+//! A round comes every `refine_every` steps. Its growth takes whole bins of the score histogram from the top, as many as
+//! fit under the cap. Its recycling takes whole bins of the histogram of mean blending weights from the bottom, at most
+//! a share of the rows that enough views weighed since the last round: where views come in spatial groups, every region
+//! then loses its share when the views come to it. The places that removed rows leave are given away by later rounds,
+//! when the removals have been applied, so the cap holds at every step. There are no opacity resets.
+//!
+//! Growth scores, per row and view: the norm of the gradient of the projected mean (NDC units), the squared error of
+//! the picture under the row (sum over pixels of blending weight times squared error, mean over channels), or the
+//! geometric mean of both.
+//!
+//! Invariants: 1. a round never leaves more than `max_gaussians` rows; 2. a decision is a function of the step and of
+//! statistics; 3. nothing is drawn at random.
+
+use super::stats::{GradHistogram, WEIGHED_VIEWS, accumulate_scores, grad_norm, rows_from_bin, score_bin, weight_bin};
+use super::strategy::{DrawnRows, Extremes, Fate, Round, RowFacts, Strategy};
+use crate::base::math::sigmoid;
+use crate::optim::bounds::SplitLimits;
+use crate::scene::events::{EventKind, LONG_AXIS_OFFSET, LongAxisRound};
+use crate::scene::rows::{Rows, RowsMut};
+use crate::scene::sightings::views;
+
+/// Rows are recycled once this share of the cap is reached.
+const FULL_FROM: f64 = 0.9;
+
+/// The value of `--growth-score`: which rows grow first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum GrowthScore {
+    /// Gradient of the projected mean.
+    Gradient,
+    /// Squared error under the row.
+    Error,
+    /// Geometric mean of both, view by view.
+    Mixed,
+}
+
+/// The strategy with its keys.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LongAxisStrategy {
+    /// Which rows grow first.
+    pub score: GrowthScore,
+    /// Share of the weighed rows that a round removes at the cap; 0: none.
+    pub recycle: f64,
+    /// A row is removed if its opacity is below this value.
+    pub prune_opa: f32,
+    /// Rounds happen only after this step.
+    pub refine_start: u32,
+    /// Rounds and statistics end before this step.
+    pub refine_stop: u32,
+    /// Steps between rounds.
+    pub refine_every: u32,
+    /// Most rows of the scene.
+    pub max_gaussians: u64,
+}
+
+impl LongAxisStrategy {
+    /// Whether a round follows this step.
+    pub fn is_round(&self, step: u32) -> bool {
+        step > self.refine_start && step < self.refine_stop && step.is_multiple_of(self.refine_every)
+    }
+
+    /// The round after this step; `rows` is an upper bound of the rows before it. The last round removes nothing by
+    /// weight, since no round would give the places away.
+    pub fn round(&self, step: u32, rows: u64, histogram: &GradHistogram) -> LongAxisRound {
+        let is_full = rows as f64 >= FULL_FROM * self.max_gaussians as f64;
+        let is_last = step.saturating_add(self.refine_every) >= self.refine_stop;
+        let removed = if is_full && !is_last { (self.recycle * histogram.weighed_rows() as f64) as u64 } else { 0 };
+        LongAxisRound {
+            split_from_bin: histogram.split_bin(self.max_gaussians.saturating_sub(rows)),
+            remove_below_bin: if removed > 0 { histogram.remove_bin(removed) } else { 0 },
+            remove_views: WEIGHED_VIEWS,
+            prune_opacity: self.prune_opa,
+        }
+    }
+
+    /// Score and weight of a listed row in a view whose size is twice `half`, pixels.
+    fn of_row(&self, drawn: &DrawnRows<'_>, half: [f32; 2], listed: usize) -> (f32, Option<f32>) {
+        let gradient = || grad_norm(drawn.v_means2d[listed], half);
+        let [weight, error] = drawn.weights.get(listed).copied().unwrap_or_default();
+        let score = match self.score {
+            GrowthScore::Gradient => gradient(),
+            GrowthScore::Error => error,
+            GrowthScore::Mixed => (gradient() * error).sqrt(),
+        };
+        (score, (self.recycle > 0.0).then_some(weight))
+    }
+}
+
+impl Strategy for LongAxisStrategy {
+    fn grows(&self) -> bool {
+        true
+    }
+
+    fn collects(&self, step: u32) -> bool {
+        step < self.refine_stop
+    }
+
+    fn needs_weights(&self) -> bool {
+        self.score != GrowthScore::Gradient || self.recycle > 0.0
+    }
+
+    fn collect(&self, view: &mut RowsMut<'_>, drawn: &DrawnRows<'_>, histogram: &mut GradHistogram) -> usize {
+        let half = drawn.image_size.map(|n| n as f32 * 0.5);
+        accumulate_scores(view, drawn.rows, drawn.radii, histogram, |listed| self.of_row(drawn, half, listed))
+    }
+
+    fn events_after(&self, step: u32, _: f32, rows: u64, histogram: &GradHistogram) -> Vec<EventKind> {
+        if self.is_round(step) { vec![EventKind::LongAxis(self.round(step, rows, histogram))] } else { Vec::new() }
+    }
+
+    /// A row grows only from bin 1 on, so only with a score above 0.
+    fn split_limits(&self, _: f32) -> SplitLimits {
+        SplitLimits { grow_grad2d: 0.0, split_scale: 0.0, reach: LONG_AXIS_OFFSET as f32 }
+    }
+}
+
+impl LongAxisRound {
+    fn removes_by_weight(&self, count: u32) -> bool {
+        views(count) >= self.remove_views && weight_bin(count).is_some_and(|bin| bin < self.remove_below_bin)
+    }
+
+    fn splits(&self, grad2d: f32, count: u32) -> bool {
+        count > 0 && score_bin(grad2d, count) >= self.split_from_bin
+    }
+}
+
+impl Round for LongAxisRound {
+    /// Removal first: a row whose place is taken does not grow.
+    fn fate(&self, row: &RowFacts) -> Fate {
+        if sigmoid(row.opacity) < self.prune_opacity || self.removes_by_weight(row.count) {
+            Fate::Prune
+        } else if self.splits(row.grad2d, row.count) {
+            Fate::SplitLongAxis
+        } else {
+            Fate::Keep
+        }
+    }
+
+    fn may_edit(&self, rows: &Rows<'_>) -> bool {
+        let mut statistics = rows.grad2d.iter().zip(rows.count);
+        statistics.any(|(&grad2d, &count)| self.splits(grad2d, count) || self.removes_by_weight(count))
+    }
+
+    /// The slack of 1e-5 covers the rounding of the sigmoid, some 4e-7.
+    fn keeps_all(&self, extremes: &Extremes) -> bool {
+        sigmoid(extremes.lowest_opacity) >= self.prune_opacity * (1.0 + 1e-5)
+    }
+
+    fn promised(&self, _: u64, histogram: &GradHistogram) -> u64 {
+        histogram.rows_from_bin(self.split_from_bin)
+    }
+
+    fn promised_rows(&self, rows: &Rows<'_>) -> u64 {
+        rows_from_bin(rows, self.split_from_bin)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::base::math::logit;
+    use crate::base::rng::{Purpose, Stream};
+    use crate::scene::columns::Columns;
+    use crate::scene::state::SceneState;
+
+    fn strategy(score: GrowthScore, max_gaussians: u64) -> LongAxisStrategy {
+        LongAxisStrategy {
+            score,
+            recycle: 0.02,
+            prune_opa: 0.005,
+            refine_start: 500,
+            refine_stop: 2400,
+            refine_every: 100,
+            max_gaussians,
+        }
+    }
+
+    /// A table of `rows` rows, `views` views of which drew with random gradients, weights and errors.
+    fn drawn(strategy: &LongAxisStrategy, rows: usize, views: u64) -> (SceneState, GradHistogram) {
+        let mut state = SceneState::from_columns(Columns::zeros(rows, 0));
+        let mut histogram = GradHistogram::default();
+        let numbers: Vec<u32> = (0..rows as u32).collect();
+        for view in 0..views {
+            let mut draws = Stream::new(5, Purpose::Test, view, 0);
+            let v_means2d: Vec<[f32; 2]> = numbers.iter().map(|_| [draws.normal() as f32, 0.5]).collect();
+            let weights: Vec<[f32; 2]> =
+                numbers.iter().map(|&row| [row as f32 + draws.uniform() as f32, draws.uniform() as f32]).collect();
+            let radii = vec![[1, 1]; rows];
+            let drawn = DrawnRows {
+                rows: &numbers,
+                v_means2d: &v_means2d,
+                radii: &radii,
+                weights: &weights,
+                image_size: [20, 10],
+            };
+            strategy.collect(&mut state.view_mut(), &drawn, &mut histogram);
+        }
+        (state, histogram)
+    }
+
+    fn facts(state: &SceneState, row: usize) -> RowFacts {
+        RowFacts { grad2d: state.grad2d[row], count: state.count[row], log_scale: 0.0, opacity: logit(0.5) }
+    }
+
+    #[test]
+    fn scores_are_gradients_errors_or_their_geometric_mean() {
+        let [gradient, error, mixed] = [GrowthScore::Gradient, GrowthScore::Error, GrowthScore::Mixed]
+            .map(|score| drawn(&strategy(score, 100), 50, 1).0.grad2d);
+        for row in 0..50 {
+            assert!(gradient[row] > 0.0 && error[row] > 0.0);
+            assert_eq!(mixed[row], (gradient[row] * error[row]).sqrt());
+        }
+        assert!(!LongAxisStrategy { recycle: 0.0, ..strategy(GrowthScore::Gradient, 9) }.needs_weights());
+        assert!(strategy(GrowthScore::Gradient, 9).needs_weights());
+    }
+
+    #[test]
+    fn growth_takes_the_highest_scores_that_fit() {
+        let strategy = strategy(GrowthScore::Mixed, 1300);
+        let (state, histogram) = drawn(&strategy, 1000, 4);
+        let round = strategy.round(700, 1000, &histogram);
+        assert_eq!(round.remove_below_bin, 0, "there is room");
+        let grows = |row: usize| round.fate(&facts(&state, row)) == Fate::SplitLongAxis;
+        let (grown, kept): (Vec<usize>, Vec<usize>) = (0..1000).partition(|&row| grows(row));
+        // A bin is under 1 % wide: some ten of a thousand rows may share the first bin that does not fit.
+        assert!((290..=300).contains(&grown.len()), "{}", grown.len());
+        let score = |row: &usize| state.grad2d[*row];
+        let least = grown.iter().map(score).fold(f32::INFINITY, f32::min);
+        assert!(kept.iter().map(score).all(|kept| kept < least));
+        assert_eq!(round.promised(1000, &histogram), grown.len() as u64);
+        assert_eq!(round.promised_rows(&state.view()), grown.len() as u64);
+        assert!(round.may_edit(&state.view()) && !round.may_edit(&SceneState::empty(0).view()));
+        // Without room nothing grows, and rows without statistics never do.
+        let full = strategy.round(700, 1300, &histogram);
+        assert_eq!(full.promised(1300, &histogram), 0);
+        assert!(!round.splits(0.0, 0) && !round.splits(0.0, 9));
+    }
+
+    #[test]
+    fn recycling_removes_the_least_weights_at_the_cap_until_the_last_round() {
+        let strategy = strategy(GrowthScore::Error, 1000);
+        let (state, histogram) = drawn(&strategy, 1000, 4);
+        assert_eq!(histogram.weighed_rows(), 1000);
+        let round = strategy.round(700, 1000, &histogram);
+        let removed: Vec<usize> = (0..1000).filter(|&row| round.fate(&facts(&state, row)) == Fate::Prune).collect();
+        // The weight of a row is its number and a bit: the 20 least are the first ones.
+        assert!(removed.len() > 15 && removed.len() <= 20, "{removed:?}");
+        assert!(removed.iter().all(|&row| row < 20), "{removed:?}");
+        assert_eq!(strategy.round(2300, 1000, &histogram).remove_below_bin, 0, "the last round");
+        assert_eq!(strategy.round(700, 800, &histogram).remove_below_bin, 0, "below the cap");
+        // Too few views say nothing about a row.
+        let (_, few) = drawn(&strategy, 1000, u64::from(WEIGHED_VIEWS) - 1);
+        assert_eq!((few.weighed_rows(), strategy.round(700, 1000, &few).remove_below_bin), (0, 0));
+    }
+
+    #[test]
+    fn faint_rows_go_and_bounds_of_pages_know_it() {
+        let strategy = strategy(GrowthScore::Mixed, 1000);
+        let round = strategy.round(700, 10, &GradHistogram::default());
+        let of = |opacity: f32| round.fate(&RowFacts { grad2d: 0.0, count: 0, log_scale: 0.0, opacity });
+        assert_eq!((of(logit(0.004)), of(logit(0.006))), (Fate::Prune, Fate::Keep));
+        let keeps = |lowest_opacity: f32| round.keeps_all(&Extremes { lowest_opacity, sigma_max: 1e9 });
+        assert!(keeps(logit(0.006)) && !keeps(logit(0.004)));
+    }
+
+    #[test]
+    fn rounds_come_between_start_and_stop() {
+        let strategy = strategy(GrowthScore::Mixed, 1000);
+        let rounds: Vec<u32> = (0..4000).filter(|&step| strategy.is_round(step)).collect();
+        assert_eq!((rounds[0], rounds[1], rounds[rounds.len() - 1]), (600, 700, 2300));
+        assert!(strategy.collects(2399) && !strategy.collects(2400));
+    }
+}
