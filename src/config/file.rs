@@ -166,7 +166,7 @@ config_keys! {
         strategy: StrategyName = StrategyName::Default => Numbers;
         /// Of --strategy long-axis: grow first what has the largest screen-space gradient (gradient), what covers the
         /// most squared error (error), or the largest geometric mean of both (mixed)
-        growth_score: GrowthScore = GrowthScore::Mixed => Numbers;
+        growth_score: GrowthScore = GrowthScore::Gradient => Numbers;
         /// Of --strategy long-axis: share of the Gaussians seen that a round at the cap removes; 0 = none
         recycle: f64 = 0.02 => Numbers;
         /// Most Gaussians; 0 = no cap

@@ -192,9 +192,11 @@ fn long_axis_rounds_page_to_the_same_bits_and_keep_the_cap() {
     let scene = scenes::wide_city(folder.path(), 8_000);
     // A round after every eighth step: most pages are unseen in between, and some rows are weighed often enough.
     let rounds = ["--refine-start", "20", "--refine-every", "8", "--strategy", "long-axis", "--recycle", "0.2"];
+    let mixed = ["--growth-score", "mixed"];
     let capped =
         ["--page-rows", "32", "--steps", "120", "--max-gaussians", "8800", "--log-every", "1", "--device", "cpu"];
-    let base = [COMMON, &rounds, &capped].concat();
+    let usual = [COMMON, &rounds, &capped].concat();
+    let base = [&usual[..], &mixed].concat();
     let (want, whole) = run(folder.path(), &scene, &base, &How { frames: 0, io: "", threads: "2", more: &[] });
     let most = number(&whole, "pages_pinned_max");
     assert!(most < number(&whole, "pages") / 2, "a view sees too much");
@@ -209,8 +211,7 @@ fn long_axis_rounds_page_to_the_same_bits_and_keep_the_cap() {
         assert!(rows.windows(2).any(|pair| pair[1] < pair[0]), "nothing was recycled: {rows:?}");
         assert!(rows.iter().max() > Some(&8_600), "the cap is not reached: {rows:?}");
     }
-    let gradient = How { frames: 0, io: "", threads: "1", more: &["--growth-score", "gradient"] };
-    let (without, _) = run(folder.path(), &scene, &base, &gradient);
+    let (without, _) = run(folder.path(), &scene, &usual, &How { frames: 0, io: "", threads: "1", more: &[] });
     assert!(without != want, "the score changes nothing");
 }
 
