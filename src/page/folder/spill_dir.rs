@@ -279,10 +279,11 @@ fn warnings_for(folder: &Path, kind: FileSystem, allow_remote: bool) -> InputRes
 
 /// Refuses a folder that contains files foreign to a spill directory.
 fn refuse_foreign_files(folder: &Path) -> InputResult<()> {
+    // Names before FORMAT: another process may create a store between the two reads, and writes FORMAT first.
+    let names = names(folder)?;
     if read_format(folder)?.is_some() {
         return Ok(());
     }
-    let names = names(folder)?;
     // A run that was interrupted before it wrote its FORMAT file leaves these.
     match names.iter().find(|n| ![LOCK, FORMAT_NEW].contains(&n.as_str())) {
         None => Ok(()),
