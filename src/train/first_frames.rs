@@ -62,8 +62,13 @@ pub(super) fn first_frames(
 /// Least budget with which the largest view has its frames.
 fn least_memory(need: &LargestNeed, memory: &MemoryEstimate, host_mem: Option<u64>) -> u64 {
     let rest = memory.fixed() - memory.staging + view_spare(memory) + need.pages * need.frame_bytes;
-    let least = with_staging(rest, memory.staging, host_mem.unwrap_or(u64::MAX));
-    least + least / 50
+    with_margin(with_staging(rest, memory.staging, host_mem.unwrap_or(u64::MAX)), memory)
+}
+
+/// A budget that is enough at the next start too: the part of the graphics driver is measured, and differs from start to
+/// start by up to 1/20.
+fn with_margin(bytes: u64, memory: &MemoryEstimate) -> u64 {
+    bytes + bytes / 50 + memory.base / 16
 }
 
 /// Margin for a view slightly larger than the rendered ones: its vectors grow by an eighth.
@@ -104,7 +109,7 @@ pub(super) fn frames_of_budget(
         let remedy = format!(
             "give at least {} ({} keeps each view in one batch), or lower --image-cache, --prefetch-bytes, --page-rows, \
              --sh-degree or the size of the photos",
-            format_bytes(floor + floor / 50),
+            format_bytes(with_margin(floor, memory)),
             format_bytes(least_memory(need, memory, host_mem))
         );
         return Err(InputError::new("--host-mem", problem, remedy));
