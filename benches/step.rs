@@ -389,6 +389,10 @@ impl Renderer for Watched {
         done
     }
 
+    fn unusable_splats(&mut self) -> Result<u64, RenderError> {
+        self.inner.unusable_splats()
+    }
+
     fn loss_value(&mut self) -> Result<LossValue, RenderError> {
         self.inner.loss_value()
     }

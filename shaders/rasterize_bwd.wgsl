@@ -30,8 +30,12 @@
 /// First intersection of each rank; row_count + 1 entries.
 @group(0) @binding(12) var<storage, read> offsets: array<u32>;
 @group(0) @binding(13) var<storage, read_write> v_splats: array<vec4<f32>>;
+/// Rows that count_unusable found.
+@group(0) @binding(14) var<storage, read_write> unusable: atomic<u32>;
 
 const SUMS: u32 = 9u;
+/// The bits of LARGEST_SPLAT_GRAD in src/base/math.rs, 1e12.
+const LARGEST_SPLAT_GRAD_BITS: u32 = 0x5368d4a5u;
 /// Parts of the sums of one splat, times the splats of a batch.
 const PARTS_OF_BATCH: u32 = 256u;
 
@@ -395,4 +399,28 @@ fn fold_rows(
     v_splats[at] = vec4<f32>(v_mean, 0.0, v_opacity);
     v_splats[at + 1u] = vec4<f32>(-0.5 * row_sums[s + 3u], -row_sums[s + 4u], -0.5 * row_sums[s + 5u], 0.0);
     v_splats[at + 2u] = vec4<f32>(row_sums[s + 6u], row_sums[s + 7u], row_sums[s + 8u], 0.0);
+}
+
+/// The bits of four numbers without their signs: ordered as the magnitudes, with NaN and infinity after all others. A
+/// shader may assume that numbers are finite, but not that bits are.
+fn magnitudes(v: vec4<f32>) -> vec4<u32> {
+    return bitcast<vec4<u32>>(v) & vec4<u32>(0x7fffffffu);
+}
+
+/// Counts the rows with a gradient that is too large for the optimizer, or not finite.
+@compute @workgroup_size(256)
+fn count_unusable(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = linear_index(workgroup, workgroups, lane, 256u);
+    if row >= view.row_count {
+        return;
+    }
+    let at = SPLAT_STRIDE * row;
+    let m = max(max(magnitudes(v_splats[at]), magnitudes(v_splats[at + 1u])), magnitudes(v_splats[at + 2u]));
+    if max(max(m.x, m.y), max(m.z, m.w)) > LARGEST_SPLAT_GRAD_BITS {
+        atomicAdd(&unusable, 1u);
+    }
 }

@@ -52,6 +52,7 @@ impl InputError {
     pub fn io(file: impl AsRef<Path>, doing: &str, source: &std::io::Error) -> Self {
         use std::io::ErrorKind as K;
         let remedy = match source.kind() {
+            _ if is_too_many_files(source) => REMEDY_TOO_MANY_FILES,
             K::NotFound => "check the path",
             K::PermissionDenied => "check the permissions of the file and its folder",
             K::StorageFull => "free space on that disk or choose another folder",
@@ -62,6 +63,16 @@ impl InputError {
         };
         InputError { kind: Some(source.kind()), ..InputError::new(file, format!("{doing} failed: {source}"), remedy) }
     }
+}
+
+/// What helps when too many files are open.
+pub const REMEDY_TOO_MANY_FILES: &str =
+    "raise the limit on open files, for example with `ulimit -n 1024`; nothing is wrong with the drive";
+
+/// Whether a file could not be opened because the process or the system has too many open; closing another file cures
+/// that.
+pub fn is_too_many_files(error: &std::io::Error) -> bool {
+    cfg!(unix) && matches!(error.raw_os_error(), Some(23 | 24)) // ENFILE, EMFILE everywhere
 }
 
 /// Whether the system refused bytes for lack of space; then nothing was written. A limit on the length of files counts,

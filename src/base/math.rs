@@ -38,6 +38,15 @@ pub fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + exp32(-x))
 }
 
+/// A gradient of a larger magnitude counts as not finite: its square must not overflow Adam's second moment. Below this
+/// limit, every number that an update computes from finite state is finite.
+pub const LARGEST_GRAD: f32 = 1e18;
+
+/// A gradient of a splat of a larger magnitude is taken to lead to a gradient of its Gaussian above [`LARGEST_GRAD`]:
+/// focal length over depth, and the like, multiply it by 1e6 at most. Losses are means over pixels, so sound training
+/// stays below 1e8.
+pub const LARGEST_SPLAT_GRAD: f32 = 1e12;
+
 /// ln(p / (1 - p)), the inverse of [`sigmoid`], for p in (0, 1).
 pub fn logit(p: f32) -> f32 {
     let p = f64::from(p);

@@ -90,9 +90,9 @@ pub struct TrainerState {
     pub step: u32,
     /// Row updates skipped because a value was not finite.
     pub rows_skipped: u64,
-    /// Steps skipped because the loss was not finite.
+    /// Steps skipped because the loss or gradients were not finite.
     pub steps_skipped: u32,
-    /// Number of the last skipped steps in a row.
+    /// Number of the last steps in a row that were skipped or that skipped more than .01 % of their rows.
     pub steps_skipped_in_a_row: u32,
     /// Seconds spent in steps.
     pub train_seconds: f64,

@@ -26,6 +26,8 @@ impl TrainConfig {
     /// Names the first key that is out of range, with what is allowed.
     pub fn check(&self) -> InputResult<()> {
         let positive = |x: f64| x.is_finite() && x > 0.0;
+        // Compared in f32, as the run computes: 0.99999998 is 1 there.
+        let is_between = |x: f64, least: f32| x as f32 > least && (x as f32) < 1.0;
         let is_interval = !matches!(self.commit_every, CommitEvery::Seconds(s) if !(s >= 0.0 && s.is_finite()));
         refuse_first(&[
             ("data-factor", self.data_factor.is_finite() && self.data_factor >= 1.0, "1 or more"),
@@ -39,12 +41,12 @@ impl TrainConfig {
             ("init-points", self.init_points <= INIT_POINTS_MAX, "0 to 100,000,000"),
             ("threads", self.threads <= THREADS_MAX, "0 to 1024"),
             ("ssim-lambda", (0.0..=1.0).contains(&self.ssim_lambda), "0 to 1"),
-            ("init-opacity", self.init_opacity > 0.0 && self.init_opacity < 1.0, "a number between 0 and 1"),
+            ("init-opacity", is_between(self.init_opacity, 0.0), "a number between 0 and 1, at most 0.9999999"),
             ("init-scale", positive(self.init_scale), "a positive number"),
             (
                 "max-alpha",
-                self.max_alpha > 0.5 && self.max_alpha < 1.0,
-                "a number between 0.5 and 1, such as 0.99 or 0.999",
+                is_between(self.max_alpha, 0.5),
+                "a number between 0.5 and 1, such as 0.99 or 0.999, at most 0.9999999",
             ),
             ("background", self.background.0.iter().all(|c| (0.0..=1.0).contains(c)), "three numbers in 0..1"),
             ("refine-every", self.refine_every > 0, "1 or more"),
@@ -140,6 +142,13 @@ mod tests {
         // As a 32-bit number this is half.
         let bad = TrainConfig { prune_opa: 0.499_999_999, ..TrainConfig::default() };
         assert!(bad.check().is_err_and(|e| e.to_string().contains("--prune-opa")));
+        // As 32-bit numbers these are 1 and 0.
+        for init_opacity in [0.999_999_98, 1e-60] {
+            let bad = TrainConfig { init_opacity, ..TrainConfig::default() };
+            assert!(bad.check().is_err_and(|e| e.to_string().contains("--init-opacity")));
+        }
+        let bad = TrainConfig { max_alpha: 0.999_999_98, ..TrainConfig::default() };
+        assert!(bad.check().is_err_and(|e| e.to_string().contains("--max-alpha")));
         assert!(TrainConfig::default().check().is_ok());
     }
 }

@@ -87,7 +87,8 @@ config_keys! {
         test_every: u32 = 8 => Numbers;
         /// Hold out every photo whose index is greater than N, instead of --test-every; -1 = off
         [allow_negative_numbers = true] test_after: i64 = -1 => Numbers;
-        /// Use masks found in masks/ (white = keep)
+        /// Use masks found in masks/ (white = keep), and the alpha of photos as a mask (opaque = keep). Without, transparent
+        /// pixels show --background
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] masks: bool = true => Numbers;
         /// White in masks means leave out
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] invert_masks: bool = false => Numbers;

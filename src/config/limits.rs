@@ -67,6 +67,8 @@ pub struct RunOptions {
     pub save_every: u32,
     /// Steps between lines of metrics.
     pub log_every: u32,
+    /// The file or store from which the run starts, for messages; empty for the points of the dataset.
+    pub init_ply: String,
 }
 
 impl RunOptions {
@@ -111,6 +113,7 @@ impl RunOptions {
             eval_every: config.eval_every,
             save_every: config.save_every,
             log_every: config.log_every,
+            init_ply: config.init_ply.clone(),
         }
     }
 
@@ -141,6 +144,7 @@ fn default_strategy(config: &TrainConfig) -> DefaultStrategy {
         refine_stop: config.refine_stop,
         refine_every: config.refine_every,
         reset_every: never_if_zero(config.reset_every),
+        schedule_steps: schedule_steps(config),
         max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
     }
 }
@@ -196,6 +200,7 @@ pub fn load_options(config: &TrainConfig) -> LoadOptions {
         test_every: (config.test_every > 0).then_some(config.test_every),
         test_after: u32::try_from(config.test_after).ok(),
         masks: config.masks,
+        background: config.background.0.map(|c| (255.0 * c).round() as u8),
         invert_masks: config.invert_masks,
         allow_missing: config.allow_missing,
         near_plane: config.near_plane,

@@ -11,7 +11,7 @@ use super::frame::{Extent, Frame, usable};
 use super::import::{Cloud, LocalCloud};
 use super::masks::{MaskIndex, MaskSource};
 use super::model::{Intrinsics, RawScene, RawView, Split};
-use super::photo::{PhotoSource, intrinsics_at};
+use super::photo::{Alpha, PhotoSource, intrinsics_at};
 use super::photo_header::{PhotoHeader, read_header};
 use super::resize::{Size, divided_size, same_shape};
 use crate::base::error::{InputError, InputResult};
@@ -38,8 +38,10 @@ pub struct LoadOptions {
     pub test_every: Option<u32>,
     /// Registered views with index > N are test views; overrides `test_every`.
     pub test_after: Option<u32>,
-    /// Whether masks are used.
+    /// Whether masks are used, and the alpha of photos as a mask.
     pub masks: bool,
+    /// The colour of transparent pixels where alpha is no mask, sRGB.
+    pub background: [u8; 3],
     /// Keep black instead of white.
     pub invert_masks: bool,
     /// Drop views without a photo instead of failing.
@@ -59,6 +61,7 @@ impl Default for LoadOptions {
             test_every: Some(8),
             test_after: None,
             masks: true,
+            background: [0; 3],
             invert_masks: false,
             allow_missing: false,
             near_plane: 0.01,
@@ -340,6 +343,13 @@ fn check_photos(
             error
         })?);
     }
+    let transparent = photos.iter().filter(|p| p.is_masked_by_alpha()).count();
+    if transparent > 0 {
+        warnings.push(format!(
+            "{transparent} photos have an alpha channel: pixels that are less than half opaque do not count, as under a mask \
+             (--masks=false shows --background there)"
+        ));
+    }
     let masked = photos.iter().filter(|p| p.mask.is_some()).count();
     if masked == 0 && !index.is_empty() {
         warnings.push("none of the files in the masks folder belongs to a photo: no mask is used".to_string());
@@ -365,6 +375,7 @@ fn check_photo(view: &RawView, index: &MaskIndex, options: &LoadOptions) -> Inpu
         intrinsics: intrinsics_at(&stated, size),
         target: target_size(size, options),
         mask,
+        alpha: if options.masks { Alpha::Mask } else { Alpha::Over(options.background) },
     })
 }
 

@@ -1,14 +1,14 @@
 //! Converts a photo file to a training target: decodes, undistorts, downscales, applies the mask.
 //!
 //! Every picture becomes 8-bit RGB: 16-bit samples are rounded, gray is repeated, CMYK is converted. Transparent pixels
-//! are composited over black, the renderer's background, so that a cut-out object (Blender's RGBA renders) is learned
-//! as an object in empty space. EXIF orientation is ignored: COLMAP poses refer to the stored pixels.
+//! ([`Alpha`]) are left out as a mask leaves pixels out, or show a background colour. EXIF orientation is ignored: COLMAP
+//! poses refer to the stored pixels.
 //!
 //! Invariants: 1. a target depends on its [`PhotoSource`] and the files alone, never on budgets or threads; 2.
 //! [`decode`] never uses more memory than [`PhotoSource::decode_bytes`], whatever the files contain besides pixels:
 //! colour profiles, texts and previews are skipped or counted; 3. distorted photos are undistorted at full size, row by
 //! row into the area average: the full-size result never exists in memory; 4. a target pixel is kept if at least half of its
-//! area is inside the photo, and at least half of it is kept by the mask.
+//! area is inside the photo, at least half of it is kept by the mask, and it is at least half opaque.
 
 use super::masks::MaskSource;
 use super::model::{Intrinsics, Lens};
@@ -24,6 +24,15 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
+/// What becomes of transparent pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Alpha {
+    /// A pixel counts if it is at least half opaque, with the colour of its opaque part.
+    Mask,
+    /// Every pixel counts; transparent ones show this colour.
+    Over([u8; 3]),
+}
+
 /// Everything needed to decode a view's target; the files were checked at load.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PhotoSource {
@@ -37,22 +46,33 @@ pub struct PhotoSource {
     pub target: Size,
     /// The view's mask.
     pub mask: Option<MaskSource>,
+    /// What becomes of transparent pixels.
+    pub alpha: Alpha,
 }
 
 impl PhotoSource {
     /// Most bytes of the decoded target (a mask may turn out to be unnecessary).
     pub fn target_bytes(&self) -> u64 {
-        let has_mask = self.mask.is_some() || self.intrinsics.lens != Lens::Pinhole;
-        self.target_pixels() * if has_mask { 4 } else { 3 }
+        self.target_pixels() * if self.may_have_mask() { 4 } else { 3 }
     }
 
     /// Peak memory of [`decode`], bytes: the larger of the photo's and the mask's, plus the target. Buffers of a few
     /// rows are not counted.
     pub fn decode_bytes(&self) -> u64 {
         let photo = self.header.decode_bytes + self.target_bytes();
-        let undone = if self.intrinsics.lens == Lens::Pinhole { 0 } else { self.target_pixels() };
+        // Validity of undistorted pixels; a photo with alpha has four bytes a pixel until its mask is taken from them.
+        let undone = if self.may_have_mask() { self.target_pixels() } else { 0 };
         let mask = self.mask.as_ref().map_or(0, |m| m.header.gray_bytes() + self.target_pixels());
         photo.max(mask + self.target_bytes()) + undone
+    }
+
+    fn may_have_mask(&self) -> bool {
+        self.mask.is_some() || self.intrinsics.lens != Lens::Pinhole || self.is_masked_by_alpha()
+    }
+
+    /// Whether transparent pixels are left out.
+    pub fn is_masked_by_alpha(&self) -> bool {
+        self.header.has_alpha && self.alpha == Alpha::Mask
     }
 
     fn target_pixels(&self) -> u64 {
@@ -80,16 +100,17 @@ pub fn intrinsics_at(intrinsics: &Intrinsics, size: Size) -> Intrinsics {
 ///
 /// Errors: the photo or its mask cannot be read or decoded, or changed its size since load.
 pub fn decode(source: &PhotoSource) -> InputResult<Target> {
-    let rgb = read_rgb(&source.image_path, &source.header)?;
-    let full = (source.header.width, source.header.height);
-    let (rgb, valid) = if source.intrinsics.lens != Lens::Pinhole {
-        undistorted(&rgb, source)
-    } else if full == source.target {
-        (rgb, None)
-    } else {
-        (resize_area(&rgb, 3, full, source.target), None)
+    let (rgb, mut mask) = match read_colors(&source.image_path, &source.header, source.alpha)? {
+        Colors::Rgb(rgb) => at_target_size::<3>(rgb, source),
+        Colors::RgbOverBlack(rgba) => {
+            let (rgba, valid) = at_target_size::<4>(rgba, source);
+            let (rgb, mut opaque) = opaque_colors(&rgba);
+            if let Some(valid) = valid {
+                opaque.iter_mut().zip(valid).for_each(|(k, v)| *k &= v);
+            }
+            (rgb, Some(opaque))
+        }
     };
-    let mut mask = valid;
     if let Some(mask_source) = &source.mask {
         let mut kept = decode_mask(mask_source, &source.intrinsics, source.target)?;
         if let Some(valid) = &mask {
@@ -101,12 +122,27 @@ pub fn decode(source: &PhotoSource) -> InputResult<Target> {
     Ok(Target { width: source.target.0, height: source.target.1, rgb, mask })
 }
 
-/// The undistorted photo at target size, and the pixels of which at least half are inside the photo.
-fn undistorted(rgb: &[u8], source: &PhotoSource) -> (Vec<u8>, Option<Vec<u8>>) {
+/// The photo at target size; for one that is undistorted, also the pixels of which at least half are inside the photo.
+fn at_target_size<const C: usize>(photo: Vec<u8>, source: &PhotoSource) -> (Vec<u8>, Option<Vec<u8>>) {
     let full = (source.header.width, source.header.height);
+    if source.intrinsics.lens == Lens::Pinhole {
+        return (if full == source.target { photo } else { resize_area(&photo, C, full, source.target) }, None);
+    }
     let mut shares = AreaResizer::new(1, full, source.target, 1);
-    let colors = undistort::<3>(rgb, source.intrinsics, source.target, |valid| shares.push_row(valid));
+    let colors = undistort::<C>(&photo, source.intrinsics, source.target, |valid| shares.push_row(valid));
     (colors, Some(thresholded(shares.finish())))
+}
+
+/// Colours of the opaque parts of pixels over black, and which pixels are at least half opaque (255, else 0).
+fn opaque_colors(rgba: &[u8]) -> (Vec<u8>, Vec<u8>) {
+    let pixels = rgba.as_chunks::<4>().0;
+    let (mut rgb, mut opaque) = (Vec::with_capacity(3 * pixels.len()), Vec::with_capacity(pixels.len()));
+    for &[r, g, b, a] in pixels {
+        let of_opaque_part = |c: u8| ((255 * u32::from(c) + u32::from(a) / 2) / u32::from(a.max(1))).min(255) as u8;
+        rgb.extend([r, g, b].map(of_opaque_part));
+        opaque.push(if a >= 128 { 255 } else { 0 });
+    }
+    (rgb, opaque)
 }
 
 /// The undistorted picture at target size. `take` receives the validity of each row at full size, 255 or 0 per pixel.
@@ -143,18 +179,37 @@ fn thresholded(mut share: Vec<u8>) -> Vec<u8> {
     share
 }
 
-/// Decodes a picture to 8-bit RGB over black.
-fn read_rgb(path: &Path, header: &PhotoHeader) -> InputResult<Vec<u8>> {
+/// An 8-bit picture, interleaved.
+enum Colors {
+    Rgb(Vec<u8>),
+    /// Colours over black, and alpha.
+    RgbOverBlack(Vec<u8>),
+}
+
+/// Decodes a picture to 8 bits; where alpha is no mask, over its background.
+fn read_colors(path: &Path, header: &PhotoHeader, alpha: Alpha) -> InputResult<Colors> {
     let picture = read_picture(path, header)?;
     if !picture.color().has_alpha() {
-        return Ok(picture.into_rgb8().into_raw());
+        return Ok(Colors::Rgb(picture.into_rgb8().into_raw()));
     }
-    let rgba = picture.into_rgba8();
-    let mut rgb = Vec::with_capacity(rgba.len() / 4 * 3);
-    for &[r, g, b, a] in rgba.as_raw().as_chunks::<4>().0 {
-        rgb.extend([over_black(r, a), over_black(g, a), over_black(b, a)]);
+    let mut rgba = picture.into_rgba8().into_raw();
+    match alpha {
+        Alpha::Mask => {
+            for pixel in rgba.as_chunks_mut::<4>().0 {
+                let [r, g, b, a] = *pixel;
+                *pixel = [over_black(r, a), over_black(g, a), over_black(b, a), a];
+            }
+            Ok(Colors::RgbOverBlack(rgba))
+        }
+        Alpha::Over(background) => {
+            let mut rgb = Vec::with_capacity(rgba.len() / 4 * 3);
+            for &[r, g, b, a] in rgba.as_chunks::<4>().0 {
+                let under = background.map(|c| over_black(c, 255 - a));
+                rgb.extend([over_black(r, a) + under[0], over_black(g, a) + under[1], over_black(b, a) + under[2]]);
+            }
+            Ok(Colors::Rgb(rgb))
+        }
     }
-    Ok(rgb)
 }
 
 /// Decodes a picture to 8-bit gray over black.

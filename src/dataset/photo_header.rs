@@ -43,6 +43,8 @@ pub struct PhotoHeader {
     pub height: u32,
     /// Peak memory of the decoder, bytes, including the 8-bit RGB result.
     pub decode_bytes: u64,
+    /// Whether pixels may be transparent.
+    pub has_alpha: bool,
 }
 
 impl PhotoHeader {
@@ -124,7 +126,8 @@ impl JpegFrame {
         let has_scans = self.code == 0xc2 || in_first_scan != self.components;
         let of_scans = if has_scans { 2 * self.coefficients } else { 0 };
         let decode_bytes = 2 * bytes + metadata + result + of_scans;
-        PhotoHeader { format: PhotoFormat::Jpeg, width: self.width, height: self.height, decode_bytes }
+        let (width, height) = (self.width, self.height);
+        PhotoHeader { format: PhotoFormat::Jpeg, width, height, decode_bytes, has_alpha: false }
     }
 }
 
@@ -266,7 +269,8 @@ impl HeaderReader<'_> {
             (false, _) => decoded + 3,
         };
         self.require_end(at, b"IEND\xae\x42\x60\x82", "the end chunk (IEND)")?;
-        Ok(PhotoHeader { format: PhotoFormat::Png, width, height, decode_bytes: pixels * per_pixel })
+        let decode_bytes = pixels * per_pixel;
+        Ok(PhotoHeader { format: PhotoFormat::Png, width, height, decode_bytes, has_alpha })
     }
 
     /// Walks the chunks up to the first pixels: their position, and whether a tRNS chunk makes some transparent.

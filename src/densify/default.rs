@@ -1,7 +1,8 @@
 //! gsplat's `DefaultStrategy`: rows with a large gradient of their projected mean are duplicated or split, faint rows
 //! and large rows are pruned, and opacities are reset at intervals.
 //!
-//! Invariants: 1. a round never leaves more than `max_gaussians` rows; 2. an interval of 0 means never.
+//! Invariants: 1. a round never leaves more than `max_gaussians` rows; 2. an interval of 0 means never; 3. no opacities
+//! are reset so late in the planned run that they cannot recover.
 
 use super::ops::{child_log_scale, sigma};
 use super::stats::{GradHistogram, promised_growth};
@@ -30,9 +31,15 @@ pub struct DefaultStrategy {
     pub refine_every: u32,
     /// Steps between opacity resets.
     pub reset_every: u32,
+    /// Steps of the planned run: no reset comes shortly before its end.
+    pub schedule_steps: u32,
     /// Most rows of the scene.
     pub max_gaussians: u64,
 }
+
+/// Most steps that opacities are given to recover from a reset before the planned end of a run; less where resets follow
+/// each other faster than three times in so many steps.
+const RECOVERY_STEPS: u32 = 1000;
 
 impl Default for DefaultStrategy {
     fn default() -> Self {
@@ -45,6 +52,7 @@ impl Default for DefaultStrategy {
             refine_stop: 15_000,
             refine_every: 100,
             reset_every: 3000,
+            schedule_steps: u32::MAX,
             max_gaussians: u64::MAX,
         }
     }
@@ -57,9 +65,12 @@ impl DefaultStrategy {
     }
 
     /// Whether an opacity reset follows this step (after its round). Resets need pruning by opacity: with `prune_opa` 0
-    /// the cap would be 0, which has no finite logit.
+    /// the cap would be 0, which has no finite logit. They also need the steps after them in which opacities recover.
     pub fn is_reset(&self, step: u32) -> bool {
-        self.prune_opa > 0.0 && step > 0 && step < self.refine_stop && step.is_multiple_of(self.reset_every)
+        let recovery = RECOVERY_STEPS.min(self.reset_every / 3);
+        let is_late = step.saturating_add(1).saturating_add(recovery) > self.schedule_steps;
+        let is_due = step > 0 && step < self.refine_stop && step.is_multiple_of(self.reset_every);
+        self.prune_opa > 0.0 && is_due && !is_late
     }
 
     /// Thresholds of the round after this step. Every growing row adds one row, so at most `max_gaussians - rows` rows
@@ -158,6 +169,14 @@ mod tests {
         assert_eq!(round.prune_scale, f32::INFINITY);
         assert_eq!(events[1], EventKind::ResetOpacity { max_opacity: 0.01 });
         assert_eq!(config.thresholds(3100, 2.0, 10, &GradHistogram::default()).prune_scale, 0.2);
+        // A run that ends 1,000 steps after a reset has it; a shorter one has not.
+        for (schedule_steps, last) in [(4001, Some(3000)), (4000, None), (3001, None), (3000, None), (7001, Some(6000))]
+        {
+            let short = DefaultStrategy { schedule_steps, ..config };
+            assert_eq!((0..schedule_steps).filter(|&s| short.is_reset(s)).last(), last, "{schedule_steps} steps");
+        }
+        let often = DefaultStrategy { reset_every: 45, schedule_steps: 100, ..config };
+        assert_eq!((0..100).filter(|&s| often.is_reset(s)).collect::<Vec<_>>(), [45]);
         let never = DefaultStrategy { refine_every: 0, reset_every: 0, ..config };
         assert!((0..20_000).all(|s| !never.is_round(s) && !never.is_reset(s)));
         let unpruned = DefaultStrategy { prune_opa: 0.0, ..DefaultStrategy::default() };

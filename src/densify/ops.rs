@@ -7,14 +7,14 @@
 //!
 //! Invariants: 1. new rows have zero moments and the stamp of the event; 2. uids and random draws of new rows depend on
 //! (seed, parent's uid, event, child) only; 3. surviving rows keep their order, and new rows follow in the order of
-//! their parents.
+//! their parents; 4. new rows are finite, because the log-scales of a parent are moved into the range of the run first.
 
 use super::strategy::{Fate, Round, RowFacts};
 use crate::base::math::{exp32, logit};
 use crate::base::rng::{Purpose, Stream, hash64};
 use crate::scene::columns::{Column, Columns};
 use crate::scene::events::{LONG_AXIS_OFFSET, SPLIT_SIGMAS};
-use crate::scene::rows::{BLOCK_LANES, RowBlock, Rows, RowsMut, RowsNow, first_lane};
+use crate::scene::rows::{BLOCK_LANES, RowBlock, Rows, RowsMut, RowsNow, first_lane, scales_of};
 use crate::scene::state::SceneState;
 use rayon::prelude::*;
 
@@ -67,6 +67,7 @@ pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, se
         });
         if matches!(fate, Fate::Split { .. } | Fate::SplitLongAxis | Fate::Duplicate { pruned: false }) {
             values.evaluate_row(rows, row, &mut block);
+            values.log_scales().clamp_all(scales_of(&mut block));
         }
         match fate {
             Fate::Keep => {}

@@ -17,6 +17,7 @@ use super::project_fwd::Projected;
 use super::rasterize_fwd::{Lists, Raster, TILE_PIXELS, copy_lanes, exp2_bounded, log2_max_alpha};
 use super::splats::{LOG2_ALPHA_MIN, ROWS_PER_CHUNK};
 use super::tile_block::{Block, ROWS, prefetch_splats};
+use crate::base::math::LARGEST_SPLAT_GRAD;
 use crate::base::room;
 use crate::base::simd::{Kernel, LANES, dispatch, fma};
 use rayon::prelude::*;
@@ -404,7 +405,8 @@ impl FoldPart {
 
 /// Folds the sums of each row over its intersections with the tiles of a range, and converts them to gradients after the last
 /// range; before that `out` holds the sums as they are. `counts` holds the number of intersections of each row in the range,
-/// and `counts_of_all` that in all tiles.
+/// and `counts_of_all` that in all tiles. Returns, after the last range, the number of rows with a gradient beyond
+/// [`LARGEST_SPLAT_GRAD`] or NaN.
 pub fn fold_rows(
     part: FoldPart,
     [counts, counts_of_all]: [&[u32]; 2],
@@ -412,7 +414,7 @@ pub fn fold_rows(
     partials: &[Partial],
     projected: &Projected,
     out: &mut FootprintGradients,
-) {
+) -> u64 {
     let rows = projected.rows();
     room::resize(&mut out.v_means2d, rows, [0.0; 2]);
     room::resize(&mut out.v_conics, rows, [0.0; 3]);
@@ -421,8 +423,8 @@ pub fn fold_rows(
     let geometry = (out.v_means2d.par_chunks_mut(ROWS_PER_CHUNK), out.v_conics.par_chunks_mut(ROWS_PER_CHUNK));
     let looks = (out.v_colors.par_chunks_mut(ROWS_PER_CHUNK), out.v_opacities.par_chunks_mut(ROWS_PER_CHUNK));
     let chunks = geometry.into_par_iter().zip(looks.into_par_iter()).enumerate();
-    chunks.for_each(|(chunk, ((v_means2d, v_conics), (v_colors, v_opacities)))| {
-        let mut first = chunk_offsets[chunk] as usize;
+    let of_chunk = |(chunk, ((v_means2d, v_conics), (v_colors, v_opacities))): (usize, FoldedChunk<'_>)| {
+        let (mut first, mut unusable) = (chunk_offsets[chunk] as usize, 0);
         for i in 0..v_means2d.len() {
             let row = chunk * ROWS_PER_CHUNK + i;
             let last = first + counts[row] as usize;
@@ -451,10 +453,18 @@ pub fn fold_rows(
                 v_means2d[i] = [a * hx + b * hy, b * hx + c * hy];
                 v_conics[i] = [-0.5 * hxx, -hxy, -0.5 * hyy];
                 v_opacities[i] = h / projected.opacities[row];
+                let ([x, y], [xx, xy, yy]) = (v_means2d[i], v_conics[i]);
+                let all = [x, y, xx, xy, yy, red, green, blue, v_opacities[i]];
+                unusable += u64::from(!all.into_iter().all(|v| v.abs() <= LARGEST_SPLAT_GRAD));
             }
         }
-    });
+        unusable
+    };
+    chunks.map(of_chunk).sum()
 }
+
+/// Gradients of the rows of a chunk: means2d and conics, colours and opacities.
+type FoldedChunk<'a> = ((&'a mut [[f32; 2]], &'a mut [[f32; 3]]), (&'a mut [[f32; 3]], &'a mut [f32]));
 
 #[cfg(test)]
 mod tests {

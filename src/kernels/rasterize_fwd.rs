@@ -104,18 +104,26 @@ pub fn exp2_bounded<const FMA: bool>(x: f32) -> f32 {
     f32::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 23))
 }
 
-/// The exponent at which alpha is clamped: the smallest float whose [`exp2_bounded`] is at least `max_alpha`.
+/// The exponent at which alpha is clamped: the smallest float whose [`exp2_bounded`] is at least `max_alpha`, found by
+/// bisection, for which [`exp2_bounded`] rises there.
 pub fn log2_max_alpha(max_alpha: f32, simd: SimdPath) -> f32 {
     struct Find(f32);
     impl Kernel for Find {
         type Out = f32;
         #[inline(always)]
         fn run<const FMA: bool>(self) -> f32 {
-            let mut x = libm::log2f(self.0) - 1e-6;
-            while exp2_bounded::<FMA>(x) < self.0 && x < 0.0 {
-                x = if x.next_up() > 0.0 { 0.0 } else { x.next_up() };
+            let below = libm::log2f(self.0) - 1e-6;
+            if exp2_bounded::<FMA>(below) >= self.0 {
+                return below;
             }
-            x
+            // Bits of negative floats rise with the magnitude: `low` is below, `high` is not.
+            let (mut low, mut high) = (below.to_bits(), (-0.0f32).to_bits());
+            while low - high > 1 {
+                let middle = high + (low - high) / 2;
+                if exp2_bounded::<FMA>(f32::from_bits(middle)) < self.0 { low = middle } else { high = middle }
+            }
+            // Adding zero makes -0 a plain 0.
+            f32::from_bits(high) + 0.0
         }
     }
     dispatch(simd, Find(max_alpha))
@@ -448,6 +456,32 @@ pub(in crate::kernels) mod tests {
                 let stopped = raster.stop.iter().filter(|s| **s != NEVER).count();
                 assert!(n < 2000 || stopped > pixels / 4, "the crowded scene must stop pixels: {stopped}");
             }
+        }
+    }
+
+    #[test]
+    fn the_clamp_is_the_first_exponent_that_reaches_it() {
+        struct Search(f32);
+        impl Kernel for Search {
+            type Out = f32;
+            #[inline(always)]
+            fn run<const FMA: bool>(self) -> f32 {
+                let mut x = libm::log2f(self.0) - 1e-6;
+                while exp2_bounded::<FMA>(x) < self.0 && x < 0.0 {
+                    x = if x.next_up() > 0.0 { 0.0 } else { x.next_up() };
+                }
+                x
+            }
+        }
+        for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+            for max_alpha in (51..=99).map(|i| i as f32 / 100.0).chain([0.999, 0.9999]) {
+                let want = dispatch(simd, Search(max_alpha));
+                assert_eq!(log2_max_alpha(max_alpha, simd).to_bits(), want.to_bits(), "{simd:?} {max_alpha}");
+            }
+            // Floats between this exponent and 0 are so dense that a search among all of them takes seconds.
+            let cap = log2_max_alpha(0.999_999_9, simd);
+            // One rounding of a number near 1 is 6e-8, twice that in the exponent.
+            assert!((cap - libm::log2f(0.999_999_9)).abs() < 2e-7 && cap <= 0.0, "{simd:?}: {cap}");
         }
     }
 

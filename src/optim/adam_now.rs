@@ -10,6 +10,7 @@ use super::moments::Moments;
 use super::rates::Rates;
 use crate::base::simd::{LANES, SimdPath};
 use crate::scene::columns::Column;
+use crate::scene::log_scales::LogScaleRange;
 use crate::scene::rows::{RowBlock, first_lane};
 
 /// A value per lane of a row; all lanes of `sh_n` share one.
@@ -50,6 +51,7 @@ pub struct DeferredAdam {
     decays: Vec<Decay>,
     simd: SimdPath,
     moments: Moments,
+    log_scales: LogScaleRange,
 }
 
 /// Counts of one step.
@@ -57,7 +59,7 @@ pub struct DeferredAdam {
 pub struct StepCounts {
     /// Rows that were rewritten.
     pub updated: usize,
-    /// Rows left unchanged because their gradient was not finite (or beyond 1e18).
+    /// Rows left unchanged because their gradient was not finite (or beyond [`crate::base::math::LARGEST_GRAD`]).
     pub skipped_non_finite: usize,
 }
 
@@ -81,7 +83,20 @@ impl DeferredAdam {
             decays: (0..TABLED_GAPS as u32).map(|k| Decay::new(config, k)).collect(),
             simd,
             moments: Moments::F32,
+            log_scales: LogScaleRange::ANY_SCENE,
         }
+    }
+
+    /// The same optimizer with the range of log-scales of a scene.
+    #[must_use]
+    pub fn with_log_scales(self, log_scales: LogScaleRange) -> Self {
+        DeferredAdam { log_scales, ..self }
+    }
+
+    /// The range to which updates clamp log-scales.
+    #[inline(always)]
+    pub(crate) fn log_scales(&self) -> LogScaleRange {
+        self.log_scales
     }
 
     /// The same optimizer with another storage format of moments.

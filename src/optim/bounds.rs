@@ -11,7 +11,7 @@
 //!
 //! Invariants: 1. bounds are a function of the stored rows and the run's configuration alone, not of the step at which
 //! they are computed; 2. they hold for every later step, whatever events are pending, in the f32 arithmetic of the
-//! evaluation; 3. the same bits on every instruction path.
+//! evaluation; 3. the same bits on every instruction path; 4. bounds of finite rows are finite.
 
 use super::adam_now::DeferredAdam;
 use super::lanes::{Coordinates, LANES, LaneDrifts, by_coordinate, drifted_lanes, drifted_opacities, tables_of};
@@ -34,6 +34,9 @@ const VALUE_SLACK: f32 = 8.0 * 0.5 * f32::EPSILON;
 const FLUSH_SLACK: f32 = 2.0 * f32::MIN_POSITIVE;
 /// Relative slack of a standard deviation: [`exp32`] is within two ulp, both here and in the test of a row.
 const SIGMA_SLACK: f32 = 1e-6;
+/// Largest standard deviation in bounds. Only a value that drifts beyond the range of log-scales has a larger one, and the
+/// projection draws no such row, because the square overflows f32.
+const SIGMA_MOST: f32 = 1e30;
 /// Factor of a split's reach for the roundings of its rotation and scales.
 const REACH_SLACK: f32 = 1.0 + 1e-4;
 
@@ -226,7 +229,8 @@ fn outwards(bound: f32, reach: f32) -> f32 {
 
 #[inline(always)]
 fn sigma(log_scale: f32) -> f32 {
-    exp32(log_scale) * (1.0 + SIGMA_SLACK)
+    let sigma = exp32(log_scale) * (1.0 + SIGMA_SLACK);
+    if sigma < SIGMA_MOST { sigma } else { SIGMA_MOST }
 }
 
 /// Largest distance of a row's children from it.

@@ -19,7 +19,8 @@ use super::row_kernels::{EvaluateRows, StepRows, evaluate_block};
 use crate::base::eight::{EightKernel, with_avx2};
 use crate::base::simd::{Kernel, SimdPath, dispatch};
 use crate::scene::columns::{Column, Columns};
-use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, RowsNow};
+use crate::scene::log_scales::LogScaleRange;
+use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, RowsNow, scales_of};
 use crate::scene::state::SceneState;
 
 /// Rows per task of parallel work.
@@ -147,6 +148,10 @@ impl RowsNow for AdamNow<'_> {
         self.evaluate_value(column, value, m, v, stamp)
     }
 
+    fn log_scales(&self) -> LogScaleRange {
+        self.adam().log_scales()
+    }
+
     fn sizes_and_opacities(&self, rows: &Rows<'_>, log_scales: &mut [f32], opacities: &mut [f32]) {
         dispatch(self.simd(), SizeRows { at: self, rows, log_scales, opacities });
     }
@@ -158,6 +163,7 @@ impl RowsNow for AdamNow<'_> {
         }
         let mut value = [0.0; BLOCK_LANES];
         self.evaluate_row(&rows.as_ref(), row, &mut value);
+        self.log_scales().clamp_all(scales_of(&mut value));
         rows.columns.store_row_any(row, &value);
         let decay = self.settled_decay(stamp);
         let (mut m, mut v) = ([0.0; BLOCK_LANES], [0.0; BLOCK_LANES]);

@@ -18,16 +18,11 @@ use super::decay::Decay;
 use super::drift::{EpsFloor, drifted, flush, needs_direct_sum};
 use super::moments::{Moments, round_block};
 use super::row_vectors::{RowVectors, Table, TableMut, is_of_row_behind};
+use crate::base::math::LARGEST_GRAD;
 use crate::base::simd::{Kernel, LANES};
 use crate::scene::columns::Column;
+use crate::scene::log_scales::LogScaleRange;
 use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, Rows, RowsMut, RowsNow, SH_N_LANE};
-
-/// Larger gradients are treated as non-finite: their square must not overflow the second moment. Below this limit every
-/// number that an update computes from finite state is finite.
-pub(super) const LARGEST_GRAD: f32 = 1e18;
-/// Log-scales are clamped to this at every update: standard deviations of 1e-13 to 1e13 scene units, whose squares and
-/// projections stay finite. Successful training never reaches it.
-const LOG_SCALE_LIMIT: f32 = 30.0;
 
 /// Rows to prefetch ahead.
 pub(super) const AHEAD: usize = 8;
@@ -301,8 +296,9 @@ fn round_row<const W: usize>(m: &mut ColumnsMut<'_>, v: &mut ColumnsMut<'_>, row
 
 /// Constants of one ordinary Adam step.
 pub(super) struct StepConstants {
-    /// Limits on the magnitudes of the narrow columns, by lane.
-    pub limits: [f32; LANES],
+    /// Least and greatest values of the narrow columns, by lane: the range of log-scales, no limit elsewhere.
+    pub lows: [f32; LANES],
+    pub highs: [f32; LANES],
     /// lr / (1 - beta1^t).
     pub sizes: OfLanes,
     pub inv_root_correction: f32,
@@ -316,8 +312,11 @@ impl StepConstants {
         let (tables, now) = (at.adam().tables(), at.now());
         let [inv_bias1, inv_root] = tables.bias(now + 1);
         let AdamConfig { beta1, beta2, eps } = tables.config();
+        let LogScaleRange { low, high } = at.adam().log_scales();
+        let of_scales = |limit: f32, none: f32| OfLanes::new(|c| if c == Column::Scales { limit } else { none }).narrow;
         StepConstants {
-            limits: OfLanes::new(|c| if c == Column::Scales { LOG_SCALE_LIMIT } else { f32::INFINITY }).narrow,
+            lows: of_scales(low, f32::NEG_INFINITY),
+            highs: of_scales(high, f32::INFINITY),
             sizes: OfLanes::new(|column| (tables.rates().at(column, now) * inv_bias1) as f32),
             inv_root_correction: inv_root as f32,
             one_minus_b1: (1.0 - beta1) as f32,
@@ -344,10 +343,10 @@ impl StepConstants {
             (value[l], m[l], v[l]) = self.step_value(value[l], m[l], v[l], g[l], decay, self.sizes.sh_n);
         }
         for l in 0..SH_N_LANE {
-            let limit = self.limits[l];
+            let (low, high) = (self.lows[l], self.highs[l]);
             // Not f32::clamp, which checks its limits.
-            value[l] = if value[l] > limit { limit } else { value[l] };
-            value[l] = if value[l] < -limit { -limit } else { value[l] };
+            value[l] = if value[l] > high { high } else { value[l] };
+            value[l] = if value[l] < low { low } else { value[l] };
         }
     }
 

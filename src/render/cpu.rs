@@ -105,6 +105,8 @@ pub struct CpuRenderer {
     /// Most bytes of intersections that are listed at once; `None`: all of them.
     list_bytes: Option<u64>,
     footprints: FootprintGradients,
+    /// Rows of the view with unusable gradients.
+    unusable: u64,
     image_loss: ImageLoss,
     loss_value: Option<LossValue>,
     gradient: PictureGradient,
@@ -205,7 +207,8 @@ impl CpuRenderer {
                 fold_weights(part.is_first, rows, &self.chunk_offsets, &self.weight_partials, &mut self.weights);
             }
             let counts = [counts, &self.packed.counts].map(Vec::as_slice);
-            fold_rows(part, counts, &self.chunk_offsets, &self.partials, &self.projected, &mut self.footprints);
+            self.unusable =
+                fold_rows(part, counts, &self.chunk_offsets, &self.partials, &self.projected, &mut self.footprints);
         }
         self.ranges = ranges;
     }
@@ -392,6 +395,11 @@ impl Renderer for CpuRenderer {
             grads.weights.extend_from_slice(&self.weights[place]);
         }
         Ok(())
+    }
+
+    fn unusable_splats(&mut self) -> Result<u64, RenderError> {
+        self.sequence.splat_gradients("unusable_splats")?;
+        Ok(self.unusable)
     }
 
     fn loss_value(&mut self) -> Result<LossValue, RenderError> {

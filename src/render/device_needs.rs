@@ -19,6 +19,9 @@ const WHOLE_ISECT_BYTES: u64 = BYTES_OF_ISECT;
 /// Bytes of small buffers: uniforms, counts, sums, and the smallest staging.
 const SMALL_BYTES: u64 = 192 << 10;
 
+/// Most tiles that a row of a grown scene is expected to reach, on average over the rows in view.
+const ISECTS_PER_ROW: u64 = 32;
+
 /// The sizes of a view.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ViewSizes {
@@ -43,11 +46,13 @@ impl ViewSizes {
         }
     }
 
-    /// The view with `growth` times as many Gaussians.
+    /// The view with `growth` times as many Gaussians. A few that cover the picture say little about many, which are
+    /// smaller: their intersections are taken to be those of ordinary scenes.
     pub fn grown(self, growth: f64) -> ViewSizes {
         let [rows, isects, longest_list] =
             [self.rows, self.isects, self.longest_list].map(|size| (size as f64 * growth).ceil() as u64);
-        ViewSizes { rows, isects, longest_list, ..self }
+        let isects = isects.min(self.isects.max(rows.saturating_mul(ISECTS_PER_ROW)));
+        ViewSizes { rows, isects, longest_list: longest_list.min(rows), ..self }
     }
 }
 

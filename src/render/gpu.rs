@@ -49,7 +49,7 @@ use super::gpu_rows::{DeviceColumns, RowStages, SplatRows};
 use super::gpu_segments::{self, Segment};
 use super::gpu_tiles::{Blend, Demand, Pixels, TileStages, splat_bytes};
 use super::gpu_tiles_bwd::{Fold, PictureGradientBuffers};
-use super::gpu_view::{DemandState, Lists, Loss, LossSums, RowsIn, View, WholeLists, WholeRows, blend_of};
+use super::gpu_view::{DemandState, Lists, Loss, LossSums, RowsIn, Unusable, View, WholeLists, WholeRows, blend_of};
 use super::sequence::{Sequence, ViewOptions};
 use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches};
 use crate::gpu::{Buffer, DeviceKind, Gpu, GpuResult, Recorder, Traffic};
@@ -395,7 +395,7 @@ impl GpuRenderer {
         let v_rgb = v_rgb.ok_or(RenderError::OutOfOrder { call: "picture_back", needs: "loss or picture_gradient" })?;
         let (v_rgb, v_alpha) = (v_rgb.view(), v_alpha.as_ref().map(Buffer::view));
         let gradient = PictureGradientBuffers { v_rgb: &v_rgb, v_alpha: v_alpha.as_ref() };
-        view.tiles_back = None;
+        (view.tiles_back, view.unusable) = (None, Unusable::Uncounted);
         match &mut view.lists {
             Lists::Whole(lists) => {
                 let (WholeLists { ranks, frame, .. }, DemandState::Known(demand)) = (&**lists, &lists.demand) else {
@@ -451,14 +451,40 @@ impl GpuRenderer {
         out.prepare(place.len(), rows.sh_degree, grads);
         if let (Some(columns), Some(segment)) = (&view.columns, view.segments.first()) {
             let room = RowGradients::new(gpu, columns.rows, sh_degree)?;
-            let recorder = view.tiles_back.take().map_or_else(|| gpu.begin("backward"), |tiles| gpu.resume(tiles));
+            let mut recorder = view.tiles_back.take().map_or_else(|| gpu.begin("backward"), |tiles| gpu.resume(tiles));
+            match self.tiles.count_unusable(&mut recorder, &view.segments, view.blend()) {
+                Ok(unusable) => view.unusable = Unusable::Pending(unusable),
+                Err(error) => {
+                    // The work that the recorder brings along goes on even if the count lacks memory.
+                    gpu.submit(recorder)?;
+                    return Err(error.into());
+                }
+            }
             return Ok(out.whole(recorder, columns, &room, segment, grads, &mut self.scratch)?);
         }
-        if let Some(tiles) = view.tiles_back.take() {
-            gpu.submit(gpu.resume(tiles))?;
+        if view.tiles_back.is_some() || matches!(view.unusable, Unusable::Uncounted) {
+            let mut recorder = view.tiles_back.take().map_or_else(|| gpu.begin("backward"), |tiles| gpu.resume(tiles));
+            let unusable = self.tiles.count_unusable(&mut recorder, &view.segments, view.blend());
+            gpu.submit(recorder)?;
+            view.unusable = Unusable::Pending(unusable?);
         }
         let of_batch = view.segments.iter().filter(|segment| place.contains(&segment.first));
         Ok(out.in_chunks(rows, place.start, of_batch, grads, &mut self.scratch)?)
+    }
+
+    /// Waits for the number of rows with unusable gradients.
+    fn read_unusable(view: &mut View) -> GpuResult<u64> {
+        let unusable = match std::mem::replace(&mut view.unusable, Unusable::Uncounted) {
+            Unusable::Pending(readback) => {
+                let mut count = [0u32];
+                readback.copy_to(&mut count)?;
+                u64::from(count[0])
+            }
+            Unusable::Known(count) => count,
+            Unusable::Uncounted => 0,
+        };
+        view.unusable = Unusable::Known(unusable);
+        Ok(unusable)
     }
 
     /// Waits for the sums of the loss of a valid picture and returns the value of the loss.
@@ -608,6 +634,11 @@ impl Renderer for GpuRenderer {
     fn rows_out(&mut self, batch: usize, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError> {
         let (_, place) = self.sequence.rows_out(batch, rows)?;
         self.with_view("rows_out", |renderer, view| renderer.rows_out_of(view, rows, &place, grads))
+    }
+
+    fn unusable_splats(&mut self) -> Result<u64, RenderError> {
+        self.sequence.splat_gradients("unusable_splats")?;
+        self.with_view("unusable_splats", |_, view| Ok(GpuRenderer::read_unusable(view)?))
     }
 
     fn loss_value(&mut self) -> Result<LossValue, RenderError> {

@@ -39,6 +39,7 @@ pub(super) struct Pipelines {
     rasterize_fwd: Arc<Pipeline>,
     pub(super) rasterize_bwd: Arc<Pipeline>,
     pub(super) fold_rows: Arc<Pipeline>,
+    pub(super) count_unusable: Arc<Pipeline>,
 }
 
 /// The parameters of blending besides splats.
@@ -189,6 +190,7 @@ impl TileStages {
             rasterize_fwd: get("rasterize_fwd", "rasterize_fwd")?,
             rasterize_bwd: get("rasterize_bwd", "rasterize_bwd")?,
             fold_rows: get("rasterize_bwd", "fold_rows")?,
+            count_unusable: get("rasterize_bwd", "count_unusable")?,
         };
         let binding_words = u32::try_from(gpu.max_binding_bytes() / 4).unwrap_or(u32::MAX);
         Ok(TileStages { pipelines, room: FrameRoom { capacity: CAPACITY_MIN, list_max: SEGMENT_FWD }, binding_words })

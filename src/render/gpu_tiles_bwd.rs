@@ -6,8 +6,9 @@
 //! size; 2. the same holds for ranges of tiles ([`Fold::Range`]), whose rows continue the sums of the ranges before; 3. the
 //! order of every sum is fixed.
 
+use super::gpu_segments::{Segment, gradients_of};
 use super::gpu_tiles::{Blend, Demand, Frame, Pixels, Ranks, TileStages, raster_uniforms};
-use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Recorder, groups_1d};
+use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Readback, Recorder, groups_1d};
 use crate::kernels::tile_range::TileRange;
 use crate::kernels::uniforms_tiles::{
     FOLD_CARRIED, FOLD_ROWS, FOLD_UNFINISHED, FOLD_WITHOUT_LISTS, HAS_V_ALPHA, RasterUniforms, SEGMENT_BWD,
@@ -154,6 +155,28 @@ impl TileStages {
         let uniform = recorder.uniform(&fold)?;
         let views = [uniform, splats.clone(), no_list.clone(), no_sums, no_list.clone(), no_list, v_splats.clone()];
         recorder.dispatch("rasterize_bwd", &self.pipelines.fold_rows, &views, groups_1d(rows, FOLD_ROWS))
+    }
+
+    /// Records the count of the rows of all segments with unusable gradients, as
+    /// [`crate::render::Renderer::unusable_splats`] defines them; the result is one u32.
+    ///
+    /// # Errors
+    /// A segment has no gradients, or device memory is exhausted.
+    pub(super) fn count_unusable(
+        &self,
+        recorder: &mut Recorder<'_>,
+        segments: &[Segment],
+        blend: Blend,
+    ) -> GpuResult<Readback> {
+        let unusable = recorder.buffer_zeroed("unusable rows", 4)?;
+        for segment in segments {
+            let mut uniform = raster_uniforms(&blend, TileRange::all(blend.grid), 0, SEGMENT_BWD, 0);
+            uniform.row_count = segment.rows;
+            let views = [recorder.uniform(&uniform)?, gradients_of(segment)?.view(), unusable.view()];
+            let groups = groups_1d(segment.rows, crate::gpu::WORKGROUP);
+            recorder.dispatch("rasterize_bwd", &self.pipelines.count_unusable, &views, groups)?;
+        }
+        recorder.read_back("rasterize_bwd", &unusable.view())
     }
 }
 

@@ -72,6 +72,19 @@ pub(super) struct View {
     pub loss: Option<Loss>,
     /// The tile stages of the backward pass, not submitted yet: the first `rows_out` appends the stages on rows.
     pub tiles_back: Option<Recording>,
+    /// Rows with unusable gradients; [`Unusable::Uncounted`] until the first `rows_out`.
+    pub unusable: Unusable,
+}
+
+/// The number of rows with unusable gradients.
+#[derive(Debug)]
+pub(super) enum Unusable {
+    /// No stage counts them yet.
+    Uncounted,
+    /// The readback is pending.
+    Pending(Readback),
+    /// The host has read the number.
+    Known(u64),
 }
 
 impl View {
@@ -84,7 +97,18 @@ impl View {
         lists: Lists,
     ) -> View {
         let (image_is_read, image_is_corrected) = (false, false);
-        View { of, segments, columns, pixels, lists, image_is_read, image_is_corrected, loss: None, tiles_back: None }
+        View {
+            of,
+            segments,
+            columns,
+            pixels,
+            lists,
+            image_is_read,
+            image_is_corrected,
+            loss: None,
+            tiles_back: None,
+            unusable: Unusable::Uncounted,
+        }
     }
 
     /// Tiles, background and clamp.

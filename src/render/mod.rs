@@ -188,8 +188,8 @@ impl RenderError {
 /// Renders one view at a time, in stages:
 ///
 /// ```text
-/// begin_view ──> rows_in (each batch) ──> picture ──> loss ──> picture_back ──> rows_out (each batch) ──> loss_value
-///                                            │          │
+/// begin_view ──> rows_in (each batch) ──> picture ──> loss ──> picture_back ──> rows_out (each batch) ──> loss_value,
+///                                            │          │                                                 unusable_splats
 ///                                            │          └> picture_gradient: read or change the gradient
 ///                                            └> image: read the picture; picture_mut: correct the picture
 /// ```
@@ -301,6 +301,14 @@ pub trait Renderer: Send {
     /// [`Renderer::picture_back`] has not run, the batch was processed already, or the batch had another number of
     /// rows.
     fn rows_out(&mut self, batch: usize, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError>;
+
+    /// The number of rows of the view whose splats have a gradient that is not finite, or beyond
+    /// [`crate::base::math::LARGEST_SPLAT_GRAD`]: too large for the optimizer. To be called after the first `rows_out`; a
+    /// device does not wait then.
+    ///
+    /// # Errors
+    /// No batch is out yet, or the device failed.
+    fn unusable_splats(&mut self) -> Result<u64, RenderError>;
 
     /// The value of the last [`Renderer::loss`]. On a device, a call after `rows_out` does not wait.
     ///

@@ -161,6 +161,14 @@ impl Sequence {
         Ok(current.view)
     }
 
+    /// Checks that a batch is out of the current backward pass.
+    pub fn splat_gradients(&self, call: &'static str) -> Result<(), RenderError> {
+        match &self.current {
+            Some(current) if current.is_out.contains(&true) => Ok(()),
+            _ => out_of_order(call, "rows_out of a batch"),
+        }
+    }
+
     /// Checks `rows_out`. Returns the view and the range of the batch in the view's rows.
     pub fn rows_out(&mut self, batch: usize, rows: &Columns) -> Result<(ViewOptions, Range<usize>), RenderError> {
         let current = match &mut self.current {

@@ -6,6 +6,7 @@ pub mod events;
 pub mod frustum;
 pub mod image;
 pub mod init;
+pub mod log_scales;
 pub mod neighbours;
 pub mod page_layout;
 pub mod page_meta;

@@ -5,6 +5,7 @@
 //! [`RowBlock`] holds one whole row in a fixed order of lanes, whatever the degree; unused lanes are zero.
 
 use super::columns::{Column, ColumnSet, Columns};
+use super::log_scales::LogScaleRange;
 use super::sightings::views;
 
 /// Floats of a [`RowBlock`]: 16 for the narrow columns, those of fixed width (14 used), 48 for `sh_n` (45 used at
@@ -28,6 +29,12 @@ pub const fn first_lane(column: Column) -> usize {
         Column::Sh0 => 12,
         Column::ShN => SH_N_LANE,
     }
+}
+
+/// The log-scales of a row.
+pub fn scales_of(block: &mut RowBlock) -> &mut [f32] {
+    let first = first_lane(Column::Scales);
+    &mut block[first..first + 3]
 }
 
 /// Shared view of the columns of some rows; each slice is `[rows][width]`.
@@ -259,9 +266,11 @@ pub trait RowsNow: Sync {
     fn evaluate_row(&self, rows: &Rows<'_>, row: usize, out: &mut RowBlock);
     /// Evaluates one value of one column of a row as of now; `element` counts within the row.
     fn evaluate_element(&self, rows: &Rows<'_>, column: Column, row: usize, element: usize) -> f32;
+    /// The range of stored log-scales. Evaluated ones may lie beyond it.
+    fn log_scales(&self) -> LogScaleRange;
     /// Evaluates for all rows, as of now, what densification rounds decide by: the largest log-scale and the opacity
     /// (logit), one entry per row each.
     fn sizes_and_opacities(&self, rows: &Rows<'_>, log_scales: &mut [f32], opacities: &mut [f32]);
-    /// Rewrites the row with its state as of now: values, decayed moments, stamp.
+    /// Rewrites the row with its state as of now: values, with log-scales within their range, decayed moments, stamp.
     fn settle_row(&self, rows: &mut RowsMut<'_>, row: usize);
 }

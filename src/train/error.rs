@@ -58,9 +58,13 @@ pub enum TrainError {
         /// What failed.
         source: Box<TrainError>,
     },
-    /// The loss was not finite several times in a row.
-    #[error("the loss of view {view} was not finite at step {step}, {count} steps in a row\n  remedy: {remedy}")]
+    /// Loss or gradients were not finite several times in a row.
+    #[error(
+        "the run diverged: {problem} at step {step}, view {view}, the last of {count} such steps in a row\n  remedy: {remedy}"
+    )]
     NonFinite {
+        /// What is not finite.
+        problem: String,
         /// The last of these steps.
         step: u32,
         /// View of that step.
@@ -68,7 +72,7 @@ pub enum TrainError {
         /// Consecutive steps.
         count: u32,
         /// Remedy.
-        remedy: &'static str,
+        remedy: String,
     },
 }
 

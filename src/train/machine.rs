@@ -9,6 +9,10 @@ use crate::render::Renderer;
 use crate::render::cpu::CpuRenderer;
 use crate::render::gpu::GpuRenderer;
 
+/// Most worker threads per core, and how many are started on any machine if asked for.
+const THREADS_PER_CORE: usize = 4;
+const THREADS_LEAST_BOUND: usize = 32;
+
 /// Starts the worker threads of `config`, checks its instruction path, and makes a file size limit an ordinary error.
 ///
 /// # Errors
@@ -16,8 +20,16 @@ use crate::render::gpu::GpuRenderer;
 pub fn set_up(config: &TrainConfig) -> InputResult<()> {
     super::signals::survive_file_size_limit();
     if config.threads > 0 {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let (asked, most) = (config.threads as usize, THREADS_LEAST_BOUND.max(THREADS_PER_CORE * cores));
+        if asked > most {
+            eprintln!(
+                "warning: --threads {asked}: {most} are started, since this machine has {cores} cores and every thread \
+                 takes memory; the result does not depend on them"
+            );
+        }
         // An existing pool (of a library user) stays in use: results do not depend on it.
-        let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
+        let _ = rayon::ThreadPoolBuilder::new().num_threads(asked.min(most)).build_global();
     }
     let path = simd_path(config);
     if path.is_supported() {

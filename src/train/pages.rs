@@ -27,6 +27,7 @@ use crate::paging::pinned::PinnedPage;
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
 use crate::scene::events::{Event, EventKind, EventLog};
+use crate::scene::log_scales::LogScaleRange;
 use crate::scene::page_layout::{read_page, write_page};
 use crate::scene::page_meta::{PageBounds, PageMeta};
 use crate::scene::page_split::SplitTooDeep;
@@ -70,7 +71,9 @@ pub struct PagedScene {
 
 impl PageRules {
     pub(super) fn new(options: &RunOptions) -> PageRules {
-        let adam = DeferredAdam::new(options.rates, options.adam, options.render.simd).with_moments(options.moments);
+        let adam = DeferredAdam::new(options.rates, options.adam, options.render.simd)
+            .with_moments(options.moments)
+            .with_log_scales(LogScaleRange::of_scene(options.scene_scale));
         PageRules {
             adam: if options.optimizer == Method::Sparse { adam.without_catch_up() } else { adam },
             events: EventLog::default(),

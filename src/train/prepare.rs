@@ -51,8 +51,10 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
     raw.warnings.extend(dropped);
     let mut dataset = load_dataset(raw, &limits::load_options(config))?;
     check_train_views(scene, &dataset)?;
+    let mut from = scene.to_path_buf();
     let (columns, sh_degree_start) = match gaussians {
         Some((mut columns, meta, ply)) => {
+            from.clone_from(&ply);
             let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
             dataset.warnings.extend(ply_warnings(&ply, &meta, far));
             let in_use = columns.sh_degree.max(limits::first_sh_degree(config));
@@ -60,7 +62,7 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
         }
         None => (first_gaussians(scene, &mut dataset, config)?, limits::first_sh_degree(config)),
     };
-    check_first_rows(scene, config, columns.rows() as u64)?;
+    check_first_rows(&from, config, columns.rows() as u64)?;
     Ok(Prepared { dataset, columns, sh_degree_start })
 }
 
@@ -126,6 +128,10 @@ pub fn ply_warnings(ply: &Path, meta: &PlyMeta, far: u64) -> Vec<String> {
     let mut warnings = Vec::new();
     if meta.dropped > 0 {
         warnings.push(format!("{}: {} Gaussians are not finite and are dropped", ply.display(), meta.dropped));
+    }
+    if meta.opacities_clamped > 0 {
+        let (file, count) = (ply.display(), meta.opacities_clamped);
+        warnings.push(format!("{file}: {count} opacities are exactly 0 or 1, and are read as 1e-6 or 0.999999"));
     }
     if far > 0 {
         warnings.push(format!("{}: {far} Gaussians are too far from this scene and are dropped", ply.display()));

@@ -15,6 +15,10 @@ use crate::scene::partition::first_fill;
 /// Views to render, spread evenly over the dataset.
 const PROBE_VIEWS: usize = 6;
 
+/// Most bytes of a renderer for a row in view that are expected of any scene: splat, gradients and staging, and some twenty
+/// intersections with tiles.
+const RENDERER_ROW_BYTES_MOST: u64 = 2048;
+
 /// Input of an estimate.
 #[derive(Debug, Clone)]
 pub struct Probe {
@@ -74,14 +78,16 @@ pub fn estimate(
     let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver;
     Ok([rows, rows_at_most(config, rows)].map(|rows_then| {
         let growth = rows_then as f64 / rows.max(1) as f64;
+        // The parts of few rows say little about those of many: most of them is what a renderer holds for any number.
+        let most = |bytes: f64, row_bytes: u64| bytes.max((bytes * growth).min((rows_then * row_bytes) as f64));
         let page_rows = config.page_rows as usize;
         let fills_up = growth * first_fill(page_rows, true) as f64 > page_rows as f64;
         MemoryEstimate {
             frames: frames_in_memory(rows_then, last, fills_up),
             staging: 0,
-            view: of_pixels + (of_rows * growth) as u64,
+            view: of_pixels + most(of_rows, WorkingSet::row_bytes(last) as u64 + RENDERER_ROW_BYTES_MOST) as u64,
             view_pixels: of_pixels,
-            working: (working * growth) as u64,
+            working: most(working, WorkingSet::row_bytes(last) as u64) as u64,
             targets,
             index: (pages * growth) as u64 * INDEX_BYTES,
             copies,

@@ -156,7 +156,7 @@ pub struct Summary {
     pub finished: bool,
     /// Gaussians whose update was skipped because a gradient was not finite, over all steps.
     pub rows_skipped_non_finite: u64,
-    /// Steps skipped because the loss was not finite.
+    /// Steps skipped because the loss was not finite, or gradients of more than .01 % of the Gaussians in view.
     pub steps_skipped_non_finite: u32,
     /// Costs of the steps alone.
     #[serde(flatten)]

@@ -23,6 +23,7 @@ use super::progress::Progress;
 use super::report::StepCosts;
 use super::report::{MetricsLog, Summary, write_summary};
 use super::signals::StopFlag;
+use super::soundness::no_view_sees;
 use super::start::Start;
 use super::start::dataset_print;
 use super::tiers::{self, Tiers};
@@ -182,6 +183,9 @@ pub(super) fn plan_and_train(
     let (config, host_mem) = (&request.config, begun.host_mem);
     trainer.renderer.set_list_bytes(host_mem.map(list_bytes));
     let largest = preflight::allow_largest_view(config, dataset, &mut trainer, host_mem);
+    if largest.is_none() {
+        return Err(no_view_sees(dataset, trainer.scene.rows()).into());
+    }
     let probe = Probe::of_run(dataset, &trainer, largest, begun.driver);
     let mut memory = estimate(config, dataset, &mut trainer, &probe)?;
     device_memory::check(config, &memory)?;

@@ -32,6 +32,7 @@ use crate::exchange::ply;
 use crate::paging::pager::Pager;
 use crate::scene::columns::{Columns, row_width};
 use crate::scene::init::InitOptions;
+use crate::scene::log_scales::LogScaleRange;
 use crate::scene::partition::first_fill;
 use crate::scene::state::SceneState;
 use rayon::prelude::*;
@@ -143,7 +144,7 @@ impl Start {
             Ok(())
         })?;
         dataset.warnings.extend(ply_warnings(file, &meta, far));
-        check_first_rows(scene, config, rows)?;
+        check_first_rows(file, config, rows)?;
         let sh_degree_start = gaussians.sh_degree().max(limits::first_sh_degree(config));
         Ok(Start { dataset, sh_degree_start, rows, points: print.digest(), from: FirstRows::Gaussians(gaussians) })
     }
@@ -197,12 +198,19 @@ impl Start {
     ) -> Result<(Dataset, PagedScene), TrainError> {
         let mut scene = PagedScene::empty(pager, options);
         let folder = folder_beside(Path::new(&config.spill_dir));
-        self.for_each_page(options, &folder, host_mem, &mut |id, state| Ok(scene.insert_first_page(id, &state)?))?;
+        let insert = &mut |id, state: SceneState| Ok(scene.insert_first_page(id, &state)?);
+        let moved = self.for_each_page(options, &folder, host_mem, insert)?;
+        if moved > 0 {
+            eprintln!(
+                "warning: {moved} log-scales of the first Gaussians are beyond 1e6 scene sizes (or 1e-13) and are reduced to that"
+            );
+        }
         Ok((self.dataset, scene))
     }
 
-    /// Passes the first pages to `take` in the order of their ids, with the SH degree of the first step. `folder` holds
-    /// temporary files for data that exceeds memory. May be called repeatedly.
+    /// Passes the first pages to `take` in the order of their ids, with the SH degree of the first step and log-scales
+    /// within the range of the scene. Returns how many log-scales were moved into it. `folder` holds temporary files for
+    /// data that exceeds memory. May be called repeatedly.
     ///
     /// # Errors
     /// The source cannot be read again, or `take` failed.
@@ -212,7 +220,8 @@ impl Start {
         folder: &Path,
         host_mem: Option<u64>,
         take: &mut dyn FnMut(PageId, SceneState) -> Result<(), TrainError>,
-    ) -> Result<(), TrainError> {
+    ) -> Result<u64, TrainError> {
+        let (range, mut moved) = (LogScaleRange::of_scene(options.scene_scale), 0);
         let (sh_degree, budget) = (options.sh_degree_at(0), budget(folder, host_mem));
         let fill = first_fill(options.page_rows, options.strategy.grows());
         let frame = self.dataset.frame;
@@ -220,6 +229,7 @@ impl Start {
         // Keep the error of `take` itself: the import would wrap it.
         let mut take_state = |id, mut state: SceneState| {
             state.raise_sh_degree(sh_degree);
+            moved += range.clamp_all(&mut state.columns.scales);
             take(id, state).map_err(|error| not_stored(failed.insert(error)))
         };
         let done = match &mut self.from {
@@ -238,16 +248,21 @@ impl Start {
             FirstRows::Store(store) => {
                 let (frame, sizes) = ((frame.origin.to_array(), frame.scale), (options.page_rows, sh_degree));
                 let mut number = 0;
-                return store.for_each_page(frame, sizes, &mut |state| {
+                store.for_each_page(frame, sizes, &mut |mut state| {
+                    moved += range.clamp_all(&mut state.columns.scales);
                     take(PageId::initial(number), state)?;
                     number += 1;
                     Ok(())
-                });
+                })?;
+                return Ok(moved);
             }
         };
         match failed {
             Some(error) => Err(error),
-            None => Ok(done?),
+            None => {
+                done?;
+                Ok(moved)
+            }
         }
     }
 }

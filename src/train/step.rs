@@ -5,8 +5,8 @@
 //! A view whose pages fit into the frames is one batch, which stays pinned between the two passes. A larger view is several
 //! batches; its pass out walks them backwards, since the last batches are still in memory then.
 //!
-//! Invariants: 1. every pinned page is released, whatever happens; 2. a step whose rendering fails, or whose loss is not
-//! finite, changes no row, except that events which were due on the pages are applied; 3. the result is the same for any
+//! Invariants: 1. every pinned page is released, whatever happens; 2. a step whose rendering fails, or which is skipped
+//! ([`Skipped`]), changes no row, except that events which were due on the pages are applied; 3. the result is the same for any
 //! number of threads and frames, and for any cut into batches; 4. an error after the first update of several batches is
 //! [`TrainError::Torn`]: the pages in memory belong to no step then.
 
@@ -23,6 +23,23 @@ use crate::paging::pinned::PinnedPage;
 use crate::render::{LossValue, RenderOptions, Renderer, RowBatches};
 use crate::scene::camera::Camera;
 use std::collections::VecDeque;
+
+/// More than one row in so many with unusable gradients skip a step.
+const ROWS_PER_UNUSABLE: u64 = 10_000;
+
+/// Whether so many of the rows of a view are too many to go on without them.
+fn are_too_many(unusable: u64, rows: usize) -> bool {
+    unusable.saturating_mul(ROWS_PER_UNUSABLE) > rows as u64
+}
+
+/// Why a step changed nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Skipped {
+    /// The loss was not finite.
+    Loss,
+    /// More than .01 % of the rows of the view had gradients that were not finite or far too large; how many.
+    Gradients(u64),
+}
 
 /// What a step did.
 #[derive(Debug, Clone, Copy, Default)]
@@ -41,8 +58,17 @@ pub struct StepOutcome {
     pub updated: u64,
     /// Rows left as they were because a gradient or a result was not finite.
     pub rows_skipped: u64,
-    /// The loss was not finite: nothing was changed.
-    pub skipped: bool,
+    /// Why nothing was changed; `None` for a step that was taken.
+    pub skipped: Option<Skipped>,
+    /// Rows of the view that were drawn; counted only where no row was rewritten.
+    pub drawn: u64,
+}
+
+impl StepOutcome {
+    /// Whether something is wrong with the numbers of the view: the step was skipped, or more than .01 % of its rows were.
+    pub fn is_unsound(&self) -> bool {
+        self.skipped.is_some() || are_too_many(self.rows_skipped, self.rows)
+    }
 }
 
 /// Trains on one view at 0-based `step`: pins its pages batch by batch, applies the events that are due, gathers the rows,
@@ -185,7 +211,7 @@ impl Passes<'_> {
     }
 
     /// One batch of the pass out, which is the first of them where its pages are still pinned. Whether the step ends here because
-    /// its loss is not finite.
+    /// it is skipped.
     fn batch_out(&mut self, batch: Batch, collects: bool) -> Result<bool, TrainError> {
         let is_first = self.batches.len() + 1 == self.outcome.batches;
         if !is_first {
@@ -199,17 +225,30 @@ impl Passes<'_> {
         self.renderer.rows_out(self.batches.len(), columns, gradients)?;
         if is_first {
             self.outcome.loss = self.renderer.loss_value()?;
-            self.outcome.skipped = !self.outcome.loss.loss.is_finite();
+            self.outcome.skipped = self.why_skipped()?;
         }
         self.prefetch_before_last();
-        if self.outcome.skipped {
+        if self.outcome.skipped.is_some() {
             return Ok(true);
         }
         let StepCounts { updated, skipped_non_finite } =
             update(self.scene, &mut self.pinned, self.step, self.camera, self.working, collects);
         self.outcome.updated += updated as u64;
         self.outcome.rows_skipped += skipped_non_finite as u64;
+        if updated == 0 {
+            let radii = &self.working.gradients.radii;
+            self.outcome.drawn += radii.iter().filter(|radii| **radii != [0, 0]).count() as u64;
+        }
         Ok(false)
+    }
+
+    /// Why the step is skipped, decided for the whole view before its first batch is updated.
+    fn why_skipped(&mut self) -> Result<Option<Skipped>, TrainError> {
+        if !self.outcome.loss.loss.is_finite() {
+            return Ok(Some(Skipped::Loss));
+        }
+        let unusable = self.renderer.unusable_splats()?;
+        Ok(are_too_many(unusable, self.outcome.rows).then_some(Skipped::Gradients(unusable)))
     }
 
     /// Begins reads during the pass in: of the next batch, or of the next steps where there is none.

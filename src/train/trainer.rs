@@ -1,9 +1,12 @@
-//! The trainer: the state of a run and one step of it, with the order of views and the events after a step. The loop
+//! The trainer: the state of a run and one step of it, with the order of views and the events between two steps. The loop
 //! lies in [`super::training_loop`].
 //!
+//! The events that follow a step are logged when the next step begins. So evaluations, saves and commits between two
+//! steps, and the result of a run, show the scene before an opacity reset instead of right after it.
+//!
 //! Invariants: 1. the state after step s is a function of dataset, config and s alone; threads, budgets, logging and
-//! evaluation do not change it; 2. a step with a non-finite loss changes no row, and three such steps in a row end the
-//! run with the result of the last good step.
+//! evaluation do not change it; 2. a skipped step changes no row ([`super::step::Skipped`]), and three of them in a row end
+//! the run with the result of the last good step; 3. the events of a step are logged once.
 
 use super::budget::HostBudget;
 use super::comparison::Comparison;
@@ -12,6 +15,7 @@ use super::error::TrainError;
 use super::eval::{EvalRequest, evaluate};
 use super::pages::PagedScene;
 use super::report::{TestMetrics, TierTraffic};
+use super::soundness::{Idle, note_soundness};
 use super::step::{StepOutcome, train_step};
 use super::view::rehearse;
 use super::working_set::WorkingSet;
@@ -34,8 +38,6 @@ use crate::schedule::order::{Order, ViewOrder};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// Consecutive steps with a non-finite loss that end a run.
-const NON_FINITE_STEPS_MAX: u32 = 3;
 /// Views whose photos are prefetched.
 const PREFETCH_VIEWS: u32 = 8;
 
@@ -66,6 +68,8 @@ pub struct Trainer {
     pub(super) whole_rows: u64,
     /// The largest share of the rows in its pages that a view has drawn so far.
     pub(super) visible_share: f64,
+    /// The steps since a row was last rewritten.
+    idle: Idle,
 }
 
 fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
@@ -131,6 +135,7 @@ impl Trainer {
             pages_most: usize::MAX,
             whole_rows: 0,
             visible_share: 0.0,
+            idle: Idle::default(),
         }
     }
 
@@ -215,12 +220,13 @@ impl Trainer {
         self.scene.events()
     }
 
-    /// Runs one step and logs the events that follow it.
+    /// Logs the events that follow the last step, and runs one step.
     ///
     /// # Errors
-    /// A photo cannot be decoded, pages could not be pinned, the renderer failed, or the loss was not finite
-    /// `NON_FINITE_STEPS_MAX` times in a row.
+    /// A photo cannot be decoded, pages could not be pinned, the renderer failed, the run diverged, or nothing counts in it
+    /// ([`super::soundness`]).
     pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
+        self.log_due_events();
         let view = self.next_view();
         let mut ahead = Vec::new();
         self.order.upcoming(self.state.step, PREFETCH_VIEWS.min(self.options.steps - self.state.step), &mut ahead);
@@ -253,14 +259,14 @@ impl Trainer {
         };
         let outcome = stepped.map_err(|error| error.with_view_name(&dataset.views[view].name))?;
         self.note_view(outcome.rows, outcome.rows_pinned, outcome.batches == 1);
-        self.count_skipped(&outcome, &dataset.views[view].name)?;
+        note_soundness(&mut self.state, &outcome, &dataset.views[view].name, &self.options.init_ply)?;
+        self.idle.note(&outcome, (self.state.step, self.scene.rows()), &target, dataset)?;
         if self.options.optimizer == Method::Dense {
             // The step has changed rows; an error here leaves a state between two steps.
             self.is_torn = true;
             settle_all(&mut self.scene, self.state.step + 1)?;
             self.is_torn = false;
         }
-        self.log_events();
         self.state.step += 1;
         self.state.train_seconds += started.elapsed().as_secs_f64();
         Ok(outcome)
@@ -286,28 +292,14 @@ impl Trainer {
         self.visible_share = self.visible_share.max(visible as f64 / in_pages.max(1) as f64);
     }
 
-    fn count_skipped(&mut self, outcome: &StepOutcome, view: &str) -> Result<(), TrainError> {
-        self.state.rows_skipped += outcome.rows_skipped;
-        if !outcome.skipped {
-            self.state.steps_skipped_in_a_row = 0;
-            return Ok(());
+    /// Decides and logs the events of the last step, unless that is done. They act on values after that step's update.
+    pub(super) fn log_due_events(&mut self) {
+        let Some(step) = self.state.step.checked_sub(1) else { return };
+        // An attempt of the coming step has logged them, or an earlier version of the program, right after the step.
+        if self.events().events().last().is_some_and(|last| last.step >= step) {
+            return;
         }
-        self.state.steps_skipped += 1;
-        self.state.steps_skipped_in_a_row += 1;
-        if self.state.steps_skipped_in_a_row < NON_FINITE_STEPS_MAX {
-            return Ok(());
-        }
-        Err(TrainError::NonFinite {
-            step: self.state.step,
-            view: view.to_string(),
-            count: self.state.steps_skipped_in_a_row,
-            remedy: "lower the learning rates; with the default rates, report this as a bug and attach the scene",
-        })
-    }
-
-    /// Decides and logs the events of this step. They act on values after the step's update.
-    fn log_events(&mut self) {
-        let (step, scale) = (self.state.step, self.options.scene_scale);
+        let scale = self.options.scene_scale;
         let rows = self.scene.rows_bound();
         let kinds = self.options.strategy.events_after(step, scale, rows, &self.scene.histogram);
         kinds.into_iter().for_each(|kind| self.scene.log_event(Event { step, kind }));

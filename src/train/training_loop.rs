@@ -43,6 +43,7 @@ impl Trainer {
         outputs: &mut LoopOutputs<'_>,
     ) -> Result<(), TrainError> {
         while self.state.step < self.options.steps && outputs.stop.exit_code().is_none() {
+            self.log_due_events();
             self.start_paging_if_outgrown(outputs)?;
             let step = self.state.step;
             let before = self.renderer.traffic();

@@ -267,7 +267,51 @@ fn every_pixel_format_becomes_rgb8() {
     assert_eq!((&targets[1].rgb[..3], &targets[1].rgb[3 * 40..][..3]), (&[200, 100, 50][..], &[0, 0, 0][..]));
     assert_eq!(&targets[2].rgb[3 * (2 * 64 + 5)..][..3], &[5, 2, 255]);
     assert_eq!(targets[3].rgb, noise_photo(64, 48, 3).into_raw());
-    assert!(targets.iter().all(|t| t.mask.is_none()));
+    // Transparent pixels are left out, or show the background.
+    let opaque: Vec<u8> = (0..64 * 48).map(|i| if i % 64 < 32 { 255 } else { 0 }).collect();
+    assert_eq!(targets[1].mask.as_ref(), Some(&opaque));
+    assert!([0, 2, 3, 4].into_iter().all(|i| targets[i].mask.is_none()));
+    assert!(has_warning(&dataset, "1 photos have an alpha channel"));
+    let over = LoadOptions { masks: false, background: [0, 128, 255], ..LoadOptions::default() };
+    let target = decode(&load_dataset(raw, &over).unwrap().views[1].photo).unwrap();
+    assert_eq!((&target.rgb[..3], &target.rgb[3 * 40..][..3]), (&[200, 100, 50][..], &[0, 128, 255][..]));
+    assert_eq!(target.mask, None);
+}
+
+/// At the edge of a cut-out object, colours are those of its opaque part, whatever lies hidden under the transparent one.
+#[test]
+fn alpha_is_a_mask_at_any_size_and_under_a_lens() {
+    let (folder, raw) = noise_scene(3);
+    let rgba = RgbaImage::from_fn(64, 48, |x, _| {
+        if x < 33 { image::Rgba([200, 100, 50, 255]) } else { image::Rgba([255, 255, 255, 0]) }
+    });
+    rgba.save(folder.path().join("images/p01.png")).unwrap();
+    let soft = RgbaImage::from_fn(64, 48, |x, _| image::Rgba([200, 100, 50, if x < 32 { 200 } else { 127 }]));
+    soft.save(folder.path().join("images/p02.png")).unwrap();
+    let options = LoadOptions { data_factor: 2.0, ..LoadOptions::default() };
+    let dataset = load_dataset(raw.clone(), &options).unwrap();
+    let [cut, soft] = [1, 2].map(|i| decode(&dataset.views[i].photo).unwrap());
+    let mask = cut.mask.unwrap();
+    // Column 16 of 32 is half opaque: it counts, in the colour of its opaque half.
+    assert!((0..32).all(|x| (mask[x] == 255) == (x <= 16)));
+    // Roundings to 8 bits of a colour times alpha, and of its quotient by alpha, which is 1/2 here.
+    assert!(
+        cut.rgb[3 * 16..][..3].iter().zip([200, 100, 50]).all(|(c, want)| c.abs_diff(want) <= 2),
+        "{:?}",
+        &cut.rgb[48..51]
+    );
+    assert!((0..32).all(|x| (soft.mask.as_ref().unwrap()[x] == 255) == (x < 16)));
+    assert!(soft.rgb[..3].iter().zip([200, 100, 50]).all(|(c, want)| c.abs_diff(want) <= 1));
+    let mut bent = raw;
+    for view in &mut bent.views {
+        view.intrinsics.lens = Lens::Radial([-0.05, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    }
+    let dataset = load_dataset(bent, &LoadOptions::default()).unwrap();
+    let target = decode(&dataset.views[1].photo).unwrap();
+    let mask = target.mask.unwrap();
+    let middle = |x: usize| 24 * 64 + x;
+    assert!(mask[middle(10)] == 255 && mask[middle(50)] == 0, "the lens moves the edge by less than 10 pixels");
+    assert_eq!(&target.rgb[3 * middle(10)..][..3], &[200, 100, 50]);
 }
 
 #[test]

@@ -9,10 +9,12 @@ use gsscale::densify::replay::apply_event;
 use gsscale::densify::stats::{GradHistogram, accumulate};
 use gsscale::densify::strategy::Strategy;
 use gsscale::optim::adam::AdamConfig;
+use gsscale::optim::bounds::SplitLimits;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::events::{Event, EventKind, EventLog, RoundThresholds};
+use gsscale::scene::log_scales::LogScaleRange;
 use gsscale::scene::state::SceneState;
 use gsscale::train::catch_up;
 use std::collections::{BTreeMap, HashMap};
@@ -259,4 +261,33 @@ fn a_reset_caps_opacities_for_good_and_spares_rows_that_it_does_not_change() {
     }
     assert_eq!(outcome.reset_rows, rewritten);
     assert!(rewritten > 200 && rewritten < 400);
+}
+
+/// A log-scale that drifts beyond the range of exp, as under a rate of 20: its children and its settled row are finite.
+#[test]
+fn rows_whose_log_scales_drift_beyond_reason_stay_finite() {
+    let adam =
+        DeferredAdam::new(Rates { scales: 20.0, ..Rates::new(1.0, 5000) }, AdamConfig::default(), SimdPath::best());
+    let range = LogScaleRange::of_scene(2.0);
+    let adam = adam.with_log_scales(range);
+    let mut start = scene(64, 0);
+    start.columns.scales.fill(range.high);
+    // Moments that move a log-scale by some rates more.
+    start.exp_avg.scales.fill(-1.0);
+    start.exp_avg_sq.scales.fill(1.0);
+    start.grad2d.fill(1.0);
+    start.count.fill(1);
+    let drifted = evaluate_all(&start, &adam, 41);
+    assert!(drifted.scales.iter().all(|&s| s > 100.0), "nothing drifts, so the test shows little");
+    let round = RoundThresholds { grow_grad2d: 0.5, split_scale: 0.1, prune_opacity: 0.0, prune_scale: f32::INFINITY };
+    for kind in [EventKind::Densify(round), EventKind::ResetOpacity { max_opacity: 0.01 }] {
+        let mut state = start.clone();
+        apply_event(&mut state, &adam, SEED, 0, &Event { step: 40, kind });
+        for column in Column::ALL {
+            assert!(state.columns.column(column).iter().all(|x| x.is_finite()), "{kind:?}: {}", column.name());
+        }
+        assert!(state.columns.scales.iter().all(|&s| s <= range.high), "{kind:?}");
+        let bounds = adam.page_bounds(&state.view(), &SplitLimits::NEVER);
+        assert!(bounds.lo.iter().chain(&bounds.hi).all(|x| x.is_finite()) && bounds.sigma_max.is_finite());
+    }
 }

@@ -11,6 +11,7 @@ mod ckpt;
 mod cli;
 #[cfg(unix)]
 mod drive_faults;
+mod extremes;
 mod gpu_train;
 mod growing;
 mod memory;

@@ -62,8 +62,8 @@ fn every_global_change_is_an_event_in_order() {
     let mut trainer = Trainer::new(columns, &dataset, Box::new(CpuRenderer::new()), options).unwrap();
     let mut degrees = Vec::new();
     for _ in 0..config.steps {
-        degrees.push(trainer.render_options().sh_degree);
         trainer.step(&dataset, &targets).unwrap();
+        degrees.push(trainer.render_options().sh_degree);
     }
     // The SH degree follows gsplat: step / 20, at most 2.
     assert!(degrees.iter().enumerate().all(|(step, &d)| usize::from(d) == (step / 20).min(2)), "{degrees:?}");

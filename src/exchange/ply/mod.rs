@@ -82,6 +82,8 @@ pub struct PlyMeta {
     pub antialiased: bool,
     /// When reading: number of rows dropped because a value was not finite.
     pub dropped: u64,
+    /// When reading: number of infinite opacities (logits of 0 and 1), which are read as logits of 1e-6 and 1 - 1e-6.
+    pub opacities_clamped: u64,
 }
 
 impl Default for PlyMeta {
@@ -94,6 +96,7 @@ impl Default for PlyMeta {
             scene_radius: 1.0,
             antialiased: false,
             dropped: 0,
+            opacities_clamped: 0,
         }
     }
 }

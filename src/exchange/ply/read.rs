@@ -3,7 +3,8 @@
 //! Not here: the grammar of the header (`header`), splitting bytes or lines into rows (`rows`).
 //!
 //! Invariants: 1. a count is checked against the bytes left before anything is allocated for it; 2. no input makes this
-//! panic; 3. rows with a non-finite value are dropped and counted, and more than 1 % of them is an error; 4. a
+//! panic; 3. rows with a non-finite value (infinite opacities apart) are dropped and counted, and more than 1 % of them
+//! is an error; 4. a
 //! successful result has at least one row.
 
 use super::header::{Element, Header, Kind, Scalar, parse_header, shorten};
@@ -159,6 +160,9 @@ impl Dropped {
     }
 }
 
+/// Logit of an opacity of 1 - 1e-6, in place of infinity: some programs store an opacity of exactly 0 or 1.
+const OPACITY_MOST: f32 = 13.815_51;
+
 /// Floats of a Gaussian before its higher bands: means, sh0, opacity, scales, quaternion.
 pub const ROW_HEAD: usize = 14;
 
@@ -233,11 +237,15 @@ fn stream_gaussian_rows<R: BufRead>(
     names.extend((0..rest).map(|i| format!("f_rest_{i}")));
     let slots = names.iter().map(|n| Ok(scalar_at(path, vertex, n)?.0)).collect::<InputResult<Vec<usize>>>()?;
     let mut meta = meta_from_comments(path, &header.comments)?;
-    let mut dropped = Dropped::default();
+    let (mut dropped, mut clamped) = (Dropped::default(), 0);
     let (mut values, mut out) = (vec![0.0f32; slots.len()], vec![0.0f32; slots.len()]);
     read_rows(body, vertex, &slots, |row, raw| {
         for (value, &r) in values.iter_mut().zip(raw) {
             *value = r as f32;
+        }
+        if values[6].is_infinite() {
+            values[6] = OPACITY_MOST.copysign(values[6]);
+            clamped += 1;
         }
         if !values.iter().all(|v| v.is_finite()) {
             dropped.add(row);
@@ -253,7 +261,7 @@ fn stream_gaussian_rows<R: BufRead>(
         take(&out)
     })?;
     dropped.check(path, vertex.count)?;
-    meta.dropped = dropped.count;
+    (meta.dropped, meta.opacities_clamped) = (dropped.count, clamped);
     Ok(meta)
 }
 

@@ -7,10 +7,11 @@
 
 use super::super::adam_now::StepCounts;
 use super::super::decay::Decay;
-use super::super::row_kernels::{AHEAD, GradKind, LARGEST_GRAD, StepConstants, StepRows, finish_step};
+use super::super::row_kernels::{AHEAD, GradKind, StepConstants, StepRows, finish_step};
 use super::super::row_vectors::{Table, TableMut, start_of_eight};
 use super::{BLOCK, Eights, Numbers, eight_mut, load, of_lanes};
 use crate::base::eight::{Avx2, EIGHT, Eight, EightKernel};
+use crate::base::math::LARGEST_GRAD;
 use crate::scene::rows::RowsNow;
 
 impl<const W: usize> EightKernel for Eights<StepRows<'_, '_, W>> {
@@ -25,7 +26,8 @@ impl<const W: usize> EightKernel for Eights<StepRows<'_, '_, W>> {
             numbers: Numbers::new(avx2),
             sizes: of_lanes(avx2, &constants.sizes.narrow, constants.sizes.sh_n),
             eps: avx2.splat(constants.eps),
-            limits: &constants.limits,
+            lows: &constants.lows,
+            highs: &constants.highs,
             inv_root_correction: avx2.splat(constants.inv_root_correction),
             one_minus_b1: avx2.splat(constants.one_minus_b1),
             one_minus_b2: avx2.splat(constants.one_minus_b2),
@@ -79,8 +81,9 @@ struct Stepping<'k, const W: usize> {
     /// lr / (1 - beta1^t) by lane.
     sizes: [Eight; 3],
     eps: Eight,
-    /// Limits on the magnitudes of the narrow columns.
-    limits: &'k [f32; 2 * EIGHT],
+    /// Least and greatest values of the narrow columns.
+    lows: &'k [f32; 2 * EIGHT],
+    highs: &'k [f32; 2 * EIGHT],
     inv_root_correction: Eight,
     one_minus_b1: Eight,
     one_minus_b2: Eight,
@@ -181,7 +184,8 @@ impl<const W: usize> Stepping<'_, W> {
     /// A half of the narrow columns, clamped to its limits; NaN stays.
     #[inline(always)]
     fn limited(&self, value: Eight, half: usize) -> Eight {
-        let limit = self.numbers.avx2.load(&self.limits.as_chunks().0[half]);
-        self.numbers.sign.or(limit).larger(limit.smaller(value))
+        let avx2 = self.numbers.avx2;
+        let (low, high) = (avx2.load(&self.lows.as_chunks().0[half]), avx2.load(&self.highs.as_chunks().0[half]));
+        low.larger(high.smaller(value))
     }
 }

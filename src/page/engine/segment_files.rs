@@ -7,6 +7,7 @@
 //! 3. nothing outside the folder is opened: file names are made here, and a symbolic link in place of a segment is an
 //! error; 4. no transfer that [`SegmentFiles::file_of`] accepts touches a byte outside its segment.
 
+use crate::base::error::is_too_many_files;
 use crate::page::engine::buffer::ALIGNMENT;
 use crate::page::engine::page_engine::{Direction, Transfer};
 use std::collections::BTreeMap;
@@ -230,12 +231,6 @@ impl SegmentFiles {
 
 fn sync_data(file: &File, lost: &mut Option<(io::ErrorKind, String)>) -> io::Result<()> {
     file.sync_data().inspect_err(|e| *lost = Some((e.kind(), e.to_string())))
-}
-
-/// Whether a file could not be opened because the process or the system has too many open; closing another file cures
-/// that.
-pub(in crate::page) fn is_too_many_files(error: &io::Error) -> bool {
-    cfg!(unix) && matches!(error.raw_os_error(), Some(23 | 24)) // ENFILE, EMFILE everywhere
 }
 
 /// Opens a file of the store for reading, without following links.

@@ -16,11 +16,12 @@
 //! kernel refuses the ring itself, requests not yet taken end with an error, and taken ones are waited for.
 #![allow(unsafe_code)] // the ring takes addresses of buffers that it owns
 
+use crate::base::error::is_too_many_files;
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::engine::page_cache::{WriteBehind, drop_cached};
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use crate::page::engine::registered::RegisteredBuffers;
-use crate::page::engine::segment_files::{SegmentFiles, is_too_many_files};
+use crate::page::engine::segment_files::SegmentFiles;
 use crate::page::engine::short_transfers::Resume;
 use io_uring::{IoUring, opcode, squeue, types};
 use slab::Slab;

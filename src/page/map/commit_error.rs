@@ -1,5 +1,6 @@
 //! Errors of commits and of opening a store, with their remedies.
 
+use crate::base::error::{REMEDY_TOO_MANY_FILES, is_too_many_files};
 use crate::page::map::entries::MapError;
 use crate::page::versions::page_error::PageError;
 use std::io;
@@ -17,7 +18,7 @@ pub enum CommitError {
     #[error("there is no space for a commit: {0}\n  remedy: free space on the drive of the spill directory")]
     Full(io::Error),
     /// A file beside the map cannot be used.
-    #[error("{name} cannot be used: {source}\n  remedy: check the drive; `gsscale-ckpt salvage` can rebuild the map")]
+    #[error("{name} cannot be used: {source}\n  remedy: {}", file_remedy(.source))]
     File {
         /// Name of the file in the store's folder.
         name: &'static str,
@@ -41,6 +42,14 @@ pub enum CommitError {
     /// The requested generation is not kept.
     #[error("generation {0} is not kept\n  remedy: `gsscale-ckpt ls` lists the kept generations")]
     NotKept(u64),
+}
+
+/// The remedy when a file beside the map cannot be used.
+fn file_remedy(source: &io::Error) -> &'static str {
+    match is_too_many_files(source) {
+        true => REMEDY_TOO_MANY_FILES,
+        false => "check the drive; `gsscale-ckpt salvage` can rebuild the map",
+    }
 }
 
 impl CommitError {

@@ -2,7 +2,7 @@
 //!
 //! Invariant: an error about stored bytes names the segment file, the offset, the page and its generation.
 
-use crate::base::error::is_out_of_space;
+use crate::base::error::{REMEDY_TOO_MANY_FILES, is_out_of_space, is_too_many_files};
 use crate::base::ids::PageId;
 use crate::page::engine::page_engine::Place;
 use crate::page::engine::segment_files::segment_file_name;
@@ -32,13 +32,13 @@ impl std::fmt::Display for SlotName {
 #[derive(Debug, thiserror::Error)]
 pub enum PageError {
     /// Reading failed twice.
-    #[error("{0} cannot be read: {1}\n  remedy: check the drive and cable; roll back to an earlier checkpoint")]
+    #[error("{0} cannot be read: {1}\n  remedy: {remedy}", remedy = remedy_of(.1, "check the drive and cable; roll back to an earlier checkpoint"))]
     Read(SlotName, #[source] io::Error),
     /// The bytes read differ from those written, in two attempts.
     #[error("{0} is damaged: {1}\n  remedy: check the drive; roll back to an earlier checkpoint")]
     Damaged(SlotName, String),
     /// Writing failed. The store accepts no more writes.
-    #[error("{0} cannot be written: {1}\n  remedy: check the drive; committed generations are intact")]
+    #[error("{0} cannot be written: {1}\n  remedy: {remedy}", remedy = remedy_of(.1, "check the drive; committed generations are intact"))]
     Write(SlotName, #[source] io::Error),
     /// No space for the bytes. Nothing is lost, and the write may be repeated.
     #[error("there is no space to write {0}: {1}\n  remedy: free space on the drive of the spill directory")]
@@ -89,9 +89,15 @@ impl PageError {
     }
 }
 
+/// The remedy for a failed transfer, unless only too many files are open.
+fn remedy_of(source: &io::Error, otherwise: &'static str) -> &'static str {
+    if is_too_many_files(source) { REMEDY_TOO_MANY_FILES } else { otherwise }
+}
+
 /// The remedy when a segment cannot be created.
 fn grow_remedy(source: &io::Error) -> &'static str {
     match source.kind() {
+        _ if is_too_many_files(source) => REMEDY_TOO_MANY_FILES,
         _ if is_out_of_space(source.kind()) => "free space on the drive of the spill directory",
         io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => {
             "make the spill directory writable, or name another one"

@@ -5,7 +5,7 @@ use crate::allocation::peak_of;
 use crate::scene_folder::scratch;
 use gsscale::dataset::masks::MaskSource;
 use gsscale::dataset::model::{Intrinsics, Lens};
-use gsscale::dataset::photo::{PhotoSource, decode};
+use gsscale::dataset::photo::{Alpha, PhotoSource, decode};
 use gsscale::dataset::photo_header::{PhotoHeader, read_header};
 use image::{ExtendedColorType, ImageEncoder, ImageFormat};
 use std::io::Cursor;
@@ -51,7 +51,7 @@ fn run(input: &[u8]) {
     }
     let intrinsics = Intrinsics { width, height, fx: 50.0, fy: 50.0, cx: 1.0, cy: 1.0, lens: Lens::Pinhole };
     let target = (width.div_ceil(2), height.div_ceil(2));
-    let source = PhotoSource { image_path: path, header, intrinsics, target, mask: None };
+    let source = PhotoSource { image_path: path, header, intrinsics, target, mask: None, alpha: Alpha::Mask };
     if let Ok(target) = decode(&source) {
         assert_eq!(target.rgb.len(), 3 * target.width as usize * target.height as usize);
     }
@@ -104,7 +104,7 @@ pub fn decoded(bytes: &[u8]) -> [(&'static str, u64, u64); 2] {
     let source = |image_path, header: PhotoHeader, mask| {
         let (width, height) = (header.width, header.height);
         let intrinsics = Intrinsics { width, height, fx: 50.0, fy: 50.0, cx: 1.0, cy: 1.0, lens: Lens::Pinhole };
-        PhotoSource { image_path, header, intrinsics, target: (16, 12), mask }
+        PhotoSource { image_path, header, intrinsics, target: (16, 12), mask, alpha: Alpha::Mask }
     };
     let mask = Some(MaskSource { path: path.clone(), header, invert: false });
     [("a photo", source(path.clone(), header, None)), ("a mask", source(small, of_small, mask))].map(

@@ -36,6 +36,16 @@ pub fn scene(rows: usize, width: u32, height: u32) -> (Columns, Camera) {
     (c, Camera { viewmat, fx, fy, cx, cy, width, height, near_plane: 0.01, far_plane: 1e10 })
 }
 
+/// The rows `place` of a table.
+fn part_of(rows: &Columns, place: Range<usize>) -> Columns {
+    let mut part = Columns { sh_degree: rows.sh_degree, ..Columns::default() };
+    for column in Column::ALL {
+        let width = column.width(rows.sh_degree);
+        *part.column_mut(column) = rows.column(column)[place.start * width..place.end * width].to_vec();
+    }
+    part
+}
+
 /// A smooth photo with a hole in its mask.
 pub fn photo(width: u32, height: u32, masked: bool) -> Target {
     let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
@@ -336,14 +346,7 @@ fn batches_of_rows_change_no_bit() {
     let (rows, camera) = scene(3000, 100, 70);
     let (target, options) = (photo(100, 70, true), RenderOptions::default());
     let loss = LossOptions::default();
-    let part = |place: Range<usize>| {
-        let mut part = Columns { sh_degree: rows.sh_degree, ..Columns::default() };
-        for column in Column::ALL {
-            let width = column.width(rows.sh_degree);
-            *part.column_mut(column) = rows.column(column)[place.start * width..place.end * width].to_vec();
-        }
-        part
-    };
+    let part = |place: Range<usize>| part_of(&rows, place);
     let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
     let mut run = |ends: &[usize], how: RowBatches| {
         let batches: Vec<Columns> = ends.windows(2).map(|ends| part(ends[0]..ends[1])).collect();
@@ -560,5 +563,48 @@ fn assert_gradients(name: &str, file: &Fixture, grads: &Gradients) {
         println!("{name}: {column} {error:.1e}");
         let limit = if name == "raster_stress" { 5e-3 } else { 5e-5 };
         assert!(error < limit, "{name}: {column} {error}");
+    }
+}
+
+/// Rows under a pixel whose gradient is not finite, or enormous, are counted alike on both devices, in one batch and in
+/// several; rows elsewhere are not.
+#[test]
+fn unusable_gradients_are_counted_on_both_devices() {
+    let (rows, camera) = scene(4000, 160, 112);
+    let count = |renderer: &mut dyn Renderer, value: Option<f32>, batches: RowBatches| {
+        let half = rows.rows() / 2;
+        let parts = match batches {
+            RowBatches::One => vec![0..rows.rows()],
+            RowBatches::Several => vec![0..half, half..rows.rows()],
+        };
+        let parts: Vec<Columns> = parts.into_iter().map(|part| part_of(&rows, part)).collect();
+        renderer.begin_view(&camera, &RenderOptions::default(), batches).unwrap();
+        parts.iter().for_each(|part| renderer.rows_in(part).unwrap());
+        renderer.picture().unwrap();
+        let gradient = renderer.picture_gradient().unwrap();
+        gradient.v_rgb.fill(1e-4);
+        if let Some(value) = value {
+            gradient.v_rgb[56 * 160 + 80] = value;
+        }
+        renderer.picture_back().unwrap();
+        assert!(renderer.unusable_splats().is_err(), "no batch is out");
+        let mut grads = Gradients::default();
+        renderer.rows_out(parts.len() - 1, &parts[parts.len() - 1], &mut grads).unwrap();
+        renderer.unusable_splats().unwrap()
+    };
+    let mut gpu = renderer(&GpuOptions::default());
+    let mut renderers: Vec<&mut dyn Renderer> = Vec::new();
+    let mut cpu = CpuRenderer::new();
+    renderers.push(&mut cpu);
+    renderers.extend(gpu.as_mut().map(|gpu| gpu as &mut dyn Renderer));
+    for renderer in renderers {
+        for batches in [RowBatches::One, RowBatches::Several] {
+            assert_eq!(count(&mut *renderer, None, batches), 0);
+            for value in [f32::NAN, f32::INFINITY, 1e30] {
+                let unusable = count(&mut *renderer, Some(value), batches);
+                // One pixel is under some of the rows, and not under most.
+                assert!((1..1000).contains(&unusable), "{} {value}: {unusable}", renderer.name());
+            }
+        }
     }
 }
