@@ -178,7 +178,8 @@ config_keys! {
         refine_stop: u32 = 15_000 => Numbers;
         /// Steps between densification rounds
         refine_every: u32 = 100 => Numbers;
-        /// Steps between opacity resets, to twice --prune-opa; 0 = never
+        /// Steps between opacity resets, to twice --prune-opa; 0 = never. None comes in the last third of such an interval
+        /// before the end of the planned run (at most 1,000 steps), in which opacities recover
         reset_every: u32 = 3000 => Numbers;
         /// Grow Gaussians whose mean screen-space gradient exceeds this
         grow_grad2d: f64 = 2e-4 => Numbers;

@@ -16,7 +16,8 @@
 //! The factor of the rate has a reason: a value whose gradients have changing signs moves like a random walk under
 //! Adam, as far as its rate times the square root of the steps. The factor keeps this distance. The limit of 3 is the
 //! factor that was measured at 3,000 steps. `reset-every` stays as it is, because opacities take a number of steps to
-//! recover, not a share; `refine-stop` ends resets too.
+//! recover, not a share; `refine-stop` ends resets too, and none comes shortly before the end of a run
+//! ([`crate::densify::default`]).
 //!
 //! Not here: which keys are given ([`super::new_run`]).
 //!

@@ -147,6 +147,25 @@ impl Columns {
         c
     }
 
+    /// Keeps the rows for which `is_kept` is true, in order; returns the number of the others.
+    pub fn retain_rows(&mut self, is_kept: impl Fn(&Columns, usize) -> bool) -> u64 {
+        let (rows, mut kept) = (self.rows(), 0);
+        for row in 0..rows {
+            if !is_kept(self, row) {
+                continue;
+            }
+            if kept != row {
+                for column in Column::ALL {
+                    let width = column.width(self.sh_degree);
+                    self.column_mut(column).copy_within(row * width..(row + 1) * width, kept * width);
+                }
+            }
+            kept += 1;
+        }
+        self.resize(kept);
+        (rows - kept) as u64
+    }
+
     /// Number of rows.
     pub fn rows(&self) -> usize {
         self.opacities.len()

@@ -1,15 +1,15 @@
 //! The range of the log-scales of a run, from which every standard deviation and its square stay finite numbers.
 //!
 //! Log-scales are clamped where Gaussians enter a run, where the optimizer updates them, and where an event rewrites or
-//! splits them. Between two updates a log-scale may drift beyond the range by the momentum of its last gradient: such a
-//! value is computed, never stored.
+//! splits them. A file's Gaussians above the range do not enter a run: at such sizes they cover every picture, and no
+//! gradient makes them smaller. Between two updates a log-scale may drift beyond the range by the momentum of its last
+//! gradient: such a value is computed, never stored.
 //!
 //! Invariants: 1. the range is a function of the scene scale, so it is the same for the whole run and on resume; 2. no
-//! Gaussian of a scene that trains well comes near the range: the limits lie 1e6 scene scales and 1e-13 units away.
+//! Gaussian of a scene that trains well comes near the range, which ends at 1e4 scene scales and at 1e-13 units.
 
-/// Largest standard deviation, in scene scales: how far from the cameras a point may lie
-/// (`crate::dataset::frame`). A larger Gaussian surrounds the whole scene.
-const LARGEST_IN_SCENE_SCALES: f64 = 1e6;
+/// Largest standard deviation, in scene scales: for cameras a metre apart, a mountain range.
+const LARGEST_IN_SCENE_SCALES: f64 = 1e4;
 /// Limit of the magnitude of log-scales in any scene: standard deviations of 1e-13 to 1e13 units.
 const LIMIT: f32 = 30.0;
 
@@ -68,8 +68,8 @@ mod tests {
             }
         }
         let range = LogScaleRange::of_scene(2.0);
-        // ln(2e6)
-        assert!((range.high - 14.508_658).abs() < 1e-6);
+        // ln(2e4)
+        assert!((range.high - 9.903_487_6).abs() < 1e-6);
         let mut ordinary = [-20.0, -7.5, 0.0, 3.0, 9.0];
         assert_eq!((range.clamp_all(&mut ordinary), ordinary), (0, [-20.0, -7.5, 0.0, 3.0, 9.0]));
         let mut extreme = [20.0, -7.5, f32::INFINITY];

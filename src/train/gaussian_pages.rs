@@ -6,12 +6,13 @@
 //! Invariants: 1. memory stays within the given bound; 2. pages have the rows of [`crate::scene::partition::partition`]
 //! in its order; the uid of a row is its number in the file.
 
-use super::prepare::truncate_sh;
+use super::prepare::{remove_giants, truncate_sh};
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::dataset::import::{Grown, PageSpace, Spool, SpoolSpace, SpoolWriter, paginate};
 use crate::exchange::ply::{PlyMeta, ROW_HEAD, gaussians_header, push_row, stream_gaussians, take_row, to_local};
 use crate::scene::columns::{Columns, sh_n_width};
+use crate::scene::log_scales::LogScaleRange;
 use crate::scene::partition::Placed;
 use crate::scene::state::SceneState;
 use std::path::{Path, PathBuf};
@@ -53,16 +54,34 @@ pub(super) struct GaussianFile {
     sh_degree_most: u8,
     origin: [f64; 3],
     scale: f64,
+    log_scales: LogScaleRange,
+}
+
+/// What [`GaussianFile::read`] found besides Gaussians.
+#[derive(Debug, Clone)]
+pub(super) struct GaussiansRead {
+    /// The file's metadata.
+    pub meta: PlyMeta,
+    /// Gaussians dropped because they are too far away for the local frame.
+    pub far: u64,
+    /// Gaussians dropped because they are too large for the scene.
+    pub giants: u64,
 }
 
 impl GaussianFile {
-    /// Opens the file for a run of at most `sh_degree_most` in the local frame of `origin` and `scale`.
+    /// Opens the file for a run of at most `sh_degree_most` in the local frame of `origin` and `scale`, with this range of
+    /// log-scales.
     ///
     /// # Errors
     /// The header is invalid.
-    pub fn open(path: &Path, sh_degree_most: u8, (origin, scale): ([f64; 3], f64)) -> InputResult<GaussianFile> {
+    pub fn open(
+        path: &Path,
+        sh_degree_most: u8,
+        (origin, scale): ([f64; 3], f64),
+        log_scales: LogScaleRange,
+    ) -> InputResult<GaussianFile> {
         let (meta, sh_degree) = gaussians_header(path)?;
-        Ok(GaussianFile { path: path.to_path_buf(), meta, sh_degree, sh_degree_most, origin, scale })
+        Ok(GaussianFile { path: path.to_path_buf(), meta, sh_degree, sh_degree_most, origin, scale, log_scales })
     }
 
     /// Degree of the file.
@@ -75,16 +94,16 @@ impl GaussianFile {
         &self.path
     }
 
-    /// Passes the Gaussians to `take` in batches, in the file's order. Returns the file's metadata, and the number of
-    /// Gaussians dropped because they are too far away for the local frame.
+    /// Passes the Gaussians to `take` in batches, in the file's order, without those that are too far away or too large.
     ///
     /// # Errors
     /// The file cannot be read, or `take` failed.
-    pub fn read(&self, take: &mut dyn FnMut(&Columns) -> InputResult<()>) -> InputResult<(PlyMeta, u64)> {
+    pub fn read(&self, take: &mut dyn FnMut(&Columns) -> InputResult<()>) -> InputResult<GaussiansRead> {
         let none = || Columns::zeros(0, self.sh_degree);
-        let (mut some, mut far) = (none(), 0);
+        let (mut some, mut far, mut giants) = (none(), 0, 0);
         let mut hand_on = |mut columns: Columns| {
             far += to_local(&mut columns, &self.meta, self.origin, self.scale);
+            giants += remove_giants(&mut columns, self.log_scales);
             take(&truncate_sh(columns, self.sh_degree_most))
         };
         let meta = stream_gaussians(&self.path, &mut |values| {
@@ -95,7 +114,7 @@ impl GaussianFile {
             }
         })?;
         hand_on(some)?;
-        Ok((meta, far))
+        Ok(GaussiansRead { meta, far, giants })
     }
 }
 

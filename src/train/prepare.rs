@@ -10,8 +10,9 @@ use crate::dataset::loader::{Dataset, load_dataset};
 use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
 use crate::exchange::ply::{PlyContent, PlyMeta, read_ply, to_local};
-use crate::scene::columns::{Columns, sh_n_width};
+use crate::scene::columns::{Column, Columns, sh_n_width};
 use crate::scene::init::{gaussians_from_points, random_points_in_frusta};
+use crate::scene::log_scales::LogScaleRange;
 use std::path::{Path, PathBuf};
 
 /// A dataset with the Gaussians that training starts from.
@@ -56,7 +57,9 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
         Some((mut columns, meta, ply)) => {
             from.clone_from(&ply);
             let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
+            let giants = remove_giants(&mut columns, LogScaleRange::of_scene(dataset.scene_scale));
             dataset.warnings.extend(ply_warnings(&ply, &meta, far));
+            dataset.warnings.extend(giants_warning(&ply, giants));
             let in_use = columns.sh_degree.max(limits::first_sh_degree(config));
             (truncate_sh(columns, config.sh_degree), in_use)
         }
@@ -78,7 +81,7 @@ pub(super) fn check_train_views(scene: &Path, dataset: &Dataset) -> InputResult<
 /// Refuses a start without Gaussians, or with more than --max-gaussians.
 pub(super) fn check_first_rows(from: &Path, config: &TrainConfig, rows: u64) -> InputResult<()> {
     if rows == 0 {
-        let problem = "all first Gaussians are too far from the cameras";
+        let problem = "all first Gaussians are too far from the cameras or too large";
         return Err(InputError::new(from, problem, "give a PLY of this scene with --init-ply"));
     }
     if config.max_gaussians > 0 && rows > config.max_gaussians {
@@ -121,6 +124,17 @@ pub(super) fn truncate_sh(columns: Columns, sh_degree: u8) -> Columns {
     let (from, to) = (sh_n_width(columns.sh_degree), sh_n_width(sh_degree));
     let sh_n = columns.sh_n.chunks_exact(from).flat_map(|row| &row[..to]).copied().collect();
     Columns { sh_degree, sh_n, ..columns }
+}
+
+/// Removes Gaussians that are larger than any of a scene can be; returns how many.
+pub(super) fn remove_giants(columns: &mut Columns, range: LogScaleRange) -> u64 {
+    columns.retain_rows(|columns, row| columns.row(Column::Scales, row).iter().all(|&s| s <= range.high))
+}
+
+/// The warning about `giants` Gaussians that [`remove_giants`] removed, if any.
+pub(super) fn giants_warning(ply: &Path, giants: u64) -> Option<String> {
+    let problem = "Gaussians are larger than 10,000 times the spread of the cameras and are dropped";
+    (giants > 0).then(|| format!("{}: {giants} {problem}", ply.display()))
 }
 
 /// Warnings about Gaussians read from `ply`, of which `far` were dropped by the change of frame.

@@ -9,12 +9,12 @@ use super::dataset_print::view_print;
 use super::dataset_print::{GaussiansPrint, points_print};
 use super::error::TrainError;
 use super::error::not_stored;
-use super::gaussian_pages::{GaussianFile, GaussianSpace, GaussianWriter};
+use super::gaussian_pages::{GaussianFile, GaussianSpace, GaussianWriter, GaussiansRead};
 use super::memory::check_photos_fit;
 use super::pages::{PagedScene, first_pages};
 use super::places::folder_beside;
 use super::prepare::ply_warnings;
-use super::prepare::{Prepared, check_first_rows, check_train_views, prepare};
+use super::prepare::{Prepared, check_first_rows, check_train_views, giants_warning, prepare};
 use super::stores::StoredStart;
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
@@ -136,14 +136,16 @@ impl Start {
         let mut dataset = load_dataset(raw, &limits::load_options(config))?;
         check_train_views(scene, &dataset)?;
         let frame = (dataset.frame.origin.to_array(), dataset.frame.scale);
-        let gaussians = GaussianFile::open(file, config.sh_degree, frame)?;
+        let range = LogScaleRange::of_scene(dataset.scene_scale);
+        let gaussians = GaussianFile::open(file, config.sh_degree, frame, range)?;
         let (mut print, mut rows) = (GaussiansPrint::default(), 0);
-        let (meta, far) = gaussians.read(&mut |columns| {
+        let GaussiansRead { meta, far, giants } = gaussians.read(&mut |columns| {
             print.add(columns);
             rows += columns.rows() as u64;
             Ok(())
         })?;
         dataset.warnings.extend(ply_warnings(file, &meta, far));
+        dataset.warnings.extend(giants_warning(file, giants));
         check_first_rows(file, config, rows)?;
         let sh_degree_start = gaussians.sh_degree().max(limits::first_sh_degree(config));
         Ok(Start { dataset, sh_degree_start, rows, points: print.digest(), from: FirstRows::Gaussians(gaussians) })
@@ -202,7 +204,7 @@ impl Start {
         let moved = self.for_each_page(options, &folder, host_mem, insert)?;
         if moved > 0 {
             eprintln!(
-                "warning: {moved} log-scales of the first Gaussians are beyond 1e6 scene sizes (or 1e-13) and are reduced to that"
+                "warning: {moved} log-scales of the first Gaussians are too small or large for this scene and are moved into its range"
             );
         }
         Ok((self.dataset, scene))

@@ -25,7 +25,7 @@ pub use read::{
 };
 pub use write::{PlyWriter, PlyWritten, write_gaussians};
 
-use crate::scene::columns::Columns;
+use crate::scene::columns::{Column, Columns};
 
 /// Beyond this many scene radii an offset is not written into f32 positions: one unit in the last place of such an
 /// offset is more than 6e-5 radii, which is pixels in a photo.
@@ -145,27 +145,9 @@ pub fn to_local(columns: &mut Columns, meta: &PlyMeta, origin: [f64; 3], scale: 
     for s in &mut columns.scales {
         *s = (f64::from(*s) + log_ratio) as f32;
     }
-    remove_rows_that_are_not_finite(columns)
-}
-
-fn remove_rows_that_are_not_finite(columns: &mut Columns) -> u64 {
-    use crate::scene::columns::Column;
-    let rows = columns.rows();
-    let mut kept = 0;
-    for row in 0..rows {
-        if !Column::ALL.into_iter().all(|c| columns.row(c, row).iter().all(|v| v.is_finite())) {
-            continue;
-        }
-        if kept != row {
-            for column in Column::ALL {
-                let width = column.width(columns.sh_degree);
-                columns.column_mut(column).copy_within(row * width..(row + 1) * width, kept * width);
-            }
-        }
-        kept += 1;
-    }
-    columns.resize(kept);
-    (rows - kept) as u64
+    let is_finite =
+        |columns: &Columns, row| Column::ALL.into_iter().all(|c| columns.row(c, row).iter().all(|v| v.is_finite()));
+    columns.retain_rows(is_finite)
 }
 
 /// Normalises a quaternion. One that is already of unit length, to f32 rounding, keeps its bits, so that writing and
