@@ -82,6 +82,7 @@ impl AreaResizer {
         match self.channels {
             1 => self.reduce::<1, S>(row),
             3 => self.reduce::<3, S>(row),
+            4 => self.reduce::<4, S>(row),
             n => panic!("{n} channels"),
         }
         let (source_height, target_height) = (u64::from(self.source.1), u64::from(self.target.1));
@@ -153,7 +154,7 @@ fn span(j: u32, source: u32, target: u32) -> Span {
     Span { start: start as u32, end: end as u32, first_weight: first_weight as u32, last_weight: last_weight as u32 }
 }
 
-/// Area average of a whole interleaved 8-bit picture with 1 or 3 channels.
+/// Area average of a whole interleaved 8-bit picture with 1, 3 or 4 channels.
 pub fn resize_area(source: &[u8], channels: usize, from: Size, to: Size) -> Vec<u8> {
     assert_eq!(source.len(), channels * from.0 as usize * from.1 as usize, "picture length");
     let mut resizer = AreaResizer::new(channels, from, to, 1);
@@ -216,7 +217,7 @@ mod tests {
     fn equals_the_definition() {
         let sizes = [((17, 11), (5, 4)), ((24, 16), (6, 4)), ((13, 9), (12, 8)), ((7, 5), (1, 1)), ((4, 3), (9, 7))];
         for (k, (from, to)) in sizes.into_iter().enumerate() {
-            for channels in [1, 3] {
+            for channels in [1, 3, 4] {
                 let source = noise(channels * (from.0 * from.1) as usize, k as u64);
                 let got = resize_area(&source, channels, from, to);
                 let want = slow(&source, channels, from, to);

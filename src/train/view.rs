@@ -66,6 +66,7 @@ pub fn rehearse(
         renderer.rows_out(i, &working.columns, &mut working.gradients)?;
     }
     renderer.loss_value()?;
+    renderer.unusable_splats()?;
     Ok(rows)
 }
 

@@ -263,11 +263,11 @@ fn a_reset_caps_opacities_for_good_and_spares_rows_that_it_does_not_change() {
     assert!(rewritten > 200 && rewritten < 400);
 }
 
-/// A log-scale that drifts beyond the range of exp, as under a rate of 20: its children and its settled row are finite.
+/// A log-scale that drifts beyond the range of exp, as under a rate of 200: its children and its settled row are finite.
 #[test]
 fn rows_whose_log_scales_drift_beyond_reason_stay_finite() {
     let adam =
-        DeferredAdam::new(Rates { scales: 20.0, ..Rates::new(1.0, 5000) }, AdamConfig::default(), SimdPath::best());
+        DeferredAdam::new(Rates { scales: 200.0, ..Rates::new(1.0, 5000) }, AdamConfig::default(), SimdPath::best());
     let range = LogScaleRange::of_scene(2.0);
     let adam = adam.with_log_scales(range);
     let mut start = scene(64, 0);

@@ -77,6 +77,7 @@ pub fn results_with(
     renderer.loss(target, loss)?;
     renderer.backpropagate(rows, &mut grads)?;
     let value = renderer.loss_value()?;
+    assert_eq!(renderer.unusable_splats()?, 0);
     Ok(Results { image: renderer.image()?.clone(), value, grads })
 }
 
