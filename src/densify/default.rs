@@ -173,7 +173,7 @@ mod tests {
         for (schedule_steps, last) in [(4001, Some(3000)), (4000, None), (3001, None), (3000, None), (7001, Some(6000))]
         {
             let short = DefaultStrategy { schedule_steps, ..config };
-            assert_eq!((0..schedule_steps).filter(|&s| short.is_reset(s)).last(), last, "{schedule_steps} steps");
+            assert_eq!((0..schedule_steps).rfind(|&s| short.is_reset(s)), last, "{schedule_steps} steps");
         }
         let often = DefaultStrategy { reset_every: 45, schedule_steps: 100, ..config };
         assert_eq!((0..100).filter(|&s| often.is_reset(s)).collect::<Vec<_>>(), [45]);

@@ -69,7 +69,7 @@ mod tests {
         }
         let range = LogScaleRange::of_scene(2.0);
         // ln(2e4)
-        assert!((range.high - 9.903_487_6).abs() < 1e-6);
+        assert!((range.high - 9.903_487).abs() < 1e-6);
         let mut ordinary = [-20.0, -7.5, 0.0, 3.0, 9.0];
         assert_eq!((range.clamp_all(&mut ordinary), ordinary), (0, [-20.0, -7.5, 0.0, 3.0, 9.0]));
         let mut extreme = [20.0, -7.5, f32::INFINITY];
