@@ -204,7 +204,8 @@ impl Start {
         let moved = self.for_each_page(options, &folder, host_mem, insert)?;
         if moved > 0 {
             eprintln!(
-                "warning: {moved} log-scales of the first Gaussians are too small or large for this scene and are moved into its range"
+                "warning: {moved} log-scales of the first Gaussians are too small or large for this scene and are moved \
+                 into its range"
             );
         }
         Ok((self.dataset, scene))

@@ -28,17 +28,21 @@ impl std::fmt::Display for SlotName {
     }
 }
 
+/// What helps when the drive refuses a read, or a write.
+const REMEDY_READ: &str = "check the drive and cable; roll back to an earlier checkpoint";
+const REMEDY_WRITE: &str = "check the drive; committed generations are intact";
+
 /// Why a page could not be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum PageError {
     /// Reading failed twice.
-    #[error("{0} cannot be read: {1}\n  remedy: {remedy}", remedy = remedy_of(.1, "check the drive and cable; roll back to an earlier checkpoint"))]
+    #[error("{0} cannot be read: {1}\n  remedy: {remedy}", remedy = remedy_of(.1, REMEDY_READ))]
     Read(SlotName, #[source] io::Error),
     /// The bytes read differ from those written, in two attempts.
     #[error("{0} is damaged: {1}\n  remedy: check the drive; roll back to an earlier checkpoint")]
     Damaged(SlotName, String),
     /// Writing failed. The store accepts no more writes.
-    #[error("{0} cannot be written: {1}\n  remedy: {remedy}", remedy = remedy_of(.1, "check the drive; committed generations are intact"))]
+    #[error("{0} cannot be written: {1}\n  remedy: {remedy}", remedy = remedy_of(.1, REMEDY_WRITE))]
     Write(SlotName, #[source] io::Error),
     /// No space for the bytes. Nothing is lost, and the write may be repeated.
     #[error("there is no space to write {0}: {1}\n  remedy: free space on the drive of the spill directory")]
