@@ -6,7 +6,8 @@
 //! Invariant: [`DeviceNeeds::least`] suffices. A test trains at the least that it states.
 
 use super::gpu_gradients::chunk_row_bytes;
-use super::gpu_ranges::{BYTES_OF_ISECT, BYTES_OF_SPLAT, PLACE_BYTES};
+use super::gpu_range_plan::{BYTES_OF_ISECT, BYTES_OF_SPLAT, PART_ISECTS};
+use super::gpu_ranges::PLACE_BYTES;
 use super::gpu_rows::{DeviceColumns, SPLAT_BYTES};
 use super::gpu_segments::CHUNK_STEP;
 use crate::gpu::staging_bytes;
@@ -26,8 +27,6 @@ pub struct ViewSizes {
     pub rows: u64,
     /// Intersections of splats and tiles.
     pub isects: u64,
-    /// Intersections of the fullest tile.
-    pub longest_list: u64,
     /// Pixels.
     pub pixels: u64,
 }
@@ -38,16 +37,14 @@ impl ViewSizes {
         ViewSizes {
             rows: self.rows.max(other.rows),
             isects: self.isects.max(other.isects),
-            longest_list: self.longest_list.max(other.longest_list),
             pixels: self.pixels.max(other.pixels),
         }
     }
 
     /// The view with `growth` times as many Gaussians.
     pub fn grown(self, growth: f64) -> ViewSizes {
-        let [rows, isects, longest_list] =
-            [self.rows, self.isects, self.longest_list].map(|size| (size as f64 * growth).ceil() as u64);
-        ViewSizes { rows, isects, longest_list, ..self }
+        let [rows, isects] = [self.rows, self.isects].map(|size| (size as f64 * growth).ceil() as u64);
+        ViewSizes { rows, isects, ..self }
     }
 }
 
@@ -66,8 +63,8 @@ pub struct DeviceNeeds {
     pub staging: u64,
     /// In place of `rows`: the smallest chunk.
     chunk: u64,
-    /// In place of `lists`: places of the rows in a range, and the splats and lists of the fullest tile.
-    tile: u64,
+    /// In place of `lists`: places of the rows in a range, and the smallest part of a tile's list with its splats.
+    part: u64,
 }
 
 impl DeviceNeeds {
@@ -82,7 +79,7 @@ impl DeviceNeeds {
             pixels: with_class(PIXEL_BYTES * view.pixels),
             staging: staging_bytes(DeviceColumns::row_bytes(sh_degree) * view.rows),
             chunk: with_class(2 * row * CHUNK_STEP as u64),
-            tile: with_class(PLACE_BYTES * view.rows + (BYTES_OF_SPLAT + BYTES_OF_ISECT) * view.longest_list),
+            part: with_class(PLACE_BYTES * view.rows + (BYTES_OF_SPLAT + BYTES_OF_ISECT) * PART_ISECTS),
         }
     }
 
@@ -94,7 +91,7 @@ impl DeviceNeeds {
     /// The least memory with which the view can be drawn and differentiated.
     pub fn least(&self) -> u64 {
         // Staging takes a 64th of the budget for each of its two sets.
-        let buffers = self.chunk + self.splats + self.tile + self.pixels + SMALL_BYTES;
+        let buffers = self.chunk + self.splats + self.part + self.pixels + SMALL_BYTES;
         buffers / 31 * 32
     }
 }
