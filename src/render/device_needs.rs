@@ -15,8 +15,6 @@ use crate::gpu::staging_bytes;
 /// Bytes a pixel: picture, transmittance, stops; photo, gradient and derivatives of the loss; the corrected picture or the
 /// carried pixels of long lists.
 const PIXEL_BYTES: u64 = 12 + 4 + 4 + 4 + 12 + 12 + 12;
-/// Bytes an intersection of a view in one piece: keys and values twice, and the row; then row, list and sums.
-const WHOLE_ISECT_BYTES: u64 = BYTES_OF_ISECT;
 /// Bytes of small buffers: uniforms, counts, sums, and the smallest staging.
 const SMALL_BYTES: u64 = 192 << 10;
 
@@ -75,7 +73,7 @@ impl DeviceNeeds {
         DeviceNeeds {
             rows: with_class(view.rows * row),
             splats: with_class(2 * SPLAT_BYTES * view.rows),
-            lists: with_class(WHOLE_ISECT_BYTES * view.isects + 12 * view.rows),
+            lists: with_class(BYTES_OF_ISECT * view.isects + 12 * view.rows),
             pixels: with_class(PIXEL_BYTES * view.pixels),
             staging: staging_bytes(DeviceColumns::row_bytes(sh_degree) * view.rows),
             chunk: with_class(2 * row * CHUNK_STEP as u64),

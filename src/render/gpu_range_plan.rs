@@ -128,8 +128,9 @@ impl Tally {
                 continue;
             }
             // The sums of a part come in one piece.
-            let of_part =
-                |splats: u64| self.fits(splats, splats, limits) && BYTES_OF_SUMS * (splats + self.slack) <= limits.binding;
+            let of_part = |splats: u64| {
+                self.fits(splats, splats, limits) && BYTES_OF_SUMS * (splats + self.slack) <= limits.binding
+            };
             let mut spans = Vec::new();
             cut_depths(ALL_DEPTHS, &of_part, &mut |keys, bits| bins_of(range, keys, bits), &mut spans)?;
             self.add_parts(whole, &without_empty(&spans), &mut planned);

@@ -16,7 +16,7 @@ use super::gpu_range_plan::{ALL_DEPTHS, PlannedRange, RangeLimits, Tally};
 use super::gpu_segments::{Segment, gradients_of, zero_gradients};
 use super::gpu_tiles::{Blend, Demand, Frame, Pixels, Ranks, TileStages, splat_bytes, words};
 use super::gpu_tiles_bwd::{Fold, PictureGradientBuffers, carry_bytes};
-use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
+use crate::gpu::{Buffer, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
 use crate::kernels::tile_range::TileRange;
 use crate::kernels::uniforms_tiles::{DEPTH_BINS, RangeUniforms, grid_words, range_words};
 use std::sync::Arc;
@@ -151,13 +151,7 @@ impl Ranges<'_> {
     }
 
     /// Uniforms of a stage on the rows of a segment, without room for a copy.
-    fn uniforms(
-        &self,
-        number: usize,
-        segment: &Segment,
-        range: TileRange,
-        depths: [u32; 2],
-    ) -> RangeUniforms {
+    fn uniforms(&self, number: usize, segment: &Segment, range: TileRange, depths: [u32; 2]) -> RangeUniforms {
         RangeUniforms {
             grid: grid_words(self.blend.grid),
             range: range_words(range),
@@ -244,12 +238,7 @@ impl Ranges<'_> {
     }
 
     /// Records the places of the splats that reach a range, segment by segment.
-    fn places(
-        &self,
-        recorder: &mut Recorder<'_>,
-        segments: &[Segment],
-        planned: &PlannedRange,
-    ) -> GpuResult<Places> {
+    fn places(&self, recorder: &mut Recorder<'_>, segments: &[Segment], planned: &PlannedRange) -> GpuResult<Places> {
         let count = segments.len() as u32;
         let totals = self.gpu.buffer("splats of segments in the range", words(count))?;
         let mut in_segment = Vec::with_capacity(segments.len());

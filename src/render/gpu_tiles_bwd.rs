@@ -36,17 +36,19 @@ pub enum Fold<'a> {
     Part(&'a Buffer),
 }
 
-/// Windows of fewer intersections are not tried: each window is a pass over all lists.
+/// Windows of fewer intersections are not tried, nor more than a few windows of any size: each window is a pass over all lists.
 const WINDOW_MIN: u32 = 1 << 10;
+const WINDOWS_MOST: u32 = 4;
 
 /// A buffer for the sums of a window of at most `isects` intersections: as many as fit one binding and device memory.
 fn window_of_sums(gpu: &Gpu, isects: u32) -> GpuResult<(Buffer, u32)> {
     let bytes = 4 * u64::from(SUMS);
     let most = u32::try_from(gpu.max_binding_bytes() / bytes).unwrap_or(u32::MAX).max(1);
     let mut window = most.min(isects.max(1));
+    let least = isects.div_ceil(WINDOWS_MOST).max(WINDOW_MIN);
     loop {
         match gpu.buffer("sums of intersections", bytes * u64::from(window)) {
-            Err(error) if error.lacks_room() && window > WINDOW_MIN => window = window.div_ceil(2),
+            Err(error) if error.lacks_room() && window > least => window = window.div_ceil(2).max(least),
             buffer => return Ok((buffer?, window)),
         }
     }

@@ -128,6 +128,8 @@ pub(super) struct Loss {
 /// The four sums from which the value of a loss follows.
 #[derive(Debug)]
 pub(super) enum LossSums {
+    /// They and the gradient belong to an invalid picture, and must be computed again.
+    Stale,
     /// The picture has no pixels.
     Empty,
     /// The readback is pending.

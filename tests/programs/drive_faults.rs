@@ -308,10 +308,8 @@ fn a_drive_that_fails_in_either_pass_loses_one_step_at_most() {
     let mut world = World::new();
     (world.frames, world.commit_every) = (world.fewest / 3, 1e-9);
     let mut torn = [0, 0];
-    for (i, (on, after)) in [Operation::Read, Operation::Write]
-        .into_iter()
-        .flat_map(|on| (0..7).map(move |i| (on, 5 + 61 * i)))
-        .enumerate()
+    for (i, (on, after)) in
+        [Operation::Read, Operation::Write].into_iter().flat_map(|on| (0..7).map(move |i| (on, 5 + 61 * i))).enumerate()
     {
         let life = world.live(&format!("passes-{i}"), &Faults::new(), |faults| {
             faults.add(on, faults.count(on) + after, true, Fault::Error(ErrorKind::Other));
