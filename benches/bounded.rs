@@ -30,6 +30,7 @@ Examples:
   cargo bench --bench bounded -- --dir /mnt/nvme/bounded                      20 million Gaussians in 2 GiB, 200 steps
   cargo bench --bench bounded -- --dir /mnt/nvme/bounded --gaussians max      as many as leave a fifth of the free drive free
   cargo bench --bench bounded -- --dir /mnt/nvme/bounded --gaussians 5000000 --host-mem 512MiB
+  cargo bench --bench bounded -- --dir /mnt/nvme/bounded --overviews 2        two photos show 40 % of the city each
 
 The limit is a memory control group of Linux, which a user such as root may create. Without a group, the line gives the
 reason, and only the peak that the run measured itself is known. 20 million Gaussians need some 17 GB of the drive.";
@@ -55,6 +56,9 @@ pub struct Args {
     /// Photos
     #[arg(long, default_value_t = 300, value_name = "N")]
     views: u32,
+    /// Further photos from high above, each of two fifths of the city
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    overviews: u32,
     /// Memory of the run
     #[arg(long, default_value = "2GiB", value_name = "SIZE")]
     host_mem: ByteSize,
@@ -84,6 +88,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let began = Instant::now();
     let options = CityOptions {
         views: args.views,
+        overviews: args.overviews,
         points: args.city,
         width: 320,
         height: 208,
@@ -95,6 +100,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let city_seconds = began.elapsed().as_secs_f64();
     let run = train(args)?;
     let summary = read_summary(&args.dir.join("out/summary.json"));
+    let steps = steps(&args.dir.join("out/metrics.jsonl"));
     drop(scratch);
     let of = |key: &str| summary.get(key).cloned().unwrap_or(Value::Null);
     let peak = summary["host_bytes_peak"].as_u64();
@@ -108,6 +114,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         "is_bounded": run.status.success() && peak.is_some_and(|peak| peak <= limit(args)),
         "train_seconds": of("train_seconds"), "stall_seconds": of("stall_seconds"), "frames": of("frames"),
         "bytes_read": of("bytes_read"), "bytes_written": of("bytes_written"), "psnr": summary["test"]["psnr"],
+        "widest_step": steps.first(), "median_step": steps.get(steps.len() / 2),
         "run_seconds": run.seconds, "city_seconds": city_seconds, "said": run.last_words,
         "version": env!("CARGO_PKG_VERSION"),
     }));
@@ -172,6 +179,7 @@ fn train(args: &Args) -> InputResult<Run> {
         ("--sh-start", "3".into()),
         ("--strategy", "none".into()),
         ("--device", "cpu".into()),
+        ("--log-every", "1".into()),
         // Without commits the drive holds the state once.
         ("--commit-every", "0".into()),
     ];
@@ -203,6 +211,23 @@ fn train(args: &Args) -> InputResult<Run> {
 fn read_summary(path: &Path) -> Value {
     let text = std::fs::read_to_string(path).unwrap_or_default();
     serde_json::from_str(&text).unwrap_or(Value::Null)
+}
+
+/// Pages, seconds and bytes of each step but the first, by falling number of pages.
+fn steps(path: &Path) -> Vec<Value> {
+    let text = std::fs::read_to_string(path).unwrap_or_default();
+    let lines: Vec<Value> = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+    let of_step = |pair: &[Value]| {
+        let less = |key: &str| Some(pair[1][key].as_f64()? - pair[0][key].as_f64()?);
+        let (pages, seconds) = (less("pages_needed")?, less("seconds")?);
+        let (read, written) = (less("bytes_read")?, less("bytes_written")?);
+        Some(json!({
+            "step": pair[1]["step"], "pages": pages, "seconds": seconds, "bytes_read": read, "bytes_written": written,
+        }))
+    };
+    let mut steps: Vec<Value> = lines.windows(2).filter_map(of_step).collect();
+    steps.sort_by(|a, b| b["pages"].as_f64().unwrap_or(0.0).total_cmp(&a["pages"].as_f64().unwrap_or(0.0)));
+    steps
 }
 
 #[cfg(unix)]

@@ -23,7 +23,7 @@
 @group(0) @binding(8) var<storage, read> v_alpha: array<f32>;
 /// [intersections of the window][9]
 @group(0) @binding(9) var<storage, read_write> partials: array<f32>;
-/// [height][width][2]: t and behind, if the list has more than one segment.
+/// [height][width][2]: t and behind, if the list has more than one segment or part.
 @group(0) @binding(10) var<storage, read_write> carry: array<vec2<f32>>;
 /// Rows by rank.
 @group(0) @binding(11) var<storage, read> order: array<u32>;
@@ -163,7 +163,7 @@ fn take_off_8(pixels: ptr<function, Pixels>, first: u32, list_index: u32, size: 
         let dx = x - vec4<f32>(splat.mean.x);
         let dy = y - splat.mean.y;
         let e = exponents(splat, dx, dy);
-        let taking_part = (e >= vec4<f32>(LOG2_ALPHA_MIN)) & (vec4<u32>(list_index + first + LANE) < (*pixels).stop);
+        let taking_part = (e >= vec4<f32>(LOG2_ALPHA_MIN)) & (vec4<u32>(view.list_base + list_index + first + LANE) < (*pixels).stop);
         let s = take_off(pixels, splat, e, taking_part, dx, dy);
         one = select(one, sum_of_8(vec3<f32>(s.h, s.firsts)), own_lane == LANE);
         two = select(two, sum_of_8(s.seconds), own_lane == LANE);
@@ -235,7 +235,7 @@ fn rasterize_bwd(
         }
         workgroupBarrier();
         // Uniform: nothing changes it after the first barrier.
-        let reached = first < atomicLoad(&tile_stop);
+        let reached = view.list_base + first < atomicLoad(&tile_stop);
 #ifdef SUBGROUPS_OF_8
         for (var i = (size + 7u) / 8u * 8u; reached && i > 0u;) {
             i -= 8u;
@@ -248,7 +248,7 @@ fn rasterize_bwd(
             let dx = x - vec4<f32>(splat.mean.x);
             let dy = y - splat.mean.y;
             let e = exponents(splat, dx, dy);
-            let taking_part = (e >= vec4<f32>(LOG2_ALPHA_MIN)) & (vec4<u32>(first + i) < stop);
+            let taking_part = (e >= vec4<f32>(LOG2_ALPHA_MIN)) & (vec4<u32>(view.list_base + first + i) < stop);
             let to = i * SUMS * parts + part;
 #ifdef SUBGROUPS
             if !subgroupAny(any(taking_part)) {

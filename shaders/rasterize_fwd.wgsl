@@ -41,7 +41,7 @@ fn are_alive(pixels: Pixels) -> bool {
     return any(pixels.low > vec4<f32>(0.0));
 }
 
-/// Blends list entry `index`, whose exponents are `e`.
+/// Blends entry `index` of the whole list, whose exponents are `e`.
 fn blend(pixels: ptr<function, Pixels>, splat: TileSplat, e: vec4<f32>, index: u32) {
     let above = e >= vec4<f32>(LOG2_ALPHA_MIN);
     let alpha = select(vec4<f32>(0.0), alphas(e, splat.log2_opacity, view.max_alpha), above);
@@ -155,7 +155,7 @@ fn rasterize_fwd(
                 subgroupBroadcast(own.log2_opacity, LANE),
                 subgroupBroadcast(own.color, LANE),
             );
-            blend(&pixels, splat, exponents(splat, x - vec4<f32>(splat.mean.x), y - splat.mean.y), first + LANE);
+            blend(&pixels, splat, exponents(splat, x - vec4<f32>(splat.mean.x), y - splat.mean.y), view.list_base + first + LANE);
         }
 #end
     }
@@ -179,7 +179,7 @@ fn rasterize_fwd(
             let splat = batch[i];
             let e = exponents(splat, x - vec4<f32>(splat.mean.x), y - splat.mean.y);
             if any(e >= vec4<f32>(LOG2_ALPHA_MIN)) {
-                blend(&pixels, splat, e, first + i);
+                blend(&pixels, splat, e, view.list_base + first + i);
                 alive = are_alive(pixels);
                 if !alive {
                     atomicAdd(&finished, 1u);

@@ -10,13 +10,18 @@ struct RangeUniforms {
     grid: Grid,
     /// First column, end of the columns, first row, end of the rows.
     range: vec4<u32>,
-    /// The number, in the view, of the segment's first row.
-    first_row: u32,
+    /// The number of the segment.
+    segment: u32,
     /// Rows of the segment.
     row_count: u32,
     /// Room of the copy, in rows.
     capacity: u32,
-    pad: u32,
+    /// The keys of a depth bin differ in this number of low bits.
+    bin_bits: u32,
+    /// First depth key of the rows that are wanted, and one past the last.
+    depths: vec2<u32>,
+    pad0: u32,
+    pad1: u32,
 }
 
 @group(0) @binding(0) var<uniform> segment: RangeUniforms;
@@ -25,9 +30,9 @@ struct RangeUniforms {
 @group(0) @binding(2) var<storage, read_write> changes: array<atomic<i32>>;
 /// For each tile column the splats that begin there, tiles_x + 1 entries; then those that ended in the column before.
 @group(0) @binding(3) var<storage, read_write> columns: array<atomic<u32>>;
-/// By row of the view: 1 if the splat reaches the range.
+/// By row of the segment: 1 if the splat reaches the range at a wanted depth.
 @group(0) @binding(4) var<storage, read_write> flags: array<u32>;
-/// Prefix sums of the flags: the place of each row in the copy.
+/// Prefix sums of the segment's flags: the place of each row among the flagged rows of the segment.
 @group(0) @binding(5) var<storage, read> places: array<u32>;
 /// Records of the segment: splats or their gradients.
 @group(0) @binding(6) var<storage, read> records: array<vec4<f32>>;
@@ -37,10 +42,36 @@ struct RangeUniforms {
 @group(0) @binding(8) var<storage, read_write> records_out: array<vec4<f32>>;
 /// Records of the copy.
 @group(0) @binding(9) var<storage, read> compact_in: array<vec4<f32>>;
+/// Prefix sums over the segments: the flagged rows before each segment.
+@group(0) @binding(10) var<storage, read> bases: array<u32>;
+/// Splats that reach the range, by depth: entry k counts the keys of bin k from the first wanted key on.
+@group(0) @binding(11) var<storage, read_write> bins: array<atomic<u32>>;
 
 fn reach_of_row(row: u32) -> Reach {
     let at = SPLAT_STRIDE * row;
     return reach_of(splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]), segment.grid);
+}
+
+/// The bits of the depth of a drawn row, as the depth sort orders them.
+fn depth_key(row: u32) -> u32 {
+    return bitcast<u32>(splats[SPLAT_STRIDE * row].z);
+}
+
+/// Whether a splat reaches the range at a wanted depth.
+fn is_in_range(row: u32) -> bool {
+    let reach = reach_of_row(row);
+    let key = depth_key(row);
+    if key < segment.depths.x || key >= segment.depths.y {
+        return false;
+    }
+    let end = min(reach.box.z, segment.range.y);
+    for (var tile_x = max(reach.box.x, segment.range.x); tile_x < end; tile_x++) {
+        let rows = tile_rows_in(reach, segment.grid, tile_x);
+        if max(rows.x, segment.range.z) < min(rows.y, segment.range.w) {
+            return true;
+        }
+    }
+    return false;
 }
 
 /// Adds each splat to the counts of the tiles that it can reach.
@@ -81,23 +112,27 @@ fn range_select(
     if row >= segment.row_count {
         return;
     }
-    let reach = reach_of_row(row);
-    var flag = 0u;
-    let end = min(reach.box.z, segment.range.y);
-    for (var tile_x = max(reach.box.x, segment.range.x); tile_x < end; tile_x++) {
-        let rows = tile_rows_in(reach, segment.grid, tile_x);
-        if max(rows.x, segment.range.z) < min(rows.y, segment.range.w) {
-            flag = 1u;
-            break;
-        }
+    flags[row] = select(0u, 1u, is_in_range(row));
+}
+
+/// Adds each splat that reaches the range at a wanted depth to the bin of its depth.
+@compute @workgroup_size(256)
+fn range_depths(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let row = linear_index(workgroup, workgroups, lane, 256u);
+    if row >= segment.row_count || !is_in_range(row) {
+        return;
     }
-    flags[segment.first_row + row] = flag;
+    atomicAdd(&bins[(depth_key(row) - segment.depths.x) >> segment.bin_bits], 1u);
 }
 
 /// The place of a row in the copy, or the capacity if it has none.
 fn place_of(row: u32) -> u32 {
-    let place = places[segment.first_row + row];
-    return select(segment.capacity, place, places[segment.first_row + row + 1u] > place);
+    let place = places[row];
+    return select(segment.capacity, bases[segment.segment] + place, places[row + 1u] > place);
 }
 
 /// Copies the records of the flagged rows to their places.

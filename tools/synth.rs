@@ -33,6 +33,9 @@ struct Flags {
     /// Number of photos; the city grows with it
     #[arg(long, default_value_t = 60, help_heading = "Size")]
     views: u32,
+    /// Further photos from high above, each of two fifths of the city
+    #[arg(long, default_value_t = 0, value_name = "N", help_heading = "Size")]
+    overviews: u32,
     /// Size of a photo, pixels
     #[arg(long, default_value = "480x320", value_name = "WxH", value_parser = parse_size, help_heading = "Size")]
     resolution: (u32, u32),
@@ -43,7 +46,7 @@ struct Flags {
     #[arg(long, help_heading = "Size")]
     blocks: Option<u32>,
     /// Repeat the city this many times along x and y: --points times AxB points in total, written in bounded memory.
-    /// The photos are divided among the copies, and do not show neighbouring copies
+    /// The photos are divided among the copies, and do not show neighbouring copies, except for --overviews
     #[arg(long, default_value = "1x1", value_name = "AxB", value_parser = parse_size, help_heading = "Size")]
     tile: (u32, u32),
     /// Seed of the city
@@ -107,6 +110,7 @@ fn run(flags: &Flags) -> InputResult<()> {
     let options = CityOptions {
         seed: flags.seed,
         views: flags.views,
+        overviews: flags.overviews,
         width: flags.resolution.0,
         height: flags.resolution.1,
         points: flags.points,
@@ -119,7 +123,7 @@ fn run(flags: &Flags) -> InputResult<()> {
         overwrite: flags.overwrite,
     };
     let start = Instant::now();
-    let bar = ProgressBar::new(u64::from(flags.views));
+    let bar = ProgressBar::new(u64::from(options.photos()));
     if let Ok(style) = ProgressStyle::with_template("{bar:32} {pos}/{len} photos  {per_sec}  {eta} left") {
         bar.set_style(style);
     }

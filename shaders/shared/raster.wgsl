@@ -25,6 +25,11 @@ struct RasterUniforms {
     window_end: u32,
     /// The range of tiles that is blended: first column, end of the columns, first row, end of the rows.
     range: vec4<u32>,
+    /// List entries of the tile in earlier parts of its list.
+    list_base: u32,
+    pad0: u32,
+    pad1: u32,
+    pad2: u32,
 }
 
 const SEGMENT_FIRST: u32 = 1u;

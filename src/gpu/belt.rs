@@ -1,8 +1,8 @@
 //! Uploads through reused staging memory: two sets, so that one is filled while the device reads the other.
 //!
 //! Invariants: (1) a chunk is written only while it is mapped, and unmapped before the commands that read it are
-//! submitted; (2) a set is refilled only after its submission has finished; (3) a set holds at most [`SET_BYTES`]: when
-//! a set is full, the recorder submits what it has recorded.
+//! submitted; (2) a set is refilled only after its submission has finished; (3) a set takes at most a 64th of the budget or
+//! one smallest chunk: when a set is full, the recorder submits what it has recorded.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
@@ -15,8 +15,8 @@ use super::error::{GpuError, GpuResult};
 const CHUNK_BYTES_MAX: u64 = 4 << 20;
 /// Bytes of one staging buffer, at least.
 const CHUNK_BYTES_MIN: u64 = 16 << 10;
-/// A staging buffer takes at most this part of the budget.
-const CHUNK_SHARE: u64 = 64;
+/// A set takes at most this part of the budget.
+const SET_SHARE: u64 = 64;
 /// Most staging buffers in one set.
 const SET_CHUNKS: usize = 8;
 
@@ -51,14 +51,17 @@ pub(super) struct Belt {
     driver: Arc<Driver>,
     pool: Arc<Pool>,
     chunk_bytes: u64,
+    /// Most staging buffers in one set.
+    set_chunks: usize,
     sets: [Set; 2],
 }
 
 impl Belt {
     /// Staging for a device whose pool may allocate `budget` bytes.
     pub(super) fn new(driver: Arc<Driver>, pool: Arc<Pool>, budget: u64) -> Belt {
-        let share = (budget / CHUNK_SHARE).clamp(CHUNK_BYTES_MIN, CHUNK_BYTES_MAX);
-        Belt { driver, pool, chunk_bytes: share / MAP_ALIGNMENT * MAP_ALIGNMENT, sets: Default::default() }
+        let share = (budget / SET_SHARE).clamp(CHUNK_BYTES_MIN, CHUNK_BYTES_MAX);
+        let set_chunks = (budget / SET_SHARE / share).clamp(1, SET_CHUNKS as u64) as usize;
+        Belt { driver, pool, chunk_bytes: share / MAP_ALIGNMENT * MAP_ALIGNMENT, set_chunks, sets: Default::default() }
     }
 
     /// Stages as much of `bytes` as fits and records its copy to `target` at `offset`; returns the number of bytes
@@ -73,7 +76,9 @@ impl Belt {
         self.sets[0].wait(&self.driver)?;
         let mut done = 0;
         while done < bytes.len() {
-            let Some(chunk) = self.sets[0].chunk_with_room(&self.pool, self.chunk_bytes)? else { break };
+            let Some(chunk) = self.sets[0].chunk_with_room(&self.pool, self.chunk_bytes, self.set_chunks)? else {
+                break;
+            };
             let room = usize::try_from(self.chunk_bytes - chunk.used).unwrap_or(0);
             let n = room.min(bytes.len() - done);
             let end = chunk.used + n as u64;
@@ -126,10 +131,10 @@ impl Set {
     }
 
     /// A chunk that is not full; `None` if the set is full.
-    fn chunk_with_room(&mut self, pool: &Pool, chunk_bytes: u64) -> GpuResult<Option<&mut Chunk>> {
+    fn chunk_with_room(&mut self, pool: &Pool, chunk_bytes: u64, most: usize) -> GpuResult<Option<&mut Chunk>> {
         let at = match self.chunks.iter().position(|c| c.used < chunk_bytes) {
             Some(at) => at,
-            None if self.chunks.len() >= SET_CHUNKS => return Ok(None),
+            None if self.chunks.len() >= most => return Ok(None),
             None => {
                 let usage = wgpu::BufferUsages::MAP_WRITE | wgpu::BufferUsages::COPY_SRC;
                 match pool.keep("upload staging", chunk_bytes, usage) {

@@ -180,7 +180,8 @@ impl Pool {
         Ok(raw)
     }
 
-    /// Asks the driver for a buffer and counts it. A refusal lowers the budget to what is allocated.
+    /// Asks the driver for a buffer and counts it. After a refusal all free buffers go back to the device, once it has finished
+    /// with them; a second refusal lowers the budget to what is allocated.
     fn allocate(
         &self,
         state: &mut PoolState,
@@ -188,9 +189,19 @@ impl Pool {
         size: u64,
         usages: wgpu::BufferUsages,
     ) -> GpuResult<wgpu::Buffer> {
-        self.driver.faults.set_stage(label);
-        let raw = self.driver.buffer(label, size, usages);
-        self.driver.faults.check().map_err(|error| match error {
+        let ask = || {
+            self.driver.faults.set_stage(label);
+            let raw = self.driver.buffer(label, size, usages);
+            self.driver.faults.check().map(|()| raw)
+        };
+        let mut asked = ask();
+        if matches!(asked, Err(GpuError::OutOfMemory { .. })) {
+            state.usage.allocated = state.usage.in_use;
+            state.free.clear();
+            self.driver.wait(label, None)?;
+            asked = ask();
+        }
+        let raw = asked.map_err(|error| match error {
             GpuError::OutOfMemory { .. } => {
                 state.budget = state.usage.allocated;
                 GpuError::DeviceFull { what: label.into(), need: size, in_use: state.usage.in_use }
@@ -251,13 +262,6 @@ impl Pool {
     pub(super) fn room(&self) -> u64 {
         let state = lock(&self.state);
         state.budget.saturating_sub(state.usage.in_use)
-    }
-
-    /// Returns all free buffers to the device.
-    pub(super) fn trim(&self) {
-        let mut state = lock(&self.state);
-        state.usage.allocated = state.usage.in_use;
-        state.free.clear();
     }
 
     /// Bytes of the free buffers for read-backs.

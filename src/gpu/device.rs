@@ -33,8 +33,17 @@ fn block_bytes(budget: u64) -> u64 {
 
 /// The part of a budget for buffers. The API holds blocks of three kinds of memory (device, uploads, read-backs), which are
 /// partly empty: measured 4 to 6 blocks in all.
-fn bytes_for_buffers(budget: u64) -> u64 {
+pub fn bytes_for_buffers(budget: u64) -> u64 {
     if budget < BLOCKS_COUNT_FROM { budget } else { budget - 6 * block_bytes(budget) }
+}
+
+/// The least budget that leaves `bytes` bytes for buffers.
+pub fn budget_for_buffers(bytes: u64) -> u64 {
+    if bytes < BLOCKS_COUNT_FROM {
+        return bytes;
+    }
+    // Blocks grow by less than a tenth of the budget, so a few rounds come within a byte.
+    (0..8).fold(bytes, |budget, _| bytes + 6 * block_bytes(budget)).max(BLOCKS_COUNT_FROM + 6 * BLOCK_MIN)
 }
 
 /// Options that a test or the user's budget sets.
@@ -220,11 +229,6 @@ impl Gpu {
     /// Device memory that buffers can still take, bytes; 2^64 - 1 less what is in use without a budget.
     pub fn room(&self) -> u64 {
         self.pool.room()
-    }
-
-    /// Returns free buffers to the device.
-    pub fn trim(&self) {
-        self.pool.trim();
     }
 
     /// Traffic over the bus, and memory in use.

@@ -43,7 +43,7 @@ mod uniforms;
 pub use adapter::{AdapterSummary, DeviceChoice, DeviceKind, WORKGROUP, list_adapters};
 pub use belt::staging_bytes;
 pub use buffers::{Buffer, BufferView};
-pub use device::{Gpu, GpuOptions, Traffic};
+pub use device::{Gpu, GpuOptions, Traffic, budget_for_buffers, bytes_for_buffers};
 pub use error::{GpuError, GpuResult};
 pub use injected::{FaultKind, InjectedFault};
 pub use layout::StructLayout;

@@ -36,6 +36,9 @@ pub const FOLD_UNFINISHED: u32 = 16;
 /// Flag of [`RasterUniforms`] for `fold_rows`: there are no lists; a row's rank is its number.
 pub const FOLD_WITHOUT_LISTS: u32 = 32;
 
+/// Bins of `range_depths`.
+pub const DEPTH_BINS: u32 = 1 << 10;
+
 crate::wgsl_struct! {
     /// Uniform of `scan.wgsl`.
     pub struct ScanUniforms {
@@ -79,14 +82,18 @@ crate::wgsl_struct! {
         pub grid: [u32; 4],
         /// First column, end of the columns, first row, end of the rows.
         pub range: [u32; 4],
-        /// The number, in the view, of the segment's first row.
-        pub first_row: u32,
+        /// The number of the segment.
+        pub segment: u32,
         /// Rows of the segment.
         pub row_count: u32,
         /// Room of the copy, rows.
         pub capacity: u32,
+        /// The keys of a depth bin differ in this number of low bits.
+        pub bin_bits: u32,
+        /// First depth key of the rows that are wanted, and one past the last.
+        pub depths: [u32; 2],
         /// Unused.
-        pub pad: u32,
+        pub pad: [u32; 2],
     }
 
     /// Uniform of `isect_offsets.wgsl`.
@@ -127,6 +134,10 @@ crate::wgsl_struct! {
         pub window_end: u32,
         /// First column, end of the columns, first row, end of the rows of the tiles that are blended.
         pub range: [u32; 4],
+        /// List entries of the tile in earlier parts.
+        pub list_base: u32,
+        /// Unused.
+        pub pad: [u32; 3],
     }
 }
 

@@ -41,8 +41,20 @@ impl Pager {
     /// # Errors
     /// As [`Pager::acquire`]. Nothing of this batch is pinned then.
     pub fn pin_batch(&mut self, step: u32, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
+        self.pin_batch_for(step, pages, Asker::Step)
+    }
+
+    /// As [`Pager::pin_batch`], for a step that has changed rows already: a failed write is left to the next step.
+    ///
+    /// # Errors
+    /// As [`Pager::acquire`]. Nothing of this batch is pinned then.
+    pub fn pin_batch_again(&mut self, step: u32, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
+        self.pin_batch_for(step, pages, Asker::RestOfStep)
+    }
+
+    fn pin_batch_for(&mut self, step: u32, pages: &[PageNo], asker: Asker) -> Result<Vec<PinnedPage>, PagingError> {
         let pages: Vec<PageNo> = pages.iter().copied().filter(|&p| self.index.has_rows(p)).collect();
-        let pinned = self.fetch(&format!("the view of step {step}"), &pages, Asker::Step)?;
+        let pinned = self.fetch(&format!("the view of step {step}"), &pages, asker)?;
         self.count_bound(&pages);
         Ok(pinned)
     }

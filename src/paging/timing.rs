@@ -15,7 +15,7 @@ pub enum Transfers {
 /// Who asks for pages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Asker {
-    /// A training step, before it changes anything: a failed write ends the call, so that the step can be done again.
+    /// A training step that can still be done again: a failed write ends the call.
     Step,
     /// A training step that has changed rows already: uses and waits count as the step's. A failed write is left to the next step,
     /// since this step must not be done twice.

@@ -6,7 +6,8 @@
 //! Invariant: [`DeviceNeeds::least`] suffices. A test trains at the least that it states.
 
 use super::gpu_gradients::chunk_row_bytes;
-use super::gpu_ranges::{BYTES_OF_ISECT, BYTES_OF_SPLAT, PLACE_BYTES};
+use super::gpu_range_plan::{BYTES_OF_ISECT, BYTES_OF_SPLAT, PART_ISECTS};
+use super::gpu_ranges::PLACE_BYTES;
 use super::gpu_rows::{DeviceColumns, SPLAT_BYTES};
 use super::gpu_segments::CHUNK_STEP;
 use crate::gpu::staging_bytes;
@@ -14,8 +15,6 @@ use crate::gpu::staging_bytes;
 /// Bytes a pixel: picture, transmittance, stops; photo, gradient and derivatives of the loss; the corrected picture or the
 /// carried pixels of long lists.
 const PIXEL_BYTES: u64 = 12 + 4 + 4 + 4 + 12 + 12 + 12;
-/// Bytes an intersection of a view in one piece: keys and values twice, and the row; then row, list and sums.
-const WHOLE_ISECT_BYTES: u64 = BYTES_OF_ISECT;
 /// Bytes of small buffers: uniforms, counts, sums, and the smallest staging.
 const SMALL_BYTES: u64 = 192 << 10;
 
@@ -29,8 +28,6 @@ pub struct ViewSizes {
     pub rows: u64,
     /// Intersections of splats and tiles.
     pub isects: u64,
-    /// Intersections of the fullest tile.
-    pub longest_list: u64,
     /// Pixels.
     pub pixels: u64,
 }
@@ -41,7 +38,6 @@ impl ViewSizes {
         ViewSizes {
             rows: self.rows.max(other.rows),
             isects: self.isects.max(other.isects),
-            longest_list: self.longest_list.max(other.longest_list),
             pixels: self.pixels.max(other.pixels),
         }
     }
@@ -49,10 +45,9 @@ impl ViewSizes {
     /// The view with `growth` times as many Gaussians. A few that cover the picture say little about many, which are
     /// smaller: their intersections are taken to be those of ordinary scenes.
     pub fn grown(self, growth: f64) -> ViewSizes {
-        let [rows, isects, longest_list] =
-            [self.rows, self.isects, self.longest_list].map(|size| (size as f64 * growth).ceil() as u64);
+        let [rows, isects] = [self.rows, self.isects].map(|size| (size as f64 * growth).ceil() as u64);
         let isects = isects.min(self.isects.max(rows.saturating_mul(ISECTS_PER_ROW)));
-        ViewSizes { rows, isects, longest_list: longest_list.min(rows), ..self }
+        ViewSizes { rows, isects, ..self }
     }
 }
 
@@ -71,8 +66,8 @@ pub struct DeviceNeeds {
     pub staging: u64,
     /// In place of `rows`: the smallest chunk.
     chunk: u64,
-    /// In place of `lists`: places of the rows in a range, and the splats and lists of the fullest tile.
-    tile: u64,
+    /// In place of `lists`: places of the rows in a range, and the smallest part of a tile's list with its splats.
+    part: u64,
 }
 
 impl DeviceNeeds {
@@ -83,11 +78,11 @@ impl DeviceNeeds {
         DeviceNeeds {
             rows: with_class(view.rows * row),
             splats: with_class(2 * SPLAT_BYTES * view.rows),
-            lists: with_class(WHOLE_ISECT_BYTES * view.isects + 12 * view.rows),
+            lists: with_class(BYTES_OF_ISECT * view.isects + 12 * view.rows),
             pixels: with_class(PIXEL_BYTES * view.pixels),
             staging: staging_bytes(DeviceColumns::row_bytes(sh_degree) * view.rows),
             chunk: with_class(2 * row * CHUNK_STEP as u64),
-            tile: with_class(PLACE_BYTES * view.rows + (BYTES_OF_SPLAT + BYTES_OF_ISECT) * view.longest_list),
+            part: with_class(PLACE_BYTES * view.rows + (BYTES_OF_SPLAT + BYTES_OF_ISECT) * PART_ISECTS),
         }
     }
 
@@ -99,7 +94,7 @@ impl DeviceNeeds {
     /// The least memory with which the view can be drawn and differentiated.
     pub fn least(&self) -> u64 {
         // Staging takes a 64th of the budget for each of its two sets.
-        let buffers = self.chunk + self.splats + self.tile + self.pixels + SMALL_BYTES;
+        let buffers = self.chunk + self.splats + self.part + self.pixels + SMALL_BYTES;
         buffers / 31 * 32
     }
 }

@@ -44,7 +44,7 @@
 use super::device_needs::ViewSizes;
 use super::gpu_gradients::{RowGradients, RowsOut, Scratch, check_room};
 use super::gpu_loss::{LossStage, value};
-use super::gpu_ranges::{RangeStages, Ranges};
+use super::gpu_ranges::{PLACE_BYTES, RangeStages, Ranges};
 use super::gpu_rows::{DeviceColumns, RowStages, SplatRows};
 use super::gpu_segments::{self, Segment};
 use super::gpu_tiles::{Blend, Demand, Pixels, TileStages, splat_bytes};
@@ -52,7 +52,7 @@ use super::gpu_tiles_bwd::{Fold, PictureGradientBuffers};
 use super::gpu_view::{DemandState, Lists, Loss, LossSums, RowsIn, Unusable, View, WholeLists, WholeRows, blend_of};
 use super::sequence::{Sequence, ViewOptions};
 use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches};
-use crate::gpu::{Buffer, DeviceKind, Gpu, GpuResult, Recorder, Traffic};
+use crate::gpu::{Buffer, DeviceKind, Gpu, GpuError, GpuResult, Recorder, Traffic};
 use crate::kernels::image_loss::LossPlan;
 use crate::kernels::splats::Grid;
 use crate::kernels::tile_range::TileRange;
@@ -219,10 +219,11 @@ impl GpuRenderer {
         Ok(())
     }
 
-    /// Device memory for the lists of a range, beside what the view still needs: gradients of the splats, and the photo, the
-    /// gradient and the derivatives of the loss.
+    /// Device memory for the lists of a range, beside what the view still needs: gradients of the splats, places of the rows, and
+    /// the photo, the gradient and the derivatives of the loss.
     fn bytes_for_lists(&self, of: &ViewOptions, segments: &[Segment]) -> u64 {
-        let rows: u64 = segments.iter().map(|segment| splat_bytes(segment.rows)).sum();
+        let rows: u64 =
+            segments.iter().map(|segment| splat_bytes(segment.rows) + PLACE_BYTES * u64::from(segment.rows)).sum();
         let reserved = (rows + (12 + 12 + 4) * of.camera.pixels() as u64) / 4 * 5;
         // The reserve is an estimate: without room beside it, lists may still fit.
         let room = self.gpu.room();
@@ -286,7 +287,7 @@ impl GpuRenderer {
     /// Waits until the picture of the view is known to be valid. A frame with too little room is recorded again with larger
     /// buffers, or drawn in ranges where these do not fit, and so is the loss of its picture.
     fn wait_for_valid_picture(&mut self, view: &mut View) -> GpuResult<()> {
-        let (mut again, blend) = (false, view.blend());
+        let blend = view.blend();
         while let Lists::Whole(lists) = &mut view.lists {
             let unread = DemandState::Known(Demand { isects: 0, list_max: 0 });
             let demand = match std::mem::replace(&mut lists.demand, unread) {
@@ -298,7 +299,9 @@ impl GpuRenderer {
             if let Ok(true) = fits {
                 break;
             }
-            again = true;
+            if let Some(loss) = &mut view.loss {
+                loss.sums = LossSums::Stale;
+            }
             self.frames_rerecorded += 1;
             let recorded = fits.and_then(|_| self.frame_again(view, blend));
             match recorded {
@@ -311,19 +314,22 @@ impl GpuRenderer {
                 Err(error) => return Err(error),
             }
         }
-        if again && let Some(Loss { plan, target, v_rgb, sums }) = view.loss.take() {
-            drop((v_rgb, sums)); // computed from the invalid picture
-            view.loss = Some(self.submit_loss(self.gpu.begin("image_loss"), view, &view.pixels.rgb, plan, target)?);
+        if let Some(loss) = view.loss.as_mut().filter(|loss| matches!(loss.sums, LossSums::Stale)) {
+            let size = [view.of.camera.width, view.of.camera.height];
+            loss.sums = self.submit_loss(self.gpu.begin("image_loss"), size, &view.pixels.rgb, loss)?;
         }
         Ok(())
     }
 
     /// Records lists and blending again, with buffers of the sizes that are known now.
     fn frame_again(&self, view: &mut View, blend: Blend) -> GpuResult<()> {
-        let Lists::Whole(lists) = std::mem::replace(&mut view.lists, Lists::Ranges(Vec::new())) else { return Ok(()) };
+        let whole = (std::mem::replace(&mut view.lists, Lists::Ranges(Vec::new())), view.segments.first());
+        let (Lists::Whole(lists), Some(segment)) = whole else {
+            let problem = "a view without whole lists has no frame to record again".to_string();
+            return Err(GpuError::Bindings { stage: "forward".to_string(), problem });
+        };
         let WholeLists { ranks, frame, .. } = *lists;
         drop(frame); // frees memory for the larger frame
-        let Some(segment) = view.segments.first() else { return Ok(()) };
         let mut recorder = self.gpu.begin("forward again");
         let splats = segment.splats.view();
         let (frame, demand) = self.tiles.frame(&self.gpu, &mut recorder, &splats, &ranks, blend, &view.pixels)?;
@@ -343,26 +349,24 @@ impl GpuRenderer {
         bytes.copy_to(&mut self.image.rgb)
     }
 
-    /// Submits the loss of `rgb`: the picture of the view, which may still turn out invalid, or the corrected picture.
+    /// Submits the loss of `rgb`: the picture of the view, which may still turn out invalid, or the corrected picture. Writes the
+    /// gradient of `loss`, and returns its sums.
     fn submit_loss(
         &self,
         mut recorder: Recorder<'_>,
-        view: &View,
+        size: [u32; 2],
         rgb: &Buffer,
-        plan: LossPlan,
-        target: Buffer,
-    ) -> GpuResult<Loss> {
+        loss: &Loss,
+    ) -> GpuResult<LossSums> {
         let gpu = &self.gpu;
-        let v_rgb = gpu.buffer("v_rgb", view.pixels.rgb.size())?;
-        let size = [view.of.camera.width, view.of.camera.height];
-        let (rgb, photo) = (rgb.view(), target.view());
-        let sums = self.loss.run(gpu, &mut recorder, size, &plan, &rgb, &photo, &v_rgb.view())?;
+        let (rgb, photo, v_rgb) = (rgb.view(), loss.target.view(), loss.v_rgb.view());
+        let sums = self.loss.run(gpu, &mut recorder, size, &loss.plan, &rgb, &photo, &v_rgb)?;
         let sums = match sums {
             Some(sums) => LossSums::Pending(recorder.read_back("image_loss", &sums.slice(0, 16))?),
             None => LossSums::Empty,
         };
         gpu.submit(recorder)?;
-        Ok(Loss { plan, target, v_rgb, sums })
+        Ok(sums)
     }
 
     /// Reads the gradient of the loss into `self.gradient`; zeros if no loss ran.
@@ -494,6 +498,8 @@ impl GpuRenderer {
             return Err(RenderError::OutOfOrder { call: "loss_value", needs: "loss" });
         };
         let sums = match std::mem::replace(&mut loss.sums, LossSums::Empty) {
+            // The wait above has computed stale sums again.
+            LossSums::Stale => return Err(RenderError::OutOfOrder { call: "loss_value", needs: "loss" }),
             LossSums::Empty => [0.0; 4],
             LossSums::Pending(readback) => {
                 let mut sums = [0.0f32; 4];
@@ -612,7 +618,10 @@ impl Renderer for GpuRenderer {
                 false => None,
             };
             let rgb = corrected.as_ref().unwrap_or(&view.pixels.rgb);
-            view.loss = Some(renderer.submit_loss(recorder, view, rgb, plan, pixels)?);
+            let v_rgb = renderer.gpu.buffer("v_rgb", view.pixels.rgb.size())?;
+            let mut loss = Loss { plan, target: pixels, v_rgb, sums: LossSums::Stale };
+            loss.sums = renderer.submit_loss(recorder, [target.width, target.height], rgb, &loss)?;
+            view.loss = Some(loss);
             Ok(())
         })
     }

@@ -1,32 +1,28 @@
 //! Ranges of tiles on a device: a picture whose splats or lists are too large to be bound or held at once is blended in parts,
 //! and its gradients come back in the same parts.
 //!
-//! A tally counts the splats that reach each tile. The host cuts the picture into ranges whose lists fit. For each range the
-//! splats that reach it are copied into one buffer, in row order, and go through the stages of a whole view. On the way back
-//! the copy and the lists are made again.
+//! A tally counts the splats that reach each tile. The host plans ranges of tiles whose lists fit, and parts of one tile's list
+//! where that list alone is too long. For each of them the splats that reach it are copied into one buffer, in row order, and
+//! go through the stages of a whole view. On the way back the copy and the lists are made again.
 //!
-//! Not here: the stages of a view (`gpu_tiles`, `gpu_tiles_bwd`), the cut (`crate::kernels::tile_range`).
+//! Not here: the stages of a view (`gpu_tiles`, `gpu_tiles_bwd`), the plan (`gpu_range_plan`).
 //!
-//! Invariants: 1. pictures and gradients have the same bits for any cut: a tile's list has the same splats in the same order,
-//! and a row's sums are carried from range to range in column order; 2. a range that lacks memory is cut again, down to one
-//! tile; 3. the picture is complete when [`Ranges::draw`] returns: it waits.
+//! Invariants: 1. pictures and gradients have the same bits for any plan: a tile's list has the same splats in the same order,
+//! a row's sums are carried from range to range in column order, and pixels carry their state from part to part; 2. a range
+//! that lacks memory is cut again, down to a few splats of one tile; 3. the picture is complete when [`Ranges::draw`] returns:
+//! it waits.
 
+use super::gpu_range_plan::{ALL_DEPTHS, PlannedRange, RangeLimits, Tally};
 use super::gpu_segments::{Segment, gradients_of, zero_gradients};
-use super::gpu_tiles::{Blend, Demand, FrameRoom, Pixels, Ranks, TileStages, splat_bytes, words};
-use super::gpu_tiles_bwd::{Fold, PictureGradientBuffers};
-use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
-use crate::kernels::splats::Grid;
+use super::gpu_tiles::{Blend, Demand, Frame, Pixels, Ranks, TileStages, splat_bytes, words};
+use super::gpu_tiles_bwd::{Fold, PictureGradientBuffers, carry_bytes};
+use crate::gpu::{Buffer, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
 use crate::kernels::tile_range::TileRange;
-use crate::kernels::uniforms_tiles::{RangeUniforms, SUMS, grid_words, range_words};
+use crate::kernels::uniforms_tiles::{DEPTH_BINS, RangeUniforms, grid_words, range_words};
 use std::sync::Arc;
 
 /// Invocations per workgroup of the stages on rows.
 const WORKGROUP: u32 = crate::gpu::WORKGROUP;
-/// Device memory of a range, bytes a splat: the splat and its gradient, two pairs of keys and values of the depth sort, and
-/// counts, offsets and order.
-pub(super) const BYTES_OF_SPLAT: u64 = 2 * 48 + 16 + 12;
-/// Bytes an intersection: the row, the sorted list, and the sums of the backward pass, which take more than the sort.
-pub(super) const BYTES_OF_ISECT: u64 = 8 + 4 * SUMS as u64 + 2;
 /// Bytes a row of the view: whether the splat reaches the range, and its place among those that do.
 pub(super) const PLACE_BYTES: u64 = 8;
 /// Words of the demand of one range: intersections, longest list, splats.
@@ -37,6 +33,7 @@ const DEMAND_WORDS: u32 = 3;
 pub(super) struct RangeStages {
     tally: Arc<Pipeline>,
     select: Arc<Pipeline>,
+    depths: Arc<Pipeline>,
     gather: Arc<Pipeline>,
     scatter: Arc<Pipeline>,
 }
@@ -51,85 +48,26 @@ impl RangeStages {
         Ok(RangeStages {
             tally: entry("range_tally")?,
             select: entry("range_select")?,
+            depths: entry("range_depths")?,
             gather: entry("range_gather")?,
             scatter: entry("range_scatter")?,
         })
     }
 }
 
-/// A range with the sizes of its buffers, and what it needed of them.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct PlannedRange {
-    range: TileRange,
-    /// Room for splats.
-    rows: u32,
-    room: FrameRoom,
-    /// Known after the range was blended.
-    pub demand: Demand,
-}
-
-/// The number of splats that reach each tile, and that begin and end in each tile column.
-#[derive(Debug)]
-struct Tally {
-    grid: Grid,
-    /// `[tiles_x][tiles_y]`.
-    isects: Vec<u64>,
-    /// `[tiles_x + 1]`: splats that begin in a column before this one.
-    begun: Vec<u64>,
-    /// `[tiles_x + 1]`: splats that ended in a column before this one.
-    ended: Vec<u64>,
-    /// Added to every size: the stages may round the reach of a splat differently from the tally.
-    slack: u64,
-}
-
-impl Tally {
-    fn of_tile(&self, x: u32, y: u32) -> u64 {
-        self.isects[(x * self.grid.tiles_y + y) as usize]
-    }
-
-    /// At most so many splats reach a range with this number of intersections.
-    fn rows(&self, range: &TileRange, isects: u64) -> u64 {
-        let [first, end] = range.columns.map(usize::from);
-        (self.begun[end] - self.ended[first]).min(isects)
-    }
-
-    /// Device memory of a range, bytes; size classes of the pool add up to a quarter.
-    fn bytes(&self, range: &TileRange, isects: u64) -> u64 {
-        (BYTES_OF_SPLAT * (self.rows(range, isects) + self.slack) + BYTES_OF_ISECT * (isects + self.slack)) / 4 * 5
-    }
-
-    /// Cuts the picture into ranges of at most `bytes` bytes whose splats and lists fit one binding each.
-    fn cut(&self, bytes: u64, binding: u64) -> Vec<PlannedRange> {
-        let fits = |range: &TileRange, isects: u64| {
-            let rows = self.rows(range, isects) + self.slack;
-            self.bytes(range, isects) <= bytes
-                && splat_bytes(1) * rows <= binding
-                && 4 * (isects + self.slack) <= binding.min(u64::from(u32::MAX))
-        };
-        let ranges = TileRange::cut(self.grid, |x, y| self.of_tile(x, y), fits);
-        ranges.into_iter().map(|range| self.planned(range)).collect()
-    }
-
-    fn planned(&self, range: TileRange) -> PlannedRange {
-        let [columns, rows] = [range.columns, range.rows].map(|[first, end]| u32::from(first)..u32::from(end));
-        let tiles = columns.flat_map(|x| rows.clone().map(move |y| (x, y)));
-        let (mut isects, mut longest) = (0, 0);
-        for (x, y) in tiles {
-            isects += self.of_tile(x, y);
-            longest = longest.max(self.of_tile(x, y));
-        }
-        let size = |count: u64| u32::try_from(count + self.slack).unwrap_or(u32::MAX);
-        let room = FrameRoom { capacity: size(isects).max(1), list_max: size(longest) };
-        let demand = Demand { isects: 0, list_max: 0 };
-        PlannedRange { range, rows: size(self.rows(&range, isects)), room, demand }
-    }
-}
-
 /// The splats that reach a range, in row order, and where each row of the view lies among them.
 struct Copied {
     splats: Buffer,
-    places: Buffer,
+    places: Places,
     ranks: Ranks,
+}
+
+/// Where the rows of the segments lie in a copy.
+struct Places {
+    /// For each segment `[rows + 1]` u32: the place of each row among the copied rows of the segment.
+    in_segment: Vec<Buffer>,
+    /// `[segments + 1]` u32: copied rows before each segment; the last entry is their number.
+    bases: Buffer,
 }
 
 /// What the parts of a view have in common.
@@ -146,17 +84,18 @@ impl Ranges<'_> {
     /// Returns the ranges.
     ///
     /// # Errors
-    /// The device failed, or has no memory for one tile.
+    /// The device failed, or has no memory for the smallest part of a tile's list.
     pub fn draw(&self, segments: &[Segment], bytes: u64) -> GpuResult<Vec<PlannedRange>> {
         let mut tally = self.tally(segments)?;
-        let isects = tally.isects.iter().sum();
-        let mut bytes = bytes.min(tally.bytes(&TileRange::all(self.blend.grid), isects));
+        let binding = self.gpu.max_binding_bytes();
+        let mut limits = RangeLimits { bytes: bytes.min(tally.bytes_of_all()), binding };
         loop {
-            let mut planned = tally.cut(bytes, self.gpu.max_binding_bytes());
+            let mut planned =
+                tally.plan(limits, |range, keys, bits| self.splats_by_depth(segments, range, keys, bits))?;
             match self.blend_all(segments, &mut planned) {
                 Ok(true) => return Ok(planned),
                 Ok(false) => tally.slack = 2 * tally.slack + 64,
-                Err(error) if error.lacks_room() && planned.iter().any(|p| p.range.tiles() > 1) => bytes /= 2,
+                Err(error) if error.lacks_room() && planned.iter().any(|range| range.can_be_cut) => limits.bytes /= 2,
                 Err(error) => return Err(error),
             }
         }
@@ -166,7 +105,7 @@ impl Ranges<'_> {
     /// [`Ranges::draw`] returned; ranges that lack memory now are cut again.
     ///
     /// # Errors
-    /// The device failed, or has no memory for one tile.
+    /// As [`Ranges::draw`].
     pub fn back(
         &self,
         segments: &mut [Segment],
@@ -176,9 +115,8 @@ impl Ranges<'_> {
         let mut bytes = self.gpu.room();
         loop {
             zero_gradients(self.gpu, segments)?;
-            let done = planned.iter().try_for_each(|range| self.back_range(segments, range, picture));
-            match done {
-                Err(error) if error.lacks_room() && planned.iter().any(|p| p.range.tiles() > 1) => {
+            match self.back_all(segments, planned, picture) {
+                Err(error) if error.lacks_room() && planned.iter().any(|range| range.can_be_cut) => {
                     bytes = (bytes / 2).min(self.gpu.room() / 2);
                     *planned = self.draw(segments, bytes)?;
                 }
@@ -194,21 +132,61 @@ impl Ranges<'_> {
         self.gpu.submit(recorder).map(|_| ())
     }
 
-    fn uniform(
+    /// Propagates the gradient through all ranges in column order, and through the parts of a tile from the farthest on.
+    fn back_all(
         &self,
-        recorder: &mut Recorder<'_>,
-        segment: &Segment,
-        range: TileRange,
-        capacity: u32,
-    ) -> GpuResult<BufferView> {
-        recorder.uniform(&RangeUniforms {
+        segments: &[Segment],
+        planned: &[PlannedRange],
+        picture: PictureGradientBuffers<'_>,
+    ) -> GpuResult<()> {
+        let carry = planned.iter().any(PlannedRange::is_part).then(|| {
+            let bytes = carry_bytes(self.pixels);
+            self.gpu.buffer("pixels between parts", bytes)
+        });
+        let carry = carry.transpose()?;
+        for of_range in planned.chunk_by(|a, b| a.range == b.range) {
+            of_range.iter().rev().try_for_each(|part| self.back_range(segments, part, picture, carry.as_ref()))?;
+        }
+        Ok(())
+    }
+
+    /// Uniforms of a stage on the rows of a segment, without room for a copy.
+    fn uniforms(&self, number: usize, segment: &Segment, range: TileRange, depths: [u32; 2]) -> RangeUniforms {
+        RangeUniforms {
             grid: grid_words(self.blend.grid),
             range: range_words(range),
-            first_row: segment.first as u32,
+            segment: number as u32,
             row_count: segment.rows,
-            capacity,
-            pad: 0,
-        })
+            capacity: 0,
+            bin_bits: 0,
+            depths,
+            pad: [0; 2],
+        }
+    }
+
+    fn uniforms_of_copy(&self, number: usize, segment: &Segment, planned: &PlannedRange) -> RangeUniforms {
+        let uniforms = self.uniforms(number, segment, planned.range, planned.depths);
+        RangeUniforms { capacity: planned.rows, ..uniforms }
+    }
+
+    /// Counts the splats that reach the range at these depth keys, in bins of `1 << bits` keys, and waits for the counts.
+    fn splats_by_depth(
+        &self,
+        segments: &[Segment],
+        range: TileRange,
+        keys: [u32; 2],
+        bits: u32,
+    ) -> GpuResult<Vec<u32>> {
+        let mut recorder = self.gpu.begin("tiles");
+        let bins = recorder.buffer_zeroed("splats by depth", words(DEPTH_BINS))?;
+        for (i, segment) in segments.iter().enumerate() {
+            let uniforms = RangeUniforms { bin_bits: bits, ..self.uniforms(i, segment, range, keys) };
+            let views = [recorder.uniform(&uniforms)?, segment.splats.view(), bins.view()];
+            recorder.dispatch("tile_range", &self.stages.depths, &views, groups_1d(segment.rows, WORKGROUP))?;
+        }
+        let bins = recorder.read_back("tile_range", &bins.view())?;
+        self.gpu.submit(recorder)?;
+        bins.to_vec()
     }
 
     /// Counts the splats of each tile and waits for the counts.
@@ -217,8 +195,8 @@ impl Ranges<'_> {
         let mut recorder = self.gpu.begin("tiles");
         let changes = recorder.buffer_zeroed("splats of tiles", words(grid.tiles_x * (grid.tiles_y + 1)))?;
         let columns = recorder.buffer_zeroed("splats of tile columns", words(2 * (grid.tiles_x + 1)))?;
-        for segment in segments {
-            let uniform = self.uniform(&mut recorder, segment, TileRange::all(grid), 0)?;
+        for (i, segment) in segments.iter().enumerate() {
+            let uniform = recorder.uniform(&self.uniforms(i, segment, TileRange::all(grid), ALL_DEPTHS))?;
             let views = [uniform, segment.splats.view(), changes.view(), columns.view()];
             recorder.dispatch("tile_range", &self.stages.tally, &views, groups_1d(segment.rows, WORKGROUP))?;
         }
@@ -250,16 +228,7 @@ impl Ranges<'_> {
 
     /// Records the copy of the splats that reach a range, and their depth sort.
     fn copy(&self, recorder: &mut Recorder<'_>, segments: &[Segment], planned: &PlannedRange) -> GpuResult<Copied> {
-        let rows = segments.last().map_or(0, |last| last.place().end) as u32;
-        let flags = self.gpu.buffer("splats of the range", words(rows))?;
-        for segment in segments {
-            let uniform = self.uniform(recorder, segment, planned.range, planned.rows)?;
-            let views = [uniform, segment.splats.view(), flags.view()];
-            recorder.dispatch("tile_range", &self.stages.select, &views, groups_1d(segment.rows, WORKGROUP))?;
-        }
-        let places = self.gpu.buffer("places in the range", words(rows + 1))?;
-        self.tiles.scan(self.gpu, recorder, &flags.view(), rows, &places.view())?;
-        drop(flags);
+        let places = self.places(recorder, segments, planned)?;
         // Records beyond the last splat stay zero, as those of a row that is not drawn.
         let splats = recorder.buffer_zeroed("splats of a range", splat_bytes(planned.rows))?;
         self.gather(recorder, segments, planned, &places, |segment| Ok(&segment.splats), &splats)?;
@@ -268,19 +237,39 @@ impl Ranges<'_> {
         Ok(Copied { splats, places, ranks })
     }
 
+    /// Records the places of the splats that reach a range, segment by segment.
+    fn places(&self, recorder: &mut Recorder<'_>, segments: &[Segment], planned: &PlannedRange) -> GpuResult<Places> {
+        let count = segments.len() as u32;
+        let totals = self.gpu.buffer("splats of segments in the range", words(count))?;
+        let mut in_segment = Vec::with_capacity(segments.len());
+        for (i, segment) in segments.iter().enumerate() {
+            let flags = self.gpu.buffer("splats of the range", words(segment.rows))?;
+            let uniform = recorder.uniform(&self.uniforms_of_copy(i, segment, planned))?;
+            let views = [uniform, segment.splats.view(), flags.view()];
+            recorder.dispatch("tile_range", &self.stages.select, &views, groups_1d(segment.rows, WORKGROUP))?;
+            let places = self.gpu.buffer("places in the range", words(segment.rows + 1))?;
+            self.tiles.scan(self.gpu, recorder, &flags.view(), segment.rows, &places.view())?;
+            recorder.copy(&places.slice(words(segment.rows), 4), &totals.slice(words(i as u32), 4))?;
+            in_segment.push(places);
+        }
+        let bases = self.gpu.buffer("splats before segments", words(count + 1))?;
+        self.tiles.scan(self.gpu, recorder, &totals.view(), count, &bases.view())?;
+        Ok(Places { in_segment, bases })
+    }
+
     /// Records the copy of records of the rows that reach a range.
     fn gather<'s>(
         &self,
         recorder: &mut Recorder<'_>,
         segments: &'s [Segment],
         planned: &PlannedRange,
-        places: &Buffer,
+        places: &Places,
         records: impl Fn(&'s Segment) -> GpuResult<&'s Buffer>,
         to: &Buffer,
     ) -> GpuResult<()> {
-        for segment in segments {
-            let uniform = self.uniform(recorder, segment, planned.range, planned.rows)?;
-            let views = [uniform, places.view(), records(segment)?.view(), to.view()];
+        for (i, (segment, in_segment)) in segments.iter().zip(&places.in_segment).enumerate() {
+            let uniform = recorder.uniform(&self.uniforms_of_copy(i, segment, planned))?;
+            let views = [uniform, in_segment.view(), records(segment)?.view(), to.view(), places.bases.view()];
             recorder.dispatch("tile_range", &self.stages.gather, &views, groups_1d(segment.rows, WORKGROUP))?;
         }
         Ok(())
@@ -292,19 +281,12 @@ impl Ranges<'_> {
         let demands = recorder.buffer_zeroed("demands of ranges", words(DEMAND_WORDS * planned.len() as u32))?;
         for (i, range) in planned.iter().enumerate() {
             let copied = self.copy(&mut recorder, segments, range)?;
-            let (splats, rows) = (copied.splats.view(), copied.places.size() - 4);
-            let frame = self.tiles.lists(
-                self.gpu,
-                &mut recorder,
-                &splats,
-                &copied.ranks,
-                self.blend,
-                range.range,
-                range.room,
-            )?;
+            let (splats, bases) = (copied.splats.view(), &copied.places.bases);
+            let frame = self.lists(&mut recorder, &copied, range)?;
             self.tiles.blend(&mut recorder, &splats, &frame, self.pixels)?;
             let total = copied.ranks.offsets.slice(words(copied.ranks.rows), 4);
-            for (word, view) in [total, frame.longest.slice(0, 4), copied.places.slice(rows, 4)].iter().enumerate() {
+            let copied_rows = bases.slice(words(segments.len() as u32), 4);
+            for (word, view) in [total, frame.longest.slice(0, 4), copied_rows].iter().enumerate() {
                 let at = 4 * (u64::from(DEMAND_WORDS) * i as u64 + word as u64);
                 recorder.copy(view, &demands.slice(at, 4))?;
             }
@@ -323,17 +305,26 @@ impl Ranges<'_> {
         Ok(had_room)
     }
 
+    /// Records the lists of a range or part.
+    fn lists(&self, recorder: &mut Recorder<'_>, copied: &Copied, planned: &PlannedRange) -> GpuResult<Frame> {
+        let (splats, room) = (copied.splats.view(), planned.room);
+        let (blend, range) = (self.blend, planned.range);
+        let frame = self.tiles.lists(self.gpu, recorder, &splats, &copied.ranks, blend, range, room)?;
+        Ok(Frame { part: planned.part, ..frame })
+    }
+
     /// Submits the backward pass of one range: the sums of its rows go on from those that the segments hold.
     fn back_range(
         &self,
         segments: &[Segment],
         planned: &PlannedRange,
         picture: PictureGradientBuffers<'_>,
+        carry: Option<&Buffer>,
     ) -> GpuResult<()> {
         let (gpu, mut recorder) = (self.gpu, self.gpu.begin("backward"));
-        let Copied { splats, places, ranks } = self.copy(&mut recorder, segments, planned)?;
-        let (range, room, demand) = (planned.range, planned.room, planned.demand);
-        let frame = self.tiles.lists(gpu, &mut recorder, &splats.view(), &ranks, self.blend, range, room)?;
+        let copied = self.copy(&mut recorder, segments, planned)?;
+        let frame = self.lists(&mut recorder, &copied, planned)?;
+        let Copied { splats, places, ranks } = copied;
         let sums = gpu.buffer("sums of a range", splat_bytes(planned.rows))?;
         self.gather(&mut recorder, segments, planned, &places, gradients_of, &sums)?;
         let (into, of_splats, of_sums) = (&mut recorder, splats.view(), sums.view());
@@ -344,14 +335,15 @@ impl Ranges<'_> {
             &ranks,
             &frame,
             self.pixels,
-            demand,
+            planned.demand,
             picture,
             &of_sums,
-            Fold::Range,
+            carry.filter(|_| planned.is_part()).map_or(Fold::Range, Fold::Part),
         )?;
-        for segment in segments {
-            let uniform = self.uniform(&mut recorder, segment, range, planned.rows)?;
-            let views = [uniform, places.view(), gradients_of(segment)?.view(), sums.view()];
+        for (i, (segment, in_segment)) in segments.iter().zip(&places.in_segment).enumerate() {
+            let uniform = recorder.uniform(&self.uniforms_of_copy(i, segment, planned))?;
+            let bases = places.bases.view();
+            let views = [uniform, in_segment.view(), gradients_of(segment)?.view(), sums.view(), bases];
             recorder.dispatch("tile_range", &self.stages.scatter, &views, groups_1d(segment.rows, WORKGROUP))?;
         }
         gpu.submit(recorder).map(|_| ())

@@ -31,13 +31,6 @@ pub(super) struct Segment {
     pub v_splats: Option<Buffer>,
 }
 
-impl Segment {
-    /// The rows, by their numbers in the view.
-    pub fn place(&self) -> Range<usize> {
-        self.first..self.first + self.rows as usize
-    }
-}
-
 /// Runs `stage` on consecutive parts of `rows`: on all rows if device memory allows, else on half as many, and so on.
 ///
 /// # Errors
@@ -69,11 +62,11 @@ pub(super) fn submit_rows(
     view: &ViewOptions,
     scratch: &mut Vec<f32>,
 ) -> GpuResult<Vec<Segment>> {
-    let most = (gpu.max_binding_bytes() / SPLAT_BYTES) as usize / CHUNK_STEP * CHUNK_STEP;
+    let most = ((gpu.max_binding_bytes() / SPLAT_BYTES) as usize / CHUNK_STEP * CHUNK_STEP).max(CHUNK_STEP);
     let mut segments = Vec::new();
-    for begin in (0..rows.rows()).step_by(most.max(CHUNK_STEP)) {
+    for begin in (0..rows.rows()).step_by(most) {
         // Row numbers fit 32 bits: `Sequence::rows_in` has checked the count.
-        let count = (rows.rows() - begin).min(most.max(CHUNK_STEP)) as u32;
+        let count = (rows.rows() - begin).min(most) as u32;
         let splats = gpu.buffer("splats", splat_bytes(count))?;
         in_chunks(count as usize, |part| {
             let rows_of_part = begin + part.start..begin + part.end;

@@ -108,6 +108,22 @@ pub struct FrameRoom {
     pub list_max: u32,
 }
 
+/// The part of its tiles' lists that a frame holds: everything, or the entries of one tile between two depths.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ListPart {
+    /// At least the list entries of the nearer parts.
+    pub base: u32,
+    /// Whether no part is nearer.
+    pub is_nearest: bool,
+    /// Whether no part is farther.
+    pub is_farthest: bool,
+}
+
+impl ListPart {
+    /// Whole lists.
+    pub const ALL: ListPart = ListPart { base: 0, is_nearest: true, is_farthest: true };
+}
+
 /// Tile lists of a view, or of a range of its tiles.
 #[derive(Debug)]
 pub struct Frame {
@@ -115,6 +131,8 @@ pub struct Frame {
     pub blend: Blend,
     /// The tiles with lists.
     pub range: TileRange,
+    /// The part of the lists.
+    pub part: ListPart,
     /// Capacity of the buffers, and longest list that the recorded segments cover.
     pub room: FrameRoom,
     /// `[capacity]` u32: row of each intersection, by emit index.
@@ -373,7 +391,8 @@ impl TileStages {
         let views = [lists, live, sorted.keys.view(), tile_offsets.view(), longest.view()];
         let groups = groups_1d(tiles + 1, WORKGROUP);
         recorder.dispatch("isect_offsets", &self.pipelines.isect_offsets, &views, groups)?;
-        Ok(Frame { blend, range, room, row_from_isect, isects: sorted.values, tile_offsets, longest })
+        let part = ListPart::ALL;
+        Ok(Frame { blend, range, part, room, row_from_isect, isects: sorted.values, tile_offsets, longest })
     }
 
     /// Records the tile lists and the blending of a whole view, with buffers as large as earlier frames needed. The picture
@@ -412,9 +431,10 @@ impl TileStages {
         let segments = frame.room.list_max.div_ceil(SEGMENT_FWD).max(1);
         for segment in 0..segments {
             let mut flags = 0;
-            flags |= if segment == 0 { SEGMENT_FIRST } else { 0 };
-            flags |= if segment + 1 == segments { SEGMENT_LAST } else { 0 };
-            let view = recorder.uniform(&raster_uniforms(&frame.blend, frame.range, segment, SEGMENT_FWD, flags))?;
+            flags |= if segment == 0 && frame.part.is_nearest { SEGMENT_FIRST } else { 0 };
+            flags |= if segment + 1 == segments && frame.part.is_farthest { SEGMENT_LAST } else { 0 };
+            let uniforms = raster_uniforms(&frame.blend, frame.range, segment, SEGMENT_FWD, flags);
+            let view = recorder.uniform(&RasterUniforms { list_base: frame.part.base, ..uniforms })?;
             let views = [
                 view,
                 splats.clone(),
@@ -512,5 +532,7 @@ pub(super) fn raster_uniforms(
         window_first: 0,
         window_end: 0,
         range: range_words(range),
+        list_base: 0,
+        pad: [0; 3],
     }
 }

@@ -26,28 +26,38 @@ pub struct PictureGradientBuffers<'a> {
 }
 
 /// What becomes of the sums of the rows of a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Fold {
+#[derive(Debug, Clone, Copy)]
+pub enum Fold<'a> {
     /// The frame is the whole view: sums begin at zero and become gradients.
     Whole,
     /// The frame is a range of tiles: the rows continue the sums that their records hold, and store sums.
     Range,
+    /// As `Range`, for a part of the list of a tile. Parts come farthest first; between two of them, the buffer holds the state
+    /// of the pixels (8 B a pixel).
+    Part(&'a Buffer),
 }
 
-/// Windows of fewer intersections are not tried: each window is a pass over all lists.
+/// Windows of fewer intersections are not tried, nor more than a few windows of any size: each window is a pass over all lists.
 const WINDOW_MIN: u32 = 1 << 10;
+const WINDOWS_MOST: u32 = 4;
 
 /// A buffer for the sums of a window of at most `isects` intersections: as many as fit one binding and device memory.
 fn window_of_sums(gpu: &Gpu, isects: u32) -> GpuResult<(Buffer, u32)> {
     let bytes = 4 * u64::from(SUMS);
     let most = u32::try_from(gpu.max_binding_bytes() / bytes).unwrap_or(u32::MAX).max(1);
     let mut window = most.min(isects.max(1));
+    let least = isects.div_ceil(WINDOWS_MOST).max(WINDOW_MIN);
     loop {
         match gpu.buffer("sums of intersections", bytes * u64::from(window)) {
-            Err(error) if error.lacks_room() && window > WINDOW_MIN => window = window.div_ceil(2),
+            Err(error) if error.lacks_room() && window > least => window = window.div_ceil(2).max(least),
             buffer => return Ok((buffer?, window)),
         }
     }
+}
+
+/// Bytes of the state of the pixels between two segments or parts: two words a pixel; the transmittance has one.
+pub fn carry_bytes(pixels: &Pixels) -> u64 {
+    2 * pixels.t_final.size()
 }
 
 impl TileStages {
@@ -67,13 +77,25 @@ impl TileStages {
         demand: Demand,
         picture: PictureGradientBuffers<'_>,
         v_splats: &BufferView,
-        fold: Fold,
+        fold: Fold<'_>,
     ) -> GpuResult<()> {
         let segments = demand.list_max.div_ceil(SEGMENT_BWD).max(1);
-        // Two words a pixel; the transmittance has one.
-        let carry = gpu.buffer("pixels between segments", if segments > 1 { 2 * pixels.t_final.size() } else { 8 })?;
-        let (partials, window) = window_of_sums(gpu, demand.isects)?;
-        let fold_flags = if fold == Fold::Range { FOLD_CARRIED | FOLD_UNFINISHED } else { 0 };
+        let (own_carry, partials, window);
+        let carry = match fold {
+            Fold::Part(carry) => {
+                // A second window would find the state of the pixels after this part instead of the state before it.
+                window = demand.isects.max(1);
+                partials = gpu.buffer("sums of intersections", 4 * u64::from(SUMS) * u64::from(window))?;
+                carry
+            }
+            Fold::Whole | Fold::Range => {
+                let bytes = if segments > 1 { carry_bytes(pixels) } else { 8 };
+                own_carry = gpu.buffer("pixels between segments", bytes)?;
+                (partials, window) = window_of_sums(gpu, demand.isects)?;
+                &own_carry
+            }
+        };
+        let fold_flags = if matches!(fold, Fold::Whole) { 0 } else { FOLD_CARRIED | FOLD_UNFINISHED };
         let mut first = 0u32;
         loop {
             let isects = first..demand.isects.min(first.saturating_add(window));
@@ -113,8 +135,8 @@ impl TileStages {
     ) -> GpuResult<()> {
         for segment in (0..segments).rev() {
             let mut flags = if v_alpha.is_some() { HAS_V_ALPHA } else { 0 };
-            flags |= if segment + 1 == segments { SEGMENT_FIRST } else { 0 };
-            flags |= if segment == 0 { SEGMENT_LAST } else { 0 };
+            flags |= if segment + 1 == segments && frame.part.is_farthest { SEGMENT_FIRST } else { 0 };
+            flags |= if segment == 0 && frame.part.is_nearest { SEGMENT_LAST } else { 0 };
             let views = [
                 recorder.uniform(&window_uniforms(frame, segment, flags, isects.clone()))?,
                 splats.clone(),
@@ -185,6 +207,7 @@ fn window_uniforms(frame: &Frame, segment: u32, flags: u32, isects: Range<u32>) 
     RasterUniforms {
         window_first,
         window_end,
+        list_base: frame.part.base,
         ..raster_uniforms(&frame.blend, frame.range, segment, SEGMENT_BWD, flags)
     }
 }

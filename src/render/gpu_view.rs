@@ -3,7 +3,7 @@
 //! Not here: the stages.
 
 use super::device_needs::ViewSizes;
-use super::gpu_ranges::PlannedRange;
+use super::gpu_range_plan::PlannedRange;
 use super::gpu_rows::DeviceColumns;
 use super::gpu_segments::Segment;
 use super::gpu_tiles::{Blend, Demand, DemandReadback, Frame, Pixels, Ranks};
@@ -116,7 +116,7 @@ impl View {
         blend_of(&self.of)
     }
 
-    /// Rows, intersections, longest list and pixels. Lists are empty until a call has read the picture, the loss or a gradient.
+    /// Rows, intersections and pixels. Lists are empty until a call has read the picture, the loss or a gradient.
     pub fn sizes(&self) -> ViewSizes {
         let demands = match &self.lists {
             Lists::Whole(lists) => match lists.demand {
@@ -128,7 +128,6 @@ impl View {
         ViewSizes {
             rows: self.segments.iter().map(|segment| u64::from(segment.rows)).sum(),
             isects: demands.iter().map(|demand| u64::from(demand.isects)).sum(),
-            longest_list: demands.iter().map(|demand| u64::from(demand.list_max)).max().unwrap_or(0),
             pixels: self.of.camera.pixels() as u64,
         }
     }
@@ -153,6 +152,8 @@ pub(super) struct Loss {
 /// The four sums from which the value of a loss follows.
 #[derive(Debug)]
 pub(super) enum LossSums {
+    /// They and the gradient belong to an invalid picture, and must be computed again.
+    Stale,
     /// The picture has no pixels.
     Empty,
     /// The readback is pending.

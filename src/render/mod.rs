@@ -11,6 +11,7 @@ pub mod device_needs;
 pub mod gpu;
 mod gpu_gradients;
 pub mod gpu_loss;
+mod gpu_range_plan;
 mod gpu_ranges;
 pub mod gpu_rows;
 mod gpu_segments;

@@ -36,15 +36,6 @@ pub(super) struct ViewMemory {
     pub at_last: u64,
 }
 
-/// Requirements of a view that does not fit.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct ViewNeed {
-    /// Pages needed at once, including new pages from splits.
-    pub pages: usize,
-    /// Its rows relative to the largest view so far; at least 1.
-    pub growth: f64,
-}
-
 /// The memory budget of a run, from which its number of frames follows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct HostBudget {
@@ -142,17 +133,14 @@ impl HostBudget {
         (self.bytes.saturating_sub(taken) / scene.pager.frame_bytes() as u64) as usize
     }
 
-    /// The least budget, larger than this one, with which a resumed run has frames for all of these views.
-    pub(super) fn least_for(&self, scene: &PagedScene, view: ViewMemory, needs: &[ViewNeed]) -> u64 {
+    /// The least budget, larger than this one, with which a resumed run has `pages` frames.
+    pub(super) fn least_for(&self, scene: &PagedScene, view: ViewMemory, pages: usize) -> u64 {
         // A resumed run has the full plan again.
         let staging = self.staging + if self.is_plan_small { (PLAN_BYTES - PLAN_BYTES_LEAST) as u64 } else { 0 };
         let frame_bytes = scene.pager.frame_bytes() as u64;
-        let need = |need: &ViewNeed| {
-            let of_rows = view.at_last.saturating_sub(self.view_pixels) as f64 * need.growth * VIEW_SPARE;
-            let beside_frames = self.bytes_beside_frames(scene, self.view_pixels + of_rows as u64, 1.0);
-            with_staging(beside_frames + need.pages as u64 * frame_bytes, staging, self.bytes)
-        };
-        let least = needs.iter().map(need).max().unwrap_or(0);
+        let of_rows = view.at_last.saturating_sub(self.view_pixels) as f64 * VIEW_SPARE;
+        let beside_frames = self.bytes_beside_frames(scene, self.view_pixels + of_rows as u64, 1.0);
+        let least = with_staging(beside_frames + pages as u64 * frame_bytes, staging, self.bytes);
         // A sixteenth of margin: the resumed run measures its memory anew.
         (least + least / 16).max(self.bytes + frame_bytes)
     }

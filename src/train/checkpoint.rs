@@ -265,6 +265,15 @@ impl Checkpoint {
         Ok(())
     }
 
+    /// Completes the commit in progress after a step that failed half-way, so that the run loses no more than that step.
+    /// The step changed no page of the cut before the page was written.
+    ///
+    /// # Errors
+    /// A page of the cut cannot be written; earlier commits are intact.
+    pub(super) fn finish_cut(&mut self, trainer: &mut Trainer) -> Result<(), TrainError> {
+        if trainer.scene.pager.is_frozen() { self.finish(trainer) } else { Ok(()) }
+    }
+
     /// Commits the current state at once and abandons a commit in progress.
     ///
     /// # Errors

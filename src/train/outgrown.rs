@@ -1,20 +1,16 @@
-//! Scenes that outgrow their memory. A scene in memory starts paging to the drive of its checkpoint. A view that needs
-//! more pages than there are frames ends the run with a commit and an error that names the photo and enough memory.
+//! Scenes that outgrow their memory. A scene in memory starts paging to the drive of its checkpoint. A run that ends for want of
+//! memory commits first, and its error names the photo and enough memory.
+//!
+//! Not here: views in batches (`step`), frames of a growing scene (`fitting`).
 //!
 //! Invariant: no step is lost and no bit of the result changes. A step that lacked frames can be repeated.
 
-use super::budget::ViewNeed;
-use super::catch_up::visible_rows;
 use super::error::TrainError;
-use super::largest_view::largest_view;
 use super::staging::PLAN_BYTES;
 use super::trainer::Trainer;
 use super::training_loop::LoopOutputs;
 use crate::base::units::{MIB, format_bytes};
-use crate::dataset::loader::Dataset;
 use crate::paging::error::PagingError;
-use crate::scene::camera::Camera;
-use crate::scene::page_split::parts_of;
 
 impl TrainError {
     /// Adds the name of the view to an error about missing frames.
@@ -97,52 +93,24 @@ impl Trainer {
         Ok(())
     }
 
-    /// Commits a run that has outgrown its frames, so that it can resume with more memory, and adds the least memory to
-    /// the error.
-    pub(super) fn commit_outgrown(
-        &mut self,
-        error: TrainError,
-        dataset: &Dataset,
-        outputs: &mut LoopOutputs<'_>,
-    ) -> TrainError {
-        let TrainError::Paging(mut source @ PagingError::WorkingSet { .. }) = error else { return error };
-        if let Some(checkpoint) = outputs.checkpoint.as_deref_mut().filter(|_| !self.is_torn)
-            && let Err(second) = checkpoint.commit(self, outputs.metrics)
-        {
-            eprintln!("warning: the run could not be committed: {second}");
-        }
-        let next = Some(self.next_view());
-        let largest = largest_view(dataset, self.scene.pager.index()).view.filter(|view| Some(*view) != next);
-        let mut needs = Vec::new();
-        for view in next.into_iter().chain(largest) {
-            match self.measure_need(&dataset.views[view].camera) {
-                Ok(need) => needs.push(need),
-                Err(second) => {
-                    eprintln!("warning: the memory of the view {} is unknown: {second}", dataset.views[view].name);
-                }
+    /// Commits what a run can be resumed from, before it ends with `error`: the last good step of a run that lacked frames or
+    /// whose renderer failed, or the cut in progress of a step that failed half-way. Adds the least memory to an error about
+    /// frames.
+    pub(super) fn commit_before_end(&mut self, error: TrainError, outputs: &mut LoopOutputs<'_>) -> TrainError {
+        let is_last_step_good =
+            matches!(error, TrainError::Render(_) | TrainError::Paging(PagingError::WorkingSet { .. }));
+        if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
+            let done = match self.is_torn {
+                true => checkpoint.finish_cut(self),
+                false if is_last_step_good => checkpoint.commit(self, outputs.metrics),
+                false => Ok(()),
+            };
+            if let Err(second) = done {
+                eprintln!("warning: the run could not be committed: {second}");
             }
         }
-        if let PagingError::WorkingSet { pages, .. } = &mut source {
-            // The error counts one frame for one split; further pages may split too.
-            *pages = needs.iter().map(|need| need.pages).fold(*pages, usize::max);
-            needs.push(ViewNeed { pages: *pages, growth: 1.0 });
-        }
-        let view = self.view_memory();
-        let least = self.budget.map(|budget| budget.least_for(&self.scene, view, &needs));
+        let TrainError::Paging(source @ PagingError::WorkingSet { pages, .. }) = error else { return error };
+        let least = self.budget.map(|budget| budget.least_for(&self.scene, self.view_memory(), pages));
         TrainError::Outgrown { source, least }
-    }
-
-    /// Measures what a step on a view needs, with pending events applied to copies of its pages.
-    fn measure_need(&mut self, camera: &Camera) -> Result<ViewNeed, PagingError> {
-        let (mut pages, mut rows, mut visible) = (0, 0, Vec::new());
-        let (now, of_view) = (self.state.step, self.scene.pager.pages_of_view(camera));
-        self.scene.visit(&of_view, &mut |rules, tables| {
-            pages += tables.iter().map(|table| parts_of(table.rows(), rules.page_rows())).sum::<usize>();
-            visible_rows(tables, &rules.adam, now, camera, &mut visible);
-            rows += visible.len();
-            Ok::<(), PagingError>(())
-        })?;
-        let largest = self.working.row_from_working.capacity().max(1);
-        Ok(ViewNeed { pages, growth: (rows as f64 / largest as f64).max(1.0) })
     }
 }

@@ -215,7 +215,7 @@ impl Passes<'_> {
     fn batch_out(&mut self, batch: Batch, collects: bool) -> Result<bool, TrainError> {
         let is_first = self.batches.len() + 1 == self.outcome.batches;
         if !is_first {
-            self.pinned = self.scene.pager.pin_batch(self.step, &batch.pages)?;
+            self.pinned = self.scene.pager.pin_batch_again(self.step, &batch.pages)?;
             self.working.row_from_working = batch.row_from_working;
             gather_listed(&self.scene.rules, &self.pinned, self.step, self.working);
         }

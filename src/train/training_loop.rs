@@ -110,7 +110,7 @@ impl Trainer {
             match self.step(dataset, targets) {
                 Ok(outcome) => return Ok(Some(outcome)),
                 Err(error) if error.is_out_of_space() => self.make_space(outputs, error)?,
-                Err(error) => return Err(self.commit_outgrown(error, dataset, outputs)),
+                Err(error) => return Err(self.commit_before_end(error, outputs)),
             }
             if outputs.stop.exit_code().is_some() {
                 return Ok(None);

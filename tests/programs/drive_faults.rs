@@ -10,6 +10,7 @@ use gsscale::checkpoint::run_state::{Origin, RunIdentity};
 use gsscale::config::choice::{Chosen, Device};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::{RunOptions, simd_path};
+use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::optim::method::Method;
@@ -88,6 +89,9 @@ struct World {
     scene: PathBuf,
     want: Vec<u8>,
     fewest: usize,
+    /// Frames of the faulty runs.
+    frames: usize,
+    commit_every: f64,
     /// The run can continue without its commits.
     is_optional: bool,
     optimizer: Method,
@@ -107,12 +111,22 @@ impl World {
     fn of(optimizer: Method) -> World {
         let folder = TempDir::new().unwrap();
         let scene = make_scene(folder.path());
-        let mut world = World { folder, scene, want: Vec::new(), fewest: usize::MAX, is_optional: false, optimizer };
+        let mut world = World {
+            folder,
+            scene,
+            want: Vec::new(),
+            fewest: usize::MAX,
+            frames: usize::MAX,
+            commit_every: 0.05,
+            is_optional: false,
+            optimizer,
+        };
         let life = world.live("healthy", &Faults::new(), |_| {});
         life.result.unwrap();
         world.want = std::fs::read(Trainer::ply_path(&life.out)).unwrap();
         let pinned = std::fs::read_to_string(life.out.join("pinned")).unwrap();
         world.fewest = pinned.parse().unwrap();
+        world.frames = world.fewest + 20;
         world
     }
 
@@ -126,7 +140,8 @@ impl World {
 
     fn train_in(&self, out: &Path, faults: &Faults, plan: impl FnOnce(&Faults)) -> Result<(), TrainError> {
         let spill_dir = out.join("spill");
-        let config = TrainConfig { optimizer: self.optimizer, ..config(&spill_dir) };
+        let commit_every = CommitEvery::Seconds(self.commit_every);
+        let config = TrainConfig { optimizer: self.optimizer, commit_every, ..config(&spill_dir) };
         let start = Start::read(&self.scene, &config, None)?;
         let print = dataset_print(&start).unwrap();
         let sh_degree_start = start.sh_degree_start;
@@ -139,7 +154,7 @@ impl World {
         let engine = Box::new(FaultyEngine::new(engine, faults.clone()));
         let store = opened.paged_store(engine, layout, Codec::Raw)?;
         let sizes = PagerConfig {
-            frames: self.fewest.saturating_add(20),
+            frames: self.frames,
             prefetch_bytes: 1 << 20,
             plan_bytes: 1 << 20,
             ..PagerConfig::in_memory(PAGE_ROWS as usize, config.sh_degree)
@@ -188,7 +203,10 @@ impl World {
             stop: &stop,
             checkpoint: Some(&mut checkpoint),
         };
-        trainer.run(&dataset, &targets, &mut outputs)?;
+        if let Err(error) = trainer.run(&dataset, &targets, &mut outputs) {
+            self.after_failure(out, &mut trainer, &dataset, &checkpoint, &error);
+            return Err(error);
+        }
         trainer.save(&dataset, &Trainer::ply_path(out))?;
         let report = checkpoint.report();
         assert!(
@@ -197,6 +215,26 @@ impl World {
         );
         std::fs::write(out.join("pinned"), trainer.scene.pager.stats().pinned_max.to_string()).unwrap();
         Ok(())
+    }
+
+    /// A step that failed after its first update leaves nothing that may be exported, and completes the cut before it. With
+    /// commits as often as possible, a cut is begun after every second step at least.
+    fn after_failure(
+        &self,
+        out: &Path,
+        trainer: &mut Trainer,
+        dataset: &Dataset,
+        checkpoint: &Checkpoint,
+        error: &TrainError,
+    ) {
+        if !matches!(error, TrainError::Torn { .. }) {
+            return;
+        }
+        let path = out.join("torn.ply");
+        let refused = trainer.save(dataset, &path).expect_err("pages of two steps are no result").to_string();
+        assert!(refused.contains("failed half-way") && refused.contains("--resume") && !path.exists(), "{refused}");
+        let (step, last) = (trainer.steps_done(), checkpoint.last_step().unwrap());
+        assert!(last + 1 >= step, "torn in step {step}, committed up to step {last}: {error}");
     }
 
     /// Resumes the run in `out` with the real program on a healthy drive, and compares its bytes.
@@ -262,6 +300,25 @@ fn a_drive_that_fails_ends_the_run_and_its_last_commit_stands() {
         assert!(error.contains("remedy"), "case {i}: {error}");
         world.goes_on(&life.out, &format!("case {i}"));
     }
+}
+
+/// Views of several batches, so that the faults come in the pass in, between the passes, and in the pass out.
+#[test]
+fn a_drive_that_fails_in_either_pass_loses_one_step_at_most() {
+    let mut world = World::new();
+    (world.frames, world.commit_every) = (world.fewest / 3, 1e-9);
+    let mut torn = [0, 0];
+    for (i, (on, after)) in
+        [Operation::Read, Operation::Write].into_iter().flat_map(|on| (0..7).map(move |i| (on, 5 + 61 * i))).enumerate()
+    {
+        let life = world.live(&format!("passes-{i}"), &Faults::new(), |faults| {
+            faults.add(on, faults.count(on) + after, true, Fault::Error(ErrorKind::Other));
+        });
+        let error = life.result.expect_err("the drive fails for ever");
+        torn[usize::from(on == Operation::Write)] += u32::from(matches!(error, TrainError::Torn { .. }));
+        world.goes_on(&life.out, &format!("case {i}"));
+    }
+    assert!(torn[0] > 1 && torn[1] > 1 && torn[0] + torn[1] < 12, "{torn:?} of 7 steps each were torn");
 }
 
 #[test]

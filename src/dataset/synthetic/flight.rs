@@ -4,6 +4,8 @@
 //! forward and down, and neighbouring strips have opposite directions, so that every wall is seen. Strips cover the
 //! places that the camera aims at: the camera itself starts outside the city.
 //!
+//! Overview photos follow after the two passes: straight down from high above the middle of the city.
+//!
 //! Invariants: 1. poses depend on the options alone; 2. within a pass, photos overlap by 75 % along a strip and by 60 %
 //! across (in the middle of the pictures), unless the user chose the number of blocks.
 
@@ -21,6 +23,8 @@ const FOCAL: f64 = 0.9;
 /// Overlap of neighbouring photos in a strip, and of neighbouring strips.
 const FORWARD_OVERLAP: f64 = 0.75;
 const SIDE_OVERLAP: f64 = 0.60;
+/// Share of the city's area that an overview photo shows.
+const OVERVIEW_AREA: f64 = 0.4;
 
 /// One photo's camera, in the city's frame (without the offset).
 #[derive(Debug, Clone)]
@@ -30,6 +34,28 @@ pub(super) struct Shot {
     pub(super) centre: DVec3,
     /// Place on the ground that the camera aims at.
     pub(super) aim: DVec2,
+    /// Copies of the city that the photo shows; `None`: one.
+    copies: Option<Copies>,
+}
+
+/// Copies of the city, side by side.
+#[derive(Debug, Clone, Copy)]
+struct Copies {
+    /// Side of one copy, metres.
+    side: f64,
+    /// Number along x and y.
+    counts: [u32; 2],
+}
+
+impl Copies {
+    /// The ray, moved into the copy where it meets the ground. At the border of two copies the picture lacks the parts of
+    /// roofs that hide another copy's ground.
+    fn fold(&self, ray: Ray) -> Ray {
+        let ground = ray.at(-ray.from.z * ray.inverse.z);
+        let copy = |x: f64, count: u32| (x / self.side).round().clamp(0.0, f64::from(count - 1));
+        let offset = DVec3::new(copy(ground.x, self.counts[0]), copy(ground.y, self.counts[1]), 0.0) * self.side;
+        Ray { from: ray.from - offset, ..ray }
+    }
 }
 
 /// The flight: one camera, one pose per photo.
@@ -48,7 +74,8 @@ impl Shot {
     /// Ray through the picture position (x, y).
     pub(super) fn ray(&self, k: &Intrinsics, x: f64, y: f64) -> Ray {
         let d = DVec3::new((x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.0);
-        Ray::new(self.centre, self.rotation.transpose() * (d / d.length()))
+        let ray = Ray::new(self.centre, self.rotation.transpose() * (d / d.length()));
+        self.copies.map_or_else(|| ray.clone(), |copies| copies.fold(ray.clone()))
     }
 
     /// Picture position of a point, if it is in front of the camera and inside the picture.
@@ -90,12 +117,26 @@ pub(super) fn plan(options: &CityOptions) -> Flight {
     // Rounded down to whole blocks, which only increases the overlap.
     let blocks = options.blocks.unwrap_or(((side / PITCH) as u32).max(1));
     let side = f64::from(blocks) * PITCH;
-    let mut shots = Vec::with_capacity(options.views as usize);
+    let mut shots = Vec::with_capacity(options.photos() as usize);
     let first = options.views.div_ceil(2);
     for (pass, views) in [(0u32, first), (1, options.views - first)] {
         fly_pass(options, pass, views, side, tilt, step / spacing, &mut shots);
     }
+    (0..options.overviews).for_each(|_| shots.push(overview(options, side, shots.len() as u64)));
     Flight { intrinsics, shots, blocks }
+}
+
+/// A photo straight down on the middle of all copies that shows [`OVERVIEW_AREA`] of them; `side` is that of one copy.
+fn overview(options: &CityOptions, side: f64, number: u64) -> Shot {
+    let (width, height) = (f64::from(options.width), f64::from(options.height));
+    let [across, along] = options.tiles.map(f64::from);
+    let breadth = side * (OVERVIEW_AREA * across * along * width / height).sqrt();
+    let mut draws = Stream::new(options.seed, Purpose::City, number, 5);
+    let shift = DVec2::new(draws.normal_within(2.5), draws.normal_within(2.5)) * (0.02 * side);
+    let aim = DVec2::new(across - 1.0, along - 1.0) * (0.5 * side) + shift;
+    let heading = DVec2::new(0.0, 1.0);
+    let copies = (options.tiles != [1, 1]).then_some(Copies { side, counts: options.tiles });
+    Shot { rotation: attitude(heading, 0.0, 0.0, 0.0), centre: aim.extend(FOCAL * breadth), aim, copies }
 }
 
 /// One pass of strips over the square of this side; `ratio` is step / spacing.
@@ -121,7 +162,7 @@ fn fly_pass(options: &CityOptions, pass: u32, views: u32, side: f64, tilt: f64, 
             let level = (aim - heading * back).extend(ALTITUDE) + shift * 1.2;
             let (yaw, pitch, roll) =
                 (0.035 * draws.normal_within(2.5), 0.025 * draws.normal_within(2.5), 0.02 * draws.normal_within(2.5));
-            shots.push(Shot { rotation: attitude(heading, yaw, tilt + pitch, roll), centre: level, aim });
+            shots.push(Shot { rotation: attitude(heading, yaw, tilt + pitch, roll), centre: level, aim, copies: None });
         }
     }
 }
@@ -141,6 +182,26 @@ fn attitude(heading: DVec2, yaw: f64, tilt: f64, roll: f64) -> DMat3 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_overview_photo_shows_its_share_of_the_city() {
+        for tiles in [[1, 1], [2, 3]] {
+            let flight = plan(&CityOptions { views: 100, overviews: 2, tiles, ..CityOptions::default() });
+            let k = &flight.intrinsics;
+            let side = PITCH * f64::from(flight.blocks);
+            let places = |n: u32, copies: u32| (f64::from(n) + 0.5) / 100.0 * side * f64::from(copies) - 0.5 * side;
+            for shot in &flight.shots[100..] {
+                let at = |x, y| DVec3::new(places(x, tiles[0]), places(y, tiles[1]), 0.0);
+                let grid = (0..100).flat_map(|x| (0..100).map(move |y| at(x, y)));
+                let seen = grid.filter(|place| shot.project(k, *place).is_some()).count();
+                // A grid of 100 by 100 places counts a row or column too many or too few.
+                assert!((3900..=4100).contains(&seen), "{seen} of 10,000 places");
+                let ray = shot.ray(k, 0.0, 0.0);
+                let ground = ray.at(-ray.from.z * ray.inverse.z);
+                assert!(ground.x.abs().max(ground.y.abs()) <= 0.5 * side * 1.0001, "{ground} lies in the first copy");
+            }
+        }
+    }
 
     #[test]
     fn neighbours_overlap_as_promised_and_cameras_look_at_the_city() {

@@ -38,8 +38,11 @@ const JPEG_QUALITY: u8 = 95;
 pub struct CityOptions {
     /// Seed of the city, the flight, the points and the sensor noise.
     pub seed: u64,
-    /// Photos, 1 to 100,000.
+    /// Photos of the flight; with the overview photos 1 to 100,000.
     pub views: u32,
+    /// Photos from high above, each of two fifths of all copies of the city, after those of the flight. They see no
+    /// points.
+    pub overviews: u32,
     /// Width of a photo, pixels, 16 to 16,384.
     pub width: u32,
     /// Height of a photo, pixels, 16 to 16,384.
@@ -56,7 +59,7 @@ pub struct CityOptions {
     /// Where surfaces meet, NxN rays are cast through a pixel; 1 to 8.
     pub supersample: u32,
     /// Copies of the city along x and y, 1 to 100 each, for any number of points in bounded memory. The photos are
-    /// divided among the copies in turn; they do not show neighbouring copies.
+    /// divided among the copies in turn; those of the flight do not show neighbouring copies.
     pub tiles: [u32; 2],
     /// Added to all coordinates, metres: (500000, 4600000, 0) makes them look like UTM.
     pub offset: [f64; 3],
@@ -69,6 +72,7 @@ impl Default for CityOptions {
         CityOptions {
             seed: 1,
             views: 60,
+            overviews: 0,
             width: 480,
             height: 320,
             points: 20_000,
@@ -80,6 +84,13 @@ impl Default for CityOptions {
             offset: [0.0; 3],
             overwrite: false,
         }
+    }
+}
+
+impl CityOptions {
+    /// All photos.
+    pub fn photos(&self) -> u32 {
+        self.views.saturating_add(self.overviews)
     }
 }
 
@@ -113,6 +124,7 @@ fn check(options: &CityOptions) -> InputResult<()> {
         Err(InputError::new(flag, format!("{value} is out of range"), format!("choose {low} to {high}")))
     };
     in_range("--views", f64::from(options.views), 1.0, 100_000.0)?;
+    in_range("--overviews", f64::from(options.overviews), 0.0, 100_000.0 - f64::from(options.views))?;
     in_range("--resolution", f64::from(options.width), 16.0, 16_384.0)?;
     in_range("--resolution", f64::from(options.height), 16.0, 16_384.0)?;
     in_range("--points", f64::from(options.points), 0.0, 50e6)?;
@@ -141,13 +153,15 @@ pub fn write_city(
     let points = points::sample(&scene, &flight, options);
     let offset = DVec3::from(options.offset);
     let tiles = tiles(options.tiles, 2.0 * scene.world.half());
-    let pose = |k: usize| flight.shots[k].pose(offset + DVec3::from(tiles[k % tiles.len()]));
-    let images = (0..flight.shots.len()).map(|k| ModelImage { name: photo_name(k, options.views), pose: pose(k) });
+    // Overview photos have their place among all copies.
+    let tile = |k: usize| if k < options.views as usize { tiles[k % tiles.len()] } else { [0.0; 3] };
+    let pose = |k: usize| flight.shots[k].pose(offset + DVec3::from(tile(k)));
+    let images = (0..flight.shots.len()).map(|k| ModelImage { name: photo_name(k, options.photos()), pose: pose(k) });
     let model = Model { intrinsics: flight.intrinsics, images: images.collect(), points, tiles };
     write_model(&folder.join("sparse"), &model)?;
     Ok(CitySummary {
         folder: folder.to_path_buf(),
-        views: options.views,
+        views: options.photos(),
         points: (model.points.len() * model.tiles.len()) as u64,
         observations: model.points.iter().map(|p| p.observations.len() as u64).sum(),
         blocks: flight.blocks,
@@ -245,7 +259,7 @@ fn write_photos(
         written?;
         if let Some((j, photo)) = done {
             rays += photo.rays;
-            progress(j as u32 + 1, options.views);
+            progress(j as u32 + 1, options.photos());
         }
         waiting = taken;
     }
@@ -253,7 +267,7 @@ fn write_photos(
 }
 
 fn write_photo(folder: &Path, options: &CityOptions, k: usize, photo: &Photo) -> InputResult<()> {
-    let path = folder.join("images").join(photo_name(k, options.views));
+    let path = folder.join("images").join(photo_name(k, options.photos()));
     let mut bytes = Vec::with_capacity(photo.rgb.len() / 4);
     JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY)
         .encode(&photo.rgb, options.width, options.height, ExtendedColorType::Rgb8)
@@ -267,7 +281,8 @@ mod tests {
 
     #[test]
     fn options_out_of_range_are_refused_by_flag() {
-        let cases: [(CityOptions, &str); 5] = [
+        let cases: [(CityOptions, &str); 6] = [
+            (CityOptions { overviews: 99_950, ..Default::default() }, "--overviews"),
             (CityOptions { views: 0, ..Default::default() }, "--views"),
             (CityOptions { width: 8, ..Default::default() }, "--resolution"),
             (CityOptions { noise: f64::NAN, ..Default::default() }, "--noise"),

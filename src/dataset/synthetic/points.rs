@@ -2,7 +2,7 @@
 //! see them.
 //!
 //! Invariants: 1. point k depends on (scene, flight, options, k) alone; 2. a track contains each photo at most once, in
-//! ascending order; 3. every observation is the projection of the true place plus noise, and inside its photo.
+//! ascending order; 3. overview photos see no points; 4. every observation is the projection of the true place plus noise, and inside its photo.
 
 use super::CityOptions;
 use super::flight::{Flight, Shot};
@@ -22,7 +22,7 @@ const TRIES: u32 = 6;
 
 /// Samples the points. A point whose draws all see the sky is left out.
 pub(super) fn sample(scene: &Scene, flight: &Flight, options: &CityOptions) -> Vec<Point> {
-    let neighbours = neighbours(&flight.shots);
+    let neighbours = neighbours(&flight.shots[..options.views as usize]);
     (0..options.points).into_par_iter().filter_map(|k| one_point(scene, flight, options, &neighbours, k)).collect()
 }
 
@@ -54,7 +54,7 @@ fn one_point(
     number: u32,
 ) -> Option<Point> {
     let k = &flight.intrinsics;
-    let view = number % flight.shots.len() as u32;
+    let view = number % options.views;
     let shot = &flight.shots[view as usize];
     let mut draws = Stream::new(options.seed, Purpose::City, u64::from(number), 6);
     let mut found = None;

@@ -103,6 +103,35 @@ fn bindings_smaller_than_the_splats_change_no_bit() {
     }
 }
 
+/// All splats reach the one tile of the picture, and some have the same depth: its list is cut front to back.
+#[test]
+fn the_list_of_one_tile_is_cut_front_to_back() {
+    let rows = 5000;
+    let (mut view, target) = (scene(rows, 16, 16), photo(16, 16, true));
+    view.0.opacities.iter_mut().for_each(|o| *o -= 4.0);
+    for row in 0..rows / 5 {
+        let same: [f32; 3] = std::array::from_fn(|i| view.0.means[i]);
+        view.0.means[3 * row..3 * row + 3].copy_from_slice(&same);
+    }
+    let (options, loss) = (RenderOptions::default(), LossOptions::default());
+    let Some(mut whole) = renderer(&GpuOptions::default()) else { return };
+    let want = bits(&results_with(&mut whole, &view, &options, &target, &loss).unwrap());
+    let sizes = whole.device_sizes().unwrap();
+    assert!(sizes.isects > 4000, "{sizes:?}");
+    let least = least(&whole);
+    let mut most = 0;
+    for budget in [least + (512 << 10), least + (128 << 10)] {
+        let Some(mut gpu) = renderer(&GpuOptions { budget: Some(budget), ..GpuOptions::default() }) else { return };
+        let got = results_with(&mut gpu, &view, &options, &target, &loss).unwrap();
+        assert!(bits(&got) == want, "{budget} bytes");
+        let batches = in_batches(&mut gpu, &view, &options, &[0, 2222, rows], &target, &loss);
+        assert!(batches == want, "{budget} bytes, in batches");
+        println!("{budget} bytes: {} parts", gpu.ranges());
+        most = most.max(gpu.ranges());
+    }
+    assert!(most > 4, "{most} parts");
+}
+
 #[test]
 fn batches_in_little_memory_change_no_bit() {
     let rows = 3000;
