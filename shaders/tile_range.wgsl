@@ -20,8 +20,7 @@ struct RangeUniforms {
     bin_bits: u32,
     /// First depth key of the rows that are wanted, and one past the last.
     depths: vec2<u32>,
-    pad0: u32,
-    pad1: u32,
+    pad: vec2<u32>,
 }
 
 @group(0) @binding(0) var<uniform> segment: RangeUniforms;

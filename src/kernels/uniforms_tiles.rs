@@ -137,7 +137,11 @@ crate::wgsl_struct! {
         /// List entries of the tile in earlier parts.
         pub list_base: u32,
         /// Unused.
-        pub pad: [u32; 3],
+        pub pad0: u32,
+        /// Unused.
+        pub pad1: u32,
+        /// Unused.
+        pub pad2: u32,
     }
 }
 

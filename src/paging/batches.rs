@@ -54,7 +54,11 @@ impl Pager {
 
     fn pin_batch_for(&mut self, step: u32, pages: &[PageNo], asker: Asker) -> Result<Vec<PinnedPage>, PagingError> {
         let pages: Vec<PageNo> = pages.iter().copied().filter(|&p| self.index.has_rows(p)).collect();
-        let pinned = self.fetch(&format!("the view of step {step}"), &pages, asker)?;
+        let pinned = match self.fetch(&format!("the view of step {step}"), &pages, asker) {
+            // The failed write that left no frame says more than the lack of frames.
+            Err(error @ PagingError::WorkingSet { .. }) => return Err(self.mover.take_failure().unwrap_or(error)),
+            pinned => pinned?,
+        };
         self.count_bound(&pages);
         Ok(pinned)
     }

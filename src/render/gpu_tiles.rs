@@ -533,6 +533,8 @@ pub(super) fn raster_uniforms(
         window_end: 0,
         range: range_words(range),
         list_base: 0,
-        pad: [0; 3],
+        pad0: 0,
+        pad1: 0,
+        pad2: 0,
     }
 }

@@ -75,7 +75,7 @@ impl Shot {
     pub(super) fn ray(&self, k: &Intrinsics, x: f64, y: f64) -> Ray {
         let d = DVec3::new((x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.0);
         let ray = Ray::new(self.centre, self.rotation.transpose() * (d / d.length()));
-        self.copies.map_or_else(|| ray.clone(), |copies| copies.fold(ray.clone()))
+        self.copies.map_or(ray, |copies| copies.fold(ray))
     }
 
     /// Picture position of a point, if it is in front of the camera and inside the picture.

@@ -108,6 +108,7 @@ fn bindings_smaller_than_the_splats_change_no_bit() {
 fn the_list_of_one_tile_is_cut_front_to_back() {
     let rows = 5000;
     let (mut view, target) = (scene(rows, 16, 16), photo(16, 16, true));
+    (view.1.fx, view.1.fy) = (4.0, 4.0);
     view.0.opacities.iter_mut().for_each(|o| *o -= 4.0);
     for row in 0..rows / 5 {
         let same: [f32; 3] = std::array::from_fn(|i| view.0.means[i]);
@@ -117,7 +118,7 @@ fn the_list_of_one_tile_is_cut_front_to_back() {
     let Some(mut whole) = renderer(&GpuOptions::default()) else { return };
     let want = bits(&results_with(&mut whole, &view, &options, &target, &loss).unwrap());
     let sizes = whole.device_sizes().unwrap();
-    assert!(sizes.isects > 4000, "{sizes:?}");
+    assert!(sizes.isects > 2000, "{sizes:?}");
     let least = least(&whole);
     let mut most = 0;
     for budget in [least + (512 << 10), least + (128 << 10)] {
