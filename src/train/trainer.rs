@@ -224,7 +224,7 @@ impl Trainer {
     ///
     /// # Errors
     /// A photo cannot be decoded, pages could not be pinned, the renderer failed, the run diverged, or nothing counts in it
-    /// ([`super::soundness`]).
+    /// (`soundness`).
     pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
         self.log_due_events();
         let view = self.next_view();
