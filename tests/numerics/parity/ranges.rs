@@ -121,7 +121,7 @@ fn the_list_of_one_tile_is_cut_front_to_back() {
     assert!(sizes.isects > 2000, "{sizes:?}");
     let least = least(&whole);
     let mut most = 0;
-    for budget in [least + (512 << 10), least + (128 << 10)] {
+    for budget in [least + (128 << 10), least] {
         let Some(mut gpu) = renderer(&GpuOptions { budget: Some(budget), ..GpuOptions::default() }) else { return };
         let got = results_with(&mut gpu, &view, &options, &target, &loss).unwrap();
         assert!(bits(&got) == want, "{budget} bytes");
@@ -130,7 +130,8 @@ fn the_list_of_one_tile_is_cut_front_to_back() {
         println!("{budget} bytes: {} parts", gpu.ranges());
         most = most.max(gpu.ranges());
     }
-    assert!(most > 4, "{most} parts");
+    // A range of tiles cannot be smaller than the one tile.
+    assert!(most > 1, "{most} parts");
 }
 
 #[test]
