@@ -49,10 +49,10 @@ fn refuse_small_drive(free: u64, pages: u64, frame_bytes: u64) -> InputResult<()
         return Ok(());
     }
     let problem = format!(
-        "the drive has {} free for pages, but may have to hold {pages} of {}, {} with writes in flight",
+        "the drive has {} free, but the run may need {}: {pages} pages of {}, and room for pages that are being written",
         format_bytes(free),
-        format_bytes(frame_bytes),
-        format_bytes(needed)
+        format_bytes(needed),
+        format_bytes(frame_bytes)
     );
     let remedy = "free space on it, choose another drive, or lower --sh-degree";
     Err(InputError::new("--spill-dir", problem, remedy))

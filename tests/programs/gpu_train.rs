@@ -2,7 +2,7 @@
 //! choice of device with its reason.
 
 use crate::support::gpu;
-use crate::support::scenes::{city, eval, psnr, stderr, summary, text, train, wide_city};
+use crate::support::scenes::{CLASSIC, city, eval, psnr, stderr, summary, text, train, wide_city};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::photo::decode;
@@ -197,6 +197,37 @@ fn a_device_that_fails_in_mid_run_leaves_the_last_good_step() {
         let line = assert_ends_with_last_good_step(&scene, &folder.path().join(kind), &format!("{kind}@150"), None);
         assert!(line.contains(expected), "{kind}: {line}");
     }
+}
+
+/// Nothing is committed on a schedule here, so the run resumes from the commit that the failure makes.
+#[test]
+fn a_run_whose_device_is_lost_resumes_from_its_last_good_step() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 8, 64, 48, 300);
+    let [alone, lost, spill] = ["alone", "lost", "spill"].map(|name| folder.path().join(name));
+    let of_run = ["--device", "gpu", "--steps", "60", "--strategy", "none", "--view-order", "shuffle", "--quiet"];
+    assert!(train(&[&[text(&scene), "--out", text(&alone)], &of_run[..]].concat()).status.success());
+    let of_drive = ["--spill-dir", text(&spill), "--spill-codec", "raw", "--commit-every", "0"];
+    let output = Command::new(env!("CARGO_BIN_EXE_gsscale-train"))
+        .args([text(&scene), "--out", text(&lost)])
+        .args(of_run)
+        .args(of_drive)
+        .args(CLASSIC)
+        .env("GSSCALE_GPU_FAULT", "lost@150")
+        .output()
+        .unwrap();
+    assert!(stderr(&output).contains("the device was lost"), "{}", stderr(&output));
+    let steps = summary(&lost)["steps"].as_u64().unwrap();
+    assert!(steps > 10 && steps < 60, "{steps} steps before the loss");
+    let resumed = train(&["--resume", text(&lost), "--log-every", "1"]);
+    assert!(resumed.status.success(), "{}", stderr(&resumed));
+    let first = metrics(&lost).iter().map(|line| line["step"].as_u64().unwrap()).filter(|&step| step >= steps).min();
+    assert_eq!(first, Some(steps), "steps before the loss were trained again, or the run began anew");
+    let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
+    assert!(ply(&lost) == ply(&alone), "the resumed run gives another scene");
 }
 
 /// The real thing: the driver is asked for memory until it refuses. A software adapter takes the program's own memory, so
