@@ -1,10 +1,25 @@
-//! Vectors that grow with an eighth to spare instead of doubling as `Vec` does, because a run's memory is bounded and
-//! these are its largest parts.
+//! Vectors that grow with an eighth to spare, but at most [`SPARE_MOST`] values, instead of doubling as `Vec` does, because
+//! a run's memory is bounded and these are its largest parts.
+
+/// Most spare values of a vector. The allocator moves vectors of this length by remapping their memory, so that growing
+/// often costs little.
+const SPARE_MOST: usize = 1 << 18;
 
 /// As [`Vec::resize`]; keeps the allocation while it is large enough.
 pub fn resize<T: Copy>(values: &mut Vec<T>, len: usize, value: T) {
     reserve(values, len);
     values.resize(len, value);
+}
+
+/// `len` times `value`; keeps the allocation while it is large enough. The old values are lost, so that a larger allocation
+/// does not exist beside the old one while values are copied, as it would for types of large alignment, which the allocator
+/// cannot remap.
+pub fn renew<T: Copy>(values: &mut Vec<T>, len: usize, value: T) {
+    if len > values.capacity() && values.capacity() > 0 {
+        *values = Vec::new();
+        values.reserve_exact(len + (len / 8).min(SPARE_MOST));
+    }
+    resize(values, len, value);
 }
 
 /// As [`Vec::resize_with`]; keeps the allocation while it is large enough.
@@ -22,7 +37,7 @@ pub fn extend<T: Copy>(values: &mut Vec<T>, more: &[T]) {
 /// Reserves capacity for `len` values in total. The first allocation is exact, for vectors that never grow.
 fn reserve<T>(values: &mut Vec<T>, len: usize) {
     if len > values.capacity() {
-        let to_spare = if values.capacity() == 0 { 0 } else { len / 8 };
+        let to_spare = if values.capacity() == 0 { 0 } else { (len / 8).min(SPARE_MOST) };
         values.reserve_exact(len + to_spare - values.len());
     }
 }
@@ -44,5 +59,9 @@ mod tests {
         assert_eq!((values.len(), values.capacity(), values[1126]), (1127, 1267, 4.0));
         resize_with(&mut values, 10, f32::default);
         assert_eq!((values.len(), values.capacity()), (10, 1267));
+        renew(&mut values, 20, 5.0);
+        assert_eq!((values.len(), values.capacity(), values[19]), (20, 1267, 5.0));
+        renew(&mut values, 2000, 6.0);
+        assert_eq!((values.len(), values.capacity(), values[0]), (2000, 2250, 6.0));
     }
 }

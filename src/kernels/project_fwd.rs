@@ -34,7 +34,7 @@ pub struct Projected {
 impl Projected {
     /// Number of rows.
     pub fn rows(&self) -> usize {
-        self.depths.len()
+        self.radii.len()
     }
 
     /// Changes the number of rows; keeps the allocation.

@@ -84,6 +84,11 @@ impl DepthSort {
         std::mem::swap(&mut self.keys, &mut self.other);
     }
 
+    /// Frees the scratch memory.
+    pub fn free(&mut self) {
+        *self = DepthSort::default();
+    }
+
     /// Bytes kept between views.
     pub fn bytes(&self) -> u64 {
         (8 * (self.keys.capacity() + self.other.capacity()) + 4 * self.places.capacity()) as u64

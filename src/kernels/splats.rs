@@ -225,8 +225,8 @@ pub const ROWS_PER_CHUNK: usize = 2048;
 /// Packs all rows. `colors` has one entry per row.
 pub fn pack(projected: &Projected, colors: &[[f32; 3]], grid: Grid, simd: SimdPath, out: &mut Packed) {
     let rows = projected.rows();
-    room::resize(&mut out.splats, rows, Splat::default());
-    room::resize(&mut out.spans, rows, Span::default());
+    room::renew(&mut out.splats, rows, Splat::default());
+    room::renew(&mut out.spans, rows, Span::default());
     room::resize(&mut out.counts, rows, 0);
     room::resize(&mut out.chunk_counts, rows.div_ceil(ROWS_PER_CHUNK), 0);
     let chunks = (out.splats.par_chunks_mut(ROWS_PER_CHUNK), out.spans.par_chunks_mut(ROWS_PER_CHUNK));

@@ -25,6 +25,12 @@ use crate::schedule::visibility::ViewPages;
 /// Growth factor that scenes hardly ever reach; growth beyond it causes no warning.
 const GROWTH_UNLIKELY: f64 = 20.0;
 
+/// A view that is measured in batches has frames and a working set of 1/16 of the budget: the splats of the view may need
+/// nearly all of the rest.
+const PROBE_BATCH_SHARE: u64 = 16;
+/// Bytes that a renderer holds for a row in view at least, beside intersections.
+const SPLAT_BYTES: u64 = 150;
+
 /// Pages, frames and drive space of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TierPlan {
@@ -162,8 +168,9 @@ pub fn allow_largest_view(
     // A default budget may rise once the memory of a view is known.
     let most = if config.host_mem.0 == 0 { host_mem.and(obtainable_bytes()).max(host_mem) } else { host_mem };
     let mut frames = needed;
-    if let Some(budget) = most.filter(|budget| needed * (frame_bytes + page_working(config)) > *budget) {
-        let (fewer, pages) = frames_and_batch(budget / 2, frame_bytes, page_working(config), true);
+    let of_page = frame_bytes + page_working(config) + u64::from(config.page_rows) * SPLAT_BYTES;
+    if let Some(budget) = most.filter(|budget| needed * of_page > *budget) {
+        let (fewer, pages) = frames_and_batch(budget / PROBE_BATCH_SHARE, frame_bytes, page_working(config), true);
         if (fewer as u64) < needed {
             (frames, trainer.pages_most) = (fewer as u64, pages);
         }
