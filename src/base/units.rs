@@ -29,6 +29,16 @@ pub fn parse_bytes(text: &str) -> Result<u64, String> {
 
 /// Formats a size with two or three digits and a binary unit.
 pub fn format_bytes(bytes: u64) -> String {
+    format_scaled(bytes, |value| value)
+}
+
+/// As [`format_bytes`], rounded up: for sizes that a user is told to give.
+pub fn format_bytes_up(bytes: u64) -> String {
+    // The digits that are printed, rounded up.
+    format_scaled(bytes, |value| if value >= 100.0 { value.ceil() } else { (value * 10.0).ceil() / 10.0 })
+}
+
+fn format_scaled(bytes: u64, round: impl Fn(f64) -> f64) -> String {
     let units = ["B", "KiB", "MiB", "GiB", "TiB"];
     let mut value = bytes as f64;
     let mut unit = 0;
@@ -36,6 +46,7 @@ pub fn format_bytes(bytes: u64) -> String {
         value /= 1024.0;
         unit += 1;
     }
+    let value = round(value);
     if unit == 0 || value >= 100.0 {
         format!("{value:.0} {}", units[unit])
     } else {
@@ -66,6 +77,11 @@ mod tests {
         assert!(parse_bytes("4 parsecs").is_err());
         assert_eq!(format_bytes(4 * GIB), "4.0 GiB");
         assert_eq!(format_bytes(900), "900 B");
+        assert_eq!([format_bytes(GIB + 1), format_bytes_up(GIB + 1)], ["1.0 GiB", "1.1 GiB"]);
+        assert_eq!(
+            [format_bytes_up(GIB), format_bytes_up(200 * GIB + 1), format_bytes_up(7)],
+            ["1.0 GiB", "201 GiB", "7 B"]
+        );
         let times = [0.25, 45.2, 99.4, 99.6, 5000.0, 7200.0, 345_600.0, 864_000.0];
         assert_eq!(times.map(format_seconds), ["0.2 s", "45 s", "99 s", "1.7 min", "83 min", "2.0 h", "96 h", "10 d"]);
     }

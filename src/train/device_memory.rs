@@ -3,12 +3,17 @@
 //!
 //! Not here: the sums ([`crate::render::device_needs`]).
 
+use super::error::TrainError;
 use super::memory::MemoryEstimate;
+use super::pages::PagedScene;
 use crate::base::error::{InputError, InputResult};
-use crate::base::units::format_bytes;
+use crate::base::units::{format_bytes, format_bytes_up};
 use crate::config::file::TrainConfig;
-use crate::gpu::{budget_for_buffers, bytes_for_buffers};
-use crate::render::device_needs::DeviceNeeds;
+use crate::dataset::loader::Dataset;
+
+use crate::gpu::{GpuError, budget_for_buffers, bytes_for_buffers};
+use crate::render::RenderError;
+use crate::render::device_needs::{DeviceNeeds, ViewSizes};
 
 /// The needs of the largest view that was probed, grown to the cap on Gaussians; `None` without a device.
 fn needs(config: &TrainConfig, memory: &MemoryEstimate) -> Option<DeviceNeeds> {
@@ -34,10 +39,46 @@ pub(super) fn check(config: &TrainConfig, memory: &[MemoryEstimate; 2]) -> Input
     let remedy = format!(
         "give at least {} ({} draws every view in one piece), lower --max-gaussians, or make the photos smaller with \
          --data-factor",
-        format_bytes(budget_for_buffers(least)),
-        format_bytes(budget_for_buffers(now.whole().max(grown.whole())))
+        format_bytes_up(budget_for_buffers(least)),
+        format_bytes_up(budget_for_buffers(now.whole().max(grown.whole())))
     );
     Err(InputError::new("--device-mem", problem, remedy))
+}
+
+/// The refusal of a `--device-mem` that could not hold a view of the probe: names the least that holds the largest of
+/// `views`, by the rows of the pages of each, of which the view may see fewer. Other errors stay as they are.
+pub(super) fn refusal(
+    error: TrainError,
+    config: &TrainConfig,
+    dataset: &Dataset,
+    scene: &PagedScene,
+    views: &[usize],
+) -> TrainError {
+    if !matches!(error, TrainError::Render(RenderError::Device(GpuError::OutOfBudget { .. }))) {
+        return error;
+    }
+    let index = scene.pager.index();
+    let of_view = |&view: &usize| {
+        let camera = &dataset.views[view].camera;
+        let rows = scene.pager.pages_of_view(camera).iter().map(|page| u64::from(index[page.index()].rows)).sum();
+        ViewSizes { rows, isects: 0, pixels: camera.pixels() as u64 }
+    };
+    let largest = views.iter().map(of_view).fold(ViewSizes::default(), ViewSizes::max);
+    let least = DeviceNeeds::new(largest, config.sh_degree).least();
+    if bytes_for_buffers(config.device_mem.0) >= least {
+        return error;
+    }
+    let problem = format!(
+        "{} are too little: a view of up to {} Gaussians in {} pixels takes more even in the smallest parts",
+        format_bytes(config.device_mem.0),
+        largest.rows,
+        largest.pixels
+    );
+    let remedy = format!(
+        "give at least {}, make the photos smaller with --data-factor, or train with --device cpu",
+        format_bytes_up(budget_for_buffers(least))
+    );
+    InputError::new("--device-mem", problem, remedy).into()
 }
 
 /// The lines of the plan about the device; empty without one. `memory` is the estimate to describe.

@@ -9,7 +9,7 @@ use super::memory::{MemoryEstimate, obtainable_bytes};
 use super::staging::with_staging;
 use super::working_set::WorkingSet;
 use crate::base::error::{InputError, InputResult};
-use crate::base::units::format_bytes;
+use crate::base::units::{format_bytes, format_bytes_up};
 use crate::config::file::TrainConfig;
 
 /// Pages are numbered in 32 bits.
@@ -109,8 +109,8 @@ pub(super) fn frames_of_budget(
         let remedy = format!(
             "give at least {} ({} keeps each view in one batch), or lower --image-cache, --prefetch-bytes, --page-rows, \
              --sh-degree or the size of the photos",
-            format_bytes(with_margin(floor, memory)),
-            format_bytes(least_memory(need, memory, host_mem))
+            format_bytes_up(with_margin(floor, memory)),
+            format_bytes_up(least_memory(need, memory, host_mem))
         );
         return Err(InputError::new("--host-mem", problem, remedy));
     };

@@ -1,5 +1,6 @@
 //! Estimates the memory of a run before its first step by rendering a few views with the first Gaussians.
 
+use super::device_memory;
 use super::error::TrainError;
 use super::memory::{
     BASE_BYTES, INDEX_BYTES, MemoryEstimate, bytes_of_copies, frames_in_memory, largest_decode, rows_at_most,
@@ -56,7 +57,9 @@ pub fn estimate(
     probe: &Probe,
 ) -> Result<[MemoryEstimate; 2], TrainError> {
     let rows = probe.rows;
-    let Probed { pixels, visible, device } = trainer.probe_views(dataset, &probe.views)?;
+    let Probed { pixels, visible, device } = trainer
+        .probe_views(dataset, &probe.views)
+        .map_err(|error| device_memory::refusal(error, config, dataset, &trainer.scene, &probe.views))?;
     let pixels = pixels as u64;
     let [working, rendering] = trainer.view_bytes();
     // Image, coverage, gradient, and per-tile copies of them.
