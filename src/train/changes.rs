@@ -14,6 +14,9 @@ use crate::dataset::loader::Dataset;
 use serde::Deserialize;
 use std::path::Path;
 
+/// What programs did that did not know a key, as the key's value.
+const BEFORE_ITS_TIME: [(&str, &str); 1] = [("appearance", "off")];
+
 /// The config that a run keeps when it resumes with `config`: that of its file, with the lasting keys of `config`
 /// (numbers, length, place of the checkpoint).
 ///
@@ -76,7 +79,11 @@ impl Changes {
         for (name, now) in &here {
             let Some(class) = KEYS.iter().find(|key| key.name() == *name).map(|key| key.class) else { continue };
             // A key unknown to the older commit counts as a difference, so that the user sees its default.
-            let then = there.get(name).filter(|_| written.contains_key(name));
+            // It counts as known if the programs of that time can only have done one thing.
+            let was_done = |value: &toml::Value| {
+                value.as_str().is_some_and(|word| BEFORE_ITS_TIME.contains(&(name.as_str(), word)))
+            };
+            let then = there.get(name).filter(|value| written.contains_key(name) || was_done(value));
             if class.is_derived() || then == Some(now) {
                 continue;
             }
