@@ -19,7 +19,8 @@ const SAMPLE: usize = 16_384;
 /// Differences below this count as squares, larger ones as absolute differences (Huber): moving objects, and detail that
 /// the picture does not have yet, must not outweigh the rest.
 const SMALL_DIFFERENCE: f64 = 0.05;
-/// Weight of the square of the exposure in stops. It bends an exposure of one stop by about one hundredth.
+/// Weight of the square of the exposure in stops. It takes one to six hundredths from an exposure of one stop, the more
+/// the darker the picture.
 const EXPOSURE_WEIGHT: f64 = 0.01;
 /// Weight of the squares of the numbers of a homography.
 const CHROMA_WEIGHT: f64 = 0.05;
@@ -259,11 +260,12 @@ mod tests {
             let pair = Pair { drawn: &drawn, photo: &photo };
             let start = Look { lens: lens(), ..Look::default() };
             let found = pair.image_values(&start, IMAGE_VALUES, 0..WIDTH as usize, 8).unwrap();
-            // The weights pull an exposure of a stop by .01 stops, and hue and saturation by a tenth of themselves.
-            assert!((found[0] - exposure).abs() < 0.03, "{found:?}");
+            // The weights take up to .06 stops from an exposure of a stop on a picture as dark as this one, and a tenth
+            // from a white balance. Hue and saturation are pulled too far to be compared.
+            assert!((found[0] - exposure).abs() < 0.06, "{found:?}");
             assert!((found[3] - 0.02).abs() < 0.002 && (found[6] + 0.01).abs() < 0.002, "{found:?}");
             let alone = pair.image_values(&start, 1, 0..WIDTH as usize, 8).unwrap();
-            assert!((alone[0] - exposure).abs() < 0.03 && alone[1..] == [0.0; 8], "{alone:?}");
+            assert!((alone[0] - exposure).abs() < 0.06 && alone[1..] == [0.0; 8], "{alone:?}");
         }
     }
 

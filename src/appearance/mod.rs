@@ -6,8 +6,8 @@
 //! brighter scene under darker exposures gives the same pictures. So what acts on a photo is its value less the mean over
 //! the photos seen ([`state`]), and small weights pull it towards no change.
 //!
-//! Values follow one damped Gauss-Newton step per sighting ([`fit`]) instead of Adam. A run of 1,500 steps sees a photo
-//! four to ten times; Adam at PPISP's rate of .002 would move an exposure by .02 stops in that time. The nine values of a
+//! Values follow one damped Gauss-Newton step per sighting ([`fit`]) instead of Adam. A run of 1,500 steps sees each of
+//! 150 photos ten times; Adam at a rate of .002 would move an exposure by .02 stops in that time. The nine values of a
 //! photo are well determined by one sighting, so their optimum is computed. Later sightings count less, so that the values
 //! settle.
 //!

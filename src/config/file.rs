@@ -160,9 +160,9 @@ config_keys! {
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
         max_alpha: f64 = 0.99 => Numbers;
         /// Correct the pictures by values trained for each photo: off, exposure (one number a photo) or full (also eight of
-        /// its colours, and the vignetting of each camera). For photos whose exposure or colours change; costs some per
-        /// cent of a step on the CPU, and 48 bytes a pixel of bus traffic on a GPU. gsscale-eval fits these values to the
-        /// left half of held-out photos
+        /// its colours, and the vignetting of each camera). For photos whose exposure or colours change. On the CPU, exposure
+        /// costs about a tenth of a step and full two fifths; on a GPU the picture and its gradient also cross the bus twice.
+        /// gsscale-eval fits these values to the left halves of held-out photos
         appearance: AppearanceMode = AppearanceMode::Off => Numbers;
         /// Background colour, RGB in 0..1
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;

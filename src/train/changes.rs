@@ -150,6 +150,8 @@ impl Changes {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use crate::appearance::AppearanceMode;
+    use crate::checkpoint::run_state::{Origin, RunIdentity};
 
     #[test]
     fn another_path_changes_numbers_where_its_bits_are_others() {
@@ -169,6 +171,31 @@ mod tests {
             assert_eq!(changes("baseline", fused), [0, 1, 0]);
             assert_eq!(changes(fused.name(), SimdPath::Baseline), [0, 1, 0]);
         }
+    }
+
+    /// A run that began before a key existed goes on as it was, and only so.
+    #[test]
+    fn a_run_without_the_key_of_appearance_was_off() {
+        let config = TrainConfig::default();
+        let text = toml::to_string(&config).unwrap();
+        let without: String =
+            text.lines().filter(|line| !line.starts_with("appearance")).map(|line| format!("{line}\n")).collect();
+        assert!(without.len() < text.len());
+        let dataset = DatasetPrint {
+            views: Vec::new(),
+            first_rows: 1,
+            points: 0,
+            scene_scale: 1.0,
+            origin: [0.0; 3],
+            scale: 1.0,
+        };
+        let simd = limits::simd_path(&config).name().to_string();
+        let origin = Origin { config: without, simd, sh_degree_start: 0, dataset, run: RunIdentity::default() };
+        let state = RunState::without_past(origin, "cpu".to_string(), 1);
+        let changes = |config: &TrainConfig| Changes::of_config(Path::new("config.toml"), &state, config).unwrap();
+        assert_eq!(changes(&config), Changes::default());
+        let on = changes(&TrainConfig { appearance: AppearanceMode::Full, ..config.clone() });
+        assert_eq!(on.numbers, ["appearance was absent and is \"full\""]);
     }
 
     #[test]
