@@ -195,7 +195,7 @@ mod tests {
         let changes = |config: &TrainConfig| Changes::of_config(Path::new("config.toml"), &state, config).unwrap();
         assert_eq!(changes(&config), Changes::default());
         let on = changes(&TrainConfig { appearance: AppearanceMode::Full, ..config.clone() });
-        assert_eq!(on.numbers, ["appearance was absent and is \"full\""]);
+        assert_eq!(on.numbers, ["appearance was \"off\" and is \"full\""]);
     }
 
     #[test]
