@@ -30,6 +30,7 @@
 //! | [`render`] | the stages in order, on the CPU or a device: rows in, picture, loss, picture back, rows out; image metrics |
 //! | [`optim`] | learning rates as a function of the step; dense Adam (oracle) and deferred Adam |
 //! | [`densify`] | what changes the number of Gaussians: strategies, the statistics they decide by, the events they log, applying these |
+//! | [`appearance`] | what differs between photos: exposure and colours of each, vignetting of each camera; a correction of the picture, its derivatives, its values |
 //! | [`exchange`] | PLY in and out; what TensorBoard reads |
 //! | [`config`] | what the user wrote, parsed once into the types of the rooms above, and what follows from it |
 //! | [`report`] | pages for people: charts and pictures of what a run left behind |
@@ -62,7 +63,7 @@
 //! 2. `config/choice.rs`: the word of `--strategy`. `config/file.rs`: the keys. `config/limits.rs`: keys to
 //!    strategy.
 //!
-//! **A loss term, or a correction of the picture such as an exposure per photo**
+//! **A loss term, or another correction of the picture than [`appearance`]**
 //! 1. `train/comparison.rs`: the one place between picture and gradient, for steps and rehearsals. It works on the
 //!    CPU and on devices through [`render::Renderer::picture_mut`] and [`render::Renderer::picture_gradient`]. What
 //!    it needs is a field of [`train::comparison::Comparison`].
@@ -88,6 +89,7 @@
 //!    whether the order ignores the plan. Runs, look-ahead and simulations share it.
 //! 2. `config/choice.rs`: the word of `--evict`. `config/file.rs`: the help of the key.
 
+pub mod appearance;
 pub mod base;
 pub mod checkpoint;
 pub mod config;

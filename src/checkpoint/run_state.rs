@@ -5,9 +5,10 @@
 //! never a panic.
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
-//! [`crate::page::format::encoding`] writes them. Only version 4 is read; no program was released with versions 1 to 3.
-//! A new value is a field of [`TrainerState`], a place at the end of `encode` and `decode`, and a new version.
+//! [`crate::page::format::encoding`] writes them. Version 4
+//! had no appearance and is read as that of a run without; no program was released with versions 1 to 3. A new value is a field of [`TrainerState`], a place at the end of `encode` and `decode`, and a new version.
 
+use crate::appearance::state::AppearanceState;
 use crate::base::identity::RunId;
 use crate::page::format::encoding::{self, EncodingError};
 use crate::paging::stats::PagerStats;
@@ -15,7 +16,9 @@ use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
-pub const VERSION: u32 = 4;
+pub const VERSION: u32 = 5;
+/// The version before appearance: the same values without the last.
+const WITHOUT_APPEARANCE: u32 = 4;
 
 /// Digests of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -98,6 +101,8 @@ pub struct TrainerState {
     pub train_seconds: f64,
     /// The last evaluation on the held-out views, if there was one.
     pub test: Option<LastTest>,
+    /// The values of photos and cameras.
+    pub appearance: AppearanceState,
 }
 
 /// The state of a run between two steps, without its pages.
@@ -171,10 +176,14 @@ impl RunState {
     pub fn from_bytes(bytes: &[u8]) -> Result<RunState, RunStateError> {
         let (version, body) = bytes.split_first_chunk().ok_or(RunStateError::Impossible("it is empty"))?;
         let version = u32::from_le_bytes(*version);
-        if version != VERSION {
-            return Err(RunStateError::Version(version));
-        }
-        let state = RunState::decode(body)?;
+        let state = match version {
+            VERSION => RunState::decode(body)?,
+            WITHOUT_APPEARANCE => {
+                let none = encoding::to_bytes(&AppearanceState::default())?;
+                RunState::decode(&[body, &none].concat())?
+            }
+            other => return Err(RunStateError::Version(other)),
+        };
         state.check()?;
         Ok(state)
     }
@@ -183,12 +192,13 @@ impl RunState {
     fn encode(&self) -> Result<Vec<u8>, EncodingError> {
         let RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic } = self;
         let Origin { config, simd, sh_degree_start, dataset, run } = origin;
-        let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, test } = trainer;
+        let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, test, appearance } =
+            trainer;
         encoding::to_bytes(&(
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run),
+            (metrics_bytes, test, traffic, run, appearance),
         ))
     }
 
@@ -198,10 +208,11 @@ impl RunState {
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run),
+            (metrics_bytes, test, traffic, run, appearance),
         ) = encoding::from_bytes(bytes)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
-        let trainer = TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, test };
+        let trainer =
+            TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, test, appearance };
         Ok(RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic })
     }
 
@@ -246,7 +257,7 @@ impl RunState {
         if test.is_some_and(|test| test.step > step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
             return refuse("its last evaluation is invalid");
         }
-        Ok(())
+        self.trainer.appearance.check().or_else(refuse)
     }
 }
 
@@ -292,6 +303,7 @@ mod tests {
                 steps_skipped_in_a_row: 1,
                 train_seconds: 0.1,
                 test: Some(LastTest { step: 8, views: 3, psnr: 21.5, ssim: 0.75 }),
+                appearance: AppearanceState::new(&[0, 1, 0]),
             },
             events: events.to_vec(),
             histogram: vec![(3, 1), (32767, 9), (65535, 2)],
@@ -312,10 +324,23 @@ mod tests {
     fn states_come_back_and_other_versions_do_not() {
         let mut bytes = sample().to_bytes().unwrap();
         assert_eq!(RunState::from_bytes(&bytes).unwrap(), sample());
-        for other in [VERSION - 1, VERSION + 1] {
+        for other in [WITHOUT_APPEARANCE - 1, VERSION + 1] {
             bytes[..4].copy_from_slice(&other.to_le_bytes());
             assert_eq!(RunState::from_bytes(&bytes), Err(RunStateError::Version(other)));
         }
+    }
+
+    #[test]
+    fn a_state_without_appearance_comes_back_without_values() {
+        let state = sample();
+        let trainer = TrainerState { appearance: AppearanceState::default(), ..state.trainer.clone() };
+        let without = RunState { trainer, ..state };
+        let mut bytes = without.to_bytes().unwrap();
+        let values = encoding::to_bytes(&AppearanceState::default()).unwrap();
+        assert!(bytes.ends_with(&values));
+        bytes.truncate(bytes.len() - values.len());
+        bytes[..4].copy_from_slice(&WITHOUT_APPEARANCE.to_le_bytes());
+        assert_eq!(RunState::from_bytes(&bytes), Ok(without));
     }
 
     #[test]
@@ -338,6 +363,9 @@ mod tests {
         refused(|s| s.traffic.other_stall_seconds = f64::INFINITY);
         refused(|s| s.trainer.test = s.trainer.test.map(|t| LastTest { step: 10, ..t }));
         refused(|s| s.trainer.test = s.trainer.test.map(|t| LastTest { psnr: f64::NAN, ..t }));
+        refused(|s| s.trainer.appearance.images[0].values[0] = i32::MIN);
+        refused(|s| s.trainer.appearance.images[0].sightings = 1);
+        refused(|s| s.trainer.appearance.cameras[1].falloff[0][0] = f64::NAN);
         refused(|s| s.origin.dataset.scale = 0.0);
         refused(|s| s.origin.dataset.origin[1] = f64::INFINITY);
     }

@@ -5,6 +5,7 @@
 //! the same message; 3. this file holds no defaults and no meanings.
 
 use super::schedule::Schedule;
+use crate::appearance::AppearanceMode;
 use crate::base::simd::SimdPath;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
@@ -130,6 +131,7 @@ choices! {
     "strategy": StrategyName { Default = "default", LongAxis = "long-axis", None = "none" }
     "schedule": Schedule { RunLength = "run-length", Classic = "classic" }
     "growth-score": GrowthScore { Gradient = "gradient", Error = "error", Mixed = "mixed" }
+    "appearance": AppearanceMode { Off = "off", Exposure = "exposure", Full = "full" }
     "log": LogFormat { Json = "json", Tensorboard = "tensorboard" }
     "ssim-variant": SsimVariant { Same = "same", Valid = "valid", Reflect = "reflect" }
     "export-frame": ExportFrame { Dataset = "dataset", Local = "local" }
@@ -300,6 +302,7 @@ mod tests {
         check::<StrategyName>();
         check::<Schedule>();
         check::<GrowthScore>();
+        check::<AppearanceMode>();
         check::<LogFormat>();
         check::<SsimVariant>();
         check::<ExportFrame>();

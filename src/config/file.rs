@@ -11,6 +11,7 @@ use super::choice::{Chosen, Device, LogFormat};
 use super::key::{Class, Key};
 use super::schedule::Schedule;
 use super::values::{ByteSize, Rgb};
+use crate::appearance::AppearanceMode;
 use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
 use crate::checkpoint::interval::CommitEvery;
@@ -158,6 +159,11 @@ config_keys! {
         init_scale: f64 = 1.0 => Numbers;
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
         max_alpha: f64 = 0.99 => Numbers;
+        /// Correct the pictures by values trained for each photo: off, exposure (one number a photo) or full (also eight of
+        /// its colours, and the vignetting of each camera). For photos whose exposure or colours change. On the CPU, exposure
+        /// costs about a tenth of a step and full two fifths; on a GPU the picture and its gradient also cross the bus twice.
+        /// gsscale-eval fits these values to the left halves of held-out photos
+        appearance: AppearanceMode = AppearanceMode::Off => Numbers;
         /// Background colour, RGB in 0..1
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }

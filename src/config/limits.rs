@@ -2,6 +2,7 @@
 //! config.
 
 use super::file::TrainConfig;
+use crate::appearance::AppearanceMode;
 use crate::base::simd::SimdPath;
 use crate::dataset::loader::LoadOptions;
 use crate::dataset::read::ReadOptions;
@@ -59,6 +60,8 @@ pub struct RunOptions {
     pub ssim_variant: SsimVariant,
     /// Method of the colour-corrected PSNR; `None` for none.
     pub color_correct: Option<ColorCorrect>,
+    /// Which corrections of the picture are trained.
+    pub appearance: AppearanceMode,
     /// Coordinates of PLY files.
     pub export_frame: ExportFrame,
     /// Steps between evaluations; 0 = only at the end.
@@ -109,6 +112,7 @@ impl RunOptions {
             scene_scale,
             ssim_variant: config.ssim_variant,
             color_correct: config.color_correct.0,
+            appearance: config.appearance,
             export_frame: config.export_frame,
             eval_every: config.eval_every,
             save_every: config.save_every,

@@ -17,6 +17,8 @@ pub const PLY_FILE: &str = "point_cloud.ply";
 pub const REPORT_FILE: &str = "report.html";
 /// The pages seen from above, for the report: a JSON list of [`super::page_map::PageTile`].
 pub const PAGES_FILE: &str = "pages.json";
+/// Exposure and colours of each photo, vignetting of each camera: what `--appearance` has found.
+pub const APPEARANCE_FILE: &str = "appearance.json";
 /// Folder of the pictures of the held-out views.
 pub const PICTURES_FOLDER: &str = "renders/test";
 /// Output of `gsscale-eval --json`, in place of the figures of the summary.
@@ -51,7 +53,7 @@ pub enum Tells {
 }
 
 /// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
-pub const RUN_FILES: [(RunFile, Tells); 11] = [
+pub const RUN_FILES: [(RunFile, Tells); 12] = [
     (RunFile::File(CONFIG_FILE), Tells::Start),
     (RunFile::File(METRICS_FILE), Tells::Steps),
     (RunFile::Events(EVENTS_FOLDER), Tells::Steps),
@@ -59,6 +61,7 @@ pub const RUN_FILES: [(RunFile, Tells); 11] = [
     (RunFile::File(PLY_FILE), Tells::Result),
     (RunFile::File(REPORT_FILE), Tells::Result),
     (RunFile::File(PAGES_FILE), Tells::Result),
+    (RunFile::File(APPEARANCE_FILE), Tells::Result),
     (RunFile::SavedPlys, Tells::Result),
     (RunFile::File(EVALUATED_FILE), Tells::Evaluation),
     (RunFile::File(EVALUATED_AS_FILE), Tells::Evaluation),

@@ -7,7 +7,9 @@ use super::chart::{Chart, Mark, short};
 use super::html::{Page, slider};
 use super::page_map::{PageTile, page_map_svg};
 use super::picture::view_pictures;
-use super::run_files::{CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE};
+use super::run_files::{
+    APPEARANCE_FILE, CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE,
+};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::base::whole_file::write_whole;
@@ -40,6 +42,7 @@ pub fn run_report(folder: &Path) -> InputResult<String> {
         page.heading("Memory and disk");
         page.charts(&tiers);
     }
+    add_appearance(&mut page, &folder.join(APPEARANCE_FILE));
     add_page_map(&mut page, &folder.join(PAGES_FILE));
     add_views(&mut page, &folder.join(PICTURES_FOLDER))?;
     page.heading("Config");
@@ -104,6 +107,17 @@ fn tiles(summary: &Value, metrics: &[Value]) -> Vec<(String, &'static str)> {
         let label = match corrected["method"].as_str() {
             Some("affine") => "colour-corrected PSNR (affine)",
             _ => "colour-corrected PSNR (quadratic)",
+        };
+        tiles.push((format!("{psnr:.2} dB"), label));
+    }
+    let half = &summary["test"]["half_fitted"];
+    if let Some(psnr) = half["right_psnr"].as_f64() {
+        tiles.push((format!("{psnr:.2} dB"), "PSNR, right halves as they are"));
+    }
+    if let Some(psnr) = half["fitted_right_psnr"].as_f64() {
+        let label = match half["model"].as_str() {
+            Some("exposure") => "PSNR, right halves (exposure fitted on the left)",
+            _ => "PSNR, right halves (appearance fitted on the left)",
         };
         tiles.push((format!("{psnr:.2} dB"), label));
     }
@@ -193,6 +207,24 @@ fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
         add(chart.with("", curve(metrics, "step", mib("device_bytes_peak")), Mark::Line), "Peak device memory so far.");
     }
     charts
+}
+
+/// A chart of the exposures of the photos, if the run has trained them.
+fn add_appearance(page: &mut Page, path: &Path) {
+    let values = read_json(path).unwrap_or(Value::Null);
+    let images = values["images"].as_array().map_or(&[][..], Vec::as_slice);
+    let stops = |(i, image): (usize, &Value)| Some((i as f64, image["exposure"].as_f64()?));
+    let points: Vec<(f64, f64)> = images.iter().enumerate().filter_map(stops).collect();
+    if points.is_empty() {
+        return;
+    }
+    page.heading("Appearance");
+    let stride = points.len().div_ceil(POINTS_MAX);
+    let points = points.into_iter().step_by(stride).collect();
+    let chart = Chart::new("Exposure", "photo, by name", "stops").with("", points, Mark::LineAndDots);
+    let caption =
+        "Exposure of each training photo against the mean of all, as trained. appearance.json has the numbers.";
+    page.charts(&[(chart.svg(), caption.to_string())]);
 }
 
 fn add_page_map(page: &mut Page, path: &Path) {

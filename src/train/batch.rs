@@ -39,7 +39,7 @@ pub(super) fn update(
     working: &WorkingSet,
     collects: bool,
 ) -> StepCounts {
-    let WorkingSet { row_from_working, columns, gradients } = working;
+    let WorkingSet { row_from_working, columns, gradients, .. } = working;
     let size = [camera.width, camera.height];
     update_pages(scene, pages, &StepGradients { step, rows: row_from_working, columns, gradients, size }, collects)
 }

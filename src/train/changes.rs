@@ -14,6 +14,9 @@ use crate::dataset::loader::Dataset;
 use serde::Deserialize;
 use std::path::Path;
 
+/// What programs did that did not know a key, as the key's value.
+const BEFORE_ITS_TIME: [(&str, &str); 1] = [("appearance", "off")];
+
 /// The config that a run keeps when it resumes with `config`: that of its file, with the lasting keys of `config`
 /// (numbers, length, place of the checkpoint).
 ///
@@ -76,7 +79,11 @@ impl Changes {
         for (name, now) in &here {
             let Some(class) = KEYS.iter().find(|key| key.name() == *name).map(|key| key.class) else { continue };
             // A key unknown to the older commit counts as a difference, so that the user sees its default.
-            let then = there.get(name).filter(|_| written.contains_key(name));
+            // It counts as known if the programs of that time can only have done one thing.
+            let was_done = |value: &toml::Value| {
+                value.as_str().is_some_and(|word| BEFORE_ITS_TIME.contains(&(name.as_str(), word)))
+            };
+            let then = there.get(name).filter(|value| written.contains_key(name) || was_done(value));
             if class.is_derived() || then == Some(now) {
                 continue;
             }
@@ -143,6 +150,8 @@ impl Changes {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use crate::appearance::AppearanceMode;
+    use crate::checkpoint::run_state::{Origin, RunIdentity};
 
     #[test]
     fn another_path_changes_numbers_where_its_bits_are_others() {
@@ -162,6 +171,31 @@ mod tests {
             assert_eq!(changes("baseline", fused), [0, 1, 0]);
             assert_eq!(changes(fused.name(), SimdPath::Baseline), [0, 1, 0]);
         }
+    }
+
+    /// A run that began before a key existed goes on as it was, and only so.
+    #[test]
+    fn a_run_without_the_key_of_appearance_was_off() {
+        let config = TrainConfig::default();
+        let text = toml::to_string(&config).unwrap();
+        let without: String =
+            text.lines().filter(|line| !line.starts_with("appearance")).map(|line| format!("{line}\n")).collect();
+        assert!(without.len() < text.len());
+        let dataset = DatasetPrint {
+            views: Vec::new(),
+            first_rows: 1,
+            points: 0,
+            scene_scale: 1.0,
+            origin: [0.0; 3],
+            scale: 1.0,
+        };
+        let simd = limits::simd_path(&config).name().to_string();
+        let origin = Origin { config: without, simd, sh_degree_start: 0, dataset, run: RunIdentity::default() };
+        let state = RunState::without_past(origin, "cpu".to_string(), 1);
+        let changes = |config: &TrainConfig| Changes::of_config(Path::new("config.toml"), &state, config).unwrap();
+        assert_eq!(changes(&config), Changes::default());
+        let on = changes(&TrainConfig { appearance: AppearanceMode::Full, ..config.clone() });
+        assert_eq!(on.numbers, ["appearance was \"off\" and is \"full\""]);
     }
 
     #[test]

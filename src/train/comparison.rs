@@ -1,12 +1,18 @@
 //! What happens between the picture of a view and the gradient of its splats: the one place for the training step and
 //! the rehearsal.
 //!
-//! A correction of the picture (an exposure per photo) or a second loss term is added in `Comparison::loss_and_back`;
+//! A second loss term is added in `Comparison::loss_and_back`, as the correction of the picture is ([`crate::appearance`]);
 //! what it needs is a field of [`Comparison`], so that step and rehearsal pass it on unchanged.
 //!
 //! Invariants: 1. the rehearsal allocates what a step allocates, because both run this code; 2. without a correction the
-//! picture stays where the renderer keeps it.
+//! picture stays where the renderer keeps it; 3. the loss, its gradient and the errors that rows are weighed by are those of
+//! the corrected picture; 4. nothing here changes the values of a correction: what was found for them is left for the
+//! trainer, which stores it only if the step is taken.
 
+use crate::appearance::AppearanceMode;
+use crate::appearance::fit::Pair;
+use crate::appearance::picture::Look;
+use crate::appearance::state::{Found, find};
 use crate::render::{LossOptions, RenderError, Renderer};
 use crate::scene::image::Target;
 
@@ -17,18 +23,53 @@ pub struct Comparison<'a> {
     pub target: &'a Target,
     /// The loss.
     pub loss: LossOptions,
+    /// The correction of the picture, and which of its values are trained; `None` without correction.
+    pub look: Option<(AppearanceMode, Look)>,
+}
+
+/// What a correction needs beside the picture, and what it has found.
+#[derive(Debug, Clone, Default)]
+pub struct Correction {
+    /// The picture as it was drawn, `[3][height][width]`.
+    drawn: Vec<f32>,
+    /// What the last picture says of the values of its photo.
+    pub found: Option<Found>,
+}
+
+impl Correction {
+    /// Bytes held.
+    pub fn bytes(&self) -> u64 {
+        4 * self.drawn.capacity() as u64
+    }
 }
 
 impl Comparison<'_> {
-    /// Compares the picture that `renderer` has drawn with the photo, and takes the loss back to the splats.
+    /// Corrects the picture that `renderer` has drawn, compares it with the photo, and takes the loss back to the splats.
     ///
     /// # Errors
     /// Photo and picture differ in size, or the renderer failed.
-    pub(super) fn loss_and_back(&self, renderer: &mut dyn Renderer) -> Result<(), RenderError> {
-        // A correction of the picture belongs here: change `renderer.picture_mut()`.
+    pub(super) fn loss_and_back(
+        &self,
+        renderer: &mut dyn Renderer,
+        correction: &mut Correction,
+    ) -> Result<(), RenderError> {
+        correction.found = None;
+        if let Some((mode, look)) = &self.look {
+            let picture = renderer.picture_mut()?;
+            // Otherwise the loss names the sizes that differ.
+            if picture.len() == 3 * self.target.pixels() {
+                correction.drawn.clear();
+                correction.drawn.extend_from_slice(picture);
+                correction.found = find(&Pair { drawn: &correction.drawn, photo: self.target }, look, *mode);
+                look.correct(picture, self.target.width as usize, Some(self.target));
+            }
+        }
         renderer.loss(self.target, &self.loss)?;
-        // A second loss term adds its gradient here, and the correction takes the gradient back, in
-        // `renderer.picture_gradient()`: first the term, then the correction.
+        // A second loss term adds its gradient here, in `renderer.picture_gradient()`, before the correction takes the
+        // gradient back.
+        if let Some((_, look)) = &self.look {
+            look.back(&correction.drawn, self.target, &mut renderer.picture_gradient()?.v_rgb);
+        }
         renderer.picture_back()
     }
 }

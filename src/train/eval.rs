@@ -1,13 +1,20 @@
 //! Evaluation of held-out views: PSNR, SSIM, LPIPS, and pictures of render beside photo. Leaves the scene unchanged.
+//!
+//! PSNR is of the pictures as they are. Two further figures have their own names and are never mixed with it: after an
+//! affine or quadratic colour correction ([`ColorCorrected`]), and of the right halves after a fit of appearance to the left
+//! halves ([`HalfFitted`]).
 
 use super::error::TrainError;
 use super::machine;
 use super::memory::{check_photos_fit, host_budget};
 use super::pages::PagedScene;
 use super::prepare::ply_warnings;
-use super::report::{ColorCorrected, TestMetrics, json_psnr};
+use super::report::{ColorCorrected, HalfFitted, TestMetrics, json_psnr};
 use super::view::draw;
 use super::working_set::WorkingSet;
+use crate::appearance::AppearanceMode;
+use crate::appearance::fit::Pair;
+use crate::appearance::picture::{Lens, Look};
 use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
@@ -21,8 +28,12 @@ use crate::render::lpips::weights::read_lpips;
 use crate::render::lpips::{InputRange, Lpips};
 use crate::render::metrics::{SsimVariant, mean, psnr, ssim};
 use crate::render::{RenderOptions, Renderer};
+use crate::scene::camera::Camera;
 use crate::scene::image::{Image, Target};
 use std::path::{Path, PathBuf};
+
+/// Steps of the fit to the left half of a photo: it has converged long before.
+const FIT_ROUNDS: usize = 10;
 
 /// Views and metrics of an evaluation.
 pub struct EvalRequest<'a> {
@@ -36,6 +47,8 @@ pub struct EvalRequest<'a> {
     pub lpips: Option<(&'a Lpips, InputRange)>,
     /// Method of colour correction; `None` for no colour-corrected PSNR.
     pub color_correct: Option<ColorCorrect>,
+    /// What is fitted to the left half of each photo; off for no such figures.
+    pub appearance: AppearanceMode,
 }
 
 /// Evaluates the scene after `now` steps on the requested views; `working` is scratch. Fully masked views have no
@@ -53,7 +66,8 @@ pub fn evaluate(
     if request.views.is_empty() {
         return Ok(None);
     }
-    let (mut psnrs, mut ssims, mut distances, mut corrected) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut psnrs, mut ssims, mut distances) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut corrected, mut halves) = (Vec::new(), Vec::new());
     for (i, &view) in request.views.iter().enumerate() {
         targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
         let target = targets.get(view)?;
@@ -64,6 +78,7 @@ pub fn evaluate(
             psnrs.push(json_psnr(psnr(image, &target)));
             let fit = request.color_correct;
             corrected.extend(fit.map(|how| json_psnr(color_corrected_psnr(image, &target, how))));
+            halves.extend(half_fitted(image, &target, camera, request.appearance));
             // NaN: every SSIM window is masked although some border pixels are not.
             ssims.extend(Some(ssim(image, &target, request.ssim, options.simd)).filter(|x| !x.is_nan()));
             // NaN: the picture is too small for the network.
@@ -80,7 +95,34 @@ pub fn evaluate(
     let ssim = if ssims.is_empty() { 0.0 } else { mean(&ssims) };
     let lpips = (!distances.is_empty()).then(|| mean(&distances));
     let color_corrected = request.color_correct.map(|method| ColorCorrected { method, cc_psnr: mean(&corrected) });
-    Ok(Some(TestMetrics { views: psnrs.len() as u32, psnr: mean(&psnrs), ssim, lpips, color_corrected }))
+    let half_fitted = (!halves.is_empty()).then(|| {
+        let [right_psnr, fitted_right_psnr] = [0, 1].map(|i| mean(&halves.iter().map(|h| h[i]).collect::<Vec<_>>()));
+        HalfFitted { model: request.appearance, right_psnr, fitted_right_psnr }
+    });
+    let views = psnrs.len() as u32;
+    Ok(Some(TestMetrics { views, psnr: mean(&psnrs), ssim, lpips, color_corrected, half_fitted }))
+}
+
+/// PSNR of the right half of a picture: as it is, and under the correction that brings the left half closest to the
+/// photo. `None` if nothing is to be fitted, or a half is masked.
+fn half_fitted(image: &Image, target: &Target, camera: &Camera, mode: AppearanceMode) -> Option<[f64; 2]> {
+    if !mode.is_on() {
+        return None;
+    }
+    let width = image.width as usize;
+    let is_right = |i: usize| i % width >= width / 2;
+    let counts = |i: usize| is_right(i) && target.mask.as_ref().is_none_or(|mask| mask[i] != 0);
+    let mask = (0..image.pixels()).map(|i| if counts(i) { u8::MAX } else { 0 }).collect();
+    let right = Target { mask: Some(mask), ..target.clone() };
+    if !right.counts() {
+        return None;
+    }
+    let start = Look { lens: Lens::of(camera), ..Look::default() };
+    let pair = Pair { drawn: &image.rgb, photo: target };
+    let values = pair.image_values(&start, mode.image_values(), 0..width / 2, FIT_ROUNDS)?;
+    let mut fitted = image.clone();
+    Look { image: values, ..start }.correct(&mut fitted.rgb, width, None);
+    Some([image, &fitted].map(|picture| json_psnr(psnr(picture, &right))))
 }
 
 /// File of a view's picture: the view's name without extension, with `/` replaced by `_`, and prefixed with the view's
@@ -183,6 +225,7 @@ pub fn evaluate_ply(
         pictures: extras.pictures,
         lpips: of_lpips,
         color_correct: run.color_correct,
+        appearance: run.appearance,
     };
     let (mut renderer, word) = machine::renderer(config)?;
     if let Some(word) = word {

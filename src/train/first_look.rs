@@ -16,6 +16,7 @@ use super::start::Start;
 use super::step::train_step;
 use super::trainer::Trainer;
 use super::working_set::WorkingSet;
+use crate::appearance::picture::{Lens, Look};
 use crate::base::ids::PageNo;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
@@ -159,7 +160,9 @@ impl World<'_> {
         let mut working = WorkingSet::default();
         let rgb = vec![0; 3 * camera.pixels()];
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-        let comparison = Comparison { target: &target, loss: options.loss };
+        let mode = options.appearance;
+        let look = mode.is_on().then(|| (mode, Look { lens: Lens::of(&camera), ..Look::default() }));
+        let comparison = Comparison { target: &target, loss: options.loss, look };
         let mut step = |number| {
             let (what, how) = ((number, &camera), (&render, &comparison));
             let began = Instant::now();

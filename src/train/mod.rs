@@ -7,9 +7,10 @@
 //! | one step | [`step`], `soundness` (stops a run that diverged or trains nothing), [`comparison`] (from picture to loss and back; also for `view`, which renders without a step), [`batch`] (gather, update), [`working_set`], [`catch_up`] (cull, evaluate), `update`, `dense` (dense Adam) |
 //! | state and loop | [`pages`], [`trainer`], [`training_loop`], [`eval`], [`costs`] |
 //! | commits | [`checkpoint`], `first_commit` (of a run in memory), [`full_drive`], [`resume`] with `changes` and [`dataset_print`] (may the run resume) |
-//! | results | [`out_folder`], [`report`], [`progress`], [`page_map`], [`facts`] |
+//! | results | `appearance_file`, [`out_folder`], [`report`], [`progress`], [`page_map`], [`facts`] |
 //! | stores | `ownership` (which run owns a store, who may delete it), `places`, [`first_look`] (for a plan), [`stores`] (what tools do with checkpoints) |
 
+mod appearance_file;
 pub mod batch;
 pub mod budget;
 pub mod catch_up;

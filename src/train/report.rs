@@ -3,6 +3,7 @@
 //! Invariants: 1. every number written is finite, because JSON has neither infinity nor NaN (see [`json_psnr`]); 2.
 //! whole files appear by rename, so a reader never sees a partial file.
 
+use crate::appearance::AppearanceMode;
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::base::whole_file::write_whole;
@@ -95,6 +96,20 @@ pub struct TestMetrics {
     /// Colour-corrected PSNR, if requested; not comparable with `psnr`.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub color_corrected: Option<ColorCorrected>,
+    /// PSNR of the right halves after a fit to the left halves, with `--appearance`; not comparable with `psnr`.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub half_fitted: Option<HalfFitted>,
+}
+
+/// Mean PSNR of the right halves of the held-out photos.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct HalfFitted {
+    /// What was fitted to the left half of each photo.
+    pub model: AppearanceMode,
+    /// As they are, dB.
+    pub right_psnr: f64,
+    /// Under the correction that was fitted to the left half, dB.
+    pub fitted_right_psnr: f64,
 }
 
 /// Mean PSNR after fitting the colours of each render to its photo.

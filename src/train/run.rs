@@ -3,6 +3,7 @@
 //! Invariants: 1. the output folder is created after the dataset was read, so bad input leaves no files; 2. a run that
 //! is stopped or fails after its first step still writes the PLY of its last good step.
 
+use super::appearance_file::write_appearance;
 use super::changes::with_absolute_paths;
 use super::checkpoint::Checkpoint;
 use super::costs::Meter;
@@ -41,7 +42,9 @@ use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyWritten};
 use crate::page::tool::uncommitted::remove_uncommitted;
 use crate::render::Renderer;
-use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE};
+use crate::report::run_files::{
+    APPEARANCE_FILE, CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE,
+};
 use crate::report::run_report::write_run_report;
 use crate::scene::partition::first_fill;
 use std::path::{Path, PathBuf};
@@ -318,6 +321,7 @@ fn train_into(
     };
     write_summary(&out.join(SUMMARY_FILE), &summary)?;
     write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
+    write_appearance(&out.join(APPEARANCE_FILE), dataset, &trainer)?;
     write_run_report(out)?;
     tested?;
     tiers.is_done = summary.finished;

@@ -185,7 +185,7 @@ impl Passes<'_> {
         self.renderer.picture()?;
         // A device may be at work on the picture.
         self.prefetch_before_last();
-        comparison.loss_and_back(self.renderer)?;
+        comparison.loss_and_back(self.renderer, &mut self.working.correction)?;
         if self.batches.len() > 1 {
             // A drive that is full is found while the step can still be given up.
             self.scene.pager.reserve_slots(self.batches.iter().map(|batch| batch.pages.len()).sum())?;

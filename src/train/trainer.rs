@@ -19,6 +19,10 @@ use super::soundness::{Idle, note_soundness};
 use super::step::{StepOutcome, train_step};
 use super::view::rehearse;
 use super::working_set::WorkingSet;
+use crate::appearance::AppearanceMode;
+use crate::appearance::model::CHANNEL_VALUES;
+use crate::appearance::picture::Look;
+use crate::appearance::state::{AppearanceState, camera_groups};
 use crate::base::error::InputError;
 use crate::checkpoint::run_state::{LastTest, TrainerState};
 use crate::config::limits::RunOptions;
@@ -55,6 +59,8 @@ pub struct Trainer {
     pub(super) options: RunOptions,
     order: ViewOrder,
     train_views: Vec<usize>,
+    /// For each view, the number of its camera; empty if the run corrects nothing.
+    camera_groups: Vec<usize>,
     pub(super) working: WorkingSet,
     /// Everything that a commit saves and a resume restores, besides the pages.
     pub(super) state: TrainerState,
@@ -122,6 +128,8 @@ impl Trainer {
     /// A trainer for a scene that was created with the same options.
     pub fn of_scene(scene: PagedScene, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Trainer {
         let train_views = dataset.train_views();
+        let is_on = options.appearance.is_on();
+        let camera_groups = camera_groups(dataset.views.iter().filter(|_| is_on).map(|view| &view.camera));
         Trainer {
             scene,
             order: view_order(options.view_order, options.seed, dataset),
@@ -129,7 +137,8 @@ impl Trainer {
             working: WorkingSet::default(),
             renderer,
             options,
-            state: TrainerState::default(),
+            state: TrainerState { appearance: AppearanceState::new(&camera_groups), ..TrainerState::default() },
+            camera_groups,
             is_torn: false,
             budget: None,
             pages_most: usize::MAX,
@@ -151,7 +160,7 @@ impl Trainer {
             let camera = &dataset.views[view].camera;
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-            let comparison = Comparison { target: &target, loss: self.options.loss };
+            let comparison = Comparison { target: &target, loss: self.options.loss, look: self.look(view, camera) };
             let now = (&mut self.scene, self.state.step, &mut self.working);
             let rows = rehearse(now, &mut *self.renderer, camera, (&render, &comparison), self.pages_most)?;
             let index = self.scene.pager.index();
@@ -175,9 +184,41 @@ impl Trainer {
         &self.order
     }
 
-    /// Bytes held for one view: working set, renderer.
+    /// Bytes held for one view: rows of the working set; renderer and picture.
     pub fn view_bytes(&self) -> [u64; 2] {
-        [self.working.bytes() as u64, self.renderer.host_bytes()]
+        [self.working.bytes() as u64, self.renderer.host_bytes() + self.working.correction.bytes()]
+    }
+
+    /// The correction of a view as it is now; `None` if the run corrects nothing.
+    fn look(&self, view: usize, camera: &Camera) -> Option<(AppearanceMode, Look)> {
+        let mode = self.options.appearance;
+        let of_view = (view, self.camera_groups.get(view).copied()?);
+        mode.is_on().then(|| (mode, self.state.appearance.look(mode, of_view, camera)))
+    }
+
+    /// Stores what a step that was taken has found for the photo of its view.
+    fn learn_appearance(&mut self, view: usize, outcome: &StepOutcome) {
+        let found = self.working.correction.found.take();
+        if let (Some(found), None, Some(&group)) = (found, outcome.skipped, self.camera_groups.get(view)) {
+            self.state.appearance.learn(self.options.appearance, (view, group), &found);
+        }
+    }
+
+    /// The values of photos and cameras; empty if the run corrects nothing.
+    pub fn appearance(&self) -> &AppearanceState {
+        &self.state.appearance
+    }
+
+    /// The cameras whose vignetting the run trains, each with its values by channel.
+    pub fn cameras_of<'a>(&self, dataset: &'a Dataset) -> Vec<(&'a Camera, [[f64; CHANNEL_VALUES]; 3])> {
+        let trained = self.state.appearance.cameras.iter().enumerate().filter(|(_, camera)| camera.sightings > 0);
+        let first = |group| self.camera_groups.iter().position(|of| *of == group);
+        trained.filter_map(|(group, values)| Some((&dataset.views[first(group)?].camera, values.falloff))).collect()
+    }
+
+    /// The options.
+    pub fn options(&self) -> &RunOptions {
+        &self.options
     }
 
     /// SH degree now and at the last step.
@@ -239,7 +280,8 @@ impl Trainer {
         let target = targets.get(view)?;
         let started = Instant::now();
         let render = self.render_options();
-        let comparison = Comparison { target: &target, loss: self.options.loss };
+        let look = self.look(view, &dataset.views[view].camera);
+        let comparison = Comparison { target: &target, loss: self.options.loss, look };
         let stepped = loop {
             let stepped = train_step(
                 &mut self.scene,
@@ -267,6 +309,7 @@ impl Trainer {
             settle_all(&mut self.scene, self.state.step + 1)?;
             self.is_torn = false;
         }
+        self.learn_appearance(view, &outcome);
         self.state.step += 1;
         self.state.train_seconds += started.elapsed().as_secs_f64();
         Ok(outcome)
@@ -327,6 +370,7 @@ impl Trainer {
             pictures,
             lpips: None,
             color_correct: self.options.color_correct,
+            appearance: self.options.appearance,
         };
         let now = (&mut self.scene, self.state.step, &mut self.working);
         let test = evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)?;

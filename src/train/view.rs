@@ -58,7 +58,7 @@ pub fn rehearse(
         rows += working.row_from_working.len();
     }
     renderer.picture()?;
-    comparison.loss_and_back(renderer)?;
+    comparison.loss_and_back(renderer, &mut working.correction)?;
     for (i, batch) in batches.iter().enumerate().rev() {
         if i + 1 < batches.len() {
             scene.gather_pages(batch, camera, now, working)?;

@@ -1,5 +1,6 @@
 //! The working set: the rows of one batch of a view and their gradients during a step.
 
+use super::comparison::Correction;
 use crate::render::Gradients;
 use crate::scene::columns::{Columns, row_width};
 
@@ -12,10 +13,12 @@ pub struct WorkingSet {
     pub columns: Columns,
     /// Gradients of the step.
     pub gradients: Gradients,
+    /// Of the picture of the view, if it is corrected.
+    pub correction: Correction,
 }
 
 impl WorkingSet {
-    /// Bytes held.
+    /// Bytes held for rows.
     pub fn bytes(&self) -> usize {
         let columns = self.columns.bytes() + self.gradients.columns.bytes();
         self.row_from_working.capacity() * 4 + columns + self.gradients.means2d.capacity() * 16

@@ -3,6 +3,7 @@
 
 mod support;
 
+mod appearance;
 mod bench_tool;
 #[cfg(target_os = "linux")] // /proc shows the peak memory of a process
 mod bombs;

@@ -3,6 +3,7 @@
 use super::pages::{PAGE_ROWS, label_of_a_page, payload_bytes_of_a_page};
 use super::with_mode;
 use crate::Target;
+use gsscale::appearance::state::AppearanceState;
 use gsscale::base::ids::PageId;
 use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, Origin, RunIdentity, RunState, TrainerState, ViewPrint};
 use gsscale::densify::stats::GradHistogram;
@@ -233,6 +234,7 @@ fn sample() -> RunState {
             steps_skipped_in_a_row: 1,
             train_seconds: 0.1,
             test: Some(LastTest { step: 8, views: 2, psnr: 20.5, ssim: 0.75 }),
+            appearance: AppearanceState::new(&[0, 0]),
         },
         events,
         histogram: vec![(3, 1), (32767, 9)],

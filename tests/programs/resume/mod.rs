@@ -1,5 +1,6 @@
 //! A killed or stopped run, resumed, ends with the bytes of an uninterrupted run. Through the real binary.
 
+mod appearance;
 mod bench;
 mod changes;
 mod events;

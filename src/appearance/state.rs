@@ -1,0 +1,234 @@
+//! The values of all photos and cameras of a run: what a commit holds of appearance.
+//!
+//! The values of a photo are fixed-point numbers, and their sums over the photos seen are kept beside them. So the mean is
+//! known at every step without a sweep, and has the same bits whatever the order. What acts on a photo is its value less
+//! that mean; a photo that no step has seen is not corrected.
+//!
+//! Invariants: 1. the sums are exactly those of the values of the photos seen; 2. what acts is within the bounds of
+//! [`super::fit::bounded`]; 3. a fit that found nothing changes nothing.
+
+use super::AppearanceMode;
+use super::fit::{Pair, bounded, bounded_channel};
+use super::model::{CHANNEL_VALUES, IMAGE_VALUES};
+use super::picture::{Lens, Look};
+use crate::scene::camera::Camera;
+use serde::{Deserialize, Serialize};
+
+/// Fixed-point numbers per unit.
+const PER_UNIT: f64 = (1 << 24) as f64;
+/// Largest stored magnitude, fixed-point: 64 units.
+const STORED_MOST: f64 = (1 << 30) as f64;
+/// Steps of Gauss-Newton at a sighting.
+const ROUNDS: usize = 2;
+/// Least weight of a sighting against the value before it.
+const IMAGE_GAIN_LEAST: f64 = 0.05;
+const CAMERA_GAIN_LEAST: f64 = 0.01;
+
+/// Weight of the sighting after `sightings` others: the first counts whole. The mean of all fits under weights that grow
+/// linearly has these weights, so the early fits, to a rough scene, are forgotten.
+fn gain(sightings: u32, least: f64) -> f64 {
+    (2.0 / (f64::from(sightings) + 2.0)).max(least)
+}
+
+/// The values of a photo.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct ImageState {
+    /// Exposure and homography, fixed-point, with the mean in them.
+    pub values: [i32; IMAGE_VALUES],
+    /// Steps that have seen the photo.
+    pub sightings: u32,
+}
+
+/// The values of a camera.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct CameraState {
+    /// Vignetting by channel.
+    pub falloff: [[f64; CHANNEL_VALUES]; 3],
+    /// Steps that have seen a photo of the camera.
+    pub sightings: u32,
+}
+
+/// What a step has found for its photo.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Found {
+    image: [f64; IMAGE_VALUES],
+    falloff: Option<[[f64; CHANNEL_VALUES]; 3]>,
+}
+
+/// All values; empty for a run without appearance.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct AppearanceState {
+    /// By view of the dataset.
+    pub images: Vec<ImageState>,
+    /// By group of views with the same intrinsics.
+    pub cameras: Vec<CameraState>,
+    /// Sums of the values of the photos seen.
+    sums: [i64; IMAGE_VALUES],
+    /// Photos seen.
+    seen: u32,
+}
+
+/// For each camera, the number of its group: cameras of the same size and intrinsics form one.
+pub fn camera_groups<'a>(cameras: impl Iterator<Item = &'a Camera>) -> Vec<usize> {
+    let mut known = std::collections::HashMap::new();
+    let key = |c: &Camera| ([c.fx, c.fy, c.cx, c.cy].map(f32::to_bits), c.width, c.height);
+    cameras
+        .map(|camera| {
+            let next = known.len();
+            *known.entry(key(camera)).or_insert(next)
+        })
+        .collect()
+}
+
+/// Finds the values of the photo of a view, under the `look` that its picture was corrected with.
+pub fn find(pair: &Pair<'_>, look: &Look, mode: AppearanceMode) -> Option<Found> {
+    let width = pair.photo.width as usize;
+    let image = pair.image_values(look, mode.image_values(), 0..width, ROUNDS)?;
+    let falloff = match mode {
+        AppearanceMode::Full => pair.falloff(&Look { image, ..*look }),
+        _ => None,
+    };
+    Some(Found { image, falloff })
+}
+
+impl AppearanceState {
+    /// The values of a run that has seen nothing: no change. `groups` as from [`camera_groups`].
+    pub fn new(groups: &[usize]) -> AppearanceState {
+        let cameras = groups.iter().max().map_or(0, |last| last + 1);
+        AppearanceState {
+            images: vec![ImageState::default(); groups.len()],
+            cameras: vec![CameraState::default(); cameras],
+            ..AppearanceState::default()
+        }
+    }
+
+    /// Whether the values are of as many photos and cameras as `other`.
+    pub fn is_as_large_as(&self, other: &AppearanceState) -> bool {
+        (self.images.len(), self.cameras.len()) == (other.images.len(), other.cameras.len())
+    }
+
+    fn mean(&self) -> [f64; IMAGE_VALUES] {
+        self.sums.map(|sum| sum as f64 / f64::from(self.seen.max(1)))
+    }
+
+    /// What acts on a photo: its values less the mean, the first `used` of them; zeros for a photo that was not seen.
+    pub fn acting(&self, view: usize, used: usize) -> [f64; IMAGE_VALUES] {
+        let Some(image) = self.images.get(view).filter(|image| image.sightings > 0) else { return [0.0; IMAGE_VALUES] };
+        let mean = self.mean();
+        let of = |k: usize| if k < used { (f64::from(image.values[k]) - mean[k]) / PER_UNIT } else { 0.0 };
+        bounded(std::array::from_fn(of)).unwrap_or_default()
+    }
+
+    /// The correction of a view of camera group `group`.
+    pub fn look(&self, mode: AppearanceMode, (view, group): (usize, usize), camera: &Camera) -> Look {
+        let falloff = match mode {
+            AppearanceMode::Full => self.cameras.get(group).map(|camera| camera.falloff).unwrap_or_default(),
+            _ => Default::default(),
+        };
+        Look { image: self.acting(view, mode.image_values()), falloff, lens: Lens::of(camera) }
+    }
+
+    /// Moves the values of a view's photo and camera towards what a step has found.
+    pub fn learn(&mut self, mode: AppearanceMode, (view, group): (usize, usize), found: &Found) {
+        let (acting, mean) = (self.acting(view, mode.image_values()), self.mean());
+        let Some(image) = self.images.get_mut(view) else { return };
+        let weight = gain(image.sightings, IMAGE_GAIN_LEAST);
+        let is_new = image.sightings == 0;
+        for k in 0..mode.image_values() {
+            let next = acting[k] + weight * (found.image[k] - acting[k]);
+            let next = (mean[k] + next * PER_UNIT).clamp(-STORED_MOST, STORED_MOST).round() as i32;
+            self.sums[k] += i64::from(next) - if is_new { 0 } else { i64::from(image.values[k]) };
+            image.values[k] = next;
+        }
+        image.sightings = image.sightings.saturating_add(1);
+        self.seen += u32::from(is_new);
+        if let (Some(falloff), Some(camera)) = (&found.falloff, self.cameras.get_mut(group)) {
+            let weight = gain(camera.sightings, CAMERA_GAIN_LEAST);
+            for (values, found) in camera.falloff.iter_mut().zip(falloff) {
+                let next = std::array::from_fn(|k| values[k] + weight * (found[k] - values[k]));
+                *values = bounded_channel(next).unwrap_or(*values);
+            }
+            camera.sightings = camera.sightings.saturating_add(1);
+        }
+    }
+
+    /// Checks values from a file.
+    ///
+    /// # Errors
+    /// Names what no run can have written.
+    pub fn check(&self) -> Result<(), &'static str> {
+        let seen = || self.images.iter().filter(|image| image.sightings > 0);
+        let sums: [i64; IMAGE_VALUES] = std::array::from_fn(|k| seen().map(|image| i64::from(image.values[k])).sum());
+        if self.sums != sums || self.seen as usize != seen().count() {
+            return Err("the sums of its exposures are not those of its photos");
+        }
+        let is_stored = |x: &i32| f64::from(*x).abs() <= STORED_MOST;
+        if !self.images.iter().all(|image| image.values.iter().all(is_stored)) {
+            return Err("an exposure or colour of a photo is out of bounds");
+        }
+        let is_right = |channel: &[f64; CHANNEL_VALUES]| bounded_channel(*channel) == Some(*channel);
+        match self.cameras.iter().all(|camera| camera.falloff.iter().all(is_right)) {
+            true => Ok(()),
+            false => Err("the vignetting of a camera is out of bounds"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn found(exposure: f64) -> Found {
+        Found { image: [exposure, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], falloff: None }
+    }
+
+    #[test]
+    fn what_acts_is_the_value_less_the_mean_of_what_was_seen() {
+        let mode = AppearanceMode::Exposure;
+        let mut state = AppearanceState::new(&[0, 0, 0]);
+        assert_eq!(state.acting(0, 1)[0], 0.0);
+        state.learn(mode, (0, 0), &found(1.0));
+        assert_eq!(state.acting(0, 1)[0], 0.0, "one photo alone is its own mean");
+        state.learn(mode, (1, 0), &found(1.0));
+        let [first, second, third] = [0, 1, 2].map(|view| state.acting(view, 1)[0]);
+        assert_eq!((first, second, third), (-0.5, 0.5, 0.0));
+        assert_eq!(state.check(), Ok(()));
+        // A second sighting moves two thirds of the way; a fixed-point number has 24 bits behind the point.
+        state.learn(mode, (1, 0), &found(1.1));
+        let far = state.acting(1, 1)[0] - state.acting(0, 1)[0];
+        assert!((far - (1.0 + 0.6 * 2.0 / 3.0)).abs() < 1e-6, "{far}");
+        state.sums[0] += 1;
+        assert!(state.check().is_err());
+    }
+
+    #[test]
+    fn values_stay_within_bounds() {
+        let mut state = AppearanceState::new(&[0, 0]);
+        for _ in 0..1000 {
+            state.learn(AppearanceMode::Exposure, (0, 0), &found(4.0));
+            state.learn(AppearanceMode::Exposure, (1, 0), &found(-4.0));
+        }
+        assert_eq!(state.check(), Ok(()));
+        assert!(state.acting(0, 1)[0].abs() <= 4.0);
+        let lost =
+            AppearanceState { cameras: vec![CameraState { falloff: [[f64::NAN; 5]; 3], sightings: 1 }], ..state };
+        assert!(lost.check().is_err());
+    }
+
+    #[test]
+    fn cameras_of_the_same_intrinsics_are_one() {
+        let camera = |fx: f32| Camera {
+            viewmat: [[0.0; 4]; 3],
+            fx,
+            fy: 50.0,
+            cx: 32.0,
+            cy: 24.0,
+            width: 64,
+            height: 48,
+            near_plane: 0.1,
+            far_plane: 100.0,
+        };
+        let cameras = [camera(50.0), camera(60.0), camera(50.0)];
+        assert_eq!(camera_groups(cameras.iter()), [0, 1, 0]);
+    }
+}
