@@ -10,7 +10,7 @@
 use super::choice::{Chosen, Device, LogFormat};
 use super::key::{Class, Key};
 use super::schedule::Schedule;
-use super::values::{ByteSize, Rgb};
+use super::values::{ByteSize, Rgb, Up};
 use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
 use crate::checkpoint::interval::CommitEvery;
@@ -206,6 +206,10 @@ config_keys! {
         [alias = "colour-correct"] color_correct: Chosen<ColorCorrect> = Chosen(None) => Free;
         /// Coordinates of the PLY: dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;
+        /// Up in the PLY: auto (from cameras and points), keep (the axes of the dataset) or X,Y,Z (this direction of the
+        /// dataset). The PLY is turned so that up is -y, as viewers show it; training is not. The file
+        /// point_cloud.transform.json leads back to the dataset
+        [allow_hyphen_values = true] up: Up = Up::Auto => Free;
     }
     "Memory and disk" {
         /// Memory limit of the run; 0 = 70 % of the memory available on this machine or in its control group

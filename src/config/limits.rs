@@ -2,6 +2,7 @@
 //! config.
 
 use super::file::TrainConfig;
+use super::values::Up;
 use crate::base::simd::SimdPath;
 use crate::dataset::loader::LoadOptions;
 use crate::dataset::read::ReadOptions;
@@ -61,6 +62,9 @@ pub struct RunOptions {
     pub color_correct: Option<ColorCorrect>,
     /// Coordinates of PLY files.
     pub export_frame: ExportFrame,
+    /// The direction of the dataset that is up in PLY files; `None` where they keep the axes of the dataset, and while
+    /// `--up auto` is unresolved.
+    pub up: Option<[f64; 3]>,
     /// Steps between evaluations; 0 = only at the end.
     pub eval_every: u32,
     /// Steps between PLY files; 0 = only at the end.
@@ -110,6 +114,10 @@ impl RunOptions {
             ssim_variant: config.ssim_variant,
             color_correct: config.color_correct.0,
             export_frame: config.export_frame,
+            up: match config.up {
+                Up::Along(up) => Some(up),
+                Up::Auto | Up::Keep => None,
+            },
             eval_every: config.eval_every,
             save_every: config.save_every,
             log_every: config.log_every,

@@ -36,9 +36,10 @@ use crate::config::choice::{Choice, Chosen, LogFormat};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::config::residence::Residence;
+use crate::config::values::Up;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
-use crate::exchange::ply::{ExportFrame, PlyWritten};
+use crate::exchange::ply::{ExportFrame, PlyWritten, write_transform};
 use crate::page::tool::uncommitted::remove_uncommitted;
 use crate::render::Renderer;
 use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE};
@@ -156,8 +157,11 @@ pub(super) fn begin(
     for warning in &start.dataset.warnings {
         eprintln!("warning: {warning}");
     }
-    let options =
+    let mut options =
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
+    if config.up == Up::Auto {
+        options.up = start.up()?;
+    }
     let before = host_bytes_now().unwrap_or(0);
     let (mut renderer, word) = machine::renderer(config)?;
     // On from here, so that probing allocates what the steps need.
@@ -228,7 +232,8 @@ fn spill_dir_flag(request: &RunRequest) -> String {
 /// The config to keep: with choices resolved and absolute paths.
 fn resolved_config(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
     let view_order = Chosen(Some(trainer.view_order().order()));
-    with_absolute_paths(TrainConfig { view_order, ..config.clone() })
+    let up = trainer.options.up.map_or(Up::Keep, Up::Along);
+    with_absolute_paths(TrainConfig { view_order, up, ..config.clone() })
 }
 
 /// Writes config.toml (on resume only if it changed); returns the origin for all commits.
@@ -297,6 +302,7 @@ fn train_into(
         (looped, saved) => (looped, saved?),
     };
     warn_of_ply(config, &written, &ply);
+    write_transform(&ply, &trainer.ply_meta(dataset), written.frame)?;
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
     let asked = stop.exit_code();
     let tested = looped.and_then(|()| match asked {

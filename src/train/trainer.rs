@@ -34,6 +34,7 @@ use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::image::Target;
+use crate::scene::rotation::Rotation;
 use crate::schedule::order::{Order, ViewOrder};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -345,18 +346,24 @@ impl Trainer {
             let remedy = "resume the run from its last commit with gsscale-train --resume and the output folder";
             return Err(InputError::new(path, problem, remedy).into());
         }
-        let meta = PlyMeta {
+        let meta = self.ply_meta(dataset);
+        let rows_at_most = self.scene.rows_bound();
+        let mut writer = ply::PlyWriter::create(path, self.options.sh_degree, rows_at_most, &meta)?;
+        self.scene.for_all_rows(self.state.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
+        Ok(writer.finish()?)
+    }
+
+    /// The metadata of a PLY of the rows at the current step.
+    pub(super) fn ply_meta(&self, dataset: &Dataset) -> PlyMeta {
+        PlyMeta {
             step: Some(u64::from(self.state.step)),
             origin: dataset.frame.origin.to_array(),
             scale: dataset.frame.scale,
             scene_radius: f64::from(dataset.scene_scale) * dataset.frame.scale,
             frame: self.options.export_frame,
+            upright: self.options.up.and_then(Rotation::upright),
             ..PlyMeta::default()
-        };
-        let rows_at_most = self.scene.rows_bound();
-        let mut writer = ply::PlyWriter::create(path, self.options.sh_degree, rows_at_most, &meta)?;
-        self.scene.for_all_rows(self.state.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
-        Ok(writer.finish()?)
+        }
     }
 
     /// Path of the final PLY in an output folder.

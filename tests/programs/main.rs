@@ -27,3 +27,4 @@ mod resume;
 mod sweeps;
 mod tiers;
 mod train;
+mod upright;

@@ -121,6 +121,19 @@ impl TextModel {
         std::fs::write(scene.join("points.ply"), ply).unwrap();
     }
 
+    /// Turns the whole scene about its origin.
+    pub fn turn(&mut self, by: DQuat) {
+        for p in &mut self.points {
+            *p = (by * DVec3::from_array(*p)).to_array();
+        }
+        for v in &mut self.views {
+            // World to camera of a turned world: first back, then as before. The translation stays.
+            let [w, x, y, z] = v.qvec;
+            let q = DQuat::from_xyzw(x, y, z, w).normalize() * by.inverse();
+            v.qvec = [q.w, q.x, q.y, q.z];
+        }
+    }
+
     /// Moves the whole scene by `offset`.
     pub fn shift(&mut self, offset: [f64; 3]) {
         let offset = DVec3::from_array(offset);
