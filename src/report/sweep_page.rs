@@ -73,7 +73,8 @@ fn tiles(settings: &[Setting]) -> Vec<(String, &'static str)> {
             tiles.push((format!("{:.3} dB", psnr.width()), "its spread over seeds"));
         }
     }
-    let free = settings.iter().filter(|s| s.verdict.is_free() && s.verdict != Verdict::Base).count();
+    let is_counted = |s: &&Setting| s.verdict.is_free() && !matches!(s.verdict, Verdict::Base | Verdict::NoEffect);
+    let free = settings.iter().filter(is_counted).count();
     tiles.push((free.to_string(), "settings that cost no accuracy"));
     tiles
 }
@@ -160,6 +161,7 @@ fn add_table(page: &mut Page, settings: &[Setting]) {
     let frames = |s: &Setting| s.runs.last().map(|r| format!("{} of {}", r.frames, r.pages));
     let verdict = |s: &Setting| match s.verdict {
         Verdict::Base => "the base",
+        Verdict::NoEffect => "changed nothing here",
         Verdict::SameBits => "the same bits",
         Verdict::WithinSpread => "no cost beyond the spread",
         Verdict::Costs => "costs",

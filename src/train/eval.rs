@@ -5,6 +5,7 @@ use super::machine;
 use super::memory::{check_photos_fit, host_budget};
 use super::pages::PagedScene;
 use super::prepare::ply_warnings;
+use super::progress::Count;
 use super::report::{ColorCorrected, TestMetrics, json_psnr};
 use super::view::draw;
 use super::working_set::WorkingSet;
@@ -36,6 +37,8 @@ pub struct EvalRequest<'a> {
     pub lpips: Option<(&'a Lpips, InputRange)>,
     /// Method of colour correction; `None` for no colour-corrected PSNR.
     pub color_correct: Option<ColorCorrect>,
+    /// Called with the number of views done, after each.
+    pub progress: &'a dyn Fn(u32),
 }
 
 /// Evaluates the scene after `now` steps on the requested views; `working` is scratch. Fully masked views have no
@@ -73,6 +76,7 @@ pub fn evaluate(
         if let Some(folder) = request.pictures {
             write_pair(&picture_path(folder, dataset, view), image, &target)?;
         }
+        (request.progress)(i as u32 + 1);
     }
     if psnrs.is_empty() {
         return Ok(None);
@@ -176,6 +180,7 @@ pub fn evaluate_ply(
     drop(columns);
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let views = dataset.test_views();
+    let shown = Count::new("views compared", views.len() as u32, false);
     let of_lpips = lpips.as_ref().map(|(lpips, range)| (lpips, *range));
     let request = EvalRequest {
         views: &views,
@@ -183,6 +188,7 @@ pub fn evaluate_ply(
         pictures: extras.pictures,
         lpips: of_lpips,
         color_correct: run.color_correct,
+        progress: &|done| shown.show(done),
     };
     let (mut renderer, word) = machine::renderer(config)?;
     if let Some(word) = word {

@@ -78,7 +78,7 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     // The resumed run takes the lock again.
     drop(lock);
     match found {
-        Ok(Some(stored)) => resume_from(request, &earlier, config, stored),
+        Ok(Some(stored)) => resume_from(request, &earlier, config, earlier.adopted(stored)),
         Ok(None) => restart(request, &earlier, config),
         // A run in memory creates its checkpoint at its first commit.
         Err(_) if is_in_output && !SpillDir::exists_in(&folder) && !has_results(&request.out) => {
@@ -139,6 +139,17 @@ impl Earlier {
         let config = TrainConfig { spill_dir: named.unwrap_or("").to_string(), ..then };
         let scene = request.scene.clone().unwrap_or_else(|| PathBuf::from(&state.origin.run.scene));
         Ok(Earlier { run: state.origin.run.id, file: None, config, scene, path })
+    }
+
+    /// `stored`, whose folder is removed at the end if the run made it.
+    fn adopted(&self, mut stored: Stored) -> Stored {
+        let is_own = |(config, facts): &(TrainConfig, Resolved)| {
+            facts.made_spill_dir && config.residence().spill_dir().is_some_and(|dir| stored.is_in(dir))
+        };
+        if self.file.as_ref().is_some_and(is_own) {
+            stored.adopt_folder();
+        }
+        stored
     }
 
     /// The claim that the run's checkpoint must satisfy.
@@ -308,16 +319,16 @@ fn finished_outcome(
     let is_kept = config.keep_checkpoint && stored.is_some();
     let is_its_own = |stored: &Stored| earlier.run.is_known() && stored.run_state.origin.run.id == earlier.run;
     if let Some(stored) = stored.filter(|stored| is_its_place && !config.keep_checkpoint && is_its_own(stored)) {
-        stored.remove()?;
+        earlier.adopted(stored).remove()?;
         // An earlier process of the run may have created the folder in its results; it is empty now.
         let _ = std::fs::remove_dir(checkpoint_folder(&request.out));
     }
-    write_run_report(&request.out)?;
+    write_run_report(&request.out, &|_, _| {})?;
     if !request.quiet {
         let more = if is_kept { "; --steps N extends it" } else { "" };
         eprintln!("{} is finished: all {} steps, with results{more}", request.out.display(), summary.steps);
     }
-    Ok(Some(RunOutcome { summary: Some(summary), exit_code: 0 }))
+    Ok(Some(RunOutcome { summary: Some(summary), exit_code: 0, out: request.out.clone() }))
 }
 
 fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {

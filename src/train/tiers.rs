@@ -190,6 +190,17 @@ impl Stored {
         Ok(Some(Stored { spill, opened, run_state }))
     }
 
+    /// Whether the checkpoint lies in `folder`.
+    pub fn is_in(&self, folder: &Path) -> bool {
+        let [here, there] = [self.spill.folder(), folder].map(|path| path.canonicalize().ok());
+        here.is_some() && here == there
+    }
+
+    /// Removes the folder with the checkpoint at the end: an earlier process of the run made it.
+    pub fn adopt_folder(&mut self) {
+        self.spill.adopt_folder();
+    }
+
     /// Removes the checkpoint. Returns the names of files that stay because they do not belong to the store.
     ///
     /// # Errors
@@ -270,6 +281,11 @@ impl Tiers {
     /// Whether a run that stops now can resume from its checkpoint.
     pub fn can_resume(&self) -> bool {
         !self.is_done && self.has_checkpoint()
+    }
+
+    /// Whether this run made the folder of its spill directory.
+    pub fn made_spill_dir(&self) -> bool {
+        self.spill.as_ref().is_some_and(SpillDir::made_folder)
     }
 
     /// Whether the checkpoint stays at a clean end.

@@ -310,7 +310,7 @@ impl Trainer {
         }
     }
 
-    /// Evaluates the held-out views at the current step.
+    /// Evaluates the held-out views at the current step. `progress` is called with the number of views done.
     ///
     /// # Errors
     /// As [`evaluate`].
@@ -319,6 +319,7 @@ impl Trainer {
         dataset: &Dataset,
         targets: &TargetCache,
         pictures: Option<&Path>,
+        progress: &dyn Fn(u32),
     ) -> Result<Option<TestMetrics>, TrainError> {
         let render = self.render_options();
         let views = dataset.test_views();
@@ -328,6 +329,7 @@ impl Trainer {
             pictures,
             lpips: None,
             color_correct: self.options.color_correct,
+            progress,
         };
         let now = (&mut self.scene, self.state.step, &mut self.working);
         let test = evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)?;

@@ -297,7 +297,8 @@ fn a_dry_run_writes_nothing_and_tells_the_memory() {
     let out = folder.path().join("dry");
     let output = train(&[text(&scene), "--out", text(&out), "--dry-run"]);
     assert!(output.status.success(), "{}", stderr(&output));
-    let said = stderr(&output);
+    // What was asked for is on standard output, so that it can be kept in a file.
+    let said = String::from_utf8_lossy(&output.stdout);
     assert!(said.contains("memory") && said.contains("views to train on"), "{said}");
     assert!(!out.exists());
 }

@@ -2,7 +2,7 @@
 //! choice of device with its reason.
 
 use crate::support::gpu;
-use crate::support::scenes::{CLASSIC, city, eval, psnr, stderr, summary, text, train, wide_city};
+use crate::support::scenes::{CLASSIC, city, eval, psnr, stderr, summary, text, told, train, wide_city};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::photo::decode;
@@ -373,7 +373,7 @@ fn auto_never_takes_a_software_adapter() {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 8, 64, 48, 200);
     let output = train(&[text(&scene), "--dry-run"]);
-    let said = stderr(&output);
+    let said = told(&output);
     assert!(output.status.success(), "{said}");
     let has_hardware = gsscale::gpu::list_adapters()
         .iter()

@@ -12,6 +12,7 @@ mod cli;
 #[cfg(unix)]
 mod drive_faults;
 mod extremes;
+mod first_hour;
 mod gpu_train;
 mod growing;
 mod memory;

@@ -158,6 +158,11 @@ pub fn train(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_gsscale-train")).args(args).args(schedule).output().unwrap()
 }
 
+/// Standard output, then standard error.
+pub fn told(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned() + &stderr(output)
+}
+
 /// Runs `gsscale-eval` with these arguments.
 pub fn eval(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_gsscale-eval")).args(args).output().unwrap()

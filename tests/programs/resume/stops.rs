@@ -29,6 +29,8 @@ fn a_run_that_is_asked_to_stop_says_how_to_go_on_and_does() {
         assert!(ply(&out) == alone.ply, "{place:?}: the scene is another");
         assert_eq!(logged(&out), alone.logged);
         assert!(place != Place::Memory || !out.join("checkpoint").exists(), "a run that is done leaves no checkpoint");
+        // The run made the folder of its pages, in its first life.
+        assert!(!bench.path("spill").exists(), "{place:?}: an empty folder is left");
         std::fs::remove_dir_all(&out).unwrap();
     }
 }
