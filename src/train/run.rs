@@ -132,6 +132,37 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     {
         eprintln!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
     }
+    let FirstTrainer { dataset, trainer, tiers, print, driver } = first_trainer(request, start, host_mem)?;
+    let run = RunId::draw();
+    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run };
+    plan_and_train(request, &dataset, tiers, trainer, begun)
+}
+
+/// A trainer before its first step, with all that belongs to it. The trainer's pages may lie in the tiers, so drop them
+/// after it.
+pub(super) struct FirstTrainer {
+    /// Views and frame.
+    pub dataset: Dataset,
+    /// The trainer.
+    pub trainer: Trainer,
+    /// Where its pages live.
+    pub tiers: Tiers,
+    /// Digest of the dataset.
+    pub print: DatasetPrint,
+    /// Bytes allocated by the graphics driver.
+    pub driver: u64,
+}
+
+/// Makes the first pages of a scene, and their trainer.
+///
+/// # Errors
+/// The drive or the device cannot be used, or the source of the Gaussians cannot be read again.
+pub(super) fn first_trainer(
+    request: &RunRequest,
+    start: Start,
+    host_mem: Option<u64>,
+) -> Result<FirstTrainer, TrainError> {
+    let config = &request.config;
     check_first_drive(config, start.rows)?;
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
     let fill = first_fill(config.page_rows as usize, options.strategy.grows());
@@ -145,9 +176,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let print = dataset_print(&start)?;
     let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
     let trainer = Trainer::of_scene(scene, &dataset, renderer, options);
-    let run = RunId::draw();
-    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run };
-    plan_and_train(request, &dataset, tiers, trainer, begun)
+    Ok(FirstTrainer { dataset, trainer, tiers, print, driver })
 }
 
 /// Common start of all runs after reading the scene: warnings, options, the renderer and its memory.

@@ -165,8 +165,8 @@ impl Stored {
         if !SpillDir::exists_in(folder) {
             let problem = "the checkpoint of this run is not there: it is removed when a run ends without \
                            --keep-checkpoint, and made by the first commit";
-            let remedy = "start the run again with --overwrite; if its pages were moved, name their folder with --spill-dir; \
-                          if their drive is not mounted, mount it";
+            let remedy = "if its drive is not mounted, mount it; if its pages were moved, name their folder with --spill-dir; \
+                          if it is lost, start a new run with another --out and --init-ply with the PLY of this one";
             return Err(InputError::new(folder, problem, remedy).into());
         }
         let spill = SpillDir::open(folder, allow_remote)?;

@@ -140,6 +140,12 @@ impl Trainer {
         }
     }
 
+    /// Counts the steps from `step` on: an earlier run has done them, in `train_seconds` seconds. Call this before the first
+    /// step.
+    pub(super) fn begin_after(&mut self, step: u32, train_seconds: f64) {
+        (self.state.step, self.state.train_seconds) = (step, train_seconds);
+    }
+
     /// Renders views forward and backward so that the memory of a view is allocated; the scene stays unchanged. Returns
     /// the pixels of the largest view, and the most rows that a view draws.
     ///

@@ -268,7 +268,9 @@ fn an_existing_run_is_refused_unless_overwritten() {
     let out = folder.path().join("out");
     let output = train(&[text(&scene), "--out", text(&out), "--steps", "12"]);
     assert_eq!(output.status.code(), Some(1));
-    assert!(stderr(&output).contains("--overwrite"));
+    // No remedy proposes to lose a result.
+    let said = stderr(&output);
+    assert!(said.contains("another --out") && said.contains("--steps N") && !said.contains("overwrite"), "{said}");
     trains(&folder, &scene, &[]);
 }
 

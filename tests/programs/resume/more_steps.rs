@@ -1,7 +1,7 @@
 //! Kept checkpoints: named checkpoints, and finished runs continued to more steps.
 
 use super::bench::{Bench, Place, SELDOM, STEPS, ended, logged, ply, signal, succeeded};
-use crate::support::scenes::{summary, text, train};
+use crate::support::scenes::{stderr, summary, text, train};
 use gsscale::checkpoint::run_state::RunState;
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
@@ -92,9 +92,17 @@ fn more_steps_keep_the_schedule() {
         bench.stopped(place, 9);
         succeeded(bench.go_on(&["--steps", "260"]));
         assert!(ply(&out) == planned, "{place:?}: the scene is another when told before the end");
-        // The removed checkpoint stays removed.
-        let said = super::bench::refused(bench.go_on(&["--steps", "300"]));
-        assert!(said.contains("--keep-checkpoint"), "{said}");
+        let psnr = |out: &Path| summary(out)["test"]["psnr"].as_f64().unwrap();
+        let before = psnr(&out);
+        // The checkpoint is gone: the run goes on from its PLY, and its earlier result stays.
+        let said = stderr(&ended(bench.go_on(&["--steps", "300"])));
+        assert!(said.contains("goes on from its Gaussians") && said.contains("Adam's moments are lost"), "{said}");
+        let done = summary(&out);
+        assert_eq!((done["steps"].as_u64(), done["finished"].as_bool()), (Some(300), Some(true)), "{said}");
+        assert!(std::fs::read(out.join("point_cloud_000260.ply")).unwrap() == planned && ply(&out) != planned);
+        assert!(done["train_seconds"].as_f64().unwrap() > 0.0 && logged(&out).last() == Some(&300));
+        // 40 steps with fresh moments; a start from points is some 5 dB lower.
+        assert!(psnr(&out) > before - 1.5, "{} after {before}", psnr(&out));
         std::fs::remove_dir_all(&out).unwrap();
         let _ = std::fs::remove_dir(bench.checkpoint(place));
     }
