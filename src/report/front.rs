@@ -49,6 +49,18 @@ pub enum Verdict {
 }
 
 impl Verdict {
+    /// The verdict for people; empty where it is not known.
+    pub fn words(self) -> &'static str {
+        match self {
+            Verdict::Base => "the base",
+            Verdict::NoEffect => "changed nothing here",
+            Verdict::SameBits => "the same bits",
+            Verdict::WithinSpread => "no cost beyond the spread",
+            Verdict::Costs => "costs",
+            Verdict::Unknown => "",
+        }
+    }
+
     /// Whether the setting loses no accuracy beyond the spread.
     pub fn is_free(self) -> bool {
         matches!(self, Verdict::Base | Verdict::NoEffect | Verdict::SameBits | Verdict::WithinSpread)

@@ -159,14 +159,6 @@ fn add_table(page: &mut Page, settings: &[Setting]) {
         against(s, base, |r| r.psnr)
     };
     let frames = |s: &Setting| s.runs.last().map(|r| format!("{} of {}", r.frames, r.pages));
-    let verdict = |s: &Setting| match s.verdict {
-        Verdict::Base => "the base",
-        Verdict::NoEffect => "changed nothing here",
-        Verdict::SameBits => "the same bits",
-        Verdict::WithinSpread => "no cost beyond the spread",
-        Verdict::Costs => "costs",
-        Verdict::Unknown => "",
-    };
     page.table(
         settings,
         &[
@@ -184,7 +176,7 @@ fn add_table(page: &mut Page, settings: &[Setting]) {
             ("written", &|s| Cell::bytes(s.mean(|r| Some(r.bytes_written as f64)))),
             ("peak", &|s| Cell::bytes(s.mean(|r| Some(r.host_bytes_peak as f64)))),
             ("Gaussians", &|s| Cell::number(s.mean(|r| Some(r.gaussians as f64)), 0)),
-            ("accuracy", &|s| Cell::text(verdict(s))),
+            ("accuracy", &|s| Cell::text(s.verdict.words())),
         ],
     );
 }
