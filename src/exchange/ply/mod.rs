@@ -111,6 +111,7 @@ impl Default for PlyMeta {
 }
 
 /// Content of a PLY file.
+#[allow(clippy::large_enum_variant)] // one value a file
 #[derive(Debug, Clone, PartialEq)]
 pub enum PlyContent {
     /// A trained scene (the file has `f_dc_0`).
