@@ -194,7 +194,8 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     let output = bench(&["ladder", scene, "--out", out, "--steps", "4", "--page-rows", "16", "--spill", text(&file)]);
     assert!(!output.status.success() && stderr(&output).contains("file"), "{}", stderr(&output));
     let failing = ["--steps", "4", "--image-cache", "1", "--host-mem", "1MiB", "--knobs", "budget", "--seeds", "1"];
-    let args = [&["pareto", scene, "--out", out, "--page-rows", "16", "--strategy", "none"][..], &failing].concat();
+    let args =
+        [&["pareto", scene, "--out", out, "--page-rows", "16", "--strategy", "none", "--json"][..], &failing].concat();
     let records = lines(&args);
     assert!(records[0]["problem"].as_str().is_some_and(|p| p.contains("--host-mem")), "{records:?}");
     assert!(records[1..].iter().all(|r| r["problem"].is_null()) && records.len() > 1, "{records:?}");
