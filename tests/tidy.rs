@@ -67,6 +67,7 @@ const LAYERS: &[(&str, &[&str])] = &[
 /// Files that may hold `unsafe`, each block with its argument.
 const UNSAFE_FILES: &[&str] = &[
     "src/base/eight.rs",
+    "src/base/environment.rs",
     "src/base/simd.rs",
     "src/page/engine/mmap.rs",
     "src/page/engine/registered.rs",

@@ -1,4 +1,4 @@
-//! `gsscale-bench`: measures training and prints lines of JSON. The first argument names the measurement; without a
+//! `gsscale-bench`: measures training and prints the figures. The first argument names the measurement; without a
 //! name it is `run`. Parses, calls, prints. (Measurements of the program's own parts are benchmarks: `benches/`.)
 
 #[path = "bench/compare.rs"]
@@ -19,6 +19,8 @@ mod published_table;
 mod run;
 #[path = "bench/sweep.rs"]
 mod sweep;
+#[path = "bench/table.rs"]
+mod table;
 
 use clap::Parser;
 use gsscale::base::error::InputError;
@@ -35,7 +37,7 @@ use std::process::ExitCode;
 
 /// The measurements, the most used first.
 const HELP: &str = "\
-Measures training, and prints one line of JSON a run.
+Measures training.
 
   gsscale-bench SCENE                  trains a scene (the same as run SCENE)
   gsscale-bench run NAME --data DIR    trains a published scene; prints our figures beside the published figures
@@ -47,6 +49,7 @@ Each command has --help with examples: gsscale-bench run --help, gsscale-bench r
 Published scenes:";
 
 fn main() -> ExitCode {
+    gsscale::base::environment::quiet_wayland();
     let mut arguments: Vec<OsString> = std::env::args_os().collect();
     let name = arguments.get(1).and_then(|a| a.to_str()).map(str::to_string);
     let mut named = |known: &str| {

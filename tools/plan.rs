@@ -145,6 +145,7 @@ struct Row {
 }
 
 fn main() -> ExitCode {
+    gsscale::base::environment::quiet_wayland();
     match start(&parse_command_line()) {
         Ok(text) => {
             gsscale::say!("{text}");

@@ -1,13 +1,16 @@
 //! `gsscale-train`: trains a scene from photos to a PLY. Parses, calls the library, prints.
 
 use clap::Parser;
+use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::{InputError, InputResult};
+use gsscale::base::units::{format_grouped, format_seconds};
 use gsscale::config::command_line::parse_command_line;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
-use gsscale::report::run_files::CONFIG_FILE;
+use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
 use gsscale::train::error::TrainError;
-use gsscale::train::out_folder::{Existing, remedy_of_existing};
+use gsscale::train::out_folder::{Existing, default_out, remedy_of_existing};
+use gsscale::train::progress::Count;
 use gsscale::train::resume::{ResumeRequest, resume};
 use gsscale::train::run::{RunOutcome, RunRequest, run};
 use std::path::{Path, PathBuf};
@@ -15,13 +18,13 @@ use std::process::ExitCode;
 
 const EXAMPLES: &str = "\
 Examples:
-  gsscale-train --demo --out runs/demo              generate a city, train on it, write pictures
+  gsscale-train --demo                              generate a city, train on it, write pictures to runs/demo
   gsscale-train scans/village --out runs/village    a COLMAP scene: images/ and sparse/0/
   gsscale-train scans/village --out runs/quick --steps 7000 --max-resolution 800
   gsscale-train scans/village --out runs/big --max-gaussians 2000000 --config configs/in_core.toml
   gsscale-train scans/village --out runs/gpu --device gpu   on a GPU; --list-devices lists the GPUs
   gsscale-train --resume runs/village               resume a stopped or interrupted run
-  gsscale-train --resume runs/village --steps 60000 more steps for a run with --keep-checkpoint
+  gsscale-train --resume runs/village --steps 60k   more steps
   gsscale-train scans/village --dry-run             print the settings and the memory needed
 
 Results in --out: point_cloud.ply (opens in any splat viewer), renders/test/*.png (render beside photo),
@@ -34,8 +37,8 @@ struct Args {
     /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     #[arg(required_unless_present_any = ["demo", "list_devices", "resume"])]
     scene: Option<PathBuf>,
-    /// Output folder
-    #[arg(long, short, required_unless_present_any = ["dry_run", "list_devices", "resume"])]
+    /// Output folder [default: runs/NAME, with the name of the scene; runs/NAME-2 and so on if that is taken]
+    #[arg(long, short)]
     out: Option<PathBuf>,
     /// Config file; flags override it
     #[arg(long)]
@@ -68,6 +71,7 @@ struct Args {
 }
 
 fn main() -> ExitCode {
+    quiet_wayland();
     let args: Args = parse_command_line();
     if args.list_devices {
         list_devices();
@@ -105,7 +109,11 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
         (file, _) => TrainConfig::of_new_run(file.as_deref(), &args.keys)?,
     };
     config.check()?;
-    let out = args.out.unwrap_or_default();
+    let out = match args.out {
+        Some(out) => out,
+        None if args.dry_run => PathBuf::new(),
+        None => default_out(args.scene.as_deref()),
+    };
     let mut scratch = None;
     let scene = match args.scene {
         Some(scene) => scene,
@@ -157,7 +165,8 @@ fn make_city(scene: &Path, config: &TrainConfig, quiet: bool) -> Result<PathBuf,
         eprintln!("generating a city in {}", scene.display());
     }
     let options = CityOptions { seed: config.seed, overwrite: true, ..CityOptions::default() };
-    write_city(scene, &options, &|_, _| {})?;
+    let shown = Count::new("photos made", options.photos(), quiet);
+    write_city(scene, &options, &|done, _| shown.show(done))?;
     Ok(scene.to_path_buf())
 }
 
@@ -193,12 +202,19 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
             None => String::from("not evaluated"),
         };
         eprintln!(
-            "{} {} steps, {} Gaussians, {:.1} s of training; {test}",
+            "{} {} steps, {} Gaussians, {} of training; {test}",
             if summary.finished { "done:" } else { "stopped after" },
-            summary.steps,
-            summary.gaussians,
-            summary.train_seconds,
+            format_grouped(summary.steps.into()),
+            format_grouped(summary.gaussians),
+            format_seconds(summary.train_seconds),
         );
+        let out = &outcome.out;
+        eprintln!("  Gaussians   {}", out.join(PLY_FILE).display());
+        eprintln!("  report      {}", out.join(REPORT_FILE).display());
+        if summary.finished {
+            let more = summary.steps.saturating_mul(2);
+            eprintln!("  more steps  gsscale-train --resume {} --steps {more}", out.display());
+        }
     }
     ExitCode::from(outcome.exit_code as u8)
 }

@@ -4,6 +4,7 @@
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod eight;
+pub mod environment;
 pub mod error;
 pub mod identity;
 pub mod ids;

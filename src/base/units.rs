@@ -1,4 +1,5 @@
-//! Sizes and times in human notation: `512MiB`, `4GiB`, `2GB`, `1048576`; `45 s`, `12 min`, `3.4 h`.
+//! Sizes, counts and times in human notation: `512MiB`, `4GiB`, `2GB`, `1048576`; `30k`, `1.25M`; `45 s`, `12 min`,
+//! `3.4 h`.
 
 /// Bytes in one MiB.
 pub const MIB: u64 = 1 << 20;
@@ -54,6 +55,60 @@ fn format_scaled(bytes: u64, round: impl Fn(f64) -> f64) -> String {
     }
 }
 
+/// Parses a count: digits, which may be grouped (`30_000`, `30,000`), or a number with `k` or `M` (`30k`, `1.5M`).
+///
+/// # Errors
+/// The text is no whole number from 0 on.
+pub fn parse_count(text: &str) -> Result<u64, String> {
+    let wrong = || format!("'{text}' is not a count; write for example 30000 or 30k");
+    let plain: String = text.trim().chars().filter(|c| !matches!(c, '_' | ',')).collect();
+    let (number, factor) = match plain.char_indices().last() {
+        Some((at, 'k' | 'K')) => (&plain[..at], 1e3),
+        Some((at, 'm' | 'M')) => (&plain[..at], 1e6),
+        _ => return plain.parse().map_err(|_| wrong()),
+    };
+    let is_number = number.chars().all(|c| c.is_ascii_digit() || c == '.');
+    let value = number.parse::<f64>().ok().filter(|_| is_number).ok_or_else(wrong)? * factor;
+    // Below 2^53 every whole number is an f64.
+    if value < 9e15 && value == value.trunc() { Ok(value as u64) } else { Err(wrong()) }
+}
+
+/// As [`parse_count`], for keys of 32 bits.
+///
+/// # Errors
+/// As [`parse_count`], or the count is 2^32 or more.
+pub fn parse_count32(text: &str) -> Result<u32, String> {
+    let too_large = |_| format!("'{text}' is too large; the most is 4,294,967,295");
+    u32::try_from(parse_count(text)?).map_err(too_large)
+}
+
+/// Formats a count with up to three digits and `k` or `M`.
+pub fn format_count(n: u64) -> String {
+    let short = |value: f64, unit: &str| match value {
+        v if v < 9.995 => format!("{v:.2}{unit}"),
+        v if v < 99.95 => format!("{v:.1}{unit}"),
+        v => format!("{v:.0}{unit}"),
+    };
+    match n {
+        0..1000 => n.to_string(),
+        1000..999_500 => short(n as f64 / 1e3, "k"),
+        _ => short(n as f64 / 1e6, "M"),
+    }
+}
+
+/// Formats a whole number with groups of three digits: `149,950`.
+pub fn format_grouped(n: u64) -> String {
+    let digits = n.to_string();
+    let mut out = String::new();
+    for (i, digit) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            out.push(',');
+        }
+        out.push(digit);
+    }
+    out
+}
+
 /// Formats a time with two or three digits and a unit.
 pub fn format_seconds(seconds: f64) -> String {
     const UNITS: [(f64, &str); 4] = [(1.0, "s"), (60.0, "min"), (3600.0, "h"), (86400.0, "d")];
@@ -66,6 +121,21 @@ pub fn format_seconds(seconds: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn counts_parse_and_print() {
+        for (text, want) in [("30000", 30_000), ("30k", 30_000), ("1.5M", 1_500_000), ("30_000", 30_000), ("0", 0)] {
+            assert_eq!(parse_count(text), Ok(want));
+        }
+        for wrong in ["", "k", "-3", "1.2345k", "30 k", "1e3", "nan", "infk", "9999999999M", "30kk", "+5k"] {
+            assert!(parse_count(wrong).is_err(), "{wrong}");
+        }
+        assert_eq!(parse_count32("4,294,967,295"), Ok(u32::MAX));
+        assert!(parse_count32("5000M").is_err_and(|e| e.contains("too large")));
+        let counts = [7, 999, 1000, 15_950, 792_000, 999_600, 1_250_000, 4_294_967_294];
+        assert_eq!(counts.map(format_count), ["7", "999", "1.00k", "15.9k", "792k", "1.00M", "1.25M", "4295M"]);
+        assert_eq!([5, 1234, 1_234_567].map(format_grouped), ["5", "1,234", "1,234,567"]);
+    }
 
     #[test]
     fn sizes_parse_and_print() {

@@ -119,17 +119,6 @@ pub struct CommitInterval {
     total: CommitReport,
 }
 
-impl CommitReport {
-    /// Text for the progress line; empty before the first commit.
-    pub fn words(&self) -> String {
-        if self.commits == 0 {
-            return String::new();
-        }
-        let CommitReport { commits, commit_overhead_percent: percent, commit_loss_seconds: loss, .. } = self;
-        format!(" {commits} commits took {percent:.1} %, a kill costs {loss:.0} s at most")
-    }
-}
-
 impl CommitInterval {
     /// The interval before the first commit.
     pub fn new(every: CommitEvery) -> CommitInterval {

@@ -10,10 +10,11 @@
 use super::choice::{Chosen, Device, LogFormat};
 use super::key::{Class, Key};
 use super::schedule::Schedule;
-use super::values::{ByteSize, Rgb};
+use super::values::{ByteSize, Rgb, Up};
 use crate::appearance::AppearanceMode;
 use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
+use crate::base::units::{parse_count, parse_count32};
 use crate::checkpoint::interval::CommitEvery;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
@@ -107,10 +108,10 @@ config_keys! {
     }
     "Training" {
         /// Total number of steps; --resume can raise it (see --keep-checkpoint)
-        steps: u32 = 30_000 => Length;
+        [value_parser = parse_count32] steps: u32 = 30_000 => Length;
         /// Steps over which the learning rate of positions decays; it is constant afterwards. 0 = --steps. A resumed
         /// run keeps its first value
-        schedule_steps: u32 = 0 => Derived;
+        [value_parser = parse_count32] schedule_steps: u32 = 0 => Derived;
         /// Values of --sh-every, --refine-start, --refine-every, --refine-stop and --means-lr where they are not given:
         /// run-length (by --steps; the classic values from 30,000 steps on) or classic (their defaults below). A
         /// resumed run keeps its values
@@ -177,7 +178,7 @@ config_keys! {
         /// Of --strategy long-axis: share of the Gaussians seen that a round at the cap removes; 0 = none
         recycle: f64 = 0.02 => Numbers;
         /// Most Gaussians; 0 = no cap
-        max_gaussians: u64 = 0 => Numbers;
+        [value_parser = parse_count] max_gaussians: u64 = 0 => Numbers;
         /// Step after which densification rounds begin
         refine_start: u32 = 500 => Numbers;
         /// Step at which densification rounds and opacity resets end
@@ -198,11 +199,11 @@ config_keys! {
     }
     "Output" {
         /// Evaluate on the held-out photos every N steps; 0 = only at the end
-        eval_every: u32 = 0 => Free;
+        [value_parser = parse_count32] eval_every: u32 = 0 => Free;
         /// Write a PLY and keep a named checkpoint (step-N) every N steps; 0 = only a PLY at the end
-        save_every: u32 = 0 => Free;
+        [value_parser = parse_count32] save_every: u32 = 0 => Free;
         /// Write a line of metrics every N steps
-        log_every: u32 = 100 => Free;
+        [value_parser = parse_count32] log_every: u32 = 100 => Free;
         /// Log of metrics: json (metrics.jsonl), or tensorboard (event files as well)
         log: LogFormat = LogFormat::Json => Free;
         /// SSIM to report: same (zero padded, as the 3DGS code), valid or reflect
@@ -212,6 +213,10 @@ config_keys! {
         [alias = "colour-correct"] color_correct: Chosen<ColorCorrect> = Chosen(None) => Free;
         /// Coordinates of the PLY: dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;
+        /// Up in the PLY: auto (from cameras and points), keep (the axes of the dataset) or X,Y,Z (this direction of the
+        /// dataset). The PLY is turned so that up is -y, as viewers show it; training is not. The file
+        /// point_cloud.transform.json leads back to the dataset
+        [allow_hyphen_values = true] up: Up = Up::Auto => Free;
     }
     "Memory and disk" {
         /// Memory limit of the run; 0 = 70 % of the memory available on this machine or in its control group

@@ -2,6 +2,7 @@
 //! config.
 
 use super::file::TrainConfig;
+use super::values::Up;
 use crate::appearance::AppearanceMode;
 use crate::base::simd::SimdPath;
 use crate::dataset::loader::LoadOptions;
@@ -64,6 +65,9 @@ pub struct RunOptions {
     pub appearance: AppearanceMode,
     /// Coordinates of PLY files.
     pub export_frame: ExportFrame,
+    /// The direction of the dataset that is up in PLY files; `None` where they keep the axes of the dataset, and while
+    /// `--up auto` is unresolved.
+    pub up: Option<[f64; 3]>,
     /// Steps between evaluations; 0 = only at the end.
     pub eval_every: u32,
     /// Steps between PLY files; 0 = only at the end.
@@ -114,6 +118,10 @@ impl RunOptions {
             color_correct: config.color_correct.0,
             appearance: config.appearance,
             export_frame: config.export_frame,
+            up: match config.up {
+                Up::Along(up) => Some(up),
+                Up::Auto | Up::Keep => None,
+            },
             eval_every: config.eval_every,
             save_every: config.save_every,
             log_every: config.log_every,

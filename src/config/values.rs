@@ -1,4 +1,4 @@
-//! Values of keys that are no single word or number: byte sizes and colours.
+//! Values of keys that are no single word or number: byte sizes, colours, and which way is up.
 //!
 //! Invariant: a value that is written reads back the same.
 
@@ -45,6 +45,72 @@ impl std::str::FromStr for Rgb {
         match values.as_deref() {
             Ok(&[r, g, b]) => Ok(Rgb([r, g, b])),
             _ => Err(format!("'{text}' is not a colour; write R,G,B with numbers in 0..1")),
+        }
+    }
+}
+
+/// Which way is up in results: the value of `--up`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Up {
+    /// As the cameras and the points say.
+    Auto,
+    /// Results keep the axes of the dataset.
+    Keep,
+    /// This direction of the dataset; finite and not zero.
+    Along([f64; 3]),
+}
+
+impl std::str::FromStr for Up {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        let unknown = || format!("'{text}' is not a direction; write auto, keep or X,Y,Z, such as 0,0,1");
+        match text {
+            "auto" => return Ok(Up::Auto),
+            "keep" => return Ok(Up::Keep),
+            _ => {}
+        }
+        let values: Result<Vec<f64>, _> = text.split(',').map(|v| v.trim().parse::<f64>()).collect();
+        let Ok(&[x, y, z]) = values.as_deref() else { return Err(unknown()) };
+        let is_direction = [x, y, z].iter().all(|v| v.is_finite()) && [x, y, z] != [0.0; 3];
+        if is_direction { Ok(Up::Along([x, y, z])) } else { Err(unknown()) }
+    }
+}
+
+impl std::fmt::Display for Up {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Up::Auto => f.write_str("auto"),
+            Up::Keep => f.write_str("keep"),
+            // `{}` prints the shortest decimal that reads back as the same f64.
+            Up::Along([x, y, z]) => write!(f, "{x},{y},{z}"),
+        }
+    }
+}
+
+impl Serialize for Up {
+    fn serialize<S: serde::Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
+        s.collect_str(self)
+    }
+}
+
+impl<'de> Deserialize<'de> for Up {
+    fn deserialize<D: serde::Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
+        String::deserialize(d)?.parse().map_err(serde::de::Error::custom)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn up_is_written_as_it_is_read() {
+        for up in [Up::Auto, Up::Keep, Up::Along([0.1 + 0.2, -1e-20, 3e9])] {
+            assert_eq!(up.to_string().parse(), Ok(up));
+        }
+        assert_eq!(" 0, 0 ,1".parse(), Ok(Up::Along([0.0, 0.0, 1.0])));
+        for wrong in ["", "up", "0,0,0", "1,2", "1,2,3,4", "nan,0,1", "inf,0,0"] {
+            assert!(wrong.parse::<Up>().is_err_and(|e| e.contains("X,Y,Z")), "{wrong}");
         }
     }
 }

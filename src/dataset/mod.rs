@@ -23,3 +23,4 @@ pub mod synthetic;
 pub mod target_cache;
 pub mod transforms;
 pub mod undistort;
+pub mod up;

@@ -36,6 +36,8 @@ impl Spread {
 pub enum Verdict {
     /// The setting is the base.
     Base,
+    /// The same bits and the same traffic as the base for every common seed: the setting changed nothing here.
+    NoEffect,
     /// The same bits as the base for every common seed.
     SameBits,
     /// PSNR and SSIM are at least the base's means over the common seeds, minus the base's spread over all its seeds.
@@ -47,9 +49,21 @@ pub enum Verdict {
 }
 
 impl Verdict {
+    /// The verdict for people; empty where it is not known.
+    pub fn words(self) -> &'static str {
+        match self {
+            Verdict::Base => "the base",
+            Verdict::NoEffect => "changed nothing here",
+            Verdict::SameBits => "the same bits",
+            Verdict::WithinSpread => "no cost beyond the spread",
+            Verdict::Costs => "costs",
+            Verdict::Unknown => "",
+        }
+    }
+
     /// Whether the setting loses no accuracy beyond the spread.
     pub fn is_free(self) -> bool {
-        matches!(self, Verdict::Base | Verdict::SameBits | Verdict::WithinSpread)
+        matches!(self, Verdict::Base | Verdict::NoEffect | Verdict::SameBits | Verdict::WithinSpread)
     }
 }
 
@@ -110,9 +124,12 @@ fn judge(setting: &Setting, base: &Setting) -> Verdict {
         return Verdict::Base;
     }
     let of_seed = |run: &RunRecord| base.runs.iter().find(|b| b.seed == run.seed);
-    let mut pairs = setting.runs.iter().filter_map(|run| Some((run, of_seed(run)?))).peekable();
-    if pairs.peek().is_some() && pairs.all(|(run, base)| !run.ply.is_empty() && run.ply == base.ply) {
-        return Verdict::SameBits;
+    let pairs: Vec<_> = setting.runs.iter().filter_map(|run| Some((run, of_seed(run)?))).collect();
+    if !pairs.is_empty() && pairs.iter().all(|(run, base)| !run.ply.is_empty() && run.ply == base.ply) {
+        // Times always differ a little; these figures differ where a setting of memory or drive does something.
+        let traffic = |r: &RunRecord| (r.bytes_read, r.bytes_written, r.frames, r.pages, r.steps);
+        let is_idle = pairs.iter().all(|(run, base)| traffic(run) == traffic(base));
+        return if is_idle { Verdict::NoEffect } else { Verdict::SameBits };
     }
     if base.runs.len() < 2 || against(setting, base, |r| r.psnr).is_none() {
         return Verdict::Unknown;
@@ -188,23 +205,25 @@ mod tests {
             run("base", 2, 26.2, 0.82, "p2"),
             run("fine", 1, 25.81, 0.781, "x"),
             run("dull", 1, 26.5, 0.77, "x"),
-            run("paged", 1, 26.0, 0.80, "p1"),
+            RunRecord { frames: 4, ..run("paged", 1, 26.0, 0.80, "p1") },
             run("paged", 2, 26.2, 0.82, "p2"),
             run("mixed", 1, 26.0, 0.80, "p1"),
             run("mixed", 2, 20.0, 0.82, "x"),
+            // A setting that never comes into effect, such as a cap that is not reached.
+            run("idle", 1, 26.0, 0.80, "p1"),
         ];
         runs.push(RunRecord { problem: Some("died".into()), ..run("base", 3, 1.0, 0.1, "") });
         let verdicts = |runs: &[RunRecord]| -> Vec<(String, Verdict)> {
             settings(runs).into_iter().map(|s| (s.knob, s.verdict)).collect()
         };
-        let names = ["base", "slow", "unlucky", "fine", "dull", "paged", "mixed"].map(str::to_string);
+        let names = ["base", "slow", "unlucky", "fine", "dull", "paged", "mixed", "idle"].map(str::to_string);
         // The spread of the base is 0.2 dB and .02; seed 1 has 26.0 dB and .80, seed 2 has 26.2 and .82.
-        use Verdict::{Base, Costs, SameBits, Unknown, WithinSpread};
-        let want = [Base, Costs, Costs, WithinSpread, Costs, SameBits, Costs];
+        use Verdict::{Base, Costs, NoEffect, SameBits, Unknown, WithinSpread};
+        let want = [Base, Costs, Costs, WithinSpread, Costs, SameBits, Costs, NoEffect];
         assert_eq!(verdicts(&runs), names.clone().into_iter().zip(want).collect::<Vec<_>>());
         // With one seed of the base, only equal bits give a verdict.
         runs.remove(3);
-        let want = [Base, Unknown, Unknown, Unknown, Unknown, SameBits, SameBits];
+        let want = [Base, Unknown, Unknown, Unknown, Unknown, SameBits, NoEffect, NoEffect];
         assert_eq!(verdicts(&runs), names.into_iter().zip(want).collect::<Vec<_>>());
         let paged = &settings(&runs)[5];
         assert_eq!(paged.psnr.map(|s| (s.low, s.high)), Some((26.0, 26.2)));

@@ -13,6 +13,8 @@ pub const EVENTS_FOLDER: &str = "tensorboard";
 pub const SUMMARY_FILE: &str = "summary.json";
 /// The Gaussians at the end.
 pub const PLY_FILE: &str = "point_cloud.ply";
+/// The way from the coordinates of the Gaussians to those of the dataset, and back.
+pub const TRANSFORM_FILE: &str = "point_cloud.transform.json";
 /// The page for people.
 pub const REPORT_FILE: &str = "report.html";
 /// The pages seen from above, for the report: a JSON list of [`super::page_map::PageTile`].
@@ -53,12 +55,13 @@ pub enum Tells {
 }
 
 /// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
-pub const RUN_FILES: [(RunFile, Tells); 12] = [
+pub const RUN_FILES: [(RunFile, Tells); 13] = [
     (RunFile::File(CONFIG_FILE), Tells::Start),
     (RunFile::File(METRICS_FILE), Tells::Steps),
     (RunFile::Events(EVENTS_FOLDER), Tells::Steps),
     (RunFile::File(SUMMARY_FILE), Tells::Result),
     (RunFile::File(PLY_FILE), Tells::Result),
+    (RunFile::File(TRANSFORM_FILE), Tells::Result),
     (RunFile::File(REPORT_FILE), Tells::Result),
     (RunFile::File(PAGES_FILE), Tells::Result),
     (RunFile::File(APPEARANCE_FILE), Tells::Result),

@@ -24,11 +24,11 @@ const POINTS_MAX: usize = 600;
 const TEXT_BYTES_MAX: u64 = 256 << 20;
 const MIB: f64 = (1 << 20) as f64;
 
-/// The report of the run in `folder` as HTML.
+/// The report of the run in `folder` as HTML. `progress(done, all)` is called after each of its pictures.
 ///
 /// # Errors
 /// The folder holds no metrics, or a picture cannot be decoded.
-pub fn run_report(folder: &Path) -> InputResult<String> {
+pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<String> {
     let metrics = read_metrics(folder)?;
     let summary = read_json(&folder.join(SUMMARY_FILE)).unwrap_or(Value::Null);
     let scene = summary["scene"].as_str().unwrap_or("").to_string();
@@ -44,7 +44,7 @@ pub fn run_report(folder: &Path) -> InputResult<String> {
     }
     add_appearance(&mut page, &folder.join(APPEARANCE_FILE));
     add_page_map(&mut page, &folder.join(PAGES_FILE));
-    add_views(&mut page, &folder.join(PICTURES_FOLDER))?;
+    add_views(&mut page, &folder.join(PICTURES_FOLDER), progress)?;
     page.heading("Config");
     if let Some(text) = read_text(&folder.join(CONFIG_FILE)) {
         page.folded("config.toml, every key as it was used", &text);
@@ -56,12 +56,12 @@ pub fn run_report(folder: &Path) -> InputResult<String> {
     Ok(page.finish())
 }
 
-/// Writes the report of the run in `folder` into the folder; returns its path.
+/// Writes the report of the run in `folder` into the folder; returns its path. `progress` as for [`run_report`].
 ///
 /// # Errors
 /// As [`run_report`], or the folder cannot be written.
-pub fn write_run_report(folder: &Path) -> InputResult<PathBuf> {
-    let html = run_report(folder)?;
+pub fn write_run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<PathBuf> {
+    let html = run_report(folder, progress)?;
     let path = folder.join(REPORT_FILE);
     write_whole(&path, html.as_bytes())?;
     Ok(path)
@@ -124,7 +124,7 @@ fn tiles(summary: &Value, metrics: &[Value]) -> Vec<(String, &'static str)> {
     if let Some(n) = number("gaussians") {
         tiles.push((short(n), "Gaussians"));
     }
-    if let Some(steps) = summary["steps"].as_f64().or(last["step"].as_f64().map(|s| s + 1.0)) {
+    if let Some(steps) = summary["steps"].as_f64().or(last["step"].as_f64()) {
         tiles.push((short(steps), "steps"));
     }
     if let Some(seconds) = summary["train_seconds"].as_f64().or(last["seconds"].as_f64()) {
@@ -239,7 +239,7 @@ fn add_page_map(page: &mut Page, path: &Path) {
     page.charts(&[(svg, caption.to_string())]);
 }
 
-fn add_views(page: &mut Page, folder: &Path) -> InputResult<()> {
+fn add_views(page: &mut Page, folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<()> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
     let mut files: Vec<PathBuf> =
         entries.flatten().map(|e| e.path()).filter(|p| p.extension().is_some_and(|e| e == "png")).collect();
@@ -258,6 +258,7 @@ fn add_views(page: &mut Page, folder: &Path) -> InputResult<()> {
         let name = file.file_stem().unwrap_or_default().to_string_lossy();
         let sides = [("render", pictures.render.as_str()), ("photo", &pictures.photo)];
         sliders.push(slider(&name, sides, ("difference", &pictures.difference)));
+        progress(sliders.len(), files.len().div_ceil(stride));
     }
     page.views(&sliders);
     Ok(())

@@ -73,7 +73,8 @@ fn tiles(settings: &[Setting]) -> Vec<(String, &'static str)> {
             tiles.push((format!("{:.3} dB", psnr.width()), "its spread over seeds"));
         }
     }
-    let free = settings.iter().filter(|s| s.verdict.is_free() && s.verdict != Verdict::Base).count();
+    let is_counted = |s: &&Setting| s.verdict.is_free() && !matches!(s.verdict, Verdict::Base | Verdict::NoEffect);
+    let free = settings.iter().filter(is_counted).count();
     tiles.push((free.to_string(), "settings that cost no accuracy"));
     tiles
 }
@@ -158,13 +159,6 @@ fn add_table(page: &mut Page, settings: &[Setting]) {
         against(s, base, |r| r.psnr)
     };
     let frames = |s: &Setting| s.runs.last().map(|r| format!("{} of {}", r.frames, r.pages));
-    let verdict = |s: &Setting| match s.verdict {
-        Verdict::Base => "the base",
-        Verdict::SameBits => "the same bits",
-        Verdict::WithinSpread => "no cost beyond the spread",
-        Verdict::Costs => "costs",
-        Verdict::Unknown => "",
-    };
     page.table(
         settings,
         &[
@@ -182,7 +176,7 @@ fn add_table(page: &mut Page, settings: &[Setting]) {
             ("written", &|s| Cell::bytes(s.mean(|r| Some(r.bytes_written as f64)))),
             ("peak", &|s| Cell::bytes(s.mean(|r| Some(r.host_bytes_peak as f64)))),
             ("Gaussians", &|s| Cell::number(s.mean(|r| Some(r.gaussians as f64)), 0)),
-            ("accuracy", &|s| Cell::text(verdict(s))),
+            ("accuracy", &|s| Cell::text(s.verdict.words())),
         ],
     );
 }

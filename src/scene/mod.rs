@@ -13,6 +13,7 @@ pub mod page_meta;
 pub mod page_split;
 pub mod partition;
 pub mod point_box;
+pub mod rotation;
 pub mod rows;
 pub mod select;
 pub mod sightings;

@@ -9,6 +9,7 @@ use super::machine;
 use super::memory::{check_photos_fit, host_budget};
 use super::pages::PagedScene;
 use super::prepare::ply_warnings;
+use super::progress::Count;
 use super::report::{ColorCorrected, HalfFitted, TestMetrics, json_psnr};
 use super::view::draw;
 use super::working_set::WorkingSet;
@@ -49,6 +50,8 @@ pub struct EvalRequest<'a> {
     pub color_correct: Option<ColorCorrect>,
     /// What is fitted to the left half of each photo; off for no such figures.
     pub appearance: AppearanceMode,
+    /// Called with the number of views done, after each.
+    pub progress: &'a dyn Fn(u32),
 }
 
 /// Evaluates the scene after `now` steps on the requested views; `working` is scratch. Fully masked views have no
@@ -88,6 +91,7 @@ pub fn evaluate(
         if let Some(folder) = request.pictures {
             write_pair(&picture_path(folder, dataset, view), image, &target)?;
         }
+        (request.progress)(i as u32 + 1);
     }
     if psnrs.is_empty() {
         return Ok(None);
@@ -218,6 +222,7 @@ pub fn evaluate_ply(
     drop(columns);
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let views = dataset.test_views();
+    let shown = Count::new("views compared", views.len() as u32, false);
     let of_lpips = lpips.as_ref().map(|(lpips, range)| (lpips, *range));
     let request = EvalRequest {
         views: &views,
@@ -226,6 +231,7 @@ pub fn evaluate_ply(
         lpips: of_lpips,
         color_correct: run.color_correct,
         appearance: run.appearance,
+        progress: &|done| shown.show(done),
     };
     let (mut renderer, word) = machine::renderer(config)?;
     if let Some(word) = word {

@@ -37,6 +37,9 @@ pub struct Resolved {
     pub scale: f64,
     /// Scene scale, dataset units.
     pub scene_scale: f64,
+    /// The run made the folder of its spill directory, and so removes it at its end.
+    #[serde(default)]
+    pub made_spill_dir: bool,
 }
 
 /// Writes config.toml: every key, then the facts.

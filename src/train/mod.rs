@@ -34,6 +34,7 @@ mod gaussian_pages;
 mod largest_view;
 pub mod machine;
 pub mod memory;
+mod more_steps;
 pub mod out_folder;
 mod outgrown;
 mod ownership;

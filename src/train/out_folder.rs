@@ -13,7 +13,7 @@ use crate::config::file::TrainConfig;
 use crate::config::residence::checkpoint_folder;
 use crate::exchange::tensorboard::is_event_file;
 use crate::page::folder::spill_dir::SpillDir;
-use crate::report::run_files::{CONFIG_FILE, RUN_FILES, RunFile, Tells, is_saved_ply};
+use crate::report::run_files::{CONFIG_FILE, PLY_FILE, RUN_FILES, RunFile, Tells, is_saved_ply};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 
@@ -56,6 +56,21 @@ pub fn is_empty(out: &Path) -> bool {
     std::fs::read_dir(out).is_ok_and(|mut entries| entries.all(|e| e.is_ok_and(|e| e.file_name() == LOCK)))
 }
 
+/// The output folder where none is named: `runs/NAME` in the working folder, NAME that of the scene's folder, or `demo`
+/// without a scene; with `-2`, `-3` and so on where that is taken.
+pub fn default_out(scene: Option<&Path>) -> PathBuf {
+    let folder = |scene: &Path| {
+        // A name such as `.` or `scans/..` is no name; one that does not exist is refused later.
+        let whole = scene.canonicalize().unwrap_or_else(|_| scene.to_path_buf());
+        let folder = if whole.is_file() { folder_of(&whole).to_path_buf() } else { whole };
+        folder.file_name().map_or_else(|| "scene".into(), |name| name.to_string_lossy().into_owned())
+    };
+    let name = scene.map_or_else(|| "demo".to_string(), folder);
+    let numbered = |n: u32| Path::new("runs").join(if n == 1 { name.clone() } else { format!("{name}-{n}") });
+    let is_free = |out: &PathBuf| !out.exists() || is_empty(out);
+    (1..=u32::MAX).map(numbered).find(is_free).unwrap_or_else(|| numbered(1))
+}
+
 /// Refuses an output folder in which a run may not begin.
 ///
 /// # Errors
@@ -83,22 +98,31 @@ fn check_new(out: &Path) -> InputResult<()> {
     Err(InputError::new(out, "exists already", remedy_of_existing(out)))
 }
 
-/// The remedy for an existing output folder: resume its run, or start over.
+/// The remedy for an existing output folder: resume its run, or another folder. `--overwrite` is proposed only where there
+/// is no result to lose.
 pub fn remedy_of_existing(out: &Path) -> String {
-    let start_over = "choose another --out, or replace it with --overwrite";
-    let Ok(config) = TrainConfig::read(&out.join(CONFIG_FILE)) else { return start_over.to_string() };
-    let residence = config.residence();
-    if !SpillDir::exists_in(&residence.checkpoint_folder(out)) {
-        return start_over.to_string();
-    }
-    let over = match residence.spill_dir() {
-        None => "--overwrite".to_string(),
-        Some(spill_dir) => format!("--overwrite after removing {}", spill_dir.display()),
+    let Ok(config) = TrainConfig::read(&out.join(CONFIG_FILE)) else {
+        return "choose another --out; --overwrite replaces the results of a run".to_string();
     };
-    format!(
-        "resume its run with gsscale-train --resume {}; or choose another --out, or start over with {over}",
-        out.display()
-    )
+    let residence = config.residence();
+    let has_result = out.join(PLY_FILE).exists();
+    let shown = out.display();
+    match SpillDir::exists_in(&residence.checkpoint_folder(out)) {
+        false if has_result => {
+            format!("choose another --out, or give its run more steps: gsscale-train --resume {shown} --steps N")
+        }
+        false => "choose another --out, or replace it with --overwrite".to_string(),
+        true if has_result => format!("resume its run with gsscale-train --resume {shown}, or choose another --out"),
+        true => {
+            let over = match residence.spill_dir() {
+                None => "--overwrite".to_string(),
+                Some(spill_dir) => format!("--overwrite after removing {}", spill_dir.display()),
+            };
+            format!(
+                "resume its run with gsscale-train --resume {shown}; or choose another --out, or start over with {over}"
+            )
+        }
+    }
 }
 
 /// Creates the folder durably.

@@ -1,8 +1,38 @@
-//! Progress display: a bar on a terminal, lines elsewhere, nothing with `--quiet`.
+//! Progress display on standard error: bars on a terminal, lines elsewhere, nothing with `--quiet`.
+//!
+//! Invariants: 1. a line, and a bar on a terminal of 80 columns, fits 80 columns for any number of steps and Gaussians;
+//! 2. rate and time left follow from the last half minute, since steps become slower while a scene grows.
 
+use crate::base::units::{format_count, format_seconds};
 use indicatif::{ProgressBar, ProgressStyle};
+use std::collections::VecDeque;
 use std::io::IsTerminal;
-use std::time::Instant;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+/// Columns of a line.
+const COLUMNS: usize = 80;
+/// Columns of the text beside `done/total`: see the test.
+const WORDS: usize = 54;
+/// Time between two lines without a terminal: logs stay small.
+const LINE_EVERY: Duration = Duration::from_secs(10);
+/// Time between two changes of a bar's text.
+const BAR_EVERY: Duration = Duration::from_millis(100);
+/// The rate is that of this time.
+const RECENT: f64 = 30.0;
+/// Least time between two samples of the rate.
+const SAMPLE_EVERY: f64 = 1.0;
+/// Weight of the last view in the shown PSNR, which varies by decibels from view to view.
+const PSNR_WEIGHT: f64 = 0.05;
+
+/// What a step shows.
+#[derive(Debug, Clone, Copy)]
+pub struct Shown {
+    /// Gaussians in the scene.
+    pub gaussians: u64,
+    /// PSNR of the step's view, dB.
+    pub psnr: f64,
+}
 
 /// Progress of a loop over steps.
 pub struct Progress {
@@ -11,47 +41,64 @@ pub struct Progress {
     /// Steps done before this process.
     first: u32,
     total: u32,
+    rate: RecentRate,
     started: Instant,
-    last_line: Instant,
+    last_shown: Instant,
+    /// Running mean of the views' PSNR.
+    psnr: Option<f64>,
 }
 
 impl Progress {
     /// A display for `total` steps.
     pub fn new(total: u32, quiet: bool) -> Self {
         let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
-            let bar = ProgressBar::new(u64::from(total));
-            let template = "{bar:32.cyan/blue} {pos}/{len} {per_sec} {msg} {eta} left";
-            bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
-            bar
+            let width = COLUMNS.saturating_sub(WORDS + 2 * digits(total) + 4).max(4);
+            new_bar(u64::from(total), &format!("{{bar:{width}.cyan/blue}} {{pos}}/{{len}}  {{msg}}"))
         });
         let now = Instant::now();
-        Progress { bar, quiet, first: 0, total, started: now, last_line: now }
+        let rate = RecentRate::default();
+        Progress { bar, quiet, first: 0, total, rate, started: now, last_shown: now, psnr: None }
     }
 
     /// The display of a run resumed after `first` steps; these do not count in the rate.
     pub fn after(self, first: u32) -> Self {
         if let Some(bar) = &self.bar {
             bar.set_position(u64::from(first));
-            bar.reset_eta();
         }
         Progress { first, ..self }
     }
 
-    /// Shows that `done` steps are done. `message` is called only if it is shown.
-    pub fn step(&mut self, done: u32, message: impl FnOnce() -> String) {
-        if let Some(bar) = &self.bar {
-            bar.set_position(u64::from(done));
-            if self.last_line.elapsed().as_millis() > 100 {
-                bar.set_message(message());
-                self.last_line = Instant::now();
-            }
+    /// Shows that `done` steps are done.
+    pub fn step(&mut self, done: u32, shown: Shown) {
+        let psnr = self.psnr.map_or(shown.psnr, |mean| mean + PSNR_WEIGHT * (shown.psnr - mean));
+        self.psnr = Some(psnr);
+        if self.quiet {
             return;
         }
-        // Without a terminal, one line every ten seconds keeps logs small.
-        if !self.quiet && (self.last_line.elapsed().as_secs() >= 10 || done == self.total) {
-            self.last_line = Instant::now();
-            let [rate, left] = rate(self.first, done, self.total, self.started.elapsed().as_secs_f64());
-            eprintln!("step {done}/{}  {rate:.1}/s  {}  {left:.0} s left", self.total, message());
+        let steps = done.saturating_sub(self.first);
+        let rate = self.rate.after(steps, self.started.elapsed().as_secs_f64());
+        let every = if self.bar.is_some() { BAR_EVERY } else { LINE_EVERY };
+        let is_last = done == self.total;
+        if let Some(bar) = &self.bar {
+            bar.set_position(u64::from(done));
+        }
+        if self.last_shown.elapsed() < every && !is_last {
+            return;
+        }
+        self.last_shown = Instant::now();
+        let words = words(Shown { psnr, ..shown }, rate, self.total.saturating_sub(done));
+        match &self.bar {
+            Some(bar) => bar.set_message(words),
+            None => eprintln!("step {done}/{}  {words}", self.total),
+        }
+    }
+
+    /// Prints a line above the bar.
+    pub fn say(&self, line: &str) {
+        match &self.bar {
+            _ if self.quiet => {}
+            Some(bar) => bar.println(line),
+            None => eprintln!("{line}"),
         }
     }
 
@@ -63,10 +110,92 @@ impl Progress {
     }
 }
 
-/// Steps per second of this process, and estimated seconds left.
-fn rate(first: u32, done: u32, total: u32, seconds: f64) -> [f64; 2] {
-    let rate = f64::from(done.saturating_sub(first)) / seconds.max(1e-9);
-    [rate, f64::from(total.saturating_sub(done)) / rate.max(1e-9)]
+fn new_bar(total: u64, template: &str) -> ProgressBar {
+    let bar = ProgressBar::new(total);
+    bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
+    bar
+}
+
+fn digits(n: u32) -> usize {
+    n.checked_ilog10().unwrap_or(0) as usize + 1
+}
+
+/// `1.25M Gaussians  PSNR 24.31  103/s  12 min left`.
+fn words(shown: Shown, rate: f64, steps_left: u32) -> String {
+    let rate_text = if rate < 9.95 { format!("{rate:.1}") } else { format!("{rate:.0}") };
+    let left = match steps_left {
+        0 => "0 s".to_string(),
+        _ if rate <= 0.0 => "unknown time".to_string(),
+        steps => format_seconds((f64::from(steps) / rate).min(99.0 * 86400.0)),
+    };
+    let gaussians = format_count(shown.gaussians);
+    format!("{gaussians} Gaussians  PSNR {:.2}  {rate_text}/s  {left} left", shown.psnr)
+}
+
+/// Steps per second over the last [`RECENT`] seconds.
+#[derive(Debug, Default)]
+struct RecentRate {
+    /// (seconds, steps), oldest first.
+    samples: VecDeque<(f64, u32)>,
+}
+
+impl RecentRate {
+    /// The rate when `steps` are done after `seconds`.
+    fn after(&mut self, steps: u32, seconds: f64) -> f64 {
+        if self.samples.is_empty() {
+            self.samples.push_back((0.0, 0));
+        }
+        if self.samples.back().is_some_and(|last| seconds - last.0 >= SAMPLE_EVERY) {
+            self.samples.push_back((seconds, steps));
+        }
+        // The oldest sample stays as long as the next one is not old enough.
+        while self.samples.get(1).is_some_and(|next| seconds - next.0 >= RECENT) {
+            self.samples.pop_front();
+        }
+        let (then, before) = self.samples.front().copied().unwrap_or_default();
+        f64::from(steps.saturating_sub(before)) / (seconds - then).max(1e-9)
+    }
+}
+
+/// Progress of another task: photos, views. May be shown from any thread.
+pub struct Count {
+    bar: Option<ProgressBar>,
+    quiet: bool,
+    what: &'static str,
+    total: u32,
+    last_line: Mutex<Instant>,
+}
+
+impl Count {
+    /// A display for `total` parts, called `what` (`photos made`).
+    pub fn new(what: &'static str, total: u32, quiet: bool) -> Count {
+        let template = format!("{{bar:32.cyan/blue}} {{pos}}/{{len}} {what}  {{eta}} left");
+        let bar =
+            (!quiet && total > 0 && std::io::stderr().is_terminal()).then(|| new_bar(u64::from(total), &template));
+        Count { bar, quiet, what, total, last_line: Mutex::new(Instant::now()) }
+    }
+
+    /// Shows that `done` parts are done.
+    pub fn show(&self, done: u32) {
+        if let Some(bar) = &self.bar {
+            bar.set_position(u64::from(done));
+            return;
+        }
+        // A thread that panicked while it held the time left a valid time.
+        let mut last = self.last_line.lock().unwrap_or_else(PoisonError::into_inner);
+        if !self.quiet && last.elapsed() >= LINE_EVERY {
+            *last = Instant::now();
+            eprintln!("{done}/{} {}", self.total, self.what);
+        }
+    }
+}
+
+impl Drop for Count {
+    fn drop(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
 }
 
 #[cfg(test)]
@@ -74,9 +203,41 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_rate_is_the_recent_one() {
+        let mut rate = RecentRate::default();
+        let mut last = 0.0;
+        // 100 steps a second for a minute, then 10.
+        for second in 1..=60 {
+            last = rate.after(100 * second, f64::from(second));
+        }
+        assert_eq!(last, 100.0);
+        for second in 1..=40 {
+            last = rate.after(6000 + 10 * second, 60.0 + f64::from(second));
+        }
+        assert_eq!(last, 10.0, "the fast minute is over");
+        assert_eq!(RecentRate::default().after(5, 0.5), 10.0);
+    }
+
+    #[test]
+    fn every_line_fits_eighty_columns() {
+        for total in [1, 30_000, 10_000_000] {
+            for gaussians in [0, 999, 1_250_000, 4_294_967_294] {
+                for (rate, psnr) in [(0.0, 0.0), (0.01, 24.31), (103.4, 100.0), (99_999.0, 9.5)] {
+                    for left in [0, 1, total] {
+                        let words = words(Shown { gaussians, psnr }, rate, left);
+                        assert!(words.len() <= WORDS, "{words}");
+                        let line = format!("step {total}/{total}  {words}");
+                        assert!(line.len() <= COLUMNS, "{line}");
+                    }
+                }
+            }
+        }
+        let words = words(Shown { gaussians: 1_250_000, psnr: 24.312 }, 41.7, 30_000);
+        assert_eq!(words, "1.25M Gaussians  PSNR 24.31  42/s  12 min left");
+    }
+
+    #[test]
     fn steps_of_earlier_lives_make_no_run_faster() {
-        assert_eq!(rate(0, 100, 300, 10.0), [10.0, 20.0]);
-        assert_eq!(rate(900, 1000, 1200, 10.0), [10.0, 20.0]);
         let after = Progress::new(1200, true).after(900);
         assert_eq!((after.first, after.total), (900, 1200));
     }

@@ -5,7 +5,7 @@
 
 use crate::appearance::AppearanceMode;
 use crate::base::error::{InputError, InputResult};
-use crate::base::units::format_bytes;
+use crate::base::machine::process_cpu_seconds;
 use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitReport;
 use crate::exchange::tensorboard::EventFile;
@@ -14,7 +14,7 @@ use crate::paging::stats::PagerStats;
 use crate::render::color_correct::ColorCorrect;
 use serde::{Deserialize, Serialize};
 use std::fs::{File, OpenOptions};
-use std::io::{BufRead, BufReader, BufWriter, Write};
+use std::io::{BufRead, BufReader, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 /// PSNR of a perfect image.
@@ -37,22 +37,12 @@ impl TierTraffic {
     pub fn of(pager: &Pager) -> TierTraffic {
         TierTraffic { stats: pager.stats(), frames: pager.frames() as u64, pages: pager.index().len() as u64 }
     }
-
-    /// Text for the progress line; empty before the first read or write.
-    pub fn words(&self) -> String {
-        let PagerStats { bytes_read, bytes_written, stall_seconds, .. } = self.stats;
-        if bytes_read + bytes_written == 0 {
-            return String::new();
-        }
-        let (read, written) = (format_bytes(bytes_read), format_bytes(bytes_written));
-        format!(" read {read} written {written} waited {stall_seconds:.1} s")
-    }
 }
 
 /// One logged step.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct StepLine {
-    /// 0-based step.
+    /// Steps done.
     pub step: u32,
     /// Loss of the step's view; the largest f64 when it was not finite and the step was skipped.
     pub loss: f64,
@@ -62,6 +52,10 @@ pub struct StepLine {
     pub gaussians: u64,
     /// Seconds of training so far.
     pub seconds: f64,
+    /// CPU seconds of training so far, all threads, over all processes of the run; absent if the system does not report
+    /// them.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub train_cpu_seconds: Option<f64>,
     /// Largest resident size so far, bytes.
     pub host_bytes_peak: u64,
     /// Bytes that this step sent to the device; 0 on the CPU.
@@ -129,11 +123,13 @@ impl TestMetrics {
     }
 }
 
-/// Costs of the steps of this process (after a resume, of the steps since then).
+/// Costs of the steps: CPU seconds of the whole run, the rest of this process (after a resume, of the steps since then).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct StepCosts {
-    /// CPU seconds of all threads during the steps; absent if the system does not report them.
+    /// CPU seconds of all threads during the steps, over all processes of the run; absent if the system does not report
+    /// them. Those of an earlier process follow from its last line of metrics, in proportion to the seconds of training
+    /// up to its last commit.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub train_cpu_seconds: Option<f64>,
     /// Bytes read from the drive by the steps.
@@ -195,6 +191,18 @@ pub struct MetricsLog {
     file: BufWriter<File>,
     /// The TensorBoard file, if requested.
     events: Option<EventFile>,
+    /// The last line that stands in the file.
+    last: Option<StepLine>,
+    cpu: CpuClock,
+}
+
+/// CPU seconds of a run over its processes.
+#[derive(Debug, Clone, Copy, Default)]
+struct CpuClock {
+    /// Seconds of earlier processes; `None` if they are not known.
+    before: Option<f64>,
+    /// The reading of this process at the start of its steps.
+    start: Option<f64>,
 }
 
 impl MetricsLog {
@@ -204,7 +212,27 @@ impl MetricsLog {
     /// The file cannot be created.
     pub fn create(path: &Path) -> InputResult<Self> {
         let file = File::create(path).map_err(|e| InputError::io(path, "creating the metrics file", &e))?;
-        Ok(MetricsLog { path: path.to_path_buf(), file: BufWriter::new(file), events: None })
+        Ok(MetricsLog::of(path, file, None))
+    }
+
+    fn of(path: &Path, file: File, last: Option<StepLine>) -> MetricsLog {
+        let (path, file) = (path.to_path_buf(), BufWriter::new(file));
+        MetricsLog { path, file, events: None, last, cpu: CpuClock::default() }
+    }
+
+    /// Starts the clock of the CPU seconds of this process, when `train_seconds` of training are done.
+    pub fn start_clock(&mut self, train_seconds: f64) {
+        let of_line = |line: &StepLine| {
+            // The steps between the last line and the last commit are taken to be as dear as those before.
+            line.train_cpu_seconds.map(|cpu| if line.seconds > 0.0 { cpu * train_seconds / line.seconds } else { cpu })
+        };
+        let before = if train_seconds > 0.0 { self.last.as_ref().and_then(of_line) } else { Some(0.0) };
+        self.cpu = CpuClock { before, start: process_cpu_seconds() };
+    }
+
+    /// CPU seconds of training so far, over all processes of the run.
+    pub fn cpu_seconds(&self) -> Option<f64> {
+        Some(self.cpu.before? + process_cpu_seconds()? - self.cpu.start?)
     }
 
     /// Writes TensorBoard's event files to `folder` as well; `first_step` as for [`EventFile::create`].
@@ -241,7 +269,8 @@ impl MetricsLog {
             );
         }
         file.set_len(kept).map_err(io)?;
-        Ok(MetricsLog { path: path.to_path_buf(), file: BufWriter::new(file), events: None })
+        let last = last_line(&file).map_err(io)?;
+        Ok(MetricsLog::of(path, file, last))
     }
 
     /// Makes the file durable; returns its length in bytes.
@@ -259,16 +288,47 @@ impl MetricsLog {
     ///
     /// # Errors
     /// The file cannot be written.
-    pub fn write(&mut self, line: &StepLine) -> InputResult<()> {
+    pub fn write(&mut self, line: StepLine) -> InputResult<()> {
+        self.append(&line)?;
+        if let Some(events) = &mut self.events {
+            let scalars = [scalars_of_step(&line), line.test.as_ref().map_or(Vec::new(), scalars_of_test)].concat();
+            events.write(line.step, &scalars)?;
+        }
+        self.last = Some(line);
+        Ok(())
+    }
+
+    /// Writes the evaluation after the last step, `step`: that step's line again, with the evaluation. A log without a line
+    /// stays as it is.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn write_evaluation(&mut self, step: u32, test: TestMetrics) -> InputResult<()> {
+        let Some(last) = self.last.clone() else { return Ok(()) };
+        self.append(&StepLine { step, test: Some(test), ..last })?;
+        match &mut self.events {
+            None => Ok(()),
+            Some(events) => events.write(step, &scalars_of_test(&test)),
+        }
+    }
+
+    fn append(&mut self, line: &StepLine) -> InputResult<()> {
         let io = |e: std::io::Error| InputError::io(&self.path, "writing metrics", &e);
         let text = serde_json::to_string(line).map_err(|e| io(e.into()))?;
         self.file.write_all(text.as_bytes()).and_then(|()| self.file.write_all(b"\n")).map_err(io)?;
-        self.file.flush().map_err(io)?;
-        match &mut self.events {
-            None => Ok(()),
-            Some(events) => write_scalars(events, line),
-        }
+        self.file.flush().map_err(io)
     }
+}
+
+/// The last line of a file that is a step's.
+fn last_line(file: &File) -> std::io::Result<Option<StepLine>> {
+    let (mut reader, mut line, mut last) = (BufReader::new(file), Vec::new(), None);
+    reader.seek(SeekFrom::Start(0))?;
+    while reader.read_until(b'\n', &mut line)? > 0 {
+        last = serde_json::from_slice(&line).ok().or(last);
+        line.clear();
+    }
+    Ok(last)
 }
 
 /// Length of the file up to the end of its last complete line, bytes.
@@ -281,7 +341,7 @@ fn end_of_whole_lines(file: &File) -> std::io::Result<u64> {
     Ok(end)
 }
 
-fn write_scalars(events: &mut EventFile, line: &StepLine) -> InputResult<()> {
+fn scalars_of_step(line: &StepLine) -> Vec<(&'static str, f64)> {
     let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
     let mut scalars = vec![
         ("loss/train", line.loss),
@@ -293,17 +353,19 @@ fn write_scalars(events: &mut EventFile, line: &StepLine) -> InputResult<()> {
         ("disk/written_mib", mib(line.tiers.stats.bytes_written)),
         ("disk/stall_seconds", line.tiers.stats.stall_seconds),
     ];
-    if let Some(test) = line.test {
-        scalars.extend([("psnr/test", test.psnr), ("ssim/test", test.ssim)]);
-        let name = |method| match method {
-            ColorCorrect::Affine => "psnr_color_corrected_affine/test",
-            ColorCorrect::Quadratic => "psnr_color_corrected_quadratic/test",
-        };
-        scalars.extend(test.color_corrected.map(|c| (name(c.method), c.cc_psnr)));
-    }
     // A skipped step has no loss.
     scalars.retain(|(_, value)| *value < f64::MAX);
-    events.write(line.step, &scalars)
+    scalars
+}
+
+fn scalars_of_test(test: &TestMetrics) -> Vec<(&'static str, f64)> {
+    let mut scalars = vec![("psnr/test", test.psnr), ("ssim/test", test.ssim)];
+    let name = |method| match method {
+        ColorCorrect::Affine => "psnr_color_corrected_affine/test",
+        ColorCorrect::Quadratic => "psnr_color_corrected_quadratic/test",
+    };
+    scalars.extend(test.color_corrected.map(|c| (name(c.method), c.cc_psnr)));
+    scalars
 }
 
 /// Writes summary.json.

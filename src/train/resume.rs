@@ -11,6 +11,7 @@ use super::error::TrainError;
 use super::facts::{Resolved, read_resolved};
 use super::machine;
 use super::memory::host_budget;
+use super::more_steps::Finished;
 use super::out_folder::{self, Existing};
 use super::ownership::{Claim, last_state, open_own};
 use super::pages::PagedScene;
@@ -73,12 +74,18 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
         return Ok(outcome);
     }
     let folder = stored_folder(&request.out, &config);
+    if let Some(summary) = result_to_continue(request, &earlier, &config, &folder) {
+        drop(lock);
+        keep_rates(&mut config, &request.keys, &earlier.config);
+        let (out, scene, quiet) = (request.out.as_path(), earlier.scene.as_path(), request.quiet);
+        return Finished { out, scene, config, file: earlier.file, run: earlier.run, summary: &summary, quiet }.go_on();
+    }
     let is_in_output = config.residence().spill_dir().is_none();
     let found = open_own(&folder, earlier.claim(request), is_in_output);
     // The resumed run takes the lock again.
     drop(lock);
     match found {
-        Ok(Some(stored)) => resume_from(request, &earlier, config, stored),
+        Ok(Some(stored)) => resume_from(request, &earlier, config, earlier.adopted(stored)),
         Ok(None) => restart(request, &earlier, config),
         // A run in memory creates its checkpoint at its first commit.
         Err(_) if is_in_output && !SpillDir::exists_in(&folder) && !has_results(&request.out) => {
@@ -141,11 +148,39 @@ impl Earlier {
         Ok(Earlier { run: state.origin.run.id, file: None, config, scene, path })
     }
 
+    /// `stored`, whose folder is removed at the end if the run made it.
+    fn adopted(&self, mut stored: Stored) -> Stored {
+        let is_own = |(config, facts): &(TrainConfig, Resolved)| {
+            facts.made_spill_dir && config.residence().spill_dir().is_some_and(|dir| stored.is_in(dir))
+        };
+        if self.file.as_ref().is_some_and(is_own) {
+            stored.adopt_folder();
+        }
+        stored
+    }
+
     /// The claim that the run's checkpoint must satisfy.
     fn claim<'a>(&self, request: &'a ResumeRequest) -> Claim<'a> {
         let is_named = request.keys.spill_dir.as_ref().is_some_and(|folder| !folder.is_empty());
         Claim { run: self.run, out: &request.out, is_named }
     }
+}
+
+/// The summary of a run that did all of its steps, has no checkpoint any more, and is to do more steps. A run that was to
+/// keep its checkpoint is not continued: the drive of the checkpoint may not be mounted.
+fn result_to_continue(
+    request: &ResumeRequest,
+    earlier: &Earlier,
+    config: &TrainConfig,
+    folder: &Path,
+) -> Option<Summary> {
+    let summary = read_summary(&request.out).filter(|s| s.finished && config.steps > s.steps)?;
+    let is_gone = !SpillDir::exists_in(folder) && !earlier.config.keep_checkpoint;
+    (is_gone && earlier.file.is_some()).then_some(summary)
+}
+
+fn read_summary(out: &Path) -> Option<Summary> {
+    serde_json::from_str(&std::fs::read_to_string(out.join(SUMMARY_FILE)).ok()?).ok()
 }
 
 /// Whether a new start would destroy something of the run in `out`: a result, or a logged commit whose checkpoint may
@@ -166,8 +201,10 @@ fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> R
     if has_results(&request.out) {
         let problem = "the run left results but no commit to resume from: a run that ends without --keep-checkpoint \
                        removes its checkpoint";
-        let remedy = "start a new run from its Gaussians with another --out and --init-ply point_cloud.ply, or start over \
-                      with --overwrite";
+        let remedy = format!(
+            "start a new run from its Gaussians with another --out and --init-ply {}",
+            request.out.join(PLY_FILE).display()
+        );
         return Err(InputError::new(&request.out, problem, remedy).into());
     }
     let (out, scene, quiet) = (request.out.clone(), earlier.scene.clone(), request.quiet);
@@ -239,11 +276,15 @@ fn stored_folder(out: &Path, config: &TrainConfig) -> PathBuf {
 
 /// Keeps the rate schedule of a run that is extended to more steps.
 fn keep_schedule(config: &mut TrainConfig, keys: &TrainOverrides, state: &RunState) {
-    if let Ok(then) = TrainConfig::parse(&state.origin.config)
-        && keys.schedule_steps.is_none()
-        && config.steps != then.steps
-    {
-        config.schedule_steps = limits::schedule_steps(&then);
+    if let Ok(then) = TrainConfig::parse(&state.origin.config) {
+        keep_rates(config, keys, &then);
+    }
+}
+
+/// Keeps the rate schedule of `then` unless a flag gives another.
+fn keep_rates(config: &mut TrainConfig, keys: &TrainOverrides, then: &TrainConfig) {
+    if keys.schedule_steps.is_none() && config.steps != then.steps {
+        config.schedule_steps = limits::schedule_steps(then);
     }
 }
 
@@ -289,9 +330,8 @@ fn finished_outcome(
     config: &TrainConfig,
     earlier: &Earlier,
 ) -> Result<Option<RunOutcome>, TrainError> {
-    let text = std::fs::read_to_string(request.out.join(SUMMARY_FILE)).unwrap_or_default();
-    let summary: Option<Summary> = serde_json::from_str(&text).ok();
-    let Some(summary) = summary.filter(|s| s.finished && s.steps >= config.steps) else { return Ok(None) };
+    let summary = read_summary(&request.out).filter(|s| s.finished && s.steps >= config.steps);
+    let Some(summary) = summary else { return Ok(None) };
     let folder = stored_folder(&request.out, config);
     let is_its_place = folder == stored_folder(&request.out, &earlier.config);
     let stored = if SpillDir::exists_in(&folder) {
@@ -308,16 +348,17 @@ fn finished_outcome(
     let is_kept = config.keep_checkpoint && stored.is_some();
     let is_its_own = |stored: &Stored| earlier.run.is_known() && stored.run_state.origin.run.id == earlier.run;
     if let Some(stored) = stored.filter(|stored| is_its_place && !config.keep_checkpoint && is_its_own(stored)) {
-        stored.remove()?;
+        earlier.adopted(stored).remove()?;
         // An earlier process of the run may have created the folder in its results; it is empty now.
         let _ = std::fs::remove_dir(checkpoint_folder(&request.out));
     }
-    write_run_report(&request.out)?;
+    write_run_report(&request.out, &|_, _| {})?;
     if !request.quiet {
-        let more = if is_kept { "; --steps N extends it" } else { "" };
-        eprintln!("{} is finished: all {} steps, with results{more}", request.out.display(), summary.steps);
+        let more = if is_kept { "" } else { " from its PLY" };
+        let (out, steps) = (request.out.display(), summary.steps);
+        eprintln!("{out} is finished: all {steps} steps, with results; --steps N continues it{more}");
     }
-    Ok(Some(RunOutcome { summary: Some(summary), exit_code: 0 }))
+    Ok(Some(RunOutcome { summary: Some(summary), exit_code: 0, out: request.out.clone() }))
 }
 
 fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {

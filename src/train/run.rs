@@ -20,9 +20,9 @@ use super::places::absolute;
 use super::plan_text;
 use super::preflight;
 use super::probe::{Probe, estimate};
-use super::progress::Progress;
+use super::progress::{Count, Progress};
 use super::report::StepCosts;
-use super::report::{MetricsLog, Summary, write_summary};
+use super::report::{MetricsLog, Summary, TestMetrics, write_summary};
 use super::signals::StopFlag;
 use super::soundness::no_view_sees;
 use super::start::Start;
@@ -37,9 +37,10 @@ use crate::config::choice::{Choice, Chosen, LogFormat};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::config::residence::Residence;
+use crate::config::values::Up;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
-use crate::exchange::ply::{ExportFrame, PlyWritten};
+use crate::exchange::ply::{ExportFrame, PlyWritten, write_transform};
 use crate::page::tool::uncommitted::remove_uncommitted;
 use crate::render::Renderer;
 use crate::report::run_files::{
@@ -73,6 +74,8 @@ pub struct RunOutcome {
     pub summary: Option<Summary>,
     /// Exit code of the process: 0, or 130/143 after a stop request.
     pub exit_code: i32,
+    /// The output folder.
+    pub out: PathBuf,
 }
 
 /// The past of a resumed run.
@@ -123,15 +126,46 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let sh_degree_start = start.sh_degree_start;
     if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
         if !request.quiet {
-            eprintln!("{known}");
+            crate::say!("{known}");
         }
-        return Ok(RunOutcome { summary: None, exit_code: 0 });
+        return Ok(RunOutcome { summary: None, exit_code: 0, out: request.out.clone() });
     }
     if let Some(spill_dir) = config.residence().spill_dir().filter(|_| !request.dry_run)
         && remove_uncommitted(spill_dir, false)?
     {
         eprintln!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
     }
+    let FirstTrainer { dataset, trainer, tiers, print, driver } = first_trainer(request, start, host_mem)?;
+    let run = RunId::draw();
+    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run };
+    plan_and_train(request, &dataset, tiers, trainer, begun)
+}
+
+/// A trainer before its first step, with all that belongs to it. The trainer's pages may lie in the tiers, so drop them
+/// after it.
+pub(super) struct FirstTrainer {
+    /// Views and frame.
+    pub dataset: Dataset,
+    /// The trainer.
+    pub trainer: Trainer,
+    /// Where its pages live.
+    pub tiers: Tiers,
+    /// Digest of the dataset.
+    pub print: DatasetPrint,
+    /// Bytes allocated by the graphics driver.
+    pub driver: u64,
+}
+
+/// Makes the first pages of a scene, and their trainer.
+///
+/// # Errors
+/// The drive or the device cannot be used, or the source of the Gaussians cannot be read again.
+pub(super) fn first_trainer(
+    request: &RunRequest,
+    start: Start,
+    host_mem: Option<u64>,
+) -> Result<FirstTrainer, TrainError> {
+    let config = &request.config;
     check_first_drive(config, start.rows)?;
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
     let fill = first_fill(config.page_rows as usize, options.strategy.grows());
@@ -145,9 +179,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let print = dataset_print(&start)?;
     let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
     let trainer = Trainer::of_scene(scene, &dataset, renderer, options);
-    let run = RunId::draw();
-    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run };
-    plan_and_train(request, &dataset, tiers, trainer, begun)
+    Ok(FirstTrainer { dataset, trainer, tiers, print, driver })
 }
 
 /// Common start of all runs after reading the scene: warnings, options, the renderer and its memory.
@@ -159,8 +191,11 @@ pub(super) fn begin(
     for warning in &start.dataset.warnings {
         eprintln!("warning: {warning}");
     }
-    let options =
+    let mut options =
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
+    if config.up == Up::Auto {
+        options.up = start.up()?;
+    }
     let before = host_bytes_now().unwrap_or(0);
     let (mut renderer, word) = machine::renderer(config)?;
     // On from here, so that probing allocates what the steps need.
@@ -196,10 +231,15 @@ pub(super) fn plan_and_train(
     if !request.quiet {
         let of_device = device_memory::describe(config, &memory[1]);
         let of_tiers = plan_text::describe(&plan, &memory[1], &tiers) + &of_device;
-        eprintln!("{}", describe(request, dataset, &trainer, &of_tiers));
+        let plan = describe(request, dataset, &trainer, &of_tiers);
+        match request.dry_run {
+            // What was asked for goes to standard output.
+            true => crate::say!("{plan}"),
+            false => eprintln!("{plan}"),
+        }
     }
     if request.dry_run {
-        return Ok(RunOutcome { summary: None, exit_code: 0 });
+        return Ok(RunOutcome { summary: None, exit_code: 0, out: request.out.clone() });
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     out_folder::make_folder(&request.out)?;
@@ -231,11 +271,18 @@ fn spill_dir_flag(request: &RunRequest) -> String {
 /// The config to keep: with choices resolved and absolute paths.
 fn resolved_config(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
     let view_order = Chosen(Some(trainer.view_order().order()));
-    with_absolute_paths(TrainConfig { view_order, ..config.clone() })
+    let up = trainer.options.up.map_or(Up::Keep, Up::Along);
+    with_absolute_paths(TrainConfig { view_order, up, ..config.clone() })
 }
 
 /// Writes config.toml (on resume only if it changed); returns the origin for all commits.
-fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun: &Begun) -> InputResult<Origin> {
+fn begin_files(
+    request: &RunRequest,
+    dataset: &Dataset,
+    trainer: &Trainer,
+    begun: &Begun,
+    made_spill_dir: bool,
+) -> InputResult<Origin> {
     let simd = limits::simd_path(&request.config).name().to_string();
     let path = request.out.join(CONFIG_FILE);
     let config = match &begun.past {
@@ -253,7 +300,8 @@ fn begin_files(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, begun
         }
         None => {
             let kept = resolved_config(&request.config, trainer);
-            write_config(&path, &kept, &resolved(request, dataset, trainer, begun.run))?;
+            let facts = resolved(request, dataset, trainer, begun.run);
+            write_config(&path, &kept, &Resolved { made_spill_dir, ..facts })?;
             kept
         }
     };
@@ -272,7 +320,7 @@ fn train_into(
     begun: Begun,
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
-    let origin = begin_files(request, dataset, &trainer, &begun)?;
+    let origin = begin_files(request, dataset, &trainer, &begun, tiers.made_spill_dir())?;
     let mut metrics = open_metrics(config.log, out, begun.past.as_ref())?;
     let keeps = tiers.keeps_checkpoint();
     let mut checkpoint = tiers.checkpoint.as_mut();
@@ -286,9 +334,10 @@ fn train_into(
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let mut progress = Progress::new(config.steps, request.quiet).after(trainer.steps_done());
     let meter = Meter::start(&trainer);
+    metrics.start_clock(trainer.train_seconds());
     let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint };
     let looped = trainer.run(dataset, &targets, &mut outputs);
-    let costs = meter.stop(&trainer, &*tiers);
+    let costs = meter.stop(&trainer, &*tiers, metrics.cpu_seconds());
     let ply = Trainer::ply_path(out);
     let saved = trainer.save(dataset, &ply);
     // Return the error that ended the run; a failure to write its last rows is an additional warning.
@@ -300,10 +349,11 @@ fn train_into(
         (looped, saved) => (looped, saved?),
     };
     warn_of_ply(config, &written, &ply);
+    write_transform(&ply, &trainer.ply_meta(dataset), written.frame)?;
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
     let asked = stop.exit_code();
     let tested = looped.and_then(|()| match asked {
-        None => trainer.evaluate(dataset, &targets, Some(&out.join(PICTURES_FOLDER))),
+        None => evaluate_result(request, dataset, &targets, &mut trainer, &mut metrics),
         Some(_) => Ok(None),
     });
     if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, tiers.checkpoint.as_mut()) {
@@ -322,10 +372,37 @@ fn train_into(
     write_summary(&out.join(SUMMARY_FILE), &summary)?;
     write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
     write_appearance(&out.join(APPEARANCE_FILE), dataset, &trainer)?;
-    write_run_report(out)?;
+    write_report(request)?;
     tested?;
     tiers.is_done = summary.finished;
-    Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0) })
+    Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0), out: out.clone() })
+}
+
+/// Evaluates the result, with pictures, and logs the evaluation.
+fn evaluate_result(
+    request: &RunRequest,
+    dataset: &Dataset,
+    targets: &TargetCache,
+    trainer: &mut Trainer,
+    metrics: &mut MetricsLog,
+) -> Result<Option<TestMetrics>, TrainError> {
+    let shown = Count::new("held-out views compared", dataset.test_views().len() as u32, request.quiet);
+    let pictures = request.out.join(PICTURES_FOLDER);
+    let test = trainer.evaluate(dataset, targets, Some(&pictures), &|done| shown.show(done))?;
+    if let Some(test) = test {
+        metrics.write_evaluation(trainer.steps_done(), test)?;
+    }
+    Ok(test)
+}
+
+fn write_report(request: &RunRequest) -> InputResult<()> {
+    let shown = std::cell::OnceCell::new();
+    let show = |done: usize, all: usize| {
+        let count = || Count::new("pictures put into the report", all as u32, request.quiet);
+        shown.get_or_init(count).show(done as u32);
+    };
+    write_run_report(&request.out, &show)?;
+    Ok(())
 }
 
 /// The log of metrics of a new run, or of a run that resumes after `past`.
@@ -333,7 +410,7 @@ fn open_metrics(log: LogFormat, out: &Path, past: Option<&Past>) -> InputResult<
     let metrics = MetricsLog::open(&out.join(METRICS_FILE), past.map(|past| past.metrics_bytes))?;
     match log {
         LogFormat::Json => Ok(metrics),
-        LogFormat::Tensorboard => metrics.with_events(&out.join(EVENTS_FOLDER), past.map(|past| past.step)),
+        LogFormat::Tensorboard => metrics.with_events(&out.join(EVENTS_FOLDER), past.map(|past| past.step + 1)),
     }
 }
 
@@ -386,6 +463,7 @@ fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, run: Run
         origin: dataset.frame.origin.to_array(),
         scale: dataset.frame.scale,
         scene_scale: f64::from(dataset.scene_scale) * dataset.frame.scale,
+        made_spill_dir: false,
     }
 }
 

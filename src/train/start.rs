@@ -24,10 +24,11 @@ use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::colmap;
 use crate::dataset::frame::Extent;
-use crate::dataset::import::{Budget, Cloud, ImportOptions, LocalCloud, import_points};
+use crate::dataset::import::{Budget, Cloud, ImportOptions, LocalCloud, PointSource, import_points};
 use crate::dataset::loader::{Dataset, load_dataset, load_dataset_with_cloud};
 use crate::dataset::model::{PointCloud, RawScene, TakePoint};
 use crate::dataset::read::{ReadOptions, read_scene};
+use crate::dataset::up::estimate_up;
 use crate::exchange::ply;
 use crate::paging::pager::Pager;
 use crate::scene::columns::{Columns, row_width};
@@ -179,6 +180,28 @@ impl Start {
         let rows = init.max_gaussians.map_or(rows, |most| rows.min(most as u64));
         let from = FirstRows::Points { cloud, extent, init };
         Ok(Some(Start { dataset, sh_degree_start: limits::first_sh_degree(config), rows, points, from }))
+    }
+
+    /// The direction of the dataset that is up, by its cameras and points; `None` without cameras. The same for streamed and
+    /// whole input.
+    ///
+    /// # Errors
+    /// The points cannot be read.
+    pub(super) fn up(&self) -> InputResult<Option<[f64; 3]>> {
+        let cameras = self.dataset.views.iter().map(|view| &view.camera);
+        estimate_up(cameras, |take| match &self.from {
+            FirstRows::Points { cloud, extent, .. } => {
+                let points = LocalCloud { cloud, extent: *extent, frame: self.dataset.frame };
+                points.read(&mut |position, _| {
+                    take(position);
+                    Ok(())
+                })
+            }
+            _ => {
+                self.dataset.points.iter().for_each(|&position| take(position));
+                Ok(())
+            }
+        })
     }
 
     /// The dataset alone, for a run that has its Gaussians already. Drops their source: columns, a spool, or a store

@@ -165,8 +165,8 @@ impl Stored {
         if !SpillDir::exists_in(folder) {
             let problem = "the checkpoint of this run is not there: it is removed when a run ends without \
                            --keep-checkpoint, and made by the first commit";
-            let remedy = "start the run again with --overwrite; if its pages were moved, name their folder with --spill-dir; \
-                          if their drive is not mounted, mount it";
+            let remedy = "if its drive is not mounted, mount it; if its pages were moved, name their folder with --spill-dir; \
+                          if it is lost, start a new run with another --out and --init-ply with the PLY of this one";
             return Err(InputError::new(folder, problem, remedy).into());
         }
         let spill = SpillDir::open(folder, allow_remote)?;
@@ -188,6 +188,17 @@ impl Stored {
             )
         })?;
         Ok(Some(Stored { spill, opened, run_state }))
+    }
+
+    /// Whether the checkpoint lies in `folder`.
+    pub fn is_in(&self, folder: &Path) -> bool {
+        let [here, there] = [self.spill.folder(), folder].map(|path| path.canonicalize().ok());
+        here.is_some() && here == there
+    }
+
+    /// Removes the folder with the checkpoint at the end: an earlier process of the run made it.
+    pub fn adopt_folder(&mut self) {
+        self.spill.adopt_folder();
     }
 
     /// Removes the checkpoint. Returns the names of files that stay because they do not belong to the store.
@@ -270,6 +281,11 @@ impl Tiers {
     /// Whether a run that stops now can resume from its checkpoint.
     pub fn can_resume(&self) -> bool {
         !self.is_done && self.has_checkpoint()
+    }
+
+    /// Whether this run made the folder of its spill directory.
+    pub fn made_spill_dir(&self) -> bool {
+        self.spill.as_ref().is_some_and(SpillDir::made_folder)
     }
 
     /// Whether the checkpoint stays at a clean end.

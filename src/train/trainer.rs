@@ -38,6 +38,7 @@ use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::image::Target;
+use crate::scene::rotation::Rotation;
 use crate::schedule::order::{Order, ViewOrder};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -146,6 +147,12 @@ impl Trainer {
             visible_share: 0.0,
             idle: Idle::default(),
         }
+    }
+
+    /// Counts the steps from `step` on: an earlier run has done them, in `train_seconds` seconds. Call this before the first
+    /// step.
+    pub(super) fn begin_after(&mut self, step: u32, train_seconds: f64) {
+        (self.state.step, self.state.train_seconds) = (step, train_seconds);
     }
 
     /// Renders views forward and backward so that the memory of a view is allocated; the scene stays unchanged. Returns
@@ -352,7 +359,7 @@ impl Trainer {
         }
     }
 
-    /// Evaluates the held-out views at the current step.
+    /// Evaluates the held-out views at the current step. `progress` is called with the number of views done.
     ///
     /// # Errors
     /// As [`evaluate`].
@@ -361,6 +368,7 @@ impl Trainer {
         dataset: &Dataset,
         targets: &TargetCache,
         pictures: Option<&Path>,
+        progress: &dyn Fn(u32),
     ) -> Result<Option<TestMetrics>, TrainError> {
         let render = self.render_options();
         let views = dataset.test_views();
@@ -371,6 +379,7 @@ impl Trainer {
             lpips: None,
             color_correct: self.options.color_correct,
             appearance: self.options.appearance,
+            progress,
         };
         let now = (&mut self.scene, self.state.step, &mut self.working);
         let test = evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)?;
@@ -389,18 +398,24 @@ impl Trainer {
             let remedy = "resume the run from its last commit with gsscale-train --resume and the output folder";
             return Err(InputError::new(path, problem, remedy).into());
         }
-        let meta = PlyMeta {
+        let meta = self.ply_meta(dataset);
+        let rows_at_most = self.scene.rows_bound();
+        let mut writer = ply::PlyWriter::create(path, self.options.sh_degree, rows_at_most, &meta)?;
+        self.scene.for_all_rows(self.state.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
+        Ok(writer.finish()?)
+    }
+
+    /// The metadata of a PLY of the rows at the current step.
+    pub(super) fn ply_meta(&self, dataset: &Dataset) -> PlyMeta {
+        PlyMeta {
             step: Some(u64::from(self.state.step)),
             origin: dataset.frame.origin.to_array(),
             scale: dataset.frame.scale,
             scene_radius: f64::from(dataset.scene_scale) * dataset.frame.scale,
             frame: self.options.export_frame,
+            upright: self.options.up.and_then(Rotation::upright),
             ..PlyMeta::default()
-        };
-        let rows_at_most = self.scene.rows_bound();
-        let mut writer = ply::PlyWriter::create(path, self.options.sh_degree, rows_at_most, &meta)?;
-        self.scene.for_all_rows(self.state.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
-        Ok(writer.finish()?)
+        }
     }
 
     /// Path of the final PLY in an output folder.

@@ -6,14 +6,15 @@
 use super::checkpoint::Checkpoint;
 use super::error::TrainError;
 use super::memory::host_bytes_peak;
-use super::progress::Progress;
-use super::report::{MetricsLog, StepLine, TestMetrics, TierTraffic, json_psnr};
+use super::progress::{Progress, Shown};
+use super::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
 use super::signals::StopFlag;
 use super::step::StepOutcome;
 use super::trainer::Trainer;
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::render::Traffic;
 use crate::report::run_files::saved_ply_name;
 use std::path::Path;
 
@@ -45,49 +46,34 @@ impl Trainer {
         while self.state.step < self.options.steps && outputs.stop.exit_code().is_none() {
             self.log_due_events();
             self.start_paging_if_outgrown(outputs)?;
-            let step = self.state.step;
             let before = self.renderer.traffic();
             let Some(outcome) = self.step_with_space(dataset, targets, outputs)? else { break };
             self.check_statistics(outputs)?;
-            let traffic = self.renderer.traffic();
-            let is_last = self.state.step == self.options.steps;
-            let due = |every: u32| step > 0 && step.is_multiple_of(every);
+            let (done, is_last) = (self.state.step, self.state.step == self.options.steps);
+            let due = |every: u32| every > 0 && done.is_multiple_of(every);
             let psnr = json_psnr(-10.0 * outcome.loss.mse.log10());
             let mut test: Option<TestMetrics> = None;
             if due(self.options.eval_every) && !is_last {
-                test = self.evaluate(dataset, targets, None)?;
+                test = self.evaluate(dataset, targets, None, &|_| {})?;
+                if let Some(t) = test {
+                    let (psnr, ssim, views) = (t.psnr, t.ssim, t.views);
+                    outputs
+                        .progress
+                        .say(&format!("step {done}: PSNR {psnr:.2} dB, SSIM {ssim:.4} on {views} held-out views"));
+                }
             }
             if due(self.options.save_every) && !is_last {
-                self.save_if_space(dataset, &outputs.out.join(saved_ply_name(step)))?;
+                self.save_if_space(dataset, &outputs.out.join(saved_ply_name(done)))?;
                 if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
-                    checkpoint.keep_next_as(format!("step-{step}"));
+                    checkpoint.keep_next_as(format!("step-{done}"));
                 }
             }
             if due(self.options.log_every) || is_last || due(self.options.eval_every) {
-                let line = StepLine {
-                    step,
-                    loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },
-                    psnr,
-                    gaussians: self.scene.rows(),
-                    seconds: self.state.train_seconds,
-                    host_bytes_peak: host_bytes_peak().unwrap_or(0),
-                    bytes_uploaded: traffic.bytes_uploaded - before.bytes_uploaded,
-                    bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
-                    device_bytes_peak: traffic.device_bytes_peak,
-                    tiers: self.tier_traffic(),
-                    commits: outputs.checkpoint.as_deref().map(Checkpoint::report),
-                    test,
-                };
-                let written = outputs.metrics.write(&line).map_err(TrainError::from);
+                let line = self.step_line(&outcome, psnr, before, outputs);
+                let written = outputs.metrics.write(StepLine { test, ..line }).map_err(TrainError::from);
                 written.or_else(|error| self.make_space(outputs, error))?;
             }
-            let (gaussians, last_test) = (self.scene.rows(), self.state.test);
-            outputs.progress.step(self.state.step, || {
-                let test = last_test.map_or(String::new(), |t| format!(" test {:.2}", t.psnr));
-                let tiers = TierTraffic::of(&self.scene.pager).words();
-                let commits = outputs.checkpoint.as_deref().map_or(String::new(), |c| c.report().words());
-                format!("loss {:.4} psnr {psnr:.2}{test} {gaussians} gaussians{tiers}{commits}", outcome.loss.loss)
-            });
+            outputs.progress.step(done, Shown { gaussians: self.scene.rows(), psnr });
             if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
                 let done = checkpoint.between_steps(self, outputs.metrics);
                 done.or_else(|error| self.make_space(outputs, error))?;
@@ -96,6 +82,26 @@ impl Trainer {
         self.commit_last(outputs)?;
         outputs.progress.finish();
         Ok(())
+    }
+
+    /// The metrics of the last step, without an evaluation.
+    fn step_line(&self, outcome: &StepOutcome, psnr: f64, before: Traffic, outputs: &LoopOutputs<'_>) -> StepLine {
+        let traffic = self.renderer.traffic();
+        StepLine {
+            step: self.state.step,
+            loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },
+            psnr,
+            gaussians: self.scene.rows(),
+            seconds: self.state.train_seconds,
+            train_cpu_seconds: outputs.metrics.cpu_seconds(),
+            host_bytes_peak: host_bytes_peak().unwrap_or(0),
+            bytes_uploaded: traffic.bytes_uploaded - before.bytes_uploaded,
+            bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
+            device_bytes_peak: traffic.device_bytes_peak,
+            tiers: self.tier_traffic(),
+            commits: outputs.checkpoint.as_deref().map(Checkpoint::report),
+            test: None,
+        }
     }
 
     /// Runs a step and repeats it after waiting for space if the drive is full. `None` if a stop was requested

@@ -15,5 +15,6 @@ mod lpips;
 mod oracle;
 mod parity;
 mod shaders;
+mod upright;
 mod visibility;
 mod weights;

@@ -10,6 +10,7 @@ use gsscale::checkpoint::run_state::{Origin, RunIdentity};
 use gsscale::config::choice::{Chosen, Device};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::{RunOptions, simd_path};
+use gsscale::config::values::Up;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::dataset::target_cache::TargetCache;
@@ -62,6 +63,7 @@ fn config(spill: &Path) -> TrainConfig {
         spill_codec: Chosen(Some(Codec::Raw)),
         commit_every: CommitEvery::Seconds(0.05),
         disk_full_wait: 30.0,
+        up: Up::Keep,
         ..TrainConfig::default()
     }
 }
@@ -174,6 +176,7 @@ impl World {
             origin: [0.0; 3],
             scale: 1.0,
             scene_scale: 1.0,
+            made_spill_dir: false,
         };
         write_config(&out.join("config.toml"), &config, &resolved)?;
         let mut checkpoint = Checkpoint::new(opened.commits, &spill_dir, &config);
@@ -546,7 +549,7 @@ fn a_drive_without_room_for_a_saved_ply_costs_that_file_alone() {
         "{said}"
     );
     let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
-    assert!(metrics.lines().last().unwrap().starts_with("{\"step\":29,"), "all steps were done: {metrics}");
+    assert!(metrics.lines().last().unwrap().starts_with("{\"step\":30,"), "all steps were done: {metrics}");
 }
 
 /// The drive of the results is full and the drive of the pages is not: the run names and waits for the drive of the

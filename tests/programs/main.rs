@@ -13,6 +13,7 @@ mod cli;
 #[cfg(unix)]
 mod drive_faults;
 mod extremes;
+mod first_hour;
 mod gpu_train;
 mod growing;
 mod memory;
@@ -28,3 +29,4 @@ mod resume;
 mod sweeps;
 mod tiers;
 mod train;
+mod upright;

@@ -1,6 +1,6 @@
 //! The memory that `--dry-run` announces against the peak memory of the run that follows.
 
-use crate::support::scenes::{city, stderr, summary, text, train};
+use crate::support::scenes::{city, stderr, summary, text, told, train};
 use std::path::Path;
 use tempfile::TempDir;
 
@@ -11,7 +11,7 @@ const SLACK: f64 = 4e6;
 /// The announced peak of a run, bytes.
 fn announced(scene: &Path, more: &[&str]) -> f64 {
     let output = train(&[&[text(scene), "--dry-run"], more].concat());
-    let said = stderr(&output);
+    let said = told(&output);
     assert!(output.status.success(), "{said}");
     let line = said.lines().find(|l| l.starts_with("memory ")).unwrap();
     let mut words = line.split_whitespace().skip(2);

@@ -1,6 +1,6 @@
 //! `gsscale-plan` through its binary: sums that agree, exact lists, and refusals with a remedy.
 
-use crate::support::scenes::{city, stderr, summary, text, train, wide_city};
+use crate::support::scenes::{city, stderr, summary, text, told, train, wide_city};
 use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Output};
@@ -168,7 +168,7 @@ fn a_run_says_what_it_takes_of_the_life_of_a_drive() {
     // Enough steps for some 900 GiB.
     let more = ["--steps", "2000000", "--dry-run", "--spill-dir", text(&spill)];
     let output = train(&[&[text(&scene)][..], &flags, &more].concat());
-    let said = stderr(&output);
+    let said = told(&output);
     assert!(output.status.success(), "{said}");
     let told =
         said.split("without commits, ").nth(1).and_then(|rest| rest.split(" % of the rated").next()).expect(&said);

@@ -33,7 +33,8 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     let scene = large_city(folder.path());
     let out = folder.path().join("ladder");
     let sizes = ["--steps", "60", "--page-rows", "16", "--strategy", "none", "--share", "70", "--seed", "3"];
-    let args = [&["ladder", text(&scene), "--out", text(&out)][..], &sizes].concat();
+    let plain = [&["ladder", text(&scene), "--out", text(&out)][..], &sizes].concat();
+    let args = [&plain[..], &["--json"]].concat();
     let rungs = lines(&args);
     let labels: Vec<&str> = rungs.iter().map(|r| r["label"].as_str().unwrap()).collect();
     assert_eq!(labels, ["naive", "deferred", "planned", "overlap", "memory"]);
@@ -57,12 +58,17 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     assert!(names(&out.join("spill")).is_empty(), "scratch is removed");
     // Finished runs are not repeated.
     assert_eq!(lines(&args), rungs);
+    // Without --json, the end is a table of them.
+    let table = String::from_utf8(bench(&plain).stdout).unwrap();
+    let words: Vec<&str> = table.lines().filter_map(|line| line.split_whitespace().next()).collect();
+    assert_eq!(words, ["rung", "naive", "deferred", "planned", "overlap", "memory"], "{table}");
+    assert!(table.contains(&format!("{:.2}", number(memory, "psnr"))), "{table}");
     assert_eq!(parse(&std::fs::read_to_string(out.join("ladder.jsonl")).unwrap()), rungs);
 }
 
 fn sweep<'a>(scene: &'a Path, out: &'a Path) -> Vec<&'a str> {
     let sizes = ["--steps", "20", "--page-rows", "16", "--strategy", "none", "--seeds", "1,2", "--setting-seeds", "2"];
-    let knobs = ["--knobs", "optimizer,budget,sh,resolution"];
+    let knobs = ["--knobs", "optimizer,budget,sh,resolution", "--json"];
     [&["pareto", text(scene), "--out", text(out)][..], &sizes, &knobs].concat()
 }
 
@@ -116,6 +122,9 @@ fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
     assert_eq!(names(&out.join("runs")).len(), planned);
     check_sweep(&records, &out, folder.path());
     assert!(lines(&args).is_empty(), "all are done");
+    let plain: Vec<&str> = args.iter().copied().filter(|arg| *arg != "--json").collect();
+    let table = String::from_utf8(bench(&plain).stdout).unwrap();
+    assert!(table.starts_with("knob ") && table.contains("the same bits") && !table.contains('{'), "{table}");
 }
 
 /// Checks the figures that follow from the knobs, and the page.
@@ -185,7 +194,8 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     let output = bench(&["ladder", scene, "--out", out, "--steps", "4", "--page-rows", "16", "--spill", text(&file)]);
     assert!(!output.status.success() && stderr(&output).contains("file"), "{}", stderr(&output));
     let failing = ["--steps", "4", "--image-cache", "1", "--host-mem", "1MiB", "--knobs", "budget", "--seeds", "1"];
-    let args = [&["pareto", scene, "--out", out, "--page-rows", "16", "--strategy", "none"][..], &failing].concat();
+    let args =
+        [&["pareto", scene, "--out", out, "--page-rows", "16", "--strategy", "none", "--json"][..], &failing].concat();
     let records = lines(&args);
     assert!(records[0]["problem"].as_str().is_some_and(|p| p.contains("--host-mem")), "{records:?}");
     assert!(records[1..].iter().all(|r| r["problem"].is_null()) && records.len() > 1, "{records:?}");

@@ -121,6 +121,19 @@ impl TextModel {
         std::fs::write(scene.join("points.ply"), ply).unwrap();
     }
 
+    /// Turns the whole scene about its origin.
+    pub fn turn(&mut self, by: DQuat) {
+        for p in &mut self.points {
+            *p = (by * DVec3::from_array(*p)).to_array();
+        }
+        for v in &mut self.views {
+            // World to camera of a turned world: first back, then as before. The translation stays.
+            let [w, x, y, z] = v.qvec;
+            let q = DQuat::from_xyzw(x, y, z, w).normalize() * by.inverse();
+            v.qvec = [q.w, q.x, q.y, q.z];
+        }
+    }
+
     /// Moves the whole scene by `offset`.
     pub fn shift(&mut self, offset: [f64; 3]) {
         let offset = DVec3::from_array(offset);
@@ -143,6 +156,11 @@ pub fn train(args: &[&str]) -> Output {
     let is_set = args.contains(&CLASSIC[0]) || args.contains(&"--resume");
     let schedule: &[&str] = if is_set { &[] } else { &CLASSIC };
     Command::new(env!("CARGO_BIN_EXE_gsscale-train")).args(args).args(schedule).output().unwrap()
+}
+
+/// Standard output, then standard error.
+pub fn told(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned() + &stderr(output)
 }
 
 /// Runs `gsscale-eval` with these arguments.

@@ -5,9 +5,11 @@
 
 use super::facts::Facts;
 use super::sweep::{Planned, Sweep, SweepArgs, use_drive};
+use super::table::{figure, table};
 use clap::Parser;
 use clap::builder::PossibleValuesParser;
 use gsscale::base::error::InputError;
+use gsscale::base::units::format_bytes;
 use gsscale::base::whole_file::write_whole;
 use gsscale::config::choice::Choice;
 use gsscale::config::file::TrainConfig;
@@ -120,8 +122,30 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         done.push(LadderRung { name: rung.name.into(), what: rung.what.into(), record });
         write_whole(&page, ladder_page(&facts, &done).as_bytes())?;
     }
-    eprintln!("{}", page.display());
+    if !args.common.json {
+        gsscale::say!("{}", text_of(&done));
+    }
+    eprintln!("done: {}", page.display());
     Ok(())
+}
+
+/// The rungs as a table.
+fn text_of(rungs: &[LadderRung]) -> String {
+    let row = |rung: &LadderRung| {
+        let r = &rung.record;
+        vec![
+            rung.name.clone(),
+            figure(Some(r.seconds), 1),
+            figure(r.cpu_seconds, 1),
+            figure(Some(r.stall_seconds), 1),
+            format_bytes(r.bytes_read),
+            format_bytes(r.bytes_written),
+            format_bytes(r.host_bytes_peak),
+            figure(r.psnr, 2),
+        ]
+    };
+    let rows: Vec<Vec<String>> = rungs.iter().map(row).collect();
+    table(&["rung", "seconds", "CPU s", "waited", "read", "written", "peak", "PSNR"], 1, &rows)
 }
 
 /// Fixes the keys that a rung could otherwise choose automatically, and resets the keys that distinguish the rungs.

@@ -3,13 +3,16 @@
 use super::facts::Facts;
 use super::knobs::{KNOBS, Knobs};
 use super::sweep::{Planned, Surroundings, Sweep, SweepArgs, use_drive};
+use super::table::{figure, table};
 use clap::Parser;
 use clap::builder::PossibleValuesParser;
 use gsscale::base::error::InputError;
+use gsscale::base::units::format_bytes;
 use gsscale::base::whole_file::write_whole;
 use gsscale::config::choice::Choice;
 use gsscale::config::file::TrainConfig;
 use gsscale::page::format::codec::Codec;
+use gsscale::report::front::{Setting, Verdict, against, settings};
 use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::{ResultsLog, successful_run};
 use gsscale::report::sweep_page::sweep_page;
@@ -23,7 +26,8 @@ Examples:
   gsscale-bench pareto scans/village --out sweeps/village --knobs sh,moments --max-runs 5
   gsscale-bench pareto scans/city --out sweeps/city --steps 300 --share 25 --knobs budget,order,codec --strategy none
 
-Each run is a process of its own and adds a line to results.jsonl in --out; the page is pareto.html. A sweep that
+Each run is a process of its own and adds a line to results.jsonl in --out; the page is pareto.html, and the end is a
+table. A sweep that
 stopped continues when started again. The knobs budget, page and codec need a drive: see --spill.";
 
 /// File of results in the output folder.
@@ -79,7 +83,10 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         write_page(args, &base, &runs, &sweep)?;
     }
     write_page(args, &base, &runs, &sweep)?;
-    eprintln!("{}", args.common.out.join("pareto.html").display());
+    if !args.common.json {
+        gsscale::say!("{}", text_of(&of_plan(&runs, &sweep)));
+    }
+    eprintln!("done: {}", args.common.out.join("pareto.html").display());
     Ok(())
 }
 
@@ -163,17 +170,45 @@ fn list(args: &Args, runs: &[Planned], surroundings: &Surroundings) -> Result<()
     Ok(())
 }
 
+/// The runs of this plan that are done. Two settings may share a run; each has the name of the planned setting.
+fn of_plan(runs: &[Planned], sweep: &Sweep) -> Vec<RunRecord> {
+    let of_run = |run: &Planned| {
+        let key = run.key(sweep.surroundings());
+        let record = sweep.records().iter().rev().find(|r| r.key == key)?;
+        Some(RunRecord { knob: run.knob.clone(), label: run.label.clone(), ..record.clone() })
+    };
+    runs.iter().filter_map(of_run).collect()
+}
+
+/// The settings as a table: means over seeds.
+fn text_of(records: &[RunRecord]) -> String {
+    let settings = settings(records);
+    let base = settings.first().filter(|s| s.verdict == Verdict::Base);
+    let row = |s: &Setting| {
+        let difference = base.filter(|_| s.verdict != Verdict::Base).and_then(|base| against(s, base, |r| r.psnr));
+        let bytes = |of: fn(&RunRecord) -> u64| {
+            s.mean(|r| Some(of(r) as f64)).map_or(String::new(), |b| format_bytes(b as u64))
+        };
+        vec![
+            s.knob.clone(),
+            s.label.clone(),
+            figure(s.psnr.map(|p| p.mean), 2),
+            difference.map_or(String::new(), |d| format!("{d:+.2}")),
+            figure(s.ssim.map(|p| p.mean), 3),
+            figure(s.mean(|r| Some(r.seconds)), 1),
+            bytes(|r| r.host_bytes_peak),
+            bytes(RunRecord::bytes_moved),
+            s.verdict.words().to_string(),
+        ]
+    };
+    let rows: Vec<Vec<String>> = settings.iter().map(row).collect();
+    let names = ["knob", "setting", "PSNR", "to base", "SSIM", "seconds", "peak", "moved", "accuracy"];
+    table(&names, 2, &rows)
+}
+
 /// Writes the page of the runs of this plan that are done.
 fn write_page(args: &Args, base: &Planned, runs: &[Planned], sweep: &Sweep) -> Result<(), TrainError> {
-    let (records, surroundings) = (sweep.records(), sweep.surroundings());
-    let mut of_plan: Vec<RunRecord> = Vec::new();
-    for run in runs {
-        let key = run.key(surroundings);
-        if let Some(record) = records.iter().rev().find(|r| r.key == key) {
-            // Two settings may share a run; the page uses the name of the planned setting.
-            of_plan.push(RunRecord { knob: run.knob.clone(), label: run.label.clone(), ..record.clone() });
-        }
-    }
+    let of_plan = of_plan(runs, sweep);
     let config = &base.config;
     let place = if config.frames > 0 { format!("{} frames", config.frames) } else { "in memory".to_string() };
     let machine = of_plan.first().map_or(String::new(), |r| format!("; {} threads of {}", r.threads, r.cpu));

@@ -84,7 +84,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     }
     let seconds = began.elapsed().as_secs_f64();
     let cpu_seconds = process_cpu_seconds().zip(cpu_before).map(|(after, before)| after - before);
-    let test = if args.no_eval { None } else { trainer.evaluate(&dataset, &targets, None)? };
+    let test = if args.no_eval { None } else { trainer.evaluate(&dataset, &targets, None, &|_| {})? };
     print(&json!({
         "scene": args.scene,
         "steps": config.steps,

@@ -53,6 +53,9 @@ pub struct SweepArgs {
     /// Spill directory, on the drive to measure [default: spill in --out]
     #[arg(long, value_name = "DIR")]
     pub spill: Option<PathBuf>,
+    /// Print each result as a line of JSON, instead of a table at the end
+    #[arg(long)]
+    pub json: bool,
     #[command(flatten)]
     pub keys: TrainOverrides,
 }
@@ -119,6 +122,7 @@ pub struct Sweep {
     surroundings: Surroundings,
     lock: File,
     log: ResultsLog,
+    json: bool,
 }
 
 /// Makes a config keep `frames` pages in memory and the others on the drive.
@@ -160,7 +164,7 @@ impl Sweep {
         // This process holds the lock, so no run uses these files.
         remove_parts(&out.join("runs"), &[".part", ".part.toml"])?;
         remove_parts(&spill, &[&format!("{}.part", surroundings.mark)])?;
-        Ok(Sweep { scene, out, spill, base, surroundings, lock, log })
+        Ok(Sweep { scene, out, spill, base, surroundings, lock, log, json: args.json })
     }
 
     /// The results so far.
@@ -173,7 +177,8 @@ impl Sweep {
         &self.surroundings
     }
 
-    /// The result of a run, from the log or from a training now. Prints the result as JSON; warns if the run failed.
+    /// The result of a run, from the log or from a training now. Prints the result as JSON if that was asked for; warns if the run
+    /// failed.
     ///
     /// # Errors
     /// The program is missing or was interrupted, or results cannot be written. A failed run is a result.
@@ -190,7 +195,9 @@ impl Sweep {
         if let Some(problem) = &record.problem {
             eprintln!("warning: the run failed: {problem}");
         }
-        print(&serde_json::to_value(&record).unwrap_or_default());
+        if self.json {
+            print(&serde_json::to_value(&record).unwrap_or_default());
+        }
         Ok(record)
     }
 

@@ -6,13 +6,14 @@
 //! arguments alone; 3. the target is replaced as a whole, after the new bytes have reached the disk, or not at all; 4.
 //! a row with a non-finite value, before or after the change of frame, is left out and counted.
 //!
-//! The comments follow the `element` line, because the viewer of the 3DGS code assumes that the third line is
-//! `element`.
+//! The comments precede the `element` line, since readers give later ones to the element, not to the file. The viewer of
+//! the 3DGS code takes the third word of the third line for the number of rows, so that line is a comment `vertices N`.
 
 use super::{ExportFrame, PlyMeta, unit_quat};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::PartFile;
 use crate::scene::columns::{Column, Columns, sh_n_width};
+use crate::scene::rotation::{GaussianRotation, Rotation};
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::{BufWriter, Seek, SeekFrom, Write};
@@ -45,8 +46,9 @@ pub fn write_gaussians(path: &Path, columns: &Columns, meta: &PlyMeta) -> InputR
 /// Writes a file in parts.
 ///
 /// In the dataset's frame positions are `means * scale + origin`, computed in f64 and rounded once, and `ln(scale)` is
-/// added to the log-scales. Quaternions are written at unit length, as viewers expect; the rotation is the same. Bands
-/// above those of the rows are zeros.
+/// added to the log-scales. Then [`PlyMeta::upright`] turns positions, quaternions and harmonics, in f64 as well.
+/// Quaternions are written at unit length, as viewers expect; the rotation is the same. Bands above those of the rows are
+/// zeros.
 ///
 /// The header contains the number of rows, which is known only at the end: the header is then rewritten at the same
 /// length. If the number has fewer digits than reserved, a comment is padded with spaces.
@@ -57,6 +59,7 @@ pub struct PlyWriter {
     sh_degree: u8,
     log_scale: f64,
     meta: PlyMeta,
+    turning: GaussianRotation,
     frame: ExportFrame,
     rows_at_most: u64,
     given: u64,
@@ -82,6 +85,7 @@ impl PlyWriter {
             sh_degree,
             log_scale: libm::log(meta.scale),
             meta: meta.clone(),
+            turning: GaussianRotation::new(meta.upright.unwrap_or(Rotation::IDENTITY)),
             frame,
             rows_at_most,
             given: 0,
@@ -122,13 +126,18 @@ impl PlyWriter {
         let (local, scale, origin) = (self.frame == ExportFrame::Local, self.meta.scale, self.meta.origin);
         let mean = c.row(Column::Means, row);
         let scales = c.row(Column::Scales, row);
+        let at = |i: usize| if local { f64::from(mean[i]) } else { f64::from(mean[i]) * scale + origin[i] };
+        let position = self.turning.position([at(0), at(1), at(2)]);
         for i in 0..3 {
-            geometry[i] = if local { mean[i] } else { (f64::from(mean[i]) * scale + origin[i]) as f32 };
+            geometry[i] = position[i] as f32;
             geometry[3 + i] = 0.0;
             tail[1 + i] = if local { scales[i] } else { (f64::from(scales[i]) + self.log_scale) as f32 };
         }
         geometry[6..9].copy_from_slice(c.row(Column::Sh0, row));
-        for (k, coefficient) in c.row(Column::ShN, row).chunks_exact(3).enumerate() {
+        let (mut bands, given) = ([0.0; 45], c.row(Column::ShN, row));
+        bands[..given.len()].copy_from_slice(given);
+        self.turning.harmonics(&mut bands[..given.len()]);
+        for (k, coefficient) in bands[..given.len()].chunks_exact(3).enumerate() {
             for channel in 0..3 {
                 f_rest[channel * coefficients + k] = coefficient[channel];
             }
@@ -136,7 +145,10 @@ impl PlyWriter {
         tail[0] = c.opacities[row];
         let q = c.row(Column::Quats, row);
         let finite = q.iter().all(|v| v.is_finite());
-        tail[4..8].copy_from_slice(&unit_quat([q[0], q[1], q[2], q[3]]));
+        // At unit length first: a turned quaternion of any length might overflow.
+        let unit = unit_quat([q[0], q[1], q[2], q[3]]);
+        let turned = if self.turning.is_identity() { unit } else { unit_quat(self.turning.orientation(unit)) };
+        tail[4..8].copy_from_slice(&turned);
         finite && out.iter().all(|v| v.is_finite())
     }
 
@@ -166,8 +178,9 @@ impl PlyWriter {
 /// The header for `rows` rows, padded to the length of the header for `rows_at_most`.
 fn header_text(sh_degree: u8, rows: u64, rows_at_most: u64, meta: &PlyMeta, frame: ExportFrame) -> String {
     let digits = |n: u64| n.checked_ilog10().unwrap_or(0) as usize;
-    let padding = digits(rows_at_most) - digits(rows);
-    let mut text = format!("ply\nformat binary_little_endian 1.0\nelement vertex {rows}\n");
+    // The number of rows stands in two lines.
+    let padding = 2 * (digits(rows_at_most) - digits(rows));
+    let mut text = format!("ply\nformat binary_little_endian 1.0\ncomment vertices {rows}\n");
     let mut line = |args: std::fmt::Arguments| {
         // Writing to a String cannot fail.
         let _ = text.write_fmt(args);
@@ -183,7 +196,14 @@ fn header_text(sh_degree: u8, rows: u64, rows_at_most: u64, meta: &PlyMeta, fram
     line(format_args!("comment origin {x} {y} {z}"));
     line(format_args!("comment scale {}", meta.scale));
     line(format_args!("comment frame {}", frame.name()));
+    if let Some(upright) = meta.upright {
+        let [w, x, y, z] = upright.quaternion();
+        line(format_args!("comment rotation {w} {x} {y} {z}"));
+        // Brush's words for: y points down.
+        line(format_args!("comment Vertical axis: y"));
+    }
     line(format_args!("comment SplatRenderMode: default"));
+    line(format_args!("element vertex {rows}"));
     for name in property_names(sh_degree) {
         line(format_args!("property float {name}"));
     }

@@ -33,7 +33,7 @@ pub struct SpillDir {
     folder: PathBuf,
     format: SpillFormat,
     warnings: Vec<String>,
-    /// Whether this process created the folder, and so may remove it.
+    /// Whether this run created the folder, and so may remove it.
     made_folder: bool,
     /// Holds the lock.
     lock: File,
@@ -95,6 +95,16 @@ impl SpillDir {
         let format = read()?;
         sign_lock(folder, &lock)?;
         Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder: false, lock })
+    }
+
+    /// Whether this run created the folder.
+    pub fn made_folder(&self) -> bool {
+        self.made_folder
+    }
+
+    /// Takes the folder for this run's: an earlier process of the run created it.
+    pub fn adopt_folder(&mut self) {
+        self.made_folder = true;
     }
 
     /// Whether `folder` contains a spill directory of any version and in any state; changes nothing.

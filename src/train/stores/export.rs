@@ -1,4 +1,4 @@
-//! Exports the Gaussians of a generation as a PLY, page by page, with the trainer's writer.
+//! Exports the Gaussians of a generation as a PLY, page by page, with the trainer's writer, and its transform beside it.
 //!
 //! Invariants: 1. without selection the file equals, byte for byte, the trainer's PLY after the generation's step; 2.
 //! memory is bounded by the budget for any size of scene; 3. the file is written whole or not at all; 4. the selection
@@ -12,13 +12,14 @@ use crate::base::units::format_bytes;
 use crate::checkpoint::run_state::RunState;
 use crate::config::limits::RunOptions;
 use crate::densify::stats::GradHistogram;
-use crate::exchange::ply::{ExportFrame, PlyMeta, PlyWriter};
+use crate::exchange::ply::{ExportFrame, PlyMeta, PlyWriter, write_transform};
 use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::{Access, StoreReader};
 use crate::paging::frames::evict::EvictPolicy;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::scene::columns::{Column, Columns};
 use crate::scene::partition::GiantCut;
+use crate::scene::rotation::Rotation;
 use crate::scene::select::RankSearch;
 use crate::train::error::TrainError;
 use crate::train::memory::host_bytes_peak;
@@ -49,7 +50,7 @@ pub struct ExportRequest {
     pub host_mem: u64,
     /// Number of Gaussians to keep, most visible first.
     pub max_gaussians: Option<u64>,
-    /// Keep Gaussians with means in this box: lower, then upper corner, dataset coordinates.
+    /// Keep Gaussians with means in this box: lower, then upper corner, dataset coordinates (also for an upright PLY).
     pub crop: Option<[f64; 6]>,
     /// Highest SH degree to keep.
     pub sh_degree: Option<u8>,
@@ -108,6 +109,7 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
         );
     }
     let written = writer.finish()?;
+    write_transform(&request.out, &meta, written.frame)?;
     Ok(Exported {
         file: request.out.clone(),
         generation,
@@ -130,6 +132,7 @@ fn meta_of(state: &RunState, options: &RunOptions) -> PlyMeta {
         scale: print.scale,
         scene_radius: f64::from(print.scene_scale) * print.scale,
         frame: options.export_frame,
+        upright: options.up.and_then(Rotation::upright),
         ..PlyMeta::default()
     }
 }

@@ -1,7 +1,8 @@
 //! Imports the Gaussians of a PLY of any size as a new store.
 //!
 //! Rows pass through files beside the store into pages, as a run's first Gaussians do. Values equal those of the file,
-//! bit for bit, in the file's own frame; moments are zero; no step is done.
+//! bit for bit, in the file's own frame; an upright file is turned back to the axes of its dataset, and an export turns it
+//! upright again. Moments are zero; no step is done.
 //!
 //! Invariants: 1. memory is bounded by the budget; 2. pages are a function of the file and `page_rows` alone; 3. the
 //! store is written whole or not at all.
@@ -13,24 +14,32 @@ use crate::base::whole_file::folder_of;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
-use crate::exchange::ply::{ExportFrame, PlyMeta, holds_gaussians, stream_gaussians};
+use crate::config::values::Up;
+use crate::exchange::ply::{
+    ExportFrame, PlyMeta, gaussians_header, holds_gaussians, push_row, stream_gaussians, turn_back,
+};
 use crate::page::format::codec::Codec;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::new_store::{NewStore, refuse_existing};
 use crate::page::versions::slots::SlotLayout;
 use crate::paging::label::label;
+use crate::scene::columns::Columns;
 use crate::scene::page_layout::{PageLayout, capacity_bytes, write_page};
 use crate::scene::partition::first_fill;
+use crate::scene::rotation::VIEWER_UP;
 use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
 use crate::train::gaussian_pages::{GaussianSpace, GaussianWriter};
 use crate::train::memory::host_bytes_peak;
 use crate::train::pages::PageRules;
 use serde::Serialize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Memory besides the rows: threads, the store's buffers and its map, bytes.
 const FIXED_BYTES: u64 = 48 * MIB;
+
+/// Gaussians turned back together.
+const ROWS_AT_ONCE: usize = 1024;
 
 /// Options of an import.
 #[derive(Debug, Clone)]
@@ -78,7 +87,7 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
     let (memory, beside) = (memory_for_rows(request)?, folder_of(&request.out));
     let space = GaussianSpace { folder: beside, memory };
     let mut rows = GaussianWriter::new(&request.file, space);
-    let meta = stream_gaussians(&request.file, &mut |values| rows.push(values))?;
+    let meta = read_rows(&request.file, &mut rows)?;
     let rows = rows.finish()?;
     let (count, sh_degree) = (rows.rows(), rows.sh_degree());
     let (config, options) = options_for(request, sh_degree, &meta)?;
@@ -109,6 +118,26 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
         sh_degree,
         host_bytes_peak: host_bytes_peak().unwrap_or(0),
     })
+}
+
+/// Streams the Gaussians of `file` into `rows`, in the axes of their dataset.
+fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<PlyMeta> {
+    let (header, sh_degree) = gaussians_header(file)?;
+    let none = || Columns::zeros(0, sh_degree);
+    let mut some = none();
+    let mut hand_on = |mut columns: Columns| {
+        turn_back(&mut columns, &header);
+        rows.push_all(&columns)
+    };
+    let meta = stream_gaussians(file, &mut |values| {
+        push_row(&mut some, values);
+        match some.rows() {
+            ROWS_AT_ONCE => hand_on(std::mem::replace(&mut some, none())),
+            _ => Ok(()),
+        }
+    })?;
+    hand_on(some)?;
+    Ok(meta)
 }
 
 /// Encodes rows as pages and stores them.
@@ -155,6 +184,7 @@ fn options_for(request: &ImportRequest, sh_degree: u8, meta: &PlyMeta) -> InputR
         sh_every: 0,
         init_ply: std::path::absolute(&request.file).unwrap_or_else(|_| request.file.clone()).display().to_string(),
         export_frame: meta.frame,
+        up: meta.upright.map_or(Up::Keep, |upright| Up::Along(upright.inverse().apply(VIEWER_UP))),
         ..TrainConfig::default()
     };
     config.check()?;

@@ -22,6 +22,7 @@ const WORDS: &[&str] = &[
     "comment scale 1e-300\n",
     "comment origin 1e300 0 0\n",
     "comment frame local\n",
+    "comment rotation 0.6 0 0.8 0\n",
     "property float f_dc_0\n",
     "list",
 ];

@@ -73,7 +73,7 @@ fn inspecting_a_store_reports_what_the_run_left_and_changes_nothing() {
 #[test]
 fn an_export_is_the_trainers_file_byte_for_byte_and_can_be_a_part_of_it() {
     let bench = Bench::new();
-    let out = bench.stopped(&[]);
+    let out = bench.stopped(&["--up", "keep"]);
     let want = std::fs::read(out.join("point_cloud.ply")).unwrap();
     let file = bench.export(&out, &[]);
     assert!(std::fs::read(&file).unwrap() == want, "the export is not what the trainer wrote");
@@ -84,6 +84,7 @@ fn an_export_is_the_trainers_file_byte_for_byte_and_can_be_a_part_of_it() {
         .export(&out, &["--host-mem", &format!("{}MiB", least.trim_end_matches("MiB").parse::<f64>().unwrap() + 1.0)]);
     assert!(std::fs::read(&file).unwrap() == want, "the budget changed the file");
 
+    // The box is in the coordinates of the dataset, which are those of this file.
     let all = Ply::read(&file);
     let middle = all.median();
     let crop = format!("{},{},{},{},1e9,1e9", middle[0], middle[1], -1e9, 1e9);

@@ -176,7 +176,7 @@ fn a_run_that_was_cut_off_before_its_first_commit_begins_again() {
     assert_eq!(ended(child).status.code(), Some(130));
     let before = files(&out);
     let said = refused(bench.go_on(&[]));
-    assert!(said.contains("not there") && said.contains("start the run again"), "{said}");
+    assert!(said.contains("not there") && said.contains("start a new run"), "{said}");
     assert!(files(&out) == before);
 }
 

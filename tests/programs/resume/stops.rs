@@ -29,6 +29,8 @@ fn a_run_that_is_asked_to_stop_says_how_to_go_on_and_does() {
         assert!(ply(&out) == alone.ply, "{place:?}: the scene is another");
         assert_eq!(logged(&out), alone.logged);
         assert!(place != Place::Memory || !out.join("checkpoint").exists(), "a run that is done leaves no checkpoint");
+        // The run made the folder of its pages, in its first life.
+        assert!(!bench.path("spill").exists(), "{place:?}: an empty folder is left");
         std::fs::remove_dir_all(&out).unwrap();
     }
 }
@@ -40,7 +42,7 @@ fn the_same_command_again_says_that_there_is_a_run() {
     assert!(refused(bench.go_on(&[])).contains("config.toml"));
     bench.stopped(Place::Spill(4000), 2);
     let said = refused(bench.begin(Place::Spill(4000), &[]));
-    assert!(said.contains("--resume") && said.contains("after removing"), "{said}");
+    assert!(said.contains("--resume") && said.contains("another --out") && !said.contains("overwrite"), "{said}");
     // `--overwrite` covers the output, but not a spill directory.
     let said = refused(bench.begin(Place::Spill(4000), &["--overwrite"]));
     assert!(said.contains("checkpoint of another run"), "{said}");
@@ -48,7 +50,12 @@ fn the_same_command_again_says_that_there_is_a_run() {
     std::fs::remove_dir_all(bench.path("spill")).unwrap();
     bench.stopped(Place::Memory, 2);
     let said = refused(bench.begin(Place::Memory, &[]));
+    assert!(said.contains("--resume") && !said.contains("overwrite"), "{said}");
+    // A run that was killed before it wrote a result may be started over.
+    std::fs::rename(bench.path("out/point_cloud.ply"), bench.path("kept.ply")).unwrap();
+    let said = refused(bench.begin(Place::Memory, &[]));
     assert!(said.contains("--resume") && said.contains("start over with --overwrite"), "{said}");
+    std::fs::rename(bench.path("kept.ply"), bench.path("out/point_cloud.ply")).unwrap();
     assert!(bench.path("out/checkpoint/FORMAT").exists());
     // Starting over removes the checkpoint, but not foreign files beside it.
     std::fs::write(bench.path("out/checkpoint/notes.txt"), "mine").unwrap();
