@@ -1,4 +1,4 @@
-//! Vectors that grow with an eighth to spare, but at most [`SPARE_MOST`] values, instead of doubling as `Vec` does, because
+//! Vectors that grow with an eighth to spare, but at most 262,144 values, instead of doubling as `Vec` does, because
 //! a run's memory is bounded and these are its largest parts.
 
 /// Most spare values of a vector. The allocator moves vectors of this length by remapping their memory, so that growing
