@@ -177,7 +177,7 @@ fn a_cap_on_the_gaussians_holds_at_every_step_and_pages_to_the_same_bits() {
     assert_eq!(number(&summary, "gaussians"), number(&whole, "gaussians"));
     let metrics = std::fs::read_to_string(folder.path().join("out/metrics.jsonl")).unwrap();
     let rows: Vec<u64> = metrics.lines().map(|l| number(&serde_json::from_str(l).unwrap(), "gaussians")).collect();
-    assert_eq!(rows.len(), 119, "a line after each step but the first");
+    assert_eq!(rows.len(), 121, "a line after each of 120 steps, and one of the last evaluation");
     assert!(rows.iter().all(|&rows| rows <= cap), "{rows:?}");
     // A histogram bin that does not fit as a whole is left out.
     let end = number(&summary, "gaussians");
