@@ -51,6 +51,8 @@ pub enum Place {
 pub struct Bench {
     folder: TempDir,
     pub scene: PathBuf,
+    /// The argument of `--device`.
+    device: &'static str,
 }
 
 /// The result of an uninterrupted run.
@@ -62,10 +64,17 @@ pub struct Alone {
     pub pages: u64,
     /// The most pages of a step.
     pub fewest: u64,
+    /// The most bytes of device memory; 0 on the CPU.
+    pub device_bytes: u64,
 }
 
 impl Bench {
     pub fn new() -> Bench {
+        Bench::on("cpu")
+    }
+
+    /// A bench whose runs train on this device.
+    pub fn on(device: &'static str) -> Bench {
         let folder = TempDir::new().unwrap();
         let scene = folder.path().join("scene");
         let (views, width, height, points) = (24, 64, 48, 6000);
@@ -73,7 +82,12 @@ impl Bench {
         let city =
             CityOptions { seed: 5, views, width, height, points, blocks, supersample: 1, ..CityOptions::default() };
         write_city(&scene, &city, &|_, _| {}).unwrap();
-        Bench { folder, scene }
+        Bench { folder, scene, device }
+    }
+
+    /// [`BUSY`] with the bench's device.
+    fn flags(&self) -> Vec<&'static str> {
+        BUSY.iter().map(|&word| if word == "cpu" { self.device } else { word }).collect()
     }
 
     pub fn path(&self, name: &str) -> PathBuf {
@@ -84,12 +98,15 @@ impl Bench {
     pub fn alone(&self, more: &[&str]) -> Alone {
         let out = self.path("alone");
         let steps = STEPS.to_string();
-        let output = train(&[&[text(&self.scene), "--out", text(&out), "--steps", &steps], BUSY, more].concat());
+        let output =
+            train(&[&[text(&self.scene), "--out", text(&out), "--steps", &steps], &self.flags()[..], more].concat());
         assert!(output.status.success(), "{}", stderr(&output));
         let done = summary(&out);
         assert_ne!(done["gaussians"], 6000, "no round changed anything, so the test shows little");
         let of = |key: &str| done[key].as_u64().unwrap();
-        let alone = Alone { ply: ply(&out), logged: logged(&out), pages: of("pages"), fewest: of("pages_pinned_max") };
+        let (pages, fewest) = (of("pages"), of("pages_pinned_max"));
+        let device_bytes = lines(&out).iter().filter_map(|line| line["device_bytes_peak"].as_u64()).max().unwrap_or(0);
+        let alone = Alone { ply: ply(&out), logged: logged(&out), pages, fewest, device_bytes };
         std::fs::remove_dir_all(&out).unwrap();
         alone
     }
@@ -104,7 +121,7 @@ impl Bench {
             // A given codec saves the second of measuring the drive.
             args.extend(["--spill-dir", text(&spill), "--frames", &frames, "--spill-codec", "raw"]);
         }
-        spawn(&[&args, BUSY, more].concat())
+        spawn(&[&args, &self.flags()[..], more].concat())
     }
 
     /// Resumes the run in `out`.

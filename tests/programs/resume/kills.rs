@@ -4,8 +4,10 @@
 
 use super::bench::{Bench, Place, ended, lines, logged, ply, succeeded};
 use super::events;
+use crate::support::gpu;
 use crate::support::scenes::{stderr, summary};
 use gsscale::base::rng::{Purpose, Stream};
+use gsscale::gpu::GpuOptions;
 use std::os::unix::process::ExitStatusExt;
 use std::time::Duration;
 
@@ -75,6 +77,46 @@ fn live(bench: &Bench, place: Place, fewest: u64, left: &mut u32, draws: &mut St
         more.extend(frames.iter().flat_map(|f| ["--frames", f.as_str()]));
         child = bench.go_on(&[OFTEN, &more].concat());
     }
+}
+
+/// On a GPU with half the device memory and half the frames that the largest view wants, a step is long and goes in batches,
+/// so most kills hit a pass. The resumed runs keep the budgets and end with the bytes of a run that has plenty of both.
+#[test]
+fn a_run_on_a_gpu_that_is_killed_within_its_passes_ends_with_the_same_bytes() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let bench = Bench::on("gpu");
+    let commits = ["--commit-every", "0.02"];
+    let alone = bench.alone(&commits);
+    let (frames, memory) = ((alone.fewest / 2).max(2), (alone.device_bytes / 2).to_string());
+    let little = [&commits[..], &["--device-mem", &memory]].concat();
+    let mut child = bench.begin(Place::Spill(frames), &little);
+    bench.wait_for_lines(&mut child, 2);
+    let mut draws = Stream::new(11, Purpose::Test, 0, 0);
+    let mut kills = 0;
+    loop {
+        if kills < 6 {
+            let before = logged(&bench.path("out")).len();
+            bench.wait_for_lines(&mut child, before + 1);
+            std::thread::sleep(Duration::from_millis(draws.below(KILL_WITHIN)));
+            let _ = child.kill();
+        }
+        let output = ended(child);
+        if output.status.signal() != Some(9) {
+            assert!(output.status.success(), "{}", stderr(&output));
+            break;
+        }
+        kills += 1;
+        let frames = frames.to_string();
+        child = bench.go_on(&[&little[..], &["--frames", &frames]].concat());
+    }
+    let out = bench.path("out");
+    assert!(kills >= 4, "the run was over after {kills} kills");
+    assert!(ply(&out) == alone.ply, "after {kills} kills the scene is another");
+    assert_eq!(logged(&out), alone.logged);
+    let frames = summary(&out)["frames"].as_u64().unwrap();
+    assert!(frames < alone.fewest, "{frames} frames hold the largest view of {} pages whole", alone.fewest);
 }
 
 /// Counters since the start of a run continue across restarts.
