@@ -1,4 +1,5 @@
-//! Datasets: the source of views. A reader (COLMAP, transforms.json, MatrixCity, Mega-NeRF) fills a [`model::RawScene`]
+//! Datasets: the source of views. A reader (COLMAP, transforms.json, MatrixCity, Mega-NeRF,
+//! OpenSfM, RealityCapture) fills a [`model::RawScene`]
 //! in the dataset's own f64 coordinates; the loader checks the photos against it and converts it to a
 //! [`loader::Dataset`] in the local frame. Pixels are decoded later, a few views ahead of their use, by
 //! [`target_cache`].
@@ -9,15 +10,19 @@ mod colmap_write;
 pub mod frame;
 pub mod import;
 pub mod layout;
+mod left_out;
 pub mod loader;
 pub mod lookalike;
 pub mod masks;
 pub mod mega_nerf;
 pub mod model;
+pub mod opensfm;
 pub mod paths;
 pub mod photo;
 pub mod photo_header;
+mod photos_only;
 pub mod read;
+pub mod reality_capture;
 pub mod resize;
 pub mod synthetic;
 pub mod target_cache;

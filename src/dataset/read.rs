@@ -3,11 +3,14 @@
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::model::RawScene;
 pub use crate::dataset::model::ReadOptions;
-use crate::dataset::{colmap, mega_nerf, transforms};
+use crate::dataset::{colmap, mega_nerf, opensfm, photos_only, reality_capture, transforms};
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 
 /// Reads a scene: a folder with a COLMAP model, with a model for each of `train` and `val`, with `transforms*.json`, in
-/// MatrixCity's or in Mega-NeRF's layout, or such a JSON file. If a folder matches several, the first of these applies.
+/// MatrixCity's or in Mega-NeRF's layout, with OpenSfM's `reconstruction.json` or RealityCapture's CSV, or such a JSON or CSV
+/// file. If a folder matches several, the first of these applies.
 ///
 /// # Errors
 /// Any problem with the files; if nothing matches, the error lists what was searched for.
@@ -19,10 +22,17 @@ pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
 
 fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<RawScene> {
     if is_file {
-        if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) {
-            return transforms::read_transforms(path, options);
-        }
-        return Err(InputError::new(path, "a scene is a folder or a transforms.json", "give the folder that holds it"));
+        let ends_with = |ending: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(ending));
+        return match () {
+            () if ends_with("json") && is_a_list(path) => opensfm::read_opensfm(path, options),
+            () if ends_with("json") => transforms::read_transforms(path, options),
+            () if ends_with("csv") => reality_capture::read_reality_capture(path, options),
+            () => {
+                let problem =
+                    "a scene is a folder, a transforms.json, a reconstruction.json or a CSV of RealityCapture";
+                Err(InputError::new(path, problem, "give the folder that holds it"))
+            }
+        };
     }
     if colmap::looks_like_colmap(path) {
         return colmap::read_colmap(path, options);
@@ -39,13 +49,30 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
     if mega_nerf::looks_like_mega_nerf(path) {
         return mega_nerf::read_mega_nerf(path, options);
     }
+    if opensfm::looks_like_opensfm(path) {
+        return opensfm::read_opensfm(path, options);
+    }
+    if reality_capture::looks_like_reality_capture(path) {
+        return reality_capture::read_reality_capture(path, options);
+    }
+    if let Some(error) = photos_only::error(path) {
+        return Err(error);
+    }
     Err(InputError::new(
         path,
         format!(
             "no scene here; looked for {}, for the same in train and val, for transforms_train.json and transforms.json, for \
-             MatrixCity's pose/block_all and for Mega-NeRF's coordinates.pt",
+             MatrixCity's pose/block_all, for Mega-NeRF's coordinates.pt, for reconstruction.json and opensfm/reconstruction.json, \
+             and for a CSV of RealityCapture",
             colmap::LOOKED_FOR
         ),
         "give the folder that holds 'sparse' and 'images' or a transforms.json",
     ))
+}
+
+/// Whether a JSON file holds a list, as OpenSfM's does, and not an object.
+fn is_a_list(path: &Path) -> bool {
+    let mut head = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(4096).read_to_end(&mut head));
+    read.is_ok() && head.iter().find(|byte| !byte.is_ascii_whitespace()) == Some(&b'[')
 }

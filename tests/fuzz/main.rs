@@ -17,6 +17,8 @@
 //! | `ply` | PLY, text and binary |
 //! | `colmap_binary`, `colmap_text` | the three files of a model |
 //! | `transforms` | transforms.json |
+//! | `opensfm` | reconstruction.json of OpenSfM and OpenDroneMap |
+//! | `reality_capture` | CSV of RealityCapture and RealityScan |
 //! | `image_names` | file names in all of the formats: no path leaves its folder |
 //! | `config` | config.toml, sizes, orders, codecs |
 //! | `torch` | files of PyTorch in Mega-NeRF's layout, and the pickles in them |
@@ -188,6 +190,8 @@ tests!(
     colmap_binary,
     colmap_text,
     transforms,
+    opensfm,
+    reality_capture,
     image_names,
     config,
     torch,

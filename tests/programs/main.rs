@@ -12,6 +12,7 @@ mod ckpt;
 mod cli;
 #[cfg(unix)]
 mod drive_faults;
+mod exports;
 mod extremes;
 mod first_hour;
 mod gpu_train;

@@ -110,6 +110,72 @@ impl TextModel {
             "w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "ply_file_path": "points.ply", "frames": frames,
         });
         std::fs::write(scene.join("transforms.json"), top.to_string()).unwrap();
+        std::fs::write(scene.join("points.ply"), self.points_ply()).unwrap();
+    }
+
+    /// Each view with its rotation and translation, world to camera.
+    fn poses(&self) -> impl Iterator<Item = (&TextView, DMat3, DVec3)> {
+        self.views.iter().map(|v| {
+            let q = DQuat::from_xyzw(v.qvec[1], v.qvec[2], v.qvec[3], v.qvec[0]).normalize();
+            (v, DMat3::from_quat(q), DVec3::from_array(v.tvec))
+        })
+    }
+
+    /// Writes the same scene as OpenSfM does, to `file`, beside an older and smaller reconstruction.
+    pub fn write_reconstruction(&self, file: &Path) {
+        let [w, h] = self.size.map(f64::from);
+        let [fx, fy, cx, cy] = self.pinhole;
+        let side = w.max(h);
+        let shots = self.poses().map(|(v, rotation, translation)| {
+            // The axis is what the rotation leaves alone, the angle follows from its trace.
+            let (axis, angle) = DQuat::from_mat3(&rotation).to_axis_angle();
+            let shot = serde_json::json!({
+                "rotation": (axis * angle).to_array(), "translation": translation.to_array(), "camera": "v2 drone",
+                "orientation": 1, "capture_time": 1.5e9, "gps_position": [1.0, 2.0, 3.0], "vertices": [], "faces": [],
+            });
+            (v.name.clone(), shot)
+        });
+        let points = self.points.iter().zip(&self.colors).enumerate();
+        let points = points.map(|(i, (at, color))| {
+            (format!("{i:07}"), serde_json::json!({ "color": color.map(f64::from), "coordinates": at }))
+        });
+        let camera = serde_json::json!({
+            "projection_type": "brown", "width": w as u32, "height": h as u32, "focal_x": fx / side, "focal_y": fy / side,
+            "c_x": (cx - w / 2.0) / side, "c_y": (cy - h / 2.0) / side,
+            "k1": 0.0, "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0,
+        });
+        let whole = serde_json::json!({
+            "cameras": { "v2 drone": camera }, "shots": shots.collect::<serde_json::Map<_, _>>(),
+            "points": points.collect::<serde_json::Map<_, _>>(), "reference_lla": { "latitude": 1, "longitude": 2, "altitude": 0 },
+        });
+        let lost = serde_json::json!({ "cameras": {}, "shots": {}, "points": {} });
+        std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+        std::fs::write(file, serde_json::json!([lost, whole]).to_string()).unwrap();
+    }
+
+    /// Writes the same scene as RealityCapture does, to `file`, and its points to points.ply beside it.
+    pub fn write_reality_capture(&self, file: &Path) {
+        let [w, h] = self.size.map(f64::from);
+        let [fx, _, cx, cy] = self.pinhole;
+        let side = w.max(h);
+        let mut csv = String::from("#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\r\n");
+        for (v, rotation, translation) in self.poses() {
+            let [x, y, z] = (-(rotation.transpose() * translation)).to_array();
+            // Camera to world with axes right-up-back is Rz(-heading) Rx(pitch) Ry(roll); its last row is
+            // (-cos(pitch) sin(roll), sin(pitch), cos(pitch) cos(roll)), its second column
+            // (sin(heading) cos(pitch), cos(heading) cos(pitch), sin(pitch)).
+            let [right, up, back] = [rotation.row(0), -rotation.row(1), -rotation.row(2)];
+            let angles = [up.x.atan2(up.y), up.z.asin(), (-right.z).atan2(back.z)].map(f64::to_degrees);
+            let [heading, pitch, roll] = angles;
+            let [f, px, py] = [fx / side * 36.0, (cx - w / 2.0) / side, (cy - h / 2.0) / side];
+            write!(csv, "{},{x},{y},{z},{heading},{pitch},{roll},{f},{px},{py},0,0,0,0,0,0\r\n", v.name).unwrap();
+        }
+        std::fs::write(file, csv).unwrap();
+        std::fs::write(file.with_file_name("points.ply"), self.points_ply()).unwrap();
+    }
+
+    /// The points as a PLY.
+    fn points_ply(&self) -> String {
         let mut ply = format!("ply\nformat ascii 1.0\nelement vertex {}\n", self.points.len());
         for property in ["double x", "double y", "double z", "uchar red", "uchar green", "uchar blue"] {
             writeln!(ply, "property {property}").unwrap();
@@ -118,7 +184,7 @@ impl TextModel {
         for (p, c) in self.points.iter().zip(&self.colors) {
             writeln!(ply, "{} {} {} {} {} {}", p[0], p[1], p[2], c[0], c[1], c[2]).unwrap();
         }
-        std::fs::write(scene.join("points.ply"), ply).unwrap();
+        ply
     }
 
     /// Turns the whole scene about its origin.

@@ -20,7 +20,7 @@
 mod intrinsics;
 mod json;
 mod matrix_city;
-mod photos;
+pub(in crate::dataset) mod photos;
 pub(in crate::dataset) mod pose;
 
 use crate::base::error::{InputError, InputResult};

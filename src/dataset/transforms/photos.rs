@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 const ENDINGS: [&str; 7] = ["", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG"];
 
 /// A photo named by a frame.
-pub(super) struct Photo {
+pub(in crate::dataset) struct Photo {
     /// Cleaned name with its ending.
     pub name: String,
     pub path: PathBuf,
@@ -32,7 +32,7 @@ fn places(folder: &Path, images: Option<&str>, name: &str) -> Vec<PathBuf> {
 
 /// Searches for the photo `stated`. If not found: the first place, with `.png` if the name has no ending. Refusals are
 /// returned as text.
-pub(super) fn find_photo(folder: &Path, images: Option<&str>, stated: &str) -> Result<Photo, String> {
+pub(in crate::dataset) fn find_photo(folder: &Path, images: Option<&str>, stated: &str) -> Result<Photo, String> {
     let name = clean_name(stated)?;
     let places = places(folder, images, &name);
     for place in &places {
@@ -55,7 +55,7 @@ fn with_ending(path: &Path, ending: &str) -> PathBuf {
 }
 
 /// Width and height from the photo's header; nothing is decoded.
-pub(super) fn read_size(path: &Path) -> InputResult<(u64, u64)> {
+pub(in crate::dataset) fn read_size(path: &Path) -> InputResult<(u64, u64)> {
     let header = read_header(path).map_err(|mut error| {
         error.problem.insert_str(0, "the photo's size cannot be read: ");
         error

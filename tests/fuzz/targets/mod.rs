@@ -14,7 +14,7 @@ pub use map::{map_values, run_state};
 pub use pages::{page_payload, slot_header};
 pub use photos::{decoded, photo, pictures};
 pub use ply::ply;
-pub use scenes::{colmap_binary, colmap_text, image_names, transforms};
+pub use scenes::{colmap_binary, colmap_text, image_names, opensfm, reality_capture, transforms};
 pub use store_dir::store_dir;
 pub use torch::torch;
 

@@ -1,4 +1,4 @@
-//! COLMAP models, transforms.json, and the names in both.
+//! COLMAP models, transforms.json, OpenSfM's reconstruction.json, RealityCapture's CSV, and the names in all of them.
 
 use super::{split_mode, with_mode};
 use crate::Target;
@@ -125,6 +125,50 @@ fn run_transforms(input: &[u8]) {
     read_and_check(scene.path());
 }
 
+fn reconstruction(name: &str) -> String {
+    format!(
+        r#"[{{"cameras": {{"c": {{"projection_type": "brown", "width": 640, "height": 480, "focal_x": 0.8, "focal_y": 0.81,
+        "c_x": 0.01, "k1": -0.1, "p1": 0.001}}, "d": {{"projection_type": "fisheye", "width": 64, "height": 48, "focal": 0.5}}}},
+        "shots": {{{name}: {{"rotation": [0.1, -3, 1e-9], "translation": [1, 2.5, 3e1], "camera": "c", "scale": 1.0}},
+        "b.jpg": {{"rotation": [0, 0, 0], "translation": [0, 0, 0], "camera": "d", "gps_position": [1, 2, 3]}}}},
+        "points": {{"1": {{"color": [1.0, 2.0, 300.0], "coordinates": [0.5, 1e16, 2]}}, "2": {{"coordinates": [1, 2, 3]}}}}}},
+        {{"cameras": {{}}, "shots": {{}}}}]"#
+    )
+}
+
+pub fn opensfm() -> Target {
+    let words =
+        &["null", "[[[[[[[[", "{\"a\":", "\"shots\"", "\"../x\"", "1e400", "perspective", "spherical", "fisheye624"];
+    let seeds = [reconstruction("\"a.jpg\""), "[]".to_string()].map(String::into_bytes).to_vec();
+    Target { name: "opensfm", run: run_opensfm, seeds, words, cases: 4_000, memory: MEMORY }
+}
+
+fn run_opensfm(input: &[u8]) {
+    let scene = scratch();
+    std::fs::create_dir(scene.path().join("opensfm")).unwrap();
+    std::fs::write(scene.path().join("opensfm/reconstruction.json"), input).unwrap();
+    read_and_check(scene.path());
+}
+
+const CSV_HEADER: &str = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2";
+
+pub fn reality_capture() -> Target {
+    let whole = format!("\u{feff}{CSV_HEADER}\r\na.png,1,2,3e1,-170.5,89,-22.7,14.2,-9.4e-4,2e-4,3e-3,0,0,0,0,0\r\n");
+    let short = "#cameras 1\n#name,x,y,alt,heading,pitch,roll,f\na.png,1,2,3,0,0,0,20\nb.png,1,2,3,0,0,0,20\n";
+    let words = &["nan", "inf", "1e400", "../", ",,", "\"", "#name", "\u{feff}", "\r", ";"];
+    let seeds = [whole, short.to_string()].map(String::into_bytes).to_vec();
+    Target { name: "reality_capture", run: run_reality_capture, seeds, words, cases: 4_000, memory: MEMORY }
+}
+
+fn run_reality_capture(input: &[u8]) {
+    let scene = scratch();
+    // The header of a picture of 64x48 pixels.
+    let header = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x40\0\0\0\x30\x08\x02\0\0\0\xad\x5e\xe8\xb6";
+    std::fs::write(scene.path().join("a.png"), header).unwrap();
+    std::fs::write(scene.path().join("cameras.csv"), input).unwrap();
+    read_and_check(scene.path());
+}
+
 /// A name in every place where a file may contain one.
 pub fn image_names() -> Target {
     let names =
@@ -166,4 +210,6 @@ fn run_name(input: &[u8]) {
             "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}],
     });
     run_transforms(text.to_string().as_bytes());
+    run_opensfm(reconstruction(&serde_json::json!(name).to_string()).as_bytes());
+    run_reality_capture(format!("{CSV_HEADER}\n{name},1,2,3,0,0,0,20,0,0,0,0,0,0,0,0\n").as_bytes());
 }

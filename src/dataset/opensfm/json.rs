@@ -1,0 +1,147 @@
+//! The content of a `reconstruction.json`, value by value: cameras, shots and points of each reconstruction.
+//!
+//! Not here: what the numbers mean ([`super`]).
+//!
+//! Invariants: 1. for any content the result is a value or an error with line and column; 2. memory holds names, poses and
+//! points, not the observations, meshes and metadata around them: at most some 16 times the size of the file.
+
+use crate::base::error::{InputError, InputResult};
+use crate::dataset::checks::MAX_COORDINATE;
+use crate::dataset::model::PointCloud;
+use serde::Deserialize;
+use serde::de::{Deserializer, Error, IgnoredAny, MapAccess, Visitor};
+use std::collections::BTreeMap;
+use std::fmt::Formatter;
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+/// Largest file read, bytes: a survey of 20,000 photos has 2 GB.
+const MAX_BYTES: u64 = 4 << 30;
+
+/// A camera; a number that is not in the file is 0.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(default)]
+pub(super) struct Camera {
+    /// The name of the lens model; empty stands for `perspective`.
+    pub projection_type: String,
+    pub width: f64,
+    pub height: f64,
+    pub focal: f64,
+    pub focal_x: f64,
+    pub focal_y: f64,
+    pub c_x: f64,
+    pub c_y: f64,
+    pub k1: f64,
+    pub k2: f64,
+    pub k3: f64,
+    pub k4: f64,
+    pub k5: f64,
+    pub k6: f64,
+    pub p1: f64,
+    pub p2: f64,
+    pub s0: f64,
+    pub s1: f64,
+    pub s2: f64,
+    pub s3: f64,
+}
+
+/// A photo with its pose.
+#[derive(Debug, Clone, Deserialize)]
+pub(super) struct Shot {
+    /// Axis times angle in radians, world to camera.
+    pub rotation: [f64; 3],
+    /// World to camera.
+    pub translation: [f64; 3],
+    /// Name of its camera.
+    pub camera: String,
+}
+
+/// Photos whose poses are in one frame.
+#[derive(Debug, Default, Deserialize)]
+pub(super) struct Reconstruction {
+    pub cameras: BTreeMap<String, Camera>,
+    #[serde(deserialize_with = "shots")]
+    pub shots: Vec<(String, Shot)>,
+    #[serde(default, deserialize_with = "points")]
+    pub points: Points,
+}
+
+/// Points, without those that are too far away for a coordinate.
+#[derive(Debug, Default)]
+pub(super) struct Points {
+    pub cloud: PointCloud,
+    pub dropped: usize,
+}
+
+/// Reads all reconstructions of a file.
+pub(super) fn load(path: &Path) -> InputResult<Vec<Reconstruction>> {
+    let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
+    let length = file.metadata().map_err(|e| InputError::io(path, "reading", &e))?.len();
+    if length > MAX_BYTES {
+        let problem = format!("the file is larger than {} GiB", MAX_BYTES >> 30);
+        return Err(InputError::new(path, problem, "export a COLMAP model, or split the project"));
+    }
+    serde_json::from_reader(BufReader::with_capacity(1 << 20, file)).map_err(|e| {
+        if let Some(kind) = e.io_error_kind() {
+            return InputError::io(path, "reading", &kind.into());
+        }
+        let remedy = "it must be a reconstruction.json of OpenSfM or OpenDroneMap: copy it again";
+        InputError::new(path, format!("cannot be read: {e}"), remedy).at(format!(
+            "line {} column {}",
+            e.line(),
+            e.column()
+        ))
+    })
+}
+
+/// Passes the entries of an object to `take`, by name.
+struct Entries<V, F: FnMut(String, V)> {
+    what: &'static str,
+    take: F,
+    values: std::marker::PhantomData<V>,
+}
+
+impl<'de, V: Deserialize<'de>, F: FnMut(String, V)> Visitor<'de> for Entries<V, F> {
+    type Value = ();
+    fn expecting(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        write!(f, "an object of {}s", self.what)
+    }
+    fn visit_map<A: MapAccess<'de>>(mut self, mut of: A) -> Result<(), A::Error> {
+        while let Some(name) = of.next_key::<String>()? {
+            // The text of the error ends with line and column, which serde_json takes over.
+            let value = of.next_value().map_err(|e| A::Error::custom(format!("{} {name:?}: {e}", self.what)))?;
+            (self.take)(name, value);
+        }
+        Ok(())
+    }
+}
+
+fn shots<'de, D: Deserializer<'de>>(source: D) -> Result<Vec<(String, Shot)>, D::Error> {
+    let mut shots = Vec::new();
+    let take = |name, shot| shots.push((name, shot));
+    source.deserialize_map(Entries { what: "shot", take, values: std::marker::PhantomData })?;
+    Ok(shots)
+}
+
+fn points<'de, D: Deserializer<'de>>(source: D) -> Result<Points, D::Error> {
+    #[derive(Deserialize)]
+    struct Point {
+        coordinates: [f64; 3],
+        color: Option<[f64; 3]>,
+        #[serde(rename = "observations")]
+        _observations: Option<IgnoredAny>,
+    }
+    let mut points = Points::default();
+    let take = |_, point: Point| {
+        if point.coordinates.iter().any(|x| x.abs() > MAX_COORDINATE) {
+            points.dropped += 1;
+            return;
+        }
+        points.cloud.positions.push(point.coordinates);
+        // Without a colour: grey.
+        points.cloud.colors.push(point.color.unwrap_or([128.0; 3]).map(|c| c.round() as u8));
+    };
+    source.deserialize_map(Entries { what: "point", take, values: std::marker::PhantomData })?;
+    Ok(points)
+}

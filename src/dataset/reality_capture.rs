@@ -1,0 +1,242 @@
+//! Reads the CSV that RealityCapture and RealityScan export as "Internal/External camera parameters":
+//! `#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2`, a line for each photo. The photos lie in `images/`
+//! beside the CSV or in its folder. It holds no points: `points.ply` beside it, in the same coordinates, is read where it
+//! exists; otherwise give points with `--init-ply`, or random ones are drawn.
+//!
+//! Conventions: `x, y, alt` is the place of the camera, in axes east-north-up. With all angles 0 it looks down, north on
+//! top. Roll turns about its y axis first, pitch about x then, heading clockwise about the vertical last; degrees. `f` is
+//! the focal length for a picture of 36 mm, `px, py` the principal point from the centre in units of the longer side.
+//! `k1..k3` and `t1, t2` are OpenCV's k1..k3 and p1, p2; `k4`, of the eighth power, has no counterpart and is refused.
+//!
+//! Invariants: 1. for any content of the file the result is a scene or an [`InputError`] that names file and line; 2. only a
+//! bad pose or, when allowed, a missing photo drops a view, with a warning that names it.
+
+use super::checks::{checked_intrinsics, sort_views};
+use super::left_out::LeftOut;
+use super::model::{Lens, RawScene, RawView, ReadOptions};
+use super::transforms::photos::{find_photo, read_size};
+use super::transforms::pose::make_pose;
+use crate::base::error::{InputError, InputResult};
+use glam::{DMat3, DVec3};
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// Largest file read, bytes; a photo takes about 300.
+const MAX_BYTES: u64 = 128 << 20;
+/// Bytes in which the header must begin, to be looked for in the CSV files of a folder.
+const HEAD_BYTES: u64 = 4096;
+/// Columns that a line must have; the others are 0 where they are missing.
+const REQUIRED: [&str; 8] = ["name", "x", "y", "alt", "heading", "pitch", "roll", "f"];
+/// The film to which `f` refers, millimetres.
+const FILM: f64 = 36.0;
+const EXPORT: &str = "export it again: Registration, 'Internal/External camera parameters'";
+
+/// Whether [`read_reality_capture`] would find something in this folder.
+pub fn looks_like_reality_capture(folder: &Path) -> bool {
+    !files_in(folder).is_empty()
+}
+
+/// Reads a folder with such a CSV, or the CSV.
+///
+/// # Errors
+/// No such file or several, columns that are missing or not numbers, impossible cameras, a lens with `k4`, a photo that is
+/// missing (unless allowed), no view left.
+pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
+    let file = if path.is_file() { path.to_path_buf() } else { only_file(path)? };
+    let folder = file.parent().unwrap_or(Path::new(""));
+    let text = read_text(&file)?;
+    let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
+    let header = lines.find_map(|(_, line)| Header::of(line));
+    let header = header.ok_or_else(|| InputError::new(&file, "no line of column names '#name,x,y,alt,...'", EXPORT))?;
+    if let Some(missing) = REQUIRED.iter().find(|name| header.place(name).is_none()) {
+        return Err(InputError::new(&file, format!("there is no column '{missing}'"), EXPORT));
+    }
+    let (mut scene, mut left_out) = (RawScene::default(), LeftOut::default());
+    for (number, line) in lines.filter(|(_, line)| !line.starts_with('#')) {
+        let line = Line { file: &file, number: number + 1, header: &header, cells: line.split(',').collect() };
+        line.add_view(folder, options, &mut scene.views, &mut left_out)?;
+    }
+    left_out.report(&file, options, scene.views.len(), &mut scene.warnings)?;
+    sort_views(&file, &mut scene.views)?;
+    scene.points_path = Some(folder.join("points.ply")).filter(|path| path.is_file());
+    Ok(scene)
+}
+
+/// The CSV files of a folder that have the header of this format.
+fn files_in(folder: &Path) -> Vec<PathBuf> {
+    let has_header = |path: &PathBuf| {
+        let mut head = Vec::new();
+        let read = File::open(path).and_then(|file| file.take(HEAD_BYTES).read_to_end(&mut head));
+        read.is_ok() && String::from_utf8_lossy(&head).lines().any(|line| Header::of(line).is_some())
+    };
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let is_csv = |path: &PathBuf| path.extension().is_some_and(|e| e.eq_ignore_ascii_case("csv")) && path.is_file();
+    let mut files: Vec<PathBuf> = entries.filter(is_csv).filter(has_header).collect();
+    files.sort();
+    files
+}
+
+fn only_file(folder: &Path) -> InputResult<PathBuf> {
+    let mut files = files_in(folder);
+    let Some(file) = files.pop() else {
+        return Err(InputError::new(folder, "no CSV of RealityCapture here", EXPORT));
+    };
+    match files.pop() {
+        None => Ok(file),
+        Some(other) => {
+            let problem = format!("two CSV files with camera poses: {} and {}", other.display(), file.display());
+            Err(InputError::new(folder, problem, "name the CSV itself instead of its folder"))
+        }
+    }
+}
+
+fn read_text(file: &Path) -> InputResult<String> {
+    let mut bytes = Vec::new();
+    let opened = File::open(file).map_err(|e| InputError::io(file, "opening", &e))?;
+    opened.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(|e| InputError::io(file, "reading", &e))?;
+    if bytes.len() as u64 > MAX_BYTES {
+        return Err(InputError::new(file, format!("the file is larger than {} MiB", MAX_BYTES >> 20), EXPORT));
+    }
+    String::from_utf8(bytes).map_err(|_| InputError::new(file, "the file is not UTF-8 text", EXPORT))
+}
+
+/// The names of the columns.
+struct Header {
+    names: Vec<String>,
+}
+
+impl Header {
+    /// The header in this line, if it is one: it begins with the name and the place.
+    fn of(line: &str) -> Option<Header> {
+        let names = line.trim_start_matches('\u{feff}').split(',');
+        let names: Vec<String> = names.map(|name| name.trim().trim_start_matches('#').to_ascii_lowercase()).collect();
+        let has = |name: &str| names.iter().any(|other| other == name);
+        (names.first().is_some_and(|name| name == "name") && has("x") && has("alt")).then_some(Header { names })
+    }
+
+    fn place(&self, name: &str) -> Option<usize> {
+        self.names.iter().position(|other| other == name)
+    }
+}
+
+/// A line of the file.
+struct Line<'a> {
+    file: &'a Path,
+    number: usize,
+    header: &'a Header,
+    cells: Vec<&'a str>,
+}
+
+impl Line<'_> {
+    fn error(&self, problem: impl Into<String>, remedy: &str) -> InputError {
+        InputError::new(self.file, problem, remedy).at(format!("line {}", self.number))
+    }
+
+    /// The number in a column, 0 if the header has no such column.
+    fn number(&self, name: &str) -> InputResult<f64> {
+        let Some(place) = self.header.place(name) else { return Ok(0.0) };
+        let cell = self.cells.get(place).map_or("", |cell| cell.trim());
+        cell.parse().map_err(|_| self.error(format!("{cell:?} in column '{name}' is not a number"), EXPORT))
+    }
+
+    fn numbers<const N: usize>(&self, names: [&str; N]) -> InputResult<[f64; N]> {
+        let mut numbers = [0.0; N];
+        for (number, name) in numbers.iter_mut().zip(names) {
+            *number = self.number(name)?;
+        }
+        Ok(numbers)
+    }
+
+    fn add_view(
+        &self,
+        folder: &Path,
+        options: &ReadOptions,
+        views: &mut Vec<RawView>,
+        left_out: &mut LeftOut,
+    ) -> InputResult<()> {
+        let stated = self.header.place("name").and_then(|place| self.cells.get(place)).map_or("", |name| name.trim());
+        let stays = "names must stay in the folder of the photos: export with plain file names";
+        let photo = find_photo(folder, options.images.as_deref().or(Some("images")), stated)
+            .map_err(|problem| self.error(problem, stays))?;
+        let [k1, k2, k3, k4, t1, t2] = self.numbers(["k1", "k2", "k3", "k4", "t1", "t2"])?;
+        if k4 != 0.0 {
+            let remedy = "choose the distortion model Brown3 before the export, or export undistorted photos";
+            return Err(self.error(format!("k4 = {k4} is a lens of the eighth power, which is not supported"), remedy));
+        }
+        let [f, px, py] = self.numbers(["f", "px", "py"])?;
+        let angles = self.numbers(["heading", "pitch", "roll"])?;
+        let centre = self.numbers(["x", "y", "alt"])?;
+        if !photo.exists {
+            left_out.missing.push(photo.name);
+            return Ok(());
+        }
+        let size = read_size(&photo.path)?;
+        let side = size.0.max(size.1) as f64;
+        let principal = [size.0 as f64 / 2.0 + px * side, size.1 as f64 / 2.0 + py * side];
+        let lens = Lens::Radial([k1, k2, t1, t2, k3, 0.0, 0.0, 0.0]);
+        let intrinsics = checked_intrinsics(size, [f * side / FILM; 2], principal, lens)
+            .map_err(|problem| self.error(problem, EXPORT))?;
+        match make_pose(&camera_to_world(angles, centre)) {
+            None => left_out.bad_poses.push(photo.name),
+            Some(pose) => views.push(RawView {
+                name: photo.name,
+                image_path: photo.path,
+                intrinsics,
+                pose,
+                mask_path: None,
+                split: None,
+            }),
+        }
+        Ok(())
+    }
+}
+
+/// Camera to world with the camera's axes right-up-back, from heading, pitch and roll in degrees.
+fn camera_to_world([heading, pitch, roll]: [f64; 3], centre: [f64; 3]) -> [[f64; 4]; 4] {
+    let turn = |degrees: f64| {
+        let angle = degrees.to_radians();
+        (libm::sin(angle), libm::cos(angle))
+    };
+    let (s, c) = turn(-heading);
+    let about_z = DMat3::from_cols(DVec3::new(c, s, 0.0), DVec3::new(-s, c, 0.0), DVec3::Z);
+    let (s, c) = turn(pitch);
+    let about_x = DMat3::from_cols(DVec3::X, DVec3::new(0.0, c, s), DVec3::new(0.0, -s, c));
+    let (s, c) = turn(roll);
+    let about_y = DMat3::from_cols(DVec3::new(c, 0.0, -s), DVec3::Y, DVec3::new(s, 0.0, c));
+    let rotation = about_z * about_x * about_y;
+    let row = |r: usize| [rotation.row(r).x, rotation.row(r).y, rotation.row(r).z, centre[r]];
+    [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    /// The directions of view and of the picture's top.
+    fn seen(angles: [f64; 3]) -> [DVec3; 2] {
+        let pose = make_pose(&camera_to_world(angles, [0.0; 3])).unwrap();
+        let back = pose.rotation.transpose();
+        [back * DVec3::Z, back * DVec3::NEG_Y]
+    }
+
+    #[test]
+    fn cameras_look_where_the_angles_say() {
+        let (east, north, up) = (DVec3::X, DVec3::Y, DVec3::Z);
+        for (angles, view, top) in [
+            ([0.0, 0.0, 0.0], -up, north),
+            ([90.0, 0.0, 0.0], -up, east),
+            ([0.0, 90.0, 0.0], north, up),
+            ([90.0, 90.0, 0.0], east, up),
+            ([180.0, 90.0, 0.0], -north, up),
+            // A roll is about the axis that points north in a camera that looks down: the wings of an aircraft tilt.
+            ([0.0, 0.0, 90.0], -east, north),
+            ([0.0, 90.0, 90.0], -east, up),
+        ] {
+            let [v, t] = seen(angles);
+            // A few roundings.
+            assert!((v - view).length() < 1e-12 && (t - top).length() < 1e-12, "{angles:?}: {v} {t}");
+        }
+    }
+}
