@@ -1,9 +1,10 @@
-//! Scalars as TensorBoard event files.
+//! Scalars and pictures as TensorBoard event files.
 //!
 //! An event file is a sequence of records: length (u64), its checksum, the bytes, their checksum; the bytes are a
 //! protocol-buffer message `Event { wall_time = 1: double, step = 2: int64, file_version = 3: string, summary = 5 }` with
-//! `Summary { value = 1: repeated { tag = 1: string, simple_value = 2: float } }`. Only these fields are written, by hand:
-//! a dozen lines in place of a code generator. A resumed run writes `session_log = 7 { status = 1: START }` with its
+//! `Summary { value = 1: repeated { tag = 1: string, simple_value = 2: float, image = 4 } }` and
+//! `Image { height = 1, width = 2, colorspace = 3, encoded_image_string = 4: bytes }`. Only these fields are written, by
+//! hand: some twenty lines in place of a code generator. A resumed run writes `session_log = 7 { status = 1: START }` with its
 //! first step, upon which TensorBoard discards what earlier files say of that step and later ones.
 //!
 //! Invariants: 1. every record is complete when [`EventFile::write`] returns, so a reader that follows the file sees
@@ -17,6 +18,9 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 /// `SessionLog { status = 1: START }`.
 const SESSION_START: [u8; 2] = [0x08, 0x01];
+
+/// The colour space RGB.
+const RGB: u32 = 3;
 
 /// An event file that records are appended to.
 pub struct EventFile {
@@ -62,6 +66,25 @@ impl EventFile {
             bytes(&mut summary, 1, &entry);
         }
         let mut message = event_of(step);
+        bytes(&mut message, 5, &summary);
+        self.record(&message)
+    }
+
+    /// Appends a picture to a step: the bytes of a PNG of `width` times `height` pixels in RGB.
+    ///
+    /// # Errors
+    /// The disk fails.
+    pub fn write_picture(&mut self, step: u32, tag: &str, (width, height): (u32, u32), png: &[u8]) -> InputResult<()> {
+        let mut image = Vec::with_capacity(png.len() + 32);
+        for (field, value) in [(1, height), (2, width), (3, RGB)] {
+            key(&mut image, field, 0);
+            varint(&mut image, u64::from(value));
+        }
+        bytes(&mut image, 4, png);
+        let (mut entry, mut summary, mut message) = (Vec::new(), Vec::new(), event_of(step));
+        bytes(&mut entry, 1, tag.as_bytes());
+        bytes(&mut entry, 4, &image);
+        bytes(&mut summary, 1, &entry);
         bytes(&mut message, 5, &summary);
         self.record(&message)
     }
@@ -156,7 +179,7 @@ fn bytes(out: &mut Vec<u8>, field: u64, value: &[u8]) {
     out.extend_from_slice(value);
 }
 
-/// Castagnoli's checksum (CRC-32C), bit by bit: records are only a few hundred bytes.
+/// Castagnoli's checksum (CRC-32C), bit by bit: a run writes a few hundred bytes a record, and a dozen pictures once.
 fn crc32c(data: &[u8]) -> u32 {
     !data.iter().fold(!0u32, |crc, &byte| {
         (0..8).fold(crc ^ u32::from(byte), |c, _| (c >> 1) ^ (0x82f6_3b78 & 0u32.wrapping_sub(c & 1)))

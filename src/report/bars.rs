@@ -10,11 +10,11 @@ const WIDTH: u32 = 560;
 /// Height of a bar with the gap below it.
 const BAR: i32 = 30;
 /// Height of the title.
-const TITLE: i32 = 34;
+const TITLE: i32 = 40;
 /// Width of the names, about twelve characters.
-const NAMES: i32 = 90;
+const NAMES: i32 = 110;
 /// Width of the value beside the longest bar.
-const VALUES: i32 = 80;
+const VALUES: i32 = 90;
 
 /// Named values, one bar each.
 #[derive(Debug, Clone)]
@@ -33,7 +33,7 @@ impl Bars {
 
     fn draw(&self, root: &Canvas<'_>) -> Result<(), String> {
         let anchor = |h| Pos::new(h, VPos::Center);
-        let title = TextStyle::from(("sans-serif", 16)).pos(anchor(HPos::Center));
+        let title = TextStyle::from(("sans-serif", 20)).pos(anchor(HPos::Center));
         root.draw(&Text::new(self.title.clone(), (WIDTH as i32 / 2, TITLE / 2), title)).map_err(text)?;
         let finite = |v: &Option<f64>| v.filter(|v| v.is_finite());
         let most = self.bars.iter().filter_map(|(_, v, _)| finite(v)).fold(0.0, f64::max);
@@ -41,13 +41,13 @@ impl Bars {
         for (i, (name, value, written)) in self.bars.iter().enumerate() {
             let y = TITLE + BAR * i as i32;
             let middle = y + BAR / 2 - 3;
-            let style = TextStyle::from(("sans-serif", 13)).pos(anchor(HPos::Right));
+            let style = TextStyle::from(("sans-serif", 15)).pos(anchor(HPos::Right));
             root.draw(&Text::new(name.clone(), (NAMES - 8, middle), style)).map_err(text)?;
             let length =
                 finite(value).map_or(0, |v| if most > 0.0 { (v.max(0.0) / most * room).round() as i32 } else { 0 });
             let bar = [(NAMES, y), (NAMES + length.max(1), y + BAR - 6)];
             root.draw(&Rectangle::new(bar, COLORS[0].filled())).map_err(text)?;
-            let style = TextStyle::from(("sans-serif", 13)).color(&AXIS).pos(anchor(HPos::Left));
+            let style = TextStyle::from(("sans-serif", 15)).color(&AXIS).pos(anchor(HPos::Left));
             root.draw(&Text::new(written.clone(), (NAMES + length + 6, middle), style)).map_err(text)?;
         }
         Ok(())

@@ -36,6 +36,15 @@ pub(super) const COLORS: [RGBColor; 13] = [
     RGBColor(230, 120, 170),
     RGBColor(0, 70, 60),
 ];
+/// Sizes of texts, SVG units: a chart is about 500 pixels wide on a large screen, and 330 on a phone.
+const TITLE_SIZE: u32 = 20;
+const TEXT_SIZE: u32 = 16;
+const LABEL_SIZE: u32 = 13;
+/// Lines of the grid; the style of the page names this colour, as that of [`AXIS`] and white, for dark screens.
+const GRID: RGBColor = RGBColor(224, 224, 224);
+/// Points of a curve that [`smoothed`] averages over: this share of them.
+const SMOOTH_SHARE: usize = 20;
+
 /// Brightness of the colours in each round through [`COLORS`]: darker below 1, lighter above 1.
 const SHADES: [f64; 4] = [1.0, 0.6, 1.5, 0.3];
 
@@ -47,12 +56,21 @@ pub(super) const AXIS: RGBColor = RGBColor(97, 97, 97);
 pub enum Mark {
     /// A line through the points.
     Line,
+    /// A pale thin line, behind a line of the same values smoothed.
+    Faint,
     /// A dot at every point.
     Dots,
     /// A ring at every point.
     Rings,
     /// A line with dots.
     LineAndDots,
+}
+
+impl Mark {
+    /// A line without dots.
+    fn is_line(self) -> bool {
+        matches!(self, Mark::Line | Mark::Faint)
+    }
 }
 
 /// A named sequence of points.
@@ -151,11 +169,11 @@ impl Chart {
 
     /// Draws the legend of a wide chart.
     fn draw_legend(&self, root: &Canvas<'_>) -> Result<(), String> {
-        let style = TextStyle::from(("sans-serif", 13)).pos(Pos::new(HPos::Left, VPos::Center));
+        let style = TextStyle::from(("sans-serif", TEXT_SIZE)).pos(Pos::new(HPos::Left, VPos::Center));
         for (row, series) in self.named().enumerate() {
             let (y, color) = ((LEGEND_TOP + LEGEND_ROW * row as u32) as i32, color(series.color));
             match series.mark {
-                Mark::Line => root.draw(&PathElement::new([(0, y), (12, y)], color.stroke_width(2))),
+                Mark::Line | Mark::Faint => root.draw(&PathElement::new([(0, y), (12, y)], color.stroke_width(2))),
                 Mark::Rings => root.draw(&Circle::new((6, y), 4, color.stroke_width(2))),
                 Mark::Dots | Mark::LineAndDots => root.draw(&Circle::new((6, y), 4, color.filled())),
             }
@@ -179,11 +197,12 @@ impl Chart {
     fn draw_plot(&self, root: &Canvas<'_>) -> Result<(), String> {
         let ([x0, x1], [y0, y1]) = self.ranges();
         let mut builder = ChartBuilder::on(root);
-        builder.margin(8).margin_right(18).x_label_area_size(38).y_label_area_size(58);
-        builder.caption(&self.title, ("sans-serif", 16));
+        builder.margin(8).margin_right(18).x_label_area_size(48).y_label_area_size(72);
+        builder.caption(&self.title, ("sans-serif", TITLE_SIZE));
         let mut chart = builder.build_cartesian_2d(x0..x1, y0..y1).map_err(text)?;
         let mut mesh = chart.configure_mesh();
-        mesh.x_desc(&self.x).y_desc(&self.y).axis_style(AXIS).light_line_style(WHITE).x_labels(8).y_labels(7);
+        mesh.x_desc(&self.x).y_desc(&self.y).axis_style(AXIS).light_line_style(TRANSPARENT).bold_line_style(GRID);
+        mesh.label_style(("sans-serif", TEXT_SIZE)).x_labels(6).y_labels(6);
         let (of_x, of_y) = (|v: &f64| tick(*v, x1 - x0), |v: &f64| tick(*v, y1 - y0));
         mesh.x_label_formatter(&of_x).y_label_formatter(&of_y);
         mesh.draw().map_err(text)?;
@@ -191,7 +210,7 @@ impl Chart {
             let line = DashedLineSeries::new([(x0, *y), (x1, *y)], 5, 4, AXIS.mix(0.7).stroke_width(1));
             chart.draw_series(line).map_err(text)?;
             let (x, y) = chart.backend_coord(&(x1, *y));
-            let style = TextStyle::from(("sans-serif", 11)).color(&AXIS).pos(Pos::new(HPos::Right, VPos::Top));
+            let style = TextStyle::from(("sans-serif", LABEL_SIZE)).color(&AXIS).pos(Pos::new(HPos::Right, VPos::Top));
             let (dx, dy) = root.get_base_pixel();
             root.draw(&Text::new(meaning.clone(), (x - dx, y - dy + 3), style)).map_err(text)?;
         }
@@ -205,13 +224,14 @@ impl Chart {
             legend
                 .position(SeriesLabelPosition::LowerRight)
                 .background_style(WHITE.mix(0.8))
-                .border_style(AXIS.mix(0.3));
+                .border_style(AXIS.mix(0.3))
+                .label_font(("sans-serif", TEXT_SIZE));
             legend.draw().map_err(text)?;
         }
         if self.is_empty() {
             let (width, height) = root.dim_in_pixel();
             let at = (width as i32 / 2 - 40, height as i32 / 2);
-            root.draw(&Text::new("no data", at, ("sans-serif", 14))).map_err(text)?;
+            root.draw(&Text::new("no data", at, ("sans-serif", TEXT_SIZE))).map_err(text)?;
         }
         Ok(())
     }
@@ -221,7 +241,7 @@ impl Chart {
         let pixel = |x: f64, y: f64| chart.backend_coord(&(x, y));
         let ([x0, x1], [y0, y1]) = self.ranges();
         let ((left, bottom), (right, top)) = (pixel(x0, y0), pixel(x1, y1));
-        let dots = self.series.iter().filter(|s| s.mark != Mark::Line).flat_map(|s| &s.points);
+        let dots = self.series.iter().filter(|s| !s.mark.is_line()).flat_map(|s| &s.points);
         let mut taken: Vec<[i32; 4]> = dots
             .map(|&(x, y)| {
                 let (x, y) = pixel(x, y);
@@ -242,7 +262,7 @@ impl Chart {
             };
             if let Some(&place) = boxes.iter().find(is_free) {
                 let at = (place[0] - base_x, place[1] - base_y);
-                root.draw(&Text::new(label.clone(), at, ("sans-serif", 11))).map_err(text)?;
+                root.draw(&Text::new(label.clone(), at, ("sans-serif", LABEL_SIZE))).map_err(text)?;
                 taken.push(place);
             }
         }
@@ -274,7 +294,7 @@ impl Chart {
             let span = if high > low { high - low } else { high.abs().max(1.0) };
             [if below { low - 0.04 * span } else { low }, high + 0.06 * span]
         };
-        (widen(x, x[0] > 0.0 && self.series.iter().any(|s| s.mark != Mark::Line)), widen(y, !self.from_zero))
+        (widen(x, x[0] > 0.0 && self.series.iter().any(|s| !s.mark.is_line())), widen(y, !self.from_zero))
     }
 }
 
@@ -289,7 +309,7 @@ pub(super) fn draw_svg(size: (u32, u32), draw: impl FnOnce(&Canvas<'_>) -> Resul
         draw(&root).and_then(|()| root.present().map_err(text))
     };
     match drawn {
-        Ok(()) => svg,
+        Ok(()) => svg.replacen("<svg ", "<svg class=\"chart\" ", 1),
         Err(problem) => format!("<p class=\"dim\">This chart could not be drawn: {}</p>", escape(&problem)),
     }
 }
@@ -324,8 +344,9 @@ fn shortened(name: &str) -> String {
 fn draw_series(chart: &mut Plot<'_, '_>, series: &Series, in_legend: bool) -> Result<(), String> {
     let color = color(series.color);
     let is_named = in_legend && !series.name.is_empty();
-    if matches!(series.mark, Mark::Line | Mark::LineAndDots) {
-        let line = LineSeries::new(series.points.iter().copied(), color.stroke_width(2));
+    if series.mark.is_line() || series.mark == Mark::LineAndDots {
+        let style = if series.mark == Mark::Faint { color.mix(0.35).stroke_width(1) } else { color.stroke_width(2) };
+        let line = LineSeries::new(series.points.iter().copied(), style);
         let drawn = chart.draw_series(line).map_err(text)?;
         if is_named {
             drawn
@@ -333,7 +354,7 @@ fn draw_series(chart: &mut Plot<'_, '_>, series: &Series, in_legend: bool) -> Re
                 .legend(move |(x, y)| Rectangle::new([(x, y - 4), (x + 12, y + 4)], color.filled()));
         }
     }
-    if series.mark != Mark::Line {
+    if !series.mark.is_line() {
         let style = if series.mark == Mark::Rings { color.stroke_width(2) } else { color.filled() };
         let dots = series.points.iter().map(|&p| Circle::new(p, if series.mark == Mark::Rings { 4 } else { 3 }, style));
         let drawn = chart.draw_series(dots).map_err(text)?;
@@ -342,6 +363,21 @@ fn draw_series(chart: &mut Plot<'_, '_>, series: &Series, in_legend: bool) -> Re
         }
     }
     Ok(())
+}
+
+/// The curve with every value replaced by the mean over a twentieth of the curve around it, fewer towards the ends; empty
+/// for a curve of few points, which needs none.
+pub fn smoothed(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let half = points.len() / SMOOTH_SHARE / 2;
+    if half == 0 {
+        return Vec::new();
+    }
+    let mean = |i: usize| {
+        let reach = half.min(i).min(points.len() - 1 - i);
+        let around = &points[i - reach..=i + reach];
+        around.iter().map(|p| p.1).sum::<f64>() / around.len() as f64
+    };
+    (0..points.len()).map(|i| (points[i].0, mean(i))).collect()
 }
 
 /// The label of a tick on an axis that covers `span`, with enough digits to tell neighbours apart.
@@ -391,6 +427,16 @@ mod tests {
         for (value, want) in cases {
             assert_eq!(short(value), want);
         }
+    }
+
+    #[test]
+    fn smoothing_keeps_lines_and_evens_out_noise() {
+        let line: Vec<(f64, f64)> = (0..100).map(|i| (f64::from(i), 3.0 * f64::from(i))).collect();
+        // Sums of five values, divided by five.
+        assert!(smoothed(&line).iter().zip(&line).all(|(a, b)| a.0 == b.0 && (a.1 - b.1).abs() < 1e-9));
+        let noise: Vec<(f64, f64)> = (0..100).map(|i| (f64::from(i), f64::from(i % 2))).collect();
+        assert!(smoothed(&noise)[5..95].iter().all(|p| (0.4..=0.6).contains(&p.1)));
+        assert!(smoothed(&line[..39]).is_empty());
     }
 
     #[test]

@@ -210,7 +210,7 @@ fn add_views(page: &mut Page, runs: &[Compared]) -> InputResult<()> {
         for run in runs.iter().map(|&run| &others[run]) {
             let right = view_pictures(&run.folder.join(PICTURES_FOLDER).join(name))?;
             let sides = [(first.name.as_str(), left.render.as_str()), (run.name.as_str(), right.render.as_str())];
-            sliders.push(slider(name.trim_end_matches(".png"), sides, ("photo", &left.photo)));
+            sliders.push(slider(name.trim_end_matches(".png"), "", sides, ("photo", &left.photo)));
         }
     }
     page.views(&sliders);

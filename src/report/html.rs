@@ -6,33 +6,42 @@
 use crate::base::units::format_bytes;
 
 const STYLE: &str = "\
-:root{--ink:#1d2228;--dim:#66707c;--line:#dfe3e8;--paper:#fff;--back:#f5f6f8;--accent:#2463b4}
+:root{color-scheme:light dark;--ink:#1d2228;--dim:#5d6773;--line:#dfe3e8;--paper:#fff;--back:#f5f6f8;--accent:#2463b4;--grid:#e5e5e5}
+@media(prefers-color-scheme:dark){:root{--ink:#e4e8ec;--dim:#a3adb8;--line:#39424c;--paper:#1c2127;--back:#12161a;--accent:#7fb2f0;--grid:#333b44}
+figure svg.chart{filter:brightness(1.25)}}
 *{box-sizing:border-box}
 body{margin:0;background:var(--back);color:var(--ink);font:15px/1.5 system-ui,sans-serif}
 main{max-width:1080px;margin:0 auto;padding:28px 20px 60px}
 h1{font-size:26px;margin:0 0 4px}
+h1,p{overflow-wrap:anywhere}
 h2{font-size:18px;margin:36px 0 10px}
 p.dim,figcaption,td.dim{color:var(--dim)}
 section.tiles{display:flex;flex-wrap:wrap;gap:12px;margin:18px 0}
 .tile{background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:10px 16px;min-width:130px}
 .tile b{display:block;font-size:21px}
 .tile span{color:var(--dim);font-size:13px}
-.charts{display:grid;grid-template-columns:repeat(auto-fill,minmax(440px,1fr));gap:14px}
+.charts{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(440px,100%),1fr));gap:14px}
 figure{margin:0;background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:10px}
 figure.wide{margin-bottom:14px}
 figure svg{width:100%;height:auto;display:block}
-figcaption{font-size:13px;margin-top:6px}
+figure svg text{fill:var(--ink)}
+figure svg [fill=\"#FFFFFF\"]{fill:var(--paper)}
+figure svg [stroke=\"#616161\"]{stroke:var(--dim)}
+figure svg [stroke=\"#E0E0E0\"]{stroke:var(--grid)}
+figcaption{font-size:14px;margin-top:6px}
+figcaption b{color:var(--ink);font-variant-numeric:tabular-nums}
 table{border-collapse:collapse;background:var(--paper);border:1px solid var(--line);font-size:14px}
 td,th{padding:4px 9px;border-bottom:1px solid var(--line);text-align:left}
 td.number{white-space:nowrap;text-align:right;font-variant-numeric:tabular-nums}
 pre{background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:12px;overflow:auto;font-size:13px;max-height:420px}
 div.table{overflow-x:auto}
 th{vertical-align:bottom}
-.views{display:grid;grid-template-columns:repeat(auto-fill,minmax(440px,1fr));gap:14px}
-.slider{position:relative;overflow:hidden;line-height:0;touch-action:none;cursor:ew-resize}
+.views{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(440px,100%),1fr));gap:14px}
+.slider{position:relative;overflow:hidden;line-height:0;touch-action:pan-y;cursor:ew-resize}
 .slider img{width:100%;display:block}
 .slider .over{position:absolute;inset:0;width:50%;overflow:hidden;border-right:2px solid #fff}
 .slider .over img{width:auto;height:100%;max-width:none}
+@media(max-width:520px){main{padding:18px 10px 40px}.tile{min-width:0;flex:1 1 40%}}
 .slider i{position:absolute;top:6px;font:12px system-ui;color:#fff;background:#0009;padding:3px 7px;border-radius:4px;line-height:1.2}
 .slider i.l{left:6px}.slider i.r{right:6px}
 details summary{cursor:pointer;color:var(--accent)}
@@ -116,6 +125,13 @@ impl Page {
         self.body += "</section>\n";
     }
 
+    /// A chart with its legend below it, both markup whose texts are escaped, in a grid.
+    pub fn charts_with_legend(&mut self, svg: &str, legend: &str, caption: &str) {
+        self.body += "<div class=\"charts\">\n";
+        self.figure("", &format!("{svg}{legend}"), caption);
+        self.body += "</div>\n";
+    }
+
     /// Charts in a grid: (SVG, caption). [`super::chart`] escapes the texts of the SVG.
     pub fn charts(&mut self, charts: &[(String, String)]) {
         self.body += "<div class=\"charts\">\n";
@@ -170,16 +186,16 @@ impl Page {
     }
 }
 
-/// HTML of two pictures of a view, one over the other with a movable edge, and a third picture behind a fold. A picture
-/// is (label, data URI).
-pub fn slider(name: &str, [left, right]: [(&str, &str); 2], folded: (&str, &str)) -> String {
-    let name = escape(name);
+/// HTML of two pictures of a view, one over the other with a movable edge, a caption with the name and `figures` of the
+/// view, and a third picture behind a fold. A picture is (label, data URI).
+pub fn slider(name: &str, figures: &str, [left, right]: [(&str, &str); 2], folded: (&str, &str)) -> String {
+    let (name, figures) = (escape(name), escape(figures));
     let [(left, left_uri), (right, right_uri), (fold, fold_uri)] =
         [left, right, folded].map(|(label, uri)| (escape(label), uri));
     format!(
         "<figure><div class=\"slider\" tabindex=\"0\" role=\"slider\" aria-label=\"{left} against {right} of {name}\" \
          aria-valuenow=\"50\"><img src=\"{right_uri}\" alt=\"{right}\"><div class=\"over\"><img src=\"{left_uri}\" \
-         alt=\"{left}\"></div><i class=\"l\">{left}</i><i class=\"r\">{right}</i></div>\n<figcaption>{name} \
+         alt=\"{left}\"></div><i class=\"l\">{left}</i><i class=\"r\">{right}</i></div>\n<figcaption>{name} <b>{figures}</b> \
          <details><summary>{fold}</summary><img src=\"{fold_uri}\" alt=\"{fold}\" style=\"width:100%\"></details>\
          </figcaption></figure>\n"
     )
@@ -203,7 +219,7 @@ mod tests {
         page.table(&[hostile], &[(hostile, &|t| Cell::text(*t)), (hostile, &|t| Cell::Number(t.to_string()))]);
         page.folded(hostile, hostile);
         page.tiles(&[(hostile.into(), hostile)]);
-        page.views(&[slider(hostile, [(hostile, "data:,"); 2], (hostile, "data:,"))]);
+        page.views(&[slider(hostile, hostile, [(hostile, "data:,"); 2], (hostile, "data:,"))]);
         let text = page.finish();
         assert_eq!(text.matches("<script>").count(), 1, "only the page's own");
         assert!(!text.contains("\" onload"));

@@ -10,6 +10,38 @@ const SIDE: f64 = 720.0;
 /// Most rectangles: browsers show larger files slowly.
 const RECTANGLES_MAX: usize = 20_000;
 
+/// Colours of 0 to the most views: dark blue over grey to yellow, which also those see apart who do not see red or green.
+const RAMP: [[f64; 3]; 5] =
+    [[0.0, 34.0, 78.0], [53.0, 69.0, 108.0], [124.0, 123.0, 120.0], [187.0, 175.0, 113.0], [254.0, 232.0, 56.0]];
+/// Outlines of pages in memory and of others.
+const OUTLINES: [&str; 2] = ["#ffffff", "#3a4450"];
+
+/// The colour at `heat` of 0 to 1.
+fn color(heat: f64) -> String {
+    let at = heat.clamp(0.0, 1.0) * (RAMP.len() - 1) as f64;
+    let low = (at as usize).min(RAMP.len() - 2);
+    let [r, g, b] = [0, 1, 2].map(|c| RAMP[low][c] + (at - low as f64) * (RAMP[low + 1][c] - RAMP[low][c]));
+    format!("#{:02x}{:02x}{:02x}", r.round() as u8, g.round() as u8, b.round() as u8)
+}
+
+/// What the colours and outlines of [`page_map_svg`] mean, as HTML.
+pub fn page_map_legend(tiles: &[PageTile]) -> String {
+    let most = tiles.iter().map(|t| t.views).max().unwrap_or(0).max(1);
+    let stops = (0..=4).map(|i| color(f64::from(i) / 4.0)).collect::<Vec<_>>().join(",");
+    let swatch = |line: &str, meaning: &str| {
+        format!(
+            "<span style=\"white-space:nowrap\"><span style=\"display:inline-block;width:16px;height:16px;margin-right:6px;\
+             vertical-align:-3px;background:#35456c;border:2px solid {line};outline:1px solid #888\"></span>{meaning}</span>"
+        )
+    };
+    let [inside, outside] = [swatch(OUTLINES[0], "in memory at the end"), swatch(OUTLINES[1], "on the drive")];
+    format!(
+        "<p style=\"display:flex;flex-wrap:wrap;align-items:center;gap:6px 14px;margin:8px 0 0;font-size:14px\">\
+         <span style=\"white-space:nowrap\">needed by 0 views <span style=\"display:inline-block;width:110px;height:14px;\
+         vertical-align:-2px;background:linear-gradient(90deg,{stops})\"></span> {most} views</span>{inside}{outside}</p>"
+    )
+}
+
 /// One page, projected along the shortest axis of the scene.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PageTile {
@@ -50,17 +82,16 @@ pub fn page_map_svg(tiles: &[PageTile]) -> String {
         let at = [0, 1].map(|i| (f64::from(tile.lo[i] - lo[i]) * scale).clamp(-1e4, 1e4));
         let side = [0, 1].map(|i| (f64::from(tile.hi[i] - tile.lo[i]) * scale).clamp(1.0, 2e4));
         let heat = (f64::from(tile.views) / f64::from(most)).sqrt();
-        let line = if tile.resident { "#7fd0ff" } else { "#3a4450" };
+        let line = OUTLINES[usize::from(!tile.resident)];
         // Writing to a String cannot fail.
         let _ = writeln!(
             svg,
-            "<rect x=\"{:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{:.1}\" fill=\"hsl({:.0} 85% {:.0}%)\" fill-opacity=\"0.55\" stroke=\"{line}\" stroke-width=\"0.6\"/>",
+            "<rect x=\"{:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{:.1}\" fill=\"{}\" fill-opacity=\"0.7\" stroke=\"{line}\" stroke-width=\"0.6\"/>",
             at[0],
             size[1] - at[1] - side[1],
             side[0],
             side[1],
-            220.0 - 200.0 * heat,
-            18.0 + 45.0 * heat,
+            color(heat),
         );
     }
     svg.push_str("</svg>");
@@ -97,5 +128,9 @@ mod tests {
         assert_eq!(svg.matches("<rect x=").count(), 202);
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
         assert_eq!(page_map_svg(&[]), "");
+        // The legend has the colours of the map: those of no views and of the most.
+        let legend = page_map_legend(&tiles);
+        assert!(legend.contains(&color(0.0)) && legend.contains(&color(1.0)) && legend.contains("199 views"));
+        assert!(svg.contains(&format!("fill=\"{}\"", color(0.0))) && svg.contains(&format!("fill=\"{}\"", color(1.0))));
     }
 }

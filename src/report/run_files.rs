@@ -23,6 +23,8 @@ pub const PAGES_FILE: &str = "pages.json";
 pub const APPEARANCE_FILE: &str = "appearance.json";
 /// Folder of the pictures of the held-out views.
 pub const PICTURES_FOLDER: &str = "renders/test";
+/// PSNR and SSIM of each held-out view, beside its picture.
+pub const VIEWS_FILE: &str = "renders/test/views.json";
 /// Output of `gsscale-eval --json`, in place of the figures of the summary.
 pub const EVALUATED_FILE: &str = "evaluated.json";
 /// Config of that evaluation.
@@ -55,7 +57,7 @@ pub enum Tells {
 }
 
 /// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
-pub const RUN_FILES: [(RunFile, Tells); 13] = [
+pub const RUN_FILES: [(RunFile, Tells); 14] = [
     (RunFile::File(CONFIG_FILE), Tells::Start),
     (RunFile::File(METRICS_FILE), Tells::Steps),
     (RunFile::Events(EVENTS_FOLDER), Tells::Steps),
@@ -68,6 +70,8 @@ pub const RUN_FILES: [(RunFile, Tells); 13] = [
     (RunFile::SavedPlys, Tells::Result),
     (RunFile::File(EVALUATED_FILE), Tells::Evaluation),
     (RunFile::File(EVALUATED_AS_FILE), Tells::Evaluation),
+    // Before the pictures, whose folder goes when it is empty.
+    (RunFile::File(VIEWS_FILE), Tells::Result),
     (RunFile::Pictures(PICTURES_FOLDER), Tells::Result),
 ];
 

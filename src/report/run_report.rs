@@ -3,12 +3,12 @@
 //! Invariants: 1. missing or incomplete files (of a run that was stopped) make the report shorter; only a folder
 //! without metrics is an error; 2. the number of pictures and of points in a chart is bounded.
 
-use super::chart::{Chart, Mark, short};
+use super::chart::{Chart, Mark, short, smoothed};
 use super::html::{Page, slider};
-use super::page_map::{PageTile, page_map_svg};
+use super::page_map::{PageTile, page_map_legend, page_map_svg};
 use super::picture::view_pictures;
 use super::run_files::{
-    APPEARANCE_FILE, CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE,
+    APPEARANCE_FILE, CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE,
 };
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
@@ -44,7 +44,7 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
     }
     add_appearance(&mut page, &folder.join(APPEARANCE_FILE));
     add_page_map(&mut page, &folder.join(PAGES_FILE));
-    add_views(&mut page, &folder.join(PICTURES_FOLDER), progress)?;
+    add_views(&mut page, folder, progress)?;
     page.heading("Config");
     if let Some(text) = read_text(&folder.join(CONFIG_FILE)) {
         page.folded("config.toml, every key as it was used", &text);
@@ -147,21 +147,34 @@ fn training_charts(metrics: &[Value]) -> Vec<(String, String)> {
     // A skipped step has the loss f64::MAX.
     let loss = |m: &Value| m["loss"].as_f64().filter(|l| *l < 1e30);
     let mut charts = Vec::new();
-    for (x, unit) in [("step", "step"), ("seconds", "seconds of training")] {
-        let mut chart = Chart::new("PSNR", unit, "dB").with("training view", curve(metrics, x, train), Mark::Line);
-        let (held_out, mut of) = (curve(metrics, x, test), "");
-        if !held_out.is_empty() {
-            chart = chart.with("held-out views", held_out, Mark::LineAndDots);
-            of = " and of the held-out views";
-        }
-        charts.push((chart.svg(), format!("PSNR of the view of each logged step{of}, over {unit}.")));
-        let chart = Chart::new("Loss", unit, "loss").with("", curve(metrics, x, loss), Mark::Line).zero_based();
-        charts.push((chart.svg(), format!("Loss of the view of each logged step, over {unit}.")));
+    let mut chart = with_smooth(Chart::new("PSNR", "step", "dB"), "training view", curve(metrics, "step", train));
+    let (held_out, mut of) = (curve(metrics, "step", test), "");
+    if !held_out.is_empty() {
+        chart = chart.with_color("held-out views", held_out, Mark::LineAndDots, 1);
+        of = ", and of the held-out views";
     }
+    charts.push((chart.svg(), format!("PSNR of the view of each logged step and its running mean{of}.")));
+    let chart = with_smooth(Chart::new("Loss", "step", "loss"), "training view", curve(metrics, "step", loss));
+    charts.push((chart.zero_based().svg(), "Loss of the view of each logged step, and its running mean.".to_string()));
     let rows = curve(metrics, "step", |m| m["gaussians"].as_f64());
     let chart = Chart::new("Gaussians", "step", "").with("", rows, Mark::Line).zero_based();
     charts.push((chart.svg(), "Gaussians in the scene.".to_string()));
+    let seconds = curve(metrics, "step", |m| m["seconds"].as_f64());
+    let chart = Chart::new("Time", "step", "seconds of training").with("", seconds, Mark::Line).zero_based();
+    charts.push((
+        chart.svg(),
+        "Seconds of training, without evaluation. It bends upwards as the scene grows.".to_string(),
+    ));
     charts
+}
+
+/// Adds a noisy curve: pale, and its running mean before it where it has points enough for one.
+fn with_smooth(chart: Chart, name: &str, points: Vec<(f64, f64)>) -> Chart {
+    let mean = smoothed(&points);
+    if mean.is_empty() {
+        return chart.with_color(name, points, Mark::Line, 0);
+    }
+    chart.with_color("", points, Mark::Faint, 0).with_color(name, mean, Mark::Line, 0)
 }
 
 /// Charts of memory and of the traffic between the tiers, if the run logged them.
@@ -229,18 +242,29 @@ fn add_appearance(page: &mut Page, path: &Path) {
 
 fn add_page_map(page: &mut Page, path: &Path) {
     let tiles: Option<Vec<PageTile>> = read_text(path).and_then(|text| serde_json::from_str(&text).ok());
-    let svg = page_map_svg(&tiles.unwrap_or_default());
+    let tiles = tiles.unwrap_or_default();
+    let svg = page_map_svg(&tiles);
     if svg.is_empty() {
         return;
     }
     page.heading("Pages");
-    let caption = "The pages of the scene, seen along its shortest axis. Warmer colours: more training views need the page. \
-                   Light outlines: the page was in memory at the end.";
-    page.charts(&[(svg, caption.to_string())]);
+    let caption =
+        "The pages of the scene, seen along its shortest axis, coloured by the training views that need them.";
+    page.charts_with_legend(&svg, &page_map_legend(&tiles), caption);
 }
 
-fn add_views(page: &mut Page, folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<()> {
-    let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
+/// PSNR and SSIM of a view for its caption; empty where they are not known.
+fn figures_of(views: &Value, picture: &str) -> String {
+    let views = views.as_array().map_or(&[][..], Vec::as_slice);
+    let Some(view) = views.iter().find(|view| view["picture"] == picture) else { return String::new() };
+    let [psnr, ssim] = ["psnr", "ssim"].map(|name| view[name].as_f64());
+    let psnr = psnr.map_or(String::from("all masked"), |psnr| format!("{psnr:.2} dB"));
+    psnr + &ssim.map_or(String::new(), |ssim| format!(", SSIM {ssim:.3}"))
+}
+
+fn add_views(page: &mut Page, run: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<()> {
+    let views = read_json(&run.join(VIEWS_FILE)).unwrap_or(Value::Null);
+    let Ok(entries) = std::fs::read_dir(run.join(PICTURES_FOLDER)) else { return Ok(()) };
     let mut files: Vec<PathBuf> =
         entries.flatten().map(|e| e.path()).filter(|p| p.extension().is_some_and(|e| e == "png")).collect();
     if files.is_empty() {
@@ -256,8 +280,9 @@ fn add_views(page: &mut Page, folder: &Path, progress: &dyn Fn(usize, usize)) ->
     for file in files.iter().step_by(stride) {
         let pictures = view_pictures(file)?;
         let name = file.file_stem().unwrap_or_default().to_string_lossy();
+        let figures = figures_of(&views, &file.file_name().unwrap_or_default().to_string_lossy());
         let sides = [("render", pictures.render.as_str()), ("photo", &pictures.photo)];
-        sliders.push(slider(&name, sides, ("difference", &pictures.difference)));
+        sliders.push(slider(&name, &figures, sides, ("difference", &pictures.difference)));
         progress(sliders.len(), files.len().div_ceil(stride));
     }
     page.views(&sliders);

@@ -17,6 +17,7 @@ use crate::appearance::AppearanceMode;
 use crate::appearance::fit::Pair;
 use crate::appearance::picture::{Lens, Look};
 use crate::base::error::{InputError, InputResult};
+use crate::base::whole_file::write_whole;
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
@@ -29,6 +30,7 @@ use crate::render::lpips::weights::read_lpips;
 use crate::render::lpips::{InputRange, Lpips};
 use crate::render::metrics::{SsimVariant, mean, psnr, ssim};
 use crate::render::{RenderOptions, Renderer};
+use crate::report::run_files::VIEWS_FILE;
 use crate::scene::camera::Camera;
 use crate::scene::image::{Image, Target};
 use std::path::{Path, PathBuf};
@@ -42,7 +44,7 @@ pub struct EvalRequest<'a> {
     pub views: &'a [usize],
     /// Variant of SSIM.
     pub ssim: SsimVariant,
-    /// Folder for pictures (render beside photo), created if missing; `None` for no pictures.
+    /// Folder for pictures (render beside photo) and the figures of each view, created if missing; `None` for none.
     pub pictures: Option<&'a Path>,
     /// LPIPS network and its input range; `None` for no LPIPS.
     pub lpips: Option<(&'a Lpips, InputRange)>,
@@ -70,28 +72,38 @@ pub fn evaluate(
         return Ok(None);
     }
     let (mut psnrs, mut ssims, mut distances) = (Vec::new(), Vec::new(), Vec::new());
-    let (mut corrected, mut halves) = (Vec::new(), Vec::new());
+    let (mut corrected, mut halves, mut figures) = (Vec::new(), Vec::new(), Vec::new());
     for (i, &view) in request.views.iter().enumerate() {
         targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
         let target = targets.get(view)?;
         let camera = &dataset.views[view].camera;
         draw((&mut *scene, now, &mut *working), renderer, camera, options)?;
         let image = renderer.image()?;
+        let mut of_view = (None, None);
         if target.counts() {
             psnrs.push(json_psnr(psnr(image, &target)));
+            of_view.0 = psnrs.last().copied();
             let fit = request.color_correct;
             corrected.extend(fit.map(|how| json_psnr(color_corrected_psnr(image, &target, how))));
             halves.extend(half_fitted(image, &target, camera, request.appearance));
             // NaN: every SSIM window is masked although some border pixels are not.
-            ssims.extend(Some(ssim(image, &target, request.ssim, options.simd)).filter(|x| !x.is_nan()));
+            of_view.1 = Some(ssim(image, &target, request.ssim, options.simd)).filter(|x| !x.is_nan());
+            ssims.extend(of_view.1);
             // NaN: the picture is too small for the network.
             let distance = request.lpips.map(|(lpips, range)| lpips.distance(image, &target, range));
             distances.extend(distance.filter(|x| !x.is_nan()));
         }
         if let Some(folder) = request.pictures {
-            write_pair(&picture_path(folder, dataset, view), image, &target)?;
+            let path = picture_path(folder, dataset, view);
+            write_pair(&path, image, &target)?;
+            let picture = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            figures.push(serde_json::json!({ "picture": picture, "psnr": of_view.0, "ssim": of_view.1 }));
         }
         (request.progress)(i as u32 + 1);
+    }
+    if let Some(folder) = request.pictures {
+        let name = Path::new(VIEWS_FILE).file_name().unwrap_or_default();
+        write_whole(&folder.join(name), serde_json::Value::from(figures).to_string().as_bytes())?;
     }
     if psnrs.is_empty() {
         return Ok(None);

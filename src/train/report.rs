@@ -8,6 +8,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::machine::process_cpu_seconds;
 use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitReport;
+use crate::dataset::photo_header::read_header;
 use crate::exchange::tensorboard::EventFile;
 use crate::paging::pager::Pager;
 use crate::paging::stats::PagerStats;
@@ -16,6 +17,9 @@ use serde::{Deserialize, Serialize};
 use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
+
+/// Most pictures for TensorBoard, which keeps ten of a tag and all tags.
+const PICTURES_MAX: usize = 12;
 
 /// PSNR of a perfect image.
 pub const PSNR_PERFECT: f64 = 100.0;
@@ -299,16 +303,19 @@ impl MetricsLog {
     }
 
     /// Writes the evaluation after the last step, `step`: that step's line again, with the evaluation. A log without a line
-    /// stays as it is.
+    /// stays as it is. TensorBoard gets some of the pictures in `pictures` as well.
     ///
     /// # Errors
     /// The file cannot be written.
-    pub fn write_evaluation(&mut self, step: u32, test: TestMetrics) -> InputResult<()> {
+    pub fn write_evaluation(&mut self, step: u32, test: TestMetrics, pictures: &Path) -> InputResult<()> {
         let Some(last) = self.last.clone() else { return Ok(()) };
         self.append(&StepLine { step, test: Some(test), ..last })?;
         match &mut self.events {
             None => Ok(()),
-            Some(events) => events.write(step, &scalars_of_test(&test)),
+            Some(events) => {
+                events.write(step, &scalars_of_test(&test))?;
+                write_pictures(events, step, pictures)
+            }
         }
     }
 
@@ -318,6 +325,20 @@ impl MetricsLog {
         self.file.write_all(text.as_bytes()).and_then(|()| self.file.write_all(b"\n")).map_err(io)?;
         self.file.flush().map_err(io)
     }
+}
+
+/// Writes up to [`PICTURES_MAX`] of the pictures in `folder`, spread over their names.
+fn write_pictures(events: &mut EventFile, step: u32, folder: &Path) -> InputResult<()> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut files: Vec<PathBuf> = entries.filter(|path| path.extension().is_some_and(|e| e == "png")).collect();
+    files.sort();
+    for file in files.iter().step_by(files.len().div_ceil(PICTURES_MAX).max(1)) {
+        let header = read_header(file)?;
+        let png = std::fs::read(file).map_err(|e| InputError::io(file, "reading the picture", &e))?;
+        let tag = format!("held-out/{}", file.file_stem().unwrap_or_default().to_string_lossy());
+        events.write_picture(step, &tag, (header.width, header.height), &png)?;
+    }
+    Ok(())
 }
 
 /// The last line of a file that is a step's.

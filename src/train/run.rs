@@ -390,7 +390,7 @@ fn evaluate_result(
     let pictures = request.out.join(PICTURES_FOLDER);
     let test = trainer.evaluate(dataset, targets, Some(&pictures), &|done| shown.show(done))?;
     if let Some(test) = test {
-        metrics.write_evaluation(trainer.steps_done(), test)?;
+        metrics.write_evaluation(trainer.steps_done(), test, &pictures)?;
     }
     Ok(test)
 }
