@@ -10,6 +10,7 @@ mod bombs;
 #[cfg(unix)]
 mod ckpt;
 mod cli;
+mod clients;
 #[cfg(unix)]
 mod drive_faults;
 mod exports;
