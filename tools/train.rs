@@ -34,7 +34,8 @@ report.html (open it in a browser), summary.json, metrics.jsonl, pages.json, con
 #[derive(Parser)]
 #[command(name = "gsscale-train", version, after_help = EXAMPLES)]
 struct Args {
-    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
+    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, an OpenDroneMap project, RealityScan's CSV, or
+    /// Mega-NeRF's layout
     #[arg(required_unless_present_any = ["demo", "list_devices", "resume"])]
     scene: Option<PathBuf>,
     /// Output folder [default: runs/NAME, with the name of the scene; runs/NAME-2 and so on if that is taken]
@@ -91,6 +92,9 @@ fn main() -> ExitCode {
 fn list_devices() {
     for adapter in gsscale::gpu::list_adapters() {
         gsscale::say!("{adapter}");
+    }
+    if cfg!(not(feature = "gpu")) {
+        gsscale::say!("no GPU: this program was built without the feature gpu");
     }
     gsscale::say!("cpu: the CPU renderer");
 }

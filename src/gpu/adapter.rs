@@ -5,6 +5,7 @@
 
 use std::fmt;
 
+use super::choice::DeviceChoice;
 use super::error::{GpuError, GpuResult};
 
 /// Invocations of a workgroup, unless a shader needs another number.
@@ -17,17 +18,6 @@ const STORAGE_BUFFERS_NEEDED: u32 = 16;
 const WORKGROUP_STORAGE_NEEDED: u32 = 16 << 10;
 /// Smallest accepted limit on bindings, bytes: the WebGPU default.
 const BINDING_NEEDED: u64 = 128 << 20;
-
-/// The device that the user requests.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum DeviceChoice {
-    /// The best hardware GPU; [`GpuError::NoHardwareGpu`] if there is none.
-    Auto,
-    /// The best adapter, even a software one.
-    Gpu,
-    /// The best adapter whose name contains this text, ignoring case.
-    Named(String),
-}
 
 /// Kind of an adapter, best first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]

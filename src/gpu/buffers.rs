@@ -10,7 +10,8 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
 use super::driver::Driver;
-use super::error::{GpuError, GpuResult, lock};
+use super::error::{GpuError, GpuResult};
+use super::faults::lock;
 
 /// Smallest buffer, bytes; also the size of a view of an empty buffer.
 const CLASS_MIN: u64 = 256;

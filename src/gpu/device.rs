@@ -6,16 +6,19 @@ use std::fmt;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
-use super::adapter::{AdapterSummary, DeviceChoice, DeviceKind, choose, limits_to_request};
+use super::adapter::{AdapterSummary, DeviceKind, choose, limits_to_request};
 use super::belt::Belt;
 use super::buffers::{Buffer, Pool, Purpose};
+use super::choice::DeviceChoice;
 use super::driver::Driver;
-use super::error::{GpuError, GpuResult, lock};
+use super::error::{GpuError, GpuResult};
+use super::faults::lock;
 use super::injected::{InjectedFault, Injector};
 use super::profile::{Profiler, StageTime};
 use super::readback::Staging;
 use super::shader::{Pipeline, Pipelines};
 use super::sources::{Defines, SOURCES, Source};
+use super::traffic::Traffic;
 use super::uniforms::UniformRing;
 
 /// Smallest and largest memory block under a budget, bytes: the API raises smaller ones to 4 MiB.
@@ -74,23 +77,6 @@ pub struct GpuOptions {
     pub uniform_blocks: Option<bool>,
     /// A fault to inject; `None`: the one that the environment variable `GSSCALE_GPU_FAULT` requests, if any.
     pub fault: Option<InjectedFault>,
-}
-
-/// Traffic over the bus since the device was opened, and memory.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Traffic {
-    /// Bytes from the host to the device: uploads and uniforms.
-    pub bytes_uploaded: u64,
-    /// Bytes from the device to the host.
-    pub bytes_read_back: u64,
-    /// Device memory of live buffers, staging and uniforms, bytes.
-    pub device_bytes: u64,
-    /// Most device memory ever allocated, bytes, including free buffers in the pool.
-    pub device_bytes_peak: u64,
-    /// Buffers allocated so far: constant once warmed up.
-    pub device_allocations: u64,
-    /// The part of this memory that stages uploads, uniforms and read-backs, bytes. It may lie in host memory.
-    pub staging_bytes: u64,
 }
 
 /// An open device.

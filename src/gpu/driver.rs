@@ -4,7 +4,8 @@
 
 use std::sync::Arc;
 
-use super::error::{Faults, GpuError, GpuResult};
+use super::error::{GpuError, GpuResult};
+use super::faults::Faults;
 
 /// An opened wgpu device.
 #[derive(Debug)]

@@ -1,15 +1,6 @@
-//! GPU errors, and the collector of the driver's asynchronous error reports.
+//! GPU errors. Not here: the collector of the driver's reports (`faults`).
 //!
-//! Invariants: (1) every error about work names the stage that was being recorded or waited for; (2) a lost device
-//! stays lost: every later call reports it; (3) any other error is returned exactly once, by the call that caused it
-//! or, if the report came late, by the next call.
-
-use std::sync::{Mutex, MutexGuard, PoisonError};
-
-/// Locks, even after another holder panicked: every holder leaves valid data.
-pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
+//! Invariant: every error about work names the stage that was being recorded or waited for.
 
 /// Why the device failed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -129,6 +120,7 @@ pub enum GpuError {
     },
 }
 
+#[cfg(feature = "gpu")]
 impl GpuError {
     /// The API refused the work of `stage`.
     pub(super) fn validation(stage: &str, message: impl ToString) -> GpuError {
@@ -162,73 +154,3 @@ impl GpuError {
 
 /// Result of calls that use a device.
 pub type GpuResult<T> = Result<T, GpuError>;
-
-/// The driver's error reports, collected until the next check.
-#[derive(Debug, Default)]
-pub(super) struct Faults {
-    state: Mutex<FaultState>,
-}
-
-#[derive(Debug, Default)]
-struct FaultState {
-    doing: String,
-    first: Option<GpuError>,
-    lost: Option<GpuError>,
-}
-
-impl Faults {
-    /// Names the stage that the following calls belong to.
-    pub(super) fn set_stage(&self, what: &str) {
-        let mut state = lock(&self.state);
-        state.doing.clear();
-        state.doing.push_str(what);
-    }
-
-    /// Keeps the first report; later ones are consequences of it.
-    pub(super) fn report(&self, error: &wgpu::Error) {
-        let mut state = lock(&self.state);
-        let stage = state.doing.clone();
-        let message = causes(error);
-        state.first.get_or_insert(match error {
-            wgpu::Error::OutOfMemory { .. } => GpuError::OutOfMemory { stage, message },
-            wgpu::Error::Validation { .. } | wgpu::Error::Internal { .. } => GpuError::Validation { stage, message },
-        });
-    }
-
-    /// Whether an error was reported and not yet returned.
-    pub(super) fn is_reported(&self) -> bool {
-        let state = lock(&self.state);
-        state.first.is_some() || state.lost.is_some()
-    }
-
-    /// Records the loss of the device.
-    pub(super) fn lost(&self, message: String) {
-        let mut state = lock(&self.state);
-        let stage = state.doing.clone();
-        state.lost.get_or_insert(GpuError::DeviceLost { stage, message });
-    }
-
-    /// Returns the collected error, if any.
-    pub(super) fn check(&self) -> GpuResult<()> {
-        let mut state = lock(&self.state);
-        if let Some(lost) = &state.lost {
-            return Err(lost.clone());
-        }
-        state.first.take().map_or(Ok(()), Err)
-    }
-}
-
-/// An error with its chain of causes on one line.
-fn causes(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(source) = cause {
-        let message = source.to_string();
-        if !text.contains(&message) {
-            text.push_str(": ");
-            text.push_str(&message);
-        }
-        cause = source.source();
-    }
-    text
-}

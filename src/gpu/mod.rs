@@ -22,33 +22,72 @@
 //! 5. Contents of a new buffer are arbitrary (it may be reused): use [`Recorder::clear`] where zeros are needed.
 //! 6. Only one recorder may be open, set aside or not: reused buffers rely on commands that run in the order recorded.
 //!
-//! Files import each other in one direction: `error` <- `driver` (the wgpu device that the others share) <- `buffers`,
+//! Without the feature `gpu` (`--no-default-features`) only the types remain that configs and reports name, and there is no
+//! adapter.
+//!
+//! Files import each other in one direction: `error` <- `faults` <- `driver` (the wgpu device that the others share) <- `buffers`,
 //! `belt`, `shader` <- `readback`, `uniforms` <- `profile` <- `device` <- `record`.
 
+#[cfg(feature = "gpu")]
 mod adapter;
+#[cfg(feature = "gpu")]
 mod belt;
+#[cfg(feature = "gpu")]
 mod buffers;
+mod choice;
+#[cfg(feature = "gpu")]
 mod device;
+#[cfg(feature = "gpu")]
 mod driver;
 mod error;
+#[cfg(feature = "gpu")]
+mod faults;
+#[cfg(feature = "gpu")]
 mod injected;
+#[cfg(feature = "gpu")]
 mod layout;
+#[cfg(feature = "gpu")]
 mod profile;
+#[cfg(feature = "gpu")]
 mod readback;
+#[cfg(feature = "gpu")]
 mod record;
+#[cfg(feature = "gpu")]
 mod shader;
+#[cfg(feature = "gpu")]
 mod sources;
+mod traffic;
+#[cfg(feature = "gpu")]
 mod uniforms;
 
-pub use adapter::{AdapterSummary, DeviceChoice, DeviceKind, WORKGROUP, list_adapters};
+#[cfg(feature = "gpu")]
+pub use adapter::{AdapterSummary, DeviceKind, WORKGROUP, list_adapters};
+#[cfg(feature = "gpu")]
 pub use belt::staging_bytes;
+#[cfg(feature = "gpu")]
 pub use buffers::{Buffer, BufferView};
-pub use device::{Gpu, GpuOptions, Traffic, budget_for_buffers, bytes_for_buffers};
+pub use choice::DeviceChoice;
+#[cfg(feature = "gpu")]
+pub use device::{Gpu, GpuOptions, budget_for_buffers, bytes_for_buffers};
 pub use error::{GpuError, GpuResult};
+#[cfg(feature = "gpu")]
 pub use injected::{FaultKind, InjectedFault};
+#[cfg(feature = "gpu")]
 pub use layout::StructLayout;
+#[cfg(feature = "gpu")]
 pub use profile::StageTime;
+#[cfg(feature = "gpu")]
 pub use readback::Readback;
+#[cfg(feature = "gpu")]
 pub use record::{Recorder, Recording, Submission, groups_1d};
+#[cfg(feature = "gpu")]
 pub use shader::{Pipeline, validate};
+#[cfg(feature = "gpu")]
 pub use sources::{Defines, SOURCES, Source, preprocess, variants};
+pub use traffic::Traffic;
+
+/// No adapter: this program was built without the feature `gpu`.
+#[cfg(not(feature = "gpu"))]
+pub fn list_adapters() -> Vec<String> {
+    Vec::new()
+}

@@ -10,7 +10,8 @@ use std::sync::{Arc, Mutex};
 use wgpu::naga;
 
 use super::driver::Driver;
-use super::error::{GpuError, GpuResult, lock};
+use super::error::{GpuError, GpuResult};
+use super::faults::lock;
 use super::sources::{Defines, Source, preprocess, switches};
 
 /// Kind of a binding.

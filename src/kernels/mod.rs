@@ -20,5 +20,7 @@ mod ssim_band;
 pub mod stages;
 mod tile_block;
 pub mod tile_range;
+#[cfg(feature = "gpu")]
 pub mod uniforms;
+#[cfg(feature = "gpu")]
 pub mod uniforms_tiles;

@@ -10,6 +10,7 @@ use super::gpu_range_plan::{BYTES_OF_ISECT, BYTES_OF_SPLAT, PART_ISECTS};
 use super::gpu_ranges::PLACE_BYTES;
 use super::gpu_rows::{DeviceColumns, SPLAT_BYTES};
 use super::gpu_segments::CHUNK_STEP;
+pub use super::view_sizes::ViewSizes;
 use crate::gpu::staging_bytes;
 
 /// Bytes a pixel: picture, transmittance, stops; photo, gradient and derivatives of the loss; the corrected picture or the
@@ -17,39 +18,6 @@ use crate::gpu::staging_bytes;
 const PIXEL_BYTES: u64 = 12 + 4 + 4 + 4 + 12 + 12 + 12;
 /// Bytes of small buffers: uniforms, counts, sums, and the smallest staging.
 const SMALL_BYTES: u64 = 192 << 10;
-
-/// Most tiles that a row of a grown scene is expected to reach, on average over the rows in view.
-const ISECTS_PER_ROW: u64 = 32;
-
-/// The sizes of a view.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct ViewSizes {
-    /// Rows in view.
-    pub rows: u64,
-    /// Intersections of splats and tiles.
-    pub isects: u64,
-    /// Pixels.
-    pub pixels: u64,
-}
-
-impl ViewSizes {
-    /// The larger of each size.
-    pub fn max(self, other: ViewSizes) -> ViewSizes {
-        ViewSizes {
-            rows: self.rows.max(other.rows),
-            isects: self.isects.max(other.isects),
-            pixels: self.pixels.max(other.pixels),
-        }
-    }
-
-    /// The view with `growth` times as many Gaussians. A few that cover the picture say little about many, which are
-    /// smaller: their intersections are taken to be those of ordinary scenes.
-    pub fn grown(self, growth: f64) -> ViewSizes {
-        let [rows, isects] = [self.rows, self.isects].map(|size| (size as f64 * growth).ceil() as u64);
-        let isects = isects.min(self.isects.max(rows.saturating_mul(ISECTS_PER_ROW)));
-        ViewSizes { rows, isects, ..self }
-    }
-}
 
 /// The device memory of a view, bytes. Size classes of the buffers, which add up to a quarter, are included.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

@@ -7,20 +7,32 @@
 
 pub mod color_correct;
 pub mod cpu;
+#[cfg(feature = "gpu")]
 pub mod device_needs;
+#[cfg(feature = "gpu")]
 pub mod gpu;
+#[cfg(feature = "gpu")]
 mod gpu_gradients;
+#[cfg(feature = "gpu")]
 pub mod gpu_loss;
+#[cfg(feature = "gpu")]
 mod gpu_range_plan;
+#[cfg(feature = "gpu")]
 mod gpu_ranges;
+#[cfg(feature = "gpu")]
 pub mod gpu_rows;
+#[cfg(feature = "gpu")]
 mod gpu_segments;
+#[cfg(feature = "gpu")]
 pub mod gpu_tiles;
+#[cfg(feature = "gpu")]
 pub mod gpu_tiles_bwd;
+#[cfg(feature = "gpu")]
 mod gpu_view;
 pub mod lpips;
 pub mod metrics;
 mod sequence;
+pub mod view_sizes;
 
 use crate::base::simd::SimdPath;
 use crate::gpu::GpuError;
@@ -30,7 +42,7 @@ use crate::kernels::splats::Grid;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
-use device_needs::ViewSizes;
+use view_sizes::ViewSizes;
 
 /// The parameters of a rendering besides rows and camera.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -4,9 +4,12 @@ use crate::base::error::{InputError, InputResult};
 use crate::config::choice::Device;
 use crate::config::file::TrainConfig;
 use crate::config::limits::simd_path;
-use crate::gpu::{DeviceChoice, Gpu, GpuError, GpuOptions, GpuResult};
+use crate::gpu::DeviceChoice;
+#[cfg(feature = "gpu")]
+use crate::gpu::{Gpu, GpuError, GpuOptions, GpuResult};
 use crate::render::Renderer;
 use crate::render::cpu::CpuRenderer;
+#[cfg(feature = "gpu")]
 use crate::render::gpu::GpuRenderer;
 
 /// Most worker threads per core, and how many are started on any machine if asked for.
@@ -45,10 +48,24 @@ pub fn set_up(config: &TrainConfig) -> InputResult<()> {
 /// # Errors
 /// The named device does not exist or cannot be used.
 pub fn renderer(config: &TrainConfig) -> InputResult<(Box<dyn Renderer>, Option<String>)> {
-    let choice = match &config.device {
-        Device::Cpu => return Ok((Box::new(CpuRenderer::new()), None)),
-        Device::Gpu(choice) => choice,
-    };
+    match &config.device {
+        Device::Cpu => Ok((Box::new(CpuRenderer::new()), None)),
+        Device::Gpu(choice) => of_gpu(config, choice),
+    }
+}
+
+/// Without GPU support `auto` means the CPU.
+#[cfg(not(feature = "gpu"))]
+fn of_gpu(_: &TrainConfig, choice: &DeviceChoice) -> InputResult<(Box<dyn Renderer>, Option<String>)> {
+    if *choice == DeviceChoice::Auto {
+        return Ok((Box::new(CpuRenderer::new()), None));
+    }
+    let problem = "this program was built without GPU support";
+    Err(InputError::new("--device", problem, "use --device cpu, or build with the feature gpu (it is on by default)"))
+}
+
+#[cfg(feature = "gpu")]
+fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> InputResult<(Box<dyn Renderer>, Option<String>)> {
     let budget = (config.device_mem.0 > 0).then_some(config.device_mem.0);
     let opened = Gpu::open_with(choice, &GpuOptions { budget, ..GpuOptions::default() }).and_then(gpu_renderer);
     match opened {
@@ -69,6 +86,7 @@ pub fn renderer(config: &TrainConfig) -> InputResult<(Box<dyn Renderer>, Option<
     }
 }
 
+#[cfg(feature = "gpu")]
 fn gpu_renderer(gpu: Gpu) -> GpuResult<Box<dyn Renderer>> {
     Ok(Box::new(GpuRenderer::new(gpu)?))
 }

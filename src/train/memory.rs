@@ -9,7 +9,7 @@ use crate::base::machine::memory_available;
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::{Dataset, View};
-use crate::render::device_needs::ViewSizes;
+use crate::render::view_sizes::ViewSizes;
 use crate::scene::state::row_bytes;
 
 /// Bytes per page of index, slot address and uses in the plan, for pages in memory or not.

@@ -20,6 +20,7 @@ pub mod comparison;
 pub mod costs;
 pub mod dataset_print;
 mod dense;
+#[cfg_attr(not(feature = "gpu"), path = "device_memory_absent.rs")]
 mod device_memory;
 mod drive_space;
 pub mod error;

@@ -31,7 +31,7 @@ use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{self, PlyMeta};
 use crate::optim::method::Method;
 use crate::paging::pager::{Pager, PagerConfig};
-use crate::render::device_needs::ViewSizes;
+use crate::render::view_sizes::ViewSizes;
 use crate::render::{RenderOptions, Renderer};
 use crate::report::run_files::PLY_FILE;
 use crate::scene::camera::Camera;

@@ -6,14 +6,20 @@
 
 use crate::page::format::halves;
 use crate::page::format::slot_header::StoredAs;
+#[cfg(feature = "zstd")]
 use std::cell::RefCell;
 use std::io;
+#[cfg(feature = "zstd")]
 use zstd::zstd_safe::CParameter;
 
 /// Bytes per word of the shuffle: payloads are mostly 32-bit floats.
+#[cfg(feature = "zstd")]
 const WORD: usize = 4;
 /// The zstd levels on offer.
 const LEVELS: std::ops::RangeInclusive<i32> = 1..=19;
+
+/// What a program without zstd says of it.
+const WITHOUT_ZSTD: &str = "this program was built without zstd: build it with the feature zstd (it is on by default)";
 
 /// The codec of new versions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -39,7 +45,8 @@ impl std::str::FromStr for Codec {
         match (text, level) {
             ("raw", _) => Ok(Codec::Raw),
             ("halves", _) => Ok(Codec::Halves),
-            (_, Some(level)) if LEVELS.contains(&level) => Ok(Codec::Zstd { level }),
+            (_, Some(level)) if LEVELS.contains(&level) && cfg!(feature = "zstd") => Ok(Codec::Zstd { level }),
+            (_, Some(_)) if cfg!(not(feature = "zstd")) => Err(WITHOUT_ZSTD.to_string()),
             _ => Err(format!("unknown codec `{text}`: write raw, halves, or zstd:1 to zstd:{}", LEVELS.end())),
         }
     }
@@ -56,6 +63,7 @@ impl std::fmt::Display for Codec {
 }
 
 /// Scratch memory of one thread, reused by encoding and decoding.
+#[cfg(feature = "zstd")]
 #[derive(Default)]
 struct Scratch {
     shuffled: Vec<u8>,
@@ -63,6 +71,7 @@ struct Scratch {
     decompressor: Option<zstd::bulk::Decompressor<'static>>,
 }
 
+#[cfg(feature = "zstd")]
 thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
@@ -86,6 +95,7 @@ pub fn encode_as(codec: Codec, payload: &[u8], stored: &mut [u8]) -> io::Result<
 ///
 /// # Errors
 /// zstd refuses the level, or runs out of memory.
+#[cfg(feature = "zstd")]
 fn encode(payload: &[u8], level: i32, stored: &mut [u8]) -> io::Result<Option<usize>> {
     SCRATCH.with_borrow_mut(|scratch| {
         scratch.shuffled.resize(payload.len(), 0);
@@ -114,25 +124,42 @@ pub fn decode(stored: &[u8], codec: StoredAs, payload: &mut [u8]) -> io::Result<
         StoredAs::Raw if stored.len() == payload.len() => payload.copy_from_slice(stored),
         StoredAs::Raw => return Err(wrong("the stored length differs from the payload's")),
         StoredAs::Halves => halves::decode(stored, payload)?,
-        StoredAs::ShuffledZstd => SCRATCH.with_borrow_mut(|scratch| {
-            let decompressor = match &mut scratch.decompressor {
-                Some(decompressor) => decompressor,
-                none => none.insert(zstd::bulk::Decompressor::new()?),
-            };
-            scratch.shuffled.resize(payload.len(), 0);
-            // A single call that writes to the final buffer: a huge window stated by the frame takes no memory.
-            let bytes = decompressor.decompress_to_buffer(stored, scratch.shuffled.as_mut_slice())?;
-            if bytes != payload.len() {
-                return Err(wrong("the decoded payload is too short"));
-            }
-            unshuffle(&scratch.shuffled, payload);
-            Ok(())
-        })?,
+        StoredAs::ShuffledZstd => decode_zstd(stored, payload)?,
     }
     Ok(())
 }
 
+#[cfg(feature = "zstd")]
+fn decode_zstd(stored: &[u8], payload: &mut [u8]) -> io::Result<()> {
+    SCRATCH.with_borrow_mut(|scratch| {
+        let decompressor = match &mut scratch.decompressor {
+            Some(decompressor) => decompressor,
+            none => none.insert(zstd::bulk::Decompressor::new()?),
+        };
+        scratch.shuffled.resize(payload.len(), 0);
+        // A single call that writes to the final buffer: a huge window stated by the frame takes no memory.
+        let bytes = decompressor.decompress_to_buffer(stored, scratch.shuffled.as_mut_slice())?;
+        if bytes != payload.len() {
+            return Err(io::Error::new(io::ErrorKind::InvalidData, "the decoded payload is too short"));
+        }
+        unshuffle(&scratch.shuffled, payload);
+        Ok(())
+    })
+}
+
+#[cfg(not(feature = "zstd"))]
+fn decode_zstd(_: &[u8], _: &mut [u8]) -> io::Result<()> {
+    Err(io::Error::new(io::ErrorKind::Unsupported, WITHOUT_ZSTD))
+}
+
+/// A program without zstd makes no value that asks for it (its `FromStr`).
+#[cfg(not(feature = "zstd"))]
+fn encode(_: &[u8], _: i32, _: &mut [u8]) -> io::Result<Option<usize>> {
+    Err(io::Error::new(io::ErrorKind::Unsupported, WITHOUT_ZSTD))
+}
+
 /// The first bytes of all words, then all second bytes, and so on; a remainder shorter than a word stays at the end.
+#[cfg(feature = "zstd")]
 fn shuffle(from: &[u8], to: &mut [u8]) {
     let words = from.len() / WORD;
     for (lane, lane_bytes) in to[..words * WORD].chunks_exact_mut(words.max(1)).enumerate() {
@@ -144,6 +171,7 @@ fn shuffle(from: &[u8], to: &mut [u8]) {
 }
 
 /// The inverse of [`shuffle`].
+#[cfg(feature = "zstd")]
 fn unshuffle(from: &[u8], to: &mut [u8]) {
     let words = from.len() / WORD;
     let (lanes, rest) = from.split_at(words * WORD);
@@ -155,7 +183,7 @@ fn unshuffle(from: &[u8], to: &mut [u8]) {
     to[words * WORD..].copy_from_slice(rest);
 }
 
-#[cfg(test)]
+#[cfg(all(test, feature = "zstd"))]
 #[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;

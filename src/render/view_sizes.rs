@@ -1,0 +1,34 @@
+//! The sizes of a view from which its device memory follows. Not here: the sums (`device_needs`).
+
+/// Most tiles that a row of a grown scene is expected to reach, on average over the rows in view.
+const ISECTS_PER_ROW: u64 = 32;
+
+/// The sizes of a view.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct ViewSizes {
+    /// Rows in view.
+    pub rows: u64,
+    /// Intersections of splats and tiles.
+    pub isects: u64,
+    /// Pixels.
+    pub pixels: u64,
+}
+
+impl ViewSizes {
+    /// The larger of each size.
+    pub fn max(self, other: ViewSizes) -> ViewSizes {
+        ViewSizes {
+            rows: self.rows.max(other.rows),
+            isects: self.isects.max(other.isects),
+            pixels: self.pixels.max(other.pixels),
+        }
+    }
+
+    /// The view with `growth` times as many Gaussians. A few that cover the picture say little about many, which are
+    /// smaller: their intersections are taken to be those of ordinary scenes.
+    pub fn grown(self, growth: f64) -> ViewSizes {
+        let [rows, isects] = [self.rows, self.isects].map(|size| (size as f64 * growth).ceil() as u64);
+        let isects = isects.min(self.isects.max(rows.saturating_mul(ISECTS_PER_ROW)));
+        ViewSizes { rows, isects, ..self }
+    }
+}
