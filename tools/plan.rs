@@ -3,7 +3,7 @@
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::base::units::{format_bytes, format_seconds};
+use gsscale::base::units::{format_bytes, format_grouped, format_seconds};
 use gsscale::config::choice::Chosen;
 use gsscale::config::command_line::parse_command_line;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
@@ -25,8 +25,10 @@ use gsscale::schedule::order::{Order, ViewOrder};
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::error::TrainError;
 use gsscale::train::first_look::{LookFor, first_look};
+use gsscale::train::forecast::{Forecast, Reach, STEP_GROWTH};
 use gsscale::train::machine::set_up;
 use gsscale::train::memory::host_bytes_peak;
+use gsscale::train::run::forecast;
 use serde_json::{Value, json};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -42,8 +44,8 @@ Examples:
 Pages are those of the first Gaussians; --growth 5 plans as if each page had grown five times as large.
 'hit rate' is the fraction of a step's pages that are already in memory, for a cache that knows the plan; 'of lru' the same for
 least-recently-used eviction. Waiting assumes that the drive does one transfer at a time, and that every step takes --step-seconds.
-Time is that of all steps with the Gaussians of the start (a scene that grows takes longer), without import, evaluation, commits
-and decoding of photos: a run takes up to a third longer than the timed steps.";
+The first lines are those of the dry run: memory, drive and time with the Gaussians that the run will reach. The table compares
+orders and frames with the Gaussians of the start, without import, evaluation, commits and decoding of photos.";
 
 /// Read and write rates of a common NVMe drive, bytes per second.
 const COMMON_DRIVE: [f64; 2] = [3e9, 2e9];
@@ -54,9 +56,6 @@ const EPOCHS: u32 = 4;
 const SHARES: [usize; 4] = [10, 25, 50, 100];
 /// Assumed step time of a scene in which nothing can be timed, seconds.
 const STEP_ASSUMED: f64 = 0.3;
-/// With twice the Gaussians a step takes 1.45 times as long (`gsscale-bench pareto`): step time grows with this power
-/// of their number.
-const STEP_GROWTH: f64 = 0.54;
 
 /// Predicts what a run would read and write through the disk tier and how long it would take, for any memory, page size
 /// and view order.
@@ -127,6 +126,8 @@ struct Scene {
     gaussians: u64,
     /// Number of frames that fit in --host-mem besides the run's other memory, if it was given.
     frames_within: Option<u64>,
+    /// What the run will take, as its dry run says it, or why that is not known.
+    forecast: Result<Forecast, String>,
 }
 
 /// One line of the result.
@@ -176,7 +177,7 @@ fn start(args: &Args) -> InputResult<String> {
             "pages": scene.index.len(), "page_rows": scene.config.page_rows, "frame_bytes": scene.frame_bytes,
             "state_bytes": state_bytes(&scene), "host_bytes_peak": host_bytes_peak(), "pages_of_largest_view": scene.views.most(),
             "drive_read_bytes_per_second": scene.drive.read_rate, "drive_write_bytes_per_second": scene.drive.write_rate,
-            "step_seconds": scene.drive.step_seconds, "step_timed_on": scene.timed_on,
+            "run": scene.forecast.as_ref().ok().map(json_of_forecast), "step_seconds": scene.drive.step_seconds, "step_timed_on": scene.timed_on,
             "plans": rows.iter().map(|row| json_of(args, &scene, row)).collect::<Vec<_>>(),
         });
         return Ok(format!("{value:#}"));
@@ -210,8 +211,10 @@ fn load(args: &Args) -> InputResult<Scene> {
     let [read_rate, write_rate] = drive_rates(args, &config)?;
     // If frames are given, the memory limit is not needed.
     let is_asked = args.compare_frames.is_empty() && config.frames == 0 && config.host_mem.0 > 0;
+    let forecast = forecast_of(args, &path, &config, is_asked)?;
+    let known = forecast.as_ref().ok().filter(|_| is_asked).and_then(|forecast| forecast.tiers.frames);
     let look_for = LookFor {
-        frames_within: is_asked.then_some(config.host_mem.0),
+        frames_within: (is_asked && known.is_none()).then_some(config.host_mem.0),
         step: args.step_seconds.is_none() && args.lists.is_none(),
     };
     let look = first_look(&path, &config, &folder_for(&config), look_for).map_err(not_planned)?;
@@ -234,11 +237,35 @@ fn load(args: &Args) -> InputResult<Scene> {
         },
         timed_on: look.step.map(|step| step.device),
         gaussians: look.gaussians,
-        frames_within: look.frames.map(|frames| (frames as f64 / args.growth) as u64),
+        frames_within: known.or(look.frames).map(|frames| (frames as f64 / args.growth) as u64),
+        forecast,
         config,
         cameras,
         index: look.index,
     })
+}
+
+/// The forecast of the run with this config; with a budget and no spill directory, of one that has a spill directory. If the
+/// budget is asked for, a run that it cannot hold is an error.
+fn forecast_of(
+    args: &Args,
+    scene: &Path,
+    config: &TrainConfig,
+    is_asked: bool,
+) -> InputResult<Result<Forecast, String>> {
+    if !args.compare_frames.is_empty() || config.frames > 0 || args.lists.is_some() {
+        return Ok(Err(String::from("frames are given")));
+    }
+    let mut config = config.clone();
+    if is_asked && config.residence().spill_dir().is_none() {
+        config.spill_dir = std::env::temp_dir().join("gsscale-pages").to_string_lossy().into_owned();
+    }
+    match forecast(scene, &config) {
+        Ok(Some(forecast)) => Ok(Ok(forecast)),
+        Ok(None) => Ok(Err(String::from("its first pages take more than half of --host-mem"))),
+        Err(error) if is_asked => Err(not_planned(error)),
+        Err(error) => Ok(Err(error.to_string())),
+    }
 }
 
 /// Folder for lists that exceed memory: beside the pages, if their folder is known.
@@ -387,10 +414,49 @@ fn json_of(args: &Args, scene: &Scene, row: &Row) -> Value {
     })
 }
 
+/// What the run will take, with the Gaussians that it reaches.
+fn json_of_forecast(forecast: &Forecast) -> Value {
+    json!({
+        "gaussians": forecast.gaussians, "gaussians_known_by": format!("{:?}", forecast.reach).to_lowercase(),
+        "memory_bytes": forecast.memory_at_end().total(), "memory_bytes_at_start": forecast.memory[0].total(),
+        "frames": forecast.tiers.frames, "drive_bytes": forecast.drive_bytes, "drive_bytes_most": forecast.drive_bytes_most,
+        "ply_bytes": forecast.ply_bytes, "bytes_written": forecast.bytes_written,
+        "commit_bytes_most": forecast.commit_bytes_most, "seconds": forecast.seconds,
+    })
+}
+
+/// The lines about the run; the table below them is about comparisons.
+fn text_of_forecast(scene: &Scene) -> String {
+    let forecast = match &scene.forecast {
+        Ok(forecast) => forecast,
+        Err(_) if scene.frames_within.is_none() => return String::new(),
+        Err(why) => return format!("the whole run is not forecast: {why}\n"),
+    };
+    let drive = match forecast.tiers.frames {
+        Some(_) => format!(
+            "{} of pages, about {} to write without commits",
+            format_bytes(forecast.drive_bytes),
+            format_bytes(forecast.bytes_written as u64)
+        ),
+        None => format!("checkpoint {} at most", format_bytes(forecast.drive_bytes_most)),
+    };
+    format!(
+        "the run, as its dry run says it, with {} Gaussians at the end{}:\n  memory  about {} at the peak\n  \
+         drive   {drive}, PLY {}; commits write {} at most\n  time    about {}\n",
+        format_grouped(forecast.gaussians[1]),
+        if forecast.reach == Reach::Guess { " (a guess)" } else { "" },
+        format_bytes(forecast.memory_at_end().total()),
+        format_bytes(forecast.ply_bytes),
+        format_bytes(forecast.commit_bytes_most as u64),
+        format_seconds(forecast.seconds),
+    )
+}
+
 fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
     let size = |bytes: f64| format_bytes(bytes as u64);
     let pages = scene.index.len();
-    let mut text = format!(
+    let mut text = text_of_forecast(scene);
+    text += &format!(
         "{} Gaussians in {pages} pages of at most {} rows, {} on disk\n\
          {} views need {:.1} % of the pages on average, {:.1} % at most",
         scene.gaussians,

@@ -2,12 +2,13 @@
 //!
 //! `--commit-every auto` limits the loss of a kill to [`LOSS_SECONDS`]. Commits are more frequent while they delay
 //! training by less than `CHEAP_OVERHEAD`, which keeps their total cost below [`OVERHEAD`] on drives fast enough for
-//! both. On a slower drive the loss limit has priority, and the overhead is reported. [`BYTES_PER_HOUR`] has priority
-//! over both.
+//! both. On a slower drive the loss limit has priority, and the overhead is reported. The limit of bytes an hour
+//! ([`bytes_per_hour`]) has priority over both.
 //!
 //! Invariants: 1. this file reads no clock; callers pass elapsed times; 2. the interval is a function of the sequence
 //! of costs; 3. no result of a run depends on it.
 
+use crate::base::units::GIB;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
 use std::str::FromStr;
@@ -19,9 +20,14 @@ pub const OVERHEAD: f64 = 0.03;
 /// Commits are more frequent than [`LOSS_SECONDS`] requires while they delay the run by less than this share.
 const CHEAP_OVERHEAD: f64 = 0.01;
 /// Shortest automatic interval: losing fewer seconds of work does not matter.
-const SHORTEST_SECONDS: f64 = 10.0;
+pub const SHORTEST_SECONDS: f64 = 10.0;
 /// Most bytes that commits write per hour: a drive rated for 300 TB lasts 1,100 hours.
-pub const BYTES_PER_HOUR: f64 = 256.0 * (1u64 << 30) as f64;
+pub const BYTES_PER_HOUR: f64 = 256.0 * GIB as f64;
+/// The commits of a run in memory write at most this many times its state an hour: each writes nearly all of it, since a
+/// minute of steps changes most pages.
+const STATES_PER_HOUR: f64 = 24.0;
+/// Bytes an hour that a run in memory may always write: a small scene is committed every few seconds.
+const BYTES_PER_HOUR_SMALL: f64 = 16.0 * GIB as f64;
 /// Weight of the last commit in the expected cost of the next.
 const LAST_WEIGHT: f64 = 0.5;
 
@@ -80,6 +86,13 @@ impl<'de> Deserialize<'de> for CommitEvery {
     }
 }
 
+/// Most bytes that commits write per hour, for a run in memory with `state_bytes` bytes of Gaussians and optimizer state;
+/// `None` for a run whose pages are on a drive, where a commit writes what changed since the last.
+pub fn bytes_per_hour(state_bytes: Option<u64>) -> f64 {
+    let of_state = |bytes: u64| (STATES_PER_HOUR * bytes as f64).clamp(BYTES_PER_HOUR_SMALL, BYTES_PER_HOUR);
+    state_bytes.map_or(BYTES_PER_HOUR, of_state)
+}
+
 /// Cost of one commit.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CommitCost {
@@ -116,20 +129,29 @@ pub struct CommitInterval {
     every: CommitEvery,
     /// Expected cost of the next commit.
     expected: Option<CommitCost>,
+    /// Most bytes that commits write per hour.
+    bytes_per_hour: f64,
     total: CommitReport,
 }
 
 impl CommitInterval {
     /// The interval before the first commit.
     pub fn new(every: CommitEvery) -> CommitInterval {
-        CommitInterval { every, expected: None, total: CommitReport::default() }
+        CommitInterval { every, expected: None, bytes_per_hour: BYTES_PER_HOUR, total: CommitReport::default() }
+    }
+
+    /// Limits the bytes that the next commits write, for a run in memory of this size ([`bytes_per_hour`]).
+    pub fn limit_bytes(&mut self, state_bytes: u64) {
+        self.bytes_per_hour = bytes_per_hour(Some(state_bytes));
     }
 
     /// Seconds from the end of a commit to the next cut; `None` without periodic commits.
     pub fn seconds(&self) -> Option<f64> {
         match self.every {
             CommitEvery::Seconds(seconds) => (seconds > 0.0).then_some(seconds),
-            CommitEvery::Auto => Some(self.expected.map_or(SHORTEST_SECONDS, automatic)),
+            CommitEvery::Auto => {
+                Some(self.expected.map_or(SHORTEST_SECONDS, |cost| automatic(cost, self.bytes_per_hour)))
+            }
         }
     }
 
@@ -166,11 +188,11 @@ impl CommitInterval {
 }
 
 /// The automatic interval for an expected cost.
-fn automatic(cost: CommitCost) -> f64 {
+fn automatic(cost: CommitCost, bytes_per_hour: f64) -> f64 {
     // A kill loses the interval plus the time until the next commit is durable.
     let longest = (LOSS_SECONDS - cost.until_durable).max(LOSS_SECONDS / 2.0);
     let cheap = cost.waited * (1.0 / CHEAP_OVERHEAD - 1.0);
-    let wear = 3600.0 * cost.bytes as f64 / BYTES_PER_HOUR - cost.until_durable;
+    let wear = 3600.0 * cost.bytes as f64 / bytes_per_hour - cost.until_durable;
     cheap.clamp(SHORTEST_SECONDS, longest).max(wear)
 }
 
@@ -178,7 +200,6 @@ fn automatic(cost: CommitCost) -> f64 {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
-    use crate::base::units::GIB;
 
     fn cost(waited: f64, until_durable: f64, bytes: u64) -> CommitCost {
         CommitCost { waited, until_durable, bytes, at_risk: 0.0 }
@@ -235,6 +256,19 @@ mod tests {
         }
         // 3,600 s x 1 GiB / 256 GiB are 14 s: by now the bytes decide.
         assert!((13.0..15.0).contains(&last), "{last}");
+    }
+
+    /// A run in memory commits all of its state each time.
+    #[test]
+    fn commits_of_a_run_in_memory_are_bounded_by_its_size() {
+        for (state, most) in [(GIB / 10, 16), (GIB, 24), (4 * GIB, 96), (64 * GIB, 256)] {
+            let mut interval = CommitInterval::new(CommitEvery::Auto);
+            interval.limit_bytes(state);
+            interval.add(cost(0.5, 0.5, state));
+            let written = state as f64 * 3600.0 / (interval.seconds().unwrap() + 0.5);
+            // A few roundings.
+            assert!(written <= (most * GIB) as f64 * (1.0 + 1e-9), "{state}: {written}");
+        }
     }
 
     #[test]

@@ -236,7 +236,7 @@ config_keys! {
         spill_codec: Chosen<Codec> = Chosen(None) => Free;
         /// Seconds between commits, which is the most that a killed run loses. 0 = only on a stop request and after the
         /// last step. auto = 10 to 60, so that commits delay training by less than 1 %; longer if commits would write
-        /// more than 256 GiB an hour. Never changes results
+        /// more than 256 GiB an hour, or in memory 24 times the scene and at least 16 GiB. Never changes results
         commit_every: CommitEvery = CommitEvery::Auto => Free;
         /// Seconds to wait for space on a full drive before the run stops with its last commit
         disk_full_wait: f64 = 600.0 => Free;

@@ -19,6 +19,7 @@ use crate::config::file::TrainConfig;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::{CommitError, Commits};
 use crate::paging::stats::SlotSpace;
+use crate::scene::state::row_bytes;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -173,6 +174,9 @@ impl Checkpoint {
     /// # Errors
     /// As [`Checkpoint::commit`].
     pub fn between_steps(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
+        if self.is_optional {
+            self.interval.limit_bytes(trainer.scene.rows() * row_bytes(trainer.scene.rules.sh_degree()) as u64);
+        }
         if !trainer.scene.pager.is_frozen() {
             // A failed write abandoned it; the next step returns the error.
             self.beside = None;

@@ -24,7 +24,7 @@ fn needs(config: &TrainConfig, memory: &MemoryEstimate) -> Option<DeviceNeeds> {
 ///
 /// # Errors
 /// The budget is too small.
-pub(super) fn check(config: &TrainConfig, memory: &[MemoryEstimate; 2]) -> InputResult<()> {
+pub(super) fn check(config: &TrainConfig, memory: &[MemoryEstimate; 3]) -> InputResult<()> {
     let [Some(now), Some(grown)] = [&memory[0], &memory[1]].map(|memory| needs(config, memory)) else { return Ok(()) };
     let (budget, least) = (config.device_mem.0, now.least().max(grown.least()));
     if budget == 0 || bytes_for_buffers(budget) >= least {

@@ -8,7 +8,7 @@ use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 
 /// Nothing to check.
-pub(super) fn check(_: &TrainConfig, _: &[MemoryEstimate; 2]) -> InputResult<()> {
+pub(super) fn check(_: &TrainConfig, _: &[MemoryEstimate; 3]) -> InputResult<()> {
     Ok(())
 }
 

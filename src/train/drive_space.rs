@@ -21,7 +21,7 @@ use crate::schedule::visibility::ViewPages;
 /// Epochs that are simulated to estimate the bytes a run writes.
 const PLAYED_EPOCHS: u32 = 3;
 /// Versions of a page on the drive: one per commit kept (two), and one being written.
-const VERSIONS: u64 = 3;
+pub(super) const VERSIONS: u64 = 3;
 /// Additional slots of writes in flight.
 const SLOTS_IN_FLIGHT: u64 = 64;
 
@@ -84,18 +84,38 @@ pub(super) fn check_drive(config: &TrainConfig, free: u64, [now, most]: [u64; 2]
     Ok(())
 }
 
-/// Bytes that the run will write to the drive, without commits: the import, and the steps by simulation of a few epochs
-/// with the current pages.
-pub(super) fn bytes_written(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, frames: usize) -> f64 {
+/// Bytes that a run writes to the drive, without commits.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct StepWrites {
+    /// The import.
+    pub import: f64,
+    /// A step with the Gaussians of now, and with those of the end.
+    pub of_step: [f64; 2],
+}
+
+/// The bytes that a run with `frames` frames writes whose pages become `growth` times as many: by simulation of a few epochs
+/// with the pages of now. At the end as many frames hold fewer of the pages, and a view takes more of them.
+pub(super) fn step_writes(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &Trainer,
+    frames: usize,
+    growth: f64,
+) -> StepWrites {
     let cameras = train_cameras(dataset);
     let index = trainer.scene.pager.index();
     let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
-    let options =
-        ReplayOptions { frames, policy: config.evict, reads_ahead: false, steps, plan_bytes: PLAN_BYTES as u64 };
     let page_bytes = vec![trainer.scene.pager.frame_bytes() as u32; index.len()];
-    let played = replay(&ViewPages::new(index, &cameras), &page_bytes, trainer.view_order(), &options);
-    let written: u64 = played.map_or(0, |p| p.steps.iter().map(|s| s.bytes_written).sum());
-    let done = trainer.steps_done();
-    let import = if done == 0 { page_bytes.iter().map(|&b| f64::from(b)).sum() } else { 0.0 };
-    import + written as f64 * f64::from(config.steps - done) / f64::from(steps.max(1))
+    let views = ViewPages::new(index, &cameras);
+    let of_step = |frames: usize| {
+        let options =
+            ReplayOptions { frames, policy: config.evict, reads_ahead: false, steps, plan_bytes: PLAN_BYTES as u64 };
+        let played = replay(&views, &page_bytes, trainer.view_order(), &options);
+        let written: u64 = played.map_or(0, |p| p.steps.iter().map(|s| s.bytes_written).sum());
+        written as f64 / f64::from(steps.max(1))
+    };
+    let then = ((frames as f64 / growth.max(1.0)) as usize).max(views.most().min(frames));
+    let import = if trainer.steps_done() == 0 { page_bytes.iter().map(|&b| f64::from(b)).sum() } else { 0.0 };
+    let now = of_step(frames);
+    StepWrites { import, of_step: [now, if then < frames { of_step(then) } else { now } * growth.max(1.0)] }
 }

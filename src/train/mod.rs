@@ -30,6 +30,7 @@ mod first_commit;
 mod first_frames;
 pub mod first_look;
 mod fitting;
+pub mod forecast;
 pub mod full_drive;
 mod gaussian_pages;
 mod largest_view;

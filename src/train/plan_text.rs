@@ -1,12 +1,11 @@
 //! The plan of a run's tiers as text, as a run prints it at its start.
 
+use super::forecast::{Forecast, Reach};
 use super::largest_view::LargestView;
-use super::memory::MemoryEstimate;
 use super::places::drive_of;
-use super::preflight::TierPlan;
 use super::start::Start;
 use super::tiers::Tiers;
-use crate::base::units::format_bytes;
+use crate::base::units::{format_bytes, format_grouped, format_seconds};
 use crate::config::file::TrainConfig;
 use crate::page::folder::file_system::free_bytes;
 use crate::paging::pager::PagerConfig;
@@ -15,8 +14,21 @@ use crate::scene::partition::first_fill;
 /// Rated endurance of a common drive of 500 GB, bytes written.
 const ENDURANCE_BYTES: f64 = 300e12;
 
-/// The description of the tiers that a run prints at its start.
-pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> String {
+/// What becomes of the number of Gaussians, in the words of a forecast.
+pub fn growth(forecast: &Forecast) -> String {
+    let last = format_grouped(forecast.gaussians[1]);
+    match forecast.reach {
+        Reach::Constant => String::from(" (no densification)"),
+        Reach::Cap => format!(", growing to at most {last}"),
+        Reach::Guess => {
+            format!(", growing to perhaps {last} (a guess; --max-gaussians caps them)")
+        }
+    }
+}
+
+/// The description of memory, drive and time that a run prints at its start.
+pub fn describe(forecast: &Forecast, tiers: &Tiers) -> String {
+    let (plan, memory) = (&forecast.tiers, forecast.memory_at_end());
     let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
     let LargestView { pages: largest, mean, .. } = &plan.largest_view;
     let mut text = format!(
@@ -36,7 +48,11 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
         }
         Some(frames) => format!("{frames} frames of pages"),
     };
-    text.push_str(&format!("memory  about {} at the peak\n", format_bytes(memory.total())));
+    let grows = forecast.gaussians[1] > forecast.gaussians[0];
+    let at = if grows { format!(", with {} Gaussians", format_grouped(forecast.gaussians[1])) } else { String::new() };
+    let start = format!(" ({} at the start)", format_bytes(forecast.memory[0].total()));
+    let start = if grows { start.as_str() } else { "" };
+    text.push_str(&format!("memory  about {} at the peak{at}{start}\n", format_bytes(memory.total())));
     text.push_str(&part(&frames, memory.frames));
     text.push_str(&part("one view: rows, gradients, images", memory.view));
     text.push_str(&part("decoded photos (--image-cache)", memory.targets));
@@ -45,19 +61,41 @@ pub fn describe(plan: &TierPlan, memory: &MemoryEstimate, tiers: &Tiers) -> Stri
     }
     text.push_str(&part("index of the pages", memory.index));
     text.push_str(&part("program and tables", memory.base + memory.copies));
-    if tiers.spills() {
-        text.push_str(&format!(
-            "drive   {} of pages by {} ({}), {} free\n        \
-             about {} to write without commits, {:.2} % of the rated life of a common drive\n",
-            format_bytes(plan.pages[0] * plan.frame_bytes),
-            tiers.engine,
-            tiers.codec,
-            plan.free_bytes.map_or(String::from("unknown"), format_bytes),
-            format_bytes(plan.bytes_written as u64),
-            100.0 * plan.bytes_written / ENDURANCE_BYTES
-        ));
-    }
+    text.push_str(&drive(forecast, tiers, &at));
+    text.push_str(&format!(
+        "time    about {} for {} steps{at}, without evaluation\n",
+        format_seconds(forecast.seconds),
+        format_grouped(forecast.steps.into())
+    ));
     text
+}
+
+/// The lines about drives.
+fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
+    let (plan, commits) = (&forecast.tiers, forecast.commit_bytes_most);
+    let commits = match commits > 0.0 {
+        true => format!("commits write {} at most", format_bytes(commits as u64)),
+        false => String::from("no periodic commits"),
+    };
+    if !tiers.spills() {
+        let [checkpoint, ply] = [forecast.drive_bytes_most, forecast.ply_bytes].map(format_bytes);
+        return format!("drive   checkpoint {checkpoint} at most, PLY {ply}{at}; {commits}\n");
+    }
+    let now = if at.is_empty() {
+        String::new()
+    } else {
+        format!(" ({} at the start)", format_bytes(plan.pages[0] * plan.frame_bytes))
+    };
+    format!(
+        "drive   {} of pages{at}{now} by {} ({}), {} free\n        \
+         about {} to write without commits, {:.2} % of the rated life of a common drive; {commits}\n",
+        format_bytes(forecast.drive_bytes),
+        tiers.engine,
+        tiers.codec,
+        plan.free_bytes.map_or(String::from("unknown"), format_bytes),
+        format_bytes(forecast.bytes_written as u64),
+        100.0 * forecast.bytes_written / ENDURANCE_BYTES
+    )
 }
 
 /// Describes a scene that a dry run cannot plan because its pages exceed half of the budget; `None` if they fit. A dry

@@ -4,7 +4,7 @@
 //! warning.
 
 use super::budget::{HostBudget, frames_and_batch};
-use super::drive_space::{bytes_written, check_drive};
+use super::drive_space::check_drive;
 use super::error::TrainError;
 use super::first_frames::{FirstFrames, LargestNeed, first_frames, frames_of_budget, page_working, raise_to_least};
 use super::largest_view::{LargestView, cut_views, largest_view, train_cameras};
@@ -46,13 +46,11 @@ pub struct TierPlan {
     pub(super) largest_view: LargestView,
     /// Training views that need several batches, and the most batches of one of them.
     pub(super) cut_views: (usize, usize),
-    /// Bytes that the run is expected to write to the drive, without commits.
-    pub bytes_written: f64,
     /// Free bytes of the drive; `None` without a drive or if the system does not report them.
     pub free_bytes: Option<u64>,
 }
 
-/// Chooses the number of frames and completes the two estimates of [`super::probe::estimate`] with it.
+/// Chooses the number of frames and completes the estimates of [`super::probe::estimate`] with it.
 ///
 /// # Errors
 /// The budget or the drive is too small.
@@ -62,14 +60,13 @@ pub fn plan_tiers(
     trainer: &mut Trainer,
     tiers: &Tiers,
     host_mem: Option<u64>,
-    memory: &mut [MemoryEstimate; 2],
+    memory: &mut [MemoryEstimate; 3],
 ) -> InputResult<TierPlan> {
     let mut plan = TierPlan {
         pages: pages_now_and_most(config, trainer),
         frame_bytes: trainer.scene.pager.frame_bytes() as u64,
         frames: None,
         frames_are_named: config.frames > 0,
-        bytes_written: 0.0,
         free_bytes: tiers.free_bytes()?,
         largest_view: largest_view(dataset, trainer.scene.pager.index()),
         cut_views: (0, 1),
@@ -87,7 +84,6 @@ pub fn plan_tiers(
         trainer.set_view_order(auto_order(config, dataset, trainer, frames, &plan)?, dataset);
     }
     warn_of_growth(config, &plan, host_mem, memory);
-    plan.bytes_written = bytes_written(config, dataset, trainer, frames.min(plan.pages[0].max(1)) as usize);
     if let Some(free) = plan.free_bytes.filter(|_| tiers.spills()) {
         check_drive(config, free, plan.pages, plan.frame_bytes)?;
     }
@@ -109,7 +105,7 @@ fn plan_in_memory(
     config: &TrainConfig,
     trainer: &mut Trainer,
     asked: Option<u64>,
-    memory: &[MemoryEstimate; 2],
+    memory: &[MemoryEstimate; 3],
 ) -> InputResult<()> {
     let host_mem = raise_to_least(config, asked, memory[0].total());
     if trainer.scene.pager.slot_space().is_none() {
@@ -129,7 +125,7 @@ fn plan_frames(
     trainer: &mut Trainer,
     plan: &TierPlan,
     asked: Option<u64>,
-    memory: &mut [MemoryEstimate; 2],
+    memory: &mut [MemoryEstimate; 3],
 ) -> InputResult<(u64, Option<u64>)> {
     let need = LargestNeed { frame_bytes: plan.frame_bytes, pages: plan.largest_view.pages };
     let (FirstFrames { frames, pages_most }, host_mem) = first_frames(config, &need, asked, &memory[0])?;
@@ -212,7 +208,7 @@ pub(super) fn frames_within(
     view_pages: u64,
     host_mem: u64,
 ) -> Result<u64, TrainError> {
-    let [mut memory, _] = estimate(config, dataset, trainer, probe)?;
+    let ([mut memory, ..], _) = estimate(config, dataset, trainer, probe, probe.rows)?;
     memory.staging = first_staging_bytes(config, host_mem);
     let need = LargestNeed { frame_bytes: trainer.scene.pager.frame_bytes() as u64, pages: view_pages };
     Ok(frames_of_budget(config, &need, Some(host_mem), &memory)?.frames)
@@ -220,7 +216,7 @@ pub(super) fn frames_within(
 
 /// Warns if views may outgrow the frames: the pages of the largest view grow in proportion to the Gaussians, while
 /// the frames shrink.
-fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, memory: &[MemoryEstimate; 2]) {
+fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, memory: &[MemoryEstimate; 3]) {
     let ([now, most], Some(frames)) = (plan.pages, plan.frames) else { return };
     if !config.strategy.grows() {
         return;
@@ -257,7 +253,7 @@ fn times_to_outgrow(plan: &TierPlan, frames: u64, of_rows: u64, are_fixed: bool)
     (frames * plan.frame_bytes + of_rows) as f64 / (needed + of_rows).max(1) as f64
 }
 
-fn check_in_memory([start, most]: &[MemoryEstimate; 2], host_mem: Option<u64>) -> InputResult<()> {
+fn check_in_memory([start, most, _]: &[MemoryEstimate; 3], host_mem: Option<u64>) -> InputResult<()> {
     let Some(budget) = host_mem else { return Ok(()) };
     if start.total() > budget {
         let problem = format!(

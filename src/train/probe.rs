@@ -44,9 +44,18 @@ impl Probe {
     }
 }
 
-/// Estimates the memory of a run with all pages in memory: without growth, and grown to its cap. The trainer renders
+/// How long views take.
+#[derive(Debug, Clone, Copy)]
+pub struct ViewTimes {
+    /// Median seconds of rendering one forward and backward.
+    pub seconds: f64,
+    /// Largest share of the Gaussians that one draws.
+    pub visible_share: f64,
+}
+
+/// Estimates the memory of a run with all pages in memory: without growth, grown to its cap, and with `last` Gaussians. The trainer renders
 /// the views of the probe and keeps the allocations for its steps; allocating twice would fragment the heap and exceed
-/// the estimate.
+/// the estimate. Also returns how long views take.
 ///
 /// # Errors
 /// A view cannot be rendered.
@@ -55,9 +64,10 @@ pub fn estimate(
     dataset: &Dataset,
     trainer: &mut Trainer,
     probe: &Probe,
-) -> Result<[MemoryEstimate; 2], TrainError> {
+    last_rows: u64,
+) -> Result<([MemoryEstimate; 3], ViewTimes), TrainError> {
     let rows = probe.rows;
-    let Probed { pixels, visible, device } = trainer
+    let Probed { pixels, visible, device, seconds } = trainer
         .probe_views(dataset, &probe.views)
         .map_err(|error| device_memory::refusal(error, config, dataset, &trainer.scene, &probe.views))?;
     let pixels = pixels as u64;
@@ -79,7 +89,7 @@ pub fn estimate(
     let is_growing = config.strategy.grows();
     let copies = if is_growing { bytes_of_copies(probe.pages, trainer.scene.pager.frame_bytes()) } else { 0 };
     let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver;
-    Ok([rows, rows_at_most(config, rows)].map(|rows_then| {
+    let memory = [rows, rows_at_most(config, rows), last_rows].map(|rows_then| {
         let growth = rows_then as f64 / rows.max(1) as f64;
         // The parts of few rows say little about those of many: most of them is what a renderer holds for any number.
         let most = |bytes: f64, row_bytes: u64| bytes.max((bytes * growth).min((rows_then * row_bytes) as f64));
@@ -97,5 +107,6 @@ pub fn estimate(
             base,
             device: device.map(|view| view.grown(growth)),
         }
-    }))
+    });
+    Ok((memory, ViewTimes { seconds, visible_share: visible as f64 / rows.max(1) as f64 }))
 }

@@ -8,9 +8,10 @@ use super::changes::with_absolute_paths;
 use super::checkpoint::Checkpoint;
 use super::costs::Meter;
 use super::device_memory;
-use super::drive_space::check_first_drive;
+use super::drive_space::{StepWrites, check_first_drive, step_writes};
 use super::error::TrainError;
 use super::facts::{Resolved, write_config};
+use super::forecast::{Forecast, Measured, mean_pixels, reach};
 use super::machine;
 use super::memory::list_bytes;
 use super::memory::{host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
@@ -33,7 +34,7 @@ use super::training_loop::LoopOutputs;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity};
-use crate::config::choice::{Choice, Chosen, LogFormat};
+use crate::config::choice::{Choice, Chosen, Device, LogFormat};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::config::residence::Residence;
@@ -203,11 +204,68 @@ pub(super) fn begin(
         let problem = format!("strategy {} needs statistics that are missing: {error}", config.strategy.word());
         InputError::new("--strategy", problem, "use --device cpu, or --growth-score gradient with --recycle 0")
     })?;
-    let driver = host_bytes_now().unwrap_or(0).saturating_sub(before);
+    // Without a search for a device, a difference is the noise of the allocator.
+    let driver = match config.device {
+        Device::Cpu => 0,
+        Device::Gpu(_) => host_bytes_now().unwrap_or(0).saturating_sub(before),
+    };
     if let Some(word) = word.filter(|_| !quiet) {
         eprintln!("{word}");
     }
     Ok((renderer, options, driver))
+}
+
+/// The forecast of a run, as its dry run makes it: nothing is written. `None` if a dry run cannot hold the scene.
+///
+/// # Errors
+/// Those of a dry run.
+pub fn forecast(scene: &Path, config: &TrainConfig) -> Result<Option<Forecast>, TrainError> {
+    let (scene, config) = (scene.to_path_buf(), config.clone());
+    let request =
+        RunRequest { scene, out: PathBuf::new(), config, dry_run: true, existing: Existing::Refuse, quiet: true };
+    let host_mem = host_budget(&request.config);
+    let start = Start::read(&request.scene, &request.config, host_mem)?;
+    if plan_text::too_large_for_a_dry_run(&request.config, &start, host_mem).is_some() {
+        return Ok(None);
+    }
+    let FirstTrainer { dataset, mut trainer, tiers, driver, .. } = first_trainer(&request, start, host_mem)?;
+    plan(&request.config, &dataset, &tiers, &mut trainer, (host_mem, driver)).map(Some)
+}
+
+/// Chooses the frames of a run, refuses what cannot fit, and forecasts the rest. `driver`: bytes of the graphics driver.
+fn plan(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    tiers: &Tiers,
+    trainer: &mut Trainer,
+    (host_mem, driver): (Option<u64>, u64),
+) -> Result<Forecast, TrainError> {
+    trainer.renderer.set_list_bytes(host_mem.map(list_bytes));
+    let largest = preflight::allow_largest_view(config, dataset, trainer, host_mem);
+    if largest.is_none() {
+        return Err(no_view_sees(dataset, trainer.scene.rows()).into());
+    }
+    let probe = Probe::of_run(dataset, trainer, largest, driver);
+    let (rows, steps_done) = (trainer.scene.rows(), trainer.steps_done());
+    let pixels = mean_pixels(dataset.train_views().iter().map(|&view| &dataset.views[view].camera));
+    let (last, known) = reach(config, rows, pixels, steps_done);
+    let (mut memory, times) = estimate(config, dataset, trainer, &probe, last)?;
+    device_memory::check(config, &memory)?;
+    let plan = preflight::plan_tiers(config, dataset, trainer, tiers, host_mem, &mut memory)?;
+    let growth = last as f64 / rows.max(1) as f64;
+    let writes = match plan.frames {
+        Some(frames) => step_writes(config, dataset, trainer, frames.min(plan.pages[0].max(1)) as usize, growth),
+        None => StepWrites::default(),
+    };
+    let measured = Measured {
+        rows,
+        reach: (last, known),
+        steps_done,
+        view_seconds: times.seconds,
+        visible_share: times.visible_share,
+        writes,
+    };
+    Ok(Forecast::new(config, memory, plan, &measured, host_mem))
 }
 
 /// Plans a run, prints the plan, and trains to the end.
@@ -218,20 +276,12 @@ pub(super) fn plan_and_train(
     mut trainer: Trainer,
     begun: Begun,
 ) -> Result<RunOutcome, TrainError> {
-    let (config, host_mem) = (&request.config, begun.host_mem);
-    trainer.renderer.set_list_bytes(host_mem.map(list_bytes));
-    let largest = preflight::allow_largest_view(config, dataset, &mut trainer, host_mem);
-    if largest.is_none() {
-        return Err(no_view_sees(dataset, trainer.scene.rows()).into());
-    }
-    let probe = Probe::of_run(dataset, &trainer, largest, begun.driver);
-    let mut memory = estimate(config, dataset, &mut trainer, &probe)?;
-    device_memory::check(config, &memory)?;
-    let plan = preflight::plan_tiers(config, dataset, &mut trainer, &tiers, host_mem, &mut memory)?;
+    let config = &request.config;
+    let forecast = plan(config, dataset, &tiers, &mut trainer, (begun.host_mem, begun.driver))?;
     if !request.quiet {
-        let of_device = device_memory::describe(config, &memory[1]);
-        let of_tiers = plan_text::describe(&plan, &memory[1], &tiers) + &of_device;
-        let plan = describe(request, dataset, &trainer, &of_tiers);
+        let of_device = device_memory::describe(config, forecast.memory_at_end());
+        let of_tiers = plan_text::describe(&forecast, &tiers) + &of_device;
+        let plan = describe(request, dataset, &trainer, &plan_text::growth(&forecast), &of_tiers);
         match request.dry_run {
             // What was asked for goes to standard output.
             true => crate::say!("{plan}"),
@@ -468,15 +518,10 @@ fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, run: Run
 }
 
 /// Text of the plan: dataset, start and tiers.
-fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, tiers: &str) -> String {
+fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, growth: &str, tiers: &str) -> String {
     let (config, rows) = (&request.config, trainer.scene.rows());
     let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
     let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
-    let growth = match (config.strategy.grows(), config.max_gaussians) {
-        (false, _) => String::from(" (no densification)"),
-        (_, 0) => String::from(" (densification without a cap: memory grows with them; see --max-gaussians)"),
-        (_, cap) => format!(" growing to at most {cap}"),
-    };
     let results = match request.out.as_os_str().is_empty() {
         true => String::new(),
         false => format!(", results in {}", request.out.display()),

@@ -93,6 +93,8 @@ pub struct Probed {
     pub visible: usize,
     /// Sizes on a device; `None` without a device.
     pub device: Option<ViewSizes>,
+    /// Median seconds of rendering a view forward and backward.
+    pub seconds: f64,
 }
 
 impl Trainer {
@@ -156,20 +158,22 @@ impl Trainer {
     }
 
     /// Renders views forward and backward so that the memory of a view is allocated; the scene stays unchanged. Returns
-    /// the pixels of the largest view, and the most rows that a view draws.
+    /// the pixels of the largest view, the most rows that a view draws, and how long a view takes.
     ///
     /// # Errors
     /// A view cannot be rendered.
     pub fn probe_views(&mut self, dataset: &Dataset, views: &[usize]) -> Result<Probed, TrainError> {
         let render = self.render_options();
-        let mut probed = Probed::default();
+        let (mut probed, mut seconds) = (Probed::default(), Vec::new());
         for &view in views {
             let camera = &dataset.views[view].camera;
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
             let comparison = Comparison { target: &target, loss: self.options.loss, look: self.look(view, camera) };
             let now = (&mut self.scene, self.state.step, &mut self.working);
+            let began = Instant::now();
             let rows = rehearse(now, &mut *self.renderer, camera, (&render, &comparison), self.pages_most)?;
+            seconds.push(began.elapsed().as_secs_f64());
             let index = self.scene.pager.index();
             let pages = self.scene.pager.pages_of_view(camera);
             let is_whole = self.scene.pager.pages_per_batch(pages.len()).min(self.pages_most) >= pages.len();
@@ -178,6 +182,10 @@ impl Trainer {
             let sizes = self.renderer.device_sizes();
             probed.device = sizes.map(|sizes| probed.device.map_or(sizes, |most| most.max(sizes)));
         }
+        // The first view allocates memory, and is the largest.
+        let rest = if seconds.len() > 1 { &mut seconds[1..] } else { &mut seconds[..] };
+        rest.sort_unstable_by(f64::total_cmp);
+        probed.seconds = rest.get(rest.len() / 2).copied().unwrap_or(0.0);
         Ok(probed)
     }
 

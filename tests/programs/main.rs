@@ -16,6 +16,7 @@ mod drive_faults;
 mod exports;
 mod extremes;
 mod first_hour;
+mod forecast;
 mod gpu_train;
 mod growing;
 mod memory;

@@ -113,11 +113,11 @@ fn a_run_does_what_was_planned() {
         "--scales-lr",
         "1e-9",
     ];
-    let common = [&common[..], &["--view-order", "groups:9", "--prefetch-bytes", "1MiB"]].concat();
+    let common = [&common[..], &["--view-order", "groups:9", "--prefetch-bytes", "1MiB", "--device", "cpu"]].concat();
     let planned = |more: &[&str]| -> Value {
         serde_json::from_str(&stdout(&plan(&scene, &[&common[..], &["--json"], more].concat()))).unwrap()
     };
-    let flags = ["--out", text(&out), "--spill-dir", text(&spill), "--commit-every", "0", "--device", "cpu"];
+    let flags = ["--out", text(&out), "--spill-dir", text(&spill), "--commit-every", "0"];
     let common = [&common[..], &["--host-mem", "42MiB"]].concat();
     let trained = train(&[&[text(&scene)][..], &common, &flags].concat());
     let said = stderr(&trained);
@@ -130,9 +130,8 @@ fn a_run_does_what_was_planned() {
         let off = (number(planned) / real - 1.0).abs();
         assert!(off <= tolerance, "{what}: {planned} planned, {real} in the run, {:.1} % off", 100.0 * off);
     };
-    // The plan renders only the view with the most pages; the run renders some others too, which may take a little
-    // more.
-    near("frames", &within["plans"][0]["frames"], number(&done["frames"]), 0.1);
+    // Threads take their buffers in another order.
+    near("frames", &within["plans"][0]["frames"], number(&done["frames"]), 0.02);
     assert!(number(&done["frames"]) < 0.9 * number(&done["pages"]), "everything fits: {done}");
     let plan = planned(&["--frames", &done["frames"].to_string()]);
     // The plan knows all views and assumes that pages stay in place, which nearly holds for these Gaussians.

@@ -9,6 +9,7 @@ use gsscale::scene::camera::Camera;
 use gsscale::schedule::order::Order;
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::error::TrainError;
+use gsscale::train::forecast::{Reach, mean_pixels, reach};
 use gsscale::train::pages::PagedScene;
 use gsscale::train::prepare::prepare;
 use std::path::Path;
@@ -18,8 +19,6 @@ const ORDER_BYTES: u64 = 256 << 20;
 /// Frames per page of the largest view: Gaussians become larger in training and reach into more views
 /// (sheffield_cross_395, 3,000 steps without densification: from 227 pages to 270, factor 1.19).
 const SPARE: f64 = 1.25;
-/// Expected growth of the number of Gaussians without a cap.
-const UNCAPPED_GROWTH: f64 = 1.5;
 /// Growth of the number of pages over that of Gaussians: a split leaves two half-full pages (the same scene up to
 /// 64,000 Gaussians: 776 pages, where full pages would be 720).
 const SPLIT_GROWTH: f64 = 1.1;
@@ -55,7 +54,7 @@ impl Facts {
         let gaussians = columns.rows() as u64;
         Ok(Facts {
             gaussians,
-            growth: growth(gaussians, config),
+            growth: growth(gaussians, mean_pixels(cameras.iter()), config),
             pages: scene.pager.index().len() as u64,
             largest_view: views.most() as u64,
             views,
@@ -95,11 +94,9 @@ impl Facts {
     }
 }
 
-fn growth(gaussians: u64, config: &TrainConfig) -> f64 {
-    match (config.strategy.grows(), config.max_gaussians) {
-        (false, _) => 1.0,
-        _ if config.steps <= config.refine_start => 1.0,
-        (_, 0) => UNCAPPED_GROWTH * SPLIT_GROWTH,
-        (_, cap) => (cap as f64 / gaussians.max(1) as f64).max(1.0) * SPLIT_GROWTH,
+fn growth(gaussians: u64, pixels: f64, config: &TrainConfig) -> f64 {
+    match reach(config, gaussians, pixels, 0) {
+        (_, Reach::Constant) => 1.0,
+        (last, _) => last as f64 / gaussians.max(1) as f64 * SPLIT_GROWTH,
     }
 }

@@ -1,0 +1,92 @@
+//! Dry run, plan and run say the same of the same run: memory, drive, bytes written, Gaussians at the end. And the guess of a
+//! run without a cap is of the right size.
+
+use crate::support::scenes::{stderr, summary, text, told, train, wide_city};
+use gsscale::base::units::{format_bytes, format_grouped};
+use serde_json::Value;
+use std::path::Path;
+use std::process::Command;
+use tempfile::TempDir;
+
+fn planned(scene: &Path, flags: &[&str]) -> (Value, String) {
+    let plan = |more: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_gsscale-plan"));
+        let output = command.arg(text(scene)).args(flags).args(["--schedule", "classic"]).args(more).output().unwrap();
+        assert!(output.status.success(), "{}", stderr(&output));
+        String::from_utf8(output.stdout).unwrap()
+    };
+    (serde_json::from_str(&plan(&["--json"])).unwrap(), plan(&[]))
+}
+
+/// The lines of a plan about memory, pages and drive, which no clock and no free space changes.
+fn plan_lines(said: &str) -> Vec<String> {
+    let begins = |line: &&str| line.starts_with("memory ") || line.starts_with("    ") || line.starts_with("start ");
+    said.lines().filter(begins).map(str::to_string).collect()
+}
+
+#[test]
+fn dry_run_plan_and_run_say_the_same() {
+    let folder = TempDir::new().unwrap();
+    let scene = wide_city(folder.path(), 8_000);
+    let spill = folder.path().join("spill");
+    let on_drive = ["--spill-dir", text(&spill), "--host-mem", "60MiB", "--commit-every", "0", "--page-rows", "32"];
+    // Smaller pages take more memory than their rows.
+    let in_memory = ["--page-rows", "256"];
+    let growth = "--threads 1 --device cpu --refine-start 20 --refine-every 20 --refine-stop 80 --steps 100 \
+                  --image-cache 4MiB --view-order groups:4";
+    let growth: Vec<&str> = growth.split_whitespace().collect();
+    for (name, flags) in [
+        ("on a drive, capped", [&growth[..], &on_drive, &["--max-gaussians", "12000"]].concat()),
+        ("in memory, capped", [&growth[..], &in_memory, &["--max-gaussians", "12000"]].concat()),
+        ("in memory, guessed", [&growth[..], &in_memory].concat()),
+    ] {
+        let out = folder.path().join(name);
+        let dry = train(&[&[text(&scene), "--dry-run"], &flags[..]].concat());
+        let dry = told(&dry);
+        let (json, table) = planned(&scene, &flags);
+        let run = train(&[&[text(&scene), "--out", text(&out)], &flags[..]].concat());
+        assert!(run.status.success(), "{name}: {}", stderr(&run));
+        let run = stderr(&run);
+        assert_eq!(plan_lines(&dry), plan_lines(&run), "{name}");
+        let plan = &json["run"];
+        let number = |key: &str| plan[key].as_u64().or(plan[key].as_f64().map(|x| x as u64)).expect(key);
+        let last = plan["gaussians"][1].as_u64().unwrap();
+        let mut words = vec![
+            format!("memory  about {} at the peak", format_bytes(number("memory_bytes"))),
+            format!("{} Gaussians", format_grouped(last)),
+            format!("PLY {}", format_bytes(number("ply_bytes"))),
+        ];
+        if name.starts_with("on a drive") {
+            words.push(format!("{} of pages", format_bytes(number("drive_bytes"))));
+            words.push(format!("about {} to write without commits", format_bytes(number("bytes_written"))));
+            words.remove(2);
+        } else {
+            words.push(format!("checkpoint {} at most", format_bytes(number("drive_bytes_most"))));
+            words.push(format!("commits write {} at most", format_bytes(number("commit_bytes_most"))));
+            // How often is a matter of time, which is measured.
+            words.pop();
+        }
+        for word in words {
+            assert!(
+                dry.contains(&word) && run.contains(&word) && table.contains(&word),
+                "{name}: {word}\n{dry}\n{table}"
+            );
+        }
+        assert!(
+            dry.contains("\ntime    about ") && run.contains("\ntime    about ") && table.contains("  time    about ")
+        );
+        let done = summary(&out);
+        let [rows, peak] = ["gaussians", "host_bytes_peak"].map(|key| done[key].as_f64().unwrap());
+        if name.ends_with("capped") {
+            // The run ends in its first tenth below the cap at most, and the memory announced is that of the cap.
+            assert!(last == 12_000 && rows > 0.9 * 12_000.0, "{name}: {rows} of {last}");
+            // A tenth, and what the bare program differs by between systems, as for the memory of any plan.
+            let off = (number("memory_bytes") as f64 - peak).abs();
+            assert!(peak == 0.0 || off <= 0.1 * peak + 4e6, "{name}: {off} bytes off {peak}");
+        } else {
+            // Three rounds add .15 of the 48x36 pixels of a photo each.
+            assert_eq!(last, plan["gaussians"][0].as_u64().unwrap() + (0.45 * 48.0 * 36.0) as u64);
+        }
+        assert!(number("seconds") < 3600, "{plan}");
+    }
+}
