@@ -53,9 +53,15 @@
 //! 1. `config/file.rs`: one line in the list gives field, flag, help, default and the effect of a change
 //!    ([`config::key::Class`]).
 //! 2. `config/check.rs`: its range. An enumeration needs its words instead: one line in `config/choice.rs`.
-//! 3. `config/limits.rs`: the options of the room that obeys the key. The room itself never sees the config.
-//! 4. `configs/default.toml`: `GSSCALE_WRITE_DEFAULT_CONFIG=1 cargo test --test inputs default_file` writes the
-//!    file again.
+//! 3. `config/limits.rs`: the options of the room that obeys the key. No room but `train` sees the config.
+//! 4. `train/changes.rs`, `BEFORE_ITS_TIME`: if older programs did what one value of the key says. Otherwise a run that they
+//!    began resumes only with `--accept-changes`.
+//! 5. `configs/default.toml`: `GSSCALE_WRITE_DEFAULT_CONFIG=1 cargo test --test inputs default_file` writes the
+//!    file again. `tests/programs/cli.rs` lists the words of all enumerations.
+//!
+//! **A setting that one backend lacks**
+//! 1. `render/mod.rs`: a method of [`render::Renderer`] whose default refuses, an error with its remedy; `weigh_rows` is the example.
+//! 2. `train/run.rs`, `begin`: asks the renderer before the output folder exists.
 //!
 //! **A densification strategy**
 //! 1. `densify/strategy.rs` states the steps: a file with the [`densify::strategy::Strategy`], its name, and an
@@ -67,15 +73,17 @@
 //! 1. `train/comparison.rs`: the one place between picture and gradient, for steps and rehearsals. It works on the
 //!    CPU and on devices through [`render::Renderer::picture_mut`] and [`render::Renderer::picture_gradient`]. What
 //!    it needs is a field of [`train::comparison::Comparison`].
-//! 2. `train/trainer.rs`: fills that field, in `step` and in `probe_views`.
+//! 2. `train/trainer.rs` and `train/first_look.rs`: fill that field, for steps and for the first rehearsal.
 //! 3. `train/step.rs`, after `loss_value`: adds the term to the loss that is logged.
 //! 4. The weight is a config key; parameters that are trained are a resumable value.
-//! 5. Only if its time matters: the stage itself, `kernels/image_loss.rs` and `image_loss.wgsl` among the shaders.
+//! 5. A term of the picture and the photo alone, for the CPU only or where its time matters: instead the stage itself,
+//!    `kernels/image_loss.rs`, its options in `LossOptions`, and `image_loss.wgsl` among the shaders. Masked pixels do not count.
 //!
 //! **An output format**
 //! 1. `exchange/` gets a file beside `exchange/ply/write.rs`, with the same three calls: create, write rows,
 //!    finish. [`base::whole_file::PartFile`] makes the file appear as a whole. `exchange/mod.rs` names the file.
-//! 2. `train/trainer.rs`, `save`: what a run writes. `train/stores/export.rs`: what `gsscale-ckpt export` writes.
+//! 2. `train/run.rs`, after the loop: what a run writes at its end. `train/stores/export.rs`: what `gsscale-ckpt export` writes.
+//!    The PLY remains: resumes, `gsscale-eval` and more steps read it.
 //! 3. `report/run_files.rs`: the name in a run's folder, so that `--overwrite` removes the file.
 //!
 //! **A resumable value**
@@ -87,7 +95,9 @@
 //! **An eviction order**
 //! 1. `paging/frames/evict.rs`: a value of [`paging::frames::evict::EvictPolicy`], its key of the order, and
 //!    whether the order ignores the plan. Runs, look-ahead and simulations share it.
+//!    `last_use` is the step of the last pin; a page that no step has pinned yet has 0.
 //! 2. `config/choice.rs`: the word of `--evict`. `config/file.rs`: the help of the key.
+//! 3. `tests/storage/schedule.rs`: what the order must do, as a simple model.
 
 pub mod appearance;
 pub mod base;

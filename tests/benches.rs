@@ -32,6 +32,9 @@ mod step;
 #[allow(dead_code)] // its `main`
 #[path = "../benches/tiers.rs"]
 mod tiers;
+#[allow(dead_code)] // its `main`
+#[path = "../benches/view_memory.rs"]
+mod view_memory;
 
 use clap::Parser;
 use gsscale::config::command_line::parse_arguments;
@@ -86,6 +89,11 @@ fn image_loss_runs() {
 #[test]
 fn render_runs() {
     assert_eq!(render::tiny(), render::tiny());
+}
+
+#[test]
+fn view_memory_runs() {
+    assert!(view_memory::tiny() != 0);
 }
 
 #[test]

@@ -42,8 +42,9 @@ Examples:
   gsscale-plan runs/city --host-mem 2GiB --lists 100..110
 
 Pages are those of the first Gaussians; --growth 5 plans as if each page had grown five times as large.
-'hit rate' is the fraction of a step's pages that are already in memory, for a cache that knows the plan; 'of lru' the same for
-least-recently-used eviction. Waiting assumes that the drive does one transfer at a time, and that every step takes --step-seconds.
+'hit rate' is the fraction of a step's pages that are already in memory, for a cache that evicts as --evict says; 'of lru' the
+same for least-recently-used eviction. Waiting assumes that the drive does one transfer at a time, and that every step takes
+--step-seconds.
 The first lines are those of the dry run: memory, drive and time with the Gaussians that the run will reach. The table compares
 orders and frames with the Gaussians of the start, without import, evaluation, commits and decoding of photos.";
 
@@ -373,7 +374,7 @@ fn row(args: &Args, scene: &Scene, frames: usize, asked: Chosen<Order>) -> Input
         let options = ReplayOptions { frames, policy, reads_ahead, steps, plan_bytes: args.plan_mem.0 };
         replay(&scene.views, &scene.page_bytes, &views, &options).map_err(|e| too_few(scene, &e))
     };
-    let (planned, lru) = (run(EvictPolicy::FarthestNextUse, false)?, run(EvictPolicy::LeastRecentlyUsed, false)?);
+    let (planned, lru) = (run(scene.config.evict, false)?, run(EvictPolicy::LeastRecentlyUsed, false)?);
     let figures = planned.figures(planned.steady());
     let timed = run(scene.config.evict, true)?;
     let stall = timed.stall(timed.steady(), &scene.drive);
@@ -400,9 +401,10 @@ fn row(args: &Args, scene: &Scene, frames: usize, asked: Chosen<Order>) -> Input
 fn json_of(args: &Args, scene: &Scene, row: &Row) -> Value {
     let (f, steps) = (&row.figures, f64::from(row.figures.steps));
     let (views, batches) = views_in_batches(scene, row.frames);
+    let is_belady_bound = row.planned.is_exact && scene.config.evict == EvictPolicy::FarthestNextUse;
     json!({
         "view_order": row.order.to_string(), "automatic": row.is_automatic, "frames": row.frames,
-        "steps_simulated": row.planned.steps.len(), "is_belady_bound": row.planned.is_exact,
+        "steps_simulated": row.planned.steps.len(), "is_belady_bound": is_belady_bound,
         "views_in_batches": views, "batches_most": batches, "pages_per_step": f.pages_per_step, "hit_rate": f.hit_rate, "lru_hit_rate": row.lru.hit_rate,
         "bytes_read_per_step": f.read_per_step, "bytes_written_per_step": f.written_per_step,
         "heaviest_5_percent_share": f.heaviest_share,
@@ -553,7 +555,7 @@ fn lists(args: &Args, scene: &Scene, frames: usize, range: Range<u32>) -> InputR
     let order = order(args, scene, frames, orders(args, &scene.config)[0])?;
     let mut views = ViewOrder::new(order, scene.config.seed, &scene.cameras);
     let mut plan = Plan::new(0, args.plan_mem.0);
-    let mut cache = CacheModel::new(frames, EvictPolicy::FarthestNextUse);
+    let mut cache = CacheModel::new(frames, scene.config.evict);
     let (end, mut change) = (range.end.min(scene.config.steps), StepChange::default());
     loop {
         let step = plan.steps().start;

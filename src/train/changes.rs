@@ -14,7 +14,8 @@ use crate::dataset::loader::Dataset;
 use serde::Deserialize;
 use std::path::Path;
 
-/// What programs did that did not know a key, as the key's value.
+/// What programs did that did not know a key, as the value of the key. A key that is missing here counts as changed when an older
+/// run resumes.
 const BEFORE_ITS_TIME: [(&str, &str); 1] = [("appearance", "off")];
 
 /// The config that a run keeps when it resumes with `config`: that of its file, with the lasting keys of `config`
@@ -81,7 +82,8 @@ impl Changes {
             // A key unknown to the older commit counts as a difference, so that the user sees its default.
             // It counts as known if the programs of that time can only have done one thing.
             let was_done = |value: &toml::Value| {
-                value.as_str().is_some_and(|word| BEFORE_ITS_TIME.contains(&(name.as_str(), word)))
+                let value = value.as_str().map_or_else(|| value.to_string(), String::from);
+                BEFORE_ITS_TIME.contains(&(name.as_str(), value.as_str()))
             };
             let then = there.get(name).filter(|value| written.contains_key(name) || was_done(value));
             if class.is_derived() || then == Some(now) {

@@ -46,7 +46,7 @@ impl Trainer {
         let Some(budget) = self.budget.filter(|_| !self.is_in_memory()) else { return };
         let pages = self.scene.pager.pages_of_view(camera);
         let index = self.scene.pager.index();
-        let rows = pages.iter().map(|page| u64::from(index[page.index()].rows)).sum();
+        let rows: u64 = pages.iter().map(|page| u64::from(index[page.index()].rows)).sum();
         let needed = pages.len();
         let view = self.view_memory_of(rows);
         let mut frames = budget.frames(&self.scene, view, needed);
@@ -55,7 +55,9 @@ impl Trainer {
             frames = needed;
         } else if frames < needed {
             let row_bytes = WorkingSet::row_bytes(self.sh_degrees().1);
-            (frames, self.pages_most) = budget.batches(&self.scene, self.view_bytes()[1], row_bytes);
+            // Between the passes, the batches keep the numbers of their rows in view.
+            let numbers = (rows as f64 * self.visible_share) as u64 * size_of::<u32>() as u64;
+            (frames, self.pages_most) = budget.batches(&self.scene, self.view_bytes()[1] + numbers, row_bytes);
             if self.working.shrink_to(self.pages_most.saturating_mul(self.options.page_rows)) {
                 self.whole_rows = 0;
             }

@@ -49,6 +49,13 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
         let shown = format!(" {:.3} {:9.3} ", number(plan, "hit_rate"), number(plan, "lru_hit_rate"));
         assert!(line.contains(&shown), "{shown} is not in: {table}");
     }
+    // Another eviction order is planned as it evicts.
+    let one = ["--compare-frames", "70%", "--view-order", "shuffle", "--json", "--evict", "lru"];
+    let lru: Value = serde_json::from_str(&with(&one)).unwrap();
+    let lru = &lru["plans"][0];
+    assert_eq!(lru["hit_rate"], lru["lru_hit_rate"], "{lru}");
+    assert!(lru["is_belady_bound"] == false && number(lru, "hit_rate") == number(&plans[1], "lru_hit_rate"), "{lru}");
+    assert!(number(lru, "bytes_read") > number(&plans[1], "bytes_read"), "{lru}");
     // Default shares hold the largest view.
     let open: Value = serde_json::from_str(&with(&["--view-order", "shuffle", "--json"])).unwrap();
     let frames = |value: &Value| -> Vec<u64> {

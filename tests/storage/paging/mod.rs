@@ -31,11 +31,11 @@ fn pages_hold_what_was_put_into_them_whatever_the_frames() {
         memory.check_all(7).unwrap();
         let fewest = memory.pager.stats().pinned_max;
         for (i, frames) in [fewest, fewest + 1, fewest + 5, fewest * 2, usize::MAX].into_iter().enumerate() {
-            for (policy, prefetch_pages, codec) in [
-                (EvictPolicy::FarthestNextUse, 8, Codec::Raw),
-                (EvictPolicy::FarthestNextUse, 0, Codec::Zstd { level: 1 }),
-                (EvictPolicy::LeastRecentlyUsed, 3, Codec::Raw),
-            ] {
+            let ahead = EvictPolicy::ALL.map(|policy| (policy, 3, Codec::Raw));
+            let planned = EvictPolicy::FarthestNextUse;
+            for (policy, prefetch_pages, codec) in
+                [(planned, 8, Codec::Raw), (planned, 0, Codec::Zstd { level: 1 })].into_iter().chain(ahead)
+            {
                 let faults = Faults::new();
                 // With and without slow transfers that complete out of order.
                 if (i as u64 + seed).is_multiple_of(2) {
