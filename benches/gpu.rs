@@ -128,7 +128,7 @@ fn steps<R: Renderer>(
     let (mut step, mut hash, mut counts, mut counted) = (0, Hash::default(), Counts::default(), false);
     let mut round = |counted: bool| {
         for (camera, target) in &views {
-            let how = (&options.render, &Comparison { target, loss: options.loss, look: None });
+            let how = (&options.render, &Comparison { target, loss: options.loss, look: None, is_left_out: false });
             let done = train_step(&mut scene, &mut working, renderer, (step, camera), how, false, usize::MAX);
             let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
             hash.add(outcome.loss.loss.to_bits());

@@ -17,6 +17,8 @@ mod published;
 mod published_table;
 #[path = "bench/run.rs"]
 mod run;
+#[path = "bench/stability.rs"]
+mod stability;
 #[path = "bench/sweep.rs"]
 mod sweep;
 #[path = "bench/table.rs"]
@@ -44,6 +46,8 @@ Measures training.
   gsscale-bench compare A B --out F    shows finished runs side by side on one page
   gsscale-bench pareto SCENE --out DIR shows the cost and savings of each setting
   gsscale-bench ladder SCENE --out DIR shows the gain of each idea of out-of-core training
+  gsscale-bench stability SCENE --out DIR
+                                       shows what faults of photos, poses and points cost, and what remedies win back
 
 Each command has --help with examples: gsscale-bench run --help, gsscale-bench run rubble --help.
 Published scenes:";
@@ -69,6 +73,8 @@ fn main() -> ExitCode {
         ladder::start(&parse_arguments(&arguments), &mut print)
     } else if named("pareto") {
         pareto::start(&parse_arguments(&arguments), &mut print)
+    } else if named("stability") {
+        stability::start(&parse_arguments(&arguments), &mut print)
     } else if named("compare") {
         compare::start(&compare::Args::parse_from(&arguments))
     } else if named("run") && published::is_meant(&arguments) {

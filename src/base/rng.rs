@@ -22,6 +22,8 @@ pub enum Purpose {
     Sensor = 6,
     /// Tests and benchmarks; keys: free.
     Test = 7,
+    /// Disturbances of a scene; keys: kind of draw, photo or point.
+    Disturb = 8,
 }
 
 /// Mixes one 64-bit word (the finaliser of SplitMix64: Steele, Lea, Flood 2014, "Fast splittable pseudorandom number

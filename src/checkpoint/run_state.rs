@@ -5,19 +5,22 @@
 //! never a panic.
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
-//! [`crate::page::format::encoding`] writes them. Version 4
-//! had no appearance and is read as that of a run without; no program was released with versions 1 to 3. A new value is a field of [`TrainerState`], a place at the end of `encode` and `decode`, and a new version.
+//! [`crate::page::format::encoding`] writes them. Version 5 had no outliers and version 4 no appearance either: they are
+//! read as those of a run that knows nothing of them. No program was released with versions 1 to 3. A new value is a field of [`TrainerState`], a place at the end of `encode` and `decode`, and a new version.
 
 use crate::appearance::state::AppearanceState;
 use crate::base::identity::RunId;
+use crate::outliers::views::ViewOutliers;
 use crate::page::format::encoding::{self, EncodingError};
 use crate::paging::stats::PagerStats;
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
-pub const VERSION: u32 = 5;
-/// The version before appearance: the same values without the last.
+pub const VERSION: u32 = 6;
+/// The version before the outliers: the same values without the last.
+const WITHOUT_OUTLIERS: u32 = 5;
+/// The version before appearance: the same values without the last two.
 const WITHOUT_APPEARANCE: u32 = 4;
 
 /// Digests of a view.
@@ -103,6 +106,8 @@ pub struct TrainerState {
     pub test: Option<LastTest>,
     /// The values of photos and cameras.
     pub appearance: AppearanceState,
+    /// What is known of views whose photo contradicts the scene.
+    pub outliers: ViewOutliers,
 }
 
 /// The state of a run between two steps, without its pages.
@@ -178,8 +183,13 @@ impl RunState {
         let version = u32::from_le_bytes(*version);
         let state = match version {
             VERSION => RunState::decode(body)?,
+            WITHOUT_OUTLIERS => {
+                let none = encoding::to_bytes(&ViewOutliers::default())?;
+                RunState::decode(&[body, &none].concat())?
+            }
             WITHOUT_APPEARANCE => {
-                let none = encoding::to_bytes(&AppearanceState::default())?;
+                let none = (AppearanceState::default(), ViewOutliers::default());
+                let none = encoding::to_bytes(&none)?;
                 RunState::decode(&[body, &none].concat())?
             }
             other => return Err(RunStateError::Version(other)),
@@ -192,13 +202,21 @@ impl RunState {
     fn encode(&self) -> Result<Vec<u8>, EncodingError> {
         let RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic } = self;
         let Origin { config, simd, sh_degree_start, dataset, run } = origin;
-        let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, test, appearance } =
-            trainer;
+        let TrainerState {
+            step,
+            rows_skipped,
+            steps_skipped,
+            steps_skipped_in_a_row,
+            train_seconds,
+            test,
+            appearance,
+            outliers,
+        } = trainer;
         encoding::to_bytes(&(
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance),
+            (metrics_bytes, test, traffic, run, appearance, outliers),
         ))
     }
 
@@ -208,11 +226,19 @@ impl RunState {
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance),
+            (metrics_bytes, test, traffic, run, appearance, outliers),
         ) = encoding::from_bytes(bytes)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
-        let trainer =
-            TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, test, appearance };
+        let trainer = TrainerState {
+            step,
+            rows_skipped,
+            steps_skipped,
+            steps_skipped_in_a_row,
+            train_seconds,
+            test,
+            appearance,
+            outliers,
+        };
         Ok(RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic })
     }
 
@@ -257,7 +283,8 @@ impl RunState {
         if test.is_some_and(|test| test.step > step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
             return refuse("its last evaluation is invalid");
         }
-        self.trainer.appearance.check().or_else(refuse)
+        let TrainerState { appearance, outliers, .. } = &self.trainer;
+        appearance.check().and_then(|()| outliers.check()).or_else(refuse)
     }
 }
 
@@ -304,6 +331,7 @@ mod tests {
                 train_seconds: 0.1,
                 test: Some(LastTest { step: 8, views: 3, psnr: 21.5, ssim: 0.75 }),
                 appearance: AppearanceState::new(&[0, 1, 0]),
+                outliers: ViewOutliers::new(3),
             },
             events: events.to_vec(),
             histogram: vec![(3, 1), (32767, 9), (65535, 2)],
@@ -331,16 +359,22 @@ mod tests {
     }
 
     #[test]
-    fn a_state_without_appearance_comes_back_without_values() {
+    fn states_of_earlier_versions_come_back_without_later_values() {
         let state = sample();
-        let trainer = TrainerState { appearance: AppearanceState::default(), ..state.trainer.clone() };
-        let without = RunState { trainer, ..state };
-        let mut bytes = without.to_bytes().unwrap();
-        let values = encoding::to_bytes(&AppearanceState::default()).unwrap();
-        assert!(bytes.ends_with(&values));
-        bytes.truncate(bytes.len() - values.len());
-        bytes[..4].copy_from_slice(&WITHOUT_APPEARANCE.to_le_bytes());
-        assert_eq!(RunState::from_bytes(&bytes), Ok(without));
+        let outliers = ViewOutliers::default();
+        let of_5 = TrainerState { outliers: outliers.clone(), ..state.trainer.clone() };
+        let of_4 = TrainerState { appearance: AppearanceState::default(), ..of_5.clone() };
+        let lacking_5 = encoding::to_bytes(&outliers).unwrap();
+        let lacking_4 = encoding::to_bytes(&(AppearanceState::default(), outliers)).unwrap();
+        for (version, trainer, lacking) in [(WITHOUT_OUTLIERS, of_5, lacking_5), (WITHOUT_APPEARANCE, of_4, lacking_4)]
+        {
+            let without = RunState { trainer, ..state.clone() };
+            let mut bytes = without.to_bytes().unwrap();
+            assert!(bytes.ends_with(&lacking));
+            bytes.truncate(bytes.len() - lacking.len());
+            bytes[..4].copy_from_slice(&version.to_le_bytes());
+            assert_eq!(RunState::from_bytes(&bytes), Ok(without));
+        }
     }
 
     #[test]

@@ -165,6 +165,9 @@ config_keys! {
         /// costs about a tenth of a step and full two fifths; on a GPU the picture and its gradient also cross the bus twice.
         /// gsscale-eval fits these values to the left halves of held-out photos
         appearance: AppearanceMode = AppearanceMode::Off => Numbers;
+        /// Train without the views whose photo contradicts the scene (see the log and the report), as long as it does: wrong
+        /// poses, photos of another place. Such views are named with and without this key
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_views: bool = false => Numbers;
         /// Background colour, RGB in 0..1
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }

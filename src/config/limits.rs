@@ -63,6 +63,8 @@ pub struct RunOptions {
     pub color_correct: Option<ColorCorrect>,
     /// Which corrections of the picture are trained.
     pub appearance: AppearanceMode,
+    /// Whether views that contradict the scene are left out.
+    pub robust_views: bool,
     /// Coordinates of PLY files.
     pub export_frame: ExportFrame,
     /// The direction of the dataset that is up in PLY files; `None` where they keep the axes of the dataset, and while
@@ -117,6 +119,7 @@ impl RunOptions {
             ssim_variant: config.ssim_variant,
             color_correct: config.color_correct.0,
             appearance: config.appearance,
+            robust_views: config.robust_views,
             export_frame: config.export_frame,
             up: match config.up {
                 Up::Along(up) => Some(up),

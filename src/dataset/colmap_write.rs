@@ -1,9 +1,9 @@
-//! Writes a COLMAP model in its binary form: `cameras.bin`, `images.bin`, `points3D.bin` with one shared camera.
+//! Writes a COLMAP model in its binary form: `cameras.bin`, `images.bin`, `points3D.bin`, of pinhole cameras.
 //!
 //! Format: COLMAP, "Output Format" in its documentation, binary files of `src/colmap/scene/reconstruction_io.cc`;
 //! little-endian, quaternions w first, world to camera.
 //!
-//! Invariants: 1. image and point ids count from 1, the camera id is 1; 2. tracks and the images' point lists agree in
+//! Invariants: 1. ids of cameras, images and points count from 1; 2. tracks and the images' point lists agree in
 //! both directions; 3. a file gets its final name only when all its bytes are on disk, and the model's folder only when
 //! all its files are.
 
@@ -17,11 +17,11 @@ use std::path::Path;
 /// Id of the PINHOLE camera model (fx, fy, cx, cy).
 const PINHOLE: i32 = 1;
 
-/// A model with one camera.
+/// A model.
 #[derive(Debug, Clone)]
 pub struct Model {
-    /// The camera of all images; a pinhole.
-    pub intrinsics: Intrinsics,
+    /// The cameras; pinholes.
+    pub cameras: Vec<Intrinsics>,
     pub images: Vec<ModelImage>,
     pub points: Vec<Point>,
     /// Offsets (at least one): the points are written once per offset, moved by it, so that a model may be larger than
@@ -34,6 +34,8 @@ pub struct ModelImage {
     /// Name relative to the image folder.
     pub name: String,
     pub pose: Pose,
+    /// Index into the cameras, from 0.
+    pub camera: u32,
 }
 
 #[derive(Debug, Clone)]
@@ -56,11 +58,11 @@ pub struct Observation {
 
 /// Writes `<sparse>/0/*.bin`; `sparse` must not exist and its parent must.
 pub fn write_model(sparse: &Path, model: &Model) -> InputResult<()> {
-    debug_assert!(model.intrinsics.lens == Lens::Pinhole && !model.tiles.is_empty());
+    debug_assert!(model.cameras.iter().all(|k| k.lens == Lens::Pinhole) && !model.tiles.is_empty());
     let partial = sparse.with_extension("partial");
     let folder = partial.join("0");
     make_folder(&folder)?;
-    write_whole_with(&folder.join("cameras.bin"), |out| cameras(out, &model.intrinsics))?;
+    write_whole_with(&folder.join("cameras.bin"), |out| cameras(out, &model.cameras))?;
     let order = observation_order(model);
     write_whole_with(&folder.join("images.bin"), |out| images_bin(out, model, &order))?;
     write_whole_with(&folder.join("points3D.bin"), |out| points_bin(out, model))?;
@@ -72,13 +74,16 @@ pub fn make_folder(folder: &Path) -> InputResult<()> {
     std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder", &e))
 }
 
-fn cameras(out: &mut dyn Write, k: &Intrinsics) -> std::io::Result<()> {
-    out.write_all(&1u64.to_le_bytes())?;
-    out.write_all(&1u32.to_le_bytes())?;
-    out.write_all(&PINHOLE.to_le_bytes())?;
-    out.write_all(&u64::from(k.width).to_le_bytes())?;
-    out.write_all(&u64::from(k.height).to_le_bytes())?;
-    floats(out, &[k.fx, k.fy, k.cx, k.cy])
+fn cameras(out: &mut dyn Write, cameras: &[Intrinsics]) -> std::io::Result<()> {
+    out.write_all(&(cameras.len() as u64).to_le_bytes())?;
+    for (id, k) in (1u32..).zip(cameras) {
+        out.write_all(&id.to_le_bytes())?;
+        out.write_all(&PINHOLE.to_le_bytes())?;
+        out.write_all(&u64::from(k.width).to_le_bytes())?;
+        out.write_all(&u64::from(k.height).to_le_bytes())?;
+        floats(out, &[k.fx, k.fy, k.cx, k.cy])?;
+    }
+    Ok(())
 }
 
 fn floats(out: &mut dyn Write, values: &[f64]) -> std::io::Result<()> {
@@ -108,7 +113,7 @@ fn images_bin(out: &mut dyn Write, model: &Model, order: &[Vec<(u64, [f64; 2])>]
         out.write_all(&(k as u32 + 1).to_le_bytes())?;
         floats(out, &quaternion(&image.pose.rotation))?;
         floats(out, &image.pose.translation.to_array())?;
-        out.write_all(&1u32.to_le_bytes())?;
+        out.write_all(&(image.camera + 1).to_le_bytes())?;
         out.write_all(image.name.as_bytes())?;
         out.write_all(&[0])?;
         out.write_all(&(order[k].len() as u64).to_le_bytes())?;

@@ -73,8 +73,8 @@ fn model_of<'a>(city: &RawScene, views: impl Iterator<Item = (String, &'a RawVie
     let point =
         |(&position, &rgb): (&[f64; 3], &[u8; 3])| Point { position, rgb, error: 0.5, observations: Vec::new() };
     Model {
-        intrinsics: city.views[0].intrinsics,
-        images: views.map(|(name, view)| ModelImage { name, pose: view.pose }).collect(),
+        cameras: vec![city.views[0].intrinsics],
+        images: views.map(|(name, view)| ModelImage { name, pose: view.pose, camera: 0 }).collect(),
         points: colored.map(point).collect(),
         tiles: vec![[0.0; 3]],
     }

@@ -6,6 +6,7 @@
 pub mod bars;
 pub mod chart;
 pub mod compare_report;
+pub mod dots;
 pub mod front;
 pub mod html;
 pub mod ladder_page;
@@ -15,4 +16,5 @@ pub mod record;
 pub mod results_log;
 pub mod run_files;
 pub mod run_report;
+pub mod stability_page;
 pub mod sweep_page;

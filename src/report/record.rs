@@ -30,6 +30,15 @@ pub struct RunRecord {
     pub psnr: Option<f64>,
     /// SSIM of the held-out views.
     pub ssim: Option<f64>,
+    /// Colour-corrected PSNR of the held-out views, dB, if the run measured it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cc_psnr: Option<f64>,
+    /// Training views whose photo contradicts the scene, by name.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub outlier_views: Vec<String>,
+    /// Training views whose photo is wrong on purpose, by name.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub wrong_views: Vec<String>,
     /// Seconds of the training steps.
     pub seconds: f64,
     /// CPU seconds of the training steps, all threads.

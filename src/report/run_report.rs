@@ -4,7 +4,7 @@
 //! without metrics is an error; 2. the number of pictures and of points in a chart is bounded.
 
 use super::chart::{Chart, Mark, short, smoothed};
-use super::html::{Page, slider};
+use super::html::{Cell, Page, slider};
 use super::page_map::{PageTile, page_map_legend, page_map_svg};
 use super::picture::view_pictures;
 use super::run_files::{
@@ -43,6 +43,7 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
         page.charts(&tiers);
     }
     add_appearance(&mut page, &folder.join(APPEARANCE_FILE));
+    add_outliers(&mut page, &summary);
     add_page_map(&mut page, &folder.join(PAGES_FILE));
     add_views(&mut page, folder, progress)?;
     page.heading("Config");
@@ -238,6 +239,29 @@ fn add_appearance(page: &mut Page, path: &Path) {
     let caption =
         "Exposure of each training photo against the mean of all, as trained. appearance.json has the numbers.";
     page.charts(&[(chart.svg(), caption.to_string())]);
+}
+
+/// The training views whose photo contradicts the scene, if there are any.
+fn add_outliers(page: &mut Page, summary: &Value) {
+    let views = summary["outlier_views"].as_array().map_or(&[][..], Vec::as_slice);
+    if views.is_empty() {
+        return;
+    }
+    page.heading("Photos that contradict the scene");
+    page.paragraph(
+        "These training photos differ from their pictures far more than others do: a wrong pose, another place, another \
+         exposure. Unexplained is the squared error over the variance of the photo; it is above 1 where a plain grey would be \
+         closer. Check these photos and their poses, or leave them out with --robust-views.",
+    );
+    let state = |view: &Value| if view["is_left_out"] == true { "left out" } else { "trained on" };
+    page.table(
+        views,
+        &[
+            ("photo", &|view| Cell::text(view["name"].as_str().unwrap_or_default())),
+            ("unexplained", &|view| Cell::number(view["unexplained"].as_f64(), 2)),
+            ("", &|view| Cell::text(state(view))),
+        ],
+    );
 }
 
 fn add_page_map(page: &mut Page, path: &Path) {

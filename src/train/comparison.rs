@@ -25,6 +25,8 @@ pub struct Comparison<'a> {
     pub loss: LossOptions,
     /// The correction of the picture, and which of its values are trained; `None` without correction.
     pub look: Option<(AppearanceMode, Look)>,
+    /// The view is compared with its photo, and that is all: there is no gradient.
+    pub is_left_out: bool,
 }
 
 /// What a correction needs beside the picture, and what it has found.
@@ -60,11 +62,16 @@ impl Comparison<'_> {
             if picture.len() == 3 * self.target.pixels() {
                 correction.drawn.clear();
                 correction.drawn.extend_from_slice(picture);
-                correction.found = find(&Pair { drawn: &correction.drawn, photo: self.target }, look, *mode);
+                if !self.is_left_out {
+                    correction.found = find(&Pair { drawn: &correction.drawn, photo: self.target }, look, *mode);
+                }
                 look.correct(picture, self.target.width as usize, Some(self.target));
             }
         }
         renderer.loss(self.target, &self.loss)?;
+        if self.is_left_out {
+            return Ok(());
+        }
         // A second loss term adds its gradient here, in `renderer.picture_gradient()`, before the correction takes the
         // gradient back.
         if let Some((_, look)) = &self.look {

@@ -148,6 +148,17 @@ pub struct StepCosts {
     pub drive_bytes_peak: u64,
 }
 
+/// A training view whose photo contradicts the scene that the others agree on.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct OutlierView {
+    /// Its name.
+    pub name: String,
+    /// Share of the photo's variance that its picture leaves unexplained; above 1 where a grey picture would be closer.
+    pub unexplained: f64,
+    /// Whether the run has left it out (`--robust-views`).
+    pub is_left_out: bool,
+}
+
 /// Content of summary.json.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Summary {
@@ -173,6 +184,9 @@ pub struct Summary {
     pub rows_skipped_non_finite: u64,
     /// Steps skipped because the loss was not finite, or gradients of more than .01 % of the Gaussians in view.
     pub steps_skipped_non_finite: u32,
+    /// Training views whose photo contradicts the scene, by name.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    pub outlier_views: Vec<OutlierView>,
     /// Costs of the steps alone.
     #[serde(flatten)]
     pub costs: StepCosts,

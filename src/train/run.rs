@@ -415,6 +415,7 @@ fn train_into(
         test: tested.as_ref().ok().copied().flatten(),
         // A run without its evaluation is not finished: a resume evaluates it.
         finished: trainer.steps_done() == config.steps && tested.is_ok() && asked.is_none(),
+        outlier_views: trainer.outlier_views(dataset),
         costs,
         commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
         ..summary_of(request, &trainer)
@@ -493,6 +494,7 @@ fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
         finished: false,
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
+        outlier_views: Vec::new(),
         costs: StepCosts::default(),
         tiers: trainer.tier_traffic(),
         commits: None,

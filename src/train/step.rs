@@ -60,6 +60,8 @@ pub struct StepOutcome {
     pub rows_skipped: u64,
     /// Why nothing was changed; `None` for a step that was taken.
     pub skipped: Option<Skipped>,
+    /// The view was compared with its photo only ([`Comparison::is_left_out`]); nothing was changed.
+    pub is_left_out: bool,
     /// Rows of the view that were drawn; counted only where no row was rewritten.
     pub drawn: u64,
 }
@@ -93,7 +95,7 @@ pub fn train_step(
     let done = passes
         .rows_in(pages, pages_most, render)
         .and_then(|()| passes.picture(comparison))
-        .and_then(|()| passes.rows_out(collects));
+        .and_then(|()| if comparison.is_left_out { passes.leave_out() } else { passes.rows_out(collects) });
     passes.release();
     let outcome = passes.outcome;
     scene.pager.end_batches();
@@ -186,10 +188,19 @@ impl Passes<'_> {
         // A device may be at work on the picture.
         self.prefetch_before_last();
         comparison.loss_and_back(self.renderer, &mut self.working.correction)?;
-        if self.batches.len() > 1 {
+        if self.batches.len() > 1 && !comparison.is_left_out {
             // A drive that is full is found while the step can still be given up.
             self.scene.pager.reserve_slots(self.batches.iter().map(|batch| batch.pages.len()).sum())?;
         }
+        Ok(())
+    }
+
+    /// Ends the step of a view that is left out: its pages stay as they are.
+    fn leave_out(&mut self) -> Result<(), TrainError> {
+        self.outcome.is_left_out = true;
+        self.outcome.loss = self.renderer.loss_value()?;
+        let pages = self.batches.drain(..).flat_map(|batch| batch.pages);
+        self.scene.pager.set_use_in_step(self.step, pages, UseInStep::Done);
         Ok(())
     }
 

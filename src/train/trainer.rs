@@ -14,8 +14,8 @@ use super::dense::settle_all;
 use super::error::TrainError;
 use super::eval::{EvalRequest, evaluate};
 use super::pages::PagedScene;
-use super::report::{TestMetrics, TierTraffic};
-use super::soundness::{Idle, note_soundness};
+use super::report::{OutlierView, TestMetrics, TierTraffic};
+use super::soundness::{Idle, note_soundness, warn_of_outliers};
 use super::step::{StepOutcome, train_step};
 use super::view::rehearse;
 use super::working_set::WorkingSet;
@@ -30,6 +30,7 @@ use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{self, PlyMeta};
 use crate::optim::method::Method;
+use crate::outliers::views::ViewOutliers;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::view_sizes::ViewSizes;
 use crate::render::{RenderOptions, Renderer};
@@ -140,7 +141,11 @@ impl Trainer {
             working: WorkingSet::default(),
             renderer,
             options,
-            state: TrainerState { appearance: AppearanceState::new(&camera_groups), ..TrainerState::default() },
+            state: TrainerState {
+                appearance: AppearanceState::new(&camera_groups),
+                outliers: ViewOutliers::new(dataset.views.len()),
+                ..TrainerState::default()
+            },
             camera_groups,
             is_torn: false,
             budget: None,
@@ -169,7 +174,8 @@ impl Trainer {
             let camera = &dataset.views[view].camera;
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-            let comparison = Comparison { target: &target, loss: self.options.loss, look: self.look(view, camera) };
+            let look = self.look(view, camera);
+            let comparison = Comparison { target: &target, loss: self.options.loss, look, is_left_out: false };
             let now = (&mut self.scene, self.state.step, &mut self.working);
             let began = Instant::now();
             let rows = rehearse(now, &mut *self.renderer, camera, (&render, &comparison), self.pages_most)?;
@@ -217,6 +223,26 @@ impl Trainer {
         if let (Some(found), None, Some(&group)) = (found, outcome.skipped, self.camera_groups.get(view)) {
             self.state.appearance.learn(self.options.appearance, (view, group), &found);
         }
+    }
+
+    /// Notes the error of the view of the last step, and after an epoch names the views that have become outliers.
+    fn judge_views(&mut self, view: usize, outcome: &StepOutcome, target: &Target, dataset: &Dataset) {
+        self.state.outliers.measure(view, outcome.loss.mse, target);
+        let (step, views) = (self.state.step, self.train_views.len() as u32);
+        if step.is_multiple_of(views) {
+            let found = self.state.outliers.end_epoch(step / views - 1);
+            warn_of_outliers(&found, step, self.options.robust_views, dataset);
+        }
+    }
+
+    /// The views whose photo contradicts the scene, by name.
+    pub fn outlier_views(&self, dataset: &Dataset) -> Vec<OutlierView> {
+        let of_view = |view: usize| OutlierView {
+            name: dataset.views[view].name.clone(),
+            unexplained: self.state.outliers.unexplained(view),
+            is_left_out: self.options.robust_views,
+        };
+        self.state.outliers.named().map(of_view).collect()
     }
 
     /// The values of photos and cameras; empty if the run corrects nothing.
@@ -296,7 +322,8 @@ impl Trainer {
         let started = Instant::now();
         let render = self.render_options();
         let look = self.look(view, &dataset.views[view].camera);
-        let comparison = Comparison { target: &target, loss: self.options.loss, look };
+        let is_left_out = self.options.robust_views && self.state.outliers.is_named(view);
+        let comparison = Comparison { target: &target, loss: self.options.loss, look, is_left_out };
         let stepped = loop {
             let stepped = train_step(
                 &mut self.scene,
@@ -326,6 +353,7 @@ impl Trainer {
         }
         self.learn_appearance(view, &outcome);
         self.state.step += 1;
+        self.judge_views(view, &outcome, &target, dataset);
         self.state.train_seconds += started.elapsed().as_secs_f64();
         Ok(outcome)
     }

@@ -4,6 +4,7 @@
 mod support;
 
 mod configs;
+mod disturb;
 mod import;
 mod photos;
 mod ply;

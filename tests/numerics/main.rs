@@ -14,6 +14,7 @@ mod init;
 mod lpips;
 mod oracle;
 mod parity;
+mod poison;
 mod shaders;
 mod upright;
 mod visibility;

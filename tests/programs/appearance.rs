@@ -89,6 +89,19 @@ fn exposures_that_change_are_found_and_cost_little() {
 }
 
 #[test]
+fn a_black_photo_spoils_nothing_of_a_run_with_appearance() {
+    let folder = TempDir::new().unwrap();
+    let (scene, changed) = flickering_city(folder.path());
+    let black = scene.join("images").join(&changed[2].0);
+    image::RgbImage::new(112, 80).save(&black).unwrap();
+    let out = folder.path().join("out");
+    run(&scene, &out, &["--steps", "210", "--device", "cpu", "--appearance", "full"]);
+    let found = exposures(&out);
+    assert!(found.iter().all(|(_, stops)| stops.is_finite() && stops.abs() <= 8.0), "{found:?}");
+    assert!(psnr(&out) > 12.0 && summary(&out)["rows_skipped_non_finite"] == 0, "{}", psnr(&out));
+}
+
+#[test]
 fn a_gpu_finds_the_exposures_of_the_cpu() {
     if gpu::open(&GpuOptions::default()).is_none() {
         return;

@@ -269,7 +269,8 @@ fn bits_of_steps(scene: &Path, options: &GpuOptions, capacity: u32) -> Option<(V
     for (step, &view) in dataset.train_views().iter().cycle().take(10).enumerate() {
         let view = &dataset.views[view];
         let target = decode(&view.photo).unwrap();
-        let how = (&options.render, &Comparison { target: &target, loss: options.loss, look: None });
+        let how =
+            (&options.render, &Comparison { target: &target, loss: options.loss, look: None, is_left_out: false });
         let at = (step as u32, &view.camera);
         let done = train_step(&mut scene, &mut working, &mut renderer, at, how, true, usize::MAX).unwrap();
         assert!(done.rows > 900 && done.updated > 300 && done.skipped.is_none(), "{done:?}");

@@ -22,6 +22,7 @@ mod growing;
 mod memory;
 mod optimizers;
 mod outgrown;
+mod outliers;
 mod paging_train;
 mod plan_tool;
 mod published;

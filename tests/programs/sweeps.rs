@@ -204,3 +204,41 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     let page = std::fs::read_to_string(Path::new(out).join("pareto.html")).unwrap();
     assert!(page.contains("Runs that failed") && page.contains("--host-mem"));
 }
+
+#[test]
+fn faults_of_a_capture_are_charted_and_a_call_that_stopped_goes_on() {
+    let folder = TempDir::new().unwrap();
+    let scene = crate::support::scenes::city(folder.path(), 24, 48, 32, 400);
+    let out = folder.path().join("stability");
+    let sizes = ["--steps", "80", "--seeds", "1,2", "--device", "cpu", "--strategy", "none"];
+    let only = ["--only", "swapped10,exposure1,points10", "--remedies", "none,own"];
+    let plain = [&["stability", text(&scene), "--out", text(&out)][..], &sizes, &only].concat();
+    let json = [&plain[..], &["--json"]].concat();
+    let listed = String::from_utf8(bench(&[&plain[..], &["--list"]].concat()).stdout).unwrap();
+    // The clean scene and points have no remedy of their own.
+    assert!(listed.matches("to do").count() == 12 && !out.exists(), "{listed}");
+    let first = lines(&[&json[..], &["--max-runs", "5"]].concat());
+    let rest = lines(&json);
+    assert_eq!((first.len(), rest.len()), (5, 7), "nothing is done twice");
+    assert!(lines(&json).is_empty() && names(&out.join("scenes")).is_empty(), "scenes are removed");
+    let of = |knob: &str, label: &str, seed: u64| -> Value {
+        let found = first.iter().chain(&rest).find(|r| r["knob"] == knob && r["label"] == label && r["seed"] == seed);
+        found.unwrap_or_else(|| panic!("{knob} {label} {seed}")).clone()
+    };
+    assert_ne!(of("clean", "none", 1)["ply"], of("points10", "none", 1)["ply"]);
+    assert!(number(&of("points10", "none", 1), "gaussians") < 0.3 * number(&of("clean", "none", 1), "gaussians"));
+    assert!(number(&of("exposure1", "none", 1), "psnr") < number(&of("clean", "none", 1), "psnr"));
+    assert_eq!(of("exposure1", "own", 1)["settings"]["appearance"], "exposure");
+    assert_eq!(of("swapped10", "own", 2)["wrong_views"].as_array().unwrap().len(), 4);
+    assert!(of("clean", "none", 1)["cc_psnr"].is_number());
+    let table = String::from_utf8(bench(&plain).stdout).unwrap();
+    assert!(table.starts_with("disturbance ") && table.contains("spread of the clean scene"), "{table}");
+    assert!(table.lines().all(|line| line.chars().count() <= 80), "{table}");
+    let parts = ["PSNR lost, dB", "wrong views named", "exposure1"];
+    check_page(&out.join("stability.html"), &parts, folder.path());
+    // Other photos are other scenes.
+    let smaller = [&json[..], &["--max-resolution", "40", "--max-runs", "1"]].concat();
+    assert_eq!(lines(&smaller).len(), 1);
+    let output = bench(&["stability", text(&scene), "--out", text(&out), "--only", "fog"]);
+    assert!(output.status.code() == Some(2) && stderr(&output).contains("possible values"), "{}", stderr(&output));
+}

@@ -115,7 +115,8 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let mut sweep = Sweep::open(&args.common, &config, RESULTS)?;
     let mut done = Vec::new();
     for rung in RUNGS.iter().filter(|r| args.rungs.iter().any(|n| n == r.name)) {
-        let mut planned = Planned { knob: "ladder".into(), label: rung.name.into(), config: config.clone() };
+        let label = rung.name.into();
+        let mut planned = Planned { knob: "ladder".into(), label, config: config.clone(), scene: None };
         (rung.change)(&mut planned.config);
         eprintln!("{}: {}", rung.name, rung.what);
         let record = sweep.run(&planned, print)?;

@@ -111,6 +111,19 @@ pub struct Planned {
     pub label: String,
     /// All settings. The sweep replaces a spill directory that is not empty by one of its own.
     pub config: TrainConfig,
+    /// The scene, if it is another than that of the sweep.
+    pub scene: Option<MadeScene>,
+}
+
+/// A scene made from that of the sweep.
+#[derive(Debug, Clone)]
+pub struct MadeScene {
+    /// Its folder, which exists while the run lives.
+    pub folder: PathBuf,
+    /// How it is made, whole: a part of the run's key in place of the folder.
+    pub how: String,
+    /// Training photos that are wrong in it, by name.
+    pub wrong: Vec<String>,
 }
 
 /// An output folder of runs with their results.
@@ -133,10 +146,11 @@ pub fn use_drive(config: &mut TrainConfig, frames: u64) {
 }
 
 impl Planned {
-    /// Digest of all settings, the seed, and the surroundings.
+    /// Digest of all settings, the seed, the scene, and the surroundings.
     pub fn key(&self, surroundings: &Surroundings) -> String {
         let settings = toml::to_string(&self.config).unwrap_or_default();
-        format!("{:016x}", xxh3_64(format!("{}\n{settings}", surroundings.text).as_bytes()))
+        let how = self.scene.as_ref().map_or(String::new(), |scene| format!("\n{}", scene.how));
+        format!("{:016x}", xxh3_64(format!("{}\n{settings}{how}", surroundings.text).as_bytes()))
     }
 
     /// Name of the run's folder.
@@ -214,7 +228,8 @@ impl Sweep {
         let file = self.out.join("runs").join(format!("{name}.part.toml"));
         write_config(&file, &config)?;
         let began = Instant::now();
-        let arguments = [&self.scene, Path::new("--out"), &part, Path::new("--config"), &file];
+        let scene = planned.scene.as_ref().map_or(&self.scene, |scene| &scene.folder);
+        let arguments = [scene, Path::new("--out"), &part, Path::new("--config"), &file];
         let output = self.spawn("gsscale-train", &arguments)?;
         record.wall_seconds = began.elapsed().as_secs_f64();
         if !output.status.success() {
@@ -247,6 +262,7 @@ impl Sweep {
             version: env!("CARGO_PKG_VERSION").to_string(),
             threads: rayon::current_num_threads() as u64,
             cpu: cpu_model(),
+            wrong_views: planned.scene.as_ref().map_or(Vec::new(), |scene| scene.wrong.clone()),
             ..RunRecord::default()
         }
     }
@@ -257,6 +273,8 @@ impl Sweep {
         let ply = folder.join(PLY_FILE);
         record.ply = digest(&ply)?;
         (record.psnr, record.ssim) = (summary.test.map(|t| t.psnr), summary.test.map(|t| t.ssim));
+        record.cc_psnr = summary.test.and_then(|t| t.color_corrected).map(|c| c.cc_psnr);
+        record.outlier_views = summary.outlier_views.into_iter().map(|view| view.name).collect();
         record.seconds = summary.train_seconds;
         record.cpu_seconds = summary.costs.train_cpu_seconds;
         record.stall_seconds = summary.costs.train_stall_seconds;

@@ -156,8 +156,9 @@ pub fn write_city(
     // Overview photos have their place among all copies.
     let tile = |k: usize| if k < options.views as usize { tiles[k % tiles.len()] } else { [0.0; 3] };
     let pose = |k: usize| flight.shots[k].pose(offset + DVec3::from(tile(k)));
-    let images = (0..flight.shots.len()).map(|k| ModelImage { name: photo_name(k, options.photos()), pose: pose(k) });
-    let model = Model { intrinsics: flight.intrinsics, images: images.collect(), points, tiles };
+    let name = |k: usize| photo_name(k, options.photos());
+    let images = (0..flight.shots.len()).map(|k| ModelImage { name: name(k), pose: pose(k), camera: 0 });
+    let model = Model { cameras: vec![flight.intrinsics], images: images.collect(), points, tiles };
     write_model(&folder.join("sparse"), &model)?;
     Ok(CitySummary {
         folder: folder.to_path_buf(),

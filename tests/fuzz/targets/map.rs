@@ -7,6 +7,7 @@ use gsscale::appearance::state::AppearanceState;
 use gsscale::base::ids::PageId;
 use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, Origin, RunIdentity, RunState, TrainerState, ViewPrint};
 use gsscale::densify::stats::GradHistogram;
+use gsscale::outliers::views::ViewOutliers;
 use gsscale::page::engine::memory::MemoryEngine;
 use gsscale::page::engine::page_engine::Place;
 use gsscale::page::folder::protocol_files::Folder;
@@ -235,6 +236,7 @@ fn sample() -> RunState {
             train_seconds: 0.1,
             test: Some(LastTest { step: 8, views: 2, psnr: 20.5, ssim: 0.75 }),
             appearance: AppearanceState::new(&[0, 0]),
+            outliers: ViewOutliers::new(2),
         },
         events,
         histogram: vec![(3, 1), (32767, 9)],

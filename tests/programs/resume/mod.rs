@@ -6,6 +6,7 @@ mod changes;
 mod events;
 mod kills;
 mod more_steps;
+mod outliers;
 mod ownership;
 mod paths;
 mod stops;

@@ -1,0 +1,279 @@
+//! Disturbed scenes: what real captures suffer from, written as ordinary COLMAP scenes, to measure what it costs.
+//!
+//! Photos are written as training sees them (undistorted, at training size, with their masks), training photos before
+//! held-out ones by name: `--test-after` with [`Plan::test_after`] gives the same split. Only what training sees is
+//! disturbed (photos, poses, points); held-out photos and their poses stay as they are.
+//!
+//! Invariants: 1. the same scene, disturbance and seed give the same bytes for any number of threads; 2. without a
+//! disturbance, pixels are those of the scene; 3. `sparse/` appears last, so that the folder of an interrupted call cannot be
+//! read as a scene.
+
+mod photos;
+mod poses;
+
+use super::colmap_write::{Model, ModelImage, Point, make_folder, write_model};
+use super::loader::{Dataset, View};
+use super::model::{Intrinsics, Lens, Pose, Split};
+use super::photo::decode;
+use crate::base::error::{InputError, InputResult};
+use crate::base::rng::{Purpose, Stream};
+use crate::base::whole_file::write_whole;
+use crate::scene::camera::Camera;
+use crate::scene::image::Target;
+use glam::{DMat3, DVec3};
+use photos::Encoded;
+use rayon::prelude::*;
+use std::path::Path;
+
+/// What is wrong with a scene.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Disturbance {
+    /// Nothing.
+    Nothing,
+    /// Pixel values of each photo times 2^dt, dt uniform within so many stops.
+    Exposure {
+        /// Stops.
+        stops: f64,
+    },
+    /// Red times 2^t and blue times 2^-t, t uniform within so many stops.
+    WhiteBalance {
+        /// Stops.
+        stops: f64,
+    },
+    /// This share of the photos have changed places in pairs that share less than half of what they see.
+    Swapped {
+        /// Of the training photos.
+        share: f64,
+    },
+    /// Normal noise on the places of cameras, along each axis.
+    PoseNoise {
+        /// Standard deviation, as a share of the scene's size.
+        share: f64,
+    },
+    /// Photos compressed as JPEG.
+    Jpeg {
+        /// 1 to 100.
+        quality: u8,
+    },
+    /// Grey boxes at random places of each photo.
+    Boxes {
+        /// Boxes on a photo.
+        count: u32,
+        /// Whether masks exclude them, as a user could by hand.
+        are_masked: bool,
+    },
+    /// One photo in so many.
+    FewPhotos {
+        /// At least 1.
+        one_in: u32,
+    },
+    /// One point in so many.
+    FewPoints {
+        /// At least 1.
+        one_in: u32,
+    },
+    /// As many points, at random places of their box, of random colours.
+    RandomPoints,
+    /// One photo in so many is blurred, by a normal distribution of a hundredth of its width.
+    Blurred {
+        /// At least 1.
+        one_in: u32,
+    },
+}
+
+/// A disturbed scene that is not written yet.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Plan {
+    /// Views with a greater index, by name, are held out: the value of `--test-after`.
+    pub test_after: u32,
+    /// Names of the training photos that are wrong: swapped or blurred.
+    pub wrong: Vec<String>,
+}
+
+/// First letters of the names of photos.
+const TRAIN: char = 'a';
+const HELD_OUT: char = 'b';
+
+/// Kinds of draws, part of their keys.
+#[derive(Debug, Clone, Copy)]
+enum Draw {
+    Photo = 1,
+    Pose = 2,
+    Swaps = 3,
+    Point = 4,
+    Chosen = 5,
+}
+
+/// The draws of one photo or point.
+fn stream(seed: u64, draw: Draw, number: usize) -> Stream {
+    Stream::new(seed, Purpose::Disturb, draw as u64, number as u64)
+}
+
+/// Whether this photo or point is one in `one_in`. Draws, so that no pattern of a flight decides.
+fn is_chosen(seed: u64, number: usize, one_in: u32) -> bool {
+    stream(seed, Draw::Chosen, number).below(u64::from(one_in.max(1))) == 0
+}
+
+/// A training view on its way.
+struct TrainView<'a> {
+    /// The view whose pose it has.
+    view: &'a View,
+    /// The view whose photo it shows.
+    shown: &'a View,
+    pose: Pose,
+    /// Number among the training views of the undisturbed scene.
+    number: usize,
+}
+
+/// The training photos of a disturbed scene.
+///
+/// # Errors
+/// Nothing is left to train on.
+pub fn plan(dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> InputResult<Plan> {
+    let train = train_views(dataset, disturbance, seed);
+    if train.is_empty() || dataset.points.is_empty() {
+        let problem = "the disturbance leaves no photo to train on, or the scene has no points";
+        return Err(InputError::new(
+            &dataset.image_folder,
+            problem,
+            "disturb a scene with more photos and with points",
+        ));
+    }
+    let is_wrong = |t: &&TrainView<'_>| {
+        let is_blurred = matches!(disturbance, Disturbance::Blurred { one_in } if is_chosen(seed, t.number, *one_in));
+        is_blurred || !std::ptr::eq(t.view, t.shown)
+    };
+    let wrong = train.iter().filter(is_wrong).map(|t| photo_name(TRAIN, t.number, disturbance)).collect();
+    Ok(Plan { test_after: train.len() as u32 - 1, wrong })
+}
+
+/// Writes the scene of `dataset` to `folder`, which must be new, with a disturbance.
+///
+/// # Errors
+/// As [`plan`]; the folder exists, a photo cannot be decoded, or a file cannot be written.
+pub fn write_disturbed(folder: &Path, dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> InputResult<()> {
+    if folder.exists() {
+        return Err(InputError::new(folder, "the folder exists", "choose another folder"));
+    }
+    plan(dataset, disturbance, seed)?;
+    let train = train_views(dataset, disturbance, seed);
+    let held_out: Vec<&View> = dataset.views.iter().filter(|view| view.split == Split::Test).collect();
+    make_folder(&folder.join("images"))?;
+    let of_train = train.par_iter().map(|t| {
+        let photo = photos::disturbed(decode(&t.shown.photo)?, disturbance, seed, t.number)?;
+        let name = photo_name(TRAIN, t.number, disturbance);
+        write_photo(folder, &name, &photo).map(|()| (name, t.pose))
+    });
+    let of_held_out = held_out.par_iter().enumerate().map(|(number, view)| {
+        let photo = photos::disturbed(decode(&view.photo)?, &Disturbance::Nothing, seed, number)?;
+        let name = photo_name(HELD_OUT, number, &Disturbance::Nothing);
+        write_photo(folder, &name, &photo).map(|()| (name, pose_of(&view.camera)))
+    });
+    let named: Vec<(String, Pose)> = of_train.chain(of_held_out).collect::<InputResult<_>>()?;
+    let (cameras, groups) = cameras(train.iter().map(|t| t.view).chain(held_out));
+    let image = |((name, pose), camera)| ModelImage { name, pose, camera };
+    let images = named.into_iter().zip(groups).map(image).collect();
+    let points = points(dataset, disturbance, seed);
+    write_model(&folder.join("sparse"), &Model { cameras, images, points, tiles: vec![[0.0; 3]] })
+}
+
+/// Name of a photo; those of a set are in the order of their numbers.
+fn photo_name(set: char, number: usize, disturbance: &Disturbance) -> String {
+    let extension = if matches!(disturbance, Disturbance::Jpeg { .. }) { "jpg" } else { "png" };
+    format!("{set}_{number:06}.{extension}")
+}
+
+/// The training views with the photos and poses that the disturbance gives them.
+fn train_views<'a>(dataset: &'a Dataset, disturbance: &Disturbance, seed: u64) -> Vec<TrainView<'a>> {
+    let views: Vec<&View> = dataset.views.iter().filter(|view| view.split == Split::Train).collect();
+    let shown = match disturbance {
+        Disturbance::Swapped { share } => poses::swapped(dataset, &views, *share, seed),
+        _ => (0..views.len()).collect(),
+    };
+    let noise = match disturbance {
+        Disturbance::PoseNoise { share } => share * f64::from(dataset.scene_scale),
+        _ => 0.0,
+    };
+    let is_kept = |number: usize| match disturbance {
+        Disturbance::FewPhotos { one_in } => is_chosen(seed, number, *one_in),
+        _ => true,
+    };
+    let of_number = |number: usize| TrainView {
+        view: views[number],
+        shown: views[shown[number]],
+        pose: poses::moved(pose_of(&views[number].camera), noise, &mut stream(seed, Draw::Pose, number)),
+        number,
+    };
+    (0..views.len()).filter(|&number| is_kept(number)).map(of_number).collect()
+}
+
+/// World to camera, in the local frame of the dataset.
+fn pose_of(camera: &Camera) -> Pose {
+    let [x, y, z] = camera.viewmat.map(|row| DVec3::new(row[0].into(), row[1].into(), row[2].into()));
+    let translation = camera.viewmat.map(|row| f64::from(row[3]));
+    Pose { rotation: DMat3::from_cols(x, y, z).transpose(), translation: DVec3::from(translation) }
+}
+
+/// The distinct intrinsics, and for each view the index of its own.
+fn cameras<'a>(views: impl Iterator<Item = &'a View>) -> (Vec<Intrinsics>, Vec<u32>) {
+    let (mut cameras, mut groups) = (Vec::<Intrinsics>::new(), Vec::new());
+    for Camera { fx, fy, cx, cy, width, height, .. } in views.map(|view| view.camera) {
+        let [fx, fy, cx, cy] = [fx, fy, cx, cy].map(f64::from);
+        let own = Intrinsics { width, height, fx, fy, cx, cy, lens: Lens::Pinhole };
+        let known = cameras.iter().position(|k| *k == own);
+        groups.push(known.unwrap_or(cameras.len()) as u32);
+        if known.is_none() {
+            cameras.push(own);
+        }
+    }
+    (cameras, groups)
+}
+
+/// Writes a photo and its mask.
+fn write_photo(folder: &Path, name: &str, photo: &Encoded) -> InputResult<()> {
+    write_whole(&folder.join("images").join(name), &photo.bytes)?;
+    let Some(mask) = &photo.mask else { return Ok(()) };
+    make_folder(&folder.join("masks"))?;
+    write_whole(&folder.join("masks").join(name).with_extension("png"), mask)
+}
+
+/// The points that the disturbance leaves.
+fn points(dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> Vec<Point> {
+    let of = |position: [f32; 3], rgb: [u8; 3]| Point {
+        position: position.map(f64::from),
+        rgb,
+        error: 0.5,
+        observations: Vec::new(),
+    };
+    let all = dataset.points.iter().copied().zip(dataset.colors.iter().copied());
+    match disturbance {
+        Disturbance::FewPoints { one_in } => {
+            let chosen = all.enumerate().filter(|(number, _)| is_chosen(seed, *number, *one_in));
+            chosen.map(|(_, (position, rgb))| of(position, rgb)).collect()
+        }
+        Disturbance::RandomPoints => {
+            let low: [f32; 3] = std::array::from_fn(|i| quantile(dataset, i, 0.01));
+            let high: [f32; 3] = std::array::from_fn(|i| quantile(dataset, i, 0.99));
+            let drawn = |number: usize| {
+                let mut draws = stream(seed, Draw::Point, number);
+                let position = std::array::from_fn(|i| draws.range(low[i].into(), high[i].into()) as f32);
+                of(position, std::array::from_fn(|_| draws.below(256) as u8))
+            };
+            (0..dataset.points.len()).map(drawn).collect()
+        }
+        _ => all.map(|(position, rgb)| of(position, rgb)).collect(),
+    }
+}
+
+/// A quantile of a coordinate of the points.
+fn quantile(dataset: &Dataset, axis: usize, share: f64) -> f32 {
+    let mut values: Vec<f32> = dataset.points.iter().map(|point| point[axis]).collect();
+    let at = ((values.len() - 1) as f64 * share) as usize;
+    *values.select_nth_unstable_by(at, f32::total_cmp).1
+}
+
+/// The mask of a photo as a PNG, if it has one.
+fn mask_png(target: &Target) -> InputResult<Option<Vec<u8>>> {
+    let Some(mask) = &target.mask else { return Ok(None) };
+    photos::png(mask, target.width, target.height, image::ExtendedColorType::L8).map(Some)
+}

@@ -1,0 +1,11 @@
+//! Outliers: what in the photos contradicts the rest of the scene.
+//!
+//! [`views`]: whole views whose photo does not match their pose (a wrong pose, another place, a broken photo).
+//!
+//! Invariants: 1. every value is a function of photos, pictures and steps alone, so runs give the same bits for any number
+//! of threads, frames and budgets, and a resumed run goes on with the values of its commit; 2. nothing here changes a
+//! picture, a photo or a gradient: `train` does, as far as the user asked for it.
+//!
+//! Not here: which step leaves out what (`train`), and the bytes of a commit (`checkpoint`).
+
+pub mod views;

@@ -1,0 +1,270 @@
+//! Wrong views: which photos contradict the scene that all others agree on.
+//!
+//! A photo with a wrong pose differs from its picture about as much as two unrelated photos differ. So a view is judged by
+//! the share of its photo's variance that its picture leaves unexplained, which photos of much and of little contrast have in
+//! common. The measure is the logarithm of mean squared error over variance.
+//!
+//! At the end of each epoch every view has a measure of that epoch. Median and median absolute deviation of all of them say
+//! what is usual; a view far above earns a strike, another loses one. Strikes outlast chance: a view is an outlier from
+//! [`STRIKES_NAMED`] on, until it has lost all of them. Views that are left out are still measured, so they can return.
+//!
+//! Invariants: 1. measures are stored as fixed-point numbers, and a verdict follows from them alone; 2. fewer than half of
+//! the views can be outliers of an epoch; 3. no verdict on fewer than [`VIEWS_LEAST`] views, or before the second epoch.
+
+use crate::scene::image::Target;
+use serde::{Deserialize, Serialize};
+
+/// Fixed-point numbers per unit of a measure.
+const PER_UNIT: f64 = 4096.0;
+/// Largest stored magnitude of a measure, fixed-point.
+const STORED_MOST: f64 = 64.0 * PER_UNIT;
+/// Fewest views of which median and deviation say what is usual.
+const VIEWS_LEAST: usize = 8;
+/// Least variance of a photo, of values in 0..1: two grey levels. A blank photo has none, and any picture would contradict it.
+const VARIANCE_LEAST: f64 = 6e-5;
+/// Pixels that say what the variance of a photo is, about.
+const SAMPLE: usize = 1 << 16;
+/// Strikes from which a view is an outlier, and the most that count.
+const STRIKES_NAMED: u8 = 2;
+const STRIKES_MOST: u8 = 4;
+/// A measure is an outlier if it exceeds the median by so many standard deviations, as the median absolute deviation
+/// estimates them, the error is so many times that of the median, and the picture leaves so large a share of the variance
+/// unexplained: a photo of another place leaves more than all of it, until the scene bends to show it.
+const DEVIATIONS: f64 = 3.0;
+const RATIO_LEAST: f64 = 1.6;
+const UNEXPLAINED_LEAST: f64 = 0.3;
+/// Median absolute deviation of a normal distribution, in standard deviations.
+const MAD_OF_NORMAL: f64 = 0.674_489_75;
+
+/// What is known of a view.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct ViewState {
+    /// The last measure, fixed-point.
+    measure: i32,
+    /// Whether a step has measured it in this epoch.
+    is_measured: bool,
+    /// Epochs in which it was an outlier, less those in which it was not.
+    strikes: u8,
+    /// Whether it is an outlier.
+    is_named: bool,
+}
+
+/// All views of a dataset.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct ViewOutliers {
+    views: Vec<ViewState>,
+}
+
+/// Variance of the used pixels of a photo over its channels, of values in 0..1; `None` without used pixels. Of a large photo
+/// some [`SAMPLE`] pixels are looked at.
+fn variance(photo: &Target) -> Option<f64> {
+    // Odd, so that it runs through the columns of a picture.
+    let stride = (photo.pixels() / SAMPLE) | 1;
+    let (mut count, mut sums, mut squares) = (0u64, [0u64; 3], 0u64);
+    for (i, rgb) in photo.rgb.as_chunks::<3>().0.iter().enumerate().step_by(stride) {
+        if photo.mask.as_ref().is_some_and(|mask| mask[i] == 0) {
+            continue;
+        }
+        count += 1;
+        for (sum, &value) in sums.iter_mut().zip(rgb) {
+            *sum += u64::from(value);
+            squares += u64::from(value) * u64::from(value);
+        }
+    }
+    let n = count as f64;
+    let of_means: f64 = sums.iter().map(|&sum| sum as f64 * sum as f64).sum::<f64>() / n.max(1.0);
+    (count > 0).then(|| ((squares as f64 - of_means) / (3.0 * n * 255.0 * 255.0)).max(VARIANCE_LEAST))
+}
+
+/// The value in the middle; the lower of two.
+fn median(values: &mut [i32]) -> i32 {
+    let middle = values.len().saturating_sub(1) / 2;
+    *values.select_nth_unstable(middle).1
+}
+
+impl ViewOutliers {
+    /// Of `views` views, of which nothing is known.
+    pub fn new(views: usize) -> ViewOutliers {
+        ViewOutliers { views: vec![ViewState::default(); views] }
+    }
+
+    /// Whether it knows as many views as `other`.
+    pub fn is_as_large_as(&self, other: &ViewOutliers) -> bool {
+        self.views.len() == other.views.len()
+    }
+
+    /// Whether a view is an outlier.
+    pub fn is_named(&self, view: usize) -> bool {
+        self.views.get(view).is_some_and(|view| view.is_named)
+    }
+
+    /// The outliers, ascending.
+    pub fn named(&self) -> impl Iterator<Item = usize> {
+        (0..self.views.len()).filter(|&view| self.views[view].is_named)
+    }
+
+    /// Share of its photo's variance that the last picture of a view left unexplained; above 1 where a grey picture would
+    /// have been closer.
+    pub fn unexplained(&self, view: usize) -> f64 {
+        self.views.get(view).map_or(0.0, |view| libm::exp(f64::from(view.measure) / PER_UNIT))
+    }
+
+    /// Notes the mean squared error of a view's picture.
+    pub fn measure(&mut self, view: usize, mse: f64, photo: &Target) {
+        let (Some(state), Some(variance)) = (self.views.get_mut(view), variance(photo)) else { return };
+        if mse.is_finite() {
+            let measure = libm::log(mse.max(1e-12) / variance) * PER_UNIT;
+            state.measure = measure.clamp(-STORED_MOST, STORED_MOST).round() as i32;
+            state.is_measured = true;
+        }
+    }
+
+    /// Judges the views measured since the last call, at the end of the epoch with this number, from 0. Returns those that
+    /// have become outliers, ascending.
+    pub fn end_epoch(&mut self, epoch: u32) -> Vec<usize> {
+        let mut measured: Vec<i32> = self.views.iter().filter(|v| v.is_measured).map(|v| v.measure).collect();
+        let mut found = Vec::new();
+        if measured.len() >= VIEWS_LEAST && epoch > 0 {
+            let middle = median(&mut measured);
+            let mut deviations: Vec<i32> = measured.iter().map(|m| (m - middle).abs()).collect();
+            let deviation = f64::from(median(&mut deviations)) / MAD_OF_NORMAL;
+            let far = (DEVIATIONS * deviation).max(PER_UNIT * libm::log(RATIO_LEAST));
+            let least = (f64::from(middle) + far).max(PER_UNIT * libm::log(UNEXPLAINED_LEAST));
+            for (number, view) in self.views.iter_mut().enumerate().filter(|(_, view)| view.is_measured) {
+                if view.judge(f64::from(view.measure) > least) {
+                    found.push(number);
+                }
+            }
+        }
+        self.views.iter_mut().for_each(|view| view.is_measured = false);
+        found
+    }
+
+    /// Checks values from a file.
+    ///
+    /// # Errors
+    /// Names what no run can have written.
+    pub fn check(&self) -> Result<(), &'static str> {
+        let is_possible = |view: &ViewState| {
+            f64::from(view.measure).abs() <= STORED_MOST
+                && view.strikes <= STRIKES_MOST
+                && (view.is_named || view.strikes < STRIKES_NAMED)
+                && !(view.is_named && view.strikes == 0)
+        };
+        if self.views.iter().all(is_possible) { Ok(()) } else { Err("the error of a view is out of bounds") }
+    }
+}
+
+impl ViewState {
+    /// Counts an epoch; whether the view has become an outlier.
+    fn judge(&mut self, is_outlier: bool) -> bool {
+        let was_named = self.is_named;
+        self.strikes = if is_outlier { (self.strikes + 1).min(STRIKES_MOST) } else { self.strikes.saturating_sub(1) };
+        self.is_named = if was_named { self.strikes > 0 } else { self.strikes >= STRIKES_NAMED };
+        self.is_named && !was_named
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    /// Half of the pixels dark, half bright: variance (contrast / 2)^2 in grey levels.
+    fn photo(contrast: u8) -> Target {
+        let rgb = (0..96).map(|i| if i < 48 { 10 } else { 10 + contrast }).collect();
+        Target { width: 8, height: 4, rgb, mask: None }
+    }
+
+    /// Epochs of twelve views, of which the last two have `wrong` times the error of the others.
+    fn after(epochs: u32, wrong: f64, outliers: &mut ViewOutliers) -> Vec<usize> {
+        let mut found = Vec::new();
+        for epoch in 0..epochs {
+            for view in 0..12 {
+                let usual = 0.01 * (1.0 + 0.05 * view as f64);
+                outliers.measure(view, if view >= 10 { usual * wrong } else { usual }, &photo(60));
+            }
+            found.extend(outliers.end_epoch(epoch));
+        }
+        found
+    }
+
+    #[test]
+    fn views_far_above_the_others_are_named_after_two_epochs_and_return_when_they_fit() {
+        let mut outliers = ViewOutliers::new(12);
+        assert_eq!(after(2, 6.0, &mut outliers), [0; 0], "the first epoch does not count, and one is not enough");
+        assert_eq!(after(2, 6.0, &mut outliers), [10, 11]);
+        assert_eq!(outliers.named().collect::<Vec<_>>(), [10, 11]);
+        assert_eq!(outliers.check(), Ok(()));
+        after(2, 1.0, &mut outliers);
+        assert!(outliers.is_named(10), "it lost one strike of two");
+        after(3, 1.0, &mut outliers);
+        assert_eq!(outliers.named().count(), 0);
+        assert_eq!(after(9, 1.1, &mut outliers), [0; 0], "a tenth more is no contradiction");
+    }
+
+    #[test]
+    fn contrast_does_not_make_an_outlier() {
+        let mut outliers = ViewOutliers::new(12);
+        for epoch in 0..5 {
+            for view in 0..12u8 {
+                let photo = photo(10 + 20 * view);
+                outliers.measure(view.into(), 0.5 * variance(&photo).unwrap(), &photo);
+            }
+            assert_eq!(outliers.end_epoch(epoch), [0; 0]);
+        }
+        // A fixed-point number has 12 bits behind the point.
+        assert!((outliers.unexplained(3) - 0.5).abs() < 1e-3);
+    }
+
+    #[test]
+    fn views_that_are_mostly_explained_are_no_outliers() {
+        let mut outliers = ViewOutliers::new(12);
+        for epoch in 0..6 {
+            for view in 0..12 {
+                let error = if view == 3 { 0.25 } else { 0.02 };
+                outliers.measure(view, error * variance(&photo(60)).unwrap(), &photo(60));
+            }
+            assert_eq!(outliers.end_epoch(epoch), [0; 0]);
+        }
+    }
+
+    #[test]
+    fn few_views_masked_photos_and_bad_numbers_say_nothing() {
+        let mut few = ViewOutliers::new(7);
+        for epoch in 0..6 {
+            (0..7).for_each(|view| few.measure(view, if view == 0 { 1.0 } else { 0.001 }, &photo(60)));
+            assert_eq!(few.end_epoch(epoch), [0; 0]);
+        }
+        let mut outliers = ViewOutliers::new(12);
+        let masked = Target { mask: Some(vec![0; 32]), ..photo(60) };
+        for epoch in 0..6 {
+            (0..11).for_each(|view| outliers.measure(view, 0.001, &photo(60)));
+            outliers.measure(11, f64::NAN, &photo(60));
+            outliers.measure(10, 1.0, &masked);
+            assert_eq!(outliers.end_epoch(epoch), [0; 0]);
+        }
+        outliers.measure(99, 1.0, &photo(60));
+    }
+
+    #[test]
+    fn variance_is_that_of_the_used_pixels() {
+        assert!((variance(&photo(60)).unwrap() - (30.0f64 / 255.0).powi(2)).abs() < 1e-12);
+        let half = Target { mask: Some((0..32).map(|i| if i < 16 { 255 } else { 0 }).collect()), ..photo(60) };
+        assert_eq!(variance(&half), Some(VARIANCE_LEAST));
+        assert_eq!(variance(&Target { mask: Some(vec![0; 32]), ..photo(60) }), None);
+    }
+
+    #[test]
+    fn impossible_states_are_refused() {
+        let refused = |change: fn(&mut ViewState)| {
+            let mut outliers = ViewOutliers::new(2);
+            change(&mut outliers.views[1]);
+            assert!(outliers.check().is_err());
+        };
+        refused(|view| view.measure = i32::MIN);
+        refused(|view| view.strikes = STRIKES_MOST + 1);
+        refused(|view| view.strikes = STRIKES_NAMED);
+        refused(|view| view.is_named = true);
+    }
+}
