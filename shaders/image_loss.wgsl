@@ -1,7 +1,7 @@
 // Stage "image_loss": (1 - lambda) L1 + lambda (1 - SSIM) of a picture, and its gradient. The twin of
 // src/kernels/image_loss.rs and src/kernels/ssim_band.rs, which document the formulas and masks.
 //
-// Three entry points, run in this order:
+// Three entry points, run in this order (a fourth, squared_errors, is the twin of src/kernels/squared_error.rs):
 //   ssim_map     one workgroup per tile and channel: SSIM's three derivative maps, and the tile's sum of SSIM;
 //   gradient     likewise: v_rgb, and the tile's sums of absolute and squared differences.
 //                In both an invocation takes four places side by side, whose windows share most of what they read:
@@ -42,6 +42,9 @@ struct LossUniforms {
 @group(0) @binding(5) var<storage, read_write> partials: array<vec4<f32>>;
 /// Output of sum_partials.
 @group(0) @binding(6) var<storage, read_write> sums: array<vec4<f32>>;
+
+/// Output of squared_errors, [height][width].
+@group(0) @binding(7) var<storage, read_write> errors: array<f32>;
 
 /// Invocations per workgroup of ssim_map and gradient: one per four pixels of a tile.
 const LANES: u32 = 64u;
@@ -355,4 +358,24 @@ fn sum_partials(place: Place) {
     if lane == 0u && group < (loss.partial_count + each - 1u) / each {
         sums[group] = vec4<f32>(total, 0.0);
     }
+}
+
+/// Squared difference of picture and photo at each pixel, mean over the channels; 0 where the pixel is excluded.
+@compute @workgroup_size(256)
+fn squared_errors(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let pixel = linear_index(workgroup, workgroups, lane, WORKGROUP);
+    if pixel >= loss.width * loss.height {
+        return;
+    }
+    var sum = 0.0;
+    for (var channel = 0u; channel < 3u; channel++) {
+        let both = values(channel, pixel);
+        let difference = both.x - both.y;
+        sum += difference * difference;
+    }
+    errors[pixel] = sum / 3.0;
 }

@@ -19,7 +19,8 @@
 @group(0) @binding(9) var<storage, read_write> v_scales: array<f32>;
 /// With respect to the logits.
 @group(0) @binding(10) var<storage, read_write> v_opacities: array<f32>;
-/// Input of densification for each row: v_mean2d.x, v_mean2d.y, radius.x, radius.y; zeros for a culled row.
+/// Input of densification for each row: v_mean2d.x, v_mean2d.y, radius.x, radius.y; zeros for a culled row. With WEIGHS a row
+/// has a second entry: weight, and weight times error.
 @group(0) @binding(11) var<storage, read_write> footprints: array<vec4<f32>>;
 
 /// The image of axis k times the conic, from the image and minor of axis k and of the two axes after it, cyclically.
@@ -113,7 +114,12 @@ fn project_bwd(
             v_scales[3u * i + c] = 0.0;
         }
         v_opacities[i] = 0.0;
+#ifdef WEIGHS
+        footprints[2u * i] = vec4<f32>();
+        footprints[2u * i + 1u] = vec4<f32>();
+#else
         footprints[i] = vec4<f32>();
+#endif
         return;
     }
     let a = v_splats[at];
@@ -128,5 +134,10 @@ fn project_bwd(
     }
     v_quats[i] = v.quat;
     v_opacities[i] = a.w * sigmoid_slope(opacities[i]);
+#ifdef WEIGHS
+    footprints[2u * i] = vec4<f32>(a.xy, radius, splats[at + 2u].w);
+    footprints[2u * i + 1u] = vec4<f32>(a.z, v_splats[at + 1u].w, 0.0, 0.0);
+#else
     footprints[i] = vec4<f32>(a.xy, radius, splats[at + 2u].w);
+#endif
 }

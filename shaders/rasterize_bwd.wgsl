@@ -1,6 +1,7 @@
 // Gradients of footprints and colours from the gradient of the image, back to front through each tile's list: the twin
 // of src/kernels/rasterize_bwd.rs, which documents the formulas. Nine sums per splat and tile: h, h dx, h dy, h dx^2, h
-// dx dy, h dy^2 and weight v_rgb; fold_rows converts them to gradients.
+// dx dy, h dy^2 and weight v_rgb; fold_rows converts them to gradients. With WEIGHS two more sums are statistics: weight, and
+// weight times the error of the pixel. They lie in words of a record that gradients leave free.
 //
 // No float atomics: the sums of an invocation's pixels are added within the subgroup (without subgroups, each
 // invocation is a part), the parts are added through workgroup memory in a fixed order, and one invocation writes the
@@ -33,7 +34,14 @@
 /// Rows that count_unusable found.
 @group(0) @binding(14) var<storage, read_write> unusable: atomic<u32>;
 
+#ifdef WEIGHS
+/// [height][width]
+@group(0) @binding(15) var<storage, read> errors: array<f32>;
+
+const SUMS: u32 = 11u;
+#else
 const SUMS: u32 = 9u;
+#endif
 /// The bits of LARGEST_SPLAT_GRAD in src/base/math.rs, 1e12.
 const LARGEST_SPLAT_GRAD_BITS: u32 = 0x5368d4a5u;
 /// Parts of the sums of one splat, times the splats of a batch.
@@ -41,8 +49,12 @@ const PARTS_OF_BATCH: u32 = 256u;
 
 var<workgroup> batch: array<TileSplat, TILE_LANES>;
 var<workgroup> batch_isects: array<u32, TILE_LANES>;
-/// [splats of the batch][9][parts]
+/// [splats of the batch][SUMS][parts]
+#ifdef WEIGHS
+var<workgroup> sums: array<f32, 2816>;
+#else
 var<workgroup> sums: array<f32, 2304>;
+#endif
 /// Largest stop of the tile.
 var<workgroup> tile_stop: atomic<u32>;
 
@@ -56,14 +68,21 @@ struct Pixels {
     v_red: vec4<f32>,
     v_green: vec4<f32>,
     v_blue: vec4<f32>,
+#ifdef WEIGHS
+    error: vec4<f32>,
+#endif
 }
 
-/// The nine sums over an invocation's pixels.
+/// The sums over an invocation's pixels.
 struct Sums {
     h: f32,
     firsts: vec2<f32>,
     seconds: vec3<f32>,
     color: vec3<f32>,
+#ifdef WEIGHS
+    /// Weight, and weight times error.
+    weights: vec2<f32>,
+#endif
 }
 
 fn pixels_behind(at: u32, plane: u32, inside: vec4<bool>) -> Pixels {
@@ -75,6 +94,9 @@ fn pixels_behind(at: u32, plane: u32, inside: vec4<bool>) -> Pixels {
             p.v_green[i] = v_rgb[plane + here];
             p.v_blue[i] = v_rgb[2u * plane + here];
             p.stop[i] = stops[here];
+#ifdef WEIGHS
+            p.error[i] = errors[here];
+#endif
             if (view.flags & SEGMENT_FIRST) != 0u {
                 p.t[i] = t_final[here];
                 p.behind[i] = dot(view.background, vec3<f32>(p.v_red[i], p.v_green[i], p.v_blue[i]));
@@ -118,6 +140,9 @@ fn take_off(
         vec2<f32>(hx_sum, dy * h_sum),
         vec3<f32>(dot(hx, dx), dy * hx_sum, dy * dy * h_sum),
         vec3<f32>(dot(weight, v_red), dot(weight, v_green), dot(weight, v_blue)),
+#ifdef WEIGHS
+        vec2<f32>((weight.x + weight.y) + (weight.z + weight.w), dot(weight, (*pixels).error)),
+#endif
     );
 }
 
@@ -131,6 +156,10 @@ fn write_sums(to: u32, parts: u32, s: Sums) {
     sums[to + 6u * parts] = s.color.x;
     sums[to + 7u * parts] = s.color.y;
     sums[to + 8u * parts] = s.color.z;
+#ifdef WEIGHS
+    sums[to + 9u * parts] = s.weights.x;
+    sums[to + 10u * parts] = s.weights.y;
+#endif
 }
 
 #ifdef SUBGROUPS_OF_8
@@ -150,6 +179,9 @@ fn take_off_8(pixels: ptr<function, Pixels>, first: u32, list_index: u32, size: 
     var one = vec3<f32>();
     var two = vec3<f32>();
     var three = vec3<f32>();
+#ifdef WEIGHS
+    var four = vec3<f32>();
+#endif
 #repeat LANE 7u 6u 5u 4u 3u 2u 1u 0u
     {
         let splat = TileSplat(
@@ -168,10 +200,17 @@ fn take_off_8(pixels: ptr<function, Pixels>, first: u32, list_index: u32, size: 
         one = select(one, sum_of_8(vec3<f32>(s.h, s.firsts)), own_lane == LANE);
         two = select(two, sum_of_8(s.seconds), own_lane == LANE);
         three = select(three, sum_of_8(s.color), own_lane == LANE);
+#ifdef WEIGHS
+        four = select(four, sum_of_8(vec3<f32>(s.weights, 0.0)), own_lane == LANE);
+#endif
     }
 #end
     if first + own_lane < size {
+#ifdef WEIGHS
+        write_sums((first + own_lane) * SUMS * 8u + part, 8u, Sums(one.x, one.yz, two, three, four.xy));
+#else
         write_sums((first + own_lane) * SUMS * 8u + part, 8u, Sums(one.x, one.yz, two, three));
+#endif
     }
 }
 #endif
@@ -258,7 +297,12 @@ fn rasterize_bwd(
                 continue;
             }
             var s = take_off(&pixels, splat, e, taking_part, dx, dy);
+#ifdef WEIGHS
+            let weights = subgroupAdd(s.weights);
+            s = Sums(subgroupAdd(s.h), subgroupAdd(s.firsts), subgroupAdd(s.seconds), subgroupAdd(s.color), weights);
+#else
             s = Sums(subgroupAdd(s.h), subgroupAdd(s.firsts), subgroupAdd(s.seconds), subgroupAdd(s.color));
+#endif
             if subgroup_lane == 0u {
                 write_sums(to, parts, s);
             }
@@ -297,8 +341,12 @@ fn rasterize_bwd(
     }
 }
 
-/// Rows per workgroup; its last four invocations are idle.
+/// Rows per workgroup; its last invocations are idle.
+#ifdef WEIGHS
+const GROUP_ROWS: u32 = 23u;
+#else
 const GROUP_ROWS: u32 = 28u;
+#endif
 
 var<workgroup> row_sums: array<f32, 256>;
 
@@ -325,7 +373,7 @@ fn isects_at(rank: u32) -> vec2<u32> {
 }
 
 /// Folds the sums of each row over its intersections, in emit order (tiles column by column), and converts them to
-/// gradients. Nine invocations process a row, one per sum. A row that ends beyond the window, or may have intersections
+/// gradients. As many invocations process a row as there are sums. A row that ends beyond the window, or may have intersections
 /// in a later range of tiles, stores its sums in place of its gradients, in the order of the sums, and the next window
 /// or range continues from there.
 @compute @workgroup_size(256)
@@ -387,7 +435,11 @@ fn fold_rows(
     if continues || (view.flags & FOLD_UNFINISHED) != 0u {
         v_splats[at] = vec4<f32>(row_sums[s], row_sums[s + 1u], row_sums[s + 2u], row_sums[s + 3u]);
         v_splats[at + 1u] = vec4<f32>(row_sums[s + 4u], row_sums[s + 5u], row_sums[s + 6u], row_sums[s + 7u]);
+#ifdef WEIGHS
+        v_splats[at + 2u] = vec4<f32>(row_sums[s + 8u], row_sums[s + 9u], row_sums[s + 10u], 0.0);
+#else
         v_splats[at + 2u] = vec4<f32>(row_sums[s + 8u], 0.0, 0.0, 0.0);
+#endif
         return;
     }
     let splat = splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]);
@@ -396,8 +448,13 @@ fn fold_rows(
     let v_mean = vec2<f32>(conic.x * row_sums[s + 1u] + conic.y * row_sums[s + 2u], conic.y * row_sums[s + 1u] + conic.z * row_sums[s + 2u]);
     // A row that is not drawn has neither opacity nor sums.
     let v_opacity = select(0.0, row_sums[s] / splat.opacity, splat.opacity > 0.0);
-    v_splats[at] = vec4<f32>(v_mean, 0.0, v_opacity);
-    v_splats[at + 1u] = vec4<f32>(-0.5 * row_sums[s + 3u], -row_sums[s + 4u], -0.5 * row_sums[s + 5u], 0.0);
+#ifdef WEIGHS
+    let weights = vec2<f32>(row_sums[s + 9u], row_sums[s + 10u]);
+#else
+    let weights = vec2<f32>();
+#endif
+    v_splats[at] = vec4<f32>(v_mean, weights.x, v_opacity);
+    v_splats[at + 1u] = vec4<f32>(-0.5 * row_sums[s + 3u], -row_sums[s + 4u], -0.5 * row_sums[s + 5u], weights.y);
     v_splats[at + 2u] = vec4<f32>(row_sums[s + 6u], row_sums[s + 7u], row_sums[s + 8u], 0.0);
 }
 

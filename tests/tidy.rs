@@ -13,7 +13,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("schedule", &["base", "scene"]),
     ("page", &["base"]),
     ("paging", &["base", "scene", "page", "schedule"]),
-    ("checkpoint", &["base", "scene", "page", "paging", "appearance", "outliers"]),
+    ("checkpoint", &["base", "scene", "page", "paging", "appearance", "outliers", "densify"]),
     ("gpu", &["base"]),
     ("kernels", &["base", "scene"]),
     ("optim", &["base", "scene"]),

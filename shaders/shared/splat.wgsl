@@ -8,10 +8,10 @@
 // project_fwd writes the record with colour 0; sh_fwd then writes the colour. A culled row is all zeros, and radius.x >
 // 0 exactly for the drawn rows (radius.y is then above 0 too).
 //
-// The gradient of a splat has the same layout:
+// The gradient of a splat has the same layout; the two weights are zero unless rows are weighed:
 //
-//   v_splats[3 row]     = v_mean2d.x, v_mean2d.y, 0, v_opacity
-//   v_splats[3 row + 1] = v_conic.xx, v_conic.xy, v_conic.yy, 0  (xy counted once: sigma holds conic.xy dx dy)
+//   v_splats[3 row]     = v_mean2d.x, v_mean2d.y, weight, v_opacity
+//   v_splats[3 row + 1] = v_conic.xx, v_conic.xy, v_conic.yy, weight times error  (xy counted once: sigma holds conic.xy dx dy)
 //   v_splats[3 row + 2] = v_red, v_green, v_blue, 0              (with respect to the colour after its clamp at 0)
 //
 // sh_bwd and project_bwd ignore entries of culled rows.

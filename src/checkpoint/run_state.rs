@@ -5,11 +5,13 @@
 //! never a panic.
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
-//! [`crate::page::format::encoding`] writes them. Version 5 had no outliers and version 4 no appearance either: they are
-//! read as those of a run that knows nothing of them. No program was released with versions 1 to 3. A new value is a field of [`TrainerState`], a place at the end of `encode` and `decode`, and a new version.
+//! [`crate::page::format::encoding`] writes them. Version 5 had neither outliers nor checks of growth, version 4 no appearance
+//! either: they are read as those of a run without. No program was released with versions 1 to 3. A new value is a field of
+//! [`TrainerState`], a place at the end of `encode` and `decode`, and a new version.
 
 use crate::appearance::state::AppearanceState;
 use crate::base::identity::RunId;
+use crate::densify::growth::GrowthState;
 use crate::outliers::views::ViewOutliers;
 use crate::page::format::encoding::{self, EncodingError};
 use crate::paging::stats::PagerStats;
@@ -18,9 +20,9 @@ use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
 pub const VERSION: u32 = 6;
-/// The version before the outliers: the same values without the last.
+/// The version before outliers and checks of growth: the same values without the last two.
 const WITHOUT_OUTLIERS: u32 = 5;
-/// The version before appearance: the same values without the last two.
+/// The version before appearance: the same values without the last three.
 const WITHOUT_APPEARANCE: u32 = 4;
 
 /// Digests of a view.
@@ -108,6 +110,8 @@ pub struct TrainerState {
     pub appearance: AppearanceState,
     /// What is known of views whose photo contradicts the scene.
     pub outliers: ViewOutliers,
+    /// What a run that decides its count knows of it.
+    pub growth: GrowthState,
 }
 
 /// The state of a run between two steps, without its pages.
@@ -184,11 +188,11 @@ impl RunState {
         let state = match version {
             VERSION => RunState::decode(body)?,
             WITHOUT_OUTLIERS => {
-                let none = encoding::to_bytes(&ViewOutliers::default())?;
+                let none = encoding::to_bytes(&(ViewOutliers::default(), GrowthState::default()))?;
                 RunState::decode(&[body, &none].concat())?
             }
             WITHOUT_APPEARANCE => {
-                let none = (AppearanceState::default(), ViewOutliers::default());
+                let none = (AppearanceState::default(), ViewOutliers::default(), GrowthState::default());
                 let none = encoding::to_bytes(&none)?;
                 RunState::decode(&[body, &none].concat())?
             }
@@ -202,21 +206,13 @@ impl RunState {
     fn encode(&self) -> Result<Vec<u8>, EncodingError> {
         let RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic } = self;
         let Origin { config, simd, sh_degree_start, dataset, run } = origin;
-        let TrainerState {
-            step,
-            rows_skipped,
-            steps_skipped,
-            steps_skipped_in_a_row,
-            train_seconds,
-            test,
-            appearance,
-            outliers,
-        } = trainer;
+        let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, .. } = trainer;
+        let TrainerState { test, appearance, outliers, growth, .. } = trainer;
         encoding::to_bytes(&(
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance, outliers),
+            (metrics_bytes, test, traffic, run, appearance, outliers, growth),
         ))
     }
 
@@ -226,7 +222,7 @@ impl RunState {
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance, outliers),
+            (metrics_bytes, test, traffic, run, appearance, outliers, growth),
         ) = encoding::from_bytes(bytes)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
         let trainer = TrainerState {
@@ -238,6 +234,7 @@ impl RunState {
             test,
             appearance,
             outliers,
+            growth,
         };
         Ok(RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic })
     }
@@ -283,8 +280,8 @@ impl RunState {
         if test.is_some_and(|test| test.step > step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
             return refuse("its last evaluation is invalid");
         }
-        let TrainerState { appearance, outliers, .. } = &self.trainer;
-        appearance.check().and_then(|()| outliers.check()).or_else(refuse)
+        let TrainerState { appearance, outliers, growth, .. } = &self.trainer;
+        appearance.check().and_then(|()| outliers.check()).and_then(|()| growth.check(step)).or_else(refuse)
     }
 }
 
@@ -293,6 +290,7 @@ impl RunState {
 mod tests {
     use super::*;
     use crate::base::rng::mix64;
+    use crate::densify::growth::GrowthCheck;
     use crate::scene::events::RoundThresholds;
 
     fn sample() -> RunState {
@@ -332,6 +330,13 @@ mod tests {
                 test: Some(LastTest { step: 8, views: 3, psnr: 21.5, ssim: 0.75 }),
                 appearance: AppearanceState::new(&[0, 1, 0]),
                 outliers: ViewOutliers::new(3),
+                growth: GrowthState {
+                    first: 7,
+                    checks: vec![
+                        GrowthCheck { step: 5, gaussians: 7, lost: 0.5, pays_from: 0.25, allowed: 10 },
+                        GrowthCheck { step: 8, gaussians: 10, lost: -0.5, pays_from: 0.5, allowed: 10 },
+                    ],
+                },
             },
             events: events.to_vec(),
             histogram: vec![(3, 1), (32767, 9), (65535, 2)],
@@ -361,11 +366,11 @@ mod tests {
     #[test]
     fn states_of_earlier_versions_come_back_without_later_values() {
         let state = sample();
-        let outliers = ViewOutliers::default();
-        let of_5 = TrainerState { outliers: outliers.clone(), ..state.trainer.clone() };
+        let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
+        let of_5 = TrainerState { outliers: outliers.clone(), growth: growth.clone(), ..state.trainer.clone() };
         let of_4 = TrainerState { appearance: AppearanceState::default(), ..of_5.clone() };
-        let lacking_5 = encoding::to_bytes(&outliers).unwrap();
-        let lacking_4 = encoding::to_bytes(&(AppearanceState::default(), outliers)).unwrap();
+        let lacking_5 = encoding::to_bytes(&(outliers.clone(), growth.clone())).unwrap();
+        let lacking_4 = encoding::to_bytes(&(AppearanceState::default(), outliers, growth)).unwrap();
         for (version, trainer, lacking) in [(WITHOUT_OUTLIERS, of_5, lacking_5), (WITHOUT_APPEARANCE, of_4, lacking_4)]
         {
             let without = RunState { trainer, ..state.clone() };
@@ -400,6 +405,9 @@ mod tests {
         refused(|s| s.trainer.appearance.images[0].values[0] = i32::MIN);
         refused(|s| s.trainer.appearance.images[0].sightings = 1);
         refused(|s| s.trainer.appearance.cameras[1].falloff[0][0] = f64::NAN);
+        refused(|s| s.trainer.growth.checks.reverse());
+        refused(|s| s.trainer.growth.checks[1].step = 10);
+        refused(|s| s.trainer.growth.checks[0].lost = f64::NAN);
         refused(|s| s.origin.dataset.scale = 0.0);
         refused(|s| s.origin.dataset.origin[1] = f64::INFINITY);
     }

@@ -5,7 +5,6 @@
 use super::file::TrainConfig;
 use crate::base::error::{InputError, InputResult};
 use crate::checkpoint::interval::CommitEvery;
-use crate::densify::strategy::StrategyName;
 use crate::optim::adam::EPS_MIN;
 
 /// Most steps of a run: the optimizer keeps 88 bytes for each.
@@ -72,10 +71,6 @@ impl TrainConfig {
         }
         if !(0.0..=0.5).contains(&self.recycle) {
             return refuse("recycle", "a share from 0 to 0.5");
-        }
-        if self.strategy == StrategyName::LongAxis && self.max_gaussians == 0 {
-            let problem = "--strategy long-axis grows until the cap, and there is none";
-            return Err(InputError::new("--max-gaussians", problem, "give the most Gaussians that the scene may have"));
         }
         // Compare in f32, as events store the value.
         if self.prune_opa as f32 >= 0.5 {

@@ -7,6 +7,7 @@
 use super::schedule::Schedule;
 use crate::appearance::AppearanceMode;
 use crate::base::simd::SimdPath;
+use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
 use crate::exchange::ply::ExportFrame;
@@ -130,6 +131,7 @@ choices! {
     "moments": Moments { F32 = "f32", Bf16 = "bf16" }
     "strategy": StrategyName { Default = "default", LongAxis = "long-axis", None = "none" }
     "schedule": Schedule { RunLength = "run-length", Classic = "classic" }
+    "quality": Quality { Draft = "draft", Normal = "normal", Archive = "archive" }
     "growth-score": GrowthScore { Gradient = "gradient", Error = "error", Mixed = "mixed" }
     "appearance": AppearanceMode { Off = "off", Exposure = "exposure", Full = "full" }
     "log": LogFormat { Json = "json", Tensorboard = "tensorboard" }
@@ -301,6 +303,7 @@ mod tests {
         check::<Moments>();
         check::<StrategyName>();
         check::<Schedule>();
+        check::<Quality>();
         check::<GrowthScore>();
         check::<AppearanceMode>();
         check::<LogFormat>();

@@ -16,6 +16,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
 use crate::base::units::{parse_count, parse_count32};
 use crate::checkpoint::interval::CommitEvery;
+use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
 use crate::exchange::ply::ExportFrame;
@@ -172,15 +173,19 @@ config_keys! {
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }
     "Densification" {
-        /// default (gsplat's: clone, split, prune, reset), long-axis (split along the longest axis; at --max-gaussians,
-        /// which it needs, remove what weighs least), or none
+        /// default (gsplat's: clone, split, prune, reset), long-axis (split along the longest axis; at --max-gaussians, or
+        /// at the number that the run decides without, remove what weighs least), or none
         strategy: StrategyName = StrategyName::Default => Numbers;
         /// Of --strategy long-axis: grow first what has the largest screen-space gradient (gradient), what covers the
         /// most squared error (error), or the largest geometric mean of both (mixed)
         growth_score: GrowthScore = GrowthScore::Gradient => Numbers;
         /// Of --strategy long-axis: share of the Gaussians seen that a round at the cap removes; 0 = none
         recycle: f64 = 0.02 => Numbers;
-        /// Most Gaussians; 0 = no cap
+        /// Of --strategy long-axis without --max-gaussians: draft (few Gaussians), normal or archive (many). During the first
+        /// half of the run, at most 1,700 steps, some training photos are held out, and the scene grows as far as they show that
+        /// more pay
+        quality: Quality = Quality::Normal => Numbers;
+        /// Most Gaussians; 0 = no cap, or with --strategy long-axis, as many as pay
         [value_parser = parse_count] max_gaussians: u64 = 0 => Numbers;
         /// Step after which densification rounds begin
         refine_start: u32 = 500 => Numbers;

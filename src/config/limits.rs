@@ -8,6 +8,7 @@ use crate::base::simd::SimdPath;
 use crate::dataset::loader::LoadOptions;
 use crate::dataset::read::ReadOptions;
 use crate::densify::default::DefaultStrategy;
+use crate::densify::growth::GrowthRule;
 use crate::densify::long_axis::LongAxisStrategy;
 use crate::densify::strategy::{NoStrategy, Strategy, StrategyName};
 use crate::exchange::ply::ExportFrame;
@@ -185,7 +186,14 @@ fn long_axis_strategy(config: &TrainConfig) -> LongAxisStrategy {
         refine_stop: config.refine_stop,
         refine_every: config.refine_every,
         max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
+        growth: growth_rule(config),
     }
+}
+
+/// How a run decides its count; `None` for a run that does not.
+pub fn growth_rule(config: &TrainConfig) -> Option<GrowthRule> {
+    let decides = config.strategy == StrategyName::LongAxis && config.max_gaussians == 0;
+    decides.then(|| GrowthRule::new(config.quality, schedule_steps(config)))
 }
 
 /// Steps over which the learning rate decays.

@@ -6,7 +6,7 @@
 
 use super::ops::{child_log_scale, sigma};
 use super::stats::{GradHistogram, promised_growth};
-use super::strategy::{Extremes, Fate, Round, RowFacts, Strategy};
+use super::strategy::{Extremes, Fate, Round, RowCount, RowFacts, Strategy};
 use crate::base::math::sigmoid;
 use crate::optim::bounds::SplitLimits;
 use crate::scene::events::{EventKind, RoundThresholds, SPLIT_SIGMAS};
@@ -98,10 +98,10 @@ impl Strategy for DefaultStrategy {
     }
 
     /// A round, then a reset.
-    fn events_after(&self, step: u32, scene_scale: f32, rows: u64, histogram: &GradHistogram) -> Vec<EventKind> {
+    fn events_after(&self, step: u32, scene_scale: f32, count: RowCount, histogram: &GradHistogram) -> Vec<EventKind> {
         let mut events = Vec::new();
         if self.is_round(step) {
-            events.push(EventKind::Densify(self.thresholds(step, scene_scale, rows, histogram)));
+            events.push(EventKind::Densify(self.thresholds(step, scene_scale, count.rows, histogram)));
         }
         if self.is_reset(step) {
             events.push(EventKind::ResetOpacity { max_opacity: 2.0 * self.prune_opa });
@@ -164,7 +164,7 @@ mod tests {
         let resets: Vec<u32> = (0..20_000).filter(|&s| config.is_reset(s)).collect();
         assert_eq!(resets, [3000, 6000, 9000, 12_000]);
         assert!(config.collects(14_999) && !config.collects(15_000));
-        let events = config.events_after(3000, 1.0, 10, &GradHistogram::default());
+        let events = config.events_after(3000, 1.0, RowCount::unlimited(10), &GradHistogram::default());
         let EventKind::Densify(round) = events[0] else { panic!("{events:?}") };
         assert_eq!(round.prune_scale, f32::INFINITY);
         assert_eq!(events[1], EventKind::ResetOpacity { max_opacity: 0.01 });

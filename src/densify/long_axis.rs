@@ -1,5 +1,6 @@
 //! The strategy `long-axis`: rows with the highest growth scores are split along their longest axis as far as the cap
-//! allows, and once the cap is reached, rows of little weight are removed so that better rows can take their places.
+//! allows, and once the cap is reached, rows of little weight are removed so that better rows can take their places. The cap
+//! is `--max-gaussians`, or what the run allows at this step ([`super::growth`]).
 //!
 //! A round comes every `refine_every` steps. Its growth takes whole bins of the score histogram from the top, as many as
 //! fit under the cap. Its recycling takes whole bins of the histogram of mean blending weights from the bottom, at most
@@ -11,11 +12,12 @@
 //! the picture under the row (sum over pixels of blending weight times squared error, mean over channels), or the
 //! geometric mean of both.
 //!
-//! Invariants: 1. a round never leaves more than `max_gaussians` rows; 2. a decision is a function of the step and of
+//! Invariants: 1. a round never leaves more rows than the cap, unless there were more before; 2. a decision is a function of the step and of
 //! statistics; 3. nothing is drawn at random.
 
+use super::growth::GrowthRule;
 use super::stats::{GradHistogram, WEIGHED_VIEWS, accumulate_scores, grad_norm, rows_from_bin, score_bin, weight_bin};
-use super::strategy::{DrawnRows, Extremes, Fate, Round, RowFacts, Strategy};
+use super::strategy::{DrawnRows, Extremes, Fate, Round, RowCount, RowFacts, Strategy};
 use crate::base::math::sigmoid;
 use crate::optim::bounds::SplitLimits;
 use crate::scene::events::{EventKind, LONG_AXIS_OFFSET, LongAxisRound};
@@ -53,6 +55,8 @@ pub struct LongAxisStrategy {
     pub refine_every: u32,
     /// Most rows of the scene.
     pub max_gaussians: u64,
+    /// How the run decides the cap; `None` for a run whose cap is given.
+    pub growth: Option<GrowthRule>,
 }
 
 impl LongAxisStrategy {
@@ -61,14 +65,14 @@ impl LongAxisStrategy {
         step > self.refine_start && step < self.refine_stop && step.is_multiple_of(self.refine_every)
     }
 
-    /// The round after this step; `rows` is an upper bound of the rows before it. The last round removes nothing by
-    /// weight, since no round would give the places away.
-    pub fn round(&self, step: u32, rows: u64, histogram: &GradHistogram) -> LongAxisRound {
-        let is_full = rows as f64 >= FULL_FROM * self.max_gaussians as f64;
+    /// The round after this step. The last round removes nothing by weight, since no round would give the places away.
+    pub fn round(&self, step: u32, RowCount { rows, allowed }: RowCount, histogram: &GradHistogram) -> LongAxisRound {
+        let cap = self.max_gaussians.min(allowed);
+        let is_full = rows as f64 >= FULL_FROM * cap as f64;
         let is_last = step.saturating_add(self.refine_every) >= self.refine_stop;
         let removed = if is_full && !is_last { (self.recycle * histogram.weighed_rows() as f64) as u64 } else { 0 };
         LongAxisRound {
-            split_from_bin: histogram.split_bin(self.max_gaussians.saturating_sub(rows)),
+            split_from_bin: histogram.split_bin(cap.saturating_sub(rows)),
             remove_below_bin: if removed > 0 { histogram.remove_bin(removed) } else { 0 },
             remove_views: WEIGHED_VIEWS,
             prune_opacity: self.prune_opa,
@@ -98,7 +102,7 @@ impl Strategy for LongAxisStrategy {
     }
 
     fn needs_weights(&self) -> bool {
-        self.score != GrowthScore::Gradient || self.recycle > 0.0
+        self.score != GrowthScore::Gradient || self.recycle > 0.0 || self.growth.is_some()
     }
 
     fn collect(&self, view: &mut RowsMut<'_>, drawn: &DrawnRows<'_>, histogram: &mut GradHistogram) -> usize {
@@ -106,8 +110,21 @@ impl Strategy for LongAxisStrategy {
         accumulate_scores(view, drawn.rows, drawn.radii, histogram, |listed| self.of_row(drawn, half, listed))
     }
 
-    fn events_after(&self, step: u32, _: f32, rows: u64, histogram: &GradHistogram) -> Vec<EventKind> {
-        if self.is_round(step) { vec![EventKind::LongAxis(self.round(step, rows, histogram))] } else { Vec::new() }
+    fn growth(&self) -> Option<&GrowthRule> {
+        self.growth.as_ref()
+    }
+
+    fn growth_check(&self, step: u32) -> Option<usize> {
+        let before = step.checked_sub(self.refine_every).filter(|before| self.is_round(*before));
+        self.growth.filter(|_| self.is_round(step))?.due(before, step)
+    }
+
+    fn may_check_growth(&self, step: u32) -> bool {
+        self.growth.is_some_and(|rule| step < self.refine_stop && rule.is_open(step, self.refine_every))
+    }
+
+    fn events_after(&self, step: u32, _: f32, count: RowCount, histogram: &GradHistogram) -> Vec<EventKind> {
+        if self.is_round(step) { vec![EventKind::LongAxis(self.round(step, count, histogram))] } else { Vec::new() }
     }
 
     /// A row grows only from bin 1 on, so only with a score above 0.
@@ -174,6 +191,7 @@ mod tests {
             refine_stop: 2400,
             refine_every: 100,
             max_gaussians,
+            growth: None,
         }
     }
 
@@ -220,7 +238,7 @@ mod tests {
     fn growth_takes_the_highest_scores_that_fit() {
         let strategy = strategy(GrowthScore::Mixed, 1300);
         let (state, histogram) = drawn(&strategy, 1000, 4);
-        let round = strategy.round(700, 1000, &histogram);
+        let round = strategy.round(700, RowCount::unlimited(1000), &histogram);
         assert_eq!(round.remove_below_bin, 0, "there is room");
         let grows = |row: usize| round.fate(&facts(&state, row)) == Fate::SplitLongAxis;
         let (grown, kept): (Vec<usize>, Vec<usize>) = (0..1000).partition(|&row| grows(row));
@@ -233,7 +251,7 @@ mod tests {
         assert_eq!(round.promised_rows(&state.view()), grown.len() as u64);
         assert!(round.may_edit(&state.view()) && !round.may_edit(&SceneState::empty(0).view()));
         // Without room nothing grows, and rows without statistics never do.
-        let full = strategy.round(700, 1300, &histogram);
+        let full = strategy.round(700, RowCount::unlimited(1300), &histogram);
         assert_eq!(full.promised(1300, &histogram), 0);
         assert!(!round.splits(0.0, 0) && !round.splits(0.0, 9));
     }
@@ -243,22 +261,22 @@ mod tests {
         let strategy = strategy(GrowthScore::Error, 1000);
         let (state, histogram) = drawn(&strategy, 1000, 4);
         assert_eq!(histogram.weighed_rows(), 1000);
-        let round = strategy.round(700, 1000, &histogram);
+        let round = strategy.round(700, RowCount::unlimited(1000), &histogram);
         let removed: Vec<usize> = (0..1000).filter(|&row| round.fate(&facts(&state, row)) == Fate::Prune).collect();
         // The weight of a row is its number and a bit: the 20 least are the first ones.
         assert!(removed.len() > 15 && removed.len() <= 20, "{removed:?}");
         assert!(removed.iter().all(|&row| row < 20), "{removed:?}");
-        assert_eq!(strategy.round(2300, 1000, &histogram).remove_below_bin, 0, "the last round");
-        assert_eq!(strategy.round(700, 800, &histogram).remove_below_bin, 0, "below the cap");
+        assert_eq!(strategy.round(2300, RowCount::unlimited(1000), &histogram).remove_below_bin, 0, "the last round");
+        assert_eq!(strategy.round(700, RowCount::unlimited(800), &histogram).remove_below_bin, 0, "below the cap");
         // Too few views say nothing about a row.
         let (_, few) = drawn(&strategy, 1000, u64::from(WEIGHED_VIEWS) - 1);
-        assert_eq!((few.weighed_rows(), strategy.round(700, 1000, &few).remove_below_bin), (0, 0));
+        assert_eq!((few.weighed_rows(), strategy.round(700, RowCount::unlimited(1000), &few).remove_below_bin), (0, 0));
     }
 
     #[test]
     fn faint_rows_go_and_bounds_of_pages_know_it() {
         let strategy = strategy(GrowthScore::Mixed, 1000);
-        let round = strategy.round(700, 10, &GradHistogram::default());
+        let round = strategy.round(700, RowCount::unlimited(10), &GradHistogram::default());
         let of = |opacity: f32| round.fate(&RowFacts { grad2d: 0.0, count: 0, log_scale: 0.0, opacity });
         assert_eq!((of(logit(0.004)), of(logit(0.006))), (Fate::Prune, Fate::Keep));
         let keeps = |lowest_opacity: f32| round.keeps_all(&Extremes { lowest_opacity, sigma_max: 1e9 });

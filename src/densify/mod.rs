@@ -1,8 +1,9 @@
 //! Densification: strategies ([`strategy`]; gsplat's strategy: [`mod@default`];
-//! splits along the longest axis: [`long_axis`]), the statistics for their decisions
+//! splits along the longest axis: [`long_axis`], as far as more Gaussians pay: [`growth`]), the statistics for their decisions
 //! ([`stats`]), the edits of a round ([`ops`]), and the application of logged events, late or on time ([`replay`]).
 
 pub mod default;
+pub mod growth;
 pub mod long_axis;
 pub mod ops;
 pub mod replay;

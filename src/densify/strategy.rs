@@ -14,6 +14,7 @@
 //! Invariants: 1. strategies and rounds are functions of their arguments, without side effects; 2. an event gives a row
 //! the same fate whenever it is applied.
 
+use super::growth::GrowthRule;
 use super::stats::{GradHistogram, accumulate};
 use crate::optim::bounds::SplitLimits;
 use crate::scene::events::EventKind;
@@ -54,6 +55,22 @@ pub struct DrawnRows<'a> {
     pub image_size: [u32; 2],
 }
 
+/// How many rows there are and may be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RowCount {
+    /// Upper bound of the rows before the first event.
+    pub rows: u64,
+    /// The most that the run allows at this step; the strategy's own cap, if any, holds as well.
+    pub allowed: u64,
+}
+
+impl RowCount {
+    /// Rows without a limit.
+    pub fn unlimited(rows: u64) -> RowCount {
+        RowCount { rows, allowed: u64::MAX }
+    }
+}
+
 /// A densification strategy: when rounds happen, and which statistics steps collect.
 pub trait Strategy: fmt::Debug + Send + Sync {
     /// Whether the number of Gaussians may grow.
@@ -73,10 +90,24 @@ pub trait Strategy: fmt::Debug + Send + Sync {
         accumulate(view, drawn.rows, drawn.v_means2d, drawn.radii, drawn.image_size, histogram)
     }
 
-    /// The events that follow this step, in order. `scene_scale` is in local units. `rows` is an upper bound of the
-    /// number of rows before the first event. `histogram` counts the rows by statistics; the caller clears it after a
-    /// round.
-    fn events_after(&self, step: u32, scene_scale: f32, rows: u64, histogram: &GradHistogram) -> Vec<EventKind>;
+    /// The rule by which the run decides how many rows it allows; `None` where it does not.
+    fn growth(&self) -> Option<&GrowthRule> {
+        None
+    }
+
+    /// The number of the [`GrowthRule::check`] before the events of this step, if one is due.
+    fn growth_check(&self, _step: u32) -> Option<usize> {
+        None
+    }
+
+    /// Whether such a check may come at this step or a later one.
+    fn may_check_growth(&self, _step: u32) -> bool {
+        false
+    }
+
+    /// The events that follow this step, in order. `scene_scale` is in local units. `histogram` counts the rows by
+    /// statistics; the caller clears it after a round.
+    fn events_after(&self, step: u32, scene_scale: f32, count: RowCount, histogram: &GradHistogram) -> Vec<EventKind>;
 
     /// Limits for the bounds of pages: a round splits only rows within these limits.
     fn split_limits(&self, scene_scale: f32) -> SplitLimits;
@@ -95,7 +126,7 @@ impl Strategy for NoStrategy {
         false
     }
 
-    fn events_after(&self, _: u32, _: f32, _: u64, _: &GradHistogram) -> Vec<EventKind> {
+    fn events_after(&self, _: u32, _: f32, _: RowCount, _: &GradHistogram) -> Vec<EventKind> {
         Vec::new()
     }
 

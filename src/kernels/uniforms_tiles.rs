@@ -5,6 +5,8 @@ use super::tile_range::TileRange;
 
 /// Sums that the backward rasterizer writes for each intersection.
 pub const SUMS: u32 = 9;
+/// As [`SUMS`], with weight and weight times error.
+pub const WEIGHED_SUMS: u32 = 11;
 /// Values per workgroup of the scan.
 pub const SCAN_BLOCK: u32 = 2048;
 /// Keys per workgroup of the sort.
@@ -15,6 +17,8 @@ pub const DIGIT_BITS: u32 = 4;
 pub const DIGITS: u32 = 1 << DIGIT_BITS;
 /// Rows per workgroup of `fold_rows`.
 pub const FOLD_ROWS: u32 = 28;
+/// As [`FOLD_ROWS`], with [`WEIGHED_SUMS`].
+pub const WEIGHED_FOLD_ROWS: u32 = 23;
 /// Words of a splat, and of its gradient: three vec4.
 pub const SPLAT_WORDS: u32 = 12;
 /// List entries per dispatch of the forward rasterizer: an invocation makes one iteration per entry and one per batch

@@ -14,8 +14,8 @@ pub use super::view_sizes::ViewSizes;
 use crate::gpu::staging_bytes;
 
 /// Bytes a pixel: picture, transmittance, stops; photo, gradient and derivatives of the loss; the corrected picture or the
-/// carried pixels of long lists.
-const PIXEL_BYTES: u64 = 12 + 4 + 4 + 4 + 12 + 12 + 12;
+/// carried pixels of long lists; the errors that rows are weighed by.
+const PIXEL_BYTES: u64 = 12 + 4 + 4 + 4 + 12 + 12 + 12 + 4;
 /// Bytes of small buffers: uniforms, counts, sums, and the smallest staging.
 const SMALL_BYTES: u64 = 192 << 10;
 

@@ -11,7 +11,7 @@
 //!
 //! # Bus traffic
 //! A step with n rows in view, p pixels and all colour bands uploads 236 n bytes of values and 4 p bytes of photo. The
-//! step downloads 236 n bytes of gradients and 16 n bytes for densification. Counts and uniforms add some KiB. While
+//! step downloads 236 n bytes of gradients and 16 n bytes for densification, 32 n bytes where rows are weighed. Counts and uniforms add some KiB. While
 //! the host holds the master copy of every value, only the mask byte of photos without a mask could be saved.
 //!
 //! | stage | transfer | device work at the same time |
@@ -81,6 +81,9 @@ pub struct GpuRenderer {
     scratch: Scratch,
     packed_target: Vec<u32>,
     frames_rerecorded: u64,
+    /// Whether the next views collect weights of rows, and whether this view does.
+    weighs_next: bool,
+    weighs: bool,
 }
 
 impl GpuRenderer {
@@ -104,6 +107,8 @@ impl GpuRenderer {
             scratch: Scratch::default(),
             packed_target: Vec::new(),
             frames_rerecorded: 0,
+            weighs_next: false,
+            weighs: false,
         })
     }
 
@@ -361,6 +366,9 @@ impl GpuRenderer {
         let gpu = &self.gpu;
         let (rgb, photo, v_rgb) = (rgb.view(), loss.target.view(), loss.v_rgb.view());
         let sums = self.loss.run(gpu, &mut recorder, size, &loss.plan, &rgb, &photo, &v_rgb)?;
+        if let Some(errors) = &loss.errors {
+            self.loss.errors(&mut recorder, size, &loss.plan, [&rgb, &photo, &errors.view()])?;
+        }
         let sums = match sums {
             Some(sums) => LossSums::Pending(recorder.read_back("image_loss", &sums.slice(0, 16))?),
             None => LossSums::Empty,
@@ -398,7 +406,13 @@ impl GpuRenderer {
         let v_rgb = uploaded.as_ref().or(view.loss.as_ref().map(|loss| &loss.v_rgb));
         let v_rgb = v_rgb.ok_or(RenderError::OutOfOrder { call: "picture_back", needs: "loss or picture_gradient" })?;
         let (v_rgb, v_alpha) = (v_rgb.view(), v_alpha.as_ref().map(Buffer::view));
-        let gradient = PictureGradientBuffers { v_rgb: &v_rgb, v_alpha: v_alpha.as_ref() };
+        // Without a loss no photo was compared.
+        let no_errors = match (&view.loss, self.weighs) {
+            (None, true) => Some(recorder.buffer_zeroed("squared errors", view.pixels.t_final.size())?),
+            _ => None,
+        };
+        let errors = view.loss.as_ref().and_then(|loss| loss.errors.as_ref()).or(no_errors.as_ref()).map(Buffer::view);
+        let gradient = PictureGradientBuffers { v_rgb: &v_rgb, v_alpha: v_alpha.as_ref(), errors: errors.as_ref() };
         (view.tiles_back, view.unusable) = (None, Unusable::Uncounted);
         match &mut view.lists {
             Lists::Whole(lists) => {
@@ -451,10 +465,10 @@ impl GpuRenderer {
         grads: &mut Gradients,
     ) -> Result<(), RenderError> {
         let (gpu, sh_degree) = (&self.gpu, view.of.options.sh_degree);
-        let out = RowsOut { gpu, stages: &self.rows, view: &view.of };
+        let out = RowsOut { gpu, stages: &self.rows, view: &view.of, weighs: self.weighs };
         out.prepare(place.len(), rows.sh_degree, grads);
         if let (Some(columns), Some(segment)) = (&view.columns, view.segments.first()) {
-            let room = RowGradients::new(gpu, columns.rows, sh_degree)?;
+            let room = RowGradients::new(gpu, columns.rows, sh_degree, self.weighs)?;
             let mut recorder = view.tiles_back.take().map_or_else(|| gpu.begin("backward"), |tiles| gpu.resume(tiles));
             match self.tiles.count_unusable(&mut recorder, &view.segments, view.blend()) {
                 Ok(unusable) => view.unusable = Unusable::Pending(unusable),
@@ -544,10 +558,21 @@ impl Renderer for GpuRenderer {
         // The lists of a device lie in its own memory, which `--device-mem` bounds.
     }
 
+    fn weigh_rows(&mut self, is_wanted: bool) -> Result<(), RenderError> {
+        if is_wanted && !self.weighs_next {
+            self.rows.weigh_rows(&self.gpu)?;
+            self.tiles.weigh_rows(&self.gpu)?;
+            self.loss.weigh_rows(&self.gpu)?;
+        }
+        self.weighs_next = is_wanted;
+        Ok(())
+    }
+
     fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError> {
         // Frees the memory of the last view before this view allocates.
         self.drop_view();
         self.gradient_on_host = false;
+        self.weighs = self.weighs_next;
         self.sequence.begin(camera, options, batches)
     }
 
@@ -619,7 +644,8 @@ impl Renderer for GpuRenderer {
             };
             let rgb = corrected.as_ref().unwrap_or(&view.pixels.rgb);
             let v_rgb = renderer.gpu.buffer("v_rgb", view.pixels.rgb.size())?;
-            let mut loss = Loss { plan, target: pixels, v_rgb, sums: LossSums::Stale };
+            let errors = renderer.weighs.then(|| renderer.gpu.buffer("squared errors", view.pixels.t_final.size()));
+            let mut loss = Loss { plan, target: pixels, v_rgb, errors: errors.transpose()?, sums: LossSums::Stale };
             loss.sums = renderer.submit_loss(recorder, [target.width, target.height], rgb, &loss)?;
             view.loss = Some(loss);
             Ok(())

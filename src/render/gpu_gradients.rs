@@ -8,7 +8,7 @@
 //! Invariant: gradients have the same bits for any cut of the rows into batches, segments and chunks.
 
 use super::Gradients;
-use super::gpu_rows::{BAND_WIDTHS, DeviceColumns, FOOTPRINT_BYTES, RowStages, SplatRows, band_into_sh_n};
+use super::gpu_rows::{BAND_WIDTHS, DeviceColumns, RowStages, SplatRows, band_into_sh_n, footprint_bytes};
 use super::gpu_segments::{CHUNK_STEP, Segment, gradients_of, in_chunks};
 use super::sequence::ViewOptions;
 use crate::base::room;
@@ -16,7 +16,8 @@ use crate::gpu::{Buffer, Gpu, GpuResult, Readback, Recorder};
 use crate::scene::columns::Columns;
 use std::ops::Range;
 
-/// Densification input of one row: gradient with respect to the projected mean (2), radii (2).
+/// Densification input of one row: gradient with respect to the projected mean (2), radii (2). In a view that weighs rows, a
+/// second one follows: weight, weight times error, unused (2).
 type Footprint = [f32; 4];
 
 /// Host memory that is reused between views.
@@ -41,20 +42,21 @@ pub(super) struct RowGradients {
 }
 
 impl RowGradients {
-    /// Allocates the gradients of `rows` rows.
+    /// Allocates the gradients of `rows` rows, with weights if `weighs`.
     ///
     /// # Errors
     /// Device memory is exhausted.
-    pub fn new(gpu: &Gpu, rows: u32, sh_degree: u8) -> GpuResult<Self> {
+    pub fn new(gpu: &Gpu, rows: u32, sh_degree: u8, weighs: bool) -> GpuResult<Self> {
         let columns = DeviceColumns::new(gpu, rows, sh_degree)?;
-        let footprints = gpu.buffer("footprints", FOOTPRINT_BYTES * u64::from(rows))?;
+        let footprints = gpu.buffer("footprints", footprint_bytes(weighs) * u64::from(rows))?;
         Ok(RowGradients { columns, footprints })
     }
 }
 
-/// Device memory of a row of a chunk, bytes: its columns, their gradients and footprint, and the read-back of both.
+/// Device memory of a row of a chunk, bytes: its columns, their gradients and footprint with weights, and the read-back of
+/// both.
 pub(super) fn chunk_row_bytes(sh_degree: u8) -> u64 {
-    3 * DeviceColumns::row_bytes(sh_degree) + 2 * FOOTPRINT_BYTES
+    3 * DeviceColumns::row_bytes(sh_degree) + 2 * footprint_bytes(true)
 }
 
 /// Checks that the smallest chunk has room, so that a pass out that has begun does not end for want of it.
@@ -63,7 +65,7 @@ pub(super) fn chunk_row_bytes(sh_degree: u8) -> u64 {
 /// Device memory is exhausted.
 pub(super) fn check_room(gpu: &Gpu, sh_degree: u8) -> GpuResult<()> {
     let columns = DeviceColumns::new(gpu, CHUNK_STEP as u32, sh_degree)?;
-    RowGradients::new(gpu, columns.rows, sh_degree).map(|_| ())
+    RowGradients::new(gpu, columns.rows, sh_degree, true).map(|_| ())
 }
 
 /// The stages and options of a way out.
@@ -71,6 +73,8 @@ pub(super) struct RowsOut<'a> {
     pub gpu: &'a Gpu,
     pub stages: &'a RowStages,
     pub view: &'a ViewOptions,
+    /// Whether rows are weighed.
+    pub weighs: bool,
 }
 
 /// Pending readbacks of the gradients of rows.
@@ -92,6 +96,7 @@ impl RowsOut<'_> {
         }
         room::resize(&mut grads.radii, rows, [0; 2]);
         room::resize(&mut grads.means2d, rows, [0.0; 2]);
+        room::resize(&mut grads.weights, if self.weighs { rows } else { 0 }, [0.0; 2]);
     }
 
     /// Submits the stages on rows whose columns are on the device, behind the work of `recorder`, and copies the gradients to
@@ -145,7 +150,7 @@ impl RowsOut<'_> {
     ) -> GpuResult<()> {
         let sh_degree = self.view.options.sh_degree;
         let columns = DeviceColumns::new(self.gpu, part.len() as u32, sh_degree)?;
-        let room = RowGradients::new(self.gpu, columns.rows, sh_degree)?;
+        let room = RowGradients::new(self.gpu, columns.rows, sh_degree, self.weighs)?;
         let of_batch = begin + part.start..begin + part.end;
         let mut recorder = self.gpu.begin("backward");
         columns.upload_geometry(&mut recorder, rows, &of_batch)?;
@@ -176,7 +181,8 @@ impl RowsOut<'_> {
         // The host copies the gradients of colours, four fifths of a row, while the device runs `project_bwd`.
         let mut recorder = gpu.begin("backward");
         let into = &mut recorder;
-        self.stages.project_bwd(gpu, into, camera, options.eps2d, columns, splats, v_splats, grads, footprints)?;
+        let (eps2d, weighs) = (options.eps2d, self.weighs);
+        self.stages.project_bwd(gpu, into, camera, eps2d, columns, splats, v_splats, grads, footprints, weighs)?;
         let geometry = [&grads.means, &grads.quats, &grads.scales, &grads.opacities];
         let readbacks = Readbacks {
             colors,
@@ -210,11 +216,16 @@ impl RowsOut<'_> {
         for ((to, width), bytes) in geometry.into_iter().zip(readbacks.geometry) {
             bytes.copy_to(&mut to[width * part.start..width * part.end])?;
         }
-        room::resize(footprints, part.len(), [0.0; 4]);
+        let of_row = if self.weighs { 2 } else { 1 };
+        room::resize(footprints, of_row * part.len(), [0.0; 4]);
         readbacks.footprints.copy_to(footprints)?;
         let rows = grads.means2d[part.clone()].iter_mut().zip(&mut grads.radii[part.clone()]);
-        for ((mean2d, radii), f) in rows.zip(footprints.iter()) {
+        for ((mean2d, radii), f) in rows.zip(footprints.iter().step_by(of_row)) {
             (*mean2d, *radii) = ([f[0], f[1]], [f[2] as u32, f[3] as u32]);
+        }
+        if self.weighs {
+            let weights = grads.weights[part.clone()].iter_mut();
+            weights.zip(footprints.iter().skip(1).step_by(2)).for_each(|(weights, f)| *weights = [f[0], f[1]]);
         }
         Ok(())
     }

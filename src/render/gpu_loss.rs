@@ -4,7 +4,7 @@
 //! Invariants: 1. sums are trees in a fixed order: the same bits on every run of one device; 2. one channel's
 //! derivative maps exist at a time.
 
-use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
+use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, WORKGROUP, groups_1d};
 use crate::kernels::image_loss::{LossPlan, LossValue};
 use crate::kernels::uniforms::LossUniforms;
 use std::sync::Arc;
@@ -15,6 +15,8 @@ pub struct LossStage {
     ssim_map: Arc<Pipeline>,
     gradient: Arc<Pipeline>,
     sum_partials: Arc<Pipeline>,
+    /// `None` before [`LossStage::weigh_rows`].
+    squared_errors: Option<Arc<Pipeline>>,
 }
 
 impl LossStage {
@@ -28,7 +30,35 @@ impl LossStage {
             ssim_map: entry("ssim_map")?,
             gradient: entry("gradient")?,
             sum_partials: entry("sum_partials")?,
+            squared_errors: None,
         })
+    }
+
+    /// Compiles [`LossStage::errors`].
+    ///
+    /// # Errors
+    /// The device rejects a shader.
+    pub fn weigh_rows(&mut self, gpu: &Gpu) -> GpuResult<()> {
+        self.squared_errors = Some(gpu.pipeline("image_loss.wgsl", "squared_errors", &[])?);
+        Ok(())
+    }
+
+    /// Records the squared error of each pixel of the picture into `errors` (`[height][width]`): the twin of
+    /// [`crate::kernels::squared_error`]. Does nothing before [`LossStage::weigh_rows`].
+    ///
+    /// # Errors
+    /// The device failed.
+    pub fn errors(
+        &self,
+        recorder: &mut Recorder<'_>,
+        [width, height]: [u32; 2],
+        plan: &LossPlan,
+        [rgb, target_pixels, errors]: [&BufferView; 3],
+    ) -> GpuResult<()> {
+        let Some(pipeline) = &self.squared_errors else { return Ok(()) };
+        let uniform = recorder.uniform(&LossUniforms::new(width, height, plan))?;
+        let views = [uniform, rgb.clone(), target_pixels.clone(), errors.clone()];
+        recorder.dispatch("image_loss", pipeline, &views, groups_1d(width * height, WORKGROUP))
     }
 
     /// Records the gradient of the picture `rgb` (planar) against `target_pixels` (layout:

@@ -12,14 +12,15 @@ use super::gpu_tiles::{Demand, FrameRoom, ListPart, splat_bytes};
 use crate::gpu::GpuResult;
 use crate::kernels::splats::Grid;
 use crate::kernels::tile_range::TileRange;
-use crate::kernels::uniforms_tiles::{DEPTH_BINS, SUMS};
+use crate::kernels::uniforms_tiles::{DEPTH_BINS, WEIGHED_SUMS};
 
 /// Device memory of a range, bytes a splat: the splat and its gradient, two pairs of keys and values of the depth sort, and
 /// counts, offsets and order.
 pub(super) const BYTES_OF_SPLAT: u64 = 2 * 48 + 16 + 12;
-/// Bytes an intersection: the row, the sorted list, and the sums of the backward pass, which take more than the sort.
+/// Bytes an intersection: the row, the sorted list, and the sums of the backward pass, which take more than the sort. The
+/// weights, which not every run collects, are included.
 pub(super) const BYTES_OF_ISECT: u64 = 8 + BYTES_OF_SUMS + 2;
-const BYTES_OF_SUMS: u64 = 4 * SUMS as u64;
+const BYTES_OF_SUMS: u64 = 4 * WEIGHED_SUMS as u64;
 /// Intersections of a range or part that is small enough.
 pub(super) const PART_ISECTS: u64 = 256;
 /// Depth keys of all splats, first and one past the last.

@@ -127,7 +127,8 @@ impl Ranges<'_> {
         let mut recorder = self.gpu.begin("backward");
         for segment in segments.iter() {
             let (splats, v_splats) = (segment.splats.view(), gradients_of(segment)?.view());
-            self.tiles.finish_sums(self.gpu, &mut recorder, &splats, &v_splats, segment.rows, self.blend)?;
+            let weighs = picture.errors.is_some();
+            self.tiles.finish_sums(self.gpu, &mut recorder, &splats, &v_splats, segment.rows, self.blend, weighs)?;
         }
         self.gpu.submit(recorder).map(|_| ())
     }

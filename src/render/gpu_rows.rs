@@ -14,8 +14,13 @@ use std::sync::Arc;
 
 /// Bytes per row of `splats` and `v_splats`: see `shaders/shared/splat.wgsl`.
 pub const SPLAT_BYTES: u64 = 48;
-/// Bytes per row of the densification input from `project_bwd`: gradient with respect to the projected mean, and radii.
-pub const FOOTPRINT_BYTES: u64 = 16;
+/// Bytes per row of the densification input from `project_bwd`: gradient with respect to the projected mean, and radii; if
+/// `weighs`, also weight, weight times error, and two unused words.
+pub fn footprint_bytes(weighs: bool) -> u64 {
+    if weighs { 32 } else { 16 }
+}
+/// The define of the shaders that weigh rows.
+pub(super) const WEIGHS: [(&str, &str); 1] = [("WEIGHS", "")];
 /// Floats per row of the SH bands 1, 2 and 3.
 pub const BAND_WIDTHS: [usize; 3] = [9, 15, 21];
 /// Windows begin at multiples of this many rows. Every column's offset is then a multiple of 256 bytes, the largest
@@ -200,6 +205,8 @@ fn windows(gpu: &Gpu, rows: u32, row_bytes: u64) -> impl Iterator<Item = Window>
 pub struct RowStages {
     project_fwd: Arc<Pipeline>,
     project_bwd: Arc<Pipeline>,
+    /// `None` before [`RowStages::weigh_rows`].
+    project_bwd_weighing: Option<Arc<Pipeline>>,
     /// Indexed by SH degree.
     sh_fwd: [Arc<Pipeline>; 4],
     sh_bwd: [Arc<Pipeline>; 4],
@@ -219,9 +226,19 @@ impl RowStages {
         Ok(RowStages {
             project_fwd: gpu.pipeline("project_fwd.wgsl", "project_fwd", &[])?,
             project_bwd: gpu.pipeline("project_bwd.wgsl", "project_bwd", &[])?,
+            project_bwd_weighing: None,
             sh_fwd: all("sh_fwd.wgsl", "sh_fwd")?,
             sh_bwd: all("sh_bwd.wgsl", "sh_bwd")?,
         })
+    }
+
+    /// Compiles what [`RowStages::project_bwd`] needs to pass weights on.
+    ///
+    /// # Errors
+    /// The device rejects a shader.
+    pub fn weigh_rows(&mut self, gpu: &Gpu) -> GpuResult<()> {
+        self.project_bwd_weighing = Some(gpu.pipeline("project_bwd.wgsl", "project_bwd", &WEIGHS)?);
+        Ok(())
     }
 
     /// Records the footprints of all rows into `splats`, with colours 0.
@@ -302,7 +319,8 @@ impl RowStages {
     }
 
     /// Records the gradients of quats, scales and opacities, adds the projection's part to the gradients of means, and
-    /// records `footprints` ([`FOOTPRINT_BYTES`] per row).
+    /// records `footprints` ([`footprint_bytes`] per row), with weights if `weighs`, which needs
+    /// [`RowStages::weigh_rows`].
     ///
     /// # Errors
     /// The device failed.
@@ -317,7 +335,9 @@ impl RowStages {
         v_splats: SplatRows<'_>,
         grads: &DeviceColumns,
         footprints: &Buffer,
+        weighs: bool,
     ) -> GpuResult<()> {
+        let pipeline = self.project_bwd_weighing.as_ref().filter(|_| weighs).unwrap_or(&self.project_bwd);
         for window in windows(gpu, rows.rows, SPLAT_BYTES) {
             let uniform = recorder.uniform(&RowsUniforms::new(camera, eps2d, window.rows))?;
             let (w, v) = (rows.window(window), grads.window(window));
@@ -333,9 +353,9 @@ impl RowStages {
                 v.quats,
                 v.scales,
                 v.opacities,
-                window.of(footprints, FOOTPRINT_BYTES),
+                window.of(footprints, footprint_bytes(weighs)),
             ];
-            recorder.dispatch("project_bwd", &self.project_bwd, &views, groups_1d(window.rows, WORKGROUP))?;
+            recorder.dispatch("project_bwd", pipeline, &views, groups_1d(window.rows, WORKGROUP))?;
         }
         Ok(())
     }

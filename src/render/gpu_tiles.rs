@@ -9,6 +9,7 @@
 //! the longest list so far, and a frame with a longer list is recorded again; 3. the order of every sum is fixed, so
 //! the same input gives the same bits on one device.
 
+use super::gpu_rows::WEIGHS;
 use crate::gpu::{Buffer, BufferView, Gpu, GpuError, GpuResult, Pipeline, Readback, Recorder, groups_1d};
 use crate::kernels::splats::Grid;
 use crate::kernels::tile_range::TileRange;
@@ -40,6 +41,15 @@ pub(super) struct Pipelines {
     pub(super) rasterize_bwd: Arc<Pipeline>,
     pub(super) fold_rows: Arc<Pipeline>,
     pub(super) count_unusable: Arc<Pipeline>,
+    /// The two stages that collect weights; `None` before [`TileStages::weigh_rows`].
+    pub(super) weighing: Option<Weighing>,
+}
+
+/// The stages of the backward pass that collect weights besides gradients.
+#[derive(Debug)]
+pub(super) struct Weighing {
+    pub rasterize_bwd: Arc<Pipeline>,
+    pub fold_rows: Arc<Pipeline>,
 }
 
 /// The parameters of blending besides splats.
@@ -209,9 +219,21 @@ impl TileStages {
             rasterize_bwd: get("rasterize_bwd", "rasterize_bwd")?,
             fold_rows: get("rasterize_bwd", "fold_rows")?,
             count_unusable: get("rasterize_bwd", "count_unusable")?,
+            weighing: None,
         };
         let binding_words = u32::try_from(gpu.max_binding_bytes() / 4).unwrap_or(u32::MAX);
         Ok(TileStages { pipelines, room: FrameRoom { capacity: CAPACITY_MIN, list_max: SEGMENT_FWD }, binding_words })
+    }
+
+    /// Compiles what the backward pass needs to collect weights.
+    ///
+    /// # Errors
+    /// The device rejects a shader.
+    pub fn weigh_rows(&mut self, gpu: &Gpu) -> GpuResult<()> {
+        let get = |entry: &str| gpu.pipeline("rasterize_bwd.wgsl", entry, &WEIGHS);
+        let (rasterize_bwd, fold_rows) = (get("rasterize_bwd")?, get("fold_rows")?);
+        self.pipelines.weighing = Some(Weighing { rasterize_bwd, fold_rows });
+        Ok(())
     }
 
     /// Sizes of the next frame of a whole view, as earlier frames needed them.

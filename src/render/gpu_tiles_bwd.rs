@@ -4,15 +4,15 @@
 //! Invariants: 1. the sums of all intersections may exceed one binding: each window of intersections has its own pass
 //! over the lists, and a row that spans two windows continues its sums, so the result has the same bits for any window
 //! size; 2. the same holds for ranges of tiles ([`Fold::Range`]), whose rows continue the sums of the ranges before; 3. the
-//! order of every sum is fixed.
+//! order of every sum is fixed; 4. collecting weights changes no bit of the gradients, and costs nothing when it is off.
 
 use super::gpu_segments::{Segment, gradients_of};
-use super::gpu_tiles::{Blend, Demand, Frame, Pixels, Ranks, TileStages, raster_uniforms};
-use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Readback, Recorder, groups_1d};
+use super::gpu_tiles::{Blend, Demand, Frame, Pixels, Ranks, TileStages, Weighing, raster_uniforms};
+use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Readback, Recorder, groups_1d};
 use crate::kernels::tile_range::TileRange;
 use crate::kernels::uniforms_tiles::{
     FOLD_CARRIED, FOLD_ROWS, FOLD_UNFINISHED, FOLD_WITHOUT_LISTS, HAS_V_ALPHA, RasterUniforms, SEGMENT_BWD,
-    SEGMENT_FIRST, SEGMENT_LAST, SUMS,
+    SEGMENT_FIRST, SEGMENT_LAST, SUMS, WEIGHED_FOLD_ROWS, WEIGHED_SUMS,
 };
 use std::ops::Range;
 
@@ -23,6 +23,8 @@ pub struct PictureGradientBuffers<'a> {
     pub v_rgb: &'a BufferView,
     /// `[height][width]` f32; `None` stands for zeros.
     pub v_alpha: Option<&'a BufferView>,
+    /// `[height][width]` f32: the error of each pixel; `None` if the rows are not weighed. Needs [`TileStages::weigh_rows`].
+    pub errors: Option<&'a BufferView>,
 }
 
 /// What becomes of the sums of the rows of a frame.
@@ -41,9 +43,9 @@ pub enum Fold<'a> {
 const WINDOW_MIN: u32 = 1 << 10;
 const WINDOWS_MOST: u32 = 4;
 
-/// A buffer for the sums of a window of at most `isects` intersections: as many as fit one binding and device memory.
-fn window_of_sums(gpu: &Gpu, isects: u32) -> GpuResult<(Buffer, u32)> {
-    let bytes = 4 * u64::from(SUMS);
+/// A buffer for the sums of a window of at most `isects` intersections, of `bytes` each: as many as fit one binding and device
+/// memory.
+fn window_of_sums(gpu: &Gpu, isects: u32, bytes: u64) -> GpuResult<(Buffer, u32)> {
     let most = u32::try_from(gpu.max_binding_bytes() / bytes).unwrap_or(u32::MAX).max(1);
     let mut window = most.min(isects.max(1));
     let least = isects.div_ceil(WINDOWS_MOST).max(WINDOW_MIN);
@@ -60,7 +62,28 @@ pub fn carry_bytes(pixels: &Pixels) -> u64 {
     2 * pixels.t_final.size()
 }
 
+/// The stages of a backward pass, with or without weights.
+struct BackStages<'a> {
+    rasterize_bwd: &'a Pipeline,
+    fold_rows: &'a Pipeline,
+    sums: u32,
+    rows_per_group: u32,
+}
+
 impl TileStages {
+    fn back_stages(&self, weighs: bool) -> BackStages<'_> {
+        let of = &self.pipelines;
+        match of.weighing.as_ref().filter(|_| weighs) {
+            Some(Weighing { rasterize_bwd, fold_rows }) => {
+                BackStages { rasterize_bwd, fold_rows, sums: WEIGHED_SUMS, rows_per_group: WEIGHED_FOLD_ROWS }
+            }
+            None => {
+                let (rasterize_bwd, fold_rows) = (&*of.rasterize_bwd, &*of.fold_rows);
+                BackStages { rasterize_bwd, fold_rows, sums: SUMS, rows_per_group: FOLD_ROWS }
+            }
+        }
+    }
+
     /// Records the gradients of the splats into `v_splats`, one record per row. [`TileStages::fits`] must be true for
     /// `frame` and `demand`.
     ///
@@ -80,18 +103,20 @@ impl TileStages {
         fold: Fold<'_>,
     ) -> GpuResult<()> {
         let segments = demand.list_max.div_ceil(SEGMENT_BWD).max(1);
+        let stages = self.back_stages(picture.errors.is_some());
+        let isect_bytes = 4 * u64::from(stages.sums);
         let (own_carry, partials, window);
         let carry = match fold {
             Fold::Part(carry) => {
                 // A second window would find the state of the pixels after this part instead of the state before it.
                 window = demand.isects.max(1);
-                partials = gpu.buffer("sums of intersections", 4 * u64::from(SUMS) * u64::from(window))?;
+                partials = gpu.buffer("sums of intersections", isect_bytes * u64::from(window))?;
                 carry
             }
             Fold::Whole | Fold::Range => {
                 let bytes = if segments > 1 { carry_bytes(pixels) } else { 8 };
                 own_carry = gpu.buffer("pixels between segments", bytes)?;
-                (partials, window) = window_of_sums(gpu, demand.isects)?;
+                (partials, window) = window_of_sums(gpu, demand.isects, isect_bytes)?;
                 &own_carry
             }
         };
@@ -113,8 +138,8 @@ impl TileStages {
                 ranks.offsets.view(),
                 v_splats.clone(),
             ];
-            let groups = groups_1d(ranks.rows, FOLD_ROWS);
-            recorder.dispatch("rasterize_bwd", &self.pipelines.fold_rows, &views, groups)?;
+            let groups = groups_1d(ranks.rows, stages.rows_per_group);
+            recorder.dispatch("rasterize_bwd", stages.fold_rows, &views, groups)?;
             first = isects.end;
             if first >= demand.isects {
                 return Ok(());
@@ -130,14 +155,14 @@ impl TileStages {
         frame: &Frame,
         segments: u32,
         isects: Range<u32>,
-        PictureGradientBuffers { v_rgb, v_alpha }: PictureGradientBuffers<'_>,
+        PictureGradientBuffers { v_rgb, v_alpha, errors }: PictureGradientBuffers<'_>,
         (splats, pixels, carry, partials): (&BufferView, &Pixels, &BufferView, &BufferView),
     ) -> GpuResult<()> {
         for segment in (0..segments).rev() {
             let mut flags = if v_alpha.is_some() { HAS_V_ALPHA } else { 0 };
             flags |= if segment + 1 == segments && frame.part.is_farthest { SEGMENT_FIRST } else { 0 };
             flags |= if segment == 0 && frame.part.is_nearest { SEGMENT_LAST } else { 0 };
-            let views = [
+            let mut views = vec![
                 recorder.uniform(&window_uniforms(frame, segment, flags, isects.clone()))?,
                 splats.clone(),
                 frame.row_from_isect.view(),
@@ -150,8 +175,9 @@ impl TileStages {
                 partials.clone(),
                 carry.clone(),
             ];
+            views.extend(errors.cloned());
             let groups = groups_1d(frame.range.tiles(), 1);
-            recorder.dispatch("rasterize_bwd", &self.pipelines.rasterize_bwd, &views, groups)?;
+            recorder.dispatch("rasterize_bwd", self.back_stages(errors.is_some()).rasterize_bwd, &views, groups)?;
         }
         Ok(())
     }
@@ -168,7 +194,9 @@ impl TileStages {
         v_splats: &BufferView,
         rows: u32,
         blend: Blend,
+        weighs: bool,
     ) -> GpuResult<()> {
+        let stages = self.back_stages(weighs);
         // Bound in place of the lists that the stage does not read.
         let (no_list, no_sums) = (gpu.buffer("no list", 4)?.view(), gpu.buffer("no sums", 4)?.view());
         let flags = FOLD_CARRIED | FOLD_WITHOUT_LISTS;
@@ -176,7 +204,7 @@ impl TileStages {
         fold.row_count = rows;
         let uniform = recorder.uniform(&fold)?;
         let views = [uniform, splats.clone(), no_list.clone(), no_sums, no_list.clone(), no_list, v_splats.clone()];
-        recorder.dispatch("rasterize_bwd", &self.pipelines.fold_rows, &views, groups_1d(rows, FOLD_ROWS))
+        recorder.dispatch("rasterize_bwd", stages.fold_rows, &views, groups_1d(rows, stages.rows_per_group))
     }
 
     /// Records the count of the rows of all segments with unusable gradients, as

@@ -146,6 +146,8 @@ pub(super) struct Loss {
     /// The photo, kept until the picture is known to be valid.
     pub target: Buffer,
     pub v_rgb: Buffer,
+    /// The squared error of each pixel, if the rows are weighed.
+    pub errors: Option<Buffer>,
     pub sums: LossSums,
 }
 

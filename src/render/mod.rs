@@ -165,12 +165,6 @@ pub enum RenderError {
         /// Pixels of the picture.
         pixels: usize,
     },
-    /// Weights of rows were asked of a backend that does not collect them.
-    #[error("the {backend} backend does not collect the blending weights of Gaussians")]
-    NoWeights {
-        /// Name of the backend.
-        backend: &'static str,
-    },
     /// The device failed, or the view exceeds a limit of the device. The error names the stage or buffer.
     #[error(transparent)]
     Device(#[from] GpuError),
@@ -190,7 +184,6 @@ impl RenderError {
                 Some("update the graphics driver if this happens again, or render with --device cpu")
             }
             RenderError::Device(_) => Some("render with --device cpu, and report a bug"),
-            RenderError::NoWeights { .. } => Some("render with --device cpu"),
             _ => Some(
                 "make the photos smaller with --max-resolution or --data-factor; if they are not large, report a bug",
             ),
@@ -246,10 +239,8 @@ pub trait Renderer: Send {
     /// loss and gradients.
     ///
     /// # Errors
-    /// The backend does not collect weights.
-    fn weigh_rows(&mut self, is_wanted: bool) -> Result<(), RenderError> {
-        if is_wanted { Err(RenderError::NoWeights { backend: self.name() }) } else { Ok(()) }
-    }
+    /// The device rejects a shader that this needs: shaders are compiled the first time.
+    fn weigh_rows(&mut self, is_wanted: bool) -> Result<(), RenderError>;
 
     /// Begins a view. Drops the previous view.
     ///

@@ -37,6 +37,7 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
     page.tiles(&tiles(&summary, &metrics));
     page.heading("Training");
     page.charts(&training_charts(&metrics));
+    add_growth(&mut page, &summary);
     let tiers = tier_charts(&metrics);
     if !tiers.is_empty() {
         page.heading("Memory and disk");
@@ -221,6 +222,26 @@ fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
         add(chart.with("", curve(metrics, "step", mib("device_bytes_peak")), Mark::Line), "Peak device memory so far.");
     }
     charts
+}
+
+/// Why the scene has the number of Gaussians that it has, if the run decided it.
+fn add_growth(page: &mut Page, summary: &Value) {
+    let checks = summary["growth"].as_array().map_or(&[][..], Vec::as_slice);
+    let Some(allowed) = checks.last().and_then(|last| last["allowed"].as_f64()) else { return };
+    page.heading("Number of Gaussians");
+    page.paragraph(&format!(
+        "The run decided that up to {} Gaussians pay (--quality). Training photos that were held out until then lost so many \
+         decibels without the quarter of the Gaussians that weighs least in each of them. Where they lose more than growth pays \
+         from, the scene grows.",
+        short(allowed)
+    ));
+    let of = |name: &str| checks.iter().filter_map(|c| Some((c["step"].as_f64()?, c[name].as_f64()?))).collect();
+    let chart =
+        Chart::new("Loss without the faintest quarter", "step", "dB").with("lost", of("lost"), Mark::LineAndDots);
+    let chart = chart.with("growth pays from", of("pays_from"), Mark::Line).zero_based();
+    let rows = Chart::new("Gaussians allowed", "step", "").with("", of("allowed"), Mark::LineAndDots).zero_based();
+    let caption = "Mean over the held-out training photos at each check.".to_string();
+    page.charts(&[(chart.svg(), caption), (rows.svg(), "What each check allowed.".to_string())]);
 }
 
 /// A chart of the exposures of the photos, if the run has trained them.

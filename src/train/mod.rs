@@ -5,7 +5,7 @@
 //! | set up and run | [`run`], [`prepare`], [`start`] (first Gaussians; `gaussian_pages` from a file of any size), [`tiers`] (where pages live), [`machine`] (threads, renderer), [`signals`] (Ctrl-C) |
 //! | memory | [`memory`], [`probe`] and [`preflight`] (does the run fit: `largest_view`, `first_frames`, `drive_space`, `plan_text`), [`budget`] and `fitting` (frames of a growing scene), `outgrown` (a scene that no longer fits), [`staging`] |
 //! | one step | [`step`], `soundness` (stops a run that diverged or trains nothing), [`comparison`] (from picture to loss and back; also for `view`, which renders without a step), [`batch`] (gather, update), [`working_set`], [`catch_up`] (cull, evaluate), `update`, `dense` (dense Adam) |
-//! | state and loop | [`pages`], [`trainer`], [`training_loop`], [`eval`], [`costs`] |
+//! | state and loop | [`pages`], [`trainer`], [`training_loop`], [`eval`], [`costs`], `growth_checks` with `held_out` and `leave_out` (how many Gaussians the scene needs) |
 //! | commits | [`checkpoint`], `first_commit` (of a run in memory), [`full_drive`], [`resume`] with `changes` and [`dataset_print`] (may the run resume) |
 //! | results | `appearance_file`, [`out_folder`], [`report`], [`progress`], [`page_map`], [`facts`] |
 //! | stores | `ownership` (which run owns a store, who may delete it), `places`, [`first_look`] (for a plan), [`stores`] (what tools do with checkpoints) |
@@ -33,7 +33,10 @@ mod fitting;
 pub mod forecast;
 pub mod full_drive;
 mod gaussian_pages;
+mod growth_checks;
+mod held_out;
 mod largest_view;
+mod leave_out;
 pub mod machine;
 pub mod memory;
 mod more_steps;

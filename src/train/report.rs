@@ -9,6 +9,7 @@ use crate::base::machine::process_cpu_seconds;
 use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitReport;
 use crate::dataset::photo_header::read_header;
+use crate::densify::growth::GrowthCheck;
 use crate::exchange::tensorboard::EventFile;
 use crate::paging::pager::Pager;
 use crate::paging::stats::PagerStats;
@@ -74,6 +75,9 @@ pub struct StepLine {
     /// Costs of the commits so far, if any.
     #[serde(flatten, skip_serializing_if = "Option::is_none", default)]
     pub commits: Option<CommitReport>,
+    /// The last check by which the run decides its count, if it does.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub growth: Option<GrowthCheck>,
     /// Evaluation on the held-out views, if one was due.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub test: Option<TestMetrics>,
@@ -190,6 +194,9 @@ pub struct Summary {
     /// Costs of the steps alone.
     #[serde(flatten)]
     pub costs: StepCosts,
+    /// The checks by which the run decided its count; empty if it did not.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    pub growth: Vec<GrowthCheck>,
     /// Traffic between the tiers, including import, evaluation and export.
     #[serde(flatten)]
     pub tiers: TierTraffic,

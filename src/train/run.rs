@@ -12,6 +12,7 @@ use super::drive_space::{StepWrites, check_first_drive, step_writes};
 use super::error::TrainError;
 use super::facts::{Resolved, write_config};
 use super::forecast::{Forecast, Measured, mean_pixels, reach};
+use super::held_out::check_enough_views;
 use super::machine;
 use super::memory::list_bytes;
 use super::memory::{host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
@@ -34,7 +35,7 @@ use super::training_loop::LoopOutputs;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity};
-use crate::config::choice::{Choice, Chosen, Device, LogFormat};
+use crate::config::choice::{Chosen, Device, LogFormat};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::config::residence::Residence;
@@ -192,6 +193,7 @@ pub(super) fn begin(
     for warning in &start.dataset.warnings {
         eprintln!("warning: {warning}");
     }
+    check_enough_views(config, &start.dataset)?;
     let mut options =
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
     if config.up == Up::Auto {
@@ -200,10 +202,7 @@ pub(super) fn begin(
     let before = host_bytes_now().unwrap_or(0);
     let (mut renderer, word) = machine::renderer(config)?;
     // On from here, so that probing allocates what the steps need.
-    renderer.weigh_rows(options.strategy.needs_weights()).map_err(|error| {
-        let problem = format!("strategy {} needs statistics that are missing: {error}", config.strategy.word());
-        InputError::new("--strategy", problem, "use --device cpu, or --growth-score gradient with --recycle 0")
-    })?;
+    renderer.weigh_rows(options.strategy.needs_weights())?;
     // Without a search for a device, a difference is the noise of the allocator.
     let driver = match config.device {
         Device::Cpu => 0,
@@ -496,6 +495,7 @@ fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
         steps_skipped_non_finite: steps_skipped,
         outlier_views: Vec::new(),
         costs: StepCosts::default(),
+        growth: trainer.growth().to_vec(),
         tiers: trainer.tier_traffic(),
         commits: None,
     }

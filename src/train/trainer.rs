@@ -13,6 +13,7 @@ use super::comparison::Comparison;
 use super::dense::settle_all;
 use super::error::TrainError;
 use super::eval::{EvalRequest, evaluate};
+use super::held_out::HeldOut;
 use super::pages::PagedScene;
 use super::report::{OutlierView, TestMetrics, TierTraffic};
 use super::soundness::{Idle, note_soundness, warn_of_outliers};
@@ -28,6 +29,8 @@ use crate::checkpoint::run_state::{LastTest, TrainerState};
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::densify::growth::GrowthCheck;
+use crate::densify::strategy::RowCount;
 use crate::exchange::ply::{self, PlyMeta};
 use crate::optim::method::Method;
 use crate::outliers::views::ViewOutliers;
@@ -60,7 +63,9 @@ pub struct Trainer {
     pub renderer: Box<dyn Renderer>,
     pub(super) options: RunOptions,
     order: ViewOrder,
-    train_views: Vec<usize>,
+    pub(super) train_views: Vec<usize>,
+    /// Training views that the run decides its count by.
+    pub(super) held_out: HeldOut,
     /// For each view, the number of its camera; empty if the run corrects nothing.
     camera_groups: Vec<usize>,
     pub(super) working: WorkingSet,
@@ -137,6 +142,7 @@ impl Trainer {
         Trainer {
             scene,
             order: view_order(options.view_order, options.seed, dataset),
+            held_out: HeldOut::new(&options.strategy, train_views.len()),
             train_views,
             working: WorkingSet::default(),
             renderer,
@@ -274,7 +280,8 @@ impl Trainer {
 
     /// Index in `dataset.views` of the next step's view.
     pub fn next_view(&mut self) -> usize {
-        self.train_views[self.order.view_at(self.state.step)]
+        let position = self.order.view_at(self.state.step);
+        self.train_views[self.held_out.trained_at(self.state.step, position)]
     }
 
     /// Seconds spent in steps.
@@ -308,14 +315,9 @@ impl Trainer {
     /// A photo cannot be decoded, pages could not be pinned, the renderer failed, the run diverged, or nothing counts in it
     /// (`soundness`).
     pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
-        self.log_due_events();
+        self.log_due_events(dataset, targets)?;
         let view = self.next_view();
-        let mut ahead = Vec::new();
-        self.order.upcoming(self.state.step, PREFETCH_VIEWS.min(self.options.steps - self.state.step), &mut ahead);
-        for position in &mut ahead {
-            *position = self.train_views[*position];
-        }
-        targets.prefetch(&ahead);
+        targets.prefetch(&self.coming_views(PREFETCH_VIEWS));
         self.fit_frames(&dataset.views[view].camera);
         self.look_ahead(dataset);
         let target = targets.get(view)?;
@@ -365,11 +367,16 @@ impl Trainer {
         }
         // Two epochs contain a use of every page that any view needs.
         let count = (2 * self.train_views.len() as u32).clamp(LOOK_AHEAD_LEAST, LOOK_AHEAD_MOST);
-        let mut coming = Vec::new();
-        self.order.upcoming(self.state.step, count.min(self.options.steps - self.state.step), &mut coming);
-        let camera = |&position: &usize| &dataset.views[self.train_views[position]].camera;
-        let cameras: Vec<&Camera> = coming.iter().map(camera).collect();
+        let cameras: Vec<&Camera> = self.coming_views(count).iter().map(|&view| &dataset.views[view].camera).collect();
         self.scene.pager.look_ahead(self.state.step, &cameras);
+    }
+
+    /// Indices in `dataset.views` of the views of the coming steps, at most `count`.
+    fn coming_views(&self, count: u32) -> Vec<usize> {
+        let (step, mut coming) = (self.state.step, Vec::new());
+        self.order.upcoming(step, count.min(self.options.steps - step), &mut coming);
+        let view = |(at, &position)| self.train_views[self.held_out.trained_at(at, position)];
+        (step..).zip(&coming).map(view).collect()
     }
 
     /// Notes how many of the rows in the pages of a view were drawn, and whether the view was one batch.
@@ -379,20 +386,41 @@ impl Trainer {
     }
 
     /// Decides and logs the events of the last step, unless that is done. They act on values after that step's update.
-    pub(super) fn log_due_events(&mut self) {
-        let Some(step) = self.state.step.checked_sub(1) else { return };
+    ///
+    /// # Errors
+    /// As [`Trainer::check_growth`].
+    pub(super) fn log_due_events(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
+        let Some(step) = self.state.step.checked_sub(1) else { return Ok(()) };
         // An attempt of the coming step has logged them, or an earlier version of the program, right after the step.
         if self.events().events().last().is_some_and(|last| last.step >= step) {
-            return;
+            return Ok(());
         }
+        self.check_growth(step, dataset, targets)?;
         let scale = self.options.scene_scale;
-        let rows = self.scene.rows_bound();
-        let kinds = self.options.strategy.events_after(step, scale, rows, &self.scene.histogram);
+        let count = RowCount { rows: self.scene.rows_bound(), allowed: self.allowed() };
+        let kinds = self.options.strategy.events_after(step, scale, count, &self.scene.histogram);
         kinds.into_iter().for_each(|kind| self.scene.log_event(Event { step, kind }));
         let degree = self.options.sh_degree_at(step + 1);
         if degree > self.scene.rules.sh_degree() {
             self.scene.log_event(Event { step, kind: EventKind::RaiseShDegree { degree } });
         }
+        Ok(())
+    }
+
+    /// Rows that the run allows now.
+    fn allowed(&mut self) -> u64 {
+        if self.options.strategy.growth().is_none() {
+            return u64::MAX;
+        }
+        if self.state.growth.first == 0 {
+            self.state.growth.first = self.scene.rows_bound();
+        }
+        self.state.growth.allowed()
+    }
+
+    /// The checks by which the run decides its count so far.
+    pub fn growth(&self) -> &[GrowthCheck] {
+        &self.state.growth.checks
     }
 
     /// Evaluates the held-out views at the current step. `progress` is called with the number of views done.

@@ -44,7 +44,9 @@ impl Trainer {
         outputs: &mut LoopOutputs<'_>,
     ) -> Result<(), TrainError> {
         while self.state.step < self.options.steps && outputs.stop.exit_code().is_none() {
-            self.log_due_events();
+            if !self.log_due_events_with_space(dataset, targets, outputs)? {
+                break;
+            }
             self.start_paging_if_outgrown(outputs)?;
             let before = self.renderer.traffic();
             let Some(outcome) = self.step_with_space(dataset, targets, outputs)? else { break };
@@ -100,8 +102,34 @@ impl Trainer {
             device_bytes_peak: traffic.device_bytes_peak,
             tiers: self.tier_traffic(),
             commits: outputs.checkpoint.as_deref().map(Checkpoint::report),
+            growth: self.growth().last().copied(),
             test: None,
         }
+    }
+
+    /// Logs the events of the last step; a check of growth that finds the drive full is repeated after waiting for space. False
+    /// if a stop was requested meanwhile.
+    fn log_due_events_with_space(
+        &mut self,
+        dataset: &Dataset,
+        targets: &TargetCache,
+        outputs: &mut LoopOutputs<'_>,
+    ) -> Result<bool, TrainError> {
+        let checks = self.growth().len();
+        loop {
+            match self.log_due_events(dataset, targets) {
+                Ok(()) => break,
+                Err(error) if error.is_out_of_space() => self.make_space(outputs, error)?,
+                Err(error) => return Err(self.commit_before_end(error, outputs)),
+            }
+            if outputs.stop.exit_code().is_some() {
+                return Ok(false);
+            }
+        }
+        if let Some(check) = self.growth().get(checks) {
+            outputs.progress.say(&check.to_string());
+        }
+        Ok(true)
     }
 
     /// Runs a step and repeats it after waiting for space if the drive is full. `None` if a stop was requested

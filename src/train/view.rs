@@ -71,11 +71,11 @@ pub fn rehearse(
 }
 
 /// At least one batch, though a view may see nothing.
-fn batches(pages: &[PageNo], per_batch: usize) -> Vec<&[PageNo]> {
+pub(super) fn batches(pages: &[PageNo], per_batch: usize) -> Vec<&[PageNo]> {
     if pages.is_empty() { vec![pages] } else { pages.chunks(per_batch.max(1)).collect() }
 }
 
-fn begin(
+pub(super) fn begin(
     renderer: &mut dyn Renderer,
     camera: &Camera,
     options: &RenderOptions,

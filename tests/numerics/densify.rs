@@ -7,7 +7,7 @@ use gsscale::densify::default::DefaultStrategy;
 use gsscale::densify::ops::child_uid;
 use gsscale::densify::replay::apply_event;
 use gsscale::densify::stats::{GradHistogram, accumulate};
-use gsscale::densify::strategy::Strategy;
+use gsscale::densify::strategy::{RowCount, Strategy};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::bounds::SplitLimits;
 use gsscale::optim::deferred::DeferredAdam;
@@ -164,7 +164,8 @@ fn events_applied_late_to_parts_give_the_rows_of_events_applied_on_time() {
         touch(&mut whole, &adam, step, &mut histogram, |uid| {
             part_is_drawn(part_from_uid[&uid], step) && row_is_drawn(uid, step)
         });
-        let kinds: Vec<EventKind> = config.events_after(step, 1.0, whole.rows() as u64, &histogram);
+        let kinds: Vec<EventKind> =
+            config.events_after(step, 1.0, RowCount::unlimited(whole.rows() as u64), &histogram);
         for kind in kinds {
             let index = log.push(Event { step, kind });
             for &uid in &whole.uid {
@@ -226,7 +227,7 @@ fn the_cap_is_reached_and_never_exceeded() {
             }
             assert_eq!(histogram, histogram_of(&state));
             let rows = state.rows() as u64;
-            let kind = config.events_after(step, 1.0, rows, &histogram)[0];
+            let kind = config.events_after(step, 1.0, RowCount::unlimited(rows), &histogram)[0];
             apply_event(&mut state, &adam, SEED, index, &Event { step, kind });
             histogram.clear();
             assert!(state.rows() as u64 <= max_gaussians.max(2000), "{} of {max_gaussians}", state.rows());

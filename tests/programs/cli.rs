@@ -327,6 +327,7 @@ fn unknown_words_are_refused_with_the_words_that_are_known() {
         ("moments", "f32 or bf16", "f32, bf16"),
         ("schedule", "run-length or classic", "run-length, classic"),
         ("strategy", "default, long-axis or none", "default, long-axis, none"),
+        ("quality", "draft, normal or archive", "draft, normal, archive"),
         ("growth-score", "gradient, error or mixed", "gradient, error, mixed"),
         ("appearance", "off, exposure or full", "off, exposure, full"),
         ("log", "json or tensorboard", "json, tensorboard"),

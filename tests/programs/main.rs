@@ -19,6 +19,7 @@ mod first_hour;
 mod forecast;
 mod gpu_train;
 mod growing;
+mod growth;
 mod memory;
 mod optimizers;
 mod outgrown;

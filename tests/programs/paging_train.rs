@@ -215,6 +215,38 @@ fn long_axis_rounds_page_to_the_same_bits_and_keep_the_cap() {
     assert!(without != want, "the score changes nothing");
 }
 
+/// A count that the run decides: the same checks, the same decisions and the same bits for any number of frames and threads.
+#[test]
+fn a_count_that_the_run_decides_pages_to_the_same_bits() {
+    let folder = TempDir::new().unwrap();
+    let scene = scenes::wide_city(folder.path(), 3_000);
+    // Rounds after every fourth step, and a check with every other of them from a third of the steps on.
+    let long = ["--page-rows", "32", "--steps", "120", "--strategy", "long-axis", "--refine-start", "20"];
+    let base = [COMMON, &long, &["--refine-every", "4", "--device", "cpu"]].concat();
+    let archive = [&base[..], &["--quality", "archive"]].concat();
+    let in_memory = How { frames: 0, io: "", threads: "2", more: &[] };
+    let (want, whole) = run(folder.path(), &scene, &archive, &in_memory);
+    let checks = whole["growth"].as_array().unwrap();
+    let steps: Vec<u64> = checks.iter().map(|check| number(check, "step")).collect();
+    assert_eq!(steps, [41, 49, 57, 65]);
+    let allowed = number(&checks[3], "allowed");
+    assert!(allowed > 3_200 && number(&whole, "gaussians") > 3_100, "nothing pays: {checks:?}");
+    assert!(number(&whole, "gaussians") <= allowed, "{whole}");
+    let most = number(&whole, "pages_pinned_max");
+    assert!(most < number(&whole, "pages"), "a view sees everything");
+    for (frames, io, threads) in [(most, "auto", "1"), (most / 3, "", "2")] {
+        let (got, summary) = run(folder.path(), &scene, &archive, &How { frames, io, threads, more: &[] });
+        assert_eq!(summary["growth"], whole["growth"], "{frames} frames");
+        assert!(got == want, "{frames} frames");
+        assert!(number(&summary, "pages_read") > 0, "{summary}");
+    }
+    // A higher price allows fewer; and the last check cannot come after the last round.
+    let draft = [&base[..], &["--quality", "draft", "--refine-stop", "60"]].concat();
+    let (_, summary) = run(folder.path(), &scene, &draft, &in_memory);
+    let growth = summary["growth"].as_array().unwrap();
+    assert!(growth.len() == 3 && number(&growth[2], "allowed") < allowed, "{growth:?}");
+}
+
 /// 16-bit moments change training, but paging changes nothing further.
 #[test]
 fn moments_in_16_bits_page_to_the_same_bits() {

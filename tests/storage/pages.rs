@@ -9,7 +9,7 @@ use gsscale::densify::long_axis::{GrowthScore, LongAxisStrategy};
 use gsscale::densify::ops::child_uid;
 use gsscale::densify::replay::{PageEdit, PendingEvents, apply_event};
 use gsscale::densify::stats::{GradHistogram, accumulate};
-use gsscale::densify::strategy::{DrawnRows, Effect, Strategy, effect_of};
+use gsscale::densify::strategy::{DrawnRows, Effect, RowCount, Strategy, effect_of};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::bounds::SplitLimits;
 use gsscale::optim::deferred::DeferredAdam;
@@ -161,6 +161,7 @@ fn long_axis(max_gaussians: u64) -> LongAxisStrategy {
         refine_stop: 240,
         refine_every: 30,
         max_gaussians,
+        growth: None,
     }
 }
 
@@ -169,7 +170,7 @@ fn on_time<'a>(start: &SceneState, adam: &'a DeferredAdam, strategy: &'a dyn Str
     for step in 0..STEPS {
         whole.step(step);
         let rows = whole.state.rows() as u64;
-        let mut kinds: Vec<EventKind> = strategy.events_after(step, 1.0, rows, &whole.histogram);
+        let mut kinds: Vec<EventKind> = strategy.events_after(step, 1.0, RowCount::unlimited(rows), &whole.histogram);
         if step % 85 == 84 {
             kinds.push(EventKind::RaiseShDegree { degree: (step / 85) as u8 + 1 });
         }
@@ -378,8 +379,9 @@ fn a_cap_by_which_pages_decide_is_never_exceeded_and_gives_the_rows_of_events_ap
             assert!(rows.iter().all(|rows| *rows <= pages.rows_bound), "{case}: {rows:?} at step {step}");
             assert!(chance < 1000 || pages.rows_bound == rows[0], "{case}: every page is up to date at every step");
             let bound = pages.rows_bound as u64;
-            let kinds: Vec<EventKind> = config.events_after(step, 1.0, bound, &pages.histogram);
-            let at_once: Vec<EventKind> = config.events_after(step, 1.0, rows[0] as u64, &whole.histogram);
+            let kinds: Vec<EventKind> = config.events_after(step, 1.0, RowCount::unlimited(bound), &pages.histogram);
+            let at_once: Vec<EventKind> =
+                config.events_after(step, 1.0, RowCount::unlimited(rows[0] as u64), &whole.histogram);
             decided_otherwise += usize::from(kinds != at_once);
             for kind in kinds {
                 match kind {

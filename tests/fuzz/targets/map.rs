@@ -6,6 +6,7 @@ use crate::Target;
 use gsscale::appearance::state::AppearanceState;
 use gsscale::base::ids::PageId;
 use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, Origin, RunIdentity, RunState, TrainerState, ViewPrint};
+use gsscale::densify::growth::{GrowthCheck, GrowthState};
 use gsscale::densify::stats::GradHistogram;
 use gsscale::outliers::views::ViewOutliers;
 use gsscale::page::engine::memory::MemoryEngine;
@@ -237,6 +238,10 @@ fn sample() -> RunState {
             test: Some(LastTest { step: 8, views: 2, psnr: 20.5, ssim: 0.75 }),
             appearance: AppearanceState::new(&[0, 0]),
             outliers: ViewOutliers::new(2),
+            growth: GrowthState {
+                first: 7,
+                checks: vec![GrowthCheck { step: 5, gaussians: 7, lost: 0.5, pays_from: 0.25, allowed: 10 }],
+            },
         },
         events,
         histogram: vec![(3, 1), (32767, 9)],

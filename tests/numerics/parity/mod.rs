@@ -6,3 +6,4 @@ mod loss;
 mod ranges;
 mod rows;
 mod tiles;
+mod weights;

@@ -12,7 +12,7 @@ use gsscale::kernels::project_fwd::{Projected, project_fwd};
 use gsscale::kernels::sh_bwd::sh_bwd;
 use gsscale::kernels::sh_fwd::sh_fwd;
 use gsscale::render::gpu_rows::{
-    BAND_WIDTHS, DeviceColumns, FOOTPRINT_BYTES, RowStages, SPLAT_BYTES, SplatRows, band_into_sh_n,
+    BAND_WIDTHS, DeviceColumns, RowStages, SPLAT_BYTES, SplatRows, band_into_sh_n, footprint_bytes,
 };
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::Columns;
@@ -120,12 +120,12 @@ fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]
     });
     let with_colors: Vec<_> = cpu.projected.iter().zip(&cpu.colors).map(|(p, c)| with_color(*p, *c)).collect();
     let mut out = Columns::zeros(n, 3);
-    let footprints = gpu.buffer("footprints", FOOTPRINT_BYTES * n as u64).unwrap();
+    let footprints = gpu.buffer("footprints", footprint_bytes(false) * n as u64).unwrap();
     out.opacities = read(gpu, &grads.opacities, |r| {
         r.upload(&splats.view(), &with_colors).unwrap();
         let [s, v_s] = [&splats, &v_splats].map(SplatRows::from);
         stages.sh_bwd(gpu, r, camera, degree, &columns, s, v_s, &grads).unwrap();
-        stages.project_bwd(gpu, r, camera, EPS2D, &columns, s, v_s, &grads, &footprints).unwrap();
+        stages.project_bwd(gpu, r, camera, EPS2D, &columns, s, v_s, &grads, &footprints, false).unwrap();
     });
     let packed = read(gpu, &footprints, |_| {});
     for (i, (got, record)) in packed.as_chunks::<4>().0.iter().zip(&with_colors).enumerate() {

@@ -4,6 +4,7 @@ mod appearance;
 mod bench;
 mod changes;
 mod events;
+mod growth;
 mod kills;
 mod more_steps;
 mod outliers;

@@ -1,0 +1,216 @@
+//! The count that a run decides itself: growth in stages, as long as more Gaussians pay.
+//!
+//! A few training views are held out while the scene may grow. Before a round, each of them is drawn with all Gaussians, and
+//! without the quarter of the drawn ones that have the least blending weight in it. Where Gaussians are scarce even the
+//! faintest carry detail, and the view loses decibels; where they abound, neighbours hide what a removed one leaves. The more
+//! decibels the held-out views lose, the more the next doubling brings.
+//!
+//! What counts as a loss that pays grows with the steps, since an untrained scene loses little whatever its count. The first
+//! check comes once the first Gaussians are trained somewhat, the last one soon after, because Gaussians that come later bring
+//! less. A stage of growth is mostly whole doublings: where only the rows of the largest scores were split, the faintest rows
+//! of a view would be the children of the most important ones, and the loss would say nothing about the count.
+//! `benches/RESULTS.md` has the measurements, also of what failed.
+//!
+//! Not here: how the loss is measured (`train::leave_out`), which views are held out (`train::held_out`), which rows grow
+//! ([`super::long_axis`]).
+//!
+//! Invariants: 1. a decision is a function of the step, of the loss, and of the decisions before it, which a commit holds;
+//! 2. the count that is allowed never falls.
+
+use serde::{Deserialize, Serialize};
+use std::fmt;
+
+/// The value of `--quality`: how much a doubling of the Gaussians must bring.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Quality {
+    /// Few Gaussians.
+    Draft,
+    /// The default.
+    Normal,
+    /// Many Gaussians.
+    Archive,
+}
+
+impl Quality {
+    /// The loss from which growth pays, as a multiple of that of [`Quality::Normal`]. A scene with twice the Gaussians loses
+    /// about half as much.
+    fn price(self) -> f64 {
+        match self {
+            Quality::Draft => 1.5,
+            Quality::Normal => 1.0,
+            Quality::Archive => 0.4,
+        }
+    }
+}
+
+/// The checks: at which share of [`GrowthRule::unit`] a check is due, and decibels from which growth pays then. These are the
+/// losses of scenes whose next doubling brings one to two tenths of a decibel.
+const CHECKS: [[f64; 2]; 4] = [[1.0 / 3.0, 0.07], [0.4, 0.16], [1.4 / 3.0, 0.24], [1.6 / 3.0, 0.30]];
+/// Longest unit: in longer runs a scene takes as many steps as in one of this length until its losses tell its count.
+const UNIT_MOST: u32 = 3000;
+/// Most doublings of one stage: as many rounds lie between two checks.
+const DOUBLINGS_MOST: f64 = 2.0;
+
+/// The rule of a run that decides its count.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GrowthRule {
+    /// How much a doubling must bring.
+    quality: Quality,
+    /// Steps to which the shares of the checks refer.
+    unit: u32,
+}
+
+/// A check, with what it decided.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct GrowthCheck {
+    /// Steps done.
+    pub step: u32,
+    /// Upper bound of the Gaussians then.
+    pub gaussians: u64,
+    /// Decibels that a held-out view loses without its faintest quarter: the mean over the views.
+    pub lost: f64,
+    /// Decibels from which growth pays.
+    pub pays_from: f64,
+    /// Gaussians that are allowed from here on.
+    pub allowed: u64,
+}
+
+/// What a run that decides its count knows of it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct GrowthState {
+    /// Gaussians before the first event; 0 before that, and in runs that do not decide.
+    pub first: u64,
+    /// The checks so far, in order.
+    pub checks: Vec<GrowthCheck>,
+}
+
+impl GrowthState {
+    /// Gaussians that are allowed now.
+    pub fn allowed(&self) -> u64 {
+        self.checks.last().map_or(self.first, |last| last.allowed)
+    }
+
+    /// What a commit cannot hold.
+    ///
+    /// # Errors
+    /// The checks are out of order, lie beyond `steps_done`, or hold a value that is not finite.
+    pub fn check(&self, steps_done: u32) -> Result<(), &'static str> {
+        let is_sound = |c: &GrowthCheck| c.lost.is_finite() && c.pays_from.is_finite() && c.step <= steps_done;
+        let rises = |pair: &[GrowthCheck]| pair[0].step < pair[1].step && pair[0].allowed <= pair[1].allowed;
+        let starts = self.checks.first().is_none_or(|check| check.allowed >= self.first);
+        if starts && self.checks.iter().all(is_sound) && self.checks.windows(2).all(rises) {
+            return Ok(());
+        }
+        Err("the checks of its growth are invalid")
+    }
+}
+
+impl GrowthCheck {
+    /// Whether the scene grows.
+    pub fn grows(&self) -> bool {
+        self.lost > self.pays_from
+    }
+}
+
+/// One line of a terminal.
+impl fmt::Display for GrowthCheck {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let GrowthCheck { step, lost, pays_from, allowed, .. } = self;
+        let what = if self.grows() { "up to" } else { "stay" };
+        write!(f, "step {step}: Gaussians {what} {allowed}; faint ones are worth {lost:.3} dB, {pays_from:.3} pay")
+    }
+}
+
+impl GrowthRule {
+    /// The rule of a run that is planned for this many steps.
+    pub fn new(quality: Quality, steps: u32) -> GrowthRule {
+        GrowthRule { quality, unit: steps.clamp(1, UNIT_MOST) }
+    }
+
+    /// The number of the check that a round after this step begins with, if `round_before` is the step of the round before: the
+    /// last one that fell due since.
+    pub fn due(&self, round_before: Option<u32>, step: u32) -> Option<usize> {
+        let is_past = |step: u32, share: f64| f64::from(step) >= share * f64::from(self.unit);
+        (0..CHECKS.len()).rfind(|&number| {
+            let [share, _] = CHECKS[number];
+            is_past(step, share) && !round_before.is_some_and(|before| is_past(before, share))
+        })
+    }
+
+    /// Whether a check may still come after this step or a later one.
+    pub fn is_open(&self, step: u32, refine_every: u32) -> bool {
+        let [last, _] = CHECKS[CHECKS.len() - 1];
+        f64::from(step) < last * f64::from(self.unit) + f64::from(refine_every)
+    }
+
+    /// The check `number` after this step of a scene of at most `gaussians` Gaussians, of which `allowed` are allowed so far, and
+    /// that loses `lost` decibels.
+    pub fn check(&self, number: usize, step: u32, [gaussians, allowed]: [u64; 2], lost: f64) -> GrowthCheck {
+        let pays_from = self.quality.price() * CHECKS[number][1];
+        let stage = libm::exp2(libm::log2(lost / pays_from).min(DOUBLINGS_MOST));
+        let allowed = if lost > pays_from { (allowed as f64 * stage) as u64 } else { allowed };
+        GrowthCheck { step: step + 1, gaussians, lost, pays_from, allowed }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The steps and numbers of the checks of a run with rounds every `every` steps from `start` on.
+    fn checks(rule: &GrowthRule, start: u32, every: u32) -> Vec<(u32, usize)> {
+        let rounds: Vec<u32> = (start..40_000).filter(|step| step.is_multiple_of(every)).collect();
+        let due = |(i, &step): (usize, &u32)| {
+            rule.due(i.checked_sub(1).map(|before| rounds[before]), step).map(|n| (step, n))
+        };
+        rounds.iter().enumerate().filter_map(due).collect()
+    }
+
+    #[test]
+    fn checks_come_with_the_rounds_and_end_soon() {
+        for (steps, unit) in [(1500, 1500), (3000, 3000), (30_000, 3000), (200_000, 3000)] {
+            let rule = GrowthRule::new(Quality::Normal, steps);
+            let every = unit / 30;
+            let due = [10, 12, 14, 16].map(|rounds| rounds * every);
+            assert_eq!(checks(&rule, 6 * every, every), due.into_iter().zip(0..).collect::<Vec<_>>());
+            assert!(rule.is_open(due[3], every) && !rule.is_open(due[3] + every, every));
+        }
+        // A run whose rounds begin late has the last check with the first round; one with few rounds skips checks.
+        let rule = GrowthRule::new(Quality::Normal, 3000);
+        assert_eq!(checks(&rule, 2000, 100), [(2000, 3)]);
+        assert_eq!(checks(&rule, 600, 500), [(1000, 0), (1500, 2), (2000, 3)]);
+    }
+
+    #[test]
+    fn a_scene_grows_by_stages_while_it_loses_more_than_pays() {
+        let rule = GrowthRule::new(Quality::Normal, 3000);
+        let pays = CHECKS[1][1];
+        let first = |lost: f64| rule.check(1, 1200, [990, 1000], lost);
+        assert_eq!((first(pays).allowed, first(-1.0).allowed, first(f64::NEG_INFINITY).allowed), (1000, 1000, 1000));
+        assert!(!first(pays).grows() && first(1.5 * pays).grows());
+        // Twice the loss that pays: one doubling.
+        assert_eq!((first(2.0 * pays).allowed, first(100.0 * pays).allowed), (2000, 4000));
+        assert!((1499..=1500).contains(&first(1.5 * pays).allowed));
+        let second = rule.check(2, 1400, [3900, 4000], 0.0);
+        assert_eq!((second.step, second.gaussians, second.allowed), (1401, 3900, 4000));
+        let of = |first, checks: [GrowthCheck; 2]| GrowthState { first, checks: checks.to_vec() };
+        let sound = of(1000, [first(4.0 * pays), second]);
+        assert_eq!((sound.allowed(), GrowthState { first: 7, ..GrowthState::default() }.allowed()), (4000, 7));
+        assert!(sound.check(1401).is_ok() && sound.check(1400).is_err());
+        for wrong in [
+            of(5000, [first(4.0 * pays), second]),
+            of(1000, [second, first(0.0)]),
+            of(1000, [first(0.0), GrowthCheck { allowed: 1, ..second }]),
+            of(1000, [first(f64::NAN), second]),
+        ] {
+            assert!(wrong.check(1401).is_err(), "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn the_price_says_how_far_a_scene_grows() {
+        let of = |quality| GrowthRule::new(quality, 3000).check(0, 1000, [1000; 2], 0.08).allowed;
+        let [draft, normal, archive] = [Quality::Draft, Quality::Normal, Quality::Archive].map(of);
+        assert!(draft == 1000 && normal > 1000 && archive > 2 * normal, "{draft}, {normal}, {archive}");
+    }
+}

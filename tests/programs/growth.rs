@@ -1,0 +1,54 @@
+//! A run that decides how many Gaussians its scene needs: what it says about it, and what it refuses.
+
+use crate::support::scenes::{city, stderr, summary, text, told, train};
+use serde_json::Value;
+use tempfile::TempDir;
+
+const DECIDES: [&str; 8] = ["--strategy", "long-axis", "--device", "cpu", "--steps", "60", "--log-every", "5"];
+
+#[test]
+fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
+    let folder = TempDir::new().unwrap();
+    let (scene, out) = (city(folder.path(), 20, 64, 48, 500), folder.path().join("out"));
+    let run = |more: &[&str]| {
+        let output = train(&[&[text(&scene), "--out", text(&out), "--overwrite"], &DECIDES[..], more].concat());
+        assert!(output.status.success(), "{}", stderr(&output));
+        told(&output)
+    };
+    let planned = run(&["--dry-run"]);
+    assert!(planned.contains("held-out training photos") && planned.contains("--quality"), "{planned}");
+    let said = run(&["--quality", "archive"]);
+    let growth = summary(&out)["growth"].clone();
+    let checks = growth.as_array().unwrap();
+    assert_eq!(checks.len(), 3, "{growth}");
+    let of = |check: &Value, name: &str| check[name].as_f64().unwrap();
+    for check in checks {
+        let line = format!("step {}: Gaussians ", check["step"]);
+        let line = said.lines().find(|l| l.starts_with(&line)).unwrap_or_else(|| panic!("no {line} in {said}"));
+        assert!(line.len() <= 80 && line.contains(&check["allowed"].to_string()), "{line}");
+        assert_eq!(line.contains("up to"), of(check, "lost") > of(check, "pays_from"), "{line}");
+    }
+    assert!(checks.windows(2).all(|pair| of(&pair[0], "allowed") <= of(&pair[1], "allowed")));
+    let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
+    let lines: Vec<Value> = metrics.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(lines[0]["growth"], Value::Null);
+    assert_eq!(lines.last().unwrap()["growth"], checks[2]);
+    let report = std::fs::read_to_string(out.join("report.html")).unwrap();
+    assert!(report.contains("Number of Gaussians") && report.contains("growth pays from"));
+    // A cap that is given is the user's decision.
+    run(&["--max-gaussians", "600"]);
+    assert_eq!(summary(&out)["growth"], Value::Null);
+}
+
+#[test]
+fn too_few_views_to_decide_by_are_refused() {
+    let folder = TempDir::new().unwrap();
+    let (scene, out) = (city(folder.path(), 13, 64, 48, 500), folder.path().join("out"));
+    // 11 training views.
+    let output = train(&[&[text(&scene), "--out", text(&out)], &DECIDES[..]].concat());
+    let said = stderr(&output);
+    assert!(!output.status.success() && !out.exists(), "{said}");
+    assert!(said.contains("11 training views") && said.contains("12") && said.contains("--strategy default"), "{said}");
+    let capped = [&[text(&scene), "--out", text(&out), "--max-gaussians", "600"], &DECIDES[..]].concat();
+    assert!(train(&capped).status.success());
+}
