@@ -12,6 +12,7 @@ use super::memory::{MemoryEstimate, rows_at_most};
 use super::preflight::TierPlan;
 use crate::checkpoint::interval::{CommitEvery, SHORTEST_SECONDS, bytes_per_hour};
 use crate::config::file::TrainConfig;
+use crate::config::limits;
 use crate::config::residence::Residence;
 use crate::scene::camera::Camera;
 use crate::scene::state::row_bytes;
@@ -42,6 +43,8 @@ pub enum Reach {
     Cap,
     /// A guess: there is no cap.
     Guess,
+    /// A guess: the run decides the count as it trains ([`crate::densify::growth`]).
+    Decided,
 }
 
 /// The number of Gaussians that a run of `rows` will reach after `steps_done` of its steps, and how that is known. `pixels`
@@ -54,7 +57,8 @@ pub fn reach(config: &TrainConfig, rows: u64, pixels: f64, steps_done: u32) -> (
         _ if !config.strategy.grows() || rounds == 0 => (rows, Reach::Constant),
         0 => {
             let added = ADDED_BY_A_ROUND * f64::from(rounds.min(ROUNDS_OF_GROWTH)) * pixels;
-            (rows + added as u64, Reach::Guess)
+            let reach = if limits::growth_rule(config).is_some() { Reach::Decided } else { Reach::Guess };
+            (rows + added as u64, reach)
         }
         _ => (rows_at_most(config, rows), Reach::Cap),
     }

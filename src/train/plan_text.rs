@@ -23,6 +23,11 @@ pub fn growth(forecast: &Forecast) -> String {
         Reach::Guess => {
             format!(", growing to perhaps {last} (a guess; --max-gaussians caps them)")
         }
+        Reach::Decided => {
+            format!(
+                ", growing as far as held-out training photos say that it pays, perhaps to {last} (a guess; see --quality)"
+            )
+        }
     }
 }
 
