@@ -69,11 +69,13 @@ impl Sequence {
     }
 
     /// How the rows of the view come; `None` without a view.
+    #[cfg(feature = "gpu")]
     pub fn batches(&self) -> Option<RowBatches> {
         self.current.as_ref().map(|current| current.batches)
     }
 
     /// Drops the view.
+    #[cfg(feature = "gpu")]
     pub fn drop_view(&mut self) {
         self.current = None;
     }

@@ -4,7 +4,20 @@ use crate::support::scenes::{city, stderr, summary, text, told, train};
 use serde_json::Value;
 use tempfile::TempDir;
 
-const DECIDES: [&str; 8] = ["--strategy", "long-axis", "--device", "cpu", "--steps", "60", "--log-every", "5"];
+const DECIDES: [&str; 12] = [
+    "--strategy",
+    "long-axis",
+    "--device",
+    "cpu",
+    "--steps",
+    "60",
+    "--log-every",
+    "5",
+    "--refine-start",
+    "10",
+    "--refine-every",
+    "10",
+];
 
 #[test]
 fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
