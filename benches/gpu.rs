@@ -24,6 +24,7 @@ use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::gpu::GpuRenderer;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::image::Target;
+use gsscale::train::batch::HostRows;
 use gsscale::train::comparison::Comparison;
 use gsscale::train::pages::PagedScene;
 use gsscale::train::step::train_step;
@@ -129,7 +130,15 @@ fn steps<R: Renderer>(
     let mut round = |counted: bool| {
         for (camera, target) in &views {
             let how = (&options.render, &Comparison { target, loss: options.loss, look: None, is_left_out: false });
-            let done = train_step(&mut scene, &mut working, renderer, (step, camera), how, false, usize::MAX);
+            let done = train_step(
+                &mut scene,
+                &mut working,
+                &mut HostRows::new(renderer),
+                (step, camera),
+                how,
+                false,
+                usize::MAX,
+            );
             let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
             hash.add(outcome.loss.loss.to_bits());
             step += 1;

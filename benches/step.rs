@@ -32,6 +32,7 @@ use gsscale::render::{
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Columns, row_width};
 use gsscale::scene::image::{Image, Target};
+use gsscale::train::batch::HostRows;
 use gsscale::train::catch_up::{gather, visible_rows};
 use gsscale::train::comparison::Comparison;
 use gsscale::train::pages::{PagedScene, row_tables};
@@ -169,7 +170,8 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
                 renderer.begin = Some(Instant::now());
                 let at = (step, camera);
                 let how = (&options.render, &Comparison { target, loss: options.loss, look: None, is_left_out: false });
-                let done = train_step(&mut scene, &mut working, &mut renderer, at, how, true, usize::MAX);
+                let done =
+                    train_step(&mut scene, &mut working, &mut HostRows::new(&mut renderer), at, how, true, usize::MAX);
                 let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
                 renderer.note_end();
                 let stats = renderer.inner.stats();

@@ -2,10 +2,13 @@
 //!
 //! Not here: whether files exist and whether a run fits, which depends on more than the config.
 
+use super::choice::{Chosen, Device};
 use super::file::TrainConfig;
 use crate::base::error::{InputError, InputResult};
 use crate::checkpoint::interval::CommitEvery;
 use crate::optim::adam::EPS_MIN;
+use crate::optim::method::{Method, OptimizerPlace};
+use crate::optim::moments::Moments;
 
 /// Most steps of a run: the optimizer keeps 88 bytes for each.
 const STEPS_MAX: u32 = 10_000_000;
@@ -54,7 +57,27 @@ impl TrainConfig {
             ("log-every", self.log_every > 0, "1 or more"),
         ])?;
         self.check_thresholds()?;
+        self.check_place()?;
         self.check_rates()
+    }
+
+    /// What an optimizer on a device does not do.
+    fn check_place(&self) -> InputResult<()> {
+        if self.optimizer_on != Chosen(Some(OptimizerPlace::Device)) {
+            return Ok(());
+        }
+        let needs = [
+            (self.device != Device::Cpu, "it needs a GPU", "use --device auto or gpu"),
+            (self.optimizer == Method::Deferred, "it knows the deferred form alone", "use --optimizer deferred"),
+            (self.moments == Moments::F32, "its moments have 32 bits", "use --moments f32"),
+        ];
+        match needs.iter().find(|(holds, ..)| !holds) {
+            Some((_, problem, remedy)) => {
+                let remedy = format!("{remedy}, or --optimizer-on host");
+                Err(InputError::new("--optimizer-on device", *problem, &remedy))
+            }
+            None => Ok(()),
+        }
     }
 
     fn check_thresholds(&self) -> InputResult<()> {

@@ -12,7 +12,7 @@ use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
 use crate::exchange::ply::ExportFrame;
 use crate::gpu::DeviceChoice;
-use crate::optim::method::Method;
+use crate::optim::method::{Method, OptimizerPlace};
 use crate::optim::moments::Moments;
 use crate::page::engine::open::IoEngine;
 use crate::page::format::codec::Codec;
@@ -161,6 +161,7 @@ open_choices! {
     "view-order": Order, "auto" in ["auto", "shuffle", "groups:N", "tour"], parsed, |order: Order| order.to_string();
     "spill-codec": Codec, "auto" in ["raw", "halves", "zstd:LEVEL", "auto"], parsed, |codec: Codec| codec.to_string();
     "simd": SimdPath, "auto" in ["auto", "avx512", "avx2", "baseline"], SimdPath::from_name, |path: SimdPath| path.name().to_string();
+    "optimizer-on": OptimizerPlace, "auto" in ["auto", "device", "host"], OptimizerPlace::from_name, |place: OptimizerPlace| place.name().to_string();
     "color-correct": ColorCorrect, "off" in ["off", "affine", "quadratic"], ColorCorrect::from_name, |fit: ColorCorrect| fit.name().to_string();
 }
 
@@ -312,6 +313,7 @@ mod tests {
         check::<Chosen<Order>>();
         check::<Chosen<Codec>>();
         check::<Chosen<SimdPath>>();
+        check::<Chosen<OptimizerPlace>>();
         check::<Chosen<ColorCorrect>>();
         let problem = parse_choice::<Transfers>("x").unwrap_err();
         assert_eq!(problem, "unknown --transfers 'x': use overlap, ahead or demand");

@@ -21,7 +21,7 @@ use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
 use crate::exchange::ply::ExportFrame;
 use crate::gpu::DeviceChoice;
-use crate::optim::method::Method;
+use crate::optim::method::{Method, OptimizerPlace};
 use crate::optim::moments::Moments;
 use crate::page::engine::open::IoEngine;
 use crate::page::format::codec::Codec;
@@ -153,6 +153,10 @@ config_keys! {
         /// Which Gaussians Adam updates: deferred (all; those without a gradient when next visible), dense (all at
         /// every step: slow, for comparison), or sparse (only those with a gradient: not exact)
         optimizer: Method = Method::Deferred => Numbers;
+        /// Where the optimizer runs: host, or device (on the GPU that renders, in pages that stay there while --device-mem
+        /// has room; with --optimizer deferred, --moments f32 and --growth-score gradient). The two round differently.
+        /// auto is host, until device is faster on measured GPUs. A resumed run keeps its place
+        optimizer_on: Chosen<OptimizerPlace> = Chosen(None) => Numbers;
         /// Format of Adam's moments: f32, or bf16 (not exact; halves their size on disk)
         moments: Moments = Moments::F32 => Numbers;
         /// Initial opacity

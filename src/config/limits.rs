@@ -13,7 +13,7 @@ use crate::densify::long_axis::LongAxisStrategy;
 use crate::densify::strategy::{NoStrategy, Strategy, StrategyName};
 use crate::exchange::ply::ExportFrame;
 use crate::optim::adam::AdamConfig;
-use crate::optim::method::Method;
+use crate::optim::method::{Method, OptimizerPlace};
 use crate::optim::moments::Moments;
 use crate::optim::rates::Rates;
 use crate::render::color_correct::ColorCorrect;
@@ -52,6 +52,8 @@ pub struct RunOptions {
     pub adam: AdamConfig,
     /// Which rows the optimizer updates.
     pub optimizer: Method,
+    /// Where the optimizer runs.
+    pub optimizer_on: OptimizerPlace,
     /// Format of stored moments.
     pub moments: Moments,
     /// Densification strategy.
@@ -114,6 +116,7 @@ impl RunOptions {
             },
             adam: AdamConfig { eps: config.adam_eps, ..AdamConfig::default() },
             optimizer: config.optimizer,
+            optimizer_on: config.optimizer_on.0.unwrap_or_default(),
             moments: config.moments,
             strategy: strategy(config),
             scene_scale,

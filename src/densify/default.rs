@@ -97,6 +97,10 @@ impl Strategy for DefaultStrategy {
         step < self.refine_stop
     }
 
+    fn reads_histogram(&self, step: u32) -> bool {
+        self.is_round(step)
+    }
+
     /// A round, then a reset.
     fn events_after(&self, step: u32, scene_scale: f32, count: RowCount, histogram: &GradHistogram) -> Vec<EventKind> {
         let mut events = Vec::new();

@@ -101,6 +101,10 @@ impl Strategy for LongAxisStrategy {
         step < self.refine_stop
     }
 
+    fn reads_histogram(&self, step: u32) -> bool {
+        self.is_round(step)
+    }
+
     fn needs_weights(&self) -> bool {
         self.score != GrowthScore::Gradient || self.recycle > 0.0 || self.growth.is_some()
     }

@@ -83,6 +83,15 @@ impl GradHistogram {
         }
     }
 
+    /// Takes over what a device counted: `changes[bin]` rows more by mean score, modulo 2^32.
+    pub fn add_changes(&mut self, changes: &[u32]) {
+        for (rows, change) in self.bins[..BINS].iter_mut().zip(changes) {
+            let counted = i64::from(*rows) + i64::from(*change as i32);
+            self.uncounted += u64::try_from(-counted).unwrap_or(0);
+            *rows = u32::try_from(counted).unwrap_or(0);
+        }
+    }
+
     /// Removals from empty bins: 0, unless the rows have statistics that were never added to this histogram.
     pub fn uncounted(&self) -> u64 {
         self.uncounted
@@ -289,6 +298,19 @@ mod tests {
         let mut recounted = GradHistogram::default();
         recounted.add_rows(&state.view());
         assert_eq!(recounted, histogram);
+    }
+
+    #[test]
+    fn what_a_device_counted_is_added_and_never_wraps() {
+        let mut histogram = GradHistogram::default();
+        [0.5, 0.5, 2.0].into_iter().for_each(|mean| histogram.add(mean));
+        let mut changes = vec![0; BINS];
+        (changes[bin(0.5)], changes[bin(2.0)], changes[bin(8.0)]) = (u32::MAX, u32::MAX, 1);
+        histogram.add_changes(&changes);
+        assert_eq!(histogram.filled(), [(bin(0.5) as u16, 1), (bin(8.0) as u16, 1)]);
+        assert_eq!(histogram.uncounted(), 0);
+        histogram.add_changes(&changes);
+        assert_eq!((histogram.filled(), histogram.uncounted()), (vec![(bin(8.0) as u16, 2)], 1));
     }
 
     #[test]

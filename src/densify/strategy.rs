@@ -79,6 +79,9 @@ pub trait Strategy: fmt::Debug + Send + Sync {
     /// Whether this step collects statistics.
     fn collects(&self, step: u32) -> bool;
 
+    /// Whether [`Strategy::events_after`] reads the histogram after this step.
+    fn reads_histogram(&self, step: u32) -> bool;
+
     /// Whether [`Strategy::collect`] reads [`DrawnRows::weights`], which the renderer collects on demand only.
     fn needs_weights(&self) -> bool {
         false
@@ -123,6 +126,10 @@ impl Strategy for NoStrategy {
     }
 
     fn collects(&self, _: u32) -> bool {
+        false
+    }
+
+    fn reads_histogram(&self, _: u32) -> bool {
         false
     }
 

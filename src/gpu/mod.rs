@@ -44,7 +44,6 @@ mod error;
 mod faults;
 #[cfg(feature = "gpu")]
 mod injected;
-#[cfg(feature = "gpu")]
 mod layout;
 #[cfg(feature = "gpu")]
 mod profile;
@@ -72,7 +71,6 @@ pub use device::{Gpu, GpuOptions, budget_for_buffers, bytes_for_buffers};
 pub use error::{GpuError, GpuResult};
 #[cfg(feature = "gpu")]
 pub use injected::{FaultKind, InjectedFault};
-#[cfg(feature = "gpu")]
 pub use layout::StructLayout;
 #[cfg(feature = "gpu")]
 pub use profile::StageTime;

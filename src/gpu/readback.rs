@@ -130,7 +130,12 @@ impl Readback {
         driver.faults.check()?;
         match self.state.load(Ordering::Acquire) {
             MAPPED => Ok(()),
-            _ => Err(GpuError::validation(self.stage, "the results could not be mapped")),
+            _ => {
+                // A lost device may fail the mapping before it reports the loss.
+                driver.wait(self.stage, None)?;
+                driver.faults.check()?;
+                Err(GpuError::validation(self.stage, "the results could not be mapped"))
+            }
         }
     }
 }

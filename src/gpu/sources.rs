@@ -37,6 +37,7 @@ macro_rules! sources {
 }
 
 sources![
+    "gather.wgsl",
     "image_loss.wgsl",
     "isect_emit.wgsl",
     "isect_offsets.wgsl",
@@ -49,12 +50,16 @@ sources![
     "sh_bwd.wgsl",
     "sh_fwd.wgsl",
     "tile_range.wgsl",
+    "update.wgsl",
     "shared/camera.wgsl",
     "shared/constants.wgsl",
     "shared/covariance.wgsl",
+    "shared/deferred.wgsl",
     "shared/dispatch.wgsl",
     "shared/footprint.wgsl",
     "shared/math.wgsl",
+    "shared/page.wgsl",
+    "shared/quotient.wgsl",
     "shared/raster.wgsl",
     "shared/sh.wgsl",
     "shared/splat.wgsl",

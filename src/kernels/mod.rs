@@ -1,11 +1,14 @@
 //! The stages of the pipeline on the CPU, one file each, on plain slices. Knows no files, GPU types or optimizer.
 
 pub mod constants;
+pub mod deferred;
+pub mod gather;
 pub mod image_loss;
 mod image_pair;
 pub mod isect_emit;
 pub mod isect_offsets;
 pub mod lanes;
+pub mod page_words;
 pub mod project_bwd;
 pub mod project_fwd;
 pub mod radix_sort;
@@ -22,5 +25,7 @@ mod tile_block;
 pub mod tile_range;
 #[cfg(feature = "gpu")]
 pub mod uniforms;
+pub mod uniforms_pages;
 #[cfg(feature = "gpu")]
 pub mod uniforms_tiles;
+pub mod update;

@@ -10,11 +10,12 @@ pub struct Stage {
     pub doc: &'static str,
 }
 
-/// The stages in order.
+/// The stages in order. The first and the last run where pages lie on a device; elsewhere the host gathers and updates.
 ///
 /// A device sorts intersections by tile between `isect_emit` and `isect_offsets`. The CPU uses a counting sort instead:
 /// `isect_offsets` converts the tiles' counts to places, and `isect_emit` writes each intersection to its place.
-pub const STAGES: [Stage; 11] = [
+pub const STAGES: [Stage; 13] = [
+    Stage { name: "gather", doc: "rows of pages on a device as they are now; culls" },
     Stage { name: "project_fwd", doc: "rows to footprints on the screen; culls" },
     Stage { name: "sh_fwd", doc: "colours of the visible rows from their view directions" },
     Stage { name: "radix_sort", doc: "visible rows front to back by the bits of their depth, ties by row" },
@@ -26,6 +27,7 @@ pub const STAGES: [Stage; 11] = [
     Stage { name: "rasterize_bwd", doc: "gradients of footprints and colours, back to front" },
     Stage { name: "sh_bwd", doc: "gradients of colours to coefficients and means" },
     Stage { name: "project_bwd", doc: "gradients of footprints to means, quats, scales, opacities" },
+    Stage { name: "update", doc: "Adam on the rows of pages on a device, their statistics and bounds" },
 ];
 
 #[cfg(test)]

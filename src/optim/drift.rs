@@ -168,6 +168,21 @@ impl DriftTables {
         &self.limits[(stamp as usize).min(self.limits.len() - 1)]
     }
 
+    /// The bias corrections of all steps that a direct sum from a state of at most `steps` steps reads, by 1-based step.
+    pub(super) fn bias_until(&self, steps: u32) -> &[[f64; 2]] {
+        &self.bias[..(steps as usize).saturating_add(DIRECT_TERMS + 1).min(self.bias.len())]
+    }
+
+    /// `[step]`, 0-based: factors on the rate of the means; the last holds from there on.
+    pub(super) fn means_factors(&self) -> &[f64] {
+        &self.means_factor
+    }
+
+    /// `[j]`: beta1^j, sqrt(beta2^j), for the terms of the direct sum.
+    pub(super) fn decay_powers(&self) -> &[[f64; 2]] {
+        &self.decay_powers[..=DIRECT_TERMS]
+    }
+
     /// 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) for the 1-based step t.
     pub(crate) fn bias(&self, t: u32) -> [f64; 2] {
         self.bias[(t as usize).min(self.bias.len() - 1)]

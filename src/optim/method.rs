@@ -1,4 +1,4 @@
-//! The three ways of handling optimizer steps without a gradient.
+//! The three ways of handling optimizer steps without a gradient, and where the optimizer runs.
 
 /// How a step treats rows without a gradient.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -11,4 +11,29 @@ pub enum Method {
     /// They never take it: values and moments stay as their last gradient left them. This is not Adam; trainers with
     /// "sparse" or "selective" optimizers do it.
     Sparse,
+}
+
+/// Where rows are gathered and updated. Another place gives another rounding, so it belongs to the run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum OptimizerPlace {
+    /// In host memory, whatever device renders.
+    #[default]
+    Host,
+    /// On the device that renders, in pages that stay there as long as there is room.
+    Device,
+}
+
+impl OptimizerPlace {
+    /// The name on the command line and in config.toml.
+    pub fn name(self) -> &'static str {
+        match self {
+            OptimizerPlace::Host => "host",
+            OptimizerPlace::Device => "device",
+        }
+    }
+
+    /// The place of a name.
+    pub fn from_name(name: &str) -> Option<OptimizerPlace> {
+        [OptimizerPlace::Host, OptimizerPlace::Device].into_iter().find(|place| place.name() == name)
+    }
 }

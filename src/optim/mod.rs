@@ -11,6 +11,7 @@ mod eights;
 pub(crate) mod lanes;
 pub mod method;
 pub mod moments;
+mod numbers;
 pub mod rates;
 mod row_kernels;
 mod row_vectors;

@@ -74,6 +74,8 @@ pub struct Pager {
     pub(super) transfers: Transfers,
     /// Next uses of the pages that the present step still needs, where it walks its view in batches.
     pub(super) uses_in_step: BTreeMap<PageNo, u32>,
+    /// Pinned pages that no batch uses: a tier above has newer bytes of them.
+    pub(super) held: usize,
 }
 
 impl Pager {
@@ -95,6 +97,7 @@ impl Pager {
             counters: Counters::default(),
             transfers: Transfers::default(),
             uses_in_step: BTreeMap::new(),
+            held: 0,
             config,
         }
     }
@@ -308,6 +311,20 @@ impl Pager {
         }
     }
 
+    /// Takes over the entry of a page that stays pinned: its new bounds count from now on.
+    pub fn note_meta(&mut self, pinned: &PinnedPage) {
+        debug_assert!(
+            pinned.dirty || pinned.meta == *self.index.meta(pinned.page),
+            "a page whose entry changes is dirty"
+        );
+        self.index.set_meta(pinned.page, pinned.meta);
+    }
+
+    /// Says how many pinned pages no batch uses: the largest number of pinned pages is counted without them.
+    pub fn set_held(&mut self, pages: usize) {
+        self.held = pages;
+    }
+
     /// The counters, over all lives of the run.
     pub fn stats(&self) -> PagerStats {
         self.counters.total(self.mover.traffic())
@@ -352,11 +369,12 @@ impl Pager {
     }
 
     pub(super) fn count_pinned(&mut self) {
-        self.counters.stats.pinned_max = self.counters.stats.pinned_max.max(self.frames.count(FrameState::Pinned));
+        let pinned = self.frames.count(FrameState::Pinned).saturating_sub(self.held);
+        self.counters.stats.pinned_max = self.counters.stats.pinned_max.max(pinned);
     }
 
     /// The next use of a page: in the present step if it walks its view in batches, else the first planned step.
-    pub(super) fn next_use(&self, page: PageNo) -> u32 {
+    pub fn next_use(&self, page: PageNo) -> u32 {
         self.uses_in_step.get(&page).copied().unwrap_or_else(|| self.look_ahead.views.next_use(page))
     }
 

@@ -254,7 +254,7 @@ impl Renderer for CpuRenderer {
     }
 
     fn rows_in(&mut self, rows: &Columns) -> Result<(), RenderError> {
-        let (ViewOptions { camera, options }, place) = self.sequence.rows_in(rows)?;
+        let (ViewOptions { camera, options }, place) = self.sequence.rows_in(rows.rows(), rows.sh_degree)?;
         let RenderOptions { eps2d, sh_degree, simd, .. } = options;
         let Self { clock, projected, colors, .. } = self;
         clock.time("project_fwd", || project_fwd(rows, &camera, eps2d, simd, place.start, projected));
@@ -357,7 +357,7 @@ impl Renderer for CpuRenderer {
     }
 
     fn rows_out(&mut self, batch: usize, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError> {
-        let (ViewOptions { camera, options }, place) = self.sequence.rows_out(batch, rows)?;
+        let (ViewOptions { camera, options }, place) = self.sequence.rows_out(batch, rows.rows())?;
         let RenderOptions { eps2d, sh_degree, simd, .. } = options;
         self.note_bytes();
         let colors_at = self.colors_of(place.clone());

@@ -1,7 +1,8 @@
 //! [`GpuRenderer`]: the stages of a view on a GPU, forward and backward, one view at a time.
 //!
 //! Not here: the recording of each stage (`gpu_rows`, `gpu_tiles`, `gpu_tiles_bwd`, `gpu_loss`), rows in chunks
-//! (`gpu_segments`, `gpu_gradients`), the picture in ranges of tiles (`gpu_ranges`), the device and its memory (`crate::gpu`).
+//! (`gpu_segments`, `gpu_gradients`), pages on the device (`gpu_paged`), the picture in ranges of tiles (`gpu_ranges`), the device
+//! and its memory (`crate::gpu`).
 //!
 //! # Memory
 //! The ordinary view keeps its rows and tile lists on the device. A buffer that the budget or the device refuses costs first
@@ -34,22 +35,27 @@
 //! The device is therefore idle only between two steps. The optimizer has just rewritten every row in view, and the
 //! cull of the next view reads the new means, so the next upload cannot start earlier. Rows of the next view that the
 //! current view does not see have known values (a function of the stored state and the step), but their list also needs
-//! the cull. Early upload of those rows belongs to a future device tier that keeps rows on the device. The next photo
-//! is known, but its upload in `loss` already costs no time.
+//! the cull. The next photo is known, but its upload in `loss` already costs no time.
 //!
-//! Invariants: 1. the device holds the rows, lists and picture of the last view only; 2. the same input gives the same
+//! All of this holds while the host has the rows. A device that holds pages ([`super::pages`]) uploads 4 p bytes of photo, some
+//! 50 KB of tables and uniforms, and the payloads that it lacks; it downloads 52 bytes a page. It waits for the number of listed
+//! rows, the two counts, and the results of the pages.
+//!
+//! Invariants: 1. of views, the device holds the rows, lists and picture of the last one only; 2. the same input gives the same
 //! bits on the same device; 3. no result comes from buffers that were too small: the frame and its loss are recorded
 //! again with larger buffers; 4. after a device error there is no view until the next `begin_view`.
 
 use super::device_needs::ViewSizes;
 use super::gpu_gradients::{RowGradients, RowsOut, Scratch, check_room};
 use super::gpu_loss::{LossStage, value};
+use super::gpu_pages::{DevicePages, PagesView};
 use super::gpu_ranges::{PLACE_BYTES, RangeStages, Ranges};
-use super::gpu_rows::{DeviceColumns, RowStages, SplatRows};
+use super::gpu_rows::{DeviceColumns, HostRows, RowSource, RowStages, SplatRows};
 use super::gpu_segments::{self, Segment};
 use super::gpu_tiles::{Blend, Demand, Pixels, TileStages, splat_bytes};
 use super::gpu_tiles_bwd::{Fold, PictureGradientBuffers};
 use super::gpu_view::{DemandState, Lists, Loss, LossSums, RowsIn, Unusable, View, WholeLists, WholeRows, blend_of};
+use super::pages::PageRenderer;
 use super::sequence::{Sequence, ViewOptions};
 use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches};
 use crate::gpu::{Buffer, DeviceKind, Gpu, GpuError, GpuResult, Recorder, Traffic};
@@ -65,14 +71,18 @@ use std::ops::Range;
 /// Renders views on a GPU.
 #[derive(Debug)]
 pub struct GpuRenderer {
-    gpu: Gpu,
-    rows: RowStages,
-    tiles: TileStages,
+    pub(super) gpu: Gpu,
+    pub(super) rows: RowStages,
+    pub(super) tiles: TileStages,
     ranges: RangeStages,
     loss: LossStage,
-    sequence: Sequence,
+    pub(super) sequence: Sequence,
     rows_in: Option<RowsIn>,
-    view: Option<View>,
+    pub(super) view: Option<View>,
+    /// The pages of a run, if this device holds them.
+    pub(super) pages: Option<Box<DevicePages>>,
+    /// What the view knows of the pages that its rows come from.
+    pub(super) pages_view: Option<PagesView>,
     image: Image,
     /// The gradient of the picture, valid if `gradient_on_host`.
     gradient: PictureGradient,
@@ -101,6 +111,8 @@ impl GpuRenderer {
             sequence: Sequence::default(),
             rows_in: None,
             view: None,
+            pages: None,
+            pages_view: None,
             image: Image::default(),
             gradient: PictureGradient::default(),
             gradient_on_host: false,
@@ -161,14 +173,14 @@ impl GpuRenderer {
     }
 
     /// Drops the view and its device memory.
-    fn drop_view(&mut self) {
+    pub(super) fn drop_view(&mut self) {
         self.sequence.drop_view();
-        (self.rows_in, self.view) = (None, None);
+        (self.rows_in, self.view, self.pages_view) = (None, None, None);
     }
 
     /// Runs a stage on a view with a picture. A stage that lacks device memory runs again while the view can give some back. A
     /// failed stage drops the view.
-    fn with_view<T>(
+    pub(super) fn with_view<T>(
         &mut self,
         call: &'static str,
         mut stage: impl FnMut(&mut Self, &mut View) -> Result<T, RenderError>,
@@ -235,27 +247,14 @@ impl GpuRenderer {
         room.saturating_sub(reserved).max(room / 8)
     }
 
-    /// Submits upload, projection and depth sort of the rows; records upload and evaluation of colours. Does not wait.
-    fn submit_whole(&mut self, rows: &Columns, view: &ViewOptions) -> GpuResult<RowsIn> {
-        let (gpu, ViewOptions { camera, options }) = (&self.gpu, view);
-        // `Sequence::rows_in` has checked that the count fits.
-        let (count, all) = (rows.rows() as u32, 0..rows.rows());
-        let columns = DeviceColumns::new(gpu, count, options.sh_degree)?;
-        let splats = gpu.buffer("splats", splat_bytes(count))?;
-        let mut recorder = gpu.begin("forward");
-        columns.upload_geometry(&mut recorder, rows, &all)?;
-        let into = SplatRows::from(&splats);
-        self.rows.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, into)?;
-        let grid = Grid::new(camera.width, camera.height);
-        let ranks = self.tiles.order(gpu, &mut recorder, &splats.view(), count, grid, TileRange::all(grid))?;
-        gpu.submit(recorder)?;
-        // The device projects and sorts during the upload of the colours, four fifths of a row.
-        let mut recorder = gpu.begin("forward");
-        columns.upload_colors(&mut recorder, rows, &all, &mut self.scratch.band)?;
-        self.rows.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, into)?;
-        let whole = Box::new(WholeRows { columns, ranks, colors: recorder.set_aside() });
-        let segment = Segment { first: 0, rows: count, splats, v_splats: None };
-        Ok(RowsIn { segments: vec![segment], whole: Some(whole) })
+    /// Appends the rows of a batch to those of the view; drops the view if they could not be submitted.
+    pub(super) fn append(&mut self, submitted: GpuResult<RowsIn>) -> GpuResult<()> {
+        let rows = submitted.inspect_err(|_| self.drop_view())?;
+        match (&mut self.rows_in, rows.whole.is_some()) {
+            (Some(before), false) => before.segments.extend(rows.segments),
+            _ => self.rows_in = Some(rows),
+        }
+        Ok(())
     }
 
     /// Submits what is recorded of the rows, the tile lists and the blending. Waits only if the lists do not fit at once.
@@ -527,6 +526,52 @@ impl GpuRenderer {
     }
 }
 
+/// Submits rows, projection and depth sort of a view of one batch; records the colours. Does not wait.
+fn submit_whole(
+    (gpu, stages, tiles): (&Gpu, &RowStages, &TileStages),
+    rows: &mut dyn RowSource,
+    view: &ViewOptions,
+) -> GpuResult<RowsIn> {
+    let ViewOptions { camera, options } = view;
+    // `Sequence::rows_in` has checked that the count fits.
+    let (count, all) = (rows.rows() as u32, 0..rows.rows());
+    let columns = DeviceColumns::new(gpu, count, options.sh_degree)?;
+    let splats = gpu.buffer("splats", splat_bytes(count))?;
+    let mut recorder = gpu.begin("forward");
+    rows.geometry(gpu, &mut recorder, &columns, &all)?;
+    let into = SplatRows::from(&splats);
+    stages.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, into)?;
+    let grid = Grid::new(camera.width, camera.height);
+    let ranks = tiles.order(gpu, &mut recorder, &splats.view(), count, grid, TileRange::all(grid))?;
+    gpu.submit(recorder)?;
+    // The device projects and sorts during the upload of the colours, four fifths of a row.
+    let mut recorder = gpu.begin("forward");
+    rows.colors(&mut recorder, &columns, &all)?;
+    stages.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, into)?;
+    let whole = Box::new(WholeRows { columns, ranks, colors: recorder.set_aside() });
+    let segment = Segment { first: 0, rows: count, splats, v_splats: None };
+    Ok(RowsIn { segments: vec![segment], whole: Some(whole) })
+}
+
+/// Submits the rows of a batch, which begins at row `first` of the view: in one piece if `is_whole` and memory allow, else in
+/// chunks.
+pub(super) fn submit_batch(
+    (gpu, stages, tiles): (&Gpu, &RowStages, &TileStages),
+    rows: &mut dyn RowSource,
+    view: &ViewOptions,
+    first: usize,
+    is_whole: bool,
+) -> GpuResult<RowsIn> {
+    if is_whole {
+        match submit_whole((gpu, stages, tiles), rows, view) {
+            Err(error) if error.lacks_room() => {}
+            submitted => return submitted,
+        }
+    }
+    let segments = gpu_segments::submit_rows(gpu, stages, rows, first, view)?;
+    Ok(RowsIn { segments, whole: None })
+}
+
 impl Renderer for GpuRenderer {
     fn name(&self) -> &'static str {
         "gpu"
@@ -577,25 +622,16 @@ impl Renderer for GpuRenderer {
     }
 
     fn rows_in(&mut self, rows: &Columns) -> Result<(), RenderError> {
-        let (view, place) = self.sequence.rows_in(rows)?;
-        if self.sequence.batches() == Some(RowBatches::One) {
-            match self.submit_whole(rows, &view) {
-                Ok(submitted) => {
-                    self.rows_in = Some(submitted);
-                    return Ok(());
-                }
-                Err(error) if error.lacks_room() => {}
-                Err(error) => {
-                    self.drop_view();
-                    return Err(error.into());
-                }
-            }
-        }
-        let band = &mut self.scratch.band;
-        let segments = gpu_segments::submit_rows(&self.gpu, &self.rows, rows, place.start, &view, band);
-        let segments = segments.inspect_err(|_| self.drop_view())?;
-        self.rows_in.get_or_insert_default().segments.extend(segments);
-        Ok(())
+        let (view, place) = self.sequence.rows_in(rows.rows(), rows.sh_degree)?;
+        let mut source = HostRows { rows, band: &mut self.scratch.band };
+        let is_whole = self.sequence.batches() == Some(RowBatches::One);
+        let stages = (&self.gpu, &self.rows, &self.tiles);
+        let submitted = submit_batch(stages, &mut source, &view, place.start, is_whole);
+        Ok(self.append(submitted)?)
+    }
+
+    fn pages(&mut self) -> Option<&mut dyn PageRenderer> {
+        Some(self)
     }
 
     fn picture(&mut self) -> Result<(), RenderError> {
@@ -667,7 +703,7 @@ impl Renderer for GpuRenderer {
     }
 
     fn rows_out(&mut self, batch: usize, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError> {
-        let (_, place) = self.sequence.rows_out(batch, rows)?;
+        let (_, place) = self.sequence.rows_out(batch, rows.rows())?;
         self.with_view("rows_out", |renderer, view| renderer.rows_out_of(view, rows, &place, grads))
     }
 

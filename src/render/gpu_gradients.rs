@@ -37,8 +37,10 @@ impl Scratch {
 
 /// Device memory of the gradients of rows.
 pub(super) struct RowGradients {
-    columns: DeviceColumns,
-    footprints: Buffer,
+    /// Gradients of the columns.
+    pub columns: DeviceColumns,
+    /// Gradient of the projected mean, and radii ([`super::gpu_rows::footprint_bytes`] a row).
+    pub footprints: Buffer,
 }
 
 impl RowGradients {
@@ -159,6 +161,23 @@ impl RowsOut<'_> {
             [&segment.splats, gradients_of(segment)?].map(|buffer| SplatRows::from_row(buffer, part.start as u64));
         let readbacks = self.submit(recorder, &columns, splats, &room)?;
         self.read(readbacks, &of_batch, grads, scratch)
+    }
+
+    /// Records the gradients of rows whose columns are on the device, for an update there.
+    ///
+    /// # Errors
+    /// The device failed.
+    pub fn record(
+        &self,
+        recorder: &mut Recorder<'_>,
+        columns: &DeviceColumns,
+        [splats, v_splats]: [SplatRows<'_>; 2],
+        RowGradients { columns: grads, footprints }: &RowGradients,
+    ) -> GpuResult<()> {
+        let (gpu, stages, ViewOptions { camera, options }) = (self.gpu, self.stages, self.view);
+        let weighs = self.weighs;
+        stages.sh_bwd(gpu, recorder, camera, options.sh_degree, columns, splats, v_splats, grads)?;
+        stages.project_bwd(gpu, recorder, camera, options.eps2d, columns, splats, v_splats, grads, footprints, weighs)
     }
 
     /// Submits the stages on rows and the readbacks of the gradients. Does not wait. The work that `recorder` brings along is

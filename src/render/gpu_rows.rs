@@ -146,6 +146,59 @@ pub fn band_into_sh_n(values: &[f32], part: &Range<usize>, band: usize, rows: &m
     }
 }
 
+/// Where the columns of the rows of a batch come from.
+pub trait RowSource {
+    /// Rows of the batch.
+    fn rows(&self) -> usize;
+
+    /// Records what fills means, quats, scales and opacities of `columns` with the rows `part` of the batch, and
+    /// perhaps the colours.
+    ///
+    /// # Errors
+    /// The device failed.
+    fn geometry(
+        &mut self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        columns: &DeviceColumns,
+        part: &Range<usize>,
+    ) -> GpuResult<()>;
+
+    /// Records what fills the colours, if [`RowSource::geometry`] has not.
+    ///
+    /// # Errors
+    /// The device failed.
+    fn colors(&mut self, recorder: &mut Recorder<'_>, columns: &DeviceColumns, part: &Range<usize>) -> GpuResult<()>;
+}
+
+/// Rows that the host gives.
+pub(super) struct HostRows<'a> {
+    /// The rows of the batch.
+    pub rows: &'a Columns,
+    /// Memory for one SH band.
+    pub band: &'a mut Vec<f32>,
+}
+
+impl RowSource for HostRows<'_> {
+    fn rows(&self) -> usize {
+        self.rows.rows()
+    }
+
+    fn geometry(
+        &mut self,
+        _: &Gpu,
+        recorder: &mut Recorder<'_>,
+        columns: &DeviceColumns,
+        part: &Range<usize>,
+    ) -> GpuResult<()> {
+        columns.upload_geometry(recorder, self.rows, part)
+    }
+
+    fn colors(&mut self, recorder: &mut Recorder<'_>, columns: &DeviceColumns, part: &Range<usize>) -> GpuResult<()> {
+        columns.upload_colors(recorder, self.rows, part, self.band)
+    }
+}
+
 /// Splat records, or their gradients, of consecutive rows from a row of a buffer on.
 #[derive(Debug, Clone, Copy)]
 pub struct SplatRows<'a> {
@@ -172,13 +225,16 @@ impl<'a> From<&'a Buffer> for SplatRows<'a> {
 
 /// A range of rows that one binding covers.
 #[derive(Debug, Clone, Copy)]
-struct Window {
-    first: u64,
-    rows: u32,
+pub(super) struct Window {
+    /// First row.
+    pub first: u64,
+    /// Rows.
+    pub rows: u32,
 }
 
 impl Window {
-    fn of(self, buffer: &Buffer, row_bytes: u64) -> BufferView {
+    /// The window's part of a buffer of `row_bytes` bytes a row.
+    pub fn of(self, buffer: &Buffer, row_bytes: u64) -> BufferView {
         buffer.slice(self.first * row_bytes, u64::from(self.rows) * row_bytes)
     }
 }
@@ -193,7 +249,7 @@ struct WindowViews {
 }
 
 /// Splits `rows` rows into windows so that no binding of `row_bytes` per row exceeds the device's limit.
-fn windows(gpu: &Gpu, rows: u32, row_bytes: u64) -> impl Iterator<Item = Window> {
+pub(super) fn windows(gpu: &Gpu, rows: u32, row_bytes: u64) -> impl Iterator<Item = Window> {
     let rows = u64::from(rows);
     let most = (gpu.max_binding_bytes() / row_bytes).min(gpu.window_rows());
     let step = (most / WINDOW_STEP * WINDOW_STEP).max(WINDOW_STEP);

@@ -8,11 +8,10 @@
 //!
 //! Invariant: splats have the same bits for any cut of the rows into batches, segments and chunks.
 
-use super::gpu_rows::{DeviceColumns, RowStages, SPLAT_BYTES, SplatRows, WINDOW_STEP};
+use super::gpu_rows::{DeviceColumns, RowSource, RowStages, SPLAT_BYTES, SplatRows, WINDOW_STEP};
 use super::gpu_tiles::splat_bytes;
 use super::sequence::ViewOptions;
 use crate::gpu::{Buffer, Gpu, GpuError, GpuResult};
-use crate::scene::columns::Columns;
 use std::ops::Range;
 
 /// Rows of the smallest chunk, and the multiple at which a chunk begins.
@@ -50,17 +49,16 @@ pub(super) fn in_chunks(rows: usize, mut stage: impl FnMut(Range<usize>) -> GpuR
     Ok(())
 }
 
-/// Submits upload, projection and colours of the rows of a batch, which begins at row `first` of the view. Does not wait.
+/// Submits gathering, projection and colours of the rows of a batch, which begins at row `first` of the view. Does not wait.
 ///
 /// # Errors
 /// The device failed, or has no memory for the splats or the smallest chunk.
 pub(super) fn submit_rows(
     gpu: &Gpu,
     stages: &RowStages,
-    rows: &Columns,
+    rows: &mut dyn RowSource,
     first: usize,
     view: &ViewOptions,
-    scratch: &mut Vec<f32>,
 ) -> GpuResult<Vec<Segment>> {
     let most = ((gpu.max_binding_bytes() / SPLAT_BYTES) as usize / CHUNK_STEP * CHUNK_STEP).max(CHUNK_STEP);
     let mut segments = Vec::new();
@@ -71,7 +69,7 @@ pub(super) fn submit_rows(
         in_chunks(count as usize, |part| {
             let rows_of_part = begin + part.start..begin + part.end;
             let splats = SplatRows::from_row(&splats, part.start as u64);
-            submit_chunk(gpu, stages, rows, &rows_of_part, view, splats, scratch)
+            submit_chunk(gpu, stages, rows, &rows_of_part, view, splats)
         })?;
         segments.push(Segment { first: first + begin, rows: count, splats, v_splats: None });
     }
@@ -82,17 +80,16 @@ pub(super) fn submit_rows(
 fn submit_chunk(
     gpu: &Gpu,
     stages: &RowStages,
-    rows: &Columns,
+    rows: &mut dyn RowSource,
     part: &Range<usize>,
     ViewOptions { camera, options }: &ViewOptions,
     splats: SplatRows<'_>,
-    scratch: &mut Vec<f32>,
 ) -> GpuResult<()> {
     let columns = DeviceColumns::new(gpu, part.len() as u32, options.sh_degree)?;
     let mut recorder = gpu.begin("forward");
-    columns.upload_geometry(&mut recorder, rows, part)?;
+    rows.geometry(gpu, &mut recorder, &columns, part)?;
     stages.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, splats)?;
-    columns.upload_colors(&mut recorder, rows, part, scratch)?;
+    rows.colors(&mut recorder, &columns, part)?;
     stages.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, splats)?;
     gpu.submit(recorder).map(|_| ())
 }

@@ -3,7 +3,7 @@
 //!
 //! [`Renderer`] is the interface of every backend: the stages of one view, in order, on batches of rows. The CPU
 //! backend is [`cpu`]. The device backend is [`gpu`], with its stages in `gpu_rows`, `gpu_tiles`, `gpu_tiles_bwd` and
-//! `gpu_loss`. The kernels themselves are in [`crate::kernels`] and `shaders/`.
+//! `gpu_loss`. A device that also holds the pages of a run is a [`pages::PageRenderer`]. The kernels themselves are in [`crate::kernels`] and `shaders/`.
 
 pub mod color_correct;
 pub mod cpu;
@@ -16,6 +16,10 @@ mod gpu_gradients;
 #[cfg(feature = "gpu")]
 pub mod gpu_loss;
 #[cfg(feature = "gpu")]
+mod gpu_paged;
+#[cfg(feature = "gpu")]
+pub mod gpu_pages;
+#[cfg(feature = "gpu")]
 mod gpu_range_plan;
 #[cfg(feature = "gpu")]
 mod gpu_ranges;
@@ -24,6 +28,8 @@ pub mod gpu_rows;
 #[cfg(feature = "gpu")]
 mod gpu_segments;
 #[cfg(feature = "gpu")]
+pub mod gpu_slots;
+#[cfg(feature = "gpu")]
 pub mod gpu_tiles;
 #[cfg(feature = "gpu")]
 pub mod gpu_tiles_bwd;
@@ -31,6 +37,7 @@ pub mod gpu_tiles_bwd;
 mod gpu_view;
 pub mod lpips;
 pub mod metrics;
+pub mod pages;
 mod sequence;
 pub mod view_sizes;
 
@@ -165,6 +172,18 @@ pub enum RenderError {
         /// Pixels of the picture.
         pixels: usize,
     },
+    /// Pages or an optimizer were asked of a backend that has neither.
+    #[error("the {backend} backend holds no pages of this run")]
+    NoPages {
+        /// Name of the backend.
+        backend: &'static str,
+    },
+    /// The device has no memory for a single page.
+    #[error("the device has no memory for a page of {bytes} bytes beside a view")]
+    NoSlots {
+        /// Bytes of a page.
+        bytes: u64,
+    },
     /// The device failed, or the view exceeds a limit of the device. The error names the stage or buffer.
     #[error(transparent)]
     Device(#[from] GpuError),
@@ -184,6 +203,8 @@ impl RenderError {
                 Some("update the graphics driver if this happens again, or render with --device cpu")
             }
             RenderError::Device(_) => Some("render with --device cpu, and report a bug"),
+            RenderError::NoPages { .. } => Some("train with --optimizer-on host"),
+            RenderError::NoSlots { .. } => Some("raise --device-mem, or train with --optimizer-on host"),
             _ => Some(
                 "make the photos smaller with --max-resolution or --data-factor; if they are not large, report a bug",
             ),
@@ -219,6 +240,11 @@ pub trait Renderer: Send {
     /// Bytes transferred to and from the device so far, and device memory; zeros for a backend without a device.
     fn traffic(&self) -> Traffic {
         Traffic::default()
+    }
+
+    /// The backend as one that can hold pages; `None` for a backend without a device.
+    fn pages(&mut self) -> Option<&mut dyn pages::PageRenderer> {
+        None
     }
 
     /// Host memory that the renderer holds, bytes.

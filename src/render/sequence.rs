@@ -9,7 +9,6 @@
 use super::{PictureGradient, RenderError, RenderOptions, RowBatches};
 use crate::kernels::splats::Grid;
 use crate::scene::camera::Camera;
-use crate::scene::columns::Columns;
 use crate::scene::image::Target;
 use std::ops::Range;
 
@@ -74,25 +73,30 @@ impl Sequence {
         self.current.as_ref().map(|current| current.batches)
     }
 
+    /// Camera and options of the view; `None` without a view.
+    pub fn view(&self) -> Option<ViewOptions> {
+        self.current.as_ref().map(|current| current.view)
+    }
+
     /// Drops the view.
     #[cfg(feature = "gpu")]
     pub fn drop_view(&mut self) {
         self.current = None;
     }
 
-    /// Checks `rows_in`. Returns the view and the range of the batch in the view's rows.
-    pub fn rows_in(&mut self, rows: &Columns) -> Result<(ViewOptions, Range<usize>), RenderError> {
+    /// Checks `rows_in` of a batch of `rows` rows that are stored with `sh_degree`. Returns the view and the range of the batch in the view's rows.
+    pub fn rows_in(&mut self, rows: usize, sh_degree: u8) -> Result<(ViewOptions, Range<usize>), RenderError> {
         let Some(current) = &mut self.current else { return out_of_order("rows_in", "begin_view") };
         let is_full = current.batches == RowBatches::One && !current.ends.is_empty();
         if current.progress != Progress::Rows || is_full {
             return out_of_order("rows_in", "begin_view: all batches of this view were given already");
         }
         let asked = current.view.options.sh_degree;
-        if asked > rows.sh_degree {
-            return Err(RenderError::ShDegree { asked, stored: rows.sh_degree });
+        if asked > sh_degree {
+            return Err(RenderError::ShDegree { asked, stored: sh_degree });
         }
         let first = current.ends.last().copied().unwrap_or(0);
-        let end = first + rows.rows();
+        let end = first + rows;
         if end >= u32::MAX as usize {
             return Err(RenderError::TooManyRows(end));
         }
@@ -172,17 +176,17 @@ impl Sequence {
     }
 
     /// Checks `rows_out`. Returns the view and the range of the batch in the view's rows.
-    pub fn rows_out(&mut self, batch: usize, rows: &Columns) -> Result<(ViewOptions, Range<usize>), RenderError> {
+    pub fn rows_out(&mut self, batch: usize, rows: usize) -> Result<(ViewOptions, Range<usize>), RenderError> {
         let current = match &mut self.current {
             Some(current) if current.progress == Progress::SplatGradients => current,
             _ => return out_of_order("rows_out", "picture_back"),
         };
         let Some(&end) = current.ends.get(batch) else {
-            return Err(RenderError::BatchRows { batch, given: rows.rows() });
+            return Err(RenderError::BatchRows { batch, given: rows });
         };
         let first = if batch == 0 { 0 } else { current.ends[batch - 1] };
-        if end - first != rows.rows() {
-            return Err(RenderError::BatchRows { batch, given: rows.rows() });
+        if end - first != rows {
+            return Err(RenderError::BatchRows { batch, given: rows });
         }
         if std::mem::replace(&mut current.is_out[batch], true) {
             return out_of_order("rows_out", "picture_back: this batch was processed already");

@@ -47,6 +47,23 @@ pub struct Frustum {
     reach: [f32; 2],
 }
 
+/// The row test of a [`Frustum`] as numbers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FrustumNumbers {
+    /// Rows of the pose.
+    pub viewmat: [[f32; 4]; 3],
+    /// Slopes of the planes at x low, x high, y low, y high; positive outwards.
+    pub slopes: [f32; 4],
+    /// Reach of a footprint beyond its mean in x and y, in sigmas.
+    pub reach: [f32; 2],
+    /// Near and far plane.
+    pub depth_range: [f32; 2],
+    /// Rounding slack of a camera coordinate: a constant part, and a factor on |x| + |y| + |z|.
+    pub slack: [f32; 2],
+    /// Factor on the slack for the side planes.
+    pub side_slack: f32,
+}
+
 impl Frustum {
     /// The half-spaces of a camera whose pose is a rotation and a translation.
     pub fn new(camera: &Camera) -> Self {
@@ -78,6 +95,18 @@ impl Frustum {
     fn steepest(&self) -> f32 {
         let slopes = &self.slopes;
         slopes[0].abs().max(slopes[1].abs()).max(slopes[2].abs()).max(slopes[3].abs())
+    }
+
+    /// The numbers of the row test, for devices.
+    pub fn numbers(&self) -> FrustumNumbers {
+        FrustumNumbers {
+            viewmat: self.viewmat,
+            slopes: self.slopes,
+            reach: self.reach,
+            depth_range: [self.near, self.far],
+            slack: [POSITION_SLACK * self.translation, POSITION_SLACK],
+            side_slack: 1.0 + self.steepest(),
+        }
     }
 
     /// Whether a row at `p` with this largest sigma may be drawn. NaN counts as drawn.

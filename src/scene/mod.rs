@@ -8,6 +8,7 @@ pub mod image;
 pub mod init;
 pub mod log_scales;
 pub mod neighbours;
+pub mod optimizer_numbers;
 pub mod page_layout;
 pub mod page_meta;
 pub mod page_split;

@@ -244,6 +244,7 @@ impl Checkpoint {
     fn begin(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         let Some(origin) = &self.origin else { return Ok(()) };
         let cut = Instant::now();
+        trainer.drain()?;
         let pager_seconds = trainer.scene.pager.commit_seconds();
         let state = trainer.run_state(origin, metrics.sync()?);
         let run_state = bytes_of(&state)?;
@@ -287,6 +288,7 @@ impl Checkpoint {
             return Ok(());
         }
         let cut = Instant::now();
+        trainer.drain()?;
         self.beside = None;
         self.make_first(trainer)?;
         let name = self.name.clone();

@@ -4,6 +4,7 @@
 //! the largest view for the frames of a budget, a small enough view for timing; 3. pages and bounds equal those at the
 //! start of a run.
 
+use super::batch::HostRows;
 use super::comparison::Comparison;
 use super::error::TrainError;
 use super::largest_view::largest_view;
@@ -166,7 +167,7 @@ impl World<'_> {
         let mut step = |number| {
             let (what, how) = ((number, &camera), (&render, &comparison));
             let began = Instant::now();
-            train_step(&mut scene, &mut working, &mut *renderer, what, how, false, usize::MAX)?;
+            train_step(&mut scene, &mut working, &mut HostRows::new(&mut *renderer), what, how, false, usize::MAX)?;
             Ok::<_, TrainError>(began.elapsed().as_secs_f64())
         };
         // The first step allocates memory, so do not time it.

@@ -29,6 +29,7 @@ impl Trainer {
             return Ok(());
         }
         let started = Instant::now();
+        self.drain()?;
         let lost = self.mean_loss(dataset, targets)?;
         let count = [self.scene.rows_bound(), self.state.growth.allowed()];
         self.state.growth.checks.push(rule.check(number, step, count, lost));

@@ -85,6 +85,11 @@ impl PageRules {
         }
     }
 
+    /// Limits within which an unseen row may split.
+    pub(super) fn splits(&self) -> &SplitLimits {
+        &self.splits
+    }
+
     /// Current SH degree, as raised by events.
     pub fn sh_degree(&self) -> u8 {
         self.sh_degree
@@ -104,7 +109,8 @@ impl PageRules {
         PendingEvents::new(&self.adam, self.seed, self.page_rows, &self.events)
     }
 
-    fn is_behind(&self, meta: &PageMeta) -> bool {
+    /// Whether a page has not applied all events.
+    pub(super) fn is_behind(&self, meta: &PageMeta) -> bool {
         (meta.events_applied as usize) < self.events.len()
     }
 

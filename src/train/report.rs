@@ -3,6 +3,7 @@
 //! Invariants: 1. every number written is finite, because JSON has neither infinity nor NaN (see [`json_psnr`]); 2.
 //! whole files appear by rename, so a reader never sees a partial file.
 
+use super::device_tier::SlotTraffic;
 use crate::appearance::AppearanceMode;
 use crate::base::error::{InputError, InputResult};
 use crate::base::machine::process_cpu_seconds;
@@ -72,6 +73,9 @@ pub struct StepLine {
     /// Traffic between the tiers since the start.
     #[serde(flatten)]
     pub tiers: TierTraffic,
+    /// What this process has copied between frames and slots, if pages are on the device.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub slots: Option<SlotTraffic>,
     /// Costs of the commits so far, if any.
     #[serde(flatten, skip_serializing_if = "Option::is_none", default)]
     pub commits: Option<CommitReport>,

@@ -43,6 +43,7 @@ use crate::config::values::Up;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::ply::{ExportFrame, PlyWritten, write_transform};
+use crate::optim::method::OptimizerPlace;
 use crate::page::tool::uncommitted::remove_uncommitted;
 use crate::render::Renderer;
 use crate::report::run_files::{
@@ -203,6 +204,16 @@ pub(super) fn begin(
     let (mut renderer, word) = machine::renderer(config)?;
     // On from here, so that probing allocates what the steps need.
     renderer.weigh_rows(options.strategy.needs_weights())?;
+    if options.optimizer_on == OptimizerPlace::Device && renderer.pages().is_none() {
+        let problem = format!("the {} backend holds no pages", renderer.name());
+        let remedy = "give a GPU with --device, or use --optimizer-on host";
+        return Err(InputError::new("--optimizer-on device", problem, remedy).into());
+    }
+    if options.optimizer_on == OptimizerPlace::Device && options.strategy.needs_weights() {
+        let problem = "a device that updates the pages collects gradients, not the blending weights of Gaussians";
+        let remedy = "use --growth-score gradient with --recycle 0, or --optimizer-on host";
+        return Err(InputError::new("--optimizer-on device", problem, remedy).into());
+    }
     // Without a search for a device, a difference is the noise of the allocator.
     let driver = match config.device {
         Device::Cpu => 0,
@@ -321,7 +332,8 @@ fn spill_dir_flag(request: &RunRequest) -> String {
 fn resolved_config(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
     let view_order = Chosen(Some(trainer.view_order().order()));
     let up = trainer.options.up.map_or(Up::Keep, Up::Along);
-    with_absolute_paths(TrainConfig { view_order, up, ..config.clone() })
+    let optimizer_on = Chosen(Some(trainer.options.optimizer_on));
+    with_absolute_paths(TrainConfig { view_order, up, optimizer_on, ..config.clone() })
 }
 
 /// Writes config.toml (on resume only if it changed); returns the origin for all commits.

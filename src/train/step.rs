@@ -10,17 +10,16 @@
 //! number of threads and frames, and for any cut into batches; 4. an error after the first update of several batches is
 //! [`TrainError::Torn`]: the pages in memory belong to no step then.
 
-use super::batch::{gather, gather_listed, update};
+use super::batch::{AtStep, RowBackend, UpdateCounts};
 use super::comparison::Comparison;
 use super::error::TrainError;
 use super::pages::PagedScene;
 use super::working_set::WorkingSet;
 use crate::base::ids::PageNo;
-use crate::optim::deferred::StepCounts;
 use crate::paging::batches::UseInStep;
 use crate::paging::error::PagingError;
 use crate::paging::pinned::PinnedPage;
-use crate::render::{LossValue, RenderOptions, Renderer, RowBatches};
+use crate::render::{LossValue, RenderOptions, RowBatches};
 use crate::scene::camera::Camera;
 use std::collections::VecDeque;
 
@@ -82,16 +81,17 @@ impl StepOutcome {
 pub fn train_step(
     scene: &mut PagedScene,
     working: &mut WorkingSet,
-    renderer: &mut dyn Renderer,
+    backend: &mut dyn RowBackend,
     (step, camera): (u32, &Camera),
     (render, comparison): (&RenderOptions, &Comparison<'_>),
     collects: bool,
     pages_most: usize,
 ) -> Result<StepOutcome, TrainError> {
-    renderer.weigh_rows(collects && scene.rules.strategy.needs_weights())?;
+    backend.renderer().weigh_rows(collects && scene.rules.strategy.needs_weights())?;
     let pages = scene.pager.begin_view(step, camera)?;
     let (batches, pinned, outcome) = (Vec::new(), Vec::new(), StepOutcome::default());
-    let mut passes = Passes { scene, working, renderer, step, camera, batches, pinned, outcome };
+    let pages_most = pages_most.min(backend.pages_most());
+    let mut passes = Passes { scene, working, backend, step, camera, batches, pinned, outcome };
     let done = passes
         .rows_in(pages, pages_most, render)
         .and_then(|()| passes.picture(comparison))
@@ -114,7 +114,7 @@ struct Batch {
 struct Passes<'a> {
     scene: &'a mut PagedScene,
     working: &'a mut WorkingSet,
-    renderer: &'a mut dyn Renderer,
+    backend: &'a mut dyn RowBackend,
     step: u32,
     camera: &'a Camera,
     /// Batches that are in and not out yet.
@@ -135,16 +135,20 @@ impl Passes<'_> {
         }
         loop {
             let batch: Vec<PageNo> = coming.drain(..per_batch.min(coming.len())).collect();
-            self.pinned = self.scene.pager.pin_batch(self.step, &batch)?;
+            self.pinned = self.backend.pin(self.scene, self.step, &batch, false)?;
             self.prefetch(&coming, per_batch);
-            if let Err(error) = self.scene.apply_pending(&mut self.pinned) {
-                // Parts of pages that split found no frame: a smaller batch leaves more of them.
+            self.backend.before_events(self.scene, &mut self.pinned)?;
+            let applied = self.scene.apply_pending(&mut self.pinned);
+            // Parts of pages that split found no frame, or no slot: a smaller batch leaves more of them.
+            if applied.is_err() || self.pinned.len() > self.backend.pages_most() {
                 let pages: Vec<PageNo> = self.pinned.iter().map(|pinned| pinned.page).collect();
-                if !matches!(error, TrainError::Paging(PagingError::WorkingSet { .. })) || pages.len() < 2 {
-                    return Err(error);
+                if !matches!(applied, Ok(()) | Err(TrainError::Paging(PagingError::WorkingSet { .. })))
+                    || pages.len() < 2
+                {
+                    return applied;
                 }
                 self.release();
-                per_batch = per_batch.min(pages.len()) / 2;
+                per_batch = (per_batch.min(pages.len()) / 2).max(1);
                 pages.into_iter().rev().for_each(|page| coming.push_front(page));
                 self.scene.pager.set_use_in_step(self.step, coming.iter().copied(), UseInStep::Coming);
                 continue;
@@ -160,15 +164,14 @@ impl Passes<'_> {
 
     /// Hands the rows of the pinned batch to the renderer, and unpins the batch unless it is the last one.
     fn batch_in(&mut self, coming: &VecDeque<PageNo>, render: &RenderOptions) -> Result<(), TrainError> {
-        gather(&self.scene.rules, &self.pinned, self.step, self.camera, self.working);
         if self.batches.is_empty() {
             let batches = if coming.is_empty() { RowBatches::One } else { RowBatches::Several };
-            self.renderer.begin_view(self.camera, render, batches)?;
+            self.backend.renderer().begin_view(self.camera, render, batches)?;
         }
-        self.renderer.rows_in(&self.working.columns)?;
+        let at = AtStep { step: self.step, camera: self.camera };
+        self.outcome.rows += self.backend.rows_in(self.scene, &self.pinned, at, self.working)?;
         let with_rows = self.pinned.iter().filter(|pinned| pinned.meta.rows > 0);
         let pages: Vec<PageNo> = with_rows.map(|pinned| pinned.page).collect();
-        self.outcome.rows += self.working.row_from_working.len();
         self.outcome.rows_pinned += self.pinned.iter().map(|pinned| pinned.meta.rows as usize).sum::<usize>();
         self.outcome.pages += self.pinned.len();
         self.outcome.batches += 1;
@@ -184,13 +187,14 @@ impl Passes<'_> {
 
     /// Renders the picture of all splats, and takes its loss back to the splats.
     fn picture(&mut self, comparison: &Comparison<'_>) -> Result<(), TrainError> {
-        self.renderer.picture()?;
+        self.backend.renderer().picture()?;
         // A device may be at work on the picture.
         self.prefetch_before_last();
-        comparison.loss_and_back(self.renderer, &mut self.working.correction)?;
+        comparison.loss_and_back(self.backend.renderer(), &mut self.working.correction)?;
         if self.batches.len() > 1 && !comparison.is_left_out {
             // A drive that is full is found while the step can still be given up.
-            self.scene.pager.reserve_slots(self.batches.iter().map(|batch| batch.pages.len()).sum())?;
+            let of_view: usize = self.batches.iter().map(|batch| batch.pages.len()).sum();
+            self.scene.pager.reserve_slots(of_view + self.backend.pages_held())?;
         }
         Ok(())
     }
@@ -198,7 +202,7 @@ impl Passes<'_> {
     /// Ends the step of a view that is left out: its pages stay as they are.
     fn leave_out(&mut self) -> Result<(), TrainError> {
         self.outcome.is_left_out = true;
-        self.outcome.loss = self.renderer.loss_value()?;
+        self.outcome.loss = self.backend.renderer().loss_value()?;
         let pages = self.batches.drain(..).flat_map(|batch| batch.pages);
         self.scene.pager.set_use_in_step(self.step, pages, UseInStep::Done);
         Ok(())
@@ -214,6 +218,7 @@ impl Passes<'_> {
             match out {
                 Ok(is_done) if is_done => return Ok(()),
                 Ok(_) => is_changed = several,
+                Err(error @ TrainError::Torn { .. }) => return Err(error),
                 Err(error) if is_changed => return Err(TrainError::Torn { source: Box::new(error) }),
                 Err(error) => return Err(error),
             }
@@ -226,30 +231,26 @@ impl Passes<'_> {
     fn batch_out(&mut self, batch: Batch, collects: bool) -> Result<bool, TrainError> {
         let is_first = self.batches.len() + 1 == self.outcome.batches;
         if !is_first {
-            self.pinned = self.scene.pager.pin_batch_again(self.step, &batch.pages)?;
+            self.pinned = self.backend.pin(self.scene, self.step, &batch.pages, true)?;
             self.working.row_from_working = batch.row_from_working;
-            gather_listed(&self.scene.rules, &self.pinned, self.step, self.working);
         }
         self.scene.pager.set_use_in_step(self.step, batch.pages, UseInStep::Done);
         self.prefetch_before_last();
-        let WorkingSet { columns, gradients, .. } = &mut *self.working;
-        self.renderer.rows_out(self.batches.len(), columns, gradients)?;
+        let (number, at) = (self.batches.len(), AtStep { step: self.step, camera: self.camera });
+        self.backend.rows_out(self.scene, (number, !is_first), &self.pinned, at, self.working)?;
         if is_first {
-            self.outcome.loss = self.renderer.loss_value()?;
+            self.outcome.loss = self.backend.renderer().loss_value()?;
             self.outcome.skipped = self.why_skipped()?;
         }
         self.prefetch_before_last();
         if self.outcome.skipped.is_some() {
             return Ok(true);
         }
-        let StepCounts { updated, skipped_non_finite } =
-            update(self.scene, &mut self.pinned, self.step, self.camera, self.working, collects);
-        self.outcome.updated += updated as u64;
-        self.outcome.rows_skipped += skipped_non_finite as u64;
-        if updated == 0 {
-            let radii = &self.working.gradients.radii;
-            self.outcome.drawn += radii.iter().filter(|radii| **radii != [0, 0]).count() as u64;
-        }
+        let UpdateCounts { updated, skipped, drawn } =
+            self.backend.update(self.scene, number, &mut self.pinned, at, self.working, collects)?;
+        self.outcome.updated += updated;
+        self.outcome.rows_skipped += skipped;
+        self.outcome.drawn += drawn;
         Ok(false)
     }
 
@@ -258,7 +259,7 @@ impl Passes<'_> {
         if !self.outcome.loss.loss.is_finite() {
             return Ok(Some(Skipped::Loss));
         }
-        let unusable = self.renderer.unusable_splats()?;
+        let unusable = self.backend.renderer().unusable_splats()?;
         Ok(are_too_many(unusable, self.outcome.rows).then_some(Skipped::Gradients(unusable)))
     }
 
@@ -282,6 +283,6 @@ impl Passes<'_> {
     }
 
     fn release(&mut self) {
-        self.scene.pager.release(std::mem::take(&mut self.pinned));
+        self.backend.release(self.scene, std::mem::take(&mut self.pinned));
     }
 }

@@ -8,9 +8,12 @@
 //! evaluation do not change it; 2. a skipped step changes no row ([`super::step::Skipped`]), and three of them in a row end
 //! the run with the result of the last good step; 3. the events of a step are logged once.
 
+use super::batch::HostRows;
 use super::budget::HostBudget;
 use super::comparison::Comparison;
 use super::dense::settle_all;
+use super::device_rows::DeviceRows;
+use super::device_tier::DeviceTier;
 use super::error::TrainError;
 use super::eval::{EvalRequest, evaluate};
 use super::held_out::HeldOut;
@@ -32,7 +35,7 @@ use crate::dataset::target_cache::TargetCache;
 use crate::densify::growth::GrowthCheck;
 use crate::densify::strategy::RowCount;
 use crate::exchange::ply::{self, PlyMeta};
-use crate::optim::method::Method;
+use crate::optim::method::{Method, OptimizerPlace};
 use crate::outliers::views::ViewOutliers;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::view_sizes::ViewSizes;
@@ -61,6 +64,8 @@ pub struct Trainer {
     pub scene: PagedScene,
     /// The renderer.
     pub renderer: Box<dyn Renderer>,
+    /// The pages on the renderer's device, from the first step of a run that updates them there.
+    pub(super) device: Option<DeviceTier>,
     pub(super) options: RunOptions,
     order: ViewOrder,
     pub(super) train_views: Vec<usize>,
@@ -146,6 +151,7 @@ impl Trainer {
             train_views,
             working: WorkingSet::default(),
             renderer,
+            device: None,
             options,
             state: TrainerState {
                 appearance: AppearanceState::new(&camera_groups),
@@ -174,6 +180,7 @@ impl Trainer {
     /// # Errors
     /// A view cannot be rendered.
     pub fn probe_views(&mut self, dataset: &Dataset, views: &[usize]) -> Result<Probed, TrainError> {
+        self.drain()?;
         let render = self.render_options();
         let (mut probed, mut seconds) = (Probed::default(), Vec::new());
         for &view in views {
@@ -327,15 +334,7 @@ impl Trainer {
         let is_left_out = self.options.robust_views && self.state.outliers.is_named(view);
         let comparison = Comparison { target: &target, loss: self.options.loss, look, is_left_out };
         let stepped = loop {
-            let stepped = train_step(
-                &mut self.scene,
-                &mut self.working,
-                &mut *self.renderer,
-                (self.state.step, &dataset.views[view].camera),
-                (&render, &comparison),
-                self.options.strategy.collects(self.state.step),
-                self.pages_most,
-            );
+            let stepped = self.attempt(&dataset.views[view].camera, (&render, &comparison));
             self.is_torn = matches!(stepped, Err(TrainError::Torn { .. }));
             // A step that lacked frames can be repeated: it only applied pending events.
             match stepped {
@@ -358,6 +357,35 @@ impl Trainer {
         self.judge_views(view, &outcome, &target, dataset);
         self.state.train_seconds += started.elapsed().as_secs_f64();
         Ok(outcome)
+    }
+
+    /// Attempts a step on a view.
+    fn attempt(&mut self, camera: &Camera, how: (&RenderOptions, &Comparison<'_>)) -> Result<StepOutcome, TrainError> {
+        let (step, renderer) = (self.state.step, &mut *self.renderer);
+        let (collects, pages_most) = (self.options.strategy.collects(step), self.pages_most);
+        let (scene, working) = (&mut self.scene, &mut self.working);
+        if self.options.optimizer_on == OptimizerPlace::Host {
+            let mut rows = HostRows::new(renderer);
+            return train_step(scene, working, &mut rows, (step, camera), how, collects, pages_most);
+        }
+        let tier = match &mut self.device {
+            Some(tier) => tier,
+            none => none.insert(DeviceTier::new(scene, renderer, self.options.steps)?),
+        };
+        let mut rows = DeviceRows::new(tier, scene, renderer, step)?;
+        train_step(scene, working, &mut rows, (step, camera), how, collects, pages_most)
+    }
+
+    /// Copies back what is newer on a device than in memory, so that the pages and their histogram are those of the last
+    /// step. Nothing for a run that updates in host memory.
+    ///
+    /// # Errors
+    /// The device failed: the run can go on from its last commit only.
+    pub fn drain(&mut self) -> Result<(), TrainError> {
+        match &mut self.device {
+            Some(tier) => tier.drain(&mut self.scene, &mut *self.renderer),
+            None => Ok(()),
+        }
     }
 
     /// Updates the pager's plan every [`LOOK_AHEAD_EVERY`] steps; doing it at every step would cost too much.
@@ -394,6 +422,9 @@ impl Trainer {
         // An attempt of the coming step has logged them, or an earlier version of the program, right after the step.
         if self.events().events().last().is_some_and(|last| last.step >= step) {
             return Ok(());
+        }
+        if let Some(tier) = self.device.as_ref().filter(|_| self.options.strategy.reads_histogram(step)) {
+            tier.take_bins(&mut self.scene, &mut *self.renderer)?;
         }
         self.check_growth(step, dataset, targets)?;
         let scale = self.options.scene_scale;
@@ -434,6 +465,7 @@ impl Trainer {
         pictures: Option<&Path>,
         progress: &dyn Fn(u32),
     ) -> Result<Option<TestMetrics>, TrainError> {
+        self.drain()?;
         let render = self.render_options();
         let views = dataset.test_views();
         let request = EvalRequest {
@@ -462,6 +494,7 @@ impl Trainer {
             let remedy = "resume the run from its last commit with gsscale-train --resume and the output folder";
             return Err(InputError::new(path, problem, remedy).into());
         }
+        self.drain()?;
         let meta = self.ply_meta(dataset);
         let rows_at_most = self.scene.rows_bound();
         let mut writer = ply::PlyWriter::create(path, self.options.sh_degree, rows_at_most, &meta)?;

@@ -4,6 +4,7 @@
 //! or frames is repeated once they are available, or the run ends with its last good step committed.
 
 use super::checkpoint::Checkpoint;
+use super::device_tier::DeviceTier;
 use super::error::TrainError;
 use super::memory::host_bytes_peak;
 use super::progress::{Progress, Shown};
@@ -101,6 +102,7 @@ impl Trainer {
             bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
             device_bytes_peak: traffic.device_bytes_peak,
             tiers: self.tier_traffic(),
+            slots: self.device.as_ref().map(DeviceTier::traffic),
             commits: outputs.checkpoint.as_deref().map(Checkpoint::report),
             growth: self.growth().last().copied(),
             test: None,

@@ -18,6 +18,7 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::Target;
 use gsscale::scene::state::SceneState;
+use gsscale::train::batch::HostRows;
 use gsscale::train::catch_up::{evaluate_all, gather, visible_rows};
 use gsscale::train::comparison::Comparison;
 use gsscale::train::pages::PagedScene;
@@ -175,7 +176,16 @@ fn no_row_outside_of_the_selected_pages_changes_a_picture() {
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
         let how =
             (&options.render, &Comparison { target: &target, loss: options.loss, look: None, is_left_out: false });
-        train_step(&mut pages, &mut working, &mut renderer, (step, &camera), how, false, usize::MAX).unwrap();
+        train_step(
+            &mut pages,
+            &mut working,
+            &mut HostRows::new(&mut renderer),
+            (step, &camera),
+            how,
+            false,
+            usize::MAX,
+        )
+        .unwrap();
     }
     let mut all = Columns::zeros(0, 0);
     let mut append = |rows: &Columns| {

@@ -7,6 +7,7 @@ mod color_correct;
 mod cull;
 mod deferred;
 mod densify;
+mod device_adam;
 mod gpu_resident;
 mod gpu_runtime;
 mod gradients;

@@ -3,7 +3,7 @@
 
 use gsscale::gpu::{SOURCES, Source, StructLayout, preprocess, validate, variants};
 use gsscale::kernels::uniforms::{LossUniforms, RowsUniforms};
-use gsscale::kernels::{constants, uniforms_tiles};
+use gsscale::kernels::{constants, page_words, uniforms_pages, uniforms_tiles};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use wgpu::naga;
@@ -11,6 +11,12 @@ use wgpu::naga;
 /// Rust twins of the structs that shaders read as uniforms (and of others that are declared in both languages).
 const LAYOUTS: &[&[StructLayout]] = &[
     &[RowsUniforms::LAYOUT, LossUniforms::LAYOUT],
+    &[
+        page_words::DevicePage::LAYOUT,
+        page_words::PageResult::LAYOUT,
+        uniforms_pages::GatherUniforms::LAYOUT,
+        uniforms_pages::UpdateUniforms::LAYOUT,
+    ],
     &[
         uniforms_tiles::ScanUniforms::LAYOUT,
         uniforms_tiles::SortUniforms::LAYOUT,

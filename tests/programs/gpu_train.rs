@@ -14,6 +14,7 @@ use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::Traffic;
 use gsscale::render::gpu::GpuRenderer;
 use gsscale::scene::columns::Column;
+use gsscale::train::batch::HostRows;
 use gsscale::train::comparison::Comparison;
 use gsscale::train::pages::PagedScene;
 use gsscale::train::prepare::{Prepared, prepare};
@@ -272,7 +273,8 @@ fn bits_of_steps(scene: &Path, options: &GpuOptions, capacity: u32) -> Option<(V
         let how =
             (&options.render, &Comparison { target: &target, loss: options.loss, look: None, is_left_out: false });
         let at = (step as u32, &view.camera);
-        let done = train_step(&mut scene, &mut working, &mut renderer, at, how, true, usize::MAX).unwrap();
+        let done =
+            train_step(&mut scene, &mut working, &mut HostRows::new(&mut renderer), at, how, true, usize::MAX).unwrap();
         assert!(done.rows > 900 && done.updated > 300 && done.skipped.is_none(), "{done:?}");
         isects = isects.min(renderer.isects());
         let columns = [&working.columns, &working.gradients.columns];

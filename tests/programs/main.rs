@@ -17,6 +17,7 @@ mod exports;
 mod extremes;
 mod first_hour;
 mod forecast;
+mod gpu_pages;
 mod gpu_train;
 mod growing;
 mod growth;

@@ -20,6 +20,7 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::Target;
 use gsscale::scene::page_layout::capacity_bytes;
+use gsscale::train::batch::HostRows;
 use gsscale::train::comparison::Comparison;
 use gsscale::train::error::TrainError;
 use gsscale::train::pages::PagedScene;
@@ -83,7 +84,7 @@ fn step(scene: &mut PagedScene, step: u32) -> Result<StepOutcome, TrainError> {
     let (mut working, mut renderer) = (WorkingSet::default(), CpuRenderer::new());
     let render = RenderOptions { sh_degree: scene.rules.sh_degree(), ..options.render };
     let how = (&render, &Comparison { target: &target, loss: options.loss, look: None, is_left_out: false });
-    train_step(scene, &mut working, &mut renderer, (step, &camera), how, false, usize::MAX)
+    train_step(scene, &mut working, &mut HostRows::new(&mut renderer), (step, &camera), how, false, usize::MAX)
 }
 
 /// The bits of every row, column by column.

@@ -3,6 +3,7 @@
 
 mod frame;
 mod loss;
+mod pages;
 mod ranges;
 mod rows;
 mod tiles;

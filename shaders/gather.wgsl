@@ -1,0 +1,302 @@
+// Stage "gather": the rows of pages that lie on the device, as they are now. `cull` lists the rows of each page that the
+// camera may draw, `list` packs the lists in the order of the pages, `gather` evaluates a column of the listed rows, and
+// `bounds` finds the bounds of a page after its update. The twin of src/kernels/gather.rs.
+//
+// A payload lies in one slab, and a dispatch works on the pages of one slab. Everything that evaluates a row is in this
+// file, so that one compiled formula decides what is seen, drawn, updated and bounded.
+#import "shared/dispatch.wgsl"
+#import "shared/math.wgsl"
+#import "shared/deferred.wgsl"
+#import "shared/page.wgsl"
+#import "shared/quotient.wgsl"
+#import "shared/workgroup_scan.wgsl"
+
+struct GatherUniforms {
+    /// The half-spaces of the camera (src/scene/frustum.rs): rows of the pose, slopes, reaches, depths.
+    world_to_camera: array<vec4<f32>, 3>,
+    slopes: vec4<f32>,
+    reach: vec2<f32>,
+    depth_range: vec2<f32>,
+    /// Rounding slack of a camera coordinate: a constant part, and a factor on |x| + |y| + |z|.
+    slack: vec2<f32>,
+    /// Factor on the slack for the side planes.
+    side_slack: f32,
+    /// Steps done.
+    now: u32,
+    /// The slab that is bound.
+    slab: u32,
+    page_count: u32,
+    /// Listed rows of this dispatch.
+    row_count: u32,
+    /// Column to evaluate, floats per row of the output, and the first of them in the row of the page.
+    column: u32,
+    width: u32,
+    first_element: u32,
+    /// Base rate of the column.
+    rate: f32,
+    /// Base rates for bounds.
+    means_rate: f32,
+    scales_rate: f32,
+    /// Limits within which rows may split.
+    grow_grad2d: f32,
+    split_scale: f32,
+    split_reach: f32,
+}
+
+@group(0) @binding(0) var<uniform> u: GatherUniforms;
+@group(0) @binding(1) var<storage, read> pages: array<DevicePage>;
+@group(0) @binding(2) var<storage, read> slab: array<u32>;
+@group(0) @binding(3) var<storage, read> tables: array<u32>;
+/// `[missed steps]`: sums of this step.
+@group(0) @binding(4) var<storage, read> recent: array<f32>;
+/// `[page]`: rows that the camera may draw.
+@group(0) @binding(5) var<storage, read_write> counts: array<u32>;
+/// At `first_row` of a page on: the rows that the camera may draw, ascending.
+@group(0) @binding(6) var<storage, read_write> found: array<u32>;
+/// Listed rows of the batch: number of the page, number of the row in it.
+@group(0) @binding(7) var<storage, read_write> rows: array<vec2<u32>>;
+@group(0) @binding(8) var<storage, read_write> out: array<f32>;
+@group(0) @binding(9) var<storage, read_write> results: array<PageResult>;
+
+/// Relative slack of a movement, slack of a value and of a flushed value, as in src/optim/bounds.rs. The slack of values
+/// is twice the CPU's, for devices that divide and take roots less exactly.
+const MOVEMENT_SLACK: f32 = 1e-3;
+const VALUE_SLACK: f32 = 16.0 * 5.9604645e-8;
+const FLUSH_SLACK: f32 = 2.3509887e-38;
+const SIGMA_SLACK: f32 = 4e-6;
+const SIGMA_MOST: f32 = 1e30;
+const REACH_SLACK: f32 = 1.0001;
+const EPSILON: f32 = 1.1920929e-7;
+
+var<workgroup> parts: array<array<f32, 256>, 7>;
+
+fn number(place: u32) -> f32 {
+    return bitcast<f32>(tables[place]);
+}
+
+/// The movement at unit base rate, term by term, smallest terms first.
+fn direct_sum(m: f32, v: f32, stamp: u32, end: u32, of_means: bool) -> f32 {
+    let root = sqrt(v);
+    let terms = min(end - stamp, tables[DIRECT_TERMS]);
+    let bias = tables[BIAS];
+    let bias_last = tables[BIAS_LENGTH] - 1u;
+    let factors = tables[MEANS_FACTOR];
+    let factor_last = tables[MEANS_FACTOR_LENGTH] - 1u;
+    var sum = 0.0;
+    for (var left = terms; left > 0u; left--) {
+        let t = stamp + left;
+        let at = bias + 2u * min(t, bias_last);
+        let power = tables[DECAY_POWERS] + 2u * left;
+        let rate = select(1.0, number(factors + min(t - 1u, factor_last)), of_means);
+        sum += rate * number(at) * number(power) * m / (root * number(power + 1u) * number(at + 1u) + number(EPS));
+    }
+    return sum;
+}
+
+/// The value of a state of `stamp` steps after `end` steps.
+fn evaluate(value: f32, m: f32, v: f32, stamp: u32, end: u32, of_means: bool, rate: f32) -> f32 {
+    if stamp >= end || m == 0.0 {
+        return value;
+    }
+    if v <= number(FLOOR) {
+        return flush(value - direct_sum(m, v, stamp, end, of_means) * rate);
+    }
+    let kind = select(4u, 0u, of_means);
+    var sums: SeriesSums;
+    let missed = end - stamp;
+    if missed < arrayLength(&recent) / SUMS_WORDS {
+        let at = SUMS_WORDS * missed + kind;
+        sums = SeriesSums(recent[at], recent[at + 1u], recent[at + 2u]);
+    } else {
+        let at = tables[LIMITS] + SUMS_WORDS * min(stamp, tables[LIMITS_LENGTH] - 1u) + kind;
+        sums = SeriesSums(number(at), number(at + 1u), number(at + 2u));
+    }
+    return drifted(value, m, v, sums, rate, number(EPS));
+}
+
+/// The value of one element of a row of a page after `end` steps.
+fn element(page: DevicePage, column: u32, row: u32, e: u32, end: u32, rate: f32) -> f32 {
+    let width = column_width(column, page.sh_n_width);
+    let at = row * width + e;
+    let value = bitcast<f32>(slab[column_at(page, column, VALUES) + at]);
+    let m = bitcast<f32>(slab[column_at(page, column, EXP_AVG) + at]);
+    let v = bitcast<f32>(slab[column_at(page, column, EXP_AVG_SQ) + at]);
+    return evaluate(value, m, v, slab[stamps_at(page) + row], end, column == MEANS, rate);
+}
+
+/// Whether the camera may draw a row at `p` with this largest sigma. NaN counts as drawn.
+fn may_draw(p: vec3<f32>, sigma_max: f32) -> bool {
+    let m = u.world_to_camera;
+    let x = m[0].x * p.x + m[0].y * p.y + m[0].z * p.z + m[0].w;
+    let y = m[1].x * p.x + m[1].y * p.y + m[1].z * p.z + m[1].w;
+    let z = m[2].x * p.x + m[2].y * p.y + m[2].z * p.z + m[2].w;
+    let slack = u.slack.x + u.slack.y * (abs(p.x) + abs(p.y) + abs(p.z));
+    let side = slack * u.side_slack;
+    let reach = u.reach * sigma_max + vec2<f32>(side);
+    let outside = z <= u.depth_range.x - slack
+        || z >= u.depth_range.y + slack
+        || -x > u.slopes.x * z + reach.x
+        || x > u.slopes.y * z + reach.x
+        || -y > u.slopes.z * z + reach.y
+        || y > u.slopes.w * z + reach.y;
+    return !outside || !is_finite(x + y + z) || !is_finite(sigma_max);
+}
+
+fn is_seen(page: DevicePage, row: u32) -> bool {
+    var mean: vec3<f32>;
+    var scale: vec3<f32>;
+    for (var c = 0u; c < 3u; c++) {
+        mean[c] = element(page, MEANS, row, c, u.now, u.means_rate);
+        scale[c] = element(page, SCALES, row, c, u.now, u.scales_rate);
+    }
+    return may_draw(mean, exp32(max(max(scale.x, scale.y), scale.z)));
+}
+
+/// One workgroup for each page.
+@compute @workgroup_size(256)
+fn cull(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+#ifdef SUBGROUPS
+    @builtin(subgroup_id) subgroup: u32,
+    @builtin(num_subgroups) subgroups: u32,
+    @builtin(subgroup_invocation_id) subgroup_lane: u32,
+#endif
+) {
+    let p = linear_group(workgroup, workgroups);
+    // The same for the whole workgroup.
+    if p >= u.page_count || pages[p].slab != u.slab {
+        return;
+    }
+    let page = pages[p];
+    var before = 0u;
+    for (var first = 0u; first < page.rows; first += 256u) {
+        let row = first + lane;
+        var seen = false;
+        if row < page.rows {
+            seen = is_seen(page, row);
+        }
+#ifdef SUBGROUPS
+        let scanned = workgroup_scan(u32(seen), lane, subgroup, subgroups, subgroup_lane);
+#else
+        let scanned = workgroup_scan(u32(seen), lane);
+#endif
+        if seen {
+            found[page.first_row + before + scanned.before] = row;
+        }
+        before += scanned.total;
+        workgroupBarrier();
+    }
+    if lane == 0u {
+        counts[p] = before;
+    }
+}
+
+/// One workgroup for each page, of any slab.
+@compute @workgroup_size(256)
+fn list(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let p = linear_group(workgroup, workgroups);
+    if p >= u.page_count {
+        return;
+    }
+    for (var i = lane; i < counts[p]; i += 256u) {
+        rows[pages[p].first_listed + i] = vec2<u32>(p, found[pages[p].first_row + i]);
+    }
+}
+
+/// One invocation for each float of the output.
+@compute @workgroup_size(256)
+fn gather(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = linear_index(workgroup, workgroups, lane, 256u);
+    if i >= u.row_count * u.width {
+        return;
+    }
+    let listed = rows[i / u.width];
+    let page = pages[listed.x];
+    if page.slab == u.slab {
+        out[i] = element(page, u.column, listed.y, u.first_element + i % u.width, u.now, u.rate);
+    }
+}
+
+/// The range that a value passes through on its way to its limit.
+fn hull(page: DevicePage, column: u32, row: u32, e: u32, rate: f32) -> vec2<f32> {
+    let value = bitcast<f32>(slab[column_at(page, column, VALUES) + 3u * row + e]);
+    let limit = element(page, column, row, e, FOR_EVER, rate);
+    let low = min(value, limit);
+    let high = max(value, limit);
+    let slack = MOVEMENT_SLACK * (high - low) + VALUE_SLACK * max(abs(low), abs(high)) + FLUSH_SLACK;
+    return vec2<f32>(low - slack, high + slack);
+}
+
+/// Largest distance of a row's children from it.
+fn split_reach(page: DevicePage, row: u32, sigma: f32) -> f32 {
+    let views = slab[count_at(page) + row] & VIEWS_MOST;
+    let mean = quotient(bitcast<f32>(slab[grad2d_at(page) + row]), max(views, 1u));
+    return select(0.0, u.split_reach * REACH_SLACK * sigma, mean > u.grow_grad2d && sigma > u.split_scale);
+}
+
+/// Bounds of the pages that an update has changed: one workgroup for each page.
+@compute @workgroup_size(256)
+fn bounds(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let p = linear_group(workgroup, workgroups);
+    if p >= u.page_count || pages[p].slab != u.slab {
+        return;
+    }
+    let page = pages[p];
+    // Numbers that no finite bound exceeds.
+    var low = vec3<f32>(3.4e38);
+    var high = vec3<f32>(-3.4e38);
+    var sigma_max = 0.0;
+    for (var row = lane; row < page.rows; row += 256u) {
+        var log_scale = -3.4e38;
+        for (var c = 0u; c < 3u; c++) {
+            log_scale = max(log_scale, hull(page, SCALES, row, c, u.scales_rate).y);
+        }
+        let sigma = min(exp32(log_scale) * (1.0 + SIGMA_SLACK), SIGMA_MOST);
+        let reach = split_reach(page, row, sigma);
+        for (var c = 0u; c < 3u; c++) {
+            let range = hull(page, MEANS, row, c, u.means_rate);
+            let below = range.x - reach;
+            let above = range.y + reach;
+            let slack = select(0.0, EPSILON, reach > 0.0);
+            low[c] = min(low[c], below - slack * abs(below));
+            high[c] = max(high[c], above + slack * abs(above));
+        }
+        sigma_max = max(sigma_max, sigma);
+    }
+    for (var c = 0u; c < 3u; c++) {
+        parts[c][lane] = low[c];
+        parts[3u + c][lane] = high[c];
+    }
+    parts[6][lane] = sigma_max;
+    for (var half = 128u; half > 0u; half = half / 2u) {
+        workgroupBarrier();
+        if lane < half {
+            for (var c = 0u; c < 3u; c++) {
+                parts[c][lane] = min(parts[c][lane], parts[c][lane + half]);
+                parts[3u + c][lane] = max(parts[3u + c][lane], parts[3u + c][lane + half]);
+            }
+            parts[6][lane] = max(parts[6][lane], parts[6][lane + half]);
+        }
+    }
+    if lane == 0u {
+        for (var c = 0u; c < 3u; c++) {
+            results[p].low[c] = bitcast<u32>(parts[c][0]);
+            results[p].high[c] = bitcast<u32>(parts[3u + c][0]);
+        }
+        results[p].sigma_max = bitcast<u32>(parts[6][0]);
+    }
+}

@@ -1,0 +1,83 @@
+// The rows of a page in its bytes on a device, as words: the twin of src/kernels/page_words.rs. The layout is that of
+// src/scene/page_layout.rs, so a payload is copied between host and device as it is.
+
+/// One page of a batch.
+struct DevicePage {
+    /// Rows.
+    rows: u32,
+    /// The slab that holds the page.
+    slab: u32,
+    /// First word of the payload in the slab.
+    base: u32,
+    /// Floats per row of the higher SH bands.
+    sh_n_width: u32,
+    /// Number, in the batch, of the page's first row.
+    first_row: u32,
+    /// Number, in the batch, of the page's first listed row.
+    first_listed: u32,
+    pad: vec2<u32>,
+}
+
+/// What an update did to a page, and its bounds.
+struct PageResult {
+    /// Rows that the optimizer rewrote.
+    updated: u32,
+    /// Rows left as they were because a gradient was not finite or too large.
+    skipped: u32,
+    /// Rows that were drawn.
+    drawn: u32,
+    /// Rows whose statistics changed.
+    collected: u32,
+    /// Box of the means, and largest standard deviation; bits of floats.
+    low: array<u32, 3>,
+    high: array<u32, 3>,
+    sigma_max: u32,
+    pad: u32,
+}
+
+/// Columns in storage order, and the tables of each.
+const MEANS: u32 = 0u;
+const QUATS: u32 = 1u;
+const SCALES: u32 = 2u;
+const OPACITIES: u32 = 3u;
+const SH0: u32 = 4u;
+const SH_N: u32 = 5u;
+const VALUES: u32 = 0u;
+const EXP_AVG: u32 = 1u;
+const EXP_AVG_SQ: u32 = 2u;
+
+/// Words of a table, padded to 64 bytes.
+fn padded(words: u32) -> u32 {
+    return (words + 15u) & 0xfffffff0u;
+}
+
+/// First words of the tables of steps, of sums and of counts; identities come first, two words a row.
+fn stamps_at(page: DevicePage) -> u32 {
+    return page.base + padded(2u * page.rows);
+}
+
+fn grad2d_at(page: DevicePage) -> u32 {
+    return stamps_at(page) + padded(page.rows);
+}
+
+fn count_at(page: DevicePage) -> u32 {
+    return grad2d_at(page) + padded(page.rows);
+}
+
+fn column_width(column: u32, sh_n_width: u32) -> u32 {
+    switch column {
+        case QUATS: { return 4u; }
+        case OPACITIES: { return 1u; }
+        case SH_N: { return sh_n_width; }
+        default: { return 3u; }
+    }
+}
+
+/// First word of a table of a column.
+fn column_at(page: DevicePage, column: u32, table: u32) -> u32 {
+    var at = count_at(page) + padded(page.rows);
+    for (var before = 0u; before < column; before++) {
+        at += 3u * padded(page.rows * column_width(before, page.sh_n_width));
+    }
+    return at + table * padded(page.rows * column_width(column, page.sh_n_width));
+}

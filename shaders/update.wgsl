@@ -1,0 +1,187 @@
+// Stage "update": one step of Adam on the listed rows of pages that lie on the device, and their statistics. `judge`
+// finds whether the gradients of a row are usable, column by column; `step` rewrites a column of the rows whose gradients
+// all are; `finish` counts, stamps and collects statistics. The twin of src/kernels/update.rs.
+//
+// Values come from the stage "gather" at the same step. A row is rewritten as a whole or not at all.
+#import "shared/dispatch.wgsl"
+#import "shared/math.wgsl"
+#import "shared/deferred.wgsl"
+#import "shared/page.wgsl"
+#import "shared/quotient.wgsl"
+
+struct UpdateUniforms {
+    /// The slab that is bound.
+    slab: u32,
+    /// Listed rows of this dispatch.
+    row_count: u32,
+    /// Column to rewrite, floats per row of its values and gradients, and the first of them in the row of the page.
+    column: u32,
+    width: u32,
+    first_element: u32,
+    /// Steps done.
+    now: u32,
+    /// Rate of the column over the bias of the first moment.
+    step_size: f32,
+    /// 1 / sqrt(1 - beta2^t).
+    inv_root_correction: f32,
+    /// Half of the image size, pixels.
+    half_size: vec2<f32>,
+    /// 1: this step collects statistics.
+    collects: u32,
+    pad: u32,
+}
+
+@group(0) @binding(0) var<uniform> u: UpdateUniforms;
+@group(0) @binding(1) var<storage, read> pages: array<DevicePage>;
+@group(0) @binding(2) var<storage, read_write> slab: array<u32>;
+@group(0) @binding(3) var<storage, read> tables: array<u32>;
+/// Number of the page, number of the row in it.
+@group(0) @binding(4) var<storage, read> rows: array<vec2<u32>>;
+@group(0) @binding(5) var<storage, read> values: array<f32>;
+/// Gradients of a column, bits of floats.
+@group(0) @binding(6) var<storage, read> grads: array<u32>;
+/// `[listed row]`: the largest magnitude of a gradient so far, bits of a float.
+@group(0) @binding(7) var<storage, read_write> largest: array<u32>;
+/// Gradient of the projected mean, radii.
+@group(0) @binding(8) var<storage, read> footprints: array<vec4<f32>>;
+/// `[page]`: the words of a PageResult.
+@group(0) @binding(9) var<storage, read_write> results: array<atomic<u32>>;
+/// Change of the number of rows by bin of the mean growth score, modulo 2^32.
+@group(0) @binding(10) var<storage, read_write> bins: array<atomic<u32>>;
+
+/// Bits of 1e18, the largest usable gradient (src/base/math.rs).
+const LARGEST_GRAD: u32 = 0x5d5e0b6bu;
+const RESULT_WORDS: u32 = 12u;
+/// Words of a PageResult.
+const UPDATED: u32 = 0u;
+const SKIPPED: u32 = 1u;
+const DRAWN: u32 = 2u;
+const COLLECTED: u32 = 3u;
+
+/// Without signs, floats are ordered as integers, with those that are not finite after all others.
+fn is_usable(bits: u32) -> bool {
+    return bits != 0u && bits <= LARGEST_GRAD;
+}
+
+/// One invocation for each row.
+@compute @workgroup_size(256)
+fn judge(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = linear_index(workgroup, workgroups, lane, 256u);
+    if i >= u.row_count {
+        return;
+    }
+    var most = largest[i];
+    for (var e = 0u; e < u.width; e++) {
+        most = max(most, grads[i * u.width + e] & 0x7fffffffu);
+    }
+    largest[i] = most;
+}
+
+/// First word of the decay over some steps: factor of the first moment, factor of the second, share that it loses.
+fn decay_at(steps: u32) -> u32 {
+    return tables[DECAYS] + 3u * min(steps, tables[DECAYS_LENGTH] - 1u);
+}
+
+/// One invocation for each float of the column.
+@compute @workgroup_size(256)
+fn step(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = linear_index(workgroup, workgroups, lane, 256u);
+    if i >= u.row_count * u.width {
+        return;
+    }
+    let row = i / u.width;
+    let listed = rows[row];
+    let page = pages[listed.x];
+    if page.slab != u.slab || !is_usable(largest[row]) {
+        return;
+    }
+    let at = listed.y * column_width(u.column, page.sh_n_width) + u.first_element + i % u.width;
+    let value_at = column_at(page, u.column, VALUES) + at;
+    let m_at = column_at(page, u.column, EXP_AVG) + at;
+    let v_at = column_at(page, u.column, EXP_AVG_SQ) + at;
+    let missed = u.now - slab[stamps_at(page) + listed.y];
+    let first = bitcast<f32>(tables[decay_at(missed)]);
+    let second = decay_at(missed + 1u) + 1u;
+    let kept = bitcast<f32>(tables[second]);
+    let lost = bitcast<f32>(tables[second + 1u]);
+    let g = bitcast<f32>(grads[i]);
+    let decayed = flush(bitcast<f32>(slab[m_at]) * first);
+    let m = flush(decayed + (g - decayed) * bitcast<f32>(tables[ONE_MINUS_BETA1]));
+    let gained = g * g * bitcast<f32>(tables[ONE_MINUS_BETA2]);
+    let old_v = bitcast<f32>(slab[v_at]);
+    let v = max(flush(old_v * kept + (gained - old_v * lost)), 0.0);
+    let root = sqrt(v) * u.inv_root_correction + bitcast<f32>(tables[EPS]);
+    var value = flush(values[i] - u.step_size * (m / root));
+    if u.column == SCALES {
+        value = max(min(value, bitcast<f32>(tables[LOG_SCALE_HIGH])), bitcast<f32>(tables[LOG_SCALE_LOW]));
+    }
+    slab[value_at] = bitcast<u32>(value);
+    slab[m_at] = bitcast<u32>(m);
+    slab[v_at] = bitcast<u32>(v);
+}
+
+/// Bin of a mean growth score, as in src/densify/stats.rs.
+fn bin(sum: f32, count: u32) -> u32 {
+    return bitcast<u32>(quotient(sum, max(count & VIEWS_MOST, 1u))) >> 16u;
+}
+
+/// Adds a growth score to the statistics of a row, unless it is not finite or the row counts no more views.
+fn collect(page: DevicePage, p: u32, row: u32, footprint: vec4<f32>) {
+    let scaled = footprint.xy * u.half_size;
+    let score = sqrt(scaled.x * scaled.x + scaled.y * scaled.y);
+    let sum_at = grad2d_at(page) + row;
+    let views_at = count_at(page) + row;
+    let count = slab[views_at];
+    if !is_finite(score) || (count & VIEWS_MOST) == VIEWS_MOST {
+        return;
+    }
+    let sum = bitcast<f32>(slab[sum_at]);
+    // A sum that overflows stays the largest number.
+    let added = select(sum + score, 3.4028235e38, !is_finite(sum + score));
+    if count > 0u {
+        atomicSub(&bins[bin(sum, count)], 1u);
+    }
+    slab[sum_at] = bitcast<u32>(added);
+    slab[views_at] = count + 1u;
+    atomicAdd(&bins[bin(added, count + 1u)], 1u);
+    atomicAdd(&results[RESULT_WORDS * p + COLLECTED], 1u);
+}
+
+/// One invocation for each row; after all columns.
+@compute @workgroup_size(256)
+fn finish(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = linear_index(workgroup, workgroups, lane, 256u);
+    if i >= u.row_count {
+        return;
+    }
+    let listed = rows[i];
+    let page = pages[listed.x];
+    if page.slab != u.slab {
+        return;
+    }
+    if is_usable(largest[i]) {
+        slab[stamps_at(page) + listed.y] = u.now + 1u;
+        atomicAdd(&results[RESULT_WORDS * listed.x + UPDATED], 1u);
+    } else if largest[i] != 0u {
+        atomicAdd(&results[RESULT_WORDS * listed.x + SKIPPED], 1u);
+    }
+    let footprint = footprints[i];
+    if footprint.z > 0.0 && footprint.w > 0.0 {
+        atomicAdd(&results[RESULT_WORDS * listed.x + DRAWN], 1u);
+        if u.collects != 0u {
+            collect(page, listed.x, listed.y, footprint);
+        }
+    }
+}

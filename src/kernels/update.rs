@@ -1,0 +1,140 @@
+//! Stage "update": one step of Adam on the listed rows of pages, in the words of their payloads, and their statistics.
+//! The twin of `shaders/update.wgsl`, in which the three functions are entry points.
+//!
+//! [`judge`] finds whether the gradients of a row are usable, column by column; [`step`] rewrites a column of the rows
+//! whose gradients all are; [`finish`] counts, stamps and collects statistics.
+//!
+//! Sums of growth scores stay floats, as in pages that the host updates. What host and device both decide by is the bin of
+//! a mean score, and that is the same integer on both: devices divide exactly (`shaders/shared/quotient.wgsl`).
+//!
+//! Not here: the values of the rows, which come from the stage "gather" at the same step.
+//!
+//! Invariants: 1. a row is rewritten as a whole or not at all; 2. nothing that is not finite enters a payload; 3. growth
+//! scores go to the same bins as on the CPU.
+
+use super::deferred::{DeferredTables, flush};
+use super::page_words::{DevicePage, PageResult, Table};
+use super::uniforms_pages::UpdateUniforms;
+use crate::base::math::LARGEST_GRAD;
+use crate::scene::columns::Column;
+use crate::scene::rows::mean_grad2d;
+use crate::scene::sightings::{is_full, with_view};
+
+/// What the stage reads beside the slab.
+#[derive(Debug, Clone, Copy)]
+pub struct UpdateInput<'a> {
+    /// Uniforms of the dispatch.
+    pub uniforms: &'a UpdateUniforms,
+    /// Pages of the batch.
+    pub pages: &'a [DevicePage],
+    /// Listed rows: number of the page, number of the row in it.
+    pub rows: &'a [[u32; 2]],
+    /// Tables of the run.
+    pub tables: &'a DeferredTables,
+    /// `[listed row]`: the largest magnitude of a gradient, bits.
+    pub largest: &'a [u32],
+}
+
+fn is_usable(bits: u32) -> bool {
+    bits != 0 && bits <= LARGEST_GRAD.to_bits()
+}
+
+/// Raises `largest` to the largest magnitude in a column of gradients, `width` floats a row. Bits of floats without
+/// signs are ordered as integers, with those that are not finite after all others.
+pub fn judge(width: usize, grads: &[f32], largest: &mut [u32]) {
+    for (grads, largest) in grads.chunks_exact(width).zip(largest) {
+        *largest = grads.iter().fold(*largest, |most, g| most.max(g.abs().to_bits()));
+    }
+}
+
+/// Rewrites a column of the listed rows in the slab whose gradients are usable, from the values of stage "gather".
+pub fn step(input: &UpdateInput<'_>, values: &[f32], grads: &[f32], slab: &mut [u32]) {
+    let UpdateUniforms { column, width, first_element, now, step_size, inv_root_correction, .. } = *input.uniforms;
+    let (column, width, tables) = (Column::ALL[column as usize], width as usize, input.tables);
+    let [one_minus_beta1, one_minus_beta2] = tables.one_minus_betas();
+    for (i, &[p, row]) in input.rows.iter().enumerate() {
+        let page = &input.pages[p as usize];
+        if page.slab != input.uniforms.slab || !is_usable(input.largest[i]) {
+            continue;
+        }
+        let missed = now - slab[page.stamp_at(row as usize)];
+        let ([first, ..], [_, kept, lost]) = (tables.decay(missed), tables.decay(missed + 1));
+        for e in 0..width {
+            let [value_at, m_at, v_at] = [Table::Values, Table::ExpAvg, Table::ExpAvgSq]
+                .map(|table| page.row_at(column, table, row as usize) + first_element as usize + e);
+            let g = grads[i * width + e];
+            let decayed = flush(f32::from_bits(slab[m_at]) * first);
+            let m = flush(decayed + (g - decayed) * one_minus_beta1);
+            let old = f32::from_bits(slab[v_at]);
+            let v = flush(old * kept + (g * g * one_minus_beta2 - old * lost)).max(0.0);
+            let root = v.sqrt() * inv_root_correction + tables.eps();
+            let mut value = flush(values[i * width + e] - step_size * (m / root));
+            if column == Column::Scales {
+                let [low, high] = tables.log_scales();
+                value = value.min(high).max(low);
+            }
+            (slab[value_at], slab[m_at], slab[v_at]) = (value.to_bits(), m.to_bits(), v.to_bits());
+        }
+    }
+}
+
+/// Stamps the rows that [`step`] rewrote, counts, and collects statistics. `footprints` holds the gradient of the
+/// projected mean and the radii of each listed row, `bins` the change of the number of rows by bin of the mean score.
+pub fn finish(
+    input: &UpdateInput<'_>,
+    footprints: &[[f32; 4]],
+    slab: &mut [u32],
+    results: &mut [PageResult],
+    bins: &mut [u32],
+) {
+    for (i, &[p, row]) in input.rows.iter().enumerate() {
+        let (page, result) = (&input.pages[p as usize], &mut results[p as usize]);
+        if page.slab != input.uniforms.slab {
+            continue;
+        }
+        if is_usable(input.largest[i]) {
+            slab[page.stamp_at(row as usize)] = input.uniforms.now + 1;
+            result.updated += 1;
+        } else {
+            result.skipped += u32::from(input.largest[i] != 0);
+        }
+        let footprint = footprints[i];
+        if footprint[2] > 0.0 && footprint[3] > 0.0 {
+            result.drawn += 1;
+            if input.uniforms.collects != 0 {
+                let at = [page.grad2d_at(row as usize), page.count_at(row as usize)];
+                result.collected += u32::from(collect(footprint, input.uniforms.half_size, at, slab, bins));
+            }
+        }
+    }
+}
+
+/// Adds a growth score to the statistics of a row; whether it did.
+fn collect(
+    footprint: [f32; 4],
+    half_size: [f32; 2],
+    [sum_at, count_at]: [usize; 2],
+    slab: &mut [u32],
+    bins: &mut [u32],
+) -> bool {
+    let (x, y) = (footprint[0] * half_size[0], footprint[1] * half_size[1]);
+    let (score, count) = ((x * x + y * y).sqrt(), slab[count_at]);
+    if !score.is_finite() || is_full(count) {
+        return false;
+    }
+    let sum = f32::from_bits(slab[sum_at]);
+    let added = (sum + score).min(f32::MAX);
+    if count > 0 {
+        let bin = &mut bins[bin(sum, count)];
+        *bin = bin.wrapping_sub(1);
+    }
+    (slab[sum_at], slab[count_at]) = (added.to_bits(), with_view(count, None));
+    let bin = &mut bins[bin(added, slab[count_at])];
+    *bin = bin.wrapping_add(1);
+    true
+}
+
+/// Bin of a mean score: as `crate::densify::stats`.
+fn bin(sum: f32, count: u32) -> usize {
+    (mean_grad2d(sum, count).to_bits() >> 16) as usize
+}

@@ -1,0 +1,219 @@
+//! [`GpuRenderer`] as a backend that holds pages: the order in which the stages on pages run within a view.
+//!
+//! A view of one batch keeps its columns on the device until the update; rows of other views are gathered again, by the same
+//! compiled stage, so they have the same bits.
+//!
+//! Not here: the recording of the stages (`gpu_pages`), slots (`gpu_slots`).
+//!
+//! Invariant: an update that has begun is never begun again. What it needs is allocated before its first chunk, or was shown to
+//! fit ([`super::gpu_gradients::check_room`]).
+
+use super::gpu::{GpuRenderer, submit_batch};
+use super::gpu_gradients::{RowGradients, RowsOut};
+use super::gpu_pages::{DevicePages, PageRows, UpdateBuffers};
+use super::gpu_rows::{DeviceColumns, RowSource, SplatRows};
+use super::gpu_segments::{Segment, gradients_of, in_chunks};
+use super::gpu_view::{Unusable, View};
+use super::pages::{DeviceSlot, PageRenderer, PageRules, SlotPage};
+use super::{RenderError, RowBatches};
+use crate::gpu::{Buffer, GpuResult};
+use crate::kernels::page_words::PageResult;
+use crate::scene::optimizer_numbers::StepNumbers;
+
+impl GpuRenderer {
+    fn held(&self) -> Result<&DevicePages, RenderError> {
+        self.pages.as_deref().ok_or(RenderError::OutOfOrder { call: "pages", needs: "hold_pages" })
+    }
+
+    /// Updates the rows of the segments of a batch: at once where the columns are still on the device, else in chunks.
+    fn update_rows(
+        &self,
+        view: &mut View,
+        mut source: PageRows<'_>,
+        first: usize,
+        (results, collects): (&Buffer, bool),
+    ) -> GpuResult<()> {
+        let sh_degree = view.of.options.sh_degree;
+        if let Some(columns) = view.columns.take() {
+            let all = 0..columns.rows as usize;
+            match (self.update_room(columns.rows, sh_degree), view.segments.first()) {
+                (Ok(room), Some(segment)) => {
+                    return self.update_chunk(view, &source, (segment, 0, &all), &columns, &room, (results, collects));
+                }
+                // The rows are gathered again, in chunks.
+                (Err(error), _) if !error.lacks_room() => return Err(error),
+                _ => {}
+            }
+        }
+        let end = first + source.rows();
+        for segment in view.segments.iter().filter(|segment| (first..end).contains(&segment.first)) {
+            let begin = segment.first - first;
+            in_chunks(segment.rows as usize, |part| {
+                let columns = DeviceColumns::new(&self.gpu, part.len() as u32, sh_degree)?;
+                let room = self.update_room(columns.rows, sh_degree)?;
+                let of_batch = begin + part.start..begin + part.end;
+                let mut recorder = self.gpu.begin("gather");
+                source.geometry(&self.gpu, &mut recorder, &columns, &of_batch)?;
+                self.gpu.submit(recorder)?;
+                let place = (segment, part.start, &of_batch);
+                self.update_chunk(view, &source, place, &columns, &room, (results, collects))
+            })?;
+        }
+        Ok(())
+    }
+
+    /// Memory of the update of `rows` rows: gradients, and the largest of each row.
+    fn update_room(&self, rows: u32, sh_degree: u8) -> GpuResult<(RowGradients, Buffer)> {
+        let grads = RowGradients::new(&self.gpu, rows, sh_degree, false)?;
+        Ok((grads, self.gpu.buffer("largest gradients", 4 * u64::from(rows))?))
+    }
+
+    /// Submits the gradients and the update of gathered rows, which begin at row `at` of the segment and are `part` of the
+    /// batch.
+    fn update_chunk(
+        &self,
+        view: &View,
+        source: &PageRows<'_>,
+        (segment, at, part): (&Segment, usize, &std::ops::Range<usize>),
+        values: &DeviceColumns,
+        (grads, largest): &(RowGradients, Buffer),
+        (results, collects): (&Buffer, bool),
+    ) -> GpuResult<()> {
+        let out = RowsOut { gpu: &self.gpu, stages: &self.rows, view: &view.of, weighs: false };
+        let splats = [&segment.splats, gradients_of(segment)?].map(|buffer| SplatRows::from_row(buffer, at as u64));
+        let mut recorder = self.gpu.begin("update");
+        out.record(&mut recorder, values, splats, grads)?;
+        let RowGradients { columns: grads, footprints } = grads;
+        let buffers = UpdateBuffers { values, grads, footprints, largest, results, collects };
+        source.pages().update(&self.gpu, &mut recorder, source, part, &buffers)?;
+        self.gpu.submit(recorder).map(|_| ())
+    }
+
+    /// First row, in the view, of a batch of pages.
+    fn first_of_batch(&self, batch: usize) -> Option<usize> {
+        let batches = &self.pages_view.as_ref()?.batches;
+        (batch < batches.len()).then(|| batches[..batch].iter().map(|before| before.rows as usize).sum())
+    }
+
+    fn update_batch(
+        &self,
+        view: &mut View,
+        batch: usize,
+        pages: &[SlotPage],
+        collects: bool,
+    ) -> Result<Vec<PageResult>, RenderError> {
+        let needs = RenderError::OutOfOrder { call: "update_pages", needs: "pages_out" };
+        let (held, first) = (self.held()?, self.first_of_batch(batch));
+        let (Some(of_view), Some(first)) = (&self.pages_view, first) else { return Err(needs) };
+        let of_batch = &of_view.batches[batch];
+        if of_batch.first_listed().len() != pages.len() {
+            return Err(RenderError::BatchRows { batch, given: pages.len() });
+        }
+        if pages.is_empty() {
+            return Ok(Vec::new());
+        }
+        let mut recorder = self.gpu.begin("update");
+        let table = held.table(&mut recorder, pages, of_batch.first_listed())?;
+        let results = recorder.buffer_zeroed("page results", (size_of::<PageResult>() * pages.len()) as u64)?;
+        self.gpu.submit(recorder)?;
+        let source = held.source(of_view, of_batch, &table);
+        self.update_rows(view, source, first, (&results, collects))?;
+        Ok(held.results(&self.gpu, &source, &results)?)
+    }
+}
+
+impl PageRenderer for GpuRenderer {
+    fn hold_pages(&mut self, rules: &PageRules) -> Result<(), RenderError> {
+        self.drop_view();
+        self.pages = None; // frees the slots
+        self.pages = Some(Box::new(DevicePages::new(&self.gpu, rules)?));
+        Ok(())
+    }
+
+    fn room(&mut self) -> u64 {
+        self.drop_view();
+        self.gpu.room()
+    }
+
+    fn slot_bytes(&self) -> u64 {
+        self.pages.as_ref().map_or(0, |pages| pages.slots.slot_bytes())
+    }
+
+    fn add_slots(&mut self, wanted: usize) -> Result<usize, RenderError> {
+        match &mut self.pages {
+            Some(pages) => Ok(pages.slots.add(&self.gpu, wanted)?),
+            None => Err(RenderError::OutOfOrder { call: "add_slots", needs: "hold_pages" }),
+        }
+    }
+
+    fn write_slots(&mut self, payloads: &[(DeviceSlot, &[u8])]) -> Result<(), RenderError> {
+        Ok(self.held()?.slots.write(&self.gpu, payloads)?)
+    }
+
+    fn read_slots(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError> {
+        Ok(self.held()?.slots.read(&self.gpu, payloads)?)
+    }
+
+    fn pages_in(&mut self, pages: &[SlotPage], step: &StepNumbers) -> Result<usize, RenderError> {
+        let Some(view) = self.sequence.view() else {
+            return Err(RenderError::OutOfOrder { call: "pages_in", needs: "begin_view" });
+        };
+        let asked = view.options.sh_degree;
+        if let Some(page) = pages.iter().find(|page| page.layout.sh_degree != asked) {
+            return Err(RenderError::ShDegree { asked, stored: page.layout.sh_degree });
+        }
+        let begun = match self.pages_view.take() {
+            Some(of_view) => Ok(of_view),
+            None => self.held().and_then(|held| Ok(held.begin(&self.gpu, &view.camera, step)?)),
+        };
+        let mut of_view = begun.inspect_err(|_| self.drop_view())?;
+        let listed = self.held().and_then(|held| Ok(held.list(&self.gpu, &of_view, pages)?));
+        let (batch, table) = listed.inspect_err(|_| self.drop_view())?;
+        let (view, place) = self.sequence.rows_in(batch.rows as usize, asked)?;
+        let is_whole = self.sequence.batches() == Some(RowBatches::One);
+        let mut source = self.held()?.source(&of_view, &batch, &table);
+        let stages = (&self.gpu, &self.rows, &self.tiles);
+        let submitted = submit_batch(stages, &mut source, &view, place.start, is_whole);
+        self.append(submitted)?;
+        let rows = batch.rows as usize;
+        of_view.batches.push(batch);
+        self.pages_view = Some(of_view);
+        Ok(rows)
+    }
+
+    fn pages_out(&mut self, batch: usize) -> Result<(), RenderError> {
+        let rows = self.pages_view.as_ref().and_then(|view| view.batches.get(batch)).map_or(0, |batch| batch.rows);
+        self.sequence.rows_out(batch, rows as usize)?;
+        self.with_view("pages_out", |renderer, view| {
+            if view.tiles_back.is_none() && !matches!(view.unusable, Unusable::Uncounted) {
+                return Ok(());
+            }
+            let gpu = &renderer.gpu;
+            let mut recorder = view.tiles_back.take().map_or_else(|| gpu.begin("backward"), |tiles| gpu.resume(tiles));
+            let unusable = renderer.tiles.count_unusable(&mut recorder, &view.segments, view.blend());
+            gpu.submit(recorder)?;
+            view.unusable = Unusable::Pending(unusable?);
+            Ok(())
+        })
+    }
+
+    fn update_pages(
+        &mut self,
+        batch: usize,
+        pages: &[SlotPage],
+        collects: bool,
+    ) -> Result<Vec<PageResult>, RenderError> {
+        let needs = RenderError::OutOfOrder { call: "update_pages", needs: "pages_out" };
+        let mut view = self.view.take().ok_or(needs)?;
+        let updated = self.update_batch(&mut view, batch, pages, collects);
+        match &updated {
+            Ok(_) => self.view = Some(view),
+            Err(_) => self.drop_view(),
+        }
+        updated
+    }
+
+    fn take_bins(&mut self) -> Result<Vec<u32>, RenderError> {
+        Ok(self.held()?.take_bins(&self.gpu)?)
+    }
+}

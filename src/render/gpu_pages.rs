@@ -1,0 +1,364 @@
+//! Records the stages on pages on a device: gather and update. Owns the slots, the optimizer's tables and the bins of
+//! growth scores.
+//!
+//! A dispatch works on the pages of one slab, so a batch takes one dispatch for each slab in which it has pages. Columns
+//! are gathered and updated one by one: an invocation for each float, and few bindings.
+//!
+//! Not here: the stages on rows (`gpu_rows`), the order of a view (`gpu`).
+//!
+//! Invariants: 1. a dispatch binds windows of columns, so no binding is too large; floats are independent, so the result has the
+//! same bits for any windows; 2. an update of a chunk is submitted at once, so a chunk is updated as a whole or not at all.
+
+use super::gpu_rows::{BAND_WIDTHS, DeviceColumns, RowSource, Window, footprint_bytes, windows};
+use super::gpu_slots::Slots;
+use super::pages::{PageRules, SlotPage};
+use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
+use crate::kernels::deferred::DeferredTables;
+use crate::kernels::page_words::{DevicePage, PageResult};
+use crate::kernels::uniforms_pages::{GatherUniforms, UpdateUniforms};
+use crate::scene::camera::Camera;
+use crate::scene::columns::Column;
+use crate::scene::optimizer_numbers::StepNumbers;
+use std::collections::BTreeSet;
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Invocations per workgroup.
+const WORKGROUP: u32 = 256;
+/// Bins of mean growth scores: the upper halves of floats that are not negative.
+const BINS: u64 = 1 << 15;
+/// Bytes of a listed row: number of the page, number of the row.
+const LISTED_BYTES: u64 = 8;
+/// Bytes of the widest part of a column, per row.
+const WIDEST: u64 = 4 * 21;
+
+/// A part of a column that is a buffer of its own: the column, floats per row, and the first of them in the row of a page.
+type Part = (Column, usize, usize);
+
+/// The parts of [`DeviceColumns::columns`], in the same order.
+fn parts() -> impl Iterator<Item = Part> {
+    let narrow = [Column::Means, Column::Quats, Column::Scales, Column::Opacities, Column::Sh0];
+    let bands = (0..BAND_WIDTHS.len()).map(|band| (Column::ShN, BAND_WIDTHS[band], BAND_WIDTHS[..band].iter().sum()));
+    narrow.into_iter().map(|column| (column, column.width(0), 0)).chain(bands)
+}
+
+/// The compiled stages.
+#[derive(Debug)]
+struct Stages {
+    cull: Arc<Pipeline>,
+    list: Arc<Pipeline>,
+    gather: Arc<Pipeline>,
+    bounds: Arc<Pipeline>,
+    judge: Arc<Pipeline>,
+    step: Arc<Pipeline>,
+    finish: Arc<Pipeline>,
+}
+
+/// The pages of a run on a device.
+#[derive(Debug)]
+pub struct DevicePages {
+    /// The slots.
+    pub slots: Slots,
+    stages: Stages,
+    rules: PageRules,
+    tables: Buffer,
+    bins: Buffer,
+}
+
+/// What the stages of one view share.
+#[derive(Debug)]
+pub struct PagesView {
+    camera: Camera,
+    step: StepNumbers,
+    recent: Buffer,
+    /// The batches that are in.
+    pub batches: Vec<PageBatch>,
+}
+
+/// The listed rows of a batch.
+#[derive(Debug)]
+pub struct PageBatch {
+    /// First listed row of each page.
+    first_listed: Vec<u32>,
+    /// Listed rows.
+    pub rows: u32,
+    /// `[rows]`: number of the page, number of the row in it.
+    listed: Buffer,
+}
+
+/// Pages of a batch in their slots.
+#[derive(Debug)]
+pub struct PageTable {
+    pages: Vec<DevicePage>,
+    on_device: Buffer,
+}
+
+impl PageTable {
+    /// The slabs in which the batch has pages.
+    fn slabs(&self) -> BTreeSet<u32> {
+        self.pages.iter().map(|page| page.slab).collect()
+    }
+}
+
+impl DevicePages {
+    /// Compiles the stages and uploads the tables of a run.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub fn new(gpu: &Gpu, rules: &PageRules) -> GpuResult<DevicePages> {
+        let of = |shader: &str, entry: &str| gpu.pipeline(shader, entry, &[]);
+        let stages = Stages {
+            cull: of("gather.wgsl", "cull")?,
+            list: of("gather.wgsl", "list")?,
+            gather: of("gather.wgsl", "gather")?,
+            bounds: of("gather.wgsl", "bounds")?,
+            judge: of("update.wgsl", "judge")?,
+            step: of("update.wgsl", "step")?,
+            finish: of("update.wgsl", "finish")?,
+        };
+        let mut recorder = gpu.begin("pages");
+        let tables = recorder.buffer_with("optimizer tables", DeferredTables::new(&rules.numbers).words())?;
+        let bins = recorder.buffer_zeroed("bins", 4 * BINS)?;
+        gpu.submit(recorder)?;
+        Ok(DevicePages { slots: Slots::new(rules.payload_bytes), stages, rules: rules.clone(), tables, bins })
+    }
+
+    /// Begins a view at a step.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub fn begin(&self, gpu: &Gpu, camera: &Camera, step: &StepNumbers) -> GpuResult<PagesView> {
+        let mut recorder = gpu.begin("gather");
+        let recent = recorder.buffer_with("recent", step.recent.as_flattened())?;
+        gpu.submit(recorder)?;
+        Ok(PagesView { camera: *camera, step: step.clone(), recent, batches: Vec::new() })
+    }
+
+    fn uniforms(&self, view: &PagesView, pages: usize) -> GatherUniforms {
+        GatherUniforms::new(&view.camera, &self.rules.numbers, view.step.now, &self.rules.splits, pages as u32)
+    }
+
+    /// Uploads the table of pages in their slots, with the first listed row of each.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub fn table(&self, recorder: &mut Recorder<'_>, pages: &[SlotPage], first_listed: &[u32]) -> GpuResult<PageTable> {
+        let mut first_row = 0;
+        let mut entries = Vec::with_capacity(pages.len());
+        for (i, page) in pages.iter().enumerate() {
+            let (slab, offset) = self.slots.place(page.slot);
+            let entry = DevicePage::new(page.layout, slab, (offset / 4) as u32, first_row);
+            first_row += entry.rows;
+            entries.push(DevicePage { first_listed: first_listed.get(i).copied().unwrap_or(0), ..entry });
+        }
+        let on_device = recorder.buffer_with("page table", &entries)?;
+        Ok(PageTable { pages: entries, on_device })
+    }
+
+    /// Lists the rows of the pages that the camera may draw. Waits for their numbers.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub fn list(&self, gpu: &Gpu, view: &PagesView, pages: &[SlotPage]) -> GpuResult<(PageBatch, PageTable)> {
+        let mut recorder = gpu.begin("gather");
+        let table = self.table(&mut recorder, pages, &[])?;
+        let rows: u64 = table.pages.iter().map(|page| u64::from(page.rows)).sum();
+        let counts = gpu.buffer("counts", 4 * pages.len() as u64)?;
+        let found = gpu.buffer("found", 4 * rows)?;
+        let uniforms = self.uniforms(view, pages.len());
+        let groups = groups_1d(pages.len() as u32 * WORKGROUP, WORKGROUP);
+        for slab in table.slabs() {
+            let uniform = recorder.uniform(&GatherUniforms { slab, ..uniforms })?;
+            let [slab, tables, recent] = [self.slots.slab(slab)?, self.tables.view(), view.recent.view()];
+            let views = [uniform, table.on_device.view(), slab, tables, recent, counts.view(), found.view()];
+            recorder.dispatch("gather", &self.stages.cull, &views, groups)?;
+        }
+        let read = recorder.read_back("gather", &counts.view())?;
+        gpu.submit(recorder)?;
+        let mut of_pages = vec![0u32; pages.len()];
+        read.copy_to(&mut of_pages)?;
+        let (mut first_listed, mut listed) = (Vec::with_capacity(pages.len()), 0);
+        for count in of_pages {
+            first_listed.push(listed);
+            listed += count;
+        }
+        let mut recorder = gpu.begin("gather");
+        let table = self.table(&mut recorder, pages, &first_listed)?;
+        let batch =
+            PageBatch { first_listed, rows: listed, listed: gpu.buffer("listed", LISTED_BYTES * u64::from(listed))? };
+        let views =
+            [recorder.uniform(&uniforms)?, table.on_device.view(), counts.view(), found.view(), batch.listed.view()];
+        recorder.dispatch("gather", &self.stages.list, &views, groups)?;
+        gpu.submit(recorder)?;
+        Ok((batch, table))
+    }
+
+    /// The listed rows of a batch as a source of columns.
+    pub fn source<'a>(&'a self, view: &'a PagesView, batch: &'a PageBatch, table: &'a PageTable) -> PageRows<'a> {
+        PageRows { pages: self, view, batch, table }
+    }
+
+    /// Records the update of the listed rows `part` of a batch.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub fn update(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        source: &PageRows<'_>,
+        part: &Range<usize>,
+        buffers: &UpdateBuffers<'_>,
+    ) -> GpuResult<()> {
+        let PageRows { view, batch, table, .. } = *source;
+        let UpdateBuffers { values, grads, .. } = *buffers;
+        let uniforms = UpdateUniforms::new(&view.camera, &view.step, buffers.collects);
+        recorder.clear(&buffers.largest.view())?;
+        for window in windows(gpu, values.rows, WIDEST) {
+            let rows = Window { first: part.start as u64 + window.first, ..window }.of(&batch.listed, LISTED_BYTES);
+            let largest = window.of(buffers.largest, 4);
+            for ((buffer, _), (_, width, _)) in grads.columns().zip(parts()) {
+                let uniforms = UpdateUniforms { row_count: window.rows, width: width as u32, ..uniforms };
+                let views = [recorder.uniform(&uniforms)?, window.of(buffer, 4 * width as u64), largest.clone()];
+                recorder.dispatch("update", &self.stages.judge, &views, groups_1d(window.rows, WORKGROUP))?;
+            }
+            for slab in table.slabs() {
+                let uniforms = UpdateUniforms { slab, row_count: window.rows, ..uniforms };
+                let of_slab = [table.on_device.view(), self.slots.slab(slab)?, self.tables.view(), rows.clone()];
+                let columns = values.columns().zip(grads.columns()).zip(parts());
+                for (((values, _), (grads, _)), (column, width, first)) in columns {
+                    let uniform = recorder.uniform(&uniforms.of_column(&view.step, column, width, first))?;
+                    let [values, grads] = [values, grads].map(|buffer| window.of(buffer, 4 * width as u64));
+                    let own = [values, grads, largest.clone()];
+                    let views: Vec<BufferView> = [uniform].into_iter().chain(of_slab.clone()).chain(own).collect();
+                    let groups = groups_1d(window.rows * width as u32, WORKGROUP);
+                    recorder.dispatch("update", &self.stages.step, &views, groups)?;
+                }
+                let [pages, slab, _, rows] = of_slab;
+                let footprints = window.of(buffers.footprints, footprint_bytes(false));
+                let own = [largest.clone(), footprints, buffers.results.view(), self.bins.view()];
+                let views: Vec<BufferView> =
+                    [recorder.uniform(&uniforms)?, pages, slab, rows].into_iter().chain(own).collect();
+                recorder.dispatch("update", &self.stages.finish, &views, groups_1d(window.rows, WORKGROUP))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Finds the bounds of the pages of a batch and reads what the update did. Waits.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub fn results(&self, gpu: &Gpu, source: &PageRows<'_>, results: &Buffer) -> GpuResult<Vec<PageResult>> {
+        let PageRows { view, table, .. } = *source;
+        let mut recorder = gpu.begin("update");
+        let uniforms = self.uniforms(view, table.pages.len());
+        let groups = groups_1d(table.pages.len() as u32 * WORKGROUP, WORKGROUP);
+        for slab in table.slabs() {
+            let uniform = recorder.uniform(&GatherUniforms { slab, ..uniforms })?;
+            let [slab, tables, recent] = [self.slots.slab(slab)?, self.tables.view(), view.recent.view()];
+            let views = [uniform, table.on_device.view(), slab, tables, recent, results.view()];
+            recorder.dispatch("update", &self.stages.bounds, &views, groups)?;
+        }
+        let read = recorder.read_back("update", &results.view())?;
+        gpu.submit(recorder)?;
+        let mut results = vec![<PageResult as bytemuck::Zeroable>::zeroed(); table.pages.len()];
+        read.copy_to(&mut results)?;
+        Ok(results)
+    }
+
+    /// Takes the bins and clears them. Waits.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub fn take_bins(&self, gpu: &Gpu) -> GpuResult<Vec<u32>> {
+        let mut recorder = gpu.begin("update");
+        let read = recorder.read_back("update", &self.bins.view())?;
+        recorder.clear(&self.bins.view())?;
+        gpu.submit(recorder)?;
+        read.to_vec()
+    }
+}
+
+/// Buffers of the update of a chunk of rows.
+pub struct UpdateBuffers<'a> {
+    /// Values of the rows, from [`PageRows`].
+    pub values: &'a DeviceColumns,
+    /// Their gradients.
+    pub grads: &'a DeviceColumns,
+    /// Gradient of the projected mean, and radii: [`footprint_bytes`] a row.
+    pub footprints: &'a Buffer,
+    /// `[row of the chunk]`: the largest magnitude of a gradient.
+    pub largest: &'a Buffer,
+    /// `[page of the batch]`: what the update did.
+    pub results: &'a Buffer,
+    /// Whether statistics are collected.
+    pub collects: bool,
+}
+
+/// The listed rows of a batch, as a source of columns.
+#[derive(Clone, Copy)]
+pub struct PageRows<'a> {
+    pages: &'a DevicePages,
+    view: &'a PagesView,
+    batch: &'a PageBatch,
+    table: &'a PageTable,
+}
+
+impl<'a> PageRows<'a> {
+    /// The pages of the run.
+    pub fn pages(&self) -> &'a DevicePages {
+        self.pages
+    }
+}
+
+impl PageBatch {
+    /// `[rows]`: number of the page, number of the row in it.
+    pub fn listed(&self) -> &Buffer {
+        &self.listed
+    }
+
+    /// First listed row of each page.
+    pub fn first_listed(&self) -> &[u32] {
+        &self.first_listed
+    }
+}
+
+impl RowSource for PageRows<'_> {
+    fn rows(&self) -> usize {
+        self.batch.rows as usize
+    }
+
+    /// Gathers all columns.
+    fn geometry(
+        &mut self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        columns: &DeviceColumns,
+        part: &Range<usize>,
+    ) -> GpuResult<()> {
+        let PageRows { pages, view, batch, table } = *self;
+        let uniforms = pages.uniforms(view, table.pages.len());
+        for window in windows(gpu, columns.rows, WIDEST) {
+            let rows = Window { first: part.start as u64 + window.first, ..window }.of(&batch.listed, LISTED_BYTES);
+            for slab in table.slabs() {
+                let uniforms = GatherUniforms { slab, row_count: window.rows, ..uniforms };
+                let [slab, tables, recent] = [pages.slots.slab(slab)?, pages.tables.view(), view.recent.view()];
+                let buffers = [table.on_device.view(), slab, tables, recent, rows.clone()];
+                for ((buffer, _), (column, width, first)) in columns.columns().zip(parts()) {
+                    let uniforms = uniforms.of_column(&pages.rules.numbers, column, width, first);
+                    let (uniform, out) = (recorder.uniform(&uniforms)?, window.of(buffer, 4 * width as u64));
+                    let views: Vec<BufferView> = [uniform].into_iter().chain(buffers.clone()).chain([out]).collect();
+                    let groups = groups_1d(window.rows * width as u32, WORKGROUP);
+                    recorder.dispatch("gather", &pages.stages.gather, &views, groups)?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The colours come with the geometry.
+    fn colors(&mut self, _: &mut Recorder<'_>, _: &DeviceColumns, _: &Range<usize>) -> GpuResult<()> {
+        Ok(())
+    }
+}

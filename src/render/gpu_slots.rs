@@ -1,0 +1,142 @@
+//! Slots of pages in device memory: slabs of at most one binding, each with slots of one size.
+//!
+//! Not here: which page lies in which slot.
+//!
+//! Invariant: a slab stays for as long as the pages of a run are held, so the place of a slot never changes.
+
+use super::pages::DeviceSlot;
+use crate::gpu::{Buffer, BufferView, Gpu, GpuError, GpuResult};
+
+/// Bytes that a slot is a multiple of: the largest alignment that a device may require of a binding.
+const SLOT_STEP: u64 = 256;
+/// Most bytes of slots that are read back at once.
+const READ_BYTES: u64 = 8 << 20;
+
+/// A buffer of slots.
+#[derive(Debug)]
+struct Slab {
+    buffer: Buffer,
+    /// Number of its first slot.
+    first: u32,
+    slots: u32,
+}
+
+/// All slots of a device.
+#[derive(Debug)]
+pub struct Slots {
+    slot_bytes: u64,
+    slabs: Vec<Slab>,
+}
+
+impl Slots {
+    /// No slots yet, for payloads of at most `payload_bytes` bytes.
+    pub fn new(payload_bytes: usize) -> Slots {
+        Slots { slot_bytes: (payload_bytes as u64).next_multiple_of(SLOT_STEP), slabs: Vec::new() }
+    }
+
+    /// Bytes of a slot.
+    pub fn slot_bytes(&self) -> u64 {
+        self.slot_bytes
+    }
+
+    /// Whether there are no slots.
+    pub fn is_empty(&self) -> bool {
+        self.slabs.is_empty()
+    }
+
+    /// Number of slots.
+    pub fn len(&self) -> u32 {
+        self.slabs.last().map_or(0, |slab| slab.first + slab.slots)
+    }
+
+    /// Makes up to `wanted` slots in slabs as large as one binding allows; returns how many the device had memory for.
+    ///
+    /// # Errors
+    /// The device failed, or a slot does not exist.
+    pub fn add(&mut self, gpu: &Gpu, wanted: usize) -> GpuResult<usize> {
+        let most = (gpu.max_binding_bytes() / self.slot_bytes).max(1) as usize;
+        let (mut added, mut next) = (0, wanted.min(most));
+        while added < wanted {
+            next = next.min(wanted - added);
+            match gpu.buffer("pages", next as u64 * self.slot_bytes) {
+                Ok(buffer) => {
+                    self.slabs.push(Slab { buffer, first: self.len(), slots: next as u32 });
+                    added += next;
+                }
+                Err(error) if error.lacks_room() && next > 1 => next /= 2,
+                Err(error) if error.lacks_room() => break,
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(added)
+    }
+
+    /// The slab of a slot, and the first byte of the slot in it.
+    pub fn place(&self, slot: DeviceSlot) -> (u32, u64) {
+        let slab = self.slabs.partition_point(|slab| slab.first <= slot.0).saturating_sub(1);
+        let first = self.slabs.get(slab).map_or(0, |slab| slab.first);
+        (slab as u32, u64::from(slot.0 - first) * self.slot_bytes)
+    }
+
+    /// All bytes of a slab.
+    ///
+    /// # Errors
+    /// The device failed, or a slot does not exist.
+    pub fn slab(&self, slab: u32) -> GpuResult<BufferView> {
+        self.slabs.get(slab as usize).map(|slab| slab.buffer.view()).ok_or_else(no_such_slot)
+    }
+
+    fn view(&self, slot: DeviceSlot, bytes: usize) -> GpuResult<BufferView> {
+        let (slab, offset) = self.place(slot);
+        let slab = self.slabs.get(slab as usize).filter(|slab| slot.0 < slab.first + slab.slots);
+        let bytes = (bytes as u64).next_multiple_of(4).min(self.slot_bytes);
+        slab.map(|slab| slab.buffer.slice(offset, bytes)).ok_or_else(no_such_slot)
+    }
+
+    /// Copies payloads into slots. Does not wait.
+    ///
+    /// # Errors
+    /// The device failed, or a slot does not exist.
+    pub fn write(&self, gpu: &Gpu, payloads: &[(DeviceSlot, &[u8])]) -> GpuResult<()> {
+        let mut recorder = gpu.begin("pages");
+        for (slot, payload) in payloads {
+            recorder.upload(&self.view(*slot, payload.len())?, payload)?;
+        }
+        gpu.submit(recorder).map(|_| ())
+    }
+
+    /// Copies slots into payloads, as many at once as staging should hold. Waits.
+    ///
+    /// # Errors
+    /// The device failed, or a slot does not exist.
+    pub fn read(&self, gpu: &Gpu, payloads: &mut [(DeviceSlot, &mut [u8])]) -> GpuResult<()> {
+        let mut at_once = (READ_BYTES / self.slot_bytes).max(1) as usize;
+        let mut rest = payloads;
+        while !rest.is_empty() {
+            let count = at_once.min(rest.len());
+            match self.read_some(gpu, &mut rest[..count]) {
+                Ok(()) => rest = &mut rest[count..],
+                Err(error) if error.lacks_room() && count > 1 => at_once = count / 2,
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(())
+    }
+
+    fn read_some(&self, gpu: &Gpu, payloads: &mut [(DeviceSlot, &mut [u8])]) -> GpuResult<()> {
+        let mut recorder = gpu.begin("pages");
+        let mut readbacks = Vec::new();
+        for (slot, payload) in payloads.iter() {
+            readbacks.push(recorder.read_back("pages", &self.view(*slot, payload.len())?)?);
+        }
+        gpu.submit(recorder)?;
+        for ((_, payload), bytes) in payloads.iter_mut().zip(readbacks) {
+            bytes.copy_to(payload)?;
+        }
+        Ok(())
+    }
+}
+
+fn no_such_slot() -> GpuError {
+    GpuError::Bindings { stage: "pages".into(), problem: "a slot that does not exist".into() }
+}

@@ -1,0 +1,108 @@
+//! Pages on a device: the interface of backends whose device holds the payloads of whole pages, and gathers and updates
+//! their rows itself.
+//!
+//! Not here: which pages lie in which slot, and when they come and go (`train`).
+//!
+//! Invariants: 1. a slot holds the payload of one page byte for byte; 2. the result of a step does not depend on slots,
+//! batches or the room for them.
+
+use super::{RenderError, Renderer};
+use crate::kernels::page_words::PageResult;
+use crate::kernels::uniforms_pages::SplitNumbers;
+use crate::scene::optimizer_numbers::{RunNumbers, StepNumbers};
+use crate::scene::page_layout::PageLayout;
+
+/// A place on a device for the payload of one page.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct DeviceSlot(pub u32);
+
+/// A page in its slot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SlotPage {
+    /// The slot that holds the payload.
+    pub slot: DeviceSlot,
+    /// Layout of the payload; at least one row.
+    pub layout: PageLayout,
+}
+
+/// What a device needs to know of a run before it holds pages.
+#[derive(Debug, Clone)]
+pub struct PageRules {
+    /// Bytes of the largest payload.
+    pub payload_bytes: usize,
+    /// The optimizer.
+    pub numbers: RunNumbers,
+    /// Limits within which rows may split.
+    pub splits: SplitNumbers,
+}
+
+/// Stages on pages, in place of those on rows:
+///
+/// ```text
+/// begin_view ──> pages_in (each batch) ──> picture ─ ─ > picture_back ──> pages_out (each batch) ──> update_pages
+/// ```
+///
+/// `loss_value` and `unusable_splats` may follow the first `pages_out`, before anything is updated.
+pub trait PageRenderer: Renderer {
+    /// Prepares the device for pages of a run. Slots that exist are given up.
+    ///
+    /// # Errors
+    /// Device memory is exhausted.
+    fn hold_pages(&mut self, rules: &PageRules) -> Result<(), RenderError>;
+
+    /// Device memory that slots and views can still take, bytes; drops the view.
+    fn room(&mut self) -> u64;
+
+    /// Device memory of a slot, bytes.
+    fn slot_bytes(&self) -> u64;
+
+    /// Makes up to `wanted` more slots, numbered on from those that exist; returns how many. Fewer than wanted, even none, where
+    /// the device has no more memory.
+    ///
+    /// # Errors
+    /// The device failed, or holds no pages.
+    fn add_slots(&mut self, wanted: usize) -> Result<usize, RenderError>;
+
+    /// Copies payloads into slots.
+    ///
+    /// # Errors
+    /// The device failed.
+    fn write_slots(&mut self, payloads: &[(DeviceSlot, &[u8])]) -> Result<(), RenderError>;
+
+    /// Copies slots into payloads. Waits.
+    ///
+    /// # Errors
+    /// The device failed.
+    fn read_slots(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError>;
+
+    /// As [`Renderer::rows_in`], for the rows of `pages` that the view's camera may draw, evaluated at the step. Returns how many.
+    /// Waits for that number.
+    ///
+    /// # Errors
+    /// As [`Renderer::rows_in`]; the pages are stored with another SH degree than the view asks for; no pages are held.
+    fn pages_in(&mut self, pages: &[SlotPage], step: &StepNumbers) -> Result<usize, RenderError>;
+
+    /// Propagates the gradients of the picture to the splats of a batch, as far as an update of the rows needs them.
+    ///
+    /// # Errors
+    /// As [`Renderer::rows_out`].
+    fn pages_out(&mut self, batch: usize) -> Result<(), RenderError>;
+
+    /// Takes the step on the rows of a batch, in their slots, and collects statistics if `collects`. `pages` are those of
+    /// [`PageRenderer::pages_in`], perhaps in other slots. Returns what it did to each page. Waits.
+    ///
+    /// # Errors
+    /// [`PageRenderer::pages_out`] of the batch has not run, or the device failed: some pages may be updated then.
+    fn update_pages(
+        &mut self,
+        batch: usize,
+        pages: &[SlotPage],
+        collects: bool,
+    ) -> Result<Vec<PageResult>, RenderError>;
+
+    /// Takes the change of the number of rows by bin of the mean growth score since the last call, modulo 2^32. Waits.
+    ///
+    /// # Errors
+    /// The device failed.
+    fn take_bins(&mut self) -> Result<Vec<u32>, RenderError>;
+}

@@ -1,0 +1,47 @@
+//! The optimizer of a run as plain numbers, for backends that evaluate and update rows themselves. `optim` fills them,
+//! and documents the formulas.
+//!
+//! Invariant: the numbers depend on the run's configuration ([`RunNumbers`]) and the step ([`StepNumbers`]) alone.
+
+use super::columns::Column;
+
+/// Series sums of one gap at unit base rate: three for the schedule of the means, 0, then the same for the constant one.
+pub type SeriesSums = [f32; 8];
+
+/// Numbers of a run.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct RunNumbers {
+    /// `[stamp]`: sums of the movement to the limit; beyond the end as the last.
+    pub limits: Vec<SeriesSums>,
+    /// `[t]`, t from 1: 1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t); beyond the end as the last.
+    pub bias: Vec<[f32; 2]>,
+    /// `[step]`, 0-based: factor on the rate of the means; beyond the end as the last.
+    pub means_factor: Vec<f32>,
+    /// `[j]`: beta1^j, sqrt(beta2^j). Its length less one is the number of terms of the direct sum.
+    pub decay_powers: Vec<[f32; 2]>,
+    /// `[k]`: decay of the moments over k steps: factor of the first, factor of the second, share that the second loses.
+    pub decays: Vec<[f32; 3]>,
+    /// Adam's epsilon.
+    pub eps: f32,
+    /// The series holds for second moments above this.
+    pub floor: f32,
+    /// 1 - beta1, 1 - beta2.
+    pub one_minus_betas: [f32; 2],
+    /// Base rate of each column, in the order of [`Column::ALL`].
+    pub base_rates: [f32; Column::ALL.len()],
+    /// Least and greatest log-scale that an update leaves.
+    pub log_scales: [f32; 2],
+}
+
+/// Numbers of one step.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct StepNumbers {
+    /// Steps done.
+    pub now: u32,
+    /// `[k]`: sums of a row that missed k steps; a row that missed more has those of its limit.
+    pub recent: Vec<SeriesSums>,
+    /// Rate of each column over the bias of the first moment, in the order of [`Column::ALL`].
+    pub step_sizes: [f32; Column::ALL.len()],
+    /// 1 / sqrt(1 - beta2^t).
+    pub inv_root_correction: f32,
+}

@@ -1,0 +1,460 @@
+//! gather and update: the stages on pages, on the device and by their twins, with dense arithmetic in f64 as the judge.
+//!
+//! Source of the tolerances: a movement is some ten roundings of 6e-8, or devices' divisions of 2.5 units in the last
+//! place, so 3e-6 of the movement; a value has one rounding of its own.
+
+use crate::support::gpu::open;
+use gsscale::base::rng::{Purpose, Stream};
+use gsscale::base::simd::SimdPath;
+use gsscale::densify::stats::GradHistogram;
+use gsscale::gpu::{Buffer, Gpu, GpuOptions, Source, groups_1d};
+use gsscale::kernels::deferred::DeferredTables;
+use gsscale::kernels::gather::{self, GatherInput};
+use gsscale::kernels::page_words::{DevicePage, PageResult};
+use gsscale::kernels::uniforms_pages::{GatherUniforms, SplitNumbers, UpdateUniforms};
+use gsscale::kernels::update::{self, UpdateInput};
+use gsscale::optim::adam::AdamConfig;
+use gsscale::optim::deferred::DeferredAdam;
+use gsscale::optim::drift::DriftTables;
+use gsscale::optim::rates::Rates;
+use gsscale::render::gpu_pages::{DevicePages, UpdateBuffers};
+use gsscale::render::gpu_rows::{BAND_WIDTHS, DeviceColumns, RowSource, footprint_bytes};
+use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
+use gsscale::scene::camera::Camera;
+use gsscale::scene::columns::{Column, Columns};
+use gsscale::scene::page_layout::{PageLayout, capacity_bytes, write_page};
+use gsscale::scene::rows::RowsNow;
+use gsscale::scene::state::SceneState;
+
+const STEPS: u32 = 900;
+/// Rows of the pages: one, below, at and above a workgroup, several workgroups.
+const PAGES: [usize; 5] = [1, 255, 256, 600, 64];
+const SPLITS: SplitNumbers = SplitNumbers { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
+
+fn adam() -> DeferredAdam {
+    DeferredAdam::new(Rates::new(1.0, STEPS), AdamConfig::default(), SimdPath::best())
+}
+
+fn camera() -> Camera {
+    Camera {
+        viewmat: [[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, -0.6, 0.2], [0.0, 0.6, 0.8, 3.0]],
+        fx: 70.0,
+        fy: 60.0,
+        cx: 33.0,
+        cy: 22.0,
+        width: 65,
+        height: 47,
+        near_plane: 0.01,
+        far_plane: 1e10,
+    }
+}
+
+/// A page after at most `now` steps. Some second moments are so small that eps matters, some rows never had a gradient.
+fn random_page(rows: usize, sh_degree: u8, seed: u64, now: u32) -> SceneState {
+    let mut draws = Stream::new(seed, Purpose::Test, rows as u64, 2);
+    let mut state = SceneState::from_columns(Columns::zeros(rows, sh_degree));
+    for row in 0..rows {
+        let least = if row % 16 == 3 { 16.0 } else { 7.0 };
+        for column in Column::ALL {
+            let range = if column == Column::Scales { (-6.0, -1.0) } else { (-3.0, 3.0) };
+            let width = column.width(sh_degree);
+            for at in row * width..(row + 1) * width {
+                state.columns.column_mut(column)[at] = draws.range(range.0, range.1) as f32;
+                if row % 8 != 5 {
+                    let root = libm::pow(10.0, -draws.range(0.0, least));
+                    state.exp_avg.column_mut(column)[at] = (draws.normal() * root) as f32;
+                    state.exp_avg_sq.column_mut(column)[at] = (root * root) as f32;
+                }
+            }
+        }
+        let missed = if row % 4 == 0 { 0 } else { draws.below(u64::from(now)) as u32 };
+        state.stamp[row] = now - missed;
+        state.count[row] = draws.below(6) as u32;
+        state.grad2d[row] = if state.count[row] > 0 { draws.uniform() as f32 } else { 0.0 };
+    }
+    state
+}
+
+/// Pages with their payloads, in a slab each for the twin.
+struct World {
+    now: u32,
+    adam: DeferredAdam,
+    states: Vec<SceneState>,
+    layouts: Vec<PageLayout>,
+    payloads: Vec<Vec<u64>>,
+}
+
+impl World {
+    fn new(sh_degree: u8, now: u32) -> World {
+        let states: Vec<SceneState> =
+            PAGES.iter().enumerate().map(|(i, rows)| random_page(*rows, sh_degree, i as u64, now)).collect();
+        let mut payloads = Vec::new();
+        let layouts = states.iter().map(|state| {
+            let mut words = vec![0u64; capacity_bytes(state.rows(), sh_degree).div_ceil(8)];
+            let layout = write_page(state, bytemuck::cast_slice_mut(&mut words));
+            payloads.push(words);
+            layout
+        });
+        World { now, adam: adam(), layouts: layouts.collect(), payloads, states }
+    }
+
+    /// The payloads behind each other, as one slab, and the pages in it.
+    fn slab(&self) -> (Vec<u32>, Vec<DevicePage>) {
+        let (mut slab, mut pages, mut first_row) = (Vec::new(), Vec::new(), 0);
+        for (layout, payload) in self.layouts.iter().zip(&self.payloads) {
+            pages.push(DevicePage::new(*layout, 0, slab.len() as u32, first_row));
+            first_row += layout.rows as u32;
+            slab.extend_from_slice(&bytemuck::cast_slice::<u64, u32>(payload)[..layout.bytes() / 4]);
+        }
+        (slab, pages)
+    }
+}
+
+/// The parts of the columns on a device: column, floats per row, and the first of them.
+fn parts(sh_degree: u8) -> Vec<(Column, usize, usize)> {
+    let narrow = Column::ALL[..5].iter().map(|column| (*column, column.width(0), 0));
+    let bands = (0..usize::from(sh_degree)).map(|b| (Column::ShN, BAND_WIDTHS[b], BAND_WIDTHS[..b].iter().sum()));
+    narrow.chain(bands).collect()
+}
+
+fn read<T: bytemuck::Pod>(gpu: &Gpu, buffer: &Buffer, count: usize) -> Vec<T> {
+    let mut recorder = gpu.begin("parity");
+    let bytes = recorder.read_back("parity", &buffer.view()).unwrap();
+    gpu.submit(recorder).unwrap();
+    let mut values: Vec<T> = bytes.to_vec().unwrap();
+    values.truncate(count);
+    values
+}
+
+/// Lists and values of the twin.
+fn gathered_by_twin(world: &World) -> (Vec<[u32; 2]>, Vec<Vec<f32>>) {
+    let numbers = world.adam.numbers(STEPS).unwrap();
+    let (tables, step) = (DeferredTables::new(&numbers), world.adam.at(world.now).numbers());
+    let (slab, mut pages) = world.slab();
+    let uniforms = GatherUniforms::new(&camera(), &numbers, world.now, &SPLITS, pages.len() as u32);
+    let rows: usize = PAGES.iter().sum();
+    let (mut counts, mut found) = (vec![0; pages.len()], vec![0; rows]);
+    let (tables, recent) = (&tables, &step.recent[..]);
+    let input = GatherInput { uniforms: &uniforms, pages: &pages, slab: &slab, tables, recent };
+    gather::cull(&input, &mut counts, &mut found);
+    let mut listed = 0;
+    for (page, count) in pages.iter_mut().zip(&counts) {
+        (page.first_listed, listed) = (listed, listed + count);
+    }
+    let mut list = vec![[0; 2]; listed as usize];
+    gather::list(&pages, &counts, &found, &mut list);
+    let mut values = Vec::new();
+    for (column, width, first) in parts(world.layouts[0].sh_degree) {
+        let mut out = vec![f32::NAN; listed as usize * width];
+        let uniforms = uniforms.of_column(&numbers, column, width, first);
+        let input = GatherInput { uniforms: &uniforms, pages: &pages, slab: &slab, tables, recent };
+        gather::gather(&input, &list, &mut out);
+        values.push(out);
+    }
+    (list, values)
+}
+
+/// What a test needs of the pages on a device.
+struct OnDevice<'g> {
+    gpu: &'g Gpu,
+    pages: DevicePages,
+    slots: Vec<SlotPage>,
+}
+
+impl<'g> OnDevice<'g> {
+    fn new(gpu: &'g Gpu, world: &World) -> OnDevice<'g> {
+        let layout = world.layouts[0];
+        let largest = capacity_bytes(PAGES.into_iter().max().unwrap(), layout.sh_degree);
+        let numbers = world.adam.numbers(STEPS).unwrap();
+        let rules = PageRules { payload_bytes: largest, numbers, splits: SPLITS };
+        let mut pages = DevicePages::new(gpu, &rules).unwrap();
+        assert_eq!(pages.slots.add(gpu, 8).unwrap(), 8);
+        // Not in order, so that slabs and batch differ in theirs.
+        let numbers = [7, 2, 5, 0, 3];
+        let slots = numbers.map(DeviceSlot).into_iter().zip(&world.layouts);
+        let slots: Vec<SlotPage> = slots.map(|(slot, layout)| SlotPage { slot, layout: *layout }).collect();
+        let payloads = slots.iter().zip(&world.payloads);
+        let payloads: Vec<(DeviceSlot, &[u8])> = payloads
+            .map(|(page, words)| (page.slot, &bytemuck::cast_slice::<u64, u8>(words)[..page.layout.bytes()]))
+            .collect();
+        pages.slots.write(gpu, &payloads).unwrap();
+        OnDevice { gpu, pages, slots }
+    }
+
+    fn payloads(&self) -> Vec<Vec<u32>> {
+        let mut payloads: Vec<Vec<u32>> = self.slots.iter().map(|page| vec![0; page.layout.bytes() / 4]).collect();
+        let places = self.slots.iter().map(|page| page.slot);
+        let mut copies: Vec<(DeviceSlot, &mut [u8])> =
+            places.zip(payloads.iter_mut().map(|words| bytemuck::cast_slice_mut(words))).collect();
+        self.pages.slots.read(self.gpu, &mut copies).unwrap();
+        payloads
+    }
+}
+
+/// A device with two slots to a slab, so that a batch has pages in several slabs.
+fn device(world: &World) -> Option<Gpu> {
+    let slot = capacity_bytes(PAGES.into_iter().max().unwrap(), world.layouts[0].sh_degree) as u64;
+    // The tables of 900 steps take some 80 KB.
+    let binding = (2 * slot.next_multiple_of(256)).max(160 << 10);
+    open(&GpuOptions { max_binding_bytes: Some(binding), ..GpuOptions::default() })
+}
+
+/// The value of an element after `now` steps, in f64, and how far it has moved.
+fn exact(world: &World, tables: &DriftTables, page: usize, column: Column, row: usize, e: usize) -> [f64; 2] {
+    let state = &world.states[page];
+    let [value, m, v] = [&state.columns, &state.exp_avg, &state.exp_avg_sq].map(|of| f64::from(of.row(column, row)[e]));
+    let rate = tables.rates().base(column);
+    let moved = rate * tables.movement([m, v], state.stamp[row], world.now, column == Column::Means);
+    [value - moved, moved.abs() + rate]
+}
+
+fn assert_gathered(world: &World, list: &[[u32; 2]], values: &[Vec<f32>], by: &str) {
+    let tables = DriftTables::new(Rates::new(1.0, STEPS), AdamConfig::default());
+    for ((column, width, first), values) in parts(world.layouts[0].sh_degree).into_iter().zip(values) {
+        for (i, got) in values.iter().enumerate() {
+            let [page, row] = list[i / width].map(|x| x as usize);
+            let [want, moved] = exact(world, &tables, page, column, row, first + i % width);
+            let slack = f64::from(f32::EPSILON) * want.abs() + 3e-6 * moved;
+            assert!((f64::from(*got) - want).abs() <= slack, "{by}: {column:?} page {page} row {row}: {got} {want}");
+        }
+    }
+}
+
+#[test]
+fn rows_of_pages_are_listed_and_gathered_as_dense_adam_has_them() {
+    for (sh_degree, now) in [(0, 40), (1, 899), (3, 700)] {
+        let world = World::new(sh_degree, now);
+        let (list, values) = gathered_by_twin(&world);
+        assert_gathered(&world, &list, &values, "twin");
+        let rows: usize = PAGES.iter().sum();
+        assert!(list.len() > rows / 10 && list.len() < rows, "{} of {rows} rows in view", list.len());
+        let Some(gpu) = device(&world) else { return };
+        let on = OnDevice::new(&gpu, &world);
+        let view = on.pages.begin(&gpu, &camera(), &world.adam.at(now).numbers()).unwrap();
+        let (batch, table) = on.pages.list(&gpu, &view, &on.slots).unwrap();
+        let listed: Vec<[u32; 2]> = read(&gpu, batch.listed(), batch.rows as usize);
+        assert!(listed.is_sorted(), "lists are in the order of pages and rows");
+        // A row at the edge of the cull's slack may be listed on one side alone.
+        let differ = listed.iter().filter(|row| !list.contains(row)).count()
+            + list.iter().filter(|row| !listed.contains(row)).count();
+        assert!(differ <= 2, "{differ} rows of {} differ", list.len());
+        let columns = DeviceColumns::new(&gpu, batch.rows, sh_degree).unwrap();
+        let mut recorder = gpu.begin("parity");
+        let all = 0..batch.rows as usize;
+        on.pages.source(&view, &batch, &table).geometry(&gpu, &mut recorder, &columns, &all).unwrap();
+        gpu.submit(recorder).unwrap();
+        let of_device: Vec<Vec<f32>> =
+            columns.columns().map(|(buffer, width)| read(&gpu, buffer, width * batch.rows as usize)).collect();
+        assert_gathered(&world, &listed, &of_device, "device");
+    }
+}
+
+/// Gradients of listed rows by part, and footprints: a tenth of the rows have none, and `poison` of them are not finite or too
+/// large in one element.
+fn random_gradients(rows: usize, sh_degree: u8, poison: f64) -> (Vec<Vec<f32>>, Vec<[f32; 4]>) {
+    let mut draws = Stream::new(5, Purpose::Test, rows as u64, 3);
+    let kinds: Vec<[f64; 2]> = (0..rows).map(|_| [draws.uniform(), draws.uniform()]).collect();
+    let parts = parts(sh_degree);
+    let bad = [f32::NAN, f32::INFINITY, -2e18];
+    let mut grads = Vec::new();
+    for (p, (_, width, _)) in parts.iter().enumerate() {
+        let mut of_part = Vec::new();
+        for (row, kind) in kinds.iter().enumerate() {
+            let is_zero = kind[0] > 0.9;
+            let size = libm::pow(10.0, -draws.range(0.0, 9.0));
+            of_part.extend((0..*width).map(|_| if is_zero { 0.0 } else { (draws.normal() * size) as f32 }));
+            if kind[1] < poison && row % parts.len() == p {
+                of_part[row * width + row % width] = bad[row % 3];
+            }
+        }
+        grads.push(of_part);
+    }
+    let footprint = |kind: &[f64; 2]| {
+        let radius = if kind[0] > 0.95 { 0.0 } else { 4.0 };
+        [draws.normal() as f32 * 1e-3, draws.normal() as f32 * 1e-3, radius, radius]
+    };
+    (grads, kinds.iter().map(footprint).collect())
+}
+
+/// What an update leaves: payloads, results of pages, change of the bins.
+type Updated = (Vec<Vec<u32>>, Vec<PageResult>, Vec<u32>);
+
+fn updated_by_twin(
+    world: &World,
+    list: &[[u32; 2]],
+    values: &[Vec<f32>],
+    (grads, footprints): (&[Vec<f32>], &[[f32; 4]]),
+) -> Updated {
+    let numbers = world.adam.numbers(STEPS).unwrap();
+    let (tables, step) = (DeferredTables::new(&numbers), world.adam.at(world.now).numbers());
+    let (mut slab, pages) = world.slab();
+    let uniforms = UpdateUniforms::new(&camera(), &step, true);
+    let mut largest = vec![0; list.len()];
+    let parts = parts(world.layouts[0].sh_degree);
+    parts.iter().zip(grads).for_each(|((_, width, _), grads)| update::judge(*width, grads, &mut largest));
+    let (pages, rows, tables, largest) = (&pages[..], list, &tables, &largest[..]);
+    for (((column, width, first), values), grads) in parts.into_iter().zip(values).zip(grads) {
+        let uniforms = uniforms.of_column(&step, column, width, first);
+        let input = UpdateInput { uniforms: &uniforms, pages, rows, tables, largest };
+        update::step(&input, values, grads, &mut slab);
+    }
+    let mut results = vec![<PageResult as bytemuck::Zeroable>::zeroed(); pages.len()];
+    let mut bins = vec![0; 1 << 15];
+    let input = UpdateInput { uniforms: &uniforms, pages, rows, tables, largest };
+    update::finish(&input, footprints, &mut slab, &mut results, &mut bins);
+    let of_bounds = GatherUniforms::new(&camera(), &numbers, world.now, &SPLITS, pages.len() as u32);
+    let input = GatherInput { uniforms: &of_bounds, pages, slab: &slab, tables, recent: &step.recent };
+    gather::bounds(&input, &mut results);
+    let payload =
+        |(page, layout): (&DevicePage, &PageLayout)| slab[page.base as usize..][..layout.bytes() / 4].to_vec();
+    (pages.iter().zip(&world.layouts).map(payload).collect(), results, bins)
+}
+
+/// The same on a device, on rows that it has listed and gathered; and these.
+fn updated_by_device(on: &OnDevice<'_>, world: &World, poison: f64) -> (Updated, Vec<[u32; 2]>, Vec<Vec<f32>>) {
+    let (gpu, sh_degree) = (on.gpu, world.layouts[0].sh_degree);
+    let view = on.pages.begin(gpu, &camera(), &world.adam.at(world.now).numbers()).unwrap();
+    let (batch, table) = on.pages.list(gpu, &view, &on.slots).unwrap();
+    let rows = batch.rows as usize;
+    let [values, grads] = [0; 2].map(|_| DeviceColumns::new(gpu, batch.rows, sh_degree).unwrap());
+    let (of_rows, footprints) = random_gradients(rows, sh_degree, poison);
+    let mut source = on.pages.source(&view, &batch, &table);
+    let mut recorder = gpu.begin("parity");
+    source.geometry(gpu, &mut recorder, &values, &(0..rows)).unwrap();
+    for ((buffer, _), of_rows) in grads.columns().zip(&of_rows) {
+        recorder.upload(&buffer.view(), of_rows).unwrap();
+    }
+    let on_device = gpu.buffer("footprints", footprint_bytes(false) * rows as u64).unwrap();
+    recorder.upload(&on_device.view(), &footprints).unwrap();
+    let largest = gpu.buffer("largest", 4 * rows as u64).unwrap();
+    let results = recorder.buffer_zeroed("results", (size_of::<PageResult>() * on.slots.len()) as u64).unwrap();
+    let buffers = UpdateBuffers {
+        values: &values,
+        grads: &grads,
+        footprints: &on_device,
+        largest: &largest,
+        results: &results,
+        collects: true,
+    };
+    on.pages.update(gpu, &mut recorder, &source, &(0..rows), &buffers).unwrap();
+    gpu.submit(recorder).unwrap();
+    let results = on.pages.results(gpu, &source, &results).unwrap();
+    let gathered = values.columns().map(|(buffer, width)| read(gpu, buffer, width * rows)).collect();
+    let bins = on.pages.take_bins(gpu).unwrap();
+    ((on.payloads(), results, bins), read(gpu, batch.listed(), rows), gathered)
+}
+
+/// Whether two floats, by their bits, agree within three units in the last place and `slack`.
+fn agree(a: u32, b: u32, slack: f32) -> bool {
+    let (x, y) = (f32::from_bits(a), f32::from_bits(b));
+    a == b || (x - y).abs() <= 3.0 * f32::EPSILON * x.abs().max(y.abs()) + slack
+}
+
+#[test]
+fn updates_of_pages_agree_and_unusable_gradients_leave_their_rows() {
+    for (poison, sh_degree) in [(0.0, 3), (0.01, 1), (0.1, 3)] {
+        let world = World::new(sh_degree, 700);
+        let Some(gpu) = device(&world) else { return };
+        let on = OnDevice::new(&gpu, &world);
+        let ((payloads, results, bins), list, values) = updated_by_device(&on, &world, poison);
+        let (grads, footprints) = random_gradients(list.len(), sh_degree, poison);
+        let twin = updated_by_twin(&world, &list, &values, (&grads, &footprints));
+        let counts = |of: &[PageResult]| -> Vec<[u32; 4]> {
+            of.iter().map(|r| [r.updated, r.skipped, r.drawn, r.collected]).collect()
+        };
+        assert_eq!(counts(&results), counts(&twin.1), "poison {poison}");
+        let skipped: u32 = results.iter().map(|r| r.skipped).sum();
+        assert_eq!(skipped > 0, poison > 0.0, "{skipped} rows were skipped");
+        assert_eq!(bins, twin.2);
+        let (mut histogram, mut after) = (GradHistogram::default(), GradHistogram::default());
+        for (p, layout) in world.layouts.iter().enumerate() {
+            let before: &[u32] = bytemuck::cast_slice(&world.payloads[p]);
+            histogram.add_rows(&layout.rows(bytemuck::cast_slice(&world.payloads[p]), 0));
+            let mut aligned = vec![0u64; layout.bytes() / 8];
+            bytemuck::cast_slice_mut::<u64, u32>(&mut aligned).copy_from_slice(&payloads[p]);
+            after.add_rows(&layout.rows(bytemuck::cast_slice(&aligned), 0));
+            // Steps of Adam are at most 32 rates long, and 1e-6 of that is the slack of the slowest arithmetic.
+            for (i, (device, twin)) in payloads[p].iter().zip(&twin.0[p]).enumerate() {
+                let is_untouched = *twin == before[i];
+                let is_same = if is_untouched { device == twin } else { agree(*device, *twin, 2e-6) };
+                assert!(is_same, "page {p} word {i}: {device:#x} {twin:#x}");
+                let float = f32::from_bits(*device);
+                assert!(float.is_finite() || is_untouched, "page {p} word {i} became {float}");
+            }
+        }
+        histogram.add_changes(&bins);
+        assert_eq!((histogram.uncounted(), histogram == after), (0, true), "bins of the device are those of the CPU");
+        assert_bounds(&world, &payloads, &results, &twin.1);
+    }
+}
+
+/// Bounds of the device hold the positions of all rows at later steps, and are those of the twin but for roundings.
+fn assert_bounds(world: &World, payloads: &[Vec<u32>], results: &[PageResult], twin: &[PageResult]) {
+    for (p, layout) in world.layouts.iter().enumerate() {
+        let (Some(bounds), Some(of_twin)) = (results[p].bounds(), twin[p].bounds()) else { continue };
+        let mut aligned = vec![0u64; layout.bytes() / 8];
+        bytemuck::cast_slice_mut::<u64, u32>(&mut aligned).copy_from_slice(&payloads[p]);
+        let rows = layout.rows(bytemuck::cast_slice(&aligned), 0);
+        for later in [1, 3, 50, 199] {
+            let at = world.adam.at(world.now + later);
+            for row in 0..layout.rows {
+                for c in 0..3 {
+                    let mean = at.evaluate_element(&rows, Column::Means, row, c);
+                    assert!((bounds.lo[c]..=bounds.hi[c]).contains(&mean), "page {p} row {row}: {mean} {bounds:?}");
+                    let scale = at.evaluate_element(&rows, Column::Scales, row, c);
+                    assert!(scale.exp() <= bounds.sigma_max, "page {p} row {row}");
+                }
+            }
+        }
+        for c in 0..3 {
+            let slack = 1e-5 * (1.0 + of_twin.hi[c].abs() + of_twin.lo[c].abs());
+            assert!((bounds.lo[c] - of_twin.lo[c]).abs() <= slack && (bounds.hi[c] - of_twin.hi[c]).abs() <= slack);
+        }
+        assert!((bounds.sigma_max / of_twin.sigma_max - 1.0).abs() < 1e-5);
+    }
+}
+
+const DIVISIONS: &str = r#"
+#import "shared/dispatch.wgsl"
+#import "shared/quotient.wgsl"
+@group(0) @binding(0) var<storage, read> sums: array<f32>;
+@group(0) @binding(1) var<storage, read> counts: array<u32>;
+@group(0) @binding(2) var<storage, read_write> quotients: array<f32>;
+@compute @workgroup_size(256)
+fn divide(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = linear_index(workgroup, workgroups, lane, 256u);
+    if i < arrayLength(&sums) {
+        quotients[i] = quotient(sums[i], counts[i]);
+    }
+}
+"#;
+
+/// Means of growth scores decide on both sides, so they must be equal to the bit.
+#[test]
+fn devices_divide_growth_scores_exactly() {
+    let Some(gpu) = open(&GpuOptions::default()) else { return };
+    let mut draws = Stream::new(6, Purpose::Test, 0, 4);
+    let (mut sums, mut counts) = (Vec::new(), Vec::new());
+    for i in 0..1 << 20u32 {
+        let exponent = draws.range(-75.0, 120.0).floor();
+        let mantissa = if i % 7 == 0 { 1.0 } else { draws.range(1.0, 2.0) };
+        sums.push(if i % 1001 == 0 { 0.0 } else { (mantissa * libm::exp2(exponent)) as f32 });
+        counts.push(1 + if i % 3 == 0 { draws.below(40) } else { draws.below(4095) } as u32);
+    }
+    (sums[5], counts[5]) = (f32::MAX, 3);
+    let divide = gpu.pipeline_from(&Source { name: "divisions", text: DIVISIONS }, "divide", &[]).unwrap();
+    let mut recorder = gpu.begin("divisions");
+    let inputs = [recorder.buffer_with("sums", &sums).unwrap(), recorder.buffer_with("counts", &counts).unwrap()];
+    let out = gpu.buffer("quotients", 4 * sums.len() as u64).unwrap();
+    let views = [inputs[0].view(), inputs[1].view(), out.view()];
+    recorder.dispatch("divisions", &divide, &views, groups_1d(sums.len() as u32, 256)).unwrap();
+    gpu.submit(recorder).unwrap();
+    let quotients: Vec<f32> = read(&gpu, &out, sums.len());
+    for ((sum, count), got) in sums.iter().zip(&counts).zip(quotients) {
+        assert_eq!(got.to_bits(), (sum / *count as f32).to_bits(), "{sum} / {count} = {got}");
+    }
+}
