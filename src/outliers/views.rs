@@ -6,10 +6,10 @@
 //!
 //! At the end of each epoch every view has a measure of that epoch. Median and median absolute deviation of all of them say
 //! what is usual; a view far above earns a strike, another loses one. Strikes outlast chance: a view is an outlier from
-//! [`STRIKES_NAMED`] on, until it has lost all of them. Views that are left out are still measured, so they can return.
+//! two strikes on, until it has lost all of them. Views that are left out are still measured, so they can return.
 //!
 //! Invariants: 1. measures are stored as fixed-point numbers, and a verdict follows from them alone; 2. fewer than half of
-//! the views can be outliers of an epoch; 3. no verdict on fewer than [`VIEWS_LEAST`] views, or before the second epoch.
+//! the views can be outliers of an epoch; 3. no verdict on fewer than eight views, or before the second epoch.
 
 use crate::scene::image::Target;
 use serde::{Deserialize, Serialize};

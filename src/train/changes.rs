@@ -16,7 +16,13 @@ use std::path::Path;
 
 /// What programs did that did not know a key, as the value of the key. A key that is missing here counts as changed when an older
 /// run resumes.
-const BEFORE_ITS_TIME: [(&str, &str); 3] = [("appearance", "off"), ("robust-views", "false"), ("quality", "normal")];
+const BEFORE_ITS_TIME: [(&str, &str); 5] = [
+    ("appearance", "off"),
+    ("robust-views", "false"),
+    ("quality", "normal"),
+    ("optimizer-on", "auto"),
+    ("optimizer-on", "host"),
+];
 
 /// The config that a run keeps when it resumes with `config`: that of its file, with the lasting keys of `config`
 /// (numbers, length, place of the checkpoint).
