@@ -74,6 +74,7 @@ impl Sequence {
     }
 
     /// Camera and options of the view; `None` without a view.
+    #[cfg(feature = "gpu")]
     pub fn view(&self) -> Option<ViewOptions> {
         self.current.as_ref().map(|current| current.view)
     }
