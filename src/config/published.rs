@@ -192,9 +192,13 @@ pub fn differences(published: &TrainConfig, used: &TrainConfig) -> Vec<String> {
     let [before, after] = [published, used].map(|c| toml::Table::try_from(c).unwrap_or_default());
     // An extended run has the resolved number written instead of 0.
     let is_same_schedule = schedule_steps(published) == schedule_steps(used);
+    // A run writes the place that auto chose.
+    let [theirs, ours] = [published, used].map(|config| config.optimizer_on.0.unwrap_or_default());
     let is_free = |name: &str| {
         let same_run = |key: &Key| key.name() == name && !key.class.makes_another_run();
-        KEYS.iter().any(same_run) || (name == "schedule-steps" && is_same_schedule)
+        KEYS.iter().any(same_run)
+            || (name == "schedule-steps" && is_same_schedule)
+            || (name == "optimizer-on" && theirs == ours)
     };
     let changed = after.iter().filter(|(key, value)| !is_free(key.as_str()) && before.get(*key) != Some(*value));
     changed

@@ -450,8 +450,10 @@ fn evaluate_result(
 ) -> Result<Option<TestMetrics>, TrainError> {
     let shown = Count::new("held-out views compared", dataset.test_views().len() as u32, request.quiet);
     let pictures = request.out.join(PICTURES_FOLDER);
+    // A run that was killed after the commit of its last evaluation has the line already.
+    let is_logged = trainer.state.test.is_some_and(|test| test.step == trainer.state.step);
     let test = trainer.evaluate(dataset, targets, Some(&pictures), &|done| shown.show(done))?;
-    if let Some(test) = test {
+    if let Some(test) = test.filter(|_| !is_logged) {
         metrics.write_evaluation(trainer.steps_done(), test, &pictures)?;
     }
     Ok(test)
