@@ -141,7 +141,7 @@ choices! {
 
 /// Implements [`Choice`] for optional choices, with their word for `None`.
 macro_rules! open_choices {
-    ($($key:literal: $type:ident, $none:literal in [$($word:literal),+], $from:expr, $to:expr;)+) => { $(
+    ($($key:literal: $type:ident, $none:literal in [$($word:expr),+], $from:expr, $to:expr;)+) => { $(
         impl Choice for Chosen<$type> {
             const KEY: &'static str = $key;
             const WORDS: &'static [&'static str] = &[$($word),+];
@@ -157,9 +157,13 @@ macro_rules! open_choices {
     )+ };
 }
 
+/// The word for zstd. It says why the codec is refused where it is missing.
+const ZSTD_WORD: &str =
+    if cfg!(feature = "zstd") { "zstd:LEVEL" } else { "zstd:LEVEL (this program was built without zstd)" };
+
 open_choices! {
     "view-order": Order, "auto" in ["auto", "shuffle", "groups:N", "tour"], parsed, |order: Order| order.to_string();
-    "spill-codec": Codec, "auto" in ["raw", "halves", "zstd:LEVEL", "auto"], parsed, |codec: Codec| codec.to_string();
+    "spill-codec": Codec, "auto" in ["raw", "halves", ZSTD_WORD, "auto"], parsed, |codec: Codec| codec.to_string();
     "simd": SimdPath, "auto" in ["auto", "avx512", "avx2", "baseline"], SimdPath::from_name, |path: SimdPath| path.name().to_string();
     "optimizer-on": OptimizerPlace, "auto" in ["auto", "device", "host"], OptimizerPlace::from_name, |place: OptimizerPlace| place.name().to_string();
     "color-correct": ColorCorrect, "off" in ["off", "affine", "quadratic"], ColorCorrect::from_name, |fit: ColorCorrect| fit.name().to_string();
