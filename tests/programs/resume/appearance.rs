@@ -14,7 +14,7 @@ fn a_run_with_appearance_resumes_with_its_values() {
         for (name, commits) in [("KILL", "0.02"), ("INT", "0")] {
             let mut child = bench.begin(place, &[FULL, &["--commit-every", commits]].concat());
             bench.wait_for_lines(&mut child, 9);
-            signal(&child, name);
+            signal(&mut child, name);
             ended(child);
             if name == "INT" {
                 let said = refused(bench.go_on(&["--appearance", "exposure"]));

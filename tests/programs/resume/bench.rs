@@ -3,6 +3,7 @@
 use crate::support::scenes::{CLASSIC, stderr, summary, text, train};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use serde_json::Value;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -53,6 +54,8 @@ pub struct Bench {
     pub scene: PathBuf,
     /// The argument of `--device`.
     device: &'static str,
+    /// The argument of `--steps` of runs in `out`.
+    pub steps: u32,
 }
 
 /// The result of an uninterrupted run.
@@ -82,7 +85,7 @@ impl Bench {
         let city =
             CityOptions { seed: 5, views, width, height, points, blocks, supersample: 1, ..CityOptions::default() };
         write_city(&scene, &city, &|_, _| {}).unwrap();
-        Bench { folder, scene, device }
+        Bench { folder, scene, device, steps: STEPS }
     }
 
     /// [`BUSY`] with the bench's device.
@@ -113,7 +116,7 @@ impl Bench {
 
     /// Starts a run in `out`.
     pub fn begin(&self, place: Place, more: &[&str]) -> Child {
-        let (out, spill, steps) = (self.path("out"), self.path("spill"), STEPS.to_string());
+        let (out, spill, steps) = (self.path("out"), self.path("spill"), self.steps.to_string());
         let mut args = vec![text(&self.scene), "--out", text(&out), "--steps", &steps];
         let frames;
         if let Place::Spill(count) = place {
@@ -143,7 +146,7 @@ impl Bench {
     pub fn stopped_with(&self, place: Place, lines: usize, more: &[&str]) {
         let mut child = self.begin(place, &[&SELDOM, more].concat());
         self.wait_for_lines(&mut child, lines);
-        signal(&child, "INT");
+        signal(&mut child, "INT");
         let output = ended(child);
         assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
     }
@@ -190,9 +193,14 @@ pub fn logged(out: &Path) -> Vec<u64> {
     lines(out).iter().map(|line| line["step"].as_u64().unwrap()).collect()
 }
 
-pub fn signal(child: &Child, name: &str) {
+/// Sends a signal to a run that must still go on; a run that has ended fails the test with its own words.
+pub fn signal(child: &mut Child, name: &str) {
     let done = Command::new("kill").args([&format!("-{name}"), &child.id().to_string()]).status().unwrap();
-    assert!(done.success());
+    if !done.success() {
+        let mut said = String::new();
+        child.stderr.take().unwrap().read_to_string(&mut said).unwrap();
+        panic!("the run ended before the signal with {:?}: {said}", child.wait());
+    }
 }
 
 pub fn ended(child: Child) -> Output {

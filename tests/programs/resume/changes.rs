@@ -33,7 +33,7 @@ fn what_changed_is_said_and_left_as_it_was() {
     // The folder is in use: a second process is refused.
     let said = refused(bench.go_on(&[]));
     assert!(said.contains("another process"), "{said}");
-    signal(&child, "INT");
+    signal(&mut child, "INT");
     assert_eq!(ended(child).status.code(), Some(130));
     // The message lists every changed key and its earlier value.
     let said = refused(bench.go_on(&["--means-lr", "0.001", "--seed", "3", "--threads", "1"]));
@@ -95,7 +95,7 @@ fn accepted_changes_are_the_same_in_any_memory() {
     let frames = ((alone.fewest + alone.pages) / 2).to_string();
     let mut child = bench.go_on_in("twin", &[&other[..], &["--frames", &frames], &SELDOM[..]].concat());
     bench.wait_for_lines_in("twin", &mut child, logged(&bench.path("out")).len() - 8);
-    signal(&child, "INT");
+    signal(&mut child, "INT");
     let output = ended(child);
     // The run may have finished before the signal arrived.
     assert!(output.status.code() == Some(130) || output.status.success(), "{}", stderr(&output));
@@ -117,7 +117,7 @@ fn other_bands_are_accepted_once() {
         succeeded(bench.go_on_in("twin", &accepted));
         let mut child = bench.go_on(&[&accepted[..], &SELDOM].concat());
         bench.wait_for_lines(&mut child, logged(&bench.path("out")).len() + 3);
-        signal(&child, "INT");
+        signal(&mut child, "INT");
         assert_eq!(ended(child).status.code(), Some(130));
         succeeded(bench.go_on(&[]));
         assert!(ply(&bench.path("out")) == ply(&bench.path("twin")), "{keys:?}: the scene is another");
@@ -145,7 +145,7 @@ fn a_scene_and_a_start_that_were_moved_are_named_and_the_run_goes_on() {
     assert!(refused(bench.go_on(&[text(&scene)])).contains("first.ply"));
     let mut child = bench.go_on(&[&[text(&scene), "--init-ply", text(&start)], &SELDOM[..]].concat());
     bench.wait_for_lines(&mut child, logged(&bench.path("out")).len() + 3);
-    signal(&child, "INT");
+    signal(&mut child, "INT");
     assert_eq!(ended(child).status.code(), Some(130));
     // Afterwards the file exists.
     succeeded(bench.go_on(&[]));

@@ -20,7 +20,7 @@ fn a_run_that_decides_its_count_resumes_with_its_checks() {
         let commits: &[&str] = if name == "KILL" { &["--commit-every", "0.02"] } else { &SELDOM };
         let mut child = bench.begin(place, &[DECIDES, commits].concat());
         bench.wait_for_lines(&mut child, lines);
-        signal(&child, name);
+        signal(&mut child, name);
         ended(child);
         succeeded(bench.go_on(&[]));
         assert!(ply(&out) == alone.ply, "{place:?}, {lines} lines, {name}: the resumed run gives another scene");

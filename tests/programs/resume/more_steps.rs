@@ -77,7 +77,7 @@ fn more_steps_keep_the_schedule() {
         assert!(bench.checkpoint(place).join("FORMAT").exists(), "the kept checkpoint is gone");
         let mut child = bench.go_on(&[&SELDOM[..], &["--steps", "260", "--log-every", "1"]].concat());
         bench.wait_for_lines(&mut child, alone.logged.len() + 4);
-        signal(&child, "INT");
+        signal(&mut child, "INT");
         assert_eq!(ended(child).status.code(), Some(130));
         // The run remembers its number of steps.
         succeeded(bench.go_on(&["--keep-checkpoint=false"]));

@@ -28,7 +28,7 @@ fn a_run_without_wrong_views_resumes_without_them() {
     {
         let mut child = bench.begin(place, &[ROBUST, &["--commit-every", commits]].concat());
         bench.wait_for_lines(&mut child, 14);
-        signal(&child, name);
+        signal(&mut child, name);
         ended(child);
         if name == "INT" {
             let said = refused(bench.go_on(&["--robust-views=false"]));

@@ -1,6 +1,6 @@
 //! Ownership of checkpoints: a run touches only the checkpoint that it made, wherever other checkpoints lie.
 
-use super::bench::{BUSY, Bench, Place, SELDOM, copy_folder, ended, ply, refused, signal, succeeded};
+use super::bench::{BUSY, Bench, Place, SELDOM, STEPS, copy_folder, ended, ply, refused, signal, succeeded};
 use crate::support::scenes::{stderr, text, train};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -102,7 +102,7 @@ fn starting_over_leaves_a_checkpoint_that_is_another_runs() {
     }
     let mut child = bench.begin(Place::Memory, &[&SELDOM[..], &["--overwrite"]].concat());
     bench.wait_for_lines(&mut child, 2);
-    signal(&child, "INT");
+    signal(&mut child, "INT");
     assert_eq!(ended(child).status.code(), Some(130));
     let left = files(&out.join("renders/test")).into_keys().collect::<Vec<_>>();
     assert_eq!(left, [out.join("renders/test/notes.txt")]);
@@ -120,7 +120,7 @@ fn the_checkpoint_alone_is_enough_to_go_on() {
         std::fs::write(out.join("metrics.jsonl"), &metrics[..metrics.len() / 2]).unwrap();
         let mut child = bench.go_on(&SELDOM);
         bench.wait_for_lines(&mut child, 8);
-        signal(&child, "INT");
+        signal(&mut child, "INT");
         let output = ended(child);
         assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
         assert!(stderr(&output).contains("metrics.jsonl has"), "{}", stderr(&output));
@@ -172,7 +172,7 @@ fn a_run_that_was_cut_off_before_its_first_commit_begins_again() {
     // A result is never overwritten by a second start.
     let mut child = bench.begin(Place::Memory, &["--frames", "4000"]);
     bench.wait_for_lines(&mut child, 1);
-    signal(&child, "INT");
+    signal(&mut child, "INT");
     assert_eq!(ended(child).status.code(), Some(130));
     let before = files(&out);
     let said = refused(bench.go_on(&[]));
@@ -183,8 +183,10 @@ fn a_run_that_was_cut_off_before_its_first_commit_begins_again() {
 /// A run killed at any early moment: the same command, or `--resume` once a config exists, trains it.
 #[test]
 fn a_kill_in_the_first_second_is_in_nobodys_way() {
-    let bench = Bench::new();
+    let mut bench = Bench::new();
     let alone = bench.alone(&[]);
+    // A fast machine does the usual steps within the longest wait.
+    bench.steps = 100 * STEPS;
     let (out, spill) = (bench.path("out"), bench.path("spill"));
     for milliseconds in [30, 60, 100, 150, 220, 300, 400, 550, 700] {
         let mut child = bench.begin(Place::Spill(alone.fewest), &SELDOM);
@@ -198,7 +200,7 @@ fn a_kill_in_the_first_second_is_in_nobodys_way() {
             false => bench.begin(Place::Spill(alone.fewest), &SELDOM),
         };
         bench.wait_for_lines(&mut again, 2);
-        signal(&again, "INT");
+        signal(&mut again, "INT");
         let output = ended(again);
         assert_eq!(output.status.code(), Some(130), "after {milliseconds} ms: {}", stderr(&output));
         assert!(out.join("point_cloud.ply").exists() && spill.join("FORMAT").exists());
@@ -259,7 +261,7 @@ fn one_process_at_a_time_trains_into_a_folder() {
     let said = refused(bench.begin(Place::Memory, &["--overwrite"]));
     assert!(said.contains("another process trains into this folder"), "{said}");
     assert!(std::fs::read(out.join("config.toml")).unwrap() == config);
-    signal(&child, "INT");
+    signal(&mut child, "INT");
     assert_eq!(ended(child).status.code(), Some(130));
     succeeded(bench.go_on(&[]));
 }

@@ -13,7 +13,7 @@ fn a_run_that_is_asked_to_stop_says_how_to_go_on_and_does() {
         let mut child = bench.begin(place, &SELDOM);
         for (lines, (name, code)) in [(3, ("INT", 130)), (12, ("TERM", 143))] {
             bench.wait_for_lines(&mut child, lines);
-            signal(&child, name);
+            signal(&mut child, name);
             let output = ended(child);
             assert_eq!(output.status.code(), Some(code), "{}", stderr(&output));
             assert!(
@@ -64,7 +64,7 @@ fn the_same_command_again_says_that_there_is_a_run() {
     bench.wait_for_lines(&mut child, 2);
     assert!(!bench.path("out/checkpoint/FORMAT").exists() && bench.path("out/checkpoint/notes.txt").exists());
     // Nothing can be committed there; the run is unaffected.
-    signal(&child, "INT");
+    signal(&mut child, "INT");
     let output = ended(child);
     assert_eq!(output.status.code(), Some(130));
     assert!(stderr(&output).contains("not committed") && !stderr(&output).contains("--resume"), "{}", stderr(&output));
