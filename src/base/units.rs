@@ -5,13 +5,19 @@
 pub const MIB: u64 = 1 << 20;
 /// Bytes in one GiB.
 pub const GIB: u64 = 1 << 30;
+/// A smaller number without a unit is taken for a unit that was forgotten.
+const BARE_LEAST: f64 = 1e6;
 
-/// Parses a size: a number, then an optional unit. `K M G T` and `KiB ...` are powers of 1024, `KB ...` of 1000.
+/// Parses a size: a number, then a unit. `K M G T` and `KiB ...` are powers of 1024, `KB ...` of 1000. Zero and a million
+/// bytes or more need no unit.
 pub fn parse_bytes(text: &str) -> Result<u64, String> {
     let text = text.trim();
     let split = text.find(|c: char| !(c.is_ascii_digit() || c == '.')).unwrap_or(text.len());
     let (number, unit) = text.split_at(split);
     let value: f64 = number.parse().map_err(|_| format!("'{text}' is not a size; write for example 4GiB"))?;
+    if unit.trim().is_empty() && value > 0.0 && value < BARE_LEAST {
+        return Err(format!("'{text}' would be that many bytes; give a unit, for example {text}GiB"));
+    }
     let factor = match unit.trim().to_ascii_lowercase().as_str() {
         "" | "b" => 1.0,
         "k" | "kib" => 1024.0,
@@ -142,7 +148,8 @@ mod tests {
         assert_eq!(parse_bytes("4GiB"), Ok(4 * GIB));
         assert_eq!(parse_bytes("1.5 MiB"), Ok(MIB + MIB / 2));
         assert_eq!(parse_bytes("2GB"), Ok(2_000_000_000));
-        assert_eq!(parse_bytes("77"), Ok(77));
+        assert_eq!([parse_bytes("77B"), parse_bytes("0"), parse_bytes("1048576")], [Ok(77), Ok(0), Ok(MIB)]);
+        assert!(parse_bytes("8").is_err_and(|e| e.contains("8GiB")));
         assert!(parse_bytes("GiB").is_err());
         assert!(parse_bytes("4 parsecs").is_err());
         assert_eq!(format_bytes(4 * GIB), "4.0 GiB");

@@ -22,7 +22,9 @@ impl Serialize for ByteSize {
         let text = units
             .iter()
             .find(|(unit, _)| self.0 > 0 && self.0.is_multiple_of(*unit))
-            .map_or_else(|| self.0.to_string(), |(unit, name)| format!("{}{name}", self.0 / unit));
+            .map(|(unit, name)| format!("{}{name}", self.0 / unit));
+        // Zero needs no unit.
+        let text = text.unwrap_or_else(|| if self.0 == 0 { "0".to_string() } else { format!("{}B", self.0) });
         s.serialize_str(&text)
     }
 }

@@ -12,6 +12,12 @@ const ENTRIES_MAX: usize = 100_000;
 pub(super) fn error(folder: &Path) -> Option<InputError> {
     let images = folder.join("images");
     let (photos, count) = [images.as_path(), folder].into_iter().map(|f| (f, photos_in(f))).find(|(_, n)| *n > 0)?;
+    if let Some(above) = folder.parent().filter(|above| above.join("sparse").is_dir()) {
+        let problem =
+            format!("{count} photos, but no camera poses, which seem to lie in {}", above.join("sparse").display());
+        let remedy = format!("name the folder above: {}", above.display());
+        return Some(InputError::new(folder, problem, remedy));
+    }
     let (place, photos) = (folder.display(), photos.display());
     let problem = format!("{count} photos, but no camera poses");
     let remedy = format!(

@@ -55,6 +55,11 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
     if reality_capture::looks_like_reality_capture(path) {
         return reality_capture::read_reality_capture(path, options);
     }
+    if let Err(e) = std::fs::metadata(path)
+        .and_then(|found| if found.is_dir() { std::fs::read_dir(path).map(|_| ()) } else { Ok(()) })
+    {
+        return Err(InputError::io(path, "reading the scene", &e));
+    }
     if let Some(error) = photos_only::error(path) {
         return Err(error);
     }

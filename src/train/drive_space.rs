@@ -93,8 +93,9 @@ pub(super) struct StepWrites {
     pub of_step: [f64; 2],
 }
 
-/// The bytes that a run with `frames` frames writes whose pages become `growth` times as many: by simulation of a few epochs
-/// with the pages of now. At the end as many frames hold fewer of the pages, and a view takes more of them.
+/// The bytes that a run with `frames` frames, possibly more than pages, writes whose pages become `growth` times as many: by
+/// simulation of a few epochs with the pages of now. At the end as many frames hold fewer of the pages, and a view takes more
+/// of them.
 pub(super) fn step_writes(
     config: &TrainConfig,
     dataset: &Dataset,
@@ -114,7 +115,9 @@ pub(super) fn step_writes(
         let written: u64 = played.map_or(0, |p| p.steps.iter().map(|s| s.bytes_written).sum());
         written as f64 / f64::from(steps.max(1))
     };
-    let then = ((frames as f64 / growth.max(1.0)) as usize).max(views.most().min(frames));
+    // Pages of now in the frames of now, and as large a share of them as the same frames hold of the pages at the end.
+    let then = ((frames as f64 / growth.max(1.0)) as usize).max(views.most().min(frames)).min(index.len());
+    let frames = frames.min(index.len()).max(1);
     let import = if trainer.steps_done() == 0 { page_bytes.iter().map(|&b| f64::from(b)).sum() } else { 0.0 };
     let now = of_step(frames);
     StepWrites { import, of_step: [now, if then < frames { of_step(then) } else { now } * growth.max(1.0)] }

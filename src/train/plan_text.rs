@@ -91,11 +91,12 @@ fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
     } else {
         format!(" ({} at the start)", format_bytes(plan.pages[0] * plan.frame_bytes))
     };
+    // A dry run keeps the pages in memory, whatever the run will use.
+    let by = if tiers.engine == "memory" { String::new() } else { format!(" by {}", tiers.engine) };
     format!(
-        "drive   {} of pages{at}{now} by {} ({}), {} free\n        \
+        "drive   {} of pages{at}{now}{by} ({}), {} free\n        \
          about {} to write without commits, {:.2} % of the rated life of a common drive; {commits}\n",
         format_bytes(forecast.drive_bytes),
-        tiers.engine,
         tiers.codec,
         plan.free_bytes.map_or(String::from("unknown"), format_bytes),
         format_bytes(forecast.bytes_written as u64),

@@ -192,7 +192,7 @@ fn plan(
     let plan = preflight::plan_tiers(config, dataset, trainer, tiers, host_mem, &mut memory)?;
     let growth = last as f64 / rows.max(1) as f64;
     let writes = match plan.frames {
-        Some(frames) => step_writes(config, dataset, trainer, frames.min(plan.pages[0].max(1)) as usize, growth),
+        Some(frames) => step_writes(config, dataset, trainer, frames as usize, growth),
         None => StepWrites::default(),
     };
     let measured = Measured {

@@ -193,7 +193,7 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     std::fs::write(&file, "").unwrap();
     let output = bench(&["ladder", scene, "--out", out, "--steps", "4", "--page-rows", "16", "--spill", text(&file)]);
     assert!(!output.status.success() && stderr(&output).contains("file"), "{}", stderr(&output));
-    let failing = ["--steps", "4", "--image-cache", "1", "--host-mem", "1MiB", "--knobs", "budget", "--seeds", "1"];
+    let failing = ["--steps", "4", "--image-cache", "1B", "--host-mem", "1MiB", "--knobs", "budget", "--seeds", "1"];
     let args =
         [&["pareto", scene, "--out", out, "--page-rows", "16", "--strategy", "none", "--json"][..], &failing].concat();
     let records = lines(&args);

@@ -64,8 +64,8 @@ impl SpillDir {
         // Checked again under the lock: another process may have created a store just now.
         if read_format(folder)?.is_some() {
             let remedy = format!(
-                "continue that run (gsscale-train --resume with its output folder), remove the folder (rm -r {}) or \
-                 {OTHER_FOLDER}",
+                "see whose it is (gsscale-ckpt ls {0}), continue that run (gsscale-train --resume with its output folder), \
+                 {OTHER_FOLDER}, or give that run up (rm -r {0})",
                 folder.display()
             );
             return Err(InputError::new(folder, "it holds the checkpoint of another run", remedy));

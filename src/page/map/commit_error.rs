@@ -15,7 +15,9 @@ pub enum CommitError {
     #[error("{0}\n  remedy: acknowledged commits are intact; check the drive, then start again")]
     Map(#[from] MapError),
     /// No space. Nothing is lost; the commit may be repeated once there is space.
-    #[error("there is no space for a commit: {0}\n  remedy: free space on the drive of the spill directory")]
+    #[error(
+        "there is no space for a commit: {0}\n  remedy: free space on the drive of the pages: of the spill directory, or of the output folder of a run in memory"
+    )]
     Full(io::Error),
     /// A file beside the map cannot be used.
     #[error("{name} cannot be used: {source}\n  remedy: {}", file_remedy(.source))]

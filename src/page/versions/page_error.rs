@@ -45,7 +45,9 @@ pub enum PageError {
     #[error("{0} cannot be written: {1}\n  remedy: {remedy}", remedy = remedy_of(.1, REMEDY_WRITE))]
     Write(SlotName, #[source] io::Error),
     /// No space for the bytes. Nothing is lost, and the write may be repeated.
-    #[error("there is no space to write {0}: {1}\n  remedy: free space on the drive of the spill directory")]
+    #[error(
+        "there is no space to write {0}: {1}\n  remedy: free space on the drive of the pages: of the spill directory, or of the output folder of a run in memory"
+    )]
     NoSpace(SlotName, #[source] io::Error),
     /// No space for another segment, or it cannot be created. Nothing is lost, and the attempt may be repeated.
     #[error("{} ({bytes} bytes) cannot be created: {source}\n  remedy: {}", segment_file_name(*.segment), grow_remedy(.source))]
@@ -102,7 +104,9 @@ fn remedy_of(source: &io::Error, otherwise: &'static str) -> &'static str {
 fn grow_remedy(source: &io::Error) -> &'static str {
     match source.kind() {
         _ if is_too_many_files(source) => REMEDY_TOO_MANY_FILES,
-        _ if is_out_of_space(source.kind()) => "free space on the drive of the spill directory",
+        _ if is_out_of_space(source.kind()) => {
+            "free space on the drive of the pages: of the spill directory, or of the output folder of a run in memory"
+        }
         io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => {
             "make the spill directory writable, or name another one"
         }
