@@ -3,6 +3,7 @@
 use clap::Parser;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::{InputError, InputResult};
+use gsscale::base::trace;
 use gsscale::base::units::{format_grouped, format_seconds};
 use gsscale::config::command_line::parse_command_line;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
@@ -67,6 +68,10 @@ struct Args {
     /// Print only warnings and errors
     #[arg(long, short)]
     quiet: bool,
+    /// Write what the host did in every step to this file, as trace events that Perfetto (ui.perfetto.dev) and chrome://tracing
+    /// open: uploads, submissions, waits, read-backs, pages, events
+    #[arg(long, value_name = "FILE")]
+    trace: Option<PathBuf>,
     #[command(flatten)]
     keys: TrainOverrides,
 }
@@ -79,13 +84,21 @@ fn main() -> ExitCode {
         return ExitCode::SUCCESS;
     }
     let quiet = args.quiet;
-    match start(args) {
+    let outcome = begin_trace(args.trace.as_deref()).and_then(|()| start(args));
+    if let Err(error) = trace::finish() {
+        eprintln!("warning: {error}");
+    }
+    match outcome {
         Ok(outcome) => finish(&outcome, quiet),
         Err(error) => {
             eprintln!("error: {error}");
             ExitCode::FAILURE
         }
     }
+}
+
+fn begin_trace(path: Option<&Path>) -> Result<(), TrainError> {
+    path.map_or(Ok(()), |path| Ok(trace::start(path)?))
 }
 
 /// Prints one line per adapter, and one for the CPU renderer, which always exists.

@@ -84,7 +84,7 @@ impl Belt {
             let end = chunk.used + n as u64;
             let view = chunk.raw.get_mapped_range_mut(chunk.used..end);
             let mut view = view.map_err(|e| GpuError::validation("upload", e))?;
-            view.copy_from_slice(&bytes[done..done + n]);
+            self.driver.cross(n as u64, || view.copy_from_slice(&bytes[done..done + n]));
             drop(view);
             encoder.copy_buffer_to_buffer(&chunk.raw, chunk.used, target, offset + done as u64, n as u64);
             chunk.used = end.next_multiple_of(MAP_ALIGNMENT).min(self.chunk_bytes);

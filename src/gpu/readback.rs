@@ -10,6 +10,7 @@ use std::sync::{Arc, OnceLock};
 use super::buffers::{Buffer, BufferView, Pool, Purpose};
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
+use crate::base::trace;
 
 const RECORDED: u8 = 0;
 const MAPPING: u8 = 1;
@@ -110,7 +111,9 @@ impl Readback {
         let out = bytemuck::cast_slice_mut::<T, u8>(out);
         let view = self.buffer.raw().get_mapped_range(..self.size).map_err(|e| GpuError::validation(self.stage, e))?;
         let n = out.len().min(view.len());
-        out[..n].copy_from_slice(&view[..n]);
+        let span = trace::span("read back").of("what", self.stage).with("bytes", self.size);
+        self.staging.driver.cross(self.size, || out[..n].copy_from_slice(&view[..n]));
+        drop(span);
         drop(view);
         self.buffer.raw().unmap();
         self.buffer.set_reusable(true);

@@ -350,6 +350,11 @@ impl Pager {
         self.frames.state(page).is_some()
     }
 
+    /// What the frame of a page holds behind the header; `None` for a page that is not in memory, is pinned, or is moving.
+    pub fn payload(&self, page: PageNo) -> Option<&[u8]> {
+        self.frames.memory(page).map(|buffer| &buffer.as_slice()[HEADER_BYTES..])
+    }
+
     /// The slots of the pages on the drive, by page: for the index of a commit, once no page is dirty.
     pub fn slots(&self) -> &[Option<SlotRef>] {
         self.index.slots()

@@ -28,6 +28,7 @@ use crate::appearance::model::CHANNEL_VALUES;
 use crate::appearance::picture::Look;
 use crate::appearance::state::{AppearanceState, camera_groups};
 use crate::base::error::InputError;
+use crate::base::trace;
 use crate::checkpoint::run_state::{LastTest, TrainerState};
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
@@ -322,19 +323,24 @@ impl Trainer {
     /// A photo cannot be decoded, pages could not be pinned, the renderer failed, the run diverged, or nothing counts in it
     /// (`soundness`).
     pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
+        trace::set_step(self.state.step);
+        let _span = trace::span("step");
         self.log_due_events(dataset, targets)?;
         let view = self.next_view();
         targets.prefetch(&self.coming_views(PREFETCH_VIEWS));
         self.fit_frames(&dataset.views[view].camera);
         self.look_ahead(dataset);
+        let photo = trace::span("photo");
         let target = targets.get(view)?;
+        drop(photo);
         let started = Instant::now();
         let render = self.render_options();
         let look = self.look(view, &dataset.views[view].camera);
         let is_left_out = self.options.robust_views && self.state.outliers.is_named(view);
         let comparison = Comparison { target: &target, loss: self.options.loss, look, is_left_out };
+        let next = self.coming_views(2).get(1).map(|&view| &dataset.views[view].camera);
         let stepped = loop {
-            let stepped = self.attempt(&dataset.views[view].camera, (&render, &comparison));
+            let stepped = self.attempt(&dataset.views[view].camera, next, (&render, &comparison));
             self.is_torn = matches!(stepped, Err(TrainError::Torn { .. }));
             // A step that lacked frames can be repeated: it only applied pending events.
             match stepped {
@@ -359,8 +365,13 @@ impl Trainer {
         Ok(outcome)
     }
 
-    /// Attempts a step on a view.
-    fn attempt(&mut self, camera: &Camera, how: (&RenderOptions, &Comparison<'_>)) -> Result<StepOutcome, TrainError> {
+    /// Attempts a step on a view; the next step draws `next`.
+    fn attempt(
+        &mut self,
+        camera: &Camera,
+        next: Option<&Camera>,
+        how: (&RenderOptions, &Comparison<'_>),
+    ) -> Result<StepOutcome, TrainError> {
         let (step, renderer) = (self.state.step, &mut *self.renderer);
         let (collects, pages_most) = (self.options.strategy.collects(step), self.pages_most);
         let (scene, working) = (&mut self.scene, &mut self.working);
@@ -372,7 +383,7 @@ impl Trainer {
             Some(tier) => tier,
             none => none.insert(DeviceTier::new(scene, renderer, self.options.steps)?),
         };
-        let mut rows = DeviceRows::new(tier, scene, renderer, step)?;
+        let mut rows = DeviceRows::new(tier, scene, renderer, (step, next))?;
         train_step(scene, working, &mut rows, (step, camera), how, collects, pages_most)
     }
 
@@ -382,6 +393,7 @@ impl Trainer {
     /// # Errors
     /// The device failed: the run can go on from its last commit only.
     pub fn drain(&mut self) -> Result<(), TrainError> {
+        let _span = trace::span("drain all");
         match &mut self.device {
             Some(tier) => tier.drain(&mut self.scene, &mut *self.renderer),
             None => Ok(()),
@@ -423,6 +435,7 @@ impl Trainer {
         if self.events().events().last().is_some_and(|last| last.step >= step) {
             return Ok(());
         }
+        let _span = trace::span("decide events");
         if let Some(tier) = self.device.as_ref().filter(|_| self.options.strategy.reads_histogram(step)) {
             tier.take_bins(&mut self.scene, &mut *self.renderer)?;
         }
@@ -465,6 +478,7 @@ impl Trainer {
         pictures: Option<&Path>,
         progress: &dyn Fn(u32),
     ) -> Result<Option<TestMetrics>, TrainError> {
+        let _span = trace::span("evaluate");
         self.drain()?;
         let render = self.render_options();
         let views = dataset.test_views();
