@@ -12,6 +12,7 @@ use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::out_folder::{Existing, default_out, remedy_of_existing};
 use gsscale::train::progress::Count;
+use gsscale::train::restart::go_on;
 use gsscale::train::resume::{ResumeRequest, resume};
 use gsscale::train::run::{RunOutcome, RunRequest, run};
 use std::path::{Path, PathBuf};
@@ -68,6 +69,9 @@ struct Args {
     /// Print only warnings and errors
     #[arg(long, short)]
     quiet: bool,
+    /// Go on from the last commit, in this process, up to N times when the GPU is lost
+    #[arg(long, value_name = "N", default_value_t = 3)]
+    restarts: u32,
     /// Write what the host did in every step to this file, as trace events that Perfetto (ui.perfetto.dev) and chrome://tracing
     /// open: uploads, submissions, waits, read-backs, pages, events
     #[arg(long, value_name = "FILE")]
@@ -115,7 +119,8 @@ fn list_devices() {
 fn start(args: Args) -> Result<RunOutcome, TrainError> {
     if let Some(out) = args.resume {
         let (accept_changes, quiet) = (args.accept_changes, args.quiet);
-        return resume(&ResumeRequest { out, keys: args.keys, scene: args.scene, accept_changes, quiet });
+        let request = ResumeRequest { out, keys: args.keys, scene: args.scene, accept_changes, quiet };
+        return go_on(resume(&request), &request, args.restarts);
     }
     let config = match (&args.config, args.demo) {
         (None, true) => {
@@ -137,14 +142,12 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
         None if args.dry_run => make_city(&scratch.insert(Scratch::new()?).folder, &config, args.quiet)?,
         None => demo_scene(&out, &config, args.overwrite, args.quiet)?,
     };
-    run(&RunRequest {
-        scene,
-        out,
-        config,
-        dry_run: args.dry_run,
-        existing: if args.overwrite || args.demo { Existing::Overwrite } else { Existing::Refuse },
-        quiet: args.quiet,
-    })
+    let (dry_run, quiet) = (args.dry_run, args.quiet);
+    let existing = if args.overwrite || args.demo { Existing::Overwrite } else { Existing::Refuse };
+    // What the run was started with is in its config.
+    let (keys, accept_changes) = (TrainOverrides::default(), false);
+    let again = ResumeRequest { out: out.clone(), keys, scene: None, accept_changes, quiet };
+    go_on(run(&RunRequest { scene, out, config, dry_run, existing, quiet }), &again, args.restarts)
 }
 
 /// Config of the demo: enough steps for a good picture within minutes on two cores.

@@ -55,6 +55,7 @@ pub mod prepare;
 pub mod probe;
 pub mod progress;
 pub mod report;
+pub mod restart;
 pub mod resume;
 pub mod run;
 pub mod signals;
