@@ -80,6 +80,11 @@ pub(super) fn slots_in(room: u64, slot_bytes: u64) -> u64 {
     room / SLOTS_SHARE / 5 * 4 / slot_bytes.max(1)
 }
 
+/// How many slots for payloads of at most `payload` bytes a device memory of `device_mem` bytes holds, beside what a view takes.
+pub fn slots_of_budget(device_mem: u64, payload: u64) -> usize {
+    usize::try_from(slots_in(device_mem, payload)).unwrap_or(usize::MAX)
+}
+
 /// There is no slot for a page of a batch.
 fn no_slot(device: &dyn PageRenderer) -> TrainError {
     RenderError::NoSlots { bytes: device.slot_bytes() }.into()
