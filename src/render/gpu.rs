@@ -13,7 +13,8 @@
 //! # Bus traffic
 //! A step with n rows in view, p pixels and all colour bands uploads 236 n bytes of values and 4 p bytes of photo. The
 //! step downloads 236 n bytes of gradients and 16 n bytes for densification, 32 n bytes where rows are weighed. Counts and uniforms add some KiB. While
-//! the host holds the master copy of every value, only the mask byte of photos without a mask could be saved.
+//! the host holds the master copy of every value, only the mask byte of photos without a mask could be saved. All threads of the host
+//! take part in packing, copying and unpacking rows.
 //!
 //! | stage | transfer | device work at the same time |
 //! | --- | --- | --- |
