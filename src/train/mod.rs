@@ -40,6 +40,7 @@ mod growth_checks;
 mod held_out;
 mod largest_view;
 mod leave_out;
+mod look_ahead;
 pub mod machine;
 pub mod memory;
 mod more_steps;

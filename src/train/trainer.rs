@@ -54,11 +54,6 @@ use std::time::Instant;
 /// Views whose photos are prefetched.
 const PREFETCH_VIEWS: u32 = 8;
 
-/// Steps between two updates of the pager's plan, and the least and most views that a plan covers.
-const LOOK_AHEAD_EVERY: u32 = 8;
-const LOOK_AHEAD_LEAST: u32 = 64;
-const LOOK_AHEAD_MOST: u32 = 8192;
-
 /// The state of a run. A run in memory uses the same code with one frame per page.
 pub struct Trainer {
     /// The pages, the optimizer and the event log.
@@ -68,7 +63,7 @@ pub struct Trainer {
     /// The pages on the renderer's device, from the first step of a run that updates them there.
     pub(super) device: Option<DeviceTier>,
     pub(super) options: RunOptions,
-    order: ViewOrder,
+    pub(super) order: ViewOrder,
     pub(super) train_views: Vec<usize>,
     /// Training views that the run decides its count by.
     pub(super) held_out: HeldOut,
@@ -398,25 +393,6 @@ impl Trainer {
             Some(tier) => tier.drain(&mut self.scene, &mut *self.renderer),
             None => Ok(()),
         }
-    }
-
-    /// Updates the pager's plan every [`LOOK_AHEAD_EVERY`] steps; doing it at every step would cost too much.
-    fn look_ahead(&mut self, dataset: &Dataset) {
-        if self.is_in_memory() || !self.state.step.is_multiple_of(LOOK_AHEAD_EVERY) {
-            return;
-        }
-        // Two epochs contain a use of every page that any view needs.
-        let count = (2 * self.train_views.len() as u32).clamp(LOOK_AHEAD_LEAST, LOOK_AHEAD_MOST);
-        let cameras: Vec<&Camera> = self.coming_views(count).iter().map(|&view| &dataset.views[view].camera).collect();
-        self.scene.pager.look_ahead(self.state.step, &cameras);
-    }
-
-    /// Indices in `dataset.views` of the views of the coming steps, at most `count`.
-    fn coming_views(&self, count: u32) -> Vec<usize> {
-        let (step, mut coming) = (self.state.step, Vec::new());
-        self.order.upcoming(step, count.min(self.options.steps - step), &mut coming);
-        let view = |(at, &position)| self.train_views[self.held_out.trained_at(at, position)];
-        (step..).zip(&coming).map(view).collect()
     }
 
     /// Notes how many of the rows in the pages of a view were drawn, and whether the view was one batch.
