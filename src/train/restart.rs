@@ -6,8 +6,8 @@
 //! that was never interrupted; 2. other errors end the run.
 
 use super::error::TrainError;
+use super::request::RunOutcome;
 use super::resume::{ResumeRequest, resume};
-use super::run::RunOutcome;
 use crate::config::file::TrainConfig;
 use crate::gpu::GpuError;
 use crate::page::folder::spill_dir::SpillDir;
