@@ -451,11 +451,13 @@ fn device_rows(args: &Args, scene: &Scene, rows: &[Row], bus: EmulatedBus) -> In
     orders.dedup();
     let steps = config.steps.min((EPOCHS * scene.cameras.len() as u32).max(1));
     let policy = EvictPolicy::FarthestNextUse;
-    let options = ReplayOptions { frames: slots, policy, reads_ahead: false, steps, plan_bytes: args.plan_mem.0 };
     let of_order = |order| {
         let views = ViewOrder::new(order, config.seed, &scene.cameras);
-        let replayed = replay(&scene.views, &scene.payload_bytes, &views, &options).map_err(|e| too_few(scene, &e))?;
-        Ok(DeviceRow::new(order, model, &replayed))
+        let run = |reads_ahead| {
+            let options = ReplayOptions { frames: slots, policy, reads_ahead, steps, plan_bytes: args.plan_mem.0 };
+            replay(&scene.views, &scene.payload_bytes, &views, &options).map_err(|e| too_few(scene, &e))
+        };
+        Ok(DeviceRow::new(order, model, [&run(true)?, &run(false)?]))
     };
     orders.into_iter().map(of_order).collect()
 }

@@ -99,6 +99,8 @@ fn pages_on_a_device_are_planned_over_a_bus() {
     assert!(up > bytes[0] / 1e6 && down > bytes[1] / 1e6 && up < 2.0 * bytes[0] / 1e6, "{few}");
     assert!((number(&few, "step_ms") - (photo + results + f64::max(3.0, up + down))).abs() < 1e-9, "{few}");
     assert!((number(&few, "step_in_turn_ms") - (photo + results + 3.0 + up + down)).abs() < 1e-9, "{few}");
+    let fewest = number(&few, "fewest_bytes_up_per_step");
+    assert!(fewest > 0.0 && fewest <= bytes[0], "{few}");
     let table = with(&["--device-mem", "6MiB"]);
     assert!(table.contains("pages on the device, modelled: a bus of"), "{table}");
     let refused = plan(&scene, &[&common[..], &["--bus", "fast"]].concat());

@@ -82,17 +82,20 @@ pub struct DeviceRow {
     pub order: Order,
     /// The device.
     pub model: DeviceModel,
-    /// What the steps after the first epoch move.
+    /// What the steps after the first epoch move, where pages of a step and of the next one lie in slots at a time.
     pub figures: Figures,
+    /// Bytes that go up in a mean step where pages come when they are needed: no cache of that size moves fewer.
+    pub fewest: f64,
     /// A mean step.
     pub parts: StepParts,
 }
 
 impl DeviceRow {
-    /// The row of a replay of payloads in slots.
-    pub fn new(order: Order, model: DeviceModel, replayed: &Replay) -> DeviceRow {
-        let figures = replayed.figures(replayed.steady());
-        DeviceRow { order, model, figures, parts: StepParts::of(&model, &figures) }
+    /// The row of two replays of payloads in slots: copied a step ahead, and when they are needed.
+    pub fn new(order: Order, model: DeviceModel, [ahead, on_demand]: [&Replay; 2]) -> DeviceRow {
+        let figures = ahead.figures(ahead.steady());
+        let fewest = on_demand.figures(on_demand.steady()).read_per_step;
+        DeviceRow { order, model, figures, fewest, parts: StepParts::of(&model, &figures) }
     }
 
     /// The row as JSON.
@@ -101,7 +104,7 @@ impl DeviceRow {
         json!({
             "view_order": self.order.to_string(), "slots": self.model.slots, "slot_bytes": self.model.slot_bytes,
             "hit_rate": self.figures.hit_rate, "bytes_up_per_step": self.figures.read_per_step,
-            "bytes_down_per_step": self.figures.written_per_step, "photo_ms": ms(parts.photo),
+            "bytes_down_per_step": self.figures.written_per_step, "fewest_bytes_up_per_step": self.fewest, "photo_ms": ms(parts.photo),
             "payloads_up_ms": ms(parts.payloads_up), "payloads_down_ms": ms(parts.payloads_down),
             "results_ms": ms(parts.results), "gpu_ms": ms(parts.gpu), "step_ms": ms(parts.beside()),
             "step_in_turn_ms": ms(parts.in_turn()), "is_modelled": true,
@@ -115,12 +118,13 @@ pub fn report(rows: &[DeviceRow]) -> String {
     let bus = first.model.bus;
     let mut text = format!(
         "\npages on the device, modelled: a bus of {}/s and {:.0} us a copy, milliseconds a step\n\
-         {:12} {:>14} {:>9} {:>10} {:>10} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8}",
+         {:12} {:>14} {:>9} {:>10} {:>10} {:>10} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8}",
         format_bytes(bus.bytes_per_second as u64),
         1e6 * bus.latency.as_secs_f64(),
         "order",
         "slots",
         "hit rate",
+        "fewest",
         "up/step",
         "down/step",
         "photo",
@@ -135,9 +139,10 @@ pub fn report(rows: &[DeviceRow]) -> String {
         let (p, ms) = (&row.parts, |seconds: f64| 1e3 * seconds);
         let slots = format!("{} {}", row.model.slots, format_bytes(row.model.slots as u64 * row.model.slot_bytes));
         text += &format!(
-            "\n{:12} {slots:>14} {:>9.3} {:>10} {:>10} {:>8.2} {:>8.2} {:>8.2} {:>8.2} {:>8.2} {:>8.2} {:>8.2}",
+            "\n{:12} {slots:>14} {:>9.3} {:>10} {:>10} {:>10} {:>8.2} {:>8.2} {:>8.2} {:>8.2} {:>8.2} {:>8.2} {:>8.2}",
             row.order.to_string(),
             row.figures.hit_rate,
+            format_bytes(row.fewest as u64),
             format_bytes(row.figures.read_per_step as u64),
             format_bytes(row.figures.written_per_step as u64),
             ms(p.photo),
@@ -149,6 +154,7 @@ pub fn report(rows: &[DeviceRow]) -> String {
             ms(p.in_turn()),
         );
     }
-    text + "\nbeside   payloads move while the GPU works; in turn: one thing after the other\
+    text + "\nfewest   bytes up where pages come when they are needed; up/step: a step ahead, with pages of two steps in slots\
+            \nbeside   payloads move while the GPU works; in turn: one thing after the other\
             \nGPU      --step-seconds, or the timed steps: the time of another GPU is to be given"
 }
