@@ -116,11 +116,11 @@ fn evaluate(value: f32, m: f32, v: f32, stamp: u32, end: u32, of_means: bool, ra
 
 /// The value of one element of a row of a page after `end` steps.
 fn element(page: DevicePage, column: u32, row: u32, e: u32, end: u32, rate: f32) -> f32 {
-    let width = column_width(column, page.sh_n_width);
-    let at = row * width + e;
-    let value = bitcast<f32>(slab[column_at(page, column, VALUES) + at]);
-    let m = bitcast<f32>(slab[column_at(page, column, EXP_AVG) + at]);
-    let v = bitcast<f32>(slab[column_at(page, column, EXP_AVG_SQ) + at]);
+    let at = column_at(page, column) + row * column_width(column, page.sh_n_width) + e;
+    let words = table_words(page, column);
+    let value = bitcast<f32>(slab[at]);
+    let m = bitcast<f32>(slab[at + words]);
+    let v = bitcast<f32>(slab[at + 2u * words]);
     return evaluate(value, m, v, slab[stamps_at(page) + row], end, column == MEANS, rate);
 }
 
@@ -220,16 +220,17 @@ fn gather(
     if i >= u.row_count * u.width {
         return;
     }
-    let listed = rows[i / u.width];
+    let row = i / u.width;
+    let listed = rows[row];
     let page = pages[listed.x];
     if page.slab == u.slab {
-        out[i] = element(page, u.column, listed.y, u.first_element + i % u.width, u.now, u.rate);
+        out[i] = element(page, u.column, listed.y, u.first_element + i - row * u.width, u.now, u.rate);
     }
 }
 
 /// The range that a value passes through on its way to its limit.
 fn hull(page: DevicePage, column: u32, row: u32, e: u32, rate: f32) -> vec2<f32> {
-    let value = bitcast<f32>(slab[column_at(page, column, VALUES) + 3u * row + e]);
+    let value = bitcast<f32>(slab[column_at(page, column) + 3u * row + e]);
     let limit = element(page, column, row, e, FOR_EVER, rate);
     let low = min(value, limit);
     let high = max(value, limit);

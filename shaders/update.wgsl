@@ -103,10 +103,10 @@ fn step(
     if page.slab != u.slab || !is_usable(largest[row]) {
         return;
     }
-    let at = listed.y * column_width(u.column, page.sh_n_width) + u.first_element + i % u.width;
-    let value_at = column_at(page, u.column, VALUES) + at;
-    let m_at = column_at(page, u.column, EXP_AVG) + at;
-    let v_at = column_at(page, u.column, EXP_AVG_SQ) + at;
+    let at = listed.y * column_width(u.column, page.sh_n_width) + u.first_element + i - row * u.width;
+    let value_at = column_at(page, u.column) + at;
+    let m_at = value_at + table_words(page, u.column);
+    let v_at = m_at + table_words(page, u.column);
     let missed = u.now - slab[stamps_at(page) + listed.y];
     let first = bitcast<f32>(tables[decay_at(missed)]);
     let second = decay_at(missed + 1u) + 1u;

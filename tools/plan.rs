@@ -1,13 +1,18 @@
 //! `gsscale-plan`: predicts what a run would read and write through the disk tier, and how long it would take. Parses,
 //! calls the library, prints; leaves no file.
 
+#[path = "plan/device.rs"]
+mod device;
+
 use clap::Parser;
+use device::{DeviceModel, DeviceRow};
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::units::{format_bytes, format_grouped, format_seconds};
 use gsscale::config::choice::Chosen;
 use gsscale::config::command_line::parse_command_line;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::values::ByteSize;
+use gsscale::gpu::EmulatedBus;
 use gsscale::optim::method::Method;
 use gsscale::page::folder::drive_rate::DriveRate;
 use gsscale::page::format::slot_header::transfer_bytes;
@@ -23,6 +28,7 @@ use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::scene::page_meta::PageMeta;
 use gsscale::schedule::order::{Order, ViewOrder};
 use gsscale::schedule::visibility::ViewPages;
+use gsscale::train::device_tier::slots_of_budget;
 use gsscale::train::error::TrainError;
 use gsscale::train::first_look::{LookFor, first_look};
 use gsscale::train::forecast::{Forecast, Reach, STEP_GROWTH};
@@ -40,6 +46,7 @@ Examples:
   gsscale-plan scans/city --host-mem 4GiB --steps 200000 --spill-dir /nvme/pages
   gsscale-plan scans/city --host-mem 4GiB --drive-read 3GB --step-seconds 0.05   # another machine's drive and GPU
   gsscale-plan runs/city --host-mem 2GiB --lists 100..110
+  gsscale-plan scans/city --device-mem 8GiB --bus 12GB/s,20us --step-seconds 0.03   # pages on a GPU, its time without copies
 
 Pages are those of the first Gaussians; --growth 5 plans as if each page had grown five times as large.
 'hit rate' is the fraction of a step's pages that are already in memory, for a cache that evicts as --evict says; 'of lru' the
@@ -91,6 +98,10 @@ struct Args {
     /// Seconds per step without waiting for pages; default: timed in a few steps on the run's device
     #[arg(long, value_name = "S", help_heading = "Drive")]
     step_seconds: Option<f64>,
+    /// Rate and latency of the bus to the GPU, such as 12GB/s,20us: also plans for --optimizer-on device, whose pages lie in --device-mem
+    /// (0: all of them), with --step-seconds as the GPU's own time
+    #[arg(long, value_name = "RATE,LATENCY", value_parser = parse_bus, help_heading = "Device")]
+    bus: Option<EmulatedBus>,
     /// Bytes that the drive is rated to write in its lifetime
     #[arg(long, default_value = "300TB", value_name = "SIZE", help_heading = "Drive")]
     endurance: ByteSize,
@@ -111,6 +122,11 @@ fn parse_range(text: &str) -> Result<Range<u32>, String> {
     if range.is_empty() { Err(wrong()) } else { Ok(range) }
 }
 
+fn parse_bus(text: &str) -> Result<EmulatedBus, String> {
+    EmulatedBus::parse(text)
+        .ok_or_else(|| format!("'{text}' is not a rate and a latency; write for example 12GB/s,20us"))
+}
+
 /// Data shared by all plans of this program.
 struct Scene {
     config: TrainConfig,
@@ -118,6 +134,9 @@ struct Scene {
     index: Vec<PageMeta>,
     /// Bytes of each page on disk, including header and padding.
     page_bytes: Vec<u32>,
+    /// Bytes of each page's payload, and the largest that a payload may have.
+    payload_bytes: Vec<u32>,
+    payload_most: u64,
     /// Bytes of one frame.
     frame_bytes: u64,
     drive: DriveModel,
@@ -172,6 +191,7 @@ fn start(args: &Args) -> InputResult<String> {
             rows.push(row(args, &scene, frames, order)?);
         }
     }
+    let devices = args.bus.map_or(Ok(Vec::new()), |bus| device_rows(args, &scene, &rows, bus))?;
     if args.json {
         let value = json!({
             "gaussians": scene.gaussians, "views": scene.cameras.len(), "steps": scene.config.steps,
@@ -179,11 +199,12 @@ fn start(args: &Args) -> InputResult<String> {
             "state_bytes": state_bytes(&scene), "host_bytes_peak": host_bytes_peak(), "pages_of_largest_view": scene.views.most(),
             "drive_read_bytes_per_second": scene.drive.read_rate, "drive_write_bytes_per_second": scene.drive.write_rate,
             "run": scene.forecast.as_ref().ok().map(json_of_forecast), "step_seconds": scene.drive.step_seconds, "step_timed_on": scene.timed_on,
+            "device": devices.iter().map(DeviceRow::json).collect::<Vec<_>>(),
             "plans": rows.iter().map(|row| json_of(args, &scene, row)).collect::<Vec<_>>(),
         });
         return Ok(format!("{value:#}"));
     }
-    Ok(report(args, &scene, &rows))
+    Ok(report(args, &scene, &rows) + &device::report(&devices))
 }
 
 fn load(args: &Args) -> InputResult<Scene> {
@@ -226,6 +247,12 @@ fn load(args: &Args) -> InputResult<Scene> {
     Ok(Scene {
         views: ViewPages::new(&look.index, &cameras),
         page_bytes: look.page_bytes.iter().map(slot).collect(),
+        payload_bytes: look
+            .page_bytes
+            .iter()
+            .map(|&bytes| grown(bytes as usize).min(u64::from(u32::MAX)) as u32)
+            .collect(),
+        payload_most: grown(capacity_bytes(config.page_rows as usize, config.sh_degree)),
         frame_bytes: grown(frame_bytes),
         drive: DriveModel {
             read_rate,
@@ -396,6 +423,43 @@ fn row(args: &Args, scene: &Scene, frames: usize, asked: Chosen<Order>) -> Input
         planned,
         figures,
     })
+}
+
+/// The steps of `--optimizer-on device` under each view order of the rows.
+fn device_rows(args: &Args, scene: &Scene, rows: &[Row], bus: EmulatedBus) -> InputResult<Vec<DeviceRow>> {
+    let config = &scene.config;
+    let pages = scene.index.len();
+    let slot_bytes = scene.payload_most;
+    let slots = match config.device_mem.0 {
+        0 => pages,
+        budget => pages.min(slots_of_budget(budget, slot_bytes)),
+    };
+    if slots == 0 {
+        let problem = format!("no page of {} fits into the part for pages", format_bytes(slot_bytes));
+        return Err(InputError::new("--device-mem", problem, "give more, or lower --page-rows"));
+    }
+    let mean = |sum: f64, count: usize| sum / count.max(1) as f64;
+    let model = DeviceModel {
+        bus,
+        slots,
+        slot_bytes,
+        payload: mean(scene.payload_bytes.iter().map(|&bytes| f64::from(bytes)).sum(), pages),
+        pixels: mean(scene.cameras.iter().map(|camera| camera.pixels() as f64).sum(), scene.cameras.len()),
+        gpu_seconds: scene.drive.step_seconds,
+    };
+    let mut orders: Vec<Order> = rows.iter().map(|row| row.order).collect();
+    orders.dedup();
+    let steps = config.steps.min((EPOCHS * scene.cameras.len() as u32).max(1));
+    let policy = EvictPolicy::FarthestNextUse;
+    let of_order = |order| {
+        let views = ViewOrder::new(order, config.seed, &scene.cameras);
+        let run = |reads_ahead| {
+            let options = ReplayOptions { frames: slots, policy, reads_ahead, steps, plan_bytes: args.plan_mem.0 };
+            replay(&scene.views, &scene.payload_bytes, &views, &options).map_err(|e| too_few(scene, &e))
+        };
+        Ok(DeviceRow::new(order, model, [&run(true)?, &run(false)?]))
+    };
+    orders.into_iter().map(of_order).collect()
 }
 
 fn json_of(args: &Args, scene: &Scene, row: &Row) -> Value {

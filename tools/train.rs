@@ -3,6 +3,7 @@
 use clap::Parser;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::{InputError, InputResult};
+use gsscale::base::trace;
 use gsscale::base::units::{format_grouped, format_seconds};
 use gsscale::config::command_line::parse_command_line;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
@@ -12,6 +13,7 @@ use gsscale::train::error::TrainError;
 use gsscale::train::out_folder::{Existing, default_out, remedy_of_existing};
 use gsscale::train::progress::Count;
 use gsscale::train::request::{RunOutcome, RunRequest};
+use gsscale::train::restart::go_on;
 use gsscale::train::resume::{ResumeRequest, resume};
 use gsscale::train::run::run;
 use std::path::{Path, PathBuf};
@@ -68,6 +70,13 @@ struct Args {
     /// Print only warnings and errors
     #[arg(long, short)]
     quiet: bool,
+    /// Go on from the last commit, in this process, up to N times when the GPU is lost
+    #[arg(long, value_name = "N", default_value_t = 3)]
+    restarts: u32,
+    /// Write what the host did in every step to this file, as trace events that Perfetto (ui.perfetto.dev) and chrome://tracing
+    /// open: uploads, submissions, waits, read-backs, pages, events
+    #[arg(long, value_name = "FILE")]
+    trace: Option<PathBuf>,
     #[command(flatten)]
     keys: TrainOverrides,
 }
@@ -80,13 +89,21 @@ fn main() -> ExitCode {
         return ExitCode::SUCCESS;
     }
     let quiet = args.quiet;
-    match start(args) {
+    let outcome = begin_trace(args.trace.as_deref()).and_then(|()| start(args));
+    if let Err(error) = trace::finish() {
+        eprintln!("warning: {error}");
+    }
+    match outcome {
         Ok(outcome) => finish(&outcome, quiet),
         Err(error) => {
             eprintln!("error: {error}");
             ExitCode::FAILURE
         }
     }
+}
+
+fn begin_trace(path: Option<&Path>) -> Result<(), TrainError> {
+    path.map_or(Ok(()), |path| Ok(trace::start(path)?))
 }
 
 /// Prints one line per adapter, and one for the CPU renderer, which always exists.
@@ -103,7 +120,8 @@ fn list_devices() {
 fn start(args: Args) -> Result<RunOutcome, TrainError> {
     if let Some(out) = args.resume {
         let (accept_changes, quiet) = (args.accept_changes, args.quiet);
-        return resume(&ResumeRequest { out, keys: args.keys, scene: args.scene, accept_changes, quiet });
+        let request = ResumeRequest { out, keys: args.keys, scene: args.scene, accept_changes, quiet };
+        return go_on(resume(&request), &request, args.restarts);
     }
     let config = match (&args.config, args.demo) {
         (None, true) => {
@@ -125,14 +143,12 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
         None if args.dry_run => make_city(&scratch.insert(Scratch::new()?).folder, &config, args.quiet)?,
         None => demo_scene(&out, &config, args.overwrite, args.quiet)?,
     };
-    run(&RunRequest {
-        scene,
-        out,
-        config,
-        dry_run: args.dry_run,
-        existing: if args.overwrite || args.demo { Existing::Overwrite } else { Existing::Refuse },
-        quiet: args.quiet,
-    })
+    let (dry_run, quiet) = (args.dry_run, args.quiet);
+    let existing = if args.overwrite || args.demo { Existing::Overwrite } else { Existing::Refuse };
+    // What the run was started with is in its config.
+    let (keys, accept_changes) = (TrainOverrides::default(), false);
+    let again = ResumeRequest { out: out.clone(), keys, scene: None, accept_changes, quiet };
+    go_on(run(&RunRequest { scene, out, config, dry_run, existing, quiet }), &again, args.restarts)
 }
 
 /// Config of the demo: enough steps for a good picture within minutes on two cores.

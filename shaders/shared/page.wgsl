@@ -42,9 +42,6 @@ const SCALES: u32 = 2u;
 const OPACITIES: u32 = 3u;
 const SH0: u32 = 4u;
 const SH_N: u32 = 5u;
-const VALUES: u32 = 0u;
-const EXP_AVG: u32 = 1u;
-const EXP_AVG_SQ: u32 = 2u;
 
 /// Words of a table, padded to 64 bytes.
 fn padded(words: u32) -> u32 {
@@ -73,11 +70,19 @@ fn column_width(column: u32, sh_n_width: u32) -> u32 {
     }
 }
 
-/// First word of a table of a column.
-fn column_at(page: DevicePage, column: u32, table: u32) -> u32 {
-    var at = count_at(page) + padded(page.rows);
-    for (var before = 0u; before < column; before++) {
-        at += 3u * padded(page.rows * column_width(before, page.sh_n_width));
-    }
-    return at + table * padded(page.rows * column_width(column, page.sh_n_width));
+/// Words of the table of values of a column, which are those of its moments.
+fn table_words(page: DevicePage, column: u32) -> u32 {
+    return padded(page.rows * column_width(column, page.sh_n_width));
+}
+
+/// First word of the values of a column; the tables of its moments follow, each after `table_words`. The sum over the columns before is
+/// written out, because every float of a step asks for it.
+fn column_at(page: DevicePage, column: u32) -> u32 {
+    let threes = padded(3u * page.rows);
+    var before = select(0u, threes, column > MEANS);
+    before += select(0u, padded(4u * page.rows), column > QUATS);
+    before += select(0u, threes, column > SCALES);
+    before += select(0u, padded(page.rows), column > OPACITIES);
+    before += select(0u, threes, column > SH0);
+    return count_at(page) + padded(page.rows) + 3u * before;
 }

@@ -1,6 +1,7 @@
 //! The environment of the process, before it starts threads.
 //!
-//! Not here: reading settings. gsscale has none in the environment.
+//! Not here: reading settings. gsscale has none in the environment but those that imitate hardware in tests and measurements
+//! (`gpu`: faults, a slower bus).
 
 /// Keeps Wayland's library quiet, which a Vulkan driver may use: without `XDG_RUNTIME_DIR`, as in containers and services,
 /// it prints `error: XDG_RUNTIME_DIR is invalid or not set` for a program that opens no window. Sets the variable to a

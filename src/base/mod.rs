@@ -15,5 +15,6 @@ pub mod rng;
 pub mod room;
 pub mod say;
 pub mod simd;
+pub mod trace;
 pub mod units;
 pub mod whole_file;

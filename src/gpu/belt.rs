@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 use super::buffers::Pool;
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
+use rayon::prelude::*;
 
 /// Bytes of one staging buffer, at most: in the range where copies run fastest.
 const CHUNK_BYTES_MAX: u64 = 4 << 20;
@@ -23,6 +24,23 @@ const SET_CHUNKS: usize = 8;
 /// Staging that uploads of `bytes` bytes a step take without a budget: two sets.
 pub fn staging_bytes(bytes: u64) -> u64 {
     2 * bytes.next_multiple_of(CHUNK_BYTES_MAX).clamp(CHUNK_BYTES_MAX, SET_CHUNKS as u64 * CHUNK_BYTES_MAX)
+}
+
+/// Bytes that one thread copies at a time: longer copies between host and mapped memory run on all threads.
+pub(super) const COPY_PART: usize = 256 << 10;
+
+/// Copies `bytes` to the mapped buffer `raw` from `at` on.
+fn fill(raw: &wgpu::Buffer, at: u64, bytes: &[u8]) -> GpuResult<()> {
+    let copy = |at: u64, part: &[u8]| -> GpuResult<()> {
+        let view = raw.get_mapped_range_mut(at..at + part.len() as u64);
+        let mut view = view.map_err(|e| GpuError::validation("upload", e))?;
+        view.copy_from_slice(part);
+        Ok(())
+    };
+    match bytes.len() {
+        0..=COPY_PART => copy(at, bytes),
+        _ => bytes.par_chunks(COPY_PART).enumerate().try_for_each(|(i, part)| copy(at + (i * COPY_PART) as u64, part)),
+    }
 }
 
 /// Alignment of mapped ranges.
@@ -82,10 +100,7 @@ impl Belt {
             let room = usize::try_from(self.chunk_bytes - chunk.used).unwrap_or(0);
             let n = room.min(bytes.len() - done);
             let end = chunk.used + n as u64;
-            let view = chunk.raw.get_mapped_range_mut(chunk.used..end);
-            let mut view = view.map_err(|e| GpuError::validation("upload", e))?;
-            view.copy_from_slice(&bytes[done..done + n]);
-            drop(view);
+            self.driver.cross(n as u64, || fill(&chunk.raw, chunk.used, &bytes[done..done + n]))?;
             encoder.copy_buffer_to_buffer(&chunk.raw, chunk.used, target, offset + done as u64, n as u64);
             chunk.used = end.next_multiple_of(MAP_ALIGNMENT).min(self.chunk_bytes);
             done += n;

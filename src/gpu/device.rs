@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex};
 use super::adapter::{AdapterSummary, DeviceKind, choose, limits_to_request};
 use super::belt::Belt;
 use super::buffers::{Buffer, Pool, Purpose};
+use super::bus::EmulatedBus;
 use super::choice::DeviceChoice;
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
@@ -50,7 +51,7 @@ pub fn budget_for_buffers(bytes: u64) -> u64 {
 }
 
 /// Options that a test or the user's budget sets.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct GpuOptions {
     /// Lowers the largest binding, bytes.
     pub max_binding_bytes: Option<u64>,
@@ -77,6 +78,8 @@ pub struct GpuOptions {
     pub uniform_blocks: Option<bool>,
     /// A fault to inject; `None`: the one that the environment variable `GSSCALE_GPU_FAULT` requests, if any.
     pub fault: Option<InjectedFault>,
+    /// A bus to emulate; `None`: the one that the environment variable `GSSCALE_EMULATE_BUS` requests, if any.
+    pub bus: Option<EmulatedBus>,
 }
 
 /// An open device.
@@ -126,8 +129,9 @@ impl Gpu {
         features.set(wgpu::Features::SUBGROUP, subgroups);
         features.set(wgpu::Features::TIMESTAMP_QUERY, profile);
         let limits = limits_to_request(&adapter.limits());
-        let driver =
-            Arc::new(Driver::open(&adapter, &summary.name, features, limits.clone(), options.budget.map(block_bytes))?);
+        let bus = options.bus.map_or_else(EmulatedBus::from_environment, |bus| Ok(Some(bus)))?;
+        let blocks = options.budget.map(block_bytes);
+        let driver = Arc::new(Driver::open(&adapter, &summary.name, features, limits.clone(), blocks, bus)?);
         let budget = options.budget.map_or(u64::MAX, bytes_for_buffers);
         let block_limit = options.budget.filter(|budget| *budget >= BLOCKS_COUNT_FROM);
         let pool = Pool::new(Arc::clone(&driver), budget, block_limit, limits.max_buffer_size);

@@ -4,8 +4,11 @@
 
 use std::sync::Arc;
 
+use super::bus::EmulatedBus;
 use super::error::{GpuError, GpuResult};
 use super::faults::Faults;
+use crate::base::trace;
+use std::time::Instant;
 
 /// An opened wgpu device.
 #[derive(Debug)]
@@ -13,6 +16,8 @@ pub(super) struct Driver {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
     pub(super) faults: Arc<Faults>,
+    /// How long copies between host and device take; `None`: as long as they take.
+    bus: Option<EmulatedBus>,
 }
 
 impl Driver {
@@ -24,6 +29,7 @@ impl Driver {
         required_features: wgpu::Features,
         required_limits: wgpu::Limits,
         block_bytes: Option<u64>,
+        bus: Option<EmulatedBus>,
     ) -> GpuResult<Driver> {
         let memory_hints = block_bytes.map_or(wgpu::MemoryHints::Performance, |bytes| wgpu::MemoryHints::Manual {
             suballocated_device_memory_block_size: bytes..bytes,
@@ -42,7 +48,7 @@ impl Driver {
         device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| reports.report(&error)));
         let losses = Arc::clone(&faults);
         device.set_device_lost_callback(move |_, message| losses.lost(message));
-        Ok(Driver { device, queue, faults })
+        Ok(Driver { device, queue, faults, bus })
     }
 
     /// A new buffer; one with `MAP_WRITE` is mapped.
@@ -56,8 +62,19 @@ impl Driver {
         self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some(label) })
     }
 
+    /// Copies between host and device: runs `copy` of `bytes` bytes, which takes at least as long as on the emulated bus.
+    pub(super) fn cross<T>(&self, bytes: u64, copy: impl FnOnce() -> T) -> T {
+        let began = Instant::now();
+        let done = copy();
+        if let Some(bus) = &self.bus {
+            bus.cross(began, bytes);
+        }
+        done
+    }
+
     /// Waits until the device has finished `submission`; errors that no report explains name `stage`.
     pub(super) fn wait(&self, stage: &str, submission: Option<wgpu::SubmissionIndex>) -> GpuResult<()> {
+        let _span = trace::span("wait").of("for", stage);
         let waited = self.device.poll(wgpu::PollType::Wait { submission_index: submission, timeout: None });
         self.faults.check()?;
         waited.map(|_| ()).map_err(|e| GpuError::validation(stage, e))

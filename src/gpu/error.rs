@@ -28,6 +28,16 @@ pub enum GpuError {
         /// The driver's message.
         message: String,
     },
+    /// The variable that asks for an emulated bus holds something else.
+    #[error(
+        "{variable}: {text:?} is not a rate and a latency\n  remedy: write for example {variable}=12GB/s,20us, or unset it"
+    )]
+    EmulatedBus {
+        /// The environment variable.
+        variable: &'static str,
+        /// What it holds.
+        text: String,
+    },
     /// The budget of `--device-mem` cannot hold a buffer.
     #[error(
         "{what} needs {need} bytes of device memory, but {in_use} of the {budget} allowed are in use\n  remedy: raise \

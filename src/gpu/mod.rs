@@ -25,7 +25,7 @@
 //! Without the feature `gpu` (`--no-default-features`) only the types remain that configs and reports name, and there is no
 //! adapter.
 //!
-//! Files import each other in one direction: `error` <- `faults` <- `driver` (the wgpu device that the others share) <- `buffers`,
+//! Files import each other in one direction: `error` <- `bus`, `faults` <- `driver` (the wgpu device that the others share) <- `buffers`,
 //! `belt`, `shader` <- `readback`, `uniforms` <- `profile` <- `device` <- `record`.
 
 #[cfg(feature = "gpu")]
@@ -34,6 +34,7 @@ mod adapter;
 mod belt;
 #[cfg(feature = "gpu")]
 mod buffers;
+mod bus;
 mod choice;
 #[cfg(feature = "gpu")]
 mod device;
@@ -65,6 +66,7 @@ pub use adapter::{AdapterSummary, DeviceKind, WORKGROUP, list_adapters};
 pub use belt::staging_bytes;
 #[cfg(feature = "gpu")]
 pub use buffers::{Buffer, BufferView};
+pub use bus::EmulatedBus;
 pub use choice::DeviceChoice;
 #[cfg(feature = "gpu")]
 pub use device::{Gpu, GpuOptions, budget_for_buffers, bytes_for_buffers};

@@ -7,9 +7,12 @@
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 
+use super::belt::COPY_PART;
 use super::buffers::{Buffer, BufferView, Pool, Purpose};
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
+use crate::base::trace;
+use rayon::prelude::*;
 
 const RECORDED: u8 = 0;
 const MAPPING: u8 = 1;
@@ -49,6 +52,17 @@ impl Staging {
 
     pub(super) fn bytes_read(&self) -> u64 {
         self.read.load(Ordering::Relaxed)
+    }
+}
+
+/// Copies mapped bytes to as many of the host.
+fn empty(mapped: &[u8], out: &mut [u8]) {
+    match out.len() {
+        0..=COPY_PART => out.copy_from_slice(mapped),
+        _ => {
+            let parts = out.par_chunks_mut(COPY_PART).zip(mapped.par_chunks(COPY_PART));
+            parts.for_each(|(out, mapped)| out.copy_from_slice(mapped));
+        }
     }
 }
 
@@ -110,7 +124,9 @@ impl Readback {
         let out = bytemuck::cast_slice_mut::<T, u8>(out);
         let view = self.buffer.raw().get_mapped_range(..self.size).map_err(|e| GpuError::validation(self.stage, e))?;
         let n = out.len().min(view.len());
-        out[..n].copy_from_slice(&view[..n]);
+        let span = trace::span("read back").of("what", self.stage).with("bytes", self.size);
+        self.staging.driver.cross(self.size, || empty(&view[..n], &mut out[..n]));
+        drop(span);
         drop(view);
         self.buffer.raw().unmap();
         self.buffer.set_reusable(true);

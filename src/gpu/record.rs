@@ -16,6 +16,7 @@ use super::injected::{FaultKind, fill_device};
 use super::readback::{PendingMap, Readback};
 use super::shader::{BindingKind, Pipeline};
 use super::uniforms::UNIFORM_CHUNK;
+use crate::base::trace;
 
 /// Workgroups for `count` invocations in workgroups of `workgroup`, folded into two dimensions beyond 65,535.
 ///
@@ -151,6 +152,7 @@ impl Recorder<'_> {
     }
 
     fn upload_words(&mut self, view: &BufferView, mut at: u64, mut bytes: &[u8]) -> GpuResult<()> {
+        let _span = trace::span("upload").of("what", view.label).with("bytes", bytes.len() as u64);
         self.work.pass = None;
         self.gpu.driver.faults.set_stage(view.label);
         self.gpu.uploaded.fetch_add(bytes.len() as u64, Ordering::Relaxed);
@@ -348,6 +350,7 @@ impl Recorder<'_> {
     /// Submits the commands recorded so far and continues with an empty encoder.
     fn flush(&mut self) -> GpuResult<Submission> {
         let gpu = self.gpu;
+        let _span = trace::span("submit").of("what", self.work.name);
         self.work.pass = None;
         let mut profiler = lock(&gpu.profiler);
         let stamps = profiler.resolve(&mut self.work.encoder)?;

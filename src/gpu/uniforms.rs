@@ -55,7 +55,7 @@ impl UniformRing {
     pub(super) fn write(&mut self, packed: &mut Vec<Vec<u8>>) -> u64 {
         let mut written = 0;
         for (raw, bytes) in self.chunks.iter().zip(packed.drain(..)) {
-            self.driver.queue.write_buffer(raw, 0, &bytes);
+            self.driver.cross(bytes.len() as u64, || self.driver.queue.write_buffer(raw, 0, &bytes));
             written += bytes.len() as u64;
         }
         written

@@ -174,6 +174,13 @@ impl Pager {
         self.look_ahead.views.limit(bytes);
     }
 
+    /// Plans the coming steps in at least about `bytes` bytes also where no page leaves memory: a tier above asks for next uses.
+    pub fn plan_for_tier_above(&mut self, bytes: usize) {
+        if self.config.plan_bytes < bytes {
+            self.limit_plan(bytes);
+        }
+    }
+
     /// Sets when pages move.
     pub fn set_transfers(&mut self, transfers: Transfers) {
         self.transfers = transfers;
@@ -203,7 +210,7 @@ impl Pager {
     /// Plans the coming views: `cameras[i]` at step `first_step + i`. Replaces the plan before; views that are planned already
     /// cost nothing.
     pub fn look_ahead(&mut self, first_step: u32, cameras: &[&Camera]) {
-        if self.mover.has_store() {
+        if self.mover.has_store() || self.config.plan_bytes > 0 {
             self.look_ahead.views.renew(first_step, cameras, self.index.metas());
             self.apply_changed_uses();
         }
@@ -348,6 +355,11 @@ impl Pager {
     /// Whether a page has a frame.
     pub fn is_in_memory(&self, page: PageNo) -> bool {
         self.frames.state(page).is_some()
+    }
+
+    /// What the frame of a page holds behind the header; `None` for a page that is not in memory, is pinned, or is moving.
+    pub fn payload(&self, page: PageNo) -> Option<&[u8]> {
+        self.frames.memory(page).map(|buffer| &buffer.as_slice()[HEADER_BYTES..])
     }
 
     /// The slots of the pages on the drive, by page: for the index of a commit, once no page is dirty.

@@ -31,7 +31,8 @@ impl Pager {
             return;
         }
         self.write_frozen();
-        if self.look_ahead.is_due(step) {
+        // Without a limit on the frames nothing is read or evicted.
+        if self.frames.frames_max() < usize::MAX && self.look_ahead.is_due(step) {
             // By what is known now; a page that this step moves into the next one's view is a late miss at most.
             self.look_ahead.refresh(step, self.index.metas());
             self.apply_changed_uses();

@@ -1,8 +1,8 @@
 //! [`GpuRenderer`]: the stages of a view on a GPU, forward and backward, one view at a time.
 //!
-//! Not here: the recording of each stage (`gpu_rows`, `gpu_tiles`, `gpu_tiles_bwd`, `gpu_loss`), rows in chunks
-//! (`gpu_segments`, `gpu_gradients`), pages on the device (`gpu_paged`), the picture in ranges of tiles (`gpu_ranges`), the device
-//! and its memory (`crate::gpu`).
+//! Not here: the picture and its validity (`gpu_picture`), loss and gradients (`gpu_back`), the recording of each stage (`gpu_rows`,
+//! `gpu_tiles`, `gpu_tiles_bwd`, `gpu_loss`), rows in chunks (`gpu_segments`, `gpu_gradients`), pages on the device (`gpu_paged`), the
+//! picture in ranges of tiles (`gpu_ranges`), the device and its memory (`crate::gpu`).
 //!
 //! # Memory
 //! The ordinary view keeps its rows and tile lists on the device. A buffer that the budget or the device refuses costs first
@@ -13,7 +13,8 @@
 //! # Bus traffic
 //! A step with n rows in view, p pixels and all colour bands uploads 236 n bytes of values and 4 p bytes of photo. The
 //! step downloads 236 n bytes of gradients and 16 n bytes for densification, 32 n bytes where rows are weighed. Counts and uniforms add some KiB. While
-//! the host holds the master copy of every value, only the mask byte of photos without a mask could be saved.
+//! the host holds the master copy of every value, only the mask byte of photos without a mask could be saved. All threads of the host
+//! take part in packing, copying and unpacking rows.
 //!
 //! | stage | transfer | device work at the same time |
 //! | --- | --- | --- |
@@ -38,27 +39,28 @@
 //! the cull. The next photo is known, but its upload in `loss` already costs no time.
 //!
 //! All of this holds while the host has the rows. A device that holds pages ([`super::pages`]) uploads 4 p bytes of photo, some
-//! 50 KB of tables and uniforms, and the payloads that it lacks; it downloads 52 bytes a page. It waits for the number of listed
-//! rows, the two counts, and the results of the pages.
+//! 50 KB of tables and uniforms, and the payloads that it lacks; it downloads 52 bytes a page, and the payloads of pages that leave their
+//! slots. It waits for the number of listed rows, the two counts, and the results of the pages. For a view of one batch,
+//! payloads of the next view go up while it computes gradients, and payloads that leave come down behind the picture (`train`).
 //!
 //! Invariants: 1. of views, the device holds the rows, lists and picture of the last one only; 2. the same input gives the same
 //! bits on the same device; 3. no result comes from buffers that were too small: the frame and its loss are recorded
 //! again with larger buffers; 4. after a device error there is no view until the next `begin_view`.
 
 use super::device_needs::ViewSizes;
-use super::gpu_gradients::{RowGradients, RowsOut, Scratch, check_room};
-use super::gpu_loss::{LossStage, value};
+use super::gpu_frame::splat_bytes;
+use super::gpu_gradients::Scratch;
+use super::gpu_loss::LossStage;
 use super::gpu_pages::{DevicePages, PagesView};
-use super::gpu_ranges::{PLACE_BYTES, RangeStages, Ranges};
+use super::gpu_ranges::RangeStages;
 use super::gpu_rows::{DeviceColumns, HostRows, RowSource, RowStages, SplatRows};
 use super::gpu_segments::{self, Segment};
-use super::gpu_tiles::{Blend, Demand, Pixels, TileStages, splat_bytes};
-use super::gpu_tiles_bwd::{Fold, PictureGradientBuffers};
-use super::gpu_view::{DemandState, Lists, Loss, LossSums, RowsIn, Unusable, View, WholeLists, WholeRows, blend_of};
+use super::gpu_tiles::TileStages;
+use super::gpu_view::{Lists, Loss, LossSums, RowsIn, View, WholeRows};
 use super::pages::PageRenderer;
 use super::sequence::{Sequence, ViewOptions};
 use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches};
-use crate::gpu::{Buffer, DeviceKind, Gpu, GpuError, GpuResult, Recorder, Traffic};
+use crate::gpu::{DeviceKind, Gpu, GpuResult, Traffic};
 use crate::kernels::image_loss::LossPlan;
 use crate::kernels::splats::Grid;
 use crate::kernels::tile_range::TileRange;
@@ -66,7 +68,6 @@ use crate::kernels::uniforms::pack_target;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
-use std::ops::Range;
 
 /// Renders views on a GPU.
 #[derive(Debug)]
@@ -74,8 +75,8 @@ pub struct GpuRenderer {
     pub(super) gpu: Gpu,
     pub(super) rows: RowStages,
     pub(super) tiles: TileStages,
-    ranges: RangeStages,
-    loss: LossStage,
+    pub(super) ranges: RangeStages,
+    pub(super) loss: LossStage,
     pub(super) sequence: Sequence,
     rows_in: Option<RowsIn>,
     pub(super) view: Option<View>,
@@ -83,17 +84,17 @@ pub struct GpuRenderer {
     pub(super) pages: Option<Box<DevicePages>>,
     /// What the view knows of the pages that its rows come from.
     pub(super) pages_view: Option<PagesView>,
-    image: Image,
+    pub(super) image: Image,
     /// The gradient of the picture, valid if `gradient_on_host`.
-    gradient: PictureGradient,
+    pub(super) gradient: PictureGradient,
     /// Whether the caller requested the gradient of the picture, and the host copy therefore replaces the device's.
-    gradient_on_host: bool,
-    scratch: Scratch,
+    pub(super) gradient_on_host: bool,
+    pub(super) scratch: Scratch,
     packed_target: Vec<u32>,
-    frames_rerecorded: u64,
+    pub(super) frames_rerecorded: u64,
     /// Whether the next views collect weights of rows, and whether this view does.
     weighs_next: bool,
-    weighs: bool,
+    pub(super) weighs: bool,
 }
 
 impl GpuRenderer {
@@ -208,45 +209,6 @@ impl GpuRenderer {
         }
     }
 
-    /// Frees device memory that a view can do without: the columns of its rows, then its lists. Returns whether it did.
-    fn give_back(&mut self, view: &mut View) -> GpuResult<bool> {
-        if view.columns.take().is_some() {
-            return Ok(true);
-        }
-        if matches!(view.lists, Lists::Ranges(_)) {
-            return Ok(false);
-        }
-        self.wait_for_valid_picture(view)?;
-        if matches!(view.lists, Lists::Whole(_)) {
-            self.draw_in_ranges(view)?;
-        }
-        Ok(true)
-    }
-
-    /// The stages on ranges of tiles.
-    fn in_ranges<'a>(&'a self, of: &ViewOptions, pixels: &'a Pixels) -> Ranges<'a> {
-        Ranges { gpu: &self.gpu, tiles: &self.tiles, stages: &self.ranges, blend: blend_of(of), pixels }
-    }
-
-    /// Replaces the lists of a view by ranges of tiles and draws the picture again. Waits.
-    fn draw_in_ranges(&self, view: &mut View) -> GpuResult<()> {
-        view.lists = Lists::Ranges(Vec::new()); // frees the lists
-        let bytes = self.bytes_for_lists(&view.of, &view.segments);
-        view.lists = Lists::Ranges(self.in_ranges(&view.of, &view.pixels).draw(&view.segments, bytes)?);
-        Ok(())
-    }
-
-    /// Device memory for the lists of a range, beside what the view still needs: gradients of the splats, places of the rows, and
-    /// the photo, the gradient and the derivatives of the loss.
-    fn bytes_for_lists(&self, of: &ViewOptions, segments: &[Segment]) -> u64 {
-        let rows: u64 =
-            segments.iter().map(|segment| splat_bytes(segment.rows) + PLACE_BYTES * u64::from(segment.rows)).sum();
-        let reserved = (rows + (12 + 12 + 4) * of.camera.pixels() as u64) / 4 * 5;
-        // The reserve is an estimate: without room beside it, lists may still fit.
-        let room = self.gpu.room();
-        room.saturating_sub(reserved).max(room / 8)
-    }
-
     /// Appends the rows of a batch to those of the view; drops the view if they could not be submitted.
     pub(super) fn append(&mut self, submitted: GpuResult<RowsIn>) -> GpuResult<()> {
         let rows = submitted.inspect_err(|_| self.drop_view())?;
@@ -255,274 +217,6 @@ impl GpuRenderer {
             _ => self.rows_in = Some(rows),
         }
         Ok(())
-    }
-
-    /// Submits what is recorded of the rows, the tile lists and the blending. Waits only if the lists do not fit at once.
-    fn submit_picture(&mut self, of: ViewOptions, rows: RowsIn) -> GpuResult<View> {
-        let (gpu, blend) = (&self.gpu, blend_of(&of));
-        let RowsIn { segments, whole } = rows;
-        if let (Some(whole), Some(segment)) = (whole, segments.first()) {
-            let WholeRows { columns, ranks, colors } = *whole;
-            let mut recorder = gpu.resume(colors);
-            let recorded = Pixels::new(gpu, blend.grid).and_then(|pixels| {
-                let splats = segment.splats.view();
-                let frame = self.tiles.frame(gpu, &mut recorder, &splats, &ranks, blend, &pixels)?;
-                Ok((pixels, frame))
-            });
-            // Without a frame, the colours at least.
-            gpu.submit(recorder)?;
-            match recorded {
-                Ok((pixels, (frame, demand))) => {
-                    let lists = WholeLists { ranks, frame, demand: DemandState::Pending(Box::new(demand)) };
-                    return Ok(View::new(of, segments, Some(columns), pixels, Lists::Whole(Box::new(lists))));
-                }
-                // Smaller views may need less than the largest so far.
-                Err(error) if error.lacks_room() => self.tiles.halve_capacity(),
-                Err(error) => return Err(error),
-            }
-        }
-        let gpu = &self.gpu;
-        let pixels = Pixels::new(gpu, blend.grid)?;
-        let mut view = View::new(of, segments, None, pixels, Lists::Ranges(Vec::new()));
-        self.draw_in_ranges(&mut view)?;
-        Ok(view)
-    }
-
-    /// Waits until the picture of the view is known to be valid. A frame with too little room is recorded again with larger
-    /// buffers, or drawn in ranges where these do not fit, and so is the loss of its picture.
-    fn wait_for_valid_picture(&mut self, view: &mut View) -> GpuResult<()> {
-        let blend = view.blend();
-        while let Lists::Whole(lists) = &mut view.lists {
-            let unread = DemandState::Known(Demand { isects: 0, list_max: 0 });
-            let demand = match std::mem::replace(&mut lists.demand, unread) {
-                DemandState::Known(demand) => demand,
-                DemandState::Pending(readback) => readback.wait()?,
-            };
-            lists.demand = DemandState::Known(demand);
-            let fits = self.tiles.fits(&lists.frame, demand);
-            if let Ok(true) = fits {
-                break;
-            }
-            if let Some(loss) = &mut view.loss {
-                loss.sums = LossSums::Stale;
-            }
-            self.frames_rerecorded += 1;
-            let recorded = fits.and_then(|_| self.frame_again(view, blend));
-            match recorded {
-                Ok(()) => {}
-                Err(error) if error.lacks_room() => {
-                    self.tiles.halve_capacity();
-                    view.columns = None;
-                    self.draw_in_ranges(view)?;
-                }
-                Err(error) => return Err(error),
-            }
-        }
-        if let Some(loss) = view.loss.as_mut().filter(|loss| matches!(loss.sums, LossSums::Stale)) {
-            let size = [view.of.camera.width, view.of.camera.height];
-            loss.sums = self.submit_loss(self.gpu.begin("image_loss"), size, &view.pixels.rgb, loss)?;
-        }
-        Ok(())
-    }
-
-    /// Records lists and blending again, with buffers of the sizes that are known now.
-    fn frame_again(&self, view: &mut View, blend: Blend) -> GpuResult<()> {
-        let whole = (std::mem::replace(&mut view.lists, Lists::Ranges(Vec::new())), view.segments.first());
-        let (Lists::Whole(lists), Some(segment)) = whole else {
-            let problem = "a view without whole lists has no frame to record again".to_string();
-            return Err(GpuError::Bindings { stage: "forward".to_string(), problem });
-        };
-        let WholeLists { ranks, frame, .. } = *lists;
-        drop(frame); // frees memory for the larger frame
-        let mut recorder = self.gpu.begin("forward again");
-        let splats = segment.splats.view();
-        let (frame, demand) = self.tiles.frame(&self.gpu, &mut recorder, &splats, &ranks, blend, &view.pixels)?;
-        self.gpu.submit(recorder)?;
-        view.lists =
-            Lists::Whole(Box::new(WholeLists { ranks, frame, demand: DemandState::Pending(Box::new(demand)) }));
-        Ok(())
-    }
-
-    fn read_image(&mut self, view: &View) -> GpuResult<()> {
-        let Camera { width, height, .. } = view.of.camera;
-        let mut recorder = self.gpu.begin("picture");
-        let bytes = recorder.read_back("rasterize_fwd", &view.pixels.rgb.view())?;
-        self.gpu.submit(recorder)?;
-        (self.image.width, self.image.height) = (width, height);
-        self.image.rgb.resize(3 * view.of.camera.pixels(), 0.0);
-        bytes.copy_to(&mut self.image.rgb)
-    }
-
-    /// Submits the loss of `rgb`: the picture of the view, which may still turn out invalid, or the corrected picture. Writes the
-    /// gradient of `loss`, and returns its sums.
-    fn submit_loss(
-        &self,
-        mut recorder: Recorder<'_>,
-        size: [u32; 2],
-        rgb: &Buffer,
-        loss: &Loss,
-    ) -> GpuResult<LossSums> {
-        let gpu = &self.gpu;
-        let (rgb, photo, v_rgb) = (rgb.view(), loss.target.view(), loss.v_rgb.view());
-        let sums = self.loss.run(gpu, &mut recorder, size, &loss.plan, &rgb, &photo, &v_rgb)?;
-        if let Some(errors) = &loss.errors {
-            self.loss.errors(&mut recorder, size, &loss.plan, [&rgb, &photo, &errors.view()])?;
-        }
-        let sums = match sums {
-            Some(sums) => LossSums::Pending(recorder.read_back("image_loss", &sums.slice(0, 16))?),
-            None => LossSums::Empty,
-        };
-        gpu.submit(recorder)?;
-        Ok(sums)
-    }
-
-    /// Reads the gradient of the loss into `self.gradient`; zeros if no loss ran.
-    fn read_gradient(&mut self, view: &mut View) -> GpuResult<()> {
-        self.gradient.reset(view.of.camera.pixels());
-        if view.loss.is_none() {
-            return Ok(());
-        }
-        self.wait_for_valid_picture(view)?;
-        if let Some(loss) = &view.loss {
-            let mut recorder = self.gpu.begin("picture gradient");
-            let bytes = recorder.read_back("image_loss", &loss.v_rgb.view())?;
-            self.gpu.submit(recorder)?;
-            bytes.copy_to(&mut self.gradient.v_rgb)?;
-        }
-        Ok(())
-    }
-
-    /// Records the backward pass from the picture to the splats, once the picture is valid.
-    fn record_picture_back(&mut self, view: &mut View) -> Result<(), RenderError> {
-        self.wait_for_valid_picture(view)?;
-        let (gpu, blend) = (&self.gpu, view.blend());
-        let mut recorder = gpu.begin("backward");
-        let (mut uploaded, mut v_alpha) = (None, None);
-        if self.gradient_on_host {
-            uploaded = Some(recorder.buffer_with("v_rgb", &self.gradient.v_rgb)?);
-            v_alpha = self.gradient.v_alpha.as_ref().map(|v| recorder.buffer_with("v_alpha", v)).transpose()?;
-        }
-        let v_rgb = uploaded.as_ref().or(view.loss.as_ref().map(|loss| &loss.v_rgb));
-        let v_rgb = v_rgb.ok_or(RenderError::OutOfOrder { call: "picture_back", needs: "loss or picture_gradient" })?;
-        let (v_rgb, v_alpha) = (v_rgb.view(), v_alpha.as_ref().map(Buffer::view));
-        // Without a loss no photo was compared.
-        let no_errors = match (&view.loss, self.weighs) {
-            (None, true) => Some(recorder.buffer_zeroed("squared errors", view.pixels.t_final.size())?),
-            _ => None,
-        };
-        let errors = view.loss.as_ref().and_then(|loss| loss.errors.as_ref()).or(no_errors.as_ref()).map(Buffer::view);
-        let gradient = PictureGradientBuffers { v_rgb: &v_rgb, v_alpha: v_alpha.as_ref(), errors: errors.as_ref() };
-        (view.tiles_back, view.unusable) = (None, Unusable::Uncounted);
-        match &mut view.lists {
-            Lists::Whole(lists) => {
-                let (WholeLists { ranks, frame, .. }, DemandState::Known(demand)) = (&**lists, &lists.demand) else {
-                    return Err(RenderError::OutOfOrder { call: "picture_back", needs: "picture" });
-                };
-                for segment in &mut view.segments {
-                    segment.v_splats = None;
-                    let v_splats = gpu.buffer("v_splats", splat_bytes(ranks.rows))?;
-                    let (splats, out) = (segment.splats.view(), v_splats.view());
-                    let (into, pixels) = (&mut recorder, &view.pixels);
-                    self.tiles.backward(
-                        gpu,
-                        into,
-                        &splats,
-                        ranks,
-                        frame,
-                        pixels,
-                        *demand,
-                        gradient,
-                        &out,
-                        Fold::Whole,
-                    )?;
-                    segment.v_splats = Some(v_splats);
-                }
-                view.tiles_back = Some(recorder.set_aside());
-            }
-            Lists::Ranges(planned) => {
-                gpu.submit(recorder)?; // the uploads
-                let ranges = Ranges { gpu, tiles: &self.tiles, stages: &self.ranges, blend, pixels: &view.pixels };
-                ranges.back(&mut view.segments, planned, gradient)?;
-            }
-        }
-        if view.columns.is_none() {
-            // The caller changes rows as soon as the first batch is out, so the pass out must not fail for want of memory.
-            if let Some(tiles) = view.tiles_back.take() {
-                gpu.submit(gpu.resume(tiles))?;
-            }
-            check_room(gpu, view.of.options.sh_degree)?;
-        }
-        Ok(())
-    }
-
-    /// Propagates the gradients of the splats of the batch at `place` to its rows.
-    fn rows_out_of(
-        &mut self,
-        view: &mut View,
-        rows: &Columns,
-        place: &Range<usize>,
-        grads: &mut Gradients,
-    ) -> Result<(), RenderError> {
-        let (gpu, sh_degree) = (&self.gpu, view.of.options.sh_degree);
-        let out = RowsOut { gpu, stages: &self.rows, view: &view.of, weighs: self.weighs };
-        out.prepare(place.len(), rows.sh_degree, grads);
-        if let (Some(columns), Some(segment)) = (&view.columns, view.segments.first()) {
-            let room = RowGradients::new(gpu, columns.rows, sh_degree, self.weighs)?;
-            let mut recorder = view.tiles_back.take().map_or_else(|| gpu.begin("backward"), |tiles| gpu.resume(tiles));
-            match self.tiles.count_unusable(&mut recorder, &view.segments, view.blend()) {
-                Ok(unusable) => view.unusable = Unusable::Pending(unusable),
-                Err(error) => {
-                    // The work that the recorder brings along goes on even if the count lacks memory.
-                    gpu.submit(recorder)?;
-                    return Err(error.into());
-                }
-            }
-            return Ok(out.whole(recorder, columns, &room, segment, grads, &mut self.scratch)?);
-        }
-        if view.tiles_back.is_some() || matches!(view.unusable, Unusable::Uncounted) {
-            let mut recorder = view.tiles_back.take().map_or_else(|| gpu.begin("backward"), |tiles| gpu.resume(tiles));
-            let unusable = self.tiles.count_unusable(&mut recorder, &view.segments, view.blend());
-            gpu.submit(recorder)?;
-            view.unusable = Unusable::Pending(unusable?);
-        }
-        let of_batch = view.segments.iter().filter(|segment| place.contains(&segment.first));
-        Ok(out.in_chunks(rows, place.start, of_batch, grads, &mut self.scratch)?)
-    }
-
-    /// Waits for the number of rows with unusable gradients.
-    fn read_unusable(view: &mut View) -> GpuResult<u64> {
-        let unusable = match std::mem::replace(&mut view.unusable, Unusable::Uncounted) {
-            Unusable::Pending(readback) => {
-                let mut count = [0u32];
-                readback.copy_to(&mut count)?;
-                u64::from(count[0])
-            }
-            Unusable::Known(count) => count,
-            Unusable::Uncounted => 0,
-        };
-        view.unusable = Unusable::Known(unusable);
-        Ok(unusable)
-    }
-
-    /// Waits for the sums of the loss of a valid picture and returns the value of the loss.
-    fn read_loss_value(&mut self, view: &mut View) -> Result<LossValue, RenderError> {
-        self.wait_for_valid_picture(view)?;
-        let Some(loss) = &mut view.loss else {
-            return Err(RenderError::OutOfOrder { call: "loss_value", needs: "loss" });
-        };
-        let sums = match std::mem::replace(&mut loss.sums, LossSums::Empty) {
-            // The wait above has computed stale sums again.
-            LossSums::Stale => return Err(RenderError::OutOfOrder { call: "loss_value", needs: "loss" }),
-            LossSums::Empty => [0.0; 4],
-            LossSums::Pending(readback) => {
-                let mut sums = [0.0f32; 4];
-                readback.copy_to(&mut sums)?;
-                sums
-            }
-            LossSums::Known(sums) => sums,
-        };
-        loss.sums = LossSums::Known(sums);
-        Ok(value(&loss.plan, sums))
     }
 }
 

@@ -8,12 +8,15 @@
 //! Invariant: gradients have the same bits for any cut of the rows into batches, segments and chunks.
 
 use super::Gradients;
-use super::gpu_rows::{BAND_WIDTHS, DeviceColumns, RowStages, SplatRows, band_into_sh_n, footprint_bytes};
+use super::gpu_rows::{
+    BAND_WIDTHS, DeviceColumns, ROWS_OF_THREAD, RowStages, SplatRows, band_into_sh_n, footprint_bytes,
+};
 use super::gpu_segments::{CHUNK_STEP, Segment, gradients_of, in_chunks};
 use super::sequence::ViewOptions;
 use crate::base::room;
 use crate::gpu::{Buffer, Gpu, GpuResult, Readback, Recorder};
 use crate::scene::columns::Columns;
+use rayon::prelude::*;
 use std::ops::Range;
 
 /// Densification input of one row: gradient with respect to the projected mean (2), radii (2). In a view that weighs rows, a
@@ -238,13 +241,15 @@ impl RowsOut<'_> {
         let of_row = if self.weighs { 2 } else { 1 };
         room::resize(footprints, of_row * part.len(), [0.0; 4]);
         readbacks.footprints.copy_to(footprints)?;
-        let rows = grads.means2d[part.clone()].iter_mut().zip(&mut grads.radii[part.clone()]);
-        for ((mean2d, radii), f) in rows.zip(footprints.iter().step_by(of_row)) {
+        let rows = grads.means2d[part.clone()].par_iter_mut().zip(&mut grads.radii[part.clone()]);
+        let rows = rows.zip(footprints.par_chunks_exact(of_row)).with_min_len(ROWS_OF_THREAD);
+        rows.for_each(|((mean2d, radii), of)| {
+            let f = of[0];
             (*mean2d, *radii) = ([f[0], f[1]], [f[2] as u32, f[3] as u32]);
-        }
+        });
         if self.weighs {
-            let weights = grads.weights[part.clone()].iter_mut();
-            weights.zip(footprints.iter().skip(1).step_by(2)).for_each(|(weights, f)| *weights = [f[0], f[1]]);
+            let weights = grads.weights[part.clone()].par_iter_mut().zip(footprints.par_chunks_exact(2));
+            weights.with_min_len(ROWS_OF_THREAD).for_each(|(weights, of)| *weights = [of[1][0], of[1][1]]);
         }
         Ok(())
     }

@@ -154,6 +154,20 @@ impl PageRenderer for GpuRenderer {
         Ok(self.held()?.slots.read(&self.gpu, payloads)?)
     }
 
+    fn begin_reads(&mut self, slots: &[(DeviceSlot, usize)]) -> Result<usize, RenderError> {
+        match &mut self.pages {
+            Some(pages) => Ok(pages.slots.begin_reads(&self.gpu, slots)?),
+            None => Err(RenderError::OutOfOrder { call: "begin_reads", needs: "hold_pages" }),
+        }
+    }
+
+    fn finish_reads(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError> {
+        match &mut self.pages {
+            Some(pages) => Ok(pages.slots.finish_reads(payloads)?),
+            None => Err(RenderError::OutOfOrder { call: "finish_reads", needs: "hold_pages" }),
+        }
+    }
+
     fn pages_in(&mut self, pages: &[SlotPage], step: &StepNumbers) -> Result<usize, RenderError> {
         let Some(view) = self.sequence.view() else {
             return Err(RenderError::OutOfOrder { call: "pages_in", needs: "begin_view" });

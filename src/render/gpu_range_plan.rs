@@ -8,7 +8,7 @@
 //! Invariants: 1. the parts of a tile cover all depths, nearest first; splats of one depth are in one part; 2. a range or part of
 //! at most [`PART_ISECTS`] intersections is not cut.
 
-use super::gpu_tiles::{Demand, FrameRoom, ListPart, splat_bytes};
+use super::gpu_frame::{Demand, FrameRoom, ListPart, splat_bytes};
 use crate::gpu::GpuResult;
 use crate::kernels::splats::Grid;
 use crate::kernels::tile_range::TileRange;

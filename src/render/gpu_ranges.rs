@@ -12,9 +12,10 @@
 //! that lacks memory is cut again, down to a few splats of one tile; 3. the picture is complete when [`Ranges::draw`] returns:
 //! it waits.
 
+use super::gpu_frame::{Blend, Demand, Frame, Pixels, Ranks, splat_bytes, words};
 use super::gpu_range_plan::{ALL_DEPTHS, PlannedRange, RangeLimits, Tally};
 use super::gpu_segments::{Segment, gradients_of, zero_gradients};
-use super::gpu_tiles::{Blend, Demand, Frame, Pixels, Ranks, TileStages, splat_bytes, words};
+use super::gpu_tiles::TileStages;
 use super::gpu_tiles_bwd::{Fold, PictureGradientBuffers, carry_bytes};
 use crate::gpu::{Buffer, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
 use crate::kernels::tile_range::TileRange;

@@ -9,6 +9,7 @@ use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_
 use crate::kernels::uniforms::RowsUniforms;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
+use rayon::prelude::*;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -28,6 +29,8 @@ pub const BAND_WIDTHS: [usize; 3] = [9, 15, 21];
 pub const WINDOW_STEP: u64 = 64;
 /// Invocations per workgroup.
 const WORKGROUP: u32 = 256;
+/// Rows that a thread of the host copies at least.
+pub(super) const ROWS_OF_THREAD: usize = 4096;
 
 /// Columns of rows on the device, or the gradients of the columns.
 #[derive(Debug)]
@@ -125,25 +128,23 @@ impl DeviceColumns {
     }
 }
 
-/// Copies one band (index 0 is l = 1) of the rows `part` from `sh_n` to `out`, `[rows][2 l + 1][3]`.
+/// Copies one band (index 0 is l = 1) of the rows `part` from `sh_n` to `out`, `[rows][2 l + 1][3]`, on all threads.
 pub fn band_from_sh_n(rows: &Columns, part: &Range<usize>, band: usize, out: &mut Vec<f32>) {
-    out.clear();
     let row_width = rows.sh_n.len() / rows.rows().max(1);
-    let first: usize = BAND_WIDTHS[..band].iter().sum();
-    for row in rows.sh_n[row_width * part.start..row_width * part.end].chunks_exact(row_width.max(1)) {
-        out.extend_from_slice(&row[first..first + BAND_WIDTHS[band]]);
-    }
+    let (first, width) = (BAND_WIDTHS[..band].iter().sum::<usize>(), BAND_WIDTHS[band]);
+    out.resize(if row_width == 0 { 0 } else { width * part.len() }, 0.0);
+    let rows = rows.sh_n[row_width * part.start..row_width * part.end].par_chunks_exact(row_width.max(1));
+    let pairs = out.par_chunks_exact_mut(width).zip(rows).with_min_len(ROWS_OF_THREAD);
+    pairs.for_each(|(out, row)| out.copy_from_slice(&row[first..first + width]));
 }
 
-/// Copies one band of the rows `part` from `values` back into `sh_n`.
+/// Copies one band of the rows `part` from `values` back into `sh_n`, on all threads.
 pub fn band_into_sh_n(values: &[f32], part: &Range<usize>, band: usize, rows: &mut Columns) {
     let row_width = rows.sh_n.len() / rows.rows().max(1);
-    let first: usize = BAND_WIDTHS[..band].iter().sum();
-    let width = BAND_WIDTHS[band];
-    let rows = rows.sh_n[row_width * part.start..row_width * part.end].chunks_exact_mut(row_width.max(1));
-    for (row, values) in rows.zip(values.chunks_exact(width)) {
-        row[first..first + width].copy_from_slice(values);
-    }
+    let (first, width) = (BAND_WIDTHS[..band].iter().sum::<usize>(), BAND_WIDTHS[band]);
+    let rows = rows.sh_n[row_width * part.start..row_width * part.end].par_chunks_exact_mut(row_width.max(1));
+    let pairs = rows.zip(values.par_chunks_exact(width)).with_min_len(ROWS_OF_THREAD);
+    pairs.for_each(|(row, values)| row[first..first + width].copy_from_slice(values));
 }
 
 /// Where the columns of the rows of a batch come from.

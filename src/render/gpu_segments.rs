@@ -8,8 +8,8 @@
 //!
 //! Invariant: splats have the same bits for any cut of the rows into batches, segments and chunks.
 
+use super::gpu_frame::splat_bytes;
 use super::gpu_rows::{DeviceColumns, RowSource, RowStages, SPLAT_BYTES, SplatRows, WINDOW_STEP};
-use super::gpu_tiles::splat_bytes;
 use super::sequence::ViewOptions;
 use crate::gpu::{Buffer, Gpu, GpuError, GpuResult};
 use std::ops::Range;

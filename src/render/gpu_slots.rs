@@ -5,12 +5,14 @@
 //! Invariant: a slab stays for as long as the pages of a run are held, so the place of a slot never changes.
 
 use super::pages::DeviceSlot;
-use crate::gpu::{Buffer, BufferView, Gpu, GpuError, GpuResult};
+use crate::gpu::{Buffer, BufferView, Gpu, GpuError, GpuResult, Readback};
 
 /// Bytes that a slot is a multiple of: the largest alignment that a device may require of a binding.
 const SLOT_STEP: u64 = 256;
 /// Most bytes of slots that are read back at once.
 const READ_BYTES: u64 = 8 << 20;
+/// Reads beside the work on a view take at most this part of the memory that the view leaves.
+const READ_SHARE: u64 = 8;
 
 /// A buffer of slots.
 #[derive(Debug)]
@@ -22,16 +24,18 @@ struct Slab {
 }
 
 /// All slots of a device.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Slots {
     slot_bytes: u64,
     slabs: Vec<Slab>,
+    /// Reads that have begun and not ended, with the slots that they read.
+    under_way: Vec<(DeviceSlot, Readback)>,
 }
 
 impl Slots {
     /// No slots yet, for payloads of at most `payload_bytes` bytes.
     pub fn new(payload_bytes: usize) -> Slots {
-        Slots { slot_bytes: (payload_bytes as u64).next_multiple_of(SLOT_STEP), slabs: Vec::new() }
+        Slots { slot_bytes: (payload_bytes as u64).next_multiple_of(SLOT_STEP), ..Slots::default() }
     }
 
     /// Bytes of a slot.
@@ -123,6 +127,40 @@ impl Slots {
         Ok(())
     }
 
+    /// Begins to read slots, each with the bytes of its payload; returns how many, from the first: those that memory allows. Does not
+    /// wait.
+    ///
+    /// # Errors
+    /// The device failed, a slot does not exist, or earlier reads have not ended.
+    pub fn begin_reads(&mut self, gpu: &Gpu, slots: &[(DeviceSlot, usize)]) -> GpuResult<usize> {
+        if !self.under_way.is_empty() {
+            return Err(wrong_slots("reads that have not ended"));
+        }
+        let most = (READ_BYTES.min(gpu.room() / READ_SHARE) / self.slot_bytes) as usize;
+        let mut recorder = gpu.begin("pages");
+        for (slot, bytes) in slots.iter().take(most) {
+            match recorder.read_back("pages", &self.view(*slot, *bytes)?) {
+                Ok(read) => self.under_way.push((*slot, read)),
+                Err(error) if error.lacks_room() => break,
+                Err(error) => return Err(error),
+            }
+        }
+        gpu.submit(recorder)?;
+        Ok(self.under_way.len())
+    }
+
+    /// Ends the reads that have begun, into the payloads of the same slots. Waits for them alone.
+    ///
+    /// # Errors
+    /// The device failed, or other slots were begun.
+    pub fn finish_reads(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> GpuResult<()> {
+        let under_way = std::mem::take(&mut self.under_way);
+        if !under_way.iter().map(|(slot, _)| slot).eq(payloads.iter().map(|(slot, _)| slot)) {
+            return Err(wrong_slots("slots whose reads have not begun"));
+        }
+        under_way.into_iter().zip(payloads).try_for_each(|((_, read), (_, payload))| read.copy_to(payload))
+    }
+
     fn read_some(&self, gpu: &Gpu, payloads: &mut [(DeviceSlot, &mut [u8])]) -> GpuResult<()> {
         let mut recorder = gpu.begin("pages");
         let mut readbacks = Vec::new();
@@ -138,5 +176,9 @@ impl Slots {
 }
 
 fn no_such_slot() -> GpuError {
-    GpuError::Bindings { stage: "pages".into(), problem: "a slot that does not exist".into() }
+    wrong_slots("a slot that does not exist")
+}
+
+fn wrong_slots(problem: &str) -> GpuError {
+    GpuError::Bindings { stage: "pages".into(), problem: problem.into() }
 }

@@ -6,8 +6,9 @@
 //! size; 2. the same holds for ranges of tiles ([`Fold::Range`]), whose rows continue the sums of the ranges before; 3. the
 //! order of every sum is fixed; 4. collecting weights changes no bit of the gradients, and costs nothing when it is off.
 
+use super::gpu_frame::{Blend, Demand, Frame, Pixels, Ranks};
 use super::gpu_segments::{Segment, gradients_of};
-use super::gpu_tiles::{Blend, Demand, Frame, Pixels, Ranks, TileStages, Weighing, raster_uniforms};
+use super::gpu_tiles::{TileStages, Weighing, raster_uniforms};
 use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Readback, Recorder, groups_1d};
 use crate::kernels::tile_range::TileRange;
 use crate::kernels::uniforms_tiles::{

@@ -3,10 +3,10 @@
 //! Not here: the stages.
 
 use super::device_needs::ViewSizes;
+use super::gpu_frame::{Blend, Demand, DemandReadback, Frame, Pixels, Ranks};
 use super::gpu_range_plan::PlannedRange;
 use super::gpu_rows::DeviceColumns;
 use super::gpu_segments::Segment;
-use super::gpu_tiles::{Blend, Demand, DemandReadback, Frame, Pixels, Ranks};
 use super::sequence::ViewOptions;
 use crate::gpu::{Buffer, Readback, Recording};
 use crate::kernels::image_loss::LossPlan;

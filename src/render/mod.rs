@@ -12,6 +12,10 @@ pub mod device_needs;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 #[cfg(feature = "gpu")]
+mod gpu_back;
+#[cfg(feature = "gpu")]
+pub mod gpu_frame;
+#[cfg(feature = "gpu")]
 mod gpu_gradients;
 #[cfg(feature = "gpu")]
 pub mod gpu_loss;
@@ -19,6 +23,8 @@ pub mod gpu_loss;
 mod gpu_paged;
 #[cfg(feature = "gpu")]
 pub mod gpu_pages;
+#[cfg(feature = "gpu")]
+mod gpu_picture;
 #[cfg(feature = "gpu")]
 mod gpu_range_plan;
 #[cfg(feature = "gpu")]

@@ -75,6 +75,20 @@ pub trait PageRenderer: Renderer {
     /// The device failed.
     fn read_slots(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError>;
 
+    /// Begins to copy slots back, each with the bytes of its payload, as they are after the work submitted so far; returns how many, from
+    /// the first. Fewer than all, even none, where memory is short. Does not wait.
+    ///
+    /// # Errors
+    /// The device failed, or copies that were begun before are not finished.
+    fn begin_reads(&mut self, slots: &[(DeviceSlot, usize)]) -> Result<usize, RenderError>;
+
+    /// Ends the copies that [`PageRenderer::begin_reads`] began, into payloads in the same order. Waits for the copies, not for work
+    /// submitted after them. Whatever happens, no copy is under way afterwards.
+    ///
+    /// # Errors
+    /// The device failed.
+    fn finish_reads(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError>;
+
     /// As [`Renderer::rows_in`], for the rows of `pages` that the view's camera may draw, evaluated at the step. Returns how many.
     /// Waits for that number.
     ///

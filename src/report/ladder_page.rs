@@ -5,6 +5,17 @@ use super::html::{Cell, Page};
 use super::record::RunRecord;
 use crate::base::units::format_bytes;
 
+/// Which rungs end with the same bits: those that round alike.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Rounding {
+    /// Dense updates on the host.
+    Dense,
+    /// Deferred Adam on the host.
+    Host,
+    /// Deferred Adam on a device.
+    Device,
+}
+
 /// A rung that has run.
 #[derive(Debug, Clone)]
 pub struct LadderRung {
@@ -12,6 +23,8 @@ pub struct LadderRung {
     pub name: String,
     /// The idea that this rung adds.
     pub what: String,
+    /// How its updates round.
+    pub rounding: Rounding,
     /// The figures.
     pub record: RunRecord,
 }
@@ -73,23 +86,33 @@ fn bars(rungs: &[LadderRung], title: &str, of: fn(&RunRecord) -> Option<f64>, wr
 /// Says which rungs ended with the same bits.
 fn equal_bits(rungs: &[LadderRung]) -> String {
     let done: Vec<&LadderRung> = rungs.iter().filter(|r| r.record.problem.is_none()).collect();
-    let exact: Vec<&&LadderRung> = done.iter().filter(|r| r.name != "naive").collect();
-    let names = |of: &[&&LadderRung]| of.iter().map(|r| r.name.clone()).collect::<Vec<_>>().join(", ");
-    let mut text = match exact.first() {
-        Some(first) if exact.len() > 1 && exact.iter().all(|r| r.record.ply == first.record.ply) => {
-            format!("The results of {} are the same, byte for byte.", names(&exact))
-        }
-        Some(_) if exact.len() > 1 => format!("The results of {} DIFFER, which is a fault.", names(&exact)),
-        _ => String::from("Too few rungs have run to compare their results."),
-    };
-    let naive = done.iter().find(|r| r.name == "naive").and_then(|r| r.record.psnr);
-    if let Some((naive, exact)) = naive.zip(exact.first().and_then(|r| r.record.psnr)) {
-        text.push_str(&format!(
-            " Dense updates round differently, and training amplifies the difference: {:+.4} dB.",
-            naive - exact
-        ));
+    let of = |rounding: Rounding| done.iter().copied().filter(move |r| r.rounding == rounding);
+    let (host, device): (Vec<_>, Vec<_>) = (of(Rounding::Host).collect(), of(Rounding::Device).collect());
+    let mut parts = vec![equal_results(&host)];
+    if !device.is_empty() {
+        parts.push(equal_results(&device));
     }
-    text
+    let difference = |rounding: Rounding| Some(of(rounding).next()?.record.psnr? - host.first()?.record.psnr?);
+    for (rounding, what) in [(Rounding::Dense, "Dense updates round"), (Rounding::Device, "A device rounds")] {
+        if let Some(difference) = difference(rounding) {
+            parts.push(format!("{what} differently, and training amplifies the difference: {difference:+.4} dB."));
+        }
+    }
+    parts.retain(|part| !part.is_empty());
+    parts.join(" ")
+}
+
+/// Whether rungs that round alike ended with the same bits.
+fn equal_results(rungs: &[&LadderRung]) -> String {
+    let names = || rungs.iter().map(|r| r.name.clone()).collect::<Vec<_>>().join(", ");
+    match rungs.first() {
+        Some(first) if rungs.len() > 1 && rungs.iter().all(|r| r.record.ply == first.record.ply) => {
+            format!("The results of {} are the same, byte for byte.", names())
+        }
+        Some(_) if rungs.len() > 1 => format!("The results of {} DIFFER, which is a fault.", names()),
+        Some(first) if first.rounding == Rounding::Device => String::new(),
+        _ => String::from("Too few rungs have run to compare their results."),
+    }
 }
 
 fn add_table(page: &mut Page, rungs: &[LadderRung], in_memory: Option<f64>) {
@@ -132,7 +155,12 @@ mod tests {
 
     fn rung(name: &str, ply: &str, psnr: f64) -> LadderRung {
         let record = RunRecord { ply: ply.into(), psnr: Some(psnr), seconds: 2.0, steps: 10, ..RunRecord::default() };
-        LadderRung { name: name.into(), what: format!("+ {name}"), record }
+        let rounding = match name {
+            "naive" => Rounding::Dense,
+            "pages" | "resident" => Rounding::Device,
+            _ => Rounding::Host,
+        };
+        LadderRung { name: name.into(), what: format!("+ {name}"), rounding, record }
     }
 
     #[test]
@@ -143,6 +171,16 @@ mod tests {
         );
         rungs[1].record.ply = "b".into();
         assert!(equal_bits(&rungs).contains("DIFFER"));
+        rungs[1].record.ply = "a".into();
+        rungs.extend([rung("pages", "d", 26.0), rung("resident", "d", 26.0)]);
+        let text = equal_bits(&rungs);
+        assert!(
+            text.contains("overlap, memory are the same") && text.contains("pages, resident are the same"),
+            "{text}"
+        );
+        assert!(text.contains("A device rounds differently") && text.contains("-0.2500 dB"), "{text}");
+        rungs[3].record.ply = "e".into();
+        assert!(equal_bits(&rungs).contains("pages, resident DIFFER"));
         rungs[1].record.problem = Some("no <memory>".into());
         assert!(ladder_page("facts", &rungs).contains("failed: no &lt;memory&gt;"));
     }

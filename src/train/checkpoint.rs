@@ -13,6 +13,7 @@ use super::error::TrainError;
 use super::first_commit::FirstCommit;
 use super::report::MetricsLog;
 use super::trainer::Trainer;
+use crate::base::trace;
 use crate::checkpoint::interval::{CommitCost, CommitInterval, CommitReport};
 use crate::checkpoint::run_state::{Origin, RunState};
 use crate::config::file::TrainConfig;
@@ -287,6 +288,7 @@ impl Checkpoint {
         if self.origin.is_none() {
             return Ok(());
         }
+        let _span = trace::span("commit");
         let cut = Instant::now();
         trainer.drain()?;
         self.beside = None;

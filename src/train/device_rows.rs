@@ -13,26 +13,29 @@ use super::working_set::WorkingSet;
 use crate::base::ids::PageNo;
 use crate::paging::pinned::PinnedPage;
 use crate::render::Renderer;
+use crate::scene::camera::Camera;
 
 /// Rows on the device of a renderer.
 pub struct DeviceRows<'a> {
     tier: &'a mut DeviceTier,
     renderer: &'a mut dyn Renderer,
+    /// Number and camera of the next step.
+    next: Option<(u32, &'a Camera)>,
 }
 
 impl<'a> DeviceRows<'a> {
-    /// Begins 0-based `step` on the pages that `renderer` holds.
+    /// Begins 0-based `step` on the pages that `renderer` holds. The next step, if there is one, draws `next`.
     ///
     /// # Errors
     /// The device failed.
     pub fn new(
         tier: &'a mut DeviceTier,
-        scene: &PagedScene,
+        scene: &mut PagedScene,
         renderer: &'a mut dyn Renderer,
-        step: u32,
+        (step, next): (u32, Option<&'a Camera>),
     ) -> Result<DeviceRows<'a>, TrainError> {
         tier.begin_step(scene, renderer, step)?;
-        Ok(DeviceRows { tier, renderer })
+        Ok(DeviceRows { tier, renderer, next: next.map(|camera| (step + 1, camera)) })
     }
 }
 
@@ -78,6 +81,10 @@ impl RowBackend for DeviceRows<'_> {
         Ok(device_of(self.renderer)?.pages_in(&pages, &step)?)
     }
 
+    fn beside_picture(&mut self, scene: &mut PagedScene) -> Result<(), TrainError> {
+        self.next.map_or(Ok(()), |next| self.tier.begin_ahead(scene, self.renderer, next))
+    }
+
     fn rows_out(
         &mut self,
         scene: &mut PagedScene,
@@ -89,7 +96,12 @@ impl RowBackend for DeviceRows<'_> {
         if is_again {
             self.tier.load(scene, self.renderer, pinned)?;
         }
-        Ok(device_of(self.renderer)?.pages_out(batch)?)
+        device_of(self.renderer)?.pages_out(batch)?;
+        match self.next.filter(|_| batch == 0) {
+            // The device is at work on the gradients, which only `loss_value` and what follows wait for.
+            Some((step, _)) => self.tier.load_ahead(scene, self.renderer, step),
+            None => Ok(()),
+        }
     }
 
     fn update(

@@ -5,8 +5,8 @@
 //! back: a page whose slot is newer than its frame stays pinned in the pager (it is *held*), so that the pager neither writes
 //! nor evicts it.
 //!
-//! Copies are made when a step needs them, and the step waits. Not here yet: copies for the next step beside this one's
-//! compute.
+//! Not here: copies for the next step beside this one's compute (`device_ahead`). What they leave to do is copied when a step needs
+//! it, and the step waits.
 //!
 //! Invariants: 1. a held page differs from its frame, and every other page equals it; 2. slots, frames and the order of
 //! copies change no bit of a page; 3. commits, evaluations and exports see pages only after [`DeviceTier::drain`].
@@ -14,6 +14,7 @@
 use super::error::TrainError;
 use super::pages::PagedScene;
 use crate::base::ids::PageNo;
+use crate::base::trace;
 use crate::kernels::uniforms_pages::SplitNumbers;
 use crate::optim::bounds::SplitLimits;
 use crate::page::format::slot_header::HEADER_BYTES;
@@ -36,6 +37,9 @@ const MORE_SLOTS_SHARE: usize = 4;
 pub struct SlotTraffic {
     /// Payloads copied to the device.
     pub loads: u64,
+    /// Those copied while the device computed the step before.
+    #[serde(default)]
+    pub loads_ahead: u64,
     /// Their bytes.
     pub bytes_loaded: u64,
     /// Payloads copied back.
@@ -49,16 +53,20 @@ pub struct SlotTraffic {
 /// The pages of a run on a device.
 #[derive(Debug)]
 pub struct DeviceTier {
-    slots: FrameTable<DeviceSlot>,
+    pub(super) slots: FrameTable<DeviceSlot>,
     /// Slots that have been given out, so that each is given out once.
     given: u32,
     /// Most slots that there may be.
     slots_most: usize,
     /// Pages whose slot is newer than their frame, pinned in the pager, outside of the batch of a step.
-    held: BTreeMap<PageNo, PinnedPage>,
+    pub(super) held: BTreeMap<PageNo, PinnedPage>,
+    /// Pages that the next step needs and the device lacks, from `begin_ahead` to `load_ahead`.
+    pub(super) coming: Vec<PageNo>,
+    /// Pages whose slots are being copied back, with their slots, from `begin_ahead` to `finish_leaving`.
+    pub(super) leaving: Vec<(PinnedPage, DeviceSlot)>,
     /// Slots of the batch of a step, and whether they are newer than the frames.
     in_use: BTreeMap<PageNo, (DeviceSlot, bool)>,
-    traffic: SlotTraffic,
+    pub(super) traffic: SlotTraffic,
 }
 
 /// The device of a renderer.
@@ -70,6 +78,11 @@ pub(super) fn device_of(renderer: &mut dyn Renderer) -> Result<&mut dyn PageRend
 /// How many slots of `slot_bytes` bytes lie in the share of `room` bytes: buffers may take a quarter more than is asked.
 pub(super) fn slots_in(room: u64, slot_bytes: u64) -> u64 {
     room / SLOTS_SHARE / 5 * 4 / slot_bytes.max(1)
+}
+
+/// How many slots for payloads of at most `payload` bytes a device memory of `device_mem` bytes holds, beside what a view takes.
+pub fn slots_of_budget(device_mem: u64, payload: u64) -> usize {
+    usize::try_from(slots_in(device_mem, payload)).unwrap_or(usize::MAX)
 }
 
 /// There is no slot for a page of a batch.
@@ -102,6 +115,8 @@ impl DeviceTier {
             given: 0,
             slots_most: slots_most as usize,
             held: BTreeMap::new(),
+            coming: Vec::new(),
+            leaving: Vec::new(),
             in_use: BTreeMap::new(),
             traffic: SlotTraffic::default(),
         };
@@ -116,7 +131,7 @@ impl DeviceTier {
 
     /// Pages that are newer than their frames and outside of a batch.
     pub fn pages_held(&self) -> usize {
-        self.held.len()
+        self.held.len() + self.leaving.len()
     }
 
     /// What was copied so far.
@@ -145,10 +160,12 @@ impl DeviceTier {
     /// A step begins.
     pub(super) fn begin_step(
         &mut self,
-        scene: &PagedScene,
+        scene: &mut PagedScene,
         renderer: &mut dyn Renderer,
         step: u32,
     ) -> Result<(), TrainError> {
+        self.coming.clear();
+        self.finish_leaving(scene, renderer)?;
         self.slots.begin_step(step);
         self.fit(scene, renderer)
     }
@@ -213,19 +230,30 @@ impl DeviceTier {
         renderer: &mut dyn Renderer,
         pages: impl Iterator<Item = &'a mut PinnedPage>,
     ) -> Result<(), TrainError> {
-        let mut copies = Vec::new();
-        let mut moved = Vec::new();
-        for page in pages {
-            let (slot, bytes) = (self.slots.begin_write(page.page), payload_bytes(page));
+        let slots = &mut self.slots;
+        let in_slots: Vec<_> = pages.map(|page| (slots.begin_write(page.page), page)).collect();
+        let in_slots = in_slots.into_iter().map(|(slot, page)| (page, slot));
+        self.fill_frames(in_slots, |copies| Ok(device_of(renderer)?.read_slots(copies)?))
+    }
+
+    /// Fills the frames of pages, whose slots are being written back, with what `read` finds in the slots.
+    pub(super) fn fill_frames<'a>(
+        &mut self,
+        pages: impl Iterator<Item = (&'a mut PinnedPage, DeviceSlot)>,
+        read: impl FnOnce(&mut [(DeviceSlot, &mut [u8])]) -> Result<(), TrainError>,
+    ) -> Result<(), TrainError> {
+        let (mut moved, mut copies) = (Vec::new(), Vec::new());
+        for (page, slot) in pages {
+            let bytes = payload_bytes(page);
             moved.push((page.page, slot));
             copies.push((slot, &mut page.payload_mut()[..bytes]));
         }
+        if copies.is_empty() {
+            return Ok(());
+        }
         let bytes: usize = copies.iter().map(|(_, payload)| payload.len()).sum();
-        let copied = if copies.is_empty() {
-            Ok(())
-        } else {
-            device_of(renderer).and_then(|device| Ok(device.read_slots(&mut copies)?))
-        };
+        let _span = trace::span("drain").with("pages", moved.len() as u64).with("bytes", bytes as u64);
+        let copied = read(&mut copies);
         for (page, slot) in &moved {
             self.slots.finish_write(*page, *slot, copied.is_ok());
         }
@@ -240,6 +268,7 @@ impl DeviceTier {
     /// # Errors
     /// The device failed; the pages that are still held exist there alone.
     pub fn drain(&mut self, scene: &mut PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
+        self.finish_leaving(scene, renderer)?;
         self.drain_to(scene, renderer, 0, &[])?;
         self.take_bins(scene, renderer)
     }
@@ -292,14 +321,9 @@ impl DeviceTier {
         self.make_room(scene, renderer, missing.len())?;
         let mut copies = Vec::new();
         for page in missing {
-            let given = &mut self.given;
-            let next_use = scene.pager.next_use(page.page);
-            let slot = self.slots.begin_load(page.page, next_use, || {
-                *given += 1;
-                DeviceSlot(*given - 1)
-            });
-            let Some(slot) = slot else { return Err(no_slot(device_of(renderer)?)) };
-            self.slots.finish_load(page.page, slot);
+            let Some(slot) = self.new_slot(page.page, scene.pager.next_use(page.page)) else {
+                return Err(no_slot(device_of(renderer)?));
+            };
             self.slots.pin(page.page, true);
             self.in_use.insert(page.page, (slot, false));
             copies.push((slot, &page.buffer.as_slice()[HEADER_BYTES..][..payload_bytes(page)]));
@@ -316,6 +340,17 @@ impl DeviceTier {
         let in_slot =
             |page: &PinnedPage| Some(SlotPage { slot: self.in_use.get(&page.page)?.0, layout: page.layout() });
         Ok(with_rows().filter_map(in_slot).collect())
+    }
+
+    /// A free slot for the payload of a page, which is to be copied there; `None` where no slot is free.
+    pub(super) fn new_slot(&mut self, page: PageNo, next_use: u32) -> Option<DeviceSlot> {
+        let given = &mut self.given;
+        let slot = self.slots.begin_load(page, next_use, || {
+            *given += 1;
+            DeviceSlot(*given - 1)
+        })?;
+        self.slots.finish_load(page, slot);
+        Some(slot)
     }
 
     /// Gives up slots that were not filled.
@@ -348,16 +383,30 @@ impl DeviceTier {
         if self.slots.free_frames() >= wanted {
             return Ok(());
         }
+        self.plan_uses(scene);
+        // All of them are read together, so the step waits once.
+        let mut newer = Vec::new();
+        while self.slots.free_frames() + newer.len() < wanted {
+            let Some(victim) = self.slots.victim() else { break };
+            match victim.dirty {
+                true => newer.push((victim.page, self.slots.begin_write(victim.page))),
+                false => self.slots.evict(victim.page),
+            }
+        }
+        newer.iter().for_each(|(page, slot)| self.slots.finish_write(*page, *slot, false));
+        let newer: Vec<PageNo> = newer.into_iter().map(|(page, _)| page).collect();
+        self.drain_pages(scene, renderer, &newer)?;
+        newer.into_iter().for_each(|page| self.slots.evict(page));
+        match self.slots.free_frames() < wanted {
+            true => Err(no_slot(device_of(renderer)?)),
+            false => Ok(()),
+        }
+    }
+
+    /// Takes over from the plan when the pages in slots are needed next.
+    pub(super) fn plan_uses(&mut self, scene: &PagedScene) {
         let pages: Vec<PageNo> = self.slots.held().map(|(_, held)| held.page).collect();
         pages.into_iter().for_each(|page| self.slots.set_next_use(page, scene.pager.next_use(page)));
-        while self.slots.free_frames() < wanted {
-            let Some(victim) = self.slots.victim() else { return Err(no_slot(device_of(renderer)?)) };
-            if victim.dirty {
-                self.drain_pages(scene, renderer, &[victim.page])?;
-            }
-            self.slots.evict(victim.page);
-        }
-        Ok(())
     }
 
     /// Notes that an update has changed a page of the batch in its slot.

@@ -16,6 +16,7 @@ use super::error::TrainError;
 use super::pages::PagedScene;
 use super::working_set::WorkingSet;
 use crate::base::ids::PageNo;
+use crate::base::trace;
 use crate::paging::batches::UseInStep;
 use crate::paging::error::PagingError;
 use crate::paging::pinned::PinnedPage;
@@ -135,10 +136,14 @@ impl Passes<'_> {
         }
         loop {
             let batch: Vec<PageNo> = coming.drain(..per_batch.min(coming.len())).collect();
+            let span = trace::span("pin pages").with("pages", batch.len() as u64);
             self.pinned = self.backend.pin(self.scene, self.step, &batch, false)?;
+            drop(span);
             self.prefetch(&coming, per_batch);
             self.backend.before_events(self.scene, &mut self.pinned)?;
+            let span = trace::span("apply events");
             let applied = self.scene.apply_pending(&mut self.pinned);
+            drop(span);
             // Parts of pages that split found no frame, or no slot: a smaller batch leaves more of them.
             if applied.is_err() || self.pinned.len() > self.backend.pages_most() {
                 let pages: Vec<PageNo> = self.pinned.iter().map(|pinned| pinned.page).collect();
@@ -169,7 +174,9 @@ impl Passes<'_> {
             self.backend.renderer().begin_view(self.camera, render, batches)?;
         }
         let at = AtStep { step: self.step, camera: self.camera };
+        let span = trace::span("rows in");
         self.outcome.rows += self.backend.rows_in(self.scene, &self.pinned, at, self.working)?;
+        drop(span);
         let with_rows = self.pinned.iter().filter(|pinned| pinned.meta.rows > 0);
         let pages: Vec<PageNo> = with_rows.map(|pinned| pinned.page).collect();
         self.outcome.rows_pinned += self.pinned.iter().map(|pinned| pinned.meta.rows as usize).sum::<usize>();
@@ -187,9 +194,13 @@ impl Passes<'_> {
 
     /// Renders the picture of all splats, and takes its loss back to the splats.
     fn picture(&mut self, comparison: &Comparison<'_>) -> Result<(), TrainError> {
+        let _span = trace::span("picture and loss");
         self.backend.renderer().picture()?;
         // A device may be at work on the picture.
         self.prefetch_before_last();
+        if self.batches.len() == 1 {
+            self.backend.beside_picture(self.scene)?;
+        }
         comparison.loss_and_back(self.backend.renderer(), &mut self.working.correction)?;
         if self.batches.len() > 1 && !comparison.is_left_out {
             // A drive that is full is found while the step can still be given up.
@@ -237,7 +248,9 @@ impl Passes<'_> {
         self.scene.pager.set_use_in_step(self.step, batch.pages, UseInStep::Done);
         self.prefetch_before_last();
         let (number, at) = (self.batches.len(), AtStep { step: self.step, camera: self.camera });
+        let span = trace::span("rows out");
         self.backend.rows_out(self.scene, (number, !is_first), &self.pinned, at, self.working)?;
+        drop(span);
         if is_first {
             self.outcome.loss = self.backend.renderer().loss_value()?;
             self.outcome.skipped = self.why_skipped()?;
@@ -246,6 +259,7 @@ impl Passes<'_> {
         if self.outcome.skipped.is_some() {
             return Ok(true);
         }
+        let _span = trace::span("update");
         let UpdateCounts { updated, skipped, drawn } =
             self.backend.update(self.scene, number, &mut self.pinned, at, self.working, collects)?;
         self.outcome.updated += updated;

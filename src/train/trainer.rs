@@ -27,6 +27,7 @@ use crate::appearance::AppearanceMode;
 use crate::appearance::model::CHANNEL_VALUES;
 use crate::appearance::picture::Look;
 use crate::appearance::state::{AppearanceState, camera_groups};
+use crate::base::trace;
 use crate::checkpoint::run_state::{LastTest, TrainerState};
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
@@ -49,11 +50,6 @@ use std::time::Instant;
 /// Views whose photos are prefetched.
 const PREFETCH_VIEWS: u32 = 8;
 
-/// Steps between two updates of the pager's plan, and the least and most views that a plan covers.
-const LOOK_AHEAD_EVERY: u32 = 8;
-const LOOK_AHEAD_LEAST: u32 = 64;
-const LOOK_AHEAD_MOST: u32 = 8192;
-
 /// The state of a run. A run in memory uses the same code with one frame per page.
 pub struct Trainer {
     /// The pages, the optimizer and the event log.
@@ -63,7 +59,7 @@ pub struct Trainer {
     /// The pages on the renderer's device, from the first step of a run that updates them there.
     pub(super) device: Option<DeviceTier>,
     pub(super) options: RunOptions,
-    order: ViewOrder,
+    pub(super) order: ViewOrder,
     pub(super) train_views: Vec<usize>,
     /// Training views that the run decides its count by.
     pub(super) held_out: HeldOut,
@@ -318,19 +314,24 @@ impl Trainer {
     /// A photo cannot be decoded, pages could not be pinned, the renderer failed, the run diverged, or nothing counts in it
     /// (`soundness`).
     pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
+        trace::set_step(self.state.step);
+        let _span = trace::span("step");
         self.log_due_events(dataset, targets)?;
         let view = self.next_view();
         targets.prefetch(&self.coming_views(PREFETCH_VIEWS));
         self.fit_frames(&dataset.views[view].camera);
         self.look_ahead(dataset);
+        let photo = trace::span("photo");
         let target = targets.get(view)?;
+        drop(photo);
         let started = Instant::now();
         let render = self.render_options();
         let look = self.look(view, &dataset.views[view].camera);
         let is_left_out = self.options.robust_views && self.state.outliers.is_named(view);
         let comparison = Comparison { target: &target, loss: self.options.loss, look, is_left_out };
+        let next = self.coming_views(2).get(1).map(|&view| &dataset.views[view].camera);
         let stepped = loop {
-            let stepped = self.attempt(&dataset.views[view].camera, (&render, &comparison));
+            let stepped = self.attempt(&dataset.views[view].camera, next, (&render, &comparison));
             self.is_torn = matches!(stepped, Err(TrainError::Torn { .. }));
             // A step that lacked frames can be repeated: it only applied pending events.
             match stepped {
@@ -355,8 +356,13 @@ impl Trainer {
         Ok(outcome)
     }
 
-    /// Attempts a step on a view.
-    fn attempt(&mut self, camera: &Camera, how: (&RenderOptions, &Comparison<'_>)) -> Result<StepOutcome, TrainError> {
+    /// Attempts a step on a view; the next step draws `next`.
+    fn attempt(
+        &mut self,
+        camera: &Camera,
+        next: Option<&Camera>,
+        how: (&RenderOptions, &Comparison<'_>),
+    ) -> Result<StepOutcome, TrainError> {
         let (step, renderer) = (self.state.step, &mut *self.renderer);
         let (collects, pages_most) = (self.options.strategy.collects(step), self.pages_most);
         let (scene, working) = (&mut self.scene, &mut self.working);
@@ -368,7 +374,7 @@ impl Trainer {
             Some(tier) => tier,
             none => none.insert(DeviceTier::new(scene, renderer, self.options.steps)?),
         };
-        let mut rows = DeviceRows::new(tier, scene, renderer, step)?;
+        let mut rows = DeviceRows::new(tier, scene, renderer, (step, next))?;
         train_step(scene, working, &mut rows, (step, camera), how, collects, pages_most)
     }
 
@@ -378,29 +384,11 @@ impl Trainer {
     /// # Errors
     /// The device failed: the run can go on from its last commit only.
     pub fn drain(&mut self) -> Result<(), TrainError> {
+        let _span = trace::span("drain all");
         match &mut self.device {
             Some(tier) => tier.drain(&mut self.scene, &mut *self.renderer),
             None => Ok(()),
         }
-    }
-
-    /// Updates the pager's plan every [`LOOK_AHEAD_EVERY`] steps; doing it at every step would cost too much.
-    fn look_ahead(&mut self, dataset: &Dataset) {
-        if self.is_in_memory() || !self.state.step.is_multiple_of(LOOK_AHEAD_EVERY) {
-            return;
-        }
-        // Two epochs contain a use of every page that any view needs.
-        let count = (2 * self.train_views.len() as u32).clamp(LOOK_AHEAD_LEAST, LOOK_AHEAD_MOST);
-        let cameras: Vec<&Camera> = self.coming_views(count).iter().map(|&view| &dataset.views[view].camera).collect();
-        self.scene.pager.look_ahead(self.state.step, &cameras);
-    }
-
-    /// Indices in `dataset.views` of the views of the coming steps, at most `count`.
-    fn coming_views(&self, count: u32) -> Vec<usize> {
-        let (step, mut coming) = (self.state.step, Vec::new());
-        self.order.upcoming(step, count.min(self.options.steps - step), &mut coming);
-        let view = |(at, &position)| self.train_views[self.held_out.trained_at(at, position)];
-        (step..).zip(&coming).map(view).collect()
     }
 
     /// Notes how many of the rows in the pages of a view were drawn, and whether the view was one batch.
@@ -419,6 +407,7 @@ impl Trainer {
         if self.events().events().last().is_some_and(|last| last.step >= step) {
             return Ok(());
         }
+        let _span = trace::span("decide events");
         if let Some(tier) = self.device.as_ref().filter(|_| self.options.strategy.reads_histogram(step)) {
             tier.take_bins(&mut self.scene, &mut *self.renderer)?;
         }
@@ -461,6 +450,7 @@ impl Trainer {
         pictures: Option<&Path>,
         progress: &dyn Fn(u32),
     ) -> Result<Option<TestMetrics>, TrainError> {
+        let _span = trace::span("evaluate");
         self.drain()?;
         let render = self.render_options();
         let views = dataset.test_views();

@@ -5,7 +5,7 @@ use crate::support::gpu;
 use crate::support::scenes::{CLASSIC, city, psnr, stderr, summary, text, train, wide_city};
 use gsscale::gpu::GpuOptions;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
@@ -142,6 +142,18 @@ fn losses_so_far(out: &Path) -> usize {
     std::fs::read_to_string(out.join("metrics.jsonl")).unwrap_or_default().lines().count()
 }
 
+/// A run of [`GROWING`] whose device is lost at every so many submissions.
+fn run_with_losses(scene: &Path, [out, spill]: [&Path; 2], fault: &str, more: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_gsscale-train"))
+        .args([text(scene), "--out", text(out), "--spill-dir", text(spill), "--commit-every", "0.005"])
+        .args(GROWING)
+        .args(CLASSIC)
+        .args(more)
+        .env("GSSCALE_GPU_FAULT", fault)
+        .output()
+        .unwrap()
+}
+
 #[test]
 fn a_lost_device_loses_the_steps_since_the_last_commit_alone() {
     if !has_device() {
@@ -151,17 +163,33 @@ fn a_lost_device_loses_the_steps_since_the_last_commit_alone() {
     let scene = scene_in(folder.path());
     let [alone, out, spill] = ["alone", "out", "spill"].map(|name| folder.path().join(name));
     run(&scene, &alone, GROWING, &[]);
-    let output = Command::new(env!("CARGO_BIN_EXE_gsscale-train"))
-        .args([text(&scene), "--out", text(&out), "--spill-dir", text(&spill), "--commit-every", "0.02"])
-        .args(GROWING)
-        .args(CLASSIC)
-        .env("GSSCALE_GPU_FAULT", "lost@400")
-        .output()
-        .unwrap();
+    let output = run_with_losses(&scene, [&out, &spill], "lost@400", &["--restarts", "0"]);
     assert!(!output.status.success() && stderr(&output).contains("the device was lost"), "{}", stderr(&output));
     let resumed = train(&["--resume", text(&out), "--quiet"]);
     assert!(resumed.status.success(), "{}", stderr(&resumed));
     assert!(ply(&out) == ply(&alone), "the resumed run gives another scene");
+    // The same in one process. The variable strikes every device that the process opens.
+    let [out, spill] = ["out2", "spill2"].map(|name| folder.path().join(name));
+    let output = run_with_losses(&scene, [&out, &spill], "lost@400", &[]);
+    let said = stderr(&output);
+    assert!(output.status.success() && said.contains("(restart 1 of at most 3)"), "{said}");
+    assert!(ply(&out) == ply(&alone) && losses(&out) == losses(&alone), "the run that went on gives another scene");
+    assert_eq!(summary(&out)["finished"], true);
+    // Before its first commit a run with a spill directory has nothing to go on from.
+    let [out, spill] = ["out3", "spill3"].map(|name| folder.path().join(name));
+    let output = run_with_losses(&scene, [&out, &spill], "lost@40", &[]);
+    let said = stderr(&output);
+    let is_loss = |line: &str| line.starts_with("error: rendering failed") && line.contains("the device was lost");
+    assert!(!output.status.success() && !said.contains("(restart 1"), "{said}");
+    assert!(said.lines().any(is_loss), "{said}");
+    // A run in memory begins again, three times at most.
+    let out = folder.path().join("out4");
+    let mut again = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
+    again.args([text(&scene), "--out", text(&out)]).args(GROWING).args(CLASSIC).env("GSSCALE_GPU_FAULT", "lost@40");
+    let output = again.output().unwrap();
+    let said = stderr(&output);
+    let restarts = said.matches("the run goes on in this process").count();
+    assert!(!output.status.success() && restarts == 3 && said.lines().any(is_loss), "{said}");
 }
 
 /// Steps without events, after every page has been loaded: only the photo, tables and counts cross the bus.
@@ -215,6 +243,12 @@ fn what_a_device_does_not_do_is_refused_with_a_remedy() {
         (&["--device", "gpu", "--moments", "bf16"], "use --moments f32"),
         (&["--device", "gpu", "--optimizer", "sparse"], "use --optimizer deferred"),
     ];
+    let weighs = ["--device", "gpu", "--strategy", "long-axis", "--max-gaussians", "500", "--growth-score", "mixed"];
+    let mut cases = cases.to_vec();
+    if has_device() {
+        // Without a device the lack of one is said first.
+        cases.push((&weighs, "use --growth-score gradient with --recycle 0"));
+    }
     for (more, remedy) in cases {
         let args = [text(&scene), "--out", text(&out), "--steps", "3", "--optimizer-on", "device"];
         let output = train(&[&args[..], more].concat());

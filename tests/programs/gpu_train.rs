@@ -171,7 +171,19 @@ fn assert_ends_with_last_good_step(scene: &Path, out: &Path, fault: &str, addres
     let limit = address_space.map_or(String::new(), |kib| format!("ulimit -v {kib} && "));
     let output = Command::new("sh")
         .args(["-c", &format!("{limit}exec \"$@\""), "sh", env!("CARGO_BIN_EXE_gsscale-train")])
-        .args([text(scene), "--out", text(out), "--device", "gpu", "--steps", "200", "--strategy", "none"])
+        .args([
+            text(scene),
+            "--out",
+            text(out),
+            "--device",
+            "gpu",
+            "--steps",
+            "200",
+            "--strategy",
+            "none",
+            "--restarts",
+            "0",
+        ])
         .env("GSSCALE_GPU_FAULT", fault)
         .output()
         .unwrap();
@@ -221,6 +233,7 @@ fn a_run_whose_device_is_lost_resumes_from_its_last_good_step() {
         .args([text(&scene), "--out", text(&lost)])
         .args(of_run)
         .args(of_drive)
+        .args(["--restarts", "0"])
         .args(CLASSIC)
         .env("GSSCALE_GPU_FAULT", "lost@150")
         .output()

@@ -72,6 +72,44 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
 }
 
 #[test]
+fn pages_on_a_device_are_planned_over_a_bus() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 100, 32, 24, 8000);
+    let common = ["--page-rows", "32", "--steps", "400", "--test-every", "0", "--step-seconds", "0.003"];
+    let order = ["--view-order", "shuffle", "--compare-frames", "100%", "--bus", "1GB/s,10us"];
+    let with = |more: &[&str]| stdout(&plan(&scene, &[&common[..], &order[..], more].concat()));
+    let of = |more: &[&str]| -> Value { serde_json::from_str(&with(&[more, &["--json"]].concat())).unwrap() };
+    let number = |value: &Value, key: &str| value["device"][0][key].as_f64().unwrap();
+    let all = of(&[]);
+    // Ten copies and the bytes of photo and tables.
+    assert_eq!(all["device"][0]["slots"], all["pages"]);
+    assert!(number(&all, "hit_rate") == 1.0 && number(&all, "payloads_up_ms") == 0.0, "{all}");
+    assert!((number(&all, "photo_ms") - (5.0 * 0.01 + (4.0 * 32.0 * 24.0 + 50e3) / 1e6)).abs() < 1e-9, "{all}");
+    let parts =
+        |value: &Value| ["photo_ms", "results_ms", "payloads_up_ms", "payloads_down_ms"].map(|key| number(value, key));
+    let [photo, results, ..] = parts(&all);
+    assert!((number(&all, "step_ms") - (photo + results + 3.0)).abs() < 1e-9, "{all}");
+    let few = of(&["--device-mem", "6MiB"]);
+    let [photo, results, up, down] = parts(&few);
+    assert!(
+        few["device"][0]["slots"].as_u64() < few["pages"].as_u64() && number(&few, "bytes_up_per_step") > 0.0,
+        "{few}"
+    );
+    let bytes = [number(&few, "bytes_up_per_step"), number(&few, "bytes_down_per_step")];
+    assert!(up > bytes[0] / 1e6 && down > bytes[1] / 1e6 && up < 2.0 * bytes[0] / 1e6, "{few}");
+    assert!((number(&few, "step_ms") - (photo + results + f64::max(3.0, up + down))).abs() < 1e-9, "{few}");
+    assert!((number(&few, "step_in_turn_ms") - (photo + results + 3.0 + up + down)).abs() < 1e-9, "{few}");
+    let fewest = number(&few, "fewest_bytes_up_per_step");
+    assert!(fewest > 0.0 && fewest <= bytes[0], "{few}");
+    let table = with(&["--device-mem", "6MiB"]);
+    assert!(table.contains("pages on the device, modelled: a bus of"), "{table}");
+    let refused = plan(&scene, &[&common[..], &["--bus", "fast"]].concat());
+    assert!(stderr(&refused).contains("12GB/s,20us") && !refused.status.success(), "{}", stderr(&refused));
+    let refused = plan(&scene, &[&common[..], &order[..], &["--device-mem", "1KiB"]].concat());
+    assert!(stderr(&refused).contains("--device-mem") && !refused.status.success(), "{}", stderr(&refused));
+}
+
+#[test]
 fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 12, 64, 48, 800);

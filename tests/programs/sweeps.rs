@@ -2,7 +2,9 @@
 
 use crate::support::bench::{bench, large_city, lines, number, parse};
 use crate::support::browser::in_a_browser;
+use crate::support::gpu;
 use crate::support::scenes::{stderr, text};
+use gsscale::gpu::GpuOptions;
 use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -64,6 +66,30 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     assert_eq!(words, ["rung", "naive", "deferred", "planned", "overlap", "memory"], "{table}");
     assert!(table.contains(&format!("{:.2}", number(memory, "psnr"))), "{table}");
     assert_eq!(parse(&std::fs::read_to_string(out.join("ladder.jsonl")).unwrap()), rungs);
+}
+
+/// Pages on a device give the same bits whatever lies there, and other bits than the host's optimizer.
+#[test]
+fn rungs_on_a_device_end_alike() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = large_city(folder.path());
+    let out = folder.path().join("ladder");
+    let args = ["--steps", "30", "--page-rows", "16", "--strategy", "none", "--share", "70", "--device-mem", "6MiB"];
+    let more = ["--rungs", "overlap,memory,pages,resident", "--device", "gpu", "--json"];
+    let rungs = lines(&[&["ladder", text(&scene), "--out", text(&out)][..], &args, &more].concat());
+    let [overlap, memory, pages, resident] = &rungs[..] else { panic!("{rungs:?}") };
+    assert!(overlap["ply"] == memory["ply"] && pages["ply"] == resident["ply"], "{rungs:?}");
+    assert_ne!(memory["ply"], pages["ply"], "the device rounds as the host does");
+    assert!((number(pages, "psnr") - number(memory, "psnr")).abs() < 0.1, "{rungs:?}");
+    assert!(number(pages, "device_bytes_peak") < number(resident, "device_bytes_peak"), "{rungs:?}");
+    let words = ["The results of overlap, memory are the same", "The results of pages, resident are the same"];
+    check_page(&out.join("ladder.html"), &words, folder.path());
+    let on_cpu = [&["ladder", text(&scene), "--out", text(&out)][..], &args, &["--rungs", "pages", "--device", "cpu"]];
+    let output = bench(&on_cpu.concat());
+    assert!(!output.status.success() && stderr(&output).contains("use --device auto or gpu"), "{}", stderr(&output));
 }
 
 fn sweep<'a>(scene: &'a Path, out: &'a Path) -> Vec<&'a str> {

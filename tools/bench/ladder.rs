@@ -1,7 +1,7 @@
 //! `gsscale-bench ladder`: the gain of each idea of out-of-core training, added one by one.
 //!
-//! Every rung trains the same steps on the same views in a process of its own. All rungs but the first end with the
-//! same bits. The first rung rewrites every Gaussian at every step, which rounds differently.
+//! Every rung trains the same steps on the same views in a process of its own. Rungs that round alike end with the same bits
+//! ([`Rounding`]): all on the host but the first, which rewrites every Gaussian at every step; and those on a device.
 
 use super::facts::Facts;
 use super::sweep::{Planned, Sweep, SweepArgs, use_drive};
@@ -11,13 +11,14 @@ use clap::builder::PossibleValuesParser;
 use gsscale::base::error::InputError;
 use gsscale::base::units::format_bytes;
 use gsscale::base::whole_file::write_whole;
-use gsscale::config::choice::Choice;
+use gsscale::config::choice::{Choice, Chosen};
 use gsscale::config::file::TrainConfig;
-use gsscale::optim::method::Method;
+use gsscale::config::values::ByteSize;
+use gsscale::optim::method::{Method, OptimizerPlace};
 use gsscale::page::format::codec::Codec;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::timing::Transfers;
-use gsscale::report::ladder_page::{LadderRung, ladder_page};
+use gsscale::report::ladder_page::{LadderRung, Rounding, ladder_page};
 use gsscale::schedule::order::Order;
 use gsscale::train::error::TrainError;
 use serde_json::Value;
@@ -26,6 +27,7 @@ const EXAMPLES: &str = "\
 Examples:
   gsscale-bench ladder scans/village --out ladders/village --steps 3000 --strategy none --page-rows 128
   gsscale-bench ladder scans/city --out ladders/city --steps 300 --strategy none --share 25 --view-order groups:25
+  gsscale-bench ladder scans/city --out ladders/gpu --rungs overlap,memory,pages,resident --device gpu --device-mem 4GiB
 
 Rungs:
   naive      every step updates every Gaussian; pages are read on demand; the least recently used page is evicted
@@ -33,7 +35,10 @@ Rungs:
   planned    pages are prefetched before their step; the page with the farthest next use is evicted
   overlap    reads and writes overlap with compute
   memory     all pages are in memory
+  pages      as overlap, with the pages of --device-mem on the GPU, which updates them (--device gpu)
+  resident   all pages are in memory and on the GPU (--device gpu)
 
+Without --rungs, the first five run.
 All rungs use the same order of views, a shuffle without --view-order. The page is ladder.html. Figures go to
 ladder.jsonl, and a rung in that file does not run again.";
 
@@ -49,9 +54,9 @@ pub struct Args {
     /// Frames in percent of the pages, for all rungs but the last; raised to the need of the largest view
     #[arg(long, default_value_t = 50.0, value_name = "P")]
     share: f64,
-    /// Rungs to run [default: all]
+    /// Rungs to run [default: those that need no GPU]
     #[arg(long, value_delimiter = ',', value_name = "RUNG", hide_default_value = true)]
-    #[arg(default_values = RUNGS.map(|r| r.name), value_parser = PossibleValuesParser::new(RUNGS.map(|r| r.name)))]
+    #[arg(default_values = HOST_RUNGS, value_parser = PossibleValuesParser::new(RUNGS.map(|r| r.name)))]
     rungs: Vec<String>,
 }
 
@@ -59,13 +64,18 @@ pub struct Args {
 struct Rung {
     name: &'static str,
     what: &'static str,
+    rounding: Rounding,
     change: fn(&mut TrainConfig),
 }
 
-const RUNGS: [Rung; 5] = [
+/// The rungs that need no GPU.
+const HOST_RUNGS: [&str; 5] = ["naive", "deferred", "planned", "overlap", "memory"];
+
+const RUNGS: [Rung; 7] = [
     Rung {
         name: "naive",
         what: "naive offloading: dense updates, pages on demand, LRU",
+        rounding: Rounding::Dense,
         change: |c| {
             c.optimizer = Method::Dense;
             (c.transfers, c.evict) = (Transfers::Demand, EvictPolicy::LeastRecentlyUsed);
@@ -74,12 +84,37 @@ const RUNGS: [Rung; 5] = [
     Rung {
         name: "deferred",
         what: "+ deferred Adam",
+        rounding: Rounding::Host,
         change: |c| (c.transfers, c.evict) = (Transfers::Demand, EvictPolicy::LeastRecentlyUsed),
     },
-    Rung { name: "planned", what: "+ planned cache and prefetch", change: |c| c.transfers = Transfers::Ahead },
-    Rung { name: "overlap", what: "+ overlap with compute", change: |_| {} },
-    Rung { name: "memory", what: "all in memory", change: |c| (c.spill_dir, c.frames) = (String::new(), 0) },
+    Rung {
+        name: "planned",
+        what: "+ planned cache and prefetch",
+        rounding: Rounding::Host,
+        change: |c| c.transfers = Transfers::Ahead,
+    },
+    Rung { name: "overlap", what: "+ overlap with compute", rounding: Rounding::Host, change: |_| {} },
+    Rung { name: "memory", what: "all in memory", rounding: Rounding::Host, change: in_memory },
+    Rung {
+        name: "pages",
+        what: "+ pages on the device",
+        rounding: Rounding::Device,
+        change: |c| c.optimizer_on = Chosen(Some(OptimizerPlace::Device)),
+    },
+    Rung {
+        name: "resident",
+        what: "all in memory and on the device",
+        rounding: Rounding::Device,
+        change: |c| {
+            in_memory(c);
+            (c.optimizer_on, c.device_mem) = (Chosen(Some(OptimizerPlace::Device)), ByteSize(0));
+        },
+    },
 ];
+
+fn in_memory(config: &mut TrainConfig) {
+    (config.spill_dir, config.frames) = (String::new(), 0);
+}
 
 /// Runs the ladder.
 ///
@@ -91,6 +126,12 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     }
     let mut config = args.common.base_config()?;
     fix_common_keys(&mut config);
+    let chosen = || RUNGS.iter().filter(|r| args.rungs.iter().any(|n| n == r.name));
+    for rung in chosen() {
+        let mut config = config.clone();
+        (rung.change)(&mut config);
+        config.check()?;
+    }
     let (scene, page) = (&args.common.scene, args.common.out.join("ladder.html"));
     let facts = Facts::of(scene, &config)?;
     let frames = facts.frames(args.share).unwrap_or_else(|| facts.fewest_frames());
@@ -114,13 +155,13 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     use_drive(&mut config, frames);
     let mut sweep = Sweep::open(&args.common, &config, RESULTS)?;
     let mut done = Vec::new();
-    for rung in RUNGS.iter().filter(|r| args.rungs.iter().any(|n| n == r.name)) {
+    for rung in chosen() {
         let label = rung.name.into();
         let mut planned = Planned { knob: "ladder".into(), label, config: config.clone(), scene: None };
         (rung.change)(&mut planned.config);
         eprintln!("{}: {}", rung.name, rung.what);
         let record = sweep.run(&planned, print)?;
-        done.push(LadderRung { name: rung.name.into(), what: rung.what.into(), record });
+        done.push(LadderRung { name: rung.name.into(), what: rung.what.into(), rounding: rung.rounding, record });
         write_whole(&page, ladder_page(&facts, &done).as_bytes())?;
     }
     if !args.common.json {
@@ -156,4 +197,5 @@ fn fix_common_keys(config: &mut TrainConfig) {
     config.spill_codec.0.get_or_insert(Codec::Raw);
     let best = TrainConfig::default();
     (config.optimizer, config.evict, config.transfers) = (best.optimizer, best.evict, best.transfers);
+    config.optimizer_on = best.optimizer_on;
 }

@@ -113,6 +113,12 @@ impl<M> FrameTable<M> {
         self.find(page).map(|frame| self.frames[frame].state)
     }
 
+    /// The memory of a page's frame; `None` for a page that is not resident.
+    pub fn memory(&self, page: PageNo) -> Option<&M> {
+        let frame = &self.frames[self.find(page)?];
+        frame.memory.as_ref().filter(|_| frame.state == FrameState::Resident)
+    }
+
     /// Frames that can be used without evicting.
     pub fn free_frames(&self) -> usize {
         self.free.len() + self.frames_max.saturating_sub(self.frames())

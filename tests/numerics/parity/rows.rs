@@ -357,18 +357,23 @@ fn windows_and_runs_change_no_bit() {
     }
 }
 
+/// Few rows are copied by one thread, many by several.
 #[test]
 fn bands_are_cut_out_and_put_back() {
-    let rows = random_rows(7);
-    let mut back = Columns::zeros(7, 3);
-    for band in 0..BAND_WIDTHS.len() {
-        let mut values = Vec::new();
-        gsscale::render::gpu_rows::band_from_sh_n(&rows, &(0..7), band, &mut values);
-        assert_eq!(values.len(), 7 * BAND_WIDTHS[band]);
-        let mut part = Vec::new();
-        gsscale::render::gpu_rows::band_from_sh_n(&rows, &(2..5), band, &mut part);
-        assert_eq!(part, values[2 * BAND_WIDTHS[band]..5 * BAND_WIDTHS[band]]);
-        band_into_sh_n(&values, &(0..7), band, &mut back);
+    for n in [7, 9001] {
+        let rows = random_rows(n);
+        let mut back = Columns::zeros(n, 3);
+        let (mut values, mut part) = (Vec::new(), Vec::new());
+        for band in 0..BAND_WIDTHS.len() {
+            let (first, width) = (BAND_WIDTHS[..band].iter().sum::<usize>(), BAND_WIDTHS[band]);
+            gsscale::render::gpu_rows::band_from_sh_n(&rows, &(0..n), band, &mut values);
+            let want: Vec<f32> =
+                rows.sh_n.chunks_exact(45).flat_map(|row| row[first..first + width].to_vec()).collect();
+            assert_eq!(values, want);
+            gsscale::render::gpu_rows::band_from_sh_n(&rows, &(2..n - 2), band, &mut part);
+            assert_eq!(part, values[2 * width..(n - 2) * width]);
+            band_into_sh_n(&values, &(0..n), band, &mut back);
+        }
+        assert_eq!(back.sh_n, rows.sh_n);
     }
-    assert_eq!(back.sh_n, rows.sh_n);
 }

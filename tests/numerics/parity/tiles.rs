@@ -13,7 +13,8 @@ use gsscale::kernels::rasterize_fwd::{Lists, Raster, rasterize_fwd, untile};
 use gsscale::kernels::scan::scan;
 use gsscale::kernels::splats::{Grid, Packed, pack};
 use gsscale::kernels::tile_range::TileRange;
-use gsscale::render::gpu_tiles::{Blend, Pairs, TileStages, splat_bytes};
+use gsscale::render::gpu_frame::{Blend, Pairs, splat_bytes};
+use gsscale::render::gpu_tiles::TileStages;
 use gsscale::render::gpu_tiles_bwd::{Fold, PictureGradientBuffers};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 

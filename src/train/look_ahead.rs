@@ -1,0 +1,42 @@
+//! The coming views of a run, and the pages that they need: the plan by which pages move between the tiers.
+//!
+//! Invariant: the plan changes no bit of the result. It says what to bring and what to evict, never what a step works on.
+
+use super::trainer::Trainer;
+use crate::dataset::loader::Dataset;
+use crate::scene::camera::Camera;
+
+/// Steps between two updates of the pager's plan, and the least and most views that a plan covers.
+const LOOK_AHEAD_EVERY: u32 = 8;
+const LOOK_AHEAD_LEAST: u32 = 64;
+const LOOK_AHEAD_MOST: u32 = 8192;
+
+/// Memory for the plan of a run in memory whose device holds a part of the pages, bytes.
+const DEVICE_PLAN_BYTES: usize = 4 << 20;
+
+impl Trainer {
+    /// Updates the pager's plan every [`LOOK_AHEAD_EVERY`] steps; doing it at every step would cost too much.
+    pub(super) fn look_ahead(&mut self, dataset: &Dataset) {
+        let pages = self.scene.pager.index().len();
+        let is_on_device_in_part = self.device.as_ref().is_some_and(|tier| tier.slots() < pages);
+        let has_plan = !self.is_in_memory() || is_on_device_in_part;
+        if !has_plan || !self.state.step.is_multiple_of(LOOK_AHEAD_EVERY) {
+            return;
+        }
+        if self.is_in_memory() {
+            self.scene.pager.plan_for_tier_above(DEVICE_PLAN_BYTES);
+        }
+        // Two epochs contain a use of every page that any view needs.
+        let count = (2 * self.train_views.len() as u32).clamp(LOOK_AHEAD_LEAST, LOOK_AHEAD_MOST);
+        let cameras: Vec<&Camera> = self.coming_views(count).iter().map(|&view| &dataset.views[view].camera).collect();
+        self.scene.pager.look_ahead(self.state.step, &cameras);
+    }
+
+    /// Indices in `dataset.views` of the views of the coming steps, at most `count`.
+    pub(super) fn coming_views(&self, count: u32) -> Vec<usize> {
+        let (step, mut coming) = (self.state.step, Vec::new());
+        self.order.upcoming(step, count.min(self.options.steps - step), &mut coming);
+        let view = |(at, &position)| self.train_views[self.held_out.trained_at(at, position)];
+        (step..).zip(&coming).map(view).collect()
+    }
+}
