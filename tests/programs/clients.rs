@@ -144,10 +144,16 @@ fn splat_transform_reads_results() {
         return;
     }
     let folder = TempDir::new().unwrap();
-    let (scene, out) = small_run(folder.path(), &["--up", "keep"]);
+    let (scene, out) = small_run(folder.path(), &["--up", "keep", "--export", "spz"]);
     let (ply, copy) = (out.join("point_cloud.ply"), folder.path().join("copy.ply"));
     let output = Command::new(&program).args(["-w", text(&ply), text(&copy)]).output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
     // It drops what cannot be seen and keeps f32 as they are, but forgets our comments: the city lies at its origin.
     assert!((psnr_of(&copy, &scene) - psnr_of(&ply, &scene)).abs() < 0.01);
+    // SPZ rounds colours to 1/255 and scales to 6 %: half a decibel on a picture of some 20 dB.
+    let from_spz = folder.path().join("from_spz.ply");
+    let output =
+        Command::new(&program).args(["-w", text(&out.join("point_cloud.spz")), text(&from_spz)]).output().unwrap();
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert!((psnr_of(&from_spz, &scene) - psnr_of(&ply, &scene)).abs() < 0.5);
 }

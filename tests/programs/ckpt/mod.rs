@@ -115,6 +115,27 @@ fn an_export_is_the_trainers_file_byte_for_byte_and_can_be_a_part_of_it() {
 }
 
 #[test]
+fn a_run_and_an_export_write_the_same_spz() {
+    let bench = Bench::new();
+    let out = bench.stopped(&["--export", "spz"]);
+    let files = ["point_cloud.spz", "point_cloud.spz.transform.json"];
+    let want = files.map(|name| std::fs::read(out.join(name)).unwrap());
+    let ply = std::fs::metadata(out.join("point_cloud.ply")).unwrap().len();
+    assert!((want[0].len() as u64) < ply / 4, "{} of {ply} bytes", want[0].len());
+    let file = bench.path("point_cloud.spz");
+    ckpt(&["export", text(&out), "--out", text(&file)]);
+    let got = files.map(|name| std::fs::read(bench.path(name)).unwrap());
+    assert!(got == want, "the export is not what the trainer wrote");
+    let transform: Value = serde_json::from_slice(&want[1]).unwrap();
+    assert_eq!(transform["up_in_file"], serde_json::json!([0.0, 1.0, 0.0]), "{transform}");
+    let said = failed(&["export", text(&out), "--out", text(&bench.path("a.splat"))]);
+    assert!(said.contains("let it end in .ply or .spz") && !bench.path("a.splat").exists(), "{said}");
+    // A new start in the folder removes the files of the run before.
+    bench.go_on(&[]);
+    assert!(std::fs::read(out.join(files[0])).unwrap() != want[0], "the end of the run wrote its own");
+}
+
+#[test]
 fn a_run_that_was_rolled_back_or_cloned_ends_with_the_same_bytes() {
     let bench = Bench::new();
     let want = bench.alone();
