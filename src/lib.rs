@@ -81,9 +81,10 @@
 //!    `kernels/image_loss.rs`, its options in `LossOptions`, and `image_loss.wgsl` among the shaders. Masked pixels do not count.
 //!
 //! **An output format**
-//! 1. `exchange/` gets a file beside `exchange/ply/write.rs`, with the same three calls: create, write rows,
-//!    finish. [`base::whole_file::PartFile`] makes the file appear as a whole. `exchange/mod.rs` names the file.
-//! 2. `train/run.rs`, after the loop: what a run writes at its end. `train/stores/export.rs`: what `gsscale-ckpt export` writes.
+//! 1. `exchange/` gets a file with the format's [`exchange::sink::GaussianSink`]; `exchange/ply/write.rs` is the example.
+//!    [`exchange::frames::ExportRows`] gives rows as files hold them, [`base::whole_file::PartFile`] makes the file appear as a
+//!    whole. `exchange/mod.rs` names the file.
+//! 2. `train/run_folder.rs`, `save_result`: what a run writes at its end. `train/stores/export.rs`: what `gsscale-ckpt export` writes.
 //!    The PLY remains: resumes, `gsscale-eval` and more steps read it.
 //! 3. `report/run_files.rs`: the name in a run's folder, so that `--overwrite` removes the file.
 //!

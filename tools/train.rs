@@ -11,8 +11,9 @@ use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::out_folder::{Existing, default_out, remedy_of_existing};
 use gsscale::train::progress::Count;
+use gsscale::train::request::{RunOutcome, RunRequest};
 use gsscale::train::resume::{ResumeRequest, resume};
-use gsscale::train::run::{RunOutcome, RunRequest, run};
+use gsscale::train::run::run;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 

@@ -10,7 +10,7 @@ use crate::base::simd::SimdPath;
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
-use crate::exchange::ply::ExportFrame;
+use crate::exchange::meta::ExportFrame;
 use crate::gpu::DeviceChoice;
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::optim::moments::Moments;

@@ -19,7 +19,7 @@ use crate::checkpoint::interval::CommitEvery;
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
-use crate::exchange::ply::ExportFrame;
+use crate::exchange::meta::ExportFrame;
 use crate::gpu::DeviceChoice;
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::optim::moments::Moments;

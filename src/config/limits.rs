@@ -11,7 +11,7 @@ use crate::densify::default::DefaultStrategy;
 use crate::densify::growth::GrowthRule;
 use crate::densify::long_axis::LongAxisStrategy;
 use crate::densify::strategy::{NoStrategy, Strategy, StrategyName};
-use crate::exchange::ply::ExportFrame;
+use crate::exchange::meta::ExportFrame;
 use crate::optim::adam::AdamConfig;
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::optim::moments::Moments;

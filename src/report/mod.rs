@@ -10,6 +10,7 @@ pub mod dots;
 pub mod front;
 pub mod html;
 pub mod ladder_page;
+mod numbers;
 pub mod page_map;
 pub mod picture;
 pub mod record;

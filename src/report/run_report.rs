@@ -3,8 +3,9 @@
 //! Invariants: 1. missing or incomplete files (of a run that was stopped) make the report shorter; only a folder
 //! without metrics is an error; 2. the number of pictures and of points in a chart is bounded.
 
-use super::chart::{Chart, Mark, short, smoothed};
+use super::chart::{Chart, Mark, smoothed};
 use super::html::{Cell, Page, slider};
+use super::numbers::short;
 use super::page_map::{PageTile, page_map_legend, page_map_svg};
 use super::picture::view_pictures;
 use super::run_files::{

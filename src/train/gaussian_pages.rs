@@ -10,7 +10,9 @@ use super::prepare::{remove_giants, truncate_sh};
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::dataset::import::{Grown, PageSpace, Spool, SpoolSpace, SpoolWriter, paginate};
-use crate::exchange::ply::{PlyMeta, ROW_HEAD, gaussians_header, push_row, stream_gaussians, take_row, to_local};
+use crate::exchange::frames::to_local;
+use crate::exchange::meta::SceneMeta;
+use crate::exchange::ply::{ROW_HEAD, gaussians_header, push_row, stream_gaussians, take_row};
 use crate::scene::columns::{Columns, sh_n_width};
 use crate::scene::log_scales::LogScaleRange;
 use crate::scene::partition::Placed;
@@ -48,7 +50,7 @@ impl Grown for Row {
 #[derive(Debug, Clone)]
 pub(super) struct GaussianFile {
     path: PathBuf,
-    meta: PlyMeta,
+    meta: SceneMeta,
     /// SH degree of the file.
     sh_degree: u8,
     sh_degree_most: u8,
@@ -61,7 +63,7 @@ pub(super) struct GaussianFile {
 #[derive(Debug, Clone)]
 pub(super) struct GaussiansRead {
     /// The file's metadata.
-    pub meta: PlyMeta,
+    pub meta: SceneMeta,
     /// Gaussians dropped because they are too far away for the local frame.
     pub far: u64,
     /// Gaussians dropped because they are too large for the scene.

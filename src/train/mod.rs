@@ -2,10 +2,10 @@
 //!
 //! | task | files |
 //! | --- | --- |
-//! | set up and run | [`run`], [`prepare`], [`start`] (first Gaussians; `gaussian_pages` from a file of any size), [`tiers`] (where pages live), [`machine`] (threads, renderer), [`signals`] (Ctrl-C) |
+//! | set up and run | [`request`], [`run`], `run_folder` (a run in its output folder), [`prepare`], [`start`] (first Gaussians; `gaussian_pages` from a file of any size), [`tiers`] (where pages live), [`machine`] (threads, renderer), [`signals`] (Ctrl-C) |
 //! | memory | [`memory`], [`probe`] and [`preflight`] (does the run fit: `largest_view`, `first_frames`, `drive_space`, `plan_text`), [`budget`] and `fitting` (frames of a growing scene), `outgrown` (a scene that no longer fits), [`staging`] |
 //! | one step | [`step`], `soundness` (stops a run that diverged or trains nothing), [`comparison`] (from picture to loss and back; also for `view`, which renders without a step), [`batch`] (gather, update; [`device_rows`] on a device that holds pages, [`device_tier`]), [`working_set`], [`catch_up`] (cull, evaluate), `update`, `dense` (dense Adam) |
-//! | state and loop | [`pages`], [`trainer`], [`training_loop`], [`eval`], [`costs`], `growth_checks` with `held_out` and `leave_out` (how many Gaussians the scene needs) |
+//! | state and loop | [`pages`], [`trainer`], `save` (as a file), [`training_loop`], [`eval`], [`costs`], `growth_checks` with `held_out` and `leave_out` (how many Gaussians the scene needs) |
 //! | commits | [`checkpoint`], `first_commit` (of a run in memory), [`full_drive`], [`resume`] with `changes` and [`dataset_print`] (may the run resume) |
 //! | results | `appearance_file`, [`out_folder`], [`report`], [`progress`], [`page_map`], [`facts`] |
 //! | stores | `ownership` (which run owns a store, who may delete it), `places`, [`first_look`] (for a plan), [`stores`] (what tools do with checkpoints) |
@@ -54,8 +54,11 @@ pub mod prepare;
 pub mod probe;
 pub mod progress;
 pub mod report;
+pub mod request;
 pub mod resume;
 pub mod run;
+mod run_folder;
+mod save;
 pub mod signals;
 mod soundness;
 pub mod staging;

@@ -9,7 +9,9 @@ use crate::config::limits;
 use crate::dataset::loader::{Dataset, load_dataset};
 use crate::dataset::model::PointCloud;
 use crate::dataset::read::read_scene;
-use crate::exchange::ply::{PlyContent, PlyMeta, read_ply, to_local};
+use crate::exchange::frames::to_local;
+use crate::exchange::meta::SceneMeta;
+use crate::exchange::ply::{PlyContent, read_ply};
 use crate::scene::columns::{Column, Columns, sh_n_width};
 use crate::scene::init::{gaussians_from_points, random_points_in_frusta};
 use crate::scene::log_scales::LogScaleRange;
@@ -138,7 +140,7 @@ pub(super) fn giants_warning(ply: &Path, giants: u64) -> Option<String> {
 }
 
 /// Warnings about Gaussians read from `ply`, of which `far` were dropped by the change of frame.
-pub fn ply_warnings(ply: &Path, meta: &PlyMeta, far: u64) -> Vec<String> {
+pub fn ply_warnings(ply: &Path, meta: &SceneMeta, far: u64) -> Vec<String> {
     let mut warnings = Vec::new();
     if meta.dropped > 0 {
         warnings.push(format!("{}: {} Gaussians are not finite and are dropped", ply.display(), meta.dropped));

@@ -1,117 +1,45 @@
-//! A run from command line to result: load, check, print the plan, train, evaluate, write.
+//! A run from command line to result: load, check, plan, print the plan, train.
 //!
-//! Invariants: 1. the output folder is created after the dataset was read, so bad input leaves no files; 2. a run that
-//! is stopped or fails after its first step still writes the PLY of its last good step.
+//! Not here: what happens in the output folder ([`super::run_folder`]).
+//!
+//! Invariant: the output folder is created after the dataset was read, so bad input leaves no files.
 
-use super::appearance_file::write_appearance;
 use super::changes::with_absolute_paths;
-use super::checkpoint::Checkpoint;
-use super::costs::Meter;
 use super::device_memory;
 use super::drive_space::{StepWrites, check_first_drive, step_writes};
 use super::error::TrainError;
-use super::facts::{Resolved, write_config};
 use super::forecast::{Forecast, Measured, Reach, mean_pixels, reach};
 use super::held_out::{keeps_first_count, too_few_to_decide};
 use super::machine;
 use super::memory::list_bytes;
-use super::memory::{host_budget, host_bytes_now, host_bytes_peak, rows_at_most};
+use super::memory::{host_budget, host_bytes_now, rows_at_most};
 use super::out_folder::{self, Existing};
-use super::page_map::write_page_map;
-use super::places::absolute;
 use super::plan_text;
 use super::preflight;
 use super::probe::{Probe, estimate};
-use super::progress::{Count, Progress};
-use super::report::StepCosts;
-use super::report::{MetricsLog, Summary, TestMetrics, write_summary};
+use super::request::{RunOutcome, RunRequest};
+use super::run_folder::{Begun, train_into};
 use super::signals::StopFlag;
 use super::soundness::no_view_sees;
 use super::start::Start;
 use super::start::dataset_print;
 use super::tiers::{self, Tiers};
 use super::trainer::Trainer;
-use super::training_loop::LoopOutputs;
-use crate::base::error::{InputError, InputResult};
+use crate::base::error::InputError;
 use crate::base::identity::RunId;
-use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity};
-use crate::config::choice::{Chosen, Device, LogFormat};
+use crate::checkpoint::run_state::DatasetPrint;
+use crate::config::choice::Device;
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::config::residence::Residence;
 use crate::config::values::Up;
 use crate::dataset::loader::Dataset;
-use crate::dataset::target_cache::TargetCache;
-use crate::exchange::ply::{ExportFrame, PlyWritten, write_transform};
 use crate::optim::method::OptimizerPlace;
 use crate::page::tool::uncommitted::remove_uncommitted;
 use crate::render::Renderer;
-use crate::report::run_files::{
-    APPEARANCE_FILE, CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE,
-};
-use crate::report::run_report::write_run_report;
+use crate::report::run_files::CONFIG_FILE;
 use crate::scene::partition::first_fill;
 use std::path::{Path, PathBuf};
-
-/// The run to start.
-#[derive(Debug, Clone)]
-pub struct RunRequest {
-    /// Scene folder (or transforms.json).
-    pub scene: PathBuf,
-    /// Output folder; may be empty for a dry run.
-    pub out: PathBuf,
-    /// Checked config.
-    pub config: TrainConfig,
-    /// Print the plan and stop.
-    pub dry_run: bool,
-    /// Treatment of an existing output folder.
-    pub existing: Existing,
-    /// Print only warnings and errors.
-    pub quiet: bool,
-}
-
-/// How a run ended.
-#[derive(Debug, Clone)]
-pub struct RunOutcome {
-    /// Content of summary.json; `None` for a dry run.
-    pub summary: Option<Summary>,
-    /// Exit code of the process: 0, or 130/143 after a stop request.
-    pub exit_code: i32,
-    /// The output folder.
-    pub out: PathBuf,
-}
-
-/// The past of a resumed run.
-pub(super) struct Past {
-    /// The config to keep from now on.
-    pub config: TrainConfig,
-    /// Length of its metrics.
-    pub metrics_bytes: u64,
-    /// Steps done.
-    pub step: u32,
-    /// Numbers have changed, which is committed at once.
-    pub has_changed: bool,
-    /// Content of its config.toml; `None` if the file is missing and must be restored.
-    pub file: Option<(TrainConfig, Resolved)>,
-    /// Number of its first Gaussians.
-    pub first_rows: u64,
-}
-
-/// Facts with which a run begins or resumes.
-pub(super) struct Begun {
-    /// Digest of the dataset.
-    pub print: DatasetPrint,
-    /// SH degree of the first step.
-    pub sh_degree_start: u8,
-    /// The past of a resumed run.
-    pub past: Option<Past>,
-    /// Budget, bytes.
-    pub host_mem: Option<u64>,
-    /// Bytes allocated by the graphics driver.
-    pub driver: u64,
-    /// Identity of the run.
-    pub run: RunId,
-}
 
 /// Runs a request from beginning to end.
 ///
@@ -330,211 +258,6 @@ fn spill_dir_flag(request: &RunRequest) -> String {
     match now {
         Ok(now) if !now.is_empty() && !kept.is_ok_and(|kept| kept == now) => format!(" --spill-dir {now}"),
         _ => String::new(),
-    }
-}
-
-/// The config to keep: with choices resolved and absolute paths.
-fn resolved_config(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
-    let view_order = Chosen(Some(trainer.view_order().order()));
-    let up = trainer.options.up.map_or(Up::Keep, Up::Along);
-    let optimizer_on = Chosen(Some(trainer.options.optimizer_on));
-    with_absolute_paths(TrainConfig { view_order, up, optimizer_on, ..config.clone() })
-}
-
-/// Writes config.toml (on resume only if it changed); returns the origin for all commits.
-fn begin_files(
-    request: &RunRequest,
-    dataset: &Dataset,
-    trainer: &Trainer,
-    begun: &Begun,
-    made_spill_dir: bool,
-) -> InputResult<Origin> {
-    let simd = limits::simd_path(&request.config).name().to_string();
-    let path = request.out.join(CONFIG_FILE);
-    let config = match &begun.past {
-        Some(past) => {
-            // It belongs to the Gaussians before the change.
-            out_folder::remove_evaluation(&request.out)?;
-            let made_again = Resolved { gaussians: past.first_rows, ..resolved(request, dataset, trainer, begun.run) };
-            let before = past.file.as_ref().map_or(&made_again, |(_, facts)| facts);
-            let facts = Resolved { run: begun.run, scene: absolute(&request.scene), ..before.clone() };
-            let kept = (past.config.clone(), facts);
-            if past.file.as_ref() != Some(&kept) {
-                write_config(&path, &kept.0, &kept.1)?;
-            }
-            kept.0
-        }
-        None => {
-            let kept = resolved_config(&request.config, trainer);
-            let facts = resolved(request, dataset, trainer, begun.run);
-            write_config(&path, &kept, &Resolved { made_spill_dir, ..facts })?;
-            kept
-        }
-    };
-    let fail = |e: toml::ser::Error| InputError::new(&path, e.to_string(), "report this as a bug");
-    let config = toml::to_string(&config).map_err(fail)?;
-    let [out, scene] = [&request.out, &request.scene].map(|path| absolute(path).to_string_lossy().into_owned());
-    let run = RunIdentity { id: begun.run, out, scene };
-    Ok(Origin { config, simd, sh_degree_start: begun.sh_degree_start, dataset: begun.print.clone(), run })
-}
-
-fn train_into(
-    request: &RunRequest,
-    dataset: &Dataset,
-    mut trainer: Trainer,
-    (stop, tiers): (&StopFlag, &mut Tiers),
-    begun: Begun,
-) -> Result<RunOutcome, TrainError> {
-    let (config, out) = (&request.config, &request.out);
-    let origin = begin_files(request, dataset, &trainer, &begun, tiers.made_spill_dir())?;
-    let mut metrics = open_metrics(config.log, out, begun.past.as_ref())?;
-    let keeps = tiers.keeps_checkpoint();
-    let mut checkpoint = tiers.checkpoint.as_mut();
-    if let Some(checkpoint) = &mut checkpoint {
-        checkpoint.set_origin(origin);
-        if begun.past.is_some_and(|p| p.has_changed) {
-            let committed = checkpoint.commit(&mut trainer, &mut metrics);
-            committed.or_else(|why| checkpoint.make_space(&mut trainer, &mut metrics, stop, why))?;
-        }
-    }
-    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-    let mut progress = Progress::new(config.steps, request.quiet).after(trainer.steps_done());
-    let meter = Meter::start(&trainer);
-    metrics.start_clock(trainer.train_seconds());
-    let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint };
-    let looped = trainer.run(dataset, &targets, &mut outputs);
-    let costs = meter.stop(&trainer, &*tiers, metrics.cpu_seconds());
-    let ply = Trainer::ply_path(out);
-    let saved = trainer.save(dataset, &ply);
-    // Return the error that ended the run; a failure to write its last rows is an additional warning.
-    let (looped, written) = match (looped, saved) {
-        (Err(error), Err(other)) => {
-            eprintln!("warning: {} cannot be written: {other}", ply.display());
-            return Err(error);
-        }
-        (looped, saved) => (looped, saved?),
-    };
-    warn_of_ply(config, &written, &ply);
-    write_transform(&ply, &trainer.ply_meta(dataset), written.frame)?;
-    // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
-    let asked = stop.exit_code();
-    let tested = looped.and_then(|()| match asked {
-        None => evaluate_result(request, dataset, &targets, &mut trainer, &mut metrics),
-        Some(_) => Ok(None),
-    });
-    if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, tiers.checkpoint.as_mut()) {
-        // Commit again, with the result of the evaluation.
-        checkpoint.commit_or_warn(&mut trainer, &mut metrics)?;
-    }
-    let summary = Summary {
-        gaussians: written.rows + written.skipped,
-        test: tested.as_ref().ok().copied().flatten(),
-        // A run without its evaluation is not finished: a resume evaluates it.
-        finished: trainer.steps_done() == config.steps && tested.is_ok() && asked.is_none(),
-        outlier_views: trainer.outlier_views(dataset),
-        costs,
-        commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
-        ..summary_of(request, &trainer)
-    };
-    write_summary(&out.join(SUMMARY_FILE), &summary)?;
-    write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
-    write_appearance(&out.join(APPEARANCE_FILE), dataset, &trainer)?;
-    write_report(request)?;
-    tested?;
-    tiers.is_done = summary.finished;
-    Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0), out: out.clone() })
-}
-
-/// Evaluates the result, with pictures, and logs the evaluation.
-fn evaluate_result(
-    request: &RunRequest,
-    dataset: &Dataset,
-    targets: &TargetCache,
-    trainer: &mut Trainer,
-    metrics: &mut MetricsLog,
-) -> Result<Option<TestMetrics>, TrainError> {
-    let shown = Count::new("held-out views compared", dataset.test_views().len() as u32, request.quiet);
-    let pictures = request.out.join(PICTURES_FOLDER);
-    // A run that was killed after the commit of its last evaluation has the line already.
-    let is_logged = trainer.state.test.is_some_and(|test| test.step == trainer.state.step);
-    let test = trainer.evaluate(dataset, targets, Some(&pictures), &|done| shown.show(done))?;
-    if let Some(test) = test.filter(|_| !is_logged) {
-        metrics.write_evaluation(trainer.steps_done(), test, &pictures)?;
-    }
-    Ok(test)
-}
-
-fn write_report(request: &RunRequest) -> InputResult<()> {
-    let shown = std::cell::OnceCell::new();
-    let show = |done: usize, all: usize| {
-        let count = || Count::new("pictures put into the report", all as u32, request.quiet);
-        shown.get_or_init(count).show(done as u32);
-    };
-    write_run_report(&request.out, &show)?;
-    Ok(())
-}
-
-/// The log of metrics of a new run, or of a run that resumes after `past`.
-fn open_metrics(log: LogFormat, out: &Path, past: Option<&Past>) -> InputResult<MetricsLog> {
-    let metrics = MetricsLog::open(&out.join(METRICS_FILE), past.map(|past| past.metrics_bytes))?;
-    match log {
-        LogFormat::Json => Ok(metrics),
-        LogFormat::Tensorboard => metrics.with_events(&out.join(EVENTS_FOLDER), past.map(|past| past.step + 1)),
-    }
-}
-
-/// Warns if the final PLY differs from the request.
-fn warn_of_ply(config: &TrainConfig, written: &PlyWritten, ply: &Path) {
-    if written.frame == ExportFrame::Local && config.export_frame == ExportFrame::Dataset {
-        eprintln!(
-            "warning: dataset coordinates exceed the precision of f32, so {} holds local positions; \
-             its comments give origin and scale",
-            ply.display()
-        );
-    }
-    if written.skipped > 0 {
-        eprintln!("warning: {} Gaussians are not finite and are not in {}", written.skipped, ply.display());
-    }
-}
-
-/// The part of the summary that the trainer knows: not finished, not evaluated.
-fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
-    let (rows_skipped, steps_skipped) = trainer.skipped();
-    Summary {
-        steps: trainer.steps_done(),
-        gaussians: trainer.scene.rows(),
-        train_seconds: trainer.train_seconds(),
-        host_bytes_peak: host_bytes_peak().unwrap_or(0),
-        test: None,
-        scene: request.scene.clone(),
-        version: env!("CARGO_PKG_VERSION").to_string(),
-        ssim_variant: request.config.ssim_variant.to_string(),
-        finished: false,
-        rows_skipped_non_finite: rows_skipped,
-        steps_skipped_non_finite: steps_skipped,
-        outlier_views: Vec::new(),
-        costs: StepCosts::default(),
-        growth: trainer.growth().to_vec(),
-        tiers: trainer.tier_traffic(),
-        commits: None,
-    }
-}
-
-fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, run: RunId) -> Resolved {
-    Resolved {
-        version: env!("CARGO_PKG_VERSION").to_string(),
-        run,
-        scene: absolute(&request.scene),
-        simd: limits::simd_path(&request.config).name().to_string(),
-        threads: rayon::current_num_threads(),
-        device: trainer.renderer.device(),
-        train_views: dataset.train_views().len(),
-        test_views: dataset.test_views().len(),
-        gaussians: trainer.scene.rows(),
-        origin: dataset.frame.origin.to_array(),
-        scale: dataset.frame.scale,
-        scene_scale: f64::from(dataset.scene_scale) * dataset.frame.scale,
-        made_spill_dir: false,
     }
 }
 

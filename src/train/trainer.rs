@@ -27,27 +27,23 @@ use crate::appearance::AppearanceMode;
 use crate::appearance::model::CHANNEL_VALUES;
 use crate::appearance::picture::Look;
 use crate::appearance::state::{AppearanceState, camera_groups};
-use crate::base::error::InputError;
 use crate::checkpoint::run_state::{LastTest, TrainerState};
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::densify::growth::GrowthCheck;
 use crate::densify::strategy::RowCount;
-use crate::exchange::ply::{self, PlyMeta};
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::outliers::views::ViewOutliers;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::view_sizes::ViewSizes;
 use crate::render::{RenderOptions, Renderer};
-use crate::report::run_files::PLY_FILE;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::image::Target;
-use crate::scene::rotation::Rotation;
 use crate::schedule::order::{Order, ViewOrder};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Instant;
 
 /// Views whose photos are prefetched.
@@ -482,41 +478,5 @@ impl Trainer {
         let of = |t: TestMetrics| LastTest { step: self.state.step, views: t.views, psnr: t.psnr, ssim: t.ssim };
         self.state.test = test.map(of).or(self.state.test);
         Ok(test)
-    }
-
-    /// Writes the rows at the current step as a PLY; returns what was written and in which coordinates.
-    ///
-    /// # Errors
-    /// The folder cannot be written, pages could not be pinned, or a failed step left pages of two steps.
-    pub fn save(&mut self, dataset: &Dataset, path: &Path) -> Result<ply::PlyWritten, TrainError> {
-        if self.is_torn {
-            let problem = "the last step failed half-way, so some Gaussians belong to the step before";
-            let remedy = "resume the run from its last commit with gsscale-train --resume and the output folder";
-            return Err(InputError::new(path, problem, remedy).into());
-        }
-        self.drain()?;
-        let meta = self.ply_meta(dataset);
-        let rows_at_most = self.scene.rows_bound();
-        let mut writer = ply::PlyWriter::create(path, self.options.sh_degree, rows_at_most, &meta)?;
-        self.scene.for_all_rows(self.state.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
-        Ok(writer.finish()?)
-    }
-
-    /// The metadata of a PLY of the rows at the current step.
-    pub(super) fn ply_meta(&self, dataset: &Dataset) -> PlyMeta {
-        PlyMeta {
-            step: Some(u64::from(self.state.step)),
-            origin: dataset.frame.origin.to_array(),
-            scale: dataset.frame.scale,
-            scene_radius: f64::from(dataset.scene_scale) * dataset.frame.scale,
-            frame: self.options.export_frame,
-            upright: self.options.up.and_then(Rotation::upright),
-            ..PlyMeta::default()
-        }
-    }
-
-    /// Path of the final PLY in an output folder.
-    pub fn ply_path(out: &Path) -> PathBuf {
-        out.join(PLY_FILE)
     }
 }

@@ -3,7 +3,9 @@
 
 use gsscale::base::error::InputError;
 use gsscale::base::rng::{Purpose, Stream};
-use gsscale::exchange::ply::{ExportFrame, PlyContent, PlyMeta, parse_ply, read_ply, to_local, write_gaussians};
+use gsscale::exchange::frames::to_local;
+use gsscale::exchange::meta::{ExportFrame, SceneMeta};
+use gsscale::exchange::ply::{PlyContent, parse_ply, read_ply, write_gaussians};
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::rotation::Rotation;
 use std::path::Path;
@@ -22,18 +24,18 @@ fn scene(rows: usize, sh_degree: u8) -> Columns {
     columns
 }
 
-fn meta(frame: ExportFrame) -> PlyMeta {
-    PlyMeta {
+fn meta(frame: ExportFrame) -> SceneMeta {
+    SceneMeta {
         step: Some(29_999),
         origin: [1_234.567_890_123_456_7, -0.1, 3e-9],
         scale: 0.1 + 0.2,
         frame,
         scene_radius: 10.0,
-        ..PlyMeta::default()
+        ..SceneMeta::default()
     }
 }
 
-fn gaussians(content: PlyContent) -> (Columns, PlyMeta) {
+fn gaussians(content: PlyContent) -> (Columns, SceneMeta) {
     match content {
         PlyContent::Gaussians { columns, meta } => (columns, meta),
         PlyContent::Points { .. } => panic!("these are points"),
@@ -51,7 +53,7 @@ fn error_of(bytes: &[u8]) -> String {
     error.to_string()
 }
 
-fn written(columns: &Columns, meta: &PlyMeta) -> Vec<u8> {
+fn written(columns: &Columns, meta: &SceneMeta) -> Vec<u8> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("out.ply");
     write_gaussians(&path, columns, meta).unwrap();
@@ -75,7 +77,7 @@ fn the_local_frame_round_trips_bit_for_bit() {
         assert_eq!(report.bytes, std::fs::metadata(&path).unwrap().len());
         let (back, back_meta) = gaussians(read_ply(&path).unwrap());
         assert_eq!(back, columns);
-        let same = PlyMeta { scene_radius: back_meta.scale, ..meta(ExportFrame::Local) };
+        let same = SceneMeta { scene_radius: back_meta.scale, ..meta(ExportFrame::Local) };
         assert_eq!(back_meta, same);
         let mut local = back;
         assert_eq!(to_local(&mut local, &back_meta, back_meta.origin, back_meta.scale), 0);
@@ -134,7 +136,7 @@ fn an_offset_too_far_for_f32_stays_local_and_says_so() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("utm.ply");
     let columns = scene(10, 0);
-    let utm = PlyMeta { origin: [5e5, 5e6, 100.0], scale: 200.0, scene_radius: 200.0, ..meta(ExportFrame::Dataset) };
+    let utm = SceneMeta { origin: [5e5, 5e6, 100.0], scale: 200.0, scene_radius: 200.0, ..meta(ExportFrame::Dataset) };
     let report = write_gaussians(&path, &columns, &utm).unwrap();
     assert_eq!(report.frame, ExportFrame::Local);
     let (back, back_meta) = gaussians(read_ply(&path).unwrap());
@@ -149,7 +151,7 @@ fn an_upright_file_is_turned_back_on_reading() {
     let upright = Rotation::upright(up);
     for frame in [ExportFrame::Local, ExportFrame::Dataset] {
         let columns = scene(200, 3);
-        let meta = PlyMeta { upright, ..meta(frame) };
+        let meta = SceneMeta { upright, ..meta(frame) };
         let bytes = written(&columns, &meta);
         let (header, _) = header_of(&bytes);
         assert!(header.contains("comment Vertical axis: y\n"), "Brush reads this line: {header}");
@@ -180,7 +182,7 @@ fn an_upright_file_is_turned_back_on_reading() {
     }
     // Nothing turns where up is the viewer's up already.
     let (columns, path) = (scene(3, 2), folder.path().join("a.ply"));
-    let flat = PlyMeta { upright: Some(Rotation::IDENTITY), ..meta(ExportFrame::Local) };
+    let flat = SceneMeta { upright: Some(Rotation::IDENTITY), ..meta(ExportFrame::Local) };
     write_gaussians(&path, &columns, &flat).unwrap();
     let (mut back, back_meta) = gaussians(read_ply(&path).unwrap());
     assert_eq!((&back, back_meta.upright), (&columns, Some(Rotation::IDENTITY)));
@@ -248,7 +250,7 @@ fn rows_that_are_not_finite_are_left_out_and_counted() {
     columns.row_mut(Column::Quats, 70).fill(0.0);
     // Finite in the local frame only.
     columns.row_mut(Column::Means, 99)[2] = 3e38;
-    let far = PlyMeta { scale: 100.0, ..meta(ExportFrame::Dataset) };
+    let far = SceneMeta { scale: 100.0, ..meta(ExportFrame::Dataset) };
     let report = write_gaussians(&path, &columns, &far).unwrap();
     assert_eq!((report.rows, report.skipped), (97, 3));
     let (back, _) = gaussians(read_ply(&path).unwrap());
@@ -313,7 +315,7 @@ fn every_format_and_order_is_read() {
         let (back, back_meta) = gaussians(parse(&foreign(&columns, ascii)).unwrap());
         assert_eq!(back, columns, "ascii: {ascii}");
         // Not our file: its comment 'step x' is none of our business.
-        assert_eq!(back_meta, PlyMeta { antialiased: true, ..PlyMeta::default() });
+        assert_eq!(back_meta, SceneMeta { antialiased: true, ..SceneMeta::default() });
     }
 }
 

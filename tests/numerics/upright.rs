@@ -1,7 +1,8 @@
 //! Upright results: a turned scene looks the same to turned cameras.
 
 use gsscale::base::rng::{Purpose, Stream};
-use gsscale::exchange::ply::{PlyContent, PlyMeta, read_ply, write_gaussians};
+use gsscale::exchange::meta::SceneMeta;
+use gsscale::exchange::ply::{PlyContent, read_ply, write_gaussians};
 use gsscale::kernels::sh_fwd::sh_basis;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::{RenderOptions, Renderer, RowBatches};
@@ -63,7 +64,7 @@ fn a_turned_scene_looks_the_same_to_a_turned_camera() {
     for up in [[0.0, 0.0, 1.0], [0.36, -0.48, 0.8], [0.0, 1.0, 0.0]] {
         let path = folder.path().join("a.ply");
         let upright = Rotation::upright(up);
-        write_gaussians(&path, &columns, &PlyMeta { upright, ..PlyMeta::default() }).unwrap();
+        write_gaussians(&path, &columns, &SceneMeta { upright, ..SceneMeta::default() }).unwrap();
         let PlyContent::Gaussians { columns: turned, .. } = read_ply(&path).unwrap() else { panic!("Gaussians") };
         // p_cam = W p = (W R^T) (R p): each row of W is a vector of the dataset.
         let viewmat = straight.map(|[x, y, z, t]: [f32; 4]| {

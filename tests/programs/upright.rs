@@ -5,7 +5,9 @@ use crate::support::scenes::{TextModel, city, eval, psnr, stderr, text, train};
 use glam::{DQuat, DVec3};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::values::Up;
-use gsscale::exchange::ply::{PlyContent, PlyMeta, read_ply, to_local};
+use gsscale::exchange::frames::to_local;
+use gsscale::exchange::meta::SceneMeta;
+use gsscale::exchange::ply::{PlyContent, read_ply};
 use gsscale::scene::columns::{Column, Columns};
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -29,7 +31,7 @@ fn run(scene: &Path, out: &Path, more: &[&str]) {
     assert!(output.status.success(), "{}", stderr(&output));
 }
 
-fn gaussians(ply: &Path) -> (Columns, PlyMeta) {
+fn gaussians(ply: &Path) -> (Columns, SceneMeta) {
     let PlyContent::Gaussians { columns, meta } = read_ply(ply).unwrap() else { panic!("Gaussians") };
     (columns, meta)
 }

@@ -9,46 +9,31 @@
 //! The comments precede the `element` line, since readers give later ones to the element, not to the file. The viewer of
 //! the 3DGS code takes the third word of the third line for the number of rows, so that line is a comment `vertices N`.
 
-use super::{ExportFrame, PlyMeta, unit_quat};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::PartFile;
-use crate::scene::columns::{Column, Columns, sh_n_width};
-use crate::scene::rotation::{GaussianRotation, Rotation};
+use crate::exchange::frames::{ExportRow, ExportRows};
+use crate::exchange::meta::{ExportFrame, SceneMeta};
+use crate::exchange::sink::{GaussianSink, Written};
+use crate::scene::columns::{Columns, sh_n_width};
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
-
-/// Summary of a written file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct PlyWritten {
-    /// Frame of the values: `Local` instead of a requested `Dataset` if f32 cannot hold the offset. Tell the user.
-    pub frame: ExportFrame,
-    /// Rows in the file.
-    pub rows: u64,
-    /// Number of rows left out because a value was not finite.
-    pub skipped: u64,
-    /// Length of the file, bytes.
-    pub bytes: u64,
-}
 
 /// Writes rows of the local frame to `path`, in the frame that `meta` requests if f32 can hold it. For rows that are
 /// not all in memory use [`PlyWriter`].
 ///
 /// # Errors
 /// The disk fails, `path` names no file, or no row is finite. The target then stays unchanged.
-pub fn write_gaussians(path: &Path, columns: &Columns, meta: &PlyMeta) -> InputResult<PlyWritten> {
+pub fn write_gaussians(path: &Path, columns: &Columns, meta: &SceneMeta) -> InputResult<Written> {
     let mut writer = PlyWriter::create(path, columns.sh_degree, columns.rows() as u64, meta)?;
     writer.write(columns)?;
-    writer.finish()
+    Box::new(writer).finish()
 }
 
 /// Writes a file in parts.
 ///
-/// In the dataset's frame positions are `means * scale + origin`, computed in f64 and rounded once, and `ln(scale)` is
-/// added to the log-scales. Then [`PlyMeta::upright`] turns positions, quaternions and harmonics, in f64 as well.
-/// Quaternions are written at unit length, as viewers expect; the rotation is the same. Bands above those of the rows are
-/// zeros.
+/// [`ExportRows`] says how values change on the way. Bands above those of the rows are zeros.
 ///
 /// The header contains the number of rows, which is known only at the end: the header is then rewritten at the same
 /// length. If the number has fewer digits than reserved, a comment is padded with spaces.
@@ -57,10 +42,8 @@ pub struct PlyWriter {
     part: PartFile,
     out: BufWriter<File>,
     sh_degree: u8,
-    log_scale: f64,
-    meta: PlyMeta,
-    turning: GaussianRotation,
-    frame: ExportFrame,
+    meta: SceneMeta,
+    to_file: ExportRows,
     rows_at_most: u64,
     given: u64,
     rows: u64,
@@ -72,21 +55,19 @@ impl PlyWriter {
     ///
     /// # Errors
     /// The disk fails, or `path` names no file.
-    pub fn create(path: &Path, sh_degree: u8, rows_at_most: u64, meta: &PlyMeta) -> InputResult<PlyWriter> {
-        let frame = meta.frame.fitting_f32(meta.origin, meta.scene_radius);
+    pub fn create(path: &Path, sh_degree: u8, rows_at_most: u64, meta: &SceneMeta) -> InputResult<PlyWriter> {
+        let to_file = ExportRows::new(meta);
         let (part, file) = PartFile::create(path)?;
         let mut out = BufWriter::with_capacity(1 << 20, file);
-        let header = header_text(sh_degree, rows_at_most, rows_at_most, meta, frame);
+        let header = header_text(sh_degree, rows_at_most, rows_at_most, meta, to_file.frame());
         out.write_all(header.as_bytes()).map_err(|e| InputError::io(path, "writing", &e))?;
         Ok(PlyWriter {
             path: path.to_path_buf(),
             part,
             out,
             sh_degree,
-            log_scale: libm::log(meta.scale),
             meta: meta.clone(),
-            turning: GaussianRotation::new(meta.upright.unwrap_or(Rotation::IDENTITY)),
-            frame,
+            to_file,
             rows_at_most,
             given: 0,
             rows: 0,
@@ -94,11 +75,27 @@ impl PlyWriter {
         })
     }
 
-    /// Appends rows; non-finite ones are left out and counted.
-    ///
-    /// # Errors
-    /// The disk fails, or there are more than `rows_at_most` rows.
-    pub fn write(&mut self, columns: &Columns) -> InputResult<()> {
+    /// The values of a row in file order.
+    fn fill(row: &ExportRow, out: &mut [f32]) {
+        let (geometry, rest) = out.split_at_mut(9);
+        let (f_rest, tail) = rest.split_at_mut(rest.len() - 8);
+        let coefficients = f_rest.len() / 3;
+        geometry[..3].copy_from_slice(&row.position);
+        geometry[3..6].fill(0.0);
+        geometry[6..].copy_from_slice(&row.sh0);
+        for (k, coefficient) in row.sh_n.chunks_exact(3).take(coefficients).enumerate() {
+            for channel in 0..3 {
+                f_rest[channel * coefficients + k] = coefficient[channel];
+            }
+        }
+        tail[0] = row.opacity;
+        tail[1..4].copy_from_slice(&row.log_scales);
+        tail[4..].copy_from_slice(&row.quat);
+    }
+}
+
+impl GaussianSink for PlyWriter {
+    fn write(&mut self, columns: &Columns) -> InputResult<()> {
         let rows = columns.rows();
         self.given += rows as u64;
         if self.given > self.rows_at_most || columns.sh_degree > self.sh_degree {
@@ -107,7 +104,8 @@ impl PlyWriter {
         }
         let (mut values, mut bytes) = (vec![0.0; 17 + sh_n_width(self.sh_degree)], Vec::new());
         for row in 0..rows {
-            if self.fill(columns, row, &mut values) {
+            if let Some(row) = self.to_file.row(columns, row) {
+                Self::fill(&row, &mut values);
                 bytes.clear();
                 bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
                 self.out.write_all(&bytes).map_err(|e| InputError::io(&self.path, "writing", &e))?;
@@ -118,46 +116,9 @@ impl PlyWriter {
         Ok(())
     }
 
-    /// Writes the values of one row in file order; false if one is not finite. Bands that the row lacks stay unchanged.
-    fn fill(&self, c: &Columns, row: usize, out: &mut [f32]) -> bool {
-        let (geometry, rest) = out.split_at_mut(9);
-        let coefficients = sh_n_width(self.sh_degree) / 3;
-        let (f_rest, tail) = rest.split_at_mut(3 * coefficients);
-        let (local, scale, origin) = (self.frame == ExportFrame::Local, self.meta.scale, self.meta.origin);
-        let mean = c.row(Column::Means, row);
-        let scales = c.row(Column::Scales, row);
-        let at = |i: usize| if local { f64::from(mean[i]) } else { f64::from(mean[i]) * scale + origin[i] };
-        let position = self.turning.position([at(0), at(1), at(2)]);
-        for i in 0..3 {
-            geometry[i] = position[i] as f32;
-            geometry[3 + i] = 0.0;
-            tail[1 + i] = if local { scales[i] } else { (f64::from(scales[i]) + self.log_scale) as f32 };
-        }
-        geometry[6..9].copy_from_slice(c.row(Column::Sh0, row));
-        let (mut bands, given) = ([0.0; 45], c.row(Column::ShN, row));
-        bands[..given.len()].copy_from_slice(given);
-        self.turning.harmonics(&mut bands[..given.len()]);
-        for (k, coefficient) in bands[..given.len()].chunks_exact(3).enumerate() {
-            for channel in 0..3 {
-                f_rest[channel * coefficients + k] = coefficient[channel];
-            }
-        }
-        tail[0] = c.opacities[row];
-        let q = c.row(Column::Quats, row);
-        let finite = q.iter().all(|v| v.is_finite());
-        // At unit length first: a turned quaternion of any length might overflow.
-        let unit = unit_quat([q[0], q[1], q[2], q[3]]);
-        let turned = if self.turning.is_identity() { unit } else { unit_quat(self.turning.orientation(unit)) };
-        tail[4..8].copy_from_slice(&turned);
-        finite && out.iter().all(|v| v.is_finite())
-    }
-
-    /// Syncs the file to the disk, then renames it to its target.
-    ///
-    /// # Errors
-    /// The disk fails, or no row is finite. The target then stays unchanged.
-    pub fn finish(self) -> InputResult<PlyWritten> {
-        let PlyWriter { path, part, out, meta, frame, rows_at_most, given, rows, bytes, .. } = self;
+    fn finish(self: Box<Self>) -> InputResult<Written> {
+        let PlyWriter { path, part, out, meta, rows_at_most, given, rows, bytes, .. } = *self;
+        let frame = self.to_file.frame();
         if rows == 0 {
             let problem = format!("none of the {given} Gaussians is finite, so there is no row to write");
             let remedy = "the training diverged or lost all Gaussians: lower the rates";
@@ -171,12 +132,12 @@ impl PlyWriter {
             written.map_err(|e| failed("writing", &e))?;
         }
         part.finish(file)?;
-        Ok(PlyWritten { frame, rows, skipped: given - rows, bytes })
+        Ok(Written { frame, rows, skipped: given - rows, bytes })
     }
 }
 
 /// The header for `rows` rows, padded to the length of the header for `rows_at_most`.
-fn header_text(sh_degree: u8, rows: u64, rows_at_most: u64, meta: &PlyMeta, frame: ExportFrame) -> String {
+fn header_text(sh_degree: u8, rows: u64, rows_at_most: u64, meta: &SceneMeta, frame: ExportFrame) -> String {
     let digits = |n: u64| n.checked_ilog10().unwrap_or(0) as usize;
     // The number of rows stands in two lines.
     let padding = 2 * (digits(rows_at_most) - digits(rows));

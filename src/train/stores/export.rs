@@ -12,7 +12,10 @@ use crate::base::units::format_bytes;
 use crate::checkpoint::run_state::RunState;
 use crate::config::limits::RunOptions;
 use crate::densify::stats::GradHistogram;
-use crate::exchange::ply::{ExportFrame, PlyMeta, PlyWriter, write_transform};
+use crate::exchange::meta::{ExportFrame, SceneMeta};
+use crate::exchange::ply::PlyWriter;
+use crate::exchange::sink::GaussianSink;
+use crate::exchange::transform::write_transform;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::{Access, StoreReader};
 use crate::paging::frames::evict::EvictPolicy;
@@ -95,7 +98,7 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
     choice.find_cut(&mut scene, &pages, state.trainer.step)?;
     let sh_degree = request.sh_degree.map_or(options.sh_degree, |degree| degree.min(options.sh_degree));
     let meta = meta_of(&state, &options);
-    let mut writer = PlyWriter::create(&request.out, sh_degree, state.rows_bound, &meta)?;
+    let mut writer = Box::new(PlyWriter::create(&request.out, sh_degree, state.rows_bound, &meta)?);
     let mut given = 0;
     scene.for_rows_of(&pages, state.trainer.step, &mut |rows| {
         let chosen = choice.chosen(rows, sh_degree);
@@ -124,16 +127,16 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
 }
 
 /// The PLY comments, as the trainer writes them.
-fn meta_of(state: &RunState, options: &RunOptions) -> PlyMeta {
+fn meta_of(state: &RunState, options: &RunOptions) -> SceneMeta {
     let print = &state.origin.dataset;
-    PlyMeta {
+    SceneMeta {
         step: Some(u64::from(state.trainer.step)),
         origin: print.origin,
         scale: print.scale,
         scene_radius: f64::from(print.scene_scale) * print.scale,
         frame: options.export_frame,
         upright: options.up.and_then(Rotation::upright),
-        ..PlyMeta::default()
+        ..SceneMeta::default()
     }
 }
 

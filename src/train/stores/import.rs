@@ -15,9 +15,9 @@ use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::config::values::Up;
-use crate::exchange::ply::{
-    ExportFrame, PlyMeta, gaussians_header, holds_gaussians, push_row, stream_gaussians, turn_back,
-};
+use crate::exchange::frames::turn_back;
+use crate::exchange::meta::{ExportFrame, SceneMeta};
+use crate::exchange::ply::{gaussians_header, holds_gaussians, push_row, stream_gaussians};
 use crate::page::format::codec::Codec;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::new_store::{NewStore, refuse_existing};
@@ -121,7 +121,7 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
 }
 
 /// Streams the Gaussians of `file` into `rows`, in the axes of their dataset.
-fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<PlyMeta> {
+fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<SceneMeta> {
     let (header, sh_degree) = gaussians_header(file)?;
     let none = || Columns::zeros(0, sh_degree);
     let mut some = none();
@@ -177,7 +177,7 @@ fn memory_for_rows(request: &ImportRequest) -> InputResult<usize> {
 }
 
 /// Default config and options for Gaussians at their full SH degree.
-fn options_for(request: &ImportRequest, sh_degree: u8, meta: &PlyMeta) -> InputResult<(TrainConfig, RunOptions)> {
+fn options_for(request: &ImportRequest, sh_degree: u8, meta: &SceneMeta) -> InputResult<(TrainConfig, RunOptions)> {
     let config = TrainConfig {
         page_rows: request.page_rows,
         sh_degree,
@@ -193,7 +193,7 @@ fn options_for(request: &ImportRequest, sh_degree: u8, meta: &PlyMeta) -> InputR
 }
 
 /// The run state before the first step.
-fn first_state(config: &TrainConfig, meta: &PlyMeta, rows: u64, sh_degree: u8) -> Result<Vec<u8>, TrainError> {
+fn first_state(config: &TrainConfig, meta: &SceneMeta, rows: u64, sh_degree: u8) -> Result<Vec<u8>, TrainError> {
     let (origin, scale) = match meta.frame {
         ExportFrame::Local => (meta.origin, meta.scale),
         ExportFrame::Dataset => ([0.0; 3], 1.0),

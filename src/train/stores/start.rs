@@ -8,7 +8,8 @@ use super::{find_store, options_of, run_state_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageNo;
 use crate::checkpoint::run_state::RunState;
-use crate::exchange::ply::{ExportFrame, PlyMeta, to_local};
+use crate::exchange::frames::to_local;
+use crate::exchange::meta::{ExportFrame, SceneMeta};
 use crate::page::tool::reading::{Access, StoreReader};
 use crate::scene::columns::Columns;
 use crate::scene::state::SceneState;
@@ -77,7 +78,7 @@ impl StoredStart {
     ) -> Result<(), TrainError> {
         let print = &self.state.origin.dataset;
         let meta =
-            PlyMeta { origin: print.origin, scale: print.scale, frame: ExportFrame::Local, ..PlyMeta::default() };
+            SceneMeta { origin: print.origin, scale: print.scale, frame: ExportFrame::Local, ..SceneMeta::default() };
         let index = self.scene.pager.index();
         let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
         pages.sort_unstable_by_key(|p| index[p.index()].id);

@@ -3,9 +3,9 @@
 use crate::Target;
 use crate::scene_folder::scratch;
 use gsscale::base::error::InputError;
-use gsscale::exchange::ply::{
-    ExportFrame, PlyContent, PlyMeta, holds_gaussians, parse_ply, stream_points, to_local, write_gaussians,
-};
+use gsscale::exchange::frames::to_local;
+use gsscale::exchange::meta::{ExportFrame, SceneMeta};
+use gsscale::exchange::ply::{PlyContent, holds_gaussians, parse_ply, stream_points, write_gaussians};
 use gsscale::scene::columns::{Column, Columns};
 use std::path::Path;
 
@@ -34,7 +34,7 @@ fn gaussians(sh_degree: u8, frame: ExportFrame) -> Vec<u8> {
             *x = ((i * 7 + at) as f32 * 0.7).sin();
         }
     }
-    let meta = PlyMeta { step: Some(3), origin: [1.5, -2.0, 0.25], scale: 0.5, frame, ..PlyMeta::default() };
+    let meta = SceneMeta { step: Some(3), origin: [1.5, -2.0, 0.25], scale: 0.5, frame, ..SceneMeta::default() };
     let folder = scratch();
     let path = folder.path().join("a.ply");
     write_gaussians(&path, &columns, &meta).unwrap();

@@ -8,7 +8,8 @@ mod fixture;
 
 use crate::support::scenes::{self, stderr, summary, text, train};
 use bench::{Bench, EVENTLESS, Ply, changed_pages, ckpt, failed, json, pin, train_from};
-use gsscale::exchange::ply::{PlyMeta, write_gaussians};
+use gsscale::exchange::meta::SceneMeta;
+use gsscale::exchange::ply::write_gaussians;
 use gsscale::page::format::slot_header::checksum;
 use gsscale::scene::columns::{Column, Columns};
 use serde_json::Value;
@@ -563,7 +564,7 @@ fn gaussians_that_do_not_fit_are_refused_by_the_header_or_go_into_pages() {
     // Each view sees at most one of ten parts.
     let mut gaussians = wave(150_000);
     gaussians.means.chunks_exact_mut(3).enumerate().for_each(|(row, mean)| mean[1] += 2000.0 * (row / 15_000) as f32);
-    write_gaussians(&ply, &gaussians, &PlyMeta::default()).unwrap();
+    write_gaussians(&ply, &gaussians, &SceneMeta::default()).unwrap();
     let scene = scenes::city(folder.path(), 8, 32, 24, 200);
     let (alone, out, spill) = (path("alone"), path("out"), path("spill"));
     let flags =
@@ -593,7 +594,7 @@ fn gaussians_round_trip_through_a_store_within_the_budget() {
     let rows = std::env::var("GSSCALE_CKPT_GAUSSIANS").ok().map_or(40_000, |n| n.parse().unwrap());
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
-    write_gaussians(&path("in.ply"), &wave(rows), &PlyMeta::default()).unwrap();
+    write_gaussians(&path("in.ply"), &wave(rows), &SceneMeta::default()).unwrap();
     // The rows alone take 29 MB at 40,000 rows, and exceed the budget from 150,000 rows on.
     let (budget, bytes) = ("112MiB", 112u64 << 20);
     let done = json(&["import", text(&path("in.ply")), "--out", text(&path("store")), "--host-mem", budget]);

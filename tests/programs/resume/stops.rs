@@ -91,3 +91,18 @@ fn a_run_without_its_last_evaluation_goes_on_to_it() {
     assert!(done["finished"] == true && done["test"]["psnr"].as_f64().is_some(), "{done}");
     assert!(ply(&out) == alone.ply && !bench.path("spill/map.redb").exists());
 }
+
+/// A run that was killed between the commit of its last evaluation and its end logs that evaluation once.
+#[test]
+fn a_run_that_is_killed_after_its_last_evaluation_logs_it_once() {
+    let bench = Bench::new();
+    let alone = bench.alone(&[]);
+    let out = bench.path("out");
+    succeeded(bench.begin(Place::Spill(alone.fewest), &["--keep-checkpoint"]));
+    assert_eq!(logged(&out), alone.logged);
+    // The summary follows that commit.
+    std::fs::remove_file(out.join("summary.json")).unwrap();
+    succeeded(bench.go_on(&[]));
+    assert_eq!(logged(&out), alone.logged);
+    assert!(summary(&out)["finished"] == true && ply(&out) == alone.ply);
+}

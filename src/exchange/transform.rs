@@ -1,30 +1,30 @@
-//! The file beside a PLY that leads from its coordinates to those of the dataset and back, for programs that do not read
-//! the comments of the PLY.
+//! The file beside a file of Gaussians that leads from its coordinates to those of the dataset and back, for programs that do
+//! not read the comments of a PLY.
 //!
 //! Not here: reading it. gsscale reads the comments.
 //!
-//! Invariant: the matrices are those that [`super::PlyWriter`] and [`super::to_local`] apply.
+//! Invariant: the matrices are those that [`super::frames`] applies.
 
-use super::{ExportFrame, PlyMeta};
+use super::meta::{ExportFrame, SceneMeta};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::scene::rotation::{Rotation, VIEWER_UP};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// Ending of the file in place of `.ply`.
+/// Ending of the file in place of that of the Gaussians.
 pub const TRANSFORM_ENDING: &str = "transform.json";
 
-/// The file beside the PLY `ply`.
-pub fn transform_path(ply: &Path) -> PathBuf {
-    ply.with_extension(TRANSFORM_ENDING)
+/// The file beside the Gaussians in `file`.
+pub fn transform_path(file: &Path) -> PathBuf {
+    file.with_extension(TRANSFORM_ENDING)
 }
 
-/// Writes the transform of a PLY that was written in `frame` with `meta`: two 4x4 matrices, row-major, for column vectors.
+/// Writes the transform of Gaussians that were written to `file` in `frame` with `meta`: two 4x4 matrices, row-major, for column vectors.
 ///
 /// # Errors
 /// The folder cannot be written.
-pub fn write_transform(ply: &Path, meta: &PlyMeta, frame: ExportFrame) -> InputResult<()> {
+pub fn write_transform(file: &Path, meta: &SceneMeta, frame: ExportFrame) -> InputResult<()> {
     let turned = meta.upright.unwrap_or(Rotation::IDENTITY);
     let (origin, scale) = match frame {
         ExportFrame::Dataset => ([0.0; 3], 1.0),
@@ -35,13 +35,13 @@ pub fn write_transform(ply: &Path, meta: &PlyMeta, frame: ExportFrame) -> InputR
     let shift = turned.apply(origin).map(|x| -x / scale);
     let there = affine(turned.matrix().map(|row| row.map(|x| x / scale)), shift);
     let text = json!({
-        "file": ply.file_name().map(|name| name.to_string_lossy()),
+        "file": file.file_name().map(|name| name.to_string_lossy()),
         "up_in_file": meta.upright.map(|_| VIEWER_UP),
         "up_in_dataset": meta.upright.map(|_| turned.inverse().apply(VIEWER_UP)),
         "file_to_dataset": back,
         "dataset_to_file": there,
     });
-    let path = transform_path(ply);
+    let path = transform_path(file);
     let text = serde_json::to_string_pretty(&text).map_err(|e| InputError::io(&path, "writing", &e.into()))?;
     write_whole(&path, (text + "\n").as_bytes())
 }
@@ -63,7 +63,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let ply = folder.path().join("a.b.ply");
         let upright = Rotation::upright([0.2, 0.3, 0.9]);
-        let meta = PlyMeta { upright, origin: [5.0, -6.0, 7.0], scale: 2.0, ..PlyMeta::default() };
+        let meta = SceneMeta { upright, origin: [5.0, -6.0, 7.0], scale: 2.0, ..SceneMeta::default() };
         for frame in [ExportFrame::Dataset, ExportFrame::Local] {
             write_transform(&ply, &meta, frame).unwrap();
             let text = std::fs::read_to_string(folder.path().join("a.b.transform.json")).unwrap();

@@ -1,0 +1,54 @@
+//! The Gaussians of a trainer as a file of other programs.
+//!
+//! Not here: the formats (`crate::exchange`), when a run writes one ([`super::training_loop`], `run_folder`).
+//!
+//! Invariant: a step that failed half-way is never saved.
+
+use super::error::TrainError;
+use super::trainer::Trainer;
+use crate::base::error::InputError;
+use crate::dataset::loader::Dataset;
+use crate::exchange::meta::SceneMeta;
+use crate::exchange::ply::PlyWriter;
+use crate::exchange::sink::{GaussianSink, Written};
+use crate::report::run_files::PLY_FILE;
+use crate::scene::rotation::Rotation;
+use std::path::{Path, PathBuf};
+
+impl Trainer {
+    /// Writes the rows at the current step as a PLY; returns what was written and in which coordinates.
+    ///
+    /// # Errors
+    /// The folder cannot be written, pages could not be pinned, or a failed step left pages of two steps.
+    pub fn save(&mut self, dataset: &Dataset, path: &Path) -> Result<Written, TrainError> {
+        if self.is_torn {
+            let problem = "the last step failed half-way, so some Gaussians belong to the step before";
+            let remedy = "resume the run from its last commit with gsscale-train --resume and the output folder";
+            return Err(InputError::new(path, problem, remedy).into());
+        }
+        self.drain()?;
+        let meta = self.scene_meta(dataset);
+        let rows_at_most = self.scene.rows_bound();
+        let mut writer = Box::new(PlyWriter::create(path, self.options.sh_degree, rows_at_most, &meta)?);
+        self.scene.for_all_rows(self.state.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
+        Ok(writer.finish()?)
+    }
+
+    /// The metadata of a file of the rows at the current step.
+    pub(super) fn scene_meta(&self, dataset: &Dataset) -> SceneMeta {
+        SceneMeta {
+            step: Some(u64::from(self.state.step)),
+            origin: dataset.frame.origin.to_array(),
+            scale: dataset.frame.scale,
+            scene_radius: f64::from(dataset.scene_scale) * dataset.frame.scale,
+            frame: self.options.export_frame,
+            upright: self.options.up.and_then(Rotation::upright),
+            ..SceneMeta::default()
+        }
+    }
+
+    /// Path of the final PLY in an output folder.
+    pub fn ply_path(out: &Path) -> PathBuf {
+        out.join(PLY_FILE)
+    }
+}
