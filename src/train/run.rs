@@ -1,6 +1,6 @@
 //! A run from command line to result: load, check, plan, print the plan, train.
 //!
-//! Not here: what happens in the output folder ([`super::run_folder`]).
+//! Not here: what happens in the output folder (`run_folder`).
 //!
 //! Invariant: the output folder is created after the dataset was read, so bad input leaves no files.
 
