@@ -36,6 +36,15 @@ impl PartFile {
         Ok((part, file))
     }
 
+    /// The temporary file again, to be written and read: for bytes that are never to get the name.
+    ///
+    /// # Errors
+    /// The file cannot be opened.
+    pub fn reopen(&self) -> InputResult<File> {
+        let opened = File::options().read(true).write(true).open(&self.path);
+        opened.map_err(|e| InputError::io(&self.target, "opening the temporary file", &e))
+    }
+
     /// Makes the bytes durable, and gives the file its name.
     ///
     /// # Errors

@@ -10,6 +10,7 @@ use crate::base::simd::SimdPath;
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
+use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::ExportFrame;
 use crate::gpu::DeviceChoice;
 use crate::optim::method::{Method, OptimizerPlace};
@@ -136,6 +137,7 @@ choices! {
     "appearance": AppearanceMode { Off = "off", Exposure = "exposure", Full = "full" }
     "log": LogFormat { Json = "json", Tensorboard = "tensorboard" }
     "ssim-variant": SsimVariant { Same = "same", Valid = "valid", Reflect = "reflect" }
+    "export": ExportFormat { Ply = "ply", Spz = "spz" }
     "export-frame": ExportFrame { Dataset = "dataset", Local = "local" }
 }
 
@@ -313,6 +315,7 @@ mod tests {
         check::<AppearanceMode>();
         check::<LogFormat>();
         check::<SsimVariant>();
+        check::<ExportFormat>();
         check::<ExportFrame>();
         check::<Chosen<Order>>();
         check::<Chosen<Codec>>();

@@ -19,6 +19,7 @@ use crate::checkpoint::interval::CommitEvery;
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
+use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::ExportFrame;
 use crate::gpu::DeviceChoice;
 use crate::optim::method::{Method, OptimizerPlace};
@@ -223,6 +224,8 @@ config_keys! {
         /// Also report colour-corrected PSNR: affine (per channel, as gsplat), quadratic (as Zip-NeRF and nerfstudio)
         /// or off. It is not comparable with PSNR
         [alias = "colour-correct"] color_correct: Chosen<ColorCorrect> = Chosen(None) => Free;
+        /// Format of the result: ply, or spz (as well, about a tenth of the bytes, for viewers)
+        export: ExportFormat = ExportFormat::Ply => Free;
         /// Coordinates of the PLY: dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;
         /// Up in the PLY: auto (from cameras and points), keep (the axes of the dataset) or X,Y,Z (this direction of the

@@ -8,23 +8,30 @@
 use super::meta::{ExportFrame, SceneMeta};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
-use crate::scene::rotation::{Rotation, VIEWER_UP};
+use crate::scene::rotation::Rotation;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// Ending of the file in place of that of the Gaussians.
+/// Ending of the file: in place of `.ply`, and after any other ending.
 pub const TRANSFORM_ENDING: &str = "transform.json";
 
 /// The file beside the Gaussians in `file`.
 pub fn transform_path(file: &Path) -> PathBuf {
-    file.with_extension(TRANSFORM_ENDING)
+    if file.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("ply")) {
+        return file.with_extension(TRANSFORM_ENDING);
+    }
+    let mut name = file.file_name().unwrap_or_default().to_os_string();
+    name.push(".");
+    name.push(TRANSFORM_ENDING);
+    file.with_file_name(name)
 }
 
 /// Writes the transform of Gaussians that were written to `file` in `frame` with `meta`: two 4x4 matrices, row-major, for column vectors.
+/// `up` is that of an upright file.
 ///
 /// # Errors
 /// The folder cannot be written.
-pub fn write_transform(file: &Path, meta: &SceneMeta, frame: ExportFrame) -> InputResult<()> {
+pub fn write_transform(file: &Path, meta: &SceneMeta, frame: ExportFrame, up: Option<[f64; 3]>) -> InputResult<()> {
     let turned = meta.upright.unwrap_or(Rotation::IDENTITY);
     let (origin, scale) = match frame {
         ExportFrame::Dataset => ([0.0; 3], 1.0),
@@ -36,8 +43,8 @@ pub fn write_transform(file: &Path, meta: &SceneMeta, frame: ExportFrame) -> Inp
     let there = affine(turned.matrix().map(|row| row.map(|x| x / scale)), shift);
     let text = json!({
         "file": file.file_name().map(|name| name.to_string_lossy()),
-        "up_in_file": meta.upright.map(|_| VIEWER_UP),
-        "up_in_dataset": meta.upright.map(|_| turned.inverse().apply(VIEWER_UP)),
+        "up_in_file": up,
+        "up_in_dataset": up.map(|up| turned.inverse().apply(up)),
         "file_to_dataset": back,
         "dataset_to_file": there,
     });
@@ -57,6 +64,7 @@ fn affine(a: [[f64; 3]; 3], b: [f64; 3]) -> [[f64; 4]; 4] {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use crate::scene::rotation::VIEWER_UP;
 
     #[test]
     fn the_matrices_lead_there_and_back() {
@@ -65,7 +73,7 @@ mod tests {
         let upright = Rotation::upright([0.2, 0.3, 0.9]);
         let meta = SceneMeta { upright, origin: [5.0, -6.0, 7.0], scale: 2.0, ..SceneMeta::default() };
         for frame in [ExportFrame::Dataset, ExportFrame::Local] {
-            write_transform(&ply, &meta, frame).unwrap();
+            write_transform(&ply, &meta, frame, Some(VIEWER_UP)).unwrap();
             let text = std::fs::read_to_string(folder.path().join("a.b.transform.json")).unwrap();
             let value: serde_json::Value = serde_json::from_str(&text).unwrap();
             let apply = |name: &str, p: [f64; 3]| {

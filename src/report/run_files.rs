@@ -15,6 +15,10 @@ pub const SUMMARY_FILE: &str = "summary.json";
 pub const PLY_FILE: &str = "point_cloud.ply";
 /// The way from the coordinates of the Gaussians to those of the dataset, and back.
 pub const TRANSFORM_FILE: &str = "point_cloud.transform.json";
+/// The Gaussians at the end, compressed (`--export spz`).
+pub const SPZ_FILE: &str = "point_cloud.spz";
+/// The way from its coordinates to those of the dataset, and back.
+pub const SPZ_TRANSFORM_FILE: &str = "point_cloud.spz.transform.json";
 /// The page for people.
 pub const REPORT_FILE: &str = "report.html";
 /// The pages seen from above, for the report: a JSON list of [`super::page_map::PageTile`].
@@ -57,13 +61,15 @@ pub enum Tells {
 }
 
 /// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
-pub const RUN_FILES: [(RunFile, Tells); 14] = [
+pub const RUN_FILES: [(RunFile, Tells); 16] = [
     (RunFile::File(CONFIG_FILE), Tells::Start),
     (RunFile::File(METRICS_FILE), Tells::Steps),
     (RunFile::Events(EVENTS_FOLDER), Tells::Steps),
     (RunFile::File(SUMMARY_FILE), Tells::Result),
     (RunFile::File(PLY_FILE), Tells::Result),
     (RunFile::File(TRANSFORM_FILE), Tells::Result),
+    (RunFile::File(SPZ_FILE), Tells::Result),
+    (RunFile::File(SPZ_TRANSFORM_FILE), Tells::Result),
     (RunFile::File(REPORT_FILE), Tells::Result),
     (RunFile::File(PAGES_FILE), Tells::Result),
     (RunFile::File(APPEARANCE_FILE), Tells::Result),

@@ -21,6 +21,9 @@ impl Rotation {
     /// No rotation.
     pub const IDENTITY: Rotation = Rotation([1.0, 0.0, 0.0, 0.0]);
 
+    /// Half a turn about x: y and z change their signs.
+    pub const HALF_TURN_ABOUT_X: Rotation = Rotation([0.0, 1.0, 0.0, 0.0]);
+
     /// The rotation of a quaternion (w, x, y, z); `None` unless its length is 1.
     pub fn from_quaternion(q: [f64; 4]) -> Option<Rotation> {
         let is_unit = (q.iter().map(|x| x * x).sum::<f64>() - 1.0).abs() <= UNIT_TOLERANCE;
@@ -44,7 +47,7 @@ impl Rotation {
         let q = [1.0 - y, z, 0.0, -x];
         let norm = q.iter().map(|x| x * x).sum::<f64>().sqrt();
         if norm < 1e-9 {
-            return Some(Rotation([0.0, 1.0, 0.0, 0.0]));
+            return Some(Rotation::HALF_TURN_ABOUT_X);
         }
         // Written so that no -0 appears.
         Some(Rotation(q.map(|x| x / norm + 0.0)))
@@ -60,6 +63,18 @@ impl Rotation {
     pub fn inverse(&self) -> Rotation {
         let [w, x, y, z] = self.0;
         Rotation([w, -x, -y, -z])
+    }
+
+    /// This rotation after `first`.
+    #[must_use]
+    pub fn after(&self, first: &Rotation) -> Rotation {
+        let ([w, x, y, z], [a, b, c, d]) = (self.0, first.0);
+        Rotation([
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ])
     }
 
     /// The matrix, row-major.

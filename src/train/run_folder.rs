@@ -31,11 +31,11 @@ use crate::config::limits;
 use crate::config::values::Up;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::ExportFrame;
 use crate::exchange::sink::Written;
-use crate::exchange::transform::write_transform;
 use crate::report::run_files::{
-    APPEARANCE_FILE, CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE,
+    APPEARANCE_FILE, CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SPZ_FILE, SUMMARY_FILE,
 };
 use crate::report::run_report::write_run_report;
 use std::path::Path;
@@ -148,7 +148,7 @@ pub(super) fn train_into(
     let looped = trainer.run(dataset, &targets, &mut outputs);
     let costs = meter.stop(&trainer, &*tiers, metrics.cpu_seconds());
     let ply = Trainer::ply_path(out);
-    let saved = save_result(dataset, &mut trainer, &ply);
+    let saved = save_result(dataset, &mut trainer, &ply, config.export);
     // Return the error that ended the run; a failure to write its last rows is an additional warning.
     let (looped, written) = match (looped, saved) {
         (Err(error), Err(other)) => {
@@ -187,10 +187,25 @@ pub(super) fn train_into(
     Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0), out: out.clone() })
 }
 
-/// Writes the Gaussians at the current step, and beside them the way to the dataset's coordinates.
-fn save_result(dataset: &Dataset, trainer: &mut Trainer, ply: &Path) -> Result<Written, TrainError> {
+/// Writes the Gaussians at the current step as a PLY and in the format that was asked for, and beside them the way to the dataset's coordinates.
+fn save_result(
+    dataset: &Dataset,
+    trainer: &mut Trainer,
+    ply: &Path,
+    format: ExportFormat,
+) -> Result<Written, TrainError> {
     let written = trainer.save(dataset, ply)?;
-    write_transform(ply, &trainer.scene_meta(dataset), written.frame)?;
+    let meta = trainer.scene_meta(dataset);
+    ExportFormat::Ply.write_transform(ply, &meta, written.frame)?;
+    if format == ExportFormat::Spz {
+        let spz = ply.with_file_name(SPZ_FILE);
+        let compressed = trainer.export(dataset, &spz, format)?;
+        format.write_transform(&spz, &meta, compressed.frame)?;
+        if compressed.rows < written.rows {
+            let lost = written.rows - compressed.rows;
+            eprintln!("warning: {lost} Gaussians lie beyond the reach of {}", spz.display());
+        }
+    }
     Ok(written)
 }
 

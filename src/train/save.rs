@@ -8,9 +8,9 @@ use super::error::TrainError;
 use super::trainer::Trainer;
 use crate::base::error::InputError;
 use crate::dataset::loader::Dataset;
+use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::SceneMeta;
-use crate::exchange::ply::PlyWriter;
-use crate::exchange::sink::{GaussianSink, Written};
+use crate::exchange::sink::Written;
 use crate::report::run_files::PLY_FILE;
 use crate::scene::rotation::Rotation;
 use std::path::{Path, PathBuf};
@@ -21,6 +21,19 @@ impl Trainer {
     /// # Errors
     /// The folder cannot be written, pages could not be pinned, or a failed step left pages of two steps.
     pub fn save(&mut self, dataset: &Dataset, path: &Path) -> Result<Written, TrainError> {
+        self.export(dataset, path, ExportFormat::Ply)
+    }
+
+    /// Like [`Trainer::save`], in another format.
+    ///
+    /// # Errors
+    /// As [`Trainer::save`].
+    pub(super) fn export(
+        &mut self,
+        dataset: &Dataset,
+        path: &Path,
+        format: ExportFormat,
+    ) -> Result<Written, TrainError> {
         if self.is_torn {
             let problem = "the last step failed half-way, so some Gaussians belong to the step before";
             let remedy = "resume the run from its last commit with gsscale-train --resume and the output folder";
@@ -29,9 +42,9 @@ impl Trainer {
         self.drain()?;
         let meta = self.scene_meta(dataset);
         let rows_at_most = self.scene.rows_bound();
-        let mut writer = Box::new(PlyWriter::create(path, self.options.sh_degree, rows_at_most, &meta)?);
-        self.scene.for_all_rows(self.state.step, &mut |rows| Ok::<(), TrainError>(writer.write(rows)?))?;
-        Ok(writer.finish()?)
+        let mut sink = format.create(path, self.options.sh_degree, rows_at_most, &meta)?;
+        self.scene.for_all_rows(self.state.step, &mut |rows| Ok::<(), TrainError>(sink.write(rows)?))?;
+        Ok(sink.finish()?)
     }
 
     /// The metadata of a file of the rows at the current step.

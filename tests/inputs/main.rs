@@ -9,4 +9,5 @@ mod import;
 mod photos;
 mod ply;
 mod readers;
+mod spz;
 mod synthetic;

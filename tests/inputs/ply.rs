@@ -11,7 +11,7 @@ use gsscale::scene::rotation::Rotation;
 use std::path::Path;
 
 /// Rows with unit quaternions.
-fn scene(rows: usize, sh_degree: u8) -> Columns {
+pub(super) fn scene(rows: usize, sh_degree: u8) -> Columns {
     let mut columns = Columns::zeros(rows, sh_degree);
     for (at, column) in Column::ALL.into_iter().enumerate() {
         let mut s = Stream::new(3, Purpose::Test, at as u64, 0);

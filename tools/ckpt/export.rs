@@ -1,4 +1,4 @@
-//! `gsscale-ckpt export`: writes a generation as a PLY.
+//! `gsscale-ckpt export`: writes a generation as a PLY or SPZ.
 
 use gsscale::base::units::format_bytes;
 use gsscale::config::values::ByteSize;
@@ -11,6 +11,7 @@ const EXAMPLES: &str = "\
 Examples:
   gsscale-ckpt export runs/city --out city.ply
   gsscale-ckpt export runs/city --generation 41 --out then.ply
+  gsscale-ckpt export runs/city --out city.spz
   gsscale-ckpt export runs/city --out small.ply --max-gaussians 2000000 --sh-degree 1
   gsscale-ckpt export runs/city --out block.ply --crop 350,120,-5,420,190,60
   gsscale-ckpt export runs/city --out city.ply --host-mem 256MiB
@@ -23,8 +24,8 @@ and --sh-degree the file is the one that gsscale-train would have written after 
 pub struct Args {
     /// A run's output folder, or a spill directory
     dir: PathBuf,
-    /// The PLY to write
-    #[arg(long, short, value_name = "FILE.ply")]
+    /// The file to write; its ending names the format: .ply or .spz
+    #[arg(long, short, value_name = "FILE")]
     out: PathBuf,
     /// Number or name of a generation [default: the latest]
     #[arg(long, value_name = "GEN|NAME")]

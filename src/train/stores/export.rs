@@ -1,4 +1,4 @@
-//! Exports the Gaussians of a generation as a PLY, page by page, with the trainer's writer, and its transform beside it.
+//! Exports the Gaussians of a generation as a PLY or SPZ, page by page, with the trainer's writers, and the transform beside it.
 //!
 //! Invariants: 1. without selection the file equals, byte for byte, the trainer's PLY after the generation's step; 2.
 //! memory is bounded by the budget for any size of scene; 3. the file is written whole or not at all; 4. the selection
@@ -12,10 +12,8 @@ use crate::base::units::format_bytes;
 use crate::checkpoint::run_state::RunState;
 use crate::config::limits::RunOptions;
 use crate::densify::stats::GradHistogram;
+use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::{ExportFrame, SceneMeta};
-use crate::exchange::ply::PlyWriter;
-use crate::exchange::sink::GaussianSink;
-use crate::exchange::transform::write_transform;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::{Access, StoreReader};
 use crate::paging::frames::evict::EvictPolicy;
@@ -47,7 +45,7 @@ const FIXED_BYTES: u64 = 32 << 20;
 pub struct ExportRequest {
     /// Number or name of the generation; `None` for the latest.
     pub generation: Option<String>,
-    /// The PLY.
+    /// The file; its ending names the format.
     pub out: PathBuf,
     /// Memory, bytes.
     pub host_mem: u64,
@@ -88,6 +86,7 @@ pub struct Exported {
 /// The store cannot be opened or is damaged, the budget is too small, no Gaussian is left, or the file cannot be
 /// written.
 pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, TrainError> {
+    let format = ExportFormat::of_path(&request.out)?;
     let store = place.open(Access::Pages)?;
     let generation = store.find(request.generation.as_deref())?;
     let state = run_state_of(&store, generation)?;
@@ -98,12 +97,12 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
     choice.find_cut(&mut scene, &pages, state.trainer.step)?;
     let sh_degree = request.sh_degree.map_or(options.sh_degree, |degree| degree.min(options.sh_degree));
     let meta = meta_of(&state, &options);
-    let mut writer = Box::new(PlyWriter::create(&request.out, sh_degree, state.rows_bound, &meta)?);
+    let mut sink = format.create(&request.out, sh_degree, state.rows_bound, &meta)?;
     let mut given = 0;
     scene.for_rows_of(&pages, state.trainer.step, &mut |rows| {
         let chosen = choice.chosen(rows, sh_degree);
         given += chosen.rows() as u64;
-        Ok::<(), TrainError>(writer.write(&chosen)?)
+        Ok::<(), TrainError>(sink.write(&chosen)?)
     })?;
     if given == 0 && request.crop.is_some() {
         let problem = "no Gaussian lies in this box";
@@ -111,8 +110,8 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
             InputError::new("--crop", problem, "the box is minx,miny,minz,maxx,maxy,maxz in dataset units").into()
         );
     }
-    let written = writer.finish()?;
-    write_transform(&request.out, &meta, written.frame)?;
+    let written = sink.finish()?;
+    format.write_transform(&request.out, &meta, written.frame)?;
     Ok(Exported {
         file: request.out.clone(),
         generation,

@@ -1,0 +1,63 @@
+//! The formats of exported Gaussians, and the way from a format to its sink.
+
+use super::meta::{ExportFrame, SceneMeta};
+use super::ply::PlyWriter;
+use super::sink::GaussianSink;
+use super::spz::{SPZ_UP, SpzWriter};
+use super::transform::write_transform;
+use crate::base::error::{InputError, InputResult};
+use crate::scene::rotation::VIEWER_UP;
+use std::path::Path;
+
+/// A format.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ExportFormat {
+    /// All values as they are; the only one that training and evaluation read.
+    Ply,
+    /// About a tenth of the bytes.
+    Spz,
+}
+
+impl ExportFormat {
+    /// The format that the ending of a file name says.
+    ///
+    /// # Errors
+    /// No format has this ending.
+    pub fn of_path(path: &Path) -> InputResult<ExportFormat> {
+        let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
+        let is = |word: &str| ending.eq_ignore_ascii_case(word);
+        match () {
+            () if is("ply") => Ok(ExportFormat::Ply),
+            () if is("spz") => Ok(ExportFormat::Spz),
+            () => Err(InputError::new(path, "the ending of this file names no format", "let it end in .ply or .spz")),
+        }
+    }
+
+    /// Starts a file of at most `rows_at_most` rows with the bands of `sh_degree`.
+    ///
+    /// # Errors
+    /// The disk fails, or `path` names no file.
+    pub fn create(
+        self,
+        path: &Path,
+        sh_degree: u8,
+        rows_at_most: u64,
+        meta: &SceneMeta,
+    ) -> InputResult<Box<dyn GaussianSink>> {
+        Ok(match self {
+            ExportFormat::Ply => Box::new(PlyWriter::create(path, sh_degree, rows_at_most, meta)?),
+            ExportFormat::Spz => Box::new(SpzWriter::create(path, sh_degree, meta)?),
+        })
+    }
+
+    /// Writes the way from a file of this format to the dataset's coordinates beside it. `meta` is that of a PLY.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub fn write_transform(self, path: &Path, meta: &SceneMeta, frame: ExportFrame) -> InputResult<()> {
+        match self {
+            ExportFormat::Ply => write_transform(path, meta, frame, meta.upright.map(|_| VIEWER_UP)),
+            ExportFormat::Spz => write_transform(path, &SpzWriter::turned(meta), frame, meta.upright.map(|_| SPZ_UP)),
+        }
+    }
+}
