@@ -43,6 +43,8 @@ pub enum Reach {
     Cap,
     /// A guess: there is no cap.
     Guess,
+    /// The number at the start: the run would decide it, and has too few photos for that.
+    Kept,
     /// A guess: the run decides the count as it trains ([`crate::densify::growth`]).
     Decided,
 }

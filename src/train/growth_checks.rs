@@ -25,7 +25,9 @@ impl Trainer {
     ) -> Result<(), TrainError> {
         let strategy = self.options.strategy.clone();
         let (Some(rule), Some(number)) = (strategy.growth(), strategy.growth_check(step)) else { return Ok(()) };
-        if self.state.growth.checks.last().is_some_and(|last| last.step > step) {
+        // Without held-out views the count stays as it is.
+        if self.held_out.positions().is_empty() || self.state.growth.checks.last().is_some_and(|last| last.step > step)
+        {
             return Ok(());
         }
         let started = Instant::now();

@@ -5,9 +5,11 @@
 //!
 //! Not here: the checks that they serve (`growth_checks`).
 //!
+//! Where training views are too few to hold some out, nothing says what more Gaussians bring, and the run keeps the number
+//! that it starts with.
+//!
 //! Invariant: which view a step trains on is a function of the step and the views.
 
-use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
 use crate::config::limits;
 use crate::dataset::loader::Dataset;
@@ -18,7 +20,7 @@ use std::sync::Arc;
 const ONE_OF: usize = 16;
 const VIEWS_LEAST: usize = 3;
 const VIEWS_MOST: usize = 16;
-/// Fewest training views with which a run decides its count: a quarter of them is held out.
+/// Fewest training views with which a run decides its count: a quarter of them is held out. With fewer, it keeps its count.
 const TRAIN_VIEWS_LEAST: usize = 4 * VIEWS_LEAST;
 
 /// The held-out training views, as positions in the list of training views.
@@ -59,24 +61,18 @@ impl HeldOut {
     }
 }
 
-/// Refuses a run that is to decide its count with too few views.
-///
-/// # Errors
-/// Fewer training views than a decision needs.
-pub(super) fn check_enough_views(config: &TrainConfig, dataset: &Dataset) -> InputResult<()> {
-    let views = dataset.train_views().len();
-    if limits::growth_rule(config).is_none() || views >= TRAIN_VIEWS_LEAST {
-        return Ok(());
-    }
-    let problem = format!(
-        "without a cap, --strategy long-axis decides the number of Gaussians by held-out training views, and {views} \
-         training views are too few to hold some out: it takes {TRAIN_VIEWS_LEAST}"
-    );
-    Err(InputError::new(
-        "--max-gaussians",
-        problem,
-        "give the most Gaussians that the scene may have, or --strategy default",
-    ))
+/// Whether a run that is to decide its count has too few training views for it, and so keeps the count that it starts with.
+pub(super) fn keeps_first_count(config: &TrainConfig, dataset: &Dataset) -> bool {
+    limits::growth_rule(config).is_some() && dataset.train_views().len() < TRAIN_VIEWS_LEAST
+}
+
+/// What such a run says about it.
+pub(super) fn too_few_to_decide(dataset: &Dataset) -> String {
+    format!(
+        "the scene keeps the number of Gaussians that it starts with: {} training photos are too few to hold some out and decide \
+         by them how many more pay ({TRAIN_VIEWS_LEAST} are enough); --max-gaussians names another number",
+        dataset.train_views().len()
+    )
 }
 
 #[cfg(test)]

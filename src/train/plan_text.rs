@@ -19,6 +19,7 @@ pub fn growth(forecast: &Forecast) -> String {
     let last = format_grouped(forecast.gaussians[1]);
     match forecast.reach {
         Reach::Constant => String::from(" (no densification)"),
+        Reach::Kept => String::from(", which stays their number (too few photos to decide by)"),
         Reach::Cap => format!(", growing to at most {last}"),
         Reach::Guess => {
             format!(", growing to perhaps {last} (a guess; --max-gaussians caps them)")

@@ -8,8 +8,8 @@ use super::changes::with_absolute_paths;
 use super::device_memory;
 use super::drive_space::{StepWrites, check_first_drive, step_writes};
 use super::error::TrainError;
-use super::forecast::{Forecast, Measured, mean_pixels, reach};
-use super::held_out::check_enough_views;
+use super::forecast::{Forecast, Measured, Reach, mean_pixels, reach};
+use super::held_out::{keeps_first_count, too_few_to_decide};
 use super::machine;
 use super::memory::list_bytes;
 use super::memory::{host_budget, host_bytes_now, rows_at_most};
@@ -122,7 +122,9 @@ pub(super) fn begin(
     for warning in &start.dataset.warnings {
         eprintln!("warning: {warning}");
     }
-    check_enough_views(config, &start.dataset)?;
+    if keeps_first_count(config, &start.dataset) {
+        eprintln!("warning: {}", too_few_to_decide(&start.dataset));
+    }
     let mut options =
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
     if config.up == Up::Auto {
@@ -186,7 +188,10 @@ fn plan(
     let probe = Probe::of_run(dataset, trainer, largest, driver);
     let (rows, steps_done) = (trainer.scene.rows(), trainer.steps_done());
     let pixels = mean_pixels(dataset.train_views().iter().map(|&view| &dataset.views[view].camera));
-    let (last, known) = reach(config, rows, pixels, steps_done);
+    let (last, known) = match keeps_first_count(config, dataset) {
+        true => (rows, Reach::Kept),
+        false => reach(config, rows, pixels, steps_done),
+    };
     let (mut memory, times) = estimate(config, dataset, trainer, &probe, last)?;
     device_memory::check(config, &memory)?;
     let plan = preflight::plan_tiers(config, dataset, trainer, tiers, host_mem, &mut memory)?;

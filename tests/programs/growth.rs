@@ -54,14 +54,23 @@ fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
 }
 
 #[test]
-fn too_few_views_to_decide_by_are_refused() {
+fn a_scene_with_too_few_views_to_decide_by_keeps_its_count() {
     let folder = TempDir::new().unwrap();
     let (scene, out) = (city(folder.path(), 13, 64, 48, 500), folder.path().join("out"));
     // 11 training views.
-    let output = train(&[&[text(&scene), "--out", text(&out)], &DECIDES[..]].concat());
-    let said = stderr(&output);
-    assert!(!output.status.success() && !out.exists(), "{said}");
-    assert!(said.contains("11 training views") && said.contains("12") && said.contains("--strategy default"), "{said}");
-    let capped = [&[text(&scene), "--out", text(&out), "--max-gaussians", "600"], &DECIDES[..]].concat();
-    assert!(train(&capped).status.success());
+    let run = |more: &[&str]| {
+        let output = train(&[&[text(&scene), "--out", text(&out), "--overwrite"], &DECIDES[..], more].concat());
+        assert!(output.status.success(), "{}", stderr(&output));
+        (stderr(&output), summary(&out), std::fs::read(out.join("point_cloud.ply")).unwrap())
+    };
+    let (said, kept, ply) = run(&[]);
+    let warned = said.lines().find(|line| line.starts_with("warning: the scene keeps the number of Gaussians"));
+    assert!(
+        warned.is_some_and(|line| line.contains("11 training photos") && line.contains("--max-gaussians")),
+        "{said}"
+    );
+    assert!(said.contains("which stays their number"), "{said}");
+    assert!(kept["gaussians"].as_u64() <= Some(500) && kept["growth"] == Value::Null, "{kept}");
+    // That is the run with its first count as the cap, and with it the scene recycles Gaussians.
+    assert!(run(&["--max-gaussians", "500"]).2 == ply && run(&["--recycle", "0"]).2 != ply);
 }
