@@ -12,7 +12,7 @@ use super::run_files::{
     APPEARANCE_FILE, CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE,
 };
 use crate::base::error::{InputError, InputResult};
-use crate::base::units::format_bytes;
+use crate::base::units::{format_bytes, format_grouped};
 use crate::base::whole_file::write_whole;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -36,6 +36,9 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
     let name = folder.file_name().map_or("run".into(), |n| n.to_string_lossy().into_owned());
     let mut page = Page::new(&format!("gsscale: {name}"), &scene);
     page.tiles(&tiles(&summary, &metrics));
+    if let Some(text) = why_unfinished(folder, &summary) {
+        page.paragraph(&text);
+    }
     page.heading("Training");
     page.charts(&training_charts(&metrics));
     add_growth(&mut page, &summary);
@@ -57,6 +60,19 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
         page.folded("summary.json", &text);
     }
     Ok(page.finish())
+}
+
+/// The words for a run that has not done its steps or its last evaluation.
+fn why_unfinished(folder: &Path, summary: &Value) -> Option<String> {
+    if summary["finished"] != false {
+        return None;
+    }
+    let config: toml::Table = read_text(&folder.join(CONFIG_FILE))?.parse().ok()?;
+    let planned = config.get("steps").and_then(toml::Value::as_integer).and_then(|steps| u64::try_from(steps).ok())?;
+    let done = summary["steps"].as_u64()?;
+    let [done, planned] = [done, planned].map(format_grouped);
+    let folder = folder.display();
+    Some(format!("Stopped after {done} of {planned} steps. To go on: gsscale-train --resume {folder}"))
 }
 
 /// Writes the report of the run in `folder` into the folder; returns its path. `progress` as for [`run_report`].

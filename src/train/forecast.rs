@@ -89,6 +89,8 @@ pub struct Forecast {
     pub memory: [MemoryEstimate; 3],
     /// Pages, frames and drive at the start.
     pub tiers: TierPlan,
+    /// Memory limit of the run, bytes.
+    pub host_mem: Option<u64>,
     /// Bytes of one version of all pages on the drive, at the end.
     pub drive_bytes: u64,
     /// Most bytes on the drive: with the pages of the commits that are kept, or the checkpoint of a run in memory.
@@ -123,7 +125,7 @@ pub(super) struct Measured {
 }
 
 impl Forecast {
-    /// The forecast of a run with these pages and frames. `host_mem` limits the memory of a run that spills.
+    /// The forecast of a run with these pages and frames. `host_mem` limits the memory of the run.
     pub(super) fn new(
         config: &TrainConfig,
         memory: [MemoryEstimate; 3],
@@ -149,6 +151,7 @@ impl Forecast {
             steps,
             memory,
             tiers,
+            host_mem,
             drive_bytes,
             drive_bytes_most: versions * if is_in_memory { state_bytes } else { drive_bytes },
             ply_bytes: last * (PLY_ROW_BYTES + 12 * (u64::from(config.sh_degree) + 1).pow(2)),

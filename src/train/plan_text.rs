@@ -4,7 +4,7 @@ use super::forecast::{Forecast, Reach};
 use super::largest_view::LargestView;
 use super::places::drive_of;
 use super::start::Start;
-use super::tiers::Tiers;
+use super::tiers::{Tiers, reserve_bytes};
 use crate::base::units::{format_bytes, format_grouped, format_seconds};
 use crate::config::file::TrainConfig;
 use crate::page::folder::file_system::free_bytes;
@@ -59,6 +59,12 @@ pub fn describe(forecast: &Forecast, tiers: &Tiers) -> String {
     let start = format!(" ({} at the start)", format_bytes(forecast.memory[0].total()));
     let start = if grows { start.as_str() } else { "" };
     text.push_str(&format!("memory  about {} at the peak{at}{start}\n", format_bytes(memory.total())));
+    if let (None, Some(limit)) = (plan.frames, forecast.host_mem.filter(|limit| *limit < memory.total())) {
+        text.push_str(&format!(
+            "        more than --host-mem {}: when the scene has grown that far, its pages move to checkpoint/\n",
+            format_bytes(limit)
+        ));
+    }
     text.push_str(&part(&frames, memory.frames));
     text.push_str(&part("one view: rows, gradients, images", memory.view));
     text.push_str(&part("decoded photos (--image-cache)", memory.targets));
@@ -96,10 +102,13 @@ fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
     let by = if tiers.engine == "memory" { String::new() } else { format!(" by {}", tiers.engine) };
     format!(
         "drive   {} of pages{at}{now}{by} ({}), {} free\n        \
+         files grow by up to {} at once, and {} are kept for the moment when the drive is full\n        \
          about {} to write without commits, {:.2} % of the rated life of a common drive; {commits}\n",
         format_bytes(forecast.drive_bytes),
         tiers.codec,
         plan.free_bytes.map_or(String::from("unknown"), format_bytes),
+        format_bytes(tiers.segment_bytes),
+        format_bytes(reserve_bytes(tiers.segment_bytes)),
         format_bytes(forecast.bytes_written as u64),
         100.0 * forecast.bytes_written / ENDURANCE_BYTES
     )

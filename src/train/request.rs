@@ -31,4 +31,6 @@ pub struct RunOutcome {
     pub exit_code: i32,
     /// The output folder.
     pub out: PathBuf,
+    /// The run keeps its checkpoint after its end.
+    pub keeps_checkpoint: bool,
 }

@@ -360,7 +360,12 @@ fn finished_outcome(
         let (out, steps) = (request.out.display(), summary.steps);
         eprintln!("{out} is finished: all {steps} steps, with results; --steps N continues it{more}");
     }
-    Ok(Some(RunOutcome { summary: Some(summary), exit_code: 0, out: request.out.clone() }))
+    Ok(Some(RunOutcome {
+        summary: Some(summary),
+        exit_code: 0,
+        out: request.out.clone(),
+        keeps_checkpoint: config.keep_checkpoint,
+    }))
 }
 
 fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {

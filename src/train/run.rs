@@ -59,7 +59,12 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
         if !request.quiet {
             crate::say!("{known}");
         }
-        return Ok(RunOutcome { summary: None, exit_code: 0, out: request.out.clone() });
+        return Ok(RunOutcome {
+            summary: None,
+            exit_code: 0,
+            out: request.out.clone(),
+            keeps_checkpoint: config.keep_checkpoint,
+        });
     }
     if let Some(spill_dir) = config.residence().spill_dir().filter(|_| !request.dry_run)
         && remove_uncommitted(spill_dir, false)?
@@ -232,7 +237,12 @@ pub(super) fn plan_and_train(
         }
     }
     if request.dry_run {
-        return Ok(RunOutcome { summary: None, exit_code: 0, out: request.out.clone() });
+        return Ok(RunOutcome {
+            summary: None,
+            exit_code: 0,
+            out: request.out.clone(),
+            keeps_checkpoint: config.keep_checkpoint,
+        });
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     out_folder::make_folder(&request.out)?;

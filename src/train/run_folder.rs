@@ -184,7 +184,12 @@ pub(super) fn train_into(
     write_report(request)?;
     tested?;
     tiers.is_done = summary.finished;
-    Ok(RunOutcome { summary: Some(summary), exit_code: stop.exit_code().unwrap_or(0), out: out.clone() })
+    Ok(RunOutcome {
+        summary: Some(summary),
+        exit_code: stop.exit_code().unwrap_or(0),
+        out: out.clone(),
+        keeps_checkpoint: config.keep_checkpoint,
+    })
 }
 
 /// Writes the Gaussians at the current step as a PLY and in the format that was asked for, and beside them the way to the dataset's coordinates.

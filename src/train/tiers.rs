@@ -60,6 +60,8 @@ pub struct Tiers {
     pub engine: String,
     /// Codec of stored pages.
     pub codec: Codec,
+    /// By as many bytes the files of the pages grow at once.
+    pub segment_bytes: u64,
     /// Messages about the drive and the choice of the engine.
     pub notes: Vec<String>,
 }
@@ -127,6 +129,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let layout = SlotLayout::new(capacity_bytes(page_rows, sh_degree), pages as u64);
     let mut tiers = Tiers::default();
     tiers.keeps = config.keep_checkpoint;
+    tiers.segment_bytes = layout.segment_bytes();
     let Some(spill_dir) = residence.spill_dir().filter(|_| !dry) else {
         tiers.planned_on = residence.spill_dir().map(drive_of);
         let engine = Box::new(MemoryEngine::new());
@@ -239,6 +242,7 @@ impl Stored {
         let mut tiers = Tiers::default();
         (tiers.has_resumed, tiers.is_in_memory, tiers.keeps) = (true, is_in_memory, config.keep_checkpoint);
         tiers.is_in_output = config.residence().spill_dir().is_none();
+        tiers.segment_bytes = layout.segment_bytes();
         let folder = spill.folder().to_path_buf();
         let (engine, codec) = tiers.take_spill(spill, config)?;
         let store = opened.paged_store(engine, layout, codec)?;
@@ -251,8 +255,13 @@ impl Stored {
     }
 }
 
+/// Bytes that a spill directory holds back for the moment when its drive is full.
+pub(super) fn reserve_bytes(segment_bytes: u64) -> u64 {
+    segment_bytes.clamp(RESERVE_BYTES_LEAST, RESERVE_BYTES_MOST)
+}
+
 fn commit_config(spill: &SpillDir) -> CommitConfig {
-    let reserve_bytes = spill.format().layout.segment_bytes().clamp(RESERVE_BYTES_LEAST, RESERVE_BYTES_MOST);
+    let reserve_bytes = reserve_bytes(spill.format().layout.segment_bytes());
     CommitConfig { store: spill.format().store, cache_bytes: MAP_CACHE_BYTES, reserve_bytes }
 }
 

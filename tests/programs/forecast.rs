@@ -24,6 +24,29 @@ fn plan_lines(said: &str) -> Vec<String> {
     said.lines().filter(begins).map(str::to_string).collect()
 }
 
+/// A drive takes no writes of pages that all stay in memory, and a limit that the scene will outgrow is said.
+#[test]
+fn a_forecast_says_what_memory_holds() {
+    let folder = TempDir::new().unwrap();
+    let scene = wide_city(folder.path(), 4_000);
+    let spill = folder.path().join("spill");
+    let dry = |more: &[&str]| {
+        let flags = "--device cpu --dry-run --steps 600 --image-cache 4MiB --max-gaussians 20000";
+        let flags: Vec<&str> = flags.split_whitespace().collect();
+        told(&train(&[&[text(&scene)], &flags[..], more].concat()))
+    };
+    let fits = dry(&["--spill-dir", text(&spill), "--host-mem", "4GiB"]);
+    assert!(fits.contains("one for every page") && !fits.contains("by memory"), "{fits}");
+    assert!(fits.contains("are kept for the moment when the drive is full"), "{fits}");
+    // The import alone, which is no more than the pages at the end.
+    let plan = planned(&scene, &["--spill-dir", text(&spill), "--host-mem", "4GiB", "--max-gaussians", "20000"]).0;
+    let number = |key: &str| plan["run"][key].as_f64().unwrap();
+    assert!(number("bytes_written") > 0.0 && number("bytes_written") <= number("drive_bytes"), "{plan}");
+    assert!(!dry(&[]).contains("more than --host-mem"));
+    let outgrows = dry(&["--host-mem", "60MiB"]);
+    assert!(outgrows.contains("more than --host-mem 60.0 MiB") && outgrows.contains("checkpoint/"), "{outgrows}");
+}
+
 #[test]
 fn dry_run_plan_and_run_say_the_same() {
     let folder = TempDir::new().unwrap();
