@@ -234,10 +234,12 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
         eprintln!("  report      {}", out.join(REPORT_FILE).display());
         if summary.finished {
             let more = summary.steps.saturating_mul(2);
-            // The flag says whether Adam's moments are still there.
-            let how =
-                if outcome.keeps_checkpoint { "" } else { " (anew from the PLY; --keep-checkpoint goes on exactly)" };
-            eprintln!("  more steps  gsscale-train --resume {} --steps {more}{how}", out.display());
+            eprintln!("  more steps  gsscale-train --resume {} --steps {more}", out.display());
+            if !outcome.keeps_checkpoint {
+                eprintln!(
+                    "              (from the PLY, without Adam's moments; runs with --keep-checkpoint go on exactly)"
+                );
+            }
         }
     }
     ExitCode::from(outcome.exit_code as u8)

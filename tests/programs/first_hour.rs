@@ -26,6 +26,7 @@ fn a_run_needs_no_folder_and_says_where_everything_is() {
     assert!(done.iter().any(|line| line.ends_with("runs/scene/point_cloud.ply")), "{said}");
     assert!(done.iter().any(|line| line.ends_with("runs/scene/report.html")), "{said}");
     assert!(done.iter().any(|line| line.ends_with("gsscale-train --resume runs/scene --steps 100")), "{said}");
+    assert!(done.last().is_some_and(|line| line.contains("--keep-checkpoint")), "{said}");
     let lines: Vec<&str> = said.lines().filter(|line| line.starts_with("step ")).collect();
     assert!(lines.iter().any(|line| line.starts_with("step 20: PSNR ")), "{said}");
     assert!(lines.last().is_some_and(|line| line.starts_with("step 50/50  500 Gaussians  PSNR ")), "{said}");
