@@ -57,7 +57,7 @@ impl ExportFormat {
     pub fn write_transform(self, path: &Path, meta: &SceneMeta, frame: ExportFrame) -> InputResult<()> {
         match self {
             ExportFormat::Ply => write_transform(path, meta, frame, meta.upright.map(|_| VIEWER_UP)),
-            ExportFormat::Spz => write_transform(path, &SpzWriter::turned(meta), frame, meta.upright.map(|_| SPZ_UP)),
+            ExportFormat::Spz => write_transform(path, &SpzWriter::spz_meta(meta), frame, meta.upright.map(|_| SPZ_UP)),
         }
     }
 }

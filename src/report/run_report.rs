@@ -62,7 +62,7 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
     Ok(page.finish())
 }
 
-/// The words for a run that has not done its steps or its last evaluation.
+/// Says after how many steps a run was stopped and how it goes on; `None` for a finished run.
 fn why_unfinished(folder: &Path, summary: &Value) -> Option<String> {
     if summary["finished"] != false {
         return None;

@@ -102,7 +102,7 @@ fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
     let by = if tiers.engine == "memory" { String::new() } else { format!(" by {}", tiers.engine) };
     format!(
         "drive   {} of pages{at}{now}{by} ({}), {} free\n        \
-         files grow by up to {} at once, and {} are kept for the moment when the drive is full\n        \
+         each new segment file takes {}; a reserve file of {} is given up when the drive is full\n        \
          about {} to write without commits, {:.2} % of the rated life of a common drive; {commits}\n",
         format_bytes(forecast.drive_bytes),
         tiers.codec,

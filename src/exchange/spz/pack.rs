@@ -23,12 +23,12 @@ pub fn attribute_bytes(sh_degree: u8) -> [usize; 5] {
     [1, 3, 3, 4, 3 * (n * n - 1)]
 }
 
-/// Largest coordinate that a file can hold.
-pub fn reach_max() -> f32 {
+/// Largest coordinate that a file can hold, in its own units.
+pub fn coordinate_max() -> f32 {
     FIXED_MAX as f32
 }
 
-/// Fractional bits with which coordinates up to `reach` fit: as many as possible.
+/// The most fractional bits with which coordinates up to `reach` (file units) fit into 24 bits.
 pub fn fraction_bits(reach: f32) -> u8 {
     let fits = |bits: &u8| f64::from(reach) * f64::from(1u32 << bits) <= FIXED_MAX - 0.5;
     (0..=FRACTION_BITS_MAX).rev().find(fits).unwrap_or(0)

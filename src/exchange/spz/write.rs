@@ -48,8 +48,8 @@ pub struct SpzWriter {
 }
 
 impl SpzWriter {
-    /// The metadata of the file with these Gaussians: that of a PLY, in the axes of SPZ.
-    pub fn turned(meta: &SceneMeta) -> SceneMeta {
+    /// Converts the metadata of a PLY to the axes of SPZ.
+    pub fn spz_meta(meta: &SceneMeta) -> SceneMeta {
         let upright = meta.upright.map_or(HALF_TURN, |upright| HALF_TURN.after(&upright));
         SceneMeta { upright: Some(upright), ..meta.clone() }
     }
@@ -72,7 +72,7 @@ impl SpzWriter {
             rows_path,
             rows_part,
             rows_file: BufWriter::with_capacity(BUFFER_BYTES, rows_file),
-            to_file: ExportRows::new(&Self::turned(meta)),
+            to_file: ExportRows::new(&Self::spz_meta(meta)),
             sh_degree,
             given: 0,
             rows: 0,
@@ -117,10 +117,10 @@ impl GaussianSink for SpzWriter {
             self.given += 1;
             let Some(mut row) = self.to_file.row(columns, row) else { continue };
             let reach = row.position.iter().fold(0.0f32, |most, x| most.max(x.abs()));
-            if reach > pack::reach_max() {
+            if reach > pack::coordinate_max() {
                 continue;
             }
-            row.quat = with_axes_turned(row.quat);
+            row.quat = half_turn_of_own_axes(row.quat);
             self.reach = self.reach.max(reach);
             bytes.clear();
             bytes.extend(row.position.iter().flat_map(|x| x.to_le_bytes()));
@@ -149,9 +149,9 @@ impl GaussianSink for SpzWriter {
     }
 }
 
-/// The same Gaussian, its own axes turned half about its first one: axes have no sign. A reader that turns a file back to the
-/// axes of a PLY, frame and Gaussians, then finds the quaternion of the PLY.
-fn with_axes_turned([w, x, y, z]: [f32; 4]) -> [f32; 4] {
+/// Rotates the Gaussian's own axes by 180 degrees about the first of them, which leaves the covariance unchanged. Readers
+/// conjugate quaternions when they convert a file to the axes of a PLY; they then get the quaternion of the PLY.
+fn half_turn_of_own_axes([w, x, y, z]: [f32; 4]) -> [f32; 4] {
     [x, -w, -z, y]
 }
 
